@@ -20,11 +20,10 @@ from blf_dsc_controller.cli.main import main
 from blf_dsc_controller.configuration.robot import chain_of
 from blf_dsc_controller.errors import BlfDscError, MissingExtraError
 from blf_dsc_controller.messages.topics import JOINT_STATES
-from blf_dsc_controller.view import address
-from blf_dsc_controller.view.address import free_port
+from blf_dsc_controller.view import page as pages
 from blf_dsc_controller.view.arm import ShownArm, planar_urdf, with_cylinders, with_known_meshes
 from blf_dsc_controller.view.bag import BagPlayer
-from blf_dsc_controller.view.page import Page, bodies_of, plant_events
+from blf_dsc_controller.view.page import Page, bodies_of, free_port, plant_events
 
 HOST = '127.0.0.1'
 PORT = 18080
@@ -106,8 +105,8 @@ def test_events_are_lines_in_the_plots_and_named_at_the_arm(player):
 def test_payloads_and_other_events_of_a_plant_are_listed():
     values = {'events.begin': [20.0, 3.0], 'events.duration': [25.0, 0.0]}
     values['events.payload'] = [2.0, 0.0]
-    found = [(3.0, 'event 2 begins', 0.0), (20.0, '2 kg picked up', 2.0)]
-    assert plant_events(values) == [*found, (45.0, '2 kg put down', -2.0)]
+    texts = [(3.0, 'event 2 begins'), (20.0, '2 kg picked up'), (45.0, '2 kg put down')]
+    assert plant_events(values) == [(at, 'plant', text) for at, text in texts]
     assert plant_events({}) == []
 
 
@@ -210,7 +209,7 @@ def test_port_in_use_is_skipped(player):
 
 
 def test_missing_viser_is_reported_with_the_pip_command(monkeypatch):
-    monkeypatch.setattr(address.importlib.util, 'find_spec', lambda _: None)
+    monkeypatch.setattr(pages.importlib.util, 'find_spec', lambda _: None)
     with pytest.raises(MissingExtraError, match=r"pip install 'blf_dsc_controller\[view\]'"):
         Page(HOST, PORT)
 

@@ -14,13 +14,6 @@ def click(button):
         callback(SimpleNamespace(client=HAND, target=button))
 
 
-def drag(slider, value):
-    """Move a slider and call its callbacks."""
-    slider.value = value  # also calls back, without a browser
-    for callback in slider._impl.update_cb:
-        callback(SimpleNamespace(client=HAND, target=slider))
-
-
 def nodes(page):
     """Return the names of all objects drawn in the 3D scene."""
     return set(page.server.scene._handle_from_node_name)

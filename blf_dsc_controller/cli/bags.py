@@ -191,9 +191,8 @@ def view(options: Namespace) -> int:
             words += ['-r', f'__ns:=/{options.namespace.strip("/")}']
         sys.argv[1:] = ['--ros-args', *words]
         return main()
-    from blf_dsc_controller.view.address import LOCAL, open_to_others
     from blf_dsc_controller.view.bag import BagPlayer
-    from blf_dsc_controller.view.page import Page
+    from blf_dsc_controller.view.page import LOCAL, Page, open_to_others
 
     page = Page(options.host, options.port)
     try:

@@ -40,7 +40,6 @@ from blf_dsc_controller.simulation.loop import Record, simulate
 from blf_dsc_controller.supervision.checks import Reason
 from blf_dsc_controller.supervision.config_warnings import config_warnings, expectation
 from blf_dsc_controller.supervision.guard import Guard
-from blf_dsc_controller.view.address import LOCAL, free_port, open_to_others, require_viser
 from sim_plant.plant import parameter_order, parameters_of, plant_of
 
 STOPPED = 5
@@ -160,6 +159,8 @@ def _check_view(options: Namespace) -> None:
             '--view shows a run over ROS: leave out --offline, or look at the bag afterwards '
             '(blf_dsc view OUT/bag)'
         )
+    from blf_dsc_controller.view.page import LOCAL, free_port, open_to_others, require_viser
+
     require_viser()
     free_port(options.view_host, 8080)
     if options.view_host not in LOCAL:

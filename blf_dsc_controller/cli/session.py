@@ -34,7 +34,6 @@ from blf_dsc_controller.law.telemetry import DECIMATION
 from blf_dsc_controller.messages import topics
 from blf_dsc_controller.messages.topics import RATIO
 from blf_dsc_controller.nodes.endpoints import qos_profile
-from blf_dsc_controller.view.address import free_port, url_of
 
 _LOOP = 'loop'
 # Started in this order and stopped in reverse, so that the recorder gets every message.
@@ -158,6 +157,8 @@ def _run_nodes(config: LoopConfig, params_file: Path, logs: Path, view_host: str
             return node
 
         def show() -> str:
+            from blf_dsc_controller.view.page import free_port, url_of
+
             port = free_port(view_host, _VIEW_PORT)
             started(VIEW, '-p', f'host:={view_host}', '-p', f'port:={port}')
             return url_of(view_host, port)

@@ -21,7 +21,6 @@ from typing import Any, NamedTuple
 
 from ament_index_python.packages import get_package_share_directory
 from rclpy._rclpy_pybind11 import RCLError, UnknownROSArgsError
-from rclpy.client import Client
 from rclpy.clock import Clock, ClockType
 from rclpy.duration import Duration
 from rclpy.lifecycle import LifecycleNode
@@ -145,13 +144,6 @@ def raw_publish(publisher: Publisher) -> Callable[[bytes], None]:
     """Return a function that publishes raw messages in half the time while the node exists."""
     publish: Callable[[bytes], None] = publisher.handle.publish_raw
     return publish
-
-
-def take_response(client: Client) -> Any:
-    """Take a response from a client that no executor spins; None if there is none yet."""
-    type_: Any = client.srv_type
-    _, response = client.handle.take_response(type_.Response)
-    return response
 
 
 def lifecycle_state(node: LifecycleNode) -> str:

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import json
 import time
 from pathlib import Path
 from typing import NoReturn
@@ -12,23 +11,14 @@ import numpy as np
 
 from blf_dsc_controller.analysis.report import read_bags
 from blf_dsc_controller.bags.content import NO_NAMES, NameMap
-from blf_dsc_controller.messages.topics import LAMBDA_MIN, LOAD
+from blf_dsc_controller.messages.topics import LAMBDA_MIN, LOAD, PLANT
 from blf_dsc_controller.run import Floats, Run, Series, Stamps
-from blf_dsc_controller.view.arm import arm_of
-from blf_dsc_controller.view.page import (
-    PAST,
-    Page,
-    Snapshot,
-    plant_events,
-    prior_deviations,
-    units_of,
-)
+from blf_dsc_controller.view.page import PAST, Page, Snapshot, plant_events, units_of
 
 _RATE = 30.0  # snapshots per second
 _MOST = 20_000  # snapshots per bag
 _PERIOD = 1.0 / 30.0  # s
 _PLOTTED = 6  # frames between updates of the plots
-_PLANT = 'sim_plant: '  # before the names of its parameters
 _SPEEDS = ('0.1', '0.5', '1', '2', '5', '10')
 
 
@@ -45,29 +35,20 @@ class BagPlayer:
     ) -> None:
         (bag,) = read_bags([path], namespace, names)
         config = bag.content.controller_config()
-        run = bag.run
-        units = units_of(config)
-        self.snapshots = snapshots(run, tuple(units))
+        plant = bag.content.configurations.get(PLANT, {})
+        self.snapshots = snapshots(bag.run, tuple(units_of(config)))
         self._page, self._times = page, np.array([each.time for each in self.snapshots])
-        plant = {
-            name.removeprefix(_PLANT): json.loads(value)
-            for name, value in bag.parameters.items()
-            if name.startswith(f'{_PLANT}events.')
-        }
-        self._events = [(*event,) for event in bag.events]
-        self._events += [(at, 'plant', text) for at, text, _ in plant_events(plant)]
-        self._events.sort()
+        happened = [(event.time, event.kind, event.text) for event in bag.events]
+        self._events = sorted([*happened, *plant_events(plant)])
         self._playing, self._drawn = False, -1
-        keys = (f'{_PLANT}arm.l1', f'{_PLANT}arm.l2')
-        lengths = [float(bag.parameters[key]) for key in keys if key in bag.parameters]
-        page.draw_arm(arm_of(config, lengths), units, prior_deviations(config))
+        page.draw_arm(config, [plant[key] for key in ('arm.l1', 'arm.l2') if key in plant])
         gui = page.server.gui
         end = float(self._times[-1])
         self.slider = gui.add_slider('time [s]', 0.0, end, 1e-3, 0.0, order=-2.0)
         self.speed = gui.add_dropdown('speed', _SPEEDS, initial_value='1', order=-1.0)
         self.button = gui.add_button('Play / Pause', order=-1.5)
         self.button.on_click(lambda _: self.toggle())
-        page.state('BAG', f'{bag.name}, {run.duration:.1f} s')
+        page.state('BAG', f'{bag.name}, {bag.run.duration:.1f} s')
 
     def toggle(self) -> None:
         """Toggle between play and pause; at the end, start over."""

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The node `view`, which feeds the page from the topics.
+"""The node `view`, which feeds the page from the topics, and asks what its buttons say.
 
 It runs in its own low-priority process, takes the newest messages thirty times a second, and
 tolerates lost ones. The controller's configuration comes from its journal.
@@ -11,15 +11,20 @@ import json
 import os
 import sys
 from collections import deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from math import inf
+from queue import SimpleQueue
 from typing import Any
 
 import numpy as np
+from rcl_interfaces.srv import SetParameters
+from rclpy.parameter import Parameter
 from rclpy.serialization import deserialize_message
+from std_srvs.srv import Trigger
 
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.nodes import VIEW, ViewConfig, is_builtin
-from blf_dsc_controller.configuration.schema import build, change, flatten
+from blf_dsc_controller.configuration.schema import build
 from blf_dsc_controller.messages import topics
 from blf_dsc_controller.messages.codecs import JointStateDecoder, MessageError, joint_state_layout
 from blf_dsc_controller.messages.journal import Event, EventType, decode
@@ -33,15 +38,13 @@ from blf_dsc_controller.nodes.endpoints import (
 from blf_dsc_controller.nodes.parameters import declare
 from blf_dsc_controller.nodes.process import PlainNode, run
 from blf_dsc_controller.run import Floats
-from blf_dsc_controller.view.address import LOCAL, open_to_others
-from blf_dsc_controller.view.arm import arm_of
-from blf_dsc_controller.view.controls import Controls, Requests
 from blf_dsc_controller.view.page import (
+    LOCAL,
     PAST,
     Page,
     Snapshot,
+    open_to_others,
     plant_events,
-    prior_deviations,
     units_of,
 )
 
@@ -49,10 +52,13 @@ _PERIOD = 1.0 / 30.0  # s
 _PLOTTED = 6  # frames between updates of the plots
 _SILENCE = 30  # frames without a joint state before the page reports it
 _OUTDATED = 500_000_000  # ns
+_LISTED = 50  # events
 _NICE = 10  # lower priority than the loop
+_PUSH = 0.5  # s
 _NEWEST = Quality(depth=1, reliability='best_effort')
 _STREAMS = (topics.JOINT_STATES, topics.TRACKING_ERROR, topics.BOUND, topics.MONITOR, topics.TRUTH)
-_EVENTS = (topics.JOURNAL, topics.CHANGES, topics.STATE, topics.DIAGNOSTICS)
+_EVENTS = (topics.JOURNAL, topics.CHANGES, topics.STATE)
+_FIGURES = (*topics.LOAD, topics.LAMBDA_MIN, topics.LATCHED)
 _LEVELS = dict(enumerate(('OK', 'WARN', 'ERROR', 'STALE')))
 
 
@@ -63,26 +69,40 @@ class ViewNode(PlainNode):
         ConfigurationError: a parameter is invalid.
         MissingExtraError: viser is not installed.
         BlfDscError: the page cannot be served at this host.
+
+    Attributes:
+        page: what is served.
+        past: the snapshots of the last `PAST` seconds.
+        buttons: by their label.
     """
 
     def __init__(self, **options: Any) -> None:
         super().__init__(VIEW, **options)
         config = declare(self, ViewConfig)
         self.page = Page(config.host, config.port)
-        self.controls: Controls | None = None
         self.past: deque[Snapshot] = deque()
+        self.buttons: dict[str, Any] = {}
         self._config: ControllerConfig | None = None
         self._plant: dict[str, Any] = {}  # parameters of the simulated plant
-        self._noted = -1.0  # s, time up to which its events are on the page
+        self._events: deque[tuple[float, str, str]] = deque(maxlen=_LISTED)
+        self._noted = -1.0  # s, time up to which the plant's events are on the page
         self._state = 'STALE', f'waiting for {self.resolve_topic_name(topics.JOURNAL.relative)}'
         self._start = self._sampled = -1  # ns, stamps of start and last tracking error
         self._pictures = self._silent = 0
         self._clients_seen: frozenset[int] = frozenset()
-        self._rejected = -1  # number of trajectories; -1: unknown
         self._newest = self._subscribe(_STREAMS, _NEWEST)
         self._kept = self._subscribe(_EVENTS)
-        prefix = self.get_namespace().rstrip('/')
-        self._requests = Requests(self, self._newest.node, prefix, self.page.notify, self._restore)
+        self._asked: SimpleQueue[Callable[[], None]] = SimpleQueue()  # by the page's threads
+        self._push_ends = inf  # s
+        self._load: list[float] = []  # N m, without a push
+        self._requests = {
+            name: self.create_client(type_, f'{self.get_namespace().rstrip("/")}/{name}')
+            for name, type_ in (
+                (f'{topics.CONTROLLER}/reset', Trigger),
+                (f'{topics.PLANT}/reset', Trigger),
+                (f'{topics.PLANT}/set_parameters', SetParameters),
+            )
+        }
         self.get_logger().info(f'open {self.page.url}')
         if config.host not in LOCAL:
             self.get_logger().warning(open_to_others(config.host))
@@ -102,14 +122,16 @@ class ViewNode(PlainNode):
         self._kept.close()
 
     def update(self) -> None:
-        """Process new messages, carry out requests, and draw."""
+        """Process new messages, do what the buttons ask for, and draw."""
         for message in self._kept.take():
             self._note(_EVENTS[message.handle], message.raw)
-        self._requests.update(self.past[-1].time if self.past else 0.0)
+        while not self._asked.empty():
+            self._asked.get()()
         config = self._config
         has_state = config is not None and self._take(self._newest.take())
         self._silent = 0 if has_state else self._silent + 1
         self.page.state(*self._health())
+        self.page.events(list(self._events))
         clients = frozenset(self.page.server.get_clients())
         if config is not None and self.past and (has_state or clients != self._clients_seen):
             self._draw(clients)
@@ -123,7 +145,16 @@ class ViewNode(PlainNode):
                 return 'ERROR', f'the {node} is gone: {topic.relative} is no longer published'
         return self._state[0], f'{self._state[1]} (no joint states received)'
 
-    # Incoming messages.
+    def _draw(self, clients: frozenset[int]) -> None:
+        self._pictures += 1
+        past = list(self.past)
+        if clients:
+            self.page.move(past)
+            if self._pictures % _PLOTTED == 0 or clients != self._clients_seen:
+                self.page.plot(past)
+        self._clients_seen = clients
+
+    # Events.
 
     def _note(self, topic: Topic, raw: bytes) -> None:
         if topic is topics.JOURNAL:
@@ -132,23 +163,16 @@ class ViewNode(PlainNode):
         content: Any = deserialize_message(raw, message_class(topic.type))
         if topic is topics.STATE:
             self._state = _LEVELS[content.level[0]], content.message
-        elif topic is topics.CHANGES:
-            said = json.loads(content.data)
-            if said.get('configured'):
-                self._meet_plant(said['parameters'])
-                return
-            self._plant |= said['parameters']
-            for name, value in said['parameters'].items():
-                self.page.event(self._time(said['stamp']), name, f'{value}')
-        else:
-            for status in content.status:
-                self._note_rejection({pair.key: pair.value for pair in status.values})
-
-    def _note_rejection(self, values: Mapping[str, str]) -> None:
-        before = self._rejected
-        self._rejected = int(values.get('trajectories rejected', before))
-        if 0 <= before < self._rejected:
-            self.page.notify('the reference was rejected', values['last rejection'])
+            return
+        said = json.loads(content.data)
+        if said.get('configured'):
+            self._plant, self._noted = said['parameters'], -1.0
+            self._load = self._plant.get('load.torque', [])
+            self._draw_all()
+            return
+        self._plant |= said['parameters']
+        for name, value in said['parameters'].items():
+            self._events.append((self._time(said['stamp']), name, f'{value}'))
 
     def _follow(self, event: Event) -> None:
         """Follow the controller's journal, which begins with all its parameters."""
@@ -157,49 +181,29 @@ class ViewNode(PlainNode):
             values = {k: v for k, v in content['parameters'].items() if not is_builtin(k)}
             self._configure(build(ControllerConfig, values))
             return
-        if event.type is EventType.PARAMETERS and self._config is not None:
-            self._config = change(self._config, content['parameters'])
-            self._restore()
         if event.type is EventType.START:
             self._start, self._noted = event.stamp, -1.0
             self.past.clear()
         details = [f'{content[k]}' for k in ('reason', 'text', 'parameters') if k in content]
-        self.page.event(self._time(event.stamp), event.type.value, ', '.join(details))
+        self._events.append((self._time(event.stamp), event.type.value, ', '.join(details)))
 
     def _configure(self, config: ControllerConfig) -> None:
         self._config = config
-        self._estimates = units_of(config)
+        self._estimates = tuple(units_of(config))
         self._decoders = {
             topic: JointStateDecoder(config.joints, ('position',)) for topic in _STREAMS[:3]
         }
-        self._learned = np.full(len(self._estimates) + len(topics.LOAD) + 2, np.nan)
-        self._truth = np.full(len(self._estimates), np.nan)
-        self._draw_all()
-
-    def _meet_plant(self, values: Mapping[str, Any]) -> None:
-        self._plant, self._noted = dict(values), -1.0
-        self._requests.meet_plant(values)
+        self._learned = np.full(len(self._estimates) + len(_FIGURES), np.nan)
+        self._truth = self._first_truth = np.full(len(self._estimates), np.nan)
         self._draw_all()
 
     def _draw_all(self) -> None:
         if self._config is not None:
             self.page.clear()
             lengths = [self._plant[name] for name in ('arm.l1', 'arm.l2') if name in self._plant]
-            tabs = self.page.draw_arm(
-                arm_of(self._config, lengths), self._estimates, prior_deviations(self._config)
-            )
-            self.controls = Controls(
-                self.page.server.gui,
-                tabs,
-                self._config,
-                self._requests,
-                simulated=bool(self._plant),
-            )
+            self._add_buttons(self.page.draw_arm(self._config, lengths), self._config.joints)
 
-    def _restore(self) -> None:
-        """Move the sliders to the values in force."""
-        if self._config is not None and self.controls is not None:
-            self.controls.show(flatten(self._config))
+    # Samples.
 
     def _time(self, stamp: int) -> float:
         """Return the time [s] since the controller's start, or since the first known stamp."""
@@ -218,10 +222,11 @@ class ViewNode(PlainNode):
                     stamp = at if topic is topics.JOINT_STATES else stamp
                     sampled = at if topic is topics.TRACKING_ERROR else sampled
                 elif topic is topics.TRUTH:
-                    self._truth = _named(message.raw, (*self._estimates,))
+                    self._truth = _named(message.raw, self._estimates)
+                    if np.isnan(self._first_truth).all():
+                        self._first_truth = self._truth
                 else:
-                    figures = (*topics.LOAD, topics.LAMBDA_MIN, topics.LATCHED)
-                    self._learn(_named(message.raw, (*self._estimates, *figures)))
+                    self._learn(_named(message.raw, (*self._estimates, *_FIGURES)))
             except MessageError as error:
                 self.get_logger().warning(f'not shown: {error}', throttle_duration_sec=10.0)
         self._sampled = max(sampled, self._sampled)
@@ -235,7 +240,7 @@ class ViewNode(PlainNode):
         before, self._learned = self._learned[-1], values
         if self.past and values[-1] != before and np.isfinite(before):
             text = 'excited window latched' if values[-1] else 'restarts: the arm has changed'
-            self.page.event(self.past[-1].time, 'learning', text)
+            self._events.append((self.past[-1].time, 'learning', text))
 
     def _keep(self, time: float) -> None:
         state, error, bound = self._decoders.values()
@@ -244,37 +249,81 @@ class ViewNode(PlainNode):
         q, xi1, k_c, tau, limit = (values.copy() for values in arrays)
         m = len(self._estimates)
         load, (lambda_min, _) = self._learned[m:-2], self._learned[-2:]
-        loaded = self._payload(time) > 0.0
+        loaded = bool((np.abs(self._truth - self._first_truth) > 0.0).any())
         learned = self._learned[:m], self._truth, float(lambda_min), load.tolist(), loaded
         self.past.append(Snapshot(time, q, xi1, k_c, tau, limit, *learned))
         while self.past[0].time < time - PAST - 1.0:
             self.past.popleft()
-
-    def _payload(self, time: float) -> float:
-        """Return the payload of the simulated arm [kg]; list events that have begun or ended."""
-        payload = float(self._plant.get('load.payload', 0.0))
-        for at, text, mass in plant_events(self._plant):
-            if self._noted < at <= time:
-                self.page.event(at, 'plant', text)
-            payload += mass if at <= time else 0.0
+        self._events += [e for e in plant_events(self._plant) if self._noted < e[0] <= time]
         self._noted = time
-        return payload
+        if time >= self._push_ends:
+            self._push_ends = inf
+            self._set('load.torque', self._load)
 
-    def _draw(self, clients: frozenset[int]) -> None:
-        self._pictures += 1
-        past = list(self.past)
-        if clients:
-            self.page.move(past)
-            if self._pictures % _PLOTTED == 0 or clients != self._clients_seen:
-                self.page.plot(past)
-        self._clients_seen = clients
+    # What the buttons ask for.
+
+    def _add_buttons(self, tabs: Any, joints: Sequence[str]) -> None:
+        gui, simulated = self.page.server.gui, bool(self._plant)
+
+        def button(label: str, hint: str, action: Callable[[], None]) -> None:
+            self.buttons[label] = gui.add_button(label, hint=hint)
+            self.buttons[label].on_click(lambda _: self._asked.put(action))
+
+        with tabs.add_tab('Try'):
+            button('Reset', 'return to the start, forget what was learned', self._reset)
+            if simulated:
+                joint = gui.add_dropdown('joint', tuple(joints), hint='joint to push')
+                push = gui.add_slider('push [N m]', -10.0, 10.0, 0.1, 2.0)
+                button(
+                    'Push',
+                    'push this joint with this torque for half a second',
+                    lambda: self._push([push.value * (name == joint.value) for name in joints]),
+                )
+                mass = gui.add_slider('payload [kg]', 0.0, 5.0, 0.05, 0.5)
+                button(
+                    'Pick up', 'attach this payload', lambda: self._set('load.payload', mass.value)
+                )
+                button('Put down', 'remove the payload', lambda: self._set('load.payload', 0.0))
+
+    def _reset(self) -> None:
+        """Reset the simulated plant, which resets the controller; without one, the controller."""
+        node = topics.PLANT if self._plant else topics.CONTROLLER
+        self._call(f'{node}/reset', Trigger.Request(), lambda it: '' if it.success else it.message)
+
+    def _push(self, torque: Sequence[float]) -> None:
+        """Push the joints by these torques [N m] for half a second of plant time."""
+        if self.past:
+            self._push_ends = self.past[-1].time + _PUSH
+            self._set('load.torque', torque)
+
+    def _set(self, name: str, value: Any) -> None:
+        """Set a parameter of the simulated arm."""
+        parameter = Parameter(name, value=value).to_parameter_msg()
+        request = SetParameters.Request(parameters=[parameter])
+        self._call(f'{topics.PLANT}/set_parameters', request, lambda it: it.results[0].reason)
+
+    def _call(self, service: str, request: Any, refusal: Callable[[Any], str]) -> None:
+        """Call a service; the page shows why it refuses."""
+
+        def done(future: Any) -> None:
+            reason = refusal(future.result())
+            if reason:
+                self.page.notify(service, reason)
+
+        client = self._requests[service]
+        if client.service_is_ready():
+            client.call_async(request).add_done_callback(done)
+        else:
+            self.page.notify(service, 'this service is not available: has the node exited?')
 
 
 def _named(raw: bytes, names: Sequence[str]) -> Floats:
     """Return the values (m,) of these names in a message, NaN where it lacks them."""
     decoder = JointStateDecoder(joint_state_layout(raw).names, ('position',))
     decoder.decode(raw)
-    found = dict(zip(joint_state_layout(raw).names, decoder.position, strict=True))
+    found: Mapping[str, float] = dict(
+        zip(joint_state_layout(raw).names, decoder.position, strict=True)
+    )
     return np.array([found.get(name, np.nan) for name in names])
 
 

@@ -7,11 +7,13 @@ viser serves the page with everything that the browser needs: nothing is loaded 
 from __future__ import annotations
 
 import contextlib
+import errno
+import importlib.util
 import io
 import os
 import re
+import socket
 import time
-from collections import deque
 from collections.abc import Iterable, Mapping, Sequence
 from html import escape
 from math import inf
@@ -22,17 +24,21 @@ import numpy as np
 from blf_dsc_controller.analysis.style import ALARM, COLOURS, GREEN, INK, MUTED, ORANGE
 from blf_dsc_controller.arms.geometry import frames, skeleton, tip_radius
 from blf_dsc_controller.configuration.controller import ControllerConfig
+from blf_dsc_controller.errors import BlfDscError, MissingExtraError
 from blf_dsc_controller.law.factory import column_names, model_of, prior_covariance
 from blf_dsc_controller.law.telemetry import load_text
 from blf_dsc_controller.run import Floats
-from blf_dsc_controller.view.address import free_port, require_viser, url_of
-from blf_dsc_controller.view.arm import ShownArm
+from blf_dsc_controller.view.arm import ShownArm, arm_of
+
+LOCAL = ('127.0.0.1', 'localhost', '::1')
+"""Hosts that can be reached from this computer only."""
 
 PAST = 20.0
 """Time span of the plots [s]."""
 
 _TRAIL = 4.0  # s of the tip's path
 _EVENTS = 12
+_PORTS = 100  # tried, from the requested one on
 _MESH = 5000  # faces of a shape from which on it is a mesh with colours of its own
 _SHOWN = 3.0  # s that an event is named beside the arm
 _PLAIN = (86, 110, 150)  # colour of an arm without any
@@ -54,6 +60,7 @@ _SHEET = (
     '{width:100%!important;max-height:50vh!important}}</style>'
 )
 _CELL = 'padding:1px 4px;text-align:right;white-space:nowrap;font-variant-numeric:tabular-nums'
+_TEXT = 'text-align:left;white-space:normal'
 _LEVELS = {'OK': GREEN, 'WARN': ORANGE, 'ERROR': ALARM, 'STALE': MUTED, 'BAG': MUTED}
 
 
@@ -80,13 +87,8 @@ def units_of(config: ControllerConfig) -> dict[str, str]:
     return dict(zip(model.parameter_names, model.parameter_units, strict=True)) | friction
 
 
-def prior_deviations(config: ControllerConfig) -> Floats:
-    """Return the standard deviations (m,) of a controller's estimates at first."""
-    return np.asarray(np.sqrt(np.diag(prior_covariance(config))))
-
-
-def plant_events(values: Mapping[str, Any]) -> list[tuple[float, str, float]]:
-    """Return time [s], text and change of payload [kg] of what a simulated arm undergoes."""
+def plant_events(values: Mapping[str, Any]) -> list[tuple[float, str, str]]:
+    """Return time [s], kind and text of what a simulated arm with these parameters undergoes."""
     begin = values.get('events.begin', ())
     nothing = (0.0,) * len(begin)
     duration, masses = (values.get(f'events.{k}') or nothing for k in ('duration', 'payload'))
@@ -94,9 +96,42 @@ def plant_events(values: Mapping[str, Any]) -> list[tuple[float, str, float]]:
     for k, (at, lasts, mass) in enumerate(zip(begin, duration, masses, strict=False), 1):
         texts = (f'{mass:g} kg picked up', f'{mass:g} kg put down')
         first, last = texts if mass else (f'event {k} begins', f'event {k} ends')
-        found.append((at, first, mass))
-        found += [(at + lasts, last, -mass)] if lasts else []
+        found.append((at, 'plant', first))
+        found += [(at + lasts, 'plant', last)] if lasts else []
     return sorted(found)
+
+
+def url_of(host: str, port: int) -> str:
+    """Return the address to open in a browser."""
+    return f'http://{"localhost" if host in LOCAL else host}:{port}'
+
+
+def open_to_others(host: str) -> str:
+    """Return the warning about a page that is not served to this computer only."""
+    return f'at {host} the page and its controls are open to other computers, without a password'
+
+
+def require_viser() -> None:
+    """Raise MissingExtraError unless viser and its URDF support are installed."""
+    for module in ('viser', 'yourdfpy'):
+        if importlib.util.find_spec(module) is None:
+            raise MissingExtraError(module, 'view', 'the page')
+
+
+def free_port(host: str, port: int) -> int:
+    """Return the first free port from `port` on; BlfDscError if the page cannot be served there."""
+    family = socket.AF_INET6 if ':' in host else socket.AF_INET
+    for candidate in range(port, min(port + _PORTS, 65536)):
+        try:
+            with socket.create_server((host, candidate), family=family):
+                return candidate
+        except OSError as error:
+            if error.errno != errno.EADDRINUSE:
+                raise BlfDscError(
+                    f'the page cannot be served at {host!r}, port {candidate}: {error.strerror}; '
+                    'give an address of this computer, and a port above 1023'
+                ) from error
+    raise BlfDscError(f'no free port from {port} to {port + _PORTS - 1}: choose another')
 
 
 class Page:
@@ -118,7 +153,7 @@ class Page:
         with contextlib.redirect_stdout(io.StringIO()):  # hides its banner
             self.server = viser.ViserServer(host, free, label='blf_dsc', verbose=False)
         self.url = url_of(host, self.server.get_port())
-        self._events: deque[tuple[float, str, str]] = deque(maxlen=_EVENTS)
+        self._events: list[tuple[float, str, str]] = []
         self._state = 'STALE', ''
         self._corners: Floats | None = None  # joints and tip when first drawn
         self.server.on_client_connect(self._welcome)
@@ -136,19 +171,17 @@ class Page:
         self._header = gui.add_html('')
         self.state(*self._state)
 
-    def draw_arm(self, arm: ShownArm, estimates: Mapping[str, str], prior: Floats) -> Any:
-        """Draw an arm; return the page's tabs.
-
-        Its estimates have these units by name, and these standard deviations (m,) at first.
-        """
+    def draw_arm(self, config: ControllerConfig, lengths: Sequence[float] = ()) -> Any:
+        """Draw the arm of a controller, planar links with these lengths [m]; return the tabs."""
         from viser.extras import ViserUrdf
 
+        arm, estimates = arm_of(config, lengths), units_of(config)
         self._arm = arm
         self._joints = [joint.name for joint in arm.chain.joints]
         prefix, names = _shortened(self._joints)
         self._units = {name.replace(f' {prefix}', ' '): unit for name, unit in estimates.items()}
         self._bodies = bodies_of(tuple(estimates))
-        self._prior = prior
+        self._prior = np.sqrt(np.diag(prior_covariance(config)))  # standard deviations (m,)
         server, gui, reach = self.server, self.server.gui, arm.reach
         model = arm.model()
         self._held = dict.fromkeys(model.actuated_joint_names, 0.0)
@@ -178,8 +211,7 @@ class Page:
         with tabs.add_tab('Estimates'):
             self._estimates = gui.add_html('')
         with tabs.add_tab('Events'):
-            self._list = gui.add_html('')
-        self.event(np.nan, '', '')
+            self._list = gui.add_html(event_table(self._events))
         return tabs
 
     def _plot(
@@ -219,19 +251,12 @@ class Page:
         for client in self.server.get_clients().values():
             client.add_notification(title, text, color='red', auto_close_seconds=15.0)
 
-    def event(self, at: float, kind: str, text: str) -> None:
-        """Add an event at `at` [s] to the list."""
-        if kind:
-            self._events.append((at, kind, text))
-        if self._list is not None:
-            self._list.content = event_table(reversed(self._events))
-
     def events(self, events: Sequence[tuple[float, str, str]]) -> None:
-        """Replace the list with the last of these events."""
-        if list(self._events) != list(events[-_EVENTS:]):
-            self._events.clear()
-            self._events.extend(events)
-            self.event(np.nan, '', '')
+        """List the last of these events: time [s], kind and text."""
+        if self._events != list(events[-_EVENTS:]):
+            self._events = list(events[-_EVENTS:])
+            if self._list is not None:
+                self._list.content = event_table(self._events)
 
     def move(self, past: Sequence[Snapshot]) -> None:
         """Move the arm to the last of these snapshots."""
@@ -388,32 +413,32 @@ def _hangs(arm: ShownArm) -> bool:
 
 def joint_table(joints: Sequence[str], now: Snapshot) -> str:
     """Return the table of error, bound, torque and limit by joint."""
-    head = _row('th', f't = {now.time:.2f} s', 'error [mrad]', 'bound', 'torque [N m]', 'limit')
+    head = (f't = {now.time:.2f} s', 'error [mrad]', 'bound', 'torque [N m]', 'limit')
     columns = 1e3 * now.error, 1e3 * now.bound, now.torque, now.torque_limit
     rows = zip(joints, *columns, strict=True)
-    table = _in_table([head, *(_row('td', escape(n), *map(_figure, row)) for n, *row in rows)])
+    table = _table(((escape(name), *map(_figure, row)) for name, *row in rows), head)
     known = np.isfinite(now.load[0])
     return table + (f'<div style="{_CELL}">held: {load_text(now.load)}</div>' if known else '')
 
 
 def estimate_table(units: Mapping[str, str], now: Snapshot) -> str:
     """Return the table of estimates; rejected ones are pale."""
-    rows = [_row('th', 'estimate', '', 'truth')]
-    for name, unit, value, truth in zip(
-        units, units.values(), now.estimate, now.truth, strict=True
-    ):
-        label = f'{escape(name)} <span style="opacity:0.6">{unit}</span>'
-        shown = f'{value:.3g}' if np.isfinite(value) else 'rejected'
-        true = f'{truth:.3g}' if np.isfinite(truth) else '-'
-        rows.append(_row('td', label, shown, true, pale=shown == 'rejected'))
-    return _in_table(rows)
+    rows = (
+        (
+            f'{escape(name)} <span style="opacity:0.6">{unit}</span>',
+            f'{value:.3g}' if np.isfinite(value) else '<span style="opacity:0.55">rejected</span>',
+            f'{truth:.3g}' if np.isfinite(truth) else '-',
+        )
+        for (name, unit), value, truth in zip(units.items(), now.estimate, now.truth, strict=True)
+    )
+    return _table(rows, ('estimate', '', 'truth'))
 
 
-def event_table(events: Iterable[tuple[float, str, str]]) -> str:
-    """Return the table of events: time [s], kind and text."""
-    return _in_table(
-        f'<tr><td style="{_CELL}">{t:.2f} s</td><td><b>{escape(k)}</b> {escape(e)}</td></tr>'
-        for t, k, e in events
+def event_table(events: Sequence[tuple[float, str, str]]) -> str:
+    """Return the table of events, the last one first."""
+    return _table(
+        (f'{t:.2f} s', f'<b>{escape(kind)}</b>', f'<div style="{_TEXT}">{escape(text)}</div>')
+        for t, kind, text in reversed(events)
     )
 
 
@@ -421,10 +446,8 @@ def _figure(value: float) -> str:
     return f'{value:.4g}' if np.isfinite(value) else '-'
 
 
-def _row(tag: str, *cells: str, pale: bool = False) -> str:
-    style = _CELL + (';opacity:0.55' if pale else '')
-    return '<tr>' + ''.join(f'<{tag} style="{style}">{cell}</{tag}>' for cell in cells) + '</tr>'
-
-
-def _in_table(rows: Iterable[str]) -> str:
-    return f'<table style="font-size:11px;margin:4px">{"".join(rows)}</table>'
+def _table(rows: Iterable[Sequence[str]], head: Sequence[str] = ()) -> str:
+    lines = [''.join(f'<th style="{_CELL}">{cell}</th>' for cell in head)]
+    lines += [''.join(f'<td style="{_CELL}">{cell}</td>' for cell in row) for row in rows]
+    body = ''.join(f'<tr>{line}</tr>' for line in lines)
+    return f'<table style="font-size:11px;margin:4px">{body}</table>'
