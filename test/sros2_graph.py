@@ -12,6 +12,7 @@ import xml.etree.ElementTree as ET
 from pathlib import Path
 
 from ros_rig import RosRig
+from trajectory_msgs.msg import JointTrajectory
 
 from blf_dsc_controller.nodes.controller_node import ControllerNode
 from blf_dsc_controller.nodes.plant_node import PlantNode
@@ -63,6 +64,8 @@ def live():
             ros.add(PlantNode, publish_clock=True, sample_time=0.02)
             ros.add(ControllerNode, sample_time=0.02)
             ros.add(ViewNode)
+            planner = '/blf_dsc_controller/joint_trajectory'  # of a user: it is recorded
+            ros.tester.create_publisher(JointTrajectory, planner, 1)
             watchdog = ros.add(WatchdogNode)
             recorder = ros.add(BagRecorderNode, output=bag)
             ros.until(lambda: is_recording_all(ros) and watchdog.line)

@@ -83,9 +83,9 @@ def test_figures_and_page_show_the_stop(tmp_path):
     assert amount(figure, ALARM) > 100
     assert amount(figure, lightened(ALARM, 0.1)) > 50_000  # shaded after the stop
     (bag,) = read_bags([path])
-    (event,) = (event for event in bag.events if event.kind == 'stop')
-    assert event.time == pytest.approx(STOP_S)
-    assert event.text.startswith("error past the bound: joint 'elbow'")
+    ((time, text),) = ((time, text) for time, kind, text in bag.events if kind == 'stop')
+    assert time == pytest.approx(STOP_S)
+    assert text.startswith("error past the bound: joint 'elbow'")
 
 
 def test_stop_is_shaded_until_the_controller_restarts(tmp_path):

@@ -55,27 +55,6 @@ def test_first_violation_is_the_earliest_of_all_joints(run):
     assert tracking['first_violation'] == {'time_s': pytest.approx(3.0), 'joint': 'elbow'}
 
 
-def test_commands_that_efforts_show_are_counted(run):
-    """Each second command is overwritten, the others take effect two samples after their state."""
-    torque = np.random.default_rng(0).normal(size=run.torque.shape)
-    effort = np.zeros_like(torque)
-    effort[2::2], effort[3::2] = torque[:-2:2], torque[:-3:2]
-    summary = summarize(dataclasses.replace(run, torque=torque, effort=effort))
-    assert summary['commands']['samples_late'] == {'p50': 2, 'max': 2}
-    assert summary['commands']['never_applied'] == pytest.approx(0.5, abs=1e-3)
-    assert 'commands    applied 2 samples later (median), at most 2; 50 %' in format_table(summary)
-    unlike = dataclasses.replace(run, torque=torque, effort=1.01 * effort)  # as with a lag
-    assert summarize(unlike)['commands'] is None
-
-
-def test_commands_applied_at_once_are_not_mentioned(run):
-    torque = np.random.default_rng(0).normal(size=run.torque.shape)
-    effort = np.vstack((torque[:1], torque[:-1]))
-    summary = summarize(dataclasses.replace(run, torque=torque, effort=effort))
-    assert summary['commands'] == {'never_applied': 0.0, 'samples_late': {'p50': 1, 'max': 1}}
-    assert 'commands' not in format_table(summary)
-
-
 def test_learning(run):
     learning = summarize(run)['learning']
     assert learning['latch_time_s'] == pytest.approx(LATCH_S)
@@ -89,14 +68,10 @@ def test_learning(run):
     assert learning['time_to_1_percent_s'] == pytest.approx(LATCH_S + np.log(50), abs=1e-3)
     assert learning['true'] == dict(zip(PARAMETERS, TRUE, strict=True))
     assert list(learning['final_estimate']) == list(PARAMETERS)
-
-
-def test_time_to_one_percent_requires_staying_below_it(run):
     values = run.learning.values.copy()
-    values[-1, 0] = 0.0
-    learning = dataclasses.replace(run.learning, values=values)
-    summary = summarize(dataclasses.replace(run, learning=learning))
-    assert summary['learning']['time_to_1_percent_s'] is None
+    values[-1, 0] = 0.0  # it has to stay below
+    left = dataclasses.replace(run, learning=dataclasses.replace(run.learning, values=values))
+    assert summarize(left)['learning']['time_to_1_percent_s'] is None
 
 
 def test_timing(run):
@@ -109,6 +84,10 @@ def test_timing(run):
     assert summarize(run)['compute_time_us']['p50'] == pytest.approx(4.9995)
     slow = dataclasses.replace(run, received=run.received * 2)  # the rate is by the wall clock
     assert summarize(slow)['timing']['rate_hz'] == pytest.approx(500.0)
+    values = run.learning.values.copy()
+    values[:, run.learning.names.index('compute_time')] = np.nan
+    unmeasured = dataclasses.replace(run.learning, values=values)
+    assert summarize(dataclasses.replace(run, learning=unmeasured))['compute_time_us'] is None
 
 
 def test_unknown_values_are_null_and_never_nan(run, tmp_path):
@@ -122,25 +101,17 @@ def test_unknown_values_are_null_and_never_nan(run, tmp_path):
     assert set(summary['tracking']['joints']['elbow'].values()) == {None}
 
 
-@pytest.mark.parametrize('topic', [TRUTH, LEARNING])
-def test_truth_and_learning_are_optional_in_a_bag(tmp_path, topic):
-    messages = [entry for entry in Synthetic(100).messages() if entry[0] is not topic]
-    summary = summarize(read_run(synthetic_bag.write(tmp_path / 'bag', messages)))
-    if topic is LEARNING:
-        assert (summary['learning'], summary['compute_time_us']) == (None, None)
-        return
-    learning = summary['learning']
+def test_truth_and_learning_are_optional_in_a_bag(tmp_path):
+    def without(topic):
+        messages = [entry for entry in Synthetic(100).messages() if entry[0] is not topic]
+        return summarize(read_run(synthetic_bag.write(tmp_path / topic.name[2:], messages)))
+
+    summary = without(LEARNING)
+    assert (summary['learning'], summary['compute_time_us']) == (None, None)
+    learning = without(TRUTH)['learning']
     assert (learning['final_relative_error'], learning['true']) == (None, None)
     assert list(learning['final_estimate']) == list(PARAMETERS)
     assert learning['latch_time_s'] is None  # the run is too short
-
-
-def test_unmeasured_compute_time_is_null(run):
-    learning = run.learning
-    values = learning.values.copy()
-    values[:, learning.names.index('compute_time')] = np.nan
-    unmeasured = dataclasses.replace(run, learning=dataclasses.replace(learning, values=values))
-    assert summarize(unmeasured)['compute_time_us'] is None
 
 
 def test_table_shows_what_is_unusual(run):

@@ -84,15 +84,12 @@ def test_regressor_is_evaluated_along_the_reference():
 
 
 def test_table_and_summary_name_the_torque_error():
-    summary = summarize(run_of(1.1 * P))
+    run = run_of(1.1 * P)
+    summary = summarize(run)
     assert summary['learning']['final_torque_error'] == pytest.approx(0.1)
     assert 'final_relative_error' not in summary['learning']
     line = 'torque error of the learned model 5 s 10 %, 10 s 10 %, end 10 %; not below 1 %'
     assert f'model       {line}' in format_table(summary).splitlines()
-
-
-def test_torque_error_is_unknown_without_a_reference():
-    run = run_of(P)
     still = replace(run, reference=np.full_like(run.reference, np.nan))
     assert np.isnan(measure(still).final_parameter_error)
     assert 'torque error' not in format_table(summarize(still))
@@ -154,5 +151,5 @@ def test_arm_of_a_bag_comes_from_its_recorded_configuration(tmp_path):
     assert run.arm is not None
     assert run.arm.deviations == learned_arm(config).deviations
     # It learned parameters with other names: their error is a norm.
-    assert estimates_of(run).torques is None
+    assert not estimates_of(run).of_torques
     assert read_run(tmp_path / 'two_links').arm is None

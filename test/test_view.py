@@ -28,7 +28,6 @@ from blf_dsc_controller.view.page import Page, bodies_of, free_port, plant_event
 HOST = '127.0.0.1'
 PORT = 18080
 
-
 CONNECTIONS = []
 sys.addaudithook(
     lambda event, args: CONNECTIONS.append(args[1]) if event == 'socket.connect' else None
@@ -114,12 +113,8 @@ def test_estimates_are_grouped_by_link_and_friction():
     names = (*(f'{kind}{link}' for link in (1, 2) for kind in ('m*cx', 'Izz', 'rotor')),)
     names += ('viscous joint1', 'viscous joint2', 'coulomb joint1', 'coulomb joint2')
     bodies = bodies_of(names)
-    assert {body: len(members) for body, members in bodies.items()} == {
-        '1': 3,
-        '2': 3,
-        'viscous': 2,
-        'coulomb': 2,
-    }
+    sizes = {'1': 3, '2': 3, 'viscous': 2, 'coulomb': 2}
+    assert {body: len(members) for body, members in bodies.items()} == sizes
     assert bodies_of(names[:3]) == {name: [k] for k, name in enumerate(names[:3])}
 
 
@@ -140,7 +135,6 @@ def test_meshes_of_an_installed_description_are_drawn_only_for_the_same_arm(tmp_
 
 
 def test_server_opens_no_external_connections(player):
-    player.slider.value = 1.0
     player.update(0.0)
     assert [peer for peer in CONNECTIONS if isinstance(peer, tuple) and peer[0] != HOST] == []
 
@@ -179,7 +173,9 @@ def test_cylinders_reach_from_joint_to_joint(seed):
         for visual in link.findall('visual'):
             cylinder = visual.find('geometry/cylinder')
             if cylinder is not None:
-                at, rpy = (np.array(visual.find('origin').get(k).split(), float) for k in _ORIGIN)
+                at, rpy = (
+                    np.array(visual.find('origin').get(k).split(), float) for k in ('xyz', 'rpy')
+                )
                 along = Rotation.from_euler('xyz', rpy).apply((0, 0, 1))
                 half = 0.5 * float(cylinder.get('length')) * along
                 assert at - half == pytest.approx(np.zeros(3), abs=1e-9)
@@ -187,9 +183,6 @@ def test_cylinders_reach_from_joint_to_joint(seed):
                 assert min(np.abs(at + half - end).max() for end in ends) < 1e-9
                 drawn += 1
     assert drawn > 8
-
-
-_ORIGIN = ('xyz', 'rpy')
 
 
 def test_planar_chain_of_any_length_is_drawn():

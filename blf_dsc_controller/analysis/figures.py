@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -13,7 +13,7 @@ from matplotlib.axes import Axes
 from matplotlib.ticker import FuncFormatter
 
 from blf_dsc_controller.analysis.metrics import change_times, measure, true_change_times
-from blf_dsc_controller.analysis.panels import Line, Mark, Panel, panels, thin
+from blf_dsc_controller.analysis.panels import GROUPS, Line, Mark, Panel, panels
 from blf_dsc_controller.analysis.style import (
     ALARM,
     BLUE,
@@ -25,7 +25,6 @@ from blf_dsc_controller.analysis.style import (
     Picture,
     formula,
     head,
-    head_of_column,
 )
 from blf_dsc_controller.messages.topics import DISTURBANCE
 from blf_dsc_controller.run import Run
@@ -43,6 +42,7 @@ _ALONE = {'Torque': ORANGE, 'Excitation': GREEN}  # colour of one line
 _WIDE = {'Motion': (3.2, 0.55), 'Estimates': (2.4, 0.75)}  # width and opacity
 _FLAT, _DECADE = 2.0, 10.0
 _SHADED = 0.1
+_ABOVE = 1.15  # of the height of a panel, where the legend of its column is
 _WIDTHS_UPON_EACH_OTHER = (5.0, 2.4)
 
 
@@ -53,49 +53,52 @@ def draw(run: Run, folder: Path) -> list[Path]:
     monitors.png if the monitor was recorded. The folder is created if necessary.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    found = panels([run])
-    metrics = measure(run)
-    n = len(run.joints)
-    motion = [panel for panel in found if panel.group in ('Motion', 'Tracking', 'Torque')]
-    motion = [panel for panel in motion if n <= _ABREAST or not panel.log]
-    excitation = [panel for panel in found if panel.group == 'Excitation']
-    parameters = [panel for panel in found if panel.group == 'Parameters']
-    disturbances = [panel for panel in found if panel.group == 'Disturbance']
-    monitors = [panel for panel in found if panel.group == 'Monitors']
+    metrics, n = measure(run), len(run.joints)
+    of: dict[str, list[Panel]] = {group: [] for group in GROUPS}
+    for panel in panels([run]):
+        of[panel.group].append(panel)
     title = f'Motion over {run.duration:.4g} s'
     if metrics.held is not None:
         kept = 'held' if metrics.held else 'VIOLATED'
         title = f'Tracking over {run.duration:.4g} s: bound {kept}'
     for time, stop in run.timed_stops[:1]:
         title += f', stopped at {time:.3f} s ({stop.reason})'
+    motion = [*of['Motion'], *of['Tracking'], *of['Torque']]
     paths = [folder / NAMES[0]]
     if n <= _ABREAST:
         draw_panels(paths[0], title, motion, n, _SIZE)
     else:
+        motion = [panel for panel in motion if not panel.log]
         rows = [panel for i in range(n) for panel in motion[i::n]]
         draw_panels(paths[0], title, rows, len(motion) // n, _LOW, legend_above=True)
     changes = true_change_times(run)
     if changes and run.column('error', 0) is not None:
         paths.append(folder / NAMES[1])
         title = f'The first change of the arm, from {changes[0] - _BEFORE:g} s on'
-        draw_panels(paths[-1], title, list(_close_up(run, found, changes[0])), 1, _CLOSE_UP)
-    if parameters:
+        draw_panels(paths[-1], title, list(_close_up(run, changes[0])), 1, _CLOSE_UP)
+    if of['Parameters']:
         title, error = 'Learning', metrics.final_parameter_error
         if not math.isnan(error):
             what = 'relative parameter error' if run.arm is None else 'torque error'
             title += f': {what} {100 * error:.2g} % at the end'
-        shown = parameters
-        if run.arm is None:
-            shown = [_overlaid('estimates', [panel for panel in parameters if not panel.log])]
-            shown += [panel for panel in parameters if panel.log]
-        shown += [_overlaid('disturbance estimates', disturbances)] if disturbances else []
         paths.append(folder / NAMES[2])
-        draw_panels(paths[-1], title, [*shown, *excitation], 2, _HIGH)
-    if monitors:
-        shown = monitors if parameters else [*monitors, *excitation]
+        draw_panels(paths[-1], title, [*_learned(run, of), *of['Excitation']], 2, _HIGH)
+    if of['Monitors']:
+        shown = [*of['Monitors'], *([] if of['Parameters'] else of['Excitation'])]
         paths.append(folder / NAMES[3])
         draw_panels(paths[-1], 'Monitors', shown, 2, _HIGH)
     return paths
+
+
+def _learned(run: Run, of: Mapping[str, list[Panel]]) -> Iterator[Panel]:
+    """Yield the panels of parameters and disturbances; few parameters are in one panel."""
+    if run.arm is None:
+        yield _overlaid('estimates', [panel for panel in of['Parameters'] if not panel.log])
+        yield from (panel for panel in of['Parameters'] if panel.log)
+    else:
+        yield from of['Parameters']
+    if of['Disturbance']:
+        yield _overlaid('disturbance estimates', of['Disturbance'])
 
 
 def _overlaid(title: str, shown: Sequence[Panel]) -> Panel:
@@ -105,35 +108,29 @@ def _overlaid(title: str, shown: Sequence[Panel]) -> Panel:
         name = panel.title.removeprefix(DISTURBANCE)
         name = formula(name) if panel.group == 'Parameters' else name
         lines += [line if line.colour else line._replace(name=name) for line in panel.lines]
-    return replace(shown[0], group='Estimates', title=title, lines=tuple(lines))
+    return replace(shown[0], group='Estimates', title=title, lines=lines)
 
 
-def _close_up(run: Run, found: Sequence[Panel], change: float) -> Iterator[Panel]:
+def _close_up(run: Run, change: float) -> Iterator[Panel]:
     """Yield the errors of all joints, their torques and the model's error around a change."""
     begin, end = change - _BEFORE, change + _AFTER
+    found = panels([run], begin, end)
     marks = [Mark(change, 'the arm changes', INK)]
     marks += [Mark(t, 'learning restarts', BLUE) for t in change_times(run) if begin < t < end]
     for group, kind in (('Tracking', 'error of '), ('Torque', 'torque of ')):
         of_joints = [panel for panel in found if panel.title.startswith(kind)]
-        lines = []
-        for panel, joint in zip(of_joints, run.joints, strict=False):
-            lines.append(panel.lines[0]._replace(name=joint))
-            lines += [line for line in panel.lines[1:] if line.shaded and len(lines) == 1]
+        lines = [
+            next(iter(panel.lines))._replace(name=joint)
+            for panel, joint in zip(of_joints, run.joints, strict=False)
+        ]
+        lines += [line for panel in of_joints[:1] for line in panel.lines if line.shaded]
         if lines:
-            title, unit = f'{kind}each joint', of_joints[0].unit
-            yield _cut(Panel(group, title, unit, tuple(lines), marks=tuple(marks)), begin, end)
+            unit = of_joints[0].unit
+            yield Panel(group, f'{kind}each joint', unit, lines, marks=tuple(marks))
             marks = [mark._replace(text='') for mark in marks]  # named once
     for panel in found:
         if panel.group == 'Parameters' and panel.log:
-            yield _cut(replace(panel, marks=tuple(marks), note=''), begin, end)
-
-
-def _cut(panel: Panel, begin: float, end: float) -> Panel:
-    lines = []
-    for line in panel.lines:
-        shown = (line.time >= begin) & (line.time <= end)
-        lines.append(line._replace(time=line.time[shown], values=line.values[shown]))
-    return replace(panel, lines=tuple(lines))
+            yield replace(panel, marks=tuple(marks), note='')
 
 
 def draw_panels(
@@ -143,11 +140,10 @@ def draw_panels(
     columns: int,
     size: tuple[float, float],
     runs: Sequence[str] = (),
-    until: float = math.inf,
     *,
     legend_above: bool = False,
 ) -> None:
-    """Draw panels of this size [inches] row by row, up to the time `until` [s].
+    """Draw panels of this size [inches] row by row.
 
     `runs` are the names of several runs, to be shown in the legends. With `legend_above`, each
     column has a single legend above its first row.
@@ -155,19 +151,16 @@ def draw_panels(
     columns = min(columns, len(shown))
     picture = Picture(-(-len(shown) // columns), columns, title, size)
     for k, (axes, panel) in enumerate(zip(picture.axes.flat, shown, strict=False)):
-        _draw_panel(axes, panel, runs, until)
+        _draw_panel(axes, panel, runs)
         title = formula(panel.title) if panel.group == 'Parameters' else panel.title
         title += panel.note and f': {panel.note}'
-        if legend_above:
-            head_of_column(axes, title, first=k < columns)
-        else:
-            head(axes, title)
+        head(axes, title, legend_at=_ABOVE * (k < columns) if legend_above else None)
     for axes in picture.axes.flat[len(shown) :]:
         axes.set_visible(False)
     picture.save(path)
 
 
-def _draw_panel(axes: Axes, panel: Panel, runs: Sequence[str], until: float) -> None:
+def _draw_panel(axes: Axes, panel: Panel, runs: Sequence[str]) -> None:
     plain = [line for line in panel.lines if not line.colour]
     for k, line in enumerate(plain):
         width, alpha = _WIDE.get(panel.group, (1.3, 1.0))
@@ -177,13 +170,12 @@ def _draw_panel(axes: Axes, panel: Panel, runs: Sequence[str], until: float) -> 
         if len(plain) == 1:
             colour = _ALONE.get(panel.group, colour)
         label = runs[line.run] if runs else line.name
-        _draw_line(axes, line, until, label=label, color=colour, lw=width, alpha=alpha)
+        _draw_line(axes, line, label=label, color=colour, lw=width, alpha=alpha)
     for line in panel.lines:
         if line.colour:
-            _draw_line(axes, line, until, label=line.name, color=line.colour, lw=1.2)
+            _draw_line(axes, line, label=line.name, color=line.colour, lw=1.2)
     for row, mark in enumerate(panel.marks):
-        if mark.time <= until:
-            _draw_mark(axes, mark, row)
+        _draw_mark(axes, mark, row)
     _set_scale(axes, panel)
 
 
@@ -201,9 +193,8 @@ def _set_scale(axes: Axes, panel: Panel) -> None:
     axes.set_ylabel(panel.symbol or f'[{panel.unit}]')
 
 
-def _draw_line(axes: Axes, line: Line, until: float, *, label: str, **style: Any) -> None:
-    shown = line.time <= until
-    time, values = thin(line.time[shown], line.values[shown])
+def _draw_line(axes: Axes, line: Line, *, label: str, **style: Any) -> None:
+    time, values = line.time, line.values
     style['ls'] = '--' if line.dashed else '-'
     if line.shaded:
         axes.fill_between(time, -values, values, color=SHADE, lw=0)

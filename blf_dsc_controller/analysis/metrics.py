@@ -7,7 +7,6 @@ import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from operator import itemgetter
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -45,38 +44,9 @@ class Estimates:
     time: Floats  # (m,) s since the first sample of the run
     estimate: Floats  # (m, p)
     true: Floats | None  # (m, p); None if unknown, or if the plant's parameters have other names
-    unlike: tuple[str, ...] = ()  # the plant's names, if they differ
-    torques: Floats | None = None  # (k, p) rows of H along the reference, for an arm of a URDF
-    base: tuple[Floats, Floats] | None = None  # true P (m, q) and its rows (k, q) of H
-
-    @property
-    def relative_error(self) -> Floats | None:
-        """|P^ - P| / |P|, (m,); of the torques H P^ and H P if P has mixed units."""
-        R: Any = None
-        if self.base is not None and self.torques is not None:
-            true, rows = self.base
-            R = np.linalg.qr(np.hstack((self.torques, rows)), 'r')
-        elif self.true is not None:
-            true = self.true
-        else:
-            return None
-        found = np.empty(self.time.size)
-        for begin in range(0, self.time.size, _BLOCK):
-            some = slice(begin, begin + _BLOCK)
-            off, size = self.estimate[some], true[some]
-            if R is None:
-                off = off - size
-            else:
-                off = np.hstack((off, -size)) @ R.T
-                size = size @ R[:, len(self.names) :].T
-            with np.errstate(invalid='ignore'):  # no motion, no torques: unknown
-                found[some] = np.linalg.norm(off, axis=1) / np.linalg.norm(size, axis=1)
-        return found
-
-    @property
-    def is_known(self) -> bool:
-        """Whether the true parameters are known."""
-        return self.true is not None or self.base is not None
+    relative_error: Floats | None  # (m,) |P^ - P| / |P|, or of torques; None if P is unknown
+    of_torques: bool  # of H P^ and H P along the reference, as the P of a URDF has mixed units
+    unlike: tuple[str, ...]  # the plant's names, if they differ
 
 
 def estimates_of(run: Run) -> Estimates | None:
@@ -92,8 +62,6 @@ def estimates_of(run: Run) -> Estimates | None:
     rows = slice((run.learning.stamp.size - 1) % step, None, step)
     stamp = run.learning.stamp[rows]
     estimate = run.learning.at(rows, _columns(run.learning, names))
-    is_known = arm is not None and _parameters(arm.units) == names
-    torques = _torques(run, arm.regressor) if arm and is_known else None
     theirs = () if truth is None else _parameters(truth.names)
 
     def true_of(names: Sequence[str]) -> Floats | None:
@@ -101,14 +69,33 @@ def estimates_of(run: Run) -> Estimates | None:
             return None
         return truth.held(stamp, _columns(truth, names))
 
-    true, base = true_of(names), None
-    if true is not None and torques is not None:
-        base = true, torques
-    elif arm and arm.base and torques is not None:
-        P = true_of(arm.base[0])
-        base = None if P is None else (P, _torques(run, arm.base[1]))
-    unlike = theirs if true is None and base is None else ()
-    return Estimates(names, run.time_of(stamp), estimate, true, unlike, torques, base)
+    true = P = true_of(names)
+    of_torques = arm is not None and _parameters(arm.units) == names
+    base = arm.base if arm and of_torques and true is None else None
+    if base:
+        P = true_of(base[0])
+    R = None  # |R [P^; -P]| is the norm of the torques H P^ - H P
+    if arm and of_torques and P is not None:
+        H = _torques(run, arm.regressor)
+        R = np.asarray(np.linalg.qr(np.hstack((H, _torques(run, base[1]) if base else H)), 'r'))
+    error = None if P is None else _relative_error(estimate, P, R)
+    unlike = theirs if P is None else ()
+    return Estimates(names, run.time_of(stamp), estimate, true, error, of_torques, unlike)
+
+
+def _relative_error(estimate: Floats, P: Floats, R: Floats | None) -> Floats:
+    """Return |P^ - P| / |P| (m,), or |R [P^; -P]| / |R [0; P]|."""
+    found = np.empty(len(P))
+    for begin in range(0, len(P), _BLOCK):
+        some = slice(begin, begin + _BLOCK)
+        if R is None:
+            off, size = estimate[some] - P[some], P[some]
+        else:
+            off = np.hstack((estimate[some], -P[some])) @ R.T
+            size = P[some] @ R[:, estimate.shape[1] :].T
+        with np.errstate(over='ignore', invalid='ignore'):  # no motion, no torques: unknown
+            found[some] = np.linalg.norm(off, axis=1) / np.linalg.norm(size, axis=1)
+    return found
 
 
 def _columns(series: Series, names: Sequence[str]) -> NDArray[np.intp]:

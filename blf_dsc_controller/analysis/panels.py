@@ -1,15 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
 """The panels of runs, plotted by matplotlib in `figures` and by plotly in `report`.
 
-Long series are thinned for plotting, without losing a peak.
+Long series are thinned, without losing a peak.
 """
 
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import chain
+from math import inf
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -51,11 +52,10 @@ _LEAST = 1e-12  # J, the smallest value on a logarithmic axis
 _ROOM = 1.2  # limit of an axis as a multiple of the largest value
 _LEAST_ERROR = 1e-5  # %
 _PIECES = 300  # of a run, each with its largest error
-_LONG = 80_000  # samples
-
+_LARGEST = 1e100
 
 PIECES = 1500
-_LARGEST = 1e100
+"""Parts of a series of which the lowest and the highest sample are drawn."""
 
 
 class Line(NamedTuple):
@@ -83,23 +83,22 @@ class Mark(NamedTuple):
 
 @dataclass(frozen=True)
 class Panel:
-    """Lines over time, or the histograms of their values."""
+    """Lines over time."""
 
     group: str
     title: str
     unit: str
-    lines: tuple[Line, ...]
+    lines: Iterable[Line]
     note: str = ''  # only if a single run is shown
     symbol: str = ''  # label of the axis in mathematical type, instead of the unit
     log: bool = False
-    histogram: bool = False
     marks: tuple[Mark, ...] = ()
     span: float = 0.0  # limit of the axis in pictures, in both directions; 0: everything
 
 
 @np.errstate(over='ignore', invalid='ignore')  # a bag may hold any number
-def panels(runs: Sequence[Run]) -> list[Panel]:
-    """Return every panel that any of the runs has data for, with several runs overlaid."""
+def panels(runs: Sequence[Run], begin: float = -inf, end: float = inf) -> list[Panel]:
+    """Return every panel that a run has data for from `begin` to `end` [s]; runs are overlaid."""
     found: dict[tuple[str, str], Panel] = {}
     for k, run in enumerate(runs):
         latched = latch_time(run)
@@ -107,35 +106,55 @@ def panels(runs: Sequence[Run]) -> list[Panel]:
         changes = true_change_times(run)
         changed = dict.fromkeys(_CHANGED, 'the arm changes')
         stops = list(_stops(run))
-        for panel in map(_kept, chain(_motion(run), _learning(run), _monitors(run), _timing(run))):
-            before = found.get((panel.group, panel.title), replace(panel, lines=(), marks=()))
+        for panel in chain(_motion(run), _learning(run), _monitors(run), _timing(run)):
             marks = latch if panel.group in _LEARNING else panel.marks
             marks = (*marks, *(stops if panel.group in _STOPPED else ()))
             if panel.group in _CHANGED:
                 texts = (changed.pop(panel.group, ''), *[''] * len(changes))  # once
                 marks = (*marks, *(Mark(*each, INK) for each in zip(changes, texts, strict=False)))
+            marks = tuple(mark._replace(run=k) for mark in marks if begin <= mark.time <= end)
+            lines = tuple(_drawn(line, begin, end)._replace(run=k) for line in panel.lines)
+            before = found.get((panel.group, panel.title))
             found[panel.group, panel.title] = replace(
-                before,
-                lines=(*before.lines, *(line._replace(run=k) for line in panel.lines)),
-                marks=(*before.marks, *(mark._replace(run=k) for mark in marks)),
+                panel,
+                lines=(*(before.lines if before else ()), *lines),
+                marks=(*(before.marks if before else ()), *marks),
                 note=panel.note if len(runs) == 1 else '',
                 span=panel.span if len(runs) == 1 else 0.0,
             )
-    drawn = [panel for panel in found.values() if panel.lines]
-    return sorted(drawn, key=lambda panel: GROUPS.index(panel.group))
+    shown = [panel for panel in found.values() if panel.lines]
+    return sorted(shown, key=lambda panel: GROUPS.index(panel.group))
 
 
-def _kept(panel: Panel) -> Panel:
-    """Return a panel whose lines do not hold the memory of a long run."""
-    return panel if panel.histogram else replace(panel, lines=tuple(map(_thinned, panel.lines)))
-
-
-def _thinned(line: Line) -> Line:
-    """Return a line that is not too long, with its peaks."""
-    if line.values.size <= _LONG:
-        return line
-    time, values = envelope(line.time, drawable(line.values), _LONG // 10)
+def _drawn(line: Line, begin: float, end: float) -> Line:
+    """Return what is drawn of a line: between two times, finite, thinned without losing a peak."""
+    shown = slice(np.searchsorted(line.time, begin), np.searchsorted(line.time, end, side='right'))
+    time, values = line.time[shown], line.values[shown]
+    values = np.where(np.abs(values) < _LARGEST, values, np.nan)
+    changes = np.flatnonzero(np.diff(values) != 0.0)
+    if changes.size < values.size // 100:  # mostly constant: its corners
+        kept = np.unique(np.concatenate([[0], changes, changes + 1, [values.size - 1]]))
+        return line._replace(time=time[kept], values=values[kept])
+    time, values = envelope(time, values)
     return line._replace(time=time, values=values)
+
+
+def envelope(time: Floats, values: Floats, pieces: int = PIECES) -> tuple[Floats, Floats]:
+    """Return the lowest and highest sample of each piece of a series (N,), in order of time.
+
+    NaN is unknown; a piece without known values stays a gap. A series of at most two samples per
+    piece is returned unchanged.
+    """
+    if values.size <= 2 * pieces:
+        return time, values
+    length = -(-values.size // pieces)
+    begins = np.arange(0, values.size, length)
+    padded = np.append(values, np.full(begins.size * length - values.size, np.nan))
+    rows = padded.reshape(-1, length)
+    low = begins + np.where(np.isnan(rows), inf, rows).argmin(axis=1)
+    high = begins + np.where(np.isnan(rows), -inf, rows).argmax(axis=1)
+    kept = np.sort(np.stack([low, high]), axis=0).T.ravel()
+    return time[kept], values[kept]
 
 
 def _stops(run: Run) -> Iterator[Mark]:
@@ -155,7 +174,7 @@ def _motion(run: Run) -> Iterator[Panel]:
         lines = [Line('measured', t, np.asarray(position))]
         if reference is not None:
             lines.append(Line('reference', t, reference, INK, dashed=True))
-        yield Panel('Motion', f'position of {joint}', 'rad', tuple(lines))
+        yield Panel('Motion', f'position of {joint}', 'rad', lines)
         error = run.column('error', i)
         if error is not None:
             yield _error(run, t, i, 1e3 * error)
@@ -168,7 +187,7 @@ def _motion(run: Run) -> Iterator[Panel]:
         if limit is not None and not np.isnan(limit).all():
             lines.append(Line('limit', t, limit, MUTED, dashed=True, mirrored=True))
         note = f'peak {np.nanmax(np.abs(torque)):.3g}'
-        yield Panel('Torque', f'torque of {joint}', 'N m', tuple(lines), note)
+        yield Panel('Torque', f'torque of {joint}', 'N m', lines, note)
     yield from errors
 
 
@@ -182,14 +201,15 @@ def _error(run: Run, t: Floats, i: int, error: Floats) -> Panel:
     if not np.isnan(error).all():
         note = f'max {np.nanmax(np.abs(error)):.3g}, rms {rms(error):.3g}'
     title, span = f'error of {run.joints[i]}', _span(bound, error)
-    return Panel('Tracking', title, 'mrad', tuple(lines), note, marks=tuple(marks), span=span)
+    return Panel('Tracking', title, 'mrad', lines, note, marks=tuple(marks), span=span)
 
 
 def _span(bound: Floats | None, error: Floats) -> float:
     """Return the axis limit for a funnel, whose wide start would hide the error; 0 otherwise."""
     if bound is None or bound[0] <= bound[-1]:
         return 0.0
-    return float(_ROOM * np.nanmax(np.abs(drawable(error)), initial=1e3 * bound[-1]))
+    known = np.abs(error[np.abs(error) < _LARGEST])
+    return float(_ROOM * known.max(initial=1e3 * bound[-1]))
 
 
 def _error_size(run: Run, t: Floats, i: int, error: Floats) -> Panel:
@@ -205,7 +225,7 @@ def _error_size(run: Run, t: Floats, i: int, error: Floats) -> Panel:
     note = f'end {known[-1]:.2g}' if known.size else ''
     title = f'|error| of {run.joints[i]}'
     span = _span(bound, error)
-    return Panel('Tracking', title, 'mrad', tuple(lines), note, log=True, span=span)
+    return Panel('Tracking', title, 'mrad', lines, note, log=True, span=span)
 
 
 def _learning(run: Run) -> Iterator[Panel]:
@@ -223,7 +243,7 @@ def _learning(run: Run) -> Iterator[Panel]:
             lines = [Line('estimate', estimates.time, estimates.estimate[:, j])]
             if estimates.true is not None:
                 lines.append(Line('true', estimates.time, estimates.true[:, j], INK, dashed=True))
-            yield Panel('Parameters', name, 'kg m²', tuple(lines))
+            yield Panel('Parameters', name, 'kg m²', lines)
         yield from error
     for name in run.learning.names:
         if name.startswith(DISTURBANCE):
@@ -240,7 +260,7 @@ def _relative_error(estimates: Estimates) -> Iterator[Panel]:
     limit = Line('1 %', estimates.time, np.ones_like(error), MUTED, dashed=True)
     lines = (Line('relative error', estimates.time, error), limit)
     symbol, title = r'$\|\hat P - P\| \;/\; \|P\|$', 'relative parameter error'
-    if estimates.torques is not None:
+    if estimates.of_torques:
         symbol, title = r'$\|H\hat P - HP\| \;/\; \|HP\|$', 'torque error'
     yield Panel('Parameters', title, '%', lines, symbol=symbol, log=True)
 
@@ -252,11 +272,11 @@ def _of_links(run: Run, arm: LearnedArm, estimates: Estimates) -> Iterator[Panel
         origin, what = estimates.estimate[:1], 'changes'
     off = estimates.estimate - origin
     for i, joint in enumerate(run.joints, 1):
-        lines = tuple(
+        lines = [
             Line(name, estimates.time, off[:, j] / arm.deviations[name])
             for j, name in enumerate(estimates.names)
             if re.fullmatch(rf'.*\D{i}', name)
-        )
+        ]
         yield Panel('Parameters', f'{what} of link {i}, {joint}', 'prior deviations', lines)
 
 
@@ -272,16 +292,16 @@ def _by_kind(_run: Run, arm: LearnedArm, estimates: Estimates) -> Iterator[Panel
             for j in members
         )
         unit = arm.units[estimates.names[members[0]]]
-        yield Panel('Parameters', title, unit or '1', tuple(lines))
+        yield Panel('Parameters', title, unit or '1', lines)
 
 
 def _frictions(run: Run, arm: LearnedArm) -> Iterator[Panel]:
     for kind in ('viscous', 'coulomb'):
         names = [name for name in arm.units if name.startswith(f'{kind} ')]
-        lines = tuple(
+        lines = (
             line for name in names for line in _column(run, run.learning, name, name.split(' ')[1])
         )
-        if lines:
+        if names:
             yield Panel('Parameters', f'{kind} friction', arm.units[names[0]], lines)
 
 
@@ -295,46 +315,31 @@ def _monitors(run: Run) -> Iterator[Panel]:
         for line in _column(run, series, LAMBDA_MIN, 'minimum eigenvalue')
     ]
     symbol = r'$\lambda_{\min}(\Phi)$'
-    lines = excitation[:1]
-    yield Panel('Excitation', 'minimum eigenvalue', '', tuple(lines), note, symbol, log=True)
-    if run.monitor is None:
-        return
-    lines, t, smallest = [], run.time, []
-    for i, joint in enumerate(run.joints):
-        error, bound = run.column('error', i), run.column('bound', i)
-        if error is not None and bound is not None:
-            distance = 1e3 * (bound - np.abs(error))
-            smallest.append(np.fmin.reduce(distance))
-            lines.append(_thinned(Line(joint, t, distance)))
-    if lines:
-        lines.append(Line('bound', t, np.zeros_like(t), ALARM))
-        note, symbol = f'minimum {np.fmin.reduce(smallest):.3g}', r'$k_c - |\xi_1|$ [mrad]'
-        yield Panel('Monitors', 'distance to bound', 'mrad', tuple(lines), note, symbol)
-    if LYAPUNOV_TERMS[0] in run.monitor.names:
-        yield from _lyapunov(run, run.monitor)
+    yield Panel('Excitation', 'minimum eigenvalue', '', excitation[:1], note, symbol, log=True)
+    if run.monitor is not None and LYAPUNOV_TERMS[0] in run.monitor.names:
+        yield _lyapunov(run, run.monitor)
 
 
-def _lyapunov(run: Run, monitor: Series) -> Iterator[Panel]:
+def _lyapunov(run: Run, monitor: Series) -> Panel:
+    """Return the panel of V (29), its terms and its bound (32)."""
+    V = Line('V', run.time_of(monitor.stamp), monitor.select(LYAPUNOV_TERMS).sum(axis=1), INK)
     terms = [
-        line._replace(values=np.maximum(line.values, _LEAST))
+        line
         for term in LYAPUNOV_TERMS
         for line in _column(run, monitor, term, term.removeprefix(LYAPUNOV))
         if np.any(line.values > 0.0)
     ]
-    symbol = 'terms of $V$ [J]'
-    yield Panel('Monitors', 'terms of V (29)', 'J', tuple(terms), symbol=symbol, log=True)
-    V = monitor.select(LYAPUNOV_TERMS).sum(axis=1)
-    lines = [Line('V', run.time_of(monitor.stamp), np.maximum(V, _LEAST), INK)]
     note = ''
-    style: Any = {'colour': MUTED, 'dashed': True, 'whole': True}
-    for line in _column(run, monitor, LYAPUNOV_BOUND, 'bound (32)', **style):
-        known = np.isfinite(line.values)
+    style: Any = {'colour': MUTED, 'dashed': True}
+    for bound in _column(run, monitor, LYAPUNOV_BOUND, 'bound (32)', **style):
+        known = np.isfinite(bound.values)
         note = r'no bound, as $\kappa_e = 0$'
         if known.any():
-            lines.append(line)
-            met = float(np.mean(V[known] <= line.values[known]))
-            note = f'met {100 * met:.3g} % of the time'
-    yield Panel('Monitors', 'V and its bound (32)', 'J', tuple(lines), note, log=True)
+            terms.append(bound)
+            met = float(np.mean(V.values[known] <= bound.values[known]))
+            note = f'below its bound {100 * met:.3g} % of the time'
+    lines = (line._replace(values=np.maximum(line.values, _LEAST)) for line in (*terms, V))
+    return Panel('Monitors', 'V (29) and its terms', 'J', lines, note, log=True)
 
 
 def _timing(run: Run) -> Iterator[Panel]:
@@ -344,56 +349,16 @@ def _timing(run: Run) -> Iterator[Panel]:
         ('state to torque', run.timing, LATENCY),
         ('computing time of the law', run.learning, COMPUTE_TIME),
     ):
-        times = [
+        times = (
             line._replace(values=1e6 * line.values)
-            for line in _column(run, series, name, 'samples', whole=True)
+            for line in _column(run, series, name, '')
             if np.isfinite(line.values).any()
-        ]
-        yield Panel('Timing', title, 'µs', tuple(times), log=True, histogram=True)
+        )
+        yield Panel('Timing', title, 'µs', times, log=True)
 
 
-def _column(
-    run: Run, series: Series | None, column: str, name: str, *, whole: bool = False, **style: Any
-) -> list[Line]:
-    """Return a column as one line, if there is one; `whole`, or not too long."""
+def _column(run: Run, series: Series | None, column: str, name: str, **style: Any) -> list[Line]:
+    """Return a column as one line, if there is one."""
     if series is None or column not in series.names:
         return []
-    line = Line(name, run.time_of(series.stamp), series.column(column), **style)
-    return [line if whole else _thinned(line)]
-
-
-def drawable(values: Floats) -> Floats:
-    """Return the values, with NaN for those that no axis can show, such as infinity."""
-    return np.where(np.abs(values) < _LARGEST, values, np.nan)
-
-
-def thin(time: Floats, values: Floats, pieces: int = PIECES) -> tuple[Floats, Floats]:
-    """Thin a series without losing a peak; a mostly constant one is reduced to its corners."""
-    values = drawable(values)
-    changes = np.flatnonzero(np.diff(values) != 0.0)
-    if changes.size < values.size // 100:
-        kept = np.unique(np.concatenate([[0], changes, changes + 1, [values.size - 1]]))
-        return time[kept], values[kept]
-    return envelope(time, values, pieces)
-
-
-def envelope(time: Floats, values: Floats, pieces: int = PIECES) -> tuple[Floats, Floats]:
-    """Return the lowest and highest sample of each piece of a series (N,), in order of time.
-
-    NaN is unknown; a piece without known values stays a gap. A series of at most two samples per
-    piece is returned unchanged.
-    """
-    if values.size <= 2 * pieces:
-        return time, values
-    edges = np.linspace(0, values.size, pieces + 1).astype(np.intp)[:-1]
-    low = _extreme(np.where(np.isnan(values), np.inf, values), edges, np.minimum)
-    high = _extreme(np.where(np.isnan(values), -np.inf, values), edges, np.maximum)
-    kept = np.sort(np.stack([low, high]), axis=0).T.ravel()
-    return time[kept], values[kept]
-
-
-def _extreme(values: Floats, edges: np.ndarray, reduction: np.ufunc) -> np.ndarray:
-    """Return the index of the first extreme sample of each piece."""
-    extremes = np.repeat(reduction.reduceat(values, edges), np.diff([*edges, values.size]))
-    found = np.where(values == extremes, np.arange(values.size), values.size)
-    return np.asarray(np.minimum.reduceat(found, edges))
+    return [Line(name, run.time_of(series.stamp), series.column(column), **style)]

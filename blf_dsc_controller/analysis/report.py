@@ -6,15 +6,15 @@ from __future__ import annotations
 import zlib
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from operator import itemgetter
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
 from blf_dsc_controller.analysis.metrics import change_times, latch_time, outside
-from blf_dsc_controller.analysis.page import Cell, write_page
-from blf_dsc_controller.analysis.panels import PIECES, Panel, panels, thin
-from blf_dsc_controller.analysis.style import COLOURS, INK
+from blf_dsc_controller.analysis.panels import PIECES, Panel, panels
+from blf_dsc_controller.analysis.style import COLOURS, INK, Cell, write_page
 from blf_dsc_controller.analysis.summary import format_table, summarize
 from blf_dsc_controller.bags.content import NO_NAMES, Content, NameMap, read_content
 from blf_dsc_controller.bags.reader import recorded_run
@@ -23,8 +23,6 @@ from blf_dsc_controller.messages.codecs import typestore
 from blf_dsc_controller.messages.topics import DIAGNOSTICS
 from blf_dsc_controller.run import Floats, Run
 
-_BINS = 200
-_TAIL = 99.9  # percentile up to which a histogram is drawn
 _DIGITS = 7
 _ALARMING = ('violation', 'stop', 'ERROR', 'lost')
 _LEVELS = ('OK', 'WARN', 'ERROR', 'STALE')
@@ -33,12 +31,8 @@ _LONGEST = 1000  # characters of a parameter that is shown in full
 _AT_LIMIT = 1.0 - 1e-9
 
 
-class ReportedEvent(NamedTuple):
-    """An event of a run."""
-
-    time: float  # s since the first sample
-    kind: str
-    text: str
+Happened = tuple[float, str, str]
+"""An event: s since the first sample, kind, text."""
 
 
 @dataclass(frozen=True)
@@ -49,13 +43,13 @@ class ReportedBag:
     run: Run
     content: Content
     parameters: dict[str, str]  # `node name: parameter` to its value as text
-    events: list[ReportedEvent]  # by time
+    events: list[Happened]  # by time
 
 
 def read_bags(
     paths: Sequence[Path], namespace: str = '', names: NameMap = NO_NAMES
 ) -> list[ReportedBag]:
-    """Read bags; each is named by its folder, with parent folders if that is ambiguous.
+    """Read bags; each is named by its folder, and by its number if that is ambiguous.
 
     Raises:
         BlfDscError: one of them cannot be read.
@@ -66,10 +60,7 @@ def read_bags(
 
 def _names(paths: Sequence[Path]) -> list[str]:
     parts = [path.resolve().parts[1:] for path in paths]
-    depth = 1 + all(part[-1] == 'bag' for part in parts)
-    while len({part[-depth:] for part in parts}) < len({*parts}):
-        depth += 1
-    names = ['/'.join(part[-depth:]) for part in parts]
+    names = ['/'.join(part[-2:] if part[-1] == 'bag' else part[-1:]) for part in parts]
     return [
         f'{name} ({names[: k + 1].count(name)})' if names.count(name) > 1 else name
         for k, name in enumerate(names)
@@ -80,10 +71,8 @@ def _read(path: Path, name: str, namespace: str, names: NameMap) -> ReportedBag:
     content = read_content(path, namespace, names)
     run = recorded_run(content, names, namespace)
     configured = content.configurations
-    lost = (
-        ReportedEvent(0.0, 'lost', f'{topic}: {text}') for topic, text in content.losses.items()
-    )
-    left_out = (ReportedEvent(0.0, 'left out', note) for note in run.notes)
+    lost = ((0.0, 'lost', f'{topic}: {text}') for topic, text in content.losses.items())
+    left_out = ((0.0, 'left out', note) for note in run.notes)
     events = (
         *left_out, *_events(run), *_diagnosed(content, run), *_changed(content, run), *lost
     )  # fmt: skip
@@ -96,21 +85,21 @@ def _read(path: Path, name: str, namespace: str, names: NameMap) -> ReportedBag:
             for node in sorted(configured)
             for parameter, value in sorted(configured[node].items())
         },
-        events=sorted(events, key=lambda event: event.time),
+        events=sorted(events, key=itemgetter(0)),
     )
 
 
-def _events(run: Run) -> Iterator[ReportedEvent]:
+def _events(run: Run) -> Iterator[Happened]:
     latched = latch_time(run)
     if latched is not None:
-        yield ReportedEvent(latched, 'learning', 'first excited window: learning began')
+        yield (latched, 'learning', 'first excited window: learning began')
     for t in change_times(run):
-        yield ReportedEvent(t, 'learning', 'the arm has changed: learning restarted')
+        yield (t, 'learning', 'the arm has changed: learning restarted')
     for column, reason in run.rejected.items():
         text = reason or f'{column} is not estimated: its column was rejected'
-        yield ReportedEvent(run.duration, 'learning', text)
+        yield (run.duration, 'learning', text)
     for t, stop in run.timed_stops:
-        yield ReportedEvent(t, 'stop', f'{stop.reason}: {stop.text}')
+        yield (t, 'stop', f'{stop.reason}: {stop.text}')
     for i, joint in enumerate(run.joints):
         violated = outside(run, i)
         if violated is not None:
@@ -121,20 +110,18 @@ def _events(run: Run) -> Iterator[ReportedEvent]:
             yield from _intervals(run, limited, 'saturation', joint, 'at its torque limit')
 
 
-def _intervals(
-    run: Run, holds: np.ndarray, kind: str, joint: str, what: str
-) -> Iterator[ReportedEvent]:
+def _intervals(run: Run, holds: np.ndarray, kind: str, joint: str, what: str) -> Iterator[Happened]:
     edges = np.diff(np.concatenate([[0], holds.astype(np.int8), [0]]))
     begins, ends = np.flatnonzero(edges == 1), np.flatnonzero(edges == -1)
     times = run.time_of(run.stamp[begins])
     for time, begin, end in list(zip(times, begins, ends, strict=True))[:_MOST_OF_A_KIND]:
-        yield ReportedEvent(float(time), kind, f'{joint} {what} for {end - begin} samples')
+        yield (float(time), kind, f'{joint} {what} for {end - begin} samples')
     if begins.size > _MOST_OF_A_KIND:
         text = f'{joint}: {begins.size - _MOST_OF_A_KIND} more intervals, not listed'
-        yield ReportedEvent(float(times[_MOST_OF_A_KIND]), kind, text)
+        yield (float(times[_MOST_OF_A_KIND]), kind, text)
 
 
-def _diagnosed(content: Content, run: Run) -> Iterator[ReportedEvent]:
+def _diagnosed(content: Content, run: Run) -> Iterator[Happened]:
     """Yield each change of a level or message, at the time of the last sample received."""
     shown: dict[str, tuple[int, str]] = {}
     messages = content.topics.get(DIAGNOSTICS)
@@ -147,15 +134,15 @@ def _diagnosed(content: Content, run: Run) -> Iterator[ReportedEvent]:
             if shown.get(status.name) != now:
                 shown[status.name] = now
                 level = _LEVELS[min(now[0], len(_LEVELS) - 1)]
-                yield ReportedEvent(time, level, f'{status.name}: {now[1]}')
+                yield (time, level, f'{status.name}: {now[1]}')
 
 
-def _changed(content: Content, run: Run) -> Iterator[ReportedEvent]:
+def _changed(content: Content, run: Run) -> Iterator[Happened]:
     """Yield each change of the simulated plant's parameters during the run."""
     for change in content.changes:
         time = (change['stamp'] - int(run.stamp[0])) * 1e-9
         for parameter, value in () if change.get('configured') else change['parameters'].items():
-            yield ReportedEvent(time, 'plant', f'{parameter}: {_shown(value)}')
+            yield (time, 'plant', f'{parameter}: {_shown(value)}')
 
 
 def _shown(value: object) -> str:
@@ -178,9 +165,7 @@ def write_report(bags: Sequence[ReportedBag], path: Path) -> None:
     found, seconds = panels([bag.run for bag in bags]), max(bag.run.duration for bag in bags)
     groups = dict.fromkeys(panel.group for panel in found)
     events = sorted(
-        (event.time, k, event.kind, event.text)
-        for k, bag in enumerate(bags)
-        for event in bag.events
+        (time, k, kind, text) for k, bag in enumerate(bags) for time, kind, text in bag.events
     )
     parameters: list[list[str | Cell]] = []
     different = []
@@ -226,8 +211,7 @@ def plots(shown: Sequence[Panel], bags: Sequence[ReportedBag]) -> list[dict[str,
             'group': panel.group,
             'title': panel.title,
             'unit': panel.unit,
-            'traces': list((_histograms if panel.histogram else _traces)(panel, prefixes)),
-            'time': not panel.histogram,
+            'traces': list(_traces(panel, prefixes)),
             'log': panel.log,
             'marks': [
                 (mark.time, mark.text, mark.colour or colour(mark.run), mark.until)
@@ -250,32 +234,16 @@ def _traces(panel: Panel, prefixes: Sequence[str]) -> Iterator[dict[str, Any]]:
         drawn += not line.colour
         if prefixes and shade == INK:
             shade = colour(line.run)
-        time, values = thin(line.time, line.values)
         for sign in (1.0, -1.0) if line.mirrored else (1.0,):
             yield {
                 'type': 'scatter',
                 'name': (prefixes[line.run] if prefixes else '') + line.name,
-                'x': _numbers(time),
-                'y': _numbers(sign * values),
+                'x': _numbers(line.time),
+                'y': _numbers(sign * line.values),
                 'line': {'width': 1.3, 'color': shade, 'dash': 'dash' if line.dashed else 'solid'},
                 # Lines with a colour of their own look the same in all bags.
                 'showlegend': bool(line.name) and sign > 0.0 and not (line.colour and line.run),
             }
-
-
-def _histograms(panel: Panel, prefixes: Sequence[str]) -> Iterator[dict[str, Any]]:
-    """Yield histograms up to the tail; values beyond it are counted in the last bin."""
-    for line in panel.lines:
-        values = line.values[np.isfinite(line.values)]
-        counts, edges = np.histogram(np.minimum(values, np.percentile(values, _TAIL)), _BINS)
-        yield {
-            'type': 'bar',
-            'name': (prefixes[line.run] if prefixes else '') + line.name,
-            'x': _numbers((edges[1:] + edges[:-1]) / 2),
-            'y': counts.tolist(),
-            'opacity': 0.7,
-            'marker': {'color': colour(line.run)},
-        }
 
 
 def _numbers(values: Floats) -> list[float | None]:

@@ -1,12 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Style of the figures: colour-blind safe colours, and legends beside the data."""
+"""Style of figures and pages: colour-blind safe colours, legends beside the data, templates."""
 
 from __future__ import annotations
 
+import base64
 import re
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
+from jinja2 import Environment, PackageLoader, StrictUndefined
 from matplotlib import rc_context
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -42,6 +44,18 @@ _SETTINGS: Any = {
     'lines.solid_joinstyle': 'round',
     'path.simplify': False,
 }
+_TEMPLATES = Environment(
+    loader=PackageLoader('blf_dsc_controller'),
+    autoescape=True,
+    undefined=StrictUndefined,
+    trim_blocks=True,
+    lstrip_blocks=True,
+)
+_TEMPLATES.policies['json.dumps_kwargs'] = {'allow_nan': False, 'separators': (',', ':')}
+_TEMPLATES.filters['anchor'] = lambda title: title.lower().replace(' ', '-')
+_TEMPLATES.filters['embedded'] = lambda png: (
+    f'data:image/png;base64,{base64.b64encode(png.read_bytes()).decode("ascii")}'
+)
 
 
 class Picture:
@@ -84,23 +98,25 @@ class Picture:
             self._canvas.print_png(path)  # type: ignore[no-untyped-call]
 
 
-def head(axes: Axes, title: str) -> None:
+def head(axes: Axes, title: str, *, legend_at: float | None = None) -> None:
     """Put the title above a panel and the legend off the data: above as well, or beside it.
 
-    A single line that the title names needs no legend.
+    With `legend_at` it is at this height of the axes; at 0, and if the title names its only line,
+    there is none.
     """
     axes.set_title(title, loc='left', fontsize=11.5)
     labels = axes.get_legend_handles_labels()[1]
     entries = len(labels)
-    if entries == 0 or labels == [title.partition(':')[0]]:
+    if entries == 0 or labels == [title.partition(':')[0]] or legend_at == 0.0:
         return
     grid = axes.get_subplotspec()
     width = axes.figure.get_figwidth() / (grid.get_gridspec().ncols if grid else 1)  # type: ignore[union-attr]
     characters = re.sub(r'\\hat|[\\${}_^,]', '', title + ''.join(labels))
-    above = _CHARACTER * len(characters) + _HANDLE * entries < width - _MARGIN
+    fits = _CHARACTER * len(characters) + _HANDLE * entries < width - _MARGIN
+    above = fits or legend_at is not None
     axes.legend(
         loc='lower right' if above else 'center left',
-        bbox_to_anchor=(1.0, 1.0) if above else (1.0, 0.5),
+        bbox_to_anchor=(1.0, legend_at or 1.0) if above else (1.0, 0.5),
         ncols=entries if above else 1,
         frameon=False,
         fontsize=10,
@@ -110,25 +126,26 @@ def head(axes: Axes, title: str) -> None:
     )
 
 
-def head_of_column(axes: Axes, title: str, *, first: bool) -> None:
-    """Put the title above a panel; the first of a column also gets the legend of the column."""
-    axes.set_title(title, loc='left', fontsize=11)
-    entries = len(axes.get_legend_handles_labels()[1])
-    if first and entries:
-        axes.legend(
-            loc='lower right',
-            bbox_to_anchor=(1.0, 1.15),
-            ncols=entries,
-            frameon=False,
-            fontsize=10,
-            borderaxespad=0.15,
-            handlelength=1.6,
-        )
-
-
 def formula(name: str) -> str:
     """Return the name of a parameter, as mathtext if it is a formula such as `m2*l1*l2`."""
     if not re.fullmatch(r'(?:[A-Za-z]\d*|[()+*^-]|\d)+', name) or not re.search(r'\d', name):
         return name
     indexed = re.sub(r'([A-Za-z])(\d+)', r'\1_{\2}', name)
     return f'${indexed.replace("*", chr(92) + ",")}$'
+
+
+class Cell(NamedTuple):
+    """Table cell that is more than plain text.
+
+    Styles: number, code, good, partly, bad; marked highlights the row.
+    """
+
+    text: str
+    style: str = ''
+    colour: str = ''  # of a swatch before the text
+
+
+def write_page(path: Path, template: str, title: str, **values: object) -> None:
+    """Render a template with its variables and write the page."""
+    text = _TEMPLATES.get_template(template).render(title=title, **values)
+    path.write_text(text, encoding='utf-8')

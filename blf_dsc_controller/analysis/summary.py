@@ -36,10 +36,6 @@ _JOINT = {  # entry of the summary: metric; title, unit, factor and decimals in 
 }
 
 _OFTEN = 0.01  # of the samples
-_BLOCK = 65_536  # samples looked at at once
-_OLDEST = 20  # samples, age of a command that is looked for in the efforts
-_DIGITS = 1e-9  # relative, by which an effort may differ from its command
-_SHOWN = 0.5  # of the samples must show a command
 _WIDEST = 'widest_bound_rad'
 _NAMED = 3  # parameters, where the names of model and plant differ
 _MEASURED = {  # comparison with the truth: entry of the summary, its line of the table
@@ -75,7 +71,6 @@ def summarize(run: Run) -> Summary:
         },
         'learning': None if estimates is None else _learning(run, estimates, metrics),
         'loads': _loads(run),
-        'commands': _commands(run),
         'timing': _timing(run),
         'compute_time_us': _percentiles(run.learning, COMPUTE_TIME),
         'messages': dict(run.message_counts),
@@ -99,13 +94,13 @@ def plain(value: Any) -> Any:
 def _learning(run: Run, estimates: Estimates, metrics: Metrics) -> Summary:
     reached = {t: error for t, error in metrics.parameter_error.items() if not math.isnan(error)}
     relative, torque = _MEASURED
-    measured = relative if estimates.torques is None else torque
+    measured = torque if estimates.of_torques else relative
     learning: Summary = plain(
         {
             'used': run.learns,
             'latch_time_s': metrics.latch_time,
             'model_changes_s': change_times(run),
-            f'{measured}_at_s': reached if estimates.is_known else None,
+            f'{measured}_at_s': None if estimates.relative_error is None else reached,
             f'final_{measured}': metrics.final_parameter_error,
             'time_to_1_percent_s': metrics.time_to_1_percent,
             'final_estimate': _named(estimates, estimates.estimate),
@@ -146,31 +141,6 @@ def _timing(run: Run) -> Summary | None:
         'rate_hz': (moving.size - 1) / elapsed if elapsed > 0 else None,
         'latency_us': _percentiles(run.timing, LATENCY),
         'late_steps': None if late is None else int(late),
-    }
-
-
-def _commands(run: Run) -> Summary | None:
-    """Return what the arm did with the commands, where its `effort` repeats them digit by digit.
-
-    `samples_late`: between the state that a torque answers and the one whose effort first shows it.
-    """
-    late = np.zeros(run.stamp.size, np.intp)
-    for begin in range(0, run.stamp.size, _BLOCK):
-        rows = slice(max(0, begin - _OLDEST), begin + _BLOCK)
-        effort, torque = run.at('effort', rows), run.at('torque', rows)
-        if effort is None or torque is None:
-            return None
-        for ago in range(_OLDEST, 0, -1):  # the newest command that agrees
-            agree = np.isclose(effort[ago:], torque[:-ago], rtol=_DIGITS, atol=0.0).all(axis=1)
-            late[rows][ago:][agree] = ago
-    shown = np.flatnonzero(late)
-    if shown.size < _SHOWN * run.stamp.size:
-        return None
-    commands, first = np.unique(shown - late[shown], return_index=True)
-    delays = late[shown[first]]
-    return {
-        'never_applied': 1.0 - commands.size / (commands[-1] - commands[0] + 1.0),
-        'samples_late': {'p50': int(np.median(delays)), 'max': int(delays.max())},
     }
 
 
@@ -226,13 +196,6 @@ def _sentences(summary: Summary) -> Iterator[str]:
     for load in summary['loads']:
         values = [math.nan if load[name] is None else load[name] for name in LOAD]
         yield f'held        {load_text(values)}, until {load["until_s"]:.1f} s'
-    if summary['commands'] is not None and summary['commands']['samples_late']['max'] > 1:
-        late = summary['commands']['samples_late']
-        never = 100.0 * summary['commands']['never_applied']
-        yield (
-            f'commands    applied {late["p50"]} samples later (median), at most {late["max"]}; '
-            f'{never:.3g} % overwritten by newer ones before'
-        )
     if summary['timing'] is not None:
         late = summary['timing']['late_steps']
         is_slow = late is not None and late > _OFTEN * summary['samples']

@@ -6,6 +6,8 @@ from __future__ import annotations
 import textwrap
 from argparse import Namespace
 from collections.abc import Iterator, Sequence
+from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import numpy as np
 from tqdm import tqdm
@@ -34,6 +36,7 @@ _DIGITS = 4  # decimals of an angle [rad] in the file
 _UNITS = {'frequency': 'rad/s, of the cosines, then of the sines'}
 _UNSHOWN = 0.8  # of the prior's deviation; parameters that keep more are hardly shown
 _WIDTH = 98
+_PANEL = (9.0, 2.2)  # inches
 
 
 def identify(options: Namespace) -> None:
@@ -71,12 +74,41 @@ def identify(options: Namespace) -> None:
         options.out.write_text(corrected, encoding='utf-8')
         print(f'wrote {options.out}')
     if options.report:
-        from blf_dsc_controller.identification.report import write_identified
-
         tables = (_load(found), _links(found), _joints(found), _errors(found), _base(found))
         lines = [*header, *problems_of(found, options.effort)]
-        write_identified(found, options.report, lines, [[*table] for table in tables])
+        _write_page(found, options.report, lines, ['\n'.join(table).strip() for table in tables])
         print(f'wrote {options.report}')
+
+
+def _write_page(found: Identified, path: Path, lines: Sequence[str], tables: Sequence[str]) -> None:
+    """Write the page: some lines, measured and predicted torques with their residual, tables."""
+    from blf_dsc_controller.analysis import style  # slow: the libraries of the pictures
+
+    n, time = len(found.chain.joints), found.time
+    jumps = np.flatnonzero(np.diff(time) > 2.0 * np.median(np.diff(time))) + 1
+    picture = style.Picture(n, 1, 'Torques: measured, predicted, residual', _PANEL)
+    for i, (axes, joint) in enumerate(zip(picture.axes.flat, found.chain.joints, strict=True)):
+        axes.axvspan(*found.held_back, color=style.SHADE, lw=0)
+        # NaN breaks the lines at gaps and rest.
+        t, measured, predicted = (
+            np.insert(values, jumps, np.nan)
+            for values in (time, found.measured[:, i], found.predicted[2, :, i])
+        )
+        axes.plot(t, measured, color=style.INK, label='measured')
+        axes.plot(t, predicted, color=style.BLUE, label='predicted', linestyle='--')
+        axes.plot(t, measured - predicted, color=style.ORANGE, label='residual', linewidth=0.9)
+        axes.set_ylabel('N' if joint.kind == 'prismatic' else 'N m')
+        style.head(axes, joint.name)
+    with TemporaryDirectory() as folder:
+        picture.save(Path(folder, 'torques.png'))
+        style.write_page(
+            path,
+            'identified.html',
+            'Identified arm',
+            lines=lines,
+            picture=Path(folder, 'torques.png'),
+            tables=[table for table in tables if table],
+        )
 
 
 def _interval(value: float, deviation: float, digits: str = '.4g') -> str:

@@ -142,21 +142,20 @@ def _resampled(
         )
     grid = np.arange(0.0, time[-1], period)
     gap = (intervals > _GAP * period)[np.searchsorted(time, grid, side='right') - 1]
-    at_grid = [
-        np.transpose([np.interp(grid, time, column) for column in values.T])
-        for values in (q, torque)
-    ]
-    return Recording(joints, period, at_grid[0], at_grid[1], gap, source)
+    q, torque = (interpolated(grid, time, values) for values in (q, torque))
+    return Recording(joints, period, q, torque, gap, source)
+
+
+def interpolated(at: np.ndarray, time: np.ndarray, values: np.ndarray) -> Floats:
+    """Return the values (N, n) of these times at other times (k,), linearly interpolated."""
+    return np.asarray(np.transpose([np.interp(at, time, column) for column in values.T]))
 
 
 def joined(first: Recording, second: Recording) -> tuple[Recording, float]:
     """Return two recordings with a gap between them as one, and the time [s] of the second."""
     times = np.arange(second.q.shape[0]) * second.period
     grid = np.arange(0.0, times[-1], first.period)
-    q, torque = (
-        np.transpose([np.interp(grid, times, column) for column in values.T])
-        for values in (second.q, second.torque)
-    )
+    q, torque = (interpolated(grid, times, values) for values in (second.q, second.torque))
     gap = np.interp(grid, times, second.gap) > 0.0
     gap[0] = True
     together = first._replace(
@@ -211,8 +210,7 @@ class Rows(NamedTuple):
     def gravity_torque(self, P: Floats) -> Floats:
         """Return the torque of gravity (N, n) of the base parameters P (p,)."""
         samples = np.arange(len(self.sliding))
-        columns = (self.gravity @ P).T
-        return np.transpose([np.interp(samples, samples[:: self.every], each) for each in columns])
+        return interpolated(samples, samples[:: self.every], self.gravity @ P)
 
     def set_load(self, P: Floats) -> None:
         """Compute the columns of the load friction in X for the gravity of P (p,)."""
@@ -234,11 +232,10 @@ class Rows(NamedTuple):
         return -self.over_windows(self._shifted(delay), self.slope)
 
     def _shifted(self, delay: float) -> Floats:
-        at = np.arange(self.torque.shape[0]) + delay / self.period
-        samples = np.arange(at.size)
-        return np.transpose([np.interp(at, samples, column) for column in self.torque.T])
+        samples = np.arange(self.torque.shape[0])
+        return interpolated(samples + delay / self.period, samples, self.torque)
 
-    def over_windows(self, values: Floats, factors: Floats) -> Floats:
+    def over_windows(self, values: np.ndarray, factors: Floats) -> Floats:
         """Return the sums (R, n) of the values (N, n) in each window times factors (L,)."""
         windows = sliding_window_view(values, factors.size, axis=0)[self.starts]
         return np.asarray(windows @ factors)

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from tqdm import tqdm
 
-from blf_dsc_controller.analysis.page import Cell, write_page
+from blf_dsc_controller.analysis.style import Cell, write_page
 from blf_dsc_controller.configuration.nodes import LoopConfig, load_loop
 from blf_dsc_controller.configuration.schema import change
 from blf_dsc_controller.errors import BlfDscError

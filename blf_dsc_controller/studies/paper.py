@@ -20,9 +20,8 @@ from matplotlib.ticker import FuncFormatter, NullFormatter
 
 from blf_dsc_controller.analysis.figures import draw_panels
 from blf_dsc_controller.analysis.metrics import MOMENTS, estimates_of
-from blf_dsc_controller.analysis.page import Cell, write_page
 from blf_dsc_controller.analysis.panels import panels
-from blf_dsc_controller.analysis.style import ALARM, COLOURS, MUTED, Picture
+from blf_dsc_controller.analysis.style import ALARM, COLOURS, MUTED, Cell, Picture, write_page
 from blf_dsc_controller.analysis.summary import plain
 from blf_dsc_controller.configuration.nodes import dump
 from blf_dsc_controller.law.factory import settings_of_config
@@ -388,20 +387,20 @@ def draw_pairs(results: Results, folder: Path) -> Iterator[tuple[Path, str]]:
     """Draw Fig. 2 and 3 of each pair of laws; yield their paths and captions."""
     for name, caption, pair in _PAIRS:
         runs = [replace(results.runs[case], torque_limit=None) for case in pair.values()]
-        shown = panels(runs)
-        linear = [panel for panel in shown if not panel.log]
+        linear = [panel for panel in panels(runs, end=_UNTIL) if not panel.log]
         tracking = [
             replace(panel, title=f'({letter}) {panel.title}')
             for letter, panel in zip('abcdef', linear, strict=False)
         ]
-        estimates = [panel for panel in shown if panel.group == 'Parameters' and not panel.log]
-        for number, drawn, columns, size, until, note in (
-            (2, tracking, 2, _TRACKING, _UNTIL, '. Shaded: within the bound'),
-            (3, estimates, 1, _ESTIMATES, math.inf, ''),
+        learning = [panel for panel in panels(runs) if panel.group == 'Parameters']
+        estimates = [panel for panel in learning if not panel.log]
+        for number, drawn, columns, size, note in (
+            (2, tracking, 2, _TRACKING, '. Shaded: within the bound'),
+            (3, estimates, 1, _ESTIMATES, ''),
         ):
             path = folder / f'figure_{number}_{name}.png'
             title = f'Fig. {number}, {caption}'
-            draw_panels(path, title, drawn, columns, size, list(pair), until)
+            draw_panels(path, title, drawn, columns, size, list(pair))
             yield path, f'Fig. {number}: {caption}{note}.'
 
 

@@ -13,7 +13,6 @@ from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 from scipy.stats import binomtest, kruskal, rankdata
 
 from blf_dsc_controller.analysis.figures import draw as draw_run
-from blf_dsc_controller.analysis.page import Cell, write_page
 from blf_dsc_controller.analysis.style import (
     ALARM,
     BLUE,
@@ -21,8 +20,10 @@ from blf_dsc_controller.analysis.style import (
     INK,
     MUTED,
     ORANGE,
+    Cell,
     Picture,
     head,
+    write_page,
 )
 from blf_dsc_controller.analysis.summary import plain, write_summary
 from blf_dsc_controller.analysis.summary import summarize as summarize_run

@@ -21,16 +21,15 @@ function layoutOf(panel, width) {
     title: {text: panel.title, x: 0.01, xanchor: 'left', font: {size: 14}},
     height: 270 + legend,
     margin: {l: 62, r: 34, t: 34, b: 46 + legend},
-    paper_bgcolor: 'white', plot_bgcolor: 'white', bargap: 0, barmode: 'overlay',
+    paper_bgcolor: 'white', plot_bgcolor: 'white', 
     legend: {font: {size: 11}, orientation: 'h', x: 0, xanchor: 'left', yref: 'container', y: 0,
       yanchor: 'bottom'},
     modebar: {orientation: 'v'},
     font: {family: 'system-ui, DejaVu Sans, sans-serif', size: 12, color: '#22272e'},
-    hovermode: panel.time ? 'x' : 'closest',
+    hovermode: 'x',
     dragmode: 'zoom',
-    xaxis: {...grid, title: {text: panel.time ? 'time [s]' : `[${panel.unit}]`, standoff: 6},
-      ...(panel.time ? {range: [0, duration]} : {})},
-    yaxis: {...grid, title: {text: panel.time ? panel.unit : 'count', standoff: 4},
+    xaxis: {...grid, title: {text: 'time [s]', standoff: 6}, range: [0, duration]},
+    yaxis: {...grid, title: {text: panel.unit, standoff: 4},
       type: panel.log ? 'log' : 'linear', exponentformat: 'power'},
     shapes: panel.marks.flatMap(([time, , colour, until]) => [
       {type: 'line', x0: time, x1: time, y0: 0, y1: 1, yref: 'paper',
@@ -62,7 +61,6 @@ function draw(panel, place) {
   const traces = panel.traces.map((trace) => ({mode: 'lines', connectgaps: false, ...trace}));
   const options = {responsive: true, displaylogo: false, scrollZoom: false};
   return Plotly.newPlot(place, traces, layoutOf(panel, place.clientWidth), options).then(() => {
-    if (!panel.time) return;
     timePlots.push(place);
     place.on('plotly_relayout', (change) => follow(place, change));
   });

@@ -38,8 +38,7 @@ class BagPlayer:
         plant = bag.content.configurations.get(PLANT, {})
         self.snapshots = snapshots(bag.run, tuple(units_of(config)))
         self._page, self._times = page, np.array([each.time for each in self.snapshots])
-        happened = [(event.time, event.kind, event.text) for event in bag.events]
-        self._events = sorted([*happened, *plant_events(plant)])
+        self._events = sorted([*bag.events, *plant_events(plant)])
         self._playing, self._drawn = False, -1
         page.draw_arm(config, [plant[key] for key in ('arm.l1', 'arm.l2') if key in plant])
         gui = page.server.gui
