@@ -22,7 +22,13 @@ pytestmark = pytest.mark.usefixtures('blank_pictures')
 pytest.importorskip('plotly', reason='needs plotly: pip install blf_dsc_controller[report]')
 
 ODD = ['/odd', 'my_msgs/msg/Odd', 5, b'\0\1\0\0\7\0\0\0']  # of a package that does not exist
-COMMANDS = ('replay', 'report', 'export', 'plot')
+COMMANDS = {
+    'replay': (),
+    'report': ('--out', 'page.html'),
+    'export': ('--out', 'table.csv'),
+    'plot': ('--out', 'plots'),
+    'identify': ('--urdf', 'two_link.urdf', '--out', 'new.urdf'),
+}
 
 
 @pytest.fixture(scope='module')
@@ -36,40 +42,30 @@ def copy(bag, tmp_path):
     return shutil.copytree(bag, tmp_path / 'copy')
 
 
-def run(command, bag, folder):
-    """Run a command on a bag and return its exit code."""
-    options = {
-        'report': ['--out', str(folder / 'page.html')],
-        'export': ['--out', str(folder / 'table.csv')],
-        'plot': ['--out', str(folder / 'plots')],
-    }
-    return main([command, str(bag), *options.get(command, [])])
+@pytest.fixture
+def run(tmp_path, monkeypatch, capsys):
+    """Runs a command on a bag; returns its exit code, output and errors."""
+    monkeypatch.chdir(tmp_path)
+
+    def call(command, bag, *words):
+        code = main([command, str(bag), *(words or COMMANDS[command])])
+        return code, *capsys.readouterr()
+
+    return call
 
 
 @pytest.fixture
-def all_say(tmp_path, capsys):
-    """Asserts that commands fail with one error that contains these words."""
+def all_say(run):
+    """Asserts that all commands fail with one error that contains these words."""
 
     def check(bag, *words, but=()):
         for command in sorted({*COMMANDS} - {*but}):
-            assert run(command, bag, tmp_path) == 1, command
-            out, error = capsys.readouterr()
-            assert error.startswith(f'blf_dsc {command}: '), command
-            assert [word for word in words if word not in error] == [], (command, error)
-            assert out == ''
+            code, out, error = run(command, bag)
+            assert (code, out) == (1, ''), command
+            assert error.startswith(f'blf_dsc {command}: '), error
+            assert [word for word in words if word not in error] == [], error
 
     return check
-
-
-@pytest.fixture
-def recovered(tmp_path, capsys):
-    """Recovers a bag; returns the exit code, the output and the clean bag."""
-
-    def recover(bag):
-        code = main(['recover', str(bag), '--out', str(tmp_path / 'clean')])
-        return code, ''.join(capsys.readouterr()), tmp_path / 'clean'
-
-    return recover
 
 
 def write_mcap(folder, entries, schema):
@@ -110,41 +106,41 @@ OTHER = ("'joint1' is not in the message, which names", 'another robot', '--map 
 
 
 @pytest.mark.parametrize(
-    ('change', 'words'),
+    ('change', 'words', 'but'),
     [
-        (without_states, ("whose name ends in 'joint_states' of type", 'commands (std_msgs/msg')),
-        (of_type_string, ('of type sensor_msgs/msg/JointState', '(std_msgs/msg/String)')),
-        (with_joints('wheel', 'arm'), OTHER),
-        (with_joints('base', 'shoulder', 'elbow'), OTHER),
-        (lambda _: [], ('is empty: it holds no message',)),
+        (without_states, ("name ends in 'joint_states' of type", 'commands (std_msgs/msg'), ()),
+        (of_type_string, ('of type sensor_msgs/msg/JointState', '(std_msgs/msg/String)'), ()),
+        (with_joints('wheel', 'arm'), OTHER, ('identify',)),
+        (with_joints('base', 'shoulder', 'elbow'), OTHER, ('identify',)),
+        (lambda _: [], ('is empty: it holds no message',), ()),
     ],
 )
-def test_bag_of_other_content(bag, tmp_path, all_say, change, words):
-    entries = recorded_run.messages(bag)
-    all_say(recorded_run.write(tmp_path / 'changed', change(entries)), *words)
+def test_bag_of_other_content(bag, tmp_path, all_say, change, words, but):
+    entries = change(recorded_run.messages(bag))
+    all_say(recorded_run.write(tmp_path / 'changed', entries), *words, but=but)
 
 
 def test_joint_states_without_joint_names(tmp_path, all_say):
     raw = JointStateEncoder(()).encode(1, [], [], [])
-    nameless = [['/joint_states', JOINT_STATE, k, raw] for k in range(9)]
-    path = recorded_run.write(tmp_path / 'bag', nameless)
-    all_say(path, 'it names no joint', but=('replay',))
+    path = recorded_run.write(
+        tmp_path / 'bag', [['/joint_states', JOINT_STATE, k, raw] for k in range(9)]
+    )
+    all_say(path, 'it names no joint', but=('replay', 'identify'))
 
 
 @pytest.mark.parametrize('schema', [('', b''), ('ros2msg', b'{{ no definition'), None])
-def test_missing_definition_of_another_topic_loses_no_other_message(
-    bag, tmp_path, capsys, recovered, schema
-):
+def test_missing_definition_of_another_topic_loses_no_other_message(bag, tmp_path, run, schema):
+    entries = recorded_run.messages(bag)
     file = write_mcap(
         tmp_path / 'bag',
-        [ODD, *recorded_run.messages(bag)],
+        [ODD, *entries],
         lambda name: schema if name == ODD[1] else ('ros2msg', definition(name)[0].encode()),
     )
-    for command in COMMANDS[1:]:
-        assert run(command, file, tmp_path) == 0, capsys.readouterr().err
-    code, output, clean = recovered(file)
+    for command in ('replay', 'report', 'export', 'plot'):
+        assert run(command, file)[0] == 0
+    code, output, _ = run('recover', file, '--out', 'clean')
     assert code == 0
-    with Reader(clean) as reader:
+    with Reader(tmp_path / 'clean') as reader:
         found = {c.topic: c.msgcount for c in reader.connections}
     assert found['/joint_states'] == 301
     assert found.get('/odd') == (None if schema is None else 1)
@@ -152,34 +148,28 @@ def test_missing_definition_of_another_topic_loses_no_other_message(
     assert (lost in output) == (schema is None)  # not even the type's name is known
 
 
-def test_types_of_this_package_need_no_definition(bag, tmp_path, recovered):
-    file = write_mcap(tmp_path / 'bag', recorded_run.messages(bag), lambda _: ('', b''))
-    for each in (file, recovered(file)[2]):
-        assert run('replay', each, tmp_path) == 0
-
-
-def test_topics_of_unknown_type(bag, tmp_path, all_say, recovered):
+def test_types_of_this_package_need_a_name_but_no_definition(bag, tmp_path, run, all_say):
     entries = recorded_run.messages(bag)
-    file = write_mcap(tmp_path / 'bag', entries, lambda _: None)
+    file = write_mcap(tmp_path / 'bag', entries, lambda _: ('', b''))
+    assert run('recover', file, '--out', 'clean')[0] == 0
+    for each in (file, tmp_path / 'clean'):
+        assert run('replay', each)[0] == 0
+    file = write_mcap(tmp_path / 'unnamed', entries, lambda _: None)
     all_say(file, '/joint_states (of unknown type)')
-    code, output, _ = recovered(file)
-    assert code == 1
-    assert f'LOST bag_0.mcap: {len(entries)} messages of topics whose name or type' in output
+    code, output, _ = run('recover', file, '--out', 'none')
+    lost = f'LOST bag_0.mcap: {len(entries)} messages of topics whose name or type'
+    assert (code, lost in output) == (1, True)
 
 
-def test_metadata_that_lists_missing_messages(bag, copy, all_say, tmp_path):
-    kept = without_states(recorded_run.messages(bag))
-    shutil.copy(recorded_run.write(tmp_path / 'bag', kept) / 'bag_0.mcap', copy)
-    all_say(copy, 'it holds 0 messages of /joint_states, but counts 301')
-
-
-def test_bag_folder_without_its_mcap_file_or_above_it(copy, all_say, recovered):
+def test_files_that_are_missing_or_hold_less_than_the_metadata_say(bag, copy, run, all_say):
     all_say(copy.parent, f'did you mean {copy}?')
+    kept = without_states(recorded_run.messages(bag))
+    shutil.copy(recorded_run.write(copy.parent / 'bag', kept) / 'bag_0.mcap', copy)
+    all_say(copy, 'it holds 0 messages of /joint_states, but counts 301')
     (copy / 'bag_0.mcap').unlink()
     all_say(copy, f'{copy} cannot be read as a bag', 'bag_0.mcap')
-    code, output, _ = recovered(copy)
-    assert code == 1
-    assert 'there is no MCAP file to recover' in output
+    code, _, error = run('recover', copy, '--out', 'clean')
+    assert (code, 'there is no MCAP file to recover' in error) == (1, True)
 
 
 @pytest.mark.parametrize(
@@ -190,11 +180,19 @@ def test_bag_folder_without_its_mcap_file_or_above_it(copy, all_say, recovered):
         ('rosbag2_bagfile_information', 'other', 'metadata key is missing'),
     ],
 )
-def test_bag_of_another_format(copy, all_say, recovered, original, replacement, words):
+def test_bag_of_another_format(copy, all_say, run, original, replacement, words):
     metadata = copy / 'metadata.yaml'
     assert original in metadata.read_text()
     metadata.write_text(metadata.read_text().replace(original, replacement))
     all_say(copy, words, f'to save the undamaged part: blf_dsc recover {copy}')
-    code, output, _ = recovered(copy)
-    assert code == 0
-    assert 'none of the recorded messages was lost' in output
+    code, output, _ = run('recover', copy, '--out', 'clean')
+    assert (code, 'none of the recorded messages was lost' in output) == (0, True)
+
+
+@pytest.mark.parametrize('declared', [1 << 29 | 1, 1 << 62])
+def test_chunk_that_declares_too_large_a_size_is_not_unpacked(copy, all_say, declared):
+    file = copy / 'bag_0.mcap'
+    data = file.read_bytes()
+    size = data.index(b'\x06', 100) + 9 + 16  # of the first chunk, after its times
+    file.write_bytes(data[:size] + declared.to_bytes(8, 'little') + data[size + 8 :])
+    all_say(file, f'a chunk would unpack to {declared} bytes')

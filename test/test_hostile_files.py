@@ -29,25 +29,6 @@ def bag(tmp_path_factory):
     return recorded_run.record(tmp_path_factory.mktemp('recorded') / 'bag', 0.1)
 
 
-@pytest.mark.parametrize('declared', [1 << 29 | 1, 1 << 62])
-def test_chunk_that_declares_too_large_a_size_is_not_unpacked(bag, tmp_path, capsys, declared):
-    data = (bag / 'bag_0.mcap').read_bytes()
-    file, at = tmp_path / 'bag_0.mcap', data.index(b'\x06', 100)  # the first chunk
-    size = at + 9 + 16  # after its times
-    file.write_bytes(data[:size] + declared.to_bytes(8, 'little') + data[size + 8 :])
-    for command in (
-        ('replay', file),
-        ('report', file, '--out', tmp_path / 'page.html'),
-        ('export', file, '--out', tmp_path / 'table.csv'),
-        ('plot', file, '--out', tmp_path / 'plots'),
-        ('identify', file, '--urdf', 'panda.urdf', '--out', tmp_path / 'new.urdf'),
-    ):
-        assert main([str(word) for word in command]) == 1, command
-        error = capsys.readouterr().err
-        assert f'a chunk would unpack to {declared} bytes' in error, command
-        assert error.count('\n') == 1, error
-
-
 def test_named_pipe_is_rejected_as_parameter_file_and_urdf(tmp_path, capsys):
     os.mkfifo(tmp_path / 'pipe')
     assert main(['run', '--offline', '--config', str(tmp_path / 'pipe')]) == 1

@@ -144,28 +144,12 @@ def test_flipped_bit_is_located_and_named_and_the_earliest_counts(
 
 def test_repeated_and_unused_states_are_skipped(entries, rewritten):
     states = of(entries, JOINT_STATES)
-    late = JointStateEncoder(('joint1', 'joint2')).encode(
-        START + 300 * MILLISECOND + 5, [9, 9], [9, 9], [9, 9]
-    )
-    at = entries.index(states[301])
-    changed = [
-        states[0],
-        *entries[:at],
-        [JOINT_STATES.resolved, JOINT_STATES.type, START + 300 * MILLISECOND + 5, late],
-        *entries[at:],
-    ]
-    result = verify(rewritten(changed))
-    assert result.difference is None
-    assert result.passed_over == 2
-    assert result.samples == SAMPLES
-
-
-def test_lost_state_ends_the_replay_with_a_remark(entries, rewritten):
-    lost = of(entries, JOINT_STATES)[500]
-    result = verify(rewritten([entry for entry in entries if entry is not lost]))
-    assert result.difference is None
-    assert result.samples == 500
-    assert any(f'stamp {START + 500 * MILLISECOND} ns' in remark for remark in result.remarks)
+    at = START + 300 * MILLISECOND + 5
+    late = JointStateEncoder(('joint1', 'joint2')).encode(at, [9, 9], [9, 9], [9, 9])
+    unused = [JOINT_STATES.resolved, JOINT_STATES.type, at, late]
+    place = entries.index(states[301])
+    result = verify(rewritten([states[0], *entries[:place], unused, *entries[place:]]))
+    assert (result.difference, result.passed_over, result.samples) == (None, 2, SAMPLES)
 
 
 def test_recording_that_started_late_is_rejected(entries, rewritten):
@@ -175,14 +159,34 @@ def test_recording_that_started_late_is_rejected(entries, rewritten):
         verify(rewritten([*journal, *late]))
 
 
-@pytest.mark.parametrize('number', [0, 500])
-def test_missing_command_leaves_the_others_compared_if_they_are_numbered(entries, tmp_path, number):
-    lost = of(entries, COMMANDS)[number]
+@pytest.mark.parametrize(
+    ('topic', 'number', 'numbered', 'percent', 'commands'),
+    [
+        (JOINT_STATES, 333, False, 33.2, 333),  # ends the replay
+        # Two of the 24 numbers of a sample are commands.
+        (COMMANDS, 333, False, 91.4, 0),
+        (COMMANDS, 333, True, None, SAMPLES - 1),
+        (COMMANDS, 0, True, None, SAMPLES - 1),
+    ],
+)
+def test_lost_message_leaves_the_others_to_compare(
+    entries, tmp_path, capsys, topic, number, numbered, percent, commands
+):
+    lost = of(entries, topic)[number]
     kept = [[*entry[:3], None] if entry is lost else entry for entry in entries]
-    for numbered, count in ((True, 2 * (SAMPLES - 1)), (False, 0)):
-        result = verify(recorded_run.write(tmp_path / f'{numbered}', kept, numbered=numbered))
-        assert result.difference is None
-        assert compared(result)['commands'] == count
+    path = recorded_run.write(tmp_path / 'bag', kept, numbered=numbered)
+    result = verify(path)
+    assert result.difference is None
+    assert compared(result)['commands'] == 2 * commands
+    if topic is JOINT_STATES:
+        assert result.samples == number
+        stamp = f'the state with stamp {lost[2]} ns was used but is not in the bag'
+        assert any(remark.startswith(stamp) for remark in result.remarks)
+    if percent:
+        assert main(['replay', str(path)]) == PARTIAL
+        last = capsys.readouterr().out.splitlines()[-1]
+        found = float(last.removeprefix('PARTLY COMPARED: ').split()[0])
+        assert found == pytest.approx(percent, abs=1.5)
 
 
 @pytest.mark.parametrize('topics', [[JOINT_STATES], [JOURNAL, JOINT_STATES]])
@@ -264,19 +268,6 @@ def test_identical_replay_exits_with_zero_and_a_verdict(bag):
     assert run.returncode == 0, run.stderr
     assert '/blf_dsc_controller/commands: 2002 values bit-equal' in run.stdout
     assert 'x real time' in run.stdout
-
-
-@pytest.mark.parametrize('topic', [JOINT_STATES, COMMANDS])
-def test_partial_comparison_has_a_verdict_of_its_own(entries, rewritten, capsys, topic):
-    """A lost state ends the replay after a third; a lost command leaves the others to compare."""
-    lost = of(entries, topic)[333]
-    assert (
-        main(['replay', str(rewritten([each for each in entries if each is not lost]))]) == PARTIAL
-    )
-    last = capsys.readouterr().out.splitlines()[-1]
-    percent = float(last.removeprefix('PARTLY COMPARED: ').split()[0])
-    # Two of the 24 numbers of a sample are commands.
-    assert percent == pytest.approx(33.2 if topic is JOINT_STATES else 91.4, abs=1.5)
 
 
 def test_bag_replays_bit_for_bit_without_its_urdf_file(tmp_path):

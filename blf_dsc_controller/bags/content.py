@@ -97,17 +97,13 @@ class Content:
 
     @property
     def losses(self) -> dict[str, str]:
-        """Recorder's notes on the messages it missed, by topic.
-
-        Topics that keep only their last message are left out.
-        """
-        return {
+        """Recorder's notes on the messages it missed, by topic; not of latched single messages."""
+        found = {
             name.removeprefix(MESSAGES): text.partition(', ')[2]
             for name, text in self.facts.items()
-            if name.startswith(MESSAGES)
-            and name.rsplit('/', 1)[-1] in _KEPT
-            and text.partition(', ')[2] not in ('', '0 missed')
+            if name.startswith(MESSAGES) and name.rsplit('/', 1)[-1] in _KEPT
         }
+        return {topic: lost for topic, lost in found.items() if lost not in ('', '0 missed')}
 
     @cached_property
     def events(self) -> list[tuple[int, Event]]:

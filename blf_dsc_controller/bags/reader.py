@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Reader of a bag as one run: joints matched by name, samples by stamp, torques by order."""
+"""A bag as one run: joints matched by name, samples by stamp, torques by order; and as a table."""
 
 from __future__ import annotations
 
+import csv
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import fields
@@ -10,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from blf_dsc_controller.bags.content import NO_NAMES, Content, NameMap, read_content
 from blf_dsc_controller.bags.sources import BagError
@@ -19,7 +21,7 @@ from blf_dsc_controller.bags.topic_messages import (
     StoredSeries,
     TopicMessages,
 )
-from blf_dsc_controller.errors import BlfDscError
+from blf_dsc_controller.errors import BlfDscError, MissingExtraError
 from blf_dsc_controller.messages import topics
 from blf_dsc_controller.messages.codecs import typestore
 from blf_dsc_controller.messages.journal import Event, EventType
@@ -35,50 +37,65 @@ from blf_dsc_controller.run import Floats, LearnedArm, Rows, Run, Series, Stop
 _MOST_FALLS = 10  # of the stamps, by resets of a simulator
 _ALTERNATING = 0.9  # ratio of the intervals to and from the state of another publisher
 _FEW = 100  # states
+_ARRAYS = {  # of a run, with a column per joint: unit, messages, field
+    'position': ('rad', 'states', 0),
+    'velocity': ('rad/s', 'states', 1),
+    'effort': ('N m', 'states', 2),
+    'torque': ('N m', 'torques', 2),
+    'reference': ('rad', 'references', 0),
+    'reference_velocity': ('rad/s', 'references', 1),
+    'error': ('rad', 'errors', 0),
+    'xi2': ('rad/s', 'errors', 1),
+    'bound': ('rad', 'bounds', 0),
+    'torque_limit': ('N m', 'bounds', 2),
+}
+_VALUES = {  # prefix of names in the vectors: unit
+    **dict.fromkeys((topics.DISTURBANCE, 'bias ', 'coulomb ', 'sin ', 'cos '), 'N m'),
+    'viscous ': 'N m s/rad',
+    topics.POSITION: 'rad',
+    topics.VELOCITY: 'rad/s',
+    topics.DISTANCE: 'rad',
+    topics.LYAPUNOV: 'J',
+    **dict.fromkeys((topics.RATIO, topics.LATCHED, topics.MODEL_CHANGES, topics.LATE_STEPS), '1'),
+    **dict.fromkeys((topics.COMPUTE_TIME, topics.LATENCY, topics.LATENESS), 's'),
+}
+_ROWS = 1 << 14
+_PARAMETER = 'kg m^2'  # of arms without a URDF
+_COMPLEMENTS = {'reference': 'error', 'error': 'reference'}
 
 
 class RecordedRun(Run):
     """Run whose arrays are read from its bag's tables each time that they are asked for."""
 
-    def __init__(
-        self,
-        stored: Mapping[str, tuple[JointStates | None, int]],
-        *,
-        is_decimated: bool,
-        **values: Any,
-    ) -> None:
-        """Take states and field of each array, and the values that are in memory.
-
-        `is_decimated`: the reference was published for some samples only.
-        """
-        for name, value in {**values, '_stored': stored, '_is_decimated': is_decimated}.items():
+    def __init__(self, stored: Mapping[str, tuple[JointStates, int]], **values: Any) -> None:
+        """Take states and field of each array that is in a table, and all other values."""
+        for name, value in {**values, '_stored': stored}.items():
             object.__setattr__(self, name, value)
 
     def __getattribute__(self, name: str) -> Any:
         stored = object.__getattribute__(self, '__dict__').get('_stored', ())
         return self.at(name) if name in stored else object.__getattribute__(self, name)
 
-    def holds(self, name: str) -> bool:
-        """Return whether some of an array is known."""
-        states, k = self._stored[name]
-        return (name == 'error' and self.holds('reference')) if states is None else states.has(k)
-
     def at(self, name: str, rows: Rows = ALL, columns: Rows = ALL) -> Floats | None:
-        """Return some rows and joints of an array; None if it is unknown."""
+        """Return some rows and joints of an array; None if it is unknown.
+
+        Reference and error are computed from each other and the positions where one is lost.
+        """
+        if name not in self._stored:
+            return super().at(name, rows, columns)
         states, k = self._stored[name]
-        if states is None:
-            return self._difference('reference', rows, columns) if self.holds(name) else None
         values: Floats = states.field(k, rows, columns)
-        if name == 'reference' and self._is_decimated:
-            lost = np.isnan(values)
-            values[lost] = self._difference('error', rows, columns)[lost]
+        if name in _COMPLEMENTS and np.isnan(values).any():
+            position, other = (
+                states.field(k, rows, columns)
+                for states, k in (self._stored['position'], self._stored[_COMPLEMENTS[name]])
+            )
+            values = np.where(np.isnan(values), position - other, values)
         return values
 
-    def _difference(self, name: str, rows: Rows, columns: Rows) -> Floats:
-        """Return the positions less another array."""
-        position, other = self.at('position', rows, columns), self.at(name, rows, columns)
-        difference: Floats = np.asarray(position) - np.asarray(other)
-        return difference
+    def holds(self, name: str) -> bool:
+        """Return whether some of an array is known."""
+        return name in self._stored and self._stored[name][0].has(self._stored[name][1])
 
     def in_memory(self) -> Run:
         """Return the run with all of its arrays in memory."""
@@ -122,34 +139,30 @@ def recorded_run(content: Content, names: NameMap = NO_NAMES, namespace: str = '
         found = within(topic)
         return None if found is None else StoredSeries(found)
 
-    errors, references = (
-        None if found is None else found.at_stamps(stamp)
-        for found in (within(TRACKING_ERROR, joints), within(topics.REFERENCE, joints))
+    errors, references, bounds = (
+        within(topic, joints) for topic in (TRACKING_ERROR, topics.REFERENCE, topics.BOUND)
     )
-    bounds = within(topics.BOUND, joints)
-    held_bounds = None if bounds is None else bounds.held(stamp)
-    events = [event for at, event in content.events if span[0] <= at < span[1]]
-    settings = [event.content.get('parameters', {}) for event in events]
-    learning = series(topics.LEARNING)
     try:
-        _, torque = applied_torque(content, states)
+        _, torques = applied_torque(content, states)
     except TorqueError:
-        torque = next_effort(states)
+        torques = next_effort(states)
+    messages = {
+        'states': states,
+        'torques': torques,
+        'errors': errors and errors.at_stamps(stamp),
+        'references': references and references.at_stamps(stamp),
+        'bounds': bounds and bounds.held(stamp),
+    }
+    arrays = {name: (messages[source], k) for name, (_, source, k) in _ARRAYS.items()}
+    known = {name: (found, k) for name, (found, k) in arrays.items() if found is not None}
+    unknown = states.select(np.full(states.size, -1)), 0
+    for name, other in _COMPLEMENTS.items():
+        if other in known:
+            known.setdefault(name, unknown)
+    events = [event for at, event in content.events if span[0] <= at < span[1]]
+    learning = series(topics.LEARNING)
     return RecordedRun(
-        stored={
-            'position': (states, 0),
-            'velocity': (states, 1),
-            'effort': (states, 2),
-            'torque': (torque, 2),
-            'error': (errors, 0),
-            'reference': (references, 0),
-            'xi2': (errors, 1),
-            'reference_velocity': (references, 1),
-            'bound': (held_bounds, 0),
-            'torque_limit': (held_bounds, 2),
-        },
-        is_decimated=errors is not None
-        and any(values.get('telemetry.decimation', 1) > 1 for values in settings),
+        known,
         joints=joints,
         stamp=stamp,
         received=states.received,
@@ -161,8 +174,9 @@ def recorded_run(content: Content, names: NameMap = NO_NAMES, namespace: str = '
         rejected=_rejected_columns(content, learning, namespace),
         stops=tuple(_stops(events, int(stamp[0]))),
         arm=_arm(content),
-        learns=_learns(settings),
+        learns=_learns([event.content.get('parameters', {}) for event in events]),
         notes=notes,
+        **dict.fromkeys(_ARRAYS.keys() - known.keys()),
     )
 
 
@@ -342,3 +356,85 @@ def _by_joint(content: Content, commands: TopicMessages, joints: tuple[str, ...]
         f'{len(states.names)} in the joint states ({", ".join(states.names)}): their order is '
         'not known'
     )
+
+
+# The table, for spreadsheets, pandas and MATLAB.
+
+
+def table(run: RecordedRun, rows: slice = slice(None)) -> dict[str, NDArray[Any]]:
+    """Return some rows of every series of a run by name and unit, as `torque joint1 [N m]`.
+
+    They are aligned to the stamps of its joint states. `stamp` and `received` are integers, all
+    others floats, NaN where unknown. Values published with each sample are in the row of its stamp;
+    those published less often (truth, timing, monitor) are held until the next message.
+    """
+    stamp = run.stamp[rows]
+    columns: dict[str, NDArray[Any]] = {
+        'stamp [ns]': stamp,
+        'received [ns]': run.received[rows],
+        'time [s]': run.time_of(stamp),
+    }
+    for field, (unit, _, _) in _ARRAYS.items():
+        values = run.at(field, rows) if run.holds(field) else None
+        if values is not None:
+            for joint, column in zip(run.joints, values.T, strict=True):
+                columns[f'{field} {joint} [{unit}]'] = column
+    for topic in ('learning', 'truth', 'timing', 'monitor'):
+        series = getattr(run, topic)
+        if series is not None:
+            values = (series.exact if topic == 'learning' else series.held)(stamp)
+            for name, column in zip(series.names, values.T, strict=True):
+                columns[f'{topic} {name} [{_unit(name, run)}]'] = column
+    return columns
+
+
+def _unit(name: str, run: Run) -> str:
+    """Return the unit of a named value; parameters of a URDF have their own."""
+    if run.arm is not None and name in run.arm.units:
+        return run.arm.units[name] or '1'
+    if name == topics.LAMBDA_MIN and run.arm is None:
+        return 's^-4'
+    known = [unit for beginning, unit in _VALUES.items() if name.startswith(beginning)]
+    return known[0] if known else '1' if run.arm is not None else _PARAMETER
+
+
+def export(run: RecordedRun, path: Path) -> int:
+    """Write the table as CSV or Parquet, by the suffix of `path`; return the number of columns.
+
+    It is written block by block: a run may be larger than memory. Numbers are read back exactly.
+
+    Raises:
+        BlfDscError: the suffix is neither .csv nor .parquet.
+        MissingExtraError: pyarrow is not installed.
+    """
+    if path.suffix not in ('.csv', '.parquet'):
+        raise BlfDscError(
+            f'{path} ends in neither .csv nor .parquet: the file extension selects the format'
+        )
+    blocks = (slice(begin, begin + _ROWS) for begin in range(0, run.stamp.size, _ROWS))
+    (_write_csv if path.suffix == '.csv' else _write_parquet)(
+        (table(run, rows) for rows in blocks), path
+    )
+    return len(table(run, slice(1)))
+
+
+def _write_csv(tables: Iterator[dict[str, NDArray[Any]]], path: Path) -> None:
+    with path.open('w', encoding='utf-8', newline='') as stream:
+        writer = csv.writer(stream)
+        for k, block in enumerate(tables):
+            if k == 0:
+                writer.writerow(block)
+            writer.writerows(zip(*(values.tolist() for values in block.values()), strict=True))
+
+
+def _write_parquet(tables: Iterator[dict[str, NDArray[Any]]], path: Path) -> None:
+    try:
+        import pyarrow as pa
+        from pyarrow import parquet
+    except ImportError:
+        raise MissingExtraError('pyarrow', 'parquet', 'writing Parquet') from None
+    first = pa.table(next(tables))
+    with parquet.ParquetWriter(path, first.schema) as writer:
+        writer.write_table(first)
+        for block in tables:
+            writer.write_table(pa.table(block))

@@ -8,8 +8,9 @@ from __future__ import annotations
 
 import os
 import tempfile
+from bisect import bisect_right
 from collections.abc import Sequence
-from typing import Any
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,9 +29,8 @@ from blf_dsc_controller.messages.codecs import (
 from blf_dsc_controller.messages.topics import FLOAT64_MULTI_ARRAY, JOINT_STATE
 from blf_dsc_controller.run import Floats, Rows, Series, Stamps
 
-_WAITING = 512  # messages decoded at once
-_BLOCK = 4096  # rows that are written at once, each column in one piece
-_NUMBER, _RECEIVED, _SEQUENCE, _STAMP, _VALUES = range(5)  # columns of a layout
+_BLOCK = 2048  # messages decoded at once
+_NUMBER, _RECEIVED, _SEQUENCE, _STAMP, _VALUES = range(5)  # columns of a table
 ALL = slice(None)
 
 
@@ -47,49 +47,48 @@ class UnreadableMessageError(BagError):
         super().__init__(f'message {index + 1} of {topic} cannot be read: {reason}')
 
 
-class Columns:
-    """Append-only table of `width` columns of 64-bit numbers."""
+class _File:
+    """Temporary file that several tables share, and that is removed with the last of them."""
 
-    def __init__(self, width: int) -> None:
-        self.width = width
-        self._pending = np.empty((width, _BLOCK), np.int64)
-        self._blocks = self._filled = 0
-        self._file: Any = None
-
-    def __len__(self) -> int:
-        return _BLOCK * self._blocks + self._filled
+    def __init__(self) -> None:
+        self.stream = tempfile.TemporaryFile()  # noqa: SIM115 - closed below
 
     def __del__(self) -> None:
-        if self._file is not None:
-            self._file.close()
+        self.stream.close()
 
-    def append(self, rows: NDArray[np.int64]) -> None:
-        """Append rows (m, width)."""
-        while rows.shape[0]:
-            taken = rows[: _BLOCK - self._filled]
-            self._pending[:, self._filled : self._filled + taken.shape[0]] = taken.T
-            self._filled += taken.shape[0]
-            rows = rows[taken.shape[0] :]
-            if self._filled == _BLOCK:
-                if self._file is None:
-                    self._file = tempfile.TemporaryFile(buffering=0)  # noqa: SIM115 - its owner's
-                self._file.write(self._pending)
-                self._blocks, self._filled = self._blocks + 1, 0
+
+class Table:
+    """Append-only table of 64-bit numbers, with a block of each column in one piece of a file."""
+
+    def __init__(self, file: _File) -> None:
+        self._file = file
+        self._begins = [0]  # row at which each block begins, and the end
+        self._offsets: list[int] = []  # of each block [bytes]
+
+    def __len__(self) -> int:
+        return self._begins[-1]
+
+    def append(self, columns: NDArray[np.int64]) -> None:
+        """Append m rows, given as columns (width, m)."""
+        stream = self._file.stream
+        self._offsets.append(stream.seek(0, os.SEEK_END))
+        self._begins.append(len(self) + columns.shape[1])
+        stream.write(columns.tobytes())
+        stream.flush()
 
     def read(self, column: int, rows: NDArray[np.int32]) -> NDArray[np.int64]:
         """Return some rows of a column, as an array of its own."""
         if not rows.size:
             return np.empty(0, np.int64)
-        first, last = (int(row) // _BLOCK for row in (rows.min(), rows.max()))
-        found = np.empty((last + 1 - first, _BLOCK), np.int64)
-        for number in range(first, min(last + 1, self._blocks)):
-            offset = 8 * _BLOCK * (number * self.width + column)
-            found[number - first] = np.frombuffer(
-                os.pread(self._file.fileno(), 8 * _BLOCK, offset), np.int64
-            )
-        if last == self._blocks:
-            found[-1] = self._pending[column]
-        return np.asarray(found.ravel()[rows - first * _BLOCK])
+        first = bisect_right(self._begins, rows.min()) - 1
+        last = bisect_right(self._begins, rows.max())
+        descriptor, parts = self._file.stream.fileno(), []
+        edges = pairwise(self._begins[first : last + 1])
+        for offset, (begin, end) in zip(self._offsets[first:last], edges, strict=True):
+            size = 8 * (end - begin)
+            raw = os.pread(descriptor, size, offset + size * column)
+            parts.append(np.frombuffer(raw, np.int64))
+        return np.concatenate(parts)[rows - self._begins[first]]
 
 
 class JointStates:
@@ -101,7 +100,7 @@ class JointStates:
     def __init__(
         self,
         names: Sequence[str],
-        table: Columns,
+        table: Table,
         places: NDArray[np.intp],
         rows: NDArray[np.int32] | None = None,
     ) -> None:
@@ -156,11 +155,6 @@ class JointStates:
             chosen[rows < 0] = -1
         return JointStates(self.names, self._table, self._places, chosen)
 
-    def of(self, names: Sequence[str]) -> JointStates:
-        """Return the states of some of the names."""
-        columns = [self.names.index(name) for name in names]
-        return JointStates(names, self._table, self._places[:, columns], self._rows)
-
     def by_stamp(self) -> JointStates:
         """Return the states ordered by stamp, one per stamp."""
         stamp = self.stamp
@@ -184,17 +178,16 @@ class JointStates:
         """Return the states of several tables in order of reception."""
         if len(parts) == 1:
             return parts[0]
-        rows = [
-            np.column_stack((
+        together = np.hstack([
+            np.vstack((
                 *(part.head(column) for column in range(_VALUES)),
-                *(part.field(k).view(np.int64) for k in range(3)),
+                *(part.field(k).T.view(np.int64) for k in range(3)),
             ))
             for part in parts
-        ]  # fmt: skip
-        together, n = np.concatenate(rows), len(names)
-        table = Columns(_VALUES + 3 * n)
-        table.append(together[np.argsort(together[:, _NUMBER])])
-        return cls(names, table, np.arange(3 * n).reshape(3, n))
+        ])  # fmt: skip
+        table = Table(_File())
+        table.append(together[:, np.argsort(together[_NUMBER])])
+        return cls(names, table, np.arange(3 * len(names)).reshape(3, -1))
 
 
 class StoredSeries(Series):
@@ -217,80 +210,72 @@ class StoredSeries(Series):
         return self._of.field(0, rows, columns)
 
 
-class _Group:
-    """Messages of a layout, in a table: number, received, sequence, stamp, then all values."""
-
-    def __init__(self, layout: Layout, *, is_stamped: bool) -> None:
-        self.layout, self._is_stamped = layout, is_stamped
-        self.table = Columns(_VALUES + layout.places.size)
-
-    def add(self, first: int, messages: Sequence[BagMessage]) -> None:
-        """Decode messages of this layout with the numbers from `first` on."""
-        count, size, double = len(messages), self.layout.size, self.layout.double
-        rows = np.zeros((count, self.table.width), np.int64)
-        rows[:, _NUMBER] = first + np.arange(count)
-        rows[:, _RECEIVED] = [each.received for each in messages]
-        rows[:, _SEQUENCE] = [each.sequence for each in messages]
-        joined = b''.join([each.raw for each in messages])
-        if self._is_stamped:
-            kind = np.dtype([('s', 'i4'), ('ns', 'u4')]).newbyteorder(double.byteorder)
-            stamp = np.ndarray(count, kind, joined, STAMP_OFFSET, (size,))
-            rows[:, _STAMP] = stamp['s'].astype(np.int64) * NANOSECONDS + stamp['ns']
-        grid = np.ndarray((count, (size - ORIGIN) // 8), double, joined, ORIGIN, (size, 8))
-        rows[:, _VALUES:] = grid[:, self.layout.places].astype(np.float64).view(np.int64)
-        self.table.append(rows)
-
-
 class TopicMessages:
-    """All messages of one topic: tables of those of known types, or the others as bytes."""
+    """All messages of one topic: a table for each layout of known types, the others as bytes."""
 
     def __init__(self, name: str, type_name: str) -> None:
         self.name, self.type = name, type_name
         self.size = 0
         self.raw: list[bytes] = []  # of other types
         self.received: list[int] = []  # likewise [ns]
-        self._find = {JOINT_STATE: joint_state_layout, FLOAT64_MULTI_ARRAY: array_layout}.get(
-            type_name
-        )
-        self._groups: list[_Group] = []
+        self._file = _File()
+        self._tables: dict[Layout, Table] = {}
         self._unreadable: dict[int, MessageError] = {}
         self._waiting: list[BagMessage] = []
 
     def add(self, message: BagMessage) -> None:
         """Add a message."""
         self.size += 1
-        if self._find is None:
+        if self.type not in (JOINT_STATE, FLOAT64_MULTI_ARRAY):
             self.raw.append(message.raw)
             self.received.append(message.received)
         else:
             self._waiting.append(message)
-            if len(self._waiting) == _WAITING:
+            if len(self._waiting) == _BLOCK:
                 self.decode()
 
     def decode(self) -> None:
         """Decode the messages added last."""
-        waiting, self._waiting = self._waiting, []
-        begin, first = 0, self.size - len(waiting)
-        while begin < len(waiting):
-            end = begin + 1
-            group = self._group_of(waiting[begin].raw, first + begin)
-            if group is not None:
-                while end < len(waiting) and group.layout.fits(waiting[end].raw):
-                    end += 1
-                group.add(first + begin, waiting[begin:end])
-            begin = end
+        batches: dict[Layout, list[tuple[int, BagMessage]]] = {}
+        layout: Layout | None = None
+        for number, message in enumerate(self._waiting, self.size - len(self._waiting)):
+            if layout is None or not layout.fits(message.raw):
+                layout = self._layout_of(message.raw, number)
+            if layout is not None:
+                batches.setdefault(layout, []).append((number, message))
+        self._waiting = []
+        for each, batch in batches.items():
+            self._tables[each].append(self._columns(each, batch))
 
-    def _group_of(self, raw: bytes, number: int) -> _Group | None:
-        for group in self._groups:
-            if group.layout.fits(raw):
-                return group
+    def _layout_of(self, raw: bytes, number: int) -> Layout | None:
+        for layout in self._tables:
+            if layout.fits(raw):
+                return layout
         try:
-            layout: Any = self._find and self._find(raw)
+            layout = (joint_state_layout if self.type == JOINT_STATE else array_layout)(raw)
         except MessageError as error:
             self._unreadable[number] = error
             return None
-        self._groups.append(_Group(layout, is_stamped=self.type == JOINT_STATE))
-        return self._groups[-1]
+        self._tables[layout] = Table(self._file)
+        return layout
+
+    def _columns(
+        self, layout: Layout, batch: Sequence[tuple[int, BagMessage]]
+    ) -> NDArray[np.int64]:
+        """Decode messages of one layout: number, received, sequence, stamp, then all values."""
+        count, size, double = len(batch), layout.size, layout.double
+        columns = np.zeros((_VALUES + layout.places.size, count), np.int64)
+        columns[_NUMBER] = [number for number, _ in batch]
+        columns[_RECEIVED] = [each.received for _, each in batch]
+        columns[_SEQUENCE] = [each.sequence for _, each in batch]
+        joined = b''.join([each.raw for _, each in batch])
+        if self.type == JOINT_STATE:
+            kind = np.dtype([('s', 'i4'), ('ns', 'u4')]).newbyteorder(double.byteorder)
+            stamp = np.ndarray(count, kind, joined, STAMP_OFFSET, (size,))
+            columns[_STAMP] = stamp['s'].astype(np.int64) * NANOSECONDS + stamp['ns']
+        grid = np.ndarray((count, (size - ORIGIN) // 8), double, joined, ORIGIN, (size, 8))
+        columns[_VALUES:] = grid[:, layout.places].astype(np.float64).view(np.int64).T
+        return columns
 
     def joint_states(
         self,
@@ -306,17 +291,17 @@ class TopicMessages:
             UnreadableMessageError: a message cannot be decoded and `errors` is None, or none can.
         """
         unreadable, parts, foreign = dict(self._unreadable), [], None
-        for group in self._groups:
+        for layout, table in self._tables.items():
             try:
-                places = group.layout.columns(names, required)
+                places = layout.columns(names, required)
             except MessageError as error:
                 if isinstance(error, MissingJointError) and error.is_foreign(names):
                     foreign = foreign or error
                 else:
-                    numbers = JointStates((), group.table, np.empty((3, 0), np.intp)).number
+                    numbers = JointStates((), table, np.empty((3, 0), np.intp)).number
                     unreadable.update(dict.fromkeys(numbers.tolist(), error))
             else:
-                parts.append(JointStates(names, group.table, places))
+                parts.append(JointStates(names, table, places))
         if not parts and foreign is not None and not unreadable:
             unreadable[0] = foreign
         if unreadable and (errors is None or not parts):
@@ -325,36 +310,31 @@ class TopicMessages:
             errors.update(unreadable)
         return JointStates.merged(names, parts)
 
-    def vectors(self) -> JointStates:
-        """Return named values, sent as positions; UnreadableMessageError as above."""
-        return self.joint_states(self.joint_names(), ('position',))
-
     def arrays(self, columns: Sequence[int]) -> JointStates:
         """Return these values of each std_msgs/Float64MultiArray as efforts.
 
         Raises:
             UnreadableMessageError: a message cannot be decoded, or has other values.
         """
-        self.layout()
-        size = self._groups[0].layout.arrays[0].size
-        if len(self._groups) > 1 or self._unreadable or max(columns) >= size:
+        size = self.layout().arrays[0].size
+        if len(self._tables) > 1 or self._unreadable or max(columns) >= size:
             error = MessageError(f'not every message holds the same {size} values')
             raise UnreadableMessageError(self.name, *min([*self._unreadable.items(), (0, error)]))
         places = np.full((3, len(columns)), -1)
         places[2] = columns
-        names = [f'{k}' for k in columns]
-        return JointStates(names, self._groups[0].table, places)
+        (table,) = self._tables.values()
+        return JointStates([f'{k}' for k in columns], table, places)
 
     def layout(self) -> Layout:
         """Return the layout of the first message; UnreadableMessageError if it has none."""
-        if 0 in self._unreadable or not self._groups:
+        if 0 in self._unreadable or not self._tables:
             raise UnreadableMessageError(self.name, 0, self._unreadable[0])
-        return self._groups[0].layout
+        return next(iter(self._tables))
 
     def name_lists(self) -> list[tuple[str, ...]]:
         """Return the different lists of names; UnreadableMessageError as `layout`."""
         self.layout()
-        return list(dict.fromkeys(group.layout.names for group in self._groups))
+        return list(dict.fromkeys(layout.names for layout in self._tables))
 
     def joint_names(self) -> tuple[str, ...]:
         """Return the longest list of names in a message; UnreadableMessageError if it is empty."""

@@ -3,12 +3,9 @@
 
 from __future__ import annotations
 
-import errno
-import os
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict
-from io import BufferedWriter, FileIO
 from math import inf
 from pathlib import Path
 from typing import Any
@@ -24,43 +21,7 @@ from blf_dsc_controller.messages.topics import FOREVER, Quality
 _COMPRESSIONS = {'none': CompressionType.NONE, 'zstd': CompressionType.ZSTD}
 _CHUNK_SIZE = 1 << 20
 _MOST_CHUNKS = 10_000  # in a file, whose index is kept in memory until it ends
-_RESERVE = 16 << 20  # bytes: the current chunk, metadata.yaml, and the index of a file's chunks
-_FULL = (errno.ENOSPC, errno.EDQUOT)
 _DURATIONS = ('deadline', 'lifespan', 'liveliness_lease_duration')
-
-
-class DiskFullError(BagError):
-    """The disk is full; the bag has been completed and closed."""
-
-    def __init__(self, path: Path, messages: int) -> None:
-        self.messages = messages
-        super().__init__(
-            f'the disk is full: recording into {path} has ended with {messages} messages, which '
-            'are complete and readable; make room before the next recording'
-        )
-
-
-class _ReservedFile(FileIO):
-    """File that can still be completed when its disk is full.
-
-    The file `reserve` keeps room for what is not written yet. It is removed when the disk is full;
-    `is_full` then means: complete the file.
-    """
-
-    def __init__(self, path: Path, reserve: Path) -> None:
-        super().__init__(path, 'xb')
-        self._reserve, self.is_full = reserve, False
-
-    def write(self, data: Any) -> int:
-        """Write bytes, giving up the reserve if needed."""
-        try:
-            return super().write(data)
-        except OSError as error:
-            if error.errno not in _FULL or self.is_full:
-                raise
-        self.is_full = True
-        self._reserve.unlink(missing_ok=True)
-        return super().write(data)
 
 
 def _period(start: int, end: int) -> dict[str, Any]:
@@ -89,6 +50,7 @@ class BagWriter:
     Data leaves the process within `flush_interval` [s] plus the time to the next call of `write` or
     `flush_if_due`, and then survives a kill of the process. Without an interval it leaves when a
     chunk is full. The compression of chunks is `none` or `zstd`. A file ends after 10,000 chunks.
+    After an OSError, such as that of a full disk, `recover` saves what was written before.
 
     Raises:
         BagError: `path` exists already.
@@ -119,9 +81,6 @@ class BagWriter:
             raise BagError(
                 f'{path} exists already and is not overwritten: choose another folder or remove it'
             ) from None
-        self._reserve = self.path / '.reserve'
-        with self._reserve.open('xb') as reserve:
-            os.posix_fallocate(reserve.fileno(), 0, _RESERVE)
         self._flushed = self._clock()
         self._begin_file()
 
@@ -164,13 +123,9 @@ class BagWriter:
 
         It was received at `log_time` [ns] and published at `publish_time` [ns], or `log_time` if
         not known, with the `sequence` number of the publisher, 0 if not known.
-
-        Raises:
-            DiskFullError: there is no room left; the bag is complete and closed.
         """
         if self._chunks >= _MOST_CHUNKS:
             self._end_file()
-            self._stop_if_full()
             self._begin_file()
         published = log_time if publish_time is None else publish_time
         self._writer.add_message(handle, log_time, raw, published, sequence)
@@ -185,32 +140,24 @@ class BagWriter:
         self._writer.add_metadata(RECORD, self._facts)
 
     def flush_if_due(self) -> None:
-        """Flush if the flush interval has passed; DiskFullError as in `write`."""
-        if self._file.is_full or self._clock() - self._flushed >= self._flush_interval:
+        """Flush if the flush interval has passed."""
+        if self._clock() - self._flushed >= self._flush_interval:
             self.flush()
 
     def flush(self) -> None:
-        """Pass everything written so far to the operating system; DiskFullError as in `write`."""
-        if self.closed:  # a timer may fire once more
-            return
-        self._end_chunk()
-        self._flushed = self._clock()
-        self._stop_if_full()
+        """Pass everything written so far to the operating system."""
+        if not self.closed:  # a timer may fire once more
+            self._end_chunk()
+            self._flushed = self._clock()
 
     def close(self) -> None:
         """Complete the bag; a second call does nothing."""
         if self.closed:
             return
         self.closed = True
-        self._reserve.unlink(missing_ok=True)
         self._end_file()
         text = _dump({'rosbag2_bagfile_information': self._information()})
         (self.path / METADATA).write_text(text, encoding='utf-8')
-
-    def _stop_if_full(self) -> None:
-        if self._file.is_full:
-            self.close()
-            raise DiskFullError(self.path, sum(self.message_counts.values()))
 
     @property
     def message_counts(self) -> dict[str, int]:
@@ -228,21 +175,14 @@ class BagWriter:
         name = f'{self.path.name}_{len(self._files)}.mcap'
         self._first, self._last = FOREVER, 0
         self._files.append({'path': name, **_period(FOREVER, 0), 'message_count': 0})
-        self._file = _ReservedFile(self.path / name, self._reserve)
-        self._stream = BufferedWriter(self._file)
+        self._stream = (self.path / name).open('xb')
         self._writer = Writer(self._stream, chunk_size=_CHUNK_SIZE, compression=self._compression)
         self._writer.start(profile='ros2', library=f'blf_dsc_controller {__version__}')
         self._schemas: dict[str, int] = {}
         self._chunks = 0
-        self._describe()
         for topic, found in zip(self._topics, self._definitions, strict=True):
             self._add_channel(topic['topic_metadata'], found)
         self.note({})
-
-    def _describe(self) -> None:
-        """Store the metadata so far; rosbag2 reads the last such record of a file."""
-        text = _dump(self._information())
-        self._writer.add_metadata('rosbag2', {'serialized_metadata': text})
 
     def _information(self) -> dict[str, Any]:
         """Return rosbag2's metadata, version 9 (that of Jazzy), in its order.
@@ -287,11 +227,7 @@ class BagWriter:
         self._chunks += self._stream.tell() > before
 
     def _end_file(self) -> None:
-        """Complete the file, unless it is complete."""
-        if self._stream.closed:
-            return
         self._end_chunk()
-        self._describe()
         self._writer.finish()  # type: ignore[no-untyped-call]
         self._stream.close()
 

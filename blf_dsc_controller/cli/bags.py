@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from blf_dsc_controller.bags import reader
 from blf_dsc_controller.bags import recover as recovering
 from blf_dsc_controller.bags.content import NameMap, read_content
-from blf_dsc_controller.bags.reader import RecordedRun, recorded_run
 from blf_dsc_controller.bags.sources import open_bag
 from blf_dsc_controller.cli.main import make_room, require_ros
 from blf_dsc_controller.errors import BlfDscError
@@ -41,10 +41,10 @@ def report(options: Namespace) -> None:
     print(f'wrote {options.out} ({options.out.stat().st_size / 1e6:.1f} MB)')
 
 
-def _run(options: Namespace) -> RecordedRun:
+def _run(options: Namespace) -> reader.RecordedRun:
     """Read the run of a bag, and print what is left out."""
     names = NameMap.parse(options.map)
-    run = recorded_run(
+    run = reader.recorded_run(
         read_content(options.bag, options.namespace, names), names, options.namespace
     )
     for note in run.notes:
@@ -54,11 +54,9 @@ def _run(options: Namespace) -> RecordedRun:
 
 def export(options: Namespace) -> None:
     """Write a bag as a table."""
-    from blf_dsc_controller.bags.table import export as export_run
-
     make_room(options.out, force=options.force)
     run = _run(options)
-    columns = export_run(run, options.out)
+    columns = reader.export(run, options.out)
     print(f'wrote {options.out}: {run.stamp.size} rows of {columns} columns')
 
 

@@ -77,9 +77,7 @@ class Event(NamedTuple):
 
     def encode(self) -> bytes:
         """Return the serialised std_msgs/String."""
-        text = json.dumps(self._asdict())
-        message = typestore().types[JOURNAL.type](data=text)
-        return bytes(typestore().serialize_cdr(message, JOURNAL.type))
+        return _json(self._asdict())
 
 
 def encode_change(stamp: int, parameters: Mapping[str, Any], *, configured: bool = False) -> bytes:
@@ -87,9 +85,10 @@ def encode_change(stamp: int, parameters: Mapping[str, Any], *, configured: bool
 
     `configured`: these are all of them, at the start.
     """
-    content = {'stamp': stamp, 'parameters': parameters} | (
-        {'configured': True} if configured else {}
-    )
+    return _json({'stamp': stamp, 'parameters': parameters, 'configured': configured})
+
+
+def _json(content: Mapping[str, Any]) -> bytes:
     message = typestore().types[JOURNAL.type](data=json.dumps(content))
     return bytes(typestore().serialize_cdr(message, JOURNAL.type))
 

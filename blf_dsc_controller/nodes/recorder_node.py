@@ -19,7 +19,7 @@ from rclpy.node import Node
 from rclpy.publisher import Publisher
 
 from blf_dsc_controller.bags.sources import BagError, OpenBag
-from blf_dsc_controller.bags.writer import BagWriter, DiskFullError, Losses, statistics
+from blf_dsc_controller.bags.writer import BagWriter, Losses, statistics
 from blf_dsc_controller.configuration.nodes import RecorderConfig
 from blf_dsc_controller.messages.codecs import (
     MessageError,
@@ -77,14 +77,14 @@ class BagRecorderNode(PlainNode):
 
     def close(self) -> None:
         """Write the waiting messages, complete the bag and log a summary."""
-        if self.failure is None:
-            self._record()
-            for message in self._waiting:  # there was no joint state
-                self._bag.write(*message)
+        self._record()
         self._raw_subscriptions.close()
-        if not self._bag.closed:
-            self._bag.note(statistics(self._bag.message_counts, self._losses))
-            self._bag.close()
+        if self.failure is not None or self._bag.closed:
+            return
+        for message in self._waiting:  # there was no joint state
+            self._bag.write(*message)
+        self._bag.note(statistics(self._bag.message_counts, self._losses))
+        self._bag.close()
         for line in self._summary():
             self.get_logger().info(line)
 
@@ -148,13 +148,11 @@ class BagRecorderNode(PlainNode):
                 self._losses_by_handle[message.handle].count(message.sequence)
                 self._bag.write(*message)
             (self._bag.flush if flush else self._bag.flush_if_due)()
-        except DiskFullError as error:
-            self.failure, self.finished = error, True
         except OSError as error:
             self.finished = True
             self.failure = BagError(
-                f'the bag cannot be written any further: {error}; blf_dsc recover saves what '
-                'was written before'
+                f'{self._bag.path} cannot be written any further: {error.strerror}; '
+                f'blf_dsc recover {self._bag.path} saves what was written before'
             )
 
     def _timed(self, messages: list[RawMessage]) -> list[RawMessage]:
