@@ -1,31 +1,40 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The recorder in its own process: signals, kills, a full disk, odd types."""
+"""The recorder in its own process: signals, kills, a full disk, odd types, beside a loop.
+
+Sequence numbers of the publishers reveal losses. `make test-nightly` records a minute.
+"""
 
 from __future__ import annotations
 
+import json
 import os
 import random
 import signal
 import subprocess
 import sys
 import time
+from collections import defaultdict
 from pathlib import Path
 
 import pytest
 
 pytest.importorskip('rclpy', reason='needs ROS 2')
 
+from command import PATIENT, closed_loop
 from foreign_readers import messages_on_disk, read
+from mcap.reader import make_reader
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from ros_rig import RosRig
 from rosbags.rosbag2 import Reader
 from sensor_msgs.msg import JointState
 from small_disk import small_disk
 
+from blf_dsc_controller.bags.content import read_content
 from blf_dsc_controller.bags.recover import recover
+from blf_dsc_controller.messages import topics
 from blf_dsc_controller.messages.codecs import JointStateEncoder, joint_state_stamp
 
-KILLS, MOST = (20, 10_000) if os.environ.get('NIGHTLY') else (3, 1000)
+KILLS, MOST, DURATION = (20, 10_000, 60) if os.environ.get('NIGHTLY') else (3, 1000, 3)  # s
 PATIENCE = 300.0  # s, until a test gives up on what should take a moment
 RECORDER = (sys.executable, '-m', 'blf_dsc_controller.nodes.recorder_node', '--ros-args')
 ODD_PARTICIPANT = Path(__file__).with_name('odd_participant.py')
@@ -33,6 +42,14 @@ ENCODER = JointStateEncoder(['joint1', 'joint2'])
 # Kept for the recorder, which may match slightly later than the publisher.
 KEPT = QoSProfile(depth=5000, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 TOPICS = ('a', 'b', 'c', 'd', 'e')
+EACH_SAMPLE = (
+    topics.JOINT_STATES,
+    topics.TIMING,
+    topics.COMMANDS,
+    topics.REFERENCE,
+    topics.TRACKING_ERROR,
+    topics.LEARNING,
+)
 
 
 class Rig(RosRig):
@@ -51,11 +68,11 @@ class Rig(RosRig):
         self.processes.append(process)
         return process
 
-    def record(self, output, topics=TOPICS):
+    def record(self, output, chosen=TOPICS):
         """Start a recorder, and wait until it has subscribed."""
-        words = ('-p', f'output:={output}', '-p', f'topics:=[{", ".join(topics)}]')
+        words = ('-p', f'output:={output}', '-p', f'topics:=[{", ".join(chosen)}]')
         process = self.start([*RECORDER, *words], stderr=subprocess.PIPE)
-        wanted = [each for each in self.publishers if each.topic_name[1:] in topics]
+        wanted = [each for each in self.publishers if each.topic_name[1:] in chosen]
         self.until(lambda: all(each.get_subscription_count() for each in wanted))
         return process
 
@@ -188,3 +205,60 @@ def test_kill_loses_nothing_that_was_written(k, rig, tmp_path):
         numbers[topic].append(joint_state_stamp(raw))
     assert sum(map(len, numbers.values())) >= written
     assert all(found == list(range(len(found))) for found in numbers.values())
+
+
+# Beside a loop in real time.
+
+
+@pytest.fixture(scope='module')
+def out(tmp_path_factory):
+    """Results of a run in real time."""
+    folder = tmp_path_factory.mktemp('run')
+    config = folder / 'fifo.yaml'
+    # Only one node, which cannot keep the others from both processors.
+    fifo = 'sim_plant:\n  ros__parameters:\n    realtime: {priority: 10, lock_memory: true}\n'
+    config.write_text(fifo + PATIENT)
+    arguments = ('--config', config, '--mode', 'realtime', '--duration', DURATION)
+    run = closed_loop(*arguments, '--out', folder / 'out')
+    assert run.returncode == 0, run.stderr
+    (folder / 'out' / 'output.txt').write_text(run.stdout)
+    return folder / 'out'
+
+
+def test_timing_and_permissions_are_reported(out):
+    timing = json.loads((out / 'summary.json').read_text())['timing']
+    assert set(timing) == {'rate_hz', 'latency_us', 'late_steps'}
+    assert timing['rate_hz'] > 0.0
+    assert list(timing['latency_us']) == ['p50', 'p99', 'p99.9', 'max']
+    assert timing['late_steps'] >= 0
+    output = (out / 'output.txt').read_text()
+    assert 'real time' in output
+    assert 'late steps' in output
+    log = (out / 'logs' / f'{topics.PLANT}.log').read_text()
+    # Granted or denied, as this machine permits, but always logged.
+    assert 'SCHED_FIFO priority 10' in log
+    assert 'memory' in log
+
+
+def test_every_message_of_a_real_time_loop_is_in_the_bag(out):
+    recorded = defaultdict(list)
+    with (out / 'bag' / 'bag_0.mcap').open('rb') as stream:
+        for _, channel, message in make_reader(stream).iter_messages():
+            recorded[channel.topic].append(message.sequence)
+    facts = read_content(out / 'bag').facts
+    for topic in EACH_SAMPLE:
+        count = len(recorded[topic.resolved])
+        assert recorded[topic.resolved] == list(range(1, count + 1))
+        assert facts[f'messages {topic.resolved}'] == f'{count} written, 0 missed'
+    logs = [
+        (out / 'logs' / f'{node}.log').read_text() for node in (topics.PLANT, topics.CONTROLLER)
+    ]
+    # On a busy machine the first torque may take seconds, and the plant sends its state again.
+    again = logs[0].count('sending the state again')
+    assert len(recorded[topics.JOINT_STATES.resolved]) == 1000 * DURATION + 1 + again
+    assert len(recorded[topics.TIMING.resolved]) == 1000 * DURATION  # one for each step
+    # On a busy machine the controller may skip a state; it then publishes nothing for it.
+    answered = (topics.REFERENCE, topics.TRACKING_ERROR, topics.LEARNING)
+    assert len({len(recorded[topic.resolved]) for topic in answered}) == 1
+    # Nor were the last ones lost, which no later sequence number would reveal.
+    assert not any('not reach every' in log for log in logs)

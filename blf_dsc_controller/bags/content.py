@@ -17,23 +17,12 @@ from blf_dsc_controller.bags.topic_messages import TopicMessages
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.schema import build
 from blf_dsc_controller.errors import BlfDscError
+from blf_dsc_controller.messages import topics
 from blf_dsc_controller.messages.codecs import typestore
 from blf_dsc_controller.messages.journal import Event, EventType, decode
-from blf_dsc_controller.messages.topics import (
-    CHANGES,
-    CLOCK,
-    COMMANDS,
-    CONTROLLER,
-    JOINT_STATE,
-    JOINT_STATES,
-    JOURNAL,
-    PLANT,
-    TOPICS,
-    Topic,
-)
 
-_OF_INTEREST = (*(topic for topic in TOPICS if topic is not CLOCK), CHANGES)
-_KEPT = frozenset(topic.leaf for topic in TOPICS if topic.offered.depth > 1)
+_OF_INTEREST = (*(topic for topic in topics.TOPICS if topic is not topics.CLOCK), topics.CHANGES)
+_KEPT = frozenset(topic.leaf for topic in topics.TOPICS if topic.offered.depth > 1)
 
 
 @dataclass(frozen=True)
@@ -53,14 +42,14 @@ class NameMap:
         sides: tuple[dict[str, str], dict[str, str]] = {}, {}
         for entry in entries:
             ours, _, theirs = (side.strip() for side in entry.partition('='))
-            side = sides[ours not in {topic.leaf for topic in TOPICS}]
+            side = sides[ours not in {topic.leaf for topic in topics.TOPICS}]
             if not ours or not theirs:
                 raise _bad_entry(entry, 'one side is missing')
             if ours in side or theirs in side.values():
                 raise _bad_entry(entry, 'a name is given twice')
             side[ours] = theirs
-        topics, joints = sides
-        return cls({leaf: '/' + name.lstrip('/') for leaf, name in topics.items()}, joints)
+        by_leaf, joints = sides
+        return cls({leaf: '/' + name.lstrip('/') for leaf, name in by_leaf.items()}, joints)
 
     def joints_of(self, joints: Sequence[str]) -> tuple[str, ...]:
         """Return the names that these joints have in the bag.
@@ -86,7 +75,7 @@ class Content:
     """
 
     path: Path
-    topics: Mapping[Topic, TopicMessages]
+    topics: Mapping[topics.Topic, TopicMessages]
     message_counts: Mapping[str, int]
     facts: Mapping[str, str]
 
@@ -108,7 +97,7 @@ class Content:
     @cached_property
     def events(self) -> list[tuple[int, Event]]:
         """Events of the journal and when they were received [ns]; others' messages are skipped."""
-        journal = self.topics.get(JOURNAL)
+        journal = self.topics.get(topics.JOURNAL)
         found = []
         for received, raw in zip(journal.received, journal.raw, strict=True) if journal else ():
             with suppress(BlfDscError):
@@ -118,11 +107,11 @@ class Content:
     @cached_property
     def changes(self) -> list[dict[str, Any]]:
         """What the plant said of its parameters: all of them first, then each change."""
-        changes = self.topics.get(CHANGES)
+        changes = self.topics.get(topics.CHANGES)
         found = []
         for raw in changes.raw if changes else ():
             with suppress(Exception):  # of another node
-                message: Any = typestore().deserialize_cdr(raw, CHANGES.type)
+                message: Any = typestore().deserialize_cdr(raw, topics.CHANGES.type)
                 found.append({'stamp': 0, 'parameters': {}, **json.loads(message.data)})
         return found
 
@@ -132,10 +121,10 @@ class Content:
         found: dict[str, dict[str, Any]] = {}
         for _, event in self.events:
             if event.type is EventType.CONFIGURE:
-                found.setdefault(CONTROLLER, event.content['parameters'])
+                found.setdefault(topics.CONTROLLER, event.content['parameters'])
         for change in self.changes:
             if change.get('configured'):
-                found[PLANT] = change['parameters']
+                found[topics.PLANT] = change['parameters']
         return found
 
     def controller_config(self) -> ControllerConfig:
@@ -145,13 +134,13 @@ class Content:
             BagError: the bag holds none.
             ConfigurationError: this version of the package cannot run the configuration.
         """
-        values = self.configurations.get(CONTROLLER)
+        values = self.configurations.get(topics.CONTROLLER)
         if values is None:
             raise BagError(
                 f'{self.path} does not hold the configuration of a controller: it was recorded by '
                 'something else, or without the controller'
             )
-        source = f'{self.path}, {JOURNAL.resolved}'
+        source = f'{self.path}, {topics.JOURNAL.resolved}'
         if self.version != __version__:
             source += f' by version {self.version or "unknown"}, not {__version__}'
         return build(ControllerConfig, values, source)
@@ -169,22 +158,22 @@ def read_content(path: Path, namespace: str = '', names: NameMap = NO_NAMES) -> 
             raise BagError(f'{path} is empty: it holds no message')
         names = _recorded_names(bag, namespace, names)
         found = {topic: _find(topic, bag.held, namespace, names) for topic in _OF_INTEREST}
-        if found[JOINT_STATES] is None:
-            raise _missing_topic(JOINT_STATES.name, JOINT_STATES.type, bag.held)
+        if found[topics.JOINT_STATES] is None:
+            raise _missing_topic(topics.JOINT_STATES.name, topics.JOINT_STATES.type, bag.held)
         types = dict(bag.held)
-        topics = {
-            topic: TopicMessages(name, types[name] if topic is COMMANDS else topic.type)
+        kept = {
+            topic: TopicMessages(name, types[name] if topic is topics.COMMANDS else topic.type)
             for topic, name in found.items()
             if name is not None
         }
-        adds = {messages.name: messages.add for messages in topics.values()}
+        adds = {messages.name: messages.add for messages in kept.values()}
         for message in bag.messages(adds):
             adds[message.topic](message)
-    for messages in topics.values():
+    for messages in kept.values():
         messages.decode()
-    if not topics[JOINT_STATES].size:
-        raise BagError(f'{path} is empty: it holds no message of {found[JOINT_STATES]}')
-    held = {topic: messages for topic, messages in topics.items() if messages.size}
+    if not kept[topics.JOINT_STATES].size:
+        raise BagError(f'{path} is empty: it holds no message of {found[topics.JOINT_STATES]}')
+    held = {topic: messages for topic, messages in kept.items() if messages.size}
     return Content(path, held, bag.counts, bag.facts)
 
 
@@ -193,9 +182,9 @@ def _recorded_names(bag: OpenBag, namespace: str, names: NameMap) -> NameMap:
 
     So it is with a driver whose joint states also come at a lower rate, as those of an FR3 do.
     """
-    journal = _find(JOURNAL, bag.held, namespace, names)
+    journal = _find(topics.JOURNAL, bag.held, namespace, names)
     held = {name for name, _ in bag.held}
-    if journal is None or sum(name.endswith(f'/{JOINT_STATES.leaf}') for name in held) < 2:
+    if journal is None or sum(name.endswith(f'/{topics.JOINT_STATES.leaf}') for name in held) < 2:
         return names
     recorded: dict[str, str] = {}
     with suppress(BlfDscError, StopIteration):
@@ -204,7 +193,9 @@ def _recorded_names(bag: OpenBag, namespace: str, names: NameMap) -> NameMap:
     return NameMap({**own, **names.topics}, names.joints)
 
 
-def _find(topic: Topic, held: list[tuple[str, str]], namespace: str, names: NameMap) -> str | None:
+def _find(
+    topic: topics.Topic, held: list[tuple[str, str]], namespace: str, names: NameMap
+) -> str | None:
     """Return the name of a topic in a bag, None if it is missing.
 
     Type and full name must match; unless the name is absolute, it may also follow any namespace,
@@ -212,7 +203,7 @@ def _find(topic: Topic, held: list[tuple[str, str]], namespace: str, names: Name
     """
     name = names.topics.get(topic.leaf)
     if name is not None:
-        types = (topic.type, JOINT_STATE) if topic is COMMANDS else (topic.type,)
+        types = (topic.type, topics.JOINT_STATE) if topic is topics.COMMANDS else (topic.type,)
         if not any((name, type_) in held for type_ in types):
             raise _missing_topic(name, ' or '.join(types), held)
         return name

@@ -25,13 +25,6 @@ from blf_dsc_controller.errors import BlfDscError, MissingExtraError
 from blf_dsc_controller.messages import topics
 from blf_dsc_controller.messages.codecs import typestore
 from blf_dsc_controller.messages.journal import Event, EventType
-from blf_dsc_controller.messages.topics import (
-    COMMANDS,
-    CONTROLLER,
-    JOINT_STATE,
-    JOINT_STATES,
-    TRACKING_ERROR,
-)
 from blf_dsc_controller.run import Floats, LearnedArm, Rows, Run, Series, Stop
 
 _MOST_FALLS = 10  # of the stamps, by resets of a simulator
@@ -140,7 +133,7 @@ def recorded_run(content: Content, names: NameMap = NO_NAMES, namespace: str = '
         return None if found is None else StoredSeries(found)
 
     errors, references, bounds = (
-        within(topic, joints) for topic in (TRACKING_ERROR, topics.REFERENCE, topics.BOUND)
+        within(topic, joints) for topic in (topics.TRACKING_ERROR, topics.REFERENCE, topics.BOUND)
     )
     try:
         _, torques = applied_torque(content, states)
@@ -191,7 +184,7 @@ def single_run(
     Raises:
         BagError: all stamps are the same, or several publishers share the topic.
     """
-    messages = content.topics[JOINT_STATES]
+    messages = content.topics[topics.JOINT_STATES]
     states = messages.joint_states(joints, required)
     stamp, received = states.stamp, states.received
     if stamp.size > 1 and (stamp == stamp[0]).all():
@@ -244,11 +237,11 @@ def _alternates(states: JointStates) -> bool:
 
 def _joints(content: Content, names: NameMap) -> tuple[str, ...]:
     """Return the controller's joints in its order; without it, those of `names`, or all."""
-    sources = (TRACKING_ERROR, topics.REFERENCE, topics.BOUND)
+    sources = (topics.TRACKING_ERROR, topics.REFERENCE, topics.BOUND)
     of_controller = [content.topics[topic] for topic in sources if topic in content.topics]
     if not of_controller and names.joints:
         return tuple(names.joints)
-    return (*of_controller, content.topics[JOINT_STATES])[0].joint_names()
+    return (*of_controller, content.topics[topics.JOINT_STATES])[0].joint_names()
 
 
 def _rejected_columns(content: Content, learning: Series | None, namespace: str) -> dict[str, str]:
@@ -273,7 +266,7 @@ def _rejected_columns(content: Content, learning: Series | None, namespace: str)
 
 def _arm(content: Content) -> LearnedArm | None:
     """Return the arm of the recorded configuration; None unless its URDF can still be read."""
-    if content.configurations.get(CONTROLLER, {}).get('model') == 'urdf':
+    if content.configurations.get(topics.CONTROLLER, {}).get('model') == 'urdf':
         from blf_dsc_controller.law.telemetry import learned_arm  # slow: compiles
 
         with suppress(BlfDscError):
@@ -312,7 +305,10 @@ def applied_torque(content: Content, states: JointStates) -> tuple[str, JointSta
     Raises:
         TorqueError: the bag holds none of them, or commands in an unknown order.
     """
-    commands, errors = content.topics.get(COMMANDS), content.topics.get(TRACKING_ERROR)
+    commands, errors = (
+        content.topics.get(topics.COMMANDS),
+        content.topics.get(topics.TRACKING_ERROR),
+    )
     if commands is not None and (errors is None or commands.size == states.size):
         return commands.name, _commanded(content, commands, states)
     if errors is not None:
@@ -324,7 +320,7 @@ def applied_torque(content: Content, states: JointStates) -> tuple[str, JointSta
             f'{content.path} does not hold the torques: there is no command topic (map it: '
             '--map commands=/its/name) and the effort of the joint states is empty'
         )
-    return f'effort of {content.topics[JOINT_STATES].name}', found
+    return f'effort of {content.topics[topics.JOINT_STATES].name}', found
 
 
 def next_effort(states: JointStates) -> JointStates:
@@ -343,10 +339,10 @@ def _commanded(content: Content, commands: TopicMessages, states: JointStates) -
 
 def _by_joint(content: Content, commands: TopicMessages, joints: tuple[str, ...]) -> JointStates:
     """Return commands by name; without names, in the order of `joints` or of the joint states."""
-    if commands.type == JOINT_STATE:
+    if commands.type == topics.JOINT_STATE:
         return commands.joint_states(joints, ('effort',))
     size = commands.layout().arrays[0].size
-    states = content.topics[JOINT_STATES].layout()
+    states = content.topics[topics.JOINT_STATES].layout()
     if size == len(joints):
         return commands.arrays(range(size))
     if size == len(states.names):

@@ -81,6 +81,8 @@ def run_session(config: LoopConfig, out: Path, domain: int | None, view_host: st
                 print(f'no space left on the disk of {out}', file=sys.stderr)
             if (out / 'bag' / 'metadata.yaml').exists():
                 print(f'the recording up to then is in {out / "bag"}', file=sys.stderr)
+            elif (out / 'bag').exists():
+                print(f'blf_dsc recover {out / "bag"} saves what was recorded', file=sys.stderr)
             raise
 
 

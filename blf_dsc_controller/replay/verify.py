@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
@@ -15,36 +15,22 @@ from blf_dsc_controller.bags.content import NO_NAMES, Content, NameMap, read_con
 from blf_dsc_controller.bags.topic_messages import JointStates, TopicMessages
 from blf_dsc_controller.configuration.schema import flatten
 from blf_dsc_controller.errors import BlfDscError
+from blf_dsc_controller.messages import topics
 from blf_dsc_controller.messages.codecs import JOINT_STATE_FIELDS, MessageError
 from blf_dsc_controller.messages.journal import FORMAT, Event, EventType, machine
-from blf_dsc_controller.messages.topics import (
-    BOUND,
-    COMMANDS,
-    COMPUTE_TIME,
-    DIAGNOSTICS,
-    FLOAT64_MULTI_ARRAY,
-    FOREVER,
-    JOINT_STATES,
-    JOURNAL,
-    LEARNING,
-    MONITOR,
-    REFERENCE,
-    STATE,
-    TRACKING_ERROR,
-    Topic,
-)
 from blf_dsc_controller.replay.rerun import Rerun
 from blf_dsc_controller.run import Floats, Stamps
 
 _BLOCK = 4096  # messages compared at once
 _COMPARED = {  # topic: fields
-    COMMANDS: (2,),
-    TRACKING_ERROR: (0, 1, 2),
-    REFERENCE: (0, 1),
-    LEARNING: (0,),
-    MONITOR: (0,),
-    BOUND: (0, 2),
+    topics.COMMANDS: (2,),
+    topics.TRACKING_ERROR: (0, 1, 2),
+    topics.REFERENCE: (0, 1),
+    topics.LEARNING: (0,),
+    topics.MONITOR: (0,),
+    topics.BOUND: (0, 2),
 }
+_TEXTS = (topics.STATE, topics.DIAGNOSTICS)
 _TRANSITIONS = (EventType.ACTIVATE, EventType.DEACTIVATE, EventType.RESET, EventType.STOP)
 
 
@@ -141,7 +127,7 @@ def verify(path: Path, namespace: str = '', names: NameMap = NO_NAMES) -> Verifi
     config = content.controller_config()
     newer = sorted(flatten(config).keys() - events[0].content['parameters'].keys())
     errors: dict[int, MessageError] = {}
-    states = content.topics[JOINT_STATES].joint_states(
+    states = content.topics[topics.JOINT_STATES].joint_states(
         names.joints_of(config.joints), ('position',), errors
     )
     start = next((event.stamp for event in events if event.type is EventType.START), None)
@@ -150,7 +136,7 @@ def verify(path: Path, namespace: str = '', names: NameMap = NO_NAMES) -> Verifi
             f'{path} does not hold the first state that the controller used, with the stamp '
             f'{start} ns, so its outputs cannot be reproduced: start the recorder first'
         )
-    answers = _before(content.topics[TRACKING_ERROR].joint_states(config.joints, ()), until)
+    answers = _before(content.topics[topics.TRACKING_ERROR].joint_states(config.joints, ()), until)
     run = Rerun(config, _before(states, until), errors, answers, _COMPARED)
     run.run(events[1:])
     comparisons = tuple(_compared(content, run, answers, config.joints))
@@ -158,7 +144,7 @@ def verify(path: Path, namespace: str = '', names: NameMap = NO_NAMES) -> Verifi
     outputs, departure = run.outputs, run.departure
     if departure is not None:
         time = (departure.stamp - max(outputs.first, 0)) * 1e-9
-        topic = TRACKING_ERROR.resolved
+        topic = topics.TRACKING_ERROR.resolved
         differences.insert(0, Difference(topic, *departure, time, 1.0, 0.0))
     elif not any(found.values for found in comparisons):
         raise _nothing_to_compare(content)
@@ -167,26 +153,24 @@ def verify(path: Path, namespace: str = '', names: NameMap = NO_NAMES) -> Verifi
         (outputs.last - outputs.first) * 1e-9,
         run.passed_over,
         comparisons,
-        tuple(
-            content.topics[topic].name for topic in (STATE, DIAGNOSTICS) if topic in content.topics
-        ),
+        tuple(content.topics[topic].name for topic in _TEXTS if topic in content.topics),
         tuple(run.events),
         outputs.safe_torques,
-        (*_remarks(content, run.end or end, newer), *_other_machine(events[0])),
+        tuple(_remarks(content, run.end or end, newer, events[0].content.get('machine', {}))),
         min(differences, key=lambda found: found.stamp, default=None),
     )
 
 
 def _events(content: Content) -> tuple[list[Event], int, str]:
     """Return the events of a bag's first controller, when the next begins [ns], and a remark."""
-    if not {JOURNAL, TRACKING_ERROR} <= content.topics.keys():
+    if not {topics.JOURNAL, topics.TRACKING_ERROR} <= content.topics.keys():
         raise _nothing_to_compare(content)
     begins = [k for k, (_, event) in enumerate(content.events) if event.type is EventType.CONFIGURE]
     events = [event for _, event in content.events]
     if not begins or begins[0] > 0:
         raise BlfDscError(
-            f'{content.path} does not hold the beginning of {content.topics[JOURNAL].name}: start '
-            'the recorder first'
+            f'{content.path} does not hold the beginning of {content.topics[topics.JOURNAL].name}: '
+            'start the recorder first'
         )
     if events[0].content.get('format', 1) < FORMAT:
         raise BlfDscError(
@@ -195,7 +179,7 @@ def _events(content: Content) -> tuple[list[Event], int, str]:
         )
     if len(begins) > 1:
         return events[: begins[1]], content.events[begins[1]][0], 'another controller was started'
-    return events, FOREVER, ''
+    return events, topics.FOREVER, ''
 
 
 def _before(states: JointStates, until: int) -> JointStates:
@@ -234,7 +218,7 @@ def _compared(
 
 
 def _compare(
-    topic: Topic,
+    topic: topics.Topic,
     messages: TopicMessages,
     own: TopicMessages,
     answers: JointStates,
@@ -244,15 +228,15 @@ def _compare(
 ) -> None:
     """Compare the messages of the same stamp or number; those that have other stamps differ."""
     fields = _COMPARED[topic]
-    if topic in (LEARNING, MONITOR):
+    if topic in (topics.LEARNING, topics.MONITOR):
         names = _shared_names(messages, own, result)
         recorded, replayed = (each.joint_states(names, ('position',)) for each in (messages, own))
     else:
         names = [f'{JOINT_STATE_FIELDS[k]} of {joint}' for k in fields for joint in joints]
         recorded, replayed = (_of_joints(each, joints) for each in (messages, own))
-    if topic is TRACKING_ERROR:
+    if topic is topics.TRACKING_ERROR:
         recorded = answers
-    if topic in (REFERENCE, LEARNING, MONITOR):
+    if topic in (topics.REFERENCE, topics.LEARNING, topics.MONITOR):
         recorded, replayed = recorded.by_stamp(), replayed.by_stamp()
         keys, wanted = recorded.stamp, replayed.stamp
     else:
@@ -266,7 +250,7 @@ def _compare(
         pair = [np.hstack([states.field(k, rows) for k in fields]) for states in (theirs, ours)]
         pair[1][has_moved[rows]] = np.inf
         result.add(stamp[rows], start, names, *pair)
-    unreached = (result.recorded - result.values) // len(joints) if topic is COMMANDS else 0
+    unreached = (result.recorded - result.values) // len(joints) if topic is topics.COMMANDS else 0
     # The last command of a node that shuts down normally is zero and belongs to no state.
     if unreached == 1 and not recorded.field(2, slice(-1, None)).any():
         result.recorded -= len(joints)
@@ -275,7 +259,7 @@ def _compare(
 
 
 def _of_joints(messages: TopicMessages, joints: Sequence[str]) -> JointStates:
-    if messages.type == FLOAT64_MULTI_ARRAY:
+    if messages.type == topics.FLOAT64_MULTI_ARRAY:
         return messages.arrays(range(len(joints)))
     return messages.joint_states(joints, ())
 
@@ -283,28 +267,33 @@ def _of_joints(messages: TopicMessages, joints: Sequence[str]) -> JointStates:
 def _shared_names(messages: TopicMessages, own: TopicMessages, result: Comparison) -> list[str]:
     """Return the names of values that both have; note the others as left out."""
     recorded, replayed = messages.joint_names(), own.joint_names()
-    shared = [name for name in replayed if name in recorded and name != COMPUTE_TIME]
+    shared = [name for name in replayed if name in recorded and name != topics.COMPUTE_TIME]
     both = dict.fromkeys((*replayed, *recorded))
     result.left_out = ', '.join(name for name in both if name not in shared)
     result.recorded = messages.size * len(shared)
     return shared
 
 
-def _numbers(topic: Topic, recorded: JointStates, answers: int) -> Stamps:
+def _numbers(topic: topics.Topic, recorded: JointStates, answers: int) -> Stamps:
     """Return the numbers of messages among those of their publisher; BlfDscError if unknown."""
-    if topic is not COMMANDS or not recorded.sequence.any():
-        if topic is COMMANDS and recorded.size < answers:  # of another recorder
-            raise BlfDscError('some are missing, and they have neither stamps nor numbers')
-        return np.arange(1, recorded.size + 1)
-    if (np.diff(recorded.sequence) <= 0).any():
+    in_order = np.arange(1, recorded.size + 1)
+    if topic is not topics.COMMANDS:
+        return in_order
+    sequence = recorded.sequence
+    if not sequence.any() and recorded.size < answers:  # of another recorder
+        raise BlfDscError('some are missing, and they have neither stamps nor numbers')
+    if sequence.any() and (np.diff(sequence) <= 0).any():
         raise BlfDscError('they are of several publishers')
-    return recorded.sequence
+    return sequence if sequence.any() else in_order
 
 
 # Remarks.
 
 
-def _remarks(content: Content, end: str, newer: Sequence[str]) -> Iterator[str]:
+def _remarks(
+    content: Content, end: str, newer: Sequence[str], recorded: Mapping[str, str]
+) -> Iterator[str]:
+    """Yield what limits the result; `recorded` is the machine of the controller."""
     if end:
         yield f'{end}: the replay ends there'
     for topic, what in content.losses.items():
@@ -319,11 +308,7 @@ def _remarks(content: Content, end: str, newer: Sequence[str]) -> Iterator[str]:
             f'recorded before the law had {", ".join(newer)}: replayed with the present law and '
             'its defaults, so differences come from the software'
         )
-
-
-def _other_machine(configured: Event) -> Iterator[str]:
-    """Remark on what may change the last digits of sine, exponential and tanh."""
-    recorded, here = configured.content.get('machine', {}), machine()
+    here = machine()
     for name, value in recorded.items():
         if value != here.get(name, ''):
             yield (
