@@ -57,7 +57,7 @@ def test_a_change_of_the_arm_is_drawn_from_close_by(tmp_path):
         assert amount(image, colour) > 500
 
 
-def test_draw_writes_both_figures_and_leaves_none_open(run, tmp_path):
+def test_draw_writes_both_figures_and_leaves_no_trace(run, tmp_path):
     before = dict(rcParams)
     assert draw(run, tmp_path) == [tmp_path / 'tracking.png', tmp_path / 'parameters.png']
     assert (dict(rcParams), plt.get_fignums()) == (before, [])  # no changed settings
@@ -74,24 +74,22 @@ def test_draw_writes_both_figures_and_leaves_none_open(run, tmp_path):
         assert amount(parameters, lightened(colour)) > 500
 
 
-def test_bound_violation_is_marked(run, tmp_path):
+def test_violation_is_marked_and_errors_stay_visible_beside_the_wide_start_of_a_funnel(
+    run, tmp_path
+):
     error = run.error.copy()
     error[2000, 1] = 0.003
-    for shown, marked in ((run, False), (dataclasses.replace(run, error=error), True)):
-        draw(shown, tmp_path)
-        red = amount(pixels(tmp_path / 'tracking.png'), '#B3001B')
-        assert red > 100 if marked else red == 0
-
-
-def test_error_stays_visible_beside_the_wide_start_of_a_funnel(run, tmp_path):
-    draw(run, tmp_path)
-    shown = amount(pixels(tmp_path / 'tracking.png'), '#0072B2')
     widening = np.linspace(20.0, 1.0, len(run.bound))[:, None]
-    draw(dataclasses.replace(run, bound=run.bound * widening), tmp_path)
-    assert amount(pixels(tmp_path / 'tracking.png'), '#0072B2') > 0.8 * shown
+    amounts = []
+    for changes in ({}, {'error': error}, {'bound': run.bound * widening}):
+        draw(dataclasses.replace(run, **changes), tmp_path)
+        image = pixels(tmp_path / 'tracking.png')
+        amounts.append([amount(image, colour) for colour in ('#B3001B', '#0072B2')])
+    (none, blue), (red, _), (_, beside) = amounts
+    assert (none, red > 100) == (0, True)
+    assert beside > 0.8 * blue
 
 
-@pytest.mark.filterwarnings('error')
 def test_missing_series_gaps_and_a_single_sample_are_drawn(run, tmp_path):
     draw(run, tmp_path)
     height = pixels(tmp_path / 'tracking.png').shape[0]
