@@ -40,8 +40,8 @@ def messages(path):
         return [[m.topic, types[m.topic], m.received, m.raw] for m in bag.messages(types)]
 
 
-def write(path, entries, *, numbered=False, **facts):
-    """Write messages into a new bag, numbered by their topics' publishers or not."""
+def write(path, entries, *, publishers=0, **facts):
+    """Write messages into a new bag, numbered by so many publishers of each topic, in turn."""
     handles, numbers = {}, Counter()
     with BagWriter(path, flush_interval=None) as bag:
         if facts:
@@ -49,9 +49,10 @@ def write(path, entries, *, numbered=False, **facts):
         for topic, type_name, at, raw in entries:
             if topic not in handles:
                 handles[topic] = bag.add_topic(topic, type_name, [])
-            numbers[topic] += numbered
+            numbers[topic] += 1
+            sequence = -(-numbers[topic] // publishers) if publishers else 0
             if raw is not None:  # else lost by the recorder
-                bag.write(handles[topic], raw, at, sequence=numbers[topic])
+                bag.write(handles[topic], raw, at, sequence=sequence)
     return path
 
 

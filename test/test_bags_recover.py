@@ -178,14 +178,6 @@ def test_recording_that_was_not_closed_is_reported_and_keeps_its_topics(plain, t
             assert found.ext.offered_qos_profiles == original.ext.offered_qos_profiles
 
 
-def test_intact_bag_has_no_losses_and_is_not_modified(whole, tmp_path, capsys):
-    before = whole.read_bytes()
-    assert main(['recover', str(whole.parent), '--out', str(tmp_path / 'clean')]) == 0
-    assert 'none of the recorded messages was lost' in capsys.readouterr().out
-    assert read(tmp_path / 'clean') == read(whole.parent)
-    assert whole.read_bytes() == before
-
-
 def test_files_of_a_split_bag_are_recovered_together(plain, tmp_path):
     for name in ('bag_0.mcap', 'bag_1.mcap'):
         folder = damaged(tmp_path / name, plain.read_bytes())

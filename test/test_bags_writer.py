@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import itertools
 import tracemalloc
 
 import pytest
@@ -12,7 +11,6 @@ from foreign_readers import messages_on_disk, read
 from mcap.reader import make_reader
 from rosbags.rosbag2 import Reader
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
-from small_disk import small_disk
 
 from blf_dsc_controller import __version__
 from blf_dsc_controller.bags.recover import recover
@@ -191,21 +189,6 @@ def test_data_is_flushed_periodically(tmp_path, compression):
     bag.close()
 
 
-def test_what_was_written_before_the_disk_was_full_is_recovered(tmp_path):
-    def write_endlessly():
-        for k in itertools.count():
-            bag.write(handle, message(k), k)
-
-    with small_disk(tmp_path / 'disk', 1) as disk:
-        bag = BagWriter(disk / 'bag', flush_interval=0.0)
-        handle = bag.add_topic('/a', JOINT_STATES.type, [STREAM])
-        with pytest.raises(OSError, match='No space left'):
-            write_endlessly()
-        recovery = recover(disk / 'bag', tmp_path / 'clean')
-    assert recovery.messages['/a'] >= sum(bag.message_counts.values()) - 1
-    assert 'the recording was not closed' in recovery.losses[-1]
-
-
 def test_memory_of_a_recorder_is_bounded_and_its_files_are_read_as_one(tmp_path):
     """Every chunk has an entry in the index, which is in memory until its file ends."""
     with BagWriter(tmp_path / 'bag', flush_interval=0.0) as bag:
@@ -221,10 +204,10 @@ def test_memory_of_a_recorder_is_bounded_and_its_files_are_read_as_one(tmp_path)
     assert len(list((tmp_path / 'bag').glob('*.mcap'))) == 6
     assert max(peaks) < 1.1 * peaks[1]
     expected = [*map(message, range(60_000))]
-    with open_bag(tmp_path / 'bag') as opened:
-        assert [each.raw for each in opened.messages({'/a'})] == expected
     assert not recover(tmp_path / 'bag', tmp_path / 'clean').losses
-    assert [raw for *_, raw in read(tmp_path / 'clean')] == expected
+    for name in ('bag', 'clean'):
+        with open_bag(tmp_path / name) as opened:
+            assert [each.raw for each in opened.messages({'/a'})] == expected
 
 
 def test_gaps_in_sequence_numbers_are_counted_as_losses():

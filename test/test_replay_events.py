@@ -231,7 +231,8 @@ def test_flipped_bit_of_a_safe_torque_is_found(tmp_path, part):
     rig = eventful()
     safe = [k for k, entry in enumerate(of(rig.entries, TRACKING_ERROR)) if NAN in entry[3]]
     number = safe[int(part * len(safe))]
-    entry = of(rig.entries, TRACKING_ERROR)[number]
+    earlier, entry = (of(rig.entries, TRACKING_ERROR)[k] for k in (safe[0], number))
+    earlier[3] = earlier[3].replace(NAN, struct.pack('<d', -float('nan')), 1)  # another NaN
     entry[3] = entry[3][:-8] + bytes([entry[3][-8] ^ 1]) + entry[3][-7:]
     difference = rig.verify(tmp_path).difference
     assert (difference.topic, difference.field) == (TRACKING_ERROR.resolved, 'effort of joint2')
@@ -246,7 +247,7 @@ def test_answers_missed_by_the_recorder_end_the_replay(tmp_path):
     lost = of(rig.entries, TRACKING_ERROR)[40]
     lost[3] = None
     entries = [list(entry) for entry in rig.entries]
-    path = recorded_run.write(tmp_path / 'bag', entries, numbered=True, package_version=__version__)
+    path = recorded_run.write(tmp_path / 'bag', entries, publishers=1, package_version=__version__)
     result = verify(path)
     assert (result.difference, result.samples) == (None, 40)
     assert 'the recorder missed messages of /blf_dsc_controller/tracking' in result.remarks[0]

@@ -24,6 +24,7 @@ from blf_dsc_controller.errors import BlfDscError, ConfigurationError
 from blf_dsc_controller.messages.codecs import JointStateEncoder
 from blf_dsc_controller.messages.journal import EventType, decode
 from blf_dsc_controller.messages.topics import (
+    BOUND,
     COMMANDS,
     JOINT_STATES,
     JOURNAL,
@@ -142,6 +143,14 @@ def test_flipped_bit_is_located_and_named_and_the_earliest_counts(
     assert f'recorded {difference.recorded!r}, replayed {difference.replayed!r}' in last
 
 
+def test_message_with_another_stamp_is_a_difference(entries, rewritten):
+    changed = [list(entry) for entry in entries]
+    (bound,) = of(changed, BOUND)
+    bound[3] = bound[3][:4] + bytes([bound[3][4] ^ 1]) + bound[3][5:]
+    difference = verify(rewritten(changed)).difference
+    assert (difference.topic, difference.replayed) == (BOUND.resolved, np.inf)
+
+
 def test_repeated_and_unused_states_are_skipped(entries, rewritten):
     states = of(entries, JOINT_STATES)
     at = START + 300 * MILLISECOND + 5
@@ -160,21 +169,22 @@ def test_recording_that_started_late_is_rejected(entries, rewritten):
 
 
 @pytest.mark.parametrize(
-    ('topic', 'number', 'numbered', 'percent', 'commands'),
+    ('topic', 'number', 'publishers', 'percent', 'commands'),
     [
-        (JOINT_STATES, 333, False, 33.2, 333),  # ends the replay
+        (JOINT_STATES, 333, 0, 33.2, 333),  # ends the replay
         # Two of the 24 numbers of a sample are commands.
-        (COMMANDS, 333, False, 91.4, 0),
-        (COMMANDS, 333, True, None, SAMPLES - 1),
-        (COMMANDS, 0, True, None, SAMPLES - 1),
+        (COMMANDS, 333, 0, 91.4, 0),
+        (COMMANDS, 333, 2, 91.4, 0),  # have no common order
+        (COMMANDS, 333, 1, None, SAMPLES - 1),
+        (COMMANDS, 0, 1, None, SAMPLES - 1),
     ],
 )
 def test_lost_message_leaves_the_others_to_compare(
-    entries, tmp_path, capsys, topic, number, numbered, percent, commands
+    entries, tmp_path, capsys, topic, number, publishers, percent, commands
 ):
     lost = of(entries, topic)[number]
     kept = [[*entry[:3], None] if entry is lost else entry for entry in entries]
-    path = recorded_run.write(tmp_path / 'bag', kept, numbered=numbered)
+    path = recorded_run.write(tmp_path / 'bag', kept, publishers=publishers)
     result = verify(path)
     assert result.difference is None
     assert compared(result)['commands'] == 2 * commands
