@@ -24,6 +24,8 @@ from std_msgs.msg import Float64MultiArray
 
 from blf_dsc_controller.compiled import jit
 from blf_dsc_controller.compiled.jit import COMPILING
+from blf_dsc_controller.configuration.nodes import load_loop
+from blf_dsc_controller.configuration.schema import flatten
 from blf_dsc_controller.messages import topics
 from blf_dsc_controller.messages.codecs import JointStateEncoder
 from blf_dsc_controller.messages.journal import EventType
@@ -36,6 +38,7 @@ from blf_dsc_controller.supervision.checks import Phase
 KEPT = QoSProfile(depth=1000, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 PLAIN = {'disturbance.constant': [0.0, 0.0], 'disturbance.amplitude': [0.0, 0.0]}
 ZERO = (0.0, 0.0)
+WARN = int.from_bytes(Log.WARN, 'little') if isinstance(Log.WARN, bytes) else Log.WARN
 FATAL = int.from_bytes(Log.FATAL, 'little') if isinstance(Log.FATAL, bytes) else Log.FATAL
 
 
@@ -94,6 +97,15 @@ def test_log_suggests_resetting_the_controller_without_a_simulated_arm(ros, log)
     ros.until(lambda: log('real', '', FATAL))
     (stop,) = log('real', '', FATAL)
     assert stop.endswith('/real/blf_dsc_controller/reset starts again from where the arm is')
+
+
+@pytest.mark.parametrize(('preset', 'warned'), [('ur5e', 1), ('panda', 0)])
+def test_node_warns_once_of_how_light_a_drive_may_be(ros, log, preset, warned):
+    config = flatten(load_loop(preset).controller)
+    given = {name: value for name, value in config.items() if value != ()}
+    ros.add(ControllerNode, given, namespace=preset)
+    ros.until(lambda: log(preset, 'ready for joint states of '))
+    assert len(log(preset, 'of the inertia assumed: then give robot.rotor_inertia', WARN)) == warned
 
 
 def test_a_stop_is_logged_once(ros, log):

@@ -34,6 +34,7 @@ from blf_dsc_controller.supervision.checks import SAME_CLOCK, Phase, rate_mismat
 from blf_dsc_controller.supervision.config_warnings import (
     ReferenceLoad,
     config_warnings,
+    light_drive,
     reference_load,
     worsened,
 )
@@ -106,6 +107,8 @@ class ControllerNode(LoopNode[ControllerConfig]):
         self._load = reference_load(self.config, self.guard.controller.settings)
         for warning in config_warnings(self.config, load=self._load):
             self.get_logger().warning(warning)
+        if risk := light_drive(self.config):
+            self.get_logger().warning(risk)
         outputs = OUTPUTS if self.config.telemetry.enabled else OUTPUTS[:1]
         if self.connect(outputs, topics.JOINT_STATES, self._on_joint_state):
             self._streams = [self._outputs[topic] for topic in STREAMS if topic in outputs]

@@ -150,28 +150,36 @@ def _of_urdf(config: ControllerConfig, load: ReferenceLoad) -> Iterator[str]:
 
 
 def expectation(config: ControllerConfig) -> str:
-    """Return the largest errors to expect of an arm of a URDF, in a sentence.
-
-    With it the lightest drives with which friction alone stays within the bound: the gains follow
-    the inertia that the law measures (`apparent_inertia`), so errors grow with its inverse.
-    """
-    settings = settings_of_config(config)
-    errors = expected_errors(config, settings)
+    """Return the largest errors to expect of an arm of a URDF, in a sentence."""
+    errors = expected_errors(config, settings_of_config(config))
     usual, most = (1e3 * float(each.max()) for each in errors)
     joint = config.joints[int(errors.pick_up.argmax())]
     text = (
         f'{usual:.2g} mrad by friction and unmodelled torque; {most:.2g} mrad of {joint} when '
         f'{config.robot.payload:g} kg are picked up in motion'
     )
+    return '; '.join(filter(None, (text, light_drive(config))))
+
+
+def light_drive(config: ControllerConfig) -> str:
+    """Return which drive may be lighter than assumed at the risk of its bound; empty: none.
+
+    The lightest drives are those with which friction alone stays within the bound: the gains follow
+    the inertia that the law measures (`apparent_inertia`), so errors grow with its inverse.
+    """
+    if config.model != 'urdf' or config.law != 'blf_dsc':
+        return ''
+    settings = settings_of_config(config)
+    errors = expected_errors(config, settings)
     drives = settings.joint_inertia - settings.link_inertia
     least = settings.joint_inertia * errors.unmodelled / settings.bound - settings.link_inertia
     lightest = np.zeros_like(drives)  # of the inertia assumed; where it is given, nothing is
     np.divide(least, drives, out=lightest, where=settings.unsure_rotor > 0.0)
     worst = int(lightest.argmax())
     if lightest[worst] <= 0.0:
-        return text
+        return ''
     return (
-        f'{text}; perhaps past the bound if the drive of {config.joints[worst]} has less than '
+        f'the bound may be passed if the drive of {config.joints[worst]} has less than '
         f'{lightest[worst]:.2g} of the inertia assumed: then give robot.rotor_inertia'
     )
 
