@@ -14,7 +14,7 @@ import pytest
 
 pytest.importorskip('rclpy', reason='needs ROS 2')
 
-from blf_dsc_controller.configuration.schema import Realtime
+from blf_dsc_controller.configuration.robot import Realtime
 from blf_dsc_controller.nodes.process import request_realtime
 
 BROKEN = """

@@ -6,7 +6,6 @@ from __future__ import annotations
 import argparse
 import ast
 import contextlib
-import importlib
 import importlib.util
 import io
 import re
@@ -21,7 +20,7 @@ import pytest
 from markdown_it import MarkdownIt
 
 from blf_dsc_controller.cli import main as command_line
-from blf_dsc_controller.cli.parser import make_parser
+from blf_dsc_controller.cli.main import make_parser
 from blf_dsc_controller.configuration.nodes import NODES, known_names, load, read
 from blf_dsc_controller.studies.monte_carlo import load_study
 
@@ -31,7 +30,7 @@ PAGES = [*(ROOT / name for name in OUTSIDE), *sorted((ROOT / 'doc').glob('*.md')
 SAVED = re.compile(r'Save this as\s`(\w+\.py)`')
 MAKEFILE = (ROOT / 'Makefile').read_text()
 LAUNCH = (ROOT / 'launch/closed_loop.launch.py').read_text()
-SETUP = (ROOT / 'setup.py').read_text()
+SETUP = (ROOT / 'setup.cfg').read_text()
 ROS2_CONTROL_NODES = {'controller_manager', 'effort_controller'}
 # Other programs that the pages may call; they are not checked.
 FOREIGN = {
@@ -215,7 +214,7 @@ def check_ros2(rest):
 
 def check_pip(rest):
     for extra in re.findall(r'blf_dsc_controller\[(.+?)\]', ' '.join(rest)):
-        assert all(f"'{name}': " in SETUP for name in extra.split(',')), extra
+        assert all(f'\n{name} =\n' in SETUP for name in extra.split(',')), extra
 
 
 def check_pre_commit(rest):
@@ -242,34 +241,24 @@ def subcommand(name):
 
 
 DOC = ROOT / 'doc'
-sys.path.append(str(DOC))
-links = importlib.import_module('links')
 
 
 @pytest.fixture(scope='module')
 def site(tmp_path_factory):
-    """Every page of the site, built as by `make docs`."""
+    """Every page of the site by its name, built as by `make docs`, which fails at a dead link."""
     out = tmp_path_factory.mktemp('site')
     sphinx = [sys.executable, '-m', 'sphinx', '-q', '-W', '--keep-going', '-n', str(DOC), str(out)]
     built = subprocess.run(sphinx, check=False, capture_output=True, text=True)
     assert built.returncode == 0, built.stderr
-    return links.read_pages(out)
+    return {path: path.read_text() for path in out.rglob('*.html')}
 
 
 @pytest.mark.nightly
-def test_site_has_every_page_and_no_dead_link(site):
+def test_site_has_every_page_and_loads_no_external_resources(site):
     names = {path.stem for path in site}
     assert {path.stem for path in DOC.iterdir() if path.suffix in ('.md', '.rst')} <= names
-    assert not list(links.dead_links(site))
-    page = next(page for path, page in site.items() if path.stem == 'index')
-    page.links += ['nowhere.html', '#nothing', 'https://example.org/elsewhere']
-    assert list(links.dead_links(site)) == ['index.html: nowhere.html', 'index.html: #nothing']
-
-
-@pytest.mark.nightly
-def test_site_loads_no_external_resources(site):
-    for path, page in site.items():
-        for url in page.loaded:
+    for path, text in site.items():
+        for url in re.findall(r'<(?!a )[^>]* (?:src|href)="([^"]*)"', text):
             assert not urlsplit(url).netloc, (path.name, url)
             assert url.startswith(('#', 'data:')) or (path.parent / urlsplit(url).path).exists()
     (folder,) = {path.parent for path in site if path.name == 'index.html'}
@@ -281,7 +270,7 @@ def test_site_loads_no_external_resources(site):
 @pytest.mark.parametrize('name', OUTSIDE)
 def test_links_outside_the_site_are_valid(name, site):
     page = ROOT / name
-    anchors = {path.stem: parsed.anchors for path, parsed in site.items()}
+    anchors = {path.stem: re.findall(r' id="([^"]*)"', text) for path, text in site.items()}
     for link in re.findall(r'\]\(([^)\s]+)\)', page.read_text()):
         url = urlsplit(link)
         if not url.scheme:

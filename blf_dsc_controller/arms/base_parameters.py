@@ -10,6 +10,7 @@ bodies before it is grouped with those, which is the usual grouping.
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass
 
 import numpy as np
@@ -41,6 +42,7 @@ class BaseParameters:
         return P
 
 
+@functools.lru_cache(maxsize=16)
 def base_parameters(
     chain: Chain, gravity: tuple[float, float, float] = (0.0, 0.0, -9.81), *, rotors: bool = True
 ) -> BaseParameters:

@@ -14,10 +14,9 @@ from tqdm import tqdm
 
 from blf_dsc_controller.arms.geometry import Clearance
 from blf_dsc_controller.bags.content import NameMap
-from blf_dsc_controller.cli.main import make_room
-from blf_dsc_controller.cli.parser import PICK_UP
+from blf_dsc_controller.cli.main import PICK_UP, make_room
 from blf_dsc_controller.configuration.controller import ControllerConfig
-from blf_dsc_controller.configuration.nodes import CONTROLLER, format_value, load, locate
+from blf_dsc_controller.configuration.nodes import CONTROLLER, dump, load, locate
 from blf_dsc_controller.configuration.robot import Robot, learned_of, parameters_of
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.identification import exciting_reference
@@ -33,7 +32,6 @@ _LASTING = 0.05  # of the motion, longest correlation length of noise
 _POOR = 0.2  # of the torque, largest accepted error on the part held back
 _LEAST_GRAVITY, _MOST_GRAVITY = 0.4, 1.6  # of the URDF's; beyond, it is missing or double
 _DIGITS = 4  # decimals of an angle [rad] in the file
-_UNITS = {'frequency': 'rad/s, of the cosines, then of the sines'}
 _UNSHOWN = 0.8  # of the prior's deviation; parameters that keep more are hardly shown
 _WIDTH = 98
 _PANEL = (9.0, 2.2)  # inches
@@ -248,15 +246,8 @@ def problems_of(found: Identified, effort: str) -> Iterator[str]:
 
 
 def excite(options: Namespace) -> None:
-    """Search for the reference and write the preset."""
+    """Search for the reference, write it as a preset, and print what it shows."""
     make_room(options.out, force=options.force)
-    text = _preset(options)
-    options.out.write_text(text, encoding='utf-8')
-    print(text[: text.index('\n\n')])
-    print(f'wrote {options.out}')
-
-
-def _preset(options: Namespace) -> str:
     config = load(locate(options.config), CONTROLLER, ControllerConfig)
     problem = exciting_reference.ExcitationProblem(
         config,
@@ -269,17 +260,14 @@ def _preset(options: Namespace) -> str:
     parameters = problem.parameters(_search(problem, options.starts))
     for name in ('offset', 'amplitude'):
         parameters[name] = tuple(round(value, _DIGITS) for value in parameters[name])
-    names = ('offset', 'amplitude', 'frequency', 'phase')
-    before = problem.evaluate({name: getattr(config.reference, name) for name in names})
+    before = problem.evaluate({name: getattr(config.reference, name) for name in parameters})
     after = problem.evaluate(parameters)
     if config.learning.prior_weight > 0.0:
         remaining = problem.remaining(parameters)
-        left = [
-            f'{100.0 * np.exp(-each.gain / 2 / remaining.size):.0f} %' for each in (before, after)
-        ]
+        shares = [100.0 * np.exp(-each.gain / 2 / remaining.size) for each in (after, before)]
         figures = (
-            f'a window leaves {left[1]} of the deviation of the prior, in the geometric mean over '
-            f'all directions, instead of {left[0]}'
+            f'a window leaves {shares[0]:.0f} % of the deviation of the prior, in the geometric '
+            f'mean over all directions, instead of {shares[1]:.0f} %'
         )
         unshown = _unshown(config, remaining)
     else:
@@ -290,27 +278,13 @@ def _preset(options: Namespace) -> str:
         unshown = []
     about = (
         'The reference that excites the learning most within the limits of joints and torque: '
-        f'{figures} with the configured reference.'
+        f'{figures} with the configured reference. First the cosines, then the sines.'
     )
-    command = f'blf_dsc excite PRESET.yaml --config {options.config}'
-    command += f' --harmonics {options.harmonics} --starts {options.starts}'
-    if options.guess:
-        command += f' --guess {" ".join(f"{value:g}" for value in options.guess)}'
-    if config.model == 'urdf':
-        command += f' --radius {options.radius:g} --floor {options.floor:g}'
-    lines = [*textwrap.wrap(about, _WIDTH), command, *unshown]
-    comment = ''.join(f'# {line}\n' for line in lines)
-    entries = ''.join(
-        f'      # {_UNITS.get(name, "rad")}\n      {name}: {format_value(value)}\n'
-        for name, value in parameters.items()
-    )
-    return f"""\
-{comment}
-/**/{CONTROLLER}:
-  ros__parameters:
-    reference:
-      type: sinusoids
-{entries}"""
+    lines = [*textwrap.wrap(about, _WIDTH), options.line, *unshown]
+    reference = {f'reference.{name}': value for name, value in parameters.items()}
+    node = {f'**/{CONTROLLER}': {'reference.type': 'sinusoids', **reference}}
+    dump(options.out, node, ''.join(f'# {line}\n' for line in lines))
+    print('\n'.join([*lines, f'wrote {options.out}']))
 
 
 def guess_of(config: ControllerConfig, given: list[float] | None) -> np.ndarray:

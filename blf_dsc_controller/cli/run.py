@@ -27,7 +27,6 @@ from blf_dsc_controller.configuration.nodes import (
     LoopConfig,
     dump,
     load_loop,
-    locate,
 )
 from blf_dsc_controller.configuration.plant import PlantConfig
 from blf_dsc_controller.configuration.schema import change
@@ -114,15 +113,10 @@ def _configuration(options: Namespace) -> LoopConfig:
     """
     chosen = {'duration': options.duration, 'mode': options.mode, 'seed': options.seed}
     given = {name: value for name, value in chosen.items() if value is not None}
-    path = locate(options.config)
-    overrides: dict[str, dict[str, Any]] = {
-        PLANT: {**given, 'wait_for_subscribers': 1},
-        CONTROLLER: {'wait_for_subscribers': 1},
-    }
-    config = load_loop(path, overrides)
+    recorded: dict[str, Any] = {'wait_for_subscribers': 1}
+    config = load_loop(options.config, {PLANT: given | recorded, CONTROLLER: recorded})
     if config.plant.duration == 0.0:
-        overrides[PLANT]['duration'] = _DURATION
-        config = load_loop(path, overrides)
+        config = config._replace(plant=change(config.plant, {'duration': _DURATION}))
     controller, plant = config.controller, config.plant
     order = [plant.joints.index(joint) for joint in controller.joints]
     q, dq = (np.array(values)[order] for values in (plant.initial.position, plant.initial.velocity))
@@ -234,18 +228,12 @@ def precompile(options: Namespace) -> None:
     """Compile the kernels of a configuration's controller and plant, in two parallel processes."""
     config = load_loop(options.config)
     with ProcessPoolExecutor(2, get_context('spawn')) as pool:
-        jobs = [
-            pool.submit(_compile_law, config.controller),
-            pool.submit(_compile_plant, config.plant),
-        ]
-        for job in jobs:
-            job.result()
+        list(pool.map(_compile, (config.controller, config.plant)))
     print(f'{options.config}: the kernels are compiled; the nodes of this user now start at once')
 
 
-def _compile_law(config: ControllerConfig) -> None:
-    Guard(config)
-
-
-def _compile_plant(config: PlantConfig) -> None:
-    plant_of(config).compile()
+def _compile(config: ControllerConfig | PlantConfig) -> None:
+    if isinstance(config, ControllerConfig):
+        Guard(config)
+    else:
+        plant_of(config).compile()

@@ -158,72 +158,56 @@ def _run_nodes(config: LoopConfig, params_file: Path, logs: Path, view_host: str
             ending.callback(node.stop)
             return node
 
-        def show() -> str:
+        def show_page() -> None:
             from blf_dsc_controller.view.page import free_port, url_of
 
             port = free_port(view_host, _VIEW_PORT)
             started(VIEW, '-p', f'host:={view_host}', '-p', f'port:={port}')
-            return url_of(view_host, port)
+            monitor.progress.write(f'the page: {url_of(view_host, port)}')
 
         recorder = started(RECORDER)
         names = [_LOOP] if config.plant.mode == 'lockstep' else [CONTROLLER, PLANT]
         loop = [started(name) for name in names]
-        remark = _monitor(config, recorder, loop, interrupts, show if view_host else None)
+        with ProgressMonitor(config, interrupts) as monitor:
+            _watch(monitor, recorder, loop, interrupts, show_page if view_host else None)
+        remark = '' if recorder.is_running else ' while the loop continued without it'
     for node in loop:
         node.check()
     recorder.check(remark)
     return not interrupts
 
 
-def _monitor(
-    config: LoopConfig,
-    recorder: NodeProcess,
-    loop: list[NodeProcess],
-    interrupts: list[int],
-    show: Callable[[], str] | None,
-) -> str:
-    """Show the progress until the plant exits or a signal arrives; return a note on the recorder.
-
-    `show` starts the page and returns its address; it is called only after the first message of
-    the loop, since the nodes wait for a subscriber, which must be the recorder.
-    """
-    with ProgressMonitor(config, interrupts) as monitor:
-
-        def goes_on() -> bool:
-            for node in loop:
-                node.check()
-            monitor.wait(0.1)
-            return loop[-1].is_running and not interrupts
-
-        _wait_for_start(monitor, recorder, loop, goes_on)
-        if monitor.has_begun and show is not None:
-            monitor.progress.write(f'the page: {show()}')
-        is_recorded = True
-        while goes_on():
-            if is_recorded and not recorder.is_running:
-                is_recorded = False
-                monitor.progress.write(f'{recorder.name} has ended: the loop continues unrecorded')
-    return '' if recorder.is_running else ' while the loop continued without it'
-
-
-def _wait_for_start(
+def _watch(
     monitor: ProgressMonitor,
     recorder: NodeProcess,
     loop: list[NodeProcess],
-    goes_on: Callable[[], bool],
+    interrupts: list[int],
+    show_page: Callable[[], None] | None,
 ) -> None:
-    """Report what is compiled until the first message arrives, the loop ends or the recorder fails.
+    """Show the progress until the plant exits, a signal arrives or a node fails.
 
-    That message may arrive a bit after the recorder has ended.
+    The page is started after the first message of the loop, since the nodes wait for a subscriber,
+    which must be the recorder. That message may arrive a bit after the recorder has ended.
     """
-    ended = inf
-    while goes_on() and not monitor.has_begun:
-        for notice in itertools.chain(*(node.new_notices() for node in loop)):
-            monitor.progress.write(notice)
-        if not recorder.is_running:
-            ended = min(ended, time.monotonic())
-            if time.monotonic() > ended + FIRST_SIGN:
-                recorder.check()
+    ended, is_recorded = inf, True
+    while loop[-1].is_running and not interrupts:
+        for node in loop:
+            node.check()
+        monitor.wait(0.1)
+        if not monitor.has_begun:
+            for notice in itertools.chain(*(node.new_notices() for node in loop)):
+                monitor.progress.write(notice)
+        elif show_page is not None:
+            show_page()
+            show_page = None
+        if recorder.is_running or not is_recorded:
+            continue
+        ended = min(ended, time.monotonic())
+        if monitor.has_begun:
+            is_recorded = False
+            monitor.progress.write(f'{recorder.name} has ended: the loop continues unrecorded')
+        elif time.monotonic() > ended + FIRST_SIGN:
+            recorder.check()
 
 
 def _die_with_parent() -> None:
@@ -239,15 +223,18 @@ class ProgressMonitor:
         self._parameters = model_of(config.controller).parameter_names
         self.progress = LoopProgress(plant, self._parameters)
         self._start, self._elapsed = -1.0, 0.0
-        self._end = plant.duration - DECIMATION * plant.sample_time / 2 if plant.duration else inf
-        self._latest: JointState | None = None
+        self._end = plant.duration - DECIMATION * plant.sample_time / 2
+        self._received: list[JointState] = []
         self._context = rclpy.Context()
         rclpy.init(context=self._context, signal_handler_options=rclpy.SignalHandlerOptions.NO)
         self._node = rclpy.create_node('closed_loop', context=self._context, enable_rosout=False)
         self._executor = EventsExecutor(context=self._context)
         self._executor.add_node(self._node)
         self._node.create_subscription(
-            JointState, topics.MONITOR.relative, self._receive, qos_profile(topics.MONITOR.offered)
+            JointState,
+            topics.MONITOR.relative,
+            self._received.append,
+            qos_profile(topics.MONITOR.offered),
         )
 
     @property
@@ -258,9 +245,10 @@ class ProgressMonitor:
     def wait(self, seconds: float) -> bool:
         """Wait for a message and show it; return False if none arrived."""
         self._executor.spin_once(timeout_sec=seconds)
-        message, self._latest = self._latest, None
-        if message is None:
+        if not self._received:
             return False
+        message = self._received[-1]
+        self._received.clear()
         values = dict(zip(message.name, message.position, strict=True))
         if not values.keys() >= set(self._parameters):
             return False  # of another arm in the same ROS domain
@@ -294,9 +282,6 @@ class ProgressMonitor:
         while self._elapsed < self._end and time.monotonic() < deadline:
             if self.wait(0.05) and not self._interrupts:
                 deadline = time.monotonic() + wait
-
-    def _receive(self, message: JointState) -> None:
-        self._latest = message
 
 
 def localhost_environment() -> dict[str, str]:

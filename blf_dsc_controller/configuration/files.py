@@ -21,18 +21,14 @@ import re
 import stat
 import sys
 import sysconfig
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator
 from contextlib import suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple, cast
+from typing import Any, NamedTuple, cast
 
 import yaml
 
 from blf_dsc_controller.errors import BlfDscError, ConfigurationError
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-
 
 _TRUE = ('Y', 'y', 'yes', 'Yes', 'YES', 'true', 'True', 'TRUE', 'on', 'On', 'ON')
 _FALSE = ('N', 'n', 'no', 'No', 'NO', 'false', 'False', 'FALSE', 'off', 'Off', 'OFF')
@@ -43,14 +39,12 @@ _HEXADECIMAL = re.compile(
 )
 _SPECIAL = re.compile(r'[+-]?(?i:inf|infinity|nan)|[+-]?\.(?:inf|Inf|INF)|\.(?:nan|NaN|NAN)')
 
-_PARAMETERS = 'ros__parameters'
+_MARK = 'ros__parameters'
 _PART = re.compile(r'\*|\*\*|[A-Za-z_][A-Za-z0-9_]*')
 _PACKAGE = 'blf_dsc_controller'
 _LARGEST = 1 << 24  # bytes of a parameter file, a URDF or a metadata.yaml
 _MOST_NODES = 50_000
 _DEEPEST = 50
-_Parser: Any = getattr(yaml, 'CLoader', yaml.Loader)  # ten times as fast, if available
-_Loader: Any = getattr(yaml, 'CSafeLoader', yaml.SafeLoader)
 
 
 class Entry(NamedTuple):
@@ -65,7 +59,7 @@ class Section(NamedTuple):
 
     pattern: str
     line: int
-    entries: Mapping[str, Entry]
+    entries: dict[str, Entry]
 
     @property
     def is_wildcard(self) -> bool:
@@ -85,7 +79,6 @@ def parse(text: str) -> tuple[Section, ...]:
     Raises ConfigurationError, with the line, if the text is not YAML or not a parameter file.
     """
     try:
-        check_yaml(text)
         root = _Composer(text).get_single_node()
     except yaml.MarkedYAMLError as error:
         mark = error.problem_mark or error.context_mark
@@ -95,8 +88,23 @@ def parse(text: str) -> tuple[Section, ...]:
     except yaml.YAMLError as error:
         raise ConfigurationError([f'not valid YAML: {error}']) from error
     if root is None:
-        raise _error(1, f'the file is empty: expected node names with {_PARAMETERS}')
-    return tuple(_sections(root, ''))
+        raise ConfigurationError([f'line 1: the file is empty: expected node names with {_MARK}'])
+    sections: dict[tuple[str, ...], Section] = {}
+    for names, node in _leaves(root, ()):
+        if _MARK not in names:
+            raise _outside(names, node)
+        at = names.index(_MARK)
+        pattern, name = f'/{"/".join(names[:at]).removeprefix("/")}', '.'.join(names[at + 1 :])
+        if not all(_PART.fullmatch(part) for part in pattern.split('/')[1:]):
+            raise _error(node, f'{pattern} is not a valid node name')
+        entries = sections.setdefault(names[:at], Section(pattern, _line(node), {})).entries
+        if name in entries:
+            raise _repeated(node, name, entries[name].line)
+        if name:
+            entries[name] = Entry(_value(node, name), _line(node))
+        elif not isinstance(node, yaml.MappingNode):
+            raise _error(node, f'{_MARK} of {pattern} has no parameters')
+    return tuple(sections.values())
 
 
 def parse_scalar(word: str) -> bool | int | float | str:
@@ -119,98 +127,107 @@ def parse_scalar(word: str) -> bool | int | float | str:
     return word
 
 
-class _Composer(yaml.BaseLoader):
-    """YAML loader that keeps each word as written."""
-
-    DEFAULT_SCALAR_TAG = '?'  # type: ignore[misc] # unlike an explicit !!str
-
-
-def _sections(node: yaml.Node, name: str) -> Iterator[Section]:
-    if not isinstance(node, yaml.MappingNode):
-        where = f'under {name}' if name else 'at the top'
-        raise _error(_line(node), f'expected node names or {_PARAMETERS} {where}')
-    keys = dict(_pairs(node))
-    if _PARAMETERS in keys and len(keys) > 1:
-        other = next(key for key in keys if key != _PARAMETERS)
-        raise _error(_line(keys[other]), f'{other} cannot be next to {_PARAMETERS} of {name}')
-    for key, value in keys.items():
-        if key == _PARAMETERS:
-            yield _section(value, name)
-        elif difflib.get_close_matches(key, [_PARAMETERS], cutoff=0.8):
-            raise _error(_line(value), f'{key} should be {_PARAMETERS} (two underscores)')
-        elif isinstance(value, yaml.MappingNode):
-            yield from _sections(value, f'{name}/{key.removeprefix("/") if not name else key}')
-        else:
-            raise _error(_line(value), f'{key} has a value, but is outside of {_PARAMETERS}')
-
-
-def _section(node: yaml.Node, name: str) -> Section:
-    if not all(_PART.fullmatch(part) for part in name.split('/')[1:]):
-        raise _error(_line(node), f'{name} is not a valid node name')
-    if not isinstance(node, yaml.MappingNode):
-        raise _error(_line(node), f'{_PARAMETERS} of {name} has no parameters')
-    entries: dict[str, Entry] = {}
-    for key, entry in _entries(node, ''):
-        if key in entries:
-            raise _repeated(entry.line, key, entries[key].line)
-        entries[key] = entry
-    return Section(name, _line(node), entries)
-
-
-def _entries(node: yaml.MappingNode, prefix: str) -> Iterator[tuple[str, Entry]]:
-    for key, value in _pairs(node):
-        name = prefix + key
-        if not isinstance(value, yaml.MappingNode):
-            yield name, Entry(_value(value, name), _line(value))
-        elif value.value:
-            yield from _entries(value, f'{name}.')
-        else:
-            raise _error(_line(value), f'{name} has no parameters')
-
-
-def _pairs(node: yaml.MappingNode) -> Iterator[tuple[str, yaml.Node]]:
-    seen: dict[str, int] = {}
+def _leaves(node: yaml.Node, names: tuple[str, ...]) -> Iterator[tuple[tuple[str, ...], yaml.Node]]:
+    """Yield what stands below nested names: values, lists, and empty mappings."""
+    if not isinstance(node, yaml.MappingNode) or not node.value:
+        yield names, node
+        return
+    lines: dict[str, int] = {}
     for key, value in node.value:
         if not isinstance(key, yaml.ScalarNode) or not key.value:
-            raise _error(_line(key), 'expected a name before the colon')
-        if key.value in seen:
-            raise _repeated(_line(key), key.value, seen[key.value])
-        seen[key.value] = _line(key)
-        yield key.value, value
+            raise _error(key, 'expected a name before the colon')
+        if key.value in lines:
+            raise _repeated(key, key.value, lines[key.value])
+        lines[key.value] = _line(key)
+        if _MARK in lines and len(lines) > 1:
+            raise _error(value, f'{" and ".join(lines)} cannot be next to each other')
+        yield from _leaves(value, (*names, key.value))
 
 
 def _value(node: yaml.Node, name: str) -> object:
+    if isinstance(node, yaml.MappingNode):
+        raise _error(node, f'{name} has no parameters')
     if not isinstance(node, yaml.SequenceNode):
         return _scalar(node, name)
     values = [_scalar(entry, name) for entry in node.value]
     if len({type(value) for value in values}) > 1:
         raise _error(
-            _line(node),
-            f'{name} mixes types, which ROS rejects: write all entries alike (1.0, not 1)',
+            node, f'{name} mixes types, which ROS rejects: write all entries alike (1.0, not 1)'
         )
     return values
 
 
 def _scalar(node: yaml.Node, name: str) -> object:
     if not isinstance(node, yaml.ScalarNode):
-        raise _error(_line(node), f'{name} has a list in a list, which ROS rejects')
+        raise _error(node, f'{name} has a list in a list, which ROS rejects')
     if node.style in ('"', "'") or node.tag == 'tag:yaml.org,2002:str':
         return node.value
     if not node.value:
-        raise _error(_line(node), f'{name} has no value')
+        raise _error(node, f'{name} has no value')
     return parse_scalar(node.value)
+
+
+def _outside(names: tuple[str, ...], node: yaml.Node) -> ConfigurationError:
+    if not names:
+        return _error(node, f'expected node names or {_MARK} at the top')
+    if close := difflib.get_close_matches(_MARK, names, n=1, cutoff=0.8):
+        return _error(node, f'{close[0]} should be {_MARK} (two underscores)')
+    return _error(node, f'{names[-1]} has a value, but is outside of {_MARK}')
 
 
 def _line(node: Any) -> int:
     return cast('int', node.start_mark.line) + 1
 
 
-def _error(line: int, problem: str) -> ConfigurationError:
-    return ConfigurationError([f'line {line}: {problem}'])
+def _error(node: yaml.Node, problem: str) -> ConfigurationError:
+    return ConfigurationError([f'line {_line(node)}: {problem}'])
 
 
-def _repeated(line: int, name: str, first: int) -> ConfigurationError:
-    return _error(line, f'{name} is repeated, first given on line {first}')
+def _repeated(node: yaml.Node, name: str, first: int) -> ConfigurationError:
+    return _error(node, f'{name} is repeated, first given on line {first}')
+
+
+class UnreasonableYamlError(yaml.MarkedYAMLError):
+    """YAML that would take too much memory or time."""
+
+
+class _Limited(yaml.composer.Composer):
+    """Limits on the size and nesting of YAML, and no aliases."""
+
+    peek_event: Callable[[], Any]  # of the parser
+    _nodes = _depth = 0
+
+    def compose_node(self, parent: Any, index: Any) -> Any:
+        event: Any = self.peek_event()
+        self._nodes += 1
+        self._depth += 1
+        problem = ''
+        if isinstance(event, yaml.AliasEvent):
+            problem = f'ROS does not support the alias *{event.anchor}'
+        elif self._depth > _DEEPEST:
+            problem = f'nested more than {_DEEPEST} levels deep'
+        elif self._nodes > _MOST_NODES:
+            problem = f'more than {_MOST_NODES} entries'
+        if problem:
+            raise UnreasonableYamlError(problem=problem, problem_mark=event.start_mark)
+        node = super().compose_node(parent, index)
+        self._depth -= 1
+        return node
+
+
+class _Composer(_Limited, yaml.BaseLoader):
+    """Keeps each word as written."""
+
+    DEFAULT_SCALAR_TAG = '?'  # type: ignore[misc] # unlike an explicit !!str
+
+
+class _Loader(_Limited, yaml.SafeLoader):
+    """Makes plain data."""
+
+
+def load_yaml(text: str) -> Any:
+    """Return the plain data of a YAML text; raises yaml.YAMLError if damaged or unreasonable."""
+    return yaml.load(text, Loader=_Loader)  # noqa: S506 - a safe loader
 
 
 _CHECKOUT = Path(__file__).resolve().parents[2]
@@ -283,32 +300,3 @@ def _candidates() -> Iterator[Path]:
         yield Path(get_package_share_directory(_PACKAGE))
     for scheme in (sysconfig.get_default_scheme(), sysconfig.get_preferred_scheme('user')):
         yield Path(sysconfig.get_path('data', scheme), 'share', _PACKAGE)
-
-
-class UnreasonableYamlError(yaml.MarkedYAMLError):
-    """YAML that would take too much memory or time."""
-
-
-def check_yaml(text: str) -> None:
-    """Raise UnreasonableYamlError, or another yaml.YAMLError if `text` is damaged."""
-    depth = nodes = 0
-    event: Any
-    for event in yaml.parse(text, Loader=_Parser):
-        depth += isinstance(event, yaml.CollectionStartEvent)
-        depth -= isinstance(event, yaml.CollectionEndEvent)
-        nodes += isinstance(event, yaml.NodeEvent)
-        problem = ''
-        if isinstance(event, yaml.AliasEvent):
-            problem = f'ROS does not support the alias *{event.anchor}'
-        elif depth > _DEEPEST:
-            problem = f'nested more than {_DEEPEST} levels deep'
-        elif nodes > _MOST_NODES:
-            problem = f'more than {_MOST_NODES} entries'
-        if problem:
-            raise UnreasonableYamlError(problem=problem, problem_mark=event.start_mark)
-
-
-def load_yaml(text: str) -> Any:
-    """Return the plain data of a YAML text; raises the errors of `check_yaml`."""
-    check_yaml(text)
-    return yaml.load(text, Loader=_Loader)  # noqa: S506 - a safe loader

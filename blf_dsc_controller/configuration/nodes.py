@@ -44,8 +44,8 @@ _PREFACE = """\
 
 All parameters of all nodes; the defaults are the recommended set. One parameter file serves all
 nodes and needs only the parameters it changes; `blf_dsc run` writes one with all values into its
-folder, `config.yaml`. Values of type double need a decimal point: `1.0`, not `1`. Arrays have one
-entry per joint unless the range says otherwise.
+folder, `config.yaml`. Values of type double need a decimal point: `1.0`, not `1`. `entries: joints`
+is one entry per joint.
 
 A dot under *live* marks a parameter that can change while the node runs (`ros2 param set`); the
 others are fixed at the start, and `ros2 param describe` gives the reason.
@@ -64,7 +64,7 @@ class RecorderConfig:
     """Parameters of the node `bag_recorder`."""
 
     output: str = _of_bag('bag', 'folder of the bag; it must not exist yet')
-    topics: tuple[str, ...] = _of_bag((), 'topics to record; empty: all', may_be_empty=True)
+    topics: tuple[str, ...] = _of_bag((), 'topics to record; empty: all', omittable=True)
     compression: Literal['none', 'zstd'] = _of_bag('none', 'compression of the chunks of the bag')
     queue_depth: int = _of_bag(
         100_000,
@@ -173,14 +173,13 @@ def locate(given: str | Path) -> Path:
     """
     presets = {path.stem: path for path in sorted((share_folder() / 'config').glob('*.yaml'))}
     name, path = str(given), Path(given)
-    if name in presets:
-        return presets[name]
-    if path.is_file():
+    if path.is_file() and name not in presets:
         return path
-    if name.removesuffix('.yaml') in presets:
-        return presets[name.removesuffix('.yaml')]
+    stem = name.removesuffix('.yaml')
+    if stem in presets:
+        return presets[stem]
     what = 'is a folder' if path.is_dir() else 'does not exist'
-    close = difflib.get_close_matches(name.removesuffix('.yaml'), presets, n=1)
+    close = difflib.get_close_matches(stem, presets, n=1)
     guess = f'did you mean {close[0]}? ' if close else ''
     remedy = f'give a parameter file, or a preset: {", ".join(presets)}'
     raise ConfigurationError([f'{name} {what}: {guess}{remedy}'])
@@ -227,14 +226,7 @@ def load(
     problems and their line numbers. Unknown names are rejected; in a section for several nodes, a
     name that any node of the package knows is accepted.
     """
-    sections = read(path)
-    problems = [*_unknown_names(sections), *unmatched_sections(sections, [node])]
-    try:
-        config = _load(sections, node, cls, overrides or {})
-    except ConfigurationError as error:
-        problems += error.problems
-    if problems:
-        raise ConfigurationError(problems, str(path))
+    config: Config = _load_all(path, {node: cls}, {node: overrides or {}})[node]
     return config
 
 
@@ -247,41 +239,45 @@ def load_loop(
     with the problems of all nodes, or if plant and controller disagree.
     """
     path = locate(given)
-    sections = read(path)
-    problems = [*_unknown_names(sections), *unmatched_sections(sections, NODES)]
-    configs: dict[str, Any] = {}
-    nodes_with: dict[str, list[str]] = {}
-    for node, cls in NODES.items():
-        try:
-            configs[node] = _load(sections, node, cls, (overrides or {}).get(node, {}))
-        except ConfigurationError as error:
-            for problem in error.problems:
-                nodes_with.setdefault(problem, []).append(node)
-    problems += [f'{", ".join(nodes)}: {problem}' for problem, nodes in nodes_with.items()]
-    if not problems:
-        loop = LoopConfig(configs[PLANT], configs[CONTROLLER], configs[RECORDER])
-        problems = loop.problems()
-    if problems:
+    configs = _load_all(path, NODES, overrides or {})
+    loop = LoopConfig(configs[PLANT], configs[CONTROLLER], configs[RECORDER])
+    if problems := loop.problems():
         raise ConfigurationError(problems, str(path))
     return loop
 
 
-def dump(path: Path, nodes: Mapping[str, object]) -> None:
-    """Write all parameters of the nodes to a parameter file; loading it restores them exactly."""
-    path.write_text(dumps(nodes), encoding='utf-8')
+def _load_all(
+    path: str | Path, nodes: Mapping[str, Any], overrides: Mapping[str, Mapping[str, object]]
+) -> dict[str, Any]:
+    """Load the configurations of some nodes; a problem of several is reported once."""
+    sections = read(path)
+    problems = [*_unknown_names(sections), *unmatched_sections(sections, nodes)]
+    configs: dict[str, Any] = {}
+    nodes_with: dict[str, list[str]] = {}
+    for node, cls in nodes.items():
+        try:
+            configs[node] = _load(sections, node, cls, overrides.get(node, {}))
+        except ConfigurationError as error:
+            for problem in error.problems:
+                nodes_with.setdefault(problem, []).append(node)
+    for problem, names in nodes_with.items():
+        problems.append(f'{", ".join(names)}: {problem}' if len(nodes) > 1 else problem)
+    if problems:
+        raise ConfigurationError(problems, str(path))
+    return configs
 
 
-def dumps(nodes: Mapping[str, object]) -> str:
-    """Return the text of a parameter file.
+def dump(path: Path, nodes: Mapping[str, object], comment: str = '') -> None:
+    """Write all parameters of the nodes to a parameter file; loading it restores them exactly.
 
     `nodes` are configurations, or values by dotted name, by node name with or without a namespace.
     """
-    lines = []
+    lines = [comment]
     for node, config in nodes.items():
         lines.append(f'/{node.removeprefix("/")}:\n  ros__parameters:\n')
         values = config if isinstance(config, Mapping) else flatten(config)
         lines += [f'    {name}: {format_value(value)}\n' for name, value in values.items()]
-    return ''.join(lines)
+    path.write_text(''.join(lines), encoding='utf-8')
 
 
 def format_value(value: Value) -> str:
@@ -363,19 +359,12 @@ def parameter_page() -> str:
 
 
 def _row(param: Parameter) -> str:
-    number = next((f'{length} entries' for length in param.length if length.isdigit()), '')
-    lengths = [name for name in param.length if name != 'joints' and not name.isdigit()]
-    if 'joints' in param.length and lengths:
-        lengths.insert(0, 'joint')
-    each = f'{number or "one entry"} per {" and ".join(lengths)}' if lengths else number
-    if param.omittable:
-        each = f'{each}, or none' if each else 'may be empty'
     cells = (
         f'`{param.name}`',
         param.description,
         f'`{format_value(param.default)}`',
         param.unit,
-        '; '.join(part for part in (param.allowed, each) if part),
+        param.constraints,
         '' if param.read_only else '•',
         param.kind.value,
         param.symbol,

@@ -15,14 +15,10 @@ from typing import Annotated, Any, Literal
 
 import numpy as np
 
-from blf_dsc_controller.configuration.robot import Robot, given_robot
+from blf_dsc_controller.configuration.robot import ArmConfig, given_robot
 from blf_dsc_controller.configuration.schema import (
     PerJoint,
-    Realtime,
-    Sampled,
     Value,
-    autostart,
-    joint_problems,
     non_negative,
     parameter,
     parameters,
@@ -64,7 +60,7 @@ class Events:
     """
 
     begin: tuple[float, ...] = parameter(
-        (), 'time at which each event begins, from the start', 's', at_least=0.0, may_be_empty=True
+        (), 'time at which each event begins, from the start', 's', at_least=0.0, omittable=True
     )
     duration: PerEvent = _of_events('duration of each event; 0: permanent', unit='s', at_least=0.0)
     ramp: PerEvent = _of_events('time to fade in, and to fade out', unit='s', at_least=0.0)
@@ -183,7 +179,7 @@ class Sensor:
     published_joints: tuple[str, ...] = _fixed(
         (),
         'names in the joint states, in order; others than `joints` stay at 0; empty: `joints`',
-        may_be_empty=True,
+        omittable=True,
     )
     incomplete: Literal['invalid', 'absent'] = _fixed(
         'invalid',
@@ -254,22 +250,9 @@ class Drive(Deviation):
 
 
 @dataclass(frozen=True)
-class PlantConfig(Sampled):
-    """Parameters of the node `sim_plant`.
+class PlantConfig(ArmConfig):
+    """Parameters of the node `sim_plant`."""
 
-    Create it with `load` from a parameter file, or with `build` and `change` from values by dotted
-    name; these validate it, the constructor does not.
-    """
-
-    joints: tuple[str, ...] = _fixed(('joint1', 'joint2'), 'names of the joints, from the base')
-    sample_time: float = _fixed(
-        0.001,
-        'time between two measured states, for which the torque is held',
-        's',
-        'T',
-        at_least=1e-5,
-        at_most=1.0,
-    )
     mode: Literal['realtime', 'lockstep'] = _fixed(
         'realtime', 'one step per sample time of the wall clock, or one per received torque'
     )
@@ -278,14 +261,7 @@ class PlantConfig(Sampled):
     )
     seed: int = _fixed(0, 'seed of the noise; equal seeds give equal runs', at_least=0)
     publish_clock: bool = _fixed(False, 'publish the simulated time on /clock')
-    wait_for_subscribers: int = _fixed(
-        0,
-        'recorders (nodes with `record` in their names) of each topic to wait for at first',
-        at_least=0,
-    )
-    autostart: bool = autostart()
     arm: PlantArm = PlantArm()
-    robot: Robot = Robot()
     truth: Truth = Truth()
     drive: Drive = Drive()
     initial: Initial = Initial()
@@ -295,7 +271,6 @@ class PlantConfig(Sampled):
     load: Load = Load()
     wall: Wall = Wall()
     events: Events = Events()
-    realtime: Realtime = Realtime()
 
     @classmethod
     def defaults(cls, given: Mapping[str, Any]) -> dict[str, Value]:
@@ -306,8 +281,11 @@ class PlantConfig(Sampled):
         middles = [(joint.lower + joint.upper) / 2.0 for joint in joints]
         zero = (0.0,) * len(joints)
         return {
-            **{param.name: zero for param in parameters(cls) if param.length == ('joints',)},
-            'robot.rotor_inertia': (),
+            **{
+                param.name: zero
+                for param in parameters(cls)
+                if param.length == ('joints',) and not param.omittable
+            },
             'joints': tuple(joint.name for joint in joints),
             'initial.position': tuple(q if math.isfinite(q) else 0.0 for q in middles),
             'disturbance.viscous': tuple(joint.damping for joint in joints),
@@ -319,17 +297,13 @@ class PlantConfig(Sampled):
 
     def problems(self) -> Iterator[str]:
         """Check the joints, the sample time and the duration."""
-        needed = None if self.robot.urdf else 2
-        yield from joint_problems(self.joints, 'the simulated arm', needed)
-        yield from self.sample_time_problems()
+        yield from self.arm_problems('the simulated arm', None if self.robot.urdf else 2)
         if not any(self.wall.normal):
             yield 'wall.normal: got [0.0, 0.0, 0.0], but a direction is needed'
         if self.truth != Truth() and not self.robot.urdf:
             yield 'truth: it applies only to a URDF: give robot.urdf, or change arm'
         if self.drive != Drive() and self.robot.drive_compensates == 'none':
             yield 'drive: without robot.drive_compensates the drives need no model'
-        for problem in self.robot.problems():
-            yield f'robot.{problem}'
         published = self.sensor.published_joints
         if published and (lacking := [name for name in self.joints if name not in published]):
             yield f'sensor.published_joints: {", ".join(lacking)} of `joints` is missing'

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The arm of a URDF: its source, its joints, and the properties that a URDF lacks."""
+"""What plant and controller share: joints, rate, and the arm of a URDF with what it lacks."""
 
 from __future__ import annotations
 
@@ -17,14 +17,23 @@ from blf_dsc_controller.arms.inertia import inertia_of
 from blf_dsc_controller.arms.prior import PAYLOAD_SIZE
 from blf_dsc_controller.arms.urdf import Chain, UrdfError, chain_joints, moving_joints, read_chain
 from blf_dsc_controller.configuration.files import read_text, resolve
-from blf_dsc_controller.configuration.schema import build, counted, parameter
+from blf_dsc_controller.configuration.schema import (
+    PerJoint,
+    build,
+    counted,
+    non_negative,
+    parameter,
+)
 from blf_dsc_controller.errors import BlfDscError, ConfigurationError
 
 if TYPE_CHECKING:
     from blf_dsc_controller.arms.base_parameters import BaseParameters
     from blf_dsc_controller.arms.forms import LearnedParameters
 
-_fixed = partial(parameter, read_only='the arm is built once, when the node starts')
+_BUILT = 'arm and law are built once, when the node starts'
+_fixed = partial(parameter, read_only=_BUILT)
+_omitted = partial(non_negative, (), read_only=_BUILT, omittable=True)
+_at_start = partial(parameter, read_only='the process requests it once, before the first sample')
 
 TOPIC = 'topic://'
 """Prefix of a `robot.urdf` that is published; the node waits for it when it starts."""
@@ -35,6 +44,7 @@ _DRIVE_ACCELERATION = 400.0  # rad/s^2, of an unloaded drive at its rated torque
 _PLACEHOLDER = 4.0  # times the weight of the arm at its full reach: the strongest drives have 1
 _NEEDED = 0.5  # of that torque, where efforts are placeholders: no arm stretches every link
 _MOST_FRICTION = 0.25  # of the effort
+_ROUNDING = 1e-12  # relative; the product of a decimal fraction and 1e9 is off by a few 1e-16
 
 
 @dataclass(frozen=True)
@@ -54,32 +64,28 @@ class Robot:
     gravity: Annotated[tuple[float, ...], '3'] = _fixed(
         (0.0, 0.0, -9.81), 'gravity in the base frame; (0, 0, 9.81): ceiling mount', 'm/s^2', 'g'
     )
-    lag: float = _fixed(
+    lag: float = non_negative(
         0.005,
         'delay of measured velocities and applied torques, in addition to the sampling',
         's',
-        at_least=0.0,
+        read_only=_BUILT,
     )
-    payload: float = _fixed(3.0, 'rated payload', 'kg', at_least=0.0)
+    payload: float = non_negative(3.0, 'rated payload', 'kg', read_only=_BUILT)
     learn: Literal['base', 'payload'] = _fixed(
         'base', 'what is learned: all base parameters, or the load at the tip'
     )
-    rotor_inertia: Annotated[tuple[float, ...], 'joints'] = _fixed(
-        (),
+    rotor_inertia: PerJoint = _omitted(
         'inertia of each drive, reflected to its joint; empty: from its effort, then as measured',
         'kg m^2',
-        at_least=0.0,
-        omittable=True,
     )
-
     drive_compensates: Literal['none', 'gravity', 'gravity_and_friction'] = _fixed(
         'none', 'what the drives add to a commanded torque by themselves'
     )
-    drive_payload: float = _fixed(
+    drive_payload: float = non_negative(
         0.0,
         'payload that the drives have been told of, as far as the URDF lacks it',
         'kg',
-        at_least=0.0,
+        read_only=_BUILT,
     )
     drive_payload_centre: Annotated[tuple[float, ...], '3'] = _fixed(
         (0.0, 0.0, 0.0), 'centre of mass of that payload, in the frame of the tip', 'm'
@@ -89,19 +95,13 @@ class Robot:
         'what `effort` in joint states is: torques, whole or without what the drives add, or only '
         'proportional to the whole, as currents are',
     )
-    viscous: Annotated[tuple[float, ...], 'joints'] = _fixed(
-        (),
+    viscous: PerJoint = _omitted(
         'initial viscous friction; empty: damping of the URDF, or 0 if the drives compensate it',
         'N m s/rad',
-        at_least=0.0,
-        omittable=True,
     )
-    coulomb: Annotated[tuple[float, ...], 'joints'] = _fixed(
-        (),
+    coulomb: PerJoint = _omitted(
         'initial Coulomb friction; empty: friction of the URDF, or 0 if the drives compensate it',
         'N m',
-        at_least=0.0,
-        omittable=True,
     )
 
     def problems(self) -> Iterator[str]:
@@ -230,30 +230,19 @@ def chain_of(text: str, base: str, tip: str, joints: tuple[str, ...]) -> Chain:
 
 def parameters_of(robot: Robot, chain: Chain) -> BaseParameters:
     """Return the base parameters of the arm, with the rotors."""
-    gravity = (robot.gravity[0], robot.gravity[1], robot.gravity[2])
-    return _parameters_of(chain, gravity)
-
-
-@functools.lru_cache(maxsize=16)
-def _parameters_of(chain: Chain, gravity: tuple[float, float, float]) -> BaseParameters:
     from blf_dsc_controller.arms.base_parameters import base_parameters  # slow: compiles
 
-    return base_parameters(chain, gravity)
-
-
-def learned_of(robot: Robot, chain: Chain) -> LearnedParameters:
-    """Return the learned parameters of the arm, with the rotors."""
-    base, rotors = parameters_of(robot, chain), tuple(robot.rotors(chain).tolist())
-    return _learned_of(chain, base, robot.learn, robot.payload, rotors)
+    x, y, z = robot.gravity
+    return base_parameters(chain, (x, y, z))
 
 
 @functools.lru_cache(maxsize=16)
-def _learned_of(
-    chain: Chain, base: BaseParameters, form: str, payload: float, rotors: tuple[float, ...]
-) -> LearnedParameters:
+def learned_of(robot: Robot, chain: Chain) -> LearnedParameters:
+    """Return the learned parameters of the arm, with the rotors."""
     from blf_dsc_controller.arms.forms import learned_parameters  # slow: compiles
 
-    return learned_parameters(chain, base, form, payload, np.array(rotors))
+    base = parameters_of(robot, chain)
+    return learned_parameters(chain, base, robot.learn, robot.payload, robot.rotors(chain))
 
 
 def drive_model(robot: Robot, joints: tuple[str, ...]) -> tuple[np.ndarray, np.ndarray]:
@@ -268,8 +257,8 @@ def drive_model(robot: Robot, joints: tuple[str, ...]) -> tuple[np.ndarray, np.n
     chain = robot.chain(joints)
     columns = [(i, entry) for i in range(len(chain.joints)) for entry in range(_MOMENTS)]
     inertias = robot.drive_inertias(chain, chain.inertias)
-    gravity = (robot.gravity[0], robot.gravity[1], robot.gravity[2])
-    return serial_chain(chain, gravity, columns).vector, inertias[:, :_MOMENTS].ravel()
+    x, y, z = robot.gravity
+    return serial_chain(chain, (x, y, z), columns).vector, inertias[:, :_MOMENTS].ravel()
 
 
 def given_robot(given: Mapping[str, Any], joints: object) -> tuple[Robot, Chain]:
@@ -292,3 +281,68 @@ def given_robot(given: Mapping[str, Any], joints: object) -> tuple[Robot, Chain]
         entries = counted(rotors, 'entry', 'entries')
         raise ConfigurationError([f'robot.rotor_inertia: got {entries} for {n} joints'])
     return robot, chain
+
+
+@dataclass(frozen=True)
+class Realtime:
+    """What the process requests from the operating system."""
+
+    priority: int = _at_start(
+        0,
+        'SCHED_FIFO priority to request, below 50, which is that of controller_manager; 0: leave '
+        'scheduling as it is',
+        at_least=0,
+        at_most=99,
+    )
+    lock_memory: bool = _at_start(False, 'lock the memory of the process, to prevent swapping')
+
+
+@dataclass(frozen=True)
+class ArmConfig:
+    """Parameters that plant and controller have in common.
+
+    Create their configurations with `load` from a parameter file, or with `build` and `change` from
+    values by dotted name; these validate them, the constructors do not.
+    """
+
+    joints: tuple[str, ...] = _fixed(('joint1', 'joint2'), 'names of the joints, from the base')
+    sample_time: float = _fixed(
+        0.001,
+        'time between two joint states, for which the torque is held',
+        's',
+        'T',
+        at_least=1e-5,
+        at_most=1.0,
+    )
+    wait_for_subscribers: int = non_negative(
+        0,
+        'recorders (nodes with `record` in their names) of each topic to wait for at first',
+        read_only='topics are created once, when the node starts',
+    )
+    autostart: bool = parameter(
+        True,
+        'configure and activate the node at once; false: wait for a lifecycle manager',
+        read_only='it has no effect later',
+    )
+    robot: Robot = Robot()
+    realtime: Realtime = Realtime()
+
+    @property
+    def sample_time_ns(self) -> int:
+        """The sample time in nanoseconds, the unit of the stamps."""
+        return round(self.sample_time * 1e9)
+
+    def arm_problems(self, arm: str, needed: int | None) -> Iterator[str]:
+        """Check the number of joints, their names, by which they are matched, and the rate."""
+        for name in sorted({name for name in self.joints if self.joints.count(name) > 1}):
+            yield f'joints: the name {name!r} is repeated'
+        if '' in self.joints:
+            yield 'joints: a name is empty'
+        if needed not in (None, len(self.joints)):
+            got = counted(len(self.joints), 'name', 'names')
+            yield f'joints: got {got}, but {arm} has {needed} joints'
+        yield from (f'robot.{problem}' for problem in self.robot.problems())
+        # Stamps are whole nanoseconds, and would drift from the time in the law.
+        if abs(self.sample_time * 1e9 - self.sample_time_ns) > _ROUNDING * self.sample_time_ns:
+            got = f'got {self.sample_time!r} s, not a whole number of nanoseconds'
+            yield f'sample_time: {got}: write {self.sample_time_ns * 1e-9:.9f}'

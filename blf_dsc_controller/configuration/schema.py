@@ -19,7 +19,6 @@ import typing
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from enum import Enum
-from functools import partial
 from typing import Annotated, Any, TypeAlias, TypeVar
 
 from blf_dsc_controller.errors import BlfDscError, ConfigurationError
@@ -63,10 +62,10 @@ class Parameter:
     """A parameter of a node: what it means and which values are valid.
 
     Ranges and choices apply to each entry of an array. `read_only` is the reason why the parameter
-    cannot change while the node runs; empty: it can. An `omittable` array may be empty regardless
-    of its required length. `kept` converts a given text to the value that a configuration holds, or
-    raises BlfDscError. The last three are derived from the field of the dataclass: `length` names
-    the parameters whose lengths multiply to the length of this array; a number is itself a length.
+    cannot change while the node runs; empty: it can. An `omittable` array may be empty. `kept`
+    converts a given text to the value that a configuration holds, or raises BlfDscError. The last
+    three are derived from the field of the dataclass: `length` names the parameters whose lengths
+    multiply to the length of this array; a number is itself a length.
     """
 
     default: Value
@@ -78,7 +77,6 @@ class Parameter:
     at_most: float | None = None
     below: float | None = None
     choices: tuple[str, ...] = ()
-    may_be_empty: bool = False
     omittable: bool = False
     read_only: str = ''
     kept: Callable[[str], str] = str
@@ -92,6 +90,13 @@ class Parameter:
         if self.choices:
             return 'one of ' + ', '.join(self.choices)
         return ' and '.join(f'{words} {limit:g}' for words, limit, _ in self._limits())
+
+    @property
+    def constraints(self) -> str:
+        """What is allowed, and the number of entries, such as `above 0; entries: joints`."""
+        entries = f'entries: {" times ".join(self.length)}' if self.length else ''
+        empty = 'may be empty' if self.omittable else ''
+        return '; '.join(filter(None, (self.allowed, entries, empty)))
 
     def problems(self, given: Any) -> list[str]:
         """Check a value; each problem names the parameter, what it got, and what is expected."""
@@ -107,7 +112,7 @@ class Parameter:
         if not all(_is(entry, self.kind.element) for entry in entries):
             yield mismatch + _remedy(entries, self.kind.element)
             return
-        if not entries and not (self.may_be_empty or self.omittable):
+        if not (entries or self.omittable or self.length):
             yield 'got an empty list, but at least one entry is needed'
         for index, entry in enumerate(entries, 1):
             if isinstance(entry, float) and not math.isfinite(entry):
@@ -233,13 +238,11 @@ def counted(count: int, single: str, many: str) -> str:
 
 @functools.cache
 def _parameters(cls: Any) -> tuple[Parameter, ...]:
-    found: list[Parameter] = []
-    for name, param in _fields(cls).items():
-        if isinstance(param, Parameter):
-            found.append(param)
-        else:
-            found += [dataclasses.replace(p, name=f'{name}.{p.name}') for p in _parameters(param)]
-    return tuple(found)
+    return tuple(
+        dataclasses.replace(each, name=f'{name}.{each.name}' if each is not param else name)
+        for name, param in _fields(cls).items()
+        for each in ([param] if isinstance(param, Parameter) else _parameters(param))
+    )
 
 
 @functools.cache
@@ -256,9 +259,7 @@ def _fields(cls: Any) -> dict[str, Any]:
         if typing.get_origin(hint) is typing.Literal:
             param, hint = dataclasses.replace(param, choices=typing.get_args(hint)), str
         length = getattr(annotated[field.name], '__metadata__', ())
-        found[field.name] = dataclasses.replace(
-            param, name=field.name, kind=_KINDS[hint], length=length
-        )
+        found[field.name] = dataclasses.replace(param, kind=_KINDS[hint], length=length)
     return found
 
 
@@ -313,58 +314,3 @@ def _remedy(entries: list[Any], kind: Kind) -> str:
 
 PerJoint: TypeAlias = Annotated[tuple[float, ...], 'joints']
 """Array with one entry per joint."""
-
-_ROUNDING = 1e-12  # relative; the product of a decimal fraction and 1e9 is off by a few 1e-16
-
-_at_start = partial(parameter, read_only='the process requests it once, before the first sample')
-
-
-@dataclass(frozen=True)
-class Realtime:
-    """What the process requests from the operating system."""
-
-    priority: int = _at_start(
-        0,
-        'SCHED_FIFO priority to request, below 50, which is that of controller_manager; 0: leave '
-        'scheduling as it is',
-        at_least=0,
-        at_most=99,
-    )
-    lock_memory: bool = _at_start(False, 'lock the memory of the process, to prevent swapping')
-
-
-def autostart() -> Any:
-    """Declare whether a lifecycle node activates itself."""
-    return parameter(
-        True,
-        'configure and activate the node at once; false: wait for a lifecycle manager',
-        read_only='it has no effect later',
-    )
-
-
-class Sampled:
-    """A configuration with a sample time."""
-
-    sample_time: float
-
-    @property
-    def sample_time_ns(self) -> int:
-        """The sample time in nanoseconds, the unit of the stamps."""
-        return round(self.sample_time * 1e9)
-
-    def sample_time_problems(self) -> Iterator[str]:
-        """Require whole nanoseconds, or stamps would drift from the time in the law."""
-        if abs(self.sample_time * 1e9 - self.sample_time_ns) > _ROUNDING * self.sample_time_ns:
-            got = f'got {self.sample_time!r} s, not a whole number of nanoseconds'
-            yield f'sample_time: {got}: write {self.sample_time_ns * 1e-9:.9f}'
-
-
-def joint_problems(joints: tuple[str, ...], arm: str, needed: int | None) -> Iterator[str]:
-    """Require distinct names, since joints are matched by name, and as many as the arm needs."""
-    for name in sorted({name for name in joints if joints.count(name) > 1}):
-        yield f'joints: the name {name!r} is repeated'
-    if '' in joints:
-        yield 'joints: a name is empty'
-    if needed is not None and len(joints) != needed:
-        got = counted(len(joints), 'name', 'names')
-        yield f'joints: got {got}, but {arm} has {needed} joints'

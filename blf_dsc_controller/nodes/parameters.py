@@ -146,15 +146,11 @@ def descriptor(parameter: Parameter) -> ParameterDescriptor:
     """
     symbol = f'{parameter.symbol}: ' if parameter.symbol else ''
     unit = f' [{parameter.unit}]' if parameter.unit else ''
-    constraints = [parameter.allowed] if parameter.allowed else []
-    if parameter.length:
-        constraints.append('as many entries as ' + ' times '.join(parameter.length))
-    if parameter.read_only:
-        constraints.append(_fixed(parameter))
+    fixed = _fixed(parameter) if parameter.read_only else ''
     described = ParameterDescriptor(
         description=f'{symbol}{parameter.description}{unit}',
         read_only=bool(parameter.read_only),
-        additional_constraints='; '.join(constraints),
+        additional_constraints='; '.join(filter(None, (parameter.constraints, fixed))),
     )
     low = parameter.above if parameter.at_least is None else parameter.at_least
     high = parameter.below if parameter.at_most is None else parameter.at_most

@@ -30,7 +30,7 @@ from rclpy.utilities import remove_ros_args
 
 from blf_dsc_controller.configuration.files import parse
 from blf_dsc_controller.configuration.nodes import read, unmatched_sections
-from blf_dsc_controller.configuration.schema import Realtime
+from blf_dsc_controller.configuration.robot import Realtime
 from blf_dsc_controller.errors import BlfDscError, ConfigurationError
 from blf_dsc_controller.nodes.endpoints import RCLError, UnknownROSArgsError
 

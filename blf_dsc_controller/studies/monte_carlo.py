@@ -83,7 +83,7 @@ class MonteCarloConfig:
         'times at which the parameter error is stored, besides the end',
         unit='s',
         at_least=0.0,
-        may_be_empty=True,
+        omittable=True,
     )
 
     def duration_problems(self, duration: float) -> Iterator[str]:
