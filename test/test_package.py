@@ -14,7 +14,7 @@ import sys
 import tarfile
 import xml.etree.ElementTree as ET
 import zipfile
-from importlib.metadata import EntryPoint
+from importlib.metadata import PathDistribution
 from pathlib import Path
 
 import pytest
@@ -28,14 +28,7 @@ ROOT = Path(__file__).resolve().parents[1]
 NAME = 'blf_dsc_controller'
 PACKAGES = (NAME, 'sim_plant')
 URL = 'https://example.org/blf_dsc_controller'
-EXECUTABLES = {
-    'blf_dsc',
-    'sim_plant',
-    'blf_dsc_controller',
-    'bag_recorder',
-    'torque_watchdog',
-    'arm_view',
-}
+NODES = {'sim_plant', 'blf_dsc_controller', 'bag_recorder', 'torque_watchdog', 'arm_view'}
 
 # rosdep's names for what pip installs. rosdep has no key for mcap alone.
 ROSDEP_KEYS = {
@@ -92,45 +85,32 @@ def wheel(sdist, tmp_path_factory):
 
 
 @pytest.fixture(scope='module')
-def metadata(wheel):
-    """Metadata of the wheel, as a list of (field, value)."""
-    (name,) = (name for name in wheel.namelist() if name.endswith('.dist-info/METADATA'))
-    header = wheel.read(name).decode().split('\n\n')[0]
-    return [tuple(line.split(': ', 1)) for line in header.splitlines() if ': ' in line]
+def distribution(wheel):
+    """Metadata, requirements and entry points of the wheel."""
+    (folder,) = {name.split('/')[0] for name in wheel.namelist() if '.dist-info/' in name}
+    return PathDistribution(zipfile.Path(wheel.filename, f'{folder}/'))
 
 
-@pytest.fixture(scope='module')
-def entry_points(wheel):
-    (name,) = (name for name in wheel.namelist() if name.endswith('entry_points.txt'))
-    parser = configparser.ConfigParser()
-    parser.read_string(wheel.read(name).decode())
-    return [
-        EntryPoint(command, target, 'console_scripts')
-        for command, target in parser['console_scripts'].items()
-    ]
-
-
-def requirements(metadata, extra=None):
-    lines = [value for field, value in metadata if field == 'Requires-Dist']
+def requirements(distribution, extra=None):
     wanted = [
-        line for line in lines if (f'extra == "{extra}"' in line if extra else 'extra' not in line)
+        line
+        for line in distribution.requires
+        if (f'extra == "{extra}"' in line if extra else 'extra' not in line)
     ]
     return {re.match(r'[\w-]+', line).group().lower() for line in wanted}
 
 
-def test_version_is_the_same_everywhere(metadata):
+def test_version_is_the_same_everywhere(distribution):
     version = blf_dsc_controller.__version__
     citation = re.search(r'^version: (.+)$', (ROOT / 'CITATION.cff').read_text(), re.MULTILINE)
-    assert dict(metadata)['Version'] == version
+    assert distribution.version == version
     assert manifest().findtext('version') == version
     assert citation.group(1) == version
     assert version in (ROOT / 'CHANGELOG.rst').read_text()
 
 
-def test_metadata_matches_the_manifest_and_readme(wheel, metadata):
-    fields = dict(metadata)
-    (name,) = (name for name in wheel.namelist() if name.endswith('.dist-info/METADATA'))
-    text = wheel.read(name).decode()
+def test_metadata_matches_the_manifest_and_readme(distribution):
+    fields, text = distribution.metadata, distribution.read_text('METADATA')
     assert not re.search(r'\]\((?!https?://|#)', text)  # PyPI shows no relative picture or link
     for place in ('raw', 'blob'):
         text = text.replace(f'({URL}/{place}/{blf_dsc_controller.__version__}/', '(')
@@ -141,12 +121,14 @@ def test_metadata_matches_the_manifest_and_readme(wheel, metadata):
     assert fields['Maintainer-email'] == manifest().find('maintainer').get('email')
     license_name = fields.get('License-Expression') or fields['License']  # depends on setuptools
     assert license_name == manifest().findtext('license') == 'Apache-2.0'
+    assert fields['Requires-Python'] == '>=3.10'
     assert fields['Keywords']
 
 
-def test_continuous_integration_runs_every_supported_python(metadata):
+def test_continuous_integration_runs_every_supported_python(distribution):
     jobs = yaml.safe_load((ROOT / '.github/workflows/ci.yml').read_text())['jobs']
-    classified = {value.split(' :: ')[-1] for _, value in metadata if 'Python :: 3.' in value}
+    classifiers = distribution.metadata.get_all('Classifier')
+    classified = {value.split(' :: ')[-1] for value in classifiers if 'Python :: 3.' in value}
     assert set(jobs['suite']['strategy']['matrix']['python']) == classified
     container = json.loads((ROOT / '.devcontainer/devcontainer.json').read_text())
     assert (ROOT / '.devcontainer' / container['build']['dockerfile']).is_file()
@@ -197,9 +179,9 @@ def test_wheel_installs_the_share_files_that_ros_expects(wheel):
     }
 
 
-def test_every_executable_has_a_callable_entry_point(entry_points):
-    assert {entry.name for entry in entry_points} == EXECUTABLES
-    for entry in entry_points:
+def test_every_executable_has_a_callable_entry_point(distribution):
+    assert distribution.entry_points.names == {'blf_dsc', *NODES}
+    for entry in distribution.entry_points:
         assert callable(entry.load())
 
 
@@ -220,21 +202,21 @@ def imports(path):
             yield node.module.split('.')[0]
 
 
-def test_every_import_is_a_declared_dependency(metadata):
+def test_every_import_is_a_declared_dependency(distribution):
     used = {name for path in sources() for name in imports(path)}
     used |= set(imports(ROOT / 'launch/closed_loop.launch.py'))
     foreign = used - set(sys.stdlib_module_names) - set(PACKAGES) - {'llvmlite'}  # a part of numba
     distributions = {'pyyaml' if name == 'yaml' else name for name in foreign}
     extras = ('monte-carlo', 'dask', 'report', 'view')
-    optional = set().union(*(requirements(metadata, extra) for extra in extras))
-    assert distributions <= requirements(metadata) | optional | depends('exec_depend')
+    optional = set().union(*(requirements(distribution, extra) for extra in extras))
+    assert distributions <= requirements(distribution) | optional | depends('exec_depend')
 
 
-def test_rosdep_and_pip_install_the_same_dependencies(metadata):
-    assert requirements(metadata) == set(ROSDEP_KEYS)
+def test_rosdep_and_pip_install_the_same_dependencies(distribution):
+    assert requirements(distribution) == set(ROSDEP_KEYS)
     assert set(ROSDEP_KEYS.values()) <= depends('exec_depend')
-    assert {'ros-jazzy-rclpy', 'ros-jazzy-rmw-fastrtps-cpp'} <= requirements(metadata, 'ros')
-    assert 'pytest' in requirements(metadata, 'test')  # where colcon looks
+    assert {'ros-jazzy-rclpy', 'ros-jazzy-rmw-fastrtps-cpp'} <= requirements(distribution, 'ros')
+    assert 'pytest' in requirements(distribution, 'test')  # where colcon looks
 
 
 def run_python(*arguments, folder):

@@ -19,7 +19,6 @@ from urllib.parse import urlsplit
 import pytest
 from markdown_it import MarkdownIt
 
-from blf_dsc_controller.cli import main as command_line
 from blf_dsc_controller.cli.main import make_parser
 from blf_dsc_controller.configuration.nodes import NODES, known_names, load, read
 from blf_dsc_controller.studies.monte_carlo import load_study
@@ -33,19 +32,7 @@ LAUNCH = (ROOT / 'launch/closed_loop.launch.py').read_text()
 SETUP = (ROOT / 'setup.cfg').read_text()
 ROS2_CONTROL_NODES = {'controller_manager', 'effort_controller'}
 # Other programs that the pages may call; they are not checked.
-FOREIGN = {
-    'cd',
-    'colcon',
-    'coverage',
-    'docker',
-    'export',
-    'git',
-    'pytest',
-    'rosdoc2',
-    'source',
-    'sudo',
-    'xacro',
-}
+FOREIGN = 'cd colcon coverage docker export git pre-commit pytest rosdoc2 source sudo xacro'
 
 
 def tokens(page):
@@ -146,27 +133,40 @@ def test_commands_of_a_page_exist_with_their_options(page):
 
 
 def check(words):
-    program, *rest = words
-    program = program.rpartition('/')[2]
-    if program == 'make':
-        targets = [word for word in rest if '=' not in word]
-        assert all(re.search(rf'^{target}:', MAKEFILE, re.MULTILINE) for target in targets), words
-        assert all(f'$({word.split("=")[0]})' in MAKEFILE for word in rest if '=' in word), words
-    elif program == 'python':
-        check_python(rest)
-    elif program in ('ros2', 'pip', 'pre-commit'):
-        globals()[f'check_{program.replace("-", "_")}'](rest)
-    elif program not in FOREIGN:
-        check_own(program, rest)
+    """Check that a command exists, that its options parse, and that its parameters are known."""
+    match [words[0].rpartition('/')[2], *words[1:]]:
+        case ['make', *rest]:
+            for word in rest:
+                name, is_variable, _ = word.partition('=')
+                wanted = re.escape(f'$({name})') if is_variable else f'^{name}:'
+                assert re.search(wanted, MAKEFILE, re.MULTILINE), words
+        case ['blf_dsc', *rest] | ['python', '-m', 'blf_dsc_controller', *rest]:
+            parse([word for word in rest if word[0] != '['])
+        case ['python', '-m', module, *_]:
+            assert importlib.util.find_spec(module), words
+        case ['python', file, *rest]:
+            assert (ROOT / file).is_file()
+            check_parameters(rest)
+        case ['ros2', *rest]:
+            check_ros2(rest)
+        case ['pip', *rest]:
+            extras = re.findall(r'blf_dsc_controller\[(.+?)\]', ' '.join(rest))
+            assert all(f'\n{name} =\n' in SETUP for name in ','.join(extras).split(',') if name)
+        case [program, *rest] if f'\n    {program} = ' in SETUP:  # a node
+            check_parameters(rest)
+        case [program, *_]:
+            assert program in FOREIGN.split(), words
 
 
-def check_own(program, rest):
-    """Check an executable of the package: its options parse and its parameters are known."""
-    if program == 'blf_dsc':
-        parse([word for word in rest if word[0] != '['])
-    else:
-        assert callable(getattr(command_line, program))
-        check_parameters(rest)
+def check_ros2(rest):
+    match rest:
+        case ['run', 'blf_dsc_controller', *own]:
+            check(own)
+        case ['launch', 'blf_dsc_controller', file, *arguments]:
+            assert (ROOT / 'launch' / file).is_file()
+            assert all(f"'{each.split(':=')[0]}'" in LAUNCH for each in arguments), rest
+        case ['param', 'set', _, name, _]:
+            assert name in known_names(), name
 
 
 def parse(words):
@@ -179,46 +179,7 @@ def parse(words):
 
 def check_parameters(rest):
     for previous, word in pairwise(['', *rest]):
-        if previous == '-p':
-            assert word.split(':=')[0] in known_names(), word
-
-
-def check_python(rest):
-    if '-m' in rest:
-        module, *arguments = rest[rest.index('-m') + 1 :]
-        assert importlib.util.find_spec(module), rest
-        if module == 'blf_dsc_controller':
-            parse(arguments)
-    else:
-        assert (ROOT / rest[0]).is_file(), rest
-        check_parameters(rest)
-
-
-def check_ros2(rest):
-    match rest:
-        case ['run', 'blf_dsc_controller', program, *arguments]:
-            check_own(program, arguments)
-        case ['launch', 'blf_dsc_controller', file, *arguments]:
-            assert (ROOT / 'launch' / file).is_file()
-            for argument in arguments:
-                assert f"'{argument.split(':=')[0]}'" in LAUNCH, argument
-        case ['run', 'controller_manager', *_] | ['control', 'switch_controllers', *_]:
-            pass
-        case ['launch', 'franka_bringup' | 'ur_robot_driver', *_]:
-            pass
-        case ['param', 'set', _, name, _]:
-            assert name in known_names(), name
-        case _:
-            assert rest[0] in ('topic', 'service', 'security', 'lifecycle'), rest
-
-
-def check_pip(rest):
-    for extra in re.findall(r'blf_dsc_controller\[(.+?)\]', ' '.join(rest)):
-        assert all(f'\n{name} =\n' in SETUP for name in extra.split(',')), extra
-
-
-def check_pre_commit(rest):
-    assert rest == ['install']
+        assert previous != '-p' or word.split(':=')[0] in known_names(), word
 
 
 @each_page(PAGES)

@@ -212,8 +212,8 @@ def _add_run(command: _Command) -> None:
     option('--offline', action='store_true', help='without ROS: no processes, no topics')
     option('--domain', type=int, help='ROS domain (a free one)')
     option('--out', type=Path, help='new folder (closed_loop, closed_loop-2, ...)')
-    option('--view', action='store_true', help='show the run on a page in the browser')
-    option('--view-host', default='127.0.0.1', help='address of that page (127.0.0.1)')
+    page = 'show the run on a page in the browser, at this address (127.0.0.1)'
+    option('--view', nargs='?', const='127.0.0.1', metavar='HOST', help=page)
     option = command(
         'precompile',
         'Compile the kernels of a configuration before its first start. They go into the cache of '

@@ -69,8 +69,7 @@ def run(options: Namespace) -> int:
         else:
             from blf_dsc_controller.cli.session import run_session
 
-            view_host = options.view_host if options.view else ''
-            completed = run_session(config, out, options.domain, view_host)
+            completed = run_session(config, out, options.domain, options.view)
         try:
             stopped = _report(out)
         except BlfDscError as error:
@@ -156,9 +155,9 @@ def _check_view(options: Namespace) -> None:
     from blf_dsc_controller.view.page import LOCAL, free_port, open_to_others, require_viser
 
     require_viser()
-    free_port(options.view_host, 8080)
-    if options.view_host not in LOCAL:
-        print(f'warning: {open_to_others(options.view_host)}', file=sys.stderr)
+    free_port(options.view, 8080)
+    if options.view not in LOCAL:
+        print(f'warning: {open_to_others(options.view)}', file=sys.stderr)
 
 
 def print_notice(notice: str) -> None:

@@ -17,6 +17,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager, nullcontext
+from functools import partial
 from math import inf
 from pathlib import Path
 
@@ -58,11 +59,11 @@ _PROFILES = 'FASTRTPS_DEFAULT_PROFILES_FILE'
 _DOMAINS = range(1, 101)  # 0 is the default; above 101, ports are ephemeral
 
 
-def run_session(config: LoopConfig, out: Path, domain: int | None, view_host: str = '') -> bool:
+def run_session(config: LoopConfig, out: Path, domain: int | None, view: str | None) -> bool:
     """Run recorder, controller and plant on `out/config.yaml` until the plant has ended.
 
-    They run in a ROS domain of their own unless `domain` is given, and with a page at `view_host`
-    unless that is empty. Returns False if SIGINT or SIGTERM ended the run; raises NodeFailedError
+    They run in a ROS domain of their own unless `domain` is given, and with a page at `view`,
+    a host, if given. Returns False if SIGINT or SIGTERM ended the run; raises NodeFailedError
     if a node exited with an error.
     """
     logs = out / 'logs'
@@ -75,7 +76,7 @@ def run_session(config: LoopConfig, out: Path, domain: int | None, view_host: st
         }
         try:
             with environment(values):
-                return _run_nodes(config, out / 'config.yaml', logs, view_host)
+                return _run_nodes(config, out / 'config.yaml', logs, view)
         except NodeFailedError:
             if shutil.disk_usage(out).free < _ROOM:
                 print(f'no space left on the disk of {out}', file=sys.stderr)
@@ -146,7 +147,7 @@ class NodeProcess:
             self._process.wait()
 
 
-def _run_nodes(config: LoopConfig, params_file: Path, logs: Path, view_host: str) -> bool:
+def _run_nodes(config: LoopConfig, params_file: Path, logs: Path, view: str | None) -> bool:
     interrupts: list[int] = []
     with ExitStack() as ending:  # stops the nodes in reverse, then restores the handlers
         for number in (signal.SIGINT, signal.SIGTERM):
@@ -158,18 +159,18 @@ def _run_nodes(config: LoopConfig, params_file: Path, logs: Path, view_host: str
             ending.callback(node.stop)
             return node
 
-        def show_page() -> None:
+        def show_page(host: str) -> None:
             from blf_dsc_controller.view.page import free_port, url_of
 
-            port = free_port(view_host, _VIEW_PORT)
-            started(VIEW, '-p', f'host:={view_host}', '-p', f'port:={port}')
-            monitor.progress.write(f'the page: {url_of(view_host, port)}')
+            port = free_port(host, _VIEW_PORT)
+            started(VIEW, '-p', f'host:={host}', '-p', f'port:={port}')
+            monitor.progress.write(f'the page: {url_of(host, port)}')
 
         recorder = started(RECORDER)
         names = [_LOOP] if config.plant.mode == 'lockstep' else [CONTROLLER, PLANT]
         loop = [started(name) for name in names]
         with ProgressMonitor(config, interrupts) as monitor:
-            _watch(monitor, recorder, loop, interrupts, show_page if view_host else None)
+            _watch(monitor, recorder, loop, interrupts, partial(show_page, view) if view else None)
         remark = '' if recorder.is_running else ' while the loop continued without it'
     for node in loop:
         node.check()

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping
-from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
 from itertools import pairwise
@@ -507,14 +506,13 @@ class ControllerConfig(ArmConfig):
     @classmethod
     def defaults(cls, given: Mapping[str, Any]) -> Mapping[str, Value]:
         """Return gains and limits for the arm of a URDF; the defaults suit the two-link arm."""
-        period = given.get('sample_time')  # validated later
-        period = period if isinstance(period, float) and 0.0 < period < math.inf else 0.001
+        period = given.get('sample_time', ArmConfig.sample_time)
         if given.get('model', 'urdf' if given.get('robot.urdf') else '') != 'urdf':
             return {
                 'surface.time_constant': max(period, Surface().time_constant),
                 'learning.interval': max(1, round(0.01 / period)),
             }
-        robot, chain = given_robot(given, given.get('joints', ()))
+        robot, chain = given_robot(given)
         arm = tuning.Design(
             chain,
             parameters_of(robot, chain),
@@ -525,12 +523,14 @@ class ControllerConfig(ArmConfig):
             robot.lag,
             robot.learn,
         )
-        bound = None
-        with suppress(KeyError, TypeError, ValueError):  # validated later
-            bound = np.broadcast_to(np.array(given['barrier.bound'], dtype=float), arm.rotors.shape)
+        bound = np.array(given.get('barrier.bound', ()))
         is_filtered = given.get('learning.prediction', 'filtered') == 'filtered'
         weighs = {'learning.weighing': robot.learn == 'base' and is_filtered}
-        return {'model': 'urdf', **weighs, **tuning.gains_of(arm, period, bound)}
+        return {
+            'model': 'urdf',
+            **weighs,
+            **tuning.gains_of(arm, period, bound if bound.size == len(chain.joints) else None),
+        }
 
     def problems(self) -> Iterator[str]:
         """Check the parameters against each other, joints and estimates against the model."""

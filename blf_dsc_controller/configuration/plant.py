@@ -277,7 +277,7 @@ class PlantConfig(ArmConfig):
         """Return joints, limits and friction from a URDF, and a start at rest in mid-range."""
         if not given.get('robot.urdf'):
             return {}
-        joints = given_robot(given, given.get('joints'))[1].joints
+        joints = given_robot(given)[1].joints
         middles = [(joint.lower + joint.upper) / 2.0 for joint in joints]
         zero = (0.0,) * len(joints)
         return {

@@ -19,7 +19,6 @@ from blf_dsc_controller.arms.urdf import Chain, UrdfError, chain_joints, moving_
 from blf_dsc_controller.configuration.files import read_text, resolve
 from blf_dsc_controller.configuration.schema import (
     PerJoint,
-    build,
     counted,
     non_negative,
     parameter,
@@ -261,19 +260,15 @@ def drive_model(robot: Robot, joints: tuple[str, ...]) -> tuple[np.ndarray, np.n
     return serial_chain(chain, (x, y, z), columns).vector, inertias[:, :_MOMENTS].ravel()
 
 
-def given_robot(given: Mapping[str, Any], joints: object) -> tuple[Robot, Chain]:
-    """Return robot and chain from parameters by dotted name; only the robot's are validated.
+def given_robot(given: Mapping[str, Any]) -> tuple[Robot, Chain]:
+    """Return robot and chain from valid parameters by dotted name.
 
-    Raises ConfigurationError with the problems of these parameters or of the URDF.
+    Raises ConfigurationError with the problems of the URDF.
     """
     values = {name: given[f'robot.{name}'] for name in vars(Robot()) if f'robot.{name}' in given}
+    robot = Robot(**values)
     try:
-        robot = build(Robot, values)
-    except ConfigurationError as error:
-        raise ConfigurationError([f'robot.{problem}' for problem in error.problems]) from error
-    wanted = tuple(joints) if isinstance(joints, (list, tuple)) else ()
-    try:
-        chain = robot.chain(wanted)
+        chain = robot.chain(given.get('joints', ()))
     except BlfDscError as error:
         raise ConfigurationError([f'robot.urdf: {error}']) from error
     rotors, n = len(robot.rotor_inertia), len(chain.joints)

@@ -57,13 +57,17 @@ _KINDS = {
 _ARRAYS = (list, tuple, array.array)  # rclpy gives array.array
 
 
+def _as_given(value: Any) -> Any:
+    return value
+
+
 @dataclass(frozen=True)
 class Parameter:
     """A parameter of a node: what it means and which values are valid.
 
     Ranges and choices apply to each entry of an array. `read_only` is the reason why the parameter
     cannot change while the node runs; empty: it can. An `omittable` array may be empty. `kept`
-    converts a given text to the value that a configuration holds, or raises BlfDscError. The last
+    converts a given value to the one that a configuration holds, or raises BlfDscError. The last
     three are derived from the field of the dataclass: `length` names the parameters whose lengths
     multiply to the length of this array; a number is itself a length.
     """
@@ -79,7 +83,7 @@ class Parameter:
     choices: tuple[str, ...] = ()
     omittable: bool = False
     read_only: str = ''
-    kept: Callable[[str], str] = str
+    kept: Callable[[Any], Any] = _as_given
     name: str = ''
     kind: Kind = Kind.DOUBLE
     length: tuple[str, ...] = ()
@@ -174,48 +178,39 @@ def differences(before: object, after: object) -> dict[str, Value]:
     return {name: value for name, value in flatten(after).items() if value != old[name]}
 
 
-def build(cls: type[Config], given: Mapping[str, object], source: str = '') -> Config:
+def build(cls: type[Config], given: Mapping[str, Any], source: str = '') -> Config:
     """Make a configuration from values by dotted name; missing ones keep their defaults.
 
-    Raises ConfigurationError with all problems: unknown names, types, ranges and lengths, and, if
-    each value is valid by itself, conflicts between parameters.
+    Raises ConfigurationError with all problems: unknown names, types and ranges, and, if each value
+    is valid by itself, lengths and conflicts between parameters.
     """
     known = {param.name: param for param in parameters(cls)}
-    given = _kept(known, given, source)
-    try:
-        derived: Mapping[str, Value] = getattr(cls, 'defaults', lambda _: {})(given)
-    except ConfigurationError as error:
-        raise ConfigurationError(error.problems, source) from error
     problems = [unknown(name, known) for name in given if name not in known]
-    values: dict[str, Any] = {}
-    for name, param in known.items():
-        value = given.get(name, derived.get(name, param.default))
-        found = param.problems(value) if name in given else []
+    valid: dict[str, Any] = {}
+    for name in (name for name in known if name in given):
+        param, value = known[name], given[name]
+        found = param.problems(value)
+        try:
+            if not found:
+                valid[name] = tuple(value) if param.kind.is_array else param.kept(value)
+        except BlfDscError as error:
+            found = [f'{name}: {error}']
         problems += found
-        if not found:
-            values[name] = tuple(value) if param.kind.is_array else value  # type: ignore[arg-type]
+    if len(valid) < len(known.keys() & given.keys()):
+        raise ConfigurationError(problems, source)
+    try:
+        derived: Mapping[str, Value] = getattr(cls, 'defaults', lambda _: {})(valid)
+    except ConfigurationError as error:
+        raise ConfigurationError([*problems, *error.problems], source) from error
+    values = {name: param.default for name, param in known.items()} | dict(derived) | valid
     lengths = [problem for param in known.values() for problem in _length_problems(param, values)]
     problems += lengths
-    if len(values) == len(known) and not lengths:
+    if not lengths:
         config: Config = _assemble(cls, values)
         problems += getattr(config, 'problems', list)()
         if not problems:
             return config
     raise ConfigurationError(problems, source)
-
-
-def _kept(
-    known: Mapping[str, Parameter], given: Mapping[str, object], source: str
-) -> Mapping[str, object]:
-    """Return the given values as the configuration holds them, e.g. the URDF for its file."""
-    values = dict(given)
-    for name, value in given.items():
-        if name in known and isinstance(value, str):
-            try:
-                values[name] = known[name].kept(value)
-            except BlfDscError as error:
-                raise ConfigurationError([f'{name}: {error}'], source) from error
-    return values
 
 
 def change(config: Config, given: Mapping[str, object], source: str = '') -> Config:
@@ -274,8 +269,7 @@ def _assemble(cls: Any, values: Mapping[str, Value], prefix: str = '') -> Any:
 
 
 def _length_problems(param: Parameter, values: Mapping[str, Any]) -> Iterator[str]:
-    named = [name for name in param.length if not name.isdigit()]
-    if not param.length or any(name not in values for name in (param.name, *named)):
+    if not param.length:
         return
     counts = [int(name) if name.isdigit() else len(values[name]) for name in param.length]
     length, needed = len(values[param.name]), math.prod(counts)
