@@ -8,7 +8,7 @@ import pytest
 
 pytest.importorskip('rclpy', reason='needs ROS 2')
 
-from ros_rig import FakeClock, activate, cleanup, configure, deactivate, shutdown, torques, values
+from ros_rig import FakeClock, activate, cleanup, configure, deactivate, torques, values
 
 import blf_dsc_controller.nodes.plant_node
 from blf_dsc_controller.messages import topics
@@ -67,15 +67,6 @@ def test_deactivation_ramps_to_the_safe_torque_while_states_arrive(ros):
     assert not commanded[start + 101 :].any()
 
 
-def test_inactive_node_that_never_commanded_stays_silent(ros):
-    commands = ros.listen(topics.COMMANDS)
-    arm, law = ros.loop(controller={'autostart': False})
-    assert configure(ros, law)
-    ros.spin(0.4)
-    assert not commands
-    assert arm.plant.sample == 0
-
-
 def test_pausing_the_plant_pauses_time(ros):
     arm, law = ros.loop()
     ros.run(arm, 50)
@@ -98,13 +89,6 @@ def test_loop_runs_again_after_cleanup_and_configuration(ros):
         assert configure(ros, node)
         assert activate(ros, node)
     assert_runs(ros, arm, law)
-
-
-def test_node_finishes_after_shutdown(ros):
-    _, law = ros.loop()
-    assert shutdown(ros, law)
-    assert law.finished
-    assert law.failure is None
 
 
 @pytest.mark.parametrize('order', ['p', 'c', 'pc', 'ccp', 'pcpc'])

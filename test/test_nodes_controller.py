@@ -10,6 +10,7 @@ import pytest
 
 pytest.importorskip('rclpy', reason='needs ROS 2')
 
+from random_arm import random_urdf
 from rcl_interfaces.srv import SetParameters
 from rclpy.parameter import Parameter
 from rclpy.timer import Timer
@@ -88,24 +89,41 @@ def test_unexpected_error_is_answered_with_the_safe_torque_at_once(ros, where):
     assert arm.torque_for(2, START).any()
 
 
-@pytest.mark.parametrize(('period', 'starts'), [(10, False), (1, True)])
-def test_rate_of_live_states_is_measured_before_the_start(ros, period, starts):
-    """controller_manager has 100 Hz by default."""
-    node = ros.add(ControllerNode)
+UNSUPPORTED = {'robot.urdf': random_urdf(3, seed=5)[0], 'robot.tip': 'tip'}
+
+
+@pytest.mark.parametrize(
+    ('period', 'given', 'failures'),
+    [
+        (1, {}, []),
+        (
+            10,
+            {},
+            [
+                'joint states come every 0.01 s, but sample_time is 0.001',
+                'set update_rate of controller_manager (100 Hz by default) to 1000',
+            ],
+        ),
+        (1, UNSUPPORTED, ['what holds the arm?']),
+    ],
+)
+def test_live_arm_is_measured_before_the_start(ros, period, given, failures):
+    """Its rate, since controller_manager has 100 Hz by default, and what holds it."""
+    node = ros.add(ControllerNode, given)
     states, commands = ros.publisher(topics.JOINT_STATES), ros.listen(topics.COMMANDS)
     ros.until(lambda: states.get_subscription_count() > 0)
-    encoder, begin = JointStateEncoder(JOINTS), time.time_ns()
+    joints, begin = node.config.joints, time.time_ns()
+    q, still = START if joints == JOINTS else np.zeros(3), np.zeros(len(joints))
     for k in range(12):
-        stamp = begin + k * period * 10**6
-        states.publish(encoder.encode(stamp, START, ZERO, ZERO))
+        raw = JointStateEncoder(joints).encode(begin + k * period * 10**6, q, still, still)
+        states.publish(raw)
         ros.until(lambda k=k: node.finished or node._arrivals is None or len(node._arrivals) > k)
-        assert bool(commands) <= (k > 9 and starts)
-    if starts:
+        assert bool(commands) <= (k > 9 and not failures)
+    if not failures:
         ros.until(lambda: commands)
         return
     ros.until(lambda: node.finished)
-    assert str(node.failure).startswith('joint states come every 0.01 s, but sample_time is 0.001')
-    assert 'set update_rate of controller_manager (100 Hz by default) to 1000' in str(node.failure)
+    assert all(text in str(node.failure) for text in failures)
     ros.spin(0.1)
     assert not commands
 

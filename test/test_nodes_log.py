@@ -143,14 +143,16 @@ def test_leaving_node_commands_the_safe_torque_last(ros):
     assert law.guard.journal.pending == deque()
 
 
-@pytest.mark.parametrize('way', [deactivate, shutdown])
-def test_every_lifecycle_way_out_leaves_the_safe_torque(ros, way):
-    commands = ros.listen(topics.COMMANDS)
+@pytest.mark.parametrize(('way', 'event'), [(deactivate, 'deactivate'), (shutdown, 'release')])
+def test_every_lifecycle_way_out_leaves_the_safe_torque(ros, way, event):
+    commands, journal = ros.listen(topics.COMMANDS), ros.listen(topics.JOURNAL)
     arm, law = ros.loop(controller={'safety.torque': 'hold_gravity'})
     ros.run(arm, 50)
     assert way(ros, law)
+    ros.until(lambda: f'"{event}"' in journal[-1].data)
     ros.spin(0.3)
     assert (np.abs(torques(commands)[-1]) > 1.0).all()
+    assert law.finished == (way is shutdown)
 
 
 def test_end_of_a_real_time_run_is_not_a_fault(ros, log):

@@ -12,6 +12,7 @@ from plain_law import dynamics
 from blf_dsc_controller.supervision.checks import Phase
 
 HOLDING = {'safety.torque': 'hold_gravity'}
+QUIET = {'disturbance.constant': [0.0, 0.0], 'disturbance.amplitude': [0.0, 0.0]}
 LEARNED = HOLDING | {'learning.initial_estimate': [1.0, 0.32, 0.4]}
 NAN = np.full(2, np.nan)
 FIRST = {
@@ -31,9 +32,7 @@ UNUSABLE = FIRST | {'frozen': lambda state: state.raw(stamp=1_000_000_000)}
 
 def moving(given):
     """Rig after half a second, when both joints are moving, without a disturbance."""
-    rig = Rig(
-        given, plant={'disturbance.constant': [0.0, 0.0], 'disturbance.amplitude': [0.0, 0.0]}
-    )
+    rig = Rig(given, plant=QUIET)
     rig.step(500)
     assert (np.abs(rig.state().dq) > 0.1).all()
     return rig
@@ -132,7 +131,9 @@ def test_after_a_long_silence_nothing_is_commanded_until_a_reset():
     rig.guard.reset()
     rig.step(5)
     assert rig.supervisor.running
-    assert len(rig.commands) == commands + 5
+    rig.guard.deactivate()
+    rig.step()
+    assert len(rig.commands) == commands + 6
 
 
 @pytest.mark.parametrize('dq', [NAN, np.array([60.0, np.inf])], ids=['missing', 'too fast'])
@@ -173,11 +174,14 @@ def test_last_torque_is_the_safe_torque_of_an_arm_at_rest(safety, on_a_ramp):
 
 
 def test_arm_settles_after_a_deactivation():
-    """Then the last torque holds it."""
-    rig = moving(LEARNED)
-    assert not rig.guard.is_settled
-    rig.guard.deactivate()
-    rig.step(400)
-    assert not rig.guard.is_settled  # on the ramp
-    rig.step(3000)
-    assert rig.guard.is_settled
+    """Then the last torque holds it: at rest after the ramp of half a second, not before."""
+    resting = Rig(LEARNED | {'reference.type': 'hold'}, plant=QUIET)
+    resting.step(1000)
+    for rig in (moving(LEARNED), resting):
+        assert not rig.guard.is_settled
+        rig.guard.deactivate()
+        rig.step(400)
+        assert not rig.guard.is_settled
+        rig.step(3000)
+        assert rig.guard.is_settled
+    assert np.abs(resting.state().dq).max() < 0.01

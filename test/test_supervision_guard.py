@@ -212,6 +212,8 @@ def test_estimates_are_kept_or_forgotten_as_configured(keep, again):
     np.testing.assert_array_equal(state.estimate, learned if keep else start)
     assert state.rows[0] == (window if keep else 0.0)
     assert not np.array_equal(learned, start)
+    rig.step()
+    assert (rig.guard.time > 0.1) == keep  # an empty window fills from t = 0 on
 
 
 def test_estimates_before_a_fault_are_kept_but_not_the_window():

@@ -164,3 +164,8 @@ def test_restarted_watchdog_holds_the_arm_of_a_controller_that_died_before(ros, 
     assert watchdog.line.active
     assert watchdog.line.silence == pytest.approx(0.05, abs=0.01)
     np.testing.assert_allclose(driver.received[0].data, np.zeros(7), atol=0.1)
+    ros.executor.remove_node(watchdog)
+    ros.spin(0.1)
+    count = len(driver.received)
+    watchdog.close()  # the driver holds the last torque
+    ros.until(lambda: len(driver.received) > count)
