@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Common case of the law's tests: Section IV with the recommended gains, in a sampled loop."""
+"""Common cases of the law's tests: Section IV in a sampled loop, and random ones of any size."""
 
 from __future__ import annotations
 
@@ -10,7 +10,9 @@ from typing import NamedTuple
 
 import numpy as np
 import plants
-from plants import START
+from paper_case import P
+from plain_law import R
+from plants import QUIET, START
 
 from blf_dsc_controller.arms.two_link import TwoLink
 from blf_dsc_controller.configuration.controller import ControllerConfig
@@ -18,19 +20,24 @@ from blf_dsc_controller.law import barrier
 from blf_dsc_controller.law.controller import Controller
 from blf_dsc_controller.law.factory import settings_of_config
 from blf_dsc_controller.law.settings import Settings
+from blf_dsc_controller.law.state import (
+    Signals,
+    State,
+    signals_of,
+    signals_size,
+    state_of,
+    state_size,
+)
 from blf_dsc_controller.reference import terms as reference
 from sim_plant.plant import Plant
 from sim_plant.sensors import DIFFERENCED, MEASURED
 
 T = 1e-3
-P = np.array([1.0, 0.32, 0.4])
-R = 9.8  # 1/s^2, g / l1
 MODEL = TwoLink(R)
 REFERENCE = reference.pack(
     2, [reference.sinusoids_term((1.9935, 1.3961), (0.3, 0.3), (1.0,), (0.0,))]
 )
 JOINTS = ('shoulder', 'elbow')
-QUIET = (0.0, 0.0)
 
 
 def recommended(*, bias: bool = True, **changes) -> Settings:
@@ -128,3 +135,53 @@ def record(law: Controller, arm: Plant, duration: float) -> Record:
 def recommended_minute() -> Record:
     """Return 60 noise-free seconds of the recommended configuration, run once for all tests."""
     return record(controller(recommended()), plant(), 60.0)
+
+
+class Case(NamedTuple):
+    """Arguments of a kernel that is independent of an arm."""
+
+    settings: Settings
+    state: State
+    signals: Signals
+
+
+def arbitrary_settings(random: np.random.Generator, n: int, p: int, **changes) -> Settings:
+    """Return gains between 0.5 and 2 for n joints, p parameters and a bias column per joint."""
+    settings = recommended()
+    length = {settings.n: n, settings.p: p, settings.m: p + n}
+    arrays = {
+        name: random.uniform(0.5, 2.0, [length.get(size, size) for size in value.shape])
+        for name, value in settings._asdict().items()
+        if isinstance(value, np.ndarray)
+    }
+    case = {
+        'n': n,
+        'p': p,
+        'm': p + n,
+        'model': None,
+        'window': 8,
+        'interval': 1,
+        'eta': 0.3,
+        'kappa': 5.0,
+        'sigma': 1e-9,
+        'learning_start': 0.0,
+        'change_detection': 0,
+        'bumpless': 0,
+        'information': np.eye(p + n),
+        'variance': np.ones(p + n),
+        'least': np.full(p + n, -np.inf),
+        'most': np.full(p + n, np.inf),
+        'damping_rate': 0.0,
+        'row_weight': np.ones(n),
+        'radius': 1e3,
+    }
+    return settings._replace(**arrays | case | changes)
+
+
+def arbitrary(seed: int, n: int = 3, p: int = 4, **changes) -> Case:
+    """Return the case of a seed, with standard normal state and signals."""
+    random = np.random.default_rng(seed)
+    settings = arbitrary_settings(random, n, p, **changes)
+    state = state_of(random.normal(size=state_size(settings)), settings)
+    signals = signals_of(random.normal(size=signals_size(settings)), settings)
+    return Case(settings, state, signals)

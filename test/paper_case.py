@@ -11,7 +11,7 @@ import numpy as np
 from blf_dsc_controller.configuration.nodes import LoopConfig, load_loop
 from blf_dsc_controller.configuration.schema import change
 from blf_dsc_controller.law.controller import Controller
-from blf_dsc_controller.law.state import sample_of
+from blf_dsc_controller.law.telemetry import sample_columns
 from blf_dsc_controller.simulation.loop import simulate
 
 P = np.array([1.0, 0.32, 0.4])
@@ -43,6 +43,7 @@ class Loop(NamedTuple):
     xi1: np.ndarray  # (., 2) rad
     xi2: np.ndarray  # (., 2) rad/s
     torque: np.ndarray  # (., 2) N m
+    disturbance: np.ndarray  # (., 2) N m, d^3 and learned friction
     estimate: np.ndarray  # (., m)
     lyapunov: np.ndarray  # (., 4)
     latched: np.ndarray  # (.,)
@@ -68,8 +69,8 @@ class Loop(NamedTuple):
 def run(config: LoopConfig) -> Loop:
     """Run a configuration offline."""
     record = simulate(config.controller, config.plant, supervised=False)
-    columns = sample_of(np.arange(record.samples.shape[1]), record.controller.settings)
-    names = ('xi1', 'xi2', 'torque', 'estimate', 'lyapunov')
-    parts = [record.samples[:, getattr(columns, name)] for name in names]
-    parts += [record.samples[:, getattr(columns, name)[0]] for name in ('latched', 'changes')]
-    return Loop(record.stamps * 1e-9, *parts, record.truths[:, :3], record.controller)
+    samples = sample_columns(record.samples, record.controller.settings)
+    names = ('xi1', 'xi2', 'torque', 'disturbance', 'estimate', 'lyapunov')
+    parts = [getattr(samples, name) for name in names]
+    parts += [samples.latched[:, 0], samples.changes[:, 0], record.truths[:, :3]]
+    return Loop(record.stamps * 1e-9, *parts, record.controller)

@@ -9,6 +9,8 @@ from __future__ import annotations
 import numpy as np
 from scipy.optimize import brentq
 
+R = 9.8  # 1/s^2, g / l1 of Section IV
+
 
 def dynamics(P, r, q, dq):
     """Return M, C, G of the two-link arm."""
@@ -18,6 +20,18 @@ def dynamics(P, r, q, dq):
     C = np.array([[-c * dq[1], -c * (dq[0] + dq[1])], [c * dq[0], 0.0]])
     outer = P[2] * r * np.cos(q[0] + q[1])
     return M, C, np.array([P[0] * r * np.cos(q[0]) + outer, outer])
+
+
+def regressor(r, q, dq, v, a):
+    """Return H of Section IV, with cos q1 in its first gravity term."""
+    c2, s2, c12 = np.cos(q[1]), np.sin(q[1]), np.cos(q[0] + q[1])
+    coriolis = s2 * (dq[1] * v[0] + (dq[0] + dq[1]) * v[1])
+    return np.array(
+        [
+            [a[0] + r * np.cos(q[0]), a[0] + a[1], c2 * (2 * a[0] + a[1]) - coriolis + r * c12],
+            [0.0, a[0] + a[1], c2 * a[0] + s2 * dq[0] * v[0] + r * c12],
+        ]
+    )
 
 
 class PlainLaw:
@@ -61,18 +75,6 @@ class PlainLaw:
         s = np.pi * xi1**2 / (2.0 * k**2)
         tau_aux = -g.K * k**2 / (xi1 * np.pi) * np.sin(s) * np.cos(s)
         return np.where(np.abs(xi1) < k, tau_aux, 0.0) - g.mu * xi1 + dqr + xi1 * dk / k
-
-    def regressor(self, q, dq, v, a):
-        """Return H of Section IV, with cos q1 in its first gravity term."""
-        r = self.gains.model.r
-        c2, s2, c12 = np.cos(q[1]), np.sin(q[1]), np.cos(q[0] + q[1])
-        coriolis = s2 * (dq[1] * v[0] + (dq[0] + dq[1]) * v[1])
-        return np.array(
-            [
-                [a[0] + r * np.cos(q[0]), a[0] + a[1], c2 * (2 * a[0] + a[1]) - coriolis + r * c12],
-                [0.0, a[0] + a[1], c2 * a[0] + s2 * dq[0] * v[0] + r * c12],
-            ]
-        )
 
     def momentum_regressors(self, q, dq):
         """Return Yp and [Yr | bias columns]."""
@@ -151,9 +153,9 @@ class PlainLaw:
         dalpha2 = (following - self.alpha2) / dt
         xi2 = dq - self.alpha2
         self.learn(t, dt, q, dq, effort if self.effort else self.tau)
-        H = self.regressor(q, dq, self.alpha2, dalpha2)
-        P0 = g.initial_estimate[:3]
-        H_r = H if self.at_state else self.regressor(qr, dqr, dqr, ddqr)
+        r, P0 = g.model.r, g.initial_estimate[:3]
+        H = regressor(r, q, dq, self.alpha2, dalpha2)
+        H_r = H if self.at_state else regressor(r, qr, dqr, dqr, ddqr)
         demand = (
             self.barrier_torque(xi1, t)
             - g.d2 * np.abs(xi1) * np.clip(xi2 / g.boundary_layer, -1.0, 1.0)

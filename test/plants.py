@@ -20,9 +20,9 @@ from sim_plant.plant import Plant
 from sim_plant.sensors import MEASURED, Encoders
 
 ARM = PointMassArm(l1=1.0, l2=0.8, m1=0.5, m2=0.5, g=9.8)
-ODD_ARM = PointMassArm(l1=0.7, l2=1.1, m1=1.3, m2=0.4, g=9.81)  # all of its numbers differ
 PERIOD = 1e-3  # s
 START = (2.293, 1.696)  # rad
+QUIET = (0.0, 0.0)
 
 
 def energies(arm, q, dq):
@@ -61,7 +61,25 @@ def rough_disturbance():
         viscous=[0.05, 0.1],
         coulomb=[0.2, 0.1],
         coulomb_velocity=0.5,
+        stribeck=0.5,
+        ripple=[0.1, 0.05],
+        ripple_frequency=20.0,
     )
+
+
+def full_plant(**changes):
+    """Return a plant with every kind of imperfection."""
+    imperfections = {
+        'position_noise': 1e-5,
+        'velocity_noise': 1e-3,
+        'resolution': 1e-5,
+        'torque_limit': (8.0, 3.0),
+        'delay': 2,
+        'time_constant': 2e-3,
+        'torque_noise': 0.01,
+        'velocity_pole': 400.0,
+    }
+    return plant(load=rough_disturbance(), **imperfections | changes)
 
 
 NOWHERE = WallSettings(np.zeros(3), np.array([0.0, 0.0, 1.0]), 0.0, 0.0)

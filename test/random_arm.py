@@ -8,6 +8,8 @@ from pathlib import Path
 import numpy as np
 import pinocchio
 
+from blf_dsc_controller.arms.urdf import read_chain
+
 CONFIG = Path(__file__).parents[1] / 'config'
 PANDA = tuple(f'panda_joint{i}' for i in range(1, 8))
 UR5E = (
@@ -81,3 +83,40 @@ def pinocchio_model(text, joints):
 def configuration(model, q):
     """Return pinocchio's configuration, with cosine and sine of continuous joints."""
     return pinocchio.integrate(model, pinocchio.neutral(model), q)
+
+
+PANDA_TEXT, UR5E_TEXT = ((CONFIG / f'{name}.urdf').read_text() for name in ('panda', 'ur5e'))
+ARMS = {
+    'one': (*random_urdf(1, 11), 'base', 'tip'),
+    'two': (*random_urdf(2, 12), 'base', 'tip'),
+    'three': (*random_urdf(3, 13), 'base', 'tip'),
+    'six': (*random_urdf(6, 14), 'base', 'tip'),
+    'nine': (*random_urdf(9, 15), 'base', 'tip'),
+    'panda': (PANDA_TEXT, PANDA, 'panda_link0', 'panda_hand_tcp'),
+    'ur5e': (UR5E_TEXT, UR5E, 'world', 'tool0'),
+}
+"""URDF, joints, base and tip of each arm."""
+
+
+def chain_of(name):
+    text, joints, base, tip = ARMS[name]
+    return read_chain(text, base, tip, joints)
+
+
+class ArmCase:
+    """An arm with a tilted base in a random state, and the same arm in pinocchio."""
+
+    gravity = (1.0, -3.0, 5.0)
+
+    def __init__(self, name):
+        text, joints, _, self.tip = ARMS[name]
+        self.chain, self.n = chain_of(name), len(joints)
+        self.random = np.random.default_rng(self.n)
+        self.q, self.dq, self.v, self.a = self.random.normal(size=(4, self.n))
+        self.rotors = self.random.uniform(0.01, 0.3, self.n)
+        self.phi = np.column_stack((self.chain.inertias, self.rotors)).ravel()
+        self.model = pinocchio_model(text, joints)
+        self.model.gravity.linear[:] = self.gravity
+        self.model.armature[:] = self.rotors
+        self.data = self.model.createData()
+        self.theirs = configuration(self.model, self.q)

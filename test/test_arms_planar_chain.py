@@ -5,22 +5,22 @@ from __future__ import annotations
 
 import numpy as np
 import pinocchio
+import plain_law
 import pytest
-from closed_loop_case import MODEL, P, R
-from plain_law import dynamics
+from closed_loop_case import MODEL
+from plain_law import R
 from plants import ARM
-from random_arm import CONFIG, PANDA, UR5E, configuration, pinocchio_model, random_urdf
+from random_arm import ArmCase, chain_of
 
-import sim_plant.arm as physics
 from blf_dsc_controller.arms.geometry import Clearance, distance, skeleton, tip_radius
 from blf_dsc_controller.arms.model import arm_model
 from blf_dsc_controller.arms.planar_chain import PlanarChain
-from blf_dsc_controller.arms.two_link import TwoLink, urdf
-from blf_dsc_controller.arms.urdf import read_chain
+from blf_dsc_controller.arms.two_link import urdf
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.plant import PlantConfig
 from blf_dsc_controller.configuration.schema import build, flatten, parameters
 from blf_dsc_controller.law.factory import controller_of
+from sim_plant.arm import PointMassArm
 from sim_plant.plant import parameters_of
 
 PLANT = build(PlantConfig, {'arm.l1': 1.1, 'arm.l2': 0.7, 'arm.m1': 0.6, 'arm.m2': 0.45})
@@ -30,8 +30,7 @@ LINKS = (1.1, 0.7), (0.6, 0.45)
 def test_mujoco_reads_the_same_arm_from_the_urdf():
     """Mass matrix and gravity torque of the URDF, compiled by MuJoCo, against the model's."""
     mujoco = pytest.importorskip('mujoco', reason='needs MuJoCo: pip install mujoco')
-    text = urdf('arm', PLANT.joints, *LINKS, (0.0, 0.0))
-    model = mujoco.MjModel.from_xml_string(text)
+    model = mujoco.MjModel.from_xml_string(urdf('arm', PLANT.joints, *LINKS, (0.0, 0.0)))
     model.opt.gravity[:] = (0.0, 0.0, -PLANT.arm.gravity)
     data = mujoco.MjData(model)
     P, r, found = parameters_of(PLANT), PLANT.arm.gravity / PLANT.arm.l1, np.zeros((2, 2))
@@ -39,17 +38,20 @@ def test_mujoco_reads_the_same_arm_from_the_urdf():
         for joint, angle in zip(PLANT.joints, q, strict=True):
             data.joint(joint).qpos[0] = angle
         mujoco.mj_forward(model, data)
-        for i in range(2):
-            mujoco.mj_mulM(model, data, found[i], np.eye(2)[i])
-        mass, _, weight = dynamics(P, r, q, np.zeros(2))
+        for row, unit in zip(found, np.eye(2), strict=True):
+            mujoco.mj_mulM(model, data, row, unit)
+        mass, _, weight = plain_law.dynamics(P, r, q, np.zeros(2))
         np.testing.assert_allclose(found, mass, atol=1e-7)  # points have 1e-9 kg m^2 in it
         np.testing.assert_allclose(data.qfrc_bias, weight, atol=1e-7)
 
 
 def test_urdf_has_an_effort_limit_only_for_limited_motors():
-    assert 'effort="12"' in urdf('arm', ('a', 'b'), *LINKS, (12.0, 0.0))
-    assert urdf('arm', ('a', 'b'), *LINKS, (12.0, 0.0)).count('<limit') == 1
-    assert '<joint name="b"' in urdf('arm', ('a', 'b'), *LINKS, (0.0, 0.0))
+    limited, free = (
+        urdf('arm', ('a', 'b'), *LINKS, limits) for limits in ((12.0, 0.0), (0.0, 0.0))
+    )
+    assert 'effort="12"' in limited
+    assert limited.count('<limit') == 1
+    assert '<joint name="b"' in free
 
 
 PER_JOINT = {
@@ -70,15 +72,15 @@ def case(n):
     return lengths, masses, P, random.normal(size=(4, n))
 
 
-def regressor(q, dq, v, a):
-    arm = PlanarChain(q.size, R)
+def regressor(q, dq, v, a, r=R):
+    arm = PlanarChain(q.size, r)
     H = np.full((q.size, len(arm.parameter_names)), np.nan)
     arm.regressor(q, dq, v, a, H)
     return H
 
 
-def momentum(q, dq):
-    arm = PlanarChain(q.size, R)
+def momentum(q, dq, r=R):
+    arm = PlanarChain(q.size, r)
     Yp, Yr = np.full((2, q.size, len(arm.parameter_names)), np.nan)
     arm.momentum_regressor(q, dq, Yp, Yr)
     return Yp, Yr
@@ -122,21 +124,26 @@ def test_chain_agrees_with_the_lagrangian(n):
     assert abs(v @ rate - 2.0 * v @ C_v) < 1e-7 * max(1.0, abs(v @ rate))
 
 
-def test_two_links_are_the_arm_of_section_iv():
+@pytest.mark.parametrize('arm', [ARM, PointMassArm(l1=0.7, l2=1.1, m1=1.3, m2=0.4, g=9.81)])
+def test_two_links_are_the_arm_of_section_iv(arm):
     """And of the tests' plain law, and of the simulated arm: M ddq + C dq + G = tau."""
+    model, P = arm_model('two_link', 2, l1=arm.l1, gravity=arm.g), np.empty(3)
+    arm.fill_parameters(0.0, P)
     for random in map(np.random.default_rng, range(20)):
         q, dq, v, a = random.normal(size=(4, 2))
         H, Yp, Yr = np.full((3, 2, 3), np.nan)
-        MODEL.regressors(q, dq, v, a, H, Yp, Yr)
-        np.testing.assert_allclose(regressor(q, dq, v, a)[:, [0, 2, 1]], H, atol=1e-13)
-        np.testing.assert_allclose(np.array(momentum(q, dq))[:, :, [0, 2, 1]], (Yp, Yr), atol=1e-13)
-        M, C, G = dynamics(P, R, q, dq)
+        model.regressors(q, dq, v, a, H, Yp, Yr)
+        columns = regressor(q, dq, v, a, model.r), *momentum(q, dq, model.r)
+        np.testing.assert_allclose(np.array(columns)[:, :, [0, 2, 1]], (H, Yp, Yr), atol=1e-13)
+        np.testing.assert_allclose(plain_law.regressor(model.r, q, dq, v, a), H, atol=1e-13)
+        M, C, G = plain_law.dynamics(P, model.r, q, dq)
         np.testing.assert_allclose(H @ P, M @ a + C @ v + G, atol=1e-12)
-        physics.acceleration(ARM, q, dq, v, a)
+        arm.accelerate(0.0, q, dq, v, a)
         np.testing.assert_allclose(M @ a + C @ dq + G, v, atol=1e-9)
-    assert MODEL.parameter_names == ('(m1+m2)*l1^2', 'm2*l2^2', 'm2*l1*l2')
-    assert MODEL.parameter_units == ('kg m^2',) * 3
-    assert arm_model('two_link', 2, l1=0.5, gravity=9.8) == TwoLink(19.6)
+    assert model.parameter_names == ('(m1+m2)*l1^2', 'm2*l2^2', 'm2*l1*l2')
+    assert model.parameter_units == ('kg m^2',) * 3
+    inner, outer = arm.m1 + arm.m2, arm.m2
+    assert pytest.approx([inner * arm.l1**2, outer * arm.l2**2, outer * arm.l1 * arm.l2]) == P
 
 
 @pytest.mark.parametrize('model', [MODEL, PlanarChain(3, R)], ids=['two', 'chain'])
@@ -151,58 +158,48 @@ def test_regressors_computed_at_once_equal_the_separate_ones(model):
 
 def test_law_runs_on_three_links():
     """A configuration of three joints gives a controller with a torque and all its estimates."""
-    config = build(
-        ControllerConfig,
-        {
-            'model': 'planar_chain',
-            'joints': ['a', 'b', 'c'],
-            'learning.initial_estimate': [0.5] * 6,
-            'learning.adaptation_gain': [0.5] * 6,
-            'reference.offset': [0.0] * 3,
-            'reference.amplitude': [0.1] * 3,
-            **{name: [value] * 3 for name, value in PER_JOINT.items()},
-        },
-    )
-    controller = controller_of(config)
-    torque = controller.update(0.0, 1e-3, np.array([0.1, 0.1, 0.1, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0]))
-    at_rest = regressor(np.full(3, 0.1), np.zeros(3), np.zeros(3), np.zeros(3)) @ np.full(6, 0.5)
+    given = {
+        'model': 'planar_chain',
+        'joints': ['a', 'b', 'c'],
+        'learning.initial_estimate': [0.5] * 6,
+        'learning.adaptation_gain': [0.5] * 6,
+        'reference.offset': [0.0] * 3,
+        'reference.amplitude': [0.1] * 3,
+    }
+    given |= {name: [value] * 3 for name, value in PER_JOINT.items()}
+    controller = controller_of(build(ControllerConfig, given))
+    torque = controller.update(0.0, 1e-3, np.append(np.full(3, 0.1), np.zeros(6)))
+    at_rest = regressor(np.full(3, 0.1), *np.zeros((3, 3))) @ np.full(6, 0.5)
     # On the reference, at its turning point, the torque only has to hold the arm.
     np.testing.assert_allclose(torque, at_rest, atol=0.01)
     assert controller.state.estimate.size == 6 + 3
 
 
 def test_corners_and_axes_agree_with_pinocchio():
-    text, joints = random_urdf(6, 5)
-    chain = read_chain(text, 'base', 'tip', joints)
-    assert {joint.kind for joint in chain.joints} >= {'revolute', 'prismatic'}
-    q = np.random.default_rng(0).uniform(-1.0, 1.0, 6)
-    corners, axes = skeleton(chain, q)
-    model = pinocchio_model(text, joints)
-    data = model.createData()
-    pinocchio.framesForwardKinematics(model, data, configuration(model, q))
+    case = ArmCase('six')
+    assert {joint.kind for joint in case.chain.joints} >= {'revolute', 'prismatic'}
+    corners, axes = skeleton(case.chain, case.q)
+    pinocchio.framesForwardKinematics(case.model, case.data, case.theirs)
     np.testing.assert_array_equal(corners[0], np.zeros(3))
-    for i, joint in enumerate(chain.joints):
-        np.testing.assert_allclose(corners[i + 1], data.oMi[i + 1].translation, atol=1e-12)
-        np.testing.assert_allclose(axes[i], data.oMi[i + 1].rotation @ joint.axis, atol=1e-12)
-    tip = data.oMf[model.getFrameId('tip')].translation
-    np.testing.assert_allclose(corners[-1], tip, atol=1e-12)
+    for i, (joint, placed) in enumerate(
+        zip(case.chain.joints, list(case.data.oMi)[1:], strict=True)
+    ):
+        np.testing.assert_allclose(corners[i + 1], placed.translation, atol=1e-12)
+        np.testing.assert_allclose(axes[i], placed.rotation @ joint.axis, atol=1e-12)
+    end = case.data.oMf[case.model.getFrameId('tip')].translation
+    np.testing.assert_allclose(corners[-1], end, atol=1e-12)
 
 
 def test_tip_radius_is_the_sum_of_what_each_joint_moves_the_tip():
-    text, joints = random_urdf(6, 5)
-    chain = read_chain(text, 'base', 'tip', joints)
-    random = np.random.default_rng(0)
-    q, bound, h = random.uniform(-1.0, 1.0, 6), random.uniform(1e-3, 2e-3, 6), 1e-5
-    moved = [
-        [skeleton(chain, q + sign * h * axis)[0][-1] for sign in (1.0, -1.0)] for axis in np.eye(6)
-    ]
-    reach = np.linalg.norm(np.subtract(*np.moveaxis(moved, 1, 0)), axis=1) / (2.0 * h)
+    chain, random, h = chain_of('six'), np.random.default_rng(0), 1e-5
+    q, bound = random.uniform(-1.0, 1.0, 6), random.uniform(1e-3, 2e-3, 6)
+    tips = [skeleton(chain, q + step)[0][-1] for step in h * np.vstack((np.eye(6), -np.eye(6)))]
+    reach = np.linalg.norm(np.subtract(tips[:6], tips[6:]), axis=1) / (2.0 * h)
     np.testing.assert_allclose(tip_radius(chain, q, bound), reach @ bound, rtol=1e-8)
 
 
 def panda(radius=0.07, floor=0.0):
-    text = (CONFIG / 'panda.urdf').read_text()
-    return Clearance(read_chain(text, 'panda_link0', 'panda_hand_tcp', PANDA), radius, floor)
+    return Clearance(chain_of('panda'), radius, floor)
 
 
 def test_distance_is_the_minimum_over_all_points_of_both_lines():
@@ -211,37 +208,23 @@ def test_distance_is_the_minimum_over_all_points_of_both_lines():
         first, second = a + (b - a) * along, c + (d - c) * along
         minimum = np.linalg.norm(first[:, np.newaxis] - second, axis=-1).min()
         assert distance(a, b, c, d) == pytest.approx(minimum, abs=1e-3)
-
-
-@pytest.mark.parametrize(
-    ('line', 'other', 'expected'),
-    [
+    for line, other, expected in (
         ([(0, 0, 0), (1, 0, 0)], [(2, 1, 0), (3, 1, 0)], 2**0.5),  # parallel
         ([(0, 0, 0), (1, 0, 0)], [(0.5, -1, 0), (0.5, 1, 0)], 0.0),  # crossing
         ([(0, 0, 0), (0, 0, 0)], [(-1, 2, 0), (1, 2, 0)], 2.0),  # a point
         ([(0, 0, 0), (0, 0, 0)], [(0, 0, 3), (0, 0, 3)], 3.0),  # two points
-    ],
-)
-def test_distance_of_parallel_crossing_and_degenerate_lines(line, other, expected):
-    assert distance(*np.array([*line, *other], dtype=float)) == pytest.approx(expected)
+    ):
+        assert distance(*np.array([*line, *other], dtype=float)) == pytest.approx(expected)
 
 
-@pytest.mark.parametrize(
-    ('posture', 'is_free'),
-    [
-        ((0.0, 0.0, 0.0, -np.pi / 2, 0.0, np.pi / 2, 0.0), True),
-        ((0.0, 0.0, 0.0, -3.0, 0.0, 0.2, 0.0), False),  # the hand in the upper arm
-        ((0.0, 1.7, 0.0, -0.5, 0.0, 1.0, 0.0), False),  # below the floor
-    ],
-)
-def test_panda_must_not_touch_itself_or_the_floor(posture, is_free):
-    assert (panda().room(np.array(posture)).min() >= 0.0) == is_free
-
-
-def test_lower_floor_and_thinner_links_leave_more_room():
-    low = np.array((0.0, 1.7, 0.0, -0.5, 0.0, 1.0, 0.0))
-    assert panda(floor=-1.0).room(low).min() > 0.0
-    folded = np.array((0.0, 0.0, 0.0, -3.0, 0.0, 1.5, 0.0))
+def test_panda_must_not_touch_itself_or_the_floor():
+    """Unless the floor is lower, and with more room if the links are thinner."""
+    upright = np.array((0.0, 0.0, 0.0, -np.pi / 2, 0.0, np.pi / 2, 0.0))
+    folded = np.array((0.0, 0.0, 0.0, -3.0, 0.0, 0.2, 0.0))  # the hand in the upper arm
+    low = np.array((0.0, 1.7, 0.0, -0.5, 0.0, 1.0, 0.0))  # below the floor
+    assert panda().room(upright).min() >= 0.0
+    assert panda().room(folded).min() < 0.0
+    assert panda().room(low).min() < 0.0 < panda(floor=-1.0).room(low).min()
     assert panda(radius=0.03).room(folded).min() > panda().room(folded).min()
 
 
@@ -254,11 +237,9 @@ def test_links_that_touch_in_every_posture_do_not_count():
 
 def test_link_with_an_offset_from_its_joints_is_checked_where_it_is():
     """The upper arm of a UR5e is 11 cm beside the line from shoulder to elbow."""
-    text = (CONFIG / 'ur5e.urdf').read_text()
-    chain = read_chain(text, 'world', 'tool0', UR5E)
-    rest = np.zeros(6)
-    corners = Clearance(chain, 0.07, 0.0).corners(rest)
-    straight = Clearance(chain, 0.2, 0.0).corners(rest)
+    corners, straight = (
+        Clearance(chain_of('ur5e'), radius, 0.0).corners(np.zeros(6)) for radius in (0.07, 0.2)
+    )
     assert len(corners) == len(straight) + 1 == 9
     apart = distance(corners[3], corners[3], straight[2], straight[3])
     assert apart == pytest.approx(0.11336, abs=1e-4)

@@ -6,7 +6,7 @@ from __future__ import annotations
 import numpy as np
 import pinocchio
 import pytest
-from random_arm import CONFIG, PANDA, UR5E, configuration, pinocchio_model, random_urdf
+from random_arm import ARMS, ArmCase, chain_of
 
 from blf_dsc_controller.arms.base_parameters import base_parameters
 from blf_dsc_controller.arms.batch import inertia_matrices, regressors_at
@@ -15,45 +15,15 @@ from blf_dsc_controller.arms.forms import TRUSTED, learned_parameters
 from blf_dsc_controller.arms.inertia import INERTIA_NAMES, inertia_of, pseudo_inertia
 from blf_dsc_controller.arms.prior import CENTRE, ROTORS, deviations, payload_inertia, prior_factor
 from blf_dsc_controller.arms.serial_chain import serial_chain
-from blf_dsc_controller.arms.urdf import read_chain
-from blf_dsc_controller.compiled.jit import kernel
 from sim_plant.rigid_body import rigid_arm
 
-# The base stands on the floor, is mounted on a wall, or is tilted.
-ARMS = {
-    'one': (*random_urdf(1, 11), 'base', 'tip', (0.0, 0.0, -9.81)),
-    'two': (*random_urdf(2, 12), 'base', 'tip', (0.0, 9.81, 0.0)),
-    'three': (*random_urdf(3, 13), 'base', 'tip', (1.0, -3.0, 5.0)),
-    'six': (*random_urdf(6, 14), 'base', 'tip', (1.0, -3.0, 5.0)),
-    'nine': (*random_urdf(9, 15), 'base', 'tip', (0.0, 0.0, 9.81)),
-    'panda': (
-        (CONFIG / 'panda.urdf').read_text(),
-        PANDA,
-        'panda_link0',
-        'panda_hand_tcp',
-        (0.0, 0.0, -9.81),
-    ),
-    'ur5e': ((CONFIG / 'ur5e.urdf').read_text(), UR5E, 'world', 'tool0', (9.81, 0.0, 0.0)),
-}
 
-
-class Case:
-    """An arm, its inertias phi, a random state, and the same arm in pinocchio."""
+class Case(ArmCase):
+    """An arm as a model of the controller."""
 
     def __init__(self, name):
-        text, joints, base, tip, gravity = ARMS[name]
-        self.chain = read_chain(text, base, tip, joints)
-        self.arm = serial_chain(self.chain, gravity)
-        self.n = self.arm.n
-        self.random = np.random.default_rng(self.n)
-        self.q, self.dq, self.v, self.a = self.random.normal(size=(4, self.n))
-        self.rotors = self.random.uniform(0.01, 0.3, self.n)
-        self.phi = np.column_stack((self.chain.inertias, self.rotors)).ravel()
-        self.model = pinocchio_model(text, joints)
-        self.model.gravity.linear[:] = gravity
-        self.model.armature[:] = self.rotors
-        self.data = self.model.createData()
-        self.theirs = configuration(self.model, self.q)
+        super().__init__(name)
+        self.arm = serial_chain(self.chain, self.gravity)
 
     def H(self, q, dq, v, a):
         H = np.full((self.n, self.arm.p), np.nan)
@@ -65,63 +35,48 @@ class Case:
         self.arm.momentum_regressor(q, dq, Yp, Yr)
         return Yp, Yr
 
-    def matrices(self):
-        """M, C and G computed by pinocchio."""
-        M = pinocchio.crba(self.model, self.data, self.theirs).copy()
-        C = pinocchio.computeCoriolisMatrix(self.model, self.data, self.theirs, self.dq).copy()
-        G = pinocchio.computeGeneralizedGravity(self.model, self.data, self.theirs).copy()
-        return M, C, G
-
 
 @pytest.mark.parametrize('name', ARMS)
 def test_regressors_agree_with_pinocchio(name):
     """Property III with the Christoffel C, where v and a are not the derivatives of q."""
     case = Case(name)
-    M, C, G = case.matrices()
+    theirs = case.model, case.data, case.theirs
+    M = pinocchio.crba(*theirs).copy()
+    C = pinocchio.computeCoriolisMatrix(*theirs, case.dq).copy()
+    G = pinocchio.computeGeneralizedGravity(*theirs).copy()
     torque = case.H(case.q, case.dq, case.v, case.a) @ case.phi
     np.testing.assert_allclose(torque, M @ case.a + C @ case.v + G, atol=1e-10)
     Yp, Yr = case.momentum(case.q, case.dq)
     np.testing.assert_allclose(Yp @ case.phi, M @ case.dq, atol=1e-10)
     np.testing.assert_allclose(Yr @ case.phi, G - C.T @ case.dq, atol=1e-10)
-    theirs = pinocchio.computeJointTorqueRegressor(
-        case.model, case.data, case.theirs, case.dq, case.a
-    )
+    expected = pinocchio.computeJointTorqueRegressor(*theirs, case.dq, case.a)
     ours = case.H(case.q, case.dq, case.dq, case.a).reshape(case.n, case.n, ROTOR + 1)
-    np.testing.assert_allclose(ours[:, :, :ROTOR].ravel(), theirs.ravel(), atol=1e-10)
+    np.testing.assert_allclose(ours[:, :, :ROTOR].ravel(), expected.ravel(), atol=1e-10)
     np.testing.assert_array_equal(ours[:, :, ROTOR], np.diag(case.a))
+    found = inertia_matrices(case.arm, case.phi, np.stack((case.q + 0.5, case.q)))[1]
+    np.testing.assert_allclose(found, M, atol=1e-10)
 
 
-@kernel
-def all_three(model, q, dq, v, a, separate, together):
-    model.regressor(q, dq, v, a, separate[0])
-    model.momentum_regressor(q, dq, separate[1], separate[2])
-    model.regressors(q, dq, v, a, together[0], together[1], together[2])
-
-
-def test_compiled_and_batched_kernels_agree_with_those_from_python():
+def test_regressors_computed_at_once_or_in_a_batch_equal_the_separate_ones():
     case = Case('six')
-    separate, together = np.full((2, 3, case.n, case.arm.p), np.nan)
-    all_three(case.arm, case.q, case.dq, case.v, case.a, separate, together)
-    np.testing.assert_array_equal(separate[0], case.H(case.q, case.dq, case.v, case.a))
-    np.testing.assert_array_equal(separate[1:], case.momentum(case.q, case.dq))
-    np.testing.assert_array_equal(together, separate)
+    together = np.full((3, case.n, case.arm.p), np.nan)
+    case.arm.regressors(case.q, case.dq, case.v, case.a, *together)
+    np.testing.assert_array_equal(together[0], case.H(case.q, case.dq, case.v, case.a))
+    np.testing.assert_array_equal(together[1:], case.momentum(case.q, case.dq))
     states = case.random.normal(size=(5, 4, case.n))
     H = regressors_at(case.arm, *np.moveaxis(states, 1, 0))
     np.testing.assert_array_equal(H, [case.H(*state) for state in states])
-    M = inertia_matrices(case.arm, case.phi, np.stack((case.q + 0.5, case.q)))[1]
-    np.testing.assert_allclose(M, case.matrices()[0], atol=1e-11)
 
 
 def test_chosen_columns_keep_their_values_names_and_units():
     whole = Case('three')
     chosen = [(0, ROTOR), (1, 0), (1, 3), (2, 9)]
-    part = serial_chain(whole.chain, ARMS['three'][-1], chosen)
+    part = serial_chain(whole.chain, whole.gravity, chosen)
     columns = [body * (ROTOR + 1) + entry for body, entry in chosen]
     rows = np.full((2, 3, 6), np.nan)  # wider, as with disturbance columns beside them
     part.momentum_regressor(whole.q, whole.dq, *rows)
-    np.testing.assert_array_equal(
-        rows[:, :, :4], np.array(whole.momentum(whole.q, whole.dq))[:, :, columns]
-    )
+    expected = np.array(whole.momentum(whole.q, whole.dq))[:, :, columns]
+    np.testing.assert_array_equal(rows[:, :, :4], expected)
     assert np.isnan(rows[:, :, 4:]).all()
     assert part.parameter_names == ('rotor1', 'm2', 'm*cz2', 'Izz3')
     rotor = 'kg' if whole.chain.joints[0].kind == 'prismatic' else 'kg m^2'
@@ -130,12 +85,8 @@ def test_chosen_columns_keep_their_values_names_and_units():
 
 
 WALL = (0.0, 9.81, 0.0)
-PANDA_CHAIN = read_chain(
-    (CONFIG / 'panda.urdf').read_text(), 'panda_link0', 'panda_hand_tcp', PANDA
-)
-UR5E_CHAIN = read_chain((CONFIG / 'ur5e.urdf').read_text(), 'world', 'tool0', UR5E)
-RANDOM = [(text, joints) for text, joints in (random_urdf(4, 2), random_urdf(7, 3))]
-CHAINS = [PANDA_CHAIN, UR5E_CHAIN, *(read_chain(t, 'base', 'tip', j) for t, j in RANDOM)]
+PANDA_CHAIN, UR5E_CHAIN, *RANDOM = map(chain_of, ('panda', 'ur5e', 'three', 'nine'))
+CHAINS = [PANDA_CHAIN, UR5E_CHAIN, *RANDOM]
 
 
 @pytest.mark.parametrize('rotors', [True, False])
@@ -175,36 +126,24 @@ def test_base_parameters_agree_with_the_literature():
 @pytest.mark.parametrize('chain', CHAINS)
 def test_prior_covers_heavier_links_moved_centres_and_the_payload(chain):
     """A deviation in a single respect has a distance of at most 1, larger ones have more."""
-    base = base_parameters(chain, WALL)
-    n = base.model.n
-    rotors = np.full(n, 0.02)
+    base, T = base_parameters(chain, WALL), np.eye(4)
+    T[0, 3] = CENTRE / 100.0  # small, as this holds to first order only
+    rotors, tip = np.full(base.model.n, 0.02), np.append(chain.tip_placement[:3, 3], 1.0)
     L = prior_factor(chain, base, 3.0, rotors)
-    P = base.of(chain.inertias, rotors)
 
-    def distance(inertias, rotors=rotors):
-        off = base.of(inertias, rotors) - P
+    def distance(body, changed, rotor=0.02):
+        inertias, others = chain.inertias, rotors.copy()
+        inertias[body], others[-1] = changed, rotor
+        off = base.of(inertias, others) - base.of(chain.inertias, rotors)
         return np.linalg.norm(np.linalg.solve(L, off))
 
-    for i in range(n):
-        heavier = chain.inertias
-        heavier[i] *= 1.3
-        assert distance(heavier) < 1.0 + 1e-6
-        moved = chain.inertias
-        T = np.eye(4)
-        T[0, 3] = CENTRE / 100.0  # small, as this holds to first order only
-        moved[i] = inertia_of(T @ pseudo_inertia(moved[i]) @ T.T)
-        assert distance(moved) < 1.05 / 100.0
-    loaded = chain.inertias
-    tip = chain.tip_placement[:3, 3]
-    point = np.append(tip, 1.0)
-    loaded[-1] += inertia_of(3.0 * np.outer(point, point))
-    assert distance(loaded) < 1.5  # a point mass, where an extended body is expected
-    other = rotors.copy()
-    other[-1] += 0.02
-    assert distance(chain.inertias, other) < 1.0 + 1e-6
-
-    loaded[-1] += 9.0 * (loaded[-1] - chain.inertias[-1])
-    assert distance(loaded) > 2.0
+    for i, ten in enumerate(chain.inertias):
+        assert distance(i, 1.3 * ten) < 1.0 + 1e-6
+        assert distance(i, inertia_of(T @ pseudo_inertia(ten) @ T.T)) < 1.05 / 100.0
+    load = inertia_of(3.0 * np.outer(tip, tip))
+    assert distance(-1, ten + load) < 1.5  # a point mass, where an extended body is expected
+    assert distance(-1, ten + 10.0 * load) > 2.0
+    assert distance(-1, ten, rotor=0.04) < 1.0 + 1e-6
 
 
 def test_prior_without_payload_is_tighter():
@@ -227,7 +166,7 @@ def test_prior_of_a_ball_is_the_same_in_every_direction():
 
 
 RATED = 3.0  # kg
-ONE_JOINT = read_chain(random_urdf(1, 0)[0], 'base', 'tip', ('j1',))
+ONE_JOINT = chain_of('one')
 
 
 class Learned:
@@ -239,33 +178,21 @@ class Learned:
         self.base = base_parameters(chain, WALL)
         self.form = learned_parameters(chain, self.base, 'payload', RATED, self.rotors)
         self.names = self.form.model.parameter_names
+        self.random = np.random.default_rng(5)
 
     def assert_same_torques(self, P, inertias, rotors):
         """All regressors times P agree with those of the base parameters and with each other."""
-        random = np.random.default_rng(1)
         expected = self.base.of(inertias, rotors)
-        for _ in range(5):
-            q, dq, v, a = random.normal(size=(4, self.n))
-            H, Yp, Yr = np.full((3, self.n, P.size + 2), np.nan)
+        for state in np.random.default_rng(1).normal(size=(5, 4, self.n)):
+            together = np.full((3, self.n, P.size + 2), np.nan)
             separate = np.full((3, self.n, P.size), np.nan)
             whole = np.zeros((3, self.n, expected.size))
-            self.form.model.regressors(q, dq, v, a, H, Yp, Yr)
-            self.form.model.regressor(q, dq, v, a, separate[0])
-            self.form.model.momentum_regressor(q, dq, *separate[1:])
-            self.base.model.regressors(q, dq, v, a, *whole)
-            for combined, alone, other in zip((H, Yp, Yr), separate, whole, strict=True):
-                np.testing.assert_array_equal(combined[:, :-2], alone)
-                np.testing.assert_allclose(alone @ P, other @ expected, rtol=1e-10, atol=1e-10)
-
-
-@pytest.mark.parametrize('chain', [*CHAINS, ONE_JOINT])
-def test_initial_parameters_give_the_torques_of_the_base_parameters(chain):
-    case = Learned(chain)
-    units = case.form.model.parameter_units
-    assert case.form.model.p == case.form.initial.size == len(units)
-    for unit, joint in zip(units, chain.joints, strict=False):  # rotors come first
-        assert unit == ('kg' if joint.kind == 'prismatic' else 'kg m^2')
-    case.assert_same_torques(case.form.initial, chain.inertias, case.rotors)
+            self.form.model.regressors(*state, *together)
+            self.form.model.regressor(*state, separate[0])
+            self.form.model.momentum_regressor(*state[:2], *separate[1:])
+            self.base.model.regressors(*state, *whole)
+            np.testing.assert_array_equal(together[:, :, :-2], separate)
+            np.testing.assert_allclose(separate @ P, whole @ expected, rtol=1e-10, atol=1e-10)
 
 
 def load_at(chain):
@@ -277,31 +204,30 @@ def load_at(chain):
     return inertia_of(load), inertias
 
 
-@pytest.mark.parametrize('chain', [c for c in CHAINS if len(c.joints) > 5])
-def test_parameters_represent_any_load(chain):
+@pytest.mark.parametrize('chain', [*CHAINS, ONE_JOINT])
+def test_parameters_of_the_form_represent_the_arm_and_any_load(chain):
+    """Also those of a short arm, which has fewer of them."""
     case = Learned(chain)
+    units = case.form.model.parameter_units
+    assert case.form.model.p == case.form.initial.size == len(units)
+    for unit, joint in zip(units, chain.joints, strict=False):  # rotors come first
+        assert unit == ('kg' if joint.kind == 'prismatic' else 'kg m^2')
+    case.assert_same_torques(case.form.initial, chain.inertias, case.rotors)
+
     ten, inertias = load_at(chain)
     heavier = case.rotors.copy()
     heavier[-1] *= 1.3
     P = case.form.initial.copy()
-    P[[case.names.index(f'load {name}') for name in INERTIA_NAMES]] = ten
-    P[case.names.index(f'rotor{case.n}')] = heavier[-1]
+    if case.n > 5:
+        P[[case.names.index(f'load {name}') for name in INERTIA_NAMES]] = ten
+        P[case.names.index(f'rotor{case.n}')] = heavier[-1]
+    else:
+        assert P.size < case.n + 11
+        known, motions = case.base.of(inertias, heavier), case.random.normal(size=(4, 40, case.n))
+        models = case.form.model, case.base.model
+        H, whole = (np.vstack(regressors_at(model, *motions)) for model in models)
+        P = np.linalg.lstsq(H, whole @ known, rcond=None)[0]
     case.assert_same_torques(P, inertias, heavier)
-
-
-@pytest.mark.parametrize('chain', [ONE_JOINT, *(c for c in CHAINS if len(c.joints) < 6)])
-def test_short_arm_with_fewer_load_parameters_still_represents_any_load(chain):
-    case = Learned(chain)
-    assert len(case.names) < case.n + 11
-    _, inertias = load_at(chain)
-    known = case.base.of(inertias, case.rotors)
-    motions = np.random.default_rng(5).normal(size=(40, 4, case.n))
-    H, whole = np.zeros((40, case.n, len(case.names))), np.zeros((40, case.n, known.size))
-    for motion, rows, all_rows in zip(motions, H, whole, strict=True):
-        case.form.model.regressor(*motion, rows)
-        case.base.model.regressor(*motion, all_rows)
-    P = np.linalg.lstsq(np.vstack(H), np.vstack(whole) @ known, rcond=None)[0]
-    case.assert_same_torques(P, inertias, case.rotors)
 
 
 def test_load_parameters_agree_with_the_payload_of_the_plant():
@@ -311,7 +237,7 @@ def test_load_parameters_agree_with_the_payload_of_the_plant():
     P = case.form.initial + 2.0 * case.form.load
     assert P[case.names.index('load m')] == 2.0
     H, found = np.zeros((7, P.size)), np.zeros(7)
-    for q, dq, ddq in np.random.default_rng(3).normal(size=(5, 3, 7)):
+    for q, dq, ddq in case.random.normal(size=(5, 3, 7)):
         case.form.model.regressor(q, dq, dq, ddq, H)
         arm.accelerate(2.0, q, dq, H @ P, found)
         np.testing.assert_allclose(found, ddq, rtol=1e-9, atol=1e-9)

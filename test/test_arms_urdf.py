@@ -9,34 +9,23 @@ from math import inf
 import numpy as np
 import pinocchio
 import pytest
-from random_arm import CONFIG, PANDA, UR5E, configuration, pinocchio_model, random_urdf
+from random_arm import ARMS, PANDA, PANDA_TEXT, chain_of, configuration, pinocchio_model
 
 from blf_dsc_controller.arms.inertia import inertia_of, pseudo_inertia
 from blf_dsc_controller.arms.urdf import UrdfError, read_chain
 
-PANDA_TEXT = (CONFIG / 'panda.urdf').read_text()
-UR5E_TEXT = (CONFIG / 'ur5e.urdf').read_text()
-ARMS = (
-    (*random_urdf(1, 1), 'base', 'tip'),
-    (*random_urdf(4, 2), 'base', 'tip'),
-    (*random_urdf(7, 3), 'base', 'tip'),
-    (PANDA_TEXT, PANDA, 'panda_link0', 'panda_hand_tcp'),
-    (UR5E_TEXT, UR5E, 'world', 'tool0'),
-)
 
-
-@pytest.mark.parametrize(('text', 'joints', 'base', 'tip'), ARMS)
-def test_frames_axes_and_inertias_agree_with_pinocchio(text, joints, base, tip):
-    chain = read_chain(text, base, tip, joints)
+@pytest.mark.parametrize('name', ARMS)
+def test_frames_axes_and_inertias_agree_with_pinocchio(name):
+    (text, joints, _, tip), chain = ARMS[name], chain_of(name)
     model = pinocchio_model(text, joints)
     data = model.createData()
     assert [joint.name for joint in chain.joints] == list(model.names[1:])
     for i, joint in enumerate(chain.joints):
         expected = model.inertias[i + 1].toDynamicParameters()
         np.testing.assert_allclose(joint.inertia, expected, atol=1e-12)
-        np.testing.assert_allclose(
-            joint.placement, model.jointPlacements[i + 1].homogeneous, atol=1e-12
-        )
+        placement = model.jointPlacements[i + 1].homogeneous
+        np.testing.assert_allclose(joint.placement, placement, atol=1e-12)
         q = configuration(model, np.eye(len(joints))[i])
         twist = pinocchio.computeJointJacobian(model, data, q, i + 1).reshape(6, -1)[:, i]
         axis = twist[:3] if joint.kind == 'prismatic' else twist[3:]
@@ -45,39 +34,28 @@ def test_frames_axes_and_inertias_agree_with_pinocchio(text, joints, base, tip):
     np.testing.assert_allclose(chain.tip_placement, frame.placement.homogeneous, atol=1e-12)
 
 
-def test_limits_are_read_from_the_file():
-    first = read_chain(PANDA_TEXT, 'panda_link0', 'panda_hand_tcp', PANDA).joints[0]
-    assert (first.lower, first.upper) == (-2.8973, 2.8973)
-    assert (first.velocity, first.effort) == (2.175, 87.0)
+def test_limits_are_read_from_the_file_and_infinite_where_they_are_missing():
+    def limits(text):
+        joint = panda(text).joints[0]
+        return joint.lower, joint.upper, joint.velocity, joint.effort
 
-
-def test_missing_limits_are_infinite():
-    text = '<limit lower="-2.8973" upper="2.8973" velocity="2.175" effort="87" />'
-    assert text in PANDA_TEXT
-    for changed in ('', '<limit effort="0" velocity="0" lower="-9" upper="9" />'):
-        joint = read_chain(
-            PANDA_TEXT.replace(text, changed, 1), 'panda_link0', 'panda_link8', PANDA
-        ).joints[0]
-        assert (joint.velocity, joint.effort) == (inf, inf)
-        assert (joint.lower, joint.upper) == ((-9.0, 9.0) if changed else (-inf, inf))
-    continuous = PANDA_TEXT.replace(
-        '"panda_joint1" type="revolute"', '"panda_joint1" type="continuous"'
-    )
-    joint = read_chain(continuous, 'panda_link0', 'panda_link8', PANDA).joints[0]
-    assert (joint.lower, joint.upper, joint.effort) == (-inf, inf, 87.0)
+    given = '<limit lower="-2.8973" upper="2.8973" velocity="2.175" effort="87" />'
+    unlimited = '<limit effort="0" velocity="0" lower="-9" upper="9" />'
+    assert limits(PANDA_TEXT) == (-2.8973, 2.8973, 2.175, 87.0)
+    assert limits(changed(given, '', 1)) == (-inf, inf, inf, inf)
+    assert limits(changed(given, unlimited, 1)) == (-9.0, 9.0, inf, inf)
+    continuous = changed(FIRST_JOINT, FIRST_JOINT.replace('revolute', 'continuous'))
+    assert limits(continuous) == (-inf, inf, 2.175, 87.0)
 
 
 def test_friction_is_read_from_the_file_and_zero_by_default():
-    text = changed(
-        '<axis xyz="0 0 1" />', '<axis xyz="0 0 1" /><dynamics damping="3" friction="2" />', 1
-    )
-    first, second = read_chain(text, 'panda_link0', 'panda_link8', PANDA).joints[:2]
-    assert (first.damping, first.friction) == (3.0, 2.0)
-    assert (second.damping, second.friction) == (0.0, 0.0)
+    text = changed(AXIS, f'{AXIS}<dynamics damping="3" friction="2" />', 1)
+    found = [(joint.damping, joint.friction) for joint in panda(text).joints[:2]]
+    assert found == [(3.0, 2.0), (0.0, 0.0)]
 
 
 def test_gripper_is_carried_for_every_tip_and_its_fingers_are_listed_as_held():
-    whole = read_chain(PANDA_TEXT, 'panda_link0', 'panda_hand_tcp', PANDA)
+    whole = panda(PANDA_TEXT)
     assert whole.held == ('panda_finger_joint1', 'panda_finger_joint2')
     assert whole.joints[6].inertia[0] == pytest.approx(0.735522 + 0.73 + 2 * 0.015)
     shorter = read_chain(PANDA_TEXT, 'panda_link0', 'panda_link7', PANDA)
@@ -86,18 +64,22 @@ def test_gripper_is_carried_for_every_tip_and_its_fingers_are_listed_as_held():
 
 def test_chain_may_begin_and_end_inside_the_arm():
     chain = read_chain(PANDA_TEXT, 'panda_link2', 'panda_link4', PANDA[2:4])
-    whole = read_chain(PANDA_TEXT, 'panda_link0', 'panda_hand_tcp', PANDA)
+    whole = panda(PANDA_TEXT)
     np.testing.assert_allclose(chain.joints[0].inertia, whole.joints[2].inertia)
     # The wrist is then a rigid load.
     assert chain.joints[1].inertia[0] == pytest.approx(sum(j.inertia[0] for j in whole.joints[3:]))
 
 
 def test_pseudo_inertia_is_positive_only_for_physical_bodies():
-    inertia = read_chain(UR5E_TEXT, 'world', 'tool0', UR5E).joints[1].inertia
+    inertia = chain_of('ur5e').joints[1].inertia
     np.testing.assert_allclose(inertia_of(pseudo_inertia(inertia)), inertia, atol=1e-15)
     assert np.linalg.eigvalsh(pseudo_inertia(inertia))[0] > 0.0
     inertia[9] = 3.0 * inertia[4] + 3.0 * inertia[6]  # Izz > Ixx + Iyy
     assert np.linalg.eigvalsh(pseudo_inertia(inertia))[0] < 0.0
+
+
+def panda(text):
+    return read_chain(text, 'panda_link0', 'panda_hand_tcp', PANDA)
 
 
 def changed(old, new, count=-1):
@@ -135,10 +117,7 @@ WRONG_CHAINS = (
     ({'tip': 'tool'}, "no link 'tool' for the tip: the links are panda_link0, "),
     ({'base': 'world'}, "no link 'world' for the base"),
     ({'base': 'panda_leftfinger', 'tip': 'panda_rightfinger'}, "ends at 'panda_link0' without rea"),
-    (
-        {'joints': ('elbow', *PANDA[1:])},
-        "no joint 'elbow' in the URDF: its joints are",
-    ),
+    ({'joints': ('elbow', *PANDA[1:])}, "no joint 'elbow' in the URDF: its joints are"),
     ({'joints': PANDA[::-1]}, 'panda_joint7, in this order; got panda_joint7'),
     ({'joints': PANDA[:6]}, 'panda_joint7, in this order'),
     ({'joints': (*PANDA, 'panda_finger_joint1')}, 'choose another base or tip'),
@@ -163,17 +142,12 @@ def test_unusable_urdf_is_rejected_with_a_remedy():
         assert message in str(caught.value)
 
 
-def test_moments_below_zero_by_rounding_are_accepted():
-    text = changed('ixx="0.001" iyy="0.0025" izz="0.0017"', 'ixx="0" iyy="0" izz="-2e-35"')
-    assert read_chain(text, 'panda_link0', 'panda_hand_tcp', PANDA).pointlike == ()
-
-
-def test_links_with_an_all_zero_tensor_are_listed():
-    text = changed('ixx="0.001" iyy="0.0025" izz="0.0017"', 'ixx="0" iyy="0" izz="0"')
-    chain = read_chain(text, 'panda_link0', 'panda_hand_tcp', PANDA)
-    assert chain.pointlike == ('panda_hand',)
+def test_links_with_an_all_zero_tensor_are_listed_and_rounding_below_zero_is_accepted():
+    given = 'ixx="0.001" iyy="0.0025" izz="0.0017"'
+    for izz, listed in (('0', ('panda_hand',)), ('-2e-35', ())):
+        assert panda(changed(given, f'ixx="0" iyy="0" izz="{izz}"')).pointlike == listed
 
 
 def test_expanded_file_may_still_declare_the_xacro_namespace():
     text = changed('<robot name', '<robot xmlns:xacro="http://www.ros.org/wiki/xacro" name')
-    assert len(read_chain(text, 'panda_link0', 'panda_hand_tcp', PANDA).joints) == 7
+    assert len(panda(text).joints) == 7

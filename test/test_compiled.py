@@ -27,23 +27,33 @@ from blf_dsc_controller.simulation.loop import run_loop
 from sim_plant.kernels import step_plant
 
 PACKAGE = Path(blf_dsc_controller.__file__).resolve().parent
-LAW = {f'{PACKAGE.name}/law/{name}.py' for name in ('barrier', 'prediction', 'step', 'settings')}
+
+
+def sources(*names):
+    return {f'{PACKAGE.name}/{name}.py' for name in names}
+
+
+LAW = sources('law/barrier', 'law/prediction', 'law/step', 'law/settings', 'reference/terms')
 PLANT = {f'sim_plant/{name}.py' for name in ('arm', 'drives', 'kernels', 'motion')}
-REFERENCE = {f'{PACKAGE.name}/reference/terms.py'}
-ALWAYS = {f'{PACKAGE.name}/{name}.py' for name in ('compiled/layout', 'arms/two_link')}
+ALWAYS = sources('compiled/layout', 'arms/two_link')
 
 
 def names(kernel):
     return {str(path.relative_to(PACKAGE.parent)) for path in jit.dependencies(kernel)[0]}
 
 
+compiling = pytest.mark.skipif(numba.config.DISABLE_JIT, reason='nothing is compiled')
+
+
 def test_kernel_depends_on_the_files_and_constants_it_is_compiled_from():
     """Changing the plant does not recompile the law; changing the configuration, no kernel."""
-    assert names(update) >= LAW | REFERENCE | ALWAYS
-    assert names(run_loop) >= LAW | REFERENCE | PLANT | ALWAYS
-    assert names(step_plant) >= PLANT | ALWAYS
-    assert not names(update) & PLANT
-    assert not names(step_plant) & (LAW | REFERENCE)
+    for kernel, needed, foreign in (
+        (update, LAW, PLANT),
+        (run_loop, LAW | PLANT, set()),
+        (step_plant, PLANT, LAW),
+    ):
+        assert names(kernel) >= needed | ALWAYS
+        assert not names(kernel) & foreign
     assert not any('configuration' in name for name in names(run_loop))
     assert {'SUSPECT=1', 'OUTSIDE=2', 'LINEAR=1'} <= jit.dependencies(update)[1]
     outside = {path.name for path in jit.dependencies(_shake)[0]}  # a kernel of these tests
@@ -51,7 +61,7 @@ def test_kernel_depends_on_the_files_and_constants_it_is_compiled_from():
     assert 'step.py' not in outside
 
 
-@pytest.mark.skipif(numba.config.DISABLE_JIT, reason='nothing is cached')
+@compiling
 @pytest.mark.parametrize('kernel', [update, run_loop, step_plant])
 def test_cache_folder_of_a_kernel_follows_from_its_dependencies(kernel):
     """A kernel must be defined after what it calls, or edits would run stale machine code."""
@@ -80,7 +90,7 @@ def compiled_in(checkout, cache, **target):
     return entry, found, compiled
 
 
-@pytest.mark.skipif(numba.config.DISABLE_JIT, reason='nothing is compiled')
+@compiling
 def test_second_checkout_finds_the_kernels_of_the_first_and_never_those_of_other_sources(tmp_path):
     first, second, cache = (tmp_path / name for name in ('first', 'second', 'cache'))
     for checkout in (first, second):
@@ -108,29 +118,20 @@ def test_code_for_a_named_processor_is_found_again_and_not_loaded_elsewhere(tmp_
     assert compiled_in(checkout, tmp_path) == (entry, 0, 1)
 
 
-@pytest.mark.skipif(numba.config.DISABLE_JIT, reason='nothing is compiled')
+@compiling
 def test_kernels_compile_without_the_private_parts_of_numba(tmp_path):
     """Other releases may lack them: then it is slower, which is said, with the same numbers."""
-    without = """
-import sys
-import numba.core.caching, numba.core.codegen
-del numba.core.codegen.JITCodeLibrary
-if sys.argv[1] == 'cache':
-    del numba.core.caching.CompileResultCacheImpl
-"""
+    H = batch.regressors_at(TwoLink(10.0), *np.full((4, 1, 2), 0.5))
+    slow = f'numba {numba.__version__} lacks what this package uses'
     environment = {**os.environ, 'NUMBA_CACHE_DIR': str(tmp_path)}
-    for lacking in ('linking', 'cache'):
-        runs = [
-            finished(sys.executable, '-c', without + COMPILE, lacking, env=environment)
-            for _ in range(2)
-        ]
-        outputs = [[float(word) for word in run.stdout.split()] for run in runs]
-        assert [counts for _, *counts in outputs] == [[0, 1], [1, 0]], runs
-        slow = f'numba {numba.__version__} lacks what this package uses'
-        assert [run.stderr.count(slow) for run in runs] == [1, 0]
-        entry, *_ = outputs[0]
-        H = batch.regressors_at(TwoLink(10.0), *np.full((4, 1, 2), 0.5))
-        assert entry == H[0, 0, 0]
+    lacking = ['import numba.core.caching, numba.core.codegen']
+    for part in ('codegen.JITCodeLibrary', 'caching.CompileResultCacheImpl'):  # one, then both
+        lacking.append(f'del numba.core.{part}')
+        for counts, said in (([0, 1], 1), ([1, 0], 0)):
+            program = '\n'.join([*lacking, COMPILE])
+            run = finished(sys.executable, '-c', program, env=environment)
+            assert [float(word) for word in run.stdout.split()] == [H[0, 0, 0], *counts]
+            assert run.stderr.count(slow) == said
 
 
 @jit.inner
@@ -164,7 +165,7 @@ def allocating(x):
     return np.zeros(3)[0] + x
 
 
-@pytest.mark.skipif(numba.config.DISABLE_JIT, reason='Python may allocate')
+@compiling
 def test_kernel_that_allocates_an_array_is_rejected():
     with pytest.raises(UnsupportedError, match='the kernel allocating allocates an array'):
         allocating(1.0)
@@ -186,85 +187,60 @@ def test_kernel_releases_references_to_its_arguments():
 
 
 class Motor(NamedTuple):
-    limit: Annotated[Array, 'n']
+    limit: Annotated[Array, 'joints']
     delay: int
-
-
-class Settings(NamedTuple):
-    n: int
-    period: float
-    motor: Motor
-    gains: Annotated[Array, 2, 'n + 1']
-
-
-class State(NamedTuple):
-    count: Cell
-    ring: Annotated[Array, 'motor.delay', 'n']
-    motor: Motor
-
-
-settings_of = view_of(Settings)
-state_of, state_size = view_of(State), size_of(State)
-SETTINGS = Settings(3, 0.5, Motor([1.0, 2.0, 3.0], 4), [[5.0, 6.0, 7.0, 8.0], [9.0, 0.0, 1.0, 2.0]])
-
-
-def total(settings_vector, state_vector):
-    settings = settings_of(settings_vector)
-    state = state_of(state_vector, settings)
-    state.count[0] += settings.period
-    state.ring[settings.motor.delay - 1, settings.n - 1] = settings.gains[1, 0]
-    return settings.gains.sum() + settings.motor.limit.sum()
-
-
-def test_kernels_and_python_agree():
-    vector = pack(SETTINGS)
-    results = []
-    for function in (total, numba.njit(total)):
-        state = np.zeros(state_size(settings_of(vector)))
-        results.append((function(vector, state), *state))
-    assert results[0] == results[1]
-    assert results[0][0] == 44.0
-    assert results[0][1] == 0.5
-    assert results[0][1 + 12] == 9.0
 
 
 class Sized(NamedTuple):
     joints: Fixed
     columns: Fixed
+    period: float
     count: int
+    motor: Motor
     gains: Annotated[Array, 'joints', 'columns + 1']
 
 
-sized_of = view_of(Sized)
+class State(NamedTuple):
+    count: Cell
+    ring: Annotated[Array, 'motor.delay', 'joints']
+    motor: Motor
 
 
-@jit.kernel
-def lengths(vector, sizes, out):
-    sized = sized_of(vector, sizes)
-    out[0], out[1], out[2] = sized.joints, sized.columns, sized.count
-    out[3] = sized.gains[sized.joints - 1, sized.columns]
+sized_of, state_of, state_size = view_of(Sized), view_of(State), size_of(State)
+
+
+def advance(vector, sizes, state_vector):
+    settings = sized_of(vector, sizes)
+    state = state_of(state_vector, settings)
+    state.count[0] += settings.period
+    state.ring[settings.motor.delay - 1, settings.joints - 1] = settings.gains[0, settings.columns]
+    return settings.motor.limit.sum() + settings.count
+
+
+compiled_advance = jit.kernel(advance)
 
 
 @pytest.mark.parametrize(('joints', 'columns'), [(1, 0), (2, 3), (7, 300)])
-def test_fixed_numbers_reach_kernels_beside_the_vector(joints, columns):
-    gains = np.arange(float(joints * (columns + 1))).reshape(joints, columns + 1)
-    sized = Sized(joints, columns, 5, gains)
-    vector, out = pack(sized), np.zeros(4)
-    assert vector.size == 1 + gains.size
-    lengths(vector, sizes_of(sized), out)
-    assert out.tolist() == [joints, columns, 5, gains[-1, -1]]
-    view = sized_of(vector, sizes_of(sized))
-    assert view[:3] == (joints, columns, 5)
-    np.testing.assert_array_equal(view.gains, gains)
-
-
-@pytest.mark.skipif(numba.config.DISABLE_JIT, reason='nothing is compiled')
-def test_kernels_are_compiled_for_their_fixed_numbers():
-    before = len(lengths.signatures)
-    for joints, count in ((11, 1), (11, 2), (12, 1)):
-        sized = Sized(joints, 0, count, np.zeros((joints, 1)))
-        lengths(pack(sized), sizes_of(sized), np.zeros(4))
-    assert len(lengths.signatures) == before + 2
+def test_vectors_and_fixed_numbers_beside_them_are_seen_alike_by_kernels_and_python(
+    joints, columns
+):
+    """Kernels are compiled for the fixed numbers, and not for the others."""
+    gains = np.arange(1.0, 1.0 + joints * (columns + 1)).reshape(joints, columns + 1)
+    before = len(compiled_advance.signatures)
+    for count in (5, 6):
+        sized = Sized(joints, columns, 0.5, count, Motor(np.arange(joints), 4), gains)
+        vector, sizes = pack(sized), sizes_of(sized)
+        assert vector.size == 3 + joints + gains.size
+        view = sized_of(vector, sizes)
+        assert view[:4] == (joints, columns, 0.5, count)
+        np.testing.assert_array_equal(view.gains, gains)
+        for function in (advance, compiled_advance):
+            state = np.zeros(state_size(view))
+            assert function(vector, sizes, state) == sum(range(joints)) + count
+            last = 1 + 4 * joints - 1
+            assert (state[0], state[last]) == (0.5, columns + 1.0)
+            assert np.count_nonzero(state) == 2
+    assert len(compiled_advance.signatures) == before + (not numba.config.DISABLE_JIT)
 
 
 SHOW = """
@@ -285,7 +261,7 @@ if __name__ == '__main__':  # the command has processes of its own
 """
 
 
-@pytest.mark.skipif(numba.config.DISABLE_JIT, reason='nothing is compiled')
+@compiling
 def test_command_compiles_every_kernel_that_a_node_calls():
     *kernels, said = finished(sys.executable, '-c', SHOW).stdout.splitlines()
     assert len(kernels) == 5

@@ -9,11 +9,10 @@ import pytest
 from blf_dsc_controller import load_loop, simulate
 from blf_dsc_controller.arms.tuning import over_postures
 from blf_dsc_controller.configuration.robot import parameters_of
-from blf_dsc_controller.law.factory import controller_of, settings_of_config
+from blf_dsc_controller.law.factory import controller_of
 from blf_dsc_controller.supervision.config_warnings import expectation
 from sim_plant.plant import plant_settings
 
-BITS_16 = 2.0 * np.pi / 2**16  # rad
 NOISY = {'sensor.velocity': 'measured', 'sensor.velocity_noise': 0.005}
 
 
@@ -21,30 +20,21 @@ def ran(preset, factor, plant=None, controller=None, sample_time=0.001):
     """Run a preset without a payload for 6 s, with rotors of `factor` times the guess."""
     given = {'sample_time': sample_time}
     truth = {'truth.rotor_factor': factor, 'duration': 6.0, 'events.begin': [100.0]}
-    overrides = {
-        'blf_dsc_controller': given | (controller or {}),
-        'sim_plant': given | truth | (plant or {}),
-    }
-    loop = load_loop(preset, overrides)
+    law, arm = given | (controller or {}), given | truth | (plant or {})
+    loop = load_loop(preset, {'blf_dsc_controller': law, 'sim_plant': arm})
     return simulate(loop.controller, loop.plant)
 
 
-@pytest.mark.parametrize('sample_time', [0.001, 0.002])
-@pytest.mark.parametrize('factor', [0.0, 0.1, 0.4, 1.3])
-def test_panda_keeps_its_bound_whatever_its_rotors_are(factor, sample_time):
-    run = ran('panda', factor, sample_time=sample_time).run()
-    assert not run.stops
-    assert np.abs(run.error / run.bound).max() < 1.0
+PANDA = [('panda', factor, period) for factor in (0.0, 0.1, 0.4, 1.3) for period in (0.001, 0.002)]
+OTHERS = [('ur5e', 0.2, 0.001), ('ur5e', 0.4, 0.002), ('fr3', 0.1, 0.001)]
 
 
-@pytest.mark.parametrize(
-    ('preset', 'factor', 'sample_time', 'most'),
-    [('ur5e', 0.2, 0.001, 1.0), ('ur5e', 0.4, 0.002, 1.0), ('fr3', 0.1, 0.001, 0.8)],
-)
-def test_other_arms_keep_their_bounds_with_light_rotors(preset, factor, sample_time, most):
+@pytest.mark.parametrize(('preset', 'factor', 'sample_time'), [*PANDA, *OTHERS])
+def test_arm_keeps_its_bound_whatever_its_rotors_are(preset, factor, sample_time):
+    """A UR5e from 0.2 of the guess on, or 0.4."""
     run = ran(preset, factor, sample_time=sample_time).run()
     assert not run.stops
-    assert np.abs(run.error / run.bound).max() < most
+    assert np.abs(run.error / run.bound).max() < (0.8 if preset == 'fr3' else 1.0)
 
 
 @pytest.mark.parametrize(
@@ -70,13 +60,12 @@ def test_wrist_that_its_friction_moves_more_than_its_gains_stops_with_the_reason
 
 
 def test_the_guess_stops_the_same_arm_where_nothing_is_measured():
-    chain = load_loop('panda').controller.robot
-    guess = chain.rotors(chain.chain(load_loop('panda').controller.joints))
-    given = {'robot.rotor_inertia': guess.tolist()}
-    assert ran('panda', 0.1, controller=given).run().stops
+    config = load_loop('panda').controller
+    guess = config.robot.rotors(config.robot.chain(config.joints))
+    assert ran('panda', 0.1, controller={'robot.rotor_inertia': guess.tolist()}).run().stops
 
 
-@pytest.mark.parametrize('plant', [{}, {'sensor.resolution': BITS_16}, NOISY])
+@pytest.mark.parametrize('plant', [{}, {'sensor.resolution': 2.0 * np.pi / 2**16}, NOISY])
 @pytest.mark.parametrize('factor', [1.0, 1.3])
 def test_noise_is_not_mistaken_for_a_light_arm(factor, plant):
     state = ran('panda', factor, plant).controller.state
@@ -87,28 +76,23 @@ def test_noise_is_not_mistaken_for_a_light_arm(factor, plant):
 def test_measured_inertia_is_that_of_the_arm_where_the_loop_was_unstable():
     """Between the true inertia and what the loop tolerates, for each joint that was measured."""
     record = ran('panda', 0.1)
-    config = record.config
-    chain = config.robot.chain(config.joints)
-    settings, scale = settings_of_config(config), record.controller.state.gain_scale
-    rotors = settings.unsure_rotor
+    config, settings = record.config, record.controller.settings
+    robot, chain = config.robot, config.robot.chain(config.joints)
     limits = config.limits.position_lower, config.limits.position_upper
-    parameters = parameters_of(config.robot, chain)
-    P = tuple(parameters.of(chain.inertias, 0.1 * rotors))
-    true = over_postures(chain, parameters, config.robot.payload, P, *limits)[0]
-    ratio = scale * settings.joint_inertia / true
+    base, scale = parameters_of(robot, chain), record.controller.state.gain_scale
+    P = tuple(base.of(chain.inertias, 0.1 * settings.unsure_rotor))
+    true = over_postures(chain, base, robot.payload, P, *limits)[0]
     measured = scale < 0.6
-    assert measured.sum() >= 3
-    assert (ratio[measured] > 0.7).all()
-    assert (ratio[measured] < 2.0).all()
+    ratio = (scale * settings.joint_inertia / true)[measured]
+    assert ratio.size >= 3
+    assert ratio.min() > 0.7
+    assert ratio.max() < 2.0
 
 
 def test_integrator_takes_as_many_steps_as_friction_on_a_light_joint_needs():
-    steps = [
-        plant_settings(load_loop('ur5e', {'sim_plant': {'truth.rotor_factor': factor}}).plant).steps
-        for factor in (1.3, 0.1)
-    ]
-    assert steps[0] == 1
-    assert steps[1] > 5
+    for factor, fewest, most in ((1.3, 1, 1), (0.1, 6, 1000)):
+        loop = load_loop('ur5e', {'sim_plant': {'truth.rotor_factor': factor}})
+        assert fewest <= plant_settings(loop.plant).steps <= most
 
 
 @pytest.mark.parametrize(('evidence', 'share'), [(1e6, 0.0), (-1e6, -1.0)])

@@ -19,26 +19,22 @@ from changes import (
     end_of,
     payload,
     run,
+    several,
 )
+from closed_loop_case import arbitrary
 from paper_case import NO_DISTURBANCE, configured
 
 from blf_dsc_controller import load_loop, simulate
 from blf_dsc_controller.law import consistency, excitation, window
 from blf_dsc_controller.law.factory import controller_of
 
+Q = np.array([2.293, 1.696])
+FRICTION = {'disturbance.viscous': [0.1, 0.1]}
+DIFFERENCED = {'sensor.velocity': 'differenced', 'sensor.position_noise': 1e-5, 'actuator.delay': 1}
 SENSORS = {
     'ideal': {},
-    'noisy': {
-        'sensor.velocity': 'differenced',
-        'sensor.position_noise': 1e-5,
-        'actuator.delay': 1,
-    },
-    '16 bit': {
-        'sensor.velocity': 'differenced',
-        'sensor.resolution': 2.0 * np.pi / 2**16,
-        'sensor.position_noise': 1e-5,
-        'actuator.delay': 1,
-    },
+    'noisy': DIFFERENCED,
+    '16 bit': DIFFERENCED | {'sensor.resolution': 2.0 * np.pi / 2**16},
     'noisy velocity': {'sensor.velocity_noise': 1e-3, 'actuator.delay': 1},
 }
 
@@ -54,8 +50,7 @@ CASES = [
 def test_bound_holds_when_the_arm_changes(name, sensors):
     row = (ROWS | LIGHTER)[name]
     plant = row | SENSORS[sensors]
-    learning, without = run(end_of(row), plant), run(end_of(row), plant, law=OFF)
-
+    learning, without = (run(end_of(row), plant, law=law) for law in ({}, OFF))
     assert np.all(learning.largest(0.0) < BOUND)
     begin = begin_of(row)
     quantisation = 0.5 * plant.get('sensor.resolution', 0.0)
@@ -75,13 +70,13 @@ def test_change_detection_has_no_effect_without_a_change():
 
 
 def test_residual_matches_least_squares():
-    controller = run(8.0, NO_DISTURBANCE | {'disturbance.viscous': [0.1, 0.1]}).controller
+    controller = run(8.0, NO_DISTURBANCE | FRICTION).controller
     settings, state = controller.settings, controller.state
     assert settings.change_detection == 1
     rows = state.ring.reshape(-1, settings.m + 1)
     _, squares, _, _ = np.linalg.lstsq(rows[:, :-1], rows[:, -1], rcond=None)
-    found = state.residual[0]
-    assert found == pytest.approx(squares[0] / settings.window, rel=0.05)  # a few rows old
+    # The residual is a few rows old.
+    assert state.residual[0] == pytest.approx(squares[0] / settings.window, rel=0.05)
 
 
 def test_estimate_does_not_drift_at_rest_with_noise():
@@ -97,12 +92,13 @@ def test_estimate_does_not_drift_at_rest_with_noise():
 
 def test_column_rejected_at_rest_is_readmitted_in_motion():
     """Hold for a while, then move: the first full window is half at rest and rejects the bias."""
+    steps = np.arange(25)
     law = {
         'reference.type': 'waypoints',
-        'reference.times': [0.0, 10.0] + [10.0 + 1.5 * k for k in range(1, 25)],
+        'reference.times': [0.0, *(10.0 + 1.5 * steps).tolist()],
         'reference.points': [
-            *(2.293, 2.293, *(2.293 - 0.5 * (k % 2) for k in range(1, 25))),
-            *(1.696, 1.696, *(1.696 - 0.4 * (k // 2 % 2) for k in range(1, 25))),
+            *(2.293, *(2.293 - 0.5 * (steps % 2)).tolist()),
+            *(1.696, *(1.696 - 0.4 * (steps // 2 % 2)).tolist()),
         ],
     }
     constant = {'disturbance.constant': [0.3, -0.2], 'disturbance.amplitude': [0.0, 0.0]}
@@ -117,32 +113,30 @@ def test_rejected_column_stays_zero_and_is_checked_again():
     Unless they are checked again then, no window would ever be latched.
     """
     controller = run(8.0, law={'learning.frequencies': [1.0]}).controller
-    settings, state, signals = controller.settings, controller.state, controller.signals
+    case = _, state, _ = controller.settings, controller.state, controller.signals
     rejected = state.active == 0.0
     assert rejected.any()
     assert state.columns_checked[0] == 1.0
     state.anchor[rejected] = 0.1
     state.rows[0] *= 0.5  # the window seems not to be full
-    window.excitation(settings, state, signals, 60)
-    assert consistency.accept_window(settings, state, signals, Q)
-    assert np.all(state.solution[rejected] == 0.0)
-    assert np.all(state.solution[~rejected] != 0.0)
+    window.excitation(*case, 60)
+    assert consistency.accept_window(*case, Q)
+    np.testing.assert_array_equal(state.solution == 0.0, rejected)
 
     state.running[:] = 0.0
     state.cursor[0] = 0.0
-    excitation.readmit_columns(settings, state, signals)
+    excitation.readmit_columns(*case)
     assert state.columns_checked[0] == 0.0
 
 
 def test_window_after_a_change_may_be_partial_and_stays_near_the_estimate_before():
-    learning = run(CHANGED + 5.0, payload(0.75))
-    state = learning.controller.state
-    assert state.latched[0] == 1.0
-    assert state.rows[0] < learning.controller.settings.window
-    free = run(CHANGED + 5.0, payload(0.75), law={'learning.anchor_weight': 0.0})
-    assert np.ptp(learning.controller.state.estimate - state.anchor) < np.ptp(
-        free.controller.state.estimate - state.anchor
-    )
+    off = []
+    for law in ({}, {'learning.anchor_weight': 0.0}):
+        learning = run(CHANGED + 5.0, payload(0.75), law=law).controller
+        assert learning.state.latched[0] == 1.0
+        assert learning.state.rows[0] < learning.settings.window
+        off.append(np.ptp(learning.state.estimate - learning.state.anchor))
+    assert off[0] < off[1]
 
 
 def test_change_detection_is_off_for_laws_without_composite_learning():
@@ -152,22 +146,16 @@ def test_change_detection_is_off_for_laws_without_composite_learning():
 
 
 @pytest.mark.parametrize(
-    ('preset', 'event'),
-    [
-        ('noisy', {'events.begin': [2.0], 'events.payload': [0.5]}),
-        ('noisy', {'events.begin': [4.0], 'events.payload': [0.3]}),
-        (
-            'panda',
-            {'events.begin': [2.0], 'events.duration': [25.0], 'events.payload': [2.0]},
-        ),
-    ],
+    ('preset', 'begin', 'duration', 'mass'),
+    [('noisy', 2.0, 0.0, 0.5), ('noisy', 4.0, 0.0, 0.3), ('panda', 2.0, 25.0, 2.0)],
 )
-def test_first_window_that_spans_a_change_is_not_latched(preset, event):
+def test_first_window_that_spans_a_change_is_not_latched(preset, begin, duration, mass):
     """0.1 s after the first latch, the estimate explains the torque of the changed arm.
 
     Mixtures used to be latched, wrong by 0.5, 7.3 and 1.2 N m then.
     """
-    config = configured(preset, 11.0, {}, event)
+    events = several({'begin': begin, 'duration': duration, 'payload': mass})
+    config = configured(preset, 11.0, {}, events)
     record = simulate(config.controller, config.plant)
     settings, state = record.controller.settings, record.controller.state
     samples = [record.sample(k) for k in range(0, len(record.samples), 50)]
@@ -187,18 +175,27 @@ def test_lasting_disturbance_above_the_floor_does_not_end_learning():
     assert state.rows[0] == learning.controller.settings.window
 
 
-Q = np.array([2.293, 1.696])
-
-
 @pytest.fixture(scope='module')
-def learned():
-    """Controller with a full latched window of unmodelled friction, and its residual."""
-    controller = run(8.0, {'disturbance.viscous': [0.1, 0.1]}).controller
+def window_of_friction():
+    """Controller with a full latched window of unmodelled friction, and its state."""
+    controller = run(8.0, FRICTION).controller
     controller.settings = controller.settings._replace(residual_floor=0.0)
     window.excitation(controller.settings, controller.state, controller.signals, 60)
-    state = controller.state
-    assert consistency.accept_window(controller.settings, state, controller.signals, Q)
-    return controller, float(state.residual[0])
+    accepted = consistency.accept_window(
+        controller.settings, controller.state, controller.signals, Q
+    )
+    assert accepted
+    return controller, controller.save()
+
+
+@pytest.fixture
+def learned(window_of_friction):
+    """Settings, state and signals of that controller, and the residual."""
+    controller, saved = window_of_friction
+    controller.restore(saved)
+    settings, state, signals = controller.settings, controller.state, controller.signals
+    window.excitation(settings, state, signals, 60)
+    return settings, state, signals, float(state.residual[0])
 
 
 @pytest.mark.parametrize(
@@ -207,9 +204,7 @@ def learned():
 )
 def test_window_is_latched_up_to_four_times_the_least_residual(learned, ratio, accepted, pulled):
     """An unusual residual pulls it to the anchor, by 3 (r^2 - 1.25 r^2_least) R."""
-    controller, residual = learned
-    settings, state, signals = controller.settings, controller.state, controller.signals
-    window.excitation(settings, state, signals, 60)
+    settings, state, signals, residual = learned
     before = np.diag(signals.Phi).copy()
     state.least_residual[0] = residual / ratio
     assert consistency.accept_window(settings, state, signals, Q) == accepted
@@ -225,12 +220,10 @@ def test_change_is_detected_from_eight_times_the_residual_on(
     learned, ratio, rows, changes, taken_back
 ):
     """What a window taught before it was full is taken back, and the torque stays the same."""
-    controller, residual = learned
-    saved = controller.save()
-    settings, state, signals = controller.settings, controller.state, controller.signals
+    settings, state, signals, residual = learned
     signals.row[:] = 0.0
     signals.row[0, -1] = np.sqrt(ratio * residual)
-    state.residual[0], state.latched[0], state.rows[0] = residual, 1.0, rows * settings.window
+    state.rows[0] = rows * settings.window
     state.anchor[:] = 0.9 * state.estimate
     before, torque = state.estimate.copy(), signals.H @ state.estimate + state.disturbance
     consistency.detect_change(settings, state, signals, 8.0, 0.1)
@@ -239,47 +232,38 @@ def test_change_is_detected_from_eight_times_the_residual_on(
     # The next, partial windows are pulled to the estimate from before.
     assert np.array_equal(state.anchor, state.estimate) == (changes == 1.0)
     np.testing.assert_allclose(signals.H @ state.estimate + state.disturbance, torque, atol=1e-12)
-    controller.restore(saved)
 
 
 @pytest.mark.parametrize(
     ('latched', 'cursor', 'kept'), [(0.0, 100.0, True), (1.0, 100.0, False), (1.0, 0.0, True)]
 )
 def test_anchor_is_kept_at_the_first_latch_and_once_per_window(learned, latched, cursor, kept):
-    controller, residual = learned
-    settings, state, signals = controller.settings, controller.state, controller.signals
-    window.excitation(settings, state, signals, 60)
-    state.least_residual[0], state.anchor[:] = residual, 0.0
+    settings, state, signals, _ = learned
+    state.anchor[:] = 0.0
     state.latched[0], state.cursor[0] = latched, cursor
     assert consistency.accept_window(settings, state, signals, Q)
     assert np.array_equal(state.anchor, state.solution) == kept
 
 
-@pytest.mark.parametrize(
-    ('floor', 'least', 'residual', 'expected'),
-    [
-        (1.0, 0.0, 0.2, 1.0),  # no full window yet: as configured
-        (1.0, 0.05, 0.1, 0.2),  # the best window left a quarter of this
-        (1.0, 0.5, 0.1, 1.0),  # never above the configured floor
-        (1.0, 1e-9, 1e-9, 0.01),  # nor below a tenth of its torque
-        (1.0, 0.05, 3.0, 3.0),
-    ],
-)
-def test_residual_floor_follows_the_residual_learned(learned, floor, least, residual, expected):
-    controller, _ = learned
-    settings, state = controller.settings._replace(residual_floor=floor), controller.state
-    before, state.least_residual[0] = state.least_residual[0], least
-    assert consistency.explained(settings, state, residual) == pytest.approx(expected)
-    state.least_residual[0] = before
+def test_residual_floor_follows_the_residual_learned():
+    settings, state, _ = arbitrary(0, residual_floor=1.0)
+    for least, residual, expected in (
+        (0.0, 0.2, 1.0),  # no full window yet: as configured
+        (0.05, 0.1, 0.2),  # the best window left a quarter of this
+        (0.5, 0.1, 1.0),  # never above the configured floor
+        (1e-9, 1e-9, 0.01),  # nor below a tenth of its torque
+        (0.05, 3.0, 3.0),
+    ):
+        state.least_residual[0] = least
+        assert consistency.explained(settings, state, residual) == pytest.approx(expected)
 
 
 def test_half_the_rated_load_is_noticed_with_a_floor_that_is_three_times_too_large():
     """As of a URDF with placeholder efforts; the configured floor alone hides this pick-up."""
     floor = load_loop('panda').controller.learning.residual_floor
-    event = {'begin': [9.0], 'duration': [0.0], 'payload': [1.5]}
-    plant = {'duration': 10.0} | {f'events.{name}': value for name, value in event.items()}
     law = {'learning.residual_floor': [3.0 * each for each in floor]}
-    loop = load_loop('panda', {'blf_dsc_controller': law, 'sim_plant': plant})
-    state = simulate(loop.controller, loop.plant).controller.state
+    event = several({'begin': 9.0, 'duration': 0.0, 'payload': 1.5})
+    config = configured('panda', 10.0, law, event)
+    state = simulate(config.controller, config.plant).controller.state
     assert state.changes[0] == 1.0
     assert 9.0 < state.change_time[0] < 9.2

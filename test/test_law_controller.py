@@ -3,24 +3,23 @@
 
 from __future__ import annotations
 
+import json
 import os
-import subprocess
 import sys
 from pathlib import Path
 
-import numba
 import numpy as np
+import plants
 import pytest
-from arbitrary_case import arbitrary_settings
-from closed_loop_case import REFERENCE, START, R, closed_loop, controller, plant, quick, record
+from closed_loop_case import arbitrary_settings, closed_loop, controller, plant, quick, record
+from command import finished
 from numba.core.runtime import _nrt_python, rtsys
 from paper_case import EXACT, NO_DISTURBANCE, P, configured, run
-from plain_law import dynamics
+from plain_law import R, regressor
 
 from blf_dsc_controller.compiled.layout import pack, sizes_of
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.schema import build
-from blf_dsc_controller.law.controller import update
 from blf_dsc_controller.law.factory import column_names, controller_of, settings_of_config
 from blf_dsc_controller.law.settings import settings_of
 from blf_dsc_controller.law.state import (
@@ -32,35 +31,33 @@ from blf_dsc_controller.law.state import (
     state_size,
 )
 
-SHAPES = [(1, 1), (2, 3), (6, 30)]
 
-
-@pytest.mark.parametrize(('n', 'p'), SHAPES)
+@pytest.mark.parametrize(('n', 'p'), [(1, 1), (2, 3), (6, 30)])
 def test_vectors_are_laid_out_without_gap_or_overlap(n, p):
     """Every setting survives packing; views of state, signals and sample cover their vectors."""
-    settings = arbitrary_settings(np.random.default_rng(0), n, p)
+    case = arbitrary_settings(np.random.default_rng(0), n, p)
     numbers = iter(range(1000, 10_000))
     sizes = ('n', 'p', 'm', 'tones', 'drive', 'drive_size', 'weighed', 'model')
     distinct = {
         name: np.reshape([float(next(numbers)) for _ in range(value.size)], value.shape)
         if isinstance(value, np.ndarray)
         else next(numbers) + (0 if isinstance(value, int) else 0.5)
-        for name, value in settings._asdict().items()
+        for name, value in case._asdict().items()
         if name not in sizes
     }
-    settings = settings._replace(**distinct)
+    settings = case._replace(**distinct)
     unpacked = settings_of(pack(settings), sizes_of(settings), settings.model)
     for name, value in settings._asdict().items():
         np.testing.assert_array_equal(getattr(unpacked, name), value, err_msg=name)
         assert isinstance(getattr(unpacked, name), type(value)), name
 
-    settings = arbitrary_settings(np.random.default_rng(0), n, p)
-    for views, size in (
-        (state_of, state_size(settings)),
-        (signals_of, signals_size(settings)),
-        (sample_of, sample_size(settings)),
+    for views, size_of in (
+        (state_of, state_size),
+        (signals_of, signals_size),
+        (sample_of, sample_size),
     ):
-        parts = views(np.arange(float(size)), settings)
+        size = size_of(case)
+        parts = views(np.arange(float(size)), case)
         covered = np.concatenate([part.ravel() for part in parts])
         np.testing.assert_array_equal(np.sort(covered), np.arange(size))
 
@@ -85,11 +82,11 @@ def test_loop_continues_bit_for_bit_from_a_saved_state_and_begins_anew_after_a_r
 
     def torques(law, first, last, saved_arm):
         arm.restore(saved_arm)
-        found = []
-        for k in range(first, last):
-            found.append(law.update(k * 1e-3, 1e-3, arm.measure()).copy())
-            arm.step(found[-1])
-        return np.array(found)
+        found = np.empty((last - first, 2))
+        for k, torque in enumerate(found, start=first):
+            torque[:] = law.update(k * 1e-3, 1e-3, arm.measure())
+            arm.step(torque)
+        return found
 
     start = torques(law, 0, 1337, begun)
     saved, saved_arm = law.save(), arm.save()
@@ -103,68 +100,52 @@ def test_loop_continues_bit_for_bit_from_a_saved_state_and_begins_anew_after_a_r
     np.testing.assert_array_equal(torques(law, 0, 1337, begun), start)
 
 
-@numba.njit
-def many_updates(model, sizes, settings, law, state, signals, measurement, sample, checks, count):
-    for k in range(count):
-        t = k * 1e-3
-        update(model, sizes, settings, law, state, signals, t, 1e-3, measurement, sample, checks)
+def allocated(duration):
+    """Blocks and counters of references that a run of the compiled loop of law and plant takes."""
+    config = configured('noisy', duration)
+    before = rtsys.get_allocation_stats()
+    latched = run(config).latched[-1]
+    after = rtsys.get_allocation_stats()
+    return (after.alloc - before.alloc, after.mi_alloc - before.mi_alloc), latched
 
 
 def test_updates_in_a_compiled_loop_allocate_nothing():
     """Passing the vectors allocates a little, independently of the number of updates."""
-    law = controller(quick(window=50, learning_start=0.01, sigma=-1.0))
-    measurement = np.array([*START, *np.zeros(4)])
-    vectors = (
-        law.settings.model,
-        law.sizes,
-        law.settings_vector,
-        REFERENCE,
-        law.state_vector,
-        law.signals_vector,
-    )
-    arguments = (*vectors, measurement, law.sample_vector, law.checks_vector)
-    many_updates(*arguments, 1)
-    allocations = []
+    run(configured('noisy', 0.1))  # compiles
+    counting = _nrt_python.memsys_stats_enabled()
     _nrt_python.memsys_enable_stats()
     try:
-        for count in (100, 5000):
-            before = rtsys.get_allocation_stats()
-            many_updates(*arguments, count)
-            after = rtsys.get_allocation_stats()
-            allocations.append((after.alloc - before.alloc, after.mi_alloc - before.mi_alloc))
+        (short, _), (long, latched) = allocated(0.1), allocated(8.0)
     finally:
-        _nrt_python.memsys_disable_stats()
-
-    assert law.state.latched[0] == 1.0
-    assert allocations[0] == allocations[1]
+        if not counting:
+            _nrt_python.memsys_disable_stats()
+    assert latched == 1.0
+    assert short == long
 
 
 INTERPRETED = """
-from closed_loop_case import controller, plant, quick, record
-settings = quick(window=100, learning_start=0.2, sigma=-1.0)
-print(*record(controller(settings), plant(), 0.4).torque[-1])
+import json, sys
+from test_law_controller import short_runs
+json.dump(short_runs(), sys.stdout)
 """
 
 
-def test_interpreted_kernels_compute_the_same_torque():
+def short_runs():
+    """Last torque of a loop that learns, and all measurements of an imperfect plant."""
+    law = controller(quick(window=100, learning_start=0.2, sigma=-1.0))
+    torques = record(law, plant(), 0.4).torque
+    assert law.state.latched[0] == 1.0
+    return torques[-1].tolist(), plants.run(plants.full_plant(), plants.commands(100)).tolist()
+
+
+def test_interpreted_kernels_compute_the_same():
     """Without numba's compiler only the last bits differ (its libm, its order of operations)."""
     here = Path(__file__).parent
-    environment = os.environ | {
-        'NUMBA_DISABLE_JIT': '1',
-        'PYTHONPATH': os.pathsep.join([str(here), str(here.parent)]),
-    }
-    run = subprocess.run(
-        [sys.executable, '-c', INTERPRETED],
-        env=environment,
-        check=True,
-        capture_output=True,
-        text=True,
-    )
-    law = controller(quick(window=100, learning_start=0.2, sigma=-1.0))
-    torque = record(law, plant(), 0.4).torque[-1]
-
-    assert law.state.latched[0] == 1.0
-    np.testing.assert_allclose(np.array(run.stdout.split(), dtype=float), torque, rtol=1e-9)
+    path = os.pathsep.join([str(here), str(here.parent)])
+    environment = os.environ | {'NUMBA_DISABLE_JIT': '1', 'PYTHONPATH': path}
+    interpreted = json.loads(finished(sys.executable, '-c', INTERPRETED, env=environment).stdout)
+    for ours, theirs, rtol in zip(short_runs(), interpreted, (1e-9, 1e-10), strict=True):
+        np.testing.assert_allclose(ours, theirs, rtol=rtol, atol=rtol)
 
 
 ROUNDING = 1e-10
@@ -186,14 +167,12 @@ class PlainComparison:
     """(35) as printed, P^ by Euler steps; `slotine_li` is the same without w, mu_bar and W_c."""
 
     def __init__(self, config, *, bare):
-        gains = config.comparison
-        self.Kp = np.array(config.feedback.gain)
-        self.layer = config.feedback.boundary_layer
+        gains, share = config.comparison, 0.0 if bare else 1.0
+        self.Kp, self.layer = np.array(config.feedback.gain), config.feedback.boundary_layer
         self.Gamma = np.array(config.learning.adaptation_gain)
         self.lambda_s = np.array(gains.surface_gain)
-        self.w = np.zeros(2) if bare else np.array(gains.position_gain)
-        self.mu_bar = np.zeros(2) if bare else np.array(gains.robust_gain)
-        self.Wc = 0.0 if bare else gains.leakage
+        self.w, self.mu_bar = share * np.array([gains.position_gain, gains.robust_gain])
+        self.Wc = share * gains.leakage
         self.P = np.array(config.learning.initial_estimate)
 
     def update(self, dt, qr, dqr, ddqr, q, dq):
@@ -201,8 +180,7 @@ class PlainComparison:
         alpha2 = dqr - self.lambda_s * z1
         dalpha2 = ddqr - self.lambda_s * (dq - dqr)
         z2 = dq - alpha2
-        parts = [dynamics(e, R, q, dq) for e in np.eye(3)]
-        H = np.column_stack([M @ dalpha2 + C @ alpha2 + G for M, C, G in parts])
+        H = regressor(R, q, dq, alpha2, dalpha2)
         sat = np.clip(z2 / self.layer, -1.0, 1.0)
         torque = H @ self.P - self.Kp * z2 - self.w * z1 - self.mu_bar * sat
         self.P = self.P - dt * self.Gamma * (H.T @ z2 + self.Wc * self.P)
@@ -214,10 +192,8 @@ def test_comparison_laws_follow_their_equations_in_a_closed_loop(law):
     config = configured('recommended', 1.0, UNEVEN | {'law': law}).controller
     controller, plain = controller_of(config), PlainComparison(config, bare=law == 'slotine_li')
     for sample in closed_loop(controller, plant(), 1.0):
-        t, (q, dq, _) = sample.t, sample.measurement.reshape(3, 2)
-        qr = np.array([1.9935, 1.3961]) + 0.3 * np.cos(t)
-        dqr, ddqr = np.full(2, -0.3 * np.sin(t)), np.full(2, -0.3 * np.cos(t))
-        torque = plain.update(1e-3, qr, dqr, ddqr, q, dq)
+        q, dq, _ = sample.measurement.reshape(3, 2)
+        torque = plain.update(1e-3, *controller.reference_at(sample.t), q, dq)
         np.testing.assert_allclose(controller.signals.torque, torque, atol=ROUNDING)
         np.testing.assert_allclose(controller.state.estimate[:3], plain.P, atol=ROUNDING)
     assert np.abs(controller.state.estimate[:3] - [0.5, 0.16, 0.2]).max() > 0.05  # it did adapt
@@ -240,25 +216,13 @@ def test_zero_weight_of_the_prediction_error_equals_no_learning_bit_for_bit():
     assert np.abs(learning.estimate - off.estimate)[-1, :3].max() > 0.01
 
 
-FROZEN = {
-    'learning.initial_estimate': list(P),
-    'learning.adaptation_gain': [0.0, 0.0, 0.0],
-    'disturbance.gain': [0.0, 0.0],
-    'truth.feed_forward': True,
-}
-
-
 def test_proposed_law_with_everything_known_and_frozen_equals_model_based():
-    frozen = run(configured('recommended', 10.0, EXACT | FROZEN))
+    known = {'learning.initial_estimate': list(P), 'truth.feed_forward': True}
+    known |= {'learning.adaptation_gain': [0.0] * 3, 'disturbance.gain': [0.0] * 2}
+    frozen = run(configured('recommended', 10.0, EXACT | known))
     model_based = run(configured('recommended', 10.0, EXACT | {'law': 'model_based'}))
     np.testing.assert_allclose(frozen.torque, model_based.torque, atol=1e-12)
     np.testing.assert_allclose(frozen.xi1, model_based.xi1, atol=1e-15)
-
-
-def error_floor(changes):
-    """Largest |xi1| [rad] from 1 s on of the model-based law, which knows the disturbance."""
-    loop = run(configured('model_based', 8.0, changes))
-    return np.abs(loop.xi1[loop.t >= 1.0]).max(axis=0)
 
 
 @pytest.mark.parametrize('time_constant', [0.002, 0.016])
@@ -266,20 +230,17 @@ def error_floor(changes):
     ('gain', 'mu', 'weight'), [(150.0, 20.0, 1000.0), (60.0, 60.0, 1.0), (0.0, 40.0, 500.0)]
 )
 def test_error_of_the_oracle_is_the_lag_of_the_surface_filter(time_constant, gain, mu, weight):
-    """alpha2 lags beta2 by lambda alpha2', which xi1 compensates.
+    """The model-based law knows the disturbance, but alpha2 lags beta2 by lambda alpha2'.
 
-    It does so by (K/2 + mu) xi1 in beta2, and by w xi1 = -K_p xi2 in the torque.  The reference's
-    acceleration is 0.3 rad/s^2; the held torque adds half a sample to the lag.
+    xi1 compensates it by (K/2 + mu) xi1 in beta2, and by w xi1 = -K_p xi2 in the torque.  The
+    reference's acceleration is 0.3 rad/s^2; the held torque adds half a sample to the lag.
     """
-    changes = {
-        'surface.time_constant': time_constant,
-        'surface.gain': [gain, gain],
-        'surface.mu': [mu, mu],
-        'barrier.weight': [weight, weight],
-    }
+    gains = {'surface.gain': gain, 'surface.mu': mu, 'barrier.weight': weight}
+    changes = {name: [value] * 2 for name, value in gains.items()}
+    loop = run(configured('model_based', 8.0, {'surface.time_constant': time_constant, **changes}))
     rate = gain / 2.0 + mu + weight / np.array([60.0, 20.0])
     expected = (time_constant + 0.5e-3) * 0.3 / rate
-    np.testing.assert_allclose(error_floor(changes), expected, rtol=0.05)
+    np.testing.assert_allclose(loop.largest(1.0), expected, rtol=0.05)
 
 
 def test_lyapunov_function_of_the_oracle_decreases_to_the_floor_of_the_lag():

@@ -4,14 +4,14 @@
 from __future__ import annotations
 
 from cmath import cos, tan
-from functools import partial
 from math import exp, pi, sin
 
 import numpy as np
 import pytest
-from arbitrary_case import arbitrary
-from closed_loop_case import P, R, closed_loop, controller, plant, quick, recommended
-from plain_law import PlainLaw, dynamics
+from closed_loop_case import arbitrary, closed_loop, controller, plant, quick, recommended
+from paper_case import P
+from plain_law import PlainLaw, R, dynamics
+from plants import QUIET
 
 from blf_dsc_controller.law import barrier, surface
 from blf_dsc_controller.law.settings import COMPENSATIONS, EFFORT, UPDATES
@@ -46,10 +46,8 @@ def test_barrier_inside_the_knee_is_that_of_the_paper_times_the_weight():
         expected = WEIGHT * each(printed, inside, BOUND).real
         np.testing.assert_allclose(each(ours, inside, *RECOMMENDED), expected, rtol=1e-12)
     # A complex step is exact to rounding.
-    slope = [partial(printed_torque, bound=BOUND)(xi + 1e-30j).imag / 1e-30 for xi in inside]
-    np.testing.assert_allclose(
-        each(barrier.slope, inside, BOUND, WEIGHT), WEIGHT * np.array(slope), rtol=1e-12
-    )
+    slope = WEIGHT * each(printed_torque, inside + 1e-30j, BOUND).imag / 1e-30
+    np.testing.assert_allclose(each(barrier.slope, inside, BOUND, WEIGHT), slope, rtol=1e-12)
 
 
 def test_barrier_continues_past_the_knee_at_the_largest_slope():
@@ -77,32 +75,27 @@ START = (2.2935 + 0.015, 1.6961 - 0.012)
 
 
 def bound(t):
-    return K + (K0 - K) * exp(-RATE * t)
-
-
-def narrowing(t):
-    return -RATE * (K0 - K) * exp(-RATE * t) / bound(t)
+    """k(t) and k'/k."""
+    wider = (K0 - K) * exp(-RATE * t)
+    return K + wider, -RATE * wider / (K + wider)
 
 
 def test_bound_narrows_at_its_rate_and_the_knee_with_it():
-    changes = {'bound': np.full(3, K), 'initial_bound': np.full(3, K0), 'funnel_rate': RATE}
-    settings, _, signals = arbitrary(0, knee=np.full(3, barrier.knee(K, WEIGHT, LIMIT)), **changes)
+    changes = {name: np.resize(value, 3) for name, value in NARROWING.items()}
+    knee = np.full(3, barrier.knee(K, WEIGHT, LIMIT))
+    settings, _, signals = arbitrary(0, **changes | {'knee': knee, 'funnel_rate': RATE})
     for t in (0.0, 0.3, 2.0):
         barrier.update_bound(settings, signals, t)
-        np.testing.assert_allclose(signals.bound, bound(t), rtol=1e-14)
-        np.testing.assert_allclose(signals.narrowing, narrowing(t), rtol=1e-13)
+        expected = np.transpose([bound(t)] * 3)
+        np.testing.assert_allclose((signals.bound, signals.narrowing), expected, rtol=1e-13)
         slope = barrier.slope(signals.knee[0], signals.bound[0], WEIGHT)
         assert slope == pytest.approx(LIMIT, rel=1e-9)
-
-
-@pytest.mark.parametrize('rate', [0.0, 3.0])
-def test_constant_bound_equals_the_given_one_bit_for_bit(rate):
-    final = arbitrary(0).settings.bound
-    settings, _, signals = arbitrary(0, funnel_rate=rate, initial_bound=final)
-    barrier.update_bound(settings, signals, 1.234)
-    np.testing.assert_array_equal(signals.bound, settings.bound)
-    np.testing.assert_array_equal(signals.knee, settings.knee)
-    np.testing.assert_array_equal(signals.narrowing, 0.0)
+    for rate in (0.0, 3.0):  # a constant one remains as it is to the last bit
+        final = settings.bound
+        constant = settings._replace(funnel_rate=rate, initial_bound=final)
+        barrier.update_bound(constant, signals, 1.234)
+        found = signals.bound, signals.knee, signals.narrowing
+        np.testing.assert_array_equal(found, (final, constant.knee, np.zeros(3)))
 
 
 def test_rate_of_the_potential_accounts_for_the_narrowing_bound():
@@ -110,43 +103,37 @@ def test_rate_of_the_potential_accounts_for_the_narrowing_bound():
     knee = barrier.knee(K, WEIGHT, LIMIT) / K
 
     def at(t, share):
-        xi, k = share * bound(t) * (1.0 + 0.1 * np.sin(5.0 * t)), bound(t)
+        k, _ = bound(t)
+        xi = share * k * (1.0 + 0.1 * np.sin(5.0 * t))
         return xi, barrier.potential(xi, k, WEIGHT, LIMIT, knee * k)
 
     h = 1e-6
     for share in (0.1, 0.5, 0.75, 1.3, -0.6, -2.0):
         for t in (0.0, 0.4, 1.5):
-            before, after = (at(t + side, share) for side in (-h, h))
-            dxi, rate = np.subtract(after, before) / (2.0 * h)
-            xi, V = at(t, share)
-            gradient = barrier.gradient(xi, bound(t), WEIGHT, LIMIT, knee * bound(t))
-            expected = gradient * (dxi - xi * narrowing(t)) + 2.0 * narrowing(t) * V
+            dxi, rate = np.subtract(at(t + h, share), at(t - h, share)) / (2.0 * h)
+            (k, narrowing), (xi, V) = bound(t), at(t, share)
+            gradient = barrier.gradient(xi, k, WEIGHT, LIMIT, knee * k)
+            expected = gradient * (dxi - xi * narrowing) + 2.0 * narrowing * V
             assert rate == pytest.approx(expected, rel=1e-6)
 
 
-def test_loop_stays_within_the_narrowing_bound():
-    law, arm = controller(recommended(**NARROWING)), plant(start=START)
-    ratios = []
-    for sample in closed_loop(law, arm, 10.0):
-        np.testing.assert_allclose(law.sample.bound, bound(sample.t), rtol=1e-12)
-        ratios.append(np.abs(law.sample.xi1) / law.sample.bound)
-    assert np.max(ratios[0]) == pytest.approx(0.75, rel=1e-3)  # 15 of 20 mrad
-    assert np.max(ratios) < 0.8
-
-
 def test_lyapunov_function_decreases_while_the_bound_narrows():
-    """(31) for the moving bound, with a known model and no disturbance."""
+    """(31) for the moving bound, with a known model and no disturbance; the loop stays within."""
     model_known = {'initial_estimate': np.array([*P, 0.0, 0.0]), 'Gamma': np.zeros(5)}
     quiet = {'gamma': np.zeros(2), 'truth_known': 1, 'true_parameters': P}
     law = controller(recommended(**NARROWING | model_known | quiet))
-    arm = plant(start=START, constant=(0.0, 0.0), amplitude=(0.0, 0.0))
-    V = []
+    arm = plant(start=START, constant=QUIET, amplitude=QUIET)
+    V, ratios = [], []
     for sample in closed_loop(law, arm, 2.0):
+        np.testing.assert_allclose(law.sample.bound, bound(sample.t)[0], rtol=1e-12)
+        ratios.append(np.abs(law.sample.xi1 / law.sample.bound).max())
         M, _, _ = dynamics(P, R, sample.measurement[:2], sample.measurement[2:4])
         V.append(law.sample.lyapunov[0] + 0.5 * law.signals.xi2 @ M @ law.signals.xi2)
     # At the first sample alpha2 jumps to the virtual control: V2 starts there.
     assert np.diff(V).max() < 1e-6 * V[0]
     assert V[-1] < 1e-3 * V[0]
+    assert ratios[0] == pytest.approx(0.75, rel=1e-3)  # 15 of 20 mrad
+    assert max(ratios) < 0.8
 
 
 def test_virtual_control_is_that_of_the_paper_without_its_singularity():
@@ -226,14 +213,17 @@ DT = 2e-3  # s: with 500 N m/s, 1 N m from sample to sample
 
 
 def cut(demand, last, *, level=10.0, rate=500.0, samples=7.0, added=0.0):
+    """Torque and what cut it; the cuts are counted, and any is reported."""
     case = arbitrary(0, n=1, torque_limit=np.array([level]), rate_limit=np.array([rate]))
-    case.state.samples[0] = samples
-    case.state.torque[0] = last
-    case.state.level_cuts[0] = case.state.rate_cuts[0] = 0.0
-    case.signals.demand[0] = demand
-    case.signals.added[0] = added
-    saturated = saturate(case.settings, case.state, case.signals, DT)
-    return case.signals.torque[0], case.signals.cuts[0], saturated, case.state
+    _, state, signals = case
+    state.samples[0], state.torque[0] = samples, last
+    state.level_cuts[0] = state.rate_cuts[0] = 0.0
+    signals.demand[0], signals.added[0] = demand, added
+    saturated = saturate(*case, DT)
+    cuts = signals.cuts[0]
+    assert saturated == (cuts > 0.0)
+    assert cuts == LEVEL_CUT * state.level_cuts[0] + RATE_CUT * state.rate_cuts[0]
+    return signals.torque[0], cuts
 
 
 @pytest.mark.parametrize(
@@ -250,62 +240,39 @@ def cut(demand, last, *, level=10.0, rate=500.0, samples=7.0, added=0.0):
     ],
 )
 def test_torque_saturates_at_its_level_and_at_its_rate(demand, last, torque, cuts):
-    applied, reported, saturated, state = cut(demand, last)
-    assert (applied, reported) == (torque, cuts)
-    assert bool(saturated) is (cuts > 0.0)
-    assert state.level_cuts[0] == (cuts in {LEVEL_CUT, LEVEL_CUT + RATE_CUT})
-    assert state.rate_cuts[0] == (cuts in {RATE_CUT, LEVEL_CUT + RATE_CUT})
+    assert cut(demand, last) == (torque, cuts)
 
 
 @pytest.mark.parametrize(
-    ('demand', 'command', 'cuts'),
+    ('demand', 'last', 'command', 'cuts', 'rate'),
     [
-        (12.0, 6.0, LEVEL_CUT),  # the whole torque is at its limit
-        (-7.0, -10.0, LEVEL_CUT),  # the command is: with the 4 N m of the drive, -6 N m
-        (9.0, 5.0, 0.0),
-        (7.5, 4.0, RATE_CUT),  # the rate is that of the command
+        (12.0, 6.0, 6.0, LEVEL_CUT, 1000.0),  # the whole torque is at its limit
+        (-7.0, -10.0, -10.0, LEVEL_CUT, 1000.0),  # the command is: with the drive's 4 N m, -6 N m
+        (9.0, 5.0, 5.0, 0.0, 1000.0),
+        (7.5, 5.0, 4.0, RATE_CUT, 500.0),  # the rate is that of the command
     ],
 )
-def test_limits_hold_for_the_command_and_for_the_whole_torque(demand, command, cuts):
-    last = {RATE_CUT: 5.0}.get(cuts, command)
-    got = cut(demand, last, rate=1000.0 if cuts != RATE_CUT else 500.0, added=4.0)
-    assert got[:2] == (command, cuts)
-    mirrored = cut(-demand, -last, rate=1000.0 if cuts != RATE_CUT else 500.0, added=-4.0)
-    assert mirrored[:2] == (-command, cuts)
+def test_limits_hold_for_the_command_and_for_the_whole_torque(demand, last, command, cuts, rate):
+    for sign in (1.0, -1.0):
+        found = cut(sign * demand, sign * last, rate=rate, added=sign * 4.0)
+        assert found == (sign * command, cuts)
 
 
 @pytest.mark.parametrize('source', ['command', 'effort without the drive', 'whole effort'])
 def test_applied_torque_has_the_mean_of_what_the_drive_adds_at_both_ends(source):
-    changes = {'torque_source': EFFORT * (source != 'command'), 'drive': 0}
-    case = arbitrary(3, effort_is_whole=int(source == 'whole effort'), **changes)
-    settings, state, signals = case
+    whole = source == 'whole effort'
+    changes = {'torque_source': EFFORT * (source != 'command'), 'effort_is_whole': int(whole)}
+    case = _, state, signals = arbitrary(3, drive=0, **changes)
     measurement = np.arange(9.0)
     base = state.torque.copy() if source == 'command' else measurement[6:]
-    added = 0.0 if source == 'whole effort' else 0.5 * (state.added + signals.added)
-    expected = base + added
-    find_applied(settings, state, signals, measurement)
+    expected = base + 0.5 * (state.added + signals.added) * (not whole)
+    find_applied(*case, measurement)
     np.testing.assert_array_equal(signals.applied, expected)
     np.testing.assert_array_equal(state.added, signals.added)
 
 
 def test_rate_limit_is_off_at_zero_and_for_the_first_torque():
-    assert cut(9.0, -9.0, rate=0.0)[:2] == (9.0, 0.0)
-    assert cut(9.0, 0.0, samples=0.0)[:2] == (9.0, 0.0)
+    assert cut(9.0, -9.0, rate=0.0) == (9.0, 0.0)
+    assert cut(9.0, 0.0, samples=0.0) == (9.0, 0.0)
     for rate in (500.0, 0.0):  # NaN must not turn into a torque that looks valid
         assert np.isnan(cut(np.nan, 3.0, rate=rate)[0])
-
-
-def test_loop_keeps_the_rate_limit_and_counts_every_cut_by_joint():
-    rates = np.array([450.0, 80.0])
-    law = controller(recommended(rate_limit=rates))  # which hardly disturbs the loop
-    torques, cuts = [], []
-    for _ in closed_loop(law, plant(), 2.0):
-        torques.append(law.sample.torque.copy())
-        cuts.append(law.sample.cuts.copy())
-    steps = np.abs(np.diff(torques, axis=0))
-
-    assert np.all(steps <= rates * 1e-3 * (1.0 + 1e-12))
-    np.testing.assert_allclose(steps.max(axis=0), rates * 1e-3)
-    np.testing.assert_array_equal(law.state.rate_cuts, np.sum(np.array(cuts) == RATE_CUT, axis=0))
-    assert law.state.rate_cuts.min() > 0.0
-    np.testing.assert_array_equal(law.state.level_cuts, 0.0)

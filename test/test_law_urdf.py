@@ -8,7 +8,9 @@ import json
 import numpy as np
 import pytest
 import yaml
-from random_arm import CONFIG, random_urdf
+from changes import several
+from paper_case import configured
+from random_arm import PANDA_TEXT, random_urdf
 
 from blf_dsc_controller import simulate
 from blf_dsc_controller.analysis.metrics import estimates_of
@@ -32,7 +34,6 @@ from blf_dsc_controller.replay.verify import verify
 from sim_plant.plant import parameters_of
 
 DURATION = 3.0  # s, 0.7 s after the first window
-MOVED = (1, 3)  # joints, by 0.1 rad
 OFFSET = [0.0, 0.0, 0.0, -1.571, 0.0, 1.867, 0.0]  # rad
 LEARN_PAYLOAD = {
     '/**': {'robot': {'urdf': 'panda.urdf', 'tip': 'panda_hand_tcp', 'learn': 'payload'}},
@@ -42,34 +43,26 @@ LEARN_PAYLOAD = {
         'reference': {
             'type': 'sinusoids',
             'offset': OFFSET,
-            'amplitude': [0.1 if joint in MOVED else 0.0 for joint in range(7)],
+            'amplitude': [0.0, 0.1, 0.0, 0.1, 0.0, 0.0, 0.0],
             'frequency': [2.5],
         },
     },
 }
 
 
-def write_config(path, **robot):
-    """Write the parameter file of that arm, with changes to its group `robot`."""
-    sections = {name: {'ros__parameters': dict(values)} for name, values in LEARN_PAYLOAD.items()}
-    common = sections['/**']['ros__parameters']
-    common['robot'] = common['robot'] | robot
-    path.write_text(yaml.safe_dump(sections), encoding='utf-8')
-    return path
-
-
 @pytest.fixture(scope='module')
 def out(tmp_path_factory):
     """Folder of a run."""
     folder = tmp_path_factory.mktemp('run')
-    arguments = ['--config', write_config(folder / 'my.yaml'), '--duration', DURATION]
-    assert main(['run', '--offline', *map(str, [*arguments, '--out', folder / 'out'])]) == 0
+    sections = {name: {'ros__parameters': values} for name, values in LEARN_PAYLOAD.items()}
+    (folder / 'my.yaml').write_text(yaml.safe_dump(sections), encoding='utf-8')
+    arguments = ['--config', folder / 'my.yaml', '--duration', DURATION, '--out', folder / 'out']
+    assert main(['run', '--offline', *map(str, arguments)]) == 0
     return folder / 'out'
 
 
 def test_load_is_learned_within_a_window_of_poor_excitation(out):
-    summary = json.loads((out / 'summary.json').read_text(encoding='utf-8'))
-    learning = summary['learning']
+    learning = json.loads((out / 'summary.json').read_text(encoding='utf-8'))['learning']
     assert learning['latch_time_s'] < 2.5
     # The simulated arm is nearly ideal; the rest is due to the weight of the prior.
     assert learning['final_torque_error'] < 0.01
@@ -78,11 +71,10 @@ def test_load_is_learned_within_a_window_of_poor_excitation(out):
     assert learning['true_parameters_of_other_names'] == []
     # The torque error is relative to the base parameters of the plant.
     run = read_run(out / 'bag')
-    estimates, loop = estimates_of(run), load_loop(out / 'config.yaml')
-    names, regressor = run.arm.base
-    P = parameters_of(loop.plant)
+    estimates, (names, regressor) = estimates_of(run), run.arm.base
+    P = parameters_of(load_loop(out / 'config.yaml').plant)
     q = run.reference[1::7]
-    states = (q, 0.0 * q, 0.0 * q, 0.0 * q)
+    states = (q, *np.zeros((3, *q.shape)))
     true = regressor(*states) @ P
     error = np.linalg.norm(run.arm.regressor(*states) @ estimates.estimate[-1] - true)
     assert run.truth.names[: P.size] == names
@@ -92,13 +84,13 @@ def test_load_is_learned_within_a_window_of_poor_excitation(out):
     # Figures show the load in its units.
     assert (out / 'parameters.png').stat().st_size > 10_000
     shown = {panel.title: panel for panel in panels([run])}
-    (mass,) = shown['load [kg]'].lines
-    assert (mass.name, shown['load [kg]'].unit) == ('m', 'kg')
-    assert mass.values[-1] == pytest.approx(2.0, rel=0.02)
-    assert [line.name for line in shown['load [kg m]'].lines] == [f'm*c{k}' for k in 'xyz']
-    assert len(shown['load [kg m^2]'].lines) == 6
-    rotors = [line.name for line in shown['rotor [kg m^2]'].lines]
-    assert rotors == [f'rotor{k}' for k in range(1, 8)]
+    lines = {title: [line.name for line in panel.lines] for title, panel in shown.items()}
+    assert lines['load [kg]'] == ['m']
+    assert shown['load [kg]'].unit == 'kg'
+    assert shown['load [kg]'].lines[0].values[-1] == pytest.approx(2.0, rel=0.02)
+    assert lines['load [kg m]'] == [f'm*c{k}' for k in 'xyz']
+    assert len(lines['load [kg m^2]']) == 6
+    assert lines['rotor [kg m^2]'] == [f'rotor{k}' for k in range(1, 8)]
     assert 'torque error' in shown
 
 
@@ -121,15 +113,6 @@ def test_defaults_depend_on_the_learned_form():
     first, second = model_of(payload), model_of(payload)  # threads share no working memory
     assert not np.shares_memory(first.combination, second.combination)
     assert not np.shares_memory(first.bodies, second.bodies)
-
-
-def test_problems_are_reported_with_their_line(tmp_path):
-    path = write_config(tmp_path / 'my.yaml', payload=0.0)
-    lines = path.read_text(encoding='utf-8').splitlines()
-    line = next(k for k, text in enumerate(lines, 1) if text.strip().startswith('payload:'))
-    message = f'line {line}: robot.payload: got 0 kg, but learn: payload needs the mass'
-    with pytest.raises(ConfigurationError, match=message):
-        load_loop(path)
 
 
 ARM = {'model': 'urdf', 'robot.urdf': 'panda.urdf', 'robot.tip': 'panda_hand_tcp'}
@@ -161,17 +144,15 @@ def test_friction_of_the_urdf_is_known_unless_the_drives_compensate_it():
 
 
 def test_given_parameters_override_the_derived_ones():
-    config = panda(barrier__bound=[0.01] * 7, robot__lag=0.002)
+    config, derived = panda(barrier__bound=[0.01] * 7, robot__lag=0.002), panda()
     assert config.barrier.bound == (0.01,) * 7
-    assert config.feedback.damping_rate == pytest.approx(
-        panda().feedback.damping_rate * 8e-3 / 5e-3
-    )
+    expected = derived.feedback.damping_rate * 8e-3 / 5e-3
+    assert config.feedback.damping_rate == pytest.approx(expected)
     assert change(config, {'feedback.damping_rate': 5.0}).feedback.damping_rate == 5.0
 
 
 def test_urdf_may_be_given_as_text_or_file(tmp_path):
-    file = CONFIG / 'panda.urdf'
-    assert panda(robot__urdf=file.read_text()).learning == panda(robot__urdf=str(file)).learning
+    assert panda(robot__urdf=PANDA_TEXT).learning == panda().learning
     empty = tmp_path / 'arm.urdf'  # as a failed xacro leaves it: not to select the two-link arm
     empty.write_text('\n')
     with pytest.raises(ConfigurationError, match=r'arm.urdf.* is empty: did the xacro'):
@@ -182,6 +163,10 @@ def test_urdf_may_be_given_as_text_or_file(tmp_path):
     ('changes', 'message'),
     [
         ({'robot.urdf': 'nowhere.urdf'}, 'robot.urdf: .*nowhere.urdf.* cannot be read'),
+        (
+            {'robot.learn': 'payload', 'robot.payload': 0.0},
+            'robot.payload: got 0 kg, but learn: payload needs the mass',
+        ),
         ({'robot.learn': 'scale'}, "robot.learn: got 'scale', but it must be one of base, payload"),
         (
             {'model': 'two_link', 'robot.urdf': '', 'robot.tip': '', 'robot.learn': 'payload'},
@@ -207,33 +192,32 @@ def test_problems_with_an_arm_are_reported(changes, message):
 
 def test_prior_covers_the_deviations_of_links_drives_and_friction():
     config = panda()
-    names, covariance = estimate_names(config), prior_covariance(config)
-    deviation = dict(zip(names, np.sqrt(np.diag(covariance)), strict=True))
-
+    deviation, covariance = deviations(config), prior_covariance(config)
     assert np.linalg.eigvalsh(covariance)[0] > 0.0
     assert deviation['rotor7'] >= 0.5 * 12.0 / 400.0
     assert deviation['coulomb panda_joint1'] == pytest.approx(0.05 * 87.0)
-    known = prior_covariance(panda(robot__coulomb=[0.7] * 7))
-    assert known[-7, -7] == pytest.approx(0.35**2)
-    np.testing.assert_allclose(
-        settings_of_config(config).information @ covariance, np.eye(62), atol=1e-5
-    )
+    known = deviations(panda(robot__coulomb=[0.7] * 7))
+    assert known['coulomb panda_joint1'] == pytest.approx(0.35)
+    information = settings_of_config(config).information
+    np.testing.assert_allclose(information @ covariance, np.eye(62), atol=1e-5)
+
+
+def deviations(config):
+    """Standard deviation of the prior of each estimate."""
+    names, covariance = estimate_names(config), prior_covariance(config)
+    return dict(zip(names, np.sqrt(np.diag(covariance)), strict=True))
 
 
 def test_gravity_is_compensated_with_the_initial_estimate():
     """At rest on the reference the torque is G of the URDF, whatever the gains."""
     config = panda(robot__gravity=[0.0, -9.81, 0.0])
-    law = controller_of(config)
     q = np.array(config.reference.offset)
-    chain = config.robot.chain(config.joints)
-    base = learned_of(config.robot, chain)
+    base = learned_of(config.robot, config.robot.chain(config.joints))
     H = np.zeros((7, base.model.p))
-    base.model.regressor(q, np.zeros(7), np.zeros(7), np.zeros(7), H)
-
-    torque = law.update(0.0, 1e-3, np.concatenate((q, np.zeros(14))))
-
+    base.model.regressor(q, *np.zeros((3, 7)), H)
     gravity = H @ base.initial
     assert np.abs(gravity).max() > 5.0
+    torque = controller_of(config).update(0.0, 1e-3, np.concatenate((q, np.zeros(14))))
     np.testing.assert_allclose(torque, gravity, atol=0.02)  # P^(0) has four digits
 
 
@@ -248,29 +232,25 @@ def test_bound_starts_as_a_funnel_where_an_unknown_load_makes_the_arm_sag():
 
 
 def test_bound_holds_from_the_start_with_an_undeclared_rated_load():
-    plant = {'duration': 1.5, 'events.payload': [3.0]}
-    plant |= {'events.begin': [0.0], 'events.duration': [0.0]}
+    def run(law):
+        config = configured('panda', 1.5, law, several({'begin': 0.0, 'payload': 3.0}))
+        return simulate(config.controller, config.plant).run()
 
-    def run(**law):
-        loop = load_loop('panda', {'sim_plant': plant, 'blf_dsc_controller': law})
-        return simulate(loop.controller, loop.plant).run()
-
-    result = run()
+    result = run({})
     assert np.abs(result.error).max() > 0.005
     assert np.all(np.abs(result.error) < 0.6 * result.bound)
     assert np.all(result.bound[-1] < 0.0051)
     assert not result.stops
-    assert run(**{'barrier.initial_bound': [0.0] * 7}).stops  # with a constant bound
+    assert run({'barrier.initial_bound': [0.0] * 7}).stops  # with a constant bound
 
 
 @pytest.mark.parametrize('learn', ['base', 'payload'])
 def test_drives_with_unknown_effort_limit_get_a_finite_prior(learn):
-    text = (CONFIG / 'panda.urdf').read_text().replace('effort="12"', 'effort="0"')
+    text = PANDA_TEXT.replace('effort="12"', 'effort="0"')
     config = panda(robot__urdf=text, robot__learn=learn)
     assert np.all(np.isfinite(settings_of_config(config).information))
-    deviation = np.sqrt(np.diag(prior_covariance(config)))
     rotor = config.robot.rotors(config.robot.chain(config.joints))[6]  # from the weight carried
-    assert deviation[estimate_names(config).index('rotor7')] == pytest.approx(0.5 * rotor)
+    assert deviations(config)['rotor7'] == pytest.approx(0.5 * rotor)
     assert 0.005 < rotor < 0.03
 
 

@@ -5,11 +5,12 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from changes import several
+from paper_case import configured
 
 from blf_dsc_controller.analysis.summary import format_table, summarize
 from blf_dsc_controller.bags.reader import read_run
 from blf_dsc_controller.configuration.controller import ControllerConfig
-from blf_dsc_controller.configuration.nodes import CONTROLLER, PLANT, load_loop, locate
 from blf_dsc_controller.errors import ConfigurationError
 from blf_dsc_controller.law.factory import controller_of
 from blf_dsc_controller.law.telemetry import load_text, sample_columns
@@ -24,12 +25,12 @@ PICKED_UP, PUT_DOWN, END = 8.0, 12.0, 15.0  # s
 LOAD = 2.0  # kg
 
 
-def loop(name, plant=None, **controller):
-    """An arm up to 30 % off its URDF that picks up a load and puts it down."""
-    events = {'begin': [PICKED_UP], 'duration': [PUT_DOWN - PICKED_UP], 'payload': [LOAD]}
-    values = {f'events.{key}': value for key, value in events.items()}
-    values |= {'duration': END, 'truth.mass_deviation': 0.3, 'sensor.incomplete_states': 0}
-    return load_loop(locate(name), {PLANT: values | (plant or {}), CONTROLLER: controller})
+def record_of(name, plant=None, **controller):
+    """A run of an arm up to 30 % off its URDF that picks up a load and puts it down."""
+    event = {'begin': PICKED_UP, 'duration': PUT_DOWN - PICKED_UP, 'payload': LOAD}
+    values = several(event) | {'truth.mass_deviation': 0.3, 'sensor.incomplete_states': 0}
+    config = configured(name, END, controller, values | (plant or {}))
+    return simulate(config.controller, config.plant)
 
 
 def weighed(record):
@@ -40,8 +41,7 @@ def weighed(record):
 
 @pytest.fixture(scope='module')
 def panda():
-    config = loop('panda')
-    return simulate(config.controller, config.plant)
+    return record_of('panda')
 
 
 def is_as_told(load, mass, within):
@@ -56,11 +56,7 @@ def is_as_told(load, mass, within):
 @pytest.mark.parametrize('name', ['panda', 'ur5e', 'fr3'])
 def test_load_is_weighed_within_three_seconds_with_wrong_links(name, panda):
     """To 5 % of 2 kg, and 50 g if nothing is held; an FR3's drives compensate gravity, wrongly."""
-    record = panda
-    if name != 'panda':
-        config = loop(name)
-        record = simulate(config.controller, config.plant)
-    load, t = weighed(record)
+    load, t = weighed(panda if name == 'panda' else record_of(name))
     is_as_told(load[t == PICKED_UP][0], 0.0, 0.05)
     is_as_told(load[t == PUT_DOWN - 1.0][0], LOAD, 0.05 * LOAD)
     is_as_told(load[-1], 0.0, 0.05)
@@ -78,8 +74,7 @@ def test_change_makes_the_load_unknown_until_the_filters_have_settled(panda):
 
 
 def test_no_torque_depends_on_it(panda):
-    config = loop('panda', **{'learning.weighing': False})
-    without = simulate(config.controller, config.plant)
+    without = record_of('panda', **{'learning.weighing': False})
     torque, other = (
         sample_columns(record.samples, record.controller.settings).torque
         for record in (panda, without)
@@ -102,37 +97,34 @@ def test_solution_is_the_joint_least_squares_of_arm_and_load(panda):
         for row in np.concatenate((X, u[:, :, None]), axis=2):
             add_products(row, state.weighed_sums[part])
         state.weighed_rows[part] = rows
-        blocks.append((X.reshape(-1, m), u.ravel()))
+        blocks += [X.reshape(-1, m), u.ravel()]
     state.weighed_noise[:] = noise**2, 0.5 * noise**2
-    a = lasting * noise**2
+    a, (X, u, Xs, us) = lasting * noise**2, blocks
     solve(settings, state, signals, lasting)
-    (X, u), (Xs, us) = blocks
     H = np.zeros((m + 10, m + 10))
-    both = np.vstack((np.hstack((X, np.zeros((len(X), 10)))), np.hstack((Xs, Xs @ ND))))
     H[:m, :m], H[m:, m:] = settings.information, np.eye(10)
+    prior = np.append(settings.initial_estimate, np.zeros(10))
+    both = np.block([[X, np.zeros((len(X), 10))], [Xs, Xs @ ND]])
+    g = both.T @ np.append(u, us) + a * H @ prior
     H = both.T @ both + a * H
-    g = both.T @ np.append(u, us)
-    g[:m] += a * settings.information @ settings.initial_estimate
     expected = np.linalg.solve(H, g)
+    model = expected[:m] + ND @ expected[m:]
     np.testing.assert_allclose(signals.load_solution, expected, rtol=1e-6, atol=1e-9)
-    np.testing.assert_allclose(state.weighed_model[:m], expected[:m] + ND @ expected[m:], atol=1e-9)
-    residual = (
-        np.mean((X @ expected[:m] - u) ** 2),
-        np.mean((Xs @ state.weighed_model[:m] - us) ** 2),
-    )
+    np.testing.assert_allclose(state.weighed_model[:m], model, atol=1e-9)
+    residual = np.mean((X @ expected[:m] - u) ** 2), np.mean((Xs @ model - us) ** 2)
     np.testing.assert_allclose(state.weighed_noise, residual, rtol=1e-6)
     describe(settings, state, signals, lasting)
     mass, *moments = D @ expected[m:]
+    centre = np.array(moments) / mass
     C = lasting * max(residual) * D @ np.linalg.inv(H)[m:, m:] @ D.T
-    J = np.column_stack((-np.array(moments) / mass, np.eye(3))) / mass
-    np.testing.assert_allclose(state.load[:4], (mass, *np.array(moments) / mass), rtol=1e-6)
+    J = np.column_stack((-centre, np.eye(3))) / mass
+    np.testing.assert_allclose(state.load[:4], (mass, *centre), rtol=1e-6)
     deviation = np.sqrt(np.append(C[0, 0], np.diag(J @ C @ J.T)))
     np.testing.assert_allclose(state.load[4:], deviation, rtol=1e-5)
 
 
 def test_light_load_that_the_law_does_not_notice_is_weighed():
-    config = loop('panda', {'events.payload': [0.1]})
-    record = simulate(config.controller, config.plant)
+    record = record_of('panda', {'events.payload': [0.1]})
     load, t = weighed(record)
     assert record.controller.state.changes[0] == 0.0
     is_as_told(load[t == PUT_DOWN - 0.5][0], 0.1, 0.05)
@@ -144,7 +136,7 @@ def test_light_load_that_the_law_does_not_notice_is_weighed():
 @pytest.mark.parametrize('given', [{'robot.learn': 'payload'}, {'learning.prediction': 'lambda'}])
 def test_weighing_what_cannot_be_weighed_is_rejected(given):
     with pytest.raises(ConfigurationError, match=r'weighing: got true with .*, but needs'):
-        load_loop(locate('panda'), {CONTROLLER: {'learning.weighing': True, **given}})
+        configured('panda', 1.0, {'learning.weighing': True, **given})
     assert not ControllerConfig().learning.weighing
 
 
@@ -152,11 +144,9 @@ def test_bag_tells_what_was_held_in_the_table_and_on_the_page(panda, tmp_path):
     write_bag(tmp_path / 'bag', panda, panda.config, 'none')
     run = read_run(tmp_path / 'bag')
     summary = summarize(run)
-    until, masses = np.transpose(
-        [(load['until_s'], load['load mass']) for load in summary['loads']]
-    )
-    np.testing.assert_allclose(until, (PICKED_UP, PUT_DOWN, END), atol=0.2)
-    np.testing.assert_allclose(masses, (0.0, LOAD, 0.0), atol=0.05)
+    held = np.array([(load['until_s'], load['load mass']) for load in summary['loads']])
+    np.testing.assert_allclose(held[:, 0], (PICKED_UP, PUT_DOWN, END), atol=0.2)
+    np.testing.assert_allclose(held[:, 1], (0.0, LOAD, 0.0), atol=0.05)
     lines = [line for line in format_table(summary).splitlines() if line.startswith('held ')]
     assert [' mm, until ' in line for line in lines] == [False, True, False]
     shown = {round(moment.time): joint_table(run.joints, moment) for moment in snapshots(run, ())}

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import importlib.util
+import os
 import sys
 from pathlib import Path
 
@@ -13,6 +14,7 @@ import pytest
 pytest.importorskip('rclpy', reason='needs ROS 2')
 pytest.importorskip('mujoco', reason='needs MuJoCo: pip install mujoco')
 
+from changes import OFF, ROWS, end_of
 from plain_law import dynamics
 from plants import commands
 from test_plant_events import ALL_KINDS
@@ -24,7 +26,7 @@ from blf_dsc_controller.nodes.controller_node import ControllerNode
 from blf_dsc_controller.simulation.loop import START
 from blf_dsc_controller.supervision.checks import Phase
 from blf_dsc_controller.supervision.guard import Guard
-from sim_plant.plant import plant_of
+from sim_plant.plant import parameters_of, plant_of
 
 EXAMPLE = Path(__file__).parents[1] / 'examples/mujoco_plant/mujoco_plant.py'
 P = np.array([1.0, 0.32, 0.4])  # (m1+m2) l1^2, m2 l2^2, m2 l1 l2 of arm.xml
@@ -170,12 +172,37 @@ def close_loop(config, arm, samples):
     return np.array(rows)
 
 
-def test_controller_keeps_the_bound_and_learns_the_parameters(example, ros):
-    law = ros.add(ControllerNode, telemetry__enabled=False)
-    arm = ros.add(example.MujocoPlant)
-    ros.until(lambda: arm.steps >= 8000 or law.guard.supervisor.text)
-    assert law.guard.supervisor.phase is Phase.TRACKING, law.guard.supervisor.text
-    assert law.guard.samples.ratio.max() < 1.0
+def test_controller_keeps_the_bound_and_learns_the_parameters(ros, example):
+    guard = run_with(ros, example, 8000, {}, {})
+    assert guard.supervisor.phase is Phase.TRACKING
+    assert guard.samples.ratio.max() < 1.0
     # Learning begins after 6.8 s, with half of each parameter missing; a second later an error
     # of 0.1 % is left with our own plant, which holds its torque the same way.
-    np.testing.assert_allclose(law.guard.controller.state.estimate[:3], P, rtol=0.01)
+    np.testing.assert_allclose(guard.controller.state.estimate[:3], P, rtol=0.01)
+
+
+def run_with(ros, example, steps, row, law):
+    """Guard of the controller's node after some steps over ROS."""
+    controller = ros.add(ControllerNode, {'telemetry.enabled': False} | law)
+    arm, guard = ros.add(example.MujocoPlant, row), controller.guard
+    ros.until(lambda: arm.steps >= steps or guard.supervisor.text)
+    assert not guard.supervisor.text
+    ros.kill(arm)
+    ros.kill(controller)
+    return guard
+
+
+# All of them in `make test-nightly`; test_law_consistency.py has them with our own plant.
+CHANGES = ROWS if os.environ.get('NIGHTLY') else ['payload to 0.75 kg at 8 s']
+
+
+@pytest.mark.parametrize('name', CHANGES)
+def test_bound_holds_while_the_arm_changes_and_learning_does_no_harm(ros, example, name):
+    """Two windows after the last change the parameters are known again."""
+    row, steps = ROWS[name], round(1e3 * end_of(ROWS[name]))
+    learning, without = (run_with(ros, example, steps, row, law) for law in ({}, OFF))
+    assert np.all(learning.samples.ratio < 1.0)
+    assert np.all(learning.samples.ratio <= 1.3 * without.samples.ratio)
+    true = parameters_of(build(PlantConfig, row), end_of(row))
+    error = learning.controller.state.estimate[:3] - true
+    assert np.linalg.norm(error) < 0.01 * np.linalg.norm(true)

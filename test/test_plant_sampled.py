@@ -1,42 +1,89 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The sampled plant as a whole: repeatable, restorable, and independent of how it is called."""
+"""The sampled plant: its integrator against scipy, disturbances, and repeatable runs."""
 
-import json
-import os
-import subprocess
-import sys
-from pathlib import Path
-
-import numba
 import numpy as np
 import pytest
-from numba.core.runtime import _nrt_python, rtsys
-from plants import START, commands, motion, plant, rough_disturbance, run
+from plants import PERIOD, START, commands, disturbance, full_plant, motion, plant, run
+from plants import rough_disturbance as rough
+from scipy.integrate import RK45, solve_ivp
 
 from blf_dsc_controller.compiled.jit import kernel
 from sim_plant.kernels import draw_noise, observe, plant_views, step
-from sim_plant.motion import Stages, integrate
+from sim_plant.motion import Stages, disturbance_torque, integrate, state_derivative
 from sim_plant.sensors import DIFFERENCED, MEASURED
 
-IMPERFECTIONS = {
-    'position_noise': 1e-5,
-    'velocity_noise': 1e-3,
-    'resolution': 1e-5,
-    'torque_limit': (8.0, 3.0),
-    'delay': 2,
-    'time_constant': 2e-3,
-    'torque_noise': 0.01,
-    'velocity_pole': 400.0,
-}
-REPOSITORY = Path(__file__).parents[1]
+STAGES = Stages(np.empty(4), np.empty((6, 4)))
+INITIAL = np.array([*START, 0.5, -1.0])
+TORQUE = np.array([-6.0, -2.0])
 
 
-def full_plant(**changes):
-    """A plant with every kind of imperfection."""
-    load = rough_disturbance()._replace(
-        stribeck=0.5, ripple=np.array([0.1, 0.05]), ripple_frequency=20.0
+def advanced(load, t, h, x=INITIAL, torque=TORQUE):
+    """State after a step of h seconds."""
+    x = np.array(x)
+    integrate(motion(load=load), t, h, torque, x, STAGES)
+    return x
+
+
+def rhs(load, torque):
+    """Right-hand side for scipy."""
+
+    def evaluate(t, x):
+        dx = np.empty(4)
+        state_derivative(motion(load=load), t, x, torque, dx)
+        return dx
+
+    return evaluate
+
+
+def test_dopri5_step_matches_scipys_rk45():
+    """The disturbance is evaluated within the step, too."""
+    load, h = rough(), 0.05
+    rk45 = RK45(rhs(load, TORQUE), 0.3, INITIAL, 1.0, first_step=h, rtol=1e9, atol=1e9)
+    rk45.step()
+    assert rk45.t == 0.3 + h
+    assert advanced(load, 0.3, h) == pytest.approx(rk45.y, rel=1e-14)
+
+
+def test_motion_under_sampled_torques_matches_dop853():
+    found = expected = INITIAL
+    for t, torque in zip(np.arange(100) * PERIOD, commands(100), strict=True):
+        found = advanced(rough(), t, PERIOD, found, torque)
+        accurate = {'method': 'DOP853', 'rtol': 1e-13, 'atol': 1e-14}
+        expected = solve_ivp(rhs(rough(), torque), (t, t + PERIOD), expected, **accurate).y[:, -1]
+    # 100 steps with scipy's tolerance of 1e-13 each
+    assert found == pytest.approx(expected, abs=1e-11)
+
+
+def torque_of(load, t, q, dq):
+    """The disturbance in plain numpy: friction has the sign of the velocity, and more near rest."""
+    near_rest = 1.0 + load.stribeck * np.exp(-((dq / load.stribeck_velocity) ** 2))
+    friction = load.viscous * dq + load.coulomb * near_rest * np.tanh(dq / load.coulomb_velocity)
+    ripple = load.ripple * np.sin(load.ripple_frequency * q)
+    return (
+        load.constant + load.amplitude * np.sin(load.frequency * t + load.phase) + friction + ripple
     )
-    return plant(load=load, **{**IMPERFECTIONS, **changes})
+
+
+def test_disturbances_of_every_kind_add_up_for_each_joint():
+    for load in (rough(), disturbance(coulomb=[0.3, 0.5]), disturbance(ripple=0.2)):
+        for q, dq in np.random.default_rng(0).normal(size=(10, 2, 2)) * [[1.0], [0.2]]:
+            found = np.empty(2)
+            disturbance_torque(load, 1.7, q, dq, found)
+            np.testing.assert_allclose(found, torque_of(load, 1.7, q, dq), rtol=1e-13)
+
+
+def test_positive_disturbance_decelerates_the_joint_and_is_in_the_truth():
+    """In the equation of motion tau_dist is on the side of M ddq."""
+    undisturbed, disturbed = plant(), plant(load=disturbance(constant=[0.0, 1.0]))
+    undisturbed.step(np.zeros(2))
+    disturbed.step(np.zeros(2))
+    assert disturbed.truth()[-1] < undisturbed.truth()[-1]
+    arm = plant(load=rough(), velocity=(0.3, -0.2))
+    for _ in range(100):
+        arm.step(TORQUE)
+    P, load, q, dq = np.split(arm.truth(), [3, 5, 7])
+    assert pytest.approx([1.0, 0.32, 0.4]) == P
+    np.testing.assert_allclose(load, torque_of(rough(), 100_000_000 * 1e-9, q, dq), rtol=1e-13)
 
 
 @kernel
@@ -62,28 +109,19 @@ def test_compiled_loop_and_python_calls_are_bit_identical(source, noise):
 
 def test_sample_times_are_whole_nanoseconds():
     """The disturbance is evaluated at t_k = (k T_ns) 1e-9 s, to the last bit."""
-    period_ns, load = 333_333, rough_disturbance()
-    arm = plant(load=load, period_ns=period_ns)
-    x, stages = np.array([*START, 0.0, 0.0]), Stages(np.empty(4), np.empty((6, 4)))
+    period_ns, x = 333_333, np.array([*START, 0.0, 0.0])
+    arm = plant(load=rough(), period_ns=period_ns)
     for k, torque in enumerate(commands(100)):
         arm.step(torque)
-        integrate(motion(load=load), (k * period_ns) * 1e-9, period_ns * 1e-9, torque, x, stages)
+        x = advanced(rough(), (k * period_ns) * 1e-9, period_ns * 1e-9, x, torque)
     assert (arm.truth()[5:] == x).all()
 
 
-def test_reset_plant_repeats_its_run():
-    arm = full_plant(seed=2)
-    first = run(arm, commands(50))
-    arm.reset()
-    assert arm.sample == 0
-    assert (run(arm, commands(50)) == first).all()
-
-
 @pytest.mark.parametrize('source', [MEASURED, DIFFERENCED])
-def test_restored_plant_continues_bit_for_bit(source):
+def test_reset_plant_repeats_its_run_and_restored_one_continues_bit_for_bit(source):
     torques = commands(120)
     arm = full_plant(velocity_source=source)
-    run(arm, torques[:60])
+    first = run(arm, torques[:60])
     saved = arm.save()
     expected = run(arm, torques[60:])
     other = full_plant(velocity_source=source, seed=99)
@@ -91,53 +129,19 @@ def test_restored_plant_continues_bit_for_bit(source):
     other.restore(saved)
     assert (run(other, torques[60:]) == expected).all()
     assert (other.state == arm.state).all()
+    arm.reset()
+    assert arm.sample == 0
+    assert (run(arm, torques[:60]) == first).all()
 
 
 def test_arm_stopped_for_excessive_speed_stays_stopped_when_restored():
     arm = plant()
     run(arm, np.full((300, 2), 9e3))
     assert arm.is_broken
-    before = arm.measure().copy()
-    arm.restore(arm.save())
+    before, saved = arm.measure().copy(), arm.save()
+    arm.reset()
+    assert not arm.is_broken
+    arm.restore(saved)
     after = run(arm, np.full((3, 2), 9e3))
     np.testing.assert_array_equal(after[-1, :2], before[:2])
     assert not after[-1, 2:4].any()
-    arm.reset()
-    assert not arm.is_broken
-
-
-@pytest.mark.skipif(bool(numba.config.DISABLE_JIT), reason='compares compiled code with Python')
-def test_results_are_the_same_without_compilation():
-    """The interpreter's libm and order of operations agree with the compiler's up to rounding."""
-    program = (
-        'import json, sys\n'
-        'from plants import commands, run\n'
-        'from test_plant_sampled import full_plant\n'
-        'json.dump(run(full_plant(seed=6), commands(100)).tolist(), sys.stdout)\n'
-    )
-    paths = os.pathsep.join([str(REPOSITORY), str(REPOSITORY / 'test')])
-    environment = {**os.environ, 'NUMBA_DISABLE_JIT': '1', 'PYTHONPATH': paths}
-    output = subprocess.run(
-        [sys.executable, '-c', program], env=environment, check=True, stdout=subprocess.PIPE
-    ).stdout
-    interpreted = np.array(json.loads(output))
-    assert run(full_plant(seed=6), commands(100)) == pytest.approx(interpreted, rel=1e-10)
-
-
-@pytest.mark.skipif(bool(numba.config.DISABLE_JIT), reason='counts allocations of compiled code')
-def test_step_allocates_no_memory():
-    arm = full_plant()
-
-    def allocations(samples):
-        torques, rows = commands(samples), np.empty((samples, 6))
-        before = rtsys.get_allocation_stats()
-        compiled_run(arm.arm, arm.settings, arm.state, arm.rng, torques, rows)
-        return rtsys.get_allocation_stats().mi_alloc - before.mi_alloc
-
-    counting = _nrt_python.memsys_stats_enabled()
-    _nrt_python.memsys_enable_stats()
-    try:
-        assert allocations(2000) == allocations(1)
-    finally:
-        if not counting:
-            _nrt_python.memsys_disable_stats()

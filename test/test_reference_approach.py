@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 from fault_rig import Rig
 
-from blf_dsc_controller.bags.reader import read_run
 from blf_dsc_controller.configuration.controller import (
     Approach,
     ControllerConfig,
@@ -28,7 +27,6 @@ from blf_dsc_controller.law.factory import begin, controller_of
 from blf_dsc_controller.reference.approach import blend, plan_start, reference_of, stop
 from blf_dsc_controller.reference.limits import MotionError, worst_violation
 from blf_dsc_controller.reference.terms import minimum_jerk, pack, sampled, sinusoids_term, unpack
-from blf_dsc_controller.simulation.bag import write_bag
 from blf_dsc_controller.simulation.loop import simulate
 
 JOINTS = ('shoulder', 'elbow')
@@ -50,6 +48,12 @@ def approach_to(main, start, limits):
     return blend([stop(T0, *start, limits)], main, T0, limits)
 
 
+def maxima(motion, end):
+    """Largest velocity and acceleration of each joint from T0 on (2, n)."""
+    fine = np.linspace(T0, end, 100_001)
+    return np.abs(sampled(motion.vector, fine)[:, 1:]).max(axis=0)
+
+
 def at(vector, t):
     return sampled(vector, np.array([t]))[0]
 
@@ -64,31 +68,27 @@ def test_approach_leads_from_the_measured_state_to_the_reference_as_fast_as_allo
         np.testing.assert_array_equal(at(motion.vector, t), at(pack(2, [main]), t))
     # 1e-5 allows for the jerk over 1e-7 s: position, velocity and acceleration do not jump.
     np.testing.assert_allclose(at(motion.vector, before), at(motion.vector, after), atol=1e-5)
-
-    fine = np.linspace(T0, motion.settled + 10.0, 100_001)
-    _, dqr, ddqr = sampled(motion.vector, fine).transpose(1, 0, 2)
     # The planner looks at times a 200th of the approach apart or closer: it misses at most 0.1 %.
-    assert np.all(np.abs(dqr).max(axis=0) <= 1.001 * np.array(limits().limits.velocity))
-    assert np.all(np.abs(ddqr).max(axis=0) <= 1.001 * np.array(limits().limits.acceleration))
+    allowed = limits().limits.velocity, limits().limits.acceleration
+    assert np.all(maxima(motion, motion.settled + 10.0) <= 1.001 * np.array(allowed))
     with pytest.raises(MotionError):
         approach_to(main, start, limits(longest=0.98 * (motion.settled - T0)))
 
 
 def test_each_joint_keeps_its_own_limits():
     motion = approach_to(PAPER, AT_REST, limits(velocity=(0.4, 3.0), acceleration=(9.0, 1.0)))
-    _, dqr, ddqr = sampled(motion.vector, np.linspace(T0, 40.0, 40_001)).transpose(1, 0, 2)
-    assert np.abs(dqr[:, 0]).max() == pytest.approx(0.4, rel=0.05)  # the active limit is reached
-    assert np.abs(ddqr[:, 1]).max() <= 1.001
+    velocity, acceleration = maxima(motion, 40.0)
+    assert velocity[0] == pytest.approx(0.4, rel=0.05)  # the active limit is reached
+    assert acceleration[1] <= 1.001
 
 
 def test_motion_beyond_the_limits_is_rejected_with_the_name_of_the_joint():
-    with pytest.raises(MotionError) as rejection:
+    with pytest.raises(MotionError, match=r'limits\.velocity') as rejection:
         approach_to(PAPER, AT_REST, limits(velocity=(1.0, 0.25)))
     violation = rejection.value.violation
     assert (violation.joint, violation.quantity) == ('elbow', 'velocity')
     assert abs(violation.value) == pytest.approx(0.3, rel=1e-4)  # 0.3 sin t
     assert abs(violation.limit) == 0.25
-    assert 'limits.velocity' in str(rejection.value)
 
     start = MOVING.copy()
     start[1, 0] = -1.7  # too fast already
@@ -114,44 +114,40 @@ CONFIG = ControllerConfig()
 FIRST = np.array([2.2935, 1.6961])  # qr(0)
 STILL = np.zeros(2)
 BOUND = 2e-3  # rad
-STARTS = FIRST + np.random.default_rng(7).uniform(-2.0, 2.0, (10, 2))
+STARTS = FIRST + np.random.default_rng(7).uniform(-2.0, 2.0, (4, 2))
 
 
 def run(config, start, duration, velocity=(0.0, 0.0)):
-    plant = replace(
-        PlantConfig(), initial=Initial(tuple(start), velocity), duration=float(duration)
-    )
-    return simulate(config, plant)
+    """Time, qr, dqr, xi1 and torque of a run from a state."""
+    initial = Initial(tuple(start), velocity)
+    plant = replace(PlantConfig(), initial=initial, duration=float(duration))
+    record = simulate(config, plant)
+    qr, dqr, xi1, _, torque = np.split(record.samples[:, :10], 5, axis=1)
+    return record.stamps * 1e-9, qr, dqr, xi1, torque
 
 
-@pytest.mark.parametrize('start', STARTS[:4], ids=range(4))
+@pytest.mark.parametrize('start', STARTS, ids=range(4))
 def test_arm_reaches_the_reference_from_anywhere_within_the_bound(start):
-    law = controller_of(CONFIG)
-    settled = begin(law, CONFIG, start, STILL)
-    record = run(CONFIG, start, 12.0)
-    t = record.stamps * 1e-9
-    qr, xi1 = record.samples[:, :2], record.samples[:, 4:6]
-
+    settled = begin(controller_of(CONFIG), CONFIG, start, STILL)
+    t, qr, _, xi1, _ = run(CONFIG, start, 12.0)
     assert 0.5 < settled < 5.0  # a step of 2 rad at 1.5 rad/s takes 2.5 s
     assert np.abs(xi1).max() < BOUND
     np.testing.assert_allclose(qr[0], start, atol=1e-12)
-    paper = sampled(reference_of(CONFIG), t)[:, 0]
-    np.testing.assert_allclose(qr[t >= settled], paper[t >= settled], atol=1e-14)
-    assert np.abs(qr[t < settled] - paper[t < settled]).max() > BOUND
+    away = np.abs(qr - sampled(reference_of(CONFIG), t)[:, 0])
+    assert away[t >= settled].max() <= 1e-14
+    assert away[t < settled].max() > BOUND
 
 
 def test_fast_reference_is_approached_through_rest_at_its_middle():
     """At 96 % of the velocity limit it leaves too little speed to cover four radians directly."""
-    fast = {'amplitude': (0.72, 0.72), 'frequency': (2.0,), 'phase': (0.0,)}
     config = replace(
         CONFIG,
-        reference=Reference(**fast),
+        reference=Reference(amplitude=(0.72, 0.72), frequency=(2.0,), phase=(0.0,)),
         limits=replace(CONFIG.limits, acceleration=(3.0, 3.0)),
         approach=Approach(longest=15.0),  # s; the direct approach takes 19 s
     )
     start = np.array(config.reference.offset) + 4.0
     motion = plan_start(config, np.full(2, BOUND), start, STILL)
-
     assert len(unpack(motion.vector)) == 3
     assert motion.settled <= config.approach.longest
     t = np.linspace(0.0, motion.settled + 5.0, 20_000)
@@ -183,12 +179,10 @@ SWINGING = {'reference.phase': [-np.pi / 2]}  # passes its middle at 0.3 rad/s a
 
 def test_start_at_rest_on_a_moving_reference_leads_to_an_approach():
     config = build(ControllerConfig, SWINGING)
-    record = run(config, config.reference.offset, 4.0)
-    largest = np.abs(record.samples[:, 4:6]).max(axis=0)
-    np.testing.assert_array_less(largest, 0.5 * BOUND)
-    assert np.abs(record.samples[:, 8:10]).max() < 15.0  # 12 N m are gravity; the limit is 20
-    paper = sampled(reference_of(config), record.stamps * 1e-9)[:, 0]
-    np.testing.assert_allclose(record.samples[-1, :2], paper[-1], atol=1e-14)
+    t, qr, _, xi1, torque = run(config, config.reference.offset, 4.0)
+    assert np.abs(xi1).max() < 0.5 * BOUND
+    assert np.abs(torque).max() < 15.0  # 12 N m are gravity; the limit is 20
+    np.testing.assert_allclose(qr[-1], at(reference_of(config), t[-1])[0], atol=1e-14)
 
 
 def test_start_that_is_too_slow_is_rejected_if_approaches_are_disabled():
@@ -207,12 +201,12 @@ def test_start_that_is_too_slow_is_rejected_if_approaches_are_disabled():
 
 def test_hold_reference_stays_where_the_arm_is_or_where_it_comes_to_rest():
     config = build(ControllerConfig, {'reference.type': 'hold'})
-    record = run(config, FIRST - 0.7, 1.0)
-    np.testing.assert_array_equal(record.samples[:, :2], np.tile(FIRST - 0.7, (1001, 1)))
-    assert np.abs(record.samples[:, 4:6]).max() < BOUND
-    record = run(config, FIRST, 6.0, velocity=(0.5, -0.5))
-    np.testing.assert_array_equal(record.samples[-1, :2], FIRST)
-    assert np.abs(record.samples[:, 4:6]).max() < 0.5 * BOUND
+    _, qr, _, xi1, _ = run(config, FIRST - 0.7, 1.0)
+    np.testing.assert_array_equal(qr, np.tile(FIRST - 0.7, (1001, 1)))
+    assert np.abs(xi1).max() < BOUND
+    _, qr, _, xi1, _ = run(config, FIRST, 6.0, velocity=(0.5, -0.5))
+    np.testing.assert_array_equal(qr[-1], FIRST)
+    assert np.abs(xi1).max() < 0.5 * BOUND
 
 
 @pytest.mark.parametrize('velocity', ['measured', 'estimated'])
@@ -253,12 +247,10 @@ def test_reference_continues_after_a_deactivation_but_begins_anew_after_a_stop()
 def test_waypoints_are_passed_at_their_times_and_the_last_is_held():
     points = np.array([[2.0, 1.0], [2.4, 1.5], [1.8, 1.2]])
     reference = Reference(type='waypoints', times=(0.0, 1.5, 3.5), points=tuple(points.T.ravel()))
-    config = replace(CONFIG, reference=reference)
-    record = run(config, points[0], 5.0)
-    qr, dqr = record.samples[:, :2], record.samples[:, 2:4]
+    _, qr, dqr, xi1, _ = run(replace(CONFIG, reference=reference), points[0], 5.0)
     np.testing.assert_allclose(qr[[0, 1500, 3500, 5000]], points[[0, 1, 2, 2]], atol=1e-12)
     np.testing.assert_array_equal(dqr[[0, 3500, 5000]], 0.0)
-    assert np.abs(record.samples[:, 4:6]).max() < BOUND
+    assert np.abs(xi1).max() < BOUND
 
 
 @pytest.mark.parametrize(
@@ -277,26 +269,10 @@ def test_invalid_reference_is_rejected_with_the_reason(given, problem):
         build(ControllerConfig, given)
 
 
-def test_bag_of_an_offline_run_contains_the_moving_bound(tmp_path):
-    config = build(
-        ControllerConfig, {'barrier.initial_bound': [0.02, 0.01], 'barrier.funnel_rate': 4.0}
-    )
-    record = run(config, FIRST + 0.009, 0.5)
-    write_bag(tmp_path / 'bag', record, config, 'none')
-    recorded = read_run(tmp_path / 'bag')
-
-    t = record.stamps[:, np.newaxis] * 1e-9
-    expected = BOUND + np.array([0.018, 0.008]) * np.exp(-4.0 * t)
-    np.testing.assert_allclose(recorded.bound, expected, rtol=1e-12)
-    ratios = np.abs(recorded.error / recorded.bound).max(axis=0)
-    assert ratios[1] == pytest.approx(0.9)  # at the start
-    assert recorded.monitor.column('max_error_ratio joint2')[-1] == pytest.approx(0.9)
-
-
 def test_new_bound_is_validated_by_its_present_width():
-    funnel = {'barrier.initial_bound': [0.02, 0.02], 'barrier.funnel_rate': 1.0}
-    guard = (rig := Rig(funnel)).guard
+    rig = Rig({'barrier.initial_bound': [0.02, 0.02], 'barrier.funnel_rate': 1.0})
     rig.step(60)
+    guard = rig.guard
     narrow = {'barrier.bound': [0.1 * np.abs(guard.controller.sample.xi1).max()] * 2}
     assert guard.problems(change(guard.config, narrow)) == []
     still = {'barrier.initial_bound': [0.0, 0.0], 'barrier.funnel_rate': 0.0}
@@ -307,8 +283,7 @@ def test_new_bound_is_validated_by_its_present_width():
 def test_arm_far_beyond_its_limits_is_not_held(at):
     """For example, an arm that reports degrees."""
     config = replace(CONFIG, reference=Reference(type='hold'))
-    bound = np.array(config.barrier.bound)
     with pytest.raises(StartError, match=r"joint 'joint2' is at .* rad, and its limits are -6.2"):
-        plan_start(config, bound, np.array([0.0, at]), np.zeros(2))
+        plan_start(config, np.full(2, BOUND), np.array([0.0, at]), STILL)
     at_rest = np.array([0.0, 2.0 * np.pi + 0.09])
-    assert plan_start(config, bound, at_rest, np.zeros(2)).settled == 0.0
+    assert plan_start(config, np.full(2, BOUND), at_rest, STILL).settled == 0.0

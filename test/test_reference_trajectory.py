@@ -15,6 +15,7 @@ from blf_dsc_controller.reference.terms import (
     hermite,
     minimum_jerk,
     pack,
+    pieces_of,
     sampled,
     sinusoids_term,
     spline_term,
@@ -51,14 +52,11 @@ def value_at(terms, t):
 
 def test_terms_are_sums_of_tones_or_polynomials_of_the_current_piece():
     for t in (0.0, 1.234, 60.0):
-        expected = [
-            offset + np.sum(row * np.cos(np.array(FREQUENCY) * t + PHASE))
-            for offset, row in zip(OFFSET, AMPLITUDE, strict=True)
-        ]
+        tones = np.cos(np.array(FREQUENCY) * t + PHASE)
+        expected = OFFSET + np.array(AMPLITUDE) @ tones
         np.testing.assert_allclose(value_at([SINUSOIDS], t)[0], expected, atol=1e-15)
     for piece, t in ((0, 0.4), (0, 0.9), (1, 1.0), (2, 1.5), (3, 3.0), (3, 5)):
-        x = t - KNOTS[piece]
-        expected = [np.polynomial.polynomial.polyval(x, c) for c in COEFFICIENTS[piece]]
+        expected = np.polynomial.polynomial.polyval(t - KNOTS[piece], COEFFICIENTS[piece].T)
         np.testing.assert_allclose(value_at([SPLINE], t)[0], expected, rtol=1e-13)
     before = value_at([SPLINE], 0.39)  # at rest at its first point
     np.testing.assert_array_equal(before, [COEFFICIENTS[0, :, 0], [0] * 3, [0] * 3])
@@ -82,28 +80,19 @@ def test_terms_are_blended_by_the_minimum_jerk_step():
     for t, s in ((0.5, 0.0), (1.3, 0.5), (2.1, 1.0)):
         expected = (1.0 - s) * value_at([SINUSOIDS], t)[0] + s * value_at([SPLINE], t)[0]
         np.testing.assert_allclose(value_at(both, t)[0], expected, rtol=1e-13)
-    # Before and after only one of them counts, to the last bit.
-    for t in (0.0, 0.49, 0.5):
-        np.testing.assert_array_equal(value_at(both, t), value_at([SINUSOIDS], t))
-    for t in (2.1, 2.2, 50.0):
-        np.testing.assert_array_equal(value_at(both, t), value_at([SPLINE], t))
+    # Before and after only one of them counts, to the last bit; also without a blend.
+    at_once = [SINUSOIDS, SPLINE._replace(begin=1.5)]
+    for terms, alone, times in (
+        (both, SINUSOIDS, (0.0, 0.49, 0.5)),
+        (both, SPLINE, (2.1, 2.2, 50.0)),
+        (at_once, SINUSOIDS, (1.4999,)),
+        (at_once, SPLINE, (1.5,)),
+    ):
+        for t in times:
+            np.testing.assert_array_equal(value_at(terms, t), value_at([alone], t))
     for t in (0.5, 2.1):  # over 2e-9 s the jerk, below 1e4 here, moves the acceleration by 2e-5
         before, after = (value_at(both, t + side) for side in (-1e-9, 1e-9))
         np.testing.assert_allclose(before, after, atol=1e-4)
-    without_fade = [SINUSOIDS, SPLINE._replace(begin=1.5)]
-    np.testing.assert_array_equal(value_at(without_fade, 1.4999), value_at([SINUSOIDS], 1.4999))
-    np.testing.assert_array_equal(value_at(without_fade, 1.5), value_at([SPLINE], 1.5))
-
-
-def test_terms_survive_packing_and_are_evaluated_at_many_times_at_once():
-    terms = [SINUSOIDS, LATER, SPLINE]
-    for term, unpacked in zip(terms, unpack(pack(3, terms)), strict=True):
-        assert (term.code, term.begin, term.fade) == (unpacked.code, unpacked.begin, unpacked.fade)
-        np.testing.assert_array_equal(term.content, unpacked.content)
-    times = np.linspace(0.0, 4.0, 9)
-    together = reference.sampled(pack(3, [SINUSOIDS, LATER]), times)
-    apart = np.array([value_at([SINUSOIDS, LATER], t) for t in times])
-    np.testing.assert_allclose(together, apart, rtol=1e-14, atol=1e-14)  # cosines of two libraries
 
 
 MOMENTS = np.array([0.5, 1.0, 1.2, 2.5, 4.0])
@@ -122,25 +111,14 @@ def jerk_cost(term):
     return np.sum(jerk**2) * (fine[1] - fine[0])
 
 
-def test_hermite_has_the_given_values_at_every_point_from_both_sides():
-    h = 1e-9
-    for k, t in enumerate(MOMENTS):
-        sides = [t + h] if k == 0 else [t - h, t] if k + 1 < len(MOMENTS) else [t - h]
-        for side in sides:
-            # The jerk between points 0.2 s apart is of the order 1e3.
-            np.testing.assert_allclose(
-                states(hermite(MOMENTS, STATES), [side])[0], STATES[:, k], atol=1e-5
-            )
-
-
 @pytest.mark.parametrize('begin', [None, BEGIN], ids=['at rest', 'moving'])
 def test_minimum_jerk_passes_through_its_points_and_ends_at_rest(begin):
     motion = minimum_jerk(MOMENTS, STATES[0], begin)
-    now = states(motion, MOMENTS)
+    now, end = states(motion, MOMENTS), states(motion, [4.0, 9.0])
     np.testing.assert_allclose(now[:, 0], STATES[0], atol=1e-12)
     np.testing.assert_allclose(now[0, 1:], np.zeros((2, 2)) if begin is None else begin, atol=1e-12)
-    np.testing.assert_array_equal(states(motion, [4.0, 9.0])[:, 1:], 0.0)
-    np.testing.assert_array_equal(states(motion, [4.0, 9.0])[:, 0], STATES[0][[-1, -1]])
+    np.testing.assert_array_equal(end[:, 1:], 0.0)
+    np.testing.assert_array_equal(end[:, 0], STATES[0][[-1, -1]])
     np.testing.assert_allclose(states(motion, [4.0 - 1e-9])[0, 1:], 0.0, atol=1e-6)
 
 
@@ -176,10 +154,12 @@ FIELDS = {
 
 def trajectory(fields=(GOALS,), times=TIMES, joints=JOINTS, begin=None):
     rows = zip(times, *fields, strict=True)
-    points = tuple(
-        TrajectoryPoint(t, *(tuple(row.tolist()) for row in given)) for t, *given in rows
-    )
+    points = tuple(TrajectoryPoint(t, *(tuple(row.tolist()) for row in each)) for t, *each in rows)
     return Trajectory(joints, points, begin)
+
+
+def plan(sent, vector=None, now=NOW):
+    return plan_trajectory(sent, PAPER if vector is None else vector, now, LIMITS)
 
 
 def at(vector, t):
@@ -188,14 +168,12 @@ def at(vector, t):
 
 @pytest.mark.parametrize('fields', FIELDS.values(), ids=FIELDS)
 def test_trajectory_continues_the_reference_passes_its_points_and_holds_the_last(fields):
-    motion = plan_trajectory(trajectory(fields), PAPER, NOW, LIMITS)
+    motion = plan(trajectory(fields))
     assert motion.settled == NOW
     np.testing.assert_allclose(at(motion.vector, NOW), at(PAPER, NOW), atol=1e-13)
     np.testing.assert_allclose(at(motion.vector, NOW + 1e-8), at(PAPER, NOW), atol=1e-6)
-    for k, t in enumerate(TIMES):
-        reference = at(motion.vector, NOW + t)
-        for row, given in enumerate(fields):
-            np.testing.assert_allclose(reference[row], given[k], atol=1e-12)
+    passed = sampled(motion.vector, NOW + np.array(TIMES)).transpose(1, 0, 2)
+    np.testing.assert_allclose(passed[: len(fields)], fields, atol=1e-12)
     times = np.linspace(NOW, NOW + 4.0, 40_001)
     qr, dqr, ddqr = sampled(motion.vector, times).transpose(1, 0, 2)
     # 6 rad/s^2 times 1e-4 s is the most that a velocity may change from one time to the next.
@@ -206,31 +184,40 @@ def test_trajectory_continues_the_reference_passes_its_points_and_holds_the_last
     np.testing.assert_array_equal(at(motion.vector, 1e4), [GOALS[-1], (0, 0), (0, 0)])
     # Joints are matched by name.
     swapped = trajectory(tuple(field[:, ::-1] for field in fields), joints=JOINTS[::-1])
-    again = plan_trajectory(swapped, PAPER, NOW, LIMITS)
-    np.testing.assert_array_equal(again.vector, motion.vector)
+    np.testing.assert_array_equal(plan(swapped).vector, motion.vector)
 
 
 def test_cubics_are_hermite_splines_with_a_smooth_lead_in():
-    """Halfway between two points, h apart: their mean plus h/8 times the decrease in velocity."""
-    motion = plan_trajectory(trajectory((GOALS, VELOCITIES)), PAPER, NOW, LIMITS)
+    """Halfway between two points, h apart: their mean plus h/8 times the decrease in velocity.
+
+    After braking, the lead-in is the quintic that set out from rest when the trajectory began.
+    """
+    motion = plan(trajectory((GOALS, VELOCITIES)))
     halfway = at(motion.vector, NOW + 1.5)[0]
     expected = 0.5 * (GOALS[0] + GOALS[1]) + (VELOCITIES[0] - VELOCITIES[1]) / 8.0
     np.testing.assert_allclose(halfway, expected, atol=1e-12)
     before, after = (at(motion.vector, NOW + 1.0 + side)[2] for side in (-1e-9, 1e-9))
     np.testing.assert_allclose(before, after, atol=1e-6)
     assert np.abs(after).min() > 0.1
+    knots, pieces = pieces_of(unpack(motion.vector)[-1], 2)
+    for coefficients in pieces[1]:
+        lead_in = np.polynomial.Polynomial(coefficients)
+        at_begin = [lead_in.deriv(order)(NOW - knots[1]) for order in (1, 2)]
+        np.testing.assert_allclose(at_begin, 0.0, atol=1e-9)
 
 
 def test_trajectory_that_begins_now_at_another_position_is_blended_in():
-    fields = (np.vstack((GOALS[2], GOALS[1], GOALS[0])),)
-    motion = plan_trajectory(trajectory(fields, times=(0.0, 4.0, 8.0)), PAPER, NOW, LIMITS)
-    assert NOW < motion.settled < NOW + 4.0
-    np.testing.assert_allclose(at(motion.vector, NOW), at(PAPER, NOW), atol=1e-13)
-    np.testing.assert_allclose(at(motion.vector, NOW + 4.0)[0], GOALS[1], atol=1e-12)
+    """A second one, planned while the blend is under way, is settled with that blend."""
+    first = plan(trajectory((GOALS[::-1],), times=(0.0, 4.0, 8.0)))
+    assert NOW + 0.1 < first.settled < NOW + 4.0
+    np.testing.assert_allclose(at(first.vector, NOW), at(PAPER, NOW), atol=1e-13)
+    np.testing.assert_allclose(at(first.vector, NOW + 4.0)[0], GOALS[1], atol=1e-12)
+    later = plan(trajectory(begin=first.settled + 0.5), first.vector, NOW + 0.05)
+    assert later.settled == first.settled
 
 
 def test_single_point_at_time_zero_is_reached_as_fast_as_the_limits_allow():
-    motion = plan_trajectory(trajectory((GOALS[:1],), times=(0.0,)), PAPER, NOW, LIMITS)
+    motion = plan(trajectory((GOALS[:1],), times=(0.0,)))
     after = at(motion.vector, motion.settled)
     np.testing.assert_allclose(after, [GOALS[0], (0, 0), (0, 0)], atol=1e-12)
     _, dqr, ddqr = sampled(motion.vector, np.linspace(NOW, motion.settled, 5001)).transpose(1, 0, 2)
@@ -238,35 +225,28 @@ def test_single_point_at_time_zero_is_reached_as_fast_as_the_limits_allow():
     assert used == pytest.approx(1.0, abs=0.05)
 
 
-def test_present_reference_continues_until_the_trajectory_begins():
-    motion = plan_trajectory(trajectory(begin=5.0), PAPER, NOW, LIMITS)
+def test_present_reference_continues_until_the_trajectory_begins_and_past_points_are_skipped():
+    later = plan(trajectory(begin=5.0)).vector
     for t in (NOW, 4.0, 4.999):
-        np.testing.assert_array_equal(at(motion.vector, t), at(PAPER, t))
-    np.testing.assert_allclose(at(motion.vector, 5.0), at(PAPER, 5.0), atol=1e-13)
-    np.testing.assert_allclose(at(motion.vector, 6.0)[0], GOALS[0], atol=1e-12)
-
-
-def test_points_in_the_past_are_skipped():
-    motion = plan_trajectory(trajectory(begin=NOW - 1.5), PAPER, NOW, LIMITS)
-    np.testing.assert_allclose(at(motion.vector, NOW), at(PAPER, NOW), atol=1e-13)
-    np.testing.assert_allclose(at(motion.vector, NOW + 0.5)[0], GOALS[1], atol=1e-12)
+        np.testing.assert_array_equal(at(later, t), at(PAPER, t))
+    np.testing.assert_allclose(at(later, 5.0), at(PAPER, 5.0), atol=1e-13)
+    np.testing.assert_allclose(at(later, 6.0)[0], GOALS[0], atol=1e-12)
+    late = plan(trajectory(begin=NOW - 1.5)).vector
+    np.testing.assert_allclose(at(late, NOW), at(PAPER, NOW), atol=1e-13)
+    np.testing.assert_allclose(at(late, NOW + 0.5)[0], GOALS[1], atol=1e-12)
 
 
 def test_later_trajectory_replaces_running_and_waiting_ones():
-    first = plan_trajectory(trajectory(), PAPER, NOW, LIMITS).vector
-    waiting = plan_trajectory(trajectory(begin=20.0), first, NOW + 1.0, LIMITS).vector
-    last = plan_trajectory(trajectory((GOALS[::-1] + 0.1,)), waiting, NOW + 1.5, LIMITS).vector
+    first = plan(trajectory()).vector
+    waiting = plan(trajectory(begin=20.0), first, NOW + 1.0).vector
+    last = plan(trajectory((GOALS[::-1] + 0.1,)), waiting, NOW + 1.5).vector
     np.testing.assert_allclose(at(last, NOW + 1.5), at(first, NOW + 1.5), atol=1e-12)
-    np.testing.assert_allclose(at(last, NOW + 5.0)[0], GOALS[0] + 0.1, atol=1e-12)
-    np.testing.assert_allclose(at(last, 22.0)[0], GOALS[0] + 0.1, atol=1e-12)
+    for t in (NOW + 5.0, 22.0):
+        np.testing.assert_allclose(at(last, t)[0], GOALS[0] + 0.1, atol=1e-12)
     assert len(unpack(last)) == 2
-
-
-def test_finished_trajectories_are_forgotten():
-    vector = PAPER
-    for k in range(20):
-        vector = plan_trajectory(trajectory((GOALS + 0.01 * k,)), vector, NOW + k, LIMITS).vector
-    assert len(unpack(vector)) == 2
+    for k in range(20):  # what is finished is forgotten
+        last = plan(trajectory((GOALS + 0.01 * k,)), last, NOW + 2.0 + k).vector
+        assert len(unpack(last)) == 2
 
 
 NAN = float('nan')
@@ -315,17 +295,15 @@ BAD = (
 def test_invalid_trajectory_is_rejected_with_the_reason():
     for bad, reason in BAD:
         with pytest.raises(TrajectoryError) as rejection:
-            plan_trajectory(bad, PAPER, NOW, LIMITS)
+            plan(bad)
         assert isinstance(rejection.value, MotionError)
         assert reason in str(rejection.value)
 
 
 def test_all_problems_are_reported_at_once():
-    bad = Trajectory(
-        ('shoulder', 'wrist'), (TrajectoryPoint(1.0, (1.0,)), TrajectoryPoint(2.0, (NAN, 1.0)))
-    )
+    points = TrajectoryPoint(1.0, (1.0,)), TrajectoryPoint(2.0, (NAN, 1.0))
     with pytest.raises(TrajectoryError) as rejection:
-        plan_trajectory(bad, PAPER, NOW, LIMITS)
+        plan(Trajectory(('shoulder', 'wrist'), points))
     assert len(rejection.value.problems) == 4
 
 
@@ -351,17 +329,14 @@ def test_goal_with_much_time_is_not_overshot_by_more_than_the_braking_distance(
 ):
     """Without braking first, the reference swings by 0.2 v T: 56 m for a joint with 1.4 rad/s."""
     fields = np.array([goal, np.zeros(2), np.zeros(2)])[:count, np.newaxis]
-    sent = trajectory(fields, times=(time,))
-    motion = plan_trajectory(sent, moving(velocity, acceleration), 0.0, LIMITS)
+    motion = plan(trajectory(fields, times=(time,)), moving(velocity, acceleration), 0.0)
     times = np.linspace(0.0, time + 1.0, 20_001)
     qr, dqr, _ = sampled(motion.vector, times).transpose(1, 0, 2)
     # All joints brake together, at no more than half of 6 rad/s^2, ddqr aside.
     h = max(0.2, 3.0 * max(map(abs, velocity)) / 6.0)
-    for i in range(2):
-        room = 0.5 * h * abs(velocity[i]) + h**2 * abs(acceleration[i]) / 6.0 + 1e-9
-        low, high = min(0.0, goal[i]), max(0.0, goal[i])
-        assert qr[:, i].min() >= low - room
-        assert qr[:, i].max() <= high + room
+    room = 0.5 * h * np.abs(velocity) + h**2 * np.abs(acceleration) / 6.0 + 1e-9
+    assert np.all(qr >= np.minimum(0.0, goal) - room)
+    assert np.all(qr <= np.maximum(0.0, goal) + room)
     np.testing.assert_allclose(qr[-1], goal, atol=1e-9)
     np.testing.assert_array_equal(dqr[-1], (0.0, 0.0))
 
@@ -370,14 +345,5 @@ def test_goal_with_much_time_is_not_overshot_by_more_than_the_braking_distance(
 def test_point_that_needs_more_time_for_braking_is_still_reached(speed, goal, time):
     """The gentle braking does not fit, or leaves too little time; up to all the time there is."""
     sent = trajectory((np.array([[goal, 0.0]]),), times=(time,))
-    motion = plan_trajectory(sent, moving((speed, 0.0)), 0.0, LIMITS)
+    motion = plan(sent, moving((speed, 0.0)), 0.0)
     np.testing.assert_allclose(at(motion.vector, time), [(goal, 0.0), (0, 0), (0, 0)], atol=1e-9)
-
-
-def test_trajectory_that_begins_after_a_blend_is_settled_with_that_blend():
-    """The blend to the first trajectory is still under way when the second is planned."""
-    first = plan_trajectory(trajectory(times=(0.0, 4.0, 8.0)), PAPER, NOW, LIMITS)
-    assert first.settled > NOW + 0.1
-    later = trajectory(begin=first.settled + 0.5)
-    motion = plan_trajectory(later, first.vector, NOW + 0.05, LIMITS)
-    assert motion.settled == first.settled

@@ -5,13 +5,14 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from changes import several
+from paper_case import configured
 
 from blf_dsc_controller.analysis.summary import summarize
 from blf_dsc_controller.bags.reader import read_run
 from blf_dsc_controller.configuration.controller import ControllerConfig
-from blf_dsc_controller.configuration.nodes import load, locate
 from blf_dsc_controller.configuration.plant import PlantConfig
-from blf_dsc_controller.configuration.schema import build, change
+from blf_dsc_controller.configuration.schema import build
 from blf_dsc_controller.replay.verify import verify
 from blf_dsc_controller.simulation.bag import write_bag
 from blf_dsc_controller.simulation.loop import START, simulate
@@ -41,16 +42,15 @@ def test_stop_and_torques_match_the_node_bit_for_bit(ros, reason, given):
 
     from blf_dsc_controller.messages import topics
 
-    record = run(given)
-    commands = ros.listen(topics.COMMANDS)
+    found, commands = run(given).run(), ros.listen(topics.COMMANDS)
     arm, law = ros.loop({'duration': 2.5} | NOISY, given)
     ros.until(lambda: arm.finished and len(commands) >= 2501)
-    np.testing.assert_array_equal(torques(commands)[:2501], record.run().torque)
+    np.testing.assert_array_equal(torques(commands)[:2501], found.torque)
     supervisor = law.guard.supervisor
     if reason.startswith(GOES_ON):
-        assert (supervisor.phase, record.run().stops) == (Phase.TRACKING, ())
+        assert (supervisor.phase, found.stops) == (Phase.TRACKING, ())
         return
-    (stop,) = record.run().stops
+    (stop,) = found.stops
     assert (stop.reason, stop.text) == (supervisor.reason, supervisor.text)
     assert stop.reason == reason
 
@@ -97,13 +97,11 @@ def test_switching_between_guard_and_compiled_loop_does_not_change_the_run():
 
 def test_panda_rests_with_a_load_that_it_was_stopped_by():
     """The model lacks 3 kg: held by it alone, the arm sinks by 0.70 rad in 1 s, 1.88 in 4 s."""
-    file = locate('panda')
-    given = {'reference.type': 'hold', 'safety.error_ratio': 0.5}
-    config = change(load(file, '/blf_dsc_controller', ControllerConfig), given)
-    pick_up = {'events.begin': (0.5,), 'events.duration': (0.0,), 'events.payload': (3.0,)}
-    plant = change(load(file, '/sim_plant', PlantConfig), pick_up | {'duration': 4.5})
-    assert config.safety.torque == 'hold_gravity'
-    record = simulate(config, plant)
+    law = {'reference.type': 'hold', 'safety.error_ratio': 0.5}
+    pick_up = several({'begin': 0.5, 'duration': 0.0, 'payload': 3.0})
+    config = configured('panda', 4.5, law, pick_up)
+    assert config.controller.safety.torque == 'hold_gravity'
+    record = simulate(config.controller, config.plant)
     (stop,) = record.run().stops
     assert stop.reason == 'error past the bound'
     row = int(np.flatnonzero(np.isnan(record.samples[:, 0]))[0])
