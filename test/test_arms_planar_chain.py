@@ -7,7 +7,6 @@ import numpy as np
 import pinocchio
 import plain_law
 import pytest
-from closed_loop_case import MODEL
 from plain_law import R
 from plants import ARM
 from random_arm import ArmCase, chain_of
@@ -144,16 +143,6 @@ def test_two_links_are_the_arm_of_section_iv(arm):
     assert model.parameter_units == ('kg m^2',) * 3
     inner, outer = arm.m1 + arm.m2, arm.m2
     assert pytest.approx([inner * arm.l1**2, outer * arm.l2**2, outer * arm.l1 * arm.l2]) == P
-
-
-@pytest.mark.parametrize('model', [MODEL, PlanarChain(3, R)], ids=['two', 'chain'])
-def test_regressors_computed_at_once_equal_the_separate_ones(model):
-    q, dq, v, a = np.random.default_rng(1).normal(size=(4, model.n))
-    separate, together = np.full((2, 3, model.n, len(model.parameter_names)), np.nan)
-    model.regressor(q, dq, v, a, separate[0])
-    model.momentum_regressor(q, dq, separate[1], separate[2])
-    model.regressors(q, dq, v, a, *together)
-    np.testing.assert_array_equal(together, separate)
 
 
 def test_law_runs_on_three_links():

@@ -6,6 +6,8 @@ from __future__ import annotations
 import numpy as np
 import pinocchio
 import pytest
+from closed_loop_case import MODEL
+from plain_law import R
 from random_arm import ARMS, ArmCase, chain_of
 
 from blf_dsc_controller.arms.base_parameters import base_parameters
@@ -13,6 +15,7 @@ from blf_dsc_controller.arms.batch import inertia_matrices, regressors_at
 from blf_dsc_controller.arms.chain_kernels import ROTOR
 from blf_dsc_controller.arms.forms import TRUSTED, learned_parameters
 from blf_dsc_controller.arms.inertia import INERTIA_NAMES, inertia_of, pseudo_inertia
+from blf_dsc_controller.arms.planar_chain import PlanarChain
 from blf_dsc_controller.arms.prior import CENTRE, ROTORS, deviations, payload_inertia, prior_factor
 from blf_dsc_controller.arms.serial_chain import serial_chain
 from sim_plant.rigid_body import rigid_arm
@@ -57,15 +60,17 @@ def test_regressors_agree_with_pinocchio(name):
     np.testing.assert_allclose(found, M, atol=1e-10)
 
 
-def test_regressors_computed_at_once_or_in_a_batch_equal_the_separate_ones():
-    case = Case('six')
-    together = np.full((3, case.n, case.arm.p), np.nan)
-    case.arm.regressors(case.q, case.dq, case.v, case.a, *together)
-    np.testing.assert_array_equal(together[0], case.H(case.q, case.dq, case.v, case.a))
-    np.testing.assert_array_equal(together[1:], case.momentum(case.q, case.dq))
-    states = case.random.normal(size=(5, 4, case.n))
-    H = regressors_at(case.arm, *np.moveaxis(states, 1, 0))
-    np.testing.assert_array_equal(H, [case.H(*state) for state in states])
+@pytest.mark.parametrize('model', [Case('six').arm, MODEL, PlanarChain(3, R)])
+def test_regressors_computed_at_once_or_in_a_batch_equal_the_separate_ones(model):
+    states = np.random.default_rng(1).normal(size=(5, 4, model.n))
+    H = regressors_at(model, *np.moveaxis(states, 1, 0))
+    for state, batched in zip(states, H, strict=True):
+        separate, together = np.full((2, 3, model.n, model.p), np.nan)
+        model.regressor(*state, separate[0])
+        model.momentum_regressor(*state[:2], *separate[1:])
+        model.regressors(*state, *together)
+        np.testing.assert_array_equal(together, separate)
+        np.testing.assert_array_equal(batched, separate[0])
 
 
 def test_chosen_columns_keep_their_values_names_and_units():

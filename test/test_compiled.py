@@ -83,8 +83,8 @@ print(float(H[0, 0, 0]), *(sum(batch._fill_regressors.stats[k].values()) for k i
 
 def compiled_in(checkout, cache, **target):
     """Return an entry of a regressor, and how often its kernel was found and was compiled."""
-    environment = {**os.environ, 'PYTHONPATH': str(checkout), 'NUMBA_CACHE_DIR': str(cache)}
-    environment |= target
+    paths = {'PYTHONPATH': str(checkout), 'NUMBA_CACHE_DIR': str(cache)}
+    environment = os.environ | paths | target
     run = finished(sys.executable, '-c', COMPILE, cwd=checkout, env=environment)
     entry, found, compiled = map(float, run.stdout.split())
     return entry, found, compiled

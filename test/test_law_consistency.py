@@ -177,25 +177,22 @@ def test_lasting_disturbance_above_the_floor_does_not_end_learning():
 
 @pytest.fixture(scope='module')
 def window_of_friction():
-    """Controller with a full latched window of unmodelled friction, and its state."""
+    """A full latched window of unmodelled friction, its controller, and the state of that."""
     controller = run(8.0, FRICTION).controller
-    controller.settings = controller.settings._replace(residual_floor=0.0)
-    window.excitation(controller.settings, controller.state, controller.signals, 60)
-    accepted = consistency.accept_window(
-        controller.settings, controller.state, controller.signals, Q
-    )
-    assert accepted
-    return controller, controller.save()
+    settings = controller.settings._replace(residual_floor=0.0)
+    case = settings, controller.state, controller.signals
+    window.excitation(*case, 60)
+    assert consistency.accept_window(*case, Q)
+    return *case, controller, controller.save()
 
 
 @pytest.fixture
 def learned(window_of_friction):
     """Settings, state and signals of that controller, and the residual."""
-    controller, saved = window_of_friction
+    *case, controller, saved = window_of_friction
     controller.restore(saved)
-    settings, state, signals = controller.settings, controller.state, controller.signals
-    window.excitation(settings, state, signals, 60)
-    return settings, state, signals, float(state.residual[0])
+    window.excitation(*case, 60)
+    return *case, float(controller.state.residual[0])
 
 
 @pytest.mark.parametrize(

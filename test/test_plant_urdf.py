@@ -78,10 +78,8 @@ PANDA_CONFIG = {'robot.urdf': 'panda.urdf', 'robot.tip': 'panda_hand_tcp'}
 
 
 def panda(**given):
-    return build(
-        PlantConfig,
-        {**PANDA_CONFIG, **{name.replace('__', '.'): value for name, value in given.items()}},
-    )
+    given = {name.replace('__', '.'): value for name, value in given.items()}
+    return build(PlantConfig, PANDA_CONFIG | given)
 
 
 def swinging_torques(samples):

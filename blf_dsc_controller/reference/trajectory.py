@@ -102,8 +102,8 @@ def plan_trajectory(
             motion = blend(before, _through_points(times, points), t0, config)
     except MotionError as error:
         raise TrajectoryError([str(error)]) from error
-    end = max(float(times[-1]), motion.settled)
-    found = worst_violation(motion.vector, check_times(t0, end), config)
+    # Until it is settled, `blend` has checked the motion.
+    found = worst_violation(motion.vector, check_times(t0, float(times[-1])), config)
     if found is not None:
         raise TrajectoryError([f'{found}; reduce the motion, or relax {found.parameters}'])
     return motion
