@@ -197,6 +197,7 @@ def test_damping_by_the_initial_inertia_is_omega_v_M_xi2(compensation):
     for rate in (0.0, 30.0):
         gains = {'Kp': np.zeros(2), 'damping_rate': rate, 'compensation': compensation}
         law = controller(recommended(**gains))
+        law.state.estimate[:3] *= 1.2  # what is learned is not damped
         law.update(0.0, 1e-3, measurement)
         demands.append(law.signals.demand.copy())
     M, _, _ = dynamics(law.settings.initial_estimate[:3], R, *measurement[:4].reshape(2, 2))
@@ -213,6 +214,9 @@ def test_window_of_every_fifth_row_gives_the_same_estimate():
     )
     assert sparse.state.ring.size * 5 == dense.state.ring.size
     assert sparse.state.rows[0] == 200.0
+    sparse.reset()
+    record(sparse, plant(), 0.5)
+    assert sparse.state.rows[0] == 99.0
     np.testing.assert_allclose(found, expected, rtol=0.02)
 
 

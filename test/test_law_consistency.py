@@ -3,8 +3,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from changes import (
@@ -26,7 +24,7 @@ from paper_case import NO_DISTURBANCE, configured
 
 from blf_dsc_controller import load_loop, simulate
 from blf_dsc_controller.law import consistency, excitation, window
-from blf_dsc_controller.law.factory import controller_of
+from blf_dsc_controller.law.factory import settings_of_config
 
 Q = np.array([2.293, 1.696])
 FRICTION = {'disturbance.viscous': [0.1, 0.1]}
@@ -140,9 +138,14 @@ def test_window_after_a_change_may_be_partial_and_stays_near_the_estimate_before
 
 
 def test_change_detection_is_off_for_laws_without_composite_learning():
-    config = configured('comparison', 1.0)
-    assert controller_of(config.controller).settings.change_detection == 0
-    assert controller_of(replace(config.controller, law='blf_dsc')).settings.change_detection == 1
+    """And for rows that contradict each other on any arm, as those of Lambda do."""
+    for law, prediction, expected in (
+        ('blf_dsc', 'filtered', 1),
+        ('backstepping', 'filtered', 0),
+        ('blf_dsc', 'lambda', 0),
+    ):
+        config = configured('comparison', 1.0, {'law': law, 'learning.prediction': prediction})
+        assert settings_of_config(config.controller).change_detection == expected
 
 
 @pytest.mark.parametrize(

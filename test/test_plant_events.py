@@ -67,6 +67,7 @@ def test_event_is_equivalent_to_changing_the_plant_at_its_time(events, lasting):
     changed, unchanged = plant_of(PlantConfig()), plant_of(PlantConfig())
     torques = commands(SAMPLES)
     before = [measurements(arm, torques[:AT]) for arm in (scheduled, changed, unchanged)]
+    changed.truth()  # what acts in this sample is summed once
     changed.change(plant_settings(build(PlantConfig, lasting)))
     after = [measurements(arm, torques[AT:]) for arm in (scheduled, changed, unchanged)]
     for same in (before, after):

@@ -110,10 +110,11 @@ def test_compiled_loop_and_python_calls_are_bit_identical(source, noise):
 def test_sample_times_are_whole_nanoseconds():
     """The disturbance is evaluated at t_k = (k T_ns) 1e-9 s, to the last bit."""
     period_ns, x = 333_333, np.array([*START, 0.0, 0.0])
-    arm = plant(load=rough(), period_ns=period_ns)
+    load = disturbance(amplitude=1.0, frequency=1e6)
+    arm = plant(load=load, period_ns=period_ns)
     for k, torque in enumerate(commands(100)):
         arm.step(torque)
-        x = advanced(rough(), (k * period_ns) * 1e-9, period_ns * 1e-9, x, torque)
+        x = advanced(load, (k * period_ns) * 1e-9, period_ns * 1e-9, x, torque)
     assert (arm.truth()[5:] == x).all()
 
 
