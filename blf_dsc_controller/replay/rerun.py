@@ -295,8 +295,8 @@ class Rerun:
             self._command(event.stamp, guard.time_out(content['text']))
         elif _reason(event) is Reason.FAILED:
             guard.journal.stamp = event.stamp
-            self._command(event.stamp, guard.fail(content['text']))
             self._failed = True  # nothing shows how far the law got
+            self._command(event.stamp, guard.fail(content['text']))
         elif event.type in (EventType.ACTIVATE, EventType.RESET, EventType.DEACTIVATE):
             self._failed &= event.type is EventType.DEACTIVATE
             getattr(guard, event.type.value)()

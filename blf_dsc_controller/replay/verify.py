@@ -251,10 +251,7 @@ def _compare(
         pair[1][has_moved[rows]] = np.inf
         result.add(stamp[rows], start, names, *pair)
     unreached = (result.recorded - result.values) // len(joints) if topic is topics.COMMANDS else 0
-    # The last command of a node that shuts down normally is zero and belongs to no state.
-    if unreached == 1 and not recorded.field(2, slice(-1, None)).any():
-        result.recorded -= len(joints)
-    elif unreached:
+    if unreached:
         result.left_out = f'{unreached} torques that the replay does not reach'
 
 
