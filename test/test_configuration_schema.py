@@ -251,6 +251,11 @@ def test_joint_names_are_unique_and_the_arm_has_two(cls):
         ),
         ({'truth.parameters': [1.0, 0.32]}, 'truth.parameters: got 2 entries, but model two_lin'),
         ({'barier.bound': [1.0, 1.0]}, 'barier.bound: unknown parameter, did you '),
+        # Of an arm that cannot be read, no lengths are known.
+        (
+            {'robot.urdf': 'no.urdf', 'barrier.bound': [0.1] * 7},
+            "robot.urdf: 'no.urdf' cannot",
+        ),
     ],
 )
 def test_invalid_controller_configuration_is_rejected(given, message):
