@@ -13,6 +13,7 @@ from blf_dsc_controller.arms.inertia import inertia_of, pseudo_inertia
 from blf_dsc_controller.arms.urdf import read_chain
 from blf_dsc_controller.bags.writer import BagWriter
 from blf_dsc_controller.compiled.jit import kernel
+from blf_dsc_controller.identification.recording import Recording
 from blf_dsc_controller.messages.codecs import JointStateEncoder
 from blf_dsc_controller.messages.topics import JOINT_STATE
 from sim_plant.rigid_body import acceleration, locate, motion_of, motion_size, rigid_bodies
@@ -132,6 +133,12 @@ def measured(states, seed, encoder=2.0 * np.pi / 2**20, noise=0.01):
     torque = states[:, 2]
     seen[:, 2] += noise * np.sqrt(np.mean(torque**2, axis=0)) * random.normal(size=torque.shape)
     return seen
+
+
+def recording_of(states):
+    """Return states (N, 3, n) of a Panda as what `identify` reads from a bag."""
+    gap = np.zeros(len(states), dtype=bool)
+    return Recording(PANDA, PERIOD, states[:, 0], states[:, 2], gap, 'made up')
 
 
 def write_states(path, joints, states, *, period=PERIOD, topic='/joint_states', fields=None):

@@ -161,6 +161,15 @@ def test_prior_uncertainty_remains_at_rest_and_shrinks_for_joints_that_move():
     assert remaining[names.index('viscous j2')] == pytest.approx(1.0, abs=1e-6)
 
 
+def test_lack_of_room_counts_as_an_excess():
+    config, problem = chain_problem()
+    high = Clearance(config.robot.chain(config.joints), 0.02, 3.0)  # a floor above the arm
+    low = ExcitationProblem(config, np.array(config.learning.initial_estimate), 0.8, 1, high)
+    motion = problem.parameters(np.full(9, 0.1))
+    assert not low.evaluate(motion).is_allowed
+    assert low.evaluate(motion).excess > problem.evaluate(motion).excess + 1.0
+
+
 def test_torque_ratio_is_the_largest_of_all_guesses():
     config, problem = chain_problem()
     motion = problem.parameters(np.full(9, 0.1))

@@ -16,6 +16,7 @@ from shaken_arm import (
     PANDA_TEXT,
     PERIOD,
     measured,
+    recording_of,
     reference_of,
     shake,
     truth_of,
@@ -35,7 +36,7 @@ from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.identification.corrected_urdf import corrected_urdf
 from blf_dsc_controller.identification.identify import identify_arm, identify_bag
 from blf_dsc_controller.identification.prior import base_matrix
-from blf_dsc_controller.identification.recording import Recording, read_recording
+from blf_dsc_controller.identification.recording import read_recording
 from blf_dsc_controller.messages.codecs import Float64MultiArrayEncoder, JointStateEncoder
 from blf_dsc_controller.messages.topics import COMMANDS, JOINT_STATE
 from blf_dsc_controller.simulation.bag import write_bag
@@ -78,11 +79,6 @@ def unseen_error(text, rotors):
 def corrected(found):
     viscous, coulomb = found.dynamics
     return corrected_urdf(PANDA_TEXT, found.chain, found.inertias, viscous, coulomb, 'note')
-
-
-def recording_of(states, joints=PANDA):
-    gap = np.zeros(len(states), dtype=bool)
-    return Recording(joints, PERIOD, states[:, 0], states[:, 2], gap, 'made up')
 
 
 @pytest.fixture(scope='module')

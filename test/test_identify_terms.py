@@ -20,6 +20,7 @@ from shaken_arm import (
     PERIOD,
     changed,
     measured,
+    recording_of,
     reference_of,
     truth_of,
     write_states,
@@ -73,11 +74,6 @@ def moved(duration, seed=2, *, loaded=False, truth=TRUTH):
     return np.stack((q, dq, torque), axis=1), gravity
 
 
-def recording_of(states, seed=3):
-    seen, gap = measured(states, seed), np.zeros(len(states), dtype=bool)
-    return Recording(PANDA, PERIOD, seen[:, 0], seen[:, 2], gap, 'made up')
-
-
 @pytest.fixture(scope='module')
 def plain():
     return moved(30.0)
@@ -85,7 +81,7 @@ def plain():
 
 @pytest.fixture(scope='module')
 def found(plain):
-    return identify_arm(recording_of(plain[0]), ROBOT)
+    return identify_arm(recording_of(measured(plain[0], 3)), ROBOT)
 
 
 def total(found):
@@ -110,7 +106,7 @@ def test_joint_whose_link_is_far_from_the_urdf_keeps_its_weight():
     bodies[-1] = inertia_of(T @ pseudo_inertia(bodies[-1]) @ T.T)
     states = moved(30.0, truth=TRUTH._replace(inertias=bodies))[0]
     robot = Robot(urdf=PANDA_TEXT, tip='panda_hand_tcp', payload=0.0)
-    found = identify_arm(recording_of(states), robot)
+    found = identify_arm(recording_of(measured(states, 3)), robot)
     assert (found.errors[2] < 0.005 * found.torque).all()
 
 
@@ -119,7 +115,7 @@ def test_load_friction_and_stribeck_friction_are_recognised(plain):
     v = states[:, 1]
     states[:, 2] += 0.06 * np.abs(gravity) * np.sign(v)
     states[:, 2, 3] += 3.0 * np.sign(v[:, 3]) * np.exp(-((v[:, 3] / 0.1) ** 2))
-    found = identify_arm(recording_of(states), ROBOT)
+    found = identify_arm(recording_of(measured(states, 3)), ROBOT)
     assert total(found) < 0.005
     np.testing.assert_allclose(found.joint_terms[3, [1, 3]], 0.06, rtol=0.1)
     assert found.joint_terms[5, 3] == pytest.approx(3.0, rel=0.1)
@@ -133,7 +129,7 @@ def test_coupled_wrist_is_recognised_and_named(plain, tmp_path, capsys):
     others = states[:, 1, [6, 5]]
     both = np.sign(states[:, 1, 5:].sum(axis=1, keepdims=True))
     states[:, 2, 5:] += 0.02 * np.gradient(others, h, axis=0) + 0.3 * others + 0.8 * both
-    found = identify_arm(recording_of(states), ROBOT)
+    found = identify_arm(recording_of(measured(states, 3)), ROBOT)
     np.testing.assert_allclose(found.coupling, (0.02, 0.3, 0.8), rtol=0.05)
     bag = write_states(tmp_path / 'bag', PANDA, states)
     urdf, page = tmp_path / 'robot.urdf', tmp_path / 'page.html'
@@ -150,7 +146,7 @@ def test_rest_at_the_end_is_left_out(plain, found):
     resting = np.vstack((states, np.repeat(states[-1:], 10_000, axis=0)))
     resting[len(states) :, 1] = 0.0
     resting[len(states) :, 2] += 5.0  # stiction, which is no fault of the model
-    recording = recording_of(resting)
+    recording = recording_of(measured(resting, 3))
     recording.gap[len(states)] = True  # it stops between two samples
     other = identify_arm(recording, ROBOT)
     assert other.rest == pytest.approx(10.0, abs=0.5)
@@ -163,16 +159,16 @@ def test_efforts_without_gravity_are_named_and_used(plain, found):
     states, gravity = plain[0].copy(), plain[1]
     states[:, 2] -= gravity
     assert 'GRAVITY IS MISSING' in next(
-        problems_of(identify_arm(recording_of(states), ROBOT), 'torque')
+        problems_of(identify_arm(recording_of(measured(states, 3)), ROBOT), 'torque')
     )
-    whole = identify_arm(recording_of(plain[0]), ROBOT, 'without-gravity')
+    whole = identify_arm(recording_of(measured(plain[0], 3)), ROBOT, 'without-gravity')
     assert 'GRAVITY IS DOUBLE' in next(problems_of(whole, 'without-gravity'))
     # The drive compensates the gravity of the URDF exactly: then this is the whole torque.
     model = pinocchio_model(PANDA_TEXT, PANDA)
     data = model.createData()
     states = plain[0].copy()
     states[:, 2] -= [pinocchio.computeGeneralizedGravity(model, data, q) for q in states[:, 0]]
-    right = identify_arm(recording_of(states), ROBOT, 'without-gravity')
+    right = identify_arm(recording_of(measured(states, 3)), ROBOT, 'without-gravity')
     assert total(right) < 2.0 * total(found)
     assert not list(problems_of(right, 'without-gravity'))
 
@@ -199,7 +195,9 @@ def loaded():
 
 
 def test_load_is_weighed_with_a_recording_without_and_one_with_it(plain, loaded):
-    together, boundary = joined(recording_of(plain[0]), recording_of(loaded, 4))
+    together, boundary = joined(
+        recording_of(measured(plain[0], 3)), recording_of(measured(loaded, 4))
+    )
     is_the_load(identify_arm(together, ROBOT, picked_up=boundary))
 
 
@@ -227,12 +225,15 @@ def test_gains_turn_currents_into_torques(plain, found, tmp_path):
         identify_bag(bag, ROBOT, gains=(1.0, 2.0))
 
 
-def test_coupling_and_load_friction_that_would_drive_are_not_identified(plain):
+@pytest.mark.parametrize('term', ['load', 'coupling'])
+def test_coupling_and_load_friction_that_would_drive_are_not_identified(plain, term):
     """Negative ones reduce the error, too, but friction does not drive."""
     states, gravity = plain[0].copy(), plain[1]
-    states[:, 2, :2] -= 0.05 * (np.abs(gravity) * np.sign(states[:, 1]))[:, :2]
-    states[:, 2, 5:] -= 0.3 * states[:, 1, [6, 5]]
-    found = identify_arm(recording_of(states), ROBOT)
+    if term == 'load':
+        states[:, 2, :2] -= 0.05 * (np.abs(gravity) * np.sign(states[:, 1]))[:, :2]
+    else:
+        states[:, 2, 5:] -= 0.3 * states[:, 1, [6, 5]]
+    found = identify_arm(recording_of(measured(states, 3)), ROBOT)
     assert not found.joint_terms[3, :2].any()
     assert not found.coupling.any()
 
@@ -278,16 +279,6 @@ def test_rows_hold_for_an_exact_motion(period, tolerance):
     assert (np.abs(residual[inner]) < tolerance * scale).all()
     # No window contains the gap.
     assert np.abs(rows.time - t[len(t) // 2]).min() >= 0.1
-
-
-def test_rate_is_the_derivative_of_the_right_hand_side():
-    t = np.arange(0.0, 4.0, PERIOD)[:, None]
-    torque = np.sin(np.linspace(1.0, 9.0, 7) * t)
-    gap = np.zeros(len(t), dtype=bool)
-    model = base_parameters(PANDA_CHAIN, GRAVITY).model
-    rows = rows_of(Recording(PANDA, PERIOD, torque, torque, gap, ''), model)
-    by_difference = (rows.u(0.002) - rows.u(-0.002)) / 0.004
-    np.testing.assert_allclose(rows.rate(0.0)[1:-1], by_difference[1:-1], atol=1e-3)
 
 
 def test_nearest_physical_body_is_found():
