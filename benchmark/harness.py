@@ -100,7 +100,7 @@ class ContestantError(BlfDscError):
     """A contestant has exited early, or does not respond."""
 
 
-class Contestant:
+class Contestant(subprocess.Popen[bytes]):
     """A process of this Python interpreter: a script or `-m module`, and its arguments."""
 
     def __init__(
@@ -108,7 +108,7 @@ class Contestant:
     ) -> None:
         self.name = name
         self._errors = tempfile.TemporaryFile()  # noqa: SIM115 - closed with the process
-        self._process = subprocess.Popen(
+        super().__init__(
             [sys.executable, *arguments],
             env={**os.environ, **(environment or {})},
             stdout=subprocess.DEVNULL,
@@ -117,11 +117,11 @@ class Contestant:
 
     def cpu_time(self) -> float:
         """Return the user and system time of the process so far [s]."""
-        return time.clock_gettime(~self._process.pid << 3 | _CPUCLOCK_SCHED)
+        return time.clock_gettime(~self.pid << 3 | _CPUCLOCK_SCHED)
 
     def check(self) -> None:
         """Raise ContestantError, with the end of its stderr, if the process has ended."""
-        code = self._process.poll()
+        code = self.poll()
         if code is not None:
             self._errors.seek(0)
             errors = self._errors.read().decode(errors='replace')[-_TAIL:].strip()
@@ -129,12 +129,12 @@ class Contestant:
 
     def end(self) -> None:
         """End the process as Ctrl-C does, or kill it if that is not enough."""
-        self._process.send_signal(signal.SIGINT)
+        self.send_signal(signal.SIGINT)
         try:
-            self._process.wait(_ENDING)
+            self.wait(_ENDING)
         except subprocess.TimeoutExpired:
-            self._process.kill()
-            self._process.wait()
+            self.kill()
+            self.wait()
         self._errors.close()
 
 

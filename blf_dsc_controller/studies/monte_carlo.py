@@ -265,11 +265,6 @@ class Distribution:
     written: str  # a key of _INVERSES
     arguments: tuple[Drawn, ...]
 
-    @property
-    def name(self) -> str:
-        """Name before the parenthesis."""
-        return self.written.partition('(')[0]
-
     def at(self, u: float) -> Drawn:
         """Return the value below which the fraction `u`, in [0, 1), of all draws lies."""
         return _INVERSES[self.written](u, *self.arguments)
@@ -285,7 +280,7 @@ class Distribution:
         return (mean - TAIL * deviation, mean + TAIL * deviation)
 
     def __str__(self) -> str:
-        return f'{self.name}({", ".join(map(str, self.arguments))})'
+        return f'{self.written.partition("(")[0]}({", ".join(map(str, self.arguments))})'
 
 
 def parse(text: object, kind: Kind) -> Distribution:
