@@ -29,6 +29,7 @@ os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
 sys.path.append(str(Path(__file__).parents[1] / 'test'))
 
 import time
+from contextlib import suppress
 from typing import Any
 
 import numpy as np
@@ -96,23 +97,22 @@ def main() -> None:
 def _identified(arms: int) -> list[tuple[str, ...]]:
     results = np.array([_of_arm(seed) for seed in range(arms)])  # (arms, rates, columns)
     print(f'{arms} arms, {np.sum(results[:, :, 4] == 0.0)} results with unphysical bodies')
-    rows: list[tuple[str, ...]] = []
-    for every, rate in zip(_EVERY, np.swapaxes(results, 0, 1), strict=True):
-        before, after = (
-            f'{np.median(e):.2f} % (95 of 100: {np.percentile(e, 95):.2f})' for e in rate.T[:2]
+    return [
+        (
+            f'{1.0 / (every * PERIOD):.0f} Hz',
+            *(f'{np.median(e):.2f} % (95 of 100: {np.percentile(e, 95):.2f})' for e in rate[:2]),
+            f'{100.0 * rate[2].mean():.1f} % hold the truth',
+            f'{np.median(rate[3]):.2f} s',
         )
-        inside = f'{100.0 * rate[:, 2].mean():.1f} % hold the truth'
-        seconds = f'{np.median(rate[:, 3]):.2f} s'
-        rows.append((f'{1.0 / (every * PERIOD):.0f} Hz', before, after, inside, seconds))
-    return rows
+        for every, rate in zip(_EVERY, np.transpose(results, (1, 2, 0)), strict=True)
+    ]
 
 
 def _robot(seed: int) -> Robot:
-    if seed % 3 == 0:
-        return Robot(urdf=(CONFIG / 'panda.urdf').read_text(), tip='panda_hand_tcp')
-    if seed % 3 == 1:
-        return Robot(urdf=(CONFIG / 'ur5e.urdf').read_text(), tip='tool0')
-    return Robot(urdf=random_urdf(6, seed)[0], tip='tip', payload=1.0)
+    if seed % 3 == 2:
+        return Robot(urdf=random_urdf(6, seed)[0], tip='tip', payload=1.0)
+    file, tip = (('panda.urdf', 'panda_hand_tcp'), ('ur5e.urdf', 'tool0'))[seed % 3]
+    return Robot(urdf=(CONFIG / file).read_text(), tip=tip)
 
 
 def _of_arm(seed: int) -> list[tuple[float, ...]]:
@@ -167,14 +167,11 @@ def _weighed(name: str, runs: int) -> tuple[str, ...]:
     off = loads[:, :, 0] - true
     known = np.isfinite(off)
     cells = []
-    for k in range(true.size):
-        errors = 1e3 * np.abs(off[known[:, k], k])
-        unknown = f', {np.sum(~known[:, k])} unknown' if not known[:, k].all() else ''
-        half = 1e3 * np.median(loads[known[:, k], k, 4])
-        cells.append(
-            f'{np.median(errors):.0f}, {np.percentile(errors, 95):.0f}, {errors.max():.0f} '
-            f'(± {half:.0f}{unknown})'
-        )
+    for k, is_known in enumerate(known.T):
+        errors = 1e3 * np.percentile(np.abs(off[is_known, k]), (50.0, 95.0, 100.0))
+        unknown = f', {np.sum(~is_known)} unknown' if not is_known.all() else ''
+        half = 1e3 * np.median(loads[is_known, k, 4])
+        cells.append(f'{", ".join(f"{each:.0f}" for each in errors)} (± {half:.0f}{unknown})')
     centre = loads[:, -1, 1:4]
     found = np.isfinite(centre[:, 0])
     middle, half = (1e3 * np.median(np.abs(x)) for x in (centre[found], loads[found, -1, 5:]))
@@ -188,14 +185,11 @@ def _weighed(name: str, runs: int) -> tuple[str, ...]:
 def _weigh(name: str, seed: int) -> Floats:
     """Return what is held (readings, 8) before the pick-up and after it."""
     random = np.random.default_rng(seed)
-    begin = round(random.uniform(10.0, 14.0), 3)
-    while True:
+    begin, record = round(random.uniform(10.0, 14.0), 3), None
+    while record is None:
         config = _random_loop(name, seed, begin, random)
-        try:
+        with suppress(MotionError):  # no approach keeps the limits: another motion
             record = simulate(config.controller, config.plant, supervised=False)
-        except MotionError:
-            continue
-        break
     load = sample_columns(record.samples, record.controller.settings).load
     times = np.array((begin, *(begin + t for t in _AFTER)))
     return np.asarray(load[np.round(times / config.controller.sample_time).astype(int)])

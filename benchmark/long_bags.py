@@ -12,6 +12,8 @@ import sys
 import tempfile
 from pathlib import Path
 
+from harness import print_table
+
 _COMMAND = [sys.executable, '-m', 'blf_dsc_controller']
 _RECORD = ('run', '--config', 'panda', '--offline', '--duration')
 _TOOLS = {
@@ -34,16 +36,17 @@ def measured(folder: Path, *words: str) -> tuple[float, float]:
 
 def main() -> None:
     """Print a row for each bag."""
-    print('| bag | size | ' + ' | '.join(_TOOLS) + ' |')
-    print('| --- ' * (2 + len(_TOOLS)) + '|')
-    for minutes in sys.argv[1:]:
-        with tempfile.TemporaryDirectory() as name:
-            folder = Path(name)
-            measured(folder, *_RECORD, f'{60.0 * float(minutes)}', '--out', 'run')
-            size = sum(file.stat().st_size for file in (folder / 'run/bag').iterdir())
-            cells = (measured(folder, tool, 'run/bag', *words) for tool, words in _TOOLS.items())
-            figures = ' | '.join(f'{cpu:.1f} s, {memory:.0f} MB' for cpu, memory in cells)
-        print(f'| {minutes} min | {1e-9 * size:.2f} GB | {figures} |', flush=True)
+    print_table(('bag', 'size', *_TOOLS), map(_row, sys.argv[1:]))
+
+
+def _row(minutes: str) -> tuple[str, ...]:
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        measured(folder, *_RECORD, f'{60.0 * float(minutes)}', '--out', 'run')
+        size = sum(file.stat().st_size for file in (folder / 'run/bag').iterdir())
+        used = [measured(folder, tool, 'run/bag', *words) for tool, words in _TOOLS.items()]
+    figures = (f'{cpu:.1f} s, {memory:.0f} MB' for cpu, memory in used)
+    return f'{minutes} min', f'{1e-9 * size:.2f} GB', *figures
 
 
 if __name__ == '__main__':

@@ -314,7 +314,10 @@ def test_start_rejected_by_the_controller_has_its_own_outcome(tmp_path):
     assert np.isnan(results['latch_time_s'][rejected]).all()
 
 
-@pytest.mark.parametrize('changes', [{}, {'enabled: false': 'enabled: true', '2.0e-5': '1.0e-3'}])
+APPROACHING = {'enabled: false': 'enabled: true', 'loguniform(1.0e-6, 2.0e-5)': 'choice(0.002)'}
+
+
+@pytest.mark.parametrize('changes', [{}, APPROACHING])
 def test_state_of_one_run_does_not_leak_into_the_next(tmp_path, changes):
     """Nor its approach, from a start that noise moved outside the bound."""
     text = LOOP + STUDY
