@@ -41,21 +41,13 @@ _telemetry = partial(parameter, read_only='topics are created once, when the nod
 _known = partial(parameter, read_only='it is known data, not a gain')
 _SAMPLES = (10, 1_000_000)  # per window: fewer do not determine P, more need over 100 MB
 
-LAWS = ('blf_dsc', 'model_based', 'backstepping', 'slotine_li')
-
-MODELS: dict[str, int | None] = {'two_link': 2, 'planar_chain': None, 'urdf': None}
-"""Number of joints of each model of the arm; None: any number."""
-
 
 @dataclass(frozen=True)
 class Reference:
     """The reference to track, until a trajectory arrives on `~/joint_trajectory`.
 
-    sinusoids  qr_i = offset_i + sum_k amplitude_ik cos(frequency_k t + phase_k)
-    waypoints  minimum jerk through `points` at `times`, at rest at both ends
-    hold       the initial position
-
-    `amplitude` and `points` hold one row per joint, row by row.
+    Sinusoids are qr_i = offset_i + sum_k amplitude_ik cos(frequency_k t + phase_k); waypoints are
+    passed with minimum jerk, at rest at both ends.
     """
 
     type: Literal['sinusoids', 'waypoints', 'hold'] = _of_reference(
@@ -486,8 +478,10 @@ class Telemetry:
 class ControllerConfig(ArmConfig):
     """Parameters of the node `blf_dsc_controller`; the defaults are the recommended set."""
 
-    law: str = _size('blf_dsc', 'control law', choices=LAWS)
-    model: str = _size('two_link', 'model of the arm', choices=tuple(MODELS))
+    law: Literal['blf_dsc', 'model_based', 'backstepping', 'slotine_li'] = _size(
+        'blf_dsc', 'control law'
+    )
+    model: Literal['two_link', 'planar_chain', 'urdf'] = _size('two_link', 'model of the arm')
     arm: ArmGeometry = ArmGeometry()
     reference: Reference = Reference()
     approach: Approach = Approach()
@@ -534,7 +528,7 @@ class ControllerConfig(ArmConfig):
 
     def problems(self) -> Iterator[str]:
         """Check the parameters against each other, joints and estimates against the model."""
-        needed = MODELS[self.model]
+        needed = 2 if self.model == 'two_link' else None
         count = parameter_count(needed or len(self.joints))
         if self.model == 'urdf':
             count = learned_of(self.robot, self.robot.chain(self.joints)).model.p
