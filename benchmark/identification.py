@@ -53,7 +53,7 @@ from blf_dsc_controller.identification.prior import base_matrix
 from blf_dsc_controller.identification.recording import Recording, rows_of
 from blf_dsc_controller.law.factory import begin, controller_of
 from blf_dsc_controller.law.telemetry import sample_columns
-from blf_dsc_controller.reference.limits import MotionError
+from blf_dsc_controller.reference.approach import MotionError
 from blf_dsc_controller.run import Floats
 from blf_dsc_controller.simulation.loop import simulate
 

@@ -70,8 +70,6 @@ class LearnedArm:
     units: Mapping[str, str]  # of each estimate by name
     deviations: Mapping[str, float]  # standard deviations of their prior, in these units
     regressor: Regressor
-    base: tuple[tuple[str, ...], Regressor] | None = None
-    """Names of the base parameters and their regressor, if other parameters are learned."""
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,7 @@ import numpy as np
 
 from blf_dsc_controller.compiled.jit import called, inner
 from blf_dsc_controller.compiled.layout import Array, Cell, size_of, view_of
-from sim_plant.motion import JointDisturbance
+from sim_plant.motion import Motion
 from sim_plant.rigid_body import BodyMotion, RigidBodies, gravity_torque, locate
 
 
@@ -29,7 +29,7 @@ class Drives(NamedTuple):
     delay: int  # samples
     decay: float  # of the lag over a sample, exp(-T / time constant); 0: no lag
     mean_decay: float  # its mean over the sample
-    noise: float  # standard deviation, relative to the torque
+    torque_noise: float  # standard deviation, relative to the torque
 
 
 class DriveState(NamedTuple):
@@ -66,8 +66,8 @@ def actuate(drives: Drives, sample: int, command: np.ndarray, state: DriveState)
             lacking = state.motor[i] - torque
             state.motor[i] = torque + drives.decay * lacking
             torque += drives.mean_decay * lacking
-        if drives.noise > 0.0:
-            torque *= 1.0 + drives.noise * state.noise[i]
+        if drives.torque_noise > 0.0:
+            torque *= 1.0 + drives.torque_noise * state.noise[i]
         state.applied[i] = torque
 
 
@@ -116,19 +116,20 @@ def fill_gravity(bodies_vector: Array, memory: Array, q: Array, still: Array, ou
 def compensate(
     compensation: Compensation,
     bodies: Array,
-    friction: JointDisturbance,
+    motion: Motion,
     q: np.ndarray,
     dq: np.ndarray,
     state: CompensationState,
 ) -> None:
-    """Write what the drives add at q, dq (n,); `friction` is the true one."""
+    """Write what the drives add at q, dq (n,), by the true friction of a motion."""
     if bodies.size == 0:
         return
     fill_gravity(bodies, state.memory, q, state.still, state.added)
     if compensation.friction > 0.0:
         for i in range(q.size):
-            torque = friction.viscous[i] * dq[i]
-            torque += friction.coulomb[i] * tanh(dq[i] / friction.coulomb_velocity[i])
+            torque = motion.acting.viscous[i] * dq[i]
+            speed = dq[i] / motion.disturbance.coulomb_velocity[i]
+            torque += motion.acting.coulomb[i] * tanh(speed)
             state.added[i] += compensation.friction * torque
 
 

@@ -11,7 +11,7 @@ from typing import Annotated, NamedTuple
 import numpy as np
 
 from blf_dsc_controller.compiled.jit import inner, kernel
-from blf_dsc_controller.compiled.layout import Array, Cell, part, size_of, view, view_of
+from blf_dsc_controller.compiled.layout import Array, Cell, Passed, part, size_of, view, view_of
 from sim_plant.arm import Arm
 from sim_plant.drives import (
     Compensation,
@@ -24,7 +24,6 @@ from sim_plant.drives import (
 )
 from sim_plant.motion import (
     Acting,
-    Contact,
     EventSettings,
     JointDisturbance,
     LoadSettings,
@@ -48,7 +47,7 @@ class PlantSettings(NamedTuple):
     """
 
     arm: Arm
-    n: int
+    n: Passed  # joints of the arm
     p: int  # parameters of the arm
     period_ns: int
     steps: int  # of the integrator in a sample
@@ -89,7 +88,7 @@ def plant_views(
     arm: Arm, settings: np.ndarray, state: np.ndarray
 ) -> tuple[PlantSettings, PlantState]:
     """Return views of both vectors, not reference-counted."""
-    plant = settings_of(view(settings), arm)
+    plant = settings_of(view(settings), arm, arm.joint_count())
     return plant, state_of(view(state), plant)
 
 
@@ -108,36 +107,17 @@ def attach_load(plant: PlantSettings, now: PlantState) -> None:
 @inner
 def update_motion(plant: PlantSettings, now: PlantState) -> Motion:
     """Return the equation of motion of this sample."""
-    acting, disturbance = now.acting, plant.disturbance
-    update_acting(disturbance, plant.load, plant.schedule, now.sample[0], acting)
+    update_acting(plant.disturbance, plant.load, plant.schedule, now.sample[0], now.acting)
     attach_load(plant, now)
-    return Motion(
-        plant.arm,
-        acting.payload[0],
-        JointDisturbance(
-            acting.constant,
-            disturbance.amplitude,
-            disturbance.frequency,
-            disturbance.phase,
-            acting.viscous,
-            acting.coulomb,
-            disturbance.coulomb_velocity,
-            disturbance.stribeck,
-            disturbance.stribeck_velocity,
-            disturbance.ripple,
-            disturbance.ripple_frequency,
-        ),
-        Contact(acting.force, plant.wall, plant.slosh, acting.sloshing[0], now.tip),
-    )
+    return Motion(plant.arm, plant.disturbance, now.acting, plant.wall, plant.slosh, now.tip)
 
 
 @inner
 def add_compensation(plant: PlantSettings, now: PlantState) -> None:
     """Compute what the drives add in this sample, by the true state."""
-    n = plant.n
-    friction = update_motion(plant, now).disturbance
+    n, motion = plant.n, update_motion(plant, now)
     q, dq = part(now.x, 0, (n,)), part(now.x, n, (n,))
-    compensate(plant.compensation, plant.drive_bodies, friction, q, dq, now.compensation)
+    compensate(plant.compensation, plant.drive_bodies, motion, q, dq, now.compensation)
 
 
 @inner
@@ -154,7 +134,7 @@ def draw_noise(plant: PlantSettings, now: PlantState, rng: np.random.Generator) 
     if is_due(plant, now):
         if is_noisy(plant.encoders):
             draw(rng, now.reading.noise)
-        if plant.drives.noise > 0.0:
+        if plant.drives.torque_noise > 0.0:
             draw(rng, now.drives.noise)
 
 
@@ -197,11 +177,10 @@ def step(plant: PlantSettings, now: PlantState, command: np.ndarray) -> None:
     add_compensation(plant, now)
     for i in range(plant.n):
         own.whole[i] = now.drives.applied[i] + own.added[i]
-    size = 2 * plant.n + 6 if motion.contact.mass > 0.0 else 2 * plant.n
-    x, h = part(now.x, 0, (size,)), plant.period_ns * 1e-9 / plant.steps
+    h = plant.period_ns * 1e-9 / plant.steps
     for k in range(plant.steps):
         t = now.sample[0] * plant.period_ns * 1e-9 + k * h
-        integrate(motion, t, h, own.whole, x, now.stages)
+        integrate(motion, t, h, own.whole, now.x, now.stages)
     now.sample[0] += 1.0
 
 
@@ -211,7 +190,7 @@ def truth(plant: PlantSettings, now: PlantState, out: np.ndarray) -> None:
     n = plant.n
     t = now.sample[0] * plant.period_ns * 1e-9
     motion = update_motion(plant, now)
-    motion.arm.fill_parameters(motion.payload, out)
+    plant.arm.fill_parameters(now.acting.payload[0], out)
     disturbing_torque(motion, t, now.x, part(out, plant.p, (n,)))
     for i in range(2 * n):
         out[plant.p + n + i] = now.x[i]

@@ -26,7 +26,7 @@ from sim_plant.arm import Arm
 
 
 class JointDisturbance(NamedTuple):
-    """Disturbance of each joint."""
+    """Disturbance of each joint; constant, viscous and coulomb as they are without events."""
 
     constant: Annotated[Array, 'n']  # N m
     amplitude: Annotated[Array, 'n']  # N m
@@ -39,30 +39,6 @@ class JointDisturbance(NamedTuple):
     stribeck_velocity: float  # rad/s
     ripple: Annotated[Array, 'n']  # N m
     ripple_frequency: float  # rad/rad
-
-
-@inner
-def disturbance_torque(
-    disturbance: JointDisturbance, t: float, q: np.ndarray, dq: np.ndarray, out: np.ndarray
-) -> None:
-    """Write tau_dist (n,) [N m] at time t [s].
-
-    Friction has the sign of the velocity; Coulomb friction is smoothed by tanh, so that the
-    fixed-step integrator keeps its order.
-    """
-    for i in range(dq.size):
-        angle = disturbance.frequency[i] * t + disturbance.phase[i]
-        torque = disturbance.constant[i] + disturbance.amplitude[i] * sin(angle)
-        torque += disturbance.viscous[i] * dq[i]
-        if disturbance.coulomb[i] != 0.0:
-            level = disturbance.coulomb[i]
-            if disturbance.stribeck != 0.0:
-                speed = dq[i] / disturbance.stribeck_velocity
-                level *= 1.0 + disturbance.stribeck * exp(-speed * speed)
-            torque += level * tanh(dq[i] / disturbance.coulomb_velocity[i])
-        if disturbance.ripple[i] != 0.0:
-            torque += disturbance.ripple[i] * sin(disturbance.ripple_frequency * q[i])
-        out[i] = torque
 
 
 class WallSettings(NamedTuple):
@@ -92,16 +68,6 @@ class TipState(NamedTuple):
     pull: Annotated[Array, '3']  # a, m/s^2
 
 
-class Contact(NamedTuple):
-    """Sources of the force at the tip."""
-
-    push: np.ndarray  # (3,) N
-    wall: WallSettings
-    slosh: SloshSettings
-    mass: float  # m of the sloshing load, kg; 0: none
-    tip: TipState
-
-
 @inner
 def wall_force(wall: WallSettings, position: np.ndarray, velocity: np.ndarray) -> float:
     """Return the normal force [N], >= 0, on a tip with position (3,) [m] and velocity (3,) [m/s].
@@ -126,30 +92,6 @@ def locate_tip(arm: Arm, q: np.ndarray, dq: np.ndarray, tip: TipState) -> None:
         tip.velocity[i] = 0.0
         for j in range(dq.size):
             tip.velocity[i] += tip.jacobian[i, j] * dq[j]
-
-
-@inner
-def subtract_contact_torque(arm: Arm, contact: Contact, x: np.ndarray, torque: np.ndarray) -> None:
-    """Subtract the contact torque J^T f (n,) [N m] from `torque`, in place.
-
-    `x` (2n + 6,) is [q, dq, y, v]; the last two are those of the sloshing load.
-    """
-    push, wall, slosh, mass, tip = contact
-    n = torque.size
-    is_pushed = push[0] != 0.0 or push[1] != 0.0 or push[2] != 0.0
-    if not is_pushed and wall.stiffness == 0.0 and mass == 0.0:
-        return
-    locate_tip(arm, part(x, 0, (n,)), part(x, n, (n,)), tip)
-    size = wall_force(wall, tip.position, tip.velocity) if wall.stiffness > 0.0 else 0.0
-    for i in range(3):
-        tip.force[i] = push[i] + size * wall.normal[i]
-        if mass > 0.0:
-            tip.pull[i] = slosh.stiffness * (x[2 * n + i] - tip.position[i])
-            tip.pull[i] += slosh.damping * (x[2 * n + 3 + i] - tip.velocity[i])
-            tip.force[i] += mass * tip.pull[i]
-    for j in range(n):
-        for i in range(3):
-            torque[j] -= tip.jacobian[i, j] * tip.force[i]
 
 
 class LoadSettings(NamedTuple):
@@ -253,17 +195,65 @@ class Motion(NamedTuple):
     """Everything that determines the acceleration besides state and motor torque."""
 
     arm: Arm
-    payload: float  # kg
     disturbance: JointDisturbance
-    contact: Contact
+    acting: Acting
+    wall: WallSettings
+    slosh: SloshSettings
+    tip: TipState
+
+
+@inner
+def disturbance_torque(
+    motion: Motion, t: float, q: np.ndarray, dq: np.ndarray, out: np.ndarray
+) -> None:
+    """Write the torque (n,) [N m] of disturbance and friction at time t [s].
+
+    Friction has the sign of the velocity; Coulomb friction is smoothed by tanh, so that the
+    fixed-step integrator keeps its order.
+    """
+    given, acting = motion.disturbance, motion.acting
+    for i in range(dq.size):
+        angle = given.frequency[i] * t + given.phase[i]
+        torque = acting.constant[i] + given.amplitude[i] * sin(angle)
+        torque += acting.viscous[i] * dq[i]
+        if acting.coulomb[i] != 0.0:
+            level = acting.coulomb[i]
+            if given.stribeck != 0.0:
+                speed = dq[i] / given.stribeck_velocity
+                level *= 1.0 + given.stribeck * exp(-speed * speed)
+            torque += level * tanh(dq[i] / given.coulomb_velocity[i])
+        if given.ripple[i] != 0.0:
+            torque += given.ripple[i] * sin(given.ripple_frequency * q[i])
+        out[i] = torque
+
+
+@inner
+def subtract_contact_torque(motion: Motion, x: np.ndarray, torque: np.ndarray) -> None:
+    """Subtract the torque J^T f (n,) [N m] of the force at the tip from `torque`, in place."""
+    push, wall, slosh, tip = motion.acting.force, motion.wall, motion.slosh, motion.tip
+    n, mass = torque.size, motion.acting.sloshing[0]
+    is_pushed = push[0] != 0.0 or push[1] != 0.0 or push[2] != 0.0
+    if not is_pushed and wall.stiffness == 0.0 and mass == 0.0:
+        return
+    locate_tip(motion.arm, part(x, 0, (n,)), part(x, n, (n,)), tip)
+    size = wall_force(wall, tip.position, tip.velocity) if wall.stiffness > 0.0 else 0.0
+    for i in range(3):
+        tip.force[i] = push[i] + size * wall.normal[i]
+        if mass > 0.0:
+            tip.pull[i] = slosh.stiffness * (x[2 * n + i] - tip.position[i])
+            tip.pull[i] += slosh.damping * (x[2 * n + 3 + i] - tip.velocity[i])
+            tip.force[i] += mass * tip.pull[i]
+    for j in range(n):
+        for i in range(3):
+            torque[j] -= tip.jacobian[i, j] * tip.force[i]
 
 
 @inner
 def disturbing_torque(motion: Motion, t: float, x: np.ndarray, out: np.ndarray) -> None:
     """Write tau_dist (n,) [N m] at time t [s], contact included; `x` as in `state_derivative`."""
     n = out.size
-    disturbance_torque(motion.disturbance, t, part(x, 0, (n,)), part(x, n, (n,)), out)
-    subtract_contact_torque(motion.arm, motion.contact, x, out)
+    disturbance_torque(motion, t, part(x, 0, (n,)), part(x, n, (n,)), out)
+    subtract_contact_torque(motion, x, out)
 
 
 @inner
@@ -271,19 +261,18 @@ def state_derivative(
     motion: Motion, t: float, x: np.ndarray, torque: np.ndarray, dx: np.ndarray
 ) -> None:
     """Write dx/dt of x = [q, dq, y, v] (2n + 6,), of which y and v only while a load sloshes."""
-    n = torque.size
+    n, acting = torque.size, motion.acting
     q, dq = part(x, 0, (n,)), part(x, n, (n,))
     velocity, net_torque = part(dx, 0, (n,)), part(dx, n, (n,))
     disturbing_torque(motion, t, x, net_torque)
     for i in range(n):
         velocity[i] = dq[i]
         net_torque[i] = torque[i] - net_torque[i]
-    motion.arm.accelerate(motion.payload, q, dq, net_torque, net_torque)  # in place
-    contact = motion.contact
-    if contact.mass > 0.0:
+    motion.arm.accelerate(acting.payload[0], q, dq, net_torque, net_torque)  # in place
+    if acting.sloshing[0] > 0.0:
         for i in range(3):
             dx[2 * n + i] = x[2 * n + 3 + i]
-            dx[2 * n + 3 + i] = contact.slosh.gravity[i] - contact.tip.pull[i]
+            dx[2 * n + 3 + i] = motion.slosh.gravity[i] - motion.tip.pull[i]
 
 
 _C = np.array([0, 1 / 5, 3 / 10, 4 / 5, 8 / 9, 1])
@@ -295,9 +284,9 @@ _A = np.array(
         [44 / 45, -56 / 15, 32 / 9, 0, 0, 0],
         [19372 / 6561, -25360 / 2187, 64448 / 6561, -212 / 729, 0, 0],
         [9017 / 3168, -355 / 33, 46732 / 5247, 49 / 176, -5103 / 18656, 0],
+        [35 / 384, 0, 500 / 1113, 125 / 192, -2187 / 6784, 11 / 84],  # b
     ]
 )
-_B = np.array([35 / 384, 0, 500 / 1113, 125 / 192, -2187 / 6784, 11 / 84])
 
 
 class Stages(NamedTuple):
@@ -308,23 +297,30 @@ class Stages(NamedTuple):
 
 
 @inner
+def combine(x: Array, h: float, stage: int, k: Array, begin: int, end: int, out: Array) -> None:
+    """Write entries `begin` to `end` of x + h sum_j a_ij k_j; after the last stage, with b_j."""
+    for i in range(begin, end):
+        slope = 0.0
+        for j in range(stage):
+            slope += _A[stage, j] * k[j, i]
+        out[i] = x[i] + h * slope
+
+
+@inner
 def integrate(
     motion: Motion, t: float, h: float, torque: np.ndarray, x: np.ndarray, stages: Stages
 ) -> None:
-    """Advance x in place from t to t + h [s] under a held torque (n,) [N m].
+    """Advance x = [q, dq, y, v] (2n + 6,) in place from t to t + h [s] under a held torque (n,).
 
-    `x` is [q, dq] (2n,), or [q, dq, y, v] (2n + 6,) while a load sloshes.
+    y and v are advanced only while a load sloshes, and may be absent otherwise.
     """
-    point, k = stages.point, stages.k
-    for stage in range(_B.size):
-        for i in range(x.size):
-            slope = 0.0
-            for j in range(stage):
-                slope += _A[stage, j] * k[j, i]
-            point[i] = x[i] + h * slope
+    point, k, end = stages.point, stages.k, 2 * torque.size
+    sloshes = motion.acting.sloshing[0] > 0.0
+    for stage in range(_C.size):
+        combine(x, h, stage, k, 0, end, point)
+        if sloshes:
+            combine(x, h, stage, k, end, end + 6, point)
         state_derivative(motion, t + _C[stage] * h, point, torque, k[stage])
-    for i in range(x.size):
-        slope = 0.0
-        for j in range(_B.size):
-            slope += _B[j] * k[j, i]
-        x[i] += h * slope
+    combine(x, h, _C.size, k, 0, end, x)
+    if sloshes:
+        combine(x, h, _C.size, k, end, end + 6, x)

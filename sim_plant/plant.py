@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar, get_type_hints
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -36,6 +36,8 @@ from sim_plant.motion import (
 )
 from sim_plant.rigid_body import rigid_arm, rigid_bodies
 from sim_plant.sensors import VELOCITY_SOURCES, Encoders, generator, is_noisy
+
+T = TypeVar('T')
 
 _RESOLVED = 1.5  # decay within a step; the integrator is stable up to 3.3
 _MOST_STEPS = 1000
@@ -69,7 +71,7 @@ class Plant:
         self.state = np.zeros(state_size(settings))
         self._now = state_of(self.state, settings)
         self._noises = [self._now.reading.noise] if is_noisy(settings.encoders) else []
-        self._noises += [self._now.drives.noise] if settings.drives.noise > 0.0 else []
+        self._noises += [self._now.drives.noise] if settings.drives.torque_noise > 0.0 else []
         self._q, self._dq = self._now.x[: 2 * self.joints].reshape(2, -1)
         self._q[:], self._dq[:] = position, velocity
         self._now.reading.sample[0] = self._now.acting.sample[0] = -1.0
@@ -186,8 +188,9 @@ def plant_of(config: PlantConfig) -> Plant:
 def plant_settings(config: PlantConfig) -> PlantSettings:
     """Return the settings of a configured plant."""
     arm, n = arm_of(config), len(config.joints)
-    sensor, actuator, load, wall = config.sensor, config.actuator, config.load, config.wall
+    sensor, actuator, wall = config.sensor, config.actuator, config.wall
     robot, drive, bodies = config.robot, config.drive, drive_bodies(config)
+    decay, mean_decay = lag(actuator.time_constant, config.sample_time)
     return PlantSettings(
         arm=arm,
         n=n,
@@ -195,21 +198,15 @@ def plant_settings(config: PlantConfig) -> PlantSettings:
         period_ns=config.sample_time_ns,
         steps=_steps_of(config, arm),
         events=len(config.events.begin),
-        encoders=Encoders(
-            sensor.position_noise,
-            sensor.velocity_noise,
-            sensor.resolution,
-            VELOCITY_SOURCES[sensor.velocity],
-            sensor.velocity_pole,
-            sensor.repeat_every,
+        encoders=_filled(Encoders, sensor, velocity_source=VELOCITY_SOURCES[sensor.velocity]),
+        disturbance=_filled(
+            JointDisturbance,
+            config.disturbance,
+            coulomb_velocity=np.full(n, config.disturbance.coulomb_velocity),
+            ripple=actuator.ripple * np.array(actuator.torque_limit),
+            ripple_frequency=actuator.ripple_cycles,
         ),
-        disturbance=_disturbance_of(config),
-        drives=Drives(
-            np.array(actuator.torque_limit),
-            actuator.delay,
-            *lag(actuator.time_constant, config.sample_time),
-            actuator.torque_noise,
-        ),
+        drives=_filled(Drives, actuator, decay=decay, mean_decay=mean_decay),
         compensation=Compensation(
             drive.friction if robot.drive_compensates == 'gravity_and_friction' else 0.0,
             int(robot.effort != 'commanded'),
@@ -220,12 +217,9 @@ def plant_settings(config: PlantConfig) -> PlantSettings:
         drive_size=bodies.size,
         drive_memory=memory_size(arm) if bodies.size else 0,
         drive_bodies=bodies,
-        load=LoadSettings(load.payload, *map(np.array, (load.torque, load.force, sensor.offset))),
-        wall=WallSettings(
-            np.array(wall.point),
-            np.array(wall.normal) / np.linalg.norm(wall.normal),
-            wall.stiffness,
-            wall.damping,
+        load=_filled(LoadSettings, config.load, sensor),
+        wall=_filled(
+            WallSettings, wall, normal=np.array(wall.normal) / np.linalg.norm(wall.normal)
         ),
         slosh=_slosh_of(config),
         schedule=_schedule_of(config),
@@ -253,21 +247,15 @@ def _steps_of(config: PlantConfig, arm: Arm) -> int:
     return min(max(1, math.ceil(config.sample_time * rate / _RESOLVED)), _MOST_STEPS)
 
 
-def _disturbance_of(config: PlantConfig) -> JointDisturbance:
-    given, actuator = config.disturbance, config.actuator
-    return JointDisturbance(
-        constant=np.array(given.constant),
-        amplitude=np.array(given.amplitude),
-        frequency=np.array(given.frequency),
-        phase=np.array(given.phase),
-        viscous=np.array(given.viscous),
-        coulomb=np.array(given.coulomb),
-        coulomb_velocity=np.full(len(config.joints), given.coulomb_velocity),
-        stribeck=given.stribeck,
-        stribeck_velocity=given.stribeck_velocity,
-        ripple=actuator.ripple * np.array(actuator.torque_limit),
-        ripple_frequency=actuator.ripple_cycles,
-    )
+def _filled(layout: type[T], *groups: object, **computed: object) -> T:
+    """Return a layout with the parameters named as its fields, and what is computed."""
+    given = {
+        name: np.array(value) if isinstance(value, tuple) else value
+        for group in groups
+        for name, value in vars(group).items()
+        if name in get_type_hints(layout)
+    }
+    return layout(**given | computed)
 
 
 def _slosh_of(config: PlantConfig) -> SloshSettings:

@@ -18,7 +18,7 @@ from typing import Annotated, NamedTuple
 import numpy as np
 
 from blf_dsc_controller.arms.base_parameters import BaseParameters
-from blf_dsc_controller.arms.inertia import inertia_of, pseudo_inertia, rotational_inertia
+from blf_dsc_controller.arms.inertia import pseudo_inertia, rotational_inertia
 from blf_dsc_controller.arms.urdf import Chain
 from blf_dsc_controller.compiled import cholesky
 from blf_dsc_controller.compiled.jit import called, inner
@@ -286,6 +286,10 @@ class RigidArm(NamedTuple):
     content: Array  # ArmContent
     memory: Array  # BodyMotion
 
+    def joint_count(self) -> int:
+        """Return n."""
+        return self.n
+
     def fill_parameters(self, payload: float, P: Array) -> None:
         """Write the base parameters P (p,) with a payload [kg]."""
         content = content_of(self.content)
@@ -330,16 +334,13 @@ def rigid_arm(
 ) -> RigidArm:
     """Return an arm with a chain's geometry, inertias (n, 10), rotors (n,) [kg m^2, or kg]."""
     bodies = rigid_bodies(chain, gravity, inertias, rotors)
-    point = np.append(bodies.tip, 1.0)
-    payload = np.zeros_like(inertias)
-    payload[-1] = inertia_of(np.outer(point, point))
     P = parameters.of(inertias, rotors)
     content = ArmContent(
         n=bodies.n,
         p=P.size,
         bodies=bodies,
         P=P,
-        P_payload=parameters.of(payload, np.zeros(bodies.n)),
+        P_payload=parameters.load,
         rest=np.zeros(bodies.n),
     )
     return RigidArm(bodies.n, P.size, pack(content), np.zeros(motion_size(bodies)))

@@ -7,7 +7,7 @@ from sim_plant.arm import PointMassArm
 from sim_plant.drives import Compensation, Drives, lag
 from sim_plant.kernels import PlantSettings
 from sim_plant.motion import (
-    Contact,
+    Acting,
     EventSettings,
     JointDisturbance,
     LoadSettings,
@@ -91,8 +91,10 @@ UNEVENTFUL = EventSettings(*np.zeros((5, 0)), *(np.zeros((0, size)) for size in 
 def motion(arm=ARM, load=None, force=(0.0, 0.0, 0.0), wall=NOWHERE):
     """Return the equation of motion of an arm with a disturbance and a force at its tip."""
     tip = TipState(np.zeros(3), np.zeros(3), np.zeros((3, 2)), np.zeros(3), np.zeros(3))
-    contact = Contact(np.array(force), wall, CALM, 0.0, tip)
-    return Motion(arm, 0.0, load or disturbance(), contact)
+    load, nothing = load or disturbance(), np.zeros(1)
+    friction = load.constant, load.viscous, load.coulomb
+    acting = Acting(nothing, nothing, nothing, np.array(force), np.zeros(2), *friction)
+    return Motion(arm, load, acting, wall, CALM, tip)
 
 
 def settings(

@@ -7,18 +7,15 @@ import numpy as np
 import pinocchio
 import plain_law
 import pytest
-from plain_law import R
+from closed_loop_case import MODEL
 from plants import ARM
 from random_arm import ArmCase, chain_of
 
 from blf_dsc_controller.arms.geometry import Clearance, distance, skeleton, tip_radius
 from blf_dsc_controller.arms.model import arm_model
-from blf_dsc_controller.arms.planar_chain import PlanarChain
 from blf_dsc_controller.arms.two_link import urdf
-from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.plant import PlantConfig
-from blf_dsc_controller.configuration.schema import build, flatten, parameters
-from blf_dsc_controller.law.factory import controller_of
+from blf_dsc_controller.configuration.schema import build
 from sim_plant.arm import PointMassArm
 from sim_plant.plant import parameters_of
 
@@ -53,35 +50,15 @@ def test_urdf_has_an_effort_limit_only_for_limited_motors():
     assert '<joint name="b"' in free
 
 
-PER_JOINT = {
-    item.name: flatten(ControllerConfig())[item.name][0]
-    for item in parameters(ControllerConfig)
-    if item.length == ('joints',) and not item.omittable and not item.name.startswith('reference')
-}
-"""Every parameter with one value per joint, and the first value of its default."""
-
-
-def case(n):
-    """Random lengths (l1 = 1 m), masses, and a state of n joints."""
-    random = np.random.default_rng(n)
-    lengths = np.concatenate(([1.0], random.uniform(0.3, 1.2, n - 1)))
-    masses = random.uniform(0.2, 1.5, n)
-    beyond = np.cumsum(masses[::-1])[::-1]
-    P = np.array([beyond[j] * lengths[i] * lengths[j] for i in range(n) for j in range(i, n)])
-    return lengths, masses, P, random.normal(size=(4, n))
-
-
-def regressor(q, dq, v, a, r=R):
-    arm = PlanarChain(q.size, r)
-    H = np.full((q.size, len(arm.parameter_names)), np.nan)
-    arm.regressor(q, dq, v, a, H)
+def regressor(q, dq, v, a):
+    H = np.full((2, 3), np.nan)
+    MODEL.regressor(q, dq, v, a, H)
     return H
 
 
-def momentum(q, dq, r=R):
-    arm = PlanarChain(q.size, r)
-    Yp, Yr = np.full((2, q.size, len(arm.parameter_names)), np.nan)
-    arm.momentum_regressor(q, dq, Yp, Yr)
+def momentum(q, dq):
+    Yp, Yr = np.full((2, 2, 3), np.nan)
+    MODEL.momentum_regressor(q, dq, Yp, Yr)
     return Yp, Yr
 
 
@@ -99,9 +76,12 @@ def complex_gradient(function, x):
     return np.array([function(x + step).imag for step in steps]) / 1e-30
 
 
-@pytest.mark.parametrize('n', [1, 2, 3, 7])
-def test_chain_agrees_with_the_lagrangian(n):
-    lengths, masses, P, (q, dq, v, a) = case(n)
+@pytest.mark.parametrize('seed', range(4))
+def test_model_agrees_with_the_lagrangian(seed):
+    random = np.random.default_rng(seed)
+    lengths, masses = np.array((1.0, random.uniform(0.3, 1.2))), random.uniform(0.2, 1.5, 2)
+    P = np.array((masses.sum(), masses[1] * lengths[1] ** 2, masses[1] * lengths[1]))
+    q, dq, v, a = random.normal(size=(4, 2))
     Yp, Yr = momentum(q, dq)
 
     p = complex_gradient(lambda rate: energies(lengths, masses, q, rate)[0], dq)
@@ -112,7 +92,7 @@ def test_chain_agrees_with_the_lagrangian(n):
     np.testing.assert_allclose(Yr @ P, lagrange + gravity, atol=1e-10)
 
     # H(q, dq, dq, ddq) P = d/dt(Yp P) + Yr P along a motion with this acceleration.
-    h, zero = 1e-6, np.zeros(n)
+    h, zero = 1e-6, np.zeros(2)
     ahead, behind = (momentum(q + s * dq, dq + s * a)[0] @ P for s in (h, -h))
     expected = (ahead - behind) / (2.0 * h) + Yr @ P
     np.testing.assert_allclose(regressor(q, dq, dq, a) @ P, expected, rtol=1e-7, atol=1e-7)
@@ -126,14 +106,12 @@ def test_chain_agrees_with_the_lagrangian(n):
 @pytest.mark.parametrize('arm', [ARM, PointMassArm(l1=0.7, l2=1.1, m1=1.3, m2=0.4, g=9.81)])
 def test_two_links_are_the_arm_of_section_iv(arm):
     """And of the tests' plain law, and of the simulated arm: M ddq + C dq + G = tau."""
-    model, P = arm_model('two_link', 2, l1=arm.l1, gravity=arm.g), np.empty(3)
+    model, P = arm_model('two_link', l1=arm.l1, gravity=arm.g), np.empty(3)
     arm.fill_parameters(0.0, P)
     for random in map(np.random.default_rng, range(20)):
         q, dq, v, a = random.normal(size=(4, 2))
         H, Yp, Yr = np.full((3, 2, 3), np.nan)
         model.regressors(q, dq, v, a, H, Yp, Yr)
-        columns = regressor(q, dq, v, a, model.r), *momentum(q, dq, model.r)
-        np.testing.assert_allclose(np.array(columns)[:, :, [0, 2, 1]], (H, Yp, Yr), atol=1e-13)
         np.testing.assert_allclose(plain_law.regressor(model.r, q, dq, v, a), H, atol=1e-13)
         M, C, G = plain_law.dynamics(P, model.r, q, dq)
         np.testing.assert_allclose(H @ P, M @ a + C @ v + G, atol=1e-12)
@@ -143,25 +121,6 @@ def test_two_links_are_the_arm_of_section_iv(arm):
     assert model.parameter_units == ('kg m^2',) * 3
     inner, outer = arm.m1 + arm.m2, arm.m2
     assert pytest.approx([inner * arm.l1**2, outer * arm.l2**2, outer * arm.l1 * arm.l2]) == P
-
-
-def test_law_runs_on_three_links():
-    """A configuration of three joints gives a controller with a torque and all its estimates."""
-    given = {
-        'model': 'planar_chain',
-        'joints': ['a', 'b', 'c'],
-        'learning.initial_estimate': [0.5] * 6,
-        'learning.adaptation_gain': [0.5] * 6,
-        'reference.offset': [0.0] * 3,
-        'reference.amplitude': [0.1] * 3,
-    }
-    given |= {name: [value] * 3 for name, value in PER_JOINT.items()}
-    controller = controller_of(build(ControllerConfig, given))
-    torque = controller.update(0.0, 1e-3, np.append(np.full(3, 0.1), np.zeros(6)))
-    at_rest = regressor(np.full(3, 0.1), *np.zeros((3, 3))) @ np.full(6, 0.5)
-    # On the reference, at its turning point, the torque only has to hold the arm.
-    np.testing.assert_allclose(torque, at_rest, atol=0.01)
-    assert controller.state.estimate.size == 6 + 3
 
 
 def test_corners_and_axes_agree_with_pinocchio():

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Chains of a URDF: regressors, base parameters, and the forms of what is learned."""
+"""Chains of a URDF: regressors, base parameters, and their prior."""
 
 from __future__ import annotations
 
@@ -7,17 +7,18 @@ import numpy as np
 import pinocchio
 import pytest
 from closed_loop_case import MODEL
-from plain_law import R
 from random_arm import ARMS, ArmCase, chain_of
 
-from blf_dsc_controller.arms.base_parameters import base_parameters
-from blf_dsc_controller.arms.batch import inertia_matrices, regressors_at
-from blf_dsc_controller.arms.chain_kernels import ROTOR
-from blf_dsc_controller.arms.forms import TRUSTED, learned_parameters
-from blf_dsc_controller.arms.inertia import INERTIA_NAMES, inertia_of, pseudo_inertia
-from blf_dsc_controller.arms.planar_chain import PlanarChain
-from blf_dsc_controller.arms.prior import CENTRE, ROTORS, deviations, payload_inertia, prior_factor
-from blf_dsc_controller.arms.serial_chain import serial_chain
+from blf_dsc_controller.arms.base_parameters import (
+    CENTRE,
+    base_parameters,
+    deviations,
+    payload_inertia,
+    prior_factor,
+)
+from blf_dsc_controller.arms.inertia import inertia_of, pseudo_inertia
+from blf_dsc_controller.arms.model import inertia_matrices, regressors_at
+from blf_dsc_controller.arms.serial_chain import ROTOR, serial_chain
 from sim_plant.rigid_body import rigid_arm
 
 
@@ -60,7 +61,7 @@ def test_regressors_agree_with_pinocchio(name):
     np.testing.assert_allclose(found, M, atol=1e-10)
 
 
-@pytest.mark.parametrize('model', [Case('six').arm, MODEL, PlanarChain(3, R)])
+@pytest.mark.parametrize('model', [Case('six').arm, MODEL])
 def test_regressors_computed_at_once_or_in_a_batch_equal_the_separate_ones(model):
     states = np.random.default_rng(1).normal(size=(5, 4, model.n))
     H = regressors_at(model, *np.moveaxis(states, 1, 0))
@@ -170,89 +171,22 @@ def test_prior_of_a_ball_is_the_same_in_every_direction():
     np.testing.assert_allclose(turned @ turned.T, ten @ ten.T, atol=1e-15)
 
 
-RATED = 3.0  # kg
-ONE_JOINT = chain_of('one')
-
-
-class Learned:
-    """A chain with rotors, all its base parameters, and those of the form `payload`."""
-
-    def __init__(self, chain):
-        self.chain, self.n = chain, len(chain.joints)
-        self.rotors = np.linspace(0.02, 0.2, self.n)
-        self.base = base_parameters(chain, WALL)
-        self.form = learned_parameters(chain, self.base, 'payload', RATED, self.rotors)
-        self.names = self.form.model.parameter_names
-        self.random = np.random.default_rng(5)
-
-    def assert_same_torques(self, P, inertias, rotors):
-        """All regressors times P agree with those of the base parameters and with each other."""
-        expected = self.base.of(inertias, rotors)
-        for state in np.random.default_rng(1).normal(size=(5, 4, self.n)):
-            together = np.full((3, self.n, P.size + 2), np.nan)
-            separate = np.full((3, self.n, P.size), np.nan)
-            whole = np.zeros((3, self.n, expected.size))
-            self.form.model.regressors(*state, *together)
-            self.form.model.regressor(*state, separate[0])
-            self.form.model.momentum_regressor(*state[:2], *separate[1:])
-            self.base.model.regressors(*state, *whole)
-            np.testing.assert_array_equal(together[:, :, :-2], separate)
-            np.testing.assert_allclose(separate @ P, whole @ expected, rtol=1e-10, atol=1e-10)
-
-
-def load_at(chain):
-    """Inertial parameters of a random load in the frame of the tip, and of all bodies with it."""
-    random, inertias = np.random.default_rng(2), chain.inertias
-    points = np.vstack((random.normal(0.05, 0.1, (3, 5)), np.ones(5)))
-    load = points @ np.diag(random.uniform(0.1, 0.8, 5)) @ points.T
-    inertias[-1] += inertia_of(chain.tip_placement @ load @ chain.tip_placement.T)
-    return inertia_of(load), inertias
-
-
-@pytest.mark.parametrize('chain', [*CHAINS, ONE_JOINT])
-def test_parameters_of_the_form_represent_the_arm_and_any_load(chain):
-    """Also those of a short arm, which has fewer of them."""
-    case = Learned(chain)
-    units = case.form.model.parameter_units
-    assert case.form.model.p == case.form.initial.size == len(units)
-    for unit, joint in zip(units, chain.joints, strict=False):  # rotors come first
-        assert unit == ('kg' if joint.kind == 'prismatic' else 'kg m^2')
-    case.assert_same_torques(case.form.initial, chain.inertias, case.rotors)
-
-    ten, inertias = load_at(chain)
-    heavier = case.rotors.copy()
-    heavier[-1] *= 1.3
-    P = case.form.initial.copy()
-    if case.n > 5:
-        P[[case.names.index(f'load {name}') for name in INERTIA_NAMES]] = ten
-        P[case.names.index(f'rotor{case.n}')] = heavier[-1]
-    else:
-        assert P.size < case.n + 11
-        known, motions = case.base.of(inertias, heavier), case.random.normal(size=(4, 40, case.n))
-        models = case.form.model, case.base.model
-        H, whole = (np.vstack(regressors_at(model, *motions)) for model in models)
-        P = np.linalg.lstsq(H, whole @ known, rcond=None)[0]
-    case.assert_same_torques(P, inertias, heavier)
-
-
-def test_load_parameters_agree_with_the_payload_of_the_plant():
+def test_load_at_the_tip_agrees_with_the_payload_of_the_plant():
     """The plant uses Newton-Euler, an independent algorithm, with a point mass at the tip."""
-    case = Learned(PANDA_CHAIN)
-    arm = rigid_arm(PANDA_CHAIN, WALL, PANDA_CHAIN.inertias, case.rotors, case.base)
-    P = case.form.initial + 2.0 * case.form.load
-    assert P[case.names.index('load m')] == 2.0
+    rotors, base = np.linspace(0.02, 0.2, 7), base_parameters(PANDA_CHAIN, WALL)
+    arm = rigid_arm(PANDA_CHAIN, WALL, PANDA_CHAIN.inertias, rotors, base)
+    P = base.of(PANDA_CHAIN.inertias, rotors) + 2.0 * base.load
     H, found = np.zeros((7, P.size)), np.zeros(7)
-    for q, dq, ddq in case.random.normal(size=(5, 3, 7)):
-        case.form.model.regressor(q, dq, dq, ddq, H)
+    for q, dq, ddq in np.random.default_rng(3).normal(size=(5, 3, 7)):
+        base.model.regressor(q, dq, dq, ddq, H)
         arm.accelerate(2.0, q, dq, H @ P, found)
         np.testing.assert_allclose(found, ddq, rtol=1e-9, atol=1e-9)
 
 
-def test_prior_is_wide_for_what_the_form_learns_and_tight_elsewhere():
-    case = Learned(PANDA_CHAIN)
-    covariance = case.form.L @ case.form.L.T
-    assert np.linalg.eigvalsh(covariance)[0] > 0.0
-    deviation = dict(zip(case.names, np.sqrt(np.diag(covariance)), strict=True))
-    assert deviation['rotor7'] == pytest.approx(ROTORS * case.rotors[-1])
-    assert deviation['load m'] == pytest.approx(RATED)
-    assert deviation['links'] == pytest.approx(TRUSTED)
+@pytest.mark.parametrize('chain', CHAINS)
+def test_rotors_have_the_unit_of_their_joint(chain):
+    model = base_parameters(chain, WALL).model
+    units = dict(zip(model.parameter_names, model.parameter_units, strict=True))
+    for number, joint in enumerate(chain.joints, 1):
+        unit = units.get(f'rotor{number}')
+        assert unit in {None, 'kg' if joint.kind == 'prismatic' else 'kg m^2'}

@@ -1,9 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`blf_dsc run` over ROS: its results are complete and nothing is lost.
-
-The controller's model is `planar_chain`, whose parameters are those of the plant by name;
-test_presets has a run with `two_link`.
-"""
+"""`blf_dsc run` over ROS: its results are complete and nothing is lost."""
 
 from __future__ import annotations
 
@@ -23,7 +19,7 @@ from blf_dsc_controller.bags.reader import read_run
 from blf_dsc_controller.cli.main import main
 from blf_dsc_controller.configuration.nodes import load_loop
 
-CHAIN = {'model': 'planar_chain', 'learning.initial_estimate': [0.5, 0.2, 0.16]}
+HALF = {'learning.initial_estimate': [0.5, 0.16, 0.2]}
 DURATION = 3  # s
 SAMPLES = 3001
 EACH_SAMPLE = ('commands', 'reference', 'tracking_error', 'learning')
@@ -44,7 +40,7 @@ def out(tmp_path_factory):
     """Results of a run in lock-step."""
     folder = tmp_path_factory.mktemp('run')
     config, out = folder / 'chain.yaml', folder / 'results' / 'first'
-    config.write_text(f'blf_dsc_controller:\n  ros__parameters: {json.dumps(CHAIN)}\n')
+    config.write_text(f'blf_dsc_controller:\n  ros__parameters: {json.dumps(HALF)}\n')
     arguments = ('--config', config, '--mode', 'lockstep', '--duration', DURATION)
     run = closed_loop(*arguments, '--out', out)
     assert run.returncode == 0, run.stderr
@@ -82,7 +78,7 @@ def test_torques_over_ros_match_the_offline_run_bit_for_bit(out, tmp_path):
     np.testing.assert_array_equal(recorded.position, computed.position)
     np.testing.assert_array_equal(recorded.stamp, computed.stamp)
     plant = {'duration': float(DURATION)}
-    np.testing.assert_array_equal(recorded.torque, simulated_torques(plant, CHAIN))
+    np.testing.assert_array_equal(recorded.torque, simulated_torques(plant, HALF))
 
 
 def test_another_library_reads_the_whole_bag(reading, counts):
@@ -121,5 +117,5 @@ def test_redirected_output_has_plain_progress_lines(out):
     progress = [line for line in output.splitlines() if line.startswith('closed loop ')]
     assert len(progress) >= 1
     assert 'max|xi1|/bound' in progress[-1]
-    assert 'parameter error 41.49 %' in progress[-1]  # as with the model two_link
+    assert 'parameter error 41.49 %' in progress[-1]
     assert 'parameters  error end 41.5 %' in output

@@ -18,7 +18,7 @@ from numba.core.errors import UnsupportedError
 from shaken_arm import _shake
 
 import blf_dsc_controller
-from blf_dsc_controller.arms import batch
+from blf_dsc_controller.arms import model
 from blf_dsc_controller.arms.two_link import TwoLink
 from blf_dsc_controller.compiled import jit
 from blf_dsc_controller.compiled.layout import Array, Cell, Fixed, pack, size_of, sizes_of, view_of
@@ -33,7 +33,7 @@ def sources(*names):
     return {f'{PACKAGE.name}/{name}.py' for name in names}
 
 
-LAW = sources('law/barrier', 'law/prediction', 'law/step', 'law/settings', 'reference/terms')
+LAW = sources('law/barrier', 'law/prediction', 'law/controller', 'law/settings', 'reference/terms')
 PLANT = {f'sim_plant/{name}.py' for name in ('arm', 'drives', 'kernels', 'motion')}
 ALWAYS = sources('compiled/layout', 'arms/two_link')
 
@@ -58,7 +58,7 @@ def test_kernel_depends_on_the_files_and_constants_it_is_compiled_from():
     assert {'SUSPECT=1', 'OUTSIDE=2', 'LINEAR=1'} <= jit.dependencies(update)[1]
     outside = {path.name for path in jit.dependencies(_shake)[0]}  # a kernel of these tests
     assert outside >= {'shaken_arm.py', 'rigid_body.py', 'cholesky.py'}
-    assert 'step.py' not in outside
+    assert 'controller.py' not in outside
 
 
 @compiling
@@ -71,13 +71,13 @@ def test_cache_folder_of_a_kernel_follows_from_its_dependencies(kernel):
 COMPILE = """
 import sys
 import numpy as np
-from blf_dsc_controller.arms import batch
+from blf_dsc_controller.arms import model
 from blf_dsc_controller.arms.two_link import TwoLink
 from blf_dsc_controller.compiled.jit import announced_compilation
 
 with announced_compilation(lambda text: print(text, file=sys.stderr)):
-    H = batch.regressors_at(TwoLink(10.0), *np.full((4, 1, 2), 0.5))
-print(float(H[0, 0, 0]), *(sum(batch._fill_regressors.stats[k].values()) for k in (1, 2)))
+    H = model.regressors_at(TwoLink(10.0), *np.full((4, 1, 2), 0.5))
+print(float(H[0, 0, 0]), *(sum(model._fill_regressors.stats[k].values()) for k in (1, 2)))
 """
 
 
@@ -121,7 +121,7 @@ def test_code_for_a_named_processor_is_found_again_and_not_loaded_elsewhere(tmp_
 @compiling
 def test_kernels_compile_without_the_private_parts_of_numba(tmp_path):
     """Other releases may lack them: then it is slower, which is said, with the same numbers."""
-    H = batch.regressors_at(TwoLink(10.0), *np.full((4, 1, 2), 0.5))
+    H = model.regressors_at(TwoLink(10.0), *np.full((4, 1, 2), 0.5))
     slow = f'numba {numba.__version__} lacks what this package uses'
     environment = {**os.environ, 'NUMBA_CACHE_DIR': str(tmp_path)}
     lacking = ['import numba.core.caching, numba.core.codegen']

@@ -6,7 +6,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from blf_dsc_controller.arms.batch import inertia_matrices
+from blf_dsc_controller.arms.model import inertia_matrices
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.nodes import load, load_loop, locate
 from blf_dsc_controller.law.factory import settings_of_config

@@ -18,7 +18,7 @@ from blf_dsc_controller.configuration.nodes import load_loop
 from blf_dsc_controller.configuration.schema import build
 from blf_dsc_controller.identification.exciting_reference import ExcitationProblem, search
 from blf_dsc_controller.law.factory import estimate_names, settings_of_config
-from blf_dsc_controller.reference.limits import MotionError
+from blf_dsc_controller.reference.approach import MotionError
 from blf_dsc_controller.simulation.loop import simulate
 
 P = np.array([1.0, 0.32, 0.4])

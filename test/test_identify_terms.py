@@ -27,8 +27,8 @@ from shaken_arm import (
 )
 
 from blf_dsc_controller.arms.base_parameters import base_parameters
-from blf_dsc_controller.arms.batch import regressors_at
 from blf_dsc_controller.arms.inertia import inertia_of, pseudo_inertia
+from blf_dsc_controller.arms.model import regressors_at
 from blf_dsc_controller.arms.urdf import attached, read_chain
 from blf_dsc_controller.cli.identify import problems_of
 from blf_dsc_controller.cli.main import main

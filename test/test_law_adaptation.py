@@ -15,7 +15,7 @@ from plants import QUIET
 from scipy.linalg import eigh
 
 from blf_dsc_controller.compiled import cholesky
-from blf_dsc_controller.law import adaptation, consistency, window
+from blf_dsc_controller.law import adaptation, excitation, window
 from blf_dsc_controller.law.settings import COMPENSATIONS, UPDATES
 
 DT = 1e-3
@@ -236,4 +236,4 @@ def test_only_estimates_with_a_positive_inertia_are_physical(P2, physical):
     q = np.array([2.0, 1.4])
     if P2 == 0.02:  # positive definite, but below a tenth of the initial estimate
         law.settings.initial_estimate[:3] = [1.0, 0.32, 0.0]
-    assert consistency.is_physical(law.settings, law.signals, q, theta) == physical
+    assert excitation.is_physical(law.settings, law.signals, q, theta) == physical

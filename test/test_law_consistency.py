@@ -23,7 +23,7 @@ from closed_loop_case import arbitrary
 from paper_case import NO_DISTURBANCE, configured
 
 from blf_dsc_controller import load_loop, simulate
-from blf_dsc_controller.law import consistency, excitation, window
+from blf_dsc_controller.law import excitation, window
 from blf_dsc_controller.law.factory import settings_of_config
 
 Q = np.array([2.293, 1.696])
@@ -118,7 +118,7 @@ def test_rejected_column_stays_zero_and_is_checked_again():
     state.anchor[rejected] = 0.1
     state.rows[0] *= 0.5  # the window seems not to be full
     window.excitation(*case, 60)
-    assert consistency.accept_window(*case, Q)
+    assert excitation.accept_window(*case, Q)
     np.testing.assert_array_equal(state.solution == 0.0, rejected)
 
     state.running[:] = 0.0
@@ -185,7 +185,7 @@ def window_of_friction():
     settings = controller.settings._replace(residual_floor=0.0)
     case = settings, controller.state, controller.signals
     window.excitation(*case, 60)
-    assert consistency.accept_window(*case, Q)
+    assert excitation.accept_window(*case, Q)
     return *case, controller, controller.save()
 
 
@@ -207,7 +207,7 @@ def test_window_is_latched_up_to_four_times_the_least_residual(learned, ratio, a
     settings, state, signals, residual = learned
     before = np.diag(signals.Phi).copy()
     state.least_residual[0] = residual / ratio
-    assert consistency.accept_window(settings, state, signals, Q) == accepted
+    assert excitation.accept_window(settings, state, signals, Q) == accepted
     expected = 3.0 * (1.0 - 1.25 / ratio) * residual * np.diag(settings.information) * pulled
     np.testing.assert_allclose(np.diag(signals.Phi) - before, expected, rtol=1e-6, atol=1e-12)
 
@@ -226,7 +226,7 @@ def test_change_is_detected_from_eight_times_the_residual_on(
     state.rows[0] = rows * settings.window
     state.anchor[:] = 0.9 * state.estimate
     before, torque = state.estimate.copy(), signals.H @ state.estimate + state.disturbance
-    consistency.detect_change(settings, state, signals, 8.0, 0.1)
+    excitation.detect_change(settings, state, signals, 8.0, 0.1)
     assert state.changes[0] == changes
     np.testing.assert_array_equal(state.estimate, 0.9 * before if taken_back else before)
     # The next, partial windows are pulled to the estimate from before.
@@ -241,7 +241,7 @@ def test_anchor_is_kept_at_the_first_latch_and_once_per_window(learned, latched,
     settings, state, signals, _ = learned
     state.anchor[:] = 0.0
     state.latched[0], state.cursor[0] = latched, cursor
-    assert consistency.accept_window(settings, state, signals, Q)
+    assert excitation.accept_window(settings, state, signals, Q)
     assert np.array_equal(state.anchor, state.solution) == kept
 
 
@@ -255,7 +255,7 @@ def test_residual_floor_follows_the_residual_learned():
         (0.05, 3.0, 3.0),
     ):
         state.least_residual[0] = least
-        assert consistency.explained(settings, state, residual) == pytest.approx(expected)
+        assert excitation.explained(settings, state, residual) == pytest.approx(expected)
 
 
 def test_half_the_rated_load_is_noticed_with_a_floor_that_is_three_times_too_large():

@@ -13,7 +13,7 @@ from plants import QUIET, START
 
 from blf_dsc_controller.compiled import cholesky
 from blf_dsc_controller.errors import OutsideBarrierError
-from blf_dsc_controller.law import adaptation, surface
+from blf_dsc_controller.law import adaptation, barrier
 from blf_dsc_controller.law.settings import EFFORT, FILTERED, LAMBDA, PREDICTIONS
 
 
@@ -65,8 +65,8 @@ def test_erratum_12_linear_virtual_control_crosses_zero_without_a_jump():
     """(18) has slope K/2 + mu there: the filter's gap is at most (lambda + T) times its rate."""
     K, mu, bound, time_constant, T = 150.0, 20.0, 0.002, 0.002, 1e-3
     errors = 1e-3 * np.sin(10.0 * np.arange(0.0, 2.0, T))
-    beta2 = [surface.virtual_control(xi1, bound, K, mu, 0.0) for xi1 in errors]
-    gain, alpha2, gap = surface.filter_gain(time_constant, T), beta2[0], []
+    beta2 = [barrier.virtual_control(xi1, bound, K, mu, 0.0) for xi1 in errors]
+    gain, alpha2, gap = barrier.filter_gain(time_constant, T), beta2[0], []
     for target in beta2:
         gap.append(abs(target - alpha2))
         alpha2 += gain * (target - alpha2)
@@ -82,7 +82,7 @@ def damping_torque(d2, xi1, xi2):
     for gain in (np.zeros(2), d2):
         law = controller(recommended(d2=gain))
         q = np.array([1.9935, 1.3961]) + 0.3 + xi1
-        beta2 = [surface.virtual_control(x, 0.002, 150.0, 20.0, 0.0) for x in xi1]
+        beta2 = [barrier.virtual_control(x, 0.002, 150.0, 20.0, 0.0) for x in xi1]
         law.update(0.0, 1e-3, np.concatenate([q, beta2 + xi2, np.zeros(2)]))
         np.testing.assert_allclose(law.signals.xi2, xi2, atol=1e-12)
         demands.append(law.signals.demand.copy())

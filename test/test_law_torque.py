@@ -13,7 +13,7 @@ from paper_case import P
 from plain_law import PlainLaw, R, dynamics
 from plants import QUIET
 
-from blf_dsc_controller.law import barrier, surface
+from blf_dsc_controller.law import barrier
 from blf_dsc_controller.law.settings import COMPENSATIONS, EFFORT, UPDATES
 from blf_dsc_controller.law.torque import LEVEL_CUT, RATE_CUT, find_applied, saturate
 
@@ -140,7 +140,7 @@ def test_virtual_control_is_that_of_the_paper_without_its_singularity():
     gain, mu, dqr = 150.0, 20.0, -0.3
 
     def ours(xi1, dqr=dqr):
-        return surface.virtual_control(xi1, BOUND, gain, mu, dqr)
+        return barrier.virtual_control(xi1, BOUND, gain, mu, dqr)
 
     assert ours(0.0) == dqr
     for xi1 in BOUND * np.linspace(0.01, 0.999, 18) * np.tile([1.0, -1.0], 9):
@@ -156,7 +156,7 @@ def test_virtual_control_is_that_of_the_paper_without_its_singularity():
     for xi1 in (BOUND, -1.1 * BOUND, 10.0 * BOUND):
         assert ours(xi1) == dqr - mu * xi1
     for x in (1e-6, -5e-5, np.nextafter(1e-4, 0.0), 1e-4, 0.1, -2.0):
-        assert surface.sinc(x) == pytest.approx(sin(x) / x, abs=3e-16)
+        assert barrier.sinc(x) == pytest.approx(sin(x) / x, abs=3e-16)
 
 
 # The window is not a multiple of the interval, and learning lasts nearly a second. For so short

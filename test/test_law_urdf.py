@@ -3,117 +3,26 @@
 
 from __future__ import annotations
 
-import json
-
 import numpy as np
 import pytest
-import yaml
 from changes import several
 from paper_case import configured
 from random_arm import PANDA_TEXT, random_urdf
 
 from blf_dsc_controller import simulate
-from blf_dsc_controller.analysis.metrics import estimates_of
-from blf_dsc_controller.analysis.panels import panels
-from blf_dsc_controller.bags.reader import read_run
-from blf_dsc_controller.cli.main import main
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.nodes import load_loop
-from blf_dsc_controller.configuration.robot import learned_of
+from blf_dsc_controller.configuration.robot import parameters_of
 from blf_dsc_controller.configuration.schema import build, change
 from blf_dsc_controller.errors import ConfigurationError
 from blf_dsc_controller.law.factory import (
+    columns_of,
     controller_of,
     estimate_names,
-    initial_columns,
     model_of,
     prior_covariance,
     settings_of_config,
 )
-from blf_dsc_controller.replay.verify import verify
-from sim_plant.plant import parameters_of
-
-DURATION = 3.0  # s, 0.7 s after the first window
-OFFSET = [0.0, 0.0, 0.0, -1.571, 0.0, 1.867, 0.0]  # rad
-LEARN_PAYLOAD = {
-    '/**': {'robot': {'urdf': 'panda.urdf', 'tip': 'panda_hand_tcp', 'learn': 'payload'}},
-    '/**/sim_plant': {'load': {'payload': 2.0}, 'initial': {'position': list(OFFSET)}},
-    '/**/blf_dsc_controller': {
-        'barrier': {'bound': [0.03] * 7},
-        'reference': {
-            'type': 'sinusoids',
-            'offset': OFFSET,
-            'amplitude': [0.0, 0.1, 0.0, 0.1, 0.0, 0.0, 0.0],
-            'frequency': [2.5],
-        },
-    },
-}
-
-
-@pytest.fixture(scope='module')
-def out(tmp_path_factory):
-    """Folder of a run."""
-    folder = tmp_path_factory.mktemp('run')
-    sections = {name: {'ros__parameters': values} for name, values in LEARN_PAYLOAD.items()}
-    (folder / 'my.yaml').write_text(yaml.safe_dump(sections), encoding='utf-8')
-    arguments = ['--config', folder / 'my.yaml', '--duration', DURATION, '--out', folder / 'out']
-    assert main(['run', '--offline', *map(str, arguments)]) == 0
-    return folder / 'out'
-
-
-def test_load_is_learned_within_a_window_of_poor_excitation(out):
-    learning = json.loads((out / 'summary.json').read_text(encoding='utf-8'))['learning']
-    assert learning['latch_time_s'] < 2.5
-    # The simulated arm is nearly ideal; the rest is due to the weight of the prior.
-    assert learning['final_torque_error'] < 0.01
-    assert learning['final_estimate']['load m'] == pytest.approx(2.0, rel=0.02)
-    assert learning['final_estimate']['links'] == pytest.approx(1.0, abs=0.001)
-    assert learning['true_parameters_of_other_names'] == []
-    # The torque error is relative to the base parameters of the plant.
-    run = read_run(out / 'bag')
-    estimates, (names, regressor) = estimates_of(run), run.arm.base
-    P = parameters_of(load_loop(out / 'config.yaml').plant)
-    q = run.reference[1::7]
-    states = (q, *np.zeros((3, *q.shape)))
-    true = regressor(*states) @ P
-    error = np.linalg.norm(run.arm.regressor(*states) @ estimates.estimate[-1] - true)
-    assert run.truth.names[: P.size] == names
-    # The arm hardly moves: nearly all of its torque is gravity.
-    expected = error / np.linalg.norm(true)
-    assert estimates.relative_error[-1] == pytest.approx(expected, rel=0.1)
-    # Figures show the load in its units.
-    assert (out / 'parameters.png').stat().st_size > 10_000
-    shown = {panel.title: panel for panel in panels([run])}
-    lines = {title: [line.name for line in panel.lines] for title, panel in shown.items()}
-    assert lines['load [kg]'] == ['m']
-    assert shown['load [kg]'].unit == 'kg'
-    assert shown['load [kg]'].lines[0].values[-1] == pytest.approx(2.0, rel=0.02)
-    assert lines['load [kg m]'] == [f'm*c{k}' for k in 'xyz']
-    assert len(lines['load [kg m^2]']) == 6
-    assert lines['rotor [kg m^2]'] == [f'rotor{k}' for k in range(1, 8)]
-    assert 'torque error' in shown
-
-
-def test_replay_without_ros_is_identical_bit_for_bit(out):
-    result = verify(out / 'bag')
-    assert result.difference is None
-    assert sum(comparison.values for comparison in result.comparisons) > 50 * DURATION * 1000
-
-
-def test_defaults_depend_on_the_learned_form():
-    base, payload = (panda(robot__learn=form) for form in ('base', 'payload'))
-    assert estimate_names(payload)[7:9] == ('load m', 'load m*cx')
-    assert payload.learning.initial_estimate[7:] == (*(0.0,) * 10, 1.0)
-    assert payload.learning.window < base.learning.window
-    p = model_of(payload).p
-    assert len(payload.learning.initial_estimate) == p == len(payload.learning.adaptation_gain)
-    # The gains are derived from the same URDF.
-    np.testing.assert_allclose(payload.barrier.weight, base.barrier.weight, rtol=2e-3)
-    assert payload.learning.radius >= 10.0 * payload.robot.payload
-    first, second = model_of(payload), model_of(payload)  # threads share no working memory
-    assert not np.shares_memory(first.combination, second.combination)
-    assert not np.shares_memory(first.bodies, second.bodies)
-
 
 ARM = {'model': 'urdf', 'robot.urdf': 'panda.urdf', 'robot.tip': 'panda_hand_tcp'}
 
@@ -135,12 +44,17 @@ def test_urdf_and_tip_are_enough_to_configure_an_arm():
     assert {'m*cx7', 'rotor7', 'viscous panda_joint1', 'coulomb panda_joint7'} <= set(names)
 
 
+def test_threads_share_no_working_memory():
+    first, second = model_of(panda()), model_of(panda())
+    assert not np.shares_memory(first.vector, second.vector)
+
+
 def test_friction_of_the_urdf_is_known_unless_the_drives_compensate_it():
     config = load_loop('fr3').controller
     known = {'gravity': [0.003] * 7 + [0.2] * 7, 'gravity_and_friction': [0.0] * 14}
     for compensated, friction in known.items():
         given = change(config, {'robot.drive_compensates': compensated})
-        assert list(initial_columns(given)) == friction
+        assert [column.initial for column in columns_of(given)] == friction
 
 
 def test_given_parameters_override_the_derived_ones():
@@ -163,15 +77,6 @@ def test_urdf_may_be_given_as_text_or_file(tmp_path):
     ('changes', 'message'),
     [
         ({'robot.urdf': 'nowhere.urdf'}, 'robot.urdf: .*nowhere.urdf.* cannot be read'),
-        (
-            {'robot.learn': 'payload', 'robot.payload': 0.0},
-            'robot.payload: got 0 kg, but learn: payload needs the mass',
-        ),
-        ({'robot.learn': 'scale'}, "robot.learn: got 'scale', but it must be one of base, payload"),
-        (
-            {'model': 'two_link', 'robot.urdf': '', 'robot.tip': '', 'robot.learn': 'payload'},
-            'robot.learn: got payload, but model two_link learns base only',
-        ),
         ({'robot.tip': 'hand'}, "robot.urdf: no link 'hand' for the tip"),
         ({'robot.tip': ''}, 'robot.urdf: neither a tip .* not one chain: .*panda_finger_joint1'),
         ({'joints': ['a', 'b']}, "robot.urdf: no joint 'a' in the URDF"),
@@ -212,10 +117,11 @@ def test_gravity_is_compensated_with_the_initial_estimate():
     """At rest on the reference the torque is G of the URDF, whatever the gains."""
     config = panda(robot__gravity=[0.0, -9.81, 0.0])
     q = np.array(config.reference.offset)
-    base = learned_of(config.robot, config.robot.chain(config.joints))
+    chain = config.robot.chain(config.joints)
+    base = parameters_of(config.robot, chain)
     H = np.zeros((7, base.model.p))
     base.model.regressor(q, *np.zeros((3, 7)), H)
-    gravity = H @ base.initial
+    gravity = H @ base.of(chain.inertias, config.robot.rotors(chain))
     assert np.abs(gravity).max() > 5.0
     torque = controller_of(config).update(0.0, 1e-3, np.concatenate((q, np.zeros(14))))
     np.testing.assert_allclose(torque, gravity, atol=0.02)  # P^(0) has four digits
@@ -244,10 +150,9 @@ def test_bound_holds_from_the_start_with_an_undeclared_rated_load():
     assert run({'barrier.initial_bound': [0.0] * 7}).stops  # with a constant bound
 
 
-@pytest.mark.parametrize('learn', ['base', 'payload'])
-def test_drives_with_unknown_effort_limit_get_a_finite_prior(learn):
+def test_drives_with_unknown_effort_limit_get_a_finite_prior():
     text = PANDA_TEXT.replace('effort="12"', 'effort="0"')
-    config = panda(robot__urdf=text, robot__learn=learn)
+    config = panda(robot__urdf=text)
     assert np.all(np.isfinite(settings_of_config(config).information))
     rotor = config.robot.rotors(config.robot.chain(config.joints))[6]  # from the weight carried
     assert deviations(config)['rotor7'] == pytest.approx(0.5 * rotor)

@@ -22,13 +22,12 @@ class Window:
     def __init__(self, n, m, length):
         self.ring = np.zeros((length, n, m + 1))
         self.running, self.fresh, self.half, self.naive = np.zeros((4, m + 1, m + 1))
-        self.cursor = 0
+        self.cursor, self.rows = np.zeros((2, 1))
         self.history = []
 
     def push(self, row):
-        self.naive += terms(row) - terms(self.ring[self.cursor])
-        sums = self.running, self.fresh, self.half
-        self.cursor = window.push_row(self.ring, self.cursor, *sums, row, len(self.history))
+        self.naive += terms(row) - terms(self.ring[int(self.cursor[0])])
+        window.push_row(self, row)
         self.history = [*self.history, row][-len(self.ring) :]
 
     def direct(self):
@@ -38,7 +37,7 @@ class Window:
     def newer_part(self):
         """Sum over the newer part of the rows, and their number."""
         newer = np.zeros_like(self.running)
-        rows = window.newer_part(self.cursor, len(self.ring), self.fresh, self.half, newer)
+        rows = window.newer_part(self, newer)
         return newer, rows
 
 
@@ -84,7 +83,7 @@ def test_window_is_split_into_exact_parts_and_goes_on_with_the_newer_one(length)
         newer, rows = sliding.newer_part()
         assert length // 4 <= rows <= length - length // 4
         assert 0 < rows < length
-        sliding.history = sliding.history[-rows:]
+        sliding.history, sliding.rows[0] = sliding.history[-rows:], rows
         np.testing.assert_allclose(newer, sliding.direct(), atol=1e-12)
 
         sliding.running[:] = newer
@@ -146,10 +145,9 @@ def excited_case(seed):
     case = arbitrary(seed, sigma=0.01, learning_start=2.0)
     settings, state, signals = case
     state.running[:] = state.fresh[:] = state.ring[:] = 0.0
-    state.latched[0], state.rows[0], cursor = 0.0, settings.window, 0
+    state.latched[0], state.rows[0], state.cursor[0] = 0.0, settings.window, 0.0
     for row in np.random.default_rng(seed).normal(size=(settings.window, *signals.row.shape)):
-        sums = state.running, state.fresh, state.half
-        cursor = window.push_row(state.ring, cursor, *sums, row, rows=settings.window)
+        window.push_row(state, row)
     return case
 
 

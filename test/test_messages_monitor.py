@@ -12,9 +12,9 @@ from blf_dsc_controller.analysis.figures import draw
 from blf_dsc_controller.analysis.summary import format_table, summarize
 from blf_dsc_controller.bags.reader import read_run
 from blf_dsc_controller.law import barrier
+from blf_dsc_controller.law.barrier import virtual_control
 from blf_dsc_controller.law.factory import controller_of, estimate_names, settings_of_config
 from blf_dsc_controller.law.lyapunov import ExponentialBound, decay_rate, largest_inertia
-from blf_dsc_controller.law.surface import virtual_control
 from blf_dsc_controller.law.telemetry import Monitor
 from blf_dsc_controller.messages import topics
 from blf_dsc_controller.messages.codecs import JointStateDecoder

@@ -12,7 +12,6 @@ from scipy.integrate import cumulative_simpson
 
 from blf_dsc_controller.configuration.plant import PlantConfig
 from blf_dsc_controller.configuration.schema import build
-from sim_plant.arm import tip
 from sim_plant.motion import wall_force
 from sim_plant.plant import plant_of, plant_settings
 
@@ -120,7 +119,7 @@ def spring_of(x):
     tips, rates = np.empty((2, len(x), 3))
     jacobian = np.empty((3, 2))
     for row, position, rate in zip(x, tips, rates, strict=True):
-        tip(ARM, row[:2], position, jacobian)
+        ARM.fill_tip(row[:2], position, jacobian)
         rate[:] = jacobian @ row[2:4]
     return x[:, 4:7] - tips, x[:, 7:10] - rates
 

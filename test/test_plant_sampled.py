@@ -68,7 +68,7 @@ def test_disturbances_of_every_kind_add_up_for_each_joint():
     for load in (rough(), disturbance(coulomb=[0.3, 0.5]), disturbance(ripple=0.2)):
         for q, dq in np.random.default_rng(0).normal(size=(10, 2, 2)) * [[1.0], [0.2]]:
             found = np.empty(2)
-            disturbance_torque(load, 1.7, q, dq, found)
+            disturbance_torque(motion(load=load), 1.7, q, dq, found)
             np.testing.assert_allclose(found, torque_of(load, 1.7, q, dq), rtol=1e-13)
 
 

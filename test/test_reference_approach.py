@@ -24,8 +24,14 @@ from blf_dsc_controller.errors import (
     VelocityMismatchError,
 )
 from blf_dsc_controller.law.factory import begin, controller_of
-from blf_dsc_controller.reference.approach import blend, plan_start, reference_of, stop
-from blf_dsc_controller.reference.limits import MotionError, worst_violation
+from blf_dsc_controller.reference.approach import (
+    MotionError,
+    blend,
+    plan_start,
+    reference_of,
+    stop,
+    worst_violation,
+)
 from blf_dsc_controller.reference.terms import minimum_jerk, pack, sampled, sinusoids_term, unpack
 from blf_dsc_controller.simulation.loop import simulate
 

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from blf_dsc_controller.configuration.controller import ControllerConfig, MotionLimits
 from blf_dsc_controller.reference import terms as reference
-from blf_dsc_controller.reference.limits import MotionError
+from blf_dsc_controller.reference.approach import MotionError
 from blf_dsc_controller.reference.terms import (
     hermite,
     minimum_jerk,

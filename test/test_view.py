@@ -21,7 +21,7 @@ from blf_dsc_controller.configuration.robot import chain_of
 from blf_dsc_controller.errors import BlfDscError, MissingExtraError
 from blf_dsc_controller.messages.topics import JOINT_STATES
 from blf_dsc_controller.view import page as pages
-from blf_dsc_controller.view.arm import ShownArm, planar_urdf, with_cylinders, with_known_meshes
+from blf_dsc_controller.view.arm import ShownArm, with_cylinders, with_known_meshes
 from blf_dsc_controller.view.bag import BagPlayer
 from blf_dsc_controller.view.page import Page, bodies_of, free_port, plant_events
 
@@ -183,13 +183,6 @@ def test_cylinders_reach_from_joint_to_joint(seed):
                 assert min(np.abs(at + half - end).max() for end in ends) < 1e-9
                 drawn += 1
     assert drawn > 8
-
-
-def test_planar_chain_of_any_length_is_drawn():
-    joints = ('a', 'b', 'c')
-    chain = chain_of(planar_urdf(joints, (1.0, 0.8, 0.5)), '', 'tip', joints)
-    for q, tip in (([0.0, 0.0, 0.0], [2.3, 0.0, 0.0]), ([np.pi / 2, 0.0, 0.0], [0.0, 0.0, 2.3])):
-        assert frames(chain, np.array(q))[-1][:3, 3] == pytest.approx(tip)
 
 
 def test_port_in_use_is_skipped(player):

@@ -69,30 +69,24 @@ def estimates_of(run: Run) -> Estimates | None:
             return None
         return truth.held(stamp, _columns(truth, names))
 
-    true = P = true_of(names)
+    true = true_of(names)
     of_torques = arm is not None and _parameters(arm.units) == names
-    base = arm.base if arm and of_torques and true is None else None
-    if base:
-        P = true_of(base[0])
-    R = None  # |R [P^; -P]| is the norm of the torques H P^ - H P
-    if arm and of_torques and P is not None:
-        H = _torques(run, arm.regressor)
-        R = np.asarray(np.linalg.qr(np.hstack((H, _torques(run, base[1]) if base else H)), 'r'))
-    error = None if P is None else _relative_error(estimate, P, R)
-    unlike = theirs if P is None else ()
+    R = None  # |R (P^ - P)| is the norm of the torques H P^ - H P
+    if arm and of_torques and true is not None:
+        R = np.asarray(np.linalg.qr(_torques(run, arm.regressor), 'r'))
+    error = None if true is None else _relative_error(estimate, true, R)
+    unlike = theirs if true is None else ()
     return Estimates(names, run.time_of(stamp), estimate, true, error, of_torques, unlike)
 
 
 def _relative_error(estimate: Floats, P: Floats, R: Floats | None) -> Floats:
-    """Return |P^ - P| / |P| (m,), or |R [P^; -P]| / |R [0; P]|."""
+    """Return |P^ - P| / |P| (m,), or |R (P^ - P)| / |R P|."""
     found = np.empty(len(P))
     for begin in range(0, len(P), _BLOCK):
         some = slice(begin, begin + _BLOCK)
-        if R is None:
-            off, size = estimate[some] - P[some], P[some]
-        else:
-            off = np.hstack((estimate[some], -P[some])) @ R.T
-            size = P[some] @ R[:, estimate.shape[1] :].T
+        off, size = estimate[some] - P[some], P[some]
+        if R is not None:
+            off, size = off @ R.T, size @ R.T
         with np.errstate(over='ignore', invalid='ignore'):  # no motion, no torques: unknown
             found[some] = np.linalg.norm(off, axis=1) / np.linalg.norm(size, axis=1)
     return found

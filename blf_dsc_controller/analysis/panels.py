@@ -234,9 +234,8 @@ def _learning(run: Run) -> Iterator[Panel]:
         return
     error = _relative_error(estimates)
     if run.arm is not None:
-        of_inertias = _by_kind if run.arm.base else _of_links
         yield from error
-        yield from of_inertias(run, run.arm, estimates)
+        yield from _of_links(run, run.arm, estimates)
         yield from _frictions(run, run.arm)
     else:
         for j, name in enumerate(estimates.names):
@@ -278,21 +277,6 @@ def _of_links(run: Run, arm: LearnedArm, estimates: Estimates) -> Iterator[Panel
             if re.fullmatch(rf'.*\D{i}', name)
         ]
         yield Panel('Parameters', f'{what} of link {i}, {joint}', 'prior deviations', lines)
-
-
-def _by_kind(_run: Run, arm: LearnedArm, estimates: Estimates) -> Iterator[Panel]:
-    """Yield the parameters themselves, those of one kind and unit in a panel."""
-    kinds: dict[str, list[int]] = {}
-    for j, name in enumerate(estimates.names):
-        kind = re.sub(r'\d+$', '', name.split(' ')[0])
-        kinds.setdefault(f'{kind} [{arm.units[name]}]'.removesuffix(' []'), []).append(j)
-    for title, members in kinds.items():
-        lines = (
-            Line(estimates.names[j].split(' ')[-1], estimates.time, estimates.estimate[:, j])
-            for j in members
-        )
-        unit = arm.units[estimates.names[members[0]]]
-        yield Panel('Parameters', title, unit or '1', lines)
 
 
 def _frictions(run: Run, arm: LearnedArm) -> Iterator[Panel]:

@@ -1,11 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Base parameters of a chain: the combinations of its inertias that torques can show.
+"""Base parameters of a chain, and the prior that its URDF gives of them.
 
-Of the columns of the full regressor Y (ten per body, a rotor per joint), a maximal set of
-independent ones, Y_B, is kept; the others are Y_D = Y_B X, so that Y phi = Y_B K phi, where K has
-unit columns for B and X for D (Gautier, Numerical calculation of the base inertial parameters of
-robots, 1991).  The columns are tried from base to tip, so that what a body has in common with the
-bodies before it is grouped with those, which is the usual grouping.
+Torques show only certain combinations of the inertias.  Of the columns of the full regressor Y (ten
+per body, a rotor per joint), a maximal set of independent ones, Y_B, is kept; the others are
+Y_D = Y_B X, so that Y phi = Y_B K phi, where K has unit columns for B and X for D (Gautier,
+Numerical calculation of the base inertial parameters of robots, 1991).  The columns are tried from
+base to tip, so that what a body has in common with the bodies before it is grouped with those,
+which is the usual grouping.
+
+The prior says how far a URDF may be off, and in which directions.  Bodies vary independently, in
+terms of their pseudo-inertia: the mass with all that scales with it, the centre of mass, and the
+spread of the mass around it.  The last body also carries a payload.
 """
 
 from __future__ import annotations
@@ -15,9 +20,24 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from blf_dsc_controller.arms.chain_kernels import ROTOR
-from blf_dsc_controller.arms.serial_chain import SerialChain, serial_chain
+from blf_dsc_controller.arms.inertia import inertia_of, pseudo_inertia
+from blf_dsc_controller.arms.serial_chain import ROTOR, SerialChain, serial_chain
 from blf_dsc_controller.arms.urdf import Chain
+
+LINKS = 0.3
+"""Standard deviation of the mass of a body and of its spread, relative to their values."""
+
+CENTRE = 0.01
+"""Standard deviation of the centre of mass [m]; also the least assumed extent of a body."""
+
+PAYLOAD_SIZE = 0.05
+"""Extent of a payload, and standard deviation of its centre of mass from the tip [m]."""
+
+ROTORS = 0.5
+"""Standard deviation of the inertia of a drive, relative to its value ..."""
+
+UNKNOWN_ROTOR = 0.01
+"""... and absolute where that is 0, as neither effort nor inertia is known [kg m^2, or kg]."""
 
 _DEPENDENT = 1e-6  # for columns of order 1; rounding of pi / 2 in URDFs gives about 1e-10
 
@@ -29,11 +49,13 @@ class BaseParameters:
     Attributes:
         model: the arm model whose regressors multiply P, named after the kept columns.
         K: (p, 11 n), maps all inertias to P: per body its ten inertial parameters and its rotor.
+        load: (p,) what 1 kg at the tip adds to P.
         combinations: (p,) each parameter as a sum, such as 'Izz2 + Iyy3 + 0.1 m4'.
     """
 
     model: SerialChain
     K: np.ndarray
+    load: np.ndarray
     combinations: tuple[str, ...]
 
     def of(self, inertias: np.ndarray, rotors: np.ndarray) -> np.ndarray:
@@ -49,25 +71,22 @@ def base_parameters(
     """Return a chain's base parameters, with or without rotors; gravity [m/s^2] is in its base."""
     full = serial_chain(chain, gravity)
     order = np.array([k for k in range(full.p) if rotors or k % (ROTOR + 1) != ROTOR])
-    kept, K = independent(stacked_regressor(full), order)
-    if not rotors:
-        K[:, ROTOR :: ROTOR + 1] = 0.0
-    columns = [(int(k) // (ROTOR + 1), int(k) % (ROTOR + 1)) for k in kept]
-    sums = tuple(_sum(row, int(k), full.parameter_names) for row, k in zip(K, kept, strict=True))
-    return BaseParameters(serial_chain(chain, gravity, columns), K, sums)
-
-
-def independent(Y: np.ndarray, order: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the independent columns (p,) of Y, tried in `order`, and K of Y = Y[:, columns] K."""
+    Y = _regressor_at_random(full)
     pivots = np.abs(np.diag(np.linalg.qr(Y[:, order], mode='r')))
     kept = order[pivots > _DEPENDENT]
     # Rounded, so that every machine's linear algebra gives the same result.
     K: np.ndarray = np.linalg.lstsq(Y[:, kept], Y, rcond=None)[0].round(12)
     K[np.abs(K) < _DEPENDENT] = 0.0
-    return kept, K
+    if not rotors:
+        K[:, ROTOR :: ROTOR + 1] = 0.0
+    columns = [(int(k) // (ROTOR + 1), int(k) % (ROTOR + 1)) for k in kept]
+    sums = tuple(_sum(row, int(k), full.parameter_names) for row, k in zip(K, kept, strict=True))
+    point, loaded = chain.tip_placement[:, 3], np.zeros((full.n, ROTOR + 1))
+    loaded[-1, :ROTOR] = inertia_of(np.outer(point, point))
+    return BaseParameters(serial_chain(chain, gravity, columns), K, K @ loaded.ravel(), sums)
 
 
-def stacked_regressor(full: SerialChain) -> np.ndarray:
+def _regressor_at_random(full: SerialChain) -> np.ndarray:
     """Return rows of H at random motions, twice as many as columns."""
     random = np.random.default_rng(0)
     blocks = np.zeros((2 * (ROTOR + 1), full.n, full.p))
@@ -85,3 +104,59 @@ def _sum(row: np.ndarray, own: int, names: tuple[str, ...]) -> str:
             factor = '' if abs(abs(row[k]) - 1.0) < _DEPENDENT else f'{abs(row[k]):.4g} '
             text += f' {"-" if row[k] < 0.0 else "+"} {factor}{names[k]}'
     return text
+
+
+def prior_factor(
+    chain: Chain, base: BaseParameters, payload: float, rotors: np.ndarray
+) -> np.ndarray:
+    """Return lower triangular L (p, p) of P = P0 + L theta, with theta of mean 0 and covariance 1.
+
+    P0 are the base parameters of the URDF, `payload` is the rated payload of the arm [kg], and
+    `rotors` (n,) are the standard deviations of the rotor inertias [kg m^2, or kg], which a URDF
+    does not contain.
+    """
+    n = len(chain.joints)
+    blocks: list[tuple[int, np.ndarray]] = []  # body, directions (11, k) of its entries
+    for i, joint in enumerate(chain.joints):
+        J = pseudo_inertia(joint.inertia)
+        blocks.append((i, _blocks_of_ten(deviations(J, LINKS, CENTRE))))
+    J = chain.tip_placement @ payload_inertia(payload) @ chain.tip_placement.T
+    blocks.append((n - 1, _blocks_of_ten(deviations(J, 1.0, PAYLOAD_SIZE))))
+    blocks += [(i, rotors[i] * np.eye(ROTOR + 1)[:, ROTOR:]) for i in range(n)]
+    K = base.K.reshape(-1, n, ROTOR + 1)
+    L = np.column_stack([K[:, i] @ block for i, block in blocks])
+    R = np.linalg.qr(L.T, mode='r')  # Cholesky factor of L L^T, without squaring rounding
+    return np.transpose(R * np.copysign(1.0, np.diag(R))[:, None])
+
+
+def payload_inertia(payload: float) -> np.ndarray:
+    """Return the pseudo-inertia (4, 4) of a payload [kg] about its centre."""
+    return payload * np.diag((*(PAYLOAD_SIZE**2,) * 3, 1.0))
+
+
+def _blocks_of_ten(directions: np.ndarray) -> np.ndarray:
+    """Append a rotor entry of zero to directions (10, k) of the ten, giving (11, k)."""
+    return np.vstack((directions, np.zeros((1, directions.shape[1]))))
+
+
+def deviations(J: np.ndarray, share: float, centre: float) -> np.ndarray:
+    """Return one standard deviation of the ten along each of ten independent directions (10, 10).
+
+    `share` is that of mass and spread, relative to them, `centre` that of the centre of mass [m].
+    """
+    if J[3, 3] == 0.0:
+        return np.zeros((10, 10))
+    directions = [share * J]
+    for k in range(3):
+        D = np.zeros((4, 4))
+        D[k, 3] = centre
+        directions.append(D @ J + J @ D.T)
+    spread = J[:3, :3] - np.outer(J[:3, 3], J[:3, 3]) / J[3, 3]
+    moments, axes = np.linalg.eigh(spread)
+    L = axes * np.sqrt(np.maximum(moments, 0.0) + J[3, 3] * centre**2)
+    for a in range(3):
+        for b in range(a + 1):
+            E = np.zeros((4, 4))
+            E[:3, :3] = (np.outer(L[:, a], L[:, b]) + np.outer(L[:, b], L[:, a])) / 2.0
+            directions.append(share * E * (1.0 if a == b else np.sqrt(2.0)))
+    return np.transpose([inertia_of(direction) for direction in directions])

@@ -4,7 +4,7 @@
 An arm is a `NamedTuple` of the geometry that its regressors need (numbers and arrays), with the
 properties and methods of `ArmModel`.  Kernels call the methods as Python does: only those of the
 type that a kernel receives are compiled into it.  To add an arm, write its class in a file of its
-own, and add it to `arm_model`, to `compile_methods` below and to the choices of the parameter
+own, and add it to `arm_model` and `compile_methods` below and to the choices of the parameter
 `model`.
 """
 
@@ -12,11 +12,11 @@ from __future__ import annotations
 
 from typing import Protocol
 
-from blf_dsc_controller.arms.combined_chain import CombinedChain
-from blf_dsc_controller.arms.planar_chain import PlanarChain
+import numpy as np
+
 from blf_dsc_controller.arms.serial_chain import SerialChain
 from blf_dsc_controller.arms.two_link import TwoLink
-from blf_dsc_controller.compiled.jit import compile_methods
+from blf_dsc_controller.compiled.jit import compile_methods, kernel
 from blf_dsc_controller.compiled.layout import Array
 
 
@@ -54,15 +54,53 @@ class ArmModel(Protocol):
         """Compute `regressor` and `momentum_regressor` for one state."""
 
 
-def arm_model(name: str, n: int, l1: float, gravity: float) -> ArmModel:
-    """Return the named model for n joints, with known l1 [m] and gravity [m/s^2]."""
-    r = gravity / l1
-    models: dict[str, ArmModel] = {'two_link': TwoLink(r), 'planar_chain': PlanarChain(n, r)}
+def arm_model(name: str, l1: float, gravity: float) -> ArmModel:
+    """Return the named model, with known l1 [m] and gravity [m/s^2]."""
+    models: dict[str, ArmModel] = {'two_link': TwoLink(gravity / l1)}
     return models[name]
 
 
-compile_methods(
-    ArmModel,
-    ('regressor', 'momentum_regressor', 'regressors'),
-    *(TwoLink, PlanarChain, SerialChain, CombinedChain),
-)
+compile_methods(ArmModel, ('regressor', 'momentum_regressor', 'regressors'), TwoLink, SerialChain)
+
+
+def regressors_at(model: ArmModel, q: Array, dq: Array, v: Array, a: Array) -> Array:
+    """Return H (k, n, p) of the states (k, n): H P = M(q) a + C(q, dq) v + G(q)   [N m]."""
+    H = np.zeros((*q.shape, model.p))
+    q, dq, v, a = (np.ascontiguousarray(each) for each in (q, dq, v, a))
+    _fill_regressors(model, q, dq, v, a, H)
+    return H
+
+
+def inertia_matrices(model: ArmModel, P: Array, q: Array) -> Array:
+    """Return M (k, n, n) at the positions (k, n) of an arm with the parameters P (p,)."""
+    k, n = q.shape
+    Yp, Yr = np.zeros((2, k * n, n, P.size))
+    units = np.tile(np.eye(n), (k, 1))
+    _fill_momentum_regressors(model, np.repeat(q, n, axis=0), units, Yp, Yr)
+    return np.swapaxes((Yp @ P).reshape(k, n, n), 1, 2)
+
+
+def free_inertias(M: Array) -> Array:
+    """Return the inertia (k, n) of each joint with the others free, of matrices M (k, n, n)."""
+    return 1.0 / np.diagonal(np.linalg.inv(M), axis1=1, axis2=2)
+
+
+@kernel
+def _fill_regressors(
+    model: ArmModel,
+    q: np.ndarray,
+    dq: np.ndarray,
+    v: np.ndarray,
+    a: np.ndarray,
+    H: np.ndarray,
+) -> None:
+    for k in range(q.shape[0]):
+        model.regressor(q[k], dq[k], v[k], a[k], H[k])
+
+
+@kernel
+def _fill_momentum_regressors(
+    model: ArmModel, q: np.ndarray, dq: np.ndarray, Yp: np.ndarray, Yr: np.ndarray
+) -> None:
+    for k in range(q.shape[0]):
+        model.momentum_regressor(q[k], dq[k], Yp[k], Yr[k])

@@ -1,24 +1,249 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Model of a serial chain of rigid bodies, linear in its inertial parameters: an `ArmModel`."""
+"""Model of a serial chain of rigid bodies, linear in its inertial parameters: an `ArmModel`.
+
+Spatial vectors are (angular, linear) at the origin of a body's frame.  S_j is the axis of joint j,
+v_i = sum_j S_j dq_j and w_i = sum_j S_j v_j over the joints j <= i that carry body i, and
+alpha_i = sum_j (S_j a_j + S_j' v_j) - gravity with S_j' = v_j x S_j.  Over the bodies i >= j,
+
+    (M a + C v + G)_j = sum_i S_j . (I_i alpha_i + B(I_i, v_i) w_i)
+    B(I, v) w = (v x* I w + w x* I v - I (v x w)) / 2,    for which M' - 2 C is skew
+    (M dq)_j = sum_i S_j . I_i v_i
+    (G - C^T dq)_j = -sum_i (S_j' . I_i v_i + S_j . weight_i)
+
+(Echeandia and Wensing, Numerical methods to compute the Coriolis matrix and Christoffel symbols for
+rigid-body systems, 2021.)  All of it is linear in the ten parameters (`inertia.INERTIA_NAMES`) of
+each body in its joint's frame.  A rotor inertia J, reflected to its joint, adds J a_j and J dq_j.
+"""
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from math import cos, sin
+from typing import Annotated, NamedTuple
 
 import numpy as np
 
-from blf_dsc_controller.arms.chain_kernels import (
-    AXES,
-    ROTOR,
-    Bodies,
-    bodies_of,
-    fill_momentum_regressor,
-    fill_regressor,
-    fill_regressors,
-)
 from blf_dsc_controller.arms.inertia import INERTIA_NAMES, INERTIA_UNITS
 from blf_dsc_controller.arms.urdf import Chain
-from blf_dsc_controller.compiled.layout import Array, pack
+from blf_dsc_controller.compiled.jit import called, inner
+from blf_dsc_controller.compiled.layout import Array, pack, view_of
+from blf_dsc_controller.compiled.vectors import Vector, cross, dot, plus
+
+ROTOR = len(INERTIA_NAMES)
+"""Entry of the rotor inertia, after the ten inertial parameters of a body."""
+
+# Rows of `Bodies.motions`; after them, S and S' of each joint.
+VELOCITY, REFERENCE, ACCELERATION, GRAVITY, AXES = range(5)
+
+
+class Bodies(NamedTuple):
+    """A chain and the columns of its regressors; motions and products are working memory."""
+
+    n: int
+    p: int
+    gravity: Annotated[Array, 3]  # m/s^2, in the base
+    rotation: Annotated[Array, 'n', 3, 3, 3]  # R0, R1, R2 of R0 + cos q R1 + sin q R2
+    offset: Annotated[Array, 'n', 3]  # of a body's origin in the previous body, m
+    slide: Annotated[Array, 'n', 3]  # change of the offset per q, for prismatic joints
+    axis: Annotated[Array, 'n', 6]  # S in the joint's own frame
+    first: Annotated[Array, 'n + 1']  # first column of each body, then p
+    entry: Annotated[Array, 'p']  # of each column: index among its body's ten, or ROTOR
+    motions: Annotated[Array, '4 + 2 * n', 6]  # in the frame of the current body
+    products: Annotated[Array, 3, ROTOR + 1]  # of an axis with each entry's contribution
+
+
+bodies_of = view_of(Bodies)
+
+
+@called
+def fill_regressor(vector: Array, q: Array, dq: Array, v: Array, a: Array, H: Array) -> None:
+    """Implement `SerialChain.regressor`."""
+    bodies = bodies_of(vector)
+    begin(bodies)
+    for i in range(bodies.n):
+        advance(bodies, i, q[i], dq[i], v[i], a[i])
+        add_torque(bodies, i, a[i], H)
+
+
+@called
+def fill_momentum_regressor(vector: Array, q: Array, dq: Array, Yp: Array, Yr: Array) -> None:
+    """Implement `SerialChain.momentum_regressor`."""
+    bodies = bodies_of(vector)
+    begin(bodies)
+    for i in range(bodies.n):
+        advance(bodies, i, q[i], dq[i], 0.0, 0.0)
+        add_momentum(bodies, i, dq[i], Yp, Yr)
+
+
+@called
+def fill_regressors(
+    vector: Array, q: Array, dq: Array, v: Array, a: Array, H: Array, Yp: Array, Yr: Array
+) -> None:
+    """Implement `SerialChain.regressors`."""
+    bodies = bodies_of(vector)
+    begin(bodies)
+    for i in range(bodies.n):
+        advance(bodies, i, q[i], dq[i], v[i], a[i])
+        add_torque(bodies, i, a[i], H)
+        add_momentum(bodies, i, dq[i], Yp, Yr)
+
+
+@inner
+def angular(motion: Array) -> Vector:
+    """Return the angular part of a motion (6,)."""
+    return motion[0], motion[1], motion[2]
+
+
+@inner
+def linear(motion: Array) -> Vector:
+    """Return the linear part of a motion (6,)."""
+    return motion[3], motion[4], motion[5]
+
+
+@inner
+def begin(bodies: Bodies) -> None:
+    """Set the motions of the base."""
+    for k in range(3):
+        for row in range(AXES):
+            bodies.motions[row, k] = 0.0
+            bodies.motions[row, 3 + k] = 0.0
+        bodies.motions[ACCELERATION, 3 + k] = -bodies.gravity[k]
+        bodies.motions[GRAVITY, 3 + k] = bodies.gravity[k]
+
+
+@inner
+def advance(bodies: Bodies, i: int, q: float, dq: float, v: float, a: float) -> None:
+    """Transform all motions from the frame of body i - 1 to that of i; add those of joint i."""
+    motions, rotation = bodies.motions, bodies.rotation[i]
+    c, s = cos(q), sin(q)
+    column0 = turned(rotation, c, s, 0)
+    column1 = turned(rotation, c, s, 1)
+    column2 = turned(rotation, c, s, 2)
+    offset, slide = bodies.offset[i], bodies.slide[i]
+    origin = (offset[0] + q * slide[0], offset[1] + q * slide[1], offset[2] + q * slide[2])
+    own = AXES + 2 * i
+    for row in range(own):
+        motion = motions[row]
+        w, u = angular(motion), linear(motion)
+        u = plus(u, cross(w, origin))
+        motion[0], motion[3] = dot(column0, w), dot(column0, u)
+        motion[1], motion[4] = dot(column1, w), dot(column1, u)
+        motion[2], motion[5] = dot(column2, w), dot(column2, u)
+    axis, rate = motions[own], motions[own + 1]
+    S = bodies.axis[i]
+    w, u = angular(motions[VELOCITY]), linear(motions[VELOCITY])
+    turning, moving = cross(w, angular(S)), cross(w, linear(S))
+    swept = cross(u, angular(S))
+    for k in range(3):
+        rate[k] = turning[k]
+        rate[3 + k] = moving[k] + swept[k]
+    for k in range(6):
+        axis[k] = S[k]
+        motions[VELOCITY, k] += S[k] * dq
+        motions[REFERENCE, k] += S[k] * v
+        motions[ACCELERATION, k] += S[k] * a + rate[k] * v
+
+
+@inner
+def turned(rotation: Array, c: float, s: float, k: int) -> Vector:
+    """Return column k of R0 + c R1 + s R2 (3, 3, 3)."""
+    return (
+        rotation[0, 0, k] + c * rotation[1, 0, k] + s * rotation[2, 0, k],
+        rotation[0, 1, k] + c * rotation[1, 1, k] + s * rotation[2, 1, k],
+        rotation[0, 2, k] + c * rotation[1, 2, k] + s * rotation[2, 2, k],
+    )
+
+
+@inner
+def add_torque(bodies: Bodies, i: int, a: float, H: Array) -> None:
+    """Fill the columns of body i in M a + C v + G."""
+    motions, products = bodies.motions, bodies.products[0]
+    w, u = angular(motions[VELOCITY]), linear(motions[VELOCITY])
+    reference = angular(motions[REFERENCE])
+    alpha, A = angular(motions[ACCELERATION]), linear(motions[ACCELERATION])
+    A = plus(A, cross(reference, u))
+    for j in range(i + 1):
+        torque_products(motions[AXES + 2 * j], alpha, A, w, reference, products)
+        products[ROTOR] = a if j == i else 0.0
+        choose(bodies, i, j, products, H)
+
+
+@inner
+def add_momentum(bodies: Bodies, i: int, dq: float, Yp: Array, Yr: Array) -> None:
+    """Fill the columns of body i in M dq and in G - C^T dq."""
+    motions, momenta, rest = bodies.motions, bodies.products[1], bodies.products[2]
+    w, u = angular(motions[VELOCITY]), linear(motions[VELOCITY])
+    g = linear(motions[GRAVITY])
+    for j in range(i + 1):
+        S, dS = motions[AXES + 2 * j], motions[AXES + 2 * j + 1]
+        momentum_products(S, w, u, momenta)
+        momenta[ROTOR] = dq if j == i else 0.0
+        choose(bodies, i, j, momenta, Yp)
+        momentum_products(dS, w, u, rest)
+        lever = cross(g, angular(S))
+        rest[0] += dot(linear(S), g)
+        rest[1] += lever[0]
+        rest[2] += lever[1]
+        rest[3] += lever[2]
+        for entry in range(ROTOR):
+            rest[entry] = -rest[entry]
+        rest[ROTOR] = 0.0
+        choose(bodies, i, j, rest, Yr)
+
+
+@inner
+def choose(bodies: Bodies, i: int, j: int, products: Array, Y: Array) -> None:
+    """Copy the products that are columns of body i to row j of Y; zero the rows below i."""
+    for k in range(int(bodies.first[i]), int(bodies.first[i + 1])):
+        Y[j, k] = products[int(bodies.entry[k])]
+        if j == i:
+            for below in range(i + 1, bodies.n):
+                Y[below, k] = 0.0
+
+
+@inner
+def torque_products(S: Array, alpha: Vector, A: Vector, v: Vector, w: Vector, out: Array) -> None:
+    """Fill S . (I alpha + B(I, v) w) for a unit of each of the ten; h = m c are the moments.
+
+        force = m A + alpha x h + w x (v x h)
+        moment = h x A + I (alpha - v x w / 2) + (v x I w + w x I v) / 2
+
+    Here alpha, v and w are the angular parts; A is alpha's linear part + w x (v's linear part).
+    """
+    s, t = angular(S), linear(S)
+    turn, lever, along, speed = cross(t, alpha), cross(A, s), dot(t, v), dot(v, w)
+    out[0] = dot(t, A)
+    out[1] = turn[0] + lever[0] + along * w[0] - speed * t[0]
+    out[2] = turn[1] + lever[1] + along * w[1] - speed * t[1]
+    out[3] = turn[2] + lever[2] + along * w[2] - speed * t[2]
+    xx, yy, zz = v[0] * w[0], v[1] * w[1], v[2] * w[2]
+    xy = 0.5 * (v[0] * w[1] + v[1] * w[0])
+    xz = 0.5 * (v[0] * w[2] + v[2] * w[0])
+    yz = 0.5 * (v[1] * w[2] + v[2] * w[1])
+    half = cross(v, w)
+    x, y, z = alpha[0] - 0.5 * half[0], alpha[1] - 0.5 * half[1], alpha[2] - 0.5 * half[2]
+    out[4] = s[0] * x + s[1] * xz - s[2] * xy
+    out[5] = s[0] * (y - xz) + s[1] * (x + yz) + s[2] * (xx - yy)
+    out[6] = s[1] * y + s[2] * xy - s[0] * yz
+    out[7] = s[0] * (z + xy) + s[1] * (zz - xx) + s[2] * (x - yz)
+    out[8] = s[0] * (yy - zz) + s[1] * (z - xy) + s[2] * (y + xz)
+    out[9] = s[2] * z + s[0] * yz - s[1] * xz
+
+
+@inner
+def momentum_products(S: Array, w: Vector, u: Vector, out: Array) -> None:
+    """Fill S . I v for a unit of each of the ten; w and u are v's angular and linear parts."""
+    s, t = angular(S), linear(S)
+    turn, lever = cross(t, w), cross(u, s)
+    out[0] = dot(t, u)
+    out[1] = turn[0] + lever[0]
+    out[2] = turn[1] + lever[1]
+    out[3] = turn[2] + lever[2]
+    out[4] = s[0] * w[0]
+    out[5] = s[0] * w[1] + s[1] * w[0]
+    out[6] = s[1] * w[1]
+    out[7] = s[0] * w[2] + s[2] * w[0]
+    out[8] = s[1] * w[2] + s[2] * w[1]
+    out[9] = s[2] * w[2]
 
 
 class SerialChain(NamedTuple):

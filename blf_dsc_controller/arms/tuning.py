@@ -16,13 +16,13 @@ from __future__ import annotations
 import functools
 import math
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
-if TYPE_CHECKING:
-    from blf_dsc_controller.arms.base_parameters import BaseParameters
-    from blf_dsc_controller.arms.urdf import Chain
+from blf_dsc_controller.arms.base_parameters import BaseParameters, prior_factor
+from blf_dsc_controller.arms.model import free_inertias, inertia_matrices, regressors_at
+from blf_dsc_controller.arms.urdf import Chain
 
 UNKNOWN_EFFORT = 100.0
 """Torque limit [N m] of a joint without one in the URDF."""
@@ -32,10 +32,9 @@ _SAG = 1.5  # sag over (standard deviation of gravity / m omega_b^2); measured: 
 _PHASE = 0.625  # rad, phase lost to the delay at omega_b
 _BOUND = 0.002  # rad
 _UNMODELLED = 0.01  # rms, fraction of the rated torque: ripple, noise, Stribeck
-_WINDOW = {'base': 5.0, 'payload': 2.0}  # s
-# 1 / (independent rows in a window); more where few parameters cannot explain all rows.
-_PRIOR = {'base': 0.01, 'payload': 0.1}
-_REGULARISATION = {'base': 1e-5, 'payload': 1e-9}  # pulls P (about 1) to 0
+_WINDOW = 5.0  # s
+_PRIOR = 0.01  # 1 / (independent rows in a window)
+_REGULARISATION = 1e-5  # pulls P (about 1) to 0
 _ANCHOR = 5.0  # times the mean square of the unmodelled torque
 _POSTURES = 20
 _ROWS, _CHECKS = 0.01, 0.05  # s, between rows of the window and between its checks
@@ -54,19 +53,17 @@ class Design(NamedTuple):
 
     chain: Chain
     parameters: BaseParameters
-    initial_estimate: np.ndarray  # (p,)
     efforts: np.ndarray  # (n,) N m, rated torques
     rotors: np.ndarray  # (n,) kg m^2, inertias of the drives
     payload: float  # kg, rated
     lag: float  # s
-    learn: str  # what is learned of it
 
 
 def gains_of(
     arm: Design, sample_time: float, bound: np.ndarray | None
 ) -> Mapping[str, bool | int | float | str | tuple[float, ...] | tuple[str, ...]]:
     """Return gains and limits by the dotted name of their parameter; `bound` (n,) [rad] or None."""
-    chain, P0, learn = arm.chain, arm.initial_estimate, arm.learn
+    chain = arm.chain
     n = len(chain.joints)
     effort = _finite([joint.effort for joint in chain.joints], UNKNOWN_EFFORT)
     velocity = _finite([joint.velocity for joint in chain.joints], 2.0)
@@ -105,17 +102,17 @@ def gains_of(
         'limits.position_upper': _listed(upper),
         'limits.velocity': _listed(_SLOW * velocity),
         'limits.acceleration': _listed(4.0 * _SLOW * velocity),
-        'learning.initial_estimate': _listed(P0),
-        'learning.adaptation_gain': (0.5,) * P0.size,
-        'learning.radius': 10.0 * max(float(np.linalg.norm(P0)), arm.payload),
-        'learning.window': _WINDOW[learn],
-        'learning.regularization': _REGULARISATION[learn],
+        'learning.initial_estimate': _listed(P),
+        'learning.adaptation_gain': (0.5,) * P.size,
+        'learning.radius': 10.0 * max(float(np.linalg.norm(P)), arm.payload),
+        'learning.window': _WINDOW,
+        'learning.regularization': _REGULARISATION,
         'learning.settling_time': 0.3,
         'learning.filter_pole': 20.0,
         'learning.row_interval': max(1, round(_ROWS / sample_time)),
         'learning.interval': max(1, round(_CHECKS / sample_time)),
         'learning.excitation_threshold': 1e-9,
-        'learning.prior_weight': _PRIOR[learn],
+        'learning.prior_weight': _PRIOR,
         'learning.anchor_weight': _ANCHOR * float(floor.min()) ** 2,
         'learning.motion_scale': 0.05,
         'learning.residual_floor': _listed(floor),
@@ -149,13 +146,6 @@ def over_postures(
 
     Both are taken over random postures within the limits, with the rated payload [kg].
     """
-    from blf_dsc_controller.arms.batch import (  # slow: compiles
-        free_inertias,
-        inertia_matrices,
-        regressors_at,
-    )
-    from blf_dsc_controller.arms.prior import prior_factor
-
     model = parameters.model
     n = model.n
     L = prior_factor(chain, parameters, payload, np.zeros(n))

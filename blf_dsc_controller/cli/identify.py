@@ -17,7 +17,7 @@ from blf_dsc_controller.bags.content import NameMap
 from blf_dsc_controller.cli.main import PICK_UP, make_room
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.nodes import CONTROLLER, dump, load, locate
-from blf_dsc_controller.configuration.robot import Robot, learned_of, parameters_of
+from blf_dsc_controller.configuration.robot import Robot, parameters_of
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.identification import exciting_reference
 from blf_dsc_controller.identification.corrected_urdf import corrected_urdf
@@ -301,7 +301,7 @@ def guess_of(config: ControllerConfig, given: list[float] | None) -> np.ndarray:
     if given or config.model != 'urdf':
         return np.atleast_2d(given or start)
     robot, chain = config.robot, config.robot.chain(config.joints)
-    return np.array((start, start + robot.payload * learned_of(robot, chain).load))
+    return np.array((start, start + robot.payload * parameters_of(robot, chain).load))
 
 
 def clearance_of(config: ControllerConfig, radius: float, floor: float) -> Clearance | None:
@@ -328,7 +328,7 @@ def _unshown(config: ControllerConfig, remaining: np.ndarray) -> list[str]:
     if not order:
         return ['It shows all parameters.']
     names = list(estimate_names(config))
-    if config.model == 'urdf' and config.robot.learn == 'base':
+    if config.model == 'urdf':
         sums = parameters_of(config.robot, config.robot.chain(config.joints)).combinations
         names[: len(sums)] = sums
     lines = ["It hardly shows the following; of the prior's deviation a window leaves"]

@@ -19,7 +19,8 @@ and `settings.N`; `'actuator.delay'` works as well, and any named tuple or objec
 tuple in kernels).  Fields of type `int` and `float` are numbers, read when the view is made.  An
 `int` field of the layout itself can also be a length; if the vector holds all lengths, the view
 takes the vector alone, and `pack` makes it from the tuple.  A field may itself be such a
-`NamedTuple`.  A field of any other type is not in the vector: the view takes it as an argument.
+`NamedTuple`.  A field of any other type, or of type `Passed`, is not in the vector: the view takes
+it as an argument.
 
 Nor is a field of type `Fixed`, an integer that is compiled into kernels, such as the number of
 joints: loops of known length are unrolled.  The view takes all of them as its second argument,
@@ -47,6 +48,8 @@ Cell = Annotated[Array, '1']
 """One number of a vector, which kernels can write."""
 Fixed = Annotated[int, 'compiled into kernels']
 """An integer that kernels are compiled for."""
+Passed = Annotated[int, 'an argument of the view']
+"""An integer that the caller of a view knows, maybe as a constant."""
 
 T = TypeVar('T')
 
@@ -90,7 +93,7 @@ def view_of(layout: type[T]) -> Callable[..., T]:
     # No field's name starts with an underscore.
     names: dict[str, Any] = {'_part': part, '_fixed': fixed, '__name__': layout.__module__}
     hints = _hints(layout)
-    own = tuple(name for name, hint in hints.items() if hint in (int, Fixed))
+    own = tuple(name for name, hint in hints.items() if hint is int or not _is_part(hint))
     lines = ['_at = 0']
     result = _view(layout, own, lines, names, '')
     passed = (name for name, hint in hints.items() if not (_is_part(hint) or hint is Fixed))
@@ -135,7 +138,7 @@ def _sizes(layout: type) -> Iterator[str]:
 
 
 def _is_part(hint: Any) -> bool:
-    is_array = hasattr(hint, '__metadata__') and hint is not Fixed
+    is_array = getattr(hint, '__origin__', None) is Array and hasattr(hint, '__metadata__')
     return hint in (int, float) or is_array or hasattr(hint, '_fields')
 
 

@@ -16,10 +16,10 @@ from typing import Annotated, Any, Literal
 import numpy as np
 
 from blf_dsc_controller.arms import tuning
+from blf_dsc_controller.arms.model import arm_model
 from blf_dsc_controller.configuration.robot import (
     ArmConfig,
     given_robot,
-    learned_of,
     parameters_of,
 )
 from blf_dsc_controller.configuration.schema import (
@@ -110,11 +110,6 @@ class MotionLimits:
             for joint, lower, upper in limits
             if upper <= lower
         ]
-
-
-def parameter_count(joints: int) -> int:
-    """Return the number of unknown parameters of a planar arm: one for each pair of links."""
-    return joints * (joints + 1) // 2
 
 
 @dataclass(frozen=True)
@@ -481,7 +476,7 @@ class ControllerConfig(ArmConfig):
     law: Literal['blf_dsc', 'model_based', 'backstepping', 'slotine_li'] = _size(
         'blf_dsc', 'control law'
     )
-    model: Literal['two_link', 'planar_chain', 'urdf'] = _size('two_link', 'model of the arm')
+    model: Literal['two_link', 'urdf'] = _size('two_link', 'model of the arm')
     arm: ArmGeometry = ArmGeometry()
     reference: Reference = Reference()
     approach: Approach = Approach()
@@ -510,34 +505,29 @@ class ControllerConfig(ArmConfig):
         arm = tuning.Design(
             chain,
             parameters_of(robot, chain),
-            learned_of(robot, chain).initial,
             robot.efforts(chain),
             robot.rotors(chain),
             robot.payload,
             robot.lag,
-            robot.learn,
         )
         bound = np.array(given.get('barrier.bound', ()))
-        is_filtered = given.get('learning.prediction', 'filtered') == 'filtered'
-        weighs = {'learning.weighing': robot.learn == 'base' and is_filtered}
         return {
             'model': 'urdf',
-            **weighs,
+            'learning.weighing': given.get('learning.prediction', 'filtered') == 'filtered',
             **tuning.gains_of(arm, period, bound if bound.size == len(chain.joints) else None),
         }
 
     def problems(self) -> Iterator[str]:
         """Check the parameters against each other, joints and estimates against the model."""
-        needed = 2 if self.model == 'two_link' else None
-        count = parameter_count(needed or len(self.joints))
         if self.model == 'urdf':
-            count = learned_of(self.robot, self.robot.chain(self.joints)).model.p
-        elif self.robot.learn != 'base':
-            yield f'robot.learn: got {self.robot.learn}, but model {self.model} learns base only'
-            return
-        learning, learned = self.learning, (self.model, self.robot.learn, self.learning.prediction)
-        if learning.weighing and learned != ('urdf', 'base', 'filtered'):
-            needs = 'model urdf, robot.learn base and learning.prediction filtered'
+            needed = None
+            count = parameters_of(self.robot, self.robot.chain(self.joints)).model.p
+        else:
+            model = arm_model(self.model, self.arm.l1, self.arm.gravity)
+            needed, count = model.n, model.p
+        learning, learned = self.learning, (self.model, self.learning.prediction)
+        if learning.weighing and learned != ('urdf', 'filtered'):
+            needs = 'model urdf and learning.prediction filtered'
             yield f'learning.weighing: got true with {", ".join(learned)}, but needs {needs}'
             return
         yield from self.arm_problems(f'model {self.model}', needed)

@@ -9,12 +9,17 @@ from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 
+from blf_dsc_controller.arms.base_parameters import (
+    PAYLOAD_SIZE,
+    BaseParameters,
+    base_parameters,
+)
 from blf_dsc_controller.arms.inertia import inertia_of
-from blf_dsc_controller.arms.prior import PAYLOAD_SIZE
+from blf_dsc_controller.arms.serial_chain import serial_chain
 from blf_dsc_controller.arms.urdf import Chain, UrdfError, chain_joints, moving_joints, read_chain
 from blf_dsc_controller.configuration.files import read_text, resolve
 from blf_dsc_controller.configuration.schema import (
@@ -24,10 +29,6 @@ from blf_dsc_controller.configuration.schema import (
     parameter,
 )
 from blf_dsc_controller.errors import BlfDscError, ConfigurationError
-
-if TYPE_CHECKING:
-    from blf_dsc_controller.arms.base_parameters import BaseParameters
-    from blf_dsc_controller.arms.forms import LearnedParameters
 
 _BUILT = 'arm and law are built once, when the node starts'
 _fixed = partial(parameter, read_only=_BUILT)
@@ -70,9 +71,6 @@ class Robot:
         read_only=_BUILT,
     )
     payload: float = non_negative(3.0, 'rated payload', 'kg', read_only=_BUILT)
-    learn: Literal['base', 'payload'] = _fixed(
-        'base', 'what is learned: all base parameters, or the load at the tip'
-    )
     rotor_inertia: PerJoint = _omitted(
         'inertia of each drive, reflected to its joint; empty: from its effort, then as measured',
         'kg m^2',
@@ -104,9 +102,7 @@ class Robot:
     )
 
     def problems(self) -> Iterator[str]:
-        """Check that there is something to learn, and a model of what the drives add."""
-        if self.learn == 'payload' and self.payload == 0.0:
-            yield 'payload: got 0 kg, but learn: payload needs the mass that the arm may carry'
+        """Check that there is a model of what the drives add."""
         if self.drive_compensates != 'none' and not self.urdf:
             yield f'drive_compensates: got {self.drive_compensates}, which needs robot.urdf'
         if self.drive_compensates == 'none' and self.drive_payload:
@@ -229,19 +225,8 @@ def chain_of(text: str, base: str, tip: str, joints: tuple[str, ...]) -> Chain:
 
 def parameters_of(robot: Robot, chain: Chain) -> BaseParameters:
     """Return the base parameters of the arm, with the rotors."""
-    from blf_dsc_controller.arms.base_parameters import base_parameters  # slow: compiles
-
     x, y, z = robot.gravity
     return base_parameters(chain, (x, y, z))
-
-
-@functools.lru_cache(maxsize=16)
-def learned_of(robot: Robot, chain: Chain) -> LearnedParameters:
-    """Return the learned parameters of the arm, with the rotors."""
-    from blf_dsc_controller.arms.forms import learned_parameters  # slow: compiles
-
-    base = parameters_of(robot, chain)
-    return learned_parameters(chain, base, robot.learn, robot.payload, robot.rotors(chain))
 
 
 def drive_model(robot: Robot, joints: tuple[str, ...]) -> tuple[np.ndarray, np.ndarray]:
@@ -251,8 +236,6 @@ def drive_model(robot: Robot, joints: tuple[str, ...]) -> tuple[np.ndarray, np.n
     """
     if robot.drive_compensates == 'none':
         return np.zeros(0), np.zeros(0)
-    from blf_dsc_controller.arms.serial_chain import serial_chain  # slow: compiles
-
     chain = robot.chain(joints)
     columns = [(i, entry) for i in range(len(chain.joints)) for entry in range(_MOMENTS)]
     inertias = robot.drive_inertias(chain, chain.inertias)

@@ -29,7 +29,7 @@ from blf_dsc_controller.compiled.layout import pack as pack_settings
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.law.factory import prior_covariance, settings_of_config
 from blf_dsc_controller.law.prediction import rows_along
-from blf_dsc_controller.reference.limits import MotionError
+from blf_dsc_controller.reference.approach import MotionError
 from blf_dsc_controller.reference.terms import pack, sampled, sinusoids_term
 
 ITERATIONS = 150

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from blf_dsc_controller.arms.base_parameters import BaseParameters, base_parameters
-from blf_dsc_controller.arms.chain_kernels import ROTOR
+from blf_dsc_controller.arms.serial_chain import ROTOR
 from blf_dsc_controller.arms.urdf import Chain, attached
 from blf_dsc_controller.bags.content import NO_NAMES, NameMap
 from blf_dsc_controller.configuration.robot import Robot

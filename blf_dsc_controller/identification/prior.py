@@ -21,16 +21,16 @@ from typing import NamedTuple
 
 import numpy as np
 
-from blf_dsc_controller.arms.base_parameters import BaseParameters
-from blf_dsc_controller.arms.chain_kernels import ROTOR
-from blf_dsc_controller.arms.inertia import inertia_of, pseudo_inertia
-from blf_dsc_controller.arms.prior import (
+from blf_dsc_controller.arms.base_parameters import (
     CENTRE,
     LINKS,
     PAYLOAD_SIZE,
+    BaseParameters,
     deviations,
     payload_inertia,
 )
+from blf_dsc_controller.arms.inertia import inertia_of, pseudo_inertia
+from blf_dsc_controller.arms.serial_chain import ROTOR
 from blf_dsc_controller.arms.urdf import Chain
 from blf_dsc_controller.configuration.robot import Robot
 from blf_dsc_controller.errors import BlfDscError

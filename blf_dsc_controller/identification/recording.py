@@ -28,7 +28,7 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
-from blf_dsc_controller.arms.batch import regressors_at
+from blf_dsc_controller.arms.model import regressors_at
 from blf_dsc_controller.arms.serial_chain import SerialChain
 from blf_dsc_controller.arms.urdf import chain_joints, moving_joints
 from blf_dsc_controller.bags.content import NO_NAMES, NameMap, read_content

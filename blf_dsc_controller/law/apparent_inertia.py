@@ -22,7 +22,7 @@ reference nothing changes: what is learned acts there.
 import numpy as np
 
 from blf_dsc_controller.compiled.jit import inner
-from blf_dsc_controller.law import surface
+from blf_dsc_controller.law import barrier
 from blf_dsc_controller.law.settings import EFFORT, Settings
 from blf_dsc_controller.law.state import Signals, State
 
@@ -62,9 +62,9 @@ def pass_band(
 ) -> None:
     """Write torque and acceleration in the band to `signals.unit` and `signals.swing`."""
     lags = state.lags
-    late = surface.filter_gain(0.5 * settings.lag, dt) if settings.lag > 0.0 else 1.0
-    smooth, slow = surface.filter_gain(dt / _SMOOTH, dt), surface.filter_gain(dt / _SLOW, dt)
-    brief = surface.filter_gain(_MEMORY, dt)
+    late = barrier.filter_gain(0.5 * settings.lag, dt) if settings.lag > 0.0 else 1.0
+    smooth, slow = barrier.filter_gain(dt / _SMOOTH, dt), barrier.filter_gain(dt / _SLOW, dt)
+    brief = barrier.filter_gain(_MEMORY, dt)
     for i in range(settings.n):
         torque = signals.applied[i]
         if settings.torque_source != EFFORT:  # which is measured after the drive

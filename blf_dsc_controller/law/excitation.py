@@ -1,13 +1,33 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Excitation: the latch (27) and the rejection of disturbance columns.
+"""Which windows are learned from: those that are excited (27), and of one and the same arm.
 
-Columns that the window cannot distinguish from the parameters are rejected: theta_j = 0.
+Disturbance columns that a window cannot distinguish from the parameters are rejected: theta_j = 0.
+
+A window that spans a change of the arm (a payload, a contact) contradicts itself although it is
+excited; its least-squares solution is a mixture, and the Newton step would solve it exactly.  The
+mean of u^T u, kept with Phi and b, gives the residual of the solution,
+
+    r^2 = mean(u^T u) - b^T theta_LS   [(N m)^2],
+
+and a window is latched only if r^2 is at most four times the smallest of any full window, or what
+unmodelled torque explains (configured, but no more than the smallest residual shows), and if its
+solution gives the arm a positive inertia, which the residual does not show.  The first full
+window has only its own parts as a measure: fitted apart, neither may explain its rows better than
+by that factor, else the older part is removed from the window; again only if the residual has
+halved since, since parts of a period never agree about a lasting disturbance.  Rows that
+contradict the latched solution (their mean square error over 0.1 s exceeds eight times r^2) mean
+that the arm has changed: window, filters and latch are cleared, and learning restarts.  Until the
+new window is full, it does not average out disturbances, so its solution is pulled to the estimate
+before the change, most strongly in weakly excited directions, and if rows contradict it that early,
+what it taught is taken back: it did not predict what it was not fitted to.  Likewise, a full window
+with an unusually large residual is pulled to an earlier solution, kept once per window.
 """
 
 import numpy as np
 
+from blf_dsc_controller.compiled import cholesky
 from blf_dsc_controller.compiled.jit import inner
-from blf_dsc_controller.law import consistency, window
+from blf_dsc_controller.law import adaptation, window
 from blf_dsc_controller.law.settings import BEST, Settings
 from blf_dsc_controller.law.state import Signals, State
 
@@ -15,6 +35,205 @@ _WARM = 4  # inverse iterations from the previous direction
 _COLD = 60  # from an arbitrary direction
 _COMPARABLE = 0.95  # fraction of the best lambda_min
 _FORGETTING = 0.1  # fraction of the best lambda_min lost per window
+_GATE = 4.0  # ratio of mean squares: twice the torque
+_ALARM = 8.0  # likewise; larger, since a solution extrapolates
+_QUIET = 4.0  # times the smallest residual: the floor, where that is below the configured one
+_LEAST_FLOOR = 0.01  # of the configured floor: a tenth of the torque
+_FALLEN = 0.5  # of the residual since the last split; that of a lasting disturbance does not fall
+_USUAL = 1.25  # times the smallest residual, which varies with the motion
+_DOUBT = 3.0  # pull to the anchor per (N m)^2 above that, 1/(kg m^2)^2
+_LEAST_INERTIA = 0.1  # fraction of the initial estimate's
+_MEMORY = 0.1  # s, averaging time of the last rows
+
+
+@inner
+def explained(settings: Settings, state: State, residual: float) -> float:
+    """Return the mean square residual that noise and unmodelled torque explain (>= `residual`).
+
+    Their configured floor is an upper limit: the best full window shows how little they are.
+    """
+    floor = settings.residual_floor
+    if state.least_residual[0] > 0.0:
+        shown = max(_QUIET * state.least_residual[0], _LEAST_FLOOR * floor)
+        floor = min(floor, shown)
+    return max(residual, floor)
+
+
+@inner
+def detect_change(settings: Settings, state: State, signals: Signals, t: float, dt: float) -> None:
+    """Compare this row with the latched solution; forget the window if the arm has changed."""
+    if state.latched[0] == 0.0:
+        return
+    square = 0.0
+    for i in range(settings.n):
+        error = -signals.row[i, settings.m]
+        for j in range(settings.m):
+            error += signals.row[i, j] * state.solution[j]
+        square += error * error
+    state.recent_residual[0] += min(1.0, dt / _MEMORY) * (square - state.recent_residual[0])
+    if state.recent_residual[0] > _ALARM * explained(settings, state, state.residual[0]):
+        state.changes[0] += 1.0
+        state.change_time[0] = t
+        state.contradiction[0] = state.recent_residual[0]
+        if state.rows[0] < settings.window:
+            take_back(settings, state, signals)
+        forget_window(settings, state)
+
+
+@inner
+def take_back(settings: Settings, state: State, signals: Signals) -> None:
+    """Return to the estimate before the last change, bumplessly."""
+    for j in range(settings.m):
+        signals.work[j] = state.estimate[j]
+        state.estimate[j] = state.anchor[j]
+    if settings.bumpless == 1:
+        adaptation.hand_over(settings, state, signals)
+
+
+@inner
+def forget_window(settings: Settings, state: State) -> None:
+    """Clear the window, its filters and the latch; the estimate stays and becomes the anchor."""
+    state.latched[0] = 0.0
+    state.latched_lambda[0] = 0.0
+    state.best_lambda[0] = 0.0
+    state.recent_residual[0] = 0.0
+    state.rows[0] = 0.0
+    state.cursor[0] = 0.0
+    window.clear(state.running)
+    window.clear(state.fresh)
+    window.clear(state.half)
+    window.clear(state.filter1)
+    window.clear(state.filter2)
+    for j in range(settings.m):
+        state.anchor[j] = state.estimate[j]
+        state.min_eigenvector[j] = settings.m**-0.5
+
+
+@inner
+def window_residual(running: np.ndarray, theta: np.ndarray) -> float:
+    """Return the sum of |u - X theta|^2 over the window, from its sums of [X | u]^T [X | u]."""
+    m = theta.size
+    total = running[m, m]
+    for i in range(m):
+        product = -2.0 * running[i, m] + running[i, i] * theta[i]
+        for j in range(i + 1, m):
+            product += 2.0 * running[i, j] * theta[j]
+        total += theta[i] * product
+    return max(float(total), 0.0)
+
+
+@inner
+def is_physical(settings: Settings, signals: Signals, q: np.ndarray, theta: np.ndarray) -> bool:
+    """Check that M(q) of theta (m,), minus a tenth of that of P^(0), is positive definite.
+
+    Overwrites Yp and Yr of `signals`.
+    """
+    for k in range(settings.n):
+        for i in range(settings.n):
+            signals.unit[i] = 1.0 if i == k else 0.0
+        settings.model.momentum_regressor(q, signals.unit, signals.momentum, signals.rest)
+        for i in range(k, settings.n):
+            signals.inertia[k, i] = 0.0
+            for j in range(settings.p):
+                parameter = theta[j] - _LEAST_INERTIA * settings.initial_estimate[j]
+                signals.inertia[k, i] += signals.momentum[i, j] * parameter
+    return cholesky.factor(signals.inertia)
+
+
+@inner
+def is_in_question(settings: Settings, state: State, residual: float) -> bool:
+    """Return whether a full window must be compared with its parts, for want of another measure."""
+    is_full = state.rows[0] == settings.window
+    if not is_full or state.least_residual[0] > 0.0 or settings.window == 1:
+        return False
+    split = state.split_residual[0]
+    is_new = split == 0.0 or residual < _FALLEN * split
+    return bool(is_new and residual > _GATE * settings.residual_floor)
+
+
+@inner
+def solve(settings: Settings, state: State, signals: Signals) -> None:
+    """Factor Phi + rho R, and solve Phi theta = b, with theta in `signals.work`."""
+    window.regularized_factor(
+        state.active, settings.rho, settings.information, signals.Phi, signals.b, signals.factor
+    )
+    for j in range(settings.m):
+        signals.work[j] = signals.b[j]
+    cholesky.solve(signals.factor, signals.work)
+
+
+@inner
+def agrees_with_parts(settings: Settings, state: State, signals: Signals, residual: float) -> bool:
+    """Check the residual of a full window against those of its two parts, each fitted apart.
+
+    If they contradict each other, only the newer part stays in the window.  Restores Phi, b, its
+    factor and the solution of the whole window in `signals`.
+    """
+    length, newer_rows = settings.window, window.newer_part(state, signals.newer)
+    least = residual
+    for k in range(3):
+        if k == 0:
+            rows = length - newer_rows
+            window.add(state.running, -1.0, signals.newer, signals.part)
+        elif k == 1:
+            rows = newer_rows
+            window.add(signals.newer, 0.0, signals.newer, signals.part)
+        else:
+            rows = length
+            window.add(state.running, 0.0, state.running, signals.part)
+        window.average_window(signals.part, rows, signals.Phi, signals.b)
+        if settings.prior_weight > 0.0:
+            prior, weight = settings.initial_estimate, settings.prior_weight
+            window.pull_to(prior, weight, settings.information, signals.Phi, signals.b)
+        solve(settings, state, signals)
+        least = min(least, window_residual(signals.part, signals.work) / rows)
+    if residual <= _GATE * explained(settings, state, least):
+        return True
+    state.split_residual[0] = residual
+    state.rows[0] = float(newer_rows)
+    window.add(signals.newer, 0.0, signals.newer, state.running)
+    for j in range(settings.m):
+        state.min_eigenvector[j] = settings.m**-0.5
+    return False
+
+
+@inner
+def accept_window(settings: Settings, state: State, signals: Signals, q: np.ndarray) -> bool:
+    """Check that the window is consistent and its solution physical; if so, keep the solution.
+
+    A window that is not full, or has an unusually large residual, is pulled to the anchor:
+    Phi + a R, b + a R theta_anchor, in `signals`.
+    """
+    m = settings.m
+    solution = signals.work
+    for j in range(m):
+        solution[j] = signals.b[j]
+    cholesky.solve(signals.factor, solution)
+    residual = window_residual(state.running, solution) / state.rows[0]
+    missing = 1.0 - state.rows[0] / settings.window
+    is_first = state.latched[0] == 0.0
+    if is_in_question(settings, state, residual) and not agrees_with_parts(
+        settings, state, signals, residual
+    ):
+        return False
+    if missing <= 0.0 and (state.least_residual[0] == 0.0 or residual < state.least_residual[0]):
+        state.least_residual[0] = residual
+    if residual > _GATE * explained(settings, state, state.least_residual[0]):
+        return False
+    doubt = _DOUBT * max(0.0, residual - _USUAL * state.least_residual[0])
+    pull = settings.anchor_weight * missing + doubt
+    if pull > 0.0:
+        window.pull_to(state.anchor, pull, settings.information, signals.Phi, signals.b)
+        solve(settings, state, signals)
+    if not is_physical(settings, signals, q, solution):
+        return False
+    for j in range(m):
+        state.solution[j] = solution[j]
+    state.residual[0] = residual
+    if missing <= 0.0 and (is_first or window.is_at_start(settings, state)):
+        for j in range(m):
+            state.anchor[j] = solution[j]
+    return True
 
 
 @inner
@@ -104,7 +323,7 @@ def update_excitation(
     if not (learning and value >= settings.sigma and is_preferred(settings, state, value)):
         return
     consistent = settings.change_detection == 0
-    if not (consistent or consistency.accept_window(settings, state, signals, q)):
+    if not (consistent or accept_window(settings, state, signals, q)):
         return
     for i in range(settings.m):
         state.b[i] = signals.b[i]

@@ -13,17 +13,24 @@ All laws share one kernel; they differ in the surface and in which gains are zer
 from __future__ import annotations
 
 from copy import deepcopy
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from blf_dsc_controller.arms.chain_kernels import ROTOR
+from blf_dsc_controller.arms.base_parameters import (
+    PAYLOAD_SIZE,
+    ROTORS,
+    UNKNOWN_ROTOR,
+    deviations,
+    payload_inertia,
+    prior_factor,
+)
 from blf_dsc_controller.arms.inertia import inertia_of, pseudo_inertia
 from blf_dsc_controller.arms.model import ArmModel, arm_model
-from blf_dsc_controller.arms.prior import PAYLOAD_SIZE, deviations, payload_inertia
+from blf_dsc_controller.arms.serial_chain import ROTOR
 from blf_dsc_controller.arms.tuning import over_postures
 from blf_dsc_controller.configuration.controller import ControllerConfig
-from blf_dsc_controller.configuration.robot import drive_model, learned_of, parameters_of
+from blf_dsc_controller.configuration.robot import drive_model, parameters_of
 from blf_dsc_controller.configuration.schema import parameters
 from blf_dsc_controller.law import barrier
 from blf_dsc_controller.law.controller import Controller
@@ -46,17 +53,58 @@ def model_of(config: ControllerConfig) -> ArmModel:
     """Return the model named by `model`, with the geometry known to the controller."""
     if config.model == 'urdf':
         robot = config.robot
-        return deepcopy(learned_of(robot, robot.chain(config.joints)).model)  # has working memory
-    return arm_model(config.model, len(config.joints), config.arm.l1, config.arm.gravity)
+        base = parameters_of(robot, robot.chain(config.joints))
+        return deepcopy(base.model)  # has working memory
+    return arm_model(config.model, config.arm.l1, config.arm.gravity)
 
 
-def column_names(config: ControllerConfig) -> tuple[str, ...]:
-    """Return the name of each disturbance column, in the order of `prediction.fill_columns`."""
-    learning = config.learning
+class Column(NamedTuple):
+    """A disturbance column: what is known of its coefficient in theta before the start."""
+
+    name: str
+    unit: str
+    initial: float  # of a URDF's friction; else zero
+    deviation: float  # of the prior
+    least: float  # value that it can have
+    most: float
+
+
+def columns_of(config: ControllerConfig) -> tuple[Column, ...]:
+    """Return the disturbance columns, in the order of `prediction.fill_columns`.
+
+    The standard deviation is half the initial estimate, or 5 % of the rated torque where that is
+    zero, for `viscous` at the largest velocity of the reference.  Friction is between a third of
+    its initial estimate and three times that, or between 0 and those 5 %: a push that is learned
+    as friction, negative or none, turns over where the joint does.
+    """
+    learning, joints = config.learning, config.joints
     switched = {'bias': learning.bias, 'viscous': learning.viscous, 'coulomb': learning.coulomb}
     blocks = [name for name, is_on in switched.items() if is_on]
     blocks += [f'{wave} {w:g} rad/s' for w in learning.frequencies for wave in ('sin', 'cos')]
-    return tuple(f'{block} {joint}' for block in blocks for joint in config.joints)
+    known = config.robot.friction(config.robot.chain(joints)) if config.model == 'urdf' else {}
+    columns = []
+    for block in blocks:
+        is_viscous, is_friction = block == 'viscous', block in {'viscous', 'coulomb'}
+        for i, joint in enumerate(joints):
+            initial = known[block][i] if block in known else 0.0
+            velocity = config.limits.velocity[i] if is_viscous else 1.0
+            usual = _FRICTION * config.torque.limit[i] / velocity
+            columns.append(
+                Column(
+                    name=f'{block} {joint}',
+                    unit='N m s/rad' if is_viscous else 'N m',
+                    initial=initial,
+                    deviation=0.5 * initial or usual,
+                    least=initial / _MOST_FRICTION if is_friction else -np.inf,
+                    most=(_MOST_FRICTION * initial or usual) if is_friction else np.inf,
+                )
+            )
+    return tuple(columns)
+
+
+def column_names(config: ControllerConfig) -> tuple[str, ...]:
+    """Return the name of each disturbance column."""
+    return tuple(column.name for column in columns_of(config))
 
 
 def estimate_names(config: ControllerConfig) -> tuple[str, ...]:
@@ -64,55 +112,18 @@ def estimate_names(config: ControllerConfig) -> tuple[str, ...]:
     return model_of(config).parameter_names + column_names(config)
 
 
-def initial_columns(config: ControllerConfig) -> tuple[float, ...]:
-    """Return the initial estimate of each disturbance column: friction of a URDF, else zero."""
-    known: dict[str, tuple[float, ...]] = {}
-    if config.model == 'urdf':
-        known = config.robot.friction(config.robot.chain(config.joints))
-    zeros = (0.0,) * len(config.joints)
-    blocks = [name.rsplit(' ', 1)[0] for name in column_names(config)[:: len(config.joints)]]
-    return tuple(value for block in blocks for value in known.get(block, zeros))
-
-
 def prior_covariance(config: ControllerConfig) -> np.ndarray:
-    """Return the prior covariance (m, m) of theta: identity for planar arms, else of the URDF.
-
-    Standard deviations: half its value for a drive and for known friction, else 5 % of the rated
-    torque for friction columns.
-    """
-    columns = column_names(config)
+    """Return the prior covariance (m, m) of theta: identity for planar arms, else of the URDF."""
+    columns = columns_of(config)
     if config.model != 'urdf':
         return np.eye(model_of(config).p + len(columns))
-    L = learned_of(config.robot, config.robot.chain(config.joints)).L
-    covariance = np.zeros((len(L) + len(columns),) * 2)
+    robot, chain = config.robot, config.robot.chain(config.joints)
+    rotors = robot.rotors(chain)
+    unsure = np.where(rotors > 0.0, ROTORS * rotors, UNKNOWN_ROTOR)
+    L = prior_factor(chain, parameters_of(robot, chain), robot.payload, unsure)
+    covariance = np.diag([0.0] * len(L) + [column.deviation**2 for column in columns])
     covariance[: len(L), : len(L)] = L @ L.T
-    for k, (name, known) in enumerate(zip(columns, initial_columns(config), strict=True)):
-        covariance[len(L) + k, len(L) + k] = (0.5 * known or _usual_friction(config, name)) ** 2
     return covariance
-
-
-def _usual_friction(config: ControllerConfig, column: str) -> float:
-    """Return 5 % of the rated torque, for `viscous` at the largest velocity of the reference."""
-    block, _, joint = column.rpartition(' ')
-    i = config.joints.index(joint)
-    velocity = config.limits.velocity[i] if block == 'viscous' else 1.0
-    return _FRICTION * config.torque.limit[i] / velocity
-
-
-def column_limits(config: ControllerConfig) -> tuple[tuple[float, ...], tuple[float, ...]]:
-    """Return the least and the most that each disturbance column can be estimated at.
-
-    Friction is between a third of its initial estimate and three times that, or where that is zero
-    between 0 and 5 % of the rated torque: a push that is learned as friction, negative or none,
-    turns over where the joint does.
-    """
-    least, most = [], []
-    for name, initial in zip(column_names(config), initial_columns(config), strict=True):
-        is_friction = name.startswith(('viscous ', 'coulomb '))
-        least.append(initial / _MOST_FRICTION if is_friction else -np.inf)
-        limit = _MOST_FRICTION * initial or _usual_friction(config, name)
-        most.append(limit if is_friction else np.inf)
-    return tuple(least), tuple(most)
 
 
 def settings_of_config(config: ControllerConfig) -> Settings:
@@ -122,7 +133,8 @@ def settings_of_config(config: ControllerConfig) -> Settings:
     """
     model = model_of(config)
     learning = config.learning
-    p, columns = model.p, len(column_names(config))
+    p, columns = model.p, columns_of(config)
+    m = p + len(columns)
     truth = config.truth
     per_joint = zip(
         config.barrier.bound, config.barrier.weight, config.barrier.slope_limit, strict=True
@@ -131,12 +143,11 @@ def settings_of_config(config: ControllerConfig) -> Settings:
     least = float(floor.min())
     covariance = prior_covariance(config)
     drive_chain, drive_inertias = drive_model(config.robot, config.joints)
-    friction = column_limits(config)
     computed = {
         'model': model,
         'n': model.n,
         'p': p,
-        'm': p + columns,
+        'm': m,
         'surface': SURFACES.index('filtered'),
         'prediction': PREDICTIONS.index(learning.prediction),
         'latch': LATCHES.index(learning.latch),
@@ -166,14 +177,14 @@ def settings_of_config(config: ControllerConfig) -> Settings:
         'true_disturbance': np.array(
             (truth.constant, truth.amplitude, truth.frequency, truth.phase)
         ),
-        'Gamma': np.array(learning.adaptation_gain + (learning.column_gain,) * columns),
-        'initial_estimate': np.array(learning.initial_estimate + initial_columns(config)),
+        'Gamma': np.array(learning.adaptation_gain + (learning.column_gain,) * len(columns)),
+        'initial_estimate': np.array((*learning.initial_estimate, *(c.initial for c in columns))),
         'information': np.linalg.inv(covariance),
         'variance': np.diag(covariance).copy(),
         **_rotors(config, model.n),
-        **_load(config, p + columns),
-        'least': np.array((-np.inf,) * p + friction[0]),
-        'most': np.array((np.inf,) * p + friction[1]),
+        **_load(config, m),
+        'least': np.array([-np.inf] * p + [column.least for column in columns]),
+        'most': np.array([np.inf] * p + [column.most for column in columns]),
         'true_parameters': np.array(truth.parameters or (0.0,) * p),
         'drive_chain': drive_chain,
         'drive_inertias': drive_inertias,

@@ -22,7 +22,7 @@ from math import tanh
 import numpy as np
 
 from blf_dsc_controller.compiled.jit import inner
-from blf_dsc_controller.law import surface
+from blf_dsc_controller.law import barrier
 from blf_dsc_controller.law.settings import FILTERED, Settings
 from blf_dsc_controller.law.state import Signals, State
 
@@ -73,7 +73,7 @@ def measure_flips(settings: Settings, state: State, dt: float) -> None:
     settling_time = settings.learning_start - settings.window * dt
     state.since_latch[0] = state.latched[0] * (state.since_latch[0] + dt)
     begins = state.since_latch[0] <= settling_time
-    gain = surface.filter_gain(1.0 / settings.pole, dt)
+    gain = barrier.filter_gain(1.0 / settings.pole, dt)
     weight = settings.pole * dt
     first, sums = first_coulomb(settings), state.flip_sums
     for i in range(settings.n):

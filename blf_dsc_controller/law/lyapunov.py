@@ -5,7 +5,7 @@ from math import exp, nan
 
 import numpy as np
 
-from blf_dsc_controller.arms.batch import inertia_matrices
+from blf_dsc_controller.arms.model import inertia_matrices
 from blf_dsc_controller.compiled.jit import inner
 from blf_dsc_controller.law import barrier
 from blf_dsc_controller.law.settings import LINEAR, NEWTON, REFERENCE, Settings

@@ -30,7 +30,7 @@ import numpy as np
 from blf_dsc_controller.arms.model import ArmModel
 from blf_dsc_controller.compiled.jit import inner, kernel
 from blf_dsc_controller.compiled.layout import sizes_of
-from blf_dsc_controller.law import surface
+from blf_dsc_controller.law import barrier
 from blf_dsc_controller.law.settings import FILTERED, LAMBDA, Settings, settings_of
 from blf_dsc_controller.law.state import Signals, State
 
@@ -72,7 +72,7 @@ def filter_row(
 
     Rows of a joint that hardly moves count less: its stiction would be mistaken for gravity.
     """
-    gain = surface.filter_gain(1.0 / settings.pole, dt)
+    gain = barrier.filter_gain(1.0 / settings.pole, dt)
     p = settings.p
     m = settings.m
     row = signals.row

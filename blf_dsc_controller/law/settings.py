@@ -56,7 +56,7 @@ class Settings(NamedTuple):
     truth_known: int  # 1: true_parameters and true_disturbance are valid
     feed_forward: int  # 1: the true disturbance is compensated
     bumpless: int  # 1: d^3 gives up what the prediction error adds to the torque
-    change_detection: int  # 1: windows must be consistent (see `consistency`)
+    change_detection: int  # 1: windows must be consistent (see `excitation`)
     time_constant: float  # lambda of (13), s
     boundary_layer: float  # b, rad/s
     eta: float  # leakage of (30)

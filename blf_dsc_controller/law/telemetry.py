@@ -9,16 +9,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
 from functools import partial
 from typing import NamedTuple, TypeAlias
 
 import numpy as np
 
-from blf_dsc_controller.arms.batch import regressors_at
+from blf_dsc_controller.arms.model import regressors_at
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.law.controller import Controller
-from blf_dsc_controller.law.factory import column_names, estimate_names, model_of, prior_covariance
+from blf_dsc_controller.law.factory import columns_of, estimate_names, model_of, prior_covariance
 from blf_dsc_controller.law.lyapunov import ExponentialBound
 from blf_dsc_controller.law.settings import Settings
 from blf_dsc_controller.law.state import Sample, sample_of
@@ -247,17 +246,12 @@ def learned_arm(config: ControllerConfig) -> LearnedArm | None:
     if config.model != 'urdf':
         return None
     model, names = model_of(config), estimate_names(config)
-    friction = ('N m s/rad' if 'viscous' in name else 'N m' for name in column_names(config))
+    friction = (column.unit for column in columns_of(config))
     deviations = np.sqrt(np.diag(prior_covariance(config))).tolist()
-    base = None
-    if config.robot.learn != 'base':
-        all_shown = model_of(replace(config, robot=replace(config.robot, learn='base')))
-        base = all_shown.parameter_names, partial(regressors_at, all_shown)
     return LearnedArm(
         dict(zip(names, (*model.parameter_units, *friction), strict=True)),
         dict(zip(names, deviations, strict=True)),
         partial(regressors_at, model),
-        base,
     )
 
 

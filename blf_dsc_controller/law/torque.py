@@ -40,7 +40,7 @@ from math import sin
 
 import numpy as np
 
-from blf_dsc_controller.arms.chain_kernels import fill_regressor
+from blf_dsc_controller.arms.serial_chain import fill_regressor
 from blf_dsc_controller.compiled.jit import inner, kernel
 from blf_dsc_controller.compiled.layout import Array, part
 from blf_dsc_controller.law import barrier

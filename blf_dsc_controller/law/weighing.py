@@ -24,7 +24,7 @@ from blf_dsc_controller.arms.model import ArmModel
 from blf_dsc_controller.compiled import cholesky
 from blf_dsc_controller.compiled.jit import inner, kernel
 from blf_dsc_controller.law import window
-from blf_dsc_controller.law.consistency import window_residual
+from blf_dsc_controller.law.excitation import window_residual
 from blf_dsc_controller.law.settings import Settings, settings_of
 from blf_dsc_controller.law.state import Signals, State, signals_of, state_of
 

@@ -14,36 +14,27 @@ units comparable: Phi x = lambda R x.
 
 from math import sqrt
 
-import numpy as np
-
 from blf_dsc_controller.compiled import cholesky
 from blf_dsc_controller.compiled.jit import called, inner
+from blf_dsc_controller.compiled.layout import Array
 from blf_dsc_controller.law.settings import Settings
 from blf_dsc_controller.law.state import Signals, State
 
 
 @inner
-def push_row(
-    ring: np.ndarray,
-    cursor: int,
-    running: np.ndarray,
-    fresh: np.ndarray,
-    half: np.ndarray,
-    row: np.ndarray,
-    rows: int,
-) -> int:
-    """Replace the oldest row of the window by `row` and return the next cursor.
+def push_row(state: State, row: Array) -> None:
+    """Replace the oldest row of the window by `row`, [X | u] (n, m + 1).
 
-    `ring` (N, n, m + 1) has the oldest row at `cursor`, which counts once the window is full
-    (`rows` = N); `running` S, `fresh` F and `half` L (m + 1, m + 1), sums of [X | u]^T [X | u],
-    have only their upper triangle filled; `row` is [X | u] (n, m + 1).
+    The oldest row of the ring is at the cursor, and counts once the window is full.  The sums of
+    [X | u]^T [X | u], S, F and L, have only their upper triangle filled.
     """
-    old = ring[cursor]
-    n = row.shape[0]
-    m = row.shape[1] - 1
-    keep = 1.0 if rows == ring.shape[0] else 0.0
-    for a in range(m + 1):
-        for b in range(a, m + 1):
+    running, fresh, half = state.running, state.fresh, state.half
+    cursor, length = int(state.cursor[0]), int(state.ring.shape[0])
+    old = state.ring[cursor]
+    n, size = row.shape
+    keep = 1.0 if state.rows[0] == length else 0.0
+    for a in range(size):
+        for b in range(a, size):
             new_term = 0.0
             old_term = 0.0
             for i in range(n):
@@ -52,22 +43,21 @@ def push_row(
             running[a, b] += new_term - old_term
             fresh[a, b] += new_term
     for i in range(n):
-        for a in range(m + 1):
+        for a in range(size):
             old[i, a] = row[i, a]
-    cursor += 1
-    if cursor == ring.shape[0] // 2:
+    state.rows[0] = min(state.rows[0] + 1.0, float(length))
+    state.cursor[0] = float((cursor + 1) % length)
+    if cursor + 1 == length // 2:
         add(fresh, 0.0, half, half)
-    if cursor < ring.shape[0]:
-        return cursor
-    if rows >= ring.shape[0] - 1:
-        add(fresh, 0.0, fresh, running)
-    add(fresh, -1.0, half, half)
-    clear(fresh)
-    return 0
+    if cursor + 1 == length:
+        if state.rows[0] == length:
+            add(fresh, 0.0, fresh, running)
+        add(fresh, -1.0, half, half)
+        clear(fresh)
 
 
 @inner
-def add(first: np.ndarray, weight: float, second: np.ndarray, out: np.ndarray) -> None:
+def add(first: Array, weight: float, second: Array, out: Array) -> None:
     """Write the upper triangle of `first` + `weight` `second` to `out`."""
     for a in range(out.shape[0]):
         for b in range(a, out.shape[0]):
@@ -75,7 +65,7 @@ def add(first: np.ndarray, weight: float, second: np.ndarray, out: np.ndarray) -
 
 
 @inner
-def add_products(row: np.ndarray, sums: np.ndarray) -> None:
+def add_products(row: Array, sums: Array) -> None:
     """Add the upper triangle of [X | u]^T [X | u] of a row (n, m + 1) to `sums`."""
     for i in range(row.shape[0]):
         for a in range(row.shape[1]):
@@ -84,7 +74,7 @@ def add_products(row: np.ndarray, sums: np.ndarray) -> None:
 
 
 @inner
-def clear(matrix: np.ndarray) -> None:
+def clear(matrix: Array) -> None:
     """Fill a matrix with zeros."""
     for i in range(matrix.shape[0]):
         for j in range(matrix.shape[1]):
@@ -92,23 +82,22 @@ def clear(matrix: np.ndarray) -> None:
 
 
 @inner
-def newer_part(
-    cursor: int, length: int, fresh: np.ndarray, half: np.ndarray, newer: np.ndarray
-) -> int:
+def newer_part(state: State, newer: Array) -> int:
     """Fill `newer` with the sum of the newer part of a full ring; return its number of rows."""
+    cursor, length = int(state.cursor[0]), int(state.ring.shape[0])
     middle = length // 2
     if 4 * cursor < length:
-        add(fresh, 1.0, half, newer)
+        add(state.fresh, 1.0, state.half, newer)
         return cursor + length - middle
     if 4 * cursor > 3 * length:
-        add(fresh, -1.0, half, newer)
+        add(state.fresh, -1.0, state.half, newer)
         return cursor - middle
-    add(fresh, 0.0, half, newer)
+    add(state.fresh, 0.0, state.half, newer)
     return cursor
 
 
 @inner
-def average_window(running: np.ndarray, samples: int, Phi: np.ndarray, b: np.ndarray) -> None:
+def average_window(running: Array, samples: int, Phi: Array, b: Array) -> None:
     """Fill Phi (m, m) and b (m,), the means (21) and (22) over the window."""
     m = Phi.shape[0]
     for i in range(m):
@@ -119,9 +108,7 @@ def average_window(running: np.ndarray, samples: int, Phi: np.ndarray, b: np.nda
 
 
 @inner
-def pull_to(
-    target: np.ndarray, weight: float, information: np.ndarray, Phi: np.ndarray, b: np.ndarray
-) -> None:
+def pull_to(target: Array, weight: float, information: Array, Phi: Array, b: Array) -> None:
     """Pull theta to `target` (m,) by `weight` a times R:  Phi + a R,  b + a R target."""
     for i in range(b.size):
         pull = weight * target[i]
@@ -131,7 +118,7 @@ def pull_to(
 
 
 @inner
-def remove_rejected(active: np.ndarray, Phi: np.ndarray, b: np.ndarray) -> None:
+def remove_rejected(active: Array, Phi: Array, b: Array) -> None:
     """Remove the rejected columns from Phi theta = b, setting theta_j = 0."""
     for i in range(active.size):
         if active[i] == 0.0:
@@ -142,14 +129,14 @@ def remove_rejected(active: np.ndarray, Phi: np.ndarray, b: np.ndarray) -> None:
             b[i] = 0.0
 
 
-@inner
+@called
 def regularized_factor(
-    active: np.ndarray,
+    active: Array,
     rho: float,
-    information: np.ndarray,
-    Phi: np.ndarray,
-    b: np.ndarray,
-    factor: np.ndarray,
+    information: Array,
+    Phi: Array,
+    b: Array,
+    factor: Array,
 ) -> None:
     """Remove the rejected columns; fill `factor` with the Cholesky factor of Phi + rho R."""
     remove_rejected(active, Phi, b)
@@ -160,7 +147,7 @@ def regularized_factor(
 
 
 @inner
-def weigh(information: np.ndarray, x: np.ndarray, out: np.ndarray) -> float:
+def weigh(information: Array, x: Array, out: Array) -> float:
     """Write R x (m,) to `out`; return x^T R x."""
     for i in range(x.size):
         out[i] = 0.0
@@ -173,13 +160,13 @@ def weigh(information: np.ndarray, x: np.ndarray, out: np.ndarray) -> float:
     return square
 
 
-@inner
+@called
 def min_eigenvector(
-    Phi: np.ndarray,
-    information: np.ndarray,
-    factor: np.ndarray,
-    direction: np.ndarray,
-    work: np.ndarray,
+    Phi: Array,
+    information: Array,
+    factor: Array,
+    direction: Array,
+    work: Array,
     iterations: int,
 ) -> float:
     """Return lambda_min(Phi) relative to R by inverse iteration, which refines `direction`.
@@ -204,48 +191,16 @@ def min_eigenvector(
     return weigh(Phi, direction, work)
 
 
-@called
-def min_eigenvalue(
-    running: np.ndarray,
-    samples: int,
-    active: np.ndarray,
-    prior: np.ndarray,
-    prior_weight: float,
-    rho: float,
-    information: np.ndarray,
-    Phi: np.ndarray,
-    b: np.ndarray,
-    factor: np.ndarray,
-    direction: np.ndarray,
-    work: np.ndarray,
-    iterations: int,
-) -> float:
-    """Return lambda_min of the current window's Phi; fill Phi, b and its factor."""
-    average_window(running, samples, Phi, b)
-    if prior_weight > 0.0:
-        pull_to(prior, prior_weight, information, Phi, b)
-    regularized_factor(active, rho, information, Phi, b, factor)
-    return min_eigenvector(Phi, information, factor, direction, work, iterations)
-
-
 @inner
 def excitation(settings: Settings, state: State, signals: Signals, iterations: int) -> float:
     """Return lambda_min of the current window's Phi; leave Phi, b and its factor in `signals`."""
-    return min_eigenvalue(
-        state.running,
-        int(state.rows[0]),
-        state.active,
-        settings.initial_estimate,
-        settings.prior_weight,
-        settings.rho,
-        settings.information,
-        signals.Phi,
-        signals.b,
-        signals.factor,
-        state.min_eigenvector,
-        signals.work,
-        iterations,
-    )
+    Phi, b, R = signals.Phi, signals.b, settings.information
+    average_window(state.running, int(state.rows[0]), Phi, b)
+    if settings.prior_weight > 0.0:
+        pull_to(settings.initial_estimate, settings.prior_weight, R, Phi, b)
+    regularized_factor(state.active, settings.rho, R, Phi, b, signals.factor)
+    direction, work = state.min_eigenvector, signals.work
+    return min_eigenvector(Phi, R, signals.factor, direction, work, iterations)
 
 
 @inner

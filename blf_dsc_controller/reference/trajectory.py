@@ -25,8 +25,14 @@ from typing import NamedTuple
 import numpy as np
 
 from blf_dsc_controller.configuration.controller import ControllerConfig
-from blf_dsc_controller.reference.approach import BlendedReference, blend, braking_time
-from blf_dsc_controller.reference.limits import MotionError, check_times, worst_violation
+from blf_dsc_controller.reference.approach import (
+    BlendedReference,
+    MotionError,
+    blend,
+    braking_time,
+    check_times,
+    worst_violation,
+)
 from blf_dsc_controller.reference.terms import (
     Term,
     cubics,

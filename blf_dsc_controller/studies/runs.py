@@ -43,7 +43,7 @@ from typing import Any
 import numpy as np
 
 import blf_dsc_controller
-from blf_dsc_controller.arms.batch import regressors_at
+from blf_dsc_controller.arms.model import regressors_at
 from blf_dsc_controller.compiled.jit import cache_folder
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.nodes import dump
@@ -53,8 +53,7 @@ from blf_dsc_controller.errors import BlfDscError, MissingExtraError, StartError
 from blf_dsc_controller.law.factory import controller_of, model_of
 from blf_dsc_controller.law.state import sample_of
 from blf_dsc_controller.messages.journal import Journal
-from blf_dsc_controller.reference.approach import reference_of
-from blf_dsc_controller.reference.limits import MotionError
+from blf_dsc_controller.reference.approach import MotionError, reference_of
 from blf_dsc_controller.reference.terms import sampled
 from blf_dsc_controller.run import Floats
 from blf_dsc_controller.simulation.loop import Record, new_record, run_alone, run_loop

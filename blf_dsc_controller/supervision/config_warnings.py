@@ -23,14 +23,14 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from blf_dsc_controller.arms.batch import free_inertias, inertia_matrices, regressors_at
 from blf_dsc_controller.arms.inertia import pseudo_inertia
+from blf_dsc_controller.arms.model import free_inertias, inertia_matrices, regressors_at
 from blf_dsc_controller.arms.tuning import SAMPLES, UNKNOWN_EFFORT, loop_delay
 from blf_dsc_controller.configuration.controller import ControllerConfig
-from blf_dsc_controller.configuration.robot import implausible_friction, learned_of
+from blf_dsc_controller.configuration.robot import implausible_friction, parameters_of
+from blf_dsc_controller.law.barrier import filter_gain
 from blf_dsc_controller.law.factory import settings_of_config
 from blf_dsc_controller.law.settings import FILTERED, LINEAR, NEWTON, Settings
-from blf_dsc_controller.law.surface import filter_gain
 from blf_dsc_controller.reference.approach import reference_of
 from blf_dsc_controller.reference.terms import sampled
 
@@ -458,7 +458,7 @@ def expected_errors(config: ControllerConfig, settings: Settings) -> ExpectedErr
     else:
         q, dq, ddq = _along(config, _MOMENTS)
     P0 = settings.initial_estimate[: settings.p]
-    load = robot.payload * learned_of(robot, chain).load
+    load = robot.payload * parameters_of(robot, chain).load
     M0, M = (inertia_matrices(model, P, q) for P in (P0, P0 + load))
     loop = Loop(config.sample_time, robot.lag)
     floor = np.array(config.learning.residual_floor)

@@ -23,8 +23,7 @@ from blf_dsc_controller.law.checks import INVALID, is_valid_state
 from blf_dsc_controller.law.factory import begin, controller_of
 from blf_dsc_controller.messages import codecs
 from blf_dsc_controller.messages.journal import EventType, Journal
-from blf_dsc_controller.reference.approach import BlendedReference, check_takeover
-from blf_dsc_controller.reference.limits import MotionError
+from blf_dsc_controller.reference.approach import BlendedReference, MotionError, check_takeover
 from blf_dsc_controller.reference.trajectory import Trajectory, TrajectoryError, plan_trajectory
 from blf_dsc_controller.supervision import handover
 from blf_dsc_controller.supervision.checks import (

@@ -15,6 +15,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from blf_dsc_controller.arms.two_link import urdf
 from blf_dsc_controller.arms.urdf import Chain
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.files import resolve
@@ -51,28 +52,9 @@ def arm_of(config: ControllerConfig, lengths: Sequence[float] = ()) -> ShownArm:
     robot = config.robot
     if config.model == 'urdf':
         return ShownArm(robot.text, robot.chain(config.joints))
-    text = planar_urdf(config.joints, lengths or (config.arm.l1,) * len(config.joints))
+    lengths = lengths or (config.arm.l1,) * 2
+    text = with_cylinders(urdf('arm', config.joints, lengths, (1.0, 1.0), (0.0, 0.0)), sum(lengths))
     return ShownArm(text, chain_of(text, '', 'tip', config.joints))
-
-
-def planar_urdf(joints: Sequence[str], lengths: Sequence[float]) -> str:
-    """Return a URDF of links of these lengths [m] in the x-z plane, without shapes, to `tip`."""
-    robot = ET.Element('robot', name='arm')
-    ET.SubElement(robot, 'link', name='base')
-    parent = 'base'
-    at = (0.0, *lengths)
-    for name, x in zip((*joints, 'tip_joint'), at, strict=True):
-        child = 'tip' if name == 'tip_joint' else f'link of {name}'
-        inertial = ET.SubElement(ET.SubElement(robot, 'link', name=child), 'inertial')
-        ET.SubElement(inertial, 'mass', value='1')
-        kind = 'fixed' if child == 'tip' else 'continuous'
-        joint = ET.SubElement(robot, 'joint', name=name, type=kind)
-        ET.SubElement(joint, 'parent', link=parent)
-        ET.SubElement(joint, 'child', link=child)
-        ET.SubElement(joint, 'origin', xyz=f'{x:.17g} 0 0')
-        ET.SubElement(joint, 'axis', xyz='0 -1 0')
-        parent = child
-    return ET.tostring(robot, encoding='unicode')
 
 
 def with_known_meshes(text: str, chain: Chain) -> str:
