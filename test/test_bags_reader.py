@@ -12,12 +12,13 @@ import recorded_run
 import synthetic_bag
 from foreign_readers import raw_records
 from mcap.opcode import Opcode
+from mcap.records import Chunk
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, Reader, StoragePlugin, Writer
 from synthetic_bag import BOUND_RAD, JOINTS, LIMIT_NM, PARAMETERS, TRUE, Synthetic
 
 from blf_dsc_controller.bags.content import NameMap, read_content
 from blf_dsc_controller.bags.reader import read_run
-from blf_dsc_controller.bags.sources import BagError
+from blf_dsc_controller.bags.sources import BagError, DamageError, records_in
 from blf_dsc_controller.bags.topic_messages import UnreadableMessageError
 from blf_dsc_controller.bags.writer import BagWriter
 from blf_dsc_controller.cli.main import main
@@ -240,6 +241,12 @@ def test_broken_bags_are_distinguished(tmp_path, messages):
         with pytest.raises(BagError, match=words):
             read_run(path)
         (path / 'metadata.yaml').unlink(missing_ok=True)
+
+
+def test_record_longer_than_its_chunk_is_an_error_without_a_checksum_too():
+    data = bytes([Opcode.MESSAGE, 30, *bytes(7), *bytes(25)])
+    with pytest.raises(DamageError, match='does not match its length'):
+        list(records_in(Chunk('', data, 0, 0, 0, len(data))))
 
 
 def test_undecodable_message_is_reported_with_topic_and_number(tmp_path, messages):

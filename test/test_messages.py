@@ -128,6 +128,7 @@ def test_missing_joint_is_named_and_others_may_be_repeated():
             (raw_joint_state('ab', [1, 2], [4.0] * k, []), ShortArrayError, f'{k} values')
             for k in (0, 1, 3)
         ),
+        (raw_joint_state('ab', [1, 2], [3, 4], [5]), ShortArrayError, '1 values'),
         (b'\x00\x07' + GOOD[2:], MessageError, '00 07'),
     ],
 )

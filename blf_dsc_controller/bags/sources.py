@@ -106,7 +106,7 @@ class OpenBag:
         """
         found: Counter[str] = Counter()
         yield from (self._of_files if self._files else self._of_library)(topics, found)
-        for topic in found | self.counts if self._files else topics:
+        for topic in topics:
             if found[topic] != self.counts[topic]:
                 raise DamageError(
                     f'it holds {found[topic]} messages of {topic}, but counts {self.counts[topic]}'

@@ -29,7 +29,7 @@ from blf_dsc_controller.messages.codecs import (
 from blf_dsc_controller.messages.topics import FLOAT64_MULTI_ARRAY, JOINT_STATE
 from blf_dsc_controller.run import Floats, Rows, Series, Stamps
 
-_BLOCK = 2048  # messages decoded at once
+_BLOCK = 512  # messages decoded at once, which then are in the cache
 _NUMBER, _RECEIVED, _SEQUENCE, _STAMP, _VALUES = range(5)  # columns of a table
 ALL = slice(None)
 
@@ -236,16 +236,18 @@ class TopicMessages:
 
     def decode(self) -> None:
         """Decode the messages added last."""
-        batches: dict[Layout, list[tuple[int, BagMessage]]] = {}
-        layout: Layout | None = None
-        for number, message in enumerate(self._waiting, self.size - len(self._waiting)):
+        batches: dict[Layout, list[int]] = {}
+        waiting, self._waiting = self._waiting, []
+        first, layout = self.size - len(waiting), None
+        for k, message in enumerate(waiting):
             if layout is None or not layout.fits(message.raw):
-                layout = self._layout_of(message.raw, number)
-            if layout is not None:
-                batches.setdefault(layout, []).append((number, message))
-        self._waiting = []
+                layout = self._layout_of(message.raw, first + k)
+                batch = [] if layout is None else batches.setdefault(layout, [])
+            batch.append(k)
         for each, batch in batches.items():
-            self._tables[each].append(self._columns(each, batch))
+            columns = self._columns(each, [waiting[k] for k in batch])
+            columns[_NUMBER] = first + np.array(batch)
+            self._tables[each].append(columns)
 
     def _layout_of(self, raw: bytes, number: int) -> Layout | None:
         for layout in self._tables:
@@ -259,16 +261,13 @@ class TopicMessages:
         self._tables[layout] = Table(self._file)
         return layout
 
-    def _columns(
-        self, layout: Layout, batch: Sequence[tuple[int, BagMessage]]
-    ) -> NDArray[np.int64]:
+    def _columns(self, layout: Layout, messages: Sequence[BagMessage]) -> NDArray[np.int64]:
         """Decode messages of one layout: number, received, sequence, stamp, then all values."""
-        count, size, double = len(batch), layout.size, layout.double
+        count, size, double = len(messages), layout.size, layout.double
         columns = np.zeros((_VALUES + layout.places.size, count), np.int64)
-        columns[_NUMBER] = [number for number, _ in batch]
-        columns[_RECEIVED] = [each.received for _, each in batch]
-        columns[_SEQUENCE] = [each.sequence for _, each in batch]
-        joined = b''.join([each.raw for _, each in batch])
+        columns[_RECEIVED] = [each.received for each in messages]
+        columns[_SEQUENCE] = [each.sequence for each in messages]
+        joined = b''.join([each.raw for each in messages])
         if self.type == JOINT_STATE:
             kind = np.dtype([('s', 'i4'), ('ns', 'u4')]).newbyteorder(double.byteorder)
             stamp = np.ndarray(count, kind, joined, STAMP_OFFSET, (size,))
