@@ -36,6 +36,7 @@ from blf_dsc_controller.configuration.nodes import load_loop, locate
 from blf_dsc_controller.configuration.plant import PlantConfig
 from blf_dsc_controller.configuration.schema import change
 from blf_dsc_controller.law.factory import controller_of, settings_of_config
+from blf_dsc_controller.reference.approach import reference_of
 from blf_dsc_controller.reference.terms import sampled
 from blf_dsc_controller.replay.verify import verify
 from blf_dsc_controller.simulation.bag import write_bag
@@ -178,19 +179,13 @@ def disturbance(t: float) -> np.ndarray:
 def run(duration: float, state: State, step: Step) -> np.ndarray:
     """Close the loop around a simulator with the numpy law."""
     law = PlainLaw(settings_of_config(CONTROLLER))
-    reference = CONTROLLER.reference
-    offset, swing = np.array(reference.offset), np.array(reference.amplitude)
-    w = reference.frequency[0]
-    errors = np.zeros((round(duration / T), 2))
-    for k in range(len(errors)):
-        t = k * T
+    times = T * np.arange(round(duration / T))
+    errors = np.zeros((times.size, 2))
+    for k, (qr, dqr, ddqr) in enumerate(sampled(reference_of(CONTROLLER), times)):
         q, dq = state()
-        qr = offset + swing * np.cos(w * t)
-        dqr = -w * swing * np.sin(w * t)
-        ddqr = -w * w * swing * np.cos(w * t)
-        law.tau = law.update(t, T, qr, dqr, ddqr, np.concatenate((q, dq, law.tau)))
+        law.tau = law.update(times[k], T, qr, dqr, ddqr, np.concatenate((q, dq, law.tau)))
         errors[k] = q - qr
-        step(t, law.tau)
+        step(times[k], law.tau)
     return errors
 
 
