@@ -11,8 +11,6 @@ from __future__ import annotations
 from math import exp, tanh
 from typing import Annotated, NamedTuple
 
-import numpy as np
-
 from blf_dsc_controller.compiled.jit import called, inner
 from blf_dsc_controller.compiled.layout import Array, Cell, size_of, view_of
 from sim_plant.motion import Motion
@@ -50,7 +48,7 @@ def limited(torque: float, limit: float) -> float:
 
 
 @inner
-def actuate(drives: Drives, sample: int, command: np.ndarray, state: DriveState) -> None:
+def actuate(drives: Drives, sample: int, command: Array, state: DriveState) -> None:
     """Process the command of this sample and write the torque applied in it to the state.
 
     Until the first command has passed the delay, the applied torque is zero.
@@ -117,8 +115,8 @@ def compensate(
     compensation: Compensation,
     bodies: Array,
     motion: Motion,
-    q: np.ndarray,
-    dq: np.ndarray,
+    q: Array,
+    dq: Array,
     state: CompensationState,
 ) -> None:
     """Write what the drives add at q, dq (n,), by the true friction of a motion."""
@@ -134,7 +132,7 @@ def compensate(
 
 
 @inner
-def let_pass(compensation: Compensation, command: np.ndarray, state: CompensationState) -> bool:
+def let_pass(compensation: Compensation, command: Array, state: CompensationState) -> bool:
     """Store what the driver lets pass of a command (n,); return whether the drives have stopped."""
     for i in range(command.size):
         last = state.command[i]

@@ -84,9 +84,7 @@ state_of, state_size = view_of(PlantState), size_of(PlantState)
 
 
 @inner
-def plant_views(
-    arm: Arm, settings: np.ndarray, state: np.ndarray
-) -> tuple[PlantSettings, PlantState]:
+def plant_views(arm: Arm, settings: Array, state: Array) -> tuple[PlantSettings, PlantState]:
     """Return views of both vectors, not reference-counted."""
     plant = settings_of(view(settings), arm, arm.joint_count())
     return plant, state_of(view(state), plant)
@@ -139,7 +137,7 @@ def draw_noise(plant: PlantSettings, now: PlantState, rng: np.random.Generator) 
 
 
 @inner
-def observe(plant: PlantSettings, now: PlantState, measurement: np.ndarray) -> None:
+def observe(plant: PlantSettings, now: PlantState, measurement: Array) -> None:
     """Write [q, dq, effort] (3n,) of this sample, with the noise already drawn.
 
     `effort` is the torque applied over the last interval [N m], before the first one that with
@@ -164,7 +162,7 @@ def observe(plant: PlantSettings, now: PlantState, measurement: np.ndarray) -> N
 
 
 @inner
-def step(plant: PlantSettings, now: PlantState, command: np.ndarray) -> None:
+def step(plant: PlantSettings, now: PlantState, command: Array) -> None:
     """Apply the commanded torque (n,) [N m] of this sample and advance to the next one."""
     own = now.compensation
     if let_pass(plant.compensation, command, own):
@@ -185,7 +183,7 @@ def step(plant: PlantSettings, now: PlantState, command: np.ndarray) -> None:
 
 
 @inner
-def truth(plant: PlantSettings, now: PlantState, out: np.ndarray) -> None:
+def truth(plant: PlantSettings, now: PlantState, out: Array) -> None:
     """Write the noise-free truth [P, tau_dist, q, dq] (p + 3n,) of this sample."""
     n = plant.n
     t = now.sample[0] * plant.period_ns * 1e-9
@@ -197,23 +195,21 @@ def truth(plant: PlantSettings, now: PlantState, out: np.ndarray) -> None:
 
 
 @kernel
-def observe_plant(
-    arm: Arm, settings: np.ndarray, state: np.ndarray, measurement: np.ndarray
-) -> None:
+def observe_plant(arm: Arm, settings: Array, state: Array, measurement: Array) -> None:
     """Call `observe` with packed vectors."""
     plant, now = plant_views(arm, settings, state)
     observe(plant, now, measurement)
 
 
 @kernel
-def step_plant(arm: Arm, settings: np.ndarray, state: np.ndarray, command: np.ndarray) -> None:
+def step_plant(arm: Arm, settings: Array, state: Array, command: Array) -> None:
     """Call `step` with packed vectors."""
     plant, now = plant_views(arm, settings, state)
     step(plant, now, command)
 
 
 @kernel
-def plant_truth(arm: Arm, settings: np.ndarray, state: np.ndarray, out: np.ndarray) -> None:
+def plant_truth(arm: Arm, settings: Array, state: Array, out: Array) -> None:
     """Call `truth` with packed vectors."""
     plant, now = plant_views(arm, settings, state)
     truth(plant, now, out)

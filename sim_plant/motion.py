@@ -69,7 +69,7 @@ class TipState(NamedTuple):
 
 
 @inner
-def wall_force(wall: WallSettings, position: np.ndarray, velocity: np.ndarray) -> float:
+def wall_force(wall: WallSettings, position: Array, velocity: Array) -> float:
     """Return the normal force [N], >= 0, on a tip with position (3,) [m] and velocity (3,) [m/s].
 
     Kelvin-Voigt model: k depth + d d(depth)/dt inside the wall, 0 outside.
@@ -85,7 +85,7 @@ def wall_force(wall: WallSettings, position: np.ndarray, velocity: np.ndarray) -
 
 
 @inner
-def locate_tip(arm: Arm, q: np.ndarray, dq: np.ndarray, tip: TipState) -> None:
+def locate_tip(arm: Arm, q: Array, dq: Array, tip: TipState) -> None:
     """Write position, velocity and Jacobian of the tip."""
     arm.fill_tip(q, tip.position, tip.jacobian)
     for i in range(3):
@@ -142,14 +142,14 @@ def come(sample: float, at: float, ramp: float) -> float:
 
 
 @inner
-def add(total: np.ndarray, fraction: float, vector: np.ndarray) -> None:
+def add(total: Array, fraction: float, vector: Array) -> None:
     """Add a fraction of one vector to another."""
     for i in range(total.size):
         total[i] += fraction * vector[i]
 
 
 @inner
-def put(target: np.ndarray, values: np.ndarray) -> None:
+def put(target: Array, values: Array) -> None:
     """Copy a vector; `target[:] = values` compiles ten functions just for a shape error."""
     for i in range(target.size):
         target[i] = values[i]
@@ -203,9 +203,7 @@ class Motion(NamedTuple):
 
 
 @inner
-def disturbance_torque(
-    motion: Motion, t: float, q: np.ndarray, dq: np.ndarray, out: np.ndarray
-) -> None:
+def disturbance_torque(motion: Motion, t: float, q: Array, dq: Array, out: Array) -> None:
     """Write the torque (n,) [N m] of disturbance and friction at time t [s].
 
     Friction has the sign of the velocity; Coulomb friction is smoothed by tanh, so that the
@@ -228,7 +226,7 @@ def disturbance_torque(
 
 
 @inner
-def subtract_contact_torque(motion: Motion, x: np.ndarray, torque: np.ndarray) -> None:
+def subtract_contact_torque(motion: Motion, x: Array, torque: Array) -> None:
     """Subtract the torque J^T f (n,) [N m] of the force at the tip from `torque`, in place."""
     push, wall, slosh, tip = motion.acting.force, motion.wall, motion.slosh, motion.tip
     n, mass = torque.size, motion.acting.sloshing[0]
@@ -249,7 +247,7 @@ def subtract_contact_torque(motion: Motion, x: np.ndarray, torque: np.ndarray) -
 
 
 @inner
-def disturbing_torque(motion: Motion, t: float, x: np.ndarray, out: np.ndarray) -> None:
+def disturbing_torque(motion: Motion, t: float, x: Array, out: Array) -> None:
     """Write tau_dist (n,) [N m] at time t [s], contact included; `x` as in `state_derivative`."""
     n = out.size
     disturbance_torque(motion, t, part(x, 0, (n,)), part(x, n, (n,)), out)
@@ -257,9 +255,7 @@ def disturbing_torque(motion: Motion, t: float, x: np.ndarray, out: np.ndarray) 
 
 
 @inner
-def state_derivative(
-    motion: Motion, t: float, x: np.ndarray, torque: np.ndarray, dx: np.ndarray
-) -> None:
+def state_derivative(motion: Motion, t: float, x: Array, torque: Array, dx: Array) -> None:
     """Write dx/dt of x = [q, dq, y, v] (2n + 6,), of which y and v only while a load sloshes."""
     n, acting = torque.size, motion.acting
     q, dq = part(x, 0, (n,)), part(x, n, (n,))
@@ -307,9 +303,7 @@ def combine(x: Array, h: float, stage: int, k: Array, begin: int, end: int, out:
 
 
 @inner
-def integrate(
-    motion: Motion, t: float, h: float, torque: np.ndarray, x: np.ndarray, stages: Stages
-) -> None:
+def integrate(motion: Motion, t: float, h: float, torque: Array, x: Array, stages: Stages) -> None:
     """Advance x = [q, dq, y, v] (2n + 6,) in place from t to t + h [s] under a held torque (n,).
 
     y and v are advanced only while a load sloshes, and may be absent otherwise.

@@ -51,7 +51,7 @@ def is_noisy(encoders: Encoders) -> bool:
 
 
 @inner
-def draw(rng: np.random.Generator, noise: np.ndarray) -> None:
+def draw(rng: np.random.Generator, noise: Array) -> None:
     """Fill `noise` with the same standard normal numbers as `rng.standard_normal(out=noise)`."""
     for i in range(noise.size):
         noise[i] = rng.standard_normal()
@@ -70,9 +70,9 @@ def sense(
     encoders: Encoders,
     sample: int,
     period: float,
-    q: np.ndarray,
-    dq: np.ndarray,
-    offset: np.ndarray,
+    q: Array,
+    dq: Array,
+    offset: Array,
     reading: EncoderReading,
 ) -> None:
     """Write the reading of this sample, including offset (n,) [rad] and noise.

@@ -21,7 +21,7 @@ import os
 import sys
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import AbstractContextManager
+from contextlib import AbstractContextManager, suppress
 from pathlib import Path
 from types import FunctionType, ModuleType
 from typing import Any, TypeVar, cast
@@ -113,19 +113,23 @@ def cache_folder(function: Callable[..., object]) -> Path:
     digest = hashlib.sha256(' '.join([numba.__version__, *sorted(constants)]).encode())
     for name, source in sorted((_name(source), source) for source in files):
         digest.update(name.encode() + b'\0' + _contents(source))
-    chosen = os.environ.get('NUMBA_CACHE_DIR')
-    base = Path(chosen) if chosen and _is_writable(Path(chosen)) else _base()
-    return base / digest.hexdigest()[:16]
+    return _base(os.environ.get('NUMBA_CACHE_DIR')) / digest.hexdigest()[:16]
 
 
 @functools.cache
-def _is_writable(folder: Path) -> bool:
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryFile(dir=folder):
-            return True
-    except OSError:
-        return False
+def _base(chosen: str | None) -> Path:
+    """Return the first folder for machine code that can be written, if need be a temporary one."""
+    users = Path(os.environ.get('XDG_CACHE_HOME') or '~/.cache', 'blf_dsc_controller')
+    temporary = Path(tempfile.gettempdir(), f'blf_dsc_controller-{os.getuid()}')
+    own = [users, temporary]  # not to be another user's
+    for folder in [Path(chosen), *own] if chosen else own:
+        with suppress(OSError, RuntimeError):  # read-only, full, or no home at all
+            place: Path = folder.expanduser()
+            place.mkdir(mode=0o700 if folder in own else 0o777, parents=True, exist_ok=True)
+            if folder not in own or place.stat().st_uid == os.getuid():
+                with tempfile.TemporaryFile(dir=place):
+                    return place
+    return Path(tempfile.mkdtemp(prefix='blf_dsc_controller-'))
 
 
 def _name(source: Path) -> str:
@@ -137,27 +141,6 @@ def _name(source: Path) -> str:
 @functools.cache
 def _contents(source: Path) -> bytes:
     return source.read_bytes()
-
-
-@functools.cache
-def _base() -> Path:
-    try:
-        users = Path(os.environ.get('XDG_CACHE_HOME') or '~/.cache').expanduser()
-        return _writable(users / 'blf_dsc_controller')
-    except (OSError, RuntimeError):  # read-only, full, or no home at all
-        pass
-    try:
-        return _writable(Path(tempfile.gettempdir(), f'blf_dsc_controller-{os.getuid()}'))
-    except OSError:  # owned by another user
-        return Path(tempfile.mkdtemp(prefix='blf_dsc_controller-'))
-
-
-def _writable(folder: Path) -> Path:
-    folder.mkdir(mode=0o700, parents=True, exist_ok=True)
-    if folder.stat().st_uid != os.getuid():
-        raise PermissionError
-    with tempfile.TemporaryFile(dir=folder):
-        return folder
 
 
 def inner(function: F) -> F:
@@ -267,7 +250,9 @@ class _Listener(event.Listener):  # type: ignore[misc]
         pass
 
 
-def announced_compilation(say: Callable[[str], object]) -> AbstractContextManager[object]:
+def announced_compilation(
+    say: Callable[[str], object],
+) -> AbstractContextManager[object]:
     """Call `say` with a notice for each kernel not in the cache that is compiled in this context.
 
     Only numba knows this: a kernel has a version for each type of arguments. Of those that are

@@ -25,11 +25,9 @@ is never farther from a true P inside.
 
 from math import isfinite, sqrt
 
-import numpy as np
-
 from blf_dsc_controller.compiled import cholesky
 from blf_dsc_controller.compiled.jit import inner
-from blf_dsc_controller.compiled.layout import part
+from blf_dsc_controller.compiled.layout import Array, part
 from blf_dsc_controller.law import friction, torque
 from blf_dsc_controller.law.settings import NEWTON, Settings
 from blf_dsc_controller.law.state import Signals, State
@@ -40,7 +38,7 @@ _MOST_STEPS = 20  # of Newton's method; 12 for Gamma spanning eight decades, ten
 
 
 @inner
-def project(estimate: np.ndarray, rate: np.ndarray, gain: np.ndarray, radius: float) -> None:
+def project(estimate: Array, rate: Array, gain: Array, radius: float) -> None:
     """Remove the outward part from `rate` v (p,):  v - Gamma w w^T v / (w^T Gamma w).
 
     `estimate` P^ (p,) is the direction w, `rate` is modified in place, `gain` (p,) is the diagonal
@@ -59,7 +57,7 @@ def project(estimate: np.ndarray, rate: np.ndarray, gain: np.ndarray, radius: fl
 
 
 @inner
-def retract(estimate: np.ndarray, gain: np.ndarray, radius: float) -> None:
+def retract(estimate: Array, gain: Array, radius: float) -> None:
     """Replace a P^ (p,) outside the ball by the nearest point in it, in the metric of Gamma.
 
     That is P^_j / (1 + nu Gamma_j) with the nu > 0 that gives it the length omega_a, found by
@@ -83,7 +81,7 @@ def retract(estimate: np.ndarray, gain: np.ndarray, radius: float) -> None:
 
 
 @inner
-def _shrunk(estimate: np.ndarray, gain: np.ndarray, nu: float) -> tuple[float, float]:
+def _shrunk(estimate: Array, gain: Array, nu: float) -> tuple[float, float]:
     """Return the length of P^_j / (1 + nu Gamma_j) and minus half the slope of its square."""
     square = 0.0
     slope = 0.0

@@ -26,9 +26,8 @@ of a constant bound plus 2 (k'/k) V, which is not positive while the bound narro
 
 from math import cos, exp, pi, sin, tan
 
-import numpy as np
-
 from blf_dsc_controller.compiled.jit import inner
+from blf_dsc_controller.compiled.layout import Array
 from blf_dsc_controller.law.settings import LINEAR, Settings
 from blf_dsc_controller.law.state import Signals, State
 
@@ -144,7 +143,7 @@ def filtered_surface(settings: Settings, state: State, signals: Signals, dt: flo
 
 
 @inner
-def linear_surface(settings: Settings, state: State, signals: Signals, dq: np.ndarray) -> None:
+def linear_surface(settings: Settings, state: State, signals: Signals, dq: Array) -> None:
     """Compute alpha2 = dqr - lambda_s z1 of (35), and its derivative, which needs ddqr."""
     for i in range(settings.n):
         state.alpha2[i] = signals.dqr[i] - settings.K[i] * signals.xi1[i]
@@ -154,12 +153,7 @@ def linear_surface(settings: Settings, state: State, signals: Signals, dq: np.nd
 
 @inner
 def compute_errors(
-    settings: Settings,
-    state: State,
-    signals: Signals,
-    dt: float,
-    q: np.ndarray,
-    dq: np.ndarray,
+    settings: Settings, state: State, signals: Signals, dt: float, q: Array, dq: Array
 ) -> None:
     """Compute the errors xi1 and xi2, and the surface between them."""
     for i in range(settings.n):

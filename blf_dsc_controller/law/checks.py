@@ -9,8 +9,6 @@ from __future__ import annotations
 from math import isfinite
 from typing import Annotated, NamedTuple
 
-import numpy as np
-
 from blf_dsc_controller.compiled.jit import inner
 from blf_dsc_controller.compiled.layout import Array, Cell, size_of, view_of
 from blf_dsc_controller.law.settings import EFFORT, LINEAR, Settings
@@ -65,7 +63,7 @@ checks_of, checks_size = view_of(Checks), size_of(Checks)
 
 
 @inner
-def is_valid_state(settings: Settings, checks: Checks, measurement: np.ndarray) -> bool:
+def is_valid_state(settings: Settings, checks: Checks, measurement: Array) -> bool:
     """Check that the used values of [q, dq, applied torque] (3 n,) are finite and not too fast."""
     n = settings.n
     for i in range(n):
@@ -78,7 +76,7 @@ def is_valid_state(settings: Settings, checks: Checks, measurement: np.ndarray) 
 
 @inner
 def bridge_repeats(
-    settings: Settings, checks: Checks, state: State, dt: float, measurement: np.ndarray
+    settings: Settings, checks: Checks, state: State, dt: float, measurement: Array
 ) -> None:
     """Write the measurement (3 n,) that the law uses to `checks.used`.
 
@@ -101,7 +99,7 @@ def bridge_repeats(
 
 
 @inner
-def check_error(settings: Settings, checks: Checks, xi1: np.ndarray, bound: np.ndarray) -> int:
+def check_error(settings: Settings, checks: Checks, xi1: Array, bound: Array) -> int:
     """Return the flags for the errors (n,) [rad]; update the largest ratio."""
     flags = 0
     error_ratio = checks.error_ratio[0] if settings.surface != LINEAR else 0.0
@@ -153,12 +151,7 @@ def check_effect(
 
 @inner
 def compare_effort(
-    settings: Settings,
-    checks: Checks,
-    signals: Signals,
-    sample: Sample,
-    begins: bool,
-    moves: bool,
+    settings: Settings, checks: Checks, signals: Signals, sample: Sample, begins: bool, moves: bool
 ) -> int:
     """Return the flags for efforts that do not follow the commands.
 

@@ -14,7 +14,7 @@ import numpy as np
 
 from blf_dsc_controller.arms.model import ArmModel
 from blf_dsc_controller.compiled.jit import inner, kernel
-from blf_dsc_controller.compiled.layout import pack, part, sizes_of
+from blf_dsc_controller.compiled.layout import Array, pack, part, sizes_of
 from blf_dsc_controller.law import (
     adaptation,
     apparent_inertia,
@@ -53,7 +53,7 @@ from blf_dsc_controller.reference.approach import check_start
 
 @inner
 def compute_regressors(
-    settings: Settings, state: State, signals: Signals, q: np.ndarray, dq: np.ndarray
+    settings: Settings, state: State, signals: Signals, q: Array, dq: Array
 ) -> None:
     """Compute H P^(0) of the feedback, H of what is learned; if the row needs them, Yp and Yr."""
     model, H = settings.model, signals.H
@@ -81,9 +81,9 @@ def update_window(
     signals: Signals,
     t: float,
     dt: float,
-    q: np.ndarray,
-    dq: np.ndarray,
-    applied: np.ndarray,
+    q: Array,
+    dq: Array,
+    applied: Array,
 ) -> None:
     """Add the row of the last interval to the window; check the excitation when due."""
     prediction.fill_columns(settings, t, dq, signals.rest)
@@ -127,12 +127,12 @@ def fill_sample(settings: Settings, state: State, signals: Signals, sample: Samp
 @inner
 def step(
     settings: Settings,
-    reference_vector: np.ndarray,
+    reference_vector: Array,
     state: State,
     signals: Signals,
     t: float,
     dt: float,
-    measurement: np.ndarray,
+    measurement: Array,
     sample: Sample,
 ) -> None:
     """Run one sample, from the measurement to the torque; `lyapunov.fill_energies` is separate.
@@ -169,15 +169,15 @@ def step(
 def update(
     model: ArmModel,
     sizes: np.dtype[np.void],
-    settings_vector: np.ndarray,
-    reference_vector: np.ndarray,
-    state_vector: np.ndarray,
-    signals_vector: np.ndarray,
+    settings_vector: Array,
+    reference_vector: Array,
+    state_vector: Array,
+    signals_vector: Array,
     t: float,
     dt: float,
-    measurement: np.ndarray,
-    sample_vector: np.ndarray,
-    checks_vector: np.ndarray,
+    measurement: Array,
+    sample_vector: Array,
+    checks_vector: Array,
 ) -> int:
     """Run one sample of the law with all its telemetry, on packed vectors: see `step`.
 
@@ -212,7 +212,7 @@ class Controller:
         flags: flags set by the checks in the last update.
     """
 
-    def __init__(self, settings: Settings, reference_vector: np.ndarray) -> None:
+    def __init__(self, settings: Settings, reference_vector: Array) -> None:
         """Allocate the vectors for settings and a packed reference; compile the kernels."""
         self.settings_vector = pack(settings)
         self.sizes = sizes_of(settings)
@@ -233,12 +233,12 @@ class Controller:
         self.weigh(1e-3)
         self.reset()
 
-    def bound_at(self, t: float) -> np.ndarray:
+    def bound_at(self, t: float) -> Array:
         """Return the bound k(t) (n,) [rad] at time t [s] since the start."""
         barrier.update_bound(self.settings, self.signals, t)
         return np.array(self.signals.bound)
 
-    def reference_at(self, t: float) -> np.ndarray:
+    def reference_at(self, t: float) -> Array:
         """Return the reference qr, dqr, ddqr (3, n) at time t [s] since the start."""
         (now,) = reference.sampled(self.reference_vector, np.array([t]))
         return np.asarray(now)
@@ -257,11 +257,11 @@ class Controller:
         self.state.active.fill(1.0)
         self.state.gain_scale.fill(1.0)
 
-    def check_start(self, joints: tuple[str, ...], q: np.ndarray, t: float = 0.0) -> None:
+    def check_start(self, joints: tuple[str, ...], q: Array, t: float = 0.0) -> None:
         """Raise OutsideBarrierError for positions (n,) [rad] outside the bound."""
         check_start(joints, q, self.bound_at(t), self.reference_vector, t)
 
-    def update(self, t: float, dt: float, measurement: np.ndarray) -> np.ndarray:
+    def update(self, t: float, dt: float, measurement: Array) -> Array:
         """Return the torque (n,) [N m] for a measurement: a view that the next update overwrites.
 
         The measurement is [q (n,) rad, dq (n,) rad/s, applied torque of the last interval (n,)
@@ -295,19 +295,19 @@ class Controller:
                 dt,
             )
 
-    def trial(self, t: float, dt: float, measurement: np.ndarray) -> np.ndarray:
+    def trial(self, t: float, dt: float, measurement: Array) -> Array:
         """Return the torque of an unchecked update that only changes `signals` and `sample`."""
         saved, limit = self.save(), self.checks.velocity_limit[0]
         self.checks.velocity_limit[0] = 0.0
-        torque: np.ndarray = self.update(t, dt, measurement).copy()
+        torque: Array = self.update(t, dt, measurement).copy()
         self.checks.velocity_limit[0] = limit
         self.restore(saved)
         return torque
 
-    def save(self) -> np.ndarray:
+    def save(self) -> Array:
         """Return a copy of the whole state."""
         return np.array(self.state_vector)
 
-    def restore(self, saved: np.ndarray) -> None:
+    def restore(self, saved: Array) -> None:
         """Return to a saved state; the loop continues from there bit for bit."""
         self.state_vector[:] = saved

@@ -23,10 +23,9 @@ what it taught is taken back: it did not predict what it was not fitted to.  Lik
 with an unusually large residual is pulled to an earlier solution, kept once per window.
 """
 
-import numpy as np
-
 from blf_dsc_controller.compiled import cholesky
 from blf_dsc_controller.compiled.jit import inner
+from blf_dsc_controller.compiled.layout import Array
 from blf_dsc_controller.law import adaptation, window
 from blf_dsc_controller.law.settings import BEST, Settings
 from blf_dsc_controller.law.state import Signals, State
@@ -110,7 +109,7 @@ def forget_window(settings: Settings, state: State) -> None:
 
 
 @inner
-def window_residual(running: np.ndarray, theta: np.ndarray) -> float:
+def window_residual(running: Array, theta: Array) -> float:
     """Return the sum of |u - X theta|^2 over the window, from its sums of [X | u]^T [X | u]."""
     m = theta.size
     total = running[m, m]
@@ -123,7 +122,7 @@ def window_residual(running: np.ndarray, theta: np.ndarray) -> float:
 
 
 @inner
-def is_physical(settings: Settings, signals: Signals, q: np.ndarray, theta: np.ndarray) -> bool:
+def is_physical(settings: Settings, signals: Signals, q: Array, theta: Array) -> bool:
     """Check that M(q) of theta (m,), minus a tenth of that of P^(0), is positive definite.
 
     Overwrites Yp and Yr of `signals`.
@@ -198,7 +197,7 @@ def agrees_with_parts(settings: Settings, state: State, signals: Signals, residu
 
 
 @inner
-def accept_window(settings: Settings, state: State, signals: Signals, q: np.ndarray) -> bool:
+def accept_window(settings: Settings, state: State, signals: Signals, q: Array) -> bool:
     """Check that the window is consistent and its solution physical; if so, keep the solution.
 
     A window that is not full, or has an unusually large residual, is pulled to the anchor:
@@ -299,7 +298,7 @@ def is_preferred(settings: Settings, state: State, value: float) -> bool:
 
 @inner
 def update_excitation(
-    settings: Settings, state: State, signals: Signals, t: float, dt: float, q: np.ndarray
+    settings: Settings, state: State, signals: Signals, t: float, dt: float, q: Array
 ) -> None:
     """Compute lambda_min of the window; from tau_d + T_a on, latch the window if it suffices (27).
 

@@ -19,9 +19,8 @@ mistaken for parameters.
 
 from math import tanh
 
-import numpy as np
-
 from blf_dsc_controller.compiled.jit import inner
+from blf_dsc_controller.compiled.layout import Array
 from blf_dsc_controller.law import barrier
 from blf_dsc_controller.law.settings import FILTERED, Settings
 from blf_dsc_controller.law.state import Signals, State
@@ -51,7 +50,7 @@ def fill_compensation(settings: Settings, signals: Signals) -> None:
 
 
 @inner
-def high_pass(lags: np.ndarray, i: int, gain: float, x: float, begins: bool) -> float:
+def high_pass(lags: Array, i: int, gain: float, x: float, begins: bool) -> float:
     """Advance the two lags of joint i and return what they leave of x, at the beginning zero."""
     if begins:
         lags[0, i] = x

@@ -7,6 +7,7 @@ import numpy as np
 
 from blf_dsc_controller.arms.model import inertia_matrices
 from blf_dsc_controller.compiled.jit import inner
+from blf_dsc_controller.compiled.layout import Array
 from blf_dsc_controller.law import barrier
 from blf_dsc_controller.law.settings import LINEAR, NEWTON, REFERENCE, Settings
 from blf_dsc_controller.law.state import Sample, Signals, State
@@ -33,7 +34,7 @@ def error_term(settings: Settings, state: State, signals: Signals) -> float:
 
 
 @inner
-def kinetic_term(settings: Settings, signals: Signals, q: np.ndarray) -> float:
+def kinetic_term(settings: Settings, signals: Signals, q: Array) -> float:
     """Return xi2^T M xi2 / 2 [J], M xi2 = Yp(q, xi2) P; overwrites Yp and Yr in `signals`."""
     settings.model.momentum_regressor(q, signals.xi2, signals.momentum, signals.rest)
     total = 0.0
@@ -67,7 +68,7 @@ def disturbance_term(settings: Settings, state: State, signals: Signals) -> floa
 
 @inner
 def fill_energies(
-    settings: Settings, state: State, signals: Signals, q: np.ndarray, sample: Sample
+    settings: Settings, state: State, signals: Signals, q: Array, sample: Sample
 ) -> None:
     """Compute the terms of (29) for the telemetry sample; NaN where the truth is unknown."""
     sample.lyapunov[0] = error_term(settings, state, signals)
@@ -133,7 +134,7 @@ class ExponentialBound:
         self._knee = settings.knee / settings.bound
         self._begin: tuple[float, float] | None = None
 
-    def at(self, t: float, V: float, xi1: np.ndarray, bound: np.ndarray, *, latched: bool) -> float:
+    def at(self, t: float, V: float, xi1: Array, bound: Array, *, latched: bool) -> float:
         """Return the bound at time t [s], given V(t) [J]; NaN before the latch or at rate 0.
 
         It ends where an error (n,) [rad] passes the knee for k(t) (n,) [rad]: K V1 is lost there.

@@ -29,14 +29,14 @@ import numpy as np
 
 from blf_dsc_controller.arms.model import ArmModel
 from blf_dsc_controller.compiled.jit import inner, kernel
-from blf_dsc_controller.compiled.layout import sizes_of
+from blf_dsc_controller.compiled.layout import Array, sizes_of
 from blf_dsc_controller.law import barrier
 from blf_dsc_controller.law.settings import FILTERED, LAMBDA, Settings, settings_of
 from blf_dsc_controller.law.state import Signals, State
 
 
 @inner
-def set_block(rest: np.ndarray, at: int, i: int, value: float) -> None:
+def set_block(rest: Array, at: int, i: int, value: float) -> None:
     """Set entry (i, i) of the block that starts at column `at`; zero the rest of its row."""
     for k in range(rest.shape[0]):
         rest[i, at + k] = 0.0
@@ -44,7 +44,7 @@ def set_block(rest: np.ndarray, at: int, i: int, value: float) -> None:
 
 
 @inner
-def fill_columns(settings: Settings, t: float, dq: np.ndarray, rest: np.ndarray) -> None:
+def fill_columns(settings: Settings, t: float, dq: Array, rest: Array) -> None:
     """Fill columns p.. of `rest` (n, m) with D at time t [s] and velocity dq (n,) [rad/s]."""
     n = settings.n
     for i in range(n):
@@ -66,7 +66,7 @@ def fill_columns(settings: Settings, t: float, dq: np.ndarray, rest: np.ndarray)
 
 @inner
 def filter_row(
-    settings: Settings, state: State, signals: Signals, dt: float, torque: np.ndarray
+    settings: Settings, state: State, signals: Signals, dt: float, torque: Array
 ) -> None:
     """Pass [X | u] of the last interval through both poles; write the result to `signals.row`.
 
@@ -118,7 +118,7 @@ def differentiate(settings: Settings, state: State, signals: Signals, dt: float)
 
 
 @inner
-def heuristic_factor(settings: Settings, state: State, signals: Signals, dq: np.ndarray) -> float:
+def heuristic_factor(settings: Settings, state: State, signals: Signals, dq: Array) -> float:
     """Return Lambda of (24), which is dimensionless only if units are ignored."""
     products = 1.0
     squares = 1.0
@@ -130,12 +130,7 @@ def heuristic_factor(settings: Settings, state: State, signals: Signals, dq: np.
 
 @inner
 def accelerated_row(
-    settings: Settings,
-    state: State,
-    signals: Signals,
-    q: np.ndarray,
-    dq: np.ndarray,
-    torque: np.ndarray,
+    settings: Settings, state: State, signals: Signals, q: Array, dq: Array, torque: Array
 ) -> None:
     """Write the row `acceleration` or `lambda` to `signals.row`, from ddq^ of `differentiate`."""
     scale = 1.0
@@ -157,9 +152,9 @@ def form_row(
     state: State,
     signals: Signals,
     dt: float,
-    q: np.ndarray,
-    dq: np.ndarray,
-    torque: np.ndarray,
+    q: Array,
+    dq: Array,
+    torque: Array,
 ) -> None:
     """Write the configured row of the last interval to `signals.row` (n, m + 1)."""
     if settings.prediction != FILTERED:
@@ -171,9 +166,7 @@ def form_row(
     remember(settings, state, signals)
 
 
-def rows_along(
-    settings: Settings, settings_vector: np.ndarray, times: np.ndarray, motion: np.ndarray
-) -> np.ndarray:
+def rows_along(settings: Settings, settings_vector: Array, times: Array, motion: Array) -> Array:
     """Return the rows [H(q, dq, dq, ddq) | D] (k, n, m) along a motion, for packed settings.
 
     `times` (k,) [s]; `motion` (k, 3, n): q, dq, ddq at each time.
@@ -188,11 +181,11 @@ def rows_along(
 def _fill_rows(
     model: ArmModel,
     sizes: np.dtype[np.void],
-    settings_vector: np.ndarray,
-    times: np.ndarray,
-    motion: np.ndarray,
-    H: np.ndarray,
-    rows: np.ndarray,
+    settings_vector: Array,
+    times: Array,
+    motion: Array,
+    H: Array,
+    rows: Array,
 ) -> None:
     settings = settings_of(settings_vector, sizes, model)
     for k in range(times.size):

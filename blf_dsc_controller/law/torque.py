@@ -102,7 +102,7 @@ def compute_demand(settings: Settings, state: State, signals: Signals) -> None:
 
 
 @inner
-def find_added(settings: Settings, signals: Signals, q: np.ndarray) -> None:
+def find_added(settings: Settings, signals: Signals, q: Array) -> None:
     """Write G_d(q) to `signals.added` (n,) [N m]."""
     if settings.drive == 0:
         return
@@ -115,9 +115,7 @@ def find_added(settings: Settings, signals: Signals, q: np.ndarray) -> None:
 
 
 @inner
-def find_applied(
-    settings: Settings, state: State, signals: Signals, measurement: np.ndarray
-) -> None:
+def find_applied(settings: Settings, state: State, signals: Signals, measurement: Array) -> None:
     """Write the mean whole torque of the last interval to `signals.applied` (n,) [N m].
 
     It is the last command, or the measured effort, and the mean of G_d at both ends.

@@ -23,6 +23,7 @@ import numpy as np
 from blf_dsc_controller.arms.model import ArmModel
 from blf_dsc_controller.compiled import cholesky
 from blf_dsc_controller.compiled.jit import inner, kernel
+from blf_dsc_controller.compiled.layout import Array
 from blf_dsc_controller.law import window
 from blf_dsc_controller.law.excitation import window_residual
 from blf_dsc_controller.law.settings import Settings, settings_of
@@ -45,9 +46,9 @@ MASS, DEVIATION = 0, 4  # in `state.load`, each followed by three of the centre
 def weigh(
     model: ArmModel,
     sizes: np.dtype[np.void],
-    settings_vector: np.ndarray,
-    state_vector: np.ndarray,
-    signals_vector: np.ndarray,
+    settings_vector: Array,
+    state_vector: Array,
+    signals_vector: Array,
     dt: float,
 ) -> None:
     """Take the row of the last sample on packed vectors: see `add_row`; `dt` [s] is its length."""

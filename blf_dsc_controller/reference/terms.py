@@ -30,7 +30,7 @@ from typing import NamedTuple
 import numpy as np
 
 from blf_dsc_controller.compiled.jit import inner, kernel
-from blf_dsc_controller.compiled.layout import part, view
+from blf_dsc_controller.compiled.layout import Array, part, view
 
 SINUSOIDS = 0
 SPLINE = 1
@@ -43,7 +43,7 @@ class Term(NamedTuple):
     """One term of a reference: kind, content, and the start and duration [s] of its blend."""
 
     code: int
-    content: np.ndarray
+    content: Array
     begin: float = -inf
     fade: float = 0.0
 
@@ -68,20 +68,20 @@ def sinusoids_term(
     return Term(SINUSOIDS, np.array(content, dtype=np.float64))
 
 
-def spline_term(knots: np.ndarray, coefficients: np.ndarray) -> Term:
+def spline_term(knots: Array, coefficients: Array) -> Term:
     """Return the spline of increasing knots (pieces,) [s] and c_kij (pieces, n, 6) [rad/s^j]."""
     content = ([float(len(knots))], knots, np.ravel(coefficients))
     return Term(SPLINE, np.concatenate(content))
 
 
-def pieces_of(term: Term, n: int) -> tuple[np.ndarray, np.ndarray]:
+def pieces_of(term: Term, n: int) -> tuple[Array, Array]:
     """Return knots (pieces,) [s] and coefficients (pieces, n, 6) of a spline."""
     count = int(term.content[0])
     knots, coefficients = np.split(term.content[1:], [count])
     return knots, coefficients.reshape(count, n, 6)
 
 
-def pack(n: int, terms: Sequence[Term]) -> np.ndarray:
+def pack(n: int, terms: Sequence[Term]) -> Array:
     """Return the vector of a reference for n joints; `unpack` is the inverse."""
     packed = [
         np.concatenate(
@@ -92,7 +92,7 @@ def pack(n: int, terms: Sequence[Term]) -> np.ndarray:
     return np.concatenate([np.array((n, len(terms)), dtype=np.float64), *packed])
 
 
-def unpack(vector: np.ndarray) -> list[Term]:
+def unpack(vector: Array) -> list[Term]:
     """Return the terms of a packed reference."""
     terms = []
     at = _VECTOR_HEAD
@@ -105,7 +105,7 @@ def unpack(vector: np.ndarray) -> list[Term]:
 
 
 @inner
-def sinusoids(vector: np.ndarray, at: int, n: int, i: int, t: float) -> tuple[float, float, float]:
+def sinusoids(vector: Array, at: int, n: int, i: int, t: float) -> tuple[float, float, float]:
     """Return q, q', q'' at t [s] of joint i of n, of sinusoids with content from entry `at` on."""
     tones = int(vector[at])
     offset = part(vector, at + 1, (n,))
@@ -125,7 +125,7 @@ def sinusoids(vector: np.ndarray, at: int, n: int, i: int, t: float) -> tuple[fl
 
 
 @inner
-def piece_at(knots: np.ndarray, t: float) -> int:
+def piece_at(knots: Array, t: float) -> int:
     """Return the last piece that has begun at time t; the first one before the first knot."""
     low = 0
     high = knots.size
@@ -139,7 +139,7 @@ def piece_at(knots: np.ndarray, t: float) -> int:
 
 
 @inner
-def spline(vector: np.ndarray, at: int, n: int, i: int, t: float) -> tuple[float, float, float]:
+def spline(vector: Array, at: int, n: int, i: int, t: float) -> tuple[float, float, float]:
     """Return q, q', q'' at t [s] of joint i of n, of a spline with content from entry `at` on."""
     pieces = int(vector[at])
     knots = part(vector, at + 1, (pieces,))
@@ -159,7 +159,7 @@ def spline(vector: np.ndarray, at: int, n: int, i: int, t: float) -> tuple[float
 
 
 @inner
-def term_in_force(vector: np.ndarray, t: float) -> tuple[int, int]:
+def term_in_force(vector: Array, t: float) -> tuple[int, int]:
     """Return the first entry and the number of the last term that has taken over completely."""
     found = _VECTOR_HEAD
     number = 0
@@ -173,7 +173,7 @@ def term_in_force(vector: np.ndarray, t: float) -> tuple[int, int]:
 
 
 @inner
-def term_at(vector: np.ndarray, at: int, n: int, i: int, t: float) -> tuple[float, float, float]:
+def term_at(vector: Array, at: int, n: int, i: int, t: float) -> tuple[float, float, float]:
     """Return q, q', q'' at time t [s] of joint i of n, of the term that starts at entry `at`."""
     if vector[at] == SPLINE:
         return spline(vector, at + _HEAD, n, i, t)
@@ -181,9 +181,7 @@ def term_at(vector: np.ndarray, at: int, n: int, i: int, t: float) -> tuple[floa
 
 
 @inner
-def evaluate(
-    vector: np.ndarray, t: float, qr: np.ndarray, dqr: np.ndarray, ddqr: np.ndarray
-) -> None:
+def evaluate(vector: Array, t: float, qr: Array, dqr: Array, ddqr: Array) -> None:
     """Write qr [rad], dqr [rad/s] and ddqr [rad/s^2] (n,) at time t [s]."""
     n = qr.size
     at, first = term_in_force(vector, t)
@@ -209,20 +207,20 @@ def evaluate(
 
 
 @kernel
-def _sample(vector: np.ndarray, times: np.ndarray, out: np.ndarray) -> None:
+def _sample(vector: Array, times: Array, out: Array) -> None:
     uncounted = view(vector)
     for k in range(times.size):
         evaluate(uncounted, times[k], out[k, 0], out[k, 1], out[k, 2])
 
 
-def sampled(vector: np.ndarray, times: np.ndarray) -> np.ndarray:
+def sampled(vector: Array, times: Array) -> Array:
     """Return qr, dqr and ddqr (k, 3, n) of a packed reference at times (k,) [s]."""
     out = np.zeros((len(times), 3, int(vector[0])))
     _sample(vector, np.asarray(times, dtype=np.float64), out)
     return out
 
 
-def quintics(h: np.ndarray, begin: np.ndarray, end: np.ndarray) -> np.ndarray:
+def quintics(h: Array, begin: Array, end: Array) -> Array:
     """Return coefficients (pieces, n, 6) of quintics of durations h (pieces,) [s].
 
     `begin` and `end` are the positions, velocities and accelerations (3, pieces, n) at the ends.
@@ -238,7 +236,7 @@ def quintics(h: np.ndarray, begin: np.ndarray, end: np.ndarray) -> np.ndarray:
     return np.stack((p, v, 0.5 * a, c3, c4, c5), axis=-1)
 
 
-def cubics(h: np.ndarray, begin: np.ndarray, end: np.ndarray) -> np.ndarray:
+def cubics(h: Array, begin: Array, end: Array) -> Array:
     """Return coefficients (pieces, n, 6) of cubics of durations h (pieces,) [s].
 
     `begin` and `end` are the positions and velocities (2, pieces, n) at the ends.
@@ -251,25 +249,25 @@ def cubics(h: np.ndarray, begin: np.ndarray, end: np.ndarray) -> np.ndarray:
     return np.stack((begin[0], begin[1], c2, c3, zero, zero), axis=-1)
 
 
-def at_rest(position: np.ndarray) -> np.ndarray:
+def at_rest(position: Array) -> Array:
     """Return coefficients (1, n, 6) of the piece that stays at `position` (n,) [rad]."""
     coefficients = np.zeros((1, len(position), 6))
     coefficients[0, :, 0] = position
     return coefficients
 
 
-def ending_at_rest(knots: np.ndarray, coefficients: np.ndarray, position: np.ndarray) -> Term:
+def ending_at_rest(knots: Array, coefficients: Array, position: Array) -> Term:
     """Return the spline of pieces between knots (k,) [s] that then stays at `position` (n,)."""
     return spline_term(knots, np.concatenate((coefficients, at_rest(position))))
 
 
-def hermite(times: np.ndarray, points: np.ndarray) -> Term:
+def hermite(times: Array, points: Array) -> Term:
     """Return quintics through positions, velocities, accelerations (3, k, n) at times (k,) [s]."""
     pieces = quintics(np.diff(times), points[:, :-1], points[:, 1:])
     return ending_at_rest(times, pieces, points[0, -1])
 
 
-def minimum_jerk(times: np.ndarray, positions: np.ndarray, begin: np.ndarray | None = None) -> Term:
+def minimum_jerk(times: Array, positions: Array, begin: Array | None = None) -> Term:
     """Return the minimum jerk through positions (k, n) [rad] at times (k,) [s], ending at rest.
 
     Times increase. `begin` is velocity and acceleration (2, n) at the first point, zero by default.
@@ -284,7 +282,7 @@ def minimum_jerk(times: np.ndarray, positions: np.ndarray, begin: np.ndarray | N
     return hermite(times, points)
 
 
-def _solve_inner_points(h: np.ndarray, points: np.ndarray) -> None:
+def _solve_inner_points(h: Array, points: Array) -> None:
     """Fill in the velocities and accelerations that make jerk and snap continuous.
 
     This is a block tridiagonal system with two equations per inner point, solved by elimination.
