@@ -253,8 +253,8 @@ from sim_plant.kernels import KERNELS
 
 if __name__ == '__main__':  # the command has processes of its own
     config = load_loop('recommended')
-    run._compile_law(config.controller)
-    run._compile_plant(config.plant)
+    run._compile(config.controller)
+    run._compile(config.plant)
     for kernel in (update, _sample, *KERNELS):
         print(kernel.__name__, len(kernel.signatures))
     assert main(['precompile', '--config', 'recommended']) == 0
