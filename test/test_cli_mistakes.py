@@ -101,7 +101,7 @@ from blf_dsc_controller.cli import main
 command = sys.argv.pop(1)
 sys.exit(getattr(main, command)())
 """
-PLANT_NODE = (sys.executable, '-m', 'blf_dsc_controller.nodes.plant_node', '--ros-args')
+PLANT_NODE = (sys.executable, '-m', 'blf_dsc_controller.nodes.plant_node')
 
 
 def here(capsys, *arguments):
@@ -185,14 +185,15 @@ def test_exit_code_shows_that_the_controller_stopped(tmp_path, capsys):
 
 def test_node_reports_what_is_wrong_with_its_arguments(tmp_path):
     pytest.importorskip('rclpy', reason='needs ROS 2')
-    path = tmp_path / 'given.yaml'
-    for content, expected in (
-        ('sim_plant:\n  ros__parameters:\n    seed: [1,\n', 'params'),
-        ('sim_plant:\n  ros__parameters:\n    sede: 1\n', 'sede: unknown parameter'),
-        (None, '--sede'),
+    broken, misspelt = tmp_path / 'broken.yaml', tmp_path / 'misspelt.yaml'
+    broken.write_text('sim_plant:\n  ros__parameters:\n    seed: [1,\n')
+    misspelt.write_text('sim_plant:\n  ros__parameters:\n    sede: 1\n')
+    for words, expected in (
+        (['--ros-args', '--params-file', broken], 'params'),
+        (['--ros-args', '--params-file', misspelt], 'sede: unknown parameter'),
+        (['--ros-args', '--param', 'seed:=1', '--sede'], '--sede'),
+        (['--params-file', misspelt], 'ROS reads only those after --ros-args'),
     ):
-        path.write_text(content or '')
-        words = ('--params-file', path) if content else ('--param', 'seed:=1', '--sede')
         run = finished(*PLANT_NODE, *words)
         assert run.returncode == 1
         assert expected in run.stderr

@@ -17,7 +17,6 @@ import pytest
 pytest.importorskip('rclpy', reason='needs ROS 2')
 
 import rclpy
-from command import finished
 from own_domain import own_domain
 from rcl_interfaces.srv import GetParameters, ListParameters
 
@@ -169,16 +168,6 @@ def test_section_that_does_not_match_the_node_is_an_error(start, tmp_path):
     assert [found.startswith(f'line 2: {remedy}') for found in caught.value.problems] == [True]
     path.write_text(right + right.replace('right', 'left').replace('1', '2'))  # for two arms
     assert start(*argv).config.seed == 2
-
-
-@pytest.mark.parametrize(
-    'module', ['blf_dsc_controller.nodes.plant_node', 'blf_dsc_controller.nodes.controller_node']
-)
-def test_parameter_file_that_ros_would_ignore_is_rejected(module):
-    run = finished(sys.executable, '-m', module, '--params-file', locate('recommended'))
-    assert run.returncode == 1
-    assert run.stderr.startswith('unknown arguments --params-file')
-    assert 'ROS reads only those after --ros-args' in run.stderr
 
 
 @pytest.mark.parametrize('name', NODES)
