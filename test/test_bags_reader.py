@@ -18,8 +18,8 @@ from synthetic_bag import BOUND_RAD, JOINTS, LIMIT_NM, PARAMETERS, TRUE, Synthet
 
 from blf_dsc_controller.bags.content import NameMap, read_content
 from blf_dsc_controller.bags.reader import read_run
-from blf_dsc_controller.bags.sources import BagError, DamageError, records_in
-from blf_dsc_controller.bags.topic_messages import UnreadableMessageError
+from blf_dsc_controller.bags.sources import BagError, BagMessage, DamageError, records_in
+from blf_dsc_controller.bags.topic_messages import TopicMessages, UnreadableMessageError
 from blf_dsc_controller.bags.writer import BagWriter
 from blf_dsc_controller.cli.main import main
 from blf_dsc_controller.messages.codecs import JointStateEncoder, typestore
@@ -241,6 +241,26 @@ def test_broken_bags_are_distinguished(tmp_path, messages):
         with pytest.raises(BagError, match=words):
             read_run(path)
         (path / 'metadata.yaml').unlink(missing_ok=True)
+
+
+def test_any_rows_of_long_topics_of_several_layouts_are_read():
+    encoders = [JointStateEncoder(names) for names in (('a', 'b'), ('b', 'a'), ('c',))]
+    messages = TopicMessages('/x', JOINT_STATES.type)
+    for k in range(3000):
+        values = [k] if k % 3 == 2 else [k, -k][:: 1 - k % 3 * 2]
+        raw = encoders[k % 3].encode(k, values, values, values)
+        messages.add(BagMessage('/x', k + 7, raw, k + 1))
+    messages.decode()
+    for states, expected in (
+        (messages.joint_states(('b', 'a')), np.flatnonzero(np.arange(3000) % 3 < 2)),
+        (messages.joint_states(('c',)), np.arange(2, 3000, 3)),
+    ):
+        for rows in (slice(None), slice(600, 900), np.array([999, 3, 700]), slice(0)):
+            known = expected[rows]
+            found = states.select(rows)
+            np.testing.assert_array_equal(found.number, known)
+            np.testing.assert_array_equal(found.received, known + 7)
+            np.testing.assert_array_equal(states.field(1, rows)[:, -1], known)
 
 
 def test_record_longer_than_its_chunk_is_an_error_without_a_checksum_too():

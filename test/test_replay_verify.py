@@ -192,6 +192,7 @@ def test_lost_message_leaves_the_others_to_compare(
         assert result.samples == number
         stamp = f'the state with stamp {lost[2]} ns was used but is not in the bag'
         assert any(remark.startswith(stamp) for remark in result.remarks)
+        assert result.comparisons[0].left_out == '668 torques that the replay does not reach'
     if percent:
         assert main(['replay', str(path)]) == PARTIAL
         last = capsys.readouterr().out.splitlines()[-1]
