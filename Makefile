@@ -73,7 +73,7 @@ test: $(READY)-test ## Run the tests (TESTS=test/test_x.py for some, WORKERS=0 i
 	    -p _hypothesis_pytestplugin -n $(WORKERS) --dist loadfile --no-loadscope-reorder $(TESTS)
 
 test-browser: $(READY)-test ## Test the pages of report and view in a headless Chromium, if installed
-	@BROWSER_TESTS=1 $(RUN) -m pytest -rs test/test_analysis_report_page.py test/test_view_page.py
+	@BROWSER_TESTS=1 $(RUN) -m pytest -rs test/test_browser.py
 
 pictures: $(READY)-test ## Make the README's animation, doc/view.webp, with a headless Chromium
 	@PYTHONPATH="$(CURDIR):$(CURDIR)/test" $(VENV)/bin/python test/view_pictures.py

@@ -106,7 +106,7 @@ def test_several_bags_are_overlaid_and_their_parameter_differences_listed(folder
 
 
 def test_page_explains_how_long_series_are_thinned(folder, tmp_path):
-    thinned = 'the largest sample of every 2.67 ms, zoomed or not; every sample is in the table'
+    thinned = 'the largest sample of every 3 ms, zoomed or not; every sample is in the table'
     for name, text in (('synthetic', thinned), ('one', 'Lines show every sample.')):
         write_report(read_bags([folder / name]), tmp_path / f'{name}.html')
         assert text in (tmp_path / f'{name}.html').read_text()

@@ -9,7 +9,6 @@ import xml.etree.ElementTree as ET
 import numpy as np
 import pytest
 import recorded_run
-import view_rig
 from random_arm import random_urdf
 from scipy.spatial.transform import Rotation
 
@@ -34,6 +33,17 @@ sys.addaudithook(
 )
 
 
+def click(button):
+    """Call the callbacks of a click on a button."""
+    for callback in button._impl.update_cb:
+        callback(None)
+
+
+def nodes(page):
+    """Return the names of all objects drawn in the 3D scene."""
+    return set(page.server.scene._handle_from_node_name)
+
+
 @pytest.fixture(scope='module')
 def player(tmp_path_factory):
     page = Page(HOST, PORT)
@@ -46,7 +56,7 @@ def test_bag_plays_and_stops_at_its_end(player):
     player.slider.value = 0.5
     player.update(0.2)
     assert player.slider.value == 0.5  # paused
-    view_rig.click(player.button)
+    click(player.button)
     player.update(0.5)
     assert player.slider.value == 1.0
     shown = player._page._table.content
@@ -57,7 +67,7 @@ def test_bag_plays_and_stops_at_its_end(player):
     assert player.slider.value == 1.5
     player.update(0.5)
     assert player.slider.value == player.snapshots[-1].time == pytest.approx(2.0, abs=1e-3)
-    view_rig.click(player.button)
+    click(player.button)
     assert player.slider.value == 0.0  # back to the start
 
 
@@ -75,7 +85,7 @@ def test_snapshots_hold_the_values_of_the_bag(player):
 def test_arm_ghost_bound_and_path_are_drawn(player):
     player.slider.value = 1.5
     player.update(0.0)
-    drawn = view_rig.nodes(player._page)
+    drawn = nodes(player._page)
     assert {'/bound', '/path', '/payload'} <= drawn
     for root in ('/arm', '/reference'):
         assert sum(name.startswith(root) for name in drawn) > 5
@@ -97,7 +107,7 @@ def test_events_are_lines_in_the_plots_and_named_at_the_arm(player):
         assert plot.data[0][at - 1 : at + 2] == pytest.approx([1.0, 1.0, 1.0])
         assert np.all(np.diff(plot.data[0]) >= 0.0)
         assert np.isfinite(plot.data).all()
-    assert '/event' in view_rig.nodes(page)
+    assert '/event' in nodes(page)
     assert page.server.scene._handle_from_node_name['/event'].text == 'plant: 2 kg picked up'
 
 

@@ -12,13 +12,13 @@ from urllib.request import urlopen
 
 import numpy as np
 import pytest
-import view_rig
 
 pytest.importorskip('rclpy', reason='needs ROS 2')
 pytest.importorskip('yourdfpy', reason='needs viser: pip install blf_dsc_controller[view]')
 
 from command import COMMAND, wait_for
 from ros_rig import RosRig, activate, configure
+from test_view import click
 
 from blf_dsc_controller.bags.reader import read_run
 from blf_dsc_controller.cli.main import INTERRUPTED
@@ -67,7 +67,7 @@ def test_page_shows_the_loop(rig, loop):
 
 def test_push_reaches_the_plant_and_ends(rig, loop):
     arm, _, view = loop
-    view_rig.click(view.buttons['Push'])
+    click(view.buttons['Push'])
     rig.until(lambda: arm.config.load.torque == (2.0, 0.0))
     rig.until(lambda: arm.config.load.torque == (0.0, 0.0))
     rig.until(lambda: len(events_with(view, 'load.torque')) == 2)
@@ -75,16 +75,16 @@ def test_push_reaches_the_plant_and_ends(rig, loop):
 
 def test_payload_reaches_the_plant(rig, loop):
     arm, _, view = loop
-    view_rig.click(view.buttons['Pick up'])
+    click(view.buttons['Pick up'])
     rig.until(lambda: arm.config.load.payload == 0.5)
     rig.until(lambda: view.past[-1].loaded)
-    view_rig.click(view.buttons['Put down'])
+    click(view.buttons['Put down'])
     rig.until(lambda: arm.config.load.payload == 0.0)
 
 
 def test_reset_returns_the_arm_to_its_start(rig, loop):
     _arm, _law, view = loop
-    view_rig.click(view.buttons['Reset'])
+    click(view.buttons['Reset'])
     rig.until(lambda: events_with(view, 'reset'))
     rig.until(lambda: 0.1 < view.past[-1].time < 1.0)  # counted from the new start
 

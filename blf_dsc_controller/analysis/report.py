@@ -224,7 +224,8 @@ def plots(shown: Sequence[Panel], bags: Sequence[ReportedBag]) -> list[dict[str,
 
 def _period(run: Run) -> float:
     """Return the interval [ms] of which two samples are drawn; 0 if all samples are."""
-    return 1e3 * run.duration / PIECES if run.stamp.size > 2 * PIECES else 0.0
+    n = run.stamp.size
+    return 1e3 * run.duration / (n - 1) * -(-n // PIECES) if n > 2 * PIECES else 0.0
 
 
 def _traces(panel: Panel, prefixes: Sequence[str]) -> Iterator[dict[str, Any]]:

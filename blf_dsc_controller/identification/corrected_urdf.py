@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator, Mapping
-from typing import NamedTuple
 from xml.parsers import expat
 
 import numpy as np
@@ -60,13 +59,8 @@ def _inertial(J: Floats) -> str:
 
 _TAG = re.compile(rb'<(?:[^>"\']|"[^"]*"|\'[^\']*\')*>')
 _PART = {'link': 'inertial', 'joint': 'dynamics'}
-
-
-class _Element(NamedTuple):
-    """Byte ranges of the opening and closing tag of an element; equal if it has only one."""
-
-    opening: tuple[int, int]
-    closing: tuple[int, int]
+_Element = tuple[slice, slice]
+"""Bytes of the opening and the closing tag of an element; equal if it has only one."""
 
 
 def _edits(
@@ -75,38 +69,38 @@ def _edits(
     """Yield begin and end byte of each edit, and the replacement."""
     elements = _elements(raw)
     for (kind, name), part in parts.items():
-        owner = elements[kind, name, '']
         old = elements.get((kind, name, _PART[kind]))
+        opening, closing = elements[kind, name, '']
         if old is not None:
-            yield old.opening[0], old.closing[1], part
-        elif part and owner.opening == owner.closing:
-            yield owner.opening[1] - 2, owner.opening[1], f'>\n    {part}\n  </{kind}>'
+            yield old[0].start, old[1].stop, part
+        elif part and opening == closing:
+            yield opening.stop - 2, opening.stop, f'>\n    {part}\n  </{kind}>'
         elif part:
-            yield owner.closing[0], owner.closing[0], f'  {part}\n  '
-    end = elements['robot', '', ''].closing[0]
+            yield closing.start, closing.start, f'  {part}\n  '
+    end = elements['robot', '', ''][1].start
     yield end, end, f'<!--\n{note.replace("--", "- -")}\n-->\n'
 
 
 def _elements(raw: bytes) -> dict[tuple[str, str, str], _Element]:
     """Return the elements of a URDF by tag and name of a link or joint, and tag of its child."""
     found: dict[tuple[str, str, str], _Element] = {}
-    stack: list[tuple[str, str, tuple[int, int]]] = []
+    stack: list[tuple[str, str, slice]] = []
     parser = expat.ParserCreate('utf-8')
 
     def begin(tag: str, attributes: dict[str, str]) -> None:
         at = parser.CurrentByteIndex
         match = _TAG.match(raw, at)
         name = attributes.get('name', '') if stack else ''
-        stack.append((tag, name, (at, match.end() if match else at)))
+        stack.append((tag, name, slice(at, match.end() if match else at)))
 
     def end(_: str) -> None:
         at = parser.CurrentByteIndex
         tag, name, opening = stack.pop()
-        closing = opening if at == opening[1] else (at, raw.index(b'>', at) + 1)
+        closing = opening if at == opening.stop else slice(at, raw.index(b'>', at) + 1)
         if len(stack) < 2:
-            found[tag, name, ''] = _Element(opening, closing)
+            found[tag, name, ''] = opening, closing
         elif len(stack) == 2:
-            found[stack[1][0], stack[1][1], tag] = _Element(opening, closing)
+            found[stack[1][0], stack[1][1], tag] = opening, closing
 
     parser.StartElementHandler, parser.EndElementHandler = begin, end
     parser.Parse(raw, True)  # noqa: FBT003 - positional only

@@ -21,7 +21,7 @@ function layoutOf(panel, width) {
     title: {text: panel.title, x: 0.01, xanchor: 'left', font: {size: 14}},
     height: 270 + legend,
     margin: {l: 62, r: 34, t: 34, b: 46 + legend},
-    paper_bgcolor: 'white', plot_bgcolor: 'white', 
+    paper_bgcolor: 'white', plot_bgcolor: 'white',
     legend: {font: {size: 11}, orientation: 'h', x: 0, xanchor: 'left', yref: 'container', y: 0,
       yanchor: 'bottom'},
     modebar: {orientation: 'v'},

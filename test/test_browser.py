@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The page of a bag draws and zooms in a browser without errors; runs in `make test-browser`.
+"""The pages of report and view in a browser; runs in `make test-browser`.
 
-The contents of the page are checked without a browser in test_analysis_report.py.
+Their contents are checked without a browser in test_analysis_report.py and test_view.py, what the
+view's buttons do in test_view_live.py.
 """
 
 from __future__ import annotations
@@ -15,21 +16,33 @@ import pytest
 import recorded_run
 
 pytest.importorskip('plotly', reason='needs plotly: pip install blf_dsc_controller[report]')
+pytest.importorskip('yourdfpy', reason='needs viser: pip install blf_dsc_controller[view]')
 
 from blf_dsc_controller.analysis.report import read_bags, write_report
+from blf_dsc_controller.view.bag import BagPlayer
+from blf_dsc_controller.view.page import Page
 
 pytestmark = [
     pytest.mark.skipif(chromium.find() is None, reason='there is no Chromium here'),
     pytest.mark.skipif(not os.environ.get('BROWSER_TESTS'), reason='runs in make test-browser'),
 ]
 
-PLOTS = "document.querySelectorAll('.js-plotly-plot')"
 SHOTS = Path(os.environ.get('BROWSER_SHOTS') or tempfile.gettempdir())
+TEXT = '(document.body?.innerText ?? "")'
+HARMLESS = ('THREE.Clock', 'GPU stall due to ReadPixels')  # warnings of libraries that viser uses
+PLOTS = "document.querySelectorAll('.js-plotly-plot')"
+
+
+@pytest.fixture
+def browser(tmp_path, request):
+    SHOTS.mkdir(exist_ok=True)
+    chrome = chromium.Browser(tmp_path / 'profile', *getattr(request, 'param', ()))
+    yield chrome
+    chrome.close()
 
 
 @pytest.fixture(scope='module')
 def pages(tmp_path_factory):
-    SHOTS.mkdir(exist_ok=True)
     folder = tmp_path_factory.mktemp('pages')
     first = recorded_run.record(folder / 'one', 4.0)
     other = recorded_run.record(folder / 'other', 4.0, **{'feedback.gain': [30.0, 10.0]})
@@ -38,23 +51,13 @@ def pages(tmp_path_factory):
     return folder
 
 
-@pytest.fixture
-def browser(tmp_path):
-    instance = chromium.Browser(tmp_path / 'profile')
-    yield instance
-    instance.close()
-
-
 def show(browser, path):
     browser.call('Page.navigate', url=path.as_uri())
     browser.wait('window.reportReady')
 
 
 def ranges(browser):
-    return browser.value(
-        f'Array.from({PLOTS}).filter(p => p.layout.xaxis.title.text == "time [s]")'
-        '.map(p => p.layout.xaxis.range)'
-    )
+    return browser.value(f'Array.from({PLOTS}).map(p => p.layout.xaxis.range)')
 
 
 @pytest.mark.parametrize('name', ['one', 'both'])
@@ -109,3 +112,83 @@ def test_dragging_zooms_all_time_panels(browser, pages):
         assert high == pytest.approx(2.0, abs=0.05)
     browser.screenshot(SHOTS / 'report_zoomed.png')
     assert browser.errors == []
+
+
+for_3d = pytest.mark.parametrize(
+    'browser', [(*chromium.WEBGL, '--window-size=1000,700')], indirect=True, ids=['3d']
+)
+
+
+def show_view(browser, page):
+    browser.call('Page.navigate', url=page.url)
+    browser.wait(f"{TEXT}.includes('largest error')")
+    browser.wait("document.querySelector('canvas') !== null")
+
+
+def errors(browser):
+    return [line for line in browser.errors if not any(w in f'{line}' for w in HARMLESS)]
+
+
+def assert_local(browser, page):
+    own = (page.url, 'data:', 'blob:')
+    assert [url for url in browser.requests if not url.startswith(own)] == []
+    assert browser.requests
+
+
+@for_3d
+def test_bag_is_played_in_the_browser(browser, tmp_path):
+    page = Page('127.0.0.1', 18280)
+    try:
+        player = BagPlayer(page, recorded_run.record(tmp_path / 'bag', 4.0))
+        show_view(browser, page)
+        player.slider.value = 3.0
+        player.update(0.0)
+        browser.wait(f"{TEXT}.includes('t = 2.9') || {TEXT}.includes('t = 3.0')")
+        browser.screenshot(SHOTS / 'view_bag.png')
+        browser.click('Play / Pause')
+        wait_until(browser, lambda: player._playing)
+        player.update(0.5)
+        browser.wait(f"{TEXT}.includes('t = 3.4') || {TEXT}.includes('t = 3.5')")
+        for tab, word in (('Estimates', 'truth'), ('Events', 'learning')):
+            browser.click(tab)
+            browser.wait(f'{TEXT}.includes({word!r})')
+            browser.screenshot(SHOTS / f'view_{tab.lower()}.png')
+        assert errors(browser) == []
+        assert_local(browser, page)
+    finally:
+        page.close()
+
+
+def wait_until(browser, condition):
+    while not condition():
+        browser.value('1')
+
+
+@for_3d
+def test_running_loop_is_shown_and_pushed(browser):
+    pytest.importorskip('rclpy', reason='needs ROS 2')
+    from ros_rig import RosRig
+
+    from blf_dsc_controller.view.node import ViewNode
+
+    rig = RosRig()
+    try:
+        view = rig.add(ViewNode, port=18290)
+        arm, law = rig.loop({'load.payload': 0.25})
+        rig.until(lambda: 'Push' in view.buttons)
+        show_view(browser, view.page)
+        rig.until(lambda: view.past and view.past[-1].time > 8.0)
+        browser.wait(f"{TEXT}.includes('OK tracking')")
+        browser.screenshot(SHOTS / 'view_running.png')
+        browser.click('Try')
+        browser.click('Push')
+        rig.until(lambda: arm.config.load.torque == (2.0, 0.0))
+        rig.until(lambda: arm.config.load.torque == (0.0, 0.0))
+        browser.screenshot(SHOTS / 'view_try.png')
+        rig.kill(law)
+        rig.until(lambda: view.page._state[0] == 'ERROR')
+        browser.wait(f"{TEXT}.includes('the controller is gone')")
+        assert errors(browser) == []
+        assert_local(browser, view.page)
+    finally:
+        rig.close()
