@@ -246,7 +246,11 @@ def test_second_publisher_on_the_same_topic_is_reported(ros, log, kind):
     is_plant = kind is PlantNode
     name = 'joint_states' if is_plant else 'blf_dsc_controller/commands'
     does = 'publishes joint states' if is_plant else 'commands torques'
-    ros.until(lambda: log(space, f'another node publishes on /{space}/{name}, too'))
+    warnings = partial(log, space, f'another node publishes on /{space}/{name}, too')
+    ros.until(lambda: len(warnings()) == 2)
+    first._on_second()
+    ros.spin(0.2)
+    assert len(warnings()) == 2  # one of each
     ros.until(
         lambda: any(
             status.message == f'another node {does}, too'
