@@ -54,7 +54,8 @@ STREAMS = topics.REFERENCE, topics.TRACKING_ERROR, topics.LEARNING
 _RATE_SAMPLES = 1001  # samples before the rate is checked
 _FAST = 0.9  # fraction of the sample time
 _MEASURED = 10  # intervals between live states, measured before the start ...
-_ALIKE = 1.5  # ... which may differ from the sample time by this factor
+_ALIKE = 1.5  # ... which may differ from the sample time by this factor ...
+_TYPICAL = 0.2, 0.5  # ... at these quantiles: a busy computer loses states between two others
 _PATIENCE = 25  # checks without a newer state (0.2 s): a simulated arm waits for its first torque
 _WAITING_PERIOD = 5.0  # s between two warnings
 _LONGEST_END = 3.0  # s from a signal to the end; ros2 launch sends the next signal after 5 s
@@ -231,10 +232,10 @@ class ControllerNode(LoopNode[ControllerConfig]):
         self._pending, self._checks = raw, 0
         if len(self._arrivals) <= _MEASURED:
             return True
-        period = float(np.median(np.diff(self._arrivals))) * 1e-9
+        often, period = 1e-9 * np.quantile(np.diff(self._arrivals), _TYPICAL)
         self._arrivals, self._pending = None, None
         T = self.config.sample_time
-        if not T / _ALIKE < period < T * _ALIKE:
+        if period <= T / _ALIKE or often >= T * _ALIKE:
             guard.refuse(StartError(rate_mismatch(period, T)))
         else:
             guard.check_support(self._decoder.values)

@@ -103,6 +103,8 @@ class WatchdogNode(PlainNode):
             self._client.call_async(request).add_done_callback(self._on_parameters)
 
     def _on_parameters(self, response: Future) -> None:
+        if self.line is not None:  # of an earlier response: it was asked again
+            return
         try:
             given = values_of(self._names, response.result())
             config = build(ControllerConfig, given, self._controller)
