@@ -149,6 +149,9 @@ def test_torques_are_those_of_the_commands_or_measured_or_unknown(tmp_path):
     with pytest.raises(BlfDscError, match='3 values, but there are 2 joints, and 4 in'):
         torque_of(write(tmp_path / 'three', foreign('three')), names_of())
     messages = list(foreign('pair'))
+    mixed = messages[:100] + list(foreign('array'))[100:]
+    with pytest.raises(UnreadableMessageError, match='not every message holds the same 2 values'):
+        torque_of(write(tmp_path / 'mixed', mixed), names_of())
     kept = [entry for k, entry in enumerate(messages) if entry[0] != '/arm/torque' or k % 4 == 1]
     source, torque = torque_of(write(tmp_path / 'slow', kept), names_of())
     assert source == '/arm/torque'
