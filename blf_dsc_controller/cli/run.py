@@ -39,7 +39,7 @@ from blf_dsc_controller.simulation.loop import Record, simulate
 from blf_dsc_controller.supervision.checks import Reason
 from blf_dsc_controller.supervision.config_warnings import config_warnings, expectation
 from blf_dsc_controller.supervision.guard import Guard
-from sim_plant.plant import parameter_order, parameters_of, plant_of
+from sim_plant.plant import parameter_names_of, parameters_of, plant_of
 
 STOPPED = 5
 """Exit code if the controller stopped before the end."""
@@ -193,7 +193,8 @@ class LoopProgress:
 
     def __init__(self, config: PlantConfig, parameters: Sequence[str]) -> None:
         """Begin at 0 s; `parameters` are the names of the estimates."""
-        self._order = parameter_order(parameters, config)
+        # Those of a URDF have mixed units.
+        self._compares = not config.robot.urdf and tuple(parameters) == parameter_names_of(config)
         self._config = config
         self._is_bar = sys.stderr.isatty()
         form, pause = (_BAR, 0.2) if self._is_bar else (_LINE, _LINE_PERIOD)
@@ -203,10 +204,10 @@ class LoopProgress:
 
     def show(self, elapsed: float, ratio: float, estimate: ArrayLike) -> None:
         """Show the simulated time [s], the largest |xi1| / k_c so far, and P^ (p,)."""
-        P = parameters_of(self._config, elapsed)[self._order]
-        error = np.linalg.norm(np.asarray(estimate) - P) / np.linalg.norm(P)
         status = f'max|xi1|/bound {ratio:.2f}'
-        if np.all(self._order >= 0) and not self._config.robot.urdf:  # else P has mixed units
+        if self._compares:
+            P = parameters_of(self._config, elapsed)
+            error = np.linalg.norm(np.asarray(estimate) - P) / np.linalg.norm(P)
             status += f', parameter error {100 * error:.2f} %'
         self._bar.set_postfix_str(status, refresh=False)
         self._bar.update(min(elapsed, self._config.duration) - self._bar.n)
