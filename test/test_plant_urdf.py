@@ -14,7 +14,7 @@ from blf_dsc_controller.arms.inertia import pseudo_inertia
 from blf_dsc_controller.arms.serial_chain import serial_chain
 from blf_dsc_controller.configuration.plant import PlantConfig
 from blf_dsc_controller.configuration.schema import build, change
-from sim_plant.plant import parameters_of, plant_of, true_inertias
+from sim_plant.plant import parameters_of, plant_of, plant_settings, true_inertias
 from sim_plant.rigid_body import acceleration, locate, motion_of, motion_size, rigid_bodies, tip
 
 
@@ -99,6 +99,8 @@ def test_urdf_and_tip_are_a_complete_configuration_which_given_parameters_overri
     config = panda(actuator__torque_limit=[50.0] * 7, initial__position=[0.1] * 7)
     assert config.actuator.torque_limit == (50.0,) * 7
     assert config.initial.position == (0.1,) * 7
+    rippled = plant_settings(change(config, {'actuator.ripple': 0.01}))  # of the limit
+    assert rippled.disturbance.ripple == pytest.approx(0.5)
 
 
 def mujoco_state(config, torques, payload):
