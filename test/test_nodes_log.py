@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 import sys
 from collections import deque
@@ -150,6 +151,7 @@ def test_every_lifecycle_way_out_leaves_the_safe_torque(ros, way, event):
     ros.run(arm, 50)
     assert way(ros, law)
     ros.until(lambda: f'"{event}"' in journal[-1].data)
+    ros.until(lambda: len(commands) > json.loads(journal[-1].data)['commands'])  # before the event
     ros.spin(0.3)
     assert (np.abs(torques(commands)[-1]) > 1.0).all()
     assert law.finished == (way is shutdown)

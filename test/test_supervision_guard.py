@@ -65,6 +65,10 @@ def test_ramp_is_linear_and_ends_at_a_moving_goal():
     ramp.commanded[0] = 4.0
     ramp.begin_ramp(0.0, np.zeros(2))
     assert advance(1.0) == 1.0
+    ramp.commanded[0] = 4.0
+    ramp.begin_ramp(1.0, np.zeros(2))
+    lowered = settings(**{'torque.limit': (3.0, 3.0)})  # at run time
+    assert ramp.advance(safety, lowered, P, 0.001)[0] == 3.0
 
 
 def test_missed_states_are_averaged():
