@@ -79,6 +79,9 @@ def test_every_law_is_tuned_with_the_same_effort():
         for gain in task.gains:
             key = gain.name, gain.joint
             assert ranges.setdefault(key, (gain.least, gain.most)) == (gain.least, gain.most)
+        found = tune.parameters_at(task, np.arange(len(task.gains)) / 10.0)
+        assert found['feedback.gain'] == (1.0, 1.26)  # of each joint; 10^0.1 to three digits
+        assert found['learning.adaptation_gain'] == (1.58,) * 3
     assert len(tune.TASKS['proposed'].gains) == len(tune.TASKS['comparison'].gains)
 
 

@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import itertools
-import json
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from functools import partial
@@ -15,6 +14,7 @@ import numpy as np
 from tqdm import tqdm
 
 from blf_dsc_controller.analysis.style import Cell, write_page
+from blf_dsc_controller.analysis.summary import plain, write_summary
 from blf_dsc_controller.configuration.nodes import LoopConfig, load_loop
 from blf_dsc_controller.configuration.schema import change
 from blf_dsc_controller.errors import BlfDscError
@@ -198,7 +198,7 @@ def _write(folder: Path, results: Results, truths: int, generations: int) -> Non
         }
         for arm, laws in results.items()
     }
-    (folder / 'figures.json').write_text(json.dumps(numbers, indent=1) + '\n', encoding='utf-8')
+    write_summary(plain(numbers), folder / 'figures.json')
     write_page(
         folder / 'index.html',
         'arms.html',

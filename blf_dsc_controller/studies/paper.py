@@ -7,7 +7,6 @@ the runs that it is about and fails in others; `condition` then says when it hol
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Iterable, Iterator
 from dataclasses import asdict, replace
@@ -22,7 +21,7 @@ from blf_dsc_controller.analysis.figures import draw_panels
 from blf_dsc_controller.analysis.metrics import MOMENTS, estimates_of
 from blf_dsc_controller.analysis.panels import panels
 from blf_dsc_controller.analysis.style import ALARM, COLOURS, MUTED, Cell, Picture, write_page
-from blf_dsc_controller.analysis.summary import plain
+from blf_dsc_controller.analysis.summary import plain, write_summary
 from blf_dsc_controller.configuration.nodes import dump
 from blf_dsc_controller.law.factory import settings_of_config
 from blf_dsc_controller.law.lyapunov import ExponentialBound, decay_rate
@@ -328,12 +327,9 @@ def compare(folder: Path) -> list[Claim]:
     results = run_all()
     found = list(claims(results))
     laws = list(side_by_side(results))
-    numbers = {
-        'claims': [claim._asdict() for claim in found],
-        'metrics': {name: plain(asdict(each)) for name, each in results.metrics.items()},
-    }
-    text = json.dumps(numbers, indent=1) + '\n'
-    (folder / 'results.json').write_text(text, encoding='utf-8')
+    metrics = {name: plain(asdict(each)) for name, each in results.metrics.items()}
+    numbers = {'claims': [claim._asdict() for claim in found], 'metrics': metrics}
+    write_summary(numbers, folder / 'results.json')
     write_page(
         folder / 'index.html',
         'paper.html',

@@ -166,8 +166,11 @@ def search(
     return found.x, float(found.fun), int(found.nfev)
 
 
-def tune(task: Task) -> tuple[Floats, float, int]:
-    """Return the best exponents, their objective, and the number of evaluations."""
+def main() -> None:
+    """Tune a law and print its gains, as they stand in its preset."""
+    options = argparse.ArgumentParser(prog='tune', description=__doc__.splitlines()[0])
+    options.add_argument('law', choices=TASKS)
+    task = TASKS[options.parse_args().law]
     loops = loops_of(task)
     with tqdm(total=EVALUATIONS, desc='tuning', unit='run') as bar:
 
@@ -175,17 +178,9 @@ def tune(task: Task) -> tuple[Floats, float, int]:
             bar.update()
             return objective(exponents, task, loops)
 
-        return search(cost, task.gains, POPULATION, GENERATIONS)
-
-
-def main() -> None:
-    """Tune a law and print its gains, as they stand in its preset."""
-    options = argparse.ArgumentParser(prog='tune', description=__doc__.splitlines()[0])
-    options.add_argument('law', choices=TASKS)
-    task = TASKS[options.parse_args().law]
-    exponents, value, evaluations = tune(task)
+        found, value, evaluations = search(cost, task.gains, POPULATION, GENERATIONS)
     print(f'# {evaluations} evaluations, objective {value:.3f} (decades of error; less is better)')
-    for name, entry in parameters_at(task, exponents).items():
+    for name, entry in parameters_at(task, found).items():
         print(f'{name}: {format_value(entry)}')
 
 
