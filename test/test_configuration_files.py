@@ -291,6 +291,16 @@ def test_section_that_does_not_match_is_ignored_or_rejected(file, pattern, node,
     assert load_plant(path, node).seed == (7 if applies else 0)
 
 
+def test_last_section_wins_regardless_of_specificity_and_names_may_nest(file):
+    wild, own = section('/**', 'seed: 1, duration: 2.0'), section('sim_plant', 'seed: 3')
+    assert load_plant(file(own + wild)).seed == 1
+    both = load_plant(file(wild + own))
+    assert (both.seed, both.duration) == (3, 2.0)
+    nested = 'left:\n  sim_plant:\n    ros__parameters: {arm: {l1: 2.0}, arm.l2: 3.0}\n'
+    arm = load_plant(file(nested), '/left/sim_plant').arm
+    assert (arm.l1, arm.l2) == (2.0, 3.0)
+
+
 def test_overrides_take_precedence_over_the_file(file):
     path = file(section('sim_plant', 'seed: 3, duration: -1.0'))
     plant = load_plant(path, overrides={'duration': 5.0})
