@@ -15,6 +15,7 @@ from mmap import ACCESS_READ, mmap
 from pathlib import Path
 from struct import Struct
 from typing import Any, NamedTuple
+from zlib import crc32
 
 import yaml
 from mcap import records
@@ -38,6 +39,7 @@ from blf_dsc_controller.configuration.files import load_yaml
 from blf_dsc_controller.messages.codecs import Definition
 
 _CHUNK = Struct('<BQQQQII')  # up to the length of the compression's name
+_END = Struct('<QQI')  # in the footer: begin of the topics and counts, and their checksum
 _KINDS: dict[int, Any] = {
     opcode: getattr(records, opcode.name.title().replace('_', '')) for opcode in Opcode
 }
@@ -92,7 +94,7 @@ class _Copy:
         is_closed = False
         with path.open('rb') as stream:
             data = mmap(stream.fileno(), 0, access=ACCESS_READ) if stream.seek(0, 2) else b''
-            for record, *_ in _scan(data):  # topics may only be known from the end
+            for record, *_ in _scan(data) if _has_intact_end(data) else ():
                 if isinstance(record, (Schema, Channel, Statistics)):
                     self._take(record)
             for record, at, end in _scan(data):
@@ -200,6 +202,17 @@ def _record(data: bytes | mmap, at: int, *, is_chunked: bool) -> tuple[Any, int]
     if stream.count != length:
         raise DamageError('a record does not match its length')
     return record, end
+
+
+def _has_intact_end(data: bytes | mmap) -> bool:
+    """Return whether the topics and counts at the end of a file match their checksum, or have none.
+
+    Only there are the topics known if the first chunk is damaged.
+    """
+    if len(data) < MAGIC_SIZE + _END.size:
+        return False
+    start, _, checksum = _END.unpack_from(data, len(data) - MAGIC_SIZE - _END.size)
+    return checksum in (0, crc32(data[start : -MAGIC_SIZE - 4]))
 
 
 def _next_chunk(data: bytes | mmap, at: int) -> int:
