@@ -177,13 +177,25 @@ def test_gain_change_takes_effect_at_the_next_sample(ros):
     assert not np.array_equal(torque, law_torques((START, VELOCITY), (NEXT, VELOCITY))[1])
 
 
-def test_gain_with_a_configuration_warning_is_rejected_at_run_time(ros):
+@pytest.mark.parametrize(
+    ('name', 'value', 'begin', 'end'),
+    [
+        (
+            'feedback.gain',
+            [4000.0, 15.0],
+            'feedback.gain: K_p over the inertia is ',
+            '; to use it anyway, start the node with it',
+        ),
+        ('barrier.bound', [1e-6, 0.002], 'barrier.bound: joint1 is ', 'with a smaller error'),
+    ],
+)
+def test_unworkable_gains_are_rejected_at_run_time(ros, name, value, begin, end):
     node = ros.add(ControllerNode)
     arm = Arm(ros)
     arm.torque_for(0, START, VELOCITY)
-    accepted, reasons = set_parameters(ros, node, feedback__gain=[4000.0, 15.0])
+    accepted, reasons = set_parameters(ros, node, **{name: value})
     assert not accepted
-    assert reasons[0].startswith('feedback.gain: K_p over the inertia is ')
-    assert reasons[0].endswith('; to use it anyway, start the node with it')
+    assert reasons[0].startswith(begin)
+    assert reasons[0].endswith(end)
     torque = arm.torque_for(1, NEXT, VELOCITY)
     np.testing.assert_array_equal(torque, law_torques((START, VELOCITY), (NEXT, VELOCITY))[1])
