@@ -144,7 +144,16 @@ def test_leaving_node_commands_the_safe_torque_last(ros):
     assert law.guard.journal.pending == deque()
 
 
-@pytest.mark.parametrize(('way', 'event'), [(deactivate, 'deactivate'), (shutdown, 'release')])
+def fail(ros, law):
+    """End by an unforeseen error in a transition."""
+    law.deactivate = lambda: 1 / 0
+    deactivate(ros, law)
+    return law.state_label == 'unconfigured'
+
+
+@pytest.mark.parametrize(
+    ('way', 'event'), [(deactivate, 'deactivate'), (shutdown, 'release'), (fail, 'release')]
+)
 def test_every_lifecycle_way_out_leaves_the_safe_torque(ros, way, event):
     commands, journal = ros.listen(topics.COMMANDS), ros.listen(topics.JOURNAL)
     arm, law = ros.loop(controller={'safety.torque': 'hold_gravity'})
