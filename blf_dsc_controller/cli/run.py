@@ -39,7 +39,7 @@ from blf_dsc_controller.simulation.loop import Record, simulate
 from blf_dsc_controller.supervision.checks import Reason
 from blf_dsc_controller.supervision.config_warnings import config_warnings, expectation
 from blf_dsc_controller.supervision.guard import Guard
-from sim_plant.plant import parameter_names_of, parameters_of, plant_of
+from sim_plant.plant import parameter_order, parameters_of, plant_of
 
 STOPPED = 5
 """Exit code if the controller stopped before the end."""
@@ -193,8 +193,8 @@ class LoopProgress:
 
     def __init__(self, config: PlantConfig, parameters: Sequence[str]) -> None:
         """Begin at 0 s; `parameters` are the names of the estimates."""
-        # Those of a URDF have mixed units.
-        self._compares = not config.robot.urdf and tuple(parameters) == parameter_names_of(config)
+        self._order = parameter_order(parameters, config)
+        self._compares = not config.robot.urdf and (self._order >= 0).all()  # else mixed units
         self._config = config
         self._is_bar = sys.stderr.isatty()
         form, pause = (_BAR, 0.2) if self._is_bar else (_LINE, _LINE_PERIOD)
@@ -206,7 +206,7 @@ class LoopProgress:
         """Show the simulated time [s], the largest |xi1| / k_c so far, and P^ (p,)."""
         status = f'max|xi1|/bound {ratio:.2f}'
         if self._compares:
-            P = parameters_of(self._config, elapsed)
+            P = parameters_of(self._config, elapsed)[self._order]
             error = np.linalg.norm(np.asarray(estimate) - P) / np.linalg.norm(P)
             status += f', parameter error {100 * error:.2f} %'
         self._bar.set_postfix_str(status, refresh=False)

@@ -93,6 +93,7 @@ class ViewNode(PlainNode):
         self._newest = self._subscribe(_STREAMS, _NEWEST)
         self._kept = self._subscribe(_EVENTS)
         self._asked: SimpleQueue[Callable[[], None]] = SimpleQueue()  # by the page's threads
+        self._pushing: list[float] = []  # N m, as asked for
         self._push_ends = inf  # s
         self._load: list[float] = []  # N m, without a push
         self._requests = {
@@ -171,6 +172,8 @@ class ViewNode(PlainNode):
             self._draw_all()
             return
         self._plant |= said['parameters']
+        if said['parameters'].get('load.torque') == self._pushing:  # from here on it acts
+            self._push_ends = self._time(said['stamp']) + _PUSH
         for name, value in said['parameters'].items():
             self._events.append((self._time(said['stamp']), name, f'{value}'))
 
@@ -257,7 +260,7 @@ class ViewNode(PlainNode):
         self._events += [e for e in plant_events(self._plant) if self._noted < e[0] <= time]
         self._noted = time
         if time >= self._push_ends:
-            self._push_ends = inf
+            self._push_ends, self._pushing = inf, []
             self._set('load.torque', self._load)
 
     # What the buttons ask for.
@@ -292,9 +295,8 @@ class ViewNode(PlainNode):
 
     def _push(self, torque: Sequence[float]) -> None:
         """Push the joints by these torques [N m] for half a second of plant time."""
-        if self.past:
-            self._push_ends = self.past[-1].time + _PUSH
-            self._set('load.torque', torque)
+        self._pushing = list(torque)
+        self._set('load.torque', torque)
 
     def _set(self, name: str, value: Any) -> None:
         """Set a parameter of the simulated arm."""
