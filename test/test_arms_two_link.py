@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Planar arms against a Lagrangian; joints, axes, tip and clearance of chains."""
+"""The two-link arm against a Lagrangian and MuJoCo; joints, axes, tip and clearance of chains."""
 
 from __future__ import annotations
 
