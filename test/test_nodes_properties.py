@@ -27,7 +27,7 @@ from blf_dsc_controller.nodes.controller_node import ControllerNode
 from blf_dsc_controller.nodes.parameters import FixedParameterError
 from blf_dsc_controller.nodes.plant_node import PlantNode
 
-EXAMPLES = 10_000 if os.environ.get('NIGHTLY') else 60
+EXAMPLES = 2_000 if os.environ.get('NIGHTLY') else 60
 SETTINGS = settings(max_examples=EXAMPLES, suppress_health_check=list(HealthCheck))
 LIMIT = 20.0
 START = (2.293, 1.696)
