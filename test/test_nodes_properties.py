@@ -15,7 +15,7 @@ import pytest
 pytest.importorskip('rclpy', reason='needs ROS 2')
 
 import rclpy
-from hypothesis import HealthCheck, given, settings
+from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState
@@ -157,6 +157,7 @@ def apply_event(node, kind, content):
 
 @pytest.mark.usefixtures('bystander')
 @given(events(joint_states()))
+@example([('parameter', ('torque.limit', [1.0, 5e-324]))])
 @SETTINGS
 def test_controller_survives_arbitrary_input(context, sequence):
     node = ControllerNode(context=context, cli_args=[], enable_rosout=False)

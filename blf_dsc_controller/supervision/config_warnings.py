@@ -213,9 +213,10 @@ def _of_errors(config: ControllerConfig, errors: ExpectedErrors) -> Iterator[str
 def _of_gains(config: ControllerConfig, load: ReferenceLoad) -> list[Finding]:
     settings = settings_of_config(config)
     damping = np.maximum(load.damping(settings), 1e-12)
-    found = [*_of_feedback(config, settings, load, damping)]
-    if settings.surface != LINEAR:
-        found += _of_surface(config, settings, damping)
+    with np.errstate(over='ignore'):  # a limit of next to nothing is exceeded infinitely
+        found = [*_of_feedback(config, settings, load, damping)]
+        if settings.surface != LINEAR:
+            found += _of_surface(config, settings, damping)
     return [finding for finding in found if finding.excess > 1.0]
 
 
