@@ -28,7 +28,7 @@ from blf_dsc_controller.messages import topics
 from blf_dsc_controller.messages.codecs import Float64MultiArrayEncoder, JointStateEncoder
 from blf_dsc_controller.nodes.controller_node import ControllerNode
 from blf_dsc_controller.nodes.plant_node import PlantNode
-from blf_dsc_controller.supervision.checks import Phase
+from blf_dsc_controller.supervision.supervisor import Phase
 
 PAGE = os.sysconf('SC_PAGE_SIZE')
 

@@ -24,8 +24,8 @@ from blf_dsc_controller.configuration.plant import PlantConfig
 from blf_dsc_controller.configuration.schema import build, change
 from blf_dsc_controller.nodes.controller_node import ControllerNode
 from blf_dsc_controller.simulation.loop import START
-from blf_dsc_controller.supervision.checks import Phase
 from blf_dsc_controller.supervision.guard import Guard
+from blf_dsc_controller.supervision.supervisor import Phase
 from sim_plant.plant import parameters_of, plant_of
 
 EXAMPLE = Path(__file__).parents[1] / 'examples/mujoco_plant/mujoco_plant.py'

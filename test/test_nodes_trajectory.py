@@ -23,7 +23,7 @@ from blf_dsc_controller.messages import topics
 from blf_dsc_controller.messages.codecs import MessageError, joint_trajectory
 from blf_dsc_controller.reference.trajectory import plan_trajectory
 from blf_dsc_controller.simulation.loop import simulate
-from blf_dsc_controller.supervision.checks import Phase
+from blf_dsc_controller.supervision.supervisor import Phase
 
 AWAY = [0.9, 2.9]  # rad, 1.4 and 1.2 from the paper's reference
 BRISK = {'limits__acceleration': [4.0, 4.0]}  # rad/s^2, for a lead of a second

@@ -23,7 +23,7 @@ from blf_dsc_controller.bags.sources import open_bag
 from blf_dsc_controller.cli.main import main
 from blf_dsc_controller.messages.codecs import typestore
 from blf_dsc_controller.messages.topics import ROBOT_DESCRIPTION
-from blf_dsc_controller.nodes.recorder_node import PlayerNode
+from blf_dsc_controller.nodes.player_node import PlayerNode
 
 
 @pytest.fixture(scope='module')

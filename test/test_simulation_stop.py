@@ -16,7 +16,7 @@ from blf_dsc_controller.configuration.schema import build
 from blf_dsc_controller.replay.verify import verify
 from blf_dsc_controller.simulation.bag import write_bag
 from blf_dsc_controller.simulation.loop import START, simulate
-from blf_dsc_controller.supervision.checks import Phase
+from blf_dsc_controller.supervision.supervisor import Phase
 
 HELD = {'safety.torque': 'hold_gravity', 'safety.stop_ramp': 0.05}
 NOISY = {'sensor.position_noise': 1e-6, 'sensor.velocity': 'differenced', 'seed': 3}

@@ -15,7 +15,8 @@ from blf_dsc_controller.configuration.controller import ControllerConfig, Safety
 from blf_dsc_controller.configuration.schema import build
 from blf_dsc_controller.law.checks import INVALID, OUTSIDE, SUSPECT, check_sample
 from blf_dsc_controller.law.settings import EFFORT
-from blf_dsc_controller.supervision.checks import Reason, SampleCheck, StateCheck, Velocity
+from blf_dsc_controller.supervision.checks import SampleCheck, StateCheck, Velocity
+from blf_dsc_controller.supervision.supervisor import Reason
 
 DT = 1e-3
 

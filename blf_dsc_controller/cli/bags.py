@@ -119,8 +119,8 @@ def play(options: Namespace) -> None:
     require_ros()
     import rclpy
 
+    from blf_dsc_controller.nodes.player_node import PlayerNode
     from blf_dsc_controller.nodes.process import drain
-    from blf_dsc_controller.nodes.recorder_node import PlayerNode
 
     rclpy.init(args=[], signal_handler_options=rclpy.SignalHandlerOptions.NO)
     try:

@@ -1,39 +1,28 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The nodes of bags: `bag_recorder` records every message of the chosen topics; and a player.
-
-The messages are not decoded. The node `rosbag2_player` publishes those of a bag where no `ros2 bag
-play` is at hand.
-"""
+"""The node `bag_recorder`: records every message of the chosen topics without decoding it."""
 
 from __future__ import annotations
 
 import sys
-import time
-from collections.abc import Collection, Iterator
+from collections.abc import Iterator
 from contextlib import suppress
 from functools import partial
 from typing import Any
 
-from rclpy.exceptions import NameValidationException
-from rclpy.node import Node
-from rclpy.publisher import Publisher
-
-from blf_dsc_controller.bags.sources import BagError, OpenBag
+from blf_dsc_controller.bags.sources import BagError
 from blf_dsc_controller.bags.writer import BagWriter, Losses, statistics
 from blf_dsc_controller.configuration.nodes import RecorderConfig
 from blf_dsc_controller.messages.codecs import (
     MessageError,
     UnknownTypeError,
-    encode_clock,
     joint_state_stamp,
 )
-from blf_dsc_controller.messages.topics import CLOCK, HISTORY, JOINT_STATES, STREAM, Quality
+from blf_dsc_controller.messages.topics import JOINT_STATES, Quality
 from blf_dsc_controller.nodes.endpoints import (
     RawMessage,
     RawSubscriptions,
     create_steady_timer,
     message_class,
-    qos_profile,
     quality_of,
     register_definition,
 )
@@ -44,7 +33,6 @@ _DISCOVERY_PERIOD = 0.1  # s
 _TAKE_PERIOD = 0.01  # s
 _FLUSH_INTERVAL = 0.05  # s; below 0.1 s including _TAKE_PERIOD, unless overloaded
 _REPEAT = 60.0  # s between repeats of a warning
-_CLOCK_PERIOD = 0.01  # s
 
 
 class BagRecorderNode(PlainNode):
@@ -181,59 +169,6 @@ class BagRecorderNode(PlainNode):
             yield f'{topic}: never appeared'
         for topic, count in self._bag.message_counts.items():
             yield f'{topic}: {count} messages{self._losses[topic].text()}'
-
-
-class PlayerNode(Node):
-    """Publishes the topics of an open bag, latched where they were, and its time on /clock.
-
-    Empty `topics` selects all. Messages are read as they are played: a bag may exceed the memory.
-
-    Raises:
-        BagError: the bag is empty, or has no such topic.
-    """
-
-    def __init__(
-        self, bag: OpenBag, topics: Collection[str] = (), *, clock: bool = False, **options: Any
-    ) -> None:
-        super().__init__('rosbag2_player', start_parameter_services=False, **options)
-        if not any(bag.counts.values()):
-            raise BagError('the bag is empty: it holds no message')
-        wanted = {'/' + name.lstrip('/') for name in topics} or {*bag.counts}
-        if missing := sorted(wanted - {*bag.counts}):
-            listing = ', '.join(bag.counts)
-            raise BagError(f'the bag has no topic {", ".join(missing)}; it holds {listing}')
-        self._bag = bag
-        self.outputs: dict[str, Publisher] = {}
-        for name, type_ in bag.held:
-            if name in wanted and not (clock and name == CLOCK.name):
-                self._add(name, type_)
-        type_ = message_class(CLOCK.type)
-        self._clock_output = self.create_publisher(type_, CLOCK.name, 10) if clock else None
-
-    def play(self, rate: float) -> None:
-        """Publish all messages at `rate` seconds of the bag a second; 0: as fast as possible."""
-        first, begin, next_clock = self._bag.times[0], time.monotonic(), 0.0
-        for message in self._bag.messages({*self.outputs}):
-            due = begin + (message.received - first) * 1e-9 / rate if rate else 0.0
-            while True:
-                now = time.monotonic()
-                if self._clock_output is not None and now >= next_clock:
-                    next_clock = now + _CLOCK_PERIOD
-                    ahead = round(max(0.0, due - now) * rate * 1e9)
-                    self._clock_output.publish(encode_clock(message.received - ahead))
-                if now >= due:
-                    break
-                time.sleep(min(due - now, _CLOCK_PERIOD))
-            self.outputs[message.topic].publish(message.raw)
-
-    def _add(self, name: str, type_: str) -> None:
-        try:
-            profile = qos_profile(HISTORY if name in self._bag.latched else STREAM)
-            self.outputs[name] = self.create_publisher(message_class(type_), name, profile)
-        except (ImportError, AttributeError):
-            self.get_logger().warning(f'{name} is not played: {type_} is not installed here')
-        except NameValidationException:
-            self.get_logger().warning(f'{name} is not played: it is not the name of a topic')
 
 
 main = partial(run, BagRecorderNode)

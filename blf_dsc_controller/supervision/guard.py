@@ -29,17 +29,15 @@ from blf_dsc_controller.supervision import handover
 from blf_dsc_controller.supervision.checks import (
     PERIOD,
     SKIP,
-    Phase,
-    Reason,
     SampleCheck,
     StateCheck,
-    Supervisor,
     Velocity,
     Watchdog,
     rate_mismatch,
 )
 from blf_dsc_controller.supervision.handover import check_first_torque, check_support
 from blf_dsc_controller.supervision.safe_torque import SafeTorque, limit_first_torque
+from blf_dsc_controller.supervision.supervisor import Phase, Reason, Supervisor
 
 Vector = NDArray[np.float64]
 _NANO = 1e-9
