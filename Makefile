@@ -41,7 +41,7 @@ PIP_FAILED := { echo 'The installation failed: see above. It needs a package ind
   'set HTTPS_PROXY, for a mirror PIP_INDEX_URL, without a network PIP_FIND_LINKS and' \
   'PIP_NO_INDEX=1, and run make again.' >&2; exit 1; }
 
-.PHONY: help venv demo paper arms changes expect test test-browser pictures test-nightly soak fuzz docs lint clean bench release
+.PHONY: help venv demo paper arms changes test test-browser pictures test-nightly soak fuzz docs lint clean bench release
 
 help: ## List the targets
 	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/  make \1	\2/p' Makefile
@@ -83,9 +83,6 @@ test-nightly: ## Run all tests, those left out by make test as well, at length a
 
 changes: $(READY) ## Simulate 14,000 randomly changing arms, each with and without learning, into out/changes
 	@$(RUN) benchmark/changing_arms.py
-
-expect: $(READY) ## Recompute the figures of doc/arms.md for the presets panda and ur5e
-	@$(RUN) benchmark/what_to_expect.py
 
 bench: $(READY)-bench ## Run the benchmarks (GROUPS=offline for one group), into benchmark/RESULTS.md
 	@$(RUN) benchmark/harness.py $(GROUPS)

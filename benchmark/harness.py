@@ -15,13 +15,8 @@ import itertools
 import os
 import platform
 import re
-import signal
-import subprocess
-import sys
-import tempfile
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
 from itertools import groupby
 from pathlib import Path
 from typing import NamedTuple
@@ -29,22 +24,15 @@ from typing import NamedTuple
 import numpy as np
 
 from blf_dsc_controller import __version__
-from blf_dsc_controller.errors import BlfDscError
 
 _GROUPS = {  # module and function of each
     'offline': ('offline', 'measure'),
-    'montecarlo': ('offline', 'measure_study'),
     'growth': ('offline', 'measure_growth'),
-    'replay': ('offline', 'measure_replay'),
     'node': ('nodes', 'measure'),
     'startup': ('nodes', 'measure_start'),
 }
 _HERE = Path(__file__).parent
 _PACKAGES = ('numpy', 'numba', 'scipy', 'mujoco', 'pin', 'ros-jazzy-rclpy')
-_START_UP = 120.0  # s, including compilation of kernels
-_ENDING = 20.0  # s from SIGINT to the end
-_TAIL = 2000  # characters of stderr quoted in an error
-_CPUCLOCK_SCHED = 2  # as clock_getcpuclockid(3) does: in ns, where /proc has 10 ms
 
 
 class Ratio(NamedTuple):
@@ -94,75 +82,6 @@ def print_table(heads: Sequence[str], rows: Iterable[Sequence[str]]) -> None:
     """Print a Markdown table, each row as soon as it is known."""
     for line in table_lines(heads, rows):
         print(line, flush=True)
-
-
-class ContestantError(BlfDscError):
-    """A contestant has exited early, or does not respond."""
-
-
-class Contestant(subprocess.Popen[bytes]):
-    """A process of this Python interpreter: a script or `-m module`, and its arguments."""
-
-    def __init__(
-        self, name: str, arguments: Sequence[str], environment: Mapping[str, str] | None = None
-    ) -> None:
-        self.name = name
-        self._errors = tempfile.TemporaryFile()  # noqa: SIM115 - closed with the process
-        super().__init__(
-            [sys.executable, *arguments],
-            env={**os.environ, **(environment or {})},
-            stdout=subprocess.DEVNULL,
-            stderr=self._errors,
-        )
-
-    def cpu_time(self) -> float:
-        """Return the user and system time of the process so far [s]."""
-        return time.clock_gettime(~self.pid << 3 | _CPUCLOCK_SCHED)
-
-    def check(self) -> None:
-        """Raise ContestantError, with the end of its stderr, if the process has ended."""
-        code = self.poll()
-        if code is not None:
-            self._errors.seek(0)
-            errors = self._errors.read().decode(errors='replace')[-_TAIL:].strip()
-            raise ContestantError(f'{self.name} ended with exit code {code}:\n{errors}')
-
-    def end(self) -> None:
-        """End the process as Ctrl-C does, or kill it if that is not enough."""
-        self.send_signal(signal.SIGINT)
-        try:
-            self.wait(_ENDING)
-        except subprocess.TimeoutExpired:
-            self.kill()
-            self.wait()
-        self._errors.close()
-
-
-def wait_for(
-    condition: Callable[[], bool],
-    what: str,
-    contestants: Sequence[Contestant] = (),
-    pause: Callable[[], object] = lambda: time.sleep(0.02),
-    timeout: float = _START_UP,
-) -> None:
-    """Wait until the condition holds; ContestantError after `timeout` [s] or if one has ended."""
-    begin = time.perf_counter()
-    while not condition():
-        for contestant in contestants:
-            contestant.check()
-        if time.perf_counter() - begin > timeout:
-            raise ContestantError(f'timed out after {timeout:g} s waiting for {what}')
-        pause()
-
-
-@contextmanager
-def own_graph() -> Iterator[None]:
-    """Isolate the ROS nodes of this process and of its contestants from all others."""
-    from blf_dsc_controller.cli.session import localhost_environment, own_domain
-
-    with own_domain() as domain:
-        os.environ.update({'ROS_DOMAIN_ID': str(domain), **localhost_environment()})
-        yield
 
 
 def machine() -> str:

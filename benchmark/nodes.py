@@ -1,55 +1,126 @@
 # SPDX-License-Identifier: Apache-2.0
 """The controller's node against a null node, which answers without decoding messages.
 
-This process stands in for the plant. Every contestant is restarted in
-each round, as a process of its own. The controller gets the joint states of a simulated run, first
-each as soon as the torque before has arrived, then one a millisecond.
+This process stands in for the plant: it publishes the joint states of a simulated run, one a
+millisecond. Every contestant is restarted in each round, as a process of its own.
 """
 
 from __future__ import annotations
 
 import gc
 import itertools
+import os
+import signal
+import subprocess
+import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from harness import Contestant, ContestantError, Ratio, own_graph, ratio, wait_for
+from harness import Ratio, ratio
 
 from blf_dsc_controller.configuration.controller import ControllerConfig, Telemetry
 from blf_dsc_controller.configuration.nodes import CONTROLLER, LoopConfig, dump, load_loop
+from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.law.telemetry import PlantTelemetry
 from blf_dsc_controller.messages import topics
 from blf_dsc_controller.simulation.loop import simulate
 
 _ROUNDS = 3
 _STARTS = 2
-_STEPS = 2000  # of each mode
+_STEPS = 2000
 _WARM_UP = 500
 _START = 1_000_000_000
 _PERIOD = 1e-3  # s
 _SETTLING = 0.5  # s for discovery, or for a message to arrive
 _PATIENCE = 60.0  # s for one torque
-_RATE = 'steps a second'
+_START_UP = 120.0  # s, including compilation of kernels
+_ENDING = 20.0  # s from SIGINT to the end
+_TAIL = 2000  # characters of stderr quoted in an error
+_CPUCLOCK_SCHED = 2  # as clock_getcpuclockid(3) does: in ns, where /proc has 10 ms
+_ARMS = {'recommended': 'node', 'panda': 'node with seven joints'}
 _NULL = 'null node'
 _QUIET = 'controller, telemetry off'
-_UNHEARD = 'controller, telemetry on, no subscriber'
-_HEARD = 'controller, telemetry on, a subscriber'
 _RECORDED = 'controller, telemetry on, recorder'
-_GROUPS = {  # preset, title, contestants
-    'recommended': ('node', (_NULL, _QUIET, _UNHEARD, _HEARD, _RECORDED)),
-    'panda': ('node with seven joints', (_NULL, _QUIET, _RECORDED)),
-}
 _WARM = 'controller, warm cache'
 _COLD = 'controller, cold cache'
-_NULL_NODE = str(Path(__file__).with_name('null_node.py'))
+_NULL_NODE = [str(Path(__file__).with_name('null_node.py'))]
 _CONTROLLER_NODE = ['-m', 'blf_dsc_controller.nodes.controller_node']
 _RECORDER_NODE = ['-m', 'blf_dsc_controller.nodes.recorder_node', '--ros-args', '-p']
+
+
+class ContestantError(BlfDscError):
+    """A contestant has exited early, or does not respond."""
+
+
+class Contestant(subprocess.Popen[bytes]):
+    """A process of this Python interpreter: a script or `-m module`, and its arguments."""
+
+    def __init__(
+        self, name: str, arguments: Sequence[str], environment: Mapping[str, str] | None = None
+    ) -> None:
+        self.name = name
+        self._errors = tempfile.TemporaryFile()  # noqa: SIM115 - closed with the process
+        super().__init__(
+            [sys.executable, *arguments],
+            env={**os.environ, **(environment or {})},
+            stdout=subprocess.DEVNULL,
+            stderr=self._errors,
+        )
+
+    def cpu_time(self) -> float:
+        """Return the user and system time of the process so far [s]."""
+        return time.clock_gettime(~self.pid << 3 | _CPUCLOCK_SCHED)
+
+    def check(self) -> None:
+        """Raise ContestantError, with the end of its stderr, if the process has ended."""
+        code = self.poll()
+        if code is not None:
+            self._errors.seek(0)
+            errors = self._errors.read().decode(errors='replace')[-_TAIL:].strip()
+            raise ContestantError(f'{self.name} ended with exit code {code}:\n{errors}')
+
+    def end(self) -> None:
+        """End the process as Ctrl-C does, or kill it if that is not enough."""
+        self.send_signal(signal.SIGINT)
+        try:
+            self.wait(_ENDING)
+        except subprocess.TimeoutExpired:
+            self.kill()
+            self.wait()
+        self._errors.close()
+
+
+def wait_for(
+    condition: Callable[[], bool],
+    what: str,
+    contestants: Sequence[Contestant] = (),
+    pause: Callable[[], object] = lambda: time.sleep(0.02),
+    timeout: float = _START_UP,
+) -> None:
+    """Wait until the condition holds; ContestantError after `timeout` [s] or if one has ended."""
+    begin = time.perf_counter()
+    while not condition():
+        for contestant in contestants:
+            contestant.check()
+        if time.perf_counter() - begin > timeout:
+            raise ContestantError(f'timed out after {timeout:g} s waiting for {what}')
+        pause()
+
+
+@contextmanager
+def own_graph() -> Iterator[None]:
+    """Isolate the ROS nodes of this process and of its contestants from all others."""
+    from blf_dsc_controller.cli.session import localhost_environment, own_domain
+
+    with own_domain() as domain:
+        os.environ.update({'ROS_DOMAIN_ID': str(domain), **localhost_environment()})
+        yield
 
 
 class StandIn:
@@ -103,20 +174,20 @@ class StandIn:
         what = f'the first torque of {contestants[-1].name}'
         wait_for(lambda: self.has_torque, what, contestants, send)
 
-    def play(self, node: Contestant, period: float) -> dict[str, float]:
-        """Publish states, one per `period` [s] or, if 0, each after the previous torque.
+    def play(self, node: Contestant) -> tuple[float, float]:
+        """Publish states, one per millisecond.
 
-        Returns latencies [s], from state published to torque received, CPU [s] of the node's
-        process, and steps a second.
+        Returns the median latency [s], from state published to torque received, and the CPU [s] of
+        the node's process.
         """
         latency = np.zeros(_WARM_UP + _STEPS)
-        begin, busy = time.perf_counter(), node.cpu_time()
+        due, busy = time.perf_counter(), 0.0
         for k in range(latency.size):
             if k == _WARM_UP:
-                begin, busy = time.perf_counter(), node.cpu_time()
-            due = begin + (k if k < _WARM_UP else k - _WARM_UP) * period
-            while period and (left := due - time.perf_counter()) > 0.0:
+                due, busy = time.perf_counter(), node.cpu_time()
+            while (left := due - time.perf_counter()) > 0.0:
                 self.executor.spin_once(timeout_sec=left)
+            due += _PERIOD
             self.has_torque = False
             sent = time.perf_counter()
             self.publisher.publish(next(self.messages))
@@ -126,9 +197,7 @@ class StandIn:
                     node.check()
                     raise ContestantError(f'{node.name}: no torque for state {k}')
             latency[k] = time.perf_counter() - sent
-        rate, cpu = _STEPS / (time.perf_counter() - begin), node.cpu_time() - busy
-        median, most = np.percentile(latency[_WARM_UP:], (50.0, 99.9)).tolist()
-        return {'median latency': median, 'p99.9 latency': most, 'CPU': cpu, _RATE: rate}
+        return float(np.median(latency[_WARM_UP:])), node.cpu_time() - busy
 
     def _spin_for(self, seconds: float) -> None:
         end = time.perf_counter() + seconds
@@ -156,50 +225,42 @@ class StandIn:
 
 
 def measure() -> Iterator[Ratio]:
-    """Measure latency, CPU and lock-step rate of the controller relative to the null node."""
-    for preset, (group, names) in _GROUPS.items():
+    """Measure latency and CPU of the controller relative to the null node."""
+    for preset, group in _ARMS.items():
         loop = load_loop(preset)
         states = _recorded_states(loop)
-        real: list[dict[str, dict[str, float]]] = []  # a round: figures by contestant
-        lockstep: list[dict[str, dict[str, float]]] = []
+        found: dict[str, list[tuple[float, float]]] = {_NULL: [], _QUIET: [], _RECORDED: []}
         with own_graph(), tempfile.TemporaryDirectory() as folder, closing(StandIn(())) as arm:
-            for k in range(_ROUNDS):
-                real.append({})
-                lockstep.append({})
-                for name in names:
-                    path = Path(folder, f'{k}-{name}'.replace(' ', '_'))
-                    arm.messages = iter(states)
-                    with _started(name, loop.controller, path) as contestants:
-                        arm.greet(contestants)
-                        lockstep[k][name] = arm.play(contestants[-1], 0.0)
-                        real[k][name] = arm.play(contestants[-1], _PERIOD)
-                        for contestant in contestants:
-                            contestant.check()
-                    arm.left_alone()
-        shown = [(f'{group}, real time at 1 kHz', what, real) for what in [*real[0][_NULL]][:-1]]
-        for title, what, rounds in [*shown, (f'{group}, lock-step', _RATE, lockstep)]:
-            values = {name: np.array([each[name][what] for each in rounds]) for name in names}
-            for name in names[1:]:
-                here = f'{np.median(values[name]):.0f} here' if what == _RATE else ''
-                yield ratio(title, f'{name}: {what}', _NULL, values[name], values[_NULL], here)
+            for k, (name, figures) in itertools.product(range(_ROUNDS), found.items()):
+                arm.messages = iter(states)
+                path = Path(folder, f'{k}-{name}'.replace(' ', '_'))
+                with _started(name, loop.controller, path) as contestants:
+                    arm.greet(contestants)
+                    figures.append(arm.play(contestants[-1]))
+                    for contestant in contestants:
+                        contestant.check()
+                arm.left_alone()
+        for column, what in enumerate(('median latency', 'CPU')):
+            values = {name: np.array(figures)[:, column] for name, figures in found.items()}
+            for name in (_QUIET, _RECORDED):
+                title = f'{group}, real time at 1 kHz'
+                yield ratio(title, f'{name}: {what}', _NULL, values[name], values[_NULL])
 
 
 @contextmanager
 def _started(name: str, config: ControllerConfig, path: Path) -> Iterator[list[Contestant]]:
-    """Start a contestant's processes: its subscriber or recorder, if it has one, then its node."""
-    commands = [[_NULL_NODE, CONTROLLER]]
+    """Start a contestant's processes: its recorder, if it has one, then its node."""
+    is_recorded = name == _RECORDED
+    commands = [_NULL_NODE]
     if name != _NULL:
         params = path.with_suffix('.yaml')
-        telemetry = Telemetry(enabled=name != _QUIET)
-        observers = int(name == _RECORDED)  # of all outputs
-        law = replace(config, telemetry=telemetry, wait_for_subscribers=observers)
+        law = replace(
+            config, telemetry=Telemetry(enabled=is_recorded), wait_for_subscribers=int(is_recorded)
+        )
         dump(params, {CONTROLLER: law})
         commands = [[*_CONTROLLER_NODE, '--ros-args', '--params-file', str(params)]]
-    if name == _RECORDED:
+    if is_recorded:
         commands.insert(0, [*_RECORDER_NODE, f'output:={path}'])
-    elif name == _HEARD:
-        heard = topics.JOINT_STATES, topics.REFERENCE, topics.TRACKING_ERROR, topics.LEARNING
-        commands.insert(0, [_NULL_NODE, 'listener', *(topic.relative for topic in heard)])
     contestants: list[Contestant] = []
     try:
         contestants.extend(Contestant(name, command) for command in commands)
@@ -210,7 +271,7 @@ def _started(name: str, config: ControllerConfig, path: Path) -> Iterator[list[C
 
 
 def _recorded_states(loop: LoopConfig) -> list[bytes]:
-    plant = replace(loop.plant, duration=2.0 * (_STEPS + _WARM_UP + 1) * _PERIOD)
+    plant = replace(loop.plant, duration=(_STEPS + _WARM_UP + 1) * _PERIOD)
     record = simulate(loop.controller, plant)
     telemetry = PlantTelemetry(plant.joints, record.parameters)
     rows = zip(record.stamps.tolist(), record.measurements, strict=True)
@@ -236,7 +297,7 @@ def _first_torque(name: str, cache: str) -> float:
     encoder = PlantTelemetry(('joint1', 'joint2'), ())
     state = np.array((2.293, 1.696, 0.0, 0.0, 0.0, 0.0))
     stamps = itertools.count(_START, 1_000_000)
-    command = [_NULL_NODE, CONTROLLER] if name == _NULL else _CONTROLLER_NODE
+    command = _NULL_NODE if name == _NULL else _CONTROLLER_NODE
     with closing(StandIn(())) as arm:
 
         def publish() -> None:

@@ -1,50 +1,36 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Offline loop and study against C, numpy, MuJoCo, pinocchio; growth; replay against a reader.
+"""Offline loop against C, numpy, MuJoCo and pinocchio; growth with joints, unknowns and window.
 
 The C reference is compiled on demand and called through ctypes. The peers run the recommended
 configuration: all hold the torque over the sample and apply the disturbance, only the integration
 of the arm differs.
-
-In a study both sides run the same drawn plants, with friction, noise and delay, and keep the
-largest and the rms error of each run. The package also draws the plants and keeps the other figures
-of a study; the reference gets its settings already laid out. Neither writes anything.
 """
 
 from __future__ import annotations
 
 import ctypes
-import importlib.util
 import itertools
 import subprocess
 import sys
 import tempfile
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import Executor
+from collections.abc import Callable, Iterator
 from dataclasses import replace
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from harness import Ratio, interleaved, ratio
-from mcap.reader import make_reader
 from scipy.integrate import RK45
 
-from blf_dsc_controller.bags.content import read_content
 from blf_dsc_controller.configuration.controller import ControllerConfig
-from blf_dsc_controller.configuration.nodes import load_loop, locate
+from blf_dsc_controller.configuration.nodes import load_loop
 from blf_dsc_controller.configuration.plant import PlantConfig
 from blf_dsc_controller.configuration.schema import change
 from blf_dsc_controller.law.factory import controller_of, settings_of_config
 from blf_dsc_controller.reference.approach import reference_of
 from blf_dsc_controller.reference.terms import sampled
-from blf_dsc_controller.replay.verify import verify
-from blf_dsc_controller.simulation.bag import write_bag
 from blf_dsc_controller.simulation.loop import simulate
-from blf_dsc_controller.studies import runs
-from blf_dsc_controller.studies.monte_carlo import Study, draw, load_study, plant_with
-from blf_dsc_controller.studies.runs import run_chunk, warm_up
-from sim_plant.sensors import generator
 
 sys.path.append(str(Path(__file__).parents[1] / 'test'))
 from plain_law import PlainLaw, dynamics
@@ -61,13 +47,6 @@ _GROWTH_ROUNDS = 9
 _UPDATES = 2000
 _NOISE = (1e-4, 0.05)  # rad, rad/s, added to the reference to excite every column
 _ANY_EXCITATION = 1e-12  # a threshold that every window passes, short ones and of many columns
-_DURATION = 10.0  # s
-_RUNS = 50  # per round against C
-_CHUNKS = 50  # per round on processes
-_CHUNK = 4  # runs; few, so that the first to finish waits for at most one chunk
-_CHUNKED = 'run_chunk'
-_READER = 'mcap reader, messages as bytes'
-_ERRORS = ('max_error_ratio', 'rms_error_rad')
 SOURCE = Path(__file__).with_name('reference.c')
 # The package's kernels are compiled for the native processor too; contraction would change the
 # numbers that are compared.
@@ -80,73 +59,36 @@ PLANT = PlantConfig()
 T = PLANT.sample_time
 
 
-class Reference:
-    """The compiled reference.
-
-    Raises:
-        FileNotFoundError: there is no C compiler named cc.
-        subprocess.CalledProcessError: compilation fails.
-    """
-
-    def __init__(self) -> None:
-        with tempfile.TemporaryDirectory() as folder:
-            library = Path(folder, 'reference.so')
-            command = ['cc', *FLAGS, '-shared', '-fPIC', '-o', str(library), str(SOURCE), '-lm']
-            subprocess.run(command, check=True)
-            self._run = ctypes.CDLL(str(library)).run
-        vector, integer = ctypes.c_void_p, ctypes.c_long
-        self._run.argtypes = (vector, integer, integer, vector, vector, vector)
-
-    def rows(self, controller: ControllerConfig, plant: PlantConfig) -> np.ndarray:
-        """Return rows (samples, 9) of a noise-free run, without the sample at `duration`."""
-        settings = _settings(controller, plant)
-        rows = np.zeros((round(plant.duration / plant.sample_time), _COLUMNS))
-        self._call(settings, len(rows), 0, None, rows, None)
-        return rows
-
-    def study(
-        self, controller: ControllerConfig, plants: Sequence[PlantConfig], settled_after: float
-    ) -> Callable[[], np.ndarray]:
-        """Return a function that runs many plants for `duration` and returns figures (plants, 4).
-
-        These are the largest abs(xi1)/k_c and the rms of xi1 [rad] from `settled_after` [s] on, of
-        both joints. The settings are laid out here; a call draws the noise with numpy and runs.
-        """
-        laid_out = [(_settings(controller, plant), plant) for plant in plants]
-
-        def run_all() -> np.ndarray:
-            figures = np.zeros((len(laid_out), 2 * _N))
-            for (settings, plant), row in zip(laid_out, figures, strict=True):
-                samples = round(plant.duration / plant.sample_time) + 1
-                noise = None
-                if plant.sensor.position_noise > 0.0 or plant.sensor.velocity_noise > 0.0:
-                    noise = generator(plant.seed).standard_normal((samples, 2 * _N))
-                settled = round(settled_after / plant.sample_time)
-                self._call(settings, samples, settled, noise, None, row)
-            return figures
-
-        return run_all
-
-    def _call(
-        self, settings: np.ndarray, samples: int, settled: int, *vectors: np.ndarray | None
-    ) -> None:
-        addresses = (None if vector is None else vector.ctypes.data for vector in vectors)
-        if self._run(settings.ctypes.data, samples, settled, *addresses) != 0:
-            raise MemoryError
+@cache
+def _reference() -> Callable[..., int]:
+    """Compile the reference; needs a C compiler named cc."""
+    with tempfile.TemporaryDirectory() as folder:
+        library = Path(folder, 'reference.so')
+        command = ['cc', *FLAGS, '-shared', '-fPIC', '-o', str(library), str(SOURCE), '-lm']
+        subprocess.run(command, check=True)
+        run = ctypes.CDLL(str(library)).run
+    run.argtypes = (ctypes.c_void_p, ctypes.c_long, ctypes.c_void_p)
+    return run
 
 
-def _settings(controller: ControllerConfig, plant: PlantConfig) -> np.ndarray:
+def reference_rows(duration: float) -> np.ndarray:
+    """Return rows (samples, 9) of a run in C, without the sample at `duration`."""
+    settings, rows = _settings(), np.zeros((round(duration / T), _COLUMNS))
+    if _reference()(settings.ctypes.data, len(rows), rows.ctypes.data) != 0:
+        raise MemoryError
+    return rows
+
+
+def _settings() -> np.ndarray:
     """Lay out `struct settings` of the C file: the same fields in order, integers as long."""
-    law = settings_of_config(controller)
-    arm, torque, reference = plant.arm, plant.disturbance, controller.reference
+    law = settings_of_config(CONTROLLER)
+    arm, torque, reference = PLANT.arm, PLANT.disturbance, CONTROLLER.reference
     values: dict[str, Any] = {
         **{name: getattr(arm, name) for name in ('l1', 'l2', 'm1', 'm2', 'gravity')},
         **{name: getattr(torque, name) for name in ('constant', 'amplitude', 'frequency', 'phase')},
         **{name: getattr(torque, name) for name in ('viscous', 'coulomb', 'coulomb_velocity')},
-        'q0': plant.initial.position,
-        'dq0': plant.initial.velocity,
-        'position_noise': plant.sensor.position_noise,
-        'velocity_noise': plant.sensor.velocity_noise,
+        'q0': PLANT.initial.position,
+        'dq0': PLANT.initial.velocity,
         'offset': reference.offset,
         'swing': reference.amplitude,
         'tone': reference.frequency[0],
@@ -156,11 +98,9 @@ def _settings(controller: ControllerConfig, plant: PlantConfig) -> np.ndarray:
         'P0': law.initial_estimate[:_P],
         **{name: getattr(law, name) for name in ('Gamma', 'kappa', 'rho', 'sigma')},
         **{name: getattr(law, name) for name in ('learning_start', 'pole', 'radius')},
-        'T': plant.sample_time,
+        'T': T,
         'window': law.window,
         'interval': law.interval,
-        'differenced': int(plant.sensor.velocity == 'differenced'),
-        'delay': plant.actuator.delay,
     }
     kinds = [
         (name, np.int64 if isinstance(value, int) else np.float64, np.shape(value))
@@ -247,35 +187,32 @@ def _numpy_acceleration(q: np.ndarray, dq: np.ndarray, torque: np.ndarray) -> np
 
 
 _PEERS = {
-    'numpy': ('numpy', numpy_loop, 'law, arm and DP5 in numpy'),
-    'MuJoCo': ('mujoco', mujoco_loop, 'its RK4, law in numpy'),
-    'pinocchio': ('pinocchio', pinocchio_loop, 'aba, DP5 and law in numpy'),
+    'numpy': (numpy_loop, 'law, arm and DP5 in numpy'),
+    'MuJoCo': (mujoco_loop, 'its RK4, law in numpy'),
+    'pinocchio': (pinocchio_loop, 'aba, DP5 and law in numpy'),
 }
 
 
 def measure() -> Iterator[Ratio]:
-    """Measure the time per simulated millisecond against C and, where installed, the peers."""
-    reference, plant = Reference(), replace(PLANT, duration=_LONG)
-    contestants = {PACKAGE: _package(_LONG), C: lambda: len(reference.rows(CONTROLLER, plant))}
+    """Measure the time per simulated millisecond against C and the peers."""
+    group = 'closed loop offline'
+    contestants = {PACKAGE: _package(_LONG), C: lambda: len(reference_rows(_LONG))}
     times = interleaved(contestants, 4 * _ROUNDS)  # short rounds
     note = f'largest difference {disagreement():.0e}'
-    yield ratio('closed loop offline', PACKAGE, C, times[PACKAGE], times[C], note)
+    yield ratio(group, PACKAGE, C, times[PACKAGE], times[C], note)
 
     contestants = {PACKAGE: _package(_SHORT)}
-    for name, (module, loop, _) in _PEERS.items():
-        if importlib.util.find_spec(module) is not None:
-            contestants[name] = partial(lambda loop: len(loop(_SHORT)), loop)
+    for name, (loop, _) in _PEERS.items():
+        contestants[name] = partial(lambda loop: len(loop(_SHORT)), loop)
     times = interleaved(contestants, _ROUNDS)
-    for name in [*contestants][1:]:
-        note = _PEERS[name][2]
-        yield ratio('closed loop offline', name, PACKAGE, times[name], times[PACKAGE], note)
+    for name, (_, note) in _PEERS.items():
+        yield ratio(group, name, PACKAGE, times[name], times[PACKAGE], note)
 
 
 def disagreement() -> float:
     """Return the largest difference to C over 10 s in errors [rad], torques and estimates."""
-    plant = replace(PLANT, duration=_AGREEMENT)
-    rows = Reference().rows(CONTROLLER, plant)
-    record = simulate(CONTROLLER, plant, supervised=False)
+    rows = reference_rows(_AGREEMENT)
+    record = simulate(CONTROLLER, replace(PLANT, duration=_AGREEMENT), supervised=False)
     samples = [record.sample(k) for k in range(len(rows))]
     mine = np.array([np.concatenate((s.xi1, s.torque, s.estimate)) for s in samples])
     return float(np.abs(mine - rows).max())
@@ -284,93 +221,6 @@ def disagreement() -> float:
 def _package(duration: float) -> Callable[[], int]:
     plant = replace(PLANT, duration=duration)
     return lambda: simulate(CONTROLLER, plant, supervised=False).stamps.size
-
-
-def measure_study() -> Iterator[Ratio]:
-    """Measure runs per second relative to C, and to one process."""
-    study = preset()
-    warm_up(study)
-    reference = _reference_of(study)
-    with runs.processes(1) as single, runs.processes(2) as double:
-        pairs: dict[str, dict[str, Callable[[], int]]] = {
-            f'{_CHUNKED}: runs a second, of a core': {
-                _CHUNKED: lambda: run_chunk(study, 0, _RUNS)['run'].size,
-                'C -O3, in a loop': lambda: len(reference()),
-            },
-            'two processes: runs a second': {
-                'two': partial(_computed, study, double),
-                'one process': partial(_computed, study, single),
-            },
-        }
-        for what, contestants in pairs.items():
-            mine, theirs = (1.0 / times for times in interleaved(contestants, _ROUNDS).values())
-            note = f'{np.median(mine):.0f} runs of {_DURATION:g} s a second here'
-            if _CHUNKED in what:
-                note += f'; errors differ by at most {study_disagreement(study):.0e} of themselves'
-            yield ratio('monte carlo', what, [*contestants][1], mine, theirs, note)
-
-
-def preset() -> Study:
-    """Return the preset with this benchmark's duration, settled in its last fifth."""
-    study = load_study(locate('monte_carlo'))
-    plant = replace(study.plant, duration=_DURATION)
-    settings = replace(study.settings, settled_after=0.8 * _DURATION, moments=())
-    learning = replace(study.controller.learning, change_detection=False)  # the reference has none
-    controller = replace(study.controller, learning=learning)
-    return replace(study, controller=controller, plant=plant, settings=settings)
-
-
-def study_disagreement(study: Study) -> float:
-    """Return the largest relative difference in largest and rms errors between package and C."""
-    theirs = _reference_of(study)()
-    columns = run_chunk(study, 0, _RUNS)
-    names = [f'{of}.{joint}' for of in _ERRORS for joint in study.plant.joints]
-    mine = np.transpose([columns[name] for name in names])
-    return float(np.abs(mine / theirs - 1.0).max())
-
-
-def _reference_of(study: Study) -> Callable[[], np.ndarray]:
-    plants = [plant_with(study, draw(study, run)) for run in range(_RUNS)]
-    return Reference().study(study.controller, plants, study.settings.settled_after)
-
-
-def _computed(study: Study, executor: Executor) -> int:
-    chunks = [range(k * _CHUNK, (k + 1) * _CHUNK) for k in range(_CHUNKS)]
-    runs.compute(study, chunks, executor, 6, lambda *_: None)
-    return _CHUNK * _CHUNKS
-
-
-def measure_replay() -> Iterator[Ratio]:
-    """Measure messages per second relative to the mcap reader alone, on a bag of all topics."""
-    plant = replace(PLANT, duration=_LONG)
-    with tempfile.TemporaryDirectory() as folder:
-        bag = Path(folder, 'bag')
-        write_bag(bag, simulate(CONTROLLER, plant), CONTROLLER, 'none', plant)
-        messages = _iterated(bag)
-
-        def replayed() -> int:
-            found = verify(bag)
-            if found.difference is not None:
-                raise ValueError(f'{bag}: {found.difference}')
-            return messages
-
-        contestants = {
-            _READER: lambda: _iterated(bag),
-            'messages read and decoded': lambda: sum(read_content(bag).message_counts.values()),
-            'bag replayed through the law and compared': replayed,
-        }
-        rates = {name: 1.0 / times for name, times in interleaved(contestants, _ROUNDS).items()}
-    for name in [*contestants][1:]:
-        note = f'{1e-3 * np.median(rates[name]):.0f} thousand messages a second here'
-        what = f'{name}: messages a second'
-        yield ratio('replay', what, _READER, rates[name], rates[_READER], note)
-
-
-def _iterated(bag: Path) -> int:
-    """Iterate over the messages of a bag of one file and return their number."""
-    (file,) = bag.glob('*.mcap')
-    with file.open('rb') as stream:
-        return sum(1 for _ in make_reader(stream).iter_messages(log_time_order=False))
 
 
 def learning(name: str, **changes: Any) -> ControllerConfig:

@@ -8,26 +8,24 @@
 #include <stdlib.h>
 #include <string.h>
 
-enum { N = 2, P = 3, M = 5, W = M + 1, STAGES = 6, MOST_DELAY = 16 };
+enum { N = 2, P = 3, M = 5, W = M + 1, STAGES = 6 };
 
 typedef struct {
     double l1, l2, m1, m2, g;                            /* arm */
     double constant[N], amplitude[N], frequency[N], phase[N]; /* tau_dist */
     double viscous[N], coulomb[N], coulomb_velocity;
     double q0[N], dq0[N];
-    double position_noise, velocity_noise;
     double offset[N], swing[N], tone;                    /* reference */
     double bound[N], weight[N], slope_limit[N], knee[N]; /* barrier */
     double K[N], mu[N], lambda;                          /* surface */
     double Kp[N], gamma[N], limit[N];
     double P0[P], Gamma[M], kappa, rho, sigma, start, pole, radius;
     double T;
-    long window, interval, differenced, delay;
+    long window, interval;
 } settings;
 
 typedef struct {
-    double y[2 * N], applied[N], sent[MOST_DELAY][N];    /* plant */
-    double q[N], dq[N];                                  /* measured */
+    double y[2 * N];                                     /* plant: q, dq */
     double alpha2[N], torque[N], d3[N], theta[M];
     double Yp[N][P], Yr[N][M];
     double filter1[N][W], filter2[N][W];
@@ -208,6 +206,7 @@ static void control(const settings *s, loop *x, double t, double xi1[N])
 {
     double qr[N], dqr[N], ddqr[N], a[N], v[N], xi2[N], beta2[N];
     double H[N][P], Hr[N][P], Yp[N][P], Yr[N][M];
+    const double q[N] = {x->y[0], x->y[1]}, dq[N] = {x->y[2], x->y[3]};
     double share = 1.0 - exp(-s->T / s->lambda);
     int saturated = 0;
     for (int i = 0; i < N; i++) {
@@ -216,18 +215,18 @@ static void control(const settings *s, loop *x, double t, double xi1[N])
         qr[i] = s->offset[i] + s->swing[i] * cos(angle);
         dqr[i] = -rate * sin(angle);
         ddqr[i] = -s->tone * rate * cos(angle);
-        xi1[i] = x->q[i] - qr[i];
+        xi1[i] = q[i] - qr[i];
         ratio = xi1[i] / s->bound[i];
         beta2[i] = dqr[i] - s->mu[i] * xi1[i];
         if (fabs(ratio) < 1.0) beta2[i] -= 0.5 * s->K[i] * xi1[i] * sinc(M_PI * ratio * ratio);
         if (x->samples == 0) x->alpha2[i] = beta2[i];
         v[i] = x->alpha2[i];
         a[i] = share * (beta2[i] - v[i]) / s->T;
-        xi2[i] = x->dq[i] - v[i];
+        xi2[i] = dq[i] - v[i];
     }
-    regressor(s, x->q, x->dq, v, a, H);
+    regressor(s, q, dq, v, a, H);
     regressor(s, qr, dqr, dqr, ddqr, Hr);
-    regressors(s, x->q, x->dq, Yp, Yr);
+    regressors(s, q, dq, Yp, Yr);
     if (x->samples > 0) {
         filter_and_push(s, x, Yp, Yr);
         if (x->samples % s->interval == 0) look(s, x, t);
@@ -293,7 +292,7 @@ static void integrate(const settings *s, loop *x, double t)
             for (int j = 0; j < stage; j++) slope += A[stage][j] * k[j][i];
             z[i] = y[i] + s->T * slope;
         }
-        motion(s, t + C[stage] * s->T, z, x->applied, k[stage]);
+        motion(s, t + C[stage] * s->T, z, x->torque, k[stage]);
     }
     for (int i = 0; i < 2 * N; i++) {
         double slope = 0.0;
@@ -302,38 +301,11 @@ static void integrate(const settings *s, loop *x, double t)
     }
 }
 
-static void sense(const settings *s, loop *x, long k, const double *noise)
+/* Run `samples` samples. Each leaves [xi1, torque, theta] in its row of `out` (samples x 9). Returns
+ * 0, or 1 where there is no memory. */
+int run(const settings *s, long samples, double *out)
 {
-    for (int i = 0; i < N; i++) {
-        double q = x->y[i], dq = x->y[N + i];
-        if (noise) q += s->position_noise * noise[2 * N * k + i];
-        if (!s->differenced && noise) dq += s->velocity_noise * noise[2 * N * k + N + i];
-        x->dq[i] = s->differenced && k > 0 ? (q - x->q[i]) / s->T : dq;
-        x->q[i] = q;
-    }
-}
-
-static void actuate(const settings *s, loop *x, long k)
-{
-    for (int i = 0; i < N; i++) {
-        double torque = x->torque[i];
-        if (s->delay > 0) {
-            double *slot = &x->sent[k % s->delay][i];
-            torque = *slot;
-            *slot = x->torque[i];
-        }
-        x->applied[i] = torque;
-    }
-}
-
-/* Run `samples` samples. Each leaves [xi1, torque, theta] in its row of `out` (samples x 9), and
- * the largest |xi1| / bound of all, then the rms of xi1 from sample `settled` on, are left in
- * `figures` (4), where these are given. `noise`, if any, is standard normal (samples x 4). Returns 0,
- * or 1 where there is no memory. */
-int run(const settings *s, long samples, long settled, const double *noise, double *out,
-        double *figures)
-{
-    double largest[N] = {0.0}, squares[N] = {0.0}, xi1[N];
+    double xi1[N];
     loop *x = calloc(1, sizeof *x);
     if (x) x->ring = calloc((size_t)s->window, sizeof *x->ring);
     if (!x || !x->ring) {
@@ -346,24 +318,12 @@ int run(const settings *s, long samples, long settled, const double *noise, doub
     for (int i = 0; i < M; i++) x->weakest[i] = 1.0 / sqrt(M);
     for (long k = 0; k < samples; k++) {
         double t = (double)k * (s->T * 1e9) * 1e-9;
-        sense(s, x, k, noise);
+        double *row = out + k * (2 * N + M);
         control(s, x, t, xi1);
-        for (int i = 0; i < N; i++) {
-            largest[i] = fmax(largest[i], fabs(xi1[i]) / s->bound[i]);
-            if (k >= settled) squares[i] += xi1[i] * xi1[i];
-        }
-        if (out) {
-            double *row = out + k * (2 * N + M);
-            memcpy(row, xi1, sizeof xi1);
-            memcpy(row + N, x->torque, sizeof x->torque);
-            memcpy(row + 2 * N, x->theta, sizeof x->theta);
-        }
-        actuate(s, x, k);
+        memcpy(row, xi1, sizeof xi1);
+        memcpy(row + N, x->torque, sizeof x->torque);
+        memcpy(row + 2 * N, x->theta, sizeof x->theta);
         integrate(s, x, t);
-    }
-    for (int i = 0; figures && i < N; i++) {
-        figures[i] = largest[i];
-        figures[N + i] = sqrt(squares[i] / (samples - settled));
     }
     free(x->ring);
     free(x);

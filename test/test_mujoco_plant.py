@@ -152,24 +152,35 @@ def test_closed_loop_runs_the_same_with_both_plants(example):
     loop = load_loop('panda')
     given = {'disturbance.coulomb': [0.0] * 7, 'actuator.ripple': 0.0, 'load.payload': 0.3}
     config = change(loop.plant, given)
-    theirs, ours = (
+    (theirs, _), (ours, _) = (
         close_loop(loop.controller, make(config), 2000) for make in (example.MujocoArm, plant_of)
     )
     np.testing.assert_allclose(theirs, ours, rtol=0.0, atol=1e-8)
     assert np.ptp(ours, axis=0).min() > 1e-3  # rad
 
 
+@pytest.mark.parametrize(('name', 'settled', 'peak'), [('panda', 0.48, 2.4), ('ur5e', 1.4, 1.7)])
+def test_errors_with_dry_friction_are_as_documented(example, name, settled, peak):
+    """In mrad, from 8 s on and when 2 kg are picked up at 20 s: doc/arms.md."""
+    loop = load_loop(name)
+    _, errors = close_loop(loop.controller, example.MujocoArm(loop.plant), 22_000)
+    largest = 1e3 * np.abs(errors).max(axis=1)
+    assert largest[8000:20_000].max() == pytest.approx(settled, rel=0.05)
+    assert largest[20_000:].max() == pytest.approx(peak, rel=0.05)
+
+
 def close_loop(config, arm, samples):
-    """Measured angles (samples, n) of either arm under the controller."""
+    """Measured angles and errors (samples, n) of either arm under the controller."""
     guard = Guard(config, lambda: 0, lambda: 0)
     guard.activate()
-    rows = []
+    rows, n = np.zeros((samples, 2, len(config.joints))), len(config.joints)
     for k in range(samples):
         measurement = arm.measure()
-        rows.append(measurement[: len(config.joints)].copy())
+        rows[k, 0] = measurement[:n]
         arm.step(guard.update(START + k * 1_000_000, measurement))
+        rows[k, 1] = guard.controller.sample.xi1
     assert guard.supervisor.phase is Phase.TRACKING
-    return np.array(rows)
+    return rows.swapaxes(0, 1)
 
 
 def test_controller_keeps_the_bound_and_learns_the_parameters(ros, example):
