@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""External interfaces of the nodes: namespaces, QoS, robot description, frames, policy."""
+"""External interfaces of the nodes: namespaces, QoS, robot description, policy."""
 
 from __future__ import annotations
 
@@ -9,19 +9,15 @@ import sys
 from pathlib import Path
 
 import numpy as np
-import pinocchio
 import pytest
 
 pytest.importorskip('rclpy', reason='needs ROS 2')
 
 import sros2_graph
 import yaml
-from geometry_msgs.msg import TransformStamped
-from random_arm import random_urdf
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from std_msgs.msg import String
 
-from blf_dsc_controller.arms.urdf import links_of
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.plant import PlantConfig
 from blf_dsc_controller.configuration.schema import build
@@ -31,7 +27,6 @@ from blf_dsc_controller.nodes.controller_node import ControllerNode
 from blf_dsc_controller.nodes.endpoints import message_class
 from blf_dsc_controller.nodes.plant_node import PlantNode
 from blf_dsc_controller.simulation.loop import simulate
-from sim_plant.plant import urdf_of
 
 CONFIG = Path(__file__).parents[1] / 'config'
 
@@ -87,34 +82,6 @@ def test_late_subscribers_receive_the_robot_description(ros):
     ros.until(lambda: received)
     assert received[0].data.startswith('<robot name="sim_plant">')
     assert 'length="0.6"' in received[0].data
-
-
-@pytest.mark.parametrize('name', ['panda', 'ur5e', 'random', ''])
-def test_frames_place_every_link_as_pinocchio_does(ros, name):
-    received, tip = [], {'panda': 'panda_hand_tcp', 'ur5e': 'tool0', 'random': 'tip'}.get(name, '')
-    ros.tester.create_subscription(TransformStamped, 'sim_plant/frames', received.append, 100)
-    urdf = random_urdf(6, seed=3)[0] if name == 'random' else f'{name}.urdf'
-    arm = ros.add(PlantNode, {'robot.urdf': urdf, 'robot.tip': tip} if name else {})
-    ros.listen(topics.JOINT_STATES)
-    text = urdf_of(arm.config)
-    model = pinocchio.buildModelFromXML(text)
-    ros.until(lambda: len(received) >= len(links_of(text)))
-    assert len({frame.child_frame_id for frame in received}) == len(links_of(text))
-    q, measured = pinocchio.neutral(model), arm.plant.measure()
-    for joint, position in zip(arm.config.joints, measured, strict=False):
-        own = model.joints[model.getJointId(joint)]
-        both = (np.cos(position), np.sin(position))  # of a continuous joint
-        q[own.idx_q : own.idx_q + own.nq] = both if own.nq == 2 else position
-    data = model.createData()
-    pinocchio.framesForwardKinematics(model, data, q)
-    for each in received:
-        parent, child = (
-            data.oMf[model.getFrameId(frame, pinocchio.BODY)]
-            for frame in (each.header.frame_id, each.child_frame_id)
-        )
-        at, by = each.transform.translation, each.transform.rotation
-        pose = pinocchio.XYZQUATToSE3(np.array([at.x, at.y, at.z, by.x, by.y, by.z, by.w]))
-        np.testing.assert_allclose((parent * pose).homogeneous, child.homogeneous, atol=1e-9)
 
 
 def test_sros2_policy_grants_each_node_exactly_what_it_uses(tmp_path):

@@ -20,7 +20,6 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from math import cos, inf, sin
 from sys import float_info
-from typing import NamedTuple
 
 import numpy as np
 
@@ -146,30 +145,6 @@ def chain_joints(
 def moving_joints(text: str) -> tuple[str, ...]:
     """Return the names of all moving joints of a URDF."""
     return tuple(name for name, joint in _parse(text)[1].items() if joint.get('type') in MOVING)
-
-
-class Link(NamedTuple):
-    """A link, and the joint that holds it, at `xyz` [m] and `rpy` [rad] in the parent."""
-
-    name: str
-    parent: str
-    joint: str
-    kind: str
-    xyz: np.ndarray
-    rpy: np.ndarray
-    axis: np.ndarray  # unit vector
-
-
-def links_of(text: str) -> tuple[Link, ...]:
-    """Return all links of a URDF but its root."""
-    found = []
-    for name, element in _parse(text)[1].items():
-        origin, child = element.find('origin'), _link(element, 'child')
-        axis = _numbers(element.find('axis'), 'xyz', '1 0 0')
-        place = _numbers(origin, 'xyz', '0 0 0'), _numbers(origin, 'rpy', '0 0 0')
-        kind, parent = element.get('type', ''), _link(element, 'parent')
-        found.append(Link(child, parent, name, kind, *place, axis / np.linalg.norm(axis)))
-    return tuple(found)
 
 
 def attached(

@@ -120,7 +120,7 @@ def _configuration(options: Namespace) -> LoopConfig:
     order = [plant.joints.index(joint) for joint in controller.joints]
     q, dq = (np.array(values)[order] for values in (plant.initial.position, plant.initial.velocity))
     plan_start(controller, np.array(controller.barrier.widest), q, dq)
-    for warning in config_warnings(controller, q):
+    for warning in config_warnings(controller):
         print(f'warning: {warning}', file=sys.stderr)
     if controller.model == 'urdf':
         print(f'errors to expect: {expectation(controller)}')

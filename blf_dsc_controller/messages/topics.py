@@ -105,8 +105,6 @@ JOINT_TRAJECTORY = Topic(
     DIAGNOSTIC,
 )
 """Published by other nodes for the controller."""
-FRAMES = Topic(PLANT, '~/frames', 'geometry_msgs/msg/TransformStamped', STREAM, STREAM)
-"""Of all links, for viewers without robot_state_publisher, such as Foxglove; not in TOPICS."""
 JOURNAL = Topic(CONTROLLER, '~/journal', 'std_msgs/msg/String', HISTORY, HISTORY)
 """Every event of the controller, also for late recorders: see messages.journal."""
 

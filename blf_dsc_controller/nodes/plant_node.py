@@ -17,19 +17,15 @@ end of its duration.
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from functools import partial
 from typing import Any
 
-import numpy as np
-from builtin_interfaces.msg import Time
-from geometry_msgs.msg import TransformStamped
 from rclpy.lifecycle import LifecycleNode
 from rclpy.timer import Timer
-from std_msgs.msg import Header, String
+from std_msgs.msg import String
 from std_srvs.srv import Trigger
 
-from blf_dsc_controller.arms.urdf import links_of
 from blf_dsc_controller.configuration.plant import PlantConfig
 from blf_dsc_controller.configuration.schema import Value, differences, flatten
 from blf_dsc_controller.law.telemetry import DECIMATION, PlantTelemetry
@@ -57,7 +53,6 @@ LOCKSTEP_START = 1_000_000_000
 _STALE = {'zero': ': not applied', 'brake': ': the brakes hold', 'hold': ', and still applied'}
 _REPEAT_PERIOD = 3.0  # s, until a state without a torque is sent again
 _IN_FLIGHT = 1000  # samples in lock-step on their way to a subscriber: a fifth of its queue
-_FRAMES_PERIOD = 0.04  # s, for viewers
 _EARLY = 0.05  # fraction of a sample by which a timer may fire early
 _BETWEEN_RUNS = 1_000_000_000  # ns from the last stamp before a reset to the first after it
 
@@ -85,11 +80,8 @@ class PlantNode(LoopNode[PlantConfig]):
         self._start_stamp = LOCKSTEP_START
         self._changed: dict[str, Value] = {}
         self._changes = create_publisher(self, topics.CHANGES)
-        self._frame_publisher = create_publisher(self, topics.FRAMES)
         self._tell_parameters()
         self._handshake = Handshake(self, self._now)
-        self._frames: Frames
-        self._frames_interval = max(1, round(_FRAMES_PERIOD / self.config.sample_time))
         self.plant: Plant
         self.deactivate()
         self.start()
@@ -111,9 +103,8 @@ class PlantNode(LoopNode[PlantConfig]):
         outputs += [] if self._lockstep else [topics.TIMING]
         outputs += [topics.CLOCK] if self.config.publish_clock else []
         if self.connect(outputs, topics.COMMANDS, self._on_command):
-            description = String(data=urdf_of(self.config))
-            create_publisher(self, topics.ROBOT_DESCRIPTION).publish(description)
-            self._frames = Frames(description.data, self.config.joints)
+            description = create_publisher(self, topics.ROBOT_DESCRIPTION)
+            description.publish(String(data=urdf_of(self.config)))
 
     def activate(self) -> None:
         """Send the present state once a controller subscribes, and continue with its torque."""
@@ -283,9 +274,6 @@ class PlantNode(LoopNode[PlantConfig]):
         self._publish(self._telemetry.joint_states(stamp, measurement))
         if self.plant.sample % DECIMATION == 0:
             self._publish(self._telemetry.truth(stamp, self.plant.truth()))
-        if self.plant.sample % self._frames_interval == 0:
-            for frame in self._frames.at(stamp, measurement[: self.plant.joints]):
-                self._frame_publisher.publish(frame)
         if self.config.publish_clock:
             self._publish(self._telemetry.clock(stamp))
 
@@ -396,63 +384,6 @@ class Handshake:
             return False
         self._log.warning('the controller did not respond to the reset request: starting anyway')
         return True
-
-
-class Frames:
-    """Frames of the links of a URDF while its `joints` move; all others stay at 0.
-
-    The messages are reused: the loop waits while they are published.
-    """
-
-    def __init__(self, text: str, joints: Sequence[str]) -> None:
-        links = links_of(text)
-        self._time = Time()
-        self._messages = [
-            TransformStamped(
-                header=Header(stamp=self._time, frame_id=link.parent), child_frame_id=link.name
-            )
-            for link in links
-        ]
-        # The last entry of (q, 0) moves links that no joint moves.
-        self._joint = [joints.index(link.joint) if link.joint in joints else -1 for link in links]
-        angles = np.array([link.rpy for link in links])
-        roll, pitch, yaw = map(_about, np.eye(3), angles.T)
-        self._rotation = _product(yaw, _product(pitch, roll))
-        self._origin = np.array([link.xyz for link in links])
-        self._axis = np.array([link.axis for link in links])
-        self._turns = np.array([link.kind != 'prismatic' for link in links])
-        axis, inverse = np.insert(self._axis, 3, 0.0, axis=1), self._rotation * [-1, -1, -1, 1]
-        in_parent = _product(_product(self._rotation, axis), inverse)[:, :3]
-        self._slide = np.where(self._turns[:, None], 0.0, in_parent)
-
-    def at(self, stamp: int, q: np.ndarray) -> list[TransformStamped]:
-        """Return the frame of each link in its parent at q (n,) [rad, or m] and a stamp [ns]."""
-        self._time.sec, self._time.nanosec = divmod(stamp, 10**9)
-        position = np.append(q, 0.0)[self._joint]
-        rotations = _product(self._rotation, _about(self._axis, self._turns * position))
-        origins = self._origin + position[:, None] * self._slide
-        for message, origin, rotation in zip(
-            self._messages, origins.tolist(), rotations.tolist(), strict=True
-        ):
-            at, turned = message.transform.translation, message.transform.rotation
-            at.x, at.y, at.z = origin
-            turned.x, turned.y, turned.z, turned.w = rotation
-        return self._messages
-
-
-def _about(axis: np.ndarray, angle: np.ndarray) -> np.ndarray:
-    """Return quaternions (k, 4), x, y, z and w, of angles (k,) about an axis or axes (k, 3)."""
-    half = 0.5 * angle[:, None]
-    return np.hstack((np.sin(half) * axis, np.cos(half)))
-
-
-def _product(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Return the products (k, 4) of quaternions (k, 4)."""
-    (ax, ay, az, aw), (bx, by, bz, bw) = a.T, b.T
-    x = aw * bx + bw * ax + ay * bz - az * by
-    y = aw * by + bw * ay + az * bx - ax * bz
-    z = aw * bz + bw * az + ax * by - ay * bx
-    return np.stack((x, y, z, aw * bw - ax * bx - ay * by - az * bz), axis=1)
 
 
 main = partial(process.run, PlantNode)

@@ -19,8 +19,6 @@ from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.robot import implausible_friction
 from blf_dsc_controller.law.factory import settings_of_config
 from blf_dsc_controller.law.settings import FILTERED, LINEAR, NEWTON, Settings
-from blf_dsc_controller.reference.approach import reference_of
-from blf_dsc_controller.reference.terms import sampled
 from blf_dsc_controller.supervision.linear_loop import (
     ExpectedErrors,
     ReferenceLoad,
@@ -32,7 +30,6 @@ Floats = NDArray[np.float64]
 
 _MARGIN = 1.25  # recommended torque limit over what the reference needs
 _PERIODS = 0.02  # periods by which a window may differ from a whole number
-_CLOSE = 0.8  # fraction of the bound
 _FUNNEL = 20.0  # times the bound; up to 5 with the presets
 _SLUGGISH = 1.0  # rad/s^2; the weakest joint of the presets has 60
 _IMPOSSIBLE = 1e-3  # of the pseudo-inertia's largest eigenvalue: more than rounding errors
@@ -48,19 +45,14 @@ class Finding(NamedTuple):
     text: str
 
 
-def config_warnings(
-    config: ControllerConfig, q: Floats | None = None, load: ReferenceLoad | None = None
-) -> list[str]:
+def config_warnings(config: ControllerConfig, load: ReferenceLoad | None = None) -> list[str]:
     """Return the warnings, one sentence each, beginning with the parameter to change first.
 
-    `q` (n,) [rad] are the measured positions at the start and `load` the load of the reference, if
-    known.
+    `load` is that of the reference, if known.
     """
     settings = settings_of_config(config)
     load = load or reference_load(config, settings)
-    found = [] if q is None else [*_of_start(config, q)]
-    if config.model == 'urdf':
-        found += _of_urdf(config, load)
+    found = [*_of_urdf(config, load)] if config.model == 'urdf' else []
     found += [finding.text for finding in _of_gains(config, load)]
     if config.model == 'urdf' and config.law == 'blf_dsc':
         found += _of_errors(config, expected_errors(config, settings))
@@ -77,18 +69,6 @@ def worsened(before: ControllerConfig, after: ControllerConfig, load: ReferenceL
         for finding in _of_gains(after, load)
         if finding.excess > known.get(finding.of, 1.0)
     ]
-
-
-def _of_start(config: ControllerConfig, q: Floats) -> Iterator[str]:
-    if config.reference.type == 'hold':
-        return
-    ((qr, _, _),) = sampled(reference_of(config), np.zeros(1))
-    for joint, error, bound in zip(config.joints, q - qr, config.barrier.widest, strict=True):
-        if _CLOSE * bound <= abs(error) < bound:
-            yield (
-                f'barrier.bound: {joint} starts {error:+.4g} rad from the reference, close to its '
-                f'bound of {bound:g} rad: the initial estimation error may push it outside'
-            )
 
 
 def _of_urdf(config: ControllerConfig, load: ReferenceLoad) -> Iterator[str]:
