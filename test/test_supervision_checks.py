@@ -19,6 +19,7 @@ from blf_dsc_controller.supervision.checks import SampleCheck, StateCheck, Veloc
 from blf_dsc_controller.supervision.supervisor import Reason
 
 DT = 1e-3
+LIMIT = 20.0  # N m, the default torque limit
 
 
 @pytest.fixture
@@ -45,16 +46,35 @@ def test_estimates_of_a_valid_sample_are_kept(law):
     assert law.checks.ratio[1] == abs(law.sample.xi1[1]) / law.sample.bound[1]
 
 
-@pytest.mark.parametrize('bad', [nan, inf, -inf])
+BAD = [
+    (part, name, i, bad, 1.0, SUSPECT)
+    for part, name, i in (
+        ('state', 'estimate', 4),
+        ('state', 'disturbance', 1),
+        ('signals', 'demand', 0),
+    )
+    for bad in (nan, inf, -inf)
+]
+
+
 @pytest.mark.parametrize(
-    ('part', 'name', 'i'),
-    [('state', 'estimate', 4), ('state', 'disturbance', 1), ('signals', 'demand', 0)],
+    ('part', 'name', 'i', 'value', 'error_ratio', 'flags'),
+    [
+        *BAD,
+        ('signals', 'demand', 1, -np.nextafter(LIMIT, 21.0), 1.0, SUSPECT),
+        ('sample', 'xi1', 0, 0.002, 1.0, OUTSIDE | SUSPECT),
+        ('sample', 'xi1', 0, -0.0021, 1.0, OUTSIDE | SUSPECT),
+        ('sample', 'xi1', 0, 0.0021, 2.0, OUTSIDE),
+        ('sample', 'xi1', 0, 0.0021, 0.0, OUTSIDE),
+        ('sample', 'xi1', 0, nan, 2.0, OUTSIDE | SUSPECT),
+        ('sample', 'estimate', 4, nan, 1.0, 0),  # of a rejected column
+    ],
 )
-def test_non_finite_values_are_suspect_and_not_kept(law, part, name, i, bad):
-    getattr(getattr(law, part), name)[i] = bad
+def test_suspect_samples_are_flagged_and_not_kept(law, part, name, i, value, error_ratio, flags):
+    getattr(getattr(law, part), name)[i] = value
     law.checks.kept[:] = 3.0
-    assert verdict(law) & SUSPECT
-    assert (law.checks.kept == 3.0).all()
+    assert verdict(law, error_ratio) == flags
+    assert (law.checks.kept == 3.0).all() == bool(flags & SUSPECT)
 
 
 @pytest.mark.parametrize(('every', 'stops'), [(4, True), (6, False)])
@@ -66,24 +86,6 @@ def test_cuts_add_up_if_they_take_more_than_a_fifth_of_the_time(law, every, stop
         law.flags = verdict(law)
         faults.append(check.check(DT))
     assert any(fault and fault.reason is Reason.SATURATED for fault in faults) == stops
-
-
-def test_demand_past_the_limit_is_suspect(law):
-    law.signals.demand[1] = -np.nextafter(20.0, 21.0)
-    assert verdict(law) == SUSPECT
-
-
-@pytest.mark.parametrize('error', [0.002, -0.0021, nan])
-def test_error_past_the_bound_is_outside_and_suspect_if_it_must_stop(law, error):
-    law.sample.xi1[0] = error
-    assert verdict(law) == OUTSIDE | SUSPECT
-    assert verdict(law, error_ratio=2.0) & SUSPECT == (SUSPECT if np.isnan(error) else 0)
-    assert verdict(law, error_ratio=0.0) == OUTSIDE
-
-
-def test_nan_of_a_rejected_column_is_not_a_fault(law):
-    law.sample.estimate[4] = nan
-    assert verdict(law) == 0
 
 
 STATES = [
@@ -154,9 +156,6 @@ def test_repeated_reading_with_a_new_stamp_is_continued_at_its_velocity():
     np.testing.assert_allclose(estimated(*coarse), [0.0, 0.2, 0.0])
 
 
-LIMIT = 20.0  # N m, the default torque limit
-
-
 @pytest.mark.parametrize('fault', FAULTS, ids=lambda fault: fault.name)
 def test_fault_is_detected_and_named_and_the_loop_recovers(fault):
     outcome = run(fault)
@@ -179,16 +178,7 @@ def test_fault_is_detected_and_named_and_the_loop_recovers(fault):
     assert outcome.recovered
 
 
-def test_invalid_command_is_counted_and_does_no_harm():
-    invalid = [fault for fault in FAULTS if fault.name.startswith('one command')]
-    assert [run(fault).rejected for fault in invalid] == [1] * 2
-
-
-def test_at_least_thirty_distinct_faults_cover_the_reasons():
-    assert len({fault.name for fault in FAULTS}) == len(FAULTS) >= 30
+def test_faults_cover_all_reasons_and_their_page_is_up_to_date():
     assert {fault.reason for fault in FAULTS} == set(Reason) - {Reason.FAILED}
-
-
-def test_faults_page_is_up_to_date():
-    path = Path(__file__).parents[1] / 'doc/faults.md'
-    assert path.read_text() == page(), 'run: python test/fault_table.py doc/faults.md'
+    text = (Path(__file__).parents[1] / 'doc/faults.md').read_text()
+    assert text == page(text), 'run: python test/fault_table.py doc/faults.md'
