@@ -1,86 +1,19 @@
 # SPDX-License-Identifier: Apache-2.0
 """The sampled plant: a reading at each sample k, then a torque held over [k, k + 1].
 
-Settings and state are one flat vector each.  Time is counted in whole nanoseconds,
-t_k = (k T_ns) 1e-9 s, so every caller computes the same floats.  The ROS 2 node and the compiled
-offline loop run the same kernels and agree bit for bit.
+Time is counted in whole nanoseconds, t_k = (k T_ns) 1e-9 s, so every caller computes the same
+floats.  The ROS 2 node and the compiled offline loop run the same kernels and agree bit for bit.
 """
-
-from typing import Annotated, NamedTuple
 
 import numpy as np
 
 from blf_dsc_controller.compiled.jit import inner, kernel
-from blf_dsc_controller.compiled.layout import Array, Cell, Passed, part, size_of, view, view_of
+from blf_dsc_controller.compiled.layout import Array, part, view
 from sim_plant.arm import Arm
-from sim_plant.drives import (
-    Compensation,
-    CompensationState,
-    Drives,
-    DriveState,
-    actuate,
-    compensate,
-    let_pass,
-)
-from sim_plant.motion import (
-    Acting,
-    EventSettings,
-    JointDisturbance,
-    LoadSettings,
-    Motion,
-    SloshSettings,
-    Stages,
-    TipState,
-    WallSettings,
-    disturbing_torque,
-    integrate,
-    locate_tip,
-    update_acting,
-)
-from sim_plant.sensors import EncoderReading, Encoders, draw, is_noisy, sense
-
-
-class PlantSettings(NamedTuple):
-    """Everything that defines a plant except its seed and its initial state.
-
-    The arm is passed to kernels as is, everything else in one vector.
-    """
-
-    arm: Arm
-    n: Passed  # joints of the arm
-    p: int  # parameters of the arm
-    period_ns: int
-    steps: int  # of the integrator in a sample
-    events: int  # number of events
-    encoders: Encoders
-    disturbance: JointDisturbance
-    drives: Drives
-    compensation: Compensation
-    drive_size: int  # of drive_bodies; 0: the drives add nothing
-    drive_memory: int
-    drive_bodies: Annotated[Array, 'drive_size']  # RigidBodies, as the drives know them
-    load: LoadSettings
-    wall: WallSettings
-    slosh: SloshSettings
-    schedule: EventSettings
-
-
-class PlantState(NamedTuple):
-    """Everything that changes from sample to sample except the random generator."""
-
-    sample: Cell  # k
-    x: Annotated[Array, '2 * n + 6']  # q [rad], dq [rad/s], noise-free; load: y [m], v [m/s]
-    sloshes: Cell  # 1: y and v are those of a load
-    reading: EncoderReading
-    drives: DriveState
-    compensation: CompensationState
-    stages: Stages
-    acting: Acting
-    tip: TipState
-
-
-settings_of = view_of(PlantSettings)
-state_of, state_size = view_of(PlantState), size_of(PlantState)
+from sim_plant.drives import actuate, compensate, let_pass
+from sim_plant.layout import PlantSettings, PlantState, settings_of, state_of
+from sim_plant.motion import disturbing_torque, integrate, update_loads
+from sim_plant.sensors import draw, is_noisy, sense
 
 
 @inner
@@ -88,34 +21,6 @@ def plant_views(arm: Arm, settings: Array, state: Array) -> tuple[PlantSettings,
     """Return views of both vectors, not reference-counted."""
     plant = settings_of(view(settings), arm, arm.joint_count())
     return plant, state_of(view(state), plant)
-
-
-@inner
-def attach_load(plant: PlantSettings, now: PlantState) -> None:
-    """Place a sloshing load that begins at the tip, moving with it."""
-    n, sloshes = plant.n, now.acting.sloshing[0] > 0.0
-    if sloshes and now.sloshes[0] == 0.0:
-        locate_tip(plant.arm, part(now.x, 0, (n,)), part(now.x, n, (n,)), now.tip)
-        for i in range(3):
-            now.x[2 * n + i] = now.tip.position[i]
-            now.x[2 * n + 3 + i] = now.tip.velocity[i]
-    now.sloshes[0] = 1.0 if sloshes else 0.0
-
-
-@inner
-def update_motion(plant: PlantSettings, now: PlantState) -> Motion:
-    """Return the equation of motion of this sample."""
-    update_acting(plant.disturbance, plant.load, plant.schedule, now.sample[0], now.acting)
-    attach_load(plant, now)
-    return Motion(plant.arm, plant.disturbance, now.acting, plant.wall, plant.slosh, now.tip)
-
-
-@inner
-def add_compensation(plant: PlantSettings, now: PlantState) -> None:
-    """Compute what the drives add in this sample, by the true state."""
-    n, motion = plant.n, update_motion(plant, now)
-    q, dq = part(now.x, 0, (n,)), part(now.x, n, (n,))
-    compensate(plant.compensation, plant.drive_bodies, motion, q, dq, now.compensation)
 
 
 @inner
@@ -145,40 +50,38 @@ def observe(plant: PlantSettings, now: PlantState, measurement: Array) -> None:
     """
     n = plant.n
     if now.sample[0] == 0.0:
-        add_compensation(plant, now)
+        update_loads(plant, now)
+        compensate(plant, now)
     if is_due(plant, now):
-        update_motion(plant, now)
-        q, dq = part(now.x, 0, (n,)), part(now.x, n, (n,))
-        offset = now.acting.offset
-        period = plant.period_ns * 1e-9
-        sense(plant.encoders, int(now.sample[0]), period, q, dq, offset, now.reading)
+        update_loads(plant, now)
+        sense(plant, now)
     for i in range(n):
         measurement[i] = now.reading.position[i]
         measurement[n + i] = now.reading.velocity[i]
         measurement[2 * n + i] = now.drives.applied[i]
-        if plant.compensation.effort_is_whole == 1:
-            measurement[2 * n + i] += now.compensation.added[i]
-        measurement[2 * n + i] *= plant.compensation.effort_scale
+        if plant.drives.effort_is_whole == 1:
+            measurement[2 * n + i] += now.drives.added[i]
+        measurement[2 * n + i] *= plant.drives.effort_scale
 
 
 @inner
 def step(plant: PlantSettings, now: PlantState, command: Array) -> None:
     """Apply the commanded torque (n,) [N m] of this sample and advance to the next one."""
-    own = now.compensation
-    if let_pass(plant.compensation, command, own):
+    drives = now.drives
+    if let_pass(plant, now, command):
         for i in range(plant.n):
-            now.x[plant.n + i] = now.drives.applied[i] = now.drives.motor[i] = 0.0
+            now.x[plant.n + i] = drives.applied[i] = drives.motor[i] = 0.0
         now.sample[0] += 1.0
         return
-    actuate(plant.drives, int(now.sample[0]), own.command, now.drives)
-    motion = update_motion(plant, now)
-    add_compensation(plant, now)
+    actuate(plant, now, drives.command)
+    update_loads(plant, now)
+    compensate(plant, now)
     for i in range(plant.n):
-        own.whole[i] = now.drives.applied[i] + own.added[i]
+        drives.whole[i] = drives.applied[i] + drives.added[i]
     h = plant.period_ns * 1e-9 / plant.steps
     for k in range(plant.steps):
         t = now.sample[0] * plant.period_ns * 1e-9 + k * h
-        integrate(motion, t, h, own.whole, now.x, now.stages)
+        integrate(plant, now, t, h, drives.whole)
     now.sample[0] += 1.0
 
 
@@ -186,10 +89,10 @@ def step(plant: PlantSettings, now: PlantState, command: Array) -> None:
 def truth(plant: PlantSettings, now: PlantState, out: Array) -> None:
     """Write the noise-free truth [P, tau_dist, q, dq] (p + 3n,) of this sample."""
     n = plant.n
-    t = now.sample[0] * plant.period_ns * 1e-9
-    motion = update_motion(plant, now)
+    update_loads(plant, now)
     plant.arm.fill_parameters(now.acting.payload[0], out)
-    disturbing_torque(motion, t, now.x, part(out, plant.p, (n,)))
+    t = now.sample[0] * plant.period_ns * 1e-9
+    disturbing_torque(plant, now, t, now.x, part(out, plant.p, (n,)))
     for i in range(2 * n):
         out[plant.p + n + i] = now.x[i]
 

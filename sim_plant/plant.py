@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple, TypeVar, get_type_hints
+from typing import Any, TypeVar, get_type_hints
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -18,24 +18,21 @@ from blf_dsc_controller.configuration.nodes import PLANT
 from blf_dsc_controller.configuration.plant import Deviation, PlantConfig
 from blf_dsc_controller.configuration.robot import parameters_of as base_parameters_of
 from sim_plant.arm import Arm, PointMassArm
-from sim_plant.drives import Compensation, Drives, lag, memory_size
-from sim_plant.kernels import (
+from sim_plant.drives import lag, memory_size
+from sim_plant.kernels import observe_plant, plant_truth, step_plant
+from sim_plant.layout import (
+    VELOCITY_SOURCES,
+    Disturbance,
+    Drives,
+    Encoders,
+    Events,
+    Load,
     PlantSettings,
-    observe_plant,
-    plant_truth,
     state_of,
     state_size,
-    step_plant,
-)
-from sim_plant.motion import (
-    EventSettings,
-    JointDisturbance,
-    LoadSettings,
-    SloshSettings,
-    WallSettings,
 )
 from sim_plant.rigid_body import rigid_arm, rigid_bodies
-from sim_plant.sensors import VELOCITY_SOURCES, Encoders, generator, is_noisy
+from sim_plant.sensors import generator, is_noisy
 
 T = TypeVar('T')
 
@@ -46,19 +43,11 @@ FASTEST = 1e3
 """Norm of the joint velocities [rad/s] beyond which the arm breaks and stops where it was."""
 
 
-class SavedPlant(NamedTuple):
-    """Snapshot of a plant's state, random generator included."""
-
-    state: np.ndarray
-    is_broken: bool
-    generator: Mapping[str, Any]
-
-
 class Plant:
     """A sampled arm: call `measure()`, then `step(torque)`, in turn.
 
     It starts at `position` (n,) [rad] with `velocity` (n,) [rad/s]; `seed` determines the noise, so
-    the same seed repeats the run.  `is_broken` is set once the arm exceeds `FASTEST`.
+    the same seed repeats the run.
     """
 
     def __init__(
@@ -79,7 +68,6 @@ class Plant:
         self._measurement = np.zeros(3 * self.joints)
         self._truth = np.zeros(settings.p + 3 * self.joints)
         self._before = np.zeros(self.joints)
-        self.is_broken = False
         self._seed = seed
         self.rng = generator(seed)
 
@@ -89,9 +77,14 @@ class Plant:
         return int(self.state[0])
 
     @property
+    def is_broken(self) -> bool:
+        """Whether the arm has exceeded `FASTEST`, until a reset."""
+        return bool(self._now.broken[0])
+
+    @property
     def is_stopped(self) -> bool:
         """Whether the drives have made a reflex stop, which lasts until a reset."""
-        return bool(self._now.compensation.stopped[0])
+        return bool(self._now.drives.stopped[0])
 
     @property
     def elapsed_ns(self) -> int:
@@ -121,7 +114,7 @@ class Plant:
         self._before[:] = self._q
         step_plant(self.arm, self.settings, self.state, torque)
         if not self._dq @ self._dq <= FASTEST**2:  # NaN as well
-            self.is_broken = True
+            self._now.broken[0] = 1.0
             self._q[:] = self._before
             self._dq[:] = 0.0
 
@@ -145,7 +138,6 @@ class Plant:
     def reset(self) -> None:
         """Return to sample 0 and reseed, so that the run is repeated."""
         self.state[:] = self._initial
-        self.is_broken = False
         self.rng = generator(self._seed)
 
     def compile(self) -> None:
@@ -154,15 +146,13 @@ class Plant:
         self.truth()
         self.reset()
 
-    def save(self) -> SavedPlant:
-        """Return a copy of everything that changes."""
-        return SavedPlant(self.state.copy(), self.is_broken, self.rng.bit_generator.state)
+    def save(self) -> tuple[np.ndarray, Mapping[str, Any]]:
+        """Return a copy of everything that changes: the state and that of the generator."""
+        return self.state.copy(), self.rng.bit_generator.state
 
-    def restore(self, saved: SavedPlant) -> None:
-        """Restore a state saved by a plant with the same settings."""
-        self.state[:] = saved.state
-        self.is_broken = saved.is_broken
-        self.rng.bit_generator.state = saved.generator
+    def restore(self, saved: tuple[np.ndarray, Mapping[str, Any]]) -> None:
+        """Restore what was saved by a plant with the same settings."""
+        self.state[:], self.rng.bit_generator.state = saved
 
 
 def parameters_of(config: PlantConfig, t: float = 0.0) -> np.ndarray:
@@ -187,41 +177,47 @@ def plant_of(config: PlantConfig) -> Plant:
 
 def plant_settings(config: PlantConfig) -> PlantSettings:
     """Return the settings of a configured plant."""
-    arm, n = arm_of(config), len(config.joints)
-    sensor, actuator, wall = config.sensor, config.actuator, config.wall
-    robot, drive, bodies = config.robot, config.drive, drive_bodies(config)
-    decay, mean_decay = lag(actuator.time_constant, config.sample_time)
+    arm, n, T = arm_of(config), len(config.joints), config.sample_time
+    sensor, actuator, events, robot = config.sensor, config.actuator, config.events, config.robot
+    decay, mean_decay = lag(actuator.time_constant, T)
+    overcomes_friction = robot.drive_compensates == 'gravity_and_friction'
+    bodies, omega = drive_bodies(config), events.sloshing_frequency
     return PlantSettings(
         arm=arm,
         n=n,
         p=arm.p,
         period_ns=config.sample_time_ns,
         steps=_steps_of(config, arm),
-        events=len(config.events.begin),
+        events=len(events.begin),
+        bodies_size=bodies.size,
+        memory_size=memory_size(arm) if bodies.size else 0,
         encoders=_filled(Encoders, sensor, velocity_source=VELOCITY_SOURCES[sensor.velocity]),
         disturbance=_filled(
-            JointDisturbance,
+            Disturbance,
             config.disturbance,
-            coulomb_velocity=np.full(n, config.disturbance.coulomb_velocity),
             ripple=actuator.ripple * np.array(actuator.torque_limit),
             ripple_frequency=actuator.ripple_cycles,
         ),
-        drives=_filled(Drives, actuator, decay=decay, mean_decay=mean_decay),
-        compensation=Compensation(
-            drive.friction if robot.drive_compensates == 'gravity_and_friction' else 0.0,
-            int(robot.effort != 'commanded'),
-            _CURRENT if robot.effort == 'current' else 1.0,
-            actuator.rate_limit * config.sample_time,
-            actuator.reflex_rate * config.sample_time,
+        drives=_filled(
+            Drives,
+            actuator,
+            decay=decay,
+            mean_decay=mean_decay,
+            friction=config.drive.friction if overcomes_friction else 0.0,
+            effort_is_whole=int(robot.effort != 'commanded'),
+            effort_scale=_CURRENT if robot.effort == 'current' else 1.0,
+            step=actuator.rate_limit * T,
+            jump=actuator.reflex_rate * T,
+            bodies=bodies,
         ),
-        drive_size=bodies.size,
-        drive_memory=memory_size(arm) if bodies.size else 0,
-        drive_bodies=bodies,
-        load=_filled(LoadSettings, config.load, sensor),
-        wall=_filled(
-            WallSettings, wall, normal=np.array(wall.normal) / np.linalg.norm(wall.normal)
+        load=_filled(
+            Load,
+            config.load,
+            sensor,
+            stiffness=omega**2,
+            damping=2.0 * events.sloshing_damping * omega,
+            gravity=np.array(robot.gravity if robot.urdf else (0.0, 0.0, -config.arm.gravity)),
         ),
-        slosh=_slosh_of(config),
         schedule=_schedule_of(config),
     )
 
@@ -258,13 +254,7 @@ def _filled(layout: type[T], *groups: object, **computed: object) -> T:
     return layout(**given | computed)
 
 
-def _slosh_of(config: PlantConfig) -> SloshSettings:
-    omega, zeta = config.events.sloshing_frequency, config.events.sloshing_damping
-    gravity = config.robot.gravity if config.robot.urdf else (0.0, 0.0, -config.arm.gravity)
-    return SloshSettings(omega**2, 2.0 * zeta * omega, np.array(gravity))
-
-
-def _schedule_of(config: PlantConfig) -> EventSettings:
+def _schedule_of(config: PlantConfig) -> Events:
     """Return the events with times in samples, and zeros for what is not given."""
     events, count, n = config.events, len(config.events.begin), len(config.joints)
 
@@ -276,7 +266,7 @@ def _schedule_of(config: PlantConfig) -> EventSettings:
         return np.rint(times / config.sample_time)
 
     begin, duration = values('begin'), values('duration')
-    return EventSettings(
+    return Events(
         begin=samples(begin),
         end=np.where(duration > 0.0, samples(begin + duration), np.inf),
         ramp=samples(values('ramp')),

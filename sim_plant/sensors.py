@@ -7,36 +7,12 @@ Noise comes from one seeded generator, so the same seed repeats a run exactly.
 """
 
 from math import exp
-from typing import Annotated, NamedTuple
 
 import numpy as np
 
 from blf_dsc_controller.compiled.jit import inner
-from blf_dsc_controller.compiled.layout import Array, Cell
-
-MEASURED = 0
-DIFFERENCED = 1
-VELOCITY_SOURCES = {'measured': MEASURED, 'differenced': DIFFERENCED}
-
-
-class Encoders(NamedTuple):
-    """Quality of the encoders, the same on every joint."""
-
-    position_noise: float  # rad, standard deviation
-    velocity_noise: float  # rad/s, standard deviation; not used when differenced
-    resolution: float  # rad, 0 = none
-    velocity_source: int  # MEASURED or DIFFERENCED
-    velocity_pole: float  # rad/s, 0 = no filter
-    repeat_every: int  # samples after which the last reading is sent once more; 0: never
-
-
-class EncoderReading(NamedTuple):
-    """The latest reading, and its sample."""
-
-    sample: Cell  # -1 before the first reading
-    noise: Annotated[Array, '2 * n']  # standard normal: positions, velocities
-    position: Annotated[Array, 'n']  # rad
-    velocity: Annotated[Array, 'n']  # rad/s
+from blf_dsc_controller.compiled.layout import Array
+from sim_plant.layout import MEASURED, Encoders, PlantSettings, PlantState
 
 
 def generator(seed: int) -> np.random.Generator:
@@ -66,36 +42,28 @@ def quantised(angle: float, resolution: float) -> float:
 
 
 @inner
-def sense(
-    encoders: Encoders,
-    sample: int,
-    period: float,
-    q: Array,
-    dq: Array,
-    offset: Array,
-    reading: EncoderReading,
-) -> None:
-    """Write the reading of this sample, including offset (n,) [rad] and noise.
+def sense(plant: PlantSettings, now: PlantState) -> None:
+    """Write the reading of this sample, including offset and noise.
 
-    A differenced velocity spans the samples since the last reading, `period` seconds each; the
-    first reading has no predecessor and gets the true velocity.
+    A differenced velocity spans the samples since the last reading; the first reading has no
+    predecessor and gets the true velocity.
     """
-    n = q.size
+    n, encoders, reading = plant.n, plant.encoders, now.reading
     first = reading.sample[0] < 0
-    span = (sample - reading.sample[0]) * period
+    span = (int(now.sample[0]) - reading.sample[0]) * (plant.period_ns * 1e-9)
     filters = encoders.velocity_pole > 0.0 and not first
     old = exp(-encoders.velocity_pole * span) if filters else 0.0
     for i in range(n):
-        position = q[i] + offset[i] + encoders.position_noise * reading.noise[i]
+        position = now.x[i] + now.acting.offset[i] + encoders.position_noise * reading.noise[i]
         position = quantised(position, encoders.resolution)
         if encoders.velocity_source == MEASURED:
-            velocity = dq[i] + encoders.velocity_noise * reading.noise[n + i]
+            velocity = now.x[n + i] + encoders.velocity_noise * reading.noise[n + i]
         elif first:
-            velocity = dq[i]
+            velocity = now.x[n + i]
         else:
             velocity = (position - reading.position[i]) / span
         if filters:
             velocity += old * (reading.velocity[i] - velocity)
         reading.velocity[i] = velocity
         reading.position[i] = position
-    reading.sample[0] = sample
+    reading.sample[0] = now.sample[0]

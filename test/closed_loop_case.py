@@ -6,13 +6,12 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import replace
 from functools import cache
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import plants
 from paper_case import P
 from plain_law import R
-from plants import QUIET, START
 
 from blf_dsc_controller.arms.two_link import TwoLink
 from blf_dsc_controller.configuration.controller import ControllerConfig
@@ -30,7 +29,6 @@ from blf_dsc_controller.law.state import (
 )
 from blf_dsc_controller.reference import terms as reference
 from sim_plant.plant import Plant
-from sim_plant.sensors import DIFFERENCED, MEASURED
 
 T = 1e-3
 MODEL = TwoLink(R)
@@ -62,30 +60,9 @@ def controller(settings: Settings) -> Controller:
     return Controller(settings, REFERENCE)
 
 
-def plant(
-    *,
-    sample_time: float = T,
-    noise: float = 0.0,
-    differenced: bool = False,
-    delay: int = 0,
-    torque_limit: tuple[float, float] = QUIET,
-    constant: tuple[float, float] = (0.1, 0.1),
-    amplitude: tuple[float, float] = (0.1, 0.1),
-    viscous: float = 0.0,
-    start: tuple[float, float] = START,
-    seed: int = 0,
-) -> Plant:
+def plant(**changes: Any) -> Plant:
     """Return Section IV's arm at its start, with disturbance 0.1 + 0.1 sin t on each joint."""
-    return plants.plant(
-        period_ns=round(sample_time * 1e9),
-        position_noise=noise,
-        velocity_source=DIFFERENCED if differenced else MEASURED,
-        load=plants.disturbance(constant=constant, amplitude=amplitude, viscous=viscous),
-        torque_limit=torque_limit,
-        delay=delay,
-        start=start,
-        seed=seed,
-    )
+    return plants.plant(**{'constant': (0.1, 0.1), 'amplitude': (0.1, 0.1)} | changes)
 
 
 class Sample(NamedTuple):

@@ -75,9 +75,12 @@ def test_sample_contains_what_the_update_computed():
             assert np.all(found != 0.0), name
 
 
+NOISY = {'position_noise': 1e-5, 'sensor.velocity': 'differenced', 'delay': 2}
+
+
 def test_loop_continues_bit_for_bit_from_a_saved_state_and_begins_anew_after_a_reset():
     """The state vector is the complete state, so another controller can continue from it too."""
-    law, arm = controller(quick()), plant(noise=1e-5, differenced=True, delay=2)
+    law, arm = controller(quick()), plant(**NOISY)
     begun = arm.save()
 
     def torques(law, first, last, saved_arm):
@@ -135,7 +138,8 @@ def short_runs():
     law = controller(quick(window=100, learning_start=0.2, sigma=-1.0))
     torques = record(law, plant(), 0.4).torque
     assert law.state.latched[0] == 1.0
-    return torques[-1].tolist(), plants.run(plants.full_plant(), plants.commands(100)).tolist()
+    arm = plants.plant(**plants.FULL)
+    return torques[-1].tolist(), plants.run(arm, plants.commands(100)).tolist()
 
 
 def test_interpreted_kernels_compute_the_same():

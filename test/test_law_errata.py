@@ -197,7 +197,7 @@ def test_erratum_16_disturbance_reduces_the_effective_velocity_feedback():
     known = {'initial_estimate': P, 'truth_known': 1, 'true_parameters': P}
     law = controller(recommended(bias=False, gamma=np.zeros(2), **known))
     start = law.reference_at(0.0)[0]  # at rest there, so that alpha2 = 0 and xi2 = q'
-    arm = plants.plant(period_ns=10_000, start=start, velocity=xi2)
+    arm = plants.plant(sample_time=1e-5, start=start, velocity=xi2)
     energy = []
     for k in range(2):
         law.update(k * T, T, arm.measure())

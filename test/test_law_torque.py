@@ -172,7 +172,7 @@ CASES = {
     "the paper's compensation": ({'compensation': AT_STATE}, {}),
     'no bias columns': ({'bias': False}, {}),
     'damping and leakage': ({'d2': np.array([300.0, 200.0]), 'eta': 0.5}, {}),
-    'effort': ({'torque_source': EFFORT}, {'delay': 2, 'noise': 1e-6}),
+    'effort': ({'torque_source': EFFORT}, {'delay': 2, 'position_noise': 1e-6}),
     'torque limit': ({'torque_limit': np.array([10.0, 4.0])}, {}),
     'torque rate limit': ({'rate_limit': np.array([500.0, 0.0])}, {}),
     'both limits': (

@@ -1,18 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Payloads, pushes, friction, encoder offsets and a wall: what they do to the simulated arm."""
+"""Payloads, pushes, friction and encoder offsets: what they do to the simulated arm."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
 from paper_case import NO_DISTURBANCE
-from plants import ARM, NOWHERE, commands, energies, points
+from plants import ARM, commands, energies
 from plants import run as measurements
 from scipy.integrate import cumulative_simpson
 
 from blf_dsc_controller.configuration.plant import PlantConfig
 from blf_dsc_controller.configuration.schema import build
-from sim_plant.motion import wall_force
 from sim_plant.plant import plant_of, plant_settings
 
 SAMPLES = 40
@@ -28,9 +27,6 @@ ALL_KINDS = {
     'events.viscous': [0.1, 0.2, 0.0, 0.3],
     'events.coulomb': [0.0, 0.2, 0.1, 0.0],
     'events.offset': [1e-4, 0.0, -2e-4, 1e-4],
-    'wall.point': [-1.0, 0.0, 0.16],
-    'wall.stiffness': 300.0,
-    'wall.damping': 3.0,
 }
 
 
@@ -81,15 +77,6 @@ def test_payload_is_ramped_in_and_out_and_the_truth_follows():
     k = np.arange(SAMPLES)
     present = np.clip((k - 10) / 4, 0.0, 1.0) - np.clip((k - 30) / 4, 0.0, 1.0)
     np.testing.assert_allclose(m2_l2_squared, (0.5 + 0.5 * present) * 0.8**2, rtol=1e-14)
-
-
-def test_events_add_up_in_any_order():
-    reversed_events = {
-        name: np.reshape(value, (2, -1))[::-1].ravel().tolist()
-        for name, value in ALL_KINDS.items()
-        if name.startswith('events.')
-    }
-    np.testing.assert_allclose(truths(ALL_KINDS | reversed_events), truths(ALL_KINDS), rtol=1e-12)
 
 
 def test_events_do_not_make_friction_negative():
@@ -148,30 +135,3 @@ def test_sloshing_load_begins_at_rest_relative_to_the_tip_and_leaves_no_trace():
         assert np.abs(rate).max() <= (1e-15 if k == 20 else 2e-2)
     np.testing.assert_array_equal(x[:20, :4], sloshing(20, sloshing=[0.0])[:, :4])
     np.testing.assert_array_equal(x[41, 4:], x[59, 4:])  # frozen, and of no effect
-
-
-def test_wall_pushes_on_contact_and_never_pulls():
-    wall = NOWHERE._replace(normal=np.array([0.0, 0.0, 1.0]), stiffness=100.0, damping=5.0)
-    rest, leaving = np.zeros(3), np.array([0.0, 0.0, 3.0])
-    inside, outside = np.array([7.0, 0.0, -0.1]), np.array([7.0, 0.0, 0.1])
-    assert wall_force(wall, inside, rest) == pytest.approx(10.0)
-    assert wall_force(wall, inside, -leaving) == pytest.approx(25.0)
-    assert wall_force(wall, inside, leaving) == 0.0
-    assert wall_force(wall, outside, -leaving) == 0.0
-
-
-def test_falling_arm_comes_to_rest_on_a_floor():
-    """Without motors the floor then balances the weight of both links; at rest friction is zero."""
-    floor = {'wall.point': [0.0, 0.0, -0.5], 'wall.normal': [0.0, 0.0, 2.0]}
-    floor |= {'wall.stiffness': 1000.0, 'wall.damping': 50.0}
-    given = {'disturbance.viscous': [2.0, 2.0], 'initial.position': [-0.4, 0.8]}
-    arm = plant_of(build(PlantConfig, NO_DISTURBANCE | floor | given))
-    for _ in range(20_000):
-        arm.step(np.zeros(2))
-    load, q, dq = arm.truth()[3:].reshape(3, 2)
-    assert np.abs(dq).max() < 1e-6
-    elbow, end = points(1.0, 0.8, q)[1:]
-    force = 1000.0 * (-0.5 - end[2])
-    assert force > 1.0
-    assert -load == pytest.approx([force * end[0], force * (end[0] - elbow[0])], rel=1e-9)
-    assert force * end[0] == pytest.approx(9.8 * 0.5 * (elbow[0] + end[0]), rel=1e-6)

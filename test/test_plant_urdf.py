@@ -1,9 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The plant of an arm from a URDF against pinocchio and MuJoCo; its events and its truth."""
+"""The plant of an arm from a URDF against pinocchio; its events and its truth."""
 
 from __future__ import annotations
 
-import mujoco
 import numpy as np
 import pinocchio
 import pytest
@@ -101,45 +100,6 @@ def test_urdf_and_tip_are_a_complete_configuration_which_given_parameters_overri
     assert config.initial.position == (0.1,) * 7
     rippled = plant_settings(change(config, {'actuator.ripple': 0.01}))  # of the limit
     assert rippled.disturbance.ripple == pytest.approx(0.5)
-
-
-def mujoco_state(config, torques, payload):
-    """State q, dq after these torques in MuJoCo, with locked fingers and its RK4 integrator."""
-    spec = mujoco.MjSpec.from_string(config.robot.text)
-    spec.compiler.boundmass = spec.compiler.boundinertia = 0.0
-    for joint in spec.joints:
-        if joint.name not in config.joints:
-            spec.delete(joint)
-    if payload:
-        ball = spec.body(config.robot.tip).add_body()
-        ball.mass, ball.inertia, ball.explicitinertial = payload, [1e-12] * 3, True
-    model = spec.compile()
-    model.opt.timestep = config.sample_time
-    model.opt.integrator = mujoco.mjtIntegrator.mjINT_RK4
-    model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONTACT
-    model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_LIMIT
-    model.opt.gravity[:] = config.robot.gravity
-    model.dof_damping[:] = config.disturbance.viscous
-    model.dof_armature[:] = config.robot.rotors(config.robot.chain(config.joints))
-    data = mujoco.MjData(model)
-    data.qpos[:], data.qvel[:] = config.initial.position, config.initial.velocity
-    mujoco.mj_forward(model, data)
-    for torque in torques:
-        data.qfrc_applied[:] = torque
-        mujoco.mj_step(model, data)
-    return np.concatenate((data.qpos, data.qvel))
-
-
-@pytest.mark.parametrize('payload', [0.0, 2.0])
-def test_motion_matches_mujoco(payload):
-    config = panda(**{'disturbance.viscous': [0.5] * 7, 'load.payload': payload})
-    torques, arm = swinging_torques(500), plant_of(config)
-    start = arm.truth()[-14:].copy()
-    for torque in torques:
-        arm.step(torque)
-    end = arm.truth()[-14:]
-    assert np.abs(end - start)[:7].max() > 0.5
-    np.testing.assert_allclose(end, mujoco_state(config, torques, payload), rtol=0.0, atol=1e-6)
 
 
 def test_truth_contains_the_base_parameters_with_payload_and_factors():

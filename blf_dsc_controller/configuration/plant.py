@@ -43,16 +43,6 @@ class Load:
 
 
 @dataclass(frozen=True)
-class Wall:
-    """Plane that pushes the tip back like a spring and a damper, but never pulls it."""
-
-    point: Vector = parameter((0.0, 0.0, 0.0), 'a point on the plane', 'm')
-    normal: Vector = parameter((0.0, 0.0, 1.0), 'direction in which the wall pushes')
-    stiffness: float = non_negative(0.0, 'force per penetration depth; 0: no wall', 'N/m')
-    damping: float = non_negative(0.0, 'force per velocity into the wall', 'N s/m')
-
-
-@dataclass(frozen=True)
 class Events:
     """Events, each of which adds to the load, the friction and the encoder offsets for a while.
 
@@ -269,7 +259,6 @@ class PlantConfig(ArmConfig):
     sensor: Sensor = Sensor()
     actuator: Actuator = Actuator()
     load: Load = Load()
-    wall: Wall = Wall()
     events: Events = Events()
 
     @classmethod
@@ -298,8 +287,6 @@ class PlantConfig(ArmConfig):
     def problems(self) -> Iterator[str]:
         """Check the joints, the sample time and the duration."""
         yield from self.arm_problems('the simulated arm', None if self.robot.urdf else 2)
-        if not any(self.wall.normal):
-            yield 'wall.normal: got [0.0, 0.0, 0.0], but a direction is needed'
         if self.truth != Truth() and not self.robot.urdf:
             yield 'truth: it applies only to a URDF: give robot.urdf, or change arm'
         if self.drive != Drive() and self.robot.drive_compensates == 'none':

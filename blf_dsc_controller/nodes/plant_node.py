@@ -6,7 +6,7 @@ fast as the machine allows. In real time, a step is taken each sample time of th
 the new torque is late, the last one is held and the delay published, but a torque older than
 `actuator.command_timeout` is not applied. The arm is braked until the first torque arrives.
 
-Load, wall, events, disturbance and encoder offsets can be changed at run time, from the next sample
+Load, events, disturbance and encoder offsets can be changed at run time, from the next sample
 on; `~/changes` publishes the time, so that an event at that time repeats the run.
 
 A reset returns the arm to its start, which no real arm does by itself. The node therefore also

@@ -336,9 +336,7 @@ class Variation:
     distribution: Distribution
 
 
-_GROUPS = (
-    *('arm.', 'truth.', 'disturbance.', 'sensor.', 'actuator.', 'load.', 'wall.', 'events.'),
-)
+_GROUPS = ('arm.', 'truth.', 'disturbance.', 'sensor.', 'actuator.', 'load.', 'events.')
 _REALTIME = ('actuator.command_timeout', 'actuator.without_command')
 
 

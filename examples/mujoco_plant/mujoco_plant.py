@@ -25,8 +25,8 @@ from std_msgs.msg import Float64MultiArray
 from blf_dsc_controller.configuration.plant import PlantConfig
 from blf_dsc_controller.nodes import parameters
 from sim_plant.drives import actuate
-from sim_plant.kernels import state_of
-from sim_plant.motion import update_acting
+from sim_plant.layout import state_of
+from sim_plant.motion import update_loads
 from sim_plant.plant import plant_of, plant_settings
 
 FIRST_STAMP = 1.0  # s
@@ -104,30 +104,19 @@ class MujocoArm:
         """Take a step with this torque (n,) [N m] and the loads that act at its start."""
         settings, now, data = self._settings, self._now, self.data
         friction, acting = settings.disturbance, now.acting
-        update_acting(friction, settings.load, settings.schedule, now.sample[0], acting)
+        update_loads(settings, now)
         self._tip.mass[0] = self._mass + acting.payload[0]
         speed = data.qvel / friction.stribeck_velocity
         self.model.dof_damping[:] = acting.viscous
         self.model.dof_frictionloss[:] = acting.coulomb
         self.model.dof_frictionloss *= 1.0 + friction.stribeck * np.exp(-(speed**2))
-        data.xfrc_applied[self._tip.id, :3] = acting.force + self._wall_force(self._tip.id)
+        data.xfrc_applied[self._tip.id, :3] = acting.force
         wave = friction.amplitude * np.sin(friction.frequency * data.time + friction.phase)
         ripple = friction.ripple * np.sin(friction.ripple_frequency * data.qpos)
-        actuate(settings.drives, int(now.sample[0]), torque, now.drives)
+        actuate(settings, now, torque)
         data.qfrc_applied[:] = now.drives.applied - (acting.constant + wave + ripple)
         mujoco.mj_step(self.model, data)
         now.sample[0] += 1.0
-
-    def _wall_force(self, tip: int) -> np.ndarray:
-        """Return the force (3,) [N] of the wall on the tip, the last link's centre of mass."""
-        wall, velocity = self._settings.wall, np.zeros(6)  # angular, linear
-        if wall.stiffness == 0.0:
-            return np.zeros(3)
-        mujoco.mj_forward(self.model, self.data)
-        mujoco.mj_objectVelocity(self.model, self.data, mujoco.mjtObj.mjOBJ_BODY, tip, velocity, 0)
-        depth = wall.normal @ (wall.point - self.data.xipos[tip])
-        force = wall.stiffness * depth - wall.damping * (wall.normal @ velocity[3:])
-        return np.asarray(max(force, 0.0) * wall.normal if depth > 0.0 else np.zeros(3))
 
 
 class MujocoPlant(Node):

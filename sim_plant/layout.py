@@ -1,0 +1,170 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Settings and state of the plant: one flat vector each, in parts by what they describe."""
+
+from typing import Annotated, NamedTuple
+
+from blf_dsc_controller.compiled.layout import Array, Cell, Passed, size_of, view_of
+from sim_plant.arm import Arm
+
+MEASURED = 0
+DIFFERENCED = 1
+VELOCITY_SOURCES = {'measured': MEASURED, 'differenced': DIFFERENCED}
+
+
+class Encoders(NamedTuple):
+    """Quality of the encoders, the same on every joint."""
+
+    position_noise: float  # rad, standard deviation
+    velocity_noise: float  # rad/s, standard deviation; not used when differenced
+    resolution: float  # rad, 0 = none
+    velocity_source: int  # MEASURED or DIFFERENCED
+    velocity_pole: float  # rad/s, 0 = no filter
+    repeat_every: int  # samples after which the last reading is sent once more; 0: never
+
+
+class Disturbance(NamedTuple):
+    """Disturbance of each joint; constant, viscous and coulomb as they are without events."""
+
+    constant: Annotated[Array, 'n']  # N m
+    amplitude: Annotated[Array, 'n']  # N m
+    frequency: Annotated[Array, 'n']  # rad/s
+    phase: Annotated[Array, 'n']  # rad
+    viscous: Annotated[Array, 'n']  # N m s/rad
+    coulomb: Annotated[Array, 'n']  # N m
+    coulomb_velocity: float  # rad/s, at which tanh reaches three quarters
+    stribeck: float  # additional friction near rest, relative to Coulomb friction
+    stribeck_velocity: float  # rad/s
+    ripple: Annotated[Array, 'n']  # N m
+    ripple_frequency: float  # rad/rad
+
+
+class Drives(NamedTuple):
+    """Properties of the drives of all joints, what they add, and the jump at which they stop.
+
+    The lag is solved exactly for a held command; the torque applied in a sample is its mean.
+    """
+
+    torque_limit: Annotated[Array, 'n']  # N m, 0 = none
+    delay: int  # samples
+    decay: float  # of the lag over a sample, exp(-T / time constant); 0: no lag
+    mean_decay: float  # its mean over the sample
+    torque_noise: float  # standard deviation, relative to the torque
+    friction: float  # share of viscous and Coulomb friction that they overcome
+    effort_is_whole: int  # 1: the measured effort contains what they add
+    effort_scale: float  # of the measured effort: 1, or A/N m of a current
+    step: float  # N m from one command to the next that their driver lets pass; 0: any
+    jump: float  # N m from one torque to the next at which they stop; 0: none
+    bodies: Annotated[Array, 'bodies_size']  # RigidBodies of their model; empty: they add nothing
+
+
+class Load(NamedTuple):
+    """Load that acts all the time, and spring and damper of a sloshing one, per kg."""
+
+    payload: float  # kg, point mass at the tip
+    torque: Annotated[Array, 'n']  # N m, pushes the joints
+    force: Annotated[Array, 3]  # N, pushes the tip, in the frame of the base
+    offset: Annotated[Array, 'n']  # rad, measured minus true position
+    stiffness: float  # omega^2, 1/s^2
+    damping: float  # 2 zeta omega, 1/s
+    gravity: Annotated[Array, 3]  # g, m/s^2
+
+
+class Events(NamedTuple):
+    """Contribution of each event to load and friction; times are in samples."""
+
+    begin: Annotated[Array, 'events']
+    end: Annotated[Array, 'events']  # infinite: permanent
+    ramp: Annotated[Array, 'events']
+    payload: Annotated[Array, 'events']
+    sloshing: Annotated[Array, 'events']
+    torque: Annotated[Array, 'events', 'n']
+    force: Annotated[Array, 'events', 3]
+    viscous: Annotated[Array, 'events', 'n']
+    coulomb: Annotated[Array, 'events', 'n']
+    offset: Annotated[Array, 'events', 'n']
+
+
+class PlantSettings(NamedTuple):
+    """Everything that defines a plant except its seed and its initial state.
+
+    The arm is passed to kernels as is, everything else in one vector.
+    """
+
+    arm: Arm
+    n: Passed  # joints of the arm
+    p: int  # parameters of the arm
+    period_ns: int
+    steps: int  # of the integrator in a sample
+    events: int  # number of events
+    bodies_size: int  # of drives.bodies
+    memory_size: int  # of their motion
+    encoders: Encoders
+    disturbance: Disturbance
+    drives: Drives
+    load: Load
+    schedule: Events
+
+
+class EncoderReading(NamedTuple):
+    """The latest reading, and its sample."""
+
+    sample: Cell  # -1 before the first reading
+    noise: Annotated[Array, '2 * n']  # standard normal: positions, velocities
+    position: Annotated[Array, 'n']  # rad
+    velocity: Annotated[Array, 'n']  # rad/s
+
+
+class DriveState(NamedTuple):
+    """Torques on their way from the command to the joint."""
+
+    stopped: Cell  # 1: after a jump
+    command: Annotated[Array, 'n']  # the last one that the driver let pass, N m
+    ring: Annotated[Array, 'drives.delay', 'n']  # delayed commands, N m
+    noise: Annotated[Array, 'n']  # standard normal
+    motor: Annotated[Array, 'n']  # at the end of the sample, N m
+    applied: Annotated[Array, 'n']  # mean over the sample, N m
+    added: Annotated[Array, 'n']  # by the drives, N m
+    whole: Annotated[Array, 'n']  # torque at the joints, N m
+    still: Annotated[Array, 'n']  # zeros
+    memory: Annotated[Array, 'memory_size']  # BodyMotion
+
+
+class Acting(NamedTuple):
+    """Sum of load and events in one sample."""
+
+    sample: Cell  # of the sum; -1: none yet
+    payload: Cell  # kg
+    sloshing: Cell  # kg
+    force: Annotated[Array, 3]  # N
+    offset: Annotated[Array, 'n']  # rad
+    constant: Annotated[Array, 'n']  # N m, of the disturbance, less torques that push the joints
+    viscous: Annotated[Array, 'n']  # N m s/rad, not below zero
+    coulomb: Annotated[Array, 'n']  # N m, not below zero
+
+
+class Memory(NamedTuple):
+    """Working memory of a step of the integrator."""
+
+    point: Annotated[Array, '2 * n + 6']
+    k: Annotated[Array, 6, '2 * n + 6']
+    tip: Annotated[Array, 3]  # m
+    tip_velocity: Annotated[Array, 3]  # m/s
+    jacobian: Annotated[Array, 3, 'n']  # m/rad
+    pull: Annotated[Array, 3]  # acceleration a of the sloshing load, m/s^2
+
+
+class PlantState(NamedTuple):
+    """Everything that changes from sample to sample except the random generator."""
+
+    sample: Cell  # k
+    x: Annotated[Array, '2 * n + 6']  # q [rad], dq [rad/s], noise-free; load: y [m], v [m/s]
+    sloshes: Cell  # 1: y and v are those of a load
+    broken: Cell  # 1: the arm has exceeded a speed that no arm survives
+    reading: EncoderReading
+    drives: DriveState
+    acting: Acting
+    memory: Memory
+
+
+settings_of = view_of(PlantSettings)
+state_of, state_size = view_of(PlantState), size_of(PlantState)
