@@ -26,7 +26,6 @@ from harness import print_table
 from numpy.typing import NDArray
 
 from blf_dsc_controller.arms.inertia import pseudo_inertia
-from blf_dsc_controller.arms.urdf import attached
 from blf_dsc_controller.bags.writer import BagWriter
 from blf_dsc_controller.configuration.robot import Robot, parameters_of
 from blf_dsc_controller.identification.identify import (
@@ -151,9 +150,8 @@ def _baselines(taken: Taken, recording: Recording) -> tuple[Rows, NDArray[np.int
         delay = float(theta[-1])
     u = rows.u(delay)[test]
     plain = rows.X[test][:, :, used] @ theta[:-1] - u
-    held = [attached(robot.text, joint.link, recording.joints)[1] for joint in chain.joints]
     largest = np.abs(recording.torque).max(axis=0)
-    prior = prior_of(robot, chain, held, largest, np.maximum(rows.speed, 0.02), load=False)
+    prior = prior_of(robot, chain, largest, np.maximum(rows.speed, 0.02), load=False)
     prior = _weakened(prior.only([]))
     G = base_matrix(parameters, n)
     found = regression(rows, fit, G, prior)

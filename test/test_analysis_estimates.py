@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 import recorded_run
 import synthetic_bag
-from paper_case import configured
 from synthetic_bag import Synthetic
 from test_law_urdf import panda
 
@@ -20,13 +19,11 @@ from blf_dsc_controller.analysis.metrics import estimates_of, measure
 from blf_dsc_controller.analysis.panels import panels
 from blf_dsc_controller.analysis.summary import format_table, summarize
 from blf_dsc_controller.bags.reader import read_run
-from blf_dsc_controller.cli.run import LoopProgress
 from blf_dsc_controller.configuration.schema import flatten
 from blf_dsc_controller.law.telemetry import learned_arm
 from blf_dsc_controller.messages.journal import decode
 from blf_dsc_controller.messages.topics import JOURNAL, LAMBDA_MIN, LATCHED
 from blf_dsc_controller.run import LearnedArm, Run, Series
-from blf_dsc_controller.simulation.loop import simulate
 
 PERIOD = 10_000_000  # ns
 TIME = np.arange(1001) * PERIOD * 1e-9
@@ -161,20 +158,6 @@ def test_arm_of_a_bag_comes_from_its_recorded_configuration(tmp_path):
 
 
 # Estimates are compared with the parameters of the plant by name only.
-
-
-def test_progress_compares_parameters_by_name(capsys):
-    config = configured('recommended', 10.0)
-    record = simulate(config.controller, config.plant)
-    names = ('(m1+m2)*l1^2', 'm2*l1*l2', 'm2*l2^2')
-    for shown, line in (
-        (names, 'parameter error 0.0'),
-        (('mass', 'length', 'other'), 'bound 0.50\n'),
-    ):
-        progress = LoopProgress(config.plant, shown)
-        progress.show(10.0, 0.5, record.sample(-1).estimate[[0, 2, 1]])
-        progress.close()
-        assert line in capsys.readouterr().err
 
 
 def test_unknown_parameter_names_give_a_reason_instead_of_an_error(tmp_path):

@@ -6,8 +6,6 @@ from __future__ import annotations
 import re
 import subprocess
 import sys
-import sysconfig
-from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
@@ -393,35 +391,18 @@ def test_misspelt_node_name_is_reported(file):
     assert load_loop(file(section('robot_state_publisher', 'a: 1'))).plant == PlantConfig()
 
 
-def installed(prefix):
-    """Create the share folder of an installation below `prefix`."""
-    folder = prefix / 'share' / 'blf_dsc_controller'
-    (folder / 'config').mkdir(parents=True)
-    return folder
-
-
-def test_files_are_those_of_the_source_tree_then_of_ros_then_of_pip(tmp_path, monkeypatch):
+@pytest.mark.parametrize('prefix', ['source', 'prefix/share/blf_dsc_controller'])
+def test_files_are_those_of_the_source_tree_or_of_the_prefix(tmp_path, monkeypatch, prefix):
     """And never those of the current folder."""
-    here, workspace = tmp_path / 'here', tmp_path / 'workspace'
-    installed(here)
-    (here / 'config').mkdir()
-    workspace.mkdir()  # of ROS, without the package at first
+    here, installed = tmp_path / 'here', tmp_path / 'prefix/lib/python3/site-packages'
+    own = installed if prefix == 'source' else tmp_path / prefix
+    monkeypatch.setattr(files, '_ABOVE', [installed, *installed.parents[:3]])
+    (here / 'config').mkdir(parents=True)
+    (here / 'config/recommended.yaml').touch()
     monkeypatch.chdir(here)
-    monkeypatch.setattr(files, '_CHECKOUT', tmp_path / 'checkout')
-    monkeypatch.setenv('AMENT_PREFIX_PATH', str(workspace))
-    monkeypatch.setattr(sysconfig, 'get_path', lambda _name, scheme: str(tmp_path / scheme))
     with pytest.raises(BlfDscError, match='install the package again') as error:
         files.share_folder()
     assert str(here) not in str(error.value)
-    for scheme in (sysconfig.get_preferred_scheme('user'), sysconfig.get_default_scheme()):
-        own = installed(tmp_path / scheme)
-        assert files.share_folder() == own
-    if find_spec('ament_index_python'):
-        packages = workspace / 'share/ament_index/resource_index/packages'
-        packages.mkdir(parents=True)
-        (packages / 'blf_dsc_controller').touch()
-        own = installed(workspace)
-        assert files.share_folder() == own
-    (tmp_path / 'checkout/config').mkdir(parents=True)
-    (tmp_path / 'checkout/setup.py').touch()
-    assert files.share_folder() == tmp_path / 'checkout'
+    (own / 'config').mkdir(parents=True)
+    (own / 'config/recommended.yaml').touch()
+    assert files.share_folder() == own

@@ -29,7 +29,7 @@ from shaken_arm import (
 from blf_dsc_controller.arms.base_parameters import base_parameters
 from blf_dsc_controller.arms.inertia import inertia_of, pseudo_inertia
 from blf_dsc_controller.arms.model import regressors_at
-from blf_dsc_controller.arms.urdf import attached, read_chain
+from blf_dsc_controller.arms.urdf import read_chain
 from blf_dsc_controller.cli.identify import problems_of
 from blf_dsc_controller.cli.main import main
 from blf_dsc_controller.configuration.robot import Robot
@@ -355,13 +355,14 @@ def test_other_readers_see_only_the_new_inertias_and_friction(tmp_path):
     np.testing.assert_allclose(new.dof_damping[:7], 0.5)
     np.testing.assert_allclose(new.dof_frictionloss[:7], 0.2)
     (tmp_path / 'arm.urdf').write_text(text)
-    fixed, held = attached(PANDA_TEXT, 'panda_link7', PANDA)
-    assert fixed == ['panda_link8', 'panda_hand', 'panda_hand_tcp']
-    assert held[3, 3] == pytest.approx(0.03)  # two fingers
+    last = PANDA_CHAIN.joints[-1]
+    assert last.fixed == ('panda_link8', 'panda_hand', 'panda_hand_tcp')
+    assert last.held[3, 3] == pytest.approx(0.03)  # two fingers
     robot = yourdfpy.URDF.load(str(tmp_path / 'arm.urdf'), load_meshes=False)
     assert robot.validate()
     for joint, inertia in zip(PANDA_CHAIN.joints, inertias, strict=True):
-        fingers = attached(PANDA_TEXT, joint.link, PANDA)[1][3, 3]
-        assert robot.link_map[joint.link].inertial.mass == pytest.approx(inertia[0] - fingers)
+        assert robot.link_map[joint.link].inertial.mass == pytest.approx(
+            inertia[0] - joint.held[3, 3]
+        )
         assert float(robot.joint_map[joint.name].dynamics.damping) == pytest.approx(0.5)
         assert robot.joint_map[joint.name].limit.upper == pytest.approx(joint.upper)

@@ -15,8 +15,8 @@ from scipy.spatial.transform import Rotation
 pytest.importorskip('yourdfpy', reason='needs viser: pip install blf_dsc_controller[view]')
 
 from blf_dsc_controller.arms.geometry import frames
+from blf_dsc_controller.arms.urdf import read_chain
 from blf_dsc_controller.cli.main import main
-from blf_dsc_controller.configuration.robot import chain_of
 from blf_dsc_controller.errors import BlfDscError, MissingExtraError
 from blf_dsc_controller.messages.topics import JOINT_STATES
 from blf_dsc_controller.view import page as pages
@@ -130,7 +130,7 @@ def test_estimates_are_grouped_by_link_and_friction():
 
 def test_meshes_of_an_installed_description_are_drawn_only_for_the_same_arm(tmp_path, monkeypatch):
     text = random_urdf(3, 0)[0]
-    chain = chain_of(text, '', 'tip', ('j1', 'j2', 'j3'))
+    chain = read_chain(text, '', 'tip', ('j1', 'j2', 'j3'))
     folder = tmp_path / 'cmeel.prefix/share/example-robot-data/robots/any/urdf'
     folder.mkdir(parents=True)
     monkeypatch.setattr('sysconfig.get_path', lambda *_: str(tmp_path))
@@ -161,7 +161,7 @@ def test_bag_without_configuration_is_rejected_in_one_line(tmp_path, capsys):
 @pytest.mark.parametrize('seed', range(2))
 def test_links_without_shapes_become_cylinders_in_place(seed):
     text = random_urdf(4, seed)[0]
-    chain = chain_of(text, '', 'tip', ('j1', 'j2', 'j3', 'j4'))
+    chain = read_chain(text, '', 'tip', ('j1', 'j2', 'j3', 'j4'))
     model = ShownArm(text, chain).model()
     assert len(model.scene.geometry) > 4
     q = np.random.default_rng(seed).uniform(-1.0, 1.0, 4)

@@ -66,7 +66,7 @@ class BaseParameters:
 
 @functools.lru_cache(maxsize=16)
 def base_parameters(
-    chain: Chain, gravity: tuple[float, float, float] = (0.0, 0.0, -9.81), *, rotors: bool = True
+    chain: Chain, gravity: tuple[float, ...] = (0.0, 0.0, -9.81), *, rotors: bool = True
 ) -> BaseParameters:
     """Return a chain's base parameters, with or without rotors; gravity [m/s^2] is in its base."""
     full = serial_chain(chain, gravity)

@@ -5,7 +5,7 @@ A body is what one joint moves: its link, with everything that is fixed to it.  
 
 - Fixed joints are merged, including those beyond the tip.
 - Moving joints beside the chain or beyond its tip, such as a gripper's fingers, are held at
-  position 0 and their links merged; `Chain.held` names them.
+  position 0 and their links merged.
 - A link without `<inertial>` has no mass, but each body must have one.
 - Continuous joints, and joints without `<limit>`, have infinite limits; an effort or a velocity of
   0 means no limit.
@@ -18,22 +18,21 @@ from __future__ import annotations
 import xml.etree.ElementTree as ET
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from math import cos, inf, sin
 from sys import float_info
+from typing import NamedTuple
 
 import numpy as np
 
 from blf_dsc_controller.arms.inertia import inertia_of, pseudo_inertia, rotational_inertia
 from blf_dsc_controller.errors import BlfDscError
 
-MOVING = ('revolute', 'continuous', 'prismatic')
+_MOVING = ('revolute', 'continuous', 'prismatic')
 _MOST = 500  # at most, of links and of joints
 _LIMITS = ('lower', 'upper', 'velocity', 'effort')
 _ROUNDED = 1e-12  # kg m^2, of moments of inertia
 _LARGEST = 1e6  # m, kg, kg m^2 and so on; limits may be larger
-
-
-Elements = Mapping[str, ET.Element]
 
 
 class UrdfError(BlfDscError):
@@ -53,6 +52,8 @@ class Joint:
         damping, friction: from `<dynamics>`: viscous [N m s/rad or N s/m], Coulomb [N m or N].
         link: the link that it moves; its frame is the joint's.
         inertia: (10,) of the body in that frame, in the order of `inertia.INERTIA_NAMES`.
+        fixed: the links that are fixed to its link.
+        held: (4, 4) pseudo-inertia, in that frame, of what joints held at position 0 carry.
     """
 
     name: str
@@ -67,21 +68,21 @@ class Joint:
     friction: float
     link: str
     inertia: np.ndarray
+    fixed: tuple[str, ...]
+    held: np.ndarray
 
 
 @dataclass(frozen=True, eq=False)
 class Chain:
     """Joints from `base` to `tip`, and placement of the tip (4, 4) in the last joint's frame.
 
-    `held` names the moving joints beside them, `pointlike` the links that they move whose mass has
-    no moments of inertia.
+    `pointlike` names the links that they move whose mass has no moments of inertia.
     """
 
     base: str
     tip: str
     joints: tuple[Joint, ...]
     tip_placement: np.ndarray
-    held: tuple[str, ...]
     pointlike: tuple[str, ...]
 
     @property
@@ -90,133 +91,176 @@ class Chain:
         return np.array([joint.inertia for joint in self.joints])
 
 
-def read_chain(text: str, base: str, tip: str, joints: Sequence[str]) -> Chain:
+@lru_cache(maxsize=16)
+def read_chain(text: str, base: str, tip: str, joints: tuple[str, ...]) -> Chain:
     """Return the serial chain of the moving `joints`, in order, between two links of a URDF text.
+
+    An empty base means the root, an empty tip the link of the last joint, no joints all that move;
+    without tip and joints, these must form one chain.
 
     Raises UrdfError, which says what was found and how to correct it.
     """
-    links, elements = _parse(text)
-    path = _path(links, elements, base, tip)
-    _check_joints(path, elements, joints)
-    held: list[str] = []
+    tree = Tree.of(text)
+    wanted = joints or (() if tip else tree.only_chain())
+    for name in wanted:
+        tree.joint(name)
+    base, tip = base or tree.root, tip or _link(tree.joint(wanted[-1]), 'child')
+    path = tree.path(base, tip)
+    _check_kinds(path)
+    moving = _moving(path)
+    if not moving or (wanted and wanted != moving):
+        raise UrdfError(
+            f'the moving joints from base to tip are {_listed(moving)}, in this order; got '
+            f'{_listed(wanted)}: list them like this, or choose another base or tip'
+        )
+    chain: list[Joint] = []
     pointlike: list[str] = []
     massless: list[str] = []
-    chain: list[Joint] = []
     frame = np.eye(4)
     for element in path:
         frame = frame @ _origin(element)
         if element.get('type') != 'fixed':
             link = _link(element, 'child')
-            J = _body(links, elements, link, joints, (held, pointlike))
-            if J[3, 3] <= 0.0:
+            body = tree.body(link, moving)
+            if body.J[3, 3] <= 0.0:
                 massless.append(f'{link} (moved by {element.get("name")})')
-            chain.append(_joint(element, frame, J))
+            chain.append(_joint(element, frame, body))
+            pointlike += body.pointlike
             frame = np.eye(4)
     if massless:
         raise UrdfError(
             f'these links have no mass, nor has anything fixed to them: {_listed(massless)}: add '
             'an <inertial> to each, even a rough one'
         )
-    return Chain(base, tip, tuple(chain), frame, tuple(held), tuple(pointlike))
+    return Chain(base, tip, tuple(chain), frame, tuple(pointlike))
 
 
-def chain_joints(
-    text: str, base: str, tip: str, joints: Sequence[str]
-) -> tuple[str, str, tuple[str, ...]]:
-    """Return base, tip and the moving joints between them, as given or else from the URDF.
+class _Body(NamedTuple):
+    """A link with everything that it carries at position 0."""
 
-    An empty base means the root, an empty tip the link of the last joint, no joints all that move.
-    """
-    links, elements = _parse(text)
-    moved = {_link(element, 'child') for element in elements.values()}
-    base = base or next((link for link in links if link not in moved), '')
-    if not base:
-        raise UrdfError(f'no link is the root: the links are {_listed(links)}, each below a joint')
-    if not tip and not joints:
-        raise UrdfError('neither a tip nor joints were given: set robot.tip')
-    if not tip and joints[-1] not in elements:
-        raise UrdfError(f'no joint {joints[-1]!r} in the URDF: its joints are {_listed(elements)}')
-    tip = tip or _link(elements[joints[-1]], 'child')
-    path = _path(links, elements, base, tip)
-    moving = tuple(str(e.get('name')) for e in path if e.get('type') != 'fixed')
-    return base, tip, tuple(joints) or moving
+    J: np.ndarray  # pseudo-inertia (4, 4) of all
+    held: np.ndarray  # of what a held joint carries
+    fixed: tuple[str, ...]  # links that are fixed to it
+    pointlike: tuple[str, ...]  # links with mass but without moments of inertia
 
 
-def moving_joints(text: str) -> tuple[str, ...]:
-    """Return the names of all moving joints of a URDF."""
-    return tuple(name for name, joint in _parse(text)[1].items() if joint.get('type') in MOVING)
+class Tree(NamedTuple):
+    """Links and joints of a URDF by name."""
 
+    links: Mapping[str, ET.Element]
+    joints: Mapping[str, ET.Element]
 
-def attached(
-    text: str, link: str, joints: Sequence[str], *, moves: bool = False
-) -> tuple[list[str], np.ndarray]:
-    """Return the links fixed to a link, and the pseudo-inertia (4, 4) of those held at position 0.
+    @classmethod
+    def of(cls, text: str) -> Tree:
+        """Read a URDF."""
+        robot = _robot(text)
+        named = []
+        for tag in ('link', 'joint'):
+            elements = robot.findall(tag)
+            if len(elements) > _MOST:
+                raise UrdfError(f'the URDF has {len(elements)} {tag}s; at most {_MOST} can be read')
+            named.append({element.get('name', ''): element for element in elements})
+            if len(named[-1]) < len(elements):
+                raise UrdfError(f'each {tag} needs a unique name; got {_listed(named[-1])}')
+        tree = cls(*named)
+        tree._check()
+        return tree
 
-    `joints` are the joints of the chain; the pseudo-inertia is in the frame of the link.
-    """
-    links, elements = _parse(text)
-    names: list[str] = []
-    J = np.zeros((4, 4))
-    for name, element in elements.items():
-        if _link(element, 'parent') == link and name not in joints:
-            child, frame = _link(element, 'child'), _origin(element)
-            is_held = moves or element.get('type') != 'fixed'
-            beyond, held = attached(text, child, joints, moves=is_held)
-            names += beyond if is_held else [child, *beyond]
-            J += frame @ (held + is_held * _link_inertia(links[child])) @ frame.T
-    return names, J
+    def _check(self) -> None:
+        """Check that each joint has its links, and each link at most one joint above it."""
+        children: set[str] = set()
+        for name, joint in self.joints.items():
+            for role in ('parent', 'child'):
+                if _link(joint, role) not in self.links:
+                    raise UrdfError(
+                        f'joint {name!r} has the {role} {_link(joint, role)!r}, but the links are '
+                        f'{_listed(self.links)}: correct its <{role}>'
+                    )
+            child = _link(joint, 'child')
+            if child in children:
+                raise UrdfError(
+                    f'link {child!r} is the child of two joints: closed chains are not '
+                    'supported; open the chain by removing a joint'
+                )
+            children.add(child)
 
+    @property
+    def root(self) -> str:
+        """The link that no joint carries."""
+        moved = {_link(joint, 'child') for joint in self.joints.values()}
+        for link in self.links:
+            if link not in moved:
+                return link
+        raise UrdfError(
+            f'no link is the root: the links are {_listed(self.links)}, each below a joint'
+        )
 
-def _path(links: Elements, elements: Elements, base: str, tip: str) -> list[ET.Element]:
-    """Return the joints from the base to the tip."""
-    for role, link in (('base', base), ('tip', tip)):
-        if link not in links:
-            raise UrdfError(f'no link {link!r} for the {role}: the links are {_listed(links)}')
-    above = {_link(element, 'child'): element for element in elements.values()}
-    path: list[ET.Element] = []
-    link = tip
-    while link != base:
-        if link not in above or len(path) > len(elements):
+    def joint(self, name: str) -> ET.Element:
+        """Return a joint by name."""
+        if name not in self.joints:
+            raise UrdfError(f'no joint {name!r} in the URDF: its joints are {_listed(self.joints)}')
+        return self.joints[name]
+
+    def path(self, base: str, tip: str) -> list[ET.Element]:
+        """Return the joints from a link to another."""
+        for role, link in (('base', base), ('tip', tip)):
+            if link not in self.links:
+                raise UrdfError(
+                    f'no link {link!r} for the {role}: the links are {_listed(self.links)}'
+                )
+        above = {_link(joint, 'child'): joint for joint in self.joints.values()}
+        path: list[ET.Element] = []
+        link = tip
+        while link != base:
+            if link not in above or len(path) > len(self.joints):
+                raise UrdfError(
+                    f'the path up from the tip {tip!r} ends at {link!r} without reaching the base '
+                    f'{base!r}: choose a tip below the base'
+                )
+            path.insert(0, above[link])
+            link = _link(path[0], 'parent')
+        return path
+
+    def moving_paths(self) -> list[tuple[str, ...]]:
+        """Return, for each moving joint, the moving joints from the root to it."""
+        ends = (
+            _link(joint, 'child') for joint in self.joints.values() if joint.get('type') in _MOVING
+        )
+        return [_moving(self.path(self.root, end)) for end in ends]
+
+    def only_chain(self) -> tuple[str, ...]:
+        """Return the moving joints, which must be one chain."""
+        paths = self.moving_paths()
+        longest = max(paths, key=len, default=())
+        if len(longest) < len(paths) or not longest:
             raise UrdfError(
-                f'the path up from the tip {tip!r} ends at {link!r} without reaching the base '
-                f'{base!r}: choose a tip below the base'
+                'neither a tip nor joints were given, and the moving joints are not one chain: '
+                f'{_listed(path[-1] for path in paths)}. Set robot.tip to the last link of the arm'
             )
-        path.insert(0, above[link])
-        link = _link(path[0], 'parent')
-    return path
+        return longest
+
+    def body(self, link: str, joints: Sequence[str]) -> _Body:
+        """Return a link with all that it carries, where no other joint than `joints` moves."""
+        J, held = _link_inertia(self.links[link]), np.zeros((4, 4))
+        tensor = self.links[link].find('inertial/inertia')
+        has_moments = any(_number(tensor, f'i{axis}{axis}') for axis in 'xyz')
+        fixed, pointlike = [], [link] if J[3, 3] > 0.0 and not has_moments else []
+        for name, joint in self.joints.items():
+            if _link(joint, 'parent') != link or name in joints:
+                continue
+            kind, child = joint.get('type'), _link(joint, 'child')
+            if kind not in (*_MOVING, 'fixed'):
+                raise UrdfError(f'joint {name!r} on {link!r} is {kind}: remove it from the URDF')
+            frame, beyond = _origin(joint), self.body(child, joints)
+            J = J + frame @ beyond.J @ frame.T
+            held += frame @ (beyond.held if kind == 'fixed' else beyond.J) @ frame.T
+            fixed += [child, *beyond.fixed] if kind == 'fixed' else []
+            pointlike += beyond.pointlike
+        return _Body(J, held, tuple(fixed), tuple(pointlike))
 
 
-def _body(
-    links: Elements,
-    elements: Elements,
-    link: str,
-    joints: Sequence[str],
-    found: tuple[list[str], list[str]],
-) -> np.ndarray:
-    """Return the pseudo-inertia (4, 4) of a link and all fixed to it.
-
-    Adds the held joints and the links without moments of inertia to the lists `found`.
-    """
-    held, pointlike = found
-    J = _link_inertia(links[link])
-    tensor = links[link].find('inertial/inertia')
-    if J[3, 3] > 0.0 and not any(_number(tensor, f'i{axis}{axis}') for axis in 'xyz'):
-        pointlike.append(link)
-    for name, element in elements.items():
-        if _link(element, 'parent') != link or name in joints:
-            continue
-        kind = element.get('type')
-        if kind in MOVING:
-            held.append(name)
-        elif kind != 'fixed':
-            raise UrdfError(f'joint {name!r} on {link!r} is {kind}: remove it from the URDF')
-        frame = _origin(element)
-        J = J + frame @ _body(links, elements, _link(element, 'child'), joints, found) @ frame.T
-    return J
-
-
-def _parse(text: str) -> tuple[Elements, Elements]:
-    """Return the links and joints of a URDF by name."""
+def _robot(text: str) -> ET.Element:
+    """Return the root element of a URDF."""
     expand = 'expand it first: `xacro FILE > robot.urdf` (from ROS or `pip install xacro`)'
     if '<!DOCTYPE' in text:  # its entities could expand to gigabytes
         raise UrdfError('a URDF must not have a <!DOCTYPE ...>: remove it and expand its entities')
@@ -230,53 +274,23 @@ def _parse(text: str) -> tuple[Elements, Elements]:
             raise UrdfError(f'<{element.tag}> is xacro, not URDF: {expand}')
     if robot.tag != 'robot':
         raise UrdfError(f'the root of a URDF is <robot>, not <{robot.tag}>: give another file')
-    named = []
-    for tag in ('link', 'joint'):
-        elements = robot.findall(tag)
-        if len(elements) > _MOST:
-            raise UrdfError(f'the URDF has {len(elements)} {tag}s; at most {_MOST} can be read')
-        named.append({element.get('name', ''): element for element in elements})
-        if len(named[-1]) < len(elements):
-            raise UrdfError(f'each {tag} needs a unique name; got {_listed(named[-1])}')
-    _check_tree(*named)
-    return named[0], named[1]
+    return robot
 
 
-def _check_tree(links: Elements, joints: Elements) -> None:
-    children = [_link(joint, 'child') for joint in joints.values()]
-    for name, joint in joints.items():
-        for role in ('parent', 'child'):
-            if _link(joint, role) not in links:
-                raise UrdfError(
-                    f'joint {name!r} has the {role} {_link(joint, role)!r}, but the links are '
-                    f'{_listed(links)}: correct its <{role}>'
-                )
-        if children.count(_link(joint, 'child')) > 1:
-            raise UrdfError(
-                f'link {_link(joint, "child")!r} is the child of two joints: closed chains are not '
-                'supported; open the chain by removing a joint'
-            )
+def _moving(path: Sequence[ET.Element]) -> tuple[str, ...]:
+    return tuple(str(joint.get('name')) for joint in path if joint.get('type') in _MOVING)
 
 
-def _check_joints(path: Sequence[ET.Element], elements: Elements, joints: Sequence[str]) -> None:
-    for name in joints:
-        if name not in elements:
-            raise UrdfError(f'no joint {name!r} in the URDF: its joints are {_listed(elements)}')
+def _check_kinds(path: Sequence[ET.Element]) -> None:
     for element in path:
         name, kind = element.get('name', ''), element.get('type')
-        if kind not in (*MOVING, 'fixed'):
-            raise UrdfError(f'joint {name!r} is {kind}; expected fixed, {_listed(MOVING)}')
+        if kind not in (*_MOVING, 'fixed'):
+            raise UrdfError(f'joint {name!r} is {kind}; expected fixed, {_listed(_MOVING)}')
         if element.find('mimic') is not None:
             raise UrdfError(f'joint {name!r} mimics another: choose a base and a tip without it')
-    moving = [element.get('name') for element in path if element.get('type') != 'fixed']
-    if not moving or list(joints) != moving:
-        raise UrdfError(
-            f'the moving joints from base to tip are {_listed(moving)}, in this order; got '
-            f'{_listed(joints)}: list them like this, or choose another base or tip'
-        )
 
 
-def _joint(element: ET.Element, placement: np.ndarray, J: np.ndarray) -> Joint:
+def _joint(element: ET.Element, placement: np.ndarray, body: _Body) -> Joint:
     name, kind = element.get('name', ''), element.get('type', '')
     axis = _numbers(element.find('axis'), 'xyz', '1 0 0')
     length = float(np.linalg.norm(axis))
@@ -309,7 +323,9 @@ def _joint(element: ET.Element, placement: np.ndarray, J: np.ndarray) -> Joint:
         damping=_number(dynamics, 'damping'),
         friction=_number(dynamics, 'friction'),
         link=_link(element, 'child'),
-        inertia=inertia_of(J),
+        inertia=inertia_of(body.J),
+        fixed=body.fixed,
+        held=body.held,
     )
 
 

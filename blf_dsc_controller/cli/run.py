@@ -6,14 +6,12 @@ from __future__ import annotations
 import itertools
 import sys
 from argparse import Namespace
-from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
 from tqdm import tqdm
 
 from blf_dsc_controller.bags.content import read_content
@@ -31,7 +29,7 @@ from blf_dsc_controller.configuration.nodes import (
 from blf_dsc_controller.configuration.plant import PlantConfig
 from blf_dsc_controller.configuration.schema import change
 from blf_dsc_controller.errors import BlfDscError
-from blf_dsc_controller.law.factory import estimate_names, model_of
+from blf_dsc_controller.law.factory import estimate_names
 from blf_dsc_controller.law.telemetry import rejected_columns
 from blf_dsc_controller.reference.approach import plan_start
 from blf_dsc_controller.simulation.bag import write_bag
@@ -39,7 +37,7 @@ from blf_dsc_controller.simulation.loop import Record, simulate
 from blf_dsc_controller.supervision.config_warnings import config_warnings, expectation
 from blf_dsc_controller.supervision.guard import Guard
 from blf_dsc_controller.supervision.supervisor import Reason
-from sim_plant.plant import parameter_order, parameters_of, plant_of
+from sim_plant.plant import plant_of
 
 STOPPED = 5
 """Exit code if the controller stopped before the end."""
@@ -128,14 +126,12 @@ def _configuration(options: Namespace) -> LoopConfig:
 
 
 def _run_offline(config: LoopConfig, bag: Path) -> None:
-    parameters = model_of(config.controller).parameter_names
-    progress = LoopProgress(config.plant, parameters)
+    progress = LoopProgress(config.plant.duration)
 
     def show(record: Record, rows: int) -> None:
         n = len(record.config.joints)
         errors = abs(record.samples[:rows, 2 * n : 3 * n] / record.samples[:rows, 6 * n : 7 * n])
-        estimate = record.controller.state.estimate[: len(parameters)]
-        progress.show(record.stamps[rows - 1] * 1e-9, np.nanmax(errors), estimate)
+        progress.show(record.stamps[rows - 1] * 1e-9, np.nanmax(errors))
 
     with announced_compilation(print_notice):
         record = simulate(config.controller, config.plant, show)
@@ -186,31 +182,21 @@ def _report(out: Path) -> bool:
 
 
 class LoopProgress:
-    """Progress over simulated time, with the largest |xi1| / k_c and the parameter error.
+    """Progress over simulated time, with the largest |xi1| / k_c.
 
     A bar on a terminal, otherwise (as in a log) a line every few seconds.
     """
 
-    def __init__(self, config: PlantConfig, parameters: Sequence[str]) -> None:
-        """Begin at 0 s; `parameters` are the names of the estimates."""
-        self._order = parameter_order(parameters, config)
-        self._compares = not config.robot.urdf and (self._order >= 0).all()  # else mixed units
-        self._config = config
-        self._is_bar = sys.stderr.isatty()
+    def __init__(self, duration: float) -> None:
+        """Begin at 0 s of the simulated duration [s]."""
+        self._duration, self._is_bar = duration, sys.stderr.isatty()
         form, pause = (_BAR, 0.2) if self._is_bar else (_LINE, _LINE_PERIOD)
-        self._bar = tqdm(
-            total=config.duration, desc='closed loop', bar_format=form, mininterval=pause
-        )
+        self._bar = tqdm(total=duration, desc='closed loop', bar_format=form, mininterval=pause)
 
-    def show(self, elapsed: float, ratio: float, estimate: ArrayLike) -> None:
-        """Show the simulated time [s], the largest |xi1| / k_c so far, and P^ (p,)."""
-        status = f'max|xi1|/bound {ratio:.2f}'
-        if self._compares:
-            P = parameters_of(self._config, elapsed)[self._order]
-            error = np.linalg.norm(np.asarray(estimate) - P) / np.linalg.norm(P)
-            status += f', parameter error {100 * error:.2f} %'
-        self._bar.set_postfix_str(status, refresh=False)
-        self._bar.update(min(elapsed, self._config.duration) - self._bar.n)
+    def show(self, elapsed: float, ratio: float) -> None:
+        """Show the simulated time [s] and the largest |xi1| / k_c so far."""
+        self._bar.set_postfix_str(f'max|xi1|/bound {ratio:.2f}', refresh=False)
+        self._bar.update(min(elapsed, self._duration) - self._bar.n)
 
     def write(self, text: str) -> None:
         """Print a line without disturbing the bar."""

@@ -14,11 +14,8 @@ import signal
 import socket
 import subprocess
 import sys
-import time
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack, contextmanager, nullcontext
-from functools import partial
-from math import inf
+from collections.abc import Iterator
+from contextlib import ExitStack, closing, contextmanager, nullcontext
 from pathlib import Path
 
 import rclpy
@@ -30,8 +27,6 @@ from blf_dsc_controller.compiled.jit import COMPILING
 from blf_dsc_controller.configuration.files import share_folder
 from blf_dsc_controller.configuration.nodes import CONTROLLER, PLANT, RECORDER, VIEW, LoopConfig
 from blf_dsc_controller.errors import BlfDscError
-from blf_dsc_controller.law.factory import model_of
-from blf_dsc_controller.law.telemetry import DECIMATION
 from blf_dsc_controller.messages import topics
 from blf_dsc_controller.messages.topics import RATIO
 from blf_dsc_controller.nodes.endpoints import qos_profile
@@ -51,9 +46,7 @@ _ROOM = 1_000_000  # bytes; with less free space the disk counts as full
 _PR_SET_PDEATHSIG = 1
 _LIBC = ctypes.CDLL(None)  # loaded before there are threads
 _VIEW_PORT = 8080  # or the next free one
-FIRST_SIGN = 5.0  # s, at most, to the first message of a running loop, even on a busy machine
-_LAST = 1.0  # s without a message after which none is expected, even on a busy machine
-_LINGER = 0.5  # s to wait for messages of an interrupted loop that still runs
+_IN_TRANSIT = 0.5  # s, at most, between messages that are still on their way at the end
 _RANGE = 'ROS_AUTOMATIC_DISCOVERY_RANGE'
 _PROFILES = 'FASTRTPS_DEFAULT_PROFILES_FILE'
 _DOMAINS = range(1, 101)  # 0 is the default; above 101, ports are ephemeral
@@ -123,7 +116,7 @@ class NodeProcess:
         new, self._noticed = notices[self._noticed :], len(notices)
         return [f'{self.name}: {notice}' for notice in new]
 
-    def check(self, remark: str = '') -> None:
+    def check(self) -> None:
         """Raise NodeFailedError, with the end of the log, if the node exited with an error."""
         code = self._process.poll()
         if not code:
@@ -134,7 +127,7 @@ class NodeProcess:
             end = f'was terminated by {names.get(-code, f"signal {-code}")}'
         lines = self._log.read_text(encoding='utf-8', errors='replace').splitlines()[-_TAIL:]
         tail = ''.join(f'\n  {line}' for line in lines)
-        raise NodeFailedError(f'{self.name} {end}{remark}:{tail}\n(full log: {self._log})')
+        raise NodeFailedError(f'{self.name} {end}:{tail}\n(full log: {self._log})')
 
     def stop(self) -> None:
         """Interrupt the node and wait until it exits; kill it if it takes too long."""
@@ -159,56 +152,27 @@ def _run_nodes(config: LoopConfig, params_file: Path, logs: Path, view: str | No
             ending.callback(node.stop)
             return node
 
-        def show_page(host: str) -> None:
-            from blf_dsc_controller.view.page import free_port, url_of
+        is_lockstep = config.plant.mode == 'lockstep'
+        nodes = list(map(started, (RECORDER, *((_LOOP,) if is_lockstep else (CONTROLLER, PLANT)))))
+        monitor = ending.enter_context(closing(ProgressMonitor(config.plant.duration)))
+        while all(node.is_running for node in nodes) and not interrupts:
+            monitor.wait(0.1)
+            if not monitor.has_begun:
+                for notice in itertools.chain(*(node.new_notices() for node in nodes)):
+                    monitor.progress.write(notice)
+            elif view:
+                from blf_dsc_controller.view.page import free_port, url_of
 
-            port = free_port(host, _VIEW_PORT)
-            started(VIEW, '-p', f'host:={host}', '-p', f'port:={port}')
-            monitor.progress.write(f'the page: {url_of(host, port)}')
-
-        recorder = started(RECORDER)
-        names = [_LOOP] if config.plant.mode == 'lockstep' else [CONTROLLER, PLANT]
-        loop = [started(name) for name in names]
-        with ProgressMonitor(config, interrupts) as monitor:
-            _watch(monitor, recorder, loop, interrupts, partial(show_page, view) if view else None)
-        remark = '' if recorder.is_running else ' while the loop continued without it'
-    for node in loop:
+                # Only now, since the nodes wait for a subscriber, which must be the recorder.
+                port = free_port(view, _VIEW_PORT)
+                started(VIEW, '-p', f'host:={view}', '-p', f'port:={port}')
+                monitor.progress.write(f'the page: {url_of(view, port)}')
+                view = None
+        while not interrupts and monitor.wait(_IN_TRANSIT):
+            pass
+    for node in nodes:
         node.check()
-    recorder.check(remark)
     return not interrupts
-
-
-def _watch(
-    monitor: ProgressMonitor,
-    recorder: NodeProcess,
-    loop: list[NodeProcess],
-    interrupts: list[int],
-    show_page: Callable[[], None] | None,
-) -> None:
-    """Show the progress until the plant exits, a signal arrives or a node fails.
-
-    The page is started after the first message of the loop, since the nodes wait for a subscriber,
-    which must be the recorder. That message may arrive a bit after the recorder has ended.
-    """
-    ended, is_recorded = inf, True
-    while loop[-1].is_running and not interrupts:
-        for node in loop:
-            node.check()
-        monitor.wait(0.1)
-        if not monitor.has_begun:
-            for notice in itertools.chain(*(node.new_notices() for node in loop)):
-                monitor.progress.write(notice)
-        elif show_page is not None:
-            show_page()
-            show_page = None
-        if recorder.is_running or not is_recorded:
-            continue
-        ended = min(ended, time.monotonic())
-        if monitor.has_begun:
-            is_recorded = False
-            monitor.progress.write(f'{recorder.name} has ended: the loop continues unrecorded')
-        elif time.monotonic() > ended + FIRST_SIGN:
-            recorder.check()
 
 
 def _die_with_parent() -> None:
@@ -218,13 +182,10 @@ def _die_with_parent() -> None:
 class ProgressMonitor:
     """Progress display of the loop that runs in this process's ROS domain."""
 
-    def __init__(self, config: LoopConfig, interrupts: Sequence[int]) -> None:
-        plant = config.plant
-        self._interrupts = interrupts
-        self._parameters = model_of(config.controller).parameter_names
-        self.progress = LoopProgress(plant, self._parameters)
-        self._start, self._elapsed = -1.0, 0.0
-        self._end = plant.duration - DECIMATION * plant.sample_time / 2
+    def __init__(self, duration: float) -> None:
+        """Wait for a loop of this simulated duration [s]."""
+        self.progress = LoopProgress(duration)
+        self._start: float | None = None
         self._received: list[JointState] = []
         self._context = rclpy.Context()
         rclpy.init(context=self._context, signal_handler_options=rclpy.SignalHandlerOptions.NO)
@@ -241,7 +202,7 @@ class ProgressMonitor:
     @property
     def has_begun(self) -> bool:
         """Whether a message of the loop has been received."""
-        return self._start >= 0.0
+        return self._start is not None
 
     def wait(self, seconds: float) -> bool:
         """Wait for a message and show it; return False if none arrived."""
@@ -250,39 +211,19 @@ class ProgressMonitor:
             return False
         message = self._received[-1]
         self._received.clear()
-        values = dict(zip(message.name, message.position, strict=True))
-        if not values.keys() >= set(self._parameters):
-            return False  # of another arm in the same ROS domain
+        values = zip(message.name, message.position, strict=True)
+        ratio = max(value for name, value in values if name.startswith(RATIO))
         stamp = message.header.stamp.sec + 1e-9 * message.header.stamp.nanosec
-        if not self.has_begun:
-            self._start = stamp
-        ratio = max(value for name, value in values.items() if name.startswith(RATIO))
-        self._elapsed = stamp - self._start
-        self.progress.show(self._elapsed, ratio, [values[name] for name in self._parameters])
+        self._start = stamp if self._start is None else self._start
+        self.progress.show(stamp - self._start, ratio)
         return True
 
-    def __enter__(self) -> ProgressMonitor:
-        return self
-
-    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
-        if kind is None:
-            self._receive_last()
+    def close(self) -> None:
+        """Leave the ROS domain."""
         self.progress.close()
         self._executor.shutdown()
         self._node.destroy_node()
         rclpy.try_shutdown(context=self._context)
-
-    def _receive_last(self) -> None:
-        """Show the messages still in transit, up to that of the last sample.
-
-        A short run in lock-step may be over before its controller has been discovered.
-        """
-        wait = _LAST if self.has_begun else FIRST_SIGN
-        wait = _LINGER if self._interrupts else wait
-        deadline = time.monotonic() + wait
-        while self._elapsed < self._end and time.monotonic() < deadline:
-            if self.wait(0.05) and not self._interrupts:
-                deadline = time.monotonic() + wait
 
 
 def localhost_environment() -> dict[str, str]:

@@ -20,9 +20,7 @@ import math
 import re
 import stat
 import sys
-import sysconfig
 from collections.abc import Callable, Iterator
-from contextlib import suppress
 from pathlib import Path
 from typing import Any, NamedTuple, cast
 
@@ -42,6 +40,8 @@ _SPECIAL = re.compile(r'[+-]?(?i:inf|infinity|nan)|[+-]?\.(?:inf|Inf|INF)|\.(?:n
 _MARK = 'ros__parameters'
 _PART = re.compile(r'\*|\*\*|[A-Za-z_][A-Za-z0-9_]*')
 _PACKAGE = 'blf_dsc_controller'
+_PRESET = 'config/recommended.yaml'
+_ABOVE = Path(__file__).resolve().parents[2:]  # the source tree, or below the prefix
 _LARGEST = 1 << 24  # bytes of a parameter file, a URDF or a metadata.yaml
 _MOST_NODES = 50_000
 _DEEPEST = 50
@@ -230,22 +230,20 @@ def load_yaml(text: str) -> Any:
     return yaml.load(text, Loader=_Loader)  # noqa: S506 - a safe loader
 
 
-_CHECKOUT = Path(__file__).resolve().parents[2]
-
-
 def share_folder() -> Path:
     """Return the folder that holds `config/` and `launch/`, regardless of the current folder.
 
-    If the code runs from a source tree, as in an editable install, that comes first; then the ament
-    index (colcon), then the data folders of this Python (pip).
+    That is the source tree, as in an editable install, or `share/blf_dsc_controller` of the prefix
+    where colcon or pip installed this file.
 
     Raises BlfDscError, listing the places searched, if the folder is not found.
     """
     searched = []
-    for folder in _candidates():
-        if (folder / 'config').is_dir():
-            return folder
-        searched.append(f'\n  - {folder / "config"}')
+    for folder in _ABOVE:
+        for found in (folder, folder / 'share' / _PACKAGE):
+            if (found / _PRESET).is_file():
+                return found
+            searched.append(f'\n  - {found / _PRESET}')
     raise BlfDscError(
         f'the data files of {_PACKAGE} were not found: install the package again. '
         f'Searched:{"".join(searched)}'
@@ -289,14 +287,3 @@ def _share_of(package: str) -> Path:
         raise BlfDscError(
             f'package {package!r} was not found: source the workspace that has it, or give a path'
         ) from error
-
-
-def _candidates() -> Iterator[Path]:
-    if (_CHECKOUT / 'setup.py').is_file():
-        yield _CHECKOUT
-    with suppress(ImportError, LookupError, OSError):  # no ROS, no index, or package not in it
-        from ament_index_python.packages import get_package_share_directory
-
-        yield Path(get_package_share_directory(_PACKAGE))
-    for scheme in (sysconfig.get_default_scheme(), sysconfig.get_preferred_scheme('user')):
-        yield Path(sysconfig.get_path('data', scheme), 'share', _PACKAGE)

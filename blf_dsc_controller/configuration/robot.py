@@ -3,10 +3,8 @@
 
 from __future__ import annotations
 
-import functools
 import math
 from collections.abc import Iterator, Mapping
-from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
 from typing import Annotated, Any, Literal
@@ -20,7 +18,7 @@ from blf_dsc_controller.arms.base_parameters import (
 )
 from blf_dsc_controller.arms.inertia import inertia_of
 from blf_dsc_controller.arms.serial_chain import serial_chain
-from blf_dsc_controller.arms.urdf import Chain, UrdfError, chain_joints, moving_joints, read_chain
+from blf_dsc_controller.arms.urdf import Chain, read_chain
 from blf_dsc_controller.configuration.files import read_text, resolve
 from blf_dsc_controller.configuration.schema import (
     PerJoint,
@@ -118,7 +116,7 @@ class Robot:
 
     def chain(self, joints: tuple[str, ...]) -> Chain:
         """Return the serial chain of the joints; raises BlfDscError if there is none."""
-        return chain_of(self.text, self.base, self.tip, joints)
+        return read_chain(self.text, self.base, self.tip, joints)
 
     def friction(self, chain: Chain) -> dict[str, tuple[float, ...]]:
         """Return the initial friction of each joint, by the name of its column."""
@@ -202,31 +200,9 @@ def read_urdf(given: str) -> str:
     return text
 
 
-@functools.lru_cache(maxsize=16)
-def chain_of(text: str, base: str, tip: str, joints: tuple[str, ...]) -> Chain:
-    """Return the chain; an empty base is the root, an empty tip the link of the last joint.
-
-    Without tip and joints, all moving joints must form one chain.
-    """
-    if tip or joints:
-        return read_chain(text, *chain_joints(text, base, tip, joints))
-    moving = moving_joints(text)
-    for last in moving:
-        with suppress(UrdfError):  # not a descendant of the base
-            start, end, _ = chain_joints(text, base, '', (last,))
-            found = chain_joints(text, start, end, ())[2]
-            if len(found) == len(moving):
-                return read_chain(text, start, end, found)
-    raise UrdfError(
-        'neither a tip nor joints were given, and the moving joints are not one chain: '
-        f'{", ".join(moving) or "nothing"}. Set robot.tip to the last link of the arm'
-    )
-
-
 def parameters_of(robot: Robot, chain: Chain) -> BaseParameters:
     """Return the base parameters of the arm, with the rotors."""
-    x, y, z = robot.gravity
-    return base_parameters(chain, (x, y, z))
+    return base_parameters(chain, robot.gravity)
 
 
 def drive_model(robot: Robot, joints: tuple[str, ...]) -> tuple[np.ndarray, np.ndarray]:
@@ -239,8 +215,7 @@ def drive_model(robot: Robot, joints: tuple[str, ...]) -> tuple[np.ndarray, np.n
     chain = robot.chain(joints)
     columns = [(i, entry) for i in range(len(chain.joints)) for entry in range(_MOMENTS)]
     inertias = robot.drive_inertias(chain, chain.inertias)
-    x, y, z = robot.gravity
-    return serial_chain(chain, (x, y, z), columns).vector, inertias[:, :_MOMENTS].ravel()
+    return serial_chain(chain, robot.gravity, columns).vector, inertias[:, :_MOMENTS].ravel()
 
 
 def given_robot(given: Mapping[str, Any]) -> tuple[Robot, Chain]:

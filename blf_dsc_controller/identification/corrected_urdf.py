@@ -14,7 +14,7 @@ from xml.parsers import expat
 import numpy as np
 
 from blf_dsc_controller.arms.inertia import pseudo_inertia, rotational_inertia
-from blf_dsc_controller.arms.urdf import Chain, attached
+from blf_dsc_controller.arms.urdf import Chain
 from blf_dsc_controller.run import Floats
 
 
@@ -25,14 +25,12 @@ def corrected_urdf(
 
     `note` is added as a comment at the end.
     """
-    joints = [joint.name for joint in chain.joints]
     parts: dict[tuple[str, str], str] = {}  # of links and joints by name
     for joint, inertia, damping, friction in zip(
         chain.joints, inertias, viscous, coulomb, strict=True
     ):
-        fixed, held = attached(text, joint.link, joints)
-        parts |= {('link', name): '' for name in fixed}
-        parts['link', joint.link] = _inertial(pseudo_inertia(inertia) - held)
+        parts |= {('link', name): '' for name in joint.fixed}
+        parts['link', joint.link] = _inertial(pseudo_inertia(inertia) - joint.held)
         numbers = f'damping="{damping:.12g}" friction="{friction:.12g}"'
         parts['joint', joint.name] = f'<dynamics {numbers} />'
     raw = text.encode()

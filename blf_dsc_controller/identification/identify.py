@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from blf_dsc_controller.arms.base_parameters import BaseParameters, base_parameters
 from blf_dsc_controller.arms.serial_chain import ROTOR
-from blf_dsc_controller.arms.urdf import Chain, attached
+from blf_dsc_controller.arms.urdf import Chain
 from blf_dsc_controller.bags.content import NO_NAMES, NameMap
 from blf_dsc_controller.configuration.robot import Robot
 from blf_dsc_controller.errors import BlfDscError
@@ -156,8 +156,7 @@ def identify_arm(
     """
     chain = robot.chain(recording.joints)
     n = len(chain.joints)
-    x, y, z = robot.gravity
-    parameters = base_parameters(chain, (x, y, z))
+    parameters = base_parameters(chain, robot.gravity)
     duration = recording.q.shape[0] * recording.period
     if duration < _SHORTEST:
         raise BlfDscError(f'the bag holds {duration:.3g} s; record at least {_SHORTEST:g} s')
@@ -166,10 +165,9 @@ def identify_arm(
     P = parameters.of(chain.inertias, robot.rotors(chain))
     if effort == 'without-gravity':
         rows = rows._replace(torque=recording.torque + rows.gravity_torque(P))
-    held = [attached(robot.text, joint.link, recording.joints)[1] for joint in chain.joints]
     largest = np.maximum(np.abs(rows.torque).max(axis=0), 1e-6)
     speed = np.maximum(rows.speed, _STILL)
-    full = prior_of(robot, chain, held, largest, speed, load=picked_up is not None)
+    full = prior_of(robot, chain, largest, speed, load=picked_up is not None)
     G = base_matrix(parameters, n)
     if picked_up is not None:
         K = parameters.K[:, -(ROTOR + 1) : -1]

@@ -16,7 +16,7 @@ most mu times the number of rows of all J_i and s_k above its minimum.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection
 from typing import NamedTuple
 
 import numpy as np
@@ -97,7 +97,6 @@ class Prior(NamedTuple):
 def prior_of(
     robot: Robot,
     chain: Chain,
-    held: Sequence[Floats],
     torque: Floats,
     speed: Floats,
     *,
@@ -105,8 +104,7 @@ def prior_of(
 ) -> Prior:
     """Return the prior of a chain: inertias as for learning, joint terms scaled by the recording.
 
-    `held` are lower bounds (4, 4) of the pseudo-inertias of the bodies; `torque` and `speed` (n,)
-    are the largest of each joint; `load` says whether one is picked up.
+    `torque` and `speed` (n,) are the largest of each joint; `load` says whether one is picked up.
     """
     from scipy.linalg import block_diag
 
@@ -118,8 +116,8 @@ def prior_of(
             J = chain.tip_placement @ payload_inertia(robot.payload) @ chain.tip_placement.T
             both = np.column_stack((D, deviations(J, 1.0, PAYLOAD_SIZE)))
             D = np.transpose(np.linalg.qr(both.T, mode='r'))
-        own = pseudo_inertia(joint.inertia) - held[i]
-        inside = inertia_of(_inside(own, joint.inertia[0]) + held[i])
+        own = pseudo_inertia(joint.inertia) - joint.held
+        inside = inertia_of(_inside(own, joint.inertia[0]) + joint.held)
         blocks.append(D)
         start.append(np.linalg.solve(D, inside - joint.inertia))
         cones.append(Cone(10 * i, own, np.array([pseudo_inertia(d) for d in D.T])))

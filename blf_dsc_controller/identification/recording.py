@@ -30,7 +30,7 @@ from numpy.typing import NDArray
 
 from blf_dsc_controller.arms.model import regressors_at
 from blf_dsc_controller.arms.serial_chain import SerialChain
-from blf_dsc_controller.arms.urdf import chain_joints, moving_joints
+from blf_dsc_controller.arms.urdf import Tree
 from blf_dsc_controller.bags.content import NO_NAMES, NameMap, read_content
 from blf_dsc_controller.bags.reader import applied_torque, single_run
 from blf_dsc_controller.bags.sources import BagError
@@ -92,10 +92,7 @@ def _arm_joints(text: str, in_bag: set[str], names: NameMap) -> tuple[str, ...]:
     Where it branches, as into fingers, the arm is the only branch with several joints in the bag.
     """
     ours = in_bag | {our for our, their in names.joints.items() if their in in_bag}
-    paths = []
-    for joint in moving_joints(text):
-        base, tip, _ = chain_joints(text, '', '', (joint,))
-        paths.append(chain_joints(text, base, tip, ())[2])
+    paths = Tree.of(text).moving_paths()
     arm: tuple[str, ...] = ()
     while True:
         beyond = [path for path in paths if path[: len(arm)] == arm and path != arm]

@@ -16,10 +16,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from blf_dsc_controller.arms.two_link import urdf
-from blf_dsc_controller.arms.urdf import Chain
+from blf_dsc_controller.arms.urdf import Chain, read_chain
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.files import resolve
-from blf_dsc_controller.configuration.robot import chain_of
 from blf_dsc_controller.errors import BlfDscError
 
 _THICKNESS = 0.025  # radius of a link relative to the length of all links
@@ -54,7 +53,7 @@ def arm_of(config: ControllerConfig, lengths: Sequence[float] = ()) -> ShownArm:
         return ShownArm(robot.text, robot.chain(config.joints))
     lengths = lengths or (config.arm.l1,) * 2
     text = with_cylinders(urdf('arm', config.joints, lengths, (1.0, 1.0), (0.0, 0.0)), sum(lengths))
-    return ShownArm(text, chain_of(text, '', 'tip', config.joints))
+    return ShownArm(text, read_chain(text, '', 'tip', config.joints))
 
 
 def with_known_meshes(text: str, chain: Chain) -> str:
@@ -65,7 +64,7 @@ def with_known_meshes(text: str, chain: Chain) -> str:
         if not all(f'"{name}"' in known for name in names):
             continue
         with suppress(BlfDscError):
-            joints = chain_of(known, '', chain.joints[-1].link, names).joints
+            joints = read_chain(known, '', chain.joints[-1].link, names).joints
             pairs = zip(joints, chain.joints, strict=True)
             if all(np.allclose(a.placement, b.placement, atol=_SAME) for a, b in pairs):
                 return _with_visuals(text, known)
