@@ -11,6 +11,7 @@ DURATION ?= 60
 # Of tests on two cores: many wait for other processes.
 WORKERS ?= 3
 MINUTES ?= 30
+CHANGING := events panda panda_500hz ur5e ur5e_500hz
 
 .DEFAULT_GOAL := help
 MAKEFLAGS += --no-print-directory
@@ -82,7 +83,9 @@ test-nightly: ## Run all tests, those left out by make test as well, at length a
 	@NIGHTLY=1 PYTEST_ADDOPTS='-m "" -rP' $(MAKE) test
 
 changes: $(READY) ## Simulate 14,000 randomly changing arms, each with and without learning, into out/changes
-	@$(RUN) benchmark/changing_arms.py
+	@for study in $(CHANGING); do $(RUN) -m blf_dsc_controller monte-carlo \
+	    --config monte_carlo_$$study --out out/changes/$$study || exit 1; done; \
+	$(RUN) -m blf_dsc_controller monte-carlo --report $(CHANGING:%=out/changes/%) --out out/changes
 
 bench: $(READY)-bench ## Run the benchmarks (GROUPS=offline for one group), into benchmark/RESULTS.md
 	@$(RUN) benchmark/harness.py $(GROUPS)

@@ -28,7 +28,6 @@ monte_carlo:
     runs: 24
     seed: 7
     settled_after: 0.2
-    moments: [0.1, 0.25]
     vary:
       arm.m2: uniform(0.3, 0.7)
       disturbance.constant: uniform(-0.2, 0.2)

@@ -101,29 +101,3 @@ def test_waiting_for_a_silent_contestant_times_out():
     nodes = importlib.import_module('nodes')
     with pytest.raises(nodes.ContestantError, match=r'after 0\.1 s waiting for a torque'):
         nodes.wait_for(lambda: False, 'a torque', timeout=0.1)
-
-
-@pytest.mark.usefixtures('blank_pictures')
-def test_changes_are_reported_in_one_table(tmp_path, monkeypatch):
-    """Of all studies, with what does not favour learning, and each exception's command."""
-    changes = importlib.import_module('changing_arms')
-    monkeypatch.setattr(changes, 'STUDIES', {'monte_carlo_events': 'two links'})
-    changes.main(['--runs', '3', '--workers', '1', '--out', str(tmp_path)])
-    written = (tmp_path / 'changes.md').read_text()
-    assert '| two links | 3 | ' in written
-
-    store = changes.Store(tmp_path / 'monte_carlo_events')
-    results = store.results()
-    noise = changes.Store(tmp_path / 'monte_carlo_events_noise').results()
-    errors = [name for name in noise if name.startswith('max_error_ratio')]
-    for name in errors:  # the same arms, but not the same runs
-        assert (noise[name] != results[f'without.{name}']).any()
-        np.testing.assert_allclose(noise[name], results[f'without.{name}'], rtol=0.3)
-    for outcomes in (results['outcome'], results['without.outcome'], noise['outcome']):
-        outcomes[:] = 'kept'
-    results['outcome'][1] = noise['outcome'][2] = 'violated'
-    written = changes.report({'monte_carlo_events': (store.study, results, noise)}, tmp_path)
-    assert ' | 1 / 0, 100.00 % | ' in written
-    assert '| two links | 3 | 2 / 3 | 1 / 0 | ' in written
-    assert 'two links, run 1: breaks the bound only with learning\n' in written
-    assert f'--reproduce {tmp_path / "monte_carlo_events"} 1 --out ' in written

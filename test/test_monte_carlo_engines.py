@@ -33,7 +33,6 @@ from blf_dsc_controller.studies.report import (
     influence,
     reproduce,
     summarize,
-    worst_first,
     write_report,
 )
 from blf_dsc_controller.studies.runs import Store, chunk_size, compute, run_chunk, warm_up
@@ -147,7 +146,7 @@ def test_killed_study_resumes(tmp_path):
     loop = LOOP.replace('duration: 0.3', 'duration: 3.0')
     path, out = write(tmp_path, loop + STUDY), tmp_path / 'out'
     command = [sys.executable, '-m', 'blf_dsc_controller', 'monte-carlo', '--config', path]
-    command += ['--out', out, '--workers', '2', '--chunk', '1']
+    command += ['--out', out, '--workers', '2']
     mark = str(uuid.uuid4())
     # What a killed process leaves goes with the logs of the suite.
     marked = {**os.environ, 'MARK': mark, 'TMPDIR': os.environ['ROS_LOG_DIR']}
@@ -248,9 +247,8 @@ def test_runs_are_sorted_worst_first_with_diverged_runs_before_all_others(whole_
     outcome[5] = 'diverged'
     results['outcome'] = outcome
     # The worse of both joints counts: ends before the middle, ties in the order of the runs.
-    assert worst_first(whole_store.study, results)[:5].tolist() == [5, 0, 23, 1, 22]
     summary = summarize(whole_store.study, results)
-    assert [entry['run'] for entry in summary['worst'][:3]] == [5, 0, 23]
+    assert [entry['run'] for entry in summary['worst'][:5]] == [5, 0, 23, 1, 22]
     assert summary['outcomes'] == {'kept': 23, 'violated': 0, 'diverged': 1, 'rejected': 0}
     assert summary['kept']['fraction'] == 23 / 24
     # (23 + z^2 / 2 -+ z sqrt(23 / 24 + z^2 / 4)) / (24 + z^2), z = 1.959964, Wilson (1927)
@@ -333,10 +331,20 @@ def test_run_that_differs_from_its_stored_results_is_reported(whole_store, tmp_p
 def test_pairs_are_compared_and_exceptions_are_reproduced(tmp_path, capsys):
     text = STUDY.replace('seed: 7', 'seed: 7\n    pairs: true')
     a_study = study(tmp_path, LOOP + text, runs=4)
+    store = Store.create_or_open(tmp_path / 'pairs', a_study)
     results = whole(a_study)
-    truth = results | {name: results[name].copy() for name in results}
+    store.keep(range(4), results)
+    reproduce(store, 2, make_folder(tmp_path / 'run'))
+    for name in ('', 'without_learning', 'other_noise'):
+        assert (tmp_path / 'run' / name / 'bag').is_dir()
+        law = load_loop(tmp_path / 'run' / name / 'config.yaml').controller
+        assert (law.learning.weight == 0.0) is bool(name)
+
     results['outcome'] = np.array(['kept', 'violated', 'kept', 'violated'])
     results['without.outcome'] = np.array(['kept', 'kept', 'violated', 'violated'])
+    results['noise.outcome'] = np.array(['violated', 'violated', 'kept', 'kept'])
+    results['noise.first_violation_s'] = np.array([0.1, 0.25, np.nan, np.nan])
+    results['without.first_violation_s'] = np.array([np.nan, np.nan, 0.25, 0.25])
     for joint in ('joint1', 'joint2'):
         results[f'settled_error_ratio.{joint}'] = np.array([0.3, 1.2, 0.9, 9.0])
         results[f'without.settled_error_ratio.{joint}'] = np.array([0.2, 0.4, 1.1, 1.0])
@@ -345,18 +353,24 @@ def test_pairs_are_compared_and_exceptions_are_reproduced(tmp_path, capsys):
     assert (pairs['broken_only_with'], pairs['broken_only_without']) == ([1], [2])
     assert pairs['above'] == [1, 0]  # run 3 breaks the bound either way
     assert pairs['factor']['max'] == pytest.approx(3.0)
+    noise = pairs['noise']  # noise breaks run 0 before learning would begin
+    assert (noise['broken_only_with'], noise['broken_only_without']) == ([1], [2, 3])
     results['outcome'][1] = 'diverged'
     assert summarize(a_study, results)['pairs']['factor']['max'] is None
 
-    pairs_store = Store.create_or_open(tmp_path / 'pairs', a_study)
-    pairs_store.keep(range(4), truth)
-    reproduce(pairs_store, 2, make_folder(tmp_path / 'run'))
-    for folder in (tmp_path / 'run', tmp_path / 'run/without_learning'):
-        assert (folder / 'bag').is_dir()
-    assert load_loop(tmp_path / 'run/without_learning/config.yaml').controller.learning.weight == 0
-    pairs_store.keep(range(4), results)
-    assert main(['monte-carlo', '--report', str(tmp_path / 'pairs')]) == 0
+    store.keep(range(4), results)
+    assert main(['monte-carlo', '--report', str(store.folder)]) == 0
     assert '1 broke it only with learning, 1 only without' in capsys.readouterr().out
-    page = html.unescape((tmp_path / 'pairs/report.html').read_text())
+    page = html.unescape((store.folder / 'report.html').read_text())
     assert 'breaks the bound only with learning' in page
     assert 'largest error more than 1.3 times' in page
+    assert main(['monte-carlo', '--report', str(store.folder), '--out', str(tmp_path)]) == 0
+    table = (tmp_path / 'changes.md').read_text()
+    assert capsys.readouterr().out == table
+    assert '| pairs | 4 | 2 / 2 | 1 / 1 | ' in table
+    assert ' | 0.00 % | 1 / 2, ' in table
+
+
+def test_studies_without_pairs_are_not_put_side_by_side(whole_store, tmp_path, capsys):
+    assert main(['monte-carlo', '--report', str(whole_store.folder), '--out', str(tmp_path)]) == 1
+    assert 'holds no pairs: its study needs pairs: true' in capsys.readouterr().err

@@ -396,8 +396,8 @@ def _add_studies(command: _Command) -> None:
     option('--engine', choices=engines, default='processes', help=computing)
     option('--workers', type=_positive, help='number of workers (one per core of this computer)')
     option('--address', default='', help='scheduler of a dask cluster (a local one)')
-    option('--chunk', type=_positive, help='runs handed to a worker at a time')
-    option('--report', type=Path, metavar='DIR', help='only report the study in this folder')
+    reported = 'only report the studies in these folders; studies of pairs side by side into --out'
+    option('--report', type=Path, nargs='+', metavar='DIR', help=reported)
     again = 'compute one run of a study again, with a bag and pictures, into --out'
     option('--reproduce', nargs=2, metavar=('DIR', 'RUN'), help=again)
     option('--out', type=Path, help='folder of the study (monte_carlo)')

@@ -20,6 +20,7 @@ from blf_dsc_controller.studies import runs
 from blf_dsc_controller.studies.arms import COLUMNS, chosen_laws, label_of
 from blf_dsc_controller.studies.arms import compare as compare_arms
 from blf_dsc_controller.studies.monte_carlo import load_study
+from blf_dsc_controller.studies.pairs import write_comparison
 from blf_dsc_controller.studies.paper import compare
 from blf_dsc_controller.studies.report import (
     headline,
@@ -64,7 +65,7 @@ def monte_carlo(options: Namespace) -> None:
     if options.reproduce:
         _reproduce(Path(options.reproduce[0]), options.reproduce[1], options.out)
     elif options.report:
-        _report(Store(options.report))
+        _report_again([Store(folder) for folder in options.report], options.out)
     else:
         _run_study(options)
 
@@ -77,7 +78,7 @@ def _run_study(options: Namespace) -> None:
     store = Store.create_or_open(options.out or Path('monte_carlo'), study)
     with store.locked():
         workers = options.workers or runs.cores()
-        chunks = store.missing(options.chunk or runs.chunk_size(study.settings.runs, workers))
+        chunks = store.missing(runs.chunk_size(study.settings.runs, workers))
         if chunks:
             with announced_compilation(print_notice):
                 warm_up(study)
@@ -113,6 +114,15 @@ def _report(store: Store) -> None:
     print(headline(summary))
     print(f'the worst   {reproduce_command(store.folder, summary["worst"][0]["run"])}')
     print(f'wrote       {store.folder}: {", ".join(path.name for path in written)}')
+
+
+def _report_again(stores: list[Store], out: Path | None) -> None:
+    if out is not None:
+        out.mkdir(parents=True, exist_ok=True)
+        print(write_comparison(stores, out), end='')
+        return
+    for store in stores:
+        _report(store)
 
 
 def _reproduce(folder: Path, index: str, out: Path | None) -> None:

@@ -54,6 +54,8 @@ from blf_dsc_controller.run import Floats
 
 WITHOUT = 'without.'
 """Prefix of the columns of a run without learning."""
+NOISE = 'noise.'
+"""Prefix of the columns of a run without learning and with other sensor noise."""
 
 _NODE = 'monte_carlo'
 _VARY = 'vary.'
@@ -65,12 +67,10 @@ class MonteCarloConfig:
 
     runs: int = parameter(1000, 'closed loops to run', at_least=1, at_most=100_000_000)
     seed: int = parameter(0, 'run i is determined by this seed and i alone', at_least=0)
-    noise_seed: int = parameter(
-        0, 'another number: the same arms and motions, with other sensor noise', at_least=0
-    )
     pairs: bool = parameter(
         default=False,
-        description='run each plant with learning and without it (learning.weight: 0)',
+        description='run each plant also without learning (learning.weight: 0), and once more so '
+        'with other sensor noise',
     )
     settled_after: float = parameter(
         0.0,
@@ -78,24 +78,12 @@ class MonteCarloConfig:
         unit='s',
         at_least=0.0,
     )
-    moments: tuple[float, ...] = parameter(
-        (),
-        'times at which the parameter error is stored, besides the end',
-        unit='s',
-        at_least=0.0,
-        omittable=True,
-    )
 
     def duration_problems(self, duration: float) -> Iterator[str]:
-        """Yield the problems with times after the end of a run of this duration [s]."""
+        """Yield the problems with a run of this duration [s]."""
         if duration == 0.0:
             yield 'sim_plant.duration: got 0 s, but every run must end: give its duration'
-            return
-        for entry, moment in enumerate(self.moments, 1):
-            if moment > duration:
-                where = f'at entry {entry}, but a run ends at {duration:g} s'
-                yield f'moments: got {moment:g} s {where}'
-        if self.settled_after >= duration:
+        elif self.settled_after >= duration:
             yield f'settled_after: got {self.settled_after:g} s, but a run ends at {duration:g} s'
 
 
@@ -109,10 +97,11 @@ class Study:
     variations: tuple[Variation, ...]
 
     def laws(self) -> dict[str, ControllerConfig]:
-        """Return each law of a run by the prefix of its columns."""
+        """Return the law of each run of a plant, by the prefix of its columns."""
         if not self.settings.pairs:
             return {'': self.controller}
-        return {'': self.controller, WITHOUT: change(self.controller, {'learning.weight': 0.0})}
+        without = change(self.controller, {'learning.weight': 0.0})
+        return {'': self.controller, WITHOUT: without, NOISE: without}
 
     def values(self) -> dict[str, dict[str, Setting]]:
         """Return every value by node and name, as `dumps` takes them; distributions as written."""
@@ -198,15 +187,16 @@ def draw(study: Study, run: int) -> dict[str, Drawn]:
         text = f'{study.settings.seed} {run} {name}'
         return int.from_bytes(blake2b(text.encode(), digest_size=8).digest(), 'big') >> 11
 
-    noise = study.settings.noise_seed
-    drawn: dict[str, Drawn] = {'run': run, 'seed': bits(f'seed {noise}' if noise else 'seed')}
+    drawn: dict[str, Drawn] = {'run': run, 'seed': bits('seed')}
+    if study.settings.pairs:
+        drawn[f'{NOISE}seed'] = bits('seed 1')
     for variation in study.variations:
         drawn[variation.column] = variation.distribution.at(bits(variation.column) / 2**53)
     return drawn
 
 
-def plant_with(study: Study, drawn: Mapping[str, Drawn]) -> PlantConfig:
-    """Return the plant configuration of a run."""
+def plant_with(study: Study, drawn: Mapping[str, Drawn], law: str = '') -> PlantConfig:
+    """Return the plant configuration of a run with the law of this prefix."""
     changes: dict[str, dict[str, Any]] = {}
     for variation in study.variations:
         group, _, field = variation.name.partition('.')
@@ -225,7 +215,7 @@ def plant_with(study: Study, drawn: Mapping[str, Drawn]) -> PlantConfig:
     groups = {
         group: replace(getattr(study.plant, group), **section) for group, section in changes.items()
     }
-    return replace(study.plant, seed=int(drawn['seed']), **groups)
+    return replace(study.plant, seed=int(drawn.get(f'{law}seed', drawn['seed'])), **groups)
 
 
 TAIL = 4.0

@@ -8,23 +8,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from matplotlib.axes import Axes
-from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+from matplotlib.ticker import PercentFormatter
 from scipy.stats import binomtest, kruskal, rankdata
 
 from blf_dsc_controller.analysis.figures import draw as draw_run
-from blf_dsc_controller.analysis.style import (
-    ALARM,
-    BLUE,
-    COLOURS,
-    INK,
-    MUTED,
-    ORANGE,
-    Cell,
-    Picture,
-    head,
-    write_page,
-)
+from blf_dsc_controller.analysis.style import ALARM, COLOURS, Cell, Picture, head, write_page
 from blf_dsc_controller.analysis.summary import plain, write_summary
 from blf_dsc_controller.analysis.summary import summarize as summarize_run
 from blf_dsc_controller.bags.reader import read_run
@@ -33,41 +21,36 @@ from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.run import Floats
 from blf_dsc_controller.simulation.bag import write_bag
 from blf_dsc_controller.simulation.loop import simulate
-from blf_dsc_controller.studies.monte_carlo import WITHOUT, Study, draw, plant_with
+from blf_dsc_controller.studies.monte_carlo import NOISE, WITHOUT, Study, draw, plant_with
+from blf_dsc_controller.studies.pairs import (
+    ALLOWED,
+    RATIO,
+    SHOWN,
+    compare_pairs,
+    draw_pairs,
+    logarithmic,
+    pair_figures,
+    worst_of,
+)
 from blf_dsc_controller.studies.runs import (
-    DIVERGED,
     KEPT,
     OUTCOMES,
     Columns,
     Store,
     differences,
-    error_columns,
     figures_of,
     rows_of_another_motion,
 )
 
 Summary = dict[str, Any]
 
-_CONFIDENCE = 0.95
 _WORST = 10
 _GROUPS = 10
 _QUANTILES = {'min': 0.0, 'p5': 0.05, 'median': 0.5, 'p95': 0.95, 'p99': 0.99, 'max': 1.0}
-_FACTORS = {'median': 0.5, 'p99': 0.99, 'p99.9': 0.999, 'max': 1.0}
 _DRAWN = 'plant.'
-
-ALLOWED = 1.3
-"""Largest error with learning that is called no larger than that without, as a factor."""
-
-LAWS = {'': 'with', WITHOUT: 'without'}
-"""The laws of a study of pairs: what they are called, by the prefix of their columns."""
-
-_NEAR = (0.8, 1.2)  # times the bound
-_MOST_DOTS = 20_000
-_SHOWN = (0.03, 2.0)  # |xi1| / k_c; what is beyond is drawn at these
-_FEW_DECADES = 1e3
-_RATIO = r'max $|\xi_1| \; / \; k_c$'
+_FOLDERS = {'': '', WITHOUT: 'without_learning', NOISE: 'other_noise'}
+_RMS = r'rms $\xi_1$ [mrad]'
 _MODEL = r'$\|\hat P - P\| \;/\; \|P\|$ [%]'
-_PERCENT = FuncFormatter(lambda value, _: f'{100 * value:g} %')
 
 
 def summarize(study: Study, results: Columns) -> Summary:
@@ -78,20 +61,8 @@ def summarize(study: Study, results: Columns) -> Summary:
     """
     outcomes = results['outcome'].tolist()
     runs, kept = len(outcomes), outcomes.count(KEPT)
-    interval = binomtest(kept, runs).proportion_ci(_CONFIDENCE, method='wilson')
-    others = ('run', 'seed', 'outcome', f'{WITHOUT}outcome')
-    figures = [name for name in results if name not in others and not name.startswith(_DRAWN)]
-    worst = [
-        {
-            'run': int(results['run'][row]),
-            'outcome': outcomes[row],
-            'max_error_ratio': {
-                joint: results[f'max_error_ratio.{joint}'][row] for joint in study.plant.joints
-            },
-            'first_violation_s': results['first_violation_s'][row],
-        }
-        for row in worst_first(study, results)[:_WORST]
-    ]
+    interval = binomtest(kept, runs).proportion_ci(0.95, method='wilson')
+    ratios = worst_of(study, results, 'max_error_ratio')
     summary: Summary = plain(
         {
             'runs': runs,
@@ -99,71 +70,26 @@ def summarize(study: Study, results: Columns) -> Summary:
             'seed': study.settings.seed,
             'duration_s': study.plant.duration,
             'outcomes': {outcome: outcomes.count(outcome) for outcome in OUTCOMES},
-            'kept': {
-                'fraction': kept / runs,
-                'low': interval.low,
-                'high': interval.high,
-                'confidence': _CONFIDENCE,
-                'interval': 'Wilson',
+            'kept': {'fraction': kept / runs, 'low': interval.low, 'high': interval.high},
+            'pairs': compare_pairs(study, results) if study.settings.pairs else None,
+            'figures': {
+                name: _quantiles(values)
+                for name, values in results.items()
+                if values.dtype.kind == 'f' and not name.startswith(_DRAWN)
             },
-            'pairs': compare(study, results) if study.settings.pairs else None,
-            'figures': {name: _quantiles(results[name]) for name in figures},
             'influence': influence(study, results),
-            'worst': worst,
+            'worst': [
+                {
+                    'run': int(results['run'][row]),
+                    'outcome': outcomes[row],
+                    'max_error_ratio': ratios[row],
+                    'first_violation_s': results['first_violation_s'][row],
+                }
+                for row in np.argsort(-ratios, kind='stable')[:_WORST]
+            ],
         }
     )
     return summary
-
-
-def compare(study: Study, results: Columns) -> Summary:
-    """Compare the runs of a study of pairs, with learning and without it.
-
-    `factor` is the largest settled error with learning over that without; None: infinite. It and
-    the medians are of the runs that keep the bound without. `near` counts the runs that come near
-    the bound without learning, with a largest error that is at least 1 % larger or smaller with it.
-    """
-
-    def both(name: str) -> list[Floats]:
-        return [worst_of(study, results, name, law) for law in LAWS]
-
-    kept, without = (results[f'{law}outcome'] == KEPT for law in LAWS)
-    settled, settled_without = both('settled_error_ratio')
-    factors = (settled / settled_without)[without]
-    above = np.flatnonzero(~(factors <= ALLOWED))
-    quantiles = np.quantile(factors, list(_FACTORS.values()), method='higher')
-    largest, before = both('max_error_ratio')
-    change = (largest / before)[(_NEAR[0] <= before) & (before <= _NEAR[1])]
-    medians = {
-        'rms_error_rad': both('rms_error_rad'),
-        'torque_error': [results[f'{law}torque_error.end'] for law in LAWS],
-    }
-    return {
-        'near': {'larger': int((change >= 1.01).sum()), 'smaller': int((change <= 0.99).sum())},
-        'kept': {'with': int(kept.sum()), 'without': int(without.sum())},
-        'broken_only_with': results['run'][without & ~kept].tolist(),
-        'broken_only_without': results['run'][kept & ~without].tolist(),
-        'factor': dict(zip(_FACTORS, quantiles.tolist(), strict=True)),
-        'allowed': ALLOWED,
-        'above': results['run'][without][above[np.argsort(-factors[above])]].tolist(),
-        'median': {
-            name: {
-                label: np.median(known) if (known := _finite(values[without])).size else None
-                for label, values in zip(LAWS.values(), each, strict=True)
-            }
-            for name, each in medians.items()
-        },
-    }
-
-
-def worst_of(study: Study, results: Columns, name: str, law: str = '') -> Floats:
-    """Return a figure of the worst joint in each run; infinite if the run diverged."""
-    each = [results[f'{law}{name}.{joint}'] for joint in study.plant.joints]
-    return np.where(results[f'{law}outcome'] == DIVERGED, np.inf, np.max(each, axis=0))
-
-
-def worst_first(study: Study, results: Columns) -> np.ndarray:
-    """Return the rows of the results, largest |xi1| / k_c first; ties in the order of the runs."""
-    return np.argsort(-worst_of(study, results, 'max_error_ratio'), kind='stable')
 
 
 def influence(study: Study, results: Columns) -> dict[str, float]:
@@ -194,12 +120,8 @@ def _explained(values: np.ndarray, ratios: Floats) -> float:
     return max(0.0, float(1.0 - (ratios.size - 1 - H) / freedom))
 
 
-def _finite(values: Floats) -> Floats:
-    return values[np.isfinite(values)]
-
-
 def _quantiles(values: Floats) -> Summary | None:
-    known = _finite(values)
+    known = values[np.isfinite(values)]
     if known.size == 0:
         return None
     quantiles = np.quantile(known, list(_QUANTILES.values())).tolist()
@@ -213,47 +135,42 @@ def write_report(store: Store) -> tuple[Summary, list[Path]]:
     """
     study, results, folder = store.study, store.results(), store.folder
     summary = summarize(study, results)
-    figures = [folder / 'distributions.png']
+    figures, pairs, exceptions = [folder / 'distributions.png'], {}, []
     _draw_distributions(study, results, figures[0])
     if study.settings.pairs:
         figures.append(folder / 'pairs.png')
         draw_pairs({'': (study, results)}, figures[-1])
-    tables = _tables(study, summary, folder)
-    title = f'Monte Carlo study: {summary["runs"]} runs of {summary["duration_s"]:g} s'
+        found = compare_pairs(study, results)
+        pairs, broken = pair_figures(found), found['broken_only_with']
+        exceptions = [(run, 'breaks the bound only with learning') for run in broken]
+        what = f'largest error more than {ALLOWED:g} times that without learning'
+        exceptions += [(run, what) for run in found['above'] if run not in broken]
+
+    def again(run: int) -> Cell:
+        return Cell(reproduce_command(folder, run), 'code')
+
     page, numbers = folder / 'report.html', folder / 'summary.json'
-    values = {'headline': headline(summary), 'summary': summary, 'figures': figures}
-    write_page(page, 'study.html', title, **values, **tables)
-    write_summary(summary, numbers)
-    return summary, [page, *figures, numbers]
-
-
-def _tables(study: Study, summary: Summary, folder: Path) -> dict[str, list[Any]]:
-    """Return the rows of the tables of the page."""
-    return {
-        'outcomes': [(name, f'{n}', OUTCOMES[name]) for name, n in summary['outcomes'].items()],
-        'quantiles': [
-            ('', *_QUANTILES),
-            *(
-                (Cell(name, 'code'), *(_number(values[quantile]) for quantile in _QUANTILES))
-                for name, values in summary['figures'].items()
-                if values is not None
-            ),
-        ],
-        'worst': [
+    write_page(
+        page,
+        'study.html',
+        f'Monte Carlo study: {summary["runs"]} runs of {summary["duration_s"]:g} s',
+        headline=headline(summary),
+        summary=summary,
+        figures=figures,
+        outcomes=[(name, f'{n}', OUTCOMES[name]) for name, n in summary['outcomes'].items()],
+        pairs=[*pairs.items()],
+        worst=[
             (
                 f'{run["run"]}',
                 run['outcome'],
-                ', '.join(_number(ratio) for ratio in run['max_error_ratio'].values()),
+                _number(run['max_error_ratio']),
                 _number(run['first_violation_s']),
-                Cell(reproduce_command(folder, run['run']), 'code'),
+                again(run['run']),
             )
             for run in summary['worst']
         ],
-        'exceptions': [
-            (run, what, Cell(command, 'code'))
-            for run, what, command in exceptions(summary['pairs'], folder)
-        ],
-        'varied': [
+        exceptions=[(f'{run}', what, again(run)) for run, what in exceptions],
+        varied=[
             (
                 Cell(name := variation.column.removeprefix(_DRAWN), 'code'),
                 Cell(f'{variation.distribution}', 'code'),
@@ -261,40 +178,24 @@ def _tables(study: Study, summary: Summary, folder: Path) -> dict[str, list[Any]
             )
             for variation in study.variations
         ],
-    }
-
-
-def exceptions(pairs: Summary | None, folder: Path) -> list[tuple[str, str, str]]:
-    """Return the run, what is wrong with it and its command for each exception of a comparison."""
-    if pairs is None:
-        return []
-    broken = pairs['broken_only_with']
-    above = [run for run in pairs['above'] if run not in broken]
-    what = f'largest error more than {ALLOWED:g} times that without learning'
-    return [
-        (f'{run}', words, reproduce_command(folder, run))
-        for runs, words in ((broken, 'breaks the bound only with learning'), (above, what))
-        for run in runs
-    ]
+    )
+    write_summary(summary, numbers)
+    return summary, [page, *figures, numbers]
 
 
 def headline(summary: Summary) -> str:
-    """Return the result in one sentence; of pairs, in three."""
+    """Return the result in one sentence; of pairs, in two."""
     kept, pairs = summary['kept'], summary['pairs']
     text = (
         f'{_percent(kept["fraction"])} of the runs kept the bound '
-        f'({summary["outcomes"]["kept"]} of {summary["runs"]}; {100 * kept["confidence"]:g} % '
-        f'confidence: {_percent(kept["low"])} to {_percent(kept["high"])})'
+        f'({summary["outcomes"][KEPT]} of {summary["runs"]}; 95 % confidence: '
+        f'{_percent(kept["low"])} to {_percent(kept["high"])})'
     )
     if pairs is None:
         return text
-    without, factor = pairs['kept']['without'], pairs['factor']
     return (
-        f'{text}, {without} without learning. {len(pairs["broken_only_with"])} broke it only with '
-        f'learning, {len(pairs["broken_only_without"])} only without. Of the {without}, the '
-        f'largest error was at most {ALLOWED:g} times that without learning in '
-        f'{_percent(1.0 - len(pairs["above"]) / max(1, without))} (99.9 %: '
-        f'{_number(factor["p99.9"])} times, largest: {_number(factor["max"])})'
+        f'{text}, {pairs["kept"]["without"]} without learning. {len(pairs["broken_only_with"])} '
+        f'broke it only with learning, {len(pairs["broken_only_without"])} only without'
     )
 
 
@@ -307,7 +208,7 @@ def reproduce_command(folder: Path, run: int) -> str:
 def reproduce(store: Store, run: int, out: Path) -> Summary:
     """Repeat a run of the study and write config.yaml, bag, figures and summary to `out`.
 
-    The one without learning, of a study of pairs, goes to `out/without_learning`.
+    Those without learning, of a study of pairs, go to `without_learning` and `other_noise` in it.
 
     Raises BlfDscError if the run has no results, or if they are not reproduced bit for bit;
     StartError if the controller rejects its start.
@@ -316,10 +217,11 @@ def reproduce(store: Store, run: int, out: Path) -> Summary:
     if run not in results['run']:
         raise BlfDscError(f'{store.folder} has no run {run}: it has {results["run"].size} runs')
     row = int((results['run'] == run).argmax())
-    plant, unseen = plant_with(study, draw(study, run)), rows_of_another_motion(study)
+    unseen = rows_of_another_motion(study)
     summaries = []
     for prefix, law in study.laws().items():
-        folder = out / 'without_learning' if prefix else out
+        plant = plant_with(study, draw(study, run), prefix)
+        folder = out / _FOLDERS[prefix]
         folder.mkdir(exist_ok=True)
         dump(folder / 'config.yaml', {PLANT: plant, CONTROLLER: law})
         record = simulate(law, plant, supervised=False)
@@ -351,92 +253,23 @@ def _draw_distributions(study: Study, results: Columns, path: Path) -> None:
     share = _percent(np.mean(results['outcome'] == KEPT))
     title = f'{results["outcome"].size} runs: {share} kept the bound'
     picture = Picture(1, 3, title, (5.2, 3.6), share_time=False)
-    moments = [*(f'{moment:g} s' for moment in study.settings.moments), 'end']
     settled = f'error from {study.settings.settled_after:g} s on'
-    for axes, name, unit, label, title in (
-        (picture.axes[0, 0], 'max_error_ratio', 1.0, _RATIO, 'largest error'),
-        (picture.axes[0, 1], 'rms_error_rad', 1e3, r'rms $\xi_1$ [mrad]', settled),
-        (picture.axes[0, 2], '', 1e2, _MODEL, 'relative parameter error'),
-    ):
-        columns = {joint: f'{name}.{joint}' for joint in study.plant.joints}
-        if not name:
-            columns = dict(zip(moments, error_columns(study), strict=True))
-        for (text, column), colour in zip(columns.items(), COLOURS, strict=False):
-            known = np.sort(unit * _finite(results[column]))
-            if label == _RATIO:
-                known = np.minimum(known, _SHOWN[1])
+    joints = study.plant.joints
+    panels = {
+        'largest error': ({f'max_error_ratio.{joint}': joint for joint in joints}, 1.0, RATIO),
+        settled: ({f'rms_error_rad.{joint}': joint for joint in joints}, 1e3, _RMS),
+        'relative parameter error': ({'parameter_error.end': 'at the end'}, 1e2, _MODEL),
+    }
+    for axes, (title, (columns, unit, label)) in zip(picture.axes[0], panels.items(), strict=True):
+        for (column, text), colour in zip(columns.items(), COLOURS, strict=False):
+            known = np.sort(unit * results[column][np.isfinite(results[column])])
+            if label == RATIO:
+                known = np.minimum(known, SHOWN[1])
             axes.plot(known, np.linspace(0.0, 1.0, known.size), color=colour, label=text)
-        _logarithmic(axes)
-        axes.yaxis.set_major_formatter(_PERCENT)
+        logarithmic(axes)
+        axes.yaxis.set_major_formatter(PercentFormatter(1.0))
         axes.set_xlabel(label)
         axes.set_ylabel('fraction of runs below')
         head(axes, title)
     picture.axes[0, 0].axvline(1.0, color=ALARM, lw=1.4)
     picture.save(path)
-
-
-def draw_pairs(studies: dict[str, tuple[Study, Columns]], path: Path) -> None:
-    """Compare studies of pairs, by their titles: errors and learned models, with and without."""
-    picture = Picture(
-        1, 3, 'The same random runs with learning and without it', (5.2, 4.2), share_time=False
-    )
-    largest, rms, model = picture.axes[0]
-    for (title, (study, results)), colour in zip(studies.items(), COLOURS, strict=False):
-        x, y = (worst_of(study, results, 'settled_error_ratio', law) for law in (WITHOUT, ''))
-        lost = (results['outcome'] != KEPT) & (results[f'{WITHOUT}outcome'] == KEPT)
-        x, y = (np.clip(values, *_SHOWN) for values in (x, y))
-        chosen = np.flatnonzero(~lost)[:_MOST_DOTS]
-        largest.plot(x[chosen], y[chosen], '.', ms=4, color=colour, alpha=0.6, mew=0, label=title)
-        largest.plot(x[lost], y[lost], 'o', ms=5, color=ALARM, mew=0)
-    ends = np.array(_SHOWN)
-    largest.loglog(ends, ends, color=MUTED, lw=1.0, label='equal')
-    largest.loglog(ends, ALLOWED * ends, color=MUTED, lw=1.0, ls=':', label=f'{ALLOWED:g} times')
-    _logarithmic(largest, both=True)
-    largest.axhline(1.0, color=INK, ls='--', lw=1.0, label='bound')
-    largest.axvline(1.0, color=INK, ls='--', lw=1.0)
-    largest.set_xlabel(f'{_RATIO} without learning')
-    largest.set_ylabel('with learning')
-    head(largest, 'largest error of each run')
-    figures = {
-        'rms_error_rad': (rms, 1e3, r'rms $\xi_1$ of the worst joint [mrad]', 'rms error'),
-        'torque_error.end': (model, 1e2, 'of the torque [%]', 'model error on the next motion'),
-    }
-    for name, (axes, unit, label, title) in figures.items():
-        _boxes(axes, name, unit, studies)
-        axes.set_xlabel(label)
-        head(axes, title)
-    picture.save(path)
-
-
-def _boxes(axes: Axes, name: str, unit: float, studies: dict[str, tuple[Study, Columns]]) -> None:
-    """Draw the quartiles, and the 1 % and 99 % quantiles, of a figure with and without learning.
-
-    Of the runs that keep the bound without.
-    """
-    labels: list[str] = []
-    for title, (study, results) in studies.items():
-        for (law, label), colour in zip(LAWS.items(), (BLUE, ORANGE), strict=True):
-            column = f'{law}{name}'
-            values = results[column] if column in results else worst_of(study, results, name, law)
-            kept = results[f'{WITHOUT}outcome'] == KEPT
-            known = unit * values[kept & np.isfinite(values)]
-            y = 2 * [-len(labels)]
-            if known.size:
-                least, *quartiles, most = np.quantile(known, (0.01, 0.25, 0.5, 0.75, 0.99))
-                axes.plot([least, most], y, color=colour, lw=1.2)
-                axes.plot([quartiles[0], quartiles[2]], y, color=colour, lw=7, alpha=0.6)
-                axes.plot(quartiles[1:2], y[:1], 'o', color=INK, ms=4)
-            labels.append(f'{title}, {label}'.removeprefix(', '))
-    axes.set_yticks(-np.arange(len(labels)), labels)
-    _logarithmic(axes)
-
-
-def _logarithmic(axes: Axes, *, both: bool = False) -> None:
-    """Make the x axis, or both, of drawn data logarithmic, with plain numbers at 1, or 1, 2, 5."""
-    axes.set_xscale('log')
-    for axis in (axes.xaxis, axes.yaxis)[: 1 + both]:
-        low, high = axis.get_view_interval()
-        subs = (1.0, 2.0, 5.0) if high < _FEW_DECADES * low else (1.0,)
-        axis.set_major_locator(LogLocator(subs=subs))
-        axis.set_major_formatter(FuncFormatter(lambda value, _: f'{value:g}'))
-        axis.set_minor_formatter(NullFormatter())

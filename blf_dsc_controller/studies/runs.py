@@ -140,7 +140,7 @@ def torque_error(rows: np.ndarray, estimate: np.ndarray, P: np.ndarray) -> float
 def warm_up(study: Study) -> None:
     """Compile what the workers run, so that they find it in the cache."""
     plant = replace(study.plant, duration=study.plant.sample_time)
-    settings = replace(study.settings, settled_after=0.0, moments=())
+    settings = replace(study.settings, settled_after=0.0)
     run_chunk(replace(study, plant=plant, settings=settings), 0, 1)
 
 
@@ -170,10 +170,7 @@ def figures_of(study: Study, record: Record, plant: PlantConfig, unseen: Floats 
         'latch_time_s': float(t[latch[0]]) if latch.size else nan,
         'saturated_fraction': float((np.abs(torque[:end]) >= limit).any(axis=1).mean()),
     }
-    settled, *moments = (
-        round(moment / plant.sample_time)
-        for moment in (study.settings.settled_after, *study.settings.moments)
-    )
+    settled = round(study.settings.settled_after / plant.sample_time)
     for i, joint in enumerate(study.plant.joints):
         ratio, late = error[:, i] / bound[:, i], error[settled:, i]
         effort = np.abs(record.measurements[:end, efforts + i])
@@ -182,30 +179,21 @@ def figures_of(study: Study, record: Record, plant: PlantConfig, unseen: Floats 
         row[f'rms_error_rad.{joint}'] = float(np.sqrt(np.mean(late**2))) if late.size else nan
         row[f'peak_torque_nm.{joint}'] = float(effort.max(initial=0.0))
     order = parameter_order(law.model.parameter_names, plant)
-    is_known = order.min() >= 0
-    for name, k in zip(error_columns(study), (*moments, t.size - 1), strict=True):
-        P = record.truths[k, order]
-        is_finite = is_known and k < end
-        off = np.linalg.norm(estimate[k] - P) / np.linalg.norm(P) if is_finite else nan
-        row[name] = float(off)
-    row['torque_error.end'] = nan
-    if is_known and unseen is not None:
-        row['torque_error.end'] = torque_error(unseen, estimate[-1], record.truths[-1, order])
+    row |= {'parameter_error.end': nan, 'torque_error.end': nan}
+    if order.min() >= 0:
+        found, P = estimate[-1], record.truths[-1, order]
+        if end == t.size:
+            row['parameter_error.end'] = float(np.linalg.norm(found - P) / np.linalg.norm(P))
+        if unseen is not None:
+            row['torque_error.end'] = torque_error(unseen, found, P)
     return row
-
-
-def error_columns(study: Study) -> list[str]:
-    """Return the column names of the parameter errors, the final one last."""
-    moments = (f'parameter_error.{moment:g}_s' for moment in study.settings.moments)
-    return [*moments, 'parameter_error.end']
 
 
 def _run(study: Study, run: int, records: dict[str, Record], unseen: Floats | None) -> Row:
     row = draw(study, run)
-    config = plant_with(study, row)
-    plant = plant_of(config)
     for prefix, record in records.items():
-        plant.reset()
+        config = plant_with(study, row, prefix)
+        plant = plant_of(config)
         record.controller.reset()
         try:
             with np.errstate(all='ignore'):  # a run that diverges has figures too
