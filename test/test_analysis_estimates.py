@@ -15,7 +15,12 @@ from synthetic_bag import Synthetic
 from test_law_urdf import panda
 
 from blf_dsc_controller.analysis.figures import draw
-from blf_dsc_controller.analysis.metrics import estimates_of, measure
+from blf_dsc_controller.analysis.metrics import (
+    bodies_of,
+    errors_of_bodies,
+    estimates_of,
+    measure,
+)
 from blf_dsc_controller.analysis.panels import panels
 from blf_dsc_controller.analysis.summary import format_table, summarize
 from blf_dsc_controller.bags.reader import read_run
@@ -97,10 +102,26 @@ def test_table_and_summary_name_the_torque_error():
     assert 'torque error' not in format_table(summarize(still))
 
 
-def test_estimate_errors_are_shown_in_deviations_of_the_prior():
-    found = {panel.title: panel for panel in panels([run_of(P + 1.0)])}
-    lines = {line.name: line.values[-1] for line in found['errors of link 1, joint1'].lines}
-    assert lines == pytest.approx({'Izz1': 2.0, 'm*cx1': 1.0, 'Ixx1': 0.5})
+@pytest.mark.parametrize(('known', 'share'), [(True, 1.0), (False, 0.5)])
+def test_estimate_errors_are_shown_in_deviations_of_the_prior(known, share):
+    run = run_of(P + np.linspace(0.5, 1.0, TIME.size)[:, np.newaxis])
+    run = run if known else replace(run, truth=None)
+    title = f'{"errors" if known else "changes"} of the estimates, by link'
+    (panel,) = (panel for panel in panels([run]) if panel.title == title)
+    off = {line.name: line.values[-1] / share for line in panel.lines}
+    assert off == pytest.approx({'Izz1': 200.0, 'm*cx1': 100.0, 'Ixx1': 50.0})  # %
+
+
+def test_estimates_are_grouped_by_link_and_friction():
+    names = (*(f'{kind}{link}' for link in (1, 2) for kind in ('m*cx', 'Izz', 'rotor')),)
+    names += ('viscous joint1', 'viscous joint2', 'coulomb joint1', 'coulomb joint2')
+    bodies = bodies_of(names)
+    sizes = {'link 1': 3, 'link 2': 3, 'viscous': 2, 'coulomb': 2}
+    assert {body: len(members) for body, members in bodies.items()} == sizes
+    assert bodies_of(names[:3]) == {name: [k] for k, name in enumerate(names[:3])}
+    off = np.array([[0.0, 0.0, 0.0, 3.0, 4.0, 0.0, *[np.nan] * 4]])  # the friction is unknown
+    found = errors_of_bodies(bodies, off, 0.0 * off, np.full(10, 2.0))[:, 0]
+    np.testing.assert_allclose(found, (0.0, 250.0 / np.sqrt(3.0), np.nan, np.nan))
 
 
 def test_change_of_the_true_arm_is_marked():
@@ -113,28 +134,39 @@ def test_change_of_the_true_arm_is_marked():
         assert marks == pytest.approx([4.0] if first else [])
 
 
-def test_seven_joints_and_sixty_parameters_fit_into_the_figures(tmp_path):
+@pytest.mark.parametrize('configured', [True, False])
+def test_seven_joints_and_sixty_parameters_fit_into_the_figures(tmp_path, configured):
     config = panda()
     arm = learned_arm(config)
     names = tuple(arm.units)
     stamp = np.arange(50) * PERIOD
     wide = np.tile(np.linspace(0.1, 1.0, 50)[:, np.newaxis], (1, 7))
     learned = np.ones((50, len(names) + 2)) * np.arange(len(names) + 2)
+    series = Series((*names, LAMBDA_MIN, LATCHED), stamp, learned)
     run = Run(
         *(config.joints, stamp, stamp, wide, wide, wide, wide + 0.001, wide / 1e3, wide, wide),
-        learning=Series((*names, LAMBDA_MIN, LATCHED), stamp, learned),
-        arm=arm,
+        learning=series,
+        truth=series,
+        arm=arm if configured else None,
     )
     with warnings.catch_warnings():
         warnings.simplefilter('error')  # matplotlib warns when there is no room for the axes
-        tracking, parameters = draw(run, tmp_path)
-    for path in (tracking, parameters):
+        drawn = draw(run, tmp_path)
+    assert [path.name for path in drawn] == ['tracking.png', 'parameters.png']
+    for path in drawn:
         assert 1200 < matplotlib.image.imread(path).shape[1] < 2000
-    shown = [panel for panel in panels([run]) if panel.group == 'Parameters']
-    assert all(len(panel.lines) <= 8 for panel in shown)  # as many as there are colours
-    drawn = [line.name for panel in shown for line in panel.lines]
-    joints = list(config.joints)
-    assert sorted(drawn) == sorted([*names[:48], *joints, *joints])
+    shown = {panel.title: panel for panel in panels([run]) if panel.group == 'Parameters'}
+    assert all(len(panel.lines) <= 8 for panel in shown.values())  # as there are colours
+    assert set(shown) == (
+        {
+            'torque error',
+            'errors of the estimates, by link',
+            'viscous friction',
+            'coulomb friction',
+        }
+        if configured
+        else {'relative parameter error'}
+    )
 
 
 def reconfigured(messages, values):

@@ -22,7 +22,7 @@ from blf_dsc_controller.messages.topics import JOINT_STATES
 from blf_dsc_controller.view import page as pages
 from blf_dsc_controller.view.arm import ShownArm, with_cylinders, with_known_meshes
 from blf_dsc_controller.view.bag import BagPlayer
-from blf_dsc_controller.view.page import Page, bodies_of, free_port, plant_events
+from blf_dsc_controller.view.page import Page, free_port, plant_events
 
 HOST = '127.0.0.1'
 PORT = 18080
@@ -117,15 +117,6 @@ def test_payloads_and_other_events_of_a_plant_are_listed():
     texts = [(3.0, 'event 2 begins'), (20.0, '2 kg picked up'), (45.0, '2 kg put down')]
     assert plant_events(values) == [(at, 'plant', text) for at, text in texts]
     assert plant_events({}) == []
-
-
-def test_estimates_are_grouped_by_link_and_friction():
-    names = (*(f'{kind}{link}' for link in (1, 2) for kind in ('m*cx', 'Izz', 'rotor')),)
-    names += ('viscous joint1', 'viscous joint2', 'coulomb joint1', 'coulomb joint2')
-    bodies = bodies_of(names)
-    sizes = {'1': 3, '2': 3, 'viscous': 2, 'coulomb': 2}
-    assert {body: len(members) for body, members in bodies.items()} == sizes
-    assert bodies_of(names[:3]) == {name: [k] for k, name in enumerate(names[:3])}
 
 
 def test_meshes_of_an_installed_description_are_drawn_only_for_the_same_arm(tmp_path, monkeypatch):

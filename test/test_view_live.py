@@ -40,7 +40,7 @@ def loop(rig):
     view = rig.add(ViewNode, port=18180)
     rig.until(lambda: view.page._state == ('STALE', 'waiting for /blf_dsc_controller/journal'))
     arm, law = rig.loop({**EVENT, 'autostart': False})
-    rig.until(lambda: 'Push' in view.buttons)
+    rig.until(lambda: 'Pick up' in view.buttons)
     assert configure(rig, arm)
     assert activate(rig, arm)
     rig.until(lambda: len(view.past) > 3)
@@ -65,14 +65,6 @@ def test_page_shows_the_loop(rig, loop):
     assert [t for t, *_ in events_with(view, '0.25 kg put down')] == [1.5]
 
 
-def test_push_reaches_the_plant_and_ends(rig, loop):
-    arm, _, view = loop
-    click(view.buttons['Push'])
-    rig.until(lambda: arm.config.load.torque == (2.0, 0.0))
-    rig.until(lambda: arm.config.load.torque == (0.0, 0.0))
-    rig.until(lambda: len(events_with(view, 'load.torque')) == 2)
-
-
 def test_payload_reaches_the_plant(rig, loop):
     arm, _, view = loop
     click(view.buttons['Pick up'])
@@ -80,6 +72,7 @@ def test_payload_reaches_the_plant(rig, loop):
     rig.until(lambda: view.past[-1].loaded)
     click(view.buttons['Put down'])
     rig.until(lambda: arm.config.load.payload == 0.0)
+    rig.until(lambda: len(events_with(view, 'load.payload')) == 2)
 
 
 def test_reset_returns_the_arm_to_its_start(rig, loop):

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -13,20 +13,17 @@ from matplotlib.axes import Axes
 from matplotlib.ticker import FuncFormatter
 
 from blf_dsc_controller.analysis.metrics import change_times, measure, true_change_times
-from blf_dsc_controller.analysis.panels import GROUPS, Line, Mark, Panel, panels
+from blf_dsc_controller.analysis.panels import Line, Mark, Panel, panels
 from blf_dsc_controller.analysis.style import (
     ALARM,
     BLUE,
     COLOURS,
-    GREEN,
     INK,
     ORANGE,
     SHADE,
     Picture,
-    formula,
     head,
 )
-from blf_dsc_controller.messages.topics import DISTURBANCE
 from blf_dsc_controller.run import Run
 
 NAMES = ('tracking.png', 'change.png', 'parameters.png', 'monitors.png')
@@ -38,12 +35,10 @@ _ABREAST = 3  # joints, at most, in columns; more are in rows
 _HIGH = (6.2, 3.2)
 _CLOSE_UP = (9.5, 2.6)
 _BEFORE, _AFTER = 1.0, 2.0  # s, shown of a change
-_ALONE = {'Torque': ORANGE, 'Excitation': GREEN}  # colour of one line
-_WIDE = {'Motion': (3.2, 0.55), 'Estimates': (2.4, 0.75)}  # width and opacity
 _FLAT, _DECADE = 2.0, 10.0
 _SHADED = 0.1
 _ABOVE = 1.15  # of the height of a panel, where the legend of its column is
-_WIDTHS_UPON_EACH_OTHER = (5.0, 2.4)
+_NARROW, _WIDE, _WIDEST = 1.3, 2.4, 5.0  # points, widths of lines
 
 
 def draw(run: Run, folder: Path) -> list[Path]:
@@ -53,62 +48,41 @@ def draw(run: Run, folder: Path) -> list[Path]:
     monitors.png if the monitor was recorded. The folder is created if necessary.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    metrics, n = measure(run), len(run.joints)
-    of: dict[str, list[Panel]] = {group: [] for group in GROUPS}
-    for panel in panels([run]):
-        of[panel.group].append(panel)
+    tracking, change, parameters, monitors = (folder / name for name in NAMES)
+    metrics, n, found = measure(run), len(run.joints), panels([run])
+
+    def of(*groups: str) -> list[Panel]:
+        return [panel for panel in found if panel.group in groups]
+
     title = f'Motion over {run.duration:.4g} s'
     if metrics.held is not None:
         kept = 'held' if metrics.held else 'VIOLATED'
         title = f'Tracking over {run.duration:.4g} s: bound {kept}'
     for time, stop in run.timed_stops[:1]:
         title += f', stopped at {time:.3f} s ({stop.reason})'
-    motion = [*of['Motion'], *of['Tracking'], *of['Torque']]
-    paths = [folder / NAMES[0]]
+    motion, paths = of('Motion', 'Tracking', 'Torque'), [tracking]
     if n <= _ABREAST:
-        draw_panels(paths[0], title, motion, n, _SIZE)
+        draw_panels(tracking, title, motion, n, _SIZE)
     else:
         motion = [panel for panel in motion if not panel.log]
         rows = [panel for i in range(n) for panel in motion[i::n]]
-        draw_panels(paths[0], title, rows, len(motion) // n, _LOW, legend_above=True)
+        draw_panels(tracking, title, rows, len(motion) // n, _LOW, legend_above=True)
     changes = true_change_times(run)
     if changes and run.column('error', 0) is not None:
-        paths.append(folder / NAMES[1])
+        paths.append(change)
         title = f'The first change of the arm, from {changes[0] - _BEFORE:g} s on'
-        draw_panels(paths[-1], title, list(_close_up(run, changes[0])), 1, _CLOSE_UP)
-    if of['Parameters']:
+        draw_panels(change, title, list(_close_up(run, changes[0])), 1, _CLOSE_UP)
+    if of('Parameters'):
         title, error = 'Learning', metrics.final_parameter_error
         if not math.isnan(error):
             what = 'relative parameter error' if run.arm is None else 'torque error'
             title += f': {what} {100 * error:.2g} % at the end'
-        paths.append(folder / NAMES[2])
-        draw_panels(paths[-1], title, [*_learned(run, of), *of['Excitation']], 2, _HIGH)
-    if of['Monitors']:
-        shown = [*of['Monitors'], *([] if of['Parameters'] else of['Excitation'])]
-        paths.append(folder / NAMES[3])
-        draw_panels(paths[-1], 'Monitors', shown, 2, _HIGH)
+        paths.append(parameters)
+        draw_panels(parameters, title, of('Parameters', 'Disturbance', 'Excitation'), 2, _HIGH)
+    if of('Monitors'):
+        paths.append(monitors)
+        draw_panels(monitors, 'Monitors', of('Monitors'), 1, _CLOSE_UP)
     return paths
-
-
-def _learned(run: Run, of: Mapping[str, list[Panel]]) -> Iterator[Panel]:
-    """Yield the panels of parameters and disturbances; few parameters are in one panel."""
-    if run.arm is None:
-        yield _overlaid('estimates', [panel for panel in of['Parameters'] if not panel.log])
-        yield from (panel for panel in of['Parameters'] if panel.log)
-    else:
-        yield from of['Parameters']
-    if of['Disturbance']:
-        yield _overlaid('disturbance estimates', of['Disturbance'])
-
-
-def _overlaid(title: str, shown: Sequence[Panel]) -> Panel:
-    """Return one panel with the lines of several: all parameters, or all disturbances."""
-    lines = []
-    for panel in shown:
-        name = panel.title.removeprefix(DISTURBANCE)
-        name = formula(name) if panel.group == 'Parameters' else name
-        lines += [line if line.colour else line._replace(name=name) for line in panel.lines]
-    return replace(shown[0], group='Estimates', title=title, lines=lines)
 
 
 def _close_up(run: Run, change: float) -> Iterator[Panel]:
@@ -120,7 +94,7 @@ def _close_up(run: Run, change: float) -> Iterator[Panel]:
     for group, kind in (('Tracking', 'error of '), ('Torque', 'torque of ')):
         of_joints = [panel for panel in found if panel.title.startswith(kind)]
         lines = [
-            next(iter(panel.lines))._replace(name=joint)
+            panel.lines[0]._replace(name=joint)
             for panel, joint in zip(of_joints, run.joints, strict=False)
         ]
         lines += [line for panel in of_joints[:1] for line in panel.lines if line.shaded]
@@ -152,8 +126,7 @@ def draw_panels(
     picture = Picture(-(-len(shown) // columns), columns, title, size)
     for k, (axes, panel) in enumerate(zip(picture.axes.flat, shown, strict=False)):
         _draw_panel(axes, panel, runs)
-        title = formula(panel.title) if panel.group == 'Parameters' else panel.title
-        title += panel.note and f': {panel.note}'
+        title = panel.title + (panel.note and f': {panel.note}')
         head(axes, title, legend_at=_ABOVE * (k < columns) if legend_above else None)
     for axes in picture.axes.flat[len(shown) :]:
         axes.set_visible(False)
@@ -161,14 +134,15 @@ def draw_panels(
 
 
 def _draw_panel(axes: Axes, panel: Panel, runs: Sequence[str]) -> None:
-    plain = [line for line in panel.lines if not line.colour]
-    for k, line in enumerate(plain):
-        width, alpha = _WIDE.get(panel.group, (1.3, 1.0))
-        if runs and panel.group == 'Motion':
-            width, alpha = _WIDTHS_UPON_EACH_OTHER[line.run % 2], 1.0
+    own = [line for line in panel.lines if not line.colour]
+    followed = any(line.colour == INK and line.dashed for line in panel.lines)
+    for k, line in enumerate(own):
         colour = COLOURS[(line.run if runs else k) % len(COLOURS)]
-        if len(plain) == 1:
-            colour = _ALONE.get(panel.group, colour)
+        if panel.group == 'Torque' and len(own) == 1:
+            colour = ORANGE
+        width, alpha = (_WIDE, 0.6) if followed else (_NARROW, 1.0)
+        if runs and followed:
+            width, alpha = (_WIDEST, _WIDE)[line.run % 2], 1.0  # one upon the other
         label = runs[line.run] if runs else line.name
         _draw_line(axes, line, label=label, color=colour, lw=width, alpha=alpha)
     for line in panel.lines:
@@ -190,7 +164,8 @@ def _set_scale(axes: Axes, panel: Panel) -> None:
         axes.set_ylim(None if panel.log else -panel.span, panel.span)
     if panel.unit == '%':
         axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f'{value:g} %'))
-    axes.set_ylabel(panel.symbol or f'[{panel.unit}]')
+    elif panel.unit:
+        axes.set_ylabel(f'[{panel.unit}]')
 
 
 def _draw_line(axes: Axes, line: Line, *, label: str, **style: Any) -> None:

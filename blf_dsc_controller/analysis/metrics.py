@@ -4,7 +4,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Sequence
+import re
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from operator import itemgetter
 
@@ -28,6 +29,7 @@ MOMENTS = (5, 10, 20, 40, 60)
 """Times at which the parameter error is reported [s]."""
 
 _LEARNED = 0.01
+_FEW = 8  # estimates that are shown one by one
 _POSTURES = 400  # of the reference, at which torques are compared
 _TAIL = 10.0  # s
 _MOST = 100_000  # samples of the estimates, evenly spaced
@@ -62,21 +64,16 @@ def estimates_of(run: Run) -> Estimates | None:
     rows = slice((run.learning.stamp.size - 1) % step, None, step)
     stamp = run.learning.stamp[rows]
     estimate = run.learning.at(rows, _columns(run.learning, names))
-    theirs = () if truth is None else _parameters(truth.names)
-
-    def true_of(names: Sequence[str]) -> Floats | None:
-        if truth is None or set(names) != set(theirs):
-            return None
-        return truth.held(stamp, _columns(truth, names))
-
-    true = true_of(names)
     of_torques = arm is not None and _parameters(arm.units) == names
-    R = None  # |R (P^ - P)| is the norm of the torques H P^ - H P
-    if arm and of_torques and true is not None:
-        R = np.asarray(np.linalg.qr(_torques(run, arm.regressor), 'r'))
-    error = None if true is None else _relative_error(estimate, true, R)
-    unlike = theirs if true is None else ()
-    return Estimates(names, run.time_of(stamp), estimate, true, error, of_torques, unlike)
+    theirs = () if truth is None else _parameters(truth.names)
+    true = error = None
+    if truth is not None and set(names) == set(theirs):
+        true, theirs = truth.held(stamp, _columns(truth, names)), ()
+        R = None  # |R (P^ - P)| is the norm of the torques H P^ - H P
+        if arm is not None and of_torques:
+            R = np.asarray(np.linalg.qr(_torques(run, arm.regressor), 'r'))
+        error = _relative_error(estimate, true, R)
+    return Estimates(names, run.time_of(stamp), estimate, true, error, of_torques, theirs)
 
 
 def _relative_error(estimate: Floats, P: Floats, R: Floats | None) -> Floats:
@@ -119,19 +116,51 @@ def _parameters(names: Iterable[str]) -> tuple[str, ...]:
     return tuple(name for name in names if not name.startswith(_NO_PARAMETERS))
 
 
+def bodies_of(names: Sequence[str]) -> dict[str, list[int]]:
+    """Return the indices of the estimates of each link and kind of friction; of few, each alone."""
+    if len(names) <= _FEW:
+        return {name: [k] for k, name in enumerate(names)}
+    bodies: dict[str, list[int]] = {}
+    for k, name in enumerate(names):
+        link = re.search(r'\d+$', name)
+        body = f'link {link[0]}' if link and ' ' not in name else name.split(' ')[0]
+        bodies.setdefault(body, []).append(k)
+    return bodies
+
+
+def errors_of_bodies(
+    bodies: Mapping[str, Sequence[int]], estimate: Floats, true: Floats | None, prior: Floats
+) -> Floats:
+    """Return how far the estimates (m, p) of each body are off, (b, m): rms [% of the prior].
+
+    Off the truth or, where none is known, off the first estimates. `prior` (p,) are deviations.
+    """
+    if true is None or np.isnan(true[-1]).all():
+        true = estimate[:1]
+    square = (100.0 * (estimate - true) / prior) ** 2
+    with np.errstate(divide='ignore', invalid='ignore'):  # unknown: 0 / 0
+        each = [
+            np.nansum(square[:, k], axis=1) / np.isfinite(square[:, k]).sum(axis=1)
+            for k in bodies.values()
+        ]
+        return np.sqrt(each)
+
+
 def latch_time(run: Run) -> float | None:
     """Return the time at which learning began [s], None if it never did or is not recorded."""
-    if not run.learns or run.learning is None or LATCHED not in run.learning.names:
-        return None
-    latched = np.flatnonzero(run.learning.column(LATCHED) > 0.5)
-    return float(run.time_of(run.learning.stamp)[latched[0]]) if latched.size else None
+    return next(iter(_rises(run, LATCHED)), None) if run.learns else None
 
 
 def change_times(run: Run) -> list[float]:
     """Return the times [s] at which the controller detected a change of the arm."""
-    if run.learning is None or MODEL_CHANGES not in run.learning.names:
+    return _rises(run, MODEL_CHANGES)
+
+
+def _rises(run: Run, name: str) -> list[float]:
+    """Return the times [s] at which a count of the learning rises."""
+    if run.learning is None or name not in run.learning.names:
         return []
-    rises = np.flatnonzero(np.diff(run.learning.column(MODEL_CHANGES), prepend=0.0) > 0.0)
+    rises = np.flatnonzero(np.diff(np.nan_to_num(run.learning.column(name)), prepend=0.0) > 0.0)
     return [float(t) for t in run.time_of(run.learning.stamp[rises])]
 
 

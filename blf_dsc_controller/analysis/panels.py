@@ -6,8 +6,7 @@ Long series are thinned, without losing a peak.
 
 from __future__ import annotations
 
-import re
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import chain
 from math import inf
@@ -17,13 +16,15 @@ import numpy as np
 
 from blf_dsc_controller.analysis.metrics import (
     Estimates,
+    bodies_of,
+    errors_of_bodies,
     estimates_of,
     latch_time,
     outside,
     rms,
     true_change_times,
 )
-from blf_dsc_controller.analysis.style import ALARM, INK, MUTED
+from blf_dsc_controller.analysis.style import ALARM, COLOURS, INK, MUTED
 from blf_dsc_controller.messages.topics import (
     COMPUTE_TIME,
     DISTURBANCE,
@@ -88,9 +89,8 @@ class Panel:
     group: str
     title: str
     unit: str
-    lines: Iterable[Line]
+    lines: Sequence[Line]
     note: str = ''  # only if a single run is shown
-    symbol: str = ''  # label of the axis in mathematical type, instead of the unit
     log: bool = False
     marks: tuple[Mark, ...] = ()
     span: float = 0.0  # limit of the axis in pictures, in both directions; 0: everything
@@ -232,74 +232,61 @@ def _learning(run: Run) -> Iterator[Panel]:
     estimates = estimates_of(run)
     if estimates is None or run.learning is None:
         return
-    error = _relative_error(estimates)
+    if estimates.relative_error is not None:
+        yield _relative_error(estimates)
     if run.arm is not None:
-        yield from error
         yield from _of_links(run, run.arm, estimates)
-        yield from _frictions(run, run.arm)
-    else:
+    elif len(estimates.names) <= len(COLOURS):
         for j, name in enumerate(estimates.names):
             lines = [Line('estimate', estimates.time, estimates.estimate[:, j])]
             if estimates.true is not None:
                 lines.append(Line('true', estimates.time, estimates.true[:, j], INK, dashed=True))
             yield Panel('Parameters', name, 'kg m²', lines)
-        yield from error
+    lines = []
     for name in run.learning.names:
         if name.startswith(DISTURBANCE):
-            estimate = _column(run, run.learning, name, 'estimate')
-            true = _column(run, run.truth, name, 'true', colour=INK, dashed=True)
-            true = true if run.arm is None else []  # it includes the learned friction
-            yield Panel('Disturbance', name, 'N m', (*estimate, *true))
-
-
-def _relative_error(estimates: Estimates) -> Iterator[Panel]:
-    if estimates.relative_error is None:
-        return
-    error = np.maximum(100.0 * estimates.relative_error, _LEAST_ERROR)
-    limit = Line('1 %', estimates.time, np.ones_like(error), MUTED, dashed=True)
-    lines = (Line('relative error', estimates.time, error), limit)
-    symbol, title = r'$\|\hat P - P\| \;/\; \|P\|$', 'relative parameter error'
-    if estimates.of_torques:
-        symbol, title = r'$\|H\hat P - HP\| \;/\; \|HP\|$', 'torque error'
-    yield Panel('Parameters', title, '%', lines, symbol=symbol, log=True)
+            lines += _column(run, run.learning, name, name.removeprefix(DISTURBANCE))
+            if run.arm is None:  # else it includes the learned friction
+                lines += _column(run, run.truth, name, 'true', colour=INK, dashed=True)
+    yield Panel('Disturbance', 'disturbance estimates', 'N m', lines)
 
 
 def _of_links(run: Run, arm: LearnedArm, estimates: Estimates) -> Iterator[Panel]:
-    """Yield the parameter errors of each link, in deviations of the prior."""
-    origin, what = estimates.true, 'errors'
-    if origin is None:
-        origin, what = estimates.estimate[:1], 'changes'
-    off = estimates.estimate - origin
-    for i, joint in enumerate(run.joints, 1):
-        lines = [
-            Line(name, estimates.time, off[:, j] / arm.deviations[name])
-            for j, name in enumerate(estimates.names)
-            if re.fullmatch(rf'.*\D{i}', name)
-        ]
-        yield Panel('Parameters', f'{what} of link {i}, {joint}', 'prior deviations', lines)
-
-
-def _frictions(run: Run, arm: LearnedArm) -> Iterator[Panel]:
+    """Yield the errors of the estimates by link, in deviations of the prior, and the friction."""
+    bodies = bodies_of(estimates.names)
+    prior = np.array([arm.deviations[name] for name in estimates.names])
+    off = errors_of_bodies(bodies, estimates.estimate, estimates.true, prior)
+    lines = [Line(body, estimates.time, each) for body, each in zip(bodies, off, strict=True)]
+    what = 'changes' if estimates.true is None else 'errors'
+    yield Panel('Parameters', f'{what} of the estimates, by link', '% of prior', lines)
     for kind in ('viscous', 'coulomb'):
         names = [name for name in arm.units if name.startswith(f'{kind} ')]
-        lines = (
-            line for name in names for line in _column(run, run.learning, name, name.split(' ')[1])
-        )
-        if names:
+        lines = []
+        for name in names:
+            lines += _column(run, run.learning, name, name.removeprefix(f'{kind} '))
+        if lines:
             yield Panel('Parameters', f'{kind} friction', arm.units[names[0]], lines)
+
+
+def _relative_error(estimates: Estimates) -> Panel:
+    error = np.maximum(100.0 * np.asarray(estimates.relative_error), _LEAST_ERROR)
+    limit = Line('1 %', estimates.time, np.ones_like(error), MUTED, dashed=True)
+    lines = (Line('relative error', estimates.time, error), limit)
+    title = 'torque error' if estimates.of_torques else 'relative parameter error'
+    return Panel('Parameters', title, '%', lines, log=True)
 
 
 def _monitors(run: Run) -> Iterator[Panel]:
     latched = latch_time(run)
     note = 'learning never began' if latched is None else f'learning from {latched:.4g} s on'
     note = note if run.learns else 'not used by this law'
+    title = 'minimum eigenvalue of Φ'
     excitation = [
         line._replace(values=np.where(line.values > 0.0, line.values, np.nan))  # 0: no update yet
         for series in (run.learning, run.monitor)
-        for line in _column(run, series, LAMBDA_MIN, 'minimum eigenvalue')
+        for line in _column(run, series, LAMBDA_MIN, title)
     ]
-    symbol = r'$\lambda_{\min}(\Phi)$'
-    yield Panel('Excitation', 'minimum eigenvalue', '', excitation[:1], note, symbol, log=True)
+    yield Panel('Excitation', title, '', excitation[:1], note, log=True)
     if run.monitor is not None and LYAPUNOV_TERMS[0] in run.monitor.names:
         yield _lyapunov(run, run.monitor)
 
@@ -317,12 +304,12 @@ def _lyapunov(run: Run, monitor: Series) -> Panel:
     style: Any = {'colour': MUTED, 'dashed': True}
     for bound in _column(run, monitor, LYAPUNOV_BOUND, 'bound (32)', **style):
         known = np.isfinite(bound.values)
-        note = r'no bound, as $\kappa_e = 0$'
+        note = 'no bound, as κe = 0'
         if known.any():
             terms.append(bound)
             met = float(np.mean(V.values[known] <= bound.values[known]))
             note = f'below its bound {100 * met:.3g} % of the time'
-    lines = (line._replace(values=np.maximum(line.values, _LEAST)) for line in (*terms, V))
+    lines = [line._replace(values=np.maximum(line.values, _LEAST)) for line in (*terms, V)]
     return Panel('Monitors', 'V (29) and its terms', 'J', lines, note, log=True)
 
 
@@ -333,11 +320,11 @@ def _timing(run: Run) -> Iterator[Panel]:
         ('state to torque', run.timing, LATENCY),
         ('computing time of the law', run.learning, COMPUTE_TIME),
     ):
-        times = (
+        times = [
             line._replace(values=1e6 * line.values)
             for line in _column(run, series, name, '')
             if np.isfinite(line.values).any()
-        )
+        ]
         yield Panel('Timing', title, 'µs', times, log=True)
 
 

@@ -25,11 +25,12 @@ from blf_dsc_controller.run import Floats, Run
 
 _DIGITS = 7
 _ALARMING = ('violation', 'stop', 'ERROR', 'lost')
-_LEVELS = ('OK', 'WARN', 'ERROR', 'STALE')
 _MOST_OF_A_KIND = 50
 _LONGEST = 1000  # characters of a parameter that is shown in full
 _AT_LIMIT = 1.0 - 1e-9
 
+LEVELS = ('OK', 'WARN', 'ERROR', 'STALE')
+"""Levels of /diagnostics."""
 
 Happened = tuple[float, str, str]
 """An event: s since the first sample, kind, text."""
@@ -70,23 +71,19 @@ def _names(paths: Sequence[Path]) -> list[str]:
 def _read(path: Path, name: str, namespace: str, names: NameMap) -> ReportedBag:
     content = read_content(path, namespace, names)
     run = recorded_run(content, names, namespace)
-    configured = content.configurations
-    lost = ((0.0, 'lost', f'{topic}: {text}') for topic, text in content.losses.items())
-    left_out = ((0.0, 'left out', note) for note in run.notes)
-    events = (
-        *left_out, *_events(run), *_diagnosed(content, run), *_changed(content, run), *lost
-    )  # fmt: skip
-    return ReportedBag(
-        name,
-        run,
-        content,
-        parameters={
-            f'{node}: {parameter}': _shown(value)
-            for node in sorted(configured)
-            for parameter, value in sorted(configured[node].items())
-        },
-        events=sorted(events, key=itemgetter(0)),
-    )
+    events = [
+        *((0.0, 'left out', note) for note in run.notes),
+        *_events(run),
+        *_diagnosed(content, run),
+        *_changed(content, run),
+        *((0.0, 'lost', f'{topic}: {text}') for topic, text in content.losses.items()),
+    ]
+    parameters = {
+        f'{node}: {parameter}': _shown(value)
+        for node, values in sorted(content.configurations.items())
+        for parameter, value in sorted(values.items())
+    }
+    return ReportedBag(name, run, content, parameters, sorted(events, key=itemgetter(0)))
 
 
 def _events(run: Run) -> Iterator[Happened]:
@@ -111,8 +108,8 @@ def _events(run: Run) -> Iterator[Happened]:
 
 
 def _intervals(run: Run, holds: np.ndarray, kind: str, joint: str, what: str) -> Iterator[Happened]:
-    edges = np.diff(np.concatenate([[0], holds.astype(np.int8), [0]]))
-    begins, ends = np.flatnonzero(edges == 1), np.flatnonzero(edges == -1)
+    edges = np.flatnonzero(np.diff(holds, prepend=False, append=False))
+    begins, ends = edges[::2], edges[1::2]
     times = run.time_of(run.stamp[begins])
     for time, begin, end in list(zip(times, begins, ends, strict=True))[:_MOST_OF_A_KIND]:
         yield (float(time), kind, f'{joint} {what} for {end - begin} samples')
@@ -133,7 +130,7 @@ def _diagnosed(content: Content, run: Run) -> Iterator[Happened]:
             now = (int(status.level), str(status.message))
             if shown.get(status.name) != now:
                 shown[status.name] = now
-                level = _LEVELS[min(now[0], len(_LEVELS) - 1)]
+                level = LEVELS[min(now[0], len(LEVELS) - 1)]
                 yield (time, level, f'{status.name}: {now[1]}')
 
 
@@ -162,49 +159,43 @@ def write_report(bags: Sequence[ReportedBag], path: Path) -> None:
         from plotly.offline import get_plotlyjs
     except ImportError:
         raise MissingExtraError('plotly', 'report', 'the page') from None
-    found, seconds = panels([bag.run for bag in bags]), max(bag.run.duration for bag in bags)
-    groups = dict.fromkeys(panel.group for panel in found)
     events = sorted(
         (time, k, kind, text) for k, bag in enumerate(bags) for time, kind, text in bag.events
     )
-    parameters: list[list[str | Cell]] = []
-    different = []
+    parameters: list[tuple[str | Cell, ...]] = []
     for name in dict.fromkeys(name for bag in bags for name in bag.parameters):
         values = [bag.parameters.get(name, 'not recorded') for bag in bags]
-        parameters.append([name, *values])
-        if len(set(values)) > 1:
-            parameters[-1][0] = Cell(name, 'marked')
-            different.append(parameters[-1])
+        parameters.append((Cell(name, 'marked' * (len(set(values)) > 1)), *values))
     write_page(
         path,
         'report.html',
         ' and '.join(bag.name for bag in bags),
         names=[bag.name for bag in bags],
-        seconds=seconds,
-        thinned=max(_period(bag.run) for bag in bags),
         versions=sorted({bag.content.version or 'another recorder' for bag in bags}),
-        links=[*groups, 'Events', 'Configuration'],
         summaries=[
-            (bag.name, colour(k), format_table(summarize(bag.run))) for k, bag in enumerate(bags)
+            (bag.name, _colour(k), format_table(summarize(bag.run))) for k, bag in enumerate(bags)
         ],
-        data={'panels': plots(found, bags), 'seconds': seconds},
+        data={
+            'panels': plots(panels([bag.run for bag in bags]), bags),
+            'seconds': max(bag.run.duration for bag in bags),
+        },
+        pieces=PIECES,
         plotly=get_plotlyjs(),
         events=[
             (
                 Cell(f'{time:.3f} s', 'number'),
-                Cell(bags[k].name, colour=colour(k)),
+                Cell(bags[k].name, colour=_colour(k)),
                 Cell(kind, 'bad' if kind in _ALARMING else ''),
                 text,
             )
             for time, k, kind, text in events
         ],
         parameters=parameters,
-        different=different,
     )
 
 
 def plots(shown: Sequence[Panel], bags: Sequence[ReportedBag]) -> list[dict[str, Any]]:
-    """Return panels as data for plotly, with traces thinned without losing a peak."""
+    """Return panels as data for plotly."""
     prefixes = [f'{bag.name}: ' for bag in bags] if len(bags) > 1 else []
     return [
         {
@@ -214,7 +205,7 @@ def plots(shown: Sequence[Panel], bags: Sequence[ReportedBag]) -> list[dict[str,
             'traces': list(_traces(panel, prefixes)),
             'log': panel.log,
             'marks': [
-                (mark.time, mark.text, mark.colour or colour(mark.run), mark.until)
+                (mark.time, mark.text, mark.colour or _colour(mark.run), mark.until)
                 for mark in panel.marks
             ],
         }
@@ -222,19 +213,15 @@ def plots(shown: Sequence[Panel], bags: Sequence[ReportedBag]) -> list[dict[str,
     ]
 
 
-def _period(run: Run) -> float:
-    """Return the interval [ms] of which two samples are drawn; 0 if all samples are."""
-    n = run.stamp.size
-    return 1e3 * run.duration / (n - 1) * -(-n // PIECES) if n > 2 * PIECES else 0.0
-
-
 def _traces(panel: Panel, prefixes: Sequence[str]) -> Iterator[dict[str, Any]]:
-    drawn = 0
+    drawn, named = 0, set()
     for line in panel.lines:
-        shade = line.colour or colour(line.run if prefixes else drawn)
+        is_known = bool(line.colour) and (line.run > 0 or line.name in named)
+        named.add(line.name)
+        shade = line.colour or _colour(line.run if prefixes else drawn)
         drawn += not line.colour
         if prefixes and shade == INK:
-            shade = colour(line.run)
+            shade = _colour(line.run)
         for sign in (1.0, -1.0) if line.mirrored else (1.0,):
             yield {
                 'type': 'scatter',
@@ -243,7 +230,7 @@ def _traces(panel: Panel, prefixes: Sequence[str]) -> Iterator[dict[str, Any]]:
                 'y': _numbers(sign * line.values),
                 'line': {'width': 1.3, 'color': shade, 'dash': 'dash' if line.dashed else 'solid'},
                 # Lines with a colour of their own look the same in all bags.
-                'showlegend': bool(line.name) and sign > 0.0 and not (line.colour and line.run),
+                'showlegend': bool(line.name) and sign > 0.0 and not is_known,
             }
 
 
@@ -251,6 +238,6 @@ def _numbers(values: Floats) -> list[float | None]:
     return [float(f'{y:.{_DIGITS}g}') if np.isfinite(y) else None for y in values.tolist()]
 
 
-def colour(k: int) -> str:
+def _colour(k: int) -> str:
     """Return the colour of the k-th bag."""
     return COLOURS[k % len(COLOURS)]

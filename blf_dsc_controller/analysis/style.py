@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import base64
-import re
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -111,8 +110,7 @@ def head(axes: Axes, title: str, *, legend_at: float | None = None) -> None:
         return
     grid = axes.get_subplotspec()
     width = axes.figure.get_figwidth() / (grid.get_gridspec().ncols if grid else 1)  # type: ignore[union-attr]
-    characters = re.sub(r'\\hat|[\\${}_^,]', '', title + ''.join(labels))
-    fits = _CHARACTER * len(characters) + _HANDLE * entries < width - _MARGIN
+    fits = _CHARACTER * len(title + ''.join(labels)) + _HANDLE * entries < width - _MARGIN
     above = fits or legend_at is not None
     axes.legend(
         loc='lower right' if above else 'center left',
@@ -124,14 +122,6 @@ def head(axes: Axes, title: str, *, legend_at: float | None = None) -> None:
         handlelength=1.6,
         columnspacing=1.2,
     )
-
-
-def formula(name: str) -> str:
-    """Return the name of a parameter, as mathtext if it is a formula such as `m2*l1*l2`."""
-    if not re.fullmatch(r'(?:[A-Za-z]\d*|[()+*^-]|\d)+', name) or not re.search(r'\d', name):
-        return name
-    indexed = re.sub(r'([A-Za-z])(\d+)', r'\1_{\2}', name)
-    return f'${indexed.replace("*", chr(92) + ",")}$'
 
 
 class Cell(NamedTuple):

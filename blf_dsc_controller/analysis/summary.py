@@ -5,8 +5,9 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
+from textwrap import shorten
 from typing import Any
 
 import numpy as np
@@ -37,7 +38,7 @@ _JOINT = {  # entry of the summary: metric; title, unit, factor and decimals in 
 
 _OFTEN = 0.01  # of the samples
 _WIDEST = 'widest_bound_rad'
-_NAMED = 3  # parameters, where the names of model and plant differ
+_WIDTH = 40  # characters of the names, where those of model and plant differ
 _MEASURED = {  # comparison with the truth: entry of the summary, its line of the table
     'relative_error': 'parameters  error',
     'torque_error': 'model       torque error of the learned model',
@@ -93,8 +94,7 @@ def plain(value: Any) -> Any:
 
 def _learning(run: Run, estimates: Estimates, metrics: Metrics) -> Summary:
     reached = {t: error for t, error in metrics.parameter_error.items() if not math.isnan(error)}
-    relative, torque = _MEASURED
-    measured = torque if estimates.of_torques else relative
+    measured = 'torque_error' if estimates.of_torques else 'relative_error'
     learning: Summary = plain(
         {
             'used': run.learns,
@@ -197,19 +197,17 @@ def _sentences(summary: Summary) -> Iterator[str]:
         values = [math.nan if load[name] is None else load[name] for name in LOAD]
         yield f'held        {load_text(values)}, until {load["until_s"]:.1f} s'
     if summary['timing'] is not None:
-        late = summary['timing']['late_steps']
-        is_slow = late is not None and late > _OFTEN * summary['samples']
-        busy = ': the computer was too busy for real time (--mode lockstep waits)'
-        yield f'real time   {", ".join(_real_time(summary["timing"]))}{busy if is_slow else ""}'
+        rate, latency, late = summary['timing'].values()
+        figures = [
+            *([] if rate is None else [f'{rate:.2f} Hz']),
+            *([] if latency is None else [f'state to torque {_microseconds(latency)}']),
+            *([] if late is None else [f'{late} late steps']),
+        ]
+        is_slow = (late or 0) > _OFTEN * summary['samples']
+        busy = ': the computer was too busy for real time (--mode lockstep waits)' * is_slow
+        yield f'real time   {", ".join(figures)}{busy}'
     if summary['compute_time_us'] is not None:
         yield f'law         {_microseconds(summary["compute_time_us"])}'
-
-
-def _first(names: Iterable[str]) -> str:
-    """List the first three names."""
-    chosen = list(names)
-    more = f', ... ({len(chosen)} in all)' if len(chosen) > _NAMED else ''
-    return ', '.join(chosen[:_NAMED]) + more
 
 
 def _learning_lines(learning: Summary) -> Iterator[str]:
@@ -223,9 +221,12 @@ def _learning_lines(learning: Summary) -> Iterator[str]:
         yield f'rejected    {reason or f"{column}: see the log for the reason"}'
     unlike = learning['true_parameters_of_other_names']
     if unlike:
-        names, true = _first(learning['final_estimate']), _first(unlike)
+        model, plant = (
+            shorten(', '.join(names), _WIDTH, placeholder=' ...')
+            for names in (learning['final_estimate'], unlike)
+        )
         yield (
-            f'parameters  not comparable: the model has {names}, the plant {true}; do gravity and '
+            f'parameters  not comparable: the model has {model}, the plant {plant}; do gravity and '
             'joints agree?'
         )
     settled = learning['time_to_1_percent_s']
@@ -235,15 +236,6 @@ def _learning_lines(learning: Summary) -> Iterator[str]:
         if end is not None:
             moments = [f'{t} s {_percent(e)}' for t, e in learning[f'{measured}_at_s'].items()]
             yield f'{title} {", ".join([*moments, f"end {_percent(end)}"])}; {ending}'
-
-
-def _real_time(timing: Summary) -> Iterator[str]:
-    if timing['rate_hz'] is not None:
-        yield f'{timing["rate_hz"]:.2f} Hz'
-    if timing['latency_us'] is not None:
-        yield f'state to torque {_microseconds(timing["latency_us"])}'
-    if timing['late_steps'] is not None:
-        yield f'{timing["late_steps"]} late steps'
 
 
 def _microseconds(values: Summary) -> str:

@@ -11,9 +11,10 @@ import numpy as np
 
 from blf_dsc_controller.analysis.report import read_bags
 from blf_dsc_controller.bags.content import NO_NAMES, NameMap
+from blf_dsc_controller.law.factory import estimate_names
 from blf_dsc_controller.messages.topics import LAMBDA_MIN, LOAD, PLANT
 from blf_dsc_controller.run import Floats, Run, Series, Stamps
-from blf_dsc_controller.view.page import PAST, Page, Snapshot, plant_events, units_of
+from blf_dsc_controller.view.page import PAST, Page, Snapshot, plant_events
 
 _RATE = 30.0  # snapshots per second
 _MOST = 20_000  # snapshots per bag
@@ -36,7 +37,7 @@ class BagPlayer:
         (bag,) = read_bags([path], namespace, names)
         config = bag.content.controller_config()
         plant = bag.content.configurations.get(PLANT, {})
-        self.snapshots = snapshots(bag.run, tuple(units_of(config)))
+        self.snapshots = snapshots(bag.run, estimate_names(config))
         self._page, self._times = page, np.array([each.time for each in self.snapshots])
         self._events = sorted([*bag.events, *plant_events(plant)])
         self._playing, self._drawn = False, -1

@@ -12,7 +12,6 @@ import os
 import sys
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
-from math import inf
 from queue import SimpleQueue
 from typing import Any
 
@@ -22,9 +21,11 @@ from rclpy.parameter import Parameter
 from rclpy.serialization import deserialize_message
 from std_srvs.srv import Trigger
 
+from blf_dsc_controller.analysis.report import LEVELS
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.nodes import VIEW, ViewConfig, is_builtin
 from blf_dsc_controller.configuration.schema import build
+from blf_dsc_controller.law.factory import estimate_names
 from blf_dsc_controller.messages import topics
 from blf_dsc_controller.messages.codecs import JointStateDecoder, MessageError, joint_state_layout
 from blf_dsc_controller.messages.journal import Event, EventType, decode
@@ -45,7 +46,6 @@ from blf_dsc_controller.view.page import (
     Snapshot,
     open_to_others,
     plant_events,
-    units_of,
 )
 
 _PERIOD = 1.0 / 30.0  # s
@@ -54,12 +54,10 @@ _SILENCE = 30  # frames without a joint state before the page reports it
 _OUTDATED = 500_000_000  # ns
 _LISTED = 50  # events
 _NICE = 10  # lower priority than the loop
-_PUSH = 0.5  # s
 _NEWEST = Quality(depth=1, reliability='best_effort')
 _STREAMS = (topics.JOINT_STATES, topics.TRACKING_ERROR, topics.BOUND, topics.MONITOR, topics.TRUTH)
 _EVENTS = (topics.JOURNAL, topics.CHANGES, topics.STATE)
 _FIGURES = (*topics.LOAD, topics.LAMBDA_MIN, topics.LATCHED)
-_LEVELS = dict(enumerate(('OK', 'WARN', 'ERROR', 'STALE')))
 
 
 class ViewNode(PlainNode):
@@ -93,9 +91,6 @@ class ViewNode(PlainNode):
         self._newest = self._subscribe(_STREAMS, _NEWEST)
         self._kept = self._subscribe(_EVENTS)
         self._asked: SimpleQueue[Callable[[], None]] = SimpleQueue()  # by the page's threads
-        self._pushing: list[float] = []  # N m, as asked for
-        self._push_ends = inf  # s
-        self._load: list[float] = []  # N m, without a push
         self._requests = {
             name: self.create_client(type_, f'{self.get_namespace().rstrip("/")}/{name}')
             for name, type_ in (
@@ -163,17 +158,14 @@ class ViewNode(PlainNode):
             return
         content: Any = deserialize_message(raw, message_class(topic.type))
         if topic is topics.STATE:
-            self._state = _LEVELS[content.level[0]], content.message
+            self._state = LEVELS[content.level[0]], content.message
             return
         said = json.loads(content.data)
         if said.get('configured'):
             self._plant, self._noted = said['parameters'], -1.0
-            self._load = self._plant.get('load.torque', [])
             self._draw_all()
             return
         self._plant |= said['parameters']
-        if said['parameters'].get('load.torque') == self._pushing:  # from here on it acts
-            self._push_ends = self._time(said['stamp']) + _PUSH
         for name, value in said['parameters'].items():
             self._events.append((self._time(said['stamp']), name, f'{value}'))
 
@@ -192,7 +184,7 @@ class ViewNode(PlainNode):
 
     def _configure(self, config: ControllerConfig) -> None:
         self._config = config
-        self._estimates = tuple(units_of(config))
+        self._estimates = estimate_names(config)
         self._decoders = {
             topic: JointStateDecoder(config.joints, ('position',)) for topic in _STREAMS[:3]
         }
@@ -204,7 +196,7 @@ class ViewNode(PlainNode):
         if self._config is not None:
             self.page.clear()
             lengths = [self._plant[name] for name in ('arm.l1', 'arm.l2') if name in self._plant]
-            self._add_buttons(self.page.draw_arm(self._config, lengths), self._config.joints)
+            self._add_buttons(self.page.draw_arm(self._config, lengths))
 
     # Samples.
 
@@ -259,14 +251,11 @@ class ViewNode(PlainNode):
             self.past.popleft()
         self._events += [e for e in plant_events(self._plant) if self._noted < e[0] <= time]
         self._noted = time
-        if time >= self._push_ends:
-            self._push_ends, self._pushing = inf, []
-            self._set('load.torque', self._load)
 
     # What the buttons ask for.
 
-    def _add_buttons(self, tabs: Any, joints: Sequence[str]) -> None:
-        gui, simulated = self.page.server.gui, bool(self._plant)
+    def _add_buttons(self, tabs: Any) -> None:
+        gui = self.page.server.gui
 
         def button(label: str, hint: str, action: Callable[[], None]) -> None:
             self.buttons[label] = gui.add_button(label, hint=hint)
@@ -274,33 +263,19 @@ class ViewNode(PlainNode):
 
         with tabs.add_tab('Try'):
             button('Reset', 'return to the start, forget what was learned', self._reset)
-            if simulated:
-                joint = gui.add_dropdown('joint', tuple(joints), hint='joint to push')
-                push = gui.add_slider('push [N m]', -10.0, 10.0, 0.1, 2.0)
-                button(
-                    'Push',
-                    'push this joint with this torque for half a second',
-                    lambda: self._push([push.value * (name == joint.value) for name in joints]),
-                )
+            if self._plant:
                 mass = gui.add_slider('payload [kg]', 0.0, 5.0, 0.05, 0.5)
-                button(
-                    'Pick up', 'attach this payload', lambda: self._set('load.payload', mass.value)
-                )
-                button('Put down', 'remove the payload', lambda: self._set('load.payload', 0.0))
+                button('Pick up', 'attach this payload', lambda: self._carry(mass.value))
+                button('Put down', 'remove the payload', lambda: self._carry(0.0))
 
     def _reset(self) -> None:
         """Reset the simulated plant, which resets the controller; without one, the controller."""
         node = topics.PLANT if self._plant else topics.CONTROLLER
         self._call(f'{node}/reset', Trigger.Request(), lambda it: '' if it.success else it.message)
 
-    def _push(self, torque: Sequence[float]) -> None:
-        """Push the joints by these torques [N m] for half a second of plant time."""
-        self._pushing = list(torque)
-        self._set('load.torque', torque)
-
-    def _set(self, name: str, value: Any) -> None:
-        """Set a parameter of the simulated arm."""
-        parameter = Parameter(name, value=value).to_parameter_msg()
+    def _carry(self, mass: float) -> None:
+        """Set the payload of the simulated arm [kg]."""
+        parameter = Parameter('load.payload', value=mass).to_parameter_msg()
         request = SetParameters.Request(parameters=[parameter])
         self._call(f'{topics.PLANT}/set_parameters', request, lambda it: it.results[0].reason)
 

@@ -11,7 +11,6 @@ import errno
 import importlib.util
 import io
 import os
-import re
 import socket
 import time
 from collections.abc import Iterable, Mapping, Sequence
@@ -21,11 +20,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from blf_dsc_controller.analysis.metrics import bodies_of, errors_of_bodies
 from blf_dsc_controller.analysis.style import ALARM, COLOURS, GREEN, INK, MUTED, ORANGE
 from blf_dsc_controller.arms.geometry import frames, skeleton, tip_radius
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.errors import BlfDscError, MissingExtraError
-from blf_dsc_controller.law.factory import column_names, model_of, prior_covariance
+from blf_dsc_controller.law.factory import estimate_names, prior_covariance
 from blf_dsc_controller.law.telemetry import load_text
 from blf_dsc_controller.run import Floats
 from blf_dsc_controller.view.arm import ShownArm, arm_of
@@ -46,7 +46,6 @@ _GHOST = (0, 200, 120, 0.35)
 _APART = 0.01  # rad, error from which on the reference is drawn beside the arm
 _PEAK = 30  # snapshots, a second, of which the largest error is plotted
 _LEAST, _MOST = 0.1, 300.0  # % of the bound, the ends of its axis
-_FEW = 8  # estimates that are plotted one by one
 _HEIGHT = 130  # px of a plot: three fit below the state at 900 px
 _VIEW = np.array((0.42, -0.88, 0.22))  # direction from the arm to the camera
 _NO_POINTS = {'show': False}
@@ -78,13 +77,6 @@ class Snapshot(NamedTuple):
     lambda_min: float
     load: Sequence[float] = (np.nan,) * 8  # of topics.LOAD
     loaded: bool = False  # the true parameters differ from those at the start
-
-
-def units_of(config: ControllerConfig) -> dict[str, str]:
-    """Return the units of a controller's estimates by name, in their order."""
-    friction = {name: 'N m s/rad' if 'viscous' in name else 'N m' for name in column_names(config)}
-    model = model_of(config)
-    return dict(zip(model.parameter_names, model.parameter_units, strict=True)) | friction
 
 
 def plant_events(values: Mapping[str, Any]) -> list[tuple[float, str, str]]:
@@ -175,12 +167,10 @@ class Page:
         """Draw the arm of a controller, planar links with these lengths [m]; return the tabs."""
         from viser.extras import ViserUrdf
 
-        arm, estimates = arm_of(config, lengths), units_of(config)
-        self._arm = arm
+        self._arm = arm = arm_of(config, lengths)
         self._joints = [joint.name for joint in arm.chain.joints]
         prefix, names = _shortened(self._joints)
-        self._units = {name.replace(f' {prefix}', ' '): unit for name, unit in estimates.items()}
-        self._bodies = bodies_of(tuple(estimates))
+        self._bodies = bodies_of(estimate_names(config))
         self._prior = np.sqrt(np.diag(prior_covariance(config)))  # standard deviations (m,)
         server, gui, reach = self.server, self.server.gui, arm.reach
         model = arm.model()
@@ -191,8 +181,7 @@ class Page:
         self._ghost = ViserUrdf(
             server, arm.model(), root_node_name='/reference', mesh_color_override=_GHOST
         )
-        base = np.array(model.get_transform(arm.chain.base))
-        self._base = base
+        self._base = np.array(model.get_transform(arm.chain.base))
         floor = min(0.0, -reach if _hangs(arm) else 0.0)
         server.scene.add_grid(
             '/floor', 4 * reach, 4 * reach, cell_size=0.25, position=(0, 0, floor)
@@ -208,8 +197,6 @@ class Page:
                 self._plot('excitation: log10 of lambda_min', ('lambda_min',)),
             ]
             self._table = gui.add_html('')
-        with tabs.add_tab('Estimates'):
-            self._estimates = gui.add_html('')
         with tabs.add_tab('Events'):
             self._list = gui.add_html(event_table(self._events))
         return tabs
@@ -294,18 +281,20 @@ class Page:
                 )
 
     def plot(self, past: Sequence[Snapshot]) -> None:
-        """Draw these snapshots in the plots, and the last one in the tables."""
+        """Draw these snapshots in the plots, and the last one in the table."""
         now = past[-1]
         shown = [each for each in past if each.time > now.time - PAST]
         t = np.array([each.time for each in shown])
         error = np.array([100.0 * each.error / each.bound for each in shown]).T
         torque = np.array([each.torque for each in shown]).T
+        estimate = np.array([each.estimate for each in shown])
+        truth = np.array([each.truth for each in shown])
         excitation = np.array([[each.lambda_min for each in shown]])
         with np.errstate(divide='ignore', invalid='ignore'):
             curves = (
                 np.vstack((_peaks(np.abs(error)), np.full(t.size, 100.0))),
                 torque,
-                self._off(shown),
+                errors_of_bodies(self._bodies, estimate, truth, self._prior),
                 np.log10(excitation),
             )
         marks = [e[0] for e in self._events if t[0] <= e[0] <= t[-1]]
@@ -313,23 +302,6 @@ class Page:
             for plot, values in zip(self._plots, curves, strict=True):
                 plot.data = with_marks(t, values, marks)
             self._table.content = joint_table(self._joints, now)
-            self._estimates.content = estimate_table(self._units, now)
-
-    def _off(self, shown: Sequence[Snapshot]) -> Floats:
-        """Return how far the estimates of each body (b, k) are off, rms [% of the prior].
-
-        Off the truth or, where none is known, off what they were at the left end of the plot.
-        """
-        estimate = np.array([each.estimate for each in shown])
-        truth = np.array([each.truth for each in shown])
-        truth = truth if np.isfinite(truth[-1]).any() else estimate[0]
-        square = (100.0 * (estimate - truth) / self._prior) ** 2
-        with np.errstate(divide='ignore', invalid='ignore'):  # unknown: 0 / 0
-            rms = [
-                np.sqrt(np.nansum(square[:, k], axis=1) / np.isfinite(square[:, k]).sum(axis=1))
-                for k in self._bodies.values()
-            ]
-        return np.array(rms)
 
     def _aim(self, camera: Any, width: float = inf) -> None:
         """Point a camera at the arm, which then fills a picture of this width [px]."""
@@ -366,18 +338,6 @@ class Page:
         """Stop the server."""
         with contextlib.redirect_stdout(io.StringIO()):  # hides its message
             self.server.stop()
-
-
-def bodies_of(estimates: Sequence[str]) -> dict[str, list[int]]:
-    """Return the indices of the estimates of each link and kind of friction; of few, each alone."""
-    if len(estimates) <= _FEW:
-        return {name: [k] for k, name in enumerate(estimates)}
-    bodies: dict[str, list[int]] = {}
-    for k, name in enumerate(estimates):
-        number = re.search(r'\d+$', name)
-        body = number[0] if number and ' ' not in name else name.split(' ')[0]
-        bodies.setdefault(body, []).append(k)
-    return bodies
 
 
 def _shortened(joints: Sequence[str]) -> tuple[str, Sequence[str]]:
@@ -419,19 +379,6 @@ def joint_table(joints: Sequence[str], now: Snapshot) -> str:
     table = _table(((escape(name), *map(_figure, row)) for name, *row in rows), head)
     known = np.isfinite(now.load[0])
     return table + (f'<div style="{_CELL}">held: {load_text(now.load)}</div>' if known else '')
-
-
-def estimate_table(units: Mapping[str, str], now: Snapshot) -> str:
-    """Return the table of estimates; rejected ones are pale."""
-    rows = (
-        (
-            f'{escape(name)} <span style="opacity:0.6">{unit}</span>',
-            f'{value:.3g}' if np.isfinite(value) else '<span style="opacity:0.55">rejected</span>',
-            f'{truth:.3g}' if np.isfinite(truth) else '-',
-        )
-        for (name, unit), value, truth in zip(units.items(), now.estimate, now.truth, strict=True)
-    )
-    return _table(rows, ('estimate', '', 'truth'))
 
 
 def event_table(events: Sequence[tuple[float, str, str]]) -> str:
