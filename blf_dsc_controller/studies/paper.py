@@ -14,8 +14,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from matplotlib.axes import Axes
-from matplotlib.ticker import FuncFormatter, NullFormatter
+from matplotlib.ticker import NullFormatter
 
 from blf_dsc_controller.analysis.figures import draw_panels
 from blf_dsc_controller.analysis.metrics import MOMENTS, estimates_of
@@ -32,39 +31,27 @@ from blf_dsc_controller.studies import tuning as tune
 from blf_dsc_controller.studies.paper_cases import (
     BOUND,
     CASES,
-    LAWS,
     SIDE_BY_SIDE,
     SWEEPS,
+    SWEPT,
     Results,
     case_name,
     run_all,
 )
-from blf_dsc_controller.supervision.config_warnings import config_warnings
 
 HOLDS = 'holds'
 ONLY_IF = 'holds only if'
 FAILS = 'does not hold'
 
-_CASES = {case.name: case for case in CASES}
 _FITTED = 0.95  # share of the variance of log |P~| that an exponential must explain
 _STYLES = {HOLDS: 'good', ONLY_IF: 'partly', FAILS: 'bad'}
-_PAIRS = (  # name, caption, labels and cases
-    (
-        'tuned',
-        'both laws tuned by the same procedure',
-        {'proposed': 'paper_tuned', 'comparison': 'comparison'},
-    ),
-    (
-        'low_gains',
+_PAIRS = {  # of Fig. 2 and 3, by their captions
+    'tuned': ('both laws tuned by the same procedure', ('paper_tuned', 'comparison')),
+    'low_gains': (
         "the paper's choices against a comparison with low gains",
-        {'proposed': 'paper', 'comparison': 'comparison_detuned'},
+        ('paper', 'comparison_detuned'),
     ),
-    (
-        'recommended',
-        'the recommended form against the tuned comparison',
-        {'recommended': 'recommended', 'comparison': 'comparison'},
-    ),
-)
+}
 _TRACKING = (6.4, 2.5)  # inches
 _ESTIMATES = (8.6, 2.4)
 _PANEL = (4.6, 2.9)
@@ -83,7 +70,6 @@ class Claim(NamedTuple):
     measured: str
     verdict: str
     condition: str = ''
-    command: str = 'blf_dsc paper'
 
     @property
     def full_verdict(self) -> str:
@@ -145,7 +131,6 @@ def _of_abstract(results: Results) -> Iterator[Claim]:
         f'(28) takes qr and its first derivative, (35) takes the second too; with all else known '
         f'the lag of the filter costs {_percent(lag)} of the bound',
         verdict(lag < 0.01),
-        command=_CASES['model_based'].command,
     )
     names = ('paper_tuned', 'comparison', 'comparison_detuned')
     rms = [float(np.linalg.norm(results.metrics[name].rms_error)) for name in names]
@@ -160,7 +145,6 @@ def _of_abstract(results: Results) -> Iterator[Claim]:
         f'{errors[1]} and {errors[2]}' + (only_detuned if rms[0] >= rms[1] else ''),
         verdict(*(each[0] < other for each in (rms, learned) for other in each[1:])),
         'the comparison is not tuned',
-        '; '.join(_CASES[name].command for name in names),
     )
 
 
@@ -184,7 +168,6 @@ def _of_section_3(results: Results) -> Iterator[Claim]:
         f'to the floor that the lag of the surface filter leaves: |xi1| up to {1e6 * lag:.2g} µrad',
         verdict(rises == 0, lag == 0.0),
         'the lag of the filter (13) is neglected',
-        _CASES['model_based'].command,
     )
     rate, leaky_rate = (decay_rate(_settings(name)) for name in ('paper', 'leaky'))
     met = [_fraction_met(results.runs[name], name) for name in ('leaky_constant', 'leaky')]
@@ -201,7 +184,7 @@ def _of_section_3(results: Results) -> Iterator[Claim]:
 
 
 def _settings(name: str) -> Settings:
-    return settings_of_config(_CASES[name].loop().controller)
+    return settings_of_config(CASES[name].loop().controller)
 
 
 def _fraction_met(run: Run, name: str) -> float:
@@ -223,7 +206,6 @@ def _of_section_4(results: Results) -> Iterator[Claim]:
         f'largest |xi1| / k_c {ratio:.2f}; of the comparison {tuned_ratio:.2f} if tuned, '
         f'{detuned_ratio:.2f} with low gains',
         verdict(results.metrics['paper'].held),
-        command=_CASES['paper'].command,
     )
     yield _swift_torque(results)
     learned = results.parameter_errors('paper', 'comparison', 'recommended')
@@ -234,7 +216,6 @@ def _of_section_4(results: Results) -> Iterator[Claim]:
         f"error at 60 s {paper} with the paper's choices, {tuned} of the tuned comparison, "
         f'{recommended} recommended',
         verdict(learned[0] < learned[1]),
-        command=f'{_CASES["paper"].command}; {_CASES["comparison"].command}',
     )
     least = float(_learned(results.runs['paper_quiet'], LAMBDA_MIN)[-1])
     yield Claim(
@@ -243,7 +224,6 @@ def _of_section_4(results: Results) -> Iterator[Claim]:
         f'lambda_min of the mean of H^T H over a period is {least:.3f} > 0: every parameter is '
         f'excited, the second one weakly',
         verdict(least < 1e-6),
-        command=f'{_CASES["paper"].command} (monitors.png)',
     )
     zero, laws = results.metrics['paper_from_zero'], ('paper_tuned', 'recommended')
     kept = [0.0 in results.held('initial parameters', law) for law in laws]
@@ -261,7 +241,7 @@ def _of_section_4(results: Results) -> Iterator[Claim]:
 
 def _swift_torque(results: Results) -> Claim:
     """Evaluate the barrier's torque at the largest error, and the error of a pushed arm."""
-    run, barrier = results.runs['paper'], _CASES['paper'].loop().controller.barrier
+    run, barrier = results.runs['paper'], CASES['paper'].loop().controller.barrier
     error = np.abs(_error(run))
     ratio = error / np.array(barrier.bound)
     k, i = np.unravel_index(ratio.argmax(), ratio.shape)
@@ -321,12 +301,11 @@ def _percents(values: Iterable[float]) -> list[str]:
 def compare(folder: Path) -> list[Claim]:
     """Run every case, write the report into an empty folder and return the claims."""
     (folder / 'configurations').mkdir()
-    for case in CASES:
-        name = case.name.replace(' ', '_')
-        dump(folder / 'configurations' / f'{name}.yaml', case.loop().by_node)
+    for name, case in CASES.items():
+        file = folder / 'configurations' / f'{name.replace(" ", "_")}.yaml'
+        dump(file, case.loop().by_node)
     results = run_all()
     found = list(claims(results))
-    laws = list(side_by_side(results))
     metrics = {name: plain(asdict(each)) for name, each in results.metrics.items()}
     numbers = {'claims': [claim._asdict() for claim in found], 'metrics': metrics}
     write_summary(numbers, folder / 'results.json')
@@ -334,17 +313,9 @@ def compare(folder: Path) -> list[Claim]:
         folder / 'index.html',
         'paper.html',
         'The paper, side by side',
-        claims=[
-            (*claim[:3], Cell(claim.full_verdict, _STYLES[claim.verdict]), Cell(claim[-1], 'code'))
-            for claim in found
-        ],
-        laws=laws,
-        presets=', '.join(f'{case.label}: {case.preset}' for case in SIDE_BY_SIDE),
-        warnings=[
-            f'{case.label}: {warning}'
-            for case in SIDE_BY_SIDE
-            for warning in config_warnings(case.loop().controller)
-        ],
+        claims=[(*claim[:3], Cell(claim.full_verdict, _STYLES[claim.verdict])) for claim in found],
+        laws=list(side_by_side(results)),
+        presets=', '.join(f'{label}: {preset}' for preset, label in SIDE_BY_SIDE.items()),
         tune=tune,
         figures=list(draw_pairs(results, folder)),
         robustness=draw_robustness(results, folder),
@@ -364,11 +335,11 @@ def side_by_side(results: Results) -> Iterator[list[str]]:
         'torque rate [N m/s]': ('torque_rate', 1.0, 1),
     }
     yield ['law', *columns, *(f'error at {t} s' for t in MOMENTS), 'below 1 % from', 'bound']
-    for case in SIDE_BY_SIDE:
-        metrics = results.metrics[case.name]
+    for preset, label in SIDE_BY_SIDE.items():
+        metrics = results.metrics[preset]
         settled = metrics.time_to_1_percent
         yield [
-            case.label,
+            label,
             *(
                 ' / '.join(f'{factor * value:.{decimals}f}' for value in getattr(metrics, name))
                 for name, factor, decimals in columns.values()
@@ -381,8 +352,8 @@ def side_by_side(results: Results) -> Iterator[list[str]]:
 
 def draw_pairs(results: Results, folder: Path) -> Iterator[tuple[Path, str]]:
     """Draw Fig. 2 and 3 of each pair of laws; yield their paths and captions."""
-    for name, caption, pair in _PAIRS:
-        runs = [replace(results.runs[case], torque_limit=None) for case in pair.values()]
+    for name, (caption, pair) in _PAIRS.items():
+        runs = [replace(results.runs[case], torque_limit=None) for case in pair]
         linear = [panel for panel in panels(runs, end=_UNTIL) if not panel.log]
         tracking = [
             replace(panel, title=f'({letter}) {panel.title}')
@@ -396,58 +367,52 @@ def draw_pairs(results: Results, folder: Path) -> Iterator[tuple[Path, str]]:
         ):
             path = folder / f'figure_{number}_{name}.png'
             title = f'Fig. {number}, {caption}'
-            draw_panels(path, title, drawn, columns, size, list(pair))
+            draw_panels(path, title, drawn, columns, size, ['proposed', 'comparison'])
             yield path, f'Fig. {number}: {caption}{note}.'
 
 
 def draw_robustness(results: Results, folder: Path) -> list[Path]:
     """Draw the largest error and the parameter error of every sweep; return both paths."""
+    tracking, learning = (folder / f'robustness_{name}.png' for name in ('tracking', 'learning'))
     metrics = results.metrics.items()
-    drawn = {
-        'Largest error, in units of the bound: above the red line it is violated': (
-            {name: min(each.max_error_ratio, _BROKEN) for name, each in metrics},
-            _dress_ratio,
-            folder / 'robustness_tracking.png',
-        ),
-        'Parameter error over the last ten of 30 s': (
-            {name: each.tail_parameter_error for name, each in metrics},
-            _dress_learning,
-            folder / 'robustness_learning.png',
-        ),
-    }
-    for title, (value_of, dress, path) in drawn.items():
-        picture = Picture(-(-len(SWEEPS) // _COLUMNS), _COLUMNS, title, _PANEL, share_time=False)
-        for sweep, axes in zip(SWEEPS, picture.axes.flat, strict=False):
-            for law, colour, mark in zip(LAWS, COLOURS, _MARKS, strict=False):
-                if law in sweep.laws:
-                    values = [value_of[case_name(sweep.name, law, value)] for value in sweep.values]
-                    style = {'color': colour, 'marker': mark, 'ms': 4.5, 'label': LAWS[law]}
-                    axes.plot(sweep.values, values, **style)
-            least, most = min(sweep.values), max(sweep.values)
-            if 0.0 < _DECADE * least < most:
-                axes.set_xscale('log')
-                shown = sweep.values[:: 1 if len(sweep.values) <= 7 else 2]
-                axes.set_xticks(shown, [f'{value:g}' for value in shown])
-                axes.xaxis.set_minor_formatter(NullFormatter())
-            axes.set_xlabel(sweep.label)
-            axes.set_yscale('log')
-            dress(axes)
-        picture.axes.flat[0].legend(frameon=False, fontsize=9, loc='best')
-        picture.save(path)
-    return [path for *_, path in drawn.values()]
+    ratios = {name: min(each.max_error_ratio, _BROKEN) for name, each in metrics}
+    title = 'Largest error, in units of the bound: above the red line it is violated'
+    picture = _draw_sweeps(title, ratios)
+    for axes in picture.axes.flat:
+        axes.set_ylim(0.15, 1.3 * _BROKEN)
+        axes.axhline(1.0, color=ALARM, lw=1.2, ls='--')
+        ticks = [0.2, 0.5, 1.0, 2.0, 5.0, _BROKEN]
+        axes.set_yticks(ticks, [*(f'{tick:g}' for tick in ticks[:-1]), f'{_BROKEN:g}+'])
+        axes.yaxis.set_minor_formatter(NullFormatter())
+        axes.set_ylabel('max $|\\xi_1| / k_c$')
+    picture.save(tracking)
+    errors = {name: each.tail_parameter_error for name, each in metrics}
+    picture = _draw_sweeps('Parameter error over the last ten of 30 s', errors)
+    for axes in picture.axes.flat:
+        axes.set_ylim(3e-5, 5.0)
+        axes.axhline(0.01, color=MUTED, lw=1.2, ls='--')
+        axes.yaxis.set_major_formatter(lambda value, _: f'{100 * value:g} %')
+        axes.set_ylabel(r'$\|\hat P - P\| \;/\; \|P\|$')
+    picture.save(learning)
+    return [tracking, learning]
 
 
-def _dress_ratio(axes: Axes) -> None:
-    axes.set_ylim(0.15, 1.3 * _BROKEN)
-    axes.axhline(1.0, color=ALARM, lw=1.2, ls='--')
-    ticks = [0.2, 0.5, 1.0, 2.0, 5.0, _BROKEN]
-    axes.set_yticks(ticks, [*(f'{tick:g}' for tick in ticks[:-1]), f'{_BROKEN:g}+'])
-    axes.yaxis.set_minor_formatter(NullFormatter())
-    axes.set_ylabel('max $|\\xi_1| / k_c$')
-
-
-def _dress_learning(axes: Axes) -> None:
-    axes.set_ylim(3e-5, 5.0)
-    axes.axhline(0.01, color=MUTED, lw=1.2, ls='--')
-    axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f'{100 * value:g} %'))
-    axes.set_ylabel(r'$\|\hat P - P\| \;/\; \|P\|$')
+def _draw_sweeps(title: str, value_of: dict[str, float]) -> Picture:
+    """Draw a figure of each case, by its name: a panel for each sweep, a line for each law."""
+    picture = Picture(-(-len(SWEEPS) // _COLUMNS), _COLUMNS, title, _PANEL, share_time=False)
+    for sweep, axes in zip(SWEEPS, picture.axes.flat, strict=True):
+        for law, colour, mark in zip(SWEPT, COLOURS, _MARKS, strict=False):
+            if law in sweep.laws:
+                values = [value_of[case_name(sweep.name, law, value)] for value in sweep.values]
+                style = {'color': colour, 'marker': mark, 'ms': 4.5, 'label': SIDE_BY_SIDE[law]}
+                axes.plot(sweep.values, values, **style)
+        least, most = min(sweep.values), max(sweep.values)
+        if 0.0 < _DECADE * least < most:
+            axes.set_xscale('log')
+            shown = sweep.values[:: 1 if len(sweep.values) <= 7 else 2]
+            axes.set_xticks(shown, [f'{value:g}' for value in shown])
+            axes.xaxis.set_minor_formatter(NullFormatter())
+        axes.set_xlabel(sweep.label)
+        axes.set_yscale('log')
+    picture.axes.flat[0].legend(frameon=False, fontsize=9, loc='best')
+    return picture

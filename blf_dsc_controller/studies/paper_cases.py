@@ -3,107 +3,81 @@
 
 from __future__ import annotations
 
-import itertools
 import math
 from collections.abc import Callable, Iterator, Mapping
-from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
-from tqdm import tqdm
+from tqdm.contrib.concurrent import process_map
 
 from blf_dsc_controller.analysis.metrics import Metrics, measure
-from blf_dsc_controller.configuration.nodes import CONTROLLER, PLANT, LoopConfig, load_loop
+from blf_dsc_controller.configuration.nodes import PLANT, LoopConfig, load_loop
 from blf_dsc_controller.configuration.schema import change
 from blf_dsc_controller.run import Run
 from blf_dsc_controller.simulation.loop import simulate
+from blf_dsc_controller.studies.runs import cores
 
 DURATION = 60.0  # s
-
-NO_DISTURBANCE = {'disturbance.constant': [0.0, 0.0], 'disturbance.amplitude': [0.0, 0.0]}
-LEAKY = {
-    'disturbance.leakage': 0.02,
-    'learning.compensation': 'state',
-    'learning.bumpless': False,
-    'truth.parameters': [1.0, 0.32, 0.4],
-    'truth.constant': [0.1, 0.1],
-}
-
-
-@dataclass(frozen=True)
-class Case:
-    """A preset with changes to the law and to the plant."""
-
-    name: str
-    label: str
-    preset: str
-    law: Mapping[str, object] = field(default_factory=dict)
-    plant: Mapping[str, object] = field(default_factory=dict)
-    duration: float = DURATION
-
-    def loop(self) -> LoopConfig:
-        """Return the configuration of the case."""
-        loop = load_loop(self.preset, {PLANT: {'duration': self.duration}, CONTROLLER: {}})
-        return loop._replace(
-            controller=change(loop.controller, self.law), plant=change(loop.plant, self.plant)
-        )
-
-    @property
-    def command(self) -> str:
-        """Command that runs the preset by itself."""
-        return f'blf_dsc run --offline --config {self.preset}'
-
-
-SIDE_BY_SIDE = (
-    Case('paper', "proposed, the paper's choices", 'paper'),
-    Case('paper_tuned', 'proposed, tuned', 'paper_tuned'),
-    Case('comparison', 'comparison, tuned', 'comparison'),
-    Case('comparison_detuned', 'comparison, low gains', 'comparison_detuned'),
-    Case('slotine_li', 'Slotine-Li, tuned', 'slotine_li'),
-    Case('recommended', 'recommended', 'recommended'),
-    Case('two_tone', 'two tones, columns', 'two_tone'),
-    Case('model_based', 'all known (16)', 'model_based'),
-)
-
-_PUSHED = {'disturbance.constant': [8.0, 0.1]}
-_AT_REST = {'reference.amplitude': [0.0, 0.0], 'reference.offset': [2.2935, 1.6961]}
-
-VARIATIONS = (
-    Case('paper_quiet', 'paper, no disturbance', 'paper', plant=NO_DISTURBANCE),
-    Case('recommended_quiet', 'recommended, no disturbance', 'recommended', plant=NO_DISTURBANCE),
-    Case('paper_at_rest', 'paper, reference at rest', 'paper', _AT_REST),
-    Case('paper_from_zero', 'paper, P^(0) = 0', 'paper', {'learning.initial_estimate': [0.0] * 3}),
-    Case(
-        'leaky',
-        "recommended in the paper's form, eta = 0.02, sinusoidal disturbance",
-        'recommended',
-        {**LEAKY, 'truth.amplitude': [0.1, 0.1]},
-    ),
-    Case(
-        'leaky_constant',
-        "recommended in the paper's form, eta = 0.02, constant disturbance",
-        'recommended',
-        LEAKY,
-        {'disturbance.amplitude': [0.0, 0.0]},
-    ),
-    Case('paper_pushed', 'paper, 8 N m against joint 1', 'paper', plant=_PUSHED),
-    Case('recommended_pushed', 'recommended, 8 N m against joint 1', 'recommended', plant=_PUSHED),
-)
-
 SWEEP_DURATION = 30.0  # s
-LAWS = {
-    'recommended': 'recommended',
+
+SIDE_BY_SIDE = {
+    'paper': "proposed, the paper's choices",
     'paper_tuned': 'proposed, tuned',
     'comparison': 'comparison, tuned',
+    'comparison_detuned': 'comparison, low gains',
     'slotine_li': 'Slotine-Li, tuned',
+    'recommended': 'recommended',
+    'two_tone': 'two tones, columns',
+    'model_based': 'all known (16)',
 }
+"""Labels of the laws that are compared, by their presets."""
+
+SWEPT = ('recommended', 'paper_tuned', 'comparison', 'slotine_li')
 
 P = (1.0, 0.32, 0.4)  # kg m^2
 START = (2.2935, 1.6961)  # rad, qr(0)
 BOUND = 0.002  # rad
 
 Changes = tuple[Mapping[str, object], Mapping[str, object]]
+"""Changes of law and plant."""
+
+
+class Case(NamedTuple):
+    """A preset with changes to the law and to the plant."""
+
+    name: str
+    preset: str
+    law: Mapping[str, object] = {}
+    plant: Mapping[str, object] = {}
+    duration: float = DURATION
+
+    def loop(self) -> LoopConfig:
+        """Return the configuration of the case."""
+        loop = load_loop(self.preset, {PLANT: {'duration': self.duration}})
+        return loop._replace(
+            controller=change(loop.controller, self.law), plant=change(loop.plant, self.plant)
+        )
+
+
+_QUIET = {'disturbance.constant': [0.0, 0.0], 'disturbance.amplitude': [0.0, 0.0]}
+_PUSHED = {'disturbance.constant': [8.0, 0.1]}  # 8 N m against joint 1
+_AT_REST = {'reference.amplitude': [0.0, 0.0], 'reference.offset': list(START)}
+_LEAKY = {  # in the paper's form, eta = 0.02
+    'disturbance.leakage': 0.02,
+    'learning.compensation': 'state',
+    'learning.bumpless': False,
+    'truth.parameters': list(P),
+    'truth.constant': [0.1, 0.1],
+}
+VARIATIONS = (
+    Case('paper_quiet', 'paper', plant=_QUIET),
+    Case('paper_at_rest', 'paper', _AT_REST),
+    Case('paper_from_zero', 'paper', {'learning.initial_estimate': [0.0] * 3}),
+    Case('leaky', 'recommended', {**_LEAKY, 'truth.amplitude': [0.1, 0.1]}),
+    Case('leaky_constant', 'recommended', _LEAKY, {'disturbance.amplitude': [0.0, 0.0]}),
+    Case('paper_pushed', 'paper', plant=_PUSHED),
+    Case('recommended_pushed', 'recommended', plant=_PUSHED),
+)
 
 
 class Sweep(NamedTuple):
@@ -112,7 +86,7 @@ class Sweep(NamedTuple):
     label: str
     values: tuple[float, ...]
     changes: Callable[[float], Changes]
-    laws: tuple[str, ...] = tuple(LAWS)
+    laws: tuple[str, ...] = SWEPT
 
     @property
     def name(self) -> str:
@@ -124,7 +98,7 @@ class Sweep(NamedTuple):
         for law in self.laws:
             for value in self.values:
                 name = case_name(self.name, law, value)
-                yield Case(name, name, law, *self.changes(value), SWEEP_DURATION)
+                yield Case(name, law, *self.changes(value), SWEEP_DURATION)
 
 
 def case_name(sweep: str, law: str, value: float) -> str:
@@ -186,7 +160,14 @@ SWEEPS = (
     ),
 )
 
-CASES = (*SIDE_BY_SIDE, *VARIATIONS, *(case for sweep in SWEEPS for case in sweep.cases()))
+CASES = {
+    case.name: case
+    for case in (
+        *(Case(preset, preset) for preset in SIDE_BY_SIDE),
+        *VARIATIONS,
+        *(case for sweep in SWEEPS for case in sweep.cases()),
+    )
+}
 
 
 class Results(NamedTuple):
@@ -218,17 +199,12 @@ def run_case(case: Case) -> tuple[Metrics, Run | None]:
 
 
 def run_all() -> Results:
-    """Simulate every case on all cores.
-
-    The first one runs in this process: it compiles the kernels, which the workers then load.
-    """
-    results = Results({}, {})
-    with ProcessPoolExecutor() as pool, tqdm(total=len(CASES), desc='runs', unit='run') as bar:
-        first = iter([run_case(CASES[0])])
-        found = itertools.chain(first, pool.map(run_case, CASES[1:]))
-        for case, (metrics, run) in zip(CASES, found, strict=True):
-            results.metrics[case.name] = metrics
-            if run is not None:
-                results.runs[case.name] = run
-            bar.update()
-    return results
+    """Simulate every case on all cores."""
+    run_case(CASES['paper']._replace(duration=1.0))  # compiles what the workers load
+    cases = CASES.values()
+    found = process_map(run_case, cases, max_workers=cores(), chunksize=1, desc='runs', unit='run')
+    named = dict(zip(CASES, found, strict=True))
+    return Results(
+        {name: metrics for name, (metrics, _) in named.items()},
+        {name: run for name, (_, run) in named.items() if run is not None},
+    )

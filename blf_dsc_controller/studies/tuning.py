@@ -22,8 +22,9 @@ from scipy.stats import qmc
 from tqdm import tqdm
 
 from blf_dsc_controller.analysis.metrics import Metrics, measure
+from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.nodes import PLANT, LoopConfig, format_value, load_loop
-from blf_dsc_controller.configuration.schema import Value, change
+from blf_dsc_controller.configuration.schema import Value, change, flatten
 from blf_dsc_controller.run import Floats
 from blf_dsc_controller.simulation.loop import simulate
 
@@ -46,8 +47,7 @@ class Gain(NamedTuple):
     least: float
     most: float
     inertial: bool = False  # multiplies the inertia m of each joint of an arm from a URDF
-    joint: int = -1  # 0 or 1, of the paper's arm; -1: both, or a scalar
-    length: int = 2  # entries of the parameter of the paper's arm; 0: a scalar
+    joint: int = -1  # that of a per-joint parameter; -1: all
 
 
 class Task(NamedTuple):
@@ -61,7 +61,7 @@ class Task(NamedTuple):
 _SHARED = (
     Gain('feedback.gain', 5.0, 200.0, joint=0),
     Gain('feedback.gain', 2.0, 100.0, joint=1),
-    Gain('learning.adaptation_gain', 0.01, 30.0, length=3),
+    Gain('learning.adaptation_gain', 0.01, 30.0),
 )
 _SURFACE_OF_35 = Gain('comparison.surface_gain', 10.0, 300.0)
 _PROPOSED = (
@@ -69,14 +69,14 @@ _PROPOSED = (
     Gain('surface.gain', 10.0, 600.0),
     Gain('surface.mu', 1.0, 100.0),
     Gain('disturbance.gain', 0.1, 300.0),
-    Gain('learning.weight', 0.1, 100.0, length=0),
+    Gain('learning.weight', 0.1, 100.0),
 )
 _COMPARISON = (
     *_SHARED,
     _SURFACE_OF_35,
     Gain('comparison.position_gain', 0.1, 1e4),
     Gain('comparison.robust_gain', 1e-3, 5.0),
-    Gain('comparison.leakage', 1e-5, 1.0, length=0),
+    Gain('comparison.leakage', 1e-5, 1.0),
 )
 TASKS = {
     'proposed': Task('paper', {}, _PROPOSED),
@@ -95,17 +95,15 @@ def bounded(cost: float) -> float:
     return min(float(cost), HOPELESS) if np.isfinite(cost) else HOPELESS
 
 
-def parameters_at(task: Task, exponents: Floats) -> dict[str, Value]:
+def parameters_at(
+    config: ControllerConfig, gains: Sequence[Gain], exponents: Floats
+) -> dict[str, Value]:
     """Return the parameters of a point, whose coordinates are log10 of the gains."""
-    chosen: dict[str, Value] = dict(task.fixed)
-    per_joint: dict[str, list[float]] = {}
-    for gain, exponent in zip(task.gains, exponents, strict=True):
-        value = value_at(exponent)
-        if gain.joint >= 0:
-            per_joint.setdefault(gain.name, [0.0, 0.0])[gain.joint] = value
-        else:
-            chosen[gain.name] = (value,) * gain.length if gain.length else value
-    return chosen | {name: tuple(values) for name, values in per_joint.items()}
+    present, chosen = flatten(config), dict[str, Floats]()
+    for gain, exponent in zip(gains, exponents, strict=True):
+        values = chosen.setdefault(gain.name, np.array(present[gain.name], dtype=float))
+        values[gain.joint if gain.joint >= 0 else ...] = value_at(exponent)
+    return {name: values.tolist() for name, values in chosen.items()}
 
 
 def cost_of(metrics: Metrics, sample_time: float) -> float:
@@ -125,7 +123,7 @@ def objective(exponents: Floats, task: Task, loops: Sequence[LoopConfig]) -> flo
     """Return the mean of `cost_of` over the plants."""
     values = []
     for loop in loops:
-        config = change(loop.controller, parameters_at(task, exponents))
+        config = change(loop.controller, parameters_at(loop.controller, task.gains, exponents))
         with np.errstate(all='ignore'):
             metrics = measure(simulate(config, loop.plant, supervised=False).run())
             values.append(cost_of(metrics, config.sample_time))
@@ -134,7 +132,7 @@ def objective(exponents: Floats, task: Task, loops: Sequence[LoopConfig]) -> flo
 
 def loops_of(task: Task) -> list[LoopConfig]:
     """Return the loops of the task's controller with each plant, for the tuning's duration."""
-    law = load_loop(task.preset).controller
+    law = change(load_loop(task.preset).controller, task.fixed)
     loops = (load_loop(name, {PLANT: {'duration': DURATION}}) for name in PLANTS)
     return [loop._replace(controller=law) for loop in loops]
 
@@ -180,7 +178,7 @@ def main() -> None:
 
         found, value, evaluations = search(cost, task.gains, POPULATION, GENERATIONS)
     print(f'# {evaluations} evaluations, objective {value:.3f} (decades of error; less is better)')
-    for name, entry in parameters_at(task, found).items():
+    for name, entry in parameters_at(loops[0].controller, task.gains, found).items():
         print(f'{name}: {format_value(entry)}')
 
 
