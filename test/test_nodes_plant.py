@@ -119,28 +119,24 @@ def test_plant_finishes_when_the_last_state_has_received_its_torque(ros):
     assert len(received) == 4
 
 
-def test_latency_of_a_late_torque_includes_all_of_its_lateness():
-    """A controller that is 2.5 samples late must not pass for one that is half a sample late."""
-    latency = Latency()
-    latency.state_published(0.0)
-    assert latency.step(1.0) == 1.0  # no torque so far
-    latency.state_published(1.0)
-    assert latency.step(2.0) == 2.0
-    latency.state_published(2.0)
-    latency.torque_received(2.5)
-    assert latency.step(3.0) == 2.5
-    assert latency.late_steps == 2
-
-
-def test_longest_wait_of_a_sample_is_published_once():
-    latency = Latency()
-    latency.state_published(0.0)
-    latency.step(1.0)
-    latency.state_published(1.0)
-    latency.torque_received(1.75)  # late, for the state at 0.0
-    latency.torque_received(1.875)  # for the state at 1.0
-    assert latency.step(2.0) == 1.75
-    latency.state_published(2.0)
-    latency.torque_received(2.25)
-    assert latency.step(3.0) == 0.25
-    assert latency.late_steps == 1
+@pytest.mark.parametrize(
+    ('events', 'waits', 'late'),
+    [
+        # A controller that is 2.5 samples late must not pass for one that is half a sample late.
+        ('sent 0, step 1, sent 1, step 2, sent 2, came 2.5, step 3', [1.0, 2.0, 2.5], 2),
+        # The longest wait is published once: the first torque is late, for the state at 0.
+        (
+            'sent 0, step 1, sent 1, came 1.75, came 1.875, step 2, sent 2, came 2.25, step 3',
+            [1.0, 1.75, 0.25],
+            1,
+        ),
+    ],
+)
+def test_latency_is_that_of_the_oldest_state_without_a_torque(events, waits, late):
+    latency, found = Latency(), []
+    for what, time in (event.split() for event in events.split(', ')):
+        if what == 'step':
+            found.append(latency.step(float(time)))
+        else:
+            {'sent': latency.state_published, 'came': latency.torque_received}[what](float(time))
+    assert (found, latency.late_steps) == (waits, late)

@@ -6,13 +6,14 @@ from __future__ import annotations
 import ctypes
 import errno
 import os
-import subprocess
 import sys
 from types import SimpleNamespace
 
 import pytest
 
 pytest.importorskip('rclpy', reason='needs ROS 2')
+
+from command import finished
 
 from blf_dsc_controller.configuration.robot import Realtime
 from blf_dsc_controller.nodes.process import request_realtime
@@ -55,20 +56,13 @@ print(sorted(name for name in names if name.startswith('dds.')))
 
 @pytest.mark.parametrize('node', ['ControllerNode', 'PlantNode'])
 def test_middleware_ends_with_the_node_and_not_only_with_the_process(node):
-    process = subprocess.run(
-        [sys.executable, '-c', ENDED.format(node=node)], capture_output=True, text=True, check=False
-    )
+    process = finished(sys.executable, '-c', ENDED.format(node=node))
     assert process.stdout == '0\n[]\n', process.stderr
 
 
 @pytest.mark.parametrize('error', ['RCLError', 'OSError', 'BlfDscError'])
 def test_error_during_shutdown_leaves_neither_node_nor_context(error):
-    process = subprocess.run(
-        [sys.executable, '-c', BROKEN.format(error=error)],
-        capture_output=True,
-        text=True,
-        check=False,
-    )
+    process = finished(sys.executable, '-c', BROKEN.format(error=error))
     assert process.stdout == 'destroyed\n0 False\n', process.stderr
     assert process.stderr.endswith('broken could not shut down cleanly: the middleware is gone\n')
     assert 'Traceback' not in process.stderr

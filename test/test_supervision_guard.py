@@ -122,11 +122,16 @@ def test_silence_stops_if_stamps_are_live_or_the_watchdog_is_on(watchdog, late, 
     assert rig.supervisor.running != stops
 
 
-def test_torque_ramps_after_a_fault_if_configured():
-    rig = Rig({'safety.stop_ramp': 0.01})
+@pytest.mark.parametrize('ramp', ['stop_ramp', 'deactivation_ramp'])
+def test_torque_ramps_after_a_fault_or_a_deactivation_as_configured(ramp):
+    rig = Rig({f'safety.{ramp}': 0.01})
     rig.step(20)
     last = rig.commands[-1]
-    rig.deliver(b'')
+    if ramp == 'stop_ramp':
+        rig.deliver(b'')
+    else:
+        rig.guard.deactivate()
+        rig.step()
     rig.step(12)
     ramp = np.array(rig.commands[-13:])
     np.testing.assert_allclose(ramp[:10], np.outer(np.linspace(0.9, 0.0, 10), last), atol=1e-12)
@@ -260,16 +265,6 @@ def test_learning_waits_for_a_full_window_after_a_reset_in_motion():
     assert state.latched[0] == 0.0
     rig.step(20)
     assert state.latched[0] == 1.0
-
-
-def test_rejected_column_is_not_a_fault():
-    """Its estimate is NaN."""
-    rig = Rig()
-    rig.step(20)
-    rig.guard.controller.state.active[-1] = 0.0
-    rig.step(20)
-    assert np.isnan(rig.guard.controller.sample.estimate[-1])
-    assert rig.supervisor.phase is Phase.TRACKING
 
 
 NEW_GAINS = [
