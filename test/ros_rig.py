@@ -70,7 +70,7 @@ class RosRig:
     def add(self, make, values=None, *, namespace='', clock=time.monotonic_ns, **given):
         """Start a node with parameters: `values` by dotted name, keywords with `__` for a dot."""
         given = {k.replace('__', '.'): v for k, v in given.items()} | (values or {})
-        overrides = [Parameter(k, value=v) for k, v in given.items()]
+        overrides = [Parameter(k, value=v) for k, v in given.items() if v != ()]
         node = make(
             context=self.context,
             namespace=namespace,

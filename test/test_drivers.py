@@ -86,8 +86,8 @@ FACTS = {
 }
 # ros2_controllers 4, tried with its real parts: joint_state_broadcaster publishes with the
 # first, the effort controllers subscribe with the second (SystemDefaultsQoS).
-OFFERED = {'depth': 1, 'reliability': 'RELIABLE', 'durability': 'TRANSIENT_LOCAL'}
-REQUESTED = {'depth': 1, 'reliability': 'BEST_EFFORT', 'durability': 'VOLATILE'}
+OFFERED = ReliabilityPolicy.RELIABLE, DurabilityPolicy.TRANSIENT_LOCAL
+REQUESTED = ReliabilityPolicy.BEST_EFFORT, DurabilityPolicy.VOLATILE
 ROBOTS = pytest.mark.parametrize('robot', FACTS)
 
 
@@ -121,21 +121,16 @@ def test_urdf_of_the_fr3_has_its_mass_and_its_reach():
     np.testing.assert_allclose(flange, [0.088, 0.0, 0.333 + 0.316 + 0.384 - 0.107], atol=1e-6)
 
 
-def described(endpoint):
+def policies(endpoint):
+    return endpoint.qos_profile.reliability, endpoint.qos_profile.durability
+
+
+def quality(reliability, durability):
     """Return what matters of an endpoint; deadlines that are not set are reported as infinite."""
-    found = endpoint.qos_profile
-    return {
-        'depth': 1,
-        'reliability': found.reliability.name,
-        'durability': found.durability.name,
-    }
-
-
-def quality(given):
     return QoSProfile(
-        depth=given['depth'],
-        reliability=ReliabilityPolicy[given['reliability']],
-        durability=DurabilityPolicy[given['durability']],
+        depth=1,
+        reliability=reliability,
+        durability=durability,
         liveliness=LivelinessPolicy.AUTOMATIC,
     )
 
@@ -158,11 +153,8 @@ def test_launched_nodes_use_the_topics_of_the_driver(launched, start, tmp_path, 
     assert types[facts.commands] == ['std_msgs/msg/Float64MultiArray']
     (states,) = controller.get_subscriptions_info_by_topic(facts.joint_states)
     (commands,) = controller.get_publishers_info_by_topic(facts.commands)
-    for offered, requested in (
-        (OFFERED, described(states)),
-        (described(commands), REQUESTED),
-    ):
-        verdict, reason = qos_check_compatible(quality(offered), quality(requested))
+    for offered, requested in ((OFFERED, policies(states)), (policies(commands), REQUESTED)):
+        verdict, reason = qos_check_compatible(quality(*offered), quality(*requested))
         assert verdict == QoSCompatibility.OK, reason
     assert controller.config.sample_time == 1.0 / facts.rate
     connected = {'joint_states': facts.joint_states, 'commands': facts.commands}

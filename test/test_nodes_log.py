@@ -19,7 +19,7 @@ from command import finished
 from plain_law import dynamics
 from rcl_interfaces.msg import Log
 from rclpy.qos import DurabilityPolicy, QoSProfile
-from ros_rig import JOINTS, START, FakeClock, deactivate, shutdown, torques
+from ros_rig import JOINTS, START, FakeClock, deactivate, shutdown, torques, values
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray
 
@@ -59,6 +59,12 @@ def log(ros):
     return logged
 
 
+def statuses(diagnostics, begin):
+    """Return the statuses whose messages begin like this."""
+    found = [status for array in diagnostics for status in array.status]
+    return [status for status in found if status.message.startswith(begin)]
+
+
 def driver(ros, space):
     """Stand in for an arm: subscribe to commands; return the publisher of joint states."""
     commands = f'/{space}/blf_dsc_controller/commands'
@@ -87,40 +93,30 @@ def test_each_phase_is_logged_and_after_a_stop_how_to_continue(ros, log):
     ros.until(lambda: logged('deactivated: zero torque'))
 
 
-def test_log_suggests_resetting_the_controller_without_a_simulated_arm(ros, log):
-    ros.add(ControllerNode, namespace='real')
-    states = driver(ros, 'real')
+def test_a_stop_is_logged_once_with_how_to_continue_on_a_real_arm(ros, log):
+    given = {'learning.window': 5.0, 'safety.torque': 'hold_gravity'}
+    node = ros.add(ControllerNode, given, namespace='real')
+    ros.until(lambda: log('real', 'learning.window: 5 s', WARN))  # before the first state
+    states, encoder = driver(ros, 'real'), JointStateEncoder(JOINTS)
     states.publish(b'')
     ros.until(lambda: log('real', 'not started, waiting for a usable joint state: '))
-    states.publish(JointStateEncoder(JOINTS).encode(10**9, START, ZERO, ZERO))
-    ros.until(lambda: log('real', 'tracking'))
-    states.publish(b'')
-    ros.until(lambda: log('real', '', FATAL))
-    (stop,) = log('real', '', FATAL)
-    assert stop.endswith('/real/blf_dsc_controller/reset starts again from where the arm is')
-
-
-@pytest.mark.parametrize(('preset', 'warned'), [('ur5e', 1), ('panda', 0)])
-def test_node_warns_once_of_how_light_a_drive_may_be(ros, log, preset, warned):
-    config = flatten(load_loop(preset).controller)
-    given = {name: value for name, value in config.items() if value != ()}
-    ros.add(ControllerNode, given, namespace=preset)
-    ros.until(lambda: log(preset, 'ready for joint states of '))
-    assert len(log(preset, 'of the inertia assumed: then give robot.rotor_inertia', WARN)) == warned
-
-
-def test_a_stop_is_logged_once(ros, log):
-    node = ros.add(ControllerNode, {'safety.torque': 'hold_gravity'}, namespace='once')
-    states, encoder = driver(ros, 'once'), JointStateEncoder(JOINTS)
     for k in (0, 1, 2, 60, 61, 62):
         states.publish(encoder.encode(10**9 + k * 10**6, START, ZERO, ZERO))
         ros.until(lambda k=k: node.guard.journal.stamp == 10**9 + k * 10**6)
         node._report_if_changed(node.guard)
     node.guard._note(EventType.SILENCE, torques=1)
     node._report_if_changed(node.guard)
-    ros.until(lambda: log('once', '', FATAL))
+    ros.until(lambda: log('real', '', FATAL))
     ros.spin(0.2)
-    assert len(log('once', '', FATAL)) == 1
+    (stop,) = log('real', '', FATAL)
+    assert stop.endswith('/real/blf_dsc_controller/reset starts again from where the arm is')
+
+
+@pytest.mark.parametrize(('preset', 'warned'), [('ur5e', 1), ('panda', 0)])
+def test_node_warns_once_of_how_light_a_drive_may_be(ros, log, preset, warned):
+    ros.add(ControllerNode, flatten(load_loop(preset).controller), namespace=preset)
+    ros.until(lambda: log(preset, 'ready for joint states of '))
+    assert len(log(preset, 'of the inertia assumed: then give robot.rotor_inertia', WARN)) == warned
 
 
 def test_leaving_node_commands_the_safe_torque_last(ros):
@@ -213,26 +209,11 @@ def test_rejected_columns_are_logged_and_diagnosed_with_the_reason(ros, log):
     ros.add(ControllerNode, cosine, namespace='rejected')
     arm = ros.add(PlantNode, {'mode': 'lockstep', 'duration': 7.0}, namespace='rejected')
 
-    def rejected():
-        return [
-            (status.message, value)
-            for array in diagnostics
-            for status in array.status
-            for value in status.values
-            if value.key.startswith('rejected cos 1 rad/s')
-        ]
-
-    ros.until(lambda: arm.finished and rejected())
-    message, value = rejected()[-1]
-    assert message.startswith('not estimated: cos 1 rad/s')
-    assert 'cannot distinguish it from m2*l2^2' in value.value
+    ros.until(lambda: arm.finished and statuses(diagnostics, 'not estimated: cos 1 rad/s'))
+    status = statuses(diagnostics, 'not estimated: cos 1 rad/s')[-1]
+    assert 'cannot distinguish it from m2*l2^2' in str(values(status))
     (warning,) = log('rejected', 'is not estimated')  # once, not in every sample
     assert 'cannot distinguish it from m2*l2^2' in warning
-
-
-def test_configuration_warnings_are_logged_before_the_first_state(ros, log):
-    ros.add(ControllerNode, {'learning.window': 5.0}, namespace='warned')
-    ros.until(lambda: log('warned', 'learning.window: 5 s'))
 
 
 @pytest.mark.parametrize('simulated', [True, False])
@@ -262,13 +243,7 @@ def test_second_publisher_on_the_same_topic_is_reported(ros, log, kind):
     first._on_second()
     ros.spin(0.2)
     assert len(warnings()) == 2  # one of each
-    ros.until(
-        lambda: any(
-            status.message == f'another node {does}, too'
-            for array in diagnostics
-            for status in array.status
-        )
-    )
+    ros.until(lambda: statuses(diagnostics, f'another node {does}, too'))
     ros.kill(second)
     ros.until(lambda: first.others == 0)
 

@@ -22,6 +22,10 @@ from lifecycle_msgs.srv import ChangeState
 from rclpy.parameter import Parameter
 from std_srvs.srv import Trigger
 
+from blf_dsc_controller.configuration import schema
+from blf_dsc_controller.configuration.controller import ControllerConfig
+from blf_dsc_controller.configuration.plant import PlantConfig
+from blf_dsc_controller.configuration.schema import Kind
 from blf_dsc_controller.messages.codecs import Float64MultiArrayEncoder, JointStateEncoder
 from blf_dsc_controller.nodes.controller_node import ControllerNode
 from blf_dsc_controller.nodes.parameters import FixedParameterError
@@ -69,42 +73,26 @@ def joint_states(draw):
     return step, raw
 
 
-TUNABLE = [
-    'barrier.bound',
-    'barrier.weight',
-    'surface.gain',
-    'surface.mu',
-    'feedback.gain',
-    'feedback.damping',
-    'disturbance.gain',
-    'torque.limit',
-    'safety.damping',
-]
-SCALARS = [
-    'actuator.command_timeout',
-    'learning.weight',
-    'learning.radius',
-    'safety.velocity_limit',
-    'safety.stop_ramp',
-]
-
+VALUES = {
+    Kind.BOOL: st.booleans(),
+    Kind.INTEGER: st.integers(-1, 10),
+    Kind.DOUBLE: numbers,
+    Kind.STRING: st.sampled_from(['zero', 'hold_gravity', 'damping', 'x']),
+    Kind.DOUBLE_ARRAY: st.one_of(
+        st.lists(st.floats(0.0, 19.0), max_size=3), st.lists(numbers, max_size=3)
+    ),
+}
+LIVE = {
+    each.name: VALUES[each.kind]
+    for config in (ControllerConfig, PlantConfig)
+    for each in schema.parameters(config)
+    if not each.read_only
+}
 parameters = st.one_of(
-    st.tuples(st.sampled_from(TUNABLE), st.lists(st.floats(0.0, 19.0), max_size=3)),
-    st.tuples(st.sampled_from(TUNABLE[:-2]), st.lists(numbers, max_size=3)),
-    st.tuples(st.sampled_from(SCALARS), numbers),
-    st.tuples(st.just('safety.torque'), st.sampled_from(['zero', 'hold_gravity', 'damping', 'x'])),
+    st.sampled_from(sorted(LIVE)).flatmap(lambda name: st.tuples(st.just(name), LIVE[name])),
     st.tuples(st.just('joints'), st.just(['a', 'b'])),
 )
-transitions = st.sampled_from(
-    [
-        Transition.TRANSITION_CONFIGURE,
-        Transition.TRANSITION_CLEANUP,
-        Transition.TRANSITION_ACTIVATE,
-        Transition.TRANSITION_DEACTIVATE,
-        Transition.TRANSITION_CREATE,
-        77,
-    ]
-)
+transitions = st.sampled_from([0, 1, 2, 3, 4, 77])  # create, configure to deactivate, none
 
 
 def events(messages):

@@ -18,10 +18,9 @@ pytest.importorskip('rclpy', reason='needs ROS 2')
 from random_arm import CONFIG
 
 from blf_dsc_controller import load_loop
-from blf_dsc_controller.configuration.schema import change, flatten
+from blf_dsc_controller.configuration.schema import flatten
 from blf_dsc_controller.messages import topics
 from blf_dsc_controller.messages.codecs import JointStateEncoder
-from blf_dsc_controller.nodes.controller_node import ControllerNode
 from blf_dsc_controller.nodes.plant_node import PlantNode
 from blf_dsc_controller.nodes.watchdog_node import WatchdogNode
 from sim_plant.plant import plant_of
@@ -41,11 +40,6 @@ class Crashing(controller_node.ControllerNode):
 controller_node.process.run(Crashing)
 """
 ENDS = {'killed': signal.SIGKILL, 'stopped': signal.SIGSTOP, 'crashed': None}
-
-
-def given(config):
-    """Return the parameters of a configuration that are not empty."""
-    return {name: value for name, value in flatten(config).items() if value != ()}
 
 
 @pytest.fixture
@@ -79,7 +73,7 @@ def test_arm_in_motion_comes_to_rest_beside_a_dead_process(ros, controller, end)
     def steady():
         return time.monotonic_ns() // SLOWER
 
-    arm = ros.add(PlantNode, given(load_loop(UR5E).plant), clock=steady)
+    arm = ros.add(PlantNode, flatten(load_loop(UR5E).plant), clock=steady)
     watchdog = ros.add(partial(WatchdogNode, steady=steady))
     process = controller(*(('-c', CRASH) if end == 'crashed' else ()))
     ros.until(lambda: watchdog.line is not None and arm.plant.sample > 425)
@@ -98,74 +92,26 @@ def test_arm_in_motion_comes_to_rest_beside_a_dead_process(ros, controller, end)
     ros.until(lambda: end == 'crashed' or not watchdog.line.active)
 
 
-class Driver:
-    """A driver that holds the last command for ever, in the time of a clock that it advances."""
-
-    def __init__(self, ros, config):
-        self.ros, self.plant, self.period = ros, plant_of(config), config.sample_time_ns
-        self.now, self.torque = 0, np.zeros(len(config.joints))
-        self.received, self.states = ros.listen(topics.COMMANDS), ros.publisher(topics.JOINT_STATES)
-        self.encoder = JointStateEncoder(config.joints)
-
-    def send(self):
-        """Publish the state of the next sample; return its stamp."""
-        stamp = 1_000_000_000 + self.plant.elapsed_ns
-        self.states.publish(self.encoder.encode(stamp, *self.plant.measure().reshape(3, -1)))
-        self.now += self.period
-        return stamp
-
-    def move(self):
-        """Advance by a sample, with the last command."""
-        self.torque = np.array(self.received[-1].data)
-        self.plant.step(self.torque)
-
-
-@pytest.mark.parametrize(('preset', 'angle'), [('fr3', 0.25), ('ur5e_driver', 0.2)])
-def test_named_arm_in_motion_comes_to_rest_once_its_controller_is_dead(ros, preset, angle):
-    """Over ROS, in the time of the states: a busy computer changes nothing."""
-    loop = load_loop(CONFIG / f'{preset}.yaml')
-    driver = Driver(ros, change(loop.plant, {'actuator.rate_limit': 0.0}))
-    n, steady = len(loop.controller.joints), lambda: driver.now
-    controller = ros.add(ControllerNode, given(loop.controller), clock=steady)
-    watchdog = ros.add(partial(WatchdogNode, steady=steady))
-    ros.until(lambda: watchdog.line is not None and driver.states.get_subscription_count() > 1)
-    for _ in range(round(1.1 / loop.controller.sample_time)):
-        count = len(driver.received)
-        driver.send()
-        ros.until(lambda count=count: len(driver.received) > count)
-        driver.move()
-    start = driver.plant.measure().copy()
-    assert np.abs(start[n : 2 * n]).max() > 0.3
-    ros.kill(controller)
-    for _ in range(round(2.0 / loop.controller.sample_time)):
-        count, stamp = len(driver.received), driver.send()
-        ros.until(lambda stamp=stamp: watchdog.line.stamp == stamp)
-        if watchdog.line.active:
-            ros.until(lambda count=count: len(driver.received) > count)
-        driver.move()
-    assert watchdog.line.takeovers == 1
-    assert not driver.plant.is_stopped
-    assert np.abs(driver.plant.measure()[n : 2 * n]).max() < 0.02
-    assert np.abs(driver.plant.measure()[:n] - start[:n]).max() < angle
-
-
 def test_restarted_watchdog_holds_the_arm_of_a_controller_that_died_before(ros, monkeypatch):
     """Which torque it held before, it cannot know: that of the model is sent at once."""
     monkeypatch.setattr(sys, 'argv', ['node', '--ros-args', '--params-file', str(FR3)])
-    config = load_loop(FR3).plant
-    driver = Driver(ros, config)
-    watchdog = ros.add(partial(WatchdogNode, steady=lambda: driver.now), {'armed': True})
-    ros.until(lambda: driver.states.get_subscription_count() > 0)
+    plant = plant_of(load_loop(FR3).plant)
+    torque = np.zeros(7)
+    commands, states = ros.listen(topics.COMMANDS), ros.publisher(topics.JOINT_STATES)
+    watchdog = ros.add(partial(WatchdogNode, steady=lambda: plant.elapsed_ns), {'armed': True})
+    ros.until(lambda: states.get_subscription_count() > 0)
+    encoder = JointStateEncoder(load_loop(FR3).plant.joints)
     for _ in range(100):
-        stamp = driver.send()
+        stamp = 10**9 + plant.elapsed_ns
+        states.publish(encoder.encode(stamp, *plant.measure().reshape(3, -1)))
         ros.until(lambda stamp=stamp: watchdog.line.stamp == stamp)
-        driver.plant.step(driver.torque)
-    ros.until(lambda: driver.received)
+        plant.step(torque)
+    ros.until(lambda: commands)
     assert watchdog.line.active
     assert watchdog.line.silence == pytest.approx(0.05, abs=0.01)
-    np.testing.assert_allclose(driver.received[0].data, np.zeros(7), atol=0.1)
+    np.testing.assert_allclose(commands[0].data, torque, atol=0.1)
     ros.executor.remove_node(watchdog)
     ros.spin(0.1)
-    count = len(driver.received)
+    count = len(commands)
     watchdog.close()  # the driver holds the last torque
-    ros.until(lambda: len(driver.received) > count)
+    ros.until(lambda: len(commands) > count)
