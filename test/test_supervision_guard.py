@@ -32,24 +32,25 @@ def weight(q):
     return dynamics(P, 9.8, q, (0.0, 0.0))[2]
 
 
-def safe(torque, q=Q, dq=DQ, estimate=P, **given):
+@pytest.mark.parametrize(
+    ('torque', 'dq', 'estimate', 'limit', 'expected'),
+    [
+        ('zero', DQ, P, 20.0, [0.0, 0.0]),
+        ('damping', DQ, P, 20.0, [-1.0, 2.0]),
+        ('hold_gravity', DQ, P, 20.0, weight(Q) + np.array([-1.0, 2.0])),
+        ('hold_gravity', DQ, P, 3.0, [3.0, 3.0]),
+        ('hold_gravity', DQ, P * np.nan, 20.0, [0.0, 0.0]),
+        ('damping', np.array([1.7e308, 0.0]), P, 20.0, [0.0, 0.0]),
+    ],
+)
+def test_safe_torque_does_what_its_name_says_limited_and_finite(
+    torque, dq, estimate, limit, expected
+):
     last = LastState(2)
-    last.take(1, np.concatenate((q, dq, np.zeros(2))))
-    safety = Safety(torque=torque, damping=(2.0, 1.0))
-    return safe_torque(safety, settings(**given), last, estimate, np.zeros(2))
-
-
-def test_each_safe_torque_does_what_its_name_says():
-    np.testing.assert_array_equal(safe('zero'), [0.0, 0.0])
-    np.testing.assert_allclose(safe('damping'), [-1.0, 2.0])
-    np.testing.assert_allclose(safe('hold_gravity'), weight(Q) + np.array([-1.0, 2.0]))
-
-
-def test_safe_torque_is_limited_and_zero_if_not_finite():
-    limited = safe('hold_gravity', **{'torque.limit': (3.0, 3.0)})
-    np.testing.assert_array_equal(limited, [3.0, 3.0])
-    np.testing.assert_array_equal(safe('hold_gravity', estimate=P * np.nan), [0.0, 0.0])
-    np.testing.assert_array_equal(safe('damping', dq=np.array([1.7e308, 0.0])), [0.0, 0.0])
+    last.take(1, np.concatenate((Q, dq, np.zeros(2))))
+    safety, limited = Safety(torque=torque, damping=(2.0, 1.0)), {'torque.limit': (limit, limit)}
+    got = safe_torque(safety, settings(**limited), last, estimate, np.zeros(2))
+    np.testing.assert_allclose(got, expected)
 
 
 def test_ramp_is_linear_and_ends_at_a_moving_goal():
@@ -304,21 +305,33 @@ def test_gain_change_is_bumpless(given, samples, most):
     assert jump(given, bumpless=True, samples=samples) < most * usual
 
 
+EXCITED = {
+    'learning.window': 0.2,
+    'learning.excitation_threshold': 1e-12,
+    'learning.settling_time': 0.0,
+}
+
+
 @pytest.mark.parametrize(
-    ('given', 'message'),
+    ('start', 'given', 'message'),
     [
-        ({'barrier.bound': (1e-6, 0.002)}, 'barrier.bound: joint1 is'),
-        ({'torque.limit': (20.0, 2.6)}, 'torque.limit: joint2 is held with'),  # 2.675 N m
-        ({'learning.radius': 0.58}, 'learning.radius: the norm of the estimate is'),
+        ({}, {'barrier.bound': (1e-6, 0.002)}, 'barrier.bound: joint1 is'),
+        ({}, {'torque.limit': (20.0, 2.6)}, 'torque.limit: joint2 is held with'),  # 2.675 N m
+        ({}, {'learning.radius': 0.58}, 'learning.radius: the norm of the estimate is'),
+        # Gradient: kappa Gamma lambda_max T >= 2; here kappa is 100 and lambda_max about 100.
+        (EXCITED, {'learning.update': 'gradient'}, 'learning.weight: with the update gradient'),
+        (EXCITED, {'learning.update': 'gradient', 'learning.weight': 2.0}, ''),
     ],
 )
-def test_gains_that_a_running_law_cannot_adopt_are_rejected(given, message):
-    rig = Rig()
-    rig.step(200)
-    (problem,) = rig.guard.problems(change(rig.guard.config, given))
-    assert problem.startswith(message)
+def test_gains_that_a_running_law_cannot_adopt_are_rejected(start, given, message):
+    rig = Rig(start)
+    rig.step(400 if start else 200)
+    assert rig.guard.controller.state.latched[0] == bool(start)
+    candidate = change(rig.guard.config, given)
+    found = rig.guard.problems(candidate)
+    assert [problem.startswith(message) for problem in found] == [True] * bool(message)
     rig.guard.deactivate()
-    assert rig.guard.problems(change(rig.guard.config, given)) == []
+    assert rig.guard.problems(candidate) == []
 
 
 def test_gains_can_change_while_the_projection_holds_the_estimate():
@@ -330,50 +343,24 @@ def test_gains_can_change_while_the_projection_holds_the_estimate():
     assert rig.guard.problems(change(rig.guard.config, {'feedback.gain': (60.0, 25.0)})) == []
 
 
-def test_update_that_would_diverge_is_rejected():
-    """Gradient: kappa Gamma lambda_max T >= 2; here kappa is 100 and lambda_max about 100."""
-    rig = Rig(
-        {
-            'learning.window': 0.2,
-            'learning.excitation_threshold': 1e-12,
-            'learning.settling_time': 0.0,
-        }
-    )
-    rig.step(400)
-    assert rig.guard.controller.state.latched[0] == 1.0
-    (problem,) = rig.guard.problems(change(rig.guard.config, {'learning.update': 'gradient'}))
-    assert problem.startswith('learning.weight: with the update gradient')
-    gentle = {'learning.update': 'gradient', 'learning.weight': 2.0}
-    assert rig.guard.problems(change(rig.guard.config, gentle)) == []
-
-
-def to(goal, seconds):
-    return Trajectory(('joint1', 'joint2'), (TrajectoryPoint(seconds, goal),))
-
-
-def test_plan_is_followed_from_its_start_time():
+def test_plan_is_followed_from_its_start_unless_late_or_from_a_replaced_reference():
     rig = Rig()
     rig.step(100)
-    plan = rig.guard.plan(to((2.1, 1.5), 1.0), rig.guard.time + 0.03)
+    to = Trajectory(JOINTS, (TrajectoryPoint(1.0, (2.1, 1.5)),))
+    late, replaced, plan = (
+        rig.guard.plan(to, rig.guard.time + lead) for lead in (0.01, 0.03, 0.03)
+    )
     before = rig.guard.controller.reference_at(plan.at)
     rig.step(20)
+    with pytest.raises(LatePlanError):
+        rig.guard.adopt(late)
     rig.guard.adopt(plan)
+    with pytest.raises(TrajectoryError, match='replaced while it was planned'):
+        rig.guard.adopt(replaced)
     np.testing.assert_allclose(rig.guard.controller.reference_at(plan.at), before, atol=1e-12)
     rig.step(1200)
     np.testing.assert_allclose(rig.guard.controller.reference_at(rig.guard.time)[0], (2.1, 1.5))
     assert rig.supervisor.phase is Phase.TRACKING
-
-
-def test_late_plan_and_that_from_a_replaced_reference_are_rejected():
-    rig = Rig()
-    rig.step(100)
-    late, replaced = (rig.guard.plan(to((2.1, 1.5), 1.0), rig.guard.time + 0.03) for _ in range(2))
-    rig.step(31)
-    with pytest.raises(LatePlanError):
-        rig.guard.adopt(late)
-    rig.guard.adopt(rig.guard.plan(to((2.0, 1.4), 1.0)))
-    with pytest.raises(TrajectoryError, match='replaced while it was planned'):
-        rig.guard.adopt(replaced)
 
 
 def test_retuning_leaves_the_estimate_of_a_joint_without_integrator():
