@@ -36,7 +36,7 @@ def record(path, duration=1.0, compression='none', **controller):
 def messages(path):
     """Return every message as [topic, type, time, bytes]."""
     with open_bag(path) as bag:
-        types = dict(bag.held)
+        types = bag.held
         return [[m.topic, types[m.topic], m.received, m.raw] for m in bag.messages(types)]
 
 

@@ -56,7 +56,7 @@ def spread(values):
 
 def foreign(torque='array', fields=('position', 'velocity', 'effort')):
     """Topic, type, time and bytes of each message as another robot's software writes it."""
-    states = JointStateEncoder(SHUFFLED, fields, frame_id='base_link')
+    states = JointStateEncoder(SHUFFLED, fields)
     arrays = {size: Float64MultiArrayEncoder(size) for size in (2, 3, 4)}
     measured = [ARM.position, ARM.error, ARM.disturbance]
     for k, stamp in enumerate(ARM.stamp.tolist()):

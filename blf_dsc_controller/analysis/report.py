@@ -70,7 +70,7 @@ def _names(paths: Sequence[Path]) -> list[str]:
 
 def _read(path: Path, name: str, namespace: str, names: NameMap) -> ReportedBag:
     content = read_content(path, namespace, names)
-    run = recorded_run(content, names, namespace)
+    run = recorded_run(content)
     events = [
         *((0.0, 'left out', note) for note in run.notes),
         *_events(run),

@@ -15,7 +15,7 @@ from blf_dsc_controller import __version__
 from blf_dsc_controller.bags.sources import MESSAGES, VERSION, BagError, OpenBag, open_bag
 from blf_dsc_controller.bags.topic_messages import TopicMessages
 from blf_dsc_controller.configuration.controller import ControllerConfig
-from blf_dsc_controller.configuration.schema import build
+from blf_dsc_controller.configuration.schema import build, parameters
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.messages import topics
 from blf_dsc_controller.messages.codecs import typestore
@@ -71,10 +71,13 @@ NO_NAMES = NameMap()
 class Content:
     """Messages of the package's topics in a bag, and the number of messages of every topic.
 
-    `facts` are what a recorder of this package noted: its version, and losses by topic.
+    `facts` are what a recorder of this package noted: its version, and losses by topic. `namespace`
+    selects one of several robots; `names` are those that differ.
     """
 
     path: Path
+    namespace: str
+    names: NameMap
     topics: Mapping[topics.Topic, TopicMessages]
     message_counts: Mapping[str, int]
     facts: Mapping[str, str]
@@ -127,8 +130,17 @@ class Content:
                 found[topics.PLANT] = change['parameters']
         return found
 
-    def controller_config(self) -> ControllerConfig:
+    @property
+    def unknown_parameters(self) -> list[str]:
+        """Recorded parameters of the controller that this version does not have."""
+        recorded = self.configurations.get(topics.CONTROLLER, {})
+        known = {parameter.name for parameter in parameters(ControllerConfig)}
+        return [name for name in recorded if name not in known]
+
+    def controller_config(self, *, exactly: bool = False) -> ControllerConfig:
         """Return the configuration of the controller as first recorded.
+
+        Unknown parameters are left out, or an error if it should be `exactly` as recorded.
 
         Raises:
             BagError: the bag holds none.
@@ -143,7 +155,9 @@ class Content:
         source = f'{self.path}, {topics.JOURNAL.resolved}'
         if self.version != __version__:
             source += f' by version {self.version or "unknown"}, not {__version__}'
-        return build(ControllerConfig, values, source)
+        left_out = () if exactly else self.unknown_parameters
+        given = {name: value for name, value in values.items() if name not in left_out}
+        return build(ControllerConfig, given, source)
 
 
 def read_content(path: Path, namespace: str = '', names: NameMap = NO_NAMES) -> Content:
@@ -154,27 +168,26 @@ def read_content(path: Path, namespace: str = '', names: NameMap = NO_NAMES) -> 
             or it holds the topics of several robots.
     """
     with open_bag(path) as bag:
-        if not bag.held or not any(bag.counts.values()):
+        if not any(bag.counts.values()):
             raise BagError(f'{path} is empty: it holds no message')
         names = _recorded_names(bag, namespace, names)
         found = {topic: _find(topic, bag.held, namespace, names) for topic in _OF_INTEREST}
-        if found[topics.JOINT_STATES] is None:
+        states = found[topics.JOINT_STATES]
+        if states is None:
             raise _missing_topic(topics.JOINT_STATES.name, topics.JOINT_STATES.type, bag.held)
-        types = dict(bag.held)
+        if not bag.counts[states]:
+            raise BagError(f'{path} is empty: it holds no message of {states}')
         kept = {
-            topic: TopicMessages(name, types[name] if topic is topics.COMMANDS else topic.type)
+            topic: TopicMessages(name, bag.held[name])
             for topic, name in found.items()
-            if name is not None
+            if name is not None and bag.counts[name]
         }
         adds = {messages.name: messages.add for messages in kept.values()}
         for message in bag.messages(adds):
             adds[message.topic](message)
     for messages in kept.values():
         messages.decode()
-    if not kept[topics.JOINT_STATES].size:
-        raise BagError(f'{path} is empty: it holds no message of {found[topics.JOINT_STATES]}')
-    held = {topic: messages for topic, messages in kept.items() if messages.size}
-    return Content(path, held, bag.counts, bag.facts)
+    return Content(path, namespace, names, kept, bag.counts, bag.facts)
 
 
 def _recorded_names(bag: OpenBag, namespace: str, names: NameMap) -> NameMap:
@@ -183,18 +196,18 @@ def _recorded_names(bag: OpenBag, namespace: str, names: NameMap) -> NameMap:
     So it is with a driver whose joint states also come at a lower rate, as those of an FR3 do.
     """
     journal = _find(topics.JOURNAL, bag.held, namespace, names)
-    held = {name for name, _ in bag.held}
-    if journal is None or sum(name.endswith(f'/{topics.JOINT_STATES.leaf}') for name in held) < 2:
+    leaf = f'/{topics.JOINT_STATES.leaf}'
+    if journal is None or sum(name.endswith(leaf) for name in bag.held) < 2:
         return names
     recorded: dict[str, str] = {}
     with suppress(BlfDscError, StopIteration):
         recorded = decode(next(bag.messages([journal])).raw).content.get('topics', {})
-    own = {leaf: name for leaf, name in recorded.items() if name in held}
+    own = {leaf: name for leaf, name in recorded.items() if name in bag.held}
     return NameMap({**own, **names.topics}, names.joints)
 
 
 def _find(
-    topic: topics.Topic, held: list[tuple[str, str]], namespace: str, names: NameMap
+    topic: topics.Topic, held: Mapping[str, str], namespace: str, names: NameMap
 ) -> str | None:
     """Return the name of a topic in a bag, None if it is missing.
 
@@ -204,13 +217,15 @@ def _find(
     name = names.topics.get(topic.leaf)
     if name is not None:
         types = (topic.type, topics.JOINT_STATE) if topic is topics.COMMANDS else (topic.type,)
-        if not any((name, type_) in held for type_ in types):
+        if held.get(name) not in types:
             raise _missing_topic(name, ' or '.join(types), held)
         return name
     if topic.name.startswith('/'):
-        return topic.name if (topic.name, topic.type) in held else None
+        return topic.name if held.get(topic.name) == topic.type else None
     prefix = f'/{namespace.strip("/")}/' if namespace.strip('/') else '/'
-    candidates = [name for name, type_ in held if type_ == topic.type and name.startswith(prefix)]
+    candidates = [
+        name for name, type_ in held.items() if type_ == topic.type and name.startswith(prefix)
+    ]
     for ending in (topic.resolved, f'/{topic.leaf}'):
         fitting = sorted(name for name in candidates if name.endswith(ending))
         exact = [name for name in fitting if name == prefix + ending[1:]]
@@ -224,8 +239,8 @@ def _find(
     return None
 
 
-def _missing_topic(wanted: str, type_name: str, held: Iterable[tuple[str, str]]) -> BagError:
-    listing = ''.join(f'\n  {name} ({type_ or "of unknown type"})' for name, type_ in held)
+def _missing_topic(wanted: str, type_name: str, held: Mapping[str, str]) -> BagError:
+    listing = ''.join(f'\n  {name} ({type_ or "of unknown type"})' for name, type_ in held.items())
     named = 'called' if wanted.startswith('/') else 'whose name ends in'
     return BagError(
         f'the bag has no topic {named} {wanted!r} of type {type_name}; it holds:{listing}'

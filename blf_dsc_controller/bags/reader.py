@@ -109,13 +109,16 @@ def read_run(path: str | Path, namespace: str = '', names: NameMap = NO_NAMES) -
             robots, or the states of several runs.
         UnreadableMessageError: a message in it cannot be decoded.
     """
-    return recorded_run(read_content(Path(path), namespace, names), names, namespace).in_memory()
+    return recorded_run(read_content(Path(path), namespace, names)).in_memory()
 
 
-def recorded_run(content: Content, names: NameMap = NO_NAMES, namespace: str = '') -> RecordedRun:
+def recorded_run(content: Content) -> RecordedRun:
     """Return the run of a bag; errors as for `read_run`."""
-    joints = _joints(content, names)
-    states, notes, span = single_run(content, names.joints_of(joints))
+    joints = _joints(content)
+    states, notes, span = single_run(content, content.names.joints_of(joints))
+    if content.unknown_parameters:
+        names = ', '.join(content.unknown_parameters)
+        notes = *notes, f'recorded parameters that this version does not have: {names}'
     stamp = states.stamp
 
     def within(topic: topics.Topic, names: Sequence[str] = ()) -> JointStates | None:
@@ -164,7 +167,7 @@ def recorded_run(content: Content, names: NameMap = NO_NAMES, namespace: str = '
         timing=series(topics.TIMING),
         monitor=series(topics.MONITOR),
         message_counts=content.message_counts,
-        rejected=_rejected_columns(content, learning, namespace),
+        rejected=_rejected_columns(content, learning),
         stops=tuple(_stops(events, int(stamp[0]))),
         arm=_arm(content),
         learns=_learns([event.content.get('parameters', {}) for event in events]),
@@ -235,16 +238,16 @@ def _alternates(states: JointStates) -> bool:
     return pauses[0] < _ALTERNATING * pauses[1]
 
 
-def _joints(content: Content, names: NameMap) -> tuple[str, ...]:
-    """Return the controller's joints in its order; without it, those of `names`, or all."""
+def _joints(content: Content) -> tuple[str, ...]:
+    """Return the controller's joints in its order; without it, those with other names, or all."""
     sources = (topics.TRACKING_ERROR, topics.REFERENCE, topics.BOUND)
     of_controller = [content.topics[topic] for topic in sources if topic in content.topics]
-    if not of_controller and names.joints:
-        return tuple(names.joints)
+    if not of_controller and content.names.joints:
+        return tuple(content.names.joints)
     return (*of_controller, content.topics[topics.JOINT_STATES])[0].joint_names()
 
 
-def _rejected_columns(content: Content, learning: Series | None, namespace: str) -> dict[str, str]:
+def _rejected_columns(content: Content, learning: Series | None) -> dict[str, str]:
     """Return columns that are NaN at the end of learning, with the reason in /diagnostics."""
     if learning is None:
         return {}
@@ -258,14 +261,14 @@ def _rejected_columns(content: Content, learning: Series | None, namespace: str)
         reasons |= {
             pair.key.removeprefix(topics.REJECTED): pair.value
             for status in message.status
-            if status.name.startswith(namespace.strip('/'))
+            if status.name.startswith(content.namespace.strip('/'))
             for pair in status.values
         }
     return {column: reasons.get(column, '') for column in columns}
 
 
 def _arm(content: Content) -> LearnedArm | None:
-    """Return the arm of the recorded configuration; None unless its URDF can still be read."""
+    """Return the arm of the recorded configuration; None if it has no URDF or cannot be built."""
     if content.configurations.get(topics.CONTROLLER, {}).get('model') == 'urdf':
         from blf_dsc_controller.law.telemetry import learned_arm  # slow: compiles
 

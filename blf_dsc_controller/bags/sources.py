@@ -9,9 +9,10 @@ no checksum covers, such as a chunk whose opcode has flipped, shows in the numbe
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager
-from io import BytesIO
+from io import SEEK_CUR, SEEK_END, BytesIO
+from mmap import mmap
 from pathlib import Path
 from struct import Struct
 from typing import Any, BinaryIO, NamedTuple, TypeAlias
@@ -68,9 +69,6 @@ class BagMessage(NamedTuple):
     sequence: int = 0  # assigned by its publisher; 0 if unknown
 
 
-Messages: TypeAlias = Iterator[BagMessage]
-
-
 class OpenBag:
     """An open bag.
 
@@ -84,13 +82,17 @@ class OpenBag:
 
     def __init__(self, reader: Any, path: Path) -> None:
         self._reader, self._files = reader, list[Path]()
-        every = reader.connections
-        types = ((each.topic, each.msgtype.replace('__schemaless__', '')) for each in every)
-        self.held = list(dict.fromkeys(types))
+        self.held: dict[str, str] = {}
         self.counts: Counter[str] = Counter()
-        for each in every:
+        self.latched: set[str] = set()
+        for each in reader.connections:
+            self.held[each.topic] = each.msgtype.replace('__schemaless__', '')
             self.counts[each.topic] += each.msgcount
-        self.latched = {each.topic for each in every if _is_latched(each.ext)}
+            ext: Any = each.ext
+            offered = getattr(ext, 'offered_qos_profiles', ())
+            kept = any(qos.durability is QosDurability.TRANSIENT_LOCAL for qos in offered)
+            if kept or getattr(ext, 'latching', False):
+                self.latched.add(each.topic)
         self.times: tuple[int, int] = reader.start_time, reader.end_time
         self.facts: dict[str, str] = {}
         if isinstance(reader, Reader) and reader.compression_mode != 'message':
@@ -98,61 +100,74 @@ class OpenBag:
             parts: list[Any] = storage.storages if path.is_dir() else [storage]
             self._files = [part.path for part in parts if part.path.suffix == '.mcap']
 
-    def messages(self, topics: Collection[str]) -> Messages:
+    def messages(self, topics: Collection[str]) -> Iterator[BagMessage]:
         """Yield the messages of `topics`, nearly in order of reception.
 
         Raises:
             DamageError: their number is not the one that the bag states.
         """
         found: Counter[str] = Counter()
-        yield from (self._of_files if self._files else self._of_library)(topics, found)
+        for message in self._of_files() if self._files else self._of_library(topics):
+            found[message.topic] += 1
+            if message.topic in topics:
+                yield message
         for topic in topics:
             if found[topic] != self.counts[topic]:
                 raise DamageError(
                     f'it holds {found[topic]} messages of {topic}, but counts {self.counts[topic]}'
                 )
 
-    def _of_files(self, topics: Collection[str], found: Counter[str]) -> Messages:
+    def _of_files(self) -> Iterator[BagMessage]:
         for path in self._files:
             names: dict[int, str] = {}
             with path.open('rb') as stream:
                 for record in _records(stream):
                     if isinstance(record, tuple):
                         number, sequence, received, _, raw = record
-                        topic = names[number]
-                        found[topic] += 1
-                        if topic in topics:
-                            yield BagMessage(topic, received, raw, sequence)
+                        yield BagMessage(names[number], received, raw, sequence)
                     elif isinstance(record, Channel):
                         names[record.id] = record.topic
                     elif isinstance(record, Metadata) and record.name == RECORD:
                         self.facts |= record.metadata
 
-    def _of_library(self, topics: Collection[str], found: Counter[str]) -> Messages:
+    def _of_library(self, topics: Collection[str]) -> Iterator[BagMessage]:
         chosen = [each for each in self._reader.connections if each.topic in topics]
         for each, received, raw in self._reader.messages(chosen) if chosen else ():
-            found[each.topic] += 1
             if isinstance(self._reader, Ros1Reader):
                 # ROS 1 and 2 serialise the common types alike, except for padding and `seq`.
                 raw = typestore().ros1_to_cdr(raw, each.msgtype)  # noqa: PLW2901
             yield BagMessage(each.topic, received, bytes(raw))
 
 
-def _records(stream: BinaryIO) -> Iterator[StoredMessage | Schema | Channel | Metadata]:
-    """Yield the records of a file."""
+def _records(stream: BinaryIO) -> Iterator[StoredMessage | Schema | Channel | Metadata | None]:
+    """Yield the records of a file; None for those that are not needed."""
+    size = stream.seek(0, SEEK_END)
     stream.seek(MAGIC_SIZE)
-    while len(head := stream.read(HEAD.size)) == HEAD.size:
-        opcode, length = HEAD.unpack(head)
-        if opcode == Opcode.MESSAGE:
-            yield message_of(stream.read(length))
-        elif opcode not in _KINDS:
-            stream.seek(length, 1)
-        else:
-            record = _KINDS[opcode].read(ReadDataStream(BytesIO(stream.read(length))))
-            if isinstance(record, Chunk):
-                yield from records_in(record)
-            else:
-                yield record
+    while stream.tell() < size - MAGIC_SIZE:
+        record = next_record(stream, size, _KINDS)
+        yield from records_in(record) if isinstance(record, Chunk) else [record]
+
+
+def next_record(stream: BinaryIO | mmap, size: int, kinds: Mapping[int, Any]) -> Any:
+    """Return the next record of a file of `size` bytes, None if it is not of these kinds.
+
+    Raises any error if it does not match its length.
+    """
+    head = stream.read(HEAD.size).ljust(HEAD.size, b'\xff')
+    opcode, length = HEAD.unpack(head)
+    if stream.tell() + length > size:
+        raise DamageError('cut off')
+    if opcode == Opcode.MESSAGE:
+        content = stream.read(length)
+        return *_MESSAGE.unpack_from(content), content[_MESSAGE.size :]
+    if opcode not in kinds:
+        stream.seek(length, SEEK_CUR)
+        return None
+    fields = ReadDataStream(BytesIO(stream.read(length)))
+    record = kinds[opcode].read(fields)
+    if fields.count != length:
+        raise DamageError('a record does not match its length')
+    return record
 
 
 def records_in(chunk: Chunk) -> Iterator[StoredMessage | Schema | Channel]:
@@ -174,18 +189,6 @@ def records_in(chunk: Chunk) -> Iterator[StoredMessage | Schema | Channel]:
             yield _KINDS[opcode].read(ReadDataStream(BytesIO(records[begin:at])))
         else:
             raise DamageError(f'unknown record type {opcode} in a chunk')
-
-
-def message_of(content: bytes) -> StoredMessage:
-    """Return a message from the content of its record; struct.error if that is too short."""
-    number, sequence, received, published = _MESSAGE.unpack_from(content)
-    return number, sequence, received, published, content[_MESSAGE.size :]
-
-
-def _is_latched(ext: Any) -> bool:
-    offered: Any = getattr(ext, 'offered_qos_profiles', ())
-    kept = any(each.durability is QosDurability.TRANSIENT_LOCAL for each in offered)
-    return kept or bool(getattr(ext, 'latching', 0))
 
 
 @contextmanager
@@ -211,11 +214,10 @@ def _reason(path: Path, error: Exception) -> str:
     text = ' '.join(f'{error}'.split()).rstrip('.') or type(error).__name__
     is_mcap = any(path.glob('*.mcap')) if path.is_dir() else path.suffix == '.mcap'
     if path.is_dir() and not (path / METADATA).exists():
-        within = sorted(path.glob(f'*/{METADATA}'))
-        if is_mcap:
-            text = f'the folder has no {METADATA}; was the recording interrupted?'
-            return f'{text} Recover it: blf_dsc recover {path}'
-        guess = f'; did you mean {within[0].parent}?' if within else ': it is not a bag'
-        return f'the folder has no {METADATA}{guess}'
+        text = f'the folder has no {METADATA}'
+        if not is_mcap:
+            within = [f'; did you mean {each.parent}?' for each in path.glob(f'*/{METADATA}')]
+            return text + min(within, default=': it is not a bag')
+        text += ', as after an interrupted recording'
     is_damaged = is_mcap and not isinstance(error, OSError)
     return f'{text}; to save the undamaged part: blf_dsc recover {path}' if is_damaged else text

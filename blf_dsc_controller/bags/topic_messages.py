@@ -8,9 +8,8 @@ from __future__ import annotations
 
 import os
 import tempfile
-from bisect import bisect_right
-from collections.abc import Sequence
-from itertools import pairwise
+from collections.abc import Collection, Mapping, Sequence
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,7 +29,8 @@ from blf_dsc_controller.messages.topics import FLOAT64_MULTI_ARRAY, JOINT_STATE
 from blf_dsc_controller.run import Floats, Rows, Series, Stamps
 
 _BLOCK = 512  # messages decoded at once, which then are in the cache
-_NUMBER, _RECEIVED, _SEQUENCE, _STAMP, _VALUES = range(5)  # columns of a table
+_RECEIVED, _SEQUENCE, _STAMP, _VALUES = range(4)  # columns, the last with all others
+_NAN = np.float64(np.nan).view(np.int64)
 ALL = slice(None)
 
 
@@ -47,113 +47,61 @@ class UnreadableMessageError(BagError):
         super().__init__(f'message {index + 1} of {topic} cannot be read: {reason}')
 
 
-class _File:
-    """Temporary file that several tables share, and that is removed with the last of them."""
-
-    def __init__(self) -> None:
-        self.stream = tempfile.TemporaryFile()  # noqa: SIM115 - closed below
-
-    def __del__(self) -> None:
-        self.stream.close()
-
-
-class Table:
-    """Append-only table of 64-bit numbers, with a block of each column in one piece of a file."""
-
-    def __init__(self, file: _File) -> None:
-        self._file = file
-        self._begins = [0]  # row at which each block begins, and the end
-        self._offsets: list[int] = []  # of each block [bytes]
-
-    def __len__(self) -> int:
-        return self._begins[-1]
-
-    def append(self, columns: NDArray[np.int64]) -> None:
-        """Append m rows, given as columns (width, m)."""
-        stream = self._file.stream
-        self._offsets.append(stream.seek(0, os.SEEK_END))
-        self._begins.append(len(self) + columns.shape[1])
-        stream.write(columns.tobytes())
-        stream.flush()
-
-    def read(self, column: int, rows: NDArray[np.int32]) -> NDArray[np.int64]:
-        """Return some rows of a column, as an array of its own."""
-        if not rows.size:
-            return np.empty(0, np.int64)
-        first = bisect_right(self._begins, rows.min()) - 1
-        last = bisect_right(self._begins, rows.max())
-        descriptor, parts = self._file.stream.fileno(), []
-        edges = pairwise(self._begins[first : last + 1])
-        for offset, (begin, end) in zip(self._offsets[first:last], edges, strict=True):
-            size = 8 * (end - begin)
-            raw = os.pread(descriptor, size, offset + size * column)
-            parts.append(np.frombuffer(raw, np.int64))
-        return np.concatenate(parts)[rows - self._begins[first]]
-
-
 class JointStates:
     """N states of n joints, or N vectors of n named values in `position`.
 
-    Its arrays are read from a table when they are asked for.
+    Its arrays are read when they are asked for.
+
+    Attributes:
+        number: of each among the messages of the topic (N,); -1 is an unknown one.
     """
 
     def __init__(
         self,
         names: Sequence[str],
-        table: Table,
-        places: NDArray[np.intp],
-        rows: NDArray[np.int32] | None = None,
+        messages: TopicMessages,
+        number: NDArray[np.int32],
+        columns: Mapping[Layout, NDArray[np.intp]],
     ) -> None:
-        """Take the values `places` (3, n) and some rows of a table; -1 is unknown."""
-        self.names = tuple(names)
-        self._table, self._places = table, places
-        self._rows = np.arange(len(table), dtype=np.int32) if rows is None else rows
-        self.size = self._rows.size
-
-    def head(self, column: int) -> Stamps:
-        """Return one of the first columns (N,): number, reception, sequence, stamp."""
-        return self._table.read(column, self._rows)
-
-    @property
-    def number(self) -> Stamps:
-        """Number of each among the messages of the topic (N,)."""
-        return self.head(_NUMBER)
+        """Take where the values (3, n) are in the messages of each layout; -1 is unknown."""
+        self.names, self.number, self.size = tuple(names), number, number.size
+        self._messages, self._columns = messages, columns
 
     @property
     def received(self) -> Stamps:
         """When each was received (N,) [ns]."""
-        return self.head(_RECEIVED)
+        return self._messages.column(_RECEIVED, self.number)
 
     @property
     def sequence(self) -> Stamps:
         """Number given by the publisher (N,); 0 if unknown."""
-        return self.head(_SEQUENCE)
+        return self._messages.column(_SEQUENCE, self.number)
 
     @property
     def stamp(self) -> Stamps:
         """Stamps (N,) [ns]."""
-        return self.head(_STAMP)
+        return self._messages.column(_STAMP, self.number)
 
     def has(self, k: int) -> bool:
         """Return whether any of the positions (0), velocities (1) or efforts (2) is known."""
-        return bool((self._places[k] >= 0).any())
+        return any((columns[k] >= 0).any() for columns in self._columns.values())
 
     def field(self, k: int, rows: Rows = ALL, columns: Rows = ALL) -> Floats:
         """Return positions (0), velocities (1) or efforts (2), (m, n); NaN where unknown."""
-        chosen, places = self._rows[rows], self._places[k][columns].tolist()
-        values = np.full((len(places), chosen.size), np.nan)
-        for row, place in zip(values, places, strict=True):
-            if place >= 0:
-                row[:] = self._table.read(_VALUES + place, np.maximum(chosen, 0)).view(np.float64)
-        values[:, chosen < 0] = np.nan
+        number = self.number[rows]
+        joints = np.arange(len(self.names))[columns].tolist()
+        values = np.empty((len(joints), number.size))
+        for row, j in zip(values, joints, strict=True):
+            places = {layout: int(found[k, j]) for layout, found in self._columns.items()}
+            row[:] = self._messages.column(places, number).view(np.float64)
         return np.asarray(values.T)
 
     def select(self, rows: Rows) -> JointStates:
         """Return the states of these rows; -1 is an unknown one."""
-        chosen = self._rows[rows]
+        number = self.number[rows]
         if not isinstance(rows, slice):
-            chosen[rows < 0] = -1
-        return JointStates(self.names, self._table, self._places, chosen)
+            number[rows < 0] = -1
+        return JointStates(self.names, self._messages, number, self._columns)
 
     def by_stamp(self) -> JointStates:
         """Return the states ordered by stamp, one per stamp."""
@@ -173,25 +121,9 @@ class JointStates:
         """Return the last states at or before these stamps, else the first."""
         return self.select(np.maximum(np.searchsorted(self.stamp, stamp, side='right') - 1, 0))
 
-    @classmethod
-    def merged(cls, names: Sequence[str], parts: Sequence[JointStates]) -> JointStates:
-        """Return the states of several tables in order of reception."""
-        if len(parts) == 1:
-            return parts[0]
-        together = np.hstack([
-            np.vstack((
-                *(part.head(column) for column in range(_VALUES)),
-                *(part.field(k).T.view(np.int64) for k in range(3)),
-            ))
-            for part in parts
-        ])  # fmt: skip
-        table = Table(_File())
-        table.append(together[:, np.argsort(together[_NUMBER])])
-        return cls(names, table, np.arange(3 * len(names)).reshape(3, -1))
-
 
 class StoredSeries(Series):
-    """Series whose values are read from a bag's table when they are asked for."""
+    """Series whose values are read from a bag's file when they are asked for."""
 
     _of: JointStates
 
@@ -202,7 +134,7 @@ class StoredSeries(Series):
 
     @property
     def values(self) -> Floats:
-        """All values (m, number of names), read from the table."""
+        """All values (m, number of names)."""
         return self.at(ALL)
 
     def at(self, rows: Rows, columns: Rows = ALL) -> Floats:
@@ -210,18 +142,30 @@ class StoredSeries(Series):
         return self._of.field(0, rows, columns)
 
 
+class _Part(NamedTuple):
+    """Messages of one layout in a block, stored column by column."""
+
+    layout: Layout
+    places: NDArray[np.intp]  # in the block
+    offset: int  # bytes
+
+
 class TopicMessages:
-    """All messages of one topic: a table for each layout of known types, the others as bytes."""
+    """All messages of one topic: the numbers of known types in a file, others as bytes."""
 
     def __init__(self, name: str, type_name: str) -> None:
         self.name, self.type = name, type_name
         self.size = 0
         self.raw: list[bytes] = []  # of other types
         self.received: list[int] = []  # likewise [ns]
-        self._file = _File()
-        self._tables: dict[Layout, Table] = {}
+        self._file = tempfile.TemporaryFile()  # noqa: SIM115 - closed below
+        self._layouts: list[Layout] = []
+        self._blocks: list[list[_Part]] = []
         self._unreadable: dict[int, MessageError] = {}
         self._waiting: list[BagMessage] = []
+
+    def __del__(self) -> None:
+        self._file.close()
 
     def add(self, message: BagMessage) -> None:
         """Add a message."""
@@ -235,22 +179,23 @@ class TopicMessages:
                 self.decode()
 
     def decode(self) -> None:
-        """Decode the messages added last."""
-        batches: dict[Layout, list[int]] = {}
+        """Decode the messages added last; no other may follow a block that is not full."""
         waiting, self._waiting = self._waiting, []
-        first, layout = self.size - len(waiting), None
+        places: dict[Layout, list[int]] = {}
+        layout = None
         for k, message in enumerate(waiting):
             if layout is None or not layout.fits(message.raw):
-                layout = self._layout_of(message.raw, first + k)
-                batch = [] if layout is None else batches.setdefault(layout, [])
-            batch.append(k)
-        for each, batch in batches.items():
-            columns = self._columns(each, [waiting[k] for k in batch])
-            columns[_NUMBER] = first + np.array(batch)
-            self._tables[each].append(columns)
+                layout = self._layout_of(message.raw, self.size - len(waiting) + k)
+            if layout is not None:
+                places.setdefault(layout, []).append(k)
+        self._blocks.append([])
+        for each, found in places.items():
+            self._blocks[-1].append(_Part(each, np.array(found), self._file.seek(0, os.SEEK_END)))
+            self._file.write(self._decoded(each, [waiting[k] for k in found]).tobytes())
+        self._file.flush()
 
     def _layout_of(self, raw: bytes, number: int) -> Layout | None:
-        for layout in self._tables:
+        for layout in self._layouts:
             if layout.fits(raw):
                 return layout
         try:
@@ -258,11 +203,11 @@ class TopicMessages:
         except MessageError as error:
             self._unreadable[number] = error
             return None
-        self._tables[layout] = Table(self._file)
+        self._layouts.append(layout)
         return layout
 
-    def _columns(self, layout: Layout, messages: Sequence[BagMessage]) -> NDArray[np.int64]:
-        """Decode messages of one layout: number, received, sequence, stamp, then all values."""
+    def _decoded(self, layout: Layout, messages: Sequence[BagMessage]) -> NDArray[np.int64]:
+        """Decode messages of one layout: received, sequence, stamp, then all values."""
         count, size, double = len(messages), layout.size, layout.double
         columns = np.zeros((_VALUES + layout.places.size, count), np.int64)
         columns[_RECEIVED] = [each.received for each in messages]
@@ -276,10 +221,26 @@ class TopicMessages:
         columns[_VALUES:] = grid[:, layout.places].astype(np.float64).view(np.int64).T
         return columns
 
+    def column(
+        self, column: int | Mapping[Layout, int], number: NDArray[np.int32]
+    ) -> NDArray[np.int64]:
+        """Return a column of some messages, which may differ by layout; NaN where unknown."""
+        known = number[number >= 0]
+        first, last = (known.min() // _BLOCK, known.max() // _BLOCK + 1) if known.size else (0, 0)
+        values = np.full((last - first) * _BLOCK + 1, _NAN)  # the last for those unknown
+        for k, block in enumerate(self._blocks[first:last]):
+            for layout, places, offset in block:
+                j = column if isinstance(column, int) else column.get(layout, -1)
+                if j >= 0:
+                    size = 8 * places.size
+                    raw = os.pread(self._file.fileno(), size, offset + size * j)
+                    values[k * _BLOCK + places] = np.frombuffer(raw, np.int64)
+        return values[np.where(number < 0, -1, number - first * _BLOCK)]
+
     def joint_states(
         self,
         names: Sequence[str],
-        required: Sequence[str] = ('position', 'velocity'),
+        required: Collection[str] = ('position', 'velocity'),
         errors: dict[int, MessageError] | None = None,
     ) -> JointStates:
         """Return sensor_msgs/JointState of these names, without those that name none of them.
@@ -289,25 +250,33 @@ class TopicMessages:
         Raises:
             UnreadableMessageError: a message cannot be decoded and `errors` is None, or none can.
         """
-        unreadable, parts, foreign = dict(self._unreadable), [], None
-        for layout, table in self._tables.items():
+        unreadable, columns, foreign = dict(self._unreadable), {}, dict[int, MessageError]()
+        for layout in self._layouts:
             try:
-                places = layout.columns(names, required)
+                found = layout.columns(names, required)
             except MessageError as error:
-                if isinstance(error, MissingJointError) and error.is_foreign(names):
-                    foreign = foreign or error
-                else:
-                    numbers = JointStates((), table, np.empty((3, 0), np.intp)).number
-                    unreadable.update(dict.fromkeys(numbers.tolist(), error))
+                is_foreign = isinstance(error, MissingJointError) and error.is_foreign(names)
+                others = dict.fromkeys(self._numbers([layout]).tolist(), error)
+                (foreign if is_foreign else unreadable).update(others)
             else:
-                parts.append(JointStates(names, table, places))
-        if not parts and foreign is not None and not unreadable:
-            unreadable[0] = foreign
-        if unreadable and (errors is None or not parts):
+                columns[layout] = np.where(found < 0, -1, found + _VALUES)
+        if not columns:
+            unreadable = unreadable or foreign
+        if unreadable and (errors is None or not columns):
             raise UnreadableMessageError(self.name, *min(unreadable.items()))
         if errors is not None:
             errors.update(unreadable)
-        return JointStates.merged(names, parts)
+        return JointStates(names, self, self._numbers(columns), columns)
+
+    def _numbers(self, layouts: Collection[Layout]) -> NDArray[np.int32]:
+        """Return the numbers of all messages of these layouts, in order."""
+        parts = [
+            k * _BLOCK + part.places
+            for k, block in enumerate(self._blocks)
+            for part in block
+            if part.layout in layouts
+        ]
+        return np.sort(np.concatenate([np.empty(0, np.intp), *parts])).astype(np.int32)
 
     def arrays(self, columns: Sequence[int]) -> JointStates:
         """Return these values of each std_msgs/Float64MultiArray as efforts.
@@ -315,25 +284,26 @@ class TopicMessages:
         Raises:
             UnreadableMessageError: a message cannot be decoded, or has other values.
         """
-        size = self.layout().arrays[0].size
-        if len(self._tables) > 1 or self._unreadable or max(columns) >= size:
+        layout = self.layout()
+        size = layout.arrays[0].size
+        if len(self._layouts) > 1 or self._unreadable or max(columns) >= size:
             error = MessageError(f'not every message holds the same {size} values')
             raise UnreadableMessageError(self.name, *min([*self._unreadable.items(), (0, error)]))
         places = np.full((3, len(columns)), -1)
-        places[2] = columns
-        (table,) = self._tables.values()
-        return JointStates([f'{k}' for k in columns], table, places)
+        places[2] = np.array(columns) + _VALUES
+        names = [f'{k}' for k in columns]
+        return JointStates(names, self, self._numbers([layout]), {layout: places})
 
     def layout(self) -> Layout:
         """Return the layout of the first message; UnreadableMessageError if it has none."""
-        if 0 in self._unreadable or not self._tables:
+        if 0 in self._unreadable or not self._layouts:
             raise UnreadableMessageError(self.name, 0, self._unreadable[0])
-        return next(iter(self._tables))
+        return self._layouts[0]
 
     def name_lists(self) -> list[tuple[str, ...]]:
         """Return the different lists of names; UnreadableMessageError as `layout`."""
         self.layout()
-        return list(dict.fromkeys(layout.names for layout in self._tables))
+        return list(dict.fromkeys(layout.names for layout in self._layouts))
 
     def joint_names(self) -> tuple[str, ...]:
         """Return the longest list of names in a message; UnreadableMessageError if it is empty."""

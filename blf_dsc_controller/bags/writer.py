@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import asdict
 from math import inf
 from pathlib import Path
@@ -18,7 +19,6 @@ from blf_dsc_controller.bags.sources import MESSAGES, METADATA, RECORD, VERSION,
 from blf_dsc_controller.messages.codecs import NANOSECONDS, Definition, definition
 from blf_dsc_controller.messages.topics import FOREVER, Quality
 
-_COMPRESSIONS = {'none': CompressionType.NONE, 'zstd': CompressionType.ZSTD}
 _CHUNK_SIZE = 1 << 20
 _MOST_CHUNKS = 10_000  # in a file, whose index is kept in memory until it ends
 _DURATIONS = ('deadline', 'lifespan', 'liveliness_lease_duration')
@@ -44,7 +44,7 @@ def _dump(tree: object) -> str:
     return str(yaml.safe_dump(tree, sort_keys=False, allow_unicode=True, width=2**20))
 
 
-class BagWriter:
+class BagWriter(AbstractContextManager['BagWriter']):
     """Writer of serialised messages to a new bag.
 
     Data leaves the process within `flush_interval` [s] plus the time to the next call of `write` or
@@ -66,7 +66,7 @@ class BagWriter:
     ) -> None:
         self.path = Path(path)
         self.closed = False
-        self._compression = _COMPRESSIONS[compression]
+        self._compression = CompressionType[compression.upper()]
         self._flush_interval = inf if flush_interval is None else flush_interval
         self._clock = clock
         self._topics: list[dict[str, Any]] = []  # as in metadata.yaml, with definitions beside
@@ -163,9 +163,6 @@ class BagWriter:
     def message_counts(self) -> dict[str, int]:
         """Messages written so far, by topic."""
         return {topic['topic_metadata']['name']: topic['message_count'] for topic in self._topics}
-
-    def __enter__(self) -> BagWriter:
-        return self
 
     def __exit__(self, *_: object) -> None:
         self.close()

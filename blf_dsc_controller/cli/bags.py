@@ -44,9 +44,7 @@ def report(options: Namespace) -> None:
 def _run(options: Namespace) -> reader.RecordedRun:
     """Read the run of a bag, and print what is left out."""
     names = NameMap.parse(options.map)
-    run = reader.recorded_run(
-        read_content(options.bag, options.namespace, names), names, options.namespace
-    )
+    run = reader.recorded_run(read_content(options.bag, options.namespace, names))
     for note in run.notes:
         print(f'note: {note}')
     return run
@@ -79,17 +77,18 @@ def recover(options: Namespace) -> int:
     """Make a clean bag from a damaged one and list the losses; return 1 if nothing is left."""
     bag = options.bag.resolve()
     out = options.out or bag.with_name(f'{bag.stem}_recovered')
-    recovery = recovering.recover(options.bag, out)
-    for topic, count in recovery.messages.items():
+    messages, losses = recovering.recover(options.bag, out)
+    for topic, count in messages.items():
         print(f'{topic}: {count} messages')
-    for loss in recovery.losses:
+    for loss in losses:
         print(f'LOST {loss}')
-    if recovery.is_empty:
+    all_lost = bool(losses) and not any(messages.values())
+    if all_lost:
         print('ALL LOST: no message could be recovered')
-    elif not recovery.losses:
+    elif not losses:
         print('none of the recorded messages was lost')
-    print(f'wrote {recovery.path}')
-    return int(recovery.is_empty)
+    print(f'wrote {out}')
+    return int(all_lost)
 
 
 def replay(options: Namespace) -> int:

@@ -288,15 +288,10 @@ class JointStateEncoder:
     Those of position, velocity, effort in `fields` hold a value for each name; others are empty.
     """
 
-    def __init__(
-        self,
-        names: Sequence[str],
-        fields: Collection[str] = JOINT_STATE_FIELDS,
-        frame_id: str = '',
-    ) -> None:
+    def __init__(self, names: Sequence[str], fields: Collection[str] = JOINT_STATE_FIELDS) -> None:
         types = typestore().types
         stamp = types['builtin_interfaces/msg/Time'](sec=0, nanosec=0)
-        header = types['std_msgs/msg/Header'](stamp=stamp, frame_id=frame_id)
+        header = types['std_msgs/msg/Header'](stamp=stamp, frame_id='')
         arrays = [np.zeros(len(names) * (field in fields)) for field in JOINT_STATE_FIELDS]
         message = types[JOINT_STATE](header, list(names), *arrays)
         self._buffer = bytearray(typestore().serialize_cdr(message, JOINT_STATE))

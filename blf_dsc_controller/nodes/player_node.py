@@ -40,7 +40,7 @@ class PlayerNode(Node):
             raise BagError(f'the bag has no topic {", ".join(missing)}; it holds {listing}')
         self._bag = bag
         self.outputs: dict[str, Publisher] = {}
-        for name, type_ in bag.held:
+        for name, type_ in bag.held.items():
             if name in wanted and not (clock and name == CLOCK.name):
                 self._add(name, type_)
         type_ = message_class(CLOCK.type)

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
-from typing import NamedTuple
 
 import numpy as np
 
@@ -99,13 +98,6 @@ class Outputs:
             self._add(stamp, self._telemetry.command(torque), guard.journal.commands)
 
 
-class Departure(NamedTuple):
-    """Where a replayed controller started, stopped or accepted otherwise than the recorded one."""
-
-    what: str
-    stamp: int  # ns
-
-
 class Rerun:
     """Replay of the guarded controller.
 
@@ -113,7 +105,8 @@ class Rerun:
         events: replayed events.
         outputs: replayed outputs.
         passed_over: number of joint states that the controller did not answer.
-        departure: where the controller departed from the journal, which ends the replay.
+        departure: in what, and at which stamp [ns], the controller first started, stopped or
+            accepted otherwise than the recorded one, which ends the replay.
         end: any other reason why the replay ended before the bag, or empty.
     """
 
@@ -131,7 +124,7 @@ class Rerun:
         """
         self.events: list[Event] = []
         self.passed_over = 0
-        self.departure: Departure | None = None
+        self.departure: tuple[str, int] | None = None
         self.end = ''
         self._guard = Guard(config, lambda: 0, lambda: 0)
         self._guard.journal.pending.clear()
@@ -326,7 +319,7 @@ class Rerun:
         self._depart(f'{what} ({text})', own.stamp)
 
     def _depart(self, what: str, stamp: int) -> None:
-        self.departure = self.departure or Departure(what, stamp)
+        self.departure = self.departure or (what, stamp)
 
 
 def _first_gap(answers: JointStates) -> int:

@@ -124,7 +124,7 @@ def verify(path: Path, namespace: str = '', names: NameMap = NO_NAMES) -> Verifi
     """
     content = read_content(path, namespace, names)
     events, until, end = _events(content)
-    config = content.controller_config()
+    config = content.controller_config(exactly=True)
     newer = sorted(flatten(config).keys() - events[0].content['parameters'].keys())
     errors: dict[int, MessageError] = {}
     states = content.topics[topics.JOINT_STATES].joint_states(
@@ -141,11 +141,12 @@ def verify(path: Path, namespace: str = '', names: NameMap = NO_NAMES) -> Verifi
     run.run(events[1:])
     comparisons = tuple(_compared(content, run, answers, config.joints))
     differences = [found.difference for found in comparisons if found.difference]
-    outputs, departure = run.outputs, run.departure
-    if departure is not None:
-        time = (departure.stamp - max(outputs.first, 0)) * 1e-9
-        topic = topics.TRACKING_ERROR.resolved
-        differences.insert(0, Difference(topic, *departure, time, 1.0, 0.0))
+    outputs = run.outputs
+    if run.departure is not None:
+        what, stamp = run.departure
+        time = (stamp - max(outputs.first, 0)) * 1e-9
+        found = Difference(topics.TRACKING_ERROR.resolved, what, stamp, time, 1.0, 0.0)
+        differences.insert(0, found)
     elif not any(found.values for found in comparisons):
         raise _nothing_to_compare(content)
     return Verification(
