@@ -51,9 +51,9 @@ class Outcome(NamedTuple):
     recovered: bool
 
 
-def run(fault: Fault) -> Outcome:
+def run(fault: Fault, rig: Rig | None = None) -> Outcome:
     """Inject a fault into a running loop, observe the outcome, and recover."""
-    rig = Rig(fault.given, live=fault.live)
+    rig = rig or Rig(fault.given, live=fault.live)
     rig.step(LEAD)
     assert rig.supervisor.phase is Phase.TRACKING, rig.supervisor.text
     start = stop = len(rig.commands)

@@ -16,7 +16,7 @@ from blf_dsc_controller import __version__
 from blf_dsc_controller.configuration.schema import change
 from blf_dsc_controller.law.factory import estimate_names
 from blf_dsc_controller.law.telemetry import ControllerTelemetry
-from blf_dsc_controller.messages.journal import EventType, decode
+from blf_dsc_controller.messages.journal import decode
 from blf_dsc_controller.messages.topics import COMMANDS, JOINT_STATES, JOURNAL, TRACKING_ERROR
 from blf_dsc_controller.reference.trajectory import Trajectory, TrajectoryPoint
 from blf_dsc_controller.replay.verify import verify
@@ -67,18 +67,21 @@ class Recorder(Rig):
             self.record(*self.telemetry.command(torque))
         super()._command(torque)
 
-    def verify(self, path, **facts):
+    def write(self, path, **options):
+        """Write the bag; return it."""
         self.publish_events()
-        return verify(
-            recorded_run.write(path / 'bag', self.entries, **facts, package_version=__version__)
-        )
+        facts = {'package_version': __version__}
+        return recorded_run.write(path / 'bag', self.entries, **options, **facts)
+
+    def verify(self, path, **options):
+        return verify(self.write(path, **options))
 
 
 @pytest.mark.parametrize('fault', IN_MESSAGES, ids=lambda fault: fault.name)
 def test_every_fault_replays_with_identical_torques(fault, tmp_path):
     rig = Recorder(fault.given, live=fault.live)
     outcome = run(fault, rig)
-    result = rig.verify(tmp_path, clock='lockstep')
+    result = rig.verify(tmp_path)
     assert result.difference is None
     if any('another controller' in remark for remark in result.remarks):
         return  # the replay ends where the controller was killed
@@ -116,25 +119,19 @@ def eventful():
     return rig
 
 
-def test_watchdog_torques_replay(tmp_path):
+def test_every_kind_of_event_and_watchdog_torques_replay(tmp_path):
     rig = eventful()
     rig.guard.release()
     result = rig.verify(tmp_path)
     assert (result.difference, result.remarks) == (None, ())
-    assert result.transitions == [
-        'activate',
-        'deactivate',
-        'activate',
-        'safe stop (state timeout)',
-        'reset',
-        'safe stop (bad message)',
-    ]
+    assert ', '.join(result.transitions) == (
+        'activate, deactivate, activate, safe stop (state timeout), reset, safe stop (bad message)'
+    )
     types = Counter(event.type for event in result.events)
-    assert (types[EventType.SILENCE], types[EventType.TRAJECTORY]) == (2, 2)
-    assert types[EventType.PARAMETERS] == 1
-    assert compared(result)['commands'] == 2 * len(of(rig.entries, COMMANDS))
-    states = len(of(rig.entries, JOINT_STATES))
-    assert len(of(rig.entries, COMMANDS)) > states + 10
+    assert [types[each] for each in ('silence', 'trajectory', 'parameters')] == [2, 2, 1]
+    states, commands = (len(of(rig.entries, topic)) for topic in (JOINT_STATES, COMMANDS))
+    assert compared(result)['commands'] == 2 * commands
+    assert commands > states + 10
 
 
 def test_dropped_states_are_detected(tmp_path):
@@ -148,8 +145,7 @@ def test_dropped_states_are_detected(tmp_path):
     rig.step(50)
     rig.guard.release()
     result = rig.verify(tmp_path)
-    assert result.difference is None
-    assert result.passed_over == 3
+    assert (result.difference, result.passed_over) == (None, 3)
     assert compared(result)['tracking_error'] == 6 * 147
     assert compared(result)['commands'] == 2 * 147
 
@@ -157,10 +153,10 @@ def test_dropped_states_are_detected(tmp_path):
 def test_unexpected_error_replays_as_a_stop(tmp_path):
     rig = Recorder(DAMPED)
     rig.step(50)
-    rig.record(JOINT_STATES, rig.state().raw())
-    stamp = rig.state().stamp
+    state = rig.state()
+    rig.record(JOINT_STATES, state.raw())
     rig.guard.journal.messages += 1  # the message was counted before the error
-    rig.guard.journal.stamp = stamp
+    rig.guard.journal.stamp = state.stamp
     estimate = rig.guard.samples.estimate
     kept = estimate.copy()
     estimate *= 1.1  # nothing in the bag shows how far the law got
@@ -170,23 +166,14 @@ def test_unexpected_error_replays_as_a_stop(tmp_path):
     estimate[:] = kept
     rig.guard.reset()
     rig.step(30)
-    result = rig.verify(tmp_path, clock='lockstep')
+    result = rig.verify(tmp_path)
     assert result.difference is None
     assert result.transitions == ['activate', 'safe stop (failed)', 'reset']
     assert compared(result)['commands'] >= 2 * (50 + 30)
 
 
-def test_event_lost_by_the_recorder_ends_the_replay(tmp_path):
-    rig = eventful()
-    rig.publish_events()
-    rig.entries.remove(of(rig.entries, JOURNAL)[3])
-    result = rig.verify(tmp_path)
-    assert result.difference is None
-    assert result.remarks == ('an event of the journal is not in the bag: the replay ends there',)
-
-
-def altered(event, **content):
-    return event._replace(content={**event.content, **content})
+def altered(**content):
+    return lambda event: event._replace(content={**event.content, **content})
 
 
 def later(event):
@@ -198,31 +185,29 @@ def other_point(event):
     return event
 
 
-def configured(name, value):
-    return lambda event: altered(event, parameters={**event.content['parameters'], name: value})
+def strict(event):
+    event.content['parameters']['safety.error_ratio'] = 1e-6
+    return event
 
 
 @pytest.mark.parametrize(
     ('kind', 'alter', 'topic', 'field'),
     [
-        ('stop', lambda event: altered(event, reason='stamp jump'), TRACKING_ERROR, 'stop: '),
+        ('stop', altered(reason='stamp jump'), TRACKING_ERROR, 'stop: '),
         ('stop', later, TRACKING_ERROR, 'used by the law ('),
         ('trajectory', later, TRACKING_ERROR, 'trajectory'),
         ('trajectory', other_point, COMMANDS, 'effort of joint'),
-        ('configure', configured('safety.error_ratio', 1e-6), TRACKING_ERROR, 'used by the law ('),
-        ('silence', lambda event: altered(event, torques=3), TRACKING_ERROR, 'silence'),
+        ('configure', strict, TRACKING_ERROR, 'used by the law ('),
+        ('silence', altered(torques=3), TRACKING_ERROR, 'silence'),
     ],
 )
 def test_changed_event_is_a_difference(tmp_path, kind, alter, topic, field):
     """The recorded controller did something else than the replayed one."""
     rig = eventful()
     rig.publish_events()
-    entry, event = next(
-        (entry, event)
-        for entry in of(rig.entries, JOURNAL)[:: -1 if kind == 'stop' else 1]
-        for event in [decode(entry[3])]
-        if event.type == kind
-    )
+    events = [(entry, decode(entry[3])) for entry in of(rig.entries, JOURNAL)]
+    chosen = [(entry, event) for entry, event in events if event.type == kind]
+    entry, event = chosen[-1 if kind == 'stop' else 0]
     entry[3] = alter(event).encode()
     difference = rig.verify(tmp_path).difference
     assert (difference.topic, difference.field[: len(field)]) == (topic.resolved, field)
@@ -233,51 +218,46 @@ def test_changed_event_is_a_difference(tmp_path, kind, alter, topic, field):
 @pytest.mark.parametrize('part', [0.1, 0.5, 0.9])
 def test_flipped_bit_of_a_safe_torque_is_found(tmp_path, part):
     rig = eventful()
-    safe = [k for k, entry in enumerate(of(rig.entries, TRACKING_ERROR)) if NAN in entry[3]]
-    number = safe[int(part * len(safe))]
-    earlier, entry = (of(rig.entries, TRACKING_ERROR)[k] for k in (safe[0], number))
-    earlier[3] = earlier[3].replace(NAN, struct.pack('<d', -float('nan')), 1)  # another NaN
+    safe = [entry for entry in of(rig.entries, TRACKING_ERROR) if NAN in entry[3]]
+    safe[0][3] = safe[0][3].replace(NAN, struct.pack('<d', -float('nan')), 1)  # another NaN
+    entry = safe[int(part * len(safe))]
     entry[3] = entry[3][:-8] + bytes([entry[3][-8] ^ 1]) + entry[3][-7:]
     difference = rig.verify(tmp_path).difference
     assert (difference.topic, difference.field) == (TRACKING_ERROR.resolved, 'effort of joint2')
     assert difference.recorded == pytest.approx(difference.replayed, abs=1e-12)
 
 
-def test_answers_missed_by_the_recorder_end_the_replay(tmp_path):
-    """Which states the law used is then not known."""
-    rig = Recorder()
-    rig.step(60)
+@pytest.mark.parametrize(
+    ('topic', 'number', 'samples', 'remark'),
+    [
+        (TRACKING_ERROR, 40, 40, f'the recorder missed messages of {TRACKING_ERROR.resolved}'),
+        (JOURNAL, 3, 1, 'an event of the journal is not in the bag'),
+    ],
+)
+def test_replay_ends_where_the_recorder_missed_what_it_needs(
+    tmp_path, topic, number, samples, remark
+):
+    """Which states the law used, and what happened, is then not known."""
+    rig = eventful()
     rig.publish_events()
-    lost = of(rig.entries, TRACKING_ERROR)[40]
-    lost[3] = None
-    entries = [list(entry) for entry in rig.entries]
-    path = recorded_run.write(tmp_path / 'bag', entries, publishers=1, package_version=__version__)
-    result = verify(path)
-    assert (result.difference, result.samples) == (None, 40)
-    assert 'the recorder missed messages of /blf_dsc_controller/tracking' in result.remarks[0]
+    of(rig.entries, topic)[number][3] = None
+    result = rig.verify(tmp_path, publishers=1)
+    assert (result.difference, result.samples) == (None, samples)
+    assert result.remarks == (f'{remark}: the replay ends there',)
+    assert result.compared < 1.0
 
 
-def test_second_controller_in_a_bag_is_not_replayed(tmp_path):
+@pytest.mark.parametrize('drops', [(), (40,)])
+def test_second_controller_in_a_bag_is_not_replayed(tmp_path, drops):
+    """In lock-step the plant sends the state that killed a controller until another answers."""
     rig = Recorder()
     rig.step(40)
+    rig.drops = drops
+    if drops:
+        rig.deliver(rig.state().raw())
     rig.guard = rig.controller()
     rig.step(40)
     result = rig.verify(tmp_path)
-    assert result.difference is None
-    assert result.remarks[0] == 'another controller was started: the replay ends there'
-    assert result.compared == pytest.approx(0.5)
-    assert result.samples == 40
-
-
-def test_state_at_which_a_controller_was_killed_belongs_to_the_next_one(tmp_path):
-    """In lock-step the plant sends it again until a controller answers."""
-    rig = Recorder()
-    rig.step(40)
-    rig.drops = (40,)
-    rig.deliver(rig.state().raw())
-    rig.guard = rig.controller()
-    rig.step(40)
-    result = rig.verify(tmp_path, clock='lockstep')
-    assert result.difference is None
-    assert result.samples == 40
+    assert (result.difference, result.samples) == (None, 40)
+    assert result.remarks == ('another controller was started: the replay ends there',)
     assert result.compared == pytest.approx(0.5)
