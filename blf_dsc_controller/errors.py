@@ -45,9 +45,6 @@ class VelocityMismatchError(StartError):
     """The velocity of a joint is so far from the reference that it would leave the bound."""
 
     def __init__(self, joint: str, difference: float, limit: float) -> None:
-        self.joint = joint
-        self.difference = difference
-        self.limit = limit
         super().__init__(
             f'joint {joint!r} starts {difference:+.6g} rad/s from the velocity of the reference; '
             f'at limits.acceleration {limit:.6g} rad/s can be made up within its bound: start with '
@@ -59,8 +56,6 @@ class MissingExtraError(BlfDscError):
     """A package from one of the optional extras is not installed."""
 
     def __init__(self, module: str, extra: str, purpose: str) -> None:
-        self.module = module
-        self.extra = extra
         super().__init__(
             f'{purpose} needs {module}, which is not installed: '
             f"pip install 'blf_dsc_controller[{extra}]'"

@@ -92,9 +92,10 @@ def nodes(context: LaunchContext) -> list[Node]:
     if bag:
         plant_mode = mode or load(file, f'{namespace}/{PLANT}', PlantConfig).mode
         clock = 'plant' if is_simulated and plant_mode == 'lockstep' else 'wall'
-        started.append(node('bag_recorder', {'output': bag, 'clock': clock}))
+        recorded = {'output': bag, 'clock': clock}
+        started.append(node('bag_recorder', recorded, required=is_simulated))
     started.append(node('torque_watchdog', {}, required=False))
-    # On an arm, the watchdog outlives a controller that crashes: it holds the arm.
+    # On an arm, the watchdog outlives a controller that crashes, and both outlive the recorder.
     started.append(node('blf_dsc_controller', of_loop, required=is_simulated))
     if is_simulated:
         started.append(node('sim_plant', of_plant))

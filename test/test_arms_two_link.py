@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The two-link arm against a Lagrangian and MuJoCo; joints, axes, tip and clearance of chains."""
+"""The two-link arm as URDF and as derived again; joints, axes, tip and clearance of chains."""
 
 from __future__ import annotations
 
@@ -7,100 +7,32 @@ import numpy as np
 import pinocchio
 import plain_law
 import pytest
-from closed_loop_case import MODEL
 from plants import ARM
 from random_arm import ArmCase, chain_of
 
 from blf_dsc_controller.arms.geometry import Clearance, distance, skeleton, tip_radius
-from blf_dsc_controller.arms.model import arm_model
+from blf_dsc_controller.arms.model import arm_model, regressors_at
+from blf_dsc_controller.arms.serial_chain import serial_chain
 from blf_dsc_controller.arms.two_link import urdf
-from blf_dsc_controller.configuration.plant import PlantConfig
-from blf_dsc_controller.configuration.schema import build
+from blf_dsc_controller.arms.urdf import read_chain
 from sim_plant.arm import PointMassArm
-from sim_plant.plant import parameters_of
-
-PLANT = build(PlantConfig, {'arm.l1': 1.1, 'arm.l2': 0.7, 'arm.m1': 0.6, 'arm.m2': 0.45})
-LINKS = (1.1, 0.7), (0.6, 0.45)
 
 
-def test_mujoco_reads_the_same_arm_from_the_urdf():
-    """Mass matrix and gravity torque of the URDF, compiled by MuJoCo, against the model's."""
-    mujoco = pytest.importorskip('mujoco', reason='needs MuJoCo: pip install mujoco')
-    model = mujoco.MjModel.from_xml_string(urdf('arm', PLANT.joints, *LINKS, (0.0, 0.0)))
-    model.opt.gravity[:] = (0.0, 0.0, -PLANT.arm.gravity)
-    data = mujoco.MjData(model)
-    P, r, found = parameters_of(PLANT), PLANT.arm.gravity / PLANT.arm.l1, np.zeros((2, 2))
-    for q in np.random.default_rng(0).uniform(-3.0, 3.0, (20, 2)):
-        for joint, angle in zip(PLANT.joints, q, strict=True):
-            data.joint(joint).qpos[0] = angle
-        mujoco.mj_forward(model, data)
-        for row, unit in zip(found, np.eye(2), strict=True):
-            mujoco.mj_mulM(model, data, row, unit)
-        mass, _, weight = plain_law.dynamics(P, r, q, np.zeros(2))
-        np.testing.assert_allclose(found, mass, atol=1e-7)  # points have 1e-9 kg m^2 in it
-        np.testing.assert_allclose(data.qfrc_bias, weight, atol=1e-7)
-
-
-def test_urdf_has_an_effort_limit_only_for_limited_motors():
-    limited, free = (
-        urdf('arm', ('a', 'b'), *LINKS, limits) for limits in ((12.0, 0.0), (0.0, 0.0))
-    )
-    assert 'effort="12"' in limited
-    assert limited.count('<limit') == 1
-    assert '<joint name="b"' in free
-
-
-def regressor(q, dq, v, a):
-    H = np.full((2, 3), np.nan)
-    MODEL.regressor(q, dq, v, a, H)
-    return H
-
-
-def momentum(q, dq):
-    Yp, Yr = np.full((2, 2, 3), np.nan)
-    MODEL.momentum_regressor(q, dq, Yp, Yr)
-    return Yp, Yr
-
-
-def energies(lengths, masses, q, dq):
-    """Kinetic and potential energy from the Cartesian positions of the masses, complex-safe."""
-    phi, w = np.cumsum(q), np.cumsum(dq)
-    x = np.cumsum(-lengths * np.sin(phi) * w), np.cumsum(lengths * np.cos(phi) * w)
-    kinetic = 0.5 * np.sum(masses * (x[0] ** 2 + x[1] ** 2))
-    return kinetic, 9.8 * np.sum(masses * np.cumsum(lengths * np.sin(phi)))
-
-
-def complex_gradient(function, x):
-    """Gradient by complex steps of 1e-30, exact to rounding."""
-    steps = 1e-30j * np.eye(x.size)
-    return np.array([function(x + step).imag for step in steps]) / 1e-30
-
-
-@pytest.mark.parametrize('seed', range(4))
-def test_model_agrees_with_the_lagrangian(seed):
-    random = np.random.default_rng(seed)
-    lengths, masses = np.array((1.0, random.uniform(0.3, 1.2))), random.uniform(0.2, 1.5, 2)
-    P = np.array((masses.sum(), masses[1] * lengths[1] ** 2, masses[1] * lengths[1]))
-    q, dq, v, a = random.normal(size=(4, 2))
-    Yp, Yr = momentum(q, dq)
-
-    p = complex_gradient(lambda rate: energies(lengths, masses, q, rate)[0], dq)
-    np.testing.assert_allclose(Yp @ P, p, atol=1e-11)
-    gravity = complex_gradient(lambda angle: energies(lengths, masses, angle, dq)[1], q)
-    # Lagrange: dp/dt - dT/dq + dU/dq = tau, so G - C^T dq = dU/dq - dT/dq.
-    lagrange = -complex_gradient(lambda angle: energies(lengths, masses, angle, dq)[0], q)
-    np.testing.assert_allclose(Yr @ P, lagrange + gravity, atol=1e-10)
-
-    # H(q, dq, dq, ddq) P = d/dt(Yp P) + Yr P along a motion with this acceleration.
-    h, zero = 1e-6, np.zeros(2)
-    ahead, behind = (momentum(q + s * dq, dq + s * a)[0] @ P for s in (h, -h))
-    expected = (ahead - behind) / (2.0 * h) + Yr @ P
-    np.testing.assert_allclose(regressor(q, dq, dq, a) @ P, expected, rtol=1e-7, atol=1e-7)
-
-    # xi^T (dM/dt - 2 C) xi = 0 (Property I), for xi = v independent of dq.
-    rate = (momentum(q + h * dq, v)[0] - momentum(q - h * dq, v)[0]) @ P / (2.0 * h)
-    C_v = (regressor(q, dq, v, zero) - regressor(q, dq, zero, zero)) @ P
-    assert abs(v @ rate - 2.0 * v @ C_v) < 1e-7 * max(1.0, abs(v @ rate))
+def test_urdf_of_two_links_is_the_same_arm():
+    """As a chain, whose regressors agree with pinocchio's: Property III for any v and a."""
+    lengths, masses = (1.1, 0.7), (0.6, 0.45)
+    chain = read_chain(urdf('arm', ('a', 'b'), lengths, masses, (12.0, 0.0)), '', 'tip', ())
+    assert [joint.effort for joint in chain.joints] == [12.0, np.inf]
+    arm = PointMassArm(*lengths, *masses, g=9.81)
+    ours, P = arm_model('two_link', l1=arm.l1, gravity=arm.g), np.empty(3)
+    arm.fill_parameters(0.0, P)
+    theirs = serial_chain(chain)
+    phi = np.column_stack((chain.inertias, np.zeros(2))).ravel()
+    states = np.random.default_rng(0).normal(size=(4, 20, 2))
+    found, expected = regressors_at(ours, *states) @ P, regressors_at(theirs, *states) @ phi
+    np.testing.assert_allclose(found, expected, atol=1e-7)  # points have 1e-9 kg m^2 in it
+    corners = skeleton(chain, np.zeros(2))[0]
+    np.testing.assert_allclose(corners[-1], (1.8, 0.0, 0.0))
 
 
 @pytest.mark.parametrize('arm', [ARM, PointMassArm(l1=0.7, l2=1.1, m1=1.3, m2=0.4, g=9.81)])
@@ -117,6 +49,8 @@ def test_two_links_are_the_arm_of_section_iv(arm):
         np.testing.assert_allclose(H @ P, M @ a + C @ v + G, atol=1e-12)
         arm.accelerate(0.0, q, dq, v, a)
         np.testing.assert_allclose(M @ a + C @ dq + G, v, atol=1e-9)
+        np.testing.assert_allclose(Yp @ P, M @ dq, atol=1e-12)
+        np.testing.assert_allclose(Yr @ P, G - C.T @ dq, atol=1e-12)
     assert model.parameter_names == ('(m1+m2)*l1^2', 'm2*l2^2', 'm2*l1*l2')
     assert model.parameter_units == ('kg m^2',) * 3
     inner, outer = arm.m1 + arm.m2, arm.m2

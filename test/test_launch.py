@@ -131,11 +131,13 @@ def test_loop_shuts_down_with_any_of_its_nodes_but_not_with_a_viewer(launched):
 
 
 @pytest.mark.parametrize(('simulated', 'ends'), [('false', False), ('true', True)])
-def test_watchdog_of_an_arm_outlives_the_controller(launched, simulated, ends):
-    """A launch that ended with it would leave the last torque of the law."""
-    nodes = {node.executable: node for node in launched(driver='ur5e', simulated=simulated)}
-    assert bool(nodes['blf_dsc_controller'].on_exit) == ends
-    assert 'torque_watchdog' in nodes
+def test_no_end_of_another_node_ends_what_holds_an_arm(launched, simulated, ends):
+    """The watchdog outlives the controller, and both the recorder, as on a full disk."""
+    started = launched(driver='ur5e', simulated=simulated, bag='run1')
+    nodes = {node.executable: node for node in started}
+    for name in ('blf_dsc_controller', 'bag_recorder'):
+        assert bool(nodes[name].on_exit) == ends
+    assert not nodes['torque_watchdog'].on_exit
     assert ('blf_dsc_controller/commands', 'forward_effort_controller/commands') in nodes[
         'torque_watchdog'
     ].remappings

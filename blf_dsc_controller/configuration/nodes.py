@@ -185,32 +185,32 @@ def locate(given: str | Path) -> Path:
     raise ConfigurationError([f'{name} {what}: {guess}{remedy}'])
 
 
-def read(path: str | Path) -> Sequence[Section]:
+def read(path: str | Path, based: tuple[str, ...] = ()) -> Sequence[Section]:
     """Read the sections of a parameter file; ConfigurationError names the file and the line.
 
-    Those of the preset or file that it names as `base` under `monte_carlo`, if any, come first.
+    Those of the preset or file that it names as `base` under `monte_carlo`, if any, come first;
+    `based` are the files that are based on it.
     """
-    files, sections = [Path(path)], list[Section]()
-    while True:
-        try:
-            sections = [*parse(read_text(files[-1])), *sections]
-            base = _base_of(sections)
-            if base is None:
-                return sections
-            files.append(locate(base))
-        except (UnicodeDecodeError, OSError) as error:
-            raise ConfigurationError([str(error)], str(files[-1])) from error
-        except ConfigurationError as error:
-            raise ConfigurationError(error.problems, str(files[-1])) from error
-        if files[-1] in files[:-1]:
-            problem = f'monte_carlo: base: {base!r} leads back to a file that is based on it'
-            raise ConfigurationError([problem], str(path))
+    try:
+        sections = list(parse(read_text(Path(path))))
+        base = _base_of(sections)
+        if base is None:
+            return sections
+        below, above = locate(base), (*based, str(path))
+    except (UnicodeDecodeError, OSError) as error:
+        raise ConfigurationError([str(error)], str(path)) from error
+    except ConfigurationError as error:
+        raise ConfigurationError(error.problems, str(path)) from error
+    if str(below) in above:
+        problem = f'monte_carlo: base: {base!r} leads back to a file that is based on it'
+        raise ConfigurationError([problem], str(path))
+    return [*read(below, above), *sections]
 
 
 def _base_of(sections: list[Section]) -> str | None:
     """Take the base out of the first sections that name it."""
     for k, section in enumerate(sections):
-        if section.pattern.rsplit('/', 1)[-1] == 'monte_carlo' and 'base' in section.entries:
+        if section.pattern.endswith('/monte_carlo') and 'base' in section.entries:
             entries = dict(section.entries)
             sections[k] = section._replace(entries=entries)
             return str(entries.pop('base').value)
