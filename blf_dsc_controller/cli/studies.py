@@ -17,8 +17,9 @@ from blf_dsc_controller.compiled.jit import announced_compilation
 from blf_dsc_controller.configuration.nodes import locate
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.studies import runs
-from blf_dsc_controller.studies.arms import COLUMNS, chosen_laws, label_of
+from blf_dsc_controller.studies.arms import COLUMNS, chosen_laws
 from blf_dsc_controller.studies.arms import compare as compare_arms
+from blf_dsc_controller.studies.laws import CONTENDERS
 from blf_dsc_controller.studies.monte_carlo import load_study
 from blf_dsc_controller.studies.pairs import write_comparison
 from blf_dsc_controller.studies.paper import compare
@@ -56,7 +57,7 @@ def arms(options: Namespace) -> None:
             worst = (
                 f'{x:8.3g}' if np.isfinite(x) else '       -' for x in result.columns().max(axis=1)
             )
-            print(f'{label_of(name):<45}{" ".join(worst)}')
+            print(f'{CONTENDERS[name].label:<45}{" ".join(worst)}')
     print(f'wrote {options.out / "index.html"}')
 
 

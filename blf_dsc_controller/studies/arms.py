@@ -3,12 +3,11 @@
 
 from __future__ import annotations
 
-import itertools
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from tqdm import tqdm
@@ -28,7 +27,7 @@ from blf_dsc_controller.studies.laws import (
     load_laws,
     run,
 )
-from blf_dsc_controller.studies.runs import another_motion, torque_rows
+from blf_dsc_controller.studies.runs import another_motion, cores, torque_rows
 from blf_dsc_controller.studies.tuning import bounded, search, value_at
 
 POPULATION = 16
@@ -131,44 +130,25 @@ def compare(
     `laws` are as in `chosen_laws`.
     """
     names = chosen_laws(laws)
-    loops = {arm: [trial(arm, seed) for seed in range(truths + 1)] for arm in arms}
-    tuned = sum(bool(CONTENDERS[name].gains) for name in names)
-    each = tuned * POPULATION * (generations + 1) + len(names) * truths
     results: Results = {arm: {} for arm in arms}
-    with (
-        tqdm(total=len(arms) * each, unit='run') as bar,
-        ProcessPoolExecutor(initializer=chosen_laws, initargs=(laws,)) as pool,
-    ):
-
-        def computed(function: Callable[[Any], Any], points: Iterable[Any]) -> Iterator[Any]:
-            for value in pool.map(function, points):
-                bar.update()
-                yield value
-
-        unseen = {arm: torque_rows(trial(arm, _UNSEEN).controller) for arm in arms}
-        for name in {str(CONTENDERS[name].law): name for name in names}.values():
-            least = {gain.name: gain.least for gain in CONTENDERS[name].gains}
-            run(
-                name, loops[arms[0]][0], least, unseen[arms[0]]
-            )  # the workers load what it compiles
-        for arm, name in itertools.product(arms, names):
-            bar.set_description(f'{arm} {name}')
+    rows = [(arm, name) for arm in arms for name in names]
+    with ProcessPoolExecutor(cores(), initializer=chosen_laws, initargs=(laws,)) as pool:
+        for arm, name in tqdm(rows, unit='law'):
+            first, *others = (trial(arm, seed) for seed in range(truths + 1))
+            unseen = torque_rows(trial(arm, _UNSEEN).controller)
+            searched = CONTENDERS[name].gains
+            least = {gain.name: gain.least for gain in searched}
+            run(name, first, least, unseen)  # compiles what the workers load
             gains, cost = {}, None
-            if searched := CONTENDERS[name].gains:
-                of_gains = partial(tuning_cost, name=name, loop=loops[arm][0], unseen=unseen[arm])
-                options = {'workers': computed, 'updating': 'deferred'}
+            if searched:
+                of_gains = partial(tuning_cost, name=name, loop=first, unseen=unseen)
+                options = {'workers': pool.map, 'updating': 'deferred'}
                 point, cost, _ = search(of_gains, searched, POPULATION, generations, **options)
                 gains = values_of(name, point)
-            runs = partial(run, name, values=gains, unseen=unseen[arm])
-            results[arm][name] = Result(gains, cost, list(computed(runs, loops[arm][1:])))
+            runs = pool.map(partial(run, name, values=gains, unseen=unseen), others)
+            results[arm][name] = Result(gains, cost, list(runs))
     _write(folder, results, truths, generations)
     return results
-
-
-def label_of(name: str) -> str:
-    """Return the label of a contender; that of an addition includes the basic law."""
-    label = CONTENDERS[name].label
-    return f'{CONTENDERS[name.rpartition("_")[0]].label} {label}' if label[0] == '+' else label
 
 
 def table_of(laws: dict[str, Result]) -> list[list[str | Cell]]:
@@ -186,7 +166,7 @@ def table_of(laws: dict[str, Result]) -> list[list[str | Cell]]:
         rough = 100.0 * max(figures.roughness for figures in result.runs)
         gains = ', '.join(f'{gain} {value:g}' for gain, value in result.gains.items())
         bound = f'{kept} of {len(result.runs)}'
-        rows.append([label_of(name), *cells, bound, f'{rough:.1f}', gains or 'rule'])
+        rows.append([CONTENDERS[name].label, *cells, bound, f'{rough:.1f}', gains or 'rule'])
     return rows
 
 

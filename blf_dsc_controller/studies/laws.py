@@ -253,11 +253,15 @@ CONTENDERS = {
     'no_learning_tuned': Contender('without learning, tuned', _FEEDBACK, learns=False),
     'slotine_li_tuned': Contender('Slotine-Li with integrator, tuned', _SLOTINE_LI, 'slotine_li'),
     'computed_torque': Contender('computed torque', _PD, computed_torque, friction=False),
-    'computed_torque_i': Contender('+ integrator', _PID, computed_torque, friction=False),
-    'computed_torque_if': Contender('+ integrator, friction', _PID, computed_torque),
+    'computed_torque_i': Contender(
+        'computed torque + integrator', _PID, computed_torque, friction=False
+    ),
+    'computed_torque_if': Contender(
+        'computed torque + integrator, friction', _PID, computed_torque
+    ),
     'pd_gravity': Contender('PD + gravity', _PD, pd_gravity, friction=False),
-    'pd_gravity_i': Contender('+ integrator', _PID, pd_gravity, friction=False),
-    'pd_gravity_if': Contender('+ integrator, friction', _PID, pd_gravity),
+    'pd_gravity_i': Contender('PD + gravity + integrator', _PID, pd_gravity, friction=False),
+    'pd_gravity_if': Contender('PD + gravity + integrator, friction', _PID, pd_gravity),
 }
 
 
@@ -279,17 +283,13 @@ def law_changes(
         slope = np.array(config.surface.gain) / 2.0 + config.surface.mu
         changes['comparison.surface_gain'] = slope.tolist()
     elif not contender.learns:
-        changes |= {
-            'learning.weight': 0.0,
-            'learning.adaptation_gain': [0.0] * len(config.learning.initial_estimate),
-            'learning.excitation_threshold': 1e9,
-            'learning.change_detection': False,
-        }
+        without = [0.0] * len(config.learning.initial_estimate)
+        changes |= {'learning.weight': 0.0, 'learning.adaptation_gain': without}
     present = flatten(config)
     for gain in contender.gains:
-        per_joint = joint_inertia(config) if gain.inertial else np.ones(np.size(present[gain.name]))
-        each = values[gain.name] * per_joint
-        changes[gain.name] = each.tolist() if np.ndim(present[gain.name]) else each.item()
+        shape = np.shape(present[gain.name])
+        each = values[gain.name] * (joint_inertia(config) if gain.inertial else np.ones(shape))
+        changes[gain.name] = each.tolist()
         if gain.name == 'barrier.weight':
             limit = np.maximum(config.barrier.slope_limit, _STIFFEST * each)
             changes['barrier.slope_limit'] = limit.tolist()
