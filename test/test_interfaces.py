@@ -106,5 +106,6 @@ def test_viewer_configurations_name_existing_topics():
         for path in panel.get('paths', [])
     ]
     used += [layout['configById']['RawMessages!state']['topicPath']]
-    used += list(layout['configById']['3D!arm']['topics'])
+    scene = layout['configById']['3D!arm']
+    used += [*scene['topics'], scene['layers']['urdf']['jointStatesTopic']]
     assert set(used) <= known
