@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from functools import cache
 from typing import Any, NamedTuple
@@ -38,19 +38,21 @@ REFERENCE = reference.pack(
 JOINTS = ('shoulder', 'elbow')
 
 
-def recommended(*, bias: bool = True, **changes) -> Settings:
+def recommended(
+    *, bias: bool = True, viscous: bool = False, frequencies: Sequence[float] = (), **changes: Any
+) -> Settings:
     """Return the settings of the default configuration with changes, and the knee for them.
 
     Change detection is off, since the paper has none: test_law_consistency.py covers it.
     """
-    config = ControllerConfig()
-    config = replace(config, learning=replace(config.learning, bias=bias))
+    config, columns = ControllerConfig(), {'viscous': viscous, 'frequencies': frequencies}
+    config = replace(config, learning=replace(config.learning, bias=bias, **columns))
     settings = settings_of_config(config)._replace(**{'change_detection': 0} | changes)
     barriers = zip(settings.bound, settings.weight, settings.slope_limit, strict=True)
     return settings._replace(knee=np.array([barrier.knee(*each) for each in barriers]))
 
 
-def quick(**changes) -> Settings:
+def quick(**changes: Any) -> Settings:
     """Return settings that learn within seconds: a window of 1 s, which is less excited."""
     return recommended(**{'window': 1000, 'learning_start': 1.2, 'sigma': 1e-6} | changes)
 

@@ -7,6 +7,7 @@ It is the tests' oracle, and the law of every peer in benchmark/ that is only a 
 from __future__ import annotations
 
 import numpy as np
+from scipy.linalg import eigvalsh
 from scipy.optimize import brentq
 
 R = 9.8  # 1/s^2, g / l1 of Section IV
@@ -44,6 +45,7 @@ class PlainLaw:
         self.at_state = settings.compensation == 1
         self.theta = settings.initial_estimate.copy()
         self.d3 = np.zeros(2)
+        self.inertia = np.ones(2)  # measured over assumed
         self.tau = np.zeros(2)
         self.alpha2 = None
         self.previous = None
@@ -66,7 +68,7 @@ class PlainLaw:
         k, _ = self.bound(t)
         edge = np.minimum(np.abs(xi1), g.knee / g.bound * k)
         inside = g.weight * edge / np.cos(np.pi * edge**2 / (2.0 * k**2)) ** 2
-        return -np.sign(xi1) * (inside + g.slope_limit * (np.abs(xi1) - edge))
+        return -np.sign(xi1) * self.inertia * (inside + g.slope_limit * (np.abs(xi1) - edge))
 
     def virtual_control(self, xi1, dqr, t):
         """Return beta2 of (18) with (15) as printed, which needs a nonzero error."""
@@ -76,39 +78,49 @@ class PlainLaw:
         tau_aux = -g.K * k**2 / (xi1 * np.pi) * np.sin(s) * np.cos(s)
         return np.where(np.abs(xi1) < k, tau_aux, 0.0) - g.mu * xi1 + dqr + xi1 * dk / k
 
-    def momentum_regressors(self, q, dq):
-        """Return Yp and [Yr | bias columns]."""
-        r = self.gains.model.r
+    def momentum_regressors(self, t, q, dq):
+        """Return Yp and [Yr | D], with the columns D of the disturbance."""
+        r, g = self.gains.model.r, self.gains
         c2, s2, c12 = np.cos(q[1]), np.sin(q[1]), np.cos(q[0] + q[1])
         both = dq[0] + dq[1]
         Yp = np.array([[dq[0], both, c2 * (dq[0] + both)], [0.0, both, c2 * dq[0]]])
         Yr = np.array([[r * np.cos(q[0]), 0.0, r * c12], [0.0, 0.0, s2 * dq[0] * both + r * c12]])
-        return Yp, np.column_stack([Yr, np.eye(2)[:, : self.gains.m - 3]])
+        columns = [np.eye(2)] * g.bias + [np.diag(dq)] * g.viscous
+        columns += [np.eye(2) * f(w * t) for w in g.frequencies for f in (np.sin, np.cos)]
+        return Yp, np.column_stack([Yr, *columns])
 
-    def learn(self, t, dt, q, dq, applied):
+    def learn(self, t, dt, q, dq, dqr, applied):
         """Filter the row of the last interval into the window; when due, latch the window."""
         g = self.gains
-        Yp, Yr = self.momentum_regressors(q, dq)
+        Yp, Yr = self.momentum_regressors(t, q, dq)
         if self.previous is not None:
             X = (Yr + self.previous[1]) / 2.0
             X[:, :3] += (Yp - self.previous[0]) / dt
             pole = 1.0 - np.exp(-g.pole * dt)
             self.pole1 = self.pole1 + pole * (np.column_stack([X, applied]) - self.pole1)
             self.pole2 = self.pole2 + pole * (self.pole1 - self.pole2)
-            oldest = self.ring[self.rows % g.window]
-            self.total = self.total + self.pole2.T @ self.pole2 - oldest.T @ oldest
-            self.ring[self.rows % g.window] = self.pole2
-            self.rows += 1
+            if self.samples % g.row_interval == 0:
+                slow = np.abs(dqr) / np.hypot(dqr, g.motion_scale) if g.motion_scale else np.ones(2)
+                self.push((g.row_weight * slow)[:, None] * self.pole2)
             if self.samples % g.interval == 0 and t >= g.learning_start:
                 self.latch_if_excited()
         self.previous = Yp, Yr
 
+    def push(self, row):
+        """Replace the oldest row of the window."""
+        oldest = self.ring[self.rows % len(self.ring)]
+        self.total = self.total + row.T @ row - oldest.T @ oldest
+        self.ring[self.rows % len(self.ring)] = row
+        self.rows += 1
+
     def latch_if_excited(self):
-        """Latch the window if it is excited, by (21), (22), (26), (27)."""
-        mean = self.total / min(self.rows, self.gains.window)
-        Phi, b = mean[:-1, :-1], mean[:-1, -1]
-        if np.linalg.eigvalsh(Phi)[0] >= self.gains.sigma:
-            self.latched = Phi.copy(), b.copy()
+        """Latch the window if it is excited, by (21), (22), (26), (27), with a prior's pull."""
+        g = self.gains
+        mean = self.total / min(self.rows, g.window)
+        Phi = mean[:-1, :-1] + g.prior_weight * g.information
+        b = mean[:-1, -1] + g.prior_weight * g.information @ g.initial_estimate
+        if eigvalsh(Phi, g.information)[0] >= g.sigma:
+            self.latched = Phi, b
 
     def adapt(self, dt, H, xi2, *, saturated):
         """Update by (20), its sign corrected and projected in the Gamma metric, and by (30)."""
@@ -118,25 +130,25 @@ class PlainLaw:
             Phi, b = self.latched
             eps = b - Phi @ self.theta
             if self.newton:
-                eps = np.linalg.solve(Phi + g.rho * np.eye(g.m), eps)
+                eps = np.linalg.solve(Phi + g.rho * g.information, eps)
             v += g.kappa * eps
         tracking = np.zeros(g.m)
         if not saturated:
-            tracking[:3] = -H.T @ xi2
-            self.d3 = self.d3 - dt * g.gamma * (xi2 + g.eta * self.d3)
+            tracking[:3] = -(g.variance * (H.T @ xi2))[:3]
+            self.d3 = self.d3 - dt * self.inertia * g.gamma * (xi2 + g.eta * self.d3)
         v = g.Gamma * (v + tracking)
         by_tracking = self.theta + dt * g.Gamma * tracking
         w = self.theta[:3].copy()
         if w @ w >= g.radius**2 * (1.0 - 1e-12) and w @ v[:3] > 0.0:
             v[:3] -= g.Gamma[:3] * w * (w @ v[:3]) / (w @ (g.Gamma[:3] * w))
-        self.theta = self.theta + dt * v
+        self.theta = np.clip(self.theta + dt * v, g.least, g.most)
         w, gain = self.theta[:3].copy(), np.array(g.Gamma[:3])
         if np.linalg.norm(w) > g.radius:
             # Nearest point of the ball, from the multiplier that puts it on the sphere.
             out = lambda nu: np.linalg.norm(w / (1.0 + nu * gain)) - g.radius  # noqa: E731
             self.theta[:3] = w / (1.0 + brentq(out, 0.0, 1e9, xtol=1e-18) * gain)
         if g.bumpless and self.latched is not None:
-            self.d3 = self.d3 - H @ (self.theta - by_tracking)[:3]
+            self.d3 = self.d3 - H @ (self.theta - by_tracking)
 
     def update(self, t, dt, qr, dqr, ddqr, measurement):
         """Return the torque (28) for a measurement; the caller sets `tau`, the last one sent.
@@ -145,23 +157,28 @@ class PlainLaw:
         """
         g = self.gains
         q, dq, effort = np.reshape(measurement, (3, 2)).copy()
-        xi1 = q - qr
+        self.xi1 = xi1 = q - qr
         beta2 = self.virtual_control(xi1, dqr, t)
         if self.alpha2 is None:
             self.alpha2 = beta2
         following = beta2 + (self.alpha2 - beta2) * np.exp(-dt / g.time_constant)
         dalpha2 = (following - self.alpha2) / dt
-        xi2 = dq - self.alpha2
-        self.learn(t, dt, q, dq, effort if self.effort else self.tau)
+        self.xi2 = xi2 = dq - self.alpha2
+        self.learn(t, dt, q, dq, dqr, effort if self.effort else self.tau)
         r, P0 = g.model.r, g.initial_estimate[:3]
-        H = regressor(r, q, dq, self.alpha2, dalpha2)
-        H_r = H if self.at_state else regressor(r, qr, dqr, dqr, ddqr)
+        H = regressor(r, q, dq, self.alpha2, dalpha2 - g.damping_rate * xi2)
+        along = (q, dq, self.alpha2, dalpha2) if self.at_state else (qr, dqr, dqr, ddqr)
+        H_r = np.zeros((2, g.m))
+        H_r[:, :3] = regressor(r, *along)
+        if g.viscous:
+            H_r[:, 3 + 2 * g.bias :][:, :2] = np.diag(dqr)
         demand = (
             self.barrier_torque(xi1, t)
             - g.d2 * np.abs(xi1) * np.clip(xi2 / g.boundary_layer, -1.0, 1.0)
             - g.Kp * xi2
             + H @ P0
-            + H_r @ (self.theta[:3] - P0)
+            - H_r[:, :3] @ P0
+            + H_r @ self.theta
             + self.d3
         )
         torque = np.clip(demand, -g.torque_limit, g.torque_limit)
@@ -169,6 +186,7 @@ class PlainLaw:
             step = np.where(g.rate_limit > 0.0, g.rate_limit * dt, np.inf)
             torque = np.clip(torque, self.tau - step, self.tau + step)
         self.adapt(dt, H_r, xi2, saturated=np.any(torque != demand))
+        self.disturbance = self.d3 + H_r[:, 3:] @ self.theta[3:]
         self.alpha2 = following
         self.samples += 1
         return torque

@@ -15,7 +15,6 @@ from scipy.integrate import solve_ivp
 from blf_dsc_controller.compiled import cholesky
 from blf_dsc_controller.law.factory import controller_of
 from blf_dsc_controller.law.settings import COMPENSATIONS
-from blf_dsc_controller.simulation.loop import simulate
 
 BOUND = 2e-3  # rad
 
@@ -26,7 +25,7 @@ def test_recommended_loop_keeps_half_the_bound_and_finds_the_parameters():
     assert np.abs(run.torque).max() < recommended().torque_limit.min()
     assert run.parameter_error[0] == pytest.approx(0.5, abs=0.01)  # P^(0) = P / 2
     assert run.parameter_error[run.t >= 15.0].max() < 0.01
-    assert run.parameter_error[-1] < 0.005
+    assert run.parameter_error[-1] < 5e-4
     # A window of one period averages the sine of 0.1 + 0.1 sin t [N m] to zero.
     np.testing.assert_allclose(run.estimate[-1, 3:], 0.1, atol=0.01)
 
@@ -172,18 +171,6 @@ def test_learned_friction_is_compensated(preset, bound):
 
     assert with_columns.largest(15.0).max() < bound
     assert without.largest(15.0).max() > 3.0 * bound
-
-
-def test_disturbance_in_telemetry_includes_friction():
-    config = configured('recommended', 30.0, COLUMNS, FRICTION)
-    found = simulate(config.controller, config.plant).run()
-    disturbance = [f'disturbance {joint}' for joint in found.joints]
-    estimated, true = (
-        series.select(disturbance)[series.stamp >= 20e9] for series in (found.learning, found.truth)
-    )
-    moving = np.abs(found.velocity[found.stamp >= 20e9]).min(axis=1) > 0.1
-    assert np.abs(true[moving]).max() > 0.5  # more than the 0.2 N m without friction
-    np.testing.assert_allclose(estimated[moving], true[moving], atol=0.02)
 
 
 GAINS = {

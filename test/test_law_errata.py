@@ -6,15 +6,17 @@ from __future__ import annotations
 import numpy as np
 import plants
 import pytest
-from closed_loop_case import JOINTS, closed_loop, controller, plant, recommended, record
+from closed_loop_case import JOINTS, REFERENCE, closed_loop, controller, plant, recommended, record
 from paper_case import EXACT, P, configured, run
 from plain_law import R, dynamics, regressor
 from plants import QUIET, START
 
 from blf_dsc_controller.compiled import cholesky
+from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.errors import OutsideBarrierError
 from blf_dsc_controller.law import adaptation, barrier
 from blf_dsc_controller.law.settings import EFFORT, FILTERED, LAMBDA, PREDICTIONS
+from blf_dsc_controller.reference.approach import check_takeover
 
 
 def work_around_a_circle(torque, radius=0.3, centre=(2.0, np.pi / 2.0), points=400):
@@ -44,17 +46,21 @@ def test_erratum_4_first_gravity_term_has_cos_q1():
 
 def test_erratum_5_start_outside_the_barrier_is_rejected_by_name():
     """Section IV prints q2(0) = 0.1696 rad: 763 times the bound away from the reference."""
-    law, bound = controller(recommended()), 0.002
-    law.check_start(JOINTS, np.array(START))
+    bound, config = 0.002, ControllerConfig(JOINTS)
+
+    def check(q, t=0.0):
+        check_takeover(config, np.full(2, bound), q, np.zeros(2), REFERENCE, t)
+
+    check(np.array(START))
     with pytest.raises(OutsideBarrierError):
-        law.check_start(JOINTS, np.array(START), t=0.2)  # the reference has moved on
+        check(np.array(START), t=0.2)  # the reference has moved on
     printed = 0.1696 - (1.3961 + 0.3)
     assert abs(printed) / bound == pytest.approx(763.0, abs=0.5)
     for joint, error in ((0, bound), (1, -0.0021), (1, 1.5), (0, np.nan), (1, printed)):
         q = np.array([1.9935, 1.3961]) + 0.3  # the reference at t = 0
         q[joint] += error * (1.0 + 1e-9)
         with pytest.raises(OutsideBarrierError) as caught:
-            law.check_start(JOINTS, q)
+            check(q)
         assert (caught.value.joint, caught.value.bound) == (JOINTS[joint], bound)
         assert caught.value.error == pytest.approx(error, rel=1e-6, nan_ok=True)
         for part in (JOINTS[joint], f'{error:+.6g} rad', '0.002 rad'):

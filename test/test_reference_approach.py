@@ -253,10 +253,9 @@ def test_reference_continues_after_a_deactivation_but_begins_anew_after_a_stop()
 def test_waypoints_are_passed_at_their_times_and_the_last_is_held():
     points = np.array([[2.0, 1.0], [2.4, 1.5], [1.8, 1.2]])
     reference = Reference(type='waypoints', times=(0.0, 1.5, 3.5), points=tuple(points.T.ravel()))
-    _, qr, dqr, xi1, _ = run(replace(CONFIG, reference=reference), points[0], 5.0)
-    np.testing.assert_allclose(qr[[0, 1500, 3500, 5000]], points[[0, 1, 2, 2]], atol=1e-12)
-    np.testing.assert_array_equal(dqr[[0, 3500, 5000]], 0.0)
-    assert np.abs(xi1).max() < BOUND
+    motion = sampled(reference_of(replace(CONFIG, reference=reference)), [0.0, 1.5, 3.5, 5.0])
+    np.testing.assert_allclose(motion[:, 0], points[[0, 1, 2, 2]], atol=1e-12)
+    np.testing.assert_array_equal(motion[[0, 2, 3], 1], 0.0)
 
 
 @pytest.mark.parametrize(

@@ -31,7 +31,6 @@ from blf_dsc_controller.messages.topics import (
     LAMBDA_MIN,
     LATENCY,
     LYAPUNOV,
-    LYAPUNOV_BOUND,
     LYAPUNOV_TERMS,
 )
 from blf_dsc_controller.run import Floats, LearnedArm, Run, Series
@@ -292,7 +291,7 @@ def _monitors(run: Run) -> Iterator[Panel]:
 
 
 def _lyapunov(run: Run, monitor: Series) -> Panel:
-    """Return the panel of V (29), its terms and its bound (32)."""
+    """Return the panel of V (29) and its terms."""
     V = Line('V', run.time_of(monitor.stamp), monitor.select(LYAPUNOV_TERMS).sum(axis=1), INK)
     terms = [
         line
@@ -300,17 +299,8 @@ def _lyapunov(run: Run, monitor: Series) -> Panel:
         for line in _column(run, monitor, term, term.removeprefix(LYAPUNOV))
         if np.any(line.values > 0.0)
     ]
-    note = ''
-    style: Any = {'colour': MUTED, 'dashed': True}
-    for bound in _column(run, monitor, LYAPUNOV_BOUND, 'bound (32)', **style):
-        known = np.isfinite(bound.values)
-        note = 'no bound, as κe = 0'
-        if known.any():
-            terms.append(bound)
-            met = float(np.mean(V.values[known] <= bound.values[known]))
-            note = f'below its bound {100 * met:.3g} % of the time'
     lines = [line._replace(values=np.maximum(line.values, _LEAST)) for line in (*terms, V)]
-    return Panel('Monitors', 'V (29) and its terms', 'J', lines, note, log=True)
+    return Panel('Monitors', 'V (29) and its terms', 'J', lines, log=True)
 
 
 def _timing(run: Run) -> Iterator[Panel]:

@@ -48,7 +48,6 @@ from blf_dsc_controller.law.state import (
 )
 from blf_dsc_controller.law.weighing import DEVIATION, TWO_SIDED, weigh
 from blf_dsc_controller.reference import terms as reference
-from blf_dsc_controller.reference.approach import check_start
 
 
 @inner
@@ -256,10 +255,6 @@ class Controller:
         self.state.min_eigenvector.fill(self.settings.m**-0.5)
         self.state.active.fill(1.0)
         self.state.gain_scale.fill(1.0)
-
-    def check_start(self, joints: tuple[str, ...], q: Array, t: float = 0.0) -> None:
-        """Raise OutsideBarrierError for positions (n,) [rad] outside the bound."""
-        check_start(joints, q, self.bound_at(t), self.reference_vector, t)
 
     def update(self, t: float, dt: float, measurement: Array) -> Array:
         """Return the torque (n,) [N m] for a measurement: a view that the next update overwrites.

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Lyapunov function (29), term by term, and the bound (32) on it, where the truth is known."""
 
-from math import exp, nan
+from math import nan
 
 import numpy as np
 
@@ -113,38 +113,23 @@ def decay_rate(settings: Settings) -> float:
     )
 
 
-class ExponentialBound:
-    """Bound (32) from the latch T_e on, at its tightest: without the mismatch eps_d.
+def exponential_bound(settings: Settings, t: Array, V: Array, holds: Array) -> Array:
+    """Return the bound (32) on V [J] from the latch T_e on, at its tightest: without eps_d.
 
         V(t) <= V(T_e) exp(-kappa_e (t - T_e)) + theta / kappa_e (1 - exp(-kappa_e (t - T_e)))
         theta = eta d3^T d3 / 2
 
     The printed theta is divided by kappa_e once too often.  d3 is the largest known disturbance.
 
-    Attributes:
-        rate: kappa_e [1/s]; if 0, there is no bound.
-        floor: theta / kappa_e [J], the limit of the bound for large t.
+    At times t (k,) [s], `holds` tells whether a window is latched and all errors are within the
+    knee, past which K V1 is lost: the bound begins anew each time, and is NaN elsewhere.
     """
-
-    def __init__(self, settings: Settings) -> None:
-        self.rate = decay_rate(settings)
-        constant, amplitude = np.abs(settings.true_disturbance[:2])
-        theta = 0.5 * settings.eta * float(np.sum((constant + amplitude) ** 2))
-        self.floor = theta / self.rate if self.rate > 0.0 else nan
-        self._knee = settings.knee / settings.bound
-        self._begin: tuple[float, float] | None = None
-
-    def at(self, t: float, V: float, xi1: Array, bound: Array, *, latched: bool) -> float:
-        """Return the bound at time t [s], given V(t) [J]; NaN before the latch or at rate 0.
-
-        It ends where an error (n,) [rad] passes the knee for k(t) (n,) [rad]: K V1 is lost there.
-        It begins anew when the error returns.
-        """
-        if self.rate == 0.0 or not latched or np.any(np.abs(xi1) > self._knee * bound):
-            self._begin = None
-            return nan
-        if self._begin is None:
-            self._begin = t, V
-        begin, V_e = self._begin
-        decay = exp(-self.rate * (t - begin))
-        return V_e * decay + self.floor * (1.0 - decay)
+    rate = decay_rate(settings)
+    if rate == 0.0:
+        return np.full(t.size, nan)
+    constant, amplitude = np.abs(settings.true_disturbance[:2])
+    floor = 0.5 * settings.eta * float(np.sum((constant + amplitude) ** 2)) / rate
+    begins = holds & ~np.append(False, holds[:-1])
+    begin = np.maximum.accumulate(np.where(begins, np.arange(t.size), 0))
+    decay = np.exp(-rate * (t - t[begin]))
+    return np.where(holds, V[begin] * decay + floor * (1.0 - decay), nan)

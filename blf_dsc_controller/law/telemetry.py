@@ -18,7 +18,6 @@ from blf_dsc_controller.arms.model import regressors_at
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.law.controller import Controller
 from blf_dsc_controller.law.factory import columns_of, estimate_names, model_of, prior_covariance
-from blf_dsc_controller.law.lyapunov import ExponentialBound
 from blf_dsc_controller.law.settings import Settings
 from blf_dsc_controller.law.state import Sample, sample_of
 from blf_dsc_controller.messages import topics
@@ -153,7 +152,7 @@ class PlantTelemetry:
 class Monitor:
     """Messages of the slow topic `~/monitor`: how well the guarantees of the law hold.
 
-    If the truth is known, they include the Lyapunov function (29) term by term and its bound (32).
+    If the truth is known, they include the Lyapunov function (29) term by term.
 
     Attributes:
         names: of the values.
@@ -165,18 +164,14 @@ class Monitor:
         self._weighs = settings.weighed > 0
         if self._weighs:
             names += topics.LOAD
-        self._ceiling = None
-        if settings.truth_known == 1:
-            names += [*topics.LYAPUNOV_TERMS, topics.LYAPUNOV_BOUND]
-            self._ceiling = ExponentialBound(settings)
+        self._knows_truth = settings.truth_known == 1
+        if self._knows_truth:
+            names += topics.LYAPUNOV_TERMS
         self.names = tuple(names)
         self._encoder = JointStateEncoder(names, ('position',))
-        self._start: int | None = None
 
-    def values(
-        self, stamp: int, sample: Sample, ratio: np.ndarray, bound: np.ndarray
-    ) -> list[float]:
-        """Return the values of `names` for a telemetry sample at a stamp [ns].
+    def values(self, sample: Sample, ratio: np.ndarray, bound: np.ndarray) -> list[float]:
+        """Return the values of `names` for a telemetry sample.
 
         `ratio` is the largest |xi1| / k_c so far (n,), `bound` the current k_c (n,) [rad].
         """
@@ -184,18 +179,13 @@ class Monitor:
         values = [*ratio, *distance, *sample.estimate, sample.lambda_min[0], sample.latched[0]]
         if self._weighs:
             values += sample.load.tolist()
-        if self._ceiling is not None:
-            self._start = stamp if self._start is None else self._start
-            V = float(sample.lyapunov.sum())
-            t = (stamp - self._start) * 1e-9
-            latched = bool(sample.latched[0])
-            values += [*sample.lyapunov, self._ceiling.at(t, V, sample.xi1, bound, latched=latched)]
+        if self._knows_truth:
+            values += sample.lyapunov.tolist()
         return values
 
     def message(self, stamp: int, sample: Sample, ratio: np.ndarray, bound: np.ndarray) -> Message:
         """Encode these values."""
-        values = self.values(stamp, sample, ratio, bound)
-        return topics.MONITOR, self._encoder.encode(stamp, values)
+        return topics.MONITOR, self._encoder.encode(stamp, self.values(sample, ratio, bound))
 
 
 def load_text(load: Sequence[float]) -> str:

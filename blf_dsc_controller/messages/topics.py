@@ -133,7 +133,6 @@ RATIO = 'max_error_ratio '  # followed by the joint: the largest |xi1| / k_c so 
 DISTANCE = 'distance_to_bound '  # followed by the joint: k_c - |xi1|
 LYAPUNOV = 'V '
 LYAPUNOV_TERMS = ('V barrier', 'V velocity', 'V parameters', 'V disturbance')  # of (29)
-LYAPUNOV_BOUND = 'V bound'  # of (32)
 LAMBDA_MIN = 'lambda_min'
 LATCHED = 'latched'
 MODEL_CHANGES = 'model_changes'

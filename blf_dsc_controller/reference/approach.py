@@ -23,14 +23,13 @@ from blf_dsc_controller.errors import (
 )
 from blf_dsc_controller.reference.terms import (
     Term,
-    at_rest,
+    ending_at_rest,
     evaluate,
     hermite,
     minimum_jerk,
     pack,
     sampled,
     sinusoids_term,
-    spline_term,
     unpack,
 )
 
@@ -122,7 +121,7 @@ class BlendedReference(NamedTuple):
 
 def hold(position: np.ndarray) -> Term:
     """Return the term that stays at `position` (n,) [rad]."""
-    return spline_term(np.zeros(1), at_rest(position))
+    return ending_at_rest(np.zeros(1), np.zeros((0, len(position), 6)), position)
 
 
 def braking_time(dq: np.ndarray, config: ControllerConfig) -> float:
@@ -199,25 +198,6 @@ def reference_of(config: ControllerConfig) -> np.ndarray:
     return pack(len(config.joints), [term])
 
 
-def check_start(
-    joints: tuple[str, ...],
-    q: np.ndarray,
-    bound: np.ndarray,
-    reference_vector: np.ndarray,
-    t: float = 0.0,
-) -> None:
-    """Check that positions q (n,) [rad] at time t [s] are inside the bound k(t) (n,) [rad].
-
-    Raises:
-        OutsideBarrierError: some |xi1_i| >= k_i(t), where the law is undefined.
-    """
-    qr, dqr, ddqr = np.zeros((3, len(joints)))
-    evaluate(reference_vector, t, qr, dqr, ddqr)
-    for joint, error, limit in zip(joints, q - qr, bound, strict=True):
-        if not abs(error) < limit:
-            raise OutsideBarrierError(joint, float(error), float(limit))
-
-
 def check_takeover(
     config: ControllerConfig,
     bound: np.ndarray,
@@ -232,12 +212,14 @@ def check_takeover(
     acceleration a of `limits`: the error must stay inside the bound k(t) (n,) [rad].
 
     Raises:
-        OutsideBarrierError: an error is already outside its bound.
+        OutsideBarrierError: an error is already outside its bound, where the law is undefined.
         VelocityMismatchError: an error would leave its bound.
     """
-    check_start(config.joints, q, bound, reference_vector, t)
     qr, dqr, ddqr = np.zeros((3, q.size))
     evaluate(reference_vector, t, qr, dqr, ddqr)
+    for joint, error, limit in zip(config.joints, q - qr, bound, strict=True):
+        if not abs(error) < limit:
+            raise OutsideBarrierError(joint, float(error), float(limit))
     limits = np.sqrt(2.0 * np.array(config.limits.acceleration) * (bound - np.abs(q - qr)))
     for joint, difference, limit in zip(config.joints, dq - dqr, limits, strict=True):
         if not abs(difference) < limit:

@@ -249,16 +249,11 @@ def cubics(h: Array, begin: Array, end: Array) -> Array:
     return np.stack((begin[0], begin[1], c2, c3, zero, zero), axis=-1)
 
 
-def at_rest(position: Array) -> Array:
-    """Return coefficients (1, n, 6) of the piece that stays at `position` (n,) [rad]."""
-    coefficients = np.zeros((1, len(position), 6))
-    coefficients[0, :, 0] = position
-    return coefficients
-
-
 def ending_at_rest(knots: Array, coefficients: Array, position: Array) -> Term:
     """Return the spline of pieces between knots (k,) [s] that then stays at `position` (n,)."""
-    return spline_term(knots, np.concatenate((coefficients, at_rest(position))))
+    rest = np.zeros((1, len(position), 6))
+    rest[0, :, 0] = position
+    return spline_term(knots, np.concatenate((coefficients, rest)))
 
 
 def hermite(times: Array, points: Array) -> Term:
@@ -267,17 +262,14 @@ def hermite(times: Array, points: Array) -> Term:
     return ending_at_rest(times, pieces, points[0, -1])
 
 
-def minimum_jerk(times: Array, positions: Array, begin: Array | None = None) -> Term:
-    """Return the minimum jerk through positions (k, n) [rad] at times (k,) [s], ending at rest.
+def minimum_jerk(times: Array, positions: Array) -> Term:
+    """Return the minimum jerk from rest to rest through positions (k, n) [rad].
 
-    Times increase. `begin` is velocity and acceleration (2, n) at the first point, zero by default.
+    The times (k,) [s] increase.
     """
-    k, n = positions.shape
-    points = np.zeros((3, k, n))
+    points = np.zeros((3, *positions.shape))
     points[0] = positions
-    if begin is not None:
-        points[1:, 0] = begin
-    if k > 2:
+    if len(times) > 2:
         _solve_inner_points(np.diff(times), points)
     return hermite(times, points)
 

@@ -197,19 +197,15 @@ def _braking(
 
 
 def _from_rest(rest: np.ndarray, t0: float, times: np.ndarray, points: np.ndarray) -> Term:
-    """Return a term from rest (3, n) at t0 [s] through the points."""
+    """Return a term from rest (3, n) at t0 [s] through the points, with a quintic to the first."""
     knots = np.concatenate(([t0], times))
-    if len(points) == 1:
-        return minimum_jerk(knots, np.vstack((rest[:1], points[0])))
-    if len(points) == 3:
-        return hermite(knots, np.concatenate((rest[:, np.newaxis], points), axis=1))
-    pieces = cubics(np.diff(times), points[:, :-1], points[:, 1:])
-    arrival = np.zeros((3, 1, points.shape[2]))
-    arrival[:2] = points[:, :1]
-    if len(pieces):
-        arrival[2, 0] = 2.0 * pieces[0, :, 2]
+    path = _through_points(knots, np.concatenate((rest[: len(points), np.newaxis], points), axis=1))
+    if len(points) != 2:
+        return path
+    _, pieces = pieces_of(path, rest.shape[1])
+    arrival = np.stack((*points[:, 0], 2.0 * pieces[1, :, 2]))[:, np.newaxis]
     first = quintics(knots[1:2] - t0, rest[:, np.newaxis], arrival)
-    return ending_at_rest(knots, np.concatenate((first, pieces)), points[0, -1])
+    return spline_term(knots, np.concatenate((first, pieces[1:])))
 
 
 def _problems(trajectory: Trajectory, joints: tuple[str, ...], now: float) -> list[str]:

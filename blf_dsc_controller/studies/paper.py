@@ -23,7 +23,7 @@ from blf_dsc_controller.analysis.style import ALARM, COLOURS, MUTED, Cell, Pictu
 from blf_dsc_controller.analysis.summary import plain, write_summary
 from blf_dsc_controller.configuration.nodes import dump
 from blf_dsc_controller.law.factory import settings_of_config
-from blf_dsc_controller.law.lyapunov import ExponentialBound, decay_rate
+from blf_dsc_controller.law.lyapunov import decay_rate, exponential_bound
 from blf_dsc_controller.law.settings import Settings
 from blf_dsc_controller.messages.topics import LAMBDA_MIN, LATCHED, LYAPUNOV_TERMS
 from blf_dsc_controller.run import Floats, Run
@@ -189,12 +189,12 @@ def _settings(name: str) -> Settings:
 
 def _fraction_met(run: Run, name: str) -> float:
     """Return the fraction of the samples, of those where (32) says something, that meet it."""
-    bound, V, latched = ExponentialBound(_settings(name)), _energy(run), _learned(run, LATCHED)
+    settings, V = _settings(name), _energy(run)
     assert run.bound is not None  # noqa: S101
-    samples = zip(run.time.tolist(), V.tolist(), _error(run), run.bound, latched, strict=True)
-    values = np.array([bound.at(*sample, latched=on > 0.5) for *sample, on in samples])
-    known = np.isfinite(values)
-    return float(np.mean(V[known] <= values[known]))
+    knee = settings.knee / settings.bound * run.bound
+    holds = (_learned(run, LATCHED) > 0.5) & np.all(np.abs(_error(run)) <= knee, axis=1)
+    bound = exponential_bound(settings, run.time, V, holds)
+    return float(np.mean(V[holds] <= bound[holds]))
 
 
 def _of_section_4(results: Results) -> Iterator[Claim]:
