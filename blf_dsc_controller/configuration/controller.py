@@ -54,8 +54,7 @@ class Reference:
     """
 
     type: Literal['sinusoids', 'waypoints', 'hold'] = _of_reference(
-        'sinusoids',
-        "sinusoids (the paper's), waypoints (minimum jerk), or hold (the initial position)",
+        'sinusoids', 'sinusoids (paper), waypoints (minimum jerk), or hold (the initial position)'
     )
     offset: PerJoint = _of_reference((1.9935, 1.3961), 'centre of the motion', 'rad')
     amplitude: Annotated[tuple[float, ...], 'joints', 'reference.frequency'] = _of_reference(
@@ -89,9 +88,7 @@ class Reference:
 class Approach:
     """Motion to the reference from a start outside the bound; the bound applies along it."""
 
-    enabled: bool = parameter(
-        True, 'guide an arm that starts outside the bound to the reference; false: do not start'
-    )
+    enabled: bool = parameter(True, 'guide an arm into the bound; false: do not start outside')
     longest: float = positive(30.0, 'longest duration of the approach', 's')
 
 
@@ -120,7 +117,7 @@ class Safety:
     """Limits past which the controller makes a safe stop, and the torque of that stop."""
 
     state_timeout: float = positive(
-        0.04, 'largest delay of a joint state, on the steady clock and by its stamp', 's'
+        0.04, 'largest delay of a state, by steady clock and stamp', 's'
     )
     watchdog: Literal['auto', 'on', 'off'] = parameter(
         'auto', 'steady-clock watchdog for missing states; auto: only if stamps are wall-clock time'
@@ -133,17 +130,12 @@ class Safety:
         'velocity as measured, or estimated from position differences, starting at rest',
         read_only='the filters hold data that depend on it',
     )
-    velocity_limit: float = positive(
-        50.0, 'joint velocity above which a measurement is considered broken', 'rad/s'
-    )
+    velocity_limit: float = positive(50.0, 'velocity above which a measurement is broken', 'rad/s')
     error_ratio: float = non_negative(
-        1.0,
-        'tracking error to stop at, as a multiple of the bound, for laws with a barrier; 0: never',
+        1.0, 'tracking error to stop at, relative to the bound, for laws with a barrier; 0: never'
     )
     saturation_time: float = positive(
-        0.5,
-        'longest time of torques at their limit; a quarter of the time without is deducted',
-        's',
+        0.5, 'longest time of torques at their limit, less a quarter of the time without', 's'
     )
     overrun_fraction: float = positive(
         0.4, 'largest fraction of missed states, averaged over overrun_window', at_most=1.0
@@ -156,16 +148,12 @@ class Safety:
         'zero', 'safe torque: zero, damping -D dq, or the learned gravity with damping'
     )
     damping: PerJoint = non_negative((2.0, 1.0), 'damping in the safe torque', 'N m s/rad', 'D')
-    stop_ramp: float = non_negative(
-        0.0, 'ramp from the last torque to the safe torque after a fault; 0: at once', 's'
-    )
+    stop_ramp: float = non_negative(0.0, 'ramp to the safe torque after a fault; 0: at once', 's')
     deactivation_ramp: float = non_negative(0.5, 'the same ramp when the node is deactivated', 's')
     fade_time: float = positive(
-        0.5, 'time over which the safe torque fades to zero without usable joint states', 's'
+        0.5, 'time to fade the safe torque without usable joint states', 's'
     )
-    keep_estimates: bool = parameter(
-        True, 'keep the estimates when the node is activated again; a reset clears them'
-    )
+    keep_estimates: bool = parameter(True, 'keep the estimates at activation; a reset clears them')
 
 
 @dataclass(frozen=True)
@@ -175,7 +163,7 @@ class Telemetry:
     enabled: bool = _telemetry(True, 'publish reference, errors, estimates and monitors')
     decimation: int = _telemetry(
         1,
-        'samples per message of reference and estimates; errors are published at every sample',
+        'samples per message of reference and estimates; errors come with every sample',
         at_least=1,
     )
 

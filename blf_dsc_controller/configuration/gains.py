@@ -97,12 +97,8 @@ class Feedback:
     damping_rate: float = non_negative(
         0.0, 'rate of damping, scaled by the inertia of learning.initial_estimate', '1/s', 'omega_v'
     )
-    damping: PerJoint = non_negative(
-        (0.0, 0.0), 'gain of the robust term d2 |xi1| sat(xi2/b)', 'N m/rad', 'd2'
-    )
-    boundary_layer: float = positive(
-        0.01, 'velocity error at which the robust term saturates', 'rad/s', 'b'
-    )
+    damping: PerJoint = non_negative((0.0, 0.0), 'robust term d2 |xi1| sat(xi2/b)', 'N m/rad', 'd2')
+    boundary_layer: float = positive(0.01, 'xi2 at which the robust term saturates', 'rad/s', 'b')
 
 
 @dataclass(frozen=True)
@@ -123,14 +119,9 @@ class Torque:
     """Saturation of the commanded torque."""
 
     limit: PerJoint = positive(
-        (20.0, 20.0),
-        'largest torque, both as commanded and with what the drives add; learning uses the limited '
-        'torque',
-        'N m',
+        (20.0, 20.0), 'largest torque, as commanded and with what the drives add', 'N m'
     )
-    rate_limit: PerJoint = non_negative(
-        (0.0, 0.0), 'largest rate of the commanded torque; 0: no limit', 'N m/s'
-    )
+    rate_limit: PerJoint = non_negative((0.0, 0.0), 'largest rate of commands; 0: any', 'N m/s')
     first_step: PerJoint = non_negative(
         (0.0, 0.0),
         'largest first torque, a step from none, that the drives tolerate; 0: any',
@@ -152,14 +143,9 @@ class ComparisonGains:
         (0.0, 0.0), 'amplitude of the robust term; not used by slotine_li', 'N m', 'mu_bar'
     )
     integral_gain: PerJoint = non_negative(
-        (),
-        'integral gain on the surface error, slotine_li only; empty: none',
-        'N m/rad',
-        omittable=True,
+        (), 'integral gain of slotine_li on its surface; empty: none', 'N m/rad', omittable=True
     )
-    leakage: float = non_negative(
-        0.001, 'leakage of the parameter estimate; not used by slotine_li', symbol='W_c'
-    )
+    leakage: float = non_negative(0.001, 'leakage of P^; not used by slotine_li', symbol='W_c')
 
 
 @dataclass(frozen=True)
@@ -173,11 +159,9 @@ class KnownArm:
         (), 'true parameters; empty: unknown', 'kg m^2', 'P', omittable=True
     )
     constant: PerJoint = _known((0.0, 0.0), 'constant part of the known disturbance', 'N m')
-    amplitude: PerJoint = _known((0.0, 0.0), 'amplitude of the sinusoidal part', 'N m')
-    frequency: PerJoint = _known(
-        (1.0, 1.0), 'angular frequency of the sinusoidal part', 'rad/s', at_least=0.0
-    )
-    phase: PerJoint = _known((0.0, 0.0), 'phase of the sinusoidal part', 'rad')
+    amplitude: PerJoint = _known((0.0, 0.0), 'amplitude of the sinusoid', 'N m')
+    frequency: PerJoint = _known((1.0, 1.0), 'frequency of the sinusoid', 'rad/s', at_least=0.0)
+    phase: PerJoint = _known((0.0, 0.0), 'phase of the sinusoid', 'rad')
     feed_forward: bool = _known(False, 'compensate the known disturbance; model_based always does')
 
     def problems(self, law: str, model: str, count: int, radius: float) -> Iterator[str]:
@@ -206,9 +190,7 @@ class Learning:
     adaptation_gain: Annotated[tuple[float, ...], 'learning.initial_estimate'] = non_negative(
         (0.5, 0.5, 0.5), 'diagonal of the adaptation gain', symbol='Gamma'
     )
-    weight: float = non_negative(
-        100.0, 'weight of the prediction error; 0: no composite learning', symbol='kappa'
-    )
+    weight: float = non_negative(100.0, 'weight of the prediction error; 0: none', symbol='kappa')
     update: Literal['newton', 'gradient'] = parameter(
         'newton', 'step along the prediction error: regularised Newton, or the gradient (paper)'
     )
@@ -218,9 +200,7 @@ class Learning:
     latch: Literal['last', 'max'] = parameter(
         'last', 'excited window that is latched: the last one (paper), or the best one'
     )
-    regularization: float = positive(
-        1e-5, 'regularisation of the excitation matrix in the Newton step', symbol='rho'
-    )
+    regularization: float = positive(1e-5, 'regularisation of the Newton step', symbol='rho')
     excitation_threshold: float = positive(
         0.003, 'minimum eigenvalue of the excitation matrix of an excited window', symbol='sigma'
     )
@@ -253,43 +233,26 @@ class Learning:
     derivative_filter: float = _in_window(
         100.0, 'frequency of filter (8) for lambda and acceleration', 'rad/s', 'omega', above=0.0
     )
-    radius: float = positive(
-        3.0, 'radius of the projection ball of the estimate', 'kg m^2', 'omega_a'
-    )
+    radius: float = positive(3.0, 'radius of the projection ball of P^', 'kg m^2', 'omega_a')
     compensation: Literal['reference', 'state'] = parameter(
-        'reference',
-        'where what is learned acts: along the reference only, or at the measured state (paper)',
+        'reference', 'where what is learned acts: along the reference, or at the state (paper)'
     )
     bumpless: bool = parameter(
         True, 'let the disturbance estimate offset the torque that the prediction error adds'
     )
-    change_detection: bool = _size(
-        True, 'discard the window when torques contradict it: payload, contact, a changed arm'
-    )
+    change_detection: bool = _size(True, 'discard a window that torques contradict: a changed arm')
     residual_floor: PerJoint = positive(
-        (0.07, 0.07),
-        'rms unmodelled torque of a joint that is not treated as a change of the arm',
-        'N m',
+        (0.07, 0.07), 'rms unmodelled torque that is not treated as a change of the arm', 'N m'
     )
-    anchor_weight: float = non_negative(
-        0.1, 'pull towards the estimate before a change, until the new window is full'
-    )
-    prior_weight: float = non_negative(
-        0.0, 'pull towards the initial estimate, for arms whose parameters are not all excited'
-    )
+    anchor_weight: float = non_negative(0.1, 'pull to the estimate before a change, for one window')
+    prior_weight: float = non_negative(0.0, 'pull to the initial estimate, if P is not all excited')
     motion_scale: float = non_negative(
         0.0, 'reference velocity below which the rows of a joint count less; 0: none', 'rad/s'
     )
-    row_interval: int = _size(
-        1, 'samples between two rows of the excitation window', 'samples', at_least=1
-    )
+    row_interval: int = _size(1, 'interval of the rows of the window', 'samples', at_least=1)
     column_gain: float = positive(1.0, 'adaptation gain of the disturbance columns')
-    interval: int = _size(
-        10, 'samples between two eigenvalue checks of the excitation matrix', 'samples', at_least=1
-    )
-    weighing: bool = _size(
-        False, 'weigh what the tip of a URDF holds, beyond what it held in the first window'
-    )
+    interval: int = _size(10, 'interval of the checks for excitation', 'samples', at_least=1)
+    weighing: bool = _size(False, 'weigh what the tip of a URDF holds since the first window')
     torque_source: Literal['command', 'effort'] = _in_window(
         'command', 'torque to learn from: the limited command, or the effort of the joint states'
     )

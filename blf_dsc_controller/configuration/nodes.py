@@ -35,8 +35,8 @@ RECORDER = 'bag_recorder'
 VIEW = 'view'
 WATCHDOG = 'torque_watchdog'
 
-_AT_START = 'it is read once, when the node starts'
 _of_bag = partial(parameter, read_only='a bag is opened once, when the recorder starts')
+_of_watchdog = partial(parameter, read_only='it is read once, when the node starts')
 _of_view = partial(parameter, read_only='the page is served once, when the node starts')
 Config = TypeVar('Config')
 _PREFACE = """\
@@ -67,15 +67,10 @@ class RecorderConfig:
     topics: tuple[str, ...] = _of_bag((), 'topics to record; empty: all', omittable=True)
     compression: Literal['none', 'zstd'] = _of_bag('none', 'compression of the chunks of the bag')
     queue_depth: int = _of_bag(
-        100_000,
-        'messages buffered per topic while the disk is busy',
-        'messages',
-        at_least=1,
+        100_000, 'messages buffered per topic while the disk is busy', 'messages', at_least=1
     )
     clock: Literal['wall', 'plant'] = _of_bag(
-        'wall',
-        'log times: as received, or (lock-step) the stamp of the last joint state, so that the bag '
-        'plays at the speed of the arm',
+        'wall', 'log times: as received, or the stamp of the last joint state (lock-step)'
     )
 
     def problems(self) -> list[str]:
@@ -87,19 +82,11 @@ class RecorderConfig:
 class WatchdogConfig:
     """Parameters of the node `torque_watchdog`."""
 
-    timeout: float = parameter(
-        0.05,
-        'silence of the controller, while joint states go on, after which it commands',
-        's',
-        at_least=0.005,
-        at_most=10.0,
-        read_only=_AT_START,
+    timeout: float = _of_watchdog(
+        0.05, 'silence of the controller until it commands', 's', at_least=0.005, at_most=10.0
     )
-    armed: bool = parameter(
-        False,
-        'do not wait for a first command: for a restart after the controller died, with its '
-        'parameter file',
-        read_only=_AT_START,
+    armed: bool = _of_watchdog(
+        False, 'do not wait for a first command: for a restart after the controller died'
     )
 
 
@@ -113,10 +100,7 @@ class ViewConfig:
     )
 
 
-NODES: Mapping[
-    str,
-    type[PlantConfig | ControllerConfig | RecorderConfig | ViewConfig | WatchdogConfig],
-] = {
+NODES: Mapping[str, Any] = {
     PLANT: PlantConfig,
     CONTROLLER: ControllerConfig,
     RECORDER: RecorderConfig,

@@ -19,17 +19,20 @@ from blf_dsc_controller.configuration.robot import ArmConfig, given_robot
 from blf_dsc_controller.configuration.schema import (
     PerJoint,
     Value,
+    Vector,
     non_negative,
     parameter,
     parameters,
     positive,
 )
 
-Vector = Annotated[tuple[float, ...], '3']
 PerEvent = Annotated[tuple[float, ...], 'events.begin']
+PerEventAndAxis = Annotated[tuple[float, ...], 'events.begin', '3']
 PerEventAndJoint = Annotated[tuple[float, ...], 'events.begin', 'joints']
 
-_fixed = partial(parameter, read_only='the plant is built once, when the node starts')
+_BUILT = 'the plant is built once, when the node starts'
+_fixed = partial(parameter, read_only=_BUILT)
+_magnitude = partial(non_negative, read_only=_BUILT)
 _of_events = partial(parameter, (), omittable=True)
 
 
@@ -46,27 +49,21 @@ class Load:
 class Events:
     """Events, each of which adds to the load, the friction and the encoder offsets for a while.
 
-    Events begin and end at whole samples; a ramp scales an event by the elapsed fraction.
+    Events begin and end at whole samples from the start; a ramp scales one by the elapsed fraction.
     """
 
-    begin: tuple[float, ...] = parameter(
-        (), 'time at which each event begins, from the start', 's', at_least=0.0, omittable=True
-    )
-    duration: PerEvent = _of_events('duration of each event; 0: permanent', unit='s', at_least=0.0)
-    ramp: PerEvent = _of_events('time to fade in, and to fade out', unit='s', at_least=0.0)
-    payload: PerEvent = _of_events('point mass at the tip', unit='kg', at_least=0.0)
-    sloshing: PerEvent = _of_events(
-        'point mass on a damped spring at the tip', unit='kg', at_least=0.0
-    )
+    begin: tuple[float, ...] = _of_events('time at which each event begins', 's', at_least=0.0)
+    duration: PerEvent = _of_events('duration of each event; 0: permanent', 's', at_least=0.0)
+    ramp: PerEvent = _of_events('time to fade in, and to fade out', 's', at_least=0.0)
+    payload: PerEvent = _of_events('point mass at the tip', 'kg', at_least=0.0)
+    sloshing: PerEvent = _of_events('point mass on a damped spring at the tip', 'kg', at_least=0.0)
     sloshing_frequency: float = positive(15.0, 'undamped frequency of this spring', 'rad/s')
     sloshing_damping: float = non_negative(0.05, 'damping ratio of this spring')
-    force: Annotated[tuple[float, ...], 'events.begin', '3'] = _of_events(
-        'external force on the tip', unit='N'
-    )
-    torque: PerEventAndJoint = _of_events('external torque on each joint', unit='N m')
-    viscous: PerEventAndJoint = _of_events('change in viscous friction', unit='N m s/rad')
-    coulomb: PerEventAndJoint = _of_events('change in Coulomb friction', unit='N m')
-    offset: PerEventAndJoint = _of_events('change in encoder offset', unit='rad')
+    force: PerEventAndAxis = _of_events('external force on the tip', 'N')
+    torque: PerEventAndJoint = _of_events('external torque on each joint', 'N m')
+    viscous: PerEventAndJoint = _of_events('change in viscous friction', 'N m s/rad')
+    coulomb: PerEventAndJoint = _of_events('change in Coulomb friction', 'N m')
+    offset: PerEventAndJoint = _of_events('change in encoder offset', 'rad')
 
 
 @dataclass(frozen=True)
@@ -77,13 +74,11 @@ class Deviation:
     """
 
     mass_factor: float = _fixed(1.0, 'factor on all masses and inertias', above=0.0)
-    mass_deviation: float = _fixed(
-        0.0, 'largest random deviation of each mass, as a fraction', at_least=0.0, below=1.0
+    mass_deviation: float = _magnitude(
+        0.0, 'largest random deviation of each mass, as a fraction', below=1.0
     )
-    centre_deviation: float = _fixed(
-        0.0, 'largest random deviation of each centre of mass, along each axis', 'm', at_least=0.0
-    )
-    seed: int = _fixed(0, 'seed of the random deviations', at_least=0)
+    centre_deviation: float = _magnitude(0.0, 'largest random deviation of a centre, per axis', 'm')
+    seed: int = _magnitude(0, 'seed of the random deviations')
 
     def changes(self, n: int) -> tuple[np.ndarray, np.ndarray]:
         """Return the factor on the mass (n,) and the shift of mass (n, 3) [m] of each body."""
@@ -97,7 +92,7 @@ class Deviation:
 class Truth(Deviation):
     """Deviations of the true arm from its URDF."""
 
-    rotor_factor: float = _fixed(1.0, 'factor on the inertias of the drives', at_least=0.0)
+    rotor_factor: float = _magnitude(1.0, 'factor on the inertias of the drives')
 
 
 @dataclass(frozen=True)
@@ -134,12 +129,8 @@ class PlantDisturbance:
     phase: PerJoint = parameter((0.0, 0.0), 'phase of the sinusoid', 'rad')
     viscous: PerJoint = non_negative((0.0, 0.0), 'viscous friction', 'N m s/rad')
     coulomb: PerJoint = non_negative((0.0, 0.0), 'Coulomb friction', 'N m')
-    coulomb_velocity: float = positive(
-        0.01, 'velocity scale of the sign change of Coulomb friction', 'rad/s'
-    )
-    stribeck: float = non_negative(
-        0.0, 'breakaway friction in excess of the Coulomb friction, as a fraction of it'
-    )
+    coulomb_velocity: float = positive(0.01, 'velocity scale of Coulomb friction', 'rad/s')
+    stribeck: float = non_negative(0.0, 'breakaway in excess of Coulomb friction, relative to it')
     stribeck_velocity: float = positive(0.1, 'velocity scale at which this excess fades', 'rad/s')
 
 
@@ -147,39 +138,23 @@ class PlantDisturbance:
 class Sensor:
     """Measurement of the true state."""
 
-    position_noise: float = _fixed(
-        0.0, 'standard deviation of the white noise on measured positions', 'rad', at_least=0.0
-    )
-    velocity_noise: float = _fixed(
-        0.0, 'standard deviation of the white noise on measured velocities', 'rad/s', at_least=0.0
-    )
-    resolution: float = _fixed(0.0, 'resolution of the encoders; 0: ideal', 'rad', at_least=0.0)
+    position_noise: float = _magnitude(0.0, 'rms of the white noise on measured positions', 'rad')
+    velocity_noise: float = _magnitude(0.0, 'rms of the white noise on velocities', 'rad/s')
+    resolution: float = _magnitude(0.0, 'resolution of the encoders; 0: ideal', 'rad')
     velocity: Literal['measured', 'differenced'] = _fixed(
         'measured', 'velocity from its own sensor, or the difference of two measured positions'
     )
-    velocity_pole: float = _fixed(
-        0.0, 'pole of the low-pass filter on the velocity; 0: none', 'rad/s', at_least=0.0
-    )
+    velocity_pole: float = _magnitude(0.0, 'pole of a low-pass on the velocity; 0: none', 'rad/s')
     offset: PerJoint = parameter((0.0, 0.0), 'measured minus true position', 'rad')
-    repeat_every: int = _fixed(
-        0,
-        'after so many samples, the last reading is repeated with a new stamp; 0: never',
-        at_least=0,
-    )
+    repeat_every: int = _magnitude(0, 'samples until a reading repeats, newly stamped; 0: never')
     published_joints: tuple[str, ...] = _fixed(
-        (),
-        'names in the joint states, in order; others than `joints` stay at 0; empty: `joints`',
-        omittable=True,
+        (), 'names in joint states, in order; others stay at 0; empty: `joints`', omittable=True
     )
     incomplete: Literal['invalid', 'absent'] = _fixed(
-        'invalid',
-        'velocities and efforts of the first `incomplete_states` joint states: NaN, or none',
+        'invalid', 'velocities and efforts of `incomplete_states`: NaN, or none'
     )
-    incomplete_states: int = _fixed(
-        0,
-        'joint states without velocities and efforts, before the first one',
-        at_least=0,
-        at_most=100,
+    incomplete_states: int = _magnitude(
+        0, 'joint states without velocities and efforts, before the first one', at_most=100
     )
 
 
@@ -187,40 +162,21 @@ class Sensor:
 class Actuator:
     """Effects between the commanded and the applied torque."""
 
-    torque_limit: PerJoint = _fixed(
-        (0.0, 0.0), 'rated joint torque; 0: no limit', 'N m', at_least=0.0
+    torque_limit: PerJoint = _magnitude((0.0, 0.0), 'rated joint torque; 0: no limit', 'N m')
+    delay: int = _magnitude(0, 'delay of the torque', 'samples', at_most=1000)
+    time_constant: float = _magnitude(
+        0.0, 'first-order lag from the limited torque to the joint', 's'
     )
-    delay: int = _fixed(0, 'delay of the torque', 'samples', at_least=0, at_most=1000)
-    time_constant: float = _fixed(
-        0.0, 'first-order lag between the limited torque and the joint', 's', at_least=0.0
-    )
-    torque_noise: float = _fixed(
-        0.0, 'standard deviation of the torque noise, as a fraction of the torque', at_least=0.0
-    )
-    ripple: float = _fixed(
-        0.0, 'amplitude of the torque ripple, as a fraction of the rated torque', at_least=0.0
-    )
-    ripple_cycles: float = _fixed(
-        20.0, 'periods of the ripple per turn of the joint, or per metre', above=0.0
-    )
-    command_timeout: float = positive(
-        0.05, 'age above which a commanded torque is not applied, in real time only', 's'
-    )
+    torque_noise: float = _magnitude(0.0, 'rms of the torque noise, as a fraction of the torque')
+    ripple: float = _magnitude(0.0, 'amplitude of the torque ripple, relative to the rated torque')
+    ripple_cycles: float = _fixed(20.0, 'periods of the ripple per turn, or per metre', above=0.0)
+    command_timeout: float = positive(0.05, 'largest age of an applied torque, in real time', 's')
     without_command: Literal['zero', 'brake', 'hold'] = parameter(
-        'zero',
-        'without a command: zero torque, the brakes hold the joints, or the last command goes on',
+        'zero', 'without a command: zero torque, the brakes, or the last command'
     )
-    rate_limit: float = _fixed(
-        0.0,
-        'rate at which the driver lets commands change, as franka_ros2 does; 0: any',
-        'N m/s',
-        at_least=0.0,
-    )
-    reflex_rate: float = _fixed(
-        0.0,
-        'rate of the torque that they get above which the drives brake until a reset; 0: never',
-        'N m/s',
-        at_least=0.0,
+    rate_limit: float = _magnitude(0.0, 'rate to which the driver limits commands; 0: any', 'N m/s')
+    reflex_rate: float = _magnitude(
+        0.0, 'rate of the torque above which the drives brake until a reset; 0: never', 'N m/s'
     )
 
 
@@ -231,12 +187,7 @@ class Drive(Deviation):
     With the deviations of `truth` it is the true arm, without any it is the URDF.
     """
 
-    friction: float = _fixed(
-        0.8,
-        'share of viscous and Coulomb friction that gravity_and_friction compensates',
-        at_least=0.0,
-        at_most=1.0,
-    )
+    friction: float = _magnitude(0.8, 'share of friction that the drives compensate', at_most=1.0)
 
 
 @dataclass(frozen=True)
@@ -246,10 +197,8 @@ class PlantConfig(ArmConfig):
     mode: Literal['realtime', 'lockstep'] = _fixed(
         'realtime', 'one step per sample time of the wall clock, or one per received torque'
     )
-    duration: float = _fixed(
-        0.0, 'simulated time after which the plant stops; 0: no limit', 's', at_least=0.0
-    )
-    seed: int = _fixed(0, 'seed of the noise; equal seeds give equal runs', at_least=0)
+    duration: float = _magnitude(0.0, 'simulated time until the plant stops; 0: no limit', 's')
+    seed: int = _magnitude(0, 'seed of the noise; equal seeds give equal runs')
     publish_clock: bool = _fixed(False, 'publish the simulated time on /clock')
     arm: PlantArm = PlantArm()
     truth: Truth = Truth()

@@ -7,7 +7,7 @@ import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from functools import partial
-from typing import Annotated, Any, Literal
+from typing import Any, Literal
 
 import numpy as np
 
@@ -22,6 +22,7 @@ from blf_dsc_controller.arms.urdf import Chain, read_chain
 from blf_dsc_controller.configuration.files import read_text, resolve
 from blf_dsc_controller.configuration.schema import (
     PerJoint,
+    Vector,
     counted,
     non_negative,
     parameter,
@@ -30,6 +31,7 @@ from blf_dsc_controller.errors import BlfDscError, ConfigurationError
 
 _BUILT = 'arm and law are built once, when the node starts'
 _fixed = partial(parameter, read_only=_BUILT)
+_magnitude = partial(non_negative, read_only=_BUILT)
 _omitted = partial(non_negative, (), read_only=_BUILT, omittable=True)
 _at_start = partial(parameter, read_only='the process requests it once, before the first sample')
 
@@ -56,34 +58,21 @@ class Robot:
         kept=lambda given: given and read_urdf(given),
     )
     base: str = _fixed('', 'fixed link at the base; empty: the root')
-    tip: str = _fixed(
-        '', 'last link, which carries payloads; empty: link of the last joint of a single chain'
-    )
-    gravity: Annotated[tuple[float, ...], '3'] = _fixed(
+    tip: str = _fixed('', 'last link, which carries payloads; empty: that of the last joint')
+    gravity: Vector = _fixed(
         (0.0, 0.0, -9.81), 'gravity in the base frame; (0, 0, 9.81): ceiling mount', 'm/s^2', 'g'
     )
-    lag: float = non_negative(
-        0.005,
-        'delay of measured velocities and applied torques, in addition to the sampling',
-        's',
-        read_only=_BUILT,
-    )
-    payload: float = non_negative(3.0, 'rated payload', 'kg', read_only=_BUILT)
+    lag: float = _magnitude(0.005, 'delay of velocities and torques besides the sampling', 's')
+    payload: float = _magnitude(3.0, 'rated payload', 'kg')
     rotor_inertia: PerJoint = _omitted(
-        'inertia of each drive, reflected to its joint; empty: from its effort, then as measured',
-        'kg m^2',
+        'inertia of each drive at its joint; empty: by its effort, then as measured', 'kg m^2'
     )
     drive_compensates: Literal['none', 'gravity', 'gravity_and_friction'] = _fixed(
         'none', 'what the drives add to a commanded torque by themselves'
     )
-    drive_payload: float = non_negative(
-        0.0,
-        'payload that the drives have been told of, as far as the URDF lacks it',
-        'kg',
-        read_only=_BUILT,
-    )
-    drive_payload_centre: Annotated[tuple[float, ...], '3'] = _fixed(
-        (0.0, 0.0, 0.0), 'centre of mass of that payload, in the frame of the tip', 'm'
+    drive_payload: float = _magnitude(0.0, 'payload told to the drives that the URDF lacks', 'kg')
+    drive_payload_centre: Vector = _fixed(
+        (0.0, 0.0, 0.0), 'centre of mass of drive_payload, in the frame of the tip', 'm'
     )
     effort: Literal['unknown', 'whole', 'commanded', 'current'] = _fixed(
         'unknown',
@@ -91,12 +80,10 @@ class Robot:
         'proportional to the whole, as currents are',
     )
     viscous: PerJoint = _omitted(
-        'initial viscous friction; empty: damping of the URDF, or 0 if the drives compensate it',
-        'N m s/rad',
+        'initial viscous friction; empty: that of the URDF, or 0 if compensated', 'N m s/rad'
     )
     coulomb: PerJoint = _omitted(
-        'initial Coulomb friction; empty: friction of the URDF, or 0 if the drives compensate it',
-        'N m',
+        'initial Coulomb friction; empty: that of the URDF, or 0 if compensated', 'N m'
     )
 
     def problems(self) -> Iterator[str]:
@@ -242,8 +229,7 @@ class Realtime:
 
     priority: int = _at_start(
         0,
-        'SCHED_FIFO priority to request, below 50, which is that of controller_manager; 0: leave '
-        'scheduling as it is',
+        "SCHED_FIFO priority, below controller_manager's 50; 0: unchanged",
         at_least=0,
         at_most=99,
     )
@@ -260,12 +246,7 @@ class ArmConfig:
 
     joints: tuple[str, ...] = _fixed(('joint1', 'joint2'), 'names of the joints, from the base')
     sample_time: float = _fixed(
-        0.001,
-        'time between two joint states, for which the torque is held',
-        's',
-        'T',
-        at_least=1e-5,
-        at_most=1.0,
+        0.001, 'period of joint states and torques', 's', 'T', at_least=1e-05, at_most=1.0
     )
     wait_for_subscribers: int = non_negative(
         0,

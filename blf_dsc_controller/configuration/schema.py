@@ -308,3 +308,5 @@ def _remedy(entries: list[Any], kind: Kind) -> str:
 
 PerJoint: TypeAlias = Annotated[tuple[float, ...], 'joints']
 """Array with one entry per joint."""
+
+Vector: TypeAlias = Annotated[tuple[float, ...], '3']
