@@ -19,13 +19,10 @@ os.environ.setdefault('ROS_DOMAIN_ID', str(1 + os.getpid() % 101))
 os.environ.setdefault('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
 
 import numpy as np
-from fault_rig import LOCKSTEP
 from rcl_interfaces.srv import SetParametersAtomically
 from rclpy.parameter import Parameter
-from ros_rig import JOINTS, START, RosRig, activate, deactivate
+from ros_rig import RosRig, activate, deactivate
 
-from blf_dsc_controller.messages import topics
-from blf_dsc_controller.messages.codecs import Float64MultiArrayEncoder, JointStateEncoder
 from blf_dsc_controller.nodes.controller_node import ControllerNode
 from blf_dsc_controller.nodes.plant_node import PlantNode
 from blf_dsc_controller.supervision.supervisor import Phase
@@ -39,12 +36,10 @@ class Soak:
     def __init__(self, seed):
         self.ros = RosRig()
         self.rng = np.random.default_rng(seed)
-        self.states = self.ros.publisher(topics.JOINT_STATES)
-        self.commands = self.ros.publisher(topics.COMMANDS)
         self.arm, self.law = self.ros.loop()
         self.samples = 0  # outside of faults
         self.worst = 0.0  # largest |xi1| / k_c outside of faults
-        self.faults, self.reasons = Counter(), Counter()
+        self.faults = Counter()
         self.memory, self.handles = [], []  # MB, and open files and sockets, after each fault
 
     def run(self, samples):
@@ -52,9 +47,10 @@ class Soak:
         while self.samples < samples:
             count = int(self.rng.integers(1000, 4000))
             self.ros.run(self.arm, count)
-            assert self.law.guard.supervisor.running, self.law.guard.supervisor.text
+            guard = self.law.guard
+            assert guard.supervisor.running, guard.supervisor.text
             self.samples += count
-            self.worst = max(self.worst, float(self.law.guard.samples.ratio.max()))
+            self.worst = max(self.worst, float(guard.samples.ratio.max()))
             fault = self.rng.choice(FAULTS)
             self.faults[fault.__name__] += 1
             fault(self)
@@ -67,9 +63,7 @@ class Soak:
 
     def recover(self):
         """Reset the loop if it has stopped, and wait until it tracks."""
-        supervisor = self.law.guard.supervisor
-        self.reasons[supervisor.reason] += 1
-        if supervisor.phase is Phase.SAFE_STOP or self.arm.plant.sample == 0:
+        if self.law.guard.supervisor.phase is Phase.SAFE_STOP or self.arm.plant.sample == 0:
             assert self.ros.reset(self.arm).success
         self.ros.until(lambda: self.law.guard.supervisor.phase is Phase.TRACKING)
 
@@ -77,36 +71,16 @@ class Soak:
         """Print what was seen; fail if the bound was left or anything grew."""
         quarter = max(1, len(self.memory) // 4)
         growth, extra = (x[-1] - x[quarter] for x in (self.memory, self.handles))
-        for line in (
-            f'{self.samples} samples, {sum(self.faults.values())} faults',
-            f'{dict(self.faults)}\n{dict(self.reasons)}',
-            f'largest error against the bound outside of them: {self.worst:.2f}',
+        print(
+            f'{self.samples} samples, {dict(self.faults)}\n'
+            f'largest error against the bound outside of them: {self.worst:.2f}\n'
             f'since the first quarter: {growth:+.1f} MB, {extra:+d} handles',
-        ):
-            print(line, file=sys.stderr)
+            file=sys.stderr,
+        )
         assert self.worst < 1.0
         # Every restarted node costs the middleware about 50 kB, and the heap takes time to settle.
         assert growth < 0.02 * len(self.memory) + 10.0
         assert extra <= 0
-
-
-def rogue_state(soak):
-    """Publish a joint state from another source."""
-    rng = soak.rng
-    q = np.array(START) + rng.normal(0.0, 1.0, 2)
-    if rng.random() < 0.3:
-        q[0] = rng.choice([np.nan, np.inf, 1e300])
-    names = JOINTS if rng.random() < 0.7 else ('joint1', 'joint9')
-    stamp = int(rng.choice([0, LOCKSTEP, soak.arm.stamp + 10**6, soak.arm.stamp + 10**10]))
-    raw = JointStateEncoder(names).encode(stamp, q, q, q)
-    soak.states.publish(raw[: rng.integers(30, len(raw) + 1)] if rng.random() < 0.3 else raw)
-
-
-def rogue_command(soak):
-    """Publish invalid torques from another source."""
-    values = soak.rng.choice([1.0, np.nan, np.inf], int(soak.rng.choice([0, 1, 3, 5])))
-    soak.commands.publish(Float64MultiArrayEncoder(values.size).encode(values))
-    soak.commands.publish(Float64MultiArrayEncoder(2).encode([np.nan, 1.0]))
 
 
 def push(soak):
@@ -149,10 +123,7 @@ def reset_one(soak):
     soak.ros.reset(soak.arm if soak.rng.random() < 0.5 else soak.law)
 
 
-FAULTS = (
-    *(rogue_state, rogue_state, rogue_command, push, new_gains),
-    *(kill_controller, kill_plant, pause_both, reset_one),
-)
+FAULTS = (push, new_gains, kill_controller, kill_plant, pause_both, reset_one)
 
 
 if __name__ == '__main__':
