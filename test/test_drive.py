@@ -136,41 +136,41 @@ def test_hold_gravity_commands_only_what_was_learned_beyond_the_model_of_the_dri
     assert np.abs(safe_torque(config.safety, settings, last, estimate, np.zeros(7))).max() > 1.0
 
 
-@pytest.mark.parametrize('preset', ['panda', 'ur5e'])
+COMMANDED = {'robot.effort': 'commanded'}  # without what the drives add: here 0
+STEPS = {'torque.first_step': [1.0] * 7}
+TWICE = '^gravity twice: the first torque would be -(32.4|18.12) N m'
+NONE = '^no gravity: .* an effort of 0 N m where the drives should hold -'
+STEP = r"'panda_joint2', more than the 1 N m .* it is the gravit"
+OTHERS = r'no gravity: .* rests with a commanded effort of'  # of another controller
+
+
 @pytest.mark.parametrize(
-    ('drive', 'parameter', 'refusal'),
+    ('preset', 'both', 'law', 'plant', 'refusal', 'size'),
     [
-        ('none', 'none', ''),
-        ('gravity', 'gravity', ''),
-        ('gravity', 'none', '^gravity twice: the first torque would be -(32.4|18.12) N m'),
-        ('none', 'gravity', '^no gravity: .* an effort of 0 N m where the drives should hold -'),
+        ('panda', {}, {}, {}, '', 32.4),
+        ('ur5e', {}, {}, {}, '', 18.1),
+        ('panda', HELD, {}, {}, '', 0.0),
+        ('ur5e', HELD, {}, {}, '', 0.0),
+        # Issue 28: 59.8 N m were sent to a UR5e whose drives held it already.
+        ('panda', {}, {}, HELD, TWICE, 0.0),
+        ('ur5e', {}, {}, HELD, TWICE, 0.0),
+        ('panda', {}, HELD, {}, NONE, 0.0),
+        ('ur5e', {}, HELD, {}, NONE, 0.0),
+        ('panda', {}, HELD | COMMANDED, HELD, OTHERS, 0.0),
+        ('panda', COMMANDED, STEPS, HELD, STEP, 0.0),
+        ('panda', COMMANDED | HELD, STEPS, {}, '', 0.0),
+        ('panda', COMMANDED, STEPS | {'safety.first_torque': 'send'}, HELD, '', 32.4),
     ],
 )
-def test_first_torque_must_fit_the_drive(preset, drive, parameter, refusal):
-    """Issue 28: 59.8 N m were sent to a UR5e whose drives held it already."""
-    name = 'robot.drive_compensates'
-    arguments = (preset, 0.1, None, {name: parameter}, {name: drive})
+def test_first_torque_must_fit_the_drive(preset, both, law, plant, refusal, size):
+    """Gravity neither twice nor missing, and no step beyond what the drive tolerates."""
     if refusal:
         with pytest.raises(StartError, match=refusal):
-            run(*arguments)
+            run(preset, 0.01, both, law, plant)
         return
-    record = run(*arguments)
+    record = run(preset, 0.01, both, law, plant)
     assert record.run().stops == ()
-    first = np.abs(record.sample(0).torque).max()
-    assert (first > 15.0) if parameter == 'none' else (first < 0.01)
-
-
-def test_first_torque_beyond_what_the_drive_tolerates_is_refused():
-    """Whatever the effort shows: here it is without what the drives add, so 0."""
-    relative = {'robot.effort': 'commanded'}
-    steps = {'torque.first_step': [1.0] * 7}
-    with pytest.raises(
-        StartError, match=r"'panda_joint2', more than the 1 N m .* it is the gravit"
-    ):
-        run('panda', 0.1, relative, steps, HELD)
-    assert run('panda', 0.1, relative | HELD, steps).run().stops == ()
-    unchecked = {'safety.first_torque': 'send'}
-    assert np.abs(run('panda', 0.01, relative, steps | unchecked, HELD).sample(0).torque[1]) > 30.0
+    assert np.abs(record.sample(0).torque).max() == pytest.approx(size, abs=0.1)
 
 
 @pytest.mark.parametrize('preset', ['panda', 'ur5e'])
@@ -241,12 +241,6 @@ def test_slow_drift_of_commands_without_effect_shows_in_the_effort(drive, effort
         is_seen = not follows and effort != 'current'
         assert guard.supervisor.running != is_seen, guard.supervisor.text
         assert ('lacks' in guard.supervisor.text) == is_seen
-
-
-def test_torque_of_another_controller_is_not_taken_for_a_missing_gravity_twice():
-    """An effort that only contains commands, but holds the arm: its drives do not."""
-    with pytest.raises(StartError, match=r'no gravity: .* rests with a commanded effort of'):
-        run('panda', 0.1, None, HELD | {'robot.effort': 'commanded'}, HELD)
 
 
 @pytest.mark.parametrize('own_model', [{}, OWN], ids=['of the URDF', 'of the arm'])

@@ -87,14 +87,13 @@ class ControllerStatus:
         self._joints = tuple(joints)
         self._diagnostics = DiagnosticsPublisher(node, joints)
         self._latched = create_publisher(node, topics.STATE)
-        self._revision = -1
-        self._published: tuple[str, str, int] | None = None
+        self._published = '', -1  # lifecycle and revision of the state
         self._logger = node.get_logger()
         self._has_warned = False
 
     def has_news(self, guard: Guard) -> bool:
         """Whether there are events or a state to publish."""
-        return bool(guard.journal.pending) or guard.supervisor.revision != self._revision
+        return bool(guard.journal.pending) or guard.supervisor.revision != self._published[1]
 
     def report(self, lifecycle: str, guard: Guard | None, others: int) -> None:
         """Publish diagnostics, new events and, if it has changed, the state.
@@ -113,11 +112,10 @@ class ControllerStatus:
             if guard.controller.settings.weighed:
                 parts.append(self._load(guard))
         self._diagnostics.publish(parts)
-        stops = guard.supervisor.stops if guard else 0
-        if (state.message, lifecycle, stops) != self._published:
+        now = lifecycle, guard.supervisor.revision if guard else -1
+        if now != self._published:
             self._latched.publish(state)
-            self._published = (state.message, lifecycle, stops)
-        self._revision = guard.supervisor.revision if guard else -1
+            self._published = now
 
     def publish_events(self, guard: Guard) -> None:
         """Publish the new events."""

@@ -74,7 +74,7 @@ class PlantNode(LoopNode[PlantConfig]):
         self._telemetry = PlantTelemetry(joints, parameter_names_of(self.config), published)
         self._decoder = Float64MultiArrayDecoder(len(joints))
         self.input = TorqueInput(joints)
-        self._reported_stale = self._reported_rejected = 0
+        self._reported_rejected = 0
         self._diagnostics = DiagnosticsPublisher(self, joints)
         self._step_timer: Timer | None = None
         self._start_stamp = LOCKSTEP_START
@@ -94,6 +94,7 @@ class PlantNode(LoopNode[PlantConfig]):
     def configure(self) -> None:
         """Put the arm at its start; create the topics on the first call."""
         self.plant = plant_of(self.config)
+        self._halt = ''  # why the arm stands still until a reset
         if self._changed:
             self._tell_parameters()
         self._changed.clear()
@@ -133,6 +134,7 @@ class PlantNode(LoopNode[PlantConfig]):
         self._start_stamp = self.stamp + _BETWEEN_RUNS
         self.deactivate()
         self.plant.reset()
+        self._halt = ''
         self._apply_changes()
         self.input.restart()
         self._handshake.begin(reset=True)
@@ -235,20 +237,17 @@ class PlantNode(LoopNode[PlantConfig]):
             self._report()
 
     def _step(self) -> None:
-        was_broken, was_stopped = self.plant.is_broken, self.plant.is_stopped
-        self.plant.step(self.input.torque)
-        if self.plant.is_stopped and not was_stopped:
-            self.get_logger().error(
-                f'reflex: the commands jumped to {self.input.torque} N m, faster than '
-                f'{self.config.actuator.reflex_rate:g} N m/s: the drives brake until a reset'
-            )
-            self._report()
-        if self.plant.is_broken and not was_broken:
-            self.get_logger().error(
-                f'the torque {self.input.torque} N m drove the arm beyond {FASTEST:g} rad/s: '
-                'the arm stands still until it is reset'
-            )
-            self._report()
+        torque = self.input.torque
+        self.plant.step(torque)
+        if self._halt or not (self.plant.is_broken or self.plant.is_stopped):
+            return
+        self._halt = f'the torque {torque} N m drove the arm beyond {FASTEST:g} rad/s'
+        if self.plant.is_stopped:
+            rate = self.config.actuator.reflex_rate
+            self._halt = f'reflex: the commands jumped to {torque} N m, faster than {rate:g} N m/s'
+        self._halt += ': the arm stands still until it is reset'
+        self.get_logger().error(self._halt)
+        self._report()
 
     def _is_over(self) -> bool:
         if 0 < self._steps <= self.plant.sample and not self.finished:
@@ -302,10 +301,10 @@ class PlantNode(LoopNode[PlantConfig]):
 
     def _report(self) -> None:
         """Publish diagnostics; the level depends on what happened since the last report."""
-        stale, rejected = self.input.stale_steps, self.input.rejected
+        rejected = self.input.rejected
         values = {
             'rejected commands': rejected,
-            'steps with a torque that was too old': stale,
+            'steps with a torque that was too old': self.input.stale_steps,
             'late steps': self.latency.late_steps,
         }
         level, message = OK, 'running'
@@ -315,17 +314,14 @@ class PlantNode(LoopNode[PlantConfig]):
             level, message = ERROR, 'another node publishes joint states, too'
         elif not self._running:
             level, message = WARN, 'braked: waiting for the first torque'
-        elif self.plant.is_broken:
-            level, message = ERROR, f'the arm was faster than {FASTEST:g} rad/s: reset it'
-        elif self.plant.is_stopped:
-            level, message = ERROR, 'reflex stop after a jump of the commands: reset the arm'
-        elif stale > self._reported_stale:
-            level = ERROR
-            message = 'the last torque is too old (actuator.command_timeout)'
-            message += _STALE[self.config.actuator.without_command]
+        elif self._halt:
+            level, message = ERROR, self._halt
+        elif self._stale:
+            after = _STALE[self.config.actuator.without_command]
+            level, message = ERROR, f'the last torque is too old (actuator.command_timeout){after}'
         elif rejected > self._reported_rejected:
             level, message = WARN, self.input.problem
-        self._reported_stale, self._reported_rejected = stale, rejected
+        self._reported_rejected = rejected
         self._diagnostics.publish([self._diagnostics.status('torque', level, message, values)])
 
 
