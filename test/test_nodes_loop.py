@@ -18,6 +18,8 @@ from ros_rig import FakeClock, simulated_torques, states, torques
 from test_plant_events import ALL_KINDS
 
 from blf_dsc_controller.configuration.controller import ControllerConfig
+from blf_dsc_controller.configuration.plant import PlantConfig
+from blf_dsc_controller.configuration.schema import build
 from blf_dsc_controller.messages import topics
 from blf_dsc_controller.nodes.controller_node import ControllerNode
 from blf_dsc_controller.nodes.plant_node import LOCKSTEP_START, PlantNode
@@ -28,6 +30,8 @@ MILLISECOND = 1_000_000  # ns
 PUSHED = {'load.payload': 0.2, 'load.torque': [0.4, -0.3], 'sensor.offset': [1e-5, 0.0]}
 OBSERVED = {'wait_for_subscribers': 1}
 ARM = {'robot.urdf': random_urdf(3, seed=5)[0], 'robot.tip': 'tip'}
+HELD = ARM | {'robot.drive_compensates': 'gravity'}
+JOINTS = build(PlantConfig, HELD).joints
 NOISY = {'sensor.position_noise': 1e-5, 'sensor.velocity': 'differenced', 'actuator.delay': 1}
 
 
@@ -55,6 +59,13 @@ CASES = {
         | {'events.begin': [2.0], 'events.payload': [0.3]},
         ARM | {'learning.window': 1.0},
     ),
+    'a driver of a real arm': (
+        HELD
+        | {'duration': 2.0, 'drive.mass_deviation': 0.2, 'actuator.delay': 2}
+        | {'sensor.repeat_every': 20, 'sensor.published_joints': ['gripper', *reversed(JOINTS)]},
+        HELD | {'learning.window': 1.0},
+    ),
+    'approach': ({'duration': 4.0, 'initial.position': [0.9, 2.9]}, {}),  # over 1.4 and 1.2 rad
 }
 
 

@@ -119,6 +119,32 @@ def test_plant_finishes_when_the_last_state_has_received_its_torque(ros):
     assert len(received) == 4
 
 
+def test_first_states_may_be_incomplete(ros):
+    received = ros.listen(topics.JOINT_STATES, raw=True)
+    ros.add(PlantNode, {'mode': 'lockstep', 'sensor.incomplete_states': 3})
+    ros.publisher(topics.COMMANDS)
+    ros.until(lambda: len(received) == 4)
+    stamps, measured = states(received)
+    assert np.isfinite(measured[:, 0]).all()
+    assert np.isfinite(measured[:, 1]).all(axis=1).tolist() == [False, False, False, True]
+    assert np.diff(stamps).tolist() == [1_000_000] * 3
+
+
+def test_reflex_is_reported_and_lasts_until_a_reset(ros):
+    diagnostics = ros.listen(topics.DIAGNOSTICS)
+    node, received, send = start_plant(ros, **{'actuator.reflex_rate': 1000.0})
+    for sample in (1, 2):
+        send(TORQUE)
+        ros.until(lambda k=sample: node.plant.sample == k)
+    assert node.plant.is_stopped
+    ros.until(lambda: len(received) == 3)
+    assert not states(received)[1][-1, 1].any()
+    ros.until(lambda: diagnostics[-1].status[0].message.startswith('reflex: '))
+    node.reset()
+    assert not node.plant.is_stopped
+    ros.until(lambda: diagnostics[-1].status[0].message.startswith('braked'))
+
+
 @pytest.mark.parametrize(
     ('events', 'waits', 'late'),
     [

@@ -137,7 +137,7 @@ class ControllerStatus:
         return self._diagnostics.status('state', level, message, values)
 
     def _loop(self, guard: Guard, others: int) -> DiagnosticStatus:
-        states, samples = guard.states, guard.samples
+        states, samples, state = guard.states, guard.samples, guard.controller.state
         off = f'off: {guard.watchdog.why_off}'.removesuffix(': ')
         values = {
             'samples': guard.controller.samples,
@@ -148,7 +148,8 @@ class ControllerStatus:
             'samples with a torque at its limit': samples.saturated,
             'messages for other joints': guard.foreign,
             'watchdog on the steady clock': 'on' if guard.watchdog.on else off,
-            **self._cuts(guard),
+            'samples cut by the torque limit': self._by_joint(state.level_cuts),
+            'samples cut by the torque rate limit': self._by_joint(state.rate_cuts),
             **(self.trajectories.values if self.trajectories else {}),
         }
         level, message = WARN, 'torque{} at its limit: adaptation by the tracking error is frozen'
@@ -169,15 +170,9 @@ class ControllerStatus:
             level, message = OK, _PHASES[guard.supervisor.phase][1]
         return self._diagnostics.status('loop', level, message, values)
 
-    def _cuts(self, guard: Guard) -> dict[str, int]:
-        """Return in how many samples the law's torque was cut, by joint and cause."""
-        state = guard.controller.state
-        causes = {'torque limit': state.level_cuts, 'torque rate limit': state.rate_cuts}
-        return {
-            f'samples cut by the {cause}, {joint}': int(count)
-            for cause, counts in causes.items()
-            for joint, count in zip(self._joints, counts, strict=True)
-        }
+    def _by_joint(self, counts: np.ndarray) -> str:
+        pairs = zip(self._joints, counts, strict=True)
+        return ', '.join(f'{joint} {count:.0f}' for joint, count in pairs if count) or 'none'
 
     def _learning(self, guard: Guard) -> DiagnosticStatus:
         state = guard.controller.state
