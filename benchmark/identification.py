@@ -39,15 +39,9 @@ from shaken_arm import PERIOD, Truth, measured, reference_of, shake, truth_of
 
 from blf_dsc_controller.arms.inertia import pseudo_inertia
 from blf_dsc_controller.arms.urdf import Chain
-from blf_dsc_controller.cli.identify import clearance_of, guess_of
 from blf_dsc_controller.configuration.nodes import CONTROLLER, PLANT, LoopConfig, load_loop
 from blf_dsc_controller.configuration.robot import Robot
-from blf_dsc_controller.identification.exciting_reference import (
-    SPEED,
-    TORQUE,
-    ExcitationProblem,
-    search,
-)
+from blf_dsc_controller.identification.exciting_reference import ExcitationProblem, search
 from blf_dsc_controller.identification.identify import Identified, identify_arm
 from blf_dsc_controller.identification.prior import base_matrix
 from blf_dsc_controller.identification.recording import Recording, rows_of
@@ -252,10 +246,7 @@ def _random_loop(name: str, seed: int, begin: float, random: np.random.Generator
 def _excited(name: str, starts: int) -> tuple[str, ...]:
     """Return the row of an arm."""
     config = load_loop(name).controller
-    clearance = clearance_of(config, _RADIUS, 0.0)
-    problem = ExcitationProblem(
-        config, guess_of(config, None), TORQUE, _HARMONICS, clearance, SPEED
-    )
+    problem = ExcitationProblem(config, _HARMONICS, _RADIUS)
     problem.evaluate(problem.parameters(problem.start(np.random.default_rng(0))))  # compiles
     begin = time.perf_counter()
     best = problem.evaluate(problem.parameters(search(problem, 0, starts))).gain

@@ -7,12 +7,10 @@ import textwrap
 from argparse import Namespace
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from tempfile import TemporaryDirectory
 
 import numpy as np
 from tqdm import tqdm
 
-from blf_dsc_controller.arms.geometry import Clearance
 from blf_dsc_controller.bags.content import NameMap
 from blf_dsc_controller.cli.main import PICK_UP, make_room
 from blf_dsc_controller.configuration.controller import ControllerConfig
@@ -21,7 +19,7 @@ from blf_dsc_controller.configuration.robot import Robot, parameters_of
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.identification import exciting_reference
 from blf_dsc_controller.identification.corrected_urdf import corrected_urdf
-from blf_dsc_controller.identification.identify import Identified, identify_bag
+from blf_dsc_controller.identification.identify import Identified, identify_bag, mass_and_centre
 from blf_dsc_controller.identification.prior import JOINT_TERMS, base_matrix
 from blf_dsc_controller.identification.recording import HOP
 from blf_dsc_controller.law.factory import estimate_names
@@ -38,10 +36,10 @@ _PANEL = (9.0, 2.2)  # inches
 
 
 def identify(options: Namespace) -> None:
-    """Identify the arm, print what changed, and write the corrected URDF and the page."""
-    if not (options.out or options.report or options.payload):
-        raise BlfDscError('nothing to write: give --out, --report or --payload')
-    for path in (options.out, options.report):
+    """Identify the arm, print what changed, and write the corrected URDF and the picture."""
+    if not (options.out or options.plot or options.payload):
+        raise BlfDscError('nothing to write: give --out, --plot or --payload')
+    for path in (options.out, options.plot):
         if path:
             make_room(path, force=options.force)
     robot = Robot(
@@ -71,42 +69,33 @@ def identify(options: Namespace) -> None:
         corrected = corrected_urdf(robot.text, found.chain, found.inertias, viscous, coulomb, note)
         options.out.write_text(corrected, encoding='utf-8')
         print(f'wrote {options.out}')
-    if options.report:
-        tables = (_load(found), _links(found), _joints(found), _errors(found), _base(found))
-        lines = [*header, *problems_of(found, options.effort)]
-        _write_page(found, options.report, lines, ['\n'.join(table).strip() for table in tables])
-        print(f'wrote {options.report}')
+    if options.plot:
+        _draw(found, options.plot)
+        print(f'wrote {options.plot}')
 
 
-def _write_page(found: Identified, path: Path, lines: Sequence[str], tables: Sequence[str]) -> None:
-    """Write the page: some lines, measured and predicted torques with their residual, tables."""
-    from blf_dsc_controller.analysis import style  # slow: the libraries of the pictures
+def _draw(found: Identified, path: Path) -> None:
+    """Draw measured and predicted torques with their residual; the part held back is shaded."""
+    from blf_dsc_controller.analysis.figures import draw_panels  # slow: the libraries
+    from blf_dsc_controller.analysis.panels import Line, Mark, Panel
+    from blf_dsc_controller.analysis.style import INK, MUTED, ORANGE
 
-    n, time = len(found.chain.joints), found.time
-    jumps = np.flatnonzero(np.diff(time) > 2.0 * np.median(np.diff(time))) + 1
-    picture = style.Picture(n, 1, 'Torques: measured, predicted, residual', _PANEL)
-    for i, (axes, joint) in enumerate(zip(picture.axes.flat, found.chain.joints, strict=True)):
-        axes.axvspan(*found.held_back, color=style.SHADE, lw=0)
-        # NaN breaks the lines at gaps and rest.
-        t, measured, predicted = (
-            np.insert(values, jumps, np.nan)
-            for values in (time, found.measured[:, i], found.predicted[2, :, i])
-        )
-        axes.plot(t, measured, color=style.INK, label='measured')
-        axes.plot(t, predicted, color=style.BLUE, label='predicted', linestyle='--')
-        axes.plot(t, measured - predicted, color=style.ORANGE, label='residual', linewidth=0.9)
-        axes.set_ylabel('N' if joint.kind == 'prismatic' else 'N m')
-        style.head(axes, joint.name)
-    with TemporaryDirectory() as folder:
-        picture.save(Path(folder, 'torques.png'))
-        style.write_page(
-            path,
-            'identified.html',
-            'Identified arm',
-            lines=lines,
-            picture=Path(folder, 'torques.png'),
-            tables=[table for table in tables if table],
-        )
+    jumps = np.flatnonzero(np.diff(found.time) > 2.0 * np.median(np.diff(found.time))) + 1
+    t = np.insert(found.time, jumps, np.nan)  # breaks the lines at gaps and rest
+    begin, end = found.held_back
+    held_back = Mark(begin, 'held back', MUTED, until=end)
+    panels = []
+    for i, joint in enumerate(found.chain.joints):
+        measured, predicted = found.measured[:, i], found.predicted[2, :, i]
+        residual = measured - predicted
+        lines = [
+            Line('measured', t, np.insert(measured, jumps, np.nan)),
+            Line('predicted', t, np.insert(predicted, jumps, np.nan), INK, dashed=True),
+            Line('residual', t, np.insert(residual, jumps, np.nan), ORANGE),
+        ]
+        unit = 'N' if joint.kind == 'prismatic' else 'N m'
+        panels.append(Panel('Motion', joint.name, unit, lines, marks=(held_back,)))
+    draw_panels(path, 'Torques: measured, predicted, residual', panels, 1, _PANEL)
 
 
 def _interval(value: float, deviation: float, digits: str = '.4g') -> str:
@@ -137,18 +126,16 @@ def _load(found: Identified) -> Iterator[str]:
 def _links(found: Identified) -> Iterator[str]:
     rows = [('body', 'mass [kg]', 'centre of mass [mm]')]
     for i, joint in enumerate(found.chain.joints):
-        at = 10 * i
-        m = found.values[at]
-        # c = h / m:  dc = (dh - c dm) / m
-        c = found.values[at + 1 : at + 4] / m
-        D = np.column_stack((-c, np.eye(3))) / m
-        C = found.covariance[at : at + 4, at : at + 4]
+        at = slice(10 * i, 10 * i + 4)
+        (m, *c), (m_spread, *spread) = mass_and_centre(
+            found.values[at], found.covariance[at, at], np.eye(4)
+        )
         before = joint.inertia[1:4] / joint.inertia[0]
         centre = ', '.join(
             f'{1e3 * old:.1f} -> {_interval(1e3 * new, 1e3 * s, ".1f")}'
-            for old, new, s in zip(before, c, np.sqrt(np.diag(D @ C @ D.T)), strict=True)
+            for old, new, s in zip(before, c, spread, strict=True)
         )
-        mass = f'{joint.inertia[0]:.3f} -> {_interval(m, C[0, 0] ** 0.5, ".3f")}'
+        mass = f'{joint.inertia[0]:.3f} -> {_interval(m, m_spread, ".3f")}'
         rows.append((joint.link, mass, centre))
     return _aligned(rows)
 
@@ -250,12 +237,7 @@ def excite(options: Namespace) -> None:
     make_room(options.out, force=options.force)
     config = load(locate(options.config), CONTROLLER, ControllerConfig)
     problem = exciting_reference.ExcitationProblem(
-        config,
-        guess_of(config, options.guess),
-        exciting_reference.TORQUE,
-        options.harmonics,
-        clearance_of(config, options.radius, options.floor),
-        exciting_reference.SPEED,
+        config, options.harmonics, options.radius, options.floor
     )
     parameters = problem.parameters(_search(problem, options.starts))
     for name in ('offset', 'amplitude'):
@@ -285,30 +267,6 @@ def excite(options: Namespace) -> None:
     node = {f'**/{CONTROLLER}': {'reference.type': 'sinusoids', **reference}}
     dump(options.out, node, ''.join(f'# {line}\n' for line in lines))
     print('\n'.join([*lines, f'wrote {options.out}']))
-
-
-def guess_of(config: ControllerConfig, given: list[float] | None) -> np.ndarray:
-    """Return parameters P (k, p) to compute the torque with: as given, or the initial estimate.
-
-    A URDF arm must also be able to carry its payload, which a second row includes.
-    """
-    start = config.learning.initial_estimate
-    if given and len(given) != len(start):
-        raise BlfDscError(
-            f'--guess has {len(given)} values, but the model {config.model} has {len(start)} '
-            'parameters'
-        )
-    if given or config.model != 'urdf':
-        return np.atleast_2d(given or start)
-    robot, chain = config.robot, config.robot.chain(config.joints)
-    return np.array((start, start + robot.payload * parameters_of(robot, chain).load))
-
-
-def clearance_of(config: ControllerConfig, radius: float, floor: float) -> Clearance | None:
-    """Return the clearance of the links of a URDF's arm; radius and height of the floor in m."""
-    if config.model != 'urdf':
-        return None
-    return Clearance(config.robot.chain(config.joints), radius, floor)
 
 
 def _search(problem: exciting_reference.ExcitationProblem, starts: int) -> np.ndarray:

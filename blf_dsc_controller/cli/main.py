@@ -305,13 +305,6 @@ def _add_identification(
     )
     option('out', type=Path, help='parameter file to write')
     option('--config', default='recommended', help=_CONFIG)
-    option(
-        '--guess',
-        type=float,
-        nargs='+',
-        help='parameters P for computing the torque (learning.initial_estimate; for a URDF, with '
-        'and without its payload)',
-    )
     option('--harmonics', type=int, default=3, help='number of harmonics of the window (3)')
     option('--starts', type=int, default=4, help='number of searches; the best result is kept (4)')
     option('--radius', type=float, default=0.07, help='radius of the links of a URDF [m] (0.07)')
@@ -322,7 +315,7 @@ def _add_identification(
         'new URDF has physical inertias that reproduce the torques and are closest to the original '
         'ones; what changed is printed, with 95 % intervals, and the torque error on the last '
         'fifth of the motion, which was held back. With --payload, weigh what the arm holds.',
-        'run1/bag --urdf robot.urdf --out corrected.urdf --report page.html\n'
+        'run1/bag --urdf robot.urdf --out corrected.urdf --plot torques.png\n'
         '  blf_dsc identify empty/bag --urdf robot.urdf --payload loaded/bag',
         names,
         force,
@@ -330,7 +323,7 @@ def _add_identification(
     option('bag', type=Path, help=_BAG)
     option('--urdf', required=True, help='URDF: a file, package://name/path, or a file in config/')
     option('--out', type=Path, help='URDF to write')
-    option('--report', type=Path, help='page with pictures and tables to write')
+    option('--plot', type=Path, help='picture of measured and predicted torques to write (PNG)')
     option(
         '--payload',
         type=Path,

@@ -27,6 +27,7 @@ import numpy as np
 from blf_dsc_controller.arms.geometry import Clearance
 from blf_dsc_controller.compiled.layout import pack as pack_settings
 from blf_dsc_controller.configuration.controller import ControllerConfig
+from blf_dsc_controller.configuration.robot import parameters_of
 from blf_dsc_controller.law.factory import prior_covariance, settings_of_config
 from blf_dsc_controller.law.prediction import rows_along
 from blf_dsc_controller.reference.approach import MotionError
@@ -35,9 +36,7 @@ from blf_dsc_controller.reference.terms import pack, sampled, sinusoids_term
 ITERATIONS = 150
 """Maximum number of iterations of a search."""
 
-TORQUE, SPEED = 0.8, 0.95
-"""Fractions of the limits of torque, and of velocity and acceleration, that `excite` uses."""
-
+_TORQUE, _SPEED = 0.8, 0.95  # of the limits of torque, and of velocity and acceleration
 _SAMPLES_PER_HARMONIC = 64
 _COARSE = 4  # samples per filtered row
 _MARGIN = 1e-3  # fraction of each limit, and m of room, for peaks between samples
@@ -64,35 +63,32 @@ class Excitation(NamedTuple):
 class ExcitationProblem:
     """Excitation of a controller as a function of its periodic reference.
 
-    The torque is computed for each parameter vector in `guess` (p,) or (k, p), with the initial
-    friction of the controller, and limited to `torque_fraction` of the configured limit; velocity
-    and acceleration are limited to `speed_fraction`.  `harmonics` is the highest harmonic of the
-    window in the reference.
+    `harmonics` is the highest harmonic of the window in the reference.  The torque is computed for
+    the initial estimate, and of a URDF arm also with its payload.  The links of a URDF arm have
+    this radius; the floor is at this height in its base frame [m].
     """
 
     def __init__(
-        self,
-        config: ControllerConfig,
-        guess: np.ndarray,
-        torque_fraction: float,
-        harmonics: int,
-        clearance: Clearance | None = None,
-        speed_fraction: float = 1.0,
+        self, config: ControllerConfig, harmonics: int, radius: float = 0.07, floor: float = 0.0
     ) -> None:
         settings = self._settings = settings_of_config(config)
         self._vector = pack_settings(settings)
-        self._clearance = clearance
-        guess = np.atleast_2d(guess)
-        friction = np.tile(settings.initial_estimate[settings.p :], (len(guess), 1))
-        self._guess = np.hstack((guess, friction))
+        self._clearance: Clearance | None = None
+        self._guess = np.atleast_2d(settings.initial_estimate)
+        if config.model == 'urdf':
+            chain = config.robot.chain(config.joints)
+            self._clearance = Clearance(chain, radius, floor)
+            self._guess = np.repeat(self._guess, 2, axis=0)
+            load = config.robot.payload * parameters_of(config.robot, chain).load
+            self._guess[1, : settings.p] += load
         self._scale = np.linalg.cholesky(prior_covariance(config))
         limits = config.limits
         lower, upper = np.array(limits.position_lower), np.array(limits.position_upper)
         self._middle, self._reach = 0.5 * (lower + upper), 0.5 * (upper - lower)
-        torque = torque_fraction * settings.torque_limit
+        torque = _TORQUE * settings.torque_limit
         tracked = self._reach - settings.bound
         self._limits = np.array((tracked, limits.velocity, limits.acceleration, torque))
-        self._limits[1:3] *= speed_fraction
+        self._limits[1:3] *= _SPEED
         self.n = settings.n
         self.harmonics = harmonics
         self._base = 2.0 * np.pi / config.learning.window
@@ -224,7 +220,7 @@ def search(
         raise MotionError(
             f'no reference found in {starts} searches keeps positions, velocities, '
             'accelerations and torques within their limits and the links clear of each other '
-            'and of the floor: allow a larger fraction of the torque, widen the limits, use a '
-            'smaller radius or a lower floor, or search from more starts'
+            'and of the floor: widen the limits, use a smaller radius or a lower floor, or '
+            'search from more starts'
         )
     return best

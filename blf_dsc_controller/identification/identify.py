@@ -99,14 +99,21 @@ class Identified(NamedTuple):
     def load(self) -> tuple[Floats, Floats]:
         """Mass [kg] and centre (x, y, z) [m] in the tip of the load, and their deviations."""
         at = slice(self.values.size - LOAD - 1, self.values.size - LOAD + 3)
-        R, shift = self.chain.tip_placement[:3, :3], self.chain.tip_placement[:3, 3]
-        m, *h = self.values[at]
-        centre = np.array(h) / m
-        # c = R^T (h / m - shift):  dc = R^T (dh - (h / m) dm) / m
-        J = np.eye(4)
-        J[1:] = R.T @ np.column_stack((-centre, np.eye(3))) / m
-        deviation = np.sqrt(np.diag(J @ self.covariance[at, at] @ J.T))
-        return np.append(m, R.T @ (centre - shift)), deviation
+        return mass_and_centre(self.values[at], self.covariance[at, at], self.chain.tip_placement)
+
+
+def mass_and_centre(values: Floats, covariance: Floats, T: Floats) -> tuple[Floats, Floats]:
+    """Return mass [kg] and centre (x, y, z) [m] in the frame T, and their deviations.
+
+    `values` are mass and first moments (4,) [kg, kg m].
+    """
+    R, shift = T[:3, :3], T[:3, 3]
+    m, *h = values
+    centre = np.array(h) / m
+    # c = R^T (h / m - shift):  dc = R^T (dh - (h / m) dm) / m
+    J = np.eye(4)
+    J[1:] = R.T @ np.column_stack((-centre, np.eye(3))) / m
+    return np.append(m, R.T @ (centre - shift)), np.sqrt(np.diag(J @ covariance @ J.T))
 
 
 def identify_bag(

@@ -11,7 +11,7 @@ import json
 import os
 import sys
 from collections import deque
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from queue import SimpleQueue
 from typing import Any
 
@@ -184,12 +184,11 @@ class ViewNode(PlainNode):
 
     def _configure(self, config: ControllerConfig) -> None:
         self._config = config
-        self._estimates = estimate_names(config)
-        self._decoders = {
-            topic: JointStateDecoder(config.joints, ('position',)) for topic in _STREAMS[:3]
-        }
-        self._learned = np.full(len(self._estimates) + len(_FIGURES), np.nan)
-        self._truth = self._first_truth = np.full(len(self._estimates), np.nan)
+        estimates = estimate_names(config)
+        names = *[config.joints] * 3, (*estimates, *_FIGURES), estimates
+        self._names = dict(zip(_STREAMS, names, strict=True))
+        self._values = {topic: np.full((3, len(of)), np.nan) for topic, of in self._names.items()}
+        self._first_truth, self._latched = self._values[topics.TRUTH][0], np.nan
         self._draw_all()
 
     def _draw_all(self) -> None:
@@ -208,45 +207,36 @@ class ViewNode(PlainNode):
 
     def _take(self, messages: Sequence[RawMessage]) -> bool:
         """Take the newest message of each topic; return whether there was a joint state."""
-        stamp = sampled = -1
+        stamps: dict[Topic, int] = {}
         for message in messages:
             topic = _STREAMS[message.handle]
             try:
-                if topic in self._decoders:
-                    at = self._decoders[topic].decode(message.raw)
-                    stamp = at if topic is topics.JOINT_STATES else stamp
-                    sampled = at if topic is topics.TRACKING_ERROR else sampled
-                elif topic is topics.TRUTH:
-                    self._truth = _named(message.raw, self._estimates)
-                    if np.isnan(self._first_truth).all():
-                        self._first_truth = self._truth
-                else:
-                    self._learn(_named(message.raw, (*self._estimates, *_FIGURES)))
+                stamps[topic], self._values[topic] = _read(message.raw, self._names[topic])
             except MessageError as error:
                 self.get_logger().warning(f'not shown: {error}', throttle_duration_sec=10.0)
-        self._sampled = max(sampled, self._sampled)
-        if stamp >= 0:
-            if stamp - self._sampled > _OUTDATED:  # the law is not running
-                self._decoders[topics.TRACKING_ERROR].values[:] = np.nan
-            self._keep(self._time(stamp))
-        return stamp >= 0
-
-    def _learn(self, values: Floats) -> None:
-        before, self._learned = self._learned[-1], values
-        if self.past and values[-1] != before and np.isfinite(before):
-            text = 'excited window latched' if values[-1] else 'restarts: the arm has changed'
-            self._events.append((self.past[-1].time, 'learning', text))
+        self._sampled = max(stamps.get(topics.TRACKING_ERROR, -1), self._sampled)
+        stamp = stamps.get(topics.JOINT_STATES)
+        if stamp is None:
+            return False
+        if stamp - self._sampled > _OUTDATED:  # the law is not running
+            self._values[topics.TRACKING_ERROR] = np.nan * self._values[topics.TRACKING_ERROR]
+        self._keep(self._time(stamp))
+        return True
 
     def _keep(self, time: float) -> None:
-        state, error, bound = self._decoders.values()
-        torque = state.effort if np.isnan(error.effort).any() else error.effort
-        arrays = (state.position, error.position, bound.position, torque, bound.effort)
-        q, xi1, k_c, tau, limit = (values.copy() for values in arrays)
-        m = len(self._estimates)
-        load, (lambda_min, _) = self._learned[m:-2], self._learned[-2:]
-        loaded = bool((np.abs(self._truth - self._first_truth) > 0.0).any())
-        learned = self._learned[:m], self._truth, float(lambda_min), load.tolist(), loaded
-        self.past.append(Snapshot(time, q, xi1, k_c, tau, limit, *learned))
+        state, (xi1, _, tau), (k_c, _, limit), (monitor, *_), (truth, *_) = self._values.values()
+        m = len(truth)
+        *load, lambda_min, latched = monitor[m:].tolist()
+        if latched != self._latched and np.isfinite(self._latched):
+            text = 'excited window latched' if latched else 'restarts: the arm has changed'
+            self._events.append((time, 'learning', text))
+        self._latched = latched
+        if np.isnan(self._first_truth).all():
+            self._first_truth = truth
+        loaded = bool((np.abs(truth - self._first_truth) > 0.0).any())
+        tau = state[2] if np.isnan(tau).any() else tau
+        learned = monitor[:m], truth, lambda_min, load, loaded
+        self.past.append(Snapshot(time, state[0], xi1, k_c, tau, limit, *learned))
         while self.past[0].time < time - PAST - 1.0:
             self.past.popleft()
         self._events += [e for e in plant_events(self._plant) if self._noted < e[0] <= time]
@@ -294,14 +284,13 @@ class ViewNode(PlainNode):
             self.page.notify(service, 'this service is not available: has the node exited?')
 
 
-def _named(raw: bytes, names: Sequence[str]) -> Floats:
-    """Return the values (m,) of these names in a message, NaN where it lacks them."""
-    decoder = JointStateDecoder(joint_state_layout(raw).names, ('position',))
-    decoder.decode(raw)
-    found: Mapping[str, float] = dict(
-        zip(joint_state_layout(raw).names, decoder.position, strict=True)
-    )
-    return np.array([found.get(name, np.nan) for name in names])
+def _read(raw: bytes, names: Sequence[str]) -> tuple[int, Floats]:
+    """Return stamp [ns] and values (3, m) of these names in a message, NaN where it lacks them."""
+    theirs = joint_state_layout(raw).names
+    decoder = JointStateDecoder(theirs, ())
+    stamp = decoder.decode(raw)
+    known = dict(zip(theirs, decoder.values.reshape(3, -1).T, strict=True))
+    return stamp, np.transpose([known.get(name, (np.nan,) * 3) for name in names])
 
 
 def main() -> int:
