@@ -45,7 +45,6 @@ from blf_dsc_controller.identification.exciting_reference import ExcitationProbl
 from blf_dsc_controller.identification.identify import Identified, identify_arm
 from blf_dsc_controller.identification.prior import base_matrix
 from blf_dsc_controller.identification.recording import Recording, rows_of
-from blf_dsc_controller.law.factory import begin, controller_of
 from blf_dsc_controller.law.telemetry import sample_columns
 from blf_dsc_controller.reference.approach import MotionError
 from blf_dsc_controller.run import Floats
@@ -62,7 +61,6 @@ _HEADS = {
     'weighing': (
         *('arm', 'nothing held [g]', *(f'2 kg after {t:g} s [g]' for t in _AFTER)),
         *('centre after 3 s [mm]', 'within 95 % intervals: mass', 'centre'),
-        *('law [us]', 'weighing: of 100 samples 90, 9, 1 [us]'),
     ),
     'excitation': (
         *('arm', 'time', 'log-determinant (smallest eigenvalue): excite', 'random'),
@@ -157,8 +155,7 @@ def _coverage(found: Identified, truth: Truth) -> float:
 def _weighed(name: str, runs: int) -> tuple[str, ...]:
     """Return the row of an arm."""
     loads = np.array([_weigh(name, seed) for seed in range(runs)])  # (runs, readings, 8)
-    true = np.array((0.0, *(_LOAD,) * len(_AFTER)))
-    off = loads[:, :, 0] - true
+    off = loads[:, :, 0] - (0.0, *(_LOAD,) * len(_AFTER))
     known = np.isfinite(off)
     cells = []
     for k, is_known in enumerate(known.T):
@@ -166,14 +163,11 @@ def _weighed(name: str, runs: int) -> tuple[str, ...]:
         unknown = f', {np.sum(~is_known)} unknown' if not is_known.all() else ''
         half = 1e3 * np.median(loads[is_known, k, 4])
         cells.append(f'{", ".join(f"{each:.0f}" for each in errors)} (± {half:.0f}{unknown})')
-    centre = loads[:, -1, 1:4]
-    found = np.isfinite(centre[:, 0])
-    middle, half = (1e3 * np.median(np.abs(x)) for x in (centre[found], loads[found, -1, 5:]))
+    centre, interval = loads[known[:, -1], -1, 1:4], loads[known[:, -1], -1, 5:]
+    middle, half = 1e3 * np.median(np.abs(centre)), 1e3 * np.median(interval)
     cells.append(f'{middle:.1f} (± {half:.1f})')
-    inside = np.abs(off[known]) < loads[:, :, 4][known]
-    inside_centre = np.abs(centre[found]) < loads[found, -1, 5:]
-    cells += [f'{100.0 * np.mean(part):.1f} %' for part in (inside, inside_centre)]
-    return name, *cells, *_times(name)
+    inside = np.abs(off[known]) < loads[:, :, 4][known], np.abs(centre) < interval
+    return name, *cells, *(f'{100.0 * np.mean(part):.1f} %' for part in inside)
 
 
 def _weigh(name: str, seed: int) -> Floats:
@@ -187,25 +181,6 @@ def _weigh(name: str, seed: int) -> Floats:
     load = sample_columns(record.samples, record.controller.settings).load
     times = np.array((begin, *(begin + t for t in _AFTER)))
     return np.asarray(load[np.round(times / config.controller.sample_time).astype(int)])
-
-
-def _times(name: str) -> tuple[str, str]:
-    """Return median times: the law; the weighing without a row, with one, and with a solution."""
-    config = load_loop(name, {PLANT: {'duration': 8.0}})
-    record = simulate(config.controller, config.plant, supervised=False)
-    controller, T = controller_of(config.controller), config.controller.sample_time
-    n = controller.settings.n
-    begin(controller, config.controller, *record.measurements[0, : 2 * n].reshape(2, n))
-    times = np.zeros((len(record.stamps), 2))
-    for k, measurement in enumerate(record.measurements):
-        before = time.perf_counter()
-        controller.update(k * T, T, measurement)
-        between = time.perf_counter()
-        controller.weigh(T)
-        times[k] = between - before, time.perf_counter() - between
-    law, weighing = 1e6 * times.T
-    each = ', '.join(f'{value:.1f}' for value in np.percentile(weighing, (50.0, 95.0, 99.5)))
-    return f'{np.median(law):.1f}', each
 
 
 def _random_loop(name: str, seed: int, begin: float, random: np.random.Generator) -> LoopConfig:

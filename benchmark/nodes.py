@@ -126,7 +126,7 @@ def own_graph() -> Iterator[None]:
 class StandIn:
     """Stand-in for the plant that publishes recorded states and waits for torques."""
 
-    def __init__(self, messages: Sequence[bytes]) -> None:
+    def __init__(self) -> None:
         import rclpy
         from rclpy.experimental import EventsExecutor
 
@@ -151,7 +151,7 @@ class StandIn:
             raw=True,
         )
         self.has_torque = False
-        self.messages = iter(messages)
+        self.messages: Iterator[bytes] = iter(())
 
     def _take(self, _torque: bytes) -> None:
         self.has_torque = True
@@ -230,7 +230,7 @@ def measure() -> Iterator[Ratio]:
         loop = load_loop(preset)
         states = _recorded_states(loop)
         found: dict[str, list[tuple[float, float]]] = {_NULL: [], _QUIET: [], _RECORDED: []}
-        with own_graph(), tempfile.TemporaryDirectory() as folder, closing(StandIn(())) as arm:
+        with own_graph(), tempfile.TemporaryDirectory() as folder, closing(StandIn()) as arm:
             for k, (name, figures) in itertools.product(range(_ROUNDS), found.items()):
                 arm.messages = iter(states)
                 path = Path(folder, f'{k}-{name}'.replace(' ', '_'))
@@ -298,7 +298,7 @@ def _first_torque(name: str, cache: str) -> float:
     state = np.array((2.293, 1.696, 0.0, 0.0, 0.0, 0.0))
     stamps = itertools.count(_START, 1_000_000)
     command = _NULL_NODE if name == _NULL else _CONTROLLER_NODE
-    with closing(StandIn(())) as arm:
+    with closing(StandIn()) as arm:
 
         def publish() -> None:
             arm.publisher.publish(encoder.joint_states(next(stamps), state)[1])

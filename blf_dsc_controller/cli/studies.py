@@ -29,11 +29,9 @@ from blf_dsc_controller.studies.report import (
     reproduce_command,
     write_report,
 )
-from blf_dsc_controller.studies.runs import KEPT, Columns, Store, require_pyarrow, warm_up
+from blf_dsc_controller.studies.runs import KEPT, Store, require_pyarrow, warm_up
 
 _PAUSE_IN_A_LOG = 10.0  # s between two updates of the bar
-_AHEAD = 3  # chunks submitted for each worker
-_AHEAD_OF_A_CLUSTER = 1000
 
 
 def paper(options: Namespace) -> None:
@@ -85,13 +83,12 @@ def _run_study(options: Namespace) -> None:
                 warm_up(study)
             is_dask = options.engine == 'dask'
             engine = runs.dask(workers, options.address) if is_dask else runs.processes(workers)
-            with engine as executor:  # how many workers a cluster has may change
-                most = _AHEAD_OF_A_CLUSTER if options.address else _AHEAD * workers
-                _compute(store, chunks, executor, most)
+            with engine as executor:
+                _compute(store, chunks, executor)
         _report(store)
 
 
-def _compute(store: Store, chunks: list[range], executor: Executor, most: int) -> None:
+def _compute(store: Store, chunks: list[range], executor: Executor) -> None:
     total = store.study.settings.runs
     done = total - sum(map(len, chunks))
     if done:
@@ -99,15 +96,11 @@ def _compute(store: Store, chunks: list[range], executor: Executor, most: int) -
     lost = 0
     pause = 0.5 if sys.stderr.isatty() else _PAUSE_IN_A_LOG
     with tqdm(total=total, initial=done, unit='run', desc='monte carlo', mininterval=pause) as bar:
-
-        def keep(done: range, columns: Columns) -> None:
-            nonlocal lost
-            store.keep(done, columns)
+        for chunk, columns in runs.compute(store.study, chunks, executor):
+            store.keep(chunk, columns)
             lost += int(np.count_nonzero(columns['outcome'] != KEPT))
             bar.set_postfix_str(f'{lost} did not keep the bound', refresh=False)
-            bar.update(len(done))
-
-        runs.compute(store.study, chunks, executor, most, keep)
+            bar.update(len(chunk))
 
 
 def _report(store: Store) -> None:

@@ -9,14 +9,12 @@ The folder of a study:
 
 Files of results are written atomically, so a study that was killed resumes with the runs that have
 none. The workers are any `concurrent.futures.Executor`: processes of this machine, or a
-dask.distributed cluster. Both give the same results. Chunks of runs are submitted one after the
-other, a few ahead of the workers, so the memory needed does not grow with the number of runs.
+dask.distributed cluster. Both give the same results.
 """
 
 from __future__ import annotations
 
 import fcntl
-import itertools
 import json
 import multiprocessing
 import os
@@ -24,15 +22,8 @@ import re
 import shutil
 import signal
 import threading
-from collections.abc import Callable, Iterable, Iterator, Mapping
-from concurrent.futures import (
-    FIRST_COMPLETED,
-    BrokenExecutor,
-    Executor,
-    Future,
-    ProcessPoolExecutor,
-    wait,
-)
+from collections.abc import Iterable, Iterator, Mapping
+from concurrent.futures import BrokenExecutor, Executor, ProcessPoolExecutor, as_completed
 from contextlib import contextmanager
 from dataclasses import replace
 from math import nan
@@ -390,30 +381,22 @@ def dask(workers: int, address: str = '') -> Iterator[Executor]:
 
 def chunk_size(runs: int, workers: int) -> int:
     """Return the runs per chunk: few files, yet enough chunks for workers to finish together."""
-    largest = min(1000, max(100, runs // 1000))
-    return max(1, min(largest, runs // (20 * workers)))
+    return max(1, min(max(100, runs // 1000), runs // (20 * workers)))
 
 
 def compute(
-    study: Study,
-    chunks: Iterable[range],
-    executor: Executor,
-    most: int,
-    keep: Callable[[range, Columns], None],
-) -> None:
-    """Compute all `chunks` and pass each with its results to `keep` as soon as it is done.
+    study: Study, chunks: Iterable[range], executor: Executor
+) -> Iterator[tuple[range, Columns]]:
+    """Compute all `chunks` and yield each with its results as soon as it is done.
 
-    At most `most` are submitted at a time.  Raises BlfDscError if a worker is lost.
+    Raises BlfDscError if a worker is lost.
     """
-    waiting, handed = iter(chunks), dict[Future[Columns], range]()
+    handed = {}
     try:
-        while True:
-            for runs in itertools.islice(waiting, most - len(handed)):
-                handed[executor.submit(run_chunk, study, runs.start, len(runs))] = runs
-            if not handed:
-                return
-            for future in wait(handed, return_when=FIRST_COMPLETED).done:
-                keep(handed.pop(future), future.result())
+        for runs in chunks:
+            handed[executor.submit(run_chunk, study, runs.start, len(runs))] = runs
+        for future in as_completed(handed):
+            yield handed.pop(future), future.result()
     except BrokenExecutor as error:
         raise BlfDscError(_LOST.format(error)) from error
     finally:
