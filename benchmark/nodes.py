@@ -22,13 +22,17 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import rclpy
 from harness import Ratio, ratio
+from rclpy.experimental import EventsExecutor
 
+from blf_dsc_controller.cli.session import localhost_environment, own_domain
 from blf_dsc_controller.configuration.controller import ControllerConfig, Telemetry
 from blf_dsc_controller.configuration.nodes import CONTROLLER, LoopConfig, dump, load_loop
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.law.telemetry import PlantTelemetry
 from blf_dsc_controller.messages import topics
+from blf_dsc_controller.nodes.endpoints import message_class, qos_profile
 from blf_dsc_controller.simulation.loop import simulate
 
 _ROUNDS = 3
@@ -64,14 +68,10 @@ class Contestant(subprocess.Popen[bytes]):
     def __init__(
         self, name: str, arguments: Sequence[str], environment: Mapping[str, str] | None = None
     ) -> None:
-        self.name = name
+        self.name, command = name, [sys.executable, *arguments]
         self._errors = tempfile.TemporaryFile()  # noqa: SIM115 - closed with the process
-        super().__init__(
-            [sys.executable, *arguments],
-            env={**os.environ, **(environment or {})},
-            stdout=subprocess.DEVNULL,
-            stderr=self._errors,
-        )
+        own = {**os.environ, **(environment or {})}
+        super().__init__(command, env=own, stdout=subprocess.DEVNULL, stderr=self._errors)
 
     def cpu_time(self) -> float:
         """Return the user and system time of the process so far [s]."""
@@ -116,8 +116,6 @@ def wait_for(
 @contextmanager
 def own_graph() -> Iterator[None]:
     """Isolate the ROS nodes of this process and of its contestants from all others."""
-    from blf_dsc_controller.cli.session import localhost_environment, own_domain
-
     with own_domain() as domain:
         os.environ.update({'ROS_DOMAIN_ID': str(domain), **localhost_environment()})
         yield
@@ -127,11 +125,6 @@ class StandIn:
     """Stand-in for the plant that publishes recorded states and waits for torques."""
 
     def __init__(self) -> None:
-        import rclpy
-        from rclpy.experimental import EventsExecutor
-
-        from blf_dsc_controller.nodes.endpoints import message_class, qos_profile
-
         self.context = rclpy.Context()
         rclpy.init(context=self.context)
         # Nodes of one name would conflict on /rosout.
@@ -151,30 +144,40 @@ class StandIn:
             raw=True,
         )
         self.has_torque = False
-        self.messages: Iterator[bytes] = iter(())
 
     def _take(self, _torque: bytes) -> None:
         self.has_torque = True
 
-    def greet(self, contestants: Sequence[Contestant]) -> None:
-        """Send the first state until its torque arrives: a half-matched reader loses messages.
+    def greet(self, contestants: Sequence[Contestant], state: bytes) -> None:
+        """Send a state until its torque arrives: a half-matched reader loses messages.
 
         The last of the contestants is the measured node; the others run beside it.
         """
-        takers = len(contestants)  # a recorder subscribes to the states, too
-        self._wait_for(lambda: self.publisher.get_subscription_count() == takers, contestants)
-        self._wait_for(lambda: self.node.count_publishers(self.commands) == 1, contestants)
+        name, takers = contestants[-1].name, len(contestants)  # a recorder takes states, too
+        self._wait_for_others(takers, 1, f'{name} to appear', contestants)
         self._spin_for(_SETTLING)
-        first, self.has_torque = next(self.messages), False
+        self.has_torque = False
 
         def send() -> None:
-            self.publisher.publish(first)
+            self.publisher.publish(state)
             self._spin_for(_SETTLING)
 
-        what = f'the first torque of {contestants[-1].name}'
-        wait_for(lambda: self.has_torque, what, contestants, send)
+        wait_for(lambda: self.has_torque, f'the first torque of {name}', contestants, send)
 
-    def play(self, node: Contestant) -> tuple[float, float]:
+    def left_alone(self) -> None:
+        """Wait until the last contestant has disappeared."""
+        self._wait_for_others(0, 0, 'a contestant to disappear')
+
+    def _wait_for_others(
+        self, takers: int, givers: int, what: str, contestants: Sequence[Contestant] = ()
+    ) -> None:
+        def met() -> bool:
+            given = self.node.count_publishers(self.commands)
+            return bool(self.publisher.get_subscription_count() == takers and given == givers)
+
+        wait_for(met, what, contestants, lambda: self.executor.spin_once(timeout_sec=0.05))
+
+    def play(self, node: Contestant, states: Iterator[bytes]) -> tuple[float, float]:
         """Publish states, one per millisecond.
 
         Returns the median latency [s], from state published to torque received, and the CPU [s] of
@@ -190,7 +193,7 @@ class StandIn:
             due += _PERIOD
             self.has_torque = False
             sent = time.perf_counter()
-            self.publisher.publish(next(self.messages))
+            self.publisher.publish(next(states))
             while not self.has_torque:
                 self.executor.spin_once(timeout_sec=_PATIENCE)
                 if time.perf_counter() - sent > _PATIENCE:
@@ -204,11 +207,6 @@ class StandIn:
         while time.perf_counter() < end:
             self.executor.spin_once(timeout_sec=0.01)
 
-    def left_alone(self) -> None:
-        """Wait until the last contestant has disappeared."""
-        self._wait_for(lambda: self.publisher.get_subscription_count() == 0)
-        self._wait_for(lambda: self.node.count_publishers(self.commands) == 0)
-
     def close(self) -> None:
         """Destroy the stand-in's node, so that no participant is left in a later round."""
         self.executor.remove_node(self.node)
@@ -216,12 +214,6 @@ class StandIn:
         self.context.try_shutdown()
         self.node = self.publisher = self.executor = None
         gc.collect()
-
-    def _wait_for(
-        self, condition: Callable[[], bool], contestants: Sequence[Contestant] = ()
-    ) -> None:
-        what = f'{contestants[-1].name} to appear' if contestants else 'a contestant to disappear'
-        wait_for(condition, what, contestants, lambda: self.executor.spin_once(timeout_sec=0.05))
 
 
 def measure() -> Iterator[Ratio]:
@@ -232,11 +224,11 @@ def measure() -> Iterator[Ratio]:
         found: dict[str, list[tuple[float, float]]] = {_NULL: [], _QUIET: [], _RECORDED: []}
         with own_graph(), tempfile.TemporaryDirectory() as folder, closing(StandIn()) as arm:
             for k, (name, figures) in itertools.product(range(_ROUNDS), found.items()):
-                arm.messages = iter(states)
+                unsent = iter(states)
                 path = Path(folder, f'{k}-{name}'.replace(' ', '_'))
                 with _started(name, loop.controller, path) as contestants:
-                    arm.greet(contestants)
-                    figures.append(arm.play(contestants[-1]))
+                    arm.greet(contestants, next(unsent))
+                    figures.append(arm.play(contestants[-1], unsent))
                     for contestant in contestants:
                         contestant.check()
                 arm.left_alone()

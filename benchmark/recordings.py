@@ -158,11 +158,7 @@ def _baselines(taken: Taken, recording: Recording) -> tuple[Rows, NDArray[np.int
     values = prior.mean + prior.D @ solve(found.A, found.b, prior.cones, prior.start)
     w = rows.u(values[-1])[test]
     bounded = rows.X[test] @ (G @ values)[:-1] - w
-    errors = [
-        _percent(np.sqrt(np.mean(e**2, axis=0)), np.sqrt(np.mean(v**2, axis=0)))
-        for e, v in ((plain, u), (bounded, w))
-    ]
-    return rows, test, errors
+    return rows, test, [_percent(plain, u), _percent(bounded, w)]
 
 
 def _weakened(prior: Prior) -> Prior:

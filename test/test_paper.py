@@ -82,8 +82,8 @@ def test_every_law_is_tuned_with_the_same_effort():
             assert ranges.setdefault(key, (gain.least, gain.most)) == (gain.least, gain.most)
         exponents = np.arange(len(task.gains)) / 10.0
         found = tune.parameters_at(ControllerConfig(), task.gains, exponents)
-        assert found['feedback.gain'] == [1.0, 1.26]  # of each joint; 10^0.1 to three digits
-        assert found['learning.adaptation_gain'] == [1.58] * 3
+        assert found['feedback.gain'] == (1.0, 1.26)  # of each joint; 10^0.1 to three digits
+        assert found['learning.adaptation_gain'] == (1.58,) * 3
     assert len(tune.TASKS['proposed'].gains) == len(tune.TASKS['comparison'].gains)
 
 

@@ -103,7 +103,7 @@ def parameters_at(
     for gain, exponent in zip(gains, exponents, strict=True):
         values = chosen.setdefault(gain.name, np.array(present[gain.name], dtype=float))
         values[gain.joint if gain.joint >= 0 else ...] = value_at(exponent)
-    return {name: values.tolist() for name, values in chosen.items()}
+    return {name: tuple(v.tolist()) if v.ndim else v.item() for name, v in chosen.items()}
 
 
 def cost_of(metrics: Metrics, sample_time: float) -> float:
