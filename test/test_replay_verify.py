@@ -16,7 +16,6 @@ from recorded_run import compared, of
 from blf_dsc_controller import __version__
 from blf_dsc_controller.bags.content import read_content
 from blf_dsc_controller.bags.reader import read_run
-from blf_dsc_controller.bags.sources import BagError
 from blf_dsc_controller.cli.bags import DIFFERENT, PARTIAL
 from blf_dsc_controller.cli.main import main
 from blf_dsc_controller.configuration.nodes import load_loop
@@ -53,42 +52,17 @@ def bag(tmp_path_factory):
     return recorded_run.record(tmp_path_factory.mktemp('recorded') / 'bag')
 
 
-@pytest.fixture(scope='module')
+@pytest.fixture
 def entries(bag):
+    """Messages of the bag, which a test may change."""
     return recorded_run.messages(bag)
 
 
-@pytest.fixture
-def rewritten(entries, tmp_path):
-    """Writes a copy of the bag with other messages."""
-
-    def write(changed=entries, **facts):
-        return recorded_run.write(tmp_path / 'changed', changed, **facts)
-
-    return write
-
-
-def test_decimated_telemetry_replays_bit_for_bit(bag, tmp_path):
-    """The tracking error is not decimated: it tells the replay which states the law used."""
-    sparse = recorded_run.record(tmp_path / 'sparse', **{'telemetry.decimation': 7})
-    result, complete = verify(sparse), verify(bag)
-    assert result.difference is None
-    assert result.compared == 1.0
-    counts, full = compared(result), compared(complete)
-    assert counts['learning'] < full['learning'] / 6.9
-    assert counts['tracking_error'] == full['tracking_error']
-    assert counts['commands'] == full['commands']
-    run, whole = read_run(sparse), read_run(bag)
-    np.testing.assert_array_equal(run.error, whole.error)
-    np.testing.assert_allclose(run.reference, whole.reference, rtol=0.0, atol=1e-15)
-    assert run.learning.stamp.size == -(-SAMPLES // 7)
-
-
-def test_every_number_is_reproduced(bag):
+def test_every_number_is_reproduced(bag, tmp_path):
+    """The tracking error is never decimated: it tells the replay which states the law used."""
     result = verify(bag)
-    assert result.difference is None
-    assert result.remarks == ()
-    assert compared(result) == {
+    assert (result.difference, result.remarks) == (None, ())
+    counts = {
         'commands': 2 * SAMPLES,
         'tracking_error': 6 * SAMPLES,
         'reference': 4 * SAMPLES,
@@ -96,21 +70,33 @@ def test_every_number_is_reproduced(bag):
         'monitor': 11 * 101,  # two ratios, two distances, five estimates, two more
         'bound': 4,
     }
+    assert compared(result) == counts
     assert [item.left_out for item in result.comparisons if item.left_out] == ['compute_time']
+    run = read_run(bag)
     # Otherwise this would not cover the composite learning.
-    assert read_run(bag).learning.column('latched')[-1] == 1.0
+    assert run.learning.column('latched')[-1] == 1.0
+
+    sparse = recorded_run.record(tmp_path / 'sparse', **{'telemetry.decimation': 7})
+    result, few = verify(sparse), -(-SAMPLES // 7)
+    assert (result.difference, result.compared) == (None, 1.0)
+    assert compared(result) == counts | {'reference': 4 * few, 'learning': 10 * few}
+    thinned = read_run(sparse)
+    np.testing.assert_array_equal(thinned.error, run.error)
+    np.testing.assert_allclose(thinned.reference, run.reference, rtol=0.0, atol=1e-15)
 
 
-def test_other_laws_and_a_narrowing_bound_replay_from_compressed_bags(tmp_path):
-    funnel = {'barrier.initial_bound': [0.02, 0.01], 'barrier.funnel_rate': 5.0}
-    for name, given in (
-        ('backstepping', {'law': 'backstepping'}),
-        ('slotine', {'law': 'slotine_li'}),
-        ('funnel', funnel),
-    ):
-        result = verify(recorded_run.record(tmp_path / name, 0.3, 'zstd', **given))
-        assert (result.difference, result.remarks) == (None, ())
-        assert EventType.PARAMETERS not in [item.type for item in result.events]
+@pytest.mark.parametrize(
+    'given',
+    [
+        {'law': 'backstepping'},
+        {'law': 'slotine_li'},
+        {'barrier.initial_bound': [0.02, 0.01], 'barrier.funnel_rate': 5.0},
+    ],
+)
+def test_other_laws_and_a_narrowing_bound_replay_from_compressed_bags(tmp_path, given):
+    result = verify(recorded_run.record(tmp_path / 'bag', 0.3, 'zstd', **given))
+    assert (result.difference, result.remarks) == (None, ())
+    assert EventType.PARAMETERS not in [item.type for item in result.events]
 
 
 @pytest.mark.parametrize(
@@ -123,49 +109,50 @@ def test_other_laws_and_a_narrowing_bound_replay_from_compressed_bags(tmp_path):
     ],
 )
 def test_flipped_bit_is_located_and_named_and_the_earliest_counts(
-    entries, rewritten, capsys, topic, at, field
+    entries, tmp_path, capsys, topic, at, field
 ):
-    changed = [list(entry) for entry in entries]
     for flipped, k, place in ((topic, 700, at), (COMMANDS, 800, -8), (LEARNING, 900, -40)):
-        raw = bytearray(of(changed, flipped)[k][3])
+        entry = of(entries, flipped)[k]
+        raw = bytearray(entry[3])
         raw[place] ^= 1
-        of(changed, flipped)[k][3] = bytes(raw)
-    path = rewritten(changed)
-    difference = verify(path).difference
+        entry[3] = bytes(raw)
+    path = recorded_run.write(tmp_path / 'bag', entries)
+    result = verify(path)
+    difference = result.difference
     assert (difference.topic, difference.field) == (topic.resolved, field)
     assert difference.stamp == START + 700 * MILLISECOND
     assert difference.time == pytest.approx(0.7)
     assert difference.recorded != difference.replayed
     assert difference.recorded == pytest.approx(difference.replayed, abs=1e-12)
     assert main(['replay', str(path)]) == DIFFERENT
-    last = capsys.readouterr().out.splitlines()[-1]
+    *lines, last = capsys.readouterr().out.splitlines()
     assert last.startswith('DIFFERENT, first at 0.700000 s (stamp 1700000000 ns), /blf_dsc_c')
     assert f'recorded {difference.recorded!r}, replayed {difference.replayed!r}' in last
+    for found in result.comparisons:
+        assert (found.difference is None) == (found.topic not in (topic.resolved, *FLIPPED))
+        assert (found.largest > 0.0) == (found.difference is not None)
+    largest = max(found.largest for found in result.comparisons if found.topic == topic.resolved)
+    assert any(f'{topic.resolved}: ' in x and f'at most {largest:.3g}' in x for x in lines)
 
 
-def test_message_with_another_stamp_is_a_difference(entries, rewritten):
-    changed = [list(entry) for entry in entries]
-    (bound,) = of(changed, BOUND)
+FLIPPED = COMMANDS.resolved, LEARNING.resolved
+
+
+def test_message_with_another_stamp_is_a_difference(entries, tmp_path):
+    (bound,) = of(entries, BOUND)
     bound[3] = bound[3][:4] + bytes([bound[3][4] ^ 1]) + bound[3][5:]
-    difference = verify(rewritten(changed)).difference
+    difference = verify(recorded_run.write(tmp_path / 'bag', entries)).difference
     assert (difference.topic, difference.replayed) == (BOUND.resolved, np.inf)
 
 
-def test_repeated_and_unused_states_are_skipped(entries, rewritten):
+def test_repeated_and_unused_states_are_skipped(entries, tmp_path):
     states = of(entries, JOINT_STATES)
     at = START + 300 * MILLISECOND + 5
     late = JointStateEncoder(('joint1', 'joint2')).encode(at, [9, 9], [9, 9], [9, 9])
-    unused = [JOINT_STATES.resolved, JOINT_STATES.type, at, late]
     place = entries.index(states[301])
-    result = verify(rewritten([states[0], *entries[:place], unused, *entries[place:]]))
+    entries.insert(place, [JOINT_STATES.resolved, JOINT_STATES.type, at, late])
+    result = verify(recorded_run.write(tmp_path / 'bag', [states[0], *entries]))
     assert (result.difference, result.passed_over, result.samples) == (None, 2, SAMPLES)
-
-
-def test_recording_that_started_late_is_rejected(entries, rewritten):
-    late = [entry for entry in entries if entry[2] > START + 200 * MILLISECOND]
-    journal = of(entries, JOURNAL)
-    with pytest.raises(BlfDscError, match=f'with the stamp {START} ns, .* start the recorder'):
-        verify(rewritten([*journal, *late]))
 
 
 @pytest.mark.parametrize(
@@ -183,8 +170,8 @@ def test_lost_message_leaves_the_others_to_compare(
     entries, tmp_path, capsys, topic, number, publishers, percent, commands
 ):
     lost = of(entries, topic)[number]
-    kept = [[*entry[:3], None] if entry is lost else entry for entry in entries]
-    path = recorded_run.write(tmp_path / 'bag', kept, publishers=publishers)
+    lost[3] = None
+    path = recorded_run.write(tmp_path / 'bag', entries, publishers=publishers)
     result = verify(path)
     assert result.difference is None
     assert compared(result)['commands'] == 2 * commands
@@ -200,24 +187,45 @@ def test_lost_message_leaves_the_others_to_compare(
         assert found == pytest.approx(percent, abs=1.5)
 
 
-@pytest.mark.parametrize('topics', [[JOINT_STATES], [JOURNAL, JOINT_STATES]])
-def test_bag_without_a_controller_has_nothing_to_compare(entries, rewritten, topics):
-    path = rewritten([entry for topic in topics for entry in of(entries, topic)])
-    with pytest.raises(BlfDscError, match=r'/joint_states \(1001\)'):
+@pytest.mark.parametrize(
+    ('topics', 'after', 'words'),
+    [
+        ([JOINT_STATES], 0, r'/joint_states \(1001\)'),
+        ([JOURNAL, JOINT_STATES], 0, r'/joint_states \(1001\)'),
+        (
+            [JOURNAL, JOINT_STATES, TRACKING_ERROR],
+            200,
+            f'with the stamp {START} ns, .* start the r',
+        ),
+        ([JOURNAL], -1, 'does not hold the beginning of /blf_dsc_controller/journal: start the re'),
+    ],
+)
+def test_bag_without_what_a_replay_needs_is_refused(entries, tmp_path, topics, after, words):
+    events = of(entries, JOURNAL)
+    if after < 0:
+        kept = [entry for entry in entries if entry is not events[0]]
+    else:
+        begin = START + after * MILLISECOND
+        kept = [
+            entry
+            for topic in topics
+            for entry in of(entries, topic)
+            if entry in events or entry[2] >= begin
+        ]
+    path = recorded_run.write(tmp_path / 'bag', kept)
+    with pytest.raises(BlfDscError, match=words):
         verify(path)
     if JOURNAL not in topics:
-        with pytest.raises(BagError, match='not hold the configuration'):
+        with pytest.raises(BlfDscError, match='not hold the configuration'):
             read_content(path).controller_config()
 
 
 def configured(entries, change):
-    """Messages with another content of the first event."""
-    changed = [list(entry) for entry in entries]
-    first = of(changed, JOURNAL)[0]
+    """Change the content of the first event."""
+    first = of(entries, JOURNAL)[0]
     event = decode(first[3])
     change(event.content)
     first[3] = event.encode()
-    return changed
 
 
 def test_what_limits_a_result_is_remarked(bag, entries, tmp_path, monkeypatch):
@@ -227,11 +235,12 @@ def test_what_limits_a_result_is_remarked(bag, entries, tmp_path, monkeypatch):
         content['machine'] |= {'tunables': 'glibc.cpu.hwcaps=-FMA', 'libc': 'glibc 2.99'}
         del content['parameters']['learning.compensation']
 
-    changed = configured(entries, change)
+    configured(entries, change)
     lost = '0 missed, 201 sent before the recorder connected'
     facts = {'package_version': __version__, 'messages /joint_states': f'800 written, {lost}'}
-    path = recorded_run.write(tmp_path / 'bag', changed, **facts)
-    missed, newer, libc, tunables = verify(path).remarks
+    missed, newer, libc, tunables = verify(
+        recorded_run.write(tmp_path / 'bag', entries, **facts)
+    ).remarks
     assert missed == f'the recorder missed messages of /joint_states: {lost}'
     assert 'before the law had learning.compensation' in newer
     assert libc.startswith('recorded with libc glibc 2.99 and replayed with')
@@ -249,18 +258,6 @@ def test_bag_of_an_earlier_version_is_read_and_its_replay_is_refused(capsys):
     assert np.isfinite([run.position, run.error, run.torque, run.bound]).all()
     assert main(['replay', str(bag)]) == 1
     assert 'recorded by an earlier version, whose controller did not' in capsys.readouterr().err
-
-
-def test_configuration_of_another_version_is_rejected(entries, tmp_path, monkeypatch):
-    changed = configured(
-        entries, lambda content: content['parameters'].update({'barrier.shape': 2})
-    )
-    path = recorded_run.write(tmp_path / 'bag', changed, package_version='0.1.0')
-    with pytest.raises(ConfigurationError, match=r'barrier\.shape'):
-        verify(path)
-    monkeypatch.setattr('blf_dsc_controller.bags.content.__version__', '9.9.9')
-    with pytest.raises(ConfigurationError, match=r'journal by version 0\.1\.0, not 9\.9\.9'):
-        verify(path)
 
 
 # The command.
@@ -281,15 +278,25 @@ def test_identical_replay_exits_with_zero_and_a_verdict(bag):
     assert 'x real time' in run.stdout
 
 
-def test_bag_replays_bit_for_bit_without_its_urdf_file(tmp_path):
+def test_bag_replays_without_its_urdf_file_and_is_read_with_unknown_parameters(
+    tmp_path, monkeypatch
+):
     urdf, file = tmp_path / 'arm.urdf', tmp_path / 'arm.yaml'
     urdf.write_text(random_urdf(3, seed=5)[0])
     file.write_text(OF_URDF.format(urdf=urdf))
-    loop = load_loop(file)
-    record = simulate(loop.controller, loop.plant)
-    write_bag(tmp_path / 'bag', record, loop.controller, 'none', loop.plant)
+    loop, bag = load_loop(file), tmp_path / 'bag'
+    write_bag(bag, simulate(loop.controller, loop.plant), loop.controller, 'none', loop.plant)
     for text in (random_urdf(3, seed=6)[0], None):  # changed, then deleted
         urdf.unlink() if text is None else urdf.write_text(text)
-        assert read_content(tmp_path / 'bag').controller_config() == loop.controller
-        assert verify(tmp_path / 'bag').difference is None
-        assert read_run(tmp_path / 'bag').arm is not None
+        assert read_content(bag).controller_config() == loop.controller
+        assert verify(bag).difference is None
+        assert read_run(bag).arm is not None
+    entries = recorded_run.messages(bag)
+    configured(entries, lambda content: content['parameters'].update({'barrier.shape': 2}))
+    bag = recorded_run.write(tmp_path / 'newer', entries, package_version='0.1.0')
+    monkeypatch.setattr('blf_dsc_controller.bags.content.__version__', '9.9.9')
+    with pytest.raises(ConfigurationError, match=r'(?s)by version 0\.1\.0, not 9.*barrier\.shape'):
+        verify(bag)
+    run = read_run(bag)
+    assert run.arm is not None
+    assert run.notes == ('recorded parameters that this version does not have: barrier.shape',)

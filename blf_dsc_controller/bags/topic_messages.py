@@ -9,6 +9,7 @@ from __future__ import annotations
 import os
 import tempfile
 from collections.abc import Collection, Mapping, Sequence
+from itertools import count
 from typing import NamedTuple
 
 import numpy as np
@@ -146,7 +147,8 @@ class _Part(NamedTuple):
     """Messages of one layout in a block, stored column by column."""
 
     layout: Layout
-    places: NDArray[np.intp]  # in the block
+    places: slice | NDArray[np.intp]  # in the block; a slice if it is the only part
+    size: int
     offset: int  # bytes
 
 
@@ -190,7 +192,9 @@ class TopicMessages:
                 places.setdefault(layout, []).append(k)
         self._blocks.append([])
         for each, found in places.items():
-            self._blocks[-1].append(_Part(each, np.array(found), self._file.seek(0, os.SEEK_END)))
+            size, offset = len(found), self._file.seek(0, os.SEEK_END)
+            of_part = slice(size) if size == len(waiting) else np.array(found)
+            self._blocks[-1].append(_Part(each, of_part, size, offset))
             self._file.write(self._decoded(each, [waiting[k] for k in found]).tobytes())
         self._file.flush()
 
@@ -225,17 +229,20 @@ class TopicMessages:
         self, column: int | Mapping[Layout, int], number: NDArray[np.int32]
     ) -> NDArray[np.int64]:
         """Return a column of some messages, which may differ by layout; NaN where unknown."""
-        known = number[number >= 0]
+        unknown = number < 0
+        known = number[~unknown] if unknown.any() else number
         first, last = (known.min() // _BLOCK, known.max() // _BLOCK + 1) if known.size else (0, 0)
         values = np.full((last - first) * _BLOCK + 1, _NAN)  # the last for those unknown
-        for k, block in enumerate(self._blocks[first:last]):
-            for layout, places, offset in block:
-                j = column if isinstance(column, int) else column.get(layout, -1)
+        for block, begin in zip(self._blocks[first:last], count(0, _BLOCK), strict=False):
+            for part in block:
+                j = column if isinstance(column, int) else column.get(part.layout, -1)
                 if j >= 0:
-                    size = 8 * places.size
-                    raw = os.pread(self._file.fileno(), size, offset + size * j)
-                    values[k * _BLOCK + places] = np.frombuffer(raw, np.int64)
-        return values[np.where(number < 0, -1, number - first * _BLOCK)]
+                    size = 8 * part.size
+                    raw = os.pread(self._file.fileno(), size, part.offset + size * j)
+                    values[begin : begin + _BLOCK][part.places] = np.frombuffer(raw, np.int64)
+        index = number - first * _BLOCK
+        index[unknown] = -1
+        return values[index]
 
     def joint_states(
         self,
@@ -271,8 +278,8 @@ class TopicMessages:
     def _numbers(self, layouts: Collection[Layout]) -> NDArray[np.int32]:
         """Return the numbers of all messages of these layouts, in order."""
         parts = [
-            k * _BLOCK + part.places
-            for k, block in enumerate(self._blocks)
+            np.arange(begin, begin + _BLOCK)[part.places]
+            for block, begin in zip(self._blocks, count(0, _BLOCK), strict=False)
             for part in block
             if part.layout in layouts
         ]
