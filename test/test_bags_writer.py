@@ -75,9 +75,8 @@ def test_other_libraries_read_the_whole_bag_by_its_own_definitions(tmp_path, com
     for schema in {schema.name: schema for schema, _, _ in found}.values():
         assert schema.encoding == 'ros2msg'
         types.register(get_types_from_msg(schema.data.decode(), schema.name))
-    assert {(c.topic, c.message_encoding, c.metadata['topic_type_hash']) for _, c, _ in found} == {
-        (topic.resolved, 'cdr', hash_) for topic, hash_ in HASHES.items()
-    }
+    channels = {(c.topic, c.message_encoding, c.metadata['topic_type_hash']) for _, c, _ in found}
+    assert channels == {(topic.resolved, 'cdr', hash_) for topic, hash_ in HASHES.items()}
     with Reader(tmp_path / 'bag') as bag:
         assert [c.msgcount for c in bag.connections] == [300, 300]
         messages = list(bag.messages())
@@ -88,23 +87,25 @@ def test_other_libraries_read_the_whole_bag_by_its_own_definitions(tmp_path, com
         assert (state.name, state.position.tolist()) == (['joint1', 'elbow'], [k, -k])
 
 
+QUALITY = """
+history: keep_last
+depth: 100
+reliability: reliable
+durability: volatile
+deadline: {sec: 9223372036, nsec: 854775807}
+lifespan: {sec: 9223372036, nsec: 854775807}
+liveliness: automatic
+liveliness_lease_duration: {sec: 9223372036, nsec: 854775807}
+avoid_ros_namespace_conventions: false
+"""
+
+
 def test_metadata_matches_rosbag2(tmp_path):
     write_messages(tmp_path / 'run', 3)
-    forever = {'sec': 9223372036, 'nsec': 854775807}
-    quality = {
-        'history': 'keep_last',
-        'depth': 100,
-        'reliability': 'reliable',
-        'durability': 'volatile',
-        'deadline': forever,
-        'lifespan': forever,
-        'liveliness': 'automatic',
-        'liveliness_lease_duration': forever,
-        'avoid_ros_namespace_conventions': False,
-    }
+    quality = yaml.safe_load(QUALITY)
     period = {
-        'starting_time': {'nanoseconds_since_epoch': START},
         'duration': {'nanoseconds': 2 * MILLISECOND + 1},
+        'starting_time': {'nanoseconds_since_epoch': START},
     }
     topics = [
         {
@@ -122,8 +123,7 @@ def test_metadata_matches_rosbag2(tmp_path):
     expected = {
         'version': 9,
         'storage_identifier': 'mcap',
-        'duration': period['duration'],
-        'starting_time': period['starting_time'],
+        **period,
         'message_count': 6,
         'topics_with_message_count': topics,
         'compression_format': '',
@@ -150,14 +150,11 @@ def test_topics_are_described_as_offered(tmp_path):
         given = bag.add_topic('/x', 'my_msgs/msg/X', [], Definition('int32 a\n', 'RIHS01_5'))
         bag.write(given, b'\0\1\0\0\7\0\0\0', START)
         bag.write(bag.add_topic('/a', JOINT_STATES.type, []), message(0), START)
-    topic, *_ = information(tmp_path / 'bag')['topics_with_message_count']
-    offered = topic['topic_metadata']['offered_qos_profiles']
-    assert [(each['durability'], each['history']) for each in offered] == [
-        ('transient_local', 'keep_last'), ('volatile', 'unknown')
-    ]  # fmt: skip
     with Reader(tmp_path / 'bag') as reader:
         bound, own, states = reader.connections
     assert [each.msgcount for each in (bound, own, states)] == [0, 1, 1]
+    offered = [(qos.durability.name, qos.history.name) for qos in bound.ext.offered_qos_profiles]
+    assert offered == [('TRANSIENT_LOCAL', 'KEEP_LAST'), ('VOLATILE', 'UNKNOWN')]
     assert (own.msgdef.data, own.digest) == ('int32 a\n', 'RIHS01_5')
     assert bound.msgdef == states.msgdef
 
@@ -176,17 +173,19 @@ def test_empty_bag_is_valid_and_an_existing_folder_is_left_alone(tmp_path):
 @pytest.mark.parametrize('compression', ['none', 'zstd'])
 def test_data_is_flushed_periodically(tmp_path, compression):
     """What another process sees on the disk survives a kill of this one."""
-    now = 0.0
-    bag = BagWriter(
-        tmp_path / 'bag', flush_interval=0.1, clock=lambda: now, compression=compression
-    )
+    now, path = 0.0, tmp_path / 'bag'
+    bag = BagWriter(path, flush_interval=0.1, clock=lambda: now, compression=compression)
     handle = bag.add_topic('/command', COMMANDS.type, [COMMANDS.offered])
     for k in range(1, 1001):
         now = k * 1e-3
         bag.write(handle, TORQUES.encode([1, 2]), START + k)
         if k % 7 == 0:  # at every phase of the flush interval; one message per millisecond
-            assert messages_on_disk(tmp_path / 'bag' / 'bag_0.mcap') >= k - 100
+            assert messages_on_disk(path / 'bag_0.mcap') >= k - 100
     bag.close()
+    complete = read(path)
+    bag.flush()  # by a timer that fires once more
+    bag.close()
+    assert read(path) == complete
 
 
 def test_memory_of_a_recorder_is_bounded_and_its_files_are_read_as_one(tmp_path):
@@ -201,8 +200,14 @@ def test_memory_of_a_recorder_is_bounded_and_its_files_are_read_as_one(tmp_path)
                 peaks.append(tracemalloc.get_traced_memory()[1])
                 tracemalloc.reset_peak()
         tracemalloc.stop()
-    assert len(list((tmp_path / 'bag').glob('*.mcap'))) == 6
     assert max(peaks) < 1.1 * peaks[1]
+    found = information(tmp_path / 'bag')
+    assert (found['starting_time'], found['duration']) == (
+        {'nanoseconds_since_epoch': 0},
+        {'nanoseconds': 59_999},
+    )
+    files = [(file['starting_time'], file['message_count']) for file in found['files']]
+    assert files == [({'nanoseconds_since_epoch': k}, 10_000) for k in range(0, 60_000, 10_000)]
     expected = [*map(message, range(60_000))]
     assert not recover(tmp_path / 'bag', tmp_path / 'clean').losses
     for name in ('bag', 'clean'):

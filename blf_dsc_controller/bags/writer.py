@@ -6,7 +6,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from math import inf
 from pathlib import Path
 from typing import Any
@@ -24,11 +24,22 @@ _MOST_CHUNKS = 10_000  # in a file, whose index is kept in memory until it ends
 _DURATIONS = ('deadline', 'lifespan', 'liveliness_lease_duration')
 
 
-def _period(start: int, end: int) -> dict[str, Any]:
-    """Return the time from the first message to the last [ns], as rosbag2 writes it."""
+@dataclass
+class _File:
+    """A file of the bag."""
+
+    name: str
+    start: int = FOREVER  # ns, of its first message
+    end: int = 0  # ns, of its last
+    messages: int = 0
+
+
+def _period(files: Sequence[_File]) -> dict[str, Any]:
+    """Return the time from the first message to the last, as rosbag2 writes it."""
+    start, end = min(file.start for file in files), max(file.end for file in files)
     return {
-        'starting_time': {'nanoseconds_since_epoch': start},
         'duration': {'nanoseconds': max(end - start, 0)},
+        'starting_time': {'nanoseconds_since_epoch': start},
     }
 
 
@@ -71,10 +82,8 @@ class BagWriter(AbstractContextManager['BagWriter']):
         self._clock = clock
         self._topics: list[dict[str, Any]] = []  # as in metadata.yaml, with definitions beside
         self._definitions: list[Definition] = []
-        self._files: list[dict[str, Any]] = []
+        self._files: list[_File] = []
         self._facts = {VERSION: __version__}
-        self._start = self._first = FOREVER  # ns, of all files, and of the last one
-        self._end = self._last = 0
         try:
             self.path.mkdir(parents=True)
         except FileExistsError:
@@ -130,8 +139,9 @@ class BagWriter(AbstractContextManager['BagWriter']):
         published = log_time if publish_time is None else publish_time
         self._writer.add_message(handle, log_time, raw, published, sequence)
         self._topics[handle - 1]['message_count'] += 1
-        self._files[-1]['message_count'] += 1
-        self._first, self._last = min(self._first, log_time), max(self._last, log_time)
+        file = self._files[-1]
+        file.start, file.end = min(file.start, log_time), max(file.end, log_time)
+        file.messages += 1
         self.flush_if_due()
 
     def note(self, facts: Mapping[str, str]) -> None:
@@ -169,10 +179,8 @@ class BagWriter(AbstractContextManager['BagWriter']):
 
     def _begin_file(self) -> None:
         """Begin the next file, with the topics of the previous one."""
-        name = f'{self.path.name}_{len(self._files)}.mcap'
-        self._first, self._last = FOREVER, 0
-        self._files.append({'path': name, **_period(FOREVER, 0), 'message_count': 0})
-        self._stream = (self.path / name).open('xb')
+        self._files.append(_File(f'{self.path.name}_{len(self._files)}.mcap'))
+        self._stream = (self.path / self._files[-1].name).open('xb')
         self._writer = Writer(self._stream, chunk_size=_CHUNK_SIZE, compression=self._compression)
         self._writer.start(profile='ros2', library=f'blf_dsc_controller {__version__}')
         self._schemas: dict[str, int] = {}
@@ -186,20 +194,19 @@ class BagWriter(AbstractContextManager['BagWriter']):
 
         The compression fields are those of rosbag2's own compression of whole files.
         """
-        self._files[-1].update(_period(self._first, self._last))
-        self._start, self._end = min(self._start, self._first), max(self._end, self._last)
-        period = _period(self._start, self._end)
         return {
             'version': 9,
             'storage_identifier': 'mcap',
-            'duration': period['duration'],
-            'starting_time': period['starting_time'],
-            'message_count': sum(file['message_count'] for file in self._files),
+            **_period(self._files),
+            'message_count': sum(file.messages for file in self._files),
             'topics_with_message_count': self._topics,
             'compression_format': '',
             'compression_mode': '',
-            'relative_file_paths': [file['path'] for file in self._files],
-            'files': self._files,
+            'relative_file_paths': [file.name for file in self._files],
+            'files': [
+                {'path': file.name, **_period([file]), 'message_count': file.messages}
+                for file in self._files
+            ],
             'custom_data': self._facts,
             'ros_distro': 'jazzy',
         }
