@@ -180,14 +180,8 @@ def make_parser() -> argparse.ArgumentParser:
         return made.add_argument
 
     names, force = (argparse.ArgumentParser(add_help=False) for _ in range(2))
-    names.add_argument(
-        '--map',
-        action='append',
-        default=[],
-        metavar='OURS=THEIRS',
-        help='name of a topic or a joint in the bag, such as commands=/arm/torque or '
-        'joint1=shoulder',
-    )
+    theirs = 'name of a topic or a joint in the bag, such as joint1=shoulder'
+    names.add_argument('--map', action='append', default=[], metavar='OURS=THEIRS', help=theirs)
     names.add_argument('--namespace', default='', help='robot to use, if a bag holds several')
     force.add_argument('--force', action='store_true', help='overwrite existing files')
     _add_run(partial(command, 'run'))
@@ -216,9 +210,9 @@ def _add_run(command: _Command) -> None:
     option('--view', nargs='?', const='127.0.0.1', metavar='HOST', help=page)
     option = command(
         'precompile',
-        'Compile the kernels of a configuration before its first start. They go into the cache of '
-        'the user (NUMBA_CACHE_DIR, or ~/.cache/blf_dsc_controller), so that controller and '
-        'simulated arm start within seconds: after an installation, or when a container is built.',
+        'Compile the kernels of a configuration before its first start. Controller and simulated '
+        'arm then start within seconds: after an installation, or when a container is built. The '
+        'kernels go into the cache of the user (NUMBA_CACHE_DIR, or ~/.cache/blf_dsc_controller).',
         '--config my.yaml',
     )
     option('--config', default='recommended', help=_CONFIG)
@@ -243,8 +237,8 @@ def _add_bags(
     option('--clock', action='store_true', help='publish the time of the bag on /clock')
     option = command(
         'report',
-        'Show one or several bags on one HTML page. It has zoomable plots, events, the '
-        'configuration and the moving arm, and needs no network.',
+        'Show one or several bags on one HTML page. It has zoomable plots, events and the '
+        'configuration, and needs no network.',
         'run1/bag run2/bag --out comparison.html',
         names,
         force,
@@ -254,9 +248,8 @@ def _add_bags(
     option = command(
         'view',
         'Show a running system, or a bag, on a page in the browser. It has the arm in 3D, its '
-        'errors inside their bounds, torques and estimates: of the system running in this ROS '
-        'domain, with buttons and sliders, or of a bag, with play and pause. It needs no network, '
-        'and by default only this computer can open it.',
+        'errors inside their bounds, torques and estimates. It needs no network, and by default '
+        'only this computer can open it.',
         'run1/bag',
         names,
     )
@@ -271,22 +264,12 @@ def _add_bags(
     )
     option('bag', type=Path, help='folder of the bag, or its .mcap file')
     option('--out', type=Path, help='new folder (BAG_recovered)')
-    option = command(
-        'export',
-        'Write a bag as a table, in CSV or Parquet. It has a row for each joint state.',
-        'run1/bag --out run1.csv',
-        names,
-        force,
-    )
+    about = 'Write a bag as a table, in CSV or Parquet. It has a row for each joint state.'
+    option = command('export', about, 'run1/bag --out run1.csv', names, force)
     option('bag', type=Path, help=_BAG)
     option('--out', type=Path, required=True, help='FILE.csv or FILE.parquet')
-    option = command(
-        'plot',
-        'Draw the pictures of a bag (tracking.png, ...) and write summary.json.',
-        'run1/bag --out pictures',
-        names,
-        force,
-    )
+    about = 'Draw the pictures of a bag (tracking.png, ...) and write summary.json.'
+    option = command('plot', about, 'run1/bag --out pictures', names, force)
     option('bag', type=Path, help=_BAG)
     option('--out', type=Path, default=Path(), help='folder to write into (.)')
 
@@ -324,32 +307,17 @@ def _add_identification(
     option('--urdf', required=True, help='URDF: a file, package://name/path, or a file in config/')
     option('--out', type=Path, help='URDF to write')
     option('--plot', type=Path, help='picture of measured and predicted torques to write (PNG)')
-    option(
-        '--payload',
-        type=Path,
-        nargs='?',
-        const=PICK_UP,
-        metavar='BAG',
-        help='identify a load: carried in this other bag, or without one, picked up in the first',
-    )
-    option(
-        '--effort',
-        choices=('torque', 'without-gravity', 'command'),
-        default='torque',
-        help='what efforts are: whole torque, or without that of gravity; or use commands (torque)',
-    )
+    load = 'identify a load: carried in this other bag, or without one, picked up in the first'
+    option('--payload', type=Path, nargs='?', const=PICK_UP, metavar='BAG', help=load)
+    efforts = ('torque', 'without-gravity', 'command')
+    what = 'what efforts are: whole torque, or without that of gravity; or use commands (torque)'
+    option('--effort', choices=efforts, default='torque', help=what)
     per_effort = 'torque per effort of each joint, for currents [N m/A]'
     option('--gains', type=float, nargs='+', default=(), help=per_effort)
     option('--base', default='', help='fixed link (the root)')
     option('--tip', default='', help='last link (that of the last joint in the bag)')
-    option(
-        '--gravity',
-        type=float,
-        nargs=3,
-        default=(0.0, 0.0, -9.81),
-        metavar=('X', 'Y', 'Z'),
-        help='gravity in the base frame [m/s^2] (0 0 -9.81)',
-    )
+    upright, given = (0.0, 0.0, -9.81), 'gravity in the base frame [m/s^2] (0 0 -9.81)'
+    option('--gravity', type=float, nargs=3, default=upright, metavar=tuple('XYZ'), help=given)
     largest = 'largest mass on the last link that is not in the URDF [kg] (3)'
     option('--rated-payload', type=float, default=3.0, help=largest)
 

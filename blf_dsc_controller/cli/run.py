@@ -55,27 +55,24 @@ def run(options: Namespace) -> int:
         config = _configuration(options)
     if options.view:
         _check_view(options)
-    out = make_folder(options.out)
-    try:
-        clock = 'plant' if config.plant.mode == 'lockstep' else 'wall'
-        recorder = {'output': str(out / 'bag'), 'clock': clock}
-        config = config._replace(recorder=change(config.recorder, recorder))
-        dump(out / 'config.yaml', config.by_node)
-        completed = True
-        if options.offline:
-            _run_offline(config, out / 'bag')
-        else:
-            from blf_dsc_controller.cli.session import run_session
+    options.out = out = make_folder(options.out)
+    clock = 'plant' if config.plant.mode == 'lockstep' else 'wall'
+    recorder = {'output': str(out / 'bag'), 'clock': clock}
+    config = config._replace(recorder=change(config.recorder, recorder))
+    dump(out / 'config.yaml', config.by_node)
+    completed = True
+    if options.offline:
+        _run_offline(config, out / 'bag')
+    else:
+        from blf_dsc_controller.cli.session import run_session
 
-            completed = run_session(config, out, options.domain, options.view)
-        try:
-            stopped = _report(out)
-        except BlfDscError as error:
-            if completed:
-                raise
-            print(f'blf_dsc run: interrupted, and nothing to draw: {error}', file=sys.stderr)
-    except OSError as error:
-        raise unwritable(Path(error.filename or out), error) from error
+        completed = run_session(config, out, options.domain, options.view)
+    try:
+        stopped = _report(out)
+    except BlfDscError as error:
+        if completed:
+            raise
+        print(f'blf_dsc run: interrupted, and nothing to draw: {error}', file=sys.stderr)
     if not completed:
         return INTERRUPTED
     return STOPPED if stopped else 0
