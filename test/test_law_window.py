@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from closed_loop_case import arbitrary, closed_loop, controller, plant, quick, recommended
+from closed_loop_case import arbitrary, closed_loop, controller, plant, quick
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from paper_case import NO_DISTURBANCE, configured, run
@@ -13,7 +13,6 @@ from paper_case import NO_DISTURBANCE, configured, run
 from blf_dsc_controller.compiled import cholesky
 from blf_dsc_controller.law import excitation, prediction, window
 from blf_dsc_controller.law.factory import column_names, controller_of
-from blf_dsc_controller.law.settings import LATCHES
 
 
 class Window:
@@ -310,23 +309,7 @@ def test_columns_are_not_checked_before_the_parameters_alone_are_excited():
 def test_much_weaker_window_does_not_replace_the_latched_one():
     """As when the reference stops; the paper, without change detection, takes any above sigma."""
     for detection, expected in ((1, [False, True]), (0, [True, True])):
-        settings, state, _ = arbitrary(0, change_detection=detection, latch=LATCHES.index('last'))
+        settings, state, _ = arbitrary(0, change_detection=detection)
         state.best_lambda[0] = 1.0
         weaker = [bool(excitation.is_preferred(settings, state, value)) for value in (0.9, 1.0)]
         assert weaker == expected
-
-
-@pytest.mark.parametrize('latch', LATCHES)
-def test_latch_keeps_the_last_or_the_best_excited_window(latch):
-    """As the excitation decays, `last` follows it down to sigma and `max` does not."""
-    gains = {'window': 1000, 'learning_start': 1.0, 'sigma': 1e-9, 'bias': False}
-    law = controller(recommended(latch=LATCHES.index(latch), **gains))
-    history = [
-        (law.state.latched_lambda[0], law.state.lambda_min[0])
-        for sample in closed_loop(law, plant(), 4.0)
-        if law.state.latched[0] and sample.k % law.settings.interval == 0
-    ]
-    held, present = np.transpose(history)
-    best = np.maximum.accumulate(present)
-    np.testing.assert_array_equal(held, present if latch == 'last' else best)
-    assert np.any(present < best)

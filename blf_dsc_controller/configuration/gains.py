@@ -197,9 +197,6 @@ class Learning:
     prediction: Literal['filtered', 'acceleration', 'lambda'] = _in_window(
         'filtered', 'prediction error by filtered regressor, estimated acceleration or Lambda (24)'
     )
-    latch: Literal['last', 'max'] = parameter(
-        'last', 'excited window that is latched: the last one (paper), or the best one'
-    )
     regularization: float = positive(1e-5, 'regularisation of the Newton step', symbol='rho')
     excitation_threshold: float = positive(
         0.003, 'minimum eigenvalue of the excitation matrix of an excited window', symbol='sigma'

@@ -27,7 +27,7 @@ from blf_dsc_controller.compiled import cholesky
 from blf_dsc_controller.compiled.jit import inner
 from blf_dsc_controller.compiled.layout import Array
 from blf_dsc_controller.law import adaptation, window
-from blf_dsc_controller.law.settings import BEST, Settings
+from blf_dsc_controller.law.settings import Settings
 from blf_dsc_controller.law.state import Signals, State
 
 _WARM = 4  # inverse iterations from the previous direction
@@ -93,7 +93,6 @@ def take_back(settings: Settings, state: State, signals: Signals) -> None:
 def forget_window(settings: Settings, state: State) -> None:
     """Clear the window, its filters and the latch; the estimate stays and becomes the anchor."""
     state.latched[0] = 0.0
-    state.latched_lambda[0] = 0.0
     state.best_lambda[0] = 0.0
     state.recent_residual[0] = 0.0
     state.rows[0] = 0.0
@@ -288,11 +287,9 @@ def readmit_columns(settings: Settings, state: State, signals: Signals) -> None:
 def is_preferred(settings: Settings, state: State, value: float) -> bool:
     """Return whether a window with lambda_min `value` may replace the latched one.
 
-    When the reference stops, `last` (27) would end with the weakest window above the threshold.  A
+    When the reference stops, (27) would end with the weakest window above the threshold.  A
     weaker window only has less information, unless the latched one is old or contradicted.
     """
-    if settings.latch == BEST:
-        return bool(value > state.latched_lambda[0])
     return bool(settings.change_detection == 0 or value >= _COMPARABLE * state.best_lambda[0])
 
 
@@ -330,7 +327,6 @@ def update_excitation(
             state.Phi[i, j] = signals.Phi[i, j]
             state.factor[i, j] = signals.factor[i, j]
     state.latched[0] = 1.0
-    state.latched_lambda[0] = value
     if state.rows[0] == settings.window:
         state.best_lambda[0] = max(value, state.best_lambda[0])
     state.latch_time[0] = t

@@ -36,7 +36,6 @@ from blf_dsc_controller.law import barrier
 from blf_dsc_controller.law.controller import Controller
 from blf_dsc_controller.law.settings import (
     COMPENSATIONS,
-    LATCHES,
     PREDICTIONS,
     SURFACES,
     TORQUE_SOURCES,
@@ -150,7 +149,6 @@ def settings_of_config(config: ControllerConfig) -> Settings:
         'm': m,
         'surface': SURFACES.index('filtered'),
         'prediction': PREDICTIONS.index(learning.prediction),
-        'latch': LATCHES.index(learning.latch),
         'update': UPDATES.index(learning.update),
         'torque_source': TORQUE_SOURCES.index(learning.torque_source),
         'effort_is_whole': int(config.robot.effort != 'commanded'),

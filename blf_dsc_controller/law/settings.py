@@ -11,7 +11,6 @@ from blf_dsc_controller.compiled.layout import Array, Fixed, view_of
 # The vector holds the index of each choice.
 SURFACES = ('filtered', 'linear')
 PREDICTIONS = ('filtered', 'acceleration', 'lambda')
-LATCHES = ('last', 'max')
 UPDATES = ('gradient', 'newton')
 TORQUE_SOURCES = ('command', 'effort')
 COMPENSATIONS = ('reference', 'state')
@@ -19,7 +18,6 @@ COMPENSATIONS = ('reference', 'state')
 LINEAR = SURFACES.index('linear')
 FILTERED = PREDICTIONS.index('filtered')
 LAMBDA = PREDICTIONS.index('lambda')
-BEST = LATCHES.index('max')
 NEWTON = UPDATES.index('newton')
 EFFORT = TORQUE_SOURCES.index('effort')
 REFERENCE = COMPENSATIONS.index('reference')
@@ -37,7 +35,6 @@ class Settings(NamedTuple):
     m: Fixed
     surface: int
     prediction: int
-    latch: int
     update: int
     torque_source: int
     effort_is_whole: int  # 1: measured efforts contain what the drive adds, 0: they do not

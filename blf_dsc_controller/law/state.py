@@ -21,7 +21,6 @@ class State(NamedTuple):
     latched: Cell  # 1 while a window (Phi_e, b_e) is latched
     latch_time: Cell  # T_e, s
     lambda_min: Cell  # of Phi at the last check
-    latched_lambda: Cell  # lambda_min of the latched window
     best_lambda: Cell  # largest of a full window since the last change, with decay
     columns_checked: Cell  # 1 once the disturbance columns are accepted or rejected
     residual: Cell  # mean square torque residual of the latched window, (N m)^2
