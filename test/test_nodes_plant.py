@@ -75,27 +75,16 @@ def test_arm_driven_too_fast_breaks_and_stands_still_until_reset(ros):
     assert not node.plant.is_broken
 
 
-def test_urdf_arm_is_simulated_and_its_description_and_truth_are_published(ros):
+def test_description_and_truth_of_a_urdf_arm_are_published(ros):
     description, truth = ros.listen(topics.ROBOT_DESCRIPTION), ros.listen(topics.TRUTH)
     given = {'robot.urdf': 'panda.urdf', 'robot.tip': 'panda_hand_tcp', 'truth.mass_factor': 1.2}
-    _, received, send = start_plant(ros, **given)
-    torque = np.linspace(5.0, 1.0, 7)
-    for count in range(2, 12):
-        send(torque)
-        ros.until(lambda k=count: len(received) == k)
-    ros.until(lambda: description and len(truth) == 2)
-
+    start_plant(ros, **given)
+    ros.until(lambda: description and truth)
     config = build(PlantConfig, given)
-    expected = plant_of(config)
-    for _ in range(10):
-        expected.measure()
-        expected.step(torque)
-    _, measured = states(received, config.joints)
-    np.testing.assert_array_equal(measured[-1].ravel(), expected.measure())
     assert description[0].data == config.robot.text
     names = (*parameter_names_of(config), *disturbance_names(config.joints))
     assert tuple(truth[-1].name[: len(names)]) == names
-    np.testing.assert_array_equal(truth[-1].position, expected.truth())
+    np.testing.assert_array_equal(truth[-1].position, plant_of(config).truth())
 
 
 def test_brake_holds_until_the_first_torque(ros):

@@ -348,7 +348,6 @@ class Handshake:
         self._complete_since: float | None = None
         self._to_reset = reset
         self._response: Any = None
-        self._requested = 0.0
 
     def reset_controller(self) -> Any:
         """Request a reset of the controller; return the future, or None without such a service."""
@@ -363,22 +362,19 @@ class Handshake:
             return False
         if self._complete_since is None:
             self._complete_since = now
-        if now - self._complete_since < _SETTLING_TIME:
+        waited = now - self._complete_since
+        if waited < _SETTLING_TIME:
             return False
         if self._to_reset:
-            self._to_reset = False
-            self._response = self.reset_controller()
-            self._requested = now
+            self._to_reset, self._response = False, self.reset_controller()
         if self._response is None:
             return True
-        if self._response.done():
-            result = self._response.result()
-            if not result.success:
-                self._log.warning(f'the controller was not reset: {result.message}')
-            return True
-        if now - self._requested < _RESET_TIMEOUT:
-            return False
-        self._log.warning('the controller did not respond to the reset request: starting anyway')
+        if not self._response.done():
+            if waited < _SETTLING_TIME + _RESET_TIMEOUT:
+                return False
+            self._log.warning('the controller did not respond to the reset: starting anyway')
+        elif not self._response.result().success:
+            self._log.warning(f'the controller was not reset: {self._response.result().message}')
         return True
 
 
