@@ -83,36 +83,34 @@ def _of_urdf(config: ControllerConfig, load: ReferenceLoad) -> Iterator[str]:
     if (joints := robot.placeholder_efforts(chain)) and not robot.rotor_inertia:
         largest = max(joint.effort for joint in chain.joints)
         yield (
-            f'torque.limit: an effort of up to {largest:g} N m for {", ".join(joints)} is not that '
-            f'of an arm of this weight: it limits nothing; the inertia of the drives and '
-            f'learning.residual_floor follow from the weight instead. Give the rated torques'
+            f'torque.limit: an effort of up to {largest:g} N m for {", ".join(joints)} limits '
+            'nothing on an arm of this weight, from which the inertia of the drives and '
+            'learning.residual_floor follow instead: give the rated torques'
         )
     if (joints := implausible_friction(chain)) and not (robot.viscous and robot.coulomb):
         yield (
             f'robot.coulomb: the friction in <dynamics> takes a quarter of the effort of '
-            f'{", ".join(joints)} or more: it is hardly real, so none of it is compensated before '
-            f'it is learned; give robot.viscous and robot.coulomb'
+            f'{", ".join(joints)} or more, hardly real, and is not compensated before it is '
+            'learned: give robot.viscous and robot.coulomb'
         )
     for i, joint in enumerate(chain.joints):
         limit = config.torque.limit[i]
         moments = np.linalg.eigvalsh(pseudo_inertia(joint.inertia))
         if moments[0] < -_IMPOSSIBLE * moments[-1]:
             yield (
-                f'robot.urdf: the inertia of what {joint.name} moves ({joint.link}) is impossible: '
-                f'one moment is larger than the sum of the other two: are they in kg m^2, about '
-                f'the centre of mass?'
+                f'robot.urdf: the inertia of what {joint.name} moves ({joint.link}) is impossible, '
+                'one moment above the sum of the others: is it in kg m^2, about the centre of mass?'
             )
         if math.isinf(joint.effort) and limit == UNKNOWN_EFFORT:
             yield (
                 f'torque.limit: {joint.name} has no effort in the URDF: {limit:g} N m is assumed; '
-                f'set the torque that its drive can withstand'
+                'set what its drive can withstand'
             )
         acceleration = limit / load.free_inertia[i]
         if acceleration < _SLUGGISH:
             yield (
                 f'robot.urdf: at its torque limit {joint.name} accelerates at only '
-                f'{acceleration:.2g} rad/s^2: are masses in kg, moments of inertia in kg m^2 and '
-                f'lengths in m?'
+                f'{acceleration:.2g} rad/s^2: are masses in kg, inertias in kg m^2, lengths in m?'
             )
         widest, bound = barrier.widest[i], barrier.bound[i]
         if widest > _FUNNEL * bound:
@@ -164,9 +162,9 @@ def _of_errors(config: ControllerConfig, errors: ExpectedErrors) -> Iterator[str
     worst = int(np.argmax(errors.unmodelled / bound))
     if errors.unmodelled[worst] > bound[worst]:
         yield (
-            f'barrier.bound: friction and unmodelled torque (learning.residual_floor) alone push '
-            f'{config.joints[worst]} about {errors.unmodelled[worst]:.2g} rad from its reference, '
-            f'past its bound of {bound[worst]:g} rad: give a wider bound'
+            'barrier.bound: friction and unmodelled torque (learning.residual_floor) alone push '
+            f'{config.joints[worst]} about {errors.unmodelled[worst]:.2g} rad from its reference: '
+            f'give more than {bound[worst]:g} rad'
         )
     worst = int(np.argmax(errors.pick_up / bound))
     peak = errors.pick_up[worst]
@@ -202,31 +200,28 @@ def _of_feedback(
             f'torque of {joint}',
             _MARGIN * need / limit,
             f'torque.limit: {joint} has {limit:g} N m, but with learning.initial_estimate the '
-            f'reference alone needs up to {need:.3g} N m: no bound can be kept with less, and '
-            f'a quarter more is recommended for errors and disturbances',
+            f'reference alone needs {need:.3g} N m: give that and a quarter more',
         )
     rate = load.rate(settings)
     product = rate * config.sample_time
     yield Finding(
         'feedback',
         product,
-        f'feedback.gain: K_p over the inertia is {rate:.3g} 1/s with '
-        f'learning.initial_estimate, {product:.2g} times the inverse of the sample time of '
-        f'{config.sample_time:g} s: above 1 the sampled loop has little margin for delays, and '
-        f'above 2 it chatters between the limits: lower the gain or the sample time',
+        f'feedback.gain: K_p over the inertia is {rate:.3g} 1/s with learning.initial_estimate, '
+        f'{product:.2g} times the inverse of sample_time: above 1 the loop has little margin for '
+        'delays, and above 2 it chatters between the limits: lower either',
     )
     fraction = float(np.max(settings.gamma * config.sample_time / damping))
     yield Finding(
         'disturbance',
         2.0 * fraction,
         f'disturbance.gain: in each sample the disturbance estimate absorbs {fraction:.2g} of '
-        f'the velocity feedback, more than half: it will oscillate against feedback.gain',
+        'the velocity feedback, and above a half it oscillates against feedback.gain: lower it',
     )
     yield Finding(
         'leakage',
         settings.eta * float(settings.gamma.max()) * config.sample_time,
-        'disturbance.leakage: eta gamma T is above 1: the leakage makes the disturbance estimate '
-        'oscillate',
+        'disturbance.leakage: eta gamma T > 1 makes the disturbance estimate oscillate: lower it',
     )
 
 
@@ -236,23 +231,22 @@ def _of_surface(config: ControllerConfig, settings: Settings, damping: Floats) -
     yield Finding(
         'filter',
         T / filtering,
-        f'surface.time_constant: {filtering:g} s is shorter than the sample time of {T:g} s: '
-        f'alpha2 then follows the measurement noise, and its derivative enters the torque',
+        f'surface.time_constant: {filtering:g} s is less than the sample time, {T:g} s: alpha2 '
+        'follows the measurement noise, and its derivative enters the torque: give more',
     )
     yield Finding(
         'surface',
         filtering * rate,
-        f'surface.gain, surface.mu: K/2 + mu is {rate:.3g} 1/s, but the filter of '
-        f'{filtering:g} s follows only {0.25 / filtering:.3g} 1/s without ringing: lower '
-        f'surface.time_constant or the gains',
+        f'surface.gain, surface.mu: K/2 + mu is {rate:.3g} 1/s, but a filter of {filtering:g} s '
+        f'rings above {0.25 / filtering:.3g} 1/s: lower surface.time_constant or the gains',
     )
     for joint, ratio in zip(config.joints, settings.slope_limit * T / damping, strict=True):
         yield Finding(
             f'barrier of {joint}',
             ratio / 2.0,
             f'barrier.slope_limit: past the knee of its barrier {joint} is corrected by '
-            f'{ratio:.2g} times its error in one sample, and above 2 the error grows: lower '
-            f'barrier.slope_limit below 2 feedback.gain / sample_time',
+            f'{ratio:.2g} times its error in a sample, and above 2 the error grows: give less than '
+            '2 feedback.gain / sample_time',
         )
 
 
@@ -268,9 +262,8 @@ def _of_learning(
     step = settings.kappa * rate * config.sample_time
     if step > 1.0:
         yield (
-            f'learning.weight: {what} is {step:.2g}: the estimate overshoots above 1 and '
-            f'diverges above 2: lower learning.weight, or learning.adaptation_gain and '
-            f'learning.column_gain'
+            f'learning.weight: {what} is {step:.2g}; above 1 the estimate overshoots, above 2 it '
+            'diverges: lower it, or learning.adaptation_gain and learning.column_gain'
         )
     if config.reference.type == 'sinusoids':
         for frequency in config.reference.frequency:
@@ -278,14 +271,13 @@ def _of_learning(
             if frequency > 0.0 and abs(periods - round(periods)) > _PERIODS:
                 yield (
                     f'learning.window: {learning.window:g} s are {periods:.3g} periods of the '
-                    f"reference's {frequency:g} rad/s: a disturbance of that period "
-                    f'averages out only over whole periods'
+                    f"reference's {frequency:g} rad/s: give whole ones, over which a disturbance "
+                    'of that period averages out'
                 )
     filtered = settings.prediction == FILTERED
     pole = learning.filter_pole if filtered else learning.derivative_filter
     if learning.settling_time * pole < (_FILTERED if filtered else _SETTLED):
         yield (
             f'learning.settling_time: {learning.settling_time:g} s is too short for the filters '
-            f'of the prediction error ({pole:g} rad/s): the initial transient is still in the '
-            f'first windows'
+            f'({pole:g} rad/s), whose transient is still in the first windows: give more'
         )
