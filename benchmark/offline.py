@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Offline loop against C, numpy, MuJoCo and pinocchio; growth with joints, unknowns and window.
+"""Offline loop against C, numpy, MuJoCo and pinocchio; growth with joints and unknowns.
 
 The C reference is compiled on demand and called through ctypes. The peers run the recommended
 configuration: all hold the torque over the sample and apply the disturbance, only the integration
@@ -223,13 +223,13 @@ def _package(duration: float) -> Callable[[], int]:
     return lambda: simulate(CONTROLLER, plant, supervised=False).stamps.size
 
 
-def learning(name: str, **changes: Any) -> ControllerConfig:
+def learning(name: str) -> ControllerConfig:
     """Return the controller of a preset, which learns from any window."""
     values = {
         'learning.excitation_threshold': _ANY_EXCITATION,
         'learning.change_detection': False,  # the states are noise, which no arm explains
     }
-    return change(load_loop(name).controller, values | changes)
+    return change(load_loop(name).controller, values)
 
 
 def label(config: ControllerConfig) -> str:
@@ -267,24 +267,11 @@ def updates(config: ControllerConfig) -> Callable[[], int]:
 
 def measure_growth() -> Iterator[Ratio]:
     """Measure the time per update relative to the two-link arm's, once the window is full."""
-    tones = {'learning.viscous': True, 'learning.frequencies': [1.0, 2.0]}
-    arms = {'two links': learning('recommended', **tones)}
-    arms |= {name: learning(name) for name in ('panda', 'ur5e')}
-    groups = {
-        'joints and unknowns': {f'{name}: {label(law)}': law for name, law in arms.items()},
-        'window': {
-            f'window of {n} samples': learning('recommended', **{'learning.window': n * T})
-            for n in (100, 100_000)
-        },
-    }
-    for group, configs in groups.items():
-        contestants = {_TWO_LINKS: updates(learning('recommended'))}
-        contestants |= {name: updates(config) for name, config in configs.items()}
-        times = interleaved(contestants, _GROWTH_ROUNDS)
-        for name, config in configs.items():
-            memory = controller_of(config).state_vector.nbytes / 1e6
-            update = 1e6 * np.median(times[name])
-            note = f'{update:.1f} us an update here, {memory:.1f} MB of state'
-            yield ratio(
-                f'growth with {group}', name, _TWO_LINKS, times[name], times[_TWO_LINKS], note
-            )
+    configs = {f'{name}: {label(learning(name))}': learning(name) for name in ('panda', 'ur5e')}
+    contestants = {_TWO_LINKS: updates(learning('recommended'))}
+    contestants |= {name: updates(config) for name, config in configs.items()}
+    group, times = 'growth with joints and unknowns', interleaved(contestants, _GROWTH_ROUNDS)
+    for name, config in configs.items():
+        memory = controller_of(config).state_vector.nbytes / 1e6
+        note = f'{1e6 * np.median(times[name]):.1f} us an update here, {memory:.1f} MB of state'
+        yield ratio(group, name, _TWO_LINKS, times[name], times[_TWO_LINKS], note)
