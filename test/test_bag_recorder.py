@@ -1,30 +1,62 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The recorder in one process with its publishers: what it records and what it reports."""
+"""The recorder: what it records, kills, a full disk, odd types, beside a loop.
+
+Sequence numbers of the publishers reveal losses. `make test-nightly` records a minute.
+"""
 
 from __future__ import annotations
 
+import json
+import os
+import random
+import signal
+import subprocess
+import sys
 import time
+from collections import Counter, defaultdict
+from pathlib import Path
 
 import pytest
 
 pytest.importorskip('rclpy', reason='needs ROS 2')
 
+from command import PATIENT, closed_loop
 from foreign_readers import messages_on_disk, read
+from mcap.reader import make_reader
 from nav_msgs.msg import Goals
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from ros_rig import RosRig
 from rosbags.rosbag2 import Reader
 from sensor_msgs.msg import JointState
+from small_disk import small_disk
 from std_msgs.msg import Float64MultiArray
 
 from blf_dsc_controller.analysis.report import read_bags
 from blf_dsc_controller.bags.content import read_content
-from blf_dsc_controller.messages.codecs import JointStateEncoder, definition
+from blf_dsc_controller.bags.recover import recover
+from blf_dsc_controller.messages import topics
+from blf_dsc_controller.messages.codecs import JointStateEncoder, definition, joint_state_stamp
 from blf_dsc_controller.messages.topics import FOREVER, Quality
 from blf_dsc_controller.nodes import recorder_node
 from blf_dsc_controller.nodes.endpoints import quality_of
 from blf_dsc_controller.nodes.recorder_node import BagRecorderNode
 
+KILLS, MOST, DURATION = (20, 10_000, 60) if os.environ.get('NIGHTLY') else (3, 1000, 3)  # s
+PATIENCE = 300.0  # s, until a test gives up on what should take a moment
+RECORDER = (sys.executable, '-m', 'blf_dsc_controller.nodes.recorder_node', '--ros-args')
+ODD_PARTICIPANT = Path(__file__).with_name('odd_participant.py')
 ENCODER = JointStateEncoder(['joint1', 'joint2'])
+# Kept for the recorder, which may match slightly later than the publisher.
+KEPT = QoSProfile(depth=5000, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+TOPICS = ('a', 'b', 'c', 'd', 'e')
+
+
+def encoded(number):
+    """Return a joint state with this number as its stamp [ns]."""
+    return ENCODER.encode(number, [1, 2], [3, 4], [5, 6])
+
+
+# In the process of its publishers.
 
 
 @pytest.fixture
@@ -48,34 +80,31 @@ def until_recorded(ros, recorder, **counts):
 def test_messages_are_recorded_byte_for_byte(ros, bag):
     recorder = ros.add(BagRecorderNode, output=str(bag))
     publisher = connected(ros, JointState, 'joint_states')
-    sent = [ENCODER.encode(k, [k, 1], [2, 3], [4, 5]) for k in range(1000)]
+    sent = [encoded(k) for k in range(1050)]
     before = time.time_ns()
     for k, raw in enumerate(sent):
         publisher.publish(raw)
-        if k % 50 == 49:
+        if k % 50 == 49 and k < 1000:
             until_recorded(ros, recorder, joint_states=k + 1)
-    after = time.time_ns()
-    for _ in range(50):
-        publisher.publish(sent[0])
+            after = time.time_ns()
     assert publisher.wait_for_all_acked()
     recorder.close()
     states = [entry for entry in read(bag) if entry[0] == '/joint_states']
     # The last ones were received before it was closed, without spinning the executor once more.
-    assert [raw for _, _, raw in states] == [*sent, *[sent[0]] * 50]
-    stamps = [stamp for _, stamp, _ in states[: len(sent)]]
+    assert [raw for _, _, raw in states] == sent
+    stamps = [stamp for _, stamp, _ in states[:1000]]
     assert [before, *stamps, after] == sorted([before, *stamps, after])
 
 
 def test_publishers_of_every_quality_are_recorded(ros, bag):
     """Latched before the recorder came, best effort, and both on one topic; not those of others."""
-    latched = QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL)
     best_effort = QoSProfile(depth=10, reliability=ReliabilityPolicy.BEST_EFFORT)
     create = ros.tester.create_publisher
-    create(JointState, 'bound', latched).publish(JointState(name=['early']))
+    create(JointState, 'bound', KEPT).publish(JointState(name=['early']))
     other = create(JointState, 'other', 10)
     chosen = ['bound', 'sensor', '/mixed', '/never']
     recorder = ros.add(BagRecorderNode, output=str(bag), topics=chosen)
-    kinds = (('sensor', best_effort), ('mixed', latched), ('mixed', best_effort))
+    kinds = (('sensor', best_effort), ('mixed', KEPT), ('mixed', best_effort))
     publishers = [create(JointState, topic, quality) for topic, quality in kinds]
     ros.until(lambda: all(each.get_subscription_count() for each in publishers))
     for publisher in publishers:
@@ -84,7 +113,7 @@ def test_publishers_of_every_quality_are_recorded(ros, bag):
     assert other.get_subscription_count() == 0
     recorder.close()
     found = read(bag)
-    assert sorted(topic for topic, _, _ in found) == ['/bound', '/mixed', '/mixed', '/sensor']
+    assert Counter(topic for topic, _, _ in found) == {'/bound': 1, '/mixed': 2, '/sensor': 1}
     assert [b'early' in raw for topic, _, raw in found if topic == '/bound'] == [True]
 
 
@@ -135,15 +164,14 @@ def test_losses_are_counted_and_reported(ros, bag, capfd):
     """Messages sent before the recorder connected, and those dropped by a full queue."""
     publisher = ros.tester.create_publisher(JointState, 'joint_states', 100)
     for k in range(7):  # nobody subscribes yet, and nothing is kept
-        publisher.publish(ENCODER.encode(k, [k, k], [0, 0], [0, 0]))
+        publisher.publish(encoded(k))
     recorder = ros.add(BagRecorderNode, output=str(bag), topics=['joint_states'], queue_depth=5)
     ros.until(publisher.get_subscription_count)
-    publisher.publish(ENCODER.encode(8, [8, 8], [0, 0], [0, 0]))
-    until_recorded(ros, recorder, joint_states=1)
-    for k in range(9, 59):
-        publisher.publish(ENCODER.encode(k, [k, k], [0, 0], [0, 0]))
-    assert publisher.wait_for_all_acked()
-    until_recorded(ros, recorder, joint_states=6)
+    for burst, count in ((range(8, 9), 1), (range(9, 59), 6)):
+        for k in burst:
+            publisher.publish(encoded(k))
+        assert publisher.wait_for_all_acked()
+        until_recorded(ros, recorder, joint_states=count)
     missed = recorder._losses['/joint_states'].missed
     recorder.close()
     assert missed > 0
@@ -153,3 +181,195 @@ def test_losses_are_counted_and_reported(ros, bag, capfd):
     assert read_content(bag).losses == {'/joint_states': lost}
     (shown,) = read_bags([bag])
     assert ('lost', f'/joint_states: {lost}') in [event[1:] for event in shown.events]
+
+
+# In a process of its own.
+
+
+class Rig(RosRig):
+    """Publishers of the test on five topics, and recorders in processes of their own."""
+
+    def __init__(self):
+        super().__init__()
+        self.processes = []
+        create = self.tester.create_publisher
+        self.publishers = [create(JointState, topic, KEPT) for topic in TOPICS]
+
+    def start(self, command, **options):
+        """Start a process in the domain of the test."""
+        environment = {**os.environ, 'ROS_DOMAIN_ID': str(self.context.get_domain_id())}
+        process = subprocess.Popen(command, env=environment, text=True, **options)
+        self.processes.append(process)
+        return process
+
+    def record(self, output, chosen=TOPICS):
+        """Start a recorder, and wait until it has subscribed."""
+        words = ('-p', f'output:={output}', '-p', f'topics:=[{", ".join(chosen)}]')
+        process = self.start([*RECORDER, *words], stderr=subprocess.PIPE)
+        wanted = [each for each in self.publishers if each.topic_name[1:] in chosen]
+        self.until(lambda: all(each.get_subscription_count() for each in wanted))
+        return process
+
+    def publish(self, *numbers):
+        """Publish messages with these numbers as stamps [ns] on every topic."""
+        for number in numbers:
+            for publisher in self.publishers:
+                publisher.publish(encoded(number))
+            if number % 20 == 19:  # not faster than the 20,000 a second of a fast lock-step run
+                time.sleep(0.005)
+
+    def end(self, process, number=signal.SIGINT):
+        """Stop a recorder by a signal; return its exit code and output."""
+        process.send_signal(number)
+        _, output = process.communicate(timeout=PATIENCE)
+        assert 'Traceback' not in output
+        return process.returncode, output
+
+    def close(self):
+        for process in self.processes:
+            if process.poll() is None:
+                process.kill()
+                process.communicate()
+        super().close()
+
+
+@pytest.fixture
+def rig():
+    ros = Rig()
+    yield ros
+    ros.close()
+
+
+def counts(bag):
+    with Reader(bag) as reader:
+        return {connection.topic: connection.msgcount for connection in reader.connections}
+
+
+@pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
+def test_all_is_on_disk_while_it_runs_and_a_signal_completes_the_bag(rig, bag, number):
+    process = rig.record(bag)
+    rig.publish(*range(2000))  # then no message follows to flush it
+    rig.until(lambda: messages_on_disk(bag / 'bag_0.mcap') == 10_000)
+    code, output = rig.end(process, number)
+    assert code == 0, output
+    assert counts(bag) == {f'/{topic}': 2000 for topic in TOPICS}
+    assert all(f'/{topic}: 2000 messages, 0 missed' in output for topic in TOPICS)
+    assert 'invalid' not in output  # a context that was shut down
+
+
+def test_signal_before_any_message_leaves_an_empty_bag_that_is_not_overwritten(rig, bag):
+    process = rig.record(bag, ['never'])
+    rig.until(bag.exists)
+    code, output = rig.end(process, signal.SIGTERM)
+    assert code == 0, output
+    assert counts(bag) == {}
+    assert '/never: never appeared' in output
+    process = rig.record(bag, ['never'])
+    _, output = process.communicate(timeout=PATIENCE)
+    assert process.returncode == 1
+    assert f'{bag} exists already' in output
+    assert 'Traceback' not in output
+
+
+def test_full_disk_stops_the_recorder_with_one_error(rig, tmp_path):
+    with small_disk(tmp_path / 'disk', 2) as disk:
+        process = rig.record(disk / 'bag', 'a')
+        deadline = time.monotonic() + PATIENCE
+        while process.poll() is None:
+            assert time.monotonic() < deadline, 'still recording'
+            rig.publish(*range(100))
+        _, output = process.communicate()
+        assert process.returncode == 1
+        hint = f'No space left on device; blf_dsc recover {disk / "bag"}'
+        assert output.count(hint) == output.count('No space left') == 1
+        assert 'Traceback' not in output
+        assert recover(disk / 'bag', tmp_path / 'clean').messages['/a'] > 1000
+
+
+def test_unknown_message_packages_are_not_imported_and_do_not_stop_the_recorder(rig, bag):
+    process = rig.record(bag, ['a', 'f', 'g', 'h', 'i'])
+    names = {'f': 'unittest::__main__::X', 'g': 'foo::X', 'h': 'unittest::msg::X', 'i': 'X'}
+    odd = [sys.executable, ODD_PARTICIPANT]
+    rig.start([*odd, *(f'{topic}={name}' for topic, name in names.items())])
+    output = wait_for_lines(process, [f'/{topic} is not recorded: its type' for topic in names])
+    assert output.count('/g is not recorded') == 1
+    assert '/f is not recorded: its type unittest/__main__/X is not installed here' in output
+    assert '/g is not recorded: its type foo/X is not installed here' in output
+    rig.publish(1)
+    rig.start([*odd, 'j=std_msgs::msg::\udce4'])  # not UTF-8
+    wait_for_lines(process, ['the name of a topic or type is not UTF-8'])
+    rig.publish(2)
+    content = encoded(1)[12:]  # after the stamp
+    rig.until(lambda: (bag / 'bag_0.mcap').read_bytes().count(content) == 2)
+    assert rig.end(process)[0] == 0
+    assert [topic for topic, _, _ in read(bag)] == ['/a', '/a']
+
+
+def wait_for_lines(process, expected):
+    """Read the output of a recorder until it has all expected texts; return it."""
+    output = ''
+    while not all(text in output for text in expected):
+        line = process.stderr.readline()
+        assert line, f'it has ended: {output}'
+        output += line
+    return output
+
+
+@pytest.mark.parametrize('k', range(KILLS))
+def test_kill_loses_nothing_that_was_written(k, rig, bag, tmp_path):
+    """How soon it is written: see test_data_is_flushed_periodically."""
+    process = rig.record(bag)
+    rig.publish(*range(random.Random(k).randrange(50, MOST)))  # noqa: S311
+    written = messages_on_disk(bag / 'bag_0.mcap')
+    process.kill()
+    process.wait()
+    *cut, last = recover(bag, tmp_path / 'clean').losses
+    assert 'the recording was not closed' in last
+    assert all('(cut off)' in loss for loss in cut)
+    numbers = {f'/{topic}': [] for topic in TOPICS}
+    for topic, _, raw in read(tmp_path / 'clean'):
+        numbers[topic].append(joint_state_stamp(raw))
+    assert sum(map(len, numbers.values())) >= written
+    assert all(found == list(range(len(found))) for found in numbers.values())
+
+
+def test_real_time_loop_is_timed_and_every_message_of_it_is_in_the_bag(tmp_path):
+    # Only one node in real time, which cannot keep the others from both processors.
+    fifo = 'sim_plant:\n  ros__parameters:\n    realtime: {priority: 10, lock_memory: true}\n'
+    config, out = tmp_path / 'fifo.yaml', tmp_path / 'out'
+    config.write_text(fifo + PATIENT)
+    arguments = ('--config', config, '--mode', 'realtime', '--duration', DURATION)
+    run = closed_loop(*arguments, '--out', out)
+    assert run.returncode == 0, run.stderr
+    assert 'real time' in run.stdout
+    assert 'late steps' in run.stdout
+    timing = json.loads((out / 'summary.json').read_text())['timing']
+    assert set(timing) == {'rate_hz', 'latency_us', 'late_steps'}
+    assert timing['rate_hz'] > 0.0
+    assert list(timing['latency_us']) == ['p50', 'p99', 'p99.9', 'max']
+    assert timing['late_steps'] >= 0
+    logs = [
+        (out / 'logs' / f'{node}.log').read_text() for node in (topics.PLANT, topics.CONTROLLER)
+    ]
+    # Granted or denied, as this machine permits, but always logged.
+    assert 'SCHED_FIFO priority 10' in logs[0]
+    assert 'memory' in logs[0]
+
+    numbers = defaultdict(list)
+    with (out / 'bag' / 'bag_0.mcap').open('rb') as stream:
+        for _, channel, message in make_reader(stream).iter_messages():
+            numbers[channel.topic].append(message.sequence)
+    facts, found = read_content(out / 'bag').facts, Counter()
+    answered = (topics.REFERENCE, topics.TRACKING_ERROR, topics.LEARNING)
+    for topic in (topics.JOINT_STATES, topics.TIMING, topics.COMMANDS, *answered):
+        name, found[topic] = topic.resolved, len(numbers[topic.resolved])
+        assert numbers[name] == list(range(1, found[topic] + 1))
+        assert facts[f'messages {name}'] == f'{found[topic]} written, 0 missed'
+    # On a busy machine the first torque may take seconds, and the plant sends its state again.
+    again = logs[0].count('sending the state again')
+    assert found[topics.JOINT_STATES] == 1000 * DURATION + 1 + again
+    assert found[topics.TIMING] == 1000 * DURATION  # one for each step
+    # On a busy machine the controller may skip a state; it then publishes nothing for it.
+    assert len({found[topic] for topic in answered}) == 1
+    # Nor were the last ones lost, which no later sequence number would reveal.
+    assert not any('not reach every' in log for log in logs)
