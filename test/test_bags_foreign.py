@@ -9,14 +9,12 @@ import numpy as np
 import pytest
 import recorded_run
 from rosbags.rosbag1 import Writer as Writer1
-from rosbags.rosbag2 import StoragePlugin, Writer
+from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 from synthetic_bag import Synthetic
 
 from blf_dsc_controller.bags.content import NameMap, read_content
 from blf_dsc_controller.bags.reader import applied_torque, read_run, single_run
-from blf_dsc_controller.bags.sources import BagError
-from blf_dsc_controller.bags.topic_messages import UnreadableMessageError
 from blf_dsc_controller.cli.main import main
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.messages.codecs import (
@@ -57,24 +55,23 @@ def spread(values):
 def foreign(torque='array', fields=('position', 'velocity', 'effort')):
     """Topic, type, time and bytes of each message as another robot's software writes it."""
     states = JointStateEncoder(SHUFFLED, fields)
-    arrays = {size: Float64MultiArrayEncoder(size) for size in (2, 3, 4)}
-    measured = [ARM.position, ARM.error, ARM.disturbance]
     for k, stamp in enumerate(ARM.stamp.tolist()):
-        q, dq, effort = (spread(field[k]) for field in measured)
-        known = (q, dq, effort)[: len(fields)]
-        yield '/arm/states', JOINT_STATE, stamp, states.encode(stamp, *known)
+        known = [spread(field[k]) for field in (ARM.position, ARM.error, ARM.disturbance)]
+        yield '/arm/states', JOINT_STATE, stamp, states.encode(stamp, *known[: len(fields)])
         command = ARM.torque[k]
-        sent = {'array': spread(command), 'pair': command, 'three': [1, 2, 3]}
-        if torque in sent:
-            raw = arrays[len(sent[torque])].encode(sent[torque])
+        sent = {'array': spread(command), 'pair': command, 'three': [1, 2, 3]}.get(torque)
+        if sent is not None:
+            raw = Float64MultiArrayEncoder(len(sent)).encode(sent)
             yield '/arm/torque', FLOAT64_MULTI_ARRAY, stamp + 9, raw
         if torque == 'state':
             raw = states.encode(stamp, [0] * 4, [0] * 4, spread(command))
             yield '/arm/torque', JOINT_STATE, stamp + 9, raw
 
 
-def write(path, messages, storage=StoragePlugin.MCAP, version=9):
-    with Writer(path, version=version, storage_plugin=storage) as writer:
+def write(path, messages, storage=StoragePlugin.MCAP, version=9, compression=CompressionMode.NONE):
+    writer = Writer(path, version=version, storage_plugin=storage)
+    writer.set_compression(compression, CompressionFormat.ZSTD)
+    with writer:
         connections = {}
         for topic, type_name, at, raw in messages:
             if topic not in connections:
@@ -92,32 +89,39 @@ def write_ros1(path, messages):
                 connections[topic] = writer.add_connection(topic, type_name, typestore=store)
             message = typestore().deserialize_cdr(raw, type_name)
             if type_name == JOINT_STATE:
-                types = store.types
-                stamp = message.header.stamp
-                header = types['std_msgs/msg/Header'](
-                    seq=k,
-                    stamp=types['builtin_interfaces/msg/Time'](stamp.sec, stamp.nanosec),
-                    frame_id=message.header.frame_id,
-                )
+                stamp, types = message.header.stamp, store.types
+                time = types['builtin_interfaces/msg/Time'](stamp.sec, stamp.nanosec)
+                header = types['std_msgs/msg/Header'](k, time, 'base_link')
                 arrays = (message.name, message.position, message.velocity, message.effort)
                 message = types[JOINT_STATE](header, *arrays)
             writer.write(connections[topic], at, store.serialize_ros1(message, type_name))
     return path
 
 
+MCAP, SQLITE3 = StoragePlugin.MCAP, StoragePlugin.SQLITE3
+
+
 @pytest.mark.parametrize(
-    ('kind', 'torque'),
-    [('mcap', 'array'), ('mcap', 'pair'), ('sqlite3', 'state'), ('humble', 'array'), ('1', 'pair')],
+    ('storage', 'version', 'compression', 'torque'),
+    [
+        (MCAP, 9, CompressionMode.NONE, 'array'),
+        (MCAP, 9, CompressionMode.FILE, 'pair'),
+        (MCAP, 9, CompressionMode.MESSAGE, 'array'),
+        (SQLITE3, 8, CompressionMode.NONE, 'state'),
+        (SQLITE3, 8, CompressionMode.FILE, 'array'),
+        (SQLITE3, 8, CompressionMode.MESSAGE, 'array'),
+        (SQLITE3, 5, CompressionMode.NONE, 'array'),  # of Humble, without definitions
+        (None, 1, CompressionMode.NONE, 'pair'),  # of ROS 1
+    ],
 )
-def test_shuffled_and_extra_joints_are_read_by_name(tmp_path, kind, torque):
-    messages, path = foreign(torque), tmp_path / 'bag'
-    if kind == '1':
-        path = write_ros1(tmp_path / 'run.bag', messages)
-    elif kind == 'mcap':
-        write(path, messages)
+def test_shuffled_and_extra_joints_are_read_by_name(
+    tmp_path, storage, version, compression, torque
+):
+    if version == 1:
+        path = write_ros1(tmp_path / 'run.bag', foreign(torque))
     else:
-        write(path, messages, StoragePlugin.SQLITE3, 8)
-    if kind == 'humble':  # without message definitions
+        path = write(tmp_path / 'bag', foreign(torque), storage, max(version, 8), compression)
+    if version == 5:
         text = (path / 'metadata.yaml').read_text()
         (path / 'metadata.yaml').write_text(text.replace('version: 8', 'version: 5'))
     run = read_run(path, names=names_of())
@@ -129,31 +133,32 @@ def test_shuffled_and_extra_joints_are_read_by_name(tmp_path, kind, torque):
         np.testing.assert_array_equal(values, known)
 
 
-def torque_of(path, names):
+def torque_of(path, messages, names):
     """Torques as `identify` reads them, and where they are from."""
-    content = read_content(path, '', names)
+    content = read_content(write(path, messages), '', names)
     states, _, _ = single_run(content, names.joints_of(('joint1', 'joint2')))
     source, torque = applied_torque(content, states)
     return source, torque.field(2)
 
 
 def test_torques_are_those_of_the_commands_or_measured_or_unknown(tmp_path):
-    names = names_of(commands=None)
-    source, torque = torque_of(write(tmp_path / 'bag', foreign('effort')), names)
+    unmapped = names_of(commands=None)
+    source, torque = torque_of(tmp_path / 'bag', foreign('effort'), unmapped)
     assert source == 'effort of /arm/states'
     # The effort of a state is the torque that led to it: the last torque is unknown.
     np.testing.assert_array_equal(torque[:-1], ARM.disturbance[1:])
     assert np.isnan(torque[-1]).all()
-    with pytest.raises(BlfDscError, match='--map commands='):
-        torque_of(write(tmp_path / 'bare', foreign('', ('position', 'velocity'))), names)
-    with pytest.raises(BlfDscError, match='3 values, but there are 2 joints, and 4 in'):
-        torque_of(write(tmp_path / 'three', foreign('three')), names_of())
-    messages = list(foreign('pair'))
-    mixed = messages[:100] + list(foreign('array'))[100:]
-    with pytest.raises(UnreadableMessageError, match='not every message holds the same 2 values'):
-        torque_of(write(tmp_path / 'mixed', mixed), names_of())
-    kept = [entry for k, entry in enumerate(messages) if entry[0] != '/arm/torque' or k % 4 == 1]
-    source, torque = torque_of(write(tmp_path / 'slow', kept), names_of())
+    pairs = list(foreign('pair'))
+    mixed = pairs[:100] + list(foreign('array'))[100:]
+    for messages, names, words in (
+        (foreign('', ('position', 'velocity')), unmapped, '--map commands='),
+        (foreign('three'), names_of(), '3 values, but there are 2 joints, and 4 in'),
+        (mixed, names_of(), 'not every message holds the same 2 values'),
+    ):
+        with pytest.raises(BlfDscError, match=words):
+            torque_of(tmp_path / words[:3], messages, names)
+    kept = [entry for k, entry in enumerate(pairs) if entry[0] != '/arm/torque' or k % 4 == 1]
+    source, torque = torque_of(tmp_path / 'slow', kept, names_of())
     assert source == '/arm/torque'
     np.testing.assert_array_equal(torque[1], ARM.torque[0])  # previous command held
     np.testing.assert_array_equal(torque[2], ARM.torque[2])
@@ -167,13 +172,13 @@ def ours(tmp_path_factory):
 def test_wrong_names_are_reported_with_the_names_in_the_bag(ours, tmp_path):
     path = write(tmp_path / 'bag', foreign())
     swapped = {'joint_states': '/arm/torque', 'commands': '/arm/states'}
-    for bag, changes, error, message in (
-        (path, {'joint_states': '/arm/state'}, BagError, r"'/arm/state' of type sensor_msgs"),
-        (path, swapped, BagError, r'/arm/torque \(std_msgs'),
-        (path, {'joint1': 'x'}, UnreadableMessageError, "'x' is not in .* gripper, elbow"),
-        (ours, {**dict.fromkeys(MAP), 'joint3': 'base'}, BlfDscError, 'nor one of the joints'),
+    for bag, changes, message in (
+        (path, {'joint_states': '/arm/state'}, r"'/arm/state' of type sensor_msgs"),
+        (path, swapped, r'/arm/torque \(std_msgs'),
+        (path, {'joint1': 'x'}, "'x' is not in .* gripper, elbow"),
+        (ours, {**dict.fromkeys(MAP), 'joint3': 'base'}, 'nor one of the joints'),
     ):
-        with pytest.raises(error, match=message):
+        with pytest.raises(BlfDscError, match=message):
             read_run(bag, names=names_of(**changes))
     for entries, words in (
         *((([entry],), 'one side is missing') for entry in ('joint1', '=x', 'joint1=')),
@@ -183,29 +188,19 @@ def test_wrong_names_are_reported_with_the_names_in_the_bag(ours, tmp_path):
             NameMap.parse(*entries)
 
 
-# A gripper that shares /joint_states with the arm.
-
-
-@pytest.fixture(scope='module')
-def entries(ours):
-    """Messages of the arm, with one of the gripper before every third joint state."""
-    fingers, both = JointStateEncoder(('left_finger',)), []
+def test_gripper_on_the_same_topic_is_told_from_the_arm_under_any_name(ours, tmp_path, capsys):
+    fingers, entries = JointStateEncoder(('left_finger',)), []
     for k, entry in enumerate(recorded_run.messages(ours)):
         if entry[0] == JOINT_STATES.resolved and k % 3 == 0:
             at = entry[2] - 5
-            both.append([*entry[:2], at, fingers.encode(at, [0.01], [0.0], [9.0])])
-        both.append(entry)
-    return both
-
-
-def test_without_controller_topics_the_device_with_most_joints_is_the_arm(entries, tmp_path):
+            entries.append([*entry[:2], at, fingers.encode(at, [0.01], [0.0], [9.0])])
+        entries.append(entry)
+    # Without topics of a controller, the device with most joints is the arm.
     path = recorded_run.write(tmp_path / 'bag', recorded_run.of(entries, JOINT_STATES))
     assert read_run(path).joints == ('joint1', 'joint2')
     run = read_run(path, names=NameMap.parse(['grip=left_finger']))
     assert (run.joints, set(run.position[:, 0])) == (('grip',), {0.01})
 
-
-def test_every_command_reads_a_shared_topic_under_any_name(ours, entries, tmp_path, capsys):
     names = {JOINT_STATES.resolved: '/arm/states', COMMANDS.resolved: '/arm/torque'}
     messages = [[names.get(topic, topic), *rest] for topic, *rest in entries]
     shared = recorded_run.write(tmp_path / 'shared', entries)
@@ -224,14 +219,3 @@ def test_every_command_reads_a_shared_topic_under_any_name(ours, entries, tmp_pa
     assert '/arm/torque: 1002 values bit-equal' in capsys.readouterr().out
     # Without the mapping, the joint states are not found.
     assert main(['plot', str(renamed), '--out', str(tmp_path / 'none')]) == 1
-
-
-def test_states_without_stamps_are_rejected_with_the_reason(tmp_path):
-    driver = JointStateEncoder(('joint1', 'joint2'))
-    states = [
-        ['/joint_states', JOINT_STATE, k, driver.encode(0, [k, 0], [0, 0], [0, 0])]
-        for k in range(1, 50)
-    ]
-    path = recorded_run.write(tmp_path / 'bag', states)
-    with pytest.raises(BagError, match='all 49 messages of /joint_states have the stamp 0 ns'):
-        read_run(path)

@@ -37,6 +37,11 @@ def bag(tmp_path_factory):
 
 
 @pytest.fixture
+def entries(bag):
+    return recorded_run.messages(bag)
+
+
+@pytest.fixture
 def copy(bag, tmp_path):
     """A copy of the bag that a test may damage."""
     return shutil.copytree(bag, tmp_path / 'copy')
@@ -102,6 +107,11 @@ def with_joints(*joints):
     ]
 
 
+def unnamed(_):
+    raw = JointStateEncoder(()).encode(1, [], [], [])
+    return [['/joint_states', JOINT_STATE, k, raw] for k in range(9)]
+
+
 OTHER = ("'joint1' is not in the message, which names", 'another robot', '--map joint1=ITS_NAME')
 
 
@@ -112,25 +122,16 @@ OTHER = ("'joint1' is not in the message, which names", 'another robot', '--map 
         (of_type_string, ('of type sensor_msgs/msg/JointState', '(std_msgs/msg/String)'), ()),
         (with_joints('wheel', 'arm'), OTHER, ('identify',)),
         (with_joints('base', 'shoulder', 'elbow'), OTHER, ('identify',)),
+        (unnamed, ('it names no joint',), ('replay', 'identify')),
         (lambda _: [], ('is empty: it holds no message',), ()),
     ],
 )
-def test_bag_of_other_content(bag, tmp_path, all_say, change, words, but):
-    entries = change(recorded_run.messages(bag))
-    all_say(recorded_run.write(tmp_path / 'changed', entries), *words, but=but)
-
-
-def test_joint_states_without_joint_names(tmp_path, all_say):
-    raw = JointStateEncoder(()).encode(1, [], [], [])
-    path = recorded_run.write(
-        tmp_path / 'bag', [['/joint_states', JOINT_STATE, k, raw] for k in range(9)]
-    )
-    all_say(path, 'it names no joint', but=('replay', 'identify'))
+def test_bag_of_other_content(entries, tmp_path, all_say, change, words, but):
+    all_say(recorded_run.write(tmp_path / 'changed', change(entries)), *words, but=but)
 
 
 @pytest.mark.parametrize('schema', [('', b''), ('ros2msg', b'{{ no definition'), None])
-def test_missing_definition_of_another_topic_loses_no_other_message(bag, tmp_path, run, schema):
-    entries = recorded_run.messages(bag)
+def test_missing_definition_of_another_topic_loses_no_other_message(entries, tmp_path, run, schema):
     file = write_mcap(
         tmp_path / 'bag',
         [ODD, *entries],
@@ -148,8 +149,7 @@ def test_missing_definition_of_another_topic_loses_no_other_message(bag, tmp_pat
     assert (lost in output) == (schema is None)  # not even the type's name is known
 
 
-def test_types_of_this_package_need_a_name_but_no_definition(bag, tmp_path, run, all_say):
-    entries = recorded_run.messages(bag)
+def test_types_of_this_package_need_a_name_but_no_definition(entries, tmp_path, run, all_say):
     file = write_mcap(tmp_path / 'bag', entries, lambda _: ('', b''))
     assert run('recover', file, '--out', 'clean')[0] == 0
     for each in (file, tmp_path / 'clean'):
@@ -161,10 +161,10 @@ def test_types_of_this_package_need_a_name_but_no_definition(bag, tmp_path, run,
     assert (code, lost in output) == (1, True)
 
 
-def test_files_that_are_missing_or_hold_less_than_the_metadata_say(bag, copy, run, all_say):
+def test_files_that_are_missing_or_hold_less_than_the_metadata_say(entries, copy, run, all_say):
     all_say(copy.parent, f'did you mean {copy}?')
-    kept = without_states(recorded_run.messages(bag))
-    shutil.copy(recorded_run.write(copy.parent / 'bag', kept) / 'bag_0.mcap', copy)
+    written = recorded_run.write(copy.parent / 'bag', without_states(entries))
+    shutil.copy(written / 'bag_0.mcap', copy)
     all_say(copy, 'it holds 0 messages of /joint_states, but counts 301')
     (copy / 'bag_0.mcap').unlink()
     all_say(copy, f'{copy} cannot be read as a bag', 'bag_0.mcap')
@@ -178,12 +178,17 @@ def test_files_that_are_missing_or_hold_less_than_the_metadata_say(bag, copy, ru
         ('version: 9', 'version: 99', 'Rosbag2 version 99 not supported'),
         ('identifier: mcap', 'identifier: tape', "Storage plugin 'tape' not supported"),
         ('rosbag2_bagfile_information', 'other', 'metadata key is missing'),
+        ('', '', 'the folder has no metadata.yaml, as after an interrupted recording'),
     ],
 )
-def test_bag_of_another_format(copy, all_say, run, original, replacement, words):
+def test_bag_of_another_format_or_without_metadata(
+    copy, all_say, run, original, replacement, words
+):
     metadata = copy / 'metadata.yaml'
-    assert original in metadata.read_text()
-    metadata.write_text(metadata.read_text().replace(original, replacement))
+    text = metadata.read_text()
+    metadata.unlink()
+    if original:
+        metadata.write_text(text.replace(original, replacement))
     all_say(copy, words, f'to save the undamaged part: blf_dsc recover {copy}')
     code, output, _ = run('recover', copy, '--out', 'clean')
     assert (code, 'none of the recorded messages was lost' in output) == (0, True)

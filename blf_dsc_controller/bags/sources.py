@@ -211,13 +211,14 @@ def open_bag(path: Path) -> Iterator[OpenBag]:
 def _reason(path: Path, error: Exception) -> str:
     if not path.exists():
         return 'there is no such folder'
-    text = ' '.join(f'{error}'.split()).rstrip('.') or type(error).__name__
     is_mcap = any(path.glob('*.mcap')) if path.is_dir() else path.suffix == '.mcap'
+    text = ' '.join(f'{error}'.split()).rstrip('.') or type(error).__name__
     if path.is_dir() and not (path / METADATA).exists():
         text = f'the folder has no {METADATA}'
         if not is_mcap:
             within = [f'; did you mean {each.parent}?' for each in path.glob(f'*/{METADATA}')]
             return text + min(within, default=': it is not a bag')
         text += ', as after an interrupted recording'
-    is_damaged = is_mcap and not isinstance(error, OSError)
-    return f'{text}; to save the undamaged part: blf_dsc recover {path}' if is_damaged else text
+    elif isinstance(error, OSError) or not is_mcap:
+        return text
+    return f'{text}; to save the undamaged part: blf_dsc recover {path}'
