@@ -119,7 +119,8 @@ def _of_arm(seed: int) -> list[tuple[float, ...]]:
         begin = time.perf_counter()
         found = identify_arm(_recording(chain, motion[::every], every), robot)
         seconds = time.perf_counter() - begin
-        physical = min(np.linalg.eigvalsh(pseudo_inertia(body))[0] for body in found.inertias) > 0.0
+        smallest = (np.linalg.eigvalsh(pseudo_inertia(body))[0] for body in found.parts.bodies)
+        physical = min(smallest) > 0.0
         errors = _errors(found, _recording(chain, unseen, 1))
         rows.append((*errors, _coverage(found, truth), seconds, float(physical)))
     return rows

@@ -111,19 +111,19 @@ def _row(taken: Taken, recording: Recording) -> tuple[str, ...]:
         u = rows.u(found.values[-1])[test]
         error = np.sqrt(np.mean((taken.published(rows, taken.robot)[test] - u) ** 2, axis=0))
         published = _percent(error, found.torque)
-    physical = min(np.linalg.eigvalsh(pseudo_inertia(body))[0] for body in found.inertias) > 0.0
+    physical = min(np.linalg.eigvalsh(pseudo_inertia(body))[0] for body in found.parts.bodies) > 0.0
     cells = (taken.name, errors[0], published, *baselines, errors[2], errors[1])
     return *cells, 'yes' if physical else 'no', _terms(found)
 
 
 def _terms(found: Identified) -> str:
-    load, stribeck, quadratic = (np.flatnonzero(found.joint_terms[k]) + 1 for k in (3, 5, 6))
+    load, stribeck, quadratic = (np.flatnonzero(found.parts.terms[k]) + 1 for k in (3, 5, 6))
     texts = [
         f'{name} {", ".join(map(str, joints))}'
         for name, joints in (('load', load), ('Stribeck', stribeck), ('quadratic', quadratic))
         if joints.size
     ]
-    return '; '.join([*texts, *(['coupled wrist'] if found.coupling.any() else [])]) or '-'
+    return '; '.join([*texts, *(['coupled wrist'] if found.parts.coupling.any() else [])]) or '-'
 
 
 def _baselines(taken: Taken, recording: Recording) -> tuple[Rows, NDArray[np.intp], list[str]]:

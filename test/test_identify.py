@@ -78,7 +78,7 @@ def unseen_error(text, rotors):
 
 def corrected(found):
     viscous, coulomb = found.dynamics
-    return corrected_urdf(PANDA_TEXT, found.chain, found.inertias, viscous, coulomb, 'note')
+    return corrected_urdf(PANDA_TEXT, found.chain, found.parts.bodies, viscous, coulomb, 'note')
 
 
 @pytest.fixture(scope='module')
@@ -106,13 +106,13 @@ def is_physical(text):
 def test_corrected_urdf_predicts_the_torques_of_an_unseen_motion(found):
     assert unseen_error(PANDA_TEXT, np.zeros(7)) > 0.1
     text = corrected(found)
-    assert unseen_error(text, found.joint_terms[0]) < 0.005
+    assert unseen_error(text, found.parts.terms[0]) < 0.005
     assert is_physical(text)
     assert mujoco.MjModel.from_xml_string(text).nq == 9  # MuJoCo loads it, fingers included
 
 
 def test_values_match_the_truth_and_the_held_back_part_is_predicted(found):
-    rotors, viscous, coulomb, _, offset = found.joint_terms[:5]
+    rotors, viscous, coulomb, _, offset = found.parts.terms[:5]
     np.testing.assert_allclose(viscous, TRUTH.viscous, rtol=0.01)
     np.testing.assert_allclose(coulomb, TRUTH.coulomb, rtol=0.01)
     # For the first joint only the sum with its link's inertia can be identified.
@@ -165,7 +165,7 @@ def test_arm_simulated_in_mujoco_is_identified(tmp_path):
         mujoco.mj_step(model, data)
     found = identify_bag(write_states(tmp_path / 'bag', PANDA, measured(states, 4)), ROBOT)
     text = corrected(found)
-    assert unseen_error(text, found.joint_terms[0]) < 0.005
+    assert unseen_error(text, found.parts.terms[0]) < 0.005
     assert is_physical(text)
 
 
@@ -243,8 +243,8 @@ def test_lost_states_do_not_bias_the_result(states, found, tmp_path):
     with_gaps[30_000:30_050, 2] = np.nan
     bag = write_states(tmp_path / 'bag', PANDA, with_gaps)
     other = identify_bag(bag, ROBOT)
-    assert unseen_error(corrected(other), other.joint_terms[0]) < 0.005
-    np.testing.assert_allclose(other.joint_terms[1], found.joint_terms[1], rtol=0.01)
+    assert unseen_error(corrected(other), other.parts.terms[0]) < 0.005
+    np.testing.assert_allclose(other.parts.terms[1], found.parts.terms[1], rtol=0.01)
 
 
 def test_bags_that_cannot_be_identified_are_rejected_for_their_reason(states, tmp_path):

@@ -90,9 +90,9 @@ def total(found):
 
 
 def test_terms_that_the_data_do_not_show_are_left_out(found):
-    load, stribeck, quadratic = found.joint_terms[[3, 5, 6]]
+    load, stribeck, quadratic = found.parts.terms[[3, 5, 6]]
     assert not load.any()
-    assert not found.coupling.any()
+    assert not found.parts.coupling.any()
     assert np.count_nonzero(stribeck) + np.count_nonzero(quadratic) <= 1  # of 14, by chance
 
 
@@ -118,8 +118,8 @@ def test_load_friction_and_stribeck_friction_are_recognised(plain):
     states[:, 2, 3] += 3.0 * np.sign(v[:, 3]) * np.exp(-((v[:, 3] / 0.1) ** 2))
     found = identify_arm(recording_of(measured(states, 3)), ROBOT)
     assert total(found) < 0.005
-    np.testing.assert_allclose(found.joint_terms[3, [1, 3]], 0.06, rtol=0.1)
-    assert found.joint_terms[5, 3] == pytest.approx(3.0, rel=0.1)
+    np.testing.assert_allclose(found.parts.terms[3, [1, 3]], 0.06, rtol=0.1)
+    assert found.parts.terms[5, 3] == pytest.approx(3.0, rel=0.1)
     # The URDF has viscous and Coulomb friction only: they take over what they can.
     assert np.linalg.norm(found.errors[1]) < 0.3 * np.linalg.norm(found.errors[0])
 
@@ -131,7 +131,7 @@ def test_coupled_wrist_is_recognised_and_named(plain, tmp_path, capsys):
     both = np.sign(states[:, 1, 5:].sum(axis=1, keepdims=True))
     states[:, 2, 5:] += 0.02 * np.gradient(others, h, axis=0) + 0.3 * others + 0.8 * both
     found = identify_arm(recording_of(measured(states, 3)), ROBOT)
-    np.testing.assert_allclose(found.coupling, (0.02, 0.3, 0.8), rtol=0.05)
+    np.testing.assert_allclose(found.parts.coupling, (0.02, 0.3, 0.8), rtol=0.05)
     bag = write_states(tmp_path / 'bag', PANDA, states)
     urdf, picture = tmp_path / 'robot.urdf', tmp_path / 'torques.png'
     urdf.write_text(PANDA_TEXT)
@@ -234,8 +234,8 @@ def test_coupling_and_load_friction_that_would_drive_are_not_identified(plain, t
     else:
         states[:, 2, 5:] -= 0.3 * states[:, 1, [6, 5]]
     found = identify_arm(recording_of(measured(states, 3)), ROBOT)
-    assert not found.joint_terms[3, :2].any()
-    assert not found.coupling.any()
+    assert not found.parts.terms[3, :2].any()
+    assert not found.parts.coupling.any()
 
 
 def test_table_of_recordings_has_a_row_for_a_folder_with_a_bag(

@@ -20,7 +20,7 @@ from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.identification import exciting_reference
 from blf_dsc_controller.identification.corrected_urdf import corrected_urdf
 from blf_dsc_controller.identification.identify import Identified, identify_bag, mass_and_centre
-from blf_dsc_controller.identification.prior import JOINT_TERMS, base_matrix
+from blf_dsc_controller.identification.prior import JOINT_TERMS, base_matrix, parts
 from blf_dsc_controller.identification.recording import HOP
 from blf_dsc_controller.law.factory import estimate_names
 
@@ -65,8 +65,8 @@ def identify(options: Namespace) -> None:
     print('\n'.join([*header, *_links(found), *_base(found), *kept]))
     if options.out:
         note = '\n'.join(['Inertias and friction by blf_dsc identify:', *header, *kept])
-        viscous, coulomb = found.dynamics
-        corrected = corrected_urdf(robot.text, found.chain, found.inertias, viscous, coulomb, note)
+        bodies, (viscous, coulomb) = found.parts.bodies, found.dynamics
+        corrected = corrected_urdf(robot.text, found.chain, bodies, viscous, coulomb, note)
         options.out.write_text(corrected, encoding='utf-8')
         print(f'wrote {options.out}')
     if options.plot:
@@ -141,23 +141,21 @@ def _links(found: Identified) -> Iterator[str]:
 
 
 def _joints(found: Identified) -> Iterator[str]:
-    n = len(found.chain.joints)
     names = [joint.name for joint in found.chain.joints]
-    spread = np.sqrt(np.diag(found.covariance))
-    terms = spread[10 * n : 17 * n].reshape(-1, n)
-    shown = [k for k in range(len(JOINT_TERMS)) if found.joint_terms[k].any()]
+    of, spread = found.parts, parts(np.sqrt(np.diag(found.covariance)))
+    shown = np.flatnonzero(of.terms.any(axis=1))
     rows = [('joint', *(JOINT_TERMS[k] for k in shown))]
-    for i, name in enumerate(names):
-        values = ((found.joint_terms[k, i], terms[k, i]) for k in shown)
+    for name, *each in zip(names, of.terms[shown].T, spread.terms[shown].T, strict=True):
+        values = zip(*each, strict=True)
         rows.append((name, *(_interval(v, s) if v else '' for v, s in values)))
     yield from _aligned(rows)
-    if found.coupling.any():
-        inertia, viscous, coulomb = map(_interval, found.coupling, spread[17 * n :])
+    if of.coupling.any():
+        inertia, viscous, coulomb = map(_interval, of.coupling, spread.coupling)
         yield (
             f'one motor drives {names[-2]} and {names[-1]}: inertia {inertia} kg m^2, viscous '
             f'friction {viscous} and Coulomb friction {coulomb} act on both'
         )
-    delay = _interval(1e3 * found.values[-1], 1e3 * spread[-1], '.2f')
+    delay = _interval(1e3 * of.delay[0], 1e3 * spread.delay[0], '.2f')
     yield f'delay of the torques relative to the positions: {delay} ms'
 
 

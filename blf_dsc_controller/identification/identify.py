@@ -25,9 +25,15 @@ from blf_dsc_controller.arms.urdf import Chain
 from blf_dsc_controller.bags.content import NO_NAMES, NameMap
 from blf_dsc_controller.configuration.robot import Robot
 from blf_dsc_controller.errors import BlfDscError
-from blf_dsc_controller.identification.prior import JOINT_TERMS, Prior, base_matrix, prior_of, solve
+from blf_dsc_controller.identification.prior import (
+    Parts,
+    Prior,
+    base_matrix,
+    parts,
+    prior_of,
+    solve,
+)
 from blf_dsc_controller.identification.recording import (
-    COUPLING,
     HOP,
     LOAD,
     WINDOW,
@@ -78,28 +84,16 @@ class Identified(NamedTuple):
     time: Floats  # (R,) of the windows, s
 
     @property
-    def inertias(self) -> Floats:
-        """Inertial parameters of the bodies (n, 10)."""
-        n = len(self.chain.joints)
-        return self.values[: 10 * n].reshape(n, 10)
-
-    @property
-    def joint_terms(self) -> Floats:
-        """Values (7, n) of JOINT_TERMS."""
-        n = len(self.chain.joints)
-        return self.values[10 * n : 17 * n].reshape(len(JOINT_TERMS), n)
-
-    @property
-    def coupling(self) -> Floats:
-        """Inertia, viscous and Coulomb friction (3,) that the last two joints share."""
-        n = len(self.chain.joints)
-        return self.values[17 * n : 17 * n + COUPLING]
+    def parts(self) -> Parts:
+        """Parts of the values."""
+        return parts(self.values)
 
     @property
     def load(self) -> tuple[Floats, Floats]:
         """Mass [kg] and centre (x, y, z) [m] in the tip of the load, and their deviations."""
-        at = slice(self.values.size - LOAD - 1, self.values.size - LOAD + 3)
-        return mass_and_centre(self.values[at], self.covariance[at, at], self.chain.tip_placement)
+        at = parts(np.arange(self.values.size)).load[:4]
+        C = self.covariance[np.ix_(at, at)]
+        return mass_and_centre(self.values[at], C, self.chain.tip_placement)
 
 
 def mass_and_centre(values: Floats, covariance: Floats, T: Floats) -> tuple[Floats, Floats]:
@@ -192,12 +186,12 @@ def identify_arm(
     covariance = prior.D @ H @ (np.eye(z_best.size) + found.scatter) @ H @ prior.D.T
     measured = rows.u(values[-1])[moving]
     dynamics = _dynamics(rows, fit, values, n)
-    in_urdf = np.zeros((2, values.size))
-    in_urdf[:, : 10 * n] = prior.mean[: 10 * n], values[: 10 * n]
-    in_urdf[0, 11 * n : 13 * n] = prior.mean[11 * n : 13 * n]
-    in_urdf[1, 11 * n : 13 * n] = dynamics.ravel()
-    in_urdf[1, -LOAD - 1 : -1] = values[-LOAD - 1 : -1]
-    predicted = np.array([rows.X[moving] @ (G @ v)[:-1] for v in (*in_urdf, values)])
+    urdf, corrected = np.zeros((2, values.size))
+    for each, source in ((urdf, parts(prior.mean)), (corrected, parts(values))):
+        of = parts(each)
+        of.bodies[:], of.load[:] = source.bodies, source.load
+        of.terms[1:3] = source.terms[1:3] if each is urdf else dynamics
+    predicted = np.array([rows.X[moving] @ (G @ v)[:-1] for v in (urdf, corrected, values)])
     shown = np.isin(moving, test)
     errors, u = predicted[:, shown] - measured[shown], measured[shown]
     return Identified(
@@ -339,8 +333,7 @@ def _worthwhile(found: Regression, prior: Prior) -> list[tuple[int, ...]]:
 def _pick_up(rows: Rows, fit: NDArray[np.intp], G: Floats, prior: Prior) -> float:
     """Return the time [s] from which a load explains the torques best."""
     found = regression(rows, fit, G, prior, len(fit) // _PER_STEP)
-    load = np.zeros(prior.mean.size + 1, dtype=bool)
-    load[-LOAD - 2 : -2] = True
+    load = parts(np.arange(prior.mean.size)).load
     without = found.folds.copy()
     without[:, load] = without[:, :, load] = 0.0
     costs = []
@@ -371,9 +364,10 @@ def _gravity_share(rows: Rows, fit: NDArray[np.intp], P: Floats) -> float:
 def _dynamics(rows: Rows, fit: NDArray[np.intp], values: Floats, n: int) -> Floats:
     """Return the viscous and Coulomb friction (2, n) nearest to that of all terms."""
     p = rows.gravity.shape[2]
-    terms = values[11 * n : 17 * n + COUPLING].copy()
-    terms[3 * n : 4 * n] = 0.0
-    friction = rows.X[fit][:, :, p:-LOAD] @ terms * rows.weight[fit]
+    terms = parts(values).terms[1:].copy()
+    terms[3] = 0.0  # the offset
+    both = np.append(terms, parts(values).coupling)
+    friction = rows.X[fit][:, :, p:-LOAD] @ both * rows.weight[fit]
     found = []
     for i in range(n):
         columns = rows.X[fit][:, i, [p + i, p + n + i]] * rows.weight[fit][:, i, None]

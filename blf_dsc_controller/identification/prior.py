@@ -1,9 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Prior of the identified values, in deviations from the URDF, and the most likely of them.
 
-The values (17 n + 14,) of n bodies and joints are the ten inertial parameters of each body, then
-each of the JOINT_TERMS for all joints, the coupling of the last two joints (see `recording`), the
-ten of a load that is picked up, and last the delay of the torques.
+The values (17 n + 14,) of n bodies and joints are in the order of `Parts`.
 
 The most likely values over physical bodies only are a convex problem, solved by the barrier method:
 
@@ -47,7 +45,7 @@ JOINT_TERMS = (
     'quadratic friction',
 )
 _POSITIVE = 4  # the first four of them cannot be negative
-_OPTIONAL = (3, 5, 6)  # in the model only of joints whose recording shows them
+_OPTIONAL = [3, 5, 6]  # in the model only of joints whose recording shows them
 
 _DELAY = 0.005  # s
 _FRICTION = 0.3  # of a joint's largest torque; viscous friction: at its largest speed
@@ -57,6 +55,23 @@ _ROTOR = 100.0  # rad/s^2 or m/s^2, acceleration of the rotor alone by the large
 _NEAREST = 0.01  # of a body's mass and extent: least value at which the search begins
 _LAST = 1e-3  # mu; one standard deviation adds 0.5 to the objective
 _STEPS = 100
+
+
+class Parts(NamedTuple):
+    """Parts of the values of n bodies and joints, or of their indices, as views."""
+
+    bodies: Floats  # (n, 10) inertial parameters
+    terms: Floats  # (7, n) JOINT_TERMS
+    coupling: Floats  # (3,) of the last two joints: inertia, viscous and Coulomb friction
+    load: Floats  # (10,) inertial parameters of a load that is picked up
+    delay: Floats  # (1,) of the torques, s
+
+
+def parts(values: np.ndarray) -> Parts:
+    """Return the parts of values (17 n + 14,)."""
+    n = (values.size - COUPLING - LOAD - 1) // (10 + len(JOINT_TERMS))
+    bodies, terms, *others = np.split(values, np.cumsum((10 * n, 7 * n, COUPLING, LOAD)))
+    return Parts(bodies.reshape(n, 10), terms.reshape(-1, n), *others)
 
 
 class Cone(NamedTuple):
@@ -83,9 +98,8 @@ class Prior(NamedTuple):
     @property
     def optional(self) -> list[tuple[int, ...]]:
         """Entries of z that are in the model together or not at all: friction, the coupling."""
-        n = (self.mean.size - COUPLING - LOAD - 1) // (10 + len(JOINT_TERMS))
-        terms = [(10 * n + k * n + i,) for k in _OPTIONAL for i in range(n)]
-        return [*terms, tuple(range(17 * n, 17 * n + COUPLING))]
+        at = parts(np.arange(self.mean.size))
+        return [*((k,) for k in at.terms[_OPTIONAL].ravel().tolist()), tuple(at.coupling.tolist())]
 
     def only(self, kept: Collection[tuple[int, ...]]) -> Prior:
         """Return the prior in which optional entries that are not kept are zero."""
@@ -109,6 +123,7 @@ def prior_of(
     from scipy.linalg import block_diag
 
     n = len(chain.joints)
+    at = parts(np.arange(17 * n + COUPLING + LOAD + 1))
     blocks, start, cones = [], [], []
     for i, joint in enumerate(chain.joints):
         D = deviations(pseudo_inertia(joint.inertia), LINKS, CENTRE)
@@ -120,7 +135,7 @@ def prior_of(
         inside = inertia_of(_inside(own, joint.inertia[0]) + joint.held)
         blocks.append(D)
         start.append(np.linalg.solve(D, inside - joint.inertia))
-        cones.append(Cone(10 * i, own, np.array([pseudo_inertia(d) for d in D.T])))
+        cones.append(Cone(at.bodies[i, 0], own, np.array([pseudo_inertia(d) for d in D.T])))
     rotors = robot.rotors(chain)
     damping, friction = np.transpose([(joint.damping, joint.friction) for joint in chain.joints])
     means = np.concatenate((rotors, damping, friction, np.zeros(4 * n + COUPLING)))
@@ -133,21 +148,16 @@ def prior_of(
     if load:
         J = payload_inertia(max(robot.payload, 1.0))
         of_load = deviations(chain.tip_placement @ J @ chain.tip_placement.T, 1.0, 2 * PAYLOAD_SIZE)
-        cones.append(
-            Cone(
-                17 * n + COUPLING,
-                np.zeros((4, 4)),
-                np.array([pseudo_inertia(d) for d in of_load.T]),
-            )
-        )
+        E = np.array([pseudo_inertia(d) for d in of_load.T])
+        cones.append(Cone(at.load[0], np.zeros((4, 4)), E))
     else:
         of_load = np.zeros((LOAD, LOAD))
     coupling = [each[-1] for each in (rotor, viscous, coulomb)]
     spread = np.concatenate((*joint_terms, coupling))
-    positive = [*range(_POSITIVE * n), *range(7 * n, 7 * n + COUPLING)]
-    cones += [Cone(10 * n + k, means[[[k]]], spread[[[[k]]]]) for k in positive]
     first = np.zeros(spread.size)
-    first[positive] = 0.1
+    for k in (np.append(at.terms[:_POSITIVE], at.coupling) - 10 * n).tolist():
+        cones.append(Cone(10 * n + k, means[[[k]]], spread[[[[k]]]]))
+        first[k] = 0.1
     return Prior(
         mean=np.concatenate((chain.inertias.ravel(), means, np.zeros(LOAD + 1))),
         D=block_diag(*blocks, np.diag(spread), of_load, _DELAY),
