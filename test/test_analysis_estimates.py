@@ -119,9 +119,10 @@ def test_estimates_are_grouped_by_link_and_friction():
     sizes = {'link 1': 3, 'link 2': 3, 'viscous': 2, 'coulomb': 2}
     assert {body: len(members) for body, members in bodies.items()} == sizes
     assert bodies_of(names[:3]) == {name: [k] for k, name in enumerate(names[:3])}
-    off = np.array([[0.0, 0.0, 0.0, 3.0, 4.0, 0.0, *[np.nan] * 4]])  # the friction is unknown
-    found = errors_of_bodies(bodies, off, 0.0 * off, np.full(10, 2.0))[:, 0]
-    np.testing.assert_allclose(found, (0.0, 250.0 / np.sqrt(3.0), np.nan, np.nan))
+    true = np.array([0.0] * 6 + [np.nan] * 4)  # the friction is unknown: how far does it move?
+    estimate = np.array([[9.0] * 10, [0.0, 0.0, 0.0, 3.0, 4.0, 0.0, np.nan, 10.0, np.nan, np.nan]])
+    found = errors_of_bodies(bodies, estimate, np.tile(true, (2, 1)), np.full(10, 2.0))[:, 1]
+    np.testing.assert_allclose(found, (0.0, 250.0 / np.sqrt(3.0), 50.0, np.nan))  # rejected
 
 
 def test_change_of_the_true_arm_is_marked():

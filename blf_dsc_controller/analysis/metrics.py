@@ -133,12 +133,12 @@ def errors_of_bodies(
 ) -> Floats:
     """Return how far the estimates (m, p) of each body are off, (b, m): rms [% of the prior].
 
-    Off the truth or, where none is known, off the first estimates. `prior` (p,) are deviations.
+    Off the truth or, where none is known, off the first estimates; a rejected estimate is NaN.
+    `prior` (p,) are deviations.
     """
-    if true is None or np.isnan(true[-1]).all():
-        true = estimate[:1]
-    square = (100.0 * (estimate - true) / prior) ** 2
-    with np.errstate(divide='ignore', invalid='ignore'):  # unknown: 0 / 0
+    origin = estimate[:1] if true is None else np.where(np.isnan(true), estimate[0], true)
+    square = (100.0 * (estimate - origin) / prior) ** 2
+    with np.errstate(divide='ignore', invalid='ignore'):  # all rejected: 0 / 0
         each = [
             np.nansum(square[:, k], axis=1) / np.isfinite(square[:, k]).sum(axis=1)
             for k in bodies.values()
