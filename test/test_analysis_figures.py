@@ -90,7 +90,7 @@ def test_violation_is_marked_and_errors_stay_visible_beside_the_wide_start_of_a_
     assert beside > 0.8 * blue
 
 
-def test_missing_series_gaps_and_a_single_sample_are_drawn(run, tmp_path):
+def test_missing_series_and_a_single_sample_are_drawn(run, tmp_path):
     draw(run, tmp_path)
     height = pixels(tmp_path / 'tracking.png').shape[0]
     unknown_torque = np.full_like(run.torque, np.nan)
@@ -100,12 +100,9 @@ def test_missing_series_gaps_and_a_single_sample_are_drawn(run, tmp_path):
     minimal = dataclasses.replace(partial, reference=None, bound=None, learning=None)
     assert draw(minimal, tmp_path / 'alone') == [tmp_path / 'alone' / 'tracking.png']
     assert not (tmp_path / 'alone' / 'parameters.png').exists()
-    error = run.error.copy()
-    error[100:200] = np.nan
     arrays = ('stamp', 'received', 'position', 'velocity', 'torque', 'reference', 'error', 'bound')
     one = {name: getattr(run, name)[:1] for name in (*arrays, 'torque_limit')}
-    for change in ({'error': error}, one):
-        assert draw(dataclasses.replace(run, **change), tmp_path)
+    assert draw(dataclasses.replace(run, **one), tmp_path)
 
 
 def test_logarithmic_error_panel_shows_small_and_large_errors(run):

@@ -16,7 +16,7 @@ from test_analysis_figures import amount, lightened, pixels
 
 from blf_dsc_controller.analysis.figures import draw
 from blf_dsc_controller.analysis.panels import panels
-from blf_dsc_controller.analysis.report import plots, read_bags, write_report
+from blf_dsc_controller.analysis.report import plots, read_bag, write_report
 from blf_dsc_controller.analysis.style import ALARM
 from blf_dsc_controller.analysis.summary import format_table, summarize
 from blf_dsc_controller.bags.reader import read_run
@@ -56,7 +56,7 @@ def by_title(bags):
 
 
 def test_every_quantity_has_a_panel(folder):
-    titles = set(by_title(read_bags([folder / 'synthetic'])))
+    titles = set(by_title([read_bag(folder / 'synthetic')]))
     expected = {
         f'{quantity} of {joint}'
         for quantity in ('error', '|error|', 'position', 'torque')
@@ -69,7 +69,7 @@ def test_every_quantity_has_a_panel(folder):
 
 
 def test_peak_of_one_sample_survives_thinning(folder):
-    panel = by_title(read_bags([folder / 'synthetic']))['error of shoulder']
+    panel = by_title([read_bag(folder / 'synthetic')])['error of shoulder']
     error, bound, _ = panel['traces']
     k = int(np.argmin(error['y']))
     assert (error['x'][k], error['y'][k]) == (1.234, -5.0)
@@ -78,7 +78,7 @@ def test_peak_of_one_sample_survives_thinning(folder):
 
 
 def test_events_list_violation_latch_saturation_and_plant_change(folder):
-    (bag,) = read_bags([folder / 'synthetic'])
+    bag = read_bag(folder / 'synthetic')
     events = {(kind, round(time, 3)): text for time, kind, text in bag.events}
     assert events == {
         ('violation', 1.234): 'shoulder outside its bound for 1 samples',
@@ -89,15 +89,15 @@ def test_events_list_violation_latch_saturation_and_plant_change(folder):
 
 
 def test_several_bags_are_overlaid_and_their_parameter_differences_listed(folder, tmp_path):
-    bags = read_bags([folder / 'one', folder / 'other'])
+    bags = [read_bag(folder / 'one'), read_bag(folder / 'other')]
     panel = by_title(bags)['error of joint1']
     names = [trace['name'] for trace in panel['traces']]
-    assert names == [
-        f'{bag}: {line}' for bag in ('one', 'other') for line in ('error', *['bound'] * 2)
-    ]
+    one, other = (bag.name for bag in bags)
+    assert names == [f'{bag}: {line}' for bag in (one, other) for line in ('error', *['bound'] * 2)]
     assert panel['traces'][0]['line']['color'] != panel['traces'][3]['line']['color']
     shown = [trace['name'] for trace in panel['traces'] if trace['showlegend']]
-    assert shown == ['one: error', 'one: bound', 'other: error']  # what they share, once
+    assert (one, other) == (f'{folder.name}/one', f'{folder.name}/other')
+    assert shown == [f'{one}: error', f'{one}: bound', f'{other}: error']  # what they share, once
     write_report(bags, tmp_path / 'page.html')
     text = (tmp_path / 'page.html').read_text()
     assert '<p>1 parameters differ.</p>' in text
@@ -105,13 +105,8 @@ def test_several_bags_are_overlaid_and_their_parameter_differences_listed(folder
     assert row in text
 
 
-def test_bags_with_the_same_name_are_numbered(folder):
-    paths = [folder / 'one', folder / '..' / folder.name / 'other', folder / 'one']
-    assert [bag.name for bag in read_bags(paths)] == ['one (1)', 'other', 'one (2)']
-
-
 def test_page_is_self_contained_and_escapes_names(folder, tmp_path):
-    (bag,) = read_bags([folder / 'one'])
+    bag = read_bag(folder / 'one')
     nasty = '</script><b>&{{data}}'
     write_report([replace(bag, name=nasty)], tmp_path / 'page.html')
     text = (tmp_path / 'page.html').read_text()
@@ -204,7 +199,7 @@ def test_figures_and_page_show_the_stop(tmp_path):
     figure = pixels(tmp_path / 'tracking.png')
     assert amount(figure, ALARM) > 100
     assert amount(figure, lightened(ALARM, 0.1)) > 50_000  # shaded after the stop
-    (bag,) = read_bags([path])
+    bag = read_bag(path)
     ((time, text),) = ((time, text) for time, kind, text in bag.events if kind == 'stop')
     assert time == pytest.approx(STOP_S)
     assert text.startswith("error past the bound: joint 'elbow'")
@@ -218,7 +213,7 @@ def test_stop_is_shaded_until_the_controller_restarts(tmp_path):
     ]
     messages = [*Synthetic(4000).messages(), *((JOURNAL, START, each.encode()) for each in events)]
     path = synthetic_bag.write(tmp_path / 'bag', messages)
-    (bag,) = read_bags([path])
+    bag = read_bag(path)
     (plot,) = (p for p in plots(panels([bag.run]), [bag]) if p['title'] == 'torque of elbow')
     assert plot['marks'] == [
         (pytest.approx(1.0), 'stop: velocity not plausible', ALARM, pytest.approx(1.8))

@@ -14,7 +14,8 @@ from synthetic_bag import BOUND_RAD, JOINTS, LATCH_S, LIMIT_NM, PARAMETERS, TRUE
 
 from blf_dsc_controller.analysis.summary import format_table, summarize, write_summary
 from blf_dsc_controller.bags.reader import read_run
-from blf_dsc_controller.messages.topics import BOUND, JOINT_STATES, LATE_STEPS, LEARNING, TRUTH
+from blf_dsc_controller.messages.topics import BOUND, JOINT_STATES, LATE_STEPS, TRUTH
+from blf_dsc_controller.run import Series
 from blf_dsc_controller.simulation.bag import write_bag
 from blf_dsc_controller.simulation.loop import simulate
 
@@ -98,20 +99,11 @@ def test_unknown_values_are_null_and_never_nan(run, tmp_path):
     assert json.loads((tmp_path / 'summary.json').read_text()) == summary
     assert summary['learning'] is None
     assert summary['tracking']['held'] is None
+    assert summary['compute_time_us'] is None
     assert set(summary['tracking']['joints']['elbow'].values()) == {None}
-
-
-def test_truth_and_learning_are_optional_in_a_bag(tmp_path):
-    def without(topic):
-        messages = [entry for entry in Synthetic(100).messages() if entry[0] is not topic]
-        return summarize(read_run(synthetic_bag.write(tmp_path / topic.name[2:], messages)))
-
-    summary = without(LEARNING)
-    assert (summary['learning'], summary['compute_time_us']) == (None, None)
-    learning = without(TRUTH)['learning']
+    learning = summarize(dataclasses.replace(run, truth=None))['learning']
     assert (learning['final_relative_error'], learning['true']) == (None, None)
     assert list(learning['final_estimate']) == list(PARAMETERS)
-    assert learning['latch_time_s'] is None  # the run is too short
 
 
 def test_table_shows_what_is_unusual(run):
@@ -121,12 +113,16 @@ def test_table_shows_what_is_unusual(run):
     late[-1, run.timing.names.index(LATE_STEPS)] = 0.02 * SAMPLES
     timing = dataclasses.replace(run.timing, values=late)
     unknown = {'error': None, 'learning': None, 'timing': None}
+    early = run.learning.stamp < run.learning.stamp[0] + 1e9 * LATCH_S  # not yet
+    learning = run.learning
+    waiting = Series(learning.names, learning.stamp[early], learning.values[early])
     usual = format_table(summarize(run))
     for changes, line in (
         ({'bound': bound}, '\nat widest   elbow 12.3 mrad\n'),
         ({'timing': timing}, '200 late steps: the computer was too busy for real time'),
         ({'error': run.error + 1.0}, 'VIOLATED, first by shoulder at 0.000 s'),
         (unknown, 'bound       unknown'),
+        ({'learning': waiting}, 'learning    never began'),
     ):
         assert line in format_table(summarize(dataclasses.replace(run, **changes)))
         assert line not in usual

@@ -31,7 +31,7 @@ from sensor_msgs.msg import JointState
 from small_disk import small_disk
 from std_msgs.msg import Float64MultiArray
 
-from blf_dsc_controller.analysis.report import read_bags
+from blf_dsc_controller.analysis.report import read_bag
 from blf_dsc_controller.bags.content import read_content
 from blf_dsc_controller.bags.recover import recover
 from blf_dsc_controller.messages import topics
@@ -179,7 +179,7 @@ def test_losses_are_counted_and_reported(ros, bag, capfd):
     lost = f'{missed} missed, 7 sent before the recorder connected'
     assert f'/joint_states: {51 - missed} messages, {lost}' in capfd.readouterr().err
     assert read_content(bag).losses == {'/joint_states': lost}
-    (shown,) = read_bags([bag])
+    shown = read_bag(bag)
     assert ('lost', f'/joint_states: {lost}') in [event[1:] for event in shown.events]
 
 

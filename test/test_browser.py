@@ -18,7 +18,7 @@ import recorded_run
 pytest.importorskip('plotly', reason='needs plotly: pip install blf_dsc_controller[report]')
 pytest.importorskip('yourdfpy', reason='needs viser: pip install blf_dsc_controller[view]')
 
-from blf_dsc_controller.analysis.report import read_bags, write_report
+from blf_dsc_controller.analysis.report import read_bag, write_report
 from blf_dsc_controller.view.bag import BagPlayer
 from blf_dsc_controller.view.page import Page
 
@@ -46,8 +46,8 @@ def pages(tmp_path_factory):
     folder = tmp_path_factory.mktemp('pages')
     first = recorded_run.record(folder / 'one', 4.0)
     other = recorded_run.record(folder / 'other', 4.0, **{'feedback.gain': [30.0, 10.0]})
-    write_report(read_bags([first]), folder / 'one.html')
-    write_report(read_bags([first, other]), folder / 'both.html')
+    write_report([read_bag(first)], folder / 'one.html')
+    write_report([read_bag(first), read_bag(other)], folder / 'both.html')
     return folder
 
 

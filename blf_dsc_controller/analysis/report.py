@@ -47,28 +47,12 @@ class ReportedBag:
     events: list[Happened]  # by time
 
 
-def read_bags(
-    paths: Sequence[Path], namespace: str = '', names: NameMap = NO_NAMES
-) -> list[ReportedBag]:
-    """Read bags; each is named by its folder, and by its number if that is ambiguous.
+def read_bag(path: Path, namespace: str = '', names: NameMap = NO_NAMES) -> ReportedBag:
+    """Read a bag, named by its folder and the folder in which that is.
 
     Raises:
-        BlfDscError: one of them cannot be read.
+        BlfDscError: it cannot be read.
     """
-    titles = zip(paths, _names(paths), strict=True)
-    return [_read(path, title, namespace, names) for path, title in titles]
-
-
-def _names(paths: Sequence[Path]) -> list[str]:
-    parts = [path.resolve().parts[1:] for path in paths]
-    names = ['/'.join(part[-2:] if part[-1] == 'bag' else part[-1:]) for part in parts]
-    return [
-        f'{name} ({names[: k + 1].count(name)})' if names.count(name) > 1 else name
-        for k, name in enumerate(names)
-    ]
-
-
-def _read(path: Path, name: str, namespace: str, names: NameMap) -> ReportedBag:
     content = read_content(path, namespace, names)
     run = recorded_run(content)
     events = [
@@ -83,6 +67,7 @@ def _read(path: Path, name: str, namespace: str, names: NameMap) -> ReportedBag:
         for node, values in sorted(content.configurations.items())
         for parameter, value in sorted(values.items())
     }
+    name = '/'.join(path.resolve().parts[-2:])
     return ReportedBag(name, run, content, parameters, sorted(events, key=itemgetter(0)))
 
 

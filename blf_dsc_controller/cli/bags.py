@@ -33,10 +33,11 @@ _DISCOVERY = 1.0  # s, until subscribers have found the publishers
 
 def report(options: Namespace) -> None:
     """Write the HTML page of one or several bags."""
-    from blf_dsc_controller.analysis.report import read_bags, write_report
+    from blf_dsc_controller.analysis.report import read_bag, write_report
 
     make_room(options.out, force=options.force)
-    bags = read_bags(options.bags, options.namespace, NameMap.parse(options.map))
+    names = NameMap.parse(options.map)
+    bags = [read_bag(path, options.namespace, names) for path in options.bags]
     write_report(bags, options.out)
     print(f'wrote {options.out} ({options.out.stat().st_size / 1e6:.1f} MB)')
 

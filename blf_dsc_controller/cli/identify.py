@@ -9,7 +9,6 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
-from tqdm import tqdm
 
 from blf_dsc_controller.bags.content import NameMap
 from blf_dsc_controller.cli.main import PICK_UP, make_room
@@ -17,8 +16,8 @@ from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.nodes import CONTROLLER, dump, load, locate
 from blf_dsc_controller.configuration.robot import Robot, parameters_of
 from blf_dsc_controller.errors import BlfDscError
-from blf_dsc_controller.identification import exciting_reference
 from blf_dsc_controller.identification.corrected_urdf import corrected_urdf
+from blf_dsc_controller.identification.exciting_reference import ExcitationProblem, search
 from blf_dsc_controller.identification.identify import Identified, identify_bag, mass_and_centre
 from blf_dsc_controller.identification.prior import JOINT_TERMS, base_matrix, parts
 from blf_dsc_controller.identification.recording import HOP
@@ -234,10 +233,8 @@ def excite(options: Namespace) -> None:
     """Search for the reference, write it as a preset, and print what it shows."""
     make_room(options.out, force=options.force)
     config = load(locate(options.config), CONTROLLER, ControllerConfig)
-    problem = exciting_reference.ExcitationProblem(
-        config, options.harmonics, options.radius, options.floor
-    )
-    parameters = problem.parameters(_search(problem, options.starts))
+    problem = ExcitationProblem(config, options.harmonics, options.radius, options.floor)
+    parameters = problem.parameters(search(problem, 0, options.starts))
     for name in ('offset', 'amplitude'):
         parameters[name] = tuple(round(value, _DIGITS) for value in parameters[name])
     before = problem.evaluate({name: getattr(config.reference, name) for name in parameters})
@@ -265,17 +262,6 @@ def excite(options: Namespace) -> None:
     node = {f'**/{CONTROLLER}': {'reference.type': 'sinusoids', **reference}}
     dump(options.out, node, ''.join(f'# {line}\n' for line in lines))
     print('\n'.join([*lines, f'wrote {options.out}']))
-
-
-def _search(problem: exciting_reference.ExcitationProblem, starts: int) -> np.ndarray:
-    total = starts * exciting_reference.ITERATIONS
-    with tqdm(total=total, desc='searching', unit='iteration', disable=None) as bar:
-
-        def show(done: int, best: float) -> None:
-            bar.set_postfix_str(f'best {best:.4g}' if best > -np.inf else '', refresh=False)
-            bar.update(done - bar.n)
-
-        return exciting_reference.search(problem, 0, starts, show)
 
 
 def _unshown(config: ControllerConfig, remaining: np.ndarray) -> list[str]:

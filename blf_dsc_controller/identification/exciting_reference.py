@@ -19,10 +19,10 @@ maximising the smallest eigenvalue would spend the motion on it.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
+from tqdm import tqdm
 
 from blf_dsc_controller.arms.geometry import Clearance
 from blf_dsc_controller.compiled.layout import pack as pack_settings
@@ -33,10 +33,8 @@ from blf_dsc_controller.law.prediction import rows_along
 from blf_dsc_controller.reference.approach import MotionError
 from blf_dsc_controller.reference.terms import pack, sampled, sinusoids_term
 
-ITERATIONS = 150
-"""Maximum number of iterations of a search."""
-
 _TORQUE, _SPEED = 0.8, 0.95  # of the limits of torque, and of velocity and acceleration
+_ITERATIONS = 150  # of a search
 _SAMPLES_PER_HARMONIC = 64
 _COARSE = 4  # samples per filtered row
 _MARGIN = 1e-3  # fraction of each limit, and m of room, for peaks between samples
@@ -168,46 +166,29 @@ class ExcitationProblem:
         return np.asarray(X.T @ X / len(coarse))
 
 
-def search(
-    problem: ExcitationProblem,
-    seed: int,
-    starts: int,
-    progress: Callable[[int, float], None] = lambda _done, _best: None,
-) -> np.ndarray:
+def search(problem: ExcitationProblem, seed: int, starts: int) -> np.ndarray:
     """Return the best x (see `ExcitationProblem.parameters`) found from random starting points.
-
-    `progress` is called after each iteration with the number of iterations done, of `starts` *
-    ITERATIONS, and the best gain of the finished searches.
 
     Raises:
         MotionError: no search found a reference that keeps the limits.
     """
     from scipy.optimize import approx_fprime, minimize
 
-    random = np.random.default_rng(seed)
-    best: np.ndarray | None = None
-    most, done = -np.inf, 0
-
     def cost(x: np.ndarray) -> float:
         reached = problem.evaluate(problem.parameters(x))
         return _PENALTY * reached.excess - reached.gain
 
-    def follow(_x: np.ndarray) -> None:
-        nonlocal done
-        done += 1
-        progress(done, most)
-
-    for number in range(starts):
-        done = number * ITERATIONS
-        result = minimize(
+    random = np.random.default_rng(seed)
+    best: np.ndarray | None = None
+    most = -np.inf
+    for _ in tqdm(range(starts), desc='searching', unit='start', disable=None):
+        x = minimize(
             cost,
             problem.start(random),
             jac=lambda x: approx_fprime(x, cost),
             method='L-BFGS-B',
-            callback=follow,
-            options={'maxiter': ITERATIONS, 'ftol': 1e-6},
-        )
-        x = result.x
+            options={'maxiter': _ITERATIONS, 'ftol': 1e-6},
+        ).x
         for _ in range(_SHRINKS):
             reached = problem.evaluate(problem.parameters(x))
             if reached.is_allowed:
@@ -215,7 +196,6 @@ def search(
                     best, most = x, reached.gain
                 break
             x[problem.n :] *= 0.99
-    progress(starts * ITERATIONS, most)
     if best is None:
         raise MotionError(
             f'no reference found in {starts} searches keeps positions, velocities, '

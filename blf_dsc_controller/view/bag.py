@@ -9,7 +9,7 @@ from typing import NoReturn
 
 import numpy as np
 
-from blf_dsc_controller.analysis.report import read_bags
+from blf_dsc_controller.analysis.report import read_bag
 from blf_dsc_controller.bags.content import NO_NAMES, NameMap
 from blf_dsc_controller.law.factory import estimate_names
 from blf_dsc_controller.messages.topics import LAMBDA_MIN, LOAD, PLANT
@@ -34,7 +34,7 @@ class BagPlayer:
     def __init__(
         self, page: Page, path: Path, namespace: str = '', names: NameMap = NO_NAMES
     ) -> None:
-        (bag,) = read_bags([path], namespace, names)
+        bag = read_bag(path, namespace, names)
         config = bag.content.controller_config()
         plant = bag.content.configurations.get(PLANT, {})
         self.snapshots = snapshots(bag.run, estimate_names(config))
