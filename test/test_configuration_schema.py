@@ -15,7 +15,6 @@ from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.nodes import NODES, RecorderConfig, load_loop
 from blf_dsc_controller.configuration.plant import PlantConfig
 from blf_dsc_controller.configuration.schema import (
-    Kind,
     build,
     change,
     flatten,
@@ -60,20 +59,6 @@ def refused(given: dict[str, object]) -> list[str]:
         build(Machine, given, 'machine.yaml')
     assert 'machine.yaml' in str(caught.value)
     return caught.value.problems
-
-
-def test_parameters_have_dotted_names_in_order():
-    assert [(entry.name, entry.kind) for entry in parameters(Machine)] == [
-        ('axes', Kind.STRING_ARRAY),
-        ('speed', Kind.DOUBLE),
-        ('steps', Kind.INTEGER),
-        ('armed', Kind.BOOL),
-        ('mode', Kind.STRING),
-        ('notes', Kind.STRING_ARRAY),
-        ('motor.gain', Kind.DOUBLE_ARRAY),
-        ('motor.table', Kind.DOUBLE_ARRAY),
-    ]
-    assert parameters(Machine)[0].read_only == 'they are wired'
 
 
 def test_build_without_values_gives_defaults_and_flatten_inverts_build():
