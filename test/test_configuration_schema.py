@@ -175,7 +175,7 @@ def test_defaults_are_valid_and_every_parameter_is_described(cls):
     assert build(cls, {}) == cls()
     for entry in parameters(cls):
         assert entry.description
-        if entry.kind.value == 'integer':
+        if entry.type is int:
             assert entry.at_least is not None, entry.name
 
 

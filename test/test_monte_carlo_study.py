@@ -13,7 +13,7 @@ from monte_carlo_case import LOOP, STUDY, study, whole, write
 from scipy import stats
 
 from blf_dsc_controller.configuration.nodes import dump, locate
-from blf_dsc_controller.configuration.schema import Kind, change
+from blf_dsc_controller.configuration.schema import change
 from blf_dsc_controller.errors import ConfigurationError
 from blf_dsc_controller.law.telemetry import sample_columns
 from blf_dsc_controller.simulation.loop import simulate
@@ -41,7 +41,7 @@ MASS = 'uniform(0.3, 0.7)'
 )
 @given(u=FRACTIONS)
 def test_distributions_match_scipy(text, reference, u):
-    distribution = parse(text, Kind.DOUBLE)
+    distribution = parse(text, float)
     assert distribution.at(u) == pytest.approx(reference.ppf(u), rel=1e-9, abs=1e-9)
     low, high = distribution.extremes
     assert low <= distribution.at(u) <= high
@@ -50,16 +50,16 @@ def test_distributions_match_scipy(text, reference, u):
 def test_values_are_as_frequent_as_stated():
     draws = np.arange(1000) / 1000
     for text in ('integers(-1, 3)', 'choice(-1, 0, 1, 2, 3)'):
-        values = [parse(text, Kind.INTEGER).at(u) for u in draws]
+        values = [parse(text, int).at(u) for u in draws]
         assert [values.count(i) for i in range(-1, 4)] == [200] * 5
-    maybe = parse('maybe(0.3, 1, 2)', Kind.DOUBLE)
+    maybe = parse('maybe(0.3, 1, 2)', float)
     values = np.array([maybe.at(u) for u in draws])
     assert (values == 0.0).sum() == 700
     assert 1.0 <= values[values > 0.0].min() < values.max() < 2.0
     assert values[values > 0.0].mean() == pytest.approx(1.5, abs=0.01)
     assert 0.0 in maybe.extremes
-    assert parse('uniform(0.5, 0.5)', Kind.DOUBLE).at(0.9) == 0.5
-    assert parse('choice(brake)', Kind.STRING).at(0.9) == 'brake'
+    assert parse('uniform(0.5, 0.5)', float).at(0.9) == 0.5
+    assert parse('choice(brake)', str).at(0.9) == 'brake'
 
 
 @pytest.mark.parametrize(

@@ -25,7 +25,6 @@ from std_srvs.srv import Trigger
 from blf_dsc_controller.configuration import schema
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.plant import PlantConfig
-from blf_dsc_controller.configuration.schema import Kind
 from blf_dsc_controller.messages.codecs import Float64MultiArrayEncoder, JointStateEncoder
 from blf_dsc_controller.nodes.controller_node import ControllerNode
 from blf_dsc_controller.nodes.parameters import FixedParameterError
@@ -74,11 +73,11 @@ def joint_states(draw):
 
 
 VALUES = {
-    Kind.BOOL: st.booleans(),
-    Kind.INTEGER: st.integers(-1, 10),
-    Kind.DOUBLE: numbers,
-    Kind.STRING: st.sampled_from(['zero', 'hold_gravity', 'damping', 'x']),
-    Kind.DOUBLE_ARRAY: st.one_of(
+    'bool': st.booleans(),
+    'integer': st.integers(-1, 10),
+    'double': numbers,
+    'string': st.sampled_from(['zero', 'hold_gravity', 'damping', 'x']),
+    'double array': st.one_of(
         st.lists(st.floats(0.0, 19.0), max_size=3), st.lists(numbers, max_size=3)
     ),
 }

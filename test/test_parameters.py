@@ -56,7 +56,7 @@ def test_node_without_overrides_has_the_defaults(start, name):
     assert declare(node, cls) == cls()
     assert read(node, cls) == cls()
     for parameter in parameters(cls):
-        assert node.get_parameter(parameter.name).type_.name == parameter.kind.name
+        assert node.get_parameter(parameter.name).type_.name == parameter.ros_type
 
 
 def test_parameters_have_descriptors(start):

@@ -350,7 +350,7 @@ def _row(param: Parameter) -> str:
         param.unit,
         param.constraints,
         '' if param.read_only else '•',
-        param.kind.value,
+        param.kind,
         param.symbol,
     )
     return '| ' + ' | '.join(cell.replace('|', '\\|') for cell in cells) + ' |\n'

@@ -18,7 +18,6 @@ import operator
 import typing
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
-from enum import Enum
 from typing import Annotated, Any, TypeAlias, TypeVar
 
 from blf_dsc_controller.errors import BlfDscError, ConfigurationError
@@ -27,33 +26,7 @@ Config = TypeVar('Config')
 Value: TypeAlias = bool | int | float | str | tuple[float, ...] | tuple[str, ...]
 
 
-class Kind(Enum):
-    """Type of a parameter; the names are those of `rclpy.parameter.Parameter.Type`."""
-
-    BOOL = 'bool'
-    INTEGER = 'integer'
-    DOUBLE = 'double'
-    STRING = 'string'
-    DOUBLE_ARRAY = 'double array'
-    STRING_ARRAY = 'string array'
-
-    @property
-    def is_array(self) -> bool:
-        """Whether a value is a list."""
-        return self.value.endswith(' array')
-
-    @property
-    def element(self) -> Kind:
-        """Kind of one entry of an array; a scalar kind is its own element."""
-        return Kind(self.value.removesuffix(' array'))
-
-
-_PYTHON = {Kind.BOOL: bool, Kind.INTEGER: int, Kind.DOUBLE: float, Kind.STRING: str}
-_KINDS = {
-    **{python: kind for kind, python in _PYTHON.items()},
-    tuple[float, ...]: Kind.DOUBLE_ARRAY,
-    tuple[str, ...]: Kind.STRING_ARRAY,
-}
+_NAMES = {bool: 'bool', int: 'integer', float: 'double', str: 'string'}
 _ARRAYS = (list, tuple, array.array)  # rclpy gives array.array
 
 
@@ -85,8 +58,19 @@ class Parameter:
     read_only: str = ''
     kept: Callable[[Any], Any] = _as_given
     name: str = ''
-    kind: Kind = Kind.DOUBLE
+    type: type = float
+    is_array: bool = False
     length: tuple[str, ...] = ()
+
+    @property
+    def kind(self) -> str:
+        """The type in words, such as `double array`."""
+        return _NAMES[self.type] + (' array' if self.is_array else '')
+
+    @property
+    def ros_type(self) -> str:
+        """The type as a name of `rclpy.parameter.Parameter.Type`, such as `DOUBLE_ARRAY`."""
+        return self.kind.upper().replace(' ', '_')
 
     @property
     def allowed(self) -> str:
@@ -107,14 +91,14 @@ class Parameter:
         return [f'{self.name}: {problem}' for problem in self._problems(given)]
 
     def _problems(self, given: Any) -> Iterator[str]:
-        article = 'an' if self.kind is Kind.INTEGER else 'a'
-        mismatch = f'got {_shown(given)}, but {article} {self.kind.value} is expected'
-        if self.kind.is_array and not isinstance(given, _ARRAYS):
+        article = 'an' if self.type is int and not self.is_array else 'a'
+        mismatch = f'got {_shown(given)}, but {article} {self.kind} is expected'
+        if self.is_array and not isinstance(given, _ARRAYS):
             yield f'{mismatch}: write a list, like {_shown(self.default)}'
             return
-        entries = list(given) if self.kind.is_array else [given]
-        if not all(_is(entry, self.kind.element) for entry in entries):
-            yield mismatch + _remedy(entries, self.kind.element)
+        entries = list(given) if self.is_array else [given]
+        if not all(_is(entry, self.type) for entry in entries):
+            yield mismatch + _remedy(entries, self.type)
             return
         if not (entries or self.omittable or self.length):
             yield 'got an empty list, but at least one entry is needed'
@@ -126,7 +110,7 @@ class Parameter:
                 expected = f'it must be {self.allowed}{unit}'
             else:
                 continue
-            place = f' at entry {index} of {_shown(entries)}' if self.kind.is_array else ''
+            place = f' at entry {index} of {_shown(entries)}' if self.is_array else ''
             yield f'got {_shown(entry)}{place}, but {expected}'
 
     def _allows(self, entry: Any) -> bool:
@@ -192,7 +176,7 @@ def build(cls: type[Config], given: Mapping[str, Any], source: str = '') -> Conf
         found = param.problems(value)
         try:
             if not found:
-                valid[name] = tuple(value) if param.kind.is_array else param.kept(value)
+                valid[name] = tuple(value) if param.is_array else param.kept(value)
         except BlfDscError as error:
             found = [f'{name}: {error}']
         problems += found
@@ -254,7 +238,9 @@ def _fields(cls: Any) -> dict[str, Any]:
         if typing.get_origin(hint) is typing.Literal:
             param, hint = dataclasses.replace(param, choices=typing.get_args(hint)), str
         length = getattr(annotated[field.name], '__metadata__', ())
-        found[field.name] = dataclasses.replace(param, kind=_KINDS[hint], length=length)
+        is_array = typing.get_origin(hint) is tuple
+        type_ = typing.get_args(hint)[0] if is_array else hint
+        found[field.name] = dataclasses.replace(param, type=type_, is_array=is_array, length=length)
     return found
 
 
@@ -282,8 +268,8 @@ def _length_problems(param: Parameter, values: Mapping[str, Any]) -> Iterator[st
         yield f'{param.name}: got {entries}, but {needed} are needed ({factors})'
 
 
-def _is(value: object, kind: Kind) -> bool:
-    return isinstance(value, _PYTHON[kind]) and (kind is Kind.BOOL or not isinstance(value, bool))
+def _is(value: object, type_: type) -> bool:
+    return isinstance(value, type_) and (type_ is bool or not isinstance(value, bool))
 
 
 def _shown(value: object) -> str:
@@ -294,14 +280,14 @@ def _shown(value: object) -> str:
     return 'nothing' if value is None else repr(value)
 
 
-def _remedy(entries: list[Any], kind: Kind) -> str:
+def _remedy(entries: list[Any], type_: type) -> str:
     """Return how to write the value: ROS accepts neither 1 nor '1.0' for 1.0."""
     for entry in entries:
-        if kind is Kind.DOUBLE and _is(entry, Kind.INTEGER):
+        if type_ is float and _is(entry, int):
             return f': write {float(entry)!r} instead of {entry}'
-        if kind in (Kind.DOUBLE, Kind.INTEGER) and isinstance(entry, str):
+        if type_ in (float, int) and isinstance(entry, str):
             return ': write a number, without quotes'
-        if kind is Kind.STRING and not isinstance(entry, str):
+        if type_ is str and not isinstance(entry, str):
             return f": write '{entry}' in quotes"
     return ''
 

@@ -202,7 +202,7 @@ def _gains(config: ControllerConfig) -> dict[str, Any]:
                 value = getattr(group, param.name)
                 is_flag = isinstance(value, bool)
                 found[name] = (
-                    int(value) if is_flag else np.array(value) if param.kind.is_array else value
+                    int(value) if is_flag else np.array(value) if param.is_array else value
                 )
     return found
 

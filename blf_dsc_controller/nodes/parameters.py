@@ -24,7 +24,6 @@ from std_msgs.msg import String
 from blf_dsc_controller.configuration.nodes import is_builtin, known_names
 from blf_dsc_controller.configuration.robot import TOPIC
 from blf_dsc_controller.configuration.schema import (
-    Kind,
     Parameter,
     build,
     change,
@@ -39,9 +38,9 @@ from blf_dsc_controller.nodes.process import assigned, check_sections
 
 Config = TypeVar('Config')
 
-_RANGES: dict[Kind, tuple[str, type[Any], type[Any], Any]] = {
-    Kind.DOUBLE: ('floating_point_range', FloatingPointRange, float, sys.float_info.max),
-    Kind.INTEGER: ('integer_range', IntegerRange, int, 2**63 - 1),
+_RANGES: dict[type, tuple[str, type[Any], type[Any], Any]] = {
+    float: ('floating_point_range', FloatingPointRange, float, sys.float_info.max),
+    int: ('integer_range', IntegerRange, int, 2**63 - 1),
 }
 
 
@@ -92,7 +91,7 @@ def _declare_empty(node: Node, parameter: Parameter) -> None:
 
     It is set as well: if any of several requested parameters is unset, rclpy's response is empty.
     """
-    kind, described = RosParameter.Type[parameter.kind.name], descriptor(parameter)
+    kind, described = RosParameter.Type[parameter.ros_type], descriptor(parameter)
     node.declare_parameter(parameter.name, kind, ignore_override=True)
     node.set_parameters([RosParameter(parameter.name, kind, [])])
     described.type = kind.value
@@ -154,8 +153,8 @@ def descriptor(parameter: Parameter) -> ParameterDescriptor:
     )
     low = parameter.above if parameter.at_least is None else parameter.at_least
     high = parameter.below if parameter.at_most is None else parameter.at_most
-    if parameter.kind in _RANGES and (low, high) != (None, None):
-        name, message, number, largest = _RANGES[parameter.kind]
+    if parameter.type in _RANGES and not parameter.is_array and (low, high) != (None, None):
+        name, message, number, largest = _RANGES[parameter.type]
         from_value = -largest if low is None else number(low)
         to_value = largest if high is None else number(high)
         setattr(described, name, [message(from_value=from_value, to_value=to_value)])
@@ -172,7 +171,7 @@ def _overrides(node: Node, cls: type[Config]) -> dict[str, Any]:
     rclpy does not show which section a value comes from, so parameters of any node of the package
     are accepted, as in a section for several nodes.
     """
-    own = {parameter.name: parameter.kind for parameter in parameters(cls)}
+    own = {parameter.name: parameter for parameter in parameters(cls)}
     others = known_names() - own.keys()
     check_sections(sys.argv, node.get_fully_qualified_name())
     given = {name: parameter.value for name, parameter in parameter_overrides(node).items()}

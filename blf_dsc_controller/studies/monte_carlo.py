@@ -38,7 +38,6 @@ from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.nodes import CONTROLLER, PLANT, LoopConfig, load_loop, read
 from blf_dsc_controller.configuration.plant import PlantConfig
 from blf_dsc_controller.configuration.schema import (
-    Kind,
     Parameter,
     build,
     change,
@@ -239,9 +238,9 @@ _INVERSES: dict[str, Callable[..., Drawn]] = {
 }
 _UNIFORM, _LOGUNIFORM, _NORMALLY, _MAYBE, _INTEGERS, _CHOICE = _INVERSES
 _EXPECTED = {
-    Kind.DOUBLE: ('a number', (_UNIFORM, _LOGUNIFORM, _NORMALLY, _MAYBE, _CHOICE)),
-    Kind.INTEGER: ('an integer', (_INTEGERS, _CHOICE)),
-    Kind.STRING: ('a word', (_CHOICE,)),
+    float: ('a number', (_UNIFORM, _LOGUNIFORM, _NORMALLY, _MAYBE, _CHOICE)),
+    int: ('an integer', (_INTEGERS, _CHOICE)),
+    str: ('a word', (_CHOICE,)),
 }
 """What arguments are, and the distributions, for each kind of parameter."""
 
@@ -273,15 +272,15 @@ class Distribution:
         return f'{self.written.partition("(")[0]}({", ".join(map(str, self.arguments))})'
 
 
-def parse(text: object, kind: Kind) -> Distribution:
-    """Parse a distribution of a scalar kind; raises ValueError naming what is expected."""
+def parse(text: object, type_: type) -> Distribution:
+    """Parse a distribution of a number or word; raises ValueError naming what is expected."""
     call = _CALL.fullmatch(text) if isinstance(text, str) else None
-    argument, known = _EXPECTED[kind]
+    argument, known = _EXPECTED[type_]
     written = next((each for each in known if call and each.startswith(f'{call[1]}(')), None)
     if call is None or written is None:
         raise ValueError(f'got {text!r}, but one of these is expected: {", ".join(known)}')
     try:
-        arguments = tuple(_argument(word.strip(), kind) for word in call[2].split(','))
+        arguments = tuple(_argument(word.strip(), type_) for word in call[2].split(','))
     except ValueError:
         raise ValueError(f'got {text!r}, but {argument} is expected between commas') from None
     if written != _CHOICE:
@@ -307,10 +306,10 @@ def _problem(written: str, arguments: tuple[float, ...]) -> str:
     return ''
 
 
-def _argument(word: str, kind: Kind) -> Drawn:
-    if kind is Kind.INTEGER:
+def _argument(word: str, type_: type) -> Drawn:
+    if type_ is int:
         return int(word)
-    value = float(word) if kind is Kind.DOUBLE else word
+    value = float(word) if type_ is float else word
     if value == '' or (isinstance(value, float) and not math.isfinite(value)):
         raise ValueError
     return value
@@ -338,13 +337,13 @@ def variable_parameters() -> Mapping[str, Parameter]:
         for param in parameters(PlantConfig)
         if param.name.startswith(_GROUPS) and param.name not in _REALTIME
     ]
-    relative = Parameter((), '', kind=Kind.DOUBLE_ARRAY, length=('joints',))
+    relative = Parameter((), '', is_array=True, length=('joints',))
     found += [
         replace(relative, name='initial.error', above=-1.0, below=1.0),
         replace(relative, name='initial.velocity_error', unit='rad/s'),
         replace(relative, name='events.gap', unit='s', at_least=0.0, length=('events.begin',)),
     ]
-    return {param.name: param for param in found if param.kind.element in _EXPECTED}
+    return {param.name: param for param in found if param.type in _EXPECTED}
 
 
 def read_variations(
@@ -368,7 +367,7 @@ def read_variations(
 
 def _variations_of(param: Parameter, given: object, plant: PlantConfig) -> Iterator[Variation]:
     column = f'plant.{param.name}'
-    if not param.kind.is_array:
+    if not param.is_array:
         yield Variation(param.name, -1, column, _distribution(param, given))
         return
     names = _entries(param, plant)
@@ -397,8 +396,8 @@ def _entries(param: Parameter, plant: PlantConfig) -> tuple[str, ...]:
 
 def _distribution(param: Parameter, text: object) -> Distribution:
     """Parse a distribution and check that the parameter allows all of its values."""
-    scalar = replace(param, kind=param.kind.element)
-    distribution = parse(text, scalar.kind)
+    scalar = replace(param, is_array=False)
+    distribution = parse(text, scalar.type)
     for value in distribution.extremes:
         for problem in scalar.problems(value):
             reason = problem.removeprefix(f'{param.name}: ')
