@@ -36,14 +36,10 @@ HEAD = """\
 
 def granted(ros, names):
     """Return the names of the topics or services of nodes, by kind of access."""
-    ask = ros.tester
-    found = {}
-    for _, access, _, method in KINDS:
-        shown = set()
-        for name in names:
-            shown |= {found for found, _ in getattr(ask, method)(name, '/')}
-        found[access] = sorted(shown)
-    return found
+    return {
+        access: sorted({f for name in names for f, _ in getattr(ros.tester, method)(name, '/')})
+        for _, access, _, method in KINDS
+    }
 
 
 def is_recording_all(ros):

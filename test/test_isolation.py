@@ -23,15 +23,12 @@ print(code, len(os.listdir('/proc/self/task')))
 LOCALHOST = {'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST'}
 
 
-def test_profile_of_the_user_is_kept(monkeypatch):
-    monkeypatch.setenv('FASTRTPS_DEFAULT_PROFILES_FILE', 'own.xml')
-    assert localhost_environment() == LOCALHOST
-
-
-def test_other_middleware_is_limited_to_this_computer_as_well(monkeypatch):
-    monkeypatch.setattr(
-        isolation.rclpy, 'get_rmw_implementation_identifier', lambda: 'rmw_cyclonedds_cpp'
-    )
+def test_profile_of_the_user_is_kept_and_other_middleware_limited_as_well(monkeypatch):
+    with monkeypatch.context() as own:
+        own.setenv('FASTRTPS_DEFAULT_PROFILES_FILE', 'own.xml')
+        assert localhost_environment() == LOCALHOST
+    name = 'get_rmw_implementation_identifier'
+    monkeypatch.setattr(isolation.rclpy, name, lambda: 'rmw_cyclonedds_cpp')
     assert localhost_environment() == LOCALHOST
 
 
