@@ -235,7 +235,7 @@ def test_reactivation_on_the_reference_tracks_at_once_only_at_its_velocity(rest,
 
 
 def test_reference_continues_after_a_deactivation_but_begins_anew_after_a_stop():
-    rig = Rig({'safety.keep_estimates': True})
+    rig = Rig()
     rig.step(500)
     rig.guard.deactivate()
     rig.step(1)

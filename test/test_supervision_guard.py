@@ -208,17 +208,14 @@ def test_rate_limit_applies_from_the_torque_before_an_activation(again):
     np.testing.assert_array_equal(rig.guard.controller.state.torque, rig.commands[-1])
 
 
-@pytest.mark.parametrize(
-    ('keep', 'again'), [(True, 'activate'), (False, 'activate'), (False, 'reset')]
-)
-def test_estimates_are_kept_or_forgotten_as_configured(keep, again):
-    rig = Rig({'safety.keep_estimates': keep or again == 'reset'})
+@pytest.mark.parametrize('again', ['activate', 'reset'])
+def test_estimates_are_kept_over_an_activation_and_forgotten_by_a_reset(again):
+    rig, keep = Rig(), again == 'activate'
     rig.step(200)
-    learned = rig.guard.controller.state.estimate.copy()
-    window = rig.guard.controller.state.rows[0]
-    rig.guard.deactivate()
-    rig.guard.activate() if again == 'activate' else rig.guard.reset()
     state = rig.guard.controller.state
+    learned, window = state.estimate.copy(), state.rows[0]
+    rig.guard.deactivate()
+    getattr(rig.guard, again)()
     start = rig.guard.controller.settings.initial_estimate
     np.testing.assert_array_equal(state.estimate, learned if keep else start)
     assert state.rows[0] == (window if keep else 0.0)

@@ -153,7 +153,6 @@ class Safety:
     fade_time: float = positive(
         0.5, 'time to fade the safe torque without usable joint states', 's'
     )
-    keep_estimates: bool = parameter(True, 'keep the estimates at activation; a reset clears them')
 
 
 @dataclass(frozen=True)

@@ -351,12 +351,9 @@ class Guard:
         return torque
 
     def activate(self) -> None:
-        """Take command with the next state; estimates are kept if so configured."""
+        """Take command with the next state and what was learned, after a fault: before it."""
         self._note(EventType.ACTIVATE)
-        if not self.config.safety.keep_estimates:
-            self.controller.reset()
-            self._resumable = False  # t also counts the filling of the window
-        elif self._clean:
+        if self._clean:
             self.controller.state.samples[0] = 0.0
         else:
             self.samples.restore()
