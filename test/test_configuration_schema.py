@@ -14,13 +14,7 @@ from blf_dsc_controller.arms.model import arm_model
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.nodes import NODES, RecorderConfig, load_loop
 from blf_dsc_controller.configuration.plant import PlantConfig
-from blf_dsc_controller.configuration.schema import (
-    build,
-    change,
-    flatten,
-    parameter,
-    parameters,
-)
+from blf_dsc_controller.configuration.schema import build, change, flatten, parameter, parameters
 from blf_dsc_controller.errors import ConfigurationError
 from blf_dsc_controller.law import factory, settings
 
@@ -230,10 +224,7 @@ def test_joint_names_are_unique_and_the_arm_has_two(cls):
         ),
         ({'truth.parameters': [1.0, 0.32]}, 'truth.parameters: got 2 entries, but model two_lin'),
         # Of an arm that cannot be read, no lengths are known.
-        (
-            {'robot.urdf': 'no.urdf', 'barrier.bound': [0.1] * 7},
-            "robot.urdf: 'no.urdf' cannot",
-        ),
+        ({'robot.urdf': 'no.urdf', 'barrier.bound': [0.1] * 7}, "robot.urdf: 'no.urdf' cannot"),
     ],
 )
 def test_invalid_controller_configuration_is_rejected(given, message):

@@ -87,12 +87,7 @@ def free_inertias(M: Array) -> Array:
 
 @kernel
 def _fill_regressors(
-    model: ArmModel,
-    q: np.ndarray,
-    dq: np.ndarray,
-    v: np.ndarray,
-    a: np.ndarray,
-    H: np.ndarray,
+    model: ArmModel, q: np.ndarray, dq: np.ndarray, v: np.ndarray, a: np.ndarray, H: np.ndarray
 ) -> None:
     for k in range(q.shape[0]):
         model.regressor(q[k], dq[k], v[k], a[k], H[k])

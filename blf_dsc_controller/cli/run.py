@@ -19,13 +19,7 @@ from blf_dsc_controller.bags.reader import recorded_run
 from blf_dsc_controller.cli.main import INTERRUPTED, unwritable
 from blf_dsc_controller.compiled.jit import announced_compilation
 from blf_dsc_controller.configuration.controller import ControllerConfig
-from blf_dsc_controller.configuration.nodes import (
-    CONTROLLER,
-    PLANT,
-    LoopConfig,
-    dump,
-    load_loop,
-)
+from blf_dsc_controller.configuration.nodes import CONTROLLER, PLANT, LoopConfig, dump, load_loop
 from blf_dsc_controller.configuration.plant import PlantConfig
 from blf_dsc_controller.configuration.schema import change
 from blf_dsc_controller.errors import BlfDscError

@@ -25,11 +25,7 @@ from blf_dsc_controller.configuration.gains import (
     Surface,
     Torque,
 )
-from blf_dsc_controller.configuration.robot import (
-    ArmConfig,
-    given_robot,
-    parameters_of,
-)
+from blf_dsc_controller.configuration.robot import ArmConfig, given_robot, parameters_of
 from blf_dsc_controller.configuration.schema import (
     PerJoint,
     Value,

@@ -11,11 +11,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from blf_dsc_controller.arms.base_parameters import (
-    PAYLOAD_SIZE,
-    BaseParameters,
-    base_parameters,
-)
+from blf_dsc_controller.arms.base_parameters import PAYLOAD_SIZE, BaseParameters, base_parameters
 from blf_dsc_controller.arms.inertia import inertia_of
 from blf_dsc_controller.arms.serial_chain import serial_chain
 from blf_dsc_controller.arms.urdf import Chain, read_chain

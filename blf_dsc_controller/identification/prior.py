@@ -108,14 +108,7 @@ class Prior(NamedTuple):
         return self._replace(D=D, cones=[cone for cone in self.cones if cone.at not in out])
 
 
-def prior_of(
-    robot: Robot,
-    chain: Chain,
-    torque: Floats,
-    speed: Floats,
-    *,
-    load: bool,
-) -> Prior:
+def prior_of(robot: Robot, chain: Chain, torque: Floats, speed: Floats, *, load: bool) -> Prior:
     """Return the prior of a chain: inertias as for learning, joint terms scaled by the recording.
 
     `torque` and `speed` (n,) are the largest of each joint; `load` says whether one is picked up.
