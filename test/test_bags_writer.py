@@ -171,10 +171,11 @@ def test_empty_bag_is_valid_and_an_existing_folder_is_left_alone(tmp_path):
 
 
 @pytest.mark.parametrize('compression', ['none', 'zstd'])
-def test_data_is_flushed_periodically(tmp_path, compression):
+def test_data_is_flushed_periodically(tmp_path, compression, monkeypatch):
     """What another process sees on the disk survives a kill of this one."""
     now, path = 0.0, tmp_path / 'bag'
-    bag = BagWriter(path, flush_interval=0.1, clock=lambda: now, compression=compression)
+    monkeypatch.setattr('blf_dsc_controller.bags.writer.monotonic', lambda: now)
+    bag = BagWriter(path, flush_interval=0.1, compression=compression)
     handle = bag.add_topic('/command', COMMANDS.type, [COMMANDS.offered])
     for k in range(1, 1001):
         now = k * 1e-3

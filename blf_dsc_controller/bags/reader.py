@@ -86,10 +86,6 @@ class RecordedRun(Run):
             values = np.where(np.isnan(values), position - other, values)
         return values
 
-    def holds(self, name: str) -> bool:
-        """Return whether some of an array is known."""
-        return name in self._stored and self._stored[name][0].has(self._stored[name][1])
-
     def in_memory(self) -> Run:
         """Return the run with all of its arrays in memory."""
         values = {field.name: getattr(self, field.name) for field in fields(Run)}
@@ -374,7 +370,7 @@ def table(run: RecordedRun, rows: slice = slice(None)) -> dict[str, NDArray[Any]
         'time [s]': run.time_of(stamp),
     }
     for field, (unit, _, _) in _ARRAYS.items():
-        values = run.at(field, rows) if run.holds(field) else None
+        values = run.at(field, rows)
         if values is not None:
             for joint, column in zip(run.joints, values.T, strict=True):
                 columns[f'{field} {joint} [{unit}]'] = column

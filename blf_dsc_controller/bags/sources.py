@@ -15,7 +15,7 @@ from io import SEEK_CUR, SEEK_END, BytesIO
 from mmap import mmap
 from pathlib import Path
 from struct import Struct
-from typing import Any, BinaryIO, NamedTuple, TypeAlias
+from typing import Any, BinaryIO, NamedTuple
 
 from mcap.data_stream import ReadDataStream
 from mcap.opcode import Opcode
@@ -47,9 +47,6 @@ _KINDS: dict[int, Any] = {
     Opcode.CHANNEL: Channel,
     Opcode.METADATA: Metadata,
 }
-
-StoredMessage: TypeAlias = tuple[int, int, int, int, bytes]
-"""Channel number, sequence number, log time [ns], publish time [ns], content."""
 
 
 class BagError(BlfDscError):
@@ -139,7 +136,7 @@ class OpenBag:
             yield BagMessage(each.topic, received, bytes(raw))
 
 
-def _records(stream: BinaryIO) -> Iterator[StoredMessage | Schema | Channel | Metadata | None]:
+def _records(stream: BinaryIO) -> Iterator[Any]:
     """Yield the records of a file; None for those that are not needed."""
     size = stream.seek(0, SEEK_END)
     stream.seek(MAGIC_SIZE)
@@ -170,8 +167,11 @@ def next_record(stream: BinaryIO | mmap, size: int, kinds: Mapping[int, Any]) ->
     return record
 
 
-def records_in(chunk: Chunk) -> Iterator[StoredMessage | Schema | Channel]:
-    """Yield the content of a chunk; ValueError if it differs from what was written."""
+def records_in(chunk: Chunk) -> Iterator[Any]:
+    """Yield the content of a chunk; ValueError if it differs from what was written.
+
+    A message is a tuple: channel number, sequence number, log time and publish time [ns], content.
+    """
     if chunk.uncompressed_size > _LARGEST_CHUNK:
         raise DamageError(f'a chunk would unpack to {chunk.uncompressed_size} bytes')
     stream, size = get_chunk_data_stream(chunk, validate_crc=True)

@@ -83,10 +83,6 @@ class JointStates:
         """Stamps (N,) [ns]."""
         return self._messages.column(_STAMP, self.number)
 
-    def has(self, k: int) -> bool:
-        """Return whether any of the positions (0), velocities (1) or efforts (2) is known."""
-        return any((columns[k] >= 0).any() for columns in self._columns.values())
-
     def field(self, k: int, rows: Rows = ALL, columns: Rows = ALL) -> Floats:
         """Return positions (0), velocities (1) or efforts (2), (m, n); NaN where unknown."""
         number = self.number[rows]

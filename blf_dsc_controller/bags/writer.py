@@ -3,12 +3,12 @@
 
 from __future__ import annotations
 
-import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import asdict, dataclass
 from math import inf
 from pathlib import Path
+from time import monotonic
 from typing import Any
 
 import yaml
@@ -73,13 +73,11 @@ class BagWriter(AbstractContextManager['BagWriter']):
         *,
         compression: str = 'none',
         flush_interval: float | None = 0.1,
-        clock: Callable[[], float] = time.monotonic,
     ) -> None:
         self.path = Path(path)
         self.closed = False
         self._compression = CompressionType[compression.upper()]
         self._flush_interval = inf if flush_interval is None else flush_interval
-        self._clock = clock
         self._topics: list[dict[str, Any]] = []  # as in metadata.yaml, with definitions beside
         self._definitions: list[Definition] = []
         self._files: list[_File] = []
@@ -90,7 +88,7 @@ class BagWriter(AbstractContextManager['BagWriter']):
             raise BagError(
                 f'{path} exists already and is not overwritten: choose another folder or remove it'
             ) from None
-        self._flushed = self._clock()
+        self._flushed = monotonic()
         self._begin_file()
 
     def add_topic(
@@ -151,14 +149,14 @@ class BagWriter(AbstractContextManager['BagWriter']):
 
     def flush_if_due(self) -> None:
         """Flush if the flush interval has passed."""
-        if self._clock() - self._flushed >= self._flush_interval:
+        if monotonic() - self._flushed >= self._flush_interval:
             self.flush()
 
     def flush(self) -> None:
         """Pass everything written so far to the operating system."""
         if not self.closed:  # a timer may fire once more
             self._end_chunk()
-            self._flushed = self._clock()
+            self._flushed = monotonic()
 
     def close(self) -> None:
         """Complete the bag; a second call does nothing."""
