@@ -19,6 +19,7 @@ from blf_dsc_controller.messages.codecs import (
     MissingJointError,
     ShortArrayError,
     encode_clock,
+    joint_state_layout,
     typestore,
 )
 
@@ -164,4 +165,45 @@ def test_multi_array_with_dimensions_of_the_expected_size_is_decoded(data, littl
     decoder = Float64MultiArrayDecoder(len(data))
     assert decoder.decode(multi_array(data, dimension, little_endian=little_endian)) == len(data)
     assert decoder.decode(multi_array([4, 5])) == 2
+    assert decoder.values.tolist() == data
+
+
+def without_padding(raw):
+    """The meaningful pieces of a JointState: rclpy leaves its padding bytes uninitialised."""
+    layout = joint_state_layout(raw)
+    return [raw[:2], raw[4:12], layout.names] + [
+        raw[array.offset : array.offset + 8 * array.size] for array in layout.arrays
+    ]
+
+
+@pytest.mark.parametrize(
+    'fields', [JOINT_STATE_FIELDS, (), *((field,) for field in JOINT_STATE_FIELDS)]
+)
+@pytest.mark.parametrize('names', [['j'], ['a', 'bcd'], ['a', 'bc', 'def', 'ghij', '']])
+def test_each_reads_what_rclpy_serialises_and_the_other_way_round(names, fields):
+    rclpy = pytest.importorskip('rclpy.serialization', reason='needs ROS 2')
+    from sensor_msgs.msg import JointState
+    from std_msgs.msg import Float64MultiArray
+
+    sizes = dict(zip(fields, (0.1, -0.2, 1e300), strict=False))
+    values = {field: [size / (j + 1) for j in range(len(names))] for field, size in sizes.items()}
+    message = JointState(name=names, **values)
+    message.header.stamp.sec, message.header.stamp.nanosec = divmod(STAMP, 10**9)
+    raw = JointStateEncoder(names, fields).encode(STAMP, **values)
+    assert rclpy.deserialize_message(raw, JointState) == message
+    expected = rclpy.serialize_message(message)
+    # rclpy may append some bytes if arrays are empty.
+    assert len(raw) == len(expected) or fields != JOINT_STATE_FIELDS
+    assert without_padding(raw) == without_padding(expected)
+    for message.header.frame_id in ('', 'b', 'world'):
+        decoder = JointStateDecoder(names[::-1], ())
+        assert decoder.decode(rclpy.serialize_message(message)) == STAMP
+        for field in JOINT_STATE_FIELDS:
+            found, unknown = getattr(decoder, field)[::-1], [np.nan] * len(names)
+            np.testing.assert_array_equal(found, values.get(field, unknown))
+    data = values.get('position', [])
+    raw = Float64MultiArrayEncoder(len(data)).encode(data)
+    assert list(rclpy.deserialize_message(raw, Float64MultiArray).data) == data
+    decoder = Float64MultiArrayDecoder(len(data))
+    assert decoder.decode(rclpy.serialize_message(Float64MultiArray(data=data))) == len(data)
     assert decoder.values.tolist() == data

@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Events between two samples are in the bag of the running nodes and replay bit for bit."""
+"""Events between two samples replay bit for bit from the bag of the nodes; bags are played."""
 
 from __future__ import annotations
 
+import threading
 import time
 
 import numpy as np
@@ -11,20 +12,30 @@ import pytest
 pytest.importorskip('rclpy', reason='needs ROS 2')
 
 import recorded_run
+import synthetic_bag
 from rclpy.parameter import Parameter
+from rclpy.qos import DurabilityPolicy, QoSProfile
+from rclpy.serialization import deserialize_message
 from recorded_run import compared, of
 from ros_rig import FakeClock, RosRig, activate, configure, deactivate
+from rosgraph_msgs.msg import Clock
+from sensor_msgs.msg import JointState
 from sent_trajectory import JOINTS, SECOND, send, trajectory
+from std_msgs.msg import String
 
 from blf_dsc_controller.bags.content import read_content
-from blf_dsc_controller.messages.codecs import JointStateEncoder
+from blf_dsc_controller.bags.sources import open_bag
+from blf_dsc_controller.cli.main import main
+from blf_dsc_controller.messages.codecs import JointStateEncoder, typestore
 from blf_dsc_controller.messages.journal import EventType
 from blf_dsc_controller.messages.topics import (
     COMMANDS,
     JOINT_STATES,
+    ROBOT_DESCRIPTION,
     TRACKING_ERROR,
 )
 from blf_dsc_controller.nodes.endpoints import message_class, qos_profile
+from blf_dsc_controller.nodes.player_node import PlayerNode
 from blf_dsc_controller.nodes.process import drain
 from blf_dsc_controller.nodes.recorder_node import BagRecorderNode
 from blf_dsc_controller.replay.verify import verify
@@ -164,3 +175,75 @@ def test_state_timeout_replays_with_its_torques(tmp_path):
     torques = len(of(recorded_run.messages(bag), COMMANDS))
     assert compared(result)['commands'] == 2 * torques
     assert compared(result)['tracking_error'] == 6 * errors.size
+
+
+# Playing a bag: its messages byte for byte over ROS, in its time.
+
+
+@pytest.fixture(scope='module')
+def bag(tmp_path_factory):
+    """200 samples, 1 ms apart, after a URDF."""
+    message = typestore().types[ROBOT_DESCRIPTION.type](data='<robot/>')
+    raw = bytes(typestore().serialize_cdr(message, ROBOT_DESCRIPTION.type))
+    # As the middleware delivers it.
+    urdf = (ROBOT_DESCRIPTION, synthetic_bag.START, raw + bytes(-len(raw) % 4))
+    messages = [urdf, *synthetic_bag.Synthetic(200).messages()]
+    return synthetic_bag.write(tmp_path_factory.mktemp('played') / 'bag', messages)
+
+
+def test_bag_is_played_in_its_time_and_order_byte_for_byte(bag, ros):
+    received = {}
+    latched = QoSProfile(depth=1000, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+
+    def listen(type_, name, quality=1000):
+        callback = received.setdefault(name, []).append
+        ros.tester.create_subscription(type_, name, callback, quality, raw=True)
+
+    listen(JointState, '/joint_states')
+    listen(Clock, '/clock')
+    with open_bag(bag) as opened:
+        chosen = ['joint_states', '/robot_description']
+        player = PlayerNode(opened, chosen, clock=True, context=ros.context)
+        assert [*player.outputs] == ['/robot_description', '/joint_states']
+        ros.until(player.outputs['/joint_states'].get_subscription_count)
+        ros.until(lambda: ros.tester.count_publishers('/clock'))
+        begin = time.monotonic()
+        thread = threading.Thread(target=player.play, args=(0.5,))
+        thread.start()
+        ros.until(lambda: not thread.is_alive())
+        assert time.monotonic() - begin >= 0.199 / 0.5  # never early, however slow the machine
+        listen(String, '/robot_description', latched)  # late, as RViz is
+        sent = [raw for _, _, _, raw in of(recorded_run.messages(bag), JOINT_STATES)]
+        ros.until(lambda: len(received['/joint_states']) == len(sent))
+        ros.until(lambda: received['/robot_description'])
+        player.destroy_node()
+    assert [bytes(raw) for raw in received['/joint_states']] == sent
+    assert deserialize_message(received['/robot_description'][0], String).data == '<robot/>'
+    clocks = [deserialize_message(raw, Clock).clock for raw in received['/clock']]
+    times = [clock.sec * 10**9 + clock.nanosec - synthetic_bag.START for clock in clocks]
+    assert len(times) > 1
+    assert [0, *times, 199_000_000] == sorted([0, *times, 199_000_000])
+
+
+@pytest.mark.parametrize(
+    ('options', 'message'),
+    [
+        (['--rate', '0'], ''),
+        (['--rate', 'nan'], '--rate nan: expected a speed, or 0'),
+        (['--rate', '-1'], '--rate -1: expected'),
+        (['--map', 'commands=/x'], '--play publishes the bag as it is'),
+        (['--topics', '/x'], 'the bag has no topic /x; it holds /'),
+        ([], 'the bag is empty'),
+    ],
+)
+def test_bag_is_played_by_command_or_refused_in_one_line(bag, tmp_path, capfd, options, message):
+    path = bag if options else recorded_run.write(tmp_path / 'bag', [])
+    code = main(['replay', str(path), '--play', *options])
+    out, err = capfd.readouterr()
+    if not message:
+        assert (code, err) == (0, '')
+        assert out.startswith('playing 0.199 s: ')
+        assert '/robot_description' in out
+        return
+    assert (code, out, err.count('\n')) == (1, '', 1)
+    assert err.startswith(f'blf_dsc replay: {message}')

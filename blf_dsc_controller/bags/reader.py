@@ -173,7 +173,7 @@ def recorded_run(content: Content) -> RecordedRun:
 
 
 def single_run(
-    content: Content, joints: Sequence[str], required: Sequence[str] = ('position',)
+    content: Content, joints: Sequence[str]
 ) -> tuple[JointStates, tuple[str, ...], tuple[int, int]]:
     """Return the states of one run of one arm, what is left out, and when it was received [ns].
 
@@ -184,7 +184,7 @@ def single_run(
         BagError: all stamps are the same, or several publishers share the topic.
     """
     messages = content.topics[topics.JOINT_STATES]
-    states = messages.joint_states(joints, required)
+    states = messages.joint_states(joints, ('position',))
     stamp, received = states.stamp, states.received
     if stamp.size > 1 and (stamp == stamp[0]).all():
         raise BagError(

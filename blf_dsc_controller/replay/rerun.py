@@ -9,7 +9,7 @@ Both together give the exact order of messages and events; what was dropped has 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
@@ -43,7 +43,7 @@ class Outputs:
         topics: messages of each topic, received at the stamp of their state.
     """
 
-    def __init__(self, guard: Guard, topics: Collection[Topic]) -> None:
+    def __init__(self, guard: Guard) -> None:
         self._guard, self._joints = guard, guard.config.joints
         self._estimates = estimate_names(guard.config)
         self._telemetry = ControllerTelemetry(self._joints, self._estimates, 1)
@@ -51,11 +51,13 @@ class Outputs:
         self.first = self.last = -1
         self._bound = b''
         self._sent: Counter[Topic] = Counter()
-        self.topics = {topic: TopicMessages(topic.resolved, topic.type) for topic in topics}
+        self.topics: dict[Topic, TopicMessages] = {}
 
     def _add(self, stamp: int, message: Message, number: int = 0) -> None:
         topic, raw = message
         self._sent[topic] += 1
+        if topic not in self.topics:
+            self.topics[topic] = TopicMessages(topic.resolved, topic.type)
         added = BagMessage(topic.resolved, stamp, raw, number or self._sent[topic])
         self.topics[topic].add(added)
 
@@ -116,12 +118,8 @@ class Rerun:
         states: JointStates,
         errors: Mapping[int, MessageError],
         answers: JointStates,
-        topics: Collection[Topic],
     ) -> None:
-        """Start with `config`; `errors` maps the number of each unreadable state to its error.
-
-        The outputs on `topics` are kept.
-        """
+        """Start with `config`; `errors` maps the number of each unreadable state to its error."""
         self.events: list[Event] = []
         self.passed_over = 0
         self.departure: tuple[str, int] | None = None
@@ -141,7 +139,7 @@ class Rerun:
         self._position = -1  # of the last message processed or passed over
         self._last = -1  # stamp of the last answer
         self._failed = False
-        self.outputs = Outputs(self._guard, topics)
+        self.outputs = Outputs(self._guard)
 
     def run(self, events: Sequence[Event]) -> None:
         """Process the joint states with the events after the configuration, in order."""

@@ -137,7 +137,7 @@ def verify(path: Path, namespace: str = '', names: NameMap = NO_NAMES) -> Verifi
             f'{start} ns, so its outputs cannot be reproduced: start the recorder first'
         )
     answers = _before(content.topics[topics.TRACKING_ERROR].joint_states(config.joints, ()), until)
-    run = Rerun(config, _before(states, until), errors, answers, _COMPARED)
+    run = Rerun(config, _before(states, until), errors, answers)
     run.run(events[1:])
     comparisons = tuple(_compared(content, run, answers, config.joints))
     differences = [found.difference for found in comparisons if found.difference]
@@ -205,13 +205,13 @@ def _compared(
 ) -> Iterator[Comparison]:
     """Yield the comparison of each topic in a bag; `answers` are those of tracking errors."""
     for topic, fields in _COMPARED.items():
-        messages, own = content.topics.get(topic), run.outputs.topics[topic]
-        own.decode()
+        messages, own = content.topics.get(topic), run.outputs.topics.get(topic)
         if messages is None:
             continue
         result = Comparison(messages.name, messages.size * len(joints) * len(fields))
         try:
-            if own.size:
+            if own is not None:
+                own.decode()
                 _compare(topic, messages, own, answers, joints, result, run.outputs.first)
         except BlfDscError as error:  # unreadable, or in an unknown order
             result.left_out = f'{error}'
