@@ -60,7 +60,8 @@ def main():
     options = parser.parse_args()
     with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as name:
         folder = Path(name)
-        bag = folder / 'panda'
+        bag = folder / 'panda' / 'bag'
+        bag.parent.mkdir()
         loop = load_loop('panda', {'sim_plant': {'duration': 27.0}})
         record = simulate(loop.controller, loop.plant)
         write_bag(bag, record, loop.controller, 'none', loop.plant)

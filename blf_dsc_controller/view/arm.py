@@ -8,7 +8,7 @@ import io
 import logging
 import sysconfig
 import xml.etree.ElementTree as ET
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -46,12 +46,12 @@ class ShownArm(NamedTuple):
         return model if model.scene.geometry else _load(with_cylinders(self.text, self.reach))
 
 
-def arm_of(config: ControllerConfig, lengths: Sequence[float] = ()) -> ShownArm:
-    """Return the arm of a controller; planar links have these lengths [m], or all `arm.l1`."""
+def arm_of(config: ControllerConfig, plant: Mapping[str, Any]) -> ShownArm:
+    """Return the arm of a controller; planar links have the lengths of its plant, if known."""
     robot = config.robot
     if config.model == 'urdf':
         return ShownArm(robot.text, robot.chain(config.joints))
-    lengths = lengths or (config.arm.l1,) * 2
+    lengths = [plant.get(name, config.arm.l1) for name in ('arm.l1', 'arm.l2')]
     text = with_cylinders(urdf('arm', config.joints, lengths, (1.0, 1.0), (0.0, 0.0)), sum(lengths))
     return ShownArm(text, read_chain(text, '', 'tip', config.joints))
 

@@ -41,7 +41,7 @@ class BagPlayer:
         self._page, self._times = page, np.array([each.time for each in self.snapshots])
         self._events = sorted([*bag.events, *plant_events(plant)])
         self._playing, self._drawn = False, -1
-        page.draw_arm(config, [plant[key] for key in ('arm.l1', 'arm.l2') if key in plant])
+        page.draw_arm(config, plant)
         gui = page.server.gui
         end = float(self._times[-1])
         self.slider = gui.add_slider('time [s]', 0.0, end, 1e-3, 0.0, order=-2.0)

@@ -194,8 +194,7 @@ class ViewNode(PlainNode):
     def _draw_all(self) -> None:
         if self._config is not None:
             self.page.clear()
-            lengths = [self._plant[name] for name in ('arm.l1', 'arm.l2') if name in self._plant]
-            self._add_buttons(self.page.draw_arm(self._config, lengths))
+            self._add_buttons(self.page.draw_arm(self._config, self._plant))
 
     # Samples.
 

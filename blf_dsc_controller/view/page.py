@@ -48,7 +48,6 @@ _PEAK = 30  # snapshots, a second, of which the largest error is plotted
 _LEAST, _MOST = 0.1, 300.0  # % of the bound, the ends of its axis
 _HEIGHT = 130  # px of a plot: three fit below the state at 900 px
 _VIEW = np.array((0.42, -0.88, 0.22))  # direction from the arm to the camera
-_NO_POINTS = {'show': False}
 _AUTO: Mapping[str, Any] = {}
 _FROM_ZERO = {'range': {'min': {'hard': 0.0, 'soft': 0.0, 'mode': 1}, 'max': {'pad': 0.1}}}
 _SETTLED = 2.0  # s
@@ -163,11 +162,11 @@ class Page:
         self._header = gui.add_html('')
         self.state(*self._state)
 
-    def draw_arm(self, config: ControllerConfig, lengths: Sequence[float] = ()) -> Any:
-        """Draw the arm of a controller, planar links with these lengths [m]; return the tabs."""
+    def draw_arm(self, config: ControllerConfig, plant: Mapping[str, Any]) -> Any:
+        """Draw the arm of a controller, with the parameters of its plant; return the tabs."""
         from viser.extras import ViserUrdf
 
-        self._arm = arm = arm_of(config, lengths)
+        self._arm = arm = arm_of(config, plant)
         self._joints = [joint.name for joint in arm.chain.joints]
         prefix, names = _shortened(self._joints)
         self._bodies = bodies_of(estimate_names(config))
@@ -204,20 +203,17 @@ class Page:
     def _plot(
         self, title: str, names: Sequence[str], y: Mapping[str, Any] = _AUTO, limit: str = ''
     ) -> Any:
-        lines: list[Any] = [{'label': 's'}]
-        lines += [
-            {'label': name, 'stroke': COLOURS[k % len(COLOURS)], 'width': 1.5, 'points': _NO_POINTS}
-            for k, name in enumerate(names)
-        ]
-        edge = {'stroke': ALARM, 'width': 1.5, 'dash': [6, 4], 'points': _NO_POINTS}
-        lines += [{'label': limit, **edge}] if limit else []
-        lines += [
-            {'label': 'event', 'stroke': INK, 'width': 1.0, 'points': _NO_POINTS, 'scale': 'marks'}
-        ]
+        def line(label: str, stroke: str, width: float = 1.5, **style: Any) -> Any:
+            points = {'show': False}
+            return {'label': label, 'stroke': stroke, 'width': width, 'points': points, **style}
+
+        lines = [line(name, COLOURS[k % len(COLOURS)]) for k, name in enumerate(names)]
+        if limit:
+            lines.append(line(limit, ALARM, dash=[6, 4]))
+        lines = [{'label': 's'}, *lines, line('event', INK, 1.0, scale='marks')]
         scales: Any = {'x': {'time': False}, 'y': y, 'marks': {'range': (0.0, 1.0)}}
-        empty = (np.zeros(1),) * len(lines)
         return self.server.gui.add_uplot(
-            empty,
+            (np.zeros(1),) * len(lines),
             tuple(lines),
             title=title,
             scales=scales,
