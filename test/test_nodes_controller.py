@@ -156,6 +156,13 @@ def test_start_outside_the_bound_is_reported_with_joint_error_and_bound(ros):
             '; to use it anyway, start the node with it',
         ),
         ('barrier.bound', [1e-6, 0.002], 'barrier.bound: joint1 is ', 'with a smaller error'),
+        (
+            'feedback.gain',
+            [65.0, -25.0],
+            'feedback.gain: got -25.0 at entry 2 of [65.0, -25.0]',
+            '',
+        ),
+        ('sample_time', 0.002, 'sample_time is fixed at the start: arm and law are built', ''),
     ],
 )
 def test_gain_change_takes_effect_at_the_next_sample_or_is_rejected(ros, name, value, begin, end):

@@ -8,9 +8,7 @@ import pytest
 pytest.importorskip('rclpy')
 
 from rcl_interfaces.msg import ParameterType
-from rcl_interfaces.srv import SetParametersAtomically
 from rclpy.context import Context
-from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 
@@ -190,29 +188,3 @@ def test_node_can_reject_a_valid_configuration_of_its_own_parameters_only(tuned)
     assert tuned.applied == []
     tuned.problems = []
     assert tuned.request(barrier__bound=[0.001, 0.001]).successful
-
-
-def test_set_parameters_service_behaves_the_same(start, tuned):
-    client_node = start('client_node')
-    executor = SingleThreadedExecutor(context=client_node.context)
-    service = '/blf_dsc_controller/set_parameters_atomically'
-    client = client_node.create_client(SetParametersAtomically, service)
-    for node in (tuned.node, client_node):
-        executor.add_node(node)
-    assert client.wait_for_service(timeout_sec=300.0)
-    reasons = []
-    for name, value in (
-        ('feedback.gain', [65.0, 25.0]),
-        ('feedback.gain', [65.0, -25.0]),
-        ('sample_time', 0.002),
-    ):
-        message = Parameter(name, value=value).to_parameter_msg()
-        future = client.call_async(SetParametersAtomically.Request(parameters=[message]))
-        executor.spin_until_future_complete(future, timeout_sec=300.0)
-        result = future.result().result
-        assert result.successful == (not reasons)
-        reasons.append(result.reason)
-    assert reasons[1].startswith('feedback.gain: got -25.0 at entry 2 of [65.0, -25.0]')
-    assert reasons[2].startswith('sample_time is fixed at the start: arm and law are built')
-    assert [config.feedback.gain for config in tuned.applied] == [(65.0, 25.0)]
-    executor.shutdown()

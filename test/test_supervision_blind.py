@@ -89,32 +89,28 @@ def test_held_gravity_fades_out_without_states_and_returns_with_them(raw):
     assert (np.abs(rig.commands[-1]) > 0.1).all()
 
 
-def torque_after_silence(rig):
-    rig.wait(1000)
-    return rig.commands[-1].tolist()
-
-
-def test_gravity_is_held_in_silence_only_for_the_fade_time():
+@pytest.mark.parametrize(
+    ('calls', 'phase'),
+    [
+        ((), Phase.SAFE_STOP),
+        (('deactivate',), Phase.INACTIVE),
+        (('deactivate', 'activate'), Phase.STARTING),
+    ],
+)
+def test_gravity_is_held_in_silence_only_for_the_fade_time(calls, phase):
+    """A driver would apply the last torque forever."""
     rig = Rig(HOLDING | {'safety.fade_time': 0.2}, live=True)
     rig.step(20)
+    for call in calls:
+        getattr(rig.guard, call)()
     rig.wait(60)
     assert (np.abs(rig.commands[-1]) > 1.0).all()
-    assert torque_after_silence(rig) == [0.0, 0.0]
-
-
-@pytest.mark.parametrize('again', [False, True])
-def test_torque_fades_when_silence_follows_a_deactivation(again):
-    """A driver would apply the last torque forever."""
-    rig = Rig(HOLDING, live=True)
-    rig.step(20)
-    rig.guard.deactivate()
-    if again:
-        rig.guard.activate()
-    assert torque_after_silence(rig) == [0.0, 0.0]
-    assert rig.supervisor.phase is (Phase.STARTING if again else Phase.INACTIVE)
+    rig.wait(1000)
+    assert rig.commands[-1].tolist() == [0.0, 0.0]
+    assert rig.supervisor.phase is phase
     rig.base += rig.steady - 5_000_000_000
     rig.step(1)
-    assert rig.supervisor.phase is (Phase.TRACKING if again else Phase.INACTIVE)
+    assert rig.supervisor.phase is (Phase.TRACKING if phase is Phase.STARTING else phase)
 
 
 def test_after_a_long_silence_nothing_is_commanded_until_a_reset():
