@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""External interfaces of the nodes: namespaces, QoS, robot description, policy."""
+"""External interfaces of the nodes: namespaces, QoS, policy."""
 
 from __future__ import annotations
 
@@ -15,8 +15,7 @@ pytest.importorskip('rclpy', reason='needs ROS 2')
 
 import sros2_graph
 import yaml
-from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
-from std_msgs.msg import String
+from rclpy.qos import QoSProfile, ReliabilityPolicy
 
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.plant import PlantConfig
@@ -71,17 +70,6 @@ def test_standard_parameters_override_qos(ros):
     (subscriber,) = ros.tester.get_subscriptions_info_by_topic('/joint_states')
     for endpoint in (publisher, subscriber):
         assert endpoint.qos_profile.reliability is ReliabilityPolicy.BEST_EFFORT
-
-
-def test_late_subscribers_receive_the_robot_description(ros):
-    ros.add(PlantNode, arm__l2=0.6)
-    ros.spin(0.1)
-    received = []
-    latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-    ros.tester.create_subscription(String, 'robot_description', received.append, latched)
-    ros.until(lambda: received)
-    assert received[0].data.startswith('<robot name="sim_plant">')
-    assert 'length="0.6"' in received[0].data
 
 
 def test_sros2_policy_grants_each_node_exactly_what_it_uses(tmp_path):

@@ -17,7 +17,7 @@ from blf_dsc_controller.messages import topics
 from blf_dsc_controller.messages.codecs import Float64MultiArrayEncoder
 from blf_dsc_controller.nodes.plant_node import PlantNode
 from sim_plant.command_input import Latency
-from sim_plant.plant import parameter_names_of, plant_of
+from sim_plant.plant import parameter_names_of, plant_of, urdf_of
 
 TORQUE = (5.0, 3.0)  # N m
 
@@ -75,13 +75,17 @@ def test_arm_driven_too_fast_breaks_and_stands_still_until_reset(ros):
     assert not node.plant.is_broken
 
 
-def test_description_and_truth_of_a_urdf_arm_are_published(ros):
-    description, truth = ros.listen(topics.ROBOT_DESCRIPTION), ros.listen(topics.TRUTH)
-    given = {'robot.urdf': 'panda.urdf', 'robot.tip': 'panda_hand_tcp', 'truth.mass_factor': 1.2}
+@pytest.mark.parametrize(
+    'given', [{'arm.l2': 0.6}, {'robot.urdf': 'panda.urdf', 'robot.tip': 'panda_hand_tcp'}]
+)
+def test_late_subscribers_receive_description_and_truth(ros, given):
     start_plant(ros, **given)
+    ros.spin(0.1)
+    description, truth = ros.listen(topics.ROBOT_DESCRIPTION), ros.listen(topics.TRUTH)
     ros.until(lambda: description and truth)
     config = build(PlantConfig, given)
-    assert description[0].data == config.robot.text
+    assert description[0].data == urdf_of(config)
+    assert 'robot.urdf' in given or 'length="0.6"' in description[0].data
     names = (*parameter_names_of(config), *disturbance_names(config.joints))
     assert tuple(truth[-1].name[: len(names)]) == names
     np.testing.assert_array_equal(truth[-1].position, plant_of(config).truth())
