@@ -116,27 +116,14 @@ def named(*names: str, fields=('position', 'velocity', 'effort')) -> JointStateE
     return JointStateEncoder(names, fields)
 
 
-def reordered(state):
-    """Send the joints in reverse order."""
-    q, dq, effort = (values[::-1] for values in (state.q, state.dq, state.effort))
-    return [state.raw(named(*JOINTS[::-1]), q=q, dq=dq, effort=effort)]
+def arranged(names, values):
+    """Send the joints by these `names`, with `values` made of those of the two joints."""
 
+    def change(state):
+        q, dq, effort = (np.array(values(*v)) for v in (state.q, state.dq, state.effort))
+        return [state.raw(named(*names), q=q, dq=dq, effort=effort)]
 
-def among_others(state):
-    """Send the joints among others, one of which is NaN."""
-    wide = [np.array([np.nan, v[1], 7.0, v[0]]) for v in (state.q, state.dq, state.effort)]
-    names = ('gripper', 'joint2', 'rail', 'joint1')
-    return [state.raw(named(*names), q=wide[0], dq=wide[1], effort=wide[2])]
-
-
-def duplicated(state):
-    triple = [np.array([*v, v[0]]) for v in (state.q, state.dq, state.effort)]
-    names = ('joint1', 'joint2', 'joint1')
-    return [state.raw(named(*names), q=triple[0], dq=triple[1], effort=triple[2])]
-
-
-def between_others(state):
-    return [state.raw(named('a', 'b')), state.raw()]
+    return change
 
 
 def renamed(*names: str):
@@ -305,11 +292,6 @@ def wall_clock_back(rig: Rig) -> None:
     rig.wall -= 3600 * 10**9
 
 
-def restarted_plant(rig: Rig) -> None:
-    """Kill and restart the plant's process, whose stamps start over."""
-    rig.plant.reset()
-
-
 def restarted_controller(rig: Rig) -> None:
     """Start a new controller process while the arm is moving, far from the start."""
     rig.sense = lambda _: []
@@ -320,6 +302,9 @@ def restarted_controller(rig: Rig) -> None:
 
 
 NAN, INF = np.nan, np.inf
+OTHERS = named('a', 'b')
+AMONG = ('gripper', 'joint2', 'rail', 'joint1')
+TWICE = ('joint1', 'joint2', 'joint1')
 BY_EFFORT = {'learning.torque_source': 'effort'}
 ESTIMATED = {'safety.velocity': 'estimated'}
 AVERAGED = {'safety.overrun_window': 0.1}
@@ -339,12 +324,12 @@ FAULTS = (
     Fault('position of joint1 jumps by 3 mrad', spoil('q', 0, 2.296), R.OUTSIDE_BOUND),
     Fault('position of joint2 is 1e300 rad', spoil('q', 1, 1e300), R.OUTSIDE_BOUND),
     Fault('velocity of joint1 is 60 rad/s', spoil('dq', 0, 60.0), R.VELOCITY),
-    Fault('joints in another order', every(reordered)),
-    Fault('extra joints, one of them NaN', every(among_others)),
-    Fault('duplicate joint', once(duplicated), R.JOINT_DUPLICATED),
+    Fault('joints in another order', every(arranged(JOINTS[::-1], lambda a, b: (b, a)))),
+    Fault('extra joints, one of them NaN', every(arranged(AMONG, lambda a, b: (NAN, b, 7.0, a)))),
+    Fault('duplicate joint', once(arranged(TWICE, lambda a, b: (a, b, a))), R.JOINT_DUPLICATED),
     Fault('missing joint', once(renamed('joint1', 'joint3')), R.JOINT_MISSING),
-    Fault('no joints', once(lambda s: [s.raw(named(), q=[], dq=[], effort=[])]), R.JOINT_MISSING),
-    Fault('states of another robot in between', every(between_others)),
+    Fault('no joints', once(arranged((), lambda *_: ())), R.JOINT_MISSING),
+    Fault('states of another robot in between', every(lambda s: [s.raw(OTHERS), s.raw()])),
     Fault('only states of another robot', every(renamed('a', 'b')), R.STATE_TIMEOUT, 60, live=True),
     Fault('no positions', once(unmeasured('position')), R.FIELD_MISSING),
     Fault('no velocities', once(unmeasured('velocity')), R.NOT_FINITE),
@@ -395,7 +380,7 @@ FAULTS = (
     Fault(
         'all commands are NaN', commanded(np.array([NAN, NAN]), always=True), R.OUTSIDE_BOUND, 80
     ),
-    Fault('plant killed and restarted', restarted_plant, R.STAMP_BACKWARD),
+    Fault('plant killed and restarted', lambda rig: rig.plant.reset(), R.STAMP_BACKWARD),
     Fault(
         'controller killed and restarted outside the bound',
         restarted_controller,
