@@ -35,10 +35,9 @@ from typing import Any
 import numpy as np
 from harness import print_table
 from random_arm import CONFIG, random_urdf
-from shaken_arm import PERIOD, Truth, measured, reference_of, shake, truth_of
+from shaken_arm import PERIOD, is_covered, measured, recording_of, reference_of, shake, truth_of
 
 from blf_dsc_controller.arms.inertia import pseudo_inertia
-from blf_dsc_controller.arms.urdf import Chain
 from blf_dsc_controller.configuration.nodes import CONTROLLER, PLANT, LoopConfig, load_loop
 from blf_dsc_controller.configuration.robot import Robot
 from blf_dsc_controller.identification.exciting_reference import ExcitationProblem, search
@@ -111,25 +110,20 @@ def _of_arm(seed: int) -> list[tuple[float, ...]]:
     """Return for each rate the errors [%] before and after, coverage, time and whether physical."""
     robot = _robot(seed)
     chain = robot.chain(())
-    truth = truth_of(chain, seed)
+    joints, truth = tuple(joint.name for joint in chain.joints), truth_of(chain, seed)
     motion = measured(shake(chain, truth, reference_of(chain, 2 * seed), _DURATION), seed)
     unseen = shake(chain, truth, reference_of(chain, 2 * seed + 1), _UNSEEN)
     rows: list[tuple[float, ...]] = []
     for every in _EVERY:
         begin = time.perf_counter()
-        found = identify_arm(_recording(chain, motion[::every], every), robot)
+        found = identify_arm(recording_of(motion[::every], joints, every * PERIOD), robot)
         seconds = time.perf_counter() - begin
         smallest = (np.linalg.eigvalsh(pseudo_inertia(body))[0] for body in found.parts.bodies)
         physical = min(smallest) > 0.0
-        errors = _errors(found, _recording(chain, unseen, 1))
-        rows.append((*errors, _coverage(found, truth), seconds, float(physical)))
+        errors = _errors(found, recording_of(unseen, joints))
+        covered = float(np.mean(is_covered(found, truth)))
+        rows.append((*errors, covered, seconds, float(physical)))
     return rows
-
-
-def _recording(chain: Chain, states: Floats, every: int) -> Recording:
-    joints = tuple(joint.name for joint in chain.joints)
-    gap = np.zeros(len(states), dtype=bool)
-    return Recording(joints, every * PERIOD, states[:, 0], states[:, 2], gap, 'simulated')
 
 
 def _errors(found: Identified, unseen: Recording) -> tuple[float, float]:
@@ -142,15 +136,6 @@ def _errors(found: Identified, unseen: Recording) -> tuple[float, float]:
         left = rows.X @ (G @ values)[:-1] - u
         errors.append(100.0 * float(np.linalg.norm(left) / np.linalg.norm(u)))
     return errors[0], errors[1]
-
-
-def _coverage(found: Identified, truth: Truth) -> float:
-    """Return the share of the base parameters and friction within their 95 % intervals."""
-    true = np.concatenate((truth.inertias.ravel(), truth.rotors, truth.viscous, truth.coulomb))
-    at, n = slice(0, true.size), len(found.chain.joints)
-    G = base_matrix(found.parameters, n)[: found.parameters.model.p + 2 * n, at]
-    deviation = np.sqrt(np.diag(G @ found.covariance[at, at] @ G.T))
-    return float(np.mean(np.abs(G @ (found.values[at] - true)) < 1.96 * deviation))
 
 
 def _weighed(name: str, runs: int) -> tuple[str, ...]:

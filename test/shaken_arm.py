@@ -13,6 +13,7 @@ from blf_dsc_controller.arms.inertia import inertia_of, pseudo_inertia
 from blf_dsc_controller.arms.urdf import read_chain
 from blf_dsc_controller.bags.writer import BagWriter
 from blf_dsc_controller.compiled.jit import kernel
+from blf_dsc_controller.identification.prior import base_matrix
 from blf_dsc_controller.identification.recording import Recording
 from blf_dsc_controller.messages.codecs import JointStateEncoder
 from blf_dsc_controller.messages.topics import JOINT_STATE
@@ -135,10 +136,19 @@ def measured(states, seed, encoder=2.0 * np.pi / 2**20, noise=0.01):
     return seen
 
 
-def recording_of(states):
-    """Return states (N, 3, n) of a Panda as what `identify` reads from a bag."""
+def recording_of(states, joints=PANDA, period=PERIOD):
+    """Return states (N, 3, n) as what `identify` reads from a bag."""
     gap = np.zeros(len(states), dtype=bool)
-    return Recording(PANDA, PERIOD, states[:, 0], states[:, 2], gap, 'made up')
+    return Recording(joints, period, states[:, 0], states[:, 2], gap, 'made up')
+
+
+def is_covered(found, truth):
+    """Return whether each base parameter and friction is within its 95 % interval."""
+    true = np.concatenate((truth.inertias.ravel(), truth.rotors, truth.viscous, truth.coulomb))
+    at, n = slice(0, true.size), len(truth.rotors)
+    G = base_matrix(found.parameters, n)[: found.parameters.model.p + 2 * n, at]
+    deviation = np.sqrt(np.diag(G @ found.covariance[at, at] @ G.T))
+    return np.abs(G @ (found.values[at] - true)) < 1.96 * deviation
 
 
 def write_states(path, joints, states, *, period=PERIOD, topic='/joint_states', fields=None):

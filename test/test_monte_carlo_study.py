@@ -303,9 +303,8 @@ def test_start_rejected_by_the_controller_has_its_own_outcome(tmp_path):
     rejected = results['outcome'] == 'rejected'
     assert rejected.sum() > 12
     assert (results['first_violation_s'][rejected] == 0.0).all()
-    worst = np.maximum(results['max_error_ratio.joint1'], results['max_error_ratio.joint2'])
-    assert (worst[rejected] >= 1.0).all()
-    assert np.isnan(results['latch_time_s'][rejected]).all()
+    for name in ('latch_time_s', 'max_error_ratio.joint1', 'rms_error_rad.joint2'):
+        assert np.isnan(results[name][rejected]).all()
 
 
 APPROACHING = {'enabled: false': 'enabled: true', 'loguniform(1.0e-6, 2.0e-5)': 'choice(0.002)'}

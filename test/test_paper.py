@@ -80,8 +80,8 @@ def test_every_law_is_tuned_with_the_same_effort():
         for gain in task.gains:
             key = gain.name, gain.joint
             assert ranges.setdefault(key, (gain.least, gain.most)) == (gain.least, gain.most)
-        exponents = np.arange(len(task.gains)) / 10.0
-        found = tune.parameters_at(ControllerConfig(), task.gains, exponents)
+        values = [tune.value_at(k / 10.0) for k in range(len(task.gains))]
+        found = tune.parameters_at(ControllerConfig(), task.gains, values)
         assert found['feedback.gain'] == (1.0, 1.26)  # of each joint; 10^0.1 to three digits
         assert found['learning.adaptation_gain'] == (1.58,) * 3
     assert len(tune.TASKS['proposed'].gains) == len(tune.TASKS['comparison'].gains)

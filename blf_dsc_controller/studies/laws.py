@@ -33,7 +33,7 @@ from blf_dsc_controller.compiled.layout import Array, part, view
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.nodes import LoopConfig
 from blf_dsc_controller.configuration.robot import parameters_of
-from blf_dsc_controller.configuration.schema import change, flatten
+from blf_dsc_controller.configuration.schema import change
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.law.factory import model_of
 from blf_dsc_controller.law.telemetry import sample_columns
@@ -42,7 +42,7 @@ from blf_dsc_controller.reference.approach import plan_start
 from blf_dsc_controller.run import Floats
 from blf_dsc_controller.simulation.loop import simulate
 from blf_dsc_controller.studies.runs import torque_error
-from blf_dsc_controller.studies.tuning import Gain
+from blf_dsc_controller.studies.tuning import Gain, parameters_at
 from sim_plant import kernels as plants
 from sim_plant.arm import Arm
 from sim_plant.plant import plant_of, steps_of
@@ -285,14 +285,13 @@ def law_changes(
     elif not contender.learns:
         without = [0.0] * len(config.learning.initial_estimate)
         changes |= {'learning.weight': 0.0, 'learning.adaptation_gain': without}
-    present = flatten(config)
-    for gain in contender.gains:
-        shape = np.shape(present[gain.name])
-        each = values[gain.name] * (joint_inertia(config) if gain.inertial else np.ones(shape))
-        changes[gain.name] = each.tolist()
-        if gain.name == 'barrier.weight':
-            limit = np.maximum(config.barrier.slope_limit, _STIFFEST * each)
-            changes['barrier.slope_limit'] = limit.tolist()
+    gains = contender.gains
+    each = (values[gain.name] for gain in gains)
+    changes |= parameters_at(config, gains, each, joint_inertia(config) if gains else 1.0)
+    if 'barrier.weight' in changes:
+        weight = np.array(changes['barrier.weight'], dtype=float)
+        limit = np.maximum(config.barrier.slope_limit, _STIFFEST * weight)
+        changes['barrier.slope_limit'] = limit.tolist()
     return changes
 
 

@@ -25,7 +25,7 @@ from blf_dsc_controller.analysis.style import (
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.run import Floats
 from blf_dsc_controller.studies.monte_carlo import NOISE, WITHOUT, Study
-from blf_dsc_controller.studies.runs import DIVERGED, KEPT, Columns, Store
+from blf_dsc_controller.studies.runs import DIVERGED, KEPT, REJECTED, Columns, Store
 
 ALLOWED = 1.3
 """Largest error with learning that is called no larger than that without, as a factor."""
@@ -94,9 +94,10 @@ def _compare(study: Study, results: Columns, law: str) -> dict[str, Any]:
 
 
 def worst_of(study: Study, results: Columns, name: str, law: str = '') -> Floats:
-    """Return a figure of the worst joint in each run; infinite if the run diverged."""
+    """Return a figure of the worst joint in each run; infinite if it diverged or did not begin."""
     each = [results[f'{law}{name}.{joint}'] for joint in study.plant.joints]
-    return np.where(results[f'{law}outcome'] == DIVERGED, np.inf, np.max(each, axis=0))
+    lost = np.isin(results[f'{law}outcome'], (DIVERGED, REJECTED))
+    return np.where(lost, np.inf, np.max(each, axis=0))
 
 
 def _known(study: Study, results: Columns, name: str, law: str) -> Floats:

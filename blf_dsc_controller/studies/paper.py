@@ -151,7 +151,7 @@ def _of_abstract(results: Results) -> Iterator[Claim]:
 def _lag(results: Results) -> float:
     """Return the largest error [rad] of the law that knows everything, once settled."""
     run = results.runs['model_based']
-    return float(np.abs(_error(run)[run.time >= 1.0]).max())
+    return float(np.abs(np.asarray(run.error)[run.time >= 1.0]).max())
 
 
 def _of_section_3(results: Results) -> Iterator[Claim]:
@@ -192,7 +192,7 @@ def _fraction_met(run: Run, name: str) -> float:
     settings, V = _settings(name), _energy(run)
     assert run.bound is not None  # noqa: S101
     knee = settings.knee / settings.bound * run.bound
-    holds = (_learned(run, LATCHED) > 0.5) & np.all(np.abs(_error(run)) <= knee, axis=1)
+    holds = (_learned(run, LATCHED) > 0.5) & np.all(np.abs(np.asarray(run.error)) <= knee, axis=1)
     bound = exponential_bound(settings, run.time, V, holds)
     return float(np.mean(V[holds] <= bound[holds]))
 
@@ -242,7 +242,7 @@ def _of_section_4(results: Results) -> Iterator[Claim]:
 def _swift_torque(results: Results) -> Claim:
     """Evaluate the barrier's torque at the largest error, and the error of a pushed arm."""
     run, barrier = results.runs['paper'], CASES['paper'].loop().controller.barrier
-    error = np.abs(_error(run))
+    error = np.abs(np.asarray(run.error))
     ratio = error / np.array(barrier.bound)
     k, i = np.unravel_index(ratio.argmax(), ratio.shape)
     torque = barrier.weight[i] * error[k, i] / np.cos(0.5 * np.pi * ratio[k, i] ** 2) ** 2
@@ -271,12 +271,7 @@ def _exponential_fit(run: Run) -> float:
     return float(np.corrcoef(t, y)[0, 1] ** 2) if t.size >= 3 else 0.0
 
 
-# Error, estimates and V of every simulated run are known.
-
-
-def _error(run: Run) -> Floats:
-    assert run.error is not None  # noqa: S101
-    return run.error
+# Estimates and V of every simulated run are known.
 
 
 def _learned(run: Run, name: str) -> Floats:

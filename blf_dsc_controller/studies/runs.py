@@ -49,7 +49,7 @@ from blf_dsc_controller.reference.terms import sampled
 from blf_dsc_controller.run import Floats
 from blf_dsc_controller.simulation.loop import Record, new_record, run_alone, run_loop
 from blf_dsc_controller.studies.monte_carlo import Drawn, Study, draw, load_study, plant_with
-from sim_plant.plant import Plant, parameter_order, plant_of
+from sim_plant.plant import parameter_order, plant_of
 
 _UNSEEN = 1000  # seed of the motion on which the torque of the learned model is judged
 _ROWS = 200  # postures of that motion
@@ -186,26 +186,15 @@ def _run(study: Study, run: int, records: dict[str, Record], unseen: Floats | No
         config = plant_with(study, row, prefix)
         plant = plant_of(config)
         record.controller.reset()
-        try:
-            with np.errstate(all='ignore'):  # a run that diverges has figures too
+        with np.errstate(all='ignore'):  # a run that diverges has figures too
+            try:
                 run_alone(record, plant, observed=False)
                 found = figures_of(study, record, config, unseen)
-        except (StartError, MotionError):
-            plant.reset()
-            found = _rejected(study, record, plant)
+            except (StartError, MotionError):  # the record is that of the run before
+                found = dict.fromkeys(figures_of(study, record, config, unseen), nan)
+                found |= {'outcome': REJECTED, 'first_violation_s': 0.0}
         row |= {f'{prefix}{name}': value for name, value in found.items()}
     return row
-
-
-def _rejected(study: Study, record: Record, plant: Plant) -> Row:
-    """Return the columns of a run that does not begin, with |xi1(0)| / k_c."""
-    qr, _, bound = study.origin
-    ratios = np.abs(plant.measure()[: plant.joints] - qr) / bound
-    with np.errstate(all='ignore'):
-        found: Row = dict.fromkeys(figures_of(study, record, study.plant, None), nan)
-    for joint, ratio in zip(study.plant.joints, ratios.tolist(), strict=True):
-        found[f'max_error_ratio.{joint}'] = ratio
-    return found | {'outcome': REJECTED, 'first_violation_s': 0.0}
 
 
 def require_pyarrow() -> Any:

@@ -13,7 +13,7 @@ gains (slotine_li has fewer) and the ranges of shared ones; the optimiser, its s
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -96,13 +96,19 @@ def bounded(cost: float) -> float:
 
 
 def parameters_at(
-    config: ControllerConfig, gains: Sequence[Gain], exponents: Floats
+    config: ControllerConfig,
+    gains: Sequence[Gain],
+    values: Iterable[float],
+    inertia: Floats | float = 1.0,
 ) -> dict[str, Value]:
-    """Return the parameters of a point, whose coordinates are log10 of the gains."""
+    """Return the parameters that these values of the gains set; `inertia` (n,) is m of the arm."""
     present, chosen = flatten(config), dict[str, Floats]()
-    for gain, exponent in zip(gains, exponents, strict=True):
-        values = chosen.setdefault(gain.name, np.array(present[gain.name], dtype=float))
-        values[gain.joint if gain.joint >= 0 else ...] = value_at(exponent)
+    for gain, value in zip(gains, values, strict=True):
+        if gain.inertial:
+            chosen[gain.name] = np.asarray(value * inertia)
+        else:
+            of = chosen.setdefault(gain.name, np.array(present[gain.name], dtype=float))
+            of[gain.joint if gain.joint >= 0 else ...] = value
     return {name: tuple(v.tolist()) if v.ndim else v.item() for name, v in chosen.items()}
 
 
@@ -123,7 +129,8 @@ def objective(exponents: Floats, task: Task, loops: Sequence[LoopConfig]) -> flo
     """Return the mean of `cost_of` over the plants."""
     values = []
     for loop in loops:
-        config = change(loop.controller, parameters_at(loop.controller, task.gains, exponents))
+        gains = parameters_at(loop.controller, task.gains, map(value_at, exponents))
+        config = change(loop.controller, gains)
         with np.errstate(all='ignore'):
             metrics = measure(simulate(config, loop.plant, supervised=False).run())
             values.append(cost_of(metrics, config.sample_time))
@@ -178,7 +185,8 @@ def main() -> None:
 
         found, value, evaluations = search(cost, task.gains, POPULATION, GENERATIONS)
     print(f'# {evaluations} evaluations, objective {value:.3f} (decades of error; less is better)')
-    for name, entry in parameters_at(loops[0].controller, task.gains, found).items():
+    gains = map(value_at, found)
+    for name, entry in parameters_at(loops[0].controller, task.gains, gains).items():
         print(f'{name}: {format_value(entry)}')
 
 
