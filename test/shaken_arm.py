@@ -65,10 +65,11 @@ class Reference(NamedTuple):
     phase: np.ndarray  # (k, n) rad
 
     def at(self, t):
-        """Return position and velocity (..., 2, n) at times (...) [s]."""
-        angle = self.frequency * np.asarray(t)[..., np.newaxis, np.newaxis] + self.phase
-        q = self.offset + (self.amplitude * np.sin(angle)).sum(-2)
-        return np.stack([q, (self.frequency * self.amplitude * np.cos(angle)).sum(-2)], -2)
+        """Return position, velocity and acceleration (..., 3, n) at times (...) [s]."""
+        w, angle = self.frequency, np.multiply.outer(t, self.frequency) + self.phase
+        sines, cosines = self.amplitude * np.sin(angle), self.amplitude * np.cos(angle)
+        motion = sines.sum(-2) + self.offset, (w * cosines).sum(-2), -(w**2 * sines).sum(-2)
+        return np.stack(motion, -2)
 
 
 def reference_of(chain, seed, tones=3):
@@ -83,7 +84,7 @@ def reference_of(chain, seed, tones=3):
 
 @kernel
 def _shake(arm, vector, viscous, coulomb, motion, gains, work, states):
-    """Follow `motion` (N, 2, n) by PD, torques held for a period; fill states (N, 3, n).
+    """Follow `motion` (N, 3, n) by PD, torques held for a period; fill states (N, 3, n).
 
     The rows of `work` (8, n) are zero at first.
     """

@@ -55,13 +55,8 @@ def model_of(text, rotors):
 
 def torques(model, seed=77):
     """Torques along a motion that is in no bag, from pinocchio."""
-    data, reference, h = model.createData(), reference_of(PANDA_CHAIN, seed), 1e-4
-    rows = []
-    for t in np.arange(0.0, 20.0, 0.05):
-        q, dq = reference.at(t)
-        ddq = (reference.at(t + h)[1] - reference.at(t - h)[1]) / (2.0 * h)
-        rows.append(pinocchio.rnea(model, data, q, dq, ddq))
-    return np.array(rows)
+    data, motion = model.createData(), reference_of(PANDA_CHAIN, seed).at(np.arange(0, 20, 0.05))
+    return np.array([pinocchio.rnea(model, data, *row) for row in motion])
 
 
 def text_of(truth):
@@ -151,11 +146,11 @@ def test_arm_simulated_in_mujoco_is_identified(tmp_path):
     model.dof_armature[:7] = TRUTH.rotors
     model.dof_armature[7:] = 1e3  # keeps the fingers where they are
     data, reference = mujoco.MjData(model), reference_of(PANDA_CHAIN, 5)
-    data.qpos[:7], data.qvel[:7] = reference.at(0.0)
+    data.qpos[:7], data.qvel[:7], _ = reference.at(0.0)
     states = np.zeros((30_000, 3, 7))
     gains = np.array([87.0] * 4 + [12.0] * 3) / 4.0
     for k, state in enumerate(states):
-        q, dq = reference.at(k * PERIOD)
+        q, dq, _ = reference.at(k * PERIOD)
         feedback = 30.0 * (q - data.qpos[:7]) + 3.0 * (dq - data.qvel[:7])
         data.qfrc_applied[:7] = gains * feedback
         state[:] = data.qpos[:7], data.qvel[:7], data.qfrc_applied[:7]

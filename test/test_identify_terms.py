@@ -64,12 +64,13 @@ def model_of(truth, loaded):
 
 def moved(duration, seed=2, *, loaded=False, truth=TRUTH):
     """States (N, 3, n) of an exact motion with viscous and Coulomb friction, and its gravity."""
-    model, reference, h = model_of(truth, loaded), reference_of(PANDA_CHAIN, seed), 1e-5
-    data = model.createData()
-    t = np.arange(0.0, duration, PERIOD)
-    q, dq = np.moveaxis(reference.at(t), -2, 0)
-    ddq = (reference.at(t + h)[:, 1] - reference.at(t - h)[:, 1]) / (2.0 * h)
-    torque = np.array([pinocchio.rnea(model, data, *row) for row in zip(q, dq, ddq, strict=True)])
+    model = model_of(truth, loaded)
+    data, motion = (
+        model.createData(),
+        reference_of(PANDA_CHAIN, seed).at(np.arange(0.0, duration, PERIOD)),
+    )
+    q, dq, _ = np.moveaxis(motion, -2, 0)
+    torque = np.array([pinocchio.rnea(model, data, *row) for row in motion])
     gravity = np.array([pinocchio.computeGeneralizedGravity(model, data, row) for row in q])
     torque += TRUTH.viscous * dq + TRUTH.coulomb * np.sign(dq)
     return np.stack((q, dq, torque), axis=1), gravity
