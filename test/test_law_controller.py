@@ -90,6 +90,16 @@ def test_loop_continues_bit_for_bit_from_a_saved_state_and_begins_anew_after_a_r
     np.testing.assert_array_equal(torques(law, 0, 1337, begun), start)
 
 
+def test_measurement_may_be_any_array_of_numbers():
+    law, start = controller(quick()), [2.0, 2.0, 0.0, 0.0, 0.0, 0.0]
+    torques = []
+    for measurement in (np.array(start), np.repeat(start, 2)[::2], np.array(start, int), start):
+        law.reset()
+        torques.append(law.update(0.0, 1e-3, measurement).tolist())
+    assert torques.count(torques[0]) == len(torques)
+    assert any(torques[0])
+
+
 def allocated(duration):
     """Blocks and counters of references that a run of the compiled loop of law and plant takes."""
     config = configured('noisy', duration)

@@ -25,6 +25,7 @@ from blf_dsc_controller.messages.codecs import (
 
 STAMP = 1_734_000_123_456_789_012
 NAMES = st.lists(st.text('abé/_ ', max_size=9), min_size=1, max_size=8, unique=True)
+STAMPS = st.sampled_from([-1, 0]) | st.integers(-(2**31) * 10**9, 2**31 * 10**9 - 1)
 VALUES = st.floats(allow_nan=False)
 NAN = float('nan')
 
@@ -40,9 +41,9 @@ def made(type_name, *fields):
     return typestore().types[type_name.replace('/', '/msg/')](*fields)
 
 
-def joint_state(names, *arrays, frame_id='', **options):
+def joint_state(names, *arrays, frame_id='', stamp=STAMP, **options):
     header = made(
-        'std_msgs/Header', made('builtin_interfaces/Time', *divmod(STAMP, 10**9)), frame_id
+        'std_msgs/Header', made('builtin_interfaces/Time', *divmod(stamp, 10**9)), frame_id
     )
     fields = (np.array(values, dtype=float) for values in arrays)
     return cdr('sensor_msgs/JointState', header, list(names), *fields, **options)
@@ -66,16 +67,17 @@ def test_encoded_messages_equal_full_serialisation(names, fields, data):
     assert encode_clock(STAMP) == cdr('rosgraph_msgs/Clock', time)
 
 
-@given(NAMES, st.text('base_', max_size=9), st.booleans(), st.randoms(use_true_random=False))
-def test_decoder_matches_joints_by_name(names, frame_id, little_endian, random):
+@given(NAMES, st.text('base_', max_size=9), STAMPS, st.booleans(), st.randoms())
+def test_decoder_matches_joints_by_name(names, frame_id, stamp, little_endian, random):
     values = {name: [index + 0.25, -index, 1e3 * index] for index, name in enumerate(names)}
     wanted = random.sample(names, random.randint(1, len(names)))
     decoder = JointStateDecoder(wanted)
     for _ in range(3):
         random.shuffle(names)
         columns = np.array([values[name] for name in names]).T
-        raw = joint_state(names, *columns, frame_id=frame_id, little_endian=little_endian)
-        assert decoder.decode(raw) == STAMP
+        options = {'frame_id': frame_id, 'stamp': stamp, 'little_endian': little_endian}
+        raw = joint_state(names, *columns, **options)
+        assert decoder.decode(raw) == stamp
         decoded = np.array([decoder.position, decoder.velocity, decoder.effort]).T
         assert decoded.tolist() == [values[name] for name in wanted]
 
@@ -91,6 +93,7 @@ SPARSE = joint_state('ab', [1, 2], [], [7, 8])
         (joint_state('ba', [8, 7], [10, 9], []), [7, 8, 9, 10, NAN, NAN]),
         # As long as another, also with the zeros that rclpy may append to a message.
         (joint_state('ab', [1, 2], [3, 4], []), [1, 2, 3, 4, NAN, NAN]),
+        (joint_state('ab', [], [], []), [NAN] * 6),
         (SPARSE, [1, 2, NAN, NAN, 7, 8]),
         (SPARSE + bytes(4), [1, 2, NAN, NAN, 7, 8]),
         # Anything may be in the option byte of the encapsulation, in padding, and after the end.

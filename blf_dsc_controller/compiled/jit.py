@@ -184,6 +184,17 @@ def kernel(function: F) -> F:
     return cast('F', compiled)
 
 
+def direct(kernel: Callable[..., Any], *arguments: object) -> Callable[..., Any]:
+    """Return a kernel that may only be called with arguments of the types of these.
+
+    Kernels look at all types in every call, which takes longer than many a kernel.
+    """
+    if config.DISABLE_JIT:
+        return kernel
+    compiled: Callable[..., Any] = cast('Any', kernel).compile(tuple(map(numba.typeof, arguments)))
+    return compiled
+
+
 def _keep(kernel: Any, folder: Path) -> None:
     """Cache the machine code of a kernel in a folder that no other source shares.
 

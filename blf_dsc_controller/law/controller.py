@@ -13,7 +13,7 @@ from math import nan
 import numpy as np
 
 from blf_dsc_controller.arms.model import ArmModel
-from blf_dsc_controller.compiled.jit import inner, kernel
+from blf_dsc_controller.compiled.jit import direct, inner, kernel
 from blf_dsc_controller.compiled.layout import Array, pack, part, sizes_of
 from blf_dsc_controller.law import (
     adaptation,
@@ -169,14 +169,14 @@ def update(
     model: ArmModel,
     sizes: np.dtype[np.void],
     settings_vector: Array,
-    reference_vector: Array,
     state_vector: Array,
     signals_vector: Array,
-    t: float,
-    dt: float,
-    measurement: Array,
     sample_vector: Array,
     checks_vector: Array,
+    measurement: Array,
+    reference_vector: Array,
+    t: float,
+    dt: float,
 ) -> int:
     """Run one sample of the law with all its telemetry, on packed vectors: see `step`.
 
@@ -226,6 +226,18 @@ class Controller:
         self.checks_vector = np.zeros(checks_size(self.settings))
         self.checks = checks_of(self.checks_vector, self.settings)
         self.flags = 0
+        self._measurement = np.zeros(3 * self.settings.n)  # contiguous, of the kernel's type
+        self._vectors = (
+            self.settings.model,
+            self.sizes,
+            self.settings_vector,
+            self.state_vector,
+            self.signals_vector,
+            self.sample_vector,
+            self.checks_vector,
+            self._measurement,
+        )
+        self._update = direct(update, *self._vectors, reference_vector, 0.0, 0.0)
         self.reset()
         self.reference_at(0.0)
         self.update(0.0, 1e-3, np.zeros(3 * self.settings.n))
@@ -263,19 +275,8 @@ class Controller:
         N m], t [s] the time since the start and dt [s] since the last sample. If INVALID is among
         the `flags`, nothing has changed, including the torque.
         """
-        self.flags = update(
-            self.settings.model,
-            self.sizes,
-            self.settings_vector,
-            self.reference_vector,
-            self.state_vector,
-            self.signals_vector,
-            t,
-            dt,
-            measurement,
-            self.sample_vector,
-            self.checks_vector,
-        )
+        self._measurement[:] = measurement
+        self.flags = self._update(*self._vectors, self.reference_vector, t, dt)
         return self.sample.torque
 
     def weigh(self, dt: float) -> None:

@@ -170,22 +170,18 @@ class Monitor:
         self.names = tuple(names)
         self._encoder = JointStateEncoder(names, ('position',))
 
-    def values(self, sample: Sample, ratio: np.ndarray, bound: np.ndarray) -> list[float]:
-        """Return the values of `names` for a telemetry sample.
+    def message(self, stamp: int, sample: Sample, ratio: np.ndarray, bound: np.ndarray) -> Message:
+        """Encode the values of `names` for a telemetry sample at a stamp [ns].
 
         `ratio` is the largest |xi1| / k_c so far (n,), `bound` the current k_c (n,) [rad].
         """
         distance = bound - np.abs(sample.xi1)
-        values = [*ratio, *distance, *sample.estimate, sample.lambda_min[0], sample.latched[0]]
+        values = [ratio, distance, sample.estimate, sample.lambda_min, sample.latched]
         if self._weighs:
-            values += sample.load.tolist()
+            values.append(sample.load)
         if self._knows_truth:
-            values += sample.lyapunov.tolist()
-        return values
-
-    def message(self, stamp: int, sample: Sample, ratio: np.ndarray, bound: np.ndarray) -> Message:
-        """Encode these values."""
-        return topics.MONITOR, self._encoder.encode(stamp, self.values(sample, ratio, bound))
+            values.append(sample.lyapunov)
+        return topics.MONITOR, self._encoder.encode(stamp, np.concatenate(values))
 
 
 def load_text(load: Sequence[float]) -> str:

@@ -5,7 +5,8 @@ Plain CDR, version 1, as ROS 2 sends it: two bytes for the byte order, two unuse
 each number aligned to its own size, from the fifth byte on. Padding bytes, and bytes after the
 last field, may hold anything. An encoder serialises a template once and then only overwrites its
 numbers. A decoder finds the values once and keeps their places for as long as the messages have the
-same names and lengths. Messages of all other types are left to the library rosbags.
+same names and lengths, which a kernel compares as it reads them. Messages of all other types are
+left to the library rosbags.
 """
 
 from __future__ import annotations
@@ -21,6 +22,7 @@ from numpy.typing import ArrayLike, NDArray
 from rosbags.typesys import Stores, get_typestore
 from rosbags.typesys.store import Typestore
 
+from blf_dsc_controller.compiled.jit import direct, kernel
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.messages.topics import FLOAT64_MULTI_ARRAY, JOINT_STATE
 from blf_dsc_controller.run import Floats
@@ -112,6 +114,7 @@ class Layout:
         places: indices of all their values in a grid of doubles that starts at ORIGIN.
         size: of the message [bytes].
         double: type of a value.
+        fixed: bytes that are no numbers.
     """
 
     def __init__(
@@ -125,7 +128,8 @@ class Layout:
         ])  # fmt: skip
         first, *others = (array.size_offset for array in arrays)
         sizes = (slice(at, at + 4) for at in others)
-        self._parts_of = itemgetter(slice(2), slice(begin, first + 4), *sizes)
+        self.fixed = slice(2), slice(begin, first + 4), *sizes
+        self._parts_of = itemgetter(*self.fixed)
         self._parts = self._parts_of(raw)
 
     def fits(self, raw: bytes) -> bool:
@@ -343,25 +347,64 @@ def _view(buffer: bytearray, doubles: Doubles) -> Floats:
     return np.frombuffer(buffer, '<f8', doubles.size, doubles.offset if doubles.size else 0)
 
 
+_OTHER = -1  # no time that a message has
+
+
+@kernel
+def _read(
+    message: bytes,
+    expected: NDArray[np.uint8],
+    places: NDArray[np.intp],
+    swap: int,
+    values: NDArray[np.uint8],
+) -> int:
+    """Read the doubles that start at these bytes, unless -1, if a message is as `expected`.
+
+    The rows of that are bytes, and 255 where they must agree. `swap` is 7 for the other byte order.
+    Returns the time [ns] at STAMP_OFFSET, of messages that have one there; _OTHER if it differs.
+    """
+    size = len(message)
+    if size != expected.shape[1] or size < STAMP_OFFSET + 8:
+        return _OTHER
+    difference = 0
+    for i in range(size):
+        difference |= (message[i] ^ expected[0, i]) & expected[1, i]
+    if difference != 0:
+        return _OTHER
+    for i in range(places.size):
+        if places[i] >= 0:
+            for k in range(8):
+                values[8 * i + (k ^ swap)] = message[places[i] + k]
+    seconds = nanoseconds = 0
+    for k in range(4):
+        byte = STAMP_OFFSET + (k ^ (swap & 3))
+        seconds |= int(message[byte]) << 8 * k
+        nanoseconds |= int(message[byte + 4]) << 8 * k
+    if seconds >= 1 << 31:
+        seconds -= 1 << 32
+    return seconds * NANOSECONDS + nanoseconds
+
+
 class _Decoder:
     """Decoder of `values` (s,) at places that are the same in all messages of one layout."""
 
     def __init__(self, size: int) -> None:
         self.values = np.full(size, np.nan)
-        self._layout: Layout | None = None
+        self._bytes = self.values.view(np.uint8)
+        self._known = np.zeros((2, 0), np.uint8), np.full(size, -1), 0, self._bytes
+        self._read = direct(_read, b'', *self._known)
 
     def _learn(self, raw: bytes, layout: Layout, columns: NDArray[np.intp]) -> None:
-        """Store a layout, and which of its values are read; -1 for NaN."""
-        self._layout, self._double = layout, layout.double
-        self._count = (len(raw) - ORIGIN) // 8
-        self._known = np.flatnonzero(columns >= 0)
-        self._places = layout.places[columns[self._known]]
-        self._stamp = Struct(layout.double.byteorder + 'iI')
+        """Store the layout of a message, and which of its values are read; -1 for NaN."""
+        expected = np.zeros((2, len(raw)), np.uint8)
+        for part in layout.fixed:
+            expected[0, part] = np.frombuffer(raw[part], np.uint8)
+            expected[1, part] = 255
+        places, known = np.full(columns.size, -1), columns >= 0
+        places[known] = ORIGIN + 8 * layout.places[columns[known]]
+        self._known = expected, places, 0 if layout.double.isnative else 7, self._bytes
         self.values[:] = np.nan
-
-    def _fill(self, raw: bytes) -> None:
-        grid = np.frombuffer(raw, self._double, self._count, ORIGIN)
-        self.values[self._known] = grid[self._places]
+        self._read(raw, *self._known)
 
 
 class JointStateDecoder(_Decoder):
@@ -388,12 +431,12 @@ class JointStateDecoder(_Decoder):
         Raises:
             MessageError: as `joint_state_layout` and `Layout.columns`.
         """
-        if self._layout is None or not self._layout.fits(raw):
-            layout = joint_state_layout(raw)
-            self._learn(raw, layout, layout.columns(self._joints, self._required).ravel())
-        self._fill(raw)
-        seconds, nanoseconds = self._stamp.unpack_from(raw, STAMP_OFFSET)
-        return int(seconds * NANOSECONDS + nanoseconds)
+        stamp: int = self._read(raw, *self._known)
+        if stamp != _OTHER:
+            return stamp
+        layout = joint_state_layout(raw)
+        self._learn(raw, layout, layout.columns(self._joints, self._required).ravel())
+        return joint_state_stamp(raw)
 
 
 class Float64MultiArrayDecoder(_Decoder):
@@ -409,11 +452,10 @@ class Float64MultiArrayDecoder(_Decoder):
         Raises:
             MessageError: as `array_layout`.
         """
-        if self._layout is None or not self._layout.fits(raw):
+        if self._read(raw, *self._known) == _OTHER:
             layout = array_layout(raw)
             (array,) = layout.arrays
             if array.size != self.values.size:
                 return array.size
             self._learn(raw, layout, np.arange(array.size))
-        self._fill(raw)
         return self.values.size

@@ -74,7 +74,8 @@ class ControllerNode(LoopNode[ControllerConfig]):
             joints, self._estimates, self.config.telemetry.decimation
         )
         self._monitor: Monitor | None = None
-        self._learning_events = (0.0, 0.0, 0.0)  # columns checked, columns in use, model changes
+        self._columns = b''  # those that are estimated, and whether they were checked
+        self._model_changes = 0.0
         self._published_bound = b''  # bytes of the array, to detect changes
         self._decoder = JointStateDecoder(joints, required=('position',))
         self._encoder = Float64MultiArrayEncoder(len(joints))
@@ -265,7 +266,8 @@ class ControllerNode(LoopNode[ControllerConfig]):
         if is_due:  # of what rarely changes
             self._heard = any(each.get_subscription_count() for each in self._streams)
             self._report_learning(guard)
-            self._warn_of_rate(guard)
+            if samples == _RATE_SAMPLES:
+                self._warn_of_rate(guard)
         if not self.config.telemetry.enabled:
             return
         if samples == 1 or self._monitor is None:
@@ -280,29 +282,29 @@ class ControllerNode(LoopNode[ControllerConfig]):
             self._publish(self._monitor.message(stamp, sample, guard.samples.ratio, sample.bound))
 
     def _warn_of_rate(self, guard: Guard) -> None:
-        samples = guard.controller.samples
-        period, expected = guard.time / max(samples - 1, 1), self.config.sample_time
-        if samples == _RATE_SAMPLES and period < _FAST * expected:
+        period, expected = guard.time / (_RATE_SAMPLES - 1), self.config.sample_time
+        if period < _FAST * expected:
             self.get_logger().warning(rate_mismatch(period, expected))
 
     def _report_learning(self, guard: Guard) -> None:
         """Report columns that were rejected or taken back, and changes of the arm."""
         state = guard.controller.state
-        events = (state.columns_checked[0], state.active.sum(), state.changes[0])
-        before, self._learning_events = self._learning_events, events
-        if events == before:
-            return
-        if events[2] > before[2]:
-            residual = guard.controller.state.contradiction[0] ** 0.5
+        columns = state.active.tobytes() + state.columns_checked.tobytes()
+        has_changed = state.changes[0] > self._model_changes
+        self._model_changes = state.changes[0]
+        if has_changed:
+            residual = state.contradiction[0] ** 0.5
             self.get_logger().warning(
                 f'the arm has changed: torques differ by {residual:.3g} N m from those learned; '
                 'learning restarts'
             )
-        if events[:2] != before[:2]:
+        if columns != self._columns:
+            self._columns = columns
             self._status.rejected = rejected_columns(guard.controller, self._estimates)
             for column in self._status.rejected:
                 self.get_logger().warning(f'{column}')
-        if self._status.rejected or events[2] > before[2]:
+            has_changed |= bool(self._status.rejected)
+        if has_changed:
             self._report()
 
     def _command(self, torque: np.ndarray | None) -> None:
