@@ -248,6 +248,7 @@ from blf_dsc_controller.cli import run
 from blf_dsc_controller.cli.main import main
 from blf_dsc_controller.configuration.nodes import load_loop
 from blf_dsc_controller.law.controller import update
+from blf_dsc_controller.messages.codecs import _read
 from blf_dsc_controller.reference.terms import _sample
 from sim_plant.kernels import KERNELS
 
@@ -255,7 +256,7 @@ if __name__ == '__main__':  # the command has processes of its own
     config = load_loop('recommended')
     run._compile(config.controller)
     run._compile(config.plant)
-    for kernel in (update, _sample, *KERNELS):
+    for kernel in (update, _read, _sample, *KERNELS):
         print(kernel.__name__, len(kernel.signatures))
     assert main(['precompile', '--config', 'recommended']) == 0
 """
@@ -264,6 +265,6 @@ if __name__ == '__main__':  # the command has processes of its own
 @compiling
 def test_command_compiles_every_kernel_that_a_node_calls():
     *kernels, said = finished(sys.executable, '-c', SHOW).stdout.splitlines()
-    assert len(kernels) == 5
+    assert len(kernels) == 6
     assert all(int(line.split()[1]) >= 1 for line in kernels), kernels
     assert 'recommended: the kernels are compiled' in said

@@ -25,6 +25,7 @@ from blf_dsc_controller.configuration.schema import change
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.law.factory import estimate_names
 from blf_dsc_controller.law.telemetry import rejected_columns
+from blf_dsc_controller.messages.codecs import JointStateDecoder
 from blf_dsc_controller.reference.approach import plan_start
 from blf_dsc_controller.simulation.bag import write_bag
 from blf_dsc_controller.simulation.loop import Record, simulate
@@ -212,5 +213,6 @@ def precompile(options: Namespace) -> None:
 def _compile(config: ControllerConfig | PlantConfig) -> None:
     if isinstance(config, ControllerConfig):
         Guard(config)
+        JointStateDecoder(config.joints)
     else:
         plant_of(config).compile()

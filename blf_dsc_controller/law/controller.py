@@ -238,6 +238,8 @@ class Controller:
             self._measurement,
         )
         self._update = direct(update, *self._vectors, reference_vector, 0.0, 0.0)
+        if self.settings.weighed:
+            self._weigh = direct(weigh, *self._vectors[:5], 0.0)
         self.reset()
         self.reference_at(0.0)
         self.update(0.0, 1e-3, np.zeros(3 * self.settings.n))
@@ -282,14 +284,7 @@ class Controller:
     def weigh(self, dt: float) -> None:
         """Weigh the load by the row of the last update, `dt` [s] after the one before."""
         if self.settings.weighed:
-            weigh(
-                self.settings.model,
-                self.sizes,
-                self.settings_vector,
-                self.state_vector,
-                self.signals_vector,
-                dt,
-            )
+            self._weigh(*self._vectors[:5], dt)
 
     def trial(self, t: float, dt: float, measurement: Array) -> Array:
         """Return the torque of an unchecked update that only changes `signals` and `sample`."""
