@@ -87,16 +87,15 @@ def test_loop_in_lockstep_waits_for_its_recorder(running):
 
 @pytest.mark.parametrize('mode', ['lockstep', 'realtime'])
 def test_full_disk_ends_the_run_and_tells_how_to_recover_the_bag(tmp_path, mode):
-    duration = 5  # of which a second takes over 1 MB
     config = tmp_path / 'patient.yaml'
     config.write_text(PATIENT)
-    with small_disk(tmp_path / 'disk', 2) as disk:
+    with small_disk(tmp_path / 'disk', 2) as disk:  # a second takes over 1 MB
         out = disk / 'out'
-        run = closed_loop('--config', config, '--mode', mode, '--duration', duration, '--out', out)
+        run = closed_loop('--config', config, '--mode', mode, '--duration', 10_000, '--out', out)
         assert run.returncode == 1
         assert 'bag_recorder exited with code 1:' in run.stderr
         assert f'no space left on the disk of {out}' in run.stderr
         assert f'blf_dsc recover {out / "bag"} saves what was recorded' in run.stderr
         assert 'Traceback' not in run.stderr
         recovered = recover(out / 'bag', tmp_path / 'clean').messages['/joint_states']
-        assert 500 < recovered < 1000 * duration
+        assert recovered > 500

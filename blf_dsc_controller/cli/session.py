@@ -56,8 +56,8 @@ def run_session(config: LoopConfig, out: Path, domain: int | None, view: str | N
     """Run recorder, controller and plant on `out/config.yaml` until the plant has ended.
 
     They run in a ROS domain of their own unless `domain` is given, and with a page at `view`,
-    a host, if given. Returns False if SIGINT or SIGTERM ended the run; raises NodeFailedError
-    if a node exited with an error.
+    a host, if given. Returns False if a signal to this process, or to another node than the plant,
+    ended the run; raises NodeFailedError if a node exited with an error.
     """
     logs = out / 'logs'
     logs.mkdir()
@@ -168,11 +168,12 @@ def _run_nodes(config: LoopConfig, params_file: Path, logs: Path, view: str | No
                 started(VIEW, '-p', f'host:={view}', '-p', f'port:={port}')
                 monitor.progress.write(f'the page: {url_of(view, port)}')
                 view = None
-        while not interrupts and monitor.wait(_IN_TRANSIT):
+        completed = not (interrupts or nodes[-1].is_running)
+        while completed and monitor.wait(_IN_TRANSIT):
             pass
     for node in nodes:
         node.check()
-    return not interrupts
+    return completed
 
 
 def _die_with_parent() -> None:
