@@ -319,6 +319,8 @@ def test_pairs_are_compared_and_exceptions_are_reproduced(tmp_path, capsys):
     assert (noise['broken_only_with'], noise['broken_only_without']) == ([1], [2, 3])
     results['outcome'][1] = 'diverged'
     assert summarize(a_study, results)['pairs']['factor']['max'] is None
+    lost = results | {f'{law}outcome': np.full(4, 'diverged') for law in ('', 'without.')}
+    assert summarize(a_study, lost)['pairs']['factor']['median'] is None
 
     store.keep(range(4), results)
     assert main(['monte-carlo', '--report', str(store.folder)]) == 0

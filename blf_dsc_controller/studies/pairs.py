@@ -68,24 +68,22 @@ def _compare(study: Study, results: Columns, law: str) -> dict[str, Any]:
     )
     factors = settled / settled_without
     above = np.flatnonzero(~(factors <= ALLOWED))
-    quantiles = [*_FACTORS.values()] if factors.size else []
+    of = factors if factors.size else [np.nan]
+    quantiles = np.quantile(of, [*_FACTORS.values()], method='higher')
     largest, before = (worst_of(study, results, 'max_error_ratio', each) for each in laws)
-    change = (largest / before)[(_NEAR[0] <= before) & (before <= _NEAR[1])]
+    near = (_NEAR[0] <= before) & (before <= _NEAR[1])
+    change = largest[near] / before[near]
     return {
         'near': {'larger': int((change >= 1.01).sum()), 'smaller': int((change <= 0.99).sum())},
         'kept': {'with': int(kept.sum()), 'without': int(without.sum())},
         'broken_only_with': results['run'][without & ~kept].tolist(),
         'broken_only_without': results['run'][kept & ~without].tolist(),
-        'factor': dict(
-            zip(_FACTORS, np.quantile(factors, quantiles, method='higher'), strict=False)
-        ),
+        'factor': dict(zip(_FACTORS, quantiles, strict=True)),
         'allowed': 1.0 - above.size / max(1, factors.size),
         'above': results['run'][without][above[np.argsort(-factors[above])]].tolist(),
         'median': {
             name: {
-                label: np.median(known)
-                if (known := _known(study, results, name, each)).size
-                else np.nan
+                label: _median(_known(study, results, name, each))
                 for each, label in zip(laws, _LAWS.values(), strict=True)
             }
             for name in ('rms_error_rad', 'torque_error.end')
@@ -106,6 +104,10 @@ def _known(study: Study, results: Columns, name: str, law: str) -> Floats:
     values = results[column] if column in results else worst_of(study, results, name, law)
     kept = results[f'{WITHOUT}outcome'] == KEPT
     return np.asarray(values[kept & np.isfinite(values)])
+
+
+def _median(values: Floats) -> float:
+    return float(np.median(values)) if values.size else np.nan
 
 
 def pair_figures(pairs: dict[str, Any]) -> dict[str, str]:
@@ -131,7 +133,7 @@ def pair_figures(pairs: dict[str, Any]) -> dict[str, str]:
             f'{noisy[0]} / {noisy[1]}, {100.0 * noise["allowed"]:.2f} %'
         ),
         'factor: median, 99.9 %, largest': ', '.join(
-            f'{factor.get(name, np.nan):.2f}' for name in ('median', 'p99.9', 'max')
+            f'{factor[name]:.2f}' for name in ('median', 'p99.9', 'max')
         ),
         'rms error with / without [mrad]': medians('rms_error_rad', 1e3),
         'torque error on the next motion with / without [%]': medians('torque_error.end', 1e2),
