@@ -94,7 +94,7 @@ def _close_up(run: Run, change: float) -> Iterator[Panel]:
     for group, kind in (('Tracking', 'error of '), ('Torque', 'torque of ')):
         of_joints = [panel for panel in found if panel.title.startswith(kind)]
         lines = [
-            panel.lines[0]._replace(name=joint)
+            next(iter(panel.lines))._replace(name=joint)
             for panel, joint in zip(of_joints, run.joints, strict=False)
         ]
         lines += [line for panel in of_joints[:1] for line in panel.lines if line.shaded]

@@ -6,7 +6,7 @@ Long series are thinned, without losing a peak.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import chain
 from math import inf
@@ -88,7 +88,7 @@ class Panel:
     group: str
     title: str
     unit: str
-    lines: Sequence[Line]
+    lines: Iterable[Line]  # long ones are made as they are drawn
     note: str = ''  # only if a single run is shown
     log: bool = False
     marks: tuple[Mark, ...] = ()
@@ -167,7 +167,6 @@ def _stops(run: Run) -> Iterator[Mark]:
 
 def _motion(run: Run) -> Iterator[Panel]:
     t = run.time
-    errors: list[Panel] = []
     for i, joint in enumerate(run.joints):
         position, reference = run.column('position', i), run.column('reference', i)
         lines = [Line('measured', t, np.asarray(position))]
@@ -177,8 +176,6 @@ def _motion(run: Run) -> Iterator[Panel]:
         error = run.column('error', i)
         if error is not None:
             yield _error(run, t, i, 1e3 * error)
-            if t.size > _PIECES:
-                errors.append(_error_size(run, t, i, 1e3 * error))
         torque, limit = run.column('torque', i), run.column('torque_limit', i)
         if torque is None or np.isnan(torque).all():
             continue
@@ -187,7 +184,10 @@ def _motion(run: Run) -> Iterator[Panel]:
             lines.append(Line('limit', t, limit, MUTED, dashed=True, mirrored=True))
         note = f'peak {np.nanmax(np.abs(torque)):.3g}'
         yield Panel('Torque', f'torque of {joint}', 'N m', lines, note)
-    yield from errors
+    for i in range(len(run.joints)) if t.size > _PIECES else ():
+        error = run.column('error', i)
+        if error is not None:
+            yield _error_size(run, t, i, 1e3 * error)
 
 
 def _error(run: Run, t: Floats, i: int, error: Floats) -> Panel:
@@ -241,13 +241,15 @@ def _learning(run: Run) -> Iterator[Panel]:
             if estimates.true is not None:
                 lines.append(Line('true', estimates.time, estimates.true[:, j], INK, dashed=True))
             yield Panel('Parameters', name, 'kg m²', lines)
-    lines = []
-    for name in run.learning.names:
+    yield Panel('Disturbance', 'disturbance estimates', 'N m', _disturbances(run, run.learning))
+
+
+def _disturbances(run: Run, learning: Series) -> Iterator[Line]:
+    for name in learning.names:
         if name.startswith(DISTURBANCE):
-            lines += _column(run, run.learning, name, name.removeprefix(DISTURBANCE))
+            yield from _column(run, learning, name, name.removeprefix(DISTURBANCE))
             if run.arm is None:  # else it includes the learned friction
-                lines += _column(run, run.truth, name, 'true', colour=INK, dashed=True)
-    yield Panel('Disturbance', 'disturbance estimates', 'N m', lines)
+                yield from _column(run, run.truth, name, 'true', colour=INK, dashed=True)
 
 
 def _of_links(run: Run, arm: LearnedArm, estimates: Estimates) -> Iterator[Panel]:
@@ -260,11 +262,11 @@ def _of_links(run: Run, arm: LearnedArm, estimates: Estimates) -> Iterator[Panel
     yield Panel('Parameters', f'{what} of the estimates, by link', '% of prior', lines)
     for kind in ('viscous', 'coulomb'):
         names = [name for name in arm.units if name.startswith(f'{kind} ')]
-        lines = []
-        for name in names:
-            lines += _column(run, run.learning, name, name.removeprefix(f'{kind} '))
-        if lines:
-            yield Panel('Parameters', f'{kind} friction', arm.units[names[0]], lines)
+        if names:
+            of_joints = chain.from_iterable(
+                _column(run, run.learning, name, name.split(' ', 1)[1]) for name in names
+            )
+            yield Panel('Parameters', f'{kind} friction', arm.units[names[0]], of_joints)
 
 
 def _relative_error(estimates: Estimates) -> Panel:
