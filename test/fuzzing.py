@@ -163,7 +163,7 @@ def read(bag, way):
     out = bag.parent / f'out_{len(tried)}'
     if way == 'part':
         with contextlib.suppress(BlfDscError), open_bag(bag) as opened:
-            list(opened.messages(opened.counts, 1_050_000_000))
+            list(opened.messages(opened.counts))
     elif way == 'replay':
         command('replay', bag)
     elif way == 'report':
