@@ -107,7 +107,7 @@ def test_excitation_is_relative_to_the_information_to_which_the_prior_pulls(seed
 def test_only_estimates_with_a_positive_inertia_are_physical(P2, physical):
     law = controller(recommended())
     theta = np.array([1.0, P2, 0.0, 0.0, 0.0])
-    q = np.array([2.0, 1.4])
+    law.signals.q[:] = 2.0, 1.4
     if P2 == 0.02:  # positive definite, but below a tenth of the initial estimate
         law.settings.initial_estimate[:3] = [1.0, 0.32, 0.0]
-    assert excitation.is_physical(law.settings, law.signals, q, theta) == physical
+    assert excitation.is_physical(law.settings, law.signals, theta) == physical

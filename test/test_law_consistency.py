@@ -118,7 +118,7 @@ def test_rejected_column_stays_zero_and_is_checked_again():
     state.anchor[rejected] = 0.1
     state.rows[0] *= 0.5  # the window seems not to be full
     window.excitation(*case, 60)
-    assert excitation.accept_window(*case, Q)
+    assert excitation.accept_window(*case)
     np.testing.assert_array_equal(state.solution == 0.0, rejected)
 
     state.running[:] = 0.0
@@ -185,7 +185,7 @@ def window_of_friction():
     settings = controller.settings._replace(residual_floor=0.0)
     case = settings, controller.state, controller.signals
     window.excitation(*case, 60)
-    assert excitation.accept_window(*case, Q)
+    assert excitation.accept_window(*case)
     return *case, controller, controller.save()
 
 
@@ -207,7 +207,7 @@ def test_window_is_latched_up_to_four_times_the_least_residual(learned, ratio, a
     settings, state, signals, residual = learned
     before = np.diag(signals.Phi).copy()
     state.least_residual[0] = residual / ratio
-    assert excitation.accept_window(settings, state, signals, Q) == accepted
+    assert excitation.accept_window(settings, state, signals) == accepted
     expected = 3.0 * (1.0 - 1.25 / ratio) * residual * np.diag(settings.information) * pulled
     np.testing.assert_allclose(np.diag(signals.Phi) - before, expected, rtol=1e-6, atol=1e-12)
 
@@ -241,7 +241,7 @@ def test_anchor_is_kept_at_the_first_latch_and_once_per_window(learned, latched,
     settings, state, signals, _ = learned
     state.anchor[:] = 0.0
     state.latched[0], state.cursor[0] = latched, cursor
-    assert excitation.accept_window(settings, state, signals, Q)
+    assert excitation.accept_window(settings, state, signals)
     assert np.array_equal(state.anchor, state.solution) == kept
 
 

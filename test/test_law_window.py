@@ -153,7 +153,7 @@ def excited_case(seed):
 def evaluate_until_settled(case, t):
     """Evaluate the window often: the first evaluation starts from an arbitrary direction."""
     for _ in range(50):
-        excitation.update_excitation(*case, t, 1e-3, np.zeros(case[0].n))
+        excitation.update_excitation(*case, t, 1e-3)
 
 
 def test_warm_started_iteration_tracks_the_minimum_eigenvalue_in_a_loop():

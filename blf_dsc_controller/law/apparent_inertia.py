@@ -46,22 +46,20 @@ def low_pass(lags: np.ndarray, row: int, i: int, gain: float, x: float) -> float
 
 
 @inner
-def begin(state: State, signals: Signals, dq: np.ndarray) -> None:
+def begin(settings: Settings, state: State, signals: Signals) -> None:
     """Start the lags at rest, with the torque held that was applied last."""
-    for i in range(dq.size):
+    for i in range(settings.n):
         for row in range(_RATE1, _BEFORE + 1):
             state.lags[row, i] = 0.0
-        state.lags[_VELOCITY, i] = dq[i]
+        state.lags[_VELOCITY, i] = signals.dq[i]
         for row in range(_RATE1):
             state.lags[row, i] = signals.applied[i]
 
 
 @inner
-def pass_band(
-    settings: Settings, state: State, signals: Signals, dt: float, dq: np.ndarray
-) -> None:
+def pass_band(settings: Settings, state: State, signals: Signals, dt: float) -> None:
     """Write torque and acceleration in the band to `signals.unit` and `signals.swing`."""
-    lags = state.lags
+    lags, dq = state.lags, signals.dq
     late = barrier.filter_gain(0.5 * settings.lag, dt) if settings.lag > 0.0 else 1.0
     smooth, slow = barrier.filter_gain(dt / _SMOOTH, dt), barrier.filter_gain(dt / _SLOW, dt)
     brief = barrier.filter_gain(_MEMORY, dt)
@@ -87,22 +85,15 @@ def pass_band(
 
 
 @inner
-def measure(
-    settings: Settings,
-    state: State,
-    signals: Signals,
-    dt: float,
-    q: np.ndarray,
-    dq: np.ndarray,
-) -> None:
+def measure(settings: Settings, state: State, signals: Signals, dt: float) -> None:
     """Update J~ from the last interval; overwrites Yp and Yr of `signals`."""
     if state.samples[0] <= 1.0:  # the first torque has had no effect yet
-        begin(state, signals, dq)
+        begin(settings, state, signals)
         return
-    pass_band(settings, state, signals, dt, dq)
+    pass_band(settings, state, signals, dt)
     if state.samples[0] * dt < _RELEASE:
         return
-    settings.model.momentum_regressor(q, signals.swing, signals.momentum, signals.rest)
+    settings.model.momentum_regressor(signals.q, signals.swing, signals.momentum, signals.rest)
     for i in range(settings.n):
         J = settings.unsure_rotor[i]
         if J == 0.0 or state.lags[_POWER, i] <= _CLEAR * state.lags[_NOISE, i]:

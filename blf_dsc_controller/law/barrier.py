@@ -27,7 +27,6 @@ of a constant bound plus 2 (k'/k) V, which is not positive while the bound narro
 from math import cos, exp, pi, sin, tan
 
 from blf_dsc_controller.compiled.jit import inner
-from blf_dsc_controller.compiled.layout import Array
 from blf_dsc_controller.law.settings import LINEAR, Settings
 from blf_dsc_controller.law.state import Signals, State
 
@@ -143,27 +142,25 @@ def filtered_surface(settings: Settings, state: State, signals: Signals, dt: flo
 
 
 @inner
-def linear_surface(settings: Settings, state: State, signals: Signals, dq: Array) -> None:
+def linear_surface(settings: Settings, state: State, signals: Signals) -> None:
     """Compute alpha2 = dqr - lambda_s z1 of (35), and its derivative, which needs ddqr."""
     for i in range(settings.n):
         state.alpha2[i] = signals.dqr[i] - settings.K[i] * signals.xi1[i]
         signals.beta2[i] = state.alpha2[i]
-        signals.dalpha2[i] = signals.ddqr[i] - settings.K[i] * (dq[i] - signals.dqr[i])
+        signals.dalpha2[i] = signals.ddqr[i] - settings.K[i] * (signals.dq[i] - signals.dqr[i])
 
 
 @inner
-def compute_errors(
-    settings: Settings, state: State, signals: Signals, dt: float, q: Array, dq: Array
-) -> None:
+def compute_errors(settings: Settings, state: State, signals: Signals, dt: float) -> None:
     """Compute the errors xi1 and xi2, and the surface between them."""
     for i in range(settings.n):
-        signals.xi1[i] = q[i] - signals.qr[i]
+        signals.xi1[i] = signals.q[i] - signals.qr[i]
     if settings.surface == LINEAR:
-        linear_surface(settings, state, signals, dq)
+        linear_surface(settings, state, signals)
     else:
         filtered_surface(settings, state, signals, dt)
     for i in range(settings.n):
-        signals.xi2[i] = dq[i] - state.alpha2[i]
+        signals.xi2[i] = signals.dq[i] - state.alpha2[i]
 
 
 @inner

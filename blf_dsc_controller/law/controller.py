@@ -14,7 +14,7 @@ import numpy as np
 
 from blf_dsc_controller.arms.model import ArmModel
 from blf_dsc_controller.compiled.jit import direct, inner, kernel
-from blf_dsc_controller.compiled.layout import Array, pack, part, sizes_of
+from blf_dsc_controller.compiled.layout import Array, pack, sizes_of
 from blf_dsc_controller.law import (
     adaptation,
     apparent_inertia,
@@ -51,11 +51,9 @@ from blf_dsc_controller.reference import terms as reference
 
 
 @inner
-def compute_regressors(
-    settings: Settings, state: State, signals: Signals, q: Array, dq: Array
-) -> None:
+def compute_regressors(settings: Settings, state: State, signals: Signals) -> None:
     """Compute H P^(0) of the feedback, H of what is learned; if the row needs them, Yp and Yr."""
-    model, H = settings.model, signals.H
+    model, H, q, dq = settings.model, signals.H, signals.q, signals.dq
     for i in range(settings.n):
         signals.damped[i] = signals.dalpha2[i] - settings.damping_rate * signals.xi2[i]
     if settings.prediction == FILTERED:
@@ -74,19 +72,10 @@ def compute_regressors(
 
 
 @inner
-def update_window(
-    settings: Settings,
-    state: State,
-    signals: Signals,
-    t: float,
-    dt: float,
-    q: Array,
-    dq: Array,
-    applied: Array,
-) -> None:
+def update_window(settings: Settings, state: State, signals: Signals, t: float, dt: float) -> None:
     """Add the row of the last interval to the window; check the excitation when due."""
-    prediction.fill_columns(settings, t, dq, signals.rest)
-    prediction.form_row(settings, state, signals, dt, q, dq, applied)
+    prediction.fill_columns(settings, t, signals.dq, signals.rest)
+    prediction.form_row(settings, state, signals, dt)
     if state.samples[0] == 0.0:
         return
     if int(state.samples[0]) % settings.row_interval == 0:
@@ -95,7 +84,7 @@ def update_window(
     if settings.change_detection == 1:
         excitation.detect_change(settings, state, signals, t, dt)
     if int(state.samples[0]) % settings.interval == 0:
-        excitation.update_excitation(settings, state, signals, t, dt, q)
+        excitation.update_excitation(settings, state, signals, t, dt)
 
 
 @inner
@@ -140,19 +129,20 @@ def step(
     t [s] the time since the start, dt [s] since the last sample (at the first: until the next).
     """
     n = settings.n
-    q = part(measurement, 0, (n,))
-    dq = part(measurement, n, (n,))
-    torque.find_added(settings, signals, q)
+    for i in range(n):
+        signals.q[i] = measurement[i]
+        signals.dq[i] = measurement[n + i]
+    torque.find_added(settings, signals)
     torque.find_applied(settings, state, signals, measurement)
     reference.evaluate(reference_vector, t, signals.qr, signals.dqr, signals.ddqr)
     torque.known_disturbance(settings, signals, t)
     barrier.update_bound(settings, signals, t)
-    barrier.compute_errors(settings, state, signals, dt, q, dq)
-    compute_regressors(settings, state, signals, q, dq)
+    barrier.compute_errors(settings, state, signals, dt)
+    compute_regressors(settings, state, signals)
     friction.fill_compensation(settings, signals)
-    update_window(settings, state, signals, t, dt, q, dq, signals.applied)
+    update_window(settings, state, signals, t, dt)
     if settings.rotors_unsure == 1:
-        apparent_inertia.measure(settings, state, signals, dt, q, dq)
+        apparent_inertia.measure(settings, state, signals, dt)
         apparent_inertia.correct_feedback(settings, state, signals)
     torque.compute_demand(settings, state, signals)
     saturated = torque.saturate(settings, state, signals, dt)
@@ -194,7 +184,7 @@ def update(
         bridge_repeats(settings, checks, state, dt, measurement)
     used = checks.used if is_checked else measurement
     step(settings, reference_vector, state, signals, t, dt, used, sample)
-    fill_energies(settings, state, signals, part(used, 0, (settings.n,)), sample)
+    fill_energies(settings, state, signals, sample)
     return check_sample(settings, checks, state, signals, sample) if is_checked else 0
 
 

@@ -121,7 +121,7 @@ def window_residual(running: Array, theta: Array) -> float:
 
 
 @inner
-def is_physical(settings: Settings, signals: Signals, q: Array, theta: Array) -> bool:
+def is_physical(settings: Settings, signals: Signals, theta: Array) -> bool:
     """Check that M(q) of theta (m,), minus a tenth of that of P^(0), is positive definite.
 
     Overwrites Yp and Yr of `signals`.
@@ -129,7 +129,7 @@ def is_physical(settings: Settings, signals: Signals, q: Array, theta: Array) ->
     for k in range(settings.n):
         for i in range(settings.n):
             signals.unit[i] = 1.0 if i == k else 0.0
-        settings.model.momentum_regressor(q, signals.unit, signals.momentum, signals.rest)
+        settings.model.momentum_regressor(signals.q, signals.unit, signals.momentum, signals.rest)
         for i in range(k, settings.n):
             signals.inertia[k, i] = 0.0
             for j in range(settings.p):
@@ -190,13 +190,12 @@ def agrees_with_parts(settings: Settings, state: State, signals: Signals, residu
     state.split_residual[0] = residual
     state.rows[0] = float(newer_rows)
     window.add(signals.newer, 0.0, signals.newer, state.running)
-    for j in range(settings.m):
-        state.min_eigenvector[j] = settings.m**-0.5
+    window.reset_direction(state)
     return False
 
 
 @inner
-def accept_window(settings: Settings, state: State, signals: Signals, q: Array) -> bool:
+def accept_window(settings: Settings, state: State, signals: Signals) -> bool:
     """Check that the window is consistent and its solution physical; if so, keep the solution.
 
     A window that is not full, or has an unusually large residual, is pulled to the anchor:
@@ -223,7 +222,7 @@ def accept_window(settings: Settings, state: State, signals: Signals, q: Array) 
     if pull > 0.0:
         window.pull_to(state.anchor, pull, settings.information, signals.Phi, signals.b)
         solve(settings, state, signals)
-    if not is_physical(settings, signals, q, solution):
+    if not is_physical(settings, signals, solution):
         return False
     for j in range(m):
         state.solution[j] = solution[j]
@@ -232,13 +231,6 @@ def accept_window(settings: Settings, state: State, signals: Signals, q: Array) 
         for j in range(m):
             state.anchor[j] = solution[j]
     return True
-
-
-@inner
-def reset_direction(settings: Settings, state: State) -> None:
-    """Restart the inverse iteration, for a matrix that has changed."""
-    for i in range(settings.m):
-        state.min_eigenvector[i] = settings.m**-0.5
 
 
 @inner
@@ -251,17 +243,17 @@ def reject_columns(settings: Settings, state: State, signals: Signals) -> None:
     """
     for j in range(settings.p, settings.m):
         state.active[j] = 0.0
-    reset_direction(settings, state)
+    window.reset_direction(state)
     parameters_excited = window.excitation(settings, state, signals, _COLD) >= settings.sigma
     for j in range(settings.p, settings.m):
         state.active[j] = 1.0
     if not parameters_excited:
         state.columns_checked[0] = 0.0  # readmit all, until a window is excited
-        reset_direction(settings, state)
+        window.reset_direction(state)
         return
     state.columns_checked[0] = 1.0
     for _ in range(settings.p, settings.m):
-        reset_direction(settings, state)
+        window.reset_direction(state)
         if window.excitation(settings, state, signals, _COLD) >= settings.sigma:
             return
         worst = settings.p
@@ -295,7 +287,7 @@ def is_preferred(settings: Settings, state: State, value: float) -> bool:
 
 @inner
 def update_excitation(
-    settings: Settings, state: State, signals: Signals, t: float, dt: float, q: Array
+    settings: Settings, state: State, signals: Signals, t: float, dt: float
 ) -> None:
     """Compute lambda_min of the window; from tau_d + T_a on, latch the window if it suffices (27).
 
@@ -319,7 +311,7 @@ def update_excitation(
     if not (learning and value >= settings.sigma and is_preferred(settings, state, value)):
         return
     consistent = settings.change_detection == 0
-    if not (consistent or accept_window(settings, state, signals, q)):
+    if not (consistent or accept_window(settings, state, signals)):
         return
     for i in range(settings.m):
         state.b[i] = signals.b[i]

@@ -34,9 +34,9 @@ def error_term(settings: Settings, state: State, signals: Signals) -> float:
 
 
 @inner
-def kinetic_term(settings: Settings, signals: Signals, q: Array) -> float:
+def kinetic_term(settings: Settings, signals: Signals) -> float:
     """Return xi2^T M xi2 / 2 [J], M xi2 = Yp(q, xi2) P; overwrites Yp and Yr in `signals`."""
-    settings.model.momentum_regressor(q, signals.xi2, signals.momentum, signals.rest)
+    settings.model.momentum_regressor(signals.q, signals.xi2, signals.momentum, signals.rest)
     total = 0.0
     for i in range(settings.n):
         for j in range(settings.p):
@@ -67,13 +67,11 @@ def disturbance_term(settings: Settings, state: State, signals: Signals) -> floa
 
 
 @inner
-def fill_energies(
-    settings: Settings, state: State, signals: Signals, q: Array, sample: Sample
-) -> None:
+def fill_energies(settings: Settings, state: State, signals: Signals, sample: Sample) -> None:
     """Compute the terms of (29) for the telemetry sample; NaN where the truth is unknown."""
     sample.lyapunov[0] = error_term(settings, state, signals)
     if settings.truth_known == 1:
-        sample.lyapunov[1] = kinetic_term(settings, signals, q)
+        sample.lyapunov[1] = kinetic_term(settings, signals)
         sample.lyapunov[2] = parameter_term(settings, state)
         sample.lyapunov[3] = disturbance_term(settings, state, signals)
     else:

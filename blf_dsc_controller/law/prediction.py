@@ -65,9 +65,7 @@ def fill_columns(settings: Settings, t: float, dq: Array, rest: Array) -> None:
 
 
 @inner
-def filter_row(
-    settings: Settings, state: State, signals: Signals, dt: float, torque: Array
-) -> None:
+def filter_row(settings: Settings, state: State, signals: Signals, dt: float) -> None:
     """Pass [X | u] of the last interval through both poles; write the result to `signals.row`.
 
     Rows of a joint that hardly moves count less: its stiction would be mistaken for gravity.
@@ -84,7 +82,7 @@ def filter_row(
             row[i, j] = 0.5 * (signals.rest[i, j] + state.rest[i, j])
         for j in range(p):
             row[i, j] += (signals.momentum[i, j] - state.momentum[i, j]) * (1.0 / dt)
-        row[i, m] = torque[i]
+        row[i, m] = signals.applied[i]
         for j in range(m + 1):
             state.filter1[i, j] += gain * (row[i, j] - state.filter1[i, j])
             state.filter2[i, j] += gain * (state.filter1[i, j] - state.filter2[i, j])
@@ -118,51 +116,40 @@ def differentiate(settings: Settings, state: State, signals: Signals, dt: float)
 
 
 @inner
-def heuristic_factor(settings: Settings, state: State, signals: Signals, dq: Array) -> float:
+def heuristic_factor(settings: Settings, state: State, signals: Signals) -> float:
     """Return Lambda of (24), which is dimensionless only if units are ignored."""
     products = 1.0
     squares = 1.0
     for i in range(settings.n):
-        products += signals.acceleration[i] * signals.dalpha2[i] + dq[i] * state.alpha2[i]
-        squares += signals.acceleration[i] ** 2 + dq[i] ** 2
+        products += signals.acceleration[i] * signals.dalpha2[i] + signals.dq[i] * state.alpha2[i]
+        squares += signals.acceleration[i] ** 2 + signals.dq[i] ** 2
     return products / squares
 
 
 @inner
-def accelerated_row(
-    settings: Settings, state: State, signals: Signals, q: Array, dq: Array, torque: Array
-) -> None:
+def accelerated_row(settings: Settings, state: State, signals: Signals) -> None:
     """Write the row `acceleration` or `lambda` to `signals.row`, from ddq^ of `differentiate`."""
-    scale = 1.0
-    X = signals.momentum
+    scale, q, dq, X = 1.0, signals.q, signals.dq, signals.momentum
     if settings.prediction == LAMBDA:
-        scale = heuristic_factor(settings, state, signals, dq)
+        scale = heuristic_factor(settings, state, signals)
         settings.model.regressor(q, dq, state.alpha2, signals.dalpha2, X)
     else:
         settings.model.regressor(q, dq, dq, signals.acceleration, X)
     for i in range(settings.n):
         for j in range(settings.m):
             signals.row[i, j] = X[i, j] if j < settings.p else scale * signals.rest[i, j]
-        signals.row[i, settings.m] = scale * torque[i]
+        signals.row[i, settings.m] = scale * signals.applied[i]
 
 
 @inner
-def form_row(
-    settings: Settings,
-    state: State,
-    signals: Signals,
-    dt: float,
-    q: Array,
-    dq: Array,
-    torque: Array,
-) -> None:
+def form_row(settings: Settings, state: State, signals: Signals, dt: float) -> None:
     """Write the configured row of the last interval to `signals.row` (n, m + 1)."""
     if settings.prediction != FILTERED:
         differentiate(settings, state, signals, dt)
-        accelerated_row(settings, state, signals, q, dq, torque)
+        accelerated_row(settings, state, signals)
         return
     if state.samples[0] > 0.0:
-        filter_row(settings, state, signals, dt, torque)
+        filter_row(settings, state, signals, dt)
     remember(settings, state, signals)
 
 

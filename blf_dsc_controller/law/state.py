@@ -73,8 +73,10 @@ class State(NamedTuple):
 
 
 class Signals(NamedTuple):
-    """Values that a law computes in one sample."""
+    """Values that a law reads and computes in one sample."""
 
+    q: Annotated[Array, 'n']  # rad
+    dq: Annotated[Array, 'n']  # rad/s
     qr: Annotated[Array, 'n']  # rad
     dqr: Annotated[Array, 'n']  # rad/s
     ddqr: Annotated[Array, 'n']  # rad/s^2

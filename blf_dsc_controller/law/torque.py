@@ -102,12 +102,12 @@ def compute_demand(settings: Settings, state: State, signals: Signals) -> None:
 
 
 @inner
-def find_added(settings: Settings, signals: Signals, q: Array) -> None:
+def find_added(settings: Settings, signals: Signals) -> None:
     """Write G_d(q) to `signals.added` (n,) [N m]."""
     if settings.drive == 0:
         return
     still = signals.still
-    fill_regressor(settings.drive_chain, q, still, still, still, signals.drive)
+    fill_regressor(settings.drive_chain, signals.q, still, still, still, signals.drive)
     for i in range(settings.n):
         signals.added[i] = 0.0
         for j in range(settings.drive):

@@ -192,6 +192,13 @@ def min_eigenvector(
 
 
 @inner
+def reset_direction(state: State) -> None:
+    """Restart the inverse iteration, for a matrix that has changed."""
+    for j in range(state.min_eigenvector.size):
+        state.min_eigenvector[j] = state.min_eigenvector.size**-0.5
+
+
+@inner
 def excitation(settings: Settings, state: State, signals: Signals, iterations: int) -> float:
     """Return lambda_min of the current window's Phi; leave Phi, b and its factor in `signals`."""
     Phi, b, R = signals.Phi, signals.b, settings.information

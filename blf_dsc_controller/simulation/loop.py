@@ -16,7 +16,7 @@ import numpy as np
 
 from blf_dsc_controller.arms.model import ArmModel
 from blf_dsc_controller.compiled.jit import kernel
-from blf_dsc_controller.compiled.layout import part, view
+from blf_dsc_controller.compiled.layout import view
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.plant import PlantConfig
 from blf_dsc_controller.configuration.schema import flatten
@@ -94,7 +94,7 @@ def run_loop(
         step(law, reference_view, law_state, law_signals, t, dt, used, sample)
         plants.truth(plant, now, true[k - first])
         if observed:
-            fill_energies(law, law_state, law_signals, part(used, 0, (law.n,)), sample)
+            fill_energies(law, law_state, law_signals, sample)
             add_row(law, law_state, law_signals, dt)
         if is_checked and check_sample(law, checks, law_state, law_signals, sample) & SUSPECT:
             return False
