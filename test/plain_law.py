@@ -43,6 +43,7 @@ class PlainLaw:
         self.newton = settings.update == 1
         self.effort = settings.torque_source == 1
         self.at_state = settings.compensation == 1
+        self.linear = settings.surface == 1
         self.theta = settings.initial_estimate.copy()
         self.d3 = np.zeros(2)
         self.inertia = np.ones(2)  # measured over assumed
@@ -63,8 +64,10 @@ class PlainLaw:
         return g.bound + wider, -g.funnel_rate * wider
 
     def barrier_torque(self, xi1, t):
-        """Return tau_c of (16) with its weight, a straight line beyond the knee."""
+        """Return tau_c of (16) with its weight, a straight line beyond the knee; of (35) -w z1."""
         g = self.gains
+        if self.linear:
+            return -g.weight * xi1
         k, _ = self.bound(t)
         edge = np.minimum(np.abs(xi1), g.knee / g.bound * k)
         inside = g.weight * edge / np.cos(np.pi * edge**2 / (2.0 * k**2)) ** 2
@@ -134,7 +137,7 @@ class PlainLaw:
             v += g.kappa * eps
         tracking = np.zeros(g.m)
         if not saturated:
-            tracking[:3] = -(g.variance * (H.T @ xi2))[:3]
+            tracking[:3] = -(g.variance * (H.T @ xi2) + g.Wc * self.theta)[:3]
             self.d3 = self.d3 - dt * self.inertia * g.gamma * (xi2 + g.eta * self.d3)
         v = g.Gamma * (v + tracking)
         by_tracking = self.theta + dt * g.Gamma * tracking
@@ -151,7 +154,7 @@ class PlainLaw:
             self.d3 = self.d3 - H @ (self.theta - by_tracking)
 
     def update(self, t, dt, qr, dqr, ddqr, measurement):
-        """Return the torque (28) for a measurement; the caller sets `tau`, the last one sent.
+        """Return the torque (28) or (35); the caller sets `tau`, the last one sent.
 
         What is learned acts along the reference, or at the measured state as in the paper.
         """
@@ -163,6 +166,8 @@ class PlainLaw:
             self.alpha2 = beta2
         following = beta2 + (self.alpha2 - beta2) * np.exp(-dt / g.time_constant)
         dalpha2 = (following - self.alpha2) / dt
+        if self.linear:
+            self.alpha2, dalpha2 = dqr - g.K * xi1, ddqr - g.K * (dq - dqr)
         self.xi2 = xi2 = dq - self.alpha2
         self.learn(t, dt, q, dq, dqr, effort if self.effort else self.tau)
         r, P0 = g.model.r, g.initial_estimate[:3]
@@ -174,7 +179,7 @@ class PlainLaw:
             H_r[:, 3 + 2 * g.bias :][:, :2] = np.diag(dqr)
         demand = (
             self.barrier_torque(xi1, t)
-            - g.d2 * np.abs(xi1) * np.clip(xi2 / g.boundary_layer, -1.0, 1.0)
+            - (g.d2 * np.abs(xi1) + g.mu_bar) * np.clip(xi2 / g.boundary_layer, -1.0, 1.0)
             - g.Kp * xi2
             + H @ P0
             - H_r[:, :3] @ P0

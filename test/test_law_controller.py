@@ -11,56 +11,15 @@ from pathlib import Path
 import numpy as np
 import plants
 import pytest
-from closed_loop_case import arbitrary_settings, closed_loop, controller, plant, quick, record
+from closed_loop_case import controller, plant, quick, record
 from command import finished
 from numba.core.runtime import _nrt_python, rtsys
 from paper_case import EXACT, P, configured, run
-from plain_law import R, regressor
 
-from blf_dsc_controller.compiled.layout import pack, sizes_of
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.schema import build
-from blf_dsc_controller.law.factory import column_names, controller_of, settings_of_config
-from blf_dsc_controller.law.settings import settings_of
-from blf_dsc_controller.law.state import (
-    sample_of,
-    sample_size,
-    signals_of,
-    signals_size,
-    state_of,
-    state_size,
-)
-
-
-@pytest.mark.parametrize(('n', 'p'), [(1, 1), (2, 3), (6, 30)])
-def test_vectors_are_laid_out_without_gap_or_overlap(n, p):
-    """Every setting survives packing; views of state, signals and sample cover their vectors."""
-    case = arbitrary_settings(np.random.default_rng(0), n, p)
-    numbers = iter(range(1000, 10_000))
-    sizes = ('n', 'p', 'm', 'tones', 'drive', 'drive_size', 'weighed', 'model')
-    distinct = {
-        name: np.reshape([float(next(numbers)) for _ in range(value.size)], value.shape)
-        if isinstance(value, np.ndarray)
-        else next(numbers) + (0 if isinstance(value, int) else 0.5)
-        for name, value in case._asdict().items()
-        if name not in sizes
-    }
-    settings = case._replace(**distinct)
-    unpacked = settings_of(pack(settings), sizes_of(settings), settings.model)
-    for name, value in settings._asdict().items():
-        np.testing.assert_array_equal(getattr(unpacked, name), value, err_msg=name)
-        assert isinstance(getattr(unpacked, name), type(value)), name
-
-    for views, size_of in (
-        (state_of, state_size),
-        (signals_of, signals_size),
-        (sample_of, sample_size),
-    ):
-        size = size_of(case)
-        parts = views(np.arange(float(size)), case)
-        covered = np.concatenate([part.ravel() for part in parts])
-        np.testing.assert_array_equal(np.sort(covered), np.arange(size))
-
+from blf_dsc_controller.law.factory import column_names, settings_of_config
+from blf_dsc_controller.law.settings import COMPENSATIONS, SURFACES
 
 NOISY = {'position_noise': 1e-5, 'sensor.velocity': 'differenced', 'delay': 2}
 
@@ -149,72 +108,22 @@ def test_interpreted_kernels_compute_the_same():
         np.testing.assert_allclose(ours, theirs, rtol=rtol, atol=rtol)
 
 
-ROUNDING = 1e-10
-UNEVEN = {
-    'feedback.gain': [40.0, 25.0],
-    'feedback.boundary_layer': 0.02,
-    'learning.adaptation_gain': [0.7, 1.3, 2.1],
-    'comparison.surface_gain': [60.0, 35.0],
-    'comparison.position_gain': [30.0, 11.0],
-    'comparison.robust_gain': [0.4, 0.2],
-    'comparison.leakage': 0.05,
-    'learning.window': 0.4,  # which they must not learn from
-    'learning.settling_time': 0.1,
-    'learning.excitation_threshold': 1e-9,
-}
-
-
-class PlainComparison:
-    """(35) as printed, P^ by Euler steps; `slotine_li` is the same without w, mu_bar and W_c."""
-
-    def __init__(self, config, *, bare):
-        gains, share = config.comparison, 0.0 if bare else 1.0
-        self.Kp, self.layer = np.array(config.feedback.gain), config.feedback.boundary_layer
-        self.Gamma = np.array(config.learning.adaptation_gain)
-        self.lambda_s = np.array(gains.surface_gain)
-        self.w, self.mu_bar = share * np.array([gains.position_gain, gains.robust_gain])
-        self.Wc = share * gains.leakage
-        self.P = np.array(config.learning.initial_estimate)
-
-    def update(self, dt, qr, dqr, ddqr, q, dq):
-        z1 = q - qr
-        alpha2 = dqr - self.lambda_s * z1
-        dalpha2 = ddqr - self.lambda_s * (dq - dqr)
-        z2 = dq - alpha2
-        H = regressor(R, q, dq, alpha2, dalpha2)
-        sat = np.clip(z2 / self.layer, -1.0, 1.0)
-        torque = H @ self.P - self.Kp * z2 - self.w * z1 - self.mu_bar * sat
-        self.P = self.P - dt * self.Gamma * (H.T @ z2 + self.Wc * self.P)
-        return torque
-
-
-@pytest.mark.parametrize('law', ['backstepping', 'slotine_li'])
-def test_comparison_laws_follow_their_equations_in_a_closed_loop(law):
-    config = configured('recommended', 1.0, UNEVEN | {'law': law}).controller
-    controller, plain = controller_of(config), PlainComparison(config, bare=law == 'slotine_li')
-    for sample in closed_loop(controller, plant(), 1.0):
-        q, dq, _ = sample.measurement.reshape(3, 2)
-        torque = plain.update(1e-3, *controller.reference_at(sample.t), q, dq)
-        np.testing.assert_allclose(controller.signals.torque, torque, atol=ROUNDING)
-        np.testing.assert_allclose(controller.state.estimate[:3], plain.P, atol=ROUNDING)
-    assert np.abs(controller.state.estimate[:3] - [0.5, 0.16, 0.2]).max() > 0.05  # it did adapt
-    assert controller.state.latched[0] == 1.0
-
-
-def test_zero_weight_of_the_prediction_error_equals_no_learning_bit_for_bit():
-    """kappa = 0 against a threshold that is never reached, beyond the latch at 6.8 s.
-
-    Without change detection, which holds the estimate where a full window is not excited.
-    """
-    paper = {'learning.change_detection': False}
-    off = run(configured('recommended', 10.0, paper | {'learning.weight': 0.0}))
-    never = run(configured('recommended', 10.0, paper | {'learning.excitation_threshold': 1e9}))
-    learning = run(configured('recommended', 10.0))
-
-    assert (off.latched[-1], never.latched[-1]) == (1.0, 0.0)
-    np.testing.assert_array_equal(off.torque, never.torque)
-    np.testing.assert_array_equal(off.estimate[:, :3], never.estimate[:, :3])
-    assert np.abs(learning.estimate - off.estimate)[-1, :3].max() > 0.01
+@pytest.mark.parametrize(('law', 'share'), [('backstepping', 1.0), ('slotine_li', 0.0)])
+def test_comparison_laws_are_the_linear_surface_with_their_gains(law, share):
+    """`slotine_li` without w, mu_bar and W_c; neither learns from a window that is excited."""
+    gains = {'surface_gain': [60.0, 35.0], 'position_gain': [30.0, 11.0]}
+    gains |= {'robust_gain': [0.4, 0.2], 'leakage': 0.05}
+    given = {f'comparison.{name}': value for name, value in gains.items()}
+    config = configured('recommended', 1.0, given | {'law': law}).controller
+    settings = settings_of_config(config)
+    assert SURFACES[settings.surface] == 'linear'
+    assert COMPENSATIONS[settings.compensation] == 'state'
+    found = (settings.weight, settings.mu_bar, settings.Wc)
+    for ours, name in zip(found, ('position_gain', 'robust_gain', 'leakage'), strict=True):
+        np.testing.assert_array_equal(ours, share * np.array(gains[name]))
+    np.testing.assert_array_equal(settings.K, gains['surface_gain'])
+    for zero in (settings.d2, settings.gamma, settings.kappa, settings.change_detection):
+        assert not np.any(zero)
 
 
 def test_proposed_law_with_everything_known_and_frozen_equals_model_based():

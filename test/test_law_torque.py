@@ -109,7 +109,7 @@ def drawn(seed):
     def each(low, high, n=2):
         return random.uniform(low, high, n)
 
-    newton = bool(random.integers(3))
+    newton, linear = bool(random.integers(3)), not random.integers(4)
     columns = {
         'bias': bool(random.integers(2)),
         'viscous': bool(random.integers(2)),
@@ -137,6 +137,8 @@ def drawn(seed):
         'row_weight': each(0.3, 1.0),
         'damping_rate': random.uniform(0.0, 20.0),
         'd2': each(0.0, 300.0),
+        'mu_bar': each(0.0, 0.4),
+        'Wc': random.choice([0.0, 0.05]),
         'boundary_layer': random.uniform(0.01, 0.1),
         'eta': random.uniform(0.0, 0.5),
         'gamma': each(0.0, 60.0),
@@ -144,10 +146,11 @@ def drawn(seed):
         'radius': random.choice([0.8, 10.0]),
         'least': np.append([-np.inf] * 3, np.full(m - 3, random.choice([-np.inf, -0.05]))),
         'most': np.append([np.inf] * 3, np.full(m - 3, random.choice([np.inf, 0.05]))),
-        'K': each(60.0, 150.0),
+        'surface': int(linear),
+        'K': each(30.0, 60.0) if linear else each(60.0, 150.0),
         'mu': each(10.0, 30.0),
         'Kp': each(10.0, 20.0),
-        'weight': each(300.0, 1000.0),
+        'weight': each(5.0, 30.0) if linear else each(300.0, 1000.0),
         'slope_limit': each(5e3, 2e4),
         'initial_bound': BOUND + random.integers(2) * each(0.0, 0.01),
         'funnel_rate': random.uniform(0.0, 3.0),
@@ -184,7 +187,8 @@ def test_law_matches_the_plain_one_in_closed_loop():
         assert law.state.latched[0] == 1.0
         assert plain.latched is not None
         met |= {('window full', law.state.rows[0] == settings.window)}
-    assert len(met) == 4 + 3 * 2
+        met |= {('linear surface', settings.surface == 1)}
+    assert len(met) == 4 + 4 * 2
 
 
 DT = 2e-3  # s: with 500 N m/s, 1 N m from sample to sample
