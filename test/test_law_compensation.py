@@ -22,7 +22,7 @@ from blf_dsc_controller.law.factory import controller_of, estimate_names
 from blf_dsc_controller.law.state import sample_of
 from blf_dsc_controller.simulation.loop import simulate
 from blf_dsc_controller.studies.monte_carlo import load_study
-from blf_dsc_controller.studies.report import compare
+from blf_dsc_controller.studies.pairs import compare_pairs
 from blf_dsc_controller.studies.runs import run_chunk
 
 AT_STATE = {'learning.compensation': 'state'}
@@ -188,7 +188,7 @@ def test_sine_at_a_frequency_of_the_reference_is_not_learned_as_friction():
 def test_learning_breaks_no_bound_that_learned_friction_once_broke(name, run):
     study = load_study(locate(name))
     study = replace(study, settings=replace(study.settings, runs=run + 1))
-    found = compare(study, run_chunk(study, run, 1))
+    found = compare_pairs(study, run_chunk(study, run, 1))
     assert found['kept'] == {'with': 1, 'without': 1}
     assert found['above'] == []
 

@@ -79,11 +79,11 @@ def test_differentiating_filter_matches_the_exact_discretisation_of_scipy(omega,
     system = (np.array([[0.0, 1.0], [-(omega**2), -2.0 * omega]]), np.array([[0.0], [omega**2]]))
     A, B, *_ = cont2discrete((*system, np.eye(2), np.zeros((2, 1))), dt)
     state.samples[0], rounding = 0.0, {'rtol': 1e-9, 'atol': 1e-9 * omega}
-    for xi2, dalpha2 in np.random.default_rng(0).normal(size=(100, 2, 3)):
+    for xi2, dalpha2 in np.random.default_rng(0).normal(size=(100, 2, 2)):
         signals.xi2[:], signals.dalpha2[:] = xi2, dalpha2
         prediction.differentiate(settings, state, signals, dt)
         if state.samples[0] == 0.0:
-            expected = np.array([signals.xi2, np.zeros(3)])
+            expected = np.array([signals.xi2, np.zeros(2)])
         else:
             expected = A @ expected + B * signals.xi2
         state.samples[0] += 1.0

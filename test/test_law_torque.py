@@ -196,11 +196,11 @@ DT = 2e-3  # s: with 500 N m/s, 1 N m from sample to sample
 
 def cut(demand, last, *, level=10.0, rate=500.0, samples=7.0, added=0.0):
     """Torque and what cut it; the cuts are counted, and any is reported."""
-    case = arbitrary(0, n=1, torque_limit=np.array([level]), rate_limit=np.array([rate]))
+    case = arbitrary(0, torque_limit=np.full(2, level), rate_limit=np.full(2, rate))
     _, state, signals = case
-    state.samples[0], state.torque[0] = samples, last
-    state.level_cuts[0] = state.rate_cuts[0] = 0.0
-    signals.demand[0], signals.added[0] = demand, added
+    state.samples[0], state.torque[:] = samples, last
+    state.level_cuts[:] = state.rate_cuts[:] = 0.0
+    signals.demand[:], signals.added[:] = demand, added
     saturated = saturate(*case, DT)
     cuts = signals.cuts[0]
     assert saturated == (cuts > 0.0)
@@ -240,9 +240,9 @@ def test_torque_that_is_not_a_number_does_not_turn_into_one_that_looks_valid(rat
 def test_applied_torque_has_the_mean_of_what_the_drive_adds_at_both_ends(source):
     whole = source == 'whole effort'
     changes = {'torque_source': EFFORT * (source != 'command'), 'effort_is_whole': int(whole)}
-    case = _, state, signals = arbitrary(3, drive=0, **changes)
-    measurement = np.arange(9.0)
-    base = state.torque.copy() if source == 'command' else measurement[6:]
+    case = _, state, signals = arbitrary(3, **changes)
+    measurement = np.arange(6.0)
+    base = state.torque.copy() if source == 'command' else measurement[4:]
     expected = base + 0.5 * (state.added + signals.added) * (not whole)
     find_applied(*case, measurement)
     np.testing.assert_array_equal(signals.applied, expected)
