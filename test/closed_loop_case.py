@@ -116,18 +116,10 @@ def recommended_minute() -> Record:
     return record(controller(recommended()), plant(), 60.0)
 
 
-class Case(NamedTuple):
-    """Arguments of a kernel."""
-
-    settings: Settings
-    state: State
-    signals: Signals
-
-
-def arbitrary(seed: int, **changes: Any) -> Case:
-    """Return a case with standard normal state and signals, and a window of eight rows."""
+def arbitrary(seed: int, **changes: Any) -> tuple[Settings, State, Signals]:
+    """Return settings with a window of eight rows, and standard normal state and signals."""
     settings = recommended(**{'window': 8, 'interval': 1, 'learning_start': 0.0} | changes)
     random = np.random.default_rng(seed)
     state = state_of(random.normal(size=state_size(settings)), settings)
     signals = signals_of(random.normal(size=signals_size(settings)), settings)
-    return Case(settings, state, signals)
+    return settings, state, signals

@@ -160,8 +160,8 @@ def test_models_and_choices_match_the_law():
     choices = {entry.name: entry.choices for entry in parameters(ControllerConfig)}
     for law in choices['law']:
         factory.settings_of_config(build(ControllerConfig, TRUE_MODEL | {'law': law}))
-    assert sorted(choices['learning.update']) == sorted(settings.UPDATES)
-    assert sorted(choices['learning.torque_source']) == sorted(settings.TORQUE_SOURCES)
+    for name in ('prediction', 'update', 'torque_source', 'compensation'):
+        assert sorted(choices[f'learning.{name}']) == sorted(settings.CHOICES[name])
 
 
 @pytest.mark.parametrize('cls', NODES.values(), ids=NODES)

@@ -14,7 +14,7 @@ from scipy.integrate import solve_ivp
 
 from blf_dsc_controller.compiled import cholesky
 from blf_dsc_controller.law.factory import controller_of
-from blf_dsc_controller.law.settings import COMPENSATIONS
+from blf_dsc_controller.law.settings import CHOICES
 
 BOUND = 2e-3  # rad
 
@@ -47,14 +47,14 @@ def power_of_the_initial_model(law, q, dq):
     return s.xi2 @ (H - s.H[:, :3]) @ (law.settings.initial_estimate[:3] - P)
 
 
-@pytest.mark.parametrize('compensation', COMPENSATIONS)
+@pytest.mark.parametrize('compensation', CHOICES['compensation'])
 @pytest.mark.parametrize('kappa', [0.0, 100.0], ids=['tracking alone', 'learning too'])
 def test_lyapunov_function_decreases_from_sample_to_sample(kappa, compensation):
     """(31), (32) without a disturbance; before the latch at 6.8 s both cases are the same.
 
     With compensation along the reference V may rise by no more than the power of the initial model.
     """
-    form = COMPENSATIONS.index(compensation)
+    form = CHOICES['compensation'].index(compensation)
     gains = {'kappa': kappa, 'gamma': np.full(2, 1.0), 'compensation': form}
     known = {'truth_known': 1, 'true_parameters': P, 'true_disturbance': np.zeros((4, 2))}
     law = controller(recommended(bias=False, bumpless=0, **gains, **known))

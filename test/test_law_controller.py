@@ -19,7 +19,7 @@ from paper_case import EXACT, P, configured, run
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.schema import build
 from blf_dsc_controller.law.factory import column_names, settings_of_config
-from blf_dsc_controller.law.settings import COMPENSATIONS, SURFACES
+from blf_dsc_controller.law.settings import CHOICES
 
 NOISY = {'position_noise': 1e-5, 'sensor.velocity': 'differenced', 'delay': 2}
 
@@ -116,8 +116,8 @@ def test_comparison_laws_are_the_linear_surface_with_their_gains(law, share):
     given = {f'comparison.{name}': value for name, value in gains.items()}
     config = configured('recommended', 1.0, given | {'law': law}).controller
     settings = settings_of_config(config)
-    assert SURFACES[settings.surface] == 'linear'
-    assert COMPENSATIONS[settings.compensation] == 'state'
+    assert CHOICES['surface'][settings.surface] == 'linear'
+    assert CHOICES['compensation'][settings.compensation] == 'state'
     found = (settings.weight, settings.mu_bar, settings.Wc)
     for ours, name in zip(found, ('position_gain', 'robust_gain', 'leakage'), strict=True):
         np.testing.assert_array_equal(ours, share * np.array(gains[name]))

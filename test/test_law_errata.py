@@ -15,7 +15,7 @@ from blf_dsc_controller.compiled import cholesky
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.errors import OutsideBarrierError
 from blf_dsc_controller.law import adaptation, barrier
-from blf_dsc_controller.law.settings import EFFORT, FILTERED, LAMBDA, PREDICTIONS
+from blf_dsc_controller.law.settings import CHOICES, EFFORT, FILTERED, LAMBDA
 from blf_dsc_controller.reference.approach import check_takeover
 
 
@@ -111,7 +111,7 @@ def test_erratum_15_robust_term_dominates_disturbances_bounded_joint_by_joint():
     np.testing.assert_allclose(torque, 0.0, atol=1e-12)
 
 
-ACCELERATION = PREDICTIONS.index('acceleration')
+ACCELERATION = CHOICES['prediction'].index('acceleration')
 
 
 def rows_of_a_loop(prediction, duration=1.0):

@@ -12,7 +12,7 @@ from plants import QUIET
 from scipy.signal import cont2discrete
 
 from blf_dsc_controller.law import prediction
-from blf_dsc_controller.law.settings import EFFORT, LAMBDA, PREDICTIONS
+from blf_dsc_controller.law.settings import CHOICES, EFFORT, LAMBDA
 
 BIAS = (0.3, -0.2)
 
@@ -68,7 +68,7 @@ def test_learning_uses_the_applied_torque():
         assert of_limited < 0.01
 
 
-ACCELERATION = PREDICTIONS.index('acceleration')
+ACCELERATION = CHOICES['prediction'].index('acceleration')
 
 
 @pytest.mark.parametrize('omega', [1.0, 30.0, 1000.0])

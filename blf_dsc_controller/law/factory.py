@@ -34,14 +34,7 @@ from blf_dsc_controller.configuration.robot import drive_model, parameters_of
 from blf_dsc_controller.configuration.schema import parameters
 from blf_dsc_controller.law import barrier
 from blf_dsc_controller.law.controller import Controller
-from blf_dsc_controller.law.settings import (
-    COMPENSATIONS,
-    PREDICTIONS,
-    SURFACES,
-    TORQUE_SOURCES,
-    UPDATES,
-    Settings,
-)
+from blf_dsc_controller.law.settings import CHOICES, LINEAR, Settings
 from blf_dsc_controller.reference.approach import plan_start, reference_of
 
 _FRICTION = 0.05  # standard deviation of friction, over the rated torque
@@ -147,14 +140,10 @@ def settings_of_config(config: ControllerConfig) -> Settings:
         'n': model.n,
         'p': p,
         'm': m,
-        'surface': SURFACES.index('filtered'),
-        'prediction': PREDICTIONS.index(learning.prediction),
-        'update': UPDATES.index(learning.update),
-        'torque_source': TORQUE_SOURCES.index(learning.torque_source),
+        'surface': CHOICES['surface'].index('filtered'),
         'effort_is_whole': int(config.robot.effort != 'commanded'),
         'drive': drive_inertias.size,
         'drive_size': drive_chain.size,
-        'compensation': COMPENSATIONS.index(learning.compensation),
         'window': round(learning.window / (config.sample_time * learning.row_interval)),
         'tones': len(learning.frequencies),
         'truth_known': int(bool(truth.parameters)),
@@ -200,10 +189,9 @@ def _gains(config: ControllerConfig) -> dict[str, Any]:
             name = param.symbol if param.symbol in Settings._fields else param.name
             if name in Settings._fields:
                 value = getattr(group, param.name)
-                is_flag = isinstance(value, bool)
-                found[name] = (
-                    int(value) if is_flag else np.array(value) if param.is_array else value
-                )
+                if name in CHOICES:
+                    value = CHOICES[name].index(value)
+                found[name] = np.array(value) if param.is_array else value
     return found
 
 
@@ -252,12 +240,12 @@ def _of_law(config: ControllerConfig, settings: Settings) -> dict[str, Any]:
     comparison = config.comparison
     nothing = np.zeros(settings.n)
     linear = {
-        'surface': SURFACES.index('linear'),
+        'surface': LINEAR,
         'K': np.array(comparison.surface_gain),
         'd2': nothing,
         'gamma': nothing,
         'kappa': 0.0,
-        'compensation': COMPENSATIONS.index('state'),
+        'compensation': CHOICES['compensation'].index('state'),
         'bumpless': 0,
         'change_detection': 0,
     }

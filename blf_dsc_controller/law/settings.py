@@ -8,19 +8,21 @@ from typing import Annotated, NamedTuple
 from blf_dsc_controller.arms.model import ArmModel
 from blf_dsc_controller.compiled.layout import Array, Fixed, view_of
 
-# The vector holds the index of each choice.
-SURFACES = ('filtered', 'linear')
-PREDICTIONS = ('filtered', 'acceleration', 'lambda')
-UPDATES = ('gradient', 'newton')
-TORQUE_SOURCES = ('command', 'effort')
-COMPENSATIONS = ('reference', 'state')
+CHOICES = {
+    'surface': ('filtered', 'linear'),
+    'prediction': ('filtered', 'acceleration', 'lambda'),
+    'update': ('gradient', 'newton'),
+    'torque_source': ('command', 'effort'),
+    'compensation': ('reference', 'state'),
+}
+"""Settings that are choices: the vector holds the index."""
 
-LINEAR = SURFACES.index('linear')
-FILTERED = PREDICTIONS.index('filtered')
-LAMBDA = PREDICTIONS.index('lambda')
-NEWTON = UPDATES.index('newton')
-EFFORT = TORQUE_SOURCES.index('effort')
-REFERENCE = COMPENSATIONS.index('reference')
+LINEAR = CHOICES['surface'].index('linear')
+FILTERED = CHOICES['prediction'].index('filtered')
+LAMBDA = CHOICES['prediction'].index('lambda')
+NEWTON = CHOICES['update'].index('newton')
+EFFORT = CHOICES['torque_source'].index('effort')
+REFERENCE = CHOICES['compensation'].index('reference')
 
 
 class Settings(NamedTuple):

@@ -153,9 +153,6 @@ class Monitor:
     """Messages of the slow topic `~/monitor`: how well the guarantees of the law hold.
 
     If the truth is known, they include the Lyapunov function (29) term by term.
-
-    Attributes:
-        names: of the values.
     """
 
     def __init__(self, joints: Sequence[str], estimates: Sequence[str], settings: Settings) -> None:
@@ -167,11 +164,10 @@ class Monitor:
         self._knows_truth = settings.truth_known == 1
         if self._knows_truth:
             names += topics.LYAPUNOV_TERMS
-        self.names = tuple(names)
         self._encoder = JointStateEncoder(names, ('position',))
 
     def message(self, stamp: int, sample: Sample, ratio: np.ndarray, bound: np.ndarray) -> Message:
-        """Encode the values of `names` for a telemetry sample at a stamp [ns].
+        """Encode the values for a telemetry sample at a stamp [ns].
 
         `ratio` is the largest |xi1| / k_c so far (n,), `bound` the current k_c (n,) [rad].
         """
