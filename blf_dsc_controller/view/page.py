@@ -279,19 +279,16 @@ class Page:
     def plot(self, past: Sequence[Snapshot]) -> None:
         """Draw these snapshots in the plots, and the last one in the table."""
         now = past[-1]
-        shown = [each for each in past if each.time > now.time - PAST]
-        t = np.array([each.time for each in shown])
-        error = np.array([100.0 * each.error / each.bound for each in shown]).T
-        torque = np.array([each.torque for each in shown]).T
-        estimate = np.array([each.estimate for each in shown])
-        truth = np.array([each.truth for each in shown])
-        excitation = np.array([[each.lambda_min for each in shown]])
+        shown = (each for each in past if each.time > now.time - PAST)
+        of = Snapshot._make(map(np.array, zip(*shown, strict=True)))  # arrays over time
+        t: Floats = np.array(of.time)
         with np.errstate(divide='ignore', invalid='ignore'):
+            share = 100.0 * np.abs(of.error / of.bound).T
             curves = (
-                np.vstack((_peaks(np.abs(error)), np.full(t.size, 100.0))),
-                torque,
-                errors_of_bodies(self._bodies, estimate, truth, self._prior),
-                np.log10(excitation),
+                np.vstack((_peaks(share), np.full(t.size, 100.0))),
+                of.torque.T,
+                errors_of_bodies(self._bodies, of.estimate, of.truth, self._prior),
+                np.log10([of.lambda_min]),
             )
         marks = [e[0] for e in self._events if t[0] <= e[0] <= t[-1]]
         with self.server.atomic():
