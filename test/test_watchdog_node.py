@@ -16,11 +16,13 @@ import pytest
 pytest.importorskip('rclpy', reason='needs ROS 2')
 
 from random_arm import CONFIG
+from ros_rig import JOINTS, START
 
 from blf_dsc_controller import load_loop
 from blf_dsc_controller.configuration.schema import flatten
 from blf_dsc_controller.messages import topics
 from blf_dsc_controller.messages.codecs import JointStateEncoder
+from blf_dsc_controller.nodes.controller_node import ControllerNode
 from blf_dsc_controller.nodes.plant_node import PlantNode
 from blf_dsc_controller.nodes.watchdog_node import WatchdogNode
 from sim_plant.plant import plant_of
@@ -115,3 +117,14 @@ def test_restarted_watchdog_holds_the_arm_of_a_controller_that_died_before(ros, 
     count = len(commands)
     watchdog.close()  # the driver holds the last torque
     ros.until(lambda: len(commands) > count)
+
+
+def test_controller_does_not_take_the_watchdog_for_an_arm(ros):
+    """Nothing listens to its commands but the second line: it waits with its first torque."""
+    watchdog, law = ros.add(WatchdogNode), ros.add(ControllerNode)
+    states = ros.publisher(topics.JOINT_STATES)
+    ros.until(lambda: watchdog.line is not None and states.get_subscription_count() == 2)
+    states.publish(JointStateEncoder(JOINTS).encode(10**9, START, np.zeros(2), np.zeros(2)))
+    ros.until(lambda: watchdog.line.stamp == 10**9)
+    ros.spin(0.2)
+    assert law.guard.journal.messages == 0

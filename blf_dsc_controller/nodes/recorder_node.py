@@ -17,7 +17,7 @@ from blf_dsc_controller.messages.codecs import (
     UnknownTypeError,
     joint_state_stamp,
 )
-from blf_dsc_controller.messages.topics import JOINT_STATES, Quality
+from blf_dsc_controller.messages.topics import JOINT_STATES
 from blf_dsc_controller.nodes.endpoints import (
     RawMessage,
     RawSubscriptions,
@@ -110,18 +110,16 @@ class BagRecorderNode(PlainNode):
         except (ImportError, AttributeError, UnknownTypeError):
             self._skip(topic, f'its type {types[0]} is not installed here')
             return
-        self._start(topic, types[0], [quality_of(each.qos_profile) for each in publishers])
-
-    def _start(self, topic: str, type_name: str, offered: list[Quality]) -> None:
         self._record(flush=True)
         if self.failure is not None:
             return
-        handle = self._bag.add_topic(topic, type_name, offered)
+        offered = [quality_of(each.qos_profile) for each in publishers]
+        handle = self._bag.add_topic(topic, types[0], offered)
         self._losses[topic] = self._losses_by_handle[handle] = Losses(len(offered))
-        self._raw_subscriptions.subscribe(topic, type_name, offered, handle)
+        self._raw_subscriptions.subscribe(topic, types[0], offered, handle)
         if topic == self._joint_states:
             self._handle_of_states = handle
-        self.get_logger().info(f'recording {topic} ({type_name})')
+        self.get_logger().info(f'recording {topic} ({types[0]})')
 
     def _skip(self, topic: str, reason: str) -> None:
         self._skipped.add(topic)

@@ -65,7 +65,6 @@ class WatchdogNode(PlainNode):
         self._states: JointStateDecoder
         self._commands: Float64MultiArrayDecoder
         self._encoder: Float64MultiArrayEncoder
-        self._was_active = False
         self._sent: deque[tuple[int, bytes]] = deque(maxlen=10 * _DEPTH)
         self._sequence = 0
         self._raw_subscriptions = RawSubscriptions(self, _DEPTH)
@@ -129,11 +128,11 @@ class WatchdogNode(PlainNode):
         if self.line is None:
             self._ask(now)
             return
+        was_active = self.line.active
         for message in messages:
             self._take(self.line, message, now)
         self._publish(self.line.poll(now))
-        if self.line.active != self._was_active:
-            self._was_active = self.line.active
+        if self.line.active != was_active:
             fast = min(_PERIOD, self.line.config.sample_time)  # at the limit of the torque's rate
             self._timer.timer_period_ns = round(1e9 * (fast if self.line.active else _PERIOD))
             self._log(self.line)
