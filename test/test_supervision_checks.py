@@ -85,6 +85,7 @@ def test_cuts_add_up_if_they_take_more_than_a_fifth_of_the_time(law, every, stop
         law.flags = verdict(law)
         faults.append(check.check(DT))
     assert any(fault and fault.reason is Reason.SATURATED for fault in faults) == stops
+    assert check.saturated == -(-2000 // every)
 
 
 @pytest.mark.parametrize(

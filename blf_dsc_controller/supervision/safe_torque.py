@@ -317,6 +317,5 @@ class SecondLine:
         if silence > self._timeout and gone_on > 0.5 * self._timeout:
             self.active, self.silence = True, silence
             self.takeovers += 1
-            self._safe.begin_ramp(0.0, self._safe.load)
             if not self._knows_torque:  # as if the torque that the drive holds were the model's
                 self._safe.leave(self.config.safety, self._settings, self._estimate)
