@@ -21,7 +21,7 @@ from ros_rig import JOINTS, START
 from blf_dsc_controller import load_loop
 from blf_dsc_controller.configuration.schema import flatten
 from blf_dsc_controller.messages import topics
-from blf_dsc_controller.messages.codecs import JointStateEncoder
+from blf_dsc_controller.messages.codecs import Float64MultiArrayEncoder, JointStateEncoder
 from blf_dsc_controller.nodes.controller_node import ControllerNode
 from blf_dsc_controller.nodes.plant_node import PlantNode
 from blf_dsc_controller.nodes.watchdog_node import WatchdogNode
@@ -94,24 +94,34 @@ def test_arm_in_motion_comes_to_rest_beside_a_dead_process(ros, controller, end)
     ros.until(lambda: end == 'crashed' or not watchdog.line.active)
 
 
-def test_restarted_watchdog_holds_the_arm_of_a_controller_that_died_before(ros, monkeypatch):
-    """Which torque it held before, it cannot know: that of the model is sent at once."""
+@pytest.mark.parametrize('held', [0.0, 5.0], ids=['restarted afterwards', 'watching'])
+def test_watchdog_continues_from_the_torque_that_the_drive_holds(ros, monkeypatch, held):
+    """At most 1 N m away, as an FR3 demands.
+
+    If it was restarted after the controller had died, it cannot know it: that of the model is sent
+    at once.
+    """
     monkeypatch.setattr(sys, 'argv', ['node', '--ros-args', '--params-file', str(FR3)])
-    plant = plant_of(load_loop(FR3).plant)
-    torque = np.zeros(7)
+    config = load_loop(FR3).plant
+    plant, torque = plant_of(config), np.append(held, np.zeros(6))
     commands, states = ros.listen(topics.COMMANDS), ros.publisher(topics.JOINT_STATES)
+    controller = ros.publisher(topics.COMMANDS)
     watchdog = ros.add(partial(WatchdogNode, steady=lambda: plant.elapsed_ns), {'armed': True})
-    ros.until(lambda: states.get_subscription_count() > 0)
-    encoder = JointStateEncoder(load_loop(FR3).plant.joints)
-    for _ in range(100):
+    ros.until(lambda: states.get_subscription_count() and controller.get_subscription_count() == 2)
+    encoder = JointStateEncoder(config.joints)
+    for k in range(100):
         stamp = 10**9 + plant.elapsed_ns
+        if held and k < 30:
+            controller.publish(Float64MultiArrayEncoder(7).encode(torque))
+            ros.until(lambda k=k: len(commands) > k)
         states.publish(encoder.encode(stamp, *plant.measure().reshape(3, -1)))
         ros.until(lambda stamp=stamp: watchdog.line.stamp == stamp)
         plant.step(torque)
-    ros.until(lambda: commands)
+    own = 30 if held else 0
+    ros.until(lambda: len(commands) > own)
     assert watchdog.line.active
     assert watchdog.line.silence == pytest.approx(0.05, abs=0.01)
-    np.testing.assert_allclose(commands[0].data, torque, atol=0.1)
+    np.testing.assert_allclose(commands[own].data, torque, atol=1.01 if held else 0.1)
     ros.executor.remove_node(watchdog)
     ros.spin(0.1)
     count = len(commands)
