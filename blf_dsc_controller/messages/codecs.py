@@ -347,7 +347,7 @@ def _view(buffer: bytearray, doubles: Doubles) -> Floats:
     return np.frombuffer(buffer, '<f8', doubles.size, doubles.offset if doubles.size else 0)
 
 
-_OTHER = -1  # no time that a message has
+_OTHER = -1  # ns: a message of this very time is read the long way each time
 
 
 @kernel
