@@ -54,11 +54,18 @@ def test_friction_is_read_from_the_file_and_zero_by_default():
     assert found == [(3.0, 2.0), (0.0, 0.0)]
 
 
-def test_gripper_is_carried_for_every_tip_and_its_fingers_are_listed_as_held():
+def test_gripper_is_carried_for_every_tip_and_its_fingers_are_held():
     whole = panda(PANDA_TEXT)
-    assert whole.joints[6].inertia[0] == pytest.approx(0.735522 + 0.73 + 2 * 0.015)
+    last = whole.joints[6]
+    assert last.inertia[0] == pytest.approx(0.735522 + 0.73 + 2 * 0.015)
+    assert last.fixed == ('panda_link8', 'panda_hand', 'panda_hand_tcp')
+    alone = panda(changed('<mass value="0.015" />', '<mass value="0" />')).joints[6]
+    fingers = inertia_of(last.held)
+    assert fingers[0] == pytest.approx(2 * 0.015)
+    np.testing.assert_allclose(fingers[:4], (last.inertia - alone.inertia)[:4], atol=1e-12)
+    assert not any(joint.held.any() for joint in whole.joints[:6])
     shorter = read_chain(PANDA_TEXT, 'panda_link0', 'panda_link7', PANDA)
-    np.testing.assert_allclose(shorter.joints[6].inertia, whole.joints[6].inertia)
+    np.testing.assert_allclose(shorter.joints[6].inertia, last.inertia)
 
 
 def test_chain_may_begin_and_end_inside_the_arm():
