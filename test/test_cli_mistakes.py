@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import synthetic_bag
 from command import finished
+from small_disk import small_disk
 from synthetic_bag import Synthetic
 
 from blf_dsc_controller.cli.main import main
@@ -149,6 +150,14 @@ def test_results_are_never_overwritten(tmp_path, capsys, monkeypatch):
         assert run.returncode == 0, run.stderr
         assert f'wrote       {folder}:' in run.stdout
         assert (tmp_path / folder / 'summary.json').is_file()
+
+
+def test_full_disk_is_reported_with_a_remedy(tmp_path, capsys):
+    with small_disk(tmp_path / 'disk', 1) as disk:
+        run = here(capsys, '--offline', '--duration', 20, '--out', disk / 'out')
+    assert run.returncode == 1
+    reason = f'{disk / "out"} cannot be written (No space left on device): make space'
+    assert f'blf_dsc run: {reason}' in run.stderr
 
 
 @pytest.mark.parametrize(
