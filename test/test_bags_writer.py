@@ -221,6 +221,9 @@ def test_memory_of_a_recorder_is_bounded_and_its_files_are_read_as_one(tmp_path)
     )
     files = [(file['starting_time'], file['message_count']) for file in found['files']]
     assert files == [({'nanoseconds_since_epoch': k}, 10_000) for k in range(0, 60_000, 10_000)]
+    with open_bag(tmp_path / 'bag' / 'bag_3.mcap') as opened:
+        assert len(list(opened.messages({'/a'}))) == 10_000
+        assert opened.facts == {'package_version': __version__}
     expected = [*map(message, range(60_000))]
     assert not recover(tmp_path / 'bag', tmp_path / 'clean').losses
     for name in ('bag', 'clean'):
