@@ -18,6 +18,7 @@ pytest.importorskip('yourdfpy', reason='needs viser: pip install blf_dsc_control
 
 from command import COMMAND, wait_for
 from ros_rig import RosRig, activate, configure
+from sensor_msgs.msg import JointState
 from test_view import click
 
 from blf_dsc_controller.bags.reader import read_run
@@ -86,6 +87,13 @@ def test_killed_controller_is_reported_as_gone(rig, loop):
     _, law, view = loop
     rig.kill(law)
     rig.until(lambda: view.page._state[0] == 'ERROR' and 'gone' in view.page._state[1])
+    # The arm goes on without it: its last error is no longer shown.
+    assert np.isfinite(view.past[-1].error).all()
+    states = view.create_publisher(JointState, 'joint_states', 1)
+    state = JointState(name=['joint1', 'joint2'], position=[0.1, 0.2])
+    state.header.stamp.sec = view._sampled // 10**9 + 2
+    rig.until(lambda: states.publish(state) or view.past[-1].position[0] == 0.1)
+    assert np.isnan(view.past[-1].error).all()
 
 
 def test_page_of_a_run_is_served_until_the_run_ends(tmp_path):
