@@ -117,12 +117,17 @@ def test_load_friction_and_stribeck_friction_are_recognised(plain):
     v = states[:, 1]
     states[:, 2] += 0.06 * np.abs(gravity) * np.sign(v)
     states[:, 2, 3] += 3.0 * np.sign(v[:, 3]) * np.exp(-((v[:, 3] / 0.1) ** 2))
+    states[:, 2, 0] += 3.0
     found = identify_arm(recording_of(measured(states, 3)), ROBOT)
     assert total(found) < 0.005
     np.testing.assert_allclose(found.parts.terms[3, [1, 3]], 0.06, rtol=0.1)
     assert found.parts.terms[5, 3] == pytest.approx(3.0, rel=0.1)
     # The URDF has viscous and Coulomb friction only: they take over what they can.
     assert found.errors[1, 3] < 0.2 * found.errors[0, 3]
+    # An offset is not friction.
+    assert found.parts.terms[4, 0] == pytest.approx(3.0, rel=0.01)
+    expected = TRUTH.viscous[0], TRUTH.coulomb[0]
+    np.testing.assert_allclose(found.dynamics[:, 0], expected, rtol=0.02)
 
 
 def test_coupled_wrist_is_recognised_and_named(plain, tmp_path, capsys):
