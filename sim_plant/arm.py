@@ -15,9 +15,9 @@ where G is the gradient of the potential; its first term has cos q1, where (34) 
 
 from __future__ import annotations
 
-from math import cos, sin
 from typing import NamedTuple, Protocol
 
+from blf_dsc_controller.compiled.elementary import cos, sin
 from blf_dsc_controller.compiled.jit import compile_methods
 from blf_dsc_controller.compiled.layout import Array
 from sim_plant.rigid_body import RigidArm

@@ -6,8 +6,7 @@ their own, right or wrong, with the payload that they have been told of.  Some b
 torque jumps (a reflex stop), until the plant is reset; their driver may limit its rate before.
 """
 
-from math import exp, tanh
-
+from blf_dsc_controller.compiled.elementary import exp, tanh
 from blf_dsc_controller.compiled.jit import called, inner
 from blf_dsc_controller.compiled.layout import Array, part, size_of, view_of
 from sim_plant.layout import PlantSettings, PlantState

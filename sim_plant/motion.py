@@ -15,10 +15,9 @@ Dormand and Prince (1980), which MATLAB calls ode5.  Stage i is evaluated at t +
 x + h sum_j a_ij k_j; the step ends at x + h sum_i b_i k_i.
 """
 
-from math import exp, sin, tanh
-
 import numpy as np
 
+from blf_dsc_controller.compiled.elementary import exp, sin, tanh
 from blf_dsc_controller.compiled.jit import inner
 from blf_dsc_controller.compiled.layout import Array, part
 from sim_plant.layout import PlantSettings, PlantState

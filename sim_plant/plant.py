@@ -10,7 +10,7 @@ from typing import Any, TypeVar, get_type_hints
 import numpy as np
 from numpy.typing import ArrayLike
 
-from blf_dsc_controller.arms.inertia import inertia_of, pseudo_inertia
+from blf_dsc_controller.arms.inertia import inertia_of, moved, pseudo_inertia
 from blf_dsc_controller.arms.two_link import PARAMETER_NAMES, urdf
 from blf_dsc_controller.arms.urdf import Chain
 from blf_dsc_controller.compiled.layout import pack
@@ -305,12 +305,12 @@ def drive_bodies(config: PlantConfig) -> np.ndarray:
 
 def true_inertias(chain: Chain, truth: Deviation) -> np.ndarray:
     """Return the inertias (n, 10) of the URDF with each mass distribution scaled and shifted."""
-    moved = np.eye(4)
+    placement = np.eye(4)
     inertias = np.empty((len(chain.joints), 10))
     for i, (factor, shift) in enumerate(zip(*truth.changes(len(inertias)), strict=True)):
-        moved[:3, 3] = shift
+        placement[:3, 3] = shift
         J = pseudo_inertia(chain.joints[i].inertia)
-        inertias[i] = inertia_of(factor * (moved @ J @ moved.T))
+        inertias[i] = inertia_of(factor * moved(J, placement))
     return inertias
 
 

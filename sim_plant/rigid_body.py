@@ -12,7 +12,6 @@ is the torque of a unit acceleration of one joint, which moves all bodies beyond
 
 from __future__ import annotations
 
-from math import cos, sin
 from typing import Annotated, NamedTuple
 
 import numpy as np
@@ -21,6 +20,7 @@ from blf_dsc_controller.arms.base_parameters import BaseParameters
 from blf_dsc_controller.arms.inertia import pseudo_inertia, rotational_inertia
 from blf_dsc_controller.arms.urdf import Chain
 from blf_dsc_controller.compiled import cholesky
+from blf_dsc_controller.compiled.elementary import cos, sin
 from blf_dsc_controller.compiled.jit import called, inner
 from blf_dsc_controller.compiled.layout import Array, pack, size_of, view_of
 from blf_dsc_controller.compiled.vectors import (

@@ -6,10 +6,9 @@ a low-pass filter may follow.
 Noise comes from one seeded generator, so the same seed repeats a run exactly.
 """
 
-from math import exp
-
 import numpy as np
 
+from blf_dsc_controller.compiled.elementary import exp
 from blf_dsc_controller.compiled.jit import inner
 from blf_dsc_controller.compiled.layout import Array
 from sim_plant.layout import MEASURED, Encoders, PlantSettings, PlantState

@@ -21,6 +21,12 @@ PATIENT = """blf_dsc_controller:
       saturation_time: 1000.0
       overrun_fraction: 1.0
 """
+OLDER = {
+    'GLIBC_TUNABLES': 'glibc.cpu.hwcaps=-FMA,-AVX2,-FMA4,-AVX2_Usable,-FMA_Usable',
+    'OPENBLAS_CORETYPE': 'Nehalem',
+    'NPY_DISABLE_CPU_FEATURES': 'AVX2 FMA3 AVX512F AVX512_SKX X86_V3 X86_V4',
+}
+"""Variables by which C library, BLAS and numpy take this processor for an older one."""
 COMMAND = (sys.executable, '-m', 'blf_dsc_controller', 'run')
 
 

@@ -141,7 +141,7 @@ def test_prior_covers_heavier_links_moved_centres_and_the_payload(chain):
         inertias, others = chain.inertias, rotors.copy()
         inertias[body], others[-1] = changed, rotor
         off = base.of(inertias, others) - base.of(chain.inertias, rotors)
-        return np.linalg.norm(np.linalg.solve(L, off))
+        return np.linalg.norm(np.linalg.lstsq(L, off, rcond=None)[0])  # the least that gives it
 
     for i, ten in enumerate(chain.inertias):
         assert distance(i, 1.3 * ten) < 1.0 + 1e-6
@@ -155,9 +155,7 @@ def test_prior_covers_heavier_links_moved_centres_and_the_payload(chain):
 def test_prior_without_payload_is_tighter():
     base = base_parameters(UR5E_CHAIN)
     loaded, empty = (prior_factor(UR5E_CHAIN, base, load, np.full(6, 0.02)) for load in (5.0, 0.0))
-    for L in (loaded, empty):
-        np.testing.assert_array_equal(L, np.tril(L))
-        assert (np.diag(L) > 0.0).all()
+    assert np.linalg.matrix_rank(empty) == base.model.p
     assert np.linalg.eigvalsh(loaded @ loaded.T - empty @ empty.T)[0] > -1e-12
     tool = base.model.parameter_names.index('m*cx6')
     assert np.linalg.norm(empty[tool]) == pytest.approx(0.365 * CENTRE)

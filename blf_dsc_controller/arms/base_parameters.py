@@ -20,9 +20,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from blf_dsc_controller.arms.inertia import inertia_of, pseudo_inertia
+from blf_dsc_controller.arms.inertia import inertia_of, moved, pseudo_inertia
 from blf_dsc_controller.arms.serial_chain import ROTOR, SerialChain, serial_chain
 from blf_dsc_controller.arms.urdf import Chain
+from blf_dsc_controller.compiled.matrices import independent_columns, product
 
 LINKS = 0.3
 """Standard deviation of the mass of a body and of its spread, relative to their values."""
@@ -60,8 +61,7 @@ class BaseParameters:
 
     def of(self, inertias: np.ndarray, rotors: np.ndarray) -> np.ndarray:
         """Return P (p,) for the ten of each body (n, 10) and the rotors (n,) [kg m^2, or kg]."""
-        P: np.ndarray = self.K @ np.column_stack((inertias, rotors)).ravel()
-        return P
+        return product(self.K, np.reshape(np.column_stack((inertias, rotors)), (-1, 1)))[:, 0]
 
 
 @functools.lru_cache(maxsize=16)
@@ -71,19 +71,15 @@ def base_parameters(
     """Return a chain's base parameters, with or without rotors; gravity [m/s^2] is in its base."""
     full = serial_chain(chain, gravity)
     order = np.array([k for k in range(full.p) if rotors or k % (ROTOR + 1) != ROTOR])
-    Y = _regressor_at_random(full)
-    pivots = np.abs(np.diag(np.linalg.qr(Y[:, order], mode='r')))
-    kept = order[pivots > _DEPENDENT]
-    # Rounded, so that every machine's linear algebra gives the same result.
-    K: np.ndarray = np.linalg.lstsq(Y[:, kept], Y, rcond=None)[0].round(12)
-    K[np.abs(K) < _DEPENDENT] = 0.0
-    if not rotors:
-        K[:, ROTOR :: ROTOR + 1] = 0.0
+    independent, X = independent_columns(_regressor_at_random(full)[:, order], _DEPENDENT)
+    kept, K = order[independent], np.zeros((independent.size, full.p))
+    K[:, order] = np.where(np.abs(X) < _DEPENDENT, 0.0, X.round(12))
     columns = [(int(k) // (ROTOR + 1), int(k) % (ROTOR + 1)) for k in kept]
     sums = tuple(_sum(row, int(k), full.parameter_names) for row, k in zip(K, kept, strict=True))
     point, loaded = chain.tip_placement[:, 3], np.zeros((full.n, ROTOR + 1))
     loaded[-1, :ROTOR] = inertia_of(np.outer(point, point))
-    return BaseParameters(serial_chain(chain, gravity, columns), K, K @ loaded.ravel(), sums)
+    load = product(K, loaded.reshape(-1, 1))[:, 0]
+    return BaseParameters(serial_chain(chain, gravity, columns), K, load, sums)
 
 
 def _regressor_at_random(full: SerialChain) -> np.ndarray:
@@ -109,7 +105,7 @@ def _sum(row: np.ndarray, own: int, names: tuple[str, ...]) -> str:
 def prior_factor(
     chain: Chain, base: BaseParameters, payload: float, rotors: np.ndarray
 ) -> np.ndarray:
-    """Return lower triangular L (p, p) of P = P0 + L theta, with theta of mean 0 and covariance 1.
+    """Return L (p, k) of P = P0 + L theta, with theta (k,) of mean 0 and covariance 1.
 
     P0 are the base parameters of the URDF, `payload` is the rated payload of the arm [kg], and
     `rotors` (n,) are the standard deviations of the rotor inertias [kg m^2, or kg], which a URDF
@@ -120,13 +116,11 @@ def prior_factor(
     for i, joint in enumerate(chain.joints):
         J = pseudo_inertia(joint.inertia)
         blocks.append((i, _blocks_of_ten(deviations(J, LINKS, CENTRE))))
-    J = chain.tip_placement @ payload_inertia(payload) @ chain.tip_placement.T
+    J = moved(payload_inertia(payload), chain.tip_placement)
     blocks.append((n - 1, _blocks_of_ten(deviations(J, 1.0, PAYLOAD_SIZE))))
     blocks += [(i, rotors[i] * np.eye(ROTOR + 1)[:, ROTOR:]) for i in range(n)]
     K = base.K.reshape(-1, n, ROTOR + 1)
-    L = np.column_stack([K[:, i] @ block for i, block in blocks])
-    R = np.linalg.qr(L.T, mode='r')  # Cholesky factor of L L^T, without squaring rounding
-    return np.transpose(R * np.copysign(1.0, np.diag(R))[:, None])
+    return np.column_stack([product(K[:, i], block) for i, block in blocks])
 
 
 def payload_inertia(payload: float) -> np.ndarray:
@@ -150,10 +144,13 @@ def deviations(J: np.ndarray, share: float, centre: float) -> np.ndarray:
     for k in range(3):
         D = np.zeros((4, 4))
         D[k, 3] = centre
-        directions.append(D @ J + J @ D.T)
-    spread = J[:3, :3] - np.outer(J[:3, 3], J[:3, 3]) / J[3, 3]
-    moments, axes = np.linalg.eigh(spread)
-    L = axes * np.sqrt(np.maximum(moments, 0.0) + J[3, 3] * centre**2)
+        directions.append(product(D, J) + product(J, D.T))
+    least = J[3, 3] * centre**2
+    L = J[:3, :3] - np.outer(J[:3, 3], J[:3, 3]) / J[3, 3] + least * np.eye(3)
+    for a in range(3):  # Cholesky factor of the spread, of at least the extent `centre`
+        L[a:, a] /= np.sqrt(max(L[a, a], least))
+        L[a + 1 :, a + 1 :] -= np.outer(L[a + 1 :, a], L[a + 1 :, a])
+        L[:a, a] = 0.0
     for a in range(3):
         for b in range(a + 1):
             E = np.zeros((4, 4))

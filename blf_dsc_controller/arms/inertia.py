@@ -3,6 +3,8 @@
 
 import numpy as np
 
+from blf_dsc_controller.compiled.matrices import product
+
 INERTIA_NAMES = ('m', 'm*cx', 'm*cy', 'm*cz', 'Ixx', 'Ixy', 'Iyy', 'Ixz', 'Iyz', 'Izz')
 """The ten, in order; moments of inertia are about the frame's origin, as in Pinocchio."""
 
@@ -25,6 +27,11 @@ def pseudo_inertia(inertia: np.ndarray) -> np.ndarray:
             [hx, hy, hz, m],
         ]
     )
+
+
+def moved(J: np.ndarray, placement: np.ndarray) -> np.ndarray:
+    """Return a pseudo-inertia (4, 4) in the frame in which its own has this placement (4, 4)."""
+    return product(product(placement, J), placement.T)
 
 
 def rotational_inertia(J: np.ndarray) -> np.ndarray:

@@ -18,6 +18,7 @@ from blf_dsc_controller.arms.serial_chain import SerialChain
 from blf_dsc_controller.arms.two_link import TwoLink
 from blf_dsc_controller.compiled.jit import compile_methods, kernel
 from blf_dsc_controller.compiled.layout import Array
+from blf_dsc_controller.compiled.matrices import inverse, product
 
 
 class ArmModel(Protocol):
@@ -77,12 +78,12 @@ def inertia_matrices(model: ArmModel, P: Array, q: Array) -> Array:
     Yp, Yr = np.zeros((2, k * n, n, P.size))
     units = np.tile(np.eye(n), (k, 1))
     _fill_momentum_regressors(model, np.repeat(q, n, axis=0), units, Yp, Yr)
-    return np.swapaxes((Yp @ P).reshape(k, n, n), 1, 2)
+    return np.swapaxes(product(Yp, P[:, np.newaxis]).reshape(k, n, n), 1, 2)
 
 
 def free_inertias(M: Array) -> Array:
     """Return the inertia (k, n) of each joint with the others free, of matrices M (k, n, n)."""
-    return 1.0 / np.diagonal(np.linalg.inv(M), axis1=1, axis2=2)
+    return 1.0 / np.diagonal(inverse(M), axis1=1, axis2=2)
 
 
 @kernel

@@ -17,15 +17,16 @@ each body in its joint's frame.  A rotor inertia J, reflected to its joint, adds
 
 from __future__ import annotations
 
-from math import cos, sin
 from typing import Annotated, NamedTuple
 
 import numpy as np
 
 from blf_dsc_controller.arms.inertia import INERTIA_NAMES, INERTIA_UNITS
 from blf_dsc_controller.arms.urdf import Chain
+from blf_dsc_controller.compiled.elementary import cos, sin
 from blf_dsc_controller.compiled.jit import called, inner
 from blf_dsc_controller.compiled.layout import Array, pack, view_of
+from blf_dsc_controller.compiled.matrices import product
 from blf_dsc_controller.compiled.vectors import Vector, cross, dot, plus
 
 ROTOR = len(INERTIA_NAMES)
@@ -309,10 +310,11 @@ def serial_chain(
     for i, joint in enumerate(chain.joints):
         R, offset[i] = joint.placement[:3, :3], joint.placement[:3, 3]
         if joint.kind == 'prismatic':
-            rotation[i, 0], slide[i], axis[i, 3:] = R, R @ joint.axis, joint.axis
+            rotation[i, 0], slide[i], axis[i, 3:] = R, (R * joint.axis).sum(axis=1), joint.axis
         else:
             along = np.outer(joint.axis, joint.axis)
-            rotation[i] = R @ along, R @ (np.eye(3) - along), R @ np.cross(np.eye(3), joint.axis)
+            turns = along, np.eye(3) - along, np.cross(np.eye(3), joint.axis)
+            rotation[i] = product(R, np.array(turns))
             axis[i, :3] = joint.axis
     body, entry = np.transpose(columns)
     bodies = Bodies(

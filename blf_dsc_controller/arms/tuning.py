@@ -104,7 +104,7 @@ def gains_of(
         'limits.acceleration': _listed(4.0 * _SLOW * velocity),
         'learning.initial_estimate': _listed(P),
         'learning.adaptation_gain': (0.5,) * P.size,
-        'learning.radius': 10.0 * max(float(np.linalg.norm(P)), arm.payload),
+        'learning.radius': 10.0 * max(float(np.sqrt((P * P).sum())), arm.payload),
         'learning.window': _WINDOW,
         'learning.regularization': _REGULARISATION,
         'learning.settling_time': 0.3,

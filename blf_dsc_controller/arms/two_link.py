@@ -16,10 +16,10 @@ counts from the horizontal upwards: from x to z, which is about -y.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from math import cos, sin
 from typing import NamedTuple
 from xml.sax.saxutils import quoteattr
 
+from blf_dsc_controller.compiled.elementary import cos, sin
 from blf_dsc_controller.compiled.jit import inner
 from blf_dsc_controller.compiled.layout import Array
 

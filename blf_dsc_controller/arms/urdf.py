@@ -19,13 +19,15 @@ import xml.etree.ElementTree as ET
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from math import cos, inf, sin
+from math import inf
 from sys import float_info
 from typing import NamedTuple
 
 import numpy as np
 
-from blf_dsc_controller.arms.inertia import inertia_of, pseudo_inertia, rotational_inertia
+from blf_dsc_controller.arms.inertia import inertia_of, moved, pseudo_inertia, rotational_inertia
+from blf_dsc_controller.compiled.elementary import cos, sin
+from blf_dsc_controller.compiled.matrices import product
 from blf_dsc_controller.errors import BlfDscError
 
 _MOVING = ('revolute', 'continuous', 'prismatic')
@@ -118,7 +120,7 @@ def read_chain(text: str, base: str, tip: str, joints: tuple[str, ...]) -> Chain
     massless: list[str] = []
     frame = np.eye(4)
     for element in path:
-        frame = frame @ _origin(element)
+        frame = product(frame, _origin(element))
         if element.get('type') != 'fixed':
             link = _link(element, 'child')
             body = tree.body(link, moving)
@@ -187,9 +189,9 @@ class Tree(NamedTuple):
     @property
     def root(self) -> str:
         """The link that no joint carries."""
-        moved = {_link(joint, 'child') for joint in self.joints.values()}
+        children = {_link(joint, 'child') for joint in self.joints.values()}
         for link in self.links:
-            if link not in moved:
+            if link not in children:
                 return link
         raise UrdfError(
             f'no link is the root: the links are {_listed(self.links)}, each below a joint'
@@ -252,8 +254,8 @@ class Tree(NamedTuple):
             if kind not in (*_MOVING, 'fixed'):
                 raise UrdfError(f'joint {name!r} on {link!r} is {kind}: remove it from the URDF')
             frame, beyond = _origin(joint), self.body(child, joints)
-            J = J + frame @ beyond.J @ frame.T
-            held += frame @ (beyond.held if kind == 'fixed' else beyond.J) @ frame.T
+            J = J + moved(beyond.J, frame)
+            held += moved(beyond.held if kind == 'fixed' else beyond.J, frame)
             fixed += [child, *beyond.fixed] if kind == 'fixed' else []
             pointlike += beyond.pointlike
         return _Body(J, held, tuple(fixed), tuple(pointlike))
@@ -293,7 +295,7 @@ def _check_kinds(path: Sequence[ET.Element]) -> None:
 def _joint(element: ET.Element, placement: np.ndarray, body: _Body) -> Joint:
     name, kind = element.get('name', ''), element.get('type', '')
     axis = _numbers(element.find('axis'), 'xyz', '1 0 0')
-    length = float(np.linalg.norm(axis))
+    length = float(np.sqrt((axis**2).sum()))
     if length < 1e-6:
         raise UrdfError(f'the axis of joint {name!r} is zero: write a direction such as 0 0 1')
     limit = element.find('limit')
@@ -345,9 +347,7 @@ def _link_inertia(link: ET.Element) -> np.ndarray:
             f'link {link.get("name")!r} has a mass of {mass:g} kg and principal moments of inertia '
             f'of {figures} kg m^2: none can be negative; correct its <inertial>'
         )
-    frame = _origin(inertial)
-    moved: np.ndarray = frame @ J @ frame.T
-    return moved
+    return moved(J, _origin(inertial))
 
 
 def _origin(element: ET.Element) -> np.ndarray:
@@ -360,7 +360,7 @@ def _origin(element: ET.Element) -> np.ndarray:
         turn = np.eye(3)
         turn[i, i] = turn[j, j] = cos(angle)
         turn[i, j], turn[j, i] = -sin(angle), sin(angle)
-        frame[:3, :3] = turn @ frame[:3, :3]
+        frame[:3, :3] = product(turn, frame[:3, :3])
     return frame
 
 

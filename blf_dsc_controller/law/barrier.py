@@ -24,8 +24,9 @@ of a constant bound plus 2 (k'/k) V, which is not positive while the bound narro
 (doc/theory-funnel.md).
 """
 
-from math import cos, exp, pi, sin, tan
+from math import pi
 
+from blf_dsc_controller.compiled.elementary import cos, exp, sin
 from blf_dsc_controller.compiled.jit import inner
 from blf_dsc_controller.law.settings import LINEAR, Settings
 from blf_dsc_controller.law.state import Signals, State
@@ -34,11 +35,18 @@ _BISECTIONS = 60
 
 
 @inner
+def angle(xi: float, bound: float) -> float:
+    """Return s = pi xi^2 / (2 k_c^2) [rad] of the error [rad] and its bound [rad]."""
+    ratio = xi / bound
+    return 0.5 * pi * (ratio * ratio)
+
+
+@inner
 def slope(xi: float, bound: float, weight: float) -> float:
     """Return the stiffness w (1 + 4 s tan s) / cos^2 s [N m/rad] at |xi| < bound [rad]."""
-    s = 0.5 * pi * (xi / bound) ** 2
+    s = angle(xi, bound)
     c = cos(s)
-    return weight * (1.0 + 4.0 * s * tan(s)) / (c * c)
+    return weight * (1.0 + 4.0 * s * sin(s) / c) / (c * c)
 
 
 @inner
@@ -59,7 +67,7 @@ def knee(bound: float, weight: float, slope_limit: float) -> float:
 def gradient(xi: float, bound: float, weight: float, slope_limit: float, knee: float) -> float:
     """Return dV/dxi [N m]; its negative is the barrier torque tau_c of (16), (28)."""
     edge = min(abs(xi), knee)
-    c = cos(0.5 * pi * (edge / bound) ** 2)
+    c = cos(angle(edge, bound))
     torque = weight * edge / (c * c) + slope_limit * (abs(xi) - edge)
     return torque if xi >= 0.0 else -torque
 
@@ -69,7 +77,8 @@ def potential(xi: float, bound: float, weight: float, slope_limit: float, knee: 
     """Return V [J]: (3) up to the knee, a parabola past it."""
     edge = min(abs(xi), knee)
     past = abs(xi) - edge
-    inside = weight * bound * bound / pi * tan(0.5 * pi * (edge / bound) ** 2)
+    s = angle(edge, bound)
+    inside = weight * bound * bound / pi * (sin(s) / cos(s))
     if past == 0.0:
         return inside
     return inside + past * (

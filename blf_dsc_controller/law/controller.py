@@ -256,7 +256,7 @@ class Controller:
         self.state_vector.fill(0.0)
         self.state.estimate[:] = self.settings.initial_estimate
         self.state.anchor[:] = self.settings.initial_estimate
-        self.state.min_eigenvector.fill(self.settings.m**-0.5)
+        self.state.min_eigenvector.fill(1.0 / np.sqrt(self.settings.m))
         self.state.active.fill(1.0)
         self.state.gain_scale.fill(1.0)
 

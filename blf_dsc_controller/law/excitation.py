@@ -23,6 +23,8 @@ what it taught is taken back: it did not predict what it was not fitted to.  Lik
 with an unusually large residual is pulled to an earlier solution, kept once per window.
 """
 
+from math import sqrt
+
 from blf_dsc_controller.compiled import cholesky
 from blf_dsc_controller.compiled.jit import inner
 from blf_dsc_controller.compiled.layout import Array
@@ -104,7 +106,7 @@ def forget_window(settings: Settings, state: State) -> None:
     window.clear(state.filter2)
     for j in range(settings.m):
         state.anchor[j] = state.estimate[j]
-        state.min_eigenvector[j] = settings.m**-0.5
+        state.min_eigenvector[j] = 1.0 / sqrt(settings.m)
 
 
 @inner

@@ -25,10 +25,11 @@ from blf_dsc_controller.arms.base_parameters import (
     payload_inertia,
     prior_factor,
 )
-from blf_dsc_controller.arms.inertia import inertia_of, pseudo_inertia
+from blf_dsc_controller.arms.inertia import inertia_of, moved, pseudo_inertia
 from blf_dsc_controller.arms.model import ArmModel, arm_model
 from blf_dsc_controller.arms.serial_chain import ROTOR
 from blf_dsc_controller.arms.tuning import over_postures
+from blf_dsc_controller.compiled.matrices import inverse, product
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.robot import drive_model, parameters_of
 from blf_dsc_controller.configuration.schema import parameters
@@ -114,7 +115,7 @@ def prior_covariance(config: ControllerConfig) -> np.ndarray:
     unsure = np.where(rotors > 0.0, ROTORS * rotors, UNKNOWN_ROTOR)
     L = prior_factor(chain, parameters_of(robot, chain), robot.payload, unsure)
     covariance = np.diag([0.0] * len(L) + [column.deviation**2 for column in columns])
-    covariance[: len(L), : len(L)] = L @ L.T
+    covariance[: len(L), : len(L)] = product(L, L.T)
     return covariance
 
 
@@ -166,7 +167,7 @@ def settings_of_config(config: ControllerConfig) -> Settings:
         ),
         'Gamma': np.array(learning.adaptation_gain + (learning.column_gain,) * len(columns)),
         'initial_estimate': np.array((*learning.initial_estimate, *(c.initial for c in columns))),
-        'information': np.linalg.inv(covariance),
+        'information': inverse(covariance),
         'variance': np.diag(covariance).copy(),
         **_rotors(config, model.n),
         **_load(config, m),
@@ -232,7 +233,8 @@ def _load(config: ControllerConfig, m: int) -> dict[str, Any]:
     T = chain.tip_placement
     K = parameters_of(robot, chain).K[:, -(ROTOR + 1) : -1]
     columns = np.zeros((m + 1, 10))
-    columns[: len(K)] = K @ np.transpose([inertia_of(T @ pseudo_inertia(d) @ T.T) for d in D.T])
+    moves = [inertia_of(moved(pseudo_inertia(direction), T)) for direction in D.T]
+    columns[: len(K)] = product(K, np.transpose(moves))
     return {'weighed': m + 1, 'load_columns': columns, 'load_scale': D[:4]}
 
 

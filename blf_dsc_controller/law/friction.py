@@ -17,8 +17,7 @@ estimate is the window's: its columns of Coulomb friction only take up what woul
 mistaken for parameters.
 """
 
-from math import tanh
-
+from blf_dsc_controller.compiled.elementary import tanh
 from blf_dsc_controller.compiled.jit import inner
 from blf_dsc_controller.compiled.layout import Array
 from blf_dsc_controller.law import barrier

@@ -23,11 +23,12 @@ for each block that is configured.  (22)-(24) instead subtract the estimate d^3 
 which hides the parameter error.
 """
 
-from math import cos, exp, sin, sqrt, tanh
+from math import sqrt
 
 import numpy as np
 
 from blf_dsc_controller.arms.model import ArmModel
+from blf_dsc_controller.compiled.elementary import cos, exp, sin, tanh
 from blf_dsc_controller.compiled.jit import inner, kernel
 from blf_dsc_controller.compiled.layout import Array, sizes_of
 from blf_dsc_controller.law import barrier

@@ -36,11 +36,10 @@ torque.
 
 from __future__ import annotations
 
-from math import sin
-
 import numpy as np
 
 from blf_dsc_controller.arms.serial_chain import fill_regressor
+from blf_dsc_controller.compiled.elementary import sin
 from blf_dsc_controller.compiled.jit import inner, kernel
 from blf_dsc_controller.compiled.layout import Array, part
 from blf_dsc_controller.law import barrier

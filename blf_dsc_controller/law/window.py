@@ -195,7 +195,7 @@ def min_eigenvector(
 def reset_direction(state: State) -> None:
     """Restart the inverse iteration, for a matrix that has changed."""
     for j in range(state.min_eigenvector.size):
-        state.min_eigenvector[j] = state.min_eigenvector.size**-0.5
+        state.min_eigenvector[j] = 1.0 / sqrt(state.min_eigenvector.size)
 
 
 @inner

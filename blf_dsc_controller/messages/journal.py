@@ -8,16 +8,10 @@ of joint-state messages it follows, and the stamp of the last of them.
 from __future__ import annotations
 
 import json
-import os
-import platform
 from collections import deque
 from collections.abc import Mapping
 from enum import Enum
-from functools import cache
 from typing import Any, NamedTuple
-
-import numba
-from llvmlite.binding import get_host_cpu_features
 
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.messages.codecs import typestore
@@ -29,23 +23,6 @@ OUTSIDE_BOUND = 'error past the bound'
 
 FORMAT = 2
 """Of the journal: in 2, every torque that answers a message is in `~/tracking_error`, too."""
-
-
-@cache
-def machine() -> dict[str, str]:
-    """Return what decides the last digits of sine, exponential and tanh on this computer.
-
-    The C library chooses its functions by the processor's features, which GLIBC_TUNABLES can mask.
-    """
-    features = get_host_cpu_features()
-    known = ('avx2', 'avx512f', 'fma', 'fma4', 'neon', 'sve')
-    named = (name for name in known if features.get(name))
-    return {
-        'processor': ' '.join((platform.machine(), *named)),
-        'libc': ' '.join(platform.libc_ver()),
-        'tunables': os.environ.get('GLIBC_TUNABLES', ''),
-        'numba': numba.__version__,
-    }
 
 
 class EventType(str, Enum):
@@ -126,7 +103,7 @@ class Journal:
     def note(self, event: EventType, **content: Any) -> None:
         """Add an event that happens now."""
         if event is EventType.CONFIGURE:
-            content |= {'format': FORMAT, 'machine': machine()}
+            content['format'] = FORMAT
         noted = Event(self._number, event, self.stamp, self.messages, self.commands, content)
         self._number += 1
         self.pending.append(noted)

@@ -24,13 +24,15 @@ pieces whose jerk and snap are also continuous.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from math import cos, inf, sin
+from math import inf
 from typing import NamedTuple
 
 import numpy as np
 
+from blf_dsc_controller.compiled.elementary import cos, sin
 from blf_dsc_controller.compiled.jit import inner, kernel
 from blf_dsc_controller.compiled.layout import Array, part, view
+from blf_dsc_controller.compiled.matrices import product
 
 SINUSOIDS = 0
 SPLINE = 1
@@ -226,13 +228,14 @@ def quintics(h: Array, begin: Array, end: Array) -> Array:
     `begin` and `end` are the positions, velocities and accelerations (3, pieces, n) at the ends.
     """
     h = np.asarray(h, dtype=np.float64)[:, np.newaxis]
+    square, cube = h * h, h * h * h  # not h**3: powers are rounded otherwise on other processors
     p, v, a = begin
-    dp = end[0] - p - v * h - 0.5 * a * h**2
+    dp = end[0] - p - v * h - 0.5 * a * square
     dv = (end[1] - v - a * h) * h
-    da = 0.5 * (end[2] - a) * h**2
-    c3 = (10.0 * dp - 4.0 * dv + da) / h**3
-    c4 = (-15.0 * dp + 7.0 * dv - 2.0 * da) / h**4
-    c5 = (6.0 * dp - 3.0 * dv + da) / h**5
+    da = 0.5 * (end[2] - a) * square
+    c3 = (10.0 * dp - 4.0 * dv + da) / cube
+    c4 = (-15.0 * dp + 7.0 * dv - 2.0 * da) / (square * square)
+    c5 = (6.0 * dp - 3.0 * dv + da) / (square * cube)
     return np.stack((p, v, 0.5 * a, c3, c4, c5), axis=-1)
 
 
@@ -244,7 +247,7 @@ def cubics(h: Array, begin: Array, end: Array) -> Array:
     h = np.asarray(h, dtype=np.float64)[:, np.newaxis]
     mean = (end[0] - begin[0]) / h
     c2 = (3.0 * mean - 2.0 * begin[1] - end[1]) / h
-    c3 = (begin[1] + end[1] - 2.0 * mean) / h**2
+    c3 = (begin[1] + end[1] - 2.0 * mean) / (h * h)
     zero = np.zeros_like(mean)
     return np.stack((begin[0], begin[1], c2, c3, zero, zero), axis=-1)
 
@@ -283,19 +286,21 @@ def _solve_inner_points(h: Array, points: Array) -> None:
     inner = range(1, len(h))
     upper, right = [np.zeros((2, 2))], [points[1:, 0]]
     for k in inner:
-        l, r = h[k - 1], h[k]
-        before = np.array([[-24.0 / l**2, -3.0 / l], [-168.0 / l**3, -24.0 / l**2]])
-        after = np.array([[24.0 / r**2, -3.0 / r], [-168.0 / r**3, 24.0 / r**2]])
+        l, r = 1.0 / h[k - 1], 1.0 / h[k]
+        l2, r2, l3, r3 = l * l, r * r, l * l * l, r * r * r
+        before = np.array([[-24.0 * l2, -3.0 * l], [-168.0 * l3, -24.0 * l2]])
+        after = np.array([[24.0 * r2, -3.0 * r], [-168.0 * r3, 24.0 * r2]])
         here = np.array(
             [
-                [-36.0 / l**2 + 36.0 / r**2, 9.0 / l + 9.0 / r],
-                [-192.0 / l**3 - 192.0 / r**3, 36.0 / l**2 - 36.0 / r**2],
+                [36.0 * (r2 - l2), 9.0 * (l + r)],
+                [-192.0 * (l3 + r3), 36.0 * (l2 - r2)],
             ]
         )
-        jerk = 60.0 * (rise[k] / r**3 - rise[k - 1] / l**3)
-        snap = -360.0 * (rise[k] / r**4 + rise[k - 1] / l**4)
-        here = here - before @ upper[-1]
-        upper.append(np.linalg.solve(here, after))
-        right.append(np.linalg.solve(here, np.stack((jerk, snap)) - before @ right[-1]))
+        jerk = 60.0 * (rise[k] * r3 - rise[k - 1] * l3)
+        snap = -360.0 * (rise[k] * (r2 * r2) + rise[k - 1] * (l2 * l2))
+        (a, b), (c, d) = here - product(before, upper[-1])
+        solved = np.array([[d, -b], [-c, a]]) / (a * d - b * c)  # the inverse
+        upper.append(product(solved, after))
+        right.append(product(solved, np.stack((jerk, snap)) - product(before, right[-1])))
     for k in reversed(inner):
-        points[1:, k] = right[k] - upper[k] @ points[1:, k + 1]
+        points[1:, k] = right[k] - product(upper[k], points[1:, k + 1])

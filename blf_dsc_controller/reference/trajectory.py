@@ -179,7 +179,7 @@ def _braking(
     """
     n = present.shape[1]
     rest = np.zeros((3, n))
-    rest[0] = present[0] + h * present[1] / 2.0 + h**2 * present[2] / 12.0
+    rest[0] = present[0] + h * present[1] / 2.0 + h * h * present[2] / 12.0
     path = _from_rest(rest, t0, times, points)
     at = np.array([t0 + h, times[0]])
     if at[0] >= at[1]:

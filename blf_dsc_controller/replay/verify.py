@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
@@ -17,7 +17,7 @@ from blf_dsc_controller.configuration.schema import flatten
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.messages import topics
 from blf_dsc_controller.messages.codecs import JOINT_STATE_FIELDS, MessageError
-from blf_dsc_controller.messages.journal import FORMAT, Event, EventType, machine
+from blf_dsc_controller.messages.journal import FORMAT, Event, EventType
 from blf_dsc_controller.replay.rerun import Rerun
 from blf_dsc_controller.run import Floats, Stamps
 
@@ -157,7 +157,7 @@ def verify(path: Path, namespace: str = '', names: NameMap = NO_NAMES) -> Verifi
         tuple(content.topics[topic].name for topic in _TEXTS if topic in content.topics),
         tuple(run.events),
         outputs.safe_torques,
-        tuple(_remarks(content, run.end or end, newer, events[0].content.get('machine', {}))),
+        tuple(_remarks(content, run.end or end, newer)),
         min(differences, key=lambda found: found.stamp, default=None),
     )
 
@@ -288,10 +288,8 @@ def _numbers(topic: topics.Topic, recorded: JointStates, answers: int) -> Stamps
 # Remarks.
 
 
-def _remarks(
-    content: Content, end: str, newer: Sequence[str], recorded: Mapping[str, str]
-) -> Iterator[str]:
-    """Yield what limits the result; `recorded` is the machine of the controller."""
+def _remarks(content: Content, end: str, newer: Sequence[str]) -> Iterator[str]:
+    """Yield what limits the result."""
     if end:
         yield f'{end}: the replay ends there'
     for topic, what in content.losses.items():
@@ -306,11 +304,3 @@ def _remarks(
             f'recorded before the law had {", ".join(newer)}: replayed with the present law and '
             'its defaults, so differences come from the software'
         )
-    here = machine()
-    for name, value in recorded.items():
-        if value != here.get(name, ''):
-            yield (
-                f'recorded with {name} {value or "unset"} and replayed with '
-                f'{here.get(name) or "unset"}: sine, exponential and tanh may differ in the last '
-                'digit'
-            )

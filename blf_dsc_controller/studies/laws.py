@@ -20,7 +20,6 @@ import importlib
 import sys
 from collections.abc import Callable, Mapping
 from functools import partial
-from math import tanh
 from pathlib import Path
 from typing import NamedTuple, Protocol
 
@@ -28,6 +27,7 @@ import numpy as np
 
 from blf_dsc_controller.arms.model import ArmModel
 from blf_dsc_controller.arms.tuning import over_postures
+from blf_dsc_controller.compiled.elementary import tanh
 from blf_dsc_controller.compiled.jit import compile_methods, kernel
 from blf_dsc_controller.compiled.layout import Array, part, view
 from blf_dsc_controller.configuration.controller import ControllerConfig

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from blf_dsc_controller.arms.model import regressors_at
+from blf_dsc_controller.compiled.elementary import tanh
 from blf_dsc_controller.configuration.controller import ControllerConfig, Safety
 from blf_dsc_controller.law.controller import Controller
 from blf_dsc_controller.law.factory import settings_of_config
@@ -86,7 +87,7 @@ def model_torque(settings: Settings, estimate: Vector, *motion: Vector) -> Vecto
     """Return H(q, dq, dq, ddq) P^ (n,) [N m] of a motion q, dq, ddq (n,); at rest of q alone."""
     q, dq, ddq = motion if len(motion) > 1 else (*motion, *np.zeros((2, settings.n)))
     (H,) = regressors_at(settings.model, *(vector[np.newaxis] for vector in (q, dq, dq, ddq)))
-    return np.asarray(H @ estimate[: settings.p])
+    return np.asarray((H * estimate[: settings.p]).sum(axis=1))
 
 
 def friction_torque(settings: Settings, estimate: Vector, dq: Vector) -> Vector:
@@ -95,7 +96,7 @@ def friction_torque(settings: Settings, estimate: Vector, dq: Vector) -> Vector:
     torque = np.zeros(n)
     for is_on, effect in (
         (settings.viscous, dq),
-        (settings.coulomb, np.tanh(dq / settings.coulomb_velocity)),
+        (settings.coulomb, [tanh(speed) for speed in dq / settings.coulomb_velocity]),
     ):
         if is_on:
             torque += estimate[at : at + n] * effect
