@@ -113,7 +113,8 @@ lint: $(READY)-lint ## Check style, types and layers
 	PYTHONPATH="$(CURDIR)" $(VENV)/bin/lint-imports || good=0; test $$good = 1
 
 clean: ## Remove everything installed and built; keep the results in out/
-	@rm -rf $(VENV) build install log *.egg-info .coverage .hypothesis .*_cache
+	@rm -rf $(VENV) build install log *.egg-info .coverage .hypothesis .*_cache \
+	    blf_dsc_controller/compiled/kernels
 	@find blf_dsc_controller sim_plant test -name __pycache__ -prune -exec rm -rf {} +
 
 $(READY): setup.py setup.cfg

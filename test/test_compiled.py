@@ -73,19 +73,19 @@ import sys
 import numpy as np
 from blf_dsc_controller.arms import model
 from blf_dsc_controller.arms.two_link import TwoLink
-from blf_dsc_controller.compiled.jit import announced_compilation
+from blf_dsc_controller.compiled import jit
 
-with announced_compilation(lambda text: print(text, file=sys.stderr)):
+with jit.announced_compilation(lambda text: print(text, file=sys.stderr)):
     H = model.regressors_at(TwoLink(10.0), *np.full((4, 1, 2), 0.5))
 print(float(H[0, 0, 0]), *(sum(model._fill_regressors.stats[k].values()) for k in (1, 2)))
 """
 
 
-def compiled_in(checkout, cache, **target):
+def compiled_in(checkout, cache, ending='', **target):
     """Return an entry of a regressor, and how often its kernel was found and was compiled."""
     paths = {'PYTHONPATH': str(checkout), 'NUMBA_CACHE_DIR': str(cache)}
     environment = os.environ | paths | target
-    run = finished(sys.executable, '-c', COMPILE, cwd=checkout, env=environment)
+    run = finished(sys.executable, '-c', COMPILE + ending, cwd=checkout, env=environment)
     entry, found, compiled = map(float, run.stdout.split())
     return entry, found, compiled
 
@@ -107,6 +107,26 @@ def test_second_checkout_finds_the_kernels_of_the_first_and_never_those_of_other
     assert compiled_in(first, cache) == (entry, 1, 0)
 
 
+@compiling
+def test_kernels_in_the_package_are_found_and_never_those_of_other_sources(tmp_path):
+    checkout, cache, unused = (tmp_path / name for name in ('checkout', 'cache', 'unused'))
+    for package in (PACKAGE, PACKAGE.parent / 'sim_plant'):
+        unwanted = shutil.ignore_patterns('__pycache__', 'kernels')
+        shutil.copytree(package, checkout / package.name, ignore=unwanted)
+    entry, *counts = compiled_in(checkout, cache, ending='jit.ship()')
+    assert counts == [0, 1]
+    shipped = checkout / PACKAGE.name / 'compiled/kernels'
+    before = sorted(shipped.rglob('*'))
+    assert compiled_in(checkout, unused) == (entry, 1, 0)
+    assert not list(unused.rglob('*.nb?'))
+
+    called = checkout / PACKAGE.name / 'arms/two_link.py'  # in another file than the kernel
+    called.write_text(called.read_text().replace('H[0, 0] = a[0] +', 'H[0, 0] = 1.0 + a[0] +'))
+    assert compiled_in(checkout, unused) == (pytest.approx(entry + 1.0), 0, 1)
+    assert compiled_in(checkout, unused) == (pytest.approx(entry + 1.0), 1, 0)
+    assert sorted(shipped.rglob('*')) == before
+
+
 @pytest.mark.skipif(platform.machine() != 'x86_64', reason='names processors of this kind')
 @pytest.mark.skipif(numba.config.DISABLE_JIT, reason='nothing is compiled')
 def test_code_for_a_named_processor_is_found_again_and_not_loaded_elsewhere(tmp_path):
@@ -119,19 +139,17 @@ def test_code_for_a_named_processor_is_found_again_and_not_loaded_elsewhere(tmp_
 
 
 @compiling
-def test_kernels_compile_without_the_private_parts_of_numba(tmp_path):
+@pytest.mark.parametrize('part', ['codegen.JITCodeLibrary', 'caching.CompileResultCacheImpl'])
+def test_kernels_compile_without_the_private_parts_of_numba(part, tmp_path):
     """Other releases may lack them: then it is slower, which is said, with the same numbers."""
     H = model.regressors_at(TwoLink(10.0), *np.full((4, 1, 2), 0.5))
     slow = f'numba {numba.__version__} lacks what this package uses'
     environment = {**os.environ, 'NUMBA_CACHE_DIR': str(tmp_path)}
-    lacking = ['import numba.core.caching, numba.core.codegen']
-    for part in ('codegen.JITCodeLibrary', 'caching.CompileResultCacheImpl'):  # one, then both
-        lacking.append(f'del numba.core.{part}')
-        for counts, said in (([0, 1], 1), ([1, 0], 0)):
-            program = '\n'.join([*lacking, COMPILE])
-            run = finished(sys.executable, '-c', program, env=environment)
-            assert [float(word) for word in run.stdout.split()] == [H[0, 0, 0], *counts]
-            assert run.stderr.count(slow) == said
+    lacking = f'import numba.core.caching, numba.core.codegen\ndel numba.core.{part}\n'
+    for counts, said in (([0, 1], 1), ([1, 0], 0)):
+        run = finished(sys.executable, '-c', lacking + COMPILE, env=environment)
+        assert [float(word) for word in run.stdout.split()] == [H[0, 0, 0], *counts]
+        assert run.stderr.count(slow) == said
 
 
 @jit.inner
@@ -244,8 +262,11 @@ def test_vectors_and_fixed_numbers_beside_them_are_seen_alike_by_kernels_and_pyt
 
 
 SHOW = """
+import sys
+from pathlib import Path
 from blf_dsc_controller.cli import run
 from blf_dsc_controller.cli.main import main
+from blf_dsc_controller.compiled import jit
 from blf_dsc_controller.configuration.nodes import load_loop
 from blf_dsc_controller.law.controller import update
 from blf_dsc_controller.messages.codecs import _read
@@ -259,12 +280,17 @@ if __name__ == '__main__':  # the command has processes of its own
     for kernel in (update, _read, _sample, *KERNELS):
         print(kernel.__name__, len(kernel.signatures))
     assert main(['precompile', '--config', 'recommended']) == 0
+    jit.SHIPPED = Path(sys.argv[1])
+    assert main(['precompile', '--config', 'recommended', '--package']) == 0
+    for kernel in (update, *KERNELS):
+        assert list(jit.SHIPPED.glob(f'*/*.{kernel.__name__}-*.nbc')), kernel
 """
 
 
 @compiling
-def test_command_compiles_every_kernel_that_a_node_calls():
-    *kernels, said = finished(sys.executable, '-c', SHOW).stdout.splitlines()
+def test_command_compiles_every_kernel_that_a_node_calls(tmp_path):
+    *kernels, said, copied = finished(sys.executable, '-c', SHOW, tmp_path).stdout.splitlines()
     assert len(kernels) == 6
     assert all(int(line.split()[1]) >= 1 for line in kernels), kernels
     assert 'recommended: the kernels are compiled' in said
+    assert copied.startswith(f'recommended: the kernels are in {tmp_path}')

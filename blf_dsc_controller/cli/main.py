@@ -216,6 +216,8 @@ def _add_run(command: _Command) -> None:
         '--config my.yaml',
     )
     option('--config', default='recommended', help=_CONFIG)
+    package = 'copy them into the package, for wheels, workspaces and images made of it'
+    option('--package', action='store_true', help=package)
 
 
 def _add_bags(

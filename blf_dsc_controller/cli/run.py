@@ -17,7 +17,7 @@ from tqdm import tqdm
 from blf_dsc_controller.bags.content import read_content
 from blf_dsc_controller.bags.reader import recorded_run
 from blf_dsc_controller.cli.main import INTERRUPTED, unwritable
-from blf_dsc_controller.compiled.jit import announced_compilation
+from blf_dsc_controller.compiled.jit import announced_compilation, ship
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.nodes import CONTROLLER, PLANT, LoopConfig, dump, load_loop
 from blf_dsc_controller.configuration.plant import PlantConfig
@@ -207,6 +207,9 @@ def precompile(options: Namespace) -> None:
     config = load_loop(options.config)
     with ProcessPoolExecutor(2, get_context('spawn')) as pool:
         list(pool.map(_compile, (config.controller, config.plant)))
+    if options.package:
+        print(f'{options.config}: the kernels are in {ship()}, for all who use this copy')
+        return
     print(f'{options.config}: the kernels are compiled; the nodes of this user now start at once')
 
 

@@ -7,7 +7,8 @@ that file.  Here the cache folder of a kernel is named after a digest of every s
 compiled from and of the constants it uses, and of nothing else: an edit recompiles what depends on
 it, and a reinstall or a second checkout finds the existing cache.
 
-If the user's cache folder is not writable, the cache is in the folder for temporary files.
+The package's own folder `SHIPPED` is looked at first, and never written to when kernels run.  If
+the user's cache folder is not writable, the cache is in the folder for temporary files.
 
 Compilation is announced, since the wait would look like a hang.
 """
@@ -18,6 +19,7 @@ import functools
 import hashlib
 import inspect
 import os
+import shutil
 import sys
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
@@ -27,13 +29,15 @@ from types import FunctionType, ModuleType
 from typing import Any, TypeVar, cast
 
 import numba
-from numba.core import caching, config, event
+from llvmlite.binding import get_host_cpu_features
+from numba.core import config, event
 from numba.core.types.containers import BaseNamedTuple
 from numba.extending import overload_method, register_jitable
 
 try:
-    from blf_dsc_controller.compiled.linked import KernelCompiler, LinkedCompiler
+    from blf_dsc_controller.compiled.linked import KernelCache, KernelCompiler, LinkedCompiler
 except ImportError:  # it uses parts of numba that other releases may lack: see there
+    _CACHE: Any = None
     _INNER_COMPILER: dict[str, Any] = {}
     _KERNEL_COMPILER: dict[str, Any] = {}
     SLOW = (
@@ -41,6 +45,7 @@ except ImportError:  # it uses parts of numba that other releases may lack: see 
         'compilation takes three times as long, and each sample of a Panda half as long again'
     )
 else:
+    _CACHE = KernelCache
     _INNER_COMPILER = {'pipeline_class': LinkedCompiler}
     _KERNEL_COMPILER = {'pipeline_class': KernelCompiler}
     SLOW = ''
@@ -60,6 +65,15 @@ COMPILING = 'compiling kernel '
 
 KERNELS: list[Any] = []
 """All kernels that have been imported."""
+
+SHIPPED = Path(__file__).with_name('kernels')
+"""Folder of kernels that come with the package: see `ship`."""
+
+_X86_64_V3 = ('avx2', 'bmi', 'bmi2', 'f16c', 'fma', 'lzcnt', 'movbe')
+_chosen = config.CPU_NAME is not None or config.CPU_FEATURES is not None
+if not _chosen and all(map(get_host_cpu_features().get, _X86_64_V3)):
+    # The same code for all these processors, about as fast, so that kernels can be shipped.
+    config.CPU_NAME, config.CPU_FEATURES = 'x86-64-v3', ''
 
 _PACKAGES = ('blf_dsc_controller.', 'sim_plant.')
 _ROOM = Path(__file__).resolve().parents[1]
@@ -198,45 +212,27 @@ def direct(kernel: Callable[..., Any], *arguments: object) -> Callable[..., Any]
 def _keep(kernel: Any, folder: Path) -> None:
     """Cache the machine code of a kernel in a folder that no other source shares.
 
-    Within it, numba tells signatures, processors and Python versions apart.  Releases of numba that
-    lack what is used here make a further folder in it, for the place of the source.
+    Within it, numba tells signatures, processors and Python versions apart.
     """
+    if _CACHE is not None:
+        cache = _CACHE(kernel.py_func, folder, SHIPPED / folder.name)
+        kernel._cache = cache  # noqa: SLF001 - as numba's enable_caching
+        return
+    before = config.CACHE_DIR
+    config.CACHE_DIR = str(folder)  # of a further folder in it, for the place of the source
     try:
-        kernel._cache = _cache(folder)(kernel.py_func)  # noqa: SLF001 - as numba's enable_caching
-    except (AttributeError, TypeError):
-        before = config.CACHE_DIR
-        config.CACHE_DIR = str(folder)
-        try:
-            kernel.enable_caching()
-        finally:
-            config.CACHE_DIR = before
+        kernel.enable_caching()
+    finally:
+        config.CACHE_DIR = before
 
 
-def _cache(folder: Path) -> Any:
-    class Place(caching._CacheLocator):  # type: ignore[misc]  # noqa: SLF001
-        def __init__(self, function: Any) -> None:
-            self._line = function.__code__.co_firstlineno
-
-        def get_cache_path(self) -> str:
-            return str(folder)
-
-        def get_source_stamp(self) -> str:
-            return folder.name
-
-        def get_disambiguator(self) -> str:
-            return str(self._line)
-
-        @classmethod
-        def from_function(cls, function: Any, _file: str) -> Place:
-            return cls(function)
-
-    class CachedCode(caching.CompileResultCacheImpl):  # type: ignore[misc]
-        _locator_classes = (Place,)
-
-    class Cache(caching.FunctionCache):  # type: ignore[misc]
-        _impl_class = CachedCode
-
-    return Cache
+def ship() -> Path:
+    """Copy the kernels in the cache into a folder of the package, and return it."""
+    for each in KERNELS:
+        folder = cache_folder(each)
+        if folder.exists():
+            shutil.copytree(folder, SHIPPED / folder.name, dirs_exist_ok=True)
+    return SHIPPED
 
 
 class _Listener(event.Listener):  # type: ignore[misc]

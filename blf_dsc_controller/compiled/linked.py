@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Compilation of functions into kernels only, not on their own.
+"""Compilation of functions into kernels only, not on their own; the files of compiled kernels.
 
 Numba optimises every function that a kernel calls and generates machine code for it before linking
 it into its caller, which it optimises again: a function five calls deep is compiled six times.
@@ -12,8 +12,11 @@ half of the code, for LLVM to remove again. Here nothing is counted, which halve
 from __future__ import annotations
 
 import gc
+from functools import partial
+from pathlib import Path
 from typing import Any
 
+from numba.core.caching import CompileResultCacheImpl, FunctionCache, _CacheLocator
 from numba.core.codegen import JITCodeLibrary
 from numba.core.compiler import CompilerBase, DefaultPassBuilder
 from numba.core.compiler_machinery import PassManager, register_pass
@@ -123,3 +126,42 @@ class KernelCompiler(_Compiler):
         finally:
             if enabled:
                 gc.enable()
+
+
+class _Folder(_CacheLocator):  # type: ignore[misc]
+    """A folder that holds machine code of one content of the sources."""
+
+    def __init__(self, path: Path, function: Any) -> None:
+        self._path, self._line = path, function.__code__.co_firstlineno
+
+    def from_function(self, _function: Any, _file: str) -> _Folder:
+        return self
+
+    def get_cache_path(self) -> str:
+        return str(self._path)
+
+    def get_source_stamp(self) -> str:
+        return self._path.name
+
+    def get_disambiguator(self) -> str:
+        return str(self._line)
+
+
+class _CachedCode(CompileResultCacheImpl):  # type: ignore[misc]
+    def __init__(self, path: Path, function: Any) -> None:
+        self._locator_classes = [_Folder(path, function)]
+        super().__init__(function)
+
+
+class KernelCache(FunctionCache):  # type: ignore[misc]
+    """Machine code of a kernel in a folder, or in another one, which is only read."""
+
+    def __init__(self, function: Any, path: Path, read_only: Path | None = None) -> None:
+        self._impl_class = partial(_CachedCode, path)
+        super().__init__(function)
+        self._shipped = KernelCache(function, read_only) if read_only else None
+
+    def load_overload(self, signature: Any, context: Any) -> Any:
+        """Return the compiled kernel, or None."""
+        shipped = self._shipped and self._shipped.load_overload(signature, context)
+        return shipped or super().load_overload(signature, context)
