@@ -42,21 +42,6 @@ TWO_SIDED = 1.96  # standard deviations in half of a 95 % interval
 MASS, DEVIATION = 0, 4  # in `state.load`, each followed by three of the centre
 
 
-@kernel
-def weigh(
-    model: ArmModel,
-    sizes: np.dtype[np.void],
-    settings_vector: Array,
-    state_vector: Array,
-    signals_vector: Array,
-    dt: float,
-) -> None:
-    """Take the row of the last sample on packed vectors: see `add_row`; `dt` [s] is its length."""
-    settings = settings_of(settings_vector, sizes, model)
-    state = state_of(state_vector, settings)
-    add_row(settings, state, signals_of(signals_vector, settings), dt)
-
-
 @inner
 def add_row(settings: Settings, state: State, signals: Signals, dt: float) -> None:
     """Add the row of this sample if one is due, and solve for the load ten times a second."""
@@ -230,3 +215,18 @@ def describe(settings: Settings, state: State, signals: Signals, lasting: float)
             is_known = abs(mass) > 2.0 * state.load[DEVIATION]
             state.load[r] = centre if is_known else 0.0
             state.load[DEVIATION + r] = state.load[DEVIATION + r] / abs(mass) if is_known else 0.0
+
+
+@kernel
+def weigh(
+    model: ArmModel,
+    sizes: np.dtype[np.void],
+    settings_vector: Array,
+    state_vector: Array,
+    signals_vector: Array,
+    dt: float,
+) -> None:
+    """Take the row of the last sample on packed vectors: see `add_row`; `dt` [s] is its length."""
+    settings = settings_of(settings_vector, sizes, model)
+    state = state_of(state_vector, settings)
+    add_row(settings, state, signals_of(signals_vector, settings), dt)
