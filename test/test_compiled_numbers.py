@@ -109,7 +109,7 @@ def test_dependent_columns_are_sums_of_those_before_them():
 
 def digests():
     """Return lines with digests of what is computed, from the parameters to closed loops."""
-    lines = []
+    lines, random = [], np.random.default_rng(1)
 
     def show(what, *arrays):
         digest = hashlib.sha256(np.concatenate([np.ravel(a) for a in arrays]).tobytes())
@@ -119,7 +119,7 @@ def digests():
     out = np.zeros((5, x.size))
     fill_all(x, out)
     show('functions', out)
-    times, points = np.cumsum(RANDOM.uniform(0.1, 2.0, 30)), RANDOM.normal(size=(2, 30, 7))
+    times, points = np.cumsum(random.uniform(0.1, 2.0, 30)), random.normal(size=(2, 30, 7))
     pieces = cubics(np.diff(times), points[:, :-1], points[:, 1:])
     show('references', minimum_jerk(times, points[0]).content, pieces)
     for preset in ('recommended', 'panda'):
@@ -130,7 +130,7 @@ def digests():
         settings, P = controller.settings, controller.state.estimate
         show('parameters', controller.settings_vector, pack(plant_settings(loop.plant)))
         show('run', record.measurements, record.samples, record.truths, controller.state_vector)
-        q, dq, ddq = RANDOM.normal(size=(3, settings.n))
+        q, dq, ddq = random.normal(size=(3, settings.n))
         safe = model_torque(settings, P, q, dq, ddq), friction_torque(settings, P, dq)
         show('safe torque', *safe)
     return lines
@@ -149,10 +149,9 @@ PROCESSORS = {
 )
 def test_every_processor_computes_the_same_bits(processor):
     """With the versions of libm, BLAS and numpy's loops for other processors, and their code."""
+    here = digests()  # compiles what the other process runs, too
     program = 'from test_compiled_numbers import digests; print(*digests(), sep="\\n")'
-    here, other = (
-        finished(sys.executable, '-c', program, env=os.environ | {'PYTHONPATH': PATH} | chosen)
-        for chosen in ({}, PROCESSORS[processor])
-    )
-    assert len(here.stdout.splitlines()) == 10, here.stderr
-    assert other.stdout == here.stdout
+    environment = os.environ | {'PYTHONPATH': PATH} | PROCESSORS[processor]
+    other = finished(sys.executable, '-c', program, env=environment)
+    assert len(here) == 10
+    assert other.stdout.splitlines() == here, other.stderr
