@@ -65,7 +65,7 @@ def test_functions_at_the_ends_of_their_range():
     assert (tanh(-math.inf), tanh(math.inf)) == (-1.0, 1.0)
     for function in (sin, cos):
         assert math.isnan(function(math.inf))
-        assert math.isnan(function(2.0**50))
+        assert function(2.0**50) == function(-1e300) == function(0.0)
         # Past 1.6e6 rad: of an angle at most a unit of the last place away.
         for x in (1e7, 1e10, 1e15):
             true = getattr(math, function.__name__)(x)

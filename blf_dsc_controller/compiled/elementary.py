@@ -40,12 +40,13 @@ _LARGEST_EXPONENT = 709.782712893384  # log of the largest float
 
 @inner
 def sine_and_cosine(x: float) -> tuple[float, float]:
-    """Return sin x and cos x; NaN for infinity, NaN, and above 2^50 rad.
+    """Return sin x and cos x.
 
-    Above 1.6e6 rad, they are those of an angle within a unit of the last place of x.
+    Above 1.6e6 rad, they are those of an angle within a unit of the last place of x, and above
+    2^50 rad those of 0, which is as good: x has no digit left after the point.
     """
     if not abs(x) < _FARTHEST:
-        return nan, nan
+        return (0.0, 1.0) if abs(x) < inf else (nan, nan)
     turns = (x * _PER_TURN + _WHOLE) - _WHOLE  # right angles
     rest = x - turns * _RIGHT_1
     part = turns * _RIGHT_2
