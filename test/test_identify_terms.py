@@ -3,11 +3,13 @@
 
 from __future__ import annotations
 
+import base64
 import importlib
 import re
 import sys
 from pathlib import Path
 
+import mujoco
 import numpy as np
 import pinocchio
 import pytest
@@ -139,10 +141,14 @@ def test_coupled_wrist_is_recognised_and_named(plain, tmp_path, capsys):
     found = identify_arm(recording_of(measured(states, 3)), ROBOT)
     np.testing.assert_allclose(found.parts.coupling, (0.02, 0.3, 0.8), rtol=0.05)
     bag = write_states(tmp_path / 'bag', PANDA, states)
-    urdf, picture = tmp_path / 'robot.urdf', tmp_path / 'torques.png'
+    urdf, page = tmp_path / 'robot.urdf', tmp_path / 'page.html'
     urdf.write_text(PANDA_TEXT)
-    assert main(['identify', str(bag), '--urdf', str(urdf), '--plot', str(picture)]) == 0
+    assert main(['identify', str(bag), '--urdf', str(urdf), '--report', str(page)]) == 0
     assert 'one motor drives panda_joint6 and panda_joint7' in capsys.readouterr().out
+    text = page.read_text()
+    assert 'panda_link7' in text
+    picture = tmp_path / 'torques.png'
+    picture.write_bytes(base64.b64decode(re.search('data:image/png;base64,([^"]+)', text)[1]))
     for colour in (lightened(COLOURS[0], 0.6), INK, ORANGE):  # measured, predicted, residual
         assert amount(pixels(picture), colour) > 1000
 
@@ -341,3 +347,34 @@ def test_rest_of_the_file_is_unchanged():
     twice = corrected_urdf(new, chain, chain.inertias, friction, friction, '')
     assert twice.count('<inertial>') == new.count('<inertial>')
     assert twice.count('<dynamics') == 7
+
+
+def test_other_readers_see_only_the_new_inertias_and_friction(tmp_path):
+    """Frames, limits and names as before, in pinocchio, MuJoCo and yourdfpy."""
+    yourdfpy = pytest.importorskip('yourdfpy', reason='needs pip install blf_dsc_controller[view]')
+    inertias = changed(PANDA_CHAIN, np.random.default_rng(5))
+    text = corrected_urdf(PANDA_TEXT, PANDA_CHAIN, inertias, np.full(7, 0.5), np.full(7, 0.2), '')
+    before, after = (pinocchio_model(each, PANDA) for each in (PANDA_TEXT, text))
+    assert list(before.names) == list(after.names)
+    for old, new in zip(before.jointPlacements, after.jointPlacements, strict=True):
+        np.testing.assert_array_equal(old.homogeneous, new.homogeneous)
+    for limit in ('upperPositionLimit', 'velocityLimit', 'effortLimit'):
+        np.testing.assert_array_equal(getattr(before, limit), getattr(after, limit))
+    masses = [body.mass for body in list(after.inertias)[1:]]
+    np.testing.assert_allclose(masses, inertias[:, 0], rtol=1e-9)
+    old, new = (mujoco.MjModel.from_xml_string(each) for each in (PANDA_TEXT, text))
+    np.testing.assert_array_equal(old.jnt_range, new.jnt_range)
+    np.testing.assert_allclose(new.dof_damping[:7], 0.5)
+    np.testing.assert_allclose(new.dof_frictionloss[:7], 0.2)
+    (tmp_path / 'arm.urdf').write_text(text)
+    last = PANDA_CHAIN.joints[-1]
+    assert last.fixed == ('panda_link8', 'panda_hand', 'panda_hand_tcp')
+    assert last.held[3, 3] == pytest.approx(0.03)  # two fingers
+    robot = yourdfpy.URDF.load(str(tmp_path / 'arm.urdf'), load_meshes=False)
+    assert robot.validate()
+    for joint, inertia in zip(PANDA_CHAIN.joints, inertias, strict=True):
+        assert robot.link_map[joint.link].inertial.mass == pytest.approx(
+            inertia[0] - joint.held[3, 3]
+        )
+        assert float(robot.joint_map[joint.name].dynamics.damping) == pytest.approx(0.5)
+        assert robot.joint_map[joint.name].limit.upper == pytest.approx(joint.upper)

@@ -7,6 +7,7 @@ import textwrap
 from argparse import Namespace
 from collections.abc import Iterator, Sequence
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import numpy as np
 
@@ -35,10 +36,10 @@ _PANEL = (9.0, 2.2)  # inches
 
 
 def identify(options: Namespace) -> None:
-    """Identify the arm, print what changed, and write the corrected URDF and the picture."""
-    if not (options.out or options.plot or options.payload):
-        raise BlfDscError('nothing to write: give --out, --plot or --payload')
-    for path in (options.out, options.plot):
+    """Identify the arm, print what changed, and write the corrected URDF and the page."""
+    if not (options.out or options.report or options.payload):
+        raise BlfDscError('nothing to write: give --out, --report or --payload')
+    for path in (options.out, options.report):
         if path:
             make_room(path, force=options.force)
     robot = Robot(
@@ -68,16 +69,18 @@ def identify(options: Namespace) -> None:
         corrected = corrected_urdf(robot.text, found.chain, bodies, viscous, coulomb, note)
         options.out.write_text(corrected, encoding='utf-8')
         print(f'wrote {options.out}')
-    if options.plot:
-        _draw(found, options.plot)
-        print(f'wrote {options.plot}')
+    if options.report:
+        tables = (_load(found), _links(found), _joints(found), _errors(found), _base(found))
+        lines = [*header, *problems_of(found, options.effort)]
+        _write_page(found, options.report, lines, ['\n'.join(table).strip() for table in tables])
+        print(f'wrote {options.report}')
 
 
-def _draw(found: Identified, path: Path) -> None:
-    """Draw measured and predicted torques with their residual; the part held back is shaded."""
+def _write_page(found: Identified, path: Path, lines: Sequence[str], tables: Sequence[str]) -> None:
+    """Write the page: some lines, measured and predicted torques with their residual, tables."""
     from blf_dsc_controller.analysis.figures import draw_panels  # slow: the libraries
     from blf_dsc_controller.analysis.panels import Line, Mark, Panel
-    from blf_dsc_controller.analysis.style import INK, MUTED, ORANGE
+    from blf_dsc_controller.analysis.style import INK, MUTED, ORANGE, write_page
 
     jumps = np.flatnonzero(np.diff(found.time) > 2.0 * np.median(np.diff(found.time))) + 1
     t = np.insert(found.time, jumps, np.nan)  # breaks the lines at gaps and rest
@@ -94,7 +97,11 @@ def _draw(found: Identified, path: Path) -> None:
         ]
         unit = 'N' if joint.kind == 'prismatic' else 'N m'
         panels.append(Panel('Motion', joint.name, unit, lines, marks=(held_back,)))
-    draw_panels(path, 'Torques: measured, predicted, residual', panels, 1, _PANEL)
+    with TemporaryDirectory() as folder:
+        picture = Path(folder, 'torques.png')
+        draw_panels(picture, 'Torques: measured, predicted, residual', panels, 1, _PANEL)
+        shown = {'lines': lines, 'picture': picture, 'tables': [*filter(None, tables)]}
+        write_page(path, 'identified.html', 'Identified arm', **shown)
 
 
 def _interval(value: float, deviation: float, digits: str = '.4g') -> str:

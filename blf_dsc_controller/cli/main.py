@@ -300,7 +300,7 @@ def _add_identification(
         'new URDF has physical inertias that reproduce the torques and are closest to the original '
         'ones; what changed is printed, with 95 % intervals, and the torque error on the last '
         'fifth of the motion, which was held back. With --payload, weigh what the arm holds.',
-        'run1/bag --urdf robot.urdf --out corrected.urdf --plot torques.png\n'
+        'run1/bag --urdf robot.urdf --out corrected.urdf --report page.html\n'
         '  blf_dsc identify empty/bag --urdf robot.urdf --payload loaded/bag',
         names,
         force,
@@ -308,7 +308,7 @@ def _add_identification(
     option('bag', type=Path, help=_BAG)
     option('--urdf', required=True, help='URDF: a file, package://name/path, or a file in config/')
     option('--out', type=Path, help='URDF to write')
-    option('--plot', type=Path, help='picture of measured and predicted torques to write (PNG)')
+    option('--report', type=Path, help='page with measured and predicted torques and the tables')
     load = 'identify a load: carried in this other bag, or without one, picked up in the first'
     option('--payload', type=Path, nargs='?', const=PICK_UP, metavar='BAG', help=load)
     efforts = ('torque', 'without-gravity', 'command')
