@@ -71,13 +71,13 @@ def identify(options: Namespace) -> None:
         print(f'wrote {options.out}')
     if options.report:
         tables = (_load(found), _links(found), _joints(found), _errors(found), _base(found))
-        lines = [*header, *problems_of(found, options.effort)]
-        _write_page(found, options.report, lines, ['\n'.join(table).strip() for table in tables])
+        facts = [*header, *problems_of(found, options.effort)]
+        _write_page(found, options.report, facts, ['\n'.join(table).strip() for table in tables])
         print(f'wrote {options.report}')
 
 
-def _write_page(found: Identified, path: Path, lines: Sequence[str], tables: Sequence[str]) -> None:
-    """Write the page: some lines, measured and predicted torques with their residual, tables."""
+def _write_page(found: Identified, path: Path, facts: Sequence[str], tables: Sequence[str]) -> None:
+    """Write the page: some facts, measured and predicted torques with their residual, tables."""
     from blf_dsc_controller.analysis.figures import draw_panels  # slow: the libraries
     from blf_dsc_controller.analysis.panels import Line, Mark, Panel
     from blf_dsc_controller.analysis.style import INK, MUTED, ORANGE, write_page
@@ -100,7 +100,7 @@ def _write_page(found: Identified, path: Path, lines: Sequence[str], tables: Seq
     with TemporaryDirectory() as folder:
         picture = Path(folder, 'torques.png')
         draw_panels(picture, 'Torques: measured, predicted, residual', panels, 1, _PANEL)
-        shown = {'lines': lines, 'picture': picture, 'tables': [*filter(None, tables)]}
+        shown = {'lines': facts, 'picture': picture, 'tables': [*filter(None, tables)]}
         write_page(path, 'identified.html', 'Identified arm', **shown)
 
 
