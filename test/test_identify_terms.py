@@ -146,7 +146,7 @@ def test_coupled_wrist_is_recognised_and_named(plain, tmp_path, capsys):
     assert main(['identify', str(bag), '--urdf', str(urdf), '--report', str(page)]) == 0
     assert 'one motor drives panda_joint6 and panda_joint7' in capsys.readouterr().out
     text = page.read_text()
-    assert all(words in text for words in (str(bag), 's of 7 joints', 'panda_link7'))
+    assert all(words in text for words in ('s of 7 joints', 'panda_link7'))
     picture = tmp_path / 'torques.png'
     picture.write_bytes(base64.b64decode(re.search('data:image/png;base64,([^"]+)', text)[1]))
     for colour in (lightened(COLOURS[0], 0.6), INK, ORANGE):  # measured, predicted, residual
