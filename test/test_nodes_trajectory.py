@@ -39,7 +39,10 @@ def sender(ros):
 def test_two_tone_trajectory_is_tracked_within_the_bound_and_replaced_twice(ros, sender, watchdog):
     references = ros.listen(topics.REFERENCE)
     errors = ros.listen(topics.TRACKING_ERROR)
-    arm, law = ros.loop(None, BRISK | PLANNED[watchdog])
+    # Planned in a thread, it is followed the later, the busier the computer: then in less time.
+    limit = {'off': 4.0, 'on': 8.0}[watchdog]  # rad/s^2
+    brisk = {'limits__acceleration': [limit, limit]}
+    arm, law = ros.loop(None, brisk | PLANNED[watchdog])
     ros.run(arm, 200)
     shifts = ([0.0, 0.0], [0.1, -0.2], [-0.15, 0.1])
     orders = (JOINTS, JOINTS[::-1], JOINTS)
@@ -60,8 +63,8 @@ def test_two_tone_trajectory_is_tracked_within_the_bound_and_replaced_twice(ros,
     assert np.max([np.abs(message.position) for message in errors]) < 2e-3
     positions = np.array([message.position for message in references])
     velocities = np.array([message.velocity for message in references])
-    # At most 4 rad/s^2 over a millisecond: no jump where one trajectory replaces another.
-    assert np.abs(np.diff(velocities, axis=0)).max() < 4.1e-3
+    # At most the limit over a millisecond: no jump where one trajectory replaces another.
+    assert np.abs(np.diff(velocities, axis=0)).max() < 1.025e-3 * limit
     np.testing.assert_allclose(
         np.diff(positions, axis=0), 0.5e-3 * (velocities[1:] + velocities[:-1]), atol=1e-8
     )
