@@ -14,6 +14,7 @@ import signal
 import socket
 import subprocess
 import sys
+import time
 from collections.abc import Iterator
 from contextlib import ExitStack, closing, contextmanager, nullcontext
 from pathlib import Path
@@ -46,6 +47,7 @@ _ROOM = 1_000_000  # bytes; with less free space the disk counts as full
 _PR_SET_PDEATHSIG = 1
 _LIBC = ctypes.CDLL(None)  # loaded before there are threads
 _VIEW_PORT = 8080  # or the next free one
+_LAST = 5.0  # s, at most, to show what a loop sent before it ended
 _IN_TRANSIT = 0.5  # s, at most, between messages that are still on their way at the end
 _RANGE = 'ROS_AUTOMATIC_DISCOVERY_RANGE'
 _PROFILES = 'FASTRTPS_DEFAULT_PROFILES_FILE'
@@ -169,7 +171,8 @@ def _run_nodes(config: LoopConfig, params_file: Path, logs: Path, view: str | No
                 monitor.progress.write(f'the page: {url_of(view, port)}')
                 view = None
         completed = not (interrupts or nodes[-1].is_running)
-        while completed and monitor.wait(_IN_TRANSIT):
+        last = time.monotonic() + _LAST  # another loop in the same domain never falls silent
+        while completed and time.monotonic() < last and monitor.wait(_IN_TRANSIT):
             pass
     for node in nodes:
         node.check()

@@ -126,7 +126,9 @@ class Safety:
         'velocity as measured, or estimated from position differences, starting at rest',
         read_only='the filters hold data that depend on it',
     )
-    velocity_limit: float = positive(50.0, 'velocity above which a measurement is broken', 'rad/s')
+    velocity_limit: float = positive(
+        50.0, 'velocity above which a measurement counts as broken', 'rad/s'
+    )
     error_ratio: float = non_negative(
         1.0, 'tracking error to stop at, relative to the bound, for laws with a barrier; 0: never'
     )

@@ -121,7 +121,9 @@ class Torque:
     limit: PerJoint = positive(
         (20.0, 20.0), 'largest torque, as commanded and with what the drives add', 'N m'
     )
-    rate_limit: PerJoint = non_negative((0.0, 0.0), 'largest rate of commands; 0: any', 'N m/s')
+    rate_limit: PerJoint = non_negative(
+        (0.0, 0.0), 'largest rate of commands; 0: no limit', 'N m/s'
+    )
     first_step: PerJoint = non_negative(
         (0.0, 0.0),
         'largest first torque, a step from none, that the drives tolerate; 0: any',
@@ -190,7 +192,9 @@ class Learning:
     adaptation_gain: Annotated[tuple[float, ...], 'learning.initial_estimate'] = non_negative(
         (0.5, 0.5, 0.5), 'diagonal of the adaptation gain', symbol='Gamma'
     )
-    weight: float = non_negative(100.0, 'weight of the prediction error; 0: none', symbol='kappa')
+    weight: float = non_negative(
+        100.0, 'weight of the prediction error; 0: no learning from it', symbol='kappa'
+    )
     update: Literal['newton', 'gradient'] = parameter(
         'newton', 'step along the prediction error: regularised Newton, or the gradient (paper)'
     )
@@ -241,7 +245,9 @@ class Learning:
     residual_floor: PerJoint = positive(
         (0.07, 0.07), 'rms unmodelled torque that is not treated as a change of the arm', 'N m'
     )
-    anchor_weight: float = non_negative(0.1, 'pull to the estimate before a change, for one window')
+    anchor_weight: float = non_negative(
+        0.1, 'pull to the estimate before a change, until a new window is full'
+    )
     prior_weight: float = non_negative(0.0, 'pull to the initial estimate, if P is not all excited')
     motion_scale: float = non_negative(
         0.0, 'reference velocity below which the rows of a joint count less; 0: none', 'rad/s'

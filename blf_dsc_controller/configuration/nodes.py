@@ -83,10 +83,16 @@ class WatchdogConfig:
     """Parameters of the node `torque_watchdog`."""
 
     timeout: float = _of_watchdog(
-        0.05, 'silence of the controller until it commands', 's', at_least=0.005, at_most=10.0
+        0.05,
+        'silence of the controller, while joint states go on, until it commands',
+        's',
+        at_least=0.005,
+        at_most=10.0,
     )
     armed: bool = _of_watchdog(
-        False, 'do not wait for a first command: for a restart after the controller died'
+        False,
+        'do not wait for a first command: for a restart after the controller died, with its '
+        'parameter file',
     )
 
 
