@@ -2,6 +2,7 @@
 """The environment of the nodes of a run: the middleware's settings, and numpy's threads."""
 
 import os
+import subprocess
 import sys
 
 import pytest
@@ -11,6 +12,7 @@ pytest.importorskip('rclpy', reason='needs ROS 2')
 
 from blf_dsc_controller.cli import session as isolation
 from blf_dsc_controller.cli.session import localhost_environment
+from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.studies.runs import cores
 
 MULTIPLY = """
@@ -47,3 +49,17 @@ def test_libraries_start_no_threads_unless_the_environment_asks_for_them(command
     (code, threads), same, more = outputs
     assert same == [code, threads]
     assert more == [code, threads + (cores() > 1)]  # never more than cores
+
+
+def test_domain_is_held_until_the_last_node_of_a_run_has_ended(monkeypatch):
+    mine = 1000 + os.getpid()  # that no other test claims
+    monkeypatch.setattr(isolation, '_DOMAINS', (mine,))
+    with isolation.own_domain():
+        node = subprocess.Popen(
+            [sys.executable, '-c', 'input()'], stdin=subprocess.PIPE, close_fds=False
+        )
+    with pytest.raises(BlfDscError, match='choose a ROS domain'), isolation.own_domain():
+        pass
+    node.communicate(b'\n')
+    with isolation.own_domain() as domain:
+        assert domain == mine

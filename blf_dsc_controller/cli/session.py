@@ -103,6 +103,7 @@ class NodeProcess:
                 stderr=subprocess.STDOUT,
                 env={**os.environ, 'PYTHONUNBUFFERED': '1'},
                 start_new_session=True,
+                close_fds=False,  # it holds the claim of the domain, which ends with the last node
                 preexec_fn=_die_with_parent,  # noqa: PLW1509 - takes no lock that a thread could hold
             )
 
@@ -262,9 +263,13 @@ def environment(values: dict[str, str]) -> Iterator[None]:
 
 @contextmanager
 def own_domain() -> Iterator[int]:
-    """Claim a ROS domain that no other run on this machine holds; BlfDscError if none is free."""
+    """Claim a ROS domain that no other run on this machine holds; BlfDscError if none is free.
+
+    Processes that inherit open files hold it as well, as the nodes of a run that was killed do.
+    """
     first = os.getpid() % len(_DOMAINS)
     with socket.socket(socket.AF_UNIX) as claim:
+        claim.set_inheritable(True)
         for domain in (*_DOMAINS[first:], *_DOMAINS[:first]):
             try:
                 claim.bind(f'\0blf_dsc_controller domain {domain}')
