@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The pages of report and view in a browser; runs in `make test-browser`.
 
-Their contents are checked without a browser in test_analysis_report.py and test_view.py, what the
-view's buttons do in test_view_live.py.
+Their contents are checked without a browser in test_analysis_report.py, test_view.py and
+test_view_live.py.
 """
 
 from __future__ import annotations
@@ -161,32 +161,3 @@ def test_bag_is_played_in_the_browser(browser, tmp_path):
 def wait_until(browser, condition):
     while not condition():
         browser.value('1')
-
-
-@for_3d
-def test_running_loop_is_shown_and_loaded(browser):
-    pytest.importorskip('rclpy', reason='needs ROS 2')
-    from ros_rig import RosRig
-
-    from blf_dsc_controller.view.node import ViewNode
-
-    rig = RosRig()
-    try:
-        view = rig.add(ViewNode, port=18290)
-        arm, law = rig.loop({'load.payload': 0.25})
-        rig.until(lambda: 'Pick up' in view.buttons)
-        show_view(browser, view.page)
-        rig.until(lambda: view.past and view.past[-1].time > 8.0)
-        browser.wait(f"{TEXT}.includes('OK tracking')")
-        browser.screenshot(SHOTS / 'view_running.png')
-        browser.click('Try')
-        browser.click('Pick up')
-        rig.until(lambda: arm.config.load.payload == 0.5)
-        browser.screenshot(SHOTS / 'view_try.png')
-        rig.kill(law)
-        rig.until(lambda: view.page._state[0] == 'ERROR')
-        browser.wait(f"{TEXT}.includes('the controller is gone')")
-        assert errors(browser) == []
-        assert_local(browser, view.page)
-    finally:
-        rig.close()

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The node `view`, which feeds the page from the topics, and asks what its buttons say.
+"""The node `view`, which feeds the page from the topics.
 
 It runs in its own low-priority process, takes the newest messages thirty times a second, and
 tolerates lost ones. The controller's configuration comes from its journal.
@@ -11,15 +11,11 @@ import json
 import os
 import sys
 from collections import deque
-from collections.abc import Callable, Sequence
-from queue import SimpleQueue
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from rcl_interfaces.srv import SetParameters
-from rclpy.parameter import Parameter
 from rclpy.serialization import deserialize_message
-from std_srvs.srv import Trigger
 
 from blf_dsc_controller.analysis.report import LEVELS
 from blf_dsc_controller.configuration.controller import ControllerConfig
@@ -71,7 +67,6 @@ class ViewNode(PlainNode):
     Attributes:
         page: what is served.
         past: the snapshots of the last `PAST` seconds.
-        buttons: by their label.
     """
 
     def __init__(self, **options: Any) -> None:
@@ -79,7 +74,6 @@ class ViewNode(PlainNode):
         config = declare(self, ViewConfig)
         self.page = Page(config.host, config.port)
         self.past: deque[Snapshot] = deque()
-        self.buttons: dict[str, Any] = {}
         self._config: ControllerConfig | None = None
         self._plant: dict[str, Any] = {}  # parameters of the simulated plant
         self._events: deque[tuple[float, str, str]] = deque(maxlen=_LISTED)
@@ -90,15 +84,6 @@ class ViewNode(PlainNode):
         self._clients_seen: frozenset[int] = frozenset()
         self._newest = self._subscribe(_STREAMS, _NEWEST)
         self._kept = self._subscribe(_EVENTS)
-        self._asked: SimpleQueue[Callable[[], None]] = SimpleQueue()  # by the page's threads
-        self._requests = {
-            name: self.create_client(type_, f'{self.get_namespace().rstrip("/")}/{name}')
-            for name, type_ in (
-                (f'{topics.CONTROLLER}/reset', Trigger),
-                (f'{topics.PLANT}/reset', Trigger),
-                (f'{topics.PLANT}/set_parameters', SetParameters),
-            )
-        }
         self.get_logger().info(f'open {self.page.url}')
         if config.host not in LOCAL:
             self.get_logger().warning(open_to_others(config.host))
@@ -118,11 +103,9 @@ class ViewNode(PlainNode):
         self._kept.close()
 
     def update(self) -> None:
-        """Process new messages, do what the buttons ask for, and draw."""
+        """Process new messages and draw."""
         for message in self._kept.take():
             self._note(_EVENTS[message.handle], message.raw)
-        while not self._asked.empty():
-            self._asked.get()()
         config = self._config
         has_state = config is not None and self._take(self._newest.take())
         self._silent = 0 if has_state else self._silent + 1
@@ -194,7 +177,7 @@ class ViewNode(PlainNode):
     def _draw_all(self) -> None:
         if self._config is not None:
             self.page.clear()
-            self._add_buttons(self.page.draw_arm(self._config, self._plant))
+            self.page.draw_arm(self._config, self._plant)
 
     # Samples.
 
@@ -240,47 +223,6 @@ class ViewNode(PlainNode):
             self.past.popleft()
         self._events += [e for e in plant_events(self._plant) if self._noted < e[0] <= time]
         self._noted = time
-
-    # What the buttons ask for.
-
-    def _add_buttons(self, tabs: Any) -> None:
-        gui = self.page.server.gui
-
-        def button(label: str, hint: str, action: Callable[[], None]) -> None:
-            self.buttons[label] = gui.add_button(label, hint=hint)
-            self.buttons[label].on_click(lambda _: self._asked.put(action))
-
-        with tabs.add_tab('Try'):
-            button('Reset', 'return to the start, forget what was learned', self._reset)
-            if self._plant:
-                mass = gui.add_slider('payload [kg]', 0.0, 5.0, 0.05, 0.5)
-                button('Pick up', 'attach this payload', lambda: self._carry(mass.value))
-                button('Put down', 'remove the payload', lambda: self._carry(0.0))
-
-    def _reset(self) -> None:
-        """Reset the simulated plant, which resets the controller; without one, the controller."""
-        node = topics.PLANT if self._plant else topics.CONTROLLER
-        self._call(f'{node}/reset', Trigger.Request(), lambda it: '' if it.success else it.message)
-
-    def _carry(self, mass: float) -> None:
-        """Set the payload of the simulated arm [kg]."""
-        parameter = Parameter('load.payload', value=mass).to_parameter_msg()
-        request = SetParameters.Request(parameters=[parameter])
-        self._call(f'{topics.PLANT}/set_parameters', request, lambda it: it.results[0].reason)
-
-    def _call(self, service: str, request: Any, refusal: Callable[[Any], str]) -> None:
-        """Call a service; the page shows why it refuses."""
-
-        def done(future: Any) -> None:
-            reason = refusal(future.result())
-            if reason:
-                self.page.notify(service, reason)
-
-        client = self._requests[service]
-        if client.service_is_ready():
-            client.call_async(request).add_done_callback(done)
-        else:
-            self.page.notify(service, 'this service is not available: has the node exited?')
 
 
 def _read(raw: bytes, names: Sequence[str]) -> tuple[int, Floats]:

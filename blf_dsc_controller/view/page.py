@@ -99,7 +99,7 @@ def url_of(host: str, port: int) -> str:
 
 def open_to_others(host: str) -> str:
     """Return the warning about a page that is not served to this computer only."""
-    return f'at {host} the page and its controls are open to other computers, without a password'
+    return f'at {host} the page is open to other computers, without a password'
 
 
 def require_viser() -> None:
@@ -162,8 +162,8 @@ class Page:
         self._header = gui.add_html('')
         self.state(*self._state)
 
-    def draw_arm(self, config: ControllerConfig, plant: Mapping[str, Any]) -> Any:
-        """Draw the arm of a controller, with the parameters of its plant; return the tabs."""
+    def draw_arm(self, config: ControllerConfig, plant: Mapping[str, Any]) -> None:
+        """Draw the arm of a controller, with the parameters of its plant."""
         from viser.extras import ViserUrdf
 
         self._arm = arm = arm_of(config, plant)
@@ -198,7 +198,6 @@ class Page:
             self._table = gui.add_html('')
         with tabs.add_tab('Events'):
             self._list = gui.add_html(event_table(self._events))
-        return tabs
 
     def _plot(
         self, title: str, names: Sequence[str], y: Mapping[str, Any] = _AUTO, limit: str = ''
@@ -228,11 +227,6 @@ class Page:
             f'{_SHEET}<div style="margin:4px 12px;padding:6px 10px;border-radius:6px;color:white;'
             f'background:{_LEVELS[level]}"><b>{level}</b> {escape(text)}</div>'
         )
-
-    def notify(self, title: str, text: str) -> None:
-        """Show a message in each open page."""
-        for client in self.server.get_clients().values():
-            client.add_notification(title, text, color='red', auto_close_seconds=15.0)
 
     def events(self, events: Sequence[tuple[float, str, str]]) -> None:
         """List the last of these events: time [s], kind and text."""
