@@ -41,13 +41,6 @@ class Series:
         index = np.searchsorted(self.stamp, stamp, side='right') - 1
         return self.at(np.maximum(index, 0), columns)
 
-    def exact(self, stamp: Stamps) -> Floats:
-        """Return the values at exactly these stamps, NaN where there are none."""
-        index = np.minimum(np.searchsorted(self.stamp, stamp), self.stamp.size - 1)
-        values = self.at(index)
-        values[self.stamp[index] != stamp] = np.nan
-        return values
-
 
 class Stop(NamedTuple):
     """A safe stop of the controller."""

@@ -360,8 +360,8 @@ def test_real_time_loop_is_timed_and_every_message_of_it_is_in_the_bag(tmp_path)
         for _, channel, message in make_reader(stream).iter_messages():
             numbers[channel.topic].append(message.sequence)
     facts, found = read_content(out / 'bag').facts, Counter()
-    answered = (topics.REFERENCE, topics.TRACKING_ERROR, topics.LEARNING)
-    for topic in (topics.JOINT_STATES, topics.TIMING, topics.COMMANDS, *answered):
+    answered, tenth = topics.TRACKING_ERROR, (topics.REFERENCE, topics.LEARNING)
+    for topic in (topics.JOINT_STATES, topics.TIMING, topics.COMMANDS, answered, *tenth):
         name, found[topic] = topic.resolved, len(numbers[topic.resolved])
         assert numbers[name] == list(range(1, found[topic] + 1))
         assert facts[f'messages {name}'] == f'{found[topic]} written, 0 missed'
@@ -370,6 +370,6 @@ def test_real_time_loop_is_timed_and_every_message_of_it_is_in_the_bag(tmp_path)
     assert found[topics.JOINT_STATES] == 1000 * DURATION + 1 + again
     assert found[topics.TIMING] == 1000 * DURATION  # one for each step
     # On a busy machine the controller may skip a state; it then publishes nothing for it.
-    assert len({found[topic] for topic in answered}) == 1
+    assert {found[topic] for topic in tenth} == {-(-found[answered] // 10)}
     # Nor were the last ones lost, which no later sequence number would reveal.
     assert not any('not reach every' in log for log in logs)

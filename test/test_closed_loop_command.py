@@ -22,12 +22,13 @@ from blf_dsc_controller.configuration.nodes import load_loop
 HALF = {'learning.initial_estimate': [0.5, 0.16, 0.2]}
 DURATION = 3  # s
 SAMPLES = 3001
-EACH_SAMPLE = ('commands', 'reference', 'tracking_error', 'learning')
+EACH_SAMPLE = ('commands', 'tracking_error')
+EACH_TENTH = ('reference', 'learning', 'monitor')
 COUNTS = {
     '/joint_states': SAMPLES,
     **{f'/blf_dsc_controller/{topic}': SAMPLES for topic in EACH_SAMPLE},
     '/blf_dsc_controller/bound': 1,
-    '/blf_dsc_controller/monitor': 301,  # every tenth sample
+    **{f'/blf_dsc_controller/{topic}': 301 for topic in EACH_TENTH},
     '/sim_plant/truth': 301,
 }
 TYPES = dict.fromkeys(COUNTS, 'sensor_msgs/msg/JointState') | {

@@ -97,7 +97,7 @@ def test_plant_counts_real_time_in_whole_samples(ros):
     clock = FakeClock()
     given = {'mode': 'realtime', 'duration': 0.3, **OBSERVED}
     plant = ros.add(PlantNode, given, clock=clock)
-    controller = ros.add(ControllerNode, clock=clock)
+    controller = ros.add(ControllerNode, {'telemetry.decimation': 1}, clock=clock)
     ros.until(lambda: clock.advance(0.01) or received[topics.JOINT_STATES])
     ros.until(plant.input.torque.any)
     # In time, except for three steps that the plant has to take at once.

@@ -41,7 +41,7 @@ def test_two_tone_trajectory_is_tracked_within_the_bound_and_replaced_twice(ros,
     errors = ros.listen(topics.TRACKING_ERROR)
     # Planned in a thread, it is followed the later, the busier the computer: then in less time.
     limit = {'off': 4.0, 'on': 8.0}[watchdog]  # rad/s^2
-    brisk = {'limits__acceleration': [limit, limit]}
+    brisk = {'limits__acceleration': [limit, limit], 'telemetry__decimation': 1}
     arm, law = ros.loop(None, brisk | PLANNED[watchdog])
     ros.run(arm, 200)
     shifts = ([0.0, 0.0], [0.1, -0.2], [-0.15, 0.1])

@@ -50,7 +50,8 @@ SAMPLES = 1001
 
 @pytest.fixture(scope='module')
 def bag(tmp_path_factory):
-    return recorded_run.record(tmp_path_factory.mktemp('recorded') / 'bag')
+    path = tmp_path_factory.mktemp('recorded') / 'bag'
+    return recorded_run.record(path, **{'telemetry.decimation': 1})
 
 
 @pytest.fixture
@@ -77,13 +78,15 @@ def test_every_number_is_reproduced(bag, tmp_path):
     # Otherwise this would not cover the composite learning.
     assert run.learning.column('latched')[-1] == 1.0
 
-    sparse = recorded_run.record(tmp_path / 'sparse', **{'telemetry.decimation': 7})
-    result, few = verify(sparse), -(-SAMPLES // 7)
-    assert (result.difference, result.compared) == (None, 1.0)
-    assert compared(result) == counts | {'reference': 4 * few, 'learning': 10 * few}
-    thinned = read_run(sparse)
-    np.testing.assert_array_equal(thinned.error, run.error)
-    np.testing.assert_allclose(thinned.reference, run.reference, rtol=0.0, atol=1e-15)
+    for decimation, given in ((10, {}), (7, {'telemetry.decimation': 7})):
+        sparse = recorded_run.record(tmp_path / f'{decimation}', **given)
+        result, few = verify(sparse), -(-SAMPLES // decimation)
+        assert (result.difference, result.compared) == (None, 1.0)
+        assert compared(result) == counts | {'reference': 4 * few, 'learning': 10 * few}
+        thinned = read_run(sparse)
+        np.testing.assert_array_equal(thinned.error, run.error)
+        np.testing.assert_allclose(thinned.reference, run.reference, rtol=0.0, atol=1e-15)
+        assert np.isfinite(thinned.reference_velocity[:, 0]).sum() == few
 
 
 @pytest.mark.parametrize(

@@ -310,7 +310,7 @@ def _timing(run: Run) -> Iterator[Panel]:
     for title, series, name in (
         ('period of the joint states, as received', periods, 'period'),
         ('state to torque', run.timing, LATENCY),
-        ('computing time of the law', run.learning, COMPUTE_TIME),
+        ('largest computing time of the law since the last message', run.learning, COMPUTE_TIME),
     ):
         times = [
             line._replace(values=1e6 * line.values)

@@ -360,8 +360,8 @@ def table(run: RecordedRun, rows: slice = slice(None)) -> dict[str, NDArray[Any]
     """Return some rows of every series of a run by name and unit, as `torque joint1 [N m]`.
 
     They are aligned to the stamps of its joint states. `stamp` and `received` are integers, all
-    others floats, NaN where unknown. Values published with each sample are in the row of its stamp;
-    those published less often (truth, timing, monitor) are held until the next message.
+    others floats, NaN where unknown, as is the reference's velocity between its messages. Named
+    values (learning, truth, timing, monitor) are held until the next message.
     """
     stamp = run.stamp[rows]
     columns: dict[str, NDArray[Any]] = {
@@ -377,8 +377,7 @@ def table(run: RecordedRun, rows: slice = slice(None)) -> dict[str, NDArray[Any]
     for topic in ('learning', 'truth', 'timing', 'monitor'):
         series = getattr(run, topic)
         if series is not None:
-            values = (series.exact if topic == 'learning' else series.held)(stamp)
-            for name, column in zip(series.names, values.T, strict=True):
+            for name, column in zip(series.names, series.held(stamp).T, strict=True):
                 columns[f'{topic} {name} [{_unit(name, run)}]'] = column
     return columns
 

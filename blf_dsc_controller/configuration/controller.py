@@ -159,7 +159,7 @@ class Telemetry:
 
     enabled: bool = _telemetry(True, 'publish reference, errors, estimates and monitors')
     decimation: int = _telemetry(
-        1,
+        10,
         'samples per message of reference and estimates; errors come with every sample',
         at_least=1,
     )

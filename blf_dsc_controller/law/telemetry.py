@@ -62,7 +62,7 @@ class ControllerTelemetry:
         self._bound = JointStateEncoder(joints, ('position', 'effort'))
         self._learning = JointStateEncoder(learning, ('position',))
         self._values = np.zeros(len(learning))
-        self._decimation, self._samples = decimation, 0
+        self._decimation, self._samples, self._slowest = decimation, 0, 0.0
 
     def command(self, torque: np.ndarray) -> Message:
         """Encode the commanded torque (n,) [N m]."""
@@ -84,17 +84,20 @@ class ControllerTelemetry:
     def sample(self, stamp: int, sample: Sample, compute_time: float) -> Iterator[Message]:
         """Yield the messages for a joint state: its stamp [ns], telemetry sample, update time [s].
 
-        The tracking error is sent every time: it tells a replay which states were used.
+        The tracking error is sent every time: it tells a replay which states were used. The
+        update time that is sent is the largest since the last message.
         """
         error = self._error.encode(stamp, sample.xi1, sample.xi2, sample.torque)
         yield topics.TRACKING_ERROR, error
         self._samples += 1
+        self._slowest = max(compute_time, self._slowest)  # NaN: not measured
         if (self._samples - 1) % self._decimation:
             return
         yield topics.REFERENCE, self._reference.encode(stamp, sample.qr, sample.dqr)
-        figures = sample.lambda_min, sample.latched, sample.changes, (compute_time,)
+        figures = sample.lambda_min, sample.latched, sample.changes, (self._slowest,)
         np.concatenate((sample.estimate, sample.disturbance, *figures), out=self._values)
         yield topics.LEARNING, self._learning.encode(stamp, self._values)
+        self._slowest = 0.0
 
 
 class PlantTelemetry:
