@@ -31,7 +31,7 @@ from blf_dsc_controller.studies.laws import (
     run,
     simulate_with,
 )
-from blf_dsc_controller.studies.runs import torque_rows
+from blf_dsc_controller.studies.monte_carlo import torque_rows
 
 IDEAL = {
     'truth.mass_deviation': 0.0,

@@ -22,7 +22,7 @@ from blf_dsc_controller.law.factory import controller_of, estimate_names
 from blf_dsc_controller.law.state import sample_of
 from blf_dsc_controller.simulation.loop import simulate
 from blf_dsc_controller.studies.monte_carlo import load_study
-from blf_dsc_controller.studies.pairs import compare_pairs
+from blf_dsc_controller.studies.report import compare_pairs
 from blf_dsc_controller.studies.runs import run_chunk
 
 AT_STATE = {'learning.compensation': 'state'}

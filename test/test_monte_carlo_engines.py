@@ -27,12 +27,7 @@ from blf_dsc_controller.configuration.nodes import load_loop
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.simulation.loop import simulate
 from blf_dsc_controller.studies import runs as engines
-from blf_dsc_controller.studies.report import (
-    influence,
-    reproduce,
-    summarize,
-    write_report,
-)
+from blf_dsc_controller.studies.report import reproduce, summarize, write_report
 from blf_dsc_controller.studies.runs import Store, chunk_size, compute, run_chunk, warm_up
 
 
@@ -223,23 +218,6 @@ def test_runs_are_sorted_worst_first_with_diverged_runs_before_all_others(whole_
     # (23 + z^2 / 2 -+ z sqrt(23 / 24 + z^2 / 4)) / (24 + z^2), z = 1.959964, Wilson (1927)
     assert summary['kept']['low'] == pytest.approx(0.797582, abs=1e-6)
     assert summary['kept']['high'] == pytest.approx(0.992607, abs=1e-6)
-
-
-def test_influence_detects_that_both_ends_are_bad(whole_store):
-    """The start does not correlate with the error, bad near both ends, yet explains all of it."""
-    rng = np.random.default_rng(3)
-    runs = 2000
-    results = {variation.column: rng.random(runs) for variation in whole_store.study.variations}
-    start = rng.uniform(-1.0, 1.0, runs)
-    results['plant.initial.error.joint1'] = start
-    results['outcome'] = np.full(runs, 'kept')
-    results['max_error_ratio.joint1'] = np.abs(start)
-    results['max_error_ratio.joint2'] = np.zeros(runs)
-    explained = influence(whole_store.study, results)
-    assert next(iter(explained)) == 'initial.error.joint1'
-    # Ten groups of equal size, five pairs: all but 1/25 of the variance, whatever the scale.
-    assert explained.pop('initial.error.joint1') == pytest.approx(0.96, abs=0.01)
-    assert max(explained.values()) < 0.02
 
 
 @pytest.mark.usefixtures('blank_pictures')

@@ -19,13 +19,15 @@ from blf_dsc_controller.law.telemetry import sample_columns
 from blf_dsc_controller.simulation.loop import simulate
 from blf_dsc_controller.studies.monte_carlo import (
     TAIL,
+    another_motion,
     draw,
     load_study,
     parse,
     plant_with,
+    torque_rows,
 )
-from blf_dsc_controller.studies.pairs import compare_pairs
-from blf_dsc_controller.studies.runs import another_motion, run_chunk, torque_rows
+from blf_dsc_controller.studies.report import compare_pairs
+from blf_dsc_controller.studies.runs import run_chunk
 
 FRACTIONS = st.floats(0.0, 1.0, exclude_max=True)
 MASS = 'uniform(0.3, 0.7)'
@@ -65,7 +67,7 @@ def test_values_are_as_frequent_as_stated():
 @pytest.mark.parametrize(
     ('before', 'after', 'expected'),
     [
-        ('arm.m2', 'arm.m3', r'line 15: vary.arm.m3: unknown parameter.* mean arm.m[12]\?'),
+        ('arm.m2', 'arm.m3', r'line 15: vary.arm.m3: unknown parameter.* mean vary.arm.m[12]\?'),
         ('arm.m2', 'initial.position', r'vary.initial.position: unknown parameter'),
         ('uniform(0.3', 'unifrm(0.3', r"line 15: vary.arm.m2: got 'unifrm\(0.3, 0.7\)', but"),
         (MASS, '0.5', r'vary.arm.m2: got 0.5, but one of these is expected'),

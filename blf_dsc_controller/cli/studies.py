@@ -16,41 +16,33 @@ from blf_dsc_controller.cli.run import make_folder, print_notice
 from blf_dsc_controller.compiled.jit import announced_compilation
 from blf_dsc_controller.configuration.nodes import locate
 from blf_dsc_controller.errors import BlfDscError
-from blf_dsc_controller.studies import runs
-from blf_dsc_controller.studies.arms import COLUMNS, chosen_laws
-from blf_dsc_controller.studies.arms import compare as compare_arms
+from blf_dsc_controller.studies import arms as arm_study
+from blf_dsc_controller.studies import paper as paper_study
+from blf_dsc_controller.studies import report, runs
 from blf_dsc_controller.studies.laws import CONTENDERS
 from blf_dsc_controller.studies.monte_carlo import load_study
-from blf_dsc_controller.studies.pairs import write_comparison
-from blf_dsc_controller.studies.paper import compare
-from blf_dsc_controller.studies.report import (
-    headline,
-    reproduce,
-    reproduce_command,
-    write_report,
-)
-from blf_dsc_controller.studies.runs import KEPT, Store, require_pyarrow, warm_up
 
 _PAUSE_IN_A_LOG = 10.0  # s between two updates of the bar
 
 
 def paper(options: Namespace) -> None:
     """Run the paper's Section IV with every law, write the report and print the claims."""
-    for claim in compare(make_folder(options.out)):
+    for claim in paper_study.compare(make_folder(options.out)):
         print(f'{claim.where:<18} {claim.says}\n{"":<18} {claim.full_verdict}')
     print(f'wrote {options.out / "index.html"}')
 
 
 def arms(options: Namespace) -> None:
     """Tune and run every law on URDF arms, write the page and print the worst of each figure."""
-    chosen_laws(options.laws)  # before there is a folder
+    arm_study.chosen_laws(options.laws)  # before there is a folder
     folder = make_folder(options.out)
     with announced_compilation(print_notice):
-        found = compare_arms(
+        found = arm_study.compare(
             folder, options.config, options.laws, options.truths, options.generations
         )
     for arm, results in found.items():
-        print(f'{arm}: worst of {options.truths} runs: {", ".join(COLUMNS)}, in mrad and %')
+        columns = ', '.join(arm_study.COLUMNS)
+        print(f'{arm}: worst of {options.truths} runs: {columns}, in mrad and %')
         for name, result in results.items():
             worst = (
                 f'{x:8.3g}' if np.isfinite(x) else '       -' for x in result.columns().max(axis=1)
@@ -63,8 +55,13 @@ def monte_carlo(options: Namespace) -> None:
     """Reproduce one run, report a study, or compute its missing runs and report it."""
     if options.reproduce:
         _reproduce(Path(options.reproduce[0]), options.reproduce[1], options.out)
+    elif options.report and options.out:
+        options.out.mkdir(parents=True, exist_ok=True)
+        stores = [runs.Store(folder) for folder in options.report]
+        print(report.write_comparison(stores, options.out), end='')
     elif options.report:
-        _report_again([Store(folder) for folder in options.report], options.out)
+        for folder in options.report:
+            _report(runs.Store(folder))
     else:
         _run_study(options)
 
@@ -73,14 +70,14 @@ def _run_study(options: Namespace) -> None:
     given = {name: getattr(options, name) for name in ('runs', 'seed')}
     overrides = {name: value for name, value in given.items() if value is not None}
     study = load_study(locate(options.config), overrides)
-    require_pyarrow()
-    store = Store.create_or_open(options.out or Path('monte_carlo'), study)
+    runs.require_pyarrow()
+    store = runs.Store.create_or_open(options.out or Path('monte_carlo'), study)
     with store.locked():
         workers = options.workers or runs.cores()
         chunks = store.missing(runs.chunk_size(study.settings.runs, workers))
         if chunks:
             with announced_compilation(print_notice):
-                warm_up(study)
+                runs.warm_up(study)
             is_dask = options.engine == 'dask'
             engine = runs.dask(workers, options.address) if is_dask else runs.processes(workers)
             with engine as executor:
@@ -88,7 +85,7 @@ def _run_study(options: Namespace) -> None:
         _report(store)
 
 
-def _compute(store: Store, chunks: list[range], executor: Executor) -> None:
+def _compute(store: runs.Store, chunks: list[range], executor: Executor) -> None:
     total = store.study.settings.runs
     done = total - sum(map(len, chunks))
     if done:
@@ -98,32 +95,23 @@ def _compute(store: Store, chunks: list[range], executor: Executor) -> None:
     with tqdm(total=total, initial=done, unit='run', desc='monte carlo', mininterval=pause) as bar:
         for chunk, columns in runs.compute(store.study, chunks, executor):
             store.keep(chunk, columns)
-            lost += int(np.count_nonzero(columns['outcome'] != KEPT))
+            lost += int(np.count_nonzero(columns['outcome'] != runs.KEPT))
             bar.set_postfix_str(f'{lost} did not keep the bound', refresh=False)
             bar.update(len(chunk))
 
 
-def _report(store: Store) -> None:
-    summary, written = write_report(store)
-    print(headline(summary))
-    print(f'the worst   {reproduce_command(store.folder, summary["worst"][0]["run"])}')
+def _report(store: runs.Store) -> None:
+    summary, written = report.write_report(store)
+    print(report.headline(summary))
+    print(f'the worst   {report.reproduce_command(store.folder, summary["worst"][0]["run"])}')
     print(f'wrote       {store.folder}: {", ".join(path.name for path in written)}')
 
 
-def _report_again(stores: list[Store], out: Path | None) -> None:
-    if out is not None:
-        out.mkdir(parents=True, exist_ok=True)
-        print(write_comparison(stores, out), end='')
-        return
-    for store in stores:
-        _report(store)
-
-
 def _reproduce(folder: Path, index: str, out: Path | None) -> None:
-    store = Store(folder)
+    store = runs.Store(folder)
     if not index.isdecimal():
         raise BlfDscError(f'--reproduce: expected the number of a run, got {index!r}')
     chosen = make_folder(out or Path(f'{folder.name}-run-{index}'))
-    print(format_table(reproduce(store, int(index), chosen)))
+    print(format_table(report.reproduce(store, int(index), chosen)))
     print(f'the same figures as in {folder}, bit for bit')
     print(f'wrote       {chosen}: config.yaml, bag, summary.json and pictures')

@@ -27,14 +27,14 @@ from blf_dsc_controller.studies.laws import (
     load_laws,
     run,
 )
-from blf_dsc_controller.studies.runs import another_motion, cores, torque_rows
+from blf_dsc_controller.studies.monte_carlo import UNSEEN, another_motion, torque_rows
+from blf_dsc_controller.studies.runs import cores
 from blf_dsc_controller.studies.tuning import bounded, search, value_at
 
 POPULATION = 16
 ROUGHEST = 0.05
 """rms change of a torque per sample, relative to its limit, beyond which it is penalised."""
 
-_UNSEEN = 1000  # seed of a motion that is never run
 COLUMNS = (*INTERVALS, 'torque error before the pick-up', 'at the end')
 
 
@@ -135,7 +135,7 @@ def compare(
     with ProcessPoolExecutor(cores(), initializer=chosen_laws, initargs=(laws,)) as pool:
         for arm, name in tqdm(rows, unit='law'):
             first, *others = (trial(arm, seed) for seed in range(truths + 1))
-            unseen = torque_rows(trial(arm, _UNSEEN).controller)
+            unseen = torque_rows(trial(arm, UNSEEN).controller)
             searched = CONTENDERS[name].gains
             least = {gain.name: gain.least for gain in searched}
             run(name, first, least, unseen)  # compiles what the workers load

@@ -41,7 +41,7 @@ from blf_dsc_controller.reference import terms as reference
 from blf_dsc_controller.reference.approach import plan_start
 from blf_dsc_controller.run import Floats
 from blf_dsc_controller.simulation.loop import simulate
-from blf_dsc_controller.studies.runs import torque_error
+from blf_dsc_controller.studies.monte_carlo import torque_error
 from blf_dsc_controller.studies.tuning import Gain, parameters_at
 from sim_plant import kernels as plants
 from sim_plant.arm import Arm

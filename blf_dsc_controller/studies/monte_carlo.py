@@ -34,7 +34,9 @@ from typing import Any, cast
 
 import numpy as np
 
+from blf_dsc_controller.arms.model import regressors_at
 from blf_dsc_controller.configuration.controller import ControllerConfig
+from blf_dsc_controller.configuration.files import Entry
 from blf_dsc_controller.configuration.nodes import CONTROLLER, PLANT, LoopConfig, load_loop, read
 from blf_dsc_controller.configuration.plant import PlantConfig
 from blf_dsc_controller.configuration.schema import (
@@ -48,7 +50,9 @@ from blf_dsc_controller.configuration.schema import (
 )
 from blf_dsc_controller.configuration.schema import Value as Setting
 from blf_dsc_controller.errors import ConfigurationError
-from blf_dsc_controller.law.factory import controller_of
+from blf_dsc_controller.law.factory import controller_of, model_of
+from blf_dsc_controller.reference.approach import reference_of
+from blf_dsc_controller.reference.terms import sampled
 from blf_dsc_controller.run import Floats
 
 WITHOUT = 'without.'
@@ -56,6 +60,11 @@ WITHOUT = 'without.'
 NOISE = 'noise.'
 """Prefix of the columns of a run without learning and with other sensor noise."""
 
+UNSEEN = 1000
+"""Seed of the motion on which the torque of a learned model is judged."""
+
+_ROWS = 200  # postures of that motion
+_ROWS_FOR = 15.0  # s
 _NODE = 'monte_carlo'
 _VARY = 'vary.'
 
@@ -77,13 +86,6 @@ class MonteCarloConfig:
         unit='s',
         at_least=0.0,
     )
-
-    def duration_problems(self, duration: float) -> Iterator[str]:
-        """Yield the problems with a run of this duration [s]."""
-        if duration == 0.0:
-            yield 'sim_plant.duration: got 0 s, but every run must end: give its duration'
-        elif self.settled_after >= duration:
-            yield f'settled_after: got {self.settled_after:g} s, but a run ends at {duration:g} s'
 
 
 @dataclass(frozen=True)
@@ -118,6 +120,37 @@ class Study:
         qr, dqr, _ = controller.reference_at(0.0)
         return qr, dqr, controller.bound_at(0.0)
 
+    @cached_property
+    def unseen(self) -> Floats | None:
+        """Rows of H of a motion that is never run, for `torque_error`; None without sinusoids."""
+        if self.controller.reference.type != 'sinusoids':
+            return None
+        return torque_rows(another_motion(self.controller, UNSEEN))
+
+
+def another_motion(config: ControllerConfig, seed: int) -> ControllerConfig:
+    """Return a configuration with other signs and phases of the reference's sinusoids."""
+    random, reference = np.random.default_rng(seed), config.reference
+    signs = random.choice((-1.0, 1.0), len(reference.amplitude))
+    motion = {
+        'reference.amplitude': (signs * reference.amplitude).tolist(),
+        'reference.phase': random.uniform(0.0, 2.0 * np.pi, len(reference.phase)).tolist(),
+    }
+    return change(config, motion)
+
+
+def torque_rows(config: ControllerConfig) -> Floats:
+    """Return the rows of H(q, q', q', q'') (k, p) along the configured reference."""
+    times = np.linspace(0.0, _ROWS_FOR, _ROWS)
+    q, dq, ddq = np.moveaxis(sampled(reference_of(config), times), 1, 0)
+    H = regressors_at(model_of(config), q, dq, dq, ddq)
+    return H.reshape(-1, H.shape[2])
+
+
+def torque_error(rows: Floats, estimate: Floats, P: Floats) -> float:
+    """Return the torque error of a learned model on such rows, relative to their torque."""
+    return float(np.linalg.norm(rows @ (estimate - P)) / np.linalg.norm(rows @ P))
+
 
 def load_study(path: str | Path, overrides: Mapping[str, object] | None = None) -> Study:
     """Read a study; `overrides` of the section `monte_carlo` take precedence over the file.
@@ -125,27 +158,32 @@ def load_study(path: str | Path, overrides: Mapping[str, object] | None = None) 
     Raises ConfigurationError with all problems of all sections, and their lines.
     """
     problems: list[str] = []
+    own: list[str] = []
     loop: LoopConfig | None = None
     settings: MonteCarloConfig | None = None
     try:
         loop = load_loop(path)
     except ConfigurationError as error:
         problems += error.problems
-    given, lines = _read_section(path)
-    varied = {name.removeprefix(_VARY): given.pop(name) for name in lines if name.startswith(_VARY)}
+    entries = _section(path)
+    given = {name: entry.value for name, entry in entries.items()}
+    varied = {name: given.pop(name) for name in entries if name.startswith(_VARY)}
     if loop is None:  # the number of events is unknown
-        varied = {name: text for name, text in varied.items() if not name.startswith('events.')}
-    variations, found = read_variations(varied, loop.plant if loop else PlantConfig())
-    own = [f'{_VARY}{problem}' for problem in found]
+        varied = {name: v for name, v in varied.items() if not name.startswith(f'{_VARY}events.')}
+    variations = tuple(_variations(varied, loop.plant if loop else PlantConfig(), own))
     try:
         settings = build(MonteCarloConfig, {**given, **(overrides or {})})
     except ConfigurationError as error:
         own += error.problems
     if loop and settings:
-        own += settings.duration_problems(loop.plant.duration)
+        end, settled = loop.plant.duration, settings.settled_after
+        if end == 0.0:
+            own.append('sim_plant.duration: got 0 s, but every run must end: give its duration')
+        elif settled >= end:
+            own.append(f'settled_after: got {settled:g} s, but a run ends at {end:g} s')
     for problem in own:
         name = problem.split(':', 1)[0]
-        where = f'line {lines[name]}: ' if name in lines else ''
+        where = f'line {entries[name].line}: ' if name in entries else ''
         problems.append(f'{_NODE}: {where}{problem}')
     if loop and loop.plant.joints != loop.controller.joints:
         problems.append(f'joints: {PLANT} and {CONTROLLER} have them in different orders')
@@ -154,8 +192,8 @@ def load_study(path: str | Path, overrides: Mapping[str, object] | None = None) 
     return Study(loop.controller, loop.plant, settings, variations)
 
 
-def _read_section(path: str | Path) -> tuple[dict[str, Any], dict[str, int]]:
-    """Return values and lines of the section `monte_carlo`, by name."""
+def _section(path: str | Path) -> dict[str, Entry]:
+    """Return the section `monte_carlo`, by name."""
     entries = {
         name: entry
         for section in read(path)
@@ -168,8 +206,7 @@ def _read_section(path: str | Path) -> tuple[dict[str, Any], dict[str, int]]:
             'see the preset monte_carlo'
         )
         raise ConfigurationError([problem], str(path))
-    lines = {name: entry.line for name, entry in entries.items()}
-    return {name: entry.value for name, entry in entries.items()}, lines
+    return entries
 
 
 Drawn = float | int | str
@@ -330,39 +367,33 @@ _REALTIME = ('actuator.command_timeout', 'actuator.without_command')
 
 
 @cache
-def variable_parameters() -> Mapping[str, Parameter]:
+def _variable_parameters() -> Mapping[str, Parameter]:
     """Return every parameter that may vary, by name; those of a relative start and events last."""
-    found = [
-        param
-        for param in parameters(PlantConfig)
-        if param.name.startswith(_GROUPS) and param.name not in _REALTIME
-    ]
     relative = Parameter((), '', is_array=True, length=('joints',))
-    found += [
+    found = [
+        *(param for param in parameters(PlantConfig) if param.name.startswith(_GROUPS)),
         replace(relative, name='initial.error', above=-1.0, below=1.0),
         replace(relative, name='initial.velocity_error', unit='rad/s'),
         replace(relative, name='events.gap', unit='s', at_least=0.0, length=('events.begin',)),
     ]
-    return {param.name: param for param in found if param.type in _EXPECTED}
+    return {p.name: p for p in found if p.type in _EXPECTED and p.name not in _REALTIME}
 
 
-def read_variations(
-    given: Mapping[str, object], plant: PlantConfig
-) -> tuple[tuple[Variation, ...], list[str]]:
-    """Return the variations in the order of the plant's parameters, and their problems.
+def _variations(
+    given: Mapping[str, object], plant: PlantConfig, problems: list[str]
+) -> Iterator[Variation]:
+    """Yield the variations in the order of the plant's parameters; add to the problems.
 
-    Each name has a distribution; a list parameter also takes a list of them.
+    Each name, `vary.` before it, has a distribution; a list parameter also takes a list of them.
     """
-    known = variable_parameters()
-    problems = [unknown(name, known) for name in given if name not in known]
-    found: list[Variation] = []
+    known = {f'{_VARY}{name}': param for name, param in _variable_parameters().items()}
+    problems += [unknown(name, known) for name in given if name not in known]
     for name, param in known.items():
         if name in given:
             try:
-                found += _variations_of(param, given[name], plant)
+                yield from [*_variations_of(param, given[name], plant)]
             except ValueError as error:
                 problems.append(f'{name}: {error}')
-    return tuple(found), problems
 
 
 def _variations_of(param: Parameter, given: object, plant: PlantConfig) -> Iterator[Variation]:

@@ -1,18 +1,31 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Report of a study in its folder: statistics of all runs, pictures, a page; and one run again."""
+"""What the results of a study say: its page, pairs with and without learning, one run again."""
 
 from __future__ import annotations
 
 import shlex
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from matplotlib.ticker import PercentFormatter
-from scipy.stats import binomtest, kruskal, rankdata
+from matplotlib.axes import Axes
+from matplotlib.ticker import LogLocator, NullFormatter, PercentFormatter
+from scipy.stats import binomtest
 
 from blf_dsc_controller.analysis.figures import draw as draw_run
-from blf_dsc_controller.analysis.style import ALARM, COLOURS, Cell, Picture, head, write_page
+from blf_dsc_controller.analysis.style import (
+    ALARM,
+    BLUE,
+    COLOURS,
+    INK,
+    MUTED,
+    ORANGE,
+    Cell,
+    Picture,
+    head,
+    write_page,
+)
 from blf_dsc_controller.analysis.summary import plain, write_summary
 from blf_dsc_controller.analysis.summary import summarize as summarize_run
 from blf_dsc_controller.bags.reader import read_run
@@ -22,33 +35,33 @@ from blf_dsc_controller.run import Floats
 from blf_dsc_controller.simulation.bag import write_bag
 from blf_dsc_controller.simulation.loop import simulate
 from blf_dsc_controller.studies.monte_carlo import NOISE, WITHOUT, Study, draw, plant_with
-from blf_dsc_controller.studies.pairs import (
-    ALLOWED,
-    RATIO,
-    SHOWN,
-    compare_pairs,
-    draw_pairs,
-    logarithmic,
-    pair_figures,
-    worst_of,
-)
 from blf_dsc_controller.studies.runs import (
+    DIVERGED,
     KEPT,
     OUTCOMES,
+    REJECTED,
     Columns,
     Store,
     differences,
     figures_of,
-    rows_of_another_motion,
 )
 
 Summary = dict[str, Any]
+Studies = dict[str, tuple[Study, Columns]]
+"""Studies and their results, by title."""
+
+ALLOWED = 1.3
+"""Largest error with learning that is called no larger than that without, as a factor."""
 
 _WORST = 10
-_GROUPS = 10
-_QUANTILES = {'min': 0.0, 'p5': 0.05, 'median': 0.5, 'p95': 0.95, 'p99': 0.99, 'max': 1.0}
-_DRAWN = 'plant.'
+_LAWS = {'': 'with', WITHOUT: 'without'}
 _FOLDERS = {'': '', WITHOUT: 'without_learning', NOISE: 'other_noise'}
+_FACTORS = {'median': 0.5, 'p99': 0.99, 'p99.9': 0.999, 'max': 1.0}
+_NEAR = (0.8, 1.2)  # times the bound
+_SHOWN = (0.03, 2.0)  # |xi1| / k_c; what is beyond is drawn at these
+_MOST_DOTS = 20_000
+_FEW_DECADES = 1e3
+_RATIO = r'max $|\xi_1| \; / \; k_c$'
 _RMS = r'rms $\xi_1$ [mrad]'
 _MODEL = r'$\|\hat P - P\| \;/\; \|P\|$ [%]'
 
@@ -62,7 +75,7 @@ def summarize(study: Study, results: Columns) -> Summary:
     outcomes = results['outcome'].tolist()
     runs, kept = len(outcomes), outcomes.count(KEPT)
     interval = binomtest(kept, runs).proportion_ci(0.95, method='wilson')
-    ratios = worst_of(study, results, 'max_error_ratio')
+    ratios = _worst_of(study, results, 'max_error_ratio')
     summary: Summary = plain(
         {
             'runs': runs,
@@ -72,12 +85,6 @@ def summarize(study: Study, results: Columns) -> Summary:
             'outcomes': {outcome: outcomes.count(outcome) for outcome in OUTCOMES},
             'kept': {'fraction': kept / runs, 'low': interval.low, 'high': interval.high},
             'pairs': compare_pairs(study, results) if study.settings.pairs else None,
-            'figures': {
-                name: _quantiles(values)
-                for name, values in results.items()
-                if values.dtype.kind == 'f' and not name.startswith(_DRAWN)
-            },
-            'influence': influence(study, results),
             'worst': [
                 {
                     'run': int(results['run'][row]),
@@ -92,40 +99,99 @@ def summarize(study: Study, results: Columns) -> Summary:
     return summary
 
 
-def influence(study: Study, results: Columns) -> dict[str, float]:
-    """Return the fraction of the variance of the largest |xi1| / k_c due to each drawn number.
+def compare_pairs(study: Study, results: Columns) -> Summary:
+    """Compare the runs with learning to those without it, and these to other sensor noise.
 
-    This is the correlation ratio of the ranks over groups of equal size, corrected for chance, from
-    the statistic of Kruskal and Wallis: unlike a correlation, it also shows if both ends of a range
-    are bad. Strongest first; numbers that are the same in all runs are left out.
+    The latter shows how many exceptions chance makes: of the runs that nothing breaks before
+    learning would begin.
     """
-    ratios = worst_of(study, results, 'max_error_ratio')
-    found = {
-        variation.column.removeprefix(_DRAWN): _explained(results[variation.column], ratios)
-        for variation in study.variations
-        if np.unique(results[variation.column]).size > 1
+    start = study.settings.settled_after
+    early = [results[f'{law}first_violation_s'] < start for law in (NOISE, WITHOUT)]
+    late = {name: values[~np.any(early, axis=0)] for name, values in results.items()}
+    return _compare(study, results, '') | {'noise': _compare(study, late, NOISE)}
+
+
+def _compare(study: Study, results: Columns, law: str) -> Summary:
+    """Compare the runs of a law, by its prefix, with those without learning.
+
+    `factor` is the largest settled error with it over that without. It and the medians are of the
+    runs that keep the bound without. `near` counts the runs that come near the bound without, with
+    a largest error that is at least 1 % larger or smaller with it.
+    """
+    laws = {law: 'with', WITHOUT: 'without'}
+    kept, without = (results[f'{each}outcome'] == KEPT for each in laws)
+    settled, settled_without = (
+        _worst_of(study, results, 'settled_error_ratio', each)[without] for each in laws
+    )
+    factors = settled / settled_without
+    above = np.flatnonzero(~(factors <= ALLOWED))
+    of = factors if factors.size else [np.nan]
+    quantiles = np.quantile(of, [*_FACTORS.values()], method='higher')
+    largest, before = (_worst_of(study, results, 'max_error_ratio', each) for each in laws)
+    near = (_NEAR[0] <= before) & (before <= _NEAR[1])
+    change = largest[near] / before[near]
+    return {
+        'near': {'larger': int((change >= 1.01).sum()), 'smaller': int((change <= 0.99).sum())},
+        'kept': {'with': int(kept.sum()), 'without': int(without.sum())},
+        'broken_only_with': results['run'][without & ~kept].tolist(),
+        'broken_only_without': results['run'][kept & ~without].tolist(),
+        'factor': dict(zip(_FACTORS, quantiles, strict=True)),
+        'allowed': 1.0 - above.size / max(1, factors.size),
+        'above': results['run'][without][above[np.argsort(-factors[above])]].tolist(),
+        'median': {
+            name: {
+                label: float(np.median(known)) if known.size else np.nan
+                for each, label in laws.items()
+                for known in [_known(study, results, name, each)]
+            }
+            for name in ('rms_error_rad', 'torque_error.end')
+        },
     }
-    return dict(sorted(found.items(), key=lambda item: -item[1]))
 
 
-def _explained(values: np.ndarray, ratios: Floats) -> float:
-    groups = np.unique(values, return_inverse=True)[1]
-    if groups.max() >= _GROUPS:
-        groups = (_GROUPS * rankdata(values) / (values.size + 1)).astype(int)
-    parts = [ratios[groups == group] for group in np.unique(groups)]
-    freedom = ratios.size - len(parts)
-    if freedom <= 0 or np.unique(ratios).size == 1:
-        return 0.0
-    H = kruskal(*parts).statistic  # n - 1 times the correlation ratio of the ranks
-    return max(0.0, float(1.0 - (ratios.size - 1 - H) / freedom))
+def _worst_of(study: Study, results: Columns, name: str, law: str = '') -> Floats:
+    """Return a figure of the worst joint in each run; infinite if it diverged or did not begin."""
+    each = [results[f'{law}{name}.{joint}'] for joint in study.plant.joints]
+    lost = np.isin(results[f'{law}outcome'], (DIVERGED, REJECTED))
+    return np.where(lost, np.inf, np.max(each, axis=0))
 
 
-def _quantiles(values: Floats) -> Summary | None:
-    known = values[np.isfinite(values)]
-    if known.size == 0:
-        return None
-    quantiles = np.quantile(known, list(_QUANTILES.values())).tolist()
-    return {**dict(zip(_QUANTILES, quantiles, strict=True)), 'known': known.size}
+def _known(study: Study, results: Columns, name: str, law: str) -> Floats:
+    """Return the finite values of a figure, of the runs that keep the bound without learning."""
+    column = f'{law}{name}'
+    values = results[column] if column in results else _worst_of(study, results, name, law)
+    kept = results[f'{WITHOUT}outcome'] == KEPT
+    return np.asarray(values[kept & np.isfinite(values)])
+
+
+def _pair_figures(pairs: Summary) -> dict[str, str]:
+    """Return the figures of a comparison of pairs, by their titles."""
+    kept, factor, noise = pairs['kept'], pairs['factor'], pairs['noise']
+    broken, noisy = (
+        [len(each[f'broken_only_{law}']) for law in _LAWS.values()] for each in (pairs, noise)
+    )
+    interval = binomtest(broken[0], max(1, kept['without'])).proportion_ci(method='exact')
+    rms, model = (
+        ' / '.join(f'{unit * value:.3g}' for value in pairs['median'][name].values())
+        for name, unit in (('rms_error_rad', 1e3), ('torque_error.end', 1e2))
+    )
+    return {
+        'bound kept with learning / without': f'{kept["with"]} / {kept["without"]}',
+        'broken only with / only without': f'{broken[0]} / {broken[1]}',
+        'of those kept without, 95 % interval': (
+            f'{100.0 * interval.low:.2f} to {100.0 * interval.high:.2f} %'
+        ),
+        'near the bound: error larger / smaller with': ' / '.join(map(str, pairs['near'].values())),
+        'largest error at most 1.3 times that without': f'{100.0 * pairs["allowed"]:.2f} %',
+        'other noise instead of learning: broken only with / only without, at most 1.3 times': (
+            f'{noisy[0]} / {noisy[1]}, {100.0 * noise["allowed"]:.2f} %'
+        ),
+        'factor: median, 99.9 %, largest': ', '.join(
+            f'{factor[name]:.2f}' for name in ('median', 'p99.9', 'max')
+        ),
+        'rms error with / without [mrad]': rms,
+        'torque error on the next motion with / without [%]': model,
+    }
 
 
 def write_report(store: Store) -> tuple[Summary, list[Path]]:
@@ -139,9 +205,9 @@ def write_report(store: Store) -> tuple[Summary, list[Path]]:
     _draw_distributions(study, results, figures[0])
     if study.settings.pairs:
         figures.append(folder / 'pairs.png')
-        draw_pairs({'': (study, results)}, figures[-1])
+        _draw_pairs({'': (study, results)}, figures[-1])
         found = compare_pairs(study, results)
-        pairs, broken = pair_figures(found), found['broken_only_with']
+        pairs, broken = _pair_figures(found), found['broken_only_with']
         exceptions = [(run, 'breaks the bound only with learning') for run in broken]
         what = f'largest error more than {ALLOWED:g} times that without learning'
         exceptions += [(run, what) for run in found['above'] if run not in broken]
@@ -161,22 +227,17 @@ def write_report(store: Store) -> tuple[Summary, list[Path]]:
         pairs=[*pairs.items()],
         worst=[
             (
-                f'{run["run"]}',
-                run['outcome'],
-                _number(run['max_error_ratio']),
-                _number(run['first_violation_s']),
-                again(run['run']),
+                f'{run}',
+                outcome,
+                *('-' if value is None else f'{value:.4g}' for value in values),
+                again(run),
             )
-            for run in summary['worst']
+            for run, outcome, *values in (each.values() for each in summary['worst'])
         ],
         exceptions=[(f'{run}', what, again(run)) for run, what in exceptions],
         varied=[
-            (
-                Cell(name := variation.column.removeprefix(_DRAWN), 'code'),
-                Cell(f'{variation.distribution}', 'code'),
-                _percent(summary['influence'].get(name, 0.0)),
-            )
-            for variation in study.variations
+            (Cell(each.column.removeprefix('plant.'), 'code'), Cell(f'{each.distribution}', 'code'))
+            for each in study.variations
         ],
     )
     write_summary(summary, numbers)
@@ -199,6 +260,26 @@ def headline(summary: Summary) -> str:
     )
 
 
+def _percent(fraction: float) -> str:
+    return f'{100 * fraction:.4g} %'
+
+
+def write_comparison(stores: Sequence[Store], folder: Path) -> str:
+    """Write changes.png and changes.md, studies of pairs side by side; return the table in it."""
+    found = {store.folder.name: (store.study, store.results()) for store in stores}
+    rows = []
+    for name, (study, results) in found.items():
+        if not study.settings.pairs:
+            raise BlfDscError(f'{name} holds no pairs: its study needs pairs: true')
+        figures = _pair_figures(compare_pairs(study, results))
+        rows.append({'study': name, 'runs': f'{results["run"].size}'} | figures)
+    _draw_pairs(found, folder / 'changes.png')
+    lines = [rows[0], ['---'] * len(rows[0]), *(row.values() for row in rows)]
+    text = ''.join(f'| {" | ".join(line)} |\n' for line in lines)
+    (folder / 'changes.md').write_text(text, encoding='utf-8')
+    return text
+
+
 def reproduce_command(folder: Path, run: int) -> str:
     """Return the command that repeats a run and records it."""
     out = shlex.quote(f'{folder.name}-run-{run}')
@@ -217,7 +298,6 @@ def reproduce(store: Store, run: int, out: Path) -> Summary:
     if run not in results['run']:
         raise BlfDscError(f'{store.folder} has no run {run}: it has {results["run"].size} runs')
     row = int((results['run'] == run).argmax())
-    unseen = rows_of_another_motion(study)
     summaries = []
     for prefix, law in study.laws().items():
         plant = plant_with(study, draw(study, run), prefix)
@@ -230,7 +310,7 @@ def reproduce(store: Store, run: int, out: Path) -> Summary:
         summaries.append(summarize_run(recorded))
         write_summary(summaries[-1], folder / 'summary.json')
         draw_run(recorded, folder)
-        here = figures_of(study, record, plant, unseen)
+        here = figures_of(study, record, plant)
         different = differences({name: results[f'{prefix}{name}'][row] for name in here}, here)
         if different:
             raise BlfDscError(
@@ -240,36 +320,91 @@ def reproduce(store: Store, run: int, out: Path) -> Summary:
     return summaries[0]
 
 
-def _number(value: float | None) -> str:
-    return '-' if value is None else f'{value:.4g}'
-
-
-def _percent(fraction: float) -> str:
-    return f'{100 * fraction:.4g} %'
-
-
 def _draw_distributions(study: Study, results: Columns, path: Path) -> None:
     """Draw the fraction of runs up to each error: largest, rms, and of the parameters."""
     share = _percent(np.mean(results['outcome'] == KEPT))
     title = f'{results["outcome"].size} runs: {share} kept the bound'
     picture = Picture(1, 3, title, (5.2, 3.6), share_time=False)
-    settled = f'error from {study.settings.settled_after:g} s on'
-    joints = study.plant.joints
-    panels = {
-        'largest error': ({f'max_error_ratio.{joint}': joint for joint in joints}, 1.0, RATIO),
-        settled: ({f'rms_error_rad.{joint}': joint for joint in joints}, 1e3, _RMS),
-        'relative parameter error': ({'parameter_error.end': 'at the end'}, 1e2, _MODEL),
-    }
-    for axes, (title, (columns, unit, label)) in zip(picture.axes[0], panels.items(), strict=True):
-        for (column, text), colour in zip(columns.items(), COLOURS, strict=False):
-            known = np.sort(unit * results[column][np.isfinite(results[column])])
-            if label == RATIO:
-                known = np.minimum(known, SHOWN[1])
-            axes.plot(known, np.linspace(0.0, 1.0, known.size), color=colour, label=text)
-        logarithmic(axes)
+    largest, rms, parameters = picture.axes[0]
+    for axes, name, unit, label, title in (
+        (largest, 'max_error_ratio', 1.0, _RATIO, 'largest error'),
+        (rms, 'rms_error_rad', 1e3, _RMS, f'error from {study.settings.settled_after:g} s on'),
+        (parameters, 'parameter_error', 1e2, _MODEL, 'relative parameter error'),
+    ):
+        each = ('end',) if axes is parameters else study.plant.joints
+        for what, colour in zip(each, COLOURS, strict=False):
+            column = results[f'{name}.{what}']
+            known = np.sort(unit * column[np.isfinite(column)])
+            if axes is largest:
+                known = np.minimum(known, _SHOWN[1])
+            axes.plot(known, np.linspace(0.0, 1.0, known.size), color=colour, label=what)
+        _make_logarithmic(axes)
         axes.yaxis.set_major_formatter(PercentFormatter(1.0))
         axes.set_xlabel(label)
         axes.set_ylabel('fraction of runs below')
         head(axes, title)
-    picture.axes[0, 0].axvline(1.0, color=ALARM, lw=1.4)
+    largest.axvline(1.0, color=ALARM, lw=1.4)
     picture.save(path)
+
+
+def _draw_pairs(studies: Studies, path: Path) -> None:
+    """Compare studies of pairs: errors and learned models, with learning and without."""
+    picture = Picture(
+        1, 3, 'The same random runs with learning and without it', (5.2, 4.2), share_time=False
+    )
+    largest, rms, model = picture.axes[0]
+    for (title, (study, results)), colour in zip(studies.items(), COLOURS, strict=False):
+        x, y = (_worst_of(study, results, 'settled_error_ratio', law) for law in (WITHOUT, ''))
+        lost = (results['outcome'] != KEPT) & (results[f'{WITHOUT}outcome'] == KEPT)
+        x, y = (np.clip(values, *_SHOWN) for values in (x, y))
+        chosen = np.flatnonzero(~lost)[:_MOST_DOTS]
+        largest.plot(x[chosen], y[chosen], '.', ms=4, color=colour, alpha=0.6, mew=0, label=title)
+        largest.plot(x[lost], y[lost], 'o', ms=5, color=ALARM, mew=0)
+    ends = np.array(_SHOWN)
+    largest.loglog(ends, ends, color=MUTED, lw=1.0, label='equal')
+    largest.loglog(ends, ALLOWED * ends, color=MUTED, lw=1.0, ls=':', label=f'{ALLOWED:g} times')
+    _make_logarithmic(largest, both=True)
+    largest.axhline(1.0, color=INK, ls='--', lw=1.0, label='bound')
+    largest.axvline(1.0, color=INK, ls='--', lw=1.0)
+    largest.set_xlabel(f'{_RATIO} without learning')
+    largest.set_ylabel('with learning')
+    head(largest, 'largest error of each run')
+    _draw_boxes(rms, 'rms_error_rad', 1e3, studies)
+    rms.set_xlabel(r'rms $\xi_1$ of the worst joint [mrad]')
+    head(rms, 'rms error')
+    _draw_boxes(model, 'torque_error.end', 1e2, studies)
+    model.set_xlabel('of the torque [%]')
+    head(model, 'model error on the next motion')
+    picture.save(path)
+
+
+def _draw_boxes(axes: Axes, name: str, unit: float, studies: Studies) -> None:
+    """Draw the quartiles, and the 1 % and 99 % quantiles, of a figure with and without learning.
+
+    Of the runs that keep the bound without.
+    """
+    labels: list[str] = []
+    for title, (study, results) in studies.items():
+        for (law, label), colour in zip(_LAWS.items(), (BLUE, ORANGE), strict=True):
+            known = unit * _known(study, results, name, law)
+            y = 2 * [-len(labels)]
+            if known.size:
+                least, *quartiles, most = np.quantile(known, (0.01, 0.25, 0.5, 0.75, 0.99))
+                axes.plot([least, most], y, color=colour, lw=1.2)
+                axes.plot([quartiles[0], quartiles[2]], y, color=colour, lw=7, alpha=0.6)
+                axes.plot(quartiles[1:2], y[:1], 'o', color=INK, ms=4)
+            labels.append(f'{title}, {label}'.removeprefix(', '))
+    axes.set_yticks(-np.arange(len(labels)), labels)
+    _make_logarithmic(axes)
+
+
+def _make_logarithmic(axes: Axes, *, both: bool = False) -> None:
+    """Make the x axis, or both, of drawn data logarithmic, with plain numbers at 1, or 1, 2, 5."""
+    axes.set_xscale('log')
+    for axis in (axes.xaxis, axes.yaxis)[: 1 + both]:
+        low, high = axis.get_view_interval()
+        axis.set_major_locator(
+            LogLocator(subs=(1.0, 2.0, 5.0) if high < _FEW_DECADES * low else (1.0,))
+        )
+        axis.set_major_formatter('{x:g}')
+        axis.set_minor_formatter(NullFormatter())

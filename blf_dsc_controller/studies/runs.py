@@ -22,7 +22,7 @@ import re
 import shutil
 import signal
 import threading
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator
 from concurrent.futures import BrokenExecutor, Executor, ProcessPoolExecutor, as_completed
 from contextlib import contextmanager
 from dataclasses import replace
@@ -34,26 +34,25 @@ from typing import Any
 import numpy as np
 
 import blf_dsc_controller
-from blf_dsc_controller.arms.model import regressors_at
+from blf_dsc_controller.analysis.summary import write_summary
 from blf_dsc_controller.compiled.jit import cache_folder
-from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.nodes import dump
 from blf_dsc_controller.configuration.plant import PlantConfig
-from blf_dsc_controller.configuration.schema import change
 from blf_dsc_controller.errors import BlfDscError, MissingExtraError, StartError
-from blf_dsc_controller.law.factory import controller_of, model_of
+from blf_dsc_controller.law.factory import controller_of
 from blf_dsc_controller.law.state import sample_of
 from blf_dsc_controller.messages.journal import Journal
-from blf_dsc_controller.reference.approach import MotionError, reference_of
-from blf_dsc_controller.reference.terms import sampled
-from blf_dsc_controller.run import Floats
+from blf_dsc_controller.reference.approach import MotionError
 from blf_dsc_controller.simulation.loop import Record, new_record, run_alone, run_loop
-from blf_dsc_controller.studies.monte_carlo import Drawn, Study, draw, load_study, plant_with
+from blf_dsc_controller.studies.monte_carlo import (
+    Drawn,
+    Study,
+    draw,
+    load_study,
+    plant_with,
+    torque_error,
+)
 from sim_plant.plant import parameter_order, plant_of
-
-_UNSEEN = 1000  # seed of the motion on which the torque of the learned model is judged
-_ROWS = 200  # postures of that motion
-_ROWS_FOR = 15.0  # s
 
 KEPT = 'kept'
 VIOLATED = 'violated'
@@ -91,41 +90,8 @@ def run_chunk(study: Study, first: int, count: int) -> Columns:
         prefix: new_record(controller_of(config), config, study.plant, Journal())
         for prefix, config in study.laws().items()
     }
-    unseen = rows_of_another_motion(study)
-    rows = [_run(study, run, records, unseen) for run in range(first, first + count)]
+    rows = [_run(study, run, records) for run in range(first, first + count)]
     return {name: np.array([row[name] for row in rows]) for name in rows[0]}
-
-
-def rows_of_another_motion(study: Study) -> Floats | None:
-    """Return rows of H (k, p) of a motion that is never run; None without sinusoids."""
-    law = study.controller
-    if law.reference.type != 'sinusoids':
-        return None
-    return torque_rows(another_motion(law, _UNSEEN))
-
-
-def another_motion(config: ControllerConfig, seed: int) -> ControllerConfig:
-    """Return a configuration with other signs and phases of the reference's sinusoids."""
-    random, reference = np.random.default_rng(seed), config.reference
-    signs = random.choice((-1.0, 1.0), len(reference.amplitude))
-    motion = {
-        'reference.amplitude': (signs * reference.amplitude).tolist(),
-        'reference.phase': random.uniform(0.0, 2.0 * np.pi, len(reference.phase)).tolist(),
-    }
-    return change(config, motion)
-
-
-def torque_rows(config: ControllerConfig) -> np.ndarray:
-    """Return the rows of H(q, q', q', q'') (k, p) along the configured reference."""
-    model = model_of(config)
-    times = np.linspace(0.0, _ROWS_FOR, _ROWS)
-    q, dq, ddq = np.moveaxis(sampled(reference_of(config), times), 1, 0)
-    return regressors_at(model, q, dq, dq, ddq).reshape(_ROWS * model.n, -1)
-
-
-def torque_error(rows: np.ndarray, estimate: np.ndarray, P: np.ndarray) -> float:
-    """Return the torque error of a learned model on such rows, relative to their torque."""
-    return float(np.linalg.norm(rows @ (estimate - P)) / np.linalg.norm(rows @ P))
 
 
 def warm_up(study: Study) -> None:
@@ -135,11 +101,10 @@ def warm_up(study: Study) -> None:
     run_chunk(replace(study, plant=plant, settings=settings), 0, 1)
 
 
-def figures_of(study: Study, record: Record, plant: PlantConfig, unseen: Floats | None) -> Row:
+def figures_of(study: Study, record: Record, plant: PlantConfig) -> Row:
     """Return the columns of a run from its record; NaN for events that did not happen.
 
-    Nothing counts from the first number on that is not finite. `unseen` are the rows of H of
-    another motion.
+    Nothing counts from the first number on that is not finite.
     """
     law, t = record.controller.settings, record.stamps * 1e-9
     at, efforts = sample_of(np.arange(record.samples.shape[1]), law), 2 * law.n
@@ -175,12 +140,12 @@ def figures_of(study: Study, record: Record, plant: PlantConfig, unseen: Floats 
         found, P = estimate[-1], record.truths[-1, order]
         if end == t.size:
             row['parameter_error.end'] = float(np.linalg.norm(found - P) / np.linalg.norm(P))
-        if unseen is not None:
-            row['torque_error.end'] = torque_error(unseen, found, P)
+        if study.unseen is not None:
+            row['torque_error.end'] = torque_error(study.unseen, found, P)
     return row
 
 
-def _run(study: Study, run: int, records: dict[str, Record], unseen: Floats | None) -> Row:
+def _run(study: Study, run: int, records: dict[str, Record]) -> Row:
     row = draw(study, run)
     for prefix, record in records.items():
         config = plant_with(study, row, prefix)
@@ -189,9 +154,9 @@ def _run(study: Study, run: int, records: dict[str, Record], unseen: Floats | No
         with np.errstate(all='ignore'):  # a run that diverges has figures too
             try:
                 run_alone(record, plant, observed=False)
-                found = figures_of(study, record, config, unseen)
+                found = figures_of(study, record, config)
             except (StartError, MotionError):  # the record is that of the run before
-                found = dict.fromkeys(figures_of(study, record, config, unseen), nan)
+                found = dict.fromkeys(figures_of(study, record, config), nan)
                 found |= {'outcome': REJECTED, 'first_violation_s': 0.0}
         row |= {f'{prefix}{name}': value for name, value in found.items()}
     return row
@@ -216,13 +181,12 @@ def versions() -> dict[str, str]:
     }
 
 
-def differences(there: Mapping[str, object], here: Mapping[str, object]) -> str:
+def differences(there: dict[str, Any], here: dict[str, Any]) -> str:
     """Return lines for a message, one for each value that differs; empty if none does."""
-    names = [*there, *(name for name in here if name not in there)]
-    pairs = ((name, there.get(name, 'nothing'), here.get(name, 'nothing')) for name in names)
+    pairs = {name: (there.get(name, 'nothing'), here.get(name, 'nothing')) for name in there | here}
     return ''.join(
         f'\n  - {name}: there {old}, here {new}'
-        for name, old, new in pairs
+        for name, (old, new) in pairs.items()
         if old != new and (old == old or new == new)  # noqa: PLR0124 - NaN equals NaN here
     )
 
@@ -254,7 +218,12 @@ class Store:
         Raises BlfDscError if it holds no study, another one, or the same by another version.
         """
         if not os.path.lexists(folder):
-            _create(folder, study)
+            unfinished = folder.with_name(f'.{folder.name}.{os.getpid()}')
+            shutil.rmtree(unfinished, ignore_errors=True)
+            (unfinished / _RUNS).mkdir(parents=True)
+            dump(unfinished / _STUDY, study.values())
+            write_summary(versions(), unfinished / _VERSIONS)
+            unfinished.rename(folder)
         store = cls(folder)
         different = differences(store._versions, versions())
         different = different or differences(_flat(store.study), _flat(study))
@@ -325,17 +294,6 @@ class Store:
 def _flat(study: Study) -> dict[str, object]:
     nodes = study.values().items()
     return {f'{node}.{name}': value for node, values in nodes for name, value in values.items()}
-
-
-def _create(folder: Path, study: Study) -> None:
-    """Create the folder atomically."""
-    unfinished = folder.with_name(f'.{folder.name}.{os.getpid()}')
-    shutil.rmtree(unfinished, ignore_errors=True)
-    (unfinished / _RUNS).mkdir(parents=True)
-    dump(unfinished / _STUDY, study.values())
-    text = json.dumps(versions(), indent=2) + '\n'
-    (unfinished / _VERSIONS).write_text(text, encoding='utf-8')
-    unfinished.rename(folder)
 
 
 def cores() -> int:
