@@ -60,8 +60,11 @@ _BETWEEN_RUNS = 1_000_000_000  # ns from the last stamp before a reset to the fi
 class PlantNode(LoopNode[PlantConfig]):
     """Node that publishes measured joint states and applies the received torques.
 
-    `latency` measures how long, in real time, the arm waits for its torques.
+    `latency` measures how long, in real time, the arm waits for its torques. `plant_of` makes the
+    arm, in a subclass another one (examples/mujoco_plant).
     """
+
+    plant_of: Callable[[PlantConfig], Plant] = staticmethod(plant_of)
 
     def __init__(self, **options: Any) -> None:
         super().__init__(topics.PLANT, PlantConfig, **options)
@@ -93,7 +96,7 @@ class PlantNode(LoopNode[PlantConfig]):
 
     def configure(self) -> None:
         """Put the arm at its start; create the topics on the first call."""
-        self.plant = plant_of(self.config)
+        self.plant = self.plant_of(self.config)
         self._halt = ''  # why the arm stands still until a reset
         if self._changed:
             self._tell_parameters()

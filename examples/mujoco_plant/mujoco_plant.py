@@ -1,36 +1,26 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The same arm simulated by MuJoCo, behind the same two topics.
+"""The same arm with the mechanics of MuJoCo, as a node like `sim_plant`, with its parameters.
 
-It publishes `joint_states` in a different joint order than the controller's and with a gripper
-among them, and takes one step per torque on `blf_dsc_controller/commands` (lock-step).
-Its parameters are those of `sim_plant`; the arm comes from arm.xml or from a URDF that MuJoCo
-reads. Encoders, drives and the schedule of events are those of `sim_plant`, all mechanics are
-MuJoCo's.
+The arm comes from arm.xml or from a URDF that MuJoCo reads. Encoders, drives and the schedule of
+events are those of `sim_plant`, all mechanics are MuJoCo's.
 """
 
 from __future__ import annotations
 
-from contextlib import suppress
+import sys
 from pathlib import Path
-from typing import Any
 
 import mujoco
 import numpy as np
-import rclpy
-from rclpy.executors import ExternalShutdownException
-from rclpy.node import Node
-from sensor_msgs.msg import JointState
-from std_msgs.msg import Float64MultiArray
 
 from blf_dsc_controller.configuration.plant import PlantConfig
-from blf_dsc_controller.nodes import parameters
+from blf_dsc_controller.nodes import process
+from blf_dsc_controller.nodes.plant_node import PlantNode
 from sim_plant.drives import actuate
-from sim_plant.layout import state_of
+from sim_plant.layout import PlantSettings
 from sim_plant.motion import update_loads
-from sim_plant.plant import plant_of, plant_settings
+from sim_plant.plant import Plant, plant_settings
 
-FIRST_STAMP = 1.0  # s
-REPEAT = 1.0  # s, before an unanswered state is published again
 TIP = 'link2'  # body of arm.xml: a point mass at the tip
 PAYLOAD = 'payload of mujoco_plant'  # massless body at the tip of a URDF
 
@@ -74,31 +64,29 @@ def _apply_truth(config: PlantConfig, model: mujoco.MjModel) -> None:
     mujoco.mj_setConst(model, data)
 
 
-class MujocoArm:
+class MujocoArm(Plant):
     """The arm with its loads and events; arrays are in the order of the parameter `joints`."""
 
     def __init__(self, config: PlantConfig) -> None:
-        self.config = config
-        self.n = len(config.joints)
+        self._settings = plant_settings(config)
+        start = config.initial
+        super().__init__(self._settings, start.position, start.velocity, config.seed)
         self.model = model_of(config)
         self.data = mujoco.MjData(self.model)
-        self.data.qpos[:] = config.initial.position
-        self.data.qvel[:] = config.initial.velocity
         self._tip = self.model.body(PAYLOAD if config.robot.urdf else TIP)
         self._mass = self._tip.mass[0]
-        self._settings = plant_settings(config)
-        self._plant = plant_of(config)  # for all but its motion
-        self._now = state_of(self._plant.state, self._settings)
+        self.reset()
 
-    def change(self, config: PlantConfig) -> None:
+    def change(self, settings: PlantSettings) -> None:
         """Take over other loads, events and friction."""
-        self.config, self._settings = config, plant_settings(config)
-        self._plant.change(self._settings)
+        self._settings = settings
+        super().change(settings)
 
-    def measure(self) -> np.ndarray:
-        """Return a view (3 n,) of measured angles [rad], velocities [rad/s], torques [N m]."""
-        self._now.x[: 2 * self.n] = np.concatenate((self.data.qpos, self.data.qvel))
-        return self._plant.measure()
+    def reset(self) -> None:
+        """Return to sample 0."""
+        super().reset()
+        mujoco.mj_resetData(self.model, self.data)
+        self.data.qpos[:], self.data.qvel[:] = self._q, self._dq
 
     def step(self, torque: np.ndarray) -> None:
         """Take a step with this torque (n,) [N m] and the loads that act at its start."""
@@ -116,62 +104,15 @@ class MujocoArm:
         actuate(settings, now, torque)
         data.qfrc_applied[:] = now.drives.applied - (acting.constant + wave + ripple)
         mujoco.mj_step(self.model, data)
+        self._q[:], self._dq[:] = data.qpos, data.qvel
         now.sample[0] += 1.0
 
 
-class MujocoPlant(Node):
-    """The arm as a node.
+class MujocoPlant(PlantNode):
+    """The arm as a node."""
 
-    Attributes:
-        arm: the simulated arm.
-        steps: number of steps taken so far.
-    """
-
-    def __init__(self, **options: Any) -> None:
-        super().__init__('mujoco_plant', **options)
-        self.arm = MujocoArm(parameters.declare(self, PlantConfig))
-        parameters.on_change(self, PlantConfig, self.arm.change)
-        self.steps = 0
-        joints = self.arm.config.joints
-        self._names = (*joints[:0:-1], 'gripper', joints[0])  # the gripper is not simulated
-        self._states = self.create_publisher(JointState, 'joint_states', 1)
-        self.create_subscription(
-            Float64MultiArray, 'blf_dsc_controller/commands', self._on_command, 1
-        )
-        self._unanswered = self.create_timer(REPEAT, self._publish)
-
-    def _on_command(self, message: Float64MultiArray) -> None:
-        torque = np.array(message.data)
-        if torque.shape != (self.arm.n,) or not np.isfinite(torque).all():
-            self.get_logger().error(f'command rejected: {list(message.data)}')
-            return
-        self.arm.step(torque)
-        self.steps += 1
-        self._unanswered.reset()
-        self._publish()
-
-    def _publish(self) -> None:
-        nanoseconds = round((FIRST_STAMP + self.arm.data.time) * 1e9)
-        message = JointState(name=list(self._names))
-        message.header.stamp.sec, message.header.stamp.nanosec = divmod(nanoseconds, 10**9)
-        kinds = zip(
-            ('position', 'velocity', 'effort'), self.arm.measure().reshape(3, -1), strict=True
-        )
-        for kind, values in kinds:
-            of = dict(zip(self.arm.config.joints, values.tolist(), strict=True))
-            setattr(message, kind, [of.get(joint, 0.0) for joint in self._names])
-        self._states.publish(message)
-
-
-def main() -> None:
-    """Run the node until it is interrupted."""
-    rclpy.init()
-    node = MujocoPlant()
-    with suppress(KeyboardInterrupt, ExternalShutdownException):
-        rclpy.spin(node)
-    node.destroy_node()
-    rclpy.try_shutdown()
+    plant_of = MujocoArm
 
 
 if __name__ == '__main__':
-    main()
+    sys.exit(process.run(MujocoPlant))
