@@ -14,7 +14,7 @@ import pytest
 from closed_loop_case import controller, plant, quick, record
 from command import finished
 from numba.core.runtime import _nrt_python, rtsys
-from paper_case import EXACT, P, configured, run
+from paper_case import NO_DISTURBANCE, P, configured, run
 
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.schema import build
@@ -128,10 +128,12 @@ def test_comparison_laws_are_the_linear_surface_with_their_gains(law, share):
 
 
 def test_proposed_law_with_everything_known_and_frozen_equals_model_based():
-    known = {'learning.initial_estimate': list(P), 'truth.feed_forward': True}
-    known |= {'learning.adaptation_gain': [0.0] * 3, 'disturbance.gain': [0.0] * 2}
-    frozen = run(configured('recommended', 10.0, EXACT | known))
-    model_based = run(configured('recommended', 10.0, EXACT | {'law': 'model_based'}))
+    frozen = {'learning.initial_estimate': list(P), 'disturbance.gain': [0.0] * 2}
+    frozen |= {'learning.adaptation_gain': [0.0] * 3}
+    known = {'law': 'model_based', 'truth.parameters': list(P)}
+    frozen, model_based = (
+        run(configured('recommended', 10.0, law, NO_DISTURBANCE)) for law in (frozen, known)
+    )
     np.testing.assert_allclose(frozen.torque, model_based.torque, atol=1e-12)
     np.testing.assert_allclose(frozen.xi1, model_based.xi1, atol=1e-15)
 

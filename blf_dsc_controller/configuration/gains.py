@@ -164,7 +164,6 @@ class KnownArm:
     amplitude: PerJoint = _known((0.0, 0.0), 'amplitude of the sinusoid', 'N m')
     frequency: PerJoint = _known((1.0, 1.0), 'frequency of the sinusoid', 'rad/s', at_least=0.0)
     phase: PerJoint = _known((0.0, 0.0), 'phase of the sinusoid', 'rad')
-    feed_forward: bool = _known(False, 'compensate the known disturbance; model_based always does')
 
     def problems(self, law: str, model: str, count: int, radius: float) -> Iterator[str]:
         """Check that the parameters fit the model and the ball, and are given if required."""
@@ -198,8 +197,8 @@ class Learning:
     update: Literal['newton', 'gradient'] = parameter(
         'newton', 'step along the prediction error: regularised Newton, or the gradient (paper)'
     )
-    prediction: Literal['filtered', 'acceleration', 'lambda'] = _in_window(
-        'filtered', 'prediction error by filtered regressor, estimated acceleration or Lambda (24)'
+    prediction: Literal['filtered', 'lambda'] = _in_window(
+        'filtered', 'prediction error by filtered regressor, or by Lambda (24)'
     )
     regularization: float = positive(1e-5, 'regularisation of the Newton step', symbol='rho')
     excitation_threshold: float = positive(
@@ -232,7 +231,7 @@ class Learning:
         omittable=True,
     )
     derivative_filter: float = _in_window(
-        100.0, 'frequency of filter (8) for lambda and acceleration', 'rad/s', 'omega', above=0.0
+        100.0, 'frequency of filter (8) for lambda', 'rad/s', 'omega', above=0.0
     )
     radius: float = positive(3.0, 'radius of the projection ball of P^', 'kg m^2', 'omega_a')
     compensation: Literal['reference', 'state'] = parameter(

@@ -27,6 +27,7 @@ from blf_dsc_controller.law import (
 )
 from blf_dsc_controller.law.checks import (
     INVALID,
+    Checks,
     bridge_repeats,
     check_sample,
     checks_of,
@@ -115,6 +116,7 @@ def fill_sample(settings: Settings, state: State, signals: Signals, sample: Samp
 @inner
 def step(
     settings: Settings,
+    checks: Checks,
     reference_vector: Array,
     state: State,
     signals: Signals,
@@ -122,18 +124,24 @@ def step(
     dt: float,
     measurement: Array,
     sample: Sample,
-) -> None:
-    """Run one sample, from the measurement to the torque; `lyapunov.fill_energies` is separate.
+) -> int:
+    """Run one sample, from the measurement to the torque; return the flags of its `checks`.
 
     The measurement is [q (n,) rad, dq (n,) rad/s, effort of the last interval (n,) N m],
     t [s] the time since the start, dt [s] since the last sample (at the first: until the next).
+    The terms of (29) are separate: `lyapunov.fill_energies`.
     """
-    n = settings.n
+    n, is_checked = settings.n, checks.velocity_limit[0] > 0.0
+    if is_checked and not is_valid_state(settings, checks, measurement):
+        return INVALID
+    if is_checked:
+        bridge_repeats(settings, checks, state, dt, measurement)
+    used = checks.used if is_checked else measurement
     for i in range(n):
-        signals.q[i] = measurement[i]
-        signals.dq[i] = measurement[n + i]
+        signals.q[i] = used[i]
+        signals.dq[i] = used[n + i]
     torque.find_added(settings, signals)
-    torque.find_applied(settings, state, signals, measurement)
+    torque.find_applied(settings, state, signals, used)
     reference.evaluate(reference_vector, t, signals.qr, signals.dqr, signals.ddqr)
     torque.known_disturbance(settings, signals, t)
     barrier.update_bound(settings, signals, t)
@@ -152,6 +160,7 @@ def step(
         state.torque[i] = signals.torque[i]
     state.samples[0] += 1.0
     fill_sample(settings, state, signals, sample)
+    return check_sample(settings, checks, state, signals, sample) if is_checked else 0
 
 
 @kernel
@@ -168,24 +177,16 @@ def update(
     t: float,
     dt: float,
 ) -> int:
-    """Run one sample of the law with all its telemetry, on packed vectors: see `step`.
-
-    Returns the flags of its checks (see `checks`), or 0 while they are off.
-    """
+    """Run `step` with all its telemetry, on packed vectors; return its flags."""
     settings = settings_of(settings_vector, sizes, model)
     state = state_of(state_vector, settings)
     signals = signals_of(signals_vector, settings)
     sample = sample_of(sample_vector, settings)
     checks = checks_of(checks_vector, settings)
-    is_checked = checks.velocity_limit[0] > 0.0
-    if is_checked and not is_valid_state(settings, checks, measurement):
-        return INVALID
-    if is_checked:
-        bridge_repeats(settings, checks, state, dt, measurement)
-    used = checks.used if is_checked else measurement
-    step(settings, reference_vector, state, signals, t, dt, used, sample)
-    fill_energies(settings, state, signals, sample)
-    return check_sample(settings, checks, state, signals, sample) if is_checked else 0
+    flags = step(settings, checks, reference_vector, state, signals, t, dt, measurement, sample)
+    if flags != INVALID:
+        fill_energies(settings, state, signals, sample)
+    return flags
 
 
 class Controller:

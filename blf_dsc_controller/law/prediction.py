@@ -8,10 +8,9 @@
 up to O(T^2).  Both sides pass through the same two cascaded poles, which preserves the identity and
 filters the noise of the difference quotient.  No acceleration is needed.
 
-`acceleration`.  ddq^ = alpha2' + xi2'^ with xi2'^ from the filter (8): X = H(q, dq, dq, ddq^).
-
 `lambda`.  The paper's (24): X = H(q, dq, alpha2, alpha2'), u = Lambda tau with the scalar
-Lambda = x^T y / x^T x,  x = [xi2'^ + alpha2'; xi2 + alpha2; 1],  y = [alpha2'; alpha2; 1].  Since
+Lambda = x^T y / x^T x,  x = [xi2'^ + alpha2'; xi2 + alpha2; 1],  y = [alpha2'; alpha2; 1], and
+xi2'^ from the filter (8).  Since
 tau = [M C G] x and H P = [M C G] y, this is exact only where y is parallel to x: its error is of
 first order in xi2 and xi2', and depends on the units.
 
@@ -32,7 +31,7 @@ from blf_dsc_controller.compiled.elementary import cos, exp, sin, tanh
 from blf_dsc_controller.compiled.jit import inner, kernel
 from blf_dsc_controller.compiled.layout import Array, sizes_of
 from blf_dsc_controller.law import barrier
-from blf_dsc_controller.law.settings import FILTERED, LAMBDA, Settings, settings_of
+from blf_dsc_controller.law.settings import FILTERED, Settings, settings_of
 from blf_dsc_controller.law.state import Signals, State
 
 
@@ -128,14 +127,10 @@ def heuristic_factor(settings: Settings, state: State, signals: Signals) -> floa
 
 
 @inner
-def accelerated_row(settings: Settings, state: State, signals: Signals) -> None:
-    """Write the row `acceleration` or `lambda` to `signals.row`, from ddq^ of `differentiate`."""
-    scale, q, dq, X = 1.0, signals.q, signals.dq, signals.momentum
-    if settings.prediction == LAMBDA:
-        scale = heuristic_factor(settings, state, signals)
-        settings.model.regressor(q, dq, state.alpha2, signals.dalpha2, X)
-    else:
-        settings.model.regressor(q, dq, dq, signals.acceleration, X)
+def lambda_row(settings: Settings, state: State, signals: Signals) -> None:
+    """Write the row `lambda` to `signals.row`, from ddq^ of `differentiate`."""
+    scale, X = heuristic_factor(settings, state, signals), signals.momentum
+    settings.model.regressor(signals.q, signals.dq, state.alpha2, signals.dalpha2, X)
     for i in range(settings.n):
         for j in range(settings.m):
             signals.row[i, j] = X[i, j] if j < settings.p else scale * signals.rest[i, j]
@@ -147,7 +142,7 @@ def form_row(settings: Settings, state: State, signals: Signals, dt: float) -> N
     """Write the configured row of the last interval to `signals.row` (n, m + 1)."""
     if settings.prediction != FILTERED:
         differentiate(settings, state, signals, dt)
-        accelerated_row(settings, state, signals)
+        lambda_row(settings, state, signals)
         return
     if state.samples[0] > 0.0:
         filter_row(settings, state, signals, dt)

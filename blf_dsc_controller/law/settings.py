@@ -10,7 +10,7 @@ from blf_dsc_controller.compiled.layout import Array, Fixed, view_of
 
 CHOICES = {
     'surface': ('filtered', 'linear'),
-    'prediction': ('filtered', 'acceleration', 'lambda'),
+    'prediction': ('filtered', 'lambda'),
     'update': ('gradient', 'newton'),
     'torque_source': ('command', 'effort'),
     'compensation': ('reference', 'state'),
@@ -19,7 +19,6 @@ CHOICES = {
 
 LINEAR = CHOICES['surface'].index('linear')
 FILTERED = CHOICES['prediction'].index('filtered')
-LAMBDA = CHOICES['prediction'].index('lambda')
 NEWTON = CHOICES['update'].index('newton')
 EFFORT = CHOICES['torque_source'].index('effort')
 REFERENCE = CHOICES['compensation'].index('reference')
@@ -53,7 +52,7 @@ class Settings(NamedTuple):
     coulomb: int  # 1: a column tanh(dq_i / coulomb_velocity) per joint
     tones: int  # number of frequencies, each with a sine and a cosine column per joint
     truth_known: int  # 1: true_parameters and true_disturbance are valid
-    feed_forward: int  # 1: the true disturbance is compensated
+    feed_forward: int  # 1: the true disturbance is compensated, as by model_based
     bumpless: int  # 1: d^3 gives up what the prediction error adds to the torque
     change_detection: int  # 1: windows must be consistent (see `excitation`)
     time_constant: float  # lambda of (13), s

@@ -20,13 +20,7 @@ from blf_dsc_controller.compiled.layout import view
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.plant import PlantConfig
 from blf_dsc_controller.configuration.schema import flatten
-from blf_dsc_controller.law.checks import (
-    SUSPECT,
-    bridge_repeats,
-    check_sample,
-    checks_of,
-    is_valid_state,
-)
+from blf_dsc_controller.law.checks import INVALID, SUSPECT, checks_of
 from blf_dsc_controller.law.controller import Controller, step
 from blf_dsc_controller.law.factory import begin, controller_of
 from blf_dsc_controller.law.lyapunov import fill_energies
@@ -79,25 +73,21 @@ def run_loop(
     reference_view, measured, true = view(reference), view(measurements), view(truths)
     rows = view(samples)
     checks = checks_of(view(checks_vector), law)
-    is_checked = checks.velocity_limit[0] > 0.0
     dt = plant.period_ns * 1e-9
     for k in range(first, last + 1):
         measurement, sample = measured[k - first], sample_of(rows[k - first], law)
         t = (k * plant.period_ns) * 1e-9
         plants.draw_noise(plant, now, rng)
         plants.observe(plant, now, measurement)
-        if is_checked and not is_valid_state(law, checks, measurement):
+        flags = step(
+            law, checks, reference_view, law_state, law_signals, t, dt, measurement, sample
+        )
+        if flags & (INVALID | SUSPECT):
             return False
-        if is_checked:
-            bridge_repeats(law, checks, law_state, dt, measurement)
-        used = checks.used if is_checked else measurement
-        step(law, reference_view, law_state, law_signals, t, dt, used, sample)
         plants.truth(plant, now, true[k - first])
         if observed:
             fill_energies(law, law_state, law_signals, sample)
             add_row(law, law_state, law_signals, dt)
-        if is_checked and check_sample(law, checks, law_state, law_signals, sample) & SUSPECT:
-            return False
         if not (is_end and k == last):
             plants.step(plant, now, sample.torque)
     return True
