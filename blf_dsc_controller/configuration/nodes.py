@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The nodes by name: their configurations, the files and presets that set them, and their page.
 
-`python -m blf_dsc_controller.configuration.nodes doc/parameters.md` writes the page.
+`python -m blf_dsc_controller.configuration.nodes doc/parameters.md` writes the tables of the page.
 """
 
 from __future__ import annotations
@@ -39,20 +39,6 @@ _of_bag = partial(parameter, read_only='a bag is opened once, when the recorder 
 _of_watchdog = partial(parameter, read_only='it is read once, when the node starts')
 _of_view = partial(parameter, read_only='the page is served once, when the node starts')
 Config = TypeVar('Config')
-_PREFACE = """\
-# Parameters
-
-All parameters of all nodes; the defaults are the recommended set. One parameter file serves all
-nodes and needs only the parameters it changes; `blf_dsc run` writes one with all values into its
-folder, `config.yaml`. Values of type double need a decimal point: `1.0`, not `1`. `entries: joints`
-is one entry per joint.
-
-A dot under *live* marks a parameter that can change while the node runs (`ros2 param set`); the
-others are fixed at the start, and `ros2 param describe` gives the reason.
-
-This page is generated: `python -m blf_dsc_controller.configuration.nodes
-doc/parameters.md`.
-"""
 _HEADER = (
     '| name | description | default | unit | range | live | type | symbol |\n'
     '| --- | --- | --- | --- | --- | --- | --- | --- |\n'
@@ -182,11 +168,12 @@ def read(path: str | Path, based: tuple[str, ...] = ()) -> Sequence[Section]:
     `based` are the files that are based on it.
     """
     try:
-        sections = list(parse(read_text(Path(path))))
-        base = _base_of(sections)
+        sections = parse(read_text(Path(path)))
+        named = (each for each in sections if each.pattern.endswith('/monte_carlo'))
+        base = next((each.entries['base'].value for each in named if 'base' in each.entries), None)
         if base is None:
             return sections
-        below, above = locate(base), (*based, str(path))
+        below, above = locate(str(base)), (*based, str(path))
     except (UnicodeDecodeError, OSError) as error:
         raise ConfigurationError([str(error)], str(path)) from error
     except ConfigurationError as error:
@@ -195,16 +182,6 @@ def read(path: str | Path, based: tuple[str, ...] = ()) -> Sequence[Section]:
         problem = f'monte_carlo: base: {base!r} leads back to a file that is based on it'
         raise ConfigurationError([problem], str(path))
     return [*read(below, above), *sections]
-
-
-def _base_of(sections: list[Section]) -> str | None:
-    """Take the base out of the first sections that name it."""
-    for k, section in enumerate(sections):
-        if section.pattern.endswith('/monte_carlo') and 'base' in section.entries:
-            entries = dict(section.entries)
-            sections[k] = section._replace(entries=entries)
-            return str(entries.pop('base').value)
-    return None
 
 
 def load(
@@ -239,17 +216,38 @@ def load_loop(
 def _load_all(
     path: str | Path, nodes: Mapping[str, Any], overrides: Mapping[str, Mapping[str, object]]
 ) -> dict[str, Any]:
-    """Load the configurations of some nodes; a problem of several is reported once."""
-    sections = read(path)
-    problems = [*_unknown_names(sections), *unmatched_sections(sections, nodes)]
+    """Load the configurations of some nodes; a problem of several is reported once.
+
+    Names of other nodes in sections for several nodes are left out.
+    """
+    sections, known = read(path), known_names()
+    problems = [
+        f'line {entry.line}: {unknown(name, known)}'
+        for section in sections
+        for name, entry in section.entries.items()
+        if section.is_wildcard and name not in known and not is_builtin(name)
+    ]
+    problems += unmatched_sections(sections, nodes)
     configs: dict[str, Any] = {}
     nodes_with: dict[str, list[str]] = {}
     for node, cls in nodes.items():
+        own, chosen = {param.name for param in parameters(cls)}, overrides.get(node, {})
+        entries = {
+            name: entry
+            for section in sections
+            if section.matches('/' + node.removeprefix('/'))
+            for name, entry in section.entries.items()
+            if name in own or not (section.is_wildcard or is_builtin(name))
+        }
+        values = {name: entry.value for name, entry in entries.items()}
         try:
-            configs[node] = _load(sections, node, cls, overrides.get(node, {}))
+            configs[node] = build(cls, {**values, **chosen})
         except ConfigurationError as error:
             for problem in error.problems:
-                nodes_with.setdefault(problem, []).append(node)
+                name = problem.split(':', 1)[0]
+                line = f'line {entries[name].line}: ' if name in entries else ''
+                told = f'{problem} (given as an override)' if name in chosen else line + problem
+                nodes_with.setdefault(told, []).append(node)
     for problem, names in nodes_with.items():
         problems.append(f'{", ".join(names)}: {problem}' if len(nodes) > 1 else problem)
     if problems:
@@ -282,40 +280,6 @@ def format_value(value: Value) -> str:
     return json.dumps(value, ensure_ascii=False)
 
 
-def _load(
-    sections: Sequence[Section], node: str, cls: type[Config], overrides: Mapping[str, object]
-) -> Config:
-    """Build the configuration; names of other nodes in wildcard sections are left out."""
-    known = {param.name for param in parameters(cls)}
-    entries = {
-        name: entry
-        for section in sections
-        if section.matches('/' + node.removeprefix('/'))
-        for name, entry in section.entries.items()
-        if name in known or not (section.is_wildcard or is_builtin(name))
-    }
-    try:
-        return build(cls, {name: entry.value for name, entry in entries.items()} | dict(overrides))
-    except ConfigurationError as error:
-        problems = []
-        for problem in error.problems:
-            name = problem.split(':', 1)[0]
-            if name in overrides:
-                problems.append(f'{problem} (given as an override)')
-            else:
-                line = f'line {entries[name].line}: ' if name in entries else ''
-                problems.append(f'{line}{problem}')
-        raise ConfigurationError(problems) from None
-
-
-def _unknown_names(sections: Sequence[Section]) -> Iterator[str]:
-    known = known_names()
-    for section in sections:
-        for name, entry in section.entries.items():
-            if section.is_wildcard and name not in known and not is_builtin(name):
-                yield f'line {entry.line}: {unknown(name, known)}'
-
-
 def unmatched_sections(sections: Sequence[Section], nodes: Iterable[str]) -> Iterator[str]:
     """Yield a problem for each section that is meant for one of these nodes but would be ignored.
 
@@ -340,12 +304,14 @@ def unmatched_sections(sections: Sequence[Section], nodes: Iterable[str]) -> Ite
             )
 
 
-def parameter_page() -> str:
-    """Return the Markdown page of all parameters."""
-    page = _PREFACE
-    for node, cls in NODES.items():
-        page += f'\n## {node}\n\n{_HEADER}{"".join(_row(param) for param in parameters(cls))}'
-    return page
+def with_tables(page: str) -> str:
+    """Return the Markdown page of all parameters: what is above its first table stays."""
+    above = page.partition('\n## ')[0]
+    tables = (
+        f'\n## {node}\n\n{_HEADER}{"".join(map(_row, parameters(cls)))}'
+        for node, cls in NODES.items()
+    )
+    return above + ''.join(tables)
 
 
 def _row(param: Parameter) -> str:
@@ -363,4 +329,5 @@ def _row(param: Parameter) -> str:
 
 
 if __name__ == '__main__':
-    Path(sys.argv[1]).write_text(parameter_page(), encoding='utf-8')
+    page = Path(sys.argv[1])
+    page.write_text(with_tables(page.read_text(encoding='utf-8')), encoding='utf-8')

@@ -199,6 +199,7 @@ def _section(path: str | Path) -> dict[str, Entry]:
         for section in read(path)
         if section.matches(f'/{_NODE}') and not section.is_wildcard
         for name, entry in section.entries.items()
+        if name != 'base'  # which `read` has followed
     }
     if not entries:
         problem = (
