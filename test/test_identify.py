@@ -47,34 +47,36 @@ ROBOT = Robot(urdf=PANDA_TEXT)
 TRUTH = truth_of(PANDA_CHAIN, 1)
 
 
-def model_of(text, rotors):
+def torques(text, rotors, seed=77):
+    """Torques of a URDF along a motion that is in no bag, from pinocchio."""
     model = pinocchio_model(text, PANDA)
     model.armature[:] = rotors
-    return model
-
-
-def torques(model, seed=77):
-    """Torques along a motion that is in no bag, from pinocchio."""
     data, motion = model.createData(), reference_of(PANDA_CHAIN, seed).at(np.arange(0, 20, 0.05))
     return np.array([pinocchio.rnea(model, data, *row) for row in motion])
 
 
-def text_of(truth):
-    """The true arm as a URDF."""
-    return corrected_urdf(
-        PANDA_TEXT, PANDA_CHAIN, truth.inertias, truth.viscous, truth.coulomb, 'true'
-    )
+TRUE_TEXT = corrected_urdf(
+    PANDA_TEXT, PANDA_CHAIN, TRUTH.inertias, TRUTH.viscous, TRUTH.coulomb, 'true'
+)
 
 
 def unseen_error(text, rotors):
     """Relative error of the torques along an unseen motion."""
-    expected = torques(model_of(text_of(TRUTH), TRUTH.rotors))
-    return np.linalg.norm(torques(model_of(text, rotors)) - expected) / np.linalg.norm(expected)
+    expected = torques(TRUE_TEXT, TRUTH.rotors)
+    return np.linalg.norm(torques(text, rotors) - expected) / np.linalg.norm(expected)
 
 
 def corrected(found):
+    """The corrected URDF, with every body physical."""
     viscous, coulomb = found.dynamics
-    return corrected_urdf(PANDA_TEXT, found.chain, found.parts.bodies, viscous, coulomb, 'note')
+    text = corrected_urdf(PANDA_TEXT, found.chain, found.parts.bodies, viscous, coulomb, 'note')
+    is_physical(text)
+    return text
+
+
+def is_physical(text):
+    for body in read_chain(text, 'panda_link0', 'panda_hand_tcp', PANDA).inertias:
+        assert np.linalg.eigvalsh(pseudo_inertia(body))[0] > 0.0
 
 
 @pytest.fixture(scope='module')
@@ -93,17 +95,10 @@ def found(bag):
     return identify_bag(bag, ROBOT)
 
 
-def is_physical(text):
-    """Whether the pseudo-inertia of every body is positive definite."""
-    chain = read_chain(text, 'panda_link0', 'panda_hand_tcp', PANDA)
-    return all(np.linalg.eigvalsh(pseudo_inertia(body))[0] > 0.0 for body in chain.inertias)
-
-
 def test_corrected_urdf_predicts_the_torques_of_an_unseen_motion(found):
     assert unseen_error(PANDA_TEXT, np.zeros(7)) > 0.1
     text = corrected(found)
     assert unseen_error(text, found.parts.terms[0]) < 0.005
-    assert is_physical(text)
     assert mujoco.MjModel.from_xml_string(text).nq == 9  # MuJoCo loads it, fingers included
 
 
@@ -140,7 +135,7 @@ def test_confidence_intervals_contain_the_truth_as_often_as_stated():
 
 def test_arm_simulated_in_mujoco_is_identified(tmp_path):
     """MuJoCo has another integrator, true stiction and efforts simultaneous with positions."""
-    model = mujoco.MjModel.from_xml_string(text_of(TRUTH))
+    model = mujoco.MjModel.from_xml_string(TRUE_TEXT)
     model.opt.timestep = PERIOD
     model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONTACT
     model.dof_armature[:7] = TRUTH.rotors
@@ -156,9 +151,7 @@ def test_arm_simulated_in_mujoco_is_identified(tmp_path):
         state[:] = data.qpos[:7], data.qvel[:7], data.qfrc_applied[:7]
         mujoco.mj_step(model, data)
     found = identify_bag(write_states(tmp_path / 'bag', PANDA, measured(states, 4)), ROBOT)
-    text = corrected(found)
-    assert unseen_error(text, found.parts.terms[0]) < 0.005
-    assert is_physical(text)
+    assert unseen_error(corrected(found), found.parts.terms[0]) < 0.005
 
 
 def test_small_motion_of_two_joints_leaves_other_parameters_at_the_prior():
@@ -167,7 +160,7 @@ def test_small_motion_of_two_joints_leaves_other_parameters_at_the_prior():
     amplitude[0, [1, 3]] = 0.1
     states = shake(PANDA_CHAIN, TRUTH, reference._replace(amplitude=amplitude), 20.0)
     found = identify_arm(recording_of(measured(states, 3)), ROBOT)
-    assert is_physical(corrected(found))
+    corrected(found)
     G = base_matrix(found.parameters, 7)
     prior, posterior = (np.diag(G @ C @ G.T) for C in (found.prior_covariance, found.covariance))
     shown = dict(zip(found.parameters.combinations, posterior < 0.5 * prior, strict=False))
@@ -186,7 +179,7 @@ def test_command_writes_the_urdf_and_prints_the_table(bag, tmp_path, capsys):
     for word in ('panda_link7', 'rotor inertia', 'Izz1 + rotor1 + Iyy2', 'held back', 'delay of'):
         assert word in output
     assert 'NOT SHOWN' not in output
-    assert is_physical(out.read_text())
+    is_physical(out.read_text())
     assert main(command) == 1
     assert 'exists already' in capsys.readouterr().err
 
