@@ -12,8 +12,6 @@ from numpy.typing import NDArray
 
 Floats = NDArray[np.float64]
 Stamps = NDArray[np.int64]
-Rows = slice | NDArray[np.intp]
-_ALL = slice(None)
 
 
 @dataclass(frozen=True)
@@ -24,22 +22,18 @@ class Series:
     stamp: Stamps  #: (m,) ns, increasing
     values: Floats  #: (m, number of names)
 
-    def at(self, rows: Rows, columns: Rows = slice(None)) -> Floats:
-        """Return the values in some rows and columns."""
-        return self.values[rows][:, columns]
-
     def select(self, names: Sequence[str]) -> Floats:
         """Return the columns of these names, (m, number of `names`)."""
-        return self.at(slice(None), np.array([self.names.index(name) for name in names], np.intp))
+        return self.values[:, np.array([self.names.index(name) for name in names], np.intp)]
 
     def column(self, name: str) -> Floats:
         """Return the values of one name, (m,)."""
-        return self.select([name])[:, 0]
+        return self.values[:, self.names.index(name)]
 
-    def held(self, stamp: Stamps, columns: Rows = _ALL) -> Floats:
+    def held(self, stamp: Stamps, columns: slice | NDArray[np.intp] = slice(None)) -> Floats:
         """Return the last values at or before each stamp; the first values for earlier stamps."""
         index = np.searchsorted(self.stamp, stamp, side='right') - 1
-        return self.at(np.maximum(index, 0), columns)
+        return self.values[np.maximum(index, 0)][:, columns]
 
 
 class Stop(NamedTuple):
@@ -93,15 +87,10 @@ class Run:
     xi2: Floats | None = None  #: (N, n) rad/s
     notes: tuple[str, ...] = ()  #: samples of a bag that are left out, and why
 
-    def at(self, name: str, rows: Rows = _ALL, columns: Rows = _ALL) -> Floats | None:
-        """Return some rows and joints of an array by name; None if it is unknown."""
-        values: Floats | None = getattr(self, name)
-        return None if values is None else values[rows][:, columns]
-
     def column(self, name: str, i: int) -> Floats | None:
         """Return the values of one joint (N,) in an array by name; None if it is unknown."""
-        found = self.at(name, _ALL, np.array([i]))
-        return None if found is None else found[:, 0]
+        values = getattr(self, name)
+        return None if values is None else values[:, i]
 
     @property
     def time(self) -> Floats:

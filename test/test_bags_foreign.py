@@ -149,7 +149,7 @@ def torque_of(path, messages, names):
     content = read_content(write(path, messages), '', names)
     states, _, _ = single_run(content, names.joints_of(('joint1', 'joint2')))
     source, torque = applied_torque(content, states)
-    return source, torque.field(2)
+    return source, np.asarray(torque.field(2))
 
 
 def test_torques_are_those_of_the_commands_or_measured_or_unknown(tmp_path):

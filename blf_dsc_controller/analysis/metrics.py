@@ -63,7 +63,7 @@ def estimates_of(run: Run) -> Estimates | None:
     step = -(-run.learning.stamp.size // _MOST)
     rows = slice((run.learning.stamp.size - 1) % step, None, step)
     stamp = run.learning.stamp[rows]
-    estimate = run.learning.at(rows, _columns(run.learning, names))
+    estimate = run.learning.values[rows][:, _columns(run.learning, names)]
     of_torques = arm is not None and _parameters(arm.units) == names
     theirs = () if truth is None else _parameters(truth.names)
     true = error = None
@@ -103,7 +103,7 @@ def _torques(run: Run, regressor: Regressor) -> Floats:
     known = 1 + np.flatnonzero(finite[:-2] & finite[1:-1] & finite[2:])
     rows = known[np.linspace(0, known.size - 1, min(_POSTURES, known.size)).astype(int)]
     after, before = (np.diff(run.time)[rows + k, np.newaxis] for k in (0, -1))
-    earlier, q, later = (np.asarray(run.at(name, rows + k)) for k in (-1, 0, 1))
+    earlier, q, later = (getattr(run, name)[rows + k] for k in (-1, 0, 1))
     forward, backward = (later - q) / after, (q - earlier) / before
     dq = (after * backward + before * forward) / (after + before)
     ddq = 2.0 * (forward - backward) / (after + before)

@@ -185,8 +185,6 @@ def read_content(path: Path, namespace: str = '', names: NameMap = NO_NAMES) -> 
         adds = {messages.name: messages.add for messages in kept.values()}
         for message in bag.messages(adds):
             adds[message.topic](message)
-    for messages in kept.values():
-        messages.decode()
     return Content(path, namespace, names, kept, bag.counts, bag.facts)
 
 

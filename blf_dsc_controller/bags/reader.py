@@ -6,7 +6,7 @@ from __future__ import annotations
 import csv
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import fields
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -15,17 +15,12 @@ from numpy.typing import NDArray
 
 from blf_dsc_controller.bags.content import NO_NAMES, Content, NameMap, read_content
 from blf_dsc_controller.bags.sources import BagError
-from blf_dsc_controller.bags.topic_messages import (
-    ALL,
-    JointStates,
-    StoredSeries,
-    TopicMessages,
-)
+from blf_dsc_controller.bags.topic_messages import JointStates, TopicMessages, Values
 from blf_dsc_controller.errors import BlfDscError, MissingExtraError
 from blf_dsc_controller.messages import topics
 from blf_dsc_controller.messages.codecs import typestore
 from blf_dsc_controller.messages.journal import Event, EventType
-from blf_dsc_controller.run import Floats, LearnedArm, Rows, Run, Series, Stop
+from blf_dsc_controller.run import LearnedArm, Run, Series, Stop
 
 _MOST_FALLS = 10  # of the stamps, by resets of a simulator
 _ALTERNATING = 0.9  # ratio of the intervals to and from the state of another publisher
@@ -53,46 +48,8 @@ _VALUES = {  # prefix of names in the vectors: unit
     **dict.fromkeys((topics.COMPUTE_TIME, topics.LATENCY, topics.LATENESS), 's'),
 }
 _ROWS = 1 << 14
+_COMPLEMENTS = {'reference': 'errors', 'error': 'references'}
 _PARAMETER = 'kg m^2'  # of arms without a URDF
-_COMPLEMENTS = {'reference': 'error', 'error': 'reference'}
-
-
-class RecordedRun(Run):
-    """Run whose arrays are read from its bag's tables each time that they are asked for."""
-
-    def __init__(self, stored: Mapping[str, tuple[JointStates, int]], **values: Any) -> None:
-        """Take states and field of each array that is in a table, and all other values."""
-        for name, value in {**values, '_stored': stored}.items():
-            object.__setattr__(self, name, value)
-
-    def __getattribute__(self, name: str) -> Any:
-        stored = object.__getattribute__(self, '__dict__').get('_stored', ())
-        return self.at(name) if name in stored else object.__getattribute__(self, name)
-
-    def at(self, name: str, rows: Rows = ALL, columns: Rows = ALL) -> Floats | None:
-        """Return some rows and joints of an array; None if it is unknown.
-
-        Reference and error are computed from each other and the positions where one is lost.
-        """
-        if name not in self._stored:
-            return super().at(name, rows, columns)
-        states, k = self._stored[name]
-        values: Floats = states.field(k, rows, columns)
-        if name in _COMPLEMENTS and np.isnan(values).any():
-            position, other = (
-                states.field(k, rows, columns)
-                for states, k in (self._stored['position'], self._stored[_COMPLEMENTS[name]])
-            )
-            values = np.where(np.isnan(values), position - other, values)
-        return values
-
-    def in_memory(self) -> Run:
-        """Return the run with all of its arrays in memory."""
-        values = {field.name: getattr(self, field.name) for field in fields(Run)}
-        for name, value in values.items():
-            if isinstance(value, Series):
-                values[name] = Series(value.names, value.stamp, value.values)
-        return Run(**values)
 
 
 def read_run(path: str | Path, namespace: str = '', names: NameMap = NO_NAMES) -> Run:
@@ -105,11 +62,19 @@ def read_run(path: str | Path, namespace: str = '', names: NameMap = NO_NAMES) -
             robots, or the states of several runs.
         UnreadableMessageError: a message in it cannot be decoded.
     """
-    return recorded_run(read_content(Path(path), namespace, names)).in_memory()
+    run = recorded_run(read_content(Path(path), namespace, names))
+    loaded: dict[str, Any] = {}
+    for field in fields(Run):
+        value = getattr(run, field.name)
+        if isinstance(value, Values):
+            loaded[field.name] = np.asarray(value)
+        elif isinstance(value, Series):
+            loaded[field.name] = replace(value, values=np.asarray(value.values))
+    return replace(run, **loaded)
 
 
-def recorded_run(content: Content) -> RecordedRun:
-    """Return the run of a bag; errors as for `read_run`."""
+def recorded_run(content: Content) -> Run:
+    """Return the run of a bag, whose `Values` are read when needed; errors as for `read_run`."""
     joints = _joints(content)
     states, notes, span = single_run(content, content.names.joints_of(joints))
     if content.unknown_parameters:
@@ -129,7 +94,7 @@ def recorded_run(content: Content) -> RecordedRun:
 
     def series(topic: topics.Topic) -> Series | None:
         found = within(topic)
-        return None if found is None else StoredSeries(found)
+        return None if found is None else Series(found.names, found.stamp, found.field(0))
 
     errors, references, bounds = (
         within(topic, joints) for topic in (topics.TRACKING_ERROR, topics.REFERENCE, topics.BOUND)
@@ -145,16 +110,20 @@ def recorded_run(content: Content) -> RecordedRun:
         'references': references and references.at_stamps(stamp),
         'bounds': bounds and bounds.held(stamp),
     }
-    arrays = {name: (messages[source], k) for name, (_, source, k) in _ARRAYS.items()}
-    known = {name: (found, k) for name, (found, k) in arrays.items() if found is not None}
-    unknown = states.select(np.full(states.size, -1)), 0
-    for name, other in _COMPLEMENTS.items():
-        if other in known:
-            known.setdefault(name, unknown)
+    unknown = states.select(np.full(states.size, -1))
+    arrays: dict[str, Any] = {}
+    for name, (_, source, k) in _ARRAYS.items():
+        found, difference = messages[source], None
+        other = messages.get(_COMPLEMENTS.get(name, ''))
+        if other is not None:  # position less error is the reference, and the other way round
+            difference = states.field(0), other.field(0)
+        arrays[name] = None
+        if found is not None or difference is not None:
+            arrays[name] = Values(found or unknown, k, difference)
     events = [event for at, event in content.events if span[0] <= at < span[1]]
     learning = series(topics.LEARNING)
-    return RecordedRun(
-        known,
+    return Run(
+        **arrays,
         joints=joints,
         stamp=stamp,
         received=states.received,
@@ -168,7 +137,6 @@ def recorded_run(content: Content) -> RecordedRun:
         arm=_arm(content),
         learns=_learns([event.content.get('parameters', {}) for event in events]),
         notes=notes,
-        **dict.fromkeys(_ARRAYS.keys() - known.keys()),
     )
 
 
@@ -247,7 +215,7 @@ def _rejected_columns(content: Content, learning: Series | None) -> dict[str, st
     """Return columns that are NaN at the end of learning, with the reason in /diagnostics."""
     if learning is None:
         return {}
-    values = learning.at(np.array([learning.stamp.size - 1]))[0]
+    values = learning.values[learning.stamp.size - 1 :][0]
     columns = [learning.names[j] for j in np.flatnonzero(np.isnan(values))]
     columns = [name for name in columns if name != topics.COMPUTE_TIME]
     reasons: dict[str, str] = {}
@@ -314,7 +282,7 @@ def applied_torque(content: Content, states: JointStates) -> tuple[str, JointSta
         telemetry = errors.joint_states(states.names, ('effort',)).by_stamp()
         return f'effort of {errors.name}', telemetry.at_stamps(states.stamp)
     found = next_effort(states)
-    if np.isnan(found.field(2, slice(0, 1000))).all():
+    if np.isnan(found.field(2)[:1000]).all():
         raise TorqueError(
             f'{content.path} does not hold the torques: there is no command topic (map it: '
             '--map commands=/its/name) and the effort of the joint states is empty'
@@ -356,7 +324,7 @@ def _by_joint(content: Content, commands: TopicMessages, joints: tuple[str, ...]
 # The table, for spreadsheets, pandas and MATLAB.
 
 
-def table(run: RecordedRun, rows: slice = slice(None)) -> dict[str, NDArray[Any]]:
+def table(run: Run, rows: slice = slice(None)) -> dict[str, NDArray[Any]]:
     """Return some rows of every series of a run by name and unit, as `torque joint1 [N m]`.
 
     They are aligned to the stamps of its joint states. `stamp` and `received` are integers, all
@@ -370,9 +338,9 @@ def table(run: RecordedRun, rows: slice = slice(None)) -> dict[str, NDArray[Any]
         'time [s]': run.time_of(stamp),
     }
     for field, (unit, _, _) in _ARRAYS.items():
-        values = run.at(field, rows)
+        values = getattr(run, field)
         if values is not None:
-            for joint, column in zip(run.joints, values.T, strict=True):
+            for joint, column in zip(run.joints, values[rows].T, strict=True):
                 columns[f'{field} {joint} [{unit}]'] = column
     for topic in ('learning', 'truth', 'timing', 'monitor'):
         series = getattr(run, topic)
@@ -392,7 +360,7 @@ def _unit(name: str, run: Run) -> str:
     return known[0] if known else '1' if run.arm is not None else _PARAMETER
 
 
-def export(run: RecordedRun, path: Path) -> int:
+def export(run: Run, path: Path) -> int:
     """Write the table as CSV or Parquet, by the suffix of `path`; return the number of columns.
 
     It is written block by block: a run may be larger than memory. Numbers are read back exactly.

@@ -18,6 +18,7 @@ from blf_dsc_controller.bags.sources import open_bag
 from blf_dsc_controller.cli.main import make_room, require_ros
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.messages.journal import EventType
+from blf_dsc_controller.run import Run
 
 if TYPE_CHECKING:
     from blf_dsc_controller.replay.verify import Verification
@@ -42,7 +43,7 @@ def report(options: Namespace) -> None:
     print(f'wrote {options.out} ({options.out.stat().st_size / 1e6:.1f} MB)')
 
 
-def _run(options: Namespace) -> reader.RecordedRun:
+def _run(options: Namespace) -> Run:
     """Read the run of a bag, and print what is left out."""
     names = NameMap.parse(options.map)
     run = reader.recorded_run(read_content(options.bag, options.namespace, names))

@@ -77,13 +77,13 @@ def read_recording(
     joints = tuple(joints) or _arm_joints(text, set().union(*named), names)
     theirs = names.joints_of(joints)
     states, _, _ = single_run(content, theirs)
-    torque, source = states.field(2), f'effort of {content.topics[JOINT_STATES].name}'
+    torque, source = np.asarray(states.field(2)), f'effort of {content.topics[JOINT_STATES].name}'
     if commanded or not np.nan_to_num(torque).any():
         source, applied = applied_torque(content, states)
-        torque = applied.field(2)
+        torque = np.asarray(applied.field(2))
         if not np.nan_to_num(torque).any():
             raise BagError(f'{path}: all torques in the {source} are zero: record measured efforts')
-    return _resampled(joints, states.stamp, states.field(0), torque, source)
+    return _resampled(joints, states.stamp, np.asarray(states.field(0)), torque, source)
 
 
 def _arm_joints(text: str, in_bag: set[str], names: NameMap) -> tuple[str, ...]:

@@ -249,7 +249,7 @@ class Rerun:
         if row not in self._loaded:
             self._loaded = range(row, min(row + _BLOCK, self._states.size))
             rows = slice(self._loaded.start, self._loaded.stop)
-            self._values = np.stack([self._states.field(k, rows) for k in range(3)], axis=1)
+            self._values = np.stack([self._states.field(k)[rows] for k in range(3)], axis=1)
         return np.ravel(self._values[row - self._loaded.start])
 
     def _command(self, stamp: int, torque: Floats | None, *, is_answer: bool = False) -> None:

@@ -211,7 +211,6 @@ def _compared(
         result = Comparison(messages.name, messages.size * len(joints) * len(fields))
         try:
             if own is not None:
-                own.decode()
                 _compare(topic, messages, own, answers, joints, result, run.outputs.first)
         except BlfDscError as error:  # unreadable, or in an unknown order
             result.left_out = f'{error}'
@@ -248,7 +247,7 @@ def _compare(
     stamp, has_moved = ours.received, theirs.stamp != ours.stamp
     for begin in range(0, known.size, _BLOCK):
         rows = slice(begin, begin + _BLOCK)
-        pair = [np.hstack([states.field(k, rows) for k in fields]) for states in (theirs, ours)]
+        pair = [np.hstack([states.field(k)[rows] for k in fields]) for states in (theirs, ours)]
         pair[1][has_moved[rows]] = np.inf
         result.add(stamp[rows], start, names, *pair)
     unreached = (result.recorded - result.values) // len(joints) if topic is topics.COMMANDS else 0
