@@ -1,9 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Identification, weighing and excitation on random simulated arms, each in one table.
+"""Identification and weighing on random simulated arms, each in one table.
 
     .venv/bin/python benchmark/identification.py arms --runs 100
     .venv/bin/python benchmark/identification.py weighing --runs 100
-    .venv/bin/python benchmark/identification.py excitation --runs 2
 
 arms        Panda, UR5e and random chains of six joints, with links, centres of mass, rotors and
             friction drawn at random, identified from positions and efforts alone: encoders of 20
@@ -12,9 +11,6 @@ weighing    What arms hold, weighed while they move. Each run has links up to 30
             lighter than the URDF's, centres of mass 1 cm off, drives and friction of its own, and a
             random motion of three tones that does not repeat. 2 kg are picked up after 10 to 14 s.
             The drives of `fr3` compensate gravity and friction by a wrong model.
-excitation  The search of `blf_dsc excite` with so many starts against random finite Fourier series
-            in the same time, with the same harmonics, limits and clearance. A random series is
-            scaled down by 10 % up to 20 times, until it keeps them; the best of all is kept.
 """
 
 from __future__ import annotations
@@ -40,7 +36,6 @@ from shaken_arm import PERIOD, is_covered, measured, recording_of, reference_of,
 from blf_dsc_controller.arms.inertia import pseudo_inertia
 from blf_dsc_controller.configuration.nodes import CONTROLLER, PLANT, LoopConfig, load_loop
 from blf_dsc_controller.configuration.robot import Robot
-from blf_dsc_controller.identification.exciting_reference import ExcitationProblem, search
 from blf_dsc_controller.identification.identify import Identified, identify_arm
 from blf_dsc_controller.identification.prior import base_matrix
 from blf_dsc_controller.identification.recording import Recording, rows_of
@@ -53,17 +48,11 @@ _DURATION, _UNSEEN = 30.0, 10.0  # s
 _EVERY = (1, 10)  # samples of 1 ms from state to state
 _LOAD = 2.0  # kg
 _AFTER = (1.0, 2.0, 3.0)  # s, from the pick-up to a reading
-_HARMONICS, _RADIUS = 3, 0.07
-_SHRINK, _SHRINKS = 0.9, 20  # to an eighth
 _HEADS = {
     'arms': ('rate', 'torque error on unseen motion: URDF', 'identified', '95 % intervals', 'time'),
     'weighing': (
         *('arm', 'nothing held [g]', *(f'2 kg after {t:g} s [g]' for t in _AFTER)),
         *('centre after 3 s [mm]', 'within 95 % intervals: mass', 'centre'),
-    ),
-    'excitation': (
-        *('arm', 'time', 'log-determinant (smallest eigenvalue): excite', 'random'),
-        'series tried',
     ),
 }
 
@@ -75,13 +64,11 @@ def main() -> None:
     )
     parser.add_argument('what', choices=_HEADS)
     parser.add_argument('--config', nargs='+', default=['panda', 'ur5e', 'fr3'])
-    parser.add_argument('--runs', type=int, default=100, help='arms, runs of each arm, or starts')
+    parser.add_argument('--runs', type=int, default=100, help='arms, or runs of each arm')
     options = parser.parse_args()
+    rows: Iterable[tuple[str, ...]] = (_weighed(name, options.runs) for name in options.config)
     if options.what == 'arms':
-        rows: Iterable[tuple[str, ...]] = _identified(options.runs)
-    else:
-        row = _weighed if options.what == 'weighing' else _excited
-        rows = (row(name, options.runs) for name in options.config)
+        rows = _identified(options.runs)
     print_table(_HEADS[options.what], rows)
 
 
@@ -202,35 +189,6 @@ def _random_loop(name: str, seed: int, begin: float, random: np.random.Generator
         'reference.phase': random.uniform(0.0, 6.0, tones).tolist(),
     }
     return load_loop(name, {PLANT: plant, CONTROLLER: controller})
-
-
-def _excited(name: str, starts: int) -> tuple[str, ...]:
-    """Return the row of an arm."""
-    config = load_loop(name).controller
-    problem = ExcitationProblem(config, _HARMONICS, _RADIUS)
-    problem.evaluate(problem.parameters(problem.start(np.random.default_rng(0))))  # compiles
-    begin = time.perf_counter()
-    best = problem.evaluate(problem.parameters(search(problem, 0, starts))).gain
-    seconds = time.perf_counter() - begin
-    other, tried = _random(problem, seconds)
-    return name, f'{seconds:.0f} s', f'{best:.4g}', f'{other:.4g}', f'{tried}'
-
-
-def _random(problem: ExcitationProblem, seconds: float) -> tuple[float, int]:
-    """Return the best gain within the time [s], and the number of series."""
-    random = np.random.default_rng(0)
-    best, tried = -np.inf, 0
-    end = time.perf_counter() + seconds
-    while time.perf_counter() < end:
-        x = problem.start(random)
-        tried += 1
-        for _ in range(_SHRINKS):
-            reached = problem.evaluate(problem.parameters(x))
-            if reached.is_allowed:
-                best = max(best, reached.gain)
-                break
-            x[problem.n :] *= _SHRINK
-    return best, tried
 
 
 if __name__ == '__main__':

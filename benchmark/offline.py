@@ -26,8 +26,8 @@ from scipy.integrate import RK45
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.nodes import load_loop
 from blf_dsc_controller.configuration.plant import PlantConfig
-from blf_dsc_controller.configuration.schema import change
-from blf_dsc_controller.law.factory import controller_of, settings_of_config
+from blf_dsc_controller.law.factory import begin, controller_of, settings_of_config
+from blf_dsc_controller.messages import topics
 from blf_dsc_controller.reference.approach import reference_of
 from blf_dsc_controller.reference.terms import sampled
 from blf_dsc_controller.simulation.loop import simulate
@@ -45,8 +45,7 @@ _AGREEMENT = 10.0  # s
 _ROUNDS = 5
 _GROWTH_ROUNDS = 9
 _UPDATES = 2000
-_NOISE = (1e-4, 0.05)  # rad, rad/s, added to the reference to excite every column
-_ANY_EXCITATION = 1e-12  # a threshold that every window passes, short ones and of many columns
+_FULL = 10.0  # s, after which learning has begun and the window is full
 SOURCE = Path(__file__).with_name('reference.c')
 # The package's kernels are compiled for the native processor too; contraction would change the
 # numbers that are compared.
@@ -223,55 +222,44 @@ def _package(duration: float) -> Callable[[], int]:
     return lambda: simulate(CONTROLLER, plant, supervised=False).stamps.size
 
 
-def learning(name: str) -> ControllerConfig:
-    """Return the controller of a preset, which learns from any window."""
-    values = {
-        'learning.excitation_threshold': _ANY_EXCITATION,
-        'learning.change_detection': False,  # the states are noise, which no arm explains
-    }
-    return change(load_loop(name).controller, values)
+def updates(name: str) -> tuple[str, Callable[[], int], int]:
+    """Return the size of a preset's problem, a function that does some updates, and its memory.
 
-
-def label(config: ControllerConfig) -> str:
-    """Describe the size of the problem; its p counts all estimates, the m of the law."""
-    law = controller_of(config).settings
-    columns = f'{law.p} of the arm + {law.m - law.p} of disturbances'
-    return f'n = {law.n} joints, p = {law.m} unknowns ({columns})'
-
-
-def updates(config: ControllerConfig) -> Callable[[], int]:
-    """Return a function that does some thousand updates along the reference with a full window.
-
-    Raises RuntimeError if nothing is learned from that window.
+    They are those of a simulated run without events, once the window is full. The p of the size
+    counts all estimates, the m of the law. Raises RuntimeError if the run learns nothing.
     """
-    controller = controller_of(config)
-    law = controller.settings
-    full = round(law.learning_start / T) + law.window + law.interval
-    ahead = full + (_GROWTH_ROUNDS + 1) * _UPDATES
-    reference = sampled(controller.reference_vector, T * np.arange(ahead + 1))
-    noise = np.random.default_rng(0).standard_normal((ahead + 1, 2, law.n))
-    states = np.zeros((ahead + 1, 3, law.n))
-    states[:, :2] = reference[:, :2] + noise * np.array(_NOISE)[:, np.newaxis]
-    clock = itertools.count()
+    ahead = (_GROWTH_ROUNDS + 1) * _UPDATES
+    quiet: dict[str, object] = {f'events.{each}': [] for each in ('begin', 'duration', 'payload')}
+    duration = _FULL + T * ahead
+    loop = load_loop(name, {topics.PLANT: {'duration': duration, **quiet}})
+    record = simulate(loop.controller, loop.plant, supervised=False)
+    rows = zip((1e-9 * record.stamps).tolist(), record.measurements, strict=True)
+    controller = controller_of(loop.controller)
+    begin(controller, loop.controller, *record.measurements[0].reshape(3, -1)[:2])
 
     def update(count: int) -> int:
-        for k in itertools.islice(clock, count):
-            controller.update(k * T, T, states[k].ravel())
+        for t, measurement in itertools.islice(rows, count):
+            controller.update(t, T, measurement)
         return count
 
-    update(full)
-    if not controller.sample.latched[0] or not np.isfinite(controller.state_vector).all():
-        raise RuntimeError(f'{label(config)}: nothing is learned from the window')
-    return lambda: update(_UPDATES)
+    update(len(record.stamps) - ahead)
+    law = controller.settings
+    size = (
+        f'n = {law.n} joints, p = {law.m} unknowns ({law.p} of the arm + {law.m - law.p} of '
+        'disturbances)'
+    )
+    if not controller.sample.latched[0]:
+        raise RuntimeError(f'{name}: {size}: nothing is learned in {_FULL:g} s')
+    return size, lambda: update(_UPDATES), controller.state_vector.nbytes
 
 
 def measure_growth() -> Iterator[Ratio]:
     """Measure the time per update relative to the two-link arm's, once the window is full."""
-    configs = {f'{name}: {label(learning(name))}': learning(name) for name in ('panda', 'ur5e')}
-    contestants = {_TWO_LINKS: updates(learning('recommended'))}
-    contestants |= {name: updates(config) for name, config in configs.items()}
-    group, times = 'growth with joints and unknowns', interleaved(contestants, _GROWTH_ROUNDS)
-    for name, config in configs.items():
-        memory = controller_of(config).state_vector.nbytes / 1e6
-        note = f'{1e6 * np.median(times[name]):.1f} us an update here, {memory:.1f} MB of state'
-        yield ratio(group, name, _TWO_LINKS, times[name], times[_TWO_LINKS], note)
+    found = {name: updates(name) for name in ('recommended', 'panda', 'ur5e')}
+    times = interleaved({name: update for name, (_, update, _) in found.items()}, _GROWTH_ROUNDS)
+    baseline = times.pop('recommended')
+    for name, seconds in times.items():
+        size, _, memory = found[name]
+        note = f'{1e6 * np.median(seconds):.1f} us an update here, {1e-6 * memory:.1f} MB of state'
+        group, what = 'growth with joints and unknowns', f'{name}: {size}'
+        yield ratio(group, what, _TWO_LINKS, seconds, baseline, note)

@@ -48,15 +48,15 @@ def test_every_module_can_be_imported(name):
 
 
 def test_growth_is_written_as_a_table(monkeypatch, tmp_path):
-    offline = tiny(monkeypatch, 'offline', _UPDATES=2, _GROWTH_ROUNDS=1)
+    offline = tiny(monkeypatch, 'offline', _UPDATES=2, _GROWTH_ROUNDS=1, _FULL=7.5)
     monkeypatch.setattr(sys, 'argv', ['harness.py', 'growth', '--out', str(tmp_path)])
     importlib.import_module('harness').main()
     text = (tmp_path / 'RESULTS.md').read_text()
     row = 'panda: n = 7 joints, p = 62 unknowns (48 of the arm + 14 of disturbances)'
     assert f'\n| {row} | **' in text
-    monkeypatch.setattr(offline, '_ANY_EXCITATION', 1e6)
-    with pytest.raises(RuntimeError, match=r'p = 5 .* nothing is learned from the window'):
-        offline.updates(offline.learning('recommended'))
+    monkeypatch.setattr(offline, '_FULL', 1.0)
+    with pytest.raises(RuntimeError, match=r'p = 5 .* nothing is learned in 1 s'):
+        offline.updates('recommended')
 
 
 @pytest.mark.skipif(shutil.which('cc') is None, reason='there is no C compiler')
@@ -80,20 +80,18 @@ def test_node_compared_with_null_node(monkeypatch):
     monkeypatch.setattr(nodes, '_ARMS', {'recommended': 'node'})
     assert contestants(list(nodes.measure())) == [
         f'{name}: {what}'
-        for what in ('median latency', 'CPU')
+        for what in ('median latency', 'CPU', 'first torque')
         for name in (nodes._QUIET, nodes._RECORDED)
     ]
 
 
-def test_dead_contestant_aborts_the_measurement(monkeypatch):
+def test_dead_or_silent_contestant_aborts_the_measurement(monkeypatch):
     nodes = tiny(monkeypatch, 'nodes', _STEPS=2, _WARM_UP=1, _NULL_NODE=['-c', 'off'])
     with pytest.raises(
         nodes.ContestantError, match=r'null node ended with exit code 1:[^!]*NameErr'
     ):
         list(nodes.measure())
-
-
-def test_waiting_for_a_silent_contestant_times_out():
-    nodes = importlib.import_module('nodes')
-    with pytest.raises(nodes.ContestantError, match=r'after 0\.1 s waiting for a torque'):
-        nodes.wait_for(lambda: False, 'a torque', timeout=0.1)
+    silent = nodes.StandIn('silent node', 0)
+    with pytest.raises(nodes.ContestantError, match=r'no sign of a torque after 0\.1 s'):
+        silent.until(lambda: False, 'a torque', patience=0.1)
+    silent.close()
