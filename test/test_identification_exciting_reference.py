@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import re
 from dataclasses import replace
 from functools import cache
 
@@ -17,7 +16,7 @@ from blf_dsc_controller.configuration.nodes import load_loop
 from blf_dsc_controller.configuration.robot import parameters_of
 from blf_dsc_controller.configuration.schema import build
 from blf_dsc_controller.identification.exciting_reference import ExcitationProblem, search
-from blf_dsc_controller.law.factory import estimate_names, settings_of_config
+from blf_dsc_controller.law.factory import settings_of_config
 from blf_dsc_controller.reference.approach import MotionError
 from blf_dsc_controller.simulation.loop import simulate
 
@@ -137,20 +136,10 @@ def test_predicted_information_of_a_panda_matches_its_loop():
 
     problem = ExcitationProblem(loop.controller, 3)
 
-    assert problem.evaluate(motion).gain == pytest.approx(gain, rel=0.01)
-    assert problem.evaluate(motion).ratios[1].max() > 0.8
-
-
-def test_prior_uncertainty_remains_at_rest_and_shrinks_for_joints_that_move():
-    config, problem = chain_problem()
-    names = estimate_names(config)
-    at_rest = problem.remaining(problem.parameters(np.zeros(9)))
-    np.testing.assert_allclose(at_rest, 1.0, atol=1e-12)
-    alone = np.zeros(9)
-    alone[3] = 0.5  # only the first joint moves
-    remaining = problem.remaining(problem.parameters(alone))
-    assert remaining[names.index('viscous j1')] < 0.7
-    assert remaining[names.index('viscous j2')] == pytest.approx(1.0, abs=1e-6)
+    found = problem.evaluate(motion)
+    assert found.gain == pytest.approx(gain, rel=0.01)
+    assert found.left == pytest.approx(np.exp(-0.5 * gain / len(Phi)), rel=0.01)
+    assert found.ratios[1].max() > 0.8
 
 
 def test_lack_of_room_counts_as_an_excess():
@@ -177,7 +166,7 @@ def test_torque_ratio_is_the_larger_with_and_without_the_payload():
     assert (heavy[3] > light[3]).any()
 
 
-def test_tool_names_the_parameters_that_the_motion_does_not_show(tmp_path, capsys):
+def test_tool_keeps_an_arm_from_the_floor(tmp_path, capsys):
     (tmp_path / 'arm.urdf').write_text(random_urdf(3, seed=5)[0])
     config = tmp_path / 'arm.yaml'
     config.write_text(
@@ -190,10 +179,6 @@ def test_tool_names_the_parameters_that_the_motion_does_not_show(tmp_path, capsy
     assert main([*command, '--radius', '0.02', '--floor', '3.0']) == 1
     assert 'a lower floor' in capsys.readouterr().err
     assert main([*command, '--radius', '0.02', '--floor', '-3.0']) == 0
-    output = capsys.readouterr().out
-    assert 'a window leaves' in output
-    combination = re.search(r'100 % of (\S+)', output)
-    assert combination
-    assert combination[1] in out.read_text()
+    assert 'a window leaves' in ' '.join(capsys.readouterr().out.split())
     config.write_text(config.read_text() + out.read_text())
     assert load_loop(config).controller.reference.type == 'sinusoids'

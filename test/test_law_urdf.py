@@ -81,7 +81,7 @@ def test_urdf_may_be_given_as_text_or_file(tmp_path):
         ({'robot.tip': ''}, 'robot.urdf: neither a tip .* not one chain: .*panda_finger_joint1'),
         ({'joints': ['a', 'b']}, "robot.urdf: no joint 'a' in the URDF"),
         ({'robot.urdf': 'package://no_such/arm.urdf'}, "package 'no_such' was not found"),
-        ({'robot.rotor_inertia': [0.1]}, 'robot.rotor_inertia: got 1 entry for 7 joints'),
+        ({'robot.rotor_inertia': [0.1]}, 'robot.rotor_inertia: got 1 entry, but 7 are needed'),
         ({'robot.lag': 'short'}, "robot.lag: got 'short', but a double is expected"),
         ({'barrier.bound': [0.01] * 2}, 'barrier.bound: got 2 entries, but 7 are needed'),
         (

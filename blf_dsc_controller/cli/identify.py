@@ -15,14 +15,13 @@ from blf_dsc_controller.bags.content import NameMap
 from blf_dsc_controller.cli.main import PICK_UP, make_room
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.nodes import CONTROLLER, dump, load, locate
-from blf_dsc_controller.configuration.robot import Robot, parameters_of
+from blf_dsc_controller.configuration.robot import Robot
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.identification.corrected_urdf import corrected_urdf
 from blf_dsc_controller.identification.exciting_reference import ExcitationProblem, search
 from blf_dsc_controller.identification.identify import Identified, identify_bag, mass_and_centre
 from blf_dsc_controller.identification.prior import JOINT_TERMS, base_matrix, parts
 from blf_dsc_controller.identification.recording import HOP
-from blf_dsc_controller.law.factory import estimate_names
 
 _TWO_SIDED = 1.96  # standard deviations of a 95 % interval
 _UNSEEN = 0.5  # of the prior's variance; parameters that keep more are not shown
@@ -30,7 +29,6 @@ _LASTING = 0.05  # of the motion, longest correlation length of noise
 _POOR = 0.2  # of the torque, largest accepted error on the part held back
 _LEAST_GRAVITY, _MOST_GRAVITY = 0.4, 1.6  # of the URDF's; beyond, it is missing or double
 _DIGITS = 4  # decimals of an angle [rad] in the file
-_UNSHOWN = 0.8  # of the prior's deviation; parameters that keep more are hardly shown
 _WIDTH = 98
 _PANEL = (9.0, 2.2)  # inches
 
@@ -237,7 +235,7 @@ def problems_of(found: Identified, effort: str) -> Iterator[str]:
 
 
 def excite(options: Namespace) -> None:
-    """Search for the reference, write it as a preset, and print what it shows."""
+    """Search for the reference, and write it as a preset."""
     make_room(options.out, force=options.force)
     config = load(locate(options.config), CONTROLLER, ControllerConfig)
     problem = ExcitationProblem(config, options.harmonics, options.radius, options.floor)
@@ -247,41 +245,21 @@ def excite(options: Namespace) -> None:
     before = problem.evaluate({name: getattr(config.reference, name) for name in parameters})
     after = problem.evaluate(parameters)
     if config.learning.prior_weight > 0.0:
-        remaining = problem.remaining(parameters)
-        shares = [100.0 * np.exp(-each.gain / 2 / remaining.size) for each in (after, before)]
         figures = (
-            f'a window leaves {shares[0]:.0f} % of the deviation of the prior, in the geometric '
-            f'mean over all directions, instead of {shares[1]:.0f} %'
+            f'a window leaves {100.0 * after.left:.0f} % of the deviation of the prior, in the '
+            f'geometric mean over all directions, instead of {100.0 * before.left:.0f} %'
         )
-        unshown = _unshown(config, remaining)
     else:
         figures = (
             f'minimum eigenvalue of the excitation matrix {after.lambda_min:.3g}, instead of '
             f'{before.lambda_min:.3g}'
         )
-        unshown = []
     about = (
         'The reference that excites the learning most within the limits of joints and torque: '
         f'{figures} with the configured reference. First the cosines, then the sines.'
     )
-    lines = [*textwrap.wrap(about, _WIDTH), options.line, *unshown]
+    lines = [*textwrap.wrap(about, _WIDTH), options.line]
     reference = {f'reference.{name}': value for name, value in parameters.items()}
     node = {f'**/{CONTROLLER}': {'reference.type': 'sinusoids', **reference}}
     dump(options.out, node, ''.join(f'# {line}\n' for line in lines))
     print('\n'.join([*lines, f'wrote {options.out}']))
-
-
-def _unshown(config: ControllerConfig, remaining: np.ndarray) -> list[str]:
-    """Return lines listing the parameters that the motion hardly shows, the least shown first."""
-    order = [int(k) for k in np.argsort(-remaining) if remaining[k] > _UNSHOWN]
-    if not order:
-        return ['It shows all parameters.']
-    names = list(estimate_names(config))
-    if config.model == 'urdf':
-        sums = parameters_of(config.robot, config.robot.chain(config.joints)).combinations
-        names[: len(sums)] = sums
-    lines = ["It hardly shows the following; of the prior's deviation a window leaves"]
-    for k in order:
-        text = f'{100.0 * remaining[k]:4.0f} % of {names[k]}'
-        lines += textwrap.wrap(text, _WIDTH, subsequent_indent=' ' * 10, initial_indent=' ')
-    return lines

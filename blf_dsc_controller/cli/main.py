@@ -284,7 +284,7 @@ def _add_identification(
         'Find a reference that excites the learning, and write it as a preset. It is the sum of '
         'sinusoids with the period of the learning window that excites the learning most within '
         'the joint and torque limits. The links of a URDF arm also keep their distance from each '
-        'other and from the floor, and the parameters that the motion does not show are listed.',
+        'other and from the floor.',
         'exciting.yaml --config my.yaml',
         force,
     )

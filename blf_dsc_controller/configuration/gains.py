@@ -150,6 +150,20 @@ class ComparisonGains:
     leakage: float = non_negative(0.001, 'leakage of P^; not used by slotine_li', symbol='W_c')
 
 
+def _misfits(
+    name: str, P: tuple[float, ...], model: str, count: int, radius: float
+) -> Iterator[str]:
+    """Check that parameters P are those of a model, and inside the ball of the projection."""
+    if len(P) != count:
+        entries = counted(len(P), 'entry', 'entries')
+        yield f'{name}: got {entries}, but model {model} has {count} parameters'
+    if (norm := math.hypot(*P)) >= radius:
+        yield (
+            f'learning.radius: got {radius:g} kg m^2, but {name} has a norm of {norm:.6g} kg m^2 '
+            'and would be shrunk to the ball: the radius must be larger'
+        )
+
+
 @dataclass(frozen=True)
 class KnownArm:
     """Known data of the arm: required by the law `model_based`, shown by the monitors.
@@ -167,18 +181,11 @@ class KnownArm:
 
     def problems(self, law: str, model: str, count: int, radius: float) -> Iterator[str]:
         """Check that the parameters fit the model and the ball, and are given if required."""
-        given, norm = len(self.parameters), math.hypot(*self.parameters)
-        if law == 'model_based' and given == 0:
+        if law == 'model_based' and not self.parameters:
             yield 'truth.parameters: got none, but the law model_based needs them'
-        elif law == 'model_based' and norm >= radius:
-            yield (
-                f'learning.radius: got {radius:g} kg m^2, but truth.parameters have a norm of '
-                f'{norm:.6g} kg m^2, and the law model_based would shrink them to the ball: the '
-                'radius must be larger'
-            )
-        elif given not in (0, count):
-            entries = counted(given, 'entry', 'entries')
-            yield f'truth.parameters: got {entries}, but model {model} has {count} parameters'
+        if self.parameters:
+            largest = radius if law == 'model_based' else math.inf
+            yield from _misfits('truth.parameters', self.parameters, model, count, largest)
 
 
 @dataclass(frozen=True)
@@ -267,15 +274,6 @@ class Learning:
                 f'learning.window: got {self.window:g} s, which is {samples} samples of '
                 f'{sample_time:g} s: between {fewest} and {most} are allowed'
             )
-        if len(self.initial_estimate) != count:
-            entries = counted(len(self.initial_estimate), 'entry', 'entries')
-            yield (
-                f'learning.initial_estimate: got {entries}, but model {model} has {count} '
-                'parameters'
-            )
-        norm = math.hypot(*self.initial_estimate)
-        if norm >= self.radius:
-            yield (
-                f'learning.radius: got {self.radius:g} kg m^2, but learning.initial_estimate has '
-                f'a norm of {norm:.6g} kg m^2: the radius must be larger'
-            )
+        yield from _misfits(
+            'learning.initial_estimate', self.initial_estimate, model, count, self.radius
+        )

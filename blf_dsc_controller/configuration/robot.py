@@ -144,10 +144,9 @@ class Robot:
 
     def rotors(self, chain: Chain) -> np.ndarray:
         """Return drive inertias (n,) [kg m^2]: as given, or rated torque / 400 rad/s^2."""
-        if self.rotor_inertia:
-            return np.array(self.rotor_inertia)
-        rotors: np.ndarray = self.efforts(chain) / _DRIVE_ACCELERATION
-        return rotors
+        is_given = len(self.rotor_inertia) == len(chain.joints)
+        guessed = self.efforts(chain) / _DRIVE_ACCELERATION
+        return np.array(self.rotor_inertia) if is_given else guessed
 
 
 def implausible_friction(chain: Chain) -> tuple[str, ...]:
@@ -212,10 +211,6 @@ def given_robot(given: Mapping[str, Any]) -> tuple[Robot, Chain]:
         chain = robot.chain(given.get('joints', ()))
     except BlfDscError as error:
         raise ConfigurationError([f'robot.urdf: {error}']) from error
-    rotors, n = len(robot.rotor_inertia), len(chain.joints)
-    if rotors not in (0, n):
-        entries = counted(rotors, 'entry', 'entries')
-        raise ConfigurationError([f'robot.rotor_inertia: got {entries} for {n} joints'])
     return robot, chain
 
 

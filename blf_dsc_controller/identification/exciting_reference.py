@@ -48,6 +48,7 @@ class Excitation(NamedTuple):
 
     lambda_min: float  # minimum eigenvalue of Phi, relative to R
     gain: float  # objective of the search
+    left: float  # of the prior's deviation after a window, geometric mean over all directions
     ratios: np.ndarray  # (4, n) largest position, velocity, acceleration, torque, over the limit
     room: np.ndarray  # (k,) least room between pairs of links and to the floor; negative: too close
     excess: float  # mean square violation of the limits, relative, and of the room, in m
@@ -122,7 +123,8 @@ class ExcitationProblem:
 
     def evaluate(self, parameters: dict[str, tuple[float, ...]]) -> Excitation:
         """Return the excitation by the reference with offset, amplitude, frequency and phase."""
-        motion, rows = self._rows(parameters)
+        motion = sampled(pack(self.n, [sinusoids_term(**parameters)]), self._times)
+        rows = rows_along(self._settings, self._vector, self._times, motion)  # [H | D]
         q, dq, ddq = motion.transpose(1, 0, 2)
         torque = np.abs(rows @ self._guess.T).max(axis=2)
         ratios = np.abs(np.stack((q - self._middle, dq, ddq, torque), axis=1)) / self._limits
@@ -132,26 +134,9 @@ class ExcitationProblem:
         mu = np.linalg.eigvalsh(self._relative_excitation(dq, rows))
         a = self._settings.prior_weight
         gain = np.log1p(np.maximum(mu, 0.0) / a).sum() if a > 0.0 else np.log(max(mu[0], 1e-12))
-        return Excitation(
-            float(mu[0]),
-            float(gain),
-            ratios.max(axis=0),
-            room.min(axis=0),
-            float(excess),
-        )
-
-    def remaining(self, parameters: dict[str, tuple[float, ...]]) -> np.ndarray:
-        """Return each entry's deviation (m,) in theta after a window, relative to its prior."""
-        motion, rows = self._rows(parameters)
-        mu, V = np.linalg.eigh(self._relative_excitation(motion[:, 1], rows))
-        a, L = self._settings.prior_weight, self._scale
-        after = (L @ V) ** 2 @ (a / (a + np.maximum(mu, 0.0)))
-        return np.asarray(np.sqrt(after / (L**2).sum(axis=1)))
-
-    def _rows(self, parameters: dict[str, tuple[float, ...]]) -> tuple[np.ndarray, np.ndarray]:
-        """Return the motion (k, 3, n) and [H | D] (k, n, m) over a period."""
-        motion = sampled(pack(self.n, [sinusoids_term(**parameters)]), self._times)
-        return motion, rows_along(self._settings, self._vector, self._times, motion)
+        left = float(np.exp(-0.5 * gain / len(mu)))
+        most, least = ratios.max(axis=0), room.min(axis=0)
+        return Excitation(float(mu[0]), float(gain), left, most, least, float(excess))
 
     def _relative_excitation(self, dq: np.ndarray, rows: np.ndarray) -> np.ndarray:
         """Return L^T Phi L (m, m), R^-1 = L L^T; its eigenvalues are those of Phi relative to R."""
