@@ -317,6 +317,7 @@ def test_nearest_physical_body_is_found():
 def test_corrected_random_urdf_has_the_given_bodies(seed):
     """With links fixed to links, links without inertias and empty tags."""
     text, joints = random_urdf(4, seed)
+    text = re.sub('<link name="l1">.*?</link>', '<link name="l1" note="a > b" />', text)
     chain = read_chain(text, 'base', 'tip', joints)
     bodies = changed(chain, np.random.default_rng(seed))
     friction = np.arange(1.0, 5.0)
