@@ -78,7 +78,6 @@ class Run:
     timing: Series | None = None
     monitor: Series | None = None
     message_counts: Mapping[str, int] = field(default_factory=dict)
-    rejected: Mapping[str, str] = field(default_factory=dict)  #: disturbance columns, and why
     stops: tuple[Stop, ...] = ()
     arm: LearnedArm | None = None  #: from a URDF
     learns: bool = True  #: whether the law uses the prediction error

@@ -59,7 +59,7 @@ def ros():
 @pytest.fixture
 def blank_pictures(monkeypatch):
     """Write empty pictures where no test looks at them: drawing takes a second for each run."""
-    from blf_dsc_controller.analysis.style import Picture
+    from blf_dsc_controller.analysis.figures import Picture
 
     monkeypatch.setattr(Picture, 'save', lambda _picture, path: path.touch())
 

@@ -18,8 +18,7 @@ from synthetic_bag import Synthetic
 
 from blf_dsc_controller.analysis import figures
 from blf_dsc_controller.analysis.figures import draw
-from blf_dsc_controller.analysis.panels import envelope, panels
-from blf_dsc_controller.analysis.style import COLOURS
+from blf_dsc_controller.analysis.panels import COLOURS, envelope, panels
 from blf_dsc_controller.bags.reader import read_run
 from blf_dsc_controller.configuration.nodes import load_loop
 from blf_dsc_controller.simulation.loop import simulate

@@ -15,9 +15,8 @@ from synthetic_bag import JOINTS, MILLISECOND, START, Synthetic
 from test_analysis_figures import amount, lightened, pixels
 
 from blf_dsc_controller.analysis.figures import draw
-from blf_dsc_controller.analysis.panels import panels
+from blf_dsc_controller.analysis.panels import ALARM, panels
 from blf_dsc_controller.analysis.report import plots, read_bag, write_report
-from blf_dsc_controller.analysis.style import ALARM
 from blf_dsc_controller.analysis.summary import format_table, summarize
 from blf_dsc_controller.bags.reader import read_run
 from blf_dsc_controller.cli.main import main

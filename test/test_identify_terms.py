@@ -28,7 +28,7 @@ from shaken_arm import (
 )
 from test_analysis_figures import amount, lightened, pixels
 
-from blf_dsc_controller.analysis.style import COLOURS, INK, ORANGE
+from blf_dsc_controller.analysis.panels import COLOURS, INK, ORANGE
 from blf_dsc_controller.arms.base_parameters import base_parameters
 from blf_dsc_controller.arms.inertia import inertia_of, pseudo_inertia
 from blf_dsc_controller.arms.model import regressors_at

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The panels of a run as PNG files: tracking.png, change.png, parameters.png and monitors.png."""
+"""The panels of a run as PNG files: tracking.png, change.png and parameters.png."""
 
 from __future__ import annotations
 
@@ -9,24 +9,30 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from matplotlib import rc_context
 from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.ticker import FuncFormatter
 
 from blf_dsc_controller.analysis.metrics import change_times, measure, true_change_times
-from blf_dsc_controller.analysis.panels import Line, Mark, Panel, panels
-from blf_dsc_controller.analysis.style import (
+from blf_dsc_controller.analysis.panels import (
     ALARM,
     BLUE,
     COLOURS,
     INK,
+    MUTED,
     ORANGE,
     SHADE,
-    Picture,
-    head,
+    Line,
+    Mark,
+    Panel,
+    panels,
 )
 from blf_dsc_controller.run import Run
 
-NAMES = ('tracking.png', 'change.png', 'parameters.png', 'monitors.png')
+NAMES = ('tracking.png', 'change.png', 'parameters.png')
 """Names of the files that `draw` can write."""
 
 _SIZE = (6.2, 2.6)  # inches
@@ -40,15 +46,103 @@ _SHADED = 0.1
 _ABOVE = 1.15  # of the height of a panel, where the legend of its column is
 _NARROW, _WIDE, _WIDEST = 1.3, 2.4, 5.0  # points, widths of lines
 
+_DPI = 130
+_CHARACTER = 0.085  # inches, approximate width in a title or legend
+_HANDLE = 0.5
+_MARGIN = 0.75  # inches of a panel, beside its axes
+_SETTINGS: Any = {
+    'font.family': 'DejaVu Sans',
+    'font.size': 11,
+    'mathtext.fontset': 'dejavusans',
+    'axes.edgecolor': MUTED,
+    'axes.labelcolor': INK,
+    'axes.titlecolor': INK,
+    'text.color': INK,
+    'xtick.color': MUTED,
+    'ytick.color': MUTED,
+    'xtick.labelcolor': INK,
+    'ytick.labelcolor': INK,
+    'lines.linewidth': 1.4,
+    'lines.solid_joinstyle': 'round',
+    'path.simplify': False,
+}
+
+
+class Picture:
+    """A figure of panels, made with these settings and without pyplot's global state."""
+
+    def __init__(
+        self,
+        rows: int,
+        columns: int,
+        title: str,
+        panel: tuple[float, float],
+        *,
+        share_time: bool = True,
+    ) -> None:
+        self._share_time = share_time
+        with rc_context(_SETTINGS):
+            self._figure = Figure(
+                figsize=(panel[0] * columns, panel[1] * rows + 0.5),
+                dpi=_DPI,
+                facecolor='white',
+                layout=ConstrainedLayoutEngine(w_pad=0.12, h_pad=0.08, hspace=0.04),
+            )
+            self._canvas = FigureCanvasAgg(self._figure)
+            self._figure.suptitle(title, x=0.01, ha='left', fontsize=14, fontweight='bold')
+            self.axes = self._figure.subplots(rows, columns, sharex=share_time, squeeze=False)
+            for axes in self.axes.flat:
+                axes.spines[['top', 'right']].set_visible(False)
+                axes.grid(visible=True, color='#E5E7EB', linewidth=0.8)
+                axes.set_axisbelow(True)
+                axes.margins(x=0.01)
+
+    def save(self, path: Path) -> None:
+        """Write the picture as PNG."""
+        with rc_context(_SETTINGS):
+            for column in self.axes.T if self._share_time else ():
+                lowest = [axes for axes in column if axes.get_visible()][-1]
+                lowest.set_xlabel('time [s]')
+                lowest.tick_params(labelbottom=True)
+            # Figure.savefig would draw twice, the first time for the layout only.
+            self._canvas.print_png(path)  # type: ignore[no-untyped-call]
+
+
+def head(axes: Axes, title: str, *, legend_at: float | None = None) -> None:
+    """Put the title above a panel and the legend off the data: above as well, or beside it.
+
+    With `legend_at` it is at this height of the axes; at 0, and if the title names its only line,
+    there is none.
+    """
+    axes.set_title(title, loc='left', fontsize=11.5)
+    labels = axes.get_legend_handles_labels()[1]
+    entries = len(labels)
+    if entries == 0 or labels == [title.partition(':')[0]] or legend_at == 0.0:
+        return
+    grid = axes.get_subplotspec()
+    width = axes.figure.get_figwidth() / (grid.get_gridspec().ncols if grid else 1)  # type: ignore[union-attr]
+    fits = _CHARACTER * len(title + ''.join(labels)) + _HANDLE * entries < width - _MARGIN
+    above = fits or legend_at is not None
+    axes.legend(
+        loc='lower right' if above else 'center left',
+        bbox_to_anchor=(1.0, legend_at or 1.0) if above else (1.0, 0.5),
+        ncols=entries if above else 1,
+        frameon=False,
+        fontsize=10,
+        borderaxespad=0.15,
+        handlelength=1.6,
+        columnspacing=1.2,
+    )
+
 
 def draw(run: Run, folder: Path) -> list[Path]:
     """Draw tracking.png and the other files that the run has data for, and return the paths.
 
-    These are change.png if a simulated arm changed, parameters.png if parameters were learned, and
-    monitors.png if the monitor was recorded. The folder is created if necessary.
+    These are change.png if a simulated arm changed, and parameters.png if parameters were learned.
+    The folder is created if necessary.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    tracking, change, parameters, monitors = (folder / name for name in NAMES)
+    tracking, change, parameters = (folder / name for name in NAMES)
     metrics, n, found = measure(run), len(run.joints), panels([run])
 
     def of(*groups: str) -> list[Panel]:
@@ -78,10 +172,8 @@ def draw(run: Run, folder: Path) -> list[Path]:
             what = 'relative parameter error' if run.arm is None else 'torque error'
             title += f': {what} {100 * error:.2g} % at the end'
         paths.append(parameters)
-        draw_panels(parameters, title, of('Parameters', 'Disturbance', 'Excitation'), 2, _HIGH)
-    if of('Monitors'):
-        paths.append(monitors)
-        draw_panels(monitors, 'Monitors', of('Monitors'), 1, _CLOSE_UP)
+        learned = of('Parameters', 'Disturbance', 'Excitation', 'Monitors')
+        draw_panels(parameters, title, learned, 2, _HIGH)
     return paths
 
 

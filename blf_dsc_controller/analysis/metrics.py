@@ -76,6 +76,15 @@ def estimates_of(run: Run) -> Estimates | None:
     return Estimates(names, run.time_of(stamp), estimate, true, error, of_torques, theirs)
 
 
+def rejected_columns(run: Run) -> list[str]:
+    """Return the disturbance columns that are not estimated at the end: this tells them by NaN."""
+    if run.learning is None:
+        return []
+    last = run.learning.values[run.learning.stamp.size - 1 :][0]
+    names = [run.learning.names[j] for j in np.flatnonzero(np.isnan(last))]
+    return [name for name in names if name != COMPUTE_TIME]
+
+
 def _relative_error(estimate: Floats, P: Floats, R: Floats | None) -> Floats:
     """Return |P^ - P| / |P| (m,), or |R (P^ - P)| / |R P|."""
     found = np.empty(len(P))

@@ -24,7 +24,6 @@ from blf_dsc_controller.analysis.metrics import (
     rms,
     true_change_times,
 )
-from blf_dsc_controller.analysis.style import ALARM, COLOURS, INK, MUTED
 from blf_dsc_controller.messages.topics import (
     COMPUTE_TIME,
     DISTURBANCE,
@@ -34,6 +33,15 @@ from blf_dsc_controller.messages.topics import (
     LYAPUNOV_TERMS,
 )
 from blf_dsc_controller.run import Floats, LearnedArm, Run, Series
+
+BLUE = '#0072B2'
+ORANGE = '#D55E00'
+GREEN = '#009E73'
+COLOURS = (BLUE, ORANGE, GREEN, '#CC79A7', '#E69F00', '#56B4E9', '#7F3C8D', '#000000')
+INK = '#22272E'
+MUTED = '#6B7280'
+SHADE = '#DCE9F5'
+ALARM = '#B3001B'
 
 GROUPS = (
     'Motion',

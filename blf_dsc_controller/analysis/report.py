@@ -3,18 +3,19 @@
 
 from __future__ import annotations
 
+import base64
 import zlib
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from operator import itemgetter
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
+from jinja2 import Environment, PackageLoader, StrictUndefined
 
-from blf_dsc_controller.analysis.metrics import change_times, latch_time, outside
-from blf_dsc_controller.analysis.panels import PIECES, Panel, panels
-from blf_dsc_controller.analysis.style import COLOURS, INK, Cell, write_page
+from blf_dsc_controller.analysis.metrics import change_times, latch_time, outside, rejected_columns
+from blf_dsc_controller.analysis.panels import COLOURS, INK, PIECES, Panel, panels
 from blf_dsc_controller.analysis.summary import format_table, summarize
 from blf_dsc_controller.bags.content import NO_NAMES, Content, NameMap, read_content
 from blf_dsc_controller.bags.reader import recorded_run
@@ -28,6 +29,19 @@ _ALARMING = ('violation', 'stop', 'ERROR', 'lost')
 _MOST_OF_A_KIND = 50
 _LONGEST = 1000  # characters of a parameter that is shown in full
 _AT_LIMIT = 1.0 - 1e-9
+
+_TEMPLATES = Environment(
+    loader=PackageLoader('blf_dsc_controller'),
+    autoescape=True,
+    undefined=StrictUndefined,
+    trim_blocks=True,
+    lstrip_blocks=True,
+)
+_TEMPLATES.policies['json.dumps_kwargs'] = {'allow_nan': False, 'separators': (',', ':')}
+_TEMPLATES.filters['anchor'] = lambda title: title.lower().replace(' ', '-')
+_TEMPLATES.filters['embedded'] = lambda png: (
+    f'data:image/png;base64,{base64.b64encode(png.read_bytes()).decode("ascii")}'
+)
 
 LEVELS = ('OK', 'WARN', 'ERROR', 'STALE')
 """Levels of /diagnostics."""
@@ -77,9 +91,8 @@ def _events(run: Run) -> Iterator[Happened]:
         yield (latched, 'learning', 'first excited window: learning began')
     for t in change_times(run):
         yield (t, 'learning', 'the arm has changed: learning restarted')
-    for column, reason in run.rejected.items():
-        text = reason or f'{column} is not estimated: its column was rejected'
-        yield (run.duration, 'learning', text)
+    for column in rejected_columns(run):
+        yield (run.duration, 'learning', f'{column} is not estimated')
     for t, stop in run.timed_stops:
         yield (t, 'stop', f'{stop.reason}: {stop.text}')
     for i, joint in enumerate(run.joints):
@@ -226,3 +239,20 @@ def _numbers(values: Floats) -> list[float | None]:
 def _colour(k: int) -> str:
     """Return the colour of the k-th bag."""
     return COLOURS[k % len(COLOURS)]
+
+
+class Cell(NamedTuple):
+    """Table cell that is more than plain text.
+
+    Styles: number, code, good, partly, bad; marked highlights the row.
+    """
+
+    text: str
+    style: str = ''
+    colour: str = ''  # of a swatch before the text
+
+
+def write_page(path: Path, template: str, title: str, **values: object) -> None:
+    """Render a template with its variables and write the page."""
+    text = _TEMPLATES.get_template(template).render(title=title, **values)
+    path.write_text(text, encoding='utf-8')

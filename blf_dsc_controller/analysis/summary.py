@@ -18,6 +18,7 @@ from blf_dsc_controller.analysis.metrics import (
     change_times,
     estimates_of,
     measure,
+    rejected_columns,
 )
 from blf_dsc_controller.law.telemetry import load_text
 from blf_dsc_controller.messages.topics import COMPUTE_TIME, LATE_STEPS, LATENCY, LOAD
@@ -104,7 +105,7 @@ def _learning(run: Run, estimates: Estimates, metrics: Metrics) -> Summary:
             f'final_{measured}': metrics.final_parameter_error,
             'time_to_1_percent_s': metrics.time_to_1_percent,
             'final_estimate': _named(estimates, estimates.estimate),
-            'rejected_columns': {name: reason or None for name, reason in run.rejected.items()},
+            'rejected_columns': rejected_columns(run),
             'true': None if estimates.true is None else _named(estimates, estimates.true),
             'true_parameters_of_other_names': list(estimates.unlike),
         }
@@ -217,8 +218,9 @@ def _learning_lines(learning: Summary) -> Iterator[str]:
     if learning['model_changes_s']:
         times = ', '.join(f'{t:.3f} s' for t in learning['model_changes_s'])
         yield f'arm         changed at {times}: learning restarted'
-    for column, reason in learning['rejected_columns'].items():
-        yield f'rejected    {reason or f"{column}: see the log for the reason"}'
+    if learning['rejected_columns']:
+        columns = ', '.join(learning['rejected_columns'])
+        yield f'rejected    {columns}: the motion does not tell them from the other columns'
     unlike = learning['true_parameters_of_other_names']
     if unlike:
         model, plant = (

@@ -18,7 +18,6 @@ from blf_dsc_controller.bags.sources import BagError
 from blf_dsc_controller.bags.topic_messages import JointStates, TopicMessages, Values
 from blf_dsc_controller.errors import BlfDscError, MissingExtraError
 from blf_dsc_controller.messages import topics
-from blf_dsc_controller.messages.codecs import typestore
 from blf_dsc_controller.messages.journal import Event, EventType
 from blf_dsc_controller.run import LearnedArm, Run, Series, Stop
 
@@ -121,18 +120,16 @@ def recorded_run(content: Content) -> Run:
         if found is not None or difference is not None:
             arrays[name] = Values(found or unknown, k, difference)
     events = [event for at, event in content.events if span[0] <= at < span[1]]
-    learning = series(topics.LEARNING)
     return Run(
         **arrays,
         joints=joints,
         stamp=stamp,
         received=states.received,
-        learning=learning,
+        learning=series(topics.LEARNING),
         truth=series(topics.TRUTH),
         timing=series(topics.TIMING),
         monitor=series(topics.MONITOR),
         message_counts=content.message_counts,
-        rejected=_rejected_columns(content, learning),
         stops=tuple(_stops(events, int(stamp[0]))),
         arm=_arm(content),
         learns=_learns([event.content.get('parameters', {}) for event in events]),
@@ -209,26 +206,6 @@ def _joints(content: Content) -> tuple[str, ...]:
     if not of_controller and content.names.joints:
         return tuple(content.names.joints)
     return (*of_controller, content.topics[topics.JOINT_STATES])[0].joint_names()
-
-
-def _rejected_columns(content: Content, learning: Series | None) -> dict[str, str]:
-    """Return columns that are NaN at the end of learning, with the reason in /diagnostics."""
-    if learning is None:
-        return {}
-    values = learning.values[learning.stamp.size - 1 :][0]
-    columns = [learning.names[j] for j in np.flatnonzero(np.isnan(values))]
-    columns = [name for name in columns if name != topics.COMPUTE_TIME]
-    reasons: dict[str, str] = {}
-    diagnostics = content.topics.get(topics.DIAGNOSTICS)
-    for raw in diagnostics.raw if columns and diagnostics is not None else ():
-        message: Any = typestore().deserialize_cdr(raw, topics.DIAGNOSTICS.type)
-        reasons |= {
-            pair.key.removeprefix(topics.REJECTED): pair.value
-            for status in message.status
-            if status.name.startswith(content.namespace.strip('/'))
-            for pair in status.values
-        }
-    return {column: reasons.get(column, '') for column in columns}
 
 
 def _arm(content: Content) -> LearnedArm | None:

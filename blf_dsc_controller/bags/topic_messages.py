@@ -73,7 +73,7 @@ class _Store:
         waiting, self._waiting = self._waiting, []
         if not waiting:
             return
-        count, size, double = len(waiting), self.layout.size, self.layout.double
+        count, size = len(waiting), self.layout.size
         block = np.zeros((self._columns, _BLOCK), np.int64)
         columns = block[:, :count]
         columns[_NUMBER] = [number for number, _ in waiting]
@@ -81,11 +81,11 @@ class _Store:
         columns[_SEQUENCE] = [message.sequence for _, message in waiting]
         joined = b''.join([message.raw for _, message in waiting])
         if self._has_stamp:
-            kind = np.dtype([('s', 'i4'), ('ns', 'u4')]).newbyteorder(double.byteorder)
+            kind = np.dtype([('s', '<i4'), ('ns', '<u4')])
             stamp = np.ndarray(count, kind, joined, STAMP_OFFSET, (size,))
             columns[_STAMP] = stamp['s'].astype(np.int64) * NANOSECONDS + stamp['ns']
-        grid = np.ndarray((count, (size - ORIGIN) // 8), double, joined, ORIGIN, (size, 8))
-        columns[_VALUES:] = grid[:, self.layout.places].astype(np.float64).view(np.int64).T
+        grid = np.ndarray((count, (size - ORIGIN) // 8), '<i8', joined, ORIGIN, (size, 8))
+        columns[_VALUES:] = grid[:, self.layout.places].T
         self._file.write(block.tobytes())
         self._file.flush()
 

@@ -77,8 +77,8 @@ def identify(options: Namespace) -> None:
 def _write_page(found: Identified, path: Path, facts: Sequence[str], tables: Sequence[str]) -> None:
     """Write the page: some facts, measured and predicted torques with their residual, tables."""
     from blf_dsc_controller.analysis.figures import draw_panels  # slow: the libraries
-    from blf_dsc_controller.analysis.panels import Line, Mark, Panel
-    from blf_dsc_controller.analysis.style import INK, MUTED, ORANGE, write_page
+    from blf_dsc_controller.analysis.panels import INK, MUTED, ORANGE, Line, Mark, Panel
+    from blf_dsc_controller.analysis.report import write_page
 
     jumps = np.flatnonzero(np.diff(found.time) > 2.0 * np.median(np.diff(found.time))) + 1
     t = np.insert(found.time, jumps, np.nan)  # breaks the lines at gaps and rest

@@ -22,11 +22,9 @@ from blf_dsc_controller.law.settings import Settings
 from blf_dsc_controller.law.state import Sample, sample_of
 from blf_dsc_controller.messages import topics
 from blf_dsc_controller.messages.codecs import (
-    NANOSECONDS,
     Float64MultiArrayEncoder,
     JointStateEncoder,
     encode_clock,
-    typestore,
 )
 from blf_dsc_controller.messages.topics import LYAPUNOV_TERMS
 from blf_dsc_controller.run import Floats, LearnedArm, Run, Series, Stamps
@@ -196,23 +194,6 @@ def load_text(load: Sequence[float]) -> str:
     return f'{text}, its centre at {", ".join(each)} mm'
 
 
-def encode_rejected_columns(stamp: int, columns: Sequence[RejectedColumn]) -> bytes:
-    """Return /diagnostics at a time [ns] with the reason for each rejected column."""
-    types = typestore().types
-    key_value = types['diagnostic_msgs/msg/KeyValue']
-    status = types['diagnostic_msgs/msg/DiagnosticStatus'](
-        level=1,  # WARN
-        name=f'{topics.CONTROLLER}/learning',
-        message=f'not estimated: {", ".join(each.column for each in columns)}',
-        hardware_id='',
-        values=[key_value(f'{topics.REJECTED}{each.column}', f'{each}') for each in columns],
-    )
-    time = types['builtin_interfaces/msg/Time'](*divmod(stamp, NANOSECONDS))
-    header = types['std_msgs/msg/Header'](stamp=time, frame_id='')
-    message = types[topics.DIAGNOSTICS.type](header=header, status=[status])
-    return bytes(typestore().serialize_cdr(message, topics.DIAGNOSTICS.type))
-
-
 def sample_columns(rows: Floats, settings: Settings) -> Sample:
     """Split packed samples (N, s) into columns by name, located by unpacking a row of indices."""
     places = sample_of(np.arange(rows.shape[1], dtype=np.float64), settings)
@@ -255,7 +236,6 @@ def run_of(
     used = ~np.isnan(samples.qr[:, 0])
     position, velocity, _ = np.split(measurements, 3, axis=1)
     monitor = Series(LYAPUNOV_TERMS, stamps[used], samples.lyapunov[used])
-    rejected = rejected_columns(controller, estimate_names(config))
     return Run(
         joints=config.joints,
         stamp=stamps,
@@ -271,7 +251,6 @@ def run_of(
         monitor=monitor if controller.settings.truth_known else None,
         arm=learned_arm(config),
         learns=config.law == 'blf_dsc' and config.learning.weight > 0.0,
-        rejected={each.column: f'{each}' for each in rejected},
     )
 
 

@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Definitions of messages, and those of the control loop to bytes and back, in a microsecond.
 
-Plain CDR, version 1, as ROS 2 sends it: two bytes for the byte order, two unused, then the fields,
-each number aligned to its own size, from the fifth byte on. Padding bytes, and bytes after the
+Plain CDR, version 1, little-endian, as ROS 2 sends it on all processors that it supports: two bytes
+that say so, two unused, then the fields, each number aligned to its own size, from the fifth byte
+on. Padding bytes, and bytes after the
 last field, may hold anything. An encoder serialises a template once and then only overwrites its
 numbers. A decoder finds the values once and keeps their places for as long as the messages have the
 same names and lengths, which a kernel compares as it reads them. Messages of all other types are
@@ -33,7 +34,7 @@ NANOSECONDS = 1_000_000_000
 ORIGIN = 4  # alignment is counted from here
 STAMP_OFFSET = 4  # of a message that starts with a std_msgs/Header
 JOINT_STATE_FIELDS = ('position', 'velocity', 'effort')
-_BYTE_ORDERS = {b'\x00\x00': '>', b'\x00\x01': '<'}
+_LITTLE_ENDIAN = b'\x00\x01'
 _STAMP = Struct('<iI')
 
 
@@ -106,14 +107,13 @@ class Doubles(NamedTuple):
 
 
 class Layout:
-    """What is the same in all messages of one sender: size, byte order, names, array sizes.
+    """What is the same in all messages of one sender: size, names, array sizes.
 
     Attributes:
         names: in the message.
         arrays: where its arrays are.
         places: indices of all their values in a grid of doubles that starts at ORIGIN.
         size: of the message [bytes].
-        double: type of a value.
         fixed: bytes that are no numbers.
     """
 
@@ -122,7 +122,7 @@ class Layout:
     ) -> None:
         """Take a message of which the bytes from `begin` to its first values are not numbers."""
         self.names, self.arrays = names, arrays
-        self.size, self.double = len(raw), np.dtype(_BYTE_ORDERS[bytes(raw[:2])] + 'f8')
+        self.size = len(raw)
         self.places = np.concatenate([
             (array.offset - ORIGIN) // 8 + np.arange(array.size) for array in arrays
         ])  # fmt: skip
@@ -183,20 +183,20 @@ class _Cursor:
         self._raw, self._offset = raw, 0
         self._take(ORIGIN)
         encapsulation = bytes(raw[:2])
-        if encapsulation not in _BYTE_ORDERS:
+        if encapsulation != _LITTLE_ENDIAN:
             raise MessageError(
-                f'message starts with the bytes {encapsulation.hex(" ")}, not with 00 00 or 00 01: '
-                'it is not plain CDR; publish it with a ROS 2 middleware in its default encoding'
+                f'message starts with the bytes {encapsulation.hex(" ")}, not with 00 01: it is '
+                'not plain CDR, little-endian; publish it with a ROS 2 middleware in its default '
+                'encoding'
             )
-        self.byte_order = _BYTE_ORDERS[encapsulation]
 
     def unsigned(self) -> int:
         self._align(4)
-        return int(unpack_from(self.byte_order + 'I', self._raw, self._take(4))[0])
+        return int(unpack_from('<I', self._raw, self._take(4))[0])
 
     def time(self) -> int:
         self._align(4)
-        seconds, nanoseconds = unpack_from(self.byte_order + 'iI', self._raw, self._take(8))
+        seconds, nanoseconds = _STAMP.unpack_from(self._raw, self._take(8))
         return int(seconds * NANOSECONDS + nanoseconds)
 
     def text(self) -> str:
@@ -216,7 +216,7 @@ class _Cursor:
 
     def values(self) -> tuple[float, ...]:
         array = self.doubles()
-        return unpack_from(f'{self.byte_order}{array.size}d', self._raw, array.offset)
+        return unpack_from(f'<{array.size}d', self._raw, array.offset)
 
     def _align(self, size: int) -> None:
         self._offset += -(self._offset - ORIGIN) % size
@@ -355,12 +355,11 @@ def _read(
     message: bytes,
     expected: NDArray[np.uint8],
     places: NDArray[np.intp],
-    swap: int,
     values: NDArray[np.uint8],
 ) -> int:
     """Read the doubles that start at these bytes, unless -1, if a message is as `expected`.
 
-    The rows of that are bytes, and 255 where they must agree. `swap` is 7 for the other byte order.
+    The rows of that are bytes, and 255 where they must agree.
     Returns the time [ns] at STAMP_OFFSET, of messages that have one there; _OTHER if it differs.
     """
     size = len(message)
@@ -374,12 +373,11 @@ def _read(
     for i in range(places.size):
         if places[i] >= 0:
             for k in range(8):
-                values[8 * i + (k ^ swap)] = message[places[i] + k]
+                values[8 * i + k] = message[places[i] + k]
     seconds = nanoseconds = 0
     for k in range(4):
-        byte = STAMP_OFFSET + (k ^ (swap & 3))
-        seconds |= int(message[byte]) << 8 * k
-        nanoseconds |= int(message[byte + 4]) << 8 * k
+        seconds |= int(message[STAMP_OFFSET + k]) << 8 * k
+        nanoseconds |= int(message[STAMP_OFFSET + 4 + k]) << 8 * k
     if seconds >= 1 << 31:
         seconds -= 1 << 32
     return seconds * NANOSECONDS + nanoseconds
@@ -391,7 +389,7 @@ class _Decoder:
     def __init__(self, size: int) -> None:
         self.values = np.full(size, np.nan)
         self._bytes = self.values.view(np.uint8)
-        self._known = np.zeros((2, 0), np.uint8), np.full(size, -1), 0, self._bytes
+        self._known = np.zeros((2, 0), np.uint8), np.full(size, -1), self._bytes
         self._read = direct(_read, b'', *self._known)
 
     def _learn(self, raw: bytes, layout: Layout, columns: NDArray[np.intp]) -> None:
@@ -402,7 +400,7 @@ class _Decoder:
             expected[1, part] = 255
         places, known = np.full(columns.size, -1), columns >= 0
         places[known] = ORIGIN + 8 * layout.places[columns[known]]
-        self._known = expected, places, 0 if layout.double.isnative else 7, self._bytes
+        self._known = expected, places, self._bytes
         self.values[:] = np.nan
         self._read(raw, *self._known)
 

@@ -20,8 +20,6 @@ from blf_dsc_controller.law.telemetry import (
     Message,
     Monitor,
     PlantTelemetry,
-    encode_rejected_columns,
-    rejected_columns,
 )
 from blf_dsc_controller.messages import topics
 from blf_dsc_controller.messages.journal import encode_change
@@ -53,10 +51,6 @@ def write_bag(
             write(START, topics.CHANGES, encode_change(START, flatten(plant), configured=True))
         for stamp, message in _messages(record, config):
             write(stamp, *message)
-        rejected = rejected_columns(record.controller, estimate_names(config))
-        if rejected:
-            stamp = START + int(record.stamps[-1])
-            write(stamp, topics.DIAGNOSTICS, encode_rejected_columns(stamp, rejected))
 
 
 def _messages(record: Record, config: ControllerConfig) -> Iterator[tuple[int, Message]]:

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from tqdm import tqdm
 
-from blf_dsc_controller.analysis.style import Cell, write_page
+from blf_dsc_controller.analysis.report import Cell, write_page
 from blf_dsc_controller.analysis.summary import plain, write_summary
 from blf_dsc_controller.configuration.nodes import LoopConfig, load_loop
 from blf_dsc_controller.configuration.schema import change

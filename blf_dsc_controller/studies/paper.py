@@ -16,10 +16,10 @@ from typing import NamedTuple
 import numpy as np
 from matplotlib.ticker import NullFormatter
 
-from blf_dsc_controller.analysis.figures import draw_panels
+from blf_dsc_controller.analysis.figures import Picture, draw_panels
 from blf_dsc_controller.analysis.metrics import MOMENTS, estimates_of
-from blf_dsc_controller.analysis.panels import panels
-from blf_dsc_controller.analysis.style import ALARM, COLOURS, MUTED, Cell, Picture, write_page
+from blf_dsc_controller.analysis.panels import ALARM, COLOURS, MUTED, panels
+from blf_dsc_controller.analysis.report import Cell, write_page
 from blf_dsc_controller.analysis.summary import plain, write_summary
 from blf_dsc_controller.configuration.nodes import dump
 from blf_dsc_controller.law.factory import settings_of_config

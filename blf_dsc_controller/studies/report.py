@@ -13,19 +13,10 @@ from matplotlib.axes import Axes
 from matplotlib.ticker import LogLocator, NullFormatter, PercentFormatter
 from scipy.stats import binomtest
 
+from blf_dsc_controller.analysis.figures import Picture, head
 from blf_dsc_controller.analysis.figures import draw as draw_run
-from blf_dsc_controller.analysis.style import (
-    ALARM,
-    BLUE,
-    COLOURS,
-    INK,
-    MUTED,
-    ORANGE,
-    Cell,
-    Picture,
-    head,
-    write_page,
-)
+from blf_dsc_controller.analysis.panels import ALARM, BLUE, COLOURS, INK, MUTED, ORANGE
+from blf_dsc_controller.analysis.report import Cell, write_page
 from blf_dsc_controller.analysis.summary import plain, write_summary
 from blf_dsc_controller.analysis.summary import summarize as summarize_run
 from blf_dsc_controller.bags.reader import read_run

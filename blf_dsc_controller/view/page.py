@@ -21,7 +21,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from blf_dsc_controller.analysis.metrics import bodies_of, errors_of_bodies
-from blf_dsc_controller.analysis.style import ALARM, COLOURS, GREEN, INK, MUTED, ORANGE
+from blf_dsc_controller.analysis.panels import ALARM, COLOURS, GREEN, INK, MUTED, ORANGE
 from blf_dsc_controller.arms.geometry import frames, skeleton, tip_radius
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.errors import BlfDscError, MissingExtraError
