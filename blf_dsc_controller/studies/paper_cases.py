@@ -4,14 +4,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from typing import NamedTuple
 
 import numpy as np
 from tqdm.contrib.concurrent import process_map
 
 from blf_dsc_controller.analysis.metrics import Metrics, measure
-from blf_dsc_controller.configuration.nodes import PLANT, LoopConfig, load_loop
+from blf_dsc_controller.configuration.nodes import LoopConfig, load_loop
 from blf_dsc_controller.configuration.schema import change
 from blf_dsc_controller.run import Run
 from blf_dsc_controller.simulation.loop import simulate
@@ -38,14 +38,12 @@ P = (1.0, 0.32, 0.4)  # kg m^2
 START = (2.2935, 1.6961)  # rad, qr(0)
 BOUND = 0.002  # rad
 
-Changes = tuple[Mapping[str, object], Mapping[str, object]]
-"""Changes of law and plant."""
+Changes = Mapping[str, object]
 
 
 class Case(NamedTuple):
     """A preset with changes to the law and to the plant."""
 
-    name: str
     preset: str
     law: Mapping[str, object] = {}
     plant: Mapping[str, object] = {}
@@ -53,9 +51,9 @@ class Case(NamedTuple):
 
     def loop(self) -> LoopConfig:
         """Return the configuration of the case."""
-        loop = load_loop(self.preset, {PLANT: {'duration': self.duration}})
+        loop, plant = load_loop(self.preset), {'duration': self.duration, **self.plant}
         return loop._replace(
-            controller=change(loop.controller, self.law), plant=change(loop.plant, self.plant)
+            controller=change(loop.controller, self.law), plant=change(loop.plant, plant)
         )
 
 
@@ -69,15 +67,6 @@ _LEAKY = {  # in the paper's form, eta = 0.02
     'truth.parameters': list(P),
     'truth.constant': [0.1, 0.1],
 }
-VARIATIONS = (
-    Case('paper_quiet', 'paper', plant=_QUIET),
-    Case('paper_at_rest', 'paper', _AT_REST),
-    Case('paper_from_zero', 'paper', {'learning.initial_estimate': [0.0] * 3}),
-    Case('leaky', 'recommended', {**_LEAKY, 'truth.amplitude': [0.1, 0.1]}),
-    Case('leaky_constant', 'recommended', _LEAKY, {'disturbance.amplitude': [0.0, 0.0]}),
-    Case('paper_pushed', 'paper', plant=_PUSHED),
-    Case('recommended_pushed', 'recommended', plant=_PUSHED),
-)
 
 
 class Sweep(NamedTuple):
@@ -85,7 +74,7 @@ class Sweep(NamedTuple):
 
     label: str
     values: tuple[float, ...]
-    changes: Callable[[float], Changes]
+    changes: Callable[[float], tuple[Changes, Changes]]
     laws: tuple[str, ...] = SWEPT
 
     @property
@@ -93,22 +82,14 @@ class Sweep(NamedTuple):
         """Name of the condition."""
         return self.label.partition(' [')[0]
 
-    def cases(self) -> Iterator[Case]:
-        """Yield a case for every law and value, named after both."""
-        for law in self.laws:
-            for value in self.values:
-                name = case_name(self.name, law, value)
-                yield Case(name, law, *self.changes(value), SWEEP_DURATION)
-
 
 def case_name(sweep: str, law: str, value: float) -> str:
     """Return the name of one run of a sweep."""
     return f'{sweep} {law} {value:g}'
 
 
-def _differenced(**sensor: float) -> Changes:
-    changes: dict[str, object] = {f'sensor.{name}': value for name, value in sensor.items()}
-    return {}, {**changes, 'sensor.velocity': 'differenced'}
+def _differenced(name: str, value: float) -> tuple[Changes, Changes]:
+    return {}, {f'sensor.{name}': value, 'sensor.velocity': 'differenced'}
 
 
 SWEEPS = (
@@ -125,12 +106,12 @@ SWEEPS = (
     Sweep(
         'encoder [bits a turn]',
         (12.0, 13.0, 14.0, 15.0, 16.0, 18.0, 20.0),
-        lambda value: _differenced(resolution=2.0 * math.pi / 2.0**value),
+        lambda value: _differenced('resolution', 2.0 * math.pi / 2.0**value),
     ),
     Sweep(
         'noise [µrad]',
         (1.0, 3.0, 10.0, 30.0, 100.0, 300.0),
-        lambda value: _differenced(position_noise=value * 1e-6),
+        lambda value: _differenced('position_noise', value * 1e-6),
     ),
     Sweep(
         'torque limit [N m]',
@@ -161,13 +142,22 @@ SWEEPS = (
 )
 
 CASES = {
-    case.name: case
-    for case in (
-        *(Case(preset, preset) for preset in SIDE_BY_SIDE),
-        *VARIATIONS,
-        *(case for sweep in SWEEPS for case in sweep.cases()),
-    )
+    **{preset: Case(preset) for preset in SIDE_BY_SIDE},
+    'paper_quiet': Case('paper', plant=_QUIET),
+    'paper_at_rest': Case('paper', _AT_REST),
+    'paper_from_zero': Case('paper', {'learning.initial_estimate': [0.0] * 3}),
+    'leaky': Case('recommended', {**_LEAKY, 'truth.amplitude': [0.1, 0.1]}),
+    'leaky_constant': Case('recommended', _LEAKY, {'disturbance.amplitude': [0.0, 0.0]}),
+    'paper_pushed': Case('paper', plant=_PUSHED),
+    'recommended_pushed': Case('recommended', plant=_PUSHED),
+    **{
+        case_name(sweep.name, law, value): Case(law, *sweep.changes(value), SWEEP_DURATION)
+        for sweep in SWEEPS
+        for law in sweep.laws
+        for value in sweep.values
+    },
 }
+"""Every run, by name."""
 
 
 class Results(NamedTuple):
