@@ -11,6 +11,7 @@ DURATION ?= 60
 # Of tests on two cores: many wait for other processes.
 WORKERS ?= 3
 MINUTES ?= 30
+EXAMPLES ?= 300
 CHANGING := events panda panda_500hz ur5e ur5e_500hz
 
 .DEFAULT_GOAL := help
@@ -103,9 +104,10 @@ release: $(READY)-release ## Check versions and metadata, and build sdist and wh
 	$(VENV)/bin/python -m twine check --strict out/dist/*
 	@! grep -q '@.*[.]invalid' package.xml || echo 'package.xml has no maintainer that can be' \
 	    'reached, and so has what is in out/dist: see CONTRIBUTING.md before you publish it.'
-fuzz: MINUTES := 5
-fuzz: $(READY)-test ## Feed random files and names to everything that reads them (MINUTES)
-	@$(RUN) test/fuzzing.py --minutes "$(MINUTES)"
+
+fuzz: $(READY)-test ## Feed random files and names to everything that reads them (EXAMPLES of each kind)
+	@EXAMPLES="$(EXAMPLES)" NIGHTLY=1 PYTEST_ADDOPTS='-m ""' $(MAKE) test \
+	    TESTS='test/test_fuzzing.py -k survived'
 
 lint: $(READY)-lint ## Check style, types and layers
 	@good=1; for check in 'ruff check' 'ruff format --check' mypy; do \

@@ -1,34 +1,387 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A few fixed examples of each property in fuzzing.py, and some seconds of soak.py.
+"""Random external input: names, metadata, MCAP files, messages, parameter files, URDFs; and a soak.
 
-`make fuzz` tries more examples, `make soak` runs half an hour.
+Each property states that a command ends with its result or an error of the package: no other
+exception, no hang, bounded memory, nothing opened outside of the folder, nothing imported.
+`make fuzz EXAMPLES=1000` looks for counterexamples, the nightly tests try a few; `make soak` runs
+soak.py for half an hour, here it runs for seconds.
 """
 
 from __future__ import annotations
 
+import contextlib
+import functools
+import io
+import os
+import resource
+import signal
 import subprocess
 import sys
+import tempfile
+import warnings
 from pathlib import Path
+from xml.etree import ElementTree as ET
 
-import fuzzing
 import pytest
-from hypothesis import HealthCheck, Phase, settings
+from hypothesis import HealthCheck, Phase, given, settings
+from hypothesis import strategies as st
 
 pytest.importorskip('rclpy', reason='needs ROS 2')
 pytest.importorskip('plotly', reason='needs plotly: pip install blf_dsc_controller[report]')
 
+import recorded_run
+from foreign_readers import raw_records
+
+from blf_dsc_controller.bags.sources import open_bag
+from blf_dsc_controller.cli.main import main
+from blf_dsc_controller.configuration.files import share_folder
+from blf_dsc_controller.errors import BlfDscError
+
+MOST_SECONDS = 60.0  # of CPU time
+MOST_MEMORY = 3 << 30  # bytes on top of what the process had before
+ASIDE = 'elsewhere'
+
 pytestmark = pytest.mark.nightly
 
-FEW = settings(
-    max_examples=8,
-    phases=(Phase.generate,),
+fuzzed = settings(
+    max_examples=int(os.environ.get('EXAMPLES', '8')),
+    deadline=None,
+    phases=(Phase.reuse, Phase.generate),
     suppress_health_check=list(HealthCheck),
+)
+# The suite removes its folder of logs at the end; a folder of our own goes with the process.
+_made = tempfile.TemporaryDirectory(prefix='fuzzing_', dir=os.environ.get('ROS_LOG_DIR'))
+_folder = Path(_made.name)
+_opened: list[str] = []
+
+
+def _watch(event, arguments):
+    if event == 'open' and ASIDE in str(arguments[0]):
+        _opened.append(str(arguments[0]))
+
+
+sys.addaudithook(_watch)
+
+
+class HangError(BaseException):
+    """A command took too long."""
+
+
+def _hang(*_):
+    raise HangError
+
+
+@contextlib.contextmanager
+def bounded():
+    """Run the tested code within limits."""
+    before = set(sys.modules)
+    _opened.clear()
+    used = int(Path('/proc/self/statm').read_text().split()[0]) * os.sysconf('SC_PAGE_SIZE')
+    limits = resource.getrlimit(resource.RLIMIT_AS)
+    handler = signal.signal(signal.SIGPROF, _hang)
+    resource.setrlimit(resource.RLIMIT_AS, (used + MOST_MEMORY, limits[1]))
+    signal.setitimer(signal.ITIMER_PROF, MOST_SECONDS)
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter('ignore', RuntimeWarning)  # from infinite numbers
+            yield
+    finally:
+        signal.setitimer(signal.ITIMER_PROF, 0.0)
+        resource.setrlimit(resource.RLIMIT_AS, limits)
+        signal.signal(signal.SIGPROF, handler)
+    assert not _opened, _opened
+    odd = {module for module in set(sys.modules) - before if module.split('.')[0] in ODD_MODULES}
+    assert not odd, odd
+
+
+def command(*words):
+    """Run a command and return its exit code; its output must not contain a traceback."""
+    said = io.StringIO()
+    with contextlib.redirect_stdout(said), contextlib.redirect_stderr(said):
+        code = main([str(word) for word in words])
+    assert 'Traceback' not in said.getvalue()
+    assert code in (0, 1, 3, 4, 5), said.getvalue()
+    return code
+
+
+# Names.
+
+ODD_MODULES = ('unittest', 'this', 'antigravity', 'idlelib', 'turtle', 'test')
+PARTS = st.one_of(
+    st.sampled_from(('std_msgs', 'msg', 'srv', 'String', '__main__', *ODD_MODULES, '..', '')),
+    st.text(max_size=8),
 )
 
 
-@pytest.mark.parametrize('check', fuzzing.PROPERTIES, ids=lambda check: check.__name__)
-def test_arbitrary_input_is_survived(check):
-    FEW(check)()
+@fuzzed
+@given(name=st.one_of(st.lists(PARTS, max_size=5).map('/'.join), st.text(max_size=30)))
+def test_names_are_survived(name):
+    """Names of types, topics and joints."""
+    from blf_dsc_controller.bags.content import NameMap
+    from blf_dsc_controller.messages.codecs import UnknownTypeError
+    from blf_dsc_controller.nodes.endpoints import message_class, register_definition
+
+    with bounded():
+        with contextlib.suppress(ImportError, AttributeError):
+            assert message_class(name).__module__.split('.')[0] == name.split('/')[0]
+        with contextlib.suppress(UnknownTypeError):
+            register_definition(name)
+        with contextlib.suppress(BlfDscError):
+            NameMap.parse([name, f'joint1={name}'])
+
+
+# Bags.
+
+
+@functools.cache
+def base():
+    """Return the bag of a short run, from which all others are derived."""
+    return recorded_run.record(_folder / 'base', 0.1)
+
+
+@functools.cache
+def entries():
+    """Return its messages."""
+    return recorded_run.messages(base())
+
+
+@functools.cache
+def pieces():
+    """Return the records of its file."""
+    (file,) = base().glob('*.mcap')
+    return [raw for _, raw in raw_records(file.read_bytes())]
+
+
+@functools.cache
+def secret():
+    """Create a file that no bag may lead to; return its folder."""
+    folder = _folder / ASIDE
+    folder.mkdir()
+    (folder / 'secret.mcap').write_bytes((base() / 'base_0.mcap').read_bytes())
+    return folder
+
+
+READ = ('export', 'replay', 'recover', 'part')
+DRAW = ('report', 'plot')
+WAYS = st.sampled_from((*READ * 5, *DRAW))
+
+
+def read(bag, way):
+    """Read a bag in one of several ways."""
+    out = bag.parent / 'out'
+    if way == 'part':
+        with contextlib.suppress(BlfDscError), open_bag(bag) as opened:
+            list(opened.messages(opened.counts))
+    elif way == 'replay':
+        command('replay', bag)
+    elif way == 'report':
+        command('report', bag, '--out', out / 'page.html')
+    elif way == 'export':
+        command('export', bag, '--out', bag.parent / 'out.csv')
+    else:
+        command(way, bag, '--out', out)
+
+
+@contextlib.contextmanager
+def folder():
+    """Provide a folder for one example, beside the secret one."""
+    secret()
+    with tempfile.TemporaryDirectory(dir=_folder) as made:
+        (Path(made) / 'bag').mkdir()
+        yield Path(made) / 'bag'
+
+
+WORDS = st.one_of(
+    st.sampled_from(('nan', '.inf', '-1', '1e308', '0', '[]', '[[1.0]]', '{}', 'null', '""', '*a')),
+    st.sampled_from(('&a [1]', '!!binary x', '[' * 200, '0x', '"\\0"', '2.0e-320', '1e999', '~')),
+    st.sampled_from(('mcap', 'sqlite3', 'zstd', 'file', 'message', f'../../{ASIDE}/secret.mcap')),
+    st.integers().map(str),
+    st.floats().map(str),
+    st.lists(st.floats(), max_size=4).map(str),
+    st.text(max_size=12),
+    st.text('[]{}&*!|>-:# \n\tab\0é', max_size=20),
+)
+
+
+def damaged(data, text):
+    """Return YAML with other values; lines repeated, removed or extended."""
+    lines = text.splitlines()
+    for _ in range(data.draw(st.integers(1, 4))):
+        at = data.draw(st.integers(0, len(lines) - 1))
+        action = data.draw(st.sampled_from(('value', 'value', 'remove', 'move', 'text')))
+        if action == 'value' and ':' in lines[at]:
+            lines[at] = f'{lines[at].partition(":")[0]}: {data.draw(WORDS)}'
+        elif action == 'remove' and len(lines) > 1:
+            del lines[at]
+        elif action == 'move':
+            lines.insert(data.draw(st.integers(0, len(lines))), lines[at])
+        else:
+            lines[at] += data.draw(WORDS)
+    return '\n'.join(lines).encode('utf-8', 'surrogatepass')
+
+
+@fuzzed
+@given(data=st.data(), way=WAYS)
+def test_metadata_is_survived(data, way):
+    """metadata.yaml: other values, missing entries, other text."""
+    with folder() as bag:
+        (bag / 'base_0.mcap').write_bytes((base() / 'base_0.mcap').read_bytes())
+        text = (base() / 'metadata.yaml').read_text()
+        (bag / 'metadata.yaml').write_bytes(damaged(data, text))
+        with bounded():
+            read(bag, way)
+
+
+NUMBERS = st.one_of(st.integers(0, 3), st.integers(0, 2**64 - 1), st.just(2**63))
+
+
+@fuzzed
+@given(data=st.data(), way=WAYS)
+def test_records_are_survived(data, way):
+    """MCAP files: records changed, removed or repeated; bytes flipped; files truncated."""
+    found = list(pieces())
+    for _ in range(data.draw(st.integers(0, 3))):
+        at = data.draw(st.integers(0, len(found) - 1))
+        action = data.draw(st.sampled_from(('remove', 'move', 'flip', 'length')))
+        if action == 'remove' and len(found) > 1:
+            del found[at]
+        elif action == 'move':
+            found.insert(data.draw(st.integers(0, len(found))), found[at])
+        elif action == 'flip' and found[at]:
+            raw = bytearray(found[at])
+            for place in data.draw(st.lists(st.integers(0, len(raw) - 1), max_size=4)):
+                raw[place] = data.draw(st.integers(0, 255))
+            found[at] = bytes(raw)
+        elif action == 'length':
+            length = data.draw(NUMBERS).to_bytes(8, 'little')
+            found[at] = found[at][:1] + length + found[at][9:]
+    magic = b'\x89MCAP0\r\n'
+    content = magic + b''.join(found) + magic
+    if data.draw(st.integers(0, 9)) == 0:
+        content = content[: data.draw(st.integers(0, len(content)))]
+    with folder() as bag:
+        (bag / 'base_0.mcap').write_bytes(content)
+        (bag / 'metadata.yaml').write_bytes((base() / 'metadata.yaml').read_bytes())
+        with bounded():
+            read(data.draw(st.sampled_from((bag, bag / 'base_0.mcap'))), way)
+
+
+@fuzzed
+@given(data=st.data(), way=WAYS)
+def test_messages_are_survived(data, way):
+    """Serialised messages: bytes changed, added or removed, or another message's content."""
+    changed = [list(message) for message in entries()]
+    topics = sorted({message[0] for message in changed})
+    for _ in range(data.draw(st.integers(1, 3))):
+        topic = data.draw(st.sampled_from(topics))
+        numbers = [k for k, message in enumerate(changed) if message[0] == topic]
+        k = data.draw(st.sampled_from(numbers))
+        raw = bytearray(changed[k][3])
+        place = data.draw(st.integers(0, len(raw)))
+        action = data.draw(st.sampled_from(('flip', 'number', 'cut', 'add', 'other', 'random')))
+        if action == 'flip' and place < len(raw):
+            raw[place] = data.draw(st.integers(0, 255))
+        elif action == 'number':
+            place -= place % 4
+            number = data.draw(st.sampled_from((0, 1, 2**31 - 1, 2**32 - 1, 0x7FF00000)))
+            raw[place : place + 4] = number.to_bytes(4, 'little')
+        elif action == 'cut':
+            del raw[place:]
+        elif action == 'add':
+            raw[place:place] = data.draw(st.binary(max_size=12))
+        elif action == 'other':
+            raw = bytearray(data.draw(st.sampled_from(changed))[3])
+        else:
+            raw = bytearray(b'\0\1\0\0' + data.draw(st.binary(max_size=60)))
+        changed[k][3] = bytes(raw)
+        if data.draw(st.integers(0, 4)) == 0:
+            changed[k][2] = data.draw(st.integers(0, 2**63 - 1))
+    with folder() as bag:
+        bag.rmdir()
+        recorded_run.write(bag, changed)
+        with bounded():
+            read(bag, way)
+
+
+# Parameter files and URDFs.
+
+
+@fuzzed
+@given(data=st.data(), preset=st.sampled_from(('recommended', 'noisy', 'payload', 'panda')))
+def test_parameters_are_survived(data, preset):
+    """Parameter files: other values; lines repeated, removed or extended."""
+    text = (share_folder() / 'config' / f'{preset}.yaml').read_text()
+    with folder() as inside:
+        path = inside / 'given.yaml'
+        path.write_bytes(damaged(data, text))
+        with bounded():
+            from blf_dsc_controller.configuration.nodes import load_loop
+
+            with contextlib.suppress(BlfDscError):
+                load_loop(path)
+
+
+NUMBERS_OF_XML = st.one_of(
+    st.sampled_from(('', 'nan', 'inf', '-1', '0', '1e308', '1e-320', '0 0 0', '1 0', 'x', '1_0')),
+    st.lists(st.floats(), min_size=1, max_size=4).map(lambda x: ' '.join(map(str, x))),
+    st.text(max_size=8),
+)
+
+
+XML = (
+    '<!DOCTYPE r [<!ENTITY a "aa"><!ENTITY b "&a;&a;">]>',
+    f'{"<a>" * 20_000}{"</a>" * 20_000}',
+    ''.join(f'<link name="x{k}"/>' for k in range(400))
+    + ''.join(
+        f'<joint name="y{k}" type="fixed"><parent link="x{k}"/><child link="x{k + 1}"/></joint>'
+        for k in range(399)
+    ),
+)
+
+
+@fuzzed
+@given(data=st.data(), arm=st.sampled_from(('panda', 'ur5e')))
+def test_urdfs_are_survived(data, arm):
+    """URDFs: other attributes; elements removed, nested or repeated."""
+    root = ET.fromstring((share_folder() / 'config' / f'{arm}.urdf').read_text())  # noqa: S314 - ours
+    for _ in range(data.draw(st.integers(1, 4))):
+        every = list(root.iter())
+        element, other = (data.draw(st.sampled_from(every)) for _ in range(2))
+        action = data.draw(st.sampled_from(('value', 'value', 'name', 'remove', 'move', 'nest')))
+        if action == 'value' and element.attrib:
+            key = data.draw(st.sampled_from(sorted(element.attrib)))
+            element.set(key, data.draw(NUMBERS_OF_XML))
+        elif action == 'name' and element.attrib and other.attrib:
+            key = data.draw(st.sampled_from(sorted(element.attrib)))
+            element.set(key, data.draw(st.sampled_from(sorted(other.attrib.values()))))
+        elif action == 'remove' and len(element):
+            element.remove(data.draw(st.sampled_from(list(element))))
+        elif action == 'move' and element is not other and other not in element.iter():
+            element.append(other)
+        elif action == 'nest':
+            tag = data.draw(st.sampled_from(('link', 'origin')))
+            ET.SubElement(other, tag, element.attrib)
+    text = ET.tostring(root, encoding='unicode')
+    if data.draw(st.integers(0, 9)) == 0:
+        at = data.draw(st.integers(0, len(text)))
+        text = (
+            text[:at] + data.draw(st.one_of(st.text(max_size=9), st.sampled_from(XML))) + text[at:]
+        )
+    with folder() as inside:
+        path = inside / 'arm.urdf'
+        path.write_bytes(text.encode('utf-8', 'surrogatepass'))
+        given_file = inside / 'given.yaml'
+        given_file.write_text(
+            f'/**:\n  ros__parameters:\n    robot: {{urdf: {path}, lag: 0.005}}\n'
+            '/**/blf_dsc_controller:\n  ros__parameters:\n'
+            f'    barrier: {{bound: {[0.005] * (7 if arm == "panda" else 6)}}}\n'
+        )
+        with bounded():
+            from blf_dsc_controller.configuration.nodes import load_loop
+
+            with contextlib.suppress(BlfDscError):
+                load_loop(given_file)
+            command('identify', base(), '--urdf', path, '--out', inside / 'out.urdf')
 
 
 def test_loop_survives_a_short_soak():
