@@ -19,7 +19,7 @@ from blf_dsc_controller.configuration.plant import Deviation, PlantConfig
 from blf_dsc_controller.configuration.robot import parameters_of as base_parameters_of
 from sim_plant.arm import Arm, PointMassArm
 from sim_plant.drives import lag, memory_size
-from sim_plant.kernels import observe_plant, plant_truth, step_plant
+from sim_plant.kernels import is_due, observe_plant, plant_truth, plant_views, step_plant
 from sim_plant.layout import (
     VELOCITY_SOURCES,
     Disturbance,
@@ -28,7 +28,6 @@ from sim_plant.layout import (
     Events,
     Load,
     PlantSettings,
-    state_of,
     state_size,
 )
 from sim_plant.rigid_body import rigid_arm, rigid_bodies
@@ -58,7 +57,7 @@ class Plant:
         self.joints = settings.n
         self.period_ns = settings.period_ns
         self.state = np.zeros(state_size(settings))
-        self._now = state_of(self.state, settings)
+        self._plant, self._now = plant_views(self.arm, self.settings, self.state)
         self._noises = [self._now.reading.noise] if is_noisy(settings.encoders) else []
         self._noises += [self._now.drives.noise] if settings.drives.torque_noise > 0.0 else []
         self._q, self._dq = self._now.x[: 2 * self.joints].reshape(2, -1)
@@ -97,7 +96,7 @@ class Plant:
         The noise is drawn here rather than in a kernel, which would draw the same numbers, because
         passing a generator to compiled code costs more than the rest of the call.
         """
-        if self._noises and self._now.reading.sample[0] != self.sample:
+        if self._noises and is_due(self._plant, self._now):
             for noise in self._noises:
                 self.rng.standard_normal(out=noise)
         observe_plant(self.arm, self.settings, self.state, self._measurement)
@@ -122,6 +121,7 @@ class Plant:
         """Switch to settings with the same number of joints, period and delay."""
         self.arm = settings.arm
         self.settings = pack(settings)
+        self._plant, self._now = plant_views(self.arm, self.settings, self.state)
         self._now.acting.sample[0] = -1.0
 
     def hold(self) -> None:

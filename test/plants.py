@@ -58,6 +58,7 @@ FULL = ROUGH | {
     'time_constant': 2e-3,
     'torque_noise': 0.01,
     'velocity_pole': 400.0,
+    'repeat_every': 7,
 }
 """Every kind of imperfection."""
 

@@ -6,7 +6,7 @@ from __future__ import annotations
 import numpy as np
 import pinocchio
 import pytest
-from plants import PERIOD, START, commands, plant, run
+from plants import PERIOD, QUIET, commands, plant
 from random_arm import CONFIG
 
 from blf_dsc_controller.configuration.plant import PlantConfig
@@ -15,7 +15,6 @@ from blf_dsc_controller.errors import ConfigurationError
 from blf_dsc_controller.law.telemetry import PlantTelemetry
 from blf_dsc_controller.messages.codecs import JointStateDecoder
 from sim_plant.plant import plant_of
-from sim_plant.sensors import draw, generator
 
 PANDA = {'robot.urdf': 'panda.urdf', 'robot.tip': 'panda_hand_tcp'}
 HELD = {'robot.drive_compensates': 'gravity'}
@@ -86,17 +85,6 @@ def test_reflex_stops_the_arm_after_a_jump_of_the_torque_until_a_reset(step, rat
     assert not plant.is_stopped
 
 
-def test_repeated_reading_has_all_values_of_the_last_one():
-    noisy = {'sensor.position_noise': 1e-5, 'sensor.velocity': 'differenced'}
-    for every in (0, 3):
-        plant, rows = panda(noisy, {'sensor.repeat_every': every}), []
-        for _ in range(10):
-            rows.append(plant.measure()[:14].copy())
-            plant.step(np.zeros(7))
-        repeated = [k for k in range(1, 10) if np.array_equal(rows[k], rows[k - 1])]
-        assert repeated == ([3, 6, 9] if every else [])
-
-
 def test_joint_states_may_have_another_order_and_other_joints():
     joints, names, measurement = ('a', 'b'), ('finger', 'b', 'a'), np.arange(1.0, 7.0)
     _, raw = PlantTelemetry(joints, (), names).joint_states(5, measurement)
@@ -146,126 +134,95 @@ def test_mistakes_give_one_line(given, problem):
     assert len(raised.value.problems) == 1
 
 
-SAMPLES = 40
+SAMPLES = 60
+OPTIONS = {  # without any imperfection, and with some
+    'delay': (0, 1, 3, SAMPLES + 1),
+    'torque_limit': ((0.0, 0.0), (5.0, 1.5), (0.0, 6.0)),
+    'rate_limit': (0.0, 300.0),
+    'time_constant': (0.0, 5e-4, 2e-3),
+    'torque_noise': (0.0, 0.01),
+    'position_noise': (0.0, 1e-5),
+    'velocity_noise': (0.0, 1e-3),
+    'resolution': (0.0, 1e-5, 2.0 * np.pi / 2**14),
+    'velocity_pole': (0.0, 400.0),
+    'repeat_every': (0, 3, 7),
+    'sensor.velocity': ('measured', 'differenced'),
+    'sensor.offset': (QUIET, (0.01, -0.02)),
+}
 
 
-@pytest.mark.parametrize('delay', [0, 1, 3, SAMPLES + 1])
-def test_command_is_applied_exactly_delay_samples_later(delay):
-    torques = commands(SAMPLES)
-    late, prompt = plant(delay=delay), plant()
-    shifted = np.vstack([np.zeros((delay, 2)), torques])[:SAMPLES]
-    assert (run(late, torques) == run(prompt, shifted)).all()
-    assert (late.truth() == prompt.truth()).all()
+def applied(torques, noise, given):
+    """Torques at the joints (samples, 2): limited in rate, late, limited, lagging, noisy."""
+    step, limit = (np.where(each, each, np.inf) for each in (rate_of(given), given['torque_limit']))
+    last, found = np.zeros(2), np.zeros((given['delay'] + len(torques), 2))
+    for row, torque in zip(found[given['delay'] :], torques, strict=True):
+        row[:] = last = last + np.clip(torque - last, -step, step)
+    found = np.clip(found[: len(torques)], -limit, limit)
+    if tau := given['time_constant']:  # the mean of an exponential over a sample
+        motor, decay = np.zeros(2), np.exp(-PERIOD / tau)
+        for torque in found:
+            lacking = motor - torque
+            motor = torque + decay * lacking
+            torque += tau / PERIOD * (1.0 - decay) * lacking
+    return found * (1.0 + given['torque_noise'] * noise)
 
 
-@pytest.mark.parametrize('delay', [0, 2])
-def test_torque_beyond_the_limit_of_its_joint_is_cut(delay):
-    torques, limit = commands(SAMPLES), np.array([5.0, 1.5])
-    cut = np.clip(torques, -limit, limit)
-    assert (cut != torques).any(axis=0).all()
-    limited = run(plant(delay=delay, torque_limit=limit), torques)
-    assert (limited == run(plant(delay=delay), cut)).all()
+def rate_of(given):
+    return np.full(2, given['rate_limit'] * PERIOD)
 
 
-def test_driver_lets_a_command_change_at_its_rate_only():
-    torques, passed = commands(SAMPLES), [np.zeros(2)]
-    for torque in torques[:-1]:
-        passed.append(passed[-1] + np.clip(torque - passed[-1], -0.3, 0.3))
-    np.testing.assert_allclose(run(plant(rate_limit=300.0), torques)[:, 4:], passed, rtol=1e-12)
+def is_new(k, given):
+    return k == 0 or given['repeat_every'] == 0 or k % given['repeat_every'] != 0
 
 
-def test_lagging_drive_has_a_first_order_step_response():
-    """The lag follows the limit; a sample reports the mean torque of its interval."""
-    tau, step = 2e-3, np.array([4.0, -9.0])
-    effort = run(plant(time_constant=tau, torque_limit=(0.0, 6.0)), np.tile(step, (20, 1)))[1:, 4:]
-    t = 1e-3 * np.arange(20)
-    mean = np.diff(t + tau * np.exp(-t / tau)) / 1e-3
-    np.testing.assert_allclose(effort, mean[:, None] * [4.0, -6.0], rtol=1e-12)
+def readings(true, noise, reads, given):
+    """Readings [q, dq] (reads, 4) of the true states (samples, 4)."""
+    rows, last = [], None  # sample of the last reading that was new
+    for k in reads:
+        if is_new(k, given):
+            q = true[k, :2] + given['sensor.offset'] + given['position_noise'] * noise[k, :2]
+            if step := given['resolution']:
+                q = np.rint(q / step) * step
+            dq = true[k, 2:]
+            if given['sensor.velocity'] == 'measured':
+                dq = dq + given['velocity_noise'] * noise[k, 2:]
+            elif last is not None:
+                dq = (q - rows[-1][:2]) / ((k - last) * PERIOD)
+            if given['velocity_pole'] and last is not None:
+                old = np.exp(-given['velocity_pole'] * (k - last) * PERIOD)
+                dq = dq + old * (rows[-1][2:] - dq)
+            last, reading = k, np.concatenate((q, dq))
+        rows.append(reading)
+    return np.array(rows)
 
 
-def test_drive_noise_is_proportional_to_the_torque_and_drawn_after_that_of_the_encoders():
-    torques = np.tile([5.0, -2.0], (4000, 1))
-    effort = run(plant(torque_noise=0.01, seed=4), torques)
-    error = effort[1:, 4:] / torques[1:] - 1.0
-    np.testing.assert_allclose(error.std(axis=0), 0.01, rtol=0.05)
-    assert abs(np.corrcoef(error.T)[0, 1]) < 0.07
-    arm, numbers = plant(position_noise=1e-5, torque_noise=0.01, seed=4), np.empty(1000)
-    draw(generator(4), numbers)  # compiled
-    drawn = np.random.Generator(np.random.PCG64(np.random.SeedSequence(4))).standard_normal(1000)
-    np.testing.assert_array_equal(numbers, drawn)
-    np.testing.assert_array_equal(arm.measure()[:2], np.array(START) + 1e-5 * drawn[:2])
-    arm.step(np.array([1.0, 2.0]))
-    np.testing.assert_array_equal(arm.measure()[4:], [1.0, 2.0] * (1.0 + 0.01 * drawn[4:6]))
-
-
-def true_states(samples, **changes):
-    """Noise-free states (samples, 4) under the usual torques."""
-    arm, rows = plant(**changes), np.empty((samples, 4))
-    for row, torque in zip(rows, commands(samples), strict=True):
-        row[:] = arm.truth()[5:]
+@pytest.mark.parametrize('seed', range(40))
+def test_readings_and_torques_are_those_of_encoders_and_drives_in_plain_numpy(seed):
+    """Also where a sample is read twice, or not at all; the arm moves by the torques reported."""
+    drawn = np.random.default_rng(seed)
+    given = {name: values[drawn.integers(len(values))] for name, values in OPTIONS.items()}
+    reads, torques, start = range(0, SAMPLES, [1, 1, 4][seed % 3]), commands(SAMPLES), (0.4, -0.3)
+    if seed == 0:
+        given = {name: values[0] for name, values in OPTIONS.items()}
+    arm = plant(seed=seed, velocity=start, **given)
+    random = np.random.Generator(np.random.PCG64(np.random.SeedSequence(seed)))
+    true, noise, found = np.zeros((SAMPLES, 4)), np.zeros((SAMPLES, 6)), []
+    for k, torque in enumerate(torques):
+        if k in reads:
+            if is_new(k, given) and (given['position_noise'] or given['velocity_noise']):
+                noise[k:, :4] = random.standard_normal(4)
+            if is_new(k, given) and given['torque_noise']:
+                noise[k:, 4:] = random.standard_normal(2)
+            found.append(arm.measure().copy())
+            np.testing.assert_array_equal(arm.measure(), found[-1])
+        true[k] = arm.truth()[5:]
         arm.step(torque)
-    return rows
-
-
-def test_ideal_sensor_measures_the_true_state_without_random_numbers():
-    arm = plant()
-    before = arm.rng.bit_generator.state
-    assert (run(arm, commands(50))[:, :4] == true_states(50)).all()
-    assert arm.rng.bit_generator.state == before
-
-
-def test_noise_has_the_configured_standard_deviation():
-    samples = 2000
-    read = run(plant(position_noise=1e-5, velocity_noise=1e-3), commands(samples))
-    noise = read[:, :4] - true_states(samples)
-    error = 1 / np.sqrt(2 * samples)  # standard error of a sample deviation, relative
-    assert noise.std(axis=0) == pytest.approx([1e-5, 1e-5, 1e-3, 1e-3], rel=4 * error)
-    assert np.abs(noise.mean(axis=0) / noise.std(axis=0)).max() < 4 / np.sqrt(samples)
-    off_diagonal = np.corrcoef(noise.T) - np.eye(4)
-    assert np.abs(off_diagonal).max() < 4 / np.sqrt(samples)
-
-
-def test_quantised_position_is_the_nearest_multiple_of_the_resolution():
-    resolution = 2 * np.pi / 2**14
-    read = run(plant(resolution=resolution), commands(200))[:, :2]
-    assert read / resolution == pytest.approx(np.rint(read / resolution), abs=1e-9)
-    # half a count, and the rounding of the division
-    error = np.abs(read - true_states(200)[:, :2])
-    assert resolution / 4 < error.max() <= resolution / 2 * (1 + 1e-9)
-
-
-@pytest.mark.parametrize('every', [1, 7])
-def test_differenced_velocity_is_that_of_the_measured_positions(every):
-    """Also where samples are skipped."""
-    noisy = {'sensor.velocity': 'differenced', 'position_noise': 1e-5, 'resolution': 1e-5}
-    arm = plant(velocity=(0.4, -0.3), **noisy)
-    read = [arm.measure().copy()]
-    for k, torque in enumerate(commands(49), start=1):
-        arm.step(torque)
-        if k % every == 0:
-            read.append(arm.measure().copy())
-    read = np.array(read)
-    assert read[0, 2:4].tolist() == [0.4, -0.3]
-    expected = np.diff(read[:, :2], axis=0) / (every * PERIOD)
-    assert read[1:, 2:4] == pytest.approx(expected, rel=1e-13)
-
-
-@pytest.mark.parametrize('source', ['measured', 'differenced'])
-def test_velocity_is_low_pass_filtered_with_its_pole(source):
-    options = {'sensor.velocity': source, 'position_noise': 1e-5, 'velocity_noise': 1e-3}
-    raw = run(plant(**options), commands(30))[:, 2:4]
-    read = run(plant(velocity_pole=400.0, **options), commands(30))[:, 2:4]
-    expected = raw.copy()
-    for k in range(1, 30):
-        expected[k] = raw[k] + np.exp(-0.4) * (expected[k - 1] - raw[k])
-    np.testing.assert_allclose(read, expected, rtol=1e-13)
-
-
-@pytest.mark.parametrize('source', ['measured', 'differenced'])
-def test_reading_a_sample_twice_gives_the_same_values(source):
-    once, twice = (plant(position_noise=1e-5, **{'sensor.velocity': source}) for _ in range(2))
-    for torque in commands(20):
-        twice.measure()
-        assert (once.measure() == twice.measure()).all()
-        once.step(torque)
-        twice.step(torque)
+    assert arm.rng.bit_generator.state == random.bit_generator.state
+    moved = applied(torques, noise[:, 4:], given)
+    efforts = np.vstack((QUIET, moved))[reads]
+    expected = np.hstack((readings(true, noise[:, :4], reads, given), efforts))
+    np.testing.assert_allclose(found, expected, rtol=1e-11, atol=1e-11)
+    ideal = plant(velocity=start)
+    for state, torque in zip(true, moved, strict=True):
+        np.testing.assert_allclose(ideal.truth()[5:], state, rtol=1e-11, atol=1e-12)
+        ideal.step(torque)
