@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Random serial arms as URDFs, and the same arms as read by pinocchio."""
+"""Random serial arms as URDFs."""
 
 from __future__ import annotations
 
@@ -101,22 +101,3 @@ ARMS = {
 def chain_of(name):
     text, joints, base, tip = ARMS[name]
     return read_chain(text, base, tip, joints)
-
-
-class ArmCase:
-    """An arm with a tilted base in a random state, and the same arm in pinocchio."""
-
-    gravity = (1.0, -3.0, 5.0)
-
-    def __init__(self, name):
-        text, joints, _, self.tip = ARMS[name]
-        self.chain, self.n = chain_of(name), len(joints)
-        self.random = np.random.default_rng(self.n)
-        self.q, self.dq, self.v, self.a = self.random.normal(size=(4, self.n))
-        self.rotors = self.random.uniform(0.01, 0.3, self.n)
-        self.phi = np.column_stack((self.chain.inertias, self.rotors)).ravel()
-        self.model = pinocchio_model(text, joints)
-        self.model.gravity.linear[:] = self.gravity
-        self.model.armature[:] = self.rotors
-        self.data = self.model.createData()
-        self.theirs = configuration(self.model, self.q)

@@ -4,10 +4,8 @@
 from __future__ import annotations
 
 import numpy as np
-import pinocchio
 import pytest
-from closed_loop_case import MODEL
-from random_arm import ARMS, ArmCase, chain_of
+from random_arm import chain_of
 
 from blf_dsc_controller.arms.base_parameters import (
     CENTRE,
@@ -17,80 +15,28 @@ from blf_dsc_controller.arms.base_parameters import (
     prior_factor,
 )
 from blf_dsc_controller.arms.inertia import inertia_of, pseudo_inertia
-from blf_dsc_controller.arms.model import inertia_matrices, regressors_at
 from blf_dsc_controller.arms.serial_chain import ROTOR, serial_chain
-from sim_plant.rigid_body import rigid_arm
 
-
-class Case(ArmCase):
-    """An arm as a model of the controller."""
-
-    def __init__(self, name):
-        super().__init__(name)
-        self.arm = serial_chain(self.chain, self.gravity)
-
-    def H(self, q, dq, v, a):
-        H = np.full((self.n, self.arm.p), np.nan)
-        self.arm.regressor(q, dq, v, a, H)
-        return H
-
-    def momentum(self, q, dq):
-        Yp, Yr = np.full((2, self.n, self.arm.p), np.nan)
-        self.arm.momentum_regressor(q, dq, Yp, Yr)
-        return Yp, Yr
-
-
-@pytest.mark.parametrize('name', ARMS)
-def test_regressors_agree_with_pinocchio(name):
-    """Property III with the Christoffel C, where v and a are not the derivatives of q."""
-    case = Case(name)
-    theirs = case.model, case.data, case.theirs
-    M = pinocchio.crba(*theirs).copy()
-    C = pinocchio.computeCoriolisMatrix(*theirs, case.dq).copy()
-    G = pinocchio.computeGeneralizedGravity(*theirs).copy()
-    torque = case.H(case.q, case.dq, case.v, case.a) @ case.phi
-    np.testing.assert_allclose(torque, M @ case.a + C @ case.v + G, atol=1e-10)
-    Yp, Yr = case.momentum(case.q, case.dq)
-    np.testing.assert_allclose(Yp @ case.phi, M @ case.dq, atol=1e-10)
-    np.testing.assert_allclose(Yr @ case.phi, G - C.T @ case.dq, atol=1e-10)
-    expected = pinocchio.computeJointTorqueRegressor(*theirs, case.dq, case.a)
-    ours = case.H(case.q, case.dq, case.dq, case.a).reshape(case.n, case.n, ROTOR + 1)
-    np.testing.assert_allclose(ours[:, :, :ROTOR].ravel(), expected.ravel(), atol=1e-10)
-    np.testing.assert_array_equal(ours[:, :, ROTOR], np.diag(case.a))
-    found = inertia_matrices(case.arm, case.phi, np.stack((case.q + 0.5, case.q)))[1]
-    np.testing.assert_allclose(found, M, atol=1e-10)
-
-
-@pytest.mark.parametrize('model', [Case('six').arm, MODEL])
-def test_regressors_computed_at_once_or_in_a_batch_equal_the_separate_ones(model):
-    states = np.random.default_rng(1).normal(size=(5, 4, model.n))
-    H = regressors_at(model, *np.moveaxis(states, 1, 0))
-    for state, batched in zip(states, H, strict=True):
-        separate, together = np.full((2, 3, model.n, model.p), np.nan)
-        model.regressor(*state, separate[0])
-        model.momentum_regressor(*state[:2], *separate[1:])
-        model.regressors(*state, *together)
-        np.testing.assert_array_equal(together, separate)
-        np.testing.assert_array_equal(batched, separate[0])
+WALL = (0.0, 9.81, 0.0)
 
 
 def test_chosen_columns_keep_their_values_names_and_units():
-    whole = Case('three')
+    chain, (q, dq) = chain_of('three'), np.random.default_rng(0).normal(size=(2, 3))
     chosen = [(0, ROTOR), (1, 0), (1, 3), (2, 9)]
-    part = serial_chain(whole.chain, whole.gravity, chosen)
+    part, whole = serial_chain(chain, WALL, chosen), serial_chain(chain, WALL)
     columns = [body * (ROTOR + 1) + entry for body, entry in chosen]
-    rows = np.full((2, 3, 6), np.nan)  # wider, as with disturbance columns beside them
-    part.momentum_regressor(whole.q, whole.dq, *rows)
-    expected = np.array(whole.momentum(whole.q, whole.dq))[:, :, columns]
-    np.testing.assert_array_equal(rows[:, :, :4], expected)
+    # Wider, as with disturbance columns beside them.
+    rows, every = np.full((2, 3, 6), np.nan), np.full((2, 3, whole.p), np.nan)
+    part.momentum_regressor(q, dq, *rows)
+    whole.momentum_regressor(q, dq, *every)
+    np.testing.assert_array_equal(rows[:, :, :4], every[:, :, columns])
     assert np.isnan(rows[:, :, 4:]).all()
     assert part.parameter_names == ('rotor1', 'm2', 'm*cz2', 'Izz3')
-    rotor = 'kg' if whole.chain.joints[0].kind == 'prismatic' else 'kg m^2'
+    rotor = 'kg' if chain.joints[0].kind == 'prismatic' else 'kg m^2'
     assert part.parameter_units == (rotor, 'kg', 'kg m', 'kg m^2')
-    assert {joint.kind for joint in whole.chain.joints} > {'prismatic'}
+    assert {joint.kind for joint in chain.joints} > {'prismatic'}
 
 
-WALL = (0.0, 9.81, 0.0)
 PANDA_CHAIN, UR5E_CHAIN, *RANDOM = map(chain_of, ('panda', 'ur5e', 'three', 'nine'))
 CHAINS = [PANDA_CHAIN, UR5E_CHAIN, *RANDOM]
 
@@ -167,18 +113,6 @@ def test_prior_of_a_ball_is_the_same_in_every_direction():
     ten = deviations(J, 0.3, CENTRE)
     turned = np.transpose([inertia_of(turn @ pseudo_inertia(d) @ turn.T) for d in ten.T])
     np.testing.assert_allclose(turned @ turned.T, ten @ ten.T, atol=1e-15)
-
-
-def test_load_at_the_tip_agrees_with_the_payload_of_the_plant():
-    """The plant uses Newton-Euler, an independent algorithm, with a point mass at the tip."""
-    rotors, base = np.linspace(0.02, 0.2, 7), base_parameters(PANDA_CHAIN, WALL)
-    arm = rigid_arm(PANDA_CHAIN, WALL, PANDA_CHAIN.inertias, rotors, base)
-    P = base.of(PANDA_CHAIN.inertias, rotors) + 2.0 * base.load
-    H, found = np.zeros((7, P.size)), np.zeros(7)
-    for q, dq, ddq in np.random.default_rng(3).normal(size=(5, 3, 7)):
-        base.model.regressor(q, dq, dq, ddq, H)
-        arm.accelerate(2.0, q, dq, H @ P, found)
-        np.testing.assert_allclose(found, ddq, rtol=1e-9, atol=1e-9)
 
 
 @pytest.mark.parametrize('chain', CHAINS)

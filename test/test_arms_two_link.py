@@ -1,14 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The two-link arm as URDF and as derived again; joints, axes, tip and clearance of chains."""
+"""The two-link arm as URDF and as derived again; tip and clearance of chains."""
 
 from __future__ import annotations
 
 import numpy as np
-import pinocchio
 import plain_law
 import pytest
 from plants import ARM
-from random_arm import ArmCase, chain_of
+from random_arm import chain_of
 
 from blf_dsc_controller.arms.geometry import Clearance, distance, skeleton, tip_radius
 from blf_dsc_controller.arms.model import arm_model, regressors_at
@@ -57,21 +56,6 @@ def test_two_links_are_the_arm_of_section_iv(arm):
     assert model.parameter_units == ('kg m^2',) * 3
     inner, outer = arm.m1 + arm.m2, arm.m2
     assert pytest.approx([inner * arm.l1**2, outer * arm.l2**2, outer * arm.l1 * arm.l2]) == P
-
-
-def test_corners_and_axes_agree_with_pinocchio():
-    case = ArmCase('six')
-    assert {joint.kind for joint in case.chain.joints} >= {'revolute', 'prismatic'}
-    corners, axes = skeleton(case.chain, case.q)
-    pinocchio.framesForwardKinematics(case.model, case.data, case.theirs)
-    np.testing.assert_array_equal(corners[0], np.zeros(3))
-    for i, (joint, placed) in enumerate(
-        zip(case.chain.joints, list(case.data.oMi)[1:], strict=True)
-    ):
-        np.testing.assert_allclose(corners[i + 1], placed.translation, atol=1e-12)
-        np.testing.assert_allclose(axes[i], placed.rotation @ joint.axis, atol=1e-12)
-    end = case.data.oMf[case.model.getFrameId('tip')].translation
-    np.testing.assert_allclose(corners[-1], end, atol=1e-12)
 
 
 def test_tip_radius_is_the_sum_of_what_each_joint_moves_the_tip():

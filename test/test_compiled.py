@@ -93,40 +93,34 @@ def compiled_in(checkout, cache, ending='', **target):
     return entry, found, compiled
 
 
+def edit(checkout):
+    """Add 1 to an entry of the regressor, in another file than that of its kernel."""
+    called = checkout / PACKAGE.name / 'arms/two_link.py'
+    called.write_text(called.read_text().replace('H[0, 0] = a[0] +', 'H[0, 0] = 1.0 + a[0] +'))
+
+
 @compiling
-def test_second_checkout_finds_the_kernels_of_the_first_and_never_those_of_other_sources(tmp_path):
-    first, second, cache = (tmp_path / name for name in ('first', 'second', 'cache'))
+def test_kernels_of_another_checkout_or_of_the_package_are_found_and_never_of_other_sources(
+    tmp_path,
+):
+    first, second, cache, unused = (tmp_path / name for name in ('first', 'second', 'a', 'b'))
     for checkout in (first, second):
         for package in (PACKAGE, PACKAGE.parent / 'sim_plant'):
-            unwanted = shutil.ignore_patterns('__pycache__')
+            unwanted = shutil.ignore_patterns('__pycache__', 'kernels')
             shutil.copytree(package, checkout / package.name, ignore=unwanted)
-    entry, *counts = compiled_in(first, cache)
+    entry, *counts = compiled_in(first, cache, ending='jit.ship()')
     assert counts == [0, 1]
     assert compiled_in(second, cache) == (entry, 1, 0)
-
-    called = second / PACKAGE.name / 'arms/two_link.py'  # in another file than the kernel
-    called.write_text(called.read_text().replace('H[0, 0] = a[0] +', 'H[0, 0] = 1.0 + a[0] +'))
-    assert compiled_in(second, cache) == (pytest.approx(entry + 1.0), 0, 1)
-    assert compiled_in(first, cache) == (entry, 1, 0)
-
-
-@compiling
-def test_kernels_in_the_package_are_found_and_never_those_of_other_sources(tmp_path):
-    checkout, cache, unused = (tmp_path / name for name in ('checkout', 'cache', 'unused'))
-    for package in (PACKAGE, PACKAGE.parent / 'sim_plant'):
-        unwanted = shutil.ignore_patterns('__pycache__', 'kernels')
-        shutil.copytree(package, checkout / package.name, ignore=unwanted)
-    entry, *counts = compiled_in(checkout, cache, ending='jit.ship()')
-    assert counts == [0, 1]
-    shipped = checkout / PACKAGE.name / 'compiled/kernels'
+    shipped = first / PACKAGE.name / 'compiled/kernels'
     before = sorted(shipped.rglob('*'))
-    assert compiled_in(checkout, unused) == (entry, 1, 0)
+    assert compiled_in(first, unused) == (entry, 1, 0)
     assert not list(unused.rglob('*.nb?'))
 
-    called = checkout / PACKAGE.name / 'arms/two_link.py'  # in another file than the kernel
-    called.write_text(called.read_text().replace('H[0, 0] = a[0] +', 'H[0, 0] = 1.0 + a[0] +'))
-    assert compiled_in(checkout, unused) == (pytest.approx(entry + 1.0), 0, 1)
-    assert compiled_in(checkout, unused) == (pytest.approx(entry + 1.0), 1, 0)
+    other = pytest.approx(entry + 1.0)
+    for checkout, folder in ((second, cache), (first, unused)):
+        edit(checkout)
+        assert compiled_in(checkout, folder) == (other, 0, 1)
+        assert compiled_in(checkout, folder) == (other, 1, 0)
     assert sorted(shipped.rglob('*')) == before
 
 

@@ -160,10 +160,10 @@ def applied(torques, noise, given):
     found = np.clip(found[: len(torques)], -limit, limit)
     if tau := given['time_constant']:  # the mean of an exponential over a sample
         motor, decay = np.zeros(2), np.exp(-PERIOD / tau)
-        for torque in found:
+        for k, torque in enumerate(found.copy()):
             lacking = motor - torque
             motor = torque + decay * lacking
-            torque += tau / PERIOD * (1.0 - decay) * lacking
+            found[k] += tau / PERIOD * (1.0 - decay) * lacking
     return found * (1.0 + given['torque_noise'] * noise)
 
 

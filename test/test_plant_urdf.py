@@ -1,77 +1,18 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The plant of an arm from a URDF against pinocchio; its events and its truth."""
+"""The plant of an arm from a URDF: its configuration, its truth and its events."""
 
 from __future__ import annotations
 
 import numpy as np
 import pinocchio
 import pytest
-from random_arm import ARMS, PANDA, ArmCase
+from random_arm import PANDA
 
 from blf_dsc_controller.arms.base_parameters import base_parameters
 from blf_dsc_controller.arms.inertia import pseudo_inertia
-from blf_dsc_controller.arms.serial_chain import serial_chain
 from blf_dsc_controller.configuration.plant import PlantConfig
 from blf_dsc_controller.configuration.schema import build, change
 from sim_plant.plant import parameters_of, plant_of, plant_settings, true_inertias
-from sim_plant.rigid_body import acceleration, locate, motion_of, motion_size, rigid_bodies, tip
-
-
-class BodyCase(ArmCase):
-    """An arm as bodies of the plant."""
-
-    def __init__(self, name):
-        super().__init__(name)
-        self.bodies = rigid_bodies(self.chain, self.gravity, self.chain.inertias, self.rotors)
-        self.now = motion_of(np.full(motion_size(self.bodies), np.nan), self.bodies)
-
-    def acceleration(self, payload=0.0):
-        """Acceleration under the torque `v`, and pinocchio's (articulated bodies)."""
-        ddq = self.v.copy()
-        locate(self.bodies, self.q, self.dq, self.now)
-        acceleration(self.bodies, self.now, payload, ddq, ddq)  # in place
-        return ddq, pinocchio.aba(self.model, self.data, self.theirs, self.dq, self.v)
-
-
-@pytest.mark.parametrize('name', ARMS)
-def test_accelerations_match_pinocchio_and_the_controllers_regressor(name):
-    """H(q, dq, dq, ddq) P = torque, from two derivations that share only the geometry."""
-    case = BodyCase(name)
-    ddq, expected = case.acceleration()
-    np.testing.assert_allclose(ddq, expected, rtol=1e-10, atol=1e-10)
-    model = serial_chain(case.chain, case.gravity)
-    H = np.zeros((case.n, model.p))
-    model.regressor(case.q, case.dq, case.dq, ddq, H)
-    np.testing.assert_allclose(H @ case.phi, case.v, rtol=1e-9, atol=1e-9)
-
-
-@pytest.mark.parametrize('name', ARMS)
-def test_tip_and_body_placements_match_pinocchio(name):
-    case = BodyCase(name)
-    locate(case.bodies, case.q, case.dq, case.now)
-    pinocchio.framesForwardKinematics(case.model, case.data, case.theirs)
-    position, jacobian, frame = np.zeros(3), np.zeros((3, case.n)), case.model.getFrameId(case.tip)
-    tip(case.bodies, case.now, position, jacobian)
-    np.testing.assert_allclose(position, case.data.oMf[frame].translation, atol=1e-12)
-    axes = pinocchio.LOCAL_WORLD_ALIGNED
-    theirs = pinocchio.computeFrameJacobian(case.model, case.data, case.theirs, frame, axes)
-    np.testing.assert_allclose(jacobian, theirs.reshape(6, -1)[:3], atol=1e-12)
-    for i in range(case.n + 1):
-        np.testing.assert_allclose(case.now.origin[i], case.data.oMi[i].translation, atol=1e-12)
-        np.testing.assert_allclose(case.now.rotation[i], case.data.oMi[i].rotation, atol=1e-12)
-
-
-def test_acceleration_accounts_for_other_inertias_and_a_payload():
-    """A truth that differs from the URDF: links 20 % heavier, 2 kg at the tip."""
-    case = BodyCase('panda')
-    inertias = 1.2 * case.chain.inertias
-    case.bodies = rigid_bodies(case.chain, case.gravity, inertias, case.rotors)
-    for i, heavier in enumerate(inertias, start=1):
-        case.model.inertias[i] = pinocchio.Inertia.FromDynamicParameters(heavier)
-    point = case.chain.tip_placement[:3, 3]
-    case.model.inertias[case.n] += pinocchio.Inertia(2.0, point, np.zeros((3, 3)))
-    np.testing.assert_allclose(*case.acceleration(2.0), rtol=1e-10, atol=1e-10)
-
 
 PANDA_CONFIG = {'robot.urdf': 'panda.urdf', 'robot.tip': 'panda_hand_tcp'}
 
