@@ -73,10 +73,9 @@ class Run:
     error: Floats | None  #: (N, n) rad, xi1 = q - qr
     bound: Floats | None  #: (N, n) rad, k_c
     torque_limit: Floats | None  #: (N, n) N m
-    learning: Series | None = None
+    monitor: Series | None = None  #: estimates and what else the law says of its state
     truth: Series | None = None
     timing: Series | None = None
-    monitor: Series | None = None
     message_counts: Mapping[str, int] = field(default_factory=dict)
     stops: tuple[Stop, ...] = ()
     arm: LearnedArm | None = None  #: from a URDF

@@ -11,7 +11,7 @@ from blf_dsc_controller.messages.topics import (
     BOUND,
     COMMANDS,
     JOINT_STATES,
-    LEARNING,
+    MONITOR,
     REFERENCE,
     TIMING,
     TRACKING_ERROR,
@@ -70,7 +70,7 @@ class Synthetic:
             yield REFERENCE, stamp, reference.encode(stamp, self.reference[k], zero)
             yield TRACKING_ERROR, stamp, tracking.encode(stamp, self.error[k], zero, self.torque[k])
             vector = [*self.estimate[k], *(0.9 * self.disturbance[k]), 0.1, 0.004]
-            yield LEARNING, stamp, learning.encode(stamp, [*vector, self.latched[k], 1e-9 * k])
+            yield MONITOR, stamp, learning.encode(stamp, [*vector, self.latched[k], 1e-9 * k])
             if k % 10 == 0:
                 yield TRUTH, stamp, truth.encode(stamp, [*TRUE, *self.disturbance[k], 1.0])
             if with_timing:

@@ -59,7 +59,7 @@ def run_of(estimate, true=P, regressor=pendulum):
         error=0 * q,
         bound=ones,
         torque_limit=ones,
-        learning=Series((*names, LAMBDA_MIN, LATCHED), stamp, learned),
+        monitor=Series((*names, LAMBDA_MIN, LATCHED), stamp, learned),
         truth=Series(names, stamp, np.broadcast_to(true, (TIME.size, 3))),
         arm=LearnedArm(
             dict.fromkeys(names, 'kg'), dict(zip(names, (0.5, 1.0, 2.0), strict=True)), regressor
@@ -146,7 +146,7 @@ def test_seven_joints_and_sixty_parameters_fit_into_the_figures(tmp_path, config
     series = Series((*names, LAMBDA_MIN, LATCHED), stamp, learned)
     run = Run(
         *(config.joints, stamp, stamp, wide, wide, wide, wide + 0.001, wide / 1e3, wide, wide),
-        learning=series,
+        monitor=series,
         truth=series,
         arm=arm if configured else None,
     )
@@ -196,8 +196,8 @@ def test_arm_of_a_bag_comes_from_its_recorded_configuration(tmp_path):
 def test_unknown_parameter_names_give_a_reason_instead_of_an_error(tmp_path):
     messages = Synthetic(200).messages()
     run = read_run(synthetic_bag.write(tmp_path / 'bag', messages))
-    names = ('mass 1', 'mass 2', *run.learning.names[2:])
-    run = replace(run, learning=replace(run.learning, names=names))
+    names = ('mass 1', 'mass 2', *run.monitor.names[2:])
+    run = replace(run, monitor=replace(run.monitor, names=names))
     learning = summarize(run)['learning']
     assert learning['final_relative_error'] is None
     assert learning['true'] is None

@@ -96,7 +96,7 @@ def test_missing_series_and_a_single_sample_are_drawn(run, tmp_path):
     partial = dataclasses.replace(run, error=None, truth=None, torque=unknown_torque)
     assert len(draw(partial, tmp_path)) == 2
     assert pixels(tmp_path / 'tracking.png').shape[0] < height / 2
-    minimal = dataclasses.replace(partial, reference=None, bound=None, learning=None)
+    minimal = dataclasses.replace(partial, reference=None, bound=None, monitor=None)
     assert draw(minimal, tmp_path / 'alone') == [tmp_path / 'alone' / 'tracking.png']
     assert not (tmp_path / 'alone' / 'parameters.png').exists()
     arrays = ('stamp', 'received', 'position', 'velocity', 'torque', 'reference', 'error', 'bound')
@@ -122,7 +122,7 @@ def test_logarithmic_error_panel_shows_small_and_large_errors(run):
 def test_panels_are_drawn_once(run, tmp_path, monkeypatch):
     drawn = []
     monkeypatch.setattr(figures, 'draw_panels', lambda _p, _t, shown, *_, **__: drawn.extend(shown))
-    draw(dataclasses.replace(run, monitor=run.learning), tmp_path)
+    draw(run, tmp_path)
     titles = [panel.title for panel in drawn]
     assert len(titles) == len({*titles})
     assert {'|error| of shoulder', 'minimum eigenvalue of Φ', 'relative parameter error'} <= {
@@ -133,11 +133,11 @@ def test_panels_are_drawn_once(run, tmp_path, monkeypatch):
 @pytest.mark.filterwarnings('error')
 @pytest.mark.parametrize('level', [0.0001, np.nan])
 def test_constant_series_on_a_logarithmic_axis_is_drawn(run, tmp_path, level):
-    learning = run.learning
+    learning = run.monitor
     values = learning.values.copy()
     values[:, learning.names.index('lambda_min')] = level
     values[-1, learning.names.index('lambda_min')] *= 1.0 - 6e-16
-    unknown = dataclasses.replace(run, learning=dataclasses.replace(learning, values=values))
+    unknown = dataclasses.replace(run, monitor=dataclasses.replace(learning, values=values))
     assert tmp_path / 'parameters.png' in draw(unknown, tmp_path)
 
 

@@ -26,7 +26,7 @@ from blf_dsc_controller.messages.topics import (
     CHANGES,
     JOINT_STATES,
     JOURNAL,
-    LEARNING,
+    MONITOR,
     REFERENCE,
     TRACKING_ERROR,
 )
@@ -155,7 +155,7 @@ def stopped(folder, reason=Reason.OUTSIDE_BOUND):
     messages = [
         (topic, stamp + LATE, raw)
         for topic, stamp, raw in Synthetic(4000).messages()
-        if topic not in (TRACKING_ERROR, REFERENCE, LEARNING) or stamp < stop
+        if topic not in (TRACKING_ERROR, REFERENCE, MONITOR) or stamp < stop
     ]
     messages.append((JOURNAL, stop + 2 * LATE, event.encode()))
     return synthetic_bag.write(folder / 'bag', sorted(messages, key=lambda entry: entry[1]))

@@ -69,9 +69,9 @@ def test_learning(run):
     assert learning['time_to_1_percent_s'] == pytest.approx(LATCH_S + np.log(50), abs=1e-3)
     assert learning['true'] == dict(zip(PARAMETERS, TRUE, strict=True))
     assert list(learning['final_estimate']) == list(PARAMETERS)
-    values = run.learning.values.copy()
+    values = run.monitor.values.copy()
     values[-1, 0] = 0.0  # it has to stay below
-    left = dataclasses.replace(run, learning=dataclasses.replace(run.learning, values=values))
+    left = dataclasses.replace(run, monitor=dataclasses.replace(run.monitor, values=values))
     assert summarize(left)['learning']['time_to_1_percent_s'] is None
 
 
@@ -85,14 +85,14 @@ def test_timing(run):
     assert summarize(run)['compute_time_us']['p50'] == pytest.approx(4.9995)
     slow = dataclasses.replace(run, received=run.received * 2)  # the rate is by the wall clock
     assert summarize(slow)['timing']['rate_hz'] == pytest.approx(500.0)
-    values = run.learning.values.copy()
-    values[:, run.learning.names.index('compute_time')] = np.nan
-    unmeasured = dataclasses.replace(run.learning, values=values)
-    assert summarize(dataclasses.replace(run, learning=unmeasured))['compute_time_us'] is None
+    values = run.monitor.values.copy()
+    values[:, run.monitor.names.index('compute_time')] = np.nan
+    unmeasured = dataclasses.replace(run.monitor, values=values)
+    assert summarize(dataclasses.replace(run, monitor=unmeasured))['compute_time_us'] is None
 
 
 def test_unknown_values_are_null_and_never_nan(run, tmp_path):
-    optional = ('reference', 'error', 'bound', 'torque_limit', 'learning', 'truth', 'timing')
+    optional = ('reference', 'error', 'bound', 'torque_limit', 'monitor', 'truth', 'timing')
     unknown = dict.fromkeys(optional) | {'torque': np.full_like(run.torque, np.nan)}
     summary = summarize(dataclasses.replace(run, **unknown))
     write_summary(summary, tmp_path / 'summary.json')
@@ -112,9 +112,9 @@ def test_table_shows_what_is_unusual(run):
     bound[:100, 1] = 0.0123
     late[-1, run.timing.names.index(LATE_STEPS)] = 0.02 * SAMPLES
     timing = dataclasses.replace(run.timing, values=late)
-    unknown = {'error': None, 'learning': None, 'timing': None}
-    early = run.learning.stamp < run.learning.stamp[0] + 1e9 * LATCH_S  # not yet
-    learning = run.learning
+    unknown = {'error': None, 'monitor': None, 'timing': None}
+    early = run.monitor.stamp < run.monitor.stamp[0] + 1e9 * LATCH_S  # not yet
+    learning = run.monitor
     waiting = Series(learning.names, learning.stamp[early], learning.values[early])
     usual = format_table(summarize(run))
     for changes, line in (
@@ -122,7 +122,7 @@ def test_table_shows_what_is_unusual(run):
         ({'timing': timing}, '200 late steps: the computer was too busy for real time'),
         ({'error': run.error + 1.0}, 'VIOLATED, first by shoulder at 0.000 s'),
         (unknown, 'bound       unknown'),
-        ({'learning': waiting}, 'learning    never began'),
+        ({'monitor': waiting}, 'learning    never began'),
     ):
         assert line in format_table(summarize(dataclasses.replace(run, **changes)))
         assert line not in usual
@@ -160,6 +160,6 @@ def test_learning_begins_only_in_a_law_that_learns_in_simulation_and_its_bag(
     simulated, recorded = summarize(record.run()), summarize(read_run(tmp_path / 'bag'))
     for part in ('duration_s', 'samples', 'tracking', 'learning'):
         assert simulated[part] == recorded[part]
-    assert record.run().learning.column('latched')[-1] == 1.0
+    assert record.run().monitor.column('latched')[-1] == 1.0
     assert f'learning    {line}' in format_table(recorded)
     assert (recorded['learning']['latch_time_s'] is None) == bool(changes)

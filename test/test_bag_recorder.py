@@ -360,7 +360,7 @@ def test_real_time_loop_is_timed_and_every_message_of_it_is_in_the_bag(tmp_path)
         for _, channel, message in make_reader(stream).iter_messages():
             numbers[channel.topic].append(message.sequence)
     facts, found = read_content(out / 'bag').facts, Counter()
-    answered, tenth = topics.TRACKING_ERROR, (topics.REFERENCE, topics.LEARNING)
+    answered, tenth = topics.TRACKING_ERROR, (topics.REFERENCE, topics.MONITOR)
     for topic in (topics.JOINT_STATES, topics.TIMING, topics.COMMANDS, answered, *tenth):
         name, found[topic] = topic.resolved, len(numbers[topic.resolved])
         assert numbers[name] == list(range(1, found[topic] + 1))

@@ -29,6 +29,7 @@ from blf_dsc_controller.messages.topics import (
     JOINT_STATES,
     JOURNAL,
     LEARNING,
+    MONITOR,
     REFERENCE,
     TRACKING_ERROR,
 )
@@ -62,7 +63,7 @@ def test_arrays_round_trip_under_any_topic_names(tmp_path, rename):
         (run.reference, MADE.reference),
         (run.error, MADE.error),
         (run.torque, MADE.torque),
-        (run.learning.select(PARAMETERS), MADE.estimate),
+        (run.monitor.select(PARAMETERS), MADE.estimate),
         (run.truth.select(PARAMETERS), np.tile(TRUE, (20, 1))),
         (run.timing.column('late_steps'), np.arange(SAMPLES) // 100),
         (run.bound, np.full((SAMPLES, 2), BOUND_RAD)),
@@ -114,7 +115,7 @@ def test_only_joint_states_are_required(tmp_path):
     run = read_run(path)  # a topic of another type is ignored
     assert run.joints == JOINTS[::-1]
     np.testing.assert_array_equal(run.position, MADE.position[:, ::-1])
-    unknown = (run.reference, run.error, run.bound, run.learning, run.truth, run.timing)
+    unknown = (run.reference, run.error, run.bound, run.monitor, run.truth, run.timing)
     assert unknown == (None,) * len(unknown)
 
 
@@ -133,18 +134,33 @@ def test_what_is_missing_is_computed_from_what_is_there(tmp_path):
     assert np.isnan(torque[-1]).all()
 
 
+def test_bag_of_an_earlier_version_has_its_learning_in_the_monitor(tmp_path):
+    slow = JointStateEncoder(('lambda_min', 'V barrier'), ('position',))
+    entries = [
+        (LEARNING, *rest) if topic is MONITOR else (topic, *rest) for topic, *rest in MESSAGES
+    ]
+    learning = synthetic_bag.write(tmp_path / 'learning', entries)
+    np.testing.assert_array_equal(read_run(learning).monitor.select(PARAMETERS), MADE.estimate)
+    tenth = MADE.stamp[::10].tolist()
+    entries += [(MONITOR, at, slow.encode(at, (0.5, 7.0))) for at in tenth]
+    both = read_run(synthetic_bag.write(tmp_path / 'both', entries)).monitor
+    assert both.stamp.tolist() == tenth
+    np.testing.assert_array_equal(both.select(PARAMETERS), MADE.estimate[::10])
+    np.testing.assert_array_equal(both.select(('lambda_min', 'V barrier')), [(0.5, 7.0)] * 20)
+
+
 @pytest.mark.parametrize('longest', [1, 2])
 def test_stamps_that_fall_once_begin_another_run(tmp_path, longest):
     """A simulator was reset: the longer run is read, and what is left out is counted."""
     later = without(COMMANDS)
     short = [entry for entry in later if entry[1] < MADE.stamp[50]]
-    kept = [entry for entry in later if not (entry[0] is LEARNING and entry[1] == MADE.stamp[10])]
+    kept = [entry for entry in later if not (entry[0] is MONITOR and entry[1] == MADE.stamp[10])]
     first, second = (short, kept) if longest == 2 else (kept, short)
     again = [(topic, at + 10**9, raw) for topic, at, raw in second]
     run = read_run(synthetic_bag.write(tmp_path / 'bag', first + again))
     np.testing.assert_array_equal(run.stamp, MADE.stamp)
     np.testing.assert_array_equal(run.error, MADE.error)
-    assert run.learning.stamp.tolist() == [*MADE.stamp[:10], *MADE.stamp[11:]]
+    assert run.monitor.stamp.tolist() == [*MADE.stamp[:10], *MADE.stamp[11:]]
     assert run.notes == (
         (
             '50 of 250 joint states left out: their stamps fall 1 times, so that 2 runs are in the '
@@ -241,9 +257,9 @@ def test_any_rows_of_long_topics_of_several_layouts_are_read():
 
 
 def test_undecodable_message_is_reported_with_topic_and_number(tmp_path):
-    bad = [*MESSAGES[:100], (LEARNING, MESSAGES[100][1], b'\0\1\0\0'), *MESSAGES[100:]]
-    number = 1 + sum(topic is LEARNING for topic, *_ in MESSAGES[:100])
-    with pytest.raises(UnreadableMessageError, match=f'message {number} of /blf.*/learning'):
+    bad = [*MESSAGES[:100], (MONITOR, MESSAGES[100][1], b'\0\1\0\0'), *MESSAGES[100:]]
+    number = 1 + sum(topic is MONITOR for topic, *_ in MESSAGES[:100])
+    with pytest.raises(UnreadableMessageError, match=f'message {number} of /blf.*/monitor'):
         read_run(synthetic_bag.write(tmp_path / 'bag', bad))
 
 
@@ -263,7 +279,7 @@ def read_table(path):
 def test_exported_table_round_trips_row_by_row(tmp_path, ending, capsys):
     if ending == 'parquet':
         pytest.importorskip('pyarrow', reason='needs pyarrow')
-    kept = [m for m in MESSAGES if not (m[0] in (REFERENCE, LEARNING) and m[1] == MADE.stamp[5])]
+    kept = [m for m in MESSAGES if not (m[0] in (REFERENCE, MONITOR) and m[1] == MADE.stamp[5])]
     bag = synthetic_bag.write(tmp_path / 'bag', kept)
     out = tmp_path / f'table.{ending}'
     code = main(['export', str(bag), '--out', str(out)])
@@ -271,7 +287,7 @@ def test_exported_table_round_trips_row_by_row(tmp_path, ending, capsys):
         assert (code, 'neither .csv nor .parquet' in capsys.readouterr().err) == (1, True)
         return
     found = read_table(out)
-    estimate = found['learning m2*l2^2 [kg m^2]']
+    estimate = found['monitor m2*l2^2 [kg m^2]']
     for values, expected in (
         (found['stamp [ns]'], MADE.stamp),
         (found['position elbow [rad]'], MADE.position[:, 1]),
@@ -294,10 +310,10 @@ def test_every_exported_column_has_a_unit(tmp_path):
     assert [name for name in found if not re.search(r' \[.+\]$', name)] == []
     assert {
         'time [s]',
-        'learning m2*l2^2 [kg m^2]',
-        'learning lambda_min [s^-4]',
-        'learning disturbance joint1 [N m]',
-        'learning compute_time [s]',
+        'monitor m2*l2^2 [kg m^2]',
+        'monitor lambda_min [s^-4]',
+        'monitor disturbance joint1 [N m]',
+        'monitor compute_time [s]',
         'monitor distance_to_bound joint1 [rad]',
     } <= {*found}
     states, errors, references = (

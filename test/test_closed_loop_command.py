@@ -23,7 +23,7 @@ HALF = {'learning.initial_estimate': [0.5, 0.16, 0.2]}
 DURATION = 3  # s
 SAMPLES = 3001
 EACH_SAMPLE = ('commands', 'tracking_error')
-EACH_TENTH = ('reference', 'learning', 'monitor')
+EACH_TENTH = ('reference', 'monitor')
 COUNTS = {
     '/joint_states': SAMPLES,
     **{f'/blf_dsc_controller/{topic}': SAMPLES for topic in EACH_SAMPLE},

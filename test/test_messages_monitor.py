@@ -14,7 +14,7 @@ from blf_dsc_controller.law import barrier
 from blf_dsc_controller.law.barrier import virtual_control
 from blf_dsc_controller.law.factory import controller_of, estimate_names, settings_of_config
 from blf_dsc_controller.law.lyapunov import decay_rate, exponential_bound, largest_inertia
-from blf_dsc_controller.law.telemetry import Monitor
+from blf_dsc_controller.law.telemetry import ControllerTelemetry
 from blf_dsc_controller.messages import topics
 from blf_dsc_controller.messages.codecs import JointStateDecoder
 from blf_dsc_controller.simulation.bag import write_bag
@@ -81,8 +81,8 @@ def gain_on_potential(law, xi1):
     return -part * barrier.gradient(xi1, *joint) / barrier.potential(xi1, *joint)
 
 
-def decoded(monitor, names, *arguments):
-    topic, raw = monitor.message(*arguments)
+def decoded(message, names):
+    topic, raw = message
     decoder = JointStateDecoder(names, required=('position',))
     decoder.decode(raw)
     assert topic is topics.MONITOR
@@ -94,24 +94,31 @@ def test_message_contains_the_distance_and_with_known_truth_the_terms(known):
     config = configured('recommended', 1.0, LEAKY if known else {}).controller
     law = controller_of(config)
     law.update(0.0, 1e-3, np.array([2.293, 1.696, 0.0, 0.0, 0.0, 0.0]))
-    monitor = Monitor(config.joints, estimate_names(config), law.settings)
+    telemetry = ControllerTelemetry(config, estimate_names(config), 3)
     names = [
         f'{quantity} {joint}'
         for quantity in ('max_error_ratio', 'distance_to_bound')
         for joint in config.joints
     ]
-    names += [*estimate_names(config), 'lambda_min', 'latched']
-    terms = ['V barrier', 'V velocity', 'V parameters', 'V disturbance']
-    arguments = (10**9, law.sample, np.array([0.3, 0.2]), np.array([0.002, 0.004]))
-    if not known:
-        assert b'V barrier' not in monitor.message(*arguments)[1]
-    values = decoded(monitor, [*names, *terms] if known else names, *arguments)
+    names += [*estimate_names(config), *(f'disturbance {joint}' for joint in config.joints)]
+    names += ['lambda_min', 'latched', 'model_changes']
+    terms = ['V barrier', 'V velocity', 'V parameters', 'V disturbance'] * known
+    sent = [
+        telemetry.monitor(10**9, law.sample, np.array([0.3, 0.2]), time)
+        for time in (9e-5, 1e-5, 4e-5, 2e-5)
+    ]
+    assert [len(each) for each in sent] == [2, 0, 0, 2]
+    (topic, _), message = sent[3]
+    assert topic is topics.REFERENCE
+    assert known or b'V barrier' not in message[1]
+    values = decoded(message, [*names, *terms, 'compute_time'])
 
     assert values['max_error_ratio joint1'] == 0.3
-    assert values['distance_to_bound joint1'] == pytest.approx(0.002 - abs(law.sample.xi1[0]))
-    assert values['distance_to_bound joint2'] == pytest.approx(0.004 - abs(law.sample.xi1[1]))
-    if known:
-        assert [values[name] for name in terms] == law.sample.lyapunov.tolist()
+    bound, error = law.sample.bound, np.abs(law.sample.xi1)
+    assert values['distance_to_bound joint1'] == pytest.approx(bound[0] - error[0])
+    assert values['distance_to_bound joint2'] == pytest.approx(bound[1] - error[1])
+    assert values['compute_time'] == 4e-5  # the largest since the last message
+    assert [values[name] for name in terms] == law.sample.lyapunov.tolist() * known
 
 
 @pytest.fixture(scope='module')

@@ -45,7 +45,7 @@ def fake_run(period=0.01, estimate=None):
         error=error,
         bound=np.broadcast_to(BOUND, (1001, 2)),
         torque_limit=None,
-        learning=Series(('P1', 'P2', 'latched'), stamp, np.column_stack([estimate, latched])),
+        monitor=Series(('P1', 'P2', 'latched'), stamp, np.column_stack([estimate, latched])),
         truth=Series(('P1', 'P2'), stamp[:1], TRUE[np.newaxis]),
     )
 
@@ -67,7 +67,7 @@ def test_metrics_describe_the_run():
 def test_first_violation_is_found_and_a_late_error_resets_the_time_to_one_percent():
     run = fake_run()
     run.error[300, 1] = -0.004
-    run.learning.values[900, :2] = 0.0
+    run.monitor.values[900, :2] = 0.0
     found = measure(run)
     assert (found.held, found.first_violation) == (False, 3.0)
     assert found.time_to_1_percent == pytest.approx(9.01)

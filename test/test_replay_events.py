@@ -33,7 +33,7 @@ class Recorder(Rig):
     def __init__(self, given=None, **options):
         self.entries = []
         super().__init__(given, **options)
-        self.telemetry = ControllerTelemetry(JOINTS, estimate_names(self.config), 1)
+        self.telemetry = ControllerTelemetry(self.config, estimate_names(self.config), 1)
         self.drops = ()  # indices of joint states that never reach the controller
         self.count = 0
 
@@ -55,10 +55,10 @@ class Recorder(Rig):
         if torque is not None and not guard.has_sample:
             self.record(*self.telemetry.answer(guard.journal.stamp, torque))
         if guard.has_sample:
-            for topic, message in self.telemetry.sample(
-                guard.last_stamp, guard.controller.sample, 0.0
-            ):
-                self.record(topic, message)
+            now = guard.last_stamp, guard.controller.sample
+            self.record(*self.telemetry.error(*now))
+            for message in self.telemetry.monitor(*now, guard.samples.ratio, 0.0):
+                self.record(*message)
         self.publish_events()
         return torque
 

@@ -29,6 +29,7 @@ from blf_dsc_controller.messages.topics import (
     JOINT_STATES,
     JOURNAL,
     LEARNING,
+    MONITOR,
     REFERENCE,
     TRACKING_ERROR,
 )
@@ -68,21 +69,21 @@ def test_every_number_is_reproduced(bag, tmp_path):
         'commands': 2 * SAMPLES,
         'tracking_error': 6 * SAMPLES,
         'reference': 4 * SAMPLES,
-        'learning': 10 * SAMPLES,  # three parameters, two biases, two disturbances, three more
-        'monitor': 11 * 101,  # two ratios, two distances, five estimates, two more
+        # Two ratios, two distances, three parameters, two biases, two disturbances, three more.
+        'monitor': 14 * SAMPLES,
         'bound': 4,
     }
     assert compared(result) == counts
     assert [item.left_out for item in result.comparisons if item.left_out] == ['compute_time']
     run = read_run(bag)
     # Otherwise this would not cover the composite learning.
-    assert run.learning.column('latched')[-1] == 1.0
+    assert run.monitor.column('latched')[-1] == 1.0
 
     for decimation, given in ((10, {}), (7, {'telemetry.decimation': 7})):
         sparse = recorded_run.record(tmp_path / f'{decimation}', **given)
         result, few = verify(sparse), -(-SAMPLES // decimation)
         assert (result.difference, result.compared) == (None, 1.0)
-        assert compared(result) == counts | {'reference': 4 * few, 'learning': 10 * few}
+        assert compared(result) == counts | {'reference': 4 * few, 'monitor': 14 * few}
         thinned = read_run(sparse)
         np.testing.assert_array_equal(thinned.error, run.error)
         np.testing.assert_allclose(thinned.reference, run.reference, rtol=0.0, atol=1e-15)
@@ -109,13 +110,13 @@ def test_other_laws_and_a_narrowing_bound_replay_from_compressed_bags(tmp_path, 
         (COMMANDS, -8, 'effort of joint2'),
         (TRACKING_ERROR, -8, 'effort of joint2'),
         (REFERENCE, -8 - 4, 'velocity of joint2'),  # followed by the empty effort
-        (LEARNING, -32, 'latched'),  # before model_changes, compute_time, velocity and effort
+        (MONITOR, -32, 'latched'),  # before model_changes, compute_time, velocity and effort
     ],
 )
 def test_flipped_bit_is_located_and_named_and_the_earliest_counts(
     entries, tmp_path, capsys, topic, at, field
 ):
-    for flipped, k, place in ((topic, 700, at), (COMMANDS, 800, -8), (LEARNING, 900, -40)):
+    for flipped, k, place in ((topic, 700, at), (COMMANDS, 800, -8), (MONITOR, 900, -40)):
         entry = of(entries, flipped)[k]
         raw = bytearray(entry[3])
         raw[place] ^= 1
@@ -139,7 +140,18 @@ def test_flipped_bit_is_located_and_named_and_the_earliest_counts(
     assert any(f'{topic.resolved}: ' in x and f'at most {largest:.3g}' in x for x in lines)
 
 
-FLIPPED = COMMANDS.resolved, LEARNING.resolved
+def test_learning_of_an_earlier_version_is_compared_with_the_monitor(entries, tmp_path):
+    for entry in of(entries, MONITOR):
+        entry[0] = LEARNING.resolved
+    result = verify(recorded_run.write(tmp_path / 'bag', entries))
+    assert (result.difference, compared(result)['learning']) == (None, 14 * SAMPLES)
+    entry = of(entries, LEARNING)[700]
+    entry[3] = entry[3][:-32] + bytes([entry[3][-32] ^ 1]) + entry[3][-31:]
+    difference = verify(recorded_run.write(tmp_path / 'flipped', entries)).difference
+    assert (difference.topic, difference.field) == (LEARNING.resolved, 'latched')
+
+
+FLIPPED = COMMANDS.resolved, MONITOR.resolved
 
 
 def test_message_with_another_stamp_is_a_difference(entries, tmp_path):

@@ -16,11 +16,15 @@ from blf_dsc_controller.messages.journal import OUTSIDE_BOUND
 from blf_dsc_controller.messages.topics import (
     COLUMNS,
     COMPUTE_TIME,
+    DISTANCE,
     DISTURBANCE,
     LAMBDA_MIN,
     LATCHED,
+    LOAD,
+    LYAPUNOV,
     MODEL_CHANGES,
     POSITION,
+    RATIO,
     VELOCITY,
 )
 from blf_dsc_controller.run import Floats, Regressor, Run, Series
@@ -34,8 +38,10 @@ _POSTURES = 400  # of the reference, at which torques are compared
 _TAIL = 10.0  # s
 _MOST = 100_000  # samples of the estimates, evenly spaced
 _BLOCK = 8192
-_OTHERS = (LAMBDA_MIN, LATCHED, MODEL_CHANGES, COMPUTE_TIME)
-_NO_PARAMETERS = (*COLUMNS, DISTURBANCE, POSITION, VELOCITY, *_OTHERS)
+_NO_PARAMETERS = (
+    *(*COLUMNS, DISTURBANCE, POSITION, VELOCITY, RATIO, DISTANCE, *LOAD, LYAPUNOV),
+    *(LAMBDA_MIN, LATCHED, MODEL_CHANGES, COMPUTE_TIME),
+)
 
 
 @dataclass(frozen=True)
@@ -57,13 +63,13 @@ def estimates_of(run: Run) -> Estimates | None:
     They are compared with the truth by name, and only if the plant has the same parameters; those
     of a URDF arm are compared by their torques.
     """
-    if run.learning is None:
+    if run.monitor is None:
         return None
-    names, truth, arm = _parameters(run.learning.names), run.truth, run.arm
-    step = -(-run.learning.stamp.size // _MOST)
-    rows = slice((run.learning.stamp.size - 1) % step, None, step)
-    stamp = run.learning.stamp[rows]
-    estimate = run.learning.values[rows][:, _columns(run.learning, names)]
+    names, truth, arm = _parameters(run.monitor.names), run.truth, run.arm
+    step = -(-run.monitor.stamp.size // _MOST)
+    rows = slice((run.monitor.stamp.size - 1) % step, None, step)
+    stamp = run.monitor.stamp[rows]
+    estimate = run.monitor.values[rows][:, _columns(run.monitor, names)]
     of_torques = arm is not None and _parameters(arm.units) == names
     theirs = () if truth is None else _parameters(truth.names)
     true = error = None
@@ -167,10 +173,10 @@ def change_times(run: Run) -> list[float]:
 
 def _rises(run: Run, name: str) -> list[float]:
     """Return the times [s] at which a count of the learning rises."""
-    if run.learning is None or name not in run.learning.names:
+    if run.monitor is None or name not in run.monitor.names:
         return []
-    rises = np.flatnonzero(np.diff(np.nan_to_num(run.learning.column(name)), prepend=0.0) > 0.0)
-    return [float(t) for t in run.time_of(run.learning.stamp[rises])]
+    rises = np.flatnonzero(np.diff(np.nan_to_num(run.monitor.column(name)), prepend=0.0) > 0.0)
+    return [float(t) for t in run.time_of(run.monitor.stamp[rises])]
 
 
 def true_change_times(run: Run) -> list[float]:

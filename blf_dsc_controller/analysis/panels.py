@@ -237,7 +237,7 @@ def _error_size(run: Run, t: Floats, i: int, error: Floats) -> Panel:
 
 def _learning(run: Run) -> Iterator[Panel]:
     estimates = estimates_of(run)
-    if estimates is None or run.learning is None:
+    if estimates is None or run.monitor is None:
         return
     if estimates.relative_error is not None:
         yield _relative_error(estimates)
@@ -249,7 +249,7 @@ def _learning(run: Run) -> Iterator[Panel]:
             if estimates.true is not None:
                 lines.append(Line('true', estimates.time, estimates.true[:, j], INK, dashed=True))
             yield Panel('Parameters', name, 'kg m²', lines)
-    yield Panel('Disturbance', 'disturbance estimates', 'N m', _disturbances(run, run.learning))
+    yield Panel('Disturbance', 'disturbance estimates', 'N m', _disturbances(run, run.monitor))
 
 
 def _disturbances(run: Run, learning: Series) -> Iterator[Line]:
@@ -272,7 +272,7 @@ def _of_links(run: Run, arm: LearnedArm, estimates: Estimates) -> Iterator[Panel
         names = [name for name in arm.units if name.startswith(f'{kind} ')]
         if names:
             of_joints = chain.from_iterable(
-                _column(run, run.learning, name, name.split(' ', 1)[1]) for name in names
+                _column(run, run.monitor, name, name.split(' ', 1)[1]) for name in names
             )
             yield Panel('Parameters', f'{kind} friction', arm.units[names[0]], of_joints)
 
@@ -292,10 +292,9 @@ def _monitors(run: Run) -> Iterator[Panel]:
     title = 'minimum eigenvalue of Φ'
     excitation = [
         line._replace(values=np.where(line.values > 0.0, line.values, np.nan))  # 0: no update yet
-        for series in (run.learning, run.monitor)
-        for line in _column(run, series, LAMBDA_MIN, title)
+        for line in _column(run, run.monitor, LAMBDA_MIN, title)
     ]
-    yield Panel('Excitation', title, '', excitation[:1], note, log=True)
+    yield Panel('Excitation', title, '', excitation, note, log=True)
     if run.monitor is not None and LYAPUNOV_TERMS[0] in run.monitor.names:
         yield _lyapunov(run, run.monitor)
 
@@ -318,7 +317,7 @@ def _timing(run: Run) -> Iterator[Panel]:
     for title, series, name in (
         ('period of the joint states, as received', periods, 'period'),
         ('state to torque', run.timing, LATENCY),
-        ('largest computing time of the law since the last message', run.learning, COMPUTE_TIME),
+        ('largest computing time of the law since the last message', run.monitor, COMPUTE_TIME),
     ):
         times = [
             line._replace(values=1e6 * line.values)

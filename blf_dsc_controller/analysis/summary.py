@@ -74,7 +74,7 @@ def summarize(run: Run) -> Summary:
         'learning': None if estimates is None else _learning(run, estimates, metrics),
         'loads': _loads(run),
         'timing': _timing(run),
-        'compute_time_us': _percentiles(run.learning, COMPUTE_TIME),
+        'compute_time_us': _percentiles(run.monitor, COMPUTE_TIME),
         'messages': dict(run.message_counts),
     }
 

@@ -125,10 +125,9 @@ def recorded_run(content: Content) -> Run:
         joints=joints,
         stamp=stamp,
         received=states.received,
-        learning=series(topics.LEARNING),
+        monitor=_with_learning(series(topics.MONITOR), series(topics.LEARNING)),
         truth=series(topics.TRUTH),
         timing=series(topics.TIMING),
-        monitor=series(topics.MONITOR),
         message_counts=content.message_counts,
         stops=tuple(_stops(events, int(stamp[0]))),
         arm=_arm(content),
@@ -206,6 +205,16 @@ def _joints(content: Content) -> tuple[str, ...]:
     if not of_controller and content.names.joints:
         return tuple(content.names.joints)
     return (*of_controller, content.topics[topics.JOINT_STATES])[0].joint_names()
+
+
+def _with_learning(monitor: Series | None, learning: Series | None) -> Series | None:
+    """Return the monitor of a bag, with what earlier versions said on ~/learning instead."""
+    if monitor is None or learning is None:
+        return monitor or learning
+    more = np.flatnonzero([name not in monitor.names for name in learning.names])
+    names = (*monitor.names, *(learning.names[k] for k in more))
+    values = np.hstack((monitor.values[:], learning.held(monitor.stamp, more)))
+    return Series(names, monitor.stamp, values)
 
 
 def _arm(content: Content) -> LearnedArm | None:
@@ -306,7 +315,7 @@ def table(run: Run, rows: slice = slice(None)) -> dict[str, NDArray[Any]]:
 
     They are aligned to the stamps of its joint states. `stamp` and `received` are integers, all
     others floats, NaN where unknown, as is the reference's velocity between its messages. Named
-    values (learning, truth, timing, monitor) are held until the next message.
+    values (monitor, truth, timing) are held until the next message.
     """
     stamp = run.stamp[rows]
     columns: dict[str, NDArray[Any]] = {
@@ -319,7 +328,7 @@ def table(run: Run, rows: slice = slice(None)) -> dict[str, NDArray[Any]]:
         if values is not None:
             for joint, column in zip(run.joints, values[rows].T, strict=True):
                 columns[f'{field} {joint} [{unit}]'] = column
-    for topic in ('learning', 'truth', 'timing', 'monitor'):
+    for topic in ('monitor', 'truth', 'timing'):
         series = getattr(run, topic)
         if series is not None:
             for name, column in zip(series.names, series.held(stamp).T, strict=True):

@@ -160,7 +160,7 @@ class Telemetry:
     enabled: bool = _telemetry(True, 'publish reference, errors, estimates and monitors')
     decimation: int = _telemetry(
         10,
-        'samples per message of reference and estimates; errors come with every sample',
+        'samples per message of reference and monitor; errors come with every sample',
         at_least=1,
     )
 

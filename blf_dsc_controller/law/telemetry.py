@@ -8,8 +8,10 @@ as JointState with the values in `position`.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from functools import partial
+from itertools import chain
+from operator import attrgetter
 from typing import NamedTuple, TypeAlias
 
 import numpy as np
@@ -26,19 +28,31 @@ from blf_dsc_controller.messages.codecs import (
     JointStateEncoder,
     encode_clock,
 )
-from blf_dsc_controller.messages.topics import LYAPUNOV_TERMS
 from blf_dsc_controller.run import Floats, LearnedArm, Run, Series, Stamps
 
 Message: TypeAlias = tuple[topics.Topic, bytes]
 
 DECIMATION = 10
-"""Number of samples from one slow message (monitor, truth) to the next."""
+"""Number of samples from one message of the plant's truth to the next."""
 
 
-def learning_names(estimates: Sequence[str], joints: Sequence[str]) -> tuple[str, ...]:
-    """Return the names of what is learned of n `joints`; `estimates` are those of theta^."""
-    figures = topics.LAMBDA_MIN, topics.LATCHED, topics.MODEL_CHANGES
-    return (*estimates, *disturbance_names(joints), *figures)
+def monitored(config: ControllerConfig, estimates: Sequence[str]) -> dict[str, Sequence[str]]:
+    """Return the parts of a `Sample` that `~/monitor` has, each with the names of its values.
+
+    `estimates` are those of theta^, as returned by `factory.estimate_names`.
+    """
+    names: dict[str, Sequence[str]] = {
+        'estimate': estimates,
+        'disturbance': disturbance_names(config.joints),
+        'lambda_min': (topics.LAMBDA_MIN,),
+        'latched': (topics.LATCHED,),
+        'changes': (topics.MODEL_CHANGES,),
+    }
+    if config.learning.weighing:
+        names['load'] = topics.LOAD
+    if config.truth.parameters:
+        names['lyapunov'] = topics.LYAPUNOV_TERMS
+    return names
 
 
 def disturbance_names(joints: Sequence[str]) -> tuple[str, ...]:
@@ -47,19 +61,21 @@ def disturbance_names(joints: Sequence[str]) -> tuple[str, ...]:
 
 
 class ControllerTelemetry:
-    """Messages of the controller of n joints and `estimates`, the m entries of theta^.
+    """Messages of the controller of n joints; `estimates` are the names of theta^ (m,).
 
-    Reference and estimates are sent with every `decimation`-th sample.
+    Reference and monitor are sent with every `decimation`-th sample, from the first one on.
     """
 
-    def __init__(self, joints: Sequence[str], estimates: Sequence[str], decimation: int) -> None:
-        learning = (*learning_names(estimates, joints), topics.COMPUTE_TIME)
+    def __init__(self, config: ControllerConfig, estimates: Sequence[str], decimation: int) -> None:
+        joints, parts = config.joints, monitored(config, estimates)
+        names = [what + joint for what in (topics.RATIO, topics.DISTANCE) for joint in joints]
+        names = [*names, *chain.from_iterable(parts.values()), topics.COMPUTE_TIME]
         self._command = Float64MultiArrayEncoder(len(joints))
         self._reference = JointStateEncoder(joints, ('position', 'velocity'))
         self._error = JointStateEncoder(joints)
         self._bound = JointStateEncoder(joints, ('position', 'effort'))
-        self._learning = JointStateEncoder(learning, ('position',))
-        self._values = np.zeros(len(learning))
+        self._monitor = JointStateEncoder(names, ('position',))
+        self._parts = attrgetter(*parts)
         self._decimation, self._samples, self._slowest = decimation, 0, 0.0
 
     def command(self, torque: np.ndarray) -> Message:
@@ -79,23 +95,33 @@ class ControllerTelemetry:
         unknown = np.full(torque.size, np.nan)
         return topics.TRACKING_ERROR, self._error.encode(stamp, unknown, unknown, torque)
 
-    def sample(self, stamp: int, sample: Sample, compute_time: float) -> Iterator[Message]:
-        """Yield the messages for a joint state: its stamp [ns], telemetry sample, update time [s].
+    def error(self, stamp: int, sample: Sample) -> Message:
+        """Encode the tracking errors for a joint state: its stamp [ns] and telemetry sample.
 
-        The tracking error is sent every time: it tells a replay which states were used. The
-        update time that is sent is the largest since the last message.
+        They are sent with every sample: they tell a replay which states were used.
         """
-        error = self._error.encode(stamp, sample.xi1, sample.xi2, sample.torque)
-        yield topics.TRACKING_ERROR, error
-        self._samples += 1
+        message = self._error.encode(stamp, sample.xi1, sample.xi2, sample.torque)
+        return topics.TRACKING_ERROR, message
+
+    def monitor(
+        self, stamp: int, sample: Sample, ratio: np.ndarray, compute_time: float
+    ) -> Sequence[Message]:
+        """Return reference and monitor for a joint state, if they are due; call it for each.
+
+        `ratio` is the largest |xi1| / k_c so far (n,). Of the times of updates, `compute_time`
+        [s], the largest since the last message is sent.
+        """
         self._slowest = max(compute_time, self._slowest)  # NaN: not measured
+        self._samples += 1
         if (self._samples - 1) % self._decimation:
-            return
-        yield topics.REFERENCE, self._reference.encode(stamp, sample.qr, sample.dqr)
-        figures = sample.lambda_min, sample.latched, sample.changes, (self._slowest,)
-        np.concatenate((sample.estimate, sample.disturbance, *figures), out=self._values)
-        yield topics.LEARNING, self._learning.encode(stamp, self._values)
+            return ()
+        distance = sample.bound - np.abs(sample.xi1)
+        values = np.concatenate((ratio, distance, *self._parts(sample), (self._slowest,)))
         self._slowest = 0.0
+        return (
+            (topics.REFERENCE, self._reference.encode(stamp, sample.qr, sample.dqr)),
+            (topics.MONITOR, self._monitor.encode(stamp, values)),
+        )
 
 
 class PlantTelemetry:
@@ -150,37 +176,6 @@ class PlantTelemetry:
         return topics.CLOCK, encode_clock(stamp)
 
 
-class Monitor:
-    """Messages of the slow topic `~/monitor`: how well the guarantees of the law hold.
-
-    If the truth is known, they include the Lyapunov function (29) term by term.
-    """
-
-    def __init__(self, joints: Sequence[str], estimates: Sequence[str], settings: Settings) -> None:
-        names = [what + joint for what in (topics.RATIO, topics.DISTANCE) for joint in joints]
-        names += [*estimates, topics.LAMBDA_MIN, topics.LATCHED]
-        self._weighs = settings.weighed > 0
-        if self._weighs:
-            names += topics.LOAD
-        self._knows_truth = settings.truth_known == 1
-        if self._knows_truth:
-            names += topics.LYAPUNOV_TERMS
-        self._encoder = JointStateEncoder(names, ('position',))
-
-    def message(self, stamp: int, sample: Sample, ratio: np.ndarray, bound: np.ndarray) -> Message:
-        """Encode the values for a telemetry sample at a stamp [ns].
-
-        `ratio` is the largest |xi1| / k_c so far (n,), `bound` the current k_c (n,) [rad].
-        """
-        distance = bound - np.abs(sample.xi1)
-        values = [ratio, distance, sample.estimate, sample.lambda_min, sample.latched]
-        if self._weighs:
-            values.append(sample.load)
-        if self._knows_truth:
-            values.append(sample.lyapunov)
-        return topics.MONITOR, self._encoder.encode(stamp, np.concatenate(values))
-
-
 def load_text(load: Sequence[float]) -> str:
     """Return what the tip holds as text, from the values (8,) of LOAD."""
     mass, *centre = load[:4]
@@ -198,13 +193,6 @@ def sample_columns(rows: Floats, settings: Settings) -> Sample:
     """Split packed samples (N, s) into columns by name, located by unpacking a row of indices."""
     places = sample_of(np.arange(rows.shape[1], dtype=np.float64), settings)
     return Sample(*(rows[:, part.astype(np.intp)] for part in places))
-
-
-def learning_of(config: ControllerConfig, stamps: Stamps, samples: Sample) -> Series:
-    """Return what the law learned, under the names of `~/learning`."""
-    names = learning_names(estimate_names(config), config.joints)
-    figures = samples.lambda_min, samples.latched, samples.changes
-    return Series(names, stamps, np.hstack((samples.estimate, samples.disturbance, *figures)))
 
 
 def learned_arm(config: ControllerConfig) -> LearnedArm | None:
@@ -235,7 +223,8 @@ def run_of(
     samples = sample_columns(rows, controller.settings)
     used = ~np.isnan(samples.qr[:, 0])
     position, velocity, _ = np.split(measurements, 3, axis=1)
-    monitor = Series(LYAPUNOV_TERMS, stamps[used], samples.lyapunov[used])
+    parts = monitored(config, estimate_names(config))
+    monitor = np.hstack([getattr(samples, part)[used] for part in parts])
     return Run(
         joints=config.joints,
         stamp=stamps,
@@ -247,8 +236,7 @@ def run_of(
         error=samples.xi1,
         bound=samples.bound,
         torque_limit=np.broadcast_to(config.torque.limit, position.shape),
-        learning=learning_of(config, stamps[used], Sample(*(part[used] for part in samples))),
-        monitor=monitor if controller.settings.truth_known else None,
+        monitor=Series(tuple(chain.from_iterable(parts.values())), stamps[used], monitor),
         arm=learned_arm(config),
         learns=config.law == 'blf_dsc' and config.learning.weight > 0.0,
     )

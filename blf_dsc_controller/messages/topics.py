@@ -79,7 +79,6 @@ JOINT_STATES = Topic(PLANT, 'joint_states', JOINT_STATE, HISTORY, LATEST)
 COMMANDS = Topic(CONTROLLER, '~/commands', FLOAT64_MULTI_ARRAY, STREAM, LATEST)
 REFERENCE = Topic(CONTROLLER, '~/reference', JOINT_STATE, STREAM, STREAM)
 TRACKING_ERROR = Topic(CONTROLLER, '~/tracking_error', JOINT_STATE, STREAM, STREAM)
-LEARNING = Topic(CONTROLLER, '~/learning', JOINT_STATE, STREAM, STREAM)
 BOUND = Topic(CONTROLLER, '~/bound', JOINT_STATE, HISTORY, LATCHED_QUALITY)
 STATE = Topic(
     CONTROLLER, '~/state', 'diagnostic_msgs/msg/DiagnosticStatus', LATCHED_QUALITY, LATCHED_QUALITY
@@ -107,13 +106,14 @@ JOINT_TRAJECTORY = Topic(
 """Published by other nodes for the controller."""
 JOURNAL = Topic(CONTROLLER, '~/journal', 'std_msgs/msg/String', HISTORY, HISTORY)
 """Every event of the controller, also for late recorders: see messages.journal."""
+LEARNING = Topic(CONTROLLER, '~/learning', JOINT_STATE, STREAM, STREAM)
+"""In bags of earlier versions: values that are now on ~/monitor."""
 
 TOPICS = (
     JOINT_STATES,
     COMMANDS,
     REFERENCE,
     TRACKING_ERROR,
-    LEARNING,
     BOUND,
     STATE,
     JOURNAL,
@@ -124,7 +124,7 @@ TOPICS = (
     DIAGNOSTICS,
 )
 
-# In the vectors learning, truth, timing, monitor.
+# In the vectors truth, timing, monitor.
 DISTURBANCE = 'disturbance '  # followed by the joint
 COLUMNS = ('bias ', 'viscous ', 'coulomb ', 'sin ', 'cos ')  # prefixes of disturbance columns
 POSITION = 'position '  # followed by the joint

@@ -9,17 +9,11 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-from rclpy.publisher import Publisher
 
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.errors import StartError
 from blf_dsc_controller.law import factory
-from blf_dsc_controller.law.telemetry import (
-    DECIMATION,
-    ControllerTelemetry,
-    Monitor,
-    rejected_columns,
-)
+from blf_dsc_controller.law.telemetry import ControllerTelemetry, rejected_columns
 from blf_dsc_controller.messages import topics
 from blf_dsc_controller.messages.codecs import (
     Float64MultiArrayEncoder,
@@ -40,13 +34,11 @@ OUTPUTS = (
     topics.COMMANDS,
     topics.REFERENCE,
     topics.TRACKING_ERROR,
-    topics.LEARNING,
     topics.BOUND,
     topics.MONITOR,
 )
-STREAMS = topics.REFERENCE, topics.TRACKING_ERROR, topics.LEARNING
-"""Telemetry of each sample; late subscribers receive none of the earlier messages."""
 
+_RARELY = 10  # samples between looks at what rarely changes
 _RATE_SAMPLES = 1001  # samples before the rate is checked
 _FAST = 0.9  # fraction of the sample time
 _MEASURED = 10  # intervals between live states, measured before the start ...
@@ -70,10 +62,7 @@ class ControllerNode(LoopNode[ControllerConfig]):
         self._load: ReferenceLoad | None = None
         joints = self.config.joints
         self._estimates = factory.estimate_names(self.config)
-        self._telemetry = ControllerTelemetry(
-            joints, self._estimates, self.config.telemetry.decimation
-        )
-        self._monitor: Monitor | None = None
+        self._telemetry = self._new_telemetry()
         self._columns = b''  # those that are estimated, and whether they were checked
         self._model_changes = 0.0
         self._published_bound = b''  # bytes of the array, to detect changes
@@ -83,8 +72,7 @@ class ControllerNode(LoopNode[ControllerConfig]):
         self._arrivals: list[int] | None = []  # stamps before the start [ns]; None: measured
         self._checks = 0  # of the timer since the last of them
         self._warned_at = -1  # stamp of the start that the last warning was about
-        self._streams: list[Publisher] = []  # of STREAMS
-        self._heard = False  # whether they had subscribers at the last count
+        self._heard = False  # whether the tracking errors had subscribers at the last count
         self._observed = self._started = False
         self._logged = Phase.INACTIVE, 0, False  # phase, stops, silenced
         self._ends_at = 0.0  # s, at the latest, since a signal
@@ -109,7 +97,6 @@ class ControllerNode(LoopNode[ControllerConfig]):
             self.get_logger().warning(risk)
         outputs = OUTPUTS if self.config.telemetry.enabled else OUTPUTS[:1]
         if self.connect(outputs, topics.JOINT_STATES, self._on_joint_state):
-            self._streams = [self._outputs[topic] for topic in STREAMS if topic in outputs]
             self._status.trajectories = TrajectoryInput(
                 self, len(self.config.joints), lambda: self.guard
             )
@@ -199,7 +186,7 @@ class ControllerNode(LoopNode[ControllerConfig]):
         guard.weigh()
         if guard.has_sample:
             self._publish_telemetry(guard)
-        elif torque is not None and self._heard and self.config.telemetry.enabled:
+        elif torque is not None and self._heard:
             self._publish(self._telemetry.answer(guard.journal.stamp, torque))
         if guard.waiting_for:
             self.get_logger().warning(
@@ -262,24 +249,27 @@ class ControllerNode(LoopNode[ControllerConfig]):
     def _publish_telemetry(self, guard: Guard) -> None:
         controller, stamp = guard.controller, guard.last_stamp
         sample, samples = controller.sample, controller.samples
-        is_due = (samples - 1) % DECIMATION == 0
-        if is_due:  # of what rarely changes
-            self._heard = any(each.get_subscription_count() for each in self._streams)
+        if (samples - 1) % _RARELY == 0:
+            errors = self._outputs.get(topics.TRACKING_ERROR)
+            self._heard = errors is not None and errors.get_subscription_count() > 0
             self._report_learning(guard)
             if samples == _RATE_SAMPLES:
                 self._warn_of_rate(guard)
         if not self.config.telemetry.enabled:
             return
-        if samples == 1 or self._monitor is None:
-            self._monitor = Monitor(self.config.joints, self._estimates, controller.settings)
-            self._published_bound = b''
+        if samples == 1:
+            self._telemetry, self._published_bound = self._new_telemetry(), b''
         if sample.bound.tobytes() != self._published_bound:
             self._publish_bound(guard, stamp, sample.bound)
         if self._heard:
-            for message in self._telemetry.sample(stamp, sample, guard.compute_time):
-                self._publish(message)
-        if is_due:
-            self._publish(self._monitor.message(stamp, sample, guard.samples.ratio, sample.bound))
+            self._publish(self._telemetry.error(stamp, sample))
+        ratio = guard.samples.ratio
+        for message in self._telemetry.monitor(stamp, sample, ratio, guard.compute_time):
+            self._publish(message)
+
+    def _new_telemetry(self) -> ControllerTelemetry:
+        decimation = self.config.telemetry.decimation
+        return ControllerTelemetry(self.config, self._estimates, decimation)
 
     def _warn_of_rate(self, guard: Guard) -> None:
         period, expected = guard.time / (_RATE_SAMPLES - 1), self.config.sample_time

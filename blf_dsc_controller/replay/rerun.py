@@ -18,7 +18,7 @@ from blf_dsc_controller.bags.topic_messages import JointStates, TopicMessages
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.schema import change
 from blf_dsc_controller.law.factory import estimate_names
-from blf_dsc_controller.law.telemetry import DECIMATION, ControllerTelemetry, Message, Monitor
+from blf_dsc_controller.law.telemetry import ControllerTelemetry, Message
 from blf_dsc_controller.messages.codecs import MessageError
 from blf_dsc_controller.messages.journal import Event, EventType
 from blf_dsc_controller.messages.topics import TRACKING_ERROR, Topic
@@ -44,9 +44,8 @@ class Outputs:
     """
 
     def __init__(self, guard: Guard) -> None:
-        self._guard, self._joints = guard, guard.config.joints
-        self._estimates = estimate_names(guard.config)
-        self._telemetry = ControllerTelemetry(self._joints, self._estimates, 1)
+        self._guard, self._estimates = guard, estimate_names(guard.config)
+        self._telemetry = ControllerTelemetry(guard.config, self._estimates, 1)
         self.samples = self.safe_torques = 0
         self.first = self.last = -1
         self._bound = b''
@@ -69,15 +68,13 @@ class Outputs:
             self.first = stamp
         self.last, self.samples = stamp, self.samples + 1
         if controller.samples == 1:
-            self._monitor = Monitor(self._joints, self._estimates, controller.settings)
+            self._telemetry = ControllerTelemetry(guard.config, self._estimates, 1)
             self._bound = b''
         if sample.bound.tobytes() != self._bound:
             self.add_bound(stamp, sample.bound)
-        for message in self._telemetry.sample(stamp, sample, 0.0):
+        self._add(stamp, self._telemetry.error(stamp, sample))
+        for message in self._telemetry.monitor(stamp, sample, guard.samples.ratio, 0.0):
             self._add(stamp, message)
-        if (controller.samples - 1) % DECIMATION == 0:
-            ratio = guard.samples.ratio
-            self._add(stamp, self._monitor.message(stamp, sample, ratio, sample.bound))
 
     def add_bound(self, stamp: int, bound: Floats) -> None:
         """Add a bound [rad], published with this stamp [ns]."""

@@ -26,8 +26,8 @@ _COMPARED = {  # topic: fields
     topics.COMMANDS: (2,),
     topics.TRACKING_ERROR: (0, 1, 2),
     topics.REFERENCE: (0, 1),
-    topics.LEARNING: (0,),
     topics.MONITOR: (0,),
+    topics.LEARNING: (0,),
     topics.BOUND: (0, 2),
 }
 _TEXTS = (topics.STATE, topics.DIAGNOSTICS)
@@ -205,7 +205,8 @@ def _compared(
 ) -> Iterator[Comparison]:
     """Yield the comparison of each topic in a bag; `answers` are those of tracking errors."""
     for topic, fields in _COMPARED.items():
-        messages, own = content.topics.get(topic), run.outputs.topics.get(topic)
+        messages = content.topics.get(topic)
+        own = run.outputs.topics.get(topics.MONITOR if topic is topics.LEARNING else topic)
         if messages is None:
             continue
         result = Comparison(messages.name, messages.size * len(joints) * len(fields))

@@ -18,7 +18,6 @@ from blf_dsc_controller.law.telemetry import (
     DECIMATION,
     ControllerTelemetry,
     Message,
-    Monitor,
     PlantTelemetry,
 )
 from blf_dsc_controller.messages import topics
@@ -56,8 +55,7 @@ def write_bag(
 def _messages(record: Record, config: ControllerConfig) -> Iterator[tuple[int, Message]]:
     plant = PlantTelemetry(config.joints, record.parameters)
     decimation = config.telemetry.decimation
-    controller = ControllerTelemetry(config.joints, estimate_names(config), decimation)
-    monitor = Monitor(config.joints, estimate_names(config), record.controller.settings)
+    controller = ControllerTelemetry(config, estimate_names(config), decimation)
     limit = np.array(config.torque.limit)
     events = deque(record.journal.pending)
     ratio = np.zeros(len(record.config.joints))
@@ -77,9 +75,8 @@ def _messages(record: Record, config: ControllerConfig) -> Iterator[tuple[int, M
         if np.isnan(sample.qr[0]):  # stopped
             continue
         np.maximum(ratio, np.abs(sample.xi1) / sample.bound, out=ratio)
-        for message in controller.sample(stamp, sample, float('nan')):
+        yield stamp, controller.error(stamp, sample)
+        for message in controller.monitor(stamp, sample, ratio, float('nan')):
             yield stamp, message
-        if row % DECIMATION == 0:
-            yield stamp, monitor.message(stamp, sample, ratio, bound)
     for event in events:
         yield START + int(record.stamps[-1]), (topics.JOURNAL, event.encode())

@@ -275,8 +275,8 @@ def _exponential_fit(run: Run) -> float:
 
 
 def _learned(run: Run, name: str) -> Floats:
-    assert run.learning is not None  # noqa: S101
-    return run.learning.column(name)
+    assert run.monitor is not None  # noqa: S101
+    return run.monitor.column(name)
 
 
 def _energy(run: Run) -> Floats:

@@ -95,7 +95,7 @@ def snapshots(run: Run, estimates: tuple[str, ...]) -> list[Snapshot]:
         return unknown if values is None else values[rows]
 
     stamps = run.stamp[rows]
-    figures = _held(run.learning, stamps, (*estimates, LAMBDA_MIN))
+    figures = _held(run.monitor, stamps, (*estimates, LAMBDA_MIN))
     truth = _held(run.truth, stamps, estimates)
     loaded = (np.abs(truth - truth[0]) > 0.0).any(axis=1)
     arrays = (run.position, run.error, run.bound, run.torque, run.torque_limit)
