@@ -197,7 +197,7 @@ def test_wrong_names_are_reported_with_the_names_in_the_bag(bag, tmp_path):
 def test_gripper_on_the_same_topic_is_told_from_the_arm_under_any_name(bag, tmp_path, capsys):
     fingers, entries = JointStateEncoder(('left_finger',)), []
     for k, entry in enumerate(recorded_run.messages(bag)):
-        if entry[0] == JOINT_STATES.resolved and k % 3 == 0:
+        if entry[0] == JOINT_STATES.resolved and k % 7 == 0:  # of some states only
             at = entry[2] - 5
             entries.append([*entry[:2], at, fingers.encode(at, [0.01], [0.0], [9.0])])
         entries.append(entry)

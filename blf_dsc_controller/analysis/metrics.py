@@ -84,11 +84,11 @@ def estimates_of(run: Run) -> Estimates | None:
 
 def rejected_columns(run: Run) -> list[str]:
     """Return the disturbance columns that are not estimated at the end: this tells them by NaN."""
-    if run.learning is None:
+    if run.monitor is None:
         return []
-    last = run.learning.values[run.learning.stamp.size - 1 :][0]
-    names = [run.learning.names[j] for j in np.flatnonzero(np.isnan(last))]
-    return [name for name in names if name != COMPUTE_TIME]
+    last = run.monitor.values[run.monitor.stamp.size - 1 :][0]
+    names = [run.monitor.names[j] for j in np.flatnonzero(np.isnan(last))]
+    return [name for name in names if name.startswith(COLUMNS)]
 
 
 def _relative_error(estimate: Floats, P: Floats, R: Floats | None) -> Floats:
