@@ -77,6 +77,10 @@ def test_urdf_may_be_given_as_text_or_file(tmp_path):
     ('changes', 'message'),
     [
         ({'robot.urdf': 'nowhere.urdf'}, 'robot.urdf: .*nowhere.urdf.* cannot be read'),
+        ({'robot.urdf': 'a\0.urdf'}, 'robot.urdf: .* cannot be read: embedded null'),
+        ({'robot.urdf': '~nobody-here/a.urdf'}, 'robot.urdf: .* cannot be read: .*home directory'),
+        ({'robot.urdf': 'package:///arm.urdf'}, "cannot be read: '' is not a valid package name"),
+        ({'robot.urdf': __file__}, r"robot.urdf: '\S+' is not XML: give a URDF$"),
         ({'robot.tip': 'hand'}, "robot.urdf: no link 'hand' for the tip"),
         ({'robot.tip': ''}, 'robot.urdf: neither a tip .* not one chain: .*panda_finger_joint1'),
         ({'joints': ['a', 'b']}, "robot.urdf: no joint 'a' in the URDF"),

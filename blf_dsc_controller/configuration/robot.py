@@ -174,11 +174,13 @@ def read_urdf(given: str) -> str:
         )
     try:
         text = read_text(resolve(given))
-    except (OSError, UnicodeDecodeError) as error:
+    except (OSError, ValueError, RuntimeError) as error:  # no such file, no text, no path, no user
         reason = getattr(error, 'strerror', None) or error
         raise BlfDscError(f'{given!r} cannot be read: {reason}') from error
     if not text.strip():
         raise BlfDscError(f'{given!r} is empty: did the xacro that wrote it fail?')
+    if not text.lstrip().startswith('<'):
+        raise BlfDscError(f'{given!r} is not XML: give a URDF')
     return text
 
 
