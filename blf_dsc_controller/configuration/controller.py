@@ -112,9 +112,7 @@ class MotionLimits:
 class Safety:
     """Limits past which the controller makes a safe stop, and the torque of that stop."""
 
-    state_timeout: float = positive(
-        0.04, 'largest delay of a state, by steady clock and stamp', 's'
-    )
+    state_timeout: float = positive(0.04, 'largest delay of a state, by steady clock or stamp', 's')
     watchdog: Literal['auto', 'on', 'off'] = parameter(
         'auto', 'steady-clock watchdog for missing states; auto: only if stamps are wall-clock time'
     )
@@ -148,9 +146,7 @@ class Safety:
     damping: PerJoint = non_negative((2.0, 1.0), 'damping in the safe torque', 'N m s/rad', 'D')
     stop_ramp: float = non_negative(0.0, 'ramp to the safe torque after a fault; 0: at once', 's')
     deactivation_ramp: float = non_negative(0.5, 'the same ramp when the node is deactivated', 's')
-    fade_time: float = positive(
-        0.5, 'time to fade the safe torque without usable joint states', 's'
-    )
+    fade_time: float = positive(0.5, 'time to fade the safe torque without usable states', 's')
 
 
 @dataclass(frozen=True)

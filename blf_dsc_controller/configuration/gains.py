@@ -121,9 +121,7 @@ class Torque:
     limit: PerJoint = positive(
         (20.0, 20.0), 'largest torque, as commanded and with what the drives add', 'N m'
     )
-    rate_limit: PerJoint = non_negative(
-        (0.0, 0.0), 'largest rate of commands; 0: no limit', 'N m/s'
-    )
+    rate_limit: PerJoint = non_negative((0.0, 0.0), 'largest rate of commands; 0: any', 'N m/s')
     first_step: PerJoint = non_negative(
         (0.0, 0.0),
         'largest first torque, a step from none, that the drives tolerate; 0: any',

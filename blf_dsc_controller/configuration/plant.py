@@ -164,9 +164,7 @@ class Actuator:
 
     torque_limit: PerJoint = _magnitude((0.0, 0.0), 'rated joint torque; 0: no limit', 'N m')
     delay: int = _magnitude(0, 'delay of the torque', 'samples', at_most=1000)
-    time_constant: float = _magnitude(
-        0.0, 'first-order lag from the limited torque to the joint', 's'
-    )
+    time_constant: float = _magnitude(0.0, 'first-order lag from limited torque to joint', 's')
     torque_noise: float = _magnitude(0.0, 'rms of the torque noise, as a fraction of the torque')
     ripple: float = _magnitude(0.0, 'amplitude of the torque ripple, relative to the rated torque')
     ripple_cycles: float = _fixed(20.0, 'periods of the ripple per turn, or per metre', above=0.0)

@@ -30,10 +30,6 @@ _NAMES = {bool: 'bool', int: 'integer', float: 'double', str: 'string'}
 _ARRAYS = (list, tuple, array.array)  # rclpy gives array.array
 
 
-def _as_given(value: Any) -> Any:
-    return value
-
-
 @dataclass(frozen=True)
 class Parameter:
     """A parameter of a node: what it means and which values are valid.
@@ -56,7 +52,7 @@ class Parameter:
     choices: tuple[str, ...] = ()
     omittable: bool = False
     read_only: str = ''
-    kept: Callable[[Any], Any] = _as_given
+    kept: Callable[[Any], Any] = lambda given: given
     name: str = ''
     type: type = float
     is_array: bool = False
@@ -86,13 +82,10 @@ class Parameter:
         empty = 'may be empty' if self.omittable else ''
         return '; '.join(filter(None, (self.allowed, entries, empty)))
 
-    def problems(self, given: Any) -> list[str]:
+    def problems(self, given: Any) -> Iterator[str]:
         """Check a value; each problem names the parameter, what it got, and what is expected."""
-        return [f'{self.name}: {problem}' for problem in self._problems(given)]
-
-    def _problems(self, given: Any) -> Iterator[str]:
         article = 'an' if self.type is int and not self.is_array else 'a'
-        mismatch = f'got {_shown(given)}, but {article} {self.kind} is expected'
+        mismatch = f'{self.name}: got {_shown(given)}, but {article} {self.kind} is expected'
         if self.is_array and not isinstance(given, _ARRAYS):
             yield f'{mismatch}: write a list, like {_shown(self.default)}'
             return
@@ -101,7 +94,7 @@ class Parameter:
             yield mismatch + _remedy(entries, self.type)
             return
         if not (entries or self.omittable or self.length):
-            yield 'got an empty list, but at least one entry is needed'
+            yield f'{self.name}: got an empty list, but at least one entry is needed'
         for index, entry in enumerate(entries, 1):
             if isinstance(entry, float) and not math.isfinite(entry):
                 expected = 'a finite number is needed'
@@ -111,7 +104,7 @@ class Parameter:
             else:
                 continue
             place = f' at entry {index} of {_shown(entries)}' if self.is_array else ''
-            yield f'got {_shown(entry)}{place}, but {expected}'
+            yield f'{self.name}: got {_shown(entry)}{place}, but {expected}'
 
     def _allows(self, entry: Any) -> bool:
         within = all(compare(entry, limit) for _, limit, compare in self._limits())
@@ -173,7 +166,7 @@ def build(cls: type[Config], given: Mapping[str, Any], source: str = '') -> Conf
     valid: dict[str, Any] = {}
     for name in (name for name in known if name in given):
         param, value = known[name], given[name]
-        found = param.problems(value)
+        found = list(param.problems(value))
         try:
             if not found:
                 valid[name] = tuple(value) if param.is_array else param.kept(value)
