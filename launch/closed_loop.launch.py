@@ -12,10 +12,8 @@ from launch.actions import DeclareLaunchArgument, OpaqueFunction, Shutdown
 from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import Node
 
-from blf_dsc_controller.configuration.files import share_folder
 from blf_dsc_controller.configuration.nodes import PLANT, load, locate
 from blf_dsc_controller.configuration.plant import PlantConfig
-from sim_plant.plant import urdf_of
 
 PACKAGE = 'blf_dsc_controller'
 
@@ -26,7 +24,6 @@ DRIVERS = {
     'fr3': ('fr3', 'franka/joint_states', 'fr3_effort_controller/commands'),
     'ur5e': ('ur5e_driver', 'joint_states', 'forward_effort_controller/commands'),
 }
-NO_OR_YES = ['false', 'true']
 ARGUMENTS = {  # default, choices and description
     'config': (
         '',
@@ -38,7 +35,11 @@ ARGUMENTS = {  # default, choices and description
         ['', *DRIVERS],
         'driver of an arm, whose topics are used; empty: the simulated arm',
     ),
-    'simulated': ('false', NO_OR_YES, 'start the simulated arm with the topics of the driver'),
+    'simulated': (
+        'false',
+        ['false', 'true'],
+        'start the simulated arm with the topics of the driver',
+    ),
     'mode': (
         '',
         ['', 'realtime', 'lockstep'],
@@ -46,7 +47,6 @@ ARGUMENTS = {  # default, choices and description
     ),
     'namespace': ('', None, 'of all nodes; in a file, the key /**/NODE matches any namespace'),
     'bag': ('', None, 'folder to record into, which must not exist yet; empty: no recording'),
-    'rviz': ('false', NO_OR_YES, 'show the arm in RViz'),
 }
 
 
@@ -61,7 +61,7 @@ def generate_launch_description() -> LaunchDescription:
 
 def nodes(context: LaunchContext) -> list[Node]:
     """Create the nodes once the arguments are known."""
-    config, robot, simulated, mode, namespace, bag, rviz = (
+    config, robot, simulated, mode, namespace, bag = (
         LaunchConfiguration(name).perform(context) for name in ARGUMENTS
     )
     own = f'{PACKAGE}/commands'  # of the simulated arm
@@ -87,8 +87,7 @@ def nodes(context: LaunchContext) -> list[Node]:
         )
 
     is_simulated = not robot or simulated == 'true'
-    # Viewers come first: if they are not installed, nothing has been started yet.
-    started = view(namespace, file) if rviz == 'true' else []
+    started = []
     if bag:
         plant_mode = mode or load(file, f'{namespace}/{PLANT}', PlantConfig).mode
         clock = 'plant' if is_simulated and plant_mode == 'lockstep' else 'wall'
@@ -100,24 +99,3 @@ def nodes(context: LaunchContext) -> list[Node]:
     if is_simulated:
         started.append(node('sim_plant', of_plant))
     return started
-
-
-def view(namespace: str, config: str) -> list[Node]:
-    """Return RViz and the node that publishes the arm's frames; both are separate packages."""
-    plant = load(config, f'{namespace}/{PLANT}', PlantConfig)
-    robot = plant.robot
-    frame = robot.chain(plant.joints).base if robot.urdf else 'base_link'
-    return [
-        Node(
-            package='robot_state_publisher',
-            executable='robot_state_publisher',
-            namespace=namespace,
-            parameters=[{'robot_description': urdf_of(plant)}],
-        ),
-        Node(
-            package='rviz2',
-            executable='rviz2',
-            namespace=namespace,
-            arguments=['-d', str(share_folder() / 'config' / 'arm.rviz'), '-f', frame],
-        ),
-    ]

@@ -22,11 +22,11 @@ from blf_dsc_controller.configuration.nodes import load_loop
 HALF = {'learning.initial_estimate': [0.5, 0.16, 0.2]}
 DURATION = 3  # s
 SAMPLES = 3001
-EACH_SAMPLE = ('commands', 'tracking_error')
 EACH_TENTH = ('reference', 'monitor')
 COUNTS = {
     '/joint_states': SAMPLES,
-    **{f'/blf_dsc_controller/{topic}': SAMPLES for topic in EACH_SAMPLE},
+    '/blf_dsc_controller/tracking_error': SAMPLES,
+    '/blf_dsc_controller/commands': SAMPLES + 1,  # the last torque, when it ends
     '/blf_dsc_controller/bound': 1,
     **{f'/blf_dsc_controller/{topic}': 301 for topic in EACH_TENTH},
     '/sim_plant/truth': 301,

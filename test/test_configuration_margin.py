@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import numpy as np
 import pytest
 
@@ -11,7 +13,7 @@ from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.nodes import load, load_loop, locate
 from blf_dsc_controller.law.factory import settings_of_config
 from blf_dsc_controller.simulation.loop import simulate
-from blf_dsc_controller.supervision.linear_loop import Loop, expected_errors, transition
+from blf_dsc_controller.supervision.linear_loop import expected_errors, transition
 
 ARMS = [('panda', 7), ('ur5e', 6), ('fr3', 7)]
 
@@ -27,9 +29,9 @@ def inertias(config, settings):
     return inertia_matrices(settings.model, np.array(config.learning.initial_estimate), q)
 
 
-def growth(settings, loop, M, M0, stiffness):
+def growth(settings, T, lag, M, M0, stiffness):
     """Largest factor by which errors grow from sample to sample; the loop is stable below 1."""
-    A, _ = transition(settings, loop, M, M0, stiffness)
+    A, _ = transition(settings, T, lag, M, M0, stiffness)
     return np.abs(np.linalg.eigvals(A)).max()
 
 
@@ -39,11 +41,11 @@ def test_default_gains_have_margins_at_every_rate(preset, sample_time):
     """Inertias coupled, with the barrier at its softest and at its stiffest."""
     config = configured(preset, sample_time)
     settings = settings_of_config(config)
-    loop, M0 = Loop(sample_time, config.robot.lag), inertias(config, settings)
-    later = loop._replace(lag=loop.lag + 1.5 * sample_time)
-    assert growth(settings, loop, M0 / 1.5, M0, settings.weight) < 1.0
-    assert growth(settings, later, M0, M0, settings.weight) < 1.0
-    assert growth(settings, loop, M0, M0, settings.slope_limit) < 1.0
+    lag, M0 = config.robot.lag, inertias(config, settings)
+    later = lag + 1.5 * sample_time
+    assert growth(settings, sample_time, lag, M0 / 1.5, M0, settings.weight) < 1.0
+    assert growth(settings, sample_time, later, M0, M0, settings.weight) < 1.0
+    assert growth(settings, sample_time, lag, M0, M0, settings.slope_limit) < 1.0
 
 
 def test_a_surface_filter_of_two_samples_costs_the_margin_at_low_rates():
@@ -51,8 +53,8 @@ def test_a_surface_filter_of_two_samples_costs_the_margin_at_low_rates():
     for factor in (1.0, 2.0):
         config = configured('panda', 0.004, {'surface.time_constant': factor * 0.004})
         settings = settings_of_config(config)
-        M0, loop = inertias(config, settings), Loop(0.004, config.robot.lag)
-        found.append([growth(settings, loop, M0 / x, M0, settings.weight) < 1.0 for x in lighter])
+        M0, size = inertias(config, settings), partial(growth, settings, 0.004, config.robot.lag)
+        found.append([size(M0 / x, M0, settings.weight) < 1.0 for x in lighter])
     assert found == [[True, True], [True, False]]
 
 

@@ -117,7 +117,7 @@ def test_node_warns_once_of_how_light_a_drive_may_be(ros, log, preset, warned):
     diagnostics = ros.listen(topics.DIAGNOSTICS)
     ros.add(ControllerNode, flatten(load_loop(preset).controller), namespace=preset)
     ros.until(lambda: log(preset, 'ready for joint states of '))
-    assert len(log(preset, 'of the inertia assumed: then give robot.rotor_inertia', WARN)) == warned
+    assert len(log(preset, 'of the inertia assumed: then give it', WARN)) == warned
     ros.until(lambda: statuses(diagnostics, 'held: '))
     assert values(statuses(diagnostics, 'held: ')[-1]).keys() == set(topics.LOAD)
 

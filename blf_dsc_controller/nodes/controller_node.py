@@ -25,7 +25,7 @@ from blf_dsc_controller.nodes.diagnostics import ControllerStatus
 from blf_dsc_controller.nodes.lifecycle import LoopNode
 from blf_dsc_controller.nodes.trajectory_input import TrajectoryInput
 from blf_dsc_controller.supervision.checks import SAME_CLOCK, rate_mismatch
-from blf_dsc_controller.supervision.config_warnings import config_warnings, light_drive, worsened
+from blf_dsc_controller.supervision.config_warnings import config_warnings, worsened
 from blf_dsc_controller.supervision.guard import Guard
 from blf_dsc_controller.supervision.linear_loop import ReferenceLoad, reference_load
 from blf_dsc_controller.supervision.supervisor import Phase
@@ -93,8 +93,6 @@ class ControllerNode(LoopNode[ControllerConfig]):
         self._load = reference_load(self.config, self.guard.controller.settings)
         for warning in config_warnings(self.config, load=self._load):
             self.get_logger().warning(warning)
-        if risk := light_drive(self.config):
-            self.get_logger().warning(risk)
         outputs = OUTPUTS if self.config.telemetry.enabled else OUTPUTS[:1]
         if self.connect(outputs, topics.JOINT_STATES, self._on_joint_state):
             self._status.trajectories = TrajectoryInput(
@@ -144,12 +142,9 @@ class ControllerNode(LoopNode[ControllerConfig]):
 
     def _leave(self) -> None:
         """Command the torque that drivers may hold from now on, and release the guard."""
-        guard, states = self.guard, self.resolve_topic_name(topics.JOINT_STATES.relative)
-        if guard is not None:
-            torque = guard.release()
-            if self.count_publishers(states):
-                self._command(torque)
-            self._status.publish_events(guard)
+        if self.guard is not None:
+            self._command(self.guard.release())
+            self._status.publish_events(self.guard)
 
     def reset(self) -> str:
         """Restart with the next joint state and the initial estimates."""

@@ -20,7 +20,6 @@ from blf_dsc_controller.configuration.robot import implausible_friction
 from blf_dsc_controller.law.factory import settings_of_config
 from blf_dsc_controller.law.settings import FILTERED, LINEAR, NEWTON, Settings
 from blf_dsc_controller.supervision.linear_loop import (
-    ExpectedErrors,
     ReferenceLoad,
     expected_errors,
     reference_load,
@@ -55,7 +54,7 @@ def config_warnings(config: ControllerConfig, load: ReferenceLoad | None = None)
     found = [*_of_urdf(config, load)] if config.model == 'urdf' else []
     found += [finding.text for finding in _of_gains(config, load)]
     if config.model == 'urdf' and config.law == 'blf_dsc':
-        found += _of_errors(config, expected_errors(config, settings))
+        found += _of_errors(config, settings)
     if settings.surface != LINEAR and settings.kappa > 0.0 and settings.Gamma.any():
         found += _of_learning(config, settings, load)
     return found
@@ -126,39 +125,20 @@ def expectation(config: ControllerConfig) -> str:
     errors = expected_errors(config, settings_of_config(config))
     usual, most = (1e3 * float(each.max()) for each in errors)
     joint = config.joints[int(errors.pick_up.argmax())]
-    text = (
+    return (
         f'{usual:.2g} mrad by friction and unmodelled torque; {most:.2g} mrad of {joint} when '
         f'{config.robot.payload:g} kg are picked up in motion'
     )
-    return '; '.join(filter(None, (text, light_drive(config))))
 
 
-def light_drive(config: ControllerConfig) -> str:
-    """Return which drive may be lighter than assumed at the risk of its bound; empty: none.
+def _of_errors(config: ControllerConfig, settings: Settings) -> Iterator[str]:
+    """Check that the errors to expect are within the bound, also with lighter drives.
 
     The lightest drives are those with which friction alone stays within the bound: the gains follow
     the inertia that the law measures (`apparent_inertia`), so errors grow with its inverse.
     """
-    if config.model != 'urdf' or config.law != 'blf_dsc':
-        return ''
-    settings = settings_of_config(config)
+    bound, T, robot = settings.bound, config.sample_time, config.robot
     errors = expected_errors(config, settings)
-    drives = settings.joint_inertia - settings.link_inertia
-    least = settings.joint_inertia * errors.unmodelled / settings.bound - settings.link_inertia
-    lightest = np.zeros_like(drives)  # of the inertia assumed; where it is given, nothing is
-    np.divide(least, drives, out=lightest, where=settings.unsure_rotor > 0.0)
-    worst = int(lightest.argmax())
-    if lightest[worst] <= 0.0:
-        return ''
-    return (
-        f'the bound may be passed if the drive of {config.joints[worst]} has less than '
-        f'{lightest[worst]:.2g} of the inertia assumed: then give robot.rotor_inertia'
-    )
-
-
-def _of_errors(config: ControllerConfig, errors: ExpectedErrors) -> Iterator[str]:
-    """Check that the errors to expect are within the bound."""
-    bound, T, robot = np.array(config.barrier.bound), config.sample_time, config.robot
     worst = int(np.argmax(errors.unmodelled / bound))
     if errors.unmodelled[worst] > bound[worst]:
         yield (
@@ -180,21 +160,27 @@ def _of_errors(config: ControllerConfig, errors: ExpectedErrors) -> Iterator[str
             f'bound of {bound[worst]:g} rad: a bound of {1.1 * peak:.2g} rad would hold, or '
             f'{share * robot.payload:.2g} kg, or {remedy}'
         )
+    drives = settings.joint_inertia - settings.link_inertia
+    least = settings.joint_inertia * errors.unmodelled / bound - settings.link_inertia
+    lightest = np.zeros_like(drives)  # of the inertia assumed; where it is given, nothing is
+    np.divide(least, drives, out=lightest, where=settings.unsure_rotor > 0.0)
+    worst = int(lightest.argmax())
+    if lightest[worst] > 0.0:
+        yield (
+            f'robot.rotor_inertia: the bound may be passed if the drive of {config.joints[worst]} '
+            f'has less than {lightest[worst]:.2g} of the inertia assumed: then give it'
+        )
 
 
 def _of_gains(config: ControllerConfig, load: ReferenceLoad) -> list[Finding]:
-    settings = settings_of_config(config)
-    damping = np.maximum(load.damping(settings), 1e-12)
     with np.errstate(over='ignore'):  # a limit of next to nothing is exceeded infinitely
-        found = [*_of_feedback(config, settings, load, damping)]
-        if settings.surface != LINEAR:
-            found += _of_surface(config, settings, damping)
-    return [finding for finding in found if finding.excess > 1.0]
+        return [each for each in _ratios(config, load) if each.excess > 1.0]
 
 
-def _of_feedback(
-    config: ControllerConfig, settings: Settings, load: ReferenceLoad, damping: Floats
-) -> Iterator[Finding]:
+def _ratios(config: ControllerConfig, load: ReferenceLoad) -> Iterator[Finding]:
+    """Yield what limits the gains, and by how much they use it."""
+    settings, T = settings_of_config(config), config.sample_time
+    damping = np.maximum(load.damping(settings), 1e-12)
     for joint, need, limit in zip(config.joints, load.torque, config.torque.limit, strict=True):
         yield Finding(
             f'torque of {joint}',
@@ -203,15 +189,14 @@ def _of_feedback(
             f'reference alone needs {need:.3g} N m: give that and a quarter more',
         )
     rate = load.rate(settings)
-    product = rate * config.sample_time
     yield Finding(
         'feedback',
-        product,
+        rate * T,
         f'feedback.gain: K_p over the inertia is {rate:.3g} 1/s with learning.initial_estimate, '
-        f'{product:.2g} times the inverse of sample_time: above 1 the loop has little margin for '
+        f'{rate * T:.2g} times the inverse of sample_time: above 1 the loop has little margin for '
         'delays, and above 2 it chatters between the limits: lower either',
     )
-    fraction = float(np.max(settings.gamma * config.sample_time / damping))
+    fraction = float(np.max(settings.gamma * T / damping))
     yield Finding(
         'disturbance',
         2.0 * fraction,
@@ -220,20 +205,19 @@ def _of_feedback(
     )
     yield Finding(
         'leakage',
-        settings.eta * float(settings.gamma.max()) * config.sample_time,
+        settings.eta * float(settings.gamma.max()) * T,
         'disturbance.leakage: eta gamma T > 1 makes the disturbance estimate oscillate: lower it',
     )
-
-
-def _of_surface(config: ControllerConfig, settings: Settings, damping: Floats) -> Iterator[Finding]:
-    T, filtering = config.sample_time, config.surface.time_constant
-    rate = float(np.max(settings.K / 2.0 + settings.mu))
+    if settings.surface == LINEAR:
+        return
+    filtering = config.surface.time_constant
     yield Finding(
         'filter',
         T / filtering,
         f'surface.time_constant: {filtering:g} s is less than the sample time, {T:g} s: alpha2 '
         'follows the measurement noise, and its derivative enters the torque: give more',
     )
+    rate = float(np.max(settings.K / 2.0 + settings.mu))
     yield Finding(
         'surface',
         filtering * rate,

@@ -89,23 +89,17 @@ _MOMENTS = 40  # of the reference
 _REVERSAL = 0.75  # of Coulomb friction: half of it too much at breakaway, with either sign
 
 
-class Loop(NamedTuple):
-    """What the loop at small errors depends on besides the gains."""
-
-    sample_time: float  # s
-    lag: float  # s, of velocity filter and drives together
-
-
 def transition(
-    settings: Settings, loop: Loop, M: Floats, M0: Floats, stiffness: Floats
+    settings: Settings, T: float, lag: float, M: Floats, M0: Floats, stiffness: Floats
 ) -> tuple[Floats, Floats]:
     """Return A (k, 8 n, 8 n) and B (k, 8 n, n) for the inertias M and M0 of the model (k, n, n).
 
-    `stiffness` (n,) [N m/rad] is the slope of the barrier.
+    T [s] is the sample time, `lag` [s] that of velocity filter and drives together, and
+    `stiffness` (n,) [N m/rad] the slope of the barrier.
     """
-    T, n = loop.sample_time, settings.n
-    decay = np.exp(-T / max(0.5 * loop.lag, 1e-9))  # of the drives
-    mean = (1.0 - decay) * 0.5 * loop.lag / T  # of the drives' transient over the sample
+    n = settings.n
+    decay = np.exp(-T / max(0.5 * lag, 1e-9))  # of the drives
+    mean = (1.0 - decay) * 0.5 * lag / T  # of the drives' transient over the sample
     rate = settings.K / 2.0 + settings.mu
     g = filter_gain(settings.time_constant, T)
     # Rows of x, and of what the law computes in terms of x: alpha2', xi2 and the torque.
@@ -139,13 +133,15 @@ def transition(
     return A, B
 
 
-def _peak_errors(settings: Settings, loop: Loop, M: Floats, M0: Floats, torque: Floats) -> Floats:
+def _peak_errors(
+    config: ControllerConfig, settings: Settings, M: Floats, M0: Floats, torque: Floats
+) -> Floats:
     """Return the largest errors (k, n) [rad] after a step of the torque d (k, n) [N m]."""
-    A, B = transition(settings, loop, M, M0, settings.weight)
+    A, B = transition(settings, config.sample_time, config.robot.lag, M, M0, settings.weight)
     push = (B @ torque[..., None])[..., 0]
     x, largest = np.zeros_like(push), np.zeros_like(torque)
     rate = max(settings.damping_rate, 1.0)
-    for _ in range(round(_RESPONSE / rate / loop.sample_time)):
+    for _ in range(round(_RESPONSE / rate / config.sample_time)):
         x = (A @ x[..., None])[..., 0] + push
         largest = np.maximum(largest, np.abs(x[:, : settings.n]))
     return largest
@@ -171,9 +167,8 @@ def expected_errors(config: ControllerConfig, settings: Settings) -> ExpectedErr
     P0 = settings.initial_estimate[: settings.p]
     load = robot.payload * parameters_of(robot, chain).load
     M0, M = (inertia_matrices(model, P, q) for P in (P0, P0 + load))
-    loop = Loop(config.sample_time, robot.lag)
     floor = np.array(config.learning.residual_floor)
     floor += _REVERSAL * np.array(robot.friction(chain)['coulomb'])
-    unmodelled = _peak_errors(settings, loop, M0, M0, np.broadcast_to(floor, q.shape))
-    pick_up = _peak_errors(settings, loop, M, M0, regressors_at(model, q, dq, dq, ddq) @ load)
+    unmodelled = _peak_errors(config, settings, M0, M0, np.broadcast_to(floor, q.shape))
+    pick_up = _peak_errors(config, settings, M, M0, regressors_at(model, q, dq, dq, ddq) @ load)
     return ExpectedErrors(unmodelled.max(axis=0), pick_up.max(axis=0))
