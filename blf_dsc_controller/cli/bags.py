@@ -126,7 +126,7 @@ def play(options: Namespace) -> None:
     rclpy.init(args=[], signal_handler_options=rclpy.SignalHandlerOptions.NO)
     try:
         with open_bag(options.bag) as bag:
-            node = PlayerNode(bag, options.topics, clock=options.clock)
+            node = PlayerNode(bag, options.topics)
             seconds = (bag.times[1] - bag.times[0]) * 1e-9
             print(f'playing {seconds:.3f} s: {", ".join(node.outputs)}', flush=True)
             time.sleep(_DISCOVERY)

@@ -28,6 +28,10 @@ ERROR = DiagnosticStatus.ERROR
 STALE = DiagnosticStatus.STALE
 
 
+Part = tuple[str, bytes, str, Mapping[str, Any]]
+"""Status of a part of a node: its name, level, message and values."""
+
+
 class DiagnosticsPublisher:
     """Publishes the statuses of a node."""
 
@@ -39,23 +43,17 @@ class DiagnosticsPublisher:
             DiagnosticArray, topics.DIAGNOSTICS.name, qos_profile(topics.DIAGNOSTICS.offered)
         )
 
-    def status(
-        self, part: str, level: bytes, message: str, values: Mapping[str, Any]
-    ) -> DiagnosticStatus:
-        """Return the status of a part of the node."""
-        return DiagnosticStatus(
-            level=level,
-            name=f'{self._name}/{part}',
-            message=message,
-            hardware_id=self._hardware,
-            values=[KeyValue(key=key, value=f'{value}') for key, value in values.items()],
-        )
-
-    def publish(self, statuses: Sequence[DiagnosticStatus]) -> None:
-        """Publish statuses on /diagnostics."""
-        array = DiagnosticArray(status=list(statuses))
+    def publish(self, *parts: Part) -> DiagnosticStatus:
+        """Publish the status of each part on /diagnostics; return that of the first."""
+        array = DiagnosticArray()
         array.header.stamp = self._node.get_clock().now().to_msg()
+        for part, level, message, values in parts:
+            status = DiagnosticStatus(level=level, message=message, hardware_id=self._hardware)
+            status.name = f'{self._name}/{part}'
+            status.values = [KeyValue(key=key, value=f'{value}') for key, value in values.items()]
+            array.status.append(status)
         self._diagnostics.publish(array)
+        return array.status[0]
 
 
 _PHASES = {
@@ -84,7 +82,6 @@ class ControllerStatus:
         self.journal = create_publisher(node, topics.JOURNAL)
         self.rejected: tuple[RejectedColumn, ...] = ()
         self.trajectories: TrajectoryInput | None = None
-        self._joints = tuple(joints)
         self._diagnostics = DiagnosticsPublisher(node, joints)
         self._latched = create_publisher(node, topics.STATE)
         self._published = '', -1  # lifecycle and revision of the state
@@ -105,13 +102,12 @@ class ControllerStatus:
         """
         if guard is not None:
             self.publish_events(guard)
-        state = self._state(lifecycle, guard)
-        parts = [state]
+        parts = [self._state(lifecycle, guard)]
         if guard is not None:
             parts += [self._loop(guard, others), self._learning(guard)]
             if guard.controller.settings.weighed:
-                parts.append(self._load(guard))
-        self._diagnostics.publish(parts)
+                parts.append(_load(guard))
+        state = self._diagnostics.publish(*parts)
         now = lifecycle, guard.supervisor.revision if guard else -1
         if now != self._published:
             self._latched.publish(state)
@@ -122,7 +118,7 @@ class ControllerStatus:
         while guard.journal.pending:
             self.journal.publish(guard.journal.pending.popleft().encode())
 
-    def _state(self, lifecycle: str, guard: Guard | None) -> DiagnosticStatus:
+    def _state(self, lifecycle: str, guard: Guard | None) -> Part:
         supervisor = guard.supervisor if guard else Supervisor()
         level, message = _PHASES[supervisor.phase]
         values: dict[str, Any] = {PHASE: supervisor.phase, REASON: supervisor.reason}
@@ -134,9 +130,9 @@ class ControllerStatus:
             values['safe torque'] = guard.config.safety.torque
         if supervisor.text:
             message += f': {supervisor.text}'
-        return self._diagnostics.status('state', level, message, values)
+        return 'state', level, message, values
 
-    def _loop(self, guard: Guard, others: int) -> DiagnosticStatus:
+    def _loop(self, guard: Guard, others: int) -> Part:
         states, samples, state = guard.states, guard.samples, guard.controller.state
         off = f'off: {guard.watchdog.why_off}'.removesuffix(': ')
         values = {
@@ -148,8 +144,8 @@ class ControllerStatus:
             'samples with a torque at its limit': samples.saturated,
             'messages for other joints': guard.foreign,
             'watchdog on the steady clock': 'on' if guard.watchdog.on else off,
-            'samples cut by the torque limit': self._by_joint(state.level_cuts),
-            'samples cut by the torque rate limit': self._by_joint(state.rate_cuts),
+            'samples cut by the torque limit': _by_joint(guard, state.level_cuts),
+            'samples cut by the torque rate limit': _by_joint(guard, state.rate_cuts),
             **(self.trajectories.values if self.trajectories else {}),
         }
         level, message = WARN, 'torque{} at its limit: adaptation by the tracking error is frozen'
@@ -161,20 +157,16 @@ class ControllerStatus:
             message = message.format('')
         elif guard.has_sample and guard.controller.sample.cuts.any():
             message = message.format(' rate')
-        elif chatter := chatter_of(guard, self._joints):
+        elif chatter := chatter_of(guard):
             message = chatter
             if not self._has_warned:
                 self._has_warned = True
                 self._logger.warning(chatter)
         else:
             level, message = OK, _PHASES[guard.supervisor.phase][1]
-        return self._diagnostics.status('loop', level, message, values)
+        return 'loop', level, message, values
 
-    def _by_joint(self, counts: np.ndarray) -> str:
-        pairs = zip(self._joints, counts, strict=True)
-        return ', '.join(f'{joint} {count:.0f}' for joint, count in pairs if count) or 'none'
-
-    def _learning(self, guard: Guard) -> DiagnosticStatus:
+    def _learning(self, guard: Guard) -> Part:
         state = guard.controller.state
         learning = 'latched' if state.latched[0] else 'not yet excited'
         values = {'lambda_min': f'{state.lambda_min[0]:.3g}', 'learning': learning}
@@ -187,23 +179,29 @@ class ControllerStatus:
         values |= {f'{REJECTED}{rejected.column}': f'{rejected}' for rejected in self.rejected}
         if self.rejected:
             columns = ', '.join(rejected.column for rejected in self.rejected)
-            return self._diagnostics.status('learning', WARN, f'not estimated: {columns}', values)
-        return self._diagnostics.status('learning', OK, learning, values)
-
-    def _load(self, guard: Guard) -> DiagnosticStatus:
-        load = guard.controller.sample.load.tolist()
-        values = {name: f'{value:.6g}' for name, value in zip(LOAD, load, strict=True)}
-        return self._diagnostics.status('load', OK, f'held: {load_text(load)}', values)
+            return 'learning', WARN, f'not estimated: {columns}', values
+        return 'learning', OK, learning, values
 
 
-def chatter_of(guard: Guard, joints: Sequence[str]) -> str:
+def _load(guard: Guard) -> Part:
+    load = guard.controller.sample.load.tolist()
+    values = {name: f'{value:.6g}' for name, value in zip(LOAD, load, strict=True)}
+    return 'load', OK, f'held: {load_text(load)}', values
+
+
+def _by_joint(guard: Guard, counts: np.ndarray) -> str:
+    pairs = zip(guard.config.joints, counts, strict=True)
+    return ', '.join(f'{joint} {count:.0f}' for joint, count in pairs if count) or 'none'
+
+
+def chatter_of(guard: Guard) -> str:
     """Return the warning about a torque that chatters, as with coarse encoders; empty if none."""
     steps = np.sqrt(guard.controller.checks.chatter)
     worst = int(np.argmax(steps / guard.controller.settings.torque_limit))
     if steps[worst] <= _CHATTER * guard.controller.settings.torque_limit[worst]:
         return ''
     return (
-        f'the torque of {joints[worst]} changes by {steps[worst]:.2g} N m rms each sample: its '
+        f'the torque of {guard.config.joints[worst]} changes by {steps[worst]:.2g} N m rms each sample: its '
         'measured velocity is coarse or noisy. Lower the pole of the velocity filter and add '
         'its lag to robot.lag, whose gains are softer'
     )

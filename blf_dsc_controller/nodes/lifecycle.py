@@ -190,22 +190,18 @@ class LoopNode(LifecycleNode, process.PlainNode, Generic[Config]):
         """Publish diagnostics."""
 
     def _on_second(self) -> None:
-        self._check_others()
+        """Warn of other publishers of the output that only this node should publish, and report."""
+        if self._outputs:
+            publisher = next(iter(self._outputs.values()))
+            found = self.get_publishers_info_by_topic(publisher.topic_name)
+            before = self.others
+            self.others = sum(each.node_name != WATCHDOG_NODE for each in found) - 1
+            if self.others > before:
+                self.get_logger().warning(
+                    f'another node publishes on {publisher.topic_name}, too: stop one of the two '
+                    '(a killed node stays visible for 20 s)'
+                )
         self._report()
-
-    def _check_others(self) -> None:
-        """Warn of other publishers of the output that only this node should publish."""
-        if not self._outputs:
-            return
-        publisher = next(iter(self._outputs.values()))
-        found = self.get_publishers_info_by_topic(publisher.topic_name)
-        before = self.others
-        self.others = sum(each.node_name != WATCHDOG_NODE for each in found) - 1
-        if self.others > before:
-            self.get_logger().warning(
-                f'another node publishes on {publisher.topic_name}, too: stop one of the two '
-                '(a killed node stays visible for 20 s)'
-            )
 
     def _on_reset(self, _request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         response.success = self.state_label == 'active'
@@ -219,13 +215,10 @@ class LoopNode(LifecycleNode, process.PlainNode, Generic[Config]):
 
     def _is_observed(self) -> bool:
         """Whether each output has its recorders, and the first one also the other node."""
-        wanted = self.config.wait_for_subscribers
-        return all(
-            publisher.get_subscription_count() - self._subscribers(publisher, WATCHDOG_NODE)
-            >= wanted + (number == 0)
-            and (wanted == 0 or self._subscribers(publisher, _RECORDER) >= wanted)
-            for number, publisher in enumerate(self._outputs.values())
-        )
+        wanted, (first, *_) = self.config.wait_for_subscribers, self._outputs.values()
+        others = first.get_subscription_count() - self._subscribers(first, WATCHDOG_NODE)
+        recorders = (self._subscribers(each, _RECORDER) for each in self._outputs.values())
+        return others > wanted and (wanted == 0 or min(recorders) >= wanted)
 
     def _subscribers(self, publisher: Publisher, kind: str) -> int:
         """Return the number of subscribers whose nodes have this in their names."""

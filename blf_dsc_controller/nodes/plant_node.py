@@ -325,7 +325,7 @@ class PlantNode(LoopNode[PlantConfig]):
         elif rejected > self._reported_rejected:
             level, message = WARN, self.input.problem
         self._reported_rejected = rejected
-        self._diagnostics.publish([self._diagnostics.status('torque', level, message, values)])
+        self._diagnostics.publish(('torque', level, message, values))
 
 
 _SETTLING_TIME = 0.2  # s from the discovery of all peers until they have discovered this node

@@ -12,15 +12,12 @@ from rclpy.node import Node
 from rclpy.publisher import Publisher
 
 from blf_dsc_controller.bags.sources import BagError, OpenBag
-from blf_dsc_controller.messages.codecs import encode_clock
-from blf_dsc_controller.messages.topics import CLOCK, HISTORY, STREAM
+from blf_dsc_controller.messages.topics import HISTORY, STREAM
 from blf_dsc_controller.nodes.endpoints import message_class, qos_profile
-
-_CLOCK_PERIOD = 0.01  # s
 
 
 class PlayerNode(Node):
-    """Publishes the topics of an open bag, latched where they were, and its time on /clock.
+    """Publishes the topics of an open bag, latched where they were.
 
     Empty `topics` selects all. Messages are read as they are played: a bag may exceed the memory.
 
@@ -28,9 +25,7 @@ class PlayerNode(Node):
         BagError: the bag is empty, or has no such topic.
     """
 
-    def __init__(
-        self, bag: OpenBag, topics: Collection[str] = (), *, clock: bool = False, **options: Any
-    ) -> None:
+    def __init__(self, bag: OpenBag, topics: Collection[str] = (), **options: Any) -> None:
         super().__init__('rosbag2_player', start_parameter_services=False, **options)
         if not any(bag.counts.values()):
             raise BagError('the bag is empty: it holds no message')
@@ -41,25 +36,15 @@ class PlayerNode(Node):
         self._bag = bag
         self.outputs: dict[str, Publisher] = {}
         for name, type_ in bag.held.items():
-            if name in wanted and not (clock and name == CLOCK.name):
+            if name in wanted:
                 self._add(name, type_)
-        type_ = message_class(CLOCK.type)
-        self._clock_output = self.create_publisher(type_, CLOCK.name, 10) if clock else None
 
     def play(self, rate: float) -> None:
         """Publish all messages at `rate` seconds of the bag a second; 0: as fast as possible."""
-        first, begin, next_clock = self._bag.times[0], time.monotonic(), 0.0
+        first, begin = self._bag.times[0], time.monotonic()
         for message in self._bag.messages({*self.outputs}):
             due = begin + (message.received - first) * 1e-9 / rate if rate else 0.0
-            while True:
-                now = time.monotonic()
-                if self._clock_output is not None and now >= next_clock:
-                    next_clock = now + _CLOCK_PERIOD
-                    ahead = round(max(0.0, due - now) * rate * 1e9)
-                    self._clock_output.publish(encode_clock(message.received - ahead))
-                if now >= due:
-                    break
-                time.sleep(min(due - now, _CLOCK_PERIOD))
+            time.sleep(max(0.0, due - time.monotonic()))
             self.outputs[message.topic].publish(message.raw)
 
     def _add(self, name: str, type_: str) -> None:

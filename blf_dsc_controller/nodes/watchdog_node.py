@@ -171,8 +171,7 @@ class WatchdogNode(PlainNode):
             level, message, takeovers = OK, 'watching', self.line.takeovers
             if self.line.active:
                 level, message = ERROR, 'commands the safe torque: the controller is silent'
-        status = self._diagnostics.status('torque', level, message, {'takeovers': takeovers})
-        self._diagnostics.publish([status])
+        self._diagnostics.publish(('torque', level, message, {'takeovers': takeovers}))
 
 
 main = partial(run, WatchdogNode)
