@@ -192,10 +192,9 @@ def states(messages, names=JOINTS):
     return np.array(stamps), np.array(rows)
 
 
-def simulated_torques(plant, controller=None):
-    """Return the torques (k, 2) [N m] of the compiled loop with the same parameters."""
-    record = simulate(build(ControllerConfig, controller or {}), build(PlantConfig, plant))
-    return np.array([record.sample(row).torque for row in range(record.stamps.size)])
+def simulated(plant, controller=None):
+    """Return the run of the compiled loop with the same parameters."""
+    return simulate(build(ControllerConfig, controller or {}), build(PlantConfig, plant)).run()
 
 
 def values(status):

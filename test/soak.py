@@ -88,7 +88,9 @@ def soak(loop, samples):
         loop.ros.until(lambda: loop.law.guard.supervisor.phase is Phase.TRACKING)
         gc.collect()
         pages = int(Path('/proc/self/statm').read_text().split()[1])
-        used.append((pages * os.sysconf('SC_PAGE_SIZE') / 1e6, len(os.listdir('/proc/self/fd'))))
+        used.append(
+            (pages * os.sysconf('SC_PAGE_SIZE') / 1e6, len(list(Path('/proc/self/fd').iterdir())))
+        )
     growth, extra = np.subtract(used[-1], used[max(1, len(used) // 4)])
     print(
         f'{done} samples, {dict(faults)}\n'

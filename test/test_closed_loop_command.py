@@ -12,7 +12,7 @@ import pytest
 pytest.importorskip('rclpy', reason='needs ROS 2')
 
 from command import closed_loop
-from ros_rig import simulated_torques
+from ros_rig import simulated
 from rosbags.highlevel import AnyReader
 
 from blf_dsc_controller.bags.reader import read_run
@@ -79,7 +79,7 @@ def test_torques_over_ros_match_the_offline_run_bit_for_bit(out, tmp_path):
     np.testing.assert_array_equal(recorded.position, computed.position)
     np.testing.assert_array_equal(recorded.stamp, computed.stamp)
     plant = {'duration': float(DURATION)}
-    np.testing.assert_array_equal(recorded.torque, simulated_torques(plant, HALF))
+    np.testing.assert_array_equal(recorded.torque, simulated(plant, HALF).torque)
 
 
 def test_another_library_reads_the_whole_bag(reading, counts):

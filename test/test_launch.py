@@ -18,7 +18,6 @@ pytest.importorskip('rclpy', reason='needs ROS 2')
 
 import rclpy
 from own_domain import own_domain
-from rcl_interfaces.srv import GetParameters, ListParameters
 
 from blf_dsc_controller.configuration.nodes import dump, locate
 from blf_dsc_controller.errors import ConfigurationError
@@ -163,22 +162,6 @@ def test_section_that_does_not_match_the_node_is_an_error(start, tmp_path):
     assert [found.startswith(f'line 2: {remedy}') for found in caught.value.problems] == [True]
     path.write_text(right + right.replace('right', 'left').replace('1', '2'))  # for two arms
     assert start(*argv).config.seed == 2
-
-
-@pytest.mark.parametrize('name', NODES)
-def test_all_parameters_of_a_node_can_be_requested_at_once(ros, tmp_path, name):
-    """As `ros2 param dump` does; the response would be empty if one of them had no value."""
-    parameters = {'output': str(tmp_path / 'bag')} if name == 'bag_recorder' else {}
-    node = ros.add(NODES[name], parameters)
-    listed = ros.call(ListParameters, f'/{name}/list_parameters', ListParameters.Request())
-    names = listed.result.names
-    assert len(names) >= 3
-    request = GetParameters.Request(names=names)
-    values = ros.call(GetParameters, f'/{name}/get_parameters', request).values
-    assert len(values) == len(names)
-    assert all(value.type for value in values)
-    if name == 'bag_recorder':
-        node.close()
 
 
 def test_value_with_a_comma_or_brace_is_not_split():

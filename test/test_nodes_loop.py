@@ -14,7 +14,7 @@ from random_arm import random_urdf
 from rcl_interfaces.srv import SetParametersAtomically
 from rclpy.parameter import Parameter
 from rclpy.time import Time
-from ros_rig import FakeClock, simulated_torques, states, torques
+from ros_rig import FakeClock, simulated, states, torques
 from test_plant_events import ALL_KINDS
 
 from blf_dsc_controller.configuration.controller import ControllerConfig
@@ -25,6 +25,7 @@ from blf_dsc_controller.nodes.controller_node import ControllerNode
 from blf_dsc_controller.nodes.plant_node import LOCKSTEP_START, PlantNode
 from blf_dsc_controller.reference import terms as reference
 from blf_dsc_controller.reference.approach import reference_of
+from blf_dsc_controller.supervision.supervisor import Reason
 
 MILLISECOND = 1_000_000  # ns
 PUSHED = {'load.payload': 0.2, 'load.torque': [0.4, -0.3], 'sensor.offset': [1e-5, 0.0]}
@@ -33,6 +34,17 @@ ARM = {'robot.urdf': random_urdf(3, seed=5)[0], 'robot.tip': 'tip'}
 HELD = ARM | {'robot.drive_compensates': 'gravity'}
 JOINTS = build(PlantConfig, HELD).joints
 NOISY = {'sensor.position_noise': 1e-5, 'sensor.velocity': 'differenced', 'actuator.delay': 1}
+JITTER = {
+    'duration': 2.5,
+    'sensor.position_noise': 1e-6,
+    'sensor.velocity': 'differenced',
+    'seed': 3,
+}
+WEAK = {  # gravity alone takes 9.7 N m
+    'torque.limit': [9.0, 3.2],
+    'safety.torque': 'hold_gravity',
+    'safety.stop_ramp': 0.05,
+}
 
 
 def run_lockstep(ros, plant, controller=None):
@@ -66,15 +78,28 @@ CASES = {
         HELD | {'learning.window': 1.0},
     ),
     'approach': ({'duration': 4.0, 'initial.position': [0.9, 2.9]}, {}),  # over 1.4 and 1.2 rad
+    'error past the bound': (JITTER, WEAK),
+    'torque saturated': (
+        JITTER,
+        WEAK | {'safety.error_ratio': 0.0, 'safety.saturation_time': 0.01},
+    ),
+    'velocity not plausible': (JITTER, {'safety.velocity_limit': 0.25}),
+    'saturated for some samples': (JITTER, {'torque.limit': [10.5, 20.0]}),
+    'estimated velocity': (JITTER, {'safety.velocity': 'estimated'}),
 }
 
 
-@pytest.mark.parametrize(('plant', 'law'), CASES.values(), ids=CASES)
-def test_lockstep_torques_match_the_offline_run_bit_for_bit(ros, plant, law):
+@pytest.mark.parametrize('name', CASES)
+def test_lockstep_torques_and_stops_match_the_offline_run_bit_for_bit(ros, name):
+    plant, law = CASES[name]
     over_ros, stamps = run_lockstep(ros, plant, law)
-    np.testing.assert_array_equal(over_ros, simulated_torques(plant, law))
+    offline, supervisor = simulated(plant, law), ros.nodes[-1].guard.supervisor
+    np.testing.assert_array_equal(over_ros, offline.torque)
+    stops = [(stop.reason, stop.text) for stop in offline.stops]
+    assert stops == [(supervisor.reason, supervisor.text)] * supervisor.stops
+    assert [reason for reason, _ in stops] == [name] * (name in set(Reason))
     eventless = {name: value for name, value in plant.items() if not name.startswith('events.')}
-    same = eventless == plant or (over_ros == simulated_torques(eventless, law)).all()
+    same = eventless == plant or (over_ros == simulated(eventless, law).torque).all()
     assert same == (eventless == plant)
     np.testing.assert_array_equal(stamps, LOCKSTEP_START + MILLISECOND * np.arange(len(stamps)))
 
@@ -86,7 +111,7 @@ def test_nodes_on_simulated_time_follow_the_clock_of_the_plant(ros):
     ros.until(lambda: len(clock) == 501)
     now = Time(nanoseconds=LOCKSTEP_START + 500 * MILLISECOND)
     ros.until(lambda: ros.nodes[-1].get_clock().now().nanoseconds == now.nanoseconds)
-    np.testing.assert_array_equal(over_ros, simulated_torques({'duration': 0.5}))
+    np.testing.assert_array_equal(over_ros, simulated({'duration': 0.5}).torque)
 
 
 def test_plant_counts_real_time_in_whole_samples(ros):
@@ -156,5 +181,5 @@ def test_parameter_change_takes_effect_at_the_published_sample(ros):
     at = (change['stamp'] - LOCKSTEP_START) * 1e-9
     assert 0.05 < at < 1.0
     load = {f'events.{name.partition(".")[2]}': np.ravel(v).tolist() for name, v in PUSHED.items()}
-    expected = simulated_torques({'duration': 1.0, 'events.begin': [at], **load})
+    expected = simulated({'duration': 1.0, 'events.begin': [at], **load}).torque
     np.testing.assert_array_equal(torques(commands), expected)

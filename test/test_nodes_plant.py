@@ -91,17 +91,6 @@ def test_late_subscribers_receive_description_and_truth(ros, given):
     np.testing.assert_array_equal(truth[-1].position, plant_of(config).truth())
 
 
-def test_brake_holds_until_the_first_torque(ros):
-    node, received, send = start_plant(ros)
-    _, measured = states(received)
-    np.testing.assert_array_equal(measured[0][0], PlantConfig().initial.position)
-    for _ in range(10):
-        ros.executor.spin_once(timeout_sec=0.01)
-    assert node.plant.sample == 0
-    send(TORQUE)
-    ros.until(lambda: node.plant.sample == 1)
-
-
 def test_plant_finishes_when_the_last_state_has_received_its_torque(ros):
     node, received, send = start_plant(ros, duration=0.003)
     for steps in range(1, 5):
