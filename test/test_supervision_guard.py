@@ -149,6 +149,7 @@ def test_stopped_arm_rests_although_its_model_may_be_wrong(factor, angle):
     rig.step(500)
     assert (np.abs(rig.state().dq) > 0.1).all()
     rig.deliver(b'')
+    np.testing.assert_array_equal(rig.guard._safe_torque.load, rig.guard.samples.disturbance)
     start = rig.state().q
     rig.step(3000)
     assert rig.supervisor.phase is Phase.SAFE_STOP
@@ -238,6 +239,24 @@ def test_estimates_before_a_fault_are_kept_but_not_the_window():
     controller.reset()  # nothing else of the state survives
     controller.state.estimate[:], controller.state.disturbance[:] = learned, disturbance
     np.testing.assert_array_equal(kept, controller.state_vector)
+
+
+def test_limit_changed_at_run_time_stops_the_arm_and_its_reference_begins_anew():
+    """A deactivated law resumes along its reference, a stopped one does not."""
+    rig = Rig()
+    rig.step(200)
+    rig.guard.deactivate()
+    rig.guard.activate()
+    rig.step(50)
+    assert rig.guard.time > 0.2
+    rig.guard.retune(change(rig.guard.config, {'safety.error_ratio': 1e-3}))
+    rig.step(20)
+    assert rig.supervisor.reason is Reason.OUTSIDE_BOUND
+    rig.guard.retune(rig.config)
+    rig.guard.activate()
+    rig.step(5)
+    assert rig.supervisor.running
+    assert rig.guard.time < 0.01
 
 
 def test_reactivation_restarts_the_surface_filter_at_the_current_state():

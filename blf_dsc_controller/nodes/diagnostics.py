@@ -201,7 +201,7 @@ def chatter_of(guard: Guard) -> str:
     if steps[worst] <= _CHATTER * guard.controller.settings.torque_limit[worst]:
         return ''
     return (
-        f'the torque of {guard.config.joints[worst]} changes by {steps[worst]:.2g} N m rms each sample: its '
-        'measured velocity is coarse or noisy. Lower the pole of the velocity filter and add '
-        'its lag to robot.lag, whose gains are softer'
+        f'the torque of {guard.config.joints[worst]} changes by {steps[worst]:.2g} N m rms each '
+        'sample: its measured velocity is coarse or noisy. Lower the pole of the velocity filter '
+        'and add its lag to robot.lag, whose gains are softer'
     )

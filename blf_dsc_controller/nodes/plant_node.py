@@ -17,11 +17,11 @@ end of its duration.
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from functools import partial
+from math import inf
 from typing import Any
 
-from rclpy.lifecycle import LifecycleNode
 from rclpy.timer import Timer
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
@@ -55,6 +55,8 @@ _REPEAT_PERIOD = 3.0  # s, until a state without a torque is sent again
 _IN_FLIGHT = 1000  # samples in lock-step on their way to a subscriber: a fifth of its queue
 _EARLY = 0.05  # fraction of a sample by which a timer may fire early
 _BETWEEN_RUNS = 1_000_000_000  # ns from the last stamp before a reset to the first after it
+_SETTLING_TIME = 0.2  # s from the discovery of all peers until they have discovered this node
+_RESET_TIMEOUT = 2.0  # s for the controller to respond
 
 
 class PlantNode(LoopNode[PlantConfig]):
@@ -84,7 +86,7 @@ class PlantNode(LoopNode[PlantConfig]):
         self._changed: dict[str, Value] = {}
         self._changes = create_publisher(self, topics.CHANGES)
         self._tell_parameters()
-        self._handshake = Handshake(self, self._now)
+        self._controller = self.create_client(Trigger, f'{topics.CONTROLLER}/reset')
         self.plant: Plant
         self.deactivate()
         self.start()
@@ -112,7 +114,7 @@ class PlantNode(LoopNode[PlantConfig]):
 
     def activate(self) -> None:
         """Send the present state once a controller subscribes, and continue with its torque."""
-        self._handshake.begin(reset=False)
+        self._peers = self._wait_for_peers(reset=False)
         self.get_logger().info(f'{self.config.mode}, waiting for a controller')
 
     def deactivate(self) -> None:
@@ -140,7 +142,7 @@ class PlantNode(LoopNode[PlantConfig]):
         self._halt = ''
         self._apply_changes()
         self.input.restart()
-        self._handshake.begin(reset=True)
+        self._peers = self._wait_for_peers(reset=True)
         return 'the arm is at its start, braked until the first torque arrives'
 
     @property
@@ -155,11 +157,36 @@ class PlantNode(LoopNode[PlantConfig]):
             return
         waits = (self._lockstep or not self._running) and not self._has_torque
         if not self._offered:
-            if self._handshake.is_done(observed=self._is_observed()):
+            if not next(self._peers, False):
                 self._offer()
         elif waits and self._now() - self._published > _REPEAT_PERIOD:
             self.get_logger().info('no torque yet: sending the state again')
             self._publish_state()
+
+    def _wait_for_peers(self, *, reset: bool) -> Iterator[bool]:
+        """Yield True until the first state can be sent.
+
+        With `reset`, the wait also lets torques of the previous run expire, and the controller is
+        reset if it offers the service; any other controller must be reset by hand.
+        """
+        settled = inf
+        while self._now() < settled:
+            settled = min(settled, self._now() + _SETTLING_TIME) if self._is_observed() else inf
+            yield True
+        response = self._reset_controller() if reset else None
+        if response is None:
+            return
+        while not response.done() and self._now() < settled + _RESET_TIMEOUT:
+            yield True
+        if not response.done():
+            self.get_logger().warning('the controller did not respond to the reset')
+        elif not response.result().success:
+            self.get_logger().warning(f'no reset of the controller: {response.result().message}')
+
+    def _reset_controller(self) -> Any:
+        """Request a reset of the controller; return the future, or None without such a service."""
+        ready = self._controller.service_is_ready()
+        return self._controller.call_async(Trigger.Request()) if ready else None
 
     def _offer(self) -> None:
         if not self._lockstep:
@@ -256,7 +283,7 @@ class PlantNode(LoopNode[PlantConfig]):
         if 0 < self._steps <= self.plant.sample and not self.finished:
             self.finished = True
             if not self._lockstep:  # a controller would take the silence for a fault
-                self._handshake.reset_controller()
+                self._reset_controller()
         return self.finished
 
     def _is_stale(self) -> bool:
@@ -326,59 +353,6 @@ class PlantNode(LoopNode[PlantConfig]):
             level, message = WARN, self.input.problem
         self._reported_rejected = rejected
         self._diagnostics.publish(('torque', level, message, values))
-
-
-_SETTLING_TIME = 0.2  # s from the discovery of all peers until they have discovered this node
-_RESET_TIMEOUT = 2.0  # s for the controller to respond
-
-
-class Handshake:
-    """Handshake that ends when the first state can be sent.
-
-    After a reset of the plant, the wait also lets torques of the previous run expire, and the
-    controller is reset if it offers the service; any other controller must be reset by hand.
-    `clock` returns a steady time [s].
-    """
-
-    def __init__(self, node: LifecycleNode, clock: Callable[[], float]) -> None:
-        self._clock = clock
-        self._log = node.get_logger()
-        self._client = node.create_client(Trigger, f'{topics.CONTROLLER}/reset')
-        self.begin(reset=False)
-
-    def begin(self, *, reset: bool) -> None:
-        """Start waiting; with `reset`, reset the controller once all peers are present."""
-        self._complete_since: float | None = None
-        self._to_reset = reset
-        self._response: Any = None
-
-    def reset_controller(self) -> Any:
-        """Request a reset of the controller; return the future, or None without such a service."""
-        ready = self._client.service_is_ready()
-        return self._client.call_async(Trigger.Request()) if ready else None
-
-    def is_done(self, *, observed: bool) -> bool:
-        """Return whether to send the state; `observed`: whether all topics have subscribers."""
-        now = self._clock()
-        if not observed:
-            self._complete_since = None
-            return False
-        if self._complete_since is None:
-            self._complete_since = now
-        waited = now - self._complete_since
-        if waited < _SETTLING_TIME:
-            return False
-        if self._to_reset:
-            self._to_reset, self._response = False, self.reset_controller()
-        if self._response is None:
-            return True
-        if not self._response.done():
-            if waited < _SETTLING_TIME + _RESET_TIMEOUT:
-                return False
-            self._log.warning('the controller did not respond to the reset: starting anyway')
-        elif not self._response.result().success:
-            self._log.warning(f'the controller was not reset: {self._response.result().message}')
-        return True
 
 
 main = partial(process.run, PlantNode)
