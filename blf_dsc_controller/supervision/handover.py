@@ -158,23 +158,16 @@ def apply_bumpless(
 
     `t` [s] and `measurement` (3 n,) are those of the last sample.
     """
-    before_beta2, before = _trial(controller, t, config.sample_time, measurement)
+    state, signals, T = controller.state, controller.signals, config.sample_time
+    controller.trial(t, T, measurement)
+    beta2, demand = signals.beta2.copy(), signals.demand.copy()
     apply(controller, config)
-    state = controller.state
     if controller.settings.surface != LINEAR:
-        after_beta2, _ = _trial(controller, t, config.sample_time, measurement)
-        state.alpha2[:] += after_beta2 - before_beta2
-    step = _trial(controller, t, config.sample_time, measurement)[1] - before
+        controller.trial(t, T, measurement)
+        state.alpha2[:] += signals.beta2 - beta2
+    controller.trial(t, T, measurement)
     integrates = controller.settings.gamma > 0.0
-    state.disturbance[integrates] -= step[integrates]
-
-
-def _trial(
-    controller: Controller, t: float, dt: float, measurement: Vector
-) -> tuple[Vector, Vector]:
-    """Return beta2 and demanded torque of an update, leaving the state unchanged."""
-    controller.trial(t, dt, measurement)
-    return controller.signals.beta2.copy(), controller.signals.demand.copy()
+    state.disturbance[integrates] -= (signals.demand - demand)[integrates]
 
 
 def problems(controller: Controller, config: ControllerConfig, t: float) -> Iterator[str]:
