@@ -12,6 +12,7 @@ import recorded_run
 import synthetic_bag
 from synthetic_bag import BOUND_RAD, JOINTS, LATCH_S, LIMIT_NM, PARAMETERS, TRUE, Synthetic
 
+from blf_dsc_controller.analysis.metrics import measure
 from blf_dsc_controller.analysis.summary import format_table, summarize, write_summary
 from blf_dsc_controller.bags.reader import read_run
 from blf_dsc_controller.messages.topics import BOUND, JOINT_STATES, LATE_STEPS, TRUTH
@@ -45,6 +46,10 @@ def test_tracking(run):
     assert elbow['rms_torque_nm'] == pytest.approx(3.0 / np.sqrt(2))
     assert shoulder['bound_rad'] == BOUND_RAD
     assert shoulder['torque_limit_nm'] == LIMIT_NM
+    metrics = measure(run)
+    assert metrics.max_error_ratio == pytest.approx(0.4)
+    rate = 2 * np.pi / np.sqrt(2)  # 1/s, of a sinusoid of 1 Hz
+    assert metrics.torque_rate == pytest.approx((8.0 * rate, 3.0 * rate), rel=1e-4)
 
 
 def test_first_violation_is_the_earliest_of_all_joints(run):

@@ -15,6 +15,7 @@ from typing import NamedTuple
 
 import numpy as np
 from matplotlib.ticker import NullFormatter
+from numpy.typing import NDArray
 
 from blf_dsc_controller.analysis.figures import Picture, draw_panels
 from blf_dsc_controller.analysis.metrics import MOMENTS, estimates_of
@@ -88,8 +89,9 @@ def claims(results: Results) -> Iterator[Claim]:
     yield from _of_section_3(results)
     yield from _of_section_4(results)
     names = ('paper_quiet', 'paper')
-    explained = [_exponential_fit(results.runs[name]) for name in names]
-    shares, residues = (_percents(each) for each in (explained, results.parameter_errors(*names)))
+    runs = [results.runs[name] for name in names]
+    explained = [_exponential_fit(run.time, _parameter_error(run), _latched(run)) for run in runs]
+    shares, residues = _percents(explained), _percents(results.parameter_errors(*names))
     yield Claim(
         'V',
         'Tracking and parameter errors converge exponentially.',
@@ -192,7 +194,7 @@ def _fraction_met(run: Run, name: str) -> float:
     settings, V = _settings(name), _energy(run)
     assert run.bound is not None  # noqa: S101
     knee = settings.knee / settings.bound * run.bound
-    holds = (_learned(run, LATCHED) > 0.5) & np.all(np.abs(np.asarray(run.error)) <= knee, axis=1)
+    holds = _latched(run) & np.all(np.abs(np.asarray(run.error)) <= knee, axis=1)
     bound = exponential_bound(settings, run.time, V, holds)
     return float(np.mean(V[holds] <= bound[holds]))
 
@@ -259,15 +261,15 @@ def _swift_torque(results: Results) -> Claim:
     )
 
 
-def _exponential_fit(run: Run) -> float:
-    """Return the fraction of the variance of log |P~| that a straight line explains."""
-    estimates = estimates_of(run)
-    error = None if estimates is None else estimates.relative_error
-    assert error is not None  # noqa: S101
-    residue = error[run.time > run.time[-1] - 10.0].max()
-    begin = int(np.argmax(_learned(run, LATCHED) > 0.5))
+def _exponential_fit(time: Floats, error: Floats, latched: NDArray[np.bool_]) -> float:
+    """Return the fraction of the variance of log |P~| that a straight line explains.
+
+    From the latch on, to twice the largest error of the last ten seconds.
+    """
+    residue = error[time > time[-1] - 10.0].max()
+    begin = int(np.argmax(latched))
     end = begin + int(np.argmax(error[begin:] < 2.0 * residue))
-    t, y = run.time[begin:end], np.log(error[begin:end])
+    t, y = time[begin:end], np.log(error[begin:end])
     return float(np.corrcoef(t, y)[0, 1] ** 2) if t.size >= 3 else 0.0
 
 
@@ -277,6 +279,17 @@ def _exponential_fit(run: Run) -> float:
 def _learned(run: Run, name: str) -> Floats:
     assert run.monitor is not None  # noqa: S101
     return run.monitor.column(name)
+
+
+def _latched(run: Run) -> NDArray[np.bool_]:
+    return _learned(run, LATCHED) > 0.5
+
+
+def _parameter_error(run: Run) -> Floats:
+    estimates = estimates_of(run)
+    error = None if estimates is None else estimates.relative_error
+    assert error is not None  # noqa: S101
+    return error
 
 
 def _energy(run: Run) -> Floats:
