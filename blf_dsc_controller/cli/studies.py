@@ -102,8 +102,7 @@ def _compute(store: runs.Store, chunks: list[range], executor: Executor) -> None
 
 def _report(store: runs.Store) -> None:
     summary, written = report.write_report(store)
-    print(report.headline(summary))
-    print(f'the worst   {report.reproduce_command(store.folder, summary["worst"][0]["run"])}')
+    print(report.format_report(summary, store.folder))
     print(f'wrote       {store.folder}: {", ".join(path.name for path in written)}')
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the results of a study say: its page, pairs with and without learning, one run again."""
+"""What the results of a study say, pairs with learning and without it, and one run again."""
 
 from __future__ import annotations
 
@@ -16,7 +16,6 @@ from scipy.stats import binomtest
 from blf_dsc_controller.analysis.figures import Picture, head
 from blf_dsc_controller.analysis.figures import draw as draw_run
 from blf_dsc_controller.analysis.panels import ALARM, BLUE, COLOURS, INK, MUTED, ORANGE
-from blf_dsc_controller.analysis.report import Cell, write_page
 from blf_dsc_controller.analysis.summary import plain, write_summary
 from blf_dsc_controller.analysis.summary import summarize as summarize_run
 from blf_dsc_controller.bags.reader import read_run
@@ -67,6 +66,7 @@ def summarize(study: Study, results: Columns) -> Summary:
     runs, kept = len(outcomes), outcomes.count(KEPT)
     interval = binomtest(kept, runs).proportion_ci(0.95, method='wilson')
     ratios = _worst_of(study, results, 'max_error_ratio')
+    pairs = compare_pairs(study, results) if study.settings.pairs else None
     summary: Summary = plain(
         {
             'runs': runs,
@@ -75,7 +75,8 @@ def summarize(study: Study, results: Columns) -> Summary:
             'duration_s': study.plant.duration,
             'outcomes': {outcome: outcomes.count(outcome) for outcome in OUTCOMES},
             'kept': {'fraction': kept / runs, 'low': interval.low, 'high': interval.high},
-            'pairs': compare_pairs(study, results) if study.settings.pairs else None,
+            'pairs': pairs,
+            'table': None if pairs is None else _pair_figures(pairs),
             'worst': [
                 {
                     'run': int(results['run'][row]),
@@ -186,69 +187,39 @@ def _pair_figures(pairs: Summary) -> dict[str, str]:
 
 
 def write_report(store: Store) -> tuple[Summary, list[Path]]:
-    """Write report.html with its figures, and summary.json, of the finished runs.
+    """Write the pictures and summary.json of the finished runs.
 
     Returns the summary and the paths; raises BlfDscError if there are no results yet.
     """
     study, results, folder = store.study, store.results(), store.folder
     summary = summarize(study, results)
-    figures, pairs, exceptions = [folder / 'distributions.png'], {}, []
-    _draw_distributions(study, results, figures[0])
+    written = [folder / 'summary.json', folder / 'distributions.png']
+    write_summary(summary, written[0])
+    _draw_distributions(study, results, written[1])
     if study.settings.pairs:
-        figures.append(folder / 'pairs.png')
-        _draw_pairs({'': (study, results)}, figures[-1])
-        found = compare_pairs(study, results)
-        pairs, broken = _pair_figures(found), found['broken_only_with']
-        exceptions = [(run, 'breaks the bound only with learning') for run in broken]
-        what = f'largest error more than {ALLOWED:g} times that without learning'
-        exceptions += [(run, what) for run in found['above'] if run not in broken]
-
-    def again(run: int) -> Cell:
-        return Cell(reproduce_command(folder, run), 'code')
-
-    page, numbers = folder / 'report.html', folder / 'summary.json'
-    write_page(
-        page,
-        'study.html',
-        f'Monte Carlo study: {summary["runs"]} runs of {summary["duration_s"]:g} s',
-        headline=headline(summary),
-        summary=summary,
-        figures=figures,
-        outcomes=[(name, f'{n}', OUTCOMES[name]) for name, n in summary['outcomes'].items()],
-        pairs=[*pairs.items()],
-        worst=[
-            (
-                f'{run}',
-                outcome,
-                *('-' if value is None else f'{value:.4g}' for value in values),
-                again(run),
-            )
-            for run, outcome, *values in (each.values() for each in summary['worst'])
-        ],
-        exceptions=[(f'{run}', what, again(run)) for run, what in exceptions],
-        varied=[
-            (Cell(each.column.removeprefix('plant.'), 'code'), Cell(f'{each.distribution}', 'code'))
-            for each in study.variations
-        ],
-    )
-    write_summary(summary, numbers)
-    return summary, [page, *figures, numbers]
+        written.append(folder / 'pairs.png')
+        _draw_pairs({'': (study, results)}, written[2])
+    return summary, written
 
 
-def headline(summary: Summary) -> str:
-    """Return the result in one sentence; of pairs, in two."""
-    kept, pairs = summary['kept'], summary['pairs']
-    text = (
-        f'{_percent(kept["fraction"])} of the runs kept the bound '
-        f'({summary["outcomes"][KEPT]} of {summary["runs"]}; 95 % confidence: '
-        f'{_percent(kept["low"])} to {_percent(kept["high"])})'
-    )
-    if pairs is None:
-        return text
-    return (
-        f'{text}, {pairs["kept"]["without"]} without learning. {len(pairs["broken_only_with"])} '
-        f'broke it only with learning, {len(pairs["broken_only_without"])} only without'
-    )
+def format_report(summary: Summary, folder: Path) -> str:
+    """Format a summary for the terminal, with the command that repeats the worst run."""
+    outcomes = (f'{count} {outcome}' for outcome, count in summary['outcomes'].items() if count)
+    share, low, high = map(_percent, summary['kept'].values())
+    runs = {'the worst': [each['run'] for each in summary['worst']]}
+    lines = [
+        f'{share} of the runs kept the bound (95 % confidence: {low} to {high})',
+        f'outcomes    {", ".join(outcomes)}',
+    ]
+    if summary['pairs'] is not None:
+        lines += [f'{title}: {figure}' for title, figure in summary['table'].items()]
+        runs['bound broken only with learning'] = summary['pairs']['broken_only_with']
+        runs[f'error above {ALLOWED:g} times that without'] = summary['pairs']['above']
+    lines += [f'{what}: {", ".join(map(str, each))}' for what, each in runs.items() if each]
+    worst = runs['the worst'][0]
+    out = shlex.quote(f'{folder.name}-run-{worst}')
+    command = f'blf_dsc monte-carlo --reproduce {shlex.quote(str(folder))} {worst} --out {out}'
+    return '\n'.join([*lines, f'one again   {command}'])
 
 
 def _percent(fraction: float) -> str:
@@ -262,19 +233,13 @@ def write_comparison(stores: Sequence[Store], folder: Path) -> str:
     for name, (study, results) in found.items():
         if not study.settings.pairs:
             raise BlfDscError(f'{name} holds no pairs: its study needs pairs: true')
-        figures = _pair_figures(compare_pairs(study, results))
-        rows.append({'study': name, 'runs': f'{results["run"].size}'} | figures)
+        summary = summarize(study, results)
+        rows.append({'study': name, 'runs': f'{summary["runs"]}'} | summary['table'])
     _draw_pairs(found, folder / 'changes.png')
     lines = [rows[0], ['---'] * len(rows[0]), *(row.values() for row in rows)]
     text = ''.join(f'| {" | ".join(line)} |\n' for line in lines)
     (folder / 'changes.md').write_text(text, encoding='utf-8')
     return text
-
-
-def reproduce_command(folder: Path, run: int) -> str:
-    """Return the command that repeats a run and records it."""
-    out = shlex.quote(f'{folder.name}-run-{run}')
-    return f'blf_dsc monte-carlo --reproduce {shlex.quote(str(folder))} {run} --out {out}'
 
 
 def reproduce(store: Store, run: int, out: Path) -> Summary:

@@ -58,13 +58,8 @@ KEPT = 'kept'
 VIOLATED = 'violated'
 DIVERGED = 'diverged'
 REJECTED = 'rejected'
-OUTCOMES = {
-    KEPT: 'inside the bound to the end',
-    VIOLATED: 'outside at some sample',
-    DIVERGED: 'a number became infinite or NaN',
-    REJECTED: 'the controller refuses to start there',
-}
-"""Possible outcomes of a run."""
+OUTCOMES = (KEPT, VIOLATED, DIVERGED, REJECTED)
+"""What may become of a run; the controller may reject its start."""
 
 Row = dict[str, Drawn]
 Columns = dict[str, np.ndarray]
