@@ -61,25 +61,17 @@ def ranges(browser):
 
 
 @pytest.mark.parametrize('name', ['one', 'both'])
-def test_every_panel_is_drawn_without_errors(browser, pages, name):
+@pytest.mark.parametrize('width', [400, 1400])
+def test_every_panel_is_drawn_and_fits_the_window(browser, pages, name, width):
+    """Legends cover no title and no axis."""
+    metrics = {'width': width, 'height': 900, 'deviceScaleFactor': 1, 'mobile': False}
+    browser.call('Emulation.setDeviceMetricsOverride', **metrics)
     show(browser, pages / f'{name}.html')
     drawn = browser.value(f"Array.from({PLOTS}).filter(p => p.querySelector('.trace')).length")
     assert drawn == browser.value('data.panels.length')
     assert drawn >= 12  # two joints, each with error, position, torque; parameters; excitation
     lines = browser.value("document.querySelectorAll('.scatterlayer path.js-line').length")
     assert lines > drawn
-    assert browser.value('performance.getEntriesByType("resource").length') == 0
-    browser.screenshot(SHOTS / f'report_{name}.png')
-    browser.screenshot(SHOTS / f'report_{name}_whole.png', whole=True)
-    assert browser.errors == []
-
-
-@pytest.mark.parametrize('name', ['one', 'both'])
-@pytest.mark.parametrize('width', [400, 1400])
-def test_page_fits_the_window_and_legends_cover_no_title_or_axis(browser, pages, name, width):
-    metrics = {'width': width, 'height': 900, 'deviceScaleFactor': 1, 'mobile': False}
-    browser.call('Emulation.setDeviceMetricsOverride', **metrics)
-    show(browser, pages / f'{name}.html')
     assert browser.value('document.documentElement.scrollWidth') <= width
     covered = browser.value(
         f'Array.from({PLOTS}).filter((plot) => {{'
@@ -91,7 +83,9 @@ def test_page_fits_the_window_and_legends_cover_no_title_or_axis(browser, pages,
         '    && other.top < legend.bottom); }).map((plot) => plot.layout.title.text)'
     )
     assert covered == []
+    assert browser.value('performance.getEntriesByType("resource").length') == 0
     browser.screenshot(SHOTS / f'report_{name}_{width}.png', whole=True)
+    assert browser.errors == []
 
 
 def test_dragging_zooms_all_time_panels(browser, pages):

@@ -82,19 +82,16 @@ class Outputs:
         limit = self._guard.controller.settings.torque_limit
         self._add(stamp, self._telemetry.bound(stamp, bound, limit))
 
-    def add_command(self, stamp: int, torque: Floats, *, is_answer: bool, is_certain: bool) -> None:
+    def add_command(self, stamp: int, torque: Floats, *, is_answer: bool) -> None:
         """Add a commanded torque (n,) [N m] after a state with this stamp [ns].
 
-        `is_answer`: it answers a message. One that is not certain is not compared.
+        `is_answer`: it answers a message.
         """
         guard = self._guard
         self.safe_torques += not guard.has_sample
         if is_answer and not guard.has_sample:
-            self._sent[TRACKING_ERROR] += not is_certain
-            if is_certain:
-                self._add(stamp, self._telemetry.answer(stamp, torque))
-        if is_certain:
-            self._add(stamp, self._telemetry.command(torque), guard.journal.commands)
+            self._add(stamp, self._telemetry.answer(stamp, torque))
+        self._add(stamp, self._telemetry.command(torque), guard.journal.commands)
 
 
 class Rerun:
@@ -135,7 +132,6 @@ class Rerun:
         self._answer = 0  # number of answers reached
         self._position = -1  # of the last message processed or passed over
         self._last = -1  # stamp of the last answer
-        self._failed = False
         self.outputs = Outputs(self._guard)
 
     def run(self, events: Sequence[Event]) -> None:
@@ -251,15 +247,16 @@ class Rerun:
 
     def _command(self, stamp: int, torque: Floats | None, *, is_answer: bool = False) -> None:
         if torque is not None:
-            self.outputs.add_command(
-                stamp, torque, is_answer=is_answer, is_certain=not self._failed
-            )
+            self.outputs.add_command(stamp, torque, is_answer=is_answer)
 
     # Events.
 
     def _repeat(self, event: Event) -> None:
         """Repeat an event, or check that the controller has produced it itself."""
         pending = self._guard.journal.pending
+        if _reason(event) is Reason.FAILED:  # nothing shows how far the law got
+            self.end = f'the law failed, {event.content["text"]}'
+            return
         if pending and not _is_own(event):
             self._report_departure(pending[0], event)
             return
@@ -281,12 +278,7 @@ class Rerun:
         guard, content = self._guard, event.content
         if _reason(event) is Reason.STATE_TIMEOUT:
             self._command(event.stamp, guard.time_out(content['text']))
-        elif _reason(event) is Reason.FAILED:
-            guard.journal.stamp = event.stamp
-            self._failed = True  # nothing shows how far the law got
-            self._command(event.stamp, guard.fail(content['text']))
         elif event.type in (EventType.ACTIVATE, EventType.RESET, EventType.DEACTIVATE):
-            self._failed &= event.type is EventType.DEACTIVATE
             getattr(guard, event.type.value)()
         elif event.type is EventType.RELEASE:
             torque = guard.release()
