@@ -19,7 +19,7 @@ from blf_dsc_controller.law.window import add_products
 from blf_dsc_controller.simulation.bag import write_bag
 from blf_dsc_controller.simulation.loop import simulate
 from blf_dsc_controller.view.bag import snapshots
-from blf_dsc_controller.view.page import joint_table
+from blf_dsc_controller.view.page import caption
 
 PICKED_UP, PUT_DOWN, END = 8.0, 12.0, 15.0  # s
 LOAD = 2.0  # kg
@@ -149,7 +149,7 @@ def test_bag_tells_what_was_held_in_the_table_and_on_the_page(panda, tmp_path):
     np.testing.assert_allclose(held[:, 1], (0.0, LOAD, 0.0), atol=0.05)
     lines = [line for line in format_table(summary).splitlines() if line.startswith('held ')]
     assert [' mm, until ' in line for line in lines] == [False, True, False]
-    shown = {round(moment.time): joint_table(run.joints, moment) for moment in snapshots(run, ())}
+    shown = {round(moment.time): caption(moment) for moment in snapshots(run, ())}
     assert 'held' not in shown[3]
     assert 'held: 2.0' in shown[11]
 

@@ -59,7 +59,7 @@ def test_bag_plays_and_stops_at_its_end(player):
     click(player.button)
     player.update(0.5)
     assert player.slider.value == 1.0
-    shown = player._page._table.content
+    shown = player._page._caption.content
     now = max(each.time for each in player.snapshots if each.time <= 1.0)
     assert f't = {now:.2f} s' in shown
     player.speed.value = '10'

@@ -58,7 +58,6 @@ def test_page_shows_the_loop(rig, loop):
     now = view.past[-1]
     assert np.abs(now.error).max() < 0.002
     assert now.bound == pytest.approx([0.002, 0.002])
-    assert now.torque_limit == pytest.approx([20.0, 20.0])
     assert now.truth[:3] == pytest.approx([1.0, 0.32, 0.4])
     assert np.isfinite(now.estimate[:3]).all()
     assert view.page._state == ('OK', 'tracking')

@@ -98,7 +98,7 @@ def snapshots(run: Run, estimates: tuple[str, ...]) -> list[Snapshot]:
     figures = _held(run.monitor, stamps, (*estimates, LAMBDA_MIN))
     truth = _held(run.truth, stamps, estimates)
     loaded = (np.abs(truth - truth[0]) > 0.0).any(axis=1)
-    arrays = (run.position, run.error, run.bound, run.torque, run.torque_limit)
+    arrays = (run.position, run.error, run.bound, run.torque)
     columns = (run.time[rows].tolist(), *map(at, arrays), figures[:, :-1], truth)
     load = _held(run.monitor, stamps, LOAD)
     each = zip(*columns, figures[:, -1].tolist(), load, loaded.tolist(), strict=True)

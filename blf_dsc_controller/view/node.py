@@ -206,7 +206,7 @@ class ViewNode(PlainNode):
         return True
 
     def _keep(self, time: float) -> None:
-        state, (xi1, _, tau), (k_c, _, limit), (monitor, *_), (truth, *_) = self._values.values()
+        state, (xi1, _, tau), (k_c, *_), (monitor, *_), (truth, *_) = self._values.values()
         m = len(truth)
         *load, lambda_min, latched = monitor[m:].tolist()
         if latched != self._latched and np.isfinite(self._latched):
@@ -218,7 +218,7 @@ class ViewNode(PlainNode):
         loaded = bool((np.abs(truth - self._first_truth) > 0.0).any())
         tau = state[2] if np.isnan(tau).any() else tau
         learned = monitor[:m], truth, lambda_min, load, loaded
-        self.past.append(Snapshot(time, state[0], xi1, k_c, tau, limit, *learned))
+        self.past.append(Snapshot(time, state[0], xi1, k_c, tau, *learned))
         while self.past[0].time < time - PAST - 1.0:
             self.past.popleft()
         self._events += [e for e in plant_events(self._plant) if self._noted < e[0] <= time]

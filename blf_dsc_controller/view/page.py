@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The page: 3D view of the arm, plots, tables and events, drawn from snapshots of any source.
+"""The page: 3D view of the arm, plots and events, drawn from snapshots of any source.
 
 viser serves the page with everything that the browser needs: nothing is loaded from elsewhere.
 """
@@ -13,7 +13,7 @@ import io
 import os
 import socket
 import time
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from html import escape
 from math import inf
 from typing import Any, NamedTuple
@@ -70,7 +70,6 @@ class Snapshot(NamedTuple):
     error: Floats  # (n,) rad, xi1
     bound: Floats  # (n,) rad, k_c
     torque: Floats  # (n,) N m
-    torque_limit: Floats  # (n,) N m
     estimate: Floats  # (m,) theta^; NaN: a rejected column
     truth: Floats  # (m,)
     lambda_min: float
@@ -195,7 +194,7 @@ class Page:
                 self._plot('error of the estimates [% of prior]', tuple(self._bodies), _FROM_ZERO),
                 self._plot('excitation: log10 of lambda_min', ('lambda_min',)),
             ]
-            self._table = gui.add_html('')
+            self._caption = gui.add_html('')
         with tabs.add_tab('Events'):
             self._list = gui.add_html(event_table(self._events))
 
@@ -271,7 +270,7 @@ class Page:
                 )
 
     def plot(self, past: Sequence[Snapshot]) -> None:
-        """Draw these snapshots in the plots, and the last one in the table."""
+        """Draw these snapshots in the plots, with a caption of the last one."""
         now = past[-1]
         shown = (each for each in past if each.time > now.time - PAST)
         of = Snapshot._make(map(np.array, zip(*shown, strict=True)))  # arrays over time
@@ -288,7 +287,7 @@ class Page:
         with self.server.atomic():
             for plot, values in zip(self._plots, curves, strict=True):
                 plot.data = with_marks(t, values, marks)
-            self._table.content = joint_table(self._joints, now)
+            self._caption.content = caption(now)
 
     def _aim(self, camera: Any, width: float = inf) -> None:
         """Point a camera at the arm, which then fills a picture of this width [px]."""
@@ -358,30 +357,17 @@ def _hangs(arm: ShownArm) -> bool:
     return not any(joint.placement[2, 3] for joint in arm.chain.joints)
 
 
-def joint_table(joints: Sequence[str], now: Snapshot) -> str:
-    """Return the table of error, bound, torque and limit by joint."""
-    head = (f't = {now.time:.2f} s', 'error [mrad]', 'bound', 'torque [N m]', 'limit')
-    columns = 1e3 * now.error, 1e3 * now.bound, now.torque, now.torque_limit
-    rows = zip(joints, *columns, strict=True)
-    table = _table(((escape(name), *map(_figure, row)) for name, *row in rows), head)
-    known = np.isfinite(now.load[0])
-    return table + (f'<div style="{_CELL}">held: {load_text(now.load)}</div>' if known else '')
+def caption(now: Snapshot) -> str:
+    """Return the time, and what the tip holds, as a line of the page."""
+    held = f', held: {load_text(now.load)}' if np.isfinite(now.load[0]) else ''
+    return f'<div style="{_CELL};{_TEXT}">t = {now.time:.2f} s{held}</div>'
 
 
 def event_table(events: Sequence[tuple[float, str, str]]) -> str:
     """Return the table of events, the last one first."""
-    return _table(
-        (f'{t:.2f} s', f'<b>{escape(kind)}</b>', f'<div style="{_TEXT}">{escape(text)}</div>')
+    rows = ''.join(
+        f'<tr><td style="{_CELL}">{t:.2f} s</td><td style="{_CELL}"><b>{escape(kind)}</b></td>'
+        f'<td style="{_CELL};{_TEXT}">{escape(text)}</td></tr>'
         for t, kind, text in reversed(events)
     )
-
-
-def _figure(value: float) -> str:
-    return f'{value:.4g}' if np.isfinite(value) else '-'
-
-
-def _table(rows: Iterable[Sequence[str]], head: Sequence[str] = ()) -> str:
-    lines = [''.join(f'<th style="{_CELL}">{cell}</th>' for cell in head)]
-    lines += [''.join(f'<td style="{_CELL}">{cell}</td>' for cell in row) for row in rows]
-    body = ''.join(f'<tr>{line}</tr>' for line in lines)
-    return f'<table style="font-size:11px;margin:4px">{body}</table>'
+    return f'<table style="font-size:11px;margin:4px">{rows}</table>'
