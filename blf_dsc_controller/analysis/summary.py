@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from textwrap import shorten
 from typing import Any
@@ -164,12 +164,15 @@ def format_table(summary: Summary) -> str:
             for entry, (_, _, unit, factor, decimals) in _JOINT.items()
         )
         rows.append([name, *cells])
-    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-    lines = []
-    for name, *values in rows:
-        padded = (cell.rjust(width) for cell, width in zip(values, widths[1:], strict=True))
-        lines.append('  '.join([name.ljust(widths[0]), *padded]))
-    return '\n'.join([*lines, '', *_sentences(summary)])
+    return '\n'.join([aligned(rows), '', *_sentences(summary)])
+
+
+def aligned(rows: Sequence[Sequence[str]]) -> str:
+    """Return a table for the terminal: the first column flush left, the others flush right."""
+    first, *widths = (max(map(len, column)) for column in zip(*rows, strict=True))
+    return '\n'.join(
+        '  '.join([name.ljust(first), *map(str.rjust, values, widths)]) for name, *values in rows
+    )
 
 
 def _sentences(summary: Summary) -> Iterator[str]:

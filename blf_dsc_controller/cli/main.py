@@ -334,7 +334,7 @@ def _add_studies(command: _Command) -> None:
     option = command(
         'arms',
         'Compare laws on arms whose URDF is wrong. Each law is tuned on one arm with wrong masses '
-        'and run on others, for a page of the errors; offline, on all cores, about ten minutes on '
+        'and run on others, for a table of the errors; offline, on all cores, about ten minutes on '
         'two.',
         '--config panda --out arms',
     )
@@ -343,7 +343,7 @@ def _add_studies(command: _Command) -> None:
     option('--laws', nargs='+', default=[], metavar='LAW', help=laws)
     option('--truths', type=int, default=5, help='runs of each law after tuning (5)')
     option('--generations', type=int, default=7, help='generations of tuning after the first (7)')
-    option('--out', type=Path, default=Path('arms'), help='new folder for the page')
+    option('--out', type=Path, default=Path('arms'), help='new folder for the figures')
     option = command(
         'monte-carlo',
         'Run a study of many random plants. Thousands of closed loops run in parallel, and the '

@@ -19,7 +19,6 @@ from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.studies import arms as arm_study
 from blf_dsc_controller.studies import paper as paper_study
 from blf_dsc_controller.studies import report, runs
-from blf_dsc_controller.studies.laws import CONTENDERS
 from blf_dsc_controller.studies.monte_carlo import load_study
 
 _PAUSE_IN_A_LOG = 10.0  # s between two updates of the bar
@@ -33,7 +32,7 @@ def paper(options: Namespace) -> None:
 
 
 def arms(options: Namespace) -> None:
-    """Tune and run every law on URDF arms, write the page and print the worst of each figure."""
+    """Tune and run every law on URDF arms, write figures.json and print the table."""
     arm_study.chosen_laws(options.laws)  # before there is a folder
     folder = make_folder(options.out)
     with announced_compilation(print_notice):
@@ -41,14 +40,9 @@ def arms(options: Namespace) -> None:
             folder, options.config, options.laws, options.truths, options.generations
         )
     for arm, results in found.items():
-        columns = ', '.join(arm_study.COLUMNS)
-        print(f'{arm}: worst of {options.truths} runs: {columns}, in mrad and %')
-        for name, result in results.items():
-            worst = (
-                f'{x:8.3g}' if np.isfinite(x) else '       -' for x in result.columns().max(axis=1)
-            )
-            print(f'{CONTENDERS[name].label:<45}{" ".join(worst)}')
-    print(f'wrote {options.out / "index.html"}')
+        print(f'{arm}: {options.truths} runs of each law; errors in mrad, of the model in %')
+        print(arm_study.format_results(results))
+    print(f'wrote {options.out / "figures.json"}')
 
 
 def monte_carlo(options: Namespace) -> None:

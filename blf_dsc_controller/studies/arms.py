@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The study: tuning of each contender on one truth, runs on others, and a page of figures."""
+"""The study: tuning of each contender on one truth, runs on others, and a table of figures."""
 
 from __future__ import annotations
 
@@ -12,8 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from tqdm import tqdm
 
-from blf_dsc_controller.analysis.report import Cell, write_page
-from blf_dsc_controller.analysis.summary import plain, write_summary
+from blf_dsc_controller.analysis.summary import aligned, plain, write_summary
 from blf_dsc_controller.configuration.nodes import LoopConfig, load_loop
 from blf_dsc_controller.configuration.schema import change
 from blf_dsc_controller.errors import BlfDscError
@@ -35,7 +34,8 @@ POPULATION = 16
 ROUGHEST = 0.05
 """rms change of a torque per sample, relative to its limit, beyond which it is penalised."""
 
-COLUMNS = (*INTERVALS, 'torque error before the pick-up', 'at the end')
+COLUMNS = (*INTERVALS, 'model before', 'model after')
+"""Largest errors [mrad], and torque errors of the model [%] before the pick-up and at the end."""
 
 
 class Result(NamedTuple):
@@ -125,7 +125,7 @@ def chosen_laws(given: Sequence[str]) -> list[str]:
 def compare(
     folder: Path, arms: Sequence[str], laws: Sequence[str], truths: int, generations: int
 ) -> Results:
-    """Tune and run everything, and write the page into an empty folder.
+    """Tune and run everything, and write figures.json into an empty folder.
 
     `laws` are as in `chosen_laws`.
     """
@@ -147,45 +147,27 @@ def compare(
                 gains = values_of(name, point)
             runs = pool.map(partial(run, name, values=gains, unseen=unseen), others)
             results[arm][name] = Result(gains, cost, list(runs))
-    _write(folder, results, truths, generations)
-    return results
-
-
-def table_of(laws: dict[str, Result]) -> list[list[str | Cell]]:
-    """Return a header and a row for each contender: median / worst of its runs, best marked."""
-    titles = (f'{name} [{"mrad" if name in INTERVALS else "%"}]' for name in COLUMNS)
-    rows: list[list[str | Cell]] = [['law', *titles, 'bound kept', 'roughness [%]', 'gains']]
-    best = np.nanmin([result.columns().max(axis=1) for result in laws.values()], axis=0)
-    for name, result in laws.items():
-        cells: list[str | Cell] = []
-        for values, least in zip(result.columns(), best, strict=True):
-            text = f'{np.median(values):.2f} / {values.max():.2f}'
-            style = 'good' if values.max() == least else 'number'
-            cells.append('-' if np.isnan(values[0]) else Cell(text, style))
-        kept = sum(figures.ratio < 1.0 for figures in result.runs)
-        rough = 100.0 * max(figures.roughness for figures in result.runs)
-        gains = ', '.join(f'{gain} {value:g}' for gain, value in result.gains.items())
-        bound = f'{kept} of {len(result.runs)}'
-        rows.append([CONTENDERS[name].label, *cells, bound, f'{rough:.1f}', gains or 'rule'])
-    return rows
-
-
-def _write(folder: Path, results: Results, truths: int, generations: int) -> None:
     numbers = {
         arm: {
             name: {**result._asdict(), 'runs': [figures._asdict() for figures in result.runs]}
-            for name, result in laws.items()
+            for name, result in found.items()
         }
-        for arm, laws in results.items()
+        for arm, found in results.items()
     }
     write_summary(plain(numbers), folder / 'figures.json')
-    write_page(
-        folder / 'index.html',
-        'arms.html',
-        'Arms from a URDF, laws side by side',
-        tables={arm: table_of(laws) for arm, laws in results.items()},
-        truths=truths,
-        evaluations=POPULATION * (generations + 1),
-        roughest=100.0 * ROUGHEST,
-        folder=folder.name,
-    )
+    return results
+
+
+def format_results(results: dict[str, Result]) -> str:
+    """Return the worst of each figure on an arm, a line for each contender, and tuned gains."""
+    rows, gains = [['worst', *COLUMNS, 'roughness', 'bound kept']], []
+    for name, result in results.items():
+        label, worst = CONTENDERS[name].label, result.columns().max(axis=1)
+        rough = 100.0 * max(figures.roughness for figures in result.runs)
+        kept = sum(figures.ratio < 1.0 for figures in result.runs)
+        cells = ('-' if np.isnan(value) else f'{value:.2f}' for value in worst)
+        rows.append([label, *cells, f'{rough:.1f} %', f'{kept} of {len(result.runs)}'])
+        if result.gains:
+            each = ', '.join(f'{gain} {value:g}' for gain, value in result.gains.items())
+            gains.append(f'{label}: {each}')
+    return '\n'.join([aligned(rows), *gains])
