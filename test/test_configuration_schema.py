@@ -62,12 +62,18 @@ def test_limits_are_inclusive_and_arrays_as_long_as_others_say():
     assert build(ControllerConfig, {'learning.window': 0.01}).learning.window == 0.01
 
 
+def test_given_values_take_precedence_over_those_of_a_urdf():
+    arm = {'robot.urdf': 'ur5e.urdf', 'robot.tip': 'tool0'}
+    given = {'initial.position': (0.5,) * 6}
+    assert flatten(build(PlantConfig, arm | given)).items() >= given.items()
+
+
 @pytest.mark.parametrize(
     ('classes', 'given', 'message'),
     [
         # Names.
         (PLANT, {'sensr.offset': [1.0, 1.0]}, 'unknown parameter, did you mean sensor.offset?'),
-        (PLANT, {'drive.belt.ramp': 1}, 'unknown parameter, did you mean events.ramp?'),
+        (PLANT, {'gripper.left.l2': 1}, 'unknown parameter, did you mean arm.l2?'),
         (PLANT, {'zzz': 1}, 'unknown parameter'),
         # Types. ROS does not accept an integer for a double, nor does a run without ROS.
         (PLANT, {'duration': 1}, 'got 1, but a double is expected: write 1.0 instead of 1'),
@@ -94,7 +100,11 @@ def test_limits_are_inclusive_and_arrays_as_long_as_others_say():
         # Lengths.
         (BOTH, {'joints': []}, 'got an empty list, but at least one entry is needed'),
         (PLANT, {'load.torque': [1.0]}, 'got 1 entry, but 2 are needed (2 of joints)'),
-        (PLANT, {'load.force': [1.0]}, 'got 1 entry, but 3 are needed (3)'),
+        (
+            PLANT,
+            {'events.force': [1.0], 'events.begin': [1.0]},
+            'got 1 entry, but 3 are needed (1 of',
+        ),
         (CONTROLLER, {'reference.phase': [0.0, 1.0]}, 'got 2 entries, but 1 are needed (1 of refe'),
         # What parameters have to do with each other.
         (BOTH, {'joints': ['elbow', 'elbow']}, "the name 'elbow' is repeated"),
