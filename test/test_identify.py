@@ -254,7 +254,7 @@ def test_bags_that_cannot_be_identified_are_rejected_for_their_reason(states, tm
 def test_states_with_odd_stamps_are_rejected_and_take_no_memory(states, tmp_path):
     """Resampled at their interval, an hour would be 26 TB."""
     encoder = JointStateEncoder(PANDA)
-    for k, stamps in enumerate(((5, 6, 7), (*range(1, 6), 3_600_000_000_000))):
+    for k, stamps in enumerate(((5, 6, 7), (*range(1, 6_000_000, 1_000_000), 3_600_000_000_000))):
         with BagWriter(tmp_path / f'{k}', flush_interval=None) as bag:
             handle = bag.add_topic('/joint_states', JOINT_STATE, [])
             for stamp, state in zip(stamps, states, strict=False):
