@@ -127,7 +127,7 @@ def test_sections_apply_as_in_ros_and_the_last_one_wins(with_ros, file, name):
 
 
 WORDS = """
-1e-5 1E3 .5 5. +5 0x1F -0x10 017 08 0x1p3 1e400 1e-400 1e-310 0e5 1.2.3 1e 0x 1d3 12abc 0b11 0o17
+1e-5 1E3 .5 5. +5 0x1F -0x10 017 08 1e400 1e-400 1e-310 0e5 1.2.3 1e 0x 1d3 12abc 0b11 0o17
 9223372036854775807 9223372036854775808 yes No y N on OFF true TRUE tRue 1_000 1:30 2020-01-01 null
 .inf -.inf +.Inf inf -inf INF infinity nan .NaN -nan NAN 5. 1_000.5 e5 . -7 12 "1.0" 'yes' ~ '' ""
 """
@@ -247,7 +247,7 @@ def test_parameter_page_is_what_its_command_writes(tmp_path):
 def test_topic_page_lists_every_topic_with_its_type():
     page = (COMMITTED.parent / 'topics.md').read_text(encoding='utf-8')
     for topic in vars(topics).values():
-        if isinstance(topic, topics.Topic):
+        if isinstance(topic, topics.Topic) and topic is not topics.LEARNING:  # of earlier versions
             name = topic.resolved if topic.name.startswith('/') else topic.relative
             assert f'| `{name}` | {topic.type.replace("/msg/", "/")} |' in page
 

@@ -32,9 +32,6 @@ _TRUE = ('Y', 'y', 'yes', 'Yes', 'YES', 'true', 'True', 'TRUE', 'on', 'On', 'ON'
 _FALSE = ('N', 'n', 'no', 'No', 'NO', 'false', 'False', 'FALSE', 'off', 'Off', 'OFF')
 _INTEGER = re.compile(r'[+-]?(?:0[xX](?P<hex>[0-9a-fA-F]+)|(?P<octal>0[0-7]*)|[1-9][0-9]*)')
 _DECIMAL = re.compile(r'[+-]?(?P<digits>[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?')
-_HEXADECIMAL = re.compile(
-    r'[+-]?0[xX](?:[0-9a-fA-F]+\.?[0-9a-fA-F]*|\.[0-9a-fA-F]+)(?:[pP][+-]?[0-9]+)?'
-)
 _SPECIAL = re.compile(r'[+-]?(?i:inf|infinity|nan)|[+-]?\.(?:inf|Inf|INF)|\.(?:nan|NaN|NAN)')
 
 _MARK = 'ros__parameters'
@@ -83,7 +80,7 @@ def parse(text: str) -> tuple[Section, ...]:
     except yaml.MarkedYAMLError as error:
         mark = error.problem_mark or error.context_mark
         line = f'line {mark.line + 1}: ' if mark else ''
-        kind = '' if isinstance(error, UnreasonableYamlError) else 'not valid YAML: '
+        kind = '' if type(error) is yaml.MarkedYAMLError else 'not valid YAML: '  # of `_Limited`
         raise ConfigurationError([f'{line}{kind}{error.problem}']) from error
     except yaml.YAMLError as error:
         raise ConfigurationError([f'not valid YAML: {error}']) from error
@@ -108,7 +105,10 @@ def parse(text: str) -> tuple[Section, ...]:
 
 
 def parse_scalar(word: str) -> bool | int | float | str:
-    """Return the value that ROS reads from an unquoted word, as get_value() of its parser does."""
+    """Return the value that ROS reads from an unquoted word, as get_value() of its parser does.
+
+    Hexadecimal fractions, such as 0x1p3, are left as text.
+    """
     if word in _TRUE or word in _FALSE:
         return word in _TRUE
     if match := _INTEGER.fullmatch(word):
@@ -117,8 +117,6 @@ def parse_scalar(word: str) -> bool | int | float | str:
             return value
     if _SPECIAL.fullmatch(word):
         return float(word.replace('.', ''))
-    if _HEXADECIMAL.fullmatch(word):
-        return float.fromhex(word)
     if match := _DECIMAL.fullmatch(word):
         number = float(word)
         underflow = abs(number) < sys.float_info.min and match['digits'].strip('0.') != ''
@@ -187,10 +185,6 @@ def _repeated(node: yaml.Node, name: str, first: int) -> ConfigurationError:
     return _error(node, f'{name} is repeated, first given on line {first}')
 
 
-class UnreasonableYamlError(yaml.MarkedYAMLError):
-    """YAML that would take too much memory or time."""
-
-
 class _Limited(yaml.composer.Composer):
     """Limits on the size and nesting of YAML, and no aliases."""
 
@@ -209,7 +203,7 @@ class _Limited(yaml.composer.Composer):
         elif self._nodes > _MOST_NODES:
             problem = f'more than {_MOST_NODES} entries'
         if problem:
-            raise UnreasonableYamlError(problem=problem, problem_mark=event.start_mark)
+            raise yaml.MarkedYAMLError(problem=problem, problem_mark=event.start_mark)
         node = super().compose_node(parent, index)
         self._depth -= 1
         return node
@@ -238,15 +232,14 @@ def share_folder() -> Path:
 
     Raises BlfDscError, listing the places searched, if the folder is not found.
     """
-    searched = []
-    for folder in _ABOVE:
-        for found in (folder, folder / 'share' / _PACKAGE):
-            if (found / _PRESET).is_file():
-                return found
-            searched.append(f'\n  - {found / _PRESET}')
+    places = [place for above in _ABOVE for place in (above, above / 'share' / _PACKAGE)]
+    for place in places:
+        if (place / _PRESET).is_file():
+            return place
+    searched = ''.join(f'\n  - {place / _PRESET}' for place in places)
     raise BlfDscError(
         f'the data files of {_PACKAGE} were not found: install the package again. '
-        f'Searched:{"".join(searched)}'
+        f'Searched:{searched}'
     )
 
 
