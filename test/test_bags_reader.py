@@ -28,7 +28,6 @@ from blf_dsc_controller.messages.topics import (
     DIAGNOSTICS,
     JOINT_STATES,
     JOURNAL,
-    LEARNING,
     MONITOR,
     REFERENCE,
     TRACKING_ERROR,
@@ -132,21 +131,6 @@ def test_what_is_missing_is_computed_from_what_is_there(tmp_path):
     # The effort in a state is the torque that led to it.
     assert torque[:-1, 0].tolist() == list(range(1, SAMPLES))
     assert np.isnan(torque[-1]).all()
-
-
-def test_bag_of_an_earlier_version_has_its_learning_in_the_monitor(tmp_path):
-    slow = JointStateEncoder(('lambda_min', 'V barrier'), ('position',))
-    entries = [
-        (LEARNING, *rest) if topic is MONITOR else (topic, *rest) for topic, *rest in MESSAGES
-    ]
-    learning = synthetic_bag.write(tmp_path / 'learning', entries)
-    np.testing.assert_array_equal(read_run(learning).monitor.select(PARAMETERS), MADE.estimate)
-    tenth = MADE.stamp[::10].tolist()
-    entries += [(MONITOR, at, slow.encode(at, (0.5, 7.0))) for at in tenth]
-    both = read_run(synthetic_bag.write(tmp_path / 'both', entries)).monitor
-    assert both.stamp.tolist() == tenth
-    np.testing.assert_array_equal(both.select(PARAMETERS), MADE.estimate[::10])
-    np.testing.assert_array_equal(both.select(('lambda_min', 'V barrier')), [(0.5, 7.0)] * 20)
 
 
 @pytest.mark.parametrize('longest', [1, 2])

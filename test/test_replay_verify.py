@@ -28,7 +28,6 @@ from blf_dsc_controller.messages.topics import (
     COMMANDS,
     JOINT_STATES,
     JOURNAL,
-    LEARNING,
     MONITOR,
     REFERENCE,
     TRACKING_ERROR,
@@ -138,17 +137,6 @@ def test_flipped_bit_is_located_and_named_and_the_earliest_counts(
         assert (found.largest > 0.0) == (found.difference is not None)
     largest = max(found.largest for found in result.comparisons if found.topic == topic.resolved)
     assert any(f'{topic.resolved}: ' in x and f'at most {largest:.3g}' in x for x in lines)
-
-
-def test_learning_of_an_earlier_version_is_compared_with_the_monitor(entries, tmp_path):
-    for entry in of(entries, MONITOR):
-        entry[0] = LEARNING.resolved
-    result = verify(recorded_run.write(tmp_path / 'bag', entries))
-    assert (result.difference, compared(result)['learning']) == (None, 14 * SAMPLES)
-    entry = of(entries, LEARNING)[700]
-    entry[3] = entry[3][:-32] + bytes([entry[3][-32] ^ 1]) + entry[3][-31:]
-    difference = verify(recorded_run.write(tmp_path / 'flipped', entries)).difference
-    assert (difference.topic, difference.field) == (LEARNING.resolved, 'latched')
 
 
 FLIPPED = COMMANDS.resolved, MONITOR.resolved

@@ -21,11 +21,7 @@ from blf_dsc_controller.messages import topics
 from blf_dsc_controller.messages.codecs import typestore
 from blf_dsc_controller.messages.journal import Event, EventType, decode
 
-_OF_INTEREST = (
-    *(topic for topic in topics.TOPICS if topic is not topics.CLOCK),
-    topics.CHANGES,
-    topics.LEARNING,
-)
+_OF_INTEREST = (*(topic for topic in topics.TOPICS if topic is not topics.CLOCK), topics.CHANGES)
 _KEPT = frozenset(topic.leaf for topic in topics.TOPICS if topic.offered.depth > 1)
 
 

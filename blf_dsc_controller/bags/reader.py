@@ -125,7 +125,7 @@ def recorded_run(content: Content) -> Run:
         joints=joints,
         stamp=stamp,
         received=states.received,
-        monitor=_with_learning(series(topics.MONITOR), series(topics.LEARNING)),
+        monitor=series(topics.MONITOR),
         truth=series(topics.TRUTH),
         timing=series(topics.TIMING),
         message_counts=content.message_counts,
@@ -205,16 +205,6 @@ def _joints(content: Content) -> tuple[str, ...]:
     if not of_controller and content.names.joints:
         return tuple(content.names.joints)
     return (*of_controller, content.topics[topics.JOINT_STATES])[0].joint_names()
-
-
-def _with_learning(monitor: Series | None, learning: Series | None) -> Series | None:
-    """Return the monitor of a bag, with what earlier versions said on ~/learning instead."""
-    if monitor is None or learning is None:
-        return monitor or learning
-    more = np.flatnonzero([name not in monitor.names for name in learning.names])
-    names = (*monitor.names, *(learning.names[k] for k in more))
-    values = np.hstack((monitor.values[:], learning.held(monitor.stamp, more)))
-    return Series(names, monitor.stamp, values)
 
 
 def _arm(content: Content) -> LearnedArm | None:

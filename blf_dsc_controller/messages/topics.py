@@ -106,8 +106,6 @@ JOINT_TRAJECTORY = Topic(
 """Published by other nodes for the controller."""
 JOURNAL = Topic(CONTROLLER, '~/journal', 'std_msgs/msg/String', HISTORY, HISTORY)
 """Every event of the controller, also for late recorders: see messages.journal."""
-LEARNING = Topic(CONTROLLER, '~/learning', JOINT_STATE, STREAM, STREAM)
-"""In bags of earlier versions: values that are now on ~/monitor."""
 
 TOPICS = (
     JOINT_STATES,

@@ -27,7 +27,6 @@ _COMPARED = {  # topic: fields
     topics.TRACKING_ERROR: (0, 1, 2),
     topics.REFERENCE: (0, 1),
     topics.MONITOR: (0,),
-    topics.LEARNING: (0,),
     topics.BOUND: (0, 2),
 }
 _TEXTS = (topics.STATE, topics.DIAGNOSTICS)
@@ -206,7 +205,7 @@ def _compared(
     """Yield the comparison of each topic in a bag; `answers` are those of tracking errors."""
     for topic, fields in _COMPARED.items():
         messages = content.topics.get(topic)
-        own = run.outputs.topics.get(topics.MONITOR if topic is topics.LEARNING else topic)
+        own = run.outputs.topics.get(topic)
         if messages is None:
             continue
         result = Comparison(messages.name, messages.size * len(joints) * len(fields))
@@ -229,7 +228,7 @@ def _compare(
 ) -> None:
     """Compare the messages of the same stamp or number; those that have other stamps differ."""
     fields = _COMPARED[topic]
-    if topic in (topics.LEARNING, topics.MONITOR):
+    if topic is topics.MONITOR:
         names = _shared_names(messages, own, result)
         recorded, replayed = (each.joint_states(names, ('position',)) for each in (messages, own))
     else:
@@ -237,7 +236,7 @@ def _compare(
         recorded, replayed = (_of_joints(each, joints) for each in (messages, own))
     if topic is topics.TRACKING_ERROR:
         recorded = answers
-    if topic in (topics.REFERENCE, topics.LEARNING, topics.MONITOR):
+    if topic in (topics.REFERENCE, topics.MONITOR):
         recorded, replayed = recorded.by_stamp(), replayed.by_stamp()
         keys, wanted = recorded.stamp, replayed.stamp
     else:
