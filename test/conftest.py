@@ -57,6 +57,36 @@ def ros():
 
 
 @pytest.fixture
+def bare_node():
+    """Return a function that makes a node of rclpy, with a parameter file or with overrides."""
+    pytest.importorskip('rclpy')
+    from rclpy.context import Context
+    from rclpy.node import Node
+    from rclpy.parameter import Parameter
+
+    context, nodes = Context(), []
+    context.init()
+
+    def make(name, path=None, overrides=None):
+        space, _, base = name.rpartition('/')
+        node = Node(
+            base,
+            namespace=space,
+            context=context,
+            cli_args=['--ros-args', '--params-file', str(path)] if path else None,
+            parameter_overrides=[Parameter(k, value=v) for k, v in (overrides or {}).items()],
+            enable_rosout=False,
+        )
+        nodes.append(node)
+        return node
+
+    yield make
+    for node in nodes:
+        node.destroy_node()
+    context.shutdown()
+
+
+@pytest.fixture
 def blank_pictures(monkeypatch):
     """Write empty pictures where no test looks at them: drawing takes a second for each run."""
     from blf_dsc_controller.analysis.figures import Picture

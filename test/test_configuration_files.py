@@ -61,35 +61,18 @@ def file(tmp_path):
     return write
 
 
-@pytest.fixture(scope='module')
-def with_ros():
+@pytest.fixture
+def with_ros(bare_node):
     """Return a function to the parameters that rcl reads for a node; None: it rejects the file."""
-    pytest.importorskip('rclpy')
-    from rclpy.context import Context
-    from rclpy.node import Node
-
-    context = Context()
-    context.init()
 
     def values(path, name):
-        space, _, base = name.rpartition('/')
         try:
-            node = Node(
-                base,
-                namespace=space,
-                context=context,
-                cli_args=['--ros-args', '--params-file', str(path)],
-                enable_rosout=False,
-                start_parameter_services=False,
-            )
+            found = bare_node(name, path)._parameter_overrides
         except RuntimeError:
             return None
-        found = {key: parameter.value for key, parameter in node._parameter_overrides.items()}
-        node.destroy_node()
-        return found
+        return {key: parameter.value for key, parameter in found.items()}
 
-    yield values
-    context.shutdown()
+    return values
 
 
 def without_ros(path, name):

@@ -8,8 +8,6 @@ import pytest
 pytest.importorskip('rclpy')
 
 from rcl_interfaces.msg import ParameterType
-from rclpy.context import Context
-from rclpy.node import Node
 from rclpy.parameter import Parameter
 
 from blf_dsc_controller.configuration.controller import ControllerConfig
@@ -20,45 +18,17 @@ from blf_dsc_controller.errors import ConfigurationError
 from blf_dsc_controller.nodes.parameters import declare, on_change, read
 
 
-@pytest.fixture
-def start(tmp_path):
-    """Return a function that starts a node from the text of a file, a path, or overrides."""
-    context = Context()
-    context.init()
-    nodes = []
-
-    def node(name='sim_plant', text='', overrides=None, path=None):
-        if text:
-            path = tmp_path / 'arm.yaml'
-            path.write_text(text)
-        values = [Parameter(key, value=value) for key, value in (overrides or {}).items()]
-        started = Node(
-            name,
-            context=context,
-            cli_args=['--ros-args', '--params-file', str(path)] if path else None,
-            parameter_overrides=values,
-            enable_rosout=False,
-        )
-        nodes.append(started)
-        return started
-
-    yield node
-    for started in nodes:
-        started.destroy_node()
-    context.shutdown()
-
-
 @pytest.mark.parametrize('name', NODES)
-def test_node_without_overrides_has_the_defaults(start, name):
-    node, cls = start(name), NODES[name]
+def test_node_without_overrides_has_the_defaults(bare_node, name):
+    node, cls = bare_node(name), NODES[name]
     assert declare(node, cls) == cls()
     assert read(node, cls) == cls()
     for parameter in parameters(cls):
         assert node.get_parameter(parameter.name).type_.name == parameter.ros_type
 
 
-def test_parameters_have_descriptors(start):
-    node = start('blf_dsc_controller')
+def test_parameters_have_descriptors(bare_node):
+    node = bare_node('blf_dsc_controller')
     declare(node, ControllerConfig)
     bound = node.describe_parameter('barrier.bound')
     assert bound.description == 'k_c: bound on the tracking error [rad]'
@@ -75,21 +45,24 @@ def test_parameters_have_descriptors(start):
     assert node.describe_parameter('surface.time_constant').floating_point_range[0].from_value == 0
 
 
-def test_empty_list_stays_empty_and_keeps_its_type_and_description(start):
-    text = 'bag_recorder:\n  ros__parameters: {topics: [], output: here}\n'
-    node = start('bag_recorder', text)
+def test_empty_list_stays_empty_and_keeps_its_type_and_description(bare_node, tmp_path):
+    path = tmp_path / 'arm.yaml'
+    path.write_text('bag_recorder:\n  ros__parameters: {topics: [], output: here}\n')
+    node = bare_node('bag_recorder', path)
     assert declare(node, RecorderConfig) == RecorderConfig(output='here')
     assert read(node, RecorderConfig).topics == ()
     descriptor = node.describe_parameter('topics')
     assert (descriptor.type, descriptor.read_only) == (ParameterType.PARAMETER_STRING_ARRAY, True)
     assert descriptor.description == 'topics to record; empty: all'
-    node = start('bag_recorder', overrides={'topics': ['/clock']})
+    node = bare_node('bag_recorder', overrides={'topics': ['/clock']})
     assert declare(node, RecorderConfig).topics == ('/clock',)
 
 
-def test_all_problems_are_reported_at_once_and_nothing_is_declared(start):
+def test_all_problems_are_reported_at_once_and_nothing_is_declared(bare_node, tmp_path):
     content = 'arm: {l1: 1}, seed: -1, mode: offline, sensr.resolution: 1.0, initial: {v: x}'
-    node = start(text=f'sim_plant:\n  ros__parameters: {{{content}}}\n')
+    path = tmp_path / 'arm.yaml'
+    path.write_text(f'sim_plant:\n  ros__parameters: {{{content}}}\n')
+    node = bare_node('sim_plant', path)
     with pytest.raises(ConfigurationError, match='/sim_plant') as caught:
         declare(node, PlantConfig)
     assert caught.value.problems == [
@@ -102,7 +75,7 @@ def test_all_problems_are_reported_at_once_and_nothing_is_declared(start):
     assert not node.has_parameter('seed')
 
 
-def test_parameters_of_other_nodes_and_of_ros_are_ignored(start):
+def test_parameters_of_other_nodes_and_of_ros_are_ignored(bare_node):
     overrides = {
         'barrier.bound': [1.0, 1.0],
         'use_sim_time': True,
@@ -110,7 +83,7 @@ def test_parameters_of_other_nodes_and_of_ros_are_ignored(start):
         'qos_overrides./clock.subscription.depth': 1,
         'seed': 5,
     }
-    node = start(overrides=overrides)
+    node = bare_node('sim_plant', overrides=overrides)
     assert declare(node, PlantConfig) == change(PlantConfig(), {'seed': 5})
     assert node.get_parameter('use_sim_time').value is True
 
@@ -137,8 +110,8 @@ class Tuned:
 
 
 @pytest.fixture
-def tuned(start):
-    return Tuned(start('blf_dsc_controller'))
+def tuned(bare_node):
+    return Tuned(bare_node('blf_dsc_controller'))
 
 
 def test_valid_changes_are_passed_on_once_each_as_a_whole_configuration(tuned):
