@@ -75,9 +75,11 @@ test: $(READY)-test ## Run the tests (TESTS=test/test_x.py for some, WORKERS=0 i
 	    -p _hypothesis_pytestplugin -n $(WORKERS) --dist loadfile --no-loadscope-reorder $(TESTS)
 
 test-browser: $(READY)-test ## Test the pages of report and view in a headless Chromium, if installed
+	@$(PIP_INSTALL) --quiet playwright || $(PIP_FAILED)
 	@BROWSER_TESTS=1 $(RUN) -m pytest -rs test/test_browser.py
 
 pictures: $(READY)-test ## Make the README's animation, doc/view.webp, with a headless Chromium
+	@$(PIP_INSTALL) --quiet playwright || $(PIP_FAILED)
 	@PYTHONPATH="$(CURDIR):$(CURDIR)/test" $(VENV)/bin/python test/view_pictures.py
 
 test-nightly: ## Run all tests, those left out by make test as well, at length and with random examples

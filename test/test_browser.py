@@ -9,12 +9,14 @@ from __future__ import annotations
 
 import os
 import tempfile
+from contextlib import contextmanager
 from pathlib import Path
 
 import chromium
 import pytest
 import recorded_run
 
+pytest.importorskip('playwright', reason='make test-browser installs it')
 pytest.importorskip('plotly', reason='needs plotly: pip install blf_dsc_controller[report]')
 pytest.importorskip('yourdfpy', reason='needs viser: pip install blf_dsc_controller[view]')
 
@@ -33,14 +35,6 @@ HARMLESS = ('THREE.Clock', 'GPU stall due to ReadPixels')  # warnings of librari
 PLOTS = "document.querySelectorAll('.js-plotly-plot')"
 
 
-@pytest.fixture
-def browser(tmp_path, request):
-    SHOTS.mkdir(exist_ok=True)
-    chrome = chromium.Browser(tmp_path / 'profile', *getattr(request, 'param', ()))
-    yield chrome
-    chrome.close()
-
-
 @pytest.fixture(scope='module')
 def pages(tmp_path_factory):
     folder = tmp_path_factory.mktemp('pages')
@@ -51,107 +45,83 @@ def pages(tmp_path_factory):
     return folder
 
 
-def show(browser, path):
-    browser.call('Page.navigate', url=path.as_uri())
-    browser.wait('window.reportReady')
+@contextmanager
+def shown(path, width=1400, height=900):
+    with chromium.opened(width, height) as (page, log):
+        page.goto(path.as_uri())
+        page.wait_for_function('window.reportReady')
+        yield page
+        assert log == []
 
 
-def ranges(browser):
-    return browser.value(f'Array.from({PLOTS}).map(p => p.layout.xaxis.range)')
+def ranges(page):
+    return page.evaluate(f'Array.from({PLOTS}).map(p => p.layout.xaxis.range)')
 
 
 @pytest.mark.parametrize('name', ['one', 'both'])
 @pytest.mark.parametrize('width', [400, 1400])
-def test_every_panel_is_drawn_and_fits_the_window(browser, pages, name, width):
+def test_every_panel_is_drawn_and_fits_the_window(pages, name, width):
     """Legends cover no title and no axis."""
-    metrics = {'width': width, 'height': 900, 'deviceScaleFactor': 1, 'mobile': False}
-    browser.call('Emulation.setDeviceMetricsOverride', **metrics)
-    show(browser, pages / f'{name}.html')
-    drawn = browser.value(f"Array.from({PLOTS}).filter(p => p.querySelector('.trace')).length")
-    assert drawn == browser.value('data.panels.length')
-    assert drawn >= 12  # two joints, each with error, position, torque; parameters; excitation
-    lines = browser.value("document.querySelectorAll('.scatterlayer path.js-line').length")
-    assert lines > drawn
-    assert browser.value('document.documentElement.scrollWidth') <= width
-    covered = browser.value(
-        f'Array.from({PLOTS}).filter((plot) => {{'
-        '  const box = (part) => plot.querySelector(part)?.getBoundingClientRect();'
-        "  const legend = box('.legend .bg');"
-        "  const others = ['.gtitle', '.xtitle', '.ytitle', '.plot'].map(box);"
-        '  return legend && others.some((other) => other && legend.left < other.right'
-        '    && other.left < legend.right && legend.top < other.bottom'
-        '    && other.top < legend.bottom); }).map((plot) => plot.layout.title.text)'
-    )
-    assert covered == []
-    assert browser.value('performance.getEntriesByType("resource").length') == 0
-    browser.screenshot(SHOTS / f'report_{name}_{width}.png', whole=True)
-    assert browser.errors == []
+    with shown(pages / f'{name}.html', width) as page:
+        drawn = f"Array.from({PLOTS}).filter(p => p.querySelector('.trace')).length"
+        panels = page.evaluate(drawn)
+        assert panels == page.evaluate('data.panels.length')
+        assert panels >= 12  # two joints, each with error, position, torque; parameters; excitation
+        assert page.locator('.scatterlayer path.js-line').count() > panels
+        assert page.evaluate('document.documentElement.scrollWidth') <= width
+        covered = page.evaluate(
+            f'Array.from({PLOTS}).filter((plot) => {{'
+            '  const box = (part) => plot.querySelector(part)?.getBoundingClientRect();'
+            "  const legend = box('.legend .bg');"
+            "  const others = ['.gtitle', '.xtitle', '.ytitle', '.plot'].map(box);"
+            '  return legend && others.some((other) => other && legend.left < other.right'
+            '    && other.left < legend.right && legend.top < other.bottom'
+            '    && other.top < legend.bottom); }).map((plot) => plot.layout.title.text)'
+        )
+        assert covered == []
+        assert page.evaluate('performance.getEntriesByType("resource").length') == 0
+        page.screenshot(path=SHOTS / f'report_{name}_{width}.png', full_page=True)
 
 
-def test_dragging_zooms_all_time_panels(browser, pages):
-    show(browser, pages / 'one.html')
-    before = ranges(browser)
-    assert all(limits == pytest.approx([0.0, 4.0]) for limits in before)
-    box = browser.value(
-        f"(() => {{ const r = {PLOTS}[0].querySelector('.nsewdrag').getBoundingClientRect();"
-        'return [r.left, r.top, r.width, r.height]; })()'
-    )
-    left, top, width, height = box
-    middle = top + height / 2
-    browser.drag((left + width * 0.25, middle), (left + width * 0.5, middle))
-    browser.wait(f'{PLOTS}[0].layout.xaxis.range[1] < 2.5')
-    browser.wait(f'Array.from({PLOTS})[3].layout.xaxis.range[1] < 2.5')
-    for low, high in ranges(browser):
-        assert low == pytest.approx(1.0, abs=0.05)
-        assert high == pytest.approx(2.0, abs=0.05)
-    browser.screenshot(SHOTS / 'report_zoomed.png')
-    assert browser.errors == []
+def test_dragging_zooms_all_time_panels(pages):
+    with shown(pages / 'one.html') as page:
+        assert all(limits == pytest.approx([0.0, 4.0]) for limits in ranges(page))
+        box = page.locator('.nsewdrag').first.bounding_box()
+        middle = box['y'] + box['height'] / 2
+        page.mouse.move(box['x'] + box['width'] * 0.25, middle)
+        page.mouse.down()
+        page.mouse.move(box['x'] + box['width'] * 0.5, middle, steps=5)
+        page.mouse.up()
+        page.wait_for_function(f'Array.from({PLOTS}).every(p => p.layout.xaxis.range[1] < 2.5)')
+        for low, high in ranges(page):
+            assert low == pytest.approx(1.0, abs=0.05)
+            assert high == pytest.approx(2.0, abs=0.05)
+        page.screenshot(path=SHOTS / 'report_zoomed.png')
 
 
-for_3d = pytest.mark.parametrize(
-    'browser', [(*chromium.WEBGL, '--window-size=1000,700')], indirect=True, ids=['3d']
-)
-
-
-def show_view(browser, page):
-    browser.call('Page.navigate', url=page.url)
-    browser.wait(f"{TEXT}.includes('largest error')")
-    browser.wait("document.querySelector('canvas') !== null")
-
-
-def errors(browser):
-    return [line for line in browser.errors if not any(w in f'{line}' for w in HARMLESS)]
-
-
-def assert_local(browser, page):
-    own = (page.url, 'data:', 'blob:')
-    assert [url for url in browser.requests if not url.startswith(own)] == []
-    assert browser.requests
-
-
-@for_3d
-def test_bag_is_played_in_the_browser(browser, tmp_path):
-    page = Page('127.0.0.1', 18280)
+def test_bag_is_played_in_the_browser(tmp_path):
+    served = Page('127.0.0.1', 18280)
     try:
-        player = BagPlayer(page, recorded_run.record(tmp_path / 'bag', 4.0))
-        show_view(browser, page)
-        player.slider.value = 3.0
-        player.update(0.0)
-        browser.wait(f"{TEXT}.includes('t = 2.9') || {TEXT}.includes('t = 3.0')")
-        browser.screenshot(SHOTS / 'view_bag.png')
-        browser.click('Play / Pause')
-        wait_until(browser, lambda: player._playing)
-        player.update(0.5)
-        browser.wait(f"{TEXT}.includes('t = 3.4') || {TEXT}.includes('t = 3.5')")
-        browser.click('Events')
-        browser.wait(f"{TEXT}.includes('learning')")
-        browser.screenshot(SHOTS / 'view_events.png')
-        assert errors(browser) == []
-        assert_local(browser, page)
+        player = BagPlayer(served, recorded_run.record(tmp_path / 'bag', 4.0))
+        with chromium.opened(1000, 700, chromium.WEBGL) as (page, log):
+            page.goto(served.url)
+            page.wait_for_function(f"{TEXT}.includes('largest error')")
+            page.wait_for_selector('canvas')
+            player.slider.value = 3.0
+            player.update(0.0)
+            page.wait_for_function(f"{TEXT}.includes('t = 2.9') || {TEXT}.includes('t = 3.0')")
+            page.screenshot(path=SHOTS / 'view_bag.png')
+            page.get_by_text('Play / Pause', exact=True).click()
+            while not player._playing:
+                page.wait_for_timeout(50.0)
+            player.update(0.5)
+            page.wait_for_function(f"{TEXT}.includes('t = 3.4') || {TEXT}.includes('t = 3.5')")
+            page.get_by_text('Events', exact=True).click()
+            page.wait_for_function(f"{TEXT}.includes('learning')")
+            page.screenshot(path=SHOTS / 'view_events.png')
+        assert [line for line in log if not any(word in f'{line}' for word in HARMLESS)] == []
+        own = (served.url, 'data:', 'blob:')
+        assert log.requests
+        assert [url for url in log.requests if not url.startswith(own)] == []
     finally:
-        page.close()
-
-
-def wait_until(browser, condition):
-    while not condition():
-        browser.value('1')
+        served.close()

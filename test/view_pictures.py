@@ -26,31 +26,28 @@ TIMES = np.arange(17.0, 26.0, 0.25)  # s; it picks up 2 kg at 20 s
 SETTLE = 1.5  # s, until the browser has drawn a frame without a GPU
 RATE = 8.0  # frames per second
 WINDOW = (1200, 880)
-NOTICE = "document.querySelectorAll('[class*=Notification]').forEach(one => one.remove())"
+NOTICE = "document.querySelectorAll('[class*=Notification]').forEach(each => each.remove())"
 
 
-def pictures(bag, folder):
+def pictures(bag):
     """Yield screenshots of the page at each of `TIMES`."""
-    page = Page('127.0.0.1', 18380)
-    size = f'--window-size={WINDOW[0]},{WINDOW[1]}'
-    browser = chromium.Browser(folder / 'profile', *chromium.WEBGL, size)
+    served = Page('127.0.0.1', 18380)
     try:
-        player = BagPlayer(page, bag)
+        player = BagPlayer(served, bag)
         player.slider.value = TIMES[0]
         player.update(0.0)
-        browser.call('Page.navigate', url=page.url)
-        browser.wait("(document.body?.innerText ?? '').includes('t = ')")
-        time.sleep(10 * SETTLE)  # the page fades in
-        browser.value(NOTICE)
-        for at in TIMES:
-            player.slider.value = float(at)
-            player.update(0.0)
-            time.sleep(SETTLE)
-            browser.screenshot(folder / 'shot.png')
-            yield Image.open(io.BytesIO((folder / 'shot.png').read_bytes())).convert('RGB')
+        with chromium.opened(*WINDOW, chromium.WEBGL) as (page, _):
+            page.goto(served.url)
+            page.wait_for_function("(document.body?.innerText ?? '').includes('t = ')")
+            time.sleep(10 * SETTLE)  # the page fades in
+            page.evaluate(NOTICE)
+            for at in TIMES:
+                player.slider.value = float(at)
+                player.update(0.0)
+                time.sleep(SETTLE)
+                yield Image.open(io.BytesIO(page.screenshot())).convert('RGB')
     finally:
-        browser.close()
-        page.close()
+        served.close()
 
 
 def main():
@@ -65,7 +62,7 @@ def main():
         loop = load_loop('panda', {'sim_plant': {'duration': 27.0}})
         record = simulate(loop.controller, loop.plant)
         write_bag(bag, record, loop.controller, 'none', loop.plant)
-        first, *others = pictures(bag, folder)
+        first, *others = pictures(bag)
         first.save(
             options.out,
             save_all=True,
