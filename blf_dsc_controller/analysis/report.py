@@ -244,7 +244,7 @@ def _colour(k: int) -> str:
 class Cell(NamedTuple):
     """Table cell that is more than plain text.
 
-    Styles: number, code, good, partly, bad; marked highlights the row.
+    Styles: number, bad; marked highlights the row.
     """
 
     text: str

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 from tqdm import tqdm
 
-from blf_dsc_controller.analysis.summary import format_table
+from blf_dsc_controller.analysis.summary import aligned, format_table
 from blf_dsc_controller.cli.run import make_folder, print_notice
 from blf_dsc_controller.compiled.jit import announced_compilation
 from blf_dsc_controller.configuration.nodes import locate
@@ -25,10 +25,13 @@ _PAUSE_IN_A_LOG = 10.0  # s between two updates of the bar
 
 
 def paper(options: Namespace) -> None:
-    """Run the paper's Section IV with every law, write the report and print the claims."""
-    for claim in paper_study.compare(make_folder(options.out)):
-        print(f'{claim.where:<18} {claim.says}\n{"":<18} {claim.full_verdict}')
-    print(f'wrote {options.out / "index.html"}')
+    """Run the paper's Section IV with every law, and print its claims and the table of the laws."""
+    claims, table = paper_study.compare(make_folder(options.out))
+    for claim in claims:
+        for where, line in zip((claim.where, '', ''), claim.lines, strict=True):
+            print(f'{where:<18} {line}')
+    print(aligned(table))
+    print(f'wrote {options.out}: results.json, six pictures, configurations of all runs')
 
 
 def arms(options: Namespace) -> None:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The paper, side by side: its claims, checked by runs of every law, in a folder with a page.
+"""The paper, side by side: its claims, checked by runs of every law, a table and pictures.
 
 Every verdict is computed from the runs. It is `holds only if` for a claim that holds in some of
 the runs that it is about and fails in others; `condition` then says when it holds.
@@ -18,9 +18,8 @@ from matplotlib.ticker import NullFormatter
 from numpy.typing import NDArray
 
 from blf_dsc_controller.analysis.figures import Picture, draw_panels
-from blf_dsc_controller.analysis.metrics import MOMENTS, estimates_of
+from blf_dsc_controller.analysis.metrics import estimates_of
 from blf_dsc_controller.analysis.panels import ALARM, COLOURS, MUTED, panels
-from blf_dsc_controller.analysis.report import Cell, write_page
 from blf_dsc_controller.analysis.summary import plain, write_summary
 from blf_dsc_controller.configuration.nodes import dump
 from blf_dsc_controller.law.factory import settings_of_config
@@ -28,7 +27,6 @@ from blf_dsc_controller.law.lyapunov import decay_rate, exponential_bound
 from blf_dsc_controller.law.settings import Settings
 from blf_dsc_controller.messages.topics import LAMBDA_MIN, LATCHED, LYAPUNOV_TERMS
 from blf_dsc_controller.run import Floats, Run
-from blf_dsc_controller.studies import tuning as tune
 from blf_dsc_controller.studies.paper_cases import (
     BOUND,
     CASES,
@@ -45,7 +43,6 @@ ONLY_IF = 'holds only if'
 FAILS = 'does not hold'
 
 _FITTED = 0.95  # share of the variance of log |P~| that an exponential must explain
-_STYLES = {HOLDS: 'good', ONLY_IF: 'partly', FAILS: 'bad'}
 _PAIRS = {  # of Fig. 2 and 3, by their captions
     'tuned': ('both laws tuned by the same procedure', ('paper_tuned', 'comparison')),
     'low_gains': (
@@ -73,9 +70,10 @@ class Claim(NamedTuple):
     condition: str = ''
 
     @property
-    def full_verdict(self) -> str:
-        """Verdict with its condition."""
-        return f'{self.verdict} {self.condition}' if self.verdict == ONLY_IF else self.verdict
+    def lines(self) -> tuple[str, str, str]:
+        """What is claimed, the verdict with its condition, and what was measured."""
+        only_if = f' {self.condition}' if self.verdict == ONLY_IF else ''
+        return self.says, f'{self.verdict}{only_if}', self.measured
 
 
 def verdict(*runs: bool | None) -> str:
@@ -306,8 +304,11 @@ def _percents(values: Iterable[float]) -> list[str]:
     return [_percent(value) for value in values]
 
 
-def compare(folder: Path) -> list[Claim]:
-    """Run every case, write the report into an empty folder and return the claims."""
+def compare(folder: Path) -> tuple[list[Claim], list[list[str]]]:
+    """Run every case, and return the claims and the table of the laws.
+
+    Writes results.json, the pictures, and the configuration of each run into an empty folder.
+    """
     (folder / 'configurations').mkdir()
     for name, case in CASES.items():
         file = folder / 'configurations' / f'{name.replace(" ", "_")}.yaml'
@@ -317,20 +318,9 @@ def compare(folder: Path) -> list[Claim]:
     metrics = {name: plain(asdict(each)) for name, each in results.metrics.items()}
     numbers = {'claims': [claim._asdict() for claim in found], 'metrics': metrics}
     write_summary(numbers, folder / 'results.json')
-    write_page(
-        folder / 'index.html',
-        'paper.html',
-        'The paper, side by side',
-        claims=[(*claim[:3], Cell(claim.full_verdict, _STYLES[claim.verdict])) for claim in found],
-        laws=list(side_by_side(results)),
-        presets=', '.join(f'{label}: {preset}' for preset, label in SIDE_BY_SIDE.items()),
-        tune=tune,
-        figures=list(draw_pairs(results, folder)),
-        robustness=draw_robustness(results, folder),
-        runs=len(CASES),
-        folder=folder.name,
-    )
-    return found
+    draw_pairs(results, folder)
+    draw_robustness(results, folder)
+    return found, list(side_by_side(results))
 
 
 def side_by_side(results: Results) -> Iterator[list[str]]:
@@ -338,28 +328,26 @@ def side_by_side(results: Results) -> Iterator[list[str]]:
     columns = {  # title: field of the metrics, factor, decimals
         'max |xi1| [mrad]': ('max_error', 1e3, 3),
         'rms xi1 [mrad]': ('rms_error', 1e3, 4),
-        'peak torque [N m]': ('peak_torque', 1.0, 2),
         'rms torque [N m]': ('rms_torque', 1.0, 2),
         'torque rate [N m/s]': ('torque_rate', 1.0, 1),
     }
-    yield ['law', *columns, *(f'error at {t} s' for t in MOMENTS), 'below 1 % from', 'bound']
+    yield ['law', *columns, 'parameter error at 60 s', 'bound']
     for preset, label in SIDE_BY_SIDE.items():
         metrics = results.metrics[preset]
-        settled = metrics.time_to_1_percent
+        error = metrics.parameter_error[60]
         yield [
             label,
             *(
                 ' / '.join(f'{factor * value:.{decimals}f}' for value in getattr(metrics, name))
                 for name, factor, decimals in columns.values()
             ),
-            *(f'{100 * error:.2g} %' for error in metrics.parameter_error.values()),
-            'never' if math.isnan(settled) else f'{settled:.2f} s',
+            '-' if math.isnan(error) else f'{100 * error:.2g} %',
             'kept' if metrics.held else f'left at {metrics.first_violation:.3f} s',
         ]
 
 
-def draw_pairs(results: Results, folder: Path) -> Iterator[tuple[Path, str]]:
-    """Draw Fig. 2 and 3 of each pair of laws; yield their paths and captions."""
+def draw_pairs(results: Results, folder: Path) -> None:
+    """Draw Fig. 2 and 3 of each pair of laws."""
     for name, (caption, pair) in _PAIRS.items():
         runs = [replace(results.runs[case], torque_limit=None) for case in pair]
         linear = [panel for panel in panels(runs, end=_UNTIL) if not panel.log]
@@ -369,19 +357,16 @@ def draw_pairs(results: Results, folder: Path) -> Iterator[tuple[Path, str]]:
         ]
         learning = [panel for panel in panels(runs) if panel.group == 'Parameters']
         estimates = [panel for panel in learning if not panel.log]
-        for number, drawn, columns, size, note in (
-            (2, tracking, 2, _TRACKING, '. Shaded: within the bound'),
-            (3, estimates, 1, _ESTIMATES, ''),
+        for number, drawn, columns, size in (
+            (2, tracking, 2, _TRACKING),
+            (3, estimates, 1, _ESTIMATES),
         ):
-            path = folder / f'figure_{number}_{name}.png'
-            title = f'Fig. {number}, {caption}'
+            path, title = folder / f'figure_{number}_{name}.png', f'Fig. {number}, {caption}'
             draw_panels(path, title, drawn, columns, size, ['proposed', 'comparison'])
-            yield path, f'Fig. {number}: {caption}{note}.'
 
 
-def draw_robustness(results: Results, folder: Path) -> list[Path]:
-    """Draw the largest error and the parameter error of every sweep; return both paths."""
-    tracking, learning = (folder / f'robustness_{name}.png' for name in ('tracking', 'learning'))
+def draw_robustness(results: Results, folder: Path) -> None:
+    """Draw the largest error and the parameter error of every sweep."""
     metrics = results.metrics.items()
     ratios = {name: min(each.max_error_ratio, _BROKEN) for name, each in metrics}
     title = 'Largest error, in units of the bound: above the red line it is violated'
@@ -393,7 +378,7 @@ def draw_robustness(results: Results, folder: Path) -> list[Path]:
         axes.set_yticks(ticks, [*(f'{tick:g}' for tick in ticks[:-1]), f'{_BROKEN:g}+'])
         axes.yaxis.set_minor_formatter(NullFormatter())
         axes.set_ylabel('max $|\\xi_1| / k_c$')
-    picture.save(tracking)
+    picture.save(folder / 'robustness_tracking.png')
     errors = {name: each.tail_parameter_error for name, each in metrics}
     picture = _draw_sweeps('Parameter error over the last ten of 30 s', errors)
     for axes in picture.axes.flat:
@@ -401,8 +386,7 @@ def draw_robustness(results: Results, folder: Path) -> list[Path]:
         axes.axhline(0.01, color=MUTED, lw=1.2, ls='--')
         axes.yaxis.set_major_formatter(lambda value, _: f'{100 * value:g} %')
         axes.set_ylabel(r'$\|\hat P - P\| \;/\; \|P\|$')
-    picture.save(learning)
-    return [tracking, learning]
+    picture.save(folder / 'robustness_learning.png')
 
 
 def _draw_sweeps(title: str, value_of: dict[str, float]) -> Picture:
