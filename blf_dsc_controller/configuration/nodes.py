@@ -15,6 +15,8 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Literal, NamedTuple, TypeVar
 
+import yaml
+
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.files import Section, parse, read_text, share_folder
 from blf_dsc_controller.configuration.plant import PlantConfig
@@ -272,11 +274,8 @@ def format_value(value: Value) -> str:
     """Return a value as YAML that ROS and YAML libraries read as the same type."""
     if isinstance(value, tuple):
         return '[' + ', '.join(format_value(entry) for entry in value) + ']'
-    if isinstance(value, bool):
-        return 'true' if value else 'false'
-    if isinstance(value, float):  # 1e-05 is a string to many YAML libraries, 1.0e-05 is not
-        mantissa, exponent, power = repr(value).partition('e')
-        return mantissa + ('' if '.' in mantissa or not exponent else '.0') + exponent + power
+    if isinstance(value, bool | float):
+        return yaml.safe_dump(value).split()[0]  # 1.0e-05; 1e-05 is a string to many libraries
     return json.dumps(value, ensure_ascii=False)
 
 
