@@ -178,6 +178,8 @@ def test_arm_settles_after_a_deactivation():
         rig.guard.deactivate()
         rig.step(400)
         assert not rig.guard.is_settled
+        rig.step(110)
+        assert rig.guard.is_settled == (rig is resting)
         rig.step(3000)
         assert rig.guard.is_settled
     assert np.abs(resting.state().dq).max() < 0.01

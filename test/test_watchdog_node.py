@@ -120,6 +120,7 @@ def test_watchdog_continues_from_the_torque_that_the_drive_holds(ros, monkeypatc
     own = 30 if held else 0
     ros.until(lambda: len(commands) > own)
     assert watchdog.line.active
+    assert watchdog._timer.timer_period_ns == 10**6  # not 4 ms, at the limit of the torque's rate
     assert watchdog.line.silence == pytest.approx(0.05, abs=0.01)
     np.testing.assert_allclose(commands[own].data, torque, atol=1.01 if held else 0.1)
     ros.executor.remove_node(watchdog)
@@ -138,3 +139,5 @@ def test_controller_does_not_take_the_watchdog_for_an_arm(ros):
     ros.until(lambda: watchdog.line.stamp == 10**9)
     ros.spin(0.2)
     assert law.guard.journal.messages == 0
+    law._on_second()
+    assert law.others == 0
