@@ -19,7 +19,7 @@ pytest.importorskip('rclpy', reason='needs ROS 2')
 import rclpy
 from own_domain import own_domain
 
-from blf_dsc_controller.configuration.nodes import dump, locate
+from blf_dsc_controller.configuration.nodes import dump
 from blf_dsc_controller.errors import ConfigurationError
 from blf_dsc_controller.nodes.controller_node import ControllerNode
 from blf_dsc_controller.nodes.plant_node import PlantNode
@@ -142,8 +142,13 @@ def test_no_end_of_another_node_ends_what_holds_an_arm(launched, simulated, ends
     ].remappings
 
 
-def test_command_line_parameter_overrides_a_file(start):
-    argv = ('sim_plant', '--ros-args', '--params-file', locate('recommended'))
+def test_command_line_parameter_overrides_a_file(start, tmp_path):
+    """Whose section for the node, after one for all nodes, would take precedence in ROS."""
+    path = tmp_path / 'my.yaml'
+    own = '{mode: realtime, arm.l2: 0.5, initial.position: [2.0, 1.0], seed: 0}'
+    sections = {'/**': '{sample_time: 0.001}', '/**/sim_plant': own}
+    path.write_text(''.join(f'{k}:\n  ros__parameters: {v}\n' for k, v in sections.items()))
+    argv = ('sim_plant', '--ros-args', '--params-file', path)
     given = ('-p', 'mode:=lockstep', '-p', 'arm.l2:=0.7', '-p', 'initial.position:=[2.29, 1.69]')
     config = start(*argv, *given, '-p', 'elsewhere:seed:=3').config
     assert (config.mode, config.arm.l2) == ('lockstep', 0.7)
