@@ -91,10 +91,11 @@ def decoded(message, names):
 
 @pytest.mark.parametrize('known', [True, False])
 def test_message_contains_the_distance_and_with_known_truth_the_terms(known):
-    config = configured('recommended', 1.0, LEAKY if known else {}).controller
+    given = (LEAKY if known else {}) | {'telemetry.decimation': 3}
+    config = configured('recommended', 1.0, given).controller
     law = controller_of(config)
     law.update(0.0, 1e-3, np.array([2.293, 1.696, 0.0, 0.0, 0.0, 0.0]))
-    telemetry = ControllerTelemetry(config, estimate_names(config), 3)
+    telemetry = ControllerTelemetry(config, estimate_names(config))
     names = [
         f'{quantity} {joint}'
         for quantity in ('max_error_ratio', 'distance_to_bound')
@@ -104,12 +105,17 @@ def test_message_contains_the_distance_and_with_known_truth_the_terms(known):
     names += ['lambda_min', 'latched', 'model_changes']
     terms = ['V barrier', 'V velocity', 'V parameters', 'V disturbance'] * known
     sent = [
-        telemetry.monitor(10**9, law.sample, np.array([0.3, 0.2]), time)
+        list(telemetry.sample(10**9, law.sample, np.ones(2), np.array([0.3, 0.2]), time))
         for time in (9e-5, 1e-5, 4e-5, 2e-5)
     ]
-    assert [len(each) for each in sent] == [2, 0, 0, 2]
-    (topic, _), message = sent[3]
-    assert topic is topics.REFERENCE
+    error, slow = topics.TRACKING_ERROR, [topics.REFERENCE, topics.MONITOR]
+    assert [[topic for topic, _ in each] for each in sent] == [
+        [topics.BOUND, error, *slow],
+        [error],
+        [error],
+        [error, *slow],
+    ]
+    message = sent[3][-1]
     assert known or b'V barrier' not in message[1]
     values = decoded(message, [*names, *terms, 'compute_time'])
 
@@ -119,6 +125,26 @@ def test_message_contains_the_distance_and_with_known_truth_the_terms(known):
     assert values['distance_to_bound joint2'] == pytest.approx(bound[1] - error[1])
     assert values['compute_time'] == 4e-5  # the largest since the last message
     assert [values[name] for name in terms] == law.sample.lyapunov.tolist() * known
+
+
+def test_bound_is_sent_at_once_when_it_widens_and_with_the_monitor_while_it_narrows():
+    config = configured('recommended', 1.0, {'telemetry.decimation': 3}).controller
+    law = controller_of(config)
+    law.update(0.0, 1e-3, np.array([2.293, 1.696, 0.0, 0.0, 0.0, 0.0]))
+    telemetry, sent = ControllerTelemetry(config, estimate_names(config)), []
+    for k, bound in enumerate((9.0, 8.0, 7.0, 7.0, 6.0, 6.5, 6.5, 7.0, 7.0)):
+        sample = law.sample._replace(bound=np.array([5.0, bound]))
+        limit = ratio = np.ones(2)
+        for topic, raw in telemetry.sample(k, sample, limit, ratio, 0.0, heard=False):
+            if topic is topics.BOUND:
+                sent.append((k, decoded_bound(raw)))
+    assert sent == [(0, 9.0), (3, 7.0), (6, 6.5), (7, 7.0)]
+
+
+def decoded_bound(raw):
+    decoder = JointStateDecoder(('joint2',), required=('position',))
+    decoder.decode(raw)
+    return decoder.position[0]
 
 
 @pytest.fixture(scope='module')

@@ -17,7 +17,13 @@ from blf_dsc_controller.configuration.schema import change
 from blf_dsc_controller.law.factory import estimate_names
 from blf_dsc_controller.law.telemetry import ControllerTelemetry
 from blf_dsc_controller.messages.journal import decode
-from blf_dsc_controller.messages.topics import COMMANDS, JOINT_STATES, JOURNAL, TRACKING_ERROR
+from blf_dsc_controller.messages.topics import (
+    BOUND,
+    COMMANDS,
+    JOINT_STATES,
+    JOURNAL,
+    TRACKING_ERROR,
+)
 from blf_dsc_controller.reference.trajectory import Trajectory, TrajectoryPoint
 from blf_dsc_controller.replay.verify import verify
 
@@ -33,7 +39,7 @@ class Recorder(Rig):
     def __init__(self, given=None, **options):
         self.entries = []
         super().__init__(given, **options)
-        self.telemetry = ControllerTelemetry(self.config, estimate_names(self.config), 1)
+        self.telemetry = ControllerTelemetry(self.config, estimate_names(self.config))
         self.drops = ()  # indices of joint states that never reach the controller
         self.count = 0
 
@@ -55,10 +61,13 @@ class Recorder(Rig):
         if torque is not None and not guard.has_sample:
             self.record(*self.telemetry.answer(guard.journal.stamp, torque))
         if guard.has_sample:
-            now = guard.last_stamp, guard.controller.sample
-            self.record(*self.telemetry.error(*now))
-            for message in self.telemetry.monitor(*now, guard.samples.ratio, 0.0):
-                self.record(*message)
+            law = guard.controller
+            if law.samples == 1:
+                self.telemetry = ControllerTelemetry(self.config, estimate_names(self.config))
+            known = law.sample, law.settings.torque_limit, guard.samples.ratio
+            for topic, message in self.telemetry.sample(guard.last_stamp, *known, 0.0):
+                if topic is not BOUND:  # of which the node also sends the changed ones
+                    self.record(topic, message)
         self.publish_events()
         return torque
 

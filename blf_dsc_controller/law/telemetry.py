@@ -8,7 +8,7 @@ as JointState with the values in `position`.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from functools import partial
 from itertools import chain
 from operator import attrgetter
@@ -63,10 +63,11 @@ def disturbance_names(joints: Sequence[str]) -> tuple[str, ...]:
 class ControllerTelemetry:
     """Messages of the controller of n joints; `estimates` are the names of theta^ (m,).
 
-    Reference and monitor are sent with every `decimation`-th sample, from the first one on.
+    Reference and monitor are sent with every `telemetry.decimation`-th sample, from the first one
+    on, and so is the bound while it narrows; one that widens is sent at once.
     """
 
-    def __init__(self, config: ControllerConfig, estimates: Sequence[str], decimation: int) -> None:
+    def __init__(self, config: ControllerConfig, estimates: Sequence[str]) -> None:
         joints, parts = config.joints, monitored(config, estimates)
         names = [what + joint for what in (topics.RATIO, topics.DISTANCE) for joint in joints]
         names = [*names, *chain.from_iterable(parts.values()), topics.COMPUTE_TIME]
@@ -76,7 +77,8 @@ class ControllerTelemetry:
         self._bound = JointStateEncoder(joints, ('position', 'effort'))
         self._monitor = JointStateEncoder(names, ('position',))
         self._parts = attrgetter(*parts)
-        self._decimation, self._samples, self._slowest = decimation, 0, 0.0
+        self._decimation, self._samples = config.telemetry.decimation, 0
+        self._sent, self._slowest = np.zeros(len(joints)), 0.0  # bound and update time
 
     def command(self, torque: np.ndarray) -> Message:
         """Encode the commanded torque (n,) [N m]."""
@@ -84,8 +86,8 @@ class ControllerTelemetry:
 
     def bound(self, stamp: int, bound: np.ndarray, torque_limit: np.ndarray) -> Message:
         """Encode the bound k_c (n,) [rad] on the tracking error and the torque limit (n,) [N m]."""
-        message = self._bound.encode(stamp, position=bound, effort=torque_limit)
-        return topics.BOUND, message
+        self._sent = np.array(bound)
+        return topics.BOUND, self._bound.encode(stamp, position=bound, effort=torque_limit)
 
     def answer(self, stamp: int, torque: np.ndarray) -> Message:
         """Encode a torque (n,) [N m] that is not the law's; the tracking errors are NaN.
@@ -95,33 +97,37 @@ class ControllerTelemetry:
         unknown = np.full(torque.size, np.nan)
         return topics.TRACKING_ERROR, self._error.encode(stamp, unknown, unknown, torque)
 
-    def error(self, stamp: int, sample: Sample) -> Message:
-        """Encode the tracking errors for a joint state: its stamp [ns] and telemetry sample.
-
-        They are sent with every sample: they tell a replay which states were used.
-        """
-        message = self._error.encode(stamp, sample.xi1, sample.xi2, sample.torque)
-        return topics.TRACKING_ERROR, message
-
-    def monitor(
-        self, stamp: int, sample: Sample, ratio: np.ndarray, compute_time: float
-    ) -> Sequence[Message]:
-        """Return reference and monitor for a joint state, if they are due; call it for each.
+    def sample(
+        self,
+        stamp: int,
+        sample: Sample,
+        torque_limit: np.ndarray,
+        ratio: np.ndarray,
+        compute_time: float,
+        *,
+        heard: bool = True,
+    ) -> Iterator[Message]:
+        """Yield the messages for a joint state: its stamp [ns] and telemetry sample.
 
         `ratio` is the largest |xi1| / k_c so far (n,). Of the times of updates, `compute_time`
-        [s], the largest since the last message is sent.
+        [s], the largest since the last message is sent. The tracking errors come with every
+        sample, if they are `heard`: they tell a replay which states were used.
         """
-        self._slowest = max(compute_time, self._slowest)  # NaN: not measured
+        is_due = self._samples % self._decimation == 0
         self._samples += 1
-        if (self._samples - 1) % self._decimation:
-            return ()
-        distance = sample.bound - np.abs(sample.xi1)
-        values = np.concatenate((ratio, distance, *self._parts(sample), (self._slowest,)))
-        self._slowest = 0.0
-        return (
-            (topics.REFERENCE, self._reference.encode(stamp, sample.qr, sample.dqr)),
-            (topics.MONITOR, self._monitor.encode(stamp, values)),
-        )
+        self._slowest = max(compute_time, self._slowest)  # NaN: not measured
+        bound = sample.bound
+        if bound.tobytes() != self._sent.tobytes() and (is_due or (bound > self._sent).any()):
+            yield self.bound(stamp, bound, torque_limit)
+        if heard:
+            error = self._error.encode(stamp, sample.xi1, sample.xi2, sample.torque)
+            yield topics.TRACKING_ERROR, error
+        if is_due:
+            yield topics.REFERENCE, self._reference.encode(stamp, sample.qr, sample.dqr)
+            distance = bound - np.abs(sample.xi1)
+            values = np.concatenate((ratio, distance, *self._parts(sample), (self._slowest,)))
+            yield topics.MONITOR, self._monitor.encode(stamp, values)
+            self._slowest = 0.0
 
 
 class PlantTelemetry:

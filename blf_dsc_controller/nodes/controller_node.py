@@ -62,10 +62,9 @@ class ControllerNode(LoopNode[ControllerConfig]):
         self._load: ReferenceLoad | None = None
         joints = self.config.joints
         self._estimates = factory.estimate_names(self.config)
-        self._telemetry = self._new_telemetry()
+        self._telemetry = ControllerTelemetry(self.config, self._estimates)
         self._columns = b''  # those that are estimated, and whether they were checked
         self._model_changes = 0.0
-        self._published_bound = b''  # bytes of the array, to detect changes
         self._decoder = JointStateDecoder(joints, required=('position',))
         self._encoder = Float64MultiArrayEncoder(len(joints))
         self._pending: bytes | None = None
@@ -253,18 +252,12 @@ class ControllerNode(LoopNode[ControllerConfig]):
         if not self.config.telemetry.enabled:
             return
         if samples == 1:
-            self._telemetry, self._published_bound = self._new_telemetry(), b''
-        if sample.bound.tobytes() != self._published_bound:
-            self._publish_bound(guard, stamp, sample.bound)
-        if self._heard:
-            self._publish(self._telemetry.error(stamp, sample))
-        ratio = guard.samples.ratio
-        for message in self._telemetry.monitor(stamp, sample, ratio, guard.compute_time):
+            self._telemetry = ControllerTelemetry(self.config, self._estimates)
+        limit, ratio = controller.settings.torque_limit, guard.samples.ratio
+        for message in self._telemetry.sample(
+            stamp, sample, limit, ratio, guard.compute_time, heard=self._heard
+        ):
             self._publish(message)
-
-    def _new_telemetry(self) -> ControllerTelemetry:
-        decimation = self.config.telemetry.decimation
-        return ControllerTelemetry(self.config, self._estimates, decimation)
 
     def _warn_of_rate(self, guard: Guard) -> None:
         period, expected = guard.time / (_RATE_SAMPLES - 1), self.config.sample_time
@@ -296,11 +289,6 @@ class ControllerNode(LoopNode[ControllerConfig]):
         if torque is not None:
             self._senders[topics.COMMANDS](self._encoder.encode(torque))
 
-    def _publish_bound(self, guard: Guard, stamp: int, bound: np.ndarray) -> None:
-        self._published_bound = bound.tobytes()
-        limit = guard.controller.settings.torque_limit
-        self._publish(self._telemetry.bound(stamp, bound, limit))
-
     def _on_poll(self) -> None:
         """Check for missing states; a timer reset by its own callback would multiply under load."""
         guard = self.guard
@@ -329,7 +317,8 @@ class ControllerNode(LoopNode[ControllerConfig]):
             guard.retune(config)
             if guard.last_stamp >= 0 and config.telemetry.enabled:
                 bound = guard.controller.bound_at(guard.time)
-                self._publish_bound(guard, guard.journal.stamp, bound)
+                limit = guard.controller.settings.torque_limit
+                self._publish(self._telemetry.bound(guard.journal.stamp, bound, limit))
 
     def _report_if_changed(self, guard: Guard) -> None:
         if not self._status.has_news(guard):

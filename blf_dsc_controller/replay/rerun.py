@@ -45,10 +45,9 @@ class Outputs:
 
     def __init__(self, guard: Guard) -> None:
         self._guard, self._estimates = guard, estimate_names(guard.config)
-        self._telemetry = ControllerTelemetry(guard.config, self._estimates, 1)
+        self._telemetry = ControllerTelemetry(guard.config, self._estimates)
         self.samples = self.safe_torques = 0
         self.first = self.last = -1
-        self._bound = b''
         self._sent: Counter[Topic] = Counter()
         self.topics: dict[Topic, TopicMessages] = {}
 
@@ -68,17 +67,13 @@ class Outputs:
             self.first = stamp
         self.last, self.samples = stamp, self.samples + 1
         if controller.samples == 1:
-            self._telemetry = ControllerTelemetry(guard.config, self._estimates, 1)
-            self._bound = b''
-        if sample.bound.tobytes() != self._bound:
-            self.add_bound(stamp, sample.bound)
-        self._add(stamp, self._telemetry.error(stamp, sample))
-        for message in self._telemetry.monitor(stamp, sample, guard.samples.ratio, 0.0):
+            self._telemetry = ControllerTelemetry(guard.config, self._estimates)
+        limit = controller.settings.torque_limit
+        for message in self._telemetry.sample(stamp, sample, limit, guard.samples.ratio, 0.0):
             self._add(stamp, message)
 
     def add_bound(self, stamp: int, bound: Floats) -> None:
         """Add a bound [rad], published with this stamp [ns]."""
-        self._bound = bound.tobytes()
         limit = self._guard.controller.settings.torque_limit
         self._add(stamp, self._telemetry.bound(stamp, bound, limit))
 

@@ -54,20 +54,15 @@ def write_bag(
 
 def _messages(record: Record, config: ControllerConfig) -> Iterator[tuple[int, Message]]:
     plant = PlantTelemetry(config.joints, record.parameters)
-    decimation = config.telemetry.decimation
-    controller = ControllerTelemetry(config, estimate_names(config), decimation)
+    controller = ControllerTelemetry(config, estimate_names(config))
     limit = np.array(config.torque.limit)
     events = deque(record.journal.pending)
     ratio = np.zeros(len(record.config.joints))
-    bound = np.zeros(len(record.config.joints))
     for row, elapsed in enumerate(record.stamps.tolist()):
         stamp = START + elapsed
         sample = record.sample(row)
         while events and events[0].messages <= row:
             yield stamp, (topics.JOURNAL, events.popleft().encode())
-        if not np.array_equal(sample.bound, bound):
-            bound = sample.bound
-            yield stamp, controller.bound(stamp, bound, limit)
         yield stamp, plant.joint_states(stamp, record.measurements[row])
         yield stamp, controller.command(sample.torque)
         if row % DECIMATION == 0:
@@ -75,8 +70,7 @@ def _messages(record: Record, config: ControllerConfig) -> Iterator[tuple[int, M
         if np.isnan(sample.qr[0]):  # stopped
             continue
         np.maximum(ratio, np.abs(sample.xi1) / sample.bound, out=ratio)
-        yield stamp, controller.error(stamp, sample)
-        for message in controller.monitor(stamp, sample, ratio, float('nan')):
+        for message in controller.sample(stamp, sample, limit, ratio, float('nan')):
             yield stamp, message
     for event in events:
         yield START + int(record.stamps[-1]), (topics.JOURNAL, event.encode())
