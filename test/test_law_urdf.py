@@ -63,6 +63,8 @@ def test_given_parameters_override_the_derived_ones():
     expected = derived.feedback.damping_rate * 8e-3 / 5e-3
     assert config.feedback.damping_rate == pytest.approx(expected)
     assert change(config, {'feedback.damping_rate': 5.0}).feedback.damping_rate == 5.0
+    heavy = panda(robot__rotor_inertia=[0.2] * 7)
+    assert heavy.robot.rotors(heavy.robot.chain(heavy.joints)).tolist() == [0.2] * 7
 
 
 def test_urdf_may_be_given_as_text_or_file(tmp_path):
