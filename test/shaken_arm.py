@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from itertools import zip_longest
 from math import tanh
 from typing import NamedTuple
 
@@ -15,8 +16,8 @@ from blf_dsc_controller.bags.writer import BagWriter
 from blf_dsc_controller.compiled.jit import kernel
 from blf_dsc_controller.identification.prior import base_matrix
 from blf_dsc_controller.identification.recording import Recording
-from blf_dsc_controller.messages.codecs import JointStateEncoder
-from blf_dsc_controller.messages.topics import JOINT_STATE
+from blf_dsc_controller.messages.codecs import Float64MultiArrayEncoder, JointStateEncoder
+from blf_dsc_controller.messages.topics import COMMANDS, JOINT_STATE
 from sim_plant.rigid_body import acceleration, locate, motion_of, motion_size, rigid_bodies
 
 PANDA_TEXT = (CONFIG / 'panda.urdf').read_text()
@@ -152,17 +153,18 @@ def is_covered(found, truth):
     return np.abs(G @ (found.values[at] - true)) < 1.96 * deviation
 
 
-def write_states(path, joints, states, *, period=PERIOD, topic='/joint_states', fields=None):
-    """Write states (N, 3, n) as a bag."""
-    fields = fields or ('position', 'velocity', 'effort')
-    encoder = JointStateEncoder(joints, fields)
+FIELDS = ('position', 'velocity', 'effort')
+
+
+def write_states(path, joints, states, *, period=PERIOD, fields=FIELDS, stamps=(), commands=()):
+    """Write states (N, 3, n), and commands (N, n) 1 us after them, as a bag."""
+    encoder, encoded = JointStateEncoder(joints, fields), Float64MultiArrayEncoder(len(joints))
+    stamps = stamps or [1_000_000_000 + round(k * period * 1e9) for k in range(len(states))]
     with BagWriter(path, flush_interval=None) as bag:
-        handle = bag.add_topic(topic, JOINT_STATE, [])
-        for k, state in enumerate(states):
-            stamp = 1_000_000_000 + round(k * period * 1e9)
-            values = [
-                state[i] if field in fields else ()
-                for i, field in enumerate(('position', 'velocity', 'effort'))
-            ]
-            bag.write(handle, bytes(encoder.encode(stamp, *values)), stamp)
+        handle = bag.add_topic('/joint_states', JOINT_STATE, [])
+        other = bag.add_topic('/arm/commands', COMMANDS.type, []) if len(commands) else 0
+        for stamp, state, command in zip_longest(stamps, states[: len(stamps)], commands):
+            bag.write(handle, bytes(encoder.encode(stamp, *state[: len(fields)])), stamp)
+            if other:
+                bag.write(other, bytes(encoded.encode(command)), stamp + 1000)
     return path

@@ -11,6 +11,7 @@ import pinocchio
 import pytest
 from random_arm import PANDA, pinocchio_model
 from shaken_arm import (
+    FIELDS,
     GRAVITY,
     PANDA_CHAIN,
     PANDA_TEXT,
@@ -38,8 +39,8 @@ from blf_dsc_controller.identification.corrected_urdf import corrected_urdf
 from blf_dsc_controller.identification.identify import identify_arm, identify_bag
 from blf_dsc_controller.identification.prior import base_matrix
 from blf_dsc_controller.identification.recording import read_recording
-from blf_dsc_controller.messages.codecs import Float64MultiArrayEncoder, JointStateEncoder
-from blf_dsc_controller.messages.topics import COMMANDS, JOINT_STATE
+from blf_dsc_controller.messages.codecs import JointStateEncoder
+from blf_dsc_controller.messages.topics import JOINT_STATE
 from blf_dsc_controller.simulation.bag import write_bag
 from blf_dsc_controller.simulation.loop import simulate
 
@@ -205,16 +206,9 @@ def test_other_publishers_joint_names_and_orders_are_recognised(states, tmp_path
 @pytest.mark.parametrize('effort', ['torque', 'command'])
 def test_commands_replace_efforts_that_are_missing_or_not_wanted(states, tmp_path, effort):
     """With `--effort command` those in the bag, here currents, are not used."""
-    fields = ('position', 'velocity', 'effort')[: 2 + (effort == 'command')]
-    q, commands = JointStateEncoder(PANDA, fields), Float64MultiArrayEncoder(7)
-    with BagWriter(tmp_path / 'bag', flush_interval=None) as bag:
-        handle = bag.add_topic('/joint_states', JOINT_STATE, [])
-        other = bag.add_topic('/arm/commands', COMMANDS.type, [])
-        for k, state in enumerate(states[:8000]):
-            stamp = 1_000_000_000 + 1_000_000 * k
-            values = (state[0], state[1], 0.1 * state[2])[: len(fields)]
-            bag.write(handle, bytes(q.encode(stamp, *values)), stamp)
-            bag.write(other, bytes(commands.encode(state[2])), stamp + 1000)
+    fields, some = FIELDS[: 2 + (effort == 'command')], states[:8000]
+    currents = some * [[1.0], [1.0], [0.1]]
+    write_states(tmp_path / 'bag', PANDA, currents, fields=fields, commands=some[:, 2])
     found = identify_bag(tmp_path / 'bag', ROBOT, effort=effort)
     assert found.source == '/arm/commands'
     assert not list(problems_of(found, effort))
@@ -253,12 +247,8 @@ def test_bags_that_cannot_be_identified_are_rejected_for_their_reason(states, tm
 
 def test_states_with_odd_stamps_are_rejected_and_take_no_memory(states, tmp_path):
     """Resampled at their interval, an hour would be 26 TB."""
-    encoder = JointStateEncoder(PANDA)
     for k, stamps in enumerate(((5, 6, 7), (*range(1, 6_000_000, 1_000_000), 3_600_000_000_000))):
-        with BagWriter(tmp_path / f'{k}', flush_interval=None) as bag:
-            handle = bag.add_topic('/joint_states', JOINT_STATE, [])
-            for stamp, state in zip(stamps, states, strict=False):
-                bag.write(handle, bytes(encoder.encode(stamp, *state)), stamp)
+        write_states(tmp_path / f'{k}', PANDA, states, stamps=stamps)
         with pytest.raises(BagError, match='are their stamps of one clock'):
             read_recording(tmp_path / f'{k}', PANDA_TEXT)
     with pytest.raises(BagError, match='a unique stamp'):
