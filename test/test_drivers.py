@@ -16,7 +16,7 @@ from markdown_it import MarkdownIt
 
 pytest.importorskip('rclpy', reason='needs ROS 2')
 
-from random_arm import CONFIG
+from random_arm import CONFIG, UR5E
 from rclpy.qos import (
     DurabilityPolicy,
     LivelinessPolicy,
@@ -74,14 +74,7 @@ FACTS = {
         commands='/forward_effort_controller/commands',
         rate=500.0,  # ur_robot_driver/config/ur5e_update_rate.yaml
         # the same file: forward_effort_controller.joints, in this order, without a tf_prefix
-        joints=(
-            'shoulder_pan_joint',
-            'shoulder_lift_joint',
-            'elbow_joint',
-            'wrist_1_joint',
-            'wrist_2_joint',
-            'wrist_3_joint',
-        ),
+        joints=UR5E,
     ),
 }
 # ros2_controllers 4, tried with its real parts: joint_state_broadcaster publishes with the

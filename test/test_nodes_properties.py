@@ -189,7 +189,7 @@ def test_plant_survives_arbitrary_input(context, sequence):
         context=context, cli_args=[], enable_rosout=False, parameter_overrides=overrides
     )
     node._is_observed = lambda: True
-    node._handshake._complete_since = 0.0
+    node._peers = iter(())  # all there
     try:
         for kind, content in sequence:
             if kind == 'message':

@@ -91,9 +91,9 @@ def check_support(controller: Controller, config: ControllerConfig, measurement:
         return
     q, dq, effort = measurement.reshape(3, -1)
     gravity = model_torque(controller.settings, controller.state.estimate, q)
-    is_limited = np.array(config.torque.first_step) > 0.0
-    worst = int(np.argmax(np.where(is_limited, 0.0, np.abs(gravity))))
-    matters = not is_limited[worst] and abs(gravity[worst]) > _MATTERS * config.torque.limit[worst]
+    unlimited = np.where(np.array(config.torque.first_step) > 0.0, 0.0, np.abs(gravity))
+    worst = int(np.argmax(unlimited))
+    matters = unlimited[worst] > _MATTERS * config.torque.limit[worst]
     is_held = np.isfinite(effort).all() and _is_like(effort, gravity)  # which the check above sees
     if matters and not is_held and not np.abs(dq).max() > _AT_REST:
         raise StartError(
