@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Messages of one topic of a bag, decoded block by block while it is read.
 
-Their numbers are in temporary files, of which only what is asked for comes into memory.
+Their numbers are in a temporary file, of which only what is asked for comes into memory.
 """
 
 from __future__ import annotations
@@ -29,6 +29,7 @@ from blf_dsc_controller.messages.topics import FLOAT64_MULTI_ARRAY, JOINT_STATE
 from blf_dsc_controller.run import Floats, Stamps
 
 _BLOCK = 512  # messages decoded at once, which then are in the cache
+_RECENT = 100  # layouts that a message is compared with: more only where no two messages are alike
 _NUMBER, _RECEIVED, _SEQUENCE, _STAMP, _VALUES = range(5)  # columns, the last with all others
 _NAN = np.float64(np.nan).view(np.int64)
 _ALL = slice(None)
@@ -48,18 +49,36 @@ class UnreadableMessageError(BagError):
         super().__init__(f'message {index + 1} of {topic} cannot be read: {reason}')
 
 
-class _Store:
-    """Messages of one layout in a temporary file: blocks of them, each column by column."""
+class _File:
+    """A temporary file, which lasts as long as what refers to it."""
 
-    def __init__(self, layout: Layout, *, has_stamp: bool) -> None:
-        self.layout, self.size = layout, 0
-        self._has_stamp = has_stamp
-        self._columns = _VALUES + layout.places.size
-        self._waiting: list[tuple[int, BagMessage]] = []
+    def __init__(self) -> None:
         self._file = tempfile.TemporaryFile()  # noqa: SIM115 - closed below
 
     def __del__(self) -> None:
         self._file.close()
+
+    def append(self, content: bytes) -> int:
+        """Write at the end and return the offset."""
+        offset = self._file.seek(0, os.SEEK_END)
+        self._file.write(content)
+        self._file.flush()
+        return offset
+
+    def read_into(self, array: NDArray[np.int64], offset: int) -> None:
+        """Fill an array from an offset on."""
+        os.preadv(self._file.fileno(), [array.data], offset)
+
+
+class _Store:
+    """Messages of one layout in the file of their topic: blocks of them, each column by column."""
+
+    def __init__(self, layout: Layout, file: _File, *, has_stamp: bool) -> None:
+        self.layout, self.size = layout, 0
+        self._has_stamp = has_stamp
+        self._waiting: list[tuple[int, BagMessage]] = []
+        self._file = file
+        self._blocks: list[tuple[int, int]] = []  # offset [bytes], messages
 
     def add(self, number: int, message: BagMessage) -> None:
         """Add a message with its number among those of the topic."""
@@ -74,8 +93,7 @@ class _Store:
         if not waiting:
             return
         count, size = len(waiting), self.layout.size
-        block = np.zeros((self._columns, _BLOCK), np.int64)
-        columns = block[:, :count]
+        columns = np.zeros((_VALUES + self.layout.places.size, count), np.int64)
         columns[_NUMBER] = [number for number, _ in waiting]
         columns[_RECEIVED] = [message.received for _, message in waiting]
         columns[_SEQUENCE] = [message.sequence for _, message in waiting]
@@ -86,8 +104,7 @@ class _Store:
             columns[_STAMP] = stamp['s'].astype(np.int64) * NANOSECONDS + stamp['ns']
         grid = np.ndarray((count, (size - ORIGIN) // 8), '<i8', joined, ORIGIN, (size, 8))
         columns[_VALUES:] = grid[:, self.layout.places].T
-        self._file.write(block.tobytes())
-        self._file.flush()
+        self._blocks.append((self._file.append(columns.tobytes()), count))
 
     def column(self, j: int, rows: NDArray[np.int32]) -> NDArray[np.int64]:
         """Return a column of some of these messages."""
@@ -95,8 +112,8 @@ class _Store:
             return np.empty(0, np.int64)
         first, last = rows.min() // _BLOCK, rows.max() // _BLOCK + 1
         values = np.empty((last - first, _BLOCK), np.int64)
-        for k, block in enumerate(values, first):
-            os.preadv(self._file.fileno(), [block.data], 8 * _BLOCK * (self._columns * int(k) + j))
+        for block, (offset, count) in zip(values, self._blocks[first:last], strict=True):
+            self._file.read_into(block[:count], offset + 8 * count * j)
         found: NDArray[np.int64] = values.ravel()[rows - first * _BLOCK]
         return found
 
@@ -209,13 +226,14 @@ class JointStates:
 
 
 class TopicMessages:
-    """All messages of one topic: the numbers of known types in files, others as bytes."""
+    """All messages of one topic: the numbers of known types in a file, others as bytes."""
 
     def __init__(self, name: str, type_name: str) -> None:
         self.name, self.type = name, type_name
         self.size = 0
         self.raw: list[bytes] = []  # of other types
         self.received: list[int] = []  # likewise [ns]
+        self._file = _File()
         self._stores: list[_Store] = []
         self._last: _Store | None = None  # that of the last message
         self._unreadable: dict[int, MessageError] = {}
@@ -233,7 +251,7 @@ class TopicMessages:
         self.size += 1
 
     def _store_of(self, raw: bytes) -> _Store | None:
-        for store in self._stores:
+        for store in self._stores[-_RECENT:]:
             if store.layout.fits(raw):
                 return store
         is_state = self.type == JOINT_STATE
@@ -242,7 +260,7 @@ class TopicMessages:
         except MessageError as error:
             self._unreadable[self.size] = error
             return None
-        self._stores.append(_Store(layout, has_stamp=is_state))
+        self._stores.append(_Store(layout, self._file, has_stamp=is_state))
         return self._stores[-1]
 
     def joint_states(
