@@ -10,10 +10,9 @@ import numpy as np
 from blf_dsc_controller.compiled.jit import inner, kernel
 from blf_dsc_controller.compiled.layout import Array, part, view
 from sim_plant.arm import Arm
-from sim_plant.drives import actuate, compensate, let_pass
+from sim_plant.drives import actuate, compensate, draw, is_noisy, let_pass, sense
 from sim_plant.layout import PlantSettings, PlantState, settings_of, state_of
 from sim_plant.motion import disturbing_torque, integrate, update_loads
-from sim_plant.sensors import draw, is_noisy, sense
 
 
 @inner

@@ -18,7 +18,7 @@ from blf_dsc_controller.configuration.nodes import PLANT
 from blf_dsc_controller.configuration.plant import Deviation, PlantConfig
 from blf_dsc_controller.configuration.robot import parameters_of as base_parameters_of
 from sim_plant.arm import Arm, PointMassArm
-from sim_plant.drives import lag, memory_size
+from sim_plant.drives import generator, is_noisy, lag, memory_size
 from sim_plant.kernels import is_due, observe_plant, plant_truth, plant_views, step_plant
 from sim_plant.layout import (
     VELOCITY_SOURCES,
@@ -31,7 +31,6 @@ from sim_plant.layout import (
     state_size,
 )
 from sim_plant.rigid_body import rigid_arm, rigid_bodies
-from sim_plant.sensors import generator, is_noisy
 
 T = TypeVar('T')
 

@@ -18,7 +18,7 @@ from paper_case import NO_DISTURBANCE, P, configured, run
 
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.schema import build
-from blf_dsc_controller.law.factory import column_names, settings_of_config
+from blf_dsc_controller.law.factory import columns_of, settings_of_config
 from blf_dsc_controller.law.settings import CHOICES
 
 NOISY = {'position_noise': 1e-5, 'sensor.velocity': 'differenced', 'delay': 2}
@@ -172,7 +172,7 @@ def test_settings_follow_the_configuration():
     given = {'learning.window': 0.75, 'learning.settling_time': 0.25}
     given |= {'learning.adaptation_gain': [1.0, 2.0, 3.0], 'learning.column_gain': 5.0}
     config = build(ControllerConfig, given)
-    settings, columns = settings_of_config(config), len(column_names(config))
+    settings, columns = settings_of_config(config), len(columns_of(config))
     assert settings.learning_start == 1.0
     assert settings.window == 750
     assert columns > 0

@@ -12,7 +12,7 @@ from paper_case import NO_DISTURBANCE, configured, run
 
 from blf_dsc_controller.compiled import cholesky
 from blf_dsc_controller.law import excitation, prediction, window
-from blf_dsc_controller.law.factory import column_names, controller_of
+from blf_dsc_controller.law.factory import controller_of, estimate_names
 
 
 class Window:
@@ -237,7 +237,7 @@ def test_columns_match_their_names():
     for w in (1.5, 4.0):
         value[f'sin {w:g} rad/s'] = np.full(2, np.sin(w * t))
         value[f'cos {w:g} rad/s'] = np.full(2, np.cos(w * t))
-    names = column_names(config)
+    names = estimate_names(config)[3:]
     assert names == tuple(f'{block} {joint}' for block in value for joint in config.joints)
     expected = np.hstack([np.diag(each) for each in value.values()])
     np.testing.assert_allclose(rest[:, 3:], expected)
@@ -246,7 +246,7 @@ def test_columns_match_their_names():
 def learned(preset, duration, learning, arm):
     """Estimates by name at the end of a run, and which columns are still estimated."""
     config = configured(preset, duration, learning, arm)
-    state, names = run(config).controller.state, column_names(config.controller)
+    state, names = run(config).controller.state, estimate_names(config.controller)[3:]
     return [dict(zip(names, values[3:], strict=True)) for values in (state.estimate, state.active)]
 
 
@@ -285,7 +285,7 @@ def test_cosine_columns_are_rejected_on_the_reference_of_the_paper():
     """
     learning = {'learning.frequencies': [1.0], 'learning.bias': False}
     config = configured('recommended', 7.99, learning)  # ends with an evaluation of Phi
-    law, names = run(config).controller, column_names(config.controller)
+    law, names = run(config).controller, estimate_names(config.controller)[3:]
     on = law.state.active > 0.0
     rejected = [name for name, kept in zip(names, on[3:], strict=True) if not kept]
     assert rejected

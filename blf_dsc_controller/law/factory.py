@@ -95,14 +95,9 @@ def columns_of(config: ControllerConfig) -> tuple[Column, ...]:
     return tuple(columns)
 
 
-def column_names(config: ControllerConfig) -> tuple[str, ...]:
-    """Return the name of each disturbance column."""
-    return tuple(column.name for column in columns_of(config))
-
-
 def estimate_names(config: ControllerConfig) -> tuple[str, ...]:
     """Return the name of each entry of theta^: model parameters, then disturbance columns."""
-    return model_of(config).parameter_names + column_names(config)
+    return (*model_of(config).parameter_names, *(column.name for column in columns_of(config)))
 
 
 def prior_covariance(config: ControllerConfig) -> np.ndarray:
