@@ -5,12 +5,10 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
-from functools import cache
 from typing import Any, NamedTuple
 
 import numpy as np
 import plants
-from paper_case import P
 from plain_law import R
 
 from blf_dsc_controller.arms.two_link import TwoLink
@@ -84,36 +82,6 @@ def closed_loop(law: Controller, arm: Plant, duration: float) -> Iterator[Sample
         law.update(t, dt, measurement)
         yield Sample(k, t, measurement)
         arm.step(law.signals.torque)
-
-
-class Record(NamedTuple):
-    """A whole run; the first axis is the sample."""
-
-    t: np.ndarray  # s
-    xi1: np.ndarray  # (., 2) rad
-    torque: np.ndarray  # (., 2) N m
-    estimate: np.ndarray  # (., m)
-
-    @property
-    def parameter_error(self) -> np.ndarray:
-        """|P^ - P| / |P| of each sample."""
-        return np.linalg.norm(self.estimate[:, :3] - P, axis=1) / np.linalg.norm(P)
-
-
-def record(law: Controller, arm: Plant, duration: float) -> Record:
-    """Run a loop and record what the tests need."""
-    signals, state = law.signals, law.state
-    rows = [
-        (sample.t, signals.xi1.copy(), signals.torque.copy(), state.estimate.copy())
-        for sample in closed_loop(law, arm, duration)
-    ]
-    return Record(*map(np.array, zip(*rows, strict=True)))
-
-
-@cache
-def recommended_minute() -> Record:
-    """Return 60 noise-free seconds of the recommended configuration, run once for all tests."""
-    return record(controller(recommended()), plant(), 60.0)
 
 
 def arbitrary(seed: int, **changes: Any) -> tuple[Settings, State, Signals]:
