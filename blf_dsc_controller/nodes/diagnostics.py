@@ -17,7 +17,7 @@ from rclpy.node import Node
 from blf_dsc_controller.law.telemetry import RejectedColumn, load_text
 from blf_dsc_controller.messages import topics
 from blf_dsc_controller.messages.topics import LOAD, PHASE, REASON, REJECTED, STOPS
-from blf_dsc_controller.nodes.endpoints import create_publisher, qos_profile
+from blf_dsc_controller.nodes.endpoints import create_publisher
 from blf_dsc_controller.nodes.trajectory_input import TrajectoryInput
 from blf_dsc_controller.supervision.guard import Guard
 from blf_dsc_controller.supervision.supervisor import Phase, Supervisor
@@ -39,9 +39,7 @@ class DiagnosticsPublisher:
         self._node = node
         self._name = node.get_fully_qualified_name().removeprefix('/')
         self._hardware = ' '.join(joints)
-        self._diagnostics = node.create_publisher(
-            DiagnosticArray, topics.DIAGNOSTICS.name, qos_profile(topics.DIAGNOSTICS.offered)
-        )
+        self._diagnostics = create_publisher(node, topics.DIAGNOSTICS)
 
     def publish(self, *parts: Part) -> DiagnosticStatus:
         """Publish the status of each part on /diagnostics; return that of the first."""

@@ -215,9 +215,10 @@ class LoopNode(LifecycleNode, process.PlainNode, Generic[Config]):
 
     def _is_observed(self) -> bool:
         """Whether each output has its recorders, and the first one also the other node."""
-        wanted, (first, *_) = self.config.wait_for_subscribers, self._outputs.values()
-        others = first.get_subscription_count() - self._subscribers(first, WATCHDOG_NODE)
-        recorders = (self._subscribers(each, _RECORDER) for each in self._outputs.values())
+        wanted, publishers = self.config.wait_for_subscribers, [*self._outputs.values()]
+        others = publishers[0].get_subscription_count()
+        others -= self._subscribers(publishers[0], WATCHDOG_NODE)
+        recorders = (self._subscribers(each, _RECORDER) for each in publishers)
         return others > wanted and (wanted == 0 or min(recorders) >= wanted)
 
     def _subscribers(self, publisher: Publisher, kind: str) -> int:
