@@ -172,12 +172,11 @@ def test_losses_are_counted_and_reported(ros, bag, capfd):
             publisher.publish(encoded(k))
         assert publisher.wait_for_all_acked()
         until_recorded(ros, recorder, joint_states=count)
-    missed = recorder._losses['/joint_states'].missed
     recorder.close()
+    missed = 51 - len(read(bag))
     assert missed > 0
-    assert len(read(bag)) == 51 - missed
     lost = f'{missed} missed, 7 sent before the recorder connected'
-    assert f'/joint_states: {51 - missed} messages, {lost}' in capfd.readouterr().err
+    assert f'/joint_states: {51 - missed} messages' in capfd.readouterr().err
     assert read_content(bag).losses == {'/joint_states': lost}
     shown = read_bag(bag)
     assert ('lost', f'/joint_states: {lost}') in [event[1:] for event in shown.events]
@@ -253,7 +252,7 @@ def test_all_is_on_disk_while_it_runs_and_a_signal_completes_the_bag(rig, bag, n
     code, output = rig.end(process, number)
     assert code == 0, output
     assert counts(bag) == {f'/{topic}': 2000 for topic in TOPICS}
-    assert all(f'/{topic}: 2000 messages, 0 missed' in output for topic in TOPICS)
+    assert all(f'/{topic}: 2000 messages' in output for topic in TOPICS)
     assert 'invalid' not in output  # a context that was shut down
 
 
@@ -359,12 +358,12 @@ def test_real_time_loop_is_timed_and_every_message_of_it_is_in_the_bag(tmp_path)
     with (out / 'bag' / 'bag_0.mcap').open('rb') as stream:
         for _, channel, message in make_reader(stream).iter_messages():
             numbers[channel.topic].append(message.sequence)
-    facts, found = read_content(out / 'bag').facts, Counter()
+    found = Counter()
     answered, tenth = topics.TRACKING_ERROR, (topics.REFERENCE, topics.MONITOR)
     for topic in (topics.JOINT_STATES, topics.TIMING, topics.COMMANDS, answered, *tenth):
         name, found[topic] = topic.resolved, len(numbers[topic.resolved])
         assert numbers[name] == list(range(1, found[topic] + 1))
-        assert facts[f'messages {name}'] == f'{found[topic]} written, 0 missed'
+    assert read_content(out / 'bag').losses == {}
     # On a busy machine the first torque may take seconds, and the plant sends its state again.
     again = logs[0].count('sending the state again')
     assert found[topics.JOINT_STATES] == 1000 * DURATION + 1 + again

@@ -32,6 +32,7 @@ from blf_dsc_controller.messages.topics import (
     REFERENCE,
     TRACKING_ERROR,
 )
+from blf_dsc_controller.run import Series
 
 SAMPLES = 200
 MADE = Synthetic(SAMPLES)
@@ -238,6 +239,22 @@ def test_any_rows_of_long_topics_of_several_layouts_are_read():
                 np.testing.assert_array_equal(values, known + offset)
         lost = states.select(np.array([-1, 900, -1])).field(1)[:, -1]
         np.testing.assert_array_equal(lost, [np.nan, expected[900], np.nan])
+
+
+def test_series_holds_its_values_and_the_first_before_it_begins():
+    series = Series(('a',), np.array([5, 9]), np.array([[1.0], [2.0]]))
+    assert series.held(np.array([0, 5, 8, 9, 20])).ravel().tolist() == [1, 1, 1, 2, 2]
+
+
+def test_gaps_in_sequence_numbers_are_losses():
+    """Each publisher has its own numbers."""
+    messages = TopicMessages('/x', JOINT_STATES.type)
+    for sequence in (4, 5, 0, 8, 9, 2, 3, 10, 4, 4, 5, 1, 2):
+        messages.add(BagMessage('/x', 0, b'', sequence))
+    assert messages.lost == '2 missed, 7 sent before the recorder connected'
+    for sequence in range(99, 1, -1):  # of whatever it may be
+        messages.add(BagMessage('/x', 0, b'', sequence))
+    assert messages.lost == ''
 
 
 def test_undecodable_message_is_reported_with_topic_and_number(tmp_path):

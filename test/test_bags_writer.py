@@ -21,7 +21,7 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from blf_dsc_controller import __version__
 from blf_dsc_controller.bags.recover import recover
 from blf_dsc_controller.bags.sources import BagError, open_bag
-from blf_dsc_controller.bags.writer import BagWriter, Losses
+from blf_dsc_controller.bags.writer import BagWriter
 from blf_dsc_controller.cli.main import main
 from blf_dsc_controller.messages.codecs import (
     Definition,
@@ -229,16 +229,6 @@ def test_memory_of_a_recorder_is_bounded_and_its_files_are_read_as_one(tmp_path)
     for name in ('bag', 'clean'):
         with open_bag(tmp_path / name) as opened:
             assert [each.raw for each in opened.messages({'/a'})] == expected
-
-
-def test_gaps_in_sequence_numbers_are_counted_as_losses():
-    losses = Losses(publishers=1)
-    for sequence in (4, 5, 8, 9, 2, 3):  # the 2 is from a new publisher
-        losses.count(sequence)
-    assert losses.text() == ', 2 missed, 4 sent before the recorder connected'
-    losses.publishers_seen(2)
-    losses.count(100)
-    assert losses.text() == ''
 
 
 # Recovery.

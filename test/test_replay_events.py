@@ -241,7 +241,8 @@ def test_replay_ends_where_the_recorder_missed_what_it_needs(
     of(rig.entries, topic)[number][3] = None
     result = rig.verify(tmp_path, publishers=1)
     assert (result.difference, result.samples) == (None, samples)
-    assert result.remarks == (f'{remark}: the replay ends there',)
+    missed = f'the recorder missed messages of {topic.resolved}: 1 missed'
+    assert result.remarks == (f'{remark}: the replay ends there', missed)
     assert result.compared < 1.0
 
 

@@ -239,10 +239,11 @@ def test_what_limits_a_result_is_remarked(bag, entries, tmp_path, monkeypatch):
         del content['parameters']['learning.compensation']
 
     configured(entries, change)
-    lost = '0 missed, 201 sent before the recorder connected'
-    facts = {'package_version': __version__, 'messages /joint_states': f'800 written, {lost}'}
-    missed, newer = verify(recorded_run.write(tmp_path / 'bag', entries, **facts)).remarks
-    assert missed == f'the recorder missed messages of /joint_states: {lost}'
+    of(entries, MONITOR)[7][3] = None
+    facts = {'package_version': __version__}
+    path = recorded_run.write(tmp_path / 'bag', entries, publishers=1, **facts)
+    missed, newer = verify(path).remarks
+    assert missed == f'the recorder missed messages of {MONITOR.resolved}: 1 missed'
     assert 'before the law had learning.compensation' in newer
     monkeypatch.setattr('blf_dsc_controller.replay.verify.__version__', '9.9.9')
     (remark,) = verify(bag).remarks

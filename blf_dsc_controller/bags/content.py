@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from blf_dsc_controller import __version__
-from blf_dsc_controller.bags.sources import MESSAGES, VERSION, BagError, OpenBag, open_bag
+from blf_dsc_controller.bags.sources import VERSION, BagError, OpenBag, open_bag
 from blf_dsc_controller.bags.topic_messages import TopicMessages
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.schema import build, parameters
@@ -22,7 +22,7 @@ from blf_dsc_controller.messages.codecs import typestore
 from blf_dsc_controller.messages.journal import Event, EventType, decode
 
 _OF_INTEREST = (*(topic for topic in topics.TOPICS if topic is not topics.CLOCK), topics.CHANGES)
-_KEPT = frozenset(topic.leaf for topic in topics.TOPICS if topic.offered.depth > 1)
+_FEW = topics.DIAGNOSTIC.depth  # messages kept by publishers of what is no stream
 
 
 @dataclass(frozen=True)
@@ -71,8 +71,8 @@ NO_NAMES = NameMap()
 class Content:
     """Messages of the package's topics in a bag, and the number of messages of every topic.
 
-    `facts` are what a recorder of this package noted: its version, and losses by topic. `namespace`
-    selects one of several robots; `names` are those that differ.
+    `facts` are what a recorder of this package noted, such as its version. `namespace` selects one
+    of several robots; `names` are those that differ.
     """
 
     path: Path
@@ -89,13 +89,9 @@ class Content:
 
     @property
     def losses(self) -> dict[str, str]:
-        """Recorder's notes on the messages it missed, by topic; not of latched single messages."""
-        found = {
-            name.removeprefix(MESSAGES): text.partition(', ')[2]
-            for name, text in self.facts.items()
-            if name.startswith(MESSAGES) and name.rsplit('/', 1)[-1] in _KEPT
-        }
-        return {topic: lost for topic, lost in found.items() if lost not in ('', '0 missed')}
+        """What is missing in the streams of the loop, which have one publisher each, by topic."""
+        streams = (each for topic, each in self.topics.items() if topic.offered.depth > _FEW)
+        return {each.name: each.lost for each in streams if each.lost}
 
     @cached_property
     def events(self) -> list[tuple[int, Event]]:

@@ -26,7 +26,6 @@ from zstandard import FRAME_HEADER, ZstdDecompressor
 from blf_dsc_controller.bags.sources import (
     HEAD,
     MAGIC_SIZE,
-    MESSAGES,
     RECORD,
     BagError,
     DamageError,
@@ -95,8 +94,7 @@ def _copied(path: Path, bag: BagWriter) -> Iterator[str]:
             elif isinstance(record, Statistics):
                 stated = Counter(record.channel_message_counts)
             elif isinstance(record, Metadata) and record.name == RECORD:
-                facts = record.metadata.items()
-                bag.note({k: v for k, v in facts if not k.startswith(MESSAGES)})
+                bag.note(record.metadata)
             elif isinstance(record, str) and not is_closed:
                 yield record if last < 0 else f'{record}, after {last * 1e-9:.6f} s'
             is_closed |= isinstance(record, DataEnd)

@@ -33,9 +33,6 @@ RECORD = 'blf_dsc_controller'
 """Name of the metadata record with the facts."""
 
 VERSION = 'package_version'
-MESSAGES = 'messages '
-"""Prefix of the names of facts that count the written and lost messages of a topic."""
-
 MAGIC_SIZE = 8
 HEAD = Struct('<BQ')  # opcode and content length, at the start of each record
 _MESSAGE = Struct('<HIQQ')

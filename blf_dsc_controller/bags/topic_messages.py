@@ -31,6 +31,7 @@ from blf_dsc_controller.run import Floats, Stamps
 _BLOCK = 512  # messages decoded at once, which then are in the cache
 _RECENT = 100  # layouts that a message is compared with: more only where no two messages are alike
 _NUMBER, _RECEIVED, _SEQUENCE, _STAMP, _VALUES = range(5)  # columns, the last with all others
+_MOST_PUBLISHERS = 10  # of a topic, one after the other or at once
 _NAN = np.float64(np.nan).view(np.int64)
 _ALL = slice(None)
 Rows = slice | NDArray[np.intp]
@@ -237,9 +238,13 @@ class TopicMessages:
         self._stores: list[_Store] = []
         self._last: _Store | None = None  # that of the last message
         self._unreadable: dict[int, MessageError] = {}
+        self._next: list[int] = []  # sequence number of each publisher, that of the last one last
+        self._missed = self._before = 0
 
     def add(self, message: BagMessage) -> None:
         """Add a message."""
+        if message.sequence:
+            self._count(message.sequence)
         if self.type not in (JOINT_STATE, FLOAT64_MULTI_ARRAY):
             self.raw.append(message.raw)
             self.received.append(message.received)
@@ -249,6 +254,27 @@ class TopicMessages:
             if self._last is not None:
                 self._last.add(self.size, message)
         self.size += 1
+
+    def _count(self, sequence: int) -> None:
+        """Count the messages that are missing before the one with this number."""
+        if self._next and self._next[-1] == sequence:
+            self._next[-1] += 1
+        elif len(self._next) <= _MOST_PUBLISHERS:
+            expected = max((number for number in self._next if number <= sequence), default=0)
+            if expected:
+                self._next.remove(expected)
+                self._missed += sequence - expected
+            else:  # of another publisher
+                self._before += sequence - 1
+            self._next.append(sequence + 1)
+
+    @property
+    def lost(self) -> str:
+        """How many messages are missing, by their numbers; empty if none, or if unknown."""
+        if len(self._next) > _MOST_PUBLISHERS or not self._missed + self._before:
+            return ''
+        earlier = f', {self._before} sent before the recorder connected' if self._before else ''
+        return f'{self._missed} missed{earlier}'
 
     def _store_of(self, raw: bytes) -> _Store | None:
         for store in self._stores[-_RECENT:]:

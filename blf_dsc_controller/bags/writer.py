@@ -15,7 +15,7 @@ import yaml
 from mcap.writer import CompressionType, Writer
 
 from blf_dsc_controller import __version__
-from blf_dsc_controller.bags.sources import MESSAGES, METADATA, RECORD, VERSION, BagError
+from blf_dsc_controller.bags.sources import METADATA, RECORD, VERSION, BagError
 from blf_dsc_controller.messages.codecs import NANOSECONDS, Definition, definition
 from blf_dsc_controller.messages.topics import FOREVER, Quality
 
@@ -232,45 +232,3 @@ class BagWriter(AbstractContextManager['BagWriter']):
         self._end_chunk()
         self._writer.finish()  # type: ignore[no-untyped-call]
         self._stream.close()
-
-
-class Losses:
-    """Counter of one topic's published but unrecorded messages, by sequence number.
-
-    Each publisher numbers its own messages: losses of a topic that ever had several are unknown.
-    """
-
-    def __init__(self, publishers: int) -> None:
-        self.missed: int | None = 0  # between recorded ones; None if unknown
-        self.before = 0  # sent by a publisher before its first recorded one
-        self._last = 0
-        self.publishers_seen(publishers)
-
-    def publishers_seen(self, publishers: int) -> None:
-        """Update the number of publishers."""
-        if publishers > 1:
-            self.missed, self.before = None, 0
-
-    def count(self, sequence: int) -> None:
-        """Count a message; a number that is not higher than the last means a new publisher."""
-        if self.missed is not None:
-            if self._last and sequence > self._last:
-                self.missed += sequence - self._last - 1
-            else:
-                self.before += max(sequence - 1, 0)
-        self._last = sequence
-
-    def text(self) -> str:
-        """Return the text that follows the number of recorded messages."""
-        if self.missed is None:
-            return ''
-        earlier = f', {self.before} sent before the recorder connected' if self.before else ''
-        return f', {self.missed} missed{earlier}'
-
-
-def statistics(written: Mapping[str, int], losses: Mapping[str, Losses]) -> dict[str, str]:
-    """Return facts that state how many messages of each topic were written and lost."""
-    return {
-        f'{MESSAGES}{topic}': f'{count} written{losses[topic].text()}'
-        for topic, count in written.items()
-    }

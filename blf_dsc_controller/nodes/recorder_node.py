@@ -10,7 +10,7 @@ from functools import partial
 from typing import Any
 
 from blf_dsc_controller.bags.sources import BagError
-from blf_dsc_controller.bags.writer import BagWriter, Losses, statistics
+from blf_dsc_controller.bags.writer import BagWriter
 from blf_dsc_controller.configuration.nodes import RecorderConfig
 from blf_dsc_controller.messages.codecs import (
     MessageError,
@@ -46,8 +46,7 @@ class BagRecorderNode(PlainNode):
         self._config = declare(self, RecorderConfig)
         self._chosen = {self.resolve_topic_name(name) for name in self._config.topics}
         self._raw_subscriptions = RawSubscriptions(self, self._config.queue_depth)
-        self._losses: dict[str, Losses] = {}
-        self._losses_by_handle: dict[int, Losses] = {}
+        self._recorded: set[str] = set()
         self._skipped: set[str] = set()
         self._joint_states = self.resolve_topic_name(JOINT_STATES.relative)
         self._handle_of_states = 0
@@ -71,7 +70,6 @@ class BagRecorderNode(PlainNode):
             return
         for message in self._waiting:  # there was no joint state
             self._bag.write(*message)
-        self._bag.note(statistics(self._bag.message_counts, self._losses))
         self._bag.close()
         for line in self._summary():
             self.get_logger().info(line)
@@ -86,9 +84,7 @@ class BagRecorderNode(PlainNode):
             )
             return
         for topic, types in found:
-            if topic in self._losses:
-                self._losses[topic].publishers_seen(self.count_publishers(topic))
-            elif topic not in self._skipped and self._wanted(topic):
+            if topic not in self._recorded | self._skipped and self._wanted(topic):
                 self._offer_topic(topic, types)
 
     def _wanted(self, topic: str) -> bool:
@@ -115,7 +111,7 @@ class BagRecorderNode(PlainNode):
             return
         offered = [quality_of(each.qos_profile) for each in publishers]
         handle = self._bag.add_topic(topic, types[0], offered)
-        self._losses[topic] = self._losses_by_handle[handle] = Losses(len(offered))
+        self._recorded.add(topic)
         self._raw_subscriptions.subscribe(topic, types[0], offered, handle)
         if topic == self._joint_states:
             self._handle_of_states = handle
@@ -131,7 +127,6 @@ class BagRecorderNode(PlainNode):
             return
         try:
             for message in self._timed(self._raw_subscriptions.take()):
-                self._losses_by_handle[message.handle].count(message.sequence)
                 self._bag.write(*message)
             (self._bag.flush if flush else self._bag.flush_if_due)()
         except OSError as error:
@@ -163,10 +158,10 @@ class BagRecorderNode(PlainNode):
         return timed
 
     def _summary(self) -> Iterator[str]:
-        for topic in self._chosen.difference(self._losses, self._skipped):
+        for topic in self._chosen.difference(self._recorded, self._skipped):
             yield f'{topic}: never appeared'
         for topic, count in self._bag.message_counts.items():
-            yield f'{topic}: {count} messages{self._losses[topic].text()}'
+            yield f'{topic}: {count} messages'
 
 
 main = partial(run, BagRecorderNode)
