@@ -87,7 +87,7 @@ def test_named_arm_of_a_dead_controller_comes_to_rest(preset, angle, armed):
     for k in range(death + round(3.0 / T)):
         now, measurement = k * T, plant.measure().copy()
         if k == death:
-            start = plant.truth()[-2 * n : -n]
+            start = plant.truth()[-2 * n : -n].copy()
             assert np.abs(measurement[n : 2 * n]).max() > 0.3
         if k < death:
             torque = guard.update(START + k * loop.controller.sample_time_ns, measurement).copy()

@@ -250,7 +250,7 @@ def test_limit_changed_at_run_time_stops_the_arm_and_its_reference_begins_anew()
     rig.step(50)
     assert rig.guard.time > 0.2
     rig.guard.retune(change(rig.guard.config, {'safety.error_ratio': 1e-3}))
-    rig.step(20)
+    rig.step()
     assert rig.supervisor.reason is Reason.OUTSIDE_BOUND
     rig.guard.retune(rig.config)
     rig.guard.activate()
