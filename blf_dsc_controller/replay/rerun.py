@@ -8,7 +8,6 @@ Both together give the exact order of messages and events; what was dropped has 
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Mapping, Sequence
 
 import numpy as np
@@ -48,16 +47,14 @@ class Outputs:
         self._telemetry = ControllerTelemetry(guard.config, self._estimates)
         self.samples = self.safe_torques = 0
         self.first = self.last = -1
-        self._sent: Counter[Topic] = Counter()
         self.topics: dict[Topic, TopicMessages] = {}
 
     def _add(self, stamp: int, message: Message, number: int = 0) -> None:
         topic, raw = message
-        self._sent[topic] += 1
         if topic not in self.topics:
             self.topics[topic] = TopicMessages(topic.resolved, topic.type)
-        added = BagMessage(topic.resolved, stamp, raw, number or self._sent[topic])
-        self.topics[topic].add(added)
+        messages = self.topics[topic]
+        messages.add(BagMessage(topic.resolved, stamp, raw, number or messages.size + 1))
 
     def add_sample(self, stamp: int) -> None:
         """Add the last sample of the law, for the state with this stamp [ns]."""
