@@ -16,10 +16,11 @@ import os
 import platform
 import re
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import suppress
 from itertools import groupby
 from pathlib import Path
-from typing import NamedTuple
+from typing import NamedTuple, TextIO
 
 import numpy as np
 
@@ -72,16 +73,12 @@ def interleaved(contestants: Mapping[str, Callable[[], int]], rounds: int) -> di
     return {name: np.array(values) for name, values in seconds.items()}
 
 
-def table_lines(heads: Sequence[str], rows: Iterable[Sequence[str]]) -> Iterator[str]:
-    """Yield the lines of a Markdown table."""
-    for row in itertools.chain([heads, ['---'] * len(heads)], rows):
-        yield f'| {" | ".join(row)} |'
-
-
-def print_table(heads: Sequence[str], rows: Iterable[Sequence[str]]) -> None:
+def print_table(
+    heads: Sequence[str], rows: Iterable[Sequence[str]], file: TextIO | None = None
+) -> None:
     """Print a Markdown table, each row as soon as it is known."""
-    for line in table_lines(heads, rows):
-        print(line, flush=True)
+    for row in itertools.chain([heads, ['---'] * len(heads)], rows):
+        print(f'| {" | ".join(row)} |', file=file, flush=True)
 
 
 def machine() -> str:
@@ -90,24 +87,9 @@ def machine() -> str:
     model = models[0] if models else 'unknown processor'
     versions = [f'Python {platform.python_version()}', f'blf_dsc_controller {__version__}']
     for package in _PACKAGES:
-        try:
+        with suppress(importlib.metadata.PackageNotFoundError):
             versions.append(f'{package} {importlib.metadata.version(package)}')
-        except importlib.metadata.PackageNotFoundError:
-            versions.append(f'{package} absent')
     return f'{model}, {os.cpu_count()} cores, {platform.system()}; {", ".join(versions)}'
-
-
-def table(rows: list[Ratio]) -> str:
-    """Return Markdown with a table for each group."""
-    lines: list[str] = []
-    for group, members in groupby(rows, key=lambda row: row.group):
-        cells = (
-            (row.what, f'**{row.median:.3g}**', f'{row.low:.3g} to {row.high:.3g}', *row[-2:])
-            for row in members
-        )
-        lines += ['', f'## {group}', '']
-        lines += table_lines(('what', 'ratio', 'range', 'to', ''), cells)
-    return '\n'.join(lines) + '\n'
 
 
 def main() -> None:
@@ -125,14 +107,21 @@ def main() -> None:
             print(f'  {row.what}: {row.median:.3g} times {row.baseline}  {row.note}', flush=True)
             rows.append(row)
     today = dt.datetime.now(dt.timezone.utc).date()
-    text = (
-        '# Results of the benchmarks\n\n'
-        f'Written by `make bench` on {today}. Every figure is a ratio of two things measured in '
-        'turns in\nthe same run: median and range of its rounds. Absolute times are notes about '
-        f'one machine.\n\n{machine()}\n' + table(rows)
-    )
-    (chosen.out / 'RESULTS.md').write_text(text, encoding='utf-8')
-    print(f'written: {chosen.out / "RESULTS.md"}')
+    with (chosen.out / 'RESULTS.md').open('w', encoding='utf-8') as file:
+        file.write(
+            '# Results of the benchmarks\n\n'
+            f'Written by `make bench` on {today}. Every figure is a ratio of two things measured '
+            'in turns in\nthe same run: median and range of its rounds. Absolute times are notes '
+            f'about one machine.\n\n{machine()}\n'
+        )
+        for group, members in groupby(rows, key=lambda row: row.group):
+            file.write(f'\n## {group}\n\n')
+            cells = (
+                (row.what, f'**{row.median:.3g}**', f'{row.low:.3g} to {row.high:.3g}', *row[-2:])
+                for row in members
+            )
+            print_table(('what', 'ratio', 'range', 'to', ''), cells, file)
+    print(f'written: {file.name}')
 
 
 if __name__ == '__main__':
