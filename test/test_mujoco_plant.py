@@ -26,7 +26,7 @@ from blf_dsc_controller.configuration.schema import build, change
 from blf_dsc_controller.nodes.controller_node import ControllerNode
 from blf_dsc_controller.simulation.loop import START
 from blf_dsc_controller.supervision.guard import Guard
-from sim_plant.plant import parameters_of, plant_of
+from sim_plant.plant import parameters_of, plant_of, plant_settings
 
 EXAMPLE = Path(__file__).parents[1] / 'examples/mujoco_plant/mujoco_plant.py'
 P = np.array([1.0, 0.32, 0.4])  # (m1+m2) l1^2, m2 l2^2, m2 l1 l2 of arm.xml
@@ -116,6 +116,17 @@ def swing(make, config):
     return rows
 
 
+def test_reset_repeats_the_run_and_loads_can_change(example):
+    config = build(PlantConfig, {'sensor.position_noise': 1e-6})
+    arm = example.MujocoArm(config)
+    first = swing(lambda _: arm, config)
+    arm.reset()
+    np.testing.assert_array_equal(swing(lambda _: arm, config), first)
+    arm.reset()
+    arm.change(plant_settings(change(config, {'load.payload': 0.5})))
+    assert np.abs(swing(lambda _: arm, config) - first)[:, 0].max() > 1e-3
+
+
 def test_closed_loop_runs_the_same_with_both_plants(example):
     """With every imperfection except dry friction and ripple, which differ over a sample."""
     loop = load_loop('panda')
@@ -157,6 +168,7 @@ def test_node_keeps_the_bound_and_learns_the_parameters(ros, example):
     guard = ros.add(ControllerNode, {'telemetry.enabled': False}).guard
     published = {'sensor.published_joints': ['joint2', 'gripper', 'joint1']}
     arm = ros.add(example.MujocoPlant, published, mode='lockstep')
+    assert isinstance(arm.plant, example.MujocoArm)
     ros.until(lambda: arm.plant.sample >= 8000 or guard.supervisor.text)
     assert not guard.supervisor.text
     assert guard.samples.ratio.max() < 1.0
