@@ -256,11 +256,11 @@ def test_table_of_recordings_has_a_row_for_a_folder_with_a_bag(
     plain, tmp_path, capsys, monkeypatch
 ):
     monkeypatch.syspath_prepend(str(Path(__file__).parents[1] / 'benchmark'))
-    recordings = importlib.import_module('recordings')
+    benchmark = importlib.import_module('identification')
     write_states(tmp_path / 'bag', PANDA, measured(plain[0], 3))
     (tmp_path / 'panda.urdf').write_text(PANDA_TEXT)
-    monkeypatch.setattr(sys, 'argv', ['recordings.py', str(tmp_path)])
-    recordings.main()
+    monkeypatch.setattr(sys, 'argv', ['identification.py', 'recordings', str(tmp_path)])
+    benchmark.main()
     row = next(line for line in capsys.readouterr().out.splitlines() if line.startswith('| bag '))
     cells = [cell.strip() for cell in row.split('|')[1:-1]]
     urdf, least_squares, bounded, ours = (float(cells[k]) for k in (1, 3, 4, 5))
