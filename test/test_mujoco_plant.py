@@ -116,14 +116,14 @@ def swing(make, config):
     return rows
 
 
-def test_reset_repeats_the_run_and_loads_can_change(example):
+def test_reset_repeats_the_run_and_disturbances_can_change(example):
     config = build(PlantConfig, {'sensor.position_noise': 1e-6})
     arm = example.MujocoArm(config)
     first = swing(lambda _: arm, config)
     arm.reset()
     np.testing.assert_array_equal(swing(lambda _: arm, config), first)
     arm.reset()
-    arm.change(plant_settings(change(config, {'load.payload': 0.5})))
+    arm.change(plant_settings(change(config, {'disturbance.amplitude': [9.0, 9.0]})))
     assert np.abs(swing(lambda _: arm, config) - first)[:, 0].max() > 1e-3
 
 
