@@ -3,16 +3,20 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import numpy as np
 import pytest
 
 pytest.importorskip('rclpy', reason='needs ROS 2')
 
+from rclpy.node import Node
 from ros_rig import FakeClock, activate, cleanup, configure, deactivate, torques, values
 
 import blf_dsc_controller.nodes.plant_node
 from blf_dsc_controller.messages import topics
 from blf_dsc_controller.nodes.controller_node import ControllerNode
+from blf_dsc_controller.nodes.endpoints import message_class
 from blf_dsc_controller.nodes.plant_node import PlantNode
 
 SECOND = 1_000_000_000  # ns
@@ -43,6 +47,21 @@ def test_nodes_without_autostart_do_nothing_until_a_manager_starts_them(ros):
     assert not commands
     assert activate(ros, law)
     assert_runs(ros, arm, law)
+
+
+def test_loop_waits_for_a_recorder_and_not_for_any_listener(ros):
+    waiting = {'wait_for_subscribers': 1}
+    arm, _ = ros.loop(waiting, waiting | {'telemetry__enabled': False})
+    outputs = topics.JOINT_STATES, topics.TRUTH, topics.COMMANDS
+    listener = ros.add(partial(Node, 'listener'))
+    for topic in outputs:
+        type_ = message_class(topic.type)
+        listener.create_subscription(type_, topic.resolved, lambda _: None, 10)
+    ros.spin(0.5)
+    assert arm.plant.sample == 0
+    for topic in outputs:
+        ros.listen(topic)
+    ros.until(lambda: arm.plant.sample > 0)
 
 
 def test_impossible_transition_is_rejected_and_the_loop_goes_on(ros):
