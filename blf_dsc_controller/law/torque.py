@@ -38,9 +38,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from blf_dsc_controller.arms.serial_chain import fill_regressor
+from blf_dsc_controller.arms.model import regressors_at
+from blf_dsc_controller.arms.serial_chain import SerialChain, fill_regressor
 from blf_dsc_controller.compiled.elementary import sin
-from blf_dsc_controller.compiled.jit import inner, kernel
+from blf_dsc_controller.compiled.jit import inner
 from blf_dsc_controller.compiled.layout import Array, part
 from blf_dsc_controller.law import barrier
 from blf_dsc_controller.law.settings import EFFORT, LINEAR, Settings
@@ -51,9 +52,13 @@ RATE_CUT = 2.0
 
 
 @inner
-def smooth_sign(x: float) -> float:
-    """Return sat(x): x limited to [-1, 1]."""
-    return min(1.0, max(-1.0, x))
+def clip(x: float, low: float, high: float) -> float:
+    """Limit x to [low, high]; NaN passes through."""
+    if x < low:
+        return low
+    if x > high:
+        return high
+    return x
 
 
 @inner
@@ -71,7 +76,7 @@ def feedback(settings: Settings, state: State, signals: Signals, i: int) -> floa
     """Return the feedback of joint i [N m]: barrier (16), robust term and damping of (28), (35)."""
     robust = settings.d2[i] * abs(signals.xi1[i]) + settings.mu_bar[i]
     torque = settings.Kp[i] * signals.xi2[i]
-    torque += robust * smooth_sign(signals.xi2[i] / settings.boundary_layer)
+    torque += robust * clip(signals.xi2[i] / settings.boundary_layer, -1.0, 1.0)
     if settings.surface == LINEAR:
         return float(-torque - settings.weight[i] * signals.xi1[i])
     slope = barrier.gradient(
@@ -133,27 +138,11 @@ def find_applied(settings: Settings, state: State, signals: Signals, measurement
 
 def added_torque(settings: Settings, q: Array) -> Array:
     """Return G_d(q) (n,) [N m] at a position q (n,)."""
-    added = np.zeros(settings.n)
-    if settings.drive:
-        H, still = np.zeros((settings.n, settings.drive)), np.zeros(settings.n)
-        _fill_gravity(settings.drive_chain, q, still, H)
-        added[:] = H @ settings.drive_inertias
-    return added
-
-
-@kernel
-def _fill_gravity(chain: Array, q: Array, still: Array, H: Array) -> None:
-    fill_regressor(chain, q, still, still, still, H)
-
-
-@inner
-def clip(x: float, low: float, high: float) -> float:
-    """Limit x to [low, high]; NaN passes through."""
-    if x < low:
-        return low
-    if x > high:
-        return high
-    return x
+    if settings.drive == 0:
+        return np.zeros(settings.n)
+    chain = SerialChain(settings.n, settings.drive, settings.drive_chain)
+    (H,) = regressors_at(chain, q[np.newaxis], *np.zeros((3, 1, settings.n)))
+    return np.asarray(H @ settings.drive_inertias)
 
 
 @inner
