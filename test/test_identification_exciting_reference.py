@@ -82,6 +82,8 @@ def test_search_keeps_its_limits_is_repeatable_and_beats_random_motions(n, seed)
     if problem.n == 2:
         np.testing.assert_array_equal(search(problem, seed, 1), x)
         assert reached.ratios[1].max() > 0.9  # the velocity limit is active
+        amplitude = np.reshape(problem.parameters(x)['amplitude'], (n, 2))  # at 1 rad/s
+        assert (np.hypot(*amplitude.T) <= (0.95 * 0.5, 0.95 * 0.8)).all()
     random = np.random.default_rng(0)
     others = [problem.evaluate(problem.parameters(problem.start(random))) for _ in range(100)]
     allowed = [other.gain for other in others if other.is_allowed]
