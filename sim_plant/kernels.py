@@ -115,7 +115,3 @@ def plant_truth(arm: Arm, settings: Array, state: Array, out: Array) -> None:
     """Call `truth` with packed vectors."""
     plant, now = plant_views(arm, settings, state)
     truth(plant, now, out)
-
-
-KERNELS = (observe_plant, step_plant, plant_truth)
-"""Plant kernels that are called from Python; compiled before the node starts."""

@@ -268,18 +268,19 @@ from blf_dsc_controller.configuration.nodes import load_loop
 from blf_dsc_controller.law.controller import update
 from blf_dsc_controller.messages.codecs import _read
 from blf_dsc_controller.reference.terms import _sample
-from sim_plant.kernels import KERNELS
+from sim_plant.kernels import observe_plant, plant_truth, step_plant
 
 if __name__ == '__main__':  # the command has processes of its own
     config = load_loop('recommended')
     run._compile(config.controller)
     run._compile(config.plant)
-    for kernel in (update, _read, _sample, *KERNELS):
+    of_plant = observe_plant, step_plant, plant_truth
+    for kernel in (update, _read, _sample, *of_plant):
         print(kernel.__name__, len(kernel.signatures))
     assert main(['precompile', '--config', 'recommended']) == 0
     jit.SHIPPED = Path(sys.argv[1])
     assert main(['precompile', '--config', 'recommended', '--package']) == 0
-    for kernel in (update, *KERNELS):
+    for kernel in (update, *of_plant):
         assert list(jit.SHIPPED.glob(f'*/*.{kernel.__name__}-*.nbc')), kernel
 """
 

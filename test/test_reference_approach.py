@@ -183,14 +183,6 @@ REPEATED = {'reference.times': [0.0, 1.0, 1.0], 'reference.points': [0.0] * 6}
 SWINGING = {'reference.phase': [-np.pi / 2]}  # passes its middle at 0.3 rad/s at t = 0
 
 
-def test_start_at_rest_on_a_moving_reference_leads_to_an_approach():
-    config = build(ControllerConfig, SWINGING)
-    t, qr, _, xi1, torque = run(config, config.reference.offset, 4.0)
-    assert np.abs(xi1).max() < 0.5 * BOUND
-    assert np.abs(torque).max() < 15.0  # 12 N m are gravity; the limit is 20
-    np.testing.assert_allclose(qr[-1], at(reference_of(config), t[-1])[0], atol=1e-14)
-
-
 def test_start_that_is_too_slow_is_rejected_if_approaches_are_disabled():
     config = build(ControllerConfig, SWINGING | {'approach.enabled': False})
     law = controller_of(config)
