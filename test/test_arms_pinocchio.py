@@ -10,7 +10,7 @@ from closed_loop_case import MODEL
 from random_arm import ARMS, chain_of, configuration, pinocchio_model
 
 from blf_dsc_controller.arms.base_parameters import base_parameters
-from blf_dsc_controller.arms.geometry import skeleton
+from blf_dsc_controller.arms.geometry import frames
 from blf_dsc_controller.arms.model import inertia_matrices, regressors_at
 from blf_dsc_controller.arms.serial_chain import ROTOR, serial_chain
 from sim_plant.rigid_body import (
@@ -59,7 +59,11 @@ def test_chain_and_its_placements_agree_with_pinocchio(name):
     assert [joint.name for joint in chain.joints] == list(model.names[1:])
     same(chain.tip_placement, model.frames[case.tip].placement.homogeneous)
     pinocchio.framesForwardKinematics(*case.theirs)
-    corners, axes = skeleton(chain, case.q)
+    placements = np.array(frames(chain, case.q))
+    corners = placements[:, :3, 3]
+    axes = np.array(
+        [at[:3, :3] @ joint.axis for at, joint in zip(placements[1:-1], chain.joints, strict=True)]
+    )
     same(corners[0], np.zeros(3))
     same(corners[-1], case.data.oMf[case.tip].translation)
     for i, joint in enumerate(chain.joints):

@@ -9,7 +9,7 @@ import pytest
 from plants import ARM
 from random_arm import chain_of
 
-from blf_dsc_controller.arms.geometry import Clearance, distance, skeleton, tip_radius
+from blf_dsc_controller.arms.geometry import Clearance, distance, frames
 from blf_dsc_controller.arms.model import arm_model, regressors_at
 from blf_dsc_controller.arms.serial_chain import serial_chain
 from blf_dsc_controller.arms.two_link import urdf
@@ -32,8 +32,7 @@ def test_urdf_of_two_links_is_the_same_arm():
     states = np.random.default_rng(0).normal(size=(4, 20, 2))
     found, expected = regressors_at(ours, *states) @ P, regressors_at(theirs, *states) @ phi
     np.testing.assert_allclose(found, expected, atol=1e-7)  # points have 1e-9 kg m^2 in it
-    corners = skeleton(chain, np.zeros(2))[0]
-    np.testing.assert_allclose(corners[-1], (1.8, 0.0, 0.0))
+    np.testing.assert_allclose(frames(chain, np.zeros(2))[-1][:3, 3], (1.8, 0.0, 0.0))
 
 
 @pytest.mark.parametrize('arm', [ARM, PointMassArm(l1=0.7, l2=1.1, m1=1.3, m2=0.4, g=9.81)])
@@ -56,14 +55,6 @@ def test_two_links_are_the_arm_of_section_iv(arm):
     assert model.parameter_units == ('kg m^2',) * 3
     inner, outer = arm.m1 + arm.m2, arm.m2
     assert pytest.approx([inner * arm.l1**2, outer * arm.l2**2, outer * arm.l1 * arm.l2]) == P
-
-
-def test_tip_radius_is_the_sum_of_what_each_joint_moves_the_tip():
-    chain, random, h = chain_of('six'), np.random.default_rng(0), 1e-5
-    q, bound = random.uniform(-1.0, 1.0, 6), random.uniform(1e-3, 2e-3, 6)
-    tips = [skeleton(chain, q + step)[0][-1] for step in h * np.vstack((np.eye(6), -np.eye(6)))]
-    reach = np.linalg.norm(np.subtract(tips[:6], tips[6:]), axis=1) / (2.0 * h)
-    np.testing.assert_allclose(tip_radius(chain, q, bound), reach @ bound, rtol=1e-8)
 
 
 def panda(radius=0.07, floor=0.0):

@@ -82,11 +82,11 @@ def test_snapshots_hold_the_values_of_the_bag(player):
     assert player.snapshots[0].estimate[:3] == pytest.approx([0.5, 0.16, 0.2], rel=0.1)
 
 
-def test_arm_ghost_bound_and_path_are_drawn(player):
+def test_arm_ghost_and_path_are_drawn(player):
     player.slider.value = 1.5
     player.update(0.0)
     drawn = nodes(player._page)
-    assert {'/bound', '/path', '/payload'} <= drawn
+    assert {'/path', '/payload'} <= drawn
     for root in ('/arm', '/reference'):
         assert sum(name.startswith(root) for name in drawn) > 5
     plot = player._page._plots[0].data

@@ -38,27 +38,6 @@ def frames(chain: Chain, q: np.ndarray) -> list[np.ndarray]:
     return [*placements, placements[-1] @ chain.tip_placement]
 
 
-def skeleton(chain: Chain, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return base, joints and tip (n + 2, 3) [m], and the joint axes (n, 3), at q (n,)."""
-    placements = np.array(frames(chain, q))
-    axes = [
-        placement[:3, :3] @ joint.axis
-        for placement, joint in zip(placements[1:-1], chain.joints, strict=True)
-    ]
-    return placements[:, :3, 3], np.array(axes)
-
-
-def tip_radius(chain: Chain, q: np.ndarray, bound: np.ndarray) -> float:
-    """Return the largest distance [m] of the tip from its reference while all bounds (n,) hold.
-
-    To first order: each joint rotates the tip about its axis, or slides it.
-    """
-    corners, axes = skeleton(chain, q)
-    reach = np.linalg.norm(np.cross(axes, corners[-1] - corners[1:-1]), axis=1)
-    slides = np.array([joint.kind == 'prismatic' for joint in chain.joints])
-    return float(np.where(slides, 1.0, reach) @ bound)
-
-
 class Clearance:
     """Clearance between the links of a chain, and between them and the floor.
 

@@ -22,7 +22,7 @@ import numpy as np
 
 from blf_dsc_controller.analysis.metrics import bodies_of, errors_of_bodies
 from blf_dsc_controller.analysis.panels import ALARM, COLOURS, GREEN, INK, MUTED, ORANGE
-from blf_dsc_controller.arms.geometry import frames, skeleton, tip_radius
+from blf_dsc_controller.arms.geometry import frames
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.errors import BlfDscError, MissingExtraError
 from blf_dsc_controller.law.factory import estimate_names, prior_covariance
@@ -241,19 +241,13 @@ class Page:
         with self.server.atomic():
             self._drawn.update_cfg(self._posture(now.position))
             if self._corners is None:
-                self._corners = self._transformed(skeleton(chain, now.position)[0])
+                self._corners = self._at(np.array(frames(chain, now.position)))
                 self._aim_all()
             tip = self._at(frames(chain, now.position)[-1])
             reference = now.position - now.error
             self._ghost.show_visual = bool(np.abs(now.error).max() > _APART)  # NaN: not
             if np.isfinite(reference).all():
                 self._ghost.update_cfg(self._posture(reference))
-                if np.isfinite(now.bound).all():
-                    radius = tip_radius(chain, reference, now.bound)
-                    at = self._at(frames(chain, reference)[-1])
-                    scene.add_icosphere(
-                        '/bound', radius, color=(230, 159, 0), opacity=0.35, position=at
-                    )
             scene.add_icosphere(
                 '/payload', 0.045 * reach, color=(213, 94, 0), position=tip, visible=now.loaded
             )
@@ -314,10 +308,7 @@ class Page:
 
     def _at(self, placement: Floats) -> Floats:
         """Return the origins (..., 3) of placements in the frame of the URDF's root."""
-        return self._transformed(placement[..., :3, 3])
-
-    def _transformed(self, points: Floats) -> Floats:
-        at: Floats = points @ self._base[:3, :3].T + self._base[:3, 3]
+        at: Floats = placement[..., :3, 3] @ self._base[:3, :3].T + self._base[:3, 3]
         return at
 
     def close(self) -> None:
