@@ -111,7 +111,9 @@ def test_loop_runs_after_resets_in_any_order(ros, order):
 def test_reset_of_both_nodes_repeats_the_run(ros):
     commands = ros.listen(topics.COMMANDS)
     clock = FakeClock()
-    arm, _ = ros.loop({'sensor__position_noise': 1e-5, 'seed': 3}, clock=clock)
+    arm, law = ros.loop({'sensor__position_noise': 1e-5, 'seed': 3}, clock=clock)
+    ros.spin(0.3)
+    assert not arm._offered  # peers need time to settle
     ros.until(lambda: clock.advance(0.01) or arm._offered)
     ros.run(arm, 100)
     begin = arm.stamp - arm.plant.elapsed_ns
@@ -123,6 +125,7 @@ def test_reset_of_both_nodes_repeats_the_run(ros):
     first = torques(commands)[:100]
     commands.clear()
     ros.until(lambda: clock.advance(0.01) or arm._offered)
+    assert law.guard.controller.samples < 50  # it has been reset before
     ros.until(lambda: len(commands) >= 100)
     np.testing.assert_array_equal(torques(commands)[:100], first)
 

@@ -125,6 +125,9 @@ def test_reflex_is_reported_and_lasts_until_a_reset(ros):
     node.reset()
     assert not node.plant.is_stopped
     ros.until(lambda: diagnostics[-1].status[0].message.startswith('braked'))
+    ros.until(lambda: len(received) == 4)
+    send((0.0, 0.0))
+    ros.until(lambda: diagnostics[-1].status[0].message == 'running')
 
 
 @pytest.mark.parametrize(
