@@ -18,65 +18,44 @@ _POSTURES = 181
 @inner
 def error_term(settings: Settings, state: State, signals: Signals) -> float:
     """Return the weighted barrier potential (3) of xi1 [J]; w z1^2 / 2 without a barrier."""
-    total = 0.0
+    total, xi1 = 0.0, signals.xi1
     for i in range(settings.n):
         if settings.surface == LINEAR:
-            total += 0.5 * settings.weight[i] * signals.xi1[i] ** 2
+            total += 0.5 * settings.weight[i] * xi1[i] ** 2
         else:
-            total += state.gain_scale[i] * barrier.potential(
-                signals.xi1[i],
-                signals.bound[i],
-                settings.weight[i],
-                settings.slope_limit[i],
-                signals.knee[i],
-            )
-    return total
-
-
-@inner
-def kinetic_term(settings: Settings, signals: Signals) -> float:
-    """Return xi2^T M xi2 / 2 [J], M xi2 = Yp(q, xi2) P; overwrites Yp and Yr in `signals`."""
-    settings.model.momentum_regressor(signals.q, signals.xi2, signals.momentum, signals.rest)
-    total = 0.0
-    for i in range(settings.n):
-        for j in range(settings.p):
-            total += 0.5 * signals.xi2[i] * signals.momentum[i, j] * settings.true_parameters[j]
-    return total
-
-
-@inner
-def parameter_term(settings: Settings, state: State) -> float:
-    """Return P~^T Gamma^-1 P~ / 2 of the parameters that are adapted (Gamma_j > 0)."""
-    total = 0.0
-    for j in range(settings.p):
-        if settings.Gamma[j] > 0.0:
-            error = settings.true_parameters[j] - state.estimate[j]
-            total += 0.5 * error * error / settings.Gamma[j]
-    return total
-
-
-@inner
-def disturbance_term(settings: Settings, state: State, signals: Signals) -> float:
-    """Return (tau_dist - d^3)^2 / (2 gamma) of the joints whose d^3 is adapted (gamma > 0)."""
-    total = 0.0
-    for i in range(settings.n):
-        if settings.gamma[i] > 0.0:
-            error = signals.known[i] - state.disturbance[i]
-            total += 0.5 * error * error / (state.gain_scale[i] * settings.gamma[i])
+            bound, knee = signals.bound[i], signals.knee[i]
+            weight, limit = settings.weight[i], settings.slope_limit[i]
+            total += state.gain_scale[i] * barrier.potential(xi1[i], bound, weight, limit, knee)
     return total
 
 
 @inner
 def fill_energies(settings: Settings, state: State, signals: Signals, sample: Sample) -> None:
-    """Compute the terms of (29) for the telemetry sample; NaN where the truth is unknown."""
-    sample.lyapunov[0] = error_term(settings, state, signals)
-    if settings.truth_known == 1:
-        sample.lyapunov[1] = kinetic_term(settings, signals)
-        sample.lyapunov[2] = parameter_term(settings, state)
-        sample.lyapunov[3] = disturbance_term(settings, state, signals)
-    else:
-        for k in range(1, 4):
-            sample.lyapunov[k] = nan
+    """Compute the terms of (29) for the telemetry sample; NaN where the truth is unknown.
+
+    After the error's: xi2^T M xi2 / 2, where M xi2 = Yp(q, xi2) P; P~^T Gamma^-1 P~ / 2 of the
+    parameters that are adapted (Gamma_j > 0); (tau_dist - d^3)^2 / (2 gamma) of the joints whose
+    d^3 is adapted (gamma > 0), all in J.  Overwrites Yp and Yr in `signals`.
+    """
+    n, p, V = settings.n, settings.p, sample.lyapunov
+    V[0] = error_term(settings, state, signals)
+    for k in range(1, 4):
+        V[k] = 0.0 if settings.truth_known == 1 else nan
+    if settings.truth_known == 0:
+        return
+    P, Yp = settings.true_parameters, signals.momentum
+    settings.model.momentum_regressor(signals.q, signals.xi2, Yp, signals.rest)
+    for i in range(n):
+        for j in range(p):
+            V[1] += 0.5 * signals.xi2[i] * Yp[i, j] * P[j]
+    for j in range(p):
+        if settings.Gamma[j] > 0.0:
+            error = P[j] - state.estimate[j]
+            V[2] += 0.5 * error * error / settings.Gamma[j]
+    for i in range(n):
+        if settings.gamma[i] > 0.0:
+            error = signals.known[i] - state.disturbance[i]
+            V[3] += 0.5 * error * error / (state.gain_scale[i] * settings.gamma[i])
 
 
 def largest_inertia(settings: Settings) -> float:
