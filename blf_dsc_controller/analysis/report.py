@@ -9,7 +9,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from operator import itemgetter
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from jinja2 import Environment, PackageLoader, StrictUndefined
@@ -160,34 +160,26 @@ def write_report(bags: Sequence[ReportedBag], path: Path) -> None:
     events = sorted(
         (time, k, kind, text) for k, bag in enumerate(bags) for time, kind, text in bag.events
     )
-    parameters: list[tuple[str | Cell, ...]] = []
+    parameters = []  # name, value in each bag, and whether these differ
     for name in dict.fromkeys(name for bag in bags for name in bag.parameters):
         values = [bag.parameters.get(name, 'not recorded') for bag in bags]
-        parameters.append((Cell(name, 'marked' * (len(set(values)) > 1)), *values))
+        parameters.append((name, values, len(set(values)) > 1))
     write_page(
         path,
         'report.html',
         ' and '.join(bag.name for bag in bags),
         names=[bag.name for bag in bags],
         versions=sorted({bag.content.version or 'another recorder' for bag in bags}),
-        summaries=[
-            (bag.name, _colour(k), format_table(summarize(bag.run))) for k, bag in enumerate(bags)
-        ],
+        summaries=[format_table(summarize(bag.run)) for bag in bags],
         data={
             'panels': plots(panels([bag.run for bag in bags]), bags),
             'seconds': max(bag.run.duration for bag in bags),
         },
         pieces=PIECES,
         plotly=get_plotlyjs(),
-        events=[
-            (
-                Cell(f'{time:.3f} s', 'number'),
-                Cell(bags[k].name, colour=_colour(k)),
-                Cell(kind, 'bad' if kind in _ALARMING else ''),
-                text,
-            )
-            for time, k, kind, text in events
-        ],
+        colours=[_colour(k) for k in range(len(bags))],
+        events=events,
+        alarming=_ALARMING,
         parameters=parameters,
     )
 
@@ -239,17 +231,6 @@ def _numbers(values: Floats) -> list[float | None]:
 def _colour(k: int) -> str:
     """Return the colour of the k-th bag."""
     return COLOURS[k % len(COLOURS)]
-
-
-class Cell(NamedTuple):
-    """Table cell that is more than plain text.
-
-    Styles: number, bad; marked highlights the row.
-    """
-
-    text: str
-    style: str = ''
-    colour: str = ''  # of a swatch before the text
 
 
 def write_page(path: Path, template: str, title: str, **values: object) -> None:
