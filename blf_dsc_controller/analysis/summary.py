@@ -211,7 +211,8 @@ def _sentences(summary: Summary) -> Iterator[str]:
         busy = ': the computer was too busy for real time (--mode lockstep waits)' * is_slow
         yield f'real time   {", ".join(figures)}{busy}'
     if summary['compute_time_us'] is not None:
-        yield f'law         {_microseconds(summary["compute_time_us"])}'
+        times = _microseconds(summary['compute_time_us'])
+        yield f'law         {times} of the longest update between two messages'
 
 
 def _learning_lines(learning: Summary) -> Iterator[str]:
