@@ -149,3 +149,19 @@ def test_torque_fades_when_the_states_stop_too_and_a_new_controller_is_waited_fo
     assert not rig.line.active
     rig.step(200)
     assert not rig.line.active
+
+
+def test_torque_is_finite_and_within_its_rate_from_what_the_controller_commanded():
+    """Polled every 4 ms, by the rate of a sample of 1 ms; an unknown torque is not continued."""
+    limited = AT_REST | {'torque.rate_limit': [300.0, 300.0]}
+    rig, restarted = Watched(limited), Watched(limited)
+    restarted.line, restarted.dead = SecondLine(rig.config, TIMEOUT, armed=True), True
+    rig.step(100)
+    last = np.array([20.0, np.nan])
+    rig.line.torque_of_controller(last, rig.plant.sample * 1e-3)
+    rig.dead = True
+    for each in (rig, restarted):
+        each.step(100)
+    steps = np.diff([np.nan_to_num(last), *rig.taken], axis=0)
+    assert np.abs(steps).max() == pytest.approx(0.3)
+    assert np.abs(restarted.taken[0]).min() > 1.0  # half of gravity
