@@ -35,7 +35,7 @@ from blf_dsc_controller.messages.topics import COMMANDS, JOINT_STATES
 from blf_dsc_controller.nodes.endpoints import message_class, qos_profile
 from blf_dsc_controller.simulation.loop import simulate
 
-_ROUNDS = 3
+_ROUNDS = 7
 _STARTS = 2
 _STEPS = 2000
 _WARM_UP = 500

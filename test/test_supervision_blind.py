@@ -113,6 +113,20 @@ def test_gravity_is_held_in_silence_only_for_the_fade_time(calls, phase):
     assert rig.supervisor.phase is (Phase.TRACKING if phase is Phase.STARTING else phase)
 
 
+def test_torque_that_fades_in_silence_fades_on_after_a_reset():
+    rig = Rig(HOLDING | {'safety.fade_time': 0.2}, live=True)
+    rig.step(20)
+    rig.wait(60)
+    assert (np.abs(rig.commands[-1]) > 1.0).all()
+    rig.guard.reset()
+    rig.wait(1000)
+    assert rig.commands[-1].tolist() == [0.0, 0.0]
+    assert rig.supervisor.phase is Phase.STARTING
+    rig.base += rig.steady - 5_000_000_000
+    rig.step(1)
+    assert rig.supervisor.running
+
+
 def test_after_a_long_silence_nothing_is_commanded_until_a_reset():
     """By then the torque has faded: whoever restarted the driver may not expect another."""
     rig = Rig(HOLDING, live=True)
