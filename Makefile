@@ -79,7 +79,7 @@ test-browser: $(READY)-test ## Test the pages of report and view in a headless C
 	@BROWSER_TESTS=1 $(RUN) -m pytest -rs test/test_browser.py
 
 pictures: $(READY)-test ## Make the README's animation, doc/view.webp, with a headless Chromium
-	@$(PIP_INSTALL) --quiet playwright || $(PIP_FAILED)
+	@$(PIP_INSTALL) --quiet playwright -e '.[meshes]' --no-build-isolation || $(PIP_FAILED)
 	@PYTHONPATH="$(CURDIR):$(CURDIR)/test" $(VENV)/bin/python test/view_pictures.py
 
 test-nightly: ## Run all tests, those left out by make test as well, at length and with random examples
