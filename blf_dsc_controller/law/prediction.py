@@ -10,9 +10,8 @@ filters the noise of the difference quotient.  No acceleration is needed.
 
 `lambda`.  The paper's (24): X = H(q, dq, alpha2, alpha2'), u = Lambda tau with the scalar
 Lambda = x^T y / x^T x,  x = [xi2'^ + alpha2'; xi2 + alpha2; 1],  y = [alpha2'; alpha2; 1], and
-xi2'^ from the filter (8).  Since
-tau = [M C G] x and H P = [M C G] y, this is exact only where y is parallel to x: its error is of
-first order in xi2 and xi2', and depends on the units.
+xi2'^ from the filter (8).  Since tau = [M C G] x and H P = [M C G] y, this is exact only where y is
+parallel to x: its error is of first order in xi2 and xi2', and depends on the units.
 
 Besides P, the learning estimates the coefficients d of the disturbance columns
 

@@ -77,8 +77,13 @@ class ControllerTelemetry:
         self._bound = JointStateEncoder(joints, ('position', 'effort'))
         self._monitor = JointStateEncoder(names, ('position',))
         self._parts = attrgetter(*parts)
-        self._decimation, self._samples = config.telemetry.decimation, 0
-        self._sent, self._slowest = np.zeros(len(joints)), 0.0  # bound and update time
+        self._decimation = config.telemetry.decimation
+        self.restart()
+
+    def restart(self) -> None:
+        """Send everything with the next sample, as with the first one."""
+        self._samples, self._slowest = 0, 0.0
+        self._sent = np.empty(0)  # bound
 
     def command(self, torque: np.ndarray) -> Message:
         """Encode the commanded torque (n,) [N m]."""

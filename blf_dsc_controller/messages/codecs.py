@@ -3,11 +3,10 @@
 
 Plain CDR, version 1, little-endian, as ROS 2 sends it on all processors that it supports: two bytes
 that say so, two unused, then the fields, each number aligned to its own size, from the fifth byte
-on. Padding bytes, and bytes after the
-last field, may hold anything. An encoder serialises a template once and then only overwrites its
-numbers. A decoder finds the values once and keeps their places for as long as the messages have the
-same names and lengths, which a kernel compares as it reads them. Messages of all other types are
-left to the library rosbags.
+on. Padding bytes, and bytes after the last field, may hold anything. An encoder serialises a
+template once and then only overwrites its numbers. A decoder finds the values once and keeps their
+places for as long as the messages have the same names and lengths, which a kernel compares as it
+reads them. Messages of all other types are left to the library rosbags.
 """
 
 from __future__ import annotations

@@ -252,7 +252,7 @@ class ControllerNode(LoopNode[ControllerConfig]):
         if not self.config.telemetry.enabled:
             return
         if samples == 1:
-            self._telemetry = ControllerTelemetry(self.config, self._estimates)
+            self._telemetry.restart()
         limit, ratio = controller.settings.torque_limit, guard.samples.ratio
         for message in self._telemetry.sample(
             stamp, sample, limit, ratio, guard.compute_time, heard=self._heard

@@ -43,8 +43,8 @@ class Outputs:
     """
 
     def __init__(self, guard: Guard) -> None:
-        self._guard, self._estimates = guard, estimate_names(guard.config)
-        self._telemetry = ControllerTelemetry(guard.config, self._estimates)
+        self._guard = guard
+        self._telemetry = ControllerTelemetry(guard.config, estimate_names(guard.config))
         self.samples = self.safe_torques = 0
         self.first = self.last = -1
         self.topics: dict[Topic, TopicMessages] = {}
@@ -64,7 +64,7 @@ class Outputs:
             self.first = stamp
         self.last, self.samples = stamp, self.samples + 1
         if controller.samples == 1:
-            self._telemetry = ControllerTelemetry(guard.config, self._estimates)
+            self._telemetry.restart()
         limit = controller.settings.torque_limit
         for message in self._telemetry.sample(stamp, sample, limit, guard.samples.ratio, 0.0):
             self._add(stamp, message)
