@@ -156,6 +156,17 @@ def test_error_of_the_oracle_is_the_lag_of_the_surface_filter(time_constant, gai
     np.testing.assert_allclose(loop.largest(1.0), expected, rtol=0.05)
 
 
+def test_lyapunov_function_of_the_oracle_decreases_to_the_floor_of_the_lag():
+    """(17): V decreases in every sample until only the barrier's energy of the lag remains."""
+    loop = run(configured('model_based', 8.0))
+    V = loop.lyapunov.sum(axis=1)
+    lag = 1000.0 * np.sum(loop.xi1[loop.t >= 1.0] ** 2, axis=1).max()  # J, twice the energy
+    above = np.flatnonzero(10.0 * lag < V)
+    assert above[-1] > 50  # there is a decrease to check
+    assert np.all(np.diff(V[: above[-1] + 2]) < 0.0)
+    assert V[0] > 1e4 * V[loop.t >= 1.0].max()
+
+
 def test_settings_follow_the_configuration():
     """Learning waits for window and filters, tau_d + T_a of (26); columns have their own gain."""
     given = {'learning.window': 0.75, 'learning.settling_time': 0.25}
