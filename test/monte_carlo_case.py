@@ -35,7 +35,7 @@ monte_carlo:
       sensor.velocity: choice(measured, differenced)
       actuator.delay: integers(0, 3)
       initial.error: uniform(-0.9, 0.9)
-      initial.velocity_error: normal(0.0, 0.02)
+      initial.velocity_error: uniform(-0.02, 0.02)
       events.begin: ["uniform(0.05, 0.1)", "choice(0.2)"]
       events.payload: uniform(0.0, 0.2)
       events.torque: ["uniform(-0.5, 0.5)", "choice(0.0)", "uniform(-0.5, 0.5)", "choice(0.0)"]

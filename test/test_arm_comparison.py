@@ -10,26 +10,28 @@ import numpy as np
 import pytest
 from scipy.linalg import expm
 
+from blf_dsc_controller.arms.model import inertia_matrices
 from blf_dsc_controller.cli.main import main
 from blf_dsc_controller.configuration.nodes import LoopConfig, load_loop
 from blf_dsc_controller.configuration.robot import parameters_of
 from blf_dsc_controller.configuration.schema import change
-from blf_dsc_controller.law.factory import settings_of_config
+from blf_dsc_controller.law.factory import model_of, settings_of_config
 from blf_dsc_controller.reference import terms
 from blf_dsc_controller.reference.approach import reference_of
-from blf_dsc_controller.studies import arms as study
 from blf_dsc_controller.studies import laws
-from blf_dsc_controller.studies.arms import ROUGHEST, Result, cost_of, format_results, trial
 from blf_dsc_controller.studies.laws import (
     CONTENDERS,
     INTERVALS,
+    ROUGHEST,
     Figures,
+    Result,
     computed_torque,
-    joint_inertia,
+    cost_of,
+    format_results,
     law_changes,
-    pd_gravity,
     run,
     simulate_with,
+    trial,
 )
 from blf_dsc_controller.studies.monte_carlo import torque_rows
 
@@ -55,15 +57,19 @@ REST = {  # sinusoids of zero amplitude, as a hold would begin where the arm is
     'reference.offset': list(HOLD),
     'reference.amplitude': [0.0] * 18,
 }
+FRICTIONLESS = {'robot.viscous': [0.0] * 6, 'robot.coulomb': [0.0] * 6}
+GAINS = {'position': 900.0, 'velocity': 50.0, 'integral': 0.0}
+OFF = dict.fromkeys(GAINS, 0.0)
 
 
 def ideal(period, duration, law=None, **plant):
-    """A UR5e true to its URDF with ideal sensors and drives, which starts E0 off the reference."""
+    """A UR5e true to its URDF, without friction, with ideal sensors, E0 off the reference."""
     loop = load_loop('ur5e')
     config, step = loop.controller, {'sample_time': period}
     chain = config.robot.chain(config.joints)
     P = parameters_of(config.robot, chain).of(chain.inertias, config.robot.rotors(chain))
-    config = change(config, step | {'learning.initial_estimate': P.tolist()} | (law or {}))
+    given = step | FRICTIONLESS | {'learning.initial_estimate': P.tolist()}
+    config = change(config, given | (law or {}))
     start = {'initial.position': (np.array(HOLD) + E0).tolist(), 'duration': duration}
     return LoopConfig(change(loop.plant, IDEAL | step | start | plant), config, loop.recorder)
 
@@ -71,8 +77,7 @@ def ideal(period, duration, law=None, **plant):
 def error_of(period):
     """Errors of computed torque with the true model, and those of e'' + k_d e' + k_p e = 0."""
     loop = ideal(period, 0.1, REST)
-    gains = {'position': 900.0, 'velocity': 50.0}
-    errors, _ = simulate_with(loop, computed_torque, gains, friction=False)
+    errors, _ = simulate_with(loop, computed_torque, GAINS)
     A = np.array([[0.0, 1.0], [-900.0, -50.0]])
     decay = [expm(A * period * k)[0, 0] for k in range(len(errors))]
     return errors, np.outer(decay, E0)
@@ -91,25 +96,24 @@ def test_computed_torque_with_the_true_model_follows_a_moving_reference():
     """With the true model, the acceleration of the reference causes no error."""
     loop = ideal(1e-3, 2.0)
     loop = loop._replace(plant=change(loop.plant, {'initial.position': list(HOLD)}))
-    gains = {'position': 900.0, 'velocity': 50.0}
-    errors, torques = simulate_with(loop, computed_torque, gains, friction=False)
+    errors, torques = simulate_with(loop, computed_torque, GAINS)
     assert np.abs(errors[1000:]).max() < 5e-5  # half a sample of the reference's jerk, over k_p
     assert np.ptp(torques, axis=0).max() > 5.0
 
 
-def test_gravity_compensation_holds_the_arm_and_the_integrator_removes_the_error_of_a_push():
+def test_model_holds_the_arm_and_the_integrator_removes_the_error_of_a_push():
     push = np.array([3.0, -2.0, 1.0, 0.3, -0.2, 0.1])  # N m
-    gains = {'position': 900.0, 'velocity': 50.0}
     found = []
-    for given, torque in (({}, 0.0 * push), (gains, push), (gains | {'integral': 5000.0}, push)):
+    for given, torque in ((OFF, 0.0 * push), (GAINS, push), (GAINS | {'integral': 5000.0}, push)):
         start = {'initial.position': list(HOLD), 'load.torque': torque.tolist()}
         loop = ideal(1e-3, 3.0, REST, **start)
-        found.append(simulate_with(loop, pd_gravity, given, friction=False))
+        found.append(simulate_with(loop, computed_torque, given))
     (resting, torques), (pushed, _), (integrated, _) = found
     assert np.abs(resting).max() < 1e-10  # rad, from rounding
     assert np.abs(torques[0]).max() > 10.0
-    static = push / (900.0 * joint_inertia(loop.controller))
-    np.testing.assert_allclose(pushed[-1], static, rtol=1e-2)
+    P = np.array(loop.controller.learning.initial_estimate)
+    (M,) = inertia_matrices(model_of(loop.controller), P, np.array([HOLD]))
+    np.testing.assert_allclose(900.0 * M @ pushed[-1], push, atol=0.01)
     assert np.all(np.abs(integrated[-1]) < 1e-3 * np.abs(pushed[-1]))
 
 
@@ -117,11 +121,11 @@ def test_known_friction_is_compensated_along_the_reference():
     config = load_loop('ur5e').controller
     ((q, dq, _),) = terms.sampled(reference_of(config), np.zeros(1))
     start = {'initial.position': q.tolist(), 'initial.velocity': dq.tolist()}  # no approach
-    loop = ideal(1e-3, 0.01, **start)
-    (_, compensated), (_, uncompensated) = (
-        simulate_with(loop, pd_gravity, {}, friction=on) for on in (True, False)
-    )
     robot, v = config.robot, config.learning.coulomb_velocity
+    known = {'robot.viscous': list(robot.viscous), 'robot.coulomb': list(robot.coulomb)}
+    (_, compensated), (_, uncompensated) = (
+        simulate_with(ideal(1e-3, 0.01, law, **start), computed_torque, OFF) for law in (known, {})
+    )
     friction = robot.viscous * dq + robot.coulomb * np.tanh(dq / v)
     np.testing.assert_allclose(compensated[0] - uncompensated[0], friction, atol=1e-12)
     assert np.abs(friction).min() > 0.1
@@ -168,17 +172,17 @@ def test_table_shows_the_worst_run_of_each_law():
     """Two runs with errors of 1 and 2 mrad, of which the second leaves the bound."""
     inside = Figures((1e-3,) * 4, 0.9, 0.01, (0.02, 0.01))
     outside = Figures((2e-3,) * 4, 1.0, 0.02, (0.03, 0.0))
-    laws = {
+    results = {
         'proposed': Result({}, None, [inside, outside]),
-        'pd_gravity_i': Result({'position': 3.0}, 1.0, [inside._replace(model=())]),
+        'computed_torque': Result({'position': 3.0}, 1.0, [inside._replace(model=())]),
     }
-    heads, proposed, pd, gains = (
-        re.split(r'  +', line) for line in format_results(laws).splitlines()
+    heads, proposed, tuned, gains = (
+        re.split(r'  +', line) for line in format_results(results).splitlines()
     )
-    assert len(heads) == len(proposed) == len(pd)
+    assert len(heads) == len(proposed) == len(tuned)
     assert proposed[1:] == [*['2.00'] * 4, '3.00', '1.00', '2.0 %', '1 of 2']
-    assert pd[1:] == [*['1.00'] * 4, '-', '-', '1.0 %', '1 of 1']
-    assert gains == [f'{pd[0]}: position 3']
+    assert tuned[1:] == [*['1.00'] * 4, '-', '-', '1.0 %', '1 of 1']
+    assert gains == [f'{tuned[0]}: position 3']
 
 
 @pytest.fixture(scope='module')
@@ -187,7 +191,7 @@ def found(tmp_path_factory):
     out = tmp_path_factory.mktemp('arms') / 'out'
     small = ['--config', 'ur5e', '--truths', '1', '--generations', '0']
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(study, 'POPULATION', 5)
+        patch.setattr(laws, 'POPULATION', 5)
         assert main(['arms', *small, '--out', str(out)]) == 0
     return json.loads((out / 'figures.json').read_text(encoding='utf-8'))['ur5e']
 
@@ -207,7 +211,7 @@ def test_every_law_is_tuned_and_run_and_learning_finds_the_model(found):
 
 
 @pytest.mark.nightly
-@pytest.mark.parametrize('name', ['proposed_tuned', 'slotine_li_tuned', 'pd_gravity_if'])
+@pytest.mark.parametrize('name', ['proposed_tuned', 'slotine_li_tuned', 'computed_torque'])
 def test_figures_are_reproduced_from_the_gains(found, name):
     """The same seed gives the same figures, in this process too."""
     rows = torque_rows(trial('ur5e', 1000).controller)
@@ -216,13 +220,13 @@ def test_figures_are_reproduced_from_the_gains(found, name):
 
 
 def test_file_without_a_usable_law_is_rejected(tmp_path, capsys):
-    taken = f"{IMPORT}CONTENDERS = {{'pd_gravity': Contender('mine')}}"
+    taken = f"{IMPORT}CONTENDERS = {{'slotine_li': Contender('mine')}}"
     for name, text, problem in (
         ('missing.py', None, 'expected a law of the study (proposed, '),
         ('json.py', '', 'there is another module of this name'),
         ('broken.py', '1 / 0', 'cannot be imported: ZeroDivisionError'),
         ('empty.py', '', 'CONTENDERS must be a dict of Contender by name'),
-        ('taken.py', taken, 'has a law pd_gravity already'),
+        ('taken.py', taken, 'has a law slotine_li already'),
     ):
         if text is not None:
             (tmp_path / name).write_text(text)
@@ -235,10 +239,9 @@ def test_file_without_a_usable_law_is_rejected(tmp_path, capsys):
 def test_laws_of_a_file_join_those_chosen_by_name(tmp_path, monkeypatch, capsys):
     assert main(['arms', '--config', 'recommended', '--out', str(tmp_path / 'out')]) == 1
     assert 'got model two_link' in capsys.readouterr().err
-    monkeypatch.setattr(study, 'CONTENDERS', dict(CONTENDERS))
-    monkeypatch.setattr(laws, 'CONTENDERS', study.CONTENDERS)
+    monkeypatch.setattr(laws, 'CONTENDERS', dict(CONTENDERS))
     file = tmp_path / 'law_of_mine.py'
     file.write_text(f"{IMPORT}CONTENDERS = {{'mine': Contender('mine')}}")
-    assert study.chosen_laws([]) == list(CONTENDERS)
+    assert laws.chosen_laws([]) == list(CONTENDERS)
     for _ in range(2):  # a worker that was forked has it already
-        assert study.chosen_laws(['pd_gravity', str(file)]) == ['proposed', 'pd_gravity', 'mine']
+        assert laws.chosen_laws(['slotine_li', str(file)]) == ['proposed', 'slotine_li', 'mine']

@@ -26,8 +26,8 @@ from blf_dsc_controller.configuration.nodes import load_loop
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.simulation.loop import simulate
 from blf_dsc_controller.studies import runs as engines
-from blf_dsc_controller.studies.report import reproduce, summarize
-from blf_dsc_controller.studies.runs import Store, chunk_size, compute, run_chunk, warm_up
+from blf_dsc_controller.studies.report import format_report, reproduce, summarize, write_report
+from blf_dsc_controller.studies.runs import Store, compute, run_chunk, warm_up
 
 
 @pytest.fixture(scope='module')
@@ -87,27 +87,21 @@ def test_error_in_a_run_is_not_taken_for_a_lost_worker(a_study):
         list(compute(broken, chunks(1), executor))
 
 
-def test_chunks_are_few_but_enough_for_all_workers():
-    for runs, workers in ((1, 8), (10_000, 2), (10**8, 64)):
-        size = chunk_size(runs, workers)
-        assert min(runs, 20 * workers) <= runs / size <= max(100, 20 * workers, 1001)
-
-
 @pytest.fixture
 def store(tmp_path):
     return Store.create_or_open(tmp_path / 'out', study(tmp_path))
 
 
-def filled(store, *ranges):
-    for first, runs in ranges:
-        store.keep(range(first, first + runs), run_chunk(store.study, first, runs))
+def filled(store, *runs):
+    for run in runs:
+        store.keep(range(run, run + 1), run_chunk(store.study, run, 1))
     return store
 
 
 @pytest.fixture(scope='module')
 def whole_store(tmp_path_factory):
     folder = tmp_path_factory.mktemp('study')
-    return filled(Store.create_or_open(folder / 'my study', study(folder)), (12, 12), (0, 12))
+    return filled(Store.create_or_open(folder / 'my study', study(folder)), *reversed(range(RUNS)))
 
 
 def stamps(folder):
@@ -145,10 +139,15 @@ def test_killed_study_resumes(tmp_path):
 
 
 def test_missing_runs_are_found_between_completed_ones(store):
-    filled(store, (3, 4), (10, 1))
-    missing = store.missing(5)
-    assert missing[:3] == [range(3), range(7, 10), range(11, 16)]
-    assert sorted([*(run for runs in missing for run in runs), 3, 4, 5, 6, 10]) == [*range(RUNS)]
+    filled(store, 3, 10)
+    assert [run for (run,) in store.missing()] == [*range(3), *range(4, 10), *range(11, RUNS)]
+
+
+@pytest.mark.parametrize(('runs', 'chunks'), [(1, 1), (1001, 201), (10**6, 1000)])
+def test_chunks_are_few_and_hold_each_run_once(tmp_path, runs, chunks):
+    missing = Store.create_or_open(tmp_path / 'out', study(tmp_path, runs=runs)).missing()
+    assert len(missing) == chunks
+    assert [0, *(chunk.stop for chunk in missing)] == [*(chunk.start for chunk in missing), runs]
 
 
 def test_results_can_be_read_with_pyarrow_alone(whole_store):
@@ -193,7 +192,7 @@ def test_folder_is_locked_and_a_damaged_file_in_it_is_named(store):
     ):
         pass
     with Store(store.folder).locked():
-        filled(store, (0, 2))
+        filled(store, 0)
     (part,) = (store.folder / 'runs').iterdir()
     part.write_bytes(part.read_bytes()[:-20])
     with pytest.raises(BlfDscError, match=f'cannot be read .*{part.name}.*remove'):
@@ -221,7 +220,8 @@ def test_runs_are_sorted_worst_first_with_diverged_runs_before_all_others(whole_
 
 @pytest.mark.usefixtures('blank_pictures')
 def test_command_of_the_report_reproduces_the_worst_run(whole_store, tmp_path, monkeypatch, capsys):
-    assert main(['monte-carlo', '--report', str(whole_store.folder)]) == 0
+    resumed = ['--config', str(whole_store.folder / 'study.yaml'), '--out', str(whole_store.folder)]
+    assert main(['monte-carlo', *resumed]) == 0
     kept = int((whole_store.results()['outcome'] == 'kept').sum())
     printed = capsys.readouterr().out
     assert f'{100 * kept / 24:.4g} % of the runs kept the bound (95 % confidence: ' in printed
@@ -297,8 +297,7 @@ def test_pairs_are_compared_and_exceptions_are_reproduced(tmp_path, capsys):
     assert summarize(a_study, lost)['pairs']['factor']['median'] is None
 
     store.keep(range(4), results)
-    assert main(['monte-carlo', '--report', str(store.folder)]) == 0
-    printed = capsys.readouterr().out
+    printed = format_report(write_report(store)[0], store.folder)
     assert 'broken only with / only without: 1 / 1' in printed
     assert 'bound broken only with learning: 1' in printed
     assert 'error above 1.3 times that without: 1, 0' in printed

@@ -334,8 +334,7 @@ def _add_studies(command: _Command) -> None:
     option = command(
         'arms',
         'Compare laws on arms whose URDF is wrong. Each law is tuned on one arm with wrong masses '
-        'and run on others, for a table of the errors; offline, on all cores, about ten minutes on '
-        'two.',
+        'and run on others, for a table of the errors; offline, on all cores, in some minutes.',
         '--config panda --out arms',
     )
     option('--config', nargs='+', default=['panda', 'ur5e'], help='presets or files (panda ur5e)')
@@ -358,7 +357,7 @@ def _add_studies(command: _Command) -> None:
     option('--engine', choices=engines, default='processes', help=computing)
     option('--workers', type=_positive, help='number of workers (one per core of this computer)')
     option('--address', default='', help='scheduler of a dask cluster (a local one)')
-    reported = 'only report the studies in these folders; studies of pairs side by side into --out'
+    reported = 'put the studies of pairs in these folders side by side, into --out (changes)'
     option('--report', type=Path, nargs='+', metavar='DIR', help=reported)
     again = 'compute one run of a study again, with a bag and pictures, into --out'
     option('--reproduce', nargs=2, metavar=('DIR', 'RUN'), help=again)

@@ -16,9 +16,8 @@ from blf_dsc_controller.cli.run import make_folder, print_notice
 from blf_dsc_controller.compiled.jit import announced_compilation
 from blf_dsc_controller.configuration.nodes import locate
 from blf_dsc_controller.errors import BlfDscError
-from blf_dsc_controller.studies import arms as arm_study
+from blf_dsc_controller.studies import laws, report, runs
 from blf_dsc_controller.studies import paper as paper_study
-from blf_dsc_controller.studies import report, runs
 from blf_dsc_controller.studies.monte_carlo import load_study
 
 _PAUSE_IN_A_LOG = 10.0  # s between two updates of the bar
@@ -36,29 +35,27 @@ def paper(options: Namespace) -> None:
 
 def arms(options: Namespace) -> None:
     """Tune and run every law on URDF arms, write figures.json and print the table."""
-    arm_study.chosen_laws(options.laws)  # before there is a folder
+    laws.chosen_laws(options.laws)  # before there is a folder
     folder = make_folder(options.out)
     with announced_compilation(print_notice):
-        found = arm_study.compare(
+        found = laws.compare(
             folder, options.config, options.laws, options.truths, options.generations
         )
     for arm, results in found.items():
         print(f'{arm}: {options.truths} runs of each law; errors in mrad, of the model in %')
-        print(arm_study.format_results(results))
+        print(laws.format_results(results))
     print(f'wrote {options.out / "figures.json"}')
 
 
 def monte_carlo(options: Namespace) -> None:
-    """Reproduce one run, report a study, or compute its missing runs and report it."""
+    """Compute the missing runs of a study and report it, compare studies, or repeat one run."""
     if options.reproduce:
         _reproduce(Path(options.reproduce[0]), options.reproduce[1], options.out)
-    elif options.report and options.out:
-        options.out.mkdir(parents=True, exist_ok=True)
-        stores = [runs.Store(folder) for folder in options.report]
-        print(report.write_comparison(stores, options.out), end='')
     elif options.report:
-        for folder in options.report:
-            _report(runs.Store(folder))
+        folder = options.out or Path('changes')
+        folder.mkdir(parents=True, exist_ok=True)
+        stores = [runs.Store(each) for each in options.report]
+        print(report.write_comparison(stores, folder), end='')
     else:
         _run_study(options)
 
@@ -71,15 +68,16 @@ def _run_study(options: Namespace) -> None:
     store = runs.Store.create_or_open(options.out or Path('monte_carlo'), study)
     with store.locked():
         workers = options.workers or runs.cores()
-        chunks = store.missing(runs.chunk_size(study.settings.runs, workers))
-        if chunks:
+        if chunks := store.missing():
             with announced_compilation(print_notice):
                 runs.warm_up(study)
             is_dask = options.engine == 'dask'
             engine = runs.dask(workers, options.address) if is_dask else runs.processes(workers)
             with engine as executor:
                 _compute(store, chunks, executor)
-        _report(store)
+        summary, written = report.write_report(store)
+    print(report.format_report(summary, store.folder))
+    print(f'wrote       {store.folder}: {", ".join(path.name for path in written)}')
 
 
 def _compute(store: runs.Store, chunks: list[range], executor: Executor) -> None:
@@ -95,12 +93,6 @@ def _compute(store: runs.Store, chunks: list[range], executor: Executor) -> None
             lost += int(np.count_nonzero(columns['outcome'] != runs.KEPT))
             bar.set_postfix_str(f'{lost} did not keep the bound', refresh=False)
             bar.update(len(chunk))
-
-
-def _report(store: runs.Store) -> None:
-    summary, written = report.write_report(store)
-    print(report.format_report(summary, store.folder))
-    print(f'wrote       {store.folder}: {", ".join(path.name for path in written)}')
 
 
 def _reproduce(folder: Path, index: str, out: Path | None) -> None:

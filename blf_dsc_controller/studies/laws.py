@@ -1,16 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The laws that are compared on arms from URDFs, their tuned gains, and the figures of one run.
+"""Laws compared on arms from URDFs: each is tuned on one truth, run on others, and has figures.
 
 Laws of the package are chosen by name. Any other is a `Law`: a named tuple of gains and arrays with
-a method that computes the torque, compiled into the closed loop. Two are here:
+a method that computes the torque, compiled into the closed loop. One is here, computed torque:
 
-    u   = -k_p e - k_d e' - k_i int e,   e = q - qr
-    tau = M0 (qr'' + u) + C0 q' + G0 + F0(qr')                               computed torque
-    tau = m u + G0 + F0(qr')                                                 PD with gravity
+    tau = M0 (qr'' - k_p e - k_d e' - k_i int e) + C0 q' + G0 + F0(qr'),   e = q - qr
 
-M0, C0, G0 are those of P0, the initial estimate of the law, and m is the inertia of each joint with
-the others free.  F0 is the friction known to the controller, at the velocity of the reference as in
-the law.  The integrators are held while any torque is saturated.  `load_laws` adds those of a file.
+M0, C0, G0 are those of P0, the initial estimate of the law.  F0 is the friction known to the
+controller, at the velocity of the reference as in the law.  The integrator is held while any torque
+is saturated.  `load_laws` adds those of a file.
 """
 
 from __future__ import annotations
@@ -18,20 +16,23 @@ from __future__ import annotations
 import functools
 import importlib
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor
 from functools import partial
 from pathlib import Path
 from typing import NamedTuple, Protocol
 
 import numpy as np
+from tqdm import tqdm
 
+from blf_dsc_controller.analysis.summary import aligned, plain, write_summary
 from blf_dsc_controller.arms.model import ArmModel
 from blf_dsc_controller.arms.tuning import over_postures
 from blf_dsc_controller.compiled.elementary import tanh
 from blf_dsc_controller.compiled.jit import compile_methods, kernel
 from blf_dsc_controller.compiled.layout import Array, part, view
 from blf_dsc_controller.configuration.controller import ControllerConfig
-from blf_dsc_controller.configuration.nodes import LoopConfig
+from blf_dsc_controller.configuration.nodes import LoopConfig, load_loop
 from blf_dsc_controller.configuration.robot import parameters_of
 from blf_dsc_controller.configuration.schema import change
 from blf_dsc_controller.errors import BlfDscError
@@ -41,8 +42,14 @@ from blf_dsc_controller.reference import terms as reference
 from blf_dsc_controller.reference.approach import plan_start
 from blf_dsc_controller.run import Floats
 from blf_dsc_controller.simulation.loop import simulate
-from blf_dsc_controller.studies.monte_carlo import torque_error
-from blf_dsc_controller.studies.tuning import Gain, parameters_at
+from blf_dsc_controller.studies.monte_carlo import (
+    UNSEEN,
+    another_motion,
+    torque_error,
+    torque_rows,
+)
+from blf_dsc_controller.studies.runs import cores
+from blf_dsc_controller.studies.tuning import Gain, bounded, parameters_at, search, value_at
 from sim_plant import kernels as plants
 from sim_plant.arm import Arm
 from sim_plant.plant import plant_of, steps_of
@@ -55,6 +62,12 @@ INTERVALS = {
     'pick-up': (PICK_UP, 17.0),
     'from 20 s': (20.0, DURATION),
 }
+POPULATION = 16
+ROUGHEST = 0.05
+"""rms change of a torque per sample, relative to its limit, beyond which it is penalised."""
+
+COLUMNS = (*INTERVALS, 'model before', 'model after')
+"""Largest errors [mrad], and torque errors of the model [%] before the pick-up and at the end."""
 _BEFORE = PICK_UP - 0.01  # s, when the model is evaluated for the first time
 _STIFFEST = 4.0  # least slope limit of the barrier, as a multiple of its weight
 
@@ -90,33 +103,28 @@ class Law(Protocol):
         """Write the torque (n,) [N m]; the loop cuts it at its limit afterwards."""
 
 
-class ModelBased(NamedTuple):
-    """Computed torque, or PD with gravity compensation, both with an integrator."""
+class ComputedTorque(NamedTuple):
+    """Computed torque with an integrator."""
 
-    computed: float  # 1: computed torque, 0: PD with gravity
     position: float  # k_p, 1/s^2
     velocity: float  # k_d, 1/s
     integral: float  # k_i, 1/s^3
     integrated: Array  # (n,) rad s, int e
-    u: Array  # (n,) rad/s^2
-    v: Array  # (n,) rad/s, velocity of the model
-    a: Array  # (n,) rad/s^2, acceleration of the model
+    a: Array  # (n,) rad/s^2
     H: Array  # (n, p)
 
     def fill_torque(self, arm: Known, now: Now, torque: Array) -> None:
         """Write the torque."""
         n = now.q.size
         for i in range(n):
-            self.u[i] = -self.position * (now.q[i] - now.qr[i])
-            self.u[i] -= self.velocity * (now.dq[i] - now.dqr[i])
-            self.u[i] -= self.integral * self.integrated[i]
-            self.v[i] = self.computed * now.dq[i]
-            self.a[i] = self.computed * (now.ddqr[i] + self.u[i])
-        arm.model.regressor(now.q, self.v, self.v, self.a, self.H)
+            u = -self.position * (now.q[i] - now.qr[i])
+            u -= self.velocity * (now.dq[i] - now.dqr[i])
+            u -= self.integral * self.integrated[i]
+            self.a[i] = now.ddqr[i] + u
+        arm.model.regressor(now.q, now.dq, now.dq, self.a, self.H)
         cut = False
         for i in range(n):
-            torque[i] = (1.0 - self.computed) * arm.inertia[i] * self.u[i]
-            torque[i] += arm.viscous[i] * now.dqr[i]
+            torque[i] = arm.viscous[i] * now.dqr[i]
             torque[i] += arm.coulomb[i] * tanh(now.dqr[i] / arm.coulomb_velocity)
             for j in range(arm.P.size):
                 torque[i] += self.H[i, j] * arm.P[j]
@@ -126,16 +134,10 @@ class ModelBased(NamedTuple):
                 self.integrated[i] += now.dt * (now.q[i] - now.qr[i])
 
 
-def model_based(gains: Mapping[str, float], arm: Known, *, computed: bool) -> ModelBased:
-    """Return the law with these gains; those that are not given are zero."""
-    n, p = arm.inertia.size, arm.P.size
-    k_p, k_d, k_i = (gains.get(name, 0.0) for name in ('position', 'velocity', 'integral'))
-    integrated, u, v, a = np.zeros((4, n))
-    return ModelBased(float(computed), k_p, k_d, k_i, integrated, u, v, a, np.zeros((n, p)))
-
-
-computed_torque = partial(model_based, computed=True)
-pd_gravity = partial(model_based, computed=False)
+def computed_torque(gains: Mapping[str, float], arm: Known) -> ComputedTorque:
+    """Return the law with gains `position`, `velocity` and `integral`."""
+    integrated, a = np.zeros((2, arm.inertia.size))
+    return ComputedTorque(**gains, integrated=integrated, a=a, H=np.zeros((a.size, arm.P.size)))
 
 
 def _run(
@@ -173,16 +175,16 @@ def _loop_with(law: type) -> Callable[..., None]:
     return kernel(_run)
 
 
-def known_of(config: ControllerConfig, *, friction: bool) -> Known:
-    """Return what a law is told of the arm of a configuration; without `friction` it knows none."""
+def known_of(config: ControllerConfig) -> Known:
+    """Return what a law is told of the arm of a configuration."""
     robot = config.robot
     on_joints = robot.friction(robot.chain(config.joints))
     return Known(
         model=model_of(config),
         P=np.array(config.learning.initial_estimate),
         inertia=joint_inertia(config),
-        viscous=friction * np.array(on_joints['viscous']),
-        coulomb=friction * np.array(on_joints['coulomb']),
+        viscous=np.array(on_joints['viscous']),
+        coulomb=np.array(on_joints['coulomb']),
         coulomb_velocity=config.learning.coulomb_velocity,
         limit=np.array(config.torque.limit),
         bound=np.array(config.barrier.bound),
@@ -193,8 +195,6 @@ def simulate_with(
     loop: LoopConfig,
     make: Callable[[Mapping[str, float], Known], Law],
     gains: Mapping[str, float],
-    *,
-    friction: bool = True,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return true errors (k, n) [rad] and torques (k, n) [N m] of `make(gains, known)`.
 
@@ -203,7 +203,7 @@ def simulate_with(
     Raises MotionError if there is no approach within the limits.
     """
     config, plant = loop.controller, plant_of(loop.plant)
-    n, known = plant.joints, known_of(config, friction=friction)
+    n, known = plant.joints, known_of(config)
     q, dq, _ = plant.measure().reshape(3, n)
     motion = plan_start(config, np.array(config.barrier.widest), q, dq)
     rows = np.zeros((steps_of(loop.plant) + 1, 8, n))
@@ -224,7 +224,6 @@ class Contender(NamedTuple):
     law: str | Callable[[Mapping[str, float], Known], Law] = 'blf_dsc'
     """Law of the package by its name, or a function of the gains by name that makes another."""
     learns: bool = True
-    friction: bool = True  # compensates the friction that the controller knows
 
 
 _DAMPING = Gain('feedback.damping_rate', 10.0, 200.0)
@@ -242,8 +241,11 @@ _SLOTINE_LI = (
     Gain('comparison.integral_gain', 100.0, 3e4, inertial=True),
     _ADAPTATION,
 )
-_PD = (Gain('position', 100.0, 3e4), Gain('velocity', 10.0, 200.0))
-_PID = (*_PD, Gain('integral', 100.0, 3e6))
+_PID = (
+    Gain('position', 100.0, 3e4),
+    Gain('velocity', 10.0, 200.0),
+    Gain('integral', 100.0, 3e6),
+)
 
 CONTENDERS = {
     'proposed': Contender('proposed, gains from the URDF'),
@@ -252,16 +254,7 @@ CONTENDERS = {
     'proposed_tuned': Contender('proposed, tuned', (*_FEEDBACK, _ADAPTATION)),
     'no_learning_tuned': Contender('without learning, tuned', _FEEDBACK, learns=False),
     'slotine_li_tuned': Contender('Slotine-Li with integrator, tuned', _SLOTINE_LI, 'slotine_li'),
-    'computed_torque': Contender('computed torque', _PD, computed_torque, friction=False),
-    'computed_torque_i': Contender(
-        'computed torque + integrator', _PID, computed_torque, friction=False
-    ),
-    'computed_torque_if': Contender(
-        'computed torque + integrator, friction', _PID, computed_torque
-    ),
-    'pd_gravity': Contender('PD + gravity', _PD, pd_gravity, friction=False),
-    'pd_gravity_i': Contender('PD + gravity + integrator', _PID, pd_gravity, friction=False),
-    'pd_gravity_if': Contender('PD + gravity + integrator, friction', _PID, pd_gravity),
+    'computed_torque': Contender('computed torque with integrator, tuned', _PID, computed_torque),
 }
 
 
@@ -320,8 +313,7 @@ def run(name: str, loop: LoopConfig, values: Mapping[str, float], unseen: Floats
                 for row in (round(_BEFORE / config.sample_time), -1)
             )
         else:
-            friction = contender.friction
-            errors, torques = simulate_with(loop, contender.law, values, friction=friction)
+            errors, torques = simulate_with(loop, contender.law, values)
         time = np.arange(len(errors)) * loop.plant.sample_time
         peaks = [
             float(np.abs(errors[(time >= begin) & (time < end)]).max(initial=0.0))
@@ -354,3 +346,138 @@ def load_laws(path: Path) -> list[str]:
         if CONTENDERS.setdefault(name, contender) is not contender:
             raise BlfDscError(f'{path}: the study has a law {name} already: choose another name')
     return list(added)
+
+
+class Result(NamedTuple):
+    """A contender on one arm: tuned gains and their cost (None if not tuned), validation runs."""
+
+    gains: dict[str, float]
+    cost: float | None
+    runs: list[Figures]
+
+    def columns(self) -> Floats:
+        """Return the values of all runs for each of COLUMNS, in mrad or %; NaN without a model."""
+        rows = [(*figures.errors, *(figures.model or (np.nan, np.nan))) for figures in self.runs]
+        units = np.where(np.arange(len(COLUMNS)) < len(INTERVALS), 1e3, 1e2)
+        return np.asarray((np.array(rows) * units).T)
+
+
+Results = dict[str, dict[str, Result]]
+"""Results by arm and contender."""
+
+
+def trial(name: str, seed: int) -> LoopConfig:
+    """Return the loop of a preset: seed 0 keeps its truth and motion, other seeds vary them.
+
+    Raises BlfDscError if it has no arm of a URDF that follows sinusoids.
+    """
+    loop = load_loop(name)
+    reference, events = loop.controller.reference, loop.plant.events
+    if loop.controller.model != 'urdf' or reference.type != 'sinusoids':
+        raise BlfDscError(
+            f'--config {name}: got model {loop.controller.model} and reference {reference.type}, '
+            'but an arm of a URDF that follows sinusoids is needed, as in config/panda.yaml'
+        )
+    plant = {
+        'duration': DURATION,
+        'seed': seed,
+        'truth.seed': loop.plant.truth.seed + seed,
+        'events.begin': [PICK_UP],
+        'events.duration': [0.0],
+        'events.payload': [max(events.payload, default=0.0)],
+    }
+    # No funnel, since the other laws have none: all approach the motion from rest.
+    law = change(loop.controller, {'barrier.initial_bound': [0.0] * len(loop.plant.joints)})
+    law = another_motion(law, seed) if seed > 0 else law
+    return loop._replace(controller=law, plant=change(loop.plant, plant))
+
+
+def values_of(name: str, exponents: Floats) -> dict[str, float]:
+    """Return the gains of a contender from their decimal logarithms."""
+    pairs = zip(CONTENDERS[name].gains, exponents, strict=True)
+    return {gain.name: value_at(exponent) for gain, exponent in pairs}
+
+
+def cost_of(figures: Figures) -> float:
+    """Return the mean over the intervals of log10 of the largest error in mrad; lower is better.
+
+    Each decade of torque roughness beyond ROUGHEST adds ten.
+    """
+    rough = max(np.log10(figures.roughness / ROUGHEST), 0.0)
+    return bounded(np.mean(np.log10(1e3 * np.array(figures.errors))) + 10.0 * rough)
+
+
+def tuning_cost(exponents: Floats, name: str, loop: LoopConfig, unseen: Floats) -> float:
+    """Return `cost_of` a contender with one more sample of delay, to keep a stability margin."""
+    delayed = change(loop.plant, {'actuator.delay': loop.plant.actuator.delay + 1})
+    values = values_of(name, exponents)
+    return cost_of(run(name, loop._replace(plant=delayed), values, unseen))
+
+
+def chosen_laws(given: Sequence[str]) -> list[str]:
+    """Return the names of contenders from names and Python files, `proposed` first; all for none.
+
+    Raises BlfDscError if there is no such contender or file.
+    """
+    if not given:
+        return list(CONTENDERS)
+    names = ['proposed']
+    for name in given:
+        if name not in CONTENDERS and not Path(name).is_file():
+            raise BlfDscError(
+                f'--laws {name}: expected a law of the study ({", ".join(CONTENDERS)}), or a '
+                'Python file with CONTENDERS'
+            )
+        names += [name] if name in CONTENDERS else load_laws(Path(name).resolve())
+    return list(dict.fromkeys(names))
+
+
+def compare(
+    folder: Path, arms: Sequence[str], laws: Sequence[str], truths: int, generations: int
+) -> Results:
+    """Tune and run everything, and write figures.json into an empty folder.
+
+    `laws` are as in `chosen_laws`.
+    """
+    names = chosen_laws(laws)
+    results: Results = {arm: {} for arm in arms}
+    rows = [(arm, name) for arm in arms for name in names]
+    with ProcessPoolExecutor(cores(), initializer=chosen_laws, initargs=(laws,)) as pool:
+        for arm, name in tqdm(rows, unit='law'):
+            first, *others = (trial(arm, seed) for seed in range(truths + 1))
+            unseen = torque_rows(trial(arm, UNSEEN).controller)
+            searched = CONTENDERS[name].gains
+            least = {gain.name: gain.least for gain in searched}
+            run(name, first, least, unseen)  # compiles what the workers load
+            gains, cost = {}, None
+            if searched:
+                of_gains = partial(tuning_cost, name=name, loop=first, unseen=unseen)
+                options = {'workers': pool.map, 'updating': 'deferred'}
+                point, cost, _ = search(of_gains, searched, POPULATION, generations, **options)
+                gains = values_of(name, point)
+            runs = pool.map(partial(run, name, values=gains, unseen=unseen), others)
+            results[arm][name] = Result(gains, cost, list(runs))
+    numbers = {
+        arm: {
+            name: {**result._asdict(), 'runs': [figures._asdict() for figures in result.runs]}
+            for name, result in found.items()
+        }
+        for arm, found in results.items()
+    }
+    write_summary(plain(numbers), folder / 'figures.json')
+    return results
+
+
+def format_results(results: dict[str, Result]) -> str:
+    """Return the worst of each figure on an arm, a line for each contender, and tuned gains."""
+    rows, gains = [['worst', *COLUMNS, 'roughness', 'bound kept']], []
+    for name, result in results.items():
+        label, worst = CONTENDERS[name].label, result.columns().max(axis=1)
+        rough = 100.0 * max(figures.roughness for figures in result.runs)
+        kept = sum(figures.ratio < 1.0 for figures in result.runs)
+        cells = ('-' if np.isnan(value) else f'{value:.2f}' for value in worst)
+        rows.append([label, *cells, f'{rough:.1f} %', f'{kept} of {len(result.runs)}'])
+        if result.gains:
+            each = ', '.join(f'{gain} {value:g}' for gain, value in result.gains.items())
+            gains.append(f'{label}: {each}')
+    return '\n'.join([aligned(rows), *gains])

@@ -11,7 +11,7 @@ Its file is a parameter file of the loop with one additional section:
           arm.m2: uniform(0.4, 0.6)
 
 A value is the inverse of the distribution function at a number u in [0, 1), so each draw takes one
-random number. The inverses are written out because `ppf` of scipy.stats takes 0.1 ms a call.
+random number.
 
 The start is relative to the reference: `initial.error` is the tracking error xi1(0) as a fraction
 of the bound, `initial.velocity_error` is dq(0) - dqr(0). So may be the events: `events.gap` is the
@@ -29,7 +29,6 @@ from dataclasses import dataclass, replace
 from functools import cache, cached_property
 from hashlib import blake2b
 from pathlib import Path
-from statistics import NormalDist
 from typing import Any, cast
 
 import numpy as np
@@ -255,18 +254,10 @@ def plant_with(study: Study, drawn: Mapping[str, Drawn], law: str = '') -> Plant
     return replace(study.plant, seed=int(drawn.get(f'{law}seed', drawn['seed'])), **groups)
 
 
-TAIL = 4.0
-"""Standard deviations from the mean at which a normal distribution is cut off."""
-
-_NORMAL = NormalDist()
-_CUT = _NORMAL.cdf(-TAIL)
 _INVERSES: dict[str, Callable[..., Drawn]] = {
     'uniform(low, high)': lambda u, low, high: low + u * (high - low),
     'loguniform(low, high)': lambda u, low, high: min(
         high, low * math.exp(u * math.log(high / low))
-    ),
-    'normal(mean, deviation)': lambda u, mean, deviation: (
-        mean + deviation * _NORMAL.inv_cdf(_CUT + u * (1.0 - 2.0 * _CUT))
     ),
     'maybe(probability, low, high)': lambda u, probability, low, high: (
         low + u / probability * (high - low) if u < probability else 0.0
@@ -274,9 +265,9 @@ _INVERSES: dict[str, Callable[..., Drawn]] = {
     'integers(low, high)': lambda u, low, high: low + min(int(u * (high - low + 1)), high - low),
     'choice(a, b, ...)': lambda u, *values: values[int(u * len(values))],
 }
-_UNIFORM, _LOGUNIFORM, _NORMALLY, _MAYBE, _INTEGERS, _CHOICE = _INVERSES
+_UNIFORM, _LOGUNIFORM, _MAYBE, _INTEGERS, _CHOICE = _INVERSES
 _EXPECTED = {
-    float: ('a number', (_UNIFORM, _LOGUNIFORM, _NORMALLY, _MAYBE, _CHOICE)),
+    float: ('a number', (_UNIFORM, _LOGUNIFORM, _MAYBE, _CHOICE)),
     int: ('an integer', (_INTEGERS, _CHOICE)),
     str: ('a word', (_CHOICE,)),
 }
@@ -299,12 +290,7 @@ class Distribution:
     @property
     def extremes(self) -> tuple[Drawn, ...]:
         """Lowest and highest value, or all values of a choice."""
-        if self.written == _MAYBE:
-            return (0.0, *self.arguments[1:])
-        if self.written != _NORMALLY:
-            return self.arguments
-        mean, deviation = cast('tuple[float, float]', self.arguments)
-        return (mean - TAIL * deviation, mean + TAIL * deviation)
+        return (0.0, *self.arguments[1:]) if self.written == _MAYBE else self.arguments
 
     def __str__(self) -> str:
         return f'{self.written.partition("(")[0]}({", ".join(map(str, self.arguments))})'
@@ -335,8 +321,6 @@ def _problem(written: str, arguments: tuple[float, ...]) -> str:
     first, second = arguments[-2:]
     if written == _MAYBE and not 0.0 <= arguments[0] <= 1.0:
         return 'a probability is from 0 to 1'
-    if written == _NORMALLY:
-        return 'a deviation cannot be below 0' if second < 0.0 else ''
     if first > second:
         return 'the first value must not be above the second'
     if written == _LOGUNIFORM and first <= 0.0:

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.ticker import LogLocator, NullFormatter, PercentFormatter
+from matplotlib.ticker import LogLocator, NullFormatter
 from scipy.stats import binomtest
 
 from blf_dsc_controller.analysis.figures import Picture, head
@@ -52,8 +52,6 @@ _SHOWN = (0.03, 2.0)  # |xi1| / k_c; what is beyond is drawn at these
 _MOST_DOTS = 20_000
 _FEW_DECADES = 1e3
 _RATIO = r'max $|\xi_1| \; / \; k_c$'
-_RMS = r'rms $\xi_1$ [mrad]'
-_MODEL = r'$\|\hat P - P\| \;/\; \|P\|$ [%]'
 
 
 def summarize(study: Study, results: Columns) -> Summary:
@@ -187,18 +185,17 @@ def _pair_figures(pairs: Summary) -> dict[str, str]:
 
 
 def write_report(store: Store) -> tuple[Summary, list[Path]]:
-    """Write the pictures and summary.json of the finished runs.
+    """Write summary.json of the finished runs, and the picture of pairs.
 
     Returns the summary and the paths; raises BlfDscError if there are no results yet.
     """
     study, results, folder = store.study, store.results(), store.folder
     summary = summarize(study, results)
-    written = [folder / 'summary.json', folder / 'distributions.png']
+    written = [folder / 'summary.json']
     write_summary(summary, written[0])
-    _draw_distributions(study, results, written[1])
     if study.settings.pairs:
         written.append(folder / 'pairs.png')
-        _draw_pairs({'': (study, results)}, written[2])
+        _draw_pairs({'': (study, results)}, written[1])
     return summary, written
 
 
@@ -274,33 +271,6 @@ def reproduce(store: Store, run: int, out: Path) -> Summary:
                 f'machine, or by another version?{different}'
             )
     return summaries[0]
-
-
-def _draw_distributions(study: Study, results: Columns, path: Path) -> None:
-    """Draw the fraction of runs up to each error: largest, rms, and of the parameters."""
-    share = _percent(np.mean(results['outcome'] == KEPT))
-    title = f'{results["outcome"].size} runs: {share} kept the bound'
-    picture = Picture(1, 3, title, (5.2, 3.6), share_time=False)
-    largest, rms, parameters = picture.axes[0]
-    for axes, name, unit, label, title in (
-        (largest, 'max_error_ratio', 1.0, _RATIO, 'largest error'),
-        (rms, 'rms_error_rad', 1e3, _RMS, f'error from {study.settings.settled_after:g} s on'),
-        (parameters, 'parameter_error', 1e2, _MODEL, 'relative parameter error'),
-    ):
-        each = ('end',) if axes is parameters else study.plant.joints
-        for what, colour in zip(each, COLOURS, strict=False):
-            column = results[f'{name}.{what}']
-            known = np.sort(unit * column[np.isfinite(column)])
-            if axes is largest:
-                known = np.minimum(known, _SHOWN[1])
-            axes.plot(known, np.linspace(0.0, 1.0, known.size), color=colour, label=what)
-        _make_logarithmic(axes)
-        axes.yaxis.set_major_formatter(PercentFormatter(1.0))
-        axes.set_xlabel(label)
-        axes.set_ylabel('fraction of runs below')
-        head(axes, title)
-    largest.axvline(1.0, color=ALARM, lw=1.4)
-    picture.save(path)
 
 
 def _draw_pairs(studies: Studies, path: Path) -> None:

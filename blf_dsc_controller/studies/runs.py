@@ -18,8 +18,6 @@ import fcntl
 import json
 import multiprocessing
 import os
-import re
-import shutil
 import signal
 import threading
 from collections.abc import Iterable, Iterator
@@ -68,7 +66,8 @@ Columns = dict[str, np.ndarray]
 _STUDY = 'study.yaml'
 _VERSIONS = 'versions.json'
 _RUNS = 'runs'
-_PART = re.compile(r'runs-(\d+)-(\d+)\.parquet')
+_CHUNKS = 200  # of a study, unless they would be of more than so many runs
+_MOST = 1000
 _LOST = (
     'a worker was lost ({}): is there enough memory? The same command resumes the study, since '
     'finished runs are kept'
@@ -193,18 +192,9 @@ class Store:
     """
 
     def __init__(self, folder: Path) -> None:
-        self.folder = folder
-        try:
-            self._versions = json.loads((folder / _VERSIONS).read_text(encoding='utf-8'))
-            if not (folder / _STUDY).is_file():
-                raise FileNotFoundError
-        except (OSError, ValueError):
-            raise BlfDscError(
-                f'{folder} exists already and holds no study: choose another folder'
-                if os.path.lexists(folder)
-                else f'{folder} does not exist: it should be the folder of a study'
-            ) from None
-        self.study = load_study(folder / _STUDY)
+        if not (folder / _STUDY).is_file():
+            raise BlfDscError(f'{folder} holds no study: choose another folder')
+        self.folder, self.study = folder, load_study(folder / _STUDY)
 
     @classmethod
     def create_or_open(cls, folder: Path, study: Study) -> Store:
@@ -212,17 +202,13 @@ class Store:
 
         Raises BlfDscError if it holds no study, another one, or the same by another version.
         """
-        if not os.path.lexists(folder):
-            unfinished = folder.with_name(f'.{folder.name}.{os.getpid()}')
-            shutil.rmtree(unfinished, ignore_errors=True)
-            (unfinished / _RUNS).mkdir(parents=True)
-            dump(unfinished / _STUDY, study.values())
-            write_summary(versions(), unfinished / _VERSIONS)
-            unfinished.rename(folder)
+        if not folder.exists():
+            (folder / _RUNS).mkdir(parents=True)
+            write_summary(versions(), folder / _VERSIONS)
+            dump(folder / _STUDY, study.values())
         store = cls(folder)
-        different = differences(store._versions, versions())
-        different = different or differences(_flat(store.study), _flat(study))
-        if different:
+        there = json.loads((folder / _VERSIONS).read_text(encoding='utf-8'))
+        if different := differences(there | _flat(store.study), versions() | _flat(study)):
             raise BlfDscError(
                 f'{folder} holds another study, which is neither resumed nor overwritten: '
                 f'choose another folder, or make them equal:{different}'
@@ -249,7 +235,7 @@ class Store:
     def keep(self, runs: range, columns: Columns) -> None:
         """Write the results of consecutive runs atomically, even if the process is killed."""
         pa = require_pyarrow()
-        path = self.folder / _RUNS / f'runs-{runs.start:09d}-{runs[-1]:09d}.parquet'
+        path = self._path(runs)
         unfinished = path.with_name(f'.{path.name}.{os.getpid()}')
         with unfinished.open('wb') as file:
             pa.parquet.write_table(pa.table(columns), file)
@@ -257,16 +243,15 @@ class Store:
             os.fsync(file.fileno())
         unfinished.replace(path)
 
-    def missing(self, size: int) -> list[range]:
-        """Return the runs without results, in chunks of at most `size`."""
-        names = sorted(path.name for path in (self.folder / _RUNS).iterdir())
-        done = [(int(m[1]), int(m[2]) + 1) for m in map(_PART.fullmatch, names) if m]
-        ends, runs = [0, *(end for _, end in done)], self.study.settings.runs
-        return [
-            range(first, min(first + size, begin))
-            for end, begin in zip(ends, [*(begin for begin, _ in done), runs], strict=True)
-            for first in range(end, begin, size)
-        ]
+    def missing(self) -> list[range]:
+        """Return the chunks of runs without results."""
+        runs = self.study.settings.runs
+        size = max(1, min(runs // _CHUNKS, _MOST))
+        chunks = (range(first, min(first + size, runs)) for first in range(0, runs, size))
+        return [chunk for chunk in chunks if not self._path(chunk).exists()]
+
+    def _path(self, runs: range) -> Path:
+        return self.folder / _RUNS / f'runs-{runs.start:09d}-{runs[-1]:09d}.parquet'
 
     def results(self) -> Columns:
         """Read all results, one row per run, in order.
@@ -319,11 +304,6 @@ def dask(workers: int, address: str = '') -> Iterator[Executor]:
             yield client.get_executor(pure=False)
         except distributed.KilledWorker as error:
             raise BlfDscError(_LOST.format(error)) from error
-
-
-def chunk_size(runs: int, workers: int) -> int:
-    """Return the runs per chunk: few files, yet enough chunks for workers to finish together."""
-    return max(1, min(max(100, runs // 1000), runs // (20 * workers)))
 
 
 def compute(
