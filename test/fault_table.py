@@ -305,7 +305,6 @@ NAN, INF = np.nan, np.inf
 OTHERS = named('a', 'b')
 AMONG = ('gripper', 'joint2', 'rail', 'joint1')
 TWICE = ('joint1', 'joint2', 'joint1')
-BY_EFFORT = {'learning.torque_source': 'effort'}
 ESTIMATED = {'safety.velocity': 'estimated'}
 AVERAGED = {'safety.overrun_window': 0.1}
 FAST = {'reference.amplitude': [1.0, 1.0], 'reference.offset': [1.2935, 0.6961]}
@@ -317,10 +316,7 @@ FAULTS = (
     Fault('position of joint1 is NaN', spoil('q', 0, NAN), R.NOT_FINITE),
     Fault('position of joint2 is minus infinity', spoil('q', 1, -INF), R.NOT_FINITE),
     Fault('velocity of joint1 is NaN', spoil('dq', 0, NAN), R.NOT_FINITE),
-    Fault('effort is NaN but not used', spoil('effort', 0, NAN)),
-    Fault(
-        'effort is NaN and used for learning', spoil('effort', 0, NAN), R.NOT_FINITE, 1, BY_EFFORT
-    ),
+    Fault('effort is NaN', spoil('effort', 0, NAN)),
     Fault('position of joint1 jumps by 3 mrad', spoil('q', 0, 2.296), R.OUTSIDE_BOUND),
     Fault('position of joint2 is 1e300 rad', spoil('q', 1, 1e300), R.OUTSIDE_BOUND),
     Fault('velocity of joint1 is 60 rad/s', spoil('dq', 0, 60.0), R.VELOCITY),

@@ -41,7 +41,6 @@ class PlainLaw:
     def __init__(self, settings):
         self.gains = settings
         self.newton = settings.update == 1
-        self.effort = settings.torque_source == 1
         self.at_state = settings.compensation == 1
         self.linear = settings.surface == 1
         self.theta = settings.initial_estimate.copy()
@@ -159,7 +158,7 @@ class PlainLaw:
         What is learned acts along the reference, or at the measured state as in the paper.
         """
         g = self.gains
-        q, dq, effort = np.reshape(measurement, (3, 2)).copy()
+        q, dq, _ = np.reshape(measurement, (3, 2)).copy()
         self.xi1 = xi1 = q - qr
         beta2 = self.virtual_control(xi1, dqr, t)
         if self.alpha2 is None:
@@ -169,7 +168,7 @@ class PlainLaw:
         if self.linear:
             self.alpha2, dalpha2 = dqr - g.K * xi1, ddqr - g.K * (dq - dqr)
         self.xi2 = xi2 = dq - self.alpha2
-        self.learn(t, dt, q, dq, dqr, effort if self.effort else self.tau)
+        self.learn(t, dt, q, dq, dqr, self.tau)
         r, P0 = g.model.r, g.initial_estimate[:3]
         H = regressor(r, q, dq, self.alpha2, dalpha2 - g.damping_rate * xi2)
         along = (q, dq, self.alpha2, dalpha2) if self.at_state else (qr, dqr, dqr, ddqr)

@@ -201,7 +201,7 @@ def test_models_and_choices_match_the_law():
     choices = {entry.name: entry.choices for entry in parameters(ControllerConfig)}
     for law in choices['law']:
         factory.settings_of_config(build(ControllerConfig, TRUE_MODEL | {'law': law}))
-    for name in ('prediction', 'update', 'torque_source', 'compensation'):
+    for name in ('prediction', 'update', 'compensation'):
         assert sorted(choices[f'learning.{name}']) == sorted(settings.CHOICES[name])
 
 

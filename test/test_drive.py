@@ -82,24 +82,13 @@ def test_command_is_the_whole_torque_without_what_the_drive_adds():
     np.testing.assert_allclose(command[inside], (whole - added)[inside], atol=1e-9)
 
 
-@pytest.mark.parametrize('effort', ['whole', 'commanded'])
-def test_learning_sees_the_whole_torque(effort):
-    """From the last command, or from efforts with or without what the drive adds."""
-    config = build(
-        ControllerConfig,
-        PANDA | HELD | {'robot.effort': effort, 'learning.torque_source': 'effort'},
-    )
-    by_command = controller_of(build(ControllerConfig, PANDA | HELD))
-    by_effort = controller_of(config)
-    added = added_torque(by_effort.settings, POSITION)
+def test_learning_sees_the_whole_torque():
+    law = controller_of(build(ControllerConfig, PANDA | HELD))
     measurement = np.concatenate((POSITION, np.zeros(14)))
-    command = by_command.update(0.0, 1e-3, measurement).copy()
-    by_command.update(1e-3, 1e-3, measurement)
-    by_effort.update(0.0, 1e-3, measurement)
-    measurement[14:] = command + (added if effort == 'whole' else 0.0)
-    by_effort.update(1e-3, 1e-3, measurement)
-    np.testing.assert_allclose(by_effort.signals.applied, command + added, atol=1e-12)
-    np.testing.assert_allclose(by_command.signals.applied, command + added, atol=1e-12)
+    command = law.update(0.0, 1e-3, measurement).copy()
+    law.update(1e-3, 1e-3, measurement)
+    whole = command + added_torque(law.settings, POSITION)
+    np.testing.assert_allclose(law.signals.applied, whole, atol=1e-12)
 
 
 def test_neither_the_command_nor_the_whole_torque_exceeds_the_limit():
@@ -324,10 +313,6 @@ def test_friction_that_the_drive_compensates_is_not_fed_forward_a_second_time():
             'drive_compensates: got gravity, which needs ro',
         ),
         ({'robot.effort': 'volts'}, "robot.effort: got 'volts', but it must be one of unknown"),
-        (
-            {'robot.effort': 'current', 'learning.torque_source': 'effort'},
-            'learning.torque_source: got effort, but robot.effort is current',
-        ),
         ({'torque.first_step': [-1.0] + 6 * [0.0]}, 'torque.first_step: got -1.0 at entry 1'),
         ({'safety.first_torque': 'ask'}, "got 'ask', but it must be one of check, send"),
     ],

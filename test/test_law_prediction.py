@@ -12,19 +12,20 @@ from plants import QUIET
 from scipy.signal import cont2discrete
 
 from blf_dsc_controller.law import prediction
-from blf_dsc_controller.law.settings import CHOICES, EFFORT
+from blf_dsc_controller.law.settings import CHOICES
 
 BIAS = (0.3, -0.2)
 
 
 def filtered_rows(sample_time, duration=2.0):
     """Rows [X | u] of the arm swinging about its lowest point under held, varying torques."""
-    law = controller(recommended(torque_source=EFFORT))
+    law = controller(recommended())
     arm = plant(sample_time=sample_time, start=(-1.2, 0.4), constant=BIAS, amplitude=QUIET)
     rows = []
     for t in np.arange(round(duration / sample_time)) * sample_time:
-        law.update(t, sample_time, arm.measure())  # its torque is not used
-        arm.step(np.array([2.0 * np.sin(3.0 * t), 1.5 * np.cos(5.0 * t)]))
+        law.update(t, sample_time, arm.measure())
+        law.state.torque[:] = 2.0 * np.sin(3.0 * t), 1.5 * np.cos(5.0 * t)  # instead of its own
+        arm.step(law.state.torque)
         rows.append(law.signals.row.copy())
     return np.array(rows[1:])
 
@@ -42,30 +43,18 @@ def test_filtered_identity_holds_up_to_the_square_of_the_sample_time():
     assert error[-1] < 1e-6 / 12.0 * 500.0
 
 
-def identity_error(disturbed_by, **gains):
-    """Largest error of X theta = u, and the number of torques that were cut."""
-    law, theta = controller(quick(**gains)), np.concatenate([P, BIAS, [-1.0]])
+@pytest.mark.parametrize(
+    ('limit', 'values'), [('torque_limit', [8.5, 20.0]), ('rate_limit', [400.0, 150.0])]
+)
+def test_learning_uses_the_limited_torque(limit, values):
+    """The controller knows its own limits: X theta = u holds while the torque is cut."""
+    law, theta = controller(quick(**{limit: np.array(values)})), np.concatenate([P, BIAS, [-1.0]])
     worst, cut = 0.0, 0
-    for _ in closed_loop(law, plant(constant=BIAS, amplitude=QUIET, **disturbed_by), 1.0):
+    for _ in closed_loop(law, plant(constant=BIAS, amplitude=QUIET), 1.0):
         worst = max(worst, np.abs(law.signals.row @ theta).max())
         cut += law.signals.torque[0] != law.signals.demand[0]
-    return worst, cut
-
-
-def test_learning_uses_the_applied_torque():
-    """With 'effort' the identity holds despite an actuator delay, with 'command' it does not.
-
-    The controller knows its own limits: the identity holds while the torque is cut.
-    """
-    of_command, of_effort = (
-        identity_error({'delay': 3}, torque_source=source)[0] for source in (0, EFFORT)
-    )
-    assert of_effort < 0.01
-    assert of_command > 10.0 * of_effort
-    for limit, values in (('torque_limit', [8.5, 20.0]), ('rate_limit', [400.0, 150.0])):
-        of_limited, cut = identity_error({}, **{limit: np.array(values)})
-        assert cut > 10
-        assert of_limited < 0.01
+    assert cut > 10
+    assert worst < 0.01
 
 
 LAMBDA = CHOICES['prediction'].index('lambda')
@@ -93,8 +82,8 @@ def test_differentiating_filter_matches_the_exact_discretisation_of_scipy(omega,
 
 
 def test_row_of_lambda_follows_equation_24_in_a_closed_loop():
-    law = controller(recommended(prediction=LAMBDA, torque_source=EFFORT, omega=60.0))
-    for sample in closed_loop(law, plant(delay=1), 0.5):
+    law = controller(recommended(prediction=LAMBDA, omega=60.0))
+    for sample in closed_loop(law, plant(), 0.5):
         q, dq, applied = sample.measurement.reshape(3, 2)
         dalpha2, alpha2 = law.signals.dalpha2, dq - law.signals.xi2
         x = np.array([*(dalpha2 + law.state.observed_rate), *dq, 1.0])

@@ -13,7 +13,6 @@ from plain_law import PlainLaw, R, dynamics
 from plants import QUIET
 
 from blf_dsc_controller.law import barrier
-from blf_dsc_controller.law.settings import EFFORT
 from blf_dsc_controller.law.torque import LEVEL_CUT, RATE_CUT, find_applied, saturate
 
 BOUND, WEIGHT, LIMIT = 0.002, 1000.0, 2e4
@@ -125,7 +124,6 @@ def drawn(seed):
         'kappa': random.choice([0.0, 2.0, 50.0 if newton else 1.0]),
         'compensation': int(random.integers(2)),
         'bumpless': int(random.integers(2)),
-        'torque_source': int(random.integers(2)),
         'information': information,
         'variance': np.diag(np.linalg.inv(information)).copy(),
         'prior_weight': random.choice([0.0, 0.1]),
@@ -232,14 +230,9 @@ def test_torque_that_is_not_a_number_does_not_turn_into_one_that_looks_valid(rat
     assert np.isnan(cut(np.nan, 3.0, rate=rate)[0])
 
 
-@pytest.mark.parametrize('source', ['command', 'effort without the drive', 'whole effort'])
-def test_applied_torque_has_the_mean_of_what_the_drive_adds_at_both_ends(source):
-    whole = source == 'whole effort'
-    changes = {'torque_source': EFFORT * (source != 'command'), 'effort_is_whole': int(whole)}
-    case = _, state, signals = arbitrary(3, **changes)
-    measurement = np.arange(6.0)
-    base = state.torque.copy() if source == 'command' else measurement[4:]
-    expected = base + 0.5 * (state.added + signals.added) * (not whole)
-    find_applied(*case, measurement)
+def test_applied_torque_has_the_mean_of_what_the_drive_adds_at_both_ends():
+    case = _, state, signals = arbitrary(3)
+    expected = state.torque + 0.5 * (state.added + signals.added)
+    find_applied(*case)
     np.testing.assert_array_equal(signals.applied, expected)
     np.testing.assert_array_equal(state.added, signals.added)

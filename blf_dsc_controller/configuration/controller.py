@@ -223,8 +223,6 @@ class ControllerConfig(ArmConfig):
             yield f'learning.weighing: got true with {", ".join(learned)}, but needs {needs}'
             return
         yield from self.arm_problems(f'model {self.model}', needed)
-        if self.robot.effort == 'current' and self.learning.torque_source == 'effort':
-            yield 'learning.torque_source: got effort, but robot.effort is current'
         yield from self.reference.problems()
         yield from self.limits.problems(self.joints)
         yield from self.barrier.problems(self.joints)

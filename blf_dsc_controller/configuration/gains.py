@@ -260,9 +260,6 @@ class Learning:
     column_gain: float = positive(1.0, 'adaptation gain of the disturbance columns')
     interval: int = _size(10, 'interval of the checks for excitation', 'samples', at_least=1)
     weighing: bool = _size(False, 'weigh what the tip of a URDF holds since the first window')
-    torque_source: Literal['command', 'effort'] = _in_window(
-        'command', 'torque to learn from: the limited command, or the effort of the joint states'
-    )
 
     def problems(self, sample_time: float, model: str, count: int) -> Iterator[str]:
         """Check the size of the window, and the initial estimate against the model and the ball."""

@@ -23,7 +23,7 @@ import numpy as np
 
 from blf_dsc_controller.compiled.jit import inner
 from blf_dsc_controller.law import barrier
-from blf_dsc_controller.law.settings import EFFORT, Settings
+from blf_dsc_controller.law.settings import Settings
 from blf_dsc_controller.law.state import Signals, State
 
 _SMOOTH = 0.5  # upper end of the band, times the sample rate
@@ -64,10 +64,8 @@ def pass_band(settings: Settings, state: State, signals: Signals, dt: float) -> 
     smooth, slow = barrier.filter_gain(dt / _SMOOTH, dt), barrier.filter_gain(dt / _SLOW, dt)
     brief = barrier.filter_gain(_MEMORY, dt)
     for i in range(settings.n):
-        torque = signals.applied[i]
-        if settings.torque_source != EFFORT:  # which is measured after the drive
-            torque = low_pass(lags, _DRIVE, i, late, lags[_HELD, i])
-            lags[_HELD, i] = signals.applied[i]
+        torque = low_pass(lags, _DRIVE, i, late, lags[_HELD, i])
+        lags[_HELD, i] = signals.applied[i]
         torque = low_pass(lags, _SENSOR, i, late, torque)
         torque = low_pass(lags, _TORQUE1, i, smooth, torque)
         torque = low_pass(lags, _TORQUE2, i, smooth, torque)

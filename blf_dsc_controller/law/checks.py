@@ -11,7 +11,7 @@ from typing import Annotated, NamedTuple
 
 from blf_dsc_controller.compiled.jit import inner
 from blf_dsc_controller.compiled.layout import Array, Cell, size_of, view_of
-from blf_dsc_controller.law.settings import EFFORT, LINEAR, Settings
+from blf_dsc_controller.law.settings import LINEAR, Settings
 from blf_dsc_controller.law.state import Sample, Signals, State
 
 SUSPECT = 1
@@ -68,8 +68,6 @@ def is_valid_state(settings: Settings, checks: Checks, measurement: Array) -> bo
     n = settings.n
     for i in range(n):
         if not (isfinite(measurement[i]) and abs(measurement[n + i]) <= checks.velocity_limit[0]):
-            return False
-        if settings.torque_source == EFFORT and not isfinite(measurement[2 * n + i]):
             return False
     return True
 

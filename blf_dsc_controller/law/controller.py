@@ -141,7 +141,7 @@ def step(
         signals.q[i] = used[i]
         signals.dq[i] = used[n + i]
     torque.find_added(settings, signals)
-    torque.find_applied(settings, state, signals, used)
+    torque.find_applied(settings, state, signals)
     reference.evaluate(reference_vector, t, signals.qr, signals.dqr, signals.ddqr)
     torque.known_disturbance(settings, signals, t)
     barrier.update_bound(settings, signals, t)

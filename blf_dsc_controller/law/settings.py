@@ -12,7 +12,6 @@ CHOICES = {
     'surface': ('filtered', 'linear'),
     'prediction': ('filtered', 'lambda'),
     'update': ('gradient', 'newton'),
-    'torque_source': ('command', 'effort'),
     'compensation': ('reference', 'state'),
 }
 """Settings that are choices: the vector holds the index."""
@@ -20,7 +19,6 @@ CHOICES = {
 LINEAR = CHOICES['surface'].index('linear')
 FILTERED = CHOICES['prediction'].index('filtered')
 NEWTON = CHOICES['update'].index('newton')
-EFFORT = CHOICES['torque_source'].index('effort')
 REFERENCE = CHOICES['compensation'].index('reference')
 
 
@@ -37,7 +35,6 @@ class Settings(NamedTuple):
     surface: int
     prediction: int
     update: int
-    torque_source: int
     effort_is_whole: int  # 1: measured efforts contain what the drive adds, 0: they do not
     drive: int  # columns of the gravity that the drive adds; 0: it adds none
     drive_size: int  # of drive_chain

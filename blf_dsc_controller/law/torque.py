@@ -42,9 +42,9 @@ from blf_dsc_controller.arms.model import regressors_at
 from blf_dsc_controller.arms.serial_chain import SerialChain, fill_regressor
 from blf_dsc_controller.compiled.elementary import sin
 from blf_dsc_controller.compiled.jit import inner
-from blf_dsc_controller.compiled.layout import Array, part
+from blf_dsc_controller.compiled.layout import Array
 from blf_dsc_controller.law import barrier
-from blf_dsc_controller.law.settings import EFFORT, LINEAR, Settings
+from blf_dsc_controller.law.settings import LINEAR, Settings
 from blf_dsc_controller.law.state import Signals, State
 
 LEVEL_CUT = 1.0
@@ -119,20 +119,13 @@ def find_added(settings: Settings, signals: Signals) -> None:
 
 
 @inner
-def find_applied(settings: Settings, state: State, signals: Signals, measurement: Array) -> None:
+def find_applied(settings: Settings, state: State, signals: Signals) -> None:
     """Write the mean whole torque of the last interval to `signals.applied` (n,) [N m].
 
-    It is the last command, or the measured effort, and the mean of G_d at both ends.
+    It is the last command and the mean of G_d at both ends.
     """
-    n = settings.n
-    effort = part(measurement, 2 * n, (n,))
-    for i in range(n):
-        if settings.torque_source != EFFORT:
-            signals.applied[i] = state.torque[i]
-        else:
-            signals.applied[i] = effort[i]
-        if settings.torque_source != EFFORT or settings.effort_is_whole == 0:
-            signals.applied[i] += 0.5 * (state.added[i] + signals.added[i])
+    for i in range(settings.n):
+        signals.applied[i] = state.torque[i] + 0.5 * (state.added[i] + signals.added[i])
         state.added[i] = signals.added[i]
 
 

@@ -116,7 +116,7 @@ class StateCheck:
 
     def invalid(self, safety: Safety, measurement: Vector) -> Fault:
         """Return the fault of an invalid [q (n,) rad, dq (n,) rad/s, effort (n,) N m]."""
-        q, dq, effort = measurement.reshape(3, -1)
+        q, dq, _ = measurement.reshape(3, -1)
         if not np.isfinite(q).all():
             return Fault(Reason.NOT_FINITE, f'the positions are not finite: {q}')
         if not np.isfinite(dq).all():
@@ -124,10 +124,6 @@ class StateCheck:
             remedy = 'if the hardware measures none, set safety.velocity to estimated'
             return Fault(Reason.NOT_FINITE, f'{text}; {remedy}')
         worst = int(np.argmax(np.abs(dq)))
-        if abs(dq[worst]) <= safety.velocity_limit:
-            return Fault(
-                Reason.NOT_FINITE, f'efforts used for learning are missing or not finite: {effort}'
-            )
         text = (
             f'the velocity of joint {self._joints[worst]!r} is {dq[worst]:+.6g} rad/s: more '
             f'than safety.velocity_limit, {safety.velocity_limit:g} rad/s'
