@@ -19,8 +19,7 @@ from blf_dsc_controller.configuration.nodes import known_names, load_loop, locat
 from blf_dsc_controller.simulation.loop import simulate
 from blf_dsc_controller.studies import paper as claims
 from blf_dsc_controller.studies import tuning as tune
-from blf_dsc_controller.studies.paper import FAILS, HOLDS, ONLY_IF
-from blf_dsc_controller.studies.paper_cases import CASES, case_name
+from blf_dsc_controller.studies.paper import CASES, FAILS, HOLDS, ONLY_IF, case_name
 
 
 def test_every_law_is_tuned_with_the_same_effort():
@@ -71,7 +70,7 @@ def test_claims_and_laws_are_printed_and_figures_drawn(report, found):
         assert f'{claim["says"]}\n' in printed
         assert f'{claim["measured"]}\n' in printed
     assert 'recommended' in printed
-    assert len(list(report.glob('*.png'))) == 6
+    assert len(list(report.glob('*.png'))) == 5
 
 
 def test_verdicts_follow_from_the_runs_of_the_report(found):

@@ -30,7 +30,7 @@ def paper(options: Namespace) -> None:
         for where, line in zip((claim.where, '', ''), claim.lines, strict=True):
             print(f'{where:<18} {line}')
     print(aligned(table))
-    print(f'wrote {options.out}: results.json, six pictures, configurations of all runs')
+    print(f'wrote {options.out}: results.json, five pictures, configurations of all runs')
 
 
 def arms(options: Namespace) -> None:

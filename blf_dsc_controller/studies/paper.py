@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The paper, side by side: its claims, checked by runs of every law, a table and pictures.
+"""The paper, side by side: laws, variations and sweeps, its claims checked by their runs, pictures.
 
 Every verdict is computed from the runs. It is `holds only if` for a claim that holds in some of
 the runs that it is about and fails in others; `condition` then says when it holds.
@@ -8,7 +8,7 @@ the runs that it is about and fails in others; `condition` then says when it hol
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import NamedTuple
@@ -16,27 +16,21 @@ from typing import NamedTuple
 import numpy as np
 from matplotlib.ticker import NullFormatter
 from numpy.typing import NDArray
+from tqdm.contrib.concurrent import process_map
 
 from blf_dsc_controller.analysis.figures import Picture, draw_panels
-from blf_dsc_controller.analysis.metrics import estimates_of
-from blf_dsc_controller.analysis.panels import ALARM, COLOURS, MUTED, panels
+from blf_dsc_controller.analysis.metrics import Metrics, estimates_of, measure
+from blf_dsc_controller.analysis.panels import ALARM, COLOURS, panels
 from blf_dsc_controller.analysis.summary import plain, write_summary
-from blf_dsc_controller.configuration.nodes import dump
+from blf_dsc_controller.configuration.nodes import LoopConfig, dump, load_loop
+from blf_dsc_controller.configuration.schema import change
 from blf_dsc_controller.law.factory import settings_of_config
 from blf_dsc_controller.law.lyapunov import decay_rate, exponential_bound
 from blf_dsc_controller.law.settings import Settings
 from blf_dsc_controller.messages.topics import LAMBDA_MIN, LATCHED, LYAPUNOV_TERMS
-from blf_dsc_controller.run import Floats, Run
-from blf_dsc_controller.studies.paper_cases import (
-    BOUND,
-    CASES,
-    SIDE_BY_SIDE,
-    SWEEPS,
-    SWEPT,
-    Results,
-    case_name,
-    run_all,
-)
+from blf_dsc_controller.run import Floats, Run, Series
+from blf_dsc_controller.simulation.loop import simulate
+from blf_dsc_controller.studies.runs import cores
 
 HOLDS = 'holds'
 ONLY_IF = 'holds only if'
@@ -53,11 +47,146 @@ _PAIRS = {  # of Fig. 2 and 3, by their captions
 _TRACKING = (6.4, 2.5)  # inches
 _ESTIMATES = (8.6, 2.4)
 _PANEL = (4.6, 2.9)
-_COLUMNS = 3
 _UNTIL = 10.0  # s, end of Fig. 2
 _BROKEN = 10.0  # multiple of the bound at which all larger ratios are drawn
 _MARKS = 'os^D'
-_DECADE = 15.0  # a sweep over more than this factor is logarithmic
+
+
+DURATION = 60.0  # s
+SWEEP_DURATION = 30.0  # s
+
+SIDE_BY_SIDE = {
+    'paper': "proposed, the paper's choices",
+    'paper_tuned': 'proposed, tuned',
+    'comparison': 'comparison, tuned',
+    'comparison_detuned': 'comparison, low gains',
+    'slotine_li': 'Slotine-Li, tuned',
+    'recommended': 'recommended',
+    'two_tone': 'two tones, columns',
+    'model_based': 'all known (16)',
+}
+"""Labels of the laws that are compared, by their presets."""
+
+SWEPT = ('recommended', 'paper_tuned', 'comparison', 'slotine_li')
+
+P = (1.0, 0.32, 0.4)  # kg m^2
+START = [2.2935, 1.6961]  # rad, qr(0)
+BOUND = 0.002  # rad
+
+Changes = Mapping[str, object]
+
+
+class Case(NamedTuple):
+    """A preset with changes to the law and to the plant."""
+
+    preset: str
+    law: Mapping[str, object] = {}
+    plant: Mapping[str, object] = {}
+    duration: float = DURATION
+
+    def loop(self) -> LoopConfig:
+        """Return the configuration of the case."""
+        loop, plant = load_loop(self.preset), {'duration': self.duration, **self.plant}
+        return loop._replace(
+            controller=change(loop.controller, self.law), plant=change(loop.plant, plant)
+        )
+
+
+_QUIET = {'disturbance.constant': [0.0, 0.0], 'disturbance.amplitude': [0.0, 0.0]}
+_PUSHED = {'disturbance.constant': [8.0, 0.1]}  # 8 N m against joint 1
+_AT_REST = {'reference.amplitude': [0.0, 0.0], 'reference.offset': START}
+_LEAKY = {  # in the paper's form, eta = 0.02
+    'disturbance.leakage': 0.02,
+    'learning.compensation': 'state',
+    'learning.bumpless': False,
+    'truth.parameters': list(P),
+    'truth.constant': [0.1, 0.1],
+}
+
+
+SWEEPS: dict[str, tuple[tuple[float, ...], Callable[[float], tuple[Changes, Changes]]]] = {
+    'sample time [ms]': (
+        (0.5, 1.0, 2.0, 3.0, 5.0, 7.0, 10.0),
+        lambda value: ({'sample_time': value * 1e-3}, {'sample_time': value * 1e-3}),
+    ),
+    'delay [samples]': (
+        (0.0, 1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 8.0, 10.0),
+        lambda value: ({}, {'actuator.delay': int(value)}),
+    ),
+    'torque limit [N m]': (
+        (9.0, 9.5, 10.0, 10.5, 11.0, 12.0, 14.0, 20.0),
+        lambda value: ({'torque.limit': [value, value]}, {}),
+    ),
+    'initial parameters [of the truth]': (
+        (0.0, 0.25, 0.5, 0.75, 1.0, 1.25, 1.5, 2.0),
+        lambda value: ({'learning.initial_estimate': [value * each for each in P]}, {}),
+    ),
+}
+"""Conditions: values of each, and the changes of law and plant for a value."""
+
+
+def case_name(condition: str, law: str, value: float) -> str:
+    """Return the name of one run of a sweep."""
+    return f'{condition.partition(" [")[0]} {law} {value:g}'
+
+
+CASES = {
+    **{preset: Case(preset) for preset in SIDE_BY_SIDE},
+    'paper_quiet': Case('paper', plant=_QUIET),
+    'paper_at_rest': Case('paper', _AT_REST),
+    'paper_from_zero': Case('paper', {'learning.initial_estimate': [0.0] * 3}),
+    'leaky': Case('recommended', {**_LEAKY, 'truth.amplitude': [0.1, 0.1]}),
+    'leaky_constant': Case('recommended', _LEAKY, {'disturbance.amplitude': [0.0, 0.0]}),
+    'paper_pushed': Case('paper', plant=_PUSHED),
+    'recommended_pushed': Case('recommended', plant=_PUSHED),
+    **{
+        case_name(condition, law, value): Case(law, *changes(value), SWEEP_DURATION)
+        for condition, (values, changes) in SWEEPS.items()
+        for law in SWEPT
+        for value in values
+    },
+}
+"""Every run, by name."""
+
+
+class Results(NamedTuple):
+    """Results by name of the case; the runs of sweeps are not kept."""
+
+    metrics: dict[str, Metrics]
+    runs: dict[str, Run]
+
+    def swept(self, condition: str, law: str) -> dict[float, Metrics]:
+        """Return the metrics of a law at each value of a condition."""
+        values, _ = SWEEPS[condition]
+        return {value: self.metrics[case_name(condition, law, value)] for value in values}
+
+    def ratios(self, *names: str) -> list[float]:
+        """Return the largest |xi1| / k_c of each case."""
+        return [self.metrics[name].max_error_ratio for name in names]
+
+    def parameter_errors(self, *names: str) -> list[float]:
+        """Return the relative parameter error of each case after 60 s."""
+        return [self.metrics[name].parameter_error[60] for name in names]
+
+
+def run_case(case: Case) -> tuple[Metrics, Run | None]:
+    """Simulate a case; return its metrics and, unless it belongs to a sweep, the run."""
+    loop = case.loop()
+    with np.errstate(all='ignore'):  # a run that diverges has metrics too
+        run = simulate(loop.controller, loop.plant, supervised=False).run()
+        return measure(run), run if case.duration == DURATION else None
+
+
+def run_all() -> Results:
+    """Simulate every case on all cores."""
+    run_case(CASES['paper']._replace(duration=1.0))  # compiles what the workers load
+    cases = CASES.values()
+    found = process_map(run_case, cases, max_workers=cores(), chunksize=1, desc='runs', unit='run')
+    named = dict(zip(CASES, found, strict=True))
+    return Results(
+        {name: metrics for name, (metrics, _) in named.items()},
+        {name: run for name, (_, run) in named.items() if run is not None},
+    )
 
 
 class Claim(NamedTuple):
@@ -103,16 +232,19 @@ def claims(results: Results) -> Iterator[Claim]:
 
 def _of_abstract(results: Results) -> Iterator[Claim]:
     paper = results.metrics['paper']
-    held = {sweep.name: results.held(sweep.name, 'paper_tuned') for sweep in SWEEPS}
+    swept = {condition: results.swept(condition, 'paper_tuned') for condition in SWEEPS}
+    times, delays, limits, _ = (
+        [value for value, metrics in each.items() if metrics.held] for each in swept.values()
+    )
     yield Claim(
         'Abstract',
         'The scheme guarantees a small bounded tracking error.',
         f"largest |xi1| / k_c {paper.max_error_ratio:.2f} with the paper's choices; with the tuned "
-        f'gains the bound is kept up to a delay of {max(held["delay"], default=0):g} samples, up '
-        f'to a sample time of {max(held["sample time"], default=0):g} ms and down to a torque '
-        f'limit of {min(held["torque limit"], default=np.nan):g} N m',
-        verdict(paper.held, all(len(held[sweep.name]) == len(sweep.values) for sweep in SWEEPS)),
-        'torque, sample time, delay and sensors allow it',
+        f'gains the bound is kept up to a delay of {max(delays, default=0):g} samples, up to a '
+        f'sample time of {max(times, default=0):g} ms and down to a torque limit of '
+        f'{min(limits, default=np.nan):g} N m',
+        verdict(paper.held, all(m.held for each in swept.values() for m in each.values())),
+        'torque, sample time and delay allow it',
     )
     final = results.parameter_errors('paper_quiet', 'paper', 'paper_at_rest')
     quiet, disturbed, rest = _percents(final)
@@ -217,7 +349,7 @@ def _of_section_4(results: Results) -> Iterator[Claim]:
         f'{recommended} recommended',
         verdict(learned[0] < learned[1]),
     )
-    least = float(_learned(results.runs['paper_quiet'], LAMBDA_MIN)[-1])
+    least = float(_monitor(results.runs['paper_quiet']).column(LAMBDA_MIN)[-1])
     yield Claim(
         'IV',
         'The reference does not fully excite the system.',
@@ -226,7 +358,7 @@ def _of_section_4(results: Results) -> Iterator[Claim]:
         verdict(least < 1e-6),
     )
     zero, laws = results.metrics['paper_from_zero'], ('paper_tuned', 'recommended')
-    kept = [0.0 in results.held('initial parameters', law) for law in laws]
+    kept = [results.metrics[case_name('initial parameters', law, 0.0)].held for law in laws]
     pairs = zip(laws, kept, strict=True)
     yield Claim(
         'IV',
@@ -274,13 +406,13 @@ def _exponential_fit(time: Floats, error: Floats, latched: NDArray[np.bool_]) ->
 # Estimates and V of every simulated run are known.
 
 
-def _learned(run: Run, name: str) -> Floats:
+def _monitor(run: Run) -> Series:
     assert run.monitor is not None  # noqa: S101
-    return run.monitor.column(name)
+    return run.monitor
 
 
 def _latched(run: Run) -> NDArray[np.bool_]:
-    return _learned(run, LATCHED) > 0.5
+    return _monitor(run).column(LATCHED) > 0.5
 
 
 def _parameter_error(run: Run) -> Floats:
@@ -292,8 +424,7 @@ def _parameter_error(run: Run) -> Floats:
 
 def _energy(run: Run) -> Floats:
     """Return V of (29), (N,) [J]."""
-    assert run.monitor is not None  # noqa: S101
-    return np.asarray(run.monitor.select(LYAPUNOV_TERMS).sum(axis=1))
+    return np.asarray(_monitor(run).select(LYAPUNOV_TERMS).sum(axis=1))
 
 
 def _percent(value: float) -> str:
@@ -366,45 +497,26 @@ def draw_pairs(results: Results, folder: Path) -> None:
 
 
 def draw_robustness(results: Results, folder: Path) -> None:
-    """Draw the largest error and the parameter error of every sweep."""
-    metrics = results.metrics.items()
-    ratios = {name: min(each.max_error_ratio, _BROKEN) for name, each in metrics}
-    title = 'Largest error, in units of the bound: above the red line it is violated'
-    picture = _draw_sweeps(title, ratios)
-    for axes in picture.axes.flat:
-        axes.set_ylim(0.15, 1.3 * _BROKEN)
-        axes.axhline(1.0, color=ALARM, lw=1.2, ls='--')
-        ticks = [0.2, 0.5, 1.0, 2.0, 5.0, _BROKEN]
-        axes.set_yticks(ticks, [*(f'{tick:g}' for tick in ticks[:-1]), f'{_BROKEN:g}+'])
-        axes.yaxis.set_minor_formatter(NullFormatter())
-        axes.set_ylabel('max $|\\xi_1| / k_c$')
-    picture.save(folder / 'robustness_tracking.png')
-    errors = {name: each.tail_parameter_error for name, each in metrics}
-    picture = _draw_sweeps('Parameter error over the last ten of 30 s', errors)
-    for axes in picture.axes.flat:
-        axes.set_ylim(3e-5, 5.0)
-        axes.axhline(0.01, color=MUTED, lw=1.2, ls='--')
-        axes.yaxis.set_major_formatter(lambda value, _: f'{100 * value:g} %')
-        axes.set_ylabel(r'$\|\hat P - P\| \;/\; \|P\|$')
-    picture.save(folder / 'robustness_learning.png')
-
-
-def _draw_sweeps(title: str, value_of: dict[str, float]) -> Picture:
-    """Draw a figure of each case, by its name: a panel for each sweep, a line for each law."""
-    picture = Picture(-(-len(SWEEPS) // _COLUMNS), _COLUMNS, title, _PANEL, share_time=False)
-    for sweep, axes in zip(SWEEPS, picture.axes.flat, strict=True):
+    """Draw the largest error and the parameter error of every sweep, a line for each law."""
+    title = 'Largest error, outside the bound above the red line; parameter error from 20 to 30 s'
+    picture = Picture(2, len(SWEEPS), title, _PANEL, share_time=False)
+    for condition, (upper, lower) in zip(SWEEPS, picture.axes.T, strict=True):
         for law, colour, mark in zip(SWEPT, COLOURS, _MARKS, strict=False):
-            if law in sweep.laws:
-                values = [value_of[case_name(sweep.name, law, value)] for value in sweep.values]
-                style = {'color': colour, 'marker': mark, 'ms': 4.5, 'label': SIDE_BY_SIDE[law]}
-                axes.plot(sweep.values, values, **style)
-        least, most = min(sweep.values), max(sweep.values)
-        if 0.0 < _DECADE * least < most:
-            axes.set_xscale('log')
-            shown = sweep.values[:: 1 if len(sweep.values) <= 7 else 2]
-            axes.set_xticks(shown, [f'{value:g}' for value in shown])
-            axes.xaxis.set_minor_formatter(NullFormatter())
-        axes.set_xlabel(sweep.label)
-        axes.set_yscale('log')
-    picture.axes.flat[0].legend(frameon=False, fontsize=9, loc='best')
-    return picture
+            found = results.swept(condition, law)
+            style = {'color': colour, 'marker': mark, 'ms': 4.5, 'label': SIDE_BY_SIDE[law]}
+            ratios = [min(each.max_error_ratio, _BROKEN) for each in found.values()]
+            errors = [100.0 * each.tail_parameter_error for each in found.values()]
+            upper.plot([*found], ratios, **style)
+            lower.plot([*found], errors, **style)
+        upper.axhline(1.0, color=ALARM, lw=1.2, ls='--')
+        for axes, label in (
+            (upper, r'max $|\xi_1| / k_c$'),
+            (lower, r'$\|\hat P - P\| \;/\; \|P\|$ [%]'),
+        ):
+            axes.set_xlabel(condition)
+            axes.set_ylabel(label)
+            axes.set_yscale('log')
+            axes.yaxis.set_major_formatter('{x:g}')
+            axes.yaxis.set_minor_formatter(NullFormatter())
+    picture.axes[0, 0].legend(frameon=False, fontsize=9)
+    picture.save(folder / 'robustness.png')
