@@ -10,7 +10,6 @@ from blf_dsc_controller import load_loop, simulate
 from blf_dsc_controller.arms.tuning import over_postures
 from blf_dsc_controller.configuration.robot import parameters_of
 from blf_dsc_controller.law.factory import controller_of
-from blf_dsc_controller.supervision.config_warnings import config_warnings
 from sim_plant.plant import plant_settings
 
 NOISY = {'sensor.velocity': 'measured', 'sensor.velocity_noise': 0.005}
@@ -35,21 +34,6 @@ def test_arm_keeps_its_bound_whatever_its_rotors_are(preset, factor, sample_time
     run = ran(preset, factor, sample_time=sample_time).run()
     assert not run.stops
     assert np.abs(run.error / run.bound).max() < (0.8 if preset == 'fr3' else 1.0)
-
-
-@pytest.mark.parametrize(
-    ('preset', 'joint', 'share'), [('ur5e', 'wrist_3_joint', 0.31), ('fr3', 'fr3_joint7', 0.054)]
-)
-def test_run_says_how_light_its_drives_may_be(preset, joint, share):
-    text = ' '.join(config_warnings(load_loop(preset).controller))
-    assert f'the drive of {joint} has less than {share:g} of the inertia assumed' in text
-    assert ran(preset, 0.3 * share).run().stops
-
-
-def test_run_says_nothing_of_drives_that_may_weigh_nothing_or_are_known():
-    for preset, given in (('panda', {}), ('ur5e', {'robot.rotor_inertia': [0.5] * 6})):
-        config = load_loop(preset, {'blf_dsc_controller': given}).controller
-        assert 'rotor_inertia' not in ' '.join(config_warnings(config))
 
 
 def test_wrist_that_its_friction_moves_more_than_its_gains_stops_with_the_reason():

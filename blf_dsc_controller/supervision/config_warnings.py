@@ -2,6 +2,17 @@
 """Warnings before the start: gains, limits and windows that are valid but cannot work well.
 
 They are based on the initial parameter estimate, which is a guess. doc/tuning.md derives them.
+
+The errors to expect are those of the sampled loop at small errors.  About a motion that the law
+follows, learning aside, the law is linear in the errors, and so is the arm with its inertia M of
+that posture.  From one sample to the next the errors of n joints follow x+ = A x + B d with, for
+each joint,
+
+    x = [q, dq, drive torque, torque of the last sample, q of the last sample, filtered dq,
+         alpha2, d^3]
+
+where d [N m] is the torque that the model lacks.  Torques arrive a sample late and pass the drives,
+velocities are differences of positions behind a filter; each of both lags is half of `robot.lag`.
 """
 
 from __future__ import annotations
@@ -13,35 +24,168 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from blf_dsc_controller.arms.inertia import pseudo_inertia
+from blf_dsc_controller.arms.model import free_inertias, inertia_matrices, regressors_at
 from blf_dsc_controller.arms.tuning import SAMPLES, UNKNOWN_EFFORT, loop_delay
 from blf_dsc_controller.configuration.controller import ControllerConfig
-from blf_dsc_controller.configuration.robot import implausible_friction
+from blf_dsc_controller.configuration.robot import implausible_friction, parameters_of
+from blf_dsc_controller.law.barrier import filter_gain
 from blf_dsc_controller.law.factory import settings_of_config
-from blf_dsc_controller.law.settings import FILTERED, LINEAR, NEWTON, Settings
-from blf_dsc_controller.supervision.linear_loop import (
-    ReferenceLoad,
-    expected_errors,
-    reference_load,
-)
+from blf_dsc_controller.law.settings import LINEAR, NEWTON, Settings
+from blf_dsc_controller.reference.approach import reference_of
+from blf_dsc_controller.reference.terms import sampled
 
 Floats = NDArray[np.float64]
 
 _MARGIN = 1.25  # recommended torque limit over what the reference needs
 _PERIODS = 0.02  # periods by which a window may differ from a whole number
-_FUNNEL = 20.0  # times the bound; up to 5 with the presets
 _SLUGGISH = 1.0  # rad/s^2; the weakest joint of the presets has 60
-_IMPOSSIBLE = 1e-3  # of the pseudo-inertia's largest eigenvalue: more than rounding errors
-_SETTLED = 10.0  # time constants of the filter (8) ...
-_FILTERED = 4.0  # ... and of the regressor's filter, applied to both sides of the identity
+_POINTS = 400  # along the reference
+_LONGEST = 120.0  # s of the reference
+_RESPONSE = 20.0  # time constants of the damping, for which the response is followed
+_MOMENTS = 40  # of the reference
+_REVERSAL = 0.75  # of Coulomb friction: half of it too much at breakaway, with either sign
+
+
+class ReferenceLoad(NamedTuple):
+    """Torque, inertia and excitation along the reference."""
+
+    torque: Floats  # largest magnitude (n,), N m
+    inertia: Floats  # M, where positive definite (k, n, n), kg m^2
+    excitation: Floats  # mean of H^T H (p, p)
+
+    def rate(self, settings: Settings) -> float:
+        """Return the largest eigenvalue of M^-1 K_p + omega_v, 1/s."""
+        Kp = np.diag(settings.Kp)[np.newaxis]  # numpy 1 reads a lone matrix as vectors
+        roots = np.linalg.eigvals(np.linalg.solve(self.inertia, Kp))
+        return float(np.abs(roots).max(initial=0.0)) + settings.damping_rate
+
+    @property
+    def free_inertia(self) -> Floats:
+        """Smallest inertia (n,) of each joint with the others free, kg m^2."""
+        least: Floats = free_inertias(self.inertia).min(axis=0, initial=np.inf)
+        return least
+
+    def damping(self, settings: Settings) -> Floats:
+        """Return the smallest damping (n,) of each joint with the others free, N m s/rad."""
+        rate = settings.damping_rate
+        damped = rate * self.free_inertia if rate > 0.0 else 0.0
+        return settings.Kp + damped
+
+
+def reference_load(config: ControllerConfig, settings: Settings) -> ReferenceLoad:
+    """Evaluate the dynamics along the reference, over its slowest period."""
+    model, P = settings.model, settings.initial_estimate[: settings.p]
+    q, dq, ddq = _along(config, _POINTS)
+    H = regressors_at(model, q, dq, dq, ddq)
+    M = inertia_matrices(model, P, q)
+    return ReferenceLoad(
+        torque=np.abs(H @ P).max(axis=0),
+        inertia=M[np.linalg.eigvalsh(M)[:, 0] > 0.0],
+        excitation=np.einsum('kni,knj->ij', H, H) / _POINTS,
+    )
+
+
+def _along(config: ControllerConfig, count: int) -> Floats:
+    """Return q, dq, ddq (3, k, n) over the whole reference, at most `_LONGEST`."""
+    frequencies = [w for w in config.reference.frequency if w > 0.0]
+    end = 2.0 * np.pi / min(frequencies, default=1.0)
+    if config.reference.type == 'waypoints':
+        end = max(config.reference.times)
+    times = np.linspace(0.0, min(end, _LONGEST), count, endpoint=False)
+    return np.moveaxis(sampled(reference_of(config), times), 1, 0)
+
+
+def transition(
+    settings: Settings, T: float, lag: float, M: Floats, M0: Floats, stiffness: Floats
+) -> tuple[Floats, Floats]:
+    """Return A (k, 8 n, 8 n) and B (k, 8 n, n) for the inertias M and M0 of the model (k, n, n).
+
+    T [s] is the sample time, `lag` [s] that of velocity filter and drives together, and
+    `stiffness` (n,) [N m/rad] the slope of the barrier.
+    """
+    n = settings.n
+    decay = np.exp(-T / max(0.5 * lag, 1e-9))  # of the drives
+    mean = (1.0 - decay) * 0.5 * lag / T  # of the drives' transient over the sample
+    rate = settings.K / 2.0 + settings.mu
+    g = filter_gain(settings.time_constant, T)
+    # Rows of x, and of what the law computes in terms of x: alpha2', xi2 and the torque.
+    q, dq, drive, last, before, speed, alpha2, d3 = np.eye(8 * n).reshape(8, n, 8 * n)
+    measured = speed + (1.0 - decay) * ((q - before) / T - speed)
+    beta2 = -rate[:, None] * q
+    dalpha2 = g * (beta2 - alpha2) / T
+    xi2 = measured - alpha2
+    torque = (
+        M0 @ (dalpha2 - settings.damping_rate * xi2)
+        - settings.Kp[:, None] * xi2
+        - stiffness[:, None] * q
+        + d3
+    )
+    applied = mean * drive + (1.0 - mean) * last  # mean over the sample
+    free = np.linalg.inv(M)
+    push = free @ applied
+    rows = [
+        q + T * dq + 0.5 * T**2 * push,
+        dq + T * push,
+        decay * drive + (1.0 - decay) * last,
+        torque,
+        q,
+        measured,
+        alpha2 + T * dalpha2,
+        d3 - T * settings.gamma[:, None] * xi2,
+    ]
+    A = np.concatenate(np.broadcast_arrays(*rows), axis=1)
+    B = np.zeros((*A.shape[:-1], n))
+    B[:, :n], B[:, n : 2 * n] = 0.5 * T**2 * free, T * free
+    return A, B
+
+
+def _peak_errors(
+    config: ControllerConfig, settings: Settings, M: Floats, M0: Floats, torque: Floats
+) -> Floats:
+    """Return the largest errors (k, n) [rad] after a step of the torque d (k, n) [N m]."""
+    A, B = transition(settings, config.sample_time, config.robot.lag, M, M0, settings.weight)
+    push = (B @ torque[..., None])[..., 0]
+    x, largest = np.zeros_like(push), np.zeros_like(torque)
+    rate = max(settings.damping_rate, 1.0)
+    for _ in range(round(_RESPONSE / rate / config.sample_time)):
+        x = (A @ x[..., None])[..., 0] + push
+        largest = np.maximum(largest, np.abs(x[:, : settings.n]))
+    return largest
+
+
+class ExpectedErrors(NamedTuple):
+    """Largest errors (n,) [rad] along the reference, before anything is learned of their cause."""
+
+    unmodelled: Floats  # of learning.residual_floor and friction at a reversal
+    pick_up: Floats  # when robot.payload is picked up in motion
+
+
+def expected_errors(config: ControllerConfig, settings: Settings) -> ExpectedErrors:
+    """Return the errors to expect from an arm of a URDF, by the linear loop without the barrier."""
+    model, robot = settings.model, config.robot
+    chain = robot.chain(config.joints)
+    if config.reference.type == 'hold':  # at rest anywhere
+        limits = config.limits.position_lower, config.limits.position_upper
+        q = np.random.default_rng(0).uniform(*limits, (_MOMENTS, len(config.joints)))
+        dq = ddq = np.zeros_like(q)
+    else:
+        q, dq, ddq = _along(config, _MOMENTS)
+    P0 = settings.initial_estimate[: settings.p]
+    load = robot.payload * parameters_of(robot, chain).load
+    M0, M = (inertia_matrices(model, P, q) for P in (P0, P0 + load))
+    floor = np.array(config.learning.residual_floor)
+    floor += _REVERSAL * np.array(robot.friction(chain)['coulomb'])
+    unmodelled = _peak_errors(config, settings, M0, M0, np.broadcast_to(floor, q.shape))
+    pick_up = _peak_errors(config, settings, M, M0, regressors_at(model, q, dq, dq, ddq) @ load)
+    return ExpectedErrors(unmodelled.max(axis=0), pick_up.max(axis=0))
 
 
 class Finding(NamedTuple):
-    """Gains that cannot work well: what they affect, a ratio (bad above 1), and a sentence."""
+    """A limit of the gains: on what, how much of it is used, and what follows above 1."""
 
-    of: str
-    excess: float
-    text: str
+    subject: str
+    use: float
+    text: str  # goes on after the subject
 
 
 def config_warnings(config: ControllerConfig, load: ReferenceLoad | None = None) -> list[str]:
@@ -52,7 +196,7 @@ def config_warnings(config: ControllerConfig, load: ReferenceLoad | None = None)
     settings = settings_of_config(config)
     load = load or reference_load(config, settings)
     found = [*_of_urdf(config, load)] if config.model == 'urdf' else []
-    found += [finding.text for finding in _of_gains(config, load)]
+    found += [f'{each.subject} {each.text}' for each in _of_gains(config, load)]
     if config.model == 'urdf' and config.law == 'blf_dsc':
         found += _of_errors(config, settings)
     if settings.surface != LINEAR and settings.kappa > 0.0 and settings.Gamma.any():
@@ -62,17 +206,17 @@ def config_warnings(config: ControllerConfig, load: ReferenceLoad | None = None)
 
 def worsened(before: ControllerConfig, after: ControllerConfig, load: ReferenceLoad) -> list[str]:
     """Return the warnings on gains that are new or worse after a change."""
-    known = {finding.of: finding.excess for finding in _of_gains(before, load)}
+    known = {each.subject: each.use for each in _of_gains(before, load)}
     return [
-        finding.text
-        for finding in _of_gains(after, load)
-        if finding.excess > known.get(finding.of, 1.0)
+        f'{each.subject} {each.text}'
+        for each in _of_gains(after, load)
+        if each.use > known.get(each.subject, 1.0)
     ]
 
 
 def _of_urdf(config: ControllerConfig, load: ReferenceLoad) -> Iterator[str]:
     """Check for figures that nobody can have measured, and for defaults that are hardly meant."""
-    robot, barrier = config.robot, config.barrier
+    robot = config.robot
     chain = robot.chain(config.joints)
     if chain.pointlike:
         yield (
@@ -92,31 +236,18 @@ def _of_urdf(config: ControllerConfig, load: ReferenceLoad) -> Iterator[str]:
             f'{", ".join(joints)} or more, hardly real, and is not compensated before it is '
             'learned: give robot.viscous and robot.coulomb'
         )
-    for i, joint in enumerate(chain.joints):
-        limit = config.torque.limit[i]
-        moments = np.linalg.eigvalsh(pseudo_inertia(joint.inertia))
-        if moments[0] < -_IMPOSSIBLE * moments[-1]:
-            yield (
-                f'robot.urdf: the inertia of what {joint.name} moves ({joint.link}) is impossible, '
-                'one moment above the sum of the others: is it in kg m^2, about the centre of mass?'
-            )
+    for joint, limit, inertia in zip(
+        chain.joints, config.torque.limit, load.free_inertia, strict=True
+    ):
         if math.isinf(joint.effort) and limit == UNKNOWN_EFFORT:
             yield (
                 f'torque.limit: {joint.name} has no effort in the URDF: {limit:g} N m is assumed; '
                 'set what its drive can withstand'
             )
-        acceleration = limit / load.free_inertia[i]
-        if acceleration < _SLUGGISH:
+        if limit / inertia < _SLUGGISH:
             yield (
-                f'robot.urdf: at its torque limit {joint.name} accelerates at only '
-                f'{acceleration:.2g} rad/s^2: are masses in kg, inertias in kg m^2, lengths in m?'
-            )
-        widest, bound = barrier.widest[i], barrier.bound[i]
-        if widest > _FUNNEL * bound:
-            yield (
-                f'barrier.initial_bound: {joint.name} begins with a bound of {widest:.3g} rad, '
-                f'which narrows to {bound:g}: with gains for robot.lag of {robot.lag:g} s it would '
-                f'sag that far under an undeclared load of {robot.payload:g} kg (robot.payload)'
+                f'robot.urdf: {joint.name} accelerates at only {limit / inertia:.2g} rad/s^2 at '
+                'its torque limit: are masses in kg, inertias in kg m^2, lengths in m?'
             )
 
 
@@ -132,11 +263,7 @@ def expectation(config: ControllerConfig) -> str:
 
 
 def _of_errors(config: ControllerConfig, settings: Settings) -> Iterator[str]:
-    """Check that the errors to expect are within the bound, also with lighter drives.
-
-    The lightest drives are those with which friction alone stays within the bound: the gains follow
-    the inertia that the law measures (`apparent_inertia`), so errors grow with its inverse.
-    """
+    """Check that the errors to expect are within the bound."""
     bound, T, robot = settings.bound, config.sample_time, config.robot
     errors = expected_errors(config, settings)
     worst = int(np.argmax(errors.unmodelled / bound))
@@ -160,75 +287,58 @@ def _of_errors(config: ControllerConfig, settings: Settings) -> Iterator[str]:
             f'bound of {bound[worst]:g} rad: a bound of {1.1 * peak:.2g} rad would hold, or '
             f'{share * robot.payload:.2g} kg, or {remedy}'
         )
-    drives = settings.joint_inertia - settings.link_inertia
-    least = settings.joint_inertia * errors.unmodelled / bound - settings.link_inertia
-    lightest = np.zeros_like(drives)  # of the inertia assumed; where it is given, nothing is
-    np.divide(least, drives, out=lightest, where=settings.unsure_rotor > 0.0)
-    worst = int(lightest.argmax())
-    if lightest[worst] > 0.0:
-        yield (
-            f'robot.rotor_inertia: the bound may be passed if the drive of {config.joints[worst]} '
-            f'has less than {lightest[worst]:.2g} of the inertia assumed: then give it'
-        )
 
 
 def _of_gains(config: ControllerConfig, load: ReferenceLoad) -> list[Finding]:
     with np.errstate(over='ignore'):  # a limit of next to nothing is exceeded infinitely
-        return [each for each in _ratios(config, load) if each.excess > 1.0]
+        return [each for each in _limits_of_gains(config, load) if each.use > 1.0]
 
 
-def _ratios(config: ControllerConfig, load: ReferenceLoad) -> Iterator[Finding]:
-    """Yield what limits the gains, and by how much they use it."""
+def _limits_of_gains(config: ControllerConfig, load: ReferenceLoad) -> Iterator[Finding]:
     settings, T = settings_of_config(config), config.sample_time
     damping = np.maximum(load.damping(settings), 1e-12)
     for joint, need, limit in zip(config.joints, load.torque, config.torque.limit, strict=True):
         yield Finding(
-            f'torque of {joint}',
+            f'torque.limit: {joint}',
             _MARGIN * need / limit,
-            f'torque.limit: {joint} has {limit:g} N m, but with learning.initial_estimate the '
-            f'reference alone needs {need:.3g} N m: give that and a quarter more',
+            f'has {limit:g} N m, but with learning.initial_estimate the reference alone needs '
+            f'{need:.3g} N m: give that and a quarter more',
         )
     rate = load.rate(settings)
     yield Finding(
-        'feedback',
+        'feedback.gain: K_p over the inertia',
         rate * T,
-        f'feedback.gain: K_p over the inertia is {rate:.3g} 1/s with learning.initial_estimate, '
-        f'{rate * T:.2g} times the inverse of sample_time: above 1 the loop has little margin for '
-        'delays, and above 2 it chatters between the limits: lower either',
+        f'is {rate:.3g} 1/s with learning.initial_estimate, {rate * T:.2g} times the inverse of '
+        'sample_time: above 1 the loop has little margin for delays, and above 2 it chatters '
+        'between the limits: lower either',
     )
-    fraction = float(np.max(settings.gamma * T / damping))
+    absorbed = float(np.max(settings.gamma * T / damping))
     yield Finding(
-        'disturbance',
-        2.0 * fraction,
-        f'disturbance.gain: in each sample the disturbance estimate absorbs {fraction:.2g} of '
-        'the velocity feedback, and above a half it oscillates against feedback.gain: lower it',
-    )
-    yield Finding(
-        'leakage',
-        settings.eta * float(settings.gamma.max()) * T,
-        'disturbance.leakage: eta gamma T > 1 makes the disturbance estimate oscillate: lower it',
+        'disturbance.gain: in each sample the disturbance estimate absorbs',
+        2.0 * absorbed,
+        f'{absorbed:.2g} of the velocity feedback, and above a half it oscillates against '
+        'feedback.gain: lower it',
     )
     if settings.surface == LINEAR:
         return
     filtering = config.surface.time_constant
     yield Finding(
-        'filter',
+        'surface.time_constant:',
         T / filtering,
-        f'surface.time_constant: {filtering:g} s is less than the sample time, {T:g} s: alpha2 '
-        'follows the measurement noise, and its derivative enters the torque: give more',
+        f'{filtering:g} s is less than the sample time, {T:g} s: alpha2 follows the measurement '
+        'noise, and its derivative enters the torque: give more',
     )
     rate = float(np.max(settings.K / 2.0 + settings.mu))
     yield Finding(
-        'surface',
+        'surface.gain, surface.mu: K/2 + mu',
         filtering * rate,
-        f'surface.gain, surface.mu: K/2 + mu is {rate:.3g} 1/s, but a filter of {filtering:g} s '
-        f'rings above {0.25 / filtering:.3g} 1/s: lower surface.time_constant or the gains',
+        f'is {rate:.3g} 1/s, but a filter of {filtering:g} s rings above '
+        f'{0.25 / filtering:.3g} 1/s: lower surface.time_constant or the gains',
     )
     for joint, ratio in zip(config.joints, settings.slope_limit * T / damping, strict=True):
         yield Finding(
-            f'barrier of {joint}',
+            f'barrier.slope_limit: past the knee of its barrier {joint} is corrected by',
             ratio / 2.0,
-            f'barrier.slope_limit: past the knee of its barrier {joint} is corrected by '
             f'{ratio:.2g} times its error in a sample, and above 2 the error grows: give less than '
             '2 feedback.gain / sample_time',
         )
@@ -258,10 +368,3 @@ def _of_learning(
                     f"reference's {frequency:g} rad/s: give whole ones, over which a disturbance "
                     'of that period averages out'
                 )
-    filtered = settings.prediction == FILTERED
-    pole = learning.filter_pole if filtered else learning.derivative_filter
-    if learning.settling_time * pole < (_FILTERED if filtered else _SETTLED):
-        yield (
-            f'learning.settling_time: {learning.settling_time:g} s is too short for the filters '
-            f'({pole:g} rad/s), whose transient is still in the first windows: give more'
-        )
