@@ -189,7 +189,7 @@ def test_exit_code_shows_that_the_controller_stopped(tmp_path, capsys):
     assert run.returncode == 5, run.stderr
     assert 'bound       held by every joint until the stop' in run.stdout
     assert 'stopped     at 0.001 s, velocity not plausible' in run.stdout
-    (stop,) = json.loads((out / 'summary.json').read_text())['tracking']['stops']
+    (stop,) = json.loads((out / 'summary.json').read_text())['stops']
     assert stop['reason'] == 'velocity not plausible'
 
 

@@ -93,7 +93,7 @@ def test_another_library_reads_the_whole_bag(reading, counts):
 def test_command_reports_where_the_results_are(out, counts):
     summary = json.loads((out / 'summary.json').read_text())
     assert summary['samples'] == SAMPLES
-    assert summary['tracking']['held'] is True
+    assert summary['held'] is True
     assert {topic: summary['messages'][topic] for topic in counts} == counts
     for picture in ('tracking.png', 'parameters.png'):
         assert (out / picture).read_bytes().startswith(b'\x89PNG')

@@ -13,7 +13,7 @@ from plants import QUIET, START
 
 from blf_dsc_controller.compiled import cholesky
 from blf_dsc_controller.configuration.controller import ControllerConfig
-from blf_dsc_controller.errors import OutsideBarrierError
+from blf_dsc_controller.errors import StartError
 from blf_dsc_controller.law import adaptation, barrier
 from blf_dsc_controller.law.settings import CHOICES, FILTERED
 from blf_dsc_controller.reference.approach import check_takeover
@@ -52,17 +52,15 @@ def test_erratum_5_start_outside_the_barrier_is_rejected_by_name():
         check_takeover(config, np.full(2, bound), q, np.zeros(2), REFERENCE, t)
 
     check(np.array(START))
-    with pytest.raises(OutsideBarrierError):
+    with pytest.raises(StartError):
         check(np.array(START), t=0.2)  # the reference has moved on
     printed = 0.1696 - (1.3961 + 0.3)
     assert abs(printed) / bound == pytest.approx(763.0, abs=0.5)
     for joint, error in ((0, bound), (1, -0.0021), (1, 1.5), (0, np.nan), (1, printed)):
         q = np.array([1.9935, 1.3961]) + 0.3  # the reference at t = 0
         q[joint] += error * (1.0 + 1e-9)
-        with pytest.raises(OutsideBarrierError) as caught:
+        with pytest.raises(StartError) as caught:
             check(q)
-        assert (caught.value.joint, caught.value.bound) == (JOINTS[joint], bound)
-        assert caught.value.error == pytest.approx(error, rel=1e-6, nan_ok=True)
         for part in (JOINTS[joint], f'{error:+.6g} rad', '0.002 rad'):
             assert part in str(caught.value)
 

@@ -8,7 +8,7 @@ import pytest
 from changes import several
 from paper_case import configured
 
-from blf_dsc_controller.analysis.summary import format_table, summarize
+from blf_dsc_controller.analysis.metrics import format_table, measure
 from blf_dsc_controller.bags.reader import read_run
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.errors import ConfigurationError
@@ -143,11 +143,11 @@ def test_weighing_what_cannot_be_weighed_is_rejected():
 def test_bag_tells_what_was_held_in_the_table_and_on_the_page(panda, tmp_path):
     write_bag(tmp_path / 'bag', panda, panda.config, 'none')
     run = read_run(tmp_path / 'bag')
-    summary = summarize(run)
-    held = np.array([(load['until_s'], load['load mass']) for load in summary['loads']])
+    metrics = measure(run)
+    held = np.array([(load['until'], load['load mass']) for load in metrics.loads])
     np.testing.assert_allclose(held[:, 0], (PICKED_UP, PUT_DOWN, END), atol=0.2)
     np.testing.assert_allclose(held[:, 1], (0.0, LOAD, 0.0), atol=0.05)
-    lines = [line for line in format_table(summary).splitlines() if line.startswith('held ')]
+    lines = [line for line in format_table(metrics).splitlines() if line.startswith('held ')]
     assert [' mm, until ' in line for line in lines] == [False, True, False]
     shown = {round(moment.time): caption(moment) for moment in snapshots(run, ())}
     assert 'held' not in shown[3]

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from paper_case import EXACT, configured
 
+from blf_dsc_controller.analysis.metrics import format_table, measure
 from blf_dsc_controller.analysis.panels import panels
-from blf_dsc_controller.analysis.summary import format_table, summarize
 from blf_dsc_controller.bags.reader import read_run
 from blf_dsc_controller.law import barrier
 from blf_dsc_controller.law.barrier import virtual_control
@@ -158,11 +158,11 @@ def rejecting_run(tmp_path_factory):
 
 
 def test_rejected_columns_are_in_the_summary(rejecting_run):
-    learning = summarize(rejecting_run)['learning']
-    (column,) = learning['rejected_columns']
+    metrics = measure(rejecting_run)
+    (column,) = metrics.rejected_columns
     assert column.startswith('cos 1 rad/s ')
-    assert f'rejected    {column}: ' in format_table(summarize(rejecting_run))
-    assert learning['final_relative_error'] < 0.5
+    assert f'rejected    {column}: ' in format_table(metrics)
+    assert metrics.final_parameter_error < 0.5
 
 
 def test_lyapunov_function_of_the_bag_is_a_panel(rejecting_run):

@@ -17,7 +17,7 @@ from rclpy.timer import Timer
 from ros_rig import JOINTS, START, Arm, FakeClock, torques
 
 from blf_dsc_controller.configuration.controller import ControllerConfig
-from blf_dsc_controller.errors import OutsideBarrierError
+from blf_dsc_controller.errors import StartError
 from blf_dsc_controller.law.factory import controller_of
 from blf_dsc_controller.messages import topics
 from blf_dsc_controller.messages.codecs import JointStateEncoder
@@ -140,7 +140,7 @@ def test_start_outside_the_bound_is_reported_with_joint_error_and_bound(ros):
     states.publish(JointStateEncoder(JOINTS).encode(10**9, outside, ZERO, ZERO))
     ros.until(lambda: node.finished)
     # 1.696 - 0.0021 against the reference's 1.6961 at its start
-    assert isinstance(node.failure, OutsideBarrierError)
+    assert isinstance(node.failure, StartError)
     assert "joint 'joint2' starts -0.0022 rad" in str(node.failure)
     assert 'its bound of 0.002 rad' in str(node.failure)
 

@@ -21,7 +21,7 @@ import pytest
 import yaml
 
 import blf_dsc_controller
-from blf_dsc_controller.errors import ConfigurationError, MissingExtraError, OutsideBarrierError
+from blf_dsc_controller.errors import ConfigurationError, MissingExtraError
 
 ROOT = Path(__file__).resolve().parents[1]
 NAME = 'blf_dsc_controller'
@@ -227,7 +227,6 @@ def test_public_names_are_documented_and_imported_on_first_use(tmp_path):
 def test_errors_can_be_passed_between_processes():
     for error in (
         ConfigurationError(['a: got 1', 'b: got 2'], 'my.yaml'),
-        OutsideBarrierError('joint1', 0.1, 0.002),
         MissingExtraError('dask', 'dask', 'a cluster'),
     ):
         copied = pickle.loads(pickle.dumps(error))  # noqa: S301 - our own

@@ -1,17 +1,22 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Metrics of a run: tracking, torque and learning, each as one number."""
+"""Metrics of a run, each as one number: as JSON (summary.json), and as a table for the terminal."""
 
 from __future__ import annotations
 
+import json
 import math
 import re
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from functools import partial
 from operator import itemgetter
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from blf_dsc_controller.law.telemetry import load_text
 from blf_dsc_controller.messages.journal import OUTSIDE_BOUND
 from blf_dsc_controller.messages.topics import (
     COLUMNS,
@@ -20,6 +25,8 @@ from blf_dsc_controller.messages.topics import (
     DISTURBANCE,
     LAMBDA_MIN,
     LATCHED,
+    LATE_STEPS,
+    LATENCY,
     LOAD,
     LYAPUNOV,
     MODEL_CHANGES,
@@ -38,6 +45,16 @@ _POSTURES = 400  # of the reference, at which torques are compared
 _TAIL = 10.0  # s
 _MOST = 100_000  # samples of the estimates, evenly spaced
 _BLOCK = 8192
+_QUANTILES = (('p50', 50.0), ('p99', 99.0), ('p99.9', 99.9), ('max', 100.0))  # %
+_OFTEN = 0.01  # of the samples
+_TABLE = {  # title: metric, unit, factor, decimals
+    'max |xi1|': ('max_error', 'mrad', 1e3, 3),
+    'rms xi1': ('rms_error', 'mrad', 1e3, 3),
+    'bound': ('bound', 'mrad', 1e3, 3),
+    'peak torque': ('peak_torque', 'N m', 1.0, 2),
+    'rms torque': ('rms_torque', 'N m', 1.0, 2),
+    'limit': ('torque_limit', 'N m', 1.0, 2),
+}
 _NO_PARAMETERS = (
     *(*COLUMNS, DISTURBANCE, POSITION, VELOCITY, RATIO, DISTANCE, *LOAD, LYAPUNOV),
     *(LAMBDA_MIN, LATCHED, MODEL_CHANGES, COMPUTE_TIME),
@@ -54,7 +71,6 @@ class Estimates:
     true: Floats | None  # (m, p); None if unknown, or if the plant's parameters have other names
     relative_error: Floats | None  # (m,) |P^ - P| / |P|, or of torques; None if P is unknown
     of_torques: bool  # of H P^ and H P along the reference, as the P of a URDF has mixed units
-    unlike: tuple[str, ...]  # the plant's names, if they differ
 
 
 def estimates_of(run: Run) -> Estimates | None:
@@ -71,15 +87,14 @@ def estimates_of(run: Run) -> Estimates | None:
     stamp = run.monitor.stamp[rows]
     estimate = run.monitor.values[rows][:, _columns(run.monitor, names)]
     of_torques = arm is not None and _parameters(arm.units) == names
-    theirs = () if truth is None else _parameters(truth.names)
     true = error = None
-    if truth is not None and set(names) == set(theirs):
-        true, theirs = truth.held(stamp, _columns(truth, names)), ()
+    if truth is not None and set(names) == set(_parameters(truth.names)):
+        true = truth.held(stamp, _columns(truth, names))
         R = None  # |R (P^ - P)| is the norm of the torques H P^ - H P
         if arm is not None and of_torques:
             R = np.asarray(np.linalg.qr(_torques(run, arm.regressor), 'r'))
         error = _relative_error(estimate, true, R)
-    return Estimates(names, run.time_of(stamp), estimate, true, error, of_torques, theirs)
+    return Estimates(names, run.time_of(stamp), estimate, true, error, of_torques)
 
 
 def rejected_columns(run: Run) -> list[str]:
@@ -220,8 +235,11 @@ def first_violation(run: Run) -> tuple[float, str]:
 
 @dataclass(frozen=True)
 class Metrics:
-    """Metrics of n joints; NaN for what is unknown or has not happened."""
+    """Metrics of a run of n joints; NaN, or None, for what is unknown or has not happened."""
 
+    duration: float  #: s
+    samples: int
+    joints: tuple[str, ...]
     max_error: tuple[float, ...]  #: (n,) rad, of |xi1|
     rms_error: tuple[float, ...]  #: (n,) rad
     bound: tuple[float, ...]  #: (n,) rad, the smallest
@@ -231,54 +249,115 @@ class Metrics:
     torque_limit: tuple[float, ...]  #: (n,) N m, the smallest
     torque_rate: tuple[float, ...]  #: (n,) N m/s, rms of the change per sample time
     max_error_ratio: float  #: of |xi1| / k_c
+    held: bool | None  #: whether no joint left its bound
     first_violation: float  #: s
     violating_joint: str
+    stops: list[dict[str, Any]]  #: `time` [s], `reason` and `text` of each
+    learns: bool  #: whether the law uses what it learns
     latch_time: float  #: s
-    parameter_error: dict[int, float]  #: `Estimates.relative_error` at MOMENTS
-    final_parameter_error: float
-    tail_parameter_error: float  #: rms over the last ten seconds
-    time_to_1_percent: float  #: s, after which the parameter error stays below 1 %
-
-    @property
-    def held(self) -> bool | None:
-        """Whether no joint left its bound, None if error or bound is unknown."""
-        if not math.isnan(self.first_violation):
-            return False
-        return None if math.isnan(self.max_error_ratio) else True
+    model_changes: list[float]  #: s, when the controller found that the arm had changed
+    rejected_columns: list[str]
+    loads: list[dict[str, float]]  #: what the tip held `until` [s], where known
+    timing: dict[str, Any] | None  #: `rate` [Hz], `latency` [s], `late_steps`, in real time
+    messages: dict[str, int]  #: number in the bag, by topic
+    estimate: dict[str, float] | None = None  #: at the end
+    true: dict[str, float] | None = None  #: at the end
+    of_torques: bool = False  #: whether the following are errors of the model's torques
+    parameter_error: dict[int, float] = field(
+        default_factory=lambda: dict.fromkeys(MOMENTS, math.nan)
+    )  #: `Estimates.relative_error` at MOMENTS
+    final_parameter_error: float = math.nan
+    tail_parameter_error: float = math.nan  #: rms over the last ten seconds
+    time_to_1_percent: float = math.nan  #: s, after which the parameter error stays below 1 %
 
 
 @np.errstate(all='ignore')  # a bag may hold any number
 def measure(run: Run) -> Metrics:
     """Compute the metrics of a run."""
     step = float(run.time[1]) if run.stamp.size > 1 else math.nan
-    violation, joint = first_violation(run)
-    latched = latch_time(run)
-    estimates = estimates_of(run)
-    learned = None if estimates is None else estimates.relative_error
-    learning = dict.fromkeys(MOMENTS, math.nan), math.nan, math.nan, math.nan
-    if estimates is not None and learned is not None:
-        at = estimates.time
-        tail = rms(learned[at >= at[-1] - _TAIL])
-        learning = _at_moments(at, learned), float(learned[-1]), tail, _settled(at, learned)
+    ratio, (violation, joint) = _largest_ratio(run), first_violation(run)
+    held = None if math.isnan(ratio) else True
+    latched, estimates = latch_time(run), estimates_of(run)
 
     def each(reduce: Callable[[Floats], float], name: str) -> tuple[float, ...]:
         return tuple(reduce(_known(run, name, i)) for i in range(len(run.joints)))
 
     return Metrics(
-        each(_peak, 'error'),
-        each(rms, 'error'),
-        each(_least, 'bound'),
-        each(_peak, 'bound'),
-        each(_peak, 'torque'),
-        each(rms, 'torque'),
-        each(_least, 'torque_limit'),
-        tuple(change / step for change in each(lambda torque: rms(np.diff(torque)), 'torque')),
-        _largest_ratio(run),
-        violation,
-        joint,
-        math.nan if latched is None else latched,
-        *learning,
+        duration=run.duration,
+        samples=run.stamp.size,
+        joints=run.joints,
+        max_error=each(_peak, 'error'),
+        rms_error=each(rms, 'error'),
+        bound=each(_least, 'bound'),
+        widest_bound=each(_peak, 'bound'),
+        peak_torque=each(_peak, 'torque'),
+        rms_torque=each(rms, 'torque'),
+        torque_limit=each(_least, 'torque_limit'),
+        torque_rate=each(lambda torque: rms(np.diff(torque)) / step, 'torque'),
+        max_error_ratio=ratio,
+        held=held if math.isnan(violation) else False,
+        first_violation=violation,
+        violating_joint=joint,
+        stops=[
+            {'time': time, 'reason': stop.reason, 'text': stop.text}
+            for time, stop in run.timed_stops
+        ],
+        learns=run.learns,
+        latch_time=math.nan if latched is None else latched,
+        model_changes=change_times(run),
+        rejected_columns=rejected_columns(run),
+        loads=_loads(run),
+        timing=_timing(run),
+        messages=dict(run.message_counts),
+        **({} if estimates is None else _learning(estimates)),
     )
+
+
+def _learning(of: Estimates) -> dict[str, Any]:
+    """Return the metrics of the estimates by name."""
+    found: dict[str, Any] = {
+        name: dict(zip(of.names, values[-1].tolist(), strict=True))
+        for name, values in (('estimate', of.estimate), ('true', of.true))
+        if values is not None
+    }
+    at, error = of.time, of.relative_error
+    if error is None:
+        return found
+    return found | {
+        'of_torques': of.of_torques,
+        'parameter_error': _at_moments(at, error),
+        'final_parameter_error': float(error[-1]),
+        'tail_parameter_error': rms(error[at >= at[-1] - _TAIL]),
+        'time_to_1_percent': _settled(at, error),
+    }
+
+
+def _loads(run: Run) -> list[dict[str, float]]:
+    """Return what the tip held, each at the end of a time in which it was known."""
+    if run.monitor is None or LOAD[0] not in run.monitor.names:
+        return []
+    values = run.monitor.select(LOAD)
+    known = np.append(np.isfinite(values[:, 0]), False)
+    ends = np.flatnonzero(known[:-1] & ~known[1:])
+    times = run.time_of(run.monitor.stamp[ends])
+    return [
+        {'until': float(t), **dict(zip(LOAD, load.tolist(), strict=True))}
+        for t, load in zip(times, values[ends], strict=True)
+    ]
+
+
+def _timing(run: Run) -> dict[str, Any] | None:
+    if run.timing is None or LATENCY not in run.timing.names:
+        return None
+    moving = run.received[1:]  # the first state waits, with brakes on, for the controller
+    elapsed = float(moving[-1] - moving[0]) * 1e-9 if moving.size else 0.0
+    latency = run.timing.column(LATENCY)
+    late = run.timing.column(LATE_STEPS)[-1] if LATE_STEPS in run.timing.names else None
+    return {
+        'rate': (moving.size - 1) / elapsed if elapsed > 0 else math.nan,
+        'latency': {k: _reduced(latency, partial(np.percentile, q=q)) for k, q in _QUANTILES},
+        'late_steps': None if late is None else int(late),
+    }
 
 
 def _largest_ratio(run: Run) -> float:
@@ -320,3 +399,89 @@ def _settled(time: Floats, error: Floats) -> float:
     above = np.flatnonzero(~(error < _LEARNED))
     first = above[-1] + 1 if above.size else 0
     return float(time[first]) if first < time.size else math.nan
+
+
+def write_json(numbers: Any, path: Path) -> None:
+    """Write metrics, or other data in dictionaries and lists, as JSON."""
+    path.write_text(json.dumps(plain(numbers), indent=2, allow_nan=False) + '\n', encoding='utf-8')
+
+
+def plain(value: Any) -> Any:
+    """Convert to data for JSON: lists and dictionaries, None instead of NaN and infinity."""
+    if isinstance(value, Metrics):
+        value = asdict(value)
+    if isinstance(value, dict):
+        return {str(key): plain(each) for key, each in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [plain(each) for each in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def format_table(metrics: Metrics) -> str:
+    """Format metrics as a few lines for the terminal, without a newline at the end."""
+    rows = [['', *_TABLE]]
+    for i, joint in enumerate(metrics.joints):
+        values = ((getattr(metrics, name)[i], *form) for name, *form in _TABLE.values())
+        cells = (
+            f'{factor * value:.{decimals}f} {unit}' if math.isfinite(value) else '-'
+            for value, unit, factor, decimals in values
+        )
+        rows.append([joint, *cells])
+    return '\n'.join([aligned(rows), '', *_sentences(metrics)])
+
+
+def aligned(rows: Sequence[Sequence[str]]) -> str:
+    """Return a table for the terminal: the first column flush left, the others flush right."""
+    first, *widths = (max(map(len, column)) for column in zip(*rows, strict=True))
+    return '\n'.join(
+        '  '.join([name.ljust(first), *map(str.rjust, values, widths)]) for name, *values in rows
+    )
+
+
+def _sentences(of: Metrics) -> Iterator[str]:
+    yield f'run         {of.duration:.3f} s, {of.samples} samples'
+    kept = 'unknown' if of.held is None else 'held by every joint'
+    if not math.isnan(of.first_violation):
+        kept = f'VIOLATED, first by {of.violating_joint} at {of.first_violation:.3f} s'
+    yield f'bound       {kept}{" until the stop" * bool(of.stops and of.held)}'
+    bounds = zip(of.joints, of.widest_bound, of.bound, strict=True)
+    wider = [
+        f'{joint} {1e3 * widest:.3g} mrad' for joint, widest, bound in bounds if widest > bound
+    ]
+    if wider:
+        yield f'at widest   {", ".join(wider)}'
+    for stop in of.stops:
+        yield f'stopped     at {stop["time"]:.3f} s, {stop["reason"]}: {stop["text"]}'
+    if of.estimate is not None:
+        yield from _learning_lines(of)
+    for load in of.loads:
+        yield f'held        {load_text([load[name] for name in LOAD])}, until {load["until"]:.1f} s'
+    if of.timing is not None:
+        rate, latency, late = of.timing.values()
+        figures = [] if math.isnan(rate) else [f'{rate:.2f} Hz']
+        if not math.isnan(latency['max']):
+            microseconds = '/'.join(f'{1e6 * each:.1f}' for each in latency.values())
+            figures.append(f'state to torque {microseconds} us ({"/".join(latency)})')
+        figures += [] if late is None else [f'{late} late steps']
+        is_slow = (late or 0) > _OFTEN * of.samples
+        busy = ': the computer was too busy for real time (--mode lockstep waits)' * is_slow
+        yield f'real time   {", ".join(figures)}{busy}'
+
+
+def _learning_lines(of: Metrics) -> Iterator[str]:
+    begun = 'never began' if math.isnan(of.latch_time) else f'began at {of.latch_time:.3f} s'
+    yield f'learning    {begun if of.learns else "not used by this law"}'
+    if of.model_changes:
+        times = ', '.join(f'{t:.3f} s' for t in of.model_changes)
+        yield f'arm         changed at {times}: learning restarted'
+    if of.rejected_columns:
+        columns = ', '.join(of.rejected_columns)
+        yield f'rejected    {columns}: the motion does not tell them from the other columns'
+    if math.isnan(of.final_parameter_error):
+        return
+    what = 'model       torque error of the learned model' if of.of_torques else 'parameters  error'
+    known = [(f'{t} s', error) for t, error in of.parameter_error.items() if not math.isnan(error)]
+    moments = (f'{t} {100 * e:.3g} %' for t, e in (*known, ('end', of.final_parameter_error)))
+    settled = of.time_to_1_percent
+    ending = 'not below 1 %' if math.isnan(settled) else f'below 1 % from {settled:.3f} s on'
+    yield f'{what} {", ".join(moments)}; {ending}'

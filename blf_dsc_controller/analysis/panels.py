@@ -25,10 +25,8 @@ from blf_dsc_controller.analysis.metrics import (
     true_change_times,
 )
 from blf_dsc_controller.messages.topics import (
-    COMPUTE_TIME,
     DISTURBANCE,
     LAMBDA_MIN,
-    LATENCY,
     LYAPUNOV,
     LYAPUNOV_TERMS,
 )
@@ -43,19 +41,10 @@ MUTED = '#6B7280'
 SHADE = '#DCE9F5'
 ALARM = '#B3001B'
 
-GROUPS = (
-    'Motion',
-    'Tracking',
-    'Torque',
-    'Parameters',
-    'Disturbance',
-    'Excitation',
-    'Monitors',
-    'Timing',
-)
+GROUPS = ('Motion', 'Tracking', 'Torque', 'Parameters', 'Disturbance', 'Excitation', 'Monitors')
 _STOPPED = GROUPS[:3]
 _CHANGED = ('Tracking', 'Parameters')
-_LEARNING = GROUPS[3:7]
+_LEARNING = GROUPS[3:]
 _LEAST = 1e-12  # J, the smallest value on a logarithmic axis
 _ROOM = 1.2  # limit of an axis as a multiple of the largest value
 _LEAST_ERROR = 1e-5  # %
@@ -113,7 +102,7 @@ def panels(runs: Sequence[Run], begin: float = -inf, end: float = inf) -> list[P
         changes = true_change_times(run)
         changed = dict.fromkeys(_CHANGED, 'the arm changes')
         stops = list(_stops(run))
-        for panel in chain(_motion(run), _learning(run), _monitors(run), _timing(run)):
+        for panel in chain(_motion(run), _learning(run), _monitors(run)):
             marks = latch if panel.group in _LEARNING else panel.marks
             marks = (*marks, *(stops if panel.group in _STOPPED else ()))
             if panel.group in _CHANGED:
@@ -242,7 +231,7 @@ def _learning(run: Run) -> Iterator[Panel]:
     if estimates.relative_error is not None:
         yield _relative_error(estimates)
     if run.arm is not None:
-        yield from _of_links(run, run.arm, estimates)
+        yield _of_links(run.arm, estimates)
     elif len(estimates.names) <= len(COLOURS):
         for j, name in enumerate(estimates.names):
             lines = [Line('estimate', estimates.time, estimates.estimate[:, j])]
@@ -260,21 +249,14 @@ def _disturbances(run: Run, learning: Series) -> Iterator[Line]:
                 yield from _column(run, run.truth, name, 'true', colour=INK, dashed=True)
 
 
-def _of_links(run: Run, arm: LearnedArm, estimates: Estimates) -> Iterator[Panel]:
-    """Yield the errors of the estimates by link, in deviations of the prior, and the friction."""
+def _of_links(arm: LearnedArm, estimates: Estimates) -> Panel:
+    """Return the panel of the errors by link and kind of friction, in deviations of the prior."""
     bodies = bodies_of(estimates.names)
     prior = np.array([arm.deviations[name] for name in estimates.names])
     off = errors_of_bodies(bodies, estimates.estimate, estimates.true, prior)
     lines = [Line(body, estimates.time, each) for body, each in zip(bodies, off, strict=True)]
     what = 'changes' if estimates.true is None else 'errors'
-    yield Panel('Parameters', f'{what} of the estimates, by link', '% of prior', lines)
-    for kind in ('viscous', 'coulomb'):
-        names = [name for name in arm.units if name.startswith(f'{kind} ')]
-        if names:
-            of_joints = chain.from_iterable(
-                _column(run, run.monitor, name, name.split(' ', 1)[1]) for name in names
-            )
-            yield Panel('Parameters', f'{kind} friction', arm.units[names[0]], of_joints)
+    return Panel('Parameters', f'{what} of the estimates, by link', '% of prior', lines)
 
 
 def _relative_error(estimates: Estimates) -> Panel:
@@ -310,21 +292,6 @@ def _lyapunov(run: Run, monitor: Series) -> Panel:
     ]
     lines = [line._replace(values=np.maximum(line.values, _LEAST)) for line in (*terms, V)]
     return Panel('Monitors', 'V (29) and its terms', 'J', lines, log=True)
-
-
-def _timing(run: Run) -> Iterator[Panel]:
-    periods = Series(('period',), run.stamp[1:], np.diff(run.received)[:, np.newaxis] * 1e-9)
-    for title, series, name in (
-        ('period of the joint states, as received', periods, 'period'),
-        ('state to torque', run.timing, LATENCY),
-        ('largest computing time of the law since the last message', run.monitor, COMPUTE_TIME),
-    ):
-        times = [
-            line._replace(values=1e6 * line.values)
-            for line in _column(run, series, name, '')
-            if np.isfinite(line.values).any()
-        ]
-        yield Panel('Timing', title, 'µs', times, log=True)
 
 
 def _column(run: Run, series: Series | None, column: str, name: str, **style: Any) -> list[Line]:

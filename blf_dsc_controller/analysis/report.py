@@ -14,9 +14,14 @@ from typing import Any
 import numpy as np
 from jinja2 import Environment, PackageLoader, StrictUndefined
 
-from blf_dsc_controller.analysis.metrics import change_times, latch_time, outside, rejected_columns
+from blf_dsc_controller.analysis.metrics import (
+    change_times,
+    format_table,
+    latch_time,
+    measure,
+    outside,
+)
 from blf_dsc_controller.analysis.panels import COLOURS, INK, PIECES, Panel, panels
-from blf_dsc_controller.analysis.summary import format_table, summarize
 from blf_dsc_controller.bags.content import NO_NAMES, Content, NameMap, read_content
 from blf_dsc_controller.bags.reader import recorded_run
 from blf_dsc_controller.errors import MissingExtraError
@@ -91,8 +96,6 @@ def _events(run: Run) -> Iterator[Happened]:
         yield (latched, 'learning', 'first excited window: learning began')
     for t in change_times(run):
         yield (t, 'learning', 'the arm has changed: learning restarted')
-    for column in rejected_columns(run):
-        yield (run.duration, 'learning', f'{column} is not estimated')
     for t, stop in run.timed_stops:
         yield (t, 'stop', f'{stop.reason}: {stop.text}')
     for i, joint in enumerate(run.joints):
@@ -170,7 +173,7 @@ def write_report(bags: Sequence[ReportedBag], path: Path) -> None:
         ' and '.join(bag.name for bag in bags),
         names=[bag.name for bag in bags],
         versions=sorted({bag.content.version or 'another recorder' for bag in bags}),
-        summaries=[format_table(summarize(bag.run)) for bag in bags],
+        summaries=[format_table(measure(bag.run)) for bag in bags],
         data={
             'panels': plots(panels([bag.run for bag in bags]), bags),
             'seconds': max(bag.run.duration for bag in bags),

@@ -62,16 +62,17 @@ def export(options: Namespace) -> None:
 
 def plot(options: Namespace) -> None:
     """Plot and summarise a bag."""
-    from blf_dsc_controller.analysis import figures, summary
+    from blf_dsc_controller.analysis import figures
+    from blf_dsc_controller.analysis.metrics import format_table, measure, write_json
 
     names = ('summary.json', *figures.NAMES)
     make_room(*(options.out / name for name in names), force=options.force)
     run = _run(options)
-    metrics = summary.summarize(run)
+    metrics = measure(run)
     options.out.mkdir(parents=True, exist_ok=True)
-    summary.write_summary(metrics, options.out / 'summary.json')
+    write_json(metrics, options.out / 'summary.json')
     written = [options.out / 'summary.json', *figures.draw(run, options.out)]
-    print(summary.format_table(metrics))
+    print(format_table(metrics))
     print('wrote', ', '.join(str(path) for path in written))
 
 

@@ -156,16 +156,16 @@ def print_notice(notice: str) -> None:
 def _report(out: Path) -> bool:
     """Draw and summarise the bag of a run; return whether the controller stopped in it."""
     from blf_dsc_controller.analysis.figures import draw  # slow: the libraries of the pictures
-    from blf_dsc_controller.analysis.summary import format_table, summarize, write_summary
+    from blf_dsc_controller.analysis.metrics import format_table, measure, write_json
 
     print_notice('reading the bag')
     content = read_content(out / 'bag')
     recorded = recorded_run(content)
-    summary = summarize(recorded)
-    write_summary(summary, out / 'summary.json')
+    metrics = measure(recorded)
+    write_json(metrics, out / 'summary.json')
     print_notice('drawing the pictures')
     pictures = draw(recorded, out)
-    print(format_table(summary))
+    print(format_table(metrics))
     for topic, text in content.losses.items():
         print(f'warning: messages of {topic} are missing in the bag: {text}')
     print(f'wrote       {out}: bag, summary.json, {", ".join(path.name for path in pictures)}')

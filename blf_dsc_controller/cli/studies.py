@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 from tqdm import tqdm
 
-from blf_dsc_controller.analysis.summary import aligned, format_table
+from blf_dsc_controller.analysis.metrics import aligned, format_table
 from blf_dsc_controller.cli.run import make_folder, print_notice
 from blf_dsc_controller.compiled.jit import announced_compilation
 from blf_dsc_controller.configuration.nodes import locate

@@ -17,9 +17,7 @@ import numpy as np
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.errors import (
     BlfDscError,
-    OutsideBarrierError,
     StartError,
-    VelocityMismatchError,
 )
 from blf_dsc_controller.reference.terms import (
     Term,
@@ -211,19 +209,26 @@ def check_takeover(
     A velocity difference v increases the error |xi1| by v^2 / (2 a) until it is removed at the
     acceleration a of `limits`: the error must stay inside the bound k(t) (n,) [rad].
 
-    Raises:
-        OutsideBarrierError: an error is already outside its bound, where the law is undefined.
-        VelocityMismatchError: an error would leave its bound.
+    Raises StartError if an error is already outside its bound, where the law is undefined, or if it
+    would leave it.
     """
     qr, dqr, ddqr = np.zeros((3, q.size))
     evaluate(reference_vector, t, qr, dqr, ddqr)
     for joint, error, limit in zip(config.joints, q - qr, bound, strict=True):
         if not abs(error) < limit:
-            raise OutsideBarrierError(joint, float(error), float(limit))
+            raise StartError(
+                f'joint {joint!r} starts {error:+.6g} rad from the reference, outside its bound of '
+                f'{limit:.6g} rad: start closer to the reference, or widen barrier.bound'
+            )
     limits = np.sqrt(2.0 * np.array(config.limits.acceleration) * (bound - np.abs(q - qr)))
     for joint, difference, limit in zip(config.joints, dq - dqr, limits, strict=True):
         if not abs(difference) < limit:
-            raise VelocityMismatchError(joint, float(difference), float(limit))
+            raise StartError(
+                f'joint {joint!r} starts {difference:+.6g} rad/s from the velocity of the '
+                f'reference; at limits.acceleration {limit:.6g} rad/s can be made up within its '
+                'bound: start with the velocity of the reference, or enable the approach '
+                '(approach.enabled)'
+            )
 
 
 def _via_centre(

@@ -25,7 +25,7 @@ from typing import NamedTuple, Protocol
 import numpy as np
 from tqdm import tqdm
 
-from blf_dsc_controller.analysis.summary import aligned, plain, write_summary
+from blf_dsc_controller.analysis.metrics import aligned, write_json
 from blf_dsc_controller.arms.model import ArmModel
 from blf_dsc_controller.arms.tuning import over_postures
 from blf_dsc_controller.compiled.elementary import tanh
@@ -464,7 +464,7 @@ def compare(
         }
         for arm, found in results.items()
     }
-    write_summary(plain(numbers), folder / 'figures.json')
+    write_json(numbers, folder / 'figures.json')
     return results
 
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -19,9 +19,8 @@ from numpy.typing import NDArray
 from tqdm.contrib.concurrent import process_map
 
 from blf_dsc_controller.analysis.figures import Picture, draw_panels
-from blf_dsc_controller.analysis.metrics import Metrics, estimates_of, measure
+from blf_dsc_controller.analysis.metrics import Metrics, estimates_of, measure, write_json
 from blf_dsc_controller.analysis.panels import ALARM, COLOURS, panels
-from blf_dsc_controller.analysis.summary import plain, write_summary
 from blf_dsc_controller.configuration.nodes import LoopConfig, dump, load_loop
 from blf_dsc_controller.configuration.schema import change
 from blf_dsc_controller.law.factory import settings_of_config
@@ -446,9 +445,8 @@ def compare(folder: Path) -> tuple[list[Claim], list[list[str]]]:
         dump(file, case.loop().by_node)
     results = run_all()
     found = list(claims(results))
-    metrics = {name: plain(asdict(each)) for name, each in results.metrics.items()}
-    numbers = {'claims': [claim._asdict() for claim in found], 'metrics': metrics}
-    write_summary(numbers, folder / 'results.json')
+    numbers = {'claims': [claim._asdict() for claim in found], 'metrics': results.metrics}
+    write_json(numbers, folder / 'results.json')
     draw_pairs(results, folder)
     draw_robustness(results, folder)
     return found, list(side_by_side(results))

@@ -15,9 +15,8 @@ from scipy.stats import binomtest
 
 from blf_dsc_controller.analysis.figures import Picture, head
 from blf_dsc_controller.analysis.figures import draw as draw_run
+from blf_dsc_controller.analysis.metrics import Metrics, measure, plain, write_json
 from blf_dsc_controller.analysis.panels import ALARM, BLUE, COLOURS, INK, MUTED, ORANGE
-from blf_dsc_controller.analysis.summary import plain, write_summary
-from blf_dsc_controller.analysis.summary import summarize as summarize_run
 from blf_dsc_controller.bags.reader import read_run
 from blf_dsc_controller.configuration.nodes import CONTROLLER, PLANT, dump
 from blf_dsc_controller.errors import BlfDscError
@@ -192,7 +191,7 @@ def write_report(store: Store) -> tuple[Summary, list[Path]]:
     study, results, folder = store.study, store.results(), store.folder
     summary = summarize(study, results)
     written = [folder / 'summary.json']
-    write_summary(summary, written[0])
+    write_json(summary, written[0])
     if study.settings.pairs:
         written.append(folder / 'pairs.png')
         _draw_pairs({'': (study, results)}, written[1])
@@ -239,7 +238,7 @@ def write_comparison(stores: Sequence[Store], folder: Path) -> str:
     return text
 
 
-def reproduce(store: Store, run: int, out: Path) -> Summary:
+def reproduce(store: Store, run: int, out: Path) -> Metrics:
     """Repeat a run of the study and write config.yaml, bag, figures and summary to `out`.
 
     Those without learning, of a study of pairs, go to `without_learning` and `other_noise` in it.
@@ -251,7 +250,7 @@ def reproduce(store: Store, run: int, out: Path) -> Summary:
     if run not in results['run']:
         raise BlfDscError(f'{store.folder} has no run {run}: it has {results["run"].size} runs')
     row = int((results['run'] == run).argmax())
-    summaries = []
+    metrics = []
     for prefix, law in study.laws().items():
         plant = plant_with(study, draw(study, run), prefix)
         folder = out / _FOLDERS[prefix]
@@ -260,8 +259,8 @@ def reproduce(store: Store, run: int, out: Path) -> Summary:
         record = simulate(law, plant, supervised=False)
         write_bag(folder / 'bag', record, law, 'none')
         recorded = read_run(folder / 'bag')
-        summaries.append(summarize_run(recorded))
-        write_summary(summaries[-1], folder / 'summary.json')
+        metrics.append(measure(recorded))
+        write_json(metrics[-1], folder / 'summary.json')
         draw_run(recorded, folder)
         here = figures_of(study, record, plant)
         different = differences({name: results[f'{prefix}{name}'][row] for name in here}, here)
@@ -270,7 +269,7 @@ def reproduce(store: Store, run: int, out: Path) -> Summary:
                 f'run {run} differs from the stored one: was it computed on another kind of '
                 f'machine, or by another version?{different}'
             )
-    return summaries[0]
+    return metrics[0]
 
 
 def _draw_pairs(studies: Studies, path: Path) -> None:

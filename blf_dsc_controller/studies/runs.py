@@ -32,7 +32,7 @@ from typing import Any
 import numpy as np
 
 import blf_dsc_controller
-from blf_dsc_controller.analysis.summary import write_summary
+from blf_dsc_controller.analysis.metrics import write_json
 from blf_dsc_controller.compiled.jit import cache_folder
 from blf_dsc_controller.configuration.nodes import dump
 from blf_dsc_controller.configuration.plant import PlantConfig
@@ -204,7 +204,7 @@ class Store:
         """
         if not folder.exists():
             (folder / _RUNS).mkdir(parents=True)
-            write_summary(versions(), folder / _VERSIONS)
+            write_json(versions(), folder / _VERSIONS)
             dump(folder / _STUDY, study.values())
         store = cls(folder)
         there = json.loads((folder / _VERSIONS).read_text(encoding='utf-8'))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The summary of a synthetic run has the numbers it was generated from."""
+"""The metrics of a synthetic run are the numbers it was generated from."""
 
 from __future__ import annotations
 
@@ -10,10 +10,9 @@ import numpy as np
 import pytest
 import recorded_run
 import synthetic_bag
-from synthetic_bag import BOUND_RAD, JOINTS, LATCH_S, LIMIT_NM, PARAMETERS, TRUE, Synthetic
+from synthetic_bag import BOUND_RAD, LATCH_S, LIMIT_NM, PARAMETERS, TRUE, Synthetic
 
-from blf_dsc_controller.analysis.metrics import measure
-from blf_dsc_controller.analysis.summary import format_table, summarize, write_summary
+from blf_dsc_controller.analysis.metrics import format_table, measure, plain, write_json
 from blf_dsc_controller.bags.reader import read_run
 from blf_dsc_controller.messages.topics import BOUND, JOINT_STATES, LATE_STEPS, TRUTH
 from blf_dsc_controller.run import Series
@@ -30,23 +29,20 @@ def run(tmp_path_factory):
 
 
 def test_tracking(run):
-    summary = summarize(run)
-    assert summary['duration_s'] == pytest.approx(9.999)
-    assert summary['samples'] == SAMPLES
-    counts = [summary['messages'][topic.resolved] for topic in (JOINT_STATES, TRUTH, BOUND)]
-    assert counts == [SAMPLES, SAMPLES / 10, 1]
-    assert summary['tracking']['held'] is True
-    assert summary['tracking']['first_violation'] is None
-    shoulder, elbow = (summary['tracking']['joints'][joint] for joint in JOINTS)
-    # Whole periods of sinusoids: the rms is the amplitude over sqrt(2).
-    assert shoulder['max_abs_error_rad'] == pytest.approx(0.0008)
-    assert shoulder['rms_error_rad'] == pytest.approx(0.0008 / np.sqrt(2))
-    assert elbow['max_abs_error_rad'] == pytest.approx(0.0005)
-    assert elbow['peak_torque_nm'] == pytest.approx(3.0)
-    assert elbow['rms_torque_nm'] == pytest.approx(3.0 / np.sqrt(2))
-    assert shoulder['bound_rad'] == BOUND_RAD
-    assert shoulder['torque_limit_nm'] == LIMIT_NM
     metrics = measure(run)
+    assert metrics.duration == pytest.approx(9.999)
+    assert metrics.samples == SAMPLES
+    counts = [metrics.messages[topic.resolved] for topic in (JOINT_STATES, TRUTH, BOUND)]
+    assert counts == [SAMPLES, SAMPLES / 10, 1]
+    assert metrics.held is True
+    assert np.isnan(metrics.first_violation)
+    # Whole periods of sinusoids: the rms is the amplitude over sqrt(2).
+    assert metrics.max_error == pytest.approx((0.0008, 0.0005))
+    assert metrics.rms_error == pytest.approx(np.array((0.0008, 0.0005)) / np.sqrt(2))
+    assert metrics.peak_torque == pytest.approx((8.0, 3.0))
+    assert metrics.rms_torque == pytest.approx(np.array((8.0, 3.0)) / np.sqrt(2))
+    assert metrics.bound == (BOUND_RAD, BOUND_RAD)
+    assert metrics.torque_limit == (LIMIT_NM, LIMIT_NM)
     assert metrics.max_error_ratio == pytest.approx(0.4)
     rate = 2 * np.pi / np.sqrt(2)  # 1/s, of a sinusoid of 1 Hz
     assert metrics.torque_rate == pytest.approx((8.0 * rate, 3.0 * rate), rel=1e-4)
@@ -56,59 +52,55 @@ def test_first_violation_is_the_earliest_of_all_joints(run):
     error = run.error.copy()
     error[4000, 0] = 0.0021
     error[3000, 1] = -BOUND_RAD  # on the bound counts as outside: the barrier is infinite there
-    tracking = summarize(dataclasses.replace(run, error=error))['tracking']
-    assert tracking['held'] is False
-    assert tracking['first_violation'] == {'time_s': pytest.approx(3.0), 'joint': 'elbow'}
+    metrics = measure(dataclasses.replace(run, error=error))
+    assert metrics.held is False
+    assert (metrics.first_violation, metrics.violating_joint) == (pytest.approx(3.0), 'elbow')
 
 
 def test_learning(run):
-    learning = summarize(run)['learning']
-    assert learning['latch_time_s'] == pytest.approx(LATCH_S)
-    errors = learning['relative_error_at_s']
+    metrics = measure(run)
+    assert metrics.latch_time == pytest.approx(LATCH_S)
+    errors = {t: error for t, error in metrics.parameter_error.items() if not np.isnan(error)}
     # The run ends one sample before 10 s, which counts as 10 s.
-    assert list(errors) == ['5', '10']
-    assert errors['5'] == pytest.approx(0.5 * np.exp(-3.5))
-    assert errors['10'] == learning['final_relative_error']
-    assert learning['final_relative_error'] == pytest.approx(0.5 * np.exp(-8.499))
+    assert errors == {5: pytest.approx(0.5 * np.exp(-3.5)), 10: metrics.final_parameter_error}
+    assert metrics.final_parameter_error == pytest.approx(0.5 * np.exp(-8.499))
     # 0.5 exp(-t) = 0.01 at t = ln 50 after the latch, seen at the next sample.
-    assert learning['time_to_1_percent_s'] == pytest.approx(LATCH_S + np.log(50), abs=1e-3)
-    assert learning['true'] == dict(zip(PARAMETERS, TRUE, strict=True))
-    assert list(learning['final_estimate']) == list(PARAMETERS)
+    assert metrics.time_to_1_percent == pytest.approx(LATCH_S + np.log(50), abs=1e-3)
+    assert metrics.true == dict(zip(PARAMETERS, TRUE, strict=True))
+    assert list(metrics.estimate) == list(PARAMETERS)
     values = run.monitor.values.copy()
     values[-1, 0] = 0.0  # it has to stay below
     left = dataclasses.replace(run, monitor=dataclasses.replace(run.monitor, values=values))
-    assert summarize(left)['learning']['time_to_1_percent_s'] is None
+    assert np.isnan(measure(left).time_to_1_percent)
 
 
 def test_timing(run):
-    timing = summarize(run)['timing']
-    assert timing['rate_hz'] == pytest.approx(1000.0)
+    timing = measure(run).timing
+    assert timing['rate'] == pytest.approx(1000.0)
     # Latencies of 0, 1, 2 ... 9999 us.
-    expected = {'p50': 4999.5, 'p99': 9899.01, 'p99.9': 9989.001, 'max': 9999.0}
-    assert timing['latency_us'] == pytest.approx(expected)
+    expected = {'p50': 4999.5e-6, 'p99': 9899.01e-6, 'p99.9': 9989.001e-6, 'max': 9999e-6}
+    assert timing['latency'] == pytest.approx(expected)
     assert timing['late_steps'] == 99
-    assert summarize(run)['compute_time_us']['p50'] == pytest.approx(4.9995)
     slow = dataclasses.replace(run, received=run.received * 2)  # the rate is by the wall clock
-    assert summarize(slow)['timing']['rate_hz'] == pytest.approx(500.0)
-    values = run.monitor.values.copy()
-    values[:, run.monitor.names.index('compute_time')] = np.nan
-    unmeasured = dataclasses.replace(run.monitor, values=values)
-    assert summarize(dataclasses.replace(run, monitor=unmeasured))['compute_time_us'] is None
+    assert measure(slow).timing['rate'] == pytest.approx(500.0)
 
 
 def test_unknown_values_are_null_and_never_nan(run, tmp_path):
     optional = ('reference', 'error', 'bound', 'torque_limit', 'monitor', 'truth', 'timing')
     unknown = dict.fromkeys(optional) | {'torque': np.full_like(run.torque, np.nan)}
-    summary = summarize(dataclasses.replace(run, **unknown))
-    write_summary(summary, tmp_path / 'summary.json')
-    assert json.loads((tmp_path / 'summary.json').read_text()) == summary
-    assert summary['learning'] is None
-    assert summary['tracking']['held'] is None
-    assert summary['compute_time_us'] is None
-    assert set(summary['tracking']['joints']['elbow'].values()) == {None}
-    learning = summarize(dataclasses.replace(run, truth=None))['learning']
-    assert (learning['final_relative_error'], learning['true']) == (None, None)
-    assert list(learning['final_estimate']) == list(PARAMETERS)
+    metrics = measure(dataclasses.replace(run, **unknown))
+    write_json(metrics, tmp_path / 'summary.json')
+    written = json.loads((tmp_path / 'summary.json').read_text())
+    assert written == plain(metrics)
+    known = {name for name, value in written.items() if value not in (None, [None, None])}
+    assert known == {
+        *('duration', 'samples', 'joints', 'violating_joint', 'stops', 'learns', 'model_changes'),
+        *('rejected_columns', 'loads', 'messages', 'of_torques', 'parameter_error'),
+    }
+    metrics = measure(dataclasses.replace(run, truth=None))
+    assert np.isnan(metrics.final_parameter_error)
+    assert metrics.true is None
+    assert list(metrics.estimate) == list(PARAMETERS)
 
 
 def test_table_shows_what_is_unusual(run):
@@ -121,7 +113,7 @@ def test_table_shows_what_is_unusual(run):
     early = run.monitor.stamp < run.monitor.stamp[0] + 1e9 * LATCH_S  # not yet
     learning = run.monitor
     waiting = Series(learning.names, learning.stamp[early], learning.values[early])
-    usual = format_table(summarize(run))
+    usual = format_table(measure(run))
     for changes, line in (
         ({'bound': bound}, '\nat widest   elbow 12.3 mrad\n'),
         ({'timing': timing}, '200 late steps: the computer was too busy for real time'),
@@ -129,12 +121,12 @@ def test_table_shows_what_is_unusual(run):
         (unknown, 'bound       unknown'),
         ({'monitor': waiting}, 'learning    never began'),
     ):
-        assert line in format_table(summarize(dataclasses.replace(run, **changes)))
+        assert line in format_table(measure(dataclasses.replace(run, **changes)))
         assert line not in usual
 
 
 def test_table_shows_the_summary(run):
-    table = format_table(summarize(run))
+    table = format_table(measure(run))
     for text in (
         'shoulder  0.800 mrad  0.566 mrad  2.000 mrad     8.00 N m    5.66 N m  20.00 N m',
         'held by every joint',
@@ -162,9 +154,9 @@ def test_learning_begins_only_in_a_law_that_learns_in_simulation_and_its_bag(
     config = recorded_run.loop_config(**changes)
     record = simulate(config.controller, config.plant)
     write_bag(tmp_path / 'bag', record, config.controller, 'none')
-    simulated, recorded = summarize(record.run()), summarize(read_run(tmp_path / 'bag'))
-    for part in ('duration_s', 'samples', 'tracking', 'learning'):
-        assert simulated[part] == recorded[part]
+    simulated, recorded = measure(record.run()), measure(read_run(tmp_path / 'bag'))
+    of_bag = {'messages': {}, 'tail_parameter_error': simulated.tail_parameter_error}
+    assert plain(dataclasses.replace(recorded, **of_bag)) == plain(simulated)
     assert record.run().monitor.column('latched')[-1] == 1.0
     assert f'learning    {line}' in format_table(recorded)
-    assert (recorded['learning']['latch_time_s'] is None) == bool(changes)
+    assert np.isnan(recorded.latch_time) == bool(changes)
