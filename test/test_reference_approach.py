@@ -185,7 +185,7 @@ def test_start_that_is_too_slow_is_rejected_if_approaches_are_disabled():
     config = build(ControllerConfig, SWINGING | {'approach.enabled': False})
     law = controller_of(config)
     offset, moving = np.array(config.reference.offset), np.full(2, 0.3)
-    with pytest.raises(StartError, match='starts -0.* velocity'):
+    with pytest.raises(StartError, match=r'starts -0.* velocity'):
         begin(law, config, offset, STILL)
     assert begin(law, config, offset, moving) == 0.0
     # Catching up takes v^2 / (2 a) = 0.9 bounds at a = 2 rad/s^2, which leaves a tenth of it.
