@@ -178,7 +178,7 @@ class PlainLaw:
             H_r[:, 3 + 2 * g.bias :][:, :2] = np.diag(dqr)
         demand = (
             self.barrier_torque(xi1, t)
-            - (g.d2 * np.abs(xi1) + g.mu_bar) * np.clip(xi2 / g.boundary_layer, -1.0, 1.0)
+            - (g.d2 * np.abs(xi1) + g.mu_bar) * np.clip(xi2 / 0.01, -1.0, 1.0)
             - g.Kp * xi2
             + H @ P0
             - H_r[:, :3] @ P0

@@ -168,12 +168,12 @@ def test_lyapunov_function_of_the_oracle_decreases_to_the_floor_of_the_lag():
 
 
 def test_settings_follow_the_configuration():
-    """Learning waits for window and filters, tau_d + T_a of (26); columns have their own gain."""
+    """Learning waits for window and filters, tau_d + T_a of (26)."""
     given = {'learning.window': 0.75, 'learning.settling_time': 0.25}
-    given |= {'learning.adaptation_gain': [1.0, 2.0, 3.0], 'learning.column_gain': 5.0}
+    given |= {'learning.adaptation_gain': [1.5, 2.0, 3.0]}
     config = build(ControllerConfig, given)
     settings, columns = settings_of_config(config), len(columns_of(config))
     assert settings.learning_start == 1.0
     assert settings.window == 750
     assert columns > 0
-    assert settings.Gamma.tolist() == [1.0, 2.0, 3.0, *[5.0] * columns]
+    assert settings.Gamma.tolist() == [1.5, 2.0, 3.0, *[1.0] * columns]

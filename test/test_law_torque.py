@@ -133,7 +133,6 @@ def drawn(seed):
         'd2': each(0.0, 300.0),
         'mu_bar': each(0.0, 0.4),
         'Wc': random.choice([0.0, 0.05]),
-        'boundary_layer': random.uniform(0.01, 0.1),
         'eta': random.uniform(0.0, 0.5),
         'gamma': each(0.0, 60.0),
         'Gamma': each(0.2, 2.0, m),

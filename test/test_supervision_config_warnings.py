@@ -96,7 +96,7 @@ STRONG = {'learning.adaptation_gain': [0.02] * 3, 'learning.weight': 2100.0}
     ('warned', 'changes', 'duration', 'happens'),
     [
         ('learning.weight: kappa Gamma T is 2.1', STRONG, 12.0, leaves_the_bound),
-        ('', STRONG | {'learning.column_gain': 0.02}, 12.0, leaves_the_bound),
+        ('', STRONG | {'learning.weight': 900.0}, 12.0, leaves_the_bound),
         (
             'learning.weight: kappa lambda_max',
             {'learning.update': 'gradient', 'learning.weight': 30.0},

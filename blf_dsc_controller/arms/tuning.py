@@ -33,11 +33,9 @@ _PHASE = 0.625  # rad, phase lost to the delay at omega_b
 _BOUND = 0.002  # rad
 _UNMODELLED = 0.01  # rms, fraction of the rated torque: ripple, noise, Stribeck
 _WINDOW = 5.0  # s
-_PRIOR = 0.01  # 1 / (independent rows in a window)
 _REGULARISATION = 1e-5  # pulls P (about 1) to 0
 _ANCHOR = 5.0  # times the mean square of the unmodelled torque
 _POSTURES = 20
-_ROWS, _CHECKS = 0.01, 0.05  # s, between rows of the window and between its checks
 _SURFACE = 0.0015  # s, least time constant of the surface filter: noise of alpha2'
 _FREE = 2.0 * math.pi  # rad, position limit of a joint without one
 _SLOW = 0.5  # fraction of the rated velocity
@@ -109,12 +107,8 @@ def gains_of(
         'learning.regularization': _REGULARISATION,
         'learning.settling_time': 0.3,
         'learning.filter_pole': 20.0,
-        'learning.row_interval': max(1, round(_ROWS / sample_time)),
-        'learning.interval': max(1, round(_CHECKS / sample_time)),
         'learning.excitation_threshold': 1e-9,
-        'learning.prior_weight': _PRIOR,
         'learning.anchor_weight': _ANCHOR * float(floor.min()) ** 2,
-        'learning.motion_scale': 0.05,
         'learning.residual_floor': _listed(floor),
         'learning.bias': False,
         'learning.viscous': True,

@@ -244,7 +244,7 @@ def excite(options: Namespace) -> None:
         parameters[name] = tuple(round(value, _DIGITS) for value in parameters[name])
     before = problem.evaluate({name: getattr(config.reference, name) for name in parameters})
     after = problem.evaluate(parameters)
-    if config.learning.prior_weight > 0.0:
+    if config.model == 'urdf':
         figures = (
             f'a window leaves {100.0 * after.left:.0f} % of the deviation of the prior, in the '
             f'geometric mean over all directions, instead of {100.0 * before.left:.0f} %'

@@ -189,10 +189,7 @@ class ControllerConfig(ArmConfig):
         """Return gains and limits for the arm of a URDF; the defaults suit the two-link arm."""
         period = given.get('sample_time', ArmConfig.sample_time)
         if given.get('model', 'urdf' if given.get('robot.urdf') else '') != 'urdf':
-            return {
-                'surface.time_constant': max(period, Surface().time_constant),
-                'learning.interval': max(1, round(0.01 / period)),
-            }
+            return {'surface.time_constant': max(period, Surface().time_constant)}
         robot, chain = given_robot(given)
         arm = tuning.Design(
             chain,

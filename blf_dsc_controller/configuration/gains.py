@@ -98,7 +98,6 @@ class Feedback:
         0.0, 'rate of damping, scaled by the inertia of learning.initial_estimate', '1/s', 'omega_v'
     )
     damping: PerJoint = non_negative((0.0, 0.0), 'robust term d2 |xi1| sat(xi2/b)', 'N m/rad', 'd2')
-    boundary_layer: float = positive(0.01, 'xi2 at which the robust term saturates', 'rad/s', 'b')
 
 
 @dataclass(frozen=True)
@@ -252,13 +251,6 @@ class Learning:
     anchor_weight: float = non_negative(
         0.1, 'pull to the estimate before a change, until a new window is full'
     )
-    prior_weight: float = non_negative(0.0, 'pull to the initial estimate, if P is not all excited')
-    motion_scale: float = non_negative(
-        0.0, 'reference velocity below which the rows of a joint count less; 0: none', 'rad/s'
-    )
-    row_interval: int = _size(1, 'interval of the rows of the window', 'samples', at_least=1)
-    column_gain: float = positive(1.0, 'adaptation gain of the disturbance columns')
-    interval: int = _size(10, 'interval of the checks for excitation', 'samples', at_least=1)
     weighing: bool = _size(False, 'weigh what the tip of a URDF holds since the first window')
 
     def problems(self, sample_time: float, model: str, count: int) -> Iterator[str]:

@@ -38,6 +38,12 @@ from blf_dsc_controller.law.controller import Controller
 from blf_dsc_controller.law.settings import CHOICES, LINEAR, Settings
 from blf_dsc_controller.reference.approach import plan_start, reference_of
 
+_COLUMNS = 1.0  # Gamma of the disturbance columns
+_CHECKS = 0.01  # s, between two checks of the excitation
+# Of an arm from a URDF, whose many parameters no motion excites all:
+_ROWS, _SLOWER_CHECKS = 0.01, 0.05  # s, between rows of the window and between its checks
+_PRIOR = 0.01  # 1 / (independent rows in a window): pull to the initial estimate
+_SLOW = 0.05  # rad/s, reference velocity below which the rows of a joint count less
 _FRICTION = 0.05  # standard deviation of friction, over the rated torque
 _MOST_FRICTION = 3.0  # times its initial estimate
 
@@ -122,7 +128,8 @@ def settings_of_config(config: ControllerConfig) -> Settings:
     model = model_of(config)
     learning = config.learning
     p, columns = model.p, columns_of(config)
-    m = p + len(columns)
+    m, is_urdf, T = p + len(columns), config.model == 'urdf', config.sample_time
+    row_interval = max(1, round(_ROWS / T)) if is_urdf else 1
     truth = config.truth
     per_joint = zip(
         config.barrier.bound, config.barrier.weight, config.barrier.slope_limit, strict=True
@@ -140,7 +147,9 @@ def settings_of_config(config: ControllerConfig) -> Settings:
         'effort_is_whole': int(config.robot.effort != 'commanded'),
         'drive': drive_inertias.size,
         'drive_size': drive_chain.size,
-        'window': round(learning.window / (config.sample_time * learning.row_interval)),
+        'window': round(learning.window / (T * row_interval)),
+        'row_interval': row_interval,
+        'interval': max(1, round((_SLOWER_CHECKS if is_urdf else _CHECKS) / T)),
         'tones': len(learning.frequencies),
         'truth_known': int(bool(truth.parameters)),
         'feed_forward': 0,
@@ -148,7 +157,8 @@ def settings_of_config(config: ControllerConfig) -> Settings:
         'change_detection': int(learning.change_detection and learning.prediction != 'lambda'),
         'learning_start': learning.window + learning.settling_time,
         'residual_floor': model.n * least * least,
-        'prior_weight': learning.prior_weight * least * least,
+        'prior_weight': (_PRIOR if is_urdf else 0.0) * least * least,
+        'motion_scale': _SLOW if is_urdf else 0.0,
         'pole': learning.filter_pole,
         'Wc': 0.0,
         'initial_bound': np.array(config.barrier.widest),
@@ -160,7 +170,7 @@ def settings_of_config(config: ControllerConfig) -> Settings:
         'true_disturbance': np.array(
             (truth.constant, truth.amplitude, truth.frequency, truth.phase)
         ),
-        'Gamma': np.array(learning.adaptation_gain + (learning.column_gain,) * len(columns)),
+        'Gamma': np.array(learning.adaptation_gain + (_COLUMNS,) * len(columns)),
         'initial_estimate': np.array((*learning.initial_estimate, *(c.initial for c in columns))),
         'information': inverse(covariance),
         'variance': np.diag(covariance).copy(),

@@ -53,7 +53,6 @@ class Settings(NamedTuple):
     bumpless: int  # 1: d^3 gives up what the prediction error adds to the torque
     change_detection: int  # 1: windows must be consistent (see `excitation`)
     time_constant: float  # lambda of (13), s
-    boundary_layer: float  # b, rad/s
     eta: float  # leakage of (30)
     kappa: float  # weight of the prediction error
     rho: float  # regularisation of the Newton update

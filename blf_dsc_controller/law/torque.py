@@ -47,6 +47,8 @@ from blf_dsc_controller.law import barrier
 from blf_dsc_controller.law.settings import LINEAR, Settings
 from blf_dsc_controller.law.state import Signals, State
 
+_LAYER = 0.01  # b, rad/s: xi2 at which the robust term saturates
+
 LEVEL_CUT = 1.0
 RATE_CUT = 2.0
 
@@ -76,7 +78,7 @@ def feedback(settings: Settings, state: State, signals: Signals, i: int) -> floa
     """Return the feedback of joint i [N m]: barrier (16), robust term and damping of (28), (35)."""
     robust = settings.d2[i] * abs(signals.xi1[i]) + settings.mu_bar[i]
     torque = settings.Kp[i] * signals.xi2[i]
-    torque += robust * clip(signals.xi2[i] / settings.boundary_layer, -1.0, 1.0)
+    torque += robust * clip(signals.xi2[i] / _LAYER, -1.0, 1.0)
     if settings.surface == LINEAR:
         return float(-torque - settings.weight[i] * signals.xi1[i])
     slope = barrier.gradient(

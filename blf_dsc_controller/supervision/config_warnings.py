@@ -357,7 +357,7 @@ def _of_learning(
     if step > 1.0:
         yield (
             f'learning.weight: {what} is {step:.2g}; above 1 the estimate overshoots, above 2 it '
-            'diverges: lower it, or learning.adaptation_gain and learning.column_gain'
+            'diverges: lower it, or learning.adaptation_gain'
         )
     if config.reference.type == 'sinusoids':
         for frequency in config.reference.frequency:

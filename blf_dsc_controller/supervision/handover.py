@@ -174,7 +174,8 @@ def problems(controller: Controller, config: ControllerConfig, t: float) -> Iter
     """Yield reasons why a running law cannot accept a valid configuration at time t [s]."""
     state, p, learning = controller.state, controller.settings.p, config.learning
     errors, torques = np.abs(controller.sample.xi1), np.abs(controller.sample.torque)
-    barrier.update_bound(settings_of_config(config), controller.signals, t)
+    settings = settings_of_config(config)
+    barrier.update_bound(settings, controller.signals, t)
     for joint, error, bound in zip(config.joints, errors, controller.signals.bound, strict=True):
         if not error < bound:
             yield (
@@ -193,9 +194,8 @@ def problems(controller: Controller, config: ControllerConfig, t: float) -> Iter
             f'learning.radius: the norm of the estimate is {norm:.4g} kg m^2 now, above a '
             f'radius of {learning.radius:g} kg m^2: choose a larger one'
         )
-    gain = max(*learning.adaptation_gain, learning.column_gain if len(state.estimate) > p else 0.0)
     stretch = 1.0 if learning.update == 'newton' else float(np.linalg.norm(state.Phi, 2))
-    step = learning.weight * gain * stretch * config.sample_time
+    step = learning.weight * float(settings.Gamma.max()) * stretch * config.sample_time
     if state.latched[0] and step >= _STABLE:
         yield (
             f'learning.weight: with the update {learning.update}, each sample would correct the '
