@@ -10,25 +10,34 @@ from __future__ import annotations
 import gc
 import itertools
 import os
-import signal
-import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, closing, contextmanager
 from dataclasses import replace
 from pathlib import Path
-from typing import IO, Any
+from typing import Any
 
 import numpy as np
 import rclpy
 from harness import Ratio, ratio
 from rclpy.experimental import EventsExecutor
 
-from blf_dsc_controller.cli.session import localhost_environment, own_domain
+from blf_dsc_controller.cli.session import (
+    NodeProcess,
+    environment,
+    localhost_environment,
+    own_domain,
+)
 from blf_dsc_controller.configuration.controller import ControllerConfig, Telemetry
-from blf_dsc_controller.configuration.nodes import CONTROLLER, LoopConfig, dump, load_loop
+from blf_dsc_controller.configuration.nodes import (
+    CONTROLLER,
+    RECORDER,
+    LoopConfig,
+    dump,
+    load_loop,
+)
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.law.telemetry import PlantTelemetry
 from blf_dsc_controller.messages.topics import COMMANDS, JOINT_STATES
@@ -44,39 +53,27 @@ _PERIOD = 1e-3  # s
 _PACE = 0.01  # s between two states before the first torque
 _SETTLING = 0.5  # s for messages under way to arrive
 _PATIENCE = 120.0  # s for a torque, including compilation of kernels
-_ENDING = 20.0  # s from SIGINT to the end
-_TAIL = 2000  # characters of stderr quoted in an error
 _CPUCLOCK_SCHED = 2  # as clock_getcpuclockid(3) does: in ns, where /proc has 10 ms
 _ARMS = {'recommended': 'node', 'panda': 'node with seven joints'}
 _NULL = 'null node'
 _QUIET = 'controller, telemetry off'
 _RECORDED = 'controller, telemetry on, recorder'
-_COLD = 'controller, cold cache'
-_NULL_NODE = [str(Path(__file__).with_name('null_node.py'))]
-_CONTROLLER_NODE = ['-m', 'blf_dsc_controller.nodes.controller_node']
-_RECORDER_NODE = ['-m', 'blf_dsc_controller.nodes.recorder_node', '--ros-args', '-p']
-
-Process = tuple['subprocess.Popen[bytes]', IO[bytes]]
-"""A process, and the file of its stderr."""
-
-
-class ContestantError(BlfDscError):
-    """A contestant has exited early, or does not respond."""
+_NULL_NODE = 'null_node'
 
 
 class StandIn:
     """Stand-in for the plant of a contestant: it publishes states and waits for torques.
 
-    The last of the contestant's `processes` is the measured node; the others run beside it.
+    The last of the contestant's `nodes` is measured; the others run beside it.
     """
 
-    def __init__(self, name: str, domain: int) -> None:
+    def __init__(self, name: str) -> None:
         self.name = name
-        self.processes: list[Process] = []
+        self.nodes: list[NodeProcess] = []
         self.has_torque = False
         self.first_torque = 0.0  # s from the start of the processes
         self._context = rclpy.Context()
-        rclpy.init(context=self._context, domain_id=domain)
+        rclpy.init(context=self._context)
         self._node: Any = rclpy.create_node(
             'sim_plant',
             context=self._context,
@@ -97,7 +94,7 @@ class StandIn:
         """Send a state until its torque arrives: a half-matched reader loses messages."""
         self.until(lambda: self.has_torque, 'the first torque', lambda: self._states.publish(state))
         self.first_torque = time.perf_counter() - begin
-        takers = len(self.processes)  # a recorder takes states, too
+        takers = len(self.nodes)  # a recorder takes states, too
         self.until(lambda: self._states.get_subscription_count() == takers, 'its recorder')
         self._spin(_SETTLING)
 
@@ -106,26 +103,20 @@ class StandIn:
         condition: Callable[[], bool],
         what: str,
         act: Callable[[], object] = lambda: None,
-        patience: float = _PATIENCE,
     ) -> None:
-        """Act until the condition holds; ContestantError if it takes too long, or at an end."""
+        """Act until the condition holds; BlfDscError if it takes too long or a node has failed."""
         begin = time.perf_counter()
         while not condition():
             self.check()
-            if time.perf_counter() - begin > patience:
-                raise ContestantError(f'{self.name}: no sign of {what} after {patience:g} s')
+            if time.perf_counter() - begin > _PATIENCE:
+                raise BlfDscError(f'{self.name}: no sign of {what} after {_PATIENCE:g} s')
             act()
             self._spin(_PACE)
 
     def check(self) -> None:
-        """Raise ContestantError, with the end of its stderr, if a process has ended."""
-        for process, file in self.processes:
-            if process.poll() is not None:
-                file.seek(0)
-                errors = file.read().decode(errors='replace')[-_TAIL:].strip()
-                raise ContestantError(
-                    f'{self.name} ended with exit code {process.returncode}:\n{errors}'
-                )
+        """Raise BlfDscError, with the end of its log, if a node has failed."""
+        for node in self.nodes:
+            node.check()
 
     def play(self, states: Iterator[bytes]) -> tuple[float, float]:
         """Publish states, one per millisecond.
@@ -133,7 +124,7 @@ class StandIn:
         Returns the median latency [s], from state published to torque received, and the CPU [s] of
         the node's process.
         """
-        clock = ~self.processes[-1][0].pid << 3 | _CPUCLOCK_SCHED
+        clock = ~self.nodes[-1].pid << 3 | _CPUCLOCK_SCHED
         latency = np.zeros(_WARM_UP + _STEPS)
         due, busy = time.perf_counter(), 0.0
         for k in range(latency.size):
@@ -149,7 +140,7 @@ class StandIn:
                 self._executor.spin_once(timeout_sec=_PATIENCE)
                 if time.perf_counter() - sent > _PATIENCE:
                     self.check()
-                    raise ContestantError(f'{self.name}: no torque for state {k}')
+                    raise BlfDscError(f'{self.name}: no torque for state {k}')
             latency[k] = time.perf_counter() - sent
         return float(np.median(latency[_WARM_UP:])), time.clock_gettime(clock) - busy
 
@@ -168,82 +159,64 @@ class StandIn:
 
 
 @contextmanager
-def _running(command: list[str], environment: dict[str, str]) -> Iterator[Process]:
-    """Run this Python with arguments, and end it as Ctrl-C does, or by force if that fails."""
-    with tempfile.TemporaryFile() as errors:
-        process = subprocess.Popen(
-            [sys.executable, *command], env=environment, stdout=subprocess.DEVNULL, stderr=errors
-        )
-        try:
-            yield process, errors
-        finally:
-            process.send_signal(signal.SIGINT)
-            try:
-                process.wait(_ENDING)
-            except subprocess.TimeoutExpired:
-                process.kill()
-                process.wait()
-
-
-@contextmanager
 def _started(
-    name: str, config: ControllerConfig, path: Path, state: bytes, cache: str = ''
+    name: str, config: ControllerConfig, folder: Path, state: bytes, **variables: str
 ) -> Iterator[StandIn]:
     """Start a contestant: its recorder, if it has one, then its node; wait for the first torque."""
-    commands, is_recorded = [_NULL_NODE], name == _RECORDED
-    if name != _NULL:
-        file, telemetry = path.with_suffix('.yaml'), Telemetry(enabled=is_recorded)
-        law = replace(config, telemetry=telemetry, wait_for_subscribers=int(is_recorded))
-        dump(file, {CONTROLLER: law})
-        commands = [[*_CONTROLLER_NODE, '--ros-args', '--params-file', str(file)]]
+    is_recorded = name == _RECORDED
+    telemetry = Telemetry(enabled=is_recorded)
+    law = replace(config, telemetry=telemetry, wait_for_subscribers=int(is_recorded))
+    folder.mkdir()
+    dump(folder / 'config.yaml', {CONTROLLER: law})
+    nodes: dict[str, tuple[str, ...]] = {_NULL_NODE if name == _NULL else CONTROLLER: ()}
     if is_recorded:
-        commands.insert(0, [*_RECORDER_NODE, f'output:={path}'])
-    os.environ.update(localhost_environment())
-    with own_domain() as domain, closing(StandIn(name, domain)) as arm, ExitStack() as processes:
-        own = {**os.environ, 'ROS_DOMAIN_ID': f'{domain}'}
-        own |= {'NUMBA_CACHE_DIR': cache} if cache else {}
+        nodes = {RECORDER: ('-p', f'output:={folder / "bag"}'), **nodes}
+    with own_domain() as domain, ExitStack() as ending:
+        values = {'ROS_DOMAIN_ID': f'{domain}', 'PYTHONPATH': os.pathsep.join(sys.path)}
+        ending.enter_context(environment(localhost_environment() | values | variables))
+        arm = ending.enter_context(closing(StandIn(name)))
         begin = time.perf_counter()
-        for command in commands:
-            arm.processes.append(processes.enter_context(_running(command, own)))
+        for node, arguments in nodes.items():
+            arm.nodes.append(NodeProcess(node, folder / 'config.yaml', folder, *arguments))
+            ending.callback(arm.nodes[-1].stop)
         arm.greet(state, begin)
         yield arm
         arm.check()
 
 
 def measure() -> Iterator[Ratio]:
-    """Measure first torque, latency and CPU of the controller relative to the null node."""
+    """Measure latency, CPU and first torque of the controller relative to the null node."""
     for preset, group in _ARMS.items():
-        loop = load_loop(preset)
-        first, *states = _recorded_states(loop)
-        found: dict[str, list[tuple[float, ...]]] = {_NULL: [], _QUIET: [], _RECORDED: []}
-        with tempfile.TemporaryDirectory() as folder:
-            for k, (name, figures) in itertools.product(range(_ROUNDS), found.items()):
-                path = Path(folder, f'{k}-{name}'.replace(' ', '_'))
-                with _started(name, loop.controller, path, first) as arm:
-                    figures.append((*arm.play(iter(states)), arm.first_torque))
+        found = _figures(load_loop(preset), (_NULL, _QUIET, _RECORDED), _ROUNDS)
         for column, what in enumerate(('median latency', 'CPU', 'first torque')):
-            values = {name: np.array(figures)[:, column] for name, figures in found.items()}
+            baseline = found[_NULL][:, column]
             for name in (_QUIET, _RECORDED):
                 title = f'{group}, real time at 1 kHz'
-                yield ratio(title, f'{name}: {what}', _NULL, values[name], values[_NULL])
-
-
-def _recorded_states(loop: LoopConfig) -> list[bytes]:
-    plant = replace(loop.plant, duration=(_STEPS + _WARM_UP + 1) * _PERIOD)
-    record = simulate(loop.controller, plant)
-    telemetry = PlantTelemetry(plant.joints, record.parameters)
-    rows = zip(record.stamps.tolist(), record.measurements, strict=True)
-    return [telemetry.joint_states(_START + stamp, row)[1] for stamp, row in rows]
+                yield ratio(title, f'{name}: {what}', _NULL, found[name][:, column], baseline)
 
 
 def measure_start() -> Iterator[Ratio]:
     """Measure the time to the first torque without compiled kernels relative to the null node's."""
-    loop, seconds = load_loop('recommended'), {_NULL: np.zeros(_STARTS), _COLD: np.zeros(_STARTS)}
-    state = _recorded_states(loop)[0]
+    found = _figures(load_loop('recommended'), (_NULL, _QUIET), _STARTS, cold=True)
+    theirs, mine = (figures[:, 2] for figures in found.values())
+    note = f'{np.median(mine):.1f} s here'
+    yield ratio('first torque', 'controller, cold cache', _NULL, mine, theirs, note)
+
+
+def _figures(
+    loop: LoopConfig, names: Sequence[str], rounds: int, *, cold: bool = False
+) -> dict[str, np.ndarray]:
+    """Return median latency, CPU and first torque [s] (rounds, 3) of each contestant."""
+    plant = replace(loop.plant, duration=(_STEPS + _WARM_UP + 1) * _PERIOD)
+    record = simulate(loop.controller, plant)
+    telemetry = PlantTelemetry(plant.joints, record.parameters)
+    rows = zip(record.stamps.tolist(), record.measurements, strict=True)
+    first, *states = [telemetry.joint_states(_START + stamp, row)[1] for stamp, row in rows]
+    found: dict[str, list[tuple[float, ...]]] = {name: [] for name in names}
     with tempfile.TemporaryDirectory() as folder:
-        for k, (name, values) in itertools.product(range(_STARTS), seconds.items()):
-            path = Path(folder, f'{k}')
-            with _started(name, loop.controller, path, state, cache=str(path)) as arm:
-                values[k] = arm.first_torque
-    note = f'{np.median(seconds[_COLD]):.1f} s here'
-    yield ratio('first torque', _COLD, _NULL, seconds[_COLD], seconds[_NULL], note)
+        for k, (name, figures) in itertools.product(range(rounds), found.items()):
+            path = Path(folder, f'{k}-{name}')
+            variables = {'NUMBA_CACHE_DIR': f'{path}'} if cold else {}
+            with _started(name, loop.controller, path, first, **variables) as arm:
+                figures.append((*arm.play(iter(states)), arm.first_torque))
+    return {name: np.array(figures) for name, figures in found.items()}

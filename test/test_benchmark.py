@@ -12,6 +12,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from blf_dsc_controller.errors import BlfDscError
+
 pytestmark = pytest.mark.nightly
 
 BENCHMARK = Path(__file__).parents[1] / 'benchmark'
@@ -86,12 +88,11 @@ def test_node_compared_with_null_node(monkeypatch):
 
 
 def test_dead_or_silent_contestant_aborts_the_measurement(monkeypatch):
-    nodes = tiny(monkeypatch, 'nodes', _STEPS=2, _WARM_UP=1, _NULL_NODE=['-c', 'off'])
-    with pytest.raises(
-        nodes.ContestantError, match=r'null node ended with exit code 1:[^!]*NameErr'
-    ):
+    nodes = tiny(monkeypatch, 'nodes', _STEPS=2, _WARM_UP=1, _NULL_NODE='not_there')
+    with pytest.raises(BlfDscError, match=r'not_there exited with code 1:[^!]*No module'):
         list(nodes.measure())
-    silent = nodes.StandIn('silent node', 0)
-    with pytest.raises(nodes.ContestantError, match=r'no sign of a torque after 0\.1 s'):
-        silent.until(lambda: False, 'a torque', patience=0.1)
+    monkeypatch.setattr(nodes, '_PATIENCE', 0.1)
+    silent = nodes.StandIn('silent node')
+    with pytest.raises(BlfDscError, match=r'no sign of a torque after 0\.1 s'):
+        silent.until(lambda: False, 'a torque')
     silent.close()

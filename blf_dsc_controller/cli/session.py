@@ -93,7 +93,8 @@ class NodeProcess:
         self.name = name
         self._noticed = 0
         self._log = logs / f'{name}.log'
-        command = [sys.executable, '-m', _MODULES[name], '--ros-args', '--params-file']
+        module = _MODULES.get(name, name)  # of the benchmark, for instance
+        command = [sys.executable, '-m', module, '--ros-args', '--params-file']
         with self._log.open('wb') as output:
             # In its own session: Ctrl-C reaches only the parent, which stops the nodes in order.
             self._process = subprocess.Popen(
@@ -106,6 +107,11 @@ class NodeProcess:
                 close_fds=False,  # it holds the claim of the domain, which ends with the last node
                 preexec_fn=_die_with_parent,  # noqa: PLW1509 - takes no lock that a thread could hold
             )
+
+    @property
+    def pid(self) -> int:
+        """Number of the process."""
+        return self._process.pid
 
     @property
     def is_running(self) -> bool:
