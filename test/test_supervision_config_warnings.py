@@ -168,10 +168,6 @@ BARE = {'robot.viscous': [], 'robot.coulomb': []}
         ),
         ({'barrier.bound': [0.0002] * 7}, ['barrier.bound: friction and unmodelled torque']),
         ({'robot.urdf': IN_KG_MM2}, ['robot.urdf: panda_joint7 accelerates at only ']),
-        (
-            {'robot.urdf': URDF.replace('ixx="0.001" iyy="0.0025" izz="0.0017"', '')},
-            ['robot.urdf: panda_hand: a mass without moments of inertia'],
-        ),
         ({'robot.urdf': PLACEHOLDERS}, ['torque.limit: an effort of up to 2000 N m for']),
         (
             {'robot.urdf': STICKY, **BARE},

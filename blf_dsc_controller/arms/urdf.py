@@ -76,16 +76,12 @@ class Joint:
 
 @dataclass(frozen=True, eq=False)
 class Chain:
-    """Joints from `base` to `tip`, and placement of the tip (4, 4) in the last joint's frame.
-
-    `pointlike` names the links that they move whose mass has no moments of inertia.
-    """
+    """Joints from `base` to `tip`, and placement of the tip (4, 4) in the last joint's frame."""
 
     base: str
     tip: str
     joints: tuple[Joint, ...]
     tip_placement: np.ndarray
-    pointlike: tuple[str, ...]
 
     @property
     def inertias(self) -> np.ndarray:
@@ -105,10 +101,17 @@ def read_chain(text: str, base: str, tip: str, joints: tuple[str, ...]) -> Chain
     tree = Tree.of(text)
     wanted = joints or (() if tip else tree.only_chain())
     for name in wanted:
-        tree.joint(name)
-    base, tip = base or tree.root, tip or _link(tree.joint(wanted[-1]), 'child')
+        if name not in tree.joints:
+            listed = _listed(tree.joints)
+            raise UrdfError(f'no joint {name!r} in the URDF: its joints are {listed}')
+    base, tip = base or tree.root, tip or _link(tree.joints[wanted[-1]], 'child')
     path = tree.path(base, tip)
-    _check_kinds(path)
+    for element in path:
+        name, kind = element.get('name', ''), element.get('type')
+        if kind not in (*_MOVING, 'fixed'):
+            raise UrdfError(f'joint {name!r} is {kind}; expected fixed, {_listed(_MOVING)}')
+        if element.find('mimic') is not None:
+            raise UrdfError(f'joint {name!r} mimics another: choose a base and a tip without it')
     moving = _moving(path)
     if not moving or (wanted and wanted != moving):
         raise UrdfError(
@@ -116,25 +119,19 @@ def read_chain(text: str, base: str, tip: str, joints: tuple[str, ...]) -> Chain
             f'{_listed(wanted)}: list them like this, or choose another base or tip'
         )
     chain: list[Joint] = []
-    pointlike: list[str] = []
-    massless: list[str] = []
     frame = np.eye(4)
     for element in path:
         frame = product(frame, _origin(element))
         if element.get('type') != 'fixed':
-            link = _link(element, 'child')
-            body = tree.body(link, moving)
-            if body.J[3, 3] <= 0.0:
-                massless.append(f'{link} (moved by {element.get("name")})')
-            chain.append(_joint(element, frame, body))
-            pointlike += body.pointlike
+            chain.append(_joint(element, frame, tree.body(_link(element, 'child'), moving)))
             frame = np.eye(4)
+    massless = [f'{joint.link} (moved by {joint.name})' for joint in chain if not joint.inertia[0]]
     if massless:
         raise UrdfError(
             f'these links have no mass, nor has anything fixed to them: {_listed(massless)}: add '
             'an <inertial> to each, even a rough one'
         )
-    return Chain(base, tip, tuple(chain), frame, tuple(pointlike))
+    return Chain(base, tip, tuple(chain), frame)
 
 
 class _Body(NamedTuple):
@@ -143,65 +140,39 @@ class _Body(NamedTuple):
     J: np.ndarray  # pseudo-inertia (4, 4) of all
     held: np.ndarray  # of what a held joint carries
     fixed: tuple[str, ...]  # links that are fixed to it
-    pointlike: tuple[str, ...]  # links with mass but without moments of inertia
 
 
 class Tree(NamedTuple):
-    """Links and joints of a URDF by name."""
+    """Links and joints of a URDF by name, and the joint above each link."""
 
     links: Mapping[str, ET.Element]
     joints: Mapping[str, ET.Element]
+    above: Mapping[str, ET.Element]
 
     @classmethod
     def of(cls, text: str) -> Tree:
-        """Read a URDF."""
+        """Read a URDF, in which each joint has its links, and no link two joints above it."""
         robot = _robot(text)
-        named = []
-        for tag in ('link', 'joint'):
-            elements = robot.findall(tag)
-            if len(elements) > _MOST:
-                raise UrdfError(f'the URDF has {len(elements)} {tag}s; at most {_MOST} can be read')
-            named.append({element.get('name', ''): element for element in elements})
-            if len(named[-1]) < len(elements):
-                raise UrdfError(f'each {tag} needs a unique name; got {_listed(named[-1])}')
-        tree = cls(*named)
-        tree._check()
-        return tree
-
-    def _check(self) -> None:
-        """Check that each joint has its links, and each link at most one joint above it."""
-        children: set[str] = set()
-        for name, joint in self.joints.items():
+        links, joints = _named(robot, 'link'), _named(robot, 'joint')
+        above: dict[str, ET.Element] = {}
+        for name, joint in joints.items():
             for role in ('parent', 'child'):
-                if _link(joint, role) not in self.links:
+                if (link := _link(joint, role)) not in links:
                     raise UrdfError(
-                        f'joint {name!r} has the {role} {_link(joint, role)!r}, but the links are '
-                        f'{_listed(self.links)}: correct its <{role}>'
+                        f'joint {name!r} has the {role} {link!r}, but the links are '
+                        f'{_listed(links)}: correct its <{role}>'
                     )
-            child = _link(joint, 'child')
-            if child in children:
+            if above.setdefault(link, joint) is not joint:
                 raise UrdfError(
-                    f'link {child!r} is the child of two joints: closed chains are not '
+                    f'link {link!r} is the child of two joints: closed chains are not '
                     'supported; open the chain by removing a joint'
                 )
-            children.add(child)
+        return cls(links, joints, above)
 
     @property
     def root(self) -> str:
-        """The link that no joint carries."""
-        children = {_link(joint, 'child') for joint in self.joints.values()}
-        for link in self.links:
-            if link not in children:
-                return link
-        raise UrdfError(
-            f'no link is the root: the links are {_listed(self.links)}, each below a joint'
-        )
-
-    def joint(self, name: str) -> ET.Element:
-        """Return a joint by name."""
-        if name not in self.joints:
-            raise UrdfError(f'no joint {name!r} in the URDF: its joints are {_listed(self.joints)}')
-        return self.joints[name]
+        """The link that no joint carries; empty if each hangs below another."""
+        return next((link for link in self.links if link not in self.above), '')
 
     def path(self, base: str, tip: str) -> list[ET.Element]:
         """Return the joints from a link to another."""
@@ -210,43 +181,41 @@ class Tree(NamedTuple):
                 raise UrdfError(
                     f'no link {link!r} for the {role}: the links are {_listed(self.links)}'
                 )
-        above = {_link(joint, 'child'): joint for joint in self.joints.values()}
         path: list[ET.Element] = []
         link = tip
         while link != base:
-            if link not in above or len(path) > len(self.joints):
+            if link not in self.above or len(path) > len(self.joints):
                 raise UrdfError(
                     f'the path up from the tip {tip!r} ends at {link!r} without reaching the base '
                     f'{base!r}: choose a tip below the base'
                 )
-            path.insert(0, above[link])
+            path.insert(0, self.above[link])
             link = _link(path[0], 'parent')
         return path
 
-    def moving_paths(self) -> list[tuple[str, ...]]:
-        """Return, for each moving joint, the moving joints from the root to it."""
-        ends = (
-            _link(joint, 'child') for joint in self.joints.values() if joint.get('type') in _MOVING
-        )
-        return [_moving(self.path(self.root, end)) for end in ends]
+    def trunk(self) -> tuple[str, ...]:
+        """Return the moving joints from the root to where they branch, as into fingers."""
+        ends = [link for link, joint in self.above.items() if joint.get('type') in _MOVING]
+        paths = [_moving(self.path(self.root, end)) for end in ends]
+        inner = {name for path in paths for name in path[:-1]}
+        leaves = [path for path in paths if path[-1] not in inner]
+        common = set.intersection(*map(set, leaves)) if leaves else set()
+        return tuple(name for name in max(paths, key=len, default=()) if name in common)
 
     def only_chain(self) -> tuple[str, ...]:
         """Return the moving joints, which must be one chain."""
-        paths = self.moving_paths()
-        longest = max(paths, key=len, default=())
-        if len(longest) < len(paths) or not longest:
+        moving = _moving([*self.joints.values()])
+        if not moving or len(trunk := self.trunk()) < len(moving):
             raise UrdfError(
                 'neither a tip nor joints were given, and the moving joints are not one chain: '
-                f'{_listed(path[-1] for path in paths)}. Set robot.tip to the last link of the arm'
+                f'{_listed(moving)}. Set robot.tip to the last link of the arm'
             )
-        return longest
+        return trunk
 
     def body(self, link: str, joints: Sequence[str]) -> _Body:
         """Return a link with all that it carries, where no other joint than `joints` moves."""
         J, held = _link_inertia(self.links[link]), np.zeros((4, 4))
-        tensor = self.links[link].find('inertial/inertia')
-        has_moments = any(_number(tensor, f'i{axis}{axis}') for axis in 'xyz')
-        fixed, pointlike = [], [link] if J[3, 3] > 0.0 and not has_moments else []
+        fixed: tuple[str, ...] = ()
         for name, joint in self.joints.items():
             if _link(joint, 'parent') != link or name in joints:
                 continue
@@ -256,9 +225,8 @@ class Tree(NamedTuple):
             frame, beyond = _origin(joint), self.body(child, joints)
             J = J + moved(beyond.J, frame)
             held += moved(beyond.held if kind == 'fixed' else beyond.J, frame)
-            fixed += [child, *beyond.fixed] if kind == 'fixed' else []
-            pointlike += beyond.pointlike
-        return _Body(J, held, tuple(fixed), tuple(pointlike))
+            fixed += (child, *beyond.fixed) if kind == 'fixed' else ()
+        return _Body(J, held, fixed)
 
 
 def _robot(text: str) -> ET.Element:
@@ -283,13 +251,15 @@ def _moving(path: Sequence[ET.Element]) -> tuple[str, ...]:
     return tuple(str(joint.get('name')) for joint in path if joint.get('type') in _MOVING)
 
 
-def _check_kinds(path: Sequence[ET.Element]) -> None:
-    for element in path:
-        name, kind = element.get('name', ''), element.get('type')
-        if kind not in (*_MOVING, 'fixed'):
-            raise UrdfError(f'joint {name!r} is {kind}; expected fixed, {_listed(_MOVING)}')
-        if element.find('mimic') is not None:
-            raise UrdfError(f'joint {name!r} mimics another: choose a base and a tip without it')
+def _named(robot: ET.Element, tag: str) -> dict[str, ET.Element]:
+    """Return the elements with a tag by name."""
+    elements = robot.findall(tag)
+    if len(elements) > _MOST:
+        raise UrdfError(f'the URDF has {len(elements)} {tag}s; at most {_MOST} can be read')
+    named = {element.get('name', ''): element for element in elements}
+    if len(named) < len(elements):
+        raise UrdfError(f'each {tag} needs a unique name; got {_listed(named)}')
+    return named
 
 
 def _joint(element: ET.Element, placement: np.ndarray, body: _Body) -> Joint:

@@ -19,7 +19,6 @@ acceleration of the other.
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
@@ -87,27 +86,15 @@ def read_recording(
 
 
 def _arm_joints(text: str, in_bag: set[str], names: NameMap) -> tuple[str, ...]:
-    """Return the joints of the arm: from the root of the URDF as far as the bag has them.
-
-    Where it branches, as into fingers, the arm is the only branch with several joints in the bag.
-    """
+    """Return the joints of the arm: from the root of the URDF to the last that the bag has."""
     ours = in_bag | {our for our, their in names.joints.items() if their in in_bag}
-    paths = Tree.of(text).moving_paths()
-    arm: tuple[str, ...] = ()
-    while True:
-        beyond = [path for path in paths if path[: len(arm)] == arm and path != arm]
-        branches = {path[len(arm)] for path in beyond}
-        counts = Counter(path[len(arm)] for path in beyond if path[-1] in ours)
-        least = 1 if len(branches) == 1 else 2
-        followed = [joint for joint, count in counts.items() if count >= least]
-        if len(followed) != 1:
-            break
-        arm = (*arm, followed[0])
+    arm = Tree.of(text).trunk()
+    while arm and arm[-1] not in ours:
+        arm = arm[:-1]
     if not arm:
-        found = f'joints of {len(followed)} arms' if followed else 'no joint of the URDF'
         raise BagError(
-            f'the bag has {found}; it names {", ".join(sorted(in_bag))}: choose an arm with --tip, '
-            "or give the bag's names, as in --map joint1=shoulder"
+            f'the bag has no joint of the URDF; it names {", ".join(sorted(in_bag))}: choose an '
+            "arm with --tip, or give the bag's names, as in --map joint1=shoulder"
         )
     return arm
 

@@ -218,11 +218,6 @@ def _of_urdf(config: ControllerConfig, load: ReferenceLoad) -> Iterator[str]:
     """Check for figures that nobody can have measured, and for defaults that are hardly meant."""
     robot = config.robot
     chain = robot.chain(config.joints)
-    if chain.pointlike:
-        yield (
-            f'robot.urdf: {", ".join(chain.pointlike)}: a mass without moments of inertia (all '
-            'zero): the gains of these joints rest on the drives alone; give rough ones'
-        )
     if (joints := robot.placeholder_efforts(chain)) and not robot.rotor_inertia:
         largest = max(joint.effort for joint in chain.joints)
         yield (
