@@ -3,16 +3,26 @@
 
 Time is counted in whole nanoseconds, t_k = (k T_ns) 1e-9 s, so every caller computes the same
 floats.  The ROS 2 node and the compiled offline loop run the same kernels and agree bit for bit.
+
+A reading has an offset, white noise and quantisation; its velocity is either measured, with noise
+of its own, or differenced from the measured positions, and a low-pass filter may follow.  Noise
+comes from one seeded generator, so the same seed repeats a run exactly.
+
+A command is limited in rate, late, limited, lagging and noisy.  Drives of cobots hold the arm
+against gravity, and overcome part of their friction, by a model of their own, right or wrong, with
+the payload that they have been told of.  Some brake when the torque jumps (a reflex stop), until
+the plant is reset; their driver may limit its rate before.
 """
 
 import numpy as np
 
+from blf_dsc_controller.compiled.elementary import exp, tanh
 from blf_dsc_controller.compiled.jit import inner, kernel
 from blf_dsc_controller.compiled.layout import Array, part, view
 from sim_plant.arm import Arm
-from sim_plant.drives import actuate, compensate, draw, is_noisy, let_pass, sense
-from sim_plant.layout import PlantSettings, PlantState, settings_of, state_of
+from sim_plant.layout import MEASURED, Encoders, PlantSettings, PlantState, settings_of, state_of
 from sim_plant.motion import disturbing_torque, integrate, update_loads
+from sim_plant.rigid_body import fill_gravity
 
 
 @inner
@@ -20,6 +30,128 @@ def plant_views(arm: Arm, settings: Array, state: Array) -> tuple[PlantSettings,
     """Return views of both vectors, not reference-counted."""
     plant = settings_of(view(settings), arm, arm.joint_count())
     return plant, state_of(view(state), plant)
+
+
+def generator(seed: int) -> np.random.Generator:
+    """Return the generator of a seed: PCG64 on every version of numpy."""
+    return np.random.Generator(np.random.PCG64(np.random.SeedSequence(seed)))
+
+
+@inner
+def is_noisy(encoders: Encoders) -> bool:
+    """Return whether a reading needs random numbers at all."""
+    return encoders.position_noise > 0.0 or encoders.velocity_noise > 0.0
+
+
+@inner
+def draw(rng: np.random.Generator, noise: Array) -> None:
+    """Fill `noise` with the same standard normal numbers as `rng.standard_normal(out=noise)`."""
+    for i in range(noise.size):
+        noise[i] = rng.standard_normal()
+
+
+@inner
+def quantised(angle: float, resolution: float) -> float:
+    """Round to the nearest multiple of the resolution; 0 means no quantisation."""
+    if resolution == 0.0:
+        return angle
+    return float(np.rint(angle / resolution) * resolution)
+
+
+@inner
+def sense(plant: PlantSettings, now: PlantState) -> None:
+    """Write the reading of this sample, including offset and noise.
+
+    A differenced velocity spans the samples since the last reading; the first reading has no
+    predecessor and gets the true velocity.
+    """
+    n, encoders, reading = plant.n, plant.encoders, now.reading
+    first = reading.sample[0] < 0
+    span = (int(now.sample[0]) - reading.sample[0]) * (plant.period_ns * 1e-9)
+    filters = encoders.velocity_pole > 0.0 and not first
+    old = exp(-encoders.velocity_pole * span) if filters else 0.0
+    for i in range(n):
+        position = now.x[i] + now.acting.offset[i] + encoders.position_noise * reading.noise[i]
+        position = quantised(position, encoders.resolution)
+        if encoders.velocity_source == MEASURED:
+            velocity = now.x[n + i] + encoders.velocity_noise * reading.noise[n + i]
+        elif first:
+            velocity = now.x[n + i]
+        else:
+            velocity = (position - reading.position[i]) / span
+        if filters:
+            velocity += old * (reading.velocity[i] - velocity)
+        reading.velocity[i] = velocity
+        reading.position[i] = position
+    reading.sample[0] = now.sample[0]
+
+
+@inner
+def limited(torque: float, limit: float) -> float:
+    """Clamp a torque to +-limit; 0 means no limit."""
+    if limit == 0.0:
+        return torque
+    return min(max(torque, -limit), limit)
+
+
+@inner
+def let_pass(plant: PlantSettings, now: PlantState, command: Array) -> bool:
+    """Store what the driver lets pass of a command (n,); return whether the drives have stopped."""
+    drives, state = plant.drives, now.drives
+    for i in range(plant.n):
+        last = state.command[i]
+        change = limited(command[i] - last, drives.step)
+        state.command[i] = command[i] if change == command[i] - last else last + change
+        # 1e-9: a command at the limit of its rate may be rounded beyond it.
+        if drives.jump > 0.0 and abs(change) > drives.jump * (1.0 + 1e-9):
+            state.stopped[0] = 1.0
+    return bool(state.stopped[0] == 1.0)
+
+
+@inner
+def actuate(plant: PlantSettings, now: PlantState, command: Array) -> None:
+    """Process the command (n,) of this sample and write the torque applied in it to the state.
+
+    Until the first command has passed the delay, the applied torque is zero.
+    """
+    drives, state = plant.drives, now.drives
+    for i in range(plant.n):
+        torque = command[i]
+        if drives.delay > 0:
+            slot = int(now.sample[0]) % drives.delay
+            torque = state.ring[slot, i]
+            state.ring[slot, i] = command[i]
+        torque = limited(torque, drives.torque_limit[i])
+        if drives.decay > 0.0:
+            lacking = state.motor[i] - torque
+            state.motor[i] = torque + drives.decay * lacking
+            torque += drives.mean_decay * lacking
+        if drives.torque_noise > 0.0:
+            torque *= 1.0 + drives.torque_noise * state.noise[i]
+        state.applied[i] = torque
+
+
+def lag(time_constant: float, period: float) -> tuple[float, float]:
+    """Return decay and mean decay over a period [s] of a lag with a time constant [s] (0: none)."""
+    if time_constant == 0.0:
+        return 0.0, 0.0
+    decay = exp(-period / time_constant)
+    return decay, time_constant / period * (1.0 - decay)
+
+
+@inner
+def compensate(plant: PlantSettings, now: PlantState) -> None:
+    """Write what the drives add in this sample, by the true state and the true friction."""
+    n, drives, state, acting = plant.n, plant.drives, now.drives, now.acting
+    if drives.bodies.size == 0:
+        return
+    fill_gravity(drives.bodies, state.memory, part(now.x, 0, (n,)), state.added)
+    if drives.friction > 0.0:
+        for i in range(n):
+            dq = now.x[n + i]
+            torque = acting.viscous[i] * dq
+            torque += acting.coulomb[i] * tanh(dq / plant.disturbance.coulomb_velocity)
+            state.added[i] += drives.friction * torque
 
 
 @inner
@@ -31,18 +163,10 @@ def is_due(plant: PlantSettings, now: PlantState) -> bool:
 
 
 @inner
-def draw_noise(plant: PlantSettings, now: PlantState, rng: np.random.Generator) -> None:
-    """Draw encoder and drive noise for this sample, unless it has been read already."""
-    if is_due(plant, now):
-        if is_noisy(plant.encoders):
-            draw(rng, now.reading.noise)
-        if plant.drives.torque_noise > 0.0:
-            draw(rng, now.drives.noise)
-
-
-@inner
-def observe(plant: PlantSettings, now: PlantState, measurement: Array) -> None:
-    """Write [q, dq, effort] (3n,) of this sample, with the noise already drawn.
+def observe(
+    plant: PlantSettings, now: PlantState, rng: np.random.Generator, measurement: Array
+) -> None:
+    """Write [q, dq, effort] (3n,) of this sample, and draw its noise.
 
     `effort` is the torque applied over the last interval [N m], before the first one that with
     which the drives hold the arm.  Reading a sample again gives the same numbers.
@@ -52,6 +176,10 @@ def observe(plant: PlantSettings, now: PlantState, measurement: Array) -> None:
         update_loads(plant, now)
         compensate(plant, now)
     if is_due(plant, now):
+        if is_noisy(plant.encoders):
+            draw(rng, now.reading.noise)
+        if plant.drives.torque_noise > 0.0:
+            draw(rng, now.drives.noise)
         update_loads(plant, now)
         sense(plant, now)
     for i in range(n):
@@ -97,10 +225,12 @@ def truth(plant: PlantSettings, now: PlantState, out: Array) -> None:
 
 
 @kernel
-def observe_plant(arm: Arm, settings: Array, state: Array, measurement: Array) -> None:
+def observe_plant(
+    arm: Arm, settings: Array, state: Array, rng: np.random.Generator, measurement: Array
+) -> None:
     """Call `observe` with packed vectors."""
     plant, now = plant_views(arm, settings, state)
-    observe(plant, now, measurement)
+    observe(plant, now, rng, measurement)
 
 
 @kernel

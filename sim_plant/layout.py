@@ -125,7 +125,6 @@ class DriveState(NamedTuple):
     applied: Annotated[Array, 'n']  # mean over the sample, N m
     added: Annotated[Array, 'n']  # by the drives, N m
     whole: Annotated[Array, 'n']  # torque at the joints, N m
-    still: Annotated[Array, 'n']  # zeros
     memory: Annotated[Array, 'memory_size']  # BodyMotion
 
 

@@ -16,10 +16,16 @@ from blf_dsc_controller.arms.urdf import Chain
 from blf_dsc_controller.compiled.layout import pack
 from blf_dsc_controller.configuration.nodes import PLANT
 from blf_dsc_controller.configuration.plant import Deviation, PlantConfig
-from blf_dsc_controller.configuration.robot import parameters_of as base_parameters_of
+from blf_dsc_controller.configuration.robot import parameters_of
 from sim_plant.arm import Arm, PointMassArm
-from sim_plant.drives import generator, is_noisy, lag, memory_size
-from sim_plant.kernels import is_due, observe_plant, plant_truth, plant_views, step_plant
+from sim_plant.kernels import (
+    generator,
+    lag,
+    observe_plant,
+    plant_truth,
+    plant_views,
+    step_plant,
+)
 from sim_plant.layout import (
     VELOCITY_SOURCES,
     Disturbance,
@@ -30,7 +36,7 @@ from sim_plant.layout import (
     PlantSettings,
     state_size,
 )
-from sim_plant.rigid_body import rigid_arm, rigid_bodies
+from sim_plant.rigid_body import motion_size, rigid_arm, rigid_bodies
 
 T = TypeVar('T')
 
@@ -56,9 +62,7 @@ class Plant:
         self.joints = settings.n
         self.period_ns = settings.period_ns
         self.state = np.zeros(state_size(settings))
-        self._plant, self._now = plant_views(self.arm, self.settings, self.state)
-        self._noises = [self._now.reading.noise] if is_noisy(settings.encoders) else []
-        self._noises += [self._now.drives.noise] if settings.drives.torque_noise > 0.0 else []
+        self._now = plant_views(self.arm, self.settings, self.state)[1]
         self._q, self._dq = self._now.x[: 2 * self.joints].reshape(2, -1)
         self._q[:], self._dq[:] = position, velocity
         self._now.reading.sample[0] = self._now.acting.sample[0] = -1.0
@@ -90,15 +94,8 @@ class Plant:
         return self.sample * self.period_ns
 
     def measure(self) -> np.ndarray:
-        """Return [q, dq, effort] (3n,) of this sample: a view, overwritten by the next call.
-
-        The noise is drawn here rather than in a kernel, which would draw the same numbers, because
-        passing a generator to compiled code costs more than the rest of the call.
-        """
-        if self._noises and is_due(self._plant, self._now):
-            for noise in self._noises:
-                self.rng.standard_normal(out=noise)
-        observe_plant(self.arm, self.settings, self.state, self._measurement)
+        """Return [q, dq, effort] (3n,) of this sample: a view, overwritten by the next call."""
+        observe_plant(self.arm, self.settings, self.state, self.rng, self._measurement)
         return self._measurement
 
     def step(self, torque: np.ndarray) -> None:
@@ -120,7 +117,7 @@ class Plant:
         """Switch to settings with the same number of joints, period and delay."""
         self.arm = settings.arm
         self.settings = pack(settings)
-        self._plant, self._now = plant_views(self.arm, self.settings, self.state)
+        self._now = plant_views(self.arm, self.settings, self.state)[1]
         self._now.acting.sample[0] = -1.0
 
     def hold(self) -> None:
@@ -154,13 +151,6 @@ class Plant:
         self.state[:], self.rng.bit_generator.state = saved
 
 
-def parameters_of(config: PlantConfig, t: float = 0.0) -> np.ndarray:
-    """Return the true parameters P (p,) of a configured arm, with its payload at time t [s]."""
-    plant = plant_of(config)
-    plant.state[0] = round(t / config.sample_time)
-    return plant.truth()[: plant.arm.p]
-
-
 def parameter_order(names: Sequence[str], config: PlantConfig) -> np.ndarray:
     """Return the index in P of each parameter of a model; all -1 if the model has others."""
     true = parameter_names_of(config)
@@ -189,7 +179,7 @@ def plant_settings(config: PlantConfig) -> PlantSettings:
         steps=_steps_of(config, arm),
         events=len(events.begin),
         bodies_size=bodies.size,
-        memory_size=memory_size(arm) if bodies.size else 0,
+        memory_size=motion_size(arm) if bodies.size else 0,
         encoders=_filled(Encoders, sensor, velocity_source=VELOCITY_SOURCES[sensor.velocity]),
         disturbance=_filled(
             Disturbance,
@@ -288,8 +278,8 @@ def arm_of(config: PlantConfig) -> Arm:
         return PointMassArm(*vars(config.arm).values())
     chain = robot.chain(config.joints)
     rotors = config.truth.rotor_factor * robot.rotors(chain)
-    inertias, parameters = true_inertias(chain, config.truth), base_parameters_of(robot, chain)
-    return rigid_arm(chain, robot.gravity, inertias, rotors, parameters)
+    inertias, parameters = true_inertias(chain, config.truth), parameters_of(robot, chain)
+    return rigid_arm(rigid_bodies(chain, robot.gravity, inertias, rotors, parameters))
 
 
 def drive_bodies(config: PlantConfig) -> np.ndarray:
@@ -318,7 +308,7 @@ def parameter_names_of(config: PlantConfig) -> tuple[str, ...]:
     robot = config.robot
     if not robot.urdf:
         return PARAMETER_NAMES
-    return base_parameters_of(robot, robot.chain(config.joints)).model.parameter_names
+    return parameters_of(robot, robot.chain(config.joints)).model.parameter_names
 
 
 def urdf_of(config: PlantConfig) -> str:

@@ -39,6 +39,7 @@ class RigidBodies(NamedTuple):
     """Geometry and inertias of a chain of n bodies, each in the frame of its joint."""
 
     n: int
+    p: int
     gravity: Annotated[Array, 3]  # m/s^2, in the base
     rotation: Annotated[Array, 'n', 3, 3]  # of a joint's frame at q = 0, to the previous body
     offset: Annotated[Array, 'n', 3]  # of its origin in the previous body, m
@@ -49,6 +50,9 @@ class RigidBodies(NamedTuple):
     inertia: Annotated[Array, 'n', 3, 3]  # kg m^2, about the frame's origin
     rotor: Annotated[Array, 'n']  # kg m^2, or kg, reflected to the joint
     tip: Annotated[Array, 3]  # m, in the last body
+    P: Annotated[Array, 'p']  # base parameters without payload; none in a model of the drives
+    P_payload: Annotated[Array, 'p']  # contribution of 1 kg at the tip
+    rest: Annotated[Array, 'n']  # zero velocities
 
 
 class BodyMotion(NamedTuple):
@@ -70,13 +74,23 @@ class BodyMotion(NamedTuple):
     factor: Annotated[Array, 'n', 'n']
 
 
+bodies_of = view_of(RigidBodies)
+motion_of, motion_size = view_of(BodyMotion), size_of(BodyMotion)
+
+
 def rigid_bodies(
-    chain: Chain, gravity: tuple[float, ...], inertias: np.ndarray, rotors: np.ndarray
+    chain: Chain,
+    gravity: tuple[float, ...],
+    inertias: np.ndarray,
+    rotors: np.ndarray,
+    parameters: BaseParameters | None = None,
 ) -> RigidBodies:
     """Return bodies with the geometry of a chain, inertias (n, 10) and rotors (n,)."""
+    P = parameters.of(inertias, rotors) if parameters else np.zeros(0)
     tensors = [pseudo_inertia(inertia) for inertia in inertias]
     return RigidBodies(
         n=len(chain.joints),
+        p=P.size,
         gravity=np.array(gravity),
         rotation=np.array([joint.placement[:3, :3] for joint in chain.joints]),
         offset=np.array([joint.placement[:3, 3] for joint in chain.joints]),
@@ -87,6 +101,9 @@ def rigid_bodies(
         inertia=np.array([rotational_inertia(J) for J in tensors]),
         rotor=np.array(rotors),
         tip=chain.tip_placement[:3, 3].copy(),
+        P=P,
+        P_payload=parameters.load if parameters else P,
+        rest=np.zeros(len(chain.joints)),
     )
 
 
@@ -130,49 +147,6 @@ def turn(R: np.ndarray, axis: Vector, angle: float) -> None:
         turned = plus(turned, times((1.0 - c) * dot(axis, column), axis))
         for r in range(3):
             R[r, k] = turned[r]
-
-
-@inner
-def tip(arm: RigidBodies, now: BodyMotion, position: np.ndarray, jacobian: np.ndarray) -> None:
-    """Write the tip position (3,) [m] after `locate`, and its Jacobian (3, n) [m/rad, or 1]."""
-    lever = product(now.rotation[arm.n], vector(arm.tip))
-    end = plus(vector(now.origin[arm.n]), lever)
-    put(end, position)
-    for j in range(arm.n):
-        axis = vector(now.axis[j + 1])
-        if arm.prismatic[j] == 0.0:
-            axis = cross(axis, plus(end, times(-1.0, vector(now.origin[j + 1]))))
-        for r in range(3):
-            jacobian[r, j] = axis[r]
-
-
-@inner
-def gravity_torque(arm: RigidBodies, now: BodyMotion, out: np.ndarray) -> None:
-    """Write G (n,) [N m, or N] after `locate` at rest, without a payload."""
-    combine_bodies(arm, now, 0.0)
-    for j in range(arm.n):
-        out[j] = along_joint(arm, now, j, vector(now.force[j + 1]), vector(now.torque[j + 1]))
-
-
-@inner
-def acceleration(
-    arm: RigidBodies, now: BodyMotion, payload: float, torque: np.ndarray, ddq: np.ndarray
-) -> None:
-    """Write ddq (n,) after `locate`, with a point mass `payload` [kg] at the tip.
-
-    `ddq` may alias the joint `torque` (n,) [N m, or N].
-    """
-    combine_bodies(arm, now, payload)
-    for j in range(arm.n):
-        ddq[j] = torque[j] - along_joint(
-            arm, now, j, vector(now.force[j + 1]), vector(now.torque[j + 1])
-        )
-    fill_inertia(arm, now)
-    for i in range(arm.n):
-        for j in range(i + 1):
-            now.factor[j, i] = now.M[i, j]
-    cholesky.factor(now.factor)
-    cholesky.solve(now.factor, ddq)
 
 
 @inner
@@ -261,21 +235,53 @@ def along_joint(arm: RigidBodies, now: BodyMotion, i: int, F: Vector, N: Vector)
     return dot(axis, F) if arm.prismatic[i] == 1.0 else dot(axis, N)
 
 
-motion_of, motion_size = view_of(BodyMotion), size_of(BodyMotion)
+@called
+def fill_tip(bodies: Array, memory: Array, q: Array, position: Array, jacobian: Array) -> None:
+    """Implement `RigidArm.fill_tip`."""
+    arm = bodies_of(bodies)
+    now = motion_of(memory, arm)
+    locate(arm, q, arm.rest, now)
+    lever = product(now.rotation[arm.n], vector(arm.tip))
+    end = plus(vector(now.origin[arm.n]), lever)
+    put(end, position)
+    for j in range(arm.n):
+        axis = vector(now.axis[j + 1])
+        if arm.prismatic[j] == 0.0:
+            axis = cross(axis, plus(end, times(-1.0, vector(now.origin[j + 1]))))
+        for r in range(3):
+            jacobian[r, j] = axis[r]
 
 
-class ArmContent(NamedTuple):
-    """Constants of an arm."""
+@called
+def fill_gravity(bodies: Array, memory: Array, q: Array, out: Array) -> None:
+    """Write the torque (n,) [N m, or N] that holds the bodies at q against gravity."""
+    arm = bodies_of(bodies)
+    now = motion_of(memory, arm)
+    locate(arm, q, arm.rest, now)
+    combine_bodies(arm, now, 0.0)
+    for j in range(arm.n):
+        out[j] = along_joint(arm, now, j, vector(now.force[j + 1]), vector(now.torque[j + 1]))
 
-    n: int
-    p: int
-    bodies: RigidBodies
-    P: Annotated[Array, 'p']  # without payload
-    P_payload: Annotated[Array, 'p']  # contribution of 1 kg at the tip
-    rest: Annotated[Array, 'n']  # zero velocities
 
-
-content_of = view_of(ArmContent)
+@called
+def accelerate(
+    bodies: Array, memory: Array, payload: float, q: Array, dq: Array, torque: Array, ddq: Array
+) -> None:
+    """Implement `RigidArm.accelerate`."""
+    arm = bodies_of(bodies)
+    now = motion_of(memory, arm)
+    locate(arm, q, dq, now)
+    combine_bodies(arm, now, payload)
+    for j in range(arm.n):
+        ddq[j] = torque[j] - along_joint(
+            arm, now, j, vector(now.force[j + 1]), vector(now.torque[j + 1])
+        )
+    fill_inertia(arm, now)
+    for i in range(arm.n):
+        for j in range(i + 1):
+            now.factor[j, i] = now.M[i, j]
+    cholesky.factor(now.factor)
+    cholesky.solve(now.factor, ddq)
 
 
 class RigidArm(NamedTuple):
@@ -283,7 +289,7 @@ class RigidArm(NamedTuple):
 
     n: int
     p: int
-    content: Array  # ArmContent
+    bodies: Array  # RigidBodies
     memory: Array  # BodyMotion
 
     def joint_count(self) -> int:
@@ -292,55 +298,22 @@ class RigidArm(NamedTuple):
 
     def fill_parameters(self, payload: float, P: Array) -> None:
         """Write the base parameters P (p,) with a payload [kg]."""
-        content = content_of(self.content)
+        bodies = bodies_of(self.bodies)
         for k in range(self.p):
-            P[k] = content.P[k] + payload * content.P_payload[k]
+            P[k] = bodies.P[k] + payload * bodies.P_payload[k]
 
     def fill_tip(self, q: Array, position: Array, jacobian: Array) -> None:
-        """Write `rigid_body.tip` at q (n,)."""
-        fill_tip(self.content, self.memory, q, position, jacobian)
+        """Write the tip position (3,) [m] at q (n,), and its Jacobian (3, n) [m/rad, or 1]."""
+        fill_tip(self.bodies, self.memory, q, position, jacobian)
 
     def accelerate(self, payload: float, q: Array, dq: Array, torque: Array, ddq: Array) -> None:
-        """Write `rigid_body.acceleration` with a payload [kg] at q, dq (n,)."""
-        accelerate(self.content, self.memory, payload, q, dq, torque, ddq)
+        """Write ddq (n,) with a point mass `payload` [kg] at the tip.
+
+        `ddq` may alias the joint `torque` (n,) [N m, or N].
+        """
+        accelerate(self.bodies, self.memory, payload, q, dq, torque, ddq)
 
 
-@called
-def fill_tip(vector: Array, memory: Array, q: Array, position: Array, jacobian: Array) -> None:
-    """Implement `RigidArm.fill_tip`."""
-    content = content_of(vector)
-    now = motion_of(memory, content.bodies)
-    locate(content.bodies, q, content.rest, now)
-    tip(content.bodies, now, position, jacobian)
-
-
-@called
-def accelerate(
-    vector: Array, memory: Array, payload: float, q: Array, dq: Array, torque: Array, ddq: Array
-) -> None:
-    """Implement `RigidArm.accelerate`."""
-    bodies = content_of(vector).bodies
-    now = motion_of(memory, bodies)
-    locate(bodies, q, dq, now)
-    acceleration(bodies, now, payload, torque, ddq)
-
-
-def rigid_arm(
-    chain: Chain,
-    gravity: tuple[float, ...],
-    inertias: Array,
-    rotors: Array,
-    parameters: BaseParameters,
-) -> RigidArm:
-    """Return an arm with a chain's geometry, inertias (n, 10), rotors (n,) [kg m^2, or kg]."""
-    bodies = rigid_bodies(chain, gravity, inertias, rotors)
-    P = parameters.of(inertias, rotors)
-    content = ArmContent(
-        n=bodies.n,
-        p=P.size,
-        bodies=bodies,
-        P=P,
-        P_payload=parameters.load,
-        rest=np.zeros(bodies.n),
-    )
-    return RigidArm(bodies.n, P.size, pack(content), np.zeros(motion_size(bodies)))
+def rigid_arm(bodies: RigidBodies) -> RigidArm:
+    """Return the arm of some bodies."""
+    return RigidArm(bodies.n, bodies.p, pack(bodies), np.zeros(motion_size(bodies)))

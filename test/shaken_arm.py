@@ -18,7 +18,7 @@ from blf_dsc_controller.identification.prior import base_matrix
 from blf_dsc_controller.identification.recording import Recording
 from blf_dsc_controller.messages.codecs import Float64MultiArrayEncoder, JointStateEncoder
 from blf_dsc_controller.messages.topics import COMMANDS, JOINT_STATE
-from sim_plant.rigid_body import acceleration, locate, motion_of, motion_size, rigid_bodies
+from sim_plant.rigid_body import rigid_arm, rigid_bodies
 
 PANDA_TEXT = (CONFIG / 'panda.urdf').read_text()
 PANDA_CHAIN = read_chain(PANDA_TEXT, 'panda_link0', 'panda_hand_tcp', PANDA)
@@ -84,12 +84,11 @@ def reference_of(chain, seed, tones=3):
 
 
 @kernel
-def _shake(arm, vector, viscous, coulomb, motion, gains, work, states):
+def _shake(arm, viscous, coulomb, motion, gains, work, states):
     """Follow `motion` (N, 3, n) by PD, torques held for a period; fill states (N, 3, n).
 
     The rows of `work` (8, n) are zero at first.
     """
-    now = motion_of(vector, arm)
     q, dq, torque = work[0], work[1], work[2]
     qs, dqs, ddq, q_step, dq_step = work[3], work[4], work[5], work[6], work[7]  # Runge-Kutta
     for i in range(q.size):
@@ -105,8 +104,7 @@ def _shake(arm, vector, viscous, coulomb, motion, gains, work, states):
                 qs[i] = q[i] + share * PERIOD * dqs[i]
                 dqs[i] = dq[i] + share * PERIOD * ddq[i]
                 ddq[i] = torque[i] - viscous[i] * dqs[i] - coulomb[i] * tanh(dqs[i] / 0.005)
-            locate(arm, qs, dqs, now)
-            acceleration(arm, now, 0.0, ddq, ddq)
+            arm.accelerate(0.0, qs, dqs, ddq, ddq)
             for i in range(q.size):
                 q_step[i] += weight * PERIOD / 6.0 * dqs[i]
                 dq_step[i] += weight * PERIOD / 6.0 * ddq[i]
@@ -117,14 +115,13 @@ def _shake(arm, vector, viscous, coulomb, motion, gains, work, states):
 
 def shake(chain, truth, reference, duration):
     """Return states (N, 3, n) of our own plant: position, velocity, previous torque."""
-    arm = rigid_bodies(chain, GRAVITY, truth.inertias, truth.rotors)
+    arm = rigid_arm(rigid_bodies(chain, GRAVITY, truth.inertias, truth.rotors))
     times = np.arange(round(duration / PERIOD)) * PERIOD
     motion = reference.at(times)
     gains = np.array([min(joint.effort, 100.0) for joint in chain.joints]) / 4.0
     n = len(chain.joints)
-    states, vector = np.zeros((times.size, 3, n)), np.zeros(motion_size(arm))
-    work = np.zeros((8, n))
-    _shake(arm, vector, truth.viscous, truth.coulomb, motion, gains, work, states)
+    states, work = np.zeros((times.size, 3, n)), np.zeros((8, n))
+    _shake(arm, truth.viscous, truth.coulomb, motion, gains, work, states)
     return states
 
 

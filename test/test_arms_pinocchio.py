@@ -13,15 +13,7 @@ from blf_dsc_controller.arms.base_parameters import base_parameters
 from blf_dsc_controller.arms.geometry import frames
 from blf_dsc_controller.arms.model import inertia_matrices, regressors_at
 from blf_dsc_controller.arms.serial_chain import ROTOR, serial_chain
-from sim_plant.rigid_body import (
-    acceleration,
-    locate,
-    motion_of,
-    motion_size,
-    rigid_arm,
-    rigid_bodies,
-    tip,
-)
+from sim_plant.rigid_body import motion_of, rigid_arm, rigid_bodies
 
 
 class Case:
@@ -37,9 +29,10 @@ class Case:
         self.rotors = self.random.uniform(0.01, 0.3, n)
         self.phi = np.column_stack((self.chain.inertias, self.rotors)).ravel()
         self.arm = serial_chain(self.chain, self.gravity)
-        self.bodies = rigid_bodies(self.chain, self.gravity, self.chain.inertias, self.rotors)
-        self.now = motion_of(np.full(motion_size(self.bodies), np.nan), self.bodies)
-        locate(self.bodies, self.q, self.dq, self.now)
+        bodies = rigid_bodies(self.chain, self.gravity, self.chain.inertias, self.rotors)
+        self.plant = rigid_arm(bodies)
+        self.plant.memory[:] = np.nan
+        self.now = motion_of(self.plant.memory, bodies)
         self.model = pinocchio_model(text, joints)
         self.model.gravity.linear[:] = self.gravity
         self.model.armature[:] = self.rotors
@@ -56,6 +49,8 @@ def test_chain_and_its_placements_agree_with_pinocchio(name):
     """As read, as points and axes of the view, and as bodies of the plant."""
     case = Case(name)
     model, chain, n = case.model, case.chain, len(case.q)
+    position, jacobian = np.zeros(3), np.zeros((3, n))
+    case.plant.fill_tip(case.q, position, jacobian)
     assert [joint.name for joint in chain.joints] == list(model.names[1:])
     same(chain.tip_placement, model.frames[case.tip].placement.homogeneous)
     pinocchio.framesForwardKinematics(*case.theirs)
@@ -74,8 +69,6 @@ def test_chain_and_its_placements_agree_with_pinocchio(name):
         same(case.now.origin[i + 1], placed.translation)
         same(case.now.rotation[i + 1], placed.rotation)
         same(axes[i], placed.rotation @ joint.axis)
-    position, jacobian = np.zeros(3), np.zeros((3, n))
-    tip(case.bodies, case.now, position, jacobian)
     same(position, corners[-1])
     world = pinocchio.LOCAL_WORLD_ALIGNED
     theirs = pinocchio.computeFrameJacobian(*case.theirs, case.tip, world).reshape(6, -1)
@@ -108,7 +101,7 @@ def test_regressors_and_accelerations_agree_with_pinocchio(name):
     np.testing.assert_array_equal(by_entry[:, :, ROTOR], np.diag(a))
     same(inertia_matrices(arm, case.phi, np.stack((q + 0.5, q)))[1], M, 1e-10)
     ddq = v.copy()
-    acceleration(case.bodies, case.now, 0.0, ddq, ddq)  # in place
+    case.plant.accelerate(0.0, q, dq, ddq, ddq)  # in place
     same(ddq, pinocchio.aba(*case.theirs, dq, v), 1e-10)
 
 
@@ -134,7 +127,7 @@ def test_payload_at_the_tip_is_that_of_the_plant_and_of_the_base_parameters():
     point = case.chain.tip_placement[:3, 3]
     case.model.inertias[7] += pinocchio.Inertia(2.0, point, np.zeros((3, 3)))
     base = base_parameters(case.chain, case.gravity)
-    arm = rigid_arm(case.chain, case.gravity, inertias, case.rotors, base)
+    arm = rigid_arm(rigid_bodies(case.chain, case.gravity, inertias, case.rotors, base))
     ddq, H = np.zeros(7), np.zeros((7, base.model.p))
     arm.accelerate(2.0, case.q, case.dq, case.v, ddq)
     same(ddq, pinocchio.aba(*case.theirs, case.dq, case.v), 1e-10)

@@ -35,7 +35,7 @@ def sources(*names):
 
 
 LAW = sources('law/barrier', 'law/prediction', 'law/controller', 'law/settings', 'reference/terms')
-PLANT = {f'sim_plant/{name}.py' for name in ('arm', 'drives', 'kernels', 'motion')}
+PLANT = {f'sim_plant/{name}.py' for name in ('arm', 'kernels', 'motion')}
 ALWAYS = sources('compiled/layout', 'arms/two_link')
 
 

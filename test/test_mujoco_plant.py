@@ -16,7 +16,7 @@ pytest.importorskip('mujoco', reason='needs MuJoCo: pip install mujoco')
 
 from changes import OFF, ROWS, end_of
 from plain_law import dynamics
-from plants import commands
+from plants import commands, true_parameters
 from test_plant_events import ALL_KINDS
 
 from blf_dsc_controller.configuration.controller import ControllerConfig
@@ -26,7 +26,7 @@ from blf_dsc_controller.configuration.schema import build, change
 from blf_dsc_controller.nodes.controller_node import ControllerNode
 from blf_dsc_controller.simulation.loop import START
 from blf_dsc_controller.supervision.guard import Guard
-from sim_plant.plant import parameters_of, plant_of, plant_settings
+from sim_plant.plant import plant_of, plant_settings
 
 EXAMPLE = Path(__file__).parents[1] / 'examples/mujoco_plant/mujoco_plant.py'
 P = np.array([1.0, 0.32, 0.4])  # (m1+m2) l1^2, m2 l2^2, m2 l1 l2 of arm.xml
@@ -191,6 +191,6 @@ def test_bound_holds_while_the_arm_changes_and_learning_does_no_harm(example, na
     )
     assert np.all(learning.samples.ratio < 1.0)
     assert np.all(learning.samples.ratio <= 1.3 * without.samples.ratio)
-    true = parameters_of(plant, end)
+    true = true_parameters(plant, end)
     error = learning.controller.state.estimate[:3] - true
     assert np.linalg.norm(error) < 0.01 * np.linalg.norm(true)

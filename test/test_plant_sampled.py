@@ -7,7 +7,7 @@ from plants import FULL, ROUGH, START, commands, plant, run
 from scipy.integrate import RK45
 
 from blf_dsc_controller.compiled.jit import kernel
-from sim_plant.kernels import draw_noise, observe, plant_views, step
+from sim_plant.kernels import observe, plant_views, step
 from sim_plant.motion import disturbing_torque, integrate, state_derivative, update_loads
 
 INITIAL = np.array([*START, 0.5, -1.0])
@@ -88,8 +88,7 @@ def test_positive_disturbance_decelerates_the_joint_and_is_in_the_truth():
 def compiled_run(arm, settings, state, rng, torques, rows):
     plant, now = plant_views(arm, settings, state)
     for k in range(len(torques)):
-        draw_noise(plant, now, rng)
-        observe(plant, now, rows[k])
+        observe(plant, now, rng, rows[k])
         step(plant, now, torques[k])
 
 

@@ -6,13 +6,14 @@ from __future__ import annotations
 import numpy as np
 import pinocchio
 import pytest
+from plants import true_parameters
 from random_arm import PANDA
 
 from blf_dsc_controller.arms.base_parameters import base_parameters
 from blf_dsc_controller.arms.inertia import pseudo_inertia
 from blf_dsc_controller.configuration.plant import PlantConfig
 from blf_dsc_controller.configuration.schema import build, change
-from sim_plant.plant import parameters_of, plant_of, plant_settings, true_inertias
+from sim_plant.plant import plant_of, plant_settings, true_inertias
 
 PANDA_CONFIG = {'robot.urdf': 'panda.urdf', 'robot.tip': 'panda_hand_tcp'}
 
@@ -48,14 +49,14 @@ def test_truth_contains_the_base_parameters_with_payload_and_factors():
     chain = config.robot.chain(config.joints)
     base, rotors = base_parameters(chain), config.robot.rotors(chain)
     expected = base.of(chain.inertias, rotors)
-    np.testing.assert_allclose(parameters_of(config, 0.4), expected, rtol=1e-12)
+    np.testing.assert_allclose(true_parameters(config, 0.4), expected, rtol=1e-12)
     loaded = chain.inertias.copy()
     point = chain.tip_placement[:3, 3]
     loaded[-1] += pinocchio.Inertia(2.0, point, np.zeros((3, 3))).toDynamicParameters()
-    np.testing.assert_allclose(parameters_of(config, 0.6), base.of(loaded, rotors), rtol=1e-12)
+    np.testing.assert_allclose(true_parameters(config, 0.6), base.of(loaded, rotors), rtol=1e-12)
     scaled = panda(truth__mass_factor=1.3, truth__rotor_factor=1.2)
     expected = base.of(1.3 * chain.inertias, 1.2 * rotors)
-    np.testing.assert_allclose(parameters_of(scaled), expected, rtol=1e-12, atol=1e-15)
+    np.testing.assert_allclose(true_parameters(scaled), expected, rtol=1e-12, atol=1e-15)
 
 
 def test_random_truth_deviates_as_configured_and_stays_physical():

@@ -77,8 +77,7 @@ def run_loop(
     for k in range(first, last + 1):
         measurement, sample = measured[k - first], sample_of(rows[k - first], law)
         t = (k * plant.period_ns) * 1e-9
-        plants.draw_noise(plant, now, rng)
-        plants.observe(plant, now, measurement)
+        plants.observe(plant, now, rng, measurement)
         flags = step(
             law, checks, reference_view, law_state, law_signals, t, dt, measurement, sample
         )

@@ -158,8 +158,7 @@ def _run(
         row = every[k]
         q, dq, torque = part(row, 0, (n,)), part(row, n, (n,)), part(row, 7 * n, (n,))
         qr, dqr, ddqr = part(row, 3 * n, (n,)), part(row, 4 * n, (n,)), part(row, 5 * n, (n,))
-        plants.draw_noise(plant, state, rng)
-        plants.observe(plant, state, part(row, 0, (3 * n,)))
+        plants.observe(plant, state, rng, part(row, 0, (3 * n,)))
         reference.evaluate(view(motion), (k * plant.period_ns) * 1e-9, qr, dqr, ddqr)
         law.fill_torque(known, Now(dt, q, dq, qr, dqr, ddqr), torque)
         for i in range(n):

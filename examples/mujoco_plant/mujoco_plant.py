@@ -16,7 +16,7 @@ import numpy as np
 from blf_dsc_controller.configuration.plant import PlantConfig
 from blf_dsc_controller.nodes import process
 from blf_dsc_controller.nodes.plant_node import PlantNode
-from sim_plant.drives import actuate
+from sim_plant.kernels import actuate
 from sim_plant.layout import PlantSettings
 from sim_plant.motion import update_loads
 from sim_plant.plant import Plant, plant_settings
