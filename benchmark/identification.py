@@ -36,13 +36,13 @@ from contextlib import suppress
 from typing import Any, NamedTuple
 
 import numpy as np
+import shaken_arm
 from harness import print_table
 from numpy.typing import NDArray
 from random_arm import CONFIG, random_urdf
 from shaken_arm import PERIOD, is_covered, measured, recording_of, reference_of, shake, truth_of
 
 from blf_dsc_controller.arms.inertia import pseudo_inertia
-from blf_dsc_controller.bags.writer import BagWriter
 from blf_dsc_controller.configuration.nodes import CONTROLLER, PLANT, LoopConfig, load_loop
 from blf_dsc_controller.configuration.robot import Robot, parameters_of
 from blf_dsc_controller.identification.identify import (
@@ -60,8 +60,6 @@ from blf_dsc_controller.identification.recording import (
     rows_of,
 )
 from blf_dsc_controller.law.telemetry import sample_columns
-from blf_dsc_controller.messages.codecs import JointStateEncoder
-from blf_dsc_controller.messages.topics import JOINT_STATE
 from blf_dsc_controller.reference.approach import MotionError
 from blf_dsc_controller.run import Floats
 from blf_dsc_controller.simulation.loop import simulate
@@ -265,7 +263,7 @@ def _recorded(
             recording = read_recording(taken.bag, taken.robot.text, taken.joints)
             yield _row(taken, recording)
             if taken.loaded:
-                weighed.append(_weigh_loaded(taken, recording))
+                weighed.append(_weigh_loaded(taken, recording, *taken.loaded))
 
 
 def _row(taken: Taken, recording: Recording) -> tuple[str, ...]:
@@ -331,9 +329,7 @@ def _weakened(prior: Prior) -> Prior:
     return prior._replace(D=_WEAK * prior.D, cones=cones, start=prior.start / _WEAK)
 
 
-def _weigh_loaded(taken: Taken, empty: Recording) -> str:
-    assert taken.loaded  # noqa: S101 - for the type checker
-    bag, mass = taken.loaded
+def _weigh_loaded(taken: Taken, empty: Recording, bag: Path, mass: float) -> str:
     together, boundary = joined(empty, read_recording(bag, taken.robot.text, taken.joints))
     texts = []
     for told in (boundary, float('nan')):
@@ -348,13 +344,9 @@ def _percent(error: Floats, torque: Floats) -> str:
 
 
 def _bag(path: Path, joints: tuple[str, ...], time: Floats, q: Floats, effort: Floats) -> Path:
-    encoder = JointStateEncoder(joints, ('position', 'effort'))
-    with BagWriter(path, flush_interval=None) as bag:
-        handle = bag.add_topic('/joint_states', JOINT_STATE, [])
-        for t, at, u in zip(time, q, effort, strict=True):
-            stamp = 1_000_000_000 + round(1e9 * t)
-            bag.write(handle, bytes(encoder.encode(stamp, at, (), u)), stamp)
-    return path
+    stamps = [1_000_000_000 + round(1e9 * t) for t in time]
+    states = np.stack((q, np.zeros_like(q), effort), axis=1)  # no velocity is read
+    return Path(shaken_arm.write_states(path, joints, states, stamps=stamps))
 
 
 def _panda(folder: Path, bags: Path) -> Iterator[Taken]:
