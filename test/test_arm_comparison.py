@@ -189,10 +189,10 @@ def test_table_shows_the_worst_run_of_each_law():
 def found(tmp_path_factory):
     """Figures of the smallest run of the command: one arm, one truth, a first population of 5."""
     out = tmp_path_factory.mktemp('arms') / 'out'
-    small = ['--config', 'ur5e', '--truths', '1', '--generations', '0']
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(laws, 'POPULATION', 5)
-        assert main(['arms', *small, '--out', str(out)]) == 0
+        for name, value in {'POPULATION': 5, 'GENERATIONS': 0, 'TRUTHS': 1}.items():
+            patch.setattr(laws, name, value)
+        assert main(['arms', '--config', 'ur5e', '--out', str(out)]) == 0
     return json.loads((out / 'figures.json').read_text(encoding='utf-8'))['ur5e']
 
 

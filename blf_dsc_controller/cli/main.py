@@ -340,8 +340,6 @@ def _add_studies(command: _Command) -> None:
     option('--config', nargs='+', default=['panda', 'ur5e'], help='presets or files (panda ur5e)')
     laws = 'laws of the study by name, or Python files that add some (all of the study)'
     option('--laws', nargs='+', default=[], metavar='LAW', help=laws)
-    option('--truths', type=int, default=5, help='runs of each law after tuning (5)')
-    option('--generations', type=int, default=7, help='generations of tuning after the first (7)')
     option('--out', type=Path, default=Path('arms'), help='new folder for the figures')
     option = command(
         'monte-carlo',
@@ -352,14 +350,12 @@ def _add_studies(command: _Command) -> None:
     )
     option('--config', default='monte_carlo', help='study file, or a preset (monte_carlo)')
     option('--runs', type=int, help='number of runs (as configured)')
-    option('--seed', type=int, help='seed of the study (as configured)')
-    engines, computing = ('processes', 'dask'), 'engine that computes the runs (processes)'
-    option('--engine', choices=engines, default='processes', help=computing)
-    option('--workers', type=_positive, help='number of workers (one per core of this computer)')
-    option('--address', default='', help='scheduler of a dask cluster (a local one)')
+    option('--workers', type=_positive, help='number of processes (one per core of this computer)')
+    scheduler = 'scheduler of a dask cluster that computes the runs, in place of these processes'
+    option('--dask', metavar='ADDRESS', help=scheduler)
     reported = 'put the studies of pairs in these folders side by side, into --out (changes)'
     option('--report', type=Path, nargs='+', metavar='DIR', help=reported)
-    again = 'compute one run of a study again, with a bag and pictures, into --out'
+    again = 'compute one run of a study again, with a bag, into --out'
     option('--reproduce', nargs=2, metavar=('DIR', 'RUN'), help=again)
     option('--out', type=Path, help='folder of the study (monte_carlo)')
 

@@ -11,11 +11,10 @@ from pathlib import Path
 import numpy as np
 from tqdm import tqdm
 
-from blf_dsc_controller.analysis.metrics import aligned, format_table
+from blf_dsc_controller.analysis.metrics import aligned, write_json
 from blf_dsc_controller.cli.run import make_folder, print_notice
 from blf_dsc_controller.compiled.jit import announced_compilation
 from blf_dsc_controller.configuration.nodes import locate
-from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.studies import laws, report, runs
 from blf_dsc_controller.studies import paper as paper_study
 from blf_dsc_controller.studies.monte_carlo import load_study
@@ -38,11 +37,9 @@ def arms(options: Namespace) -> None:
     laws.chosen_laws(options.laws)  # before there is a folder
     folder = make_folder(options.out)
     with announced_compilation(print_notice):
-        found = laws.compare(
-            folder, options.config, options.laws, options.truths, options.generations
-        )
+        found = laws.compare(folder, options.config, options.laws)
     for arm, results in found.items():
-        print(f'{arm}: {options.truths} runs of each law; errors in mrad, of the model in %')
+        print(f'{arm}: {laws.TRUTHS} runs of each law; errors in mrad, of the model in %')
         print(laws.format_results(results))
     print(f'wrote {options.out / "figures.json"}')
 
@@ -50,7 +47,11 @@ def arms(options: Namespace) -> None:
 def monte_carlo(options: Namespace) -> None:
     """Compute the missing runs of a study and report it, compare studies, or repeat one run."""
     if options.reproduce:
-        _reproduce(Path(options.reproduce[0]), options.reproduce[1], options.out)
+        folder, run = options.reproduce
+        chosen = make_folder(options.out or Path(f'{Path(folder).name}-run-{run}'))
+        report.reproduce(runs.Store(Path(folder)), run, chosen)
+        print(f'the same figures as in {folder}, bit for bit')
+        print(f'wrote       {chosen}: config.yaml and bag, which blf_dsc plot and report draw')
     elif options.report:
         folder = options.out or Path('changes')
         folder.mkdir(parents=True, exist_ok=True)
@@ -61,23 +62,20 @@ def monte_carlo(options: Namespace) -> None:
 
 
 def _run_study(options: Namespace) -> None:
-    given = {name: getattr(options, name) for name in ('runs', 'seed')}
-    overrides = {name: value for name, value in given.items() if value is not None}
-    study = load_study(locate(options.config), overrides)
+    given = {} if options.runs is None else {'runs': options.runs}
+    study = load_study(locate(options.config), given)
     runs.require_pyarrow()
     store = runs.Store.create_or_open(options.out or Path('monte_carlo'), study)
-    with store.locked():
+    if chunks := store.missing():
+        with announced_compilation(print_notice):
+            runs.warm_up(study)
         workers = options.workers or runs.cores()
-        if chunks := store.missing():
-            with announced_compilation(print_notice):
-                runs.warm_up(study)
-            is_dask = options.engine == 'dask'
-            engine = runs.dask(workers, options.address) if is_dask else runs.processes(workers)
-            with engine as executor:
-                _compute(store, chunks, executor)
-        summary, written = report.write_report(store)
+        with runs.dask(options.dask) if options.dask else runs.processes(workers) as executor:
+            _compute(store, chunks, executor)
+    summary = report.summarize(study, store.results())
+    write_json(summary, store.folder / 'summary.json')
     print(report.format_report(summary, store.folder))
-    print(f'wrote       {store.folder}: {", ".join(path.name for path in written)}')
+    print(f'wrote       {store.folder}: summary.json')
 
 
 def _compute(store: runs.Store, chunks: list[range], executor: Executor) -> None:
@@ -93,13 +91,3 @@ def _compute(store: runs.Store, chunks: list[range], executor: Executor) -> None
             lost += int(np.count_nonzero(columns['outcome'] != runs.KEPT))
             bar.set_postfix_str(f'{lost} did not keep the bound', refresh=False)
             bar.update(len(chunk))
-
-
-def _reproduce(folder: Path, index: str, out: Path | None) -> None:
-    store = runs.Store(folder)
-    if not index.isdecimal():
-        raise BlfDscError(f'--reproduce: expected the number of a run, got {index!r}')
-    chosen = make_folder(out or Path(f'{folder.name}-run-{index}'))
-    print(format_table(report.reproduce(store, int(index), chosen)))
-    print(f'the same figures as in {folder}, bit for bit')
-    print(f'wrote       {chosen}: config.yaml, bag, summary.json and pictures')

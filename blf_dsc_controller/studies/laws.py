@@ -63,6 +63,8 @@ INTERVALS = {
     'from 20 s': (20.0, DURATION),
 }
 POPULATION = 16
+GENERATIONS = 7  # of tuning, after the first
+TRUTHS = 5  # on which a tuned law runs
 ROUGHEST = 0.05
 """rms change of a torque per sample, relative to its limit, beyond which it is penalised."""
 
@@ -431,9 +433,7 @@ def chosen_laws(given: Sequence[str]) -> list[str]:
     return list(dict.fromkeys(names))
 
 
-def compare(
-    folder: Path, arms: Sequence[str], laws: Sequence[str], truths: int, generations: int
-) -> Results:
+def compare(folder: Path, arms: Sequence[str], laws: Sequence[str]) -> Results:
     """Tune and run everything, and write figures.json into an empty folder.
 
     `laws` are as in `chosen_laws`.
@@ -443,7 +443,7 @@ def compare(
     rows = [(arm, name) for arm in arms for name in names]
     with ProcessPoolExecutor(cores(), initializer=chosen_laws, initargs=(laws,)) as pool:
         for arm, name in tqdm(rows, unit='law'):
-            first, *others = (trial(arm, seed) for seed in range(truths + 1))
+            first, *others = (trial(arm, seed) for seed in range(TRUTHS + 1))
             unseen = torque_rows(trial(arm, UNSEEN).controller)
             searched = CONTENDERS[name].gains
             least = {gain.name: gain.least for gain in searched}
@@ -452,7 +452,7 @@ def compare(
             if searched:
                 of_gains = partial(tuning_cost, name=name, loop=first, unseen=unseen)
                 options = {'workers': pool.map, 'updating': 'deferred'}
-                point, cost, _ = search(of_gains, searched, POPULATION, generations, **options)
+                point, cost, _ = search(of_gains, searched, POPULATION, GENERATIONS, **options)
                 gains = values_of(name, point)
             runs = pool.map(partial(run, name, values=gains, unseen=unseen), others)
             results[arm][name] = Result(gains, cost, list(runs))

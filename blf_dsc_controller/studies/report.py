@@ -14,10 +14,8 @@ from matplotlib.ticker import LogLocator, NullFormatter
 from scipy.stats import binomtest
 
 from blf_dsc_controller.analysis.figures import Picture, head
-from blf_dsc_controller.analysis.figures import draw as draw_run
-from blf_dsc_controller.analysis.metrics import Metrics, measure, plain, write_json
+from blf_dsc_controller.analysis.metrics import plain
 from blf_dsc_controller.analysis.panels import ALARM, BLUE, COLOURS, INK, MUTED, ORANGE
-from blf_dsc_controller.bags.reader import read_run
 from blf_dsc_controller.configuration.nodes import CONTROLLER, PLANT, dump
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.run import Floats
@@ -183,21 +181,6 @@ def _pair_figures(pairs: Summary) -> dict[str, str]:
     }
 
 
-def write_report(store: Store) -> tuple[Summary, list[Path]]:
-    """Write summary.json of the finished runs, and the picture of pairs.
-
-    Returns the summary and the paths; raises BlfDscError if there are no results yet.
-    """
-    study, results, folder = store.study, store.results(), store.folder
-    summary = summarize(study, results)
-    written = [folder / 'summary.json']
-    write_json(summary, written[0])
-    if study.settings.pairs:
-        written.append(folder / 'pairs.png')
-        _draw_pairs({'': (study, results)}, written[1])
-    return summary, written
-
-
 def format_report(summary: Summary, folder: Path) -> str:
     """Format a summary for the terminal, with the command that repeats the worst run."""
     outcomes = (f'{count} {outcome}' for outcome, count in summary['outcomes'].items() if count)
@@ -238,8 +221,8 @@ def write_comparison(stores: Sequence[Store], folder: Path) -> str:
     return text
 
 
-def reproduce(store: Store, run: int, out: Path) -> Metrics:
-    """Repeat a run of the study and write config.yaml, bag, figures and summary to `out`.
+def reproduce(store: Store, run: str, out: Path) -> None:
+    """Repeat the run of this number: write its config.yaml and bag to `out`.
 
     Those without learning, of a study of pairs, go to `without_learning` and `other_noise` in it.
 
@@ -247,29 +230,23 @@ def reproduce(store: Store, run: int, out: Path) -> Metrics:
     StartError if the controller rejects its start.
     """
     study, results = store.study, store.results()
-    if run not in results['run']:
+    rows = np.flatnonzero(results['run'].astype(str) == run)
+    if not rows.size:
         raise BlfDscError(f'{store.folder} has no run {run}: it has {results["run"].size} runs')
-    row = int((results['run'] == run).argmax())
-    metrics = []
     for prefix, law in study.laws().items():
-        plant = plant_with(study, draw(study, run), prefix)
+        plant = plant_with(study, draw(study, int(run)), prefix)
         folder = out / _FOLDERS[prefix]
         folder.mkdir(exist_ok=True)
         dump(folder / 'config.yaml', {PLANT: plant, CONTROLLER: law})
         record = simulate(law, plant, supervised=False)
         write_bag(folder / 'bag', record, law, 'none')
-        recorded = read_run(folder / 'bag')
-        metrics.append(measure(recorded))
-        write_json(metrics[-1], folder / 'summary.json')
-        draw_run(recorded, folder)
         here = figures_of(study, record, plant)
-        different = differences({name: results[f'{prefix}{name}'][row] for name in here}, here)
+        different = differences({name: results[f'{prefix}{name}'][rows[0]] for name in here}, here)
         if different:
             raise BlfDscError(
                 f'run {run} differs from the stored one: was it computed on another kind of '
                 f'machine, or by another version?{different}'
             )
-    return metrics[0]
 
 
 def _draw_pairs(studies: Studies, path: Path) -> None:
@@ -318,7 +295,7 @@ def _draw_boxes(axes: Axes, name: str, unit: float, studies: Studies) -> None:
                 axes.plot([least, most], y, color=colour, lw=1.2)
                 axes.plot([quartiles[0], quartiles[2]], y, color=colour, lw=7, alpha=0.6)
                 axes.plot(quartiles[1:2], y[:1], 'o', color=INK, ms=4)
-            labels.append(f'{title}, {label}'.removeprefix(', '))
+            labels.append(f'{title}, {label}')
     axes.set_yticks(-np.arange(len(labels)), labels)
     _make_logarithmic(axes)
 

@@ -14,7 +14,6 @@ dask.distributed cluster. Both give the same results.
 
 from __future__ import annotations
 
-import fcntl
 import json
 import multiprocessing
 import os
@@ -215,28 +214,11 @@ class Store:
             )
         return store
 
-    @contextmanager
-    def locked(self) -> Iterator[None]:
-        """Keep other processes from writing to the folder; the lock ends with its process.
-
-        Removes unfinished files of an earlier process. Raises BlfDscError if it is locked already.
-        """
-        with (self.folder / _STUDY).open(encoding='utf-8') as file:
-            try:
-                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except BlockingIOError:
-                raise BlfDscError(
-                    f'another monte-carlo is running in {self.folder}: wait for it, or end it'
-                ) from None
-            for unfinished in (self.folder / _RUNS).glob('.runs-*'):
-                unfinished.unlink()
-            yield
-
     def keep(self, runs: range, columns: Columns) -> None:
         """Write the results of consecutive runs atomically, even if the process is killed."""
         pa = require_pyarrow()
         path = self._path(runs)
-        unfinished = path.with_name(f'.{path.name}.{os.getpid()}')
+        unfinished = path.with_name(f'.{path.name}')
         with unfinished.open('wb') as file:
             pa.parquet.write_table(pa.table(columns), file)
             file.flush()
@@ -289,17 +271,16 @@ def processes(workers: int) -> Executor:
 
 
 @contextmanager
-def dask(workers: int, address: str = '') -> Iterator[Executor]:
-    """Start a dask.distributed cluster on this machine, or use the one at a scheduler's address.
+def dask(address: str) -> Iterator[Executor]:
+    """Use the dask.distributed cluster of the scheduler at this address.
 
     Dask itself repeats the work of a lost worker, unless it fails repeatedly.
     """
     try:
         import distributed
     except ImportError:
-        raise MissingExtraError('dask.distributed', 'dask', 'the engine dask') from None
-    local = {'n_workers': workers, 'threads_per_worker': 1, 'dashboard_address': None}
-    with distributed.Client(address) if address else distributed.Client(**local) as client:
+        raise MissingExtraError('dask.distributed', 'dask', '--dask') from None
+    with distributed.Client(address) as client:
         try:
             yield client.get_executor(pure=False)
         except distributed.KilledWorker as error:
