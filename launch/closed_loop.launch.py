@@ -35,11 +35,6 @@ ARGUMENTS = {  # default, choices and description
         ['', *DRIVERS],
         'driver of an arm, whose topics are used; empty: the simulated arm',
     ),
-    'simulated': (
-        'false',
-        ['false', 'true'],
-        'start the simulated arm with the topics of the driver',
-    ),
     'mode': (
         '',
         ['', 'realtime', 'lockstep'],
@@ -61,12 +56,13 @@ def generate_launch_description() -> LaunchDescription:
 
 def nodes(context: LaunchContext) -> list[Node]:
     """Create the nodes once the arguments are known."""
-    config, robot, simulated, mode, namespace, bag = (
+    config, robot, mode, namespace, bag = (
         LaunchConfiguration(name).perform(context) for name in ARGUMENTS
     )
-    own = f'{PACKAGE}/commands'  # of the simulated arm
+    own = f'{PACKAGE}/commands'  # as other nodes than the controller write it
     of_driver, states, commands = DRIVERS.get(robot, ('recommended', 'joint_states', own))
     remappings = [('joint_states', states), ('~/commands', commands), (own, commands)]
+    is_simulated = not robot
     file = str(locate(config or of_driver))
     # The first sample must be recorded too, so the loop starts after the recorder subscribes.
     of_loop = {'wait_for_subscribers': 1} if bag else {}
@@ -81,12 +77,11 @@ def nodes(context: LaunchContext) -> list[Node]:
             name=executable,
             namespace=namespace,
             parameters=[file, given] if given else [file],
-            remappings=remappings if robot else [],
+            remappings=remappings,
             output='screen',
             on_exit=Shutdown(reason=f'{executable} has ended') if required else None,
         )
 
-    is_simulated = not robot or simulated == 'true'
     started = []
     if bag:
         plant_mode = mode or load(file, f'{namespace}/{PLANT}', PlantConfig).mode

@@ -80,11 +80,6 @@ def live():
             ros.executor.remove_node(recorder)
             ros.spin(0.1)
             recorder.close()
-            # It requests the parameters of the controller once, by short-lived clients.
-            found['torque_watchdog']['request'] = [
-                f'/blf_dsc_controller/{service}'
-                for service in ('get_parameters', 'list_parameters')
-            ]
             return found
     finally:
         ros.close()

@@ -21,8 +21,7 @@ pytest.importorskip('plotly', reason='needs plotly: pip install blf_dsc_controll
 pytest.importorskip('yourdfpy', reason='needs viser: pip install blf_dsc_controller[view]')
 
 from blf_dsc_controller.analysis.report import read_bag, write_report
-from blf_dsc_controller.view.bag import BagPlayer
-from blf_dsc_controller.view.page import Page
+from blf_dsc_controller.view.node import ViewNode
 
 pytestmark = [
     pytest.mark.skipif(chromium.find() is None, reason='there is no Chromium here'),
@@ -99,29 +98,25 @@ def test_dragging_zooms_all_time_panels(pages):
         page.screenshot(path=SHOTS / 'report_zoomed.png')
 
 
-def test_bag_is_played_in_the_browser(tmp_path):
-    served = Page('127.0.0.1', 18280)
-    try:
-        player = BagPlayer(served, recorded_run.record(tmp_path / 'bag', 4.0))
-        with chromium.opened(1000, 700, chromium.WEBGL) as (page, log):
-            page.goto(served.url)
-            page.wait_for_function(f"{TEXT}.includes('largest error')")
-            page.wait_for_selector('canvas')
-            player.slider.value = 3.0
-            player.update(0.0)
-            page.wait_for_function(f"{TEXT}.includes('t = 2.9') || {TEXT}.includes('t = 3.0')")
-            page.screenshot(path=SHOTS / 'view_bag.png')
-            page.get_by_text('Play / Pause', exact=True).click()
-            while not player._playing:
-                page.wait_for_timeout(50.0)
-            player.update(0.5)
-            page.wait_for_function(f"{TEXT}.includes('t = 3.4') || {TEXT}.includes('t = 3.5')")
-            page.get_by_text('Events', exact=True).click()
-            page.wait_for_function(f"{TEXT}.includes('learning')")
-            page.screenshot(path=SHOTS / 'view_events.png')
-        assert [line for line in log if not any(word in f'{line}' for word in HARMLESS)] == []
-        own = (served.url, 'data:', 'blob:')
-        assert log.requests
-        assert [url for url in log.requests if not url.startswith(own)] == []
-    finally:
-        served.close()
+def test_view_of_a_loop_in_the_browser(ros):
+    view = ros.add(ViewNode, port=18280)
+    arm, _ = ros.loop({'events.begin': [1.0], 'events.payload': [0.25]})
+    ros.until(lambda: view.past and view.past[-1].time > 3.0)
+    with chromium.opened(1000, 700, chromium.WEBGL) as (page, log):
+        page.goto(view.page.url)
+        page.wait_for_function(f"{TEXT}.includes('largest error')")
+        page.wait_for_selector('canvas')
+        for name in ('view', 'view_later'):
+            ros.run(arm, 500)
+            ros.until(lambda: view.past[-1].time > 1e-3 * arm.plant.sample - 0.1)
+            view.page.plot(list(view.past))
+            page.wait_for_function(f"{TEXT}.includes('t = {view.past[-1].time:.2f} s')")
+            page.screenshot(path=SHOTS / f'{name}.png')
+        page.get_by_text('Events', exact=True).click()
+        page.wait_for_function(f"{TEXT}.includes('0.25 kg picked up')")
+        page.screenshot(path=SHOTS / 'view_events.png')
+    assert [line for line in log if not any(word in f'{line}' for word in HARMLESS)] == []
+    own = (view.page.url, 'data:', 'blob:')
+    assert log.requests
+    assert [url for url in log.requests if not url.startswith(own)] == []
+    view.close()

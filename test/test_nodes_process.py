@@ -27,7 +27,7 @@ BROKEN = """
 import rclpy
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.nodes.process import PlainNode, run
-from blf_dsc_controller.nodes.endpoints import RCLError
+from rclpy._rclpy_pybind11 import RCLError
 
 class Broken(PlainNode):
     finished = True

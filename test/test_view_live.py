@@ -94,7 +94,7 @@ def test_page_of_a_run_is_served_until_the_run_ends(tmp_path):
     command = (*COMMAND, '--view', '--mode', 'lockstep', '--duration', '100000', '--out', str(out))
     with subprocess.Popen(command, stdout=PIPE, stderr=STDOUT, text=True) as process:
         output = ''
-        while not (found := re.search(r'the page: (http://localhost:\d+)', output)):
+        while not (found := re.search(r'open (http://127.0.0.1:\d+)', output)):
             output += process.stdout.readline()
             assert process.poll() is None, output
         wait_for(lambda: 'open http' in (out / 'logs' / 'view.log').read_text())

@@ -1,26 +1,25 @@
 # SPDX-License-Identifier: Apache-2.0
 """The README's animation: the live view of a Panda that picks up 2 kg. `make pictures`.
 
-The run is offline and played from a bag, so that the animation does not depend on the computer.
+Controller, arm and view are nodes of this process, and the loop is in lock-step: it stands still
+while the browser draws.
 """
 
 from __future__ import annotations
 
 import argparse
 import io
-import tempfile
 import time
 from pathlib import Path
 
 import chromium
 import numpy as np
 from PIL import Image
+from ros_rig import RosRig
 
 from blf_dsc_controller.configuration.nodes import load_loop
-from blf_dsc_controller.simulation.bag import write_bag
-from blf_dsc_controller.simulation.loop import simulate
-from blf_dsc_controller.view.bag import BagPlayer
-from blf_dsc_controller.view.page import Page
+from blf_dsc_controller.configuration.schema import flatten
+from blf_dsc_controller.view.node import ViewNode
 
 TIMES = np.arange(17.0, 26.0, 0.25)  # s; it picks up 2 kg at 20 s
 SETTLE = 1.5  # s, until the browser has drawn a frame without a GPU
@@ -29,25 +28,26 @@ WINDOW = (1200, 880)
 NOTICE = "document.querySelectorAll('[class*=Notification]').forEach(each => each.remove())"
 
 
-def pictures(bag):
+def pictures():
     """Yield screenshots of the page at each of `TIMES`."""
-    served = Page('127.0.0.1', 18380)
+    ros, loop = RosRig(), load_loop('panda')
     try:
-        player = BagPlayer(served, bag)
-        player.slider.value = TIMES[0]
-        player.update(0.0)
+        view = ros.add(ViewNode, port=18380)
+        ros.loop(flatten(loop.plant), flatten(loop.controller))
+        ros.until(lambda: view.past and view.past[-1].time >= TIMES[0])
         with chromium.opened(*WINDOW, chromium.WEBGL) as (page, _):
-            page.goto(served.url)
-            page.wait_for_function("(document.body?.innerText ?? '').includes('t = ')")
+            page.goto(view.page.url)
+            page.wait_for_function("(document.body?.innerText ?? '').includes('torque')")
             time.sleep(10 * SETTLE)  # the page fades in
             page.evaluate(NOTICE)
             for at in TIMES:
-                player.slider.value = float(at)
-                player.update(0.0)
+                ros.until(lambda at=at: view.past[-1].time >= at)
+                view.page.plot(list(view.past))
                 time.sleep(SETTLE)
                 yield Image.open(io.BytesIO(page.screenshot())).convert('RGB')
     finally:
-        served.close()
+        ros.close()
+        view.close()
 
 
 def main():
@@ -55,23 +55,16 @@ def main():
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument('--out', type=Path, default=Path('doc/view.webp'))
     options = parser.parse_args()
-    with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as name:
-        folder = Path(name)
-        bag = folder / 'panda' / 'bag'
-        bag.parent.mkdir()
-        loop = load_loop('panda', {'sim_plant': {'duration': 27.0}})
-        record = simulate(loop.controller, loop.plant)
-        write_bag(bag, record, loop.controller, 'none', loop.plant)
-        first, *others = pictures(bag)
-        first.save(
-            options.out,
-            save_all=True,
-            append_images=others,
-            duration=round(1000.0 / RATE),
-            loop=0,
-            quality=60,
-            method=6,
-        )
+    first, *others = pictures()
+    first.save(
+        options.out,
+        save_all=True,
+        append_images=others,
+        duration=round(1000.0 / RATE),
+        loop=0,
+        quality=60,
+        method=6,
+    )
     print(f'{options.out}: {options.out.stat().st_size / 1e6:.2f} MB')
 
 

@@ -1,9 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`blf_dsc report`, `plot`, `export`, `recover`, `replay`, `view`: what is made from bags."""
+"""`blf_dsc report`, `plot`, `export`, `recover`, `replay`: what is made from bags."""
 
 from __future__ import annotations
 
-import sys
 import time
 from argparse import Namespace
 from collections.abc import Iterator
@@ -177,30 +176,3 @@ def _events(result: Verification) -> Iterator[str]:
     if result.passed_over:
         yield f'{result.passed_over} states skipped: the controller did not use them'
     yield from (f'note: {remark}' for remark in result.remarks)
-
-
-def view(options: Namespace) -> int:
-    """Serve the page until Ctrl-C."""
-    if options.bag is None:
-        require_ros()
-        from blf_dsc_controller.view.node import main
-
-        given = (f'host:={options.host}', f'port:={options.port}')
-        words = [word for parameter in given for word in ('-p', parameter)]
-        if options.namespace:
-            words += ['-r', f'__ns:=/{options.namespace.strip("/")}']
-        sys.argv[1:] = ['--ros-args', *words]
-        return main()
-    from blf_dsc_controller.view.bag import BagPlayer
-    from blf_dsc_controller.view.page import LOCAL, Page, open_to_others
-
-    page = Page(options.host, options.port)
-    try:
-        player = BagPlayer(page, options.bag, options.namespace, NameMap.parse(options.map))
-        print(f'{options.bag} is shown at {page.url}  (Ctrl-C to quit)', flush=True)
-        if options.host not in LOCAL:
-            print(f'warning: {open_to_others(options.host)}', file=sys.stderr)
-        player.play()
-    finally:
-        page.close()
-    return 0

@@ -206,8 +206,7 @@ def _add_run(command: _Command) -> None:
     option('--offline', action='store_true', help='without ROS: no processes, no topics')
     option('--domain', type=int, help='ROS domain (a free one)')
     option('--out', type=Path, help='new folder (closed_loop, closed_loop-2, ...)')
-    page = 'show the run on a page in the browser, at this address (127.0.0.1)'
-    option('--view', nargs='?', const='127.0.0.1', metavar='HOST', help=page)
+    option('--view', action='store_true', help='show the run on a page in the browser')
     option = command(
         'precompile',
         'Compile the kernels of a configuration before its first start. Controller and simulated '
@@ -246,17 +245,6 @@ def _add_bags(
     )
     option('bags', type=Path, nargs='+', metavar='BAG', help=_BAG)
     option('--out', type=Path, default=Path('report.html'), help='file (report.html)')
-    option = command(
-        'view',
-        'Show a running system, or a bag, on a page in the browser. It has the arm in 3D, its '
-        'errors inside their bounds, torques and estimates. It needs no network, and by default '
-        'only this computer can open it.',
-        'run1/bag',
-        names,
-    )
-    option('bag', type=Path, nargs='?', help=f'{_BAG}; without it: the running system')
-    option('--host', default='127.0.0.1', help='address to serve at (127.0.0.1)')
-    option('--port', type=int, default=8080, help='port, or the next free one (8080)')
     option = command(
         'recover',
         'Make a clean bag from one that was cut off or damaged, and list what was lost. The '

@@ -61,7 +61,7 @@ def run(options: Namespace) -> int:
     else:
         from blf_dsc_controller.cli.session import run_session
 
-        completed = run_session(config, out, options.domain, options.view)
+        completed = run_session(config, out, options.domain, view=options.view)
     try:
         stopped = _report(out)
     except BlfDscError as error:
@@ -134,18 +134,12 @@ def _run_offline(config: LoopConfig, bag: Path) -> None:
 
 
 def _check_view(options: Namespace) -> None:
-    """Raise BlfDscError if the page cannot be served; warn if others can open it."""
+    """Raise BlfDscError if there can be no page."""
     if options.offline:
-        raise BlfDscError(
-            '--view shows a run over ROS: leave out --offline, or look at the bag afterwards '
-            '(blf_dsc view OUT/bag)'
-        )
-    from blf_dsc_controller.view.page import LOCAL, free_port, open_to_others, require_viser
+        raise BlfDscError('--view shows a run over ROS: leave out --offline')
+    from blf_dsc_controller.view.page import require_viser
 
     require_viser()
-    free_port(options.view, 8080)
-    if options.view not in LOCAL:
-        print(f'warning: {open_to_others(options.view)}', file=sys.stderr)
 
 
 def print_notice(notice: str) -> None:

@@ -7,8 +7,8 @@ Plant and controller are one process in lock-step, and the recorder is another.
 from __future__ import annotations
 
 import ctypes
-import itertools
 import os
+import re
 import shutil
 import signal
 import socket
@@ -46,7 +46,7 @@ _TAIL = 12  # lines of a failed node's log that are shown
 _ROOM = 1_000_000  # bytes; with less free space the disk counts as full
 _PR_SET_PDEATHSIG = 1
 _LIBC = ctypes.CDLL(None)  # loaded before there are threads
-_VIEW_PORT = 8080  # or the next free one
+_PAGE = 'open http'  # in the log of the node that serves it
 _LAST = 5.0  # s, at most, to show what a loop sent before it ended
 _IN_TRANSIT = 0.5  # s, at most, between messages that are still on their way at the end
 _RANGE = 'ROS_AUTOMATIC_DISCOVERY_RANGE'
@@ -54,11 +54,11 @@ _PROFILES = 'FASTRTPS_DEFAULT_PROFILES_FILE'
 _DOMAINS = range(1, 101)  # 0 is the default; above 101, ports are ephemeral
 
 
-def run_session(config: LoopConfig, out: Path, domain: int | None, view: str | None) -> bool:
+def run_session(config: LoopConfig, out: Path, domain: int | None, *, view: bool) -> bool:
     """Run recorder, controller and plant on `out/config.yaml` until the plant has ended.
 
-    They run in a ROS domain of their own unless `domain` is given, and with a page at `view`,
-    a host, if given. Returns False if a signal to this process, or to another node than the plant,
+    They run in a ROS domain of their own unless `domain` is given, and with a page if they should
+    be viewed. Returns False if a signal to this process, or to another node than the plant,
     ended the run; raises NodeFailedError if a node exited with an error.
     """
     logs = out / 'logs'
@@ -71,7 +71,7 @@ def run_session(config: LoopConfig, out: Path, domain: int | None, view: str | N
         }
         try:
             with environment(values):
-                return _run_nodes(config, out / 'config.yaml', logs, view)
+                return _run_nodes(config, out / 'config.yaml', logs, view=view)
         except NodeFailedError:
             if shutil.disk_usage(out).free < _ROOM:
                 print(f'no space left on the disk of {out}', file=sys.stderr)
@@ -119,9 +119,10 @@ class NodeProcess:
         return self._process.poll() is None
 
     def new_notices(self) -> list[str]:
-        """Return what the node has newly reported about compiling its kernels."""
+        """Return what the node has newly reported about compiling its kernels, or its page."""
         lines = self._log.read_text(encoding='utf-8', errors='replace').splitlines()
-        notices = [line[line.index(COMPILING) :] for line in lines if COMPILING in line]
+        found = (re.search(f'({COMPILING}|{_PAGE}).*', line) for line in lines)
+        notices = [each[0] for each in found if each]
         new, self._noticed = notices[self._noticed :], len(notices)
         return [f'{self.name}: {notice}' for notice in new]
 
@@ -149,34 +150,30 @@ class NodeProcess:
             self._process.wait()
 
 
-def _run_nodes(config: LoopConfig, params_file: Path, logs: Path, view: str | None) -> bool:
+def _run_nodes(config: LoopConfig, params_file: Path, logs: Path, *, view: bool) -> bool:
     interrupts: list[int] = []
     with ExitStack() as ending:  # stops the nodes in reverse, then restores the handlers
         for number in (signal.SIGINT, signal.SIGTERM):
             handler = signal.signal(number, lambda number, _: interrupts.append(number))
             ending.callback(signal.signal, number, handler)
 
-        def started(name: str, *arguments: str) -> NodeProcess:
-            node = NodeProcess(name, params_file, logs, *arguments)
+        def started(name: str) -> NodeProcess:
+            node = NodeProcess(name, params_file, logs)
             ending.callback(node.stop)
             return node
 
         is_lockstep = config.plant.mode == 'lockstep'
         nodes = list(map(started, (RECORDER, *((_LOOP,) if is_lockstep else (CONTROLLER, PLANT)))))
         monitor = ending.enter_context(closing(ProgressMonitor(config.plant.duration)))
+        starting = nodes
         while all(node.is_running for node in nodes) and not interrupts:
             monitor.wait(0.1)
-            if not monitor.has_begun:
-                for notice in itertools.chain(*(node.new_notices() for node in nodes)):
-                    monitor.progress.write(notice)
-            elif view:
-                from blf_dsc_controller.view.page import free_port, url_of
-
+            notices = [notice for node in starting for notice in node.new_notices()]
+            for notice in notices:
+                monitor.progress.write(notice)
+            if monitor.has_begun and (starting is nodes or notices):
                 # Only now, since the nodes wait for a subscriber, which must be the recorder.
-                port = free_port(view, _VIEW_PORT)
-                started(VIEW, '-p', f'host:={view}', '-p', f'port:={port}')
-                monitor.progress.write(f'the page: {url_of(view, port)}')
-                view = None
+                starting, view = [started(VIEW)] if view else [], False
         completed = not (interrupts or nodes[-1].is_running)
         last = time.monotonic() + _LAST  # another loop in the same domain never falls silent
         while completed and time.monotonic() < last and monitor.wait(_IN_TRANSIT):

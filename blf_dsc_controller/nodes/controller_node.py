@@ -353,19 +353,12 @@ class ControllerNode(LoopNode[ControllerConfig]):
             self.get_logger().warning(supervisor.text)
         elif supervisor.phase is Phase.SAFE_STOP:
             stop = f'{self.config.safety.torque} torque: {supervisor.text}'
-            self.get_logger().fatal(f'{stop}; {self._restart_hint()}')
+            self.get_logger().fatal(f'{stop}; {self.get_fully_qualified_name()}/reset starts again')
         elif supervisor.phase is Phase.APPROACHING:
             left = guard.settled - guard.time
             self.get_logger().info(f'approaching the reference, for {left:.3g} s')
         elif supervisor.phase is Phase.TRACKING:
             self.get_logger().info('tracking the reference')
-
-    def _restart_hint(self) -> str:
-        """Return how to start again after a stop."""
-        plant = f'{self.get_namespace().rstrip("/")}/{topics.PLANT}/reset'
-        if plant in dict(self.get_service_names_and_types()):
-            return f'{plant} returns the arm to its start and starts again'
-        return f'{self.get_fully_qualified_name()}/reset starts again from where the arm is'
 
     def _report(self) -> None:
         self._status.report(self.state_label, self.guard, self.others)

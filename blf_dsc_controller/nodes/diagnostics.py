@@ -169,11 +169,6 @@ class ControllerStatus:
         learning = 'latched' if state.latched[0] else 'not yet excited'
         values = {'lambda_min': f'{state.lambda_min[0]:.3g}', 'learning': learning}
         values['model changes'] = f'{state.changes[0]:.0f}'
-        if state.changes[0]:
-            residual = state.contradiction[0] ** 0.5
-            values['last model change'] = (
-                f'{state.change_time[0]:.3f} s after the start, by {residual:.3g} N m'
-            )
         values |= {f'{REJECTED}{rejected.column}': f'{rejected}' for rejected in self.rejected}
         if self.rejected:
             columns = ', '.join(rejected.column for rejected in self.rejected)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Message types, qualities of service, publishers, subscriptions, timers, and what rclpy hides.
+"""Message types, qualities of service, publishers, subscriptions and timers.
 
 `RawSubscriptions` are for messages that are taken in batches, serialised. An executor would run a
 callback for each message. Here the messages of all topics are taken from the middleware's queues
@@ -14,18 +14,15 @@ import importlib
 import re
 import sysconfig
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from operator import attrgetter
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from ament_index_python.packages import get_package_share_directory
-from rclpy._rclpy_pybind11 import RCLError, UnknownROSArgsError
 from rclpy.clock import Clock, ClockType
 from rclpy.duration import Duration
-from rclpy.lifecycle import LifecycleNode
 from rclpy.node import Node
-from rclpy.parameter import Parameter
 from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, LivelinessPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.qos_overriding_options import QoSOverridingOptions
@@ -132,48 +129,13 @@ def create_steady_timer(node: Node, period: float, callback: Callable[[], None])
     return node.create_timer(period, callback, clock=Clock(clock_type=ClockType.STEADY_TIME))
 
 
-__all__ = ['RCLError', 'UnknownROSArgsError']  # re-exported
-
-
-def parameter_overrides(node: Node) -> Mapping[str, Parameter]:
-    """Return the parameters in a node's start files and arguments, declared or not."""
-    return node._parameter_overrides  # noqa: SLF001
-
-
-def raw_publish(publisher: Publisher) -> Callable[[bytes], None]:
-    """Return a function that publishes raw messages in half the time while the node exists."""
-    publish: Callable[[bytes], None] = publisher.handle.publish_raw
-    return publish
-
-
-def lifecycle_state(node: LifecycleNode) -> str:
-    """Return the state of a lifecycle node: unconfigured, inactive, active or finalized."""
-    return str(node._state_machine.current_state[1])  # noqa: SLF001
-
-
-def destroy_state_machine(node: LifecycleNode) -> None:
-    """Destroy the state machine, which rclpy forgets when it destroys the node.
-
-    It would keep the middleware's threads alive until the process exits: a known cause of crashes.
-    """
-    node._state_machine.destroy_when_not_in_use()  # noqa: SLF001
-
-
-def wrap_change_state(
-    node: LifecycleNode, wrap: Callable[[Callable[[Any, Any], Any]], Callable[[Any, Any], Any]]
-) -> None:
-    """Replace the callback of the service `~/change_state` with `wrap(callback)`."""
-    service = node._service_change_state  # noqa: SLF001
-    service.callback = wrap(service.callback)
-
-
 _BATCH = 1000  # messages taken from one topic before the next one's turn
 
 
 class RawMessage(NamedTuple):
     """A serialised message with the middleware's metadata."""
 
-    handle: int
+    handle: Any  # of the subscription
     raw: bytes
     received: int  # ns, system time
     published: int  # ns, system time of the publisher
@@ -181,12 +143,12 @@ class RawMessage(NamedTuple):
 
 
 class RawSubscriptions:
-    """Subscriptions to any number of topics, each with a queue of `depth`.
+    """Subscriptions to any number of topics.
 
     They belong to `node`, a hidden node separate from their owner.
     """
 
-    def __init__(self, owner: Node, depth: int) -> None:
+    def __init__(self, owner: Node) -> None:
         self.node = Node(
             f'_{owner.get_name()}_subscriptions',
             context=owner.context,
@@ -194,18 +156,20 @@ class RawSubscriptions:
             enable_rosout=False,
             start_parameter_services=False,
         )
-        self._depth = depth
-        self._subscriptions: list[tuple[int, Subscription]] = []
+        self._owner = owner
+        self._subscriptions: list[tuple[Any, Subscription]] = []
 
-    def subscribe(
-        self, topic: str, type_name: str, offered: Sequence[Quality], handle: int
-    ) -> None:
+    def follow(self, topic: Topic, quality: Quality) -> None:
+        """Subscribe to a topic of the owner's namespace, which is the handle of its messages."""
+        self.subscribe(self._owner.resolve_topic_name(topic.relative), topic.type, quality, topic)
+
+    def subscribe(self, topic: str, type_name: str, quality: Quality, handle: Any) -> None:
         """Subscribe to a topic; its messages carry `handle`. Raises what `message_class` raises."""
         subscription = self.node.create_subscription(
             message_class(type_name),
             topic,
             lambda _: None,  # rclpy requires a callback; the messages are taken, not delivered
-            compatible_profile(offered, self._depth),
+            qos_profile(quality),
             raw=True,
         )
         self._subscriptions.append((handle, subscription))
@@ -233,13 +197,13 @@ class RawSubscriptions:
         self.node.destroy_node()
 
 
-def compatible_profile(offered: Sequence[Quality], depth: int) -> QoSProfile:
+def compatible(offered: Sequence[Quality], depth: int) -> Quality:
     """Return the strictest quality of service that is compatible with all publishers."""
     reliable = all(quality.reliability == 'reliable' for quality in offered)
     latched = all(quality.durability == 'transient_local' for quality in offered)
     reliability = 'reliable' if reliable else 'best_effort'
     durability = 'transient_local' if latched else 'volatile'
-    return qos_profile(Quality(depth, reliability, durability))
+    return Quality(depth, reliability, durability)
 
 
 def quality_of(profile: QoSProfile) -> Quality:

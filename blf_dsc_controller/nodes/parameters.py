@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Configurations as parameters: declared, read, changed at run time, and those of other nodes."""
+"""Configurations as parameters: declared, read, and changed at run time."""
 
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any, TypeVar
 
 from rcl_interfaces.msg import (
@@ -13,11 +13,9 @@ from rcl_interfaces.msg import (
     ParameterDescriptor,
     SetParametersResult,
 )
-from rcl_interfaces.srv import GetParameters
 from rclpy.exceptions import ParameterNotDeclaredException
 from rclpy.node import Node
 from rclpy.parameter import Parameter as RosParameter
-from rclpy.parameter import parameter_value_to_python
 from rclpy.wait_for_message import wait_for_message
 from std_msgs.msg import String
 
@@ -33,7 +31,7 @@ from blf_dsc_controller.configuration.schema import (
 from blf_dsc_controller.errors import ConfigurationError
 from blf_dsc_controller.messages.topics import ROBOT_DESCRIPTION
 from blf_dsc_controller.nodes import process
-from blf_dsc_controller.nodes.endpoints import parameter_overrides, qos_profile
+from blf_dsc_controller.nodes.endpoints import qos_profile
 from blf_dsc_controller.nodes.process import assigned, check_sections
 
 Config = TypeVar('Config')
@@ -174,25 +172,14 @@ def _overrides(node: Node, cls: type[Config]) -> dict[str, Any]:
     own = {parameter.name: parameter for parameter in parameters(cls)}
     others = known_names() - own.keys()
     check_sections(sys.argv, node.get_fully_qualified_name())
-    given = {name: parameter.value for name, parameter in parameter_overrides(node).items()}
+    overrides = node._parameter_overrides  # noqa: SLF001 - those in start files and arguments
+    given = {name: parameter.value for name, parameter in overrides.items()}
     given |= assigned(sys.argv)
     return {
         name: [] if value is None and name in own and own[name].is_array else value
         for name, value in given.items()
         if name not in others and not is_builtin(name)
     }
-
-
-def values_of(names: Sequence[str], response: GetParameters.Response) -> dict[str, Any]:
-    """Return another node's parameters as configurations hold them.
-
-    Raises ConfigurationError if it lacks one: then the response is empty.
-    """
-    found = [parameter_value_to_python(value) for value in response.values]
-    if len(found) != len(names):
-        raise ConfigurationError(['the node has other parameters: is it of another version?'])
-    plain = (each if isinstance(each, bool | int | float | str) else tuple(each) for each in found)
-    return dict(zip(names, plain, strict=True))
 
 
 TIMEOUT = 60  # s
@@ -214,9 +201,7 @@ def wait_for_description(node: Node, name: str) -> str:
         if found:
             return str(message.data)
         node.get_logger().info(f'waiting for the URDF on {topic}', throttle_duration_sec=5.0)
-    publishers, reason = node.count_publishers(topic), 'nobody publishes there'
-    if publishers:
-        reason = f'its {publishers} publisher(s) may not be latched (transient local)'
-    problem = f'no URDF was received on {topic} within {TIMEOUT} s, and {reason}'
-    remedy = 'start robot_state_publisher, correct the name, or give a file'
+    count = node.count_publishers(topic)
+    problem = f'no URDF within {TIMEOUT} s on {topic}, which has {count} publishers'
+    remedy = 'start robot_state_publisher, whose topic is latched, correct the name, or give a file'
     raise ConfigurationError([f'robot.urdf: {problem}: {remedy}'])

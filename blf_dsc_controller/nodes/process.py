@@ -20,6 +20,7 @@ from pathlib import Path
 from typing import Any
 
 import rclpy
+from rclpy._rclpy_pybind11 import RCLError, UnknownROSArgsError
 from rclpy.duration import Duration
 from rclpy.experimental import EventsExecutor
 from rclpy.impl.rcutils_logger import RcutilsLogger
@@ -32,7 +33,6 @@ from blf_dsc_controller.configuration.files import parse
 from blf_dsc_controller.configuration.nodes import read, unmatched_sections
 from blf_dsc_controller.configuration.robot import Realtime
 from blf_dsc_controller.errors import BlfDscError, ConfigurationError
-from blf_dsc_controller.nodes.endpoints import RCLError, UnknownROSArgsError
 
 _POLL = 0.1  # s; EventsExecutor has no usable spin()
 _DRAIN_TIMEOUT = 10.0  # s for all topics; a recorder on a busy machine has been seen 2 s behind

@@ -21,6 +21,7 @@ from blf_dsc_controller.messages.topics import JOINT_STATES
 from blf_dsc_controller.nodes.endpoints import (
     RawMessage,
     RawSubscriptions,
+    compatible,
     create_steady_timer,
     message_class,
     quality_of,
@@ -45,7 +46,7 @@ class BagRecorderNode(PlainNode):
         super().__init__('bag_recorder', enable_rosout=False, **options)
         self._config = declare(self, RecorderConfig)
         self._chosen = {self.resolve_topic_name(name) for name in self._config.topics}
-        self._raw_subscriptions = RawSubscriptions(self, self._config.queue_depth)
+        self._raw_subscriptions = RawSubscriptions(self)
         self._recorded: set[str] = set()
         self._skipped: set[str] = set()
         self._joint_states = self.resolve_topic_name(JOINT_STATES.relative)
@@ -112,7 +113,8 @@ class BagRecorderNode(PlainNode):
         offered = [quality_of(each.qos_profile) for each in publishers]
         handle = self._bag.add_topic(topic, types[0], offered)
         self._recorded.add(topic)
-        self._raw_subscriptions.subscribe(topic, types[0], offered, handle)
+        quality = compatible(offered, self._config.queue_depth)
+        self._raw_subscriptions.subscribe(topic, types[0], quality, handle)
         if topic == self._joint_states:
             self._handle_of_states = handle
         self.get_logger().info(f'recording {topic} ({types[0]})')

@@ -3,8 +3,8 @@
 
 Effort controllers hold the last torque for ever. When commands stop while joint states go on, this
 node commands the safe torque of the controller's configuration until the controller is back. It
-reads that configuration from the running controller, so it needs no parameters of the arm; only if
-it is `armed`, to take over from a controller that has died before, it needs the parameter file.
+reads that configuration from the controller's journal, so it needs no parameters of the arm; only
+if it is `armed`, to take over from a controller that has died before, it needs the parameter file.
 """
 
 from __future__ import annotations
@@ -12,19 +12,16 @@ from __future__ import annotations
 import sys
 import time
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from functools import partial
-from math import inf
 from typing import Any
 
 import numpy as np
-from rcl_interfaces.srv import GetParameters
-from rclpy.task import Future
 
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.nodes import WatchdogConfig, load
-from blf_dsc_controller.configuration.schema import build, parameters
-from blf_dsc_controller.errors import ConfigurationError
+from blf_dsc_controller.configuration.schema import build
+from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.messages import topics
 from blf_dsc_controller.messages.codecs import (
     Float64MultiArrayDecoder,
@@ -32,6 +29,8 @@ from blf_dsc_controller.messages.codecs import (
     JointStateDecoder,
     MessageError,
 )
+from blf_dsc_controller.messages.journal import EventType, decode
+from blf_dsc_controller.messages.topics import Quality
 from blf_dsc_controller.nodes.diagnostics import ERROR, OK, WARN, DiagnosticsPublisher
 from blf_dsc_controller.nodes.endpoints import (
     RawMessage,
@@ -40,14 +39,13 @@ from blf_dsc_controller.nodes.endpoints import (
     message_class,
     qos_profile,
 )
-from blf_dsc_controller.nodes.parameters import declare, values_of
+from blf_dsc_controller.nodes.parameters import declare
 from blf_dsc_controller.nodes.process import PlainNode, drain, parameter_files, run
 from blf_dsc_controller.supervision.safe_torque import SecondLine
 
 _PERIOD = 0.004  # s, of the checks and of the torques
 _REPORT_PERIOD = 1.0  # s
 _DEPTH = 20  # messages of a topic in a period
-_STATES, _COMMANDS = range(2)
 
 
 class WatchdogNode(PlainNode):
@@ -67,18 +65,15 @@ class WatchdogNode(PlainNode):
         self._encoder: Float64MultiArrayEncoder
         self._sent: deque[tuple[int, bytes]] = deque(maxlen=10 * _DEPTH)
         self._sequence = 0
-        self._raw_subscriptions = RawSubscriptions(self, _DEPTH)
-        for handle, topic in ((_STATES, topics.JOINT_STATES), (_COMMANDS, topics.COMMANDS)):
-            name = self.resolve_topic_name(topic.relative)
-            self._raw_subscriptions.subscribe(name, topic.type, [topics.UNRELIABLE], handle)
+        self._raw_subscriptions = RawSubscriptions(self)
+        for topic in (topics.JOINT_STATES, topics.COMMANDS):
+            self._raw_subscriptions.follow(topic, Quality(_DEPTH, 'best_effort'))
+        self._raw_subscriptions.follow(topics.JOURNAL, topics.JOURNAL.requested)
         topic = topics.COMMANDS
-        quality = qos_profile(topic.offered)
-        self._output = self.create_publisher(message_class(topic.type), topic.relative, quality)
+        offered = qos_profile(topic.offered)
+        self._output = self.create_publisher(message_class(topic.type), topic.relative, offered)
         self._diagnostics = DiagnosticsPublisher(self, ())
         self._controller = f'{self.get_namespace().rstrip("/")}/{topics.CONTROLLER}'
-        self._names = [parameter.name for parameter in parameters(ControllerConfig)]
-        self._client = self.create_client(GetParameters, f'{self._controller}/get_parameters')
-        self._asked_at = -inf
         self._timer = create_steady_timer(self, _PERIOD, self._poll)
         create_steady_timer(self, _REPORT_PERIOD, self._report)
         if self._config.armed:
@@ -94,23 +89,15 @@ class WatchdogNode(PlainNode):
             drain([self._output])
         self._raw_subscriptions.close()
 
-    def _ask(self, now: float) -> None:
-        """Ask for the parameters of the controller, again if it has died over them."""
-        if now > self._asked_at + _REPORT_PERIOD and self._client.service_is_ready():
-            self._asked_at = now
-            request = GetParameters.Request(names=self._names)
-            self._client.call_async(request).add_done_callback(self._on_parameters)
-
-    def _on_parameters(self, response: Future) -> None:
-        if self.line is not None:  # of an earlier response: it was asked again
-            return
-        try:
-            given = values_of(self._names, response.result())
-            config = build(ControllerConfig, given, self._controller)
-        except ConfigurationError as error:
-            self.failure, self.finished = error, True
-            return
-        self._watch(config)
+    def _read_journal(self, messages: Iterable[RawMessage]) -> None:
+        """Watch the controller once it has told its parameters, with what was changed since."""
+        given: dict[str, Any] = {}
+        for message in messages:
+            event = decode(message.raw)
+            if event.type is EventType.CONFIGURE or given:
+                given |= event.content.get('parameters', {})
+        if given:
+            self._watch(build(ControllerConfig, given, self._controller))
 
     def _watch(self, config: ControllerConfig) -> None:
         count = len(config.joints)
@@ -126,7 +113,10 @@ class WatchdogNode(PlainNode):
     def _poll(self) -> None:
         messages, now = self._raw_subscriptions.take(), self._steady() * 1e-9
         if self.line is None:
-            self._ask(now)
+            try:
+                self._read_journal(each for each in messages if each.handle is topics.JOURNAL)
+            except BlfDscError as error:  # it is of another version
+                self.failure, self.finished = error, True
             return
         was_active = self.line.active
         for message in messages:
@@ -139,12 +129,13 @@ class WatchdogNode(PlainNode):
             self._report()
 
     def _take(self, line: SecondLine, message: RawMessage, now: float) -> None:
+        raw, sequence = message.raw, message.sequence
         try:
-            if message.handle == _STATES:
-                stamp = self._states.decode(message.raw)
+            if message.handle is topics.JOINT_STATES:
+                stamp = self._states.decode(raw)
                 line.state(stamp, self._states.values, now)
-            elif (message.sequence, message.raw) not in self._sent:
-                self._commands.decode(message.raw)
+            elif message.handle is topics.COMMANDS and (sequence, raw) not in self._sent:
+                self._commands.decode(raw)
                 line.torque_of_controller(self._commands.values, now)
         except MessageError as error:
             self.get_logger().warning(f'ignored: {error}', throttle_duration_sec=10.0)

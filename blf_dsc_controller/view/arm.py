@@ -3,12 +3,10 @@
 
 from __future__ import annotations
 
-import copy
 import io
 import logging
 import sysconfig
-import xml.etree.ElementTree as ET
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from contextlib import suppress
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -42,8 +40,10 @@ class ShownArm(NamedTuple):
     def model(self) -> Any:
         """Return the yourdfpy model with the first shapes found: meshes, others, cylinders."""
         has_meshes = '<mesh' in self.text
-        model = _load(self.text if has_meshes else with_known_meshes(self.text, self.chain))
-        return model if model.scene.geometry else _load(with_cylinders(self.text, self.reach))
+        model = _load(self.text if has_meshes else known_model(self.text, self.chain))
+        if not model.scene.geometry:
+            _add_cylinders(model, _THICKNESS * self.reach)
+        return model
 
 
 def arm_of(config: ControllerConfig, plant: Mapping[str, Any]) -> ShownArm:
@@ -52,34 +52,26 @@ def arm_of(config: ControllerConfig, plant: Mapping[str, Any]) -> ShownArm:
     if config.model == 'urdf':
         return ShownArm(robot.text, robot.chain(config.joints))
     lengths = [plant.get(name, config.arm.l1) for name in ('arm.l1', 'arm.l2')]
-    text = with_cylinders(urdf('arm', config.joints, lengths, (1.0, 1.0), (0.0, 0.0)), sum(lengths))
+    text = urdf('arm', config.joints, lengths, (1.0, 1.0), (0.0, 0.0))
     return ShownArm(text, read_chain(text, '', 'tip', config.joints))
 
 
-def with_known_meshes(text: str, chain: Chain) -> str:
-    """Draw an arm as the wheel `example-robot-data` does, if it has one with these joints."""
+def known_model(text: str, chain: Chain) -> str:
+    """Return the URDF with meshes that the wheel `example-robot-data` has of an arm, else its own.
+
+    The same arm has the same joints, in the same places.
+    """
     names = tuple(joint.name for joint in chain.joints)
     for path in sorted(_installed('example-robot-data').glob('robots/*/urdf/*.urdf')):
         known = path.read_text(encoding='utf-8')
         if not all(f'"{name}"' in known for name in names):
             continue
         with suppress(BlfDscError):
-            joints = read_chain(known, '', chain.joints[-1].link, names).joints
+            joints = read_chain(known, chain.base, chain.joints[-1].link, names).joints
             pairs = zip(joints, chain.joints, strict=True)
             if all(np.allclose(a.placement, b.placement, atol=_SAME) for a, b in pairs):
-                return _with_visuals(text, known)
+                return known
     return text
-
-
-def _with_visuals(text: str, known: str) -> str:
-    robot, source = ET.fromstring(text), ET.fromstring(known)  # noqa: S314 - as trusted as the robot
-    visuals = {link.get('name'): link.findall('visual') for link in source.findall('link')}
-    for link in robot.findall('link'):
-        found = visuals.get(link.get('name'))
-        for own in link.findall('visual') if found else ():
-            link.remove(own)
-        link.extend(copy.deepcopy(found or []))
-    return ET.tostring(robot, encoding='unicode')
 
 
 def _installed(package: str) -> Path:
@@ -87,33 +79,21 @@ def _installed(package: str) -> Path:
     return Path(sysconfig.get_path('purelib'), 'cmeel.prefix', 'share', package)
 
 
-def with_cylinders(text: str, reach: float) -> str:
-    """Replace a URDF's visuals: a cylinder between joints, a ball at each joint that moves."""
-    robot = ET.fromstring(text)  # noqa: S314 - as trusted as the robot that it describes
-    links = {link.get('name'): link for link in robot.findall('link')}
-    for link in links.values():
-        for visual in link.findall('visual'):
-            link.remove(visual)
-    radius = _THICKNESS * reach
-    for joint in robot.findall('joint'):
-        ends = {role: links[joint.find(role).get('link')] for role in ('parent', 'child')}  # type: ignore[union-attr]
-        if joint.get('type') != 'fixed':
-            _add(ends['child'], (0.0, 0.0, 0.0), '0 0 0', 'sphere', radius=f'{1.6 * radius}')
-        origin = joint.find('origin')
-        xyz = [float(x) for x in ('' if origin is None else origin.get('xyz', '')).split()]
-        length = float(np.linalg.norm(xyz))
-        if length > _SHORTEST:
-            x, y, z = xyz
-            rpy = f'0 {np.arccos(z / length)} {np.arctan2(y, x)}'
-            size = {'radius': f'{radius}', 'length': f'{length}'}
-            _add(ends['parent'], (x / 2, y / 2, z / 2), rpy, 'cylinder', **size)
-    return ET.tostring(robot, encoding='unicode')
+def _add_cylinders(model: Any, radius: float) -> None:
+    """Draw a cylinder of this radius [m] between joints, a ball at each joint that moves."""
+    import trimesh
 
+    def add(shape: Any, joint: str, link: str) -> None:
+        name = f'{joint} {link}'
+        model.scene.add_geometry(shape, node_name=name, geom_name=name, parent_node_name=link)
 
-def _add(link: ET.Element, at: Sequence[float], rpy: str, shape: str, **size: str) -> None:
-    visual = ET.SubElement(link, 'visual')
-    ET.SubElement(visual, 'origin', xyz=' '.join(map(str, at)), rpy=rpy)
-    ET.SubElement(ET.SubElement(visual, 'geometry'), shape, size)
+    for joint in model.robot.joints:
+        end = model.get_transform(joint.child, joint.parent)[:3, 3]
+        if np.linalg.norm(end) > _SHORTEST:
+            cylinder = trimesh.creation.cylinder(radius, segment=(np.zeros(3), end))
+            add(cylinder, joint.name, joint.parent)
+        if joint.type != 'fixed':
+            add(trimesh.creation.icosphere(radius=1.6 * radius), joint.name, joint.child)
 
 
 def _load(text: str) -> Any:

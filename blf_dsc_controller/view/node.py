@@ -11,7 +11,7 @@ import json
 import os
 import sys
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -25,9 +25,8 @@ from blf_dsc_controller.law.factory import estimate_names
 from blf_dsc_controller.messages import topics
 from blf_dsc_controller.messages.codecs import JointStateDecoder, MessageError, joint_state_layout
 from blf_dsc_controller.messages.journal import Event, EventType, decode
-from blf_dsc_controller.messages.topics import Quality, Topic
+from blf_dsc_controller.messages.topics import Topic
 from blf_dsc_controller.nodes.endpoints import (
-    RawMessage,
     RawSubscriptions,
     create_steady_timer,
     message_class,
@@ -35,14 +34,7 @@ from blf_dsc_controller.nodes.endpoints import (
 from blf_dsc_controller.nodes.parameters import declare
 from blf_dsc_controller.nodes.process import PlainNode, run
 from blf_dsc_controller.run import Floats
-from blf_dsc_controller.view.page import (
-    LOCAL,
-    PAST,
-    Page,
-    Snapshot,
-    open_to_others,
-    plant_events,
-)
+from blf_dsc_controller.view.page import PAST, Page, Snapshot
 
 _PERIOD = 1.0 / 30.0  # s
 _PLOTTED = 6  # frames between updates of the plots
@@ -50,9 +42,9 @@ _SILENCE = 30  # frames without a joint state before the page reports it
 _OUTDATED = 500_000_000  # ns
 _LISTED = 50  # events
 _NICE = 10  # lower priority than the loop
-_NEWEST = Quality(depth=1, reliability='best_effort')
+_LOCAL = ('127.0.0.1', 'localhost')  # hosts that only this computer can reach
 _STREAMS = (topics.JOINT_STATES, topics.TRACKING_ERROR, topics.BOUND, topics.MONITOR, topics.TRUTH)
-_EVENTS = (topics.JOURNAL, topics.CHANGES, topics.STATE)
+_LATCHED = (topics.BOUND, topics.JOURNAL, topics.CHANGES, topics.STATE)
 _FIGURES = (*topics.LOAD, topics.LAMBDA_MIN, topics.LATCHED)
 
 
@@ -82,37 +74,36 @@ class ViewNode(PlainNode):
         self._start = self._sampled = -1  # ns, stamps of start and last tracking error
         self._pictures = self._silent = 0
         self._clients_seen: frozenset[int] = frozenset()
-        self._newest = self._subscribe(_STREAMS, _NEWEST)
-        self._kept = self._subscribe(_EVENTS)
+        self._raw_subscriptions = RawSubscriptions(self)
+        for topic in {*_STREAMS, *_LATCHED}:
+            quality = topic.requested if topic in _LATCHED else topics.UNRELIABLE
+            self._raw_subscriptions.follow(topic, quality)
         self.get_logger().info(f'open {self.page.url}')
-        if config.host not in LOCAL:
-            self.get_logger().warning(open_to_others(config.host))
+        if config.host not in _LOCAL:
+            self.get_logger().warning(
+                f'at {config.host} the page is open to other computers, without a password'
+            )
         create_steady_timer(self, _PERIOD, self.update)
-
-    def _subscribe(self, of: Sequence[Topic], quality: Quality | None = None) -> RawSubscriptions:
-        made = RawSubscriptions(self, (quality or topics.HISTORY).depth)
-        for handle, topic in enumerate(of):
-            offered = topic.offered if quality is None or topic is topics.BOUND else quality
-            made.subscribe(self.resolve_topic_name(topic.relative), topic.type, [offered], handle)
-        return made
 
     def close(self) -> None:
         """Close the page and the subscriptions."""
         self.page.close()
-        self._newest.close()
-        self._kept.close()
+        self._raw_subscriptions.close()
 
     def update(self) -> None:
         """Process new messages and draw."""
-        for message in self._kept.take():
-            self._note(_EVENTS[message.handle], message.raw)
-        config = self._config
-        has_state = config is not None and self._take(self._newest.take())
+        streams: dict[Topic, bytes] = {}
+        for message in self._raw_subscriptions.take():
+            if message.handle in _STREAMS:
+                streams[message.handle] = message.raw
+            else:
+                self._note(message.handle, message.raw)
+        has_state = self._config is not None and self._take(streams)
         self._silent = 0 if has_state else self._silent + 1
         self.page.state(*self._health())
         self.page.events(list(self._events))
         clients = frozenset(self.page.server.get_clients())
-        if config is not None and self.past and (has_state or clients != self._clients_seen):
+        if self.past and (has_state or clients != self._clients_seen):
             self._draw(clients)
 
     def _health(self) -> tuple[str, str]:
@@ -120,7 +111,7 @@ class ViewNode(PlainNode):
         if self._config is None or self._silent < _SILENCE:
             return self._state
         for topic, node in ((topics.TRACKING_ERROR, 'controller'), (topics.JOINT_STATES, 'arm')):
-            if not self._newest.node.count_publishers(self.resolve_topic_name(topic.relative)):
+            if not self.count_publishers(topic.relative):
                 return 'ERROR', f'the {node} is gone: {topic.relative} is no longer published'
         return self._state[0], f'{self._state[1]} (no joint states received)'
 
@@ -176,7 +167,6 @@ class ViewNode(PlainNode):
 
     def _draw_all(self) -> None:
         if self._config is not None:
-            self.page.clear()
             self.page.draw_arm(self._config, self._plant)
 
     # Samples.
@@ -187,13 +177,12 @@ class ViewNode(PlainNode):
             self._start = stamp
         return max(0.0, (stamp - self._start) * 1e-9)
 
-    def _take(self, messages: Sequence[RawMessage]) -> bool:
+    def _take(self, newest: Mapping[Topic, bytes]) -> bool:
         """Take the newest message of each topic; return whether there was a joint state."""
         stamps: dict[Topic, int] = {}
-        for message in messages:
-            topic = _STREAMS[message.handle]
+        for topic, raw in newest.items():
             try:
-                stamps[topic], self._values[topic] = _read(message.raw, self._names[topic])
+                stamps[topic], self._values[topic] = _read(raw, self._names[topic])
             except MessageError as error:
                 self.get_logger().warning(f'not shown: {error}', throttle_duration_sec=10.0)
         self._sampled = max(stamps.get(topics.TRACKING_ERROR, -1), self._sampled)
@@ -232,6 +221,20 @@ def _read(raw: bytes, names: Sequence[str]) -> tuple[int, Floats]:
     stamp = decoder.decode(raw)
     known = dict(zip(theirs, decoder.values.reshape(3, -1).T, strict=True))
     return stamp, np.transpose([known.get(name, (np.nan,) * 3) for name in names])
+
+
+def plant_events(values: Mapping[str, Any]) -> list[tuple[float, str, str]]:
+    """Return time [s], kind and text of what a simulated arm with these parameters undergoes."""
+    begin = values.get('events.begin', ())
+    nothing = (0.0,) * len(begin)
+    duration, masses = (values.get(f'events.{k}') or nothing for k in ('duration', 'payload'))
+    found = []
+    for k, (at, lasts, mass) in enumerate(zip(begin, duration, masses, strict=False), 1):
+        texts = (f'{mass:g} kg picked up', f'{mass:g} kg put down')
+        first, last = texts if mass else (f'event {k} begins', f'event {k} ends')
+        found.append((at, 'plant', first))
+        found += [(at + lasts, 'plant', last)] if lasts else []
+    return sorted(found)
 
 
 def main() -> int:

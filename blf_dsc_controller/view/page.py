@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The page: 3D view of the arm, plots and events, drawn from snapshots of any source.
+"""The page: 3D view of the arm, plots and events, drawn from snapshots.
 
 viser serves the page with everything that the browser needs: nothing is loaded from elsewhere.
 """
@@ -7,7 +7,6 @@ viser serves the page with everything that the browser needs: nothing is loaded 
 from __future__ import annotations
 
 import contextlib
-import errno
 import importlib.util
 import io
 import os
@@ -30,15 +29,11 @@ from blf_dsc_controller.law.telemetry import load_text
 from blf_dsc_controller.run import Floats
 from blf_dsc_controller.view.arm import ShownArm, arm_of
 
-LOCAL = ('127.0.0.1', 'localhost', '::1')
-"""Hosts that can be reached from this computer only."""
-
 PAST = 20.0
 """Time span of the plots [s]."""
 
 _TRAIL = 4.0  # s of the tip's path
 _EVENTS = 12
-_PORTS = 100  # tried, from the requested one on
 _MESH = 5000  # faces of a shape from which on it is a mesh with colours of its own
 _SHOWN = 3.0  # s that an event is named beside the arm
 _PLAIN = (86, 110, 150)  # colour of an arm without any
@@ -59,7 +54,7 @@ _SHEET = (
 )
 _CELL = 'padding:1px 4px;text-align:right;white-space:nowrap;font-variant-numeric:tabular-nums'
 _TEXT = 'text-align:left;white-space:normal'
-_LEVELS = {'OK': GREEN, 'WARN': ORANGE, 'ERROR': ALARM, 'STALE': MUTED, 'BAG': MUTED}
+_LEVELS = {'OK': GREEN, 'WARN': ORANGE, 'ERROR': ALARM, 'STALE': MUTED}
 
 
 class Snapshot(NamedTuple):
@@ -77,51 +72,11 @@ class Snapshot(NamedTuple):
     loaded: bool = False  # the true parameters differ from those at the start
 
 
-def plant_events(values: Mapping[str, Any]) -> list[tuple[float, str, str]]:
-    """Return time [s], kind and text of what a simulated arm with these parameters undergoes."""
-    begin = values.get('events.begin', ())
-    nothing = (0.0,) * len(begin)
-    duration, masses = (values.get(f'events.{k}') or nothing for k in ('duration', 'payload'))
-    found = []
-    for k, (at, lasts, mass) in enumerate(zip(begin, duration, masses, strict=False), 1):
-        texts = (f'{mass:g} kg picked up', f'{mass:g} kg put down')
-        first, last = texts if mass else (f'event {k} begins', f'event {k} ends')
-        found.append((at, 'plant', first))
-        found += [(at + lasts, 'plant', last)] if lasts else []
-    return sorted(found)
-
-
-def url_of(host: str, port: int) -> str:
-    """Return the address to open in a browser."""
-    return f'http://{"localhost" if host in LOCAL else host}:{port}'
-
-
-def open_to_others(host: str) -> str:
-    """Return the warning about a page that is not served to this computer only."""
-    return f'at {host} the page is open to other computers, without a password'
-
-
 def require_viser() -> None:
     """Raise MissingExtraError unless viser and its URDF support are installed."""
     for module in ('viser', 'yourdfpy'):
         if importlib.util.find_spec(module) is None:
             raise MissingExtraError(module, 'view', 'the page')
-
-
-def free_port(host: str, port: int) -> int:
-    """Return the first free port from `port` on; BlfDscError if the page cannot be served there."""
-    family = socket.AF_INET6 if ':' in host else socket.AF_INET
-    for candidate in range(port, min(port + _PORTS, 65536)):
-        try:
-            with socket.create_server((host, candidate), family=family):
-                return candidate
-        except OSError as error:
-            if error.errno != errno.EADDRINUSE:
-                raise BlfDscError(
-                    f'the page cannot be served at {host!r}, port {candidate}: {error.strerror}; '
-                    'give an address of this computer, and a port above 1023'
-                ) from error
-    raise BlfDscError(f'no free port from {port} to {port + _PORTS - 1}: choose another')
 
 
 class Page:
@@ -133,23 +88,28 @@ class Page:
 
     Attributes:
         server: the viser server.
+        url: address to open in a browser.
     """
 
     def __init__(self, host: str, port: int) -> None:
         require_viser()
         import viser
 
-        free = free_port(host, port)
+        try:  # viser would try one port after the other, for ever
+            socket.create_server((host, 0)).close()
+        except OSError as error:
+            problem = f'the page cannot be served at {host!r} ({error.strerror})'
+            raise BlfDscError(f'{problem}: give an address of this computer') from error
         with contextlib.redirect_stdout(io.StringIO()):  # hides its banner
-            self.server = viser.ViserServer(host, free, label='blf_dsc', verbose=False)
-        self.url = url_of(host, self.server.get_port())
+            self.server = viser.ViserServer(host, port, label='blf_dsc', verbose=False)
+        self.url = f'http://{host}:{self.server.get_port()}'
         self._events: list[tuple[float, str, str]] = []
         self._state = 'STALE', ''
         self._corners: Floats | None = None  # joints and tip when first drawn
         self.server.on_client_connect(self._welcome)
-        self.clear()
+        self._clear()
 
-    def clear(self) -> None:
+    def _clear(self) -> None:
         """Show only the state until `draw_arm` is called."""
         server, gui = self.server, self.server.gui
         self._list: Any = None
@@ -165,6 +125,7 @@ class Page:
         """Draw the arm of a controller, with the parameters of its plant."""
         from viser.extras import ViserUrdf
 
+        self._clear()
         self._arm = arm = arm_of(config, plant)
         self._joints = [joint.name for joint in arm.chain.joints]
         prefix, names = _shortened(self._joints)
@@ -220,7 +181,7 @@ class Page:
         )
 
     def state(self, level: str, text: str) -> None:
-        """Show the controller's state: level (OK, WARN, ERROR, STALE or BAG) and description."""
+        """Show the controller's state: level (OK, WARN, ERROR or STALE) and description."""
         self._state = level, text
         self._header.content = (
             f'{_SHEET}<div style="margin:4px 12px;padding:6px 10px;border-radius:6px;color:white;'
