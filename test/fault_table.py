@@ -18,7 +18,7 @@ from fault_rig import JOINTS, MILLISECOND, Rig
 from blf_dsc_controller.configuration.schema import change, flatten
 from blf_dsc_controller.messages.codecs import Float64MultiArrayEncoder, JointStateEncoder
 from blf_dsc_controller.reference.trajectory import Trajectory, TrajectoryError, TrajectoryPoint
-from blf_dsc_controller.supervision.supervisor import Phase, Reason
+from blf_dsc_controller.supervision.checks import Phase, Reason
 
 LEAD = 40  # fault-free samples before the fault
 WATCHED = 120  # samples after the fault

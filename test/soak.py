@@ -25,7 +25,7 @@ from ros_rig import RosRig, activate, deactivate
 
 from blf_dsc_controller.nodes.controller_node import ControllerNode
 from blf_dsc_controller.nodes.plant_node import PlantNode
-from blf_dsc_controller.supervision.supervisor import Phase
+from blf_dsc_controller.supervision.checks import Phase
 
 
 class Loop:

@@ -30,7 +30,7 @@ from blf_dsc_controller.messages.topics import (
     REFERENCE,
     TRACKING_ERROR,
 )
-from blf_dsc_controller.supervision.supervisor import Reason
+from blf_dsc_controller.supervision.checks import Reason
 
 pytest.importorskip('plotly', reason='needs plotly: pip install blf_dsc_controller[report]')
 

@@ -13,7 +13,7 @@ from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.nodes import load, load_loop, locate
 from blf_dsc_controller.law.factory import settings_of_config
 from blf_dsc_controller.simulation.loop import simulate
-from blf_dsc_controller.supervision.config_warnings import expected_errors, transition
+from blf_dsc_controller.supervision.gains import expected_errors, transition
 
 ARMS = [('panda', 7), ('ur5e', 6), ('fr3', 7)]
 

@@ -19,8 +19,12 @@ from blf_dsc_controller.law.torque import added_torque
 from blf_dsc_controller.replay.verify import verify
 from blf_dsc_controller.simulation.bag import write_bag
 from blf_dsc_controller.supervision.guard import Guard
-from blf_dsc_controller.supervision.handover import check_support
-from blf_dsc_controller.supervision.safe_torque import LastState, model_torque, safe_torque
+from blf_dsc_controller.supervision.safe_torque import (
+    LastState,
+    check_support,
+    model_torque,
+    safe_torque,
+)
 
 PANDA = {'robot.urdf': 'panda.urdf', 'robot.tip': 'panda_hand_tcp'}
 HELD = {'robot.drive_compensates': 'gravity'}

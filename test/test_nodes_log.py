@@ -32,7 +32,7 @@ from blf_dsc_controller.messages.codecs import JointStateEncoder
 from blf_dsc_controller.messages.journal import EventType
 from blf_dsc_controller.nodes.controller_node import ControllerNode
 from blf_dsc_controller.nodes.plant_node import PlantNode
-from blf_dsc_controller.supervision.supervisor import Phase
+from blf_dsc_controller.supervision.checks import Phase
 
 # Transient local, to get from /rosout what was logged before discovery. rcl keeps one publisher
 # for each logger name, so the nodes of each test are in a namespace of their own.

@@ -25,7 +25,7 @@ from blf_dsc_controller.nodes.controller_node import ControllerNode
 from blf_dsc_controller.nodes.plant_node import LOCKSTEP_START, PlantNode
 from blf_dsc_controller.reference import terms as reference
 from blf_dsc_controller.reference.approach import reference_of
-from blf_dsc_controller.supervision.supervisor import Reason
+from blf_dsc_controller.supervision.checks import Reason
 
 MILLISECOND = 1_000_000  # ns
 PUSHED = {'load.payload': 0.2, 'load.torque': [0.4, -0.3], 'sensor.offset': [1e-5, 0.0]}

@@ -19,7 +19,7 @@ from sent_trajectory import JOINTS, SECOND, inputs, send, trajectory, two_tones
 from blf_dsc_controller.messages import topics
 from blf_dsc_controller.messages.codecs import MessageError, joint_trajectory
 from blf_dsc_controller.reference.trajectory import plan_trajectory
-from blf_dsc_controller.supervision.supervisor import Phase
+from blf_dsc_controller.supervision.checks import Phase
 
 BRISK = {'limits__acceleration': [4.0, 4.0]}  # rad/s^2, for a lead of a second
 PATIENT = {'safety__state_timeout': 60.0}

@@ -9,7 +9,7 @@ from fault_rig import Rig
 from fault_table import named
 from plain_law import dynamics
 
-from blf_dsc_controller.supervision.supervisor import Phase
+from blf_dsc_controller.supervision.checks import Phase
 
 HOLDING = {'safety.torque': 'hold_gravity'}
 QUIET = {'disturbance.constant': [0.0, 0.0], 'disturbance.amplitude': [0.0, 0.0]}

@@ -14,8 +14,7 @@ from fault_table import FAULTS, page, run
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.schema import build
 from blf_dsc_controller.law.checks import INVALID, OUTSIDE, SUSPECT, check_sample
-from blf_dsc_controller.supervision.checks import SampleCheck, Velocity
-from blf_dsc_controller.supervision.supervisor import Reason
+from blf_dsc_controller.supervision.checks import Reason, SampleCheck, Velocity
 
 DT = 1e-3
 LIMIT = 20.0  # N m, the default torque limit

@@ -13,11 +13,10 @@ from blf_dsc_controller.configuration.controller import ControllerConfig, Safety
 from blf_dsc_controller.configuration.schema import change
 from blf_dsc_controller.law.factory import controller_of, settings_of_config
 from blf_dsc_controller.reference.trajectory import Trajectory, TrajectoryError, TrajectoryPoint
-from blf_dsc_controller.supervision.checks import StateCheck, Watchdog
+from blf_dsc_controller.supervision.checks import Phase, Reason, StateCheck, Watchdog
+from blf_dsc_controller.supervision.gains import apply, apply_bumpless
 from blf_dsc_controller.supervision.guard import LatePlanError
-from blf_dsc_controller.supervision.handover import apply, apply_bumpless
 from blf_dsc_controller.supervision.safe_torque import LastState, SafeTorque, safe_torque
-from blf_dsc_controller.supervision.supervisor import Phase, Reason
 
 Q, DQ = np.array([0.3, -0.4]), np.array([0.5, -2.0])
 P = np.array([1.0, 0.32, 0.4])

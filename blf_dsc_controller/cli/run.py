@@ -29,9 +29,9 @@ from blf_dsc_controller.messages.codecs import JointStateDecoder
 from blf_dsc_controller.reference.approach import plan_start
 from blf_dsc_controller.simulation.bag import write_bag
 from blf_dsc_controller.simulation.loop import Record, simulate
-from blf_dsc_controller.supervision.config_warnings import config_warnings, expectation
+from blf_dsc_controller.supervision.checks import Reason
+from blf_dsc_controller.supervision.gains import config_warnings, expectation
 from blf_dsc_controller.supervision.guard import Guard
-from blf_dsc_controller.supervision.supervisor import Reason
 from sim_plant.plant import plant_of
 
 STOPPED = 5

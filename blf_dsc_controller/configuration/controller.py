@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Parameters of the controller: reference, limits, safety, telemetry; the gains are in `gains`."""
+"""Parameters of the controller: reference, limits, safety, telemetry, gains.
+
+The gains are those of the control laws (28) and (35), and of composite learning (20) to (27).
+"""
 
 from __future__ import annotations
 
@@ -14,21 +17,11 @@ import numpy as np
 
 from blf_dsc_controller.arms import tuning
 from blf_dsc_controller.arms.model import arm_model
-from blf_dsc_controller.configuration.gains import (
-    ArmGeometry,
-    Barrier,
-    ComparisonGains,
-    DisturbanceEstimate,
-    Feedback,
-    KnownArm,
-    Learning,
-    Surface,
-    Torque,
-)
 from blf_dsc_controller.configuration.robot import ArmConfig, given_robot, parameters_of
 from blf_dsc_controller.configuration.schema import (
     PerJoint,
     Value,
+    counted,
     non_negative,
     parameter,
     positive,
@@ -37,8 +30,12 @@ from blf_dsc_controller.configuration.schema import (
 _of_reference = partial(
     parameter, read_only='the reference would jump: send a trajectory on ~/joint_trajectory'
 )
-_size = partial(parameter, read_only='it sets the size of the state of the law')
 _telemetry = partial(parameter, read_only='topics are created once, when the node starts')
+_size = partial(parameter, read_only='it sets the size of the state of the law')
+_in_window = partial(parameter, read_only='the data in the excitation window depend on it')
+_at_start = partial(parameter, read_only='it has no effect later')
+_known = partial(parameter, read_only='it is known data, not a gain')
+_SAMPLES = (10, 1_000_000)  # per window: fewer do not determine P, more need over 100 MB
 
 
 @dataclass(frozen=True)
@@ -159,6 +156,248 @@ class Telemetry:
         'samples per message of reference and monitor; errors come with every sample',
         at_least=1,
     )
+
+
+@dataclass(frozen=True)
+class ArmGeometry:
+    """Known geometry in the regressor; the masses and the length of the second link are learned."""
+
+    l1: float = _in_window(1.0, 'length of the first link', 'm', 'l1', above=0.0)
+    gravity: float = _in_window(9.8, 'gravity; 0 for a horizontal arm', 'm/s^2', 'g')
+
+
+@dataclass(frozen=True)
+class Barrier:
+    """Bound on the tracking error, and the barrier that enforces it."""
+
+    bound: PerJoint = positive((0.002, 0.002), 'bound on the tracking error', 'rad', 'k_c')
+    initial_bound: PerJoint = non_negative(
+        (0.0, 0.0), 'initial bound of a funnel that narrows to `bound`; 0: constant', 'rad', 'k_0'
+    )
+    funnel_rate: float = non_negative(0.0, 'rate at which the funnel narrows', '1/s', 'a')
+    weight: PerJoint = positive(
+        (1000.0, 1000.0), 'stiffness of the barrier at zero error; 1 in the paper', 'N m/rad', 'w'
+    )
+    slope_limit: PerJoint = positive(
+        (2e4, 2e4), 'stiffness at which the barrier continues linearly', 'N m/rad', 'S_lim'
+    )
+
+    @property
+    def widest(self) -> tuple[float, ...]:
+        """Bound of each joint at the start [rad]."""
+        return tuple(
+            initial or bound for initial, bound in zip(self.initial_bound, self.bound, strict=True)
+        )
+
+    def problems(self, joints: tuple[str, ...]) -> Iterator[str]:
+        """Check the weight against the slope limit, and the bounds of the funnel."""
+        for joint, weight, limit in zip(joints, self.weight, self.slope_limit, strict=True):
+            if limit <= weight:
+                yield (
+                    f'barrier.slope_limit: got {limit:g} N m/rad for {joint}, but it must be above '
+                    f'barrier.weight, {weight:g} N m/rad'
+                )
+        for joint, initial, bound in zip(joints, self.initial_bound, self.bound, strict=True):
+            if 0.0 < initial < bound:
+                yield (
+                    f'barrier.initial_bound: got {initial:g} rad for {joint}, but it must be 0 '
+                    f'(no funnel) or at least barrier.bound, {bound:g} rad'
+                )
+        if self.funnel_rate == 0.0 and self.widest != self.bound:
+            yield (
+                'barrier.funnel_rate: got 0 1/s, but barrier.initial_bound must narrow to '
+                'barrier.bound: give the rate'
+            )
+
+
+@dataclass(frozen=True)
+class Surface:
+    """Virtual control (15), (18) and the surface filter (13)."""
+
+    gain: PerJoint = non_negative(
+        (150.0, 150.0), 'gain of the virtual control on the tracking error', '1/s', 'K'
+    )
+    mu: PerJoint = non_negative(
+        (20.0, 20.0), 'gain of the virtual control that remains at the bound', '1/s', 'mu'
+    )
+    time_constant: float = positive(0.002, 'time constant of the surface filter', 's', 'lambda')
+
+
+@dataclass(frozen=True)
+class Feedback:
+    """Feedback terms of the law (28)."""
+
+    gain: PerJoint = non_negative((60.0, 20.0), 'gain on the velocity error', 'N m s/rad', 'K_p')
+    damping_rate: float = non_negative(
+        0.0, 'rate of damping, scaled by the inertia of learning.initial_estimate', '1/s', 'omega_v'
+    )
+    damping: PerJoint = non_negative((0.0, 0.0), 'robust term d2 |xi1| sat(xi2/b)', 'N m/rad', 'd2')
+
+
+@dataclass(frozen=True)
+class DisturbanceEstimate:
+    """Adaptive estimate of the disturbance (30)."""
+
+    gain: PerJoint = non_negative(
+        (100.0, 100.0),
+        'adaptation gain of the disturbance estimate; 0: no estimate',
+        'N m/rad',
+        'gamma',
+    )
+    leakage: float = non_negative(0.0, 'leakage of the disturbance estimate', 'rad/(N m s)', 'eta')
+
+
+@dataclass(frozen=True)
+class Torque:
+    """Saturation of the commanded torque."""
+
+    limit: PerJoint = positive(
+        (20.0, 20.0), 'largest torque, as commanded and with what the drives add', 'N m'
+    )
+    rate_limit: PerJoint = non_negative((0.0, 0.0), 'largest rate of commands; 0: any', 'N m/s')
+    first_step: PerJoint = non_negative(
+        (0.0, 0.0),
+        'largest first torque, a step from none, that the drives tolerate; 0: any',
+        'N m',
+    )
+
+
+@dataclass(frozen=True)
+class ComparisonGains:
+    """Gains of the laws `backstepping` (35) and `slotine_li`, besides feedback and learning."""
+
+    surface_gain: PerJoint = positive(
+        (70.0, 70.0), 'gain of the linear surface alpha2 = dqr - lambda_s z1', '1/s', 'lambda_s'
+    )
+    position_gain: PerJoint = non_negative(
+        (1.0, 1.0), 'gain on the tracking error z1; not used by slotine_li', 'N m/rad', 'w'
+    )
+    robust_gain: PerJoint = non_negative(
+        (0.0, 0.0), 'amplitude of the robust term; not used by slotine_li', 'N m', 'mu_bar'
+    )
+    integral_gain: PerJoint = non_negative(
+        (), 'integral gain of slotine_li on its surface; empty: none', 'N m/rad', omittable=True
+    )
+    leakage: float = non_negative(0.001, 'leakage of P^; not used by slotine_li', symbol='W_c')
+
+
+def _misfits(
+    name: str, P: tuple[float, ...], model: str, count: int, radius: float
+) -> Iterator[str]:
+    """Check that parameters P are those of a model, and inside the ball of the projection."""
+    if len(P) != count:
+        entries = counted(len(P), 'entry', 'entries')
+        yield f'{name}: got {entries}, but model {model} has {count} parameters'
+    if (norm := math.hypot(*P)) >= radius:
+        yield (
+            f'learning.radius: got {radius:g} kg m^2, but {name} has a norm of {norm:.6g} kg m^2 '
+            'and would be shrunk to the ball: the radius must be larger'
+        )
+
+
+@dataclass(frozen=True)
+class KnownArm:
+    """Known data of the arm: required by the law `model_based`, shown by the monitors.
+
+    The known disturbance is constant + amplitude*sin(frequency*t + phase) on each joint.
+    """
+
+    parameters: tuple[float, ...] = _known(
+        (), 'true parameters; empty: unknown', 'kg m^2', 'P', omittable=True
+    )
+    constant: PerJoint = _known((0.0, 0.0), 'constant part of the known disturbance', 'N m')
+    amplitude: PerJoint = _known((0.0, 0.0), 'amplitude of the sinusoid', 'N m')
+    frequency: PerJoint = _known((1.0, 1.0), 'frequency of the sinusoid', 'rad/s', at_least=0.0)
+    phase: PerJoint = _known((0.0, 0.0), 'phase of the sinusoid', 'rad')
+
+    def problems(self, law: str, model: str, count: int, radius: float) -> Iterator[str]:
+        """Check that the parameters fit the model and the ball, and are given if required."""
+        if law == 'model_based' and not self.parameters:
+            yield 'truth.parameters: got none, but the law model_based needs them'
+        if self.parameters:
+            largest = radius if law == 'model_based' else math.inf
+            yield from _misfits('truth.parameters', self.parameters, model, count, largest)
+
+
+@dataclass(frozen=True)
+class Learning:
+    """Composite learning of the parameters P and of the disturbance columns."""
+
+    initial_estimate: tuple[float, ...] = _at_start(
+        (0.5, 0.16, 0.2), 'initial estimate of (m1+m2)*l1^2, m2*l2^2, m2*l1*l2', 'kg m^2', 'P^(0)'
+    )
+    adaptation_gain: Annotated[tuple[float, ...], 'learning.initial_estimate'] = non_negative(
+        (0.5, 0.5, 0.5), 'diagonal of the adaptation gain', symbol='Gamma'
+    )
+    weight: float = non_negative(
+        100.0, 'weight of the prediction error; 0: no learning from it', symbol='kappa'
+    )
+    update: Literal['newton', 'gradient'] = parameter(
+        'newton', 'step along the prediction error: regularised Newton, or the gradient (paper)'
+    )
+    prediction: Literal['filtered', 'lambda'] = _in_window(
+        'filtered', 'prediction error by filtered regressor, or by Lambda (24)'
+    )
+    regularization: float = positive(1e-5, 'regularisation of the Newton step', symbol='rho')
+    excitation_threshold: float = positive(
+        0.003, 'minimum eigenvalue of the excitation matrix of an excited window', symbol='sigma'
+    )
+    window: float = _size(
+        2.0 * math.pi,
+        'length of the excitation window; whole reference periods average out disturbances',
+        's',
+        'tau_d',
+        above=0.0,
+    )
+    settling_time: float = _at_start(
+        0.5, 'time for the filters to settle before the window is used', 's', 'T_a', at_least=0.0
+    )
+    filter_pole: float = _in_window(
+        10.0, 'pole of the filters on regressor and torque', 'rad/s', above=0.0
+    )
+    bias: bool = _size(True, 'also estimate a constant disturbance of each joint')
+    viscous: bool = _size(False, 'also estimate the viscous friction of each joint')
+    coulomb: bool = _size(False, 'also estimate the Coulomb friction of each joint')
+    coulomb_velocity: float = _in_window(
+        0.01, 'velocity scale of the sign change of the Coulomb column', 'rad/s', above=0.0
+    )
+    frequencies: tuple[float, ...] = _size(
+        (),
+        'also estimate a sinusoidal disturbance of each joint at each of these frequencies',
+        'rad/s',
+        above=0.0,
+        omittable=True,
+    )
+    derivative_filter: float = _in_window(
+        100.0, 'frequency of filter (8) for lambda', 'rad/s', 'omega', above=0.0
+    )
+    radius: float = positive(3.0, 'radius of the projection ball of P^', 'kg m^2', 'omega_a')
+    compensation: Literal['reference', 'state'] = parameter(
+        'reference', 'where what is learned acts: along the reference, or at the state (paper)'
+    )
+    bumpless: bool = parameter(
+        True, 'let the disturbance estimate offset the torque that the prediction error adds'
+    )
+    change_detection: bool = _size(True, 'discard a window that torques contradict: a changed arm')
+    residual_floor: PerJoint = positive(
+        (0.07, 0.07), 'rms unmodelled torque that is not treated as a change of the arm', 'N m'
+    )
+    anchor_weight: float = non_negative(
+        0.1, 'pull to the estimate before a change, until a new window is full'
+    )
+    weighing: bool = _size(False, 'weigh what the tip of a URDF holds since the first window')
+
+    def problems(self, sample_time: float, model: str, count: int) -> Iterator[str]:
+        """Check the size of the window, and the initial estimate against the model and the ball."""
+        samples, (fewest, most) = round(self.window / sample_time), _SAMPLES
+        if not fewest <= samples <= most:
+            yield (
+                f'learning.window: got {self.window:g} s, which is {samples} samples of '
+                f'{sample_time:g} s: between {fewest} and {most} are allowed'
+            )
+        yield from _misfits(
+            'learning.initial_estimate', self.initial_estimate, model, count, self.radius
+        )
 
 
 @dataclass(frozen=True)

@@ -24,15 +24,14 @@ from blf_dsc_controller.nodes import parameters, process
 from blf_dsc_controller.nodes.diagnostics import ControllerStatus
 from blf_dsc_controller.nodes.lifecycle import LoopNode
 from blf_dsc_controller.nodes.trajectory_input import TrajectoryInput
-from blf_dsc_controller.supervision.checks import SAME_CLOCK, rate_mismatch
-from blf_dsc_controller.supervision.config_warnings import (
+from blf_dsc_controller.supervision.checks import SAME_CLOCK, Phase, rate_mismatch
+from blf_dsc_controller.supervision.gains import (
     ReferenceLoad,
     config_warnings,
     reference_load,
     worsened,
 )
 from blf_dsc_controller.supervision.guard import Guard
-from blf_dsc_controller.supervision.supervisor import Phase
 
 OUTPUTS = (
     topics.COMMANDS,

@@ -19,8 +19,8 @@ from blf_dsc_controller.messages import topics
 from blf_dsc_controller.messages.topics import LOAD, PHASE, REASON, REJECTED, STOPS
 from blf_dsc_controller.nodes.endpoints import create_publisher
 from blf_dsc_controller.nodes.trajectory_input import TrajectoryInput
+from blf_dsc_controller.supervision.checks import Phase, Supervisor
 from blf_dsc_controller.supervision.guard import Guard
-from blf_dsc_controller.supervision.supervisor import Phase, Supervisor
 
 OK = DiagnosticStatus.OK
 WARN = DiagnosticStatus.WARN

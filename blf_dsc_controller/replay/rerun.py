@@ -23,8 +23,8 @@ from blf_dsc_controller.messages.journal import Event, EventType
 from blf_dsc_controller.messages.topics import TRACKING_ERROR, Topic
 from blf_dsc_controller.reference.trajectory import Trajectory, TrajectoryError, TrajectoryPoint
 from blf_dsc_controller.run import Floats
+from blf_dsc_controller.supervision.checks import Reason
 from blf_dsc_controller.supervision.guard import Guard
-from blf_dsc_controller.supervision.supervisor import Reason
 
 _UNREADABLE = frozenset(
     (Reason.BAD_MESSAGE, Reason.JOINT_MISSING, Reason.JOINT_DUPLICATED, Reason.FIELD_MISSING)

@@ -1,13 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Checks of joint states, of samples of the law and of silence: each returns a fault, or none.
+"""What the controller is doing, why it stops, and the checks that find a reason to stop.
 
-All but the check of silence read no clock, so the same states always have the same faults.
+Those of joint states, of samples of the law and of silence each return a fault, or none. All but
+that of silence read no clock, so the same states always have the same faults.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from enum import Enum
 from math import inf
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,10 +19,95 @@ from blf_dsc_controller.configuration.controller import ControllerConfig, Safety
 from blf_dsc_controller.law.checks import NO_EFFECT, OUTSIDE, SUSPECT
 from blf_dsc_controller.law.controller import Controller
 from blf_dsc_controller.law.settings import LINEAR
-from blf_dsc_controller.supervision.supervisor import Fault, Reason
+from blf_dsc_controller.messages.journal import OUTSIDE_BOUND
 
 Vector = NDArray[np.float64]
 _NANO = 1e-9
+
+
+class Phase(str, Enum):
+    """What the controller is doing."""
+
+    __str__ = str.__str__
+
+    INACTIVE = 'inactive'  # not in command: the safe torque, or on the ramp to it
+    STARTING = 'starting'  # waiting for the first joint state
+    APPROACHING = 'approaching'  # on the way to the reference
+    TRACKING = 'tracking'
+    SAFE_STOP = 'safe stop'  # the safe torque until the next reset or activation
+
+
+class Reason(str, Enum):
+    """Why the controller stopped."""
+
+    __str__ = str.__str__
+
+    NONE = 'none'
+    STATE_TIMEOUT = 'state timeout'
+    STAMP_MISSING = 'stamp missing'
+    STAMP_REPEATED = 'stamp repeated'
+    STAMP_BACKWARD = 'stamp backward'
+    STAMP_JUMP = 'stamp jump'
+    BAD_MESSAGE = 'bad message'
+    JOINT_MISSING = 'joint missing'
+    JOINT_DUPLICATED = 'joint duplicated'
+    FIELD_MISSING = 'field missing'
+    NOT_FINITE = 'measurement not finite'
+    VELOCITY = 'velocity not plausible'
+    START_REJECTED = 'start rejected'
+    OUTSIDE_BOUND = OUTSIDE_BOUND
+    NO_EFFECT = 'commands without effect'
+    SATURATED = 'torque saturated'
+    OVERRUN = 'loop overrun'
+    ESTIMATE = 'estimate not finite'
+    TORQUE = 'torque not finite'
+    FAILED = 'failed'
+
+
+class Fault(NamedTuple):
+    """Why the controller must stop: the reason, and a sentence with the values."""
+
+    reason: Reason
+    text: str
+
+
+class Supervisor:
+    """Phase of the controller and the reason of its last stop.
+
+    Attributes:
+        phase: what the controller is doing.
+        reason, text: why it stopped; `NONE` and empty if it did not.
+        stops: number of stops since the controller was configured.
+        revision: how often phase, reason or text have been set.
+        running: whether the law is in command.
+        uses_states: whether the law uses joint states: it runs or is about to start.
+    """
+
+    def __init__(self) -> None:
+        self.stops = self.revision = 0
+        self.enter(Phase.INACTIVE)
+
+    def enter(self, phase: Phase) -> None:
+        """Begin a phase other than the safe stop, and clear the reason."""
+        self._set(phase, Reason.NONE, '')
+
+    def stop(self, reason: Reason, text: str) -> bool:
+        """Enter the safe stop; return False if already stopped or inactive."""
+        if not self.uses_states:
+            return False
+        self._set(Phase.SAFE_STOP, reason, text)
+        self.stops += 1
+        return True
+
+    def add(self, text: str) -> None:
+        """Add to the text, without changing phase or reason."""
+        self._set(self.phase, self.reason, '; '.join(filter(None, (self.text, text))))
+
+    def _set(self, phase: Phase, reason: Reason, text: str) -> None:
+        self.phase, self.reason, self.text = phase, reason, text
+        self.running = phase in (Phase.TRACKING, Phase.APPROACHING)
+        self.uses_states = self.running or phase is Phase.STARTING
+        self.revision += 1
 
 
 SKIP = Fault(Reason.NONE, '')
@@ -86,10 +174,8 @@ class StateCheck:
                 f'{safety.state_timeout:g} s (safety.state_timeout)'
             )
             return Fault(Reason.STAMP_JUMP, text)
-        fault = self._count_missed(safety, max(1, round(step / self._sample_time)) - 1)
-        if fault is None:
-            self._last_stamp = stamp
-        return fault
+        self._last_stamp = stamp
+        return self._count_missed(safety, max(1, round(step / self._sample_time)) - 1)
 
     def _check_repeats(self, safety: Safety) -> Fault:
         self.repeated += 1
@@ -198,7 +284,7 @@ class SampleCheck:
         """Reset the controller, but set its estimates to the kept ones."""
         self._controller.reset()
         state = self._controller.state
-        state.estimate[:], state.disturbance[:] = self.estimate, self._kept[state.estimate.size :]
+        state.estimate[:], state.disturbance[:] = self.estimate, self.disturbance
 
     def check(self, dt: float) -> Fault | None:
         """Return why the torque of a sample, `dt` [s] after the one before, must not be used."""
@@ -208,10 +294,9 @@ class SampleCheck:
         if not flags & SUSPECT:
             self.relax(dt)
             return None
-        fault = self._without_effect() if flags & NO_EFFECT else self._not_finite()
-        if fault is None:
-            saturated = self._saturated(dt)
-            fault = self._outside() or saturated
+        if flags & NO_EFFECT:
+            return self._without_effect()
+        fault = self._not_finite() or self._outside() or self._saturated(dt)
         if fault is None:
             self.keep()
         return fault
@@ -276,20 +361,16 @@ class SampleCheck:
         )
 
     def _saturated(self, dt: float) -> Fault | None:
+        """Count a sample in which a torque is at its limit: what else is suspect has stopped."""
         signals, limit = self._controller.signals, self._controller.settings.torque_limit
-        command = signals.demand - signals.added
-        demand = np.where(np.abs(command) > np.abs(signals.demand), command, signals.demand)
-        worst = int(np.argmax(np.abs(demand) - limit))
-        is_saturated = bool(np.abs(demand[worst]) > limit[worst])
-        self.saturated += is_saturated
-        if is_saturated:
-            self._saturation += _RELIEF * round(dt * 1e9)
-        else:
-            self.relax(dt)
+        needed = np.maximum(np.abs(signals.demand), np.abs(signals.demand - signals.added))
+        self.saturated += 1
+        self._saturation += _RELIEF * round(dt * 1e9)
         if self.saturated_time <= self._safety.saturation_time:
             return None
+        worst = int(np.argmax(needed - limit))
         text = (
-            f'joint {self._joints[worst]!r} needs {demand[worst]:+.4g} N m and has been at '
+            f'joint {self._joints[worst]!r} needs {needed[worst]:.4g} N m and has been at '
             f'its limit of {limit[worst]:g} N m for {self.saturated_time:.4g} s (less a quarter '
             'of the time in between)'
         )

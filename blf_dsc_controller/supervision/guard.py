@@ -25,19 +25,25 @@ from blf_dsc_controller.messages import codecs
 from blf_dsc_controller.messages.journal import EventType, Journal
 from blf_dsc_controller.reference.approach import BlendedReference, MotionError, check_takeover
 from blf_dsc_controller.reference.trajectory import Trajectory, TrajectoryError, plan_trajectory
-from blf_dsc_controller.supervision import handover
+from blf_dsc_controller.supervision import gains
 from blf_dsc_controller.supervision.checks import (
     PERIOD,
     SKIP,
+    Phase,
+    Reason,
     SampleCheck,
     StateCheck,
+    Supervisor,
     Velocity,
     Watchdog,
     rate_mismatch,
 )
-from blf_dsc_controller.supervision.handover import check_first_torque, check_support
-from blf_dsc_controller.supervision.safe_torque import SafeTorque, limit_first_torque
-from blf_dsc_controller.supervision.supervisor import Phase, Reason, Supervisor
+from blf_dsc_controller.supervision.safe_torque import (
+    SafeTorque,
+    check_first_torque,
+    check_support,
+    limit_first_torque,
+)
 
 Vector = NDArray[np.float64]
 _NANO = 1e-9
@@ -420,9 +426,9 @@ class Guard:
         self._note(EventType.PARAMETERS, parameters=differences(self.config, config))
         if self.supervisor.running:
             last = self._safe_torque.last.measurement
-            handover.apply_bumpless(self.controller, config, self.time, last)
+            gains.apply_bumpless(self.controller, config, self.time, last)
         else:
-            handover.apply(self.controller, config)
+            gains.apply(self.controller, config)
         self.config = config
         self.samples.set_limits(config.safety)
 
@@ -430,7 +436,7 @@ class Guard:
         """Return why a configuration cannot be applied now; empty if it can."""
         if not self.supervisor.running:
             return []
-        return list(handover.problems(self.controller, config, self.time))
+        return list(gains.problems(self.controller, config, self.time))
 
     @property
     def is_settled(self) -> bool:

@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Warnings before the start: gains, limits and windows that are valid but cannot work well.
+"""Gains: warnings before the start, and changes of a running law without a jump of its torque.
 
-They are based on the initial parameter estimate, which is a guess. doc/tuning.md derives them.
+Warnings are about gains, limits and windows that are valid but cannot work well. They are based on
+the initial parameter estimate, which is a guess. doc/tuning.md derives them.
 
 The errors to expect are those of the sampled loop at small errors.  About a motion that the law
 follows, learning aside, the law is linear in the errors, and so is the arm with its inertia M of
@@ -13,6 +14,12 @@ each joint,
 
 where d [N m] is the torque that the model lacks.  Torques arrive a sample late and pass the drives,
 velocities are differences of positions behind a filter; each of both lags is half of `robot.lag`.
+
+A jump of the gains at unchanged errors would make the torque jump. Two states of the law absorb
+the difference: the surface filter is shifted with the virtual control, so that alpha2' does not
+change, and the disturbance estimate, the integrator of the law, absorbs the rest; it then returns
+to its own value at the rate of its gain. A joint whose disturbance gain is 0 has no integrator, so
+its torque steps.
 """
 
 from __future__ import annotations
@@ -26,9 +33,11 @@ from numpy.typing import NDArray
 
 from blf_dsc_controller.arms.model import free_inertias, inertia_matrices, regressors_at
 from blf_dsc_controller.arms.tuning import SAMPLES, UNKNOWN_EFFORT, loop_delay
+from blf_dsc_controller.compiled.layout import pack
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.robot import implausible_friction, parameters_of
-from blf_dsc_controller.law.barrier import filter_gain
+from blf_dsc_controller.law import barrier
+from blf_dsc_controller.law.controller import Controller
 from blf_dsc_controller.law.factory import settings_of_config
 from blf_dsc_controller.law.settings import LINEAR, NEWTON, Settings
 from blf_dsc_controller.reference.approach import reference_of
@@ -44,6 +53,8 @@ _LONGEST = 120.0  # s of the reference
 _RESPONSE = 20.0  # time constants of the damping, for which the response is followed
 _MOMENTS = 40  # of the reference
 _REVERSAL = 0.75  # of Coulomb friction: half of it too much at breakaway, with either sign
+_STABLE = 2.0  # x += -a x diverges for a >= 2
+_ROUNDED = 1.0 + 1e-9  # times the radius, on which the projection may hold an estimate
 
 
 class ReferenceLoad(NamedTuple):
@@ -107,7 +118,7 @@ def transition(
     decay = np.exp(-T / max(0.5 * lag, 1e-9))  # of the drives
     mean = (1.0 - decay) * 0.5 * lag / T  # of the drives' transient over the sample
     rate = settings.K / 2.0 + settings.mu
-    g = filter_gain(settings.time_constant, T)
+    g = barrier.filter_gain(settings.time_constant, T)
     # Rows of x, and of what the law computes in terms of x: alpha2', xi2 and the torque.
     q, dq, drive, last, before, speed, alpha2, d3 = np.eye(8 * n).reshape(8, n, 8 * n)
     measured = speed + (1.0 - decay) * ((q - before) / T - speed)
@@ -363,3 +374,61 @@ def _of_learning(
                     f"reference's {frequency:g} rad/s: give whole ones, over which a disturbance "
                     'of that period averages out'
                 )
+
+
+def apply(controller: Controller, config: ControllerConfig) -> None:
+    """Replace the settings of a law."""
+    controller.settings_vector[:] = pack(settings_of_config(config))
+
+
+def apply_bumpless(
+    controller: Controller, config: ControllerConfig, t: float, measurement: Floats
+) -> None:
+    """Replace the settings of a running law without a jump of its torque.
+
+    `t` [s] and `measurement` (3 n,) are those of the last sample.
+    """
+    state, signals, T = controller.state, controller.signals, config.sample_time
+    controller.trial(t, T, measurement)
+    beta2, demand = signals.beta2.copy(), signals.demand.copy()
+    apply(controller, config)
+    if controller.settings.surface != LINEAR:
+        controller.trial(t, T, measurement)
+        state.alpha2[:] += signals.beta2 - beta2
+    controller.trial(t, T, measurement)
+    integrates = controller.settings.gamma > 0.0
+    state.disturbance[integrates] -= (signals.demand - demand)[integrates]
+
+
+def problems(controller: Controller, config: ControllerConfig, t: float) -> Iterator[str]:
+    """Yield reasons why a running law cannot accept a valid configuration at time t [s]."""
+    state, p, learning = controller.state, controller.settings.p, config.learning
+    errors, torques = np.abs(controller.sample.xi1), np.abs(controller.sample.torque)
+    settings = settings_of_config(config)
+    barrier.update_bound(settings, controller.signals, t)
+    for joint, error, bound in zip(config.joints, errors, controller.signals.bound, strict=True):
+        if not error < bound:
+            yield (
+                f'barrier.bound: {joint} is {error:.6g} rad from its reference now, outside of a '
+                f'bound of {bound:g} rad: choose a wider one, or try again with a smaller error'
+            )
+    for joint, torque, limit in zip(config.joints, torques, config.torque.limit, strict=True):
+        if torque > limit:
+            yield (
+                f'torque.limit: {joint} is held with {torque:.4g} N m now, more than a limit of '
+                f'{limit:g} N m: choose a higher one'
+            )
+    norm = float(np.linalg.norm(state.estimate[:p]))
+    if norm > _ROUNDED * learning.radius:
+        yield (
+            f'learning.radius: the norm of the estimate is {norm:.4g} kg m^2 now, above a '
+            f'radius of {learning.radius:g} kg m^2: choose a larger one'
+        )
+    stretch = 1.0 if learning.update == 'newton' else float(np.linalg.norm(state.Phi, 2))
+    step = learning.weight * float(settings.Gamma.max()) * stretch * config.sample_time
+    if state.latched[0] and step >= _STABLE:
+        yield (
+            f'learning.weight: with the update {learning.update}, each sample would correct the '
+            f'estimates by {step:.3g} times their error, which diverges at {_STABLE:g} or more: '
+            'lower learning.weight or learning.adaptation_gain'
+        )

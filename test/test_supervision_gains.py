@@ -14,7 +14,7 @@ from blf_dsc_controller.configuration.nodes import load, load_loop, locate
 from blf_dsc_controller.configuration.robot import read_urdf
 from blf_dsc_controller.configuration.schema import change
 from blf_dsc_controller.law.factory import settings_of_config
-from blf_dsc_controller.supervision.config_warnings import (
+from blf_dsc_controller.supervision.gains import (
     config_warnings,
     reference_load,
     worsened,
