@@ -146,7 +146,7 @@ def test_presets_and_written_files_have_the_values_of_ros(with_ros, tmp_path, pr
         ('a:\n\tb: 1\n', 'line 2: not valid YAML'),
         ('n:\n  seed: 1\n', 'line 2: seed has a value, but is outside of ros__parameters'),
         ('n:\n', 'line 1: n has a value, but is outside of ros__parameters'),
-        ('n:\n  ros_parameters: {seed: 1}\n', 'line 2: ros_parameters should be ros__parameters'),
+        ('n:\n  ros_parameters: {seed: 1}\n', 'line 2: seed has a value, but is outside of ros__p'),
         ('n:\n  ros__parameters:\n', 'line 2: ros__parameters of /n has no parameters'),
         ('n:\n  ros__parameters:\n    seed:\n', 'line 3: seed has no value'),
         (section('n', 'a: [1, 2.0]'), 'line 2: a mixes types'),

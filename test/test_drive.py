@@ -311,7 +311,7 @@ def test_friction_that_the_drive_compensates_is_not_fed_forward_a_second_time():
         ({'robot.drive_compensates': 'friction'}, "got 'friction', but it must be one of none, "),
         ({'robot.drive_payload': -1.0} | HELD, 'drive_payload: got -1.0, but it must be at least'),
         (TOLD, 'robot.drive_payload: got 1.5 kg, but drive_compensates is none'),
-        ({'robot.drive_payload_centre': [0.0]} | HELD, 'got 1 entry, but 3 are needed'),
+        ({'robot.drive_payload_centre': [0.0]} | HELD, 'got 1, but 3 entries are needed'),
         (
             {'robot.urdf': '', 'robot.tip': ''} | HELD,
             'drive_compensates: got gravity, which needs ro',

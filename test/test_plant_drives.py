@@ -107,12 +107,12 @@ def test_incomplete_states_have_positions_only(missing):
 @pytest.mark.parametrize(
     ('given', 'problem'),
     [
-        ({'events.payload': [0.1]}, 'events.payload: got 1 entry, but 0 are needed'),
+        ({'events.payload': [0.1]}, 'events.payload: got 1, but 0 entries are needed'),
         (
             {'events.begin': [1.0], 'events.force': [1.0, 2.0]},
-            r'events.force: got 2 entries, but 3 are needed \(1 of events.begin times 3\)',
+            r'events.force: got 2, but 3 entries are needed \(1 of events.begin times 3\)',
         ),
-        ({'load.torque': [1.0]}, 'load.torque: got 1 entry, but 7 are needed'),
+        ({'load.torque': [1.0]}, 'load.torque: got 1, but 7 entries are needed'),
         ({'robot.tip': ''}, 'robot.urdf: neither a tip nor joints were given'),
         ({'joints': ['panda_joint1']}, 'the moving joints from base to tip are'),
         ({'robot.urdf': '', 'truth.mass_factor': 1.1}, 'truth: it applies only to a URDF'),

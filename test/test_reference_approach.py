@@ -254,7 +254,7 @@ def test_waypoints_are_passed_at_their_times_and_the_last_is_held():
         ({'reference.type': 'spiral'}, "type: got 'spiral', but it must be one of"),
         ({'reference.type': 'waypoints'}, 'times: got none'),
         (REPEATED, 'times: got 1 s after 1 s, but they must increase'),
-        (TIMES, 'points: got 3 entries, but 4 are needed'),
+        (TIMES, 'points: got 3, but 4 entries are needed'),
         ({'limits.velocity': [0.0, 1.0]}, 'limits.velocity: got 0.0 at entry 1'),
         ({'limits.position_lower': [1.0, 7.0]}, 'position_upper: got 6.28319 rad for joint2, but'),
     ],

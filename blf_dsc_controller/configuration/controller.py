@@ -21,7 +21,6 @@ from blf_dsc_controller.configuration.robot import ArmConfig, given_robot, param
 from blf_dsc_controller.configuration.schema import (
     PerJoint,
     Value,
-    counted,
     non_negative,
     parameter,
     positive,
@@ -286,8 +285,7 @@ def _misfits(
 ) -> Iterator[str]:
     """Check that parameters P are those of a model, and inside the ball of the projection."""
     if len(P) != count:
-        entries = counted(len(P), 'entry', 'entries')
-        yield f'{name}: got {entries}, but model {model} has {count} parameters'
+        yield f'{name}: got {len(P)}, but model {model} has {count} parameters'
     if (norm := math.hypot(*P)) >= radius:
         yield (
             f'learning.radius: got {radius:g} kg m^2, but {name} has a norm of {norm:.6g} kg m^2 '

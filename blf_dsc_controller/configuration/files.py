@@ -14,7 +14,6 @@ string.
 
 from __future__ import annotations
 
-import difflib
 import functools
 import math
 import re
@@ -168,8 +167,6 @@ def _scalar(node: yaml.Node, name: str) -> object:
 def _outside(names: tuple[str, ...], node: yaml.Node) -> ConfigurationError:
     if not names:
         return _error(node, f'expected node names or {_MARK} at the top')
-    if close := difflib.get_close_matches(_MARK, names, n=1, cutoff=0.8):
-        return _error(node, f'{close[0]} should be {_MARK} (two underscores)')
     return _error(node, f'{names[-1]} has a value, but is outside of {_MARK}')
 
 
@@ -230,16 +227,14 @@ def share_folder() -> Path:
     That is the source tree, as in an editable install, or `share/blf_dsc_controller` of the prefix
     where colcon or pip installed this file.
 
-    Raises BlfDscError, listing the places searched, if the folder is not found.
+    Raises BlfDscError if there is neither.
     """
-    places = [place for above in _ABOVE for place in (above, above / 'share' / _PACKAGE)]
-    for place in places:
+    for place in (place for above in _ABOVE for place in (above, above / 'share' / _PACKAGE)):
         if (place / _PRESET).is_file():
             return place
-    searched = ''.join(f'\n  - {place / _PRESET}' for place in places)
     raise BlfDscError(
-        f'the data files of {_PACKAGE} were not found: install the package again. '
-        f'Searched:{searched}'
+        f'{_PRESET} was not found above {_ABOVE[0]}, nor in a share/{_PACKAGE} there: install the '
+        'package again'
     )
 
 
@@ -249,14 +244,20 @@ def resolve(url: str) -> Path:
     A path that does not exist is looked up in `config/` of this package. Raises BlfDscError if
     there is no such folder or package.
     """
-    if url.startswith('package://'):
-        name, _, rest = url.removeprefix('package://').partition('/')
-        return _share_of(name) / rest
-    path = Path(url).expanduser()
-    own = share_folder() / 'config' / url
-    if path.is_file() or not own.is_file():
-        return path
-    return own
+    if not url.startswith('package://'):
+        path, own = Path(url).expanduser(), share_folder() / 'config' / url
+        return path if path.is_file() or not own.is_file() else own
+    package, _, rest = url.removeprefix('package://').partition('/')
+    if package == _PACKAGE:
+        return share_folder() / rest
+    try:
+        from ament_index_python.packages import get_package_share_directory
+
+        return Path(get_package_share_directory(package), rest)
+    except (ImportError, LookupError, OSError) as error:
+        raise BlfDscError(
+            f'package {package!r} was not found: source the workspace that has it, or give a path'
+        ) from error
 
 
 def read_text(path: Path) -> str:
@@ -267,16 +268,3 @@ def read_text(path: Path) -> str:
     if state.st_size > _LARGEST:
         raise OSError(f'{path} has {state.st_size} bytes; expected text of at most {_LARGEST}')
     return path.read_text(encoding='utf-8')
-
-
-def _share_of(package: str) -> Path:
-    if package == _PACKAGE:
-        return share_folder()
-    try:
-        from ament_index_python.packages import get_package_share_directory
-
-        return Path(get_package_share_directory(package))
-    except (ImportError, LookupError, OSError) as error:
-        raise BlfDscError(
-            f'package {package!r} was not found: source the workspace that has it, or give a path'
-        ) from error

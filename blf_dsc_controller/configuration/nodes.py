@@ -6,7 +6,6 @@
 
 from __future__ import annotations
 
-import difflib
 import json
 import sys
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -27,6 +26,7 @@ from blf_dsc_controller.configuration.schema import (
     flatten,
     parameter,
     parameters,
+    suggestion,
     unknown,
 )
 from blf_dsc_controller.errors import ConfigurationError
@@ -157,10 +157,8 @@ def locate(given: str | Path) -> Path:
     if stem in presets:
         return presets[stem]
     what = 'is a folder' if path.is_dir() else 'does not exist'
-    close = difflib.get_close_matches(stem, presets, n=1)
-    guess = f'did you mean {close[0]}? ' if close else ''
     remedy = f'give a parameter file, or a preset: {", ".join(presets)}'
-    raise ConfigurationError([f'{name} {what}: {guess}{remedy}'])
+    raise ConfigurationError([f'{name} {what}{suggestion(stem, presets) or ":"} {remedy}'])
 
 
 def read(path: str | Path, based: tuple[str, ...] = ()) -> Sequence[Section]:
@@ -288,9 +286,8 @@ def unmatched_sections(sections: Sequence[Section], nodes: Iterable[str]) -> Ite
     by_name = {section.pattern.rsplit('/', 1)[-1]: section for section in sections}
     absent = [node for node in NODES if node not in by_name]
     for name, section in by_name.items():
-        close = difflib.get_close_matches(name, absent, n=1, cutoff=0.8)
-        if close and name not in NODES:
-            yield f'line {section.line}: unknown node {name}, did you mean {close[0]}?'
+        if name not in NODES and (guess := suggestion(name, absent, cutoff=0.8)):
+            yield f'line {section.line}: unknown node {name}{guess}'
     for node in nodes:
         full, name = '/' + node.removeprefix('/'), node.rsplit('/', 1)[-1]
         if name in by_name and not any(

@@ -19,7 +19,6 @@ from blf_dsc_controller.configuration.files import read_text, resolve
 from blf_dsc_controller.configuration.schema import (
     PerJoint,
     Vector,
-    counted,
     non_negative,
     parameter,
 )
@@ -266,8 +265,7 @@ class ArmConfig:
         if '' in self.joints:
             yield 'joints: a name is empty'
         if needed not in (None, len(self.joints)):
-            got = counted(len(self.joints), 'name', 'names')
-            yield f'joints: got {got}, but {arm} has {needed} joints'
+            yield f'joints: got {len(self.joints)}, but {arm} has {needed} joints'
         yield from (f'robot.{problem}' for problem in self.robot.problems())
         # Stamps are whole nanoseconds, and would drift from the time in the law.
         if abs(self.sample_time * 1e9 - self.sample_time_ns) > _ROUNDING * self.sample_time_ns:

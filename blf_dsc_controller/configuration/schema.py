@@ -91,7 +91,8 @@ class Parameter:
             return
         entries = list(given) if self.is_array else [given]
         if not all(_is(entry, self.type) for entry in entries):
-            yield mismatch + _remedy(entries, self.type)
+            lacks_point = self.type is float and all(_is(entry, int | float) for entry in entries)
+            yield mismatch + (', with a decimal point' if lacks_point else '')
             return
         if not (entries or self.omittable or self.length):
             yield f'{self.name}: got an empty list, but at least one entry is needed'
@@ -140,6 +141,15 @@ non_negative = functools.partial(parameter, at_least=0.0)
 def parameters(cls: Any) -> tuple[Parameter, ...]:
     """Return every parameter of a configuration, in the order of declaration, by dotted name."""
     return _parameters(cls)
+
+
+@functools.cache
+def _parameters(cls: Any) -> tuple[Parameter, ...]:
+    return tuple(
+        dataclasses.replace(each, name=f'{name}.{each.name}' if each is not param else name)
+        for name, param in _fields(cls).items()
+        for each in ([param] if isinstance(param, Parameter) else _parameters(param))
+    )
 
 
 def flatten(config: object) -> dict[str, Value]:
@@ -197,24 +207,13 @@ def change(config: Config, given: Mapping[str, object], source: str = '') -> Con
 
 def unknown(name: str, known: Iterable[str]) -> str:
     """Return the problem for an unknown name, suggesting the closest known one."""
-    close = difflib.get_close_matches(name, known, n=1)
-    if not close:
-        close = [other for other in known if other.rsplit('.', 1)[-1] == name.rsplit('.', 1)[-1]]
-    return f'{name}: unknown parameter' + (f', did you mean {close[0]}?' if close else '')
+    return f'{name}: unknown parameter{suggestion(name, known)}'
 
 
-def counted(count: int, single: str, many: str) -> str:
-    """Return a number with its noun, such as `1 entry`."""
-    return f'{count} {single if count == 1 else many}'
-
-
-@functools.cache
-def _parameters(cls: Any) -> tuple[Parameter, ...]:
-    return tuple(
-        dataclasses.replace(each, name=f'{name}.{each.name}' if each is not param else name)
-        for name, param in _fields(cls).items()
-        for each in ([param] if isinstance(param, Parameter) else _parameters(param))
-    )
+def suggestion(name: str, known: Iterable[str], cutoff: float = 0.6) -> str:
+    """Return `, did you mean X?` with the known name that is most like this one, or nothing."""
+    close = difflib.get_close_matches(name, known, n=1, cutoff=cutoff)
+    return f', did you mean {close[0]}?' if close else ''
 
 
 @functools.cache
@@ -257,11 +256,10 @@ def _length_problems(param: Parameter, values: Mapping[str, Any]) -> Iterator[st
             name if name.isdigit() else f'{count} of {name}'
             for count, name in zip(counts, param.length, strict=True)
         )
-        entries = counted(length, 'entry', 'entries')
-        yield f'{param.name}: got {entries}, but {needed} are needed ({factors})'
+        yield f'{param.name}: got {length}, but {needed} entries are needed ({factors})'
 
 
-def _is(value: object, type_: type) -> bool:
+def _is(value: object, type_: Any) -> bool:
     return isinstance(value, type_) and (type_ is bool or not isinstance(value, bool))
 
 
@@ -271,18 +269,6 @@ def _shown(value: object) -> str:
     if isinstance(value, bool):
         return 'true' if value else 'false'
     return 'nothing' if value is None else repr(value)
-
-
-def _remedy(entries: list[Any], type_: type) -> str:
-    """Return how to write the value: ROS accepts neither 1 nor '1.0' for 1.0."""
-    for entry in entries:
-        if type_ is float and _is(entry, int):
-            return f': write {float(entry)!r} instead of {entry}'
-        if type_ in (float, int) and isinstance(entry, str):
-            return ': write a number, without quotes'
-        if type_ is str and not isinstance(entry, str):
-            return f": write '{entry}' in quotes"
-    return ''
 
 
 PerJoint: TypeAlias = Annotated[tuple[float, ...], 'joints']

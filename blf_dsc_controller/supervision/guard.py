@@ -467,8 +467,8 @@ class Guard:
         self.silenced = False
         self.has_sample = False
         self._clean = True
-        if not 0.0 < self._safe_torque.last.age < self.config.safety.fade_time:
-            self.watchdog.wait()  # else a torque is fading, which a driver must not hold
+        if self._safe_torque.last.age >= self.config.safety.fade_time:
+            self.watchdog.wait()  # else a torque may have to fade, which a driver must not hold
 
     def _check_running(self) -> None:
         supervisor = self.supervisor
