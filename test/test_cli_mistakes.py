@@ -55,7 +55,7 @@ def test_unwritable_output_path_is_reported(bag, tmp_path, monkeypatch, capfd, c
     if command == 'export':
         place = {'/dev/full': 'full.csv'}.get(place, f'{place}.csv')
     words = [str(bag)] if command in ('report', 'plot', 'recover', 'export') else []
-    options = [place, '--starts', '1'] if command == 'excite' else ['--out', place]
+    options = [place, '--config', 'panda'] if command == 'excite' else ['--out', place]
     assert main([*command.split(), *words, *options]) == 1
     lines = capfd.readouterr().err.splitlines()
     (error,) = (line for line in lines if COMPILING not in line)

@@ -238,25 +238,19 @@ def excite(options: Namespace) -> None:
     """Search for the reference, and write it as a preset."""
     make_room(options.out, force=options.force)
     config = load(locate(options.config), CONTROLLER, ControllerConfig)
+    if config.model != 'urdf':
+        raise BlfDscError(f'{options.config}: got model {config.model}, but a URDF is needed')
     problem = ExcitationProblem(config, options.harmonics, options.radius, options.floor)
     parameters = problem.parameters(search(problem, 0, options.starts))
     for name in ('offset', 'amplitude'):
         parameters[name] = tuple(round(value, _DIGITS) for value in parameters[name])
     before = problem.evaluate({name: getattr(config.reference, name) for name in parameters})
     after = problem.evaluate(parameters)
-    if config.model == 'urdf':
-        figures = (
-            f'a window leaves {100.0 * after.left:.0f} % of the deviation of the prior, in the '
-            f'geometric mean over all directions, instead of {100.0 * before.left:.0f} %'
-        )
-    else:
-        figures = (
-            f'minimum eigenvalue of the excitation matrix {after.lambda_min:.3g}, instead of '
-            f'{before.lambda_min:.3g}'
-        )
     about = (
-        'The reference that excites the learning most within the limits of joints and torque: '
-        f'{figures} with the configured reference. First the cosines, then the sines.'
+        'The reference that excites the learning most within the limits of joints and torque: a '
+        f'window leaves {100.0 * after.left:.0f} % of the deviation of the prior, in the geometric '
+        f'mean over all directions, instead of {100.0 * before.left:.0f} % with the configured '
+        'reference. First the cosines, then the sines.'
     )
     lines = [*textwrap.wrap(about, _WIDTH), options.line]
     reference = {f'reference.{name}': value for name, value in parameters.items()}

@@ -268,18 +268,18 @@ def _add_identification(
 ) -> None:
     option = command(
         'excite',
-        'Find a reference that excites the learning, and write it as a preset. It is the sum of '
-        'sinusoids with the period of the learning window that excites the learning most within '
-        'the joint and torque limits. The links of a URDF arm also keep their distance from each '
-        'other and from the floor.',
+        'Find a reference that excites the learning of an arm from a URDF, and write it as a '
+        'preset. It is the sum of sinusoids with the period of the learning window that excites '
+        'the learning most within the joint and torque limits, with the links clear of each other '
+        'and of the floor.',
         'exciting.yaml --config my.yaml',
         force,
     )
     option('out', type=Path, help='parameter file to write')
-    option('--config', default='recommended', help=_CONFIG)
+    option('--config', required=True, help=_CONFIG)
     option('--harmonics', type=int, default=3, help='number of harmonics of the window (3)')
     option('--starts', type=int, default=4, help='number of searches; the best result is kept (4)')
-    option('--radius', type=float, default=0.07, help='radius of the links of a URDF [m] (0.07)')
+    option('--radius', type=float, default=0.07, help='radius of the links [m] (0.07)')
     option('--floor', type=float, default=0.0, help='height of the floor in the base frame [m] (0)')
     option = command(
         'identify',

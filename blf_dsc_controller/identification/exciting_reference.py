@@ -1,20 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Search for the sum of sinusoids that excites the learning most.
+"""Search for the sum of sinusoids that excites the learning of an arm from a URDF most.
 
 For a reference whose period is the window, the excitation matrix in the steady state is
 
     Phi = 1/tau_d int X_f^T X_f dt,      X_f = [H(q, dq, dq, ddq) | D] after the learning's filter
 
-with the row weights of the learning.  Its eigenvalues mu_i relative to the information R of the
-prior, of which the learning adds a multiple a to Phi (`learning.prior_weight`), measure how well a
-window determines theta.  The search maximises, over offset, cosines and sines of each joint,
-
-    a = 0:  log min mu_i                    the worst-determined combination
-    a > 0:  sum log (1 + mu_i / a)          the log-determinant of (a R)^-1 (Phi + a R)
-
-The second measures how much a window shrinks the uncertainty volume of the prior.  With a prior,
-the worst-determined combination is one that no motion reveals and that is left to the prior:
-maximising the smallest eigenvalue would spend the motion on it.
+with the row weights of the learning, which adds a multiple a R of the prior's information to it.
+The search maximises, over offset, cosines and sines of each joint, the log-determinant of
+(a R)^-1 (Phi + a R): how much a window shrinks the uncertainty volume of the prior.  (The
+worst-determined combination is one that no motion reveals and that is left to the prior.)
 """
 
 from __future__ import annotations
@@ -46,7 +40,6 @@ _SPREAD = 0.2  # standard deviation of a search's initial amplitudes
 class Excitation(NamedTuple):
     """Excitation by a periodic reference in the steady state, and its use of the limits."""
 
-    lambda_min: float  # minimum eigenvalue of Phi, relative to R
     gain: float  # objective of the search
     left: float  # of the prior's deviation after a window, geometric mean over all directions
     ratios: np.ndarray  # (4, n) largest position, velocity, acceleration, torque, over the limit
@@ -63,8 +56,8 @@ class ExcitationProblem:
     """Excitation of a controller as a function of its periodic reference.
 
     `harmonics` is the highest harmonic of the window in the reference.  The torque is computed for
-    the initial estimate, and of a URDF arm also with its payload.  The links of a URDF arm have
-    this radius; the floor is at this height in its base frame [m].
+    the initial estimate, with and without the payload.  The links have this radius; the floor is at
+    this height in the base frame [m].
     """
 
     def __init__(
@@ -72,14 +65,12 @@ class ExcitationProblem:
     ) -> None:
         settings = self._settings = settings_of_config(config)
         self._vector = pack_settings(settings)
-        self._clearance: Clearance | None = None
-        self._guess = np.atleast_2d(settings.initial_estimate)
-        if config.model == 'urdf':
-            chain = config.robot.chain(config.joints)
-            self._clearance = Clearance(chain, radius, floor)
-            self._guess = np.repeat(self._guess, 2, axis=0)
-            load = config.robot.payload * parameters_of(config.robot, chain).load
-            self._guess[1, : settings.p] += load
+        chain = config.robot.chain(config.joints)
+        self._clearance = Clearance(chain, radius, floor)
+        self._guess = np.tile(settings.initial_estimate, (2, 1))
+        self._guess[1, : settings.p] += (
+            config.robot.payload * parameters_of(config.robot, chain).load
+        )
         self._scale = np.linalg.cholesky(prior_covariance(config))
         limits = config.limits
         lower, upper = np.array(limits.position_lower), np.array(limits.position_upper)
@@ -128,15 +119,13 @@ class ExcitationProblem:
         q, dq, ddq = motion.transpose(1, 0, 2)
         torque = np.abs(rows @ self._guess.T).max(axis=2)
         ratios = np.abs(np.stack((q - self._middle, dq, ddq, torque), axis=1)) / self._limits
-        room = self._clearance.room(q) if self._clearance else np.zeros((len(q), 0))
+        room = self._clearance.room(q)
         over = (ratios - 1.0 + _MARGIN, _MARGIN - room)
         excess = sum((np.maximum(each, 0.0) ** 2).sum() for each in over) / len(q)
         mu = np.linalg.eigvalsh(self._relative_excitation(dq, rows))
-        a = self._settings.prior_weight
-        gain = np.log1p(np.maximum(mu, 0.0) / a).sum() if a > 0.0 else np.log(max(mu[0], 1e-12))
+        gain = np.log1p(np.maximum(mu, 0.0) / self._settings.prior_weight).sum()
         left = float(np.exp(-0.5 * gain / len(mu)))
-        most, least = ratios.max(axis=0), room.min(axis=0)
-        return Excitation(float(mu[0]), float(gain), left, most, least, float(excess))
+        return Excitation(float(gain), left, ratios.max(axis=0), room.min(axis=0), float(excess))
 
     def _relative_excitation(self, dq: np.ndarray, rows: np.ndarray) -> np.ndarray:
         """Return L^T Phi L (m, m), R^-1 = L L^T; its eigenvalues are those of Phi relative to R."""
