@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Start the controller with its watchdog, the simulated arm, and, with `bag`, the recorder.
 
-For instance: ros2 launch blf_dsc_controller closed_loop.launch.py mode:=lockstep bag:=run1
+For instance: ros2 launch blf_dsc_controller closed_loop.launch.py config:=noisy bag:=run1
 and for the driver of an arm: ros2 launch blf_dsc_controller closed_loop.launch.py driver:=fr3
 """
 
@@ -24,39 +24,29 @@ DRIVERS = {
     'fr3': ('fr3', 'franka/joint_states', 'fr3_effort_controller/commands'),
     'ur5e': ('ur5e_driver', 'joint_states', 'forward_effort_controller/commands'),
 }
-ARGUMENTS = {  # default, choices and description
+ARGUMENTS = {  # choices and description; the default is empty
     'config': (
-        '',
         None,
-        'parameter file for all nodes, or a preset; empty: that of the driver, or recommended',
+        'parameter file of all nodes, or a preset; empty: of the driver, or recommended',
     ),
-    'driver': (
-        '',
-        ['', *DRIVERS],
-        'driver of an arm, whose topics are used; empty: the simulated arm',
-    ),
-    'mode': (
-        '',
-        ['', 'realtime', 'lockstep'],
-        'step on the wall clock, or wait for each torque; empty: as configured',
-    ),
-    'namespace': ('', None, 'of all nodes; in a file, the key /**/NODE matches any namespace'),
-    'bag': ('', None, 'folder to record into, which must not exist yet; empty: no recording'),
+    'driver': (['', *DRIVERS], 'driver of an arm, whose topics are used; empty: the simulated arm'),
+    'namespace': (None, 'of all nodes; in a file, the key /**/NODE matches any namespace'),
+    'bag': (None, 'folder to record into, which must not exist yet; empty: no recording'),
 }
 
 
 def generate_launch_description() -> LaunchDescription:
     """Declare the arguments; `--show-args` lists them."""
     declared = [
-        DeclareLaunchArgument(name, default_value=default, choices=choices, description=text)
-        for name, (default, choices, text) in ARGUMENTS.items()
+        DeclareLaunchArgument(name, default_value='', choices=choices, description=text)
+        for name, (choices, text) in ARGUMENTS.items()
     ]
     return LaunchDescription([*declared, OpaqueFunction(function=nodes)])
 
 
 def nodes(context: LaunchContext) -> list[Node]:
     """Create the nodes once the arguments are known."""
-    config, robot, mode, namespace, bag = (
+    config, robot, namespace, bag = (
         LaunchConfiguration(name).perform(context) for name in ARGUMENTS
     )
     own = f'{PACKAGE}/commands'  # as other nodes than the controller write it
@@ -66,7 +56,6 @@ def nodes(context: LaunchContext) -> list[Node]:
     file = str(locate(config or of_driver))
     # The first sample must be recorded too, so the loop starts after the recorder subscribes.
     of_loop = {'wait_for_subscribers': 1} if bag else {}
-    of_plant = of_loop | ({'mode': mode} if mode else {})
 
     def node(executable: str, given: dict[str, Any], *, required: bool = True) -> Node:
         return Node(
@@ -84,13 +73,13 @@ def nodes(context: LaunchContext) -> list[Node]:
 
     started = []
     if bag:
-        plant_mode = mode or load(file, f'{namespace}/{PLANT}', PlantConfig).mode
-        clock = 'plant' if is_simulated and plant_mode == 'lockstep' else 'wall'
+        mode = load(file, f'{namespace}/{PLANT}', PlantConfig).mode
+        clock = 'plant' if is_simulated and mode == 'lockstep' else 'wall'
         recorded = {'output': bag, 'clock': clock}
         started.append(node('bag_recorder', recorded, required=is_simulated))
     started.append(node('torque_watchdog', {}, required=False))
     # On an arm, the watchdog outlives a controller that crashes, and both outlive the recorder.
     started.append(node('blf_dsc_controller', of_loop, required=is_simulated))
     if is_simulated:
-        started.append(node('sim_plant', of_plant))
+        started.append(node('sim_plant', of_loop))
     return started

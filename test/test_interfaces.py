@@ -16,26 +16,14 @@ pytest.importorskip('rclpy', reason='needs ROS 2')
 import sros2_graph
 import yaml
 from rclpy.qos import QoSProfile, ReliabilityPolicy
+from ros_rig import simulated
 
-from blf_dsc_controller.configuration.controller import ControllerConfig
-from blf_dsc_controller.configuration.plant import PlantConfig
-from blf_dsc_controller.configuration.schema import build
-from blf_dsc_controller.law.state import sample_of
 from blf_dsc_controller.messages import topics
 from blf_dsc_controller.nodes.controller_node import ControllerNode
 from blf_dsc_controller.nodes.endpoints import message_class
 from blf_dsc_controller.nodes.plant_node import PlantNode
-from blf_dsc_controller.simulation.loop import simulate
 
 CONFIG = Path(__file__).parents[1] / 'config'
-
-
-def alone(**parameters):
-    """Torques of a loop that runs alone."""
-    plant = build(PlantConfig, {'mode': 'lockstep', 'duration': 0.2, **parameters})
-    record = simulate(ControllerConfig(), plant)
-    rows = record.samples
-    return np.array([sample_of(row, record.controller.settings).torque for row in rows])
 
 
 def test_two_arms_in_one_domain_do_not_interfere(ros):
@@ -54,8 +42,8 @@ def test_two_arms_in_one_domain_do_not_interfere(ros):
     ros.until(lambda: all(len(messages) == 201 for messages in received.values()))
     for seed, side in enumerate(received):
         torques = np.array([message.data for message in received[side]])
-        expected = alone(seed=seed, **{'sensor.position_noise': 1e-5})
-        np.testing.assert_array_equal(torques, expected)
+        alone = simulated({'seed': seed, 'duration': 0.2, 'sensor.position_noise': 1e-5})
+        np.testing.assert_array_equal(torques, alone.torque)
     assert not np.array_equal(received['left'][-1].data, received['right'][-1].data)
 
 

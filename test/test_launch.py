@@ -108,8 +108,10 @@ def start(monkeypatch):
 @pytest.mark.parametrize('namespace', ['', 'left'])
 def test_launch_arguments_override_the_parameter_file(launched, start, tmp_path, namespace):
     """A section `/**/NODE` of the preset takes precedence over one for any node."""
-    bag = tmp_path / 'run1'
-    nodes = launched(mode='lockstep', bag=str(bag), namespace=namespace)
+    bag, file = tmp_path / 'run1', tmp_path / 'my.yaml'
+    given = '{mode: lockstep, wait_for_subscribers: 0}'
+    file.write_text(f'/**/sim_plant:\n  ros__parameters: {given}\n')
+    nodes = launched(config=str(file), bag=str(bag), namespace=namespace)
     by_name = {node.name: node for node in nodes}
     assert by_name.keys() == NODES.keys()
     plant = start(*arguments_of(by_name['sim_plant'], tmp_path))

@@ -7,7 +7,6 @@
 from __future__ import annotations
 
 import os
-from contextlib import suppress
 
 import numpy as np
 import pytest
@@ -27,7 +26,6 @@ from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.plant import PlantConfig
 from blf_dsc_controller.messages.codecs import Float64MultiArrayEncoder, JointStateEncoder
 from blf_dsc_controller.nodes.controller_node import ControllerNode
-from blf_dsc_controller.nodes.parameters import FixedParameterError
 from blf_dsc_controller.nodes.plant_node import PlantNode
 
 EXAMPLES = 2_000 if os.environ.get('NIGHTLY') else 60
@@ -138,8 +136,7 @@ def apply_event(node, kind, content):
         if not node.has_parameter(name):  # of the other node
             return
         typed = Parameter(name, value=value) if value != [] else Parameter(name)
-        with suppress(FixedParameterError):  # which the service passes on
-            node.set_parameters_atomically([typed])
+        node.set_parameters_atomically([typed])
 
 
 @pytest.mark.usefixtures('bystander')

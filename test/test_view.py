@@ -18,9 +18,8 @@ from blf_dsc_controller.cli.main import main
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.errors import BlfDscError, MissingExtraError
 from blf_dsc_controller.view import page as pages
-from blf_dsc_controller.view.arm import ShownArm, known_model
 from blf_dsc_controller.view.node import plant_events
-from blf_dsc_controller.view.page import Page, Snapshot
+from blf_dsc_controller.view.page import Page, ShownArm, Snapshot, known_model
 
 HOST = '127.0.0.1'
 PORT = 18080

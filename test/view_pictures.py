@@ -19,6 +19,8 @@ from ros_rig import RosRig
 
 from blf_dsc_controller.configuration.nodes import load_loop
 from blf_dsc_controller.configuration.schema import flatten
+from blf_dsc_controller.nodes.controller_node import ControllerNode
+from blf_dsc_controller.nodes.plant_node import PlantNode
 from blf_dsc_controller.view.node import ViewNode
 
 TIMES = np.arange(17.0, 26.0, 0.25)  # s; it picks up 2 kg at 20 s
@@ -28,20 +30,28 @@ WINDOW = (1200, 880)
 NOTICE = "document.querySelectorAll('[class*=Notification]').forEach(each => each.remove())"
 
 
+def advance(ros, arm, view, end):
+    """Let the loop run until this time [s], with as many snapshots as in real time."""
+    while not view.past or view.past[-1].time < end:
+        ros.run(arm, 33)
+        view.update()
+
+
 def pictures():
     """Yield screenshots of the page at each of `TIMES`."""
     ros, loop = RosRig(), load_loop('panda')
     try:
         view = ros.add(ViewNode, port=18380)
-        ros.loop(flatten(loop.plant), flatten(loop.controller))
-        ros.until(lambda: view.past and view.past[-1].time >= TIMES[0])
+        arm = ros.add(PlantNode, flatten(loop.plant) | {'mode': 'lockstep'})
+        ros.add(ControllerNode, flatten(loop.controller))
+        advance(ros, arm, view, TIMES[0])
         with chromium.opened(*WINDOW, chromium.WEBGL) as (page, _):
             page.goto(view.page.url)
             page.wait_for_function("(document.body?.innerText ?? '').includes('torque')")
             time.sleep(10 * SETTLE)  # the page fades in
             page.evaluate(NOTICE)
             for at in TIMES:
-                ros.until(lambda at=at: view.past[-1].time >= at)
+                advance(ros, arm, view, at)
                 view.page.plot(list(view.past))
                 time.sleep(SETTLE)
                 yield Image.open(io.BytesIO(page.screenshot())).convert('RGB')

@@ -7,13 +7,7 @@ import sys
 from collections.abc import Callable
 from typing import Any, TypeVar
 
-from rcl_interfaces.msg import (
-    FloatingPointRange,
-    IntegerRange,
-    ParameterDescriptor,
-    SetParametersResult,
-)
-from rclpy.exceptions import ParameterNotDeclaredException
+from rcl_interfaces.msg import ParameterDescriptor, SetParametersResult
 from rclpy.node import Node
 from rclpy.parameter import Parameter as RosParameter
 from rclpy.wait_for_message import wait_for_message
@@ -36,22 +30,6 @@ from blf_dsc_controller.nodes.process import assigned, check_sections
 
 Config = TypeVar('Config')
 
-_RANGES: dict[type, tuple[str, type[Any], type[Any], Any]] = {
-    float: ('floating_point_range', FloatingPointRange, float, sys.float_info.max),
-    int: ('integer_range', IntegerRange, int, 2**63 - 1),
-}
-
-
-class FixedParameterError(ParameterNotDeclaredException):
-    """Refusal to change a parameter that is fixed at the start.
-
-    rclpy refuses it before it asks any callback that can give a reason, but passes the text of its
-    own exception on to `ros2 param set`.
-    """
-
-    def __init__(self, parameter: Parameter) -> None:
-        Exception.__init__(self, f'{parameter.name} is {_fixed(parameter)}')
-
 
 def declare(node: Node, cls: type[Config]) -> Config:
     """Declare all parameters of a configuration, and return the one the node was started with.
@@ -64,36 +42,24 @@ def declare(node: Node, cls: type[Config]) -> Config:
         given['robot.urdf'] = wait_for_description(node, given['robot.urdf'].removeprefix(TOPIC))
     config = build(cls, given, node.get_fully_qualified_name())
     values = flatten(config)
+    initial = []
     for parameter in parameters(cls):
-        value = values[parameter.name]
-        if value == ():
-            _declare_empty(node, parameter)
-        else:
-            typed = list(value) if isinstance(value, tuple) else value
-            described = descriptor(parameter)
-            node.declare_parameter(parameter.name, typed, described, ignore_override=True)
+        # By its type, since rclpy would take an empty list for one of bytes.
+        name, kind = parameter.name, RosParameter.Type[parameter.ros_type]
+        node.declare_parameter(name, kind, descriptor(parameter), ignore_override=True)
+        value = values[name]
+        initial.append(RosParameter(name, kind, list(value) if isinstance(value, tuple) else value))
+    node.set_parameters_atomically(initial)
     fixed = {parameter.name: parameter for parameter in parameters(cls) if parameter.read_only}
 
-    def refuse_fixed(requested: list[RosParameter]) -> list[RosParameter]:
-        for each in requested:
-            if each.name in fixed:
-                raise FixedParameterError(fixed[each.name])
-        return requested
+    def refuse_fixed(requested: list[RosParameter]) -> SetParametersResult:
+        names = [each.name for each in requested if each.name in fixed]
+        reasons = [f'{name} is {_fixed(fixed[name])}' for name in names]
+        return SetParametersResult(successful=not reasons, reason='\n'.join(reasons))
 
-    node.add_pre_set_parameters_callback(refuse_fixed)
+    # With `read_only` in their descriptors, rclpy would refuse them without the reason.
+    node.add_on_set_parameters_callback(refuse_fixed)
     return config
-
-
-def _declare_empty(node: Node, parameter: Parameter) -> None:
-    """Declare an empty list by its type, since rclpy would infer a list of bytes.
-
-    It is set as well: if any of several requested parameters is unset, rclpy's response is empty.
-    """
-    kind, described = RosParameter.Type[parameter.ros_type], descriptor(parameter)
-    node.declare_parameter(parameter.name, kind, ignore_override=True)
-    node.set_parameters([RosParameter(parameter.name, kind, [])])
-    described.type = kind.value
-    node.set_descriptor(parameter.name, described)
 
 
 def read(node: Node, cls: type[Config]) -> Config:
@@ -139,24 +105,15 @@ def on_change(
 def descriptor(parameter: Parameter) -> ParameterDescriptor:
     """Return what `ros2 param describe` shows for a parameter.
 
-    ROS only has inclusive ranges, so an excluded limit is rejected by `build` alone.
+    Its range is told as a constraint, since those of ROS are inclusive, and not for lists.
     """
     symbol = f'{parameter.symbol}: ' if parameter.symbol else ''
     unit = f' [{parameter.unit}]' if parameter.unit else ''
     fixed = _fixed(parameter) if parameter.read_only else ''
-    described = ParameterDescriptor(
+    return ParameterDescriptor(
         description=f'{symbol}{parameter.description}{unit}',
-        read_only=bool(parameter.read_only),
         additional_constraints='; '.join(filter(None, (parameter.constraints, fixed))),
     )
-    low = parameter.above if parameter.at_least is None else parameter.at_least
-    high = parameter.below if parameter.at_most is None else parameter.at_most
-    if parameter.type in _RANGES and not parameter.is_array and (low, high) != (None, None):
-        name, message, number, largest = _RANGES[parameter.type]
-        from_value = -largest if low is None else number(low)
-        to_value = largest if high is None else number(high)
-        setattr(described, name, [message(from_value=from_value, to_value=to_value)])
-    return described
 
 
 def _fixed(parameter: Parameter) -> str:

@@ -90,24 +90,21 @@ class TrajectoryInput:
             self._reject(error)
 
     def _on_trajectory(self, raw: bytes) -> None:
-        try:
-            self._take(raw)
-        except Exception as error:  # noqa: BLE001 - the current reference continues
-            self._reject(error)
-
-    def _take(self, raw: bytes) -> None:
         guard = self._guard()
         if guard is None:
-            raise TrajectoryError(['the controller is not configured'])
-        if len(raw) > self._largest:
+            self._reject(TrajectoryError(['the controller is not configured']))
+        elif len(raw) > self._largest:
             problem = f'it has {len(raw)} bytes, more than {MOST_POINTS} points can have'
-            raise TrajectoryError([f'{problem}: send it in pieces'])
-        if not guard.watchdog.on:
-            self._adopt(guard, guard.plan(_trajectory(raw, guard.start_stamp)))
-            return
-        if self.job is not None:
-            self._reject(TrajectoryError(['a newer one arrived while it was being planned']))
-        self._submit(guard, raw, _LEAD)
+            self._reject(TrajectoryError([f'{problem}: send it in pieces']))
+        elif guard.watchdog.on:
+            if self.job is not None:
+                self._reject(TrajectoryError(['a newer one arrived while it was being planned']))
+            self._submit(guard, raw, _LEAD)
+        else:
+            try:
+                self._adopt(guard, guard.plan(_trajectory(raw, guard.start_stamp)))
+            except Exception as error:  # noqa: BLE001 - the current reference continues
+                self._reject(error)
 
     def _submit(self, guard: Guard, raw: bytes, lead: float) -> None:
         start, at = guard.start_stamp, guard.time + lead

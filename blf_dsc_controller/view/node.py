@@ -19,7 +19,7 @@ from rclpy.serialization import deserialize_message
 
 from blf_dsc_controller.analysis.report import LEVELS
 from blf_dsc_controller.configuration.controller import ControllerConfig
-from blf_dsc_controller.configuration.nodes import VIEW, ViewConfig, is_builtin
+from blf_dsc_controller.configuration.nodes import VIEW, ViewConfig
 from blf_dsc_controller.configuration.schema import build
 from blf_dsc_controller.law.factory import estimate_names
 from blf_dsc_controller.messages import topics
@@ -102,9 +102,13 @@ class ViewNode(PlainNode):
         self._silent = 0 if has_state else self._silent + 1
         self.page.state(*self._health())
         self.page.events(list(self._events))
-        clients = frozenset(self.page.server.get_clients())
-        if self.past and (has_state or clients != self._clients_seen):
-            self._draw(clients)
+        before, self._clients_seen = self._clients_seen, frozenset(self.page.server.get_clients())
+        is_new = before != self._clients_seen
+        if self.past and self._clients_seen and (has_state or is_new):
+            self._pictures += 1
+            self.page.move(list(self.past))
+            if self._pictures % _PLOTTED == 0 or is_new:
+                self.page.plot(list(self.past))
 
     def _health(self) -> tuple[str, str]:
         """Return the state of the controller, or that it or the arm has gone silent."""
@@ -114,15 +118,6 @@ class ViewNode(PlainNode):
             if not self.count_publishers(topic.relative):
                 return 'ERROR', f'the {node} is gone: {topic.relative} is no longer published'
         return self._state[0], f'{self._state[1]} (no joint states received)'
-
-    def _draw(self, clients: frozenset[int]) -> None:
-        self._pictures += 1
-        past = list(self.past)
-        if clients:
-            self.page.move(past)
-            if self._pictures % _PLOTTED == 0 or clients != self._clients_seen:
-                self.page.plot(past)
-        self._clients_seen = clients
 
     # Events.
 
@@ -147,8 +142,7 @@ class ViewNode(PlainNode):
         """Follow the controller's journal, which begins with all its parameters."""
         content = event.content
         if event.type is EventType.CONFIGURE:
-            values = {k: v for k, v in content['parameters'].items() if not is_builtin(k)}
-            self._configure(build(ControllerConfig, values))
+            self._configure(build(ControllerConfig, content['parameters']))
             return
         if event.type is EventType.START:
             self._start, self._noted = event.stamp, -1.0

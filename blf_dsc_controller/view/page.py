@@ -6,15 +6,18 @@ viser serves the page with everything that the browser needs: nothing is loaded 
 
 from __future__ import annotations
 
-import contextlib
 import importlib.util
 import io
+import logging
 import os
 import socket
+import sysconfig
 import time
 from collections.abc import Mapping, Sequence
+from contextlib import redirect_stdout, suppress
 from html import escape
 from math import inf
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -22,16 +25,21 @@ import numpy as np
 from blf_dsc_controller.analysis.metrics import bodies_of, errors_of_bodies
 from blf_dsc_controller.analysis.panels import ALARM, COLOURS, GREEN, INK, MUTED, ORANGE
 from blf_dsc_controller.arms.geometry import frames
+from blf_dsc_controller.arms.two_link import urdf
+from blf_dsc_controller.arms.urdf import Chain, read_chain
 from blf_dsc_controller.configuration.controller import ControllerConfig
+from blf_dsc_controller.configuration.files import resolve
 from blf_dsc_controller.errors import BlfDscError, MissingExtraError
 from blf_dsc_controller.law.factory import estimate_names, prior_covariance
 from blf_dsc_controller.law.telemetry import load_text
 from blf_dsc_controller.run import Floats
-from blf_dsc_controller.view.arm import ShownArm, arm_of
 
 PAST = 20.0
 """Time span of the plots [s]."""
 
+_THICKNESS = 0.025  # radius of a link relative to the length of all links
+_SHORTEST = 1e-3  # m, length below which a link is not drawn
+_SAME = 1e-3  # m and of rotation matrices, between two URDFs of the same arm
 _TRAIL = 4.0  # s of the tip's path
 _EVENTS = 12
 _MESH = 5000  # faces of a shape from which on it is a mesh with colours of its own
@@ -52,8 +60,6 @@ _SHEET = (
     '<style>@media (max-width:36em){[style*="width: 20em"]'
     '{width:100%!important;max-height:50vh!important}}</style>'
 )
-_CELL = 'padding:1px 4px;text-align:right;white-space:nowrap;font-variant-numeric:tabular-nums'
-_TEXT = 'text-align:left;white-space:normal'
 _LEVELS = {'OK': GREEN, 'WARN': ORANGE, 'ERROR': ALARM, 'STALE': MUTED}
 
 
@@ -100,7 +106,7 @@ class Page:
         except OSError as error:
             problem = f'the page cannot be served at {host!r} ({error.strerror})'
             raise BlfDscError(f'{problem}: give an address of this computer') from error
-        with contextlib.redirect_stdout(io.StringIO()):  # hides its banner
+        with redirect_stdout(io.StringIO()):  # hides its banner
             self.server = viser.ViserServer(host, port, label='blf_dsc', verbose=False)
         self.url = f'http://{host}:{self.server.get_port()}'
         self._events: list[tuple[float, str, str]] = []
@@ -157,7 +163,7 @@ class Page:
             ]
             self._caption = gui.add_html('')
         with tabs.add_tab('Events'):
-            self._list = gui.add_html(event_table(self._events))
+            self._list = gui.add_html(event_list(self._events))
 
     def _plot(
         self, title: str, names: Sequence[str], y: Mapping[str, Any] = _AUTO, limit: str = ''
@@ -193,7 +199,7 @@ class Page:
         if self._events != list(events[-_EVENTS:]):
             self._events = list(events[-_EVENTS:])
             if self._list is not None:
-                self._list.content = event_table(self._events)
+                self._list.content = event_list(self._events)
 
     def move(self, past: Sequence[Snapshot]) -> None:
         """Move the arm to the last of these snapshots."""
@@ -274,7 +280,7 @@ class Page:
 
     def close(self) -> None:
         """Stop the server."""
-        with contextlib.redirect_stdout(io.StringIO()):  # hides its message
+        with redirect_stdout(io.StringIO()):  # hides its message
             self.server.stop()
 
 
@@ -312,14 +318,105 @@ def _hangs(arm: ShownArm) -> bool:
 def caption(now: Snapshot) -> str:
     """Return the time, and what the tip holds, as a line of the page."""
     held = f', held: {load_text(now.load)}' if np.isfinite(now.load[0]) else ''
-    return f'<div style="{_CELL};{_TEXT}">t = {now.time:.2f} s{held}</div>'
+    return f'<div style="margin:4px">t = {now.time:.2f} s{held}</div>'
 
 
-def event_table(events: Sequence[tuple[float, str, str]]) -> str:
-    """Return the table of events, the last one first."""
-    rows = ''.join(
-        f'<tr><td style="{_CELL}">{t:.2f} s</td><td style="{_CELL}"><b>{escape(kind)}</b></td>'
-        f'<td style="{_CELL};{_TEXT}">{escape(text)}</td></tr>'
+def event_list(events: Sequence[tuple[float, str, str]]) -> str:
+    """Return the lines of events, the last one first."""
+    return ''.join(
+        f'<div style="margin:4px">{t:.2f} s <b>{escape(kind)}</b> {escape(text)}</div>'
         for t, kind, text in reversed(events)
     )
-    return f'<table style="font-size:11px;margin:4px">{rows}</table>'
+
+
+# The arm: the shapes of its URDF, else known meshes, else cylinders.
+
+
+class ShownArm(NamedTuple):
+    """The text of a URDF and the chain of its controlled joints."""
+
+    text: str
+    chain: Chain
+
+    @property
+    def reach(self) -> float:
+        """Total length of all links [m]."""
+        offsets = [joint.placement[:3, 3] for joint in self.chain.joints]
+        steps = np.array([*offsets, self.chain.tip_placement[:3, 3]])
+        return float(np.linalg.norm(steps, axis=1).sum())
+
+    def model(self) -> Any:
+        """Return the yourdfpy model with the first shapes found: meshes, others, cylinders."""
+        has_meshes = '<mesh' in self.text
+        model = _load(self.text if has_meshes else known_model(self.text, self.chain))
+        if not model.scene.geometry:
+            _add_cylinders(model, _THICKNESS * self.reach)
+        return model
+
+
+def arm_of(config: ControllerConfig, plant: Mapping[str, Any]) -> ShownArm:
+    """Return the arm of a controller; planar links have the lengths of its plant, if known."""
+    robot = config.robot
+    if config.model == 'urdf':
+        return ShownArm(robot.text, robot.chain(config.joints))
+    lengths = [plant.get(name, config.arm.l1) for name in ('arm.l1', 'arm.l2')]
+    text = urdf('arm', config.joints, lengths, (1.0, 1.0), (0.0, 0.0))
+    return ShownArm(text, read_chain(text, '', 'tip', config.joints))
+
+
+def known_model(text: str, chain: Chain) -> str:
+    """Return the URDF with meshes that the wheel `example-robot-data` has of an arm, else its own.
+
+    The same arm has the same joints, in the same places.
+    """
+    names = tuple(joint.name for joint in chain.joints)
+    for path in sorted(_installed('example-robot-data').glob('robots/*/urdf/*.urdf')):
+        known = path.read_text(encoding='utf-8')
+        if not all(f'"{name}"' in known for name in names):
+            continue
+        with suppress(BlfDscError):
+            joints = read_chain(known, chain.base, chain.joints[-1].link, names).joints
+            pairs = zip(joints, chain.joints, strict=True)
+            if all(np.allclose(a.placement, b.placement, atol=_SAME) for a, b in pairs):
+                return known
+    return text
+
+
+def _installed(package: str) -> Path:
+    """Return the folder of a description that is installed as a wheel."""
+    return Path(sysconfig.get_path('purelib'), 'cmeel.prefix', 'share', package)
+
+
+def _add_cylinders(model: Any, radius: float) -> None:
+    """Draw a cylinder of this radius [m] between joints, a ball at each joint that moves."""
+    import trimesh
+
+    def add(shape: Any, joint: str, link: str) -> None:
+        name = f'{joint} {link}'
+        model.scene.add_geometry(shape, node_name=name, geom_name=name, parent_node_name=link)
+
+    for joint in model.robot.joints:
+        end = model.get_transform(joint.child, joint.parent)[:3, 3]
+        if np.linalg.norm(end) > _SHORTEST:
+            cylinder = trimesh.creation.cylinder(radius, segment=(np.zeros(3), end))
+            add(cylinder, joint.name, joint.parent)
+        if joint.type != 'fixed':
+            add(trimesh.creation.icosphere(radius=1.6 * radius), joint.name, joint.child)
+
+
+def _load(text: str) -> Any:
+    import yourdfpy
+
+    logging.getLogger('yourdfpy').setLevel(logging.ERROR)  # it warns about missing meshes
+    model = yourdfpy.URDF.load(io.BytesIO(text.encode()), filename_handler=_file)
+    for joint in model.robot.joints:
+        if joint.axis is not None:  # yourdfpy scales prismatic motion by its length
+            joint.axis = joint.axis / np.linalg.norm(joint.axis)
+    return model
+
+
+def _file(fname: str) -> str:  # yourdfpy prescribes the argument's name
+    with suppress(BlfDscError, OSError):
+        return str(resolve(fname.removeprefix('file://')))
+    package, _, rest = fname.removeprefix('package://').partition('/')
+    return str(_installed(package) / rest)
