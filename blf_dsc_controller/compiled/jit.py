@@ -22,10 +22,10 @@ import os
 import shutil
 import sys
 import tempfile
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, suppress
 from pathlib import Path
-from types import FunctionType, ModuleType
+from types import ModuleType
 from typing import Any, TypeVar, cast
 
 import numba
@@ -75,50 +75,32 @@ if not _chosen and all(map(get_host_cpu_features().get, _X86_64_V3)):
     # The same code for all these processors, about as fast, so that kernels can be shipped.
     config.CPU_NAME, config.CPU_FEATURES = 'x86-64-v3', ''
 
-_PACKAGES = ('blf_dsc_controller.', 'sim_plant.')
 _ROOM = Path(__file__).resolve().parents[1]
 # Layouts and arm models reach a kernel through the types of its arguments.
 _IN_EVERY_KERNEL = (*_ROOM.glob('compiled/*.py'), *_ROOM.glob('arms/*.py'))
-_METHODS: dict[str, list[Callable[..., object]]] = {}  # by name, see `compile_methods`
+_COMPILED: dict[str, set[str]] = {}
+"""Modules with functions for kernels, each with those of the types whose methods it calls."""
 
 
 def dependencies(function: Callable[..., object]) -> tuple[set[Path], set[str]]:
-    """Return the source files of a kernel, and the constants in it as `name=value`.
+    """Return the source files of a kernel, and the constants in them as `name=value`.
 
-    The kernel itself may be outside the package, and so may methods of `compile_methods`.
+    They are those of its module, of the modules with functions for kernels that this one imports,
+    and so on.
     """
-    function = getattr(function, 'py_func', function)
-    files, constants = set(_IN_EVERY_KERNEL), set()
-    pending: list[tuple[str, Any]] = [('', function)]
-    compiled_in = {id(method) for methods in _METHODS.values() for method in methods}
-    compiled_in.add(id(function))
-    seen: list[object] = []
+    pending, modules, constants = [function.__module__], set(), set()
     while pending:
-        name, value = pending.pop()
-        value = getattr(value, 'py_func', value)
-        if isinstance(value, (int, float, str, tuple)):
-            constants.add(f'{name}={value!r}')
-        module = getattr(value, '__module__', None) or ''
-        ours = id(value) in compiled_in or module.startswith(_PACKAGES)
-        if not ours or any(value is other for other in seen):
-            continue
-        seen.append(value)
-        files.add(Path(inspect.getfile(sys.modules[module])).resolve())
-        if isinstance(value, FunctionType):
-            pending.extend(_globals_of(value))
-    return files, constants
-
-
-def _globals_of(function: FunctionType) -> Iterator[tuple[str, object]]:
-    """Yield the globals that a function uses, and what it uses of the package's modules."""
-    names = function.__code__.co_names
-    for name in names:
-        value = function.__globals__.get(name)
-        yield name, value
-        yield from ((name, method) for method in _METHODS.get(name, ()))
-        if isinstance(value, ModuleType) and value.__name__.startswith(_PACKAGES):
-            for attribute in names:
-                yield f'{value.__name__}.{attribute}', getattr(value, attribute, None)
+        module = pending.pop()
+        modules.add(module)
+        uses = set(_COMPILED.get(module, ()))
+        for name, value in vars(sys.modules[module]).items():
+            is_module = isinstance(value, ModuleType)
+            uses.add(value.__name__ if is_module else getattr(value, '__module__', ''))
+            if isinstance(value, (int, float, tuple)):
+                constants.add(f'{name}={value!r}')
+        pending.extend(uses & _COMPILED.keys() - modules)
+    files = {Path(inspect.getfile(sys.modules[module])).resolve() for module in modules}
+    return {*_IN_EVERY_KERNEL, *files}, constants
 
 
 def cache_folder(function: Callable[..., object]) -> Path:
@@ -159,12 +141,14 @@ def _contents(source: Path) -> bytes:
 
 def inner(function: F) -> F:
     """Let kernels call `function`, which is compiled into them; in Python it is unchanged."""
+    _COMPILED.setdefault(function.__module__, set())
     register_jitable(**INLINED)(function)
     return function
 
 
 def called(function: F) -> F:
     """Let kernels call `function` without inlining it: large functions compile faster this way."""
+    _COMPILED.setdefault(function.__module__, set())
     register_jitable(**INLINED | {'forceinline': False})(function)
     return function
 
@@ -174,8 +158,11 @@ def compile_methods(interface: type, names: Sequence[str], *types: type) -> None
 
     `interface` declares them, `types` implement them; a kernel depends on the files of all types.
     """
+    uses = _COMPILED.setdefault(interface.__module__, set())
+    for module in (type_.__module__ for type_ in types):
+        _COMPILED.setdefault(module, set())
+        uses.add(module)
     for name in names:
-        _METHODS.setdefault(name, []).extend(getattr(type_, name) for type_ in types)
         _compile_method(name, inspect.signature(getattr(interface, name)))
 
 
