@@ -16,8 +16,8 @@ from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.law import barrier
 from blf_dsc_controller.law.controller import Controller
 from blf_dsc_controller.law.factory import settings_of_config
-from blf_dsc_controller.law.settings import Settings
 from blf_dsc_controller.law.state import (
+    Settings,
     Signals,
     State,
     signals_of,

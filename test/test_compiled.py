@@ -34,7 +34,7 @@ def sources(*names):
     return {f'{PACKAGE.name}/{name}.py' for name in names}
 
 
-LAW = sources('law/barrier', 'law/prediction', 'law/controller', 'law/settings', 'reference/terms')
+LAW = sources('law/barrier', 'law/prediction', 'law/controller', 'law/state', 'reference/terms')
 PLANT = {f'sim_plant/{name}.py' for name in ('arm', 'kernels', 'motion')}
 ALWAYS = sources('compiled/layout', 'arms/two_link')
 

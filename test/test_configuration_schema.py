@@ -13,7 +13,7 @@ from blf_dsc_controller.configuration.nodes import NODES, RecorderConfig, load_l
 from blf_dsc_controller.configuration.plant import PlantConfig
 from blf_dsc_controller.configuration.schema import build, change, flatten, parameters
 from blf_dsc_controller.errors import ConfigurationError
-from blf_dsc_controller.law import factory, settings
+from blf_dsc_controller.law import factory, state
 
 TRUE_MODEL = {'law': 'model_based', 'truth.parameters': [1.0, 0.32, 0.4]}
 PLANT, CONTROLLER, BOTH = (PlantConfig,), (ControllerConfig,), (PlantConfig, ControllerConfig)
@@ -201,7 +201,7 @@ def test_models_and_choices_match_the_law():
     for law in choices['law']:
         factory.settings_of_config(build(ControllerConfig, TRUE_MODEL | {'law': law}))
     for name in ('prediction', 'update', 'compensation'):
-        assert sorted(choices[f'learning.{name}']) == sorted(settings.CHOICES[name])
+        assert sorted(choices[f'learning.{name}']) == sorted(state.CHOICES[name])
 
 
 @pytest.mark.parametrize('cls', NODES.values(), ids=NODES)

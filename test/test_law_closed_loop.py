@@ -14,7 +14,7 @@ from scipy.integrate import solve_ivp
 
 from blf_dsc_controller.compiled import cholesky
 from blf_dsc_controller.law.factory import controller_of
-from blf_dsc_controller.law.settings import CHOICES
+from blf_dsc_controller.law.state import CHOICES
 
 BOUND = 2e-3  # rad
 

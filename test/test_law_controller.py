@@ -19,7 +19,7 @@ from paper_case import NO_DISTURBANCE, P, configured, run
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.schema import build
 from blf_dsc_controller.law.factory import columns_of, settings_of_config
-from blf_dsc_controller.law.settings import CHOICES
+from blf_dsc_controller.law.state import CHOICES
 
 NOISY = {'position_noise': 1e-5, 'sensor.velocity': 'differenced', 'delay': 2}
 

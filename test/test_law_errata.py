@@ -15,7 +15,7 @@ from blf_dsc_controller.compiled import cholesky
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.errors import StartError
 from blf_dsc_controller.law import adaptation, barrier
-from blf_dsc_controller.law.settings import CHOICES, FILTERED
+from blf_dsc_controller.law.state import CHOICES, FILTERED
 from blf_dsc_controller.reference.approach import check_takeover
 
 

@@ -12,7 +12,7 @@ from plants import QUIET
 from scipy.signal import cont2discrete
 
 from blf_dsc_controller.law import prediction
-from blf_dsc_controller.law.settings import CHOICES
+from blf_dsc_controller.law.state import CHOICES
 
 BIAS = (0.3, -0.2)
 

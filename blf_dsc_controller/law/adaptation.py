@@ -29,8 +29,7 @@ from blf_dsc_controller.compiled import cholesky
 from blf_dsc_controller.compiled.jit import inner
 from blf_dsc_controller.compiled.layout import Array, part
 from blf_dsc_controller.law import friction, torque
-from blf_dsc_controller.law.settings import NEWTON, Settings
-from blf_dsc_controller.law.state import Signals, State
+from blf_dsc_controller.law.state import NEWTON, Settings, Signals, State
 
 _ON_SPHERE = 1.0 - 1e-12  # of radius^2: `retract` ends within rounding of the sphere
 _ROUNDED = 1.0 + 1e-14

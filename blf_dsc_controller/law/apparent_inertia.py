@@ -23,8 +23,7 @@ import numpy as np
 
 from blf_dsc_controller.compiled.jit import inner
 from blf_dsc_controller.law import barrier
-from blf_dsc_controller.law.settings import Settings
-from blf_dsc_controller.law.state import Signals, State
+from blf_dsc_controller.law.state import Settings, Signals, State
 
 _SMOOTH = 0.5  # upper end of the band, times the sample rate
 _SLOW = 0.06  # lower end, likewise

@@ -28,8 +28,7 @@ from math import pi
 
 from blf_dsc_controller.compiled.elementary import cos, exp, sin
 from blf_dsc_controller.compiled.jit import inner
-from blf_dsc_controller.law.settings import LINEAR, Settings
-from blf_dsc_controller.law.state import Signals, State
+from blf_dsc_controller.law.state import LINEAR, Settings, Signals, State
 
 _BISECTIONS = 60
 

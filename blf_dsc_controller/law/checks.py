@@ -11,8 +11,7 @@ from typing import Annotated, NamedTuple
 
 from blf_dsc_controller.compiled.jit import inner
 from blf_dsc_controller.compiled.layout import Array, Cell, size_of, view_of
-from blf_dsc_controller.law.settings import LINEAR, Settings
-from blf_dsc_controller.law.state import Sample, Signals, State
+from blf_dsc_controller.law.state import LINEAR, Sample, Settings, Signals, State
 
 SUSPECT = 1
 """A value that is not finite, a torque demand past its limit, or too large an error."""

@@ -35,13 +35,16 @@ from blf_dsc_controller.law.checks import (
     is_valid_state,
 )
 from blf_dsc_controller.law.lyapunov import fill_energies
-from blf_dsc_controller.law.settings import FILTERED, REFERENCE, Settings, settings_of
 from blf_dsc_controller.law.state import (
+    FILTERED,
+    REFERENCE,
     Sample,
+    Settings,
     Signals,
     State,
     sample_of,
     sample_size,
+    settings_of,
     signals_of,
     signals_size,
     state_of,

@@ -29,8 +29,7 @@ from blf_dsc_controller.compiled import cholesky
 from blf_dsc_controller.compiled.jit import inner
 from blf_dsc_controller.compiled.layout import Array
 from blf_dsc_controller.law import adaptation, window
-from blf_dsc_controller.law.settings import Settings
-from blf_dsc_controller.law.state import Signals, State
+from blf_dsc_controller.law.state import Settings, Signals, State
 
 _WARM = 4  # inverse iterations from the previous direction
 _COLD = 60  # from an arbitrary direction

@@ -35,7 +35,7 @@ from blf_dsc_controller.configuration.robot import drive_model, parameters_of
 from blf_dsc_controller.configuration.schema import parameters
 from blf_dsc_controller.law import barrier
 from blf_dsc_controller.law.controller import Controller
-from blf_dsc_controller.law.settings import CHOICES, LINEAR, Settings
+from blf_dsc_controller.law.state import CHOICES, LINEAR, Settings
 from blf_dsc_controller.reference.approach import plan_start, reference_of
 
 _COLUMNS = 1.0  # Gamma of the disturbance columns

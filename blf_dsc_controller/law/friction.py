@@ -21,8 +21,7 @@ from blf_dsc_controller.compiled.elementary import tanh
 from blf_dsc_controller.compiled.jit import inner
 from blf_dsc_controller.compiled.layout import Array
 from blf_dsc_controller.law import barrier
-from blf_dsc_controller.law.settings import FILTERED, Settings
-from blf_dsc_controller.law.state import Signals, State
+from blf_dsc_controller.law.state import FILTERED, Settings, Signals, State
 
 _ENERGY = 1.0  # of p int c_h^2 dt; a reversal has an eighth of it
 _PRIOR = 0.1  # 1 / (reversals that outweigh the initial estimate where f is unmodelled)

@@ -9,8 +9,7 @@ from blf_dsc_controller.arms.model import inertia_matrices
 from blf_dsc_controller.compiled.jit import inner
 from blf_dsc_controller.compiled.layout import Array
 from blf_dsc_controller.law import barrier
-from blf_dsc_controller.law.settings import LINEAR, NEWTON, REFERENCE, Settings
-from blf_dsc_controller.law.state import Sample, Signals, State
+from blf_dsc_controller.law.state import LINEAR, NEWTON, REFERENCE, Sample, Settings, Signals, State
 
 _POSTURES = 181
 

@@ -30,8 +30,7 @@ from blf_dsc_controller.compiled.elementary import cos, exp, sin, tanh
 from blf_dsc_controller.compiled.jit import inner, kernel
 from blf_dsc_controller.compiled.layout import Array, sizes_of
 from blf_dsc_controller.law import barrier
-from blf_dsc_controller.law.settings import FILTERED, Settings, settings_of
-from blf_dsc_controller.law.state import Signals, State
+from blf_dsc_controller.law.state import FILTERED, Settings, Signals, State, settings_of
 
 
 @inner

@@ -20,8 +20,7 @@ from blf_dsc_controller.arms.model import regressors_at
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.law.controller import Controller
 from blf_dsc_controller.law.factory import columns_of, estimate_names, model_of, prior_covariance
-from blf_dsc_controller.law.settings import Settings
-from blf_dsc_controller.law.state import Sample, sample_of
+from blf_dsc_controller.law.state import Sample, Settings, sample_of
 from blf_dsc_controller.messages import topics
 from blf_dsc_controller.messages.codecs import (
     Float64MultiArrayEncoder,

@@ -44,8 +44,7 @@ from blf_dsc_controller.compiled.elementary import sin
 from blf_dsc_controller.compiled.jit import inner
 from blf_dsc_controller.compiled.layout import Array
 from blf_dsc_controller.law import barrier
-from blf_dsc_controller.law.settings import LINEAR, Settings
-from blf_dsc_controller.law.state import Signals, State
+from blf_dsc_controller.law.state import LINEAR, Settings, Signals, State
 
 _LAYER = 0.01  # b, rad/s: xi2 at which the robust term saturates
 

@@ -26,8 +26,7 @@ from blf_dsc_controller.compiled.jit import inner, kernel
 from blf_dsc_controller.compiled.layout import Array
 from blf_dsc_controller.law import window
 from blf_dsc_controller.law.excitation import window_residual
-from blf_dsc_controller.law.settings import Settings, settings_of
-from blf_dsc_controller.law.state import Signals, State, signals_of, state_of
+from blf_dsc_controller.law.state import Settings, Signals, State, settings_of, signals_of, state_of
 
 _PERIOD = 0.1  # s, from one solution to the next
 _LASTING = 0.2  # s, correlation length of the residual

@@ -17,8 +17,7 @@ from math import sqrt
 from blf_dsc_controller.compiled import cholesky
 from blf_dsc_controller.compiled.jit import called, inner
 from blf_dsc_controller.compiled.layout import Array
-from blf_dsc_controller.law.settings import Settings
-from blf_dsc_controller.law.state import Signals, State
+from blf_dsc_controller.law.state import Settings, Signals, State
 
 
 @inner

@@ -24,8 +24,7 @@ from blf_dsc_controller.law.checks import INVALID, SUSPECT, checks_of
 from blf_dsc_controller.law.controller import Controller, step
 from blf_dsc_controller.law.factory import begin, controller_of
 from blf_dsc_controller.law.lyapunov import fill_energies
-from blf_dsc_controller.law.settings import settings_of
-from blf_dsc_controller.law.state import Sample, sample_of, signals_of, state_of
+from blf_dsc_controller.law.state import Sample, sample_of, settings_of, signals_of, state_of
 from blf_dsc_controller.law.telemetry import disturbance_names, run_of, sample_columns
 from blf_dsc_controller.law.weighing import add_row
 from blf_dsc_controller.messages.journal import EventType, Journal

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from blf_dsc_controller.configuration.controller import ControllerConfig, Safety
 from blf_dsc_controller.law.checks import NO_EFFECT, OUTSIDE, SUSPECT
 from blf_dsc_controller.law.controller import Controller
-from blf_dsc_controller.law.settings import LINEAR
+from blf_dsc_controller.law.state import LINEAR
 from blf_dsc_controller.messages.journal import OUTSIDE_BOUND
 
 Vector = NDArray[np.float64]

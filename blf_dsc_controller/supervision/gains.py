@@ -39,7 +39,7 @@ from blf_dsc_controller.configuration.robot import implausible_friction, paramet
 from blf_dsc_controller.law import barrier
 from blf_dsc_controller.law.controller import Controller
 from blf_dsc_controller.law.factory import settings_of_config
-from blf_dsc_controller.law.settings import LINEAR, NEWTON, Settings
+from blf_dsc_controller.law.state import LINEAR, NEWTON, Settings
 from blf_dsc_controller.reference.approach import reference_of
 from blf_dsc_controller.reference.terms import sampled
 

@@ -24,7 +24,7 @@ from blf_dsc_controller.configuration.controller import ControllerConfig, Safety
 from blf_dsc_controller.errors import StartError
 from blf_dsc_controller.law.controller import Controller
 from blf_dsc_controller.law.factory import settings_of_config
-from blf_dsc_controller.law.settings import Settings
+from blf_dsc_controller.law.state import Settings
 from blf_dsc_controller.law.torque import RATE_CUT, added_torque
 
 Vector = NDArray[np.float64]
