@@ -88,7 +88,7 @@ def unplannable(*_):
 
 
 REJECTED = {
-    of_another_arm: "no joint 'elbow' here, only 'joint1', 'joint2'; joint 'joint2' is missing",
+    of_another_arm: "its joints are 'joint1', 'elbow', but each of 'joint1', 'joint2' is needed",
     too_long: 'it takes 2e+09 s, longer than 3600 s',
     oversized: 'bytes, more than 1000 points can have',
     unplannable: 'trajectory rejected: MemoryError: no room',

@@ -128,8 +128,8 @@ def _run_offline(config: LoopConfig, bag: Path) -> None:
     with announced_compilation(print_notice):
         record = simulate(config.controller, config.plant, show)
     progress.close()
-    for rejected in rejected_columns(record.controller, estimate_names(config.controller)):
-        print(f'warning: {rejected}')
+    for reason in rejected_columns(record.controller, estimate_names(config.controller)).values():
+        print(f'warning: {reason}')
     write_bag(bag, record, config.controller, config.recorder.compression, config.plant)
 
 

@@ -12,7 +12,7 @@ from collections.abc import Iterator, Sequence
 from functools import partial
 from itertools import chain
 from operator import attrgetter
-from typing import NamedTuple, TypeAlias
+from typing import TypeAlias
 
 import numpy as np
 
@@ -147,7 +147,6 @@ class PlantTelemetry:
         true_state = [
             what + joint for what in (topics.POSITION, topics.VELOCITY) for joint in joints
         ]
-        self._joints = len(joints)
         self._joint_states = JointStateEncoder(names)
         self._positions_only = JointStateEncoder(names, ('position',))
         self._places = [names.index(joint) for joint in joints]
@@ -159,19 +158,18 @@ class PlantTelemetry:
             (topics.LATENCY, topics.LATENESS, topics.LATE_STEPS), ('position',)
         )
 
-    def joint_states(self, stamp: int, measurement: np.ndarray) -> Message:
-        """Encode measured [q, dq, applied torque of the last interval] (3 n,)."""
-        self._published[:, self._places] = measurement.reshape(3, self._joints)
-        return topics.JOINT_STATES, self._joint_states.encode(stamp, *self._published)
+    def joint_states(self, stamp: int, measurement: np.ndarray, missing: str = '') -> Message:
+        """Encode measured [q, dq, applied torque of the last interval] (3 n,).
 
-    def incomplete_states(self, stamp: int, measurement: np.ndarray, missing: str) -> Message:
-        """Encode a joint state whose velocities and efforts are `missing`: invalid or absent."""
-        self._published[:, self._places] = measurement.reshape(3, self._joints)
-        position = self._published[0]
+        Velocities and efforts may be `missing`: invalid or absent.
+        """
+        self._published[:, self._places] = measurement.reshape(3, -1)
+        position, *others = self._published
         if missing == 'absent':
             return topics.JOINT_STATES, self._positions_only.encode(stamp, position)
-        unknown = np.full(position.size, np.nan)
-        return topics.JOINT_STATES, self._joint_states.encode(stamp, position, unknown, unknown)
+        if missing:
+            others = [np.full(position.size, np.nan)] * 2
+        return topics.JOINT_STATES, self._joint_states.encode(stamp, position, *others)
 
     def truth(self, stamp: int, truth: np.ndarray) -> Message:
         """Encode the true [P, tau_dist, q, dq] (p + 3 n,)."""
@@ -255,45 +253,29 @@ def run_of(
 _NOTABLE = 0.1  # relative to the largest component
 
 
-class RejectedColumn(NamedTuple):
-    """A disturbance column that is not estimated."""
+def rejected_columns(controller: Controller, names: Sequence[str]) -> dict[str, str]:
+    """Return why a controller that learns does not estimate columns, by their names.
 
-    column: str  # its name
-    alike: tuple[str, ...]  # names of the columns whose combination resembles it, largest first
-    fraction: float  # of the column that these explain, in [0, 1]
-
-    def __str__(self) -> str:
-        return (
-            f'{self.column} is not estimated: this window cannot distinguish it from '
-            f'{" + ".join(self.alike)} ({100 * self.fraction:.4g} % of it is explained by them). '
-            'A reference with more tones can separate them; learning.excitation_threshold sets '
-            'how clearly'
-        )
-
-
-def rejected_columns(controller: Controller, names: Sequence[str]) -> tuple[RejectedColumn, ...]:
-    """Return the rejected columns of a controller that learns, explained by its current window.
-
+    Each resembles a combination of others in the current window; these are named, largest first.
     `names` are those of the m entries of theta^, as returned by `factory.estimate_names`.
     """
-    state = controller.state
-    rejected = np.flatnonzero(state.active == 0.0)
+    state, reasons = controller.state, {}
     if controller.settings.kappa == 0.0 or state.columns_checked[0] == 0.0:
-        return ()
+        return {}
     upper = np.triu(state.running[:-1, :-1])
     Phi = upper + np.triu(upper, 1).T
     kept = np.flatnonzero(state.active > 0.0)
-    return tuple(_explained(Phi, int(column), kept, names) for column in rejected)
-
-
-def _explained(
-    Phi: np.ndarray, column: int, kept: np.ndarray, names: Sequence[str]
-) -> RejectedColumn:
-    """Regress the column on the kept ones, from their inner products over the window."""
-    products = Phi[kept, column]
-    parts = np.linalg.lstsq(Phi[np.ix_(kept, kept)], products, rcond=None)[0]
-    strength = np.abs(parts) * np.sqrt(np.diag(Phi)[kept])
-    order = np.argsort(-strength)
-    notable = [k for k in order if strength[k] >= _NOTABLE * strength[order[0]]]
-    fraction = float(np.clip(parts @ products / Phi[column, column], 0.0, 1.0))
-    return RejectedColumn(names[column], tuple(names[kept[k]] for k in notable), fraction)
+    for column in np.flatnonzero(state.active == 0.0):
+        products = Phi[kept, column]
+        parts = np.linalg.lstsq(Phi[np.ix_(kept, kept)], products, rcond=None)[0]
+        strength = np.abs(parts) * np.sqrt(np.diag(Phi)[kept])
+        order = kept[np.argsort(-strength)]
+        alike = [names[k] for k in order[: np.sum(strength >= _NOTABLE * strength.max())]]
+        explained = float(np.clip(parts @ products / Phi[column, column], 0.0, 1.0))
+        reasons[names[column]] = (
+            f'{names[column]} is not estimated: this window cannot distinguish it from '
+            f'{" + ".join(alike)} ({100 * explained:.4g} % of it is explained by them). '
+            'A reference with more tones can separate them; learning.excitation_threshold sets '
+            'how clearly'
+        )
+    return reasons

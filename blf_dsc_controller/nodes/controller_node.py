@@ -282,8 +282,8 @@ class ControllerNode(LoopNode[ControllerConfig]):
         if columns != self._columns:
             self._columns = columns
             self._status.rejected = rejected_columns(guard.controller, self._estimates)
-            for column in self._status.rejected:
-                self.get_logger().warning(f'{column}')
+            for reason in self._status.rejected.values():
+                self.get_logger().warning(reason)
             has_changed |= bool(self._status.rejected)
         if has_changed:
             self._report()

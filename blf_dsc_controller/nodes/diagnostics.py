@@ -14,7 +14,7 @@ import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rclpy.node import Node
 
-from blf_dsc_controller.law.telemetry import RejectedColumn, load_text
+from blf_dsc_controller.law.telemetry import load_text
 from blf_dsc_controller.messages import topics
 from blf_dsc_controller.messages.topics import LOAD, PHASE, REASON, REJECTED, STOPS
 from blf_dsc_controller.nodes.endpoints import create_publisher
@@ -78,7 +78,7 @@ class ControllerStatus:
     def __init__(self, node: Node, joints: Sequence[str]) -> None:
         """Create the publishers of a node that controls `joints`."""
         self.journal = create_publisher(node, topics.JOURNAL)
-        self.rejected: tuple[RejectedColumn, ...] = ()
+        self.rejected: Mapping[str, str] = {}
         self.trajectories: TrajectoryInput | None = None
         self._diagnostics = DiagnosticsPublisher(node, joints)
         self._latched = create_publisher(node, topics.STATE)
@@ -169,10 +169,9 @@ class ControllerStatus:
         learning = 'latched' if state.latched[0] else 'not yet excited'
         values = {'lambda_min': f'{state.lambda_min[0]:.3g}', 'learning': learning}
         values['model changes'] = f'{state.changes[0]:.0f}'
-        values |= {f'{REJECTED}{rejected.column}': f'{rejected}' for rejected in self.rejected}
+        values |= {f'{REJECTED}{column}': reason for column, reason in self.rejected.items()}
         if self.rejected:
-            columns = ', '.join(rejected.column for rejected in self.rejected)
-            return 'learning', WARN, f'not estimated: {columns}', values
+            return 'learning', WARN, f'not estimated: {", ".join(self.rejected)}', values
         return 'learning', OK, learning, values
 
 

@@ -310,7 +310,7 @@ class PlantNode(LoopNode[PlantConfig]):
         sensor, measurement = self.config.sensor, self.plant.measure()
         for ahead in range(sensor.incomplete_states, 0, -1):
             stamp = self.stamp - ahead * self.config.sample_time_ns
-            self._publish(self._telemetry.incomplete_states(stamp, measurement, sensor.incomplete))
+            self._publish(self._telemetry.joint_states(stamp, measurement, sensor.incomplete))
 
     def _tell_parameters(self) -> None:
         """Publish all parameters, in force from the start."""

@@ -18,7 +18,7 @@ are skipped.  The last point is held.  To keep planning below a second, a trajec
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -210,37 +210,20 @@ def _from_rest(rest: np.ndarray, t0: float, times: np.ndarray, points: np.ndarra
 
 def _problems(trajectory: Trajectory, joints: tuple[str, ...], now: float) -> list[str]:
     """Return all problems of a trajectory that can be found before its motion is computed."""
-    count = len(trajectory.points)
-    if count > MOST_POINTS:
-        return [f'it has {count} points, more than {MOST_POINTS}: send it in pieces']
-    problems = [*_joint_problems(trajectory.joints, joints), *_point_problems(trajectory)]
+    points, problems = trajectory.points, []
+    if len(points) > MOST_POINTS:
+        return [f'it has {len(points)} points, more than {MOST_POINTS}: send it in pieces']
+    if sorted(trajectory.joints) != sorted(joints):
+        given, needed = (', '.join(map(repr, names)) for names in (trajectory.joints, joints))
+        problems.append(f'its joints are {given or "none"}, but each of {needed} is needed once')
+    if not points:
+        problems.append('it has no points')
+    for number, point in enumerate(points, start=1):
+        found = _problems_of(point, len(trajectory.joints))
+        problems += [f'point {number} has {problem}' for problem in found]
+    if len({tuple(map(bool, point[1:4])) for point in points}) > 1:
+        problems.append('its points do not all give the same fields among ' + ', '.join(_FIELDS))
     return problems or list(_time_problems(trajectory, now))
-
-
-def _joint_problems(given: tuple[str, ...], joints: tuple[str, ...]) -> Iterator[str]:
-    unknown = sorted(set(given) - set(joints))
-    missing = [joint for joint in joints if joint not in given]
-    repeated = sorted({joint for joint in given if given.count(joint) > 1})
-    if unknown:
-        yield f'there is no joint {_listed(unknown)} here, only {_listed(joints)}'
-    if missing:
-        yield f'joint {_listed(missing)} is missing: name all of {_listed(joints)}'
-    if repeated:
-        yield f'joint {_listed(repeated)} is named more than once'
-
-
-def _listed(names: Sequence[str]) -> str:
-    return ', '.join(repr(name) for name in names)
-
-
-def _point_problems(trajectory: Trajectory) -> Iterator[str]:
-    if not trajectory.points:
-        yield 'it has no points'
-    for number, point in enumerate(trajectory.points, start=1):
-        for problem in _problems_of(point, len(trajectory.joints)):
-            yield f'point {number} has {problem}'
-    if len({tuple(map(bool, point[1:4])) for point in trajectory.points}) > 1:
-        yield 'its points do not all give the same fields among ' + ', '.join(_FIELDS)
 
 
 def _problems_of(point: TrajectoryPoint, count: int) -> Iterator[str]:
@@ -253,10 +236,8 @@ def _problems_of(point: TrajectoryPoint, count: int) -> Iterator[str]:
     if not np.isfinite(point.time):
         yield f'no finite time: {point.time}'
     for field, values in zip(_FIELDS, point[1:4], strict=True):
-        if values and len(values) != count:
-            yield f'{len(values)} {field} for {count} joints'
-        elif not np.isfinite(values).all():
-            yield f'{field} that are not finite: {list(values)}'
+        if values and not (len(values) == count and np.isfinite(values).all()):
+            yield f'{field} {list(values)}, but {count} finite numbers are needed'
 
 
 def _time_problems(trajectory: Trajectory, now: float) -> Iterator[str]:
