@@ -86,7 +86,7 @@ def update_window(settings: Settings, state: State, signals: Signals, t: float, 
         window.push_row(state, signals.row)
         friction.measure_flips(settings, state, settings.row_interval * dt)
     if settings.change_detection == 1:
-        excitation.detect_change(settings, state, signals, t, dt)
+        excitation.detect_change(settings, state, signals, dt)
     if int(state.samples[0]) % settings.interval == 0:
         excitation.update_excitation(settings, state, signals, t, dt)
 

@@ -60,7 +60,7 @@ def explained(settings: Settings, state: State, residual: float) -> float:
 
 
 @inner
-def detect_change(settings: Settings, state: State, signals: Signals, t: float, dt: float) -> None:
+def detect_change(settings: Settings, state: State, signals: Signals, dt: float) -> None:
     """Compare this row with the latched solution; forget the window if the arm has changed."""
     if state.latched[0] == 0.0:
         return
@@ -73,7 +73,6 @@ def detect_change(settings: Settings, state: State, signals: Signals, t: float, 
     state.recent_residual[0] += min(1.0, dt / _MEMORY) * (square - state.recent_residual[0])
     if state.recent_residual[0] > _ALARM * explained(settings, state, state.residual[0]):
         state.changes[0] += 1.0
-        state.change_time[0] = t
         state.contradiction[0] = state.recent_residual[0]
         if state.rows[0] < settings.window:
             take_back(settings, state, signals)

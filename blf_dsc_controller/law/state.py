@@ -122,7 +122,6 @@ class State(NamedTuple):
     split_residual: Cell  # of the last first window that its parts contradicted, (N m)^2
     recent_residual: Cell  # of the last rows against `solution`, (N m)^2
     changes: Cell  # number of times that the arm was found to have changed
-    change_time: Cell  # time of the last change, s
     contradiction: Cell  # `recent_residual` at the last change, (N m)^2
     alpha2: Annotated[Array, 'n']  # rad/s
     torque: Annotated[Array, 'n']  # last commanded torque, N m

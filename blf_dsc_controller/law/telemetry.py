@@ -265,11 +265,11 @@ def rejected_columns(controller: Controller, names: Sequence[str]) -> dict[str, 
     upper = np.triu(state.running[:-1, :-1])
     Phi = upper + np.triu(upper, 1).T
     kept = np.flatnonzero(state.active > 0.0)
-    for column in np.flatnonzero(state.active == 0.0):
+    for column in np.flatnonzero(state.active == 0.0).tolist():
         products = Phi[kept, column]
         parts = np.linalg.lstsq(Phi[np.ix_(kept, kept)], products, rcond=None)[0]
         strength = np.abs(parts) * np.sqrt(np.diag(Phi)[kept])
-        order = kept[np.argsort(-strength)]
+        order = kept[np.argsort(-strength)].tolist()
         alike = [names[k] for k in order[: np.sum(strength >= _NOTABLE * strength.max())]]
         explained = float(np.clip(parts @ products / Phi[column, column], 0.0, 1.0))
         reasons[names[column]] = (
