@@ -325,7 +325,7 @@ def test_load_loop_collects_the_problems_of_all_nodes_each_once(file):
     assert [problem.split(', but')[0] for problem in problems_of(path, load_loop)] == [
         'sim_plant, blf_dsc_controller: line 2: sample_time: got 1',
         'sim_plant: line 4: seed: got -1',
-        "bag_recorder: line 6: compression: got 'zip'",
+        'bag_recorder: line 6: compression: got "zip"',
     ]
     path = file(section('/**', 'robot: {urdf: panda.urdf, tip: tol}'))
     (problem,) = problems_of(path, load_loop)

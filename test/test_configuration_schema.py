@@ -77,25 +77,29 @@ def test_given_values_take_precedence_over_those_of_a_urdf():
         # Types. ROS does not accept an integer for a double, nor does a run without ROS.
         (PLANT, {'duration': 1}, 'got 1, but a double is expected, with a decimal point'),
         (PLANT, {'load.torque': [1, 2]}, 'got [1, 2], but a double array is expected, with a dec'),
-        (PLANT, {'duration': '1'}, "got '1', but a double is expected"),
+        (PLANT, {'duration': '1'}, 'got "1", but a double is expected'),
         (PLANT, {'duration': True}, 'got true, but a double is expected'),
         (PLANT, {'seed': True}, 'got true, but an integer is expected'),
         (PLANT, {'seed': 2.0}, 'got 2.0, but an integer is expected'),
         (PLANT, {'publish_clock': 1}, 'got 1, but a bool is expected'),
         (PLANT, {'mode': 3}, 'got 3, but a string is expected'),
-        (PLANT, {'duration': None}, 'got nothing, but a double is expected'),
+        (PLANT, {'duration': None}, 'got null, but a double is expected'),
         (PLANT, {'load.torque': 1.0}, 'got 1.0, but a double array is expected: write a list, lik'),
-        (PLANT, {'joints': 'xy'}, "got 'xy', but a string array is expected: write a list, like"),
-        (PLANT, {'joints': ['x', 1]}, "got ['x', 1], but a string array is expected"),
+        (PLANT, {'joints': 'xy'}, 'got "xy", but a string array is expected: write a list, like'),
+        (PLANT, {'joints': ['x', 1]}, 'got ["x", 1], but a string array is expected'),
         # Ranges.
         (PLANT, {'arm.l1': 0.0}, 'got 0.0, but it must be above 0 m'),
         (PLANT, {'truth.mass_deviation': 1.0}, 'got 1.0, but it must be at least 0 and below 1'),
         (PLANT, {'actuator.delay': -1}, 'got -1, but it must be at least 0 and at most 1000 sam'),
         (PLANT, {'actuator.delay': 1001}, 'got 1001, but it must be at least 0 and at most 1000'),
-        (PLANT, {'mode': 'slow'}, "got 'slow', but it must be one of realtime, lockstep"),
+        (PLANT, {'mode': 'slow'}, 'got "slow", but it must be one of realtime, lockstep'),
         (PLANT, {'disturbance.coulomb': [1.0, -0.5]}, 'got -0.5 at entry 2 of [1.0, -0.5], but it'),
-        (PLANT, {'duration': float('nan')}, 'got nan, but a finite number is needed'),
-        (PLANT, {'load.torque': [-float('inf'), 1.0]}, 'got -inf at entry 1 of [-inf, 1.0], but a'),
+        (PLANT, {'duration': float('nan')}, 'got .nan, but a finite number is needed'),
+        (
+            PLANT,
+            {'load.torque': [-float('inf'), 1.0]},
+            'got -.inf at entry 1 of [-.inf, 1.0], but a',
+        ),
         # Lengths.
         (BOTH, {'joints': []}, 'got an empty list, but at least one entry is needed'),
         (PLANT, {'load.torque': [1.0]}, 'got 1, but 2 entries are needed (2 of joints)'),
@@ -107,7 +111,6 @@ def test_given_values_take_precedence_over_those_of_a_urdf():
         (CONTROLLER, {'reference.phase': [0.0, 1.0]}, 'got 2, but 1 entries are needed (1 of refe'),
         # What parameters have to do with each other.
         (BOTH, {'joints': ['elbow', 'elbow']}, "the name 'elbow' is repeated"),
-        (BOTH, {'joints': ['elbow', '']}, 'a name is empty'),
         (PLANT, of_one_joint(PlantConfig), 'got 1, but'),
         (CONTROLLER, of_one_joint(ControllerConfig), 'got 1, but'),
         (
@@ -116,7 +119,6 @@ def test_given_values_take_precedence_over_those_of_a_urdf():
             f'got {1 / 3000} s, not a whole number of nanoseconds: write 0.000333333',
         ),
         (PLANT, {'duration': 0.0005}, 'got 0.0005 s, shorter than one sample of 0.001 s'),
-        ((RecorderConfig,), {'output': ' '}, 'got no folder name to write the bag into'),
         (
             CONTROLLER,
             {

@@ -88,7 +88,7 @@ def test_urdf_may_be_given_as_text_or_file(tmp_path):
         ({'joints': ['a', 'b']}, "robot.urdf: no joint 'a' in the URDF"),
         ({'robot.urdf': 'package://no_such/arm.urdf'}, "package 'no_such' was not found"),
         ({'robot.rotor_inertia': [0.1]}, 'robot.rotor_inertia: got 1, but 7 entries are needed'),
-        ({'robot.lag': 'short'}, "robot.lag: got 'short', but a double is expected"),
+        ({'robot.lag': 'short'}, 'robot.lag: got "short", but a double is expected'),
         ({'barrier.bound': [0.01] * 2}, 'barrier.bound: got 2, but 7 entries are needed'),
         (
             {'learning.initial_estimate': [1.0] * 3, 'learning.adaptation_gain': [0.5] * 3},

@@ -80,7 +80,7 @@ def test_values_are_as_frequent_as_stated():
         ('uniform(-0.9, 0.9)', 'uniform(-1.0, 0.9)', r'initial.error: .* above -1 and below 1'),
         ('integers(0, 3)', 'uniform(0.0, 3.0)', r'delay: got .*: integers\(low, high\), choice'),
         ('integers(0, 3)', 'integers(0.5, 3)', r'delay: .* an integer is expected between'),
-        ('choice(measured,', 'choice(guessed,', r"velocity: .* got 'guessed', but it must be one"),
+        ('choice(measured,', 'choice(guessed,', r'velocity: .* got "guessed", but it must be one'),
         ('uniform(-0.2, 0.2)', '["uniform(0, 1)"]', r'got 1 distributions, .* 2 entries \(joint1'),
         ('runs: 24', 'runs: 0', r'line 11: runs: got 0, but it must be at least 1'),
         ('runs: 24', 'rums: 24', r'line 11: rums: .* did you mean runs\?'),

@@ -76,7 +76,7 @@ def test_all_problems_are_reported_at_once_and_nothing_is_declared(bare_node, tm
     assert caught.value.problems == [
         'sensr.resolution: unknown parameter, did you mean sensor.resolution?',
         'initial.v: unknown parameter, did you mean initial.velocity?',
-        "mode: got 'offline', but it must be one of realtime, lockstep",
+        'mode: got "offline", but it must be one of realtime, lockstep',
         'seed: got -1, but it must be at least 0',
         'arm.l1: got 1, but a double is expected, with a decimal point',
     ]
@@ -136,7 +136,7 @@ def test_valid_changes_are_passed_on_once_each_as_a_whole_configuration(tuned):
     [
         ({'feedback__gain': [1.0]}, 'feedback.gain: got 1, but 2 entries are needed (2 of joints)'),
         ({'barrier__bound': [0.0, 1.0]}, 'barrier.bound: got 0.0 at entry 1 of [0.0, 1.0]'),
-        ({'learning__update': 'magic'}, "learning.update: got 'magic', but it must be one of"),
+        ({'learning__update': 'magic'}, 'learning.update: got "magic", but it must be one of'),
         ({'learning__radius': 0.1}, 'learning.radius: got 0.1 kg m^2, but learning.initial_est'),
         ({'learning__weight': -1.0}, 'learning.weight: got -1.0, but it must be at least 0'),
         ({'learning__weight': float('inf')}, 'learning.weight: got inf, but a finite number'),

@@ -251,7 +251,7 @@ def test_waypoints_are_passed_at_their_times_and_the_last_is_held():
 @pytest.mark.parametrize(
     ('given', 'problem'),
     [
-        ({'reference.type': 'spiral'}, "type: got 'spiral', but it must be one of"),
+        ({'reference.type': 'spiral'}, 'type: got "spiral", but it must be one of'),
         ({'reference.type': 'waypoints'}, 'times: got none'),
         (REPEATED, 'times: got 1 s after 1 s, but they must increase'),
         (TIMES, 'points: got 3, but 4 entries are needed'),

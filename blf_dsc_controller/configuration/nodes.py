@@ -6,7 +6,6 @@
 
 from __future__ import annotations
 
-import json
 import sys
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -14,16 +13,14 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Literal, NamedTuple, TypeVar
 
-import yaml
-
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.files import Section, parse, read_text, share_folder
 from blf_dsc_controller.configuration.plant import PlantConfig
 from blf_dsc_controller.configuration.schema import (
     Parameter,
-    Value,
     build,
     flatten,
+    format_value,
     parameter,
     parameters,
     suggestion,
@@ -60,10 +57,6 @@ class RecorderConfig:
     clock: Literal['wall', 'plant'] = _of_bag(
         'wall', 'log times: as received, or the stamp of the last joint state (lock-step)'
     )
-
-    def problems(self) -> list[str]:
-        """Check that the folder has a name."""
-        return [] if self.output.strip() else ['output: got no folder name to write the bag into']
 
 
 @dataclass(frozen=True)
@@ -266,15 +259,6 @@ def dump(path: Path, nodes: Mapping[str, object], comment: str = '') -> None:
         values = config if isinstance(config, Mapping) else flatten(config)
         lines += [f'    {name}: {format_value(value)}\n' for name, value in values.items()]
     path.write_text(''.join(lines), encoding='utf-8')
-
-
-def format_value(value: Value) -> str:
-    """Return a value as YAML that ROS and YAML libraries read as the same type."""
-    if isinstance(value, tuple):
-        return '[' + ', '.join(format_value(entry) for entry in value) + ']'
-    if isinstance(value, bool | float):
-        return yaml.safe_dump(value).split()[0]  # 1.0e-05; 1e-05 is a string to many libraries
-    return json.dumps(value, ensure_ascii=False)
 
 
 def unmatched_sections(sections: Sequence[Section], nodes: Iterable[str]) -> Iterator[str]:

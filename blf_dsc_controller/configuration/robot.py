@@ -168,8 +168,7 @@ def read_urdf(given: str) -> str:
     if given.startswith(TOPIC):
         raise BlfDscError(
             f'{given!r} is a topic, which only a node can read: save its message to a file '
-            '(`ros2 param get --hide-type robot_state_publisher robot_description > '
-            'robot.urdf`) and give that file'
+            '(`ros2 topic echo --once --field data`) and give that'
         )
     try:
         text = read_text(resolve(given))
@@ -262,8 +261,6 @@ class ArmConfig:
         """Check the number of joints, their names, by which they are matched, and the rate."""
         for name in sorted({name for name in self.joints if self.joints.count(name) > 1}):
             yield f'joints: the name {name!r} is repeated'
-        if '' in self.joints:
-            yield 'joints: a name is empty'
         if needed not in (None, len(self.joints)):
             yield f'joints: got {len(self.joints)}, but {arm} has {needed} joints'
         yield from (f'robot.{problem}' for problem in self.robot.problems())

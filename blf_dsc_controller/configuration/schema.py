@@ -13,12 +13,15 @@ import array
 import dataclasses
 import difflib
 import functools
+import json
 import math
 import operator
 import typing
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Annotated, Any, TypeAlias, TypeVar
+
+import yaml
 
 from blf_dsc_controller.errors import BlfDscError, ConfigurationError
 
@@ -85,9 +88,9 @@ class Parameter:
     def problems(self, given: Any) -> Iterator[str]:
         """Check a value; each problem names the parameter, what it got, and what is expected."""
         article = 'an' if self.type is int and not self.is_array else 'a'
-        mismatch = f'{self.name}: got {_shown(given)}, but {article} {self.kind} is expected'
+        mismatch = f'{self.name}: got {format_value(given)}, but {article} {self.kind} is expected'
         if self.is_array and not isinstance(given, _ARRAYS):
-            yield f'{mismatch}: write a list, like {_shown(self.default)}'
+            yield f'{mismatch}: write a list, like {format_value(self.default)}'
             return
         entries = list(given) if self.is_array else [given]
         if not all(_is(entry, self.type) for entry in entries):
@@ -104,8 +107,8 @@ class Parameter:
                 expected = f'it must be {self.allowed}{unit}'
             else:
                 continue
-            place = f' at entry {index} of {_shown(entries)}' if self.is_array else ''
-            yield f'{self.name}: got {_shown(entry)}{place}, but {expected}'
+            place = f' at entry {index} of {format_value(entries)}' if self.is_array else ''
+            yield f'{self.name}: got {format_value(entry)}{place}, but {expected}'
 
     def _allows(self, entry: Any) -> bool:
         within = all(compare(entry, limit) for _, limit, compare in self._limits())
@@ -210,6 +213,15 @@ def unknown(name: str, known: Iterable[str]) -> str:
     return f'{name}: unknown parameter{suggestion(name, known)}'
 
 
+def format_value(value: object) -> str:
+    """Return a value as YAML that ROS and YAML libraries read as the same type."""
+    if isinstance(value, _ARRAYS):
+        return '[' + ', '.join(map(format_value, value)) + ']'
+    if isinstance(value, float):  # 1.0e-05, since 1e-05 is a string to many libraries
+        return str(yaml.safe_dump(float(value)).split()[0])
+    return json.dumps(value, ensure_ascii=False, default=str)
+
+
 def suggestion(name: str, known: Iterable[str], cutoff: float = 0.6) -> str:
     """Return `, did you mean X?` with the known name that is most like this one, or nothing."""
     close = difflib.get_close_matches(name, known, n=1, cutoff=cutoff)
@@ -261,14 +273,6 @@ def _length_problems(param: Parameter, values: Mapping[str, Any]) -> Iterator[st
 
 def _is(value: object, type_: Any) -> bool:
     return isinstance(value, type_) and (type_ is bool or not isinstance(value, bool))
-
-
-def _shown(value: object) -> str:
-    if isinstance(value, _ARRAYS):
-        return '[' + ', '.join(_shown(entry) for entry in value) + ']'
-    if isinstance(value, bool):
-        return 'true' if value else 'false'
-    return 'nothing' if value is None else repr(value)
 
 
 PerJoint: TypeAlias = Annotated[tuple[float, ...], 'joints']

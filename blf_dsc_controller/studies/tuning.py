@@ -23,8 +23,8 @@ from tqdm import tqdm
 
 from blf_dsc_controller.analysis.metrics import Metrics, measure
 from blf_dsc_controller.configuration.controller import ControllerConfig
-from blf_dsc_controller.configuration.nodes import PLANT, LoopConfig, format_value, load_loop
-from blf_dsc_controller.configuration.schema import Value, change, flatten
+from blf_dsc_controller.configuration.nodes import PLANT, LoopConfig, load_loop
+from blf_dsc_controller.configuration.schema import Value, change, flatten, format_value
 from blf_dsc_controller.run import Floats
 from blf_dsc_controller.simulation.loop import simulate
 
