@@ -128,11 +128,6 @@ def run(duration: float, state: State, step: Step) -> np.ndarray:
     return errors
 
 
-def numpy_loop(duration: float) -> np.ndarray:
-    """Run the arm and a Dormand-Prince step in numpy, too."""
-    return _integrated(duration, _numpy_acceleration)
-
-
 def pinocchio_loop(duration: float) -> np.ndarray:
     """Run the arm of our URDF by pinocchio's articulated-body algorithm, a DP5 step in numpy."""
     import pinocchio
@@ -144,7 +139,7 @@ def pinocchio_loop(duration: float) -> np.ndarray:
     def acceleration(q: np.ndarray, dq: np.ndarray, torque: np.ndarray) -> np.ndarray:
         return np.asarray(pinocchio.aba(model, data, q, dq, torque))
 
-    return _integrated(duration, acceleration)
+    return _integrated(acceleration, duration)
 
 
 def mujoco_loop(duration: float) -> np.ndarray:
@@ -163,7 +158,8 @@ def mujoco_loop(duration: float) -> np.ndarray:
     return run(duration, lambda: (data.qpos.copy(), data.qvel.copy()), step)
 
 
-def _integrated(duration: float, acceleration: Callable[..., np.ndarray]) -> np.ndarray:
+def _integrated(acceleration: Callable[..., np.ndarray], duration: float) -> np.ndarray:
+    """Run an arm and a Dormand-Prince step in numpy."""
     x = np.concatenate((PLANT.initial.position, PLANT.initial.velocity))
     k = np.zeros((6, 4))
 
@@ -186,7 +182,7 @@ def _numpy_acceleration(q: np.ndarray, dq: np.ndarray, torque: np.ndarray) -> np
 
 
 _PEERS = {
-    'numpy': (numpy_loop, 'law, arm and DP5 in numpy'),
+    'numpy': (partial(_integrated, _numpy_acceleration), 'law, arm and DP5 in numpy'),
     'MuJoCo': (mujoco_loop, 'its RK4, law in numpy'),
     'pinocchio': (pinocchio_loop, 'aba, DP5 and law in numpy'),
 }

@@ -304,7 +304,7 @@ def parse(text: object, type_: type) -> Distribution:
     if call is None or written is None:
         raise ValueError(f'got {text!r}, but one of these is expected: {", ".join(known)}')
     try:
-        arguments = tuple(_argument(word.strip(), type_) for word in call[2].split(','))
+        arguments = tuple(type_(word.strip()) for word in call[2].split(','))
     except ValueError:
         raise ValueError(f'got {text!r}, but {argument} is expected between commas') from None
     if written != _CHOICE:
@@ -321,20 +321,11 @@ def _problem(written: str, arguments: tuple[float, ...]) -> str:
     first, second = arguments[-2:]
     if written == _MAYBE and not 0.0 <= arguments[0] <= 1.0:
         return 'a probability is from 0 to 1'
-    if first > second:
+    if not first <= second:
         return 'the first value must not be above the second'
     if written == _LOGUNIFORM and first <= 0.0:
         return 'a loguniform distribution begins above 0'
     return ''
-
-
-def _argument(word: str, type_: type) -> Drawn:
-    if type_ is int:
-        return int(word)
-    value = float(word) if type_ is float else word
-    if value == '' or (isinstance(value, float) and not math.isfinite(value)):
-        raise ValueError
-    return value
 
 
 @dataclass(frozen=True)

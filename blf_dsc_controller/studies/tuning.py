@@ -17,7 +17,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
-from scipy.optimize import differential_evolution
+from scipy.optimize import OptimizeResult, differential_evolution
 from scipy.stats import qmc
 from tqdm import tqdm
 
@@ -150,15 +150,15 @@ def search(
     population: int,
     generations: int,
     **options: Any,
-) -> tuple[Floats, float, int]:
-    """Return the best point (log10 of the gains), its cost, and the number of evaluations.
+) -> OptimizeResult:
+    """Search the logarithms (base 10) of the gains.
 
     Differential evolution with a fixed seed from a Latin hypercube, of the same size for every
     law; `options` are passed to scipy.
     """
     ranges = np.log10([(gain.least, gain.most) for gain in gains])
     points = qmc.LatinHypercube(len(ranges), seed=np.random.default_rng(SEED)).random(population)
-    found = differential_evolution(
+    return differential_evolution(
         cost,
         ranges,
         init=points * np.diff(ranges).T + ranges[:, 0],
@@ -168,7 +168,6 @@ def search(
         seed=np.random.default_rng(SEED),
         **options,
     )
-    return found.x, float(found.fun), int(found.nfev)
 
 
 def main() -> None:
@@ -183,9 +182,11 @@ def main() -> None:
             bar.update()
             return objective(exponents, task, loops)
 
-        found, value, evaluations = search(cost, task.gains, POPULATION, GENERATIONS)
-    print(f'# {evaluations} evaluations, objective {value:.3f} (decades of error; less is better)')
-    gains = map(value_at, found)
+        found = search(cost, task.gains, POPULATION, GENERATIONS)
+    print(
+        f'# {found.nfev} evaluations, objective {found.fun:.3f} (decades of error; less is better)'
+    )
+    gains = map(value_at, found.x)
     for name, entry in parameters_at(loops[0].controller, task.gains, gains).items():
         print(f'{name}: {format_value(entry)}')
 
