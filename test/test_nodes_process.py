@@ -134,7 +134,7 @@ def test_domain_is_held_until_the_last_node_of_a_run_has_ended(monkeypatch):
         node = subprocess.Popen(
             [sys.executable, '-c', 'input()'], stdin=subprocess.PIPE, close_fds=False
         )
-    with pytest.raises(BlfDscError, match='choose a ROS domain'), isolation.own_domain():
+    with pytest.raises(BlfDscError, match='no ROS domain is free'), isolation.own_domain():
         pass
     node.communicate(b'\n')
     with isolation.own_domain() as domain:

@@ -47,21 +47,6 @@ def test_preset_runs_by_name_and_saves_its_configuration(preset, tmp_path, capsy
     assert summary['of_torques'] is from_urdf
 
 
-@pytest.mark.usefixtures('blank_pictures')
-def test_offline_run_warns_about_a_rejected_column_with_the_reason(tmp_path, capsys):
-    path = tmp_path / 'cosine.yaml'
-    path.write_text(
-        'blf_dsc_controller:\n  ros__parameters:\n'
-        '    learning: {frequencies: [1.0], bias: false}\n',
-        encoding='utf-8',
-    )
-    assert offline(str(path), tmp_path / 'out', 7.5) == 0
-    printed = capsys.readouterr().out
-    assert 'warning: cos 1 rad/s joint1 is not estimated' in printed
-    assert 'cannot distinguish it from m2*l2^2 + cos 1 rad/s joint2' in printed
-    assert 'rejected    cos 1 rad/s joint1' in printed
-
-
 @pytest.mark.skipif(importlib.util.find_spec('rclpy') is None, reason='needs ROS 2')
 @pytest.mark.usefixtures('blank_pictures')
 def test_papers_preset_over_ros_matches_its_offline_run_bit_for_bit(tmp_path):

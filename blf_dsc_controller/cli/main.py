@@ -15,7 +15,6 @@ import sys
 import textwrap
 import warnings
 from collections.abc import Callable, Sequence
-from contextvars import copy_context
 from functools import partial
 from pathlib import Path
 from typing import Any, TypeAlias
@@ -49,9 +48,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     # Names may have letters that the font of the pictures lacks.
     warnings.filterwarnings('ignore', 'Glyph .* missing')
     try:
-        code = copy_context().run(_handle, options)
+        code = _handle(options)
     except (BlfDscError, OSError) as error:
-        print(f'blf_dsc {options.command}: {_sentence(error, options)}', file=sys.stderr)
+        print(f'blf_dsc {options.command}: {error}', file=sys.stderr)
         return 1
     except KeyboardInterrupt:
         is_study = options.command == 'monte-carlo' and not (options.reproduce or options.report)
@@ -88,23 +87,6 @@ def _interrupt(command: str, _number: int, _frame: object) -> None:
         os.write(2, f'blf_dsc {command}: interrupted\n'.encode())
         os._exit(INTERRUPTED)
     raise KeyboardInterrupt
-
-
-def _sentence(error: BlfDscError | OSError, options: argparse.Namespace) -> str:
-    """Return the message of an error; an OSError around --out is reported as unwritable."""
-    out = getattr(options, 'out', None)
-    if isinstance(error, BlfDscError) or not (out and error.errno):
-        return str(error)
-    named, out = Path(error.filename or out).resolve(), Path(out).resolve()
-    if named not in (out, *out.parents) and not named.is_relative_to(out.parent):
-        return str(error)
-    return str(unwritable(options.out, error))
-
-
-def unwritable(path: Path, error: OSError) -> BlfDscError:
-    """Return the error for a file or folder of --out that cannot be written."""
-    reason = os.strerror(error.errno) if error.errno else error
-    return BlfDscError(f'{path} cannot be written ({reason}): make space or choose another path')
 
 
 def require_ros() -> None:
@@ -204,8 +186,7 @@ def _add_run(command: _Command) -> None:
     option('--mode', choices=('realtime', 'lockstep'), help='mode of the plant (as configured)')
     option('--seed', type=int, help='seed of the sensor noise (as configured)')
     option('--offline', action='store_true', help='without ROS: no processes, no topics')
-    option('--domain', type=int, help='ROS domain (a free one)')
-    option('--out', type=Path, help='new folder (closed_loop, closed_loop-2, ...)')
+    option('--out', type=Path, default=Path('closed_loop'), help='new folder (closed_loop)')
     option('--view', action='store_true', help='show the run on a page in the browser')
     option = command(
         'precompile',

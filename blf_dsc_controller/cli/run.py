@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import itertools
 import sys
 from argparse import Namespace
 from concurrent.futures import ProcessPoolExecutor
@@ -12,23 +11,20 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from tqdm import tqdm
 
 from blf_dsc_controller.bags.content import read_content
 from blf_dsc_controller.bags.reader import recorded_run
-from blf_dsc_controller.cli.main import INTERRUPTED, unwritable
+from blf_dsc_controller.cli.main import INTERRUPTED
 from blf_dsc_controller.compiled.jit import announced_compilation, ship
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.nodes import CONTROLLER, PLANT, LoopConfig, dump, load_loop
 from blf_dsc_controller.configuration.plant import PlantConfig
 from blf_dsc_controller.configuration.schema import change
 from blf_dsc_controller.errors import BlfDscError
-from blf_dsc_controller.law.factory import estimate_names
-from blf_dsc_controller.law.telemetry import rejected_columns
 from blf_dsc_controller.messages.codecs import JointStateDecoder
 from blf_dsc_controller.reference.approach import plan_start
 from blf_dsc_controller.simulation.bag import write_bag
-from blf_dsc_controller.simulation.loop import Record, simulate
+from blf_dsc_controller.simulation.loop import simulate
 from blf_dsc_controller.supervision.checks import Reason
 from blf_dsc_controller.supervision.gains import config_warnings, expectation
 from blf_dsc_controller.supervision.guard import Guard
@@ -37,11 +33,12 @@ from sim_plant.plant import plant_of
 STOPPED = 5
 """Exit code if the controller stopped before the end."""
 
-_FOLDER = 'closed_loop'
 _DURATION = 60.0  # s, if neither the file nor an option sets it
-_BAR = '{desc} |{bar}| {n:.1f}/{total:g} s [{elapsed}<{remaining}]{postfix}'
-_LINE = '{desc} {n:.1f}/{total:g} s{postfix}\n'
-_LINE_PERIOD = 10.0  # s between two lines if stderr is not a terminal
+
+
+def print_notice(notice: str) -> None:
+    """Print a notice to stderr, since it is not part of the results."""
+    print(notice, file=sys.stderr, flush=True)
 
 
 def run(options: Namespace) -> int:
@@ -50,18 +47,20 @@ def run(options: Namespace) -> int:
         config = _configuration(options)
     if options.view:
         _check_view(options)
-    options.out = out = make_folder(options.out)
+    out = make_folder(options.out)
     clock = 'plant' if config.plant.mode == 'lockstep' else 'wall'
     recorder = {'output': str(out / 'bag'), 'clock': clock}
     config = config._replace(recorder=change(config.recorder, recorder))
     dump(out / 'config.yaml', config.by_node)
     completed = True
     if options.offline:
-        _run_offline(config, out / 'bag')
+        with announced_compilation(print_notice):
+            record = simulate(config.controller, config.plant)
+        write_bag(out / 'bag', record, config.controller, config.recorder.compression, config.plant)
     else:
         from blf_dsc_controller.cli.session import run_session
 
-        completed = run_session(config, out, options.domain, view=options.view)
+        completed = run_session(config, out, view=options.view)
     try:
         stopped = _report(out)
     except BlfDscError as error:
@@ -73,25 +72,15 @@ def run(options: Namespace) -> int:
     return STOPPED if stopped else 0
 
 
-def make_folder(chosen: Path | None) -> Path:
-    """Create the chosen folder, or the first free one of closed_loop, closed_loop-2, ...
-
-    Raises BlfDscError if the chosen one exists already, or if it cannot be created.
-    """
-    for number in itertools.count(1):
-        path = chosen or Path(_FOLDER if number == 1 else f'{_FOLDER}-{number}')
-        try:
-            path.mkdir(parents=True)
-        except FileExistsError:
-            if chosen:
-                raise BlfDscError(
-                    f'{path} exists already and is not overwritten: choose another --out'
-                ) from None
-        except OSError as error:
-            raise unwritable(Path(error.filename or path), error) from error
-        else:
-            return path
-    raise AssertionError
+def make_folder(path: Path) -> Path:
+    """Create a folder; raises BlfDscError if it exists already."""
+    try:
+        path.mkdir(parents=True)
+    except FileExistsError:
+        raise BlfDscError(
+            f'{path} exists already and is not overwritten: choose another --out'
+        ) from None
+    return path
 
 
 def _configuration(options: Namespace) -> LoopConfig:
@@ -117,22 +106,6 @@ def _configuration(options: Namespace) -> LoopConfig:
     return config
 
 
-def _run_offline(config: LoopConfig, bag: Path) -> None:
-    progress = LoopProgress(config.plant.duration)
-
-    def show(record: Record, rows: int) -> None:
-        n = len(record.config.joints)
-        errors = abs(record.samples[:rows, 2 * n : 3 * n] / record.samples[:rows, 6 * n : 7 * n])
-        progress.show(record.stamps[rows - 1] * 1e-9, np.nanmax(errors))
-
-    with announced_compilation(print_notice):
-        record = simulate(config.controller, config.plant, show)
-    progress.close()
-    for reason in rejected_columns(record.controller, estimate_names(config.controller)).values():
-        print(f'warning: {reason}')
-    write_bag(bag, record, config.controller, config.recorder.compression, config.plant)
-
-
 def _check_view(options: Namespace) -> None:
     """Raise BlfDscError if there can be no page."""
     if options.offline:
@@ -140,11 +113,6 @@ def _check_view(options: Namespace) -> None:
     from blf_dsc_controller.view.page import require_viser
 
     require_viser()
-
-
-def print_notice(notice: str) -> None:
-    """Print a notice to stderr, since it is not part of the results."""
-    print(notice, file=sys.stderr, flush=True)
 
 
 def _report(out: Path) -> bool:
@@ -165,35 +133,6 @@ def _report(out: Path) -> bool:
     print(f'wrote       {out}: bag, summary.json, {", ".join(path.name for path in pictures)}')
     last = recorded.stamp[-1]  # the plant ends after it, so the controller times out
     return any(stop.stamp < last or stop.reason != Reason.STATE_TIMEOUT for stop in recorded.stops)
-
-
-class LoopProgress:
-    """Progress over simulated time, with the largest |xi1| / k_c.
-
-    A bar on a terminal, otherwise (as in a log) a line every few seconds.
-    """
-
-    def __init__(self, duration: float) -> None:
-        """Begin at 0 s of the simulated duration [s]."""
-        self._duration, self._is_bar = duration, sys.stderr.isatty()
-        form, pause = (_BAR, 0.2) if self._is_bar else (_LINE, _LINE_PERIOD)
-        self._bar = tqdm(total=duration, desc='closed loop', bar_format=form, mininterval=pause)
-
-    def show(self, elapsed: float, ratio: float) -> None:
-        """Show the simulated time [s] and the largest |xi1| / k_c so far."""
-        self._bar.set_postfix_str(f'max|xi1|/bound {ratio:.2f}', refresh=False)
-        self._bar.update(min(elapsed, self._duration) - self._bar.n)
-
-    def write(self, text: str) -> None:
-        """Print a line without disturbing the bar."""
-        if self._is_bar:
-            self._bar.write(text, file=sys.stderr)
-        else:
-            print_notice(text)
-
-    def close(self) -> None:
-        """Show the last state."""
-        self._bar.close()
 
 
 def precompile(options: Namespace) -> None:

@@ -14,16 +14,16 @@ import signal
 import socket
 import subprocess
 import sys
-import time
 from collections.abc import Iterator
-from contextlib import ExitStack, closing, contextmanager, nullcontext
+from contextlib import ExitStack, closing, contextmanager
 from pathlib import Path
 
 import rclpy
 from rclpy.experimental import EventsExecutor
 from sensor_msgs.msg import JointState
+from tqdm import tqdm
 
-from blf_dsc_controller.cli.run import LoopProgress
+from blf_dsc_controller.cli.run import print_notice
 from blf_dsc_controller.compiled.jit import COMPILING
 from blf_dsc_controller.configuration.files import share_folder
 from blf_dsc_controller.configuration.nodes import CONTROLLER, PLANT, RECORDER, VIEW, LoopConfig
@@ -47,32 +47,29 @@ _ROOM = 1_000_000  # bytes; with less free space the disk counts as full
 _PR_SET_PDEATHSIG = 1
 _LIBC = ctypes.CDLL(None)  # loaded before there are threads
 _PAGE = 'open http'  # in the log of the node that serves it
-_LAST = 5.0  # s, at most, to show what a loop sent before it ended
-_IN_TRANSIT = 0.5  # s, at most, between messages that are still on their way at the end
+_BAR = '{desc} |{bar}| {n:.1f}/{total:g} s [{elapsed}<{remaining}]{postfix}'
+_LINE = '{desc} {n:.1f}/{total:g} s{postfix}\n'
+_LINE_PERIOD = 10.0  # s between two lines if stderr is not a terminal
 _RANGE = 'ROS_AUTOMATIC_DISCOVERY_RANGE'
 _PROFILES = 'FASTRTPS_DEFAULT_PROFILES_FILE'
 _DOMAINS = range(1, 101)  # 0 is the default; above 101, ports are ephemeral
 
 
-def run_session(config: LoopConfig, out: Path, domain: int | None, *, view: bool) -> bool:
+def run_session(config: LoopConfig, out: Path, *, view: bool) -> bool:
     """Run recorder, controller and plant on `out/config.yaml` until the plant has ended.
 
-    They run in a ROS domain of their own unless `domain` is given, and with a page if they should
-    be viewed. Returns False if a signal to this process, or to another node than the plant,
-    ended the run; raises NodeFailedError if a node exited with an error.
+    They run in a ROS domain of their own, and with a page if they should be viewed. Returns False
+    if a signal to this process, or to another node than the plant, ended the run; raises
+    BlfDscError if a node exited with an error.
     """
     logs = out / 'logs'
     logs.mkdir()
-    with own_domain() if domain is None else nullcontext(domain) as chosen:
-        values = {
-            'ROS_DOMAIN_ID': str(chosen),
-            'ROS_LOG_DIR': str(logs / 'ros'),
-            **localhost_environment(),
-        }
+    with own_domain() as domain:
+        values = {'ROS_DOMAIN_ID': str(domain), 'ROS_LOG_DIR': str(logs / 'ros')}
         try:
-            with environment(values):
+            with environment(values | localhost_environment()):
                 return _run_nodes(config, out / 'config.yaml', logs, view=view)
-        except NodeFailedError:
+        except BlfDscError:
             if shutil.disk_usage(out).free < _ROOM:
                 print(f'no space left on the disk of {out}', file=sys.stderr)
             if (out / 'bag' / 'metadata.yaml').exists():
@@ -80,10 +77,6 @@ def run_session(config: LoopConfig, out: Path, domain: int | None, *, view: bool
             elif (out / 'bag').exists():
                 print(f'blf_dsc recover {out / "bag"} saves what was recorded', file=sys.stderr)
             raise
-
-
-class NodeFailedError(BlfDscError):
-    """A node exited with an error."""
 
 
 class NodeProcess:
@@ -127,7 +120,7 @@ class NodeProcess:
         return [f'{self.name}: {notice}' for notice in new]
 
     def check(self) -> None:
-        """Raise NodeFailedError, with the end of the log, if the node exited with an error."""
+        """Raise BlfDscError, with the end of the log, if the node exited with an error."""
         code = self._process.poll()
         if not code:
             return
@@ -137,7 +130,7 @@ class NodeProcess:
             end = f'was terminated by {names.get(-code, f"signal {-code}")}'
         lines = self._log.read_text(encoding='utf-8', errors='replace').splitlines()[-_TAIL:]
         tail = ''.join(f'\n  {line}' for line in lines)
-        raise NodeFailedError(f'{self.name} {end}:{tail}\n(full log: {self._log})')
+        raise BlfDscError(f'{self.name} {end}:{tail}\n(full log: {self._log})')
 
     def stop(self) -> None:
         """Interrupt the node and wait until it exits; kill it if it takes too long."""
@@ -170,14 +163,13 @@ def _run_nodes(config: LoopConfig, params_file: Path, logs: Path, *, view: bool)
             monitor.wait(0.1)
             notices = [notice for node in starting for notice in node.new_notices()]
             for notice in notices:
-                monitor.progress.write(notice)
+                monitor.write(notice)
             if monitor.has_begun and (starting is nodes or notices):
                 # Only now, since the nodes wait for a subscriber, which must be the recorder.
                 starting, view = [started(VIEW)] if view else [], False
         completed = not (interrupts or nodes[-1].is_running)
-        last = time.monotonic() + _LAST  # another loop in the same domain never falls silent
-        while completed and time.monotonic() < last and monitor.wait(_IN_TRANSIT):
-            pass
+        if completed:
+            monitor.show(config.plant.duration)
     for node in nodes:
         node.check()
     return completed
@@ -188,11 +180,16 @@ def _die_with_parent() -> None:
 
 
 class ProgressMonitor:
-    """Progress display of the loop that runs in this process's ROS domain."""
+    """Progress over simulated time of the loop in this process's ROS domain, with max |xi1| / k_c.
+
+    A bar on a terminal, otherwise (as in a log) a line every few seconds.
+    """
 
     def __init__(self, duration: float) -> None:
         """Wait for a loop of this simulated duration [s]."""
-        self.progress = LoopProgress(duration)
+        self._duration, self._is_bar = duration, sys.stderr.isatty()
+        form, pause = (_BAR, 0.2) if self._is_bar else (_LINE, _LINE_PERIOD)
+        self._bar = tqdm(total=duration, desc='closed loop', bar_format=form, mininterval=pause)
         self._start: float | None = None
         self._received: list[JointState] = []
         self._context = rclpy.Context()
@@ -212,23 +209,34 @@ class ProgressMonitor:
         """Whether a message of the loop has been received."""
         return self._start is not None
 
-    def wait(self, seconds: float) -> bool:
-        """Wait for a message and show it; return False if none arrived."""
+    def wait(self, seconds: float) -> None:
+        """Wait for a message and show it."""
         self._executor.spin_once(timeout_sec=seconds)
         if not self._received:
-            return False
+            return
         message = self._received[-1]
         self._received.clear()
         values = zip(message.name, message.position, strict=True)
         ratio = max(value for name, value in values if name.startswith(RATIO))
+        self._bar.set_postfix_str(f'max|xi1|/bound {ratio:.2f}', refresh=False)
         stamp = message.header.stamp.sec + 1e-9 * message.header.stamp.nanosec
         self._start = stamp if self._start is None else self._start
-        self.progress.show(stamp - self._start, ratio)
-        return True
+        self.show(stamp - self._start)
+
+    def show(self, elapsed: float) -> None:
+        """Show the simulated time [s]."""
+        self._bar.update(min(elapsed, self._duration) - self._bar.n)
+
+    def write(self, notice: str) -> None:
+        """Print a notice without disturbing the bar."""
+        if self._is_bar:
+            self._bar.write(notice, file=sys.stderr)
+        else:
+            print_notice(notice)
 
     def close(self) -> None:
         """Leave the ROS domain."""
-        self.progress.close()
+        self._bar.close()
         self._executor.shutdown()
         self._node.destroy_node()
         rclpy.try_shutdown(context=self._context)
@@ -253,15 +261,13 @@ def environment(values: dict[str, str]) -> Iterator[None]:
 
     A caller in Python must not stay in a domain that the next run may claim.
     """
-    before = {name: os.environ.get(name) for name in values}
+    before = dict(os.environ)
     os.environ.update(values)
     try:
         yield
     finally:
-        for name, value in before.items():
-            os.environ.pop(name)
-            if value is not None:
-                os.environ[name] = value
+        os.environ.clear()
+        os.environ.update(before)
 
 
 @contextmanager
@@ -280,4 +286,4 @@ def own_domain() -> Iterator[int]:
                 continue
             yield domain
             return
-    raise BlfDscError(f'{len(_DOMAINS)} runs are active: choose a ROS domain with --domain')
+    raise BlfDscError(f'{len(_DOMAINS)} runs are active: no ROS domain is free')

@@ -9,7 +9,6 @@ stop.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -94,14 +93,13 @@ def run_loop(
 def simulate(
     controller_config: ControllerConfig,
     plant_config: PlantConfig,
-    progress: Callable[[Record, int], None] | None = None,
     *,
     supervised: bool = True,
 ) -> Record:
     """Run controller and plant in closed loop for `duration` and return every sample.
 
-    The plant's duration must not be 0.  `progress` is called periodically with the record and the
-    number of rows that are filled.  If not `supervised`, the law runs alone, past its limits too.
+    The plant's duration must not be 0.  If not `supervised`, the law runs alone, past its limits
+    too.
 
     Raises StartError if the law cannot take over and approach.enabled is false, and MotionError if
     there is no approach within the limits.
@@ -111,7 +109,7 @@ def simulate(
         guard = Guard(controller_config, lambda: 0, lambda: 0)
         guard.activate()
         record = new_record(guard.controller, controller_config, plant_config, guard.journal)
-        _run_supervised(guard, plant, record, progress)
+        _run_supervised(guard, plant, record)
         return record
     journal = Journal()
     record = new_record(controller_of(controller_config), controller_config, plant_config, journal)
@@ -136,9 +134,7 @@ def run_alone(record: Record, plant: Plant, *, observed: bool = True) -> None:
     _run_samples(record.controller, plant, samples, arrays)
 
 
-def _run_supervised(
-    guard: Guard, plant: Plant, record: Record, progress: Callable[[Record, int], None] | None
-) -> None:
+def _run_supervised(guard: Guard, plant: Plant, record: Record) -> None:
     rows = record.stamps.size
     _run_guarded(guard, plant, record, range(1))
     if guard.start_error is not None:
@@ -147,8 +143,6 @@ def _run_supervised(
         chunk = range(first, min(first + _CHUNK, rows))
         if not _run_compiled(guard, plant, record, chunk):
             _run_guarded(guard, plant, record, chunk)
-        if progress is not None:
-            progress(record, chunk.stop)
 
 
 def _run_compiled(guard: Guard, plant: Plant, record: Record, chunk: range) -> bool:
