@@ -165,7 +165,7 @@ def test_torques_are_those_of_the_commands_or_measured_or_unknown(tmp_path):
     for messages, names, words in (
         (foreign('', ('position', 'velocity')), unmapped, '--map commands='),
         (foreign('three'), names_of(), '3 values, but there are 2 joints, and 4 in'),
-        (mixed, names_of(), 'not every message holds the same 2 values'),
+        (mixed, names_of(), 'not every message holds the same number'),
     ):
         with pytest.raises(BlfDscError, match=words):
             torque_of(tmp_path / words[:3], messages, names)

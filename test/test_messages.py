@@ -173,7 +173,7 @@ def without_padding(raw):
     """The meaningful pieces of a JointState: rclpy leaves its padding bytes uninitialised."""
     layout = joint_state_layout(raw)
     return [raw[:2], raw[4:12], layout.names] + [
-        raw[array.offset : array.offset + 8 * array.size] for array in layout.arrays
+        raw[array.offset : array.offset + 8 * array.size] for array in layout.arrays.values()
     ]
 
 

@@ -284,16 +284,18 @@ def _by_joint(content: Content, commands: TopicMessages, joints: tuple[str, ...]
     """Return commands by name; without names, in the order of `joints` or of the joint states."""
     if commands.type == topics.JOINT_STATE:
         return commands.joint_states(joints, ('effort',))
-    size = commands.layout().arrays[0].size
-    states = content.topics[topics.JOINT_STATES].layout()
-    if size == len(joints):
-        return commands.arrays(range(size))
-    if size == len(states.names):
-        return commands.arrays(states.indices_of(joints))
+    numbers, *others = commands.name_lists()
+    lists = content.topics[topics.JOINT_STATES].name_lists()
+    names = next(names for names in lists if {*joints} <= {*names})
+    if others:
+        raise TorqueError(f'{commands.name}: not every message holds the same number of values')
+    if len(numbers) == len(joints):
+        return commands.joint_states(numbers, ('effort',))
+    if len(numbers) == len(names):
+        return commands.joint_states([f'{names.index(j)}' for j in joints], ('effort',))
     raise TorqueError(
-        f'{commands.name} has {size} values, but there are {len(joints)} joints, and '
-        f'{len(states.names)} in the joint states ({", ".join(states.names)}): their order is '
-        'not known'
+        f'{commands.name} has {len(numbers)} values, but there are {len(joints)} joints, and '
+        f'{len(names)} in the joint states ({", ".join(names)}): their order is not known'
     )
 
 

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from blf_dsc_controller.bags.sources import BagError, BagMessage
 from blf_dsc_controller.messages.codecs import (
+    JOINT_STATE_FIELDS,
     NANOSECONDS,
     ORIGIN,
     STAMP_OFFSET,
@@ -30,7 +31,9 @@ from blf_dsc_controller.run import Floats, Stamps
 
 _BLOCK = 512  # messages decoded at once, which then are in the cache
 _RECENT = 100  # layouts that a message is compared with: more only where no two messages are alike
-_NUMBER, _RECEIVED, _SEQUENCE, _STAMP, _VALUES = range(5)  # columns, the last with all others
+_LAYOUTS = {JOINT_STATE: joint_state_layout, FLOAT64_MULTI_ARRAY: array_layout}
+_UNREADABLE = -1  # instead of a layout
+_LAYOUT, _RECEIVED, _SEQUENCE, _STAMP, _VALUES = range(5)  # columns, the last with all others
 _MOST_PUBLISHERS = 10  # of a topic, one after the other or at once
 _NAN = np.float64(np.nan).view(np.int64)
 _ALL = slice(None)
@@ -50,75 +53,6 @@ class UnreadableMessageError(BagError):
         super().__init__(f'message {index + 1} of {topic} cannot be read: {reason}')
 
 
-class _File:
-    """A temporary file, which lasts as long as what refers to it."""
-
-    def __init__(self) -> None:
-        self._file = tempfile.TemporaryFile()  # noqa: SIM115 - closed below
-
-    def __del__(self) -> None:
-        self._file.close()
-
-    def append(self, content: bytes) -> int:
-        """Write at the end and return the offset."""
-        offset = self._file.seek(0, os.SEEK_END)
-        self._file.write(content)
-        self._file.flush()
-        return offset
-
-    def read_into(self, array: NDArray[np.int64], offset: int) -> None:
-        """Fill an array from an offset on."""
-        os.preadv(self._file.fileno(), [array.data], offset)
-
-
-class _Store:
-    """Messages of one layout in the file of their topic: blocks of them, each column by column."""
-
-    def __init__(self, layout: Layout, file: _File, *, has_stamp: bool) -> None:
-        self.layout, self.size = layout, 0
-        self._has_stamp = has_stamp
-        self._waiting: list[tuple[int, BagMessage]] = []
-        self._file = file
-        self._blocks: list[tuple[int, int]] = []  # offset [bytes], messages
-
-    def add(self, number: int, message: BagMessage) -> None:
-        """Add a message with its number among those of the topic."""
-        self.size += 1
-        self._waiting.append((number, message))
-        if len(self._waiting) == _BLOCK:
-            self.flush()
-
-    def flush(self) -> None:
-        """Decode the messages added last; no other may follow a block that is not full."""
-        waiting, self._waiting = self._waiting, []
-        if not waiting:
-            return
-        count, size = len(waiting), self.layout.size
-        columns = np.zeros((_VALUES + self.layout.places.size, count), np.int64)
-        columns[_NUMBER] = [number for number, _ in waiting]
-        columns[_RECEIVED] = [message.received for _, message in waiting]
-        columns[_SEQUENCE] = [message.sequence for _, message in waiting]
-        joined = b''.join([message.raw for _, message in waiting])
-        if self._has_stamp:
-            kind = np.dtype([('s', '<i4'), ('ns', '<u4')])
-            stamp = np.ndarray(count, kind, joined, STAMP_OFFSET, (size,))
-            columns[_STAMP] = stamp['s'].astype(np.int64) * NANOSECONDS + stamp['ns']
-        grid = np.ndarray((count, (size - ORIGIN) // 8), '<i8', joined, ORIGIN, (size, 8))
-        columns[_VALUES:] = grid[:, self.layout.places].T
-        self._blocks.append((self._file.append(columns.tobytes()), count))
-
-    def column(self, j: int, rows: NDArray[np.int32]) -> NDArray[np.int64]:
-        """Return a column of some of these messages."""
-        if not rows.size:
-            return np.empty(0, np.int64)
-        first, last = rows.min() // _BLOCK, rows.max() // _BLOCK + 1
-        values = np.empty((last - first, _BLOCK), np.int64)
-        for block, (offset, count) in zip(values, self._blocks[first:last], strict=True):
-            self._file.read_into(block[:count], offset + 8 * count * j)
-        found: NDArray[np.int64] = values.ravel()[rows - first * _BLOCK]
-        return found
-
-
 class Values:
     """Values (N, n) of states, read when they are indexed: by rows, or by rows and columns.
 
@@ -135,10 +69,8 @@ class Values:
         states = self._states.select(rows)
         joints = np.arange(len(states.names))[columns]
         values = np.empty((joints.size, states.size))
-        for row, j in zip(values, joints.ravel().tolist(), strict=True):
-            row[:] = states.column([places[self._field, j] for _, places in states.parts]).view(
-                float
-            )
+        for row, j in zip(values, states.places[self._field, joints.ravel()].tolist(), strict=True):
+            row[:] = states.messages.column(j, states.number).view(float)
         values = values.T if joints.ndim else values[0]
         if self._difference is not None and np.isnan(values).any():
             first, second = (each[key] for each in self._difference)
@@ -151,61 +83,47 @@ class Values:
 
 
 class JointStates:
-    """N states of n joints, or N vectors of n named values in `position`."""
+    """N states of n joints, or N vectors of n named values."""
 
     def __init__(
         self,
+        messages: TopicMessages,
         names: Sequence[str],
-        parts: Sequence[tuple[_Store, NDArray[np.intp]]],
-        rows: NDArray[np.int32],
+        places: NDArray[np.intp],
+        number: NDArray[np.int32],
     ) -> None:
-        """Take rows (N,) of the messages of several layouts, one after another; -1 is unknown.
+        """Take messages by their `number` (N,) in the topic; -1 is an unknown one.
 
-        With each layout comes where its values (3, n) are; -1 is unknown.
+        Their positions, velocities and efforts are in the columns `places` (3, n), -1 if unknown.
         """
-        self.names, self.size = tuple(names), rows.size
-        self.parts, self._rows = parts, rows
-
-    @property
-    def number(self) -> NDArray[np.int64]:
-        """Number of each among the messages of the topic (N,)."""
-        return self.column([_NUMBER] * len(self.parts))
+        self.names, self.size = tuple(names), number.size
+        self.messages, self.places, self.number = messages, places, number
 
     @property
     def received(self) -> Stamps:
         """When each was received (N,) [ns]."""
-        return self.column([_RECEIVED] * len(self.parts))
+        return self.messages.column(_RECEIVED, self.number)
 
     @property
     def sequence(self) -> Stamps:
         """Number given by the publisher (N,); 0 if unknown."""
-        return self.column([_SEQUENCE] * len(self.parts))
+        return self.messages.column(_SEQUENCE, self.number)
 
     @property
     def stamp(self) -> Stamps:
         """Stamps (N,) [ns]."""
-        return self.column([_STAMP] * len(self.parts))
+        return self.messages.column(_STAMP, self.number)
 
     def field(self, k: int) -> Any:
         """Return positions (0), velocities (1) or efforts (2) as `Values` (N, n)."""
         return Values(self, k)
 
-    def column(self, places: Sequence[int]) -> NDArray[np.int64]:
-        """Return a column (N,), which is at this place of each layout; NaN where unknown."""
-        values, begin = np.full(self.size, _NAN), 0
-        for (store, _), j in zip(self.parts, places, strict=True):
-            inside = (self._rows >= begin) & (self._rows < begin + store.size)
-            if j >= 0:
-                values[inside] = store.column(j, self._rows[inside] - begin)
-            begin += store.size
-        return values
-
     def select(self, rows: Rows) -> JointStates:
         """Return the states of these rows; -1 is an unknown one."""
-        chosen = self._rows[rows]
+        chosen = self.number[rows]
         if not isinstance(rows, slice):
             chosen[rows < 0] = -1
-        return JointStates(self.names, self.parts, chosen)
+        return JointStates(self.messages, self.names, self.places, chosen)
 
     def by_stamp(self) -> JointStates:
         """Return the states ordered by stamp, one per stamp."""
@@ -227,32 +145,47 @@ class JointStates:
 
 
 class TopicMessages:
-    """All messages of one topic: the numbers of known types in a file, others as bytes."""
+    """All messages of one topic: the numbers of known types in a file, others as bytes.
+
+    The file has blocks of messages, each column by column: one for each name and field so far.
+
+    Attributes:
+        name, type: of the topic.
+        size: number of messages.
+        raw: messages of other types, which are few.
+        received: when those were received [ns].
+    """
 
     def __init__(self, name: str, type_name: str) -> None:
-        self.name, self.type = name, type_name
-        self.size = 0
-        self.raw: list[bytes] = []  # of other types
-        self.received: list[int] = []  # likewise [ns]
-        self._file = _File()
-        self._stores: list[_Store] = []
-        self._last: _Store | None = None  # that of the last message
+        self.name, self.type, self.size = name, type_name, 0
+        self.raw: list[bytes] = []
+        self.received: list[int] = []
+        self._file = tempfile.TemporaryFile()  # noqa: SIM115 - closed below
+        self._blocks: list[tuple[int, int, int]] = []  # offset [bytes], columns, messages
+        self._waiting: list[tuple[int, BagMessage]] = []  # with the number of the layout
+        self._layouts: list[Layout] = []
+        self._columns: dict[tuple[str, str], int] = {}  # by field and name
+        self._last = _UNREADABLE  # layout of the last message
         self._unreadable: dict[int, MessageError] = {}
         self._next: list[int] = []  # sequence number of each publisher, that of the last one last
         self._missed = self._before = 0
 
+    def __del__(self) -> None:
+        self._file.close()
+
     def add(self, message: BagMessage) -> None:
-        """Add a message."""
+        """Add a message; none may be added once a column was read."""
         if message.sequence:
             self._count(message.sequence)
-        if self.type not in (JOINT_STATE, FLOAT64_MULTI_ARRAY):
+        if self.type not in _LAYOUTS:
             self.raw.append(message.raw)
             self.received.append(message.received)
         else:
-            if self._last is None or not self._last.layout.fits(message.raw):
-                self._last = self._store_of(message.raw)
-            if self._last is not None:
-                self._last.add(self.size, message)
+            if self._last < 0 or not self._layouts[self._last].fits(message.raw):
+                self._last = self._layout_of(message.raw)
+            self._waiting.append((self._last, message))
+            if len(self._waiting) == _BLOCK:
+                self._flush()
         self.size += 1
 
     def _count(self, sequence: int) -> None:
@@ -276,18 +209,56 @@ class TopicMessages:
         earlier = f', {self._before} sent before the recorder connected' if self._before else ''
         return f'{self._missed} missed{earlier}'
 
-    def _store_of(self, raw: bytes) -> _Store | None:
-        for store in self._stores[-_RECENT:]:
-            if store.layout.fits(raw):
-                return store
-        is_state = self.type == JOINT_STATE
+    def _layout_of(self, raw: bytes) -> int:
+        for k in range(max(0, len(self._layouts) - _RECENT), len(self._layouts)):
+            if self._layouts[k].fits(raw):
+                return k
         try:
-            layout = (joint_state_layout if is_state else array_layout)(raw)
+            layout = _LAYOUTS[self.type](raw)
         except MessageError as error:
             self._unreadable[self.size] = error
-            return None
-        self._stores.append(_Store(layout, self._file, has_stamp=is_state))
-        return self._stores[-1]
+            return _UNREADABLE
+        for key in layout.keys:
+            self._columns.setdefault(key, _VALUES + len(self._columns))
+        self._layouts.append(layout)
+        return len(self._layouts) - 1
+
+    def _flush(self) -> None:
+        """Decode the messages added last."""
+        waiting, self._waiting = self._waiting, []
+        if not waiting:
+            return
+        columns = np.full((_VALUES + len(self._columns), len(waiting)), _NAN)
+        columns[_LAYOUT] = [k for k, _ in waiting]
+        columns[_RECEIVED] = [message.received for _, message in waiting]
+        columns[_SEQUENCE] = [message.sequence for _, message in waiting]
+        for k in {k for k, _ in waiting} - {_UNREADABLE}:
+            rows, layout = np.flatnonzero(columns[_LAYOUT] == k), self._layouts[k]
+            joined = b''.join([message.raw for of, message in waiting if of == k])
+            if self.type == JOINT_STATE:
+                kind = np.dtype([('s', '<i4'), ('ns', '<u4')])
+                stamp = np.ndarray(rows.size, kind, joined, STAMP_OFFSET, (layout.size,))
+                columns[_STAMP, rows] = stamp['s'].astype(np.int64) * NANOSECONDS + stamp['ns']
+            grid = (rows.size, (layout.size - ORIGIN) // 8), '<i8', joined, ORIGIN, (layout.size, 8)
+            places = np.array([self._columns[key] for key in layout.keys], np.intp)
+            columns[np.ix_(places, rows)] = np.ndarray(*grid)[:, layout.places].T
+        self._blocks.append((self._file.tell(), *columns.shape))
+        self._file.write(columns.tobytes())
+        self._file.flush()
+
+    def column(self, j: int, number: NDArray[np.int32]) -> NDArray[np.int64]:
+        """Return a column of messages by number; NaN where a message or its column is unknown."""
+        self._flush()
+        found, known = np.full(number.size, _NAN), number >= 0
+        if j < 0 or not known.any():
+            return found
+        first, last = number[known].min() // _BLOCK, number.max() // _BLOCK + 1
+        values = np.full((last - first, _BLOCK), _NAN)
+        for block, (offset, columns, size) in zip(values, self._blocks[first:last], strict=True):
+            if j < columns:
+                os.preadv(self._file.fileno(), [block[:size].data], offset + 8 * size * j)
+        found[known] = values.ravel()[number[known] - first * _BLOCK]
+        return found
 
     def joint_states(
         self,
@@ -295,58 +266,41 @@ class TopicMessages:
         required: Collection[str] = ('position', 'velocity'),
         errors: dict[int, MessageError] | None = None,
     ) -> JointStates:
-        """Return sensor_msgs/JointState of these names, without those that name none of them.
+        """Return the states of these names, without messages that name none of them.
 
+        The values of a std_msgs/Float64MultiArray are efforts; their names are their numbers.
         Messages that cannot be decoded are added to `errors` by number.
 
         Raises:
             UnreadableMessageError: a message cannot be decoded and `errors` is None, or none can.
         """
-        unreadable, foreign = dict(self._unreadable), dict[int, MessageError]()
-        parts = []
-        for store in self._stores:
-            store.flush()
+        problems: dict[int, MessageError] = {}
+        for k, layout in enumerate(self._layouts):
             try:
-                found = store.layout.columns(names, required)
+                layout.columns(names, required)
             except MessageError as error:
-                is_foreign = isinstance(error, MissingJointError) and error.is_foreign(names)
-                numbers = store.column(_NUMBER, np.arange(store.size, dtype=np.int32)).tolist()
-                (foreign if is_foreign else unreadable).update(dict.fromkeys(numbers, error))
-            else:
-                parts.append((store, np.where(found < 0, -1, found + _VALUES)))
-        if not parts:
-            unreadable = unreadable or foreign
-        if unreadable and (errors is None or not parts):
-            raise UnreadableMessageError(self.name, *min(unreadable.items()))
+                problems[k] = error
+        last = len(self._layouts)  # of what has no layout
+        is_read = np.array([k not in problems for k in range(last)] + [False])
+        is_bad = np.array([not _is_foreign(problems.get(k), names) for k in range(last)] + [True])
+        layouts = self.column(_LAYOUT, np.arange(self.size, dtype=np.int32))
+        number = np.flatnonzero(is_read[layouts]).astype(np.int32)
+        bad = np.flatnonzero((is_bad & ~is_read)[layouts]) if number.size else range(self.size)
+        found = {k: self._unreadable.get(k) or problems[layouts[k]] for k in map(int, bad)}
+        if found and (errors is None or not number.size):
+            raise UnreadableMessageError(self.name, *min(found.items()))
         if errors is not None:
-            errors.update(unreadable)
-        return _together(names, parts)
-
-    def arrays(self, columns: Sequence[int]) -> JointStates:
-        """Return these values of each std_msgs/Float64MultiArray as efforts.
-
-        Raises:
-            UnreadableMessageError: a message cannot be decoded, or has other values.
-        """
-        size = self.layout().arrays[0].size
-        self._stores[0].flush()
-        if len(self._stores) > 1 or self._unreadable or max(columns) >= size:
-            error = MessageError(f'not every message holds the same {size} values')
-            raise UnreadableMessageError(self.name, *min([*self._unreadable.items(), (0, error)]))
-        places = np.full((3, len(columns)), -1)
-        places[2] = np.array(columns) + _VALUES
-        return _together([f'{k}' for k in columns], [(self._stores[0], places)])
-
-    def layout(self) -> Layout:
-        """Return the layout of the first message; UnreadableMessageError if it has none."""
-        if 0 in self._unreadable or not self._stores:
-            raise UnreadableMessageError(self.name, 0, self._unreadable[0])
-        return self._stores[0].layout
+            errors.update(found)
+        places = [
+            [self._columns.get((field, name), -1) for name in names] for field in JOINT_STATE_FIELDS
+        ]
+        return JointStates(self, names, np.array(places, np.intp), number)
 
     def name_lists(self) -> list[tuple[str, ...]]:
-        """Return the different lists of names; UnreadableMessageError as `layout`."""
-        self.layout()
-        return list(dict.fromkeys(store.layout.names for store in self._stores))
+        """Return the different lists of names; UnreadableMessageError if there is none."""
+        if not self._layouts:
+            raise UnreadableMessageError(self.name, *min(self._unreadable.items()))
+        return list(dict.fromkeys(layout.names for layout in self._layouts))
 
     def joint_names(self) -> tuple[str, ...]:
         """Return the longest list of names in a message; UnreadableMessageError if it is empty."""
@@ -357,10 +311,5 @@ class TopicMessages:
         return names
 
 
-def _together(
-    names: Sequence[str], parts: Sequence[tuple[_Store, NDArray[np.intp]]]
-) -> JointStates:
-    """Return all messages of some layouts in order."""
-    rows = np.arange(sum(store.size for store, _ in parts), dtype=np.int32)
-    states = JointStates(names, parts, rows)
-    return states if len(parts) == 1 else states.select(np.argsort(states.number, kind='stable'))
+def _is_foreign(problem: MessageError | None, names: Collection[str]) -> bool:
+    return isinstance(problem, MissingJointError) and problem.is_foreign(names)

@@ -12,7 +12,7 @@ reads them. Messages of all other types are left to the library rosbags.
 from __future__ import annotations
 
 import functools
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from operator import itemgetter
 from struct import Struct, unpack_from
 from typing import NamedTuple
@@ -109,23 +109,33 @@ class Layout:
     """What is the same in all messages of one sender: size, names, array sizes.
 
     Attributes:
-        names: in the message.
-        arrays: where its arrays are.
+        names: in the message; numbers as text if it has none.
+        arrays: where its arrays are, by field.
         places: indices of all their values in a grid of doubles that starts at ORIGIN.
+        keys: field and name of each of them.
         size: of the message [bytes].
         fixed: bytes that are no numbers.
     """
 
     def __init__(
-        self, raw: bytes | bytearray, begin: int, names: tuple[str, ...], *arrays: Doubles
+        self,
+        raw: bytes | bytearray,
+        begin: int,
+        names: tuple[str, ...],
+        arrays: Mapping[str, Doubles],
     ) -> None:
         """Take a message of which the bytes from `begin` to its first values are not numbers."""
         self.names, self.arrays = names, arrays
         self.size = len(raw)
         self.places = np.concatenate([
-            (array.offset - ORIGIN) // 8 + np.arange(array.size) for array in arrays
+            (array.offset - ORIGIN) // 8 + np.arange(array.size) for array in arrays.values()
         ])  # fmt: skip
-        first, *others = (array.size_offset for array in arrays)
+        self.keys = [
+            (field, names[i] if array.size == len(names) else '')
+            for field, array in arrays.items()
+            for i in range(array.size)
+        ]
+        first, *others = (array.size_offset for array in arrays.values())
         sizes = (slice(at, at + 4) for at in others)
         self.fixed = slice(2), slice(begin, first + 4), *sizes
         self._parts_of = itemgetter(*self.fixed)
@@ -163,9 +173,9 @@ class Layout:
         """
         indices, begin = np.array(self.indices_of(joints), dtype=np.intp), 0
         columns = np.full((3, indices.size), -1)
-        for row, field, array in zip(columns, JOINT_STATE_FIELDS, self.arrays, strict=True):
+        for field, array in self.arrays.items():
             if array.size == len(self.names):
-                row[:] = begin + indices
+                columns[JOINT_STATE_FIELDS.index(field)] = begin + indices
             elif array.size or field in required:
                 raise ShortArrayError(
                     f'`{field}` of the message holds {array.size} values for {len(self.names)} '
@@ -241,8 +251,8 @@ def joint_state_layout(raw: bytes | bytearray) -> Layout:
     cursor.time()
     cursor.text()
     names = cursor.texts()
-    arrays = (cursor.doubles() for _ in JOINT_STATE_FIELDS)
-    return Layout(raw, STAMP_OFFSET + _STAMP.size, names, *arrays)
+    arrays = {field: cursor.doubles() for field in JOINT_STATE_FIELDS}
+    return Layout(raw, STAMP_OFFSET + _STAMP.size, names, arrays)
 
 
 def joint_state_stamp(raw: bytes) -> int:
@@ -251,14 +261,15 @@ def joint_state_stamp(raw: bytes) -> int:
 
 
 def array_layout(raw: bytes | bytearray) -> Layout:
-    """Find the values of a std_msgs/Float64MultiArray after its dimensions; errors as above."""
+    """Find the values of a std_msgs/Float64MultiArray, as efforts; errors as above."""
     cursor = _Cursor(raw)
     for _ in range(cursor.unsigned()):
         cursor.text()
         cursor.unsigned()
         cursor.unsigned()
     cursor.unsigned()
-    return Layout(raw, ORIGIN, (), cursor.doubles())
+    values = cursor.doubles()
+    return Layout(raw, ORIGIN, tuple(map(str, range(values.size))), {'effort': values})
 
 
 class TrajectoryContent(NamedTuple):
@@ -299,7 +310,7 @@ class JointStateEncoder:
         message = types[JOINT_STATE](header, list(names), *arrays)
         self._buffer = bytearray(typestore().serialize_cdr(message, JOINT_STATE))
         self._position, self._velocity, self._effort = (
-            _view(self._buffer, array) for array in joint_state_layout(self._buffer).arrays
+            _view(self._buffer, each) for each in joint_state_layout(self._buffer).arrays.values()
         )
 
     def encode(
@@ -329,7 +340,7 @@ class Float64MultiArrayEncoder:
         layout = types['std_msgs/msg/MultiArrayLayout'](dim=[], data_offset=0)
         message = types[FLOAT64_MULTI_ARRAY](layout=layout, data=np.zeros(size))
         self._buffer = bytearray(typestore().serialize_cdr(message, FLOAT64_MULTI_ARRAY))
-        self._data = _view(self._buffer, array_layout(self._buffer).arrays[0])
+        self._data = _view(self._buffer, array_layout(self._buffer).arrays['effort'])
 
     def encode(self, data: ArrayLike) -> bytes:
         """Return the serialised message of `data` (size,); ValueError for another length."""
@@ -451,8 +462,7 @@ class Float64MultiArrayDecoder(_Decoder):
         """
         if self._read(raw, *self._known) == _OTHER:
             layout = array_layout(raw)
-            (array,) = layout.arrays
-            if array.size != self.values.size:
-                return array.size
-            self._learn(raw, layout, np.arange(array.size))
+            if len(layout.names) != self.values.size:
+                return len(layout.names)
+            self._learn(raw, layout, np.arange(self.values.size))
         return self.values.size

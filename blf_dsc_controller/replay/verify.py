@@ -233,7 +233,8 @@ def _compare(
         recorded, replayed = (each.joint_states(names, ('position',)) for each in (messages, own))
     else:
         names = [f'{JOINT_STATE_FIELDS[k]} of {joint}' for k in fields for joint in joints]
-        recorded, replayed = (_of_joints(each, joints) for each in (messages, own))
+        given = own.joint_names() if topic is topics.COMMANDS else joints
+        recorded, replayed = (each.joint_states(given, ()) for each in (messages, own))
     if topic is topics.TRACKING_ERROR:
         recorded = answers
     if topic in (topics.REFERENCE, topics.MONITOR):
@@ -253,12 +254,6 @@ def _compare(
     unreached = (result.recorded - result.values) // len(joints) if topic is topics.COMMANDS else 0
     if unreached:
         result.left_out = f'{unreached} torques that the replay does not reach'
-
-
-def _of_joints(messages: TopicMessages, joints: Sequence[str]) -> JointStates:
-    if messages.type == topics.FLOAT64_MULTI_ARRAY:
-        return messages.arrays(range(len(joints)))
-    return messages.joint_states(joints, ())
 
 
 def _shared_names(messages: TopicMessages, own: TopicMessages, result: Comparison) -> list[str]:
