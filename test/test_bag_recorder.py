@@ -33,7 +33,7 @@ from std_msgs.msg import Float64MultiArray
 
 from blf_dsc_controller.analysis.report import read_bag
 from blf_dsc_controller.bags.content import read_content
-from blf_dsc_controller.bags.recover import recover
+from blf_dsc_controller.bags.writer import recover
 from blf_dsc_controller.messages import topics
 from blf_dsc_controller.messages.codecs import JointStateEncoder, definition, joint_state_stamp
 from blf_dsc_controller.messages.topics import FOREVER, Quality

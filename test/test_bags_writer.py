@@ -19,9 +19,8 @@ from rosbags.rosbag2 import CompressionFormat, CompressionMode, Reader, StorageP
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from blf_dsc_controller import __version__
-from blf_dsc_controller.bags.recover import recover
 from blf_dsc_controller.bags.sources import BagError, open_bag
-from blf_dsc_controller.bags.writer import BagWriter
+from blf_dsc_controller.bags.writer import BagWriter, recover
 from blf_dsc_controller.cli.main import main
 from blf_dsc_controller.messages.codecs import (
     Definition,

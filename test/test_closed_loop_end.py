@@ -17,7 +17,7 @@ from command import PATIENT, Running, closed_loop, wait_for
 from small_disk import small_disk
 
 from blf_dsc_controller.bags.reader import read_run
-from blf_dsc_controller.bags.recover import recover
+from blf_dsc_controller.bags.writer import recover
 
 
 @pytest.fixture

@@ -145,7 +145,7 @@ def test_stops_ramps_and_activations_replay_with_identical_torques(tmp_path):
     )
     torques = len(of(recorded_run.messages(bag), COMMANDS))
     assert compared(result)['commands'] == 2 * torques
-    assert result.safe_torques == torques - result.samples >= 600 + 3 * 50
+    assert torques - result.samples >= 600 + 3 * 50
 
 
 def test_state_timeout_replays_with_its_torques(tmp_path):
@@ -200,15 +200,13 @@ def test_bag_is_played_in_its_time_and_order_byte_for_byte(bag, ros):
 
     listen(JointState, '/joint_states')
     with open_bag(bag) as opened:
-        chosen = ['joint_states', '/robot_description']
-        player = PlayerNode(opened, chosen, context=ros.context)
-        assert [*player.outputs] == ['/robot_description', '/joint_states']
+        player = PlayerNode(opened, context=ros.context)
         ros.until(player.outputs['/joint_states'].get_subscription_count)
         begin = time.monotonic()
-        thread = threading.Thread(target=player.play, args=(0.5,))
+        thread = threading.Thread(target=player.play)
         thread.start()
         ros.until(lambda: not thread.is_alive())
-        assert time.monotonic() - begin >= 0.199 / 0.5  # never early, however slow the machine
+        assert time.monotonic() - begin >= 0.199  # never early, however slow the machine
         listen(String, '/robot_description', latched)  # late, as RViz is
         sent = [raw for _, _, _, raw in of(recorded_run.messages(bag), JOINT_STATES)]
         ros.until(lambda: len(received['/joint_states']) == len(sent))
@@ -218,25 +216,17 @@ def test_bag_is_played_in_its_time_and_order_byte_for_byte(bag, ros):
     assert deserialize_message(received['/robot_description'][0], String).data == '<robot/>'
 
 
-@pytest.mark.parametrize(
-    ('options', 'message'),
-    [
-        (['--rate', '0'], ''),
-        (['--rate', 'nan'], '--rate nan: expected a speed, or 0'),
-        (['--rate', '-1'], '--rate -1: expected'),
-        (['--map', 'commands=/x'], '--play publishes the bag as it is'),
-        (['--topics', '/x'], 'the bag has no topic /x; it holds /'),
-        ([], 'the bag is empty'),
-    ],
-)
-def test_bag_is_played_by_command_or_refused_in_one_line(bag, tmp_path, capfd, options, message):
-    path = bag if options else recorded_run.write(tmp_path / 'bag', [])
-    code = main(['replay', str(path), '--play', *options])
+def test_bag_is_played_by_command_or_refused_in_one_line(bag, tmp_path, capfd):
+    assert main(['replay', str(bag), '--play']) == 0
     out, err = capfd.readouterr()
-    if not message:
-        assert (code, err) == (0, '')
-        assert out.startswith('playing 0.199 s: ')
-        assert '/robot_description' in out
-        return
-    assert (code, out, err.count('\n')) == (1, '', 1)
-    assert err.startswith(f'blf_dsc replay: {message}')
+    assert (out[: len('playing 0.199 s: ')], err) == ('playing 0.199 s: ', '')
+    assert '/robot_description' in out
+    empty = recorded_run.write(tmp_path / 'bag', [])
+    for path, options, message in (
+        (bag, ['--map', 'commands=/x'], '--play publishes the bag as it is'),
+        (empty, [], f'{empty} is empty'),
+    ):
+        assert main(['replay', str(path), '--play', *options]) == 1
+        out, err = capfd.readouterr()
+        assert (out, err.count('\n')) == ('', 1)
+        assert err.startswith(f'blf_dsc replay: {message}')

@@ -251,13 +251,13 @@ def test_what_limits_a_result_is_remarked(bag, entries, tmp_path, monkeypatch):
 
 
 def test_bag_of_an_earlier_version_is_read_and_its_replay_is_refused(capsys):
-    """Recorded at 31c6ec4, the version before its controller said which states it used."""
+    """Recorded at 31c6ec4, whose law had parameters that are gone."""
     bag = Path(__file__).with_name('earlier_version.mcap')
     run = read_run(bag)
     assert run.stamp.size == 21
     assert np.isfinite([run.position, run.error, run.torque, run.bound]).all()
     assert main(['replay', str(bag)]) == 1
-    assert 'recorded by an earlier version, whose controller did not' in capsys.readouterr().err
+    assert 'robot.learn: unknown parameter' in capsys.readouterr().err
 
 
 # The command.

@@ -71,12 +71,11 @@ NO_NAMES = NameMap()
 class Content:
     """Messages of the package's topics in a bag, and the number of messages of every topic.
 
-    `facts` are what a recorder of this package noted, such as its version. `namespace` selects one
-    of several robots; `names` are those that differ.
+    `facts` are what a recorder of this package noted, such as its version; `names` are those that
+    differ.
     """
 
     path: Path
-    namespace: str
     names: NameMap
     topics: Mapping[topics.Topic, TopicMessages]
     message_counts: Mapping[str, int]
@@ -181,21 +180,19 @@ def read_content(path: Path, namespace: str = '', names: NameMap = NO_NAMES) -> 
         adds = {messages.name: messages.add for messages in kept.values()}
         for message in bag.messages(adds):
             adds[message.topic](message)
-    return Content(path, namespace, names, kept, bag.counts, bag.facts)
+    return Content(path, names, kept, bag.counts, bag.facts)
 
 
 def _recorded_names(bag: OpenBag, namespace: str, names: NameMap) -> NameMap:
-    """Add the topics that the controller was connected to, where several have the same last part.
+    """Add the topics that the controller was connected to.
 
-    So it is with a driver whose joint states also come at a lower rate, as those of an FR3 do.
+    The joint states of some drivers also come at a lower rate, as those of an FR3 do.
     """
     journal = _find(topics.JOURNAL, bag.held, namespace, names)
-    leaf = f'/{topics.JOINT_STATES.leaf}'
-    if journal is None or sum(name.endswith(leaf) for name in bag.held) < 2:
-        return names
     recorded: dict[str, str] = {}
     with suppress(BlfDscError, StopIteration):
-        recorded = decode(next(bag.messages([journal])).raw).content.get('topics', {})
+        if journal is not None:
+            recorded = decode(next(bag.messages([journal])).raw).content.get('topics', {})
     own = {leaf: name for leaf, name in recorded.items() if name in bag.held}
     return NameMap({**own, **names.topics}, names.joints)
 

@@ -241,22 +241,21 @@ class TorqueError(BlfDscError):
 def applied_torque(content: Content, states: JointStates) -> tuple[str, JointStates]:
     """Return the torque from each state to the next as efforts, and its source.
 
-    The states are ordered by stamp. It is the first available of these: commands, if there is one
-    for each state; the saturated torque of the controller's telemetry; commands; the effort of the
-    next state.
+    The states are ordered by stamp. It is the first available of these: the torque in the
+    controller's telemetry; the last command before the next state; the effort of the next state.
 
     Raises:
         TorqueError: the bag holds none of them, or commands in an unknown order.
     """
-    commands, errors = (
-        content.topics.get(topics.COMMANDS),
-        content.topics.get(topics.TRACKING_ERROR),
-    )
-    if commands is not None and (errors is None or commands.size == states.size):
-        return commands.name, _commanded(content, commands, states)
+    errors, commands = map(content.topics.get, (topics.TRACKING_ERROR, topics.COMMANDS))
     if errors is not None:
         telemetry = errors.joint_states(states.names, ('effort',)).by_stamp()
         return f'effort of {errors.name}', telemetry.at_stamps(states.stamp)
+    if commands is not None:
+        sent = _by_joint(content, commands, states.names)
+        until = np.append(states.received[1:], np.iinfo(np.int64).max)
+        before = np.searchsorted(np.maximum.accumulate(sent.received), until) - 1
+        return commands.name, sent.select(before)
     found = next_effort(states)
     if np.isnan(found.field(2)[:1000]).all():
         raise TorqueError(
@@ -269,15 +268,6 @@ def applied_torque(content: Content, states: JointStates) -> tuple[str, JointSta
 def next_effort(states: JointStates) -> JointStates:
     """Return the effort measured with the next state; unknown for the last one."""
     return states.select(np.append(np.arange(1, states.size), -1))
-
-
-def _commanded(content: Content, commands: TopicMessages, states: JointStates) -> JointStates:
-    """Return the command after each state: k-th, or last before the next if counts differ."""
-    efforts = _by_joint(content, commands, states.names)
-    if efforts.size == states.size:
-        return efforts
-    until = np.append(states.received[1:], np.iinfo(np.int64).max)
-    return efforts.select(np.searchsorted(np.maximum.accumulate(efforts.received), until) - 1)
 
 
 def _by_joint(content: Content, commands: TopicMessages, joints: tuple[str, ...]) -> JointStates:

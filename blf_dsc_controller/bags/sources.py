@@ -12,7 +12,6 @@ from collections import Counter
 from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager
 from io import SEEK_CUR, SEEK_END, BytesIO
-from mmap import mmap
 from pathlib import Path
 from struct import Struct
 from typing import Any, BinaryIO, NamedTuple
@@ -142,7 +141,7 @@ def _records(stream: BinaryIO) -> Iterator[Any]:
         yield from records_in(record) if isinstance(record, Chunk) else [record]
 
 
-def next_record(stream: BinaryIO | mmap, size: int, kinds: Mapping[int, Any]) -> Any:
+def next_record(stream: BinaryIO, size: int, kinds: Mapping[int, Any]) -> Any:
     """Return the next record of a file of `size` bytes, None if it is not of these kinds.
 
     Raises any error if it does not match its length.

@@ -218,7 +218,7 @@ class TopicMessages:
         except MessageError as error:
             self._unreadable[self.size] = error
             return _UNREADABLE
-        for key in layout.keys:
+        for key in layout.places:
             self._columns.setdefault(key, _VALUES + len(self._columns))
         self._layouts.append(layout)
         return len(self._layouts) - 1
@@ -240,8 +240,9 @@ class TopicMessages:
                 stamp = np.ndarray(rows.size, kind, joined, STAMP_OFFSET, (layout.size,))
                 columns[_STAMP, rows] = stamp['s'].astype(np.int64) * NANOSECONDS + stamp['ns']
             grid = (rows.size, (layout.size - ORIGIN) // 8), '<i8', joined, ORIGIN, (layout.size, 8)
-            places = np.array([self._columns[key] for key in layout.keys], np.intp)
-            columns[np.ix_(places, rows)] = np.ndarray(*grid)[:, layout.places].T
+            values = np.ndarray(*grid)
+            for key, place in layout.places.items():
+                columns[self._columns[key], rows] = values[:, place]
         self._blocks.append((self._file.tell(), *columns.shape))
         self._file.write(columns.tobytes())
         self._file.flush()
@@ -277,7 +278,7 @@ class TopicMessages:
         problems: dict[int, MessageError] = {}
         for k, layout in enumerate(self._layouts):
             try:
-                layout.columns(names, required)
+                layout.places_of(names, required)
             except MessageError as error:
                 problems[k] = error
         last = len(self._layouts)  # of what has no layout

@@ -8,15 +8,11 @@ from argparse import Namespace
 from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
-import numpy as np
-
-from blf_dsc_controller.bags import reader
-from blf_dsc_controller.bags import recover as recovering
+from blf_dsc_controller.bags import reader, writer
 from blf_dsc_controller.bags.content import NameMap, read_content
 from blf_dsc_controller.bags.sources import open_bag
 from blf_dsc_controller.cli.main import make_room, require_ros
 from blf_dsc_controller.errors import BlfDscError
-from blf_dsc_controller.messages.journal import EventType
 from blf_dsc_controller.run import Run
 
 if TYPE_CHECKING:
@@ -79,7 +75,7 @@ def recover(options: Namespace) -> int:
     """Make a clean bag from a damaged one and list the losses; return 1 if nothing is left."""
     bag = options.bag.resolve()
     out = options.out or bag.with_name(f'{bag.stem}_recovered')
-    messages, losses = recovering.recover(options.bag, out)
+    messages, losses = writer.recover(options.bag, out)
     for topic, count in messages.items():
         print(f'{topic}: {count} messages')
     for loss in losses:
@@ -113,8 +109,6 @@ def replay(options: Namespace) -> int:
 
 def play(options: Namespace) -> None:
     """Publish the messages of a bag until its end, or Ctrl-C."""
-    if not 0.0 <= options.rate < np.inf:
-        raise BlfDscError(f'--rate {options.rate:g}: expected a speed, or 0: as fast as possible')
     if options.map or options.namespace:
         raise BlfDscError('--play publishes the bag as it is: no --map or --namespace')
     require_ros()
@@ -126,11 +120,13 @@ def play(options: Namespace) -> None:
     rclpy.init(args=[], signal_handler_options=rclpy.SignalHandlerOptions.NO)
     try:
         with open_bag(options.bag) as bag:
-            node = PlayerNode(bag, options.topics)
+            if not any(bag.counts.values()):
+                raise BlfDscError(f'{options.bag} is empty: it holds no message')
+            node = PlayerNode(bag)
             seconds = (bag.times[1] - bag.times[0]) * 1e-9
             print(f'playing {seconds:.3f} s: {", ".join(node.outputs)}', flush=True)
             time.sleep(_DISCOVERY)
-            node.play(options.rate)
+            node.play()
             drain(node.outputs.values())
     except KeyboardInterrupt:
         pass
@@ -162,17 +158,8 @@ def _verification(result: Verification) -> Iterator[str]:
 
 def _events(result: Verification) -> Iterator[str]:
     """Yield what happened in the run, and what limits the result."""
-    types = [event.type for event in result.events]
-    for type_, what in (
-        (EventType.PARAMETERS, 'parameter changes'),
-        (EventType.TRAJECTORY, 'trajectories'),
-    ):
-        if type_ in types:
-            yield f'{types.count(type_)} {what} replayed where they took effect'
     if len(result.transitions) > 1:
         yield f'replayed in order: {", ".join(result.transitions)}'
-    if result.safe_torques:
-        yield f'{result.safe_torques} of the commands are safe torques, or on the ramp to one'
     if result.passed_over:
         yield f'{result.passed_over} states skipped: the controller did not use them'
     yield from (f'note: {remark}' for remark in result.remarks)

@@ -214,8 +214,6 @@ def _add_bags(
     )
     option('bag', type=Path, help=_BAG)
     option('--play', action='store_true', help='publish the recorded topics over ROS')
-    option('--rate', type=float, default=1.0, help='speed of it; 0: as fast as possible (1)')
-    option('--topics', nargs='+', default=[], metavar='TOPIC', help='topics to play (all)')
     option = command(
         'report',
         'Show one or several bags on one HTML page. It has zoomable plots, events and the '

@@ -111,8 +111,7 @@ class Layout:
     Attributes:
         names: in the message; numbers as text if it has none.
         arrays: where its arrays are, by field.
-        places: indices of all their values in a grid of doubles that starts at ORIGIN.
-        keys: field and name of each of them.
+        places: index of each value in a grid of doubles that starts at ORIGIN, by field and name.
         size: of the message [bytes].
         fixed: bytes that are no numbers.
     """
@@ -127,14 +126,12 @@ class Layout:
         """Take a message of which the bytes from `begin` to its first values are not numbers."""
         self.names, self.arrays = names, arrays
         self.size = len(raw)
-        self.places = np.concatenate([
-            (array.offset - ORIGIN) // 8 + np.arange(array.size) for array in arrays.values()
-        ])  # fmt: skip
-        self.keys = [
-            (field, names[i] if array.size == len(names) else '')
+        self.places = {
+            (field, name): (array.offset - ORIGIN) // 8 + i
             for field, array in arrays.items()
-            for i in range(array.size)
-        ]
+            if array.size == len(names)
+            for i, name in enumerate(names)
+        }
         first, *others = (array.size_offset for array in arrays.values())
         sizes = (slice(at, at + 4) for at in others)
         self.fixed = slice(2), slice(begin, first + 4), *sizes
@@ -145,11 +142,12 @@ class Layout:
         """Return whether a message has this layout."""
         return len(raw) == self.size and self._parts_of(raw) == self._parts
 
-    def indices_of(self, joints: Sequence[str]) -> list[int]:
-        """Return the index of each joint among the names.
+    def places_of(self, joints: Sequence[str], required: Collection[str]) -> NDArray[np.intp]:
+        """Return the places of position, velocity and effort of n `joints` (3, n); -1: empty.
 
         Raises:
-            MissingJointError, DuplicatedJointError: a joint is not among them, or more than once.
+            MissingJointError, DuplicatedJointError: a joint is not named, or more than once.
+            ShortArrayError: an array differs in length from the names, or is empty but `required`.
         """
         for joint in joints:
             count = self.names.count(joint)
@@ -160,29 +158,17 @@ class Layout:
                     f'joint {joint!r} appears {count} times in the message '
                     f'({", ".join(self.names)}): name each joint once'
                 )
-        return [self.names.index(joint) for joint in joints]
-
-    def columns(self, joints: Sequence[str], required: Collection[str]) -> NDArray[np.intp]:
-        """Return which of all values are position, velocity and effort of n `joints`, (3, n).
-
-        A field that is not `required` and is empty has -1.
-
-        Raises:
-            MissingJointError, DuplicatedJointError: as in `indices_of`.
-            ShortArrayError: an array differs in length from the names.
-        """
-        indices, begin = np.array(self.indices_of(joints), dtype=np.intp), 0
-        columns = np.full((3, indices.size), -1)
         for field, array in self.arrays.items():
-            if array.size == len(self.names):
-                columns[JOINT_STATE_FIELDS.index(field)] = begin + indices
-            elif array.size or field in required:
+            if array.size != len(self.names) and (array.size or field in required):
                 raise ShortArrayError(
                     f'`{field}` of the message holds {array.size} values for {len(self.names)} '
                     'names: publish one value for each name'
                 )
-            begin += array.size
-        return columns
+        fields = [
+            [self.places.get((field, joint), -1) for joint in joints]
+            for field in JOINT_STATE_FIELDS
+        ]
+        return np.array(fields, np.intp)
 
 
 class _Cursor:
@@ -402,15 +388,13 @@ class _Decoder:
         self._known = np.zeros((2, 0), np.uint8), np.full(size, -1), self._bytes
         self._read = direct(_read, b'', *self._known)
 
-    def _learn(self, raw: bytes, layout: Layout, columns: NDArray[np.intp]) -> None:
-        """Store the layout of a message, and which of its values are read; -1 for NaN."""
+    def _learn(self, raw: bytes, layout: Layout, places: NDArray[np.intp]) -> None:
+        """Store the layout of a message, and where its values are; -1 for NaN."""
         expected = np.zeros((2, len(raw)), np.uint8)
         for part in layout.fixed:
             expected[0, part] = np.frombuffer(raw[part], np.uint8)
             expected[1, part] = 255
-        places, known = np.full(columns.size, -1), columns >= 0
-        places[known] = ORIGIN + 8 * layout.places[columns[known]]
-        self._known = expected, places, self._bytes
+        self._known = expected, np.where(places < 0, -1, ORIGIN + 8 * places), self._bytes
         self.values[:] = np.nan
         self._read(raw, *self._known)
 
@@ -437,13 +421,13 @@ class JointStateDecoder(_Decoder):
         """Fill the arrays from a serialised message and return its stamp [ns].
 
         Raises:
-            MessageError: as `joint_state_layout` and `Layout.columns`.
+            MessageError: as `joint_state_layout` and `Layout.places_of`.
         """
         stamp: int = self._read(raw, *self._known)
         if stamp != _OTHER:
             return stamp
         layout = joint_state_layout(raw)
-        self._learn(raw, layout, layout.columns(self._joints, self._required).ravel())
+        self._learn(raw, layout, layout.places_of(self._joints, self._required).ravel())
         return joint_state_stamp(raw)
 
 
@@ -464,5 +448,5 @@ class Float64MultiArrayDecoder(_Decoder):
             layout = array_layout(raw)
             if len(layout.names) != self.values.size:
                 return len(layout.names)
-            self._learn(raw, layout, np.arange(self.values.size))
+            self._learn(raw, layout, np.array([*layout.places.values()], np.intp))
         return self.values.size

@@ -21,10 +21,6 @@ OUTSIDE_BOUND = 'error past the bound'
 """Reason for a stop: the error left its bound."""
 
 
-FORMAT = 2
-"""Of the journal: in 2, every torque that answers a message is in `~/tracking_error`, too."""
-
-
 class EventType(str, Enum):
     """Type of an event, with the event's content."""
 
@@ -102,8 +98,6 @@ class Journal:
 
     def note(self, event: EventType, **content: Any) -> None:
         """Add an event that happens now."""
-        if event is EventType.CONFIGURE:
-            content['format'] = FORMAT
         noted = Event(self._number, event, self.stamp, self.messages, self.commands, content)
         self._number += 1
         self.pending.append(noted)

@@ -37,7 +37,7 @@ class Outputs:
     """What a guard's node would have published.
 
     Attributes:
-        samples, safe_torques: number of samples of the law, and of torques that are not the law's.
+        samples: number of samples of the law.
         first, last: stamps [ns] of its first and last sample; -1 before the first.
         topics: messages of each topic, received at the stamp of their state.
     """
@@ -45,7 +45,7 @@ class Outputs:
     def __init__(self, guard: Guard) -> None:
         self._guard = guard
         self._telemetry = ControllerTelemetry(guard.config, estimate_names(guard.config))
-        self.samples = self.safe_torques = 0
+        self.samples = 0
         self.first = self.last = -1
         self.topics: dict[Topic, TopicMessages] = {}
 
@@ -80,7 +80,6 @@ class Outputs:
         `is_answer`: it answers a message.
         """
         guard = self._guard
-        self.safe_torques += not guard.has_sample
         if is_answer and not guard.has_sample:
             self._add(stamp, self._telemetry.answer(stamp, torque))
         self._add(stamp, self._telemetry.command(torque), guard.journal.commands)

@@ -17,7 +17,7 @@ from blf_dsc_controller.configuration.schema import flatten
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.messages import topics
 from blf_dsc_controller.messages.codecs import JOINT_STATE_FIELDS, MessageError
-from blf_dsc_controller.messages.journal import FORMAT, Event, EventType
+from blf_dsc_controller.messages.journal import Event, EventType
 from blf_dsc_controller.replay.rerun import Rerun
 from blf_dsc_controller.run import Floats, Stamps
 
@@ -90,7 +90,6 @@ class Verification(NamedTuple):
     comparisons: tuple[Comparison, ...]  #: one for each topic of the controller with numbers
     not_compared: tuple[str, ...]  #: topics with text
     events: tuple[Event, ...]  #: replayed events
-    safe_torques: int  #: number of replayed torques that are not the law's
     remarks: tuple[str, ...]  #: limitations of the result
     difference: Difference | None  #: the earliest, in a topic or in an event
 
@@ -155,7 +154,6 @@ def verify(path: Path, namespace: str = '', names: NameMap = NO_NAMES) -> Verifi
         comparisons,
         tuple(content.topics[topic].name for topic in _TEXTS if topic in content.topics),
         tuple(run.events),
-        outputs.safe_torques,
         tuple(_remarks(content, run.end or end, newer)),
         min(differences, key=lambda found: found.stamp, default=None),
     )
@@ -171,11 +169,6 @@ def _events(content: Content) -> tuple[list[Event], int, str]:
         raise BlfDscError(
             f'{content.path} does not hold the beginning of {content.topics[topics.JOURNAL].name}: '
             'start the recorder first'
-        )
-    if events[0].content.get('format', 1) < FORMAT:
-        raise BlfDscError(
-            f'{content.path} was recorded by an earlier version, whose controller did not say '
-            'which states it used, so that it cannot be replayed; report, plot and export read it'
         )
     if len(begins) > 1:
         return events[: begins[1]], content.events[begins[1]][0], 'another controller was started'
