@@ -33,64 +33,14 @@ _EXTERNAL = (Reason.STATE_TIMEOUT, Reason.FAILED)
 _BLOCK = 4096  # states in memory
 
 
-class Outputs:
-    """What a guard's node would have published.
-
-    Attributes:
-        samples: number of samples of the law.
-        first, last: stamps [ns] of its first and last sample; -1 before the first.
-        topics: messages of each topic, received at the stamp of their state.
-    """
-
-    def __init__(self, guard: Guard) -> None:
-        self._guard = guard
-        self._telemetry = ControllerTelemetry(guard.config, estimate_names(guard.config))
-        self.samples = 0
-        self.first = self.last = -1
-        self.topics: dict[Topic, TopicMessages] = {}
-
-    def _add(self, stamp: int, message: Message, number: int = 0) -> None:
-        topic, raw = message
-        if topic not in self.topics:
-            self.topics[topic] = TopicMessages(topic.resolved, topic.type)
-        messages = self.topics[topic]
-        messages.add(BagMessage(topic.resolved, stamp, raw, number or messages.size + 1))
-
-    def add_sample(self, stamp: int) -> None:
-        """Add the last sample of the law, for the state with this stamp [ns]."""
-        guard, controller = self._guard, self._guard.controller
-        sample = controller.sample
-        if self.first < 0:
-            self.first = stamp
-        self.last, self.samples = stamp, self.samples + 1
-        if controller.samples == 1:
-            self._telemetry.restart()
-        limit = controller.settings.torque_limit
-        for message in self._telemetry.sample(stamp, sample, limit, guard.samples.ratio, 0.0):
-            self._add(stamp, message)
-
-    def add_bound(self, stamp: int, bound: Floats) -> None:
-        """Add a bound [rad], published with this stamp [ns]."""
-        limit = self._guard.controller.settings.torque_limit
-        self._add(stamp, self._telemetry.bound(stamp, bound, limit))
-
-    def add_command(self, stamp: int, torque: Floats, *, is_answer: bool) -> None:
-        """Add a commanded torque (n,) [N m] after a state with this stamp [ns].
-
-        `is_answer`: it answers a message.
-        """
-        guard = self._guard
-        if is_answer and not guard.has_sample:
-            self._add(stamp, self._telemetry.answer(stamp, torque))
-        self._add(stamp, self._telemetry.command(torque), guard.journal.commands)
-
-
 class Rerun:
     """Replay of the guarded controller.
 
     Attributes:
         events: replayed events.
-        outputs: replayed outputs.
+        topics: what its node would have published, received at the stamp of its state.
+        samples: number of samples of the law.
+        first, last: stamps [ns] of its first and last sample; -1 before the first.
         passed_over: number of joint states that the controller did not answer.
         departure: in what, and at which stamp [ns], the controller first started, stopped or
             accepted otherwise than the recorded one, which ends the replay.
@@ -106,11 +56,14 @@ class Rerun:
     ) -> None:
         """Start with `config`; `errors` maps the number of each unreadable state to its error."""
         self.events: list[Event] = []
-        self.passed_over = 0
+        self.topics: dict[Topic, TopicMessages] = {}
+        self.samples = self.passed_over = 0
+        self.first = self.last = -1
         self.departure: tuple[str, int] | None = None
         self.end = ''
         self._guard = Guard(config, lambda: 0, lambda: 0)
         self._guard.journal.pending.clear()
+        self._telemetry = ControllerTelemetry(config, estimate_names(config))
         self._states = states
         self._values, self._loaded = np.empty((0, 3, 0)), range(0)
         # All messages in order: row of the state, or of an error after them, whose stamp is -1.
@@ -123,7 +76,6 @@ class Rerun:
         self._answer = 0  # number of answers reached
         self._position = -1  # of the last message processed or passed over
         self._last = -1  # stamp of the last answer
-        self.outputs = Outputs(self._guard)
 
     def run(self, events: Sequence[Event]) -> None:
         """Process the joint states with the events after the configuration, in order."""
@@ -213,7 +165,7 @@ class Rerun:
                 self._process(k)
 
     def _process(self, k: int) -> None:
-        guard, outputs, stamp = self._guard, self.outputs, int(self._stamp[k])
+        guard, stamp = self._guard, int(self._stamp[k])
         self.passed_over += k - self._position - 1
         self._position, row = k, int(self._row[k])
         if row in self._unreadable:
@@ -223,11 +175,13 @@ class Rerun:
             torque = guard.update(stamp, self._measurement(row))
             guard.weigh()
         if guard.has_sample:
-            if stamp <= outputs.last:
+            if stamp <= self.last:
                 self.end = f'the stamps restart at {stamp} ns'
                 return
-            outputs.add_sample(stamp)
-        self._command(stamp, torque, is_answer=True)
+            self._add_sample(stamp)
+        elif torque is not None:
+            self._add(stamp, self._telemetry.answer(stamp, torque))
+        self._command(stamp, torque)
 
     def _measurement(self, row: int) -> Floats:
         if row not in self._loaded:
@@ -236,9 +190,31 @@ class Rerun:
             self._values = np.stack([self._states.field(k)[rows] for k in range(3)], axis=1)
         return np.ravel(self._values[row - self._loaded.start])
 
-    def _command(self, stamp: int, torque: Floats | None, *, is_answer: bool = False) -> None:
+    # Outputs.
+
+    def _add_sample(self, stamp: int) -> None:
+        """Add the last sample of the law, for the state with this stamp [ns]."""
+        guard, controller = self._guard, self._guard.controller
+        if self.first < 0:
+            self.first = stamp
+        self.last, self.samples = stamp, self.samples + 1
+        if controller.samples == 1:
+            self._telemetry.restart()
+        known = controller.sample, controller.settings.torque_limit, guard.samples.ratio
+        for message in self._telemetry.sample(stamp, *known, 0.0):
+            self._add(stamp, message)
+
+    def _command(self, stamp: int, torque: Floats | None) -> None:
+        """Add a torque (n,) [N m], if any, that is commanded after a state with this stamp [ns]."""
         if torque is not None:
-            self.outputs.add_command(stamp, torque, is_answer=is_answer)
+            self._add(stamp, self._telemetry.command(torque), self._guard.journal.commands)
+
+    def _add(self, stamp: int, message: Message, number: int = 0) -> None:
+        topic, raw = message
+        if topic not in self.topics:
+            self.topics[topic] = TopicMessages(topic.resolved, topic.type)
+        messages = self.topics[topic]
+        messages.add(BagMessage(topic.resolved, stamp, raw, number or messages.size + 1))
 
     # Events.
 
@@ -282,8 +258,9 @@ class Rerun:
         elif event.type is EventType.PARAMETERS:
             guard.retune(change(guard.config, content['parameters']))
             if guard.last_stamp >= 0:
+                stamp, limit = guard.journal.stamp, guard.controller.settings.torque_limit
                 bound = guard.controller.bound_at(guard.time)
-                self.outputs.add_bound(guard.journal.stamp, bound)
+                self._add(stamp, self._telemetry.bound(stamp, bound, limit))
         elif event.type is EventType.SILENCE:
             while guard.watchdog.torques < content['torques']:
                 self._command(event.stamp, guard.time_out(''))

@@ -139,17 +139,16 @@ def verify(path: Path, namespace: str = '', names: NameMap = NO_NAMES) -> Verifi
     run.run(events[1:])
     comparisons = tuple(_compared(content, run, answers, config.joints))
     differences = [found.difference for found in comparisons if found.difference]
-    outputs = run.outputs
     if run.departure is not None:
         what, stamp = run.departure
-        time = (stamp - max(outputs.first, 0)) * 1e-9
+        time = (stamp - max(run.first, 0)) * 1e-9
         found = Difference(topics.TRACKING_ERROR.resolved, what, stamp, time, 1.0, 0.0)
         differences.insert(0, found)
     elif not any(found.values for found in comparisons):
         raise _nothing_to_compare(content)
     return Verification(
-        outputs.samples,
-        (outputs.last - outputs.first) * 1e-9,
+        run.samples,
+        (run.last - run.first) * 1e-9,
         run.passed_over,
         comparisons,
         tuple(content.topics[topic].name for topic in _TEXTS if topic in content.topics),
@@ -198,13 +197,13 @@ def _compared(
     """Yield the comparison of each topic in a bag; `answers` are those of tracking errors."""
     for topic, fields in _COMPARED.items():
         messages = content.topics.get(topic)
-        own = run.outputs.topics.get(topic)
+        own = run.topics.get(topic)
         if messages is None:
             continue
         result = Comparison(messages.name, messages.size * len(joints) * len(fields))
         try:
             if own is not None:
-                _compare(topic, messages, own, answers, joints, result, run.outputs.first)
+                _compare(topic, messages, own, answers, joints, result, run.first)
         except BlfDscError as error:  # unreadable, or in an unknown order
             result.left_out = f'{error}'
         yield result
@@ -220,14 +219,14 @@ def _compare(
     start: int,
 ) -> None:
     """Compare the messages of the same stamp or number; those that have other stamps differ."""
-    fields = _COMPARED[topic]
-    if topic is topics.MONITOR:
-        names = _shared_names(messages, own, result)
-        recorded, replayed = (each.joint_states(names, ('position',)) for each in (messages, own))
-    else:
+    fields, theirs, ours = _COMPARED[topic], messages.joint_names(), own.joint_names()
+    shared = [name for name in ours if name in theirs and name != topics.COMPUTE_TIME]
+    result.left_out = ', '.join(n for n in dict.fromkeys((*ours, *theirs)) if n not in shared)
+    result.recorded = messages.size * len(shared) * len(fields)
+    recorded, replayed = (each.joint_states(shared, ()) for each in (messages, own))
+    names = shared
+    if topic is not topics.MONITOR:
         names = [f'{JOINT_STATE_FIELDS[k]} of {joint}' for k in fields for joint in joints]
-        given = own.joint_names() if topic is topics.COMMANDS else joints
-        recorded, replayed = (each.joint_states(given, ()) for each in (messages, own))
     if topic is topics.TRACKING_ERROR:
         recorded = answers
     if topic in (topics.REFERENCE, topics.MONITOR):
@@ -237,11 +236,13 @@ def _compare(
         keys, wanted = _numbers(topic, recorded, answers.size), replayed.sequence
     index = np.minimum(np.searchsorted(keys, wanted), keys.size - 1)
     known = np.flatnonzero(keys[index] == wanted)
-    theirs, ours = recorded.select(index[known]), replayed.select(known)
-    stamp, has_moved = ours.received, theirs.stamp != ours.stamp
+    recorded, replayed = recorded.select(index[known]), replayed.select(known)
+    stamp, has_moved = replayed.received, recorded.stamp != replayed.stamp
     for begin in range(0, known.size, _BLOCK):
         rows = slice(begin, begin + _BLOCK)
-        pair = [np.hstack([states.field(k)[rows] for k in fields]) for states in (theirs, ours)]
+        pair = [
+            np.hstack([states.field(k)[rows] for k in fields]) for states in (recorded, replayed)
+        ]
         pair[1][has_moved[rows]] = np.inf
         result.add(stamp[rows], start, names, *pair)
     unreached = (result.recorded - result.values) // len(joints) if topic is topics.COMMANDS else 0
@@ -249,27 +250,16 @@ def _compare(
         result.left_out = f'{unreached} torques that the replay does not reach'
 
 
-def _shared_names(messages: TopicMessages, own: TopicMessages, result: Comparison) -> list[str]:
-    """Return the names of values that both have; note the others as left out."""
-    recorded, replayed = messages.joint_names(), own.joint_names()
-    shared = [name for name in replayed if name in recorded and name != topics.COMPUTE_TIME]
-    both = dict.fromkeys((*replayed, *recorded))
-    result.left_out = ', '.join(name for name in both if name not in shared)
-    result.recorded = messages.size * len(shared)
-    return shared
-
-
 def _numbers(topic: topics.Topic, recorded: JointStates, answers: int) -> Stamps:
     """Return the numbers of messages among those of their publisher; BlfDscError if unknown."""
-    in_order = np.arange(1, recorded.size + 1)
-    if topic is not topics.COMMANDS:
-        return in_order
     sequence = recorded.sequence
-    if not sequence.any() and recorded.size < answers:  # of another recorder
-        raise BlfDscError('some are missing, and they have neither stamps nor numbers')
-    if sequence.any() and (np.diff(sequence) <= 0).any():
+    if topic is not topics.COMMANDS or not sequence.any():
+        if topic is topics.COMMANDS and recorded.size < answers:  # of another recorder
+            raise BlfDscError('some are missing, and they have neither stamps nor numbers')
+        return np.arange(1, recorded.size + 1)
+    if (np.diff(sequence) <= 0).any():
         raise BlfDscError('they are of several publishers')
-    return sequence if sequence.any() else in_order
+    return sequence
 
 
 # Remarks.
