@@ -21,14 +21,13 @@ import pytest
 pytest.importorskip('rclpy', reason='needs ROS 2')
 
 from command import PATIENT, closed_loop
-from foreign_readers import messages_on_disk, read
 from mcap.reader import make_reader
 from nav_msgs.msg import Goals
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from recorded_run import messages_on_disk, read, small_disk
 from ros_rig import RosRig
 from rosbags.rosbag2 import Reader
 from sensor_msgs.msg import JointState
-from small_disk import small_disk
 from std_msgs.msg import Float64MultiArray
 
 from blf_dsc_controller.analysis.report import read_bag

@@ -7,7 +7,6 @@ Unusable ones give one clear error line from every command, and no traceback.
 from __future__ import annotations
 
 import csv
-import resource
 import shutil
 
 import numpy as np
@@ -226,23 +225,6 @@ def test_gripper_on_the_same_topic_is_told_from_the_arm_under_any_name(bag, tmp_
     assert '/arm/torque: 602 values bit-equal' in capsys.readouterr().out
     # Without the mapping, the joint states are not found.
     assert main(['plot', str(renamed), '--out', str(tmp_path / 'none')]) == 1
-
-
-def test_no_two_states_alike_take_no_more_open_files(tmp_path):
-    """A driver may write what changes into the frame or a name: each message has a layout."""
-    entries = []
-    for k in range(700):
-        state = JointStateEncoder(('joint1', f'tool{k}')).encode(k, [k, 0], [0, 0], [0, 0])
-        entries.append([JOINT_STATES.resolved, JOINT_STATE, k, state])
-    path = recorded_run.write(tmp_path / 'bag', entries)
-    limits = resource.getrlimit(resource.RLIMIT_NOFILE)
-    resource.setrlimit(resource.RLIMIT_NOFILE, (500, limits[1]))
-    try:
-        run = read_run(path, names=NameMap.parse(['joint1=joint1']))
-        position = run.position[:, 0]
-    finally:
-        resource.setrlimit(resource.RLIMIT_NOFILE, limits)
-    np.testing.assert_array_equal(position, np.arange(700))
 
 
 # Unusable bags.

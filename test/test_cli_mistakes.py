@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import synthetic_bag
 from command import finished
-from small_disk import small_disk
+from recorded_run import small_disk
 from synthetic_bag import Synthetic
 
 from blf_dsc_controller.cli.main import main

@@ -14,7 +14,7 @@ import pytest
 pytest.importorskip('rclpy', reason='needs ROS 2')
 
 from command import PATIENT, Running, closed_loop, wait_for
-from small_disk import small_disk
+from recorded_run import small_disk
 
 from blf_dsc_controller.bags.reader import read_run
 from blf_dsc_controller.bags.writer import recover

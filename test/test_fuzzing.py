@@ -30,7 +30,7 @@ pytest.importorskip('rclpy', reason='needs ROS 2')
 pytest.importorskip('plotly', reason='needs plotly: pip install blf_dsc_controller[report]')
 
 import recorded_run
-from foreign_readers import raw_records
+from recorded_run import raw_records
 
 from blf_dsc_controller.bags.sources import open_bag
 from blf_dsc_controller.cli.main import main

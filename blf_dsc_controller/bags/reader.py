@@ -241,21 +241,24 @@ class TorqueError(BlfDscError):
 def applied_torque(content: Content, states: JointStates) -> tuple[str, JointStates]:
     """Return the torque from each state to the next as efforts, and its source.
 
-    The states are ordered by stamp. It is the first available of these: the torque in the
-    controller's telemetry; the last command before the next state; the effort of the next state.
+    The states are ordered by stamp. It is the first available of these: commands, if there is one
+    for each state; the saturated torque of the controller's telemetry; the last command before the
+    next state; the effort of the next state.
 
     Raises:
         TorqueError: the bag holds none of them, or commands in an unknown order.
     """
     errors, commands = map(content.topics.get, (topics.TRACKING_ERROR, topics.COMMANDS))
+    if commands is not None and (errors is None or commands.size == states.size):
+        sent = _by_joint(content, commands, states.names)
+        if sent.size != states.size:
+            until = np.append(states.received[1:], np.iinfo(np.int64).max)
+            before = np.searchsorted(np.maximum.accumulate(sent.received), until) - 1
+            sent = sent.select(before)
+        return commands.name, sent
     if errors is not None:
         telemetry = errors.joint_states(states.names, ('effort',)).by_stamp()
         return f'effort of {errors.name}', telemetry.at_stamps(states.stamp)
-    if commands is not None:
-        sent = _by_joint(content, commands, states.names)
-        until = np.append(states.received[1:], np.iinfo(np.int64).max)
-        before = np.searchsorted(np.maximum.accumulate(sent.received), until) - 1
-        return commands.name, sent.select(before)
     found = next_effort(states)
     if np.isnan(found.field(2)[:1000]).all():
         raise TorqueError(

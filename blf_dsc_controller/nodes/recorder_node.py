@@ -145,18 +145,15 @@ class BagRecorderNode(PlainNode):
         """
         if self._config.clock != 'plant':
             return messages
-        timed, self._waiting = [], [*self._waiting, *messages]
-        for k, message in enumerate(self._waiting):
+        timed = []
+        for message in messages:
             if message.handle == self._handle_of_states:
                 with suppress(MessageError):
-                    stamp = joint_state_stamp(message.raw)
-                    before = self._waiting[:k] if self._plant_time < 0 else []
-                    self._plant_time = max(self._plant_time, stamp)
-                    timed += [each._replace(received=self._plant_time) for each in before]
+                    self._plant_time = max(self._plant_time, joint_state_stamp(message.raw))
+            self._waiting.append(message)
             if self._plant_time >= 0:
-                timed.append(message._replace(received=self._plant_time))
-        if self._plant_time >= 0:
-            self._waiting = []
+                timed += [each._replace(received=self._plant_time) for each in self._waiting]
+                self._waiting = []
         return timed
 
     def _summary(self) -> Iterator[str]:
