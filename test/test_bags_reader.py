@@ -120,8 +120,8 @@ def test_only_joint_states_are_required(tmp_path):
 
 
 def test_what_is_missing_is_computed_from_what_is_there(tmp_path):
-    path = synthetic_bag.write(tmp_path / 'bag', without(TRACKING_ERROR))
-    np.testing.assert_allclose(read_run(path).error, MADE.error, atol=1e-15)
+    path = synthetic_bag.write(tmp_path / 'bag', without(REFERENCE))
+    np.testing.assert_allclose(read_run(path).reference, MADE.reference, atol=1e-15)
     lost = next(k for k, entry in enumerate(MESSAGES) if entry[0] is COMMANDS)
     path = synthetic_bag.write(tmp_path / 'one', MESSAGES[:lost] + MESSAGES[lost + 1 :])
     np.testing.assert_array_equal(read_run(path).torque, MADE.torque)

@@ -47,7 +47,6 @@ _VALUES = {  # prefix of names in the vectors: unit
     **dict.fromkeys((topics.COMPUTE_TIME, topics.LATENCY, topics.LATENESS), 's'),
 }
 _ROWS = 1 << 14
-_COMPLEMENTS = {'reference': 'errors', 'error': 'references'}
 _PARAMETER = 'kg m^2'  # of arms without a URDF
 
 
@@ -102,23 +101,20 @@ def recorded_run(content: Content) -> Run:
         _, torques = applied_torque(content, states)
     except TorqueError:
         torques = next_effort(states)
-    messages = {
+    messages: dict[str, Any] = {
         'states': states,
         'torques': torques,
         'errors': errors and errors.at_stamps(stamp),
         'references': references and references.at_stamps(stamp),
         'bounds': bounds and bounds.held(stamp),
     }
-    unknown = states.select(np.full(states.size, -1))
-    arrays: dict[str, Any] = {}
-    for name, (_, source, k) in _ARRAYS.items():
-        found, difference = messages[source], None
-        other = messages.get(_COMPLEMENTS.get(name, ''))
-        if other is not None:  # position less error is the reference, and the other way round
-            difference = states.field(0), other.field(0)
-        arrays[name] = None
-        if found is not None or difference is not None:
-            arrays[name] = Values(found or unknown, k, difference)
+    arrays: dict[str, Any] = {
+        name: Values(messages[source], k) if messages[source] else None
+        for name, (_, source, k) in _ARRAYS.items()
+    }
+    if errors:  # its messages are not decimated: the reference is known at every sample
+        known = messages['references'] or states.select(np.full(states.size, -1))
+        arrays['reference'] = Values(known, 0, (states.field(0), messages['errors'].field(0)))
     events = [event for at, event in content.events if span[0] <= at < span[1]]
     return Run(
         **arrays,

@@ -271,13 +271,9 @@ def _remarks(content: Content, end: str, newer: Sequence[str]) -> Iterator[str]:
         yield f'{end}: the replay ends there'
     for topic, what in content.losses.items():
         yield f'the recorder missed messages of {topic}: {what}'
-    if content.version != __version__:
+    if content.version != __version__ or newer:
+        lacking = f', before the law had {", ".join(newer)},' if newer else ''
         yield (
-            f'recorded by version {content.version or "unknown"} and replayed by {__version__}: '
-            'differences may come from the software'
-        )
-    if newer:
-        yield (
-            f'recorded before the law had {", ".join(newer)}: replayed with the present law and '
-            'its defaults, so differences come from the software'
+            f'recorded by version {content.version or "unknown"}{lacking} and replayed by '
+            f'{__version__}: differences may come from the software'
         )
