@@ -46,12 +46,10 @@ def messages(path):
         return [[m.topic, types[m.topic], m.received, m.raw] for m in bag.messages(types)]
 
 
-def write(path, entries, *, publishers=0, **facts):
+def write(path, entries, *, publishers=0):
     """Write messages into a new bag, numbered by so many publishers of each topic, in turn."""
     handles, numbers = {}, Counter()
     with BagWriter(path, flush_interval=None) as bag:
-        if facts:
-            bag.note(facts)
         for topic, type_name, at, raw in entries:
             if topic not in handles:
                 handles[topic] = bag.add_topic(topic, type_name, [])

@@ -19,7 +19,6 @@ from recorded_run import messages_on_disk, raw_records, read
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, Reader, StoragePlugin, Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from blf_dsc_controller import __version__
 from blf_dsc_controller.bags.sources import BagError, open_bag
 from blf_dsc_controller.bags.writer import BagWriter, recover
 from blf_dsc_controller.cli.main import main
@@ -46,10 +45,9 @@ def message(k):
     return STATES.encode(k, [k, 0], [0, 0], [0, 0])
 
 
-def write_messages(path, count, per_chunk=0, facts=None, **options):
+def write_messages(path, count, per_chunk=0, **options):
     """Write messages of two topics; return the size of the bag."""
     with BagWriter(path, **options) as bag:
-        bag.note(facts or {})
         first = bag.add_topic(JOINT_STATES.resolved, JOINT_STATES.type, [Quality(depth=100)])
         second = bag.add_topic(COMMANDS.resolved, COMMANDS.type, [Quality(depth=100)])
         for k in range(count):
@@ -142,7 +140,7 @@ def test_metadata_matches_rosbag2(tmp_path):
         'compression_mode': '',
         'relative_file_paths': ['run_0.mcap'],
         'files': [{'path': 'run_0.mcap', **period, 'message_count': 6}],
-        'custom_data': {'package_version': __version__},
+        'custom_data': {},
         'ros_distro': 'jazzy',
     }
     found = information(tmp_path / 'run')
@@ -223,7 +221,6 @@ def test_memory_of_a_recorder_is_bounded_and_its_files_are_read_as_one(tmp_path)
     assert files == [({'nanoseconds_since_epoch': k}, 10_000) for k in range(0, 60_000, 10_000)]
     with open_bag(tmp_path / 'bag' / 'bag_3.mcap') as opened:
         assert len(list(opened.messages({'/a'}))) == 10_000
-        assert opened.facts == {'package_version': __version__}
     expected = [*map(message, range(60_000))]
     assert not recover(tmp_path / 'bag', tmp_path / 'clean').losses
     for name in ('bag', 'clean'):
@@ -241,7 +238,7 @@ ALL = 2 * PER_CHUNK * CHUNKS
 def write(path, compression='none'):
     """Write a bag of two topics in chunks that are flushed; return its file."""
     options = {'flush_interval': None, 'compression': compression}
-    write_messages(path, CHUNKS * PER_CHUNK, PER_CHUNK, {'arm': 'left'}, **options)
+    write_messages(path, CHUNKS * PER_CHUNK, PER_CHUNK, **options)
     return path / f'{path.name}_0.mcap'
 
 
@@ -372,7 +369,6 @@ def test_recording_that_was_not_closed_is_reported_and_keeps_its_topics(whole, t
     assert f'wrote {clean}' in output
     with open_bag(clean) as opened:
         assert list(opened.messages(())) == []
-    assert (opened.facts['arm'], opened.facts['recovered_from']) == ('left', str(folder))
     with Reader(clean) as reader, Reader(whole.parent) as before:
         for found, original in zip(reader.connections, before.connections, strict=True):
             assert (found.topic, found.digest) == (original.topic, original.digest)

@@ -12,7 +12,6 @@ from fault_rig import JOINTS, MILLISECOND, Rig
 from fault_table import FAULTS, run
 from recorded_run import compared, of
 
-from blf_dsc_controller import __version__
 from blf_dsc_controller.configuration.schema import change
 from blf_dsc_controller.law.factory import estimate_names
 from blf_dsc_controller.law.telemetry import ControllerTelemetry
@@ -79,8 +78,7 @@ class Recorder(Rig):
     def write(self, path, **options):
         """Write the bag; return it."""
         self.publish_events()
-        facts = {'package_version': __version__}
-        return recorded_run.write(path / 'bag', self.entries, **options, **facts)
+        return recorded_run.write(path / 'bag', self.entries, **options)
 
     def verify(self, path, **options):
         return verify(self.write(path, **options))

@@ -14,7 +14,6 @@ from command import OLDER, finished
 from random_arm import random_urdf
 from recorded_run import compared, of
 
-from blf_dsc_controller import __version__
 from blf_dsc_controller.bags.content import read_content
 from blf_dsc_controller.bags.reader import read_run
 from blf_dsc_controller.cli.bags import DIFFERENT, PARTIAL
@@ -229,8 +228,7 @@ def test_what_limits_a_result_is_remarked(bag, entries, tmp_path, monkeypatch):
 
     configured(entries, change)
     of(entries, MONITOR)[7][3] = None
-    facts = {'package_version': __version__}
-    path = recorded_run.write(tmp_path / 'bag', entries, publishers=1, **facts)
+    path = recorded_run.write(tmp_path / 'bag', entries, publishers=1)
     missed, newer = verify(path).remarks
     assert missed == f'the recorder missed messages of {MONITOR.resolved}: 1 missed'
     assert 'before the law had learning.compensation' in newer
@@ -282,7 +280,7 @@ def test_bag_replays_without_its_urdf_file_and_is_read_with_unknown_parameters(
         assert read_run(bag).arm is not None
     entries = recorded_run.messages(bag)
     configured(entries, lambda content: content['parameters'].update({'barrier.shape': 2}))
-    bag = recorded_run.write(tmp_path / 'newer', entries, package_version='0.1.0')
+    bag = recorded_run.write(tmp_path / 'newer', entries)
     monkeypatch.setattr('blf_dsc_controller.bags.content.__version__', '9.9.9')
     with pytest.raises(ConfigurationError, match=r'(?s)by version 0\.1\.0, not 9.*barrier\.shape'):
         verify(bag)

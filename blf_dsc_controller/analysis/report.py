@@ -172,7 +172,7 @@ def write_report(bags: Sequence[ReportedBag], path: Path) -> None:
         'report.html',
         ' and '.join(bag.name for bag in bags),
         names=[bag.name for bag in bags],
-        versions=sorted({bag.content.version or 'another recorder' for bag in bags}),
+        versions=sorted({bag.content.version or 'unknown' for bag in bags}),
         summaries=[format_table(measure(bag.run)) for bag in bags],
         data={
             'panels': plots(panels([bag.run for bag in bags]), bags),

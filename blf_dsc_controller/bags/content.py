@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from blf_dsc_controller import __version__
-from blf_dsc_controller.bags.sources import VERSION, BagError, OpenBag, open_bag
+from blf_dsc_controller.bags.sources import BagError, OpenBag, open_bag
 from blf_dsc_controller.bags.topic_messages import TopicMessages
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.schema import build, parameters
@@ -71,20 +71,19 @@ NO_NAMES = NameMap()
 class Content:
     """Messages of the package's topics in a bag, and the number of messages of every topic.
 
-    `facts` are what a recorder of this package noted, such as its version; `names` are those that
-    differ.
+    `names` are those that differ.
     """
 
     path: Path
     names: NameMap
     topics: Mapping[topics.Topic, TopicMessages]
     message_counts: Mapping[str, int]
-    facts: Mapping[str, str]
 
     @property
     def version(self) -> str:
-        """Version of this package that recorded the bag, empty for another recorder."""
-        return self.facts.get(VERSION, '')
+        """Version of the package whose controller was recorded; empty if unknown."""
+        of_events = (event.content.get('version', '') for _, event in self.events)
+        return next(of_events, '')
 
     @property
     def losses(self) -> dict[str, str]:
@@ -180,7 +179,7 @@ def read_content(path: Path, namespace: str = '', names: NameMap = NO_NAMES) -> 
         adds = {messages.name: messages.add for messages in kept.values()}
         for message in bag.messages(adds):
             adds[message.topic](message)
-    return Content(path, names, kept, bag.counts, bag.facts)
+    return Content(path, names, kept, bag.counts)
 
 
 def _recorded_names(bag: OpenBag, namespace: str, names: NameMap) -> NameMap:

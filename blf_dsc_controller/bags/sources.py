@@ -18,7 +18,7 @@ from typing import Any, BinaryIO, NamedTuple
 
 from mcap.data_stream import ReadDataStream
 from mcap.opcode import Opcode
-from mcap.records import Channel, Chunk, Metadata, Schema
+from mcap.records import Channel, Chunk, Schema
 from mcap.stream_reader import get_chunk_data_stream
 from rosbags.interfaces import QosDurability
 from rosbags.rosbag1 import Reader as Ros1Reader
@@ -28,10 +28,6 @@ from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.messages.codecs import typestore
 
 METADATA = 'metadata.yaml'
-RECORD = 'blf_dsc_controller'
-"""Name of the metadata record with the facts."""
-
-VERSION = 'package_version'
 MAGIC_SIZE = 8
 HEAD = Struct('<BQ')  # opcode and content length, at the start of each record
 _MESSAGE = Struct('<HIQQ')
@@ -41,7 +37,6 @@ _KINDS: dict[int, Any] = {
     Opcode.CHUNK: Chunk,
     Opcode.SCHEMA: Schema,
     Opcode.CHANNEL: Channel,
-    Opcode.METADATA: Metadata,
 }
 
 
@@ -70,7 +65,6 @@ class OpenBag:
         counts: number of messages of each topic.
         latched: topics whose publishers keep messages for late subscribers.
         times: of the first message and after the last [ns].
-        facts: what a recorder of this package noted about the run; complete once all is read.
     """
 
     def __init__(self, reader: Any, path: Path) -> None:
@@ -87,7 +81,6 @@ class OpenBag:
             if kept or getattr(ext, 'latching', False):
                 self.latched.add(each.topic)
         self.times: tuple[int, int] = reader.start_time, reader.end_time
-        self.facts: dict[str, str] = {}
         if isinstance(reader, Reader) and reader.compression_mode != 'message':
             storage: Any = reader.storage
             parts: list[Any] = storage.storages if path.is_dir() else [storage]
@@ -120,8 +113,6 @@ class OpenBag:
                         yield BagMessage(names[number], received, raw, sequence)
                     elif isinstance(record, Channel):
                         names[record.id] = record.topic
-                    elif isinstance(record, Metadata) and record.name == RECORD:
-                        self.facts |= record.metadata
 
     def _of_library(self, topics: Collection[str]) -> Iterator[BagMessage]:
         chosen = [each for each in self._reader.connections if each.topic in topics]

@@ -9,7 +9,7 @@ file says; without that index, as after a kill, the rest is lost.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import AbstractContextManager, suppress
 from dataclasses import asdict, dataclass
 from io import SEEK_END
@@ -23,7 +23,7 @@ from zlib import crc32
 import yaml
 from mcap import records
 from mcap.opcode import Opcode
-from mcap.records import Channel, Chunk, ChunkIndex, DataEnd, Metadata, Schema, Statistics
+from mcap.records import Channel, Chunk, ChunkIndex, DataEnd, Schema, Statistics
 from mcap.summary import Summary
 from mcap.writer import CompressionType, Writer
 from zstandard import FRAME_HEADER, ZstdDecompressor
@@ -32,8 +32,6 @@ from blf_dsc_controller import __version__
 from blf_dsc_controller.bags.sources import (
     MAGIC_SIZE,
     METADATA,
-    RECORD,
-    VERSION,
     BagError,
     DamageError,
     next_record,
@@ -105,7 +103,6 @@ class BagWriter(AbstractContextManager['BagWriter']):
         self._topics: list[dict[str, Any]] = []  # as in metadata.yaml, with definitions beside
         self._definitions: list[Definition] = []
         self._files: list[_File] = []
-        self._facts = {VERSION: __version__}
         try:
             self.path.mkdir(parents=True)
         except FileExistsError:
@@ -166,11 +163,6 @@ class BagWriter(AbstractContextManager['BagWriter']):
         file.messages += 1
         self.flush_if_due()
 
-    def note(self, facts: Mapping[str, str]) -> None:
-        """Store facts about the run by name."""
-        self._facts.update(facts)
-        self._writer.add_metadata(RECORD, self._facts)
-
     def flush_if_due(self) -> None:
         """Flush if the flush interval has passed."""
         if monotonic() - self._flushed >= self._flush_interval:
@@ -209,7 +201,6 @@ class BagWriter(AbstractContextManager['BagWriter']):
         self._chunks = 0
         for topic, found in zip(self._topics, self._definitions, strict=True):
             self._add_channel(topic['topic_metadata'], found)
-        self.note({})
 
     def _information(self) -> dict[str, Any]:
         """Return rosbag2's metadata, version 9 (that of Jazzy), in its order.
@@ -229,7 +220,7 @@ class BagWriter(AbstractContextManager['BagWriter']):
                 {'path': file.name, **_period([file]), 'message_count': file.messages}
                 for file in self._files
             ],
-            'custom_data': self._facts,
+            'custom_data': {},
             'ros_distro': 'jazzy',
         }
 
@@ -287,7 +278,6 @@ def recover(path: Path, out: Path) -> Recovery:
     files.sort(key=lambda file: (len(file.name), file.name))  # bag_10 after bag_9
     with BagWriter(out, flush_interval=None) as bag:
         losses = [f'{file.name}: {loss}' for file in files for loss in _copied(file, bag)]
-        bag.note({'recovered_from': str(path)})
     return Recovery(bag.message_counts, losses)
 
 
@@ -297,7 +287,7 @@ def _copied(path: Path, bag: BagWriter) -> Iterator[str]:
     found, last, is_closed = Counter[int](), -1, False  # `last`: latest time of a message [ns]
     with path.open('rb') as stream:
         size = stream.seek(0, SEEK_END)
-        summary = _summary(stream, size, bag)
+        summary = _summary(stream, size)
         for record in _records(stream, size, summary):
             if isinstance(record, tuple):
                 number, sequence, received, published, raw = record
@@ -308,7 +298,7 @@ def _copied(path: Path, bag: BagWriter) -> Iterator[str]:
                     last = max(last, received)
                     bag.write(handles[number], _plain(raw), received, published, sequence)
             elif not isinstance(record, str):
-                _note(record, summary, bag)
+                _note(record, summary)
             elif not is_closed:
                 yield record if last < 0 else f'{record}, after {last * 1e-9:.6f} s'
             is_closed |= isinstance(record, DataEnd)
@@ -323,8 +313,8 @@ def _copied(path: Path, bag: BagWriter) -> Iterator[str]:
     yield from _missing(summary, found)
 
 
-def _note(record: Any, summary: Summary, bag: BagWriter) -> None:
-    """Note a type, a topic, numbers of messages, a place of a chunk, or facts about the run."""
+def _note(record: Any, summary: Summary) -> None:
+    """Note a type, a topic, numbers of messages, or the place of a chunk."""
     if isinstance(record, Schema):
         summary.schemas[record.id] = record
     elif isinstance(record, Channel):
@@ -333,8 +323,6 @@ def _note(record: Any, summary: Summary, bag: BagWriter) -> None:
         summary.statistics = record
     elif isinstance(record, ChunkIndex):
         summary.chunk_indexes.append(record)
-    elif isinstance(record, Metadata) and record.name == RECORD:
-        bag.note(record.metadata)
 
 
 def _missing(summary: Summary, found: Counter[int]) -> Iterator[str]:
@@ -367,7 +355,7 @@ def _handle(bag: BagWriter, summary: Summary, number: int) -> int:
     return bag.add_topic(channel.topic, schema.name, profiles, definition)
 
 
-def _summary(stream: BinaryIO, size: int, bag: BagWriter) -> Summary:
+def _summary(stream: BinaryIO, size: int) -> Summary:
     """Return the topics and the index at the end of a file, empty unless they match a checksum.
 
     Only there are the topics known if the first chunk is damaged.
@@ -380,7 +368,7 @@ def _summary(stream: BinaryIO, size: int, bag: BagWriter) -> Summary:
         if checksum in (0, crc32(stream.read(size - MAGIC_SIZE - 4 - start))):
             stream.seek(start)
             while stream.tell() < size - MAGIC_SIZE:
-                _note(next_record(stream, size, _KINDS), summary, bag)
+                _note(next_record(stream, size, _KINDS), summary)
     return summary
 
 

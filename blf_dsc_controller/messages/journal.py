@@ -13,6 +13,7 @@ from collections.abc import Mapping
 from enum import Enum
 from typing import Any, NamedTuple
 
+from blf_dsc_controller import __version__
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.messages.codecs import typestore
 from blf_dsc_controller.messages.topics import JOURNAL
@@ -26,7 +27,7 @@ class EventType(str, Enum):
 
     __str__ = str.__str__
 
-    CONFIGURE = 'configure'  # parameters: all of them by name
+    CONFIGURE = 'configure'  # parameters: all of them by name; version: of this package
     ACTIVATE = 'activate'
     START = 'start'  # the law receives its first state; resumed: on the running reference
     TRAJECTORY = 'trajectory'  # joints, points, begin: as sent; at: followed from then on
@@ -75,7 +76,7 @@ def decode(raw: bytes) -> Event:
     try:
         message: Any = typestore().deserialize_cdr(raw, JOURNAL.type)
         event = Event(**json.loads(message.data))
-        return event._replace(type=EventType(event.type))
+        return event._replace(type=EventType(event.type), content={**event.content})
     except Exception as error:
         reason = f'a message of {JOURNAL.resolved} holds no event: {error}'
         raise BlfDscError(reason) from error
@@ -98,6 +99,8 @@ class Journal:
 
     def note(self, event: EventType, **content: Any) -> None:
         """Add an event that happens now."""
+        if event is EventType.CONFIGURE:
+            content['version'] = __version__
         noted = Event(self._number, event, self.stamp, self.messages, self.commands, content)
         self._number += 1
         self.pending.append(noted)
