@@ -28,7 +28,6 @@ from recorded_run import messages_on_disk, read, small_disk
 from ros_rig import RosRig
 from rosbags.rosbag2 import Reader
 from sensor_msgs.msg import JointState
-from std_msgs.msg import Float64MultiArray
 
 from blf_dsc_controller.analysis.report import read_bag
 from blf_dsc_controller.bags.content import read_content
@@ -95,50 +94,48 @@ def test_messages_are_recorded_byte_for_byte(ros, bag):
     assert [before, *stamps, after] == sorted([before, *stamps, after])
 
 
-def test_publishers_of_every_quality_are_recorded(ros, bag):
-    """Latched before the recorder came, best effort, and both on one topic; not those of others."""
+def test_topics_of_every_quality_and_type_are_recorded_as_offered(ros, bag):
+    """Latched before the recorder came, best effort, and both on one topic; not those of others.
+
+    Also a type of a package that rosbags does not know.
+    """
     best_effort = QoSProfile(depth=10, reliability=ReliabilityPolicy.BEST_EFFORT)
     create = ros.tester.create_publisher
     create(JointState, 'bound', KEPT).publish(JointState(name=['early']))
     other = create(JointState, 'other', 10)
-    chosen = ['bound', 'sensor', '/mixed', '/never']
+    chosen = ['bound', 'sensor', '/mixed', '/never', 'goals']
     recorder = ros.add(BagRecorderNode, output=str(bag), topics=chosen)
     kinds = (('sensor', best_effort), ('mixed', KEPT), ('mixed', best_effort))
     publishers = [create(JointState, topic, quality) for topic, quality in kinds]
+    publishers.append(create(Goals, 'goals', 100))
     ros.until(lambda: all(each.get_subscription_count() for each in publishers))
     for publisher in publishers:
-        publisher.publish(JointState())
-    until_recorded(ros, recorder, bound=1, sensor=1, mixed=2)
+        publisher.publish(publisher.msg_type())
+    until_recorded(ros, recorder, bound=1, sensor=1, mixed=2, goals=1)
     assert other.get_subscription_count() == 0
+    infos = [recorder.get_publishers_info_by_topic(f'/{topic}')[0] for topic in ('bound', 'goals')]
     recorder.close()
-    found = read(bag)
-    assert Counter(topic for topic, _, _ in found) == {'/bound': 1, '/mixed': 2, '/sensor': 1}
-    assert [b'early' in raw for topic, _, raw in found if topic == '/bound'] == [True]
-
-
-def test_quality_and_type_are_taken_from_the_graph(ros, bag):
-    """Also the type of a package that rosbags does not know."""
-    recorder = ros.add(BagRecorderNode, output=str(bag))
-    latched = QoSProfile(depth=7, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-    connected(ros, Float64MultiArray, 'commands', latched)
-    connected(ros, Goals, 'goals').publish(Goals())
-    until_recorded(ros, recorder, goals=1)
-    seen, goals = (
-        recorder.get_publishers_info_by_topic(topic)[0] for topic in ('/commands', '/goals')
-    )
-    recorder.close()
+    messages = read(bag)
+    assert Counter(topic for topic, _, _ in messages) == {
+        '/bound': 1,
+        '/mixed': 2,
+        '/sensor': 1,
+        '/goals': 1,
+    }
+    assert [b'early' in raw for topic, _, raw in messages if topic == '/bound'] == [True]
     with Reader(bag) as reader:
         found = {connection.topic: connection for connection in reader.connections}
-    commands = found['/commands']
-    assert str(seen.topic_type_hash) == commands.digest == definition(commands.msgtype)[1]
-    (offered,) = commands.ext.offered_qos_profiles
+    bound, goals = found['/bound'], found['/goals']
+    hashes = [str(info.topic_type_hash) for info in infos]
+    assert hashes == [bound.digest, goals.digest]
+    assert bound.digest == definition(bound.msgtype)[1]
+    assert 'geometry_msgs/Quaternion' in goals.msgdef.data
+    (offered,) = bound.ext.offered_qos_profiles
     assert offered.durability.name == 'TRANSIENT_LOCAL'
     # The graph knows neither history nor depth.
-    assert quality_of(seen.qos_profile) == Quality(
+    assert quality_of(infos[0].qos_profile) == Quality(
         depth=0, durability='transient_local', history='unknown', deadline=FOREVER
     )
-    assert found['/goals'].digest == str(goals.topic_type_hash)
-    assert 'geometry_msgs/Quaternion' in found['/goals'].msgdef.data
 
 
 def test_received_messages_are_on_disk_before_a_type_is_imported(ros, bag, monkeypatch):
@@ -219,6 +216,10 @@ class Rig(RosRig):
     def end(self, process, number=signal.SIGINT):
         """Stop a recorder by a signal; return its exit code and output."""
         process.send_signal(number)
+        return self.output(process)
+
+    def output(self, process):
+        """Wait for the end of a recorder; return its exit code and output."""
         _, output = process.communicate(timeout=PATIENCE)
         assert 'Traceback' not in output
         return process.returncode, output
@@ -256,17 +257,12 @@ def test_all_is_on_disk_while_it_runs_and_a_signal_completes_the_bag(rig, bag, n
 
 
 def test_signal_before_any_message_leaves_an_empty_bag_that_is_not_overwritten(rig, bag):
-    process = rig.record(bag, ['never'])
-    rig.until(bag.exists)
-    code, output = rig.end(process, signal.SIGTERM)
-    assert code == 0, output
-    assert counts(bag) == {}
-    assert '/never: never appeared' in output
-    process = rig.record(bag, ['never'])
-    _, output = process.communicate(timeout=PATIENCE)
-    assert process.returncode == 1
-    assert f'{bag} exists already' in output
-    assert 'Traceback' not in output
+    for code, words in ((0, '/never: never appeared'), (1, f'{bag} exists already')):
+        process = rig.record(bag, ['never'])
+        rig.until(lambda code=code: code or bag.exists())
+        returned, output = rig.end(process, signal.SIGTERM) if code == 0 else rig.output(process)
+        assert (returned, words in output) == (code, True), output
+        assert counts(bag) == {}
 
 
 def test_full_disk_stops_the_recorder_with_one_error(rig, tmp_path):

@@ -1,18 +1,24 @@
 # SPDX-License-Identifier: Apache-2.0
 """Bags of other software: other topics, joints and orders, shared topics, other formats.
 
-Unusable ones give one clear error line from every command, and no traceback.
+Unusable ones, and malicious files of all kinds, give one clear error line from every command.
 """
 
 from __future__ import annotations
 
 import csv
+import json
+import os
 import shutil
+from itertools import pairwise
 
 import numpy as np
 import pytest
 import recorded_run
+import synthetic_bag
+from mcap.opcode import Opcode
 from mcap.writer import Writer as McapWriter
+from recorded_run import raw_records
 from rosbags.rosbag1 import Writer as Writer1
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, Reader, StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
@@ -21,6 +27,9 @@ from synthetic_bag import Synthetic
 from blf_dsc_controller.bags.content import NameMap, read_content
 from blf_dsc_controller.bags.reader import applied_torque, read_run, single_run
 from blf_dsc_controller.cli.main import main
+from blf_dsc_controller.configuration.files import share_folder
+from blf_dsc_controller.configuration.nodes import load_loop
+from blf_dsc_controller.configuration.robot import Robot
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.messages.codecs import (
     Float64MultiArrayEncoder,
@@ -80,32 +89,20 @@ def foreign(torque='array', fields=('position', 'velocity', 'effort')):
 
 
 def write(path, messages, storage=StoragePlugin.MCAP, version=9, compression=CompressionMode.NONE):
-    writer = Writer(path, version=version, storage_plugin=storage)
-    writer.set_compression(compression, CompressionFormat.ZSTD)
+    """Write a bag of rosbag2, or of ROS 1 (version 1)."""
+    if version == 1:
+        writer, store = Writer1(path), get_typestore(Stores.ROS1_NOETIC)
+    else:
+        writer, store = Writer(path, version=version, storage_plugin=storage), typestore()
+        writer.set_compression(compression, CompressionFormat.ZSTD)
     with writer:
         connections = {}
         for topic, type_name, at, raw in messages:
             if topic not in connections:
-                connections[topic] = writer.add_connection(topic, type_name, typestore=typestore())
-            writer.write(connections[topic], at, raw)
-    return path
-
-
-def write_ros1(path, messages):
-    store = get_typestore(Stores.ROS1_NOETIC)
-    with Writer1(path) as writer:
-        connections = {}
-        for k, (topic, type_name, at, raw) in enumerate(messages):
-            if topic not in connections:
                 connections[topic] = writer.add_connection(topic, type_name, typestore=store)
-            message = typestore().deserialize_cdr(raw, type_name)
-            if type_name == JOINT_STATE:
-                stamp, types = message.header.stamp, store.types
-                time = types['builtin_interfaces/msg/Time'](stamp.sec, stamp.nanosec)
-                header = types['std_msgs/msg/Header'](k, time, 'base_link')
-                arrays = (message.name, message.position, message.velocity, message.effort)
-                message = types[JOINT_STATE](header, *arrays)
-            writer.write(connections[topic], at, store.serialize_ros1(message, type_name))
+            if version == 1:
+                raw = typestore().cdr_to_ros1(raw, type_name)  # noqa: PLW2901
+            writer.write(connections[topic], at, raw)
     return path
 
 
@@ -128,10 +125,8 @@ MCAP, SQLITE3 = StoragePlugin.MCAP, StoragePlugin.SQLITE3
 def test_shuffled_and_extra_joints_are_read_by_name(
     tmp_path, storage, version, compression, torque
 ):
-    if version == 1:
-        path = write_ros1(tmp_path / 'run.bag', foreign(torque))
-    else:
-        path = write(tmp_path / 'bag', foreign(torque), storage, max(version, 8), compression)
+    path = tmp_path / ('run.bag' if version == 1 else 'bag')
+    write(path, foreign(torque), storage, 8 if version == 5 else version, compression)
     if version == 5:
         text = (path / 'metadata.yaml').read_text()
         (path / 'metadata.yaml').write_text(text.replace('version: 8', 'version: 5'))
@@ -401,6 +396,92 @@ def test_bag_of_another_format_or_without_metadata(
 def test_chunk_that_declares_too_large_a_size_is_not_unpacked(copy, all_say, declared):
     file = copy / 'bag_0.mcap'
     data = file.read_bytes()
-    size = data.index(b'\x06', 100) + 9 + 16  # of the first chunk, after its times
+    (chunk, _), *_ = ((at, raw) for at, raw in raw_records(data) if raw[0] == Opcode.CHUNK)
+    size = chunk + 9 + 16  # after its times
     file.write_bytes(data[:size] + declared.to_bytes(8, 'little') + data[size + 8 :])
     all_say(file, f'a chunk would unpack to {declared} bytes')
+
+
+# Malicious files.
+
+BOMB = '- &a [x, x]\n' + ''.join(f'- &{b} [*{a}, *{a}]\n' for a, b in pairwise('abcdefghi'))
+
+
+def test_named_pipe_is_rejected_as_parameter_file_and_urdf(tmp_path, capsys):
+    os.mkfifo(tmp_path / 'pipe')
+    assert main(['run', '--offline', '--config', str(tmp_path / 'pipe')]) == 1
+    with pytest.raises(BlfDscError, match='is not a regular file'):
+        _ = Robot(urdf=str(tmp_path / 'pipe')).text
+    capsys.readouterr()
+
+
+@pytest.mark.parametrize(
+    ('text', 'words'),
+    [
+        ('[' * 100_000, 'nested more than 50 levels'),
+        ('a:\n' + '- 1\n' * 100_000, 'more than 50000 entries'),
+        (BOMB, 'does not support the alias'),
+    ],
+)
+def test_unreasonable_yaml_is_rejected(tmp_path, text, words):
+    path = tmp_path / 'given.yaml'
+    path.write_text(text)
+    with pytest.raises(BlfDscError, match=words):
+        load_loop(path)
+
+
+ROBOT = '<robot name="x">'
+NUMBERS = r'of at most 1e\+06 in magnitude'
+
+
+@pytest.mark.parametrize(
+    ('change', 'words'),
+    [
+        (lambda _: '<!DOCTYPE r [<!ENTITY a "x">]>', 'DOCTYPE'),
+        (lambda _: ROBOT + '<link name="a"/>' * 100_000 + '</robot>', 'at most 500'),
+        (lambda _: ROBOT + '<a>' * 10**5 + '</a>' * 10**5 + '</robot>', 'the links are none'),
+        (lambda text: text.replace(' izz="', ' izz="1e308" was="'), NUMBERS),
+        (lambda text: text.replace(' xyz="', ' xyz="1e200 0 0" was="'), NUMBERS),
+    ],
+    ids=['entities', 'large', 'deep', 'inertia', 'place'],
+)
+def test_unreasonable_urdf_is_rejected(change, words):
+    text = (share_folder() / 'config' / 'ur5e.urdf').read_text()
+    with pytest.raises(BlfDscError, match=words):
+        Robot(urdf=change(text), tip='tool0').chain(())
+
+
+# Output files.
+
+
+def test_nothing_is_overwritten_without_force(bag, tmp_path, capsys):
+    for name, *words in (
+        ('out', 'report', bag, '--out', tmp_path / 'out'),
+        ('out.csv', 'export', bag, '--out', tmp_path / 'out.csv'),
+        ('tracking.png', 'plot', bag, '--out', tmp_path),
+        ('out', 'identify', bag, '--urdf', 'panda.urdf', '--out', tmp_path / 'out'),
+        ('out', 'excite', tmp_path / 'out', '--config', 'panda'),
+    ):
+        out, kept, command = tmp_path / name, tmp_path / 'kept', [str(word) for word in words]
+        kept.write_text('kept')
+        out.symlink_to(kept)
+        assert main(command) == 1
+        assert f'{out} exists already' in capsys.readouterr().err
+        if command[0] in ('report', 'export', 'plot'):
+            assert main([*command, '--force']) == 0
+            assert not out.is_symlink()
+            assert main([*command, '--force']) == 0
+        assert kept.read_text() == 'kept'
+        out.unlink()
+
+
+def test_joint_names_cannot_break_out_of_the_page_script(tmp_path, monkeypatch):
+    monkeypatch.setattr(synthetic_bag, 'JOINTS', ('<!--<script>', '</script><b>x'))
+    bag = synthetic_bag.write(tmp_path / 'bag', synthetic_bag.Synthetic(200).messages())
+    assert main(['report', str(bag), '--out', str(tmp_path / 'page.html')]) == 0
+    _, _, rest = (tmp_path / 'page.html').read_text().partition('id="data">')
+    data, _, after = rest.partition('</script>')
+    assert '<' not in data
+    titles = {panel['title'] for panel in json.loads(data)['panels']}
+    assert {'position of <!--<script>', 'position of </script><b>x'} <= titles
+    assert '<b>x' not in after

@@ -21,7 +21,6 @@ from blf_dsc_controller.messages.codecs import (
     MissingJointError,
     ShortArrayError,
     encode_clock,
-    joint_state_layout,
     typestore,
 )
 
@@ -163,14 +162,6 @@ def test_multi_array_with_dimensions_of_the_expected_size_is_decoded(data):
     assert decoder.values.tolist() == data
 
 
-def without_padding(raw):
-    """The meaningful pieces of a JointState: rclpy leaves its padding bytes uninitialised."""
-    layout = joint_state_layout(raw)
-    return [raw[:2], raw[4:12], layout.names] + [
-        raw[array.offset : array.offset + 8 * array.size] for array in layout.arrays.values()
-    ]
-
-
 @pytest.mark.parametrize(
     'fields', [JOINT_STATE_FIELDS, (), *((field,) for field in JOINT_STATE_FIELDS)]
 )
@@ -186,10 +177,6 @@ def test_each_reads_what_rclpy_serialises_and_the_other_way_round(names, fields)
     message.header.stamp.sec, message.header.stamp.nanosec = divmod(STAMP, 10**9)
     raw = JointStateEncoder(names, fields).encode(STAMP, **values)
     assert rclpy.deserialize_message(raw, JointState) == message
-    expected = rclpy.serialize_message(message)
-    # rclpy may append some bytes if arrays are empty.
-    assert len(raw) == len(expected) or fields != JOINT_STATE_FIELDS
-    assert without_padding(raw) == without_padding(expected)
     for message.header.frame_id in ('', 'b', 'world'):
         decoder = JointStateDecoder(names[::-1], ())
         assert decoder.decode(rclpy.serialize_message(message)) == STAMP
