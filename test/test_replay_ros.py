@@ -107,8 +107,10 @@ def test_trajectories_and_gain_change_replay_where_they_took_effect(tmp_path):
 
 
 def test_stops_ramps_and_activations_replay_with_identical_torques(tmp_path):
-    """A pause, a safe stop in which a gain changes, activations and a reset."""
-    run = Recording(tmp_path / 'bag', **DAMPED)
+    """A pause, a stop in which a gain changes, a reset, a stop since no state comes any more."""
+    clock = FakeClock()
+    run = Recording(tmp_path / 'bag', clock, safety__watchdog='on', **DAMPED)
+    run.ros.until(lambda: clock.advance(0.01) or run.arm._offered)
     run.run(100)
     deactivate(run.ros, run.law)
     run.run(600)  # past the ramp
@@ -125,23 +127,6 @@ def test_stops_ramps_and_activations_replay_with_identical_torques(tmp_path):
     run.run(100)
     run.ros.reset(run.law)
     run.run(100)
-    bag = run.end()
-    result = verify(bag)
-    assert (result.difference, result.remarks) == (None, ())
-    assert [event.type for event in result.events].count(EventType.PARAMETERS) == 1
-    assert ', '.join(result.transitions) == (
-        'activate, deactivate, activate, safe stop (stamp jump), deactivate, activate, reset'
-    )
-    torques = len(of(recorded_run.messages(bag), COMMANDS))
-    assert compared(result)['commands'] == 2 * torques
-    assert torques - result.samples >= 600 + 2 * 50
-
-
-def test_state_timeout_replays_with_its_torques(tmp_path):
-    clock = FakeClock()
-    run = Recording(tmp_path / 'bag', clock, safety__watchdog='on', **DAMPED)
-    run.ros.until(lambda: clock.advance(0.01) or run.arm._offered)
-    run.run(50)
     deactivate(run.ros, run.arm)
     clock.advance(0.1)
     run.ros.until(lambda: run.law.guard.supervisor.text)
@@ -154,8 +139,12 @@ def test_state_timeout_replays_with_its_torques(tmp_path):
     run.run(50)
     bag = run.end()
     result = verify(bag)
-    assert result.difference is None
-    assert result.transitions == ['activate', 'safe stop (state timeout)', 'deactivate', 'activate']
+    assert (result.difference, result.remarks) == (None, ())
+    assert [event.type for event in result.events].count(EventType.PARAMETERS) == 1
+    assert ', '.join(result.transitions) == (
+        'activate, deactivate, activate, safe stop (stamp jump), deactivate, activate, reset, '
+        'safe stop (state timeout), deactivate, activate'
+    )
     errors = read_content(bag).topics[TRACKING_ERROR].joint_states(JOINTS, ())
     used = errors.stamp[np.isfinite(errors.field(0)[:, 0])]
     assert result.samples == used.size
@@ -163,6 +152,7 @@ def test_state_timeout_replays_with_its_torques(tmp_path):
     torques = len(of(recorded_run.messages(bag), COMMANDS))
     assert compared(result)['commands'] == 2 * torques
     assert compared(result)['tracking_error'] == 6 * errors.size
+    assert torques - result.samples >= 600 + 2 * 50
 
 
 # Playing a bag: its messages byte for byte over ROS, in its time.
