@@ -17,17 +17,11 @@ from blf_dsc_controller.errors import BlfDscError
 pytestmark = pytest.mark.nightly
 
 BENCHMARK = Path(__file__).parents[1] / 'benchmark'
-MODULES = [
-    '.'.join(path.relative_to(BENCHMARK).with_suffix('').parts)
-    for path in sorted(BENCHMARK.rglob('*.py'))
-]
 
 
 @pytest.fixture(autouse=True)
 def _importable(monkeypatch):
     monkeypatch.syspath_prepend(str(BENCHMARK))
-    for name in ('ROS_DOMAIN_ID', 'ROS_AUTOMATIC_DISCOVERY_RANGE'):
-        monkeypatch.setenv(name, '')  # the benchmarks set them; restored after each test
 
 
 def tiny(monkeypatch, name, **sizes):
@@ -42,11 +36,6 @@ def contestants(rows):
     """Names of the measurements, after a check that their ratios are finite."""
     assert all(0.0 < row.low <= row.median <= row.high < math.inf for row in rows)
     return [row.what for row in rows]
-
-
-@pytest.mark.parametrize('name', MODULES)
-def test_every_module_can_be_imported(name):
-    importlib.import_module(name)
 
 
 def test_growth_is_written_as_a_table(monkeypatch, tmp_path):
@@ -96,3 +85,12 @@ def test_dead_or_silent_contestant_aborts_the_measurement(monkeypatch):
     with pytest.raises(BlfDscError, match=r'no sign of a torque after 0\.1 s'):
         silent.until(lambda: False, 'a torque')
     silent.close()
+
+
+def test_arms_are_identified_at_both_rates(monkeypatch, capsys):
+    monkeypatch.setattr(sys, 'argv', ['identification.py', 'arms', '--runs', '1'])
+    importlib.import_module('identification').main()
+    printed = capsys.readouterr().out
+    assert '1 arms, 0 results with unphysical bodies' in printed
+    assert '\n| 1000 Hz | ' in printed
+    assert '\n| 100 Hz | ' in printed

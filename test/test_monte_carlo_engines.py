@@ -16,9 +16,8 @@ from contextlib import contextmanager
 from dataclasses import replace
 
 import numpy as np
-import pyarrow.parquet
 import pytest
-from monte_carlo_case import LOOP, RUNS, STUDY, same, study, whole, write
+from test_monte_carlo_study import LOOP, RUNS, STUDY, same, study, whole, write
 
 from blf_dsc_controller.bags.reader import read_run
 from blf_dsc_controller.cli.main import main
@@ -152,12 +151,6 @@ def test_chunks_are_few_and_hold_each_run_once(tmp_path, runs, chunks):
     missing = Store.create_or_open(tmp_path / 'out', study(tmp_path, runs=runs)).missing()
     assert len(missing) == chunks
     assert [0, *(chunk.stop for chunk in missing)] == [*(chunk.start for chunk in missing), runs]
-
-
-def test_results_can_be_read_with_pyarrow_alone(whole_store):
-    table, expected = pyarrow.parquet.read_table(whole_store.folder / 'runs'), whole_store.results()
-    assert same({name: table[name].to_numpy() for name in table.column_names}, expected)
-    assert same(expected, whole(whole_store.study))
 
 
 def test_other_study_or_version_is_rejected_and_the_difference_is_named(

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from monte_carlo_case import LOOP, STUDY, study, whole, write
 from scipy import stats
 
 from blf_dsc_controller.configuration.nodes import dump, locate
@@ -27,6 +26,65 @@ from blf_dsc_controller.studies.monte_carlo import (
 )
 from blf_dsc_controller.studies.report import compare_pairs
 from blf_dsc_controller.studies.runs import run_chunk
+
+RUNS = 24
+
+# A window of 0.1 s is hardly excited, but it latches: learning within 0.3 s.
+LOOP = """\
+sim_plant:
+  ros__parameters:
+    duration: 0.3
+    events: {begin: [0.0, 0.2], duration: [0.1, 0.0]}
+blf_dsc_controller:
+  ros__parameters:
+    approach: {enabled: false}
+    learning: {window: 0.1, settling_time: 0.05, excitation_threshold: 1.0e-12}
+"""
+
+STUDY = """\
+monte_carlo:
+  ros__parameters:
+    runs: 24
+    seed: 7
+    settled_after: 0.2
+    vary:
+      arm.m2: uniform(0.3, 0.7)
+      disturbance.constant: uniform(-0.2, 0.2)
+      sensor.position_noise: loguniform(1.0e-6, 2.0e-5)
+      sensor.velocity: choice(measured, differenced)
+      actuator.delay: integers(0, 3)
+      initial.error: uniform(-0.9, 0.9)
+      initial.velocity_error: uniform(-0.02, 0.02)
+      events.begin: ["uniform(0.05, 0.1)", "choice(0.2)"]
+      events.payload: uniform(0.0, 0.2)
+      events.torque: ["uniform(-0.5, 0.5)", "choice(0.0)", "uniform(-0.5, 0.5)", "choice(0.0)"]
+"""
+
+
+def write(folder, text=LOOP + STUDY):
+    """Write the file of a study and return its path."""
+    path = folder / 'study.yaml'
+    path.write_text(text)
+    return path
+
+
+def study(folder, text=LOOP + STUDY, **overrides):
+    """Return the study of a file with this text."""
+    return load_study(write(folder, text), overrides)
+
+
+def whole(a_study):
+    """Return the results of all runs, computed at once in this process."""
+    return run_chunk(a_study, 0, a_study.settings.runs)
+
+
+def same(results, other):
+    """Return True if two results are the same, bit for bit; fail otherwise."""
+    assert list(results) == list(other)
+    for name, values in results.items():
+        np.testing.assert_array_equal(values, other[name], err_msg=name)
+    return True
+
 
 FRACTIONS = st.floats(0.0, 1.0, exclude_max=True)
 MASS = 'uniform(0.3, 0.7)'
@@ -68,11 +126,10 @@ def test_values_are_as_frequent_as_stated():
         ('arm.m2', 'arm.m3', r'line 15: vary.arm.m3: unknown parameter.* mean vary.arm.m[12]\?'),
         ('arm.m2', 'initial.position', r'vary.initial.position: unknown parameter'),
         ('uniform(0.3', 'unifrm(0.3', r"line 15: vary.arm.m2: got 'unifrm\(0.3, 0.7\)', but"),
-        (MASS, '0.5', r'vary.arm.m2: got 0.5, but one of these is expected'),
         (MASS, 'uniform(0.3)', r'with 1 values, but uniform\(low, high\) is'),
         (MASS, 'uniform(a, 0.7)', r'but a number is expected between commas'),
         (MASS, 'uniform(nan, 0.7)', r'must not be above the second'),
-        (MASS, 'choice(inf)', r'can give values that are not allowed: got inf'),
+        (MASS, 'choice(inf)', r'can give values that are not allowed: got .inf, but a fin'),
         (MASS, 'uniform(0.7, 0.3)', r'must not be above the second'),
         (MASS, 'maybe(1.3, 0.3, 0.7)', r'but a probability is from 0 to 1'),
         (MASS, 'maybe(0.3, 0.4, 0.7)', r'not allowed: got 0.0, .* above 0'),
@@ -80,11 +137,9 @@ def test_values_are_as_frequent_as_stated():
         ('loguniform(1.0e-6', 'loguniform(0.0', r'loguniform distribution begins above 0'),
         ('uniform(-0.9, 0.9)', 'uniform(-1.0, 0.9)', r'initial.error: .* above -1 and below 1'),
         ('integers(0, 3)', 'uniform(0.0, 3.0)', r'delay: got .*: integers\(low, high\), choice'),
-        ('integers(0, 3)', 'integers(0.5, 3)', r'delay: .* an integer is expected between'),
         ('choice(measured,', 'choice(guessed,', r'velocity: .* got "guessed", but it must be one'),
         ('uniform(-0.2, 0.2)', '["uniform(0, 1)"]', r'got 1 distributions, .* 2 entries \(joint1'),
         ('runs: 24', 'runs: 0', r'line 11: runs: got 0, but it must be at least 1'),
-        ('runs: 24', 'rums: 24', r'line 11: rums: .* did you mean runs\?'),
         ('after: 0.2', 'after: 0.3', r'settled_after: got 0.3 s, but a run ends at 0.3 s'),
         ('duration: 0.3', 'duration: 0.0', r'sim_plant.duration: got 0 s, but every run must end'),
         ('monte_carlo:', 'monte:', r'there is no section monte_carlo'),

@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import importlib.util
-import os
 import sys
 from pathlib import Path
 
@@ -14,12 +13,10 @@ import pytest
 pytest.importorskip('rclpy', reason='needs ROS 2')
 pytest.importorskip('mujoco', reason='needs MuJoCo: pip install mujoco')
 
-from changes import OFF, ROWS, end_of
-from plain_law import dynamics
-from plants import commands, true_parameters
+from paper_case import P
+from plants import commands
 from test_plant_events import ALL_KINDS
 
-from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.nodes import load_loop
 from blf_dsc_controller.configuration.plant import PlantConfig
 from blf_dsc_controller.configuration.schema import build, change
@@ -29,7 +26,6 @@ from blf_dsc_controller.supervision.guard import Guard
 from sim_plant.plant import plant_of, plant_settings
 
 EXAMPLE = Path(__file__).parents[1] / 'examples/mujoco_plant/mujoco_plant.py'
-P = np.array([1.0, 0.32, 0.4])  # (m1+m2) l1^2, m2 l2^2, m2 l1 l2 of arm.xml
 
 
 @pytest.fixture(scope='module')
@@ -38,24 +34,6 @@ def example():
     module = sys.modules[spec.name] = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
     return module
-
-
-def test_mujoco_arm_has_the_inertia_and_gravity_of_the_model():
-    """MuJoCo's M(q) and its bias torque at rest against the paper's (33), (34)."""
-    import mujoco
-
-    model = mujoco.MjModel.from_xml_path(str(EXAMPLE.with_name('arm.xml')))
-    data = mujoco.MjData(model)
-    for q in np.random.default_rng(0).uniform(-3.0, 3.0, (20, 2)):
-        data.qpos[:] = q
-        mujoco.mj_forward(model, data)
-        theirs = np.zeros((2, 2))
-        for i in range(2):
-            mujoco.mj_mulM(model, data, theirs[i], np.eye(2)[i])
-        ours, _, gravity = dynamics(P, 9.8, q, (0.0, 0.0))
-        np.testing.assert_allclose(theirs, ours, atol=1e-8)  # the point masses have 1e-9 kg m^2
-        np.testing.assert_allclose(data.qfrc_bias, gravity, atol=1e-8)
-    assert [model.joint(k).name for k in range(model.njnt)] == ['joint1', 'joint2']
 
 
 PANDA = {'robot.urdf': 'panda.urdf', 'robot.tip': 'panda_hand_tcp'}
@@ -175,22 +153,3 @@ def test_node_keeps_the_bound_and_learns_the_parameters(ros, example):
     # Learning begins after 6.8 s, with half of each parameter missing; a second later an error
     # of 0.1 % is left with our own plant, which holds its torque the same way.
     np.testing.assert_allclose(guard.controller.state.estimate[:3], P, rtol=0.01)
-
-
-# All of them in `make test-nightly`; test_law_consistency.py has them with our own plant.
-CHANGES = ROWS if os.environ.get('NIGHTLY') else ['payload to 0.75 kg at 8 s']
-
-
-@pytest.mark.parametrize('name', CHANGES)
-def test_bound_holds_while_the_arm_changes_and_learning_does_no_harm(example, name):
-    """Two windows after the last change the parameters are known again."""
-    plant, end = build(PlantConfig, ROWS[name]), end_of(ROWS[name])
-    learning, without = (
-        close_loop(build(ControllerConfig, law), example.MujocoArm(plant), round(1e3 * end))[0]
-        for law in ({}, OFF)
-    )
-    assert np.all(learning.samples.ratio < 1.0)
-    assert np.all(learning.samples.ratio <= 1.3 * without.samples.ratio)
-    true = true_parameters(plant, end)
-    error = learning.controller.state.estimate[:3] - true
-    assert np.linalg.norm(error) < 0.01 * np.linalg.norm(true)
