@@ -158,7 +158,6 @@ class PlantState(NamedTuple):
     sample: Cell  # k
     x: Annotated[Array, '2 * n + 6']  # q [rad], dq [rad/s], noise-free; load: y [m], v [m/s]
     sloshes: Cell  # 1: y and v are those of a load
-    broken: Cell  # 1: the arm has exceeded a speed that no arm survives
     reading: EncoderReading
     drives: DriveState
     acting: Acting

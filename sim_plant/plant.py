@@ -43,8 +43,6 @@ T = TypeVar('T')
 _RESOLVED = 1.5  # decay within a step; the integrator is stable up to 3.3
 _MOST_STEPS = 1000
 _CURRENT = 0.1  # A/N m, of motors with their gears, roughly that of cobots
-FASTEST = 1e3
-"""Norm of the joint velocities [rad/s] beyond which the arm breaks and stops where it was."""
 
 
 class Plant:
@@ -69,7 +67,6 @@ class Plant:
         self._initial = self.state.copy()
         self._measurement = np.zeros(3 * self.joints)
         self._truth = np.zeros(settings.p + 3 * self.joints)
-        self._before = np.zeros(self.joints)
         self._seed = seed
         self.rng = generator(seed)
 
@@ -77,11 +74,6 @@ class Plant:
     def sample(self) -> int:
         """Samples stepped since the start, k."""
         return int(self.state[0])
-
-    @property
-    def is_broken(self) -> bool:
-        """Whether the arm has exceeded `FASTEST`, until a reset."""
-        return bool(self._now.broken[0])
 
     @property
     def is_stopped(self) -> bool:
@@ -99,19 +91,8 @@ class Plant:
         return self._measurement
 
     def step(self, torque: np.ndarray) -> None:
-        """Apply the commanded torque (n,) [N m] and advance to the next sample.
-
-        An arm that breaks stands still from then on.
-        """
-        if self.is_broken:
-            self.hold()
-            return
-        self._before[:] = self._q
+        """Apply the commanded torque (n,) [N m] and advance to the next sample."""
         step_plant(self.arm, self.settings, self.state, torque)
-        if not self._dq @ self._dq <= FASTEST**2:  # NaN as well
-            self._now.broken[0] = 1.0
-            self._q[:] = self._before
-            self._dq[:] = 0.0
 
     def change(self, settings: PlantSettings) -> None:
         """Switch to settings with the same number of joints, period and delay."""

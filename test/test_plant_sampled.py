@@ -134,16 +134,3 @@ def test_reset_plant_repeats_its_run_and_restored_one_continues_bit_for_bit(sour
     arm.reset()
     assert arm.sample == 0
     assert (run(arm, torques[:60]) == first).all()
-
-
-def test_arm_stopped_for_excessive_speed_stays_stopped_when_restored():
-    arm = plant()
-    run(arm, np.full((300, 2), 9e3))
-    assert arm.is_broken
-    before, saved = arm.measure().copy(), arm.save()
-    arm.reset()
-    assert not arm.is_broken
-    arm.restore(saved)
-    after = run(arm, np.full((3, 2), 9e3))
-    np.testing.assert_array_equal(after[-1, :2], before[:2])
-    assert not after[-1, 2:4].any()

@@ -38,7 +38,6 @@ from blf_dsc_controller.nodes.endpoints import create_publisher, create_steady_t
 from blf_dsc_controller.nodes.lifecycle import LoopNode
 from sim_plant.command_input import Latency, TorqueInput
 from sim_plant.plant import (
-    FASTEST,
     Plant,
     parameter_names_of,
     plant_of,
@@ -269,13 +268,13 @@ class PlantNode(LoopNode[PlantConfig]):
     def _step(self) -> None:
         torque = self.input.torque
         self.plant.step(torque)
-        if self._halt or not (self.plant.is_broken or self.plant.is_stopped):
+        if self._halt or not self.plant.is_stopped:
             return
-        self._halt = f'the torque {torque} N m drove the arm beyond {FASTEST:g} rad/s'
-        if self.plant.is_stopped:
-            rate = self.config.actuator.reflex_rate
-            self._halt = f'reflex: the commands jumped to {torque} N m, faster than {rate:g} N m/s'
-        self._halt += ': the arm stands still until it is reset'
+        rate = self.config.actuator.reflex_rate
+        self._halt = (
+            f'reflex: the commands jumped to {torque} N m, faster than {rate:g} N m/s: the arm '
+            'stands still until it is reset'
+        )
         self.get_logger().error(self._halt)
         self._report()
 
