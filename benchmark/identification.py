@@ -42,7 +42,7 @@ from numpy.typing import NDArray
 from random_arm import CONFIG, random_urdf
 from shaken_arm import PERIOD, is_covered, measured, recording_of, reference_of, shake, truth_of
 
-from blf_dsc_controller.arms.inertia import pseudo_inertia
+from blf_dsc_controller.arms.urdf import pseudo_inertia
 from blf_dsc_controller.configuration.nodes import CONTROLLER, PLANT, LoopConfig, load_loop
 from blf_dsc_controller.configuration.robot import Robot, parameters_of
 from blf_dsc_controller.identification.identify import (

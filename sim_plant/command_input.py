@@ -21,9 +21,8 @@ class TorqueInput:
     torque was too old.
     """
 
-    def __init__(self, joints: tuple[str, ...]) -> None:
-        self._joints = joints
-        self.torque = np.zeros(len(joints))
+    def __init__(self, n: int) -> None:
+        self.torque = np.zeros(n)
         self.problem = ''
         self.rejected = 0
         self.stale_steps = 0
@@ -34,33 +33,21 @@ class TorqueInput:
 
         Returns whether it is valid; if not, `problem` describes why.
         """
-        if size != self.torque.size:
-            self.rejected += 1
-            self.problem = f'command rejected: {size} values, {self.torque.size} expected'
-            return False
-        possible = np.abs(torque) <= LARGEST
-        if not possible.all():
-            self.rejected += 1
-            names = ', '.join(np.array(self._joints)[~possible])
-            self.problem = (
-                f'command rejected: {torque} N m (for {names}): '
-                f'not finite, or above the limit of {LARGEST:g} N m'
-            )
-            return False
-        self.torque[:] = torque
-        self._taken_at = sample
-        return True
+        if size == self.torque.size and (np.abs(torque) <= LARGEST).all():
+            self.torque[:] = torque
+            self._taken_at = sample
+            return True
+        self.rejected += 1
+        got = f'{torque} N m' if size == self.torque.size else f'{size} values'
+        needed = f'{self.torque.size} of at most {LARGEST:g} N m are needed'
+        self.problem = f'command rejected: got {got}, but {needed}'
+        return False
 
     def is_stale(self, sample: int, limit: int) -> bool:
         """Return whether the torque is older than `limit` samples at `sample`, and count it."""
         stale = sample - self._taken_at > limit
         self.stale_steps += stale
         return stale
-
-    def restart(self) -> None:
-        """Clear the torque and restart at sample 0."""
-        self.torque[:] = 0.0
-        self.renew(0)
 
     def renew(self, sample: int) -> None:
         """Measure the age of the torque from `sample` on."""

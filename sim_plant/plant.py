@@ -10,11 +10,9 @@ from typing import Any, TypeVar, get_type_hints
 import numpy as np
 from numpy.typing import ArrayLike
 
-from blf_dsc_controller.arms.inertia import inertia_of, moved, pseudo_inertia
 from blf_dsc_controller.arms.two_link import PARAMETER_NAMES, urdf
-from blf_dsc_controller.arms.urdf import Chain
+from blf_dsc_controller.arms.urdf import Chain, inertia_of, moved, pseudo_inertia
 from blf_dsc_controller.compiled.layout import pack
-from blf_dsc_controller.configuration.nodes import PLANT
 from blf_dsc_controller.configuration.plant import Deviation, PlantConfig
 from blf_dsc_controller.configuration.robot import parameters_of
 from sim_plant.arm import Arm, PointMassArm
@@ -296,5 +294,5 @@ def urdf_of(config: PlantConfig) -> str:
     """Return the URDF of a configured arm."""
     if config.robot.urdf:
         return config.robot.text
-    arm, limits = config.arm, config.actuator.torque_limit
-    return urdf(PLANT, config.joints, (arm.l1, arm.l2), (arm.m1, arm.m2), limits)
+    arm = config.arm
+    return urdf(config.joints, (arm.l1, arm.l2), (arm.m1, arm.m2))

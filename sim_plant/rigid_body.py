@@ -17,8 +17,7 @@ from typing import Annotated, NamedTuple
 import numpy as np
 
 from blf_dsc_controller.arms.base_parameters import BaseParameters
-from blf_dsc_controller.arms.inertia import pseudo_inertia, rotational_inertia
-from blf_dsc_controller.arms.urdf import Chain
+from blf_dsc_controller.arms.urdf import Chain, pseudo_inertia, rotational_inertia
 from blf_dsc_controller.compiled import cholesky
 from blf_dsc_controller.compiled.elementary import cos, sin
 from blf_dsc_controller.compiled.jit import called, inner

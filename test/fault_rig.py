@@ -57,7 +57,7 @@ class Rig:
         self.base = TODAY if live else LOCKSTEP
         self.guard = self.controller()
         self.plant = plant_of(build(PlantConfig, plant or {}))
-        self.input = TorqueInput(JOINTS)
+        self.input = TorqueInput(len(JOINTS))
         self.commands = []  # all torques commanded
         self.push = np.zeros(2)
         self.sense = lambda state: [state.raw()]  # messages sent for a state
@@ -125,5 +125,5 @@ class Rig:
         self.base = self.state().stamp + LOCKSTEP
         self.wall = max(self.wall, self.base) if self.live else self.wall
         self.plant.reset()
-        self.input.restart()
+        self.input.torque[:] = 0.0
         self.guard.reset()

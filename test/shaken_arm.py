@@ -10,8 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from random_arm import CONFIG, PANDA
 
-from blf_dsc_controller.arms.inertia import inertia_of, pseudo_inertia
-from blf_dsc_controller.arms.urdf import read_chain
+from blf_dsc_controller.arms.urdf import inertia_of, pseudo_inertia, read_chain
 from blf_dsc_controller.bags.writer import BagWriter
 from blf_dsc_controller.compiled.jit import kernel
 from blf_dsc_controller.identification.prior import base_matrix

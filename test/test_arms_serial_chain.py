@@ -14,8 +14,8 @@ from blf_dsc_controller.arms.base_parameters import (
     payload_inertia,
     prior_factor,
 )
-from blf_dsc_controller.arms.inertia import inertia_of, pseudo_inertia
 from blf_dsc_controller.arms.serial_chain import ROTOR, serial_chain
+from blf_dsc_controller.arms.urdf import inertia_of, pseudo_inertia
 
 WALL = (0.0, 9.81, 0.0)
 
@@ -41,14 +41,13 @@ PANDA_CHAIN, UR5E_CHAIN, *RANDOM = map(chain_of, ('panda', 'ur5e', 'three', 'nin
 CHAINS = [PANDA_CHAIN, UR5E_CHAIN, *RANDOM]
 
 
-@pytest.mark.parametrize('rotors', [True, False])
 @pytest.mark.parametrize('chain', CHAINS)
-def test_base_parameters_are_the_smallest_set_that_gives_the_same_torques(chain, rotors):
-    base = base_parameters(chain, WALL, rotors=rotors)
+def test_base_parameters_are_the_smallest_set_that_gives_the_same_torques(chain):
+    base = base_parameters(chain, WALL)
     whole = serial_chain(chain, WALL)
     n, p = base.model.n, base.model.p
     random = np.random.default_rng(5)
-    inertias, joint_rotors = random.normal(size=(n, 10)), random.normal(size=n) * rotors
+    inertias, joint_rotors = random.normal(size=(n, 10)), random.normal(size=n)
     P, phi = base.of(inertias, joint_rotors), np.column_stack((inertias, joint_rotors)).ravel()
     H, rows = np.zeros((n, p)), np.zeros((p, n, whole.p))
     for full in rows:
@@ -56,18 +55,18 @@ def test_base_parameters_are_the_smallest_set_that_gives_the_same_torques(chain,
         whole.regressor(q, dq, v, a, full)
         base.model.regressor(q, dq, v, a, H)
         np.testing.assert_allclose(H @ P, full @ phi, rtol=1e-8, atol=1e-8)
-    shown = [k for k in range(whole.p) if rotors or k % (ROTOR + 1) != ROTOR]
-    singular = np.linalg.svd(rows[:, :, shown].reshape(-1, len(shown)), compute_uv=False)
+    singular = np.linalg.svd(rows.reshape(-1, whole.p), compute_uv=False)
     assert singular[p - 1] > 1e-3
-    assert p == len(shown) or singular[p] < 1e-7  # pi / 2 has ten digits in the UR5e's file
+    assert singular[p] < 1e-7  # pi / 2 has ten digits in the UR5e's file
 
 
 def test_base_parameters_agree_with_the_literature():
     """43 for a Panda (Gaz et al., 2019), 36 for an arm like the UR; rotors except at the base."""
     for chain, inertial, rotors in ((PANDA_CHAIN, 43, 5), (UR5E_CHAIN, 36, 4)):
-        assert base_parameters(chain, rotors=False).model.p == inertial
-        assert base_parameters(chain).model.p == inertial + rotors
-    base = base_parameters(PANDA_CHAIN, rotors=False)
+        names = base_parameters(chain).model.parameter_names
+        found = sum(name.startswith('rotor') for name in names)
+        assert (len(names) - found, found) == (inertial, rotors)
+    base = base_parameters(PANDA_CHAIN)
     sums = dict(zip(base.model.parameter_names, base.combinations, strict=True))
     assert sums['Ixx7'] == 'Ixx7 - Iyy7'
     assert sums['m*cx7'] == 'm*cx7'

@@ -10,8 +10,7 @@ import numpy as np
 import pytest
 from random_arm import PANDA, PANDA_TEXT, chain_of
 
-from blf_dsc_controller.arms.inertia import inertia_of, pseudo_inertia
-from blf_dsc_controller.arms.urdf import UrdfError, read_chain
+from blf_dsc_controller.arms.urdf import UrdfError, inertia_of, pseudo_inertia, read_chain
 
 
 def test_limits_are_read_from_the_file_and_infinite_where_they_are_missing():

@@ -25,8 +25,7 @@ from shaken_arm import (
     write_states,
 )
 
-from blf_dsc_controller.arms.inertia import pseudo_inertia
-from blf_dsc_controller.arms.urdf import read_chain
+from blf_dsc_controller.arms.urdf import pseudo_inertia, read_chain
 from blf_dsc_controller.bags.content import NameMap
 from blf_dsc_controller.bags.sources import BagError
 from blf_dsc_controller.bags.writer import BagWriter

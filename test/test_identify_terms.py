@@ -30,9 +30,8 @@ from test_analysis_figures import amount, lightened, pixels
 
 from blf_dsc_controller.analysis.panels import COLOURS, INK, ORANGE
 from blf_dsc_controller.arms.base_parameters import base_parameters
-from blf_dsc_controller.arms.inertia import inertia_of, pseudo_inertia
 from blf_dsc_controller.arms.model import regressors_at
-from blf_dsc_controller.arms.urdf import read_chain
+from blf_dsc_controller.arms.urdf import inertia_of, pseudo_inertia, read_chain
 from blf_dsc_controller.cli.identify import problems_of
 from blf_dsc_controller.cli.main import main
 from blf_dsc_controller.configuration.robot import Robot

@@ -10,7 +10,7 @@ from plants import true_parameters
 from random_arm import PANDA
 
 from blf_dsc_controller.arms.base_parameters import base_parameters
-from blf_dsc_controller.arms.inertia import pseudo_inertia
+from blf_dsc_controller.arms.urdf import pseudo_inertia
 from blf_dsc_controller.configuration.plant import PlantConfig
 from blf_dsc_controller.configuration.schema import build, change
 from sim_plant.plant import plant_of, plant_settings, true_inertias

@@ -20,9 +20,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from blf_dsc_controller.arms.inertia import inertia_of, moved, pseudo_inertia
 from blf_dsc_controller.arms.serial_chain import ROTOR, SerialChain, serial_chain
-from blf_dsc_controller.arms.urdf import Chain
+from blf_dsc_controller.arms.urdf import Chain, inertia_of, moved, pseudo_inertia
 from blf_dsc_controller.compiled.matrices import independent_columns, product
 
 LINKS = 0.3
@@ -65,15 +64,11 @@ class BaseParameters:
 
 
 @functools.lru_cache(maxsize=16)
-def base_parameters(
-    chain: Chain, gravity: tuple[float, ...] = (0.0, 0.0, -9.81), *, rotors: bool = True
-) -> BaseParameters:
-    """Return a chain's base parameters, with or without rotors; gravity [m/s^2] is in its base."""
+def base_parameters(chain: Chain, gravity: tuple[float, ...] = (0.0, 0.0, -9.81)) -> BaseParameters:
+    """Return the base parameters of a chain; gravity [m/s^2] is in its base."""
     full = serial_chain(chain, gravity)
-    order = np.array([k for k in range(full.p) if rotors or k % (ROTOR + 1) != ROTOR])
-    independent, X = independent_columns(_regressor_at_random(full)[:, order], _DEPENDENT)
-    kept, K = order[independent], np.zeros((independent.size, full.p))
-    K[:, order] = np.where(np.abs(X) < _DEPENDENT, 0.0, X.round(12))
+    kept, X = independent_columns(_regressor_at_random(full), _DEPENDENT)
+    K = np.where(np.abs(X) < _DEPENDENT, 0.0, X.round(12))
     columns = [(int(k) // (ROTOR + 1), int(k) % (ROTOR + 1)) for k in kept]
     sums = tuple(_sum(row, int(k), full.parameter_names) for row, k in zip(K, kept, strict=True))
     point, loaded = chain.tip_placement[:, 3], np.zeros((full.n, ROTOR + 1))

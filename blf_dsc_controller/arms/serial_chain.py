@@ -11,7 +11,7 @@ alpha_i = sum_j (S_j a_j + S_j' v_j) - gravity with S_j' = v_j x S_j.  Over the 
     (G - C^T dq)_j = -sum_i (S_j' . I_i v_i + S_j . weight_i)
 
 (Echeandia and Wensing, Numerical methods to compute the Coriolis matrix and Christoffel symbols for
-rigid-body systems, 2021.)  All of it is linear in the ten parameters (`inertia.INERTIA_NAMES`) of
+rigid-body systems, 2021.)  All of it is linear in the ten parameters (`urdf.INERTIA_NAMES`) of
 each body in its joint's frame.  A rotor inertia J, reflected to its joint, adds J a_j and J dq_j.
 """
 
@@ -21,8 +21,7 @@ from typing import Annotated, NamedTuple
 
 import numpy as np
 
-from blf_dsc_controller.arms.inertia import INERTIA_NAMES, INERTIA_UNITS
-from blf_dsc_controller.arms.urdf import Chain
+from blf_dsc_controller.arms.urdf import INERTIA_NAMES, INERTIA_UNITS, Chain
 from blf_dsc_controller.compiled.elementary import cos, sin
 from blf_dsc_controller.compiled.jit import called, inner
 from blf_dsc_controller.compiled.layout import Array, pack, view_of

@@ -107,32 +107,22 @@ def fill_momentum_regressor(r: float, angles: Angles, dq: Array, Yp: Array, Yr: 
     Yr[1, 2] = s2 * dq[0] * (dq[0] + dq[1]) + r * c12
 
 
-def urdf(
-    name: str,
-    joints: Sequence[str],
-    lengths: Sequence[float],
-    masses: Sequence[float],
-    effort: Sequence[float],
-) -> str:
-    """Return the URDF of a robot of this name, whose tip is the link `tip`.
+def urdf(joints: Sequence[str], lengths: Sequence[float], masses: Sequence[float]) -> str:
+    """Return the URDF of the arm, whose tip is the link `tip`.
 
-    `lengths` and `masses` are those of the links [m] and at their ends [kg], `effort` the torque
-    limits of the joints [N m], 0 for none.  Point masses have a tiny inertia: most parsers reject
-    zero.
+    `lengths` and `masses` are those of the links [m] and at their ends [kg].  Point masses have a
+    tiny inertia: most parsers reject zero.
     """
-    text = f'<robot name={quoteattr(name)}>\n  <link name="base_link" />\n'
+    text = '<robot name="two_link">\n  <link name="base_link" />\n'
     parent, x = 'base_link', 0.0
-    for joint, link, length, mass, most in zip(
-        joints, ('link1', 'link2'), lengths, masses, effort, strict=True
-    ):
-        limit = f'<limit effort="{most:g}" velocity="1000" />' if most > 0.0 else ''
+    for k, (joint, length, mass) in enumerate(zip(joints, lengths, masses, strict=True), 1):
+        link = f'link{k}'
         text += f"""\
   <joint name={quoteattr(joint)} type="continuous">
     <parent link="{parent}" />
     <child link="{link}" />
     <origin xyz="{x:.17g} 0 0" />
     <axis xyz="0 -1 0" />
-    {limit}
   </joint>
   <link name="{link}">
     <inertial>

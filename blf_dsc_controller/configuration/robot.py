@@ -12,9 +12,8 @@ from typing import Any, Literal
 import numpy as np
 
 from blf_dsc_controller.arms.base_parameters import PAYLOAD_SIZE, BaseParameters, base_parameters
-from blf_dsc_controller.arms.inertia import inertia_of
 from blf_dsc_controller.arms.serial_chain import serial_chain
-from blf_dsc_controller.arms.urdf import Chain, read_chain
+from blf_dsc_controller.arms.urdf import Chain, inertia_of, read_chain
 from blf_dsc_controller.configuration.files import read_text, resolve
 from blf_dsc_controller.configuration.schema import (
     PerJoint,

@@ -27,9 +27,8 @@ from blf_dsc_controller.arms.base_parameters import (
     deviations,
     payload_inertia,
 )
-from blf_dsc_controller.arms.inertia import inertia_of, pseudo_inertia
 from blf_dsc_controller.arms.serial_chain import ROTOR
-from blf_dsc_controller.arms.urdf import Chain
+from blf_dsc_controller.arms.urdf import Chain, inertia_of, pseudo_inertia
 from blf_dsc_controller.configuration.robot import Robot
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.identification.recording import COUPLING, LOAD

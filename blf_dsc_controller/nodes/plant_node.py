@@ -77,7 +77,7 @@ class PlantNode(LoopNode[PlantConfig]):
         published = self.config.sensor.published_joints
         self._telemetry = PlantTelemetry(joints, parameter_names_of(self.config), published)
         self._decoder = Float64MultiArrayDecoder(len(joints))
-        self.input = TorqueInput(joints)
+        self.input = TorqueInput(len(joints))
         self._reported_rejected = 0
         self._diagnostics = DiagnosticsPublisher(self, joints)
         self._step_timer: Timer | None = None
@@ -140,7 +140,7 @@ class PlantNode(LoopNode[PlantConfig]):
         self.plant.reset()
         self._halt = ''
         self._apply_changes()
-        self.input.restart()
+        self.input.torque[:] = 0.0
         self._peers = self._wait_for_peers(reset=True)
         return 'the arm is at its start, braked until the first torque arrives'
 

@@ -360,7 +360,7 @@ def arm_of(config: ControllerConfig, plant: Mapping[str, Any]) -> ShownArm:
     if config.model == 'urdf':
         return ShownArm(robot.text, robot.chain(config.joints))
     lengths = [plant.get(name, config.arm.l1) for name in ('arm.l1', 'arm.l2')]
-    text = urdf('arm', config.joints, lengths, (1.0, 1.0), (0.0, 0.0))
+    text = urdf(config.joints, lengths, (1.0, 1.0))
     return ShownArm(text, read_chain(text, '', 'tip', config.joints))
 
 
