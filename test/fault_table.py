@@ -75,11 +75,7 @@ def run(fault: Fault, rig: Rig | None = None) -> Outcome:
 
 def every(change) -> Callable[[Rig], None]:
     """Apply `change` to every state from now on."""
-
-    def inject(rig):
-        rig.sense = change
-
-    return inject
+    return lambda rig: setattr(rig, 'sense', change)
 
 
 def once(change) -> Callable[[Rig], None]:
@@ -116,7 +112,7 @@ def named(*names: str, fields=('position', 'velocity', 'effort')) -> JointStateE
     return JointStateEncoder(names, fields)
 
 
-def arranged(names, values):
+def arranged(names, values=lambda *both: both):
     """Send the joints by these `names`, with `values` made of those of the two joints."""
 
     def change(state):
@@ -124,10 +120,6 @@ def arranged(names, values):
         return [state.raw(named(*names), q=q, dq=dq, effort=effort)]
 
     return change
-
-
-def renamed(*names: str):
-    return lambda state: [state.raw(named(*names))]
 
 
 def unmeasured(*fields: str):
@@ -321,12 +313,15 @@ FAULTS = (
     Fault('position of joint2 is 1e300 rad', spoil('q', 1, 1e300), R.OUTSIDE_BOUND),
     Fault('velocity of joint1 is 60 rad/s', spoil('dq', 0, 60.0), R.VELOCITY),
     Fault('joints in another order', every(arranged(JOINTS[::-1], lambda a, b: (b, a)))),
-    Fault('extra joints, one of them NaN', every(arranged(AMONG, lambda a, b: (NAN, b, 7.0, a)))),
+    Fault(
+        'extra joints, one of them NaN',
+        every(arranged(AMONG, lambda a, b: (NAN, b, 7.0, a))),
+    ),
     Fault('duplicate joint', once(arranged(TWICE, lambda a, b: (a, b, a))), R.JOINT_DUPLICATED),
-    Fault('missing joint', once(renamed('joint1', 'joint3')), R.JOINT_MISSING),
+    Fault('missing joint', once(arranged(('joint1', 'joint3'))), R.JOINT_MISSING),
     Fault('no joints', once(arranged((), lambda *_: ())), R.JOINT_MISSING),
     Fault('states of another robot in between', every(lambda s: [s.raw(OTHERS), s.raw()])),
-    Fault('only states of another robot', every(renamed('a', 'b')), R.STATE_TIMEOUT, 60, live=True),
+    Fault('only states of another robot', every(arranged('ab')), R.STATE_TIMEOUT, 60, live=True),
     Fault('no positions', once(unmeasured('position')), R.FIELD_MISSING),
     Fault('no velocities', once(unmeasured('velocity')), R.NOT_FINITE),
     Fault(
@@ -350,6 +345,7 @@ FAULTS = (
     Fault('stamp before 1970', once(lambda s: [s.raw(stamp=-1)]), R.STAMP_MISSING),
     Fault('burst of twenty old states', delayed, R.STAMP_BACKWARD),
     Fault('10 ms of silence, then all delayed states at once', silence(10, queued=True)),
+    Fault('30 ms of silence', silence(30), live=True),
     Fault('50 ms of silence', silence(50), R.STATE_TIMEOUT, 50, live=True),
     Fault('50 ms of silence, watchdog off', silence(50), R.STAMP_JUMP, 50),
     Fault('joint states stop for good', every(lambda _: []), R.STATE_TIMEOUT, 60, live=True),

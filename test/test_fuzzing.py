@@ -140,19 +140,6 @@ def base():
 
 
 @functools.cache
-def entries():
-    """Return its messages."""
-    return recorded_run.messages(base())
-
-
-@functools.cache
-def pieces():
-    """Return the records of its file."""
-    (file,) = base().glob('*.mcap')
-    return [raw for _, raw in raw_records(file.read_bytes())]
-
-
-@functools.cache
 def secret():
     """Create a file that no bag may lead to; return its folder."""
     folder = _folder / ASIDE
@@ -203,21 +190,44 @@ WORDS = st.one_of(
 )
 
 
+def disordered(data, items, change):
+    """Return the items with some changed, removed or repeated elsewhere."""
+    items = list(items)
+    for _ in range(data.draw(st.integers(1, 4))):
+        at = data.draw(st.integers(0, len(items) - 1))
+        action = data.draw(st.sampled_from(('change', 'change', 'remove', 'repeat')))
+        if action == 'change':
+            items[at] = change(items[at])
+        elif action == 'repeat':
+            items.insert(data.draw(st.integers(0, len(items))), items[at])
+        elif len(items) > 1:
+            del items[at]
+    return items
+
+
 def damaged(data, text):
     """Return YAML with other values; lines repeated, removed or extended."""
-    lines = text.splitlines()
-    for _ in range(data.draw(st.integers(1, 4))):
-        at = data.draw(st.integers(0, len(lines) - 1))
-        action = data.draw(st.sampled_from(('value', 'value', 'remove', 'move', 'text')))
-        if action == 'value' and ':' in lines[at]:
-            lines[at] = f'{lines[at].partition(":")[0]}: {data.draw(WORDS)}'
-        elif action == 'remove' and len(lines) > 1:
-            del lines[at]
-        elif action == 'move':
-            lines.insert(data.draw(st.integers(0, len(lines))), lines[at])
-        else:
-            lines[at] += data.draw(WORDS)
-    return '\n'.join(lines).encode('utf-8', 'surrogatepass')
+
+    def change(line):
+        begin = data.draw(st.sampled_from((line, f'{line.partition(":")[0]}: ')))
+        return begin + data.draw(WORDS)
+
+    return '\n'.join(disordered(data, text.splitlines(), change)).encode('utf-8', 'surrogatepass')
+
+
+NUMBERS = st.sampled_from((0, 1, 3, 2**31 - 1, 2**32 - 1, 0x7FF00000, 2**63, 2**64 - 1))
+
+
+def corrupted(data, raw):
+    """Return bytes with one changed, a number changed, some added, or the rest missing or other."""
+    place = data.draw(st.integers(0, len(raw)))
+    kept = data.draw(st.sampled_from((0, 1, 4, 8)))  # after what is replaced
+    if kept > 1:
+        place -= place % kept
+    number = (data.draw(NUMBERS) % 2 ** (8 * kept)).to_bytes(kept, 'little')
+    new = data.draw(st.one_of(st.just(number), st.binary(max_size=12)))
+    end = raw[place + kept :] if data.draw(st.integers(0, 3)) else b''
+    return raw[:place] + new + end
 
 
 @fuzzed
@@ -232,31 +242,21 @@ def test_metadata_is_survived(data, way):
             read(bag, way)
 
 
-NUMBERS = st.one_of(st.integers(0, 3), st.integers(0, 2**64 - 1), st.just(2**63))
-
-
 @fuzzed
 @given(data=st.data(), way=WAYS)
 def test_records_are_survived(data, way):
-    """MCAP files: records changed, removed or repeated; bytes flipped; files truncated."""
-    found = list(pieces())
-    for _ in range(data.draw(st.integers(0, 3))):
-        at = data.draw(st.integers(0, len(found) - 1))
-        action = data.draw(st.sampled_from(('remove', 'move', 'flip', 'length')))
-        if action == 'remove' and len(found) > 1:
-            del found[at]
-        elif action == 'move':
-            found.insert(data.draw(st.integers(0, len(found))), found[at])
-        elif action == 'flip' and found[at]:
-            raw = bytearray(found[at])
-            for place in data.draw(st.lists(st.integers(0, len(raw) - 1), max_size=4)):
-                raw[place] = data.draw(st.integers(0, 255))
-            found[at] = bytes(raw)
-        elif action == 'length':
-            length = data.draw(NUMBERS).to_bytes(8, 'little')
-            found[at] = found[at][:1] + length + found[at][9:]
+    """MCAP files: records changed, removed or repeated, their lengths, too; files truncated."""
+
+    def change(raw):
+        length = data.draw(st.none() | NUMBERS | st.integers(0, 2**64 - 1))
+        if length is None:
+            return corrupted(data, raw)
+        return raw[:1] + length.to_bytes(8, 'little') + raw[9:]
+
+    (file,) = base().glob('*.mcap')
+    found = [raw for _, raw in raw_records(file.read_bytes())]
     magic = b'\x89MCAP0\r\n'
-    content = magic + b''.join(found) + magic
+    content = magic + b''.join(disordered(data, found, change)) + magic
     if data.draw(st.integers(0, 9)) == 0:
         content = content[: data.draw(st.integers(0, len(content)))]
     with folder() as bag:
@@ -269,36 +269,21 @@ def test_records_are_survived(data, way):
 @fuzzed
 @given(data=st.data(), way=WAYS)
 def test_messages_are_survived(data, way):
-    """Serialised messages: bytes changed, added or removed, or another message's content."""
-    changed = [list(message) for message in entries()]
-    topics = sorted({message[0] for message in changed})
-    for _ in range(data.draw(st.integers(1, 3))):
-        topic = data.draw(st.sampled_from(topics))
-        numbers = [k for k, message in enumerate(changed) if message[0] == topic]
-        k = data.draw(st.sampled_from(numbers))
-        raw = bytearray(changed[k][3])
-        place = data.draw(st.integers(0, len(raw)))
-        action = data.draw(st.sampled_from(('flip', 'number', 'cut', 'add', 'other', 'random')))
-        if action == 'flip' and place < len(raw):
-            raw[place] = data.draw(st.integers(0, 255))
-        elif action == 'number':
-            place -= place % 4
-            number = data.draw(st.sampled_from((0, 1, 2**31 - 1, 2**32 - 1, 0x7FF00000)))
-            raw[place : place + 4] = number.to_bytes(4, 'little')
-        elif action == 'cut':
-            del raw[place:]
-        elif action == 'add':
-            raw[place:place] = data.draw(st.binary(max_size=12))
-        elif action == 'other':
-            raw = bytearray(data.draw(st.sampled_from(changed))[3])
-        else:
-            raw = bytearray(b'\0\1\0\0' + data.draw(st.binary(max_size=60)))
-        changed[k][3] = bytes(raw)
-        if data.draw(st.integers(0, 4)) == 0:
-            changed[k][2] = data.draw(st.integers(0, 2**63 - 1))
+    """Serialised messages, of each topic alike: bytes, times, or another message's content."""
+    messages = [list(message) for message in recorded_run.messages(base())]
+    topics = sorted({message[0] for message in messages})
+
+    def change(message):
+        at, other = data.draw(st.integers(0, 2**63 - 1)), data.draw(st.sampled_from(messages))[3]
+        raw = corrupted(data, data.draw(st.sampled_from((message[3], message[3], other))))
+        return [*message[:2], data.draw(st.sampled_from((message[2], at))), raw]
+
+    topic = data.draw(st.sampled_from(topics))
+    chosen = [message for message in messages if message[0] == topic]
+    others = [message for message in messages if message[0] != topic]
     with folder() as bag:
         bag.rmdir()
-        recorded_run.write(bag, changed)
+        recorded_run.write(bag, others + disordered(data, chosen, change))
         with bounded():
             read(bag, way)
 
