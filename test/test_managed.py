@@ -64,16 +64,11 @@ def test_loop_waits_for_a_recorder_and_not_for_any_listener(ros):
     ros.until(lambda: arm.plant.sample > 0)
 
 
-def test_impossible_transition_is_rejected_and_the_loop_goes_on(ros):
+def test_transitions_pause_and_restart_the_loop_and_impossible_ones_are_rejected(ros):
     arm, law = ros.loop()
     assert not activate(ros, law)
     assert not configure(ros, arm)
     assert not cleanup(ros, law)
-    assert_runs(ros, arm, law)
-
-
-def test_pausing_the_plant_pauses_time(ros):
-    arm, law = ros.loop()
     ros.run(arm, 50)
     assert deactivate(ros, arm)
     sample = arm.plant.sample
@@ -81,11 +76,6 @@ def test_pausing_the_plant_pauses_time(ros):
     assert arm.plant.sample == sample
     assert activate(ros, arm)
     assert_runs(ros, arm, law)
-
-
-def test_loop_runs_again_after_cleanup_and_configuration(ros):
-    arm, law = ros.loop()
-    ros.run(arm, 30)
     for node in (law, arm):
         assert deactivate(ros, node)
         assert cleanup(ros, node)

@@ -46,7 +46,11 @@ def run(options: Namespace) -> int:
     with announced_compilation(print_notice):
         config = _configuration(options)
     if options.view:
-        _check_view(options)
+        if options.offline:
+            raise BlfDscError('--view shows a run over ROS: leave out --offline')
+        from blf_dsc_controller.view.page import require_viser  # slow, as below
+
+        require_viser()
     out = make_folder(options.out)
     clock = 'plant' if config.plant.mode == 'lockstep' else 'wall'
     recorder = {'output': str(out / 'bag'), 'clock': clock}
@@ -104,15 +108,6 @@ def _configuration(options: Namespace) -> LoopConfig:
     if controller.model == 'urdf':
         print(f'errors to expect: {expectation(controller)}')
     return config
-
-
-def _check_view(options: Namespace) -> None:
-    """Raise BlfDscError if there can be no page."""
-    if options.offline:
-        raise BlfDscError('--view shows a run over ROS: leave out --offline')
-    from blf_dsc_controller.view.page import require_viser
-
-    require_viser()
 
 
 def _report(out: Path) -> bool:

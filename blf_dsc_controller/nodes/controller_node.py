@@ -33,14 +33,6 @@ from blf_dsc_controller.supervision.gains import (
 )
 from blf_dsc_controller.supervision.guard import Guard
 
-OUTPUTS = (
-    topics.COMMANDS,
-    topics.REFERENCE,
-    topics.TRACKING_ERROR,
-    topics.BOUND,
-    topics.MONITOR,
-)
-
 _RARELY = 10  # samples between looks at what rarely changes
 _RATE_SAMPLES = 1001  # samples before the rate is checked
 _FAST = 0.9  # fraction of the sample time
@@ -95,7 +87,9 @@ class ControllerNode(LoopNode[ControllerConfig]):
         self._load = reference_load(self.config, self.guard.controller.settings)
         for warning in config_warnings(self.config, load=self._load):
             self.get_logger().warning(warning)
-        outputs = OUTPUTS if self.config.telemetry.enabled else OUTPUTS[:1]
+        outputs = [topics.COMMANDS]
+        if self.config.telemetry.enabled:
+            outputs += [topics.REFERENCE, topics.TRACKING_ERROR, topics.BOUND, topics.MONITOR]
         if self.connect(outputs, topics.JOINT_STATES, self._on_joint_state):
             self._status.trajectories = TrajectoryInput(
                 self, len(self.config.joints), lambda: self.guard

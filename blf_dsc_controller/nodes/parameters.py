@@ -152,11 +152,10 @@ def wait_for_description(node: Node, name: str) -> str:
         found, message = wait_for_message(String, node, topic, qos_profile=quality, time_to_wait=1)
         if process.interrupted():
             raise SystemExit(0)
-        if found and not message.data.strip():
-            problem = f'the URDF on {topic} is empty: did xacro fail?'
-            raise ConfigurationError([f'robot.urdf: {problem}'])
         if found:
-            return str(message.data)
+            if message.data.strip():
+                return str(message.data)
+            raise ConfigurationError([f'robot.urdf: the one on {topic} is empty: did xacro fail?'])
         node.get_logger().info(f'waiting for the URDF on {topic}', throttle_duration_sec=5.0)
     count = node.count_publishers(topic)
     problem = f'no URDF within {TIMEOUT} s on {topic}, which has {count} publishers'

@@ -15,7 +15,7 @@ import signal
 import sys
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 from pathlib import Path
 from typing import Any
 
@@ -78,37 +78,33 @@ def run(*make_nodes: Callable[[], PlainNode]) -> int:
     Returns the exit code: 0 at the end or on SIGINT and SIGTERM, 1 after an error, which is printed
     to stderr.
     """
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda number, _: _signals.append(number))
     nodes: list[PlainNode] = []
     problem = ''
-    try:
-        refuse_unknown(sys.argv)
-        rclpy.init(args=sys.argv, signal_handler_options=rclpy.SignalHandlerOptions.NO)
-        with EventsExecutor() as executor:
-            for make in make_nodes:
-                nodes.append(make())
-                executor.add_node(nodes[-1])
-            # What is loaded by now stays: scanning it again would stall the loop for 0.1 s.
-            gc.collect()
-            gc.freeze()
-            while not _is_over(nodes):
-                spin_once(executor, *nodes)
-        for failure in filter(None, (node.failure for node in nodes)):
-            raise failure
-    except UnknownROSArgsError as error:
-        problem = f'unknown arguments after --ros-args: {error}'
-    except (BlfDscError, RCLError, OSError) as error:
-        problem = str(error)
-    finally:
+    with ExitStack() as ending:
+        for number in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(number, lambda number, _: _signals.append(number))
+            # ros2 launch forwards the terminal's signal: the second copy arrives at the end.
+            ending.callback(signal.signal, number, signal.SIG_IGN)
         try:
-            for node in reversed(nodes):
-                _close(node)
-        finally:
-            rclpy.try_shutdown()
-            # ros2 launch forwards the terminal's signal: the second copy arrives now.
-            for number in (signal.SIGINT, signal.SIGTERM):
-                signal.signal(number, signal.SIG_IGN)
+            refuse_unknown(sys.argv)
+            rclpy.init(args=sys.argv, signal_handler_options=rclpy.SignalHandlerOptions.NO)
+            ending.callback(rclpy.try_shutdown)
+            with EventsExecutor() as executor:
+                for make in make_nodes:
+                    nodes.append(make())
+                    ending.callback(_close, nodes[-1])
+                    executor.add_node(nodes[-1])
+                # What is loaded by now stays: scanning it again would stall the loop for 0.1 s.
+                gc.collect()
+                gc.freeze()
+                while not _is_over(nodes):
+                    spin_once(executor, *nodes)
+            for failure in filter(None, (node.failure for node in nodes)):
+                raise failure
+        except UnknownROSArgsError as error:
+            problem = f'unknown arguments after --ros-args: {error}'
+        except (BlfDscError, RCLError, OSError) as error:
+            problem = str(error)
     if problem:  # last, so that it ends the output
         print(problem, file=sys.stderr)  # noqa: T201
         return 1
@@ -162,8 +158,6 @@ def request_realtime(realtime: Realtime, logger: RcutilsLogger) -> None:
                 f'SCHED_FIFO priority {realtime.priority} refused ({error.strerror}): running with '
                 'the default scheduling; allow it with a limit on rtprio for this user'
             )
-        else:
-            logger.info(f'running with SCHED_FIFO priority {realtime.priority}')
     if realtime.lock_memory:
         libc = ctypes.CDLL(None, use_errno=True)
         if libc.mlockall(_MCL_CURRENT | _MCL_FUTURE) != 0:
@@ -172,8 +166,6 @@ def request_realtime(realtime: Realtime, logger: RcutilsLogger) -> None:
                 f'locking memory refused ({reason}): pages may be swapped out; allow it with a '
                 'limit on memlock for this user'
             )
-        else:
-            logger.info('memory locked')
 
 
 def _schedule(priority: int) -> None:

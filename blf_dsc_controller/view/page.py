@@ -51,6 +51,7 @@ _PEAK = 30  # snapshots, a second, of which the largest error is plotted
 _LEAST, _MOST = 0.1, 300.0  # % of the bound, the ends of its axis
 _HEIGHT = 130  # px of a plot: three fit below the state at 900 px
 _VIEW = np.array((0.42, -0.88, 0.22))  # direction from the arm to the camera
+_LINE = {'width': 1.5, 'points': {'show': False}}
 _AUTO: Mapping[str, Any] = {}
 _FROM_ZERO = {'range': {'min': {'hard': 0.0, 'soft': 0.0, 'mode': 1}, 'max': {'pad': 0.1}}}
 _SETTLED = 2.0  # s
@@ -168,14 +169,13 @@ class Page:
     def _plot(
         self, title: str, names: Sequence[str], y: Mapping[str, Any] = _AUTO, limit: str = ''
     ) -> Any:
-        def line(label: str, stroke: str, width: float = 1.5, **style: Any) -> Any:
-            points = {'show': False}
-            return {'label': label, 'stroke': stroke, 'width': width, 'points': points, **style}
-
-        lines = [line(name, COLOURS[k % len(COLOURS)]) for k, name in enumerate(names)]
+        lines: list[dict[str, Any]] = [
+            {'label': name, 'stroke': COLOURS[k % len(COLOURS)]} for k, name in enumerate(names)
+        ]
         if limit:
-            lines.append(line(limit, ALARM, dash=[6, 4]))
-        lines = [{'label': 's'}, *lines, line('event', INK, 1.0, scale='marks')]
+            lines.append({'label': limit, 'stroke': ALARM, 'dash': [6, 4]})
+        lines.append({'label': 'event', 'stroke': INK, 'width': 1.0, 'scale': 'marks'})
+        lines = [{'label': 's'}, *({**_LINE, **line} for line in lines)]
         scales: Any = {'x': {'time': False}, 'y': y, 'marks': {'range': (0.0, 1.0)}}
         return self.server.gui.add_uplot(
             (np.zeros(1),) * len(lines),
