@@ -4,9 +4,8 @@
 from __future__ import annotations
 
 import csv
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -60,19 +59,14 @@ def read_run(path: str | Path, namespace: str = '', names: NameMap = NO_NAMES) -
             robots, or the states of several runs.
         UnreadableMessageError: a message in it cannot be decoded.
     """
-    run = recorded_run(read_content(Path(path), namespace, names))
-    loaded: dict[str, Any] = {}
-    for field in fields(Run):
-        value = getattr(run, field.name)
-        if isinstance(value, Values):
-            loaded[field.name] = np.asarray(value)
-        elif isinstance(value, Series):
-            loaded[field.name] = replace(value, values=np.asarray(value.values))
-    return replace(run, **loaded)
+    return recorded_run(read_content(Path(path), namespace, names), np.asarray)
 
 
-def recorded_run(content: Content) -> Run:
-    """Return the run of a bag, whose `Values` are read when needed; errors as for `read_run`."""
+def recorded_run(content: Content, loaded: Callable[[Values], Any] = lambda values: values) -> Run:
+    """Return the run of a bag; errors as for `read_run`.
+
+    Its `Values` are read when needed, unless `loaded` reads them into memory.
+    """
     joints = _joints(content)
     states, notes, span = single_run(content, content.names.joints_of(joints))
     if content.unknown_parameters:
@@ -92,7 +86,7 @@ def recorded_run(content: Content) -> Run:
 
     def series(topic: topics.Topic) -> Series | None:
         found = within(topic)
-        return None if found is None else Series(found.names, found.stamp, found.field(0))
+        return None if found is None else Series(found.names, found.stamp, loaded(found.field(0)))
 
     errors, references, bounds = (
         within(topic, joints) for topic in (topics.TRACKING_ERROR, topics.REFERENCE, topics.BOUND)
@@ -109,12 +103,13 @@ def recorded_run(content: Content) -> Run:
         'bounds': bounds and bounds.held(stamp),
     }
     arrays: dict[str, Any] = {
-        name: Values(messages[source], k) if messages[source] else None
+        name: messages[source] and Values(messages[source], k)
         for name, (_, source, k) in _ARRAYS.items()
     }
     if errors:  # its messages are not decimated: the reference is known at every sample
         known = messages['references'] or states.select(np.full(states.size, -1))
         arrays['reference'] = Values(known, 0, (states.field(0), messages['errors'].field(0)))
+    arrays = {name: values and loaded(values) for name, values in arrays.items()}
     events = [event for at, event in content.events if span[0] <= at < span[1]]
     return Run(
         **arrays,

@@ -75,7 +75,7 @@ class Rerun:
         self._gap = _first_gap(answers)
         self._answer = 0  # number of answers reached
         self._position = -1  # of the last message processed or passed over
-        self._last = -1  # stamp of the last answer
+        self._answered_at = -1  # stamp of the last answer
 
     def run(self, events: Sequence[Event]) -> None:
         """Process the joint states with the events after the configuration, in order."""
@@ -117,12 +117,12 @@ class Rerun:
         self._answer += 1
         commands = self._guard.journal.commands
         self._process(k)
-        while stamp == self._last and self._guard.journal.commands == commands:
+        while stamp == self._answered_at and self._guard.journal.commands == commands:
             k = self._find(stamp)  # a repeated stamp is skipped at first
             if k < 0:
                 break
             self._process(k)
-        self._last = stamp
+        self._answered_at = stamp
         if self._guard.journal.commands == commands and not self._is_over:
             self._depart(f'used by the law ({self._guard.supervisor.text})', stamp)
         return True
@@ -132,7 +132,7 @@ class Rerun:
 
         Unreadable ones have the stamp -1; after the last message, one with its stamp may be one.
         """
-        wanted = (stamp, -1) if stamp == self._last else (stamp,)
+        wanted = (stamp, -1) if stamp == self._answered_at else (stamp,)
         for k in range(self._position + 1, self._stamp.size):
             if self._stamp[k] in wanted:
                 return k
