@@ -130,9 +130,11 @@ def test_topics_of_every_quality_and_type_are_recorded_as_offered(ros, bag):
     assert hashes == [bound.digest, goals.digest]
     assert bound.digest == definition(bound.msgtype)[1]
     assert 'geometry_msgs/Quaternion' in goals.msgdef.data
-    (offered,) = bound.ext.offered_qos_profiles
-    assert offered.durability.name == 'TRANSIENT_LOCAL'
+    (offered,), mixed = bound.ext.offered_qos_profiles, found['/mixed'].ext.offered_qos_profiles
     # The graph knows neither history nor depth.
+    assert (offered.durability.name, offered.history.name) == ('TRANSIENT_LOCAL', 'UNKNOWN')
+    assert {quality.reliability.name for quality in mixed} == {'RELIABLE', 'BEST_EFFORT'}
+    assert bound.msgdef == found['/sensor'].msgdef
     assert quality_of(infos[0].qos_profile) == Quality(
         depth=0, durability='transient_local', history='unknown', deadline=FOREVER
     )
