@@ -18,20 +18,21 @@ import numpy as np
 
 from blf_dsc_controller.arms.base_parameters import BaseParameters
 from blf_dsc_controller.arms.urdf import Chain, pseudo_inertia, rotational_inertia
-from blf_dsc_controller.compiled import cholesky
-from blf_dsc_controller.compiled.elementary import cos, sin
-from blf_dsc_controller.compiled.jit import called, inner
-from blf_dsc_controller.compiled.layout import Array, pack, size_of, view_of
-from blf_dsc_controller.compiled.vectors import (
+from blf_dsc_controller.compiled.algebra import (
     Vector,
+    cholesky_factor,
+    cholesky_solve,
     cross,
     dot,
     plus,
-    product,
     put,
     times,
+    transform,
     vector,
 )
+from blf_dsc_controller.compiled.elementary import cos, sin
+from blf_dsc_controller.compiled.jit import called, inner
+from blf_dsc_controller.compiled.layout import Array, pack, size_of, view_of
 
 
 class RigidBodies(NamedTuple):
@@ -117,11 +118,11 @@ def locate(arm: RigidBodies, q: np.ndarray, dq: np.ndarray, now: BodyMotion) -> 
     for i in range(arm.n):
         before, R = now.rotation[i], now.rotation[i + 1]
         for c in range(3):
-            column = product(before, vector(arm.rotation[i, :, c]))
+            column = transform(before, vector(arm.rotation[i, :, c]))
             for r in range(3):
                 R[r, c] = column[r]
-        axis = product(R, vector(arm.axis[i]))
-        lever = product(before, vector(arm.offset[i]))
+        axis = transform(R, vector(arm.axis[i]))
+        lever = transform(before, vector(arm.offset[i]))
         slides, turns = arm.prismatic[i], 1.0 - arm.prismatic[i]
         turn(R, axis, turns * q[i])
         lever = plus(lever, times(slides * q[i], axis))
@@ -156,18 +157,18 @@ def combine_bodies(arm: RigidBodies, now: BodyMotion, payload: float) -> None:
     for i in range(n, 0, -1):
         R = now.rotation[i]
         m = arm.mass[i - 1]
-        h = product(R, vector(arm.moment[i - 1]))
+        h = transform(R, vector(arm.moment[i - 1]))
         I = now.inertia[i]
         rotate(R, arm.inertia[i - 1], I)
         if i == n:
-            lever = product(R, vector(arm.tip))
+            lever = transform(R, vector(arm.tip))
             h = plus(h, times(payload, lever))
             m += payload
             add_point(payload, lever, I)
         w, dw = vector(now.turning[i]), vector(now.turning_rate[i])
         a = plus(vector(now.bias[i]), times(-1.0, vector(arm.gravity)))
         F = plus(F, plus(times(m, a), plus(cross(dw, h), cross(w, cross(w, h)))))
-        N = plus(N, plus(cross(h, a), plus(product(I, dw), cross(w, product(I, w)))))
+        N = plus(N, plus(cross(h, a), plus(transform(I, dw), cross(w, transform(I, w)))))
         put(F, now.force[i])
         put(N, now.torque[i])
         if i < n:
@@ -219,7 +220,7 @@ def fill_inertia(arm: RigidBodies, now: BodyMotion) -> None:
         if arm.prismatic[j] == 1.0:
             F, N = times(now.mass[j + 1], axis), cross(h, axis)
         else:
-            F, N = cross(axis, h), product(now.inertia[j + 1], axis)
+            F, N = cross(axis, h), transform(now.inertia[j + 1], axis)
         for i in range(j, -1, -1):
             now.M[i, j] = now.M[j, i] = along_joint(arm, now, i, F, N)
             lever = plus(vector(now.origin[i + 1]), times(-1.0, vector(now.origin[i])))
@@ -240,7 +241,7 @@ def fill_tip(bodies: Array, memory: Array, q: Array, position: Array, jacobian: 
     arm = bodies_of(bodies)
     now = motion_of(memory, arm)
     locate(arm, q, arm.rest, now)
-    lever = product(now.rotation[arm.n], vector(arm.tip))
+    lever = transform(now.rotation[arm.n], vector(arm.tip))
     end = plus(vector(now.origin[arm.n]), lever)
     put(end, position)
     for j in range(arm.n):
@@ -279,8 +280,8 @@ def accelerate(
     for i in range(arm.n):
         for j in range(i + 1):
             now.factor[j, i] = now.M[i, j]
-    cholesky.factor(now.factor)
-    cholesky.solve(now.factor, ddq)
+    cholesky_factor(now.factor)
+    cholesky_solve(now.factor, ddq)
 
 
 class RigidArm(NamedTuple):

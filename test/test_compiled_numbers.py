@@ -15,9 +15,9 @@ import pytest
 from command import OLDER, finished
 
 from blf_dsc_controller.compiled import elementary
+from blf_dsc_controller.compiled.algebra import independent_columns, inverse, product
 from blf_dsc_controller.compiled.jit import kernel
 from blf_dsc_controller.compiled.layout import pack
-from blf_dsc_controller.compiled.matrices import independent_columns, inverse, product
 from blf_dsc_controller.configuration.nodes import load_loop
 from blf_dsc_controller.configuration.schema import flatten
 from blf_dsc_controller.reference.terms import cubics, minimum_jerk

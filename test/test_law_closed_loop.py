@@ -12,7 +12,7 @@ from plain_law import PlainLaw, R, dynamics, regressor
 from plants import QUIET, START
 from scipy.integrate import solve_ivp
 
-from blf_dsc_controller.compiled import cholesky
+from blf_dsc_controller.compiled.algebra import cholesky_factor
 from blf_dsc_controller.law.factory import controller_of
 from blf_dsc_controller.law.state import CHOICES
 
@@ -118,7 +118,7 @@ def sampled(dt, settings):
     law.state.latched[0] = 1.0
     law.state.Phi[:], law.state.b[:] = PHI, PHI @ P
     law.state.factor[:] = PHI + RHO * np.eye(3)
-    cholesky.factor(law.state.factor)
+    cholesky_factor(law.state.factor)
     stride = round(END / dt / (TIMES.size - 1))
     found, estimate = [], law.state.estimate.copy()
     for sample in closed_loop(law, arm, END + dt):

@@ -11,7 +11,7 @@ from paper_case import EXACT, P, configured, run
 from plain_law import R, dynamics, regressor
 from plants import QUIET, START
 
-from blf_dsc_controller.compiled import cholesky
+from blf_dsc_controller.compiled.algebra import cholesky_factor
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.errors import StartError
 from blf_dsc_controller.law import adaptation, barrier
@@ -237,7 +237,7 @@ def test_erratum_2_both_integrals_carry_the_same_factor():
     def rest_point(Phi):
         law.state.Phi[:] = Phi
         law.state.factor[:] = law.state.Phi + settings.rho * np.eye(settings.m)
-        cholesky.factor(law.state.factor)
+        cholesky_factor(law.state.factor)
         law.signals.xi2[:] = 0.0
         for _ in range(2000):
             adaptation.adapt(settings, law.state, law.signals, 1e-3, False)  # noqa: FBT003

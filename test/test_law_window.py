@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from paper_case import NO_DISTURBANCE, configured, run
 
-from blf_dsc_controller.compiled import cholesky
+from blf_dsc_controller.compiled.algebra import cholesky_factor, cholesky_solve
 from blf_dsc_controller.law import excitation, prediction, window
 from blf_dsc_controller.law.factory import controller_of, estimate_names
 
@@ -117,8 +117,8 @@ def test_factor_matches_numpy_and_solves(m, rank, shift):
     shifted = rows.T @ rows + shift * np.eye(m)
     U, y = np.triu(shifted), x.copy()
 
-    assert cholesky.factor(U)
-    cholesky.solve(U, y)
+    assert cholesky_factor(U)
+    cholesky_solve(U, y)
 
     np.fill_diagonal(U, 1.0 / np.diag(U))  # kept inverted
     # Backward stable: the residual, and not the solution, is at the level of rounding.
@@ -131,11 +131,11 @@ def test_factor_shows_whether_a_matrix_is_positive_definite_and_stays_finite():
     for random in map(np.random.default_rng, range(20)):
         A = random.normal(size=(4, 4)) + np.diag(random.uniform(0.0, 3.0, 4))
         A = A + A.T
-        assert cholesky.factor(np.triu(A)) == (np.linalg.eigvalsh(A)[0] > 0.0)
+        assert cholesky_factor(np.triu(A)) == (np.linalg.eigvalsh(A)[0] > 0.0)
         # Rank one at 1e12 rounds at 1e-4, so the other two pivots of Phi + 1e-5 I are noise.
         row = 1e6 * random.normal(size=3)
         U = np.triu(np.outer(row, row) + 1e-5 * np.eye(3))
-        cholesky.factor(U)
+        cholesky_factor(U)
         assert np.all(np.isfinite(U))
 
 

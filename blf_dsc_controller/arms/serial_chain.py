@@ -22,11 +22,10 @@ from typing import Annotated, NamedTuple
 import numpy as np
 
 from blf_dsc_controller.arms.urdf import INERTIA_NAMES, INERTIA_UNITS, Chain
+from blf_dsc_controller.compiled.algebra import Vector, cross, dot, plus, product
 from blf_dsc_controller.compiled.elementary import cos, sin
 from blf_dsc_controller.compiled.jit import called, inner
 from blf_dsc_controller.compiled.layout import Array, pack, view_of
-from blf_dsc_controller.compiled.matrices import product
-from blf_dsc_controller.compiled.vectors import Vector, cross, dot, plus
 
 ROTOR = len(INERTIA_NAMES)
 """Entry of the rotor inertia, after the ten inertial parameters of a body."""

@@ -25,8 +25,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from blf_dsc_controller.compiled.algebra import product
 from blf_dsc_controller.compiled.elementary import cos, sin
-from blf_dsc_controller.compiled.matrices import product
 from blf_dsc_controller.errors import BlfDscError
 
 INERTIA_NAMES = ('m', 'm*cx', 'm*cy', 'm*cz', 'Ixx', 'Ixy', 'Iyy', 'Ixz', 'Iyz', 'Izz')

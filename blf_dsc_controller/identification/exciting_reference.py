@@ -19,11 +19,10 @@ import numpy as np
 from tqdm import tqdm
 
 from blf_dsc_controller.arms.geometry import Clearance
-from blf_dsc_controller.compiled.layout import pack as pack_settings
+from blf_dsc_controller.arms.model import regressors_at
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.robot import parameters_of
 from blf_dsc_controller.law.factory import prior_covariance, settings_of_config
-from blf_dsc_controller.law.prediction import rows_along
 from blf_dsc_controller.reference.approach import MotionError
 from blf_dsc_controller.reference.terms import pack, sampled, sinusoids_term
 
@@ -64,7 +63,6 @@ class ExcitationProblem:
         self, config: ControllerConfig, harmonics: int, radius: float = 0.07, floor: float = 0.0
     ) -> None:
         settings = self._settings = settings_of_config(config)
-        self._vector = pack_settings(settings)
         chain = config.robot.chain(config.joints)
         self._clearance = Clearance(chain, radius, floor)
         self._guess = np.tile(settings.initial_estimate, (2, 1))
@@ -115,8 +113,8 @@ class ExcitationProblem:
     def evaluate(self, parameters: dict[str, tuple[float, ...]]) -> Excitation:
         """Return the excitation by the reference with offset, amplitude, frequency and phase."""
         motion = sampled(pack(self.n, [sinusoids_term(**parameters)]), self._times)
-        rows = rows_along(self._settings, self._vector, self._times, motion)  # [H | D]
         q, dq, ddq = motion.transpose(1, 0, 2)
+        rows = self._rows(q, dq, ddq)
         torque = np.abs(rows @ self._guess.T).max(axis=2)
         ratios = np.abs(np.stack((q - self._middle, dq, ddq, torque), axis=1)) / self._limits
         room = self._clearance.room(q)
@@ -126,6 +124,16 @@ class ExcitationProblem:
         gain = np.log1p(np.maximum(mu, 0.0) / self._settings.prior_weight).sum()
         left = float(np.exp(-0.5 * gain / len(mu)))
         return Excitation(float(gain), left, ratios.max(axis=0), room.min(axis=0), float(excess))
+
+    def _rows(self, q: np.ndarray, dq: np.ndarray, ddq: np.ndarray) -> np.ndarray:
+        """Return [H(q, dq, dq, ddq) | D] (k, n, m) of a motion, as `law.prediction` describes D."""
+        given, ones, t = self._settings, np.ones_like(dq), self._times[:, np.newaxis]
+        columns = [ones] * given.bias + [dq] * given.viscous
+        columns += [np.tanh(dq / given.coulomb_velocity)] * given.coulomb
+        columns += [wave(w * t) * ones for w in given.frequencies for wave in (np.sin, np.cos)]
+        H = regressors_at(given.model, q, dq, dq, ddq)
+        D = [column[:, :, np.newaxis] * np.eye(self.n) for column in columns]
+        return np.concatenate((H, *D), axis=2)
 
     def _relative_excitation(self, dq: np.ndarray, rows: np.ndarray) -> np.ndarray:
         """Return L^T Phi L (m, m), R^-1 = L L^T; its eigenvalues are those of Phi relative to R."""

@@ -25,7 +25,7 @@ is never farther from a true P inside.
 
 from math import isfinite, sqrt
 
-from blf_dsc_controller.compiled import cholesky
+from blf_dsc_controller.compiled.algebra import cholesky_solve
 from blf_dsc_controller.compiled.jit import inner
 from blf_dsc_controller.compiled.layout import Array, part
 from blf_dsc_controller.law import friction, torque
@@ -103,7 +103,7 @@ def prediction_error(settings: Settings, state: State, signals: Signals) -> None
         for j in range(settings.m):
             signals.rate[i] -= state.Phi[i, j] * state.estimate[j]
     if settings.update == NEWTON:
-        cholesky.solve(state.factor, signals.rate)
+        cholesky_solve(state.factor, signals.rate)
     friction.follow_flips(settings, state, signals)
 
 

@@ -23,9 +23,7 @@ what it taught is taken back: it did not predict what it was not fitted to.  Lik
 with an unusually large residual is pulled to an earlier solution, kept once per window.
 """
 
-from math import sqrt
-
-from blf_dsc_controller.compiled import cholesky
+from blf_dsc_controller.compiled.algebra import cholesky_factor, cholesky_solve
 from blf_dsc_controller.compiled.jit import inner
 from blf_dsc_controller.compiled.layout import Array
 from blf_dsc_controller.law import adaptation, window
@@ -74,19 +72,13 @@ def detect_change(settings: Settings, state: State, signals: Signals, dt: float)
     if state.recent_residual[0] > _ALARM * explained(settings, state, state.residual[0]):
         state.changes[0] += 1.0
         state.contradiction[0] = state.recent_residual[0]
-        if state.rows[0] < settings.window:
-            take_back(settings, state, signals)
+        if state.rows[0] < settings.window:  # back to the estimate before the last change
+            for j in range(settings.m):
+                signals.work[j] = state.estimate[j]
+                state.estimate[j] = state.anchor[j]
+            if settings.bumpless == 1:
+                adaptation.hand_over(settings, state, signals)
         forget_window(settings, state)
-
-
-@inner
-def take_back(settings: Settings, state: State, signals: Signals) -> None:
-    """Return to the estimate before the last change, bumplessly."""
-    for j in range(settings.m):
-        signals.work[j] = state.estimate[j]
-        state.estimate[j] = state.anchor[j]
-    if settings.bumpless == 1:
-        adaptation.hand_over(settings, state, signals)
 
 
 @inner
@@ -104,7 +96,7 @@ def forget_window(settings: Settings, state: State) -> None:
     window.clear(state.filter2)
     for j in range(settings.m):
         state.anchor[j] = state.estimate[j]
-        state.min_eigenvector[j] = 1.0 / sqrt(settings.m)
+    window.reset_direction(state)
 
 
 @inner
@@ -135,7 +127,7 @@ def is_physical(settings: Settings, signals: Signals, theta: Array) -> bool:
             for j in range(settings.p):
                 parameter = theta[j] - _LEAST_INERTIA * settings.initial_estimate[j]
                 signals.inertia[k, i] += signals.momentum[i, j] * parameter
-    return cholesky.factor(signals.inertia)
+    return cholesky_factor(signals.inertia)
 
 
 @inner
@@ -157,7 +149,7 @@ def solve(settings: Settings, state: State, signals: Signals) -> None:
     )
     for j in range(settings.m):
         signals.work[j] = signals.b[j]
-    cholesky.solve(signals.factor, signals.work)
+    cholesky_solve(signals.factor, signals.work)
 
 
 @inner
@@ -205,7 +197,7 @@ def accept_window(settings: Settings, state: State, signals: Signals) -> bool:
     solution = signals.work
     for j in range(m):
         solution[j] = signals.b[j]
-    cholesky.solve(signals.factor, solution)
+    cholesky_solve(signals.factor, solution)
     residual = window_residual(state.running, solution) / state.rows[0]
     missing = 1.0 - state.rows[0] / settings.window
     is_first = state.latched[0] == 0.0

@@ -29,7 +29,7 @@ from blf_dsc_controller.arms.model import ArmModel, arm_model
 from blf_dsc_controller.arms.serial_chain import ROTOR
 from blf_dsc_controller.arms.tuning import over_postures
 from blf_dsc_controller.arms.urdf import inertia_of, moved, pseudo_inertia
-from blf_dsc_controller.compiled.matrices import inverse, product
+from blf_dsc_controller.compiled.algebra import inverse, product
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.robot import drive_model, parameters_of
 from blf_dsc_controller.configuration.schema import parameters

@@ -23,14 +23,11 @@ which hides the parameter error.
 
 from math import sqrt
 
-import numpy as np
-
-from blf_dsc_controller.arms.model import ArmModel
 from blf_dsc_controller.compiled.elementary import cos, exp, sin, tanh
-from blf_dsc_controller.compiled.jit import inner, kernel
-from blf_dsc_controller.compiled.layout import Array, sizes_of
+from blf_dsc_controller.compiled.jit import inner
+from blf_dsc_controller.compiled.layout import Array
 from blf_dsc_controller.law import barrier
-from blf_dsc_controller.law.state import FILTERED, Settings, Signals, State, settings_of
+from blf_dsc_controller.law.state import FILTERED, Settings, Signals, State
 
 
 @inner
@@ -145,35 +142,3 @@ def form_row(settings: Settings, state: State, signals: Signals, dt: float) -> N
     if state.samples[0] > 0.0:
         filter_row(settings, state, signals, dt)
     remember(settings, state, signals)
-
-
-def rows_along(settings: Settings, settings_vector: Array, times: Array, motion: Array) -> Array:
-    """Return the rows [H(q, dq, dq, ddq) | D] (k, n, m) along a motion, for packed settings.
-
-    `times` (k,) [s]; `motion` (k, 3, n): q, dq, ddq at each time.
-    """
-    H = np.zeros((settings.n, settings.p))
-    rows = np.zeros((times.size, settings.n, settings.m))
-    _fill_rows(settings.model, sizes_of(settings), settings_vector, times, motion, H, rows)
-    return rows
-
-
-@kernel
-def _fill_rows(
-    model: ArmModel,
-    sizes: np.dtype[np.void],
-    settings_vector: Array,
-    times: Array,
-    motion: Array,
-    H: Array,
-    rows: Array,
-) -> None:
-    settings = settings_of(settings_vector, sizes, model)
-    for k in range(times.size):
-        q = motion[k, 0]
-        dq = motion[k, 1]
-        model.regressor(q, dq, dq, motion[k, 2], H)
-        fill_columns(settings, times[k], dq, rows[k])
-        for i in range(settings.n):
-            for j in range(settings.p):
-                rows[k, i, j] = H[i, j]

@@ -21,7 +21,7 @@ from math import sqrt
 import numpy as np
 
 from blf_dsc_controller.arms.model import ArmModel
-from blf_dsc_controller.compiled import cholesky
+from blf_dsc_controller.compiled.algebra import cholesky_factor, cholesky_solve
 from blf_dsc_controller.compiled.jit import inner, kernel
 from blf_dsc_controller.compiled.layout import Array
 from blf_dsc_controller.law import window
@@ -48,7 +48,10 @@ def add_row(settings: Settings, state: State, signals: Signals, dt: float) -> No
     if settings.weighed == 0 or samples % interval != interval // 2:
         return
     period = interval * dt
-    weight_row(settings, signals)
+    for i in range(settings.n):  # those of slow joints count little
+        weight = abs(signals.dqr[i]) / sqrt(signals.dqr[i] ** 2 + _SLOW**2)
+        for j in range(settings.m + 1):
+            signals.row[i, j] *= weight
     is_new = samples <= interval or state.changes[0] != state.weighed_changes[0]
     if is_new or is_contradicted(settings, state, signals, period):
         state.weighed_changes[0] = state.changes[0]
@@ -59,7 +62,11 @@ def add_row(settings: Settings, state: State, signals: Signals, dt: float) -> No
         return
     part = BEFORE if is_first(settings, state) else NEWER
     window.add_products(signals.row, state.weighed_sums[part])
-    state.weighed_rows[part] += moving_share(settings, signals)
+    share = 0.0  # mean square weight of the joints' rows: 1 in motion, 0 at rest
+    for i in range(settings.n):
+        square = signals.dqr[i] ** 2
+        share += square / (square + settings.motion_scale**2 + 1e-12) / settings.n
+    state.weighed_rows[part] += share
     if part == NEWER and state.weighed_rows[NEWER] >= 0.5 * settings.window:
         window.add(state.weighed_sums[NEWER], 0.0, state.weighed_sums[NEWER], signals.since)
         window.add(signals.since, 0.0, signals.since, state.weighed_sums[OLDER])
@@ -73,15 +80,6 @@ def add_row(settings: Settings, state: State, signals: Signals, dt: float) -> No
 
 
 @inner
-def weight_row(settings: Settings, signals: Signals) -> None:
-    """Reduce the rows of slow joints."""
-    for i in range(settings.n):
-        weight = abs(signals.dqr[i]) / sqrt(signals.dqr[i] ** 2 + _SLOW**2)
-        for j in range(settings.m + 1):
-            signals.row[i, j] *= weight
-
-
-@inner
 def is_first(settings: Settings, state: State) -> bool:
     """Whether the first window is not complete."""
     return bool(state.weighed_rows[BEFORE] < settings.window)
@@ -91,16 +89,6 @@ def is_first(settings: Settings, state: State) -> bool:
 def rows_since(state: State) -> float:
     """Return the number of moving rows since the first window that count."""
     return float(state.weighed_rows[OLDER] + state.weighed_rows[NEWER])
-
-
-@inner
-def moving_share(settings: Settings, signals: Signals) -> float:
-    """Return the mean square weight of the joints' rows: 0 at rest, 1 in motion."""
-    share = 0.0
-    for i in range(settings.n):
-        square = signals.dqr[i] ** 2
-        share += square / (square + settings.motion_scale**2 + 1e-12) / settings.n
-    return share
 
 
 @inner
@@ -172,8 +160,8 @@ def solve(settings: Settings, state: State, signals: Signals, lasting: float) ->
     m, ND, x = settings.m, settings.load_columns, signals.load_solution
     window.add(state.weighed_sums[OLDER], 1.0, state.weighed_sums[NEWER], signals.since)
     fill_equations(settings, state, signals, row_variance(settings, state, lasting))
-    cholesky.factor(signals.load_normal)
-    cholesky.solve(signals.load_normal, x)
+    cholesky_factor(signals.load_normal)
+    cholesky_solve(signals.load_normal, x)
     theta, model = x[:m], state.weighed_model[:m]
     for i in range(m):
         model[i] = theta[i]

@@ -14,7 +14,7 @@ units comparable: Phi x = lambda R x.
 
 from math import sqrt
 
-from blf_dsc_controller.compiled import cholesky
+from blf_dsc_controller.compiled.algebra import cholesky_factor, cholesky_solve
 from blf_dsc_controller.compiled.jit import called, inner
 from blf_dsc_controller.compiled.layout import Array
 from blf_dsc_controller.law.state import Settings, Signals, State
@@ -142,7 +142,7 @@ def regularized_factor(
     for i in range(Phi.shape[0]):
         for j in range(i + 1):
             factor[j, i] = Phi[i, j] + rho * information[i, j]
-    cholesky.factor(factor)
+    cholesky_factor(factor)
 
 
 @inner
@@ -182,7 +182,7 @@ def min_eigenvector(
     for _ in range(iterations):
         for i in range(m):
             direction[i] = work[i]
-        cholesky.solve(factor, direction)
+        cholesky_solve(factor, direction)
         shrink = 1.0 / sqrt(weigh(information, direction, work))
         for i in range(m):
             direction[i] *= shrink

@@ -160,16 +160,13 @@ def blend(
         return worst_violation(attempt(duration), check_times(t0, t0 + duration), config)
 
     too_short, duration = 0.0, min(_SHORTEST, longest)
-    closest = None
     while (found := violation(duration)) is not None:
-        if closest is None or found.ratio < closest.ratio:
-            closest = found
         if duration >= longest:
             raise MotionError(
                 f'no motion of at most {longest:g} s from here to the reference stays '
-                f'within the limits of the arm: in the closest one, {closest}; start closer and '
-                f'at rest, or relax {closest.parameters} or approach.longest',
-                closest,
+                f'within the limits of the arm: in the longest one, {found}; start closer and '
+                f'at rest, or relax {found.parameters} or approach.longest',
+                found,
             )
         too_short, duration = duration, min(duration * _STEP, longest)
     for _ in range(_BISECTIONS):

@@ -29,10 +29,10 @@ from typing import NamedTuple
 
 import numpy as np
 
+from blf_dsc_controller.compiled.algebra import product
 from blf_dsc_controller.compiled.elementary import cos, sin
 from blf_dsc_controller.compiled.jit import inner, kernel
 from blf_dsc_controller.compiled.layout import Array, part, view
-from blf_dsc_controller.compiled.matrices import product
 
 SINUSOIDS = 0
 SPLINE = 1
