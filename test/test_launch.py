@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import runpy
 import sys
+from operator import itemgetter
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
 
@@ -36,25 +37,21 @@ NODES = {
 }
 
 
-def stand_in(**attributes):
-    return SimpleNamespace(**attributes)
-
-
 @pytest.fixture
 def launched(monkeypatch):
     """Return a function from launch arguments to what the launch file starts, in order."""
     stand_ins = {
         'launch': {'LaunchContext': dict, 'LaunchDescription': list},
         'launch.actions': {
-            'DeclareLaunchArgument': lambda name, **options: stand_in(name=name, **options),
-            'OpaqueFunction': stand_in,
-            'Shutdown': stand_in,
+            'DeclareLaunchArgument': lambda name, **options: SimpleNamespace(name=name, **options),
+            'OpaqueFunction': SimpleNamespace,
+            'Shutdown': SimpleNamespace,
         },
         'launch.substitutions': {
-            'LaunchConfiguration': lambda name: stand_in(perform=lambda context: context[name])
+            'LaunchConfiguration': lambda name: SimpleNamespace(perform=itemgetter(name))
         },
         'launch_ros': {},
-        'launch_ros.actions': {'Node': stand_in},
+        'launch_ros.actions': {'Node': SimpleNamespace},
     }
     for name, content in stand_ins.items():
         module = ModuleType(name)

@@ -139,7 +139,7 @@ def test_valid_changes_are_passed_on_once_each_as_a_whole_configuration(tuned):
         ({'learning__update': 'magic'}, 'learning.update: got "magic", but it must be one of'),
         ({'learning__radius': 0.1}, 'learning.radius: got 0.1 kg m^2, but learning.initial_est'),
         ({'learning__weight': -1.0}, 'learning.weight: got -1.0, but it must be at least 0'),
-        ({'learning__weight': float('inf')}, 'learning.weight: got inf, but a finite number'),
+        ({'learning__weight': float('inf')}, 'learning.weight: got .inf, but a finite number'),
         # ROS itself rejects this, by the descriptor of the parameter.
         ({'learning__weight': 1}, 'Wrong parameter type, expected'),
     ],

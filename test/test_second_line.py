@@ -105,42 +105,32 @@ def test_named_arm_of_a_dead_controller_comes_to_rest(preset, angle, armed):
     assert np.abs(q - start).max() < angle
 
 
-def test_controller_that_is_back_takes_over_at_once():
-    rig = Watched(HOLDING)
-    rig.step(100)
-    rig.dead = True
-    rig.step(200)
-    assert rig.line.active
-    rig.dead = False
-    count = len(rig.taken)
-    rig.step(100)
-    assert not rig.line.active
-    assert len(rig.taken) == count
-    rig.dead = True
-    rig.step(100)
-    assert rig.line.takeovers == 2
-
-
 def test_nothing_is_commanded_before_the_controller_or_while_states_stand_still():
     """Such as a plant in lock-step, which waits for a torque and repeats its state."""
     rig = Watched(HOLDING)
     state = rig.state()
     values = np.concatenate((state.q, state.dq, state.effort))
-    for k in range(500):
-        rig.line.state(state.stamp + k * MILLISECOND, values, k * 1e-3)
-        assert rig.line.poll(k * 1e-3) is None
-    rig.line.torque_of_controller(np.ones(2), 0.5)
-    for k in range(500, 1000):
-        rig.line.state(state.stamp + 499 * MILLISECOND, values, k * 1e-3)
+    for k in range(1000):
+        if k == 500:
+            rig.line.torque_of_controller(np.ones(2), 0.5)
+        rig.line.state(state.stamp + min(k, 499) * MILLISECOND, values, k * 1e-3)
         assert rig.line.poll(k * 1e-3) is None
     assert rig.line.leave() is None
 
 
-def test_torque_fades_when_the_states_stop_too_and_a_new_controller_is_waited_for():
+def test_controller_that_is_back_takes_over_at_once_and_the_torque_fades_with_the_states():
+    """After that it waits for a new controller."""
     rig = Watched(HOLDING)
-    rig.step(100)
-    rig.dead = True
-    rig.step(100)
+    for takeovers in (1, 2):
+        count = len(rig.taken)
+        rig.dead = False
+        rig.step(100)
+        assert not rig.line.active
+        assert len(rig.taken) == count
+        rig.dead = True
+        rig.step(200)
+        assert rig.line.active
+        assert rig.line.takeovers == takeovers
     assert rig.line.leave().all()
     now = rig.plant.sample * 1e-3
     faded = [rig.line.poll(now + k * 1e-3) for k in range(1000)]
