@@ -42,7 +42,7 @@ _FIRST = (
     'test_replay',
     'test_managed',
     'test_nodes',
-    'test_paper',
+    'test_studies',
 )
 
 

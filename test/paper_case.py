@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Configurations and runs of presets, for the tests of the paper's variants."""
+"""Configurations and runs of presets, and arms that change during learning, by events."""
 
 from __future__ import annotations
 
@@ -74,3 +74,99 @@ def run(config: LoopConfig) -> Loop:
     parts = [getattr(samples, name) for name in names]
     parts += [samples.latched[:, 0], samples.changes[:, 0], record.truths[:, :3]]
     return Loop(record.stamps * 1e-9, *parts, record.controller)
+
+
+BOUND = 2e-3  # rad
+WINDOW = 2.0 * np.pi  # s
+OFF = {'learning.weight': 0.0}
+CHANGED = 20.0  # s
+GENTLE = 0.25e-3  # rad, allowed after a ramp: errors so small that 1.3 times is too strict
+
+
+def payload(m2, begin=CHANGED):
+    """Return parameters of a plant whose tip mass becomes `m2` [kg]; a lower one is a release."""
+    if m2 >= 0.5:
+        return {'events.begin': [begin], 'events.payload': [m2 - 0.5]}
+    released = {'events.begin': [0.0], 'events.duration': [begin], 'events.payload': [0.5 - m2]}
+    return {'arm.m2': m2, **released}
+
+
+def push(joint, torque, seconds, begin=CHANGED):
+    """Return parameters of a plant with a torque [N m] on a joint for some seconds."""
+    torques = [0.0, 0.0]
+    torques[joint] = torque
+    return {'events.begin': [begin], 'events.duration': [seconds], 'events.torque': torques}
+
+
+def several(*events):
+    """Return parameters of a plant with all of these events, named without `events.`."""
+    names = {name for event in events for name in event}
+    return {
+        f'events.{name}': [
+            value
+            for event in events
+            for value in np.ravel(event.get(name, [0.0, 0.0] if name == 'torque' else 0.0)).tolist()
+        ]
+        for name in sorted(names)
+    }
+
+
+ROWS = {
+    **{f'payload to {m2} kg': payload(m2) for m2 in (0.6, 0.65, 0.7, 0.75, 0.8, 1.0)},
+    'payload to 0.75 kg at 8 s': payload(0.75, begin=8.0),
+    **{
+        f'release from {m2} kg': several({'begin': 10.0, 'duration': 10.0, 'payload': m2 - 0.5})
+        for m2 in (0.75, 1.0)
+    },
+    **{f'push {row}': push(*row) for row in [(1, 1.0, 3.0), (1, 2.0, 2.0), (0, 3.0, 3.0)]},
+    **{
+        f'payload to 0.75 kg within {ramp} s': payload(0.75) | {'events.ramp': [ramp]}
+        for ramp in (0.5, 2.0)
+    },
+    'five payloads of 5 s': several(
+        *({'begin': 10.0 * k, 'duration': 5.0, 'payload': 0.25} for k in range(1, 6))
+    ),
+    'payload, then pushes': several(
+        {'begin': CHANGED, 'payload': 0.3},
+        {'begin': CHANGED + 5.0, 'duration': 2.0, 'torque': [2.0, 0.0]},
+        {'begin': CHANGED + 9.0, 'duration': 2.0, 'torque': [0.0, -1.0]},
+    ),
+}
+"""Changes by name; a run ends at `end_of`, two windows after the last change."""
+
+LIGHTER = {f'release to {m2} kg': payload(m2) for m2 in (0.25, 0.3)}
+"""Releases that also change the arm itself, which is not an event."""
+
+
+def allowed(row, without):
+    """Return the largest error allowed with learning [rad], given the largest without it.
+
+    Without learning the arm is up to 0.09 mrad off before the change, sometimes to the side from
+    which the change pushes it back: that alone makes the ratio 1.21 for a tenth of a kilogram.
+    """
+    return np.maximum(1.3 * without, GENTLE if 'events.ramp' in row else 0.0)
+
+
+def _times(row):
+    """Return begin, duration and ramp of each event of a row [s]."""
+    begin = np.array(row['events.begin'])
+    return begin, *(
+        np.array(row.get(f'events.{name}', 0.0 * begin)) for name in ('duration', 'ramp')
+    )
+
+
+def begin_of(row):
+    """Return the time of the first change of a row after its start [s]."""
+    begin, duration, _ = _times(row)
+    times = np.concatenate([begin, begin + duration])
+    return float(times[times > 0.0].min())
+
+
+def end_of(row):
+    """Return the time two windows after the last change of a row [s], in whole samples."""
+    return round(float(np.max(sum(_times(row)))) + 2.0 * WINDOW, 3)
+
+
+def run_preset(duration, plant=None, *, preset='recommended', law=None):
+    """Run a preset with changed parameters of the plant, events among them, and of the law."""
+    return run(configured(preset, duration, law, plant))

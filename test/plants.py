@@ -24,13 +24,6 @@ def energies(arm, q, dq):
     return kinetic, arm.g * (arm.m1 * height1 + arm.m2 * (height1 + arm.l2 * s12))
 
 
-def points(l1, l2, q):
-    """Return base, elbow and tip [m] at the joint positions q [rad]."""
-    elbow = l1 * np.array([np.cos(q[0]), 0.0, np.sin(q[0])])
-    angle = q[0] + q[1]
-    return np.zeros(3), elbow, elbow + l2 * np.array([np.cos(angle), 0.0, np.sin(angle)])
-
-
 IDEAL = {'disturbance.constant': QUIET, 'disturbance.amplitude': QUIET}
 NAMES = {
     param.name.rpartition('.')[2]: param.name

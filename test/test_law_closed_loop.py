@@ -5,9 +5,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from changes import run
 from closed_loop_case import closed_loop, controller, plant, recommended
-from paper_case import EXACT, P, configured
+from paper_case import BOUND, EXACT, P, configured, run_preset
 from plain_law import PlainLaw, R, dynamics, regressor
 from plants import QUIET, START
 from scipy.integrate import solve_ivp
@@ -16,11 +15,9 @@ from blf_dsc_controller.compiled.algebra import cholesky_factor
 from blf_dsc_controller.law.factory import controller_of
 from blf_dsc_controller.law.state import CHOICES
 
-BOUND = 2e-3  # rad
-
 
 def test_recommended_loop_keeps_half_the_bound_and_finds_the_parameters():
-    loop = run(60.0)
+    loop = run_preset(60.0)
     assert np.abs(loop.xi1).max() < 0.5 * BOUND
     assert np.abs(loop.torque).max() < recommended().torque_limit.min()
     assert loop.parameter_error[0] == pytest.approx(0.5, abs=0.01)  # P^(0) = P / 2
@@ -150,7 +147,9 @@ def test_first_latch_disturbs_neither_the_tracking_nor_the_disturbance_estimate(
     """The estimate steps by half of P; without the handover the error reaches 0.42 mrad."""
     end = LATCH + 1.0
     true = 0.1 + 0.1 * np.sin(end)  # N m
-    bumpless, paper = (run(end, law={'learning.bumpless': choice}) for choice in (True, False))
+    bumpless, paper = (
+        run_preset(end, law={'learning.bumpless': choice}) for choice in (True, False)
+    )
     off, late = (
         np.abs(loop.controller.state.disturbance - true).max() for loop in (bumpless, paper)
     )
@@ -164,8 +163,8 @@ def test_first_latch_disturbs_neither_the_tracking_nor_the_disturbance_estimate(
 
 @pytest.mark.parametrize(('preset', 'bound'), [('recommended', 0.01e-3), ('noisy', 0.05e-3)])
 def test_learned_friction_is_compensated(preset, bound):
-    with_columns = run(30.0, preset=preset, plant=FRICTION, law=COLUMNS)
-    without = run(30.0, preset=preset, plant=FRICTION)
+    with_columns = run_preset(30.0, preset=preset, plant=FRICTION, law=COLUMNS)
+    without = run_preset(30.0, preset=preset, plant=FRICTION)
 
     assert with_columns.largest(15.0).max() < bound
     assert without.largest(15.0).max() > 3.0 * bound

@@ -12,8 +12,7 @@ from functools import cache
 
 import numpy as np
 import pytest
-from changes import OFF, several
-from paper_case import configured
+from paper_case import OFF, configured, several
 from scipy.linalg import expm
 
 from blf_dsc_controller.configuration.nodes import locate

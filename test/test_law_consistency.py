@@ -5,22 +5,23 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from changes import (
+from closed_loop_case import arbitrary
+from paper_case import (
     BOUND,
     CHANGED,
     LIGHTER,
+    NO_DISTURBANCE,
     OFF,
     ROWS,
     WINDOW,
     allowed,
     begin_of,
+    configured,
     end_of,
     payload,
-    run,
+    run_preset,
     several,
 )
-from closed_loop_case import arbitrary
-from paper_case import NO_DISTURBANCE, configured
 
 from blf_dsc_controller import load_loop, simulate
 from blf_dsc_controller.law import excitation, window
@@ -48,7 +49,7 @@ CASES = [
 def test_bound_holds_when_the_arm_changes(name, sensors):
     row = (ROWS | LIGHTER)[name]
     plant = row | SENSORS[sensors]
-    learning, without = (run(end_of(row), plant, law=law) for law in ({}, OFF))
+    learning, without = (run_preset(end_of(row), plant, law=law) for law in ({}, OFF))
     assert np.all(learning.largest(0.0) < BOUND)
     begin = begin_of(row)
     quantisation = 0.5 * plant.get('sensor.resolution', 0.0)
@@ -60,15 +61,15 @@ def test_bound_holds_when_the_arm_changes(name, sensors):
 def test_change_detection_has_no_effect_without_a_change():
     """Bit for bit: consistency only decides which windows are latched."""
     for preset in ('noisy', 'excitation', 'two_tone'):
-        assert run(30.0, preset=preset).changes[-1] == 0.0
-    with_detection = run(30.0)
-    without = run(30.0, law={'learning.change_detection': False})
+        assert run_preset(30.0, preset=preset).changes[-1] == 0.0
+    with_detection = run_preset(30.0)
+    without = run_preset(30.0, law={'learning.change_detection': False})
     assert with_detection.changes[-1] == 0.0
     np.testing.assert_array_equal(with_detection.torque, without.torque)
 
 
 def test_residual_matches_least_squares():
-    controller = run(8.0, NO_DISTURBANCE | FRICTION).controller
+    controller = run_preset(8.0, NO_DISTURBANCE | FRICTION).controller
     settings, state = controller.settings, controller.state
     assert settings.change_detection == 1
     rows = state.ring.reshape(-1, settings.m + 1)
@@ -83,7 +84,7 @@ def test_estimate_does_not_drift_at_rest_with_noise():
     The tracking error adapts the estimate until the first full window; as that window is not
     excited, the estimate is held from then on.
     """
-    standing = run(60.0, preset='noisy', law={'reference.type': 'hold'})
+    standing = run_preset(60.0, preset='noisy', law={'reference.type': 'hold'})
     assert np.ptp(standing.parameter_error[standing.t > WINDOW + 0.1]) == 0.0
     assert np.all(standing.largest(1.0) < 0.5 * BOUND)
 
@@ -100,7 +101,7 @@ def test_column_rejected_at_rest_is_readmitted_in_motion():
         ],
     }
     constant = {'disturbance.constant': [0.3, -0.2], 'disturbance.amplitude': [0.0, 0.0]}
-    moved = run(45.0, constant, law=law)
+    moved = run_preset(45.0, constant, law=law)
     assert np.all(moved.controller.state.active == 1.0)
     assert moved.parameter_error[-1] < 0.01
 
@@ -110,7 +111,7 @@ def test_rejected_column_stays_zero_and_is_checked_again():
 
     Unless they are checked again then, no window would ever be latched.
     """
-    controller = run(8.0, law={'learning.frequencies': [1.0]}).controller
+    controller = run_preset(8.0, law={'learning.frequencies': [1.0]}).controller
     case = _, state, _ = controller.settings, controller.state, controller.signals
     rejected = state.active == 0.0
     assert rejected.any()
@@ -130,7 +131,7 @@ def test_rejected_column_stays_zero_and_is_checked_again():
 def test_window_after_a_change_may_be_partial_and_stays_near_the_estimate_before():
     off = []
     for law in ({}, {'learning.anchor_weight': 0.0}):
-        learning = run(CHANGED + 5.0, payload(0.75), law=law).controller
+        learning = run_preset(CHANGED + 5.0, payload(0.75), law=law).controller
         assert learning.state.latched[0] == 1.0
         assert learning.state.rows[0] < learning.settings.window
         off.append(np.ptp(learning.state.estimate - learning.state.anchor))
@@ -171,7 +172,7 @@ def test_first_window_that_spans_a_change_is_not_latched(preset, begin, duration
 
 def test_lasting_disturbance_above_the_floor_does_not_end_learning():
     """Its first window is split once, since its parts never agree, and then accepted."""
-    learning = run(30.0, {'disturbance.amplitude': [1.5, 1.5]}, preset='noisy')
+    learning = run_preset(30.0, {'disturbance.amplitude': [1.5, 1.5]}, preset='noisy')
     state = learning.controller.state
     assert state.split_residual[0] > 0.0
     assert state.latched[0] == 1.0
@@ -181,7 +182,7 @@ def test_lasting_disturbance_above_the_floor_does_not_end_learning():
 @pytest.fixture(scope='module')
 def window_of_friction():
     """A full latched window of unmodelled friction, its controller, and the state of that."""
-    controller = run(8.0, FRICTION).controller
+    controller = run_preset(8.0, FRICTION).controller
     settings = controller.settings._replace(residual_floor=0.0)
     case = settings, controller.state, controller.signals
     window.excitation(*case, 60)

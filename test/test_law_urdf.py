@@ -5,8 +5,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from changes import several
-from paper_case import configured
+from paper_case import configured, several
 from random_arm import PANDA_TEXT, random_urdf
 
 from blf_dsc_controller import simulate

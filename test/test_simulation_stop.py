@@ -5,8 +5,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from changes import several
-from paper_case import configured
+from paper_case import configured, several
 
 from blf_dsc_controller.analysis.metrics import measure
 from blf_dsc_controller.bags.reader import read_run

@@ -1,0 +1,368 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Laws side by side: the paper's claims and what pages say of them; laws on arms from URDFs."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import re
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+from paper_case import P, configured, run
+from scipy.linalg import expm
+
+from blf_dsc_controller.analysis.metrics import measure
+from blf_dsc_controller.cli.main import main
+from blf_dsc_controller.configuration.controller import ControllerConfig
+from blf_dsc_controller.configuration.nodes import known_names, load_loop, locate
+from blf_dsc_controller.configuration.plant import PlantConfig
+from blf_dsc_controller.configuration.robot import parameters_of
+from blf_dsc_controller.configuration.schema import build, change
+from blf_dsc_controller.law.factory import settings_of_config
+from blf_dsc_controller.reference import terms
+from blf_dsc_controller.reference.approach import reference_of
+from blf_dsc_controller.simulation.loop import simulate
+from blf_dsc_controller.studies import laws
+from blf_dsc_controller.studies import tuning as tune
+from blf_dsc_controller.studies.monte_carlo import torque_rows
+from blf_dsc_controller.studies.paper import CASES, FAILS, HOLDS, ONLY_IF, case_name
+
+
+def test_every_law_is_tuned_with_the_same_effort():
+    """Same optimiser, seed and budget; one range per shared gain; as many for both of Fig. 2."""
+    ranges = {}
+    for task in tune.TASKS.values():
+        for gain in task.gains:
+            key = gain.name, gain.joint
+            assert ranges.setdefault(key, (gain.least, gain.most)) == (gain.least, gain.most)
+        values = [tune.value_at(k / 10.0) for k in range(len(task.gains))]
+        found = tune.parameters_at(ControllerConfig(), task.gains, values)
+        assert found['feedback.gain'] == (1.0, 1.26)  # of each joint; 10^0.1 to three digits
+        assert found['learning.adaptation_gain'] == (1.58,) * 3
+    assert len(tune.TASKS['proposed'].gains) == len(tune.TASKS['comparison'].gains)
+
+
+@pytest.mark.parametrize('name', tune.TASKS)
+def test_committed_gains_beat_the_middle_of_their_ranges(name):
+    """By at least a decade of the search's objective, whose value is stated in their file."""
+    task = tune.TASKS[name]
+    preset = {'proposed': 'paper_tuned'}.get(name, name)
+    middle = np.array([np.log10(gain.least * gain.most) / 2.0 for gain in task.gains])
+    loops = tune.loops_of(task)
+    bare, tuned = task._replace(gains=()), load_loop(preset).controller
+    best = tune.objective(np.array([]), bare, [loop._replace(controller=tuned) for loop in loops])
+    assert best < tune.objective(middle, task, loops) - 1.0
+    stated = re.search(r'objective (-?[\d.]+)', locate(preset).read_text(encoding='utf-8'))
+    assert best == pytest.approx(float(stated.group(1)), abs=0.01)
+
+
+@pytest.fixture(scope='module')
+def report(tmp_path_factory):
+    """The report of the whole study, run once: about 20 s on two cores."""
+    out = tmp_path_factory.mktemp('study') / 'report'
+    with (out.parent / 'printed.txt').open('w') as file, contextlib.redirect_stdout(file):
+        assert main(['paper', '--out', str(out)]) == 0
+    return out
+
+
+@pytest.fixture(scope='module')
+def found(report):
+    return json.loads((report / 'results.json').read_text(encoding='utf-8'))
+
+
+def test_claims_and_laws_are_printed_and_figures_drawn(report, found):
+    printed = (report.parent / 'printed.txt').read_text()
+    for claim in found['claims']:
+        assert f'{claim["says"]}\n' in printed
+        assert f'{claim["measured"]}\n' in printed
+    assert 'recommended' in printed
+    assert len(list(report.glob('*.png'))) == 5
+
+
+def test_verdicts_follow_from_the_runs_of_the_report(found):
+    """Those verdicts about which the mathematics leaves no doubt."""
+    verdicts = {row['says']: row['verdict'] for row in found['claims']}
+    assert len(verdicts) >= 11
+    assert verdicts['The reference does not fully excite the system.'] == FAILS
+    assert verdicts['With everything known V decreases for all time.'] == ONLY_IF
+    assert verdicts['It is superior in tracking and in estimation.'] == ONLY_IF
+    assert verdicts['The proposed controller always stays within the boundaries.'] == HOLDS
+    assert verdicts['Tracking and parameter errors converge exponentially.'] == HOLDS
+    # w = 1 N m/rad is a spring with 2 mN m at 2 mrad, and the push is 8 N m.
+    assert found['metrics']['paper_pushed']['max_error_ratio'] > 1.0
+    assert found['metrics']['recommended_pushed']['max_error_ratio'] < 0.5
+    for row in found['claims']:
+        assert bool(row['condition']) or row['verdict'] != ONLY_IF
+
+
+def test_saved_configurations_are_those_that_ran(report, found):
+    """Running one case of a sweep again from its file reproduces the number in the report."""
+    name = case_name('delay', 'comparison', 1.0)
+    loop = load_loop(report / 'configurations' / f'{name.replace(" ", "_")}.yaml')
+    again = measure(simulate(loop.controller, loop.plant, supervised=False).run())
+    metrics = found['metrics']
+    assert metrics[name]['max_error_ratio'] == again.max_error_ratio
+    assert loop.plant.actuator.delay == 1
+    assert len(list((report / 'configurations').iterdir())) == len(metrics) == len(CASES)
+
+
+ROOT = Path(__file__).resolve().parents[1]
+PAGES = {name: (ROOT / 'doc' / f'{name}.md').read_text() for name in ('theory', 'errata', 'tuning')}
+TESTS = ''.join(path.read_text() for path in (ROOT / 'test').glob('test_*.py'))
+
+
+@pytest.mark.parametrize('page', PAGES)
+def test_every_test_and_preset_named_on_a_page_exists(page):
+    text = PAGES[page]
+    for name in re.findall(r'`(test_\w+)`', text):
+        assert f'def {name}' in TESTS, name
+    for path in re.findall(r'`?(test/test_\w+\.py)', text):
+        assert (ROOT / path).is_file(), path
+    for preset in re.findall(r'--config (\w+)', text):
+        assert locate(preset).is_file()
+
+
+def test_every_erratum_and_every_test_of_one_has_a_row():
+    rows = [int(number) for number in re.findall(r'^\| (\d+)', PAGES['errata'], re.MULTILINE)]
+    assert rows == list(range(1, 27))
+    tested = {int(number) for number in re.findall(r'def test_erratum_(\d+)_', TESTS)}
+    assert tested <= set(rows)
+    for line in PAGES['errata'].splitlines():
+        if re.match(r'\| \d', line):
+            assert '`test_' in line, line
+
+
+def test_every_parameter_named_on_the_tuning_page_exists():
+    names = re.findall(r'`((?:\w+\.)+\w+)`', PAGES['tuning'])
+    groups = {name.split('.')[0] for name in known_names()}
+    wanted = [name for name in names if name.split('.')[0] in groups]
+    assert len(wanted) > 15
+    assert set(wanted) <= known_names()
+
+
+def test_table_of_the_laws_matches_the_presets(found):
+    """Columns as `make paper` writes them: joint1 / joint2. README has some of the rows."""
+    row = r'^\| `(\w+)`[^|]*\| ([\d.]+) / ([\d.]+) \| ([\d.]+) / ([\d.]+) \| ([\d.]+)?'
+    page = (ROOT / 'doc' / 'comparison.md').read_text()
+    rows = re.findall(row, page, re.MULTILINE)
+    short = re.findall(row, (ROOT / 'README.md').read_text(), re.MULTILINE)
+    assert short
+    assert set(short) <= set(rows)
+    assert len(rows) == 7
+    for preset, *errors, parameter_error in rows:
+        metrics = found['metrics'][preset]
+        values = 1e3 * np.array(metrics['max_error'] + metrics['rms_error'])
+        np.testing.assert_allclose(values, np.array(errors, float), rtol=0.01)
+        if parameter_error:
+            percent = 100 * metrics['final_parameter_error']
+            assert percent == pytest.approx(float(parameter_error), rel=0.1)
+
+
+def error_at_phase(preset, phase):
+    """Relative parameter error after a minute, with this phase of the disturbance's sinusoid."""
+    arm = {'disturbance.phase': [phase, phase]}
+    return run(configured(preset, 60.0, arm=arm)).parameter_error[-1]
+
+
+def test_parameter_error_depends_on_the_phase_of_the_disturbance_as_documented():
+    """0.1 cos t N m on both joints looks like 0.1 / 0.6 kg m^2 of the second parameter."""
+    assert error_at_phase('recommended', np.pi / 2) == pytest.approx(
+        0.1 / 0.6 / np.linalg.norm(P), abs=1e-3
+    )
+    assert error_at_phase('recommended', 17.0) == pytest.approx(0.143, abs=5e-4)
+    for phase in (0.0, np.pi / 2, 17.0):
+        assert error_at_phase('two_tone', phase) < 5e-5
+        assert 0.004 < error_at_phase('excitation', phase) < 0.008
+    for page in ('README.md', 'doc/theory.md', 'doc/comparison.md'):
+        text = ' '.join((ROOT / page).read_text().split())
+        assert '14.8 %' in text
+        assert 'below 0.005 %' in text
+
+
+def test_numbers_on_the_pages_match_the_runs():
+    assert 'a fifth is left' in ' '.join(PAGES['theory'].split())
+    errors = [
+        run(configured('recommended', 60.0, {'learning.weight': weight})).parameter_error[-1]
+        for weight in (100.0, 500.0)
+    ]
+    assert errors[0] / errors[1] == pytest.approx(5.0, abs=0.5)
+
+    assert '7 % at 5 s instead of 0.01 % at 2π' in PAGES['tuning']
+    window = run(configured('recommended', 30.0, {'learning.window': 5.0}))
+    assert window.error_at(30.0) == pytest.approx(0.07, abs=0.015)
+
+
+IMPORT = 'from blf_dsc_controller.studies.laws import Contender\n'
+E0 = 0.004 * np.array([1.0, -0.5, 0.2, 0.8, -1.0, 0.6])  # rad, inside the bound
+GAINS = {'position': 900.0, 'velocity': 50.0}
+
+
+class ComputedTorque(NamedTuple):
+    """M (qr'' - k_p e - k_d e') + C q' + G."""
+
+    position: float
+    velocity: float
+    a: np.ndarray
+    H: np.ndarray
+
+    def fill_torque(self, arm, now, torque):
+        for i in range(now.q.size):
+            self.a[i] = now.ddqr[i] - self.velocity * (now.dq[i] - now.dqr[i])
+            self.a[i] -= self.position * (now.q[i] - now.qr[i])
+        arm.model.regressor(now.q, now.dq, now.dq, self.a, self.H)
+        for i in range(now.q.size):
+            torque[i] = 0.0
+            for j in range(arm.P.size):
+                torque[i] += self.H[i, j] * arm.P[j]
+
+
+def computed_torque(gains, arm):
+    n = arm.bound.size
+    return ComputedTorque(**gains, a=np.zeros(n), H=np.zeros((n, arm.P.size)))
+
+
+def ideal(period):
+    """A UR5e true to its URDF, with ideal sensors and drives, in motion E0 off its reference."""
+    loop, step = load_loop('ur5e'), {'sample_time': period}
+    config, robot = loop.controller, {'robot.urdf': 'ur5e.urdf', 'robot.tip': 'tool0'}
+    chain = config.robot.chain(config.joints)
+    P = parameters_of(config.robot, chain).of(chain.inertias, config.robot.rotors(chain))
+    config = change(config, step | {'learning.initial_estimate': P.tolist()})
+    ((q, dq, _),) = terms.sampled(reference_of(config), np.zeros(1))
+    start = {'initial.position': (q + E0).tolist(), 'initial.velocity': dq.tolist()}
+    plant = build(PlantConfig, robot | step | start | {'duration': 0.1})
+    return loop._replace(plant=plant, controller=config)
+
+
+def deviation(period):
+    """Largest difference to the errors of e'' + k_d e' + k_p e = 0."""
+    errors, torques = laws.simulate_with(ideal(period), computed_torque, GAINS)
+    A = np.array([[0.0, 1.0], [-900.0, -50.0]])
+    decay = [expm(A * period * k)[0, 0] for k in range(len(errors))]
+    np.testing.assert_allclose(errors[0], E0, atol=1e-15)
+    assert np.ptp(torques, axis=0).max() > 5.0
+    return np.abs(errors - np.outer(decay, E0)).max()
+
+
+def test_law_of_a_file_acts_at_the_right_time():
+    """Computed torque with the true model; the deviation is of first order in the sample time."""
+    coarse, fine = deviation(1e-3), deviation(1e-4)
+    assert coarse < 0.02 * np.abs(E0).max()
+    assert coarse / fine == pytest.approx(10.0, rel=0.1)
+
+
+def test_torque_is_cut_at_its_limit():
+    gains, loop = {'position': 1e9, 'velocity': 0.0}, ideal(1e-3)
+    _, torques = laws.simulate_with(loop, computed_torque, gains)
+    np.testing.assert_array_equal(np.abs(torques).max(axis=0), loop.controller.torque.limit)
+
+
+def test_law_is_told_of_the_friction_that_the_controller_knows():
+    config = load_loop('ur5e').controller
+    known = laws.known_of(config)
+    np.testing.assert_array_equal(known.viscous, config.robot.viscous)
+    np.testing.assert_array_equal(known.coulomb, config.robot.coulomb)
+    assert known.coulomb.min() > 0.0
+
+
+def test_integral_gain_of_slotine_li_is_the_gain_of_its_disturbance_estimate():
+    config = load_loop('ur5e').controller
+    chosen = {'law': 'slotine_li', 'comparison.integral_gain': [1.0, 2.0, 3.0, 4.0, 5.0, 6.0]}
+    settings = settings_of_config(change(config, chosen))
+    assert settings.gamma.tolist() == [1.0, 2.0, 3.0, 4.0, 5.0, 6.0]
+    assert not settings_of_config(change(config, {'law': 'slotine_li'})).gamma.any()
+
+
+@pytest.mark.parametrize('name', [k for k, c in laws.CONTENDERS.items() if isinstance(c.law, str)])
+def test_limits_of_the_gain_search_are_valid_configurations(name):
+    config, contender = load_loop('panda').controller, laws.CONTENDERS[name]
+    for side in ('least', 'most'):
+        values = {gain.name: getattr(gain, side) for gain in contender.gains}
+        change(config, laws.law_changes(contender, config, values))
+
+
+def test_every_trial_has_its_own_truth_motion_and_noise():
+    trials = [laws.trial('ur5e', seed) for seed in range(4)]
+    for get in (
+        lambda loop: loop.controller.reference.phase,
+        lambda loop: loop.controller.reference.amplitude,
+        lambda loop: loop.plant.seed,
+        lambda loop: loop.plant.truth.seed,
+    ):
+        assert len({get(each) for each in trials}) == 4
+    assert trials[0].controller.reference == load_loop('ur5e').controller.reference
+    assert len({each.controller.learning.initial_estimate for each in trials}) == 1
+
+
+def test_cost_penalises_rough_torque_and_is_largest_for_a_diverged_run():
+    figures = laws.Figures((1e-3, 1e-2, 1e-1, 1e0), 200.0, laws.ROUGHEST / 2.0, ())
+    assert laws.cost_of(figures) == pytest.approx(1.5)
+    assert laws.cost_of(figures._replace(roughness=10.0 * laws.ROUGHEST)) == pytest.approx(11.5)
+    assert laws.cost_of(figures._replace(errors=(np.nan,) * 4)) == 30.0
+    assert laws.cost_of(figures._replace(errors=(1e300,) * 4)) == 30.0
+
+
+def test_table_shows_the_worst_run_of_each_law():
+    """Two runs with errors of 1 and 2 mrad, of which the second leaves the bound."""
+    inside = laws.Figures((1e-3,) * 4, 0.9, 0.01, (0.02, 0.01))
+    outside = laws.Figures((2e-3,) * 4, 1.0, 0.02, (0.03, 0.0))
+    results = {
+        'proposed': laws.Result({}, None, [inside, outside]),
+        'slotine_li_tuned': laws.Result({'position': 3.0}, 1.0, [inside._replace(model=())]),
+    }
+    heads, proposed, tuned, gains = (
+        re.split(r'  +', line) for line in laws.format_results(results).splitlines()
+    )
+    assert len(heads) == len(proposed) == len(tuned)
+    assert proposed[1:] == [*['2.00'] * 4, '3.00', '1.00', '2.0 %', '1 of 2']
+    assert tuned[1:] == [*['1.00'] * 4, '-', '-', '1.0 %', '1 of 1']
+    assert gains == [f'{tuned[0]}: position 3']
+
+
+@pytest.mark.nightly
+def test_every_law_is_tuned_and_run_and_learning_finds_the_model(tmp_path, monkeypatch):
+    """The smallest run of the command: one arm, one truth, a first population of 5."""
+    for name, value in {'POPULATION': 5, 'GENERATIONS': 0, 'TRUTHS': 1}.items():
+        monkeypatch.setattr(laws, name, value)
+    assert main(['arms', '--config', 'ur5e', '--out', str(tmp_path / 'out')]) == 0
+    found = json.loads((tmp_path / 'out/figures.json').read_text(encoding='utf-8'))['ur5e']
+    assert list(found) == list(laws.CONTENDERS)
+    rows = torque_rows(laws.trial('ur5e', 1000).controller)
+    for name, contender in laws.CONTENDERS.items():
+        assert list(found[name]['gains']) == [gain.name for gain in contender.gains]
+        again = laws.run(name, laws.trial('ur5e', 1), found[name]['gains'], rows)  # in this process
+        assert found[name]['runs'] == [json.loads(json.dumps(again._asdict()))]
+    learned, guessed = (found[name]['runs'][0]['model'] for name in ('proposed', 'no_learning'))
+    assert learned[0] < guessed[0] / 2.0
+    assert learned[1] < guessed[1] / 5.0  # the URDF does not include the payload
+
+
+def test_file_without_a_usable_law_is_rejected(tmp_path, capsys):
+    taken = f"{IMPORT}CONTENDERS = {{'slotine_li': Contender('mine')}}"
+    for name, text, problem in (
+        ('missing.py', None, 'expected a law of the study (proposed, '),
+        ('json.py', '', 'there is another module of this name'),
+        ('broken.py', '1 / 0', 'cannot be imported: ZeroDivisionError'),
+        ('empty.py', '', 'CONTENDERS must be a dict of Contender by name'),
+        ('taken.py', taken, 'has a law slotine_li already'),
+    ):
+        if text is not None:
+            (tmp_path / name).write_text(text)
+        out = tmp_path / 'out'
+        assert main(['arms', '--laws', str(tmp_path / name), '--out', str(out)]) == 1
+        assert problem in capsys.readouterr().err
+        assert not out.exists()
+
+
+def test_laws_of_a_file_join_those_chosen_by_name(tmp_path, monkeypatch, capsys):
+    assert main(['arms', '--config', 'recommended', '--out', str(tmp_path / 'out')]) == 1
+    assert 'got model two_link' in capsys.readouterr().err
+    monkeypatch.setattr(laws, 'CONTENDERS', dict(laws.CONTENDERS))
+    file = tmp_path / 'law_of_mine.py'
+    file.write_text(f"{IMPORT}CONTENDERS = {{'mine': Contender('mine')}}")
+    assert laws.chosen_laws([]) == list(laws.CONTENDERS)
+    for _ in range(2):  # a worker that was forked has it already
+        assert laws.chosen_laws(['slotine_li', str(file)]) == ['proposed', 'slotine_li', 'mine']
