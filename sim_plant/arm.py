@@ -33,11 +33,6 @@ class PointMassArm(NamedTuple):
     g: float  # m/s^2
 
     @property
-    def n(self) -> int:
-        """Number of joints."""
-        return 2
-
-    @property
     def p(self) -> int:
         """Number of parameters."""
         return 3
@@ -82,10 +77,6 @@ class PointMassArm(NamedTuple):
 
 class Arm(Protocol):
     """An arm that may carry a payload, a point mass [kg] at its tip."""
-
-    @property
-    def n(self) -> int:
-        """Number of joints."""
 
     @property
     def p(self) -> int:

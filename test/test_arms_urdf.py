@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 from random_arm import PANDA, PANDA_TEXT, chain_of
 
-from blf_dsc_controller.arms.urdf import UrdfError, inertia_of, pseudo_inertia, read_chain
+from blf_dsc_controller.arms.urdf import inertia_of, pseudo_inertia, read_chain
+from blf_dsc_controller.errors import BlfDscError
 
 
 def test_limits_are_read_from_the_file_and_infinite_where_they_are_missing():
@@ -122,7 +123,7 @@ def test_unusable_urdf_is_rejected_with_a_remedy():
     cases = [({'text': changed(old, new, 1)}, message) for old, new, message in WRONG_TEXTS]
     arm = {'text': PANDA_TEXT, 'base': 'panda_link0', 'tip': 'panda_hand_tcp', 'joints': PANDA}
     for changes, message in (*cases, *WRONG_CHAINS):
-        with pytest.raises(UrdfError) as caught:
+        with pytest.raises(BlfDscError) as caught:
             read_chain(**arm | changes)
         assert message in str(caught.value)
 

@@ -44,19 +44,12 @@ _DEPENDENT = 1e-6  # for columns of order 1; rounding of pi / 2 in URDFs gives a
 
 @dataclass(frozen=True, eq=False)
 class BaseParameters:
-    """Base parameters P of a chain.
+    """Base parameters P of a chain."""
 
-    Attributes:
-        model: the arm model whose regressors multiply P, named after the kept columns.
-        K: (p, 11 n), maps all inertias to P: per body its ten inertial parameters and its rotor.
-        load: (p,) what 1 kg at the tip adds to P.
-        combinations: (p,) each parameter as a sum, such as 'Izz2 + Iyy3 + 0.1 m4'.
-    """
-
-    model: SerialChain
-    K: np.ndarray
-    load: np.ndarray
-    combinations: tuple[str, ...]
+    model: SerialChain  # whose regressors multiply P, named after the kept columns
+    K: np.ndarray  # (p, 11 n) to P from each body's ten inertial parameters and its rotor
+    load: np.ndarray  # (p,) what 1 kg at the tip adds to P
+    combinations: tuple[str, ...]  # each as a sum, such as 'Izz2 + Iyy3 + 0.1 m4'
 
     def of(self, inertias: np.ndarray, rotors: np.ndarray) -> np.ndarray:
         """Return P (p,) for the ten of each body (n, 10) and the rotors (n,) [kg m^2, or kg]."""

@@ -41,41 +41,27 @@ _ROUNDED = 1e-12  # kg m^2, of moments of inertia
 _LARGEST = 1e6  # m, kg, kg m^2 and so on; limits may be larger
 
 
-class UrdfError(BlfDscError):
-    """A URDF without a serial chain of the given joints, or with impossible values."""
-
-
-@dataclass(frozen=True, eq=False)
-class Joint:
+class Joint(NamedTuple):
     """A moving joint, with the body that it moves.
 
-    Attributes:
-        placement: (4, 4) of its frame at position 0, in the frame of the previous joint (for the
-            first joint: in the base).
-        axis: (3,) unit vector, in that frame.
-        lower, upper: position limits [rad or m].
-        velocity, effort: limits [rad/s or m/s, N m or N].
-        damping, friction: from `<dynamics>`: viscous [N m s/rad or N s/m], Coulomb [N m or N].
-        link: the link that it moves; its frame is the joint's.
-        inertia: (10,) of the body in that frame, in the order of `INERTIA_NAMES`.
-        fixed: the links that are fixed to its link.
-        held: (4, 4) pseudo-inertia, in that frame, of what joints held at position 0 carry.
+    The frame of the joint is that of its link; its placement is in the frame of the previous joint,
+    of the first joint in the base.
     """
 
     name: str
     kind: str
-    placement: np.ndarray
-    axis: np.ndarray
-    lower: float
+    placement: np.ndarray  # (4, 4) at position 0
+    axis: np.ndarray  # (3,) unit vector
+    lower: float  # position limits, rad or m
     upper: float
-    velocity: float
-    effort: float
-    damping: float
-    friction: float
-    link: str
-    inertia: np.ndarray
-    fixed: tuple[str, ...]
-    held: np.ndarray
+    velocity: float  # limit, rad/s or m/s
+    effort: float  # limit, N m or N
+    damping: float  # viscous friction from <dynamics>, N m s/rad or N s/m
+    friction: float  # Coulomb friction from <dynamics>, N m or N
+    link: str  # that it moves
+    inertia: np.ndarray  # (10,) of the body, in the order of `INERTIA_NAMES`
+    fixed: tuple[str, ...]  # links that are fixed to its link
+    held: np.ndarray  # (4, 4) pseudo-inertia of what joints held at position 0 carry
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,25 +86,25 @@ def read_chain(text: str, base: str, tip: str, joints: tuple[str, ...]) -> Chain
     An empty base means the root, an empty tip the link of the last joint, no joints all that move;
     without tip and joints, these must form one chain.
 
-    Raises UrdfError, which says what was found and how to correct it.
+    Raises BlfDscError, which says what was found and how to correct it.
     """
     tree = Tree.of(text)
     wanted = joints or (() if tip else tree.only_chain())
     for name in wanted:
         if name not in tree.joints:
             listed = _listed(tree.joints)
-            raise UrdfError(f'no joint {name!r} in the URDF: its joints are {listed}')
+            raise BlfDscError(f'no joint {name!r} in the URDF: its joints are {listed}')
     base, tip = base or tree.root, tip or _link(tree.joints[wanted[-1]], 'child')
     path = tree.path(base, tip)
     for element in path:
         name, kind = element.get('name', ''), element.get('type')
         if kind not in (*_MOVING, 'fixed'):
-            raise UrdfError(f'joint {name!r} is {kind}; expected fixed, {_listed(_MOVING)}')
+            raise BlfDscError(f'joint {name!r} is {kind}; expected fixed, {_listed(_MOVING)}')
         if element.find('mimic') is not None:
-            raise UrdfError(f'joint {name!r} mimics another: choose a base and a tip without it')
+            raise BlfDscError(f'joint {name!r} mimics another: choose a base and a tip without it')
     moving = _moving(path)
     if not moving or (wanted and wanted != moving):
-        raise UrdfError(
+        raise BlfDscError(
             f'the moving joints from base to tip are {_listed(moving)}, in this order; got '
             f'{_listed(wanted)}: list them like this, or choose another base or tip'
         )
@@ -131,7 +117,7 @@ def read_chain(text: str, base: str, tip: str, joints: tuple[str, ...]) -> Chain
             frame = np.eye(4)
     massless = [f'{joint.link} (moved by {joint.name})' for joint in chain if not joint.inertia[0]]
     if massless:
-        raise UrdfError(
+        raise BlfDscError(
             f'these links have no mass, nor has anything fixed to them: {_listed(massless)}: add '
             'an <inertial> to each, even a rough one'
         )
@@ -162,12 +148,12 @@ class Tree(NamedTuple):
         for name, joint in joints.items():
             for role in ('parent', 'child'):
                 if (link := _link(joint, role)) not in links:
-                    raise UrdfError(
+                    raise BlfDscError(
                         f'joint {name!r} has the {role} {link!r}, but the links are '
                         f'{_listed(links)}: correct its <{role}>'
                     )
             if above.setdefault(link, joint) is not joint:
-                raise UrdfError(
+                raise BlfDscError(
                     f'link {link!r} is the child of two joints: closed chains are not '
                     'supported; open the chain by removing a joint'
                 )
@@ -182,14 +168,14 @@ class Tree(NamedTuple):
         """Return the joints from a link to another."""
         for role, link in (('base', base), ('tip', tip)):
             if link not in self.links:
-                raise UrdfError(
+                raise BlfDscError(
                     f'no link {link!r} for the {role}: the links are {_listed(self.links)}'
                 )
         path: list[ET.Element] = []
         link = tip
         while link != base:
             if link not in self.above or len(path) > len(self.joints):
-                raise UrdfError(
+                raise BlfDscError(
                     f'the path up from the tip {tip!r} ends at {link!r} without reaching the base '
                     f'{base!r}: choose a tip below the base'
                 )
@@ -210,7 +196,7 @@ class Tree(NamedTuple):
         """Return the moving joints, which must be one chain."""
         moving = _moving([*self.joints.values()])
         if not moving or len(trunk := self.trunk()) < len(moving):
-            raise UrdfError(
+            raise BlfDscError(
                 'neither a tip nor joints were given, and the moving joints are not one chain: '
                 f'{_listed(moving)}. Set robot.tip to the last link of the arm'
             )
@@ -225,7 +211,7 @@ class Tree(NamedTuple):
                 continue
             kind, child = joint.get('type'), _link(joint, 'child')
             if kind not in (*_MOVING, 'fixed'):
-                raise UrdfError(f'joint {name!r} on {link!r} is {kind}: remove it from the URDF')
+                raise BlfDscError(f'joint {name!r} on {link!r} is {kind}: remove it from the URDF')
             frame, beyond = _origin(joint), self.body(child, joints)
             J = J + moved(beyond.J, frame)
             held += moved(beyond.held if kind == 'fixed' else beyond.J, frame)
@@ -237,17 +223,17 @@ def _robot(text: str) -> ET.Element:
     """Return the root element of a URDF."""
     expand = 'expand it first: `xacro FILE > robot.urdf` (from ROS or `pip install xacro`)'
     if '<!DOCTYPE' in text:  # its entities could expand to gigabytes
-        raise UrdfError('a URDF must not have a <!DOCTYPE ...>: remove it and expand its entities')
+        raise BlfDscError('a URDF must not have a <!DOCTYPE>: remove it, expand its entities')
     try:
         robot = ET.fromstring(text)  # noqa: S314 - without entities
     except ET.ParseError as error:
         hint = f'; this looks like xacro, {expand}' if 'xacro:' in text else ''
-        raise UrdfError(f'not a URDF, as it is not valid XML: {error}{hint}') from error
+        raise BlfDscError(f'not a URDF, as it is not valid XML: {error}{hint}') from error
     for element in robot.iter():
         if 'xacro' in element.tag or any('${' in value for value in element.attrib.values()):
-            raise UrdfError(f'<{element.tag}> is xacro, not URDF: {expand}')
+            raise BlfDscError(f'<{element.tag}> is xacro, not URDF: {expand}')
     if robot.tag != 'robot':
-        raise UrdfError(f'the root of a URDF is <robot>, not <{robot.tag}>: give another file')
+        raise BlfDscError(f'the root of a URDF is <robot>, not <{robot.tag}>: give another file')
     return robot
 
 
@@ -259,10 +245,10 @@ def _named(robot: ET.Element, tag: str) -> dict[str, ET.Element]:
     """Return the elements with a tag by name."""
     elements = robot.findall(tag)
     if len(elements) > _MOST:
-        raise UrdfError(f'the URDF has {len(elements)} {tag}s; at most {_MOST} can be read')
+        raise BlfDscError(f'the URDF has {len(elements)} {tag}s; at most {_MOST} can be read')
     named = {element.get('name', ''): element for element in elements}
     if len(named) < len(elements):
-        raise UrdfError(f'each {tag} needs a unique name; got {_listed(named)}')
+        raise BlfDscError(f'each {tag} needs a unique name; got {_listed(named)}')
     return named
 
 
@@ -271,18 +257,18 @@ def _joint(element: ET.Element, placement: np.ndarray, body: _Body) -> Joint:
     axis = _numbers(element.find('axis'), 'xyz', '1 0 0')
     length = float(np.sqrt((axis**2).sum()))
     if length < 1e-6:
-        raise UrdfError(f'the axis of joint {name!r} is zero: write a direction such as 0 0 1')
+        raise BlfDscError(f'the axis of joint {name!r} is zero: write a direction such as 0 0 1')
     limit = element.find('limit')
     lower, upper = -inf, inf
     if kind != 'continuous' and limit is not None:
         lower, upper = _number(limit, 'lower'), _number(limit, 'upper')
         if lower >= upper:
-            raise UrdfError(
+            raise BlfDscError(
                 f'joint {name!r} has an empty range, {lower:g} to {upper:g}: correct its <limit>'
             )
     for key in ('velocity', 'effort'):
         if (value := _number(limit, key)) < 0.0:
-            raise UrdfError(
+            raise BlfDscError(
                 f'joint {name!r} has <limit {key}="{value:g}">: it is a magnitude, so give '
                 f'{-value:g}, or 0 if it is unknown'
             )
@@ -352,7 +338,7 @@ def _link_inertia(link: ET.Element) -> np.ndarray:
     moments = np.linalg.eigvalsh(rotational_inertia(J))
     if mass < 0.0 or moments[0] < -max(1e-9 * moments[-1], _ROUNDED):
         figures = _listed(f'{moment:.3g}' for moment in moments)
-        raise UrdfError(
+        raise BlfDscError(
             f'link {link.get("name")!r} has a mass of {mass:g} kg and principal moments of inertia '
             f'of {figures} kg m^2: none can be negative; correct its <inertial>'
         )
@@ -392,7 +378,7 @@ def _numbers(element: ET.Element | None, key: str, default: str, count: int = 3)
         numbers = []
     largest = float_info.max if key in _LIMITS else _LARGEST
     if len(numbers) != count or not all(abs(number) <= largest for number in numbers):
-        raise UrdfError(
+        raise BlfDscError(
             f'<{element.tag} {key}="{text}">: expected {count} finite number(s) of at most '
             f'{largest:g} in magnitude'
         )
