@@ -22,18 +22,18 @@ WALL = (0.0, 9.81, 0.0)
 
 def test_chosen_columns_keep_their_values_names_and_units():
     chain, (q, dq) = chain_of('three'), np.random.default_rng(0).normal(size=(2, 3))
-    chosen = [(0, ROTOR), (1, 0), (1, 3), (2, 9)]
+    chosen = [(0, ROTOR), (1, 0), (1, 3), (1, ROTOR), (2, 9), (2, ROTOR)]
     part, whole = serial_chain(chain, WALL, chosen), serial_chain(chain, WALL)
     columns = [body * (ROTOR + 1) + entry for body, entry in chosen]
     # Wider, as with disturbance columns beside them.
-    rows, every = np.full((2, 3, 6), np.nan), np.full((2, 3, whole.p), np.nan)
+    rows, every = np.full((2, 3, 8), np.nan), np.full((2, 3, whole.p), np.nan)
     part.momentum_regressor(q, dq, *rows)
     whole.momentum_regressor(q, dq, *every)
-    np.testing.assert_array_equal(rows[:, :, :4], every[:, :, columns])
-    assert np.isnan(rows[:, :, 4:]).all()
-    assert part.parameter_names == ('rotor1', 'm2', 'm*cz2', 'Izz3')
-    rotor = 'kg' if chain.joints[0].kind == 'prismatic' else 'kg m^2'
-    assert part.parameter_units == (rotor, 'kg', 'kg m', 'kg m^2')
+    np.testing.assert_array_equal(rows[:, :, :6], every[:, :, columns])
+    assert np.isnan(rows[:, :, 6:]).all()
+    assert part.parameter_names == ('rotor1', 'm2', 'm*cz2', 'rotor2', 'Izz3', 'rotor3')
+    first, *others = ('kg' if j.kind == 'prismatic' else 'kg m^2' for j in chain.joints)
+    assert part.parameter_units == (first, 'kg', 'kg m', others[0], 'kg m^2', others[1])
     assert {joint.kind for joint in chain.joints} > {'prismatic'}
 
 
@@ -112,12 +112,3 @@ def test_prior_of_a_ball_is_the_same_in_every_direction():
     ten = deviations(J, 0.3, CENTRE)
     turned = np.transpose([inertia_of(turn @ pseudo_inertia(d) @ turn.T) for d in ten.T])
     np.testing.assert_allclose(turned @ turned.T, ten @ ten.T, atol=1e-15)
-
-
-@pytest.mark.parametrize('chain', CHAINS)
-def test_rotors_have_the_unit_of_their_joint(chain):
-    model = base_parameters(chain, WALL).model
-    units = dict(zip(model.parameter_names, model.parameter_units, strict=True))
-    for number, joint in enumerate(chain.joints, 1):
-        unit = units.get(f'rotor{number}')
-        assert unit in {None, 'kg' if joint.kind == 'prismatic' else 'kg m^2'}

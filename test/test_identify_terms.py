@@ -11,7 +11,6 @@ from pathlib import Path
 
 import mujoco
 import numpy as np
-import pinocchio
 import pytest
 from random_arm import PANDA, pinocchio_model, random_urdf
 from shaken_arm import (
@@ -23,6 +22,7 @@ from shaken_arm import (
     measured,
     recording_of,
     reference_of,
+    shake,
     truth_of,
     write_states,
 )
@@ -44,39 +44,19 @@ from blf_dsc_controller.identification.recording import Recording, joined, rows_
 ROBOT = Robot(urdf=PANDA_TEXT, tip='panda_hand_tcp')
 TRUTH = truth_of(PANDA_CHAIN, 1)
 LOAD = 2.0  # kg, a ball ...
-RADIUS = 0.03  # m
 CENTRE = (0.02, -0.03, 0.05)  # m, ... in the tip
+BASE = base_parameters(PANDA_CHAIN, GRAVITY)
 
 
-def model_of(truth, loaded):
-    bodies = truth.inertias.copy()
-    if loaded:
-        T = PANDA_CHAIN.tip_placement.copy()
-        T[:3, 3] += T[:3, :3] @ CENTRE
-        ball = LOAD * np.diag((*(0.2 * RADIUS**2,) * 3, 1.0))
-        bodies[-1] += inertia_of(T @ ball @ T.T)
-    none = np.zeros(7)
-    model = pinocchio_model(
-        corrected_urdf(PANDA_TEXT, PANDA_CHAIN, bodies, none, none, 'true'), PANDA
-    )
-    model.armature[:] = TRUTH.rotors
-    return model
+def moved(duration, seed=2, truth=TRUTH):
+    """States (N, 3, n) of a motion with viscous and Coulomb friction."""
+    return shake(PANDA_CHAIN, truth, reference_of(PANDA_CHAIN, seed), duration)
 
 
-def moved(duration, seed=2, *, loaded=False, truth=TRUTH):
-    """States (N, 3, n) of an exact motion with viscous and Coulomb friction, and its gravity."""
-    model = model_of(truth, loaded)
-    data = model.createData()
-    motion = reference_of(PANDA_CHAIN, seed).at(np.arange(0.0, duration, PERIOD))
-    q, dq, _ = np.moveaxis(motion, -2, 0)
-    torque = np.array([pinocchio.rnea(model, data, *row) for row in motion])
-    torque += TRUTH.viscous * dq + TRUTH.coulomb * np.sign(dq)
-    return np.stack((q, dq, torque), axis=1), gravity_of(model, q)
-
-
-def gravity_of(model, q):
-    data = model.createData()
-    return np.array([pinocchio.computeGeneralizedGravity(model, data, row) for row in q])
+def gravity_of(inertias, q):
+    """Torque of gravity (N, n) at the positions (N, n)."""
+    still = np.zeros_like(q)
+    return regressors_at(BASE.model, q, still, still, still) @ BASE.of(inertias, np.zeros(7))
 
 
 def identified(states, *arguments, robot=ROBOT):
@@ -90,7 +70,7 @@ def plain():
 
 @pytest.fixture(scope='module')
 def found(plain):
-    return identified(plain[0])
+    return identified(plain)
 
 
 def total(found):
@@ -113,14 +93,14 @@ def test_joint_whose_link_is_far_from_the_urdf_keeps_its_weight():
     T[:2, 3] = 0.1
     bodies = PANDA_CHAIN.inertias.copy()
     bodies[-1] = inertia_of(T @ pseudo_inertia(bodies[-1]) @ T.T)
-    states = moved(30.0, truth=TRUTH._replace(inertias=bodies))[0]
+    states = moved(30.0, truth=TRUTH._replace(inertias=bodies))
     robot = Robot(urdf=PANDA_TEXT, tip='panda_hand_tcp', payload=0.0)
     found = identified(states, robot=robot)
     assert (found.errors[2] < 0.005 * found.torque).all()
 
 
 def test_load_friction_and_stribeck_friction_are_recognised(plain):
-    states, gravity = plain[0].copy(), plain[1]
+    states, gravity = plain.copy(), gravity_of(TRUTH.inertias, plain[:, 0])
     v = states[:, 1]
     states[:, 2] += 0.06 * np.abs(gravity) * np.sign(v)
     states[:, 2, 3] += 3.0 * np.sign(v[:, 3]) * np.exp(-((v[:, 3] / 0.1) ** 2))
@@ -138,7 +118,7 @@ def test_load_friction_and_stribeck_friction_are_recognised(plain):
 
 
 def test_coupled_wrist_is_recognised_and_named(plain, tmp_path, capsys):
-    states = plain[0].copy()
+    states = plain.copy()
     h = PERIOD
     others = states[:, 1, [6, 5]]
     both = np.sign(states[:, 1, 5:].sum(axis=1, keepdims=True))
@@ -159,7 +139,7 @@ def test_coupled_wrist_is_recognised_and_named(plain, tmp_path, capsys):
 
 
 def test_rest_at_the_end_is_left_out(plain, found):
-    states = plain[0]
+    states = plain
     resting = np.vstack((states, np.repeat(states[-1:], 10_000, axis=0)))
     resting[len(states) :, 1] = 0.0
     resting[len(states) :, 2] += 5.0  # stiction, which is no fault of the model
@@ -173,14 +153,14 @@ def test_rest_at_the_end_is_left_out(plain, found):
 
 
 def test_efforts_without_gravity_are_named_and_used(plain, found):
-    states, gravity = plain
-    without = states - gravity[:, None] * [[0.0], [0.0], [1.0]]
+    gravity = gravity_of(TRUTH.inertias, plain[:, 0])
+    without = plain - gravity[:, None] * [[0.0], [0.0], [1.0]]
     assert 'GRAVITY IS MISSING' in next(problems_of(identified(without), 'torque'))
-    whole = identified(states, 'without-gravity')
+    whole = identified(plain, 'without-gravity')
     assert 'GRAVITY IS DOUBLE' in next(problems_of(whole, 'without-gravity'))
     # The drive compensates the gravity of the URDF exactly: then this is the whole torque.
-    without = states.copy()
-    without[:, 2] -= gravity_of(pinocchio_model(PANDA_TEXT, PANDA), states[:, 0])
+    without = plain.copy()
+    without[:, 2] -= gravity_of(PANDA_CHAIN.inertias, plain[:, 0])
     right = identified(without, 'without-gravity')
     assert total(right) < 2.0 * total(found)
     assert not list(problems_of(right, 'without-gravity'))
@@ -204,13 +184,14 @@ def is_the_load(found):
 
 @pytest.fixture(scope='module')
 def loaded():
-    return moved(20.0, 5, loaded=True)[0]
+    bodies, T = TRUTH.inertias.copy(), PANDA_CHAIN.tip_placement.copy()
+    T[:3, 3] += T[:3, :3] @ CENTRE
+    bodies[-1] += inertia_of(T @ (LOAD * np.diag((2e-4, 2e-4, 2e-4, 1.0))) @ T.T)
+    return moved(20.0, 5, TRUTH._replace(inertias=bodies))
 
 
 def test_load_is_weighed_with_a_recording_without_and_one_with_it(plain, loaded):
-    together, boundary = joined(
-        recording_of(measured(plain[0], 3)), recording_of(measured(loaded, 4))
-    )
+    together, boundary = joined(recording_of(measured(plain, 3)), recording_of(measured(loaded, 4)))
     is_the_load(identify_arm(together, ROBOT, picked_up=boundary))
 
 
@@ -218,7 +199,7 @@ def test_load_that_is_picked_up_is_found_and_weighed(plain, loaded, tmp_path, ca
     """The change is found; the jump from one motion to the other is a gap of the recording."""
     bag = tmp_path / 'bag'
     jump = np.full((10, 3, 7), np.nan)
-    write_states(bag, PANDA, np.vstack((plain[0], jump, loaded)))
+    write_states(bag, PANDA, np.vstack((plain, jump, loaded)))
     found = identify_bag(bag, ROBOT, pick_up=True)
     assert found.picked_up == pytest.approx(30.0, abs=1.0)
     is_the_load(found)
@@ -229,7 +210,7 @@ def test_load_that_is_picked_up_is_found_and_weighed(plain, loaded, tmp_path, ca
 
 
 def test_gains_turn_currents_into_torques(plain, found, tmp_path):
-    states, gains = plain[0].copy(), np.linspace(5.0, 11.0, 7)
+    states, gains = plain.copy(), np.linspace(5.0, 11.0, 7)
     states[:, 2] /= gains
     bag = write_states(tmp_path / 'bag', PANDA, states)
     other = identify_bag(bag, ROBOT, gains=gains)
@@ -241,7 +222,7 @@ def test_gains_turn_currents_into_torques(plain, found, tmp_path):
 @pytest.mark.parametrize('term', ['load', 'coupling'])
 def test_coupling_and_load_friction_that_would_drive_are_not_identified(plain, term):
     """Negative ones reduce the error, too, but friction does not drive."""
-    states, gravity = plain[0].copy(), plain[1]
+    states, gravity = plain.copy(), gravity_of(TRUTH.inertias, plain[:, 0])
     if term == 'load':
         states[:, 2, :2] -= 0.05 * (np.abs(gravity) * np.sign(states[:, 1]))[:, :2]
     else:
@@ -256,7 +237,7 @@ def test_table_of_recordings_has_a_row_for_a_folder_with_a_bag(
 ):
     monkeypatch.syspath_prepend(str(Path(__file__).parents[1] / 'benchmark'))
     benchmark = importlib.import_module('identification')
-    write_states(tmp_path / 'bag', PANDA, measured(plain[0], 3))
+    write_states(tmp_path / 'bag', PANDA, measured(plain, 3))
     (tmp_path / 'panda.urdf').write_text(PANDA_TEXT)
     monkeypatch.setattr(sys, 'argv', ['identification.py', 'recordings', str(tmp_path)])
     benchmark.main()

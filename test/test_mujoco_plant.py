@@ -15,7 +15,7 @@ pytest.importorskip('mujoco', reason='needs MuJoCo: pip install mujoco')
 
 from paper_case import P
 from plants import commands
-from test_plant_events import ALL_KINDS
+from test_plant_sampled import ALL_KINDS
 
 from blf_dsc_controller.configuration.nodes import load_loop
 from blf_dsc_controller.configuration.plant import PlantConfig

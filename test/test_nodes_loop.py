@@ -15,7 +15,7 @@ from rcl_interfaces.srv import SetParametersAtomically
 from rclpy.parameter import Parameter
 from rclpy.time import Time
 from ros_rig import FakeClock, simulated, states, torques
-from test_plant_events import ALL_KINDS
+from test_plant_sampled import ALL_KINDS
 
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.plant import PlantConfig

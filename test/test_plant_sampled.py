@@ -1,14 +1,20 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The sampled plant: its integrator against scipy, disturbances, and repeatable runs."""
+"""The sampled plant: its integrator against scipy, disturbances, events, and repeatable runs."""
+
+from __future__ import annotations
 
 import numpy as np
 import pytest
-from plants import FULL, ROUGH, START, commands, plant, run
-from scipy.integrate import RK45
+from paper_case import NO_DISTURBANCE
+from plants import ARM, FULL, ROUGH, START, commands, energies, plant, run
+from scipy.integrate import RK45, cumulative_simpson
 
 from blf_dsc_controller.compiled.jit import kernel
+from blf_dsc_controller.configuration.plant import PlantConfig
+from blf_dsc_controller.configuration.schema import build
 from sim_plant.kernels import observe, plant_views, step
 from sim_plant.motion import disturbing_torque, integrate, state_derivative, update_loads
+from sim_plant.plant import plant_of, plant_settings
 
 INITIAL = np.array([*START, 0.5, -1.0])
 TORQUE = np.array([-6.0, -2.0])
@@ -134,3 +140,126 @@ def test_reset_plant_repeats_its_run_and_restored_one_continues_bit_for_bit(sour
     arm.reset()
     assert arm.sample == 0
     assert (run(arm, torques[:60]) == first).all()
+
+
+SAMPLES = 40
+AT = 13  # sample at which the arm changes
+ALL_KINDS = {
+    'events.begin': [0.005, 0.015],
+    'events.duration': [0.02, 0.0],
+    'events.ramp': [0.004, 0.003],
+    'events.payload': [0.3, 0.2],
+    'events.sloshing': [0.0, 0.4],
+    'events.force': [3.0, 0.0, -2.0, 0.0, 1.0, 4.0],
+    'events.torque': [1.0, -2.0, 0.5, 0.0],
+    'events.viscous': [0.1, 0.2, 0.0, 0.3],
+    'events.coulomb': [0.0, 0.2, 0.1, 0.0],
+    'events.offset': [1e-4, 0.0, -2e-4, 1e-4],
+}
+
+
+def truths(given, samples=SAMPLES):
+    """True values (samples, 9) under the usual torques."""
+    arm, rows = plant_of(build(PlantConfig, given)), np.empty((samples, 9))
+    for row, torque in zip(rows, commands(samples), strict=True):
+        row[:] = arm.truth()
+        arm.step(torque)
+    return rows
+
+
+OFFSET = {'sensor.offset': [0.01, -0.02]}
+
+
+@pytest.mark.parametrize(
+    ('events', 'lasting'),
+    [
+        ({'payload': [0.25]}, {'arm.m2': 0.75}),
+        ({'payload': [0.25]}, {'load.payload': 0.25}),
+        ({'payload': [0.25]}, {'events.begin': [0.0, 0.0], 'events.payload': [0.125, 0.125]}),
+        ({'torque': [2.0, -1.0]}, {'disturbance.constant': [-1.9, 1.1]}),
+        ({'torque': [2.0, -1.0]}, {'load.torque': [2.0, -1.0]}),
+        ({'force': [1.0, 0.0, -2.0]}, {'load.force': [1.0, 0.0, -2.0]}),
+        ({'viscous': [0.1, 0.2]}, {'disturbance.viscous': [0.1, 0.2]}),
+        ({'coulomb': [0.1, 0.2]}, {'disturbance.coulomb': [0.1, 0.2]}),
+        ({'offset': OFFSET['sensor.offset']}, OFFSET),
+    ],
+)
+def test_event_is_equivalent_to_changing_the_plant_at_its_time(events, lasting):
+    given = {f'events.{name}': value for name, value in events.items()}
+    scheduled = plant_of(build(PlantConfig, {'events.begin': [AT * 1e-3], **given}))
+    changed, unchanged = plant_of(PlantConfig()), plant_of(PlantConfig())
+    torques = commands(SAMPLES)
+    before = [run(arm, torques[:AT]) for arm in (scheduled, changed, unchanged)]
+    changed.truth()  # what acts in this sample is summed once
+    changed.change(plant_settings(build(PlantConfig, lasting)))
+    after = [run(arm, torques[AT:]) for arm in (scheduled, changed, unchanged)]
+    for same in (before, after):
+        np.testing.assert_array_equal(*same[:2])
+    np.testing.assert_array_equal(scheduled.truth(), changed.truth())
+    assert np.any(after[2] != after[0])
+
+
+def test_payload_is_ramped_in_and_out_and_the_truth_follows():
+    events = {'begin': [0.01], 'duration': [0.02], 'ramp': [0.004], 'payload': [0.5]}
+    m2_l2_squared = truths({f'events.{name}': value for name, value in events.items()})[:, 1]
+    k = np.arange(SAMPLES)
+    present = np.clip((k - 10) / 4, 0.0, 1.0) - np.clip((k - 30) / 4, 0.0, 1.0)
+    np.testing.assert_allclose(m2_l2_squared, (0.5 + 0.5 * present) * 0.8**2, rtol=1e-14)
+
+
+def test_events_do_not_make_friction_negative():
+    for name in ('viscous', 'coulomb'):
+        decrease = {'events.begin': [0.0], f'events.{name}': [-1.0, -0.1]}
+        found = truths({f'disturbance.{name}': [0.3, 0.3], **decrease})
+        np.testing.assert_array_equal(found, truths({f'disturbance.{name}': [0.0, 0.3 - 0.1]}))
+
+
+OMEGA, MASS = 12.0, 0.4  # rad/s, kg
+
+
+def sloshing(samples, **events):
+    """State x (samples, 10) of an arm that falls, carrying a sloshing load from the start."""
+    given = {'begin': [0.0], 'sloshing': [MASS], 'sloshing_frequency': OMEGA} | events
+    events = {f'events.{name}': value for name, value in given.items()}
+    arm, rows = plant_of(build(PlantConfig, NO_DISTURBANCE | events)), np.empty((samples, 10))
+    for row in rows:
+        arm.measure()
+        row[:] = arm._now.x
+        arm.step(np.zeros(2))
+    return rows
+
+
+def spring_of(x):
+    """Stretch [m] and its rate [m/s] of the spring at the states x (samples, 10)."""
+    tips, rates = np.empty((2, len(x), 3))
+    jacobian = np.empty((3, 2))
+    for row, position, rate in zip(x, tips, rates, strict=True):
+        ARM.fill_tip(row[:2], position, jacobian)
+        rate[:] = jacobian @ row[2:4]
+    return x[:, 4:7] - tips, x[:, 7:10] - rates
+
+
+@pytest.mark.parametrize('zeta', [0.0, 0.3])
+def test_energy_of_arm_and_sloshing_load_changes_by_what_its_damper_takes(zeta):
+    """d/dt [E_arm + m v^2 / 2 + m g z + m omega^2 |y - x|^2 / 2] = -2 m zeta omega |v - dx|^2."""
+    x = sloshing(2000, sloshing_damping=zeta)
+    stretch, rate = spring_of(x)
+    energy = np.array([sum(energies(ARM, row[:2], row[2:4])) for row in x])
+    energy += MASS * (0.5 * np.sum(x[:, 7:10] ** 2, axis=1) + ARM.g * x[:, 6])
+    energy += 0.5 * MASS * OMEGA**2 * np.sum(stretch**2, axis=1)
+    power = 2.0 * MASS * zeta * OMEGA * np.sum(rate**2, axis=1)
+    taken = cumulative_simpson(power, dx=1e-3, initial=0.0)
+    assert np.ptp(energies(ARM, x[0, :2], x[0, 2:4])) > 1.0
+    assert np.abs(stretch).max() > 0.05
+    assert taken[-1] > 0.1 or zeta == 0.0
+    np.testing.assert_allclose(energy + taken, energy[0], atol=1e-7)
+
+
+def test_sloshing_load_begins_at_rest_relative_to_the_tip_and_leaves_no_trace():
+    x = sloshing(60, begin=[0.02], duration=[0.02])
+    for k in (20, 21):
+        stretch, rate = spring_of(x[k : k + 1])
+        assert np.abs(stretch).max() <= (1e-15 if k == 20 else 1e-4)
+        assert np.abs(rate).max() <= (1e-15 if k == 20 else 2e-2)
+    np.testing.assert_array_equal(x[:20, :4], sloshing(20, sloshing=[0.0])[:, :4])
+    np.testing.assert_array_equal(x[41, 4:], x[59, 4:])  # frozen, and of no effect
