@@ -44,7 +44,6 @@ class RosRig:
         self.executor = EventsExecutor(context=self.context)
         self.nodes = []
         self.tester = self._keep(rclpy.create_node('record_tester', context=self.context))
-        self._clients = {}
 
     def _keep(self, node):
         self.nodes.append(node)
@@ -57,7 +56,6 @@ class RosRig:
         rclpy.try_shutdown(context=self.context)
         # A node's services keep its participant, visible to others, until it is collected.
         self.tester = self.executor = None
-        self._clients.clear()
         gc.collect()
 
     def kill(self, node):
@@ -96,8 +94,7 @@ class RosRig:
     def spin(self, seconds):
         """Spin for a while."""
         end = time.monotonic() + seconds
-        while time.monotonic() < end:
-            self.executor.spin_once(timeout_sec=0.01)
+        self.until(lambda: time.monotonic() >= end)
 
     def run(self, arm, samples):
         """Let the loop run for this many samples."""
@@ -121,13 +118,11 @@ class RosRig:
 
     def call(self, service, name, request):
         """Call a service and return its response."""
-        key = (service, name)
-        if key not in self._clients:
-            self._clients[key] = self.tester.create_client(service, name)
-        client = self._clients[key]
+        client = self.tester.create_client(service, name)
         self.until(client.service_is_ready)
         future = client.call_async(request)
         self.until(future.done)
+        self.tester.destroy_client(client)
         return future.result()
 
     def reset(self, node):
