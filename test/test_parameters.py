@@ -99,17 +99,15 @@ def test_parameters_of_other_nodes_and_of_ros_are_ignored(bare_node):
 class Tuned:
     """A node that accepts changes, and the configurations it applied."""
 
-    def __init__(self, node):
-        self.node, self.applied, self.problems = node, [], []
-        declare(node, ControllerConfig)
-        on_change(node, ControllerConfig, self.applied.append, lambda _: self.problems)
+    def __init__(self, bare_node):
+        self.node, self.applied, self.problems = bare_node('blf_dsc_controller'), [], []
+        declare(self.node, ControllerConfig)
+        on_change(self.node, ControllerConfig, self.applied.append, lambda _: self.problems)
 
     def request(self, **given):
         """Send one atomic request; `__` stands for the dot."""
-        values = {name.replace('__', '.'): value for name, value in given.items()}
-        return self.node.set_parameters_atomically(
-            [Parameter(name, value=value) for name, value in values.items()]
-        )
+        changes = [Parameter(k.replace('__', '.'), value=v) for k, v in given.items()]
+        return self.node.set_parameters_atomically(changes)
 
     @property
     def config(self):
@@ -119,7 +117,7 @@ class Tuned:
 
 @pytest.fixture
 def tuned(bare_node):
-    return Tuned(bare_node('blf_dsc_controller'))
+    return Tuned(bare_node)
 
 
 def test_valid_changes_are_passed_on_once_each_as_a_whole_configuration(tuned):
