@@ -44,10 +44,6 @@ class BagError(BlfDscError):
     """A bag that cannot be read or written."""
 
 
-class DamageError(ValueError):
-    """A damaged file."""
-
-
 class BagMessage(NamedTuple):
     """A message in CDR, as recorded."""
 
@@ -90,7 +86,7 @@ class OpenBag:
         """Yield the messages of `topics`, nearly in order of reception.
 
         Raises:
-            DamageError: their number is not the one that the bag states.
+            ValueError: their number is not the one that the bag states.
         """
         found: Counter[str] = Counter()
         for message in self._of_files() if self._files else self._of_library(topics):
@@ -99,7 +95,7 @@ class OpenBag:
                 yield message
         for topic in topics:
             if found[topic] != self.counts[topic]:
-                raise DamageError(
+                raise ValueError(
                     f'it holds {found[topic]} messages of {topic}, but counts {self.counts[topic]}'
                 )
 
@@ -140,7 +136,7 @@ def next_record(stream: BinaryIO, size: int, kinds: Mapping[int, Any]) -> Any:
     head = stream.read(HEAD.size).ljust(HEAD.size, b'\xff')
     opcode, length = HEAD.unpack(head)
     if stream.tell() + length > size:
-        raise DamageError('cut off')
+        raise ValueError('cut off')
     if opcode == Opcode.MESSAGE:
         content = stream.read(length)
         return *_MESSAGE.unpack_from(content), content[_MESSAGE.size :]
@@ -150,7 +146,7 @@ def next_record(stream: BinaryIO, size: int, kinds: Mapping[int, Any]) -> Any:
     fields = ReadDataStream(BytesIO(stream.read(length)))
     record = kinds[opcode].read(fields)
     if fields.count != length:
-        raise DamageError('a record does not match its length')
+        raise ValueError('a record does not match its length')
     return record
 
 
@@ -160,22 +156,22 @@ def records_in(chunk: Chunk) -> Iterator[Any]:
     A message is a tuple: channel number, sequence number, log time and publish time [ns], content.
     """
     if chunk.uncompressed_size > _LARGEST_CHUNK:
-        raise DamageError(f'a chunk would unpack to {chunk.uncompressed_size} bytes')
+        raise ValueError(f'a chunk would unpack to {chunk.uncompressed_size} bytes')
     stream, size = get_chunk_data_stream(chunk, validate_crc=True)
     if size != chunk.uncompressed_size:
-        raise DamageError(f'a chunk of {chunk.uncompressed_size} bytes unpacks to {size}')
+        raise ValueError(f'a chunk of {chunk.uncompressed_size} bytes unpacks to {size}')
     records, at, message = stream.read(size), 0, _MESSAGE.unpack_from
     while at < size:
         opcode, length = HEAD.unpack_from(records, at)
         begin, at = at + HEAD.size, at + HEAD.size + length
         if at > size:
-            raise DamageError('a record does not match its length')
+            raise ValueError('a record does not match its length')
         if opcode == _MESSAGE_CODE:
             yield *message(records, begin), records[begin + _MESSAGE.size : at]
         elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
             yield _KINDS[opcode].read(ReadDataStream(BytesIO(records[begin:at])))
         else:
-            raise DamageError(f'unknown record type {opcode} in a chunk')
+            raise ValueError(f'unknown record type {opcode} in a chunk')
 
 
 @contextmanager

@@ -33,7 +33,6 @@ from blf_dsc_controller.bags.sources import (
     MAGIC_SIZE,
     METADATA,
     BagError,
-    DamageError,
     next_record,
     records_in,
 )
@@ -382,7 +381,7 @@ def _records(stream: BinaryIO, size: int, summary: Summary) -> Iterator[Any]:
         try:
             record = next_record(stream, size, _KINDS)
             if record is None or ((starts or chunks) and isinstance(record, tuple)):
-                raise DamageError('no such record belongs here')  # noqa: TRY301
+                raise ValueError('no such record belongs here')  # noqa: TRY301
             end = stream.tell()
             if not isinstance(record, Chunk):
                 yield record
