@@ -241,11 +241,6 @@ def rig():
     ros.close()
 
 
-def counts(bag):
-    with Reader(bag) as reader:
-        return {connection.topic: connection.msgcount for connection in reader.connections}
-
-
 @pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
 def test_all_is_on_disk_while_it_runs_and_a_signal_completes_the_bag(rig, bag, number):
     process = rig.record(bag)
@@ -253,7 +248,7 @@ def test_all_is_on_disk_while_it_runs_and_a_signal_completes_the_bag(rig, bag, n
     rig.until(lambda: messages_on_disk(bag / 'bag_0.mcap') == 10_000)
     code, output = rig.end(process, number)
     assert code == 0, output
-    assert counts(bag) == {f'/{topic}': 2000 for topic in TOPICS}
+    assert Counter(topic for topic, *_ in read(bag)) == {f'/{topic}': 2000 for topic in TOPICS}
     assert all(f'/{topic}: 2000 messages' in output for topic in TOPICS)
     assert 'invalid' not in output  # a context that was shut down
 
@@ -264,7 +259,7 @@ def test_signal_before_any_message_leaves_an_empty_bag_that_is_not_overwritten(r
         rig.until(lambda code=code: code or bag.exists())
         returned, output = rig.end(process, signal.SIGTERM) if code == 0 else rig.output(process)
         assert (returned, words in output) == (code, True), output
-        assert counts(bag) == {}
+        assert read(bag) == []
 
 
 def test_full_disk_stops_the_recorder_with_one_error(rig, tmp_path):
@@ -274,11 +269,9 @@ def test_full_disk_stops_the_recorder_with_one_error(rig, tmp_path):
         while process.poll() is None:
             assert time.monotonic() < deadline, 'still recording'
             rig.publish(*range(100))
-        _, output = process.communicate()
-        assert process.returncode == 1
+        code, output = rig.output(process)
         hint = f'No space left on device; blf_dsc recover {disk / "bag"}'
-        assert output.count(hint) == output.count('No space left') == 1
-        assert 'Traceback' not in output
+        assert (code, output.count(hint), output.count('No space left')) == (1, 1, 1)
         assert recover(disk / 'bag', tmp_path / 'clean').messages['/a'] > 1000
 
 

@@ -357,11 +357,13 @@ def test_types_of_this_package_need_a_name_but_no_definition(entries, tmp_path, 
     assert (code, lost in output) == (1, True)
 
 
-def test_files_that_are_missing_or_hold_less_than_the_metadata_say(entries, copy, run, all_say):
+def test_files_that_are_missing_or_hold_other_numbers_than_stated(entries, copy, run, all_say):
     all_say(copy.parent, f'did you mean {copy}?')
-    written = recorded_run.write(copy.parent / 'bag', without_states(entries))
-    shutil.copy(written / 'bag_0.mcap', copy)
-    all_say(copy, 'it holds 0 messages of /joint_states, but counts 301')
+    others = without_states(entries)
+    for changed, count in ((others, 0), (entries + entries, 602)):
+        written = recorded_run.write(copy.parent / f'{count}', changed)
+        shutil.copy(written / f'{count}_0.mcap', copy / 'bag_0.mcap')
+        all_say(copy, f'it holds {count} messages of /joint_states, but counts 301')
     (copy / 'bag_0.mcap').unlink()
     all_say(copy, f'{copy} cannot be read as a bag', 'bag_0.mcap')
     code, _, error = run('recover', copy, '--out', 'clean')

@@ -12,7 +12,6 @@ import recorded_run
 import synthetic_bag
 from mcap.opcode import Opcode
 from mcap.records import Chunk
-from recorded_run import raw_records
 from synthetic_bag import BOUND_RAD, JOINTS, LIMIT_NM, PARAMETERS, TRUE, Synthetic
 
 from blf_dsc_controller.bags.content import NameMap, read_content
@@ -193,21 +192,6 @@ def test_repeated_states_and_those_of_other_joints_are_counted(tmp_path):
         '1 of 202 joint states left out: they name other joints',
         '1 joint states left out: they repeat the stamp before',
     )
-
-
-def test_lost_chunk_is_an_error_of_every_reader(tmp_path):
-    """Also if the index does not mention it, and if it is in the file twice."""
-    path = synthetic_bag.write(tmp_path / 'bag', MESSAGES)
-    data = (path / 'bag_0.mcap').read_bytes()
-    chunk = next(raw for _, raw in raw_records(data) if raw[0] == Opcode.CHUNK)
-    start = int.from_bytes(data[-28:-20], 'little')  # of the description, without a checksum
-    for times in (0, 2):
-        begin = (start + (times - 1) * len(chunk)).to_bytes(8, 'little')
-        footer = data[-37:-28] + begin + bytes(12) + data[-8:]
-        changed = (data[:-37] + footer).replace(chunk, times * chunk, 1)
-        (path / 'bag_0.mcap').write_bytes(changed)
-        with pytest.raises(BagError, match=r'messages of .*, but counts'):
-            read_run(path)
 
 
 def test_record_longer_than_its_chunk_is_an_error_without_a_checksum_too():
