@@ -298,7 +298,7 @@ OTHERS = named('a', 'b')
 AMONG = ('gripper', 'joint2', 'rail', 'joint1')
 TWICE = ('joint1', 'joint2', 'joint1')
 ESTIMATED = {'safety.velocity': 'estimated'}
-AVERAGED = {'safety.overrun_window': 0.1}
+STRICT = {'safety.overrun_fraction': 0.05}
 FAST = {'reference.amplitude': [1.0, 1.0], 'reference.offset': [1.2935, 0.6961]}
 IMPATIENT = {'safety.saturation_time': 0.01}
 IN_THE_BALL = {'learning.radius': 0.6, 'learning.initial_estimate': [0.55, 0.16, 0.16]}
@@ -350,7 +350,7 @@ FAULTS = (
     Fault('50 ms of silence, watchdog off', silence(50), R.STAMP_JUMP, 50),
     Fault('joint states stop for good', every(lambda _: []), R.STATE_TIMEOUT, 60, live=True),
     Fault('controller process stalls for 200 ms', stalled, live=True),
-    Fault('only every third state arrives', sparse(3), R.OVERRUN, 100, AVERAGED),
+    Fault('only every third state arrives', sparse(3), R.OVERRUN, 100, STRICT),
     Fault('wall clock set back by an hour', wall_clock_back, live=True),
     Fault('encoders frozen', frozen, R.OUTSIDE_BOUND, 120, FAST),
     Fault('arm jammed', jammed, R.NO_EFFECT, 120),

@@ -189,16 +189,6 @@ def test_joint_states_may_have_another_order_and_other_joints():
     np.testing.assert_array_equal(others.position, [0.0, 2.0, 1.0])
 
 
-@pytest.mark.parametrize('missing', ['invalid', 'absent'])
-def test_incomplete_states_have_positions_only(missing):
-    telemetry = PlantTelemetry(('a', 'b'), ())
-    _, raw = telemetry.joint_states(7, np.arange(6.0), missing)
-    decoder = JointStateDecoder(('a', 'b'), ('position',))
-    assert decoder.decode(raw) == 7
-    np.testing.assert_array_equal(decoder.position, [0.0, 1.0])
-    assert np.isnan(decoder.values[2:]).all()
-
-
 @pytest.mark.parametrize(
     ('given', 'problem'),
     [

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Configuration warnings: none for sound gains, and what they warn of does happen."""
+"""Gains: what is warned of does happen, and what follows from a URDF has margins."""
 
 from __future__ import annotations
 
@@ -190,10 +190,8 @@ def test_neither_gains_nor_the_residual_floor_rest_on_placeholders():
     rotors = config.robot.rotors(config.robot.chain(config.joints))
     assert max(rotors) < 0.2  # kg m^2, instead of 5
     assert arm_of('panda').learning.residual_floor == (0.87,) * 4 + (0.12,) * 3
-    bare = arm_of(
-        'panda', changes={'robot.urdf': STICKY, **BARE}
-    )  # not compensated before it is learned
-    assert not settings_of_config(bare).initial_estimate[-14:].any()
+    bare = arm_of('panda', changes={'robot.urdf': STICKY, **BARE})
+    assert not settings_of_config(bare).initial_estimate[-14:].any()  # learned before it is used
 
 
 # Margins and expected errors of the gains derived from a URDF, at three sample rates.

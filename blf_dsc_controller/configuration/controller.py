@@ -112,9 +112,6 @@ class Safety:
     watchdog: Literal['auto', 'on', 'off'] = parameter(
         'auto', 'steady-clock watchdog for missing states; auto: only if stamps are wall-clock time'
     )
-    repeated_states: int = non_negative(
-        3, 'consecutive states with an unchanged stamp to ignore', 'samples', at_most=1_000_000
-    )
     velocity: Literal['measured', 'estimated'] = parameter(
         'measured',
         'velocity as measured, or estimated from position differences, starting at rest',
@@ -130,9 +127,8 @@ class Safety:
         0.5, 'longest time of torques at their limit, less a quarter of the time without', 's'
     )
     overrun_fraction: float = positive(
-        0.4, 'largest fraction of missed states, averaged over overrun_window', at_most=1.0
+        0.4, 'largest fraction of missed states, averaged over a second', at_most=1.0
     )
-    overrun_window: float = positive(1.0, 'time over which missed states are averaged', 's')
     first_torque: Literal['check', 'send'] = parameter(
         'check', 'refuse a first torque that an arm at rest contradicts, or send it unchecked'
     )

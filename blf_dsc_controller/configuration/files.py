@@ -88,7 +88,8 @@ def parse(text: str) -> tuple[Section, ...]:
     sections: dict[tuple[str, ...], Section] = {}
     for names, node in _leaves(root, ()):
         if _MARK not in names:
-            raise _outside(names, node)
+            outside = f'{names[-1]} has a value, but is outside of {_MARK}' if names else ''
+            raise _error(node, outside or f'expected node names or {_MARK} at the top')
         at = names.index(_MARK)
         pattern, name = f'/{"/".join(names[:at]).removeprefix("/")}', '.'.join(names[at + 1 :])
         if not all(_PART.fullmatch(part) for part in pattern.split('/')[1:]):
@@ -162,12 +163,6 @@ def _scalar(node: yaml.Node, name: str) -> object:
     if not node.value:
         raise _error(node, f'{name} has no value')
     return parse_scalar(node.value)
-
-
-def _outside(names: tuple[str, ...], node: yaml.Node) -> ConfigurationError:
-    if not names:
-        return _error(node, f'expected node names or {_MARK} at the top')
-    return _error(node, f'{names[-1]} has a value, but is outside of {_MARK}')
 
 
 def _line(node: Any) -> int:

@@ -150,11 +150,8 @@ class Sensor:
     published_joints: tuple[str, ...] = _fixed(
         (), 'names in joint states, in order; others stay at 0; empty: `joints`', omittable=True
     )
-    incomplete: Literal['invalid', 'absent'] = _fixed(
-        'invalid', 'velocities and efforts of `incomplete_states`: NaN, or none'
-    )
     incomplete_states: int = _magnitude(
-        0, 'joint states without velocities and efforts, before the first one', at_most=100
+        0, 'joint states with velocities and efforts of NaN before the first one', at_most=100
     )
 
 

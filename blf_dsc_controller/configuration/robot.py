@@ -142,9 +142,9 @@ class Robot:
 
     def rotors(self, chain: Chain) -> np.ndarray:
         """Return drive inertias (n,) [kg m^2]: as given, or rated torque / 400 rad/s^2."""
-        is_given = len(self.rotor_inertia) == len(chain.joints)
-        guessed = self.efforts(chain) / _DRIVE_ACCELERATION
-        return np.array(self.rotor_inertia) if is_given else guessed
+        if len(self.rotor_inertia) == len(chain.joints):
+            return np.array(self.rotor_inertia)
+        return self.efforts(chain) / _DRIVE_ACCELERATION
 
 
 def implausible_friction(chain: Chain) -> tuple[str, ...]:

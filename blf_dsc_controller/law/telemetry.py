@@ -148,7 +148,6 @@ class PlantTelemetry:
             what + joint for what in (topics.POSITION, topics.VELOCITY) for joint in joints
         ]
         self._joint_states = JointStateEncoder(names)
-        self._positions_only = JointStateEncoder(names, ('position',))
         self._places = [names.index(joint) for joint in joints]
         self._published = np.zeros((3, len(names)))
         self._truth = JointStateEncoder(
@@ -158,18 +157,10 @@ class PlantTelemetry:
             (topics.LATENCY, topics.LATENESS, topics.LATE_STEPS), ('position',)
         )
 
-    def joint_states(self, stamp: int, measurement: np.ndarray, missing: str = '') -> Message:
-        """Encode measured [q, dq, applied torque of the last interval] (3 n,).
-
-        Velocities and efforts may be `missing`: invalid or absent.
-        """
+    def joint_states(self, stamp: int, measurement: np.ndarray) -> Message:
+        """Encode measured [q, dq, applied torque of the last interval] (3 n,)."""
         self._published[:, self._places] = measurement.reshape(3, -1)
-        position, *others = self._published
-        if missing == 'absent':
-            return topics.JOINT_STATES, self._positions_only.encode(stamp, position)
-        if missing:
-            others = [np.full(position.size, np.nan)] * 2
-        return topics.JOINT_STATES, self._joint_states.encode(stamp, position, *others)
+        return topics.JOINT_STATES, self._joint_states.encode(stamp, *self._published)
 
     def truth(self, stamp: int, truth: np.ndarray) -> Message:
         """Encode the true [P, tau_dist, q, dq] (p + 3 n,)."""

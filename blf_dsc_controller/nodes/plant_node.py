@@ -19,7 +19,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable, Iterator
 from functools import partial
-from math import inf
+from math import inf, nan
 from typing import Any
 
 from rclpy.timer import Timer
@@ -306,10 +306,11 @@ class PlantNode(LoopNode[PlantConfig]):
             self._publish(self._telemetry.clock(stamp))
 
     def _publish_incomplete_states(self) -> None:
-        sensor, measurement = self.config.sensor, self.plant.measure()
-        for ahead in range(sensor.incomplete_states, 0, -1):
+        measurement = self.plant.measure().copy()
+        measurement[len(self.config.joints) :] = nan
+        for ahead in range(self.config.sensor.incomplete_states, 0, -1):
             stamp = self.stamp - ahead * self.config.sample_time_ns
-            self._publish(self._telemetry.joint_states(stamp, measurement, sensor.incomplete))
+            self._publish(self._telemetry.joint_states(stamp, measurement))
 
     def _tell_parameters(self) -> None:
         """Publish all parameters, in force from the start."""

@@ -123,14 +123,18 @@ def rate_mismatch(period: float, sample_time: float) -> str:
     )
 
 
+_REPEATS = 3  # states in a row with the stamp of the one before that are ignored
+_AVERAGED = 1.0  # s, over which missed states are
+
+
 class StateCheck:
     """Checks joint states, one after the other.
 
     Attributes:
         repeated: states ignored because their stamp was repeated.
         missed: states missing between consecutive stamps, since the start.
-        missed_fraction: fraction of missed states, averaged exponentially over
-            safety.overrun_window; by their stamps, so a slow computer in lock-step misses none.
+        missed_fraction: fraction of missed states, averaged exponentially over a second; by their
+            stamps, so a slow computer in lock-step misses none.
     """
 
     def __init__(self, joints: Sequence[str], sample_time: float) -> None:
@@ -162,7 +166,7 @@ class StateCheck:
         is_first = self._last_stamp < 0
         step = self._sample_time if is_first else (stamp - self._last_stamp) * _NANO
         if step == 0.0:
-            return self._check_repeats(safety)
+            return self._check_repeats()
         self._repeats = 0
         if step < 0.0:
             text = f'the stamp of a joint state is {-step:.6g} s before the last one'
@@ -177,16 +181,16 @@ class StateCheck:
         self._last_stamp = stamp
         return self._count_missed(safety, max(1, round(step / self._sample_time)) - 1)
 
-    def _check_repeats(self, safety: Safety) -> Fault:
+    def _check_repeats(self) -> Fault:
         self.repeated += 1
         self._repeats += 1
-        if self._repeats <= safety.repeated_states:
+        if self._repeats <= _REPEATS:
             return SKIP
         text = f'{self._repeats} joint states in a row repeat the stamp of the one before them'
         return Fault(Reason.STAMP_REPEATED, text)
 
     def _count_missed(self, safety: Safety, missed: int) -> Fault | None:
-        keep = 1.0 - min(1.0, self._sample_time / safety.overrun_window)
+        keep = 1.0 - min(1.0, self._sample_time / _AVERAGED)
         self.missed += missed
         self.missed_fraction *= keep
         if missed:
@@ -195,8 +199,8 @@ class StateCheck:
             return None
         text = (
             f'{100.0 * self.missed_fraction:.0f} % of the joint states were missed: more than '
-            f'safety.overrun_fraction allows over {safety.overrun_window:g} s, or the arm sends '
-            f'them less often than every {self._sample_time:g} s (sample_time)'
+            'safety.overrun_fraction allows, or the arm sends them less often than every '
+            f'{self._sample_time:g} s (sample_time)'
         )
         return Fault(Reason.OVERRUN, text)
 
