@@ -6,6 +6,7 @@ from __future__ import annotations
 import contextlib
 import json
 import re
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -300,9 +301,9 @@ def test_every_trial_has_its_own_truth_motion_and_noise():
 def test_cost_penalises_rough_torque_and_is_largest_for_a_diverged_run():
     figures = laws.Figures((1e-3, 1e-2, 1e-1, 1e0), 200.0, laws.ROUGHEST / 2.0, ())
     assert laws.cost_of(figures) == pytest.approx(1.5)
-    assert laws.cost_of(figures._replace(roughness=10.0 * laws.ROUGHEST)) == pytest.approx(11.5)
-    assert laws.cost_of(figures._replace(errors=(np.nan,) * 4)) == 30.0
-    assert laws.cost_of(figures._replace(errors=(1e300,) * 4)) == 30.0
+    assert laws.cost_of(replace(figures, roughness=10.0 * laws.ROUGHEST)) == pytest.approx(11.5)
+    assert laws.cost_of(replace(figures, errors=(np.nan,) * 4)) == 30.0
+    assert laws.cost_of(replace(figures, errors=(1e300,) * 4)) == 30.0
 
 
 def test_table_shows_the_worst_run_of_each_law():
@@ -311,7 +312,7 @@ def test_table_shows_the_worst_run_of_each_law():
     outside = laws.Figures((2e-3,) * 4, 1.0, 0.02, (0.03, 0.0))
     results = {
         'proposed': laws.Result({}, None, [inside, outside]),
-        'slotine_li_tuned': laws.Result({'position': 3.0}, 1.0, [inside._replace(model=())]),
+        'slotine_li_tuned': laws.Result({'position': 3.0}, 1.0, [replace(inside, model=())]),
     }
     heads, proposed, tuned, gains = (
         re.split(r'  +', line) for line in laws.format_results(results).splitlines()
@@ -334,7 +335,7 @@ def test_every_law_is_tuned_and_run_and_learning_finds_the_model(tmp_path, monke
     for name, contender in laws.CONTENDERS.items():
         assert list(found[name]['gains']) == [gain.name for gain in contender.gains]
         again = laws.run(name, laws.trial('ur5e', 1), found[name]['gains'], rows)  # in this process
-        assert found[name]['runs'] == [json.loads(json.dumps(again._asdict()))]
+        assert found[name]['runs'] == [json.loads(json.dumps(asdict(again)))]
     learned, guessed = (found[name]['runs'][0]['model'] for name in ('proposed', 'no_learning'))
     assert learned[0] < guessed[0] / 2.0
     assert learned[1] < guessed[1] / 5.0  # the URDF does not include the payload

@@ -7,7 +7,7 @@ import json
 import math
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, is_dataclass
 from functools import partial
 from operator import itemgetter
 from pathlib import Path
@@ -408,7 +408,7 @@ def write_json(numbers: Any, path: Path) -> None:
 
 def plain(value: Any) -> Any:
     """Convert to data for JSON: lists and dictionaries, None instead of NaN and infinity."""
-    if isinstance(value, Metrics):
+    if is_dataclass(value) and not isinstance(value, type):
         value = asdict(value)
     if isinstance(value, dict):
         return {str(key): plain(each) for key, each in value.items()}

@@ -25,9 +25,7 @@ _PAUSE_IN_A_LOG = 10.0  # s between two updates of the bar
 def paper(options: Namespace) -> None:
     """Run the paper's Section IV with every law, and print its claims and the table of the laws."""
     claims, table = paper_study.compare(make_folder(options.out))
-    for claim in claims:
-        for where, line in zip((claim.where, '', ''), claim.lines, strict=True):
-            print(f'{where:<18} {line}')
+    print(*claims, sep='\n')
     print(aligned(table))
     print(f'wrote {options.out}: results.json, five pictures, configurations of all runs')
 

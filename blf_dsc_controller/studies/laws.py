@@ -12,6 +12,7 @@ import importlib
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import NamedTuple, Protocol
@@ -209,7 +210,8 @@ CONTENDERS = {
 }
 
 
-class Figures(NamedTuple):
+@dataclass(frozen=True)
+class Figures:
     """Figures of one run: largest true error of any joint in each of INTERVALS, torque, model."""
 
     errors: tuple[float, ...]  # rad
@@ -299,7 +301,8 @@ def load_laws(path: Path) -> list[str]:
     return list(added)
 
 
-class Result(NamedTuple):
+@dataclass(frozen=True)
+class Result:
     """A contender on one arm: tuned gains and their cost (None if not tuned), validation runs."""
 
     gains: dict[str, float]
@@ -311,10 +314,6 @@ class Result(NamedTuple):
         rows = [(*figures.errors, *(figures.model or (np.nan, np.nan))) for figures in self.runs]
         units = np.where(np.arange(len(COLUMNS)) < len(INTERVALS), 1e3, 1e2)
         return np.asarray((np.array(rows) * units).T)
-
-
-Results = dict[str, dict[str, Result]]
-"""Results by arm and contender."""
 
 
 def trial(name: str, seed: int) -> LoopConfig:
@@ -383,13 +382,13 @@ def chosen_laws(given: Sequence[str]) -> list[str]:
     return list(dict.fromkeys(names))
 
 
-def compare(folder: Path, arms: Sequence[str], laws: Sequence[str]) -> Results:
-    """Tune and run everything, and write figures.json into an empty folder.
+def compare(folder: Path, arms: Sequence[str], laws: Sequence[str]) -> dict[str, dict[str, Result]]:
+    """Tune and run everything, and write figures.json; return the results by arm and contender.
 
     `laws` are as in `chosen_laws`.
     """
     names = chosen_laws(laws)
-    results: Results = {arm: {} for arm in arms}
+    results: dict[str, dict[str, Result]] = {arm: {} for arm in arms}
     rows = [(arm, name) for arm in arms for name in names]
     with ProcessPoolExecutor(cores(), initializer=chosen_laws, initargs=(laws,)) as pool:
         for arm, name in tqdm(rows, unit='law'):
@@ -406,14 +405,7 @@ def compare(folder: Path, arms: Sequence[str], laws: Sequence[str]) -> Results:
                 gains, cost = values_of(name, found.x), float(found.fun)
             runs = pool.map(partial(run, name, values=gains, unseen=unseen), others)
             results[arm][name] = Result(gains, cost, list(runs))
-    numbers = {
-        arm: {
-            name: {**result._asdict(), 'runs': [figures._asdict() for figures in result.runs]}
-            for name, result in found.items()
-        }
-        for arm, found in results.items()
-    }
-    write_json(numbers, folder / 'figures.json')
+    write_json(results, folder / 'figures.json')
     return results
 
 

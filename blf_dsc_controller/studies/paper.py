@@ -197,11 +197,10 @@ class Claim(NamedTuple):
     verdict: str
     condition: str = ''
 
-    @property
-    def lines(self) -> tuple[str, str, str]:
-        """What is claimed, the verdict with its condition, and what was measured."""
+    def __str__(self) -> str:
         only_if = f' {self.condition}' if self.verdict == ONLY_IF else ''
-        return self.says, f'{self.verdict}{only_if}', self.measured
+        lines = self.says, f'{self.verdict}{only_if}', self.measured
+        return f'{self.where:<18} ' + f'\n{"":<18} '.join(lines)
 
 
 def verdict(*runs: bool | None) -> str:
