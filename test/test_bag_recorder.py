@@ -340,10 +340,6 @@ def test_real_time_loop_is_timed_and_every_message_of_it_is_in_the_bag(tmp_path)
     logs = [
         (out / 'logs' / f'{node}.log').read_text() for node in (topics.PLANT, topics.CONTROLLER)
     ]
-    # Granted or denied, as this machine permits, but always logged.
-    assert 'SCHED_FIFO priority 10' in logs[0]
-    assert 'memory' in logs[0]
-
     numbers = defaultdict(list)
     with (out / 'bag' / 'bag_0.mcap').open('rb') as stream:
         for _, channel, message in make_reader(stream).iter_messages():
