@@ -20,7 +20,7 @@ from blf_dsc_controller.bags.sources import BagError, BagMessage, records_in
 from blf_dsc_controller.bags.topic_messages import TopicMessages, UnreadableMessageError
 from blf_dsc_controller.bags.writer import BagWriter
 from blf_dsc_controller.cli.main import main
-from blf_dsc_controller.messages.codecs import JointStateEncoder
+from blf_dsc_controller.messages.codecs import JOINT_STATE_FIELDS, JointStateEncoder
 from blf_dsc_controller.messages.journal import EventType, Journal
 from blf_dsc_controller.messages.topics import (
     COMMANDS,
@@ -201,16 +201,17 @@ def test_record_longer_than_its_chunk_is_an_error_without_a_checksum_too():
 
 
 def test_any_rows_of_long_topics_of_many_layouts_are_read():
-    """Of two devices; the arm's joints change their order, and the name of its tool."""
-    encoders = [
-        JointStateEncoder(names)
+    """Of two devices; the arm's joints change their order, the tool its name, later the fields."""
+    lists = [
+        names
         for k in range(150)
         for names in (('a', 'b', f'tool{k}'), (f'tool{k}', 'b', 'a'), ('c',))
     ]
     messages = TopicMessages('/x', JOINT_STATES.type)
     for k in range(3000):
         values = [k] if k % 3 == 2 else [k, -k, k][:: 1 - k % 3 * 2]
-        raw = encoders[k % 450].encode(10**9 + k, values, values, values)
+        fields = dict.fromkeys(JOINT_STATE_FIELDS[: 2 if k < 600 else 3], values)
+        raw = JointStateEncoder(lists[k % 450], fields).encode(10**9 + k, **fields)
         messages.add(BagMessage('/x', k + 7, raw, k + 1))
     for states, expected in (
         (messages.joint_states(('b', 'a')), np.flatnonzero(np.arange(3000) % 3 < 2)),
@@ -226,6 +227,8 @@ def test_any_rows_of_long_topics_of_many_layouts_are_read():
                 (states.field(1)[rows, -1], 0),
             ):
                 np.testing.assert_array_equal(values, known + offset)
+        effort = states.field(2)[:, -1]
+        np.testing.assert_array_equal(effort, np.where(expected < 600, np.nan, expected))
         lost = states.select(np.array([-1, 900, -1])).field(1)[:, -1]
         np.testing.assert_array_equal(lost, [np.nan, expected[900], np.nan])
 
