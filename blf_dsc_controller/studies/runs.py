@@ -166,11 +166,12 @@ def require_pyarrow() -> Any:
 
 
 def versions() -> dict[str, str]:
-    """Return the versions on which the numbers depend besides the configuration."""
+    """Return what must be equal, besides the configuration, where a study is resumed."""
     return {
         'blf_dsc_controller': blf_dsc_controller.__version__,
         'kernels': cache_folder(run_loop).name,
         'numpy': np.__version__,
+        'chunks': f'{_CHUNKS} of at most {_MOST} runs',  # by whose names `missing` goes
     }
 
 
