@@ -20,7 +20,7 @@ from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.plant import PlantConfig
 from blf_dsc_controller.configuration.schema import build
 from blf_dsc_controller.messages import topics
-from blf_dsc_controller.messages.codecs import JointStateDecoder, JointStateEncoder
+from blf_dsc_controller.messages.codecs import JointStateDecoder
 from blf_dsc_controller.nodes.controller_node import ControllerNode
 from blf_dsc_controller.nodes.endpoints import message_class, qos_profile
 from blf_dsc_controller.nodes.plant_node import PlantNode
@@ -147,29 +147,6 @@ class FakeClock:
 
     def advance(self, seconds):
         self.now += round(1e9 * seconds)
-
-
-class Arm:
-    """A stand-in for the arm: sends joint states to a controller and receives its torques."""
-
-    def __init__(self, ros, names=JOINTS):
-        self._ros = ros
-        self._publisher = ros.publisher(topics.JOINT_STATES)
-        self.commands = ros.listen(topics.COMMANDS)
-        self._encoder = JointStateEncoder(names)
-
-    def torque_for(self, k, position, velocity=None, *, encoder=None):
-        """Send the state of sample k and return the torque received (2,) [N m]."""
-        size = len(position)
-        velocity = np.zeros(size) if velocity is None else velocity
-        raw = (encoder or self._encoder).encode(
-            1_000_000_000 + k * 1_000_000, position, velocity, np.zeros(size)
-        )
-        self._ros.until(lambda: self._publisher.get_subscription_count() > 0)
-        before = len(self.commands)
-        self._publisher.publish(raw)
-        self._ros.until(lambda: len(self.commands) > before)
-        return torques(self.commands)[-1]
 
 
 def torques(messages):

@@ -14,7 +14,7 @@ from random_arm import random_urdf
 from rcl_interfaces.srv import SetParameters
 from rclpy.parameter import Parameter
 from rclpy.timer import Timer
-from ros_rig import JOINTS, START, Arm, FakeClock, torques
+from ros_rig import JOINTS, START, FakeClock, torques
 
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.errors import StartError
@@ -38,21 +38,43 @@ def law_torques(*measurements):
     ]
 
 
+class Arm:
+    """A stand-in for the arm: sends joint states to a controller and receives its torques."""
+
+    def __init__(self, ros, names=JOINTS):
+        self._ros, self._encoder = ros, JointStateEncoder(names)
+        self._publisher = ros.publisher(topics.JOINT_STATES)
+        self.commands = ros.listen(topics.COMMANDS)
+        ros.until(self._publisher.get_subscription_count)
+
+    def send(self, stamp, position, velocity=None):
+        """Send a state, at rest unless told otherwise, with its stamp [ns]."""
+        still = np.zeros(len(position))
+        velocity = still if velocity is None else velocity
+        self._publisher.publish(self._encoder.encode(stamp, position, velocity, still))
+
+    def torque_for(self, k, *state):
+        """Send the state of sample k and return the torque received (2,) [N m]."""
+        before = len(self.commands)
+        self.send(1_000_000_000 + k * 1_000_000, *state)
+        self._ros.until(lambda: len(self.commands) > before)
+        return torques(self.commands)[-1]
+
+
 def test_safe_torque_is_repeated_when_the_arm_falls_silent(ros, monkeypatch):
     """By a timer that its callback never resets: with no time left, those would multiply."""
     monkeypatch.setattr(Timer, 'reset', None)
     clock = FakeClock()
     node = ros.add(ControllerNode, {'safety.watchdog': 'on'}, clock=clock)
     arm = Arm(ros)
-    commands = ros.listen(topics.COMMANDS)
     assert arm.torque_for(0, START).any()
     assert not node.guard.supervisor.text
     clock.advance(0.1)
     ros.until(lambda: node.guard.supervisor.text)  # only the clock has advanced
     assert 'no joint state received for' in node.guard.supervisor.text
-    before = len(commands)
-    ros.until(lambda: clock.advance(0.01) or len(commands) >= before + 20)
-    np.testing.assert_array_equal(torques(commands)[-1], ZERO)
+    before = len(arm.commands)
+    ros.until(lambda: clock.advance(0.01) or len(arm.commands) >= before + 20)
+    np.testing.assert_array_equal(torques(arm.commands)[-1], ZERO)
 
 
 @pytest.mark.parametrize('where', ['in the law', 'in another callback'])
@@ -79,14 +101,6 @@ def test_unexpected_error_is_answered_with_the_safe_torque_at_once(ros, where):
     assert arm.torque_for(2, START).any()
 
 
-def sender(ros, joints=JOINTS):
-    """Return a function that sends a controller the state at q, at rest, with a stamp [ns]."""
-    states, still = ros.publisher(topics.JOINT_STATES), np.zeros(len(joints))
-    ros.until(states.get_subscription_count)
-    encoder = JointStateEncoder(joints)
-    return lambda stamp, q: states.publish(encoder.encode(stamp, q, still, still))
-
-
 UNSUPPORTED = {'robot.urdf': random_urdf(3, seed=5)[0], 'robot.tip': 'tip'}
 TOO_SLOW = (
     'joint states come every 0.01 s, but sample_time is 0.001 s: set update_rate of '
@@ -108,32 +122,30 @@ def test_live_arm_is_measured_before_the_start(ros, steps, given, failure):
 
     States lost on a busy computer are no other rate.
     """
-    node, commands = ros.add(ControllerNode, given), ros.listen(topics.COMMANDS)
-    joints, stamp = node.config.joints, time.time_ns()
-    send = sender(ros, joints)
+    node, stamp = ros.add(ControllerNode, given), time.time_ns()
+    arm = Arm(ros, node.config.joints)
     for k in range(12):
         stamp += steps[k % len(steps)] * 10**6
-        send(stamp, START if joints == JOINTS else np.zeros(3))
+        arm.send(stamp, np.zeros(3) if given else START)
         ros.until(lambda k=k: node.finished or node._arrivals is None or len(node._arrivals) > k)
-        assert bool(commands) <= (k > 9 and not failure)
-    ros.until(lambda: node.finished if failure else commands)
+        assert bool(arm.commands) <= (k > 9 and not failure)
+    ros.until(lambda: node.finished if failure else arm.commands)
     assert failure in str(node.failure)
     ros.spin(0.1)
-    assert bool(commands) != bool(failure)
+    assert bool(arm.commands) != bool(failure)
 
 
 def test_single_live_state_is_started_from_as_its_sender_waits_for_a_torque(ros):
     ros.add(ControllerNode, {'safety.state_timeout': 600.0})
-    send, commands = sender(ros), ros.listen(topics.COMMANDS)
+    arm = Arm(ros)
     ros.spin(0.2)
-    send(time.time_ns(), START)
-    ros.until(lambda: commands)
+    arm.send(time.time_ns(), START)
+    ros.until(lambda: arm.commands)
 
 
 def test_start_outside_the_bound_is_reported_with_joint_error_and_bound(ros):
     node = ros.add(ControllerNode, {'approach.enabled': False})
-    ros.listen(topics.COMMANDS)
-    sender(ros)(10**9, (START[0], START[1] - 0.0021))
+    Arm(ros).send(10**9, (START[0], START[1] - 0.0021))
     ros.until(lambda: node.finished)
     # 1.696 - 0.0021 against the reference's 1.6961 at its start
     assert isinstance(node.failure, StartError)

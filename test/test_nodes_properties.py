@@ -13,7 +13,6 @@ import pytest
 
 pytest.importorskip('rclpy', reason='needs ROS 2')
 
-import rclpy
 from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 from lifecycle_msgs.msg import Transition
@@ -105,22 +104,6 @@ def events(messages):
     return st.lists(event, max_size=30)
 
 
-@pytest.fixture(scope='module')
-def context():
-    context = rclpy.Context()
-    rclpy.init(context=context, signal_handler_options=rclpy.SignalHandlerOptions.NO)
-    yield context
-    rclpy.try_shutdown(context=context)
-
-
-@pytest.fixture(scope='module')
-def bystander(context):
-    """Keep the middleware up between examples, which makes them ten times faster."""
-    node = rclpy.create_node('bystander', context=context)
-    yield node
-    node.destroy_node()
-
-
 def apply_event(node, kind, content):
     """Apply one event to a node, through the callbacks that ROS would call."""
     if kind == 'transition':
@@ -139,12 +122,11 @@ def apply_event(node, kind, content):
         node.set_parameters_atomically([typed])
 
 
-@pytest.mark.usefixtures('bystander')
 @given(events(joint_states()))
 @example([('parameter', ('torque.limit', [1.0, 5e-324]))])
 @SETTINGS
-def test_controller_survives_arbitrary_input(context, sequence):
-    node = ControllerNode(context=context, cli_args=[], enable_rosout=False)
+def test_controller_survives_arbitrary_input(ros, sequence):
+    node = ControllerNode(context=ros.context, cli_args=[], enable_rosout=False)
     commands = []
     node._command = lambda torque: torque is None or commands.append(torque.copy())
     node._is_observed = lambda: True
@@ -174,16 +156,15 @@ def commands(draw):
     return draw(st.binary(max_size=60))
 
 
-@pytest.mark.usefixtures('bystander')
 @given(events(commands()))
 @SETTINGS
-def test_plant_survives_arbitrary_input(context, sequence):
+def test_plant_survives_arbitrary_input(ros, sequence):
     overrides = [
         Parameter('mode', value='lockstep'),
         Parameter('actuator.torque_limit', value=[20.0, 20.0]),
     ]
     node = PlantNode(
-        context=context, cli_args=[], enable_rosout=False, parameter_overrides=overrides
+        context=ros.context, cli_args=[], enable_rosout=False, parameter_overrides=overrides
     )
     node._is_observed = lambda: True
     node._peers = iter(())  # all there
