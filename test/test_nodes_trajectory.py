@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from functools import partial
 from threading import Event
 
 import numpy as np
@@ -12,9 +11,11 @@ import pytest
 
 pytest.importorskip('rclpy', reason='needs ROS 2')
 
+from rclpy.duration import Duration
 from rclpy.serialization import serialize_message
-from ros_rig import PATIENCE
-from sent_trajectory import JOINTS, SECOND, inputs, send, trajectory, two_tones
+from rclpy.time import Time
+from ros_rig import JOINTS, PATIENCE
+from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 from blf_dsc_controller.messages import topics
 from blf_dsc_controller.messages.codecs import MessageError, joint_trajectory
@@ -26,17 +27,57 @@ PATIENT = {'safety__state_timeout': 60.0}
 PLANNED = {watchdog: PATIENT | {'safety__watchdog': watchdog} for watchdog in ('on', 'off')}
 
 
+SECOND = 1_000_000_000
+FIELDS = ('positions', 'velocities', 'accelerations')
+
+
+def two_tones(t, shift):
+    """Return position, velocity and acceleration (3, 2) at t [s] of two tones on each joint."""
+    rates, sizes = np.array([1.0, 2.3]), np.array([[0.2, 0.08], [0.25, -0.05]])
+    tones = sizes * np.exp(1j * (rates * t + [0.2, -0.9]))
+    motion = np.array([(tones * (1j * rates) ** k).sum(axis=1).real for k in range(3)])
+    motion[0] += [1.9, 1.4] + shift * np.ones(2)
+    return motion
+
+
+def trajectory(joints, shift, *, duration, fields=3, stamp=0):
+    """Return a trajectory into two tones within a second, at rest a second after them."""
+    sent = JointTrajectory(joint_names=joints)
+    sent.header.stamp = Time(nanoseconds=stamp).to_msg()
+    times = 1.0 + 0.05 * np.arange(round(duration / 0.05))
+    points = [two_tones(t, shift) for t in times]
+    rest = np.vstack((points[-1][:1], np.zeros((2, 2))))
+    for t, point in zip((*times, times[-1] + 1.0), (*points, rest), strict=True):
+        values = point[:fields, [JOINTS.index(joint) for joint in joints]]
+        at = Duration(nanoseconds=round(t * 1e9)).to_msg()
+        arrays = dict(zip(FIELDS, values, strict=False))
+        sent.points.append(JointTrajectoryPoint(**arrays, time_from_start=at))
+    return sent
+
+
+def inputs(law):
+    """Return the status of the trajectories that a controller was sent."""
+    return law._status.trajectories
+
+
+def send(ros, law, sent):
+    """Send a trajectory; return the reason of the last rejection, empty if there was none."""
+    name = '/' + topics.JOINT_TRAJECTORY.relative
+    publisher = ros.tester.create_publisher(JointTrajectory, name, 10)
+    ros.until(lambda: publisher.get_subscription_count() > 0)
+    before = inputs(law).accepted + inputs(law).rejected
+    publisher.publish(sent)
+    ros.until(lambda: inputs(law).accepted + inputs(law).rejected > before)
+    ros.tester.destroy_publisher(publisher)
+    return inputs(law).reason
+
+
 def phase(law):
     return law.guard.supervisor.phase
 
 
-@pytest.fixture
-def sender(ros):
-    return partial(send, ros)
-
-
 @pytest.mark.parametrize('watchdog', ['on', 'off'])
-def test_two_tone_trajectory_is_tracked_within_the_bound_and_replaced_twice(ros, sender, watchdog):
+def test_two_tone_trajectory_is_tracked_within_the_bound_and_replaced_twice(ros, watchdog):
     references = ros.listen(topics.REFERENCE)
     errors = ros.listen(topics.TRACKING_ERROR)
     # Planned in a thread, it is followed the later, the busier the computer: then in less time.
@@ -48,7 +89,7 @@ def test_two_tone_trajectory_is_tracked_within_the_bound_and_replaced_twice(ros,
     orders = (JOINTS, JOINTS[::-1], JOINTS)
     for shift, joints, fields in zip(shifts, orders, (3, 2, 3), strict=True):
         message = trajectory(joints, np.array(shift), duration=3.0, fields=fields)
-        assert sender(law, message) == ''
+        assert send(ros, law, message) == ''
         ros.run(arm, 1800)
     begin = law.guard.start_stamp
     last = [1e-9 * (law.guard.last_stamp - begin)]
@@ -97,7 +138,7 @@ REJECTED = {
 
 @pytest.mark.parametrize('watchdog', ['on', 'off'])
 @pytest.mark.parametrize('spoil', REJECTED, ids=lambda spoil: spoil.__name__)
-def test_rejected_trajectory_changes_nothing(ros, sender, monkeypatch, spoil, watchdog):
+def test_rejected_trajectory_changes_nothing(ros, monkeypatch, spoil, watchdog):
     """Planned in the background, or not."""
     arm, law = ros.loop(None, PLANNED[watchdog])
     ros.run(arm, 20)
@@ -107,22 +148,22 @@ def test_rejected_trajectory_changes_nothing(ros, sender, monkeypatch, spoil, wa
         monkeypatch.setattr('blf_dsc_controller.supervision.guard.plan_trajectory', spoil)
     else:
         spoil(sent)
-    assert REJECTED[spoil] in sender(law, sent)
+    assert REJECTED[spoil] in send(ros, law, sent)
     assert inputs(law).rejected == 1
     np.testing.assert_array_equal(law.guard.controller.reference_vector, before)
     ros.run(arm, 20)
     assert phase(law) is Phase.TRACKING
 
 
-def test_header_stamp_sets_the_start_of_a_trajectory(ros, sender):
+def test_header_stamp_sets_the_start_of_a_trajectory(ros):
     """Before the start of the loop it is rejected."""
     arm, law = ros.loop(None, BRISK)
     sent = trajectory(JOINTS, 0.0, duration=0.1)
-    assert 'not in command: starting' in sender(law, sent)
+    assert 'not in command: starting' in send(ros, law, sent)
     ros.run(arm, 20)
     begin = law.guard.start_stamp + 3 * SECOND
     sent = trajectory(JOINTS, 0.0, duration=0.1, stamp=begin)
-    sender(law, sent)
+    send(ros, law, sent)
     assert inputs(law).accepted == 1
     reference_at = law.guard.controller.reference_at
     np.testing.assert_allclose(reference_at(4.0), two_tones(1.0, 0.0), atol=1e-9)

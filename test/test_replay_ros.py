@@ -19,8 +19,8 @@ from rclpy.serialization import deserialize_message
 from recorded_run import compared, of
 from ros_rig import FakeClock, RosRig, activate, configure, deactivate
 from sensor_msgs.msg import JointState
-from sent_trajectory import JOINTS, SECOND, send, trajectory
 from std_msgs.msg import String
+from test_nodes_trajectory import JOINTS, SECOND, send, trajectory
 
 from blf_dsc_controller.bags.content import read_content
 from blf_dsc_controller.bags.sources import open_bag
