@@ -18,7 +18,7 @@ pytest.importorskip('yourdfpy', reason='needs viser: pip install blf_dsc_control
 
 from command import COMMAND, wait_for
 from rclpy.parameter import Parameter
-from ros_rig import RosRig, activate, configure
+from ros_rig import activate, configure
 from sensor_msgs.msg import JointState
 
 from blf_dsc_controller.bags.reader import read_run
@@ -28,33 +28,18 @@ from blf_dsc_controller.view.node import ViewNode
 EVENT = {'events.begin': [1.0], 'events.duration': [0.5], 'events.payload': [0.25]}
 
 
-@pytest.fixture(scope='module')
-def rig():
-    rig = RosRig()
-    yield rig
-    rig.close()
-
-
-@pytest.fixture(scope='module')
-def loop(rig):
-    """Plant, controller and the page that shows them."""
-    view = rig.add(ViewNode, port=18180)
-    rig.until(lambda: view.page._state == ('STALE', 'waiting for /blf_dsc_controller/journal'))
-    arm, law = rig.loop({**EVENT, 'autostart': False})
-    rig.until(lambda: view._plant)
-    assert configure(rig, arm)
-    assert activate(rig, arm)
-    rig.until(lambda: len(view.past) > 3)
-    return arm, law, view
-
-
 def events_with(view, word):
     return [event for event in view.page._events if word in f'{event}']
 
 
-def test_page_shows_the_loop(rig, loop):
-    _arm, _law, view = loop
-    rig.until(lambda: view.past[-1].time > 2.0)
+def test_page_shows_the_loop_its_events_and_that_its_controller_is_gone(ros):
+    view = ros.add(ViewNode, port=18180)
+    ros.until(lambda: view.page._state == ('STALE', 'waiting for /blf_dsc_controller/journal'))
+    arm, law = ros.loop({**EVENT, 'autostart': False})
+    ros.until(lambda: view._plant)
+    assert configure(ros, arm)
+    assert activate(ros, arm)
+    ros.until(lambda: view.past and view.past[-1].time > 2.0)
     now = view.past[-1]
     assert np.abs(now.error).max() < 0.002
     assert now.bound == pytest.approx([0.002, 0.002])
@@ -64,29 +49,24 @@ def test_page_shows_the_loop(rig, loop):
     assert [t for t, *_ in events_with(view, '0.25 kg picked up')] == [1.0]
     assert [t for t, *_ in events_with(view, '0.25 kg put down')] == [1.5]
 
-
-def test_payload_and_reset_are_shown(rig, loop):
-    arm, _, view = loop
     arm.set_parameters([Parameter('load.payload', value=0.5)])
-    rig.until(lambda: view.past[-1].loaded)
+    ros.until(lambda: view.past[-1].loaded)
     arm.set_parameters([Parameter('load.payload', value=0.0)])
-    rig.until(lambda: len(events_with(view, 'load.payload')) == 2)
-    rig.reset(arm)
-    rig.until(lambda: events_with(view, 'reset'))
-    rig.until(lambda: 0.1 < view.past[-1].time < 1.0)  # counted from the new start
+    ros.until(lambda: len(events_with(view, 'load.payload')) == 2)
+    ros.reset(arm)
+    ros.until(lambda: events_with(view, 'reset'))
+    ros.until(lambda: 0.1 < view.past[-1].time < 1.0)  # counted from the new start
 
-
-def test_killed_controller_is_reported_as_gone(rig, loop):
-    _, law, view = loop
-    rig.kill(law)
-    rig.until(lambda: view.page._state[0] == 'ERROR' and 'gone' in view.page._state[1])
+    ros.kill(law)
+    ros.until(lambda: view.page._state[0] == 'ERROR' and 'gone' in view.page._state[1])
     # The arm goes on without it: its last error is no longer shown.
     assert np.isfinite(view.past[-1].error).all()
     states = view.create_publisher(JointState, 'joint_states', 1)
     state = JointState(name=['joint1', 'joint2'], position=[0.1, 0.2])
     state.header.stamp.sec = view._sampled // 10**9 + 2
-    rig.until(lambda: states.publish(state) or view.past[-1].position[0] == 0.1)
+    ros.until(lambda: states.publish(state) or view.past[-1].position[0] == 0.1)
     assert np.isnan(view.past[-1].error).all()
+    view.close()
 
 
 def test_page_of_a_run_is_served_until_the_run_ends(tmp_path):
