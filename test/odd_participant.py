@@ -16,33 +16,25 @@ import rclpy
 from std_msgs.msg import String
 
 _KEPT = []  # names that the middleware reads, kept alive
-_IDENTIFIER = b'rosidl_typesupport_fastrtps_c'
-_get_pointer = ctypes.pythonapi.PyCapsule_GetPointer
-_get_pointer.restype, _get_pointer.argtypes = ctypes.c_void_p, (ctypes.py_object, ctypes.c_char_p)
-_get_name = ctypes.pythonapi.PyCapsule_GetName
-_get_name.restype, _get_name.argtypes = ctypes.c_char_p, (ctypes.py_object,)
+_LIBRARY = 'libstd_msgs__rosidl_typesupport_fastrtps_c.so'
+_HANDLE = 'rosidl_typesupport_fastrtps_c__get_message_type_support_handle__std_msgs__msg__String'
 
 
 class TypeSupport(ctypes.Structure):
     """First fields of rosidl_message_type_support_t."""
 
-
-TypeSupport._fields_ = (
-    ('identifier', ctypes.c_char_p),
-    ('data', ctypes.POINTER(ctypes.c_char_p)),  # begins with namespace and name
-    (
-        'find',
-        ctypes.CFUNCTYPE(ctypes.POINTER(TypeSupport), ctypes.POINTER(TypeSupport), ctypes.c_char_p),
-    ),
-)
+    _fields_ = (
+        ('identifier', ctypes.c_char_p),
+        ('data', ctypes.POINTER(ctypes.c_char_p)),  # begins with namespace and name
+    )
 
 
 def rename(namespace, name):
     """Rename std_msgs/String in this process."""
-    String.__class__.__import_type_support__()
-    capsule = String.__class__._TYPE_SUPPORT
-    found = ctypes.cast(_get_pointer(capsule, _get_name(capsule)), ctypes.POINTER(TypeSupport))
-    names = found.contents.find(found, _IDENTIFIER).contents.data
+    String.__class__.__import_type_support__()  # loads its libraries
+    handle = getattr(ctypes.CDLL(_LIBRARY), _HANDLE)
+    handle.restype = ctypes.POINTER(TypeSupport)
+    names = handle().contents.data
     _KEPT.extend((namespace, name))
     names[0], names[1] = namespace, name
 

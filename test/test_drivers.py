@@ -6,7 +6,7 @@ from __future__ import annotations
 import json
 import re
 import shlex
-from typing import NamedTuple
+from types import SimpleNamespace
 
 import numpy as np
 import pinocchio
@@ -36,30 +36,20 @@ from blf_dsc_controller.simulation.loop import START, simulate
 from blf_dsc_controller.supervision.guard import Guard
 from sim_plant.plant import plant_of
 
-
-class Facts(NamedTuple):
-    """What the sources of a driver say; each is named beside it."""
-
-    preset: str
-    joint_states: str
-    commands: str
-    rate: float  # Hz
-    joints: tuple[str, ...]
-
-
+# What the sources of a driver say; each is named beside it.
 FACTS = {
     # franka_ros2 jazzy 29cb85a (3.4.0)
-    'fr3': Facts(
+    'fr3': SimpleNamespace(
         preset='fr3',
         # franka_bringup/launch/franka.launch.py: the broadcaster's remapping
         joint_states='/franka/joint_states',
         commands='/fr3_effort_controller/commands',  # config/fr3_effort_controller.yml
-        rate=1000.0,  # franka_bringup/config/controllers.yaml: update_rate
+        rate=1000.0,  # Hz; franka_bringup/config/controllers.yaml: update_rate
         # franka_description 566ba44, robots/common/franka_arm.xacro with the prefix fr3_
         joints=tuple(f'fr3_joint{i}' for i in range(1, 8)),
     ),
     # Universal_Robots_ROS2_Driver jazzy a16a268 (3.8.0)
-    'ur5e': Facts(
+    'ur5e': SimpleNamespace(
         preset='ur5e_driver',
         joint_states='/joint_states',  # ur_robot_driver/launch/ur_control.launch.py
         # ur_robot_driver/config/ur_controllers.yaml: a forward_command_controller

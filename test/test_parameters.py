@@ -58,10 +58,7 @@ def test_empty_list_stays_empty_and_keeps_its_type_and_description(bare_node, tm
     assert descriptor.type == ParameterType.PARAMETER_STRING_ARRAY
     assert descriptor.description == 'topics to record; empty: all'
     (result,) = node.set_parameters([Parameter('topics', value=['/clock'])])
-    assert (
-        result.reason
-        == 'topics is fixed at the start: a bag is opened once, when the recorder starts'
-    )
+    assert result.reason.startswith('topics is fixed at the start: a bag is opened once')
     node = bare_node('bag_recorder', overrides={'topics': ['/clock']})
     assert declare(node, RecorderConfig).topics == ('/clock',)
 

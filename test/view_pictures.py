@@ -7,7 +7,6 @@ while the browser draws.
 
 from __future__ import annotations
 
-import argparse
 import io
 import time
 from pathlib import Path
@@ -23,6 +22,7 @@ from blf_dsc_controller.nodes.controller_node import ControllerNode
 from blf_dsc_controller.nodes.plant_node import PlantNode
 from blf_dsc_controller.view.node import ViewNode
 
+OUT = Path('doc/view.webp')
 TIMES = np.arange(17.0, 26.0, 0.25)  # s; it picks up 2 kg at 20 s
 SETTLE = 1.5  # s, until the browser has drawn a frame without a GPU
 RATE = 8.0  # frames per second
@@ -62,12 +62,9 @@ def pictures():
 
 def main():
     """Write the animation."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument('--out', type=Path, default=Path('doc/view.webp'))
-    options = parser.parse_args()
     first, *others = pictures()
     first.save(
-        options.out,
+        OUT,
         save_all=True,
         append_images=others,
         duration=round(1000.0 / RATE),
@@ -75,7 +72,7 @@ def main():
         quality=60,
         method=6,
     )
-    print(f'{options.out}: {options.out.stat().st_size / 1e6:.2f} MB')
+    print(f'{OUT}: {OUT.stat().st_size / 1e6:.2f} MB')
 
 
 if __name__ == '__main__':
