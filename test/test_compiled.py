@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import os
-import platform
 import shutil
 import sys
 from pathlib import Path
@@ -122,17 +121,6 @@ def test_kernels_of_another_checkout_or_of_the_package_are_found_and_never_of_ot
         assert compiled_in(checkout, folder) == (other, 0, 1)
         assert compiled_in(checkout, folder) == (other, 1, 0)
     assert sorted(shipped.rglob('*')) == before
-
-
-@pytest.mark.skipif(platform.machine() != 'x86_64', reason='names processors of this kind')
-@pytest.mark.skipif(numba.config.DISABLE_JIT, reason='nothing is compiled')
-def test_code_for_a_named_processor_is_found_again_and_not_loaded_elsewhere(tmp_path):
-    """As an image does that is compiled once for many computers."""
-    checkout, named = PACKAGE.parent, {'NUMBA_CPU_NAME': 'x86-64', 'NUMBA_CPU_FEATURES': ''}
-    entry, *counts = compiled_in(checkout, tmp_path, **named)
-    assert counts == [0, 1]
-    assert compiled_in(checkout, tmp_path, **named) == (entry, 1, 0)
-    assert compiled_in(checkout, tmp_path) == (entry, 0, 1)
 
 
 @compiling

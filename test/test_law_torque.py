@@ -74,21 +74,17 @@ def test_lyapunov_function_decreases_while_the_bound_narrows():
     assert max(ratios) < 0.8
 
 
-def test_virtual_control_is_that_of_the_paper_without_its_singularity():
-    gain, mu, dqr = 150.0, 20.0, -0.3
+def test_virtual_control_has_no_singularity():
+    """Elsewhere inside the bound it is that of the plain law."""
 
-    def ours(xi1, dqr=dqr):
-        return barrier.virtual_control(xi1, BOUND, gain, mu, dqr)
+    def ours(xi1, dqr=0.0):
+        return barrier.virtual_control(xi1, BOUND, 150.0, 20.0, dqr)
 
-    assert ours(0.0) == dqr  # elsewhere inside the bound it is that of the plain law
+    assert ours(0.0, -0.3) == -0.3
     for xi1 in (1e-12, -1e-9, 1e-7):  # linear: the next term is 1e-17 at 1e-7 rad
-        assert ours(xi1, 0.0) == pytest.approx(-(gain / 2.0 + mu) * xi1, rel=1e-14)
-    # At the bound only mu is left: sinc(pi (1 - e)^2) = 2 e to first order.
-    e = 1e-9
-    part = dqr - mu * BOUND * (1.0 - e) - ours(BOUND * (1.0 - e))
-    assert part == pytest.approx(gain / 2.0 * BOUND * 2.0 * e, abs=1e-15)
-    for xi1 in (BOUND, -1.1 * BOUND, 10.0 * BOUND):
-        assert ours(xi1) == dqr - mu * xi1
+        assert ours(xi1) == pytest.approx(-95.0 * xi1, rel=1e-14)
+    for xi1 in (BOUND, -1.1 * BOUND, 10.0 * BOUND):  # only mu is left
+        assert ours(xi1) == -20.0 * xi1
     for x in (1e-6, -5e-5, np.nextafter(1e-4, 0.0), 1e-4, 0.1, -2.0):
         assert barrier.sinc(x) == pytest.approx(sin(x) / x, abs=3e-16)
 
