@@ -313,6 +313,12 @@ def test_no_step_leaves_the_ball(seed, size, speed, radius):
         assert np.linalg.norm(estimate) <= radius * (1.0 + 1e-15)
 
 
+def test_inward_rates_are_kept_on_the_sphere():
+    w, inward = np.array([2.0, 2.0, 1.0]), -np.array([2.0, 2.0, 1.0])
+    adaptation.project(w, inward, np.array([0.05, 1.0, 20.0]), 3.0)
+    np.testing.assert_array_equal(inward, -w)
+
+
 @pytest.mark.parametrize('bad', [np.nan, np.inf])
 def test_non_finite_estimates_are_left_for_the_supervisor(bad):
     estimate = np.array([bad, 1.0, 1.0])
