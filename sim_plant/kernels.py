@@ -19,10 +19,9 @@ import numpy as np
 from blf_dsc_controller.compiled.elementary import exp, tanh
 from blf_dsc_controller.compiled.jit import inner, kernel
 from blf_dsc_controller.compiled.layout import Array, part, view
-from sim_plant.arm import Arm
+from sim_plant.arm import Arm, fill_gravity
 from sim_plant.layout import MEASURED, Encoders, PlantSettings, PlantState, settings_of, state_of
 from sim_plant.motion import disturbing_torque, integrate, update_loads
-from sim_plant.rigid_body import fill_gravity
 
 
 @inner

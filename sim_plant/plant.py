@@ -15,7 +15,7 @@ from blf_dsc_controller.arms.urdf import Chain, inertia_of, moved, pseudo_inerti
 from blf_dsc_controller.compiled.layout import pack
 from blf_dsc_controller.configuration.plant import Deviation, PlantConfig
 from blf_dsc_controller.configuration.robot import parameters_of
-from sim_plant.arm import Arm, PointMassArm
+from sim_plant.arm import Arm, PointMassArm, motion_size, rigid_arm, rigid_bodies
 from sim_plant.kernels import (
     generator,
     lag,
@@ -34,7 +34,6 @@ from sim_plant.layout import (
     PlantSettings,
     state_size,
 )
-from sim_plant.rigid_body import motion_size, rigid_arm, rigid_bodies
 
 T = TypeVar('T')
 

@@ -17,7 +17,7 @@ from blf_dsc_controller.identification.prior import base_matrix
 from blf_dsc_controller.identification.recording import Recording
 from blf_dsc_controller.messages.codecs import Float64MultiArrayEncoder, JointStateEncoder
 from blf_dsc_controller.messages.topics import COMMANDS, JOINT_STATE
-from sim_plant.rigid_body import rigid_arm, rigid_bodies
+from sim_plant.arm import rigid_arm, rigid_bodies
 
 PANDA_TEXT = (CONFIG / 'panda.urdf').read_text()
 PANDA_CHAIN = read_chain(PANDA_TEXT, 'panda_link0', 'panda_hand_tcp', PANDA)

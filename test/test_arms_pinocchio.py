@@ -10,10 +10,10 @@ from closed_loop_case import MODEL
 from random_arm import ARMS, chain_of, configuration, pinocchio_model
 
 from blf_dsc_controller.arms.base_parameters import base_parameters
-from blf_dsc_controller.arms.geometry import frames
 from blf_dsc_controller.arms.model import inertia_matrices, regressors_at
 from blf_dsc_controller.arms.serial_chain import ROTOR, serial_chain
-from sim_plant.rigid_body import motion_of, rigid_arm, rigid_bodies
+from blf_dsc_controller.arms.urdf import frames
+from sim_plant.arm import motion_of, rigid_arm, rigid_bodies
 
 
 class Case:

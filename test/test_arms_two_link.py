@@ -9,11 +9,11 @@ import pytest
 from plants import ARM
 from random_arm import chain_of
 
-from blf_dsc_controller.arms.geometry import Clearance, distance, frames
 from blf_dsc_controller.arms.model import arm_model, regressors_at
 from blf_dsc_controller.arms.serial_chain import serial_chain
 from blf_dsc_controller.arms.two_link import urdf
-from blf_dsc_controller.arms.urdf import read_chain
+from blf_dsc_controller.arms.urdf import frames, read_chain
+from blf_dsc_controller.identification.exciting_reference import Clearance, distance
 from sim_plant.arm import PointMassArm
 
 

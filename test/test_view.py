@@ -12,8 +12,7 @@ from random_arm import random_urdf
 
 pytest.importorskip('yourdfpy', reason='needs viser: pip install blf_dsc_controller[view]')
 
-from blf_dsc_controller.arms.geometry import frames
-from blf_dsc_controller.arms.urdf import read_chain
+from blf_dsc_controller.arms.urdf import frames, read_chain
 from blf_dsc_controller.cli.main import main
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.errors import BlfDscError, MissingExtraError

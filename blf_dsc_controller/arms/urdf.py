@@ -124,6 +124,25 @@ def read_chain(text: str, base: str, tip: str, joints: tuple[str, ...]) -> Chain
     return Chain(base, tip, tuple(chain), frame)
 
 
+def frames(chain: Chain, q: np.ndarray) -> list[np.ndarray]:
+    """Return the placements (..., 4, 4), in the base frame, of the base, each joint and the tip.
+
+    `q` is (..., n): one posture or an array of postures.
+    """
+    placements = [np.broadcast_to(np.eye(4), (*q.shape[:-1], 4, 4))]
+    for i, joint in enumerate(chain.joints):
+        axis, position = joint.axis, q[..., i, None]
+        motion = placements[0].copy()
+        if joint.kind == 'prismatic':
+            motion[..., :3, 3] = position * axis
+        else:
+            along = np.outer(axis, axis)
+            c, s = np.cos(position)[..., None], np.sin(position)[..., None]
+            motion[..., :3, :3] = along + c * (np.eye(3) - along) + s * np.cross(np.eye(3), axis)
+        placements.append(placements[-1] @ joint.placement @ motion)
+    return [*placements, placements[-1] @ chain.tip_placement]
+
+
 class _Body(NamedTuple):
     """A link with everything that it carries at position 0."""
 

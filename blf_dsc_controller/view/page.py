@@ -24,9 +24,8 @@ import numpy as np
 
 from blf_dsc_controller.analysis.metrics import bodies_of, errors_of_bodies
 from blf_dsc_controller.analysis.panels import ALARM, COLOURS, GREEN, INK, MUTED, ORANGE
-from blf_dsc_controller.arms.geometry import frames
 from blf_dsc_controller.arms.two_link import urdf
-from blf_dsc_controller.arms.urdf import Chain, read_chain
+from blf_dsc_controller.arms.urdf import Chain, frames, read_chain
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.files import resolve
 from blf_dsc_controller.errors import BlfDscError, MissingExtraError
