@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -22,9 +22,13 @@ class Series:
     stamp: Stamps  #: (m,) ns, increasing
     values: Floats  #: (m, number of names)
 
+    def indices(self, names: Sequence[str]) -> NDArray[np.intp]:
+        """Return the columns' numbers of these names."""
+        return np.array([self.names.index(name) for name in names], np.intp)
+
     def select(self, names: Sequence[str]) -> Floats:
         """Return the columns of these names, (m, number of `names`)."""
-        return self.values[:, np.array([self.names.index(name) for name in names], np.intp)]
+        return self.values[:, self.indices(names)]
 
     def column(self, name: str) -> Floats:
         """Return the values of one name, (m,)."""
@@ -76,7 +80,6 @@ class Run:
     monitor: Series | None = None  #: estimates and what else the law says of its state
     truth: Series | None = None
     timing: Series | None = None
-    message_counts: Mapping[str, int] = field(default_factory=dict)
     stops: tuple[Stop, ...] = ()
     arm: LearnedArm | None = None  #: from a URDF
     learns: bool = True  #: whether the law uses the prediction error

@@ -14,8 +14,7 @@ from rosbags.rosbag2 import Reader
 from blf_dsc_controller.bags.sources import open_bag
 from blf_dsc_controller.bags.writer import BagWriter
 from blf_dsc_controller.configuration.nodes import CONTROLLER, PLANT, load_loop
-from blf_dsc_controller.simulation.bag import write_bag
-from blf_dsc_controller.simulation.loop import simulate
+from blf_dsc_controller.simulation.loop import simulate, write_bag
 
 # Learns within a second: a window of half a second, which is less excited.
 QUICK = {
@@ -35,7 +34,7 @@ def record(path, duration=1.0, compression='none', **controller):
     """Run offline and write the bag; return its folder."""
     config = loop_config(duration, **controller)
     run = simulate(config.controller, config.plant)
-    write_bag(path, run, config.controller, compression, config.plant)
+    write_bag(path, run, config.plant, compression=compression)
     return path
 
 

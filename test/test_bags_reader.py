@@ -70,8 +70,6 @@ def test_arrays_round_trip_under_any_topic_names(tmp_path, rename):
     ):
         np.testing.assert_array_equal(found, expected)
     assert run.duration == pytest.approx(0.199)
-    counts = sorted(run.message_counts.values())
-    assert counts == [1, SAMPLES // 10, *[SAMPLES] * 6]
 
 
 def test_journal_tells_which_joint_states_the_controller_used(tmp_path):

@@ -17,7 +17,7 @@ from blf_dsc_controller.errors import ConfigurationError, StartError
 from blf_dsc_controller.law.factory import controller_of, estimate_names
 from blf_dsc_controller.law.torque import added_torque
 from blf_dsc_controller.replay.verify import verify
-from blf_dsc_controller.simulation.bag import write_bag
+from blf_dsc_controller.simulation.loop import write_bag
 from blf_dsc_controller.supervision.guard import Guard
 from blf_dsc_controller.supervision.safe_torque import (
     LastState,
@@ -281,7 +281,7 @@ def test_stop_in_motion_comes_to_rest_and_replays_bit_for_bit(tmp_path):
     assert np.abs(dq[0]).max() > 0.4
     assert np.abs(q - q[0]).max() < 0.05
     assert np.abs(dq[-1]).max() < 0.005
-    write_bag(tmp_path / 'bag', record, record.config, 'none')
+    write_bag(tmp_path / 'bag', record)
     assert verify(tmp_path / 'bag').difference is None
 
 

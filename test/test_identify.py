@@ -40,8 +40,7 @@ from blf_dsc_controller.identification.prior import base_matrix
 from blf_dsc_controller.identification.recording import read_recording
 from blf_dsc_controller.messages.codecs import JointStateEncoder
 from blf_dsc_controller.messages.topics import JOINT_STATE
-from blf_dsc_controller.simulation.bag import write_bag
-from blf_dsc_controller.simulation.loop import simulate
+from blf_dsc_controller.simulation.loop import simulate, write_bag
 
 ROBOT = Robot(urdf=PANDA_TEXT)
 TRUTH = truth_of(PANDA_CHAIN, 1)
@@ -256,7 +255,7 @@ def test_arm_of_the_paper_is_identified_from_its_urdf(tmp_path, capsys):
     plant = {'duration': 20.0, 'arm.m2': 0.7}
     config = load_loop('recommended', {PLANT: plant})
     run = simulate(config.controller, config.plant)
-    write_bag(tmp_path / 'bag', run, config.controller, 'none', config.plant)
+    write_bag(tmp_path / 'bag', run, config.plant)
     robot = Robot(urdf='two_link.urdf', gravity=(0.0, 0.0, -9.8))
     found = identify_bag(tmp_path / 'bag', robot)
     K = base_matrix(found.parameters, 2)[: len(found.parameters.combinations)]

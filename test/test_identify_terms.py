@@ -26,7 +26,7 @@ from shaken_arm import (
     truth_of,
     write_states,
 )
-from test_analysis_figures import amount, lightened, pixels
+from test_analysis_report import amount, lightened, pixels
 
 from blf_dsc_controller.analysis.panels import COLOURS, INK, ORANGE
 from blf_dsc_controller.arms.base_parameters import base_parameters

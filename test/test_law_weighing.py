@@ -15,8 +15,7 @@ from blf_dsc_controller.law.factory import controller_of
 from blf_dsc_controller.law.telemetry import load_text, sample_columns
 from blf_dsc_controller.law.weighing import BEFORE, NEWER, describe, solve
 from blf_dsc_controller.law.window import add_products
-from blf_dsc_controller.simulation.bag import write_bag
-from blf_dsc_controller.simulation.loop import simulate
+from blf_dsc_controller.simulation.loop import simulate, write_bag
 
 PICKED_UP, PUT_DOWN, END = 8.0, 12.0, 15.0  # s
 LOAD = 2.0  # kg
@@ -138,7 +137,7 @@ def test_weighing_what_cannot_be_weighed_is_rejected():
 
 
 def test_bag_tells_what_was_held_in_the_table_and_on_the_page(panda, tmp_path):
-    write_bag(tmp_path / 'bag', panda, panda.config, 'none')
+    write_bag(tmp_path / 'bag', panda)
     run = read_run(tmp_path / 'bag')
     metrics = measure(run)
     held = np.array([(load['until'], load['load mass']) for load in metrics.loads])

@@ -17,8 +17,7 @@ from blf_dsc_controller.law.lyapunov import decay_rate, exponential_bound, large
 from blf_dsc_controller.law.telemetry import ControllerTelemetry
 from blf_dsc_controller.messages import topics
 from blf_dsc_controller.messages.codecs import JointStateDecoder
-from blf_dsc_controller.simulation.bag import write_bag
-from blf_dsc_controller.simulation.loop import simulate
+from blf_dsc_controller.simulation.loop import simulate, write_bag
 
 LARGEST = np.linalg.eigvalsh([[2.12, 0.72], [0.72, 0.32]])[-1]  # kg m^2, of M stretched
 PAPER = {'learning.compensation': 'state', 'learning.bumpless': False}  # (32) is for this form
@@ -144,7 +143,7 @@ def rejecting_run(tmp_path_factory):
     learning = {'learning.frequencies': [1.0], 'learning.bias': False}
     config = configured('recommended', 8.0, LEAKY | learning)
     path = tmp_path_factory.mktemp('refusing') / 'bag'
-    write_bag(path, simulate(config.controller, config.plant), config.controller, 'none')
+    write_bag(path, simulate(config.controller, config.plant))
     return read_run(path)
 
 

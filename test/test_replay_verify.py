@@ -32,8 +32,7 @@ from blf_dsc_controller.messages.topics import (
     TRACKING_ERROR,
 )
 from blf_dsc_controller.replay.verify import verify
-from blf_dsc_controller.simulation.bag import write_bag
-from blf_dsc_controller.simulation.loop import simulate
+from blf_dsc_controller.simulation.loop import simulate, write_bag
 
 OF_URDF = """
 /**:
@@ -272,7 +271,7 @@ def test_bag_replays_without_its_urdf_file_and_is_read_with_unknown_parameters(
     urdf.write_text(random_urdf(3, seed=5)[0])
     file.write_text(OF_URDF.format(urdf=urdf))
     loop, bag = load_loop(file), tmp_path / 'bag'
-    write_bag(bag, simulate(loop.controller, loop.plant), loop.controller, 'none', loop.plant)
+    write_bag(bag, simulate(loop.controller, loop.plant), loop.plant)
     for text in (random_urdf(3, seed=6)[0], None):  # changed, then deleted
         urdf.unlink() if text is None else urdf.write_text(text)
         assert read_content(bag).controller_config() == loop.controller

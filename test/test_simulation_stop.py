@@ -13,8 +13,7 @@ from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.plant import PlantConfig
 from blf_dsc_controller.configuration.schema import build
 from blf_dsc_controller.replay.verify import verify
-from blf_dsc_controller.simulation.bag import write_bag
-from blf_dsc_controller.simulation.loop import simulate
+from blf_dsc_controller.simulation.loop import simulate, write_bag
 
 HELD = {'safety.torque': 'hold_gravity', 'safety.stop_ramp': 0.05}
 NOISY = {'sensor.position_noise': 1e-6, 'sensor.velocity': 'differenced', 'seed': 3}
@@ -35,7 +34,7 @@ def run(given, *, supervised=True):
 def test_bag_of_a_stopped_run_replays_with_its_stop(tmp_path, reason):
     given = CASES[reason]
     record = run(given)
-    write_bag(tmp_path / 'bag', record, record.config, 'none')
+    write_bag(tmp_path / 'bag', record)
     result = verify(tmp_path / 'bag')
     assert (result.difference, result.remarks) == (None, ())
     assert result.transitions == ['activate', f'safe stop ({reason})']

@@ -34,7 +34,7 @@ from blf_dsc_controller.messages.topics import (
     RATIO,
     VELOCITY,
 )
-from blf_dsc_controller.run import Floats, Regressor, Run, Series
+from blf_dsc_controller.run import Floats, Regressor, Run
 
 MOMENTS = (5, 10, 20, 40, 60)
 """Times at which the parameter error is reported [s]."""
@@ -85,11 +85,11 @@ def estimates_of(run: Run) -> Estimates | None:
     step = -(-run.monitor.stamp.size // _MOST)
     rows = slice((run.monitor.stamp.size - 1) % step, None, step)
     stamp = run.monitor.stamp[rows]
-    estimate = run.monitor.values[rows][:, _columns(run.monitor, names)]
+    estimate = run.monitor.values[rows][:, run.monitor.indices(names)]
     of_torques = arm is not None and _parameters(arm.units) == names
     true = error = None
     if truth is not None and set(names) == set(_parameters(truth.names)):
-        true = truth.held(stamp, _columns(truth, names))
+        true = truth.held(stamp, truth.indices(names))
         R = None  # |R (P^ - P)| is the norm of the torques H P^ - H P
         if arm is not None and of_torques:
             R = np.asarray(np.linalg.qr(_torques(run, arm.regressor), 'r'))
@@ -117,10 +117,6 @@ def _relative_error(estimate: Floats, P: Floats, R: Floats | None) -> Floats:
         with np.errstate(over='ignore', invalid='ignore'):  # no motion, no torques: unknown
             found[some] = np.linalg.norm(off, axis=1) / np.linalg.norm(size, axis=1)
     return found
-
-
-def _columns(series: Series, names: Sequence[str]) -> NDArray[np.intp]:
-    return np.array([series.names.index(name) for name in names], np.intp)
 
 
 def _torques(run: Run, regressor: Regressor) -> Floats:
@@ -176,9 +172,9 @@ def errors_of_bodies(
         return np.sqrt(each)
 
 
-def latch_time(run: Run) -> float | None:
-    """Return the time at which learning began [s], None if it never did or is not recorded."""
-    return next(iter(_rises(run, LATCHED)), None) if run.learns else None
+def latch_time(run: Run) -> float:
+    """Return the time at which learning began [s], NaN if it never did or is not recorded."""
+    return next(iter(_rises(run, LATCHED)), math.nan) if run.learns else math.nan
 
 
 def change_times(run: Run) -> list[float]:
@@ -259,7 +255,6 @@ class Metrics:
     rejected_columns: list[str]
     loads: list[dict[str, float]]  #: what the tip held `until` [s], where known
     timing: dict[str, Any] | None  #: `rate` [Hz], `latency` [s], `late_steps`, in real time
-    messages: dict[str, int]  #: number in the bag, by topic
     estimate: dict[str, float] | None = None  #: at the end
     true: dict[str, float] | None = None  #: at the end
     of_torques: bool = False  #: whether the following are errors of the model's torques
@@ -277,7 +272,7 @@ def measure(run: Run) -> Metrics:
     step = float(run.time[1]) if run.stamp.size > 1 else math.nan
     ratio, (violation, joint) = _largest_ratio(run), first_violation(run)
     held = None if math.isnan(ratio) else True
-    latched, estimates = latch_time(run), estimates_of(run)
+    estimates = estimates_of(run)
 
     def each(reduce: Callable[[Floats], float], name: str) -> tuple[float, ...]:
         return tuple(reduce(_known(run, name, i)) for i in range(len(run.joints)))
@@ -303,12 +298,11 @@ def measure(run: Run) -> Metrics:
             for time, stop in run.timed_stops
         ],
         learns=run.learns,
-        latch_time=math.nan if latched is None else latched,
+        latch_time=latch_time(run),
         model_changes=change_times(run),
         rejected_columns=rejected_columns(run),
         loads=_loads(run),
         timing=_timing(run),
-        messages=dict(run.message_counts),
         **({} if estimates is None else _learning(estimates)),
     )
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import chain
-from math import inf
+from math import inf, isnan
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -98,7 +98,7 @@ def panels(runs: Sequence[Run], begin: float = -inf, end: float = inf) -> list[P
     found: dict[tuple[str, str], Panel] = {}
     for k, run in enumerate(runs):
         latched = latch_time(run)
-        latch = () if latched is None else (Mark(latched, 'latch'),)
+        latch = () if isnan(latched) else (Mark(latched, 'latch'),)
         changes = true_change_times(run)
         changed = dict.fromkeys(_CHANGED, 'the arm changes')
         stops = list(_stops(run))
@@ -269,7 +269,7 @@ def _relative_error(estimates: Estimates) -> Panel:
 
 def _monitors(run: Run) -> Iterator[Panel]:
     latched = latch_time(run)
-    note = 'learning never began' if latched is None else f'learning from {latched:.4g} s on'
+    note = 'learning never began' if isnan(latched) else f'learning from {latched:.4g} s on'
     note = note if run.learns else 'not used by this law'
     title = 'minimum eigenvalue of Φ'
     excitation = [

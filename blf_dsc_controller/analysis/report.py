@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import base64
+import math
 import zlib
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -67,11 +68,7 @@ class ReportedBag:
 
 
 def read_bag(path: Path, namespace: str = '', names: NameMap = NO_NAMES) -> ReportedBag:
-    """Read a bag, named by its folder and the folder in which that is.
-
-    Raises:
-        BlfDscError: it cannot be read.
-    """
+    """Read a bag, named by its folder and the folder above; raises BlfDscError if it cannot."""
     content = read_content(path, namespace, names)
     run = recorded_run(content)
     events = [
@@ -92,7 +89,7 @@ def read_bag(path: Path, namespace: str = '', names: NameMap = NO_NAMES) -> Repo
 
 def _events(run: Run) -> Iterator[Happened]:
     latched = latch_time(run)
-    if latched is not None:
+    if not math.isnan(latched):
         yield (latched, 'learning', 'first excited window: learning began')
     for t in change_times(run):
         yield (t, 'learning', 'the arm has changed: learning restarted')
@@ -151,11 +148,7 @@ def _shown(value: object) -> str:
 
 
 def write_report(bags: Sequence[ReportedBag], path: Path) -> None:
-    """Write the page of some bags.
-
-    Raises:
-        MissingExtraError: plotly is not installed.
-    """
+    """Write the page of some bags; raises MissingExtraError without plotly."""
     try:
         from plotly.offline import get_plotlyjs
     except ImportError:

@@ -119,7 +119,6 @@ def recorded_run(content: Content, loaded: Callable[[Values], Any] = lambda valu
         monitor=series(topics.MONITOR),
         truth=series(topics.TRUTH),
         timing=series(topics.TIMING),
-        message_counts=content.message_counts,
         stops=tuple(_stops(events, int(stamp[0]))),
         arm=_arm(content),
         learns=_learns([event.content.get('parameters', {}) for event in events]),

@@ -11,6 +11,7 @@ from tempfile import TemporaryDirectory
 
 import numpy as np
 
+from blf_dsc_controller.analysis.metrics import aligned
 from blf_dsc_controller.bags.content import NameMap
 from blf_dsc_controller.cli.main import PICK_UP, make_room
 from blf_dsc_controller.configuration.controller import ControllerConfig
@@ -106,15 +107,6 @@ def _interval(value: float, deviation: float, digits: str = '.4g') -> str:
     return f'{value:{digits}} +- {_TWO_SIDED * deviation:.2g}'
 
 
-def _aligned(rows: Sequence[Sequence[str]]) -> Iterator[str]:
-    """Yield an empty line and the rows of a table as lines; all but the first column are equal."""
-    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-    yield ''
-    for row in rows:
-        cells = (f'{cell:{width}}' for cell, width in zip(row, widths, strict=True))
-        yield '  '.join(cells).rstrip()
-
-
 def _load(found: Identified) -> Iterator[str]:
     if found.picked_up is None:
         return
@@ -141,7 +133,7 @@ def _links(found: Identified) -> Iterator[str]:
         )
         mass = f'{joint.inertia[0]:.3f} -> {_interval(m, m_spread, ".3f")}'
         rows.append((joint.link, mass, centre))
-    return _aligned(rows)
+    yield from ('', aligned(rows))
 
 
 def _joints(found: Identified) -> Iterator[str]:
@@ -152,7 +144,7 @@ def _joints(found: Identified) -> Iterator[str]:
     for name, *each in zip(names, of.terms[shown].T, spread.terms[shown].T, strict=True):
         values = zip(*each, strict=True)
         rows.append((name, *(_interval(v, s) if v else '' for v, s in values)))
-    yield from _aligned(rows)
+    yield from ('', aligned(rows))
     if of.coupling.any():
         inertia, viscous, coulomb = map(_interval, of.coupling, spread.coupling)
         yield (
@@ -185,12 +177,10 @@ def _errors(found: Identified) -> Iterator[str]:
     yield f'torque error from {begin:.1f} to {end:.1f} s, which was held back [% of rms torque]:'
     names = [joint.name for joint in found.chain.joints]
     shares = np.vstack(((100.0 * found.errors / found.torque).T, total_errors(found)))
-    heads = ('    URDF', 'corrected', 'with all terms')
-    rows: list[tuple[str, ...]] = [('joint', *heads)]
+    rows = [['joint', 'URDF', 'corrected', 'with all terms']]
     for name, share in zip((*names, 'all'), shares, strict=True):
-        cells = (f'{x:{size}.2f}' for x, size in zip(share, (8, 9, 8), strict=True))
-        rows.append((name, *cells))
-    yield from list(_aligned(rows))[1:]
+        rows.append([name, *(f'{x:.2f}' for x in share)])
+    yield aligned(rows)
     if found.rest:
         yield f'{found.rest:.1f} s in which no joint moves were left out'
     moving = found.time.size * HOP

@@ -48,26 +48,18 @@ def main(arguments: Sequence[str] | None = None) -> int:
     # Names may have letters that the font of the pictures lacks.
     warnings.filterwarnings('ignore', 'Glyph .* missing')
     try:
-        code = _handle(options)
+        if options.command == 'run' and not options.offline:
+            require_ros()  # before what takes a second to import
+        module, function = options.handler
+        command = getattr(importlib.import_module(f'blf_dsc_controller.cli.{module}'), function)
+        code: int | None = command(options)
     except (BlfDscError, OSError) as error:
         print(f'blf_dsc {options.command}: {error}', file=sys.stderr)
         return 1
     except KeyboardInterrupt:
-        is_study = options.command == 'monte-carlo' and not (options.reproduce or options.report)
-        remedy = '; the same command resumes the study' if is_study else ''
-        print(f'blf_dsc {options.command}: interrupted{remedy}', file=sys.stderr)
+        print(f'blf_dsc {options.command}: interrupted', file=sys.stderr)
         return INTERRUPTED
     return code or 0
-
-
-def _handle(options: argparse.Namespace) -> int | None:
-    if options.command == 'run' and not options.offline:
-        require_ros()  # before what takes a second to import
-    module, function = options.handler
-    code: int | None = getattr(
-        importlib.import_module(f'blf_dsc_controller.cli.{module}'), function
-    )(options)
-    return code
 
 
 def _keep_to_one_thread() -> None:
@@ -108,9 +100,7 @@ def make_room(*paths: Path, force: bool) -> None:
     """
     existing = [path for path in paths if os.path.lexists(path)]
     if existing and not force:
-        names = ', '.join(str(path) for path in existing)
-        exist = 'exists' if len(existing) == 1 else 'exist'
-        raise BlfDscError(f'{names} {exist} already: choose another path, or use --force')
+        raise BlfDscError(f'{existing[0]} exists already: choose another path, or use --force')
     for path in existing:
         if path.is_symlink():
             path.unlink()

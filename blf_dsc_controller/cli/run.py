@@ -23,8 +23,7 @@ from blf_dsc_controller.configuration.schema import change
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.messages.codecs import JointStateDecoder
 from blf_dsc_controller.reference.approach import plan_start
-from blf_dsc_controller.simulation.bag import write_bag
-from blf_dsc_controller.simulation.loop import simulate
+from blf_dsc_controller.simulation.loop import simulate, write_bag
 from blf_dsc_controller.supervision.checks import Reason
 from blf_dsc_controller.supervision.gains import config_warnings, expectation
 from blf_dsc_controller.supervision.guard import Guard
@@ -60,7 +59,7 @@ def run(options: Namespace) -> int:
     if options.offline:
         with announced_compilation(print_notice):
             record = simulate(config.controller, config.plant)
-        write_bag(out / 'bag', record, config.controller, config.recorder.compression, config.plant)
+        write_bag(out / 'bag', record, config.plant, compression=config.recorder.compression)
     else:
         from blf_dsc_controller.cli.session import run_session
 

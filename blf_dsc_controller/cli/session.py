@@ -23,7 +23,6 @@ from rclpy.experimental import EventsExecutor
 from sensor_msgs.msg import JointState
 from tqdm import tqdm
 
-from blf_dsc_controller.cli.run import print_notice
 from blf_dsc_controller.compiled.jit import COMPILING
 from blf_dsc_controller.configuration.files import share_folder
 from blf_dsc_controller.configuration.nodes import CONTROLLER, PLANT, RECORDER, VIEW, LoopConfig
@@ -48,8 +47,6 @@ _PR_SET_PDEATHSIG = 1
 _LIBC = ctypes.CDLL(None)  # loaded before there are threads
 _PAGE = 'open http'  # in the log of the node that serves it
 _BAR = '{desc} |{bar}| {n:.1f}/{total:g} s [{elapsed}<{remaining}]{postfix}'
-_LINE = '{desc} {n:.1f}/{total:g} s{postfix}\n'
-_LINE_PERIOD = 10.0  # s between two lines if stderr is not a terminal
 _RANGE = 'ROS_AUTOMATIC_DISCOVERY_RANGE'
 _PROFILES = 'FASTRTPS_DEFAULT_PROFILES_FILE'
 _DOMAINS = range(1, 101)  # 0 is the default; above 101, ports are ephemeral
@@ -124,10 +121,9 @@ class NodeProcess:
         code = self._process.poll()
         if not code:
             return
-        names = {int(number): number.name for number in signal.Signals}
         end = f'exited with code {code}'
         if code < 0:
-            end = f'was terminated by {names.get(-code, f"signal {-code}")}'
+            end = f'was terminated by {signal.Signals(-code).name}'
         lines = self._log.read_text(encoding='utf-8', errors='replace').splitlines()[-_TAIL:]
         tail = ''.join(f'\n  {line}' for line in lines)
         raise BlfDscError(f'{self.name} {end}:{tail}\n(full log: {self._log})')
@@ -163,8 +159,8 @@ def _run_nodes(config: LoopConfig, params_file: Path, logs: Path, *, view: bool)
             monitor.wait(0.1)
             notices = [notice for node in starting for notice in node.new_notices()]
             for notice in notices:
-                monitor.write(notice)
-            if monitor.has_begun and (starting is nodes or notices):
+                tqdm.write(notice, file=sys.stderr)
+            if monitor.start is not None and (starting is nodes or notices):
                 # Only now, since the nodes wait for a subscriber, which must be the recorder.
                 starting, view = [started(VIEW)] if view else [], False
         completed = not (interrupts or nodes[-1].is_running)
@@ -180,17 +176,14 @@ def _die_with_parent() -> None:
 
 
 class ProgressMonitor:
-    """Progress over simulated time of the loop in this process's ROS domain, with max |xi1| / k_c.
-
-    A bar on a terminal, otherwise (as in a log) a line every few seconds.
-    """
+    """Progress bar over simulated time of the loop in this ROS domain, with max |xi1| / k_c."""
 
     def __init__(self, duration: float) -> None:
         """Wait for a loop of this simulated duration [s]."""
-        self._duration, self._is_bar = duration, sys.stderr.isatty()
-        form, pause = (_BAR, 0.2) if self._is_bar else (_LINE, _LINE_PERIOD)
-        self._bar = tqdm(total=duration, desc='closed loop', bar_format=form, mininterval=pause)
-        self._start: float | None = None
+        self._duration = duration
+        # Disabled (None) in a log, where a bar would be one long line.
+        self._bar = tqdm(total=duration, desc='closed loop', bar_format=_BAR, disable=None)
+        self.start: float | None = None  # s, stamp of the first message
         self._received: list[JointState] = []
         self._context = rclpy.Context()
         rclpy.init(context=self._context, signal_handler_options=rclpy.SignalHandlerOptions.NO)
@@ -204,11 +197,6 @@ class ProgressMonitor:
             qos_profile(topics.MONITOR.offered),
         )
 
-    @property
-    def has_begun(self) -> bool:
-        """Whether a message of the loop has been received."""
-        return self._start is not None
-
     def wait(self, seconds: float) -> None:
         """Wait for a message and show it."""
         self._executor.spin_once(timeout_sec=seconds)
@@ -220,19 +208,12 @@ class ProgressMonitor:
         ratio = max(value for name, value in values if name.startswith(RATIO))
         self._bar.set_postfix_str(f'max|xi1|/bound {ratio:.2f}', refresh=False)
         stamp = message.header.stamp.sec + 1e-9 * message.header.stamp.nanosec
-        self._start = stamp if self._start is None else self._start
-        self.show(stamp - self._start)
+        self.start = stamp if self.start is None else self.start
+        self.show(stamp - self.start)
 
     def show(self, elapsed: float) -> None:
         """Show the simulated time [s]."""
         self._bar.update(min(elapsed, self._duration) - self._bar.n)
-
-    def write(self, notice: str) -> None:
-        """Print a notice without disturbing the bar."""
-        if self._is_bar:
-            self._bar.write(notice, file=sys.stderr)
-        else:
-            print_notice(notice)
 
     def close(self) -> None:
         """Leave the ROS domain."""

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The closed loop without ROS: the kernels that the nodes run, in one compiled loop.
+"""The closed loop without ROS: the kernels that the nodes run, in one compiled loop; its bag.
 
 A lock-step run over ROS and an offline run of the same configuration agree bit for bit, stops and
 safe torques included: the compiled loop runs as long as its checks pass.  A chunk of samples in
@@ -9,11 +9,15 @@ stop.
 
 from __future__ import annotations
 
+from collections import Counter, deque
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 
 from blf_dsc_controller.arms.model import ArmModel
+from blf_dsc_controller.bags.writer import BagWriter
 from blf_dsc_controller.compiled.jit import kernel
 from blf_dsc_controller.compiled.layout import view
 from blf_dsc_controller.configuration.controller import ControllerConfig
@@ -21,12 +25,21 @@ from blf_dsc_controller.configuration.plant import PlantConfig
 from blf_dsc_controller.configuration.schema import flatten
 from blf_dsc_controller.law.checks import INVALID, SUSPECT, checks_of
 from blf_dsc_controller.law.controller import Controller, step
-from blf_dsc_controller.law.factory import begin, controller_of
+from blf_dsc_controller.law.factory import begin, controller_of, estimate_names
 from blf_dsc_controller.law.lyapunov import fill_energies
 from blf_dsc_controller.law.state import Sample, sample_of, settings_of, signals_of, state_of
-from blf_dsc_controller.law.telemetry import disturbance_names, run_of, sample_columns
+from blf_dsc_controller.law.telemetry import (
+    DECIMATION,
+    ControllerTelemetry,
+    Message,
+    PlantTelemetry,
+    disturbance_names,
+    run_of,
+    sample_columns,
+)
 from blf_dsc_controller.law.weighing import add_row
-from blf_dsc_controller.messages.journal import EventType, Journal
+from blf_dsc_controller.messages import topics
+from blf_dsc_controller.messages.journal import EventType, Journal, encode_change
 from blf_dsc_controller.run import Run, Series, Stop
 from blf_dsc_controller.supervision.guard import Guard
 from sim_plant import kernels as plants
@@ -265,3 +278,52 @@ def new_record(
         controller=controller,
         journal=journal,
     )
+
+
+def write_bag(
+    path: Path, record: Record, plant: PlantConfig | None = None, *, compression: str = 'none'
+) -> None:
+    """Write the messages that the nodes would have published in a run as a bag.
+
+    It has the configuration of the controller and, if given, of the plant; `compression` is `none`
+    or `zstd`. Raises BagError if `path` exists already.
+    """
+    with BagWriter(path, compression=compression, flush_interval=None) as bag:
+        handles: dict[topics.Topic, int] = {}
+        sent: Counter[topics.Topic] = Counter()
+
+        def write(stamp: int, topic: topics.Topic, raw: bytes) -> None:
+            if topic not in handles:
+                handles[topic] = bag.add_topic(topic.resolved, topic.type, [topic.offered])
+            sent[topic] += 1
+            bag.write(handles[topic], raw, stamp, sequence=sent[topic])
+
+        if plant is not None:
+            write(START, topics.CHANGES, encode_change(START, flatten(plant), configured=True))
+        for stamp, message in _messages(record):
+            write(stamp, *message)
+
+
+def _messages(record: Record) -> Iterator[tuple[int, Message]]:
+    config = record.config
+    plant = PlantTelemetry(config.joints, record.parameters)
+    controller = ControllerTelemetry(config, estimate_names(config))
+    limit = np.array(config.torque.limit)
+    events = deque(record.journal.pending)
+    ratio = np.zeros(len(config.joints))
+    for row, elapsed in enumerate(record.stamps.tolist()):
+        stamp = START + elapsed
+        sample = record.sample(row)
+        while events and events[0].messages <= row:
+            yield stamp, (topics.JOURNAL, events.popleft().encode())
+        yield stamp, plant.joint_states(stamp, record.measurements[row])
+        yield stamp, controller.command(sample.torque)
+        if row % DECIMATION == 0:
+            yield stamp, plant.truth(stamp, record.truths[row])
+        if np.isnan(sample.qr[0]):  # stopped
+            continue
+        np.maximum(ratio, np.abs(sample.xi1) / sample.bound, out=ratio)
+        for message in controller.sample(stamp, sample, limit, ratio, float('nan')):
+            yield stamp, message
+    for event in events:
+        yield START + int(record.stamps[-1]), (topics.JOURNAL, event.encode())

@@ -19,8 +19,7 @@ from blf_dsc_controller.analysis.panels import ALARM, BLUE, COLOURS, INK, MUTED,
 from blf_dsc_controller.configuration.nodes import CONTROLLER, PLANT, dump
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.run import Floats
-from blf_dsc_controller.simulation.bag import write_bag
-from blf_dsc_controller.simulation.loop import simulate
+from blf_dsc_controller.simulation.loop import simulate, write_bag
 from blf_dsc_controller.studies.monte_carlo import NOISE, WITHOUT, Study, draw, plant_with
 from blf_dsc_controller.studies.runs import (
     DIVERGED,
@@ -239,7 +238,7 @@ def reproduce(store: Store, run: str, out: Path) -> None:
         folder.mkdir(exist_ok=True)
         dump(folder / 'config.yaml', {PLANT: plant, CONTROLLER: law})
         record = simulate(law, plant, supervised=False)
-        write_bag(folder / 'bag', record, law, 'none')
+        write_bag(folder / 'bag', record)
         here = figures_of(study, record, plant)
         different = differences({name: results[f'{prefix}{name}'][rows[0]] for name in here}, here)
         if different:
