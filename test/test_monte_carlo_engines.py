@@ -224,6 +224,8 @@ def test_command_of_the_report_reproduces_the_worst_run(whole_store, tmp_path, m
     np.testing.assert_array_equal(again.measurements[:, :2], bag.position)
     # An existing folder is not overwritten, and there are no more runs.
     assert main(arguments) == 1
+    assert main(['monte-carlo', '--reproduce', 'nowhere', '1']) == 1
+    assert not (tmp_path / 'nowhere-run-1').exists()
     for missing in ('24', 'one'):
         assert main([*arguments[:3], missing]) == 1
         assert f'has no run {missing}' in capsys.readouterr().err

@@ -46,8 +46,9 @@ def monte_carlo(options: Namespace) -> None:
     """Compute the missing runs of a study and report it, compare studies, or repeat one run."""
     if options.reproduce:
         folder, run = options.reproduce
-        chosen = make_folder(options.out or Path(f'{Path(folder).name}-run-{run}'))
-        report.reproduce(runs.Store(Path(folder)), run, chosen)
+        store = runs.Store(Path(folder))
+        chosen = make_folder(options.out or Path(f'{store.folder.name}-run-{run}'))
+        report.reproduce(store, run, chosen)
         print(f'the same figures as in {folder}, bit for bit')
         print(f'wrote       {chosen}: config.yaml and bag, which blf_dsc plot and report draw')
     elif options.report:
