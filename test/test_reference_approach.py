@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from fault_rig import Rig
+from fault_table import Rig
 
 from blf_dsc_controller.configuration.controller import (
     Approach,

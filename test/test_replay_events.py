@@ -8,8 +8,7 @@ from collections import Counter
 
 import pytest
 import recorded_run
-from fault_rig import JOINTS, MILLISECOND, Rig
-from fault_table import FAULTS, run
+from fault_table import FAULTS, JOINTS, MILLISECOND, Rig, run
 from recorded_run import compared, of
 
 from blf_dsc_controller.configuration.schema import change

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from fault_rig import MILLISECOND, Rig
+from fault_table import MILLISECOND, Rig
 from random_arm import CONFIG
 
 from blf_dsc_controller import load_loop

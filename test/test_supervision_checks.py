@@ -9,8 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from closed_loop_case import controller, plant, recommended
-from fault_rig import Rig
-from fault_table import FAULTS, named, page, run
+from fault_table import FAULTS, Rig, named, page, run
 from plain_law import dynamics
 
 from blf_dsc_controller.configuration.controller import ControllerConfig

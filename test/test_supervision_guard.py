@@ -5,8 +5,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from fault_rig import JOINTS, MILLISECOND, Rig
-from fault_table import jammed
+from fault_table import JOINTS, MILLISECOND, Rig, jammed
 from plain_law import dynamics
 
 from blf_dsc_controller.configuration.controller import ControllerConfig, Safety
