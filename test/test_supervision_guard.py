@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from fault_table import JOINTS, MILLISECOND, Rig, jammed
+from fault_table import JOINTS, MILLISECOND, Rig, jammed, sparse
 from plain_law import dynamics
 
 from blf_dsc_controller.configuration.controller import ControllerConfig, Safety
@@ -384,6 +384,25 @@ def test_samples_past_the_bound_are_counted_where_they_do_not_stop_the_arm():
     rig.step(60)
     assert rig.supervisor.running
     assert 0 < rig.guard.samples.outside < 60
+
+
+def test_law_without_a_barrier_is_not_stopped_by_its_bound():
+    rig = Rig({'law': 'backstepping'})
+    rig.push = np.array([40.0, 0.0])  # past the torque limit, too
+    rig.step(60)
+    assert rig.supervisor.running
+    assert rig.guard.samples.ratio[0] > 1.0
+    assert rig.guard.samples.saturated > 0
+
+
+def test_stop_names_both_rates_where_the_states_come_at_another():
+    rig = Rig({'safety.overrun_fraction': 1.0})
+    sparse(3)(rig)
+    rig.step(30)
+    rig.push = np.array([40.0, 0.0])
+    rig.step(60)
+    assert rig.supervisor.reason is Reason.OUTSIDE_BOUND
+    assert 'joint states come every 0.003 s, but sample_time is 0.001 s' in rig.supervisor.text
 
 
 def test_commands_without_effect_stop_the_arm_with_the_model_from_before():
