@@ -16,6 +16,7 @@ import pytest
 pytest.importorskip('rclpy', reason='needs ROS 2')
 
 from random_arm import CONFIG
+from rclpy.parameter import Parameter
 from ros_rig import JOINTS, START
 
 from blf_dsc_controller import load_loop
@@ -119,12 +120,15 @@ def test_watchdog_continues_from_the_torque_that_the_drive_holds(ros, monkeypatc
 
 def test_controller_does_not_take_the_watchdog_for_an_arm(ros):
     """Nothing listens to its commands but the second line: it waits with its first torque."""
-    watchdog, law = ros.add(WatchdogNode), ros.add(ControllerNode)
+    law = ros.add(ControllerNode)
+    assert law.set_parameters([Parameter('torque.limit', value=[15.0, 9.0])])[0].successful
+    watchdog = ros.add(WatchdogNode)
     states = ros.publisher(topics.JOINT_STATES)
     ros.until(lambda: watchdog.line is not None and states.get_subscription_count() == 2)
     states.publish(JointStateEncoder(JOINTS).encode(10**9, START, np.zeros(2), np.zeros(2)))
     ros.until(lambda: watchdog.line.stamp == 10**9)
     ros.spin(0.2)
+    assert watchdog.line.config.torque.limit == (15.0, 9.0)  # as changed before
     assert law.guard.journal.messages == 0
     law._on_second()
     assert law.others == 0
