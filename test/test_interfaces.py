@@ -48,10 +48,8 @@ def test_two_arms_in_one_domain_do_not_interfere(ros):
 
 
 def test_standard_parameters_override_qos(ros):
-    ros.add(PlantNode, **{'qos_overrides./joint_states.publisher.reliability': 'best_effort'})
-    ros.add(
-        ControllerNode, **{'qos_overrides./joint_states.subscription.reliability': 'best_effort'}
-    )
+    for node, end in ((PlantNode, 'publisher'), (ControllerNode, 'subscription')):
+        ros.add(node, {f'qos_overrides./joint_states.{end}.reliability': 'best_effort'})
     ros.until(lambda: ros.tester.count_publishers('/joint_states'))
     ros.until(lambda: ros.tester.count_subscribers('/joint_states'))
     (publisher,) = ros.tester.get_publishers_info_by_topic('/joint_states')

@@ -32,21 +32,11 @@ sys.addaudithook(
 
 def moving(seconds, error=0.001):
     """Snapshots of a two-link arm that moves, with this tracking error of its first joint [rad]."""
-    unknown, torque = np.full(5, np.nan), np.array([3.0, np.nan])
-    return [
-        Snapshot(
-            t,
-            np.array([1.0 + t, 0.5]),
-            np.array([error, 0.0]),
-            np.array([0.002, 0.002]),
-            torque,
-            unknown,
-            unknown,
-            0.1,
-            LOAD if t > 1.0 else (np.nan,) * 8,
-        )
-        for t in np.arange(0.0, seconds, 1 / 30)
-    ]
+    times, unknown = np.arange(0.0, seconds, 1 / 30), np.full(5, np.nan)
+    of_joints = np.array([[error, 0.0], [0.002, 0.002], [3.0, np.nan]])  # error, bound, torque
+    learned = unknown, unknown, 0.1
+    first = (Snapshot(t, np.array([1.0 + t, 0.5]), *of_joints, *learned) for t in times)
+    return [each._replace(load=LOAD) if each.time > 1.0 else each for each in first]
 
 
 @pytest.fixture(scope='module')

@@ -132,7 +132,8 @@ class ViewNode(PlainNode):
         said = json.loads(content.data)
         if said.get('configured'):
             self._plant, self._noted = said['parameters'], -1.0
-            self._draw_all()
+            if self._config is not None:
+                self.page.draw_arm(self._config, self._plant)
             return
         self._plant |= said['parameters']
         for name, value in said['parameters'].items():
@@ -157,11 +158,7 @@ class ViewNode(PlainNode):
         self._names = dict(zip(_STREAMS, names, strict=True))
         self._values = {topic: np.full((3, len(of)), np.nan) for topic, of in self._names.items()}
         self._first_truth, self._latched = self._values[topics.TRUTH][0], np.nan
-        self._draw_all()
-
-    def _draw_all(self) -> None:
-        if self._config is not None:
-            self.page.draw_arm(self._config, self._plant)
+        self.page.draw_arm(config, self._plant)
 
     # Samples.
 
