@@ -147,6 +147,27 @@ def test_given_values_take_precedence_over_those_of_a_urdf():
             {'barrier.initial_bound': [0.003, 0.001], 'barrier.funnel_rate': 1.0},
             'got 0.001 rad for joint2, but it must be 0 (no funnel) or at',
         ),
+        (
+            CONTROLLER,
+            {'barrier.funnel_rate': 0.0, 'barrier.initial_bound': [0.003, 0.003]},
+            'got 0 1/s, but',
+        ),
+        (
+            CONTROLLER,
+            {'truth.parameters': [], 'law': 'model_based'},
+            'got none, but the law model_based needs them',
+        ),
+        (CONTROLLER, {'reference.times': [], 'reference.type': 'waypoints'}, 'got none'),
+        (
+            CONTROLLER,
+            {'reference.times': [2.0, 2.0], 'reference.points': [0.0] * 4},
+            'got 2 s after 2 s, but they must increase',
+        ),
+        (
+            CONTROLLER,
+            {'limits.position_upper': [1.0, 1.0], 'limits.position_lower': [-1.0, 1.0]},
+            'got 1 rad for joint2, but it must be above',
+        ),
         # Of an arm that cannot be read, no lengths are known.
         (BOTH, {'robot.urdf': 'no.urdf', 'joints': ['a'] * 7}, "'no.urdf' cannot be read"),
     ],
@@ -156,27 +177,6 @@ def test_invalid_value_is_rejected_with_what_it_is_and_what_is_expected(classes,
     for cls in classes:
         (problem,) = problems_of(cls, given)
         assert problem.startswith(f'{name}: {message}')
-
-
-@pytest.mark.parametrize(
-    ('given', 'message'),
-    [
-        ({'barrier.initial_bound': [0.003, 0.003]}, 'barrier.funnel_rate: got 0 1/s, but'),
-        ({'law': 'model_based'}, 'truth.parameters: got none, but the law model_based needs them'),
-        ({'reference.type': 'waypoints'}, 'reference.times: got none'),
-        (
-            {'reference.times': [2.0, 2.0], 'reference.points': [0.0] * 4},
-            'reference.times: got 2 s after 2 s, but they must increase',
-        ),
-        (
-            {'limits.position_lower': [-1.0, 1.0], 'limits.position_upper': [1.0, 1.0]},
-            'limits.position_upper: got 1 rad for joint2, but it must be above',
-        ),
-    ],
-)
-def test_parameter_that_is_missing_or_contradicts_another_is_named(given, message):
-    (problem,) = problems_of(ControllerConfig, given)
-    assert problem.startswith(message)
 
 
 def test_problems_of_all_parameters_are_reported_at_once():

@@ -199,10 +199,6 @@ def test_joint_states_may_have_another_order_and_other_joints():
             {'sensor.published_joints': ['panda_joint1', 'gripper']},
             'sensor.published_joints: panda_joint2, .* of `joints` is missing',
         ),
-        (
-            {'sensor.published_joints': [f'panda_joint{i}' for i in range(1, 8)] + ['a', 'a']},
-            'sensor.published_joints: a name is repeated',
-        ),
     ],
 )
 def test_mistakes_give_one_line(given, problem):

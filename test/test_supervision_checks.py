@@ -129,15 +129,6 @@ def test_velocity_is_zero_where_the_stamps_restart():
     np.testing.assert_allclose(estimated((5, 0.5), (6, 0.502), (1, 0.1), (2, 0.1)), [0, 2, 0, 0])
 
 
-def test_velocity_is_zero_after_a_reset():
-    velocity, measurement = Velocity(2), np.zeros(6)
-    for stamp in (1, 2):
-        velocity.reset()
-        measurement[0] += 0.002
-        velocity.replace(stamp * MILLISECOND, measurement)
-        assert measurement[2] == 0.0
-
-
 def test_repeated_reading_with_a_new_stamp_is_continued_at_its_velocity():
     """Once; an arm that really stands still is at rest in the sample after."""
     moving = (1, 0.5), (2, 0.502)

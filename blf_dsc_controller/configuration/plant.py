@@ -238,8 +238,6 @@ class PlantConfig(ArmConfig):
         published = self.sensor.published_joints
         if published and (lacking := [name for name in self.joints if name not in published]):
             yield f'sensor.published_joints: {", ".join(lacking)} of `joints` is missing'
-        if len(set(published)) < len(published):
-            yield 'sensor.published_joints: a name is repeated'
         if self.actuator.ripple > 0.0 and not all(self.actuator.torque_limit):
             yield 'actuator.ripple: a fraction of the rated torque: give actuator.torque_limit'
         if 0.0 < self.duration < self.sample_time:

@@ -397,10 +397,6 @@ class Velocity:
         self._dq = np.zeros(n)
         self._repeated = False
 
-    def reset(self) -> None:
-        """Forget the last state: the arm is assumed to be at rest in the next one."""
-        self._stamp = -1
-
     def replace(self, stamp: int, measurement: Vector) -> None:
         """Overwrite dq in [q (n,) rad, dq (n,) rad/s, torque (n,)] with a stamp [ns]."""
         q, dq, _ = measurement.reshape(3, -1)

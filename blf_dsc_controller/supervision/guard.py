@@ -382,8 +382,6 @@ class Guard:
         self._note(EventType.RESET)
         self._resumable = False
         self.controller.reset()
-        if self._velocity is not None:
-            self._velocity.reset()
         self.samples.keep()
         self._start_over()
 
