@@ -138,15 +138,9 @@ def test_window_after_a_change_may_be_partial_and_stays_near_the_estimate_before
     assert off[0] < off[1]
 
 
-def test_change_detection_is_off_for_laws_without_composite_learning():
-    """And for rows that contradict each other on any arm, as those of Lambda do."""
-    for law, prediction, expected in (
-        ('blf_dsc', 'filtered', 1),
-        ('backstepping', 'filtered', 0),
-        ('blf_dsc', 'lambda', 0),
-    ):
-        config = configured('comparison', 1.0, {'law': law, 'learning.prediction': prediction})
-        assert settings_of_config(config.controller).change_detection == expected
+def test_change_detection_is_off_for_rows_of_lambda_which_contradict_each_other_on_any_arm():
+    config = configured('recommended', 1.0, {'learning.prediction': 'lambda'})
+    assert settings_of_config(config.controller).change_detection == 0
 
 
 @pytest.mark.parametrize(

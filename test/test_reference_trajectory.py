@@ -17,6 +17,7 @@ from blf_dsc_controller.reference.terms import (
     hermite,
     minimum_jerk,
     pack,
+    pieces_of,
     sampled,
     sinusoids_term,
     spline_term,
@@ -190,7 +191,10 @@ def test_trajectory_continues_the_reference_passes_its_points_and_holds_the_last
 
 
 def test_cubics_are_hermite_splines_with_a_smooth_lead_in():
-    """Halfway between two points, h apart: their mean plus h/8 times the decrease in velocity."""
+    """Halfway between two points, h apart: their mean plus h/8 times the decrease in velocity.
+
+    After braking, the lead-in is the quintic that set out from rest when the trajectory began.
+    """
     motion = plan(trajectory((GOALS, VELOCITIES)))
     halfway = at(motion.vector, NOW + 1.5)[0]
     expected = 0.5 * (GOALS[0] + GOALS[1]) + (VELOCITIES[0] - VELOCITIES[1]) / 8.0
@@ -198,6 +202,10 @@ def test_cubics_are_hermite_splines_with_a_smooth_lead_in():
     before, after = (at(motion.vector, NOW + 1.0 + side)[2] for side in (-1e-9, 1e-9))
     np.testing.assert_allclose(before, after, atol=1e-6)
     assert np.abs(after).min() > 0.1
+    knots, pieces = pieces_of(unpack(motion.vector)[-1], 2)
+    lead_in = np.polynomial.Polynomial(pieces[1, 0])
+    at_begin = [lead_in.deriv(order)(NOW - knots[1]) for order in (1, 2)]
+    np.testing.assert_allclose(at_begin, 0.0, atol=1e-9)
 
 
 def test_trajectory_that_begins_now_at_another_position_is_blended_in():

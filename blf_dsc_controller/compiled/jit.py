@@ -108,7 +108,7 @@ def cache_folder(function: Callable[..., object]) -> Path:
     files, constants = dependencies(function)
     digest = hashlib.sha256(' '.join([numba.__version__, *sorted(constants)]).encode())
     for name, source in sorted((_name(source), source) for source in files):
-        digest.update(name.encode() + b'\0' + _contents(source))
+        digest.update(name.encode() + b'\0' + source.read_bytes())
     return _base(os.environ.get('NUMBA_CACHE_DIR')) / digest.hexdigest()[:16]
 
 
@@ -132,11 +132,6 @@ def _name(source: Path) -> str:
     """Return the place of a file in the packages, which cached types refer to."""
     inside = source.is_relative_to(_ROOM.parent)
     return str(source.relative_to(_ROOM.parent)) if inside else source.name
-
-
-@functools.cache
-def _contents(source: Path) -> bytes:
-    return source.read_bytes()
 
 
 def inner(function: F) -> F:

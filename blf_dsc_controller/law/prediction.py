@@ -111,20 +111,16 @@ def differentiate(settings: Settings, state: State, signals: Signals, dt: float)
 
 
 @inner
-def heuristic_factor(settings: Settings, state: State, signals: Signals) -> float:
-    """Return Lambda of (24), which is dimensionless only if units are ignored."""
-    products = 1.0
-    squares = 1.0
+def lambda_row(settings: Settings, state: State, signals: Signals) -> None:
+    """Write the row `lambda` to `signals.row`, from ddq^ of `differentiate`.
+
+    Lambda of (24) is dimensionless only if units are ignored.
+    """
+    products, squares, X = 1.0, 1.0, signals.momentum
     for i in range(settings.n):
         products += signals.acceleration[i] * signals.dalpha2[i] + signals.dq[i] * state.alpha2[i]
         squares += signals.acceleration[i] ** 2 + signals.dq[i] ** 2
-    return products / squares
-
-
-@inner
-def lambda_row(settings: Settings, state: State, signals: Signals) -> None:
-    """Write the row `lambda` to `signals.row`, from ddq^ of `differentiate`."""
-    scale, X = heuristic_factor(settings, state, signals), signals.momentum
+    scale = products / squares
     settings.model.regressor(signals.q, signals.dq, state.alpha2, signals.dalpha2, X)
     for i in range(settings.n):
         for j in range(settings.m):
