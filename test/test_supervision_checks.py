@@ -105,13 +105,13 @@ def test_invalid_state_leaves_the_law_as_it_was(law, index, value, is_valid):
 MILLISECOND = 1_000_000  # ns
 
 
-def estimated(*states):
+def estimated(*states, index=2):
     """Estimated velocity (rad/s) of joint 1 at each (stamp in ms, position in rad)."""
     velocity, found = Velocity(2), []
     for stamp, position in states:
         measurement = np.array([position, 0.0, 7.0, 7.0, 8.0, 8.0])
         velocity.replace(stamp * MILLISECOND, measurement)
-        found.append(measurement[2])
+        found.append(measurement[index])
         assert (measurement[4:] == 8.0).all()
     return found
 
@@ -135,6 +135,7 @@ def test_repeated_reading_with_a_new_stamp_is_continued_at_its_velocity():
     found = estimated(*moving, (3, 0.502), (3, 0.504), (4, 0.506), (5, 0.508))
     np.testing.assert_allclose(found, [0.0, 2.0, 2.0, 2.0, 2.0, 2.0])
     np.testing.assert_allclose(estimated(*moving, (3, 0.502), (4, 0.502)), [0.0, 2.0, 2.0, 0.0])
+    np.testing.assert_allclose(estimated(*moving, (3, 0.502), index=0), [0.5, 0.502, 0.504])
     coarse = (1, 0.5), (2, 0.5002), (3, 0.5002)  # less than three counts of 16 bits
     np.testing.assert_allclose(estimated(*coarse), [0.0, 0.2, 0.0])
 
@@ -293,7 +294,10 @@ def test_after_a_long_silence_nothing_is_commanded_until_a_reset():
     rig.base += 3_000_000_000
     rig.step(50)
     assert len(rig.commands) == commands
-    assert 'joint states are back after 3 s' in rig.supervisor.text
+    why, back = rig.supervisor.text.split('; ')
+    assert why.startswith('no joint state received')
+    assert back.startswith('joint states are back after 3 s')
+    assert rig.supervisor.stops == 1
     assert rig.guard.release() is None
     rig.guard.reset()
     rig.step(5)
