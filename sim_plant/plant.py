@@ -98,12 +98,6 @@ class Plant:
         self._now = plant_views(self.arm, self.settings, self.state)[1]
         self._now.acting.sample[0] = -1.0
 
-    def hold(self) -> None:
-        """Stay at rest for one sample, without torque, as with the brakes on."""
-        self._dq[:] = 0.0
-        self._now.drives.applied[:] = self._now.drives.motor[:] = 0.0
-        self._now.sample[0] += 1.0
-
     def truth(self) -> np.ndarray:
         """Return [P, tau_dist, q, dq] (p + 3n,) of this sample; the next call overwrites it."""
         plant_truth(self.arm, self.settings, self.state, self._truth)

@@ -1,21 +1,26 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Identification of an arm from bags of our plant and of MuJoCo, with its confidence."""
+"""Identification of an arm from bags of our plant and of MuJoCo: confidence, terms, loads."""
 
 from __future__ import annotations
 
+import base64
+import importlib
 import re
+import sys
+from pathlib import Path
 
 import mujoco
 import numpy as np
 import pinocchio
 import pytest
-from random_arm import PANDA, pinocchio_model
+from random_arm import PANDA, pinocchio_model, random_urdf
 from shaken_arm import (
     FIELDS,
     GRAVITY,
     PANDA_CHAIN,
     PANDA_TEXT,
     PERIOD,
+    changed,
     is_covered,
     measured,
     recording_of,
@@ -24,8 +29,12 @@ from shaken_arm import (
     truth_of,
     write_states,
 )
+from test_analysis_report import amount, lightened, pixels
 
-from blf_dsc_controller.arms.urdf import pseudo_inertia, read_chain
+from blf_dsc_controller.analysis.panels import COLOURS, INK, ORANGE
+from blf_dsc_controller.arms.base_parameters import base_parameters
+from blf_dsc_controller.arms.model import regressors_at
+from blf_dsc_controller.arms.urdf import inertia_of, pseudo_inertia, read_chain
 from blf_dsc_controller.bags.content import NameMap
 from blf_dsc_controller.bags.sources import BagError
 from blf_dsc_controller.bags.writer import BagWriter
@@ -36,8 +45,8 @@ from blf_dsc_controller.configuration.robot import Robot
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.identification.corrected_urdf import corrected_urdf
 from blf_dsc_controller.identification.identify import identify_arm, identify_bag
-from blf_dsc_controller.identification.prior import base_matrix
-from blf_dsc_controller.identification.recording import read_recording
+from blf_dsc_controller.identification.prior import Cone, base_matrix, solve
+from blf_dsc_controller.identification.recording import Recording, joined, read_recording, rows_of
 from blf_dsc_controller.messages.codecs import JointStateEncoder
 from blf_dsc_controller.messages.topics import JOINT_STATE
 from blf_dsc_controller.simulation.loop import simulate, write_bag
@@ -274,3 +283,311 @@ def test_gravity_depends_on_the_mounting(states):
     wrong = identify_arm(recording_of(states), hanging)
     assert np.linalg.norm(wrong.errors[2]) > 0.1 * np.linalg.norm(wrong.torque)
     assert ROBOT.gravity == GRAVITY
+
+
+LOAD = 2.0  # kg, a ball ...
+CENTRE = (0.02, -0.03, 0.05)  # m, ... in the tip
+BASE = base_parameters(PANDA_CHAIN, GRAVITY)
+AT_TIP = Robot(urdf=PANDA_TEXT, tip='panda_hand_tcp')
+
+
+def moved(duration, seed=2, truth=TRUTH):
+    """States (N, 3, n) of a motion with viscous and Coulomb friction."""
+    return shake(PANDA_CHAIN, truth, reference_of(PANDA_CHAIN, seed), duration)
+
+
+def gravity_of(inertias, q):
+    """Torque of gravity (N, n) at the positions (N, n)."""
+    still = np.zeros_like(q)
+    return regressors_at(BASE.model, q, still, still, still) @ BASE.of(inertias, np.zeros(7))
+
+
+def identified(states, *arguments, robot=AT_TIP):
+    return identify_arm(recording_of(measured(states, 3)), robot, *arguments)
+
+
+@pytest.fixture(scope='module')
+def plain():
+    return moved(30.0)
+
+
+@pytest.fixture(scope='module')
+def simple(plain):
+    return identified(plain)
+
+
+def total(found):
+    return np.linalg.norm(found.errors[2]) / np.linalg.norm(found.torque)
+
+
+def test_terms_that_the_data_do_not_show_are_left_out(simple):
+    load, stribeck, quadratic = simple.parts.terms[[3, 5, 6]]
+    assert not load.any()
+    assert not simple.parts.coupling.any()
+    assert np.count_nonzero(stribeck) + np.count_nonzero(quadratic) <= 1  # of 14, by chance
+
+
+def test_joint_whose_link_is_far_from_the_urdf_keeps_its_weight():
+    """Weighted by correlation lengths, too, joints that fit badly would be left to the prior.
+
+    With the last link 14 cm from where the URDF has it, they then stay 5 % off.
+    """
+    T = np.eye(4)
+    T[:2, 3] = 0.1
+    bodies = PANDA_CHAIN.inertias.copy()
+    bodies[-1] = inertia_of(T @ pseudo_inertia(bodies[-1]) @ T.T)
+    states = moved(30.0, truth=TRUTH._replace(inertias=bodies))
+    robot = Robot(urdf=PANDA_TEXT, tip='panda_hand_tcp', payload=0.0)
+    found = identified(states, robot=robot)
+    assert (found.errors[2] < 0.005 * found.torque).all()
+
+
+def test_load_friction_and_stribeck_friction_are_recognised(plain):
+    states, gravity = plain.copy(), gravity_of(TRUTH.inertias, plain[:, 0])
+    v = states[:, 1]
+    states[:, 2] += 0.06 * np.abs(gravity) * np.sign(v)
+    states[:, 2, 3] += 3.0 * np.sign(v[:, 3]) * np.exp(-((v[:, 3] / 0.1) ** 2))
+    states[:, 2, 0] += 3.0
+    found = identified(states)
+    assert total(found) < 0.005
+    np.testing.assert_allclose(found.parts.terms[3, [1, 3]], 0.06, rtol=0.1)
+    assert found.parts.terms[5, 3] == pytest.approx(3.0, rel=0.1)
+    # The URDF has viscous and Coulomb friction only: they take over what they can.
+    assert found.errors[1, 3] < 0.2 * found.errors[0, 3]
+    # An offset is not friction.
+    assert found.parts.terms[4, 0] == pytest.approx(3.0, rel=0.01)
+    expected = TRUTH.viscous[0], TRUTH.coulomb[0]
+    np.testing.assert_allclose(found.dynamics[:, 0], expected, rtol=0.02)
+
+
+def test_coupled_wrist_is_recognised_and_named(plain, tmp_path, capsys):
+    states = plain.copy()
+    h = PERIOD
+    others = states[:, 1, [6, 5]]
+    both = np.sign(states[:, 1, 5:].sum(axis=1, keepdims=True))
+    states[:, 2, 5:] += 0.02 * np.gradient(others, h, axis=0) + 0.3 * others + 0.8 * both
+    found = identified(states)
+    np.testing.assert_allclose(found.parts.coupling, (0.02, 0.3, 0.8), rtol=0.05)
+    bag = write_states(tmp_path / 'bag', PANDA, states)
+    urdf, page = tmp_path / 'robot.urdf', tmp_path / 'page.html'
+    urdf.write_text(PANDA_TEXT)
+    assert main(['identify', str(bag), '--urdf', str(urdf), '--report', str(page)]) == 0
+    assert 'one motor drives panda_joint6 and panda_joint7' in capsys.readouterr().out
+    text = page.read_text()
+    assert all(words in text for words in ('s of 7 joints', 'panda_link7'))
+    picture = tmp_path / 'torques.png'
+    picture.write_bytes(base64.b64decode(re.search('data:image/png;base64,([^"]+)', text)[1]))
+    for colour in (lightened(COLOURS[0], 0.6), INK, ORANGE):  # measured, predicted, residual
+        assert amount(pixels(picture), colour) > 1000
+
+
+def test_rest_at_the_end_is_left_out(plain, simple):
+    states = plain
+    resting = np.vstack((states, np.repeat(states[-1:], 10_000, axis=0)))
+    resting[len(states) :, 1] = 0.0
+    resting[len(states) :, 2] += 5.0  # stiction, which is no fault of the model
+    recording = recording_of(measured(resting, 3))
+    recording.gap[len(states)] = True  # it stops between two samples
+    other = identify_arm(recording, AT_TIP)
+    assert other.rest == pytest.approx(10.0, abs=0.5)
+    assert other.held_back[1] < 30.5
+    assert total(other) == pytest.approx(total(simple), rel=0.2)
+    assert not list(problems_of(other, 'torque'))
+
+
+def test_efforts_without_gravity_are_named_and_used(plain, simple):
+    gravity = gravity_of(TRUTH.inertias, plain[:, 0])
+    without = plain - gravity[:, None] * [[0.0], [0.0], [1.0]]
+    assert 'GRAVITY IS MISSING' in next(problems_of(identified(without), 'torque'))
+    whole = identified(plain, 'without-gravity')
+    assert 'GRAVITY IS DOUBLE' in next(problems_of(whole, 'without-gravity'))
+    # The drive compensates the gravity of the URDF exactly: then this is the whole torque.
+    without = plain.copy()
+    without[:, 2] -= gravity_of(PANDA_CHAIN.inertias, plain[:, 0])
+    right = identified(without, 'without-gravity')
+    assert total(right) < 2.0 * total(simple)
+    assert not list(problems_of(right, 'without-gravity'))
+
+
+def is_the_load(found):
+    value, deviation = found.load
+    off = np.abs(value - (LOAD, *CENTRE))
+    assert off[0] < 0.05 * LOAD
+    assert (off[1:] < 0.005).all()
+    assert (off < 4.0 * deviation).all()
+    assert np.linalg.eigvalsh(pseudo_inertia(found.values[-11:-1]))[0] > 0.0
+    # Deviations as of many draws of mass and moments, each with its centre in the tip.
+    at, T = slice(-11, -7), found.chain.tip_placement
+    draws = np.random.default_rng(0).multivariate_normal(
+        found.values[at], found.covariance[at, at], 20_000
+    )
+    centres = (draws[:, 1:] / draws[:, :1] - T[:3, 3]) @ T[:3, :3]
+    np.testing.assert_allclose(deviation, [draws[:, 0].std(), *centres.std(axis=0)], rtol=0.03)
+
+
+@pytest.fixture(scope='module')
+def loaded():
+    bodies, T = TRUTH.inertias.copy(), PANDA_CHAIN.tip_placement.copy()
+    T[:3, 3] += T[:3, :3] @ CENTRE
+    bodies[-1] += inertia_of(T @ (LOAD * np.diag((2e-4, 2e-4, 2e-4, 1.0))) @ T.T)
+    return moved(20.0, 5, TRUTH._replace(inertias=bodies))
+
+
+def test_load_is_weighed_with_a_recording_without_and_one_with_it(plain, loaded):
+    together, boundary = joined(recording_of(measured(plain, 3)), recording_of(measured(loaded, 4)))
+    is_the_load(identify_arm(together, AT_TIP, picked_up=boundary))
+
+
+def test_load_that_is_picked_up_is_found_and_weighed(plain, loaded, tmp_path, capsys):
+    """The change is found; the jump from one motion to the other is a gap of the recording."""
+    bag = tmp_path / 'bag'
+    jump = np.full((10, 3, 7), np.nan)
+    write_states(bag, PANDA, np.vstack((plain, jump, loaded)))
+    found = identify_bag(bag, AT_TIP, pick_up=True)
+    assert found.picked_up == pytest.approx(30.0, abs=1.0)
+    is_the_load(found)
+    urdf = tmp_path / 'robot.urdf'
+    urdf.write_text(PANDA_TEXT)
+    assert main(['identify', str(bag), '--urdf', str(urdf), '--payload']) == 0
+    assert 'load from' in capsys.readouterr().out
+
+
+def test_gains_turn_currents_into_torques(plain, simple, tmp_path):
+    states, gains = plain.copy(), np.linspace(5.0, 11.0, 7)
+    states[:, 2] /= gains
+    bag = write_states(tmp_path / 'bag', PANDA, states)
+    other = identify_bag(bag, AT_TIP, gains=gains)
+    np.testing.assert_allclose(other.torque, simple.torque, rtol=0.01)
+    with pytest.raises(BlfDscError, match='got 2 gains for 7 joints'):
+        identify_bag(bag, AT_TIP, gains=(1.0, 2.0))
+
+
+@pytest.mark.parametrize('term', ['load', 'coupling'])
+def test_coupling_and_load_friction_that_would_drive_are_not_identified(plain, term):
+    """Negative ones reduce the error, too, but friction does not drive."""
+    states, gravity = plain.copy(), gravity_of(TRUTH.inertias, plain[:, 0])
+    if term == 'load':
+        states[:, 2, :2] -= 0.05 * (np.abs(gravity) * np.sign(states[:, 1]))[:, :2]
+    else:
+        states[:, 2, 5:] -= 0.3 * states[:, 1, [6, 5]]
+    found = identified(states)
+    assert not found.parts.terms[3, :2].any()
+    assert not found.parts.coupling.any()
+
+
+def test_table_of_recordings_has_a_row_for_a_folder_with_a_bag(
+    plain, tmp_path, capsys, monkeypatch
+):
+    monkeypatch.syspath_prepend(str(Path(__file__).parents[1] / 'benchmark'))
+    benchmark = importlib.import_module('identification')
+    write_states(tmp_path / 'bag', PANDA, measured(plain, 3))
+    (tmp_path / 'panda.urdf').write_text(PANDA_TEXT)
+    monkeypatch.setattr(sys, 'argv', ['identification.py', 'recordings', str(tmp_path)])
+    benchmark.main()
+    row = next(line for line in capsys.readouterr().out.splitlines() if line.startswith('| bag '))
+    cells = [cell.strip() for cell in row.split('|')[1:-1]]
+    urdf, least_squares, bounded, ours = (float(cells[k]) for k in (1, 3, 4, 5))
+    assert urdf > 10.0
+    assert max(least_squares, bounded, ours) < 1.0
+    assert cells[7] == 'yes'
+
+
+UNIT = np.array([pseudo_inertia(e) for e in np.eye(10)])  # E_a of sum_a ten_a E_a
+
+
+# At 10 ms the error is that of interpolating torques between samples: (w h)^2 / 8 of them.
+@pytest.mark.parametrize(('period', 'tolerance'), [(0.001, 1e-5), (0.01, 1e-3)])
+def test_rows_hold_for_an_exact_motion(period, tolerance):
+    """X P = u with the torques of a smooth motion; no acceleration is given."""
+    parameters = base_parameters(PANDA_CHAIN, GRAVITY)
+    model = parameters.model
+    P = parameters.of(PANDA_CHAIN.inertias, np.full(7, 0.1))
+    delay = 0.004
+    t = np.arange(0.0, 4.0, period)[:, None]
+    speed = np.linspace(1.0, 3.0, 7)
+    angle, dq = speed * (t - delay), speed * np.cos(speed * (t - delay))
+    torque = regressors_at(model, np.sin(angle), dq, dq, -(speed**2) * np.sin(angle)) @ P
+    gap = np.zeros(len(t), dtype=bool)
+    gap[len(t) // 2] = True
+    rows = rows_of(Recording(PANDA, period, np.sin(speed * t), torque, gap, ''), model)
+    residual = rows.X[:, :, : model.p] @ P - rows.u(delay)
+    inner = slice(1, -1)  # at both ends the torque has no delayed values
+    scale = np.abs(torque).max(axis=0)
+    assert (np.abs(residual[inner]) < tolerance * scale).all()
+    # No window contains the gap.
+    assert np.abs(rows.time - t[len(t) // 2]).min() >= 0.1
+
+
+def test_nearest_physical_body_is_found():
+    """The J >= 0 nearest in the Frobenius norm is known: the eigenvalues clipped at zero."""
+    target = np.diag([1.0, 2.0, -1.0, 3.0])
+    rotation = np.linalg.qr(np.random.default_rng(0).normal(size=(4, 4)))[0]
+    target = rotation @ target @ rotation.T
+    A = 1e3 * UNIT.reshape(10, 16).T  # so large that |z|^2 and mu hardly count
+    z = solve(A, 1e3 * target.ravel(), [Cone(0, np.zeros((4, 4)), UNIT)], inertia_of(np.eye(4)))
+    expected = rotation @ np.diag([1.0, 2.0, 0.0, 3.0]) @ rotation.T
+    np.testing.assert_allclose(pseudo_inertia(z), expected, atol=2e-3)
+    assert np.linalg.eigvalsh(pseudo_inertia(z))[0] > 0.0
+    # Far from the bounds it is that of least squares.
+    random = np.random.default_rng(1)
+    A, b = random.normal(size=(20, 3)), random.normal(size=20)
+    far = [Cone(k, np.array([[1e3]]), np.array([[[1.0]]])) for k in range(3)]
+    expected = np.linalg.solve(A.T @ A + np.eye(3), A.T @ b)
+    np.testing.assert_allclose(solve(A, b, far, np.zeros(3)), expected, atol=1e-3)
+
+
+@pytest.mark.parametrize('seed', range(2))
+def test_corrected_random_urdf_has_the_given_bodies(seed):
+    """With links fixed to links, links without inertias and empty tags."""
+    text, joints = random_urdf(4, seed)
+    text = re.sub('<link name="l1">.*?</link>', '<link name="l1" note="a > b" />', text)
+    chain = read_chain(text, 'base', 'tip', joints)
+    bodies = changed(chain, np.random.default_rng(seed))
+    friction = np.arange(1.0, 5.0)
+    new = corrected_urdf(text, chain, bodies, friction, 0.1 * friction, 'a -- b')
+    again = read_chain(new, 'base', 'tip', joints)
+    np.testing.assert_allclose(again.inertias, bodies, rtol=1e-9, atol=1e-9)
+    assert [joint.damping for joint in again.joints] == friction.tolist()
+    model = pinocchio_model(new, joints)
+    inertias = np.array([inertia.toDynamicParameters() for inertia in list(model.inertias)[1:]])
+    np.testing.assert_allclose(inertias, bodies, rtol=1e-9, atol=1e-9)
+
+
+def test_rest_of_the_file_is_unchanged():
+    text = PANDA_TEXT.replace('<mass value="0.73" />', '<mass value="0.73" /><!-- a guess -->')
+    text = text.replace('name="panda_link1"', "name='panda_link1'  note='a > b'", 1)
+    friction = np.ones(7)
+    new = corrected_urdf(text, PANDA_CHAIN, 1.1 * PANDA_CHAIN.inertias, friction, friction, 'note')
+    changed_parts = r'<inertial>.*?</inertial>|\s*<dynamics[^>]*>|<!--\nnote\n-->\n|\s+(?=</joint>)'
+
+    def rest(urdf):
+        return re.sub(changed_parts, '', urdf, flags=re.DOTALL)
+
+    assert rest(new) == rest(text)
+    assert new.count('<dynamics damping="1" friction="1" />') == 7
+    for kept in ('panda_link0', 'panda_leftfinger', 'panda_rightfinger'):
+        link = rf'<link name="{kept}">.*?</link>'
+        assert re.search(link, new, re.DOTALL)[0] == re.search(link, text, re.DOTALL)[0]
+    chain = read_chain(new, 'panda_link0', 'panda_hand_tcp', PANDA)
+    np.testing.assert_allclose(chain.inertias, 1.1 * PANDA_CHAIN.inertias, atol=1e-9)
+    twice = corrected_urdf(new, chain, chain.inertias, friction, friction, '')
+    assert twice.count('<inertial>') == new.count('<inertial>')
+    assert twice.count('<dynamics') == 7
+
+
+def test_other_readers_load_the_new_inertias_and_friction(tmp_path):
+    yourdfpy = pytest.importorskip('yourdfpy', reason='needs pip install blf_dsc_controller[view]')
+    inertias = changed(PANDA_CHAIN, np.random.default_rng(5))
+    text = corrected_urdf(PANDA_TEXT, PANDA_CHAIN, inertias, np.full(7, 0.5), np.full(7, 0.2), '')
+    model = mujoco.MjModel.from_xml_string(text)
+    np.testing.assert_allclose(model.dof_damping[:7], 0.5)
+    np.testing.assert_allclose(model.dof_frictionloss[:7], 0.2)
+    (tmp_path / 'arm.urdf').write_text(text)
+    robot = yourdfpy.URDF.load(str(tmp_path / 'arm.urdf'), load_meshes=False)
+    assert robot.validate()
+    last = PANDA_CHAIN.joints[-1]
+    assert last.fixed == ('panda_link8', 'panda_hand', 'panda_hand_tcp')
+    assert last.held[3, 3] == pytest.approx(0.03)  # two fingers
+    for joint, inertia in zip(PANDA_CHAIN.joints, inertias, strict=True):
+        mass = inertia[0] - joint.held[3, 3]
+        assert robot.link_map[joint.link].inertial.mass == pytest.approx(mass)

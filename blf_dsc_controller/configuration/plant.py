@@ -166,8 +166,8 @@ class Actuator:
     ripple: float = _magnitude(0.0, 'amplitude of the torque ripple, relative to the rated torque')
     ripple_cycles: float = _fixed(20.0, 'periods of the ripple per turn, or per metre', above=0.0)
     command_timeout: float = positive(0.05, 'largest age of an applied torque, in real time', 's')
-    without_command: Literal['zero', 'brake', 'hold'] = parameter(
-        'zero', 'without a command: zero torque, the brakes, or the last command'
+    without_command: Literal['zero', 'hold'] = parameter(
+        'zero', 'without a command: zero torque, or the last command'
     )
     rate_limit: float = _magnitude(0.0, 'rate to which the driver limits commands; 0: any', 'N m/s')
     reflex_rate: float = _magnitude(

@@ -49,7 +49,7 @@ from sim_plant.plant import (
 LOCKSTEP_START = 1_000_000_000
 """First stamp in lock-step [ns]: a zero stamp means 'not set' in ROS."""
 
-_STALE = {'zero': ': not applied', 'brake': ': the brakes hold', 'hold': ', and still applied'}
+_STALE = {'zero': ': not applied', 'hold': ', and still applied'}
 _REPEAT_PERIOD = 3.0  # s, until a state without a torque is sent again
 _IN_FLIGHT = 1000  # samples in lock-step on their way to a subscriber: a fifth of its queue
 _EARLY = 0.05  # fraction of a sample by which a timer may fire early
@@ -249,13 +249,9 @@ class PlantNode(LoopNode[PlantConfig]):
         if self._is_over():
             return
         was_stale, self._stale = self._stale, self._is_stale()
-        without = self.config.actuator.without_command
-        if self._stale and without == 'brake':
-            self.plant.hold()
-        else:
-            if self._stale and without == 'zero':
-                self.input.torque[:] = 0.0
-            self._step()
+        if self._stale and self.config.actuator.without_command == 'zero':
+            self.input.torque[:] = 0.0
+        self._step()
         self._apply_changes()
         self._publish_state()
         if self._stale and not was_stale:
