@@ -167,6 +167,20 @@ def test_replay_ends_where_the_law_failed(tmp_path):
     assert result.remarks == ('the law failed, ZeroDivisionError: x: the replay ends there',)
 
 
+def test_replay_ends_where_the_stamps_restart(tmp_path):
+    """Messages of the same stamp could not be told apart."""
+    rig = Recorder(DAMPED)
+    rig.step(50)
+    rig.base -= 20 * MILLISECOND
+    rig.step(5)
+    rig.guard.reset()
+    rig.step(50)
+    result = rig.verify(tmp_path)
+    stamp = rig.base + 55 * MILLISECOND
+    assert (result.difference, result.samples) == (None, 50)
+    assert result.remarks == (f'the stamps restart at {stamp} ns: the replay ends there',)
+
+
 def altered(**content):
     return lambda event: event._replace(content={**event.content, **content})
 

@@ -207,14 +207,14 @@ class Rerun:
     def _command(self, stamp: int, torque: Floats | None) -> None:
         """Add a torque (n,) [N m], if any, that is commanded after a state with this stamp [ns]."""
         if torque is not None:
-            self._add(stamp, self._telemetry.command(torque), self._guard.journal.commands)
+            self._add(stamp, self._telemetry.command(torque))
 
-    def _add(self, stamp: int, message: Message, number: int = 0) -> None:
+    def _add(self, stamp: int, message: Message) -> None:
         topic, raw = message
         if topic not in self.topics:
             self.topics[topic] = TopicMessages(topic.resolved, topic.type)
         messages = self.topics[topic]
-        messages.add(BagMessage(topic.resolved, stamp, raw, number or messages.size + 1))
+        messages.add(BagMessage(topic.resolved, stamp, raw, messages.size + 1))
 
     # Events.
 
