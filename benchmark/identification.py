@@ -51,7 +51,7 @@ from blf_dsc_controller.identification.identify import (
     regression,
     windows_of,
 )
-from blf_dsc_controller.identification.prior import Prior, base_matrix, prior_of, solve
+from blf_dsc_controller.identification.prior import base_matrix, prior_of, solve
 from blf_dsc_controller.identification.recording import (
     Recording,
     Rows,
@@ -315,18 +315,15 @@ def _baselines(taken: Taken, recording: Recording) -> tuple[Rows, NDArray[np.int
     plain = rows.X[test][:, :, used] @ theta[:-1] - u
     largest = np.abs(recording.torque).max(axis=0)
     prior = prior_of(robot, chain, largest, np.maximum(rows.speed, 0.02), load=False)
-    prior = _weakened(prior.only([]))
+    prior = prior.only([])
+    cones = [cone._replace(E=_WEAK * cone.E) for cone in prior.cones]
+    prior = prior._replace(D=_WEAK * prior.D, cones=cones, start=prior.start / _WEAK)
     G = base_matrix(parameters, n)
     found = regression(rows, fit, G, prior)
     values = prior.mean + prior.D @ solve(found.A, found.b, prior.cones, prior.start)
     w = rows.u(values[-1])[test]
     bounded = rows.X[test] @ (G @ values)[:-1] - w
     return rows, test, [_percent(plain, u), _percent(bounded, w)]
-
-
-def _weakened(prior: Prior) -> Prior:
-    cones = [cone._replace(E=_WEAK * cone.E) for cone in prior.cones]
-    return prior._replace(D=_WEAK * prior.D, cones=cones, start=prior.start / _WEAK)
 
 
 def _weigh_loaded(taken: Taken, empty: Recording, bag: Path, mass: float) -> str:

@@ -31,7 +31,6 @@ from blf_dsc_controller.simulation.loop import simulate
 SEED = 1
 POPULATION = 96
 GENERATIONS = 12
-EVALUATIONS = POPULATION * (GENERATIONS + 1)
 DURATION = 30.0  # s
 ROUGHEST = 2.0  # N m, largest acceptable rms change of a torque from sample to sample
 HOPELESS = 30.0
@@ -176,7 +175,7 @@ def main() -> None:
     options.add_argument('law', choices=TASKS)
     task = TASKS[options.parse_args().law]
     loops = loops_of(task)
-    with tqdm(total=EVALUATIONS, desc='tuning', unit='run') as bar:
+    with tqdm(total=POPULATION * (GENERATIONS + 1), desc='tuning', unit='run') as bar:
 
         def cost(exponents: Floats) -> float:
             bar.update()
