@@ -40,10 +40,7 @@ _THICKNESS = 0.025  # radius of a link relative to the length of all links
 _SHORTEST = 1e-3  # m, length below which a link is not drawn
 _SAME = 1e-3  # m and of rotation matrices, between two URDFs of the same arm
 _TRAIL = 4.0  # s of the tip's path
-_EVENTS = 12
-_MESH = 5000  # faces of a shape from which on it is a mesh with colours of its own
 _SHOWN = 3.0  # s that an event is named beside the arm
-_PLAIN = (86, 110, 150)  # colour of an arm without any
 _GHOST = (0, 200, 120, 0.35)
 _APART = 0.01  # rad, error from which on the reference is drawn beside the arm
 _PEAK = 30  # snapshots, a second, of which the largest error is plotted
@@ -140,17 +137,12 @@ class Page:
         server, gui, reach = self.server, self.server.gui, arm.reach
         model = arm.model()
         self._held = dict.fromkeys(model.actuated_joint_names, 0.0)
-        shapes = model.scene.geometry.values()
-        colour = None if any(len(shape.faces) > _MESH for shape in shapes) else _PLAIN
-        self._drawn = ViserUrdf(server, model, root_node_name='/arm', mesh_color_override=colour)
+        self._drawn = ViserUrdf(server, model, root_node_name='/arm')
         self._ghost = ViserUrdf(
             server, arm.model(), root_node_name='/reference', mesh_color_override=_GHOST
         )
         self._base = np.array(model.get_transform(arm.chain.base))
-        floor = min(0.0, -reach if _hangs(arm) else 0.0)
-        server.scene.add_grid(
-            '/floor', 4 * reach, 4 * reach, cell_size=0.25, position=(0, 0, floor)
-        )
+        server.scene.add_grid('/floor', 4 * reach, 4 * reach, cell_size=0.25)
         self._corners = None
         tabs = gui.add_tab_group()
         with tabs.add_tab('Plots'):
@@ -194,9 +186,9 @@ class Page:
         )
 
     def events(self, events: Sequence[tuple[float, str, str]]) -> None:
-        """List the last of these events: time [s], kind and text."""
-        if self._events != list(events[-_EVENTS:]):
-            self._events = list(events[-_EVENTS:])
+        """List these events: time [s], kind and text."""
+        if self._events != list(events):
+            self._events = list(events)
             if self._list is not None:
                 self._list.content = event_list(self._events)
 
@@ -307,11 +299,6 @@ def with_marks(t: Floats, curves: Floats, marks: Sequence[float]) -> tuple[Float
     line = np.insert(np.full(t.size, -1.0), at, (-1.0, 1.0, -1.0) * len(marks))
     held = known[:, np.maximum(at - 1, 0)]
     return (np.insert(t, at, np.repeat(marks, 3)), *np.insert(known, at, held, axis=1), line)
-
-
-def _hangs(arm: ShownArm) -> bool:
-    """Return whether the links turn in a vertical plane, also below their base."""
-    return not any(joint.placement[2, 3] for joint in arm.chain.joints)
 
 
 def caption(now: Snapshot) -> str:
