@@ -191,7 +191,11 @@ class PlantNode(LoopNode[PlantConfig]):
         if not self._lockstep:
             self._start_stamp = self._wall() - self.plant.elapsed_ns
         self._offered = True
-        self._publish_incomplete_states()
+        measurement = self.plant.measure().copy()
+        measurement[len(self.config.joints) :] = nan
+        for ahead in range(self.config.sensor.incomplete_states, 0, -1):
+            stamp = self.stamp - ahead * self.config.sample_time_ns
+            self._publish(self._telemetry.joint_states(stamp, measurement))
         if self._lockstep and self._torque_waits:
             self._running = True
             self._advance()
@@ -248,7 +252,9 @@ class PlantNode(LoopNode[PlantConfig]):
     def _advance(self) -> None:
         if self._is_over():
             return
-        was_stale, self._stale = self._stale, self._is_stale()
+        was_stale, limit = self._stale, self.config.actuator.command_timeout
+        samples = round(limit / self.config.sample_time)
+        self._stale = not self._lockstep and self.input.is_stale(self.plant.sample, samples)
         if self._stale and self.config.actuator.without_command == 'zero':
             self.input.torque[:] = 0.0
         self._step()
@@ -281,12 +287,6 @@ class PlantNode(LoopNode[PlantConfig]):
                 self._reset_controller()
         return self.finished
 
-    def _is_stale(self) -> bool:
-        if self._lockstep:
-            return False
-        limit = round(self.config.actuator.command_timeout / self.config.sample_time)
-        return self.input.is_stale(self.plant.sample, limit)
-
     def _publish_state(self) -> None:
         if self._lockstep and self.plant.sample % _IN_FLIGHT == 0:
             process.drain(self._outputs.values())  # the loop must not outrun its recorder
@@ -300,13 +300,6 @@ class PlantNode(LoopNode[PlantConfig]):
             self._publish(self._telemetry.truth(stamp, self.plant.truth()))
         if self.config.publish_clock:
             self._publish(self._telemetry.clock(stamp))
-
-    def _publish_incomplete_states(self) -> None:
-        measurement = self.plant.measure().copy()
-        measurement[len(self.config.joints) :] = nan
-        for ahead in range(self.config.sensor.incomplete_states, 0, -1):
-            stamp = self.stamp - ahead * self.config.sample_time_ns
-            self._publish(self._telemetry.joint_states(stamp, measurement))
 
     def _tell_parameters(self) -> None:
         """Publish all parameters, in force from the start."""
