@@ -70,25 +70,19 @@ def retract(estimate: Array, gain: Array, radius: float) -> None:
     nu = 0.0
     length = radius
     for _ in range(_MOST_STEPS):
-        length, slope = _shrunk(estimate, gain, nu)
+        square, slope = 0.0, 0.0  # of the length of P^_j / (1 + nu Gamma_j): minus half the slope
+        for j in range(gain.size):
+            shrink = 1.0 + nu * gain[j]
+            entry = estimate[j] / shrink
+            square += entry * entry
+            slope += gain[j] * entry * entry / shrink
+        length = sqrt(square)
         if not (length > _ROUNDED * radius and slope > 0.0):
             break
         nu += (length / radius - 1.0) * length * length / slope
     rounding = min(1.0, radius / length)
     for j in range(gain.size):
         estimate[j] *= rounding / (1.0 + nu * gain[j])
-
-
-@inner
-def _shrunk(estimate: Array, gain: Array, nu: float) -> tuple[float, float]:
-    """Return the length of P^_j / (1 + nu Gamma_j) and minus half the slope of its square."""
-    square = 0.0
-    slope = 0.0
-    for j in range(gain.size):
-        entry = estimate[j] / (1.0 + nu * gain[j])
-        square += entry * entry
-        slope += gain[j] * entry * entry / (1.0 + nu * gain[j])
-    return sqrt(square), slope
 
 
 @inner

@@ -85,16 +85,6 @@ def filter_row(settings: Settings, state: State, signals: Signals, dt: float) ->
 
 
 @inner
-def remember(settings: Settings, state: State, signals: Signals) -> None:
-    """Keep this sample's Yp and [Yr | D] for the next interval."""
-    for i in range(settings.n):
-        for j in range(settings.m):
-            state.rest[i, j] = signals.rest[i, j]
-            if j < settings.p:
-                state.momentum[i, j] = signals.momentum[i, j]
-
-
-@inner
 def differentiate(settings: Settings, state: State, signals: Signals, dt: float) -> None:
     """Step the filter (8) with damping 1, exactly for held xi2; write ddq^ to `signals`."""
     decay = exp(-settings.omega * dt)
@@ -137,4 +127,8 @@ def form_row(settings: Settings, state: State, signals: Signals, dt: float) -> N
         return
     if state.samples[0] > 0.0:
         filter_row(settings, state, signals, dt)
-    remember(settings, state, signals)
+    for i in range(settings.n):  # Yp and [Yr | D] for the next interval
+        for j in range(settings.m):
+            state.rest[i, j] = signals.rest[i, j]
+            if j < settings.p:
+                state.momentum[i, j] = signals.momentum[i, j]

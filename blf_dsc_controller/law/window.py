@@ -116,18 +116,6 @@ def pull_to(target: Array, weight: float, information: Array, Phi: Array, b: Arr
             b[j] += pull * information[i, j]
 
 
-@inner
-def remove_rejected(active: Array, Phi: Array, b: Array) -> None:
-    """Remove the rejected columns from Phi theta = b, setting theta_j = 0."""
-    for i in range(active.size):
-        if active[i] == 0.0:
-            for j in range(active.size):
-                Phi[i, j] = 0.0
-                Phi[j, i] = 0.0
-            Phi[i, i] = 1.0
-            b[i] = 0.0
-
-
 @called
 def regularized_factor(
     active: Array,
@@ -137,8 +125,14 @@ def regularized_factor(
     b: Array,
     factor: Array,
 ) -> None:
-    """Remove the rejected columns; fill `factor` with the Cholesky factor of Phi + rho R."""
-    remove_rejected(active, Phi, b)
+    """Remove the rejected columns (theta_j = 0); fill `factor` with that of Phi + rho R."""
+    for i in range(active.size):
+        if active[i] == 0.0:
+            for j in range(active.size):
+                Phi[i, j] = 0.0
+                Phi[j, i] = 0.0
+            Phi[i, i] = 1.0
+            b[i] = 0.0
     for i in range(Phi.shape[0]):
         for j in range(i + 1):
             factor[j, i] = Phi[i, j] + rho * information[i, j]
