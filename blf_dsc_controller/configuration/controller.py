@@ -362,9 +362,6 @@ class Learning:
         above=0.0,
         omittable=True,
     )
-    derivative_filter: float = _in_window(
-        100.0, 'frequency of filter (8) for lambda', 'rad/s', 'omega', above=0.0
-    )
     radius: float = positive(3.0, 'radius of the projection ball of P^', 'kg m^2', 'omega_a')
     compensation: Literal['reference', 'state'] = parameter(
         'reference', 'where what is learned acts: along the reference, or at the state (paper)'

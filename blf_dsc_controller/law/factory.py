@@ -39,6 +39,7 @@ from blf_dsc_controller.law.state import CHOICES, LINEAR, Settings
 from blf_dsc_controller.reference.approach import plan_start, reference_of
 
 _COLUMNS = 1.0  # Gamma of the disturbance columns
+_OMEGA = 100.0  # rad/s, of the filter (8)
 _CHECKS = 0.01  # s, between two checks of the excitation
 # Of an arm from a URDF, whose many parameters no motion excites all:
 _ROWS, _SLOWER_CHECKS = 0.01, 0.05  # s, between rows of the window and between its checks
@@ -160,6 +161,7 @@ def settings_of_config(config: ControllerConfig) -> Settings:
         'prior_weight': (_PRIOR if is_urdf else 0.0) * least * least,
         'motion_scale': _SLOW if is_urdf else 0.0,
         'pole': learning.filter_pole,
+        'omega': _OMEGA,
         'Wc': 0.0,
         'initial_bound': np.array(config.barrier.widest),
         'knee': np.array([barrier.knee(*joint) for joint in per_joint]),
