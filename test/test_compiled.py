@@ -33,6 +33,7 @@ from blf_dsc_controller.law.controller import update
 from blf_dsc_controller.law.weighing import weigh
 from blf_dsc_controller.reference.terms import cubics, minimum_jerk
 from blf_dsc_controller.simulation.loop import run_loop, simulate
+from blf_dsc_controller.studies import laws
 from blf_dsc_controller.supervision.safe_torque import friction_torque, model_torque
 from sim_plant.kernels import step_plant
 from sim_plant.plant import plant_settings
@@ -70,6 +71,19 @@ def test_kernel_depends_on_the_files_and_constants_it_is_compiled_from():
     outside = {path.name for path in jit.dependencies(_shake)[0]}  # a kernel of these tests
     assert outside >= {'shaken_arm.py', 'arm.py', 'algebra.py'}
     assert 'controller.py' not in outside
+
+
+class OwnLaw(NamedTuple):
+    gain: float
+
+    def fill_torque(self, _arm, now, torque):
+        torque[:] = -self.gain * (now.q - now.qr)
+
+
+def test_kernel_depends_on_the_file_of_a_type_whose_methods_it_calls(monkeypatch):
+    monkeypatch.setattr(jit, '_COMPILED', {name: {*uses} for name, uses in jit._COMPILED.items()})
+    monkeypatch.setattr(jit, 'KERNELS', [])
+    assert Path(__file__) in jit.dependencies(laws._loop_with(OwnLaw))[0]
 
 
 @compiling

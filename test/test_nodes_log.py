@@ -213,7 +213,7 @@ def test_rejected_columns_are_logged_and_diagnosed_with_the_reason(ros, log):
     status = statuses(diagnostics, 'not estimated: cos 1 rad/s')[-1]
     assert 'cannot distinguish it from m2*l2^2' in str(values(status))
     (warning,) = log('rejected', 'is not estimated')  # once, not in every sample
-    assert 'cannot distinguish it from m2*l2^2' in warning
+    assert 'cannot distinguish it from m2*l2^2 + cos 1 rad/s joint2 (' in warning
 
 
 @pytest.mark.parametrize('simulated', [True, False])
