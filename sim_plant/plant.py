@@ -1,5 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The simulated plant of a configuration: its arm, its vectors and its random generator."""
+"""The simulated plant of a configuration: its arm, its vectors and its random generator.
+
+`TorqueInput` and `Latency` follow the torques that its node receives.  They are the counterpart of
+the controller's checks of joint states: a motor that applies an outdated torque, or one that is not
+finite, is as dangerous as a law that commands one.
+"""
 
 from __future__ import annotations
 
@@ -8,7 +13,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any, TypeVar, get_type_hints
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from blf_dsc_controller.arms.two_link import PARAMETER_NAMES, urdf
 from blf_dsc_controller.arms.urdf import Chain, inertia_of, moved, pseudo_inertia
@@ -40,6 +45,10 @@ T = TypeVar('T')
 _RESOLVED = 1.5  # decay within a step; the integrator is stable up to 3.3
 _MOST_STEPS = 1000
 _CURRENT = 0.1  # A/N m, of motors with their gears, roughly that of cobots
+
+
+LARGEST = 1e4
+"""Largest valid torque [N m] of a command; a step with 1e6 N m makes the arm diverge."""
 
 
 class Plant:
@@ -121,6 +130,79 @@ class Plant:
     def restore(self, saved: tuple[np.ndarray, Mapping[str, Any]]) -> None:
         """Restore what was saved by a plant with the same settings."""
         self.state[:], self.rng.bit_generator.state = saved
+
+
+class TorqueInput:
+    """The last valid `torque` (n,) [N m] of the n joints, and counts of rejected commands.
+
+    `problem` describes the last rejected command; `stale_steps` counts the steps for which the
+    torque was too old.
+    """
+
+    def __init__(self, n: int) -> None:
+        self.torque = np.zeros(n)
+        self.problem = ''
+        self.rejected = 0
+        self.stale_steps = 0
+        self._taken_at = 0
+
+    def take(self, size: int, torque: NDArray[np.float64], sample: int) -> bool:
+        """Store a command of `size` values, `torque` (n,), at a sample of the plant.
+
+        Returns whether it is valid; if not, `problem` describes why.
+        """
+        if size == self.torque.size and (np.abs(torque) <= LARGEST).all():
+            self.torque[:] = torque
+            self._taken_at = sample
+            return True
+        self.rejected += 1
+        got = f'{torque} N m' if size == self.torque.size else f'{size} values'
+        needed = f'{self.torque.size} of at most {LARGEST:g} N m are needed'
+        self.problem = f'command rejected: got {got}, but {needed}'
+        return False
+
+    def is_stale(self, sample: int, limit: int) -> bool:
+        """Return whether the torque is older than `limit` samples at `sample`, and count it."""
+        stale = sample - self._taken_at > limit
+        self.stale_steps += stale
+        return stale
+
+    def renew(self, sample: int) -> None:
+        """Measure the age of the torque from `sample` on."""
+        self._taken_at = sample
+
+
+class Latency:
+    """Time from a published state to the torque that follows it, and the number of late steps.
+
+    A torque does not identify its state. It is matched with the oldest state that has had no
+    torque yet, so that a late torque counts with its full delay. Times are in s; `late_steps`
+    counts the steps taken before a torque for their state had arrived.
+    """
+
+    def __init__(self) -> None:
+        self.late_steps = 0
+        self._since: float | None = None
+        self._longest = 0.0
+
+    def state_published(self, now: float) -> None:
+        """Start waiting, unless an older state has had no torque yet."""
+        if self._since is None:
+            self._since = now
+
+    def torque_received(self, now: float) -> None:
+        """Stop waiting."""
+        if self._since is not None:
+            self._longest = max(self._longest, now - self._since)
+            self._since = None
+
+    def step(self, now: float) -> float:
+        """End a sample; return its longest wait, or the wait of the oldest state so far."""
+        if self._since is not None:
+            self.late_steps += 1
+            return now - self._since
+        longest, self._longest = self._longest, 0.0
+        return longest
 
 
 def parameter_order(names: Sequence[str], config: PlantConfig) -> np.ndarray:

@@ -30,8 +30,7 @@ from blf_dsc_controller.messages.codecs import (
 from blf_dsc_controller.reference.trajectory import Trajectory, TrajectoryError, TrajectoryPoint
 from blf_dsc_controller.supervision.checks import PERIOD, Phase, Reason
 from blf_dsc_controller.supervision.guard import Guard
-from sim_plant.command_input import TorqueInput
-from sim_plant.plant import plant_of
+from sim_plant.plant import TorqueInput, plant_of
 
 JOINTS = ('joint1', 'joint2')
 MILLISECOND = 1_000_000  # ns

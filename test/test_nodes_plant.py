@@ -16,8 +16,7 @@ from blf_dsc_controller.law.telemetry import disturbance_names
 from blf_dsc_controller.messages import topics
 from blf_dsc_controller.messages.codecs import Float64MultiArrayEncoder
 from blf_dsc_controller.nodes.plant_node import PlantNode
-from sim_plant.command_input import Latency
-from sim_plant.plant import parameter_names_of, plant_of, urdf_of
+from sim_plant.plant import Latency, parameter_names_of, plant_of, urdf_of
 
 TORQUE = (5.0, 3.0)  # N m
 

@@ -99,13 +99,13 @@ def prior_factor(
     `rotors` (n,) are the standard deviations of the rotor inertias [kg m^2, or kg], which a URDF
     does not contain.
     """
-    n = len(chain.joints)
+    n, without_rotor = len(chain.joints), ((0, 1), (0, 0))
     blocks: list[tuple[int, np.ndarray]] = []  # body, directions (11, k) of its entries
     for i, joint in enumerate(chain.joints):
         J = pseudo_inertia(joint.inertia)
-        blocks.append((i, _blocks_of_ten(deviations(J, LINKS, CENTRE))))
+        blocks.append((i, np.pad(deviations(J, LINKS, CENTRE), without_rotor)))
     J = moved(payload_inertia(payload), chain.tip_placement)
-    blocks.append((n - 1, _blocks_of_ten(deviations(J, 1.0, PAYLOAD_SIZE))))
+    blocks.append((n - 1, np.pad(deviations(J, 1.0, PAYLOAD_SIZE), without_rotor)))
     blocks += [(i, rotors[i] * np.eye(ROTOR + 1)[:, ROTOR:]) for i in range(n)]
     K = base.K.reshape(-1, n, ROTOR + 1)
     return np.column_stack([product(K[:, i], block) for i, block in blocks])
@@ -114,11 +114,6 @@ def prior_factor(
 def payload_inertia(payload: float) -> np.ndarray:
     """Return the pseudo-inertia (4, 4) of a payload [kg] about its centre."""
     return payload * np.diag((*(PAYLOAD_SIZE**2,) * 3, 1.0))
-
-
-def _blocks_of_ten(directions: np.ndarray) -> np.ndarray:
-    """Append a rotor entry of zero to directions (10, k) of the ten, giving (11, k)."""
-    return np.vstack((directions, np.zeros((1, directions.shape[1]))))
 
 
 def deviations(J: np.ndarray, share: float, centre: float) -> np.ndarray:

@@ -36,9 +36,10 @@ from blf_dsc_controller.nodes import parameters, process
 from blf_dsc_controller.nodes.diagnostics import ERROR, OK, STALE, WARN, DiagnosticsPublisher
 from blf_dsc_controller.nodes.endpoints import create_publisher, create_steady_timer
 from blf_dsc_controller.nodes.lifecycle import LoopNode
-from sim_plant.command_input import Latency, TorqueInput
 from sim_plant.plant import (
+    Latency,
     Plant,
+    TorqueInput,
     parameter_names_of,
     plant_of,
     plant_settings,
