@@ -44,6 +44,7 @@ class RosRig:
         self.executor = EventsExecutor(context=self.context)
         self.nodes = []
         self.tester = self._keep(rclpy.create_node('record_tester', context=self.context))
+        self._clients = {}  # by the name of their service; kept, since events may be pending
 
     def _keep(self, node):
         self.nodes.append(node)
@@ -56,6 +57,7 @@ class RosRig:
         rclpy.try_shutdown(context=self.context)
         # A node's services keep its participant, visible to others, until it is collected.
         self.tester = self.executor = None
+        self._clients.clear()
         gc.collect()
 
     def kill(self, node):
@@ -118,11 +120,11 @@ class RosRig:
 
     def call(self, service, name, request):
         """Call a service and return its response."""
-        client = self.tester.create_client(service, name)
+        client = self._clients.get(name) or self.tester.create_client(service, name)
+        self._clients[name] = client
         self.until(client.service_is_ready)
         future = client.call_async(request)
         self.until(future.done)
-        self.tester.destroy_client(client)
         return future.result()
 
     def reset(self, node):
