@@ -27,10 +27,8 @@ from blf_dsc_controller.analysis.metrics import (
 )
 from blf_dsc_controller.analysis.panels import panels
 from blf_dsc_controller.bags.reader import read_run
-from blf_dsc_controller.configuration.schema import flatten
 from blf_dsc_controller.law.telemetry import learned_arm
-from blf_dsc_controller.messages.journal import decode
-from blf_dsc_controller.messages.topics import JOURNAL, LAMBDA_MIN, LATCHED, LATE_STEPS
+from blf_dsc_controller.messages.topics import LAMBDA_MIN, LATCHED, LATE_STEPS
 from blf_dsc_controller.run import LearnedArm, Run, Series
 from blf_dsc_controller.simulation.loop import simulate, write_bag
 
@@ -116,8 +114,7 @@ def test_unknown_values_are_null_and_never_nan(run, tmp_path):
     assert list(metrics.estimate) == list(PARAMETERS)
 
 
-def test_table_shows_what_is_unusual(run):
-    """A wide bound, late steps, a violation, an unknown bound."""
+def test_table_shows_the_metrics_and_what_is_unusual(run):
     bound, late = run.bound.copy(), run.timing.values.copy()
     bound[:100, 1] = 0.0123
     late[-1, run.timing.names.index(LATE_STEPS)] = 0.02 * SAMPLES
@@ -127,19 +124,6 @@ def test_table_shows_what_is_unusual(run):
     learning = run.monitor
     waiting = Series(learning.names, learning.stamp[early], learning.values[early])
     usual = format_table(measure(run))
-    for changes, line in (
-        ({'bound': bound}, '\nat widest   elbow 12.3 mrad\n'),
-        ({'timing': timing}, '200 late steps: the computer was too busy for real time'),
-        ({'error': run.error + 1.0}, 'VIOLATED, first by shoulder at 0.000 s'),
-        (unknown, 'bound       unknown'),
-        ({'monitor': waiting}, 'learning    never began'),
-    ):
-        assert line in format_table(measure(replace(run, **changes)))
-        assert line not in usual
-
-
-def test_table_shows_the_summary(run):
-    table = format_table(measure(run))
     for text in (
         'shoulder  0.800 mrad  0.566 mrad  2.000 mrad     8.00 N m    5.66 N m  20.00 N m',
         'held by every joint',
@@ -149,8 +133,17 @@ def test_table_shows_the_summary(run):
         '1000.00 Hz',
         '99 late steps',
     ):
-        assert text in table
-    assert max(map(len, table.splitlines())) <= 120
+        assert text in usual
+    assert max(map(len, usual.splitlines())) <= 120
+    for changes, line in (
+        ({'bound': bound}, '\nat widest   elbow 12.3 mrad\n'),
+        ({'timing': timing}, '200 late steps: the computer was too busy for real time'),
+        ({'error': run.error + 1.0}, 'VIOLATED, first by shoulder at 0.000 s'),
+        (unknown, 'bound       unknown'),
+        ({'monitor': waiting}, 'learning    never began'),
+    ):
+        assert line in format_table(measure(replace(run, **changes)))
+        assert line not in usual
 
 
 @pytest.mark.parametrize(
@@ -301,39 +294,14 @@ def test_seven_joints_and_sixty_parameters_fit_into_the_figures(tmp_path, config
         assert 1200 < matplotlib.image.imread(path).shape[1] < 2000
     shown = {panel.title: panel for panel in panels([run]) if panel.group == 'Parameters'}
     assert all(len(panel.lines) <= 8 for panel in shown.values())  # as there are colours
-    assert set(shown) == (
-        {
-            'torque error',
-            'errors of the estimates, by link',
-        }
-        if configured
-        else {'relative parameter error'}
-    )
-
-
-def reconfigured(messages, values):
-    """Messages of a bag whose journal has another configuration."""
-    first = recorded_run.of(messages, JOURNAL)[0]
-    event = decode(first[3])
-    first[3] = event._replace(content={'parameters': values}).encode()
-    return messages
-
-
-def test_arm_of_a_bag_comes_from_its_recorded_configuration(tmp_path):
-    config = panda()
-    messages = recorded_run.messages(recorded_run.record(tmp_path / 'two_links', 0.1))
-    bag = recorded_run.write(tmp_path / 'bag', reconfigured(messages, flatten(config)))
-    run = read_run(bag)
-    assert run.arm is not None
-    assert run.arm.deviations == learned_arm(config).deviations
-    # It learned parameters with other names: their error is a norm.
-    assert not estimates_of(run).of_torques
-    assert read_run(tmp_path / 'two_links').arm is None
+    of_links = {'torque error', 'errors of the estimates, by link'}
+    assert set(shown) == (of_links if configured else {'relative parameter error'})
 
 
 def test_estimates_of_other_parameters_than_the_plant_has_are_not_compared(tmp_path):
     run = read_run(synthetic_bag.write(tmp_path / 'bag', Synthetic(200).messages()))
     names = ('mass 1', 'mass 2', *run.monitor.names[2:])
+    assert run.arm is None
     metrics = measure(replace(run, monitor=replace(run.monitor, names=names)))
     assert np.isnan(metrics.final_parameter_error)
     assert metrics.true is None

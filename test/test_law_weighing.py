@@ -12,7 +12,7 @@ from blf_dsc_controller.bags.reader import read_run
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.errors import ConfigurationError
 from blf_dsc_controller.law.factory import controller_of
-from blf_dsc_controller.law.telemetry import load_text, sample_columns
+from blf_dsc_controller.law.telemetry import learned_arm, load_text, sample_columns
 from blf_dsc_controller.law.weighing import BEFORE, NEWER, describe, solve
 from blf_dsc_controller.law.window import add_products
 from blf_dsc_controller.simulation.loop import simulate, write_bag
@@ -139,6 +139,7 @@ def test_weighing_what_cannot_be_weighed_is_rejected():
 def test_bag_tells_what_was_held_in_the_table_and_on_the_page(panda, tmp_path):
     write_bag(tmp_path / 'bag', panda)
     run = read_run(tmp_path / 'bag')
+    assert run.arm.deviations == learned_arm(panda.config).deviations
     metrics = measure(run)
     held = np.array([(load['until'], load['load mass']) for load in metrics.loads])
     np.testing.assert_allclose(held[:, 0], (PICKED_UP, PUT_DOWN, END), atol=0.2)

@@ -341,16 +341,15 @@ def _loads(run: Run) -> list[dict[str, float]]:
 
 
 def _timing(run: Run) -> dict[str, Any] | None:
-    if run.timing is None or LATENCY not in run.timing.names:
+    if run.timing is None or not {LATENCY, LATE_STEPS} <= {*run.timing.names}:
         return None
     moving = run.received[1:]  # the first state waits, with brakes on, for the controller
     elapsed = float(moving[-1] - moving[0]) * 1e-9 if moving.size else 0.0
     latency = run.timing.column(LATENCY)
-    late = run.timing.column(LATE_STEPS)[-1] if LATE_STEPS in run.timing.names else None
     return {
         'rate': (moving.size - 1) / elapsed if elapsed > 0 else math.nan,
         'latency': {k: _reduced(latency, partial(np.percentile, q=q)) for k, q in _QUANTILES},
-        'late_steps': None if late is None else int(late),
+        'late_steps': int(run.timing.column(LATE_STEPS)[-1]),
     }
 
 
@@ -456,10 +455,9 @@ def _sentences(of: Metrics) -> Iterator[str]:
         if not math.isnan(latency['max']):
             microseconds = '/'.join(f'{1e6 * each:.1f}' for each in latency.values())
             figures.append(f'state to torque {microseconds} us ({"/".join(latency)})')
-        figures += [] if late is None else [f'{late} late steps']
-        is_slow = (late or 0) > _OFTEN * of.samples
+        is_slow = late > _OFTEN * of.samples
         busy = ': the computer was too busy for real time (--mode lockstep waits)' * is_slow
-        yield f'real time   {", ".join(figures)}{busy}'
+        yield f'real time   {", ".join([*figures, f"{late} late steps"])}{busy}'
 
 
 def _learning_lines(of: Metrics) -> Iterator[str]:

@@ -123,7 +123,7 @@ def _diagnosed(content: Content, run: Run) -> Iterator[Happened]:
     for received, raw in zip(messages.received, messages.raw, strict=True) if messages else ():
         message: Any = typestore().deserialize_cdr(raw, DIAGNOSTICS.type)
         k = int(np.searchsorted(run.received, received)) - 1
-        time = float(run.time[k]) if k >= 0 else (received - int(run.received[0])) * 1e-9
+        time = float(run.time[max(k, 0)])
         for status in message.status:
             now = (int(status.level), str(status.message))
             if shown.get(status.name) != now:
@@ -141,10 +141,12 @@ def _changed(content: Content, run: Run) -> Iterator[Happened]:
 
 
 def _shown(value: object) -> str:
-    if isinstance(value, str) and len(value) > _LONGEST:  # a URDF
-        digest = zlib.crc32(value.encode())
-        return f'{value[:40]} ... ({len(value)} characters, CRC {digest:08x})'
-    return f'[{", ".join(map(_shown, value))}]' if isinstance(value, list) else f'{value}'
+    text = f'{value}'
+    if len(text) <= _LONGEST:
+        return text
+    return (
+        f'{text[:40]} ... ({len(text)} characters, CRC {zlib.crc32(text.encode()):08x})'  # a URDF
+    )
 
 
 def write_report(bags: Sequence[ReportedBag], path: Path) -> None:

@@ -114,12 +114,11 @@ def _report(out: Path) -> bool:
     from blf_dsc_controller.analysis.figures import draw  # slow: the libraries of the pictures
     from blf_dsc_controller.analysis.metrics import format_table, measure, write_json
 
-    print_notice('reading the bag')
+    print_notice('reading the bag and drawing the pictures')
     content = read_content(out / 'bag')
     recorded = recorded_run(content)
     metrics = measure(recorded)
     write_json(metrics, out / 'summary.json')
-    print_notice('drawing the pictures')
     pictures = draw(recorded, out)
     print(format_table(metrics))
     for topic, text in content.losses.items():
