@@ -142,11 +142,9 @@ def _changed(content: Content, run: Run) -> Iterator[Happened]:
 
 def _shown(value: object) -> str:
     text = f'{value}'
-    if len(text) <= _LONGEST:
-        return text
-    return (
-        f'{text[:40]} ... ({len(text)} characters, CRC {zlib.crc32(text.encode()):08x})'  # a URDF
-    )
+    if len(text) > _LONGEST:  # a URDF
+        text = f'{text[:40]} ... ({len(text)} characters, CRC {zlib.crc32(text.encode()):08x})'
+    return text
 
 
 def write_report(bags: Sequence[ReportedBag], path: Path) -> None:

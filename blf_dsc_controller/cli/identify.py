@@ -13,7 +13,7 @@ import numpy as np
 
 from blf_dsc_controller.analysis.metrics import aligned
 from blf_dsc_controller.bags.content import NameMap
-from blf_dsc_controller.cli.main import PICK_UP, make_room
+from blf_dsc_controller.cli.main import make_room
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.nodes import CONTROLLER, dump, load, locate
 from blf_dsc_controller.configuration.robot import Robot
@@ -48,7 +48,7 @@ def identify(options: Namespace) -> None:
         gravity=tuple(options.gravity),
         payload=options.rated_payload,
     )
-    pick_up = options.payload == PICK_UP
+    pick_up = options.payload is True
     found = identify_bag(
         options.bag,
         robot,

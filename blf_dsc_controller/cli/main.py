@@ -24,9 +24,6 @@ from blf_dsc_controller.errors import BlfDscError
 INTERRUPTED = 130
 """Exit code after Ctrl-C."""
 
-PICK_UP = Path()
-"""Value of `identify --payload` without a bag."""
-
 _THREADS = ('OPENBLAS_NUM_THREADS', 'OMP_NUM_THREADS', 'MKL_NUM_THREADS')
 _BAG = 'folder of the bag, or its .mcap, .db3 or .bag file'
 _CONFIG = 'parameter file, or a preset (recommended)'
@@ -266,7 +263,7 @@ def _add_identification(
     option('--out', type=Path, help='URDF to write')
     option('--report', type=Path, help='page with measured and predicted torques and the tables')
     load = 'identify a load: carried in this other bag, or without one, picked up in the first'
-    option('--payload', type=Path, nargs='?', const=PICK_UP, metavar='BAG', help=load)
+    option('--payload', type=Path, nargs='?', const=True, metavar='BAG', help=load)
     efforts = ('torque', 'without-gravity', 'command')
     what = 'what efforts are: whole torque, or without that of gravity; or use commands (torque)'
     option('--effort', choices=efforts, default='torque', help=what)
