@@ -94,6 +94,24 @@ def test_messages_are_recorded_byte_for_byte(ros, bag):
     assert [before, *stamps, after] == sorted([before, *stamps, after])
 
 
+def test_plant_as_the_clock_logs_at_the_stamp_of_the_last_joint_state(ros, bag):
+    """What comes before the first of them waits for it; stamps that fall do not set time back."""
+    topics = ['early', 'joint_states']
+    given = {'output': str(bag), 'clock': 'plant', 'topics': topics}
+    recorder = ros.add(BagRecorderNode, given)
+    early, states = (connected(ros, JointState, topic) for topic in topics)
+    for publisher, numbers in ((early, (1, 2)), (states, (70, 90, 80))):
+        for number in numbers:
+            publisher.publish(encoded(number))
+        ros.until(lambda: len(recorder._waiting) == 2 or recorder._plant_time == 90)
+    until_recorded(ros, recorder, early=2, joint_states=3)
+    recorder.close()
+    assert [(topic[1:], at) for topic, at, _ in read(bag)] == [
+        *(('early', 70), ('early', 70), ('joint_states', 70)),
+        *(('joint_states', 90), ('joint_states', 90)),
+    ]
+
+
 def test_topics_of_every_quality_and_type_are_recorded_as_offered(ros, bag):
     """Latched before the recorder came, best effort, and both on one topic; not those of others.
 
