@@ -8,7 +8,6 @@ import json
 import re
 from dataclasses import asdict, replace
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 import pytest
@@ -198,40 +197,17 @@ def test_numbers_on_the_pages_match_the_runs():
 
 IMPORT = 'from blf_dsc_controller.studies.laws import Contender\n'
 E0 = 0.004 * np.array([1.0, -0.5, 0.2, 0.8, -1.0, 0.6])  # rad, inside the bound
-GAINS = {'position': 900.0, 'velocity': 50.0}
+GAINS = {'position': 900.0, 'velocity': 50.0, 'integral': 0.0}
+FRICTIONLESS = {'robot.viscous': [0.0] * 6, 'robot.coulomb': [0.0] * 6}
 
 
-class ComputedTorque(NamedTuple):
-    """M (qr'' - k_p e - k_d e') + C q' + G."""
-
-    position: float
-    velocity: float
-    a: np.ndarray
-    H: np.ndarray
-
-    def fill_torque(self, arm, now, torque):
-        for i in range(now.q.size):
-            self.a[i] = now.ddqr[i] - self.velocity * (now.dq[i] - now.dqr[i])
-            self.a[i] -= self.position * (now.q[i] - now.qr[i])
-        arm.model.regressor(now.q, now.dq, now.dq, self.a, self.H)
-        for i in range(now.q.size):
-            torque[i] = 0.0
-            for j in range(arm.P.size):
-                torque[i] += self.H[i, j] * arm.P[j]
-
-
-def computed_torque(gains, arm):
-    n = arm.bound.size
-    return ComputedTorque(**gains, a=np.zeros(n), H=np.zeros((n, arm.P.size)))
-
-
-def ideal(period):
+def ideal(period, law=FRICTIONLESS):
     """A UR5e true to its URDF, with ideal sensors and drives, in motion E0 off its reference."""
     loop, step = load_loop('ur5e'), {'sample_time': period}
     config, robot = loop.controller, {'robot.urdf': 'ur5e.urdf', 'robot.tip': 'tool0'}
     chain = config.robot.chain(config.joints)
     P = parameters_of(config.robot, chain).of(chain.inertias, config.robot.rotors(chain))
-    config = change(config, step | {'learning.initial_estimate': P.tolist()})
+    config = change(config, step | law | {'learning.initial_estimate': P.tolist()})
     ((q, dq, _),) = terms.sampled(reference_of(config), np.zeros(1))
     start = {'initial.position': (q + E0).tolist(), 'initial.velocity': dq.tolist()}
     plant = build(PlantConfig, robot | step | start | {'duration': 0.1})
@@ -240,7 +216,7 @@ def ideal(period):
 
 def deviation(period):
     """Largest difference to the errors of e'' + k_d e' + k_p e = 0."""
-    errors, torques = laws.simulate_with(ideal(period), computed_torque, GAINS)
+    errors, torques = laws.simulate_with(ideal(period), laws.computed_torque, GAINS)
     A = np.array([[0.0, 1.0], [-900.0, -50.0]])
     decay = [expm(A * period * k)[0, 0] for k in range(len(errors))]
     np.testing.assert_allclose(errors[0], E0, atol=1e-15)
@@ -256,17 +232,33 @@ def test_law_of_a_file_acts_at_the_right_time():
 
 
 def test_torque_is_cut_at_its_limit():
-    gains, loop = {'position': 1e9, 'velocity': 0.0}, ideal(1e-3)
-    _, torques = laws.simulate_with(loop, computed_torque, gains)
+    gains, loop = GAINS | {'position': 1e9}, ideal(1e-3)
+    _, torques = laws.simulate_with(loop, laws.computed_torque, gains)
     np.testing.assert_array_equal(np.abs(torques).max(axis=0), loop.controller.torque.limit)
 
 
-def test_law_is_told_of_the_friction_that_the_controller_knows():
+def test_integrator_of_computed_torque_removes_the_error_of_a_push():
+    rest = ideal(1e-3, FRICTIONLESS | {'reference.amplitude': [0.0] * 18})
+    push = {'load.torque': [3.0, -2.0, 1.0, 0.3, -0.2, 0.1], 'duration': 3.0}
+    loop = rest._replace(plant=change(rest.plant, push))
+    (pushed, _), (integrated, _) = (
+        laws.simulate_with(loop, laws.computed_torque, GAINS | {'integral': integral})
+        for integral in (0.0, 5000.0)
+    )
+    assert np.all(np.abs(integrated[-1]) < 1e-3 * np.abs(pushed[-1]))
+
+
+def test_computed_torque_compensates_known_friction_along_the_reference():
+    (_, without), (_, compensated) = (
+        laws.simulate_with(ideal(1e-3, law), laws.computed_torque, GAINS)
+        for law in (FRICTIONLESS, {})
+    )
     config = load_loop('ur5e').controller
-    known = laws.known_of(config)
-    np.testing.assert_array_equal(known.viscous, config.robot.viscous)
-    np.testing.assert_array_equal(known.coulomb, config.robot.coulomb)
-    assert known.coulomb.min() > 0.0
+    ((_, dq, _),) = terms.sampled(reference_of(config), np.zeros(1))
+    slip = np.tanh(dq / config.learning.coulomb_velocity)
+    friction = config.robot.viscous * dq + config.robot.coulomb * slip
+    np.testing.assert_allclose(compensated[0] - without[0], friction, atol=1e-12)
+    assert np.abs(friction).min() > 0.1
 
 
 def test_integral_gain_of_slotine_li_is_the_gain_of_its_disturbance_estimate():

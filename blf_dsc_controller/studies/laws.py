@@ -1,8 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """Laws compared on arms from URDFs: each is tuned on one truth, run on others, and has figures.
 
-Laws of the package are chosen by name. `load_laws` adds those of a file: named tuples of gains and
-arrays with a method that computes the torque, compiled into the closed loop.
+Laws of the package are chosen by name. Any other is a `Law`: a named tuple of gains and arrays with
+a method that computes the torque, compiled into the closed loop. One is here, computed torque:
+
+    tau = M0 (qr'' - k_p e - k_d e' - k_i int e) + C0 q' + G0 + F0(qr'),   e = q - qr
+
+M0, C0, G0 are those of P0, the initial estimate of the law.  F0 is the friction known to the
+controller, at the velocity of the reference as in the law.  The integrator is held while any torque
+is saturated.  `load_laws` adds those of a file.
 """
 
 from __future__ import annotations
@@ -23,6 +29,7 @@ from tqdm import tqdm
 from blf_dsc_controller.analysis.metrics import aligned, write_json
 from blf_dsc_controller.arms.model import ArmModel
 from blf_dsc_controller.arms.tuning import over_postures
+from blf_dsc_controller.compiled.elementary import tanh
 from blf_dsc_controller.compiled.jit import compile_methods, kernel
 from blf_dsc_controller.compiled.layout import Array, part, view
 from blf_dsc_controller.configuration.controller import ControllerConfig
@@ -97,6 +104,43 @@ class Law(Protocol):
 
     def fill_torque(self, arm: Known, now: Now, torque: Array) -> None:
         """Write the torque (n,) [N m]; the loop cuts it at its limit afterwards."""
+
+
+class ComputedTorque(NamedTuple):
+    """Computed torque with an integrator."""
+
+    position: float  # k_p, 1/s^2
+    velocity: float  # k_d, 1/s
+    integral: float  # k_i, 1/s^3
+    integrated: Array  # (n,) rad s, int e
+    a: Array  # (n,) rad/s^2
+    H: Array  # (n, p)
+
+    def fill_torque(self, arm: Known, now: Now, torque: Array) -> None:
+        """Write the torque."""
+        n = now.q.size
+        for i in range(n):
+            u = -self.position * (now.q[i] - now.qr[i])
+            u -= self.velocity * (now.dq[i] - now.dqr[i])
+            u -= self.integral * self.integrated[i]
+            self.a[i] = now.ddqr[i] + u
+        arm.model.regressor(now.q, now.dq, now.dq, self.a, self.H)
+        cut = False
+        for i in range(n):
+            torque[i] = arm.viscous[i] * now.dqr[i]
+            torque[i] += arm.coulomb[i] * tanh(now.dqr[i] / arm.coulomb_velocity)
+            for j in range(arm.P.size):
+                torque[i] += self.H[i, j] * arm.P[j]
+            cut = cut or abs(torque[i]) > arm.limit[i]
+        if not cut:
+            for i in range(n):
+                self.integrated[i] += now.dt * (now.q[i] - now.qr[i])
+
+
+def computed_torque(gains: Mapping[str, float], arm: Known) -> ComputedTorque:
+    """Return the law with gains `position`, `velocity` and `integral`."""
+    integrated, a = np.zeros((2, arm.inertia.size))
+    return ComputedTorque(**gains, integrated=integrated, a=a, H=np.zeros((a.size, arm.P.size)))
 
 
 def _run(
@@ -199,6 +243,11 @@ _SLOTINE_LI = (
     Gain('comparison.integral_gain', 100.0, 3e4, inertial=True),
     _ADAPTATION,
 )
+_PID = (
+    Gain('position', 100.0, 3e4),
+    Gain('velocity', 10.0, 200.0),
+    Gain('integral', 100.0, 3e6),
+)
 
 CONTENDERS = {
     'proposed': Contender('proposed, gains from the URDF'),
@@ -207,6 +256,7 @@ CONTENDERS = {
     'proposed_tuned': Contender('proposed, tuned', (*_FEEDBACK, _ADAPTATION)),
     'no_learning_tuned': Contender('without learning, tuned', _FEEDBACK, learns=False),
     'slotine_li_tuned': Contender('Slotine-Li with integrator, tuned', _SLOTINE_LI, 'slotine_li'),
+    'computed_torque': Contender('computed torque with integrator, tuned', _PID, computed_torque),
 }
 
 
