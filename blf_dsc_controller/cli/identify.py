@@ -7,7 +7,7 @@ import textwrap
 from argparse import Namespace
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from tempfile import TemporaryDirectory
+from tempfile import TemporaryDirectory, TemporaryFile
 
 import numpy as np
 
@@ -227,6 +227,7 @@ def problems_of(found: Identified, effort: str) -> Iterator[str]:
 def excite(options: Namespace) -> None:
     """Search for the reference, and write it as a preset."""
     make_room(options.out, force=options.force)
+    TemporaryFile(dir=options.out.parent).close()  # what cannot be written is said at once
     config = load(locate(options.config), CONTROLLER, ControllerConfig)
     if config.model != 'urdf':
         raise BlfDscError(f'{options.config}: got model {config.model}, but a URDF is needed')
