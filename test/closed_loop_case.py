@@ -28,7 +28,6 @@ from blf_dsc_controller.law.state import (
 from blf_dsc_controller.reference import terms as reference
 from sim_plant.plant import Plant
 
-T = 1e-3
 MODEL = TwoLink(R)
 REFERENCE = reference.pack(
     2, [reference.sinusoids_term((1.9935, 1.3961), (0.3, 0.3), (1.0,), (0.0,))]

@@ -16,7 +16,9 @@ from typing import Annotated, NamedTuple
 import mpmath
 import numba
 import numpy as np
+import plants
 import pytest
+from closed_loop_case import closed_loop, controller, quick
 from command import OLDER, finished
 from numba.core.errors import UnsupportedError
 from shaken_arm import _shake
@@ -117,12 +119,6 @@ def compiled_in(checkout, cache, ending='', **target):
     return entry, found, compiled
 
 
-def edit(checkout):
-    """Add 1 to an entry of the regressor, in another file than that of its kernel."""
-    called = checkout / PACKAGE.name / 'arms/two_link.py'
-    called.write_text(called.read_text().replace('H[0, 0] = a[0] +', 'H[0, 0] = 1.0 + a[0] +'))
-
-
 @compiling
 def test_kernels_of_another_checkout_or_of_the_package_are_found_and_never_of_other_sources(
     tmp_path,
@@ -142,7 +138,8 @@ def test_kernels_of_another_checkout_or_of_the_package_are_found_and_never_of_ot
 
     other = pytest.approx(entry + 1.0)
     for checkout, folder in ((second, cache), (first, unused)):
-        edit(checkout)
+        called = checkout / PACKAGE.name / 'arms/two_link.py'  # not the file of the kernel itself
+        called.write_text(called.read_text().replace('H[0, 0] = a[0] +', 'H[0, 0] = 1.0 + a[0] +'))
         assert compiled_in(checkout, folder) == (other, 0, 1)
         assert compiled_in(checkout, folder) == (other, 1, 0)
     assert sorted(shipped.rglob('*')) == before
@@ -387,6 +384,22 @@ def test_dependent_columns_are_sums_of_those_before_them():
     assert kept.tolist() == [0, 1, 3]
     sums = [[1, 0, 1, 0, 0, 0], [0, 1, 2, 0, 0, -1], [0, 0, 0, 1, 0, 3]]
     np.testing.assert_allclose(X, sums, atol=1e-13)
+
+
+def learned_torque():
+    """Return the last torque of a loop that learns, with every imperfection of the plant."""
+    law = controller(quick(window=100, learning_start=0.2, sigma=-1.0))
+    list(closed_loop(law, plants.plant(**plants.FULL), 0.4))
+    assert law.state.latched[0] == 1.0
+    return law.signals.torque.tolist()
+
+
+def test_interpreted_kernels_compute_the_same():
+    """Without numba's compiler only the last bits differ (its libm, its order of operations)."""
+    program = 'from test_compiled import learned_torque; print(*learned_torque())'
+    environment = os.environ | {'NUMBA_DISABLE_JIT': '1', 'PYTHONPATH': PATH}
+    interpreted = finished(sys.executable, '-c', program, env=environment).stdout.split()
+    np.testing.assert_allclose(np.array(interpreted, float), learned_torque(), rtol=1e-9)
 
 
 def digests():

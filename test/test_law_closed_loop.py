@@ -3,17 +3,9 @@
 
 from __future__ import annotations
 
-import json
-import os
-import sys
-from pathlib import Path
-
 import numpy as np
-import plants
 import pytest
-from closed_loop_case import closed_loop, controller, plant, quick, recommended
-from command import finished
-from numba.core.runtime import _nrt_python, rtsys
+from closed_loop_case import REFERENCE, closed_loop, controller, plant, quick, recommended
 from paper_case import BOUND, EXACT, NO_DISTURBANCE, P, configured, run_preset
 from plain_law import PlainLaw, R, dynamics, regressor
 from plants import QUIET, START
@@ -24,6 +16,7 @@ from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.schema import build
 from blf_dsc_controller.law.factory import columns_of, controller_of, settings_of_config
 from blf_dsc_controller.law.state import CHOICES
+from blf_dsc_controller.reference.terms import sampled
 
 
 def test_recommended_loop_keeps_half_the_bound_and_finds_the_parameters():
@@ -86,7 +79,7 @@ def derivative(t, y, plain):
     """The whole loop: arm (1), filter (13), law (28), learning (20) from a latched window, (30)."""
     g = plain.gains
     q, dq, alpha2, estimate, d3 = np.split(y, [2, 4, 6, 9])
-    qr, dqr, ddqr = reference(t)
+    ((qr, dqr, ddqr),) = sampled(REFERENCE, np.array([t]))
     xi1, xi2 = q - qr, dq - alpha2
     dalpha2 = (plain.virtual_control(xi1, dqr, t) - alpha2) / g.time_constant
     H, H_r = regressor(R, q, dq, alpha2, dalpha2), regressor(R, qr, dqr, dqr, ddqr)
@@ -100,17 +93,10 @@ def derivative(t, y, plain):
     return np.concatenate([dq, ddq, dalpha2, update, -g.gamma * xi2 - H_r @ learned])
 
 
-def reference(t):
-    """qr of Section IV and its derivatives."""
-    return np.array([[1.9935, 1.3961], QUIET, QUIET]) + 0.3 * np.array(
-        [[np.cos(t)] * 2, [-np.sin(t)] * 2, [-np.cos(t)] * 2]
-    )
-
-
 def continuous(settings):
     """Positions and P^ at TIMES, to a tolerance far below the sampling error."""
     plain, start = PlainLaw(settings), np.array(START)
-    qr, dqr, _ = reference(0.0)
+    ((qr, dqr, _),) = sampled(REFERENCE, np.zeros(1))
     alpha2 = plain.virtual_control(start - qr, dqr, 0.0)
     y = np.concatenate([start, np.zeros(2), alpha2, 0.5 * P, np.zeros(2)])
     tolerance = {'method': 'LSODA', 'rtol': 1e-10, 'atol': 1e-13}
@@ -119,7 +105,7 @@ def continuous(settings):
     return solution.y[[0, 1, 6, 7, 8]]
 
 
-def sampled(dt, settings):
+def of_samples(dt, settings):
     """The same for the sampled loop with the package's own kernels."""
     law, arm = controller(settings), plant(sample_time=dt)
     law.state.latched[0] = 1.0
@@ -141,7 +127,7 @@ def test_sampled_loop_converges_to_the_continuous_one_at_first_order():
     settings = recommended(bias=False, **learning)
     exact = continuous(settings)
     steps = (1e-3, 5e-4, 2.5e-4, 1.25e-4)
-    errors = np.array([np.abs(sampled(dt, settings) - exact).max(axis=1) for dt in steps])
+    errors = np.array([np.abs(of_samples(dt, settings) - exact).max(axis=1) for dt in steps])
     errors = np.column_stack((errors[:, :2].max(1), errors[:, 2:].max(1)))  # positions, estimates
     order = np.log2(errors[:-1] / errors[1:])
     assert np.all(order > 0.9), (errors, order)
@@ -255,54 +241,6 @@ def test_loop_continues_bit_for_bit_from_a_saved_state_and_begins_anew_after_a_r
         np.testing.assert_array_equal(torques(same, 1337, 2000, saved_arm), after)
     law.reset()
     np.testing.assert_array_equal(torques(law, 0, 1337, begun), start)
-
-
-def allocated(duration):
-    """Blocks and counters of references that a run of the compiled loop of law and plant takes."""
-    before = rtsys.get_allocation_stats()
-    latched = run_preset(duration, preset='noisy').latched[-1]
-    after = rtsys.get_allocation_stats()
-    return (after.alloc - before.alloc, after.mi_alloc - before.mi_alloc), latched
-
-
-def test_updates_in_a_compiled_loop_allocate_nothing():
-    """Passing the vectors allocates a little, independently of the number of updates."""
-    run_preset(0.1, preset='noisy')  # compiles
-    counting = _nrt_python.memsys_stats_enabled()
-    _nrt_python.memsys_enable_stats()
-    try:
-        (short, _), (long, latched) = allocated(0.1), allocated(8.0)
-    finally:
-        if not counting:
-            _nrt_python.memsys_disable_stats()
-    assert latched == 1.0
-    assert short == long
-
-
-INTERPRETED = """
-import json, sys
-from test_law_closed_loop import short_runs
-json.dump(short_runs(), sys.stdout)
-"""
-
-
-def short_runs():
-    """Last torque of a loop that learns, and all measurements of an imperfect plant."""
-    law = controller(quick(window=100, learning_start=0.2, sigma=-1.0))
-    list(closed_loop(law, plant(), 0.4))
-    assert law.state.latched[0] == 1.0
-    arm = plants.plant(**plants.FULL)
-    return law.signals.torque.tolist(), plants.run(arm, plants.commands(100)).tolist()
-
-
-def test_interpreted_kernels_compute_the_same():
-    """Without numba's compiler only the last bits differ (its libm, its order of operations)."""
-    here = Path(__file__).parent
-    path = os.pathsep.join([str(here), str(here.parent)])
-    environment = os.environ | {'NUMBA_DISABLE_JIT': '1', 'PYTHONPATH': path}
-    interpreted = json.loads(finished(sys.executable, '-c', INTERPRETED, env=environment).stdout)
-    for ours, theirs, rtol in zip(short_runs(), interpreted, (1e-9, 1e-10), strict=True):
-        np.testing.assert_allclose(ours, theirs, rtol=rtol, atol=rtol)
 
 
 @pytest.mark.parametrize(('law', 'share'), [('backstepping', 1.0), ('slotine_li', 0.0)])

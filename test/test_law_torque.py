@@ -8,7 +8,7 @@ from math import exp, sin
 import numpy as np
 import pytest
 from closed_loop_case import arbitrary, closed_loop, controller, plant, quick, recommended
-from paper_case import NO_DISTURBANCE, P, configured, run
+from paper_case import P
 from plain_law import PlainLaw, R, dynamics, regressor
 from plants import QUIET
 from scipy.signal import cont2discrete
@@ -31,13 +31,9 @@ def test_barrier_continues_past_the_knee_at_the_largest_slope():
     for weight in (1.0, 1000.0, 2e4):
         knee = barrier.knee(BOUND, weight, LIMIT)
         assert 0.0 <= knee < BOUND
-        assert barrier.slope(knee, BOUND, weight) == pytest.approx(LIMIT, rel=1e-9)
-    xi = np.linspace(-3.0 * BOUND, 3.0 * BOUND, 4001)
-    slope = np.diff(each(barrier.gradient, xi, *RECOMMENDED)) / np.diff(xi)
-    past = np.minimum(np.abs(xi[1:]), np.abs(xi[:-1])) >= KNEE
-    assert slope.min() >= WEIGHT * (1.0 - 1e-9)
-    assert slope.max() <= LIMIT * (1.0 + 1e-9)
-    np.testing.assert_allclose(slope[past], LIMIT, rtol=1e-9)
+        h = 1e-11  # rad: below the knee the slope changes by less than 1 N m/rad over it
+        below, above = each(barrier.gradient, (knee - h, knee + h), BOUND, weight, LIMIT, knee)
+        assert (above - below) / (2.0 * h) == pytest.approx(LIMIT, rel=1e-4)
     # The potential is its integral: with h = 1e-8 rad the third derivative (below 1e11 N m/rad^3)
     # adds 1e-6 N m to ~10.
     h, errors = 1e-8, np.append(np.linspace(-3.0, 3.0, 51) * BOUND, [-KNEE, KNEE])
@@ -235,49 +231,6 @@ def test_applied_torque_has_the_mean_of_what_the_drive_adds_at_both_ends():
     np.testing.assert_array_equal(state.added, signals.added)
 
 
-BIAS = (0.3, -0.2)
-
-
-def filtered_rows(sample_time, duration=2.0):
-    """Rows [X | u] of the arm swinging about its lowest point under held, varying torques."""
-    law = controller(recommended())
-    arm = plant(sample_time=sample_time, start=(-1.2, 0.4), constant=BIAS, amplitude=QUIET)
-    rows = []
-    for t in np.arange(round(duration / sample_time)) * sample_time:
-        law.update(t, sample_time, arm.measure())
-        law.state.torque[:] = 2.0 * np.sin(3.0 * t), 1.5 * np.cos(5.0 * t)  # instead of its own
-        arm.step(law.state.torque)
-        rows.append(law.signals.row.copy())
-    return np.array(rows[1:])
-
-
-def test_filtered_identity_holds_up_to_the_square_of_the_sample_time():
-    theta = np.concatenate([P, BIAS])
-    error = []
-    for sample_time in (4e-3, 2e-3, 1e-3):
-        rows = filtered_rows(sample_time)
-        error.append(np.abs(rows[:, :, :-1] @ theta - rows[:, :, -1]).max())
-
-    order = np.log2(np.divide(error[:-1], error[1:]))
-    np.testing.assert_allclose(order, 2.0, atol=0.1)
-    # The trapezoid's T^2 / 12 times (Yr P)'', up to some 400 N m/s^2 in this swing.
-    assert error[-1] < 1e-6 / 12.0 * 500.0
-
-
-@pytest.mark.parametrize(
-    ('limit', 'values'), [('torque_limit', [8.5, 20.0]), ('rate_limit', [400.0, 150.0])]
-)
-def test_learning_uses_the_limited_torque(limit, values):
-    """The controller knows its own limits: X theta = u holds while the torque is cut."""
-    law, theta = controller(quick(**{limit: np.array(values)})), np.concatenate([P, BIAS, [-1.0]])
-    worst, cut = 0.0, 0
-    for _ in closed_loop(law, plant(constant=BIAS, amplitude=QUIET), 1.0):
-        worst = max(worst, np.abs(law.signals.row @ theta).max())
-        cut += law.signals.torque[0] != law.signals.demand[0]
-    assert cut > 10
-    assert worst < 0.01
-
-
 LAMBDA = CHOICES['prediction'].index('lambda')
 
 
@@ -312,17 +265,6 @@ def test_row_of_lambda_follows_equation_24_in_a_closed_loop():
         rest = x @ y / (x @ x) * np.column_stack([np.eye(2), applied])
         expected = np.column_stack([regressor(R, q, dq, alpha2, dalpha2), rest])
         np.testing.assert_allclose(law.signals.row, expected, rtol=1e-9, atol=1e-9)
-
-
-@pytest.mark.parametrize('kind', ['lambda', 'filtered'])
-@pytest.mark.parametrize(('update', 'weight'), [('gradient', 4.0), ('newton', 100.0)])
-def test_every_prediction_learns_the_parameters_without_disturbance(kind, update, weight):
-    """`filtered` is exact; Lambda is so up to the lag of (8), once the errors have decayed."""
-    law = {'prediction': kind, 'update': update, 'weight': weight, 'bias': False}
-    law |= {'excitation_threshold': 0.05}
-    law = {f'learning.{name}': value for name, value in law.items()}
-    loop = run(configured('recommended', 25.0, law, NO_DISTURBANCE))
-    assert loop.parameter_error[-1] < (1e-4 if kind == 'filtered' else 1e-3)
 
 
 def error_with_filter(omega):

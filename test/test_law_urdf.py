@@ -86,7 +86,6 @@ def test_urdf_may_be_given_as_text_or_file(tmp_path):
         ({'robot.urdf': __file__}, r"robot.urdf: '\S+' is not XML: give a URDF$"),
         ({'robot.tip': 'hand'}, "robot.urdf: no link 'hand' for the tip"),
         ({'robot.tip': ''}, 'robot.urdf: neither a tip .* not one chain: .*panda_finger_joint1'),
-        ({'joints': ['a', 'b']}, "robot.urdf: no joint 'a' in the URDF"),
         ({'robot.urdf': 'package://no_such/arm.urdf'}, "package 'no_such' was not found"),
         ({'robot.rotor_inertia': [0.1]}, 'robot.rotor_inertia: got 1, but 7 entries are needed'),
         ({'robot.lag': 'short'}, 'robot.lag: got "short", but a double is expected'),

@@ -254,7 +254,6 @@ def test_same_columns_are_accepted_on_a_two_tone_reference():
     for joint in ('joint1', 'joint2'):
         for name, true in (('bias', 0.1), ('sin 1 rad/s', 0.1), ('cos 1 rad/s', 0.0)):
             assert estimate[f'{name} {joint}'] == pytest.approx(true, abs=1e-3)
-    assert run(configured('two_tone', 60.0)).parameter_error[-1] < 1e-4
 
 
 def test_cosine_columns_are_rejected_on_the_reference_of_the_paper():
@@ -311,12 +310,6 @@ def test_no_step_leaves_the_ball(seed, size, speed, radius):
         estimate += 1e-2 * rate
         adaptation.retract(estimate, gain, radius)
         assert np.linalg.norm(estimate) <= radius * (1.0 + 1e-15)
-
-
-def test_inward_rates_are_kept_on_the_sphere():
-    w, inward = np.array([2.0, 2.0, 1.0]), -np.array([2.0, 2.0, 1.0])
-    adaptation.project(w, inward, np.array([0.05, 1.0, 20.0]), 3.0)
-    np.testing.assert_array_equal(inward, -w)
 
 
 @pytest.mark.parametrize('bad', [np.nan, np.inf])

@@ -17,7 +17,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from test_monte_carlo_study import LOOP, RUNS, STUDY, same, study, whole, write
+from test_monte_carlo_study import LOOP, RUNS, STUDY, study, whole, write
 
 from blf_dsc_controller.bags.reader import read_run
 from blf_dsc_controller.cli.main import main
@@ -59,7 +59,8 @@ def test_every_executor_gives_the_same_results(a_study, undisturbed, make):
     with make() as executor:
         parts = dict(compute(a_study, chunks(5), executor))
     found = [parts[runs] for runs in chunks(5)]
-    assert same({name: np.concatenate([c[name] for c in found]) for name in found[0]}, undisturbed)
+    joined = {name: np.concatenate([part[name] for part in found]) for name in found[0]}
+    np.testing.assert_equal(joined, undisturbed)
 
 
 def test_killed_worker_is_named_and_what_was_kept_is_complete(a_study, undisturbed):
@@ -129,7 +130,7 @@ def test_killed_study_resumes(tmp_path):
     assert stamps(out) == after  # nothing is computed again
     assert 'of the runs kept the bound' in finished.stdout
     opened = Store(out)
-    assert same(opened.results(), whole(opened.study))
+    np.testing.assert_equal(opened.results(), whole(opened.study))
 
 
 def test_missing_runs_are_found_between_completed_ones(store):

@@ -78,14 +78,6 @@ def whole(a_study):
     return run_chunk(a_study, 0, a_study.settings.runs)
 
 
-def same(results, other):
-    """Return True if two results are the same, bit for bit; fail otherwise."""
-    assert list(results) == list(other)
-    for name, values in results.items():
-        np.testing.assert_array_equal(values, other[name], err_msg=name)
-    return True
-
-
 FRACTIONS = st.floats(0.0, 1.0, exclude_max=True)
 MASS = 'uniform(0.3, 0.7)'
 

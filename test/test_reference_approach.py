@@ -41,7 +41,7 @@ AT_REST = np.array([[-0.4, 2.9], [0.0, 0.0]])
 MOVING = np.array([[0.8, 1.5], [0.6, -0.9]])
 
 
-def limits(velocity=(1.5, 1.5), acceleration=(2.0, 2.0), reach=(6.0, 6.0), longest=30.0):
+def limits(velocity=(1.5, 1.0), acceleration=(4.0, 1.5), reach=(6.0, 6.0), longest=30.0):
     lower = tuple(-limit for limit in reach)
     allowed = MotionLimits(lower, reach, velocity, acceleration)
     return ControllerConfig(JOINTS, limits=allowed, approach=Approach(longest=longest))
@@ -77,13 +77,6 @@ def test_approach_leads_from_the_measured_state_to_the_reference_as_fast_as_allo
     assert np.all(maxima(motion, motion.settled + 10.0) <= 1.001 * np.array(allowed))
     with pytest.raises(MotionError):
         approach_to(main, start, limits(longest=0.98 * (motion.settled - T0)))
-
-
-def test_each_joint_keeps_its_own_limits():
-    motion = approach_to(PAPER, AT_REST, limits(velocity=(0.4, 3.0), acceleration=(9.0, 1.0)))
-    velocity, acceleration = maxima(motion, 40.0)
-    assert velocity[0] == pytest.approx(0.4, rel=0.05)  # the active limit is reached
-    assert acceleration[1] <= 1.001
 
 
 def test_motion_beyond_the_limits_is_rejected_with_the_name_of_the_joint():
