@@ -36,11 +36,10 @@ from contextlib import suppress
 from typing import Any, NamedTuple
 
 import numpy as np
-import shaken_arm
+import random_arm
 from harness import print_table
 from numpy.typing import NDArray
-from random_arm import CONFIG, random_urdf
-from shaken_arm import PERIOD, is_covered, measured, recording_of, reference_of, shake, truth_of
+from random_arm import PERIOD, is_covered, measured, recording_of, reference_of, shake, truth_of
 
 from blf_dsc_controller.arms.urdf import pseudo_inertia
 from blf_dsc_controller.configuration.nodes import CONTROLLER, PLANT, LoopConfig, load_loop
@@ -135,9 +134,9 @@ def _identified(arms: int) -> list[tuple[str, ...]]:
 
 def _robot(seed: int) -> Robot:
     if seed % 3 == 2:
-        return Robot(urdf=random_urdf(6, seed)[0], tip='tip', payload=1.0)
+        return Robot(urdf=random_arm.random_urdf(6, seed)[0], tip='tip', payload=1.0)
     file, tip = (('panda.urdf', 'panda_hand_tcp'), ('ur5e.urdf', 'tool0'))[seed % 3]
-    return Robot(urdf=(CONFIG / file).read_text(), tip=tip)
+    return Robot(urdf=(random_arm.CONFIG / file).read_text(), tip=tip)
 
 
 def _of_arm(seed: int) -> list[tuple[float, ...]]:
@@ -343,7 +342,7 @@ def _percent(error: Floats, torque: Floats) -> str:
 def _bag(path: Path, joints: tuple[str, ...], time: Floats, q: Floats, effort: Floats) -> Path:
     stamps = [1_000_000_000 + round(1e9 * t) for t in time]
     states = np.stack((q, np.zeros_like(q), effort), axis=1)  # no velocity is read
-    return Path(shaken_arm.write_states(path, joints, states, stamps=stamps))
+    return Path(random_arm.write_states(path, joints, states, stamps=stamps))
 
 
 def _panda(folder: Path, bags: Path) -> Iterator[Taken]:

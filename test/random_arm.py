@@ -1,14 +1,24 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Random serial arms as URDFs."""
+"""Random serial arms as URDFs; arms in motion, as bags of joint states with efforts."""
 
 from __future__ import annotations
 
+from itertools import zip_longest
+from math import tanh
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import pinocchio
 
-from blf_dsc_controller.arms.urdf import read_chain
+from blf_dsc_controller.arms.urdf import inertia_of, pseudo_inertia, read_chain
+from blf_dsc_controller.bags.writer import BagWriter
+from blf_dsc_controller.compiled.jit import kernel
+from blf_dsc_controller.identification.prior import base_matrix
+from blf_dsc_controller.identification.recording import Recording
+from blf_dsc_controller.messages.codecs import Float64MultiArrayEncoder, JointStateEncoder
+from blf_dsc_controller.messages.topics import COMMANDS, JOINT_STATE
+from sim_plant.arm import rigid_arm, rigid_bodies
 
 CONFIG = Path(__file__).parents[1] / 'config'
 PANDA = tuple(f'panda_joint{i}' for i in range(1, 8))
@@ -101,3 +111,151 @@ ARMS = {
 def chain_of(name):
     text, joints, base, tip = ARMS[name]
     return read_chain(text, base, tip, joints)
+
+
+# In motion.
+
+PANDA_CHAIN = chain_of('panda')
+GRAVITY = (0.0, 0.0, -9.81)
+PERIOD = 0.001  # s
+
+
+class Truth(NamedTuple):
+    """The true values that a URDF lacks: n bodies, rotors and friction."""
+
+    inertias: np.ndarray  # (n, 10)
+    rotors: np.ndarray  # (n,) kg m^2
+    viscous: np.ndarray  # (n,) N m s/rad
+    coulomb: np.ndarray  # (n,) N m
+
+
+def changed(chain, random, share=0.3, centre=0.01):
+    """Return inertias (n, 10), scaled at random by `share`, moved at random by `centre` [m]."""
+    bodies = []
+    for joint in chain.joints:
+        T = np.eye(4)
+        T[:3, 3] = centre * random.normal(size=3)
+        J = T @ pseudo_inertia(joint.inertia) @ T.T
+        bodies.append(inertia_of(np.exp(share * random.normal()) * J))
+    return np.array(bodies)
+
+
+def truth_of(chain, seed):
+    random = np.random.default_rng(seed)
+    efforts = np.array([min(joint.effort, 100.0) for joint in chain.joints])
+    return Truth(
+        changed(chain, random),
+        efforts / 400.0 * random.uniform(0.5, 1.5, efforts.size),
+        0.02 * efforts * random.uniform(0.5, 1.5, efforts.size),
+        0.02 * efforts * random.uniform(0.5, 1.5, efforts.size),
+    )
+
+
+class Reference(NamedTuple):
+    """Sums of sinusoids: offset + sum amplitude sin(frequency t + phase)."""
+
+    offset: np.ndarray  # (n,) rad
+    amplitude: np.ndarray  # (k, n) rad
+    frequency: np.ndarray  # (k, n) rad/s
+    phase: np.ndarray  # (k, n) rad
+
+    def at(self, t):
+        """Return position, velocity and acceleration (..., 3, n) at times (...) [s]."""
+        w, angle = self.frequency, np.multiply.outer(t, self.frequency) + self.phase
+        sines, cosines = self.amplitude * np.sin(angle), self.amplitude * np.cos(angle)
+        motion = sines.sum(-2) + self.offset, (w * cosines).sum(-2), -(w**2 * sines).sum(-2)
+        return np.stack(motion, -2)
+
+
+def reference_of(chain, seed, tones=3):
+    random = np.random.default_rng(seed)
+    n = len(chain.joints)
+    limits = np.clip([(joint.lower, joint.upper) for joint in chain.joints], -2.0, 2.0)
+    amplitude = random.uniform(0.5, 1.0, (tones, n))
+    amplitude *= 0.35 * np.ptp(limits, axis=1) / amplitude.sum(0)
+    frequency = random.uniform(0.5, 4.0, (tones, n))
+    return Reference(limits.mean(1), amplitude, frequency, random.uniform(0.0, 6.3, (tones, n)))
+
+
+@kernel
+def _shake(arm, viscous, coulomb, motion, gains, work, states):
+    """Follow `motion` (N, 3, n) by PD, torques held for a period; fill states (N, 3, n).
+
+    The rows of `work` (8, n) are zero at first.
+    """
+    q, dq, torque = work[0], work[1], work[2]
+    qs, dqs, ddq, q_step, dq_step = work[3], work[4], work[5], work[6], work[7]  # Runge-Kutta
+    for i in range(q.size):
+        q[i], dq[i] = motion[0, 0, i], motion[0, 1, i]
+    for k in range(motion.shape[0]):
+        for i in range(q.size):
+            states[k, 0, i], states[k, 1, i], states[k, 2, i] = q[i], dq[i], torque[i]
+            q_error, dq_error = motion[k, 0, i] - q[i], motion[k, 1, i] - dq[i]
+            torque[i] = gains[i] * (30.0 * q_error + 3.0 * dq_error)
+            q_step[i] = dq_step[i] = 0.0
+        for share, weight in ((0.0, 1.0), (0.5, 2.0), (0.5, 2.0), (1.0, 1.0)):
+            for i in range(q.size):
+                qs[i] = q[i] + share * PERIOD * dqs[i]
+                dqs[i] = dq[i] + share * PERIOD * ddq[i]
+                ddq[i] = torque[i] - viscous[i] * dqs[i] - coulomb[i] * tanh(dqs[i] / 0.005)
+            arm.accelerate(0.0, qs, dqs, ddq, ddq)
+            for i in range(q.size):
+                q_step[i] += weight * PERIOD / 6.0 * dqs[i]
+                dq_step[i] += weight * PERIOD / 6.0 * ddq[i]
+        for i in range(q.size):
+            q[i] += q_step[i]
+            dq[i] += dq_step[i]
+
+
+def shake(chain, truth, reference, duration):
+    """Return states (N, 3, n) of our own plant: position, velocity, previous torque."""
+    arm = rigid_arm(rigid_bodies(chain, GRAVITY, truth.inertias, truth.rotors))
+    times = np.arange(round(duration / PERIOD)) * PERIOD
+    motion = reference.at(times)
+    gains = np.array([min(joint.effort, 100.0) for joint in chain.joints]) / 4.0
+    n = len(chain.joints)
+    states, work = np.zeros((times.size, 3, n)), np.zeros((8, n))
+    _shake(arm, truth.viscous, truth.coulomb, motion, gains, work, states)
+    return states
+
+
+def measured(states, seed, encoder=2.0 * np.pi / 2**20, noise=0.01):
+    """Return the states as measured by encoders and torque sensors; noise is of the rms torque."""
+    random = np.random.default_rng(seed)
+    seen = states.copy()
+    seen[:, 0] = np.round(states[:, 0] / encoder) * encoder
+    torque = states[:, 2]
+    seen[:, 2] += noise * np.sqrt(np.mean(torque**2, axis=0)) * random.normal(size=torque.shape)
+    return seen
+
+
+def recording_of(states, joints=PANDA, period=PERIOD):
+    """Return states (N, 3, n) as what `identify` reads from a bag."""
+    gap = np.zeros(len(states), dtype=bool)
+    return Recording(joints, period, states[:, 0], states[:, 2], gap, 'made up')
+
+
+def is_covered(found, truth):
+    """Return whether each base parameter and friction is within its 95 % interval."""
+    true = np.concatenate((truth.inertias.ravel(), truth.rotors, truth.viscous, truth.coulomb))
+    at, n = slice(0, true.size), len(truth.rotors)
+    G = base_matrix(found.parameters, n)[: found.parameters.model.p + 2 * n, at]
+    deviation = np.sqrt(np.diag(G @ found.covariance[at, at] @ G.T))
+    return np.abs(G @ (found.values[at] - true)) < 1.96 * deviation
+
+
+FIELDS = ('position', 'velocity', 'effort')
+
+
+def write_states(path, joints, states, *, period=PERIOD, fields=FIELDS, stamps=(), commands=()):
+    """Write states (N, 3, n), and commands (N, n) 1 us after them, as a bag."""
+    encoder, encoded = JointStateEncoder(joints, fields), Float64MultiArrayEncoder(len(joints))
+    stamps = stamps or [1_000_000_000 + round(k * period * 1e9) for k in range(len(states))]
+    with BagWriter(path, flush_interval=None) as bag:
+        handle = bag.add_topic('/joint_states', JOINT_STATE, [])
+        other = bag.add_topic('/arm/commands', COMMANDS.type, []) if len(commands) else 0
+        for stamp, state, command in zip_longest(stamps, states[: len(stamps)], commands):
+            bag.write(handle, bytes(encoder.encode(stamp, *state[: len(fields)])), stamp)
+            if other:
+                bag.write(other, bytes(encoded.encode(command)), stamp + 1000)
+    return path

@@ -11,8 +11,7 @@ import matplotlib.image
 import numpy as np
 import pytest
 import recorded_run
-import synthetic_bag
-from synthetic_bag import BOUND_RAD, LATCH_S, LIMIT_NM, PARAMETERS, TRUE, Synthetic
+from recorded_run import BOUND_RAD, LATCH_S, LIMIT_NM, PARAMETERS, TRUE, Synthetic
 from test_law_urdf import panda
 
 from blf_dsc_controller.analysis.figures import draw
@@ -38,7 +37,7 @@ SAMPLES = 10_000
 @pytest.fixture(scope='module')
 def run(tmp_path_factory):
     messages = Synthetic(SAMPLES).messages(with_timing=True)
-    return read_run(synthetic_bag.write(tmp_path_factory.mktemp('made') / 'bag', messages))
+    return read_run(recorded_run.write_made(tmp_path_factory.mktemp('made') / 'bag', messages))
 
 
 def test_tracking(run):
@@ -299,7 +298,7 @@ def test_seven_joints_and_sixty_parameters_fit_into_the_figures(tmp_path, config
 
 
 def test_estimates_of_other_parameters_than_the_plant_has_are_not_compared(tmp_path):
-    run = read_run(synthetic_bag.write(tmp_path / 'bag', Synthetic(200).messages()))
+    run = read_run(recorded_run.write_made(tmp_path / 'bag', Synthetic(200).messages()))
     names = ('mass 1', 'mass 2', *run.monitor.names[2:])
     assert run.arm is None
     metrics = measure(replace(run, monitor=replace(run.monitor, names=names)))

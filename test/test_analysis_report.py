@@ -11,13 +11,12 @@ import matplotlib.image
 import numpy as np
 import pytest
 import recorded_run
-import synthetic_bag
 from hypothesis import given
 from hypothesis import strategies as st
 from matplotlib import pyplot as plt
 from matplotlib import rcParams
 from matplotlib.colors import to_hex, to_rgb
-from synthetic_bag import JOINTS, MILLISECOND, START, Synthetic
+from recorded_run import JOINTS, MILLISECOND, START, Synthetic
 
 from blf_dsc_controller.analysis import figures
 from blf_dsc_controller.analysis.figures import draw
@@ -46,7 +45,7 @@ pytest.importorskip('plotly', reason='needs plotly: pip install blf_dsc_controll
 @pytest.fixture(scope='module')
 def run(tmp_path_factory):
     messages = Synthetic(5000).messages()
-    return read_run(synthetic_bag.write(tmp_path_factory.mktemp('made') / 'bag', messages))
+    return read_run(recorded_run.write_made(tmp_path_factory.mktemp('made') / 'bag', messages))
 
 
 def pixels(path):
@@ -177,7 +176,7 @@ def folder(tmp_path_factory):
     data = json.dumps({'stamp': START + 2_500_000_000, 'parameters': {'load.torque': [1.0, 0.0]}})
     message = typestore().types[CHANGES.type](data=data)
     change = (CHANGES, START, bytes(typestore().serialize_cdr(message, CHANGES.type)))
-    synthetic_bag.write(path / 'synthetic', [*synthetic.messages(with_timing=True), change])
+    recorded_run.write_made(path / 'synthetic', [*synthetic.messages(with_timing=True), change])
     return path
 
 
@@ -240,8 +239,8 @@ def test_several_bags_are_overlaid_and_their_parameter_differences_listed(folder
 
 def test_page_is_self_contained_and_escapes_names(tmp_path, monkeypatch):
     nasty = '</script><b>&{{data}}'
-    monkeypatch.setattr(synthetic_bag, 'JOINTS', ('<!--<script>', nasty))
-    bag = read_bag(synthetic_bag.write(tmp_path / 'bag', Synthetic(200).messages()))
+    monkeypatch.setattr(recorded_run, 'JOINTS', ('<!--<script>', nasty))
+    bag = read_bag(recorded_run.write_made(tmp_path / 'bag', Synthetic(200).messages()))
     write_report([replace(bag, name=nasty)], tmp_path / 'page.html')
     text = (tmp_path / 'page.html').read_text()
     own = text.split('<script>')[0] + text.rsplit('<script>', 1)[1]  # without plotly's own script
@@ -256,7 +255,7 @@ def test_page_is_self_contained_and_escapes_names(tmp_path, monkeypatch):
 
 def test_joint_states_alone_suffice_for_a_page(tmp_path, capsys):
     states = [entry for entry in Synthetic(500).messages() if entry[0] is JOINT_STATES]
-    synthetic_bag.write(tmp_path / 'bag', states)
+    recorded_run.write_made(tmp_path / 'bag', states)
     assert main(['report', str(tmp_path / 'bag'), '--out', str(tmp_path / 'page.html')]) == 0
     assert 'not recorded in the bag' in (tmp_path / 'page.html').read_text()
     assert main(['report', str(tmp_path / 'nowhere'), '--out', str(tmp_path / 'none.html')]) == 1
@@ -269,12 +268,12 @@ def test_absurd_numbers_and_characters_missing_from_the_font_cause_no_warning(
     tmp_path, value, monkeypatch, capfd
 ):
     """Warnings are errors here: numpy's and matplotlib's would be seen beside the page."""
-    monkeypatch.setattr(synthetic_bag, 'JOINTS', ('关节', 'elbow'))
+    monkeypatch.setattr(recorded_run, 'JOINTS', ('关节', 'elbow'))
     made = Synthetic(4000)
     made.position[50, 0] = made.error[100, 1] = made.reference[70, 0] = value
     made.error[200:, 0] = made.torque[:, 1] = made.estimate[:, 1] = value
     made.disturbance[100:, 0] = made.latched[:] = value
-    bag = str(synthetic_bag.write(tmp_path / 'bag', made.messages(with_timing=True)))
+    bag = str(recorded_run.write_made(tmp_path / 'bag', made.messages(with_timing=True)))
     for command, out in (('report', 'page.html'), ('plot', 'plots'), ('export', 'table.csv')):
         assert main([command, bag, '--out', str(tmp_path / out)]) == 0
     out, errors = capfd.readouterr()
@@ -300,12 +299,12 @@ def stopped(folder, reason=Reason.OUTSIDE_BOUND):
         if topic not in (TRACKING_ERROR, REFERENCE, MONITOR) or stamp < stop
     ]
     messages.append((JOURNAL, stop + 2 * LATE, event.encode()))
-    return synthetic_bag.write(folder / 'bag', sorted(messages, key=lambda entry: entry[1]))
+    return recorded_run.write_made(folder / 'bag', sorted(messages, key=lambda entry: entry[1]))
 
 
 def test_stop_outside_the_bound_is_a_violation_at_the_stamp_of_the_last_state(tmp_path):
     run = read_run(stopped(tmp_path))
-    assert np.nanmax(np.abs(run.error)) < synthetic_bag.BOUND_RAD
+    assert np.nanmax(np.abs(run.error)) < recorded_run.BOUND_RAD
     metrics = measure(run)
     assert metrics.held is False
     assert metrics.first_violation == pytest.approx(STOP_S)
@@ -353,7 +352,7 @@ def test_stop_is_shaded_until_the_controller_restarts(tmp_path):
         Event(2, EventType.START, start, 1, 1, {'resumed': False}),
     ]
     messages = [*Synthetic(4000).messages(), *((JOURNAL, START, each.encode()) for each in events)]
-    path = synthetic_bag.write(tmp_path / 'bag', messages)
+    path = recorded_run.write_made(tmp_path / 'bag', messages)
     bag = read_bag(path)
     (plot,) = (p for p in plots(panels([bag.run]), [bag]) if p['title'] == 'torque of elbow')
     assert plot['marks'] == [

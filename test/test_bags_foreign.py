@@ -16,11 +16,10 @@ import pytest
 import recorded_run
 from mcap.opcode import Opcode
 from mcap.writer import Writer as McapWriter
-from recorded_run import raw_records
+from recorded_run import Synthetic, raw_records
 from rosbags.rosbag1 import Writer as Writer1
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, Reader, StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
-from synthetic_bag import Synthetic
 
 from blf_dsc_controller.bags.content import NameMap, read_content
 from blf_dsc_controller.bags.reader import applied_torque, read_run, single_run

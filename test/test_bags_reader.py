@@ -9,10 +9,9 @@ import re
 import numpy as np
 import pytest
 import recorded_run
-import synthetic_bag
 from mcap.opcode import Opcode
 from mcap.records import Chunk
-from synthetic_bag import BOUND_RAD, JOINTS, LIMIT_NM, PARAMETERS, TRUE, Synthetic
+from recorded_run import BOUND_RAD, JOINTS, LIMIT_NM, PARAMETERS, TRUE, Synthetic
 
 from blf_dsc_controller.bags.content import NameMap, read_content
 from blf_dsc_controller.bags.reader import read_run
@@ -54,7 +53,7 @@ def without(*topics):
     ],
 )
 def test_arrays_round_trip_under_any_topic_names(tmp_path, rename):
-    run = read_run(synthetic_bag.write(tmp_path / 'bag', MESSAGES, rename))
+    run = read_run(recorded_run.write_made(tmp_path / 'bag', MESSAGES, rename))
     assert run.joints == JOINTS
     for found, expected in (
         (run.stamp, MADE.stamp),
@@ -104,7 +103,7 @@ def test_namespace_selects_one_of_several_robots(tmp_path):
 
 def test_only_joint_states_are_required(tmp_path):
     decoy = (DIAGNOSTICS, 0, b'\0\1\0\0')
-    path = synthetic_bag.write(
+    path = recorded_run.write_made(
         tmp_path / 'bag',
         [decoy, *STATES],
         lambda topic: '/x/learning' if topic is DIAGNOSTICS else topic.resolved,
@@ -117,18 +116,11 @@ def test_only_joint_states_are_required(tmp_path):
 
 
 def test_what_is_missing_is_computed_from_what_is_there(tmp_path):
-    path = synthetic_bag.write(tmp_path / 'bag', without(REFERENCE))
+    path = recorded_run.write_made(tmp_path / 'bag', without(REFERENCE))
     np.testing.assert_allclose(read_run(path).reference, MADE.reference, atol=1e-15)
     lost = next(k for k, entry in enumerate(MESSAGES) if entry[0] is COMMANDS)
-    path = synthetic_bag.write(tmp_path / 'one', MESSAGES[:lost] + MESSAGES[lost + 1 :])
+    path = recorded_run.write_made(tmp_path / 'one', MESSAGES[:lost] + MESSAGES[lost + 1 :])
     np.testing.assert_array_equal(read_run(path).torque, MADE.torque)
-    with_effort = [
-        (JOINT_STATES, k, ENCODER.encode(k, [0, 0], [0, 0], [k, -k])) for k in range(SAMPLES)
-    ]
-    torque = read_run(synthetic_bag.write(tmp_path / 'none', with_effort)).torque
-    # The effort in a state is the torque that led to it.
-    assert torque[:-1, 0].tolist() == list(range(1, SAMPLES))
-    assert np.isnan(torque[-1]).all()
 
 
 @pytest.mark.parametrize('longest', [1, 2])
@@ -139,7 +131,7 @@ def test_stamps_that_fall_once_begin_another_run(tmp_path, longest):
     kept = [entry for entry in later if not (entry[0] is MONITOR and entry[1] == MADE.stamp[10])]
     first, second = (short, kept) if longest == 2 else (kept, short)
     again = [(topic, at + 10**9, raw) for topic, at, raw in second]
-    run = read_run(synthetic_bag.write(tmp_path / 'bag', first + again))
+    run = read_run(recorded_run.write_made(tmp_path / 'bag', first + again))
     np.testing.assert_array_equal(run.stamp, MADE.stamp)
     np.testing.assert_array_equal(run.error, MADE.error)
     assert run.monitor.stamp.tolist() == [*MADE.stamp[:10], *MADE.stamp[11:]]
@@ -184,7 +176,7 @@ def test_repeated_states_and_those_of_other_joints_are_counted(tmp_path):
     gripper = JointStateEncoder(['finger']).encode(5, [0], [0], [0])
     kept = [STATES[0], STATES[0], (JOINT_STATES, STATES[0][1], gripper), *STATES[1:]]
     names = NameMap({}, {joint: joint for joint in JOINTS})
-    run = read_run(synthetic_bag.write(tmp_path / 'bag', kept), names=names)
+    run = read_run(recorded_run.write_made(tmp_path / 'bag', kept), names=names)
     assert run.stamp.size == SAMPLES
     assert run.notes == (
         '1 of 202 joint states left out: they name other joints',
@@ -251,7 +243,7 @@ def test_undecodable_message_is_reported_with_topic_and_number(tmp_path):
     bad = [*MESSAGES[:100], (MONITOR, MESSAGES[100][1], b'\0\1\0\0'), *MESSAGES[100:]]
     number = 1 + sum(topic is MONITOR for topic, *_ in MESSAGES[:100])
     with pytest.raises(UnreadableMessageError, match=f'message {number} of /blf.*/monitor'):
-        read_run(synthetic_bag.write(tmp_path / 'bag', bad))
+        read_run(recorded_run.write_made(tmp_path / 'bag', bad))
 
 
 # The table.
@@ -271,7 +263,7 @@ def test_exported_table_round_trips_row_by_row(tmp_path, ending, capsys):
     if ending == 'parquet':
         pytest.importorskip('pyarrow', reason='needs pyarrow')
     kept = [m for m in MESSAGES if not (m[0] in (REFERENCE, MONITOR) and m[1] == MADE.stamp[5])]
-    bag = synthetic_bag.write(tmp_path / 'bag', kept)
+    bag = recorded_run.write_made(tmp_path / 'bag', kept)
     out = tmp_path / f'table.{ending}'
     code = main(['export', str(bag), '--out', str(out)])
     if ending == 'xlsx':

@@ -8,10 +8,9 @@ import subprocess
 import sys
 
 import pytest
-import synthetic_bag
+import recorded_run
 from command import finished
-from recorded_run import small_disk
-from synthetic_bag import Synthetic
+from recorded_run import Synthetic, small_disk
 
 from blf_dsc_controller.cli.main import main
 from blf_dsc_controller.compiled.jit import COMPILING
@@ -39,7 +38,8 @@ sys.exit(main(['plot', 'bag']))
 
 @pytest.fixture(scope='module')
 def bag(tmp_path_factory):
-    return synthetic_bag.write(tmp_path_factory.mktemp('made') / 'bag', Synthetic(100).messages())
+    path = tmp_path_factory.mktemp('made') / 'bag'
+    return recorded_run.write_made(path, Synthetic(100).messages())
 
 
 COMMANDS = 'run --offline, report, plot, recover, export, excite, paper, arms, monte-carlo'

@@ -21,7 +21,7 @@ import pytest
 from closed_loop_case import closed_loop, controller, quick
 from command import OLDER, finished
 from numba.core.errors import UnsupportedError
-from shaken_arm import _shake
+from random_arm import _shake
 
 import blf_dsc_controller
 from blf_dsc_controller.arms import model
@@ -71,7 +71,7 @@ def test_kernel_depends_on_the_files_and_constants_it_is_compiled_from():
     assert not any('configuration' in name for name in names(run_loop))
     assert {'SUSPECT=1', 'OUTSIDE=2', 'LINEAR=1'} <= jit.dependencies(update)[1]
     outside = {path.name for path in jit.dependencies(_shake)[0]}  # a kernel of these tests
-    assert outside >= {'shaken_arm.py', 'arm.py', 'algebra.py'}
+    assert outside >= {'random_arm.py', 'arm.py', 'algebra.py'}
     assert 'controller.py' not in outside
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Exciting references: their predicted excitation, limits and benefit."""
+"""Exciting references: their predicted excitation, limits, clearance and benefit."""
 
 from __future__ import annotations
 
@@ -8,14 +8,19 @@ from functools import cache
 
 import numpy as np
 import pytest
-from random_arm import random_urdf
+from random_arm import chain_of, random_urdf
 
 from blf_dsc_controller.cli.main import main
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.nodes import load_loop
 from blf_dsc_controller.configuration.robot import parameters_of
 from blf_dsc_controller.configuration.schema import build
-from blf_dsc_controller.identification.exciting_reference import ExcitationProblem, search
+from blf_dsc_controller.identification.exciting_reference import (
+    Clearance,
+    ExcitationProblem,
+    distance,
+    search,
+)
 from blf_dsc_controller.law.factory import settings_of_config
 from blf_dsc_controller.simulation.loop import simulate
 
@@ -146,3 +151,53 @@ def test_tool_writes_a_preset_for_an_arm_from_a_urdf_that_keeps_it_from_the_floo
     assert 0.08 < speed.max() <= 0.95 * 0.1 + 1e-4
     assert main(['excite', str(out), '--config', 'recommended', '--force']) == 1
     assert 'got model two_link' in capsys.readouterr().err
+
+
+# Room around an arm.
+
+
+def panda(radius=0.07, floor=0.0):
+    return Clearance(chain_of('panda'), radius, floor)
+
+
+def test_distance_is_the_minimum_over_all_points_of_both_lines():
+    along = np.linspace(0.0, 1.0, 300)[:, np.newaxis]
+    for a, b, c, d in np.random.default_rng(0).normal(size=(100, 4, 3)):
+        first, second = a + (b - a) * along, c + (d - c) * along
+        minimum = np.linalg.norm(first[:, np.newaxis] - second, axis=-1).min()
+        assert distance(a, b, c, d) == pytest.approx(minimum, abs=1e-3)
+    for line, other, expected in (
+        ([(0, 0, 0), (1, 0, 0)], [(2, 1, 0), (3, 1, 0)], 2**0.5),  # parallel
+        ([(0, 0, 0), (1, 0, 0)], [(0.5, -1, 0), (0.5, 1, 0)], 0.0),  # crossing
+        ([(0, 0, 0), (0, 0, 0)], [(-1, 2, 0), (1, 2, 0)], 2.0),  # a point
+        ([(0, 0, 0), (0, 0, 0)], [(0, 0, 3), (0, 0, 3)], 3.0),  # two points
+    ):
+        assert distance(*np.array([*line, *other], dtype=float)) == pytest.approx(expected)
+
+
+def test_panda_must_not_touch_itself_or_the_floor():
+    """Unless the floor is lower, and with more room if the links are thinner."""
+    upright = np.array((0.0, 0.0, 0.0, -np.pi / 2, 0.0, np.pi / 2, 0.0))
+    folded = np.array((0.0, 0.0, 0.0, -3.0, 0.0, 0.2, 0.0))  # the hand in the upper arm
+    low = np.array((0.0, 1.7, 0.0, -0.5, 0.0, 1.0, 0.0))  # below the floor
+    assert panda().room(upright).min() >= 0.0
+    assert panda().room(folded).min() < 0.0
+    assert panda().room(low).min() < 0.0 < panda(floor=-1.0).room(low).min()
+    assert panda(radius=0.03).room(folded).min() > panda().room(folded).min()
+
+
+def test_links_that_touch_in_every_posture_do_not_count():
+    """With thick links only a Panda's base and what is beyond its elbow are left."""
+    q = np.random.default_rng(0).uniform(-1.0, 1.0, (50, 7))
+    assert panda(radius=0.3).room(q).shape[1] < panda().room(q).shape[1]
+    assert np.all(panda(radius=0.005).room(q).max(axis=0) > 0.0)
+
+
+def test_link_with_an_offset_from_its_joints_is_checked_where_it_is():
+    """The upper arm of a UR5e is 11 cm beside the line from shoulder to elbow."""
+    corners, straight = (
+        Clearance(chain_of('ur5e'), radius, 0.0).corners(np.zeros(6)) for radius in (0.07, 0.2)
+    )
+    assert len(corners) == len(straight) + 1 == 9
+    apart = distance(corners[3], corners[3], straight[2], straight[3])
+    assert apart == pytest.approx(0.11336, abs=1e-4)

@@ -13,16 +13,18 @@ import mujoco
 import numpy as np
 import pinocchio
 import pytest
-from random_arm import PANDA, pinocchio_model, random_urdf
-from shaken_arm import (
+from random_arm import (
     FIELDS,
     GRAVITY,
+    PANDA,
     PANDA_CHAIN,
     PANDA_TEXT,
     PERIOD,
     changed,
     is_covered,
     measured,
+    pinocchio_model,
+    random_urdf,
     recording_of,
     reference_of,
     shake,
@@ -37,7 +39,6 @@ from blf_dsc_controller.arms.model import regressors_at
 from blf_dsc_controller.arms.urdf import inertia_of, pseudo_inertia, read_chain
 from blf_dsc_controller.bags.content import NameMap
 from blf_dsc_controller.bags.sources import BagError
-from blf_dsc_controller.bags.writer import BagWriter
 from blf_dsc_controller.cli.identify import problems_of
 from blf_dsc_controller.cli.main import main
 from blf_dsc_controller.configuration.nodes import PLANT, load_loop
@@ -47,8 +48,6 @@ from blf_dsc_controller.identification.corrected_urdf import corrected_urdf
 from blf_dsc_controller.identification.identify import identify_arm, identify_bag
 from blf_dsc_controller.identification.prior import Cone, base_matrix, solve
 from blf_dsc_controller.identification.recording import Recording, joined, read_recording, rows_of
-from blf_dsc_controller.messages.codecs import JointStateEncoder
-from blf_dsc_controller.messages.topics import JOINT_STATE
 from blf_dsc_controller.simulation.loop import simulate, write_bag
 
 ROBOT = Robot(urdf=PANDA_TEXT)
@@ -189,34 +188,20 @@ def test_command_writes_the_urdf_and_prints_the_table(bag, tmp_path, capsys):
     is_physical(out.read_text())
 
 
-def test_other_publishers_joint_names_and_orders_are_recognised(states, tmp_path):
-    """A gripper on the same topic, joints in another order and one with another name."""
-    published = ('elbow' if name == 'panda_joint4' else name for name in PANDA[::-1])
-    arm, hand = JointStateEncoder(tuple(published)), JointStateEncoder(('panda_finger_joint1',))
-    with BagWriter(tmp_path / 'bag', flush_interval=None) as bag:
-        handle = bag.add_topic('/franka/joint_states', JOINT_STATE, [])
-        for k, state in enumerate(states[:8000]):
-            stamp = 1_000_000_000 + 1_000_000 * k
-            bag.write(handle, bytes(arm.encode(stamp, *state[:, ::-1])), stamp)
-            bag.write(handle, bytes(hand.encode(stamp, [0.0], [0.0], [0.0])), stamp)
-    names = NameMap.parse(['panda_joint4=elbow'])
-    recording = read_recording(tmp_path / 'bag', PANDA_TEXT, names=names)
-    assert recording.joints == PANDA
-    assert recording.source == 'effort of /franka/joint_states'
-    np.testing.assert_allclose(recording.q, states[: len(recording.q), 0], atol=1e-12)
-    np.testing.assert_allclose(recording.torque, states[: len(recording.q), 2], atol=1e-12)
-
-
 @pytest.mark.parametrize('effort', ['torque', 'command'])
 def test_commands_replace_efforts_that_are_missing_or_not_wanted(states, tmp_path, effort):
-    """With `--effort command` those in the bag, here currents, are not used."""
+    """With `--effort command` those in the bag, here currents, are not used; names are mapped."""
+    names = NameMap.parse(['panda_joint4=elbow'])
+    joints = [names.joints.get(joint, joint) for joint in PANDA]
     fields, some = FIELDS[: 2 + (effort == 'command')], states[:8000]
     currents = some * [[1.0], [1.0], [0.1]]
-    write_states(tmp_path / 'bag', PANDA, currents, fields=fields, commands=some[:, 2])
-    found = identify_bag(tmp_path / 'bag', ROBOT, effort=effort)
+    write_states(tmp_path / 'bag', joints, currents, fields=fields, commands=some[:, 2])
+    found = identify_bag(tmp_path / 'bag', ROBOT, names=names, effort=effort)
     assert found.source == '/arm/commands'
     assert not list(problems_of(found, effort))
-    recording = read_recording(tmp_path / 'bag', PANDA_TEXT, commanded=effort == 'command')
+    commanded = effort == 'command'
+    recording = read_recording(tmp_path / 'bag', PANDA_TEXT, names=names, commanded=commanded)
+    assert recording.joints == PANDA
     np.testing.assert_allclose(recording.torque, states[: len(recording.q), 2], atol=1e-12)
 
 
@@ -573,21 +558,3 @@ def test_rest_of_the_file_is_unchanged():
     twice = corrected_urdf(new, chain, chain.inertias, friction, friction, '')
     assert twice.count('<inertial>') == new.count('<inertial>')
     assert twice.count('<dynamics') == 7
-
-
-def test_other_readers_load_the_new_inertias_and_friction(tmp_path):
-    yourdfpy = pytest.importorskip('yourdfpy', reason='needs pip install blf_dsc_controller[view]')
-    inertias = changed(PANDA_CHAIN, np.random.default_rng(5))
-    text = corrected_urdf(PANDA_TEXT, PANDA_CHAIN, inertias, np.full(7, 0.5), np.full(7, 0.2), '')
-    model = mujoco.MjModel.from_xml_string(text)
-    np.testing.assert_allclose(model.dof_damping[:7], 0.5)
-    np.testing.assert_allclose(model.dof_frictionloss[:7], 0.2)
-    (tmp_path / 'arm.urdf').write_text(text)
-    robot = yourdfpy.URDF.load(str(tmp_path / 'arm.urdf'), load_meshes=False)
-    assert robot.validate()
-    last = PANDA_CHAIN.joints[-1]
-    assert last.fixed == ('panda_link8', 'panda_hand', 'panda_hand_tcp')
-    assert last.held[3, 3] == pytest.approx(0.03)  # two fingers
-    for joint, inertia in zip(PANDA_CHAIN.joints, inertias, strict=True):
-        mass = inertia[0] - joint.held[3, 3]
-        assert robot.link_map[joint.link].inertial.mass == pytest.approx(mass)

@@ -162,30 +162,26 @@ def test_multi_array_with_dimensions_of_the_expected_size_is_decoded(data):
     assert decoder.values.tolist() == data
 
 
-@pytest.mark.parametrize(
-    'fields', [JOINT_STATE_FIELDS, (), *((field,) for field in JOINT_STATE_FIELDS)]
-)
-@pytest.mark.parametrize('names', [['j'], ['a', 'bcd'], ['a', 'bc', 'def', 'ghij', '']])
-def test_each_reads_what_rclpy_serialises_and_the_other_way_round(names, fields):
+@given(NAMES, st.sets(st.sampled_from(JOINT_STATE_FIELDS)), st.text('base_', max_size=9))
+def test_messages_pass_through_rclpy_unchanged(names, fields, frame_id):
     rclpy = pytest.importorskip('rclpy.serialization', reason='needs ROS 2')
     from sensor_msgs.msg import JointState
     from std_msgs.msg import Float64MultiArray
 
-    sizes = dict(zip(fields, (0.1, -0.2, 1e300), strict=False))
-    values = {field: [size / (j + 1) for j in range(len(names))] for field, size in sizes.items()}
-    message = JointState(name=names, **values)
-    message.header.stamp.sec, message.header.stamp.nanosec = divmod(STAMP, 10**9)
+    count = len(names)
+    values = {name: (k - np.arange(count) / 3).tolist() for k, name in enumerate(sorted(fields))}
     raw = JointStateEncoder(names, fields).encode(STAMP, **values)
-    assert rclpy.deserialize_message(raw, JointState) == message
-    for message.header.frame_id in ('', 'b', 'world'):
-        decoder = JointStateDecoder(names[::-1], ())
-        assert decoder.decode(rclpy.serialize_message(message)) == STAMP
-        for field in JOINT_STATE_FIELDS:
-            found, unknown = getattr(decoder, field)[::-1], [np.nan] * len(names)
-            np.testing.assert_array_equal(found, values.get(field, unknown))
-    data = values.get('position', [])
-    raw = Float64MultiArrayEncoder(len(data)).encode(data)
-    assert list(rclpy.deserialize_message(raw, Float64MultiArray).data) == data
-    decoder = Float64MultiArrayDecoder(len(data))
-    assert decoder.decode(rclpy.serialize_message(Float64MultiArray(data=data))) == len(data)
-    assert decoder.values.tolist() == data
+    message = rclpy.deserialize_message(raw, JointState)
+    message.header.frame_id = frame_id
+    decoder = JointStateDecoder(names[::-1], ())
+    assert decoder.decode(rclpy.serialize_message(message)) == STAMP
+    for field in JOINT_STATE_FIELDS:
+        expected = values.get(field, [NAN] * count)
+        np.testing.assert_array_equal(getattr(decoder, field)[::-1], expected)
+    raw = Float64MultiArrayEncoder(count).encode(range(count))
+    array, message = (
+        Float64MultiArrayDecoder(count),
+        rclpy.deserialize_message(raw, Float64MultiArray),
+    )
+    assert array.decode(rclpy.serialize_message(message)) == count
+    assert array.values.tolist() == list(range(count))

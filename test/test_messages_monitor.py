@@ -137,26 +137,18 @@ def test_bound_is_sent_at_once_when_it_widens_and_with_the_monitor_while_it_narr
     assert sent == [(0, 9.0), (3, 7.0), (6, 6.5), (7, 7.0)]
 
 
-@pytest.fixture(scope='module')
-def rejecting_run(tmp_path_factory):
+def test_rejected_columns_are_in_the_summary_and_the_lyapunov_function_is_a_panel(tmp_path):
     """Run of 8 s from a bag, truth known, with a cosine column that the reference cannot excite."""
     learning = {'learning.frequencies': [1.0], 'learning.bias': False}
     config = configured('recommended', 8.0, LEAKY | learning)
-    path = tmp_path_factory.mktemp('refusing') / 'bag'
-    write_bag(path, simulate(config.controller, config.plant))
-    return read_run(path)
-
-
-def test_rejected_columns_are_in_the_summary(rejecting_run):
-    metrics = measure(rejecting_run)
+    write_bag(tmp_path / 'bag', simulate(config.controller, config.plant))
+    run = read_run(tmp_path / 'bag')
+    metrics = measure(run)
     (column,) = metrics.rejected_columns
     assert column.startswith('cos 1 rad/s ')
     assert f'rejected    {column}: ' in format_table(metrics)
     assert metrics.final_parameter_error < 0.5
-
-
-def test_lyapunov_function_of_the_bag_is_a_panel(rejecting_run):
-    (panel,) = (panel for panel in panels([rejecting_run]) if panel.group == 'Monitors')
+    (panel,) = (panel for panel in panels([run]) if panel.group == 'Monitors')
     *terms, V = panel.lines
     assert [line.name for line in terms] == ['barrier', 'velocity', 'parameters', 'disturbance']
     assert V.values[0] == pytest.approx(sum(line.values[0] for line in terms))

@@ -192,6 +192,8 @@ def test_joint_states_may_have_another_order_and_other_joints():
 @pytest.mark.parametrize(
     ('given', 'problem'),
     [
+        ({'robot.drive_payload': 1.5}, 'robot.drive_payload: got 1.5 kg, but drive_compensates is'),
+        ({'robot.urdf': '', 'robot.tip': ''} | HELD, 'drive_compensates: got gravity, which needs'),
         ({'robot.urdf': '', 'truth.mass_factor': 1.1}, 'truth: it applies only to a URDF'),
         ({'robot.urdf': '', 'actuator.ripple': 0.1}, 'actuator.ripple: .* give actuator.torque_'),
         ({'drive.mass_factor': 0.9}, 'drive: without robot.drive_compensates the drives need no'),

@@ -12,7 +12,6 @@ import pytest
 pytest.importorskip('rclpy', reason='needs ROS 2')
 
 import recorded_run
-import synthetic_bag
 from rclpy.parameter import Parameter
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from rclpy.serialization import deserialize_message
@@ -164,9 +163,9 @@ def bag(tmp_path_factory):
     message = typestore().types[ROBOT_DESCRIPTION.type](data='<robot/>')
     raw = bytes(typestore().serialize_cdr(message, ROBOT_DESCRIPTION.type))
     # As the middleware delivers it.
-    urdf = (ROBOT_DESCRIPTION, synthetic_bag.START, raw + bytes(-len(raw) % 4))
-    messages = [urdf, *synthetic_bag.Synthetic(200).messages()]
-    return synthetic_bag.write(tmp_path_factory.mktemp('played') / 'bag', messages)
+    urdf = (ROBOT_DESCRIPTION, recorded_run.START, raw + bytes(-len(raw) % 4))
+    messages = [urdf, *recorded_run.Synthetic(200).messages()]
+    return recorded_run.write_made(tmp_path_factory.mktemp('played') / 'bag', messages)
 
 
 def test_bag_is_played_in_its_time_and_order_byte_for_byte(bag, ros):
