@@ -80,15 +80,11 @@ BOUND = 2e-3  # rad
 WINDOW = 2.0 * np.pi  # s
 OFF = {'learning.weight': 0.0}
 CHANGED = 20.0  # s
-GENTLE = 0.25e-3  # rad, allowed after a ramp: errors so small that 1.3 times is too strict
 
 
 def payload(m2, begin=CHANGED):
-    """Return parameters of a plant whose tip mass becomes `m2` [kg]; a lower one is a release."""
-    if m2 >= 0.5:
-        return {'events.begin': [begin], 'events.payload': [m2 - 0.5]}
-    released = {'events.begin': [0.0], 'events.duration': [begin], 'events.payload': [0.5 - m2]}
-    return {'arm.m2': m2, **released}
+    """Return parameters of a plant whose tip mass becomes `m2` [kg]."""
+    return {'events.begin': [begin], 'events.payload': [m2 - 0.5]}
 
 
 def push(joint, torque, seconds, begin=CHANGED):
@@ -134,37 +130,11 @@ ROWS = {
 }
 """Changes by name; a run ends at `end_of`, two windows after the last change."""
 
-LIGHTER = {f'release to {m2} kg': payload(m2) for m2 in (0.25, 0.3)}
-"""Releases that also change the arm itself, which is not an event."""
-
-
-def allowed(row, without):
-    """Return the largest error allowed with learning [rad], given the largest without it.
-
-    Without learning the arm is up to 0.09 mrad off before the change, sometimes to the side from
-    which the change pushes it back: that alone makes the ratio 1.21 for a tenth of a kilogram.
-    """
-    return np.maximum(1.3 * without, GENTLE if 'events.ramp' in row else 0.0)
-
-
-def _times(row):
-    """Return begin, duration and ramp of each event of a row [s]."""
-    begin = np.array(row['events.begin'])
-    return begin, *(
-        np.array(row.get(f'events.{name}', 0.0 * begin)) for name in ('duration', 'ramp')
-    )
-
-
-def begin_of(row):
-    """Return the time of the first change of a row after its start [s]."""
-    begin, duration, _ = _times(row)
-    times = np.concatenate([begin, begin + duration])
-    return float(times[times > 0.0].min())
-
 
 def end_of(row):
     """Return the time two windows after the last change of a row [s], in whole samples."""
-    return round(float(np.max(sum(_times(row)))) + 2.0 * WINDOW, 3)
+    times = (np.array(row.get(f'events.{name}', 0.0)) for name in ('begin', 'duration', 'ramp'))
+    return round(float(np.max(sum(times))) + 2.0 * WINDOW, 3)
 
 
 def run_preset(duration, plant=None, *, preset='recommended', law=None):

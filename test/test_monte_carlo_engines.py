@@ -116,8 +116,9 @@ def test_killed_study_resumes(tmp_path):
             time.sleep(0.01)
         process.kill()
         process.communicate(timeout=300.0)  # to the end of the pipe: its workers have ended too
+    min(out.glob('runs/r*')).unlink()  # what is missing need not be at the end
     before = {name: stamp for name, stamp in stamps(out).items() if name.startswith('r')}
-    assert 3 <= len(before) < RUNS
+    assert 2 <= len(before) < RUNS
     (out / 'runs' / '.runs-000000023-000000023.parquet').write_bytes(b'half a fi')
 
     resumed = subprocess.run(command, capture_output=True, text=True, check=True)
@@ -131,11 +132,6 @@ def test_killed_study_resumes(tmp_path):
     assert 'of the runs kept the bound' in finished.stdout
     opened = Store(out)
     np.testing.assert_equal(opened.results(), whole(opened.study))
-
-
-def test_missing_runs_are_found_between_completed_ones(store):
-    filled(store, 3, 10)
-    assert [run for (run,) in store.missing()] == [*range(3), *range(4, 10), *range(11, RUNS)]
 
 
 @pytest.mark.parametrize(('runs', 'chunks'), [(1, 1), (1001, 201), (10**6, 1000)])
