@@ -40,7 +40,6 @@ _FIRST = (
     'test_monte_carlo',
     'test_bag_recorder',
     'test_replay',
-    'test_managed',
     'test_nodes',
     'test_studies',
 )

@@ -302,26 +302,27 @@ def stopped(folder, reason=Reason.OUTSIDE_BOUND):
     return recorded_run.write_made(folder / 'bag', sorted(messages, key=lambda entry: entry[1]))
 
 
-def test_stop_outside_the_bound_is_a_violation_at_the_stamp_of_the_last_state(tmp_path):
-    run = read_run(stopped(tmp_path))
+@pytest.mark.parametrize(
+    ('reason', 'held', 'violated', 'bound'),
+    [
+        (Reason.OUTSIDE_BOUND, False, STOP_S, 'VIOLATED, first by elbow at 2.345 s'),
+        (Reason.VELOCITY, True, np.nan, 'held by every joint until the stop'),
+    ],
+)
+def test_stop_outside_the_bound_is_a_violation_at_the_stamp_of_the_last_state(
+    tmp_path, reason, held, violated, bound
+):
+    """A stop for another reason keeps the bound held until then."""
+    run = read_run(stopped(tmp_path, reason))
     assert np.nanmax(np.abs(run.error)) < recorded_run.BOUND_RAD
     metrics = measure(run)
-    assert metrics.held is False
-    assert metrics.first_violation == pytest.approx(STOP_S)
-    assert metrics.violating_joint == 'elbow'
+    assert metrics.held is held
+    assert metrics.first_violation == pytest.approx(violated, nan_ok=True)
+    assert metrics.violating_joint == ('' if held else 'elbow')
     assert [stop['time'] for stop in metrics.stops] == [pytest.approx(STOP_S)]
     table = format_table(metrics)
-    assert 'bound       VIOLATED, first by elbow at 2.345 s' in table
-    assert "stopped     at 2.345 s, error past the bound: joint 'elbow' is +0.0023 rad" in table
-    assert 'held' not in table
-
-
-def test_stop_for_another_reason_keeps_the_bound_held_until_then(tmp_path):
-    metrics = measure(read_run(stopped(tmp_path, Reason.VELOCITY)))
-    assert metrics.held is True
-    table = format_table(metrics)
-    assert 'bound       held by every joint until the stop' in table
-    assert 'stopped     at 2.345 s, velocity not plausible' in table
+    assert f'bound       {bound}' in table
+    assert f"stopped     at 2.345 s, {reason}: joint 'elbow' is +0.0023 rad" in table
 
 
 def test_figures_and_page_show_the_stop(tmp_path):

@@ -1,8 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The pages of report and view in a browser; runs in `make test-browser`.
 
-Their contents are checked without a browser in test_analysis_report.py, test_view.py and
-test_view_live.py.
+Their contents are checked without a browser in test_analysis_report.py and test_view.py.
 """
 
 from __future__ import annotations

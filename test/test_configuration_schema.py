@@ -62,18 +62,11 @@ def test_limits_are_inclusive_and_arrays_as_long_as_others_say():
     assert build(ControllerConfig, {'learning.window': 0.01}).learning.window == 0.01
 
 
-def test_given_values_take_precedence_over_those_of_a_urdf():
-    arm = {'robot.urdf': 'ur5e.urdf', 'robot.tip': 'tool0'}
-    given = {'initial.position': (0.5,) * 6}
-    assert flatten(build(PlantConfig, arm | given)).items() >= given.items()
-
-
 @pytest.mark.parametrize(
     ('classes', 'given', 'message'),
     [
         # Names.
         (PLANT, {'sensr.offset': [1.0, 1.0]}, 'unknown parameter, did you mean sensor.offset?'),
-        (PLANT, {'zzz': 1}, 'unknown parameter'),
         # Types. ROS does not accept an integer for a double, nor does a run without ROS.
         (PLANT, {'duration': 1}, 'got 1, but a double is expected, with a decimal point'),
         (PLANT, {'load.torque': [1, 2]}, 'got [1, 2], but a double array is expected, with a dec'),
@@ -213,9 +206,3 @@ def test_defaults_are_valid_and_every_parameter_is_described(cls):
         assert entry.description
         if entry.type is int:
             assert entry.at_least is not None, entry.name
-
-
-def test_sample_time_is_a_whole_number_of_nanoseconds():
-    for cls in BOTH:
-        for period, expected in ((0.0003, 300_000), (0.01, 10_000_000)):
-            assert build(cls, {'sample_time': period}).sample_time_ns == expected

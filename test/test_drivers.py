@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import json
 import re
 import shlex
 from types import SimpleNamespace
@@ -21,9 +20,8 @@ from rclpy.serialization import serialize_message
 from rclpy.wait_for_message import wait_for_message
 from ros_rig import PATIENCE
 from std_msgs.msg import String
-from test_launch import NODES, arguments_of, launched, start  # noqa: F401 - fixtures
+from test_nodes_process import NODES, arguments_of, launched, start  # noqa: F401 - fixtures
 
-from blf_dsc_controller.bags.reader import read_run
 from blf_dsc_controller.cli.main import main
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.nodes import load, load_loop
@@ -31,7 +29,6 @@ from blf_dsc_controller.configuration.schema import change
 from blf_dsc_controller.messages import topics
 from blf_dsc_controller.messages.journal import decode
 from blf_dsc_controller.nodes.endpoints import qos_profile
-from blf_dsc_controller.replay.verify import verify
 from blf_dsc_controller.simulation.loop import START, simulate
 from blf_dsc_controller.supervision.guard import Guard
 from sim_plant.plant import plant_of
@@ -182,16 +179,6 @@ def test_lost_commands_neither_stop_the_drives_nor_cost_the_bound(robot, lost):
     assert ratio < 0.5
 
 
-def test_arm_at_100_hz_stops_with_the_rate_as_the_reason():
-    """controller_manager's default; an arm that sends states before is refused at the start."""
-    loop = load_loop('fr3')
-    guard, plant = Guard(loop.controller), plant_of(change(loop.plant, {'sample_time': 0.01}))
-    guard.activate()
-    for k in range(20):
-        plant.step(guard.update(START + k * 10_000_000, plant.measure()))
-    assert 'states come every 0.01 s, but sample_time is 0.001 s' in guard.supervisor.text
-
-
 @pytest.mark.usefixtures('blank_pictures')
 def test_every_own_shell_line_of_the_page_is_executed(launched, start, tmp_path, monkeypatch):  # noqa: F811
     """The rest belongs to packages of the robots; nodes that a line starts find each other."""
@@ -226,23 +213,3 @@ def test_every_own_shell_line_of_the_page_is_executed(launched, start, tmp_path,
                     continue
                 own.append(line)
     assert len(own) == 6
-
-
-@ROBOTS
-@pytest.mark.usefixtures('blank_pictures')
-def test_one_command_runs_the_simulated_driver_over_ros_and_replays_bit_for_bit(robot, tmp_path):
-    """With a pick-up at 6 s; 60 s with pick-up and put-down are run by hand before a release."""
-    preset = FACTS[robot].preset
-    file = tmp_path / 'early.yaml'
-    text = (CONFIG / f'{preset}.yaml').read_text()
-    file.write_text(text.replace('begin: [20.0]', 'begin: [6.0]'))
-    run = ['run', '--config', str(file), '--mode', 'lockstep', '--duration', '8']
-    assert main([*run, '--out', str(tmp_path / 'out')]) == 0
-    summary = json.loads((tmp_path / 'out' / 'summary.json').read_text(encoding='utf-8'))
-    assert summary['held']
-    recorded = read_run(tmp_path / 'out' / 'bag')
-    assert recorded.stops == ()
-    replayed = verify(tmp_path / 'out' / 'bag')
-    assert replayed.difference is None
-    left_out = [each.left_out for each in replayed.comparisons if each.left_out]
-    assert left_out == ['compute_time']

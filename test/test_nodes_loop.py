@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Plant and controller as nodes in one process: the closed loop, and whose clock counts."""
+"""Plant and controller as nodes in one process: the closed loop, its clocks, its lifecycle."""
 
 from __future__ import annotations
 
 import json
+from functools import partial
 
 import numpy as np
 import pytest
@@ -12,9 +13,21 @@ pytest.importorskip('rclpy', reason='needs ROS 2')
 
 from random_arm import random_urdf
 from rcl_interfaces.srv import SetParametersAtomically
+from rclpy.node import Node
 from rclpy.parameter import Parameter
+from rclpy.qos import QoSProfile
 from rclpy.time import Time
-from ros_rig import FakeClock, simulated, states, torques
+from ros_rig import (
+    FakeClock,
+    activate,
+    cleanup,
+    configure,
+    deactivate,
+    simulated,
+    states,
+    torques,
+    values,
+)
 from test_plant_sampled import ALL_KINDS
 
 from blf_dsc_controller.configuration.controller import ControllerConfig
@@ -22,6 +35,7 @@ from blf_dsc_controller.configuration.plant import PlantConfig
 from blf_dsc_controller.configuration.schema import build
 from blf_dsc_controller.messages import topics
 from blf_dsc_controller.nodes.controller_node import ControllerNode
+from blf_dsc_controller.nodes.endpoints import message_class
 from blf_dsc_controller.nodes.plant_node import LOCKSTEP_START, PlantNode
 from blf_dsc_controller.reference import terms as reference
 from blf_dsc_controller.reference.approach import reference_of
@@ -104,6 +118,27 @@ def test_lockstep_torques_and_stops_match_the_offline_run_bit_for_bit(ros, name)
     np.testing.assert_array_equal(stamps, LOCKSTEP_START + MILLISECOND * np.arange(len(stamps)))
 
 
+def test_two_arms_in_one_domain_do_not_interfere(ros):
+    """Each runs as if it were alone, bit for bit; they differ in their noise."""
+    noise = {'sensor__position_noise': 1e-5}
+    law = {'wait_for_subscribers': 1, 'telemetry__enabled': False}
+    arms, received = {}, {}
+    for seed, side in enumerate(('left', 'right')):
+        name = f'/{side}/blf_dsc_controller/commands'
+        received[side] = []
+        ros.tester.create_subscription(
+            message_class(topics.COMMANDS.type), name, received[side].append, QoSProfile(depth=1000)
+        )
+        plant = {'seed': seed, 'duration': 0.2, **noise}
+        arms[side], _ = ros.loop(plant, law, namespace=side)
+    ros.until(lambda: all(len(messages) == 201 for messages in received.values()))
+    for seed, side in enumerate(received):
+        torques = np.array([message.data for message in received[side]])
+        alone = simulated({'seed': seed, 'duration': 0.2, 'sensor.position_noise': 1e-5})
+        np.testing.assert_array_equal(torques, alone.torque)
+    assert not np.array_equal(received['left'][-1].data, received['right'][-1].data)
+
+
 def test_nodes_on_simulated_time_follow_the_clock_of_the_plant(ros):
     clock = ros.listen(topics.CLOCK)
     plant = {'duration': 0.5, 'publish_clock': True}
@@ -183,3 +218,163 @@ def test_parameter_change_takes_effect_at_the_published_sample(ros):
     load = {f'events.{name.partition(".")[2]}': np.ravel(v).tolist() for name, v in PUSHED.items()}
     expected = simulated({'duration': 1.0, 'events.begin': [at], **load}).torque
     np.testing.assert_array_equal(torques(commands), expected)
+
+
+# Under a lifecycle manager: transitions, resets in any order, one node killed.
+
+SECOND = 1_000_000_000  # ns
+
+
+def is_running(node):
+    return node.guard is not None and node.guard.supervisor.running
+
+
+def assert_runs(ros, arm, law, samples=60):
+    """Run the loop on, and check that the law is running and the error within its bound."""
+    ros.run(arm, samples)
+    assert is_running(law), law.guard.supervisor.text
+    assert law.guard.samples.ratio.max() < 1.0
+
+
+def test_nodes_without_autostart_do_nothing_until_a_manager_starts_them(ros):
+    commands = ros.listen(topics.COMMANDS)
+    arm, law = ros.loop({'autostart': False}, {'autostart': False})
+    for node in (arm, law):
+        assert node.state_label == 'unconfigured'
+        assert 'unconfigured: activate it first' in ros.reset(node).message
+        assert configure(ros, node)
+    ros.spin(0.4)  # longer than the plant waits for its peers to settle
+    assert not commands
+    assert activate(ros, arm)
+    ros.spin(0.4)
+    assert not commands
+    assert activate(ros, law)
+    assert_runs(ros, arm, law)
+
+
+def test_loop_waits_for_a_recorder_and_not_for_any_listener(ros):
+    waiting = {'wait_for_subscribers': 1}
+    arm, _ = ros.loop(waiting, waiting | {'telemetry__enabled': False})
+    outputs = topics.JOINT_STATES, topics.TRUTH, topics.COMMANDS
+    listener = ros.add(partial(Node, 'listener'))
+    for topic in outputs:
+        type_ = message_class(topic.type)
+        listener.create_subscription(type_, topic.resolved, lambda _: None, 10)
+    ros.spin(0.5)
+    assert arm.plant.sample == 0
+    for topic in outputs:
+        ros.listen(topic)
+    ros.until(lambda: arm.plant.sample > 0)
+
+
+def test_transitions_pause_and_restart_the_loop_and_impossible_ones_are_rejected(ros):
+    arm, law = ros.loop()
+    assert not activate(ros, law)
+    assert not configure(ros, arm)
+    assert not cleanup(ros, law)
+    ros.run(arm, 50)
+    assert deactivate(ros, arm)
+    sample = arm.plant.sample
+    ros.spin(0.3)
+    assert arm.plant.sample == sample
+    assert activate(ros, arm)
+    assert_runs(ros, arm, law)
+    for node in (law, arm):
+        assert deactivate(ros, node)
+        assert cleanup(ros, node)
+        assert node.state_label == 'unconfigured'
+    for node in (arm, law):
+        assert configure(ros, node)
+        assert activate(ros, node)
+    assert_runs(ros, arm, law)
+
+
+@pytest.mark.parametrize('order', ['p', 'c', 'pc', 'ccp', 'pcpc'])
+def test_loop_runs_after_resets_in_any_order(ros, order):
+    arm, law = ros.loop()
+    ros.run(arm, 300)
+    for letter in order:
+        assert ros.reset(arm if letter == 'p' else law).success
+        ros.spin(0.02)
+    if 'p' in order:
+        ros.until(lambda: arm.plant.sample > 30)
+    assert_runs(ros, arm, law)
+
+
+def test_reset_of_both_nodes_repeats_the_run(ros):
+    commands = ros.listen(topics.COMMANDS)
+    clock = FakeClock()
+    arm, law = ros.loop({'sensor__position_noise': 1e-5, 'seed': 3}, clock=clock)
+    ros.spin(0.3)
+    assert not arm._offered  # peers need time to settle
+    ros.until(lambda: clock.advance(0.01) or arm._offered)
+    ros.run(arm, 100)
+    begin = arm.stamp - arm.plant.elapsed_ns
+    ros.reset(arm)
+    # Clock and plant stand still until all torques of the first run have arrived.
+    samples = (arm.stamp - SECOND - begin) // (SECOND // 1000) + 1
+    ros.until(lambda: len(commands) == samples)
+    assert arm.plant.sample == 0
+    first = torques(commands)[:100]
+    commands.clear()
+    ros.until(lambda: clock.advance(0.01) or arm._offered)
+    assert law.guard.controller.samples < 50  # it has been reset before
+    ros.until(lambda: len(commands) >= 100)
+    np.testing.assert_array_equal(torques(commands)[:100], first)
+
+
+def test_restarted_controller_continues_from_where_the_arm_is(ros, monkeypatch):
+    monkeypatch.setattr('blf_dsc_controller.nodes.plant_node._REPEAT_PERIOD', 0.1)
+    arm, law = ros.loop()
+    ros.run(arm, 50)
+    ros.kill(law)
+    ros.until(lambda: arm.stamp == law.guard.journal.stamp + SECOND // 1000)
+    sample = arm.plant.sample
+    ros.spin(0.3)
+    assert arm.plant.sample == sample  # without torques, time stands still
+    restarted = ros.add(ControllerNode)
+    assert_runs(ros, arm, restarted)
+
+
+def test_stale_torque_is_not_applied_in_real_time(ros):
+    diagnostics, states = ros.listen(topics.DIAGNOSTICS), ros.listen(topics.JOINT_STATES)
+    clock = FakeClock()
+    arm = ros.add(PlantNode, clock=clock)
+    law = ros.add(ControllerNode, clock=clock)
+    ros.until(lambda: clock.advance(0.01) or states)
+    ros.until(arm.input.torque.any)
+    for sample in range(1, 21):
+        clock.advance(0.001)
+        ros.until(lambda k=sample: arm.plant.sample == k and arm._has_torque)
+    assert arm.plant.measure()[4:].any()
+    ros.kill(law)
+    ros.until(lambda: clock.advance(0.001) or arm.input.stale_steps > 5)
+    assert not arm.plant.measure()[4:].any()
+    ros.until(
+        lambda: any(
+            (status.name, status.level) == ('sim_plant/torque', b'\2')
+            and 'too old' in status.message
+            for array in diagnostics
+            for status in array.status
+        )
+    )
+    # A restarted controller gets the arm moving once the arm is reset.
+    restarted = ros.add(ControllerNode, clock=clock)
+    ros.reset(arm)
+    ros.until(lambda: clock.advance(0.01) or is_running(restarted))
+
+
+def test_state_is_latched_and_gives_the_reason(ros):
+    arm, _ = ros.loop()
+    ros.run(arm, 20)
+    msgs = ros.listen(topics.STATE)
+    ros.until(lambda: msgs)
+    assert msgs[-1].message == 'tracking'
+    assert values(msgs[-1])['phase'] == 'tracking'
+    arm._start_stamp -= 10**9
+    ros.until(lambda: len(msgs) > 1)
+    assert msgs[-1].level == b'\2'
+    assert msgs[-1].message.startswith('stopped: the stamp of a joint state is 0.999 s before')
+    assert values(msgs[-1]) | {'phase': 'safe stop', 'reason': 'stamp backward'} == values(msgs[-1])
+    assert msgs[-1].name == 'blf_dsc_controller/state'
+    assert msgs[-1].hardware_id == 'joint1 joint2'

@@ -1,26 +1,36 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A node's process ends cleanly, even if a shutdown fails; what it asks of the system."""
+"""Processes of the nodes: how they end, what they ask of the system, how they are launched."""
 
 from __future__ import annotations
 
 import ctypes
 import errno
 import os
+import runpy
 import subprocess
 import sys
-from types import SimpleNamespace
+from operator import itemgetter
+from pathlib import Path
+from types import ModuleType, SimpleNamespace
 
 import pytest
 
 pytest.importorskip('rclpy', reason='needs ROS 2')
 
+import rclpy
 from command import finished
+from own_domain import own_domain
 
 from blf_dsc_controller.cli import session as isolation
 from blf_dsc_controller.cli.session import localhost_environment
+from blf_dsc_controller.configuration.nodes import dump
 from blf_dsc_controller.configuration.robot import Realtime
-from blf_dsc_controller.errors import BlfDscError
-from blf_dsc_controller.nodes.process import request_realtime
+from blf_dsc_controller.errors import BlfDscError, ConfigurationError
+from blf_dsc_controller.nodes.controller_node import ControllerNode
+from blf_dsc_controller.nodes.plant_node import PlantNode
+from blf_dsc_controller.nodes.process import assigned, request_realtime
+from blf_dsc_controller.nodes.recorder_node import BagRecorderNode
+from blf_dsc_controller.nodes.watchdog_node import WatchdogNode
 from blf_dsc_controller.studies.runs import cores
 
 BROKEN = """
@@ -139,3 +149,149 @@ def test_domain_is_held_until_the_last_node_of_a_run_has_ended(monkeypatch):
     node.communicate(b'\n')
     with isolation.own_domain() as domain:
         assert domain == mine
+
+
+# The launch file and the command line: which parameters reach the nodes. `launch` comes only with a
+# ROS installation: here stand-ins replace the few classes needed, and the real nodes get the
+# arguments that `launch_ros` would pass to their processes.
+
+ROOT = Path(__file__).resolve().parents[1]
+NODES = {
+    'sim_plant': PlantNode,
+    'blf_dsc_controller': ControllerNode,
+    'bag_recorder': BagRecorderNode,
+    'torque_watchdog': WatchdogNode,
+}
+
+
+@pytest.fixture
+def launched(monkeypatch):
+    """Return a function from launch arguments to what the launch file starts, in order."""
+    stand_ins = {
+        'launch': {'LaunchContext': dict, 'LaunchDescription': list},
+        'launch.actions': {
+            'DeclareLaunchArgument': lambda name, **options: SimpleNamespace(name=name, **options),
+            'OpaqueFunction': SimpleNamespace,
+            'Shutdown': SimpleNamespace,
+        },
+        'launch.substitutions': {
+            'LaunchConfiguration': lambda name: SimpleNamespace(perform=itemgetter(name))
+        },
+        'launch_ros': {},
+        'launch_ros.actions': {'Node': SimpleNamespace},
+    }
+    for name, content in stand_ins.items():
+        module = ModuleType(name)
+        vars(module).update(content)
+        monkeypatch.setitem(sys.modules, name, module)
+
+    def launch(**arguments):
+        code = runpy.run_path(str(ROOT / 'launch/closed_loop.launch.py'))
+        *declared, start = code['generate_launch_description']()
+        context = {argument.name: argument.default_value for argument in declared}
+        assert arguments.keys() <= context.keys()
+        return start.function(context | arguments)
+
+    return launch
+
+
+def arguments_of(node, folder):
+    """Command line of a node, as `launch_ros` writes it."""
+    full = f'{"/" + node.namespace if node.namespace else ""}/{node.name}'
+    argv = [node.executable, '--ros-args', '-r', f'__node:={node.name}']
+    argv += ['-r', f'__ns:=/{node.namespace}']
+    for number, parameters in enumerate(node.parameters):
+        path = parameters
+        if isinstance(parameters, dict):
+            path = folder / f'{node.name}{number}.yaml'
+            dump(path, {full: parameters})
+        argv += ['--params-file', str(path)]
+    return argv
+
+
+@pytest.fixture
+def start(monkeypatch):
+    """Start nodes of the package as processes with these arguments would."""
+    contexts, nodes = [], []
+
+    def node(*argv):
+        monkeypatch.setattr(sys, 'argv', list(map(str, argv)))
+        contexts.append(rclpy.Context())
+        rclpy.init(args=sys.argv, context=contexts[-1], domain_id=own_domain())
+        nodes.append(NODES[argv[0]](context=contexts[-1]))
+        return nodes[-1]
+
+    yield node
+    for started in nodes:
+        started.close()
+        started.destroy_node()
+    for context in contexts:
+        rclpy.try_shutdown(context=context)
+
+
+@pytest.mark.parametrize('namespace', ['', 'left'])
+def test_launch_arguments_override_the_parameter_file(launched, start, tmp_path, namespace):
+    """A section `/**/NODE` of the preset takes precedence over one for any node."""
+    bag, file = tmp_path / 'run1', tmp_path / 'my.yaml'
+    given = '{mode: lockstep, wait_for_subscribers: 0}'
+    file.write_text(f'/**/sim_plant:\n  ros__parameters: {given}\n')
+    nodes = launched(config=str(file), bag=str(bag), namespace=namespace)
+    by_name = {node.name: node for node in nodes}
+    assert by_name.keys() == NODES.keys()
+    plant = start(*arguments_of(by_name['sim_plant'], tmp_path))
+    assert (plant.config.mode, plant.config.wait_for_subscribers) == ('lockstep', 1)
+    assert plant.get_namespace() == f'/{namespace}'
+    recorder = start(*arguments_of(by_name['bag_recorder'], tmp_path))
+    assert bag.is_dir()
+    assert recorder._config.clock == 'plant'
+    assert {'output': 'run1', 'clock': 'wall'} in launched(bag='run1')[0].parameters
+
+
+def test_loop_shuts_down_with_any_of_its_nodes(launched):
+    nodes = launched(bag='run1')
+    required = {node.executable for node in nodes if getattr(node, 'on_exit', None)}
+    assert required == {'sim_plant', 'blf_dsc_controller', 'bag_recorder'}
+    commands = (ROOT / 'setup.cfg').read_text()
+    assert all(f'\n    {name} = ' in commands for name in NODES)
+
+
+def test_no_end_of_another_node_ends_what_holds_an_arm(launched):
+    """The watchdog outlives the controller, and both the recorder, as on a full disk."""
+    nodes = {node.executable: node for node in launched(driver='ur5e', bag='run1')}
+    assert nodes.keys() == NODES.keys() - {'sim_plant'}
+    assert not any(node.on_exit for node in nodes.values())
+    assert ('blf_dsc_controller/commands', 'forward_effort_controller/commands') in nodes[
+        'torque_watchdog'
+    ].remappings
+
+
+def test_command_line_parameter_overrides_a_file(start, tmp_path):
+    """Whose section for the node, after one for all nodes, would take precedence in ROS."""
+    path = tmp_path / 'my.yaml'
+    own = '{mode: realtime, arm.l2: 0.5, initial.position: [2.0, 1.0], seed: 0}'
+    sections = {'/**': '{sample_time: 0.001}', '/**/sim_plant': own}
+    path.write_text(''.join(f'{k}:\n  ros__parameters: {v}\n' for k, v in sections.items()))
+    argv = ('sim_plant', '--ros-args', '--params-file', path)
+    given = ('-p', 'mode:=lockstep', '-p', 'arm.l2:=0.7', '-p', 'initial.position:=[2.29, 1.69]')
+    config = start(*argv, *given, '-p', 'elsewhere:seed:=3').config
+    assert (config.mode, config.arm.l2) == ('lockstep', 0.7)
+    assert config.initial.position == (2.29, 1.69)
+    assert config.seed == 0
+
+
+def test_section_that_does_not_match_the_node_is_an_error(start, tmp_path):
+    path = tmp_path / 'my.yaml'
+    argv = ('sim_plant', '--ros-args', '-r', '__ns:=/left', '--params-file', path)
+    right = '/right/sim_plant:\n  ros__parameters: {seed: 1}\n'
+    path.write_text(right)
+    with pytest.raises(ConfigurationError) as caught:
+        start(*argv)
+    remedy = '/right/sim_plant does not match /left/sim_plant: write /**/sim_plant'
+    assert [found.startswith(f'line 2: {remedy}') for found in caught.value.problems] == [True]
+    path.write_text(right + right.replace('right', 'left').replace('1', '2'))  # for two arms
+    assert start(*argv).config.seed == 2
+
+
+def test_value_with_a_comma_or_brace_is_not_split():
+    argv = ['node', '--ros-args', '-p', 'output:=run, 1 {a}', '-p', 'topics:=[/a, /b]']
+    assert assigned(argv) == {'output': 'run, 1 {a}', 'topics': ['/a', '/b']}

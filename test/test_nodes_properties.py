@@ -18,6 +18,7 @@ from hypothesis import strategies as st
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState
 from rclpy.parameter import Parameter
+from ros_rig import START
 from std_srvs.srv import Trigger
 
 from blf_dsc_controller.configuration import schema
@@ -30,7 +31,6 @@ from blf_dsc_controller.nodes.plant_node import PlantNode
 EXAMPLES = 2_000 if os.environ.get('NIGHTLY') else 60
 SETTINGS = settings(max_examples=EXAMPLES, suppress_health_check=list(HealthCheck))
 LIMIT = 20.0
-START = (2.293, 1.696)
 
 numbers = st.one_of(
     st.floats(allow_nan=True, allow_infinity=True, width=64),

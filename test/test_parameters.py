@@ -1,15 +1,23 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A configuration as the parameters of a real node: declared, described, changed, rejected."""
+"""Interfaces of real nodes: parameters declared, described and changed; QoS; policy; viewers."""
 
 from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
 
 import pytest
 
 pytest.importorskip('rclpy')
 
+import sros2_graph
+import yaml
 from random_arm import random_urdf
 from rcl_interfaces.msg import ParameterType
 from rclpy.parameter import Parameter
+from rclpy.qos import ReliabilityPolicy
 from std_msgs.msg import String
 
 from blf_dsc_controller.configuration.controller import ControllerConfig
@@ -130,11 +138,7 @@ def test_valid_changes_are_passed_on_once_each_as_a_whole_configuration(tuned):
     ('given', 'message'),
     [
         ({'feedback__gain': [1.0]}, 'feedback.gain: got 1, but 2 entries are needed (2 of joints)'),
-        ({'barrier__bound': [0.0, 1.0]}, 'barrier.bound: got 0.0 at entry 1 of [0.0, 1.0]'),
-        ({'learning__update': 'magic'}, 'learning.update: got "magic", but it must be one of'),
         ({'learning__radius': 0.1}, 'learning.radius: got 0.1 kg m^2, but learning.initial_est'),
-        ({'learning__weight': -1.0}, 'learning.weight: got -1.0, but it must be at least 0'),
-        ({'learning__weight': float('inf')}, 'learning.weight: got .inf, but a finite number'),
         # ROS itself rejects this, by the descriptor of the parameter.
         ({'learning__weight': 1}, 'Wrong parameter type, expected'),
     ],
@@ -207,3 +211,46 @@ def test_urdf_that_is_missing_or_not_latched_is_reported(ros, monkeypatch, publi
 def test_topic_is_rejected_outside_a_node():
     with pytest.raises(ConfigurationError, match=r'robot.urdf: .* is a topic, which only a node'):
         build(ControllerConfig, ON_TOPIC)
+
+
+def test_standard_parameters_override_qos(ros):
+    for node, end in ((PlantNode, 'publisher'), (ControllerNode, 'subscription')):
+        ros.add(node, {f'qos_overrides./joint_states.{end}.reliability': 'best_effort'})
+    ros.until(lambda: ros.tester.count_publishers('/joint_states'))
+    ros.until(lambda: ros.tester.count_subscribers('/joint_states'))
+    (publisher,) = ros.tester.get_publishers_info_by_topic('/joint_states')
+    (subscriber,) = ros.tester.get_subscriptions_info_by_topic('/joint_states')
+    for endpoint in (publisher, subscriber):
+        assert endpoint.qos_profile.reliability is ReliabilityPolicy.BEST_EFFORT
+
+
+# Files for other programs, which name the interfaces of the nodes.
+
+CONFIG = Path(__file__).parents[1] / 'config'
+
+
+def test_sros2_policy_grants_each_node_exactly_what_it_uses(tmp_path):
+    """In a separate process: rcl publishes /rosout once per node name and process."""
+    live = tmp_path / 'policy.xml'
+    subprocess.run([sys.executable, sros2_graph.__file__, live], check=True, capture_output=True)
+    hint = 'run: python test/sros2_graph.py config/sros2_policy.xml'
+    assert (CONFIG / 'sros2_policy.xml').read_text() == live.read_text(), hint
+
+
+def test_viewer_configurations_name_existing_topics():
+    rviz = yaml.safe_load((CONFIG / 'arm.rviz').read_text())
+    displays = rviz['Visualization Manager']['Displays']
+    assert {d['Description Topic']['Value'] for d in displays if 'Description Topic' in d} == {
+        'robot_description'
+    }
+    layout = json.loads((CONFIG / 'foxglove.json').read_text())
+    known = {t.resolved for t in topics.TOPICS} | {'/robot_description'}
+    used = [
+        path['value'].split('.')[0]
+        for panel in layout['configById'].values()
+        for path in panel.get('paths', [])
+    ]
+    used += [layout['configById']['RawMessages!state']['topicPath']]
+    scene = layout['configById']['3D!arm']
+    used += [*scene['topics'], scene['layers']['urdf']['jointStatesTopic']]
+    assert set(used) <= known

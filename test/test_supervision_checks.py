@@ -120,15 +120,10 @@ def estimated(*states, index=2):
 
 
 def test_velocity_is_the_difference_quotient_of_two_states():
+    """A repeated stamp keeps it, and where the stamps restart it is zero."""
     np.testing.assert_allclose(estimated((1, 0.5), (2, 0.502), (4, 0.501)), [0.0, 2.0, -0.5])
-
-
-def test_repeated_stamp_keeps_the_velocity_and_the_next_one_counts_from_it():
     found = estimated((1, 0.5), (2, 0.502), (2, 0.502), (2, 0.502), (3, 0.503))
     np.testing.assert_allclose(found, [0.0, 2.0, 2.0, 2.0, 1.0])
-
-
-def test_velocity_is_zero_where_the_stamps_restart():
     np.testing.assert_allclose(estimated((5, 0.5), (6, 0.502), (1, 0.1), (2, 0.1)), [0, 2, 0, 0])
 
 

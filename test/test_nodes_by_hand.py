@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The controller node with states sent by hand: joints by name, rejections, live gains."""
+"""The controller node with states sent by hand, and the plant node with torques."""
 
 from __future__ import annotations
 
@@ -14,15 +14,20 @@ from random_arm import random_urdf
 from rcl_interfaces.srv import SetParameters
 from rclpy.parameter import Parameter
 from rclpy.timer import Timer
-from ros_rig import JOINTS, START, FakeClock, torques
+from ros_rig import JOINTS, START, FakeClock, states, torques
 
 from blf_dsc_controller.configuration.controller import ControllerConfig
+from blf_dsc_controller.configuration.plant import PlantConfig
+from blf_dsc_controller.configuration.schema import build
 from blf_dsc_controller.errors import StartError
 from blf_dsc_controller.law.factory import controller_of
+from blf_dsc_controller.law.telemetry import disturbance_names
 from blf_dsc_controller.messages import topics
-from blf_dsc_controller.messages.codecs import JointStateEncoder
+from blf_dsc_controller.messages.codecs import Float64MultiArrayEncoder, JointStateEncoder
 from blf_dsc_controller.nodes import process
 from blf_dsc_controller.nodes.controller_node import ControllerNode
+from blf_dsc_controller.nodes.plant_node import PlantNode
+from sim_plant.plant import Latency, parameter_names_of, plant_of, urdf_of
 
 ZERO = (0.0, 0.0)
 VELOCITY = (0.01, -0.02)  # rad/s
@@ -163,13 +168,6 @@ def test_start_outside_the_bound_is_reported_with_joint_error_and_bound(ros):
             'feedback.gain: K_p over the inertia is ',
             '; to use it anyway, start the node with it',
         ),
-        ('barrier.bound', [1e-6, 0.002], 'barrier.bound: joint1 is ', 'with a smaller error'),
-        (
-            'feedback.gain',
-            [65.0, -25.0],
-            'feedback.gain: got -25.0 at entry 2 of [65.0, -25.0]',
-            '',
-        ),
         ('sample_time', 0.002, 'sample_time is fixed at the start: arm and law are built', ''),
     ],
 )
@@ -187,3 +185,108 @@ def test_gain_change_takes_effect_at_the_next_sample_or_is_rejected(ros, name, v
         law_torques((START, VELOCITY), (NEXT, VELOCITY)),
     )
     assert np.array_equal(torque, before[1]) != result.successful
+
+
+# The plant, with torques sent by hand.
+
+TORQUE = (5.0, 3.0)  # N m
+
+
+def start_plant(ros, **values):
+    """Start a plant in lock-step; return it, what it publishes, and a way to send torques."""
+    received = ros.listen(topics.JOINT_STATES, raw=True)
+    node = ros.add(PlantNode, {'mode': 'lockstep', **values})
+    commands = ros.publisher(topics.COMMANDS)
+    ros.until(lambda: len(received) == 1 and commands.get_subscription_count() > 0)
+
+    def send(torque):
+        commands.publish(Float64MultiArrayEncoder(len(torque)).encode(torque))
+
+    return node, received, send
+
+
+@pytest.mark.parametrize(
+    'invalid',
+    [(1.0,), (1.0, 2.0, 3.0), (1.0, np.nan), (np.inf, 0.0), (1e300, 1.0), (0.0, -2e4)],
+    ids=str,
+)
+def test_invalid_command_is_counted_but_not_applied(ros, invalid):
+    node, received, send = start_plant(ros)
+    send(TORQUE)
+    ros.until(lambda: node.plant.sample == 1)
+    send(invalid)
+    ros.until(lambda: node.input.rejected == 1)
+    assert node.plant.sample == 1
+    send(TORQUE)
+    ros.until(lambda: len(received) == 3)
+
+    expected = plant_of(PlantConfig())
+    expected.step(np.array(TORQUE))
+    expected.step(np.array(TORQUE))
+    _, measured = states(received)
+    np.testing.assert_array_equal(measured[2].ravel(), expected.measure())
+    assert node.input.rejected == 1
+
+
+@pytest.mark.parametrize(
+    'given', [{'arm.l2': 0.6}, {'robot.urdf': 'panda.urdf', 'robot.tip': 'panda_hand_tcp'}]
+)
+def test_late_subscribers_receive_description_and_truth(ros, given):
+    start_plant(ros, **given)
+    ros.spin(0.1)
+    description, truth = ros.listen(topics.ROBOT_DESCRIPTION), ros.listen(topics.TRUTH)
+    ros.until(lambda: description and truth)
+    config = build(PlantConfig, given)
+    assert description[0].data == urdf_of(config)
+    assert 'robot.urdf' in given or 'length="0.6"' in description[0].data
+    names = (*parameter_names_of(config), *disturbance_names(config.joints))
+    assert tuple(truth[-1].name[: len(names)]) == names
+    np.testing.assert_array_equal(truth[-1].position, plant_of(config).truth())
+
+
+def test_first_states_may_be_incomplete(ros):
+    received = ros.listen(topics.JOINT_STATES, raw=True)
+    ros.add(PlantNode, {'mode': 'lockstep', 'sensor.incomplete_states': 3})
+    ros.publisher(topics.COMMANDS)
+    ros.until(lambda: len(received) == 4)
+    stamps, measured = states(received)
+    assert np.isfinite(measured[:, 0]).all()
+    assert np.isfinite(measured[:, 1]).all(axis=1).tolist() == [False, False, False, True]
+    assert np.diff(stamps).tolist() == [1_000_000] * 3
+
+
+def test_reflex_is_reported_until_a_reset(ros):
+    diagnostics = ros.listen(topics.DIAGNOSTICS)
+    node, received, send = start_plant(ros, **{'actuator.reflex_rate': 1000.0})
+    for sample in (1, 2):
+        send(TORQUE)
+        ros.until(lambda k=sample: node.plant.sample == k)
+    ros.until(lambda: diagnostics[-1].status[0].message.startswith('reflex: '))
+    node.reset()
+    ros.until(lambda: diagnostics[-1].status[0].message.startswith('braked'))
+    ros.until(lambda: len(received) == 4)
+    send((0.0, 0.0))
+    ros.until(lambda: diagnostics[-1].status[0].message == 'running')
+
+
+LATE = 'sent 0, step 1, sent 1, step 2, sent 2, came 2.5, step 3'
+ONCE = 'sent 0, step 1, sent 1, came 1.75, came 1.875, step 2, sent 2, came 2.25, step 3'
+
+
+@pytest.mark.parametrize(
+    ('events', 'waits', 'late'),
+    [
+        # A controller that is 2.5 samples late must not pass for one that is half a sample late.
+        (LATE, [1.0, 2.0, 2.5], 2),
+        # The longest wait is published once: the first torque is late, for the state at 0.
+        (ONCE, [1.0, 1.75, 0.25], 1),
+    ],
+)
+def test_latency_is_that_of_the_oldest_state_without_a_torque(events, waits, late):
+    latency, found = Latency(), []
+    for what, at in (event.split() for event in events.split(', ')):
+        if what == 'step':
+            found.append(latency.step(float(at)))
+        else:
+            {'sent': latency.state_published, 'came': latency.torque_received}[what](float(at))
+    assert (found, latency.late_steps) == (waits, late)
