@@ -1,7 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Arms against pinocchio and plain formulas; base parameters of chains, and their prior."""
+"""Arms against pinocchio and plain formulas; base parameters, and their prior; rules of URDFs."""
 
 from __future__ import annotations
+
+import re
+from math import inf
 
 import numpy as np
 import pinocchio
@@ -9,7 +12,15 @@ import plain_law
 import pytest
 from closed_loop_case import MODEL
 from plants import ARM
-from random_arm import ARMS, chain_of, configuration, pinocchio_model
+from random_arm import (
+    ARMS,
+    PANDA,
+    PANDA_CHAIN,
+    PANDA_TEXT,
+    chain_of,
+    configuration,
+    pinocchio_model,
+)
 
 from blf_dsc_controller.arms.base_parameters import (
     CENTRE,
@@ -22,6 +33,7 @@ from blf_dsc_controller.arms.model import arm_model, inertia_matrices, regressor
 from blf_dsc_controller.arms.serial_chain import ROTOR, serial_chain
 from blf_dsc_controller.arms.two_link import urdf
 from blf_dsc_controller.arms.urdf import frames, inertia_of, pseudo_inertia, read_chain
+from blf_dsc_controller.errors import BlfDscError
 from sim_plant.arm import PointMassArm, motion_of, rigid_arm, rigid_bodies
 
 
@@ -206,8 +218,8 @@ def test_chosen_columns_keep_their_values_names_and_units():
     assert {joint.kind for joint in chain.joints} > {'prismatic'}
 
 
-PANDA, UR5E, *RANDOM = map(chain_of, ('panda', 'ur5e', 'three', 'nine'))
-CHAINS = [PANDA, UR5E, *RANDOM]
+UR5E_CHAIN, *RANDOM = map(chain_of, ('ur5e', 'three', 'nine'))
+CHAINS = [PANDA_CHAIN, UR5E_CHAIN, *RANDOM]
 
 
 @pytest.mark.parametrize('chain', CHAINS)
@@ -231,11 +243,11 @@ def test_base_parameters_are_the_smallest_set_that_gives_the_same_torques(chain)
 
 def test_base_parameters_agree_with_the_literature():
     """43 for a Panda (Gaz et al., 2019), 36 for an arm like the UR; rotors except at the base."""
-    for chain, inertial, rotors in ((PANDA, 43, 5), (UR5E, 36, 4)):
+    for chain, inertial, rotors in ((PANDA_CHAIN, 43, 5), (UR5E_CHAIN, 36, 4)):
         names = base_parameters(chain).model.parameter_names
         found = sum(name.startswith('rotor') for name in names)
         assert (len(names) - found, found) == (inertial, rotors)
-    base = base_parameters(PANDA)
+    base = base_parameters(PANDA_CHAIN)
     sums = dict(zip(base.model.parameter_names, base.combinations, strict=True))
     assert sums['Ixx7'] == 'Ixx7 - Iyy7'
     assert sums['m*cx7'] == 'm*cx7'
@@ -267,8 +279,8 @@ def test_prior_covers_heavier_links_moved_centres_and_the_payload(chain):
 
 
 def test_prior_without_payload_is_tighter():
-    base = base_parameters(UR5E)
-    loaded, empty = (prior_factor(UR5E, base, load, np.full(6, 0.02)) for load in (5.0, 0.0))
+    base = base_parameters(UR5E_CHAIN)
+    loaded, empty = (prior_factor(UR5E_CHAIN, base, load, np.full(6, 0.02)) for load in (5.0, 0.0))
     assert np.linalg.matrix_rank(empty) == base.model.p
     assert np.linalg.eigvalsh(loaded @ loaded.T - empty @ empty.T)[0] > -1e-12
     tool = base.model.parameter_names.index('m*cx6')
@@ -281,3 +293,131 @@ def test_prior_of_a_ball_is_the_same_in_every_direction():
     ten = deviations(J, 0.3, CENTRE)
     turned = np.transpose([inertia_of(turn @ pseudo_inertia(d) @ turn.T) for d in ten.T])
     np.testing.assert_allclose(turned @ turned.T, ten @ ten.T, atol=1e-15)
+
+
+# Chains are read from a URDF by its rules; unusable files are rejected with a remedy.
+
+
+def test_limits_are_read_from_the_file_and_infinite_where_they_are_missing():
+    def limits(text):
+        joint = panda(text).joints[0]
+        return joint.lower, joint.upper, joint.velocity, joint.effort
+
+    given = '<limit lower="-2.8973" upper="2.8973" velocity="2.175" effort="87" />'
+    unlimited = '<limit effort="0" velocity="0" lower="-9" upper="9" />'
+    assert limits(PANDA_TEXT) == (-2.8973, 2.8973, 2.175, 87.0)
+    assert limits(changed(given, '', 1)) == (-inf, inf, inf, inf)
+    assert limits(changed(given, unlimited, 1)) == (-9.0, 9.0, inf, inf)
+    continuous = changed(FIRST_JOINT, FIRST_JOINT.replace('revolute', 'continuous'))
+    assert limits(continuous) == (-inf, inf, 2.175, 87.0)
+
+
+def test_friction_is_read_from_the_file_and_zero_by_default():
+    text = changed(AXIS, f'{AXIS}<dynamics damping="3" friction="2" />', 1)
+    found = [(joint.damping, joint.friction) for joint in panda(text).joints[:2]]
+    assert found == [(3.0, 2.0), (0.0, 0.0)]
+
+
+def test_gripper_is_carried_for_every_tip_and_its_fingers_are_held():
+    whole = panda(PANDA_TEXT)
+    last = whole.joints[6]
+    assert last.inertia[0] == pytest.approx(0.735522 + 0.73 + 2 * 0.015)
+    assert last.fixed == ('panda_link8', 'panda_hand', 'panda_hand_tcp')
+    alone = panda(changed('<mass value="0.015" />', '<mass value="0" />')).joints[6]
+    fingers = inertia_of(last.held)
+    assert fingers[0] == pytest.approx(2 * 0.015)
+    np.testing.assert_allclose(fingers[:4], (last.inertia - alone.inertia)[:4], atol=1e-12)
+    assert not any(joint.held.any() for joint in whole.joints[:6])
+    shorter = read_chain(PANDA_TEXT, 'panda_link0', 'panda_link7', PANDA)
+    np.testing.assert_allclose(shorter.joints[6].inertia, last.inertia)
+
+
+def test_chain_may_begin_and_end_inside_the_arm():
+    chain = read_chain(PANDA_TEXT, 'panda_link2', 'panda_link4', PANDA[2:4])
+    whole = panda(PANDA_TEXT)
+    np.testing.assert_allclose(chain.joints[0].inertia, whole.joints[2].inertia)
+    # The wrist is then a rigid load.
+    assert chain.joints[1].inertia[0] == pytest.approx(sum(j.inertia[0] for j in whole.joints[3:]))
+
+
+def test_pseudo_inertia_is_positive_only_for_physical_bodies():
+    inertia = chain_of('ur5e').joints[1].inertia.copy()
+    np.testing.assert_allclose(inertia_of(pseudo_inertia(inertia)), inertia, atol=1e-15)
+    assert np.linalg.eigvalsh(pseudo_inertia(inertia))[0] > 0.0
+    inertia[9] = 3.0 * inertia[4] + 3.0 * inertia[6]  # Izz > Ixx + Iyy
+    assert np.linalg.eigvalsh(pseudo_inertia(inertia))[0] < 0.0
+
+
+def panda(text):
+    return read_chain(text, 'panda_link0', 'panda_hand_tcp', PANDA)
+
+
+def changed(old, new, count=-1):
+    assert old in PANDA_TEXT
+    return PANDA_TEXT.replace(old, new, count)
+
+
+LINK7 = PANDA_TEXT[PANDA_TEXT.index('<link name="panda_link7">') :]
+LINK7_INERTIAL = LINK7[LINK7.index('<inertial>') : LINK7.index('</inertial>')] + '</inertial>'
+WEIGHTLESS = changed(LINK7_INERTIAL, '').replace('<mass value="0.73" />', '<mass value="0" />')
+
+FIRST_JOINT = '"panda_joint1" type="revolute"'
+AXIS, MASS, LINK8 = '<axis xyz="0 0 1" />', '<mass value="0.73" />', '<link name="panda_link8" />'
+WRONG_TEXTS = (  # what is replaced, by what, and the remedy
+    (LINK8, '<link name="${name}_link8" />', 'xacro FILE > robot.urdf'),
+    (LINK8, '<xacro:hand />', 'xacro FILE > robot.urdf'),
+    (PANDA_TEXT, 'l1: 1.0', 'not a URDF, as it is not valid XML'),
+    (PANDA_TEXT, '<sdf />', 'is <robot>, not <sdf>'),
+    (AXIS, f'<mimic joint="j" />{AXIS}', "'panda_joint1' mimics"),
+    (FIRST_JOINT, FIRST_JOINT.replace('revolute', 'floating'), 'expected fixed, revolute'),
+    ('finger_joint1" type="prismatic"', 'finger_joint1" type="floating"', "on 'panda_hand' is fl"),
+    ('effort="87"', 'effort="-87"', 'has <limit effort="-87">: it is a magnitude, so give 87'),
+    ('velocity="2.175"', 'velocity="-2"', 'so give 2'),
+    (MASS, '<mass value="-0.73" />', "link 'panda_hand' has a mass of -0.73 kg"),
+    ('izz="0.0017"', 'izz="-0.0017"', 'none can be negative'),
+    (AXIS, '<axis xyz="0 0 0" />', 'is zero'),
+    ('upper="2.8973"', 'upper="-3"', 'empty range, -2.8973 to -3'),
+    (MASS, '<mass value="heavy" />', '<mass value="heavy">: expected 1 finite number'),
+    (AXIS, '<axis xyz="0 1" />', 'expected 3 finite number'),
+    (LINK8, '<link name="panda_link7" />', 'each link needs a unique name'),
+    (LINK8, '', "has the child 'panda_link8', but the links are"),
+    ('child link="panda_right', 'child link="panda_left', "'panda_leftfinger' is the child of two"),
+)
+WRONG_CHAINS = (
+    ({'tip': 'tool'}, "no link 'tool' for the tip: the links are panda_link0, "),
+    ({'base': 'world'}, "no link 'world' for the base"),
+    ({'base': 'panda_leftfinger', 'tip': 'panda_rightfinger'}, "ends at 'panda_link0' without rea"),
+    ({'joints': ('elbow', *PANDA[1:])}, "no joint 'elbow' in the URDF: its joints are"),
+    ({'joints': PANDA[::-1]}, 'panda_joint7, in this order; got panda_joint7'),
+    ({'joints': PANDA[:6]}, 'panda_joint7, in this order'),
+    ({'joints': (*PANDA, 'panda_finger_joint1')}, 'choose another base or tip'),
+    ({'base': 'panda_hand', 'joints': ()}, 'are none'),
+    (
+        {'text': WEIGHTLESS.replace('<mass value="0.015" />', '<mass value="0" />')},
+        'nor has anything fixed to them: panda_link7 (moved by panda_joint7): add',
+    ),
+    (
+        {'text': re.sub('<inertial>.*?</inertial>', '', PANDA_TEXT, flags=re.DOTALL)},
+        'panda_link1 (moved by panda_joint1), panda_link2 (moved by panda_joint2), ',
+    ),
+)
+
+
+def test_unusable_urdf_is_rejected_with_a_remedy():
+    cases = [({'text': changed(old, new, 1)}, message) for old, new, message in WRONG_TEXTS]
+    arm = {'text': PANDA_TEXT, 'base': 'panda_link0', 'tip': 'panda_hand_tcp', 'joints': PANDA}
+    for changes, message in (*cases, *WRONG_CHAINS):
+        with pytest.raises(BlfDscError) as caught:
+            read_chain(**arm | changes)
+        assert message in str(caught.value)
+
+
+def test_all_zero_tensor_and_rounding_below_zero_are_accepted():
+    given = 'ixx="0.001" iyy="0.0025" izz="0.0017"'
+    for izz in ('0', '-2e-35'):
+        assert panda(changed(given, f'ixx="0" iyy="0" izz="{izz}"')).joints[6].inertia[0] > 0.73
+
+
+def test_expanded_file_may_still_declare_the_xacro_namespace():
+    text = changed('<robot name', '<robot xmlns:xacro="http://www.ros.org/wiki/xacro" name')
+    assert len(panda(text).joints) == 7

@@ -9,10 +9,9 @@ from paper_case import NO_DISTURBANCE
 from plants import ARM, FULL, ROUGH, START, commands, energies, plant, run
 from scipy.integrate import RK45, cumulative_simpson
 
-from blf_dsc_controller.compiled.jit import kernel
 from blf_dsc_controller.configuration.plant import PlantConfig
 from blf_dsc_controller.configuration.schema import build
-from sim_plant.kernels import observe, plant_views, step
+from sim_plant.kernels import plant_views
 from sim_plant.motion import disturbing_torque, integrate, state_derivative, update_loads
 from sim_plant.plant import plant_of, plant_settings
 
@@ -90,29 +89,6 @@ def test_positive_disturbance_decelerates_the_joint_and_is_in_the_truth():
     np.testing.assert_allclose(load, expected, rtol=1e-13)
 
 
-@kernel
-def compiled_run(arm, settings, state, rng, torques, rows):
-    plant, now = plant_views(arm, settings, state)
-    for k in range(len(torques)):
-        observe(plant, now, rng, rows[k])
-        step(plant, now, torques[k])
-
-
-SOURCES = pytest.mark.parametrize('source', ['measured', 'differenced'])
-
-
-@SOURCES
-@pytest.mark.parametrize('noise', [0.0, 1e-5])
-def test_compiled_loop_and_python_calls_are_bit_identical(source, noise):
-    changes = FULL | {'sensor.velocity': source, 'position_noise': noise}
-    arm, other = (plant(seed=11, **changes) for _ in range(2))
-    rows = np.empty((300, 6))
-    compiled_run(other.arm, other.settings, other.state, other.rng, commands(300), rows)
-    assert (run(arm, commands(300)) == rows).all()
-    assert (arm.state == other.state).all()
-    assert arm.rng.bit_generator.state == other.rng.bit_generator.state
-
-
 def test_sample_times_are_whole_nanoseconds():
     """The disturbance is evaluated at t_k = (k T_ns) 1e-9 s, to the last bit."""
     period_ns, x = 333_333, np.array([*START, 0.0, 0.0])
@@ -124,7 +100,7 @@ def test_sample_times_are_whole_nanoseconds():
     assert (arm.truth()[5:] == x).all()
 
 
-@SOURCES
+@pytest.mark.parametrize('source', ['measured', 'differenced'])
 def test_reset_plant_repeats_its_run_and_restored_one_continues_bit_for_bit(source):
     torques = commands(120)
     changes = FULL | {'sensor.velocity': source}
