@@ -153,7 +153,7 @@ def test_other_study_or_version_is_rejected_and_the_difference_is_named(
         other = study(tmp_path, (LOOP + STUDY).replace(before, after, 1))
         with pytest.raises(BlfDscError, match=difference):
             Store.create_or_open(store.folder, other)
-    assert Store(store.folder).study == store.study
+    assert Store(store.folder).study == study(tmp_path)
     now = engines.versions()
     monkeypatch.setattr(engines, 'versions', lambda: now | {'kernels': 'of tomorrow'})
     with pytest.raises(BlfDscError, match=r'kernels: there .*, here of tomorrow'):

@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy import stats
 
-from blf_dsc_controller.configuration.nodes import dump, locate
+from blf_dsc_controller.configuration.nodes import locate
 from blf_dsc_controller.configuration.schema import change
 from blf_dsc_controller.errors import ConfigurationError
 from blf_dsc_controller.law.telemetry import sample_columns
@@ -150,13 +150,6 @@ def test_all_problems_are_named_at_once(tmp_path):
     with pytest.raises(ConfigurationError) as error:
         study(tmp_path, text.replace('window: 0.1', 'window: -0.1'))
     assert len(error.value.problems) == 3
-
-
-def test_written_study_reads_back_unchanged(tmp_path):
-    text = STUDY.replace('constant: uniform(-0.2, 0.2)', 'constant: ["choice(1, 2)", "choice(3)"]')
-    original = study(tmp_path, LOOP + text)
-    dump(tmp_path / 'again.yaml', original.values())
-    assert load_study(tmp_path / 'again.yaml') == original
 
 
 def test_run_depends_on_seed_and_index_alone(tmp_path):

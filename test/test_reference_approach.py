@@ -164,9 +164,6 @@ def test_start_inside_the_bound_needs_no_approach():
     # It may begin later: the paper's reference is 0.6 rad away by then.
     assert begin(law, CONFIG, FIRST, STILL, 3.0) > 3.0
     np.testing.assert_allclose(law.reference_at(3.0), [FIRST, STILL, STILL], atol=1e-12)
-    config = replace(CONFIG, approach=Approach(enabled=False))
-    with pytest.raises(StartError, match='outside its bound'):
-        begin(controller_of(config), config, FIRST + 1.1 * BOUND, STILL)
 
 
 TIMES = {'reference.times': [0.0, 1.0], 'reference.points': [0.0] * 3}
