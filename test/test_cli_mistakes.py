@@ -160,8 +160,6 @@ def test_exit_code_shows_that_the_controller_stopped(tmp_path, capsys):
     out = tmp_path / 'out'
     run = here(capsys, '--config', path, '--offline', '--duration', 0.1, '--out', out)
     assert run.returncode == 5, run.stderr
-    assert 'bound       held by every joint until the stop' in run.stdout
-    assert 'stopped     at 0.001 s, velocity not plausible' in run.stdout
     (stop,) = json.loads((out / 'summary.json').read_text())['stops']
     assert stop['reason'] == 'velocity not plausible'
 
