@@ -28,11 +28,6 @@ P = np.array([1.0, 0.32, 0.4])
 SIGMA = ControllerConfig().learning.excitation_threshold
 
 
-def reference_of(config):
-    names = ('offset', 'amplitude', 'frequency', 'phase')
-    return {name: getattr(config.reference, name) for name in names}
-
-
 @cache
 def run(name, phase=0.0):
     """Record of 16 s: at its end the window of 2 pi s contains only the reference."""
@@ -87,7 +82,8 @@ def test_search_keeps_its_limits_is_repeatable_and_beats_random_motions():
 
 def test_predicted_information_of_a_panda_matches_its_loop():
     loop = load_loop('panda')
-    motion = reference_of(loop.controller)
+    names = ('offset', 'amplitude', 'frequency', 'phase')
+    motion = {name: getattr(loop.controller.reference, name) for name in names}
     plant = replace(loop.plant, duration=11.0)
     state = simulate(loop.controller, plant).controller.state
     upper = np.triu(state.running[:-1, :-1]) / state.rows[0]

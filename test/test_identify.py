@@ -93,13 +93,8 @@ def states():
 
 
 @pytest.fixture(scope='module')
-def bag(states, tmp_path_factory):
-    return write_states(tmp_path_factory.mktemp('identify') / 'bag', PANDA, states)
-
-
-@pytest.fixture(scope='module')
-def found(bag):
-    return identify_bag(bag, ROBOT)
+def found(states, tmp_path_factory):
+    return identify_bag(write_states(tmp_path_factory.mktemp('bag') / 'bag', PANDA, states), ROBOT)
 
 
 def test_corrected_urdf_predicts_the_torques_of_an_unseen_motion(found):
@@ -175,17 +170,6 @@ def test_small_motion_of_two_joints_leaves_other_parameters_at_the_prior():
     gravity_of_joint_4 = next(name for name in shown if name.startswith('m*cx4'))
     assert shown[gravity_of_joint_4]
     assert {PANDA[0], PANDA[2], PANDA[4], PANDA[6]} <= set(found.still)
-
-
-def test_command_writes_the_urdf_and_prints_the_table(bag, tmp_path, capsys):
-    urdf, out = tmp_path / 'robot.urdf', tmp_path / 'corrected.urdf'
-    urdf.write_text(PANDA_TEXT)
-    assert main(['identify', str(bag), '--urdf', str(urdf), '--out', str(out)]) == 0
-    output = capsys.readouterr().out
-    for word in ('panda_link7', 'rotor inertia', 'Izz1 + rotor1 + Iyy2', 'held back', 'delay of'):
-        assert word in output
-    assert 'NOT SHOWN' not in output
-    is_physical(out.read_text())
 
 
 @pytest.mark.parametrize('effort', ['torque', 'command'])
@@ -345,7 +329,7 @@ def test_load_friction_and_stribeck_friction_are_recognised(plain):
     np.testing.assert_allclose(found.dynamics[:, 0], expected, rtol=0.02)
 
 
-def test_coupled_wrist_is_recognised_and_named(plain, tmp_path, capsys):
+def test_coupled_wrist_is_recognised_and_named_in_table_and_report(plain, tmp_path, capsys):
     states = plain.copy()
     h = PERIOD
     others = states[:, 1, [6, 5]]
@@ -354,10 +338,18 @@ def test_coupled_wrist_is_recognised_and_named(plain, tmp_path, capsys):
     found = identified(states)
     np.testing.assert_allclose(found.parts.coupling, (0.02, 0.3, 0.8), rtol=0.05)
     bag = write_states(tmp_path / 'bag', PANDA, states)
-    urdf, page = tmp_path / 'robot.urdf', tmp_path / 'page.html'
+    urdf, out, page = (tmp_path / name for name in ('robot.urdf', 'new.urdf', 'page.html'))
     urdf.write_text(PANDA_TEXT)
-    assert main(['identify', str(bag), '--urdf', str(urdf), '--report', str(page)]) == 0
-    assert 'one motor drives panda_joint6 and panda_joint7' in capsys.readouterr().out
+    command = ['identify', str(bag), '--urdf', str(urdf), '--out', str(out), '--report', str(page)]
+    assert main(command) == 0
+    output = capsys.readouterr().out
+    for words in (
+        'one motor drives panda_joint6 and panda_joint7',
+        *('panda_link7', 'rotor inertia', 'Izz1 + rotor1 + Iyy2', 'held back', 'delay of'),
+    ):
+        assert words in output
+    assert 'NOT SHOWN' not in output
+    is_physical(out.read_text())
     text = page.read_text()
     assert all(words in text for words in ('s of 7 joints', 'panda_link7'))
     picture = tmp_path / 'torques.png'

@@ -24,15 +24,11 @@ NO_FRICTION = {'disturbance.viscous': [0.0] * 7, 'disturbance.coulomb': [0.0] * 
 POSITION = [0.3, -0.4, 0.5, -1.8, 0.2, 1.9, 0.7]
 
 
-def panda(*given):
-    merged = {**PANDA, 'initial.position': POSITION}
-    for each in given:
-        merged |= each
-    return plant_of(build(PlantConfig, merged))
+def panda(given):
+    return plant_of(panda_config({'initial.position': POSITION} | given))
 
 
-def panda_config(**given):
-    given = {name.replace('__', '.'): value for name, value in given.items()}
+def panda_config(given):
     return build(PlantConfig, PANDA | given)
 
 
@@ -44,13 +40,13 @@ def swinging_torques(samples):
 
 
 def test_urdf_and_tip_are_a_complete_configuration_which_given_parameters_override():
-    config = panda_config()
+    config = panda_config({})
     assert config.joints == tuple(f'panda_joint{i}' for i in range(1, 8))
     assert config.initial.position == pytest.approx((0, 0, 0, -1.5708, 0, 1.8675, 0), abs=1e-9)
     assert config.initial.velocity == config.disturbance.amplitude == (0.0,) * 7
     assert config.actuator.torque_limit == (87.0,) * 4 + (12.0,) * 3
     assert change(config, {'seed': 3}).joints == config.joints
-    config = panda_config(actuator__torque_limit=[50.0] * 7, initial__position=[0.1] * 7)
+    config = panda_config({'actuator.torque_limit': [50.0] * 7, 'initial.position': [0.1] * 7})
     assert config.actuator.torque_limit == (50.0,) * 7
     assert config.initial.position == (0.1,) * 7
     rippled = plant_settings(change(config, {'actuator.ripple': 0.01}))  # of the limit
@@ -58,7 +54,7 @@ def test_urdf_and_tip_are_a_complete_configuration_which_given_parameters_overri
 
 
 def test_truth_contains_the_base_parameters_with_payload_and_factors():
-    config = panda_config(**{'events.begin': [0.5], 'events.payload': [2.0]})
+    config = panda_config({'events.begin': [0.5], 'events.payload': [2.0]})
     chain = config.robot.chain(config.joints)
     base, rotors = base_parameters(chain), config.robot.rotors(chain)
     expected = base.of(chain.inertias, rotors)
@@ -67,14 +63,14 @@ def test_truth_contains_the_base_parameters_with_payload_and_factors():
     point = chain.tip_placement[:3, 3]
     loaded[-1] += pinocchio.Inertia(2.0, point, np.zeros((3, 3))).toDynamicParameters()
     np.testing.assert_allclose(true_parameters(config, 0.6), base.of(loaded, rotors), rtol=1e-12)
-    scaled = panda_config(truth__mass_factor=1.3, truth__rotor_factor=1.2)
+    scaled = panda_config({'truth.mass_factor': 1.3, 'truth.rotor_factor': 1.2})
     expected = base.of(1.3 * chain.inertias, 1.2 * rotors)
     np.testing.assert_allclose(true_parameters(scaled), expected, rtol=1e-12, atol=1e-15)
 
 
 def test_random_truth_deviates_as_configured_and_stays_physical():
     """A shift only moves the centre of mass: the inertia about it remains."""
-    config = panda_config(truth__mass_deviation=0.3, truth__centre_deviation=0.01)
+    config = panda_config({'truth.mass_deviation': 0.3, 'truth.centre_deviation': 0.01})
     chain = config.robot.chain(config.joints)
     bodies = np.array(
         [true_inertias(chain, change(config, {'truth.seed': seed}).truth) for seed in range(100)]
@@ -99,7 +95,7 @@ def test_events_act_on_all_seven_joints_at_their_time():
     names = ('force', 'torque', 'viscous', 'coulomb', 'offset')
     values = ([3.0, -2.0, 5.0], *(np.linspace(low, 2.0 * low, 7) for low in (2.0, 1.0, 0.5, 1e-3)))
     given = {f'events.{name}': list(value) for name, value in zip(names, values, strict=True)}
-    arm = plant_of(panda_config(**{'events.begin': [0.1], **given}))
+    arm = plant_of(panda_config({'events.begin': [0.1], **given}))
     for torque in swinging_torques(100):
         arm.step(torque)
     load, q, dq = arm.truth()[arm.arm.p :].reshape(3, 7)
@@ -111,7 +107,7 @@ def test_events_act_on_all_seven_joints_at_their_time():
 
 
 def test_two_plants_of_a_urdf_are_independent_and_repeatable():
-    first, second = plant_of(panda_config()), plant_of(panda_config(**{'load.payload': 1.0}))
+    first, second = plant_of(panda_config({})), plant_of(panda_config({'load.payload': 1.0}))
     rows = [], []
     for torque in swinging_torques(50):
         first.step(torque)
@@ -132,7 +128,7 @@ def waited(plant, samples):
 
 
 def test_drives_with_another_model_let_the_arm_sag_by_the_difference():
-    plant = panda(HELD, NO_FRICTION, {'drive.mass_factor': 0.9})
+    plant = panda(HELD | NO_FRICTION | {'drive.mass_factor': 0.9})
     model = pinocchio.buildModelFromXML((CONFIG / 'panda.urdf').read_text())
     q = np.append(POSITION, np.zeros(model.nq - 7))
     G = pinocchio.computeGeneralizedGravity(model, model.createData(), q)[:7]
@@ -144,10 +140,10 @@ def test_drives_with_another_model_let_the_arm_sag_by_the_difference():
 def test_drives_hold_the_arm_and_a_told_payload_without_any_command(payload, effort):
     """The effort shows it if it is the whole."""
     loaded = {'robot.drive_payload': payload, 'load.payload': payload}
-    plant = panda(HELD, NO_FRICTION, loaded)
+    plant = panda(HELD | NO_FRICTION | loaded)
     np.testing.assert_allclose(waited(plant, 500), POSITION, atol=1e-9)
     assert np.abs(plant.measure()[14:]).max() > effort
-    relative = panda(HELD, NO_FRICTION, loaded, {'robot.effort': 'commanded'})
+    relative = panda(HELD | NO_FRICTION | loaded | {'robot.effort': 'commanded'})
     assert not relative.measure()[14:].any()
 
 
@@ -156,7 +152,7 @@ def test_drives_overcome_their_share_of_friction():
     slowed = []
     for viscous, share in ((0.0, 0.0), (1.0, 0.0), (1.0, 0.5), (1.0, 1.0)):
         friction = {'disturbance.viscous': [viscous] * 7, 'drive.friction': share}
-        plant = panda(given, NO_FRICTION, friction, {'robot.gravity': [0.0, 0.0, 0.0]})
+        plant = panda(given | NO_FRICTION | friction | {'robot.gravity': [0.0, 0.0, 0.0]})
         plant.step(np.zeros(7))
         slowed.append(0.2 - plant.measure()[13])
     by_friction = np.subtract(slowed[1:], slowed[0])
@@ -170,7 +166,7 @@ def test_drives_overcome_their_share_of_friction():
 def test_reflex_stops_the_arm_after_a_jump_of_the_torque_until_a_reset(step, rate, stops):
     """1000 N m/s at 1 kHz: 1 N m from torque to torque, the first from none."""
     given = {'actuator.reflex_rate': 1000.0, 'actuator.rate_limit': rate}
-    plant = panda(HELD, NO_FRICTION, given)
+    plant = panda(HELD | NO_FRICTION | given)
     for k in range(1, 7):
         before = plant.measure().copy()
         plant.step(np.full(7, min(k, 5) * step))

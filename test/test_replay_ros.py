@@ -37,7 +37,6 @@ from blf_dsc_controller.nodes.process import drain
 from blf_dsc_controller.nodes.recorder_node import BagRecorderNode
 from blf_dsc_controller.replay.verify import verify
 
-MILLISECOND = 1_000_000  # ns
 BRISK = {
     'limits__acceleration': [4.0, 4.0],  # rad/s^2, for a trajectory of one second
     'barrier__bound': [0.02, 0.02],  # rad, twenty times what this run needs

@@ -12,7 +12,7 @@ import pytest
 import recorded_run
 from command import OLDER, finished
 from random_arm import random_urdf
-from recorded_run import compared, of
+from recorded_run import MILLISECOND, START, compared, of
 
 from blf_dsc_controller.bags.content import read_content
 from blf_dsc_controller.bags.reader import read_run
@@ -41,8 +41,6 @@ OF_URDF = """
 /sim_plant:
   ros__parameters: {{duration: 0.2, truth.mass_deviation: 0.3}}
 """
-START = 1_000_000_000  # ns
-MILLISECOND = 1_000_000  # ns
 SAMPLES = 1001
 
 
