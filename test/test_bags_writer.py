@@ -15,7 +15,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from mcap.opcode import Opcode
 from mcap.reader import make_reader
-from recorded_run import messages_on_disk, raw_records, read
+from recorded_run import MILLISECOND, messages_on_disk, raw_records, read
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, Reader, StoragePlugin, Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
@@ -31,7 +31,6 @@ from blf_dsc_controller.messages.codecs import (
 from blf_dsc_controller.messages.topics import COMMANDS, JOINT_STATES, STREAM, Quality
 
 START = 1_734_000_000_000_000_000
-MILLISECOND = 1_000_000
 STATES = JointStateEncoder(['joint1', 'elbow'])
 TORQUES = Float64MultiArrayEncoder(2)
 HASHES = {  # as `ros2 topic info --verbose` shows them on Jazzy

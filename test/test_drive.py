@@ -54,10 +54,6 @@ def ratios(record, begin=0.0):
     return np.max([np.abs(sample.xi1) / sample.bound for sample in samples], axis=0)
 
 
-def panda(**given):
-    return build(ControllerConfig, PANDA | {k.replace('__', '.'): v for k, v in given.items()})
-
-
 def test_added_torque_is_the_gravity_of_the_urdf_and_of_the_payload_told():
     model = pinocchio.buildModelFromXML((CONFIG / 'panda.urdf').read_text())
     config = build(ControllerConfig, PANDA | HELD | TOLD)
@@ -75,7 +71,7 @@ def test_added_torque_is_the_gravity_of_the_urdf_and_of_the_payload_told():
 
 
 def test_command_is_the_whole_torque_without_what_the_drive_adds():
-    laws = [controller_of(panda()), controller_of(build(ControllerConfig, PANDA | HELD | TOLD))]
+    laws = [controller_of(build(ControllerConfig, PANDA | given)) for given in ({}, HELD | TOLD)]
     added = added_torque(laws[1].settings, POSITION)
     measurement = np.concatenate((POSITION, 0.01 * POSITION, np.zeros(7)))
     for law in laws:

@@ -100,6 +100,14 @@ def test_predicted_information_of_a_panda_matches_its_loop():
     assert found.ratios[1].max() > 0.8
 
 
+def test_lack_of_room_counts_as_an_excess():
+    config, problem = chain_problem()
+    low = ExcitationProblem(config, 1, 0.02, 3.0)  # a floor above the arm
+    motion = problem.parameters(np.full(9, 0.1))
+    assert not low.evaluate(motion).is_allowed
+    assert low.evaluate(motion).excess > problem.evaluate(motion).excess + 1.0
+
+
 def test_torque_ratio_is_the_larger_with_and_without_the_payload():
     config, problem = chain_problem()
     motion, P = problem.parameters(np.full(9, 0.1)), config.learning.initial_estimate
