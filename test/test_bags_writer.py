@@ -377,9 +377,3 @@ def test_bag_from_rosbags_writer_is_recovered(tmp_path, mode):
     (file,) = (tmp_path / 'bag').glob('*.mcap')
     messages, _ = recovered(tmp_path / 'cut', file.read_bytes()[:-1])
     assert messages == read(tmp_path / 'bag')
-
-
-def test_nothing_to_recover_is_an_exit_code(plain, tmp_path, capsys):
-    for k, data in enumerate([b'', plain[0][: chunks(plain[0])[0][0]]]):
-        assert main(['recover', str(damaged(tmp_path / f'{k}', data))]) == 1
-        assert 'ALL LOST' in capsys.readouterr().out

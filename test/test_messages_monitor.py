@@ -95,11 +95,10 @@ def test_message_contains_the_distance_and_with_known_truth_the_terms(known):
     telemetry = ControllerTelemetry(config, estimate_names(config))
     names = [
         f'{quantity} {joint}'
-        for quantity in ('max_error_ratio', 'distance_to_bound')
+        for quantity in ('max_error_ratio', 'distance_to_bound', 'disturbance')
         for joint in config.joints
     ]
-    names += [*estimate_names(config), *(f'disturbance {joint}' for joint in config.joints)]
-    names += ['lambda_min', 'latched', 'model_changes']
+    names += [*estimate_names(config), 'lambda_min', 'latched', 'model_changes']
     terms = ['V barrier', 'V velocity', 'V parameters', 'V disturbance'] * known
     sent = [
         list(telemetry.sample(10**9, law.sample, np.ones(2), np.array([0.3, 0.2]), time))
