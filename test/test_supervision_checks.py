@@ -120,11 +120,13 @@ def estimated(*states, index=2):
 
 
 def test_velocity_is_the_difference_quotient_of_two_states():
-    """A repeated stamp keeps it, and where the stamps restart it is zero."""
+    """A repeated stamp keeps it, and where the stamps restart, or after a pause, it is zero."""
     np.testing.assert_allclose(estimated((1, 0.5), (2, 0.502), (4, 0.501)), [0.0, 2.0, -0.5])
     found = estimated((1, 0.5), (2, 0.502), (2, 0.502), (2, 0.502), (3, 0.503))
     np.testing.assert_allclose(found, [0.0, 2.0, 2.0, 2.0, 1.0])
     np.testing.assert_allclose(estimated((5, 0.5), (6, 0.502), (1, 0.1), (2, 0.1)), [0, 2, 0, 0])
+    reset = (2, 0.502), (1002, 0.1), (1003, 0.102)  # of the simulated arm: a second later
+    np.testing.assert_allclose(estimated((1, 0.5), *reset), [0.0, 2.0, 0.0, 2.0])
 
 
 def test_repeated_reading_with_a_new_stamp_is_continued_at_its_velocity():

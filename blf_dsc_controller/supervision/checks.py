@@ -382,6 +382,7 @@ class SampleCheck:
 
 
 _MOVING = 3e-4  # rad in a sample: three counts of an encoder of 16 bits
+_PAUSE = 1_000_000_000  # ns without states, after which the arm is at rest, as at the start
 
 
 class Velocity:
@@ -400,7 +401,7 @@ class Velocity:
     def replace(self, stamp: int, measurement: Vector) -> None:
         """Overwrite dq in [q (n,) rad, dq (n,) rad/s, torque (n,)] with a stamp [ns]."""
         q, dq, _ = measurement.reshape(3, -1)
-        if self._stamp < 0 or stamp < self._stamp:
+        if self._stamp < 0 or not 0 <= stamp - self._stamp < _PAUSE:
             self._dq[:] = 0.0
         elif stamp > self._seen:
             step, self._seen = (stamp - self._stamp) * 1e-9, stamp
