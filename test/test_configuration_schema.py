@@ -7,6 +7,7 @@ import array
 
 import pytest
 
+from blf_dsc_controller.configuration import schema
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.nodes import NODES, RecorderConfig, load_loop
 from blf_dsc_controller.configuration.plant import PlantConfig
@@ -203,3 +204,12 @@ def test_defaults_are_valid_and_every_parameter_is_described(cls):
         assert entry.description
         if entry.type is int:
             assert entry.at_least is not None, entry.name
+
+
+def test_valid_values_are_not_put_into_words(monkeypatch):
+    """A gain changes between two samples; the words of all values would take several."""
+    config = load_loop('panda').controller
+    monkeypatch.setattr(
+        schema, 'format_value', lambda _: pytest.fail('a valid value was formatted')
+    )
+    assert change(config, {'telemetry.decimation': 3}).telemetry.decimation == 3

@@ -88,14 +88,16 @@ class Parameter:
     def problems(self, given: Any) -> Iterator[str]:
         """Check a value; each problem names the parameter, what it got, and what is expected."""
         article = 'an' if self.type is int and not self.is_array else 'a'
-        mismatch = f'{self.name}: got {format_value(given)}, but {article} {self.kind} is expected'
+        expected = f'but {article} {self.kind} is expected'
         if self.is_array and not isinstance(given, _ARRAYS):
-            yield f'{mismatch}: write a list, like {format_value(self.default)}'
+            expected += f': write a list, like {format_value(self.default)}'
+            yield f'{self.name}: got {format_value(given)}, {expected}'
             return
         entries = list(given) if self.is_array else [given]
         if not all(_is(entry, self.type) for entry in entries):
             lacks_point = self.type is float and all(_is(entry, int | float) for entry in entries)
-            yield mismatch + (', with a decimal point' if lacks_point else '')
+            expected += ', with a decimal point' if lacks_point else ''
+            yield f'{self.name}: got {format_value(given)}, {expected}'
             return
         if not (entries or self.omittable or self.length):
             yield f'{self.name}: got an empty list, but at least one entry is needed'

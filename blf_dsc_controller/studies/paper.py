@@ -50,7 +50,6 @@ _UNTIL = 10.0  # s, end of Fig. 2
 _BROKEN = 10.0  # multiple of the bound at which all larger ratios are drawn
 _MARKS = 'os^D'
 
-
 DURATION = 60.0  # s
 SWEEP_DURATION = 30.0  # s
 
