@@ -14,9 +14,12 @@ import pinocchio
 from blf_dsc_controller.arms.urdf import inertia_of, pseudo_inertia, read_chain
 from blf_dsc_controller.bags.writer import BagWriter
 from blf_dsc_controller.compiled.jit import kernel
-from blf_dsc_controller.identification.prior import base_matrix
 from blf_dsc_controller.identification.recording import Recording
-from blf_dsc_controller.messages.codecs import Float64MultiArrayEncoder, JointStateEncoder
+from blf_dsc_controller.identification.values import base_matrix
+from blf_dsc_controller.messages.codecs import (
+    Float64MultiArrayEncoder,
+    JointStateEncoder,
+)
 from blf_dsc_controller.messages.topics import COMMANDS, JOINT_STATE
 from sim_plant.arm import rigid_arm, rigid_bodies
 
@@ -44,7 +47,9 @@ def link(name, random):
     mass = random.uniform(0.2, 4.0)
     second = (points - points.mean(0)).T @ (points - points.mean(0)) * mass / 5.0
     I = np.trace(second) * np.eye(3) - second
-    entries = zip(('ixx', 'ixy', 'ixz', 'iyy', 'iyz', 'izz'), I[np.triu_indices(3)], strict=True)
+    entries = zip(
+        ('ixx', 'ixy', 'ixz', 'iyy', 'iyz', 'izz'), I[np.triu_indices(3)], strict=True
+    )
     return (
         f'<link name="{name}"><inertial>'
         f'<origin xyz="{words(points.mean(0))}" rpy="{words(random.uniform(-3, 3, 3))}" />'
@@ -55,7 +60,8 @@ def link(name, random):
 
 
 def joint(name, kind, parent, child, random):
-    xyz, rpy = words(random.uniform(-0.4, 0.4, 3)), words(random.uniform(-3.0, 3.0, 3))
+    xyz = words(random.uniform(-0.4, 0.4, 3))
+    rpy = words(random.uniform(-3.0, 3.0, 3))
     return (
         f'<joint name="{name}" type="{kind}"><origin xyz="{xyz}" rpy="{rpy}" />'
         f'<parent link="{parent}" /><child link="{child}" />'
@@ -74,13 +80,21 @@ def random_urdf(n, seed):
     for i in range(1, n + 1):
         kind = random.choice(('revolute', 'continuous', 'prismatic'), p=(0.5, 0.2, 0.3))
         text += [link(f'l{i}', random), joint(f'j{i}', kind, at, f'l{i}', random)]
-        text += [link(f'aside{i}', random), joint(f'a{i}', 'fixed', f'l{i}', f'aside{i}', random)]
-        text += [link(f'flange{i}', None), joint(f'f{i}', 'fixed', f'l{i}', f'flange{i}', random)]
+        text += [
+            link(f'aside{i}', random),
+            joint(f'a{i}', 'fixed', f'l{i}', f'aside{i}', random),
+        ]
+        text += [
+            link(f'flange{i}', None),
+            joint(f'f{i}', 'fixed', f'l{i}', f'flange{i}', random),
+        ]
         at = f'flange{i}'
     text += [link('tip', None), joint('tip_joint', 'fixed', at, 'tip', random)]
     text += [link('tool', random), joint('tool_joint', 'fixed', 'tip', 'tool', random)]
     random.shuffle(text)
-    return f'<robot name="arm">{"".join(text)}</robot>', tuple(f'j{i}' for i in range(1, n + 1))
+    return f'<robot name="arm">{"".join(text)}</robot>', tuple(
+        f'j{i}' for i in range(1, n + 1)
+    )
 
 
 def pinocchio_model(text, joints):
@@ -95,7 +109,9 @@ def configuration(model, q):
     return pinocchio.integrate(model, pinocchio.neutral(model), q)
 
 
-PANDA_TEXT, UR5E_TEXT = ((CONFIG / f'{name}.urdf').read_text() for name in ('panda', 'ur5e'))
+PANDA_TEXT, UR5E_TEXT = (
+    (CONFIG / f'{name}.urdf').read_text() for name in ('panda', 'ur5e')
+)
 ARMS = {
     'one': (*random_urdf(1, 11), 'base', 'tip'),
     'two': (*random_urdf(2, 12), 'base', 'tip'),
@@ -161,9 +177,15 @@ class Reference(NamedTuple):
 
     def at(self, t):
         """Return position, velocity and acceleration (..., 3, n) at times (...) [s]."""
-        w, angle = self.frequency, np.multiply.outer(t, self.frequency) + self.phase
-        sines, cosines = self.amplitude * np.sin(angle), self.amplitude * np.cos(angle)
-        motion = sines.sum(-2) + self.offset, (w * cosines).sum(-2), -(w**2 * sines).sum(-2)
+        w = self.frequency
+        angle = np.multiply.outer(t, self.frequency) + self.phase
+        sines = self.amplitude * np.sin(angle)
+        cosines = self.amplitude * np.cos(angle)
+        motion = (
+            sines.sum(-2) + self.offset,
+            (w * cosines).sum(-2),
+            -(w**2 * sines).sum(-2),
+        )
         return np.stack(motion, -2)
 
 
@@ -174,7 +196,9 @@ def reference_of(chain, seed, tones=3):
     amplitude = random.uniform(0.5, 1.0, (tones, n))
     amplitude *= 0.35 * np.ptp(limits, axis=1) / amplitude.sum(0)
     frequency = random.uniform(0.5, 4.0, (tones, n))
-    return Reference(limits.mean(1), amplitude, frequency, random.uniform(0.0, 6.3, (tones, n)))
+    return Reference(
+        limits.mean(1), amplitude, frequency, random.uniform(0.0, 6.3, (tones, n))
+    )
 
 
 @kernel
@@ -183,21 +207,33 @@ def _shake(arm, viscous, coulomb, motion, gains, work, states):
 
     The rows of `work` (8, n) are zero at first.
     """
-    q, dq, torque = work[0], work[1], work[2]
-    qs, dqs, ddq, q_step, dq_step = work[3], work[4], work[5], work[6], work[7]  # Runge-Kutta
+    q = work[0]
+    dq = work[1]
+    torque = work[2]
+    # Runge-Kutta
+    qs = work[3]
+    dqs = work[4]
+    ddq = work[5]
+    q_step = work[6]
+    dq_step = work[7]
     for i in range(q.size):
         q[i], dq[i] = motion[0, 0, i], motion[0, 1, i]
     for k in range(motion.shape[0]):
         for i in range(q.size):
-            states[k, 0, i], states[k, 1, i], states[k, 2, i] = q[i], dq[i], torque[i]
-            q_error, dq_error = motion[k, 0, i] - q[i], motion[k, 1, i] - dq[i]
+            states[k, 0, i] = q[i]
+            states[k, 1, i] = dq[i]
+            states[k, 2, i] = torque[i]
+            q_error = motion[k, 0, i] - q[i]
+            dq_error = motion[k, 1, i] - dq[i]
             torque[i] = gains[i] * (30.0 * q_error + 3.0 * dq_error)
             q_step[i] = dq_step[i] = 0.0
         for share, weight in ((0.0, 1.0), (0.5, 2.0), (0.5, 2.0), (1.0, 1.0)):
             for i in range(q.size):
                 qs[i] = q[i] + share * PERIOD * dqs[i]
                 dqs[i] = dq[i] + share * PERIOD * ddq[i]
-                ddq[i] = torque[i] - viscous[i] * dqs[i] - coulomb[i] * tanh(dqs[i] / 0.005)
+                ddq[i] = (
+                    torque[i] - viscous[i] * dqs[i] - coulomb[i] * tanh(dqs[i] / 0.005)
+                )
             arm.accelerate(0.0, qs, dqs, ddq, ddq)
             for i in range(q.size):
                 q_step[i] += weight * PERIOD / 6.0 * dqs[i]
@@ -214,7 +250,8 @@ def shake(chain, truth, reference, duration):
     motion = reference.at(times)
     gains = np.array([min(joint.effort, 100.0) for joint in chain.joints]) / 4.0
     n = len(chain.joints)
-    states, work = np.zeros((times.size, 3, n)), np.zeros((8, n))
+    states = np.zeros((times.size, 3, n))
+    work = np.zeros((8, n))
     _shake(arm, truth.viscous, truth.coulomb, motion, gains, work, states)
     return states
 
@@ -225,7 +262,9 @@ def measured(states, seed, encoder=2.0 * np.pi / 2**20, noise=0.01):
     seen = states.copy()
     seen[:, 0] = np.round(states[:, 0] / encoder) * encoder
     torque = states[:, 2]
-    seen[:, 2] += noise * np.sqrt(np.mean(torque**2, axis=0)) * random.normal(size=torque.shape)
+    seen[:, 2] += (
+        noise * np.sqrt(np.mean(torque**2, axis=0)) * random.normal(size=torque.shape)
+    )
     return seen
 
 
@@ -237,7 +276,9 @@ def recording_of(states, joints=PANDA, period=PERIOD):
 
 def is_covered(found, truth):
     """Return whether each base parameter and friction is within its 95 % interval."""
-    true = np.concatenate((truth.inertias.ravel(), truth.rotors, truth.viscous, truth.coulomb))
+    true = np.concatenate(
+        (truth.inertias.ravel(), truth.rotors, truth.viscous, truth.coulomb)
+    )
     at, n = slice(0, true.size), len(truth.rotors)
     G = base_matrix(found.parameters, n)[: found.parameters.model.p + 2 * n, at]
     deviation = np.sqrt(np.diag(G @ found.covariance[at, at] @ G.T))
@@ -247,15 +288,26 @@ def is_covered(found, truth):
 FIELDS = ('position', 'velocity', 'effort')
 
 
-def write_states(path, joints, states, *, period=PERIOD, fields=FIELDS, stamps=(), commands=()):
+def write_states(
+    path, joints, states, *, period=PERIOD, fields=FIELDS, stamps=(), commands=()
+):
     """Write states (N, 3, n), and commands (N, n) 1 us after them, as a bag."""
-    encoder, encoded = JointStateEncoder(joints, fields), Float64MultiArrayEncoder(len(joints))
-    stamps = stamps or [1_000_000_000 + round(k * period * 1e9) for k in range(len(states))]
+    encoder = JointStateEncoder(joints, fields)
+    encoded = Float64MultiArrayEncoder(len(joints))
+    stamps = stamps or [
+        1_000_000_000 + round(k * period * 1e9) for k in range(len(states))
+    ]
     with BagWriter(path, flush_interval=None) as bag:
         handle = bag.add_topic('/joint_states', JOINT_STATE, [])
-        other = bag.add_topic('/arm/commands', COMMANDS.type, []) if len(commands) else 0
-        for stamp, state, command in zip_longest(stamps, states[: len(stamps)], commands):
-            bag.write(handle, bytes(encoder.encode(stamp, *state[: len(fields)])), stamp)
+        other = (
+            bag.add_topic('/arm/commands', COMMANDS.type, []) if len(commands) else 0
+        )
+        for stamp, state, command in zip_longest(
+            stamps, states[: len(stamps)], commands
+        ):
+            bag.write(
+                handle, bytes(encoder.encode(stamp, *state[: len(fields)])), stamp
+            )
             if other:
                 bag.write(other, bytes(encoded.encode(command)), stamp + 1000)
     return path

@@ -50,7 +50,9 @@ class Case:
         self.rotors = self.random.uniform(0.01, 0.3, n)
         self.phi = np.column_stack((self.chain.inertias, self.rotors)).ravel()
         self.arm = serial_chain(self.chain, self.gravity)
-        bodies = rigid_bodies(self.chain, self.gravity, self.chain.inertias, self.rotors)
+        bodies = rigid_bodies(
+            self.chain, self.gravity, self.chain.inertias, self.rotors
+        )
         self.plant = rigid_arm(bodies)
         self.plant.memory[:] = np.nan
         self.now = motion_of(self.plant.memory, bodies)
@@ -69,7 +71,9 @@ def same(ours, theirs, rounding=1e-12):
 def test_chain_and_its_placements_agree_with_pinocchio(name):
     """As read, as points and axes of the view, and as bodies of the plant."""
     case = Case(name)
-    model, chain, n = case.model, case.chain, len(case.q)
+    model = case.model
+    chain = case.chain
+    n = len(case.q)
     position, jacobian = np.zeros(3), np.zeros((3, n))
     case.plant.fill_tip(case.q, position, jacobian)
     assert [joint.name for joint in chain.joints] == list(model.names[1:])
@@ -78,7 +82,10 @@ def test_chain_and_its_placements_agree_with_pinocchio(name):
     placements = np.array(frames(chain, case.q))
     corners = placements[:, :3, 3]
     axes = np.array(
-        [at[:3, :3] @ joint.axis for at, joint in zip(placements[1:-1], chain.joints, strict=True)]
+        [
+            at[:3, :3] @ joint.axis
+            for at, joint in zip(placements[1:-1], chain.joints, strict=True)
+        ]
     )
     same(corners[0], np.zeros(3))
     same(corners[-1], case.data.oMf[case.tip].translation)
@@ -92,7 +99,9 @@ def test_chain_and_its_placements_agree_with_pinocchio(name):
         same(axes[i], placed.rotation @ joint.axis)
     same(position, corners[-1])
     world = pinocchio.LOCAL_WORLD_ALIGNED
-    theirs = pinocchio.computeFrameJacobian(*case.theirs, case.tip, world).reshape(6, -1)
+    theirs = pinocchio.computeFrameJacobian(*case.theirs, case.tip, world).reshape(
+        6, -1
+    )
     same(jacobian, theirs[:3])
     turns = [joint.kind != 'prismatic' for joint in chain.joints]
     same(axes[turns].T, theirs[3:, turns])
@@ -105,7 +114,12 @@ def test_regressors_and_accelerations_agree_with_pinocchio(name):
     The plant's accelerations are from another derivation, which shares only the geometry.
     """
     case = Case(name)
-    q, dq, v, a, n, arm = case.q, case.dq, case.v, case.a, len(case.q), case.arm
+    q = case.q
+    dq = case.dq
+    v = case.v
+    a = case.a
+    n = len(case.q)
+    arm = case.arm
     M = pinocchio.crba(*case.theirs).copy()
     C = pinocchio.computeCoriolisMatrix(*case.theirs, dq).copy()
     G = pinocchio.computeGeneralizedGravity(*case.theirs).copy()
@@ -164,26 +178,34 @@ def test_urdf_of_two_links_is_the_same_arm():
     lengths, masses = (1.1, 0.7), (0.6, 0.45)
     chain = read_chain(urdf(('a', 'b"<&'), lengths, masses), '', 'tip', ('a', 'b"<&'))
     arm = PointMassArm(*lengths, *masses, g=9.81)
-    ours, P = arm_model('two_link', l1=arm.l1, gravity=arm.g), np.empty(3)
+    ours = arm_model('two_link', l1=arm.l1, gravity=arm.g)
+    P = np.empty(3)
     arm.fill_parameters(0.0, P)
     theirs = serial_chain(chain)
     phi = np.column_stack((chain.inertias, np.zeros(2))).ravel()
     states = np.random.default_rng(0).normal(size=(4, 20, 2))
-    found, expected = regressors_at(ours, *states) @ P, regressors_at(theirs, *states) @ phi
-    np.testing.assert_allclose(found, expected, atol=1e-7)  # points have 1e-9 kg m^2 in it
+    found = regressors_at(ours, *states) @ P
+    expected = regressors_at(theirs, *states) @ phi
+    # points have 1e-9 kg m^2 in it
+    np.testing.assert_allclose(found, expected, atol=1e-7)
     np.testing.assert_allclose(frames(chain, np.zeros(2))[-1][:3, 3], (1.8, 0.0, 0.0))
 
 
-@pytest.mark.parametrize('arm', [ARM, PointMassArm(l1=0.7, l2=1.1, m1=1.3, m2=0.4, g=9.81)])
+@pytest.mark.parametrize(
+    'arm', [ARM, PointMassArm(l1=0.7, l2=1.1, m1=1.3, m2=0.4, g=9.81)]
+)
 def test_two_links_are_the_arm_of_section_iv(arm):
     """And of the tests' plain law, and of the simulated arm: M ddq + C dq + G = tau."""
-    model, P = arm_model('two_link', l1=arm.l1, gravity=arm.g), np.empty(3)
+    model = arm_model('two_link', l1=arm.l1, gravity=arm.g)
+    P = np.empty(3)
     arm.fill_parameters(0.0, P)
     for random in map(np.random.default_rng, range(20)):
         q, dq, v, a = random.normal(size=(4, 2))
         H, Yp, Yr = np.full((3, 2, 3), np.nan)
         model.regressors(q, dq, v, a, H, Yp, Yr)
-        np.testing.assert_allclose(plain_law.regressor(model.r, q, dq, v, a), H, atol=1e-13)
+        np.testing.assert_allclose(
+            plain_law.regressor(model.r, q, dq, v, a), H, atol=1e-13
+        )
         M, C, G = plain_law.dynamics(P, model.r, q, dq)
         np.testing.assert_allclose(H @ P, M @ a + C @ v + G, atol=1e-12)
         arm.accelerate(0.0, q, dq, v, a)
@@ -193,7 +215,10 @@ def test_two_links_are_the_arm_of_section_iv(arm):
     assert model.parameter_names == ('(m1+m2)*l1^2', 'm2*l2^2', 'm2*l1*l2')
     assert model.parameter_units == ('kg m^2',) * 3
     inner, outer = arm.m1 + arm.m2, arm.m2
-    assert pytest.approx([inner * arm.l1**2, outer * arm.l2**2, outer * arm.l1 * arm.l2]) == P
+    assert (
+        pytest.approx([inner * arm.l1**2, outer * arm.l2**2, outer * arm.l1 * arm.l2])
+        == P
+    )
 
 
 # Base parameters.
@@ -202,12 +227,15 @@ WALL = (0.0, 9.81, 0.0)
 
 
 def test_chosen_columns_keep_their_values_names_and_units():
-    chain, (q, dq) = chain_of('three'), np.random.default_rng(0).normal(size=(2, 3))
+    chain = chain_of('three')
+    (q, dq) = np.random.default_rng(0).normal(size=(2, 3))
     chosen = [(0, ROTOR), (1, 0), (1, 3), (1, ROTOR), (2, 9), (2, ROTOR)]
-    part, whole = serial_chain(chain, WALL, chosen), serial_chain(chain, WALL)
+    part = serial_chain(chain, WALL, chosen)
+    whole = serial_chain(chain, WALL)
     columns = [body * (ROTOR + 1) + entry for body, entry in chosen]
     # Wider, as with disturbance columns beside them.
-    rows, every = np.full((2, 3, 8), np.nan), np.full((2, 3, whole.p), np.nan)
+    rows = np.full((2, 3, 8), np.nan)
+    every = np.full((2, 3, whole.p), np.nan)
     part.momentum_regressor(q, dq, *rows)
     whole.momentum_regressor(q, dq, *every)
     np.testing.assert_array_equal(rows[:, :, :6], every[:, :, columns])
@@ -228,9 +256,12 @@ def test_base_parameters_are_the_smallest_set_that_gives_the_same_torques(chain)
     whole = serial_chain(chain, WALL)
     n, p = base.model.n, base.model.p
     random = np.random.default_rng(5)
-    inertias, joint_rotors = random.normal(size=(n, 10)), random.normal(size=n)
-    P, phi = base.of(inertias, joint_rotors), np.column_stack((inertias, joint_rotors)).ravel()
-    H, rows = np.zeros((n, p)), np.zeros((p, n, whole.p))
+    inertias = random.normal(size=(n, 10))
+    joint_rotors = random.normal(size=n)
+    P = base.of(inertias, joint_rotors)
+    phi = np.column_stack((inertias, joint_rotors)).ravel()
+    H = np.zeros((n, p))
+    rows = np.zeros((p, n, whole.p))
     for full in rows:
         q, dq, v, a = random.normal(size=(4, n))
         whole.regressor(q, dq, v, a, full)
@@ -260,27 +291,32 @@ def test_prior_covers_heavier_links_moved_centres_and_the_payload(chain):
     """A deviation in a single respect has a distance of at most 1, larger ones have more."""
     base, T = base_parameters(chain, WALL), np.eye(4)
     T[0, 3] = CENTRE / 100.0  # small, as this holds to first order only
-    rotors, tip = np.full(base.model.n, 0.02), np.append(chain.tip_placement[:3, 3], 1.0)
+    rotors = np.full(base.model.n, 0.02)
+    tip = np.append(chain.tip_placement[:3, 3], 1.0)
     L = prior_factor(chain, base, 3.0, rotors)
 
     def distance(body, changed, rotor=0.02):
         inertias, others = chain.inertias, rotors.copy()
         inertias[body], others[-1] = changed, rotor
         off = base.of(inertias, others) - base.of(chain.inertias, rotors)
-        return np.linalg.norm(np.linalg.lstsq(L, off, rcond=None)[0])  # the least that gives it
+        # the least that gives it
+        return np.linalg.norm(np.linalg.lstsq(L, off, rcond=None)[0])
 
     for i, ten in enumerate(chain.inertias):
         assert distance(i, 1.3 * ten) < 1.0 + 1e-6
         assert distance(i, inertia_of(T @ pseudo_inertia(ten) @ T.T)) < 1.05 / 100.0
     load = inertia_of(3.0 * np.outer(tip, tip))
-    assert distance(-1, ten + load) < 1.5  # a point mass, where an extended body is expected
+    # a point mass, where an extended body is expected
+    assert distance(-1, ten + load) < 1.5
     assert distance(-1, ten + 10.0 * load) > 2.0
     assert distance(-1, ten, rotor=0.04) < 1.0 + 1e-6
 
 
 def test_prior_without_payload_is_tighter():
     base = base_parameters(UR5E_CHAIN)
-    loaded, empty = (prior_factor(UR5E_CHAIN, base, load, np.full(6, 0.02)) for load in (5.0, 0.0))
+    loaded, empty = (
+        prior_factor(UR5E_CHAIN, base, load, np.full(6, 0.02)) for load in (5.0, 0.0)
+    )
     assert np.linalg.matrix_rank(empty) == base.model.p
     assert np.linalg.eigvalsh(loaded @ loaded.T - empty @ empty.T)[0] > -1e-12
     tool = base.model.parameter_names.index('m*cx6')
@@ -291,7 +327,9 @@ def test_prior_of_a_ball_is_the_same_in_every_direction():
     J, turn = payload_inertia(2.0), np.eye(4)
     turn[:3, :3] = np.linalg.qr(np.random.default_rng(0).normal(size=(3, 3)))[0]
     ten = deviations(J, 0.3, CENTRE)
-    turned = np.transpose([inertia_of(turn @ pseudo_inertia(d) @ turn.T) for d in ten.T])
+    turned = np.transpose(
+        [inertia_of(turn @ pseudo_inertia(d) @ turn.T) for d in ten.T]
+    )
     np.testing.assert_allclose(turned @ turned.T, ten @ ten.T, atol=1e-15)
 
 
@@ -326,7 +364,9 @@ def test_gripper_is_carried_for_every_tip_and_its_fingers_are_held():
     alone = panda(changed('<mass value="0.015" />', '<mass value="0" />')).joints[6]
     fingers = inertia_of(last.held)
     assert fingers[0] == pytest.approx(2 * 0.015)
-    np.testing.assert_allclose(fingers[:4], (last.inertia - alone.inertia)[:4], atol=1e-12)
+    np.testing.assert_allclose(
+        fingers[:4], (last.inertia - alone.inertia)[:4], atol=1e-12
+    )
     assert not any(joint.held.any() for joint in whole.joints[:6])
     shorter = read_chain(PANDA_TEXT, 'panda_link0', 'panda_link7', PANDA)
     np.testing.assert_allclose(shorter.joints[6].inertia, last.inertia)
@@ -337,7 +377,9 @@ def test_chain_may_begin_and_end_inside_the_arm():
     whole = panda(PANDA_TEXT)
     np.testing.assert_allclose(chain.joints[0].inertia, whole.joints[2].inertia)
     # The wrist is then a rigid load.
-    assert chain.joints[1].inertia[0] == pytest.approx(sum(j.inertia[0] for j in whole.joints[3:]))
+    assert chain.joints[1].inertia[0] == pytest.approx(
+        sum(j.inertia[0] for j in whole.joints[3:])
+    )
 
 
 def panda(text):
@@ -350,20 +392,38 @@ def changed(old, new, count=-1):
 
 
 LINK7 = PANDA_TEXT[PANDA_TEXT.index('<link name="panda_link7">') :]
-LINK7_INERTIAL = LINK7[LINK7.index('<inertial>') : LINK7.index('</inertial>')] + '</inertial>'
-WEIGHTLESS = changed(LINK7_INERTIAL, '').replace('<mass value="0.73" />', '<mass value="0" />')
+LINK7_INERTIAL = (
+    LINK7[LINK7.index('<inertial>') : LINK7.index('</inertial>')] + '</inertial>'
+)
+WEIGHTLESS = changed(LINK7_INERTIAL, '').replace(
+    '<mass value="0.73" />', '<mass value="0" />'
+)
 
 FIRST_JOINT = '"panda_joint1" type="revolute"'
-AXIS, MASS, LINK8 = '<axis xyz="0 0 1" />', '<mass value="0.73" />', '<link name="panda_link8" />'
+AXIS = '<axis xyz="0 0 1" />'
+MASS = '<mass value="0.73" />'
+LINK8 = '<link name="panda_link8" />'
 WRONG_TEXTS = (  # what is replaced, by what, and the remedy
     (LINK8, '<link name="${name}_link8" />', 'xacro FILE > robot.urdf'),
     (LINK8, '<xacro:hand />', 'xacro FILE > robot.urdf'),
     (PANDA_TEXT, 'l1: 1.0', 'not a URDF, as it is not valid XML'),
     (PANDA_TEXT, '<sdf />', 'is <robot>, not <sdf>'),
     (AXIS, f'<mimic joint="j" />{AXIS}', "'panda_joint1' mimics"),
-    (FIRST_JOINT, FIRST_JOINT.replace('revolute', 'floating'), 'expected fixed, revolute'),
-    ('finger_joint1" type="prismatic"', 'finger_joint1" type="floating"', "on 'panda_hand' is fl"),
-    ('effort="87"', 'effort="-87"', 'has <limit effort="-87">: it is a magnitude, so give 87'),
+    (
+        FIRST_JOINT,
+        FIRST_JOINT.replace('revolute', 'floating'),
+        'expected fixed, revolute',
+    ),
+    (
+        'finger_joint1" type="prismatic"',
+        'finger_joint1" type="floating"',
+        "on 'panda_hand' is fl",
+    ),
+    (
+        'effort="87"',
+        'effort="-87"',
+        'has <limit effort="-87">: it is a magnitude, so give 87',
+    ),
     ('velocity="2.175"', 'velocity="-2"', 'so give 2'),
     (MASS, '<mass value="-0.73" />', "link 'panda_hand' has a mass of -0.73 kg"),
     ('izz="0.0017"', 'izz="-0.0017"', 'none can be negative'),
@@ -373,12 +433,19 @@ WRONG_TEXTS = (  # what is replaced, by what, and the remedy
     (AXIS, '<axis xyz="0 1" />', 'expected 3 finite number'),
     (LINK8, '<link name="panda_link7" />', 'each link needs a unique name'),
     (LINK8, '', "has the child 'panda_link8', but the links are"),
-    ('child link="panda_right', 'child link="panda_left', "'panda_leftfinger' is the child of two"),
+    (
+        'child link="panda_right',
+        'child link="panda_left',
+        "'panda_leftfinger' is the child of two",
+    ),
 )
 WRONG_CHAINS = (
     ({'tip': 'tool'}, "no link 'tool' for the tip: the links are panda_link0, "),
     ({'base': 'world'}, "no link 'world' for the base"),
-    ({'base': 'panda_leftfinger', 'tip': 'panda_rightfinger'}, "ends at 'panda_link0' without rea"),
+    (
+        {'base': 'panda_leftfinger', 'tip': 'panda_rightfinger'},
+        "ends at 'panda_link0' without rea",
+    ),
     ({'joints': ('elbow', *PANDA[1:])}, "no joint 'elbow' in the URDF: its joints are"),
     ({'joints': PANDA[::-1]}, 'panda_joint7, in this order; got panda_joint7'),
     ({'joints': PANDA[:6]}, 'panda_joint7, in this order'),
@@ -396,8 +463,15 @@ WRONG_CHAINS = (
 
 
 def test_unusable_urdf_is_rejected_with_a_remedy():
-    cases = [({'text': changed(old, new, 1)}, message) for old, new, message in WRONG_TEXTS]
-    arm = {'text': PANDA_TEXT, 'base': 'panda_link0', 'tip': 'panda_hand_tcp', 'joints': PANDA}
+    cases = [
+        ({'text': changed(old, new, 1)}, message) for old, new, message in WRONG_TEXTS
+    ]
+    arm = {
+        'text': PANDA_TEXT,
+        'base': 'panda_link0',
+        'tip': 'panda_hand_tcp',
+        'joints': PANDA,
+    }
     for changes, message in (*cases, *WRONG_CHAINS):
         with pytest.raises(BlfDscError) as caught:
             read_chain(**arm | changes)
@@ -407,6 +481,11 @@ def test_unusable_urdf_is_rejected_with_a_remedy():
 def test_zero_tensor_rounding_below_zero_and_the_namespace_of_an_expanded_file_are_accepted():
     given = 'ixx="0.001" iyy="0.0025" izz="0.0017"'
     for izz in ('0', '-2e-35'):
-        assert panda(changed(given, f'ixx="0" iyy="0" izz="{izz}"')).joints[6].inertia[0] > 0.73
-    text = changed('<robot name', '<robot xmlns:xacro="http://www.ros.org/wiki/xacro" name')
+        assert (
+            panda(changed(given, f'ixx="0" iyy="0" izz="{izz}"')).joints[6].inertia[0]
+            > 0.73
+        )
+    text = changed(
+        '<robot name', '<robot xmlns:xacro="http://www.ros.org/wiki/xacro" name'
+    )
     assert len(panda(text).joints) == 7

@@ -8,7 +8,9 @@ import math
 import os
 import platform
 import shutil
+import subprocess
 import sys
+import tempfile
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, NamedTuple
@@ -21,14 +23,22 @@ import pytest
 from closed_loop_case import closed_loop, controller, quick
 from command import OLDER, finished
 from numba.core.errors import UnsupportedError
-from random_arm import _shake
+from random_arm import _shake, random_urdf
 
 import blf_dsc_controller
 from blf_dsc_controller.arms import model
 from blf_dsc_controller.arms.two_link import TwoLink
 from blf_dsc_controller.compiled import elementary, jit
 from blf_dsc_controller.compiled.algebra import independent_columns, inverse, product
-from blf_dsc_controller.compiled.layout import Array, Cell, Fixed, pack, size_of, sizes_of, view_of
+from blf_dsc_controller.compiled.layout import (
+    Array,
+    Cell,
+    Passed,
+    pack,
+    size_of,
+    source_of,
+    view_of,
+)
 from blf_dsc_controller.configuration.nodes import load_loop
 from blf_dsc_controller.configuration.schema import flatten
 from blf_dsc_controller.law.controller import update
@@ -36,7 +46,7 @@ from blf_dsc_controller.law.weighing import weigh
 from blf_dsc_controller.reference.terms import cubics, minimum_jerk
 from blf_dsc_controller.simulation.loop import run_loop, simulate
 from blf_dsc_controller.studies import laws
-from blf_dsc_controller.supervision.safe_torque import friction_torque, model_torque
+from blf_dsc_controller.supervision.model_torque import friction_torque, model_torque
 from sim_plant.kernels import step_plant
 from sim_plant.plant import plant_settings
 
@@ -47,13 +57,17 @@ def sources(*names):
     return {f'{PACKAGE.name}/{name}.py' for name in names}
 
 
-LAW = sources('law/barrier', 'law/prediction', 'law/controller', 'law/state', 'reference/terms')
+LAW = sources(
+    'law/barrier', 'law/prediction', 'law/controller', 'law/state', 'reference/terms'
+)
 PLANT = {f'sim_plant/{name}.py' for name in ('arm', 'kernels', 'motion')}
 ALWAYS = sources('compiled/layout', 'arms/two_link')
 
 
 def names(kernel):
-    return {str(path.relative_to(PACKAGE.parent)) for path in jit.dependencies(kernel)[0]}
+    return {
+        str(path.relative_to(PACKAGE.parent)) for path in jit.dependencies(kernel)[0]
+    }
 
 
 compiling = pytest.mark.skipif(numba.config.DISABLE_JIT, reason='nothing is compiled')
@@ -69,8 +83,9 @@ def test_kernel_depends_on_the_files_and_constants_it_is_compiled_from():
         assert names(kernel) >= needed | ALWAYS
         assert not names(kernel) & foreign
     assert not any('configuration' in name for name in names(run_loop))
-    assert {'SUSPECT=1', 'OUTSIDE=2', 'LINEAR=1'} <= jit.dependencies(update)[1]
-    outside = {path.name for path in jit.dependencies(_shake)[0]}  # a kernel of these tests
+    assert {'SUSPECT=1', 'OUTSIDE=2', 'LEVEL_CUT=1.0'} <= jit.dependencies(update)[1]
+    # a kernel of these tests
+    outside = {path.name for path in jit.dependencies(_shake)[0]}
     assert outside >= {'random_arm.py', 'arm.py', 'algebra.py'}
     assert 'controller.py' not in outside
 
@@ -83,7 +98,9 @@ class OwnLaw(NamedTuple):
 
 
 def test_kernel_depends_on_the_file_of_a_type_whose_methods_it_calls(monkeypatch):
-    monkeypatch.setattr(jit, '_COMPILED', {name: {*uses} for name, uses in jit._COMPILED.items()})
+    monkeypatch.setattr(
+        jit, '_COMPILED', {name: {*uses} for name, uses in jit._COMPILED.items()}
+    )
     monkeypatch.setattr(jit, 'KERNELS', [])
     assert Path(__file__) in jit.dependencies(laws._loop_with(OwnLaw))[0]
 
@@ -91,7 +108,9 @@ def test_kernel_depends_on_the_file_of_a_type_whose_methods_it_calls(monkeypatch
 @compiling
 def test_cache_folders_of_kernels_follow_from_their_dependencies():
     """A kernel must be defined after what it calls, or edits would run stale machine code."""
-    own = [kernel for kernel in jit.KERNELS if kernel.__module__.startswith(('blf', 'sim'))]
+    own = [
+        kernel for kernel in jit.KERNELS if kernel.__module__.startswith(('blf', 'sim'))
+    ]
     assert {update, weigh, run_loop, step_plant} <= {*own}
     for kernel in own:
         assert str(jit.cache_folder(kernel)) in kernel._cache.cache_path, kernel
@@ -114,7 +133,9 @@ def compiled_in(checkout, cache, ending='', **target):
     """Return an entry of a regressor, and how often its kernel was found and was compiled."""
     paths = {'PYTHONPATH': str(checkout), 'NUMBA_CACHE_DIR': str(cache)}
     environment = os.environ | paths | target
-    run = finished(sys.executable, '-c', COMPILE + ending, cwd=checkout, env=environment)
+    run = finished(
+        sys.executable, '-c', COMPILE + ending, cwd=checkout, env=environment
+    )
     entry, found, compiled = map(float, run.stdout.split())
     return entry, found, compiled
 
@@ -123,7 +144,9 @@ def compiled_in(checkout, cache, ending='', **target):
 def test_kernels_of_another_checkout_or_of_the_package_are_found_and_never_of_other_sources(
     tmp_path,
 ):
-    first, second, cache, unused = (tmp_path / name for name in ('first', 'second', 'a', 'b'))
+    first, second, cache, unused = (
+        tmp_path / name for name in ('first', 'second', 'a', 'b')
+    )
     for checkout in (first, second):
         for package in (PACKAGE, PACKAGE.parent / 'sim_plant'):
             unwanted = shutil.ignore_patterns('__pycache__', 'kernels')
@@ -138,24 +161,45 @@ def test_kernels_of_another_checkout_or_of_the_package_are_found_and_never_of_ot
 
     other = pytest.approx(entry + 1.0)
     for checkout, folder in ((second, cache), (first, unused)):
-        called = checkout / PACKAGE.name / 'arms/two_link.py'  # not the file of the kernel itself
-        called.write_text(called.read_text().replace('H[0, 0] = a[0] +', 'H[0, 0] = 1.0 + a[0] +'))
+        # not the file of the kernel itself
+        called = checkout / PACKAGE.name / 'arms/two_link.py'
+        called.write_text(
+            called.read_text().replace('H[0, 0] = a[0] +', 'H[0, 0] = 1.0 + a[0] +')
+        )
         assert compiled_in(checkout, folder) == (other, 0, 1)
         assert compiled_in(checkout, folder) == (other, 1, 0)
     assert sorted(shipped.rglob('*')) == before
 
 
+LACKING = {
+    'library': 'del numba.core.codegen.JITCodeLibrary',
+    'cache': 'del numba.core.caching.CompileResultCacheImpl',
+    'release': 'numba.version_info = numba.version_info._replace(short=(9, 0))',
+}
+SAMPLE = """
+from blf_dsc_controller.reference.terms import minimum_jerk, pack, sampled
+
+motion = minimum_jerk(np.array([0.0, 1.0]), np.array([[0.0], [1.0]]))
+print(*sampled(pack(1, [motion]), np.array([0.5])).ravel().tolist())
+"""
+
+
 @compiling
-@pytest.mark.parametrize('part', ['codegen.JITCodeLibrary', 'caching.CompileResultCacheImpl'])
+@pytest.mark.parametrize('part', LACKING)
 def test_kernels_compile_without_the_private_parts_of_numba(part, tmp_path):
     """Other releases may lack them: then it is slower, which is said, with the same numbers."""
     H = model.regressors_at(TwoLink(10.0), *np.full((4, 1, 2), 0.5))
     slow = f'numba {numba.__version__} lacks what this package uses'
     environment = {**os.environ, 'NUMBA_CACHE_DIR': str(tmp_path)}
-    lacking = f'import numba.core.caching, numba.core.codegen\ndel numba.core.{part}\n'
+    lacking = f'import numba.core.caching, numba.core.codegen\n{LACKING[part]}\n'
     for counts, said in (([0, 1], 1), ([1, 0], 0)):
-        run = finished(sys.executable, '-c', lacking + COMPILE, env=environment)
-        assert [float(word) for word in run.stdout.split()] == [H[0, 0, 0], *counts]
+        code = lacking + COMPILE + SAMPLE
+        run = finished(sys.executable, '-c', code, env=environment)
+        entries, motion = run.stdout.splitlines()
+        assert [float(word) for word in entries.split()] == [H[0, 0, 0], *counts]
+        # half of the way, at 15/8 of the mean velocity, without acceleration
+        halfway = pytest.approx([0.5, 1.875, 0.0], abs=1e-14)
+        assert [float(word) for word in motion.split()] == halfway
         assert run.stderr.count(slow) == said
 
 
@@ -192,7 +236,9 @@ def allocating(x):
 
 @compiling
 def test_kernel_that_allocates_an_array_is_rejected():
-    with pytest.raises(UnsupportedError, match='the kernel allocating allocates an array'):
+    with pytest.raises(
+        UnsupportedError, match='the kernel allocating allocates an array'
+    ):
         allocating(1.0)
 
 
@@ -217,8 +263,8 @@ class Motor(NamedTuple):
 
 
 class Sized(NamedTuple):
-    joints: Fixed
-    columns: Fixed
+    joints: Passed
+    columns: int
     period: float
     count: int
     motor: Motor
@@ -231,41 +277,60 @@ class State(NamedTuple):
     motor: Motor
 
 
-sized_of, state_of, state_size = view_of(Sized), view_of(State), size_of(State)
+sized_of = view_of(Sized)
+state_of = view_of(State)
+state_size = size_of(State)
 
 
-def advance(vector, sizes, state_vector):
-    settings = sized_of(vector, sizes)
+def advance(vector, joints, state_vector):
+    settings = sized_of(vector, joints)
     state = state_of(state_vector, settings)
     state.count[0] += settings.period
-    state.ring[settings.motor.delay - 1, settings.joints - 1] = settings.gains[0, settings.columns]
+    state.ring[settings.motor.delay - 1, settings.joints - 1] = settings.gains[
+        0, settings.columns
+    ]
     return settings.motor.limit.sum() + settings.count
 
 
 compiled_advance = jit.kernel(advance)
 
 
-@pytest.mark.parametrize(('joints', 'columns'), [(1, 0), (2, 3), (7, 300)])
-def test_vectors_and_fixed_numbers_beside_them_are_seen_alike_by_kernels_and_python(
-    joints, columns
-):
-    """Kernels are compiled for the fixed numbers, and not for the others."""
-    gains = np.arange(1.0, 1.0 + joints * (columns + 1)).reshape(joints, columns + 1)
-    before = len(compiled_advance.signatures)
-    for count in (5, 6):
+def test_kernels_and_python_see_the_same_layout_of_every_size():
+    """One compiled kernel serves all sizes."""
+    for joints, columns, count in [(1, 0, 5), (2, 3, 5), (2, 3, 6), (7, 300, 5)]:
+        gains = np.arange(1.0, 1.0 + joints * (columns + 1)).reshape(
+            joints, columns + 1
+        )
         sized = Sized(joints, columns, 0.5, count, Motor(np.arange(joints), 4), gains)
-        vector, sizes = pack(sized), sizes_of(sized)
-        assert vector.size == 3 + joints + gains.size
-        view = sized_of(vector, sizes)
+        vector = pack(sized)
+        assert vector.size == 4 + joints + gains.size
+        view = sized_of(vector, joints)
         assert view[:4] == (joints, columns, 0.5, count)
         np.testing.assert_array_equal(view.gains, gains)
         for function in (advance, compiled_advance):
             state = np.zeros(state_size(view))
-            assert function(vector, sizes, state) == sum(range(joints)) + count
+            assert function(vector, joints, state) == sum(range(joints)) + count
             last = 1 + 4 * joints - 1
             assert (state[0], state[last]) == (0.5, columns + 1.0)
             assert np.count_nonzero(state) == 2
-    assert len(compiled_advance.signatures) == before + (not numba.config.DISABLE_JIT)
+    assert len(compiled_advance.signatures) == (0 if numba.config.DISABLE_JIT else 1)
+
+
+def test_generated_view_can_be_read():
+    assert source_of(State) == (
+        'def view(_vector, _sizes):\n'
+        '    _at = 0\n'
+        '    count = _part(_vector, _at, (1,))\n'
+        '    _at += (1)\n'
+        '    ring = _part(_vector, _at, (_sizes.motor.delay, _sizes.joints,))\n'
+        '    _at += (_sizes.motor.delay) * (_sizes.joints)\n'
+        '    motor_limit = _part(_vector, _at, (_sizes.joints,))\n'
+        '    _at += (_sizes.joints)\n'
+        '    motor_delay = int(_vector[_at])\n'
+        '    _at += 1\n'
+        '    return State(count=count, ring=ring, '
+        'motor=motor_Motor(limit=motor_limit, delay=motor_delay))\n'
+    )
 
 
 SHOW = """
@@ -295,9 +360,92 @@ if __name__ == '__main__':  # the command has processes of its own
 """
 
 
+ANY_ARM = """
+import sys
+import numpy as np
+import blf_dsc_controller as blf
+from blf_dsc_controller.cli import run
+from blf_dsc_controller.compiled import jit
+from sim_plant.kernels import observe_plant, plant_truth, step_plant
+
+def signatures():
+    return {(kernel.__name__, each) for kernel in jit.KERNELS for each in kernel.signatures}
+
+first, *others = (blf.load_loop(path) for path in sys.argv[1:])
+run._compile(first.controller)
+run._compile(first.plant)
+known = signatures()
+assert len(known) >= 7, known
+for arm in (first, *others):
+    n = len(arm.controller.joints)
+    run._compile(arm.plant)
+    with blf.ArmController(arm.controller) as controller:
+        for k in range(200):
+            controller.update(0.001 * k, np.full(n, 0.3), np.zeros(n), np.zeros(n))
+    print(n, sorted(signatures() - known))
+"""
+ARM = """
+/**:
+  ros__parameters:
+    robot: {{urdf: {urdf}, tip: tip, lag: 0.005{drive}}}
+/**/blf_dsc_controller:
+  ros__parameters:
+    joints: {joints}
+    barrier: {{bound: {bound}}}
+/**/sim_plant:
+  ros__parameters:
+    joints: {joints}
+"""
+
+
+@compiling
+def test_kernels_of_one_urdf_are_those_of_every_other_arm(tmp_path):
+    """So that a package with the kernels of a Panda compiles nothing for an arm never seen."""
+    paths = []
+    for n, drive in ((2, ''), (9, f', viscous: {[1.0] * 9}, payload: 0.0')):
+        text, joints = random_urdf(n, seed=n)
+        urdf = tmp_path / f'{n}.urdf'
+        urdf.write_text(text)
+        values = {'joints': [*joints], 'bound': [0.1] * n, 'drive': drive}
+        paths.append(tmp_path / f'{n}.yaml')
+        paths[-1].write_text(ARM.format(urdf=urdf, **values))
+    run = finished(sys.executable, '-c', ANY_ARM, 'panda', 'ur5e', 'fr3', *paths)
+    assert run.stdout.splitlines() == [f'{n} []' for n in (7, 6, 7, 2, 9)], run.stderr
+
+
+def test_machine_code_is_loaded_only_from_a_folder_that_nobody_else_can_write(
+    tmp_path, monkeypatch
+):
+    for place in ('XDG_CACHE_HOME', 'TMPDIR'):
+        monkeypatch.setenv(place, str(tmp_path / place))
+    (tmp_path / 'TMPDIR').mkdir()
+    monkeypatch.setattr(tempfile, 'tempdir', None)
+    own = tmp_path / 'own'
+    everybodys = tmp_path / 'everybodys'
+    everybodys.mkdir()
+    everybodys.chmod(0o1777)
+    base = jit._base.__wrapped__
+    inside = everybodys / f'blf_dsc_controller-{os.getuid()}'
+    assert (base(str(own)), base(str(everybodys))) == (own, inside)
+    assert inside.stat().st_mode & 0o777 == 0o700
+    inside.chmod(0o770)
+    users = tmp_path / 'XDG_CACHE_HOME' / 'blf_dsc_controller'
+    assert base(str(everybodys)) == users
+
+    # Everything there so far is another user's.
+    uid = os.getuid() + 1
+    monkeypatch.setattr(os, 'getuid', lambda: uid)
+    (everybodys / f'blf_dsc_controller-{uid}').mkdir(mode=0o700)
+    elsewhere = base(str(everybodys))
+    assert not elsewhere.is_relative_to(everybodys)
+    assert not elsewhere.is_relative_to(tmp_path / 'XDG_CACHE_HOME')
+
+
 @compiling
 def test_command_compiles_every_kernel_that_a_node_calls(tmp_path):
-    *kernels, said, copied = finished(sys.executable, '-c', SHOW, tmp_path).stdout.splitlines()
+    *kernels, said, copied = finished(
+        sys.executable, '-c', SHOW, tmp_path
+    ).stdout.splitlines()
     assert len(kernels) == 6
     assert all(int(line.split()[1]) >= 1 for line in kernels), kernels
     assert 'recommended: the kernels are compiled' in said
@@ -311,26 +459,35 @@ ANGLES = np.concatenate(
     (
         RANDOM.uniform(-4.0, 4.0, 3000),
         RANDOM.uniform(-FAR, FAR, 3000),
-        [float(k * mpmath.pi / 2) for k in RANDOM.integers(-1_000_000, 1_000_000, 3000).tolist()],
+        [
+            float(k * mpmath.pi / 2)
+            for k in RANDOM.integers(-1_000_000, 1_000_000, 3000).tolist()
+        ],
         np.ldexp(RANDOM.uniform(size=1000), RANDOM.integers(-1000, 0, 1000)),
         [0.0, math.pi / 4.0, math.pi / 2.0, math.pi, 5.706674932067741e5],
     )
 )
 """Also those nearest to multiples of a right angle, where the most digits cancel."""
 SMALL = np.concatenate(
-    (RANDOM.uniform(-4.0, 4.0, 5000), np.ldexp(RANDOM.uniform(size=500), -np.arange(500)))
+    (
+        RANDOM.uniform(-4.0, 4.0, 5000),
+        np.ldexp(RANDOM.uniform(size=500), -np.arange(500)),
+    )
 )
 ARGUMENTS = {
     'sin': ANGLES,
     'cos': ANGLES,
     'exp': np.concatenate((SMALL, RANDOM.uniform(-708.0, 709.78, 5000))),
-    'tanh': np.concatenate((SMALL, RANDOM.uniform(0.5, 0.6, 5000), [-30.0, 19.9, 20.1])),
+    'tanh': np.concatenate(
+        (SMALL, RANDOM.uniform(0.5, 0.6, 5000), [-30.0, 19.9, 20.1])
+    ),
 }
 
 
 @pytest.mark.parametrize('name', ARGUMENTS)
 def test_functions_are_within_nine_tenths_of_a_unit_of_the_last_place(name):
-    own, exact = getattr(elementary, name), getattr(mpmath, name)
+    own = getattr(elementary, name)
+    exact = getattr(mpmath, name)
     with mpmath.workprec(200):
         for x in map(float, ARGUMENTS[name]):
             expected = exact(mpmath.mpf(x))
@@ -340,7 +497,12 @@ def test_functions_are_within_nine_tenths_of_a_unit_of_the_last_place(name):
 def test_functions_at_the_ends_of_their_range():
     sin, cos, exp, tanh = (getattr(elementary, name) for name in ARGUMENTS)
     assert (sin(0.0), cos(0.0), exp(0.0), tanh(0.0)) == (0.0, 1.0, 1.0, 0.0)
-    assert (exp(-math.inf), exp(-1e4), exp(710.0), exp(math.inf)) == (0.0, 0.0, math.inf, math.inf)
+    assert (exp(-math.inf), exp(-1e4), exp(710.0), exp(math.inf)) == (
+        0.0,
+        0.0,
+        math.inf,
+        math.inf,
+    )
     assert (tanh(-math.inf), tanh(math.inf)) == (-1.0, 1.0)
     for function in (sin, cos):
         assert math.isnan(function(math.inf))
@@ -359,11 +521,14 @@ def fill_all(x, out):
         out[1, i] = elementary.cos(x[i])
         out[2, i] = elementary.exp(x[i])
         out[3, i] = elementary.tanh(x[i])
-        out[4, i] = x[i] * out[0, i] + out[1, i]  # no fused operation, which would round once
+        # no fused operation, which would round once
+        out[4, i] = x[i] * out[0, i] + out[1, i]
 
 
 def test_compiled_functions_give_the_bits_of_python():
-    x = np.concatenate((ANGLES, ARGUMENTS['exp'], [math.inf, -math.inf, math.nan, 1e300]))
+    x = np.concatenate(
+        (ANGLES, ARGUMENTS['exp'], [math.inf, -math.inf, math.nan, 1e300])
+    )
     compiled, interpreted = np.zeros((2, 5, x.size))
     fill_all(x, compiled)
     fill_all.py_func(x, interpreted)
@@ -371,10 +536,13 @@ def test_compiled_functions_give_the_bits_of_python():
 
 
 def test_products_and_inverses_are_those_of_numpy():
-    A, B = RANDOM.normal(size=(3, 5, 8)), RANDOM.normal(size=(3, 8, 4))
+    A = RANDOM.normal(size=(3, 5, 8))
+    B = RANDOM.normal(size=(3, 8, 4))
     np.testing.assert_allclose(product(A, B), A @ B, rtol=1e-13, atol=1e-14)
     M = A @ np.swapaxes(A, 1, 2)
-    np.testing.assert_allclose(inverse(M) @ M, np.tile(np.eye(5), (3, 1, 1)), atol=1e-12)
+    np.testing.assert_allclose(
+        inverse(M) @ M, np.tile(np.eye(5), (3, 1, 1)), atol=1e-12
+    )
 
 
 def test_dependent_columns_are_sums_of_those_before_them():
@@ -398,8 +566,12 @@ def test_interpreted_kernels_compute_the_same():
     """Without numba's compiler only the last bits differ (its libm, its order of operations)."""
     program = 'from test_compiled import learned_torque; print(*learned_torque())'
     environment = os.environ | {'NUMBA_DISABLE_JIT': '1', 'PYTHONPATH': PATH}
-    interpreted = finished(sys.executable, '-c', program, env=environment).stdout.split()
-    np.testing.assert_allclose(np.array(interpreted, float), learned_torque(), rtol=1e-9)
+    interpreted = finished(
+        sys.executable, '-c', program, env=environment
+    ).stdout.split()
+    np.testing.assert_allclose(
+        np.array(interpreted, float), learned_torque(), rtol=1e-9
+    )
 
 
 def digests():
@@ -414,7 +586,8 @@ def digests():
     out = np.zeros((5, x.size))
     fill_all(x, out)
     show('functions', out)
-    times, points = np.cumsum(random.uniform(0.1, 2.0, 30)), random.normal(size=(2, 30, 7))
+    times = np.cumsum(random.uniform(0.1, 2.0, 30))
+    points = random.normal(size=(2, 30, 7))
     pieces = cubics(np.diff(times), points[:, :-1], points[:, 1:])
     show('references', minimum_jerk(times, points[0]).content, pieces)
     for preset in ('recommended', 'panda'):
@@ -422,9 +595,16 @@ def digests():
         lines.append(f'{preset} {flatten(loop.controller)}')
         record = simulate(loop.controller, replace(loop.plant, duration=0.2))
         controller = record.controller
-        settings, P = controller.settings, controller.state.estimate
+        settings = controller.settings
+        P = controller.state.estimate
         show('parameters', controller.settings_vector, pack(plant_settings(loop.plant)))
-        show('run', record.measurements, record.samples, record.truths, controller.state_vector)
+        show(
+            'run',
+            record.measurements,
+            record.samples,
+            record.truths,
+            controller.state_vector,
+        )
         q, dq, ddq = random.normal(size=(3, settings.n))
         safe = model_torque(settings, P, q, dq, ddq), friction_torque(settings, P, dq)
         show('safe torque', *safe)
@@ -438,7 +618,9 @@ PROCESSORS = {
 }
 
 
-@pytest.mark.skipif(platform.machine() != 'x86_64', reason='names processors of this kind')
+@pytest.mark.skipif(
+    platform.machine() != 'x86_64', reason='names processors of this kind'
+)
 @pytest.mark.parametrize(
     'processor', ['older', 'newer', pytest.param('oldest', marks=pytest.mark.nightly)]
 )
@@ -450,3 +632,50 @@ def test_every_processor_computes_the_same_bits(processor):
     other = finished(sys.executable, '-c', program, env=environment)
     assert len(here) == 10
     assert other.stdout.splitlines() == here, other.stderr
+
+
+RACE = """
+import sys, time
+from blf_dsc_controller.compiled import jit
+
+@jit.kernel
+def slow(x):
+    total = 0.0
+    for k in range(3):
+        total += x ** k
+    return total
+
+notices = []
+with jit.announced_compilation(notices.append):
+    print('ready', flush=True)
+    sys.stdin.readline()
+    slow(1.0)
+print(len([text for text in notices if text.startswith(jit.COMPILING)]))
+"""
+
+
+@compiling
+def test_of_processes_that_need_a_kernel_at_once_one_compiles_it(tmp_path):
+    script = tmp_path / 'race.py'
+    script.write_text(RACE)
+    environment = os.environ | {
+        'NUMBA_CACHE_DIR': str(tmp_path / 'cache'),
+        'PYTHONPATH': str(Path(__file__).parents[1]),
+    }
+    processes = [
+        subprocess.Popen(
+            [sys.executable, script],
+            env=environment,
+            text=True,
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+        )
+        for _ in range(4)
+    ]
+    for each in processes:
+        assert each.stdout.readline() == 'ready\n'
+    for each in processes:
+        each.stdin.write('go\n')
+        each.stdin.flush()
+    compiled = [int(each.communicate(timeout=300)[0]) for each in processes]
+    assert sorted(compiled) == [0, 0, 0, 1]

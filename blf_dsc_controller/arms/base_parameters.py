@@ -39,7 +39,8 @@ ROTORS = 0.5
 UNKNOWN_ROTOR = 0.01
 """... and absolute where that is 0, as neither effort nor inertia is known [kg m^2, or kg]."""
 
-_DEPENDENT = 1e-6  # for columns of order 1; rounding of pi / 2 in URDFs gives about 1e-10
+# for columns of order 1; rounding of pi / 2 in URDFs gives about 1e-10
+_DEPENDENT = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,24 +48,32 @@ class BaseParameters:
     """Base parameters P of a chain."""
 
     model: SerialChain  # whose regressors multiply P, named after the kept columns
-    K: np.ndarray  # (p, 11 n) to P from each body's ten inertial parameters and its rotor
+    # (p, 11 n) to P from each body's ten inertial parameters and its rotor
+    K: np.ndarray
     load: np.ndarray  # (p,) what 1 kg at the tip adds to P
     combinations: tuple[str, ...]  # each as a sum, such as 'Izz2 + Iyy3 + 0.1 m4'
 
     def of(self, inertias: np.ndarray, rotors: np.ndarray) -> np.ndarray:
         """Return P (p,) for the ten of each body (n, 10) and the rotors (n,) [kg m^2, or kg]."""
-        return product(self.K, np.reshape(np.column_stack((inertias, rotors)), (-1, 1)))[:, 0]
+        return product(
+            self.K, np.reshape(np.column_stack((inertias, rotors)), (-1, 1))
+        )[:, 0]
 
 
 @functools.lru_cache(maxsize=16)
-def base_parameters(chain: Chain, gravity: tuple[float, ...] = (0.0, 0.0, -9.81)) -> BaseParameters:
+def base_parameters(
+    chain: Chain, gravity: tuple[float, ...] = (0.0, 0.0, -9.81)
+) -> BaseParameters:
     """Return the base parameters of a chain; gravity [m/s^2] is in its base."""
     full = serial_chain(chain, gravity)
     kept, X = independent_columns(_regressor_at_random(full), _DEPENDENT)
     K = np.where(np.abs(X) < _DEPENDENT, 0.0, X.round(12))
     columns = [(int(k) // (ROTOR + 1), int(k) % (ROTOR + 1)) for k in kept]
-    sums = tuple(_sum(row, int(k), full.parameter_names) for row, k in zip(K, kept, strict=True))
-    point, loaded = chain.tip_placement[:, 3], np.zeros((full.n, ROTOR + 1))
+    sums = tuple(
+        _sum(row, int(k), full.parameter_names) for row, k in zip(K, kept, strict=True)
+    )
+    point = chain.tip_placement[:, 3]
+    loaded = np.zeros((full.n, ROTOR + 1))
     loaded[-1, :ROTOR] = inertia_of(np.outer(point, point))
     load = product(K, loaded.reshape(-1, 1))[:, 0]
     return BaseParameters(serial_chain(chain, gravity, columns), K, load, sums)
@@ -85,7 +94,9 @@ def _sum(row: np.ndarray, own: int, names: tuple[str, ...]) -> str:
     text = names[own]
     for k in np.flatnonzero(row):
         if k != own:
-            factor = '' if abs(abs(row[k]) - 1.0) < _DEPENDENT else f'{abs(row[k]):.4g} '
+            factor = (
+                '' if abs(abs(row[k]) - 1.0) < _DEPENDENT else f'{abs(row[k]):.4g} '
+            )
             text += f' {"-" if row[k] < 0.0 else "+"} {factor}{names[k]}'
     return text
 
@@ -99,7 +110,8 @@ def prior_factor(
     `rotors` (n,) are the standard deviations of the rotor inertias [kg m^2, or kg], which a URDF
     does not contain.
     """
-    n, without_rotor = len(chain.joints), ((0, 1), (0, 0))
+    n = len(chain.joints)
+    without_rotor = ((0, 1), (0, 0))
     blocks: list[tuple[int, np.ndarray]] = []  # body, directions (11, k) of its entries
     for i, joint in enumerate(chain.joints):
         J = pseudo_inertia(joint.inertia)

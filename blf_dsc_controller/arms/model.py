@@ -40,6 +40,9 @@ class ArmModel(Protocol):
     def parameter_units(self) -> tuple[str, ...]:
         """Units of the entries of P."""
 
+    def sizes(self) -> tuple[int, int]:
+        """Return n and p, in kernels too; literal numbers are constants of the kernels."""
+
     def regressor(self, q: Array, dq: Array, v: Array, a: Array, H: Array) -> None:
         """Fill H (n, p) so that H P = M(q) a + C(q, dq) v + G(q)   [N m], Property III."""
 
@@ -61,7 +64,12 @@ def arm_model(name: str, l1: float, gravity: float) -> ArmModel:
     return models[name]
 
 
-compile_methods(ArmModel, ('regressor', 'momentum_regressor', 'regressors'), TwoLink, SerialChain)
+compile_methods(
+    ArmModel,
+    ('sizes', 'regressor', 'momentum_regressor', 'regressors'),
+    TwoLink,
+    SerialChain,
+)
 
 
 def regressors_at(model: ArmModel, q: Array, dq: Array, v: Array, a: Array) -> Array:
@@ -88,7 +96,12 @@ def free_inertias(M: Array) -> Array:
 
 @kernel
 def _fill_regressors(
-    model: ArmModel, q: np.ndarray, dq: np.ndarray, v: np.ndarray, a: np.ndarray, H: np.ndarray
+    model: ArmModel,
+    q: np.ndarray,
+    dq: np.ndarray,
+    v: np.ndarray,
+    a: np.ndarray,
+    H: np.ndarray,
 ) -> None:
     for k in range(q.shape[0]):
         model.regressor(q[k], dq[k], v[k], a[k], H[k])

@@ -47,14 +47,17 @@ class Bodies(NamedTuple):
     first: Annotated[Array, 'n + 1']  # first column of each body, then p
     entry: Annotated[Array, 'p']  # of each column: index among its body's ten, or ROTOR
     motions: Annotated[Array, '4 + 2 * n', 6]  # in the frame of the current body
-    products: Annotated[Array, 3, ROTOR + 1]  # of an axis with each entry's contribution
+    # of an axis with each entry's contribution
+    products: Annotated[Array, 3, ROTOR + 1]
 
 
 bodies_of = view_of(Bodies)
 
 
 @called
-def fill_regressor(vector: Array, q: Array, dq: Array, v: Array, a: Array, H: Array) -> None:
+def fill_regressor(
+    vector: Array, q: Array, dq: Array, v: Array, a: Array, H: Array
+) -> None:
     """Implement `SerialChain.regressor`."""
     bodies = bodies_of(vector)
     begin(bodies)
@@ -64,7 +67,9 @@ def fill_regressor(vector: Array, q: Array, dq: Array, v: Array, a: Array, H: Ar
 
 
 @called
-def fill_momentum_regressor(vector: Array, q: Array, dq: Array, Yp: Array, Yr: Array) -> None:
+def fill_momentum_regressor(
+    vector: Array, q: Array, dq: Array, Yp: Array, Yr: Array
+) -> None:
     """Implement `SerialChain.momentum_regressor`."""
     bodies = bodies_of(vector)
     begin(bodies)
@@ -75,7 +80,14 @@ def fill_momentum_regressor(vector: Array, q: Array, dq: Array, Yp: Array, Yr: A
 
 @called
 def fill_regressors(
-    vector: Array, q: Array, dq: Array, v: Array, a: Array, H: Array, Yp: Array, Yr: Array
+    vector: Array,
+    q: Array,
+    dq: Array,
+    v: Array,
+    a: Array,
+    H: Array,
+    Yp: Array,
+    Yr: Array,
 ) -> None:
     """Implement `SerialChain.regressors`."""
     bodies = bodies_of(vector)
@@ -112,25 +124,35 @@ def begin(bodies: Bodies) -> None:
 @inner
 def advance(bodies: Bodies, i: int, q: float, dq: float, v: float, a: float) -> None:
     """Transform all motions from the frame of body i - 1 to that of i; add those of joint i."""
-    motions, rotation = bodies.motions, bodies.rotation[i]
+    motions = bodies.motions
+    rotation = bodies.rotation[i]
     c, s = cos(q), sin(q)
     column0 = turned(rotation, c, s, 0)
     column1 = turned(rotation, c, s, 1)
     column2 = turned(rotation, c, s, 2)
     offset, slide = bodies.offset[i], bodies.slide[i]
-    origin = (offset[0] + q * slide[0], offset[1] + q * slide[1], offset[2] + q * slide[2])
+    origin = (
+        offset[0] + q * slide[0],
+        offset[1] + q * slide[1],
+        offset[2] + q * slide[2],
+    )
     own = AXES + 2 * i
     for row in range(own):
         motion = motions[row]
         w, u = angular(motion), linear(motion)
         u = plus(u, cross(w, origin))
-        motion[0], motion[3] = dot(column0, w), dot(column0, u)
-        motion[1], motion[4] = dot(column1, w), dot(column1, u)
-        motion[2], motion[5] = dot(column2, w), dot(column2, u)
+        motion[0] = dot(column0, w)
+        motion[3] = dot(column0, u)
+        motion[1] = dot(column1, w)
+        motion[4] = dot(column1, u)
+        motion[2] = dot(column2, w)
+        motion[5] = dot(column2, u)
     axis, rate = motions[own], motions[own + 1]
     S = bodies.axis[i]
-    w, u = angular(motions[VELOCITY]), linear(motions[VELOCITY])
-    turning, moving = cross(w, angular(S)), cross(w, linear(S))
+    w = angular(motions[VELOCITY])
+    u = linear(motions[VELOCITY])
+    turning = cross(w, angular(S))
+    moving = cross(w, linear(S))
     swept = cross(u, angular(S))
     for k in range(3):
         rate[k] = turning[k]
@@ -155,10 +177,13 @@ def turned(rotation: Array, c: float, s: float, k: int) -> Vector:
 @inner
 def add_torque(bodies: Bodies, i: int, a: float, H: Array) -> None:
     """Fill the columns of body i in M a + C v + G."""
-    motions, products = bodies.motions, bodies.products[0]
-    w, u = angular(motions[VELOCITY]), linear(motions[VELOCITY])
+    motions = bodies.motions
+    products = bodies.products[0]
+    w = angular(motions[VELOCITY])
+    u = linear(motions[VELOCITY])
     reference = angular(motions[REFERENCE])
-    alpha, A = angular(motions[ACCELERATION]), linear(motions[ACCELERATION])
+    alpha = angular(motions[ACCELERATION])
+    A = linear(motions[ACCELERATION])
     A = plus(A, cross(reference, u))
     for j in range(i + 1):
         torque_products(motions[AXES + 2 * j], alpha, A, w, reference, products)
@@ -169,11 +194,15 @@ def add_torque(bodies: Bodies, i: int, a: float, H: Array) -> None:
 @inner
 def add_momentum(bodies: Bodies, i: int, dq: float, Yp: Array, Yr: Array) -> None:
     """Fill the columns of body i in M dq and in G - C^T dq."""
-    motions, momenta, rest = bodies.motions, bodies.products[1], bodies.products[2]
-    w, u = angular(motions[VELOCITY]), linear(motions[VELOCITY])
+    motions = bodies.motions
+    momenta = bodies.products[1]
+    rest = bodies.products[2]
+    w = angular(motions[VELOCITY])
+    u = linear(motions[VELOCITY])
     g = linear(motions[GRAVITY])
     for j in range(i + 1):
-        S, dS = motions[AXES + 2 * j], motions[AXES + 2 * j + 1]
+        S = motions[AXES + 2 * j]
+        dS = motions[AXES + 2 * j + 1]
         momentum_products(S, w, u, momenta)
         momenta[ROTOR] = dq if j == i else 0.0
         choose(bodies, i, j, momenta, Yp)
@@ -200,7 +229,9 @@ def choose(bodies: Bodies, i: int, j: int, products: Array, Y: Array) -> None:
 
 
 @inner
-def torque_products(S: Array, alpha: Vector, A: Vector, v: Vector, w: Vector, out: Array) -> None:
+def torque_products(
+    S: Array, alpha: Vector, A: Vector, v: Vector, w: Vector, out: Array
+) -> None:
     """Fill S . (I alpha + B(I, v) w) for a unit of each of the ten; h = m c are the moments.
 
         force = m A + alpha x h + w x (v x h)
@@ -209,17 +240,24 @@ def torque_products(S: Array, alpha: Vector, A: Vector, v: Vector, w: Vector, ou
     Here alpha, v and w are the angular parts; A is alpha's linear part + w x (v's linear part).
     """
     s, t = angular(S), linear(S)
-    turn, lever, along, speed = cross(t, alpha), cross(A, s), dot(t, v), dot(v, w)
+    turn = cross(t, alpha)
+    lever = cross(A, s)
+    along = dot(t, v)
+    speed = dot(v, w)
     out[0] = dot(t, A)
     out[1] = turn[0] + lever[0] + along * w[0] - speed * t[0]
     out[2] = turn[1] + lever[1] + along * w[1] - speed * t[1]
     out[3] = turn[2] + lever[2] + along * w[2] - speed * t[2]
-    xx, yy, zz = v[0] * w[0], v[1] * w[1], v[2] * w[2]
+    xx = v[0] * w[0]
+    yy = v[1] * w[1]
+    zz = v[2] * w[2]
     xy = 0.5 * (v[0] * w[1] + v[1] * w[0])
     xz = 0.5 * (v[0] * w[2] + v[2] * w[0])
     yz = 0.5 * (v[1] * w[2] + v[2] * w[1])
     half = cross(v, w)
-    x, y, z = alpha[0] - 0.5 * half[0], alpha[1] - 0.5 * half[1], alpha[2] - 0.5 * half[2]
+    x = alpha[0] - 0.5 * half[0]
+    y = alpha[1] - 0.5 * half[1]
+    z = alpha[2] - 0.5 * half[2]
     out[4] = s[0] * x + s[1] * xz - s[2] * xy
     out[5] = s[0] * (y - xz) + s[1] * (x + yz) + s[2] * (xx - yy)
     out[6] = s[1] * y + s[2] * xy - s[0] * yz
@@ -275,6 +313,10 @@ class SerialChain(NamedTuple):
         body = np.repeat(np.arange(self.n), np.diff(bodies.first).astype(int))
         return [(int(b), int(e)) for b, e in zip(body, bodies.entry, strict=True)]
 
+    def sizes(self) -> tuple[int, int]:
+        """Return n and p."""
+        return self.n, self.p
+
     def regressor(self, q: Array, dq: Array, v: Array, a: Array, H: Array) -> None:
         """Fill H (n, p) so that H P = M(q) a + C(q, dq) v + G(q)   [N m], Property III."""
         fill_regressor(self.vector, q, dq, v, a, H)
@@ -304,11 +346,16 @@ def serial_chain(
     if columns is None:
         columns = [(i, entry) for i in range(n) for entry in range(ROTOR + 1)]
     rotation = np.zeros((n, 3, 3, 3))
-    offset, slide, axis = np.zeros((n, 3)), np.zeros((n, 3)), np.zeros((n, 6))
+    offset = np.zeros((n, 3))
+    slide = np.zeros((n, 3))
+    axis = np.zeros((n, 6))
     for i, joint in enumerate(chain.joints):
-        R, offset[i] = joint.placement[:3, :3], joint.placement[:3, 3]
+        R = joint.placement[:3, :3]
+        offset[i] = joint.placement[:3, 3]
         if joint.kind == 'prismatic':
-            rotation[i, 0], slide[i], axis[i, 3:] = R, (R * joint.axis).sum(axis=1), joint.axis
+            rotation[i, 0] = R
+            slide[i] = (R * joint.axis).sum(axis=1)
+            axis[i, 3:] = joint.axis
         else:
             along = np.outer(joint.axis, joint.axis)
             turns = along, np.eye(3) - along, np.cross(np.eye(3), joint.axis)

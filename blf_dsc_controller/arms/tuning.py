@@ -1,11 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """Design rules: the gains and limits of the controller that follow from the URDF of an arm.
 
-The delay of the loop, 3 T + robot.lag, gives the rate omega_b = 0.625 / delay. Gains are multiples
-of this rate and of the inertia of each joint with the others free, m_i = 1 / (M^-1)_ii, minimised
-over several postures. Three samples: half a sample for which torques are held, one until they are
-applied, half a sample of differenced velocities, and one for the surface filter and alpha2', so
-that gain margins are alike at 1 kHz and 250 Hz (doc/arms.md: margins).
+The delay of the loop, 3 T + robot.lag, gives the rate omega_b = 0.625 / delay; feedback.stiffness
+is the part of it that is used. Gains are multiples of this rate and of the inertia of each joint
+with the others free, m_i = 1 / (M^-1)_ii, minimised over several postures; the law multiplies what
+acts on errors by M(q, P^(0)) / m. Three samples: half a sample for which torques are held, one
+until they are applied, half a sample of differenced velocities, and one for the surface filter and
+alpha2', so that gain margins are alike at 1 kHz and 250 Hz (doc/arms.md: margins).
 
 Errors of the modelled gravity, including the rated payload, make a joint sag at the start until the
 disturbance estimate compensates them. If it sags by more than the bound, the bound is a funnel.
@@ -28,15 +29,16 @@ UNKNOWN_EFFORT = 100.0
 """Torque limit [N m] of a joint without one in the URDF."""
 SAMPLES = 3.0
 """Delay of the loop by its sampling alone, in samples."""
-_SAG = 1.5  # sag over (standard deviation of gravity / m omega_b^2); measured: at most 1
+# sag over (standard deviation of gravity / m omega_b^2); measured: at most 1
+_SAG = 1.5
 _PHASE = 0.625  # rad, phase lost to the delay at omega_b
-_BOUND = 0.002  # rad
+_BOUND = 0.002  # rad, at full stiffness
 _UNMODELLED = 0.01  # rms, fraction of the rated torque: ripple, noise, Stribeck
 _WINDOW = 5.0  # s
 _REGULARISATION = 1e-5  # pulls P (about 1) to 0
 _ANCHOR = 5.0  # times the mean square of the unmodelled torque
 _POSTURES = 20
-_SURFACE = 0.0015  # s, least time constant of the surface filter: noise of alpha2'
+_SURFACE = 0.00155  # s, least time constant of the surface filter: noise of alpha2'
 _FREE = 2.0 * math.pi  # rad, position limit of a joint without one
 _SLOW = 0.5  # fraction of the rated velocity
 
@@ -58,9 +60,13 @@ class Design(NamedTuple):
 
 
 def gains_of(
-    arm: Design, sample_time: float, bound: np.ndarray | None
+    arm: Design, sample_time: float, stiffness: float, bound: np.ndarray | None
 ) -> Mapping[str, bool | int | float | str | tuple[float, ...] | tuple[str, ...]]:
-    """Return gains and limits by the dotted name of their parameter; `bound` (n,) [rad] or None."""
+    """Return gains and limits by the dotted name of their parameter.
+
+    `stiffness` is the part of the rate omega_b that is used, `bound` (n,) [rad] or None the one
+    that is given.
+    """
     chain = arm.chain
     n = len(chain.joints)
     effort = _finite([joint.effort for joint in chain.joints], UNKNOWN_EFFORT)
@@ -68,7 +74,9 @@ def gains_of(
     lower = _finite([joint.lower for joint in chain.joints], -_FREE)
     upper = _finite([joint.upper for joint in chain.joints], _FREE)
     P = arm.parameters.of(chain.inertias, arm.rotors)
-    rate = _PHASE / loop_delay(sample_time, arm.lag)
+    fastest = _PHASE / loop_delay(sample_time, arm.lag)
+    rate = stiffness * fastest
+    usual_bound = float(f'{_BOUND / stiffness**2:.4g}')
     limits = tuple(lower), tuple(upper)
     m, gravity = over_postures(chain, arm.parameters, arm.payload, tuple(P), *limits)
     sag = _SAG * gravity / (m * rate**2)
@@ -76,15 +84,15 @@ def gains_of(
     zeros = (0.0,) * n
     return {
         'joints': tuple(joint.name for joint in chain.joints),
-        'barrier.bound': (_BOUND,) * n,
+        'barrier.bound': (usual_bound,) * n,
         'barrier.initial_bound': _listed(
-            np.where(sag > (_BOUND if bound is None else bound), sag, 0.0)
+            np.where(sag > (usual_bound if bound is None else bound), sag, 0.0)
         ),
         'barrier.funnel_rate': float(f'{rate / 20.0:.4g}'),
-        'barrier.weight': _listed(0.25 * m * rate**2),
-        'barrier.slope_limit': _listed(m * rate**2),
-        'surface.gain': (2.0 * rate,) * n,
-        'surface.mu': (0.5 * rate,) * n,
+        'barrier.weight': _listed(0.5 * m * rate**2),
+        'barrier.slope_limit': _listed(1.5 * m * rate**2),
+        'surface.gain': (0.4 * rate,) * n,
+        'surface.mu': (1.3 * rate,) * n,
         'surface.time_constant': max(sample_time, _SURFACE),
         'feedback.gain': zeros,
         'feedback.damping': zeros,
@@ -113,7 +121,7 @@ def gains_of(
         'learning.bias': False,
         'learning.viscous': True,
         'learning.coulomb': True,
-        'learning.coulomb_velocity': 0.05,
+        'learning.coulomb_velocity': 0.02,
         'comparison.surface_gain': (rate / 3.0,) * n,
         'comparison.position_gain': _listed(m * (rate / 4.0) ** 2),
         'comparison.robust_gain': zeros,
@@ -122,7 +130,7 @@ def gains_of(
         'truth.frequency': (1.0,) * n,
         'truth.phase': zeros,
         'safety.torque': 'hold_gravity',
-        'safety.damping': _listed(m * rate / 4.0),
+        'safety.damping': _listed(m * fastest / 4.0),
         'safety.velocity_limit': 3.0 * float(velocity.max()),
     }
 

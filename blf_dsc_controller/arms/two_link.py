@@ -54,6 +54,10 @@ class TwoLink(NamedTuple):
         """Units of the entries of P."""
         return ('kg m^2',) * 3
 
+    def sizes(self) -> tuple[int, int]:
+        """Return n and p, constants in kernels: their loops over two joints are unrolled."""
+        return 2, 3
+
     def regressor(self, q: Array, dq: Array, v: Array, a: Array, H: Array) -> None:
         """Fill H (2, 3) so that H P = M(q) a + C(q, dq) v + G(q)   [N m], Property III."""
         fill_regressor(self.r, angles_of(q), dq, v, a, H)
@@ -78,19 +82,27 @@ def angles_of(q: Array) -> Angles:
 
 
 @inner
-def fill_regressor(r: float, angles: Angles, dq: Array, v: Array, a: Array, H: Array) -> None:
+def fill_regressor(
+    r: float, angles: Angles, dq: Array, v: Array, a: Array, H: Array
+) -> None:
     """Compute `regressor` from the angles' sines and cosines."""
     c1, c2, s2, c12 = angles
     H[0, 0] = a[0] + r * c1
     H[0, 1] = a[0] + a[1]
-    H[0, 2] = c2 * (2.0 * a[0] + a[1]) - s2 * (dq[1] * v[0] + (dq[0] + dq[1]) * v[1]) + r * c12
+    H[0, 2] = (
+        c2 * (2.0 * a[0] + a[1])
+        - s2 * (dq[1] * v[0] + (dq[0] + dq[1]) * v[1])
+        + r * c12
+    )
     H[1, 0] = 0.0
     H[1, 1] = a[0] + a[1]
     H[1, 2] = c2 * a[0] + s2 * dq[0] * v[0] + r * c12
 
 
 @inner
-def fill_momentum_regressor(r: float, angles: Angles, dq: Array, Yp: Array, Yr: Array) -> None:
+def fill_momentum_regressor(
+    r: float, angles: Angles, dq: Array, Yp: Array, Yr: Array
+) -> None:
     """Compute `momentum_regressor` from the angles' sines and cosines."""
     c1, c2, s2, c12 = angles
     Yp[0, 0] = dq[0]
@@ -107,7 +119,9 @@ def fill_momentum_regressor(r: float, angles: Angles, dq: Array, Yp: Array, Yr: 
     Yr[1, 2] = s2 * dq[0] * (dq[0] + dq[1]) + r * c12
 
 
-def urdf(joints: Sequence[str], lengths: Sequence[float], masses: Sequence[float]) -> str:
+def urdf(
+    joints: Sequence[str], lengths: Sequence[float], masses: Sequence[float]
+) -> str:
     """Return the URDF of the arm, whose tip is the link `tip`.
 
     `lengths` and `masses` are those of the links [m] and at their ends [kg].  Point masses have a
@@ -115,7 +129,9 @@ def urdf(joints: Sequence[str], lengths: Sequence[float], masses: Sequence[float
     """
     text = '<robot name="two_link">\n  <link name="base_link" />\n'
     parent, x = 'base_link', 0.0
-    for k, (joint, length, mass) in enumerate(zip(joints, lengths, masses, strict=True), 1):
+    for k, (joint, length, mass) in enumerate(
+        zip(joints, lengths, masses, strict=True), 1
+    ):
         link = f'link{k}'
         text += f"""\
   <joint name={quoteattr(joint)} type="continuous">

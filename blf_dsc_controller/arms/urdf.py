@@ -94,14 +94,20 @@ def read_chain(text: str, base: str, tip: str, joints: tuple[str, ...]) -> Chain
         if name not in tree.joints:
             listed = _listed(tree.joints)
             raise BlfDscError(f'no joint {name!r} in the URDF: its joints are {listed}')
-    base, tip = base or tree.root, tip or _link(tree.joints[wanted[-1]], 'child')
+    base = base or tree.root
+    tip = tip or _link(tree.joints[wanted[-1]], 'child')
     path = tree.path(base, tip)
     for element in path:
-        name, kind = element.get('name', ''), element.get('type')
+        name = element.get('name', '')
+        kind = element.get('type')
         if kind not in (*_MOVING, 'fixed'):
-            raise BlfDscError(f'joint {name!r} is {kind}; expected fixed, {_listed(_MOVING)}')
+            raise BlfDscError(
+                f'joint {name!r} is {kind}; expected fixed, {_listed(_MOVING)}'
+            )
         if element.find('mimic') is not None:
-            raise BlfDscError(f'joint {name!r} mimics another: choose a base and a tip without it')
+            raise BlfDscError(
+                f'joint {name!r} mimics another: choose a base and a tip without it'
+            )
     moving = _moving(path)
     if not moving or (wanted and wanted != moving):
         raise BlfDscError(
@@ -113,9 +119,15 @@ def read_chain(text: str, base: str, tip: str, joints: tuple[str, ...]) -> Chain
     for element in path:
         frame = product(frame, _origin(element))
         if element.get('type') != 'fixed':
-            chain.append(_joint(element, frame, tree.body(_link(element, 'child'), moving)))
+            chain.append(
+                _joint(element, frame, tree.body(_link(element, 'child'), moving))
+            )
             frame = np.eye(4)
-    massless = [f'{joint.link} (moved by {joint.name})' for joint in chain if not joint.inertia[0]]
+    massless = [
+        f'{joint.link} (moved by {joint.name})'
+        for joint in chain
+        if not joint.inertia[0]
+    ]
     if massless:
         raise BlfDscError(
             f'these links have no mass, nor has anything fixed to them: {_listed(massless)}: add '
@@ -137,8 +149,11 @@ def frames(chain: Chain, q: np.ndarray) -> list[np.ndarray]:
             motion[..., :3, 3] = position * axis
         else:
             along = np.outer(axis, axis)
-            c, s = np.cos(position)[..., None], np.sin(position)[..., None]
-            motion[..., :3, :3] = along + c * (np.eye(3) - along) + s * np.cross(np.eye(3), axis)
+            c = np.cos(position)[..., None]
+            s = np.sin(position)[..., None]
+            motion[..., :3, :3] = (
+                along + c * (np.eye(3) - along) + s * np.cross(np.eye(3), axis)
+            )
         placements.append(placements[-1] @ joint.placement @ motion)
     return [*placements, placements[-1] @ chain.tip_placement]
 
@@ -162,7 +177,8 @@ class Tree(NamedTuple):
     def of(cls, text: str) -> Tree:
         """Read a URDF, in which each joint has its links, and no link two joints above it."""
         robot = _robot(text)
-        links, joints = _named(robot, 'link'), _named(robot, 'joint')
+        links = _named(robot, 'link')
+        joints = _named(robot, 'joint')
         above: dict[str, ET.Element] = {}
         for name, joint in joints.items():
             for role in ('parent', 'child'):
@@ -204,7 +220,9 @@ class Tree(NamedTuple):
 
     def trunk(self) -> tuple[str, ...]:
         """Return the moving joints from the root to where they branch, as into fingers."""
-        ends = [link for link, joint in self.above.items() if joint.get('type') in _MOVING]
+        ends = [
+            link for link, joint in self.above.items() if joint.get('type') in _MOVING
+        ]
         paths = [_moving(self.path(self.root, end)) for end in ends]
         inner = {name for path in paths for name in path[:-1]}
         leaves = [path for path in paths if path[-1] not in inner]
@@ -223,15 +241,20 @@ class Tree(NamedTuple):
 
     def body(self, link: str, joints: Sequence[str]) -> _Body:
         """Return a link with all that it carries, where no other joint than `joints` moves."""
-        J, held = _link_inertia(self.links[link]), np.zeros((4, 4))
+        J = _link_inertia(self.links[link])
+        held = np.zeros((4, 4))
         fixed: tuple[str, ...] = ()
         for name, joint in self.joints.items():
             if _link(joint, 'parent') != link or name in joints:
                 continue
-            kind, child = joint.get('type'), _link(joint, 'child')
+            kind = joint.get('type')
+            child = _link(joint, 'child')
             if kind not in (*_MOVING, 'fixed'):
-                raise BlfDscError(f'joint {name!r} on {link!r} is {kind}: remove it from the URDF')
-            frame, beyond = _origin(joint), self.body(child, joints)
+                raise BlfDscError(
+                    f'joint {name!r} on {link!r} is {kind}: remove it from the URDF'
+                )
+            frame = _origin(joint)
+            beyond = self.body(child, joints)
             J = J + moved(beyond.J, frame)
             held += moved(beyond.held if kind == 'fixed' else beyond.J, frame)
             fixed += (child, *beyond.fixed) if kind == 'fixed' else ()
@@ -240,31 +263,45 @@ class Tree(NamedTuple):
 
 def _robot(text: str) -> ET.Element:
     """Return the root element of a URDF."""
-    expand = 'expand it first: `xacro FILE > robot.urdf` (from ROS or `pip install xacro`)'
+    expand = (
+        'expand it first: `xacro FILE > robot.urdf` (from ROS or `pip install xacro`)'
+    )
     if '<!DOCTYPE' in text:  # its entities could expand to gigabytes
-        raise BlfDscError('a URDF must not have a <!DOCTYPE>: remove it, expand its entities')
+        raise BlfDscError(
+            'a URDF must not have a <!DOCTYPE>: remove it, expand its entities'
+        )
     try:
         robot = ET.fromstring(text)  # noqa: S314 - without entities
     except ET.ParseError as error:
         hint = f'; this looks like xacro, {expand}' if 'xacro:' in text else ''
-        raise BlfDscError(f'not a URDF, as it is not valid XML: {error}{hint}') from error
+        raise BlfDscError(
+            f'not a URDF, as it is not valid XML: {error}{hint}'
+        ) from error
     for element in robot.iter():
-        if 'xacro' in element.tag or any('${' in value for value in element.attrib.values()):
+        if 'xacro' in element.tag or any(
+            '${' in value for value in element.attrib.values()
+        ):
             raise BlfDscError(f'<{element.tag}> is xacro, not URDF: {expand}')
     if robot.tag != 'robot':
-        raise BlfDscError(f'the root of a URDF is <robot>, not <{robot.tag}>: give another file')
+        raise BlfDscError(
+            f'the root of a URDF is <robot>, not <{robot.tag}>: give another file'
+        )
     return robot
 
 
 def _moving(path: Sequence[ET.Element]) -> tuple[str, ...]:
-    return tuple(str(joint.get('name')) for joint in path if joint.get('type') in _MOVING)
+    return tuple(
+        str(joint.get('name')) for joint in path if joint.get('type') in _MOVING
+    )
 
 
 def _named(robot: ET.Element, tag: str) -> dict[str, ET.Element]:
     """Return the elements with a tag by name."""
     elements = robot.findall(tag)
     if len(elements) > _MOST:
-        raise BlfDscError(f'the URDF has {len(elements)} {tag}s; at most {_MOST} can be read')
+        raise BlfDscError(
+            f'the URDF has {len(elements)} {tag}s; at most {_MOST} can be read'
+        )
     named = {element.get('name', ''): element for element in elements}
     if len(named) < len(elements):
         raise BlfDscError(f'each {tag} needs a unique name; got {_listed(named)}')
@@ -272,15 +309,19 @@ def _named(robot: ET.Element, tag: str) -> dict[str, ET.Element]:
 
 
 def _joint(element: ET.Element, placement: np.ndarray, body: _Body) -> Joint:
-    name, kind = element.get('name', ''), element.get('type', '')
+    name = element.get('name', '')
+    kind = element.get('type', '')
     axis = _numbers(element.find('axis'), 'xyz', '1 0 0')
     length = float(np.sqrt((axis**2).sum()))
     if length < 1e-6:
-        raise BlfDscError(f'the axis of joint {name!r} is zero: write a direction such as 0 0 1')
+        raise BlfDscError(
+            f'the axis of joint {name!r} is zero: write a direction such as 0 0 1'
+        )
     limit = element.find('limit')
     lower, upper = -inf, inf
     if kind != 'continuous' and limit is not None:
-        lower, upper = _number(limit, 'lower'), _number(limit, 'upper')
+        lower = _number(limit, 'lower')
+        upper = _number(limit, 'upper')
         if lower >= upper:
             raise BlfDscError(
                 f'joint {name!r} has an empty range, {lower:g} to {upper:g}: correct its <limit>'
@@ -342,7 +383,9 @@ def rotational_inertia(J: np.ndarray) -> np.ndarray:
 def inertia_of(J: np.ndarray) -> np.ndarray:
     """Return the ten (10,) of a pseudo-inertia (4, 4)."""
     I = rotational_inertia(J)
-    return np.array([J[3, 3], *J[:3, 3], I[0, 0], I[0, 1], I[1, 1], I[0, 2], I[1, 2], I[2, 2]])
+    return np.array(
+        [J[3, 3], *J[:3, 3], I[0, 0], I[0, 1], I[1, 1], I[0, 2], I[1, 2], I[2, 2]]
+    )
 
 
 def _link_inertia(link: ET.Element) -> np.ndarray:
@@ -351,7 +394,9 @@ def _link_inertia(link: ET.Element) -> np.ndarray:
     if inertial is None:
         return np.zeros((4, 4))
     tensor = inertial.find('inertia')
-    entries = [_number(tensor, key) for key in ('ixx', 'ixy', 'iyy', 'ixz', 'iyz', 'izz')]
+    entries = [
+        _number(tensor, key) for key in ('ixx', 'ixy', 'iyy', 'ixz', 'iyz', 'izz')
+    ]
     mass = _number(inertial.find('mass'), 'value')
     J = pseudo_inertia(np.array([mass, 0.0, 0.0, 0.0, *entries]))
     moments = np.linalg.eigvalsh(rotational_inertia(J))
@@ -387,7 +432,9 @@ def _number(element: ET.Element | None, key: str) -> float:
     return float(_numbers(element, key, '0', 1)[0])
 
 
-def _numbers(element: ET.Element | None, key: str, default: str, count: int = 3) -> np.ndarray:
+def _numbers(
+    element: ET.Element | None, key: str, default: str, count: int = 3
+) -> np.ndarray:
     if element is None:
         element = ET.Element('')
     text = element.get(key, default)

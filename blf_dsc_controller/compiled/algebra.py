@@ -45,7 +45,11 @@ def times(k: float, a: Vector) -> Vector:
 @inner
 def cross(a: Vector, b: Vector) -> Vector:
     """Return the cross product."""
-    return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
+    return (
+        a[1] * b[2] - a[2] * b[1],
+        a[2] * b[0] - a[0] * b[2],
+        a[0] * b[1] - a[1] * b[0],
+    )
 
 
 @inner
@@ -78,8 +82,14 @@ def cholesky_factor(U: np.ndarray) -> bool:
             for i in range(row.size):
                 row[i] -= a0 * a[i]
         for k in range(j % 4, j, 4):
-            a, b, c, d = U[k, j:], U[k + 1, j:], U[k + 2, j:], U[k + 3, j:]
-            a0, b0, c0, d0 = a[0], b[0], c[0], d[0]
+            a = U[k, j:]
+            b = U[k + 1, j:]
+            c = U[k + 2, j:]
+            d = U[k + 3, j:]
+            a0 = a[0]
+            b0 = b[0]
+            c0 = c[0]
+            d0 = d[0]
             for i in range(row.size):
                 row[i] = row[i] - a0 * a[i] - b0 * b[i] - c0 * c[i] - d0 * d[i]
         pivot = row[0]
@@ -132,7 +142,9 @@ def independent_columns(Y: np.ndarray, least: float) -> tuple[np.ndarray, np.nda
     A column is dependent if less than `least` remains of it without its part along those before
     (modified Gram-Schmidt).
     """
-    rest, kept, rows = Y.copy(), [], []
+    rest = Y.copy()
+    kept = []
+    rows = []
     for k in range(Y.shape[1]):
         size = np.sqrt((rest[:, k] ** 2).sum())
         if size > least:

@@ -128,7 +128,9 @@ def tanh(x: float) -> float:
     if size < 0.55:
         z = x * x
         above = 1.0 / 3.0 + z * (0.020500386365353156 + z * 0.00019924838273231179)
-        below = 0.4615011590960552 + z * (0.023293446881950782 + z * 0.00020660907807196698)
+        below = 0.4615011590960552 + z * (
+            0.023293446881950782 + z * 0.00020660907807196698
+        )
         return x - x * z * (above / (1.0 + z * below))
     if size > 20.0:
         return copysign(1.0, x)
@@ -150,8 +152,12 @@ def power_of_two(k: int) -> float:
 
 @intrinsic
 def _power_of_two(_typing: Any, k: Any) -> Any:
-    def generate(_context: Any, builder: ir.IRBuilder, _signature: Any, args: Any) -> ir.Value:
-        exponent = builder.shl(builder.add(args[0], args[0].type(1023)), args[0].type(52))
+    def generate(
+        _context: Any, builder: ir.IRBuilder, _signature: Any, args: Any
+    ) -> ir.Value:
+        exponent = builder.shl(
+            builder.add(args[0], args[0].type(1023)), args[0].type(52)
+        )
         return builder.bitcast(exponent, ir.DoubleType())
 
     return types.float64(k), generate

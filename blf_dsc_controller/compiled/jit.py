@@ -8,7 +8,8 @@ compiled from and of the constants it uses, and of nothing else: an edit recompi
 it, and a reinstall or a second checkout finds the existing cache.
 
 The package's own folder `SHIPPED` is looked at first, and never written to when kernels run.  If
-the user's cache folder is not writable, the cache is in the folder for temporary files.
+the user's cache folder is not writable, the cache is in the folder for temporary files.  Machine
+code is loaded only from a folder of this user that nobody else can write.
 
 Compilation is announced, since the wait would look like a hang.
 """
@@ -20,6 +21,7 @@ import hashlib
 import inspect
 import os
 import shutil
+import stat
 import sys
 import tempfile
 from collections.abc import Callable, Sequence
@@ -35,7 +37,11 @@ from numba.core.types.containers import BaseNamedTuple
 from numba.extending import overload_method, register_jitable
 
 try:
-    from blf_dsc_controller.compiled.linked import KernelCache, KernelCompiler, LinkedCompiler
+    from blf_dsc_controller.compiled.linked import (
+        KernelCache,
+        KernelCompiler,
+        LinkedCompiler,
+    )
 except ImportError:  # it uses parts of numba that other releases may lack: see there
     _CACHE: Any = None
     _INNER_COMPILER: dict[str, Any] = {}
@@ -73,7 +79,10 @@ _X86_64_V3 = ('avx2', 'bmi', 'bmi2', 'f16c', 'fma', 'lzcnt', 'movbe')
 _chosen = config.CPU_NAME is not None or config.CPU_FEATURES is not None
 if not _chosen and all(map(get_host_cpu_features().get, _X86_64_V3)):
     # The same code for all these processors, about as fast, so that kernels can be shipped.
-    config.CPU_NAME, config.CPU_FEATURES = 'x86-64-v3', ''
+    config.CPU_NAME = 'x86-64-v3'
+    config.CPU_FEATURES = ''
+
+_OTHERS_WRITE = stat.S_IWGRP | stat.S_IWOTH
 
 _ROOM = Path(__file__).resolve().parents[1]
 # Layouts and arm models reach a kernel through the types of its arguments.
@@ -88,7 +97,9 @@ def dependencies(function: Callable[..., object]) -> tuple[set[Path], set[str]]:
     They are those of its module, of the modules with functions for kernels that this one imports,
     and so on.
     """
-    pending, modules, constants = [function.__module__], set(), set()
+    pending = [function.__module__]
+    modules = set()
+    constants = set()
     while pending:
         module = pending.pop()
         modules.add(module)
@@ -116,16 +127,24 @@ def cache_folder(function: Callable[..., object]) -> Path:
 def _base(chosen: str | None) -> Path:
     """Return the first folder for machine code that can be written, if need be a temporary one."""
     users = Path(os.environ.get('XDG_CACHE_HOME') or '~/.cache', 'blf_dsc_controller')
-    temporary = Path(tempfile.gettempdir(), f'blf_dsc_controller-{os.getuid()}')
-    own = [users, temporary]  # not to be another user's
-    for folder in [Path(chosen), *own] if chosen else own:
+    inside = f'blf_dsc_controller-{os.getuid()}'  # of a folder for everybody
+    folders = [users, Path(tempfile.gettempdir(), inside)]
+    if chosen:
+        folders[:0] = [Path(chosen), Path(chosen, inside)]
+    for folder in folders:
         with suppress(OSError, RuntimeError):  # read-only, full, or no home at all
             place: Path = folder.expanduser()
-            place.mkdir(mode=0o700 if folder in own else 0o777, parents=True, exist_ok=True)
-            if folder not in own or place.stat().st_uid == os.getuid():
+            place.mkdir(mode=0o700, parents=True, exist_ok=True)
+            if _is_private(place):
                 with tempfile.TemporaryFile(dir=place):
                     return place
     return Path(tempfile.mkdtemp(prefix='blf_dsc_controller-'))
+
+
+def _is_private(folder: Path) -> bool:
+    """Whether this user owns a folder, and nobody else can write it."""
+    found = folder.stat()
+    return found.st_uid == os.getuid() and not found.st_mode & _OTHERS_WRITE
 
 
 def _name(source: Path) -> str:
@@ -153,12 +172,17 @@ def compile_methods(interface: type, names: Sequence[str], *types: type) -> None
 
     `interface` declares them, `types` implement them; a kernel depends on the files of all types.
     """
+    depend_on(interface, *types)
+    for name in names:
+        _compile_method(name, inspect.signature(getattr(interface, name)))
+
+
+def depend_on(interface: type, *types: type) -> None:
+    """Let kernels that are defined from now on depend on the files of further types."""
     uses = _COMPILED.setdefault(interface.__module__, set())
     for module in (type_.__module__ for type_ in types):
         _COMPILED.setdefault(module, set())
         uses.add(module)
-    for name in names:
-        _compile_method(name, inspect.signature(getattr(interface, name)))
 
 
 def _compile_method(name: str, signature: inspect.Signature) -> None:
@@ -172,7 +196,11 @@ def _compile_method(name: str, signature: inspect.Signature) -> None:
 def kernel(function: F) -> F:
     """Compile `function` for calls from Python: IEEE arithmetic (no fast-math), cached."""
     compiled = numba.njit(
-        function, error_model='numpy', nogil=True, no_cfunc_wrapper=True, **_KERNEL_COMPILER
+        function,
+        error_model='numpy',
+        nogil=True,
+        no_cfunc_wrapper=True,
+        **_KERNEL_COMPILER,
     )
     KERNELS.append(compiled)
     if not config.DISABLE_JIT:
@@ -187,7 +215,9 @@ def direct(kernel: Callable[..., Any], *arguments: object) -> Callable[..., Any]
     """
     if config.DISABLE_JIT:
         return kernel
-    compiled: Callable[..., Any] = cast('Any', kernel).compile(tuple(map(numba.typeof, arguments)))
+    compiled: Callable[..., Any] = cast('Any', kernel).compile(
+        tuple(map(numba.typeof, arguments))
+    )
     return compiled
 
 
@@ -201,7 +231,8 @@ def _keep(kernel: Any, folder: Path) -> None:
         kernel._cache = cache  # noqa: SLF001 - as numba's enable_caching
         return
     before = config.CACHE_DIR
-    config.CACHE_DIR = str(folder)  # of a further folder in it, for the place of the source
+    # of a further folder in it, for the place of the source
+    config.CACHE_DIR = str(folder)
     try:
         kernel.enable_caching()
     finally:
@@ -213,7 +244,12 @@ def ship() -> Path:
     for each in KERNELS:
         folder = cache_folder(each)
         if folder.exists():
-            shutil.copytree(folder, SHIPPED / folder.name, dirs_exist_ok=True)
+            shutil.copytree(
+                folder,
+                SHIPPED / folder.name,
+                ignore=shutil.ignore_patterns('*.lock'),
+                dirs_exist_ok=True,
+            )
     return SHIPPED
 
 
@@ -231,7 +267,7 @@ class _Listener(event.Listener):  # type: ignore[misc]
         self._count += 1
         total = max(self._count, len(KERNELS))
         self._say(
-            f'{COMPILING}{self._count} of at most {total}, once for this version: '
+            f'{COMPILING}{self._count} of at most {total}, once for this version and kind of arm: '
             f'{kernel.py_func.__name__}'
         )
 

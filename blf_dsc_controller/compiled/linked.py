@@ -1,5 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Compilation of functions into kernels only, not on their own; the files of compiled kernels.
+"""Everything that rests on parts of numba that are not public: it is optional.
+
+It is tested with the releases `FIRST` to before `AFTER` of numba; with others, importing
+this module raises ImportError, and kernels are compiled in numba's ordinary way (`jit`,
+`views`).
 
 Numba optimises every function that a kernel calls and generates machine code for it before linking
 it into its caller, which it optimises again: a function five calls deep is compiled six times.
@@ -16,6 +20,9 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import numba
+from llvmlite import ir
+from numba.core import cgutils, types
 from numba.core.caching import CompileResultCacheImpl, FunctionCache, _CacheLocator
 from numba.core.codegen import JITCodeLibrary
 from numba.core.compiler import CompilerBase, DefaultPassBuilder
@@ -24,6 +31,17 @@ from numba.core.environment import lookup_environment
 from numba.core.errors import UnsupportedError
 from numba.core.typed_passes import NativeLowering
 from numba.core.types import NumPyRandomGeneratorType
+from numba.extending import intrinsic
+from numba.np.arrayobj import populate_array
+
+from blf_dsc_controller.compiled.file_lock import FileLock
+
+FIRST = (0, 58)
+AFTER = (0, 69)
+if not FIRST <= numba.version_info.short < AFTER:
+    raise ImportError(
+        f'numba {numba.__version__}: its private parts are not known here'
+    )
 
 _ENVIRONMENT = '_ZN08NumbaEnv'
 _ALLOCATORS = ('NRT_Allocate', 'NRT_MemInfo_alloc')
@@ -79,14 +97,18 @@ class _LowerKernel(NativeLowering):  # type: ignore[misc]
         """Lower a kernel, and set the environments of the functions in it."""
         counting = state.targetctx
         _without_reference_counts(state)
-        if any(isinstance(argument, NumPyRandomGeneratorType) for argument in state.args):
+        if any(
+            isinstance(argument, NumPyRandomGeneratorType) for argument in state.args
+        ):
             # It is allocated for the call, and freed by the wrapper that counts references.
             state.targetctx.create_cpython_wrapper = counting.create_cpython_wrapper
         changed = bool(super().run_pass(state))
         library = state.library
         module = library._final_module  # noqa: SLF001 - as numba's cache
         if any(function.name.startswith(_ALLOCATORS) for function in module.functions):
-            raise UnsupportedError(f'the kernel {state.func_id.func_name} allocates an array')
+            raise UnsupportedError(
+                f'the kernel {state.func_id.func_name} allocates an array'
+            )
         for variable in module.global_variables:
             if variable.name.startswith(_ENVIRONMENT):
                 environment = lookup_environment(variable.name)
@@ -100,7 +122,9 @@ class _Compiler(CompilerBase):  # type: ignore[misc]
 
     def define_pipelines(self) -> list[Any]:
         pipeline = PassManager(self.lowering.__name__)
-        for step, about in DefaultPassBuilder.define_nopython_pipeline(self.state).passes:
+        for step, about in DefaultPassBuilder.define_nopython_pipeline(
+            self.state
+        ).passes:
             pipeline.add_pass(self.lowering if step is NativeLowering else step, about)
         pipeline.finalize()
         return [pipeline]
@@ -132,7 +156,8 @@ class _Folder(_CacheLocator):  # type: ignore[misc]
     """A folder that holds machine code of one content of the sources."""
 
     def __init__(self, path: Path, function: Any) -> None:
-        self._path, self._line = path, function.__code__.co_firstlineno
+        self._path = path
+        self._line = function.__code__.co_firstlineno
 
     def from_function(self, _function: Any, _file: str) -> _Folder:
         return self
@@ -153,15 +178,84 @@ class _CachedCode(CompileResultCacheImpl):  # type: ignore[misc]
         super().__init__(function)
 
 
-class KernelCache(FunctionCache):  # type: ignore[misc]
-    """Machine code of a kernel in a folder, or in another one, which is only read."""
+class ShippedKernels(FunctionCache):  # type: ignore[misc]
+    """Machine code of a kernel in a folder that is only read."""
 
-    def __init__(self, function: Any, path: Path, read_only: Path | None = None) -> None:
+    def __init__(self, function: Any, path: Path) -> None:
         self._impl_class = partial(_CachedCode, path)
         super().__init__(function)
-        self._shipped = KernelCache(function, read_only) if read_only else None
+
+
+class KernelCache(FunctionCache):  # type: ignore[misc]
+    """Machine code of a kernel in a folder, or in that of the shipped kernels.
+
+    Of several processes that need a kernel at once, one compiles it; the others wait, and load it.
+    """
+
+    def __init__(self, function: Any, path: Path, shipped: Path) -> None:
+        self._impl_class = partial(_CachedCode, path)
+        super().__init__(function)
+        self._shipped = ShippedKernels(function, shipped)
+        self._lock = FileLock(path / f'{function.__name__}.lock')
 
     def load_overload(self, signature: Any, context: Any) -> Any:
-        """Return the compiled kernel, or None."""
-        shipped = self._shipped and self._shipped.load_overload(signature, context)
-        return shipped or super().load_overload(signature, context)
+        """Return the compiled kernel, or None: then the caller compiles and saves it."""
+        found = self._shipped.load_overload(signature, context)
+        found = found or super().load_overload(signature, context)
+        if found is not None:
+            return found
+        self._lock.acquire()
+        found = super().load_overload(signature, context)
+        if found is not None:
+            self._lock.release()
+        return found
+
+    def save_overload(self, signature: Any, data: Any) -> None:
+        """Write a compiled kernel, for the processes that wait for it, too."""
+        try:
+            super().save_overload(signature, data)
+        finally:
+            self._lock.release()
+
+
+@intrinsic
+def uncounted(_typing: Any, vector: Any) -> Any:
+    """Return the vector as an array whose references are not counted."""
+
+    def generate(
+        context: Any, builder: ir.IRBuilder, signature: Any, args: Any
+    ) -> ir.Value:
+        array = context.make_array(signature.return_type)(context, builder, args[0])
+        array.meminfo = cgutils.get_null_value(array.meminfo.type)
+        array.parent = cgutils.get_null_value(array.parent.type)
+        return array._getvalue()  # noqa: SLF001 - numba's own way to read a structure
+
+    return vector(vector), generate
+
+
+@intrinsic
+def part_of(_typing: Any, vector: Any, at: Any, shape: Any) -> Any:
+    """Return the contiguous part of this shape at an entry of a vector, unchecked."""
+    view = types.Array(vector.dtype, len(shape), 'C')
+
+    def generate(
+        context: Any, builder: ir.IRBuilder, signature: Any, args: Any
+    ) -> ir.Value:
+        source = context.make_array(signature.args[0])(context, builder, args[0])
+        result = context.make_array(signature.return_type)(context, builder)
+        lengths = cgutils.unpack_tuple(builder, args[2])
+        itemsize = context.get_constant(types.intp, 8)
+        strides = [itemsize]
+        for length in lengths[:0:-1]:
+            strides.insert(0, builder.mul(strides[0], length))
+        populate_array(
+            result,
+            data=builder.gep(source.data, [args[1]]),
+            shape=lengths,
+            strides=strides,
+            itemsize=itemsize,
+            meminfo=None,
+        )
+        return result._getvalue()  # noqa: SLF001
+
+    return view(vector, at, shape), generate

@@ -1,0 +1,43 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A lock that processes hold one at a time; it ends with the process that holds it."""
+
+from __future__ import annotations
+
+import fcntl
+import time
+from contextlib import suppress
+from pathlib import Path
+from typing import IO
+
+_PATIENCE = 600.0  # s: a process may have been stopped while it holds the lock
+_POLL = 0.05  # s
+
+
+class FileLock:
+    """A lock by a file, which is created; without the right to, nobody is locked out."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._file: IO[bytes] | None = None
+
+    def acquire(self) -> None:
+        """Wait until no other process holds the lock, at most ten minutes, and hold it."""
+        if self._file is not None:
+            return
+        with suppress(OSError):  # read-only or full: then several may do the same work
+            self._path.parent.mkdir(parents=True, exist_ok=True)
+            self._file = self._path.open('ab')
+        end = time.monotonic() + _PATIENCE
+        while self._file is not None and time.monotonic() < end:
+            try:
+                fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                time.sleep(_POLL)
+            else:
+                return
+
+    def release(self) -> None:
+        """Let the next process have the lock."""
+        if self._file is not None:
+            self._file.close()
+            self._file = None
