@@ -17,7 +17,9 @@ def dynamics(P, r, q, dq):
     """Return M, C, G of the two-link arm."""
     c = P[2] * np.sin(q[1])
     coupling = P[2] * np.cos(q[1])
-    M = np.array([[P[0] + P[1] + 2.0 * coupling, P[1] + coupling], [P[1] + coupling, P[1]]])
+    M = np.array(
+        [[P[0] + P[1] + 2.0 * coupling, P[1] + coupling], [P[1] + coupling, P[1]]]
+    )
     C = np.array([[-c * dq[1], -c * (dq[0] + dq[1])], [c * dq[0], 0.0]])
     outer = P[2] * r * np.cos(q[0] + q[1])
     return M, C, np.array([P[0] * r * np.cos(q[0]) + outer, outer])
@@ -25,11 +27,17 @@ def dynamics(P, r, q, dq):
 
 def regressor(r, q, dq, v, a):
     """Return H of Section IV, with cos q1 in its first gravity term."""
-    c2, s2, c12 = np.cos(q[1]), np.sin(q[1]), np.cos(q[0] + q[1])
+    c2 = np.cos(q[1])
+    s2 = np.sin(q[1])
+    c12 = np.cos(q[0] + q[1])
     coriolis = s2 * (dq[1] * v[0] + (dq[0] + dq[1]) * v[1])
     return np.array(
         [
-            [a[0] + r * np.cos(q[0]), a[0] + a[1], c2 * (2 * a[0] + a[1]) - coriolis + r * c12],
+            [
+                a[0] + r * np.cos(q[0]),
+                a[0] + a[1],
+                c2 * (2 * a[0] + a[1]) - coriolis + r * c12,
+            ],
             [0.0, a[0] + a[1], c2 * a[0] + s2 * dq[0] * v[0] + r * c12],
         ]
     )
@@ -42,10 +50,9 @@ class PlainLaw:
         self.gains = settings
         self.newton = settings.update == 1
         self.at_state = settings.compensation == 1
-        self.linear = settings.surface == 1
+        self.linear = settings.has_barrier == 0
         self.theta = settings.initial_estimate.copy()
         self.d3 = np.zeros(2)
-        self.inertia = np.ones(2)  # measured over assumed
         self.tau = np.zeros(2)
         self.alpha2 = None
         self.previous = None
@@ -70,7 +77,7 @@ class PlainLaw:
         k, _ = self.bound(t)
         edge = np.minimum(np.abs(xi1), g.knee / g.bound * k)
         inside = g.weight * edge / np.cos(np.pi * edge**2 / (2.0 * k**2)) ** 2
-        return -np.sign(xi1) * self.inertia * (inside + g.slope_limit * (np.abs(xi1) - edge))
+        return -np.sign(xi1) * (inside + g.slope_limit * (np.abs(xi1) - edge))
 
     def virtual_control(self, xi1, dqr, t):
         """Return beta2 of (18) with (15) as printed, which needs a nonzero error."""
@@ -83,12 +90,18 @@ class PlainLaw:
     def momentum_regressors(self, t, q, dq):
         """Return Yp and [Yr | D], with the columns D of the disturbance."""
         r, g = self.gains.model.r, self.gains
-        c2, s2, c12 = np.cos(q[1]), np.sin(q[1]), np.cos(q[0] + q[1])
+        c2 = np.cos(q[1])
+        s2 = np.sin(q[1])
+        c12 = np.cos(q[0] + q[1])
         both = dq[0] + dq[1]
         Yp = np.array([[dq[0], both, c2 * (dq[0] + both)], [0.0, both, c2 * dq[0]]])
-        Yr = np.array([[r * np.cos(q[0]), 0.0, r * c12], [0.0, 0.0, s2 * dq[0] * both + r * c12]])
+        Yr = np.array(
+            [[r * np.cos(q[0]), 0.0, r * c12], [0.0, 0.0, s2 * dq[0] * both + r * c12]]
+        )
         columns = [np.eye(2)] * g.bias + [np.diag(dq)] * g.viscous
-        columns += [np.eye(2) * f(w * t) for w in g.frequencies for f in (np.sin, np.cos)]
+        columns += [
+            np.eye(2) * f(w * t) for w in g.frequencies for f in (np.sin, np.cos)
+        ]
         return Yp, np.column_stack([Yr, *columns])
 
     def learn(self, t, dt, q, dq, dqr, applied):
@@ -99,10 +112,16 @@ class PlainLaw:
             X = (Yr + self.previous[1]) / 2.0
             X[:, :3] += (Yp - self.previous[0]) / dt
             pole = 1.0 - np.exp(-g.pole * dt)
-            self.pole1 = self.pole1 + pole * (np.column_stack([X, applied]) - self.pole1)
+            self.pole1 = self.pole1 + pole * (
+                np.column_stack([X, applied]) - self.pole1
+            )
             self.pole2 = self.pole2 + pole * (self.pole1 - self.pole2)
             if self.samples % g.row_interval == 0:
-                slow = np.abs(dqr) / np.hypot(dqr, g.motion_scale) if g.motion_scale else np.ones(2)
+                slow = (
+                    np.abs(dqr) / np.hypot(dqr, g.motion_scale)
+                    if g.motion_scale
+                    else np.ones(2)
+                )
                 self.push((g.row_weight * slow)[:, None] * self.pole2)
             if self.samples % g.interval == 0 and t >= g.learning_start:
                 self.latch_if_excited()
@@ -124,7 +143,7 @@ class PlainLaw:
         if eigvalsh(Phi, g.information)[0] >= g.sigma:
             self.latched = Phi, b
 
-    def adapt(self, dt, H, xi2, *, saturated):
+    def adapt(self, dt, q, H, xi2, *, saturated):
         """Update by (20), its sign corrected and projected in the Gamma metric, and by (30)."""
         g = self.gains
         v = np.zeros(g.m)
@@ -137,14 +156,19 @@ class PlainLaw:
         tracking = np.zeros(g.m)
         if not saturated:
             tracking[:3] = -(g.variance * (H.T @ xi2) + g.Wc * self.theta)[:3]
-            self.d3 = self.d3 - dt * self.inertia * g.gamma * (xi2 + g.eta * self.d3)
+            rate = g.gamma * (xi2 + g.eta * self.d3)
+            if g.follows_inertia:
+                Yp, _ = self.momentum_regressors(0.0, q, rate / g.joint_inertia)
+                rate = Yp @ g.initial_estimate[:3]
+            self.d3 = self.d3 - dt * rate
         v = g.Gamma * (v + tracking)
         by_tracking = self.theta + dt * g.Gamma * tracking
         w = self.theta[:3].copy()
         if w @ w >= g.radius**2 * (1.0 - 1e-12) and w @ v[:3] > 0.0:
             v[:3] -= g.Gamma[:3] * w * (w @ v[:3]) / (w @ (g.Gamma[:3] * w))
         self.theta = np.clip(self.theta + dt * v, g.least, g.most)
-        w, gain = self.theta[:3].copy(), np.array(g.Gamma[:3])
+        w = self.theta[:3].copy()
+        gain = np.array(g.Gamma[:3])
         if np.linalg.norm(w) > g.radius:
             # Nearest point of the ball, from the multiplier that puts it on the sphere.
             out = lambda nu: np.linalg.norm(w / (1.0 + nu * gain)) - g.radius  # noqa: E731
@@ -166,18 +190,25 @@ class PlainLaw:
         following = beta2 + (self.alpha2 - beta2) * np.exp(-dt / g.time_constant)
         dalpha2 = (following - self.alpha2) / dt
         if self.linear:
-            self.alpha2, dalpha2 = dqr - g.K * xi1, ddqr - g.K * (dq - dqr)
+            self.alpha2 = dqr - g.K * xi1
+            dalpha2 = ddqr - g.K * (dq - dqr)
         self.xi2 = xi2 = dq - self.alpha2
         self.learn(t, dt, q, dq, dqr, self.tau)
         r, P0 = g.model.r, g.initial_estimate[:3]
-        H = regressor(r, q, dq, self.alpha2, dalpha2 - g.damping_rate * xi2)
+        barrier = self.barrier_torque(xi1, t)
+        damped = dalpha2 - g.damping_rate * xi2
+        if g.follows_inertia:
+            damped = damped + barrier / g.joint_inertia
+            barrier = np.zeros(2)
+        H = regressor(r, q, dq, self.alpha2, damped)
         along = (q, dq, self.alpha2, dalpha2) if self.at_state else (qr, dqr, dqr, ddqr)
         H_r = np.zeros((2, g.m))
         H_r[:, :3] = regressor(r, *along)
         if g.viscous:
-            H_r[:, 3 + 2 * g.bias :][:, :2] = np.diag(dqr)
+            ahead = dqr + (1.5 * dt + 0.5 * g.lag) * ddqr
+            H_r[:, 3 + 2 * g.bias :][:, :2] = np.diag(ahead)
         demand = (
-            self.barrier_torque(xi1, t)
+            barrier
             - (g.d2 * np.abs(xi1) + g.mu_bar) * np.clip(xi2 / 0.01, -1.0, 1.0)
             - g.Kp * xi2
             + H @ P0
@@ -189,7 +220,7 @@ class PlainLaw:
         if self.samples:
             step = np.where(g.rate_limit > 0.0, g.rate_limit * dt, np.inf)
             torque = np.clip(torque, self.tau - step, self.tau + step)
-        self.adapt(dt, H_r, xi2, saturated=np.any(torque != demand))
+        self.adapt(dt, q, H_r, xi2, saturated=np.any(torque != demand))
         self.disturbance = self.d3 + H_r[:, 3:] @ self.theta[3:]
         self.alpha2 = following
         self.samples += 1

@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 
 from blf_dsc_controller.configuration import files
 from blf_dsc_controller.configuration.controller import ControllerConfig
-from blf_dsc_controller.configuration.files import parse
+from blf_dsc_controller.configuration.files import parse, share_folder
 from blf_dsc_controller.configuration.nodes import (
     LoopConfig,
     RecorderConfig,
@@ -35,7 +35,12 @@ from blf_dsc_controller.messages import topics
 CHANGED = LoopConfig(
     build(
         PlantConfig,
-        {'sensor.position_noise': 1e-5, 'arm.l1': 1 / 3, 'seed': 2**62, 'mode': 'lockstep'},
+        {
+            'sensor.position_noise': 1e-5,
+            'arm.l1': 1 / 3,
+            'seed': 2**62,
+            'mode': 'lockstep',
+        },
     ),
     build(
         ControllerConfig,
@@ -45,7 +50,9 @@ CHANGED = LoopConfig(
             'learning.bias': False,
         },
     ),
-    build(RecorderConfig, {'output': "it's a 'bag': #1", 'topics': ['/clock', '~/größe']}),
+    build(
+        RecorderConfig, {'output': "it's a 'bag': #1", 'topics': ['/clock', '~/größe']}
+    ),
 )
 COMMITTED = Path(__file__).parents[1] / 'doc' / 'parameters.md'
 
@@ -77,7 +84,11 @@ def with_ros(bare_node):
 
 def without_ros(path, name):
     matching = [section for section in read(path) if section.matches(name)]
-    return {key: entry.value for section in matching for key, entry in section.entries.items()}
+    return {
+        key: entry.value
+        for section in matching
+        for key, entry in section.entries.items()
+    }
 
 
 def section(pattern, content):
@@ -97,7 +108,19 @@ def problems_of(path, load=load_plant, *arguments):
 
 # As ROS.
 
-PATTERNS = ('/**', '/*', 'n', '/s/n', '/s/*', '/s/**', '/**/n', '/*/n', '/*/*', 's/t/n', '/**/t/*')
+PATTERNS = (
+    '/**',
+    '/*',
+    'n',
+    '/s/n',
+    '/s/*',
+    '/s/**',
+    '/**/n',
+    '/*/n',
+    '/*/*',
+    's/t/n',
+    '/**/t/*',
+)
 
 
 @pytest.mark.parametrize('name', ['/n', '/s/n', '/s/t/n', '/m', '/left/n'])
@@ -121,7 +144,8 @@ def test_scalars_have_the_values_and_types_of_ros(with_ros, file):
     words = [*WORDS.split(), '!!str 1', '1 2', '>-\n      yes', '|\n      12']
     lines = [f'    a{index}: {word}\n' for index, word in enumerate(words)]
     path = file('n:\n  ros__parameters:\n' + ''.join(lines))
-    ours, expected = without_ros(path, '/n'), with_ros(path, '/n')
+    ours = without_ros(path, '/n')
+    expected = with_ros(path, '/n')
     assert len(expected) == len(words)
     assert {key: repr(value) for key, value in ours.items()} == {
         key: repr(value) for key, value in expected.items()
@@ -130,13 +154,18 @@ def test_scalars_have_the_values_and_types_of_ros(with_ros, file):
 
 @pytest.mark.parametrize('node', ['sim_plant', 'blf_dsc_controller', 'bag_recorder'])
 @pytest.mark.parametrize('preset', ['panda', 'noisy', None])
-def test_presets_and_written_files_have_the_values_of_ros(with_ros, tmp_path, preset, node):
+def test_presets_and_written_files_have_the_values_of_ros(
+    with_ros, tmp_path, preset, node
+):
     path = tmp_path / 'run.yaml' if preset is None else locate(preset)
     if preset is None:
         dump(path, CHANGED.by_node)
-    ours, expected = without_ros(path, f'/{node}'), with_ros(path, f'/{node}')
+    ours = without_ros(path, f'/{node}')
+    expected = with_ros(path, f'/{node}')
     # rclpy has no type for an empty list and leaves it unset.
-    assert {key: value or None if value == [] else value for key, value in ours.items()} == expected
+    assert {
+        key: value or None if value == [] else value for key, value in ours.items()
+    } == expected
 
 
 MALFORMED = [
@@ -145,29 +174,49 @@ MALFORMED = [
     ('a:\n\tb: 1\n', 'line 2: not valid YAML'),
     ('n:\n  seed: 1\n', 'line 2: seed has a value, but is outside of ros__parameters'),
     ('n:\n', 'line 1: n has a value, but is outside of ros__parameters'),
-    ('n:\n  ros_parameters: {seed: 1}\n', 'line 2: seed has a value, but is outside of ros__p'),
+    (
+        'n:\n  ros_parameters: {seed: 1}\n',
+        'line 2: seed has a value, but is outside of ros__p',
+    ),
     ('n:\n  ros__parameters:\n', 'line 2: ros__parameters of /n has no parameters'),
     ('n:\n  ros__parameters:\n    seed:\n', 'line 3: seed has no value'),
     (section('n', 'a: [1, 2.0]'), 'line 2: a mixes types'),
     (section('n', 'a: [[1], [2]]'), 'line 2: a has a list in a list'),
     (section('n', 'a: &x 1, b: *x'), 'line 2: ROS does not support the alias'),
     (section('n-1', 'a: 1'), 'line 2: /n-1 is not a valid node name'),
-    ('s:\n  /n:\n    ros__parameters: {a: 1}\n', 'line 3: /s//n is not a valid node name'),
-    (section('n', 'a: 1') + '  m: {b: 1}\n', 'line 3: ros__parameters and m cannot be n'),
+    (
+        's:\n  /n:\n    ros__parameters: {a: 1}\n',
+        'line 3: /s//n is not a valid node name',
+    ),
+    (
+        section('n', 'a: 1') + '  m: {b: 1}\n',
+        'line 3: ros__parameters and m cannot be n',
+    ),
 ]
 IGNORED = [
     ('# a comment\n', 'line 1: the file is empty'),
     ('n:\n  ros__parameters: {a: 1}\n---\nm: {}\n', 'line 3: not valid YAML'),
-    ('n:\n  ros__parameters:\n    a: 1\n    a: 2\n', 'line 4: a is repeated, first given on l'),
-    ('n:\n  ros__parameters:\n    a.b: 1\n    a:\n      b: 2\n', 'line 5: a.b is repeated, f'),
-    ('n:\n  ros__parameters: {a: 1}\nn:\n  ros__parameters: {b: 1}\n', 'line 3: n is repeated'),
+    (
+        'n:\n  ros__parameters:\n    a: 1\n    a: 2\n',
+        'line 4: a is repeated, first given on l',
+    ),
+    (
+        'n:\n  ros__parameters:\n    a.b: 1\n    a:\n      b: 2\n',
+        'line 5: a.b is repeated, f',
+    ),
+    (
+        'n:\n  ros__parameters: {a: 1}\nn:\n  ros__parameters: {b: 1}\n',
+        'line 3: n is repeated',
+    ),
     (section('n', 'a: {}'), 'line 2: a has no parameters'),
 ]
 """What ROS would silently ignore, or read in part."""
 
 
 @pytest.mark.parametrize(('text', 'message'), MALFORMED + IGNORED)
-def test_malformed_file_is_rejected_with_its_line_and_by_ros(with_ros, file, text, message):
+def test_malformed_file_is_rejected_with_its_line_and_by_ros(
+    with_ros, file, text, message
+):
     path = file(text)
     (problem,) = problems_of(path)
     assert problem.startswith(message)
@@ -184,7 +233,9 @@ def test_configuration_of_a_run_round_trips(tmp_path):
     assert load_loop(path) == CHANGED
     dump(path, {'/left/sim_plant': CHANGED.plant})
     assert load(path, '/left/sim_plant', PlantConfig) == CHANGED.plant
-    with pytest.raises(ConfigurationError, match='/left/sim_plant does not match /right/sim'):
+    with pytest.raises(
+        ConfigurationError, match='/left/sim_plant does not match /right/sim'
+    ):
         load(path, '/right/sim_plant', PlantConfig)
 
 
@@ -210,10 +261,13 @@ def test_formatted_values_round_trip_here_and_through_pyyaml(value):
 
 
 def test_parameter_page_is_what_its_command_writes(tmp_path):
-    page, module = tmp_path / 'parameters.md', 'blf_dsc_controller.configuration.nodes'
+    page = tmp_path / 'parameters.md'
+    module = 'blf_dsc_controller.configuration.nodes'
     committed = COMMITTED.read_text(encoding='utf-8')
     page.write_text(committed.partition('| `')[0], encoding='utf-8')
-    subprocess.run([sys.executable, '-m', module, str(page)], check=True, cwd=COMMITTED.parents[1])
+    subprocess.run(
+        [sys.executable, '-m', module, str(page)], check=True, cwd=COMMITTED.parents[1]
+    )
     assert committed == page.read_text(encoding='utf-8'), (
         'run: python -m blf_dsc_controller.configuration.nodes doc/parameters.md'
     )
@@ -234,9 +288,12 @@ def test_topic_page_lists_every_topic_with_its_type():
 
 
 @pytest.mark.parametrize(
-    ('pattern', 'node'), [('sim_plant', '/left/sim_plant'), ('/*/sim_plant', '/sim_plant')]
+    ('pattern', 'node'),
+    [('sim_plant', '/left/sim_plant'), ('/*/sim_plant', '/sim_plant')],
 )
-def test_section_meant_for_the_node_that_ros_would_ignore_is_rejected(file, pattern, node):
+def test_section_meant_for_the_node_that_ros_would_ignore_is_rejected(
+    file, pattern, node
+):
     """Unless the file has another one for it."""
     text = section(pattern, 'seed: 7')
     remedy = f'does not match {node}: write /**/sim_plant for the node in any namespace'
@@ -254,14 +311,21 @@ def test_overrides_take_precedence_over_the_file(file):
     ]
 
 
-def test_unknown_names_are_rejected_and_those_of_other_nodes_only_in_their_own_section(file):
-    assert problems_of(file(section('sim_plant', 'barrier.bound: [1.0, 1.0], sed: 1'))) == [
+def test_unknown_names_are_rejected_and_those_of_other_nodes_only_in_their_own_section(
+    file,
+):
+    assert problems_of(
+        file(section('sim_plant', 'barrier.bound: [1.0, 1.0], sed: 1'))
+    ) == [
         'line 2: barrier.bound: unknown parameter',
         'line 2: sed: unknown parameter, did you mean seed?',
     ]
     path = file(section('/**', 'barrier.bound: [1.0, 1.0], seed: 4'))
     assert load_plant(path).seed == 4
-    assert load(path, 'blf_dsc_controller', ControllerConfig).barrier.bound == (1.0, 1.0)
+    assert load(path, 'blf_dsc_controller', ControllerConfig).barrier.bound == (
+        1.0,
+        1.0,
+    )
     assert problems_of(file(section('/**', 'barrier.bond: [1.0, 1.0], seed: 4'))) == [
         'line 2: barrier.bond: unknown parameter, did you mean barrier.bound?'
     ]
@@ -277,7 +341,9 @@ def test_missing_file_error_lists_the_presets(tmp_path):
             locate(name)
         assert str(name) in str(caught.value)
         assert re.search('a preset: .*noisy.* recommended', str(caught.value))
-    with pytest.raises(ConfigurationError, match=r'did you mean recommended\? give a parameter'):
+    with pytest.raises(
+        ConfigurationError, match=r'did you mean recommended\? give a parameter'
+    ):
         load_loop('recomended')
     (tmp_path / 'binary.yaml').write_bytes(b'\xff\xfe\x00')
     for file in ('absent.yaml', 'binary.yaml'):
@@ -315,11 +381,18 @@ def test_nodes_of_a_loop_agree_on_sample_time_and_joints(file):
     path = file(section('sim_plant', 'sample_time: 0.002'))
     (problem,) = problems_of(path, load_loop)
     assert problem.startswith('sample_time: sim_plant has 0.002 s, but')
-    given = {'blf_dsc_controller': {'sample_time': 0.002}, 'sim_plant': {'mode': 'lockstep'}}
+    given = {
+        'blf_dsc_controller': {'sample_time': 0.002},
+        'sim_plant': {'mode': 'lockstep'},
+    }
     loop = load_loop(path, given)
     assert (loop.controller.sample_time, loop.plant.mode) == (0.002, 'lockstep')
-    (problem,) = problems_of(file(section('sim_plant', 'joints: [joint1, elbow]')), load_loop)
-    assert problem.startswith('joints: sim_plant has joint1, elbow, but blf_dsc_controller has')
+    (problem,) = problems_of(
+        file(section('sim_plant', 'joints: [joint1, elbow]')), load_loop
+    )
+    assert problem.startswith(
+        'joints: sim_plant has joint1, elbow, but blf_dsc_controller has'
+    )
     swapped = load_loop(file(section('sim_plant', 'joints: [joint2, joint1]')))
     assert swapped.plant.joints != swapped.controller.joints
 
@@ -328,17 +401,26 @@ def test_misspelt_node_name_is_reported(file):
     assert problems_of(file(section('sim_plnat', 'seed: 1')), load_loop) == [
         'line 2: unknown node sim_plnat, did you mean sim_plant?'
     ]
-    loop = load_loop(file(section('sim_plant', 'seed: 1') + section('sim_plant2', 'seed: 2')))
+    loop = load_loop(
+        file(section('sim_plant', 'seed: 1') + section('sim_plant2', 'seed: 2'))
+    )
     assert loop.plant.seed == 1
-    (problem,) = problems_of(file(section('/left/bag_recorder', 'output: here')), load_loop)
+    (problem,) = problems_of(
+        file(section('/left/bag_recorder', 'output: here')), load_loop
+    )
     assert '/left/bag_recorder does not match /bag_rec' in problem
-    assert load_loop(file(section('robot_state_publisher', 'a: 1'))).plant == PlantConfig()
+    assert (
+        load_loop(file(section('robot_state_publisher', 'a: 1'))).plant == PlantConfig()
+    )
 
 
 @pytest.mark.parametrize('prefix', ['source', 'prefix/share/blf_dsc_controller'])
-def test_files_are_those_of_the_source_tree_or_of_the_prefix(tmp_path, monkeypatch, prefix):
+def test_files_are_those_of_the_source_tree_or_of_the_prefix(
+    tmp_path, monkeypatch, prefix
+):
     """And never those of the current folder."""
-    here, installed = tmp_path / 'here', tmp_path / 'prefix/lib/python3/site-packages'
+    here = tmp_path / 'here'
+    installed = tmp_path / 'prefix/lib/python3/site-packages'
     own = installed if prefix == 'source' else tmp_path / prefix
     monkeypatch.setattr(files, '_ABOVE', [installed, *installed.parents[:3]])
     (here / 'config').mkdir(parents=True)
@@ -350,3 +432,27 @@ def test_files_are_those_of_the_source_tree_or_of_the_prefix(tmp_path, monkeypat
     (own / 'config').mkdir(parents=True)
     (own / 'config/recommended.yaml').touch()
     assert files.share_folder() == own
+
+
+def test_wrong_joints_are_reported_with_their_own_line(tmp_path):
+    path = tmp_path / 'given.yaml'
+    path.write_text(
+        '/**:\n  ros__parameters:\n    robot: {urdf: panda.urdf, tip: panda_hand_tcp}\n'
+        '    joints: [panda_joint1, wrist]\n'
+    )
+    with pytest.raises(ConfigurationError, match="line 4: joints: no joint 'wrist'"):
+        load_loop(path)
+
+
+def test_missing_urdf_is_reported_with_the_places_where_it_was_looked_for(
+    tmp_path, monkeypatch
+):
+    monkeypatch.chdir(tmp_path)
+    path = tmp_path / 'given.yaml'
+    path.write_text(
+        '/**:\n  ros__parameters:\n    robot: {urdf: no.urdf, tip: tool0}\n'
+    )
+    with pytest.raises(ConfigurationError) as error:
+        load_loop(path)
+    own = share_folder() / 'config' / 'no.urdf'
+    assert f'there is no {tmp_path / "no.urdf"}, nor {own}' in str(error.value)

@@ -16,7 +16,9 @@ from blf_dsc_controller.errors import ConfigurationError
 from blf_dsc_controller.law import factory, state
 
 TRUE_MODEL = {'law': 'model_based', 'truth.parameters': [1.0, 0.32, 0.4]}
-PLANT, CONTROLLER, BOTH = (PlantConfig,), (ControllerConfig,), (PlantConfig, ControllerConfig)
+PLANT = (PlantConfig,)
+CONTROLLER = (ControllerConfig,)
+BOTH = (PlantConfig, ControllerConfig)
 
 
 def problems_of(cls, given):
@@ -26,12 +28,19 @@ def problems_of(cls, given):
 
 
 def of_one_joint(cls):
-    arrays = (each for each in parameters(cls) if {'joints'} & {each.name, *each.length})
+    arrays = (
+        each for each in parameters(cls) if {'joints'} & {each.name, *each.length}
+    )
     return {each.name: each.default[:1] for each in arrays}
 
 
 def test_values_are_kept_and_flattened_and_a_change_keeps_the_others():
-    given = {'duration': 2.5, 'disturbance.viscous': (3.0, 0.0), 'mode': 'lockstep', 'seed': 5}
+    given = {
+        'duration': 2.5,
+        'disturbance.viscous': (3.0, 0.0),
+        'mode': 'lockstep',
+        'seed': 5,
+    }
     built = build(PlantConfig, given)
     assert built.disturbance.viscous == (3.0, 0.0)
     assert dict(flatten(PlantConfig()), **given) == flatten(built)
@@ -66,10 +75,22 @@ def test_limits_are_inclusive_and_arrays_as_long_as_others_say():
     ('classes', 'given', 'message'),
     [
         # Names.
-        (PLANT, {'sensr.offset': [1.0, 1.0]}, 'unknown parameter, did you mean sensor.offset?'),
+        (
+            PLANT,
+            {'sensr.offset': [1.0, 1.0]},
+            'unknown parameter, did you mean sensor.offset?',
+        ),
         # Types. ROS does not accept an integer for a double, nor does a run without ROS.
-        (PLANT, {'duration': 1}, 'got 1, but a double is expected, with a decimal point'),
-        (PLANT, {'load.torque': [1, 2]}, 'got [1, 2], but a double array is expected, with a dec'),
+        (
+            PLANT,
+            {'duration': 1},
+            'got 1, but a double is expected, with a decimal point',
+        ),
+        (
+            PLANT,
+            {'load.torque': [1, 2]},
+            'got [1, 2], but a double array is expected, with a dec',
+        ),
         (PLANT, {'duration': '1'}, 'got "1", but a double is expected'),
         (PLANT, {'duration': True}, 'got true, but a double is expected'),
         (PLANT, {'seed': True}, 'got true, but an integer is expected'),
@@ -77,16 +98,44 @@ def test_limits_are_inclusive_and_arrays_as_long_as_others_say():
         (PLANT, {'publish_clock': 1}, 'got 1, but a bool is expected'),
         (PLANT, {'mode': 3}, 'got 3, but a string is expected'),
         (PLANT, {'duration': None}, 'got null, but a double is expected'),
-        (PLANT, {'load.torque': 1.0}, 'got 1.0, but a double array is expected: write a list, lik'),
-        (PLANT, {'joints': 'xy'}, 'got "xy", but a string array is expected: write a list, like'),
+        (
+            PLANT,
+            {'load.torque': 1.0},
+            'got 1.0, but a double array is expected: write a list, lik',
+        ),
+        (
+            PLANT,
+            {'joints': 'xy'},
+            'got "xy", but a string array is expected: write a list, like',
+        ),
         (PLANT, {'joints': ['x', 1]}, 'got ["x", 1], but a string array is expected'),
         # Ranges.
         (PLANT, {'arm.l1': 0.0}, 'got 0.0, but it must be above 0 m'),
-        (PLANT, {'truth.mass_deviation': 1.0}, 'got 1.0, but it must be at least 0 and below 1'),
-        (PLANT, {'actuator.delay': -1}, 'got -1, but it must be at least 0 and at most 1000 sam'),
-        (PLANT, {'actuator.delay': 1001}, 'got 1001, but it must be at least 0 and at most 1000'),
-        (PLANT, {'mode': 'slow'}, 'got "slow", but it must be one of realtime, lockstep'),
-        (PLANT, {'disturbance.coulomb': [1.0, -0.5]}, 'got -0.5 at entry 2 of [1.0, -0.5], but it'),
+        (
+            PLANT,
+            {'truth.mass_deviation': 1.0},
+            'got 1.0, but it must be at least 0 and below 1',
+        ),
+        (
+            PLANT,
+            {'actuator.delay': -1},
+            'got -1, but it must be at least 0 and at most 1000 sam',
+        ),
+        (
+            PLANT,
+            {'actuator.delay': 1001},
+            'got 1001, but it must be at least 0 and at most 1000',
+        ),
+        (
+            PLANT,
+            {'mode': 'slow'},
+            'got "slow", but it must be one of realtime, lockstep',
+        ),
+        (
+            PLANT,
+            {'disturbance.coulomb': [1.0, -0.5]},
+            'got -0.5 at entry 2 of [1.0, -0.5], but it',
+        ),
         (PLANT, {'duration': float('nan')}, 'got .nan, but a finite number is needed'),
         (
             PLANT,
@@ -95,13 +144,21 @@ def test_limits_are_inclusive_and_arrays_as_long_as_others_say():
         ),
         # Lengths.
         (BOTH, {'joints': []}, 'got an empty list, but at least one entry is needed'),
-        (PLANT, {'load.torque': [1.0]}, 'got 1, but 2 entries are needed (2 of joints)'),
+        (
+            PLANT,
+            {'load.torque': [1.0]},
+            'got 1, but 2 entries are needed (2 of joints)',
+        ),
         (
             PLANT,
             {'events.force': [1.0], 'events.begin': [1.0]},
             'got 1, but 3 entries are needed (1 of',
         ),
-        (CONTROLLER, {'reference.phase': [0.0, 1.0]}, 'got 2, but 1 entries are needed (1 of refe'),
+        (
+            CONTROLLER,
+            {'reference.phase': [0.0, 1.0]},
+            'got 2, but 1 entries are needed (1 of refe',
+        ),
         # What parameters have to do with each other.
         (BOTH, {'joints': ['elbow', 'elbow']}, "the name 'elbow' is repeated"),
         (PLANT, of_one_joint(PlantConfig), 'got 1, but'),
@@ -111,7 +168,11 @@ def test_limits_are_inclusive_and_arrays_as_long_as_others_say():
             {'sample_time': 1 / 3000},
             f'got {1 / 3000} s, not a whole number of nanoseconds: write 0.000333333',
         ),
-        (PLANT, {'duration': 0.0005}, 'got 0.0005 s, shorter than one sample of 0.001 s'),
+        (
+            PLANT,
+            {'duration': 0.0005},
+            'got 0.0005 s, shorter than one sample of 0.001 s',
+        ),
         (
             CONTROLLER,
             {
@@ -126,10 +187,26 @@ def test_limits_are_inclusive_and_arrays_as_long_as_others_say():
             {'learning.radius': 5.0, 'learning.initial_estimate': [3.0, 0.0, 4.0]},
             'got 5 kg m^2, but learning.initial_estimate has a norm of 5 kg m^2',
         ),
-        (CONTROLLER, {'learning.radius': 1.1, **TRUE_MODEL}, 'got 1.1 kg m^2, but truth.paramet'),
-        (CONTROLLER, {'learning.window': 0.009}, 'got 0.009 s, which is 9 samples of 0.001'),
-        (CONTROLLER, {'learning.window': 1000.001}, 'got 1000 s, which is 1000001 samples'),
-        (CONTROLLER, {'truth.parameters': [1.0, 0.3]}, 'got 2, but model two_link has 3'),
+        (
+            CONTROLLER,
+            {'learning.radius': 1.1, **TRUE_MODEL},
+            'got 1.1 kg m^2, but truth.paramet',
+        ),
+        (
+            CONTROLLER,
+            {'learning.window': 0.009},
+            'got 0.009 s, which is 9 samples of 0.001',
+        ),
+        (
+            CONTROLLER,
+            {'learning.window': 1000.001},
+            'got 1000 s, which is 1000001 samples',
+        ),
+        (
+            CONTROLLER,
+            {'truth.parameters': [1.0, 0.3]},
+            'got 2, but model two_link has 3',
+        ),
         (
             CONTROLLER,
             {'barrier.slope_limit': [2e4, 2e4], 'barrier.weight': [1e3, 2e4]},
@@ -150,7 +227,11 @@ def test_limits_are_inclusive_and_arrays_as_long_as_others_say():
             {'truth.parameters': [], 'law': 'model_based'},
             'got none, but the law model_based needs them',
         ),
-        (CONTROLLER, {'reference.times': [], 'reference.type': 'waypoints'}, 'got none'),
+        (
+            CONTROLLER,
+            {'reference.times': [], 'reference.type': 'waypoints'},
+            'got none',
+        ),
         (
             CONTROLLER,
             {'reference.times': [2.0, 2.0], 'reference.points': [0.0] * 4},
@@ -162,10 +243,16 @@ def test_limits_are_inclusive_and_arrays_as_long_as_others_say():
             'got 1 rad for joint2, but it must be above',
         ),
         # Of an arm that cannot be read, no lengths are known.
-        (BOTH, {'robot.urdf': 'no.urdf', 'joints': ['a'] * 7}, "'no.urdf' cannot be read"),
+        (
+            BOTH,
+            {'robot.urdf': 'no.urdf', 'joints': ['a'] * 7},
+            "'no.urdf' cannot be read",
+        ),
     ],
 )
-def test_invalid_value_is_rejected_with_what_it_is_and_what_is_expected(classes, given, message):
+def test_invalid_value_is_rejected_with_what_it_is_and_what_is_expected(
+    classes, given, message
+):
     name = next(iter(given))
     for cls in classes:
         (problem,) = problems_of(cls, given)
@@ -173,12 +260,16 @@ def test_invalid_value_is_rejected_with_what_it_is_and_what_is_expected(classes,
 
 
 def test_problems_of_all_parameters_are_reported_at_once():
-    found = problems_of(PlantConfig, {'bogus': 1, 'joints': ['a', 'b', 'c'], 'load.force': [1.0]})
+    found = problems_of(
+        PlantConfig, {'bogus': 1, 'joints': ['a', 'b', 'c'], 'load.force': [1.0]}
+    )
     assert found[0] == 'bogus: unknown parameter'
     assert 'load.force: got 1, but 3 entries are needed (3)' in found
     assert 'load.torque: got 2, but 3 entries are needed (3 of joints)' in found
     found = problems_of(ControllerConfig, {'reference.frequency': [1.0, 2.0], 'zzz': 1})
-    lengths = 'got 2, but 4 entries are needed (2 of joints times 2 of reference.frequency)'
+    lengths = (
+        'got 2, but 4 entries are needed (2 of joints times 2 of reference.frequency)'
+    )
     assert found[:2] == ['zzz: unknown parameter', f'reference.amplitude: {lengths}']
     assert found[2].startswith('reference.phase: got 1, but 2 entries are needed')
     found = problems_of(PlantConfig, {'duration': 0.0005, 'bogus': 1})
@@ -186,7 +277,11 @@ def test_problems_of_all_parameters_are_reported_at_once():
 
 
 def test_recommended_preset_equals_the_defaults():
-    assert load_loop('recommended') == (PlantConfig(), ControllerConfig(), RecorderConfig())
+    assert load_loop('recommended') == (
+        PlantConfig(),
+        ControllerConfig(),
+        RecorderConfig(),
+    )
 
 
 def test_choices_match_the_law():
@@ -213,3 +308,12 @@ def test_valid_values_are_not_put_into_words(monkeypatch):
         schema, 'format_value', lambda _: pytest.fail('a valid value was formatted')
     )
     assert change(config, {'telemetry.decimation': 3}).telemetry.decimation == 3
+
+
+@pytest.mark.parametrize(('given', 'kept'), [(True, 'on'), (False, 'off')])
+def test_on_and_off_may_be_written_without_quotes(given, kept):
+    """YAML reads them as true and false."""
+    config = build(ControllerConfig, {'safety.watchdog': given})
+    assert config.safety.watchdog == kept
+    with pytest.raises(ConfigurationError, match='got true, but a string is expected'):
+        build(ControllerConfig, {'safety.torque': True})

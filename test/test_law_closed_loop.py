@@ -5,7 +5,14 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from closed_loop_case import REFERENCE, closed_loop, controller, plant, quick, recommended
+from closed_loop_case import (
+    REFERENCE,
+    closed_loop,
+    controller,
+    plant,
+    quick,
+    recommended,
+)
 from paper_case import BOUND, EXACT, NO_DISTURBANCE, P, configured, run_preset
 from plain_law import PlainLaw, R, dynamics, regressor
 from plants import QUIET, START
@@ -32,7 +39,8 @@ def test_recommended_loop_keeps_half_the_bound_and_finds_the_parameters():
 
 def test_arm_beyond_its_bound_comes_back():
     """There the paper's law is not defined; the barrier continues as a straight line."""
-    law, arm = controller(recommended()), plant(start=(2.2935 + 0.004, 1.6961 - 0.004))
+    law = controller(recommended())
+    arm = plant(start=(2.2935 + 0.004, 1.6961 - 0.004))
     errors = np.array([np.abs(law.signals.xi1) for _ in closed_loop(law, arm, 1.0)])
     assert errors[0].min() > 1.9 * BOUND
     assert errors[100:].max() < 0.5 * BOUND
@@ -54,12 +62,18 @@ def test_lyapunov_function_decreases_from_sample_to_sample(kappa, compensation):
     """
     form = CHOICES['compensation'].index(compensation)
     gains = {'kappa': kappa, 'gamma': np.full(2, 1.0), 'compensation': form}
-    known = {'truth_known': 1, 'true_parameters': P, 'true_disturbance': np.zeros((4, 2))}
+    known = {
+        'truth_known': 1,
+        'true_parameters': P,
+        'true_disturbance': np.zeros((4, 2)),
+    }
     law = controller(recommended(bias=False, bumpless=0, **gains, **known))
     V, power = [], []
     for sample in closed_loop(law, plant(constant=QUIET, amplitude=QUIET), 10.0):
         V.append(law.sample.lyapunov.sum())
-        power.append(power_of_the_initial_model(law, *sample.measurement.reshape(3, 2)[:2]))
+        power.append(
+            power_of_the_initial_model(law, *sample.measurement.reshape(3, 2)[:2])
+        )
     V, power = np.array(V), np.array(power)
 
     assert (np.abs(power).max() > 1e-3) == (compensation == 'reference')
@@ -70,7 +84,9 @@ def test_lyapunov_function_decreases_from_sample_to_sample(kappa, compensation):
         assert V[-1] < 0.1 * V[6000]
 
 
-END, RHO, KAPPA = 0.5, 1e-5, 20.0
+END = 0.5
+RHO = 1e-5
+KAPPA = 20.0
 PHI = np.array([[60.0, 5.0, 20.0], [5.0, 1.0, 2.0], [20.0, 2.0, 9.0]])
 TIMES = np.linspace(0.0, END, 11)
 
@@ -82,9 +98,12 @@ def derivative(t, y, plain):
     ((qr, dqr, ddqr),) = sampled(REFERENCE, np.array([t]))
     xi1, xi2 = q - qr, dq - alpha2
     dalpha2 = (plain.virtual_control(xi1, dqr, t) - alpha2) / g.time_constant
-    H, H_r = regressor(R, q, dq, alpha2, dalpha2), regressor(R, qr, dqr, dqr, ddqr)
+    H = regressor(R, q, dq, alpha2, dalpha2)
+    H_r = regressor(R, qr, dqr, dqr, ddqr)
     P0 = 0.5 * P
-    torque = H @ P0 + H_r @ (estimate - P0) + d3 - g.Kp * xi2 + plain.barrier_torque(xi1, t)
+    torque = (
+        H @ P0 + H_r @ (estimate - P0) + d3 - g.Kp * xi2 + plain.barrier_torque(xi1, t)
+    )
     M, C, G = dynamics(P, R, q, dq)
     ddq = np.linalg.solve(M, torque - C @ dq - G - 0.1 - 0.1 * np.sin(t))
     eps = np.linalg.solve(PHI + RHO * np.eye(3), PHI @ (P - estimate))
@@ -100,14 +119,17 @@ def continuous(settings):
     alpha2 = plain.virtual_control(start - qr, dqr, 0.0)
     y = np.concatenate([start, np.zeros(2), alpha2, 0.5 * P, np.zeros(2)])
     tolerance = {'method': 'LSODA', 'rtol': 1e-10, 'atol': 1e-13}
-    solution = solve_ivp(derivative, (0.0, END), y, t_eval=TIMES, args=(plain,), **tolerance)
+    solution = solve_ivp(
+        derivative, (0.0, END), y, t_eval=TIMES, args=(plain,), **tolerance
+    )
     assert solution.success
     return solution.y[[0, 1, 6, 7, 8]]
 
 
 def of_samples(dt, settings):
     """The same for the sampled loop with the package's own kernels."""
-    law, arm = controller(settings), plant(sample_time=dt)
+    law = controller(settings)
+    arm = plant(sample_time=dt)
     law.state.latched[0] = 1.0
     law.state.Phi[:], law.state.b[:] = PHI, PHI @ P
     law.state.factor[:] = PHI + RHO * np.eye(3)
@@ -123,12 +145,20 @@ def of_samples(dt, settings):
 
 def test_sampled_loop_converges_to_the_continuous_one_at_first_order():
     """Halve the sample time three times; held torque and Euler adaptation are of first order."""
-    learning = {'Gamma': np.full(3, 0.5), 'kappa': KAPPA, 'learning_start': 1e9, 'window': 10}
+    learning = {
+        'Gamma': np.full(3, 0.5),
+        'kappa': KAPPA,
+        'learning_start': 1e9,
+        'window': 10,
+    }
     settings = recommended(bias=False, **learning)
     exact = continuous(settings)
     steps = (1e-3, 5e-4, 2.5e-4, 1.25e-4)
-    errors = np.array([np.abs(of_samples(dt, settings) - exact).max(axis=1) for dt in steps])
-    errors = np.column_stack((errors[:, :2].max(1), errors[:, 2:].max(1)))  # positions, estimates
+    errors = np.array(
+        [np.abs(of_samples(dt, settings) - exact).max(axis=1) for dt in steps]
+    )
+    # positions, estimates
+    errors = np.column_stack((errors[:, :2].max(1), errors[:, 2:].max(1)))
     order = np.log2(errors[:-1] / errors[1:])
     assert np.all(order > 0.9), (errors, order)
     assert np.all(errors[-1] < 0.15 * errors[0])
@@ -147,7 +177,8 @@ def test_first_latch_disturbs_neither_the_tracking_nor_the_disturbance_estimate(
         run_preset(end, law={'learning.bumpless': choice}) for choice in (True, False)
     )
     off, late = (
-        np.abs(loop.controller.state.disturbance - true).max() for loop in (bumpless, paper)
+        np.abs(loop.controller.state.disturbance - true).max()
+        for loop in (bumpless, paper)
     )
     assert bumpless.parameter_error[np.searchsorted(bumpless.t, LATCH - 0.1)] > 0.1
     assert bumpless.parameter_error[-1] < 1e-3
@@ -157,7 +188,9 @@ def test_first_latch_disturbs_neither_the_tracking_nor_the_disturbance_estimate(
     assert late > 0.1
 
 
-@pytest.mark.parametrize(('preset', 'bound'), [('recommended', 0.01e-3), ('noisy', 0.05e-3)])
+@pytest.mark.parametrize(
+    ('preset', 'bound'), [('recommended', 0.01e-3), ('noisy', 0.05e-3)]
+)
 def test_learned_friction_is_compensated(preset, bound):
     with_columns = run_preset(30.0, preset=preset, plant=FRICTION, law=COLUMNS)
     without = run_preset(30.0, preset=preset, plant=FRICTION)
@@ -185,16 +218,21 @@ def samples(law, **changes):
 
 @pytest.mark.parametrize('law', ['blf_dsc', 'backstepping'])
 def test_terms_are_those_of_equation_29(law):
-    Gamma, gamma = np.array([0.5, 2.0, 1.5]), np.array([40.0, 10.0])
+    Gamma = np.array([0.5, 2.0, 1.5])
+    gamma = np.array([40.0, 10.0])
     w = np.array([800.0, 300.0] if law == 'blf_dsc' else [25.0, 9.0])
     for t, running, measurement in samples(law, **GAINS):
         sample = running.sample
         xi1, xi2 = sample.xi1, sample.xi2
         M, _, _ = dynamics(P, 9.8, measurement[:2], measurement[2:4])
         tau_dist = 0.1 + 0.1 * np.sin(t + np.array([0.0, 0.4]))
-        error, disturbance = 0.5 * np.sum(w * xi1**2), 0.0  # (35) has no barrier and no d^3
+        # (35) has no barrier and no d^3
+        error = 0.5 * np.sum(w * xi1**2)
+        disturbance = 0.0
         if law == 'blf_dsc':
-            error = np.sum(w * 0.002**2 / np.pi * np.tan(np.pi * xi1**2 / (2.0 * 0.002**2)))
+            error = np.sum(
+                w * 0.002**2 / np.pi * np.tan(np.pi * xi1**2 / (2.0 * 0.002**2))
+            )
             disturbance = 0.5 * np.sum((tau_dist - sample.disturbance) ** 2 / gamma)
         parameters = 0.5 * np.sum((P - sample.estimate[:3]) ** 2 / Gamma)
         expected = error, 0.5 * xi2 @ M @ xi2, parameters, disturbance
@@ -202,7 +240,10 @@ def test_terms_are_those_of_equation_29(law):
 
 
 def test_energies_of_estimates_that_are_not_adapted_or_unknown_do_not_count():
-    frozen = {'learning.adaptation_gain': [0.0, 1.0, 0.0], 'disturbance.gain': [0.0, 50.0]}
+    frozen = {
+        'learning.adaptation_gain': [0.0, 1.0, 0.0],
+        'disturbance.gain': [0.0, 50.0],
+    }
     for t, running, _ in samples('blf_dsc', **frozen):
         off = (
             P[1] - running.sample.estimate[1],
@@ -251,13 +292,20 @@ def test_comparison_laws_are_the_linear_surface_with_their_gains(law, share):
     given = {f'comparison.{name}': value for name, value in gains.items()}
     config = configured('recommended', 1.0, given | {'law': law}).controller
     settings = settings_of_config(config)
-    assert CHOICES['surface'][settings.surface] == 'linear'
+    assert settings.has_barrier == 0
     assert CHOICES['compensation'][settings.compensation] == 'state'
     found = (settings.weight, settings.mu_bar, settings.Wc)
-    for ours, name in zip(found, ('position_gain', 'robust_gain', 'leakage'), strict=True):
+    for ours, name in zip(
+        found, ('position_gain', 'robust_gain', 'leakage'), strict=True
+    ):
         np.testing.assert_array_equal(ours, share * np.array(gains[name]))
     np.testing.assert_array_equal(settings.K, gains['surface_gain'])
-    for zero in (settings.d2, settings.gamma, settings.kappa, settings.change_detection):
+    for zero in (
+        settings.d2,
+        settings.gamma,
+        settings.kappa,
+        settings.change_detection,
+    ):
         assert not np.any(zero)
 
 
@@ -265,16 +313,21 @@ def test_proposed_law_with_everything_known_and_frozen_equals_model_based():
     frozen = {'learning.initial_estimate': list(P), 'disturbance.gain': [0.0] * 2}
     frozen |= {'learning.adaptation_gain': [0.0] * 3}
     known = {'law': 'model_based', 'truth.parameters': list(P)}
-    frozen, model_based = (run_preset(10.0, NO_DISTURBANCE, law=law) for law in (frozen, known))
+    frozen, model_based = (
+        run_preset(10.0, NO_DISTURBANCE, law=law) for law in (frozen, known)
+    )
     np.testing.assert_allclose(frozen.torque, model_based.torque, atol=1e-12)
     np.testing.assert_allclose(frozen.xi1, model_based.xi1, atol=1e-15)
 
 
 @pytest.mark.parametrize('time_constant', [0.002, 0.016])
 @pytest.mark.parametrize(
-    ('gain', 'mu', 'weight'), [(150.0, 20.0, 1000.0), (60.0, 60.0, 1.0), (0.0, 40.0, 500.0)]
+    ('gain', 'mu', 'weight'),
+    [(150.0, 20.0, 1000.0), (60.0, 60.0, 1.0), (0.0, 40.0, 500.0)],
 )
-def test_error_of_the_oracle_is_the_lag_of_the_surface_filter(time_constant, gain, mu, weight):
+def test_error_of_the_oracle_is_the_lag_of_the_surface_filter(
+    time_constant, gain, mu, weight
+):
     """The model-based law knows the disturbance, but alpha2 lags beta2 by lambda alpha2'.
 
     xi1 compensates it by (K/2 + mu) xi1 in beta2, and by w xi1 = -K_p xi2 in the torque.  The
@@ -293,7 +346,8 @@ def test_lyapunov_function_of_the_oracle_decreases_to_the_floor_of_the_lag():
     """(17): V decreases in every sample until only the barrier's energy of the lag remains."""
     loop = run_preset(8.0, preset='model_based')
     V = loop.lyapunov.sum(axis=1)
-    lag = 1000.0 * np.sum(loop.xi1[loop.t >= 1.0] ** 2, axis=1).max()  # J, twice the energy
+    # J, twice the energy
+    lag = 1000.0 * np.sum(loop.xi1[loop.t >= 1.0] ** 2, axis=1).max()
     above = np.flatnonzero(10.0 * lag < V)
     assert above[-1] > 50  # there is a decrease to check
     assert np.all(np.diff(V[: above[-1] + 2]) < 0.0)
@@ -305,7 +359,8 @@ def test_settings_follow_the_configuration():
     given = {'learning.window': 0.75, 'learning.settling_time': 0.25}
     given |= {'learning.adaptation_gain': [1.5, 2.0, 3.0]}
     config = build(ControllerConfig, given)
-    settings, columns = settings_of_config(config), len(columns_of(config))
+    settings = settings_of_config(config)
+    columns = len(columns_of(config))
     assert settings.learning_start == 1.0
     assert settings.window == 750
     assert columns > 0

@@ -25,12 +25,15 @@ from blf_dsc_controller.studies.report import compare_pairs
 from blf_dsc_controller.studies.runs import run_chunk
 
 AT_STATE = {'learning.compensation': 'state'}
-TONE = 1.2566370614359172  # rad/s, first of the presets panda and ur5e, third of the last
+# rad/s, first of the presets panda and ur5e, third of the last
+TONE = 1.2566370614359172
 
 
 def event(begin, payload, duration=0.0, ramp=0.0):
     """Return parameters of a plant that picks up a payload [kg]."""
-    return several({'begin': begin, 'duration': duration, 'ramp': ramp, 'payload': payload})
+    return several(
+        {'begin': begin, 'duration': duration, 'ramp': ramp, 'payload': payload}
+    )
 
 
 SINE = {'disturbance.amplitude': [0.0] * 6 + [1.2], 'disturbance.frequency': [TONE] * 7}
@@ -56,16 +59,20 @@ def spectral_radius(T, *, learned=1.0, initial=1.0, at_state=False, delay=1):
     held, `delay` samples late, with a drive of 2 ms; the velocity is filtered at 400 rad/s.  The
     states are q, dq, torque, filtered velocity, alpha2, d^3 and, with a delay, the last command.
     """
-    rate, time_constant = 0.5 / (1.5 * T + 0.0045), 0.002
+    rate = 0.5 / (1.5 * T + 0.0045)
+    time_constant = 0.002
     n = 6 + delay
     A = np.zeros((5, 5))
     A[0, 1] = A[1, 2] = 1.0
     A[2, [2, 4]] = -1.0 / 0.002, 1.0 / 0.002
     A[3, [1, 3]] = 400.0, -400.0
-    held, x, F = expm(A * T), np.eye(n), np.zeros((n, n))
+    held = expm(A * T)
+    x = np.eye(n)
+    F = np.zeros((n, n))
     share = 1.0 - np.exp(-T / time_constant)
     beta2 = -1.5 * rate * x[0]
-    dalpha2, xi2 = share * (beta2 - x[4]) / T, x[3] - x[4]
+    dalpha2 = share * (beta2 - x[4]) / T
+    xi2 = x[3] - x[4]
     feedback = initial * rate * (-0.25 * rate * x[0] - 0.6 * xi2) + x[5]
     command = feedback + (learned if at_state else initial) * dalpha2
     F[:4] = held[:4, :4] @ x[:4] + np.outer(held[:4, 4], x[6] if delay else command)
@@ -75,7 +82,9 @@ def spectral_radius(T, *, learned=1.0, initial=1.0, at_state=False, delay=1):
     return np.abs(np.linalg.eigvals(F)).max()
 
 
-@pytest.mark.parametrize(('T', 'most'), [(1e-3, 2.65), (2e-3, 2.10), (4e-3, 1.72), (5e-3, 1.63)])
+@pytest.mark.parametrize(
+    ('T', 'most'), [(1e-3, 2.65), (2e-3, 2.10), (4e-3, 1.72), (5e-3, 1.63)]
+)
 def test_learned_inertia_is_a_gain_of_the_loop_only_at_the_state(T, most):
     """The paper's form is unstable from these M^ / M on; along the reference nothing depends on it.
 
@@ -112,7 +121,9 @@ def test_learning_breaks_no_bound_that_is_kept_without_it(name):
 
 @pytest.mark.parametrize('name', BROKEN)
 def test_compensation_of_the_paper_breaks_them(name):
-    assert [stop.reason for stop in run(name, AT_STATE).stops] == ['error past the bound']
+    assert [stop.reason for stop in run(name, AT_STATE).stops] == [
+        'error past the bound'
+    ]
 
 
 def test_sine_of_the_frequency_of_the_reference_is_compensated_like_a_model():
@@ -133,7 +144,10 @@ def test_torques_that_bang_between_their_limits_stop_the_arm():
     found = run('noisy, cosines', AT_STATE)
     (stop,) = found.stops
     assert stop.reason == 'torque saturated'
-    begin = np.flatnonzero(np.any(np.abs(found.torque) >= found.torque_limit, axis=1))[0] * 1e-3
+    begin = (
+        np.flatnonzero(np.any(np.abs(found.torque) >= found.torque_limit, axis=1))[0]
+        * 1e-3
+    )
     assert begin + 0.6 < stop.stamp * 1e-9 < begin + 3.0
 
 
@@ -143,30 +157,35 @@ def test_learned_friction_stays_friction():
     The first windows of the UR5e see a payload come and go, and take parts of it for friction.
     """
     record = simulated('ur5e, 1.26 kg put down again')
-    settings, names = record.controller.settings, estimate_names(record.config)
-    friction = [k for k, name in enumerate(names) if name.startswith(('viscous ', 'coulomb '))]
+    settings = record.controller.settings
+    names = estimate_names(record.config)
+    friction = [
+        k for k, name in enumerate(names) if name.startswith(('viscous ', 'coulomb '))
+    ]
     columns = sample_of(np.arange(record.samples.shape[1]), settings).estimate[friction]
-    learned, initial = record.samples[:, columns], settings.initial_estimate[friction]
+    learned = record.samples[:, columns]
+    initial = settings.initial_estimate[friction]
     assert initial.min() > 0.0
     assert np.all((learned >= initial / 3.0) & (learned <= 3.0 * initial))
     assert np.any(learned == initial / 3.0)
 
-    planar = configured('recommended', 1.0, {'learning.coulomb': True, 'learning.viscous': True})
+    planar = configured(
+        'recommended', 1.0, {'learning.coulomb': True, 'learning.viscous': True}
+    )
     settings = controller_of(planar.controller).settings
     assert np.all(settings.least[-4:] == 0.0)
-    np.testing.assert_allclose(settings.most[-4:], [0.05 * 20.0 / 1.5] * 2 + [0.05 * 20.0] * 2)
+    np.testing.assert_allclose(
+        settings.most[-4:], [0.05 * 20.0 / 1.5] * 2 + [0.05 * 20.0] * 2
+    )
 
 
 COULOMB = {'learning.coulomb': True}
 BROKEN_BY_FRICTION = [
-    *(('monte_carlo_ur5e', run) for run in (51, 179, 200, 274)),
+    ('monte_carlo_ur5e', 51),
+    ('monte_carlo_ur5e', 274),
     ('monte_carlo_panda', 423),
 ]
-"""Runs in which friction learned from the window alone, 0.37 to 0.9 of 0.73 to 1.23 N m on light
-drives, or partial windows that are not taken back, leave a bound that is kept without learning."""
-
-HANGS_ON_LAST_DIGITS = 179
-"""Without learning, this run kept its bound with the sines of one C library, and leaves it now."""
+"""Runs whose bound learning left when it learned friction from the window alone."""
 
 
 def test_sine_at_a_frequency_of_the_reference_is_not_learned_as_friction():
@@ -174,7 +193,9 @@ def test_sine_at_a_frequency_of_the_reference_is_not_learned_as_friction():
     wrist = {'coulomb': (6.0, true), 'amplitude': (0.0, 1.2), 'phase': (0.0, 5.0)}
     arm = {f'disturbance.{name}': [a] * 3 + [b] * 3 for name, (a, b) in wrist.items()}
     arm |= {'events.begin': [100.0], 'disturbance.stribeck': 0.0}
-    config = configured('ur5e', 15.0, {}, arm | {'disturbance.frequency': [3.0 * TONE] * 6})
+    config = configured(
+        'ur5e', 15.0, {}, arm | {'disturbance.frequency': [3.0 * TONE] * 6}
+    )
     record = simulate(config.controller, config.plant)
     assert not record.run().stops
     state = record.controller.state
@@ -191,32 +212,167 @@ def test_learning_breaks_no_bound_that_learned_friction_once_broke(name, run):
     study = load_study(locate(name))
     study = replace(study, settings=replace(study.settings, runs=run + 1))
     found = compare_pairs(study, run_chunk(study, run, 1))
-    assert found['kept'] == {'with': 1, 'without': int(run != HANGS_ON_LAST_DIGITS)}
+    assert found['kept'] == {'with': 1, 'without': 1}
     assert found['above'] == []
+
+
+FALLS = [(4, 13.0), (4, 12.4), (5, 12.4), (0, 12.4)]
+"""Joints of a UR5e and times [s] at which their friction falls."""
+
+
+@pytest.mark.parametrize(('joint', 'time'), FALLS)
+def test_friction_that_falls_costs_no_more_than_not_having_learned_it(joint, time):
+    """Of 1.9 times the assumed Coulomb friction a tenth remains: once, learning left the bound."""
+    known = np.array(configured('ur5e', 1.0).plant.disturbance.coulomb)
+    high = known.copy()
+    high[joint] *= 1.9
+    fall = np.zeros(6)
+    fall[joint] = -1.8 * known[joint]
+    events = {'begin': [time], 'duration': [0.0], 'coulomb': fall.tolist()}
+    plant = {f'events.{name}': value for name, value in events.items()}
+    plant |= {'events.payload': [], 'disturbance.coulomb': high.tolist()}
+    largest = []
+    for learning in ({}, {'learning.weight': 0.0}):
+        loop = configured('ur5e', 18.0, learning, plant)
+        record = simulate(loop.controller, loop.plant)
+        assert not record.run().stops
+        errors = np.abs(record.true_errors()[round(1e3 * time) :])
+        largest.append(float(errors.max()))
+    assert largest[0] < 1.05 * largest[1]
+
+
+def reversing_law():
+    """Return a law with columns of Coulomb friction whose window is latched."""
+    law = controller_of(configured('recommended', 1.0, COULOMB).controller)
+    law.state.latched[0] = 1.0
+    return law
+
+
+def reverse(law, coulomb, reversals):
+    """Show the law some reversals of its first joint with a Coulomb friction [N m]."""
+    settings, state = law.settings, law.state
+    for k in range(reversals):
+        friction.close_reversal(settings, state, 0)
+        sign = (-1.0) ** k
+        for _ in range(300):
+            state.shape_lags[0, 2, 0] = sign
+            state.filter2[0, -1] = coulomb * sign
+            friction.measure_reversals(settings, state, 0.001)
 
 
 def test_friction_is_not_forgotten_at_rest():
     """The sums age by what reversals tell, not by time."""
-    law = controller_of(configured('recommended', 1.0, COULOMB).controller)
+    law = reversing_law()
     settings, state = law.settings, law.state
-    state.latched[0] = 1.0
-    state.flip_sums[:] = before = [[0.4, 0.1], [1.0, 1.0]]
-    for _ in range(10_000):
-        friction.measure_flips(settings, state, 0.001)
-    np.testing.assert_array_equal(state.flip_sums, before)
+    reverse(law, 0.4, 20)
+    state.column_lags[:] = 0.0
+    state.torque_lags[:] = 0.0
+    state.shape_lags[:] = 0.0
+    state.filter2[:] = 0.0
+    before = friction.learned_friction(settings, state, 0)
+    assert before[0] == pytest.approx(0.4, abs=0.02)
+    for _ in range(3_000):
+        friction.measure_reversals(settings, state, 0.001)
+    assert friction.learned_friction(settings, state, 0) == before
     state.latched[0] = 0.0
-    friction.measure_flips(settings, state, 0.001)
+    friction.measure_reversals(settings, state, 0.001)
     assert state.since_latch[0] == 0.0
 
 
-def test_other_friction_is_learned_within_some_reversals():
-    """However long the arm has moved before."""
-    law = controller_of(configured('recommended', 1.0, COULOMB).controller)
-    settings, state = law.settings, law.state
-    state.latched[0] = 1.0
-    column = friction.first_coulomb(settings)
-    for k in range(30_000):
-        sign, coulomb = (-1.0) ** (k // 300), 1.0 if k < 24_000 else 2.0  # N m
-        state.filter2[0, [column, -1]] = sign, coulomb * sign
-        friction.measure_flips(settings, state, 0.001)
-    assert state.flip_sums[0, 0] / state.flip_sums[1, 0] == pytest.approx(2.0, abs=0.1)
+@pytest.mark.parametrize(
+    ('other', 'reversals', 'most'), [(0.8, 3, 0.02), (0.42, 40, 0.005)]
+)
+def test_the_last_two_reversals_overrule_older_ones(other, reversals, most):
+    """Friction that differs by less than what is unmodelled is averaged over eight or so."""
+    law = reversing_law()
+    reverse(law, 0.4, 30)
+    reverse(law, other, reversals)
+    friction.close_reversal(law.settings, law.state, 0)
+    coulomb, _ = friction.learned_friction(law.settings, law.state, 0)
+    assert coulomb == pytest.approx(other, abs=most)
+
+
+@pytest.mark.parametrize('seed', range(20))
+def test_compensation_lies_between_what_is_assumed_and_whatever_may_be_true(seed):
+    """So none of it can cost more than not knowing it, up to the dead band."""
+    law = controller_of(configured('ur5e', 1.0).controller)
+    settings, state, signals = law.settings, law.state, law.signals
+    random = np.random.default_rng(seed)
+    first = friction.first_coulomb(settings)
+    of = slice(first, first + settings.n)
+    assumed = settings.initial_estimate[of]
+    learned = assumed * random.uniform(1.0 / 3.0, 3.0, settings.n)
+    claims = assumed * random.uniform(0.0, 3.0, (4, settings.n))
+    state.estimate[of] = learned
+    state.shown[:] = claims[:2]
+    state.unanswered[0] = np.minimum(claims[2] - learned, 0.0)
+    state.unanswered[1] = np.maximum(claims[3] - learned, 0.0)
+    state.breakaway[:] = random.uniform(0.0, 1.0, settings.n)
+    signals.sign[:] = 1.0
+    signals.stribeck[:] = random.uniform(0.0, 1.0, settings.n)
+    scale = 1.0 + state.breakaway * signals.stribeck
+    for i in range(settings.n):
+        used = friction.coulomb_torque(settings, state, signals, i)
+        band = friction.unmodelled(settings, i)
+        changed = learned[i] + state.unanswered[:, i]
+        for true in (learned[i], *state.shown[:, i], *changed):
+            error = abs(used - scale[i] * true)
+            not_knowing = abs(assumed[i] - scale[i] * true)
+            assert error <= not_knowing + scale[i] * band + 1e-12
+
+
+def test_evidence_changes_no_torque_until_the_joint_reverses():
+    law = controller_of(configured('ur5e', 1.0).controller)
+    settings, state, signals = law.settings, law.state, law.signals
+    state.estimate[friction.first_coulomb(settings) :] *= 2.0
+    state.shown[:] = state.estimate[friction.first_coulomb(settings) :]
+    signals.sign[:] = [1.0, -1.0, 0.5, 0.0, 1.0, -1.0]
+    for i in range(settings.n):
+        signals.friction[i] = friction.coulomb_torque(settings, state, signals, i)
+    before = signals.friction.copy()
+    total = signals.friction + state.disturbance
+    state.unanswered[0] = -1.0
+    state.breakaway[:] = 0.3
+    signals.stribeck[:] = 0.5
+    friction.hand_over(settings, state, signals)
+    assert np.abs(signals.friction - before).max() > 0.5
+    np.testing.assert_allclose(signals.friction + state.disturbance, total, atol=1e-12)
+
+
+UR5E_COULOMB = (6.0, 6.0, 6.0, 1.1, 1.1, 1.1)
+
+
+def falling(begin, joint=4, high=1.9, low=0.1):
+    """Return a UR5e with friction of a joint that falls, in times of what is assumed."""
+    before = list(UR5E_COULOMB)
+    before[joint] *= high
+    change = [0.0] * 6
+    change[joint] = (low - high) * UR5E_COULOMB[joint]
+    return {
+        'events.payload': [],
+        'events.begin': [begin],
+        'events.duration': [0.0],
+        'events.coulomb': change,
+        'disturbance.coulomb': before,
+    }
+
+
+@pytest.mark.parametrize('begin', [11.3, 13.0, 13.01, 13.02, 14.2])
+def test_friction_that_falls_costs_no_more_with_learning(begin):
+    """It broke the bound with learning in three of these runs, at up to 1.16 of it."""
+    ratios = []
+    for weight in ({}, OFF):
+        config = configured('ur5e', 18.0, weight, falling(begin))
+        record = simulate(config.controller, config.plant)
+        assert not record.run().stops
+        errors = np.abs(record.true_errors()[round(begin * 1e3) :])
+        ratios.append(errors.max() / config.controller.barrier.bound[0])
+    assert ratios[0] < 1.05 * ratios[1]
+
+
+def test_geared_arm_learns_its_friction_at_breakaway():
+    """Of it nothing is known before the start; without it 1.1 mrad remain."""
+    config = configured('ur5e', 15.0)
+    record = simulate(config.controller, config.plant)
+    assert np.abs(record.true_errors()[8000:]).max() < 0.6e-3
+    np.testing.assert_allclose(record.controller.state.breakaway, 0.5, atol=0.12)

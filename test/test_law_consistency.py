@@ -25,7 +25,11 @@ from blf_dsc_controller.law import excitation, window
 from blf_dsc_controller.law.factory import settings_of_config
 
 FRICTION = {'disturbance.viscous': [0.1, 0.1]}
-DIFFERENCED = {'sensor.velocity': 'differenced', 'sensor.position_noise': 1e-5, 'actuator.delay': 1}
+DIFFERENCED = {
+    'sensor.velocity': 'differenced',
+    'sensor.position_noise': 1e-5,
+    'actuator.delay': 1,
+}
 SENSORS = {
     'ideal': {},
     'noisy': DIFFERENCED,
@@ -54,7 +58,8 @@ def test_bound_holds_when_the_arm_changes(name, sensors):
     assert np.all(learning.largest(0.0) < BOUND)
     begin = min(row['events.begin'])
     quantisation = 0.5 * plant.get('sensor.resolution', 0.0)
-    gentle = 0.25e-3 if 'events.ramp' in row else 0.0  # so small that 1.3 times is too strict
+    # so small that 1.3 times is too strict
+    gentle = 0.25e-3 if 'events.ramp' in row else 0.0
     allowed = np.maximum(1.3 * without.largest(begin), gentle) + quantisation
     assert np.all(learning.largest(begin) <= allowed)
     assert learning.changes[-1] >= 1.0
@@ -73,7 +78,8 @@ def test_change_detection_has_no_effect_without_a_change():
 
 def test_residual_matches_least_squares():
     controller = run_preset(8.0, NO_DISTURBANCE | FRICTION).controller
-    settings, state = controller.settings, controller.state
+    settings = controller.settings
+    state = controller.state
     assert settings.change_detection == 1
     rows = state.ring.reshape(-1, settings.m + 1)
     _, squares, _, _ = np.linalg.lstsq(rows[:, :-1], rows[:, -1], rcond=None)
@@ -103,7 +109,10 @@ def test_column_rejected_at_rest_is_readmitted_in_motion():
             *(1.696, *(1.696 - 0.4 * (steps // 2 % 2)).tolist()),
         ],
     }
-    constant = {'disturbance.constant': [0.3, -0.2], 'disturbance.amplitude': [0.0, 0.0]}
+    constant = {
+        'disturbance.constant': [0.3, -0.2],
+        'disturbance.amplitude': [0.0, 0.0],
+    }
     moved = run_preset(45.0, constant, law=law)
     assert np.all(moved.controller.state.active == 1.0)
     assert moved.parameter_error[-1] < 0.01
@@ -158,7 +167,8 @@ def test_first_window_that_spans_a_change_is_not_latched(preset, begin, duration
     events = several({'begin': begin, 'duration': duration, 'payload': mass})
     config = configured(preset, 11.0, {}, events)
     record = simulate(config.controller, config.plant)
-    settings, state = record.controller.settings, record.controller.state
+    settings = record.controller.settings
+    state = record.controller.state
     samples = [record.sample(k) for k in range(0, len(record.samples), 50)]
     first = next(k for k, sample in enumerate(samples) if sample.latched[0] == 1.0)
     rows = state.ring[: int(state.rows[0])].reshape(-1, settings.m + 1)
@@ -200,14 +210,20 @@ def learned(window_of_friction):
     ('ratio', 'accepted', 'pulled'),
     [(1.2, True, 0), (3.0, True, 1), (3.9, True, 1), (4.1, False, 0)],
 )
-def test_window_is_latched_up_to_four_times_the_least_residual(learned, ratio, accepted, pulled):
+def test_window_is_latched_up_to_four_times_the_least_residual(
+    learned, ratio, accepted, pulled
+):
     """An unusual residual pulls it to the anchor, by 3 (r^2 - 1.25 r^2_least) R."""
     settings, state, signals, residual = learned
     before = np.diag(signals.Phi).copy()
     state.least_residual[0] = residual / ratio
     assert excitation.accept_window(settings, state, signals) == accepted
-    expected = 3.0 * (1.0 - 1.25 / ratio) * residual * np.diag(settings.information) * pulled
-    np.testing.assert_allclose(np.diag(signals.Phi) - before, expected, rtol=1e-6, atol=1e-12)
+    expected = (
+        3.0 * (1.0 - 1.25 / ratio) * residual * np.diag(settings.information) * pulled
+    )
+    np.testing.assert_allclose(
+        np.diag(signals.Phi) - before, expected, rtol=1e-6, atol=1e-12
+    )
 
 
 @pytest.mark.parametrize(
@@ -223,19 +239,27 @@ def test_change_is_detected_from_eight_times_the_residual_on(
     signals.row[0, -1] = np.sqrt(ratio * residual)
     state.rows[0] = rows * settings.window
     state.anchor[:] = 0.9 * state.estimate
-    before, torque = state.estimate.copy(), signals.H @ state.estimate + state.disturbance
+    before = state.estimate.copy()
+    torque = signals.H @ state.estimate + state.disturbance
     excitation.detect_change(settings, state, signals, 0.1)
     assert state.changes[0] == changes
-    np.testing.assert_array_equal(state.estimate, 0.9 * before if taken_back else before)
+    np.testing.assert_array_equal(
+        state.estimate, 0.9 * before if taken_back else before
+    )
     # The next, partial windows are pulled to the estimate from before.
     assert np.array_equal(state.anchor, state.estimate) == (changes == 1.0)
-    np.testing.assert_allclose(signals.H @ state.estimate + state.disturbance, torque, atol=1e-12)
+    np.testing.assert_allclose(
+        signals.H @ state.estimate + state.disturbance, torque, atol=1e-12
+    )
 
 
 @pytest.mark.parametrize(
-    ('latched', 'cursor', 'kept'), [(0.0, 100.0, True), (1.0, 100.0, False), (1.0, 0.0, True)]
+    ('latched', 'cursor', 'kept'),
+    [(0.0, 100.0, True), (1.0, 100.0, False), (1.0, 0.0, True)],
 )
-def test_anchor_is_kept_at_the_first_latch_and_once_per_window(learned, latched, cursor, kept):
+def test_anchor_is_kept_at_the_first_latch_and_once_per_window(
+    learned, latched, cursor, kept
+):
     settings, state, signals, _ = learned
     state.anchor[:] = 0.0
     state.latched[0], state.cursor[0] = latched, cursor
@@ -253,7 +277,9 @@ def test_residual_floor_follows_the_residual_learned():
         (0.05, 3.0, 3.0),
     ):
         state.least_residual[0] = least
-        assert excitation.explained(settings, state, residual) == pytest.approx(expected)
+        assert excitation.explained(settings, state, residual) == pytest.approx(
+            expected
+        )
 
 
 def test_half_the_rated_load_is_noticed_with_a_floor_that_is_three_times_too_large():
@@ -263,4 +289,8 @@ def test_half_the_rated_load_is_noticed_with_a_floor_that_is_three_times_too_lar
     event = several({'begin': 9.0, 'duration': 0.0, 'payload': 1.5})
     config = configured('panda', 10.0, law, event)
     record = simulate(config.controller, config.plant)
-    assert [record.sample(row).changes[0] for row in (9000, 9200, -1)] == [0.0, 1.0, 1.0]
+    assert [record.sample(row).changes[0] for row in (9000, 9200, -1)] == [
+        0.0,
+        1.0,
+        1.0,
+    ]

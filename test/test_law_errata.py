@@ -6,7 +6,14 @@ from __future__ import annotations
 import numpy as np
 import plants
 import pytest
-from closed_loop_case import JOINTS, REFERENCE, closed_loop, controller, plant, recommended
+from closed_loop_case import (
+    JOINTS,
+    REFERENCE,
+    closed_loop,
+    controller,
+    plant,
+    recommended,
+)
 from paper_case import EXACT, P, configured, run
 from plain_law import R, dynamics, regressor
 from plants import QUIET, START
@@ -41,7 +48,9 @@ def test_erratum_4_first_gravity_term_has_cos_q1():
     # The curl of the printed field is P1 r sin q2, 9.8 N m/rad over a circle of 0.28 rad^2.
     assert abs(work_around_a_circle(printed)) == pytest.approx(2.74, abs=0.01)
     stretched = np.array([0.0, np.pi])
-    assert np.abs(printed(stretched) - corrected(stretched)).max() == pytest.approx(19.6)
+    assert np.abs(printed(stretched) - corrected(stretched)).max() == pytest.approx(
+        19.6
+    )
 
 
 def test_erratum_5_start_outside_the_barrier_is_rejected_by_name():
@@ -67,10 +76,16 @@ def test_erratum_5_start_outside_the_barrier_is_rejected_by_name():
 
 def test_erratum_12_linear_virtual_control_crosses_zero_without_a_jump():
     """(18) has slope K/2 + mu there: the filter's gap is at most (lambda + T) times its rate."""
-    K, mu, bound, time_constant, T = 150.0, 20.0, 0.002, 0.002, 1e-3
+    K = 150.0
+    mu = 20.0
+    bound = 0.002
+    time_constant = 0.002
+    T = 1e-3
     errors = 1e-3 * np.sin(10.0 * np.arange(0.0, 2.0, T))
     beta2 = [barrier.virtual_control(xi1, bound, K, mu, 0.0) for xi1 in errors]
-    gain, alpha2, gap = barrier.filter_gain(time_constant, T), beta2[0], []
+    gain = barrier.filter_gain(time_constant, T)
+    alpha2 = beta2[0]
+    gap = []
     for target in beta2:
         gap.append(abs(target - alpha2))
         alpha2 += gain * (target - alpha2)
@@ -98,12 +113,17 @@ def test_erratum_15_robust_term_dominates_disturbances_bounded_joint_by_joint():
     d2, d = np.array([300.0, 200.0]), 300.0
     for random in map(np.random.default_rng, range(3)):
         xi1 = random.uniform(-0.0015, 0.0015, 2)
-        xi2 = random.choice([-1.0, 1.0], 2) * random.uniform(0.01, 1.0, 2)  # outside the layer b
+        # outside the layer b
+        xi2 = random.choice([-1.0, 1.0], 2) * random.uniform(0.01, 1.0, 2)
         power = damping_torque(d2, xi1, xi2) @ xi2
-        assert power + np.sum(d2 * np.abs(xi1) * np.abs(xi2)) == pytest.approx(0.0, abs=1e-10)
+        assert power + np.sum(d2 * np.abs(xi1) * np.abs(xi2)) == pytest.approx(
+            0.0, abs=1e-10
+        )
         of_norms = d * np.linalg.norm(xi1) * np.linalg.norm(xi2)
-        assert of_norms > d * np.abs(xi1) @ np.abs(xi2)  # xi3 as printed leaves this power
-        assert of_norms <= d * np.linalg.norm(xi1) * np.sum(np.abs(xi2))  # |xi1| as a norm does not
+        # xi3 as printed leaves this power
+        assert of_norms > d * np.abs(xi1) @ np.abs(xi2)
+        # |xi1| as a norm does not
+        assert of_norms <= d * np.linalg.norm(xi1) * np.sum(np.abs(xi2))
     # As printed it vanishes if the errors are on different joints.
     torque = damping_torque(np.full(2, d), np.array([0.001, 0.0]), np.array([0.0, 1.0]))
     np.testing.assert_allclose(torque, 0.0, atol=1e-12)
@@ -130,7 +150,8 @@ def test_erratum_6_known_part_of_the_dynamics_is_subtracted():
     corrected, printed = [], []
     for _, law, sample in rows_of_a_loop(LAMBDA):
         q, dq, torque = sample.measurement.reshape(3, 2)
-        xi2, observed = law.signals.xi2, law.state.observed_rate
+        xi2 = law.signals.xi2
+        observed = law.state.observed_rate
         M, C, _ = dynamics(P, R, q, dq)
         known = regressor(R, q, dq, dq - xi2, law.signals.dalpha2) @ P
         rest = M @ observed + C @ xi2 - torque
@@ -158,7 +179,8 @@ def test_erratum_11_filter_gap_enters_the_error_rate_with_a_minus():
     for sample in closed_loop(law, plant(), 0.05):
         signals = law.signals
         if alpha2 is not None:  # the filter's state before this sample
-            gap, rate = signals.beta2 - alpha2, sample.measurement[2:4] - signals.dqr
+            gap = signals.beta2 - alpha2
+            rate = sample.measurement[2:4] - signals.dqr
             off.append(
                 [
                     signals.xi2 + signals.beta2 + sign * gap - law.signals.dqr - rate
@@ -177,7 +199,10 @@ def test_erratum_24_varying_disturbance_adds_a_term_to_the_rate_of_the_lyapunov_
     From d3^' = -gamma xi2 follows (V_d)' = d3~ (xi2 + tau_dist' / gamma), exact for the means.
     """
     gain, T = 5.0, 1e-3
-    known = {'learning.initial_estimate': list(P), 'learning.adaptation_gain': [0.0] * 3}
+    known = {
+        'learning.initial_estimate': list(P),
+        'learning.adaptation_gain': [0.0] * 3,
+    }
     law = EXACT | known | {'disturbance.gain': [gain, gain]}
     loop = run(configured('recommended', 8.0, law))
     V = loop.lyapunov[:, 3]
@@ -198,7 +223,9 @@ def test_erratum_16_disturbance_reduces_the_effective_velocity_feedback():
     The arm starts on its reference with a velocity error xi2; the published energy
     xi2^T M xi2 / 2 is differenced over a hundredth of a millisecond.
     """
-    T, d1, xi2 = 1e-5, 15.0, np.array([0.02, -0.05])
+    T = 1e-5
+    d1 = 15.0
+    xi2 = np.array([0.02, -0.05])
     known = {'initial_estimate': P, 'truth_known': 1, 'true_parameters': P}
     law = controller(recommended(bias=False, gamma=np.zeros(2), **known))
     start = law.reference_at(0.0)[0]  # at rest there, so that alpha2 = 0 and xi2 = q'
@@ -210,15 +237,20 @@ def test_erratum_16_disturbance_reduces_the_effective_velocity_feedback():
         arm.step(law.signals.torque + d1 * xi2)
     power = np.diff(energy)[0] / T
     assert power == pytest.approx(-xi2 @ ((law.settings.Kp - d1) * xi2), rel=0.01)
-    assert power > -0.5 * xi2 @ (law.settings.Kp * xi2)  # the printed rate is twice as fast
+    # the printed rate is twice as fast
+    assert power > -0.5 * xi2 @ (law.settings.Kp * xi2)
 
 
 def test_erratum_1_prediction_error_enters_with_a_minus():
     """(20) prints -Gamma (H^T xi2 + kappa eps): learning then drives P^ to the projection ball."""
-    settings, torques, estimates = recommended(), [], []
+    settings = recommended()
+    torques = []
+    estimates = []
     for sign in (1.0, -1.0):
         law = controller(settings._replace(kappa=sign * settings.kappa))
-        torques.append([law.signals.torque.copy() for _ in closed_loop(law, plant(), 8.0)])
+        torques.append(
+            [law.signals.torque.copy() for _ in closed_loop(law, plant(), 8.0)]
+        )
         estimates.append(law.state.estimate[:3])
     before = round(settings.learning_start / 1e-3)
     np.testing.assert_array_equal(*(torque[:before] for torque in torques))
@@ -244,16 +276,16 @@ def test_erratum_2_both_integrals_carry_the_same_factor():
         return law.state.estimate.copy()
 
     np.testing.assert_allclose(rest_point(law.state.Phi.copy()), theta, atol=1e-4)
-    np.testing.assert_allclose(rest_point(law.state.Phi * tau_d), theta / tau_d, atol=1e-4)
+    np.testing.assert_allclose(
+        rest_point(law.state.Phi * tau_d), theta / tau_d, atol=1e-4
+    )
 
 
 def test_erratum_3_integrand_belongs_to_the_integration_variable():
     """(21) prints H_a(t)^T H_a(t), a window of one sample: it has rank n and is never excited."""
     gains = {'bias': False, 'sigma': 1e-6}
-    printed, corrected = (
-        controller(recommended(window=1, **gains)),
-        controller(recommended(**gains)),
-    )
+    printed = controller(recommended(window=1, **gains))
+    corrected = controller(recommended(**gains))
     ranks = set()
     for sample in closed_loop(printed, plant(), 8.0):
         if sample.k > 0 and sample.k % 10 == 0:
@@ -272,7 +304,8 @@ def test_erratum_8_estimates_drift_if_the_disturbance_estimate_is_subtracted():
     """
     errors = []
     for subtract in (True, False):
-        law, arm = controller(recommended(bias=not subtract)), plant()
+        law = controller(recommended(bias=not subtract))
+        arm = plant()
         for k in range(20_000):
             d3 = law.state.disturbance.copy()  # contained in the next torque
             arm.step(law.update(k * 1e-3, 1e-3, arm.measure()))
@@ -313,7 +346,8 @@ def test_erratum_19_printed_projection_lets_the_estimate_leave_for_good():
 
 def test_erratum_23_reference_excites_every_parameter_but_the_second_weakly():
     """Over a period of exact tracking, lambda_min of the mean of H^T H is 0.269."""
-    law, Phi = controller(recommended()), np.zeros((3, 3))
+    law = controller(recommended())
+    Phi = np.zeros((3, 3))
     for t in np.arange(1000) * 2.0 * np.pi / 1000:
         q, dq, ddq = law.reference_at(t)
         H = regressor(R, q, dq, dq, ddq)

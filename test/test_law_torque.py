@@ -7,7 +7,14 @@ from math import exp, sin
 
 import numpy as np
 import pytest
-from closed_loop_case import arbitrary, closed_loop, controller, plant, quick, recommended
+from closed_loop_case import (
+    arbitrary,
+    closed_loop,
+    controller,
+    plant,
+    quick,
+    recommended,
+)
 from paper_case import P
 from plain_law import PlainLaw, R, regressor
 from plants import QUIET
@@ -17,7 +24,9 @@ from blf_dsc_controller.law import barrier, prediction
 from blf_dsc_controller.law.state import CHOICES
 from blf_dsc_controller.law.torque import LEVEL_CUT, RATE_CUT, find_applied, saturate
 
-BOUND, WEIGHT, LIMIT = 0.002, 1000.0, 2e4
+BOUND = 0.002
+WEIGHT = 1000.0
+LIMIT = 2e4
 KNEE = barrier.knee(BOUND, WEIGHT, LIMIT)
 RECOMMENDED = (BOUND, WEIGHT, LIMIT, KNEE)
 
@@ -31,19 +40,33 @@ def test_barrier_continues_past_the_knee_at_the_largest_slope():
     for weight in (1.0, 1000.0, 2e4):
         knee = barrier.knee(BOUND, weight, LIMIT)
         assert 0.0 <= knee < BOUND
-        h = 1e-11  # rad: below the knee the slope changes by less than 1 N m/rad over it
-        below, above = each(barrier.gradient, (knee - h, knee + h), BOUND, weight, LIMIT, knee)
+        # rad: below the knee the slope changes by less than 1 N m/rad over it
+        h = 1e-11
+        below, above = each(
+            barrier.gradient, (knee - h, knee + h), BOUND, weight, LIMIT, knee
+        )
         assert (above - below) / (2.0 * h) == pytest.approx(LIMIT, rel=1e-4)
     # The potential is its integral: with h = 1e-8 rad the third derivative (below 1e11 N m/rad^3)
     # adds 1e-6 N m to ~10.
-    h, errors = 1e-8, np.append(np.linspace(-3.0, 3.0, 51) * BOUND, [-KNEE, KNEE])
-    below, above = (each(barrier.potential, errors + side, *RECOMMENDED) for side in (-h, h))
+    h = 1e-8
+    errors = np.append(np.linspace(-3.0, 3.0, 51) * BOUND, [-KNEE, KNEE])
+    below, above = (
+        each(barrier.potential, errors + side, *RECOMMENDED) for side in (-h, h)
+    )
     gradient = each(barrier.gradient, errors, *RECOMMENDED)
-    np.testing.assert_allclose((above - below) / (2.0 * h), gradient, rtol=1e-6, atol=1e-6)
+    np.testing.assert_allclose(
+        (above - below) / (2.0 * h), gradient, rtol=1e-6, atol=1e-6
+    )
 
 
-K0, K, RATE = 0.02, 0.0015, 2.0
-NARROWING = {'bound': np.full(2, K), 'initial_bound': np.full(2, K0), 'funnel_rate': RATE}
+K0 = 0.02
+K = 0.0015
+RATE = 2.0
+NARROWING = {
+    'bound': np.full(2, K),
+    'initial_bound': np.full(2, K0),
+    'funnel_rate': RATE,
+}
 START = (2.2935 + 0.015, 1.6961 - 0.012)
 
 
@@ -97,7 +120,8 @@ def drawn(seed):
     def each(low, high, n=2):
         return random.uniform(low, high, n)
 
-    newton, linear = bool(random.integers(3)), not random.integers(4)
+    newton = bool(random.integers(3))
+    linear = not random.integers(4)
     columns = {
         'bias': bool(random.integers(2)),
         'viscous': bool(random.integers(2)),
@@ -123,16 +147,18 @@ def drawn(seed):
         'motion_scale': random.choice([0.0, 0.05]),
         'row_weight': each(0.3, 1.0),
         'damping_rate': random.uniform(0.0, 20.0),
-        'd2': each(0.0, 300.0),
-        'mu_bar': each(0.0, 0.4),
+        'd2': each(0.0, 300.0) * (not linear),
+        'mu_bar': each(0.0, 0.4) * linear,
         'Wc': random.choice([0.0, 0.05]),
         'eta': random.uniform(0.0, 0.5),
         'gamma': each(0.0, 60.0),
         'Gamma': each(0.2, 2.0, m),
         'radius': random.choice([0.8, 10.0]),
-        'least': np.append([-np.inf] * 3, np.full(m - 3, random.choice([-np.inf, -0.05]))),
+        'least': np.append(
+            [-np.inf] * 3, np.full(m - 3, random.choice([-np.inf, -0.05]))
+        ),
         'most': np.append([np.inf] * 3, np.full(m - 3, random.choice([np.inf, 0.05]))),
-        'surface': int(linear),
+        'has_barrier': int(not linear),
         'K': each(30.0, 60.0) if linear else each(60.0, 150.0),
         'mu': each(10.0, 30.0),
         'Kp': each(10.0, 20.0),
@@ -147,7 +173,12 @@ def drawn(seed):
     }
     start = (2.297, 1.692) if random.integers(2) else (2.293, 1.696)
     arm = {'start': start, 'delay': int(random.integers(3)), 'position_noise': 1e-6}
-    return quick(**columns | gains), arm | {'sample_time': random.choice([1e-3, 2e-3])}
+    arm |= {'sample_time': random.choice([1e-3, 2e-3])}
+    gains |= {
+        'follows_inertia': int(random.integers(2)),
+        'joint_inertia': each(0.2, 0.5),
+    }
+    return quick(**columns | gains), arm
 
 
 def test_law_matches_the_plain_one_in_closed_loop():
@@ -156,24 +187,38 @@ def test_law_matches_the_plain_one_in_closed_loop():
     for seed in range(24):
         settings, given = drawn(seed)
         law, arm = controller(settings), plant(**given)
-        plain, sample = PlainLaw(law.settings), law.sample
-        law.state.gain_scale[:] = plain.inertia = np.random.default_rng(seed).uniform(0.5, 1.0, 2)
+        plain = PlainLaw(law.settings)
+        sample = law.sample
         for now in closed_loop(law, arm, 1.5):
             reference = law.reference_at(now.t)
-            torque = plain.update(now.t, arm.period_ns * 1e-9, *reference, now.measurement)
+            torque = plain.update(
+                now.t, arm.period_ns * 1e-9, *reference, now.measurement
+            )
             plain.tau = sample.torque.copy()
-            ours = sample.torque, sample.estimate, sample.disturbance, sample.xi1, sample.xi2
+            ours = (
+                sample.torque,
+                sample.estimate,
+                sample.disturbance,
+                sample.xi1,
+                sample.xi2,
+            )
             theirs = torque, plain.theta, plain.disturbance, plain.xi1, plain.xi2
             np.testing.assert_allclose(
-                np.concatenate(ours), np.concatenate(theirs), rtol=0.0, atol=1e-11, err_msg=seed
+                np.concatenate(ours),
+                np.concatenate(theirs),
+                rtol=0.0,
+                atol=1e-11,
+                err_msg=seed,
             )
             met |= {('cut', cut) for cut in sample.cuts}
             met |= {('past the bound', bool(np.any(np.abs(sample.xi1) > sample.bound)))}
-            met |= {('at the ball', bool(np.linalg.norm(sample.estimate[:3]) > 0.999 * 0.8))}
+            met |= {
+                ('at the ball', bool(np.linalg.norm(sample.estimate[:3]) > 0.999 * 0.8))
+            }
         assert law.state.latched[0] == 1.0
         assert plain.latched is not None
         met |= {('window full', law.state.rows[0] == settings.window)}
-        met |= {('linear surface', settings.surface == 1)}
+        met |= {('linear surface', settings.has_barrier == 0)}
     assert len(met) == 4 + 4 * 2
 
 
@@ -201,7 +246,8 @@ def cut(demand, last, *, level=10.0, rate=500.0, samples=7.0, added=0.0):
         (5.0, 3.0, 4.0, RATE_CUT, {}),
         (12.0, 9.5, 10.0, LEVEL_CUT, {}),
         (12.0, 5.0, 6.0, LEVEL_CUT + RATE_CUT, {}),
-        (13.0, 14.0, 10.0, LEVEL_CUT + RATE_CUT, {}),  # the level was lowered below the last torque
+        # the level was lowered below the last torque
+        (13.0, 14.0, 10.0, LEVEL_CUT + RATE_CUT, {}),
         (9.0, -9.0, 9.0, 0.0, {'rate': 0.0}),  # no limit
         (9.0, 0.0, 9.0, 0.0, {'samples': 0.0}),  # the first torque
         # With 4 N m of the drive: limits hold for the command and for the whole torque.
@@ -211,7 +257,9 @@ def cut(demand, last, *, level=10.0, rate=500.0, samples=7.0, added=0.0):
         (7.5, 5.0, 4.0, RATE_CUT, {'added': 4.0}),  # the rate is that of the command
     ],
 )
-def test_torque_saturates_at_its_level_and_at_its_rate(demand, last, command, cuts, given):
+def test_torque_saturates_at_its_level_and_at_its_rate(
+    demand, last, command, cuts, given
+):
     for sign in (1.0, -1.0):
         signed = given | {'added': sign * given.get('added', 0.0)}
         assert cut(sign * demand, sign * last, **signed) == (sign * command, cuts)
@@ -238,11 +286,16 @@ LAMBDA = CHOICES['prediction'].index('lambda')
 def test_differentiating_filter_matches_the_exact_discretisation_of_scipy(omega, dt):
     """(8) without its hat and with damping 1, for an input held over each sample."""
     settings, state, signals = arbitrary(4, omega=omega)
-    system = (np.array([[0.0, 1.0], [-(omega**2), -2.0 * omega]]), np.array([[0.0], [omega**2]]))
+    system = (
+        np.array([[0.0, 1.0], [-(omega**2), -2.0 * omega]]),
+        np.array([[0.0], [omega**2]]),
+    )
     A, B, *_ = cont2discrete((*system, np.eye(2), np.zeros((2, 1))), dt)
-    state.samples[0], rounding = 0.0, {'rtol': 1e-9, 'atol': 1e-9 * omega}
+    state.samples[0] = 0.0
+    rounding = {'rtol': 1e-9, 'atol': 1e-9 * omega}
     for xi2, dalpha2 in np.random.default_rng(0).normal(size=(100, 2, 2)):
-        signals.xi2[:], signals.dalpha2[:] = xi2, dalpha2
+        signals.xi2[:] = xi2
+        signals.dalpha2[:] = dalpha2
         prediction.differentiate(settings, state, signals, dt)
         if state.samples[0] == 0.0:
             expected = np.array([signals.xi2, np.zeros(2)])
@@ -251,14 +304,17 @@ def test_differentiating_filter_matches_the_exact_discretisation_of_scipy(omega,
         state.samples[0] += 1.0
         np.testing.assert_allclose(state.observed, expected[0], atol=1e-12)
         np.testing.assert_allclose(state.observed_rate, expected[1], **rounding)
-        np.testing.assert_allclose(signals.acceleration, signals.dalpha2 + expected[1], **rounding)
+        np.testing.assert_allclose(
+            signals.acceleration, signals.dalpha2 + expected[1], **rounding
+        )
 
 
 def test_row_of_lambda_follows_equation_24_in_a_closed_loop():
     law = controller(recommended(prediction=LAMBDA, omega=60.0))
     for sample in closed_loop(law, plant(), 0.5):
         q, dq, applied = sample.measurement.reshape(3, 2)
-        dalpha2, alpha2 = law.signals.dalpha2, dq - law.signals.xi2
+        dalpha2 = law.signals.dalpha2
+        alpha2 = dq - law.signals.xi2
         x = np.array([*(dalpha2 + law.state.observed_rate), *dq, 1.0])
         y = np.array([*dalpha2, *alpha2, 1.0])
         rest = x @ y / (x @ x) * np.column_stack([np.eye(2), applied])
@@ -289,7 +345,9 @@ def test_erratum_21_filter_starts_at_its_input_with_zero_slope():
 
     The paper prints hatted initial values, which are unknown before the first sample.
     """
-    omega, dt, z = 100.0, 1e-3, 0.3
+    omega = 100.0
+    dt = 1e-3
+    z = 0.3
     settings, state, signals = arbitrary(4, omega=omega)
     signals.xi2[:] = z
     slopes = []

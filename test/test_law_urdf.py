@@ -29,7 +29,9 @@ ARM = {'model': 'urdf', 'robot.urdf': 'panda.urdf', 'robot.tip': 'panda_hand_tcp
 
 
 def panda(**changes):
-    return build(ControllerConfig, ARM | {k.replace('__', '.'): v for k, v in changes.items()})
+    return build(
+        ControllerConfig, ARM | {k.replace('__', '.'): v for k, v in changes.items()}
+    )
 
 
 def test_urdf_and_tip_are_enough_to_configure_an_arm():
@@ -42,7 +44,9 @@ def test_urdf_and_tip_are_enough_to_configure_an_arm():
     assert config.safety.velocity_limit == pytest.approx(3.0 * 2.61)
     names = estimate_names(config)
     assert len(names) == 48 + 14
-    assert {'m*cx7', 'rotor7', 'viscous panda_joint1', 'coulomb panda_joint7'} <= set(names)
+    assert {'m*cx7', 'rotor7', 'viscous panda_joint1', 'coulomb panda_joint7'} <= set(
+        names
+    )
 
 
 def test_threads_share_no_working_memory():
@@ -59,7 +63,8 @@ def test_friction_of_the_urdf_is_known_unless_the_drives_compensate_it():
 
 
 def test_given_parameters_override_the_derived_ones():
-    config, derived = panda(barrier__bound=[0.01] * 7, robot__lag=0.002), panda()
+    config = panda(barrier__bound=[0.01] * 7, robot__lag=0.002)
+    derived = panda()
     assert config.barrier.bound == (0.01,) * 7
     expected = derived.feedback.damping_rate * 8e-3 / 5e-3
     assert config.feedback.damping_rate == pytest.approx(expected)
@@ -70,7 +75,8 @@ def test_given_parameters_override_the_derived_ones():
 
 def test_urdf_may_be_given_as_text_or_file(tmp_path):
     assert panda(robot__urdf=PANDA_TEXT).learning == panda().learning
-    empty = tmp_path / 'arm.urdf'  # as a failed xacro leaves it: not to select the two-link arm
+    # as a failed xacro leaves it: not to select the two-link arm
+    empty = tmp_path / 'arm.urdf'
     empty.write_text('\n')
     with pytest.raises(ConfigurationError, match=r'arm.urdf.* is empty: did the xacro'):
         panda(robot__urdf=str(empty))
@@ -81,17 +87,41 @@ def test_urdf_may_be_given_as_text_or_file(tmp_path):
     [
         ({'robot.urdf': 'nowhere.urdf'}, 'robot.urdf: .*nowhere.urdf.* cannot be read'),
         ({'robot.urdf': 'a\0.urdf'}, 'robot.urdf: .* cannot be read: embedded null'),
-        ({'robot.urdf': '~nobody-here/a.urdf'}, 'robot.urdf: .* cannot be read: .*home directory'),
-        ({'robot.urdf': 'package:///arm.urdf'}, "cannot be read: '' is not a valid package name"),
-        ({'robot.urdf': __file__}, r"robot.urdf: '\S+' is not XML: give a URDF$"),
-        ({'robot.tip': 'hand'}, "robot.urdf: no link 'hand' for the tip"),
-        ({'robot.tip': ''}, 'robot.urdf: neither a tip .* not one chain: .*panda_finger_joint1'),
-        ({'robot.urdf': 'package://no_such/arm.urdf'}, "package 'no_such' was not found"),
-        ({'robot.rotor_inertia': [0.1]}, 'robot.rotor_inertia: got 1, but 7 entries are needed'),
-        ({'robot.lag': 'short'}, 'robot.lag: got "short", but a double is expected'),
-        ({'barrier.bound': [0.01] * 2}, 'barrier.bound: got 2, but 7 entries are needed'),
         (
-            {'learning.initial_estimate': [1.0] * 3, 'learning.adaptation_gain': [0.5] * 3},
+            {'robot.urdf': '~nobody-here/a.urdf'},
+            'robot.urdf: .* cannot be read: .*home directory',
+        ),
+        (
+            {'robot.urdf': 'package:///arm.urdf'},
+            "cannot be read: '' is not a valid package name",
+        ),
+        (
+            {'robot.urdf': __file__},
+            r"robot.urdf: '\S+' is not XML: give a URDF or MJCF$",
+        ),
+        ({'robot.tip': 'hand'}, "robot.urdf: no link 'hand' for the tip"),
+        (
+            {'robot.tip': ''},
+            'robot.urdf: neither a tip .* not one chain: .*panda_finger_joint1',
+        ),
+        (
+            {'robot.urdf': 'package://no_such/arm.urdf'},
+            "package 'no_such' was not found",
+        ),
+        (
+            {'robot.rotor_inertia': [0.1]},
+            'robot.rotor_inertia: got 1, but 7 entries are needed',
+        ),
+        ({'robot.lag': 'short'}, 'robot.lag: got "short", but a double is expected'),
+        (
+            {'barrier.bound': [0.01] * 2},
+            'barrier.bound: got 2, but 7 entries are needed',
+        ),
+        (
+            {
+                'learning.initial_estimate': [1.0] * 3,
+                'learning.adaptation_gain': [0.5] * 3,
+            },
             'learning.initial_estimate: got 3, but model urdf has 48',
         ),
     ],
@@ -103,7 +133,8 @@ def test_problems_with_an_arm_are_reported(changes, message):
 
 def test_prior_covers_the_deviations_of_links_drives_and_friction():
     config = panda()
-    deviation, covariance = deviations(config), prior_covariance(config)
+    deviation = deviations(config)
+    covariance = prior_covariance(config)
     assert np.linalg.eigvalsh(covariance)[0] > 0.0
     assert deviation['rotor7'] >= 0.5 * 12.0 / 400.0
     assert deviation['coulomb panda_joint1'] == pytest.approx(0.05 * 87.0)
@@ -115,7 +146,8 @@ def test_prior_covers_the_deviations_of_links_drives_and_friction():
 
 def deviations(config):
     """Standard deviation of the prior of each estimate."""
-    names, covariance = estimate_names(config), prior_covariance(config)
+    names = estimate_names(config)
+    covariance = prior_covariance(config)
     return dict(zip(names, np.sqrt(np.diag(covariance)), strict=True))
 
 
@@ -137,7 +169,10 @@ def test_bound_starts_as_a_funnel_where_an_unknown_load_makes_the_arm_sag():
     barrier = panda().barrier
     assert barrier.initial_bound[0] == 0.0  # its axis is vertical
     assert 0.01 < barrier.initial_bound[5] < 0.03
-    assert panda(robot__payload=0.0).barrier.initial_bound[5] < 0.2 * barrier.initial_bound[5]
+    assert (
+        panda(robot__payload=0.0).barrier.initial_bound[5]
+        < 0.2 * barrier.initial_bound[5]
+    )
     wide = panda(barrier__bound=[0.03] * 7).barrier
     assert wide.initial_bound == (0.0,) * 7
     assert panda(barrier__initial_bound=[0.0] * 7).barrier.widest == (0.002,) * 7
@@ -160,13 +195,15 @@ def test_drives_with_unknown_effort_limit_get_a_finite_prior():
     text = PANDA_TEXT.replace('effort="12"', 'effort="0"')
     config = panda(robot__urdf=text)
     assert np.all(np.isfinite(settings_of_config(config).information))
-    rotor = config.robot.rotors(config.robot.chain(config.joints))[6]  # from the weight carried
+    # from the weight carried
+    rotor = config.robot.rotors(config.robot.chain(config.joints))[6]
     assert deviations(config)['rotor7'] == pytest.approx(0.5 * rotor)
     assert 0.005 < rotor < 0.03
 
 
 def test_random_arm_with_prismatic_joints_needs_only_its_urdf():
-    given = {'model': 'urdf', 'robot.urdf': random_urdf(4, seed=3)[0]}  # one chain: no tip needed
+    # one chain: no tip needed
+    given = {'model': 'urdf', 'robot.urdf': random_urdf(4, seed=3)[0]}
     config = build(ControllerConfig, given)
     assert config.joints == ('j1', 'j2', 'j3', 'j4')
     assert np.all(np.isfinite(settings_of_config(config).information))
@@ -179,12 +216,17 @@ def ran(preset, factor, plant=None, controller=None, sample_time=0.001):
     """Run a preset without a payload for 6 s, with rotors of `factor` times the guess."""
     given = {'sample_time': sample_time}
     truth = {'truth.rotor_factor': factor, 'duration': 6.0, 'events.begin': [100.0]}
-    law, arm = given | (controller or {}), given | truth | (plant or {})
+    law = given | (controller or {})
+    arm = given | truth | (plant or {})
     loop = load_loop(preset, {'blf_dsc_controller': law, 'sim_plant': arm})
     return simulate(loop.controller, loop.plant)
 
 
-PANDA = [('panda', factor, period) for factor in (0.0, 0.1, 0.4, 1.3) for period in (0.001, 0.002)]
+PANDA = [
+    ('panda', factor, period)
+    for factor in (0.0, 0.1, 0.4, 1.3)
+    for period in (0.001, 0.002)
+]
 OTHERS = [('ur5e', 0.2, 0.001), ('ur5e', 0.4, 0.002), ('fr3', 0.1, 0.001)]
 
 
@@ -206,10 +248,16 @@ def test_wrist_that_its_friction_moves_more_than_its_gains_stops_with_the_reason
 def test_the_guess_stops_the_same_arm_where_nothing_is_measured():
     config = load_loop('panda').controller
     guess = config.robot.rotors(config.robot.chain(config.joints))
-    assert ran('panda', 0.1, controller={'robot.rotor_inertia': guess.tolist()}).run().stops
+    assert (
+        ran('panda', 0.1, controller={'robot.rotor_inertia': guess.tolist()})
+        .run()
+        .stops
+    )
 
 
-@pytest.mark.parametrize('plant', [{}, {'sensor.resolution': 2.0 * np.pi / 2**16}, NOISY])
+@pytest.mark.parametrize(
+    'plant', [{}, {'sensor.resolution': 2.0 * np.pi / 2**16}, NOISY]
+)
 @pytest.mark.parametrize('factor', [1.0, 1.3])
 def test_noise_is_not_mistaken_for_a_light_arm(factor, plant):
     state = ran('panda', factor, plant).controller.state
@@ -220,10 +268,13 @@ def test_noise_is_not_mistaken_for_a_light_arm(factor, plant):
 def test_measured_inertia_is_that_of_the_arm_where_the_loop_was_unstable():
     """Between the true inertia and what the loop tolerates, for each joint that was measured."""
     record = ran('panda', 0.1)
-    config, settings = record.config, record.controller.settings
-    robot, chain = config.robot, config.robot.chain(config.joints)
+    config = record.config
+    settings = record.controller.settings
+    robot = config.robot
+    chain = config.robot.chain(config.joints)
     limits = config.limits.position_lower, config.limits.position_upper
-    base, scale = parameters_of(robot, chain), record.controller.state.gain_scale
+    base = parameters_of(robot, chain)
+    scale = record.controller.state.gain_scale
     P = tuple(base.of(chain.inertias, 0.1 * settings.unsure_rotor))
     true = over_postures(chain, base, robot.payload, P, *limits)[0]
     measured = scale < 0.6
@@ -249,4 +300,6 @@ def test_error_of_the_guess_is_between_no_rotor_and_the_guess(evidence, share):
         if k == 199:
             law.state.rotor_sums[:] = np.array([[evidence], [1e6]])
         law.update(k * 1e-3, 1e-3, np.concatenate((q, swing, np.zeros(7))))
-    np.testing.assert_allclose(law.state.rotor_error, share * law.settings.unsure_rotor, atol=1e-12)
+    np.testing.assert_allclose(
+        law.state.rotor_error, share * law.settings.unsure_rotor, atol=1e-12
+    )

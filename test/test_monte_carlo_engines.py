@@ -48,7 +48,9 @@ def chunks(size):
 
 @contextmanager
 def local_dask():
-    distributed = pytest.importorskip('distributed', reason='the extra dask is not installed')
+    distributed = pytest.importorskip(
+        'distributed', reason='the extra dask is not installed'
+    )
     cluster = distributed.LocalCluster(2, threads_per_worker=1, dashboard_address=None)
     with cluster, engines.dask(cluster.scheduler_address) as executor:
         yield executor
@@ -65,7 +67,9 @@ def test_every_executor_gives_the_same_results(a_study, undisturbed, make):
 
 def test_killed_worker_is_named_and_what_was_kept_is_complete(a_study, undisturbed):
     parts = {}
-    lost = pytest.raises(BlfDscError, match=r'a worker was lost .* The same command resumes')
+    lost = pytest.raises(
+        BlfDscError, match=r'a worker was lost .* The same command resumes'
+    )
     with engines.processes(2) as executor, lost:
         for runs, columns in compute(a_study, chunks(1), executor):
             if not parts:
@@ -73,7 +77,10 @@ def test_killed_worker_is_named_and_what_was_kept_is_complete(a_study, undisturb
             parts[runs] = columns
     assert 1 <= len(parts) < RUNS
     for runs, columns in parts.items():
-        assert columns['rms_error_rad.joint1'] == undisturbed['rms_error_rad.joint1'][runs.start]
+        assert (
+            columns['rms_error_rad.joint1']
+            == undisturbed['rms_error_rad.joint1'][runs.start]
+        )
 
 
 def test_error_in_a_run_is_not_taken_for_a_lost_worker(a_study):
@@ -96,7 +103,9 @@ def filled(store, *runs):
 @pytest.fixture(scope='module')
 def whole_store(tmp_path_factory):
     folder = tmp_path_factory.mktemp('study')
-    return filled(Store.create_or_open(folder / 'my study', study(folder)), *reversed(range(RUNS)))
+    return filled(
+        Store.create_or_open(folder / 'my study', study(folder)), *reversed(range(RUNS))
+    )
 
 
 def stamps(folder):
@@ -105,8 +114,16 @@ def stamps(folder):
 
 def test_killed_study_resumes(tmp_path):
     loop = LOOP.replace('duration: 0.3', 'duration: 3.0')
-    path, out = write(tmp_path, loop + STUDY), tmp_path / 'out'
-    command = [sys.executable, '-m', 'blf_dsc_controller', 'monte-carlo', '--config', path]
+    path = write(tmp_path, loop + STUDY)
+    out = tmp_path / 'out'
+    command = [
+        sys.executable,
+        '-m',
+        'blf_dsc_controller',
+        'monte-carlo',
+        '--config',
+        path,
+    ]
     command += ['--out', out, '--workers', '2']
     # What a killed process leaves goes with the logs of the suite.
     environment = {**os.environ, 'TMPDIR': os.environ['ROS_LOG_DIR']}
@@ -115,9 +132,12 @@ def test_killed_study_resumes(tmp_path):
             assert process.poll() is None
             time.sleep(0.01)
         process.kill()
-        process.communicate(timeout=300.0)  # to the end of the pipe: its workers have ended too
+        # to the end of the pipe: its workers have ended too
+        process.communicate(timeout=300.0)
     min(out.glob('runs/r*')).unlink()  # what is missing need not be at the end
-    before = {name: stamp for name, stamp in stamps(out).items() if name.startswith('r')}
+    before = {
+        name: stamp for name, stamp in stamps(out).items() if name.startswith('r')
+    }
     assert 2 <= len(before) < RUNS
     (out / 'runs' / '.runs-000000023-000000023.parquet').write_bytes(b'half a fi')
 
@@ -136,16 +156,25 @@ def test_killed_study_resumes(tmp_path):
 
 @pytest.mark.parametrize(('runs', 'chunks'), [(1, 1), (1001, 201), (10**6, 1000)])
 def test_chunks_are_few_and_hold_each_run_once(tmp_path, runs, chunks):
-    missing = Store.create_or_open(tmp_path / 'out', study(tmp_path, runs=runs)).missing()
+    missing = Store.create_or_open(
+        tmp_path / 'out', study(tmp_path, runs=runs)
+    ).missing()
     assert len(missing) == chunks
-    assert [0, *(chunk.stop for chunk in missing)] == [*(chunk.start for chunk in missing), runs]
+    assert [0, *(chunk.stop for chunk in missing)] == [
+        *(chunk.start for chunk in missing),
+        runs,
+    ]
 
 
 def test_other_study_or_version_is_rejected_and_the_difference_is_named(
     tmp_path, store, monkeypatch
 ):
     for before, after, difference in (
-        ('m2: uniform(0.3', 'm2: uniform(0.2', r'arm.m2: there uniform\(0.3, 0.7\), here uniform'),
+        (
+            'm2: uniform(0.3',
+            'm2: uniform(0.2',
+            r'arm.m2: there uniform\(0.3, 0.7\), here uniform',
+        ),
         ('arm.m2', 'arm.m1', r'arm.m2: there uniform\(0.3, 0.7\), here nothing'),
         ('duration: 0.3', 'duration: 0.4', r'sim_plant.duration: there 0.3, here 0.4'),
         ('window: 0.1', 'window: 0.12', r'learning.window: there 0.1, here 0.12'),
@@ -164,7 +193,9 @@ def test_folder_without_a_study_is_left_alone(tmp_path, capsys):
     out = tmp_path / 'thesis'
     out.mkdir()
     (out / 'chapter1.txt').write_text('In the beginning')
-    assert main(['monte-carlo', '--config', str(write(tmp_path)), '--out', str(out)]) == 1
+    assert (
+        main(['monte-carlo', '--config', str(write(tmp_path)), '--out', str(out)]) == 1
+    )
     assert 'holds no study: choose another folder' in capsys.readouterr().err
     assert [path.name for path in out.iterdir()] == ['chapter1.txt']
 
@@ -189,19 +220,34 @@ def test_runs_are_sorted_worst_first_with_diverged_runs_before_all_others(whole_
     # The worse of both joints counts: ends before the middle, ties in the order of the runs.
     summary = summarize(whole_store.study, results)
     assert [entry['run'] for entry in summary['worst'][:5]] == [5, 0, 23, 1, 22]
-    assert summary['outcomes'] == {'kept': 23, 'violated': 0, 'diverged': 1, 'rejected': 0}
+    assert summary['outcomes'] == {
+        'kept': 23,
+        'violated': 0,
+        'diverged': 1,
+        'rejected': 0,
+    }
     assert summary['kept']['fraction'] == 23 / 24
     # (23 + z^2 / 2 -+ z sqrt(23 / 24 + z^2 / 4)) / (24 + z^2), z = 1.959964, Wilson (1927)
     assert summary['kept']['low'] == pytest.approx(0.797582, abs=1e-6)
     assert summary['kept']['high'] == pytest.approx(0.992607, abs=1e-6)
 
 
-def test_command_of_the_report_reproduces_the_worst_run(whole_store, tmp_path, monkeypatch, capsys):
-    resumed = ['--config', str(whole_store.folder / 'study.yaml'), '--out', str(whole_store.folder)]
+def test_command_of_the_report_reproduces_the_worst_run(
+    whole_store, tmp_path, monkeypatch, capsys
+):
+    resumed = [
+        '--config',
+        str(whole_store.folder / 'study.yaml'),
+        '--out',
+        str(whole_store.folder),
+    ]
     assert main(['monte-carlo', *resumed]) == 0
     kept = int((whole_store.results()['outcome'] == 'kept').sum())
     printed = capsys.readouterr().out
-    assert f'{100 * kept / 24:.4g} % of the runs kept the bound (95 % confidence: ' in printed
+    assert (
+        f'{100 * kept / 24:.4g} % of the runs kept the bound (95 % confidence: '
+        in printed
+    )
     summary = json.loads((whole_store.folder / 'summary.json').read_text())
     assert summary == summarize(whole_store.study, whole_store.results())
     (command,) = re.findall(r'blf_dsc (monte-carlo --reproduce .*)', printed)
@@ -209,8 +255,10 @@ def test_command_of_the_report_reproduces_the_worst_run(whole_store, tmp_path, m
     arguments = shlex.split(command)
     assert int(arguments[3]) == summary['worst'][0]['run']
     assert main(arguments) == 0
-    run, out = int(arguments[3]), tmp_path / arguments[5]
-    results, bag = whole_store.results(), read_run(out / 'bag')
+    run = int(arguments[3])
+    out = tmp_path / arguments[5]
+    results = whole_store.results()
+    bag = read_run(out / 'bag')
     peak = np.abs(bag.error).max(axis=0) / 0.002
     expected = [results[f'max_error_ratio.joint{i}'][run] for i in (1, 2)]
     # The order of operations is not the same as in the kernel.
@@ -232,10 +280,14 @@ def test_run_that_differs_from_its_stored_results_is_reported(whole_store, tmp_p
     folder = tmp_path / 'tampered'
     other = Store.create_or_open(folder, whole_store.study)
     results = whole_store.results()
-    results['max_error_ratio.joint2'] = np.nextafter(results['max_error_ratio.joint2'], 2.0)
+    results['max_error_ratio.joint2'] = np.nextafter(
+        results['max_error_ratio.joint2'], 2.0
+    )
     other.keep(range(RUNS), results)
     (tmp_path / 'run').mkdir()
-    with pytest.raises(BlfDscError, match=r'run 4 differs .*\n.*max_error_ratio.joint2'):
+    with pytest.raises(
+        BlfDscError, match=r'run 4 differs .*\n.*max_error_ratio.joint2'
+    ):
         reproduce(other, '4', tmp_path / 'run')
 
 
@@ -269,7 +321,9 @@ def test_pairs_are_compared_and_exceptions_are_reproduced(tmp_path, capsys):
     assert (noise['broken_only_with'], noise['broken_only_without']) == ([1], [2, 3])
     results['outcome'][1] = 'diverged'
     assert summarize(a_study, results)['pairs']['factor']['max'] is None
-    lost = results | {f'{law}outcome': np.full(4, 'diverged') for law in ('', 'without.')}
+    lost = results | {
+        f'{law}outcome': np.full(4, 'diverged') for law in ('', 'without.')
+    }
     assert summarize(a_study, lost)['pairs']['factor']['median'] is None
 
     store.keep(range(4), results)
@@ -277,7 +331,10 @@ def test_pairs_are_compared_and_exceptions_are_reproduced(tmp_path, capsys):
     assert 'broken only with / only without: 1 / 1' in printed
     assert 'bound broken only with learning: 1' in printed
     assert 'error above 1.3 times that without: 1, 0' in printed
-    assert main(['monte-carlo', '--report', str(store.folder), '--out', str(tmp_path)]) == 0
+    assert (
+        main(['monte-carlo', '--report', str(store.folder), '--out', str(tmp_path)])
+        == 0
+    )
     table = (tmp_path / 'changes.md').read_text()
     assert capsys.readouterr().out == table
     assert '| pairs | 4 | 2 / 2 | 1 / 1 | ' in table
@@ -285,5 +342,10 @@ def test_pairs_are_compared_and_exceptions_are_reproduced(tmp_path, capsys):
 
 
 def test_studies_without_pairs_are_not_put_side_by_side(whole_store, tmp_path, capsys):
-    assert main(['monte-carlo', '--report', str(whole_store.folder), '--out', str(tmp_path)]) == 1
+    assert (
+        main(
+            ['monte-carlo', '--report', str(whole_store.folder), '--out', str(tmp_path)]
+        )
+        == 1
+    )
     assert 'holds no pairs: its study needs pairs: true' in capsys.readouterr().err

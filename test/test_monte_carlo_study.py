@@ -115,25 +115,65 @@ def test_values_are_as_frequent_as_stated():
 @pytest.mark.parametrize(
     ('before', 'after', 'expected'),
     [
-        ('arm.m2', 'arm.m3', r'line 15: vary.arm.m3: unknown parameter.* mean vary.arm.m[12]\?'),
+        (
+            'arm.m2',
+            'arm.m3',
+            r'line 15: vary.arm.m3: unknown parameter.* mean vary.arm.m[12]\?',
+        ),
         ('arm.m2', 'initial.position', r'vary.initial.position: unknown parameter'),
-        ('uniform(0.3', 'unifrm(0.3', r"line 15: vary.arm.m2: got 'unifrm\(0.3, 0.7\)', but"),
+        (
+            'uniform(0.3',
+            'unifrm(0.3',
+            r"line 15: vary.arm.m2: got 'unifrm\(0.3, 0.7\)', but",
+        ),
         (MASS, 'uniform(0.3)', r'with 1 values, but uniform\(low, high\) is'),
         (MASS, 'uniform(a, 0.7)', r'but a number is expected between commas'),
         (MASS, 'uniform(nan, 0.7)', r'must not be above the second'),
-        (MASS, 'choice(inf)', r'can give values that are not allowed: got .inf, but a fin'),
+        (
+            MASS,
+            'choice(inf)',
+            r'can give values that are not allowed: got .inf, but a fin',
+        ),
         (MASS, 'uniform(0.7, 0.3)', r'must not be above the second'),
         (MASS, 'maybe(1.3, 0.3, 0.7)', r'but a probability is from 0 to 1'),
         (MASS, 'maybe(0.3, 0.4, 0.7)', r'not allowed: got 0.0, .* above 0'),
         ('runs: 24', 'base: nothing', r'nothing does not exist: give a parameter file'),
-        ('loguniform(1.0e-6', 'loguniform(0.0', r'loguniform distribution begins above 0'),
-        ('uniform(-0.9, 0.9)', 'uniform(-1.0, 0.9)', r'initial.error: .* above -1 and below 1'),
-        ('integers(0, 3)', 'uniform(0.0, 3.0)', r'delay: got .*: integers\(low, high\), choice'),
-        ('choice(measured,', 'choice(guessed,', r'velocity: .* got "guessed", but it must be one'),
-        ('uniform(-0.2, 0.2)', '["uniform(0, 1)"]', r'got 1 distributions, .* 2 entries \(joint1'),
+        (
+            'loguniform(1.0e-6',
+            'loguniform(0.0',
+            r'loguniform distribution begins above 0',
+        ),
+        (
+            'uniform(-0.9, 0.9)',
+            'uniform(-1.0, 0.9)',
+            r'initial.error: .* above -1 and below 1',
+        ),
+        (
+            'integers(0, 3)',
+            'uniform(0.0, 3.0)',
+            r'delay: got .*: integers\(low, high\), choice',
+        ),
+        (
+            'choice(measured,',
+            'choice(guessed,',
+            r'velocity: .* got "guessed", but it must be one',
+        ),
+        (
+            'uniform(-0.2, 0.2)',
+            '["uniform(0, 1)"]',
+            r'got 1 distributions, .* 2 entries \(joint1',
+        ),
         ('runs: 24', 'runs: 0', r'line 11: runs: got 0, but it must be at least 1'),
-        ('after: 0.2', 'after: 0.3', r'settled_after: got 0.3 s, but a run ends at 0.3 s'),
-        ('duration: 0.3', 'duration: 0.0', r'sim_plant.duration: got 0 s, but every run must end'),
+        (
+            'after: 0.2',
+            'after: 0.3',
+            r'settled_after: got 0.3 s, but a run ends at 0.3 s',
+        ),
+        (
+            'duration: 0.3',
+            'duration: 0.0',
+            r'sim_plant.duration: got 0 s, but every run must end',
+        ),
         ('monte_carlo:', 'monte:', r'there is no section monte_carlo'),
     ],
 )
@@ -163,7 +203,9 @@ def test_run_depends_on_seed_and_index_alone(tmp_path):
     after = draw(study(tmp_path, LOOP + more), 5)
     assert after.pop('plant.arm.l2') > 0.0
     assert drawn == after
-    without = '\n'.join(line for line in (LOOP + STUDY).splitlines() if 'events' not in line)
+    without = '\n'.join(
+        line for line in (LOOP + STUDY).splitlines() if 'events' not in line
+    )
     fewer = draw(study(tmp_path, without), 5)
     assert len(fewer) == 12
     assert fewer.items() <= drawn.items()
@@ -174,7 +216,10 @@ def test_drawn_values_are_used_in_the_plant_of_the_run(tmp_path):
     values = draw(a_study, 2)
     plant = plant_with(a_study, values)
     assert plant.seed == values['seed']
-    assert (plant.arm.m1, plant.arm.m2) == (a_study.plant.arm.m1, values['plant.arm.m2'])
+    assert (plant.arm.m1, plant.arm.m2) == (
+        a_study.plant.arm.m1,
+        values['plant.arm.m2'],
+    )
     assert plant.disturbance.constant[1] == values['plant.disturbance.constant.joint2']
     assert plant.disturbance.constant[0] != plant.disturbance.constant[1]
     assert plant.actuator.delay == values['plant.actuator.delay']
@@ -187,21 +232,27 @@ def test_drawn_values_are_used_in_the_plant_of_the_run(tmp_path):
     events = plant.events  # drawn entry by entry
     assert events.begin == (values['plant.events.begin.1'], 0.2)
     assert events.duration == (0.1, 0.0)
-    assert events.payload == (values['plant.events.payload.1'], values['plant.events.payload.2'])
+    assert events.payload == (
+        values['plant.events.payload.1'],
+        values['plant.events.payload.2'],
+    )
     assert events.torque[0] == values['plant.events.torque.1.joint1'] != 0.0
-    assert events.torque[2] == values['plant.events.torque.2.joint1'] != events.torque[0]
+    assert (
+        events.torque[2] == values['plant.events.torque.2.joint1'] != events.torque[0]
+    )
     assert (events.torque[1], events.torque[3]) == (0.0, 0.0)
 
 
 def test_start_is_as_configured_and_events_follow_each_other_by_gaps(tmp_path):
-    text = '\n'.join(line for line in STUDY.splitlines() if 'initial' not in line) + '\n'
-    begin, gap = (
-        'begin: ["uniform(0.05, 0.1)", "choice(0.2)"]',
-        'gap: ["uniform(0, 1)", "choice(2)"]',
+    text = (
+        '\n'.join(line for line in STUDY.splitlines() if 'initial' not in line) + '\n'
     )
+    begin = 'begin: ["uniform(0.05, 0.1)", "choice(0.2)"]'
+    gap = 'gap: ["uniform(0, 1)", "choice(2)"]'
     a_study = study(tmp_path, LOOP + text.replace(begin, gap))
     values = draw(a_study, 3)
-    plant, first = plant_with(a_study, values), values['plant.events.gap.1']
+    plant = plant_with(a_study, values)
+    first = values['plant.events.gap.1']
     assert plant.initial == a_study.plant.initial
     assert plant.events.begin == (first, first + 2.0)
 
@@ -211,7 +262,9 @@ def test_one_row_of_joints_serves_all_events_and_needs_some(tmp_path):
     assert text != STUDY
     assert study(tmp_path, LOOP + text) == study(tmp_path)
     text = '\n'.join(line for line in LOOP.splitlines() if 'events' not in line)
-    with pytest.raises(ConfigurationError, match=r'events.payload: .* no events: give events.beg'):
+    with pytest.raises(
+        ConfigurationError, match=r'events.payload: .* no events: give events.beg'
+    ):
         study(tmp_path, f'{text}\n{STUDY}')
 
 
@@ -225,7 +278,9 @@ def test_study_may_be_based_on_a_preset(tmp_path):
     changed = {'runs': 3, 'seed': 1, 'vary.arm.m2': 'choice(0.5)'}
     assert derived.values()['monte_carlo'] == original.values()['monte_carlo'] | changed
     assert derived.plant == original.plant
-    with pytest.raises(ConfigurationError, match=r'base: .*study.yaml. leads back to a file'):
+    with pytest.raises(
+        ConfigurationError, match=r'base: .*study.yaml. leads back to a file'
+    ):
         study(tmp_path, text.replace(str(base), str(tmp_path / 'study.yaml')))
 
 
@@ -257,12 +312,14 @@ LIMITS = 'blf_dsc_controller:\n  ros__parameters:\n'
 WEAK = LOOP.replace(LIMITS, LIMITS + '    torque: {limit: [8.0, 20.0]}\n')
 # Motors that are weaker than the law assumes.
 MOTORS = LOOP.replace(
-    '    duration: 0.3\n', '    duration: 0.3\n    actuator: {torque_limit: [9.0, 0.0]}\n'
+    '    duration: 0.3\n',
+    '    duration: 0.3\n    actuator: {torque_limit: [9.0, 0.0]}\n',
 )
 # A gain far above what a 1 kHz loop can take, and no effective torque limit.
 UNSTABLE = LOOP.replace(
     LIMITS,
-    LIMITS + '    torque: {limit: [1.0e+308, 1.0e+308]}\n    feedback: {gain: [1.0e+9, 1.0e+9]}\n',
+    LIMITS
+    + '    torque: {limit: [1.0e+308, 1.0e+308]}\n    feedback: {gain: [1.0e+9, 1.0e+9]}\n',
 )
 
 
@@ -272,11 +329,15 @@ def metrics_of_record(a_study, run):
     record = simulate(a_study.controller, plant, supervised=False)
     rows = sample_columns(record.samples, record.controller.settings)
     t = record.stamps * 1e-9
-    error, estimate, P = np.abs(rows.xi1), rows.estimate[-1, :3], record.truths[-1, :3]
+    error = np.abs(rows.xi1)
+    estimate = rows.estimate[-1, :3]
+    P = record.truths[-1, :3]
     outside = t[(error >= 0.002).any(axis=1)]
     latched = t[rows.latched[:, 0] > 0.0]
     motors = np.array(a_study.plant.actuator.torque_limit)
-    limit = np.minimum(a_study.controller.torque.limit, np.where(motors > 0.0, motors, np.inf))
+    limit = np.minimum(
+        a_study.controller.torque.limit, np.where(motors > 0.0, motors, np.inf)
+    )
     H = torque_rows(another_motion(a_study.controller, 1000))
     metrics = {
         'first_violation_s': outside[0] if outside.size else np.nan,
@@ -300,7 +361,9 @@ def test_metrics_match_the_full_record(tmp_path, loop):
     for run in range(6):
         for name, value in metrics_of_record(a_study, run).items():
             # Sums are taken in another order.
-            assert results[name][run] == pytest.approx(value, rel=1e-12, nan_ok=True), name
+            assert results[name][run] == pytest.approx(value, rel=1e-12, nan_ok=True), (
+                name
+            )
     is_kept = results['outcome'] == 'kept'
     np.testing.assert_array_equal(is_kept, np.isnan(results['first_violation_s']))
     assert is_kept.sum() > 3 or loop != LOOP
@@ -319,10 +382,14 @@ def test_pairs_run_the_same_plant_with_and_without_learning(tmp_path):
     figures = [name for name in alone if not name.startswith('plant.')][2:]
     for name in figures:
         np.testing.assert_array_equal(found[name], alone[name], err_msg=name)
-        np.testing.assert_array_equal(found[f'without.{name}'], without[name], err_msg=name)
+        np.testing.assert_array_equal(
+            found[f'without.{name}'], without[name], err_msg=name
+        )
     assert (found['parameter_error.end'] != found['without.parameter_error.end']).any()
     for joint in ('joint1', 'joint2'):
-        quiet, noisy = (found[f'{law}.max_error_ratio.{joint}'] for law in ('without', 'noise'))
+        quiet, noisy = (
+            found[f'{law}.max_error_ratio.{joint}'] for law in ('without', 'noise')
+        )
         assert (noisy != quiet).all()
         np.testing.assert_allclose(noisy, quiet, rtol=0.3)
 
@@ -345,7 +412,10 @@ def test_start_rejected_by_the_controller_has_its_own_outcome(tmp_path):
         assert np.isnan(results[name][rejected]).all()
 
 
-APPROACHING = {'enabled: false': 'enabled: true', 'loguniform(1.0e-6, 2.0e-5)': 'choice(0.002)'}
+APPROACHING = {
+    'enabled: false': 'enabled: true',
+    'loguniform(1.0e-6, 2.0e-5)': 'choice(0.002)',
+}
 
 
 @pytest.mark.parametrize('changes', [{}, APPROACHING])
@@ -358,4 +428,6 @@ def test_state_of_one_run_does_not_leak_into_the_next(tmp_path, changes):
     whole_study = whole(a_study)
     for run in range(8):
         for name, values in run_chunk(a_study, run, 1).items():
-            np.testing.assert_array_equal(values, whole_study[name][run : run + 1], err_msg=name)
+            np.testing.assert_array_equal(
+                values, whole_study[name][run : run + 1], err_msg=name
+            )

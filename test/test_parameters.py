@@ -53,7 +53,9 @@ def test_parameters_have_descriptors(bare_node):
     window = node.describe_parameter('learning.window')
     assert 'fixed at the start: it sets the size' in window.additional_constraints
     sample_time = node.describe_parameter('sample_time')
-    assert sample_time.additional_constraints.startswith('at least 1e-05 and at most 1; fixed at')
+    assert sample_time.additional_constraints.startswith(
+        'at least 1e-05 and at most 1; fixed at'
+    )
 
 
 def test_empty_list_stays_empty_and_keeps_its_type_and_description(bare_node, tmp_path):
@@ -66,13 +68,17 @@ def test_empty_list_stays_empty_and_keeps_its_type_and_description(bare_node, tm
     assert descriptor.type == ParameterType.PARAMETER_STRING_ARRAY
     assert descriptor.description == 'topics to record; empty: all'
     (result,) = node.set_parameters([Parameter('topics', value=['/clock'])])
-    assert result.reason.startswith('topics is fixed at the start: a bag is opened once')
+    assert result.reason.startswith(
+        'topics is fixed at the start: a bag is opened once'
+    )
     node = bare_node('bag_recorder', overrides={'topics': ['/clock']})
     assert declare(node, RecorderConfig).topics == ('/clock',)
 
 
 def test_all_problems_are_reported_at_once_and_nothing_is_declared(bare_node, tmp_path):
-    content = 'arm: {l1: 1}, seed: -1, mode: offline, sensr.resolution: 1.0, initial: {v: x}'
+    content = (
+        'arm: {l1: 1}, seed: -1, mode: offline, sensr.resolution: 1.0, initial: {v: x}'
+    )
     path = tmp_path / 'arm.yaml'
     path.write_text(f'sim_plant:\n  ros__parameters: {{{content}}}\n')
     node = bare_node('sim_plant', path)
@@ -105,9 +111,13 @@ class Tuned:
     """A node that accepts changes, and the configurations it applied."""
 
     def __init__(self, bare_node):
-        self.node, self.applied, self.problems = bare_node('blf_dsc_controller'), [], []
+        self.node = bare_node('blf_dsc_controller')
+        self.applied = []
+        self.problems = []
         declare(self.node, ControllerConfig)
-        on_change(self.node, ControllerConfig, self.applied.append, lambda _: self.problems)
+        on_change(
+            self.node, ControllerConfig, self.applied.append, lambda _: self.problems
+        )
 
     def request(self, **given):
         """Send one atomic request; `__` stands for the dot."""
@@ -127,7 +137,9 @@ def tuned(bare_node):
 
 def test_valid_changes_are_passed_on_once_each_as_a_whole_configuration(tuned):
     assert tuned.request(feedback__gain=[70.0, 30.0], learning__weight=2.0).successful
-    expected = change(ControllerConfig(), {'feedback.gain': (70.0, 30.0), 'learning.weight': 2.0})
+    expected = change(
+        ControllerConfig(), {'feedback.gain': (70.0, 30.0), 'learning.weight': 2.0}
+    )
     assert tuned.applied == [expected]
     assert tuned.config == expected
     tuned.request(disturbance__leakage=0.5)
@@ -137,13 +149,21 @@ def test_valid_changes_are_passed_on_once_each_as_a_whole_configuration(tuned):
 @pytest.mark.parametrize(
     ('given', 'message'),
     [
-        ({'feedback__gain': [1.0]}, 'feedback.gain: got 1, but 2 entries are needed (2 of joints)'),
-        ({'learning__radius': 0.1}, 'learning.radius: got 0.1 kg m^2, but learning.initial_est'),
+        (
+            {'feedback__gain': [1.0]},
+            'feedback.gain: got 1, but 2 entries are needed (2 of joints)',
+        ),
+        (
+            {'learning__radius': 0.1},
+            'learning.radius: got 0.1 kg m^2, but learning.initial_est',
+        ),
         # ROS itself rejects this, by the descriptor of the parameter.
         ({'learning__weight': 1}, 'Wrong parameter type, expected'),
     ],
 )
-def test_invalid_change_is_rejected_with_the_reason_and_none_of_it_applied(tuned, given, message):
+def test_invalid_change_is_rejected_with_the_reason_and_none_of_it_applied(
+    tuned, given, message
+):
     result = tuned.request(disturbance__gain=[3.0, 3.0], **given)
     assert not result.successful
     assert result.reason.startswith(message)
@@ -153,7 +173,9 @@ def test_invalid_change_is_rejected_with_the_reason_and_none_of_it_applied(tuned
 
 def test_changes_that_are_valid_only_together_are_applied_together(tuned):
     assert not tuned.request(barrier__weight=[3e4, 3e4]).successful
-    assert tuned.request(barrier__weight=[3e4, 3e4], barrier__slope_limit=[5e4, 5e4]).successful
+    assert tuned.request(
+        barrier__weight=[3e4, 3e4], barrier__slope_limit=[5e4, 5e4]
+    ).successful
     assert tuned.applied[-1].barrier.weight == (3e4, 3e4)
     # Now the limit is validated against the current weight, not against the first one.
     assert not tuned.request(barrier__slope_limit=[2.5e4, 2.5e4]).successful
@@ -173,7 +195,11 @@ def test_node_can_reject_a_valid_configuration_of_its_own_parameters_only(tuned)
 # The URDF on a latched topic: the node waits for it and uses it as if given as a file.
 
 TEXT = random_urdf(3, seed=5)[0]
-ON_TOPIC = {'robot.urdf': 'topic://robot_description', 'robot.tip': 'tip', 'autostart': False}
+ON_TOPIC = {
+    'robot.urdf': 'topic://robot_description',
+    'robot.tip': 'tip',
+    'autostart': False,
+}
 
 
 def publish(ros, topic, quality=topics.ROBOT_DESCRIPTION.offered):
@@ -209,7 +235,9 @@ def test_urdf_that_is_missing_or_not_latched_is_reported(ros, monkeypatch, publi
 
 
 def test_topic_is_rejected_outside_a_node():
-    with pytest.raises(ConfigurationError, match=r'robot.urdf: .* is a topic, which only a node'):
+    with pytest.raises(
+        ConfigurationError, match=r'robot.urdf: .* is a topic, which only a node'
+    ):
         build(ControllerConfig, ON_TOPIC)
 
 
@@ -232,7 +260,9 @@ CONFIG = Path(__file__).parents[1] / 'config'
 def test_sros2_policy_grants_each_node_exactly_what_it_uses(tmp_path):
     """In a separate process: rcl publishes /rosout once per node name and process."""
     live = tmp_path / 'policy.xml'
-    subprocess.run([sys.executable, sros2_graph.__file__, live], check=True, capture_output=True)
+    subprocess.run(
+        [sys.executable, sros2_graph.__file__, live], check=True, capture_output=True
+    )
     hint = 'run: python test/sros2_graph.py config/sros2_policy.xml'
     assert (CONFIG / 'sros2_policy.xml').read_text() == live.read_text(), hint
 
@@ -240,9 +270,9 @@ def test_sros2_policy_grants_each_node_exactly_what_it_uses(tmp_path):
 def test_viewer_configurations_name_existing_topics():
     rviz = yaml.safe_load((CONFIG / 'arm.rviz').read_text())
     displays = rviz['Visualization Manager']['Displays']
-    assert {d['Description Topic']['Value'] for d in displays if 'Description Topic' in d} == {
-        'robot_description'
-    }
+    assert {
+        d['Description Topic']['Value'] for d in displays if 'Description Topic' in d
+    } == {'robot_description'}
     layout = json.loads((CONFIG / 'foxglove.json').read_text())
     known = {t.resolved for t in topics.TOPICS} | {'/robot_description'}
     used = [

@@ -25,7 +25,7 @@ from blf_dsc_controller.law.factory import settings_of_config
 from blf_dsc_controller.reference import terms
 from blf_dsc_controller.reference.approach import reference_of
 from blf_dsc_controller.simulation.loop import simulate
-from blf_dsc_controller.studies import laws
+from blf_dsc_controller.studies import laws, stiffness
 from blf_dsc_controller.studies import tuning as tune
 from blf_dsc_controller.studies.monte_carlo import torque_rows
 from blf_dsc_controller.studies.paper import CASES, FAILS, HOLDS, ONLY_IF, case_name
@@ -37,10 +37,14 @@ def test_every_law_is_tuned_with_the_same_effort():
     for task in tune.TASKS.values():
         for gain in task.gains:
             key = gain.name, gain.joint
-            assert ranges.setdefault(key, (gain.least, gain.most)) == (gain.least, gain.most)
+            assert ranges.setdefault(key, (gain.least, gain.most)) == (
+                gain.least,
+                gain.most,
+            )
         values = [tune.value_at(k / 10.0) for k in range(len(task.gains))]
         found = tune.parameters_at(ControllerConfig(), task.gains, values)
-        assert found['feedback.gain'] == (1.0, 1.26)  # of each joint; 10^0.1 to three digits
+        # of each joint; 10^0.1 to three digits
+        assert found['feedback.gain'] == (1.0, 1.26)
         assert found['learning.adaptation_gain'] == (1.58,) * 3
     assert len(tune.TASKS['proposed'].gains) == len(tune.TASKS['comparison'].gains)
 
@@ -52,10 +56,15 @@ def test_committed_gains_beat_the_middle_of_their_ranges(name):
     preset = {'proposed': 'paper_tuned'}.get(name, name)
     middle = np.array([np.log10(gain.least * gain.most) / 2.0 for gain in task.gains])
     loops = tune.loops_of(task)
-    bare, tuned = task._replace(gains=()), load_loop(preset).controller
-    best = tune.objective(np.array([]), bare, [loop._replace(controller=tuned) for loop in loops])
+    bare = task._replace(gains=())
+    tuned = load_loop(preset).controller
+    best = tune.objective(
+        np.array([]), bare, [loop._replace(controller=tuned) for loop in loops]
+    )
     assert best < tune.objective(middle, task, loops) - 1.0
-    stated = re.search(r'objective (-?[\d.]+)', locate(preset).read_text(encoding='utf-8'))
+    stated = re.search(
+        r'objective (-?[\d.]+)', locate(preset).read_text(encoding='utf-8')
+    )
     assert best == pytest.approx(float(stated.group(1)), abs=0.01)
 
 
@@ -63,7 +72,10 @@ def test_committed_gains_beat_the_middle_of_their_ranges(name):
 def report(tmp_path_factory):
     """The report of the whole study, run once: about 20 s on two cores."""
     out = tmp_path_factory.mktemp('study') / 'report'
-    with (out.parent / 'printed.txt').open('w') as file, contextlib.redirect_stdout(file):
+    with (
+        (out.parent / 'printed.txt').open('w') as file,
+        contextlib.redirect_stdout(file),
+    ):
         assert main(['paper', '--out', str(out)]) == 0
     return out
 
@@ -89,7 +101,9 @@ def test_verdicts_follow_from_the_runs_of_the_report(found):
     assert verdicts['The reference does not fully excite the system.'] == FAILS
     assert verdicts['With everything known V decreases for all time.'] == ONLY_IF
     assert verdicts['It is superior in tracking and in estimation.'] == ONLY_IF
-    assert verdicts['The proposed controller always stays within the boundaries.'] == HOLDS
+    assert (
+        verdicts['The proposed controller always stays within the boundaries.'] == HOLDS
+    )
     assert verdicts['Tracking and parameter errors converge exponentially.'] == HOLDS
     # w = 1 N m/rad is a spring with 2 mN m at 2 mrad, and the push is 8 N m.
     assert found['metrics']['paper_pushed']['max_error_ratio'] > 1.0
@@ -106,11 +120,16 @@ def test_saved_configurations_are_those_that_ran(report, found):
     metrics = found['metrics']
     assert metrics[name]['max_error_ratio'] == again.max_error_ratio
     assert loop.plant.actuator.delay == 1
-    assert len(list((report / 'configurations').iterdir())) == len(metrics) == len(CASES)
+    assert (
+        len(list((report / 'configurations').iterdir())) == len(metrics) == len(CASES)
+    )
 
 
 ROOT = Path(__file__).resolve().parents[1]
-PAGES = {name: (ROOT / 'doc' / f'{name}.md').read_text() for name in ('theory', 'errata', 'tuning')}
+PAGES = {
+    name: (ROOT / 'doc' / f'{name}.md').read_text()
+    for name in ('theory', 'errata', 'tuning')
+}
 TESTS = ''.join(path.read_text() for path in (ROOT / 'test').glob('test_*.py'))
 
 
@@ -126,7 +145,10 @@ def test_every_test_and_preset_named_on_a_page_exists(page):
 
 
 def test_every_erratum_and_every_test_of_one_has_a_row():
-    rows = [int(number) for number in re.findall(r'^\| (\d+)', PAGES['errata'], re.MULTILINE)]
+    rows = [
+        int(number)
+        for number in re.findall(r'^\| (\d+)', PAGES['errata'], re.MULTILINE)
+    ]
     assert rows == list(range(1, 27))
     tested = {int(number) for number in re.findall(r'def test_erratum_(\d+)_', TESTS)}
     assert tested <= set(rows)
@@ -185,7 +207,9 @@ def test_parameter_error_depends_on_the_phase_of_the_disturbance_as_documented()
 def test_numbers_on_the_pages_match_the_runs():
     assert 'a fifth is left' in ' '.join(PAGES['theory'].split())
     errors = [
-        run(configured('recommended', 60.0, {'learning.weight': weight})).parameter_error[-1]
+        run(
+            configured('recommended', 60.0, {'learning.weight': weight})
+        ).parameter_error[-1]
         for weight in (100.0, 500.0)
     ]
     assert errors[0] / errors[1] == pytest.approx(5.0, abs=0.5)
@@ -203,10 +227,14 @@ FRICTIONLESS = {'robot.viscous': [0.0] * 6, 'robot.coulomb': [0.0] * 6}
 
 def ideal(period, law=FRICTIONLESS):
     """A UR5e true to its URDF, with ideal sensors and drives, in motion E0 off its reference."""
-    loop, step = load_loop('ur5e'), {'sample_time': period}
-    config, robot = loop.controller, {'robot.urdf': 'ur5e.urdf', 'robot.tip': 'tool0'}
+    loop = load_loop('ur5e')
+    step = {'sample_time': period}
+    config = loop.controller
+    robot = {'robot.urdf': 'ur5e.urdf', 'robot.tip': 'tool0'}
     chain = config.robot.chain(config.joints)
-    P = parameters_of(config.robot, chain).of(chain.inertias, config.robot.rotors(chain))
+    P = parameters_of(config.robot, chain).of(
+        chain.inertias, config.robot.rotors(chain)
+    )
     config = change(config, step | law | {'learning.initial_estimate': P.tolist()})
     ((q, dq, _),) = terms.sampled(reference_of(config), np.zeros(1))
     start = {'initial.position': (q + E0).tolist(), 'initial.velocity': dq.tolist()}
@@ -234,7 +262,9 @@ def test_law_of_a_file_acts_at_the_right_time():
 def test_torque_is_cut_at_its_limit():
     gains, loop = GAINS | {'position': 1e9}, ideal(1e-3)
     _, torques = laws.simulate_with(loop, laws.computed_torque, gains)
-    np.testing.assert_array_equal(np.abs(torques).max(axis=0), loop.controller.torque.limit)
+    np.testing.assert_array_equal(
+        np.abs(torques).max(axis=0), loop.controller.torque.limit
+    )
 
 
 def test_integrator_of_computed_torque_removes_the_error_of_a_push():
@@ -261,17 +291,54 @@ def test_computed_torque_compensates_known_friction_along_the_reference():
     assert np.abs(friction).min() > 0.1
 
 
+def test_computed_torque_without_gains_has_those_of_the_law_at_small_errors():
+    """k_p = 1.8 w^2, k_d = 2.1 w, k_i = 0.6 w^3 with the rate w = 0.625 / 7.5 ms."""
+    config = load_loop('ur5e').controller
+    law = laws.computed_torque({}, laws.known_of(config))
+    rate = 0.625 / 7.5e-3
+    np.testing.assert_allclose(law.position, 1.8 * rate**2, rtol=1e-3)
+    np.testing.assert_allclose(law.velocity, 2.1 * rate, rtol=1e-3)
+    np.testing.assert_allclose(law.integral, 0.6 * rate**3, rtol=1e-3)
+
+
+def test_soft_trial_has_a_part_of_the_bandwidth_and_a_bound_that_fits():
+    stiff = laws.trial('ur5e', 1).controller
+    soft = stiffness.soft_trial('ur5e', 1, 0.25).controller
+    assert soft.feedback.damping_rate == pytest.approx(
+        0.25 * stiff.feedback.damping_rate
+    )
+    assert soft.barrier.bound == (16 * 0.005,) * 6
+    assert soft.reference == stiff.reference
+
+
+def test_table_and_picture_of_soft_arms_show_each_law(tmp_path):
+    of_law = {'before': [1e-3, 2e-3, 3e-3, 4e-3], 'with the load': [5e-3] * 4}
+    errors = dict.fromkeys(stiffness.LAWS, of_law)
+    head, *lines = stiffness.format_errors(errors).splitlines()
+    assert head.split()[-4:] == ['1', '0.5', '0.25', '0.125']
+    assert len(lines) == 6
+    assert lines[0].split()[-4:] == ['1.00', '2.00', '3.00', '4.00']
+    stiffness.draw({'ur5e': errors}, tmp_path / 'stiffness.png')
+    assert (tmp_path / 'stiffness.png').stat().st_size > 10_000
+
+
 def test_integral_gain_of_slotine_li_is_the_gain_of_its_disturbance_estimate():
     config = load_loop('ur5e').controller
-    chosen = {'law': 'slotine_li', 'comparison.integral_gain': [1.0, 2.0, 3.0, 4.0, 5.0, 6.0]}
+    chosen = {
+        'law': 'slotine_li',
+        'comparison.integral_gain': [1.0, 2.0, 3.0, 4.0, 5.0, 6.0],
+    }
     settings = settings_of_config(change(config, chosen))
     assert settings.gamma.tolist() == [1.0, 2.0, 3.0, 4.0, 5.0, 6.0]
     assert not settings_of_config(change(config, {'law': 'slotine_li'})).gamma.any()
 
 
-@pytest.mark.parametrize('name', [k for k, c in laws.CONTENDERS.items() if isinstance(c.law, str)])
+@pytest.mark.parametrize(
+    'name', [k for k, c in laws.CONTENDERS.items() if isinstance(c.law, str)]
+)
 def test_limits_of_the_gain_search_are_valid_configurations(name):
-    config, contender = load_loop('panda').controller, laws.CONTENDERS[name]
+    config = load_loop('panda').controller
+    contender = laws.CONTENDERS[name]
     for side in ('least', 'most'):
         values = {gain.name: getattr(gain, side) for gain in contender.gains}
         change(config, laws.law_changes(contender, config, values))
@@ -293,7 +360,9 @@ def test_every_trial_has_its_own_truth_motion_and_noise():
 def test_cost_penalises_rough_torque_and_is_largest_for_a_diverged_run():
     figures = laws.Figures((1e-3, 1e-2, 1e-1, 1e0), 200.0, laws.ROUGHEST / 2.0, ())
     assert laws.cost_of(figures) == pytest.approx(1.5)
-    assert laws.cost_of(replace(figures, roughness=10.0 * laws.ROUGHEST)) == pytest.approx(11.5)
+    assert laws.cost_of(
+        replace(figures, roughness=10.0 * laws.ROUGHEST)
+    ) == pytest.approx(11.5)
     assert laws.cost_of(replace(figures, errors=(np.nan,) * 4)) == 30.0
     assert laws.cost_of(replace(figures, errors=(1e300,) * 4)) == 30.0
 
@@ -304,7 +373,9 @@ def test_table_shows_the_worst_run_of_each_law():
     outside = laws.Figures((2e-3,) * 4, 1.0, 0.02, (0.03, 0.0))
     results = {
         'proposed': laws.Result({}, None, [inside, outside]),
-        'slotine_li_tuned': laws.Result({'position': 3.0}, 1.0, [replace(inside, model=())]),
+        'slotine_li_tuned': laws.Result(
+            {'position': 3.0}, 1.0, [replace(inside, model=())]
+        ),
     }
     heads, proposed, tuned, gains = (
         re.split(r'  +', line) for line in laws.format_results(results).splitlines()
@@ -321,14 +392,19 @@ def test_every_law_is_tuned_and_run_and_learning_finds_the_model(tmp_path, monke
     for name, value in {'POPULATION': 5, 'GENERATIONS': 0, 'TRUTHS': 1}.items():
         monkeypatch.setattr(laws, name, value)
     assert main(['arms', '--config', 'ur5e', '--out', str(tmp_path / 'out')]) == 0
-    found = json.loads((tmp_path / 'out/figures.json').read_text(encoding='utf-8'))['ur5e']
+    found = json.loads((tmp_path / 'out/figures.json').read_text(encoding='utf-8'))[
+        'ur5e'
+    ]
     assert list(found) == list(laws.CONTENDERS)
     rows = torque_rows(laws.trial('ur5e', 1000).controller)
     for name, contender in laws.CONTENDERS.items():
         assert list(found[name]['gains']) == [gain.name for gain in contender.gains]
-        again = laws.run(name, laws.trial('ur5e', 1), found[name]['gains'], rows)  # in this process
+        # in this process
+        again = laws.run(name, laws.trial('ur5e', 1), found[name]['gains'], rows)
         assert found[name]['runs'] == [json.loads(json.dumps(asdict(again)))]
-    learned, guessed = (found[name]['runs'][0]['model'] for name in ('proposed', 'no_learning'))
+    learned, guessed = (
+        found[name]['runs'][0]['model'] for name in ('proposed', 'no_learning')
+    )
     assert learned[0] < guessed[0] / 2.0
     assert learned[1] < guessed[1] / 5.0  # the URDF does not include the payload
 
@@ -351,11 +427,17 @@ def test_file_without_a_usable_law_is_rejected(tmp_path, capsys):
 
 
 def test_laws_of_a_file_join_those_chosen_by_name(tmp_path, monkeypatch, capsys):
-    assert main(['arms', '--config', 'recommended', '--out', str(tmp_path / 'out')]) == 1
+    assert (
+        main(['arms', '--config', 'recommended', '--out', str(tmp_path / 'out')]) == 1
+    )
     assert 'got model two_link' in capsys.readouterr().err
     monkeypatch.setattr(laws, 'CONTENDERS', dict(laws.CONTENDERS))
     file = tmp_path / 'law_of_mine.py'
     file.write_text(f"{IMPORT}CONTENDERS = {{'mine': Contender('mine')}}")
     assert laws.chosen_laws([]) == list(laws.CONTENDERS)
     for _ in range(2):  # a worker that was forked has it already
-        assert laws.chosen_laws(['slotine_li', str(file)]) == ['proposed', 'slotine_li', 'mine']
+        assert laws.chosen_laws(['slotine_li', str(file)]) == [
+            'proposed',
+            'slotine_li',
+            'mine',
+        ]

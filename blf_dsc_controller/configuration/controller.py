@@ -6,6 +6,8 @@ The gains are those of the control laws (28) and (35), and of composite learning
 
 from __future__ import annotations
 
+import dataclasses
+import functools
 import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
@@ -17,24 +19,42 @@ import numpy as np
 
 from blf_dsc_controller.arms import tuning
 from blf_dsc_controller.arms.model import arm_model
-from blf_dsc_controller.configuration.robot import ArmConfig, given_robot, parameters_of
+from blf_dsc_controller.configuration import law_file
+from blf_dsc_controller.configuration.robot import (
+    ArmConfig,
+    described,
+    given_robot,
+    parameters_of,
+)
 from blf_dsc_controller.configuration.schema import (
     PerJoint,
     Value,
+    build,
+    flatten,
+    format_value,
     non_negative,
     parameter,
     positive,
+    suggestion,
 )
+from blf_dsc_controller.errors import BlfDscError
 
 _of_reference = partial(
-    parameter, read_only='the reference would jump: send a trajectory on ~/joint_trajectory'
+    parameter,
+    read_only='the reference would jump: send a trajectory on ~/joint_trajectory',
 )
-_telemetry = partial(parameter, read_only='topics are created once, when the node starts')
+_telemetry = partial(
+    parameter, read_only='topics are created once, when the node starts'
+)
 _size = partial(parameter, read_only='it sets the size of the state of the law')
-_in_window = partial(parameter, read_only='the data in the excitation window depend on it')
+_in_window = partial(
+    parameter, read_only='the data in the excitation window depend on it'
+)
 _at_start = partial(parameter, read_only='it has no effect later')
 _known = partial(parameter, read_only='it is known data, not a gain')
-_SAMPLES = (10, 1_000_000)  # per window: fewer do not determine P, more need over 100 MB
+_RISE = 0.05  # s to the largest acceleration
+# per window: fewer do not determine P, more need over 100 MB
+_SAMPLES = (10, 1_000_000)
 
 
 @dataclass(frozen=True)
@@ -46,11 +66,14 @@ class Reference:
     """
 
     type: Literal['sinusoids', 'waypoints', 'hold'] = _of_reference(
-        'sinusoids', 'sinusoids (paper), waypoints (minimum jerk), or hold (the initial position)'
+        'sinusoids',
+        'sinusoids (paper), waypoints (minimum jerk), or hold (the initial position)',
     )
     offset: PerJoint = _of_reference((1.9935, 1.3961), 'centre of the motion', 'rad')
-    amplitude: Annotated[tuple[float, ...], 'joints', 'reference.frequency'] = _of_reference(
-        (0.3, 0.3), 'amplitude of each tone: one row per joint, row by row', 'rad'
+    amplitude: Annotated[tuple[float, ...], 'joints', 'reference.frequency'] = (
+        _of_reference(
+            (0.3, 0.3), 'amplitude of each tone: one row per joint, row by row', 'rad'
+        )
     )
     frequency: tuple[float, ...] = _of_reference(
         (1.0,), 'angular frequency of each tone', 'rad/s', at_least=0.0
@@ -65,10 +88,18 @@ class Reference:
         (), 'position at each waypoint: one row per joint, row by row', 'rad'
     )
 
+    stream_timeout: float = positive(
+        0.25,
+        'time after which a target of a stream is its last: the reference brakes',
+        's',
+    )
+
     def problems(self) -> list[str]:
         """Check that there are waypoints if they are used, and that their times increase."""
         if self.type == 'waypoints' and not self.times:
-            return ['reference.times: got none, but reference.type waypoints needs at least one']
+            return [
+                'reference.times: got none, but reference.type waypoints needs at least one'
+            ]
         return [
             f'reference.times: got {after:g} s after {before:g} s, but they must increase'
             for before, after in pairwise(self.times)
@@ -80,7 +111,9 @@ class Reference:
 class Approach:
     """Motion to the reference from a start outside the bound; the bound applies along it."""
 
-    enabled: bool = parameter(True, 'guide an arm into the bound; false: do not start outside')
+    enabled: bool = parameter(
+        True, 'guide an arm into the bound; false: do not start outside'
+    )
     longest: float = positive(30.0, 'longest duration of the approach', 's')
 
 
@@ -88,10 +121,25 @@ class Approach:
 class MotionLimits:
     """Limits of each joint for an approach or a received trajectory."""
 
-    position_lower: PerJoint = parameter((-2.0 * math.pi,) * 2, 'lowest position', 'rad')
-    position_upper: PerJoint = parameter((2.0 * math.pi,) * 2, 'highest position', 'rad')
+    position_lower: PerJoint = parameter(
+        (-2.0 * math.pi,) * 2, 'lowest position', 'rad'
+    )
+    position_upper: PerJoint = parameter(
+        (2.0 * math.pi,) * 2, 'highest position', 'rad'
+    )
     velocity: PerJoint = positive((1.5, 1.5), 'largest velocity', 'rad/s')
     acceleration: PerJoint = positive((2.0, 2.0), 'largest acceleration', 'rad/s^2')
+    jerk: PerJoint = positive(
+        (),
+        'largest jerk of motions to streamed targets; empty: reaches the acceleration in 0.05 s',
+        'rad/s^3',
+        omittable=True,
+    )
+
+    @property
+    def largest_jerk(self) -> tuple[float, ...]:
+        """The jerk as given, or that which reaches the acceleration in `_RISE`."""
+        return self.jerk or tuple(each / _RISE for each in self.acceleration)
 
     def problems(self, joints: tuple[str, ...]) -> list[str]:
         """Check that the position limits leave a range."""
@@ -108,9 +156,17 @@ class MotionLimits:
 class Safety:
     """Limits past which the controller makes a safe stop, and the torque of that stop."""
 
-    state_timeout: float = positive(0.04, 'largest delay of a state, by steady clock or stamp', 's')
+    state_timeout: float = positive(
+        0.04, 'largest delay of a state, by steady clock or stamp', 's'
+    )
     watchdog: Literal['auto', 'on', 'off'] = parameter(
-        'auto', 'steady-clock watchdog for missing states; auto: only if stamps are wall-clock time'
+        'auto',
+        'steady-clock watchdog for missing states; auto: only if stamps are wall-clock time',
+    )
+    expect_watchdog: bool = parameter(
+        False,
+        'report that the node torque_watchdog is missing, also before one has been seen',
+        read_only='it says which processes belong together',
     )
     velocity: Literal['measured', 'estimated'] = parameter(
         'measured',
@@ -121,31 +177,45 @@ class Safety:
         50.0, 'velocity above which a measurement counts as broken', 'rad/s'
     )
     error_ratio: float = non_negative(
-        1.0, 'tracking error to stop at, relative to the bound, for laws with a barrier; 0: never'
+        1.0,
+        'tracking error to stop at, relative to the bound, for laws with a barrier; 0: never',
     )
     saturation_time: float = positive(
-        0.5, 'longest time of torques at their limit, less a quarter of the time without', 's'
+        0.5,
+        'longest time of torques at their limit, less a quarter of the time without',
+        's',
     )
     overrun_fraction: float = positive(
         0.4, 'largest fraction of missed states, averaged over a second', at_most=1.0
     )
     first_torque: Literal['check', 'send'] = parameter(
-        'check', 'refuse a first torque that an arm at rest contradicts, or send it unchecked'
+        'check',
+        'refuse a first torque that an arm at rest contradicts, or send it unchecked',
     )
     torque: Literal['zero', 'damping', 'hold_gravity'] = parameter(
         'zero', 'safe torque: zero, damping -D dq, or the learned gravity with damping'
     )
-    damping: PerJoint = non_negative((2.0, 1.0), 'damping in the safe torque', 'N m s/rad', 'D')
-    stop_ramp: float = non_negative(0.0, 'ramp to the safe torque after a fault; 0: at once', 's')
-    deactivation_ramp: float = non_negative(0.5, 'the same ramp when the node is deactivated', 's')
-    fade_time: float = positive(0.5, 'time to fade the safe torque without usable states', 's')
+    damping: PerJoint = non_negative(
+        (2.0, 1.0), 'damping in the safe torque', 'N m s/rad', 'D'
+    )
+    stop_ramp: float = non_negative(
+        0.0, 'ramp to the safe torque after a fault; 0: at once', 's'
+    )
+    deactivation_ramp: float = non_negative(
+        0.5, 'the same ramp when the node is deactivated', 's'
+    )
+    fade_time: float = positive(
+        0.5, 'time to fade the safe torque without usable states', 's'
+    )
 
 
 @dataclass(frozen=True)
 class Telemetry:
     """What the controller publishes besides its commands."""
 
-    enabled: bool = _telemetry(True, 'publish reference, errors, estimates and monitors')
+    enabled: bool = _telemetry(
+        True, 'publish reference, errors, estimates and monitors'
+    )
     decimation: int = _telemetry(
         10,
         'samples per message of reference and monitor; errors come with every sample',
@@ -165,34 +235,52 @@ class ArmGeometry:
 class Barrier:
     """Bound on the tracking error, and the barrier that enforces it."""
 
-    bound: PerJoint = positive((0.002, 0.002), 'bound on the tracking error', 'rad', 'k_c')
-    initial_bound: PerJoint = non_negative(
-        (0.0, 0.0), 'initial bound of a funnel that narrows to `bound`; 0: constant', 'rad', 'k_0'
+    bound: PerJoint = positive(
+        (0.002, 0.002), 'bound on the tracking error', 'rad', 'k_c'
     )
-    funnel_rate: float = non_negative(0.0, 'rate at which the funnel narrows', '1/s', 'a')
+    initial_bound: PerJoint = non_negative(
+        (0.0, 0.0),
+        'initial bound of a funnel that narrows to `bound`; 0: constant',
+        'rad',
+        'k_0',
+    )
+    funnel_rate: float = non_negative(
+        0.0, 'rate at which the funnel narrows', '1/s', 'a'
+    )
     weight: PerJoint = positive(
-        (1000.0, 1000.0), 'stiffness of the barrier at zero error; 1 in the paper', 'N m/rad', 'w'
+        (1000.0, 1000.0),
+        'stiffness of the barrier at zero error; 1 in the paper',
+        'N m/rad',
+        'w',
     )
     slope_limit: PerJoint = positive(
-        (2e4, 2e4), 'stiffness at which the barrier continues linearly', 'N m/rad', 'S_lim'
+        (2e4, 2e4),
+        'stiffness at which the barrier continues linearly',
+        'N m/rad',
+        'S_lim',
     )
 
     @property
     def widest(self) -> tuple[float, ...]:
         """Bound of each joint at the start [rad]."""
         return tuple(
-            initial or bound for initial, bound in zip(self.initial_bound, self.bound, strict=True)
+            initial or bound
+            for initial, bound in zip(self.initial_bound, self.bound, strict=True)
         )
 
     def problems(self, joints: tuple[str, ...]) -> Iterator[str]:
         """Check the weight against the slope limit, and the bounds of the funnel."""
-        for joint, weight, limit in zip(joints, self.weight, self.slope_limit, strict=True):
+        for joint, weight, limit in zip(
+            joints, self.weight, self.slope_limit, strict=True
+        ):
             if limit <= weight:
                 yield (
                     f'barrier.slope_limit: got {limit:g} N m/rad for {joint}, but it must be above '
                     f'barrier.weight, {weight:g} N m/rad'
                 )
-        for joint, initial, bound in zip(joints, self.initial_bound, self.bound, strict=True):
+        for joint, initial, bound in zip(
+            joints, self.initial_bound, self.bound, strict=True
+        ):
             if 0.0 < initial < bound:
                 yield (
                     f'barrier.initial_bound: got {initial:g} rad for {joint}, but it must be 0 '
@@ -213,20 +301,38 @@ class Surface:
         (150.0, 150.0), 'gain of the virtual control on the tracking error', '1/s', 'K'
     )
     mu: PerJoint = non_negative(
-        (20.0, 20.0), 'gain of the virtual control that remains at the bound', '1/s', 'mu'
+        (20.0, 20.0),
+        'gain of the virtual control that remains at the bound',
+        '1/s',
+        'mu',
     )
-    time_constant: float = positive(0.002, 'time constant of the surface filter', 's', 'lambda')
+    time_constant: float = positive(
+        0.002, 'time constant of the surface filter', 's', 'lambda'
+    )
 
 
 @dataclass(frozen=True)
 class Feedback:
     """Feedback terms of the law (28)."""
 
-    gain: PerJoint = non_negative((60.0, 20.0), 'gain on the velocity error', 'N m s/rad', 'K_p')
-    damping_rate: float = non_negative(
-        0.0, 'rate of damping, scaled by the inertia of learning.initial_estimate', '1/s', 'omega_v'
+    stiffness: float = positive(
+        1.0,
+        'bandwidth of the gains that follow from a URDF, relative to what the delay allows',
+        at_most=1.0,
+        read_only='the other gains follow from it when they are read: change those',
     )
-    damping: PerJoint = non_negative((0.0, 0.0), 'robust term d2 |xi1| sat(xi2/b)', 'N m/rad', 'd2')
+    gain: PerJoint = non_negative(
+        (60.0, 20.0), 'gain on the velocity error', 'N m s/rad', 'K_p'
+    )
+    damping_rate: float = non_negative(
+        0.0,
+        'rate of damping, scaled by the inertia of learning.initial_estimate',
+        '1/s',
+        'omega_v',
+    )
+    damping: PerJoint = non_negative(
+        (0.0, 0.0), 'robust term d2 |xi1| sat(xi2/b)', 'N m/rad', 'd2'
+    )
 
 
 @dataclass(frozen=True)
@@ -239,7 +345,9 @@ class DisturbanceEstimate:
         'N m/rad',
         'gamma',
     )
-    leakage: float = non_negative(0.0, 'leakage of the disturbance estimate', 'rad/(N m s)', 'eta')
+    leakage: float = non_negative(
+        0.0, 'leakage of the disturbance estimate', 'rad/(N m s)', 'eta'
+    )
 
 
 @dataclass(frozen=True)
@@ -249,7 +357,9 @@ class Torque:
     limit: PerJoint = positive(
         (20.0, 20.0), 'largest torque, as commanded and with what the drives add', 'N m'
     )
-    rate_limit: PerJoint = non_negative((0.0, 0.0), 'largest rate of commands; 0: any', 'N m/s')
+    rate_limit: PerJoint = non_negative(
+        (0.0, 0.0), 'largest rate of commands; 0: any', 'N m/s'
+    )
     first_step: PerJoint = non_negative(
         (0.0, 0.0),
         'largest first torque, a step from none, that the drives tolerate; 0: any',
@@ -262,18 +372,32 @@ class ComparisonGains:
     """Gains of the laws `backstepping` (35) and `slotine_li`, besides feedback and learning."""
 
     surface_gain: PerJoint = positive(
-        (70.0, 70.0), 'gain of the linear surface alpha2 = dqr - lambda_s z1', '1/s', 'lambda_s'
+        (70.0, 70.0),
+        'gain of the linear surface alpha2 = dqr - lambda_s z1',
+        '1/s',
+        'lambda_s',
     )
     position_gain: PerJoint = non_negative(
-        (1.0, 1.0), 'gain on the tracking error z1; not used by slotine_li', 'N m/rad', 'w'
+        (1.0, 1.0),
+        'gain on the tracking error z1; not used by slotine_li',
+        'N m/rad',
+        'w',
     )
     robust_gain: PerJoint = non_negative(
-        (0.0, 0.0), 'amplitude of the robust term; not used by slotine_li', 'N m', 'mu_bar'
+        (0.0, 0.0),
+        'amplitude of the robust term; not used by slotine_li',
+        'N m',
+        'mu_bar',
     )
     integral_gain: PerJoint = non_negative(
-        (), 'integral gain of slotine_li on its surface; empty: none', 'N m/rad', omittable=True
+        (),
+        'integral gain of slotine_li on its surface; empty: none',
+        'N m/rad',
+        omittable=True,
     )
-    leakage: float = non_negative(0.001, 'leakage of P^; not used by slotine_li', symbol='W_c')
+    leakage: float = non_negative(
+        0.001, 'leakage of P^; not used by slotine_li', symbol='W_c'
+    )
 
 
 def _misfits(
@@ -299,18 +423,26 @@ class KnownArm:
     parameters: tuple[float, ...] = _known(
         (), 'true parameters; empty: unknown', 'kg m^2', 'P', omittable=True
     )
-    constant: PerJoint = _known((0.0, 0.0), 'constant part of the known disturbance', 'N m')
+    constant: PerJoint = _known(
+        (0.0, 0.0), 'constant part of the known disturbance', 'N m'
+    )
     amplitude: PerJoint = _known((0.0, 0.0), 'amplitude of the sinusoid', 'N m')
-    frequency: PerJoint = _known((1.0, 1.0), 'frequency of the sinusoid', 'rad/s', at_least=0.0)
+    frequency: PerJoint = _known(
+        (1.0, 1.0), 'frequency of the sinusoid', 'rad/s', at_least=0.0
+    )
     phase: PerJoint = _known((0.0, 0.0), 'phase of the sinusoid', 'rad')
 
-    def problems(self, law: str, model: str, count: int, radius: float) -> Iterator[str]:
+    def problems(
+        self, law: str, model: str, count: int, radius: float
+    ) -> Iterator[str]:
         """Check that the parameters fit the model and the ball, and are given if required."""
         if law == 'model_based' and not self.parameters:
             yield 'truth.parameters: got none, but the law model_based needs them'
         if self.parameters:
             largest = radius if law == 'model_based' else math.inf
-            yield from _misfits('truth.parameters', self.parameters, model, count, largest)
+            yield from _misfits(
+                'truth.parameters', self.parameters, model, count, largest
+            )
 
 
 @dataclass(frozen=True)
@@ -318,23 +450,31 @@ class Learning:
     """Composite learning of the parameters P and of the disturbance columns."""
 
     initial_estimate: tuple[float, ...] = _at_start(
-        (0.5, 0.16, 0.2), 'initial estimate of (m1+m2)*l1^2, m2*l2^2, m2*l1*l2', 'kg m^2', 'P^(0)'
+        (0.5, 0.16, 0.2),
+        'initial estimate of (m1+m2)*l1^2, m2*l2^2, m2*l1*l2',
+        'kg m^2',
+        'P^(0)',
     )
-    adaptation_gain: Annotated[tuple[float, ...], 'learning.initial_estimate'] = non_negative(
-        (0.5, 0.5, 0.5), 'diagonal of the adaptation gain', symbol='Gamma'
+    adaptation_gain: Annotated[tuple[float, ...], 'learning.initial_estimate'] = (
+        non_negative((0.5, 0.5, 0.5), 'diagonal of the adaptation gain', symbol='Gamma')
     )
     weight: float = non_negative(
         100.0, 'weight of the prediction error; 0: no learning from it', symbol='kappa'
     )
     update: Literal['newton', 'gradient'] = parameter(
-        'newton', 'step along the prediction error: regularised Newton, or the gradient (paper)'
+        'newton',
+        'step along the prediction error: regularised Newton, or the gradient (paper)',
     )
     prediction: Literal['filtered', 'lambda'] = _in_window(
         'filtered', 'prediction error by filtered regressor, or by Lambda (24)'
     )
-    regularization: float = positive(1e-5, 'regularisation of the Newton step', symbol='rho')
+    regularization: float = positive(
+        1e-5, 'regularisation of the Newton step', symbol='rho'
+    )
     excitation_threshold: float = positive(
-        0.003, 'minimum eigenvalue of the excitation matrix of an excited window', symbol='sigma'
+        0.003,
+        'minimum eigenvalue of the excitation matrix of an excited window',
+        symbol='sigma',
     )
     window: float = _size(
         2.0 * math.pi,
@@ -344,7 +484,11 @@ class Learning:
         above=0.0,
     )
     settling_time: float = _at_start(
-        0.5, 'time for the filters to settle before the window is used', 's', 'T_a', at_least=0.0
+        0.5,
+        'time for the filters to settle before the window is used',
+        's',
+        'T_a',
+        at_least=0.0,
     )
     filter_pole: float = _in_window(
         10.0, 'pole of the filters on regressor and torque', 'rad/s', above=0.0
@@ -353,7 +497,10 @@ class Learning:
     viscous: bool = _size(False, 'also estimate the viscous friction of each joint')
     coulomb: bool = _size(False, 'also estimate the Coulomb friction of each joint')
     coulomb_velocity: float = _in_window(
-        0.01, 'velocity scale of the sign change of the Coulomb column', 'rad/s', above=0.0
+        0.01,
+        'velocity scale of the sign change of the Coulomb column',
+        'rad/s',
+        above=0.0,
     )
     frequencies: tuple[float, ...] = _size(
         (),
@@ -362,41 +509,62 @@ class Learning:
         above=0.0,
         omittable=True,
     )
-    radius: float = positive(3.0, 'radius of the projection ball of P^', 'kg m^2', 'omega_a')
+    radius: float = positive(
+        3.0, 'radius of the projection ball of P^', 'kg m^2', 'omega_a'
+    )
     compensation: Literal['reference', 'state'] = parameter(
-        'reference', 'where what is learned acts: along the reference, or at the state (paper)'
+        'reference',
+        'where what is learned acts: along the reference, or at the state (paper)',
     )
     bumpless: bool = parameter(
-        True, 'let the disturbance estimate offset the torque that the prediction error adds'
+        True,
+        'let the disturbance estimate offset the torque that the prediction error adds',
     )
-    change_detection: bool = _size(True, 'discard a window that torques contradict: a changed arm')
+    change_detection: bool = _size(
+        True, 'discard a window that torques contradict: a changed arm'
+    )
     residual_floor: PerJoint = positive(
-        (0.07, 0.07), 'rms unmodelled torque that is not treated as a change of the arm', 'N m'
+        (0.07, 0.07),
+        'rms unmodelled torque that is not treated as a change of the arm',
+        'N m',
     )
     anchor_weight: float = non_negative(
         0.1, 'pull to the estimate before a change, until a new window is full'
     )
-    weighing: bool = _size(False, 'weigh what the tip of a URDF holds since the first window')
+    weighing: bool = _size(
+        False, 'weigh what the tip of a URDF holds since the first window'
+    )
 
     def problems(self, sample_time: float, model: str, count: int) -> Iterator[str]:
         """Check the size of the window, and the initial estimate against the model and the ball."""
-        samples, (fewest, most) = round(self.window / sample_time), _SAMPLES
+        samples = round(self.window / sample_time)
+        (fewest, most) = _SAMPLES
         if not fewest <= samples <= most:
             yield (
                 f'learning.window: got {self.window:g} s, which is {samples} samples of '
                 f'{sample_time:g} s: between {fewest} and {most} are allowed'
             )
         yield from _misfits(
-            'learning.initial_estimate', self.initial_estimate, model, count, self.radius
+            'learning.initial_estimate',
+            self.initial_estimate,
+            model,
+            count,
+            self.radius,
         )
+
+
+LAWS = ('blf_dsc', 'model_based', 'backstepping', 'slotine_li')
+"""Laws of the package; the first is the default."""
 
 
 @dataclass(frozen=True)
 class ControllerConfig(ArmConfig):
     """Parameters of the node `blf_dsc_controller`; the defaults are the recommended set."""
 
-    law: Literal['blf_dsc', 'model_based', 'backstepping', 'slotine_li'] = _size(
-        'blf_dsc', 'control law'
+    law: str = _size(
+        'blf_dsc',
+        f'control law: {", ".join(LAWS)}, or a Python file that defines one',
+        kept=law_file.kept,
     )
     model: Literal['two_link', 'urdf'] = _size('two_link', 'model of the arm')
     arm: ArmGeometry = ArmGeometry()
@@ -413,6 +581,26 @@ class ControllerConfig(ArmConfig):
     truth: KnownArm = KnownArm()
     safety: Safety = Safety()
     telemetry: Telemetry = Telemetry()
+
+    @classmethod
+    def variant(cls, given: Mapping[str, Any]) -> type[ControllerConfig]:
+        """Return the configuration with the gains of a law of a file as the group `gains`.
+
+        Raises BlfDscError if there is no such law.
+        """
+        law = given.get('law', LAWS[0])
+        if not isinstance(law, str) or law in LAWS:
+            return ControllerConfig
+        if not law_file.is_file(law):
+            raise BlfDscError(
+                f'law: got {format_value(law)}, but expected one of {", ".join(LAWS)}, or a '
+                f'Python file{suggestion(law, LAWS)}'
+            )
+        return _with_gains(law_file.gains_of(law_file.load_law(law)))
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Pickle by values, since the class of a law of a file is made when it is loaded."""
+        return build, (ControllerConfig, flatten(self))
 
     @classmethod
     def defaults(cls, given: Mapping[str, Any]) -> Mapping[str, Value]:
@@ -432,8 +620,15 @@ class ControllerConfig(ArmConfig):
         bound = np.array(given.get('barrier.bound', ()))
         return {
             'model': 'urdf',
-            'learning.weighing': given.get('learning.prediction', 'filtered') == 'filtered',
-            **tuning.gains_of(arm, period, bound if bound.size == len(chain.joints) else None),
+            **described(robot, chain),
+            'learning.weighing': given.get('learning.prediction', 'filtered')
+            == 'filtered',
+            **tuning.gains_of(
+                arm,
+                period,
+                given.get('feedback.stiffness', Feedback().stiffness),
+                bound if bound.size == len(chain.joints) else None,
+            ),
         }
 
     def problems(self) -> Iterator[str]:
@@ -444,14 +639,35 @@ class ControllerConfig(ArmConfig):
         else:
             model = arm_model(self.model, self.arm.l1, self.arm.gravity)
             needed, count = model.n, model.p
-        learning, learned = self.learning, (self.model, self.learning.prediction)
+        learning = self.learning
+        learned = (self.model, self.learning.prediction)
         if learning.weighing and learned != ('urdf', 'filtered'):
             needs = 'model urdf and learning.prediction filtered'
             yield f'learning.weighing: got true with {", ".join(learned)}, but needs {needs}'
             return
+        if self.model != 'urdf' and self.feedback.stiffness != Feedback().stiffness:
+            yield (
+                f'feedback.stiffness: got {self.feedback.stiffness:g} with model {self.model}, but '
+                'only the gains of model urdf follow from it: leave it at 1, and lower '
+                'feedback.gain and surface.gain'
+            )
         yield from self.arm_problems(f'model {self.model}', needed)
         yield from self.reference.problems()
         yield from self.limits.problems(self.joints)
         yield from self.barrier.problems(self.joints)
-        yield from self.truth.problems(self.law, self.model, count, self.learning.radius)
+        yield from self.truth.problems(
+            self.law, self.model, count, self.learning.radius
+        )
         yield from self.learning.problems(self.sample_time, self.model, count)
+
+
+@functools.cache
+def _with_gains(gains: type) -> type[ControllerConfig]:
+    """Return the configuration with a group of gains of a law of a file."""
+    group = dataclasses.field(default=gains())
+    return dataclasses.make_dataclass(
+        'ControllerConfig',
+        [(law_file.GROUP, gains, group)],
+        bases=(ControllerConfig,),
+        frozen=True,
+    )

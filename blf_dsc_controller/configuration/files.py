@@ -15,10 +15,12 @@ string.
 from __future__ import annotations
 
 import functools
+import importlib.util
 import math
 import re
 import stat
 import sys
+import sysconfig
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple, cast
@@ -29,9 +31,13 @@ from blf_dsc_controller.errors import BlfDscError, ConfigurationError
 
 _TRUE = ('Y', 'y', 'yes', 'Yes', 'YES', 'true', 'True', 'TRUE', 'on', 'On', 'ON')
 _FALSE = ('N', 'n', 'no', 'No', 'NO', 'false', 'False', 'FALSE', 'off', 'Off', 'OFF')
-_INTEGER = re.compile(r'[+-]?(?:0[xX](?P<hex>[0-9a-fA-F]+)|(?P<octal>0[0-7]*)|[1-9][0-9]*)')
+_INTEGER = re.compile(
+    r'[+-]?(?:0[xX](?P<hex>[0-9a-fA-F]+)|(?P<octal>0[0-7]*)|[1-9][0-9]*)'
+)
 _DECIMAL = re.compile(r'[+-]?(?P<digits>[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?')
-_SPECIAL = re.compile(r'[+-]?(?i:inf|infinity|nan)|[+-]?\.(?:inf|Inf|INF)|\.(?:nan|NaN|NAN)')
+_SPECIAL = re.compile(
+    r'[+-]?(?i:inf|infinity|nan)|[+-]?\.(?:inf|Inf|INF)|\.(?:nan|NaN|NAN)'
+)
 
 _MARK = 'ros__parameters'
 _PART = re.compile(r'\*|\*\*|[A-Za-z_][A-Za-z0-9_]*')
@@ -79,22 +85,30 @@ def parse(text: str) -> tuple[Section, ...]:
     except yaml.MarkedYAMLError as error:
         mark = error.problem_mark or error.context_mark
         line = f'line {mark.line + 1}: ' if mark else ''
-        kind = '' if type(error) is yaml.MarkedYAMLError else 'not valid YAML: '  # of `_Limited`
+        # of `_Limited`
+        kind = '' if type(error) is yaml.MarkedYAMLError else 'not valid YAML: '
         raise ConfigurationError([f'{line}{kind}{error.problem}']) from error
     except yaml.YAMLError as error:
         raise ConfigurationError([f'not valid YAML: {error}']) from error
     if root is None:
-        raise ConfigurationError([f'line 1: the file is empty: expected node names with {_MARK}'])
+        raise ConfigurationError(
+            [f'line 1: the file is empty: expected node names with {_MARK}']
+        )
     sections: dict[tuple[str, ...], Section] = {}
     for names, node in _leaves(root, ()):
         if _MARK not in names:
-            outside = f'{names[-1]} has a value, but is outside of {_MARK}' if names else ''
+            outside = (
+                f'{names[-1]} has a value, but is outside of {_MARK}' if names else ''
+            )
             raise _error(node, outside or f'expected node names or {_MARK} at the top')
         at = names.index(_MARK)
-        pattern, name = f'/{"/".join(names[:at]).removeprefix("/")}', '.'.join(names[at + 1 :])
+        pattern = f'/{"/".join(names[:at]).removeprefix("/")}'
+        name = '.'.join(names[at + 1 :])
         if not all(_PART.fullmatch(part) for part in pattern.split('/')[1:]):
             raise _error(node, f'{pattern} is not a valid node name')
-        entries = sections.setdefault(names[:at], Section(pattern, _line(node), {})).entries
+        entries = sections.setdefault(
+            names[:at], Section(pattern, _line(node), {})
+        ).entries
         if name in entries:
             raise _repeated(node, name, entries[name].line)
         if name:
@@ -119,13 +133,17 @@ def parse_scalar(word: str) -> bool | int | float | str:
         return float(word.replace('.', ''))
     if match := _DECIMAL.fullmatch(word):
         number = float(word)
-        underflow = abs(number) < sys.float_info.min and match['digits'].strip('0.') != ''
+        underflow = (
+            abs(number) < sys.float_info.min and match['digits'].strip('0.') != ''
+        )
         if math.isfinite(number) and not underflow:
             return number
     return word
 
 
-def _leaves(node: yaml.Node, names: tuple[str, ...]) -> Iterator[tuple[tuple[str, ...], yaml.Node]]:
+def _leaves(
+    node: yaml.Node, names: tuple[str, ...]
+) -> Iterator[tuple[tuple[str, ...], yaml.Node]]:
     """Yield what stands below nested names: values, lists, and empty mappings."""
     if not isinstance(node, yaml.MappingNode) or not node.value:
         yield names, node
@@ -150,7 +168,8 @@ def _value(node: yaml.Node, name: str) -> object:
     values = [_scalar(entry, name) for entry in node.value]
     if len({type(value) for value in values}) > 1:
         raise _error(
-            node, f'{name} mixes types, which ROS rejects: write all entries alike (1.0, not 1)'
+            node,
+            f'{name} mixes types, which ROS rejects: write all entries alike (1.0, not 1)',
         )
     return values
 
@@ -224,7 +243,9 @@ def share_folder() -> Path:
 
     Raises BlfDscError if there is neither.
     """
-    for place in (place for above in _ABOVE for place in (above, above / 'share' / _PACKAGE)):
+    for place in (
+        place for above in _ABOVE for place in (above, above / 'share' / _PACKAGE)
+    ):
         if (place / _PRESET).is_file():
             return place
     raise BlfDscError(
@@ -236,11 +257,13 @@ def share_folder() -> Path:
 def resolve(url: str) -> Path:
     """Return the path of a file, or of a resource as `package://name/path`.
 
-    A path that does not exist is looked up in `config/` of this package. Raises BlfDscError if
-    there is no such folder or package.
+    A path that does not exist is looked up in `config/` of this package. A package is one of ROS,
+    or a Python package that pip installed: its folder in `share/` or its own. Raises BlfDscError
+    if there is no such folder or package.
     """
     if not url.startswith('package://'):
-        path, own = Path(url).expanduser(), share_folder() / 'config' / url
+        path = Path(url).expanduser()
+        own = share_folder() / 'config' / url
         return path if path.is_file() or not own.is_file() else own
     package, _, rest = url.removeprefix('package://').partition('/')
     if package == _PACKAGE:
@@ -250,9 +273,29 @@ def resolve(url: str) -> Path:
 
         return Path(get_package_share_directory(package), rest)
     except (ImportError, LookupError, OSError) as error:
+        for place in _of_python(package):
+            if (place / rest).exists():
+                return place / rest
         raise BlfDscError(
-            f'package {package!r} was not found: source the workspace that has it, or give a path'
+            f'package {package!r} was not found with {rest!r} in it: source its workspace, '
+            'install it with pip, or give a path'
         ) from error
+
+
+def _of_python(package: str) -> Iterator[Path]:
+    """Yield the folders that can hold the data of a package installed by pip, not imported."""
+    yield Path(sysconfig.get_path('data')) / 'share' / package
+    spec = importlib.util.find_spec(package) if package.isidentifier() else None
+    if spec is not None:
+        yield from map(Path, spec.submodule_search_locations or ())
+
+
+def places_of(url: str) -> str:
+    """Return where `resolve` has looked for a file that does not exist, in words."""
+    if url.startswith('package://'):
+        return str(resolve(url))
+    own = share_folder() / 'config' / url
+    return f'{Path(url).expanduser().absolute()}, nor {own}'
 
 
 def read_text(path: Path) -> str:
@@ -261,5 +304,7 @@ def read_text(path: Path) -> str:
     if not stat.S_ISREG(state.st_mode):
         raise OSError(f'{path} is not a regular file: give a file')
     if state.st_size > _LARGEST:
-        raise OSError(f'{path} has {state.st_size} bytes; expected text of at most {_LARGEST}')
+        raise OSError(
+            f'{path} has {state.st_size} bytes; expected text of at most {_LARGEST}'
+        )
     return path.read_text(encoding='utf-8')

@@ -14,7 +14,13 @@ from pathlib import Path
 from typing import Any, Literal, NamedTuple, TypeVar
 
 from blf_dsc_controller.configuration.controller import ControllerConfig
-from blf_dsc_controller.configuration.files import Section, parse, read_text, share_folder
+from blf_dsc_controller.configuration.drive import DriveConfig
+from blf_dsc_controller.configuration.files import (
+    Section,
+    parse,
+    read_text,
+    share_folder,
+)
 from blf_dsc_controller.configuration.plant import PlantConfig
 from blf_dsc_controller.configuration.schema import (
     Parameter,
@@ -33,6 +39,9 @@ CONTROLLER = 'blf_dsc_controller'
 RECORDER = 'bag_recorder'
 VIEW = 'view'
 WATCHDOG = 'torque_watchdog'
+DRIVE = 'drive'
+STUDY = 'monte_carlo'
+"""Name of the section of a study, which is no node."""
 
 _of_bag = partial(parameter, read_only='a bag is opened once, when the recorder starts')
 _of_watchdog = partial(parameter, read_only='it is read once, when the node starts')
@@ -49,13 +58,21 @@ class RecorderConfig:
     """Parameters of the node `bag_recorder`."""
 
     output: str = _of_bag('bag', 'folder of the bag; it must not exist yet')
-    topics: tuple[str, ...] = _of_bag((), 'topics to record; empty: all', omittable=True)
-    compression: Literal['none', 'zstd'] = _of_bag('none', 'compression of the chunks of the bag')
+    topics: tuple[str, ...] = _of_bag(
+        (), 'topics to record; empty: all', omittable=True
+    )
+    compression: Literal['none', 'zstd'] = _of_bag(
+        'none', 'compression of the chunks of the bag'
+    )
     queue_depth: int = _of_bag(
-        100_000, 'messages buffered per topic while the disk is busy', 'messages', at_least=1
+        100_000,
+        'messages buffered per topic while the disk is busy',
+        'messages',
+        at_least=1,
     )
     clock: Literal['wall', 'plant'] = _of_bag(
-        'wall', 'log times: as received, or the stamp of the last joint state (lock-step)'
+        'wall',
+        'log times: as received, or the stamp of the last joint state (lock-step)',
     )
 
 
@@ -81,7 +98,9 @@ class WatchdogConfig:
 class ViewConfig:
     """Parameters of the node `view`."""
 
-    host: str = _of_view('127.0.0.1', 'address of this computer on which the page is served')
+    host: str = _of_view(
+        '127.0.0.1', 'address of this computer on which the page is served'
+    )
     port: int = _of_view(
         8080, 'port of the page; if taken, the next free one', at_least=1, at_most=65535
     )
@@ -93,6 +112,7 @@ NODES: Mapping[str, Any] = {
     RECORDER: RecorderConfig,
     VIEW: ViewConfig,
     WATCHDOG: WatchdogConfig,
+    DRIVE: DriveConfig,
 }
 
 
@@ -142,7 +162,9 @@ def locate(given: str | Path) -> Path:
     A preset takes precedence over a file of the same name in the current folder; `./name` is the
     file. Raises ConfigurationError, which lists the presets, if neither exists.
     """
-    presets = {path.stem: path for path in sorted((share_folder() / 'config').glob('*.yaml'))}
+    presets = {
+        path.stem: path for path in sorted((share_folder() / 'config').glob('*.yaml'))
+    }
     name, path = str(given), Path(given)
     if path.is_file() and name not in presets:
         return path
@@ -151,7 +173,9 @@ def locate(given: str | Path) -> Path:
         return presets[stem]
     what = 'is a folder' if path.is_dir() else 'does not exist'
     remedy = f'give a parameter file, or a preset: {", ".join(presets)}'
-    raise ConfigurationError([f'{name} {what}{suggestion(stem, presets) or ":"} {remedy}'])
+    raise ConfigurationError(
+        [f'{name} {what}{suggestion(stem, presets) or ":"} {remedy}']
+    )
 
 
 def read(path: str | Path, based: tuple[str, ...] = ()) -> Sequence[Section]:
@@ -162,23 +186,32 @@ def read(path: str | Path, based: tuple[str, ...] = ()) -> Sequence[Section]:
     """
     try:
         sections = parse(read_text(Path(path)))
-        named = (each for each in sections if each.pattern.endswith('/monte_carlo'))
-        base = next((each.entries['base'].value for each in named if 'base' in each.entries), None)
+        named = (each for each in sections if each.pattern.endswith(f'/{STUDY}'))
+        base = next(
+            (each.entries['base'].value for each in named if 'base' in each.entries),
+            None,
+        )
         if base is None:
             return sections
-        below, above = locate(str(base)), (*based, str(path))
+        below = locate(str(base))
+        above = (*based, str(path))
     except (UnicodeDecodeError, OSError) as error:
         raise ConfigurationError([str(error)], str(path)) from error
     except ConfigurationError as error:
         raise ConfigurationError(error.problems, str(path)) from error
     if str(below) in above:
-        problem = f'monte_carlo: base: {base!r} leads back to a file that is based on it'
+        problem = (
+            f'monte_carlo: base: {base!r} leads back to a file that is based on it'
+        )
         raise ConfigurationError([problem], str(path))
     return [*read(below, above), *sections]
 
 
 def load(
-    path: str | Path, node: str, cls: type[Config], overrides: Mapping[str, object] | None = None
+    path: str | Path,
+    node: str,
+    cls: type[Config],
+    overrides: Mapping[str, object] | None = None,
 ) -> Config:
     """Load the configuration of one node, whose name may have a namespace (`/left/sim_plant`).
 
@@ -207,7 +240,9 @@ def load_loop(
 
 
 def _load_all(
-    path: str | Path, nodes: Mapping[str, Any], overrides: Mapping[str, Mapping[str, object]]
+    path: str | Path,
+    nodes: Mapping[str, Any],
+    overrides: Mapping[str, Mapping[str, object]],
 ) -> dict[str, Any]:
     """Load the configurations of some nodes; a problem of several is reported once.
 
@@ -224,7 +259,8 @@ def _load_all(
     configs: dict[str, Any] = {}
     nodes_with: dict[str, list[str]] = {}
     for node, cls in nodes.items():
-        own, chosen = {param.name for param in parameters(cls)}, overrides.get(node, {})
+        chosen = overrides.get(node, {})
+        own = {param.name for param in parameters(cls)}
         entries = {
             name: entry
             for section in sections
@@ -239,7 +275,11 @@ def _load_all(
             for problem in error.problems:
                 name = problem.split(':', 1)[0]
                 line = f'line {entries[name].line}: ' if name in entries else ''
-                told = f'{problem} (given as an override)' if name in chosen else line + problem
+                told = (
+                    f'{problem} (given as an override)'
+                    if name in chosen
+                    else line + problem
+                )
                 nodes_with.setdefault(told, []).append(node)
     for problem, names in nodes_with.items():
         problems.append(f'{", ".join(names)}: {problem}' if len(nodes) > 1 else problem)
@@ -257,11 +297,15 @@ def dump(path: Path, nodes: Mapping[str, object], comment: str = '') -> None:
     for node, config in nodes.items():
         lines.append(f'/{node.removeprefix("/")}:\n  ros__parameters:\n')
         values = config if isinstance(config, Mapping) else flatten(config)
-        lines += [f'    {name}: {format_value(value)}\n' for name, value in values.items()]
+        lines += [
+            f'    {name}: {format_value(value)}\n' for name, value in values.items()
+        ]
     path.write_text(''.join(lines), encoding='utf-8')
 
 
-def unmatched_sections(sections: Sequence[Section], nodes: Iterable[str]) -> Iterator[str]:
+def unmatched_sections(
+    sections: Sequence[Section], nodes: Iterable[str]
+) -> Iterator[str]:
     """Yield a problem for each section that is meant for one of these nodes but would be ignored.
 
     Either its name is misspelt, or its namespace differs from the node's and no other section of
@@ -273,7 +317,8 @@ def unmatched_sections(sections: Sequence[Section], nodes: Iterable[str]) -> Ite
         if name not in NODES and (guess := suggestion(name, absent, cutoff=0.8)):
             yield f'line {section.line}: unknown node {name}{guess}'
     for node in nodes:
-        full, name = '/' + node.removeprefix('/'), node.rsplit('/', 1)[-1]
+        full = '/' + node.removeprefix('/')
+        name = node.rsplit('/', 1)[-1]
         if name in by_name and not any(
             section.matches(full) for section in sections if not section.is_wildcard
         ):
@@ -282,6 +327,31 @@ def unmatched_sections(sections: Sequence[Section], nodes: Iterable[str]) -> Ite
                 f'line {section.line}: {section.pattern} does not match {full}: write /**/{name} '
                 'for the node in any namespace'
             )
+
+
+def ignored_sections(sections: Sequence[Section], nodes: Iterable[str]) -> str:
+    """Return the sections that no node of this package reads, in words; empty without any.
+
+    They may belong to others in the same file, or be misspelt. `nodes` are those that are started.
+    """
+    full = ['/' + node.removeprefix('/') for node in nodes]
+    by_wildcard = [section for section in sections if section.is_wildcard]
+    matches = {
+        section.pattern: any(map(section.matches, full)) for section in by_wildcard
+    }
+    ignored = [section for section in sections if _is_of_others(section)]
+    if not any(matches.values()):
+        ignored += by_wildcard
+    listed = ', '.join(f'{each.pattern} (line {each.line})' for each in ignored)
+    if not listed:
+        return ''
+    known = ', '.join(NODES)
+    return f'no node of this package reads the sections {listed}: its nodes are {known}'
+
+
+def _is_of_others(section: Section) -> bool:
+    name = section.pattern.rsplit('/', 1)[-1]
+    return not section.is_wildcard and name not in (*NODES, STUDY)
 
 
 def with_tables(page: str) -> str:

@@ -15,7 +15,11 @@ from typing import Annotated, Any, Literal
 
 import numpy as np
 
-from blf_dsc_controller.configuration.robot import ArmConfig, given_robot
+from blf_dsc_controller.configuration.robot import (
+    ArmConfig,
+    described,
+    given_robot,
+)
 from blf_dsc_controller.configuration.schema import (
     PerJoint,
     Value,
@@ -52,12 +56,20 @@ class Events:
     Events begin and end at whole samples from the start; a ramp scales one by the elapsed fraction.
     """
 
-    begin: tuple[float, ...] = _of_events('time at which each event begins', 's', at_least=0.0)
-    duration: PerEvent = _of_events('duration of each event; 0: permanent', 's', at_least=0.0)
+    begin: tuple[float, ...] = _of_events(
+        'time at which each event begins', 's', at_least=0.0
+    )
+    duration: PerEvent = _of_events(
+        'duration of each event; 0: permanent', 's', at_least=0.0
+    )
     ramp: PerEvent = _of_events('time to fade in, and to fade out', 's', at_least=0.0)
     payload: PerEvent = _of_events('point mass at the tip', 'kg', at_least=0.0)
-    sloshing: PerEvent = _of_events('point mass on a damped spring at the tip', 'kg', at_least=0.0)
-    sloshing_frequency: float = positive(15.0, 'undamped frequency of this spring', 'rad/s')
+    sloshing: PerEvent = _of_events(
+        'point mass on a damped spring at the tip', 'kg', at_least=0.0
+    )
+    sloshing_frequency: float = positive(
+        15.0, 'undamped frequency of this spring', 'rad/s'
+    )
     sloshing_damping: float = non_negative(0.05, 'damping ratio of this spring')
     force: PerEventAndAxis = _of_events('external force on the tip', 'N')
     torque: PerEventAndJoint = _of_events('external torque on each joint', 'N m')
@@ -77,7 +89,9 @@ class Deviation:
     mass_deviation: float = _magnitude(
         0.0, 'largest random deviation of each mass, as a fraction', below=1.0
     )
-    centre_deviation: float = _magnitude(0.0, 'largest random deviation of a centre, per axis', 'm')
+    centre_deviation: float = _magnitude(
+        0.0, 'largest random deviation of a centre, per axis', 'm'
+    )
     seed: int = _magnitude(0, 'seed of the random deviations')
 
     def changes(self, n: int) -> tuple[np.ndarray, np.ndarray]:
@@ -110,8 +124,12 @@ class PlantArm:
 class Initial:
     """Initial state of the arm."""
 
-    position: PerJoint = _fixed((2.293, 1.696), 'initial joint positions', 'rad', 'q(0)')
-    velocity: PerJoint = _fixed((0.0, 0.0), 'initial joint velocities', 'rad/s', 'dq(0)')
+    position: PerJoint = _fixed(
+        (2.293, 1.696), 'initial joint positions', 'rad', 'q(0)'
+    )
+    velocity: PerJoint = _fixed(
+        (0.0, 0.0), 'initial joint velocities', 'rad/s', 'dq(0)'
+    )
 
 
 @dataclass(frozen=True)
@@ -125,33 +143,54 @@ class PlantDisturbance:
 
     constant: PerJoint = parameter((0.1, 0.1), 'constant part', 'N m')
     amplitude: PerJoint = parameter((0.1, 0.1), 'amplitude of the sinusoid', 'N m')
-    frequency: PerJoint = non_negative((1.0, 1.0), 'angular frequency of the sinusoid', 'rad/s')
+    frequency: PerJoint = non_negative(
+        (1.0, 1.0), 'angular frequency of the sinusoid', 'rad/s'
+    )
     phase: PerJoint = parameter((0.0, 0.0), 'phase of the sinusoid', 'rad')
     viscous: PerJoint = non_negative((0.0, 0.0), 'viscous friction', 'N m s/rad')
     coulomb: PerJoint = non_negative((0.0, 0.0), 'Coulomb friction', 'N m')
-    coulomb_velocity: float = positive(0.01, 'velocity scale of Coulomb friction', 'rad/s')
-    stribeck: float = non_negative(0.0, 'breakaway in excess of Coulomb friction, relative to it')
-    stribeck_velocity: float = positive(0.1, 'velocity scale at which this excess fades', 'rad/s')
+    coulomb_velocity: float = positive(
+        0.01, 'velocity scale of Coulomb friction', 'rad/s'
+    )
+    stribeck: float = non_negative(
+        0.0, 'breakaway in excess of Coulomb friction, relative to it'
+    )
+    stribeck_velocity: float = positive(
+        0.1, 'velocity scale at which this excess fades', 'rad/s'
+    )
 
 
 @dataclass(frozen=True)
 class Sensor:
     """Measurement of the true state."""
 
-    position_noise: float = _magnitude(0.0, 'rms of the white noise on measured positions', 'rad')
-    velocity_noise: float = _magnitude(0.0, 'rms of the white noise on velocities', 'rad/s')
+    position_noise: float = _magnitude(
+        0.0, 'rms of the white noise on measured positions', 'rad'
+    )
+    velocity_noise: float = _magnitude(
+        0.0, 'rms of the white noise on velocities', 'rad/s'
+    )
     resolution: float = _magnitude(0.0, 'resolution of the encoders; 0: ideal', 'rad')
     velocity: Literal['measured', 'differenced'] = _fixed(
-        'measured', 'velocity from its own sensor, or the difference of two measured positions'
+        'measured',
+        'velocity from its own sensor, or the difference of two measured positions',
     )
-    velocity_pole: float = _magnitude(0.0, 'pole of a low-pass on the velocity; 0: none', 'rad/s')
+    velocity_pole: float = _magnitude(
+        0.0, 'pole of a low-pass on the velocity; 0: none', 'rad/s'
+    )
     offset: PerJoint = parameter((0.0, 0.0), 'measured minus true position', 'rad')
-    repeat_every: int = _magnitude(0, 'samples until a reading repeats, newly stamped; 0: never')
+    repeat_every: int = _magnitude(
+        0, 'samples until a reading repeats, newly stamped; 0: never'
+    )
     published_joints: tuple[str, ...] = _fixed(
-        (), 'names in joint states, in order; others stay at 0; empty: `joints`', omittable=True
+        (),
+        'names in joint states, in order; others stay at 0; empty: `joints`',
+        omittable=True,
     )
     incomplete_states: int = _magnitude(
-        0, 'joint states with velocities and efforts of NaN before the first one', at_most=100
+        0,
+        'joint states with velocities and efforts of NaN before the first one',
+        at_most=100,
     )
 
 
@@ -159,19 +198,35 @@ class Sensor:
 class Actuator:
     """Effects between the commanded and the applied torque."""
 
-    torque_limit: PerJoint = _magnitude((0.0, 0.0), 'rated joint torque; 0: no limit', 'N m')
+    torque_limit: PerJoint = _magnitude(
+        (0.0, 0.0), 'rated joint torque; 0: no limit', 'N m'
+    )
     delay: int = _magnitude(0, 'delay of the torque', 'samples', at_most=1000)
-    time_constant: float = _magnitude(0.0, 'first-order lag from limited torque to joint', 's')
-    torque_noise: float = _magnitude(0.0, 'rms of the torque noise, as a fraction of the torque')
-    ripple: float = _magnitude(0.0, 'amplitude of the torque ripple, relative to the rated torque')
-    ripple_cycles: float = _fixed(20.0, 'periods of the ripple per turn, or per metre', above=0.0)
-    command_timeout: float = positive(0.05, 'largest age of an applied torque, in real time', 's')
+    time_constant: float = _magnitude(
+        0.0, 'first-order lag from limited torque to joint', 's'
+    )
+    torque_noise: float = _magnitude(
+        0.0, 'rms of the torque noise, as a fraction of the torque'
+    )
+    ripple: float = _magnitude(
+        0.0, 'amplitude of the torque ripple, relative to the rated torque'
+    )
+    ripple_cycles: float = _fixed(
+        20.0, 'periods of the ripple per turn, or per metre', above=0.0
+    )
+    command_timeout: float = positive(
+        0.05, 'largest age of an applied torque, in real time', 's'
+    )
     without_command: Literal['zero', 'hold'] = parameter(
         'zero', 'without a command: zero torque, or the last command'
     )
-    rate_limit: float = _magnitude(0.0, 'rate to which the driver limits commands; 0: any', 'N m/s')
+    rate_limit: float = _magnitude(
+        0.0, 'rate to which the driver limits commands; 0: any', 'N m/s'
+    )
     reflex_rate: float = _magnitude(
-        0.0, 'rate of the torque above which the drives brake until a reset; 0: never', 'N m/s'
+        0.0,
+        'rate of the torque above which the drives brake until a reset; 0: never',
+        'N m/s',
     )
 
 
@@ -182,7 +237,9 @@ class Drive(Deviation):
     With the deviations of `truth` it is the true arm, without any it is the URDF.
     """
 
-    friction: float = _magnitude(0.8, 'share of friction that the drives compensate', at_most=1.0)
+    friction: float = _magnitude(
+        0.8, 'share of friction that the drives compensate', at_most=1.0
+    )
 
 
 @dataclass(frozen=True)
@@ -190,9 +247,12 @@ class PlantConfig(ArmConfig):
     """Parameters of the node `sim_plant`."""
 
     mode: Literal['realtime', 'lockstep'] = _fixed(
-        'realtime', 'one step per sample time of the wall clock, or one per received torque'
+        'realtime',
+        'one step per sample time of the wall clock, or one per received torque',
     )
-    duration: float = _magnitude(0.0, 'simulated time until the plant stops; 0: no limit', 's')
+    duration: float = _magnitude(
+        0.0, 'simulated time until the plant stops; 0: no limit', 's'
+    )
     seed: int = _magnitude(0, 'seed of the noise; equal seeds give equal runs')
     publish_clock: bool = _fixed(False, 'publish the simulated time on /clock')
     arm: PlantArm = PlantArm()
@@ -210,7 +270,8 @@ class PlantConfig(ArmConfig):
         """Return joints, limits and friction from a URDF, and a start at rest in mid-range."""
         if not given.get('robot.urdf'):
             return {}
-        joints = given_robot(given)[1].joints
+        robot, chain = given_robot(given)
+        joints = chain.joints
         middles = [(joint.lower + joint.upper) / 2.0 for joint in joints]
         zero = (0.0,) * len(joints)
         return {
@@ -219,6 +280,7 @@ class PlantConfig(ArmConfig):
                 for param in parameters(cls)
                 if param.length == ('joints',) and not param.omittable
             },
+            **described(robot, chain),
             'joints': tuple(joint.name for joint in joints),
             'initial.position': tuple(q if math.isfinite(q) else 0.0 for q in middles),
             'disturbance.viscous': tuple(joint.damping for joint in joints),
@@ -230,13 +292,17 @@ class PlantConfig(ArmConfig):
 
     def problems(self) -> Iterator[str]:
         """Check the joints, the sample time and the duration."""
-        yield from self.arm_problems('the simulated arm', None if self.robot.urdf else 2)
+        yield from self.arm_problems(
+            'the simulated arm', None if self.robot.urdf else 2
+        )
         if self.truth != Truth() and not self.robot.urdf:
             yield 'truth: it applies only to a URDF: give robot.urdf, or change arm'
         if self.drive != Drive() and self.robot.drive_compensates == 'none':
             yield 'drive: without robot.drive_compensates the drives need no model'
         published = self.sensor.published_joints
-        if published and (lacking := [name for name in self.joints if name not in published]):
+        if published and (
+            lacking := [name for name in self.joints if name not in published]
+        ):
             yield f'sensor.published_joints: {", ".join(lacking)} of `joints` is missing'
         if self.actuator.ripple > 0.0 and not all(self.actuator.torque_limit):
             yield 'actuator.ripple: a fraction of the rated torque: give actuator.torque_limit'

@@ -4,7 +4,7 @@
 Each field is declared with `parameter`, or is itself such a dataclass: a group, whose parameters
 have dotted names (`arm.l1`). The method `problems()` of a configuration, if it has one, checks
 parameters against each other; its class method `defaults(given)` returns the defaults that follow
-from the given parameters.
+from the given parameters, `variant(given)` a class with further parameters.
 """
 
 from __future__ import annotations
@@ -95,7 +95,9 @@ class Parameter:
             return
         entries = list(given) if self.is_array else [given]
         if not all(_is(entry, self.type) for entry in entries):
-            lacks_point = self.type is float and all(_is(entry, int | float) for entry in entries)
+            lacks_point = self.type is float and all(
+                _is(entry, int | float) for entry in entries
+            )
             expected += ', with a decimal point' if lacks_point else ''
             yield f'{self.name}: got {format_value(given)}, {expected}'
             return
@@ -109,8 +111,15 @@ class Parameter:
                 expected = f'it must be {self.allowed}{unit}'
             else:
                 continue
-            place = f' at entry {index} of {format_value(entries)}' if self.is_array else ''
+            place = (
+                f' at entry {index} of {format_value(entries)}' if self.is_array else ''
+            )
             yield f'{self.name}: got {format_value(entry)}{place}, but {expected}'
+
+    def spelt(self, given: Any) -> Any:
+        """Return a value as it was written: of `on` and `off`, YAML makes true and false."""
+        word = 'on' if given is True else 'off'
+        return word if isinstance(given, bool) and word in self.choices else given
 
     def _allows(self, entry: Any) -> bool:
         within = all(compare(entry, limit) for _, limit, compare in self._limits())
@@ -151,7 +160,9 @@ def parameters(cls: Any) -> tuple[Parameter, ...]:
 @functools.cache
 def _parameters(cls: Any) -> tuple[Parameter, ...]:
     return tuple(
-        dataclasses.replace(each, name=f'{name}.{each.name}' if each is not param else name)
+        dataclasses.replace(
+            each, name=f'{name}.{each.name}' if each is not param else name
+        )
         for name, param in _fields(cls).items()
         for each in ([param] if isinstance(param, Parameter) else _parameters(param))
     )
@@ -160,7 +171,8 @@ def _parameters(cls: Any) -> tuple[Parameter, ...]:
 def flatten(config: object) -> dict[str, Value]:
     """Return the values of a configuration by dotted name, as `build` takes them."""
     return {
-        param.name: operator.attrgetter(param.name)(config) for param in parameters(type(config))
+        param.name: operator.attrgetter(param.name)(config)
+        for param in parameters(type(config))
     }
 
 
@@ -176,11 +188,16 @@ def build(cls: type[Config], given: Mapping[str, Any], source: str = '') -> Conf
     Raises ConfigurationError with all problems: unknown names, types and ranges, and, if each value
     is valid by itself, lengths and conflicts between parameters.
     """
+    try:
+        cls = variant_of(cls, given)
+    except BlfDscError as error:
+        raise ConfigurationError([str(error)], source) from error
     known = {param.name: param for param in parameters(cls)}
     problems = [unknown(name, known) for name in given if name not in known]
     valid: dict[str, Any] = {}
     for name in (name for name in known if name in given):
-        param, value = known[name], given[name]
+        param = known[name]
+        value = param.spelt(given[name])
         found = list(param.problems(value))
         try:
             if not found:
@@ -194,8 +211,14 @@ def build(cls: type[Config], given: Mapping[str, Any], source: str = '') -> Conf
         derived: Mapping[str, Value] = getattr(cls, 'defaults', lambda _: {})(valid)
     except ConfigurationError as error:
         raise ConfigurationError([*problems, *error.problems], source) from error
-    values = {name: param.default for name, param in known.items()} | dict(derived) | valid
-    lengths = [problem for param in known.values() for problem in _length_problems(param, values)]
+    values = (
+        {name: param.default for name, param in known.items()} | dict(derived) | valid
+    )
+    lengths = [
+        problem
+        for param in known.values()
+        for problem in _length_problems(param, values)
+    ]
     problems += lengths
     if not lengths:
         config: Config = _assemble(cls, values)
@@ -203,6 +226,16 @@ def build(cls: type[Config], given: Mapping[str, Any], source: str = '') -> Conf
         if not problems:
             return config
     raise ConfigurationError(problems, source)
+
+
+def variant_of(cls: type[Config], given: Mapping[str, Any]) -> type[Config]:
+    """Return the configuration with those parameters that depend on the given ones.
+
+    Its class method `variant(given)` chooses it; without one, there is only `cls`.
+    """
+    variant: Callable[[Mapping[str, Any]], type[Config]] | None
+    variant = getattr(cls, 'variant', None)
+    return variant(given) if variant else cls
 
 
 def change(config: Config, given: Mapping[str, object], source: str = '') -> Config:
@@ -237,16 +270,20 @@ def _fields(cls: Any) -> dict[str, Any]:
     annotated = typing.get_type_hints(cls, include_extras=True)
     found: dict[str, Any] = {}
     for field in dataclasses.fields(cls):
-        hint, param = types[field.name], field.metadata.get('parameter')
+        hint = types[field.name]
+        param = field.metadata.get('parameter')
         if param is None:
             found[field.name] = hint
             continue
         if typing.get_origin(hint) is typing.Literal:
-            param, hint = dataclasses.replace(param, choices=typing.get_args(hint)), str
+            param = dataclasses.replace(param, choices=typing.get_args(hint))
+            hint = str
         length = getattr(annotated[field.name], '__metadata__', ())
         is_array = typing.get_origin(hint) is tuple
         type_ = typing.get_args(hint)[0] if is_array else hint
-        found[field.name] = dataclasses.replace(param, type=type_, is_array=is_array, length=length)
+        found[field.name] = dataclasses.replace(
+            param, type=type_, is_array=is_array, length=length
+        )
     return found
 
 
@@ -263,8 +300,11 @@ def _assemble(cls: Any, values: Mapping[str, Value], prefix: str = '') -> Any:
 def _length_problems(param: Parameter, values: Mapping[str, Any]) -> Iterator[str]:
     if not param.length:
         return
-    counts = [int(name) if name.isdigit() else len(values[name]) for name in param.length]
-    length, needed = len(values[param.name]), math.prod(counts)
+    counts = [
+        int(name) if name.isdigit() else len(values[name]) for name in param.length
+    ]
+    length = len(values[param.name])
+    needed = math.prod(counts)
     if length != needed and not (param.omittable and length == 0):
         factors = ' times '.join(
             name if name.isdigit() else f'{count} of {name}'

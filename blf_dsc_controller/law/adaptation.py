@@ -27,13 +27,15 @@ from math import isfinite, sqrt
 
 from blf_dsc_controller.compiled.algebra import cholesky_solve
 from blf_dsc_controller.compiled.jit import inner
-from blf_dsc_controller.compiled.layout import Array, part
+from blf_dsc_controller.compiled.layout import Array
+from blf_dsc_controller.compiled.views import part
 from blf_dsc_controller.law import friction, torque
 from blf_dsc_controller.law.state import NEWTON, Settings, Signals, State
 
 _ON_SPHERE = 1.0 - 1e-12  # of radius^2: `retract` ends within rounding of the sphere
 _ROUNDED = 1.0 + 1e-14
-_MOST_STEPS = 20  # of Newton's method; 12 for Gamma spanning eight decades, ten radii outside
+# of Newton's method; 12 for Gamma spanning eight decades, ten radii outside
+_MOST_STEPS = 20
 
 
 @inner
@@ -70,7 +72,8 @@ def retract(estimate: Array, gain: Array, radius: float) -> None:
     nu = 0.0
     length = radius
     for _ in range(_MOST_STEPS):
-        square, slope = 0.0, 0.0  # of the length of P^_j / (1 + nu Gamma_j): minus half the slope
+        # of the length of P^_j / (1 + nu Gamma_j): minus half the slope
+        square, slope = 0.0, 0.0
         for j in range(gain.size):
             shrink = 1.0 + nu * gain[j]
             entry = estimate[j] / shrink
@@ -98,7 +101,7 @@ def prediction_error(settings: Settings, state: State, signals: Signals) -> None
             signals.rate[i] -= state.Phi[i, j] * state.estimate[j]
     if settings.update == NEWTON:
         cholesky_solve(state.factor, signals.rate)
-    friction.follow_flips(settings, state, signals)
+    friction.follow_reversals(settings, state, signals)
 
 
 @inner
@@ -106,11 +109,44 @@ def hand_over(settings: Settings, state: State, signals: Signals) -> None:
     """Subtract H (theta^ - `work`) from d^3; `work` is theta^ after the tracking error alone."""
     for j in range(settings.m):
         for i in range(settings.n):
-            state.disturbance[i] -= signals.H[i, j] * (state.estimate[j] - signals.work[j])
+            state.disturbance[i] -= signals.H[i, j] * (
+                state.estimate[j] - signals.work[j]
+            )
 
 
 @inner
-def adapt(settings: Settings, state: State, signals: Signals, dt: float, saturated: bool) -> None:
+def integrate(settings: Settings, state: State, signals: Signals, dt: float) -> None:
+    """Advance d^3 by `dt` [s]: (30), with gamma (M(q, P^(0)) + J~) / m on an arm of a URDF.
+
+    Overwrites Yp and Yr of `signals`.
+    """
+    for i in range(settings.n):
+        error = signals.xi2[i] + settings.eta * state.disturbance[i]
+        signals.unit[i] = dt * settings.gamma[i] * error
+    if settings.follows_inertia == 1:
+        scale_by_inertia(settings, state, signals)
+    for i in range(settings.n):
+        state.disturbance[i] -= signals.unit[i]
+        friction.follow_observer(state, i, -signals.unit[i])
+
+
+@inner
+def scale_by_inertia(settings: Settings, state: State, signals: Signals) -> None:
+    """Replace x in `signals.unit` by (M(q, P^(0)) + J~) x / m; overwrites Yp and Yr."""
+    x = signals.unit
+    for i in range(settings.n):
+        x[i] /= settings.joint_inertia[i]
+    settings.model.momentum_regressor(signals.q, x, signals.momentum, signals.rest)
+    for i in range(settings.n):
+        x[i] *= state.rotor_error[i]
+        for j in range(settings.p):
+            x[i] += signals.momentum[i, j] * settings.initial_estimate[j]
+
+
+@inner
+def adapt(
+    settings: Settings, state: State, signals: Signals, dt: float, saturated: bool
+) -> None:
     """Advance theta^ and d^3 by `dt` [s]: (20), (30).
 
     While a torque is saturated, the tracking error reflects the limit, not the parameters, so only
@@ -130,7 +166,9 @@ def adapt(settings: Settings, state: State, signals: Signals, dt: float, saturat
                 tracking += signals.H[i, j] * signals.xi2[i]
             tracking = settings.variance[j] * tracking + settings.Wc * state.estimate[j]
         signals.work[j] = state.estimate[j] - dt * settings.Gamma[j] * tracking
-        signals.rate[j] = settings.Gamma[j] * (settings.kappa * signals.rate[j] - tracking)
+        signals.rate[j] = settings.Gamma[j] * (
+            settings.kappa * signals.rate[j] - tracking
+        )
     p = settings.p
     parameters = part(state.estimate, 0, (p,))
     gain = part(settings.Gamma, 0, (p,))
@@ -140,10 +178,8 @@ def adapt(settings: Settings, state: State, signals: Signals, dt: float, saturat
         state.estimate[j] = torque.clip(estimate, settings.least[j], settings.most[j])
     retract(parameters, gain, settings.radius)
     if not saturated:
-        for i in range(settings.n):
-            gamma = state.gain_scale[i] * settings.gamma[i]
-            state.disturbance[i] -= (
-                dt * gamma * (signals.xi2[i] + settings.eta * state.disturbance[i])
-            )
+        integrate(settings, state, signals, dt)
     if settings.bumpless == 1 and state.latched[0] == 1.0:
         hand_over(settings, state, signals)
+    friction.adapt_breakaway(settings, state, signals, dt)
+    friction.hand_over(settings, state, signals)

@@ -13,10 +13,10 @@ same band pass.  Sums over all time give J~ in [-J, 0] of each joint.  They grow
 acceleration is clear of the noise, which is known by its second difference: noise comes back
 through the feedback, where it cannot be told from an arm without inertia.
 
-The feedback then acts on M_0 + J~ in place of M_0: its acceleration alpha2' - omega_v xi2 - qr''
-gets the torque of J~ as well, and the stiffness of the barrier and the gain of d^3 are scaled by
-the inertia of each joint with the others free, interpolated between J~ = -J and 0.  Along the
-reference nothing changes: what is learned acts there.
+The feedback then acts on M_0 + J~ in place of M_0: its acceleration, damping and barrier included,
+minus qr'' gets the torque of J~ as well, as does the rate of d^3.  The damping of a safe stop is
+scaled by the inertia of each joint with the others free, interpolated between J~ = -J and 0.  Along
+the reference nothing changes: what is learned acts there.
 """
 
 import numpy as np
@@ -29,7 +29,8 @@ _SMOOTH = 0.5  # upper end of the band, times the sample rate
 _SLOW = 0.06  # lower end, likewise
 _MEMORY = 0.02  # s, of the two powers that are compared
 _CLEAR = 0.1  # their ratio: noise has 0.005, an oscillation 100
-_EVIDENCE = 0.05  # s (rad/s^2)^2, times the inertia: least sum of z a that shows anything
+# s (rad/s^2)^2, times the inertia: least sum of z a that shows anything
+_EVIDENCE = 0.05
 _RELEASE = 0.02  # s, in which the arm settles on its first torque
 
 # Rows of `State.lags`: poles of the torque, those of the acceleration, and the last samples.
@@ -60,7 +61,8 @@ def pass_band(settings: Settings, state: State, signals: Signals, dt: float) -> 
     """Write torque and acceleration in the band to `signals.unit` and `signals.swing`."""
     lags, dq = state.lags, signals.dq
     late = barrier.filter_gain(0.5 * settings.lag, dt) if settings.lag > 0.0 else 1.0
-    smooth, slow = barrier.filter_gain(dt / _SMOOTH, dt), barrier.filter_gain(dt / _SLOW, dt)
+    smooth = barrier.filter_gain(dt / _SMOOTH, dt)
+    slow = barrier.filter_gain(dt / _SLOW, dt)
     brief = barrier.filter_gain(_MEMORY, dt)
     for i in range(settings.n):
         torque = low_pass(lags, _DRIVE, i, late, lags[_HELD, i])
@@ -90,7 +92,9 @@ def measure(settings: Settings, state: State, signals: Signals, dt: float) -> No
     pass_band(settings, state, signals, dt)
     if state.samples[0] * dt < _RELEASE:
         return
-    settings.model.momentum_regressor(signals.q, signals.swing, signals.momentum, signals.rest)
+    settings.model.momentum_regressor(
+        signals.q, signals.swing, signals.momentum, signals.rest
+    )
     for i in range(settings.n):
         J = settings.unsure_rotor[i]
         if J == 0.0 or state.lags[_POWER, i] <= _CLEAR * state.lags[_NOISE, i]:
@@ -113,4 +117,6 @@ def measure(settings: Settings, state: State, signals: Signals, dt: float) -> No
 def correct_feedback(settings: Settings, state: State, signals: Signals) -> None:
     """Add the torque of J~ for what the feedback accelerates to H P^(0)."""
     for i in range(settings.n):
-        signals.model_torque[i] += state.rotor_error[i] * (signals.damped[i] - signals.ddqr[i])
+        signals.model_torque[i] += state.rotor_error[i] * (
+            signals.damped[i] - signals.ddqr[i]
+        )

@@ -1,7 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Barrier (3), virtual control (15), (18) with its filter (13), and the linear surface of (35).
-
-    xi1 = q - qr,   xi2 = dq - alpha2,   lambda alpha2' = beta2 - alpha2,   alpha2(0) = beta2(0)
+"""The barrier (3), constant or a funnel, and the virtual control (15), (18).
 
 The weighted tan-type barrier is continued linearly past the stiffness a sampled loop can hold:
 
@@ -28,7 +26,7 @@ from math import pi
 
 from blf_dsc_controller.compiled.elementary import cos, exp, sin
 from blf_dsc_controller.compiled.jit import inner
-from blf_dsc_controller.law.state import LINEAR, Settings, Signals, State
+from blf_dsc_controller.law.state import Settings, Signals
 
 _BISECTIONS = 60
 
@@ -63,7 +61,9 @@ def knee(bound: float, weight: float, slope_limit: float) -> float:
 
 
 @inner
-def gradient(xi: float, bound: float, weight: float, slope_limit: float, knee: float) -> float:
+def gradient(
+    xi: float, bound: float, weight: float, slope_limit: float, knee: float
+) -> float:
     """Return dV/dxi [N m]; its negative is the barrier torque tau_c of (16), (28)."""
     edge = min(abs(xi), knee)
     c = cos(angle(edge, bound))
@@ -72,7 +72,9 @@ def gradient(xi: float, bound: float, weight: float, slope_limit: float, knee: f
 
 
 @inner
-def potential(xi: float, bound: float, weight: float, slope_limit: float, knee: float) -> float:
+def potential(
+    xi: float, bound: float, weight: float, slope_limit: float, knee: float
+) -> float:
     """Return V [J]: (3) up to the knee, a parabola past it."""
     edge = min(abs(xi), knee)
     past = abs(xi) - edge
@@ -106,7 +108,11 @@ def sinc(x: float) -> float:
 
 @inner
 def virtual_control(
-    xi1: float, bound: float, barrier_gain: float, linear_gain: float, reference_velocity: float
+    xi1: float,
+    bound: float,
+    barrier_gain: float,
+    linear_gain: float,
+    reference_velocity: float,
 ) -> float:
     """Return beta2 = -(K/2) xi1 sinc(pi xi1^2 / k_c^2) - mu xi1 + dqr   [rad/s], (15) and (18).
 
@@ -125,55 +131,3 @@ def virtual_control(
 def filter_gain(time_constant: float, dt: float) -> float:
     """Return the exact gain 1 - exp(-dt / time_constant) of a first-order lag with held input."""
     return 1.0 - exp(-dt / time_constant)
-
-
-@inner
-def filtered_surface(settings: Settings, state: State, signals: Signals, dt: float) -> None:
-    """Compute beta2 of (18) and alpha2' of the filter (13); `filter_step` advances alpha2.
-
-    beta2 is held for the sample, in which alpha2' decays from (beta2 - alpha2) / lambda by the
-    factor exp(-dt / lambda).  The torque is held too, so it uses the mean of alpha2': with
-    lambda = 2 dt the initial value would be 27 % too large.
-    """
-    gain = filter_gain(settings.time_constant, dt)
-    for i in range(settings.n):
-        signals.beta2[i] = virtual_control(
-            signals.xi1[i],
-            signals.bound[i],
-            settings.K[i],
-            settings.mu[i],
-            signals.dqr[i] + signals.narrowing[i] * signals.xi1[i],
-        )
-        if state.samples[0] == 0.0:
-            state.alpha2[i] = signals.beta2[i]
-        signals.dalpha2[i] = gain * (signals.beta2[i] - state.alpha2[i]) / dt
-
-
-@inner
-def linear_surface(settings: Settings, state: State, signals: Signals) -> None:
-    """Compute alpha2 = dqr - lambda_s z1 of (35), and its derivative, which needs ddqr."""
-    for i in range(settings.n):
-        state.alpha2[i] = signals.dqr[i] - settings.K[i] * signals.xi1[i]
-        signals.beta2[i] = state.alpha2[i]
-        signals.dalpha2[i] = signals.ddqr[i] - settings.K[i] * (signals.dq[i] - signals.dqr[i])
-
-
-@inner
-def compute_errors(settings: Settings, state: State, signals: Signals, dt: float) -> None:
-    """Compute the errors xi1 and xi2, and the surface between them."""
-    for i in range(settings.n):
-        signals.xi1[i] = signals.q[i] - signals.qr[i]
-    if settings.surface == LINEAR:
-        linear_surface(settings, state, signals)
-    else:
-        filtered_surface(settings, state, signals, dt)
-    for i in range(settings.n):
-        signals.xi2[i] = signals.dq[i] - state.alpha2[i]
-
-
-@inner
-def filter_step(settings: Settings, state: State, signals: Signals, dt: float) -> None:
-    """Advance alpha2 of the filter (13) by `dt` [s], exactly for the held beta2."""
-    gain = filter_gain(settings.time_constant, dt)
-    for i in range(settings.n):
-        state.alpha2[i] += gain * (signals.beta2[i] - state.alpha2[i])

@@ -7,58 +7,16 @@ The supervisor derives the reason for each flag.
 from __future__ import annotations
 
 from math import isfinite
-from typing import Annotated, NamedTuple
 
 from blf_dsc_controller.compiled.jit import inner
-from blf_dsc_controller.compiled.layout import Array, Cell, size_of, view_of
-from blf_dsc_controller.law.state import LINEAR, Sample, Settings, Signals, State
+from blf_dsc_controller.compiled.layout import Array
+from blf_dsc_controller.law.check_state import OUTSIDE, SUSPECT, Checks
+from blf_dsc_controller.law.effect import average_steps, check_effect
+from blf_dsc_controller.law.state import Sample, Settings, Signals, State
 
-SUSPECT = 1
-"""A value that is not finite, a torque demand past its limit, or too large an error."""
-
-OUTSIDE = 2
-"""An error outside its bound."""
-
-NO_EFFECT = 8
-"""Commands that have changed without any joint moving: they do not reach the arm, or it is held."""
-
-INVALID = 4
-"""A joint state that is not finite or too fast; the law did not use it."""
-
-
-class Checks(NamedTuple):
-    """Limits of the checks, and the values that they keep from past samples."""
-
-    velocity_limit: Cell  # rad/s, of each joint; 0 disables all checks
-    error_ratio: Cell  # |xi1| / k from which an error is suspect; 0: never
-    ratio: Annotated[Array, 'n']  # largest |xi1| / k so far
-    kept: Annotated[Array, 'm + n']  # estimates and d^3 of the last sample that was not suspect
-    sample_time: Cell  # s, for the check of the effect of commands; 0: none
-    last: Annotated[Array, 'n']  # N m, command of the last sample
-    chatter: Annotated[Array, 'n']  # (N m)^2, mean square step of the commands over _CHATTERS
-    still: Cell  # s, since a joint has last moved
-    q: Annotated[Array, 'n']  # rad, where it has
-    moved: Annotated[Array, 'm + n']  # estimates and d^3 of then
-    recent: Annotated[Array, 'n']  # N m, average of the commands over _RECENT
-    before: Annotated[Array, 'n']  # N m, average of them over _BEFORE
-    compares: Cell  # 1: measured efforts are torques, to be compared with the commands
-    lack: Annotated[Array, 'n']  # N m, average of commands less efforts over _RECENT
-    known: Annotated[Array, 'n']  # N m, of it the error of the model of what the drives add
-    lacking: Cell  # s, since a lack has become too large
-    read: Annotated[Array, '2 * n']  # q and dq as last read
-    age: Cell  # s, since they were new
-    used: Annotated[Array, '3 * n']  # the measurement that the law uses
-
-
-_STILL = 0.02  # of the bound: a joint that stays within has not moved
-_CHANGED = 0.1  # of the torque limit: a command that differs by more should have moved something
-_RECENT = 0.05  # s, past the chatter of encoders' steps in the velocities
-_BEFORE = 1.0  # s
-_CHATTERS = 0.5  # s
-_LASTING = 0.1  # s, for which the efforts have to differ from the commands
 _BRIDGED = 3.5  # samples, for which a reading may be repeated
-
-checks_of, checks_size = view_of(Checks), size_of(Checks)
+_RELAXED = 1.4  # s, in which the least error may double, nearly: an error grows faster
+_SMALL = 0.01  # of the bound: an error that has not grown
 
 
 @inner
@@ -66,7 +24,10 @@ def is_valid_state(settings: Settings, checks: Checks, measurement: Array) -> bo
     """Check that the used values of [q, dq, applied torque] (3 n,) are finite and not too fast."""
     n = settings.n
     for i in range(n):
-        if not (isfinite(measurement[i]) and abs(measurement[n + i]) <= checks.velocity_limit[0]):
+        if not (
+            isfinite(measurement[i])
+            and abs(measurement[n + i]) <= checks.velocity_limit[0]
+        ):
             return False
     return True
 
@@ -99,7 +60,7 @@ def bridge_repeats(
 def check_error(settings: Settings, checks: Checks, xi1: Array, bound: Array) -> int:
     """Return the flags for the errors (n,) [rad]; update the largest ratio."""
     flags = 0
-    error_ratio = checks.error_ratio[0] if settings.surface != LINEAR else 0.0
+    error_ratio = checks.error_ratio[0] if settings.has_barrier == 1 else 0.0
     for i in range(settings.n):
         now = abs(xi1[i]) / bound[i]
         if now == now:  # noqa: PLR0124 - not NaN
@@ -112,77 +73,24 @@ def check_error(settings: Settings, checks: Checks, xi1: Array, bound: Array) ->
 
 
 @inner
-def check_effect(
-    settings: Settings, checks: Checks, state: State, signals: Signals, sample: Sample
-) -> int:
-    """Return the flags for commands without effect; call it once the sample's values are kept.
+def keep_consistent(
+    settings: Settings, checks: Checks, state: State, sample: Sample
+) -> None:
+    """Keep the estimates of the smallest error of late, from before an error grows.
 
-    While no joint moves, gravity does not change: the commands should not either, except by what
-    overcomes stiction. Otherwise brakes hold the arm, or its effort controller is not active, and
-    the law learns what its own commands say. Slower drifts show in efforts that are torques.
+    Commands that do not reach the arm make its error grow, and the disturbance estimate with it.
     """
-    begins = state.samples[0] <= 1.0
-    moves = begins
+    ratio = 0.0
     for i in range(settings.n):
-        moved = abs(sample.qr[i] + sample.xi1[i] - checks.q[i])
-        moves = moves or not moved < _STILL * sample.bound[i]
-    T = checks.sample_time[0]
-    flags = compare_effort(settings, checks, signals, sample, begins, moves)
-    checks.still[0] = 0.0 if moves else checks.still[0] + T
-    for i in range(settings.n):
-        smooth = 1.0 if begins else min(1.0, T / _RECENT)
-        checks.recent[i] += smooth * (sample.torque[i] - checks.recent[i])
-        if moves:
-            checks.q[i] = sample.qr[i] + sample.xi1[i]
-            checks.before[i] = checks.recent[i]
-        else:
-            checks.before[i] += min(1.0, T / _BEFORE) * (sample.torque[i] - checks.before[i])
-        change = abs(checks.recent[i] - checks.before[i])
-        if checks.still[0] > _RECENT and change > _CHANGED * settings.torque_limit[i]:
-            flags |= NO_EFFECT | SUSPECT
-    if moves and checks.lacking[0] == 0.0:
-        for j in range(settings.m + settings.n):
-            checks.moved[j] = checks.kept[j]
-    return flags
-
-
-@inner
-def compare_effort(
-    settings: Settings, checks: Checks, signals: Signals, sample: Sample, begins: bool, moves: bool
-) -> int:
-    """Return the flags for efforts that do not follow the commands.
-
-    The drives' own model of what they add may differ from the law's: then what the efforts lack
-    must not change while no joint moves.
-    """
-    if checks.compares[0] == 0.0:
-        return 0
-    T, is_lacking = checks.sample_time[0], False
-    is_relative = settings.drive > 0 and settings.effort_is_whole == 1
-    for i in range(settings.n):
-        lack = sample.torque[i] - checks.used[2 * settings.n + i]
-        if is_relative:
-            lack += signals.added[i]
-        if begins:
-            checks.lack[i] = lack if is_relative else 0.0
-        elif isfinite(lack):
-            checks.lack[i] += min(1.0, T / _RECENT) * (lack - checks.lack[i])
-        if moves:
-            checks.known[i] = checks.lack[i] if is_relative else 0.0
-        excess = abs(checks.lack[i] - checks.known[i])
-        is_lacking = is_lacking or excess > _CHANGED * settings.torque_limit[i]
-    checks.lacking[0] = checks.lacking[0] + T if is_lacking else 0.0
-    return NO_EFFECT | SUSPECT if checks.lacking[0] > _LASTING else 0
-
-
-@inner
-def average_steps(settings: Settings, checks: Checks, state: State, sample: Sample) -> None:
-    """Update the mean square step of the commands, which coarse encoders make chatter."""
-    share = min(1.0, checks.sample_time[0] / _CHATTERS)
-    for i in range(settings.n):
-        step = sample.torque[i] - checks.last[i] if state.samples[0] > 1.0 else 0.0
-        checks.chatter[i] += share * (step * step - checks.chatter[i])
-        checks.last[i] = sample.torque[i]
+        ratio = max(ratio, abs(sample.xi1[i]) / sample.bound[i])
+    least = checks.least_ratio[0] * (1.0 + checks.sample_time[0] / _RELAXED)
+    least = max(_SMALL, least)
+    if ratio > least and state.samples[0] > 1.0:
+        checks.least_ratio[0] = least
+        return
+    checks.least_ratio[0] = ratio
+    for j in range(settings.m + settings.n):
+        checks.consistent[j] = checks.kept[j]
 
 
 @inner
@@ -198,7 +106,9 @@ def check_sample(
         demand = signals.demand[i]
         largest = max(abs(demand), abs(demand - signals.added[i]))
         within = largest <= settings.torque_limit[i]
-        if not (within and isfinite(sample.torque[i]) and isfinite(state.disturbance[i])):
+        if not (
+            within and isfinite(sample.torque[i]) and isfinite(state.disturbance[i])
+        ):
             flags |= SUSPECT
     for j in range(settings.m):
         if not isfinite(state.estimate[j]):
@@ -210,5 +120,6 @@ def check_sample(
             checks.kept[settings.m + i] = state.disturbance[i]
         if checks.sample_time[0] > 0.0:
             average_steps(settings, checks, state, sample)
+            keep_consistent(settings, checks, state, sample)
             flags |= check_effect(settings, checks, state, signals, sample)
     return flags

@@ -1,9 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""One sample of a law, and the controller: a law with explicit state, `reset`, and `update`.
+"""One sample of the loop, and the controller: a law with explicit state, `reset`, and `update`.
 
-The proposed law (28) has the filtered surface (13), (15), (18) and the barrier torque; the
-comparison law (35) has the linear surface and a position gain.  All other differences between the
-laws are gains that are zero (see `factory`).
+What the loop does for every law, and what a law does itself, is told in `interface`.
 """
 
 from __future__ import annotations
@@ -14,30 +12,23 @@ import numpy as np
 
 from blf_dsc_controller.arms.model import ArmModel
 from blf_dsc_controller.compiled.jit import direct, inner, kernel
-from blf_dsc_controller.compiled.layout import Array, pack, sizes_of
-from blf_dsc_controller.law import (
-    adaptation,
-    apparent_inertia,
-    barrier,
-    excitation,
-    friction,
-    prediction,
-    torque,
-    window,
-)
-from blf_dsc_controller.law.checks import (
+from blf_dsc_controller.compiled.layout import Array, pack
+from blf_dsc_controller.errors import BlfDscError
+from blf_dsc_controller.law import barrier, torque
+from blf_dsc_controller.law.check_state import (
+    CONTRADICTION,
     INVALID,
     Checks,
-    bridge_repeats,
-    check_sample,
     checks_of,
     checks_size,
-    is_valid_state,
 )
+from blf_dsc_controller.law.checks import bridge_repeats, check_sample, is_valid_state
+from blf_dsc_controller.law.friction import first_coulomb
+from blf_dsc_controller.law.interface import Law
+from blf_dsc_controller.law.laws import for_law
 from blf_dsc_controller.law.lyapunov import fill_energies
+from blf_dsc_controller.law.sensor import compare_velocities
 from blf_dsc_controller.law.state import (
-    FILTERED,
-    REFERENCE,
     Sample,
     Settings,
     Signals,
@@ -55,44 +46,9 @@ from blf_dsc_controller.reference import terms as reference
 
 
 @inner
-def compute_regressors(settings: Settings, state: State, signals: Signals) -> None:
-    """Compute H P^(0) of the feedback, H of what is learned; if the row needs them, Yp and Yr."""
-    model, H, q, dq = settings.model, signals.H, signals.q, signals.dq
-    for i in range(settings.n):
-        signals.damped[i] = signals.dalpha2[i] - settings.damping_rate * signals.xi2[i]
-    if settings.prediction == FILTERED:
-        Yp, Yr = signals.momentum, signals.rest
-        model.regressors(q, dq, state.alpha2, signals.damped, H, Yp, Yr)
-    else:
-        model.regressor(q, dq, state.alpha2, signals.damped, H)
-    for i in range(settings.n):
-        signals.model_torque[i] = 0.0
-        for j in range(settings.p):
-            signals.model_torque[i] += H[i, j] * settings.initial_estimate[j]
-    if settings.compensation == REFERENCE:
-        model.regressor(signals.qr, signals.dqr, signals.dqr, signals.ddqr, H)
-    elif settings.damping_rate > 0.0:
-        model.regressor(q, dq, state.alpha2, signals.dalpha2, H)
-
-
-@inner
-def update_window(settings: Settings, state: State, signals: Signals, t: float, dt: float) -> None:
-    """Add the row of the last interval to the window; check the excitation when due."""
-    prediction.fill_columns(settings, t, signals.dq, signals.rest)
-    prediction.form_row(settings, state, signals, dt)
-    if state.samples[0] == 0.0:
-        return
-    if int(state.samples[0]) % settings.row_interval == 0:
-        window.push_row(state, signals.row)
-        friction.measure_flips(settings, state, settings.row_interval * dt)
-    if settings.change_detection == 1:
-        excitation.detect_change(settings, state, signals, dt)
-    if int(state.samples[0]) % settings.interval == 0:
-        excitation.update_excitation(settings, state, signals, t, dt)
-
-
-@inner
-def fill_sample(settings: Settings, state: State, signals: Signals, sample: Sample) -> None:
+def fill_sample(
+    settings: Settings, state: State, signals: Signals, sample: Sample
+) -> None:
     """Fill the telemetry sample, except for the terms of (29)."""
     for i in range(settings.n):
         sample.qr[i] = signals.qr[i]
@@ -100,7 +56,7 @@ def fill_sample(settings: Settings, state: State, signals: Signals, sample: Samp
         sample.xi1[i] = signals.xi1[i]
         sample.xi2[i] = signals.xi2[i]
         sample.torque[i] = signals.torque[i]
-        sample.disturbance[i] = state.disturbance[i]
+        sample.disturbance[i] = state.disturbance[i] + signals.friction[i]
         for j in range(settings.p, settings.m):
             sample.disturbance[i] += signals.H[i, j] * state.estimate[j]
         sample.bound[i] = signals.bound[i]
@@ -118,6 +74,7 @@ def fill_sample(settings: Settings, state: State, signals: Signals, sample: Samp
 
 @inner
 def step(
+    law: Law,
     settings: Settings,
     checks: Checks,
     reference_vector: Array,
@@ -134,9 +91,13 @@ def step(
     t [s] the time since the start, dt [s] since the last sample (at the first: until the next).
     The terms of (29) are separate: `lyapunov.fill_energies`.
     """
-    n, is_checked = settings.n, checks.velocity_limit[0] > 0.0
+    n = settings.n
+    is_checked = checks.velocity_limit[0] > 0.0
     if is_checked and not is_valid_state(settings, checks, measurement):
         return INVALID
+    compares = is_checked and checks.sample_time[0] > 0.0
+    if compares and compare_velocities(checks, dt, measurement, n):
+        return INVALID | CONTRADICTION
     if is_checked:
         bridge_repeats(settings, checks, state, dt, measurement)
     used = checks.used if is_checked else measurement
@@ -148,17 +109,11 @@ def step(
     reference.evaluate(reference_vector, t, signals.qr, signals.dqr, signals.ddqr)
     torque.known_disturbance(settings, signals, t)
     barrier.update_bound(settings, signals, t)
-    barrier.compute_errors(settings, state, signals, dt)
-    compute_regressors(settings, state, signals)
-    friction.fill_compensation(settings, signals)
-    update_window(settings, state, signals, t, dt)
-    if settings.rotors_unsure == 1:
-        apparent_inertia.measure(settings, state, signals, dt)
-        apparent_inertia.correct_feedback(settings, state, signals)
-    torque.compute_demand(settings, state, signals)
+    for i in range(n):
+        signals.xi1[i] = signals.q[i] - signals.qr[i]
+    law.compute_demand(settings, state, signals, t, dt)
     saturated = torque.saturate(settings, state, signals, dt)
-    adaptation.adapt(settings, state, signals, dt, saturated)
-    barrier.filter_step(settings, state, signals, dt)
+    law.finish(settings, state, signals, dt, saturated)
     for i in range(n):
         state.torque[i] = signals.torque[i]
     state.samples[0] += 1.0
@@ -168,8 +123,8 @@ def step(
 
 @kernel
 def update(
+    law: Law,
     model: ArmModel,
-    sizes: np.dtype[np.void],
     settings_vector: Array,
     state_vector: Array,
     signals_vector: Array,
@@ -181,23 +136,48 @@ def update(
     dt: float,
 ) -> int:
     """Run `step` with all its telemetry, on packed vectors; return its flags."""
-    settings = settings_of(settings_vector, sizes, model)
+    settings = settings_of(settings_vector, model)
     state = state_of(state_vector, settings)
     signals = signals_of(signals_vector, settings)
     sample = sample_of(sample_vector, settings)
     checks = checks_of(checks_vector, settings)
-    flags = step(settings, checks, reference_vector, state, signals, t, dt, measurement, sample)
-    if flags != INVALID:
+    flags = step(
+        law,
+        settings,
+        checks,
+        reference_vector,
+        state,
+        signals,
+        t,
+        dt,
+        measurement,
+        sample,
+    )
+    if flags & INVALID == 0:
         fill_energies(settings, state, signals, sample)
     return flags
+
+
+@kernel
+def compare(
+    model: ArmModel,
+    settings_vector: Array,
+    checks_vector: Array,
+    measurement: Array,
+    dt: float,
+) -> bool:
+    """Run `compare_velocities` on packed vectors, without the law."""
+    settings = settings_of(settings_vector, model)
+    checks = checks_of(checks_vector, settings)
+    return compare_velocities(checks, dt, measurement, settings.n)
 
 
 class Controller:
     """A law with its settings, its reference and its state.
 
     Attributes:
-        settings: settings of the law; views of `settings_vector`.
-        sizes: what the kernels are compiled for.
+        law: the law, with its own gains.
+        settings: settings of the loop and the learning; views of `settings_vector`.
         state: views of `state_vector`, the whole state of the controller.
         signals: views of the values that the last update computed.
         sample: telemetry of the last update.
@@ -205,12 +185,12 @@ class Controller:
         flags: flags set by the checks in the last update.
     """
 
-    def __init__(self, settings: Settings, reference_vector: Array) -> None:
+    def __init__(self, law: Law, settings: Settings, reference_vector: Array) -> None:
         """Allocate the vectors for settings and a packed reference; compile the kernels."""
+        self.law = law
         self.settings_vector = pack(settings)
-        self.sizes = sizes_of(settings)
         self.reference_vector = reference_vector
-        self.settings = settings_of(self.settings_vector, self.sizes, settings.model)
+        self.settings = settings_of(self.settings_vector, settings.model)
         self.state_vector = np.zeros(state_size(self.settings))
         self.signals_vector = np.zeros(signals_size(self.settings))
         self.state = state_of(self.state_vector, self.settings)
@@ -220,10 +200,10 @@ class Controller:
         self.checks_vector = np.zeros(checks_size(self.settings))
         self.checks = checks_of(self.checks_vector, self.settings)
         self.flags = 0
-        self._measurement = np.zeros(3 * self.settings.n)  # contiguous, of the kernel's type
+        # contiguous, of the kernel's type
+        self._measurement = np.zeros(3 * self.settings.n)
         self._vectors = (
             self.settings.model,
-            self.sizes,
             self.settings_vector,
             self.state_vector,
             self.signals_vector,
@@ -231,9 +211,13 @@ class Controller:
             self.checks_vector,
             self._measurement,
         )
-        self._update = direct(update, *self._vectors, reference_vector, 0.0, 0.0)
+        self._update = direct(
+            for_law(update, law), law, *self._vectors, reference_vector, 0.0, 0.0
+        )
+        self._compared = (*self._vectors[:2], self.checks_vector, self._measurement)
+        self._compare = direct(compare, *self._compared, 0.0)
         if self.settings.weighed:
-            self._weigh = direct(weigh, *self._vectors[:5], 0.0)
+            self._weigh = direct(weigh, *self._vectors[:4], 0.0)
         self.reset()
         self.reference_at(0.0)
         self.update(0.0, 1e-3, np.zeros(3 * self.settings.n))
@@ -263,6 +247,10 @@ class Controller:
         self.state.min_eigenvector.fill(1.0 / np.sqrt(self.settings.m))
         self.state.active.fill(1.0)
         self.state.gain_scale.fill(1.0)
+        if self.settings.coulomb:
+            first = first_coulomb(self.settings)
+            coulomb = self.settings.initial_estimate[first : first + self.settings.n]
+            self.state.shown[:] = coulomb
 
     def update(self, t: float, dt: float, measurement: Array) -> Array:
         """Return the torque (n,) [N m] for a measurement: a view that the next update overwrites.
@@ -270,24 +258,53 @@ class Controller:
         The measurement is [q (n,) rad, dq (n,) rad/s, applied torque of the last interval (n,)
         N m], t [s] the time since the start and dt [s] since the last sample. If INVALID is among
         the `flags`, nothing has changed, including the torque.
+
+        Raises BlfDscError if the measurement has another shape than (3 n,).
         """
-        self._measurement[:] = measurement
-        self.flags = self._update(*self._vectors, self.reference_vector, t, dt)
+        self._take(measurement)
+        self.flags = self._update(
+            self.law, *self._vectors, self.reference_vector, t, dt
+        )
         return self.sample.torque
+
+    def contradicts(self, dt: float, measurement: Array) -> bool:
+        """Whether a velocity contradicts the positions, by a state that the law does not use.
+
+        The measurement (3 n,) is finite, `dt` [s] after the last.
+        """
+        self._take(measurement)
+        return bool(self._compare(*self._compared, dt))
+
+    def _take(self, measurement: Array) -> None:
+        """Copy a measurement to where the kernels read it."""
+        given = np.shape(measurement)
+        if given != self._measurement.shape:
+            n = self.settings.n
+            raise BlfDscError(
+                f'measurement: got an array of shape {given}, but {n} joints need ({3 * n},): '
+                'positions, velocities and torques, one after the other'
+            )
+        self._measurement[:] = measurement
 
     def weigh(self, dt: float) -> None:
         """Weigh the load by the row of the last update, `dt` [s] after the one before."""
         if self.settings.weighed:
-            self._weigh(*self._vectors[:5], dt)
+            self._weigh(*self._vectors[:4], dt)
 
     def trial(self, t: float, dt: float, measurement: Array) -> Array:
         """Return the torque of an unchecked update that only changes `signals` and `sample`."""
-        saved, limit = self.save(), self.checks.velocity_limit[0]
+        saved = self.save()
+        limit = self.checks.velocity_limit[0]
         self.checks.velocity_limit[0] = 0.0
         torque: Array = self.update(t, dt, measurement).copy()
         self.checks.velocity_limit[0] = limit
         self.restore(saved)
         return torque
+
+    def retune(self, law: Law, settings: Settings) -> None:
+        """Replace the gains of the law, and settings that change no size; the state stays."""
+        self.law = law
+        self.settings_vector[:] = pack(settings)
 
     def save(self) -> Array:
         """Return a copy of the whole state."""

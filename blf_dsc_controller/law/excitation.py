@@ -35,9 +35,11 @@ _COMPARABLE = 0.95  # fraction of the best lambda_min
 _FORGETTING = 0.1  # fraction of the best lambda_min lost per window
 _GATE = 4.0  # ratio of mean squares: twice the torque
 _ALARM = 8.0  # likewise; larger, since a solution extrapolates
-_QUIET = 4.0  # times the smallest residual: the floor, where that is below the configured one
+# times the smallest residual: the floor, where that is below the configured one
+_QUIET = 4.0
 _LEAST_FLOOR = 0.01  # of the configured floor: a tenth of the torque
-_FALLEN = 0.5  # of the residual since the last split; that of a lasting disturbance does not fall
+# of the residual since the last split; that of a lasting disturbance does not fall
+_FALLEN = 0.5
 _USUAL = 1.25  # times the smallest residual, which varies with the motion
 _DOUBT = 3.0  # pull to the anchor per (N m)^2 above that, 1/(kg m^2)^2
 _LEAST_INERTIA = 0.1  # fraction of the initial estimate's
@@ -58,7 +60,9 @@ def explained(settings: Settings, state: State, residual: float) -> float:
 
 
 @inner
-def detect_change(settings: Settings, state: State, signals: Signals, dt: float) -> None:
+def detect_change(
+    settings: Settings, state: State, signals: Signals, dt: float
+) -> None:
     """Compare this row with the latched solution; forget the window if the arm has changed."""
     if state.latched[0] == 0.0:
         return
@@ -68,11 +72,16 @@ def detect_change(settings: Settings, state: State, signals: Signals, dt: float)
         for j in range(settings.m):
             error += signals.row[i, j] * state.solution[j]
         square += error * error
-    state.recent_residual[0] += min(1.0, dt / _MEMORY) * (square - state.recent_residual[0])
-    if state.recent_residual[0] > _ALARM * explained(settings, state, state.residual[0]):
+    state.recent_residual[0] += min(1.0, dt / _MEMORY) * (
+        square - state.recent_residual[0]
+    )
+    if state.recent_residual[0] > _ALARM * explained(
+        settings, state, state.residual[0]
+    ):
         state.changes[0] += 1.0
         state.contradiction[0] = state.recent_residual[0]
-        if state.rows[0] < settings.window:  # back to the estimate before the last change
+        # back to the estimate before the last change
+        if state.rows[0] < settings.window:
             for j in range(settings.m):
                 signals.work[j] = state.estimate[j]
                 state.estimate[j] = state.anchor[j]
@@ -121,7 +130,9 @@ def is_physical(settings: Settings, signals: Signals, theta: Array) -> bool:
     for k in range(settings.n):
         for i in range(settings.n):
             signals.unit[i] = 1.0 if i == k else 0.0
-        settings.model.momentum_regressor(signals.q, signals.unit, signals.momentum, signals.rest)
+        settings.model.momentum_regressor(
+            signals.q, signals.unit, signals.momentum, signals.rest
+        )
         for i in range(k, settings.n):
             signals.inertia[k, i] = 0.0
             for j in range(settings.p):
@@ -145,7 +156,12 @@ def is_in_question(settings: Settings, state: State, residual: float) -> bool:
 def solve(settings: Settings, state: State, signals: Signals) -> None:
     """Factor Phi + rho R, and solve Phi theta = b, with theta in `signals.work`."""
     window.regularized_factor(
-        state.active, settings.rho, settings.information, signals.Phi, signals.b, signals.factor
+        state.active,
+        settings.rho,
+        settings.information,
+        signals.Phi,
+        signals.b,
+        signals.factor,
     )
     for j in range(settings.m):
         signals.work[j] = signals.b[j]
@@ -153,13 +169,16 @@ def solve(settings: Settings, state: State, signals: Signals) -> None:
 
 
 @inner
-def agrees_with_parts(settings: Settings, state: State, signals: Signals, residual: float) -> bool:
+def agrees_with_parts(
+    settings: Settings, state: State, signals: Signals, residual: float
+) -> bool:
     """Check the residual of a full window against those of its two parts, each fitted apart.
 
     If they contradict each other, only the newer part stays in the window.  Restores Phi, b, its
     factor and the solution of the whole window in `signals`.
     """
-    length, newer_rows = settings.window, window.newer_part(state, signals.newer)
+    length = settings.window
+    newer_rows = window.newer_part(state, signals.newer)
     least = residual
     for k in range(3):
         if k == 0:
@@ -173,7 +192,8 @@ def agrees_with_parts(settings: Settings, state: State, signals: Signals, residu
             window.add(state.running, 0.0, state.running, signals.part)
         window.average_window(signals.part, rows, signals.Phi, signals.b)
         if settings.prior_weight > 0.0:
-            prior, weight = settings.initial_estimate, settings.prior_weight
+            prior = settings.initial_estimate
+            weight = settings.prior_weight
             window.pull_to(prior, weight, settings.information, signals.Phi, signals.b)
         solve(settings, state, signals)
         least = min(least, window_residual(signals.part, signals.work) / rows)
@@ -205,7 +225,9 @@ def accept_window(settings: Settings, state: State, signals: Signals) -> bool:
         settings, state, signals, residual
     ):
         return False
-    if missing <= 0.0 and (state.least_residual[0] == 0.0 or residual < state.least_residual[0]):
+    if missing <= 0.0 and (
+        state.least_residual[0] == 0.0 or residual < state.least_residual[0]
+    ):
         state.least_residual[0] = residual
     if residual > _GATE * explained(settings, state, state.least_residual[0]):
         return False
@@ -236,7 +258,9 @@ def reject_columns(settings: Settings, state: State, signals: Signals) -> None:
     for j in range(settings.p, settings.m):
         state.active[j] = 0.0
     window.reset_direction(state)
-    parameters_excited = window.excitation(settings, state, signals, _COLD) >= settings.sigma
+    parameters_excited = (
+        window.excitation(settings, state, signals, _COLD) >= settings.sigma
+    )
     for j in range(settings.p, settings.m):
         state.active[j] = 1.0
     if not parameters_excited:
@@ -274,7 +298,9 @@ def is_preferred(settings: Settings, state: State, value: float) -> bool:
     When the reference stops, (27) would end with the weakest window above the threshold.  A
     weaker window only has less information, unless the latched one is old or contradicted.
     """
-    return bool(settings.change_detection == 0 or value >= _COMPARABLE * state.best_lambda[0])
+    return bool(
+        settings.change_detection == 0 or value >= _COMPARABLE * state.best_lambda[0]
+    )
 
 
 @inner
@@ -289,7 +315,9 @@ def update_excitation(
         return
     period = settings.row_interval * dt
     settling_time = settings.learning_start - settings.window * period
-    settled = state.rows[0] == settings.window or state.rows[0] * period >= settling_time
+    settled = (
+        state.rows[0] == settings.window or state.rows[0] * period >= settling_time
+    )
     learning = t >= settings.learning_start and settled
     if learning and state.columns_checked[0] == 0.0:
         reject_columns(settings, state, signals)
@@ -300,7 +328,9 @@ def update_excitation(
     state.best_lambda[0] *= 1.0 - _FORGETTING * settings.interval / (
         settings.window * settings.row_interval
     )
-    if not (learning and value >= settings.sigma and is_preferred(settings, state, value)):
+    if not (
+        learning and value >= settings.sigma and is_preferred(settings, state, value)
+    ):
         return
     consistent = settings.change_detection == 0
     if not (consistent or accept_window(settings, state, signals)):

@@ -1,17 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Construction of the model, settings and controller of a configuration.
+"""Construction of the model, law, settings and controller of a configuration.
 
-All laws share one kernel; they differ in the surface and in which gains are zero:
-
-    blf_dsc       (28): filtered surface, barrier, composite learning, d^3
-    model_based   (16): P^ = P and the disturbance known, no robust term, nothing adapted
-    backstepping  (35): linear surface, position gain, leaky adaptation by the tracking error
-    slotine_li    tau = H P^ - K_p s, P^' = -Gamma H^T s: (35) without its extra terms,
-                  optionally with the integral of s, by (30)
+blf_dsc       (28): filtered surface, barrier, composite learning, d^3     `law.blf_dsc`
+model_based   (16): the same with P^ = P and the disturbance known
+backstepping  (35): linear surface, adaptation by the tracking error       `law.backstepping`
+slotine_li    the same without position gain, robust term and leakage
+FILE.py       a law of a user's own                                        its `LAW`
 """
 
 from __future__ import annotations
 
+import dataclasses
 from copy import deepcopy
 from typing import Any, NamedTuple
 
@@ -25,28 +24,40 @@ from blf_dsc_controller.arms.base_parameters import (
     payload_inertia,
     prior_factor,
 )
-from blf_dsc_controller.arms.model import ArmModel, arm_model
+from blf_dsc_controller.arms.model import (
+    ArmModel,
+    arm_model,
+    free_inertias,
+    inertia_matrices,
+)
 from blf_dsc_controller.arms.serial_chain import ROTOR
 from blf_dsc_controller.arms.tuning import over_postures
 from blf_dsc_controller.arms.urdf import inertia_of, moved, pseudo_inertia
 from blf_dsc_controller.compiled.algebra import inverse, product
+from blf_dsc_controller.compiled.layout import size_of
+from blf_dsc_controller.configuration import law_file
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.robot import drive_model, parameters_of
 from blf_dsc_controller.configuration.schema import parameters
 from blf_dsc_controller.law import barrier
+from blf_dsc_controller.law.backstepping import Backstepping
+from blf_dsc_controller.law.blf_dsc import BlfDsc
 from blf_dsc_controller.law.controller import Controller
-from blf_dsc_controller.law.state import CHOICES, LINEAR, Settings
+from blf_dsc_controller.law.interface import Law
+from blf_dsc_controller.law.state import CHOICES, Settings
 from blf_dsc_controller.reference.approach import plan_start, reference_of
 
 _COLUMNS = 1.0  # Gamma of the disturbance columns
 _OMEGA = 100.0  # rad/s, of the filter (8)
 _CHECKS = 0.01  # s, between two checks of the excitation
 # Of an arm from a URDF, whose many parameters no motion excites all:
-_ROWS, _SLOWER_CHECKS = 0.01, 0.05  # s, between rows of the window and between its checks
+# s, between rows of the window and between its checks
+_ROWS, _SLOWER_CHECKS = 0.01, 0.05
 _PRIOR = 0.01  # 1 / (independent rows in a window): pull to the initial estimate
 _SLOW = 0.05  # rad/s, reference velocity below which the rows of a joint count less
 _FRICTION = 0.05  # standard deviation of friction, over the rated torque
 _MOST_FRICTION = 3.0  # times its initial estimate
+_POSTURES = 1000  # random ones of a planar arm
 
 
 def model_of(config: ControllerConfig) -> ArmModel:
@@ -78,13 +89,24 @@ def columns_of(config: ControllerConfig) -> tuple[Column, ...]:
     as friction, negative or none, turns over where the joint does.
     """
     learning, joints = config.learning, config.joints
-    switched = {'bias': learning.bias, 'viscous': learning.viscous, 'coulomb': learning.coulomb}
+    switched = {
+        'bias': learning.bias,
+        'viscous': learning.viscous,
+        'coulomb': learning.coulomb,
+    }
     blocks = [name for name, is_on in switched.items() if is_on]
-    blocks += [f'{wave} {w:g} rad/s' for w in learning.frequencies for wave in ('sin', 'cos')]
-    known = config.robot.friction(config.robot.chain(joints)) if config.model == 'urdf' else {}
+    blocks += [
+        f'{wave} {w:g} rad/s' for w in learning.frequencies for wave in ('sin', 'cos')
+    ]
+    known = (
+        config.robot.friction(config.robot.chain(joints))
+        if config.model == 'urdf'
+        else {}
+    )
     columns = []
     for block in blocks:
-        is_viscous, is_friction = block == 'viscous', block in {'viscous', 'coulomb'}
+        is_viscous = block == 'viscous'
+        is_friction = block in {'viscous', 'coulomb'}
         for i, joint in enumerate(joints):
             initial = known[block][i] if block in known else 0.0
             velocity = config.limits.velocity[i] if is_viscous else 1.0
@@ -104,7 +126,10 @@ def columns_of(config: ControllerConfig) -> tuple[Column, ...]:
 
 def estimate_names(config: ControllerConfig) -> tuple[str, ...]:
     """Return the name of each entry of theta^: model parameters, then disturbance columns."""
-    return (*model_of(config).parameter_names, *(column.name for column in columns_of(config)))
+    return (
+        *model_of(config).parameter_names,
+        *(column.name for column in columns_of(config)),
+    )
 
 
 def prior_covariance(config: ControllerConfig) -> np.ndarray:
@@ -112,7 +137,8 @@ def prior_covariance(config: ControllerConfig) -> np.ndarray:
     columns = columns_of(config)
     if config.model != 'urdf':
         return np.eye(model_of(config).p + len(columns))
-    robot, chain = config.robot, config.robot.chain(config.joints)
+    robot = config.robot
+    chain = config.robot.chain(config.joints)
     rotors = robot.rotors(chain)
     unsure = np.where(rotors > 0.0, ROTORS * rotors, UNKNOWN_ROTOR)
     L = prior_factor(chain, parameters_of(robot, chain), robot.payload, unsure)
@@ -129,11 +155,16 @@ def settings_of_config(config: ControllerConfig) -> Settings:
     model = model_of(config)
     learning = config.learning
     p, columns = model.p, columns_of(config)
-    m, is_urdf, T = p + len(columns), config.model == 'urdf', config.sample_time
+    m = p + len(columns)
+    is_urdf = config.model == 'urdf'
+    T = config.sample_time
     row_interval = max(1, round(_ROWS / T)) if is_urdf else 1
     truth = config.truth
     per_joint = zip(
-        config.barrier.bound, config.barrier.weight, config.barrier.slope_limit, strict=True
+        config.barrier.bound,
+        config.barrier.weight,
+        config.barrier.slope_limit,
+        strict=True,
     )
     floor = np.array(learning.residual_floor)
     least = float(floor.min())
@@ -144,7 +175,9 @@ def settings_of_config(config: ControllerConfig) -> Settings:
         'n': model.n,
         'p': p,
         'm': m,
-        'surface': CHOICES['surface'].index('filtered'),
+        'has_barrier': int(law_of(config).has_barrier),
+        'Wc': 0.0,
+        'memory': 0,
         'effort_is_whole': int(config.robot.effort != 'commanded'),
         'drive': drive_inertias.size,
         'drive_size': drive_chain.size,
@@ -155,14 +188,15 @@ def settings_of_config(config: ControllerConfig) -> Settings:
         'truth_known': int(bool(truth.parameters)),
         'feed_forward': 0,
         # Lambda is a heuristic: its rows contradict each other on any arm.
-        'change_detection': int(learning.change_detection and learning.prediction != 'lambda'),
+        'change_detection': int(
+            learning.change_detection and learning.prediction != 'lambda'
+        ),
         'learning_start': learning.window + learning.settling_time,
         'residual_floor': model.n * least * least,
         'prior_weight': (_PRIOR if is_urdf else 0.0) * least * least,
         'motion_scale': _SLOW if is_urdf else 0.0,
         'pole': learning.filter_pole,
         'omega': _OMEGA,
-        'Wc': 0.0,
         'initial_bound': np.array(config.barrier.widest),
         'knee': np.array([barrier.knee(*joint) for joint in per_joint]),
         'Kp': np.array(config.feedback.gain),
@@ -173,10 +207,13 @@ def settings_of_config(config: ControllerConfig) -> Settings:
             (truth.constant, truth.amplitude, truth.frequency, truth.phase)
         ),
         'Gamma': np.array(learning.adaptation_gain + (_COLUMNS,) * len(columns)),
-        'initial_estimate': np.array((*learning.initial_estimate, *(c.initial for c in columns))),
+        'initial_estimate': np.array(
+            (*learning.initial_estimate, *(c.initial for c in columns))
+        ),
         'information': inverse(covariance),
         'variance': np.diag(covariance).copy(),
-        **_rotors(config, model.n),
+        'follows_inertia': int(is_urdf),
+        **_inertias(config, model.n),
         **_load(config, m),
         'least': np.array([-np.inf] * p + [column.least for column in columns]),
         'most': np.array([np.inf] * p + [column.most for column in columns]),
@@ -190,7 +227,13 @@ def settings_of_config(config: ControllerConfig) -> Settings:
 
 def _gains(config: ControllerConfig) -> dict[str, Any]:
     """Return the parameters that are settings, under the name of the field."""
-    groups = (config.barrier, config.surface, config.feedback, config.disturbance, config.torque)
+    groups = (
+        config.barrier,
+        config.surface,
+        config.feedback,
+        config.disturbance,
+        config.torque,
+    )
     found: dict[str, Any] = {}
     for group in (*groups, config.learning):
         for param in parameters(type(group)):
@@ -203,37 +246,49 @@ def _gains(config: ControllerConfig) -> dict[str, Any]:
     return found
 
 
-def _rotors(config: ControllerConfig, n: int) -> dict[str, Any]:
-    """Return what `apparent_inertia` needs: it measures rotor inertias that are only assumed."""
+def joint_inertia(config: ControllerConfig, P: tuple[float, ...]) -> np.ndarray:
+    """Return m (n,) [kg m^2] of parameters P: least inertia of a joint with the others free."""
+    robot = config.robot
+    chain = robot.chain(config.joints)
+    limits = (config.limits.position_lower, config.limits.position_upper)
+    base = parameters_of(robot, chain)
+    least, _ = over_postures(chain, base, robot.payload, P, *limits)
+    return least
+
+
+def _inertias(config: ControllerConfig, n: int) -> dict[str, Any]:
+    """Return m of each joint, and what `apparent_inertia` needs to measure assumed rotors."""
     settings = {
         'rotors_unsure': 0,
-        'lag': config.robot.lag,
+        'lag': config.robot.lag if config.model == 'urdf' else 0.0,
         'unsure_rotor': np.zeros(n),
         'joint_inertia': np.ones(n),
         'link_inertia': np.ones(n),
     }
-    if config.model != 'urdf' or config.robot.rotor_inertia:
+    if config.model != 'urdf':
         return settings
-    robot, limits = config.robot, (config.limits.position_lower, config.limits.position_upper)
+    robot = config.robot
     chain = robot.chain(config.joints)
-    rotors = robot.rotors(chain)
-    base = parameters_of(robot, chain)
-    links, joints = (
-        over_postures(chain, base, robot.payload, tuple(P), *limits)[0]
-        for P in (base.of(chain.inertias, J) for J in (np.zeros(n), rotors))
-    )
+    P0 = config.learning.initial_estimate
+    settings['joint_inertia'] = joint_inertia(config, P0)
+    if robot.rotor_inertia:
+        return settings
+    links = parameters_of(robot, chain).of(chain.inertias, np.zeros(n))
     return settings | {
         'rotors_unsure': 1,
-        'unsure_rotor': rotors,
-        'joint_inertia': joints,
-        'link_inertia': links,
+        'unsure_rotor': robot.rotors(chain),
+        'link_inertia': joint_inertia(config, tuple(links)),
     }
 
 
 def _load(config: ControllerConfig, m: int) -> dict[str, Any]:
     """Return what `weighing` needs: how a load in the tip changes the base parameters."""
     if not config.learning.weighing:
-        return {'weighed': 0, 'load_columns': np.zeros((0, 10)), 'load_scale': np.zeros((4, 10))}
+        return {
+            'weighed': 0,
+            'load_columns': np.zeros((0, 10)),
+            'load_scale': np.zeros((4, 10)),
+        }
     robot = config.robot
     chain = robot.chain(config.joints)
     D = deviations(payload_inertia(max(robot.payload, 1.0)), 1.0, 2.0 * PAYLOAD_SIZE)
@@ -246,11 +301,35 @@ def _load(config: ControllerConfig, m: int) -> dict[str, Any]:
 
 
 def _of_law(config: ControllerConfig, settings: Settings) -> dict[str, Any]:
-    comparison = config.comparison
+    """Return the settings of a law that differ from those of `blf_dsc`."""
+    of_law = {
+        'model_based': _of_model_based,
+        'backstepping': _of_backstepping,
+        'slotine_li': _of_slotine_li,
+    }
+    if law_file.is_file(config.law):
+        return _of_file(config, settings)
+    return of_law[config.law](config, settings) if config.law in of_law else {}
+
+
+def _of_model_based(_config: ControllerConfig, settings: Settings) -> dict[str, Any]:
+    """Return the settings of (16): everything is known, nothing adapts."""
     nothing = np.zeros(settings.n)
-    linear = {
-        'surface': LINEAR,
-        'K': np.array(comparison.surface_gain),
+    columns = settings.initial_estimate[settings.p :]
+    return {
+        'initial_estimate': np.concatenate((settings.true_parameters, columns)),
+        'feed_forward': 1,
+        'd2': nothing,
+        'gamma': nothing,
+        'Gamma': np.zeros(settings.m),
+    }
+
+
+def _of_linear_surface(config: ControllerConfig, n: int) -> dict[str, Any]:
+    """Return what the laws with a linear surface share: they adapt by the tracking error."""
+    nothing = np.zeros(n)
+    return {
+        'K': np.array(config.comparison.surface_gain),
         'd2': nothing,
         'gamma': nothing,
         'kappa': 0.0,
@@ -258,32 +337,65 @@ def _of_law(config: ControllerConfig, settings: Settings) -> dict[str, Any]:
         'bumpless': 0,
         'change_detection': 0,
     }
-    laws: dict[str, dict[str, Any]] = {
-        'blf_dsc': {},
-        'model_based': {
-            'initial_estimate': np.concatenate(
-                (settings.true_parameters, settings.initial_estimate[settings.p :])
-            ),
-            'feed_forward': 1,
-            'd2': nothing,
-            'gamma': nothing,
-            'Gamma': np.zeros(settings.m),
-        },
-        'backstepping': linear
-        | {
-            'weight': np.array(comparison.position_gain),
-            'mu_bar': np.array(comparison.robust_gain),
-            'Wc': comparison.leakage,
-        },
-        'slotine_li': linear
-        | {'weight': nothing, 'gamma': np.array(comparison.integral_gain or nothing)},
+
+
+def _of_backstepping(config: ControllerConfig, settings: Settings) -> dict[str, Any]:
+    """Return the settings of (35)."""
+    return _of_linear_surface(config, settings.n) | {
+        'weight': np.array(config.comparison.position_gain),
+        'mu_bar': np.array(config.comparison.robust_gain),
+        'Wc': config.comparison.leakage,
     }
-    return laws[config.law]
+
+
+def _of_slotine_li(config: ControllerConfig, settings: Settings) -> dict[str, Any]:
+    """Return the settings of Slotine and Li's law: (35) without its extra terms."""
+    nothing = np.zeros(settings.n)
+    return _of_linear_surface(config, settings.n) | {
+        'weight': nothing,
+        'gamma': np.array(config.comparison.integral_gain or nothing),
+    }
+
+
+def _of_file(config: ControllerConfig, settings: Settings) -> dict[str, Any]:
+    """Return the settings of a law of a file: its memory, and the inertias to scale gains by."""
+    memory = law_file.memory_of(law_file.load_law(config.law))
+    return {
+        'joint_inertia': least_inertias(config),
+        'memory': size_of(memory)(settings) if memory else 0,
+    }
+
+
+def least_inertias(config: ControllerConfig) -> np.ndarray:
+    """Return the least inertia (n,) [kg m^2] of each joint over the postures, the others free."""
+    P0 = config.learning.initial_estimate
+    lower = config.limits.position_lower
+    upper = config.limits.position_upper
+    if config.model == 'urdf':
+        chain = config.robot.chain(config.joints)
+        base = parameters_of(config.robot, chain)
+        inertias = over_postures(chain, base, config.robot.payload, P0, lower, upper)[0]
+        return np.asarray(inertias)
+    rng = np.random.default_rng(0)
+    postures = rng.uniform(lower, upper, (_POSTURES, len(lower)))
+    inertias = inertia_matrices(model_of(config), np.array(P0), postures)
+    return np.asarray(free_inertias(inertias).min(axis=0))
+
+
+def law_of(config: ControllerConfig) -> Law:
+    """Return the law of a configuration, with its own gains."""
+    if config.law in ('backstepping', 'slotine_li'):
+        return Backstepping()
+    if law_file.is_file(config.law):
+        gains = getattr(config, law_file.GROUP)
+        law: Law = law_file.load_law(config.law)(**dataclasses.asdict(gains))
+        return law
+    return BlfDsc()
 
 
 def controller_of(config: ControllerConfig) -> Controller:
     """Return the controller of a configuration, compiled and in its initial state."""
-    return Controller(settings_of_config(config), reference_of(config))
+    return Controller(law_of(config), settings_of_config(config), reference_of(config))
 
 
 def begin(

@@ -9,7 +9,14 @@ from blf_dsc_controller.arms.model import inertia_matrices
 from blf_dsc_controller.compiled.jit import inner
 from blf_dsc_controller.compiled.layout import Array
 from blf_dsc_controller.law import barrier
-from blf_dsc_controller.law.state import LINEAR, NEWTON, REFERENCE, Sample, Settings, Signals, State
+from blf_dsc_controller.law.state import (
+    NEWTON,
+    REFERENCE,
+    Sample,
+    Settings,
+    Signals,
+    State,
+)
 
 _POSTURES = 181
 
@@ -19,24 +26,32 @@ def error_term(settings: Settings, state: State, signals: Signals) -> float:
     """Return the weighted barrier potential (3) of xi1 [J]; w z1^2 / 2 without a barrier."""
     total, xi1 = 0.0, signals.xi1
     for i in range(settings.n):
-        if settings.surface == LINEAR:
+        if settings.has_barrier == 0:
             total += 0.5 * settings.weight[i] * xi1[i] ** 2
         else:
-            bound, knee = signals.bound[i], signals.knee[i]
-            weight, limit = settings.weight[i], settings.slope_limit[i]
-            total += state.gain_scale[i] * barrier.potential(xi1[i], bound, weight, limit, knee)
+            bound = signals.bound[i]
+            knee = signals.knee[i]
+            weight = settings.weight[i]
+            limit = settings.slope_limit[i]
+            total += state.gain_scale[i] * barrier.potential(
+                xi1[i], bound, weight, limit, knee
+            )
     return total
 
 
 @inner
-def fill_energies(settings: Settings, state: State, signals: Signals, sample: Sample) -> None:
+def fill_energies(
+    settings: Settings, state: State, signals: Signals, sample: Sample
+) -> None:
     """Compute the terms of (29) for the telemetry sample; NaN where the truth is unknown.
 
     After the error's: xi2^T M xi2 / 2, where M xi2 = Yp(q, xi2) P; P~^T Gamma^-1 P~ / 2 of the
     parameters that are adapted (Gamma_j > 0); (tau_dist - d^3)^2 / (2 gamma) of the joints whose
     d^3 is adapted (gamma > 0), all in J.  Overwrites Yp and Yr in `signals`.
     """
-    n, p, V = settings.n, settings.p, sample.lyapunov
+    n = settings.n
+    p = settings.p
+    V = sample.lyapunov
     V[0] = error_term(settings, state, signals)
     for k in range(1, 4):
         V[k] = 0.0 if settings.truth_known == 1 else nan
@@ -62,7 +77,9 @@ def largest_inertia(settings: Settings) -> float:
 
     Of postures with equal joint angles, one of which is the stretched planar arm.
     """
-    postures = np.linspace(-np.pi, np.pi, _POSTURES)[:, np.newaxis] * np.ones(settings.n)
+    postures = np.linspace(-np.pi, np.pi, _POSTURES)[:, np.newaxis] * np.ones(
+        settings.n
+    )
     M = inertia_matrices(settings.model, settings.true_parameters, postures)
     return float(np.linalg.eigvalsh(M).max())
 
@@ -74,7 +91,7 @@ def decay_rate(settings: Settings) -> float:
     the handover to d^3, V of (29) need not fall (doc/theory.md: stability).  A Newton step
     replaces sigma, the smallest eigenvalue of Phi_e, by sigma / (sigma + rho).
     """
-    if settings.surface == LINEAR or settings.truth_known == 0:
+    if settings.has_barrier == 0 or settings.truth_known == 0:
         return 0.0
     if settings.compensation == REFERENCE or settings.bumpless == 1:
         return 0.0

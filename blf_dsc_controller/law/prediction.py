@@ -60,6 +60,26 @@ def fill_columns(settings: Settings, t: float, dq: Array, rest: Array) -> None:
 
 
 @inner
+def delay_torque(settings: Settings, state: State, signals: Signals, dt: float) -> None:
+    """Pass the applied torque through the lags of drives and sensors, to `state.late`.
+
+    A measured motion is that of a torque of `robot.lag` ago: half of it is the drives', half the
+    velocity filter's.
+    """
+    begins = settings.lag == 0.0 or state.samples[0] <= 1.0
+    gain = 0.0
+    if not begins:
+        gain = barrier.filter_gain(0.5 * settings.lag, dt)
+    for i in range(settings.n):
+        torque = signals.applied[i]
+        for k in range(2):
+            if begins:
+                state.late[k, i] = torque
+            torque = state.late[k, i] + gain * (torque - state.late[k, i])
+            state.late[k, i] = torque
+
+
+@inner
 def filter_row(settings: Settings, state: State, signals: Signals, dt: float) -> None:
     """Pass [X | u] of the last interval through both poles; write the result to `signals.row`.
 
@@ -72,12 +92,14 @@ def filter_row(settings: Settings, state: State, signals: Signals, dt: float) ->
     for i in range(settings.n):
         weight = settings.row_weight[i]
         if settings.motion_scale > 0.0:
-            weight *= abs(signals.dqr[i]) / sqrt(signals.dqr[i] ** 2 + settings.motion_scale**2)
+            weight *= abs(signals.dqr[i]) / sqrt(
+                signals.dqr[i] ** 2 + settings.motion_scale**2
+            )
         for j in range(m):
             row[i, j] = 0.5 * (signals.rest[i, j] + state.rest[i, j])
         for j in range(p):
             row[i, j] += (signals.momentum[i, j] - state.momentum[i, j]) * (1.0 / dt)
-        row[i, m] = signals.applied[i]
+        row[i, m] = state.late[1, i]
         for j in range(m + 1):
             state.filter1[i, j] += gain * (row[i, j] - state.filter1[i, j])
             state.filter2[i, j] += gain * (state.filter1[i, j] - state.filter2[i, j])
@@ -85,7 +107,9 @@ def filter_row(settings: Settings, state: State, signals: Signals, dt: float) ->
 
 
 @inner
-def differentiate(settings: Settings, state: State, signals: Signals, dt: float) -> None:
+def differentiate(
+    settings: Settings, state: State, signals: Signals, dt: float
+) -> None:
     """Step the filter (8) with damping 1, exactly for held xi2; write ddq^ to `signals`."""
     decay = exp(-settings.omega * dt)
     for i in range(settings.n):
@@ -96,7 +120,9 @@ def differentiate(settings: Settings, state: State, signals: Signals, dt: float)
             offset = state.observed[i] - signals.xi2[i]
             slope = state.observed_rate[i] + settings.omega * offset
             state.observed[i] = signals.xi2[i] + (offset + slope * dt) * decay
-            state.observed_rate[i] = (state.observed_rate[i] - settings.omega * slope * dt) * decay
+            state.observed_rate[i] = (
+                state.observed_rate[i] - settings.omega * slope * dt
+            ) * decay
         signals.acceleration[i] = signals.dalpha2[i] + state.observed_rate[i]
 
 
@@ -106,15 +132,22 @@ def lambda_row(settings: Settings, state: State, signals: Signals) -> None:
 
     Lambda of (24) is dimensionless only if units are ignored.
     """
-    products, squares, X = 1.0, 1.0, signals.momentum
+    products = 1.0
+    squares = 1.0
+    X = signals.momentum
     for i in range(settings.n):
-        products += signals.acceleration[i] * signals.dalpha2[i] + signals.dq[i] * state.alpha2[i]
+        products += (
+            signals.acceleration[i] * signals.dalpha2[i]
+            + signals.dq[i] * state.alpha2[i]
+        )
         squares += signals.acceleration[i] ** 2 + signals.dq[i] ** 2
     scale = products / squares
     settings.model.regressor(signals.q, signals.dq, state.alpha2, signals.dalpha2, X)
     for i in range(settings.n):
         for j in range(settings.m):
-            signals.row[i, j] = X[i, j] if j < settings.p else scale * signals.rest[i, j]
+            signals.row[i, j] = (
+                X[i, j] if j < settings.p else scale * signals.rest[i, j]
+            )
         signals.row[i, settings.m] = scale * signals.applied[i]
 
 
@@ -126,6 +159,7 @@ def form_row(settings: Settings, state: State, signals: Signals, dt: float) -> N
         lambda_row(settings, state, signals)
         return
     if state.samples[0] > 0.0:
+        delay_torque(settings, state, signals, dt)
         filter_row(settings, state, signals, dt)
     for i in range(settings.n):  # Yp and [Yr | D] for the next interval
         for j in range(settings.m):

@@ -19,7 +19,12 @@ import numpy as np
 from blf_dsc_controller.arms.model import regressors_at
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.law.controller import Controller
-from blf_dsc_controller.law.factory import columns_of, estimate_names, model_of, prior_covariance
+from blf_dsc_controller.law.factory import (
+    columns_of,
+    estimate_names,
+    model_of,
+    prior_covariance,
+)
 from blf_dsc_controller.law.state import Sample, Settings, sample_of
 from blf_dsc_controller.messages import topics
 from blf_dsc_controller.messages.codecs import (
@@ -35,7 +40,9 @@ DECIMATION = 10
 """Number of samples from one message of the plant's truth to the next."""
 
 
-def monitored(config: ControllerConfig, estimates: Sequence[str]) -> dict[str, Sequence[str]]:
+def monitored(
+    config: ControllerConfig, estimates: Sequence[str]
+) -> dict[str, Sequence[str]]:
     """Return the parts of a `Sample` that `~/monitor` has, each with the names of its values.
 
     `estimates` are those of theta^, as returned by `factory.estimate_names`.
@@ -67,8 +74,11 @@ class ControllerTelemetry:
     """
 
     def __init__(self, config: ControllerConfig, estimates: Sequence[str]) -> None:
-        joints, parts = config.joints, monitored(config, estimates)
-        names = [what + joint for what in (topics.RATIO, topics.DISTANCE) for joint in joints]
+        joints = config.joints
+        parts = monitored(config, estimates)
+        names = [
+            what + joint for what in (topics.RATIO, topics.DISTANCE) for joint in joints
+        ]
         names = [*names, *chain.from_iterable(parts.values()), topics.COMPUTE_TIME]
         self._command = Float64MultiArrayEncoder(len(joints))
         self._reference = JointStateEncoder(joints, ('position', 'velocity'))
@@ -91,7 +101,9 @@ class ControllerTelemetry:
     def bound(self, stamp: int, bound: np.ndarray, torque_limit: np.ndarray) -> Message:
         """Encode the bound k_c (n,) [rad] on the tracking error and the torque limit (n,) [N m]."""
         self._sent = np.array(bound)
-        return topics.BOUND, self._bound.encode(stamp, position=bound, effort=torque_limit)
+        return topics.BOUND, self._bound.encode(
+            stamp, position=bound, effort=torque_limit
+        )
 
     def answer(self, stamp: int, torque: np.ndarray) -> Message:
         """Encode a torque (n,) [N m] that is not the law's; the tracking errors are NaN.
@@ -99,7 +111,9 @@ class ControllerTelemetry:
         `stamp` [ns] is that of the joint state, or of the last readable one.
         """
         unknown = np.full(torque.size, np.nan)
-        return topics.TRACKING_ERROR, self._error.encode(stamp, unknown, unknown, torque)
+        return topics.TRACKING_ERROR, self._error.encode(
+            stamp, unknown, unknown, torque
+        )
 
     def sample(
         self,
@@ -121,7 +135,9 @@ class ControllerTelemetry:
         self._samples += 1
         self._slowest = max(compute_time, self._slowest)  # NaN: not measured
         bound = sample.bound
-        if bound.tobytes() != self._sent.tobytes() and (is_due or (bound > self._sent).any()):
+        if bound.tobytes() != self._sent.tobytes() and (
+            is_due or (bound > self._sent).any()
+        ):
             yield self.bound(stamp, bound, torque_limit)
         if heard:
             error = self._error.encode(stamp, sample.xi1, sample.xi2, sample.torque)
@@ -129,7 +145,9 @@ class ControllerTelemetry:
         if is_due:
             yield topics.REFERENCE, self._reference.encode(stamp, sample.qr, sample.dqr)
             distance = bound - np.abs(sample.xi1)
-            values = np.concatenate((ratio, distance, *self._parts(sample), (self._slowest,)))
+            values = np.concatenate(
+                (ratio, distance, *self._parts(sample), (self._slowest,))
+            )
             yield topics.MONITOR, self._monitor.encode(stamp, values)
             self._slowest = 0.0
 
@@ -141,11 +159,16 @@ class PlantTelemetry:
     """
 
     def __init__(
-        self, joints: Sequence[str], parameters: Sequence[str], published: Sequence[str] = ()
+        self,
+        joints: Sequence[str],
+        parameters: Sequence[str],
+        published: Sequence[str] = (),
     ) -> None:
         names = tuple(published) or tuple(joints)
         true_state = [
-            what + joint for what in (topics.POSITION, topics.VELOCITY) for joint in joints
+            what + joint
+            for what in (topics.POSITION, topics.VELOCITY)
+            for joint in joints
         ]
         self._joint_states = JointStateEncoder(names)
         self._places = [names.index(joint) for joint in joints]
@@ -166,9 +189,13 @@ class PlantTelemetry:
         """Encode the true [P, tau_dist, q, dq] (p + 3 n,)."""
         return topics.TRUTH, self._truth.encode(stamp, truth)
 
-    def timing(self, stamp: int, latency: float, lateness: float, late_steps: int) -> Message:
+    def timing(
+        self, stamp: int, latency: float, lateness: float, late_steps: int
+    ) -> Message:
         """Encode the real-time performance of the step up to this sample [s, s, count]."""
-        return topics.TIMING, self._timing.encode(stamp, (latency, lateness, late_steps))
+        return topics.TIMING, self._timing.encode(
+            stamp, (latency, lateness, late_steps)
+        )
 
     def clock(self, stamp: int) -> Message:
         """Encode the plant's time [ns] for /clock."""
@@ -184,7 +211,9 @@ def load_text(load: Sequence[float]) -> str:
     text = f'{mass:.3f} +- {interval:.2g} kg'
     if not math.isfinite(centre[0]):
         return text
-    each = (f'{1e3 * c:.1f} +- {1e3 * s:.2g}' for c, s in zip(centre, spread, strict=True))
+    each = (
+        f'{1e3 * c:.1f} +- {1e3 * s:.2g}' for c, s in zip(centre, spread, strict=True)
+    )
     return f'{text}, its centre at {", ".join(each)} mm'
 
 
@@ -198,7 +227,8 @@ def learned_arm(config: ControllerConfig) -> LearnedArm | None:
     """Return units, prior and regressor of what is learned of a URDF; None for other models."""
     if config.model != 'urdf':
         return None
-    model, names = model_of(config), estimate_names(config)
+    model = model_of(config)
+    names = estimate_names(config)
     friction = (column.unit for column in columns_of(config))
     deviations = np.sqrt(np.diag(prior_covariance(config))).tolist()
     return LearnedArm(
@@ -235,7 +265,9 @@ def run_of(
         error=samples.xi1,
         bound=samples.bound,
         torque_limit=np.broadcast_to(config.torque.limit, position.shape),
-        monitor=Series(tuple(chain.from_iterable(parts.values())), stamps[used], monitor),
+        monitor=Series(
+            tuple(chain.from_iterable(parts.values())), stamps[used], monitor
+        ),
         arm=learned_arm(config),
         learns=config.law == 'blf_dsc' and config.learning.weight > 0.0,
     )
@@ -261,7 +293,9 @@ def rejected_columns(controller: Controller, names: Sequence[str]) -> dict[str, 
         parts = np.linalg.lstsq(Phi[np.ix_(kept, kept)], products, rcond=None)[0]
         strength = np.abs(parts) * np.sqrt(np.diag(Phi)[kept])
         order = kept[np.argsort(-strength)].tolist()
-        alike = [names[k] for k in order[: np.sum(strength >= _NOTABLE * strength.max())]]
+        alike = [
+            names[k] for k in order[: np.sum(strength >= _NOTABLE * strength.max())]
+        ]
         explained = float(np.clip(parts @ products / Phi[column, column], 0.0, 1.0))
         reasons[names[column]] = (
             f'{names[column]} is not estimated: this window cannot distinguish it from '

@@ -18,25 +18,33 @@ window in any case.  Nothing here acts on the torque: `weigh` runs after it has 
 
 from math import sqrt
 
-import numpy as np
-
 from blf_dsc_controller.arms.model import ArmModel
 from blf_dsc_controller.compiled.algebra import cholesky_factor, cholesky_solve
 from blf_dsc_controller.compiled.jit import inner, kernel
 from blf_dsc_controller.compiled.layout import Array
 from blf_dsc_controller.law import window
 from blf_dsc_controller.law.excitation import window_residual
-from blf_dsc_controller.law.state import Settings, Signals, State, settings_of, signals_of, state_of
+from blf_dsc_controller.law.state import (
+    Settings,
+    Signals,
+    State,
+    settings_of,
+    signals_of,
+    state_of,
+)
 
 _PERIOD = 0.1  # s, from one solution to the next
 _LASTING = 0.2  # s, correlation length of the residual
 _MEMORY = 0.3  # s, averaging time of the last rows
 _FEWEST = 0.5  # s of motion, before which they are not compared with the solution
-_ALARM = 8.0  # times the mean square residual of the first window: something else is held
+# times the mean square residual of the first window: something else is held
+_ALARM = 8.0
 _SETTLED = 6.0  # time constants of the filters
-_SLOW = 0.3  # rad/s or m/s, below which friction is least like its columns, and rows count less
+# rad/s or m/s, below which friction is least like its columns, and rows count less
+_SLOW = 0.3
 
-BEFORE, OLDER, NEWER = range(3)  # rows of the first window, and of the last two halves since
+# rows of the first window, and of the last two halves since
+BEFORE, OLDER, NEWER = range(3)
 TWO_SIDED = 1.96  # standard deviations in half of a 95 % interval
 MASS, DEVIATION = 0, 4  # in `state.load`, each followed by three of the centre
 
@@ -44,7 +52,8 @@ MASS, DEVIATION = 0, 4  # in `state.load`, each followed by three of the centre
 @inner
 def add_row(settings: Settings, state: State, signals: Signals, dt: float) -> None:
     """Add the row of this sample if one is due, and solve for the load ten times a second."""
-    samples, interval = int(state.samples[0]), settings.row_interval
+    samples = int(state.samples[0])
+    interval = settings.row_interval
     if settings.weighed == 0 or samples % interval != interval // 2:
         return
     period = interval * dt
@@ -68,7 +77,9 @@ def add_row(settings: Settings, state: State, signals: Signals, dt: float) -> No
         share += square / (square + settings.motion_scale**2 + 1e-12) / settings.n
     state.weighed_rows[part] += share
     if part == NEWER and state.weighed_rows[NEWER] >= 0.5 * settings.window:
-        window.add(state.weighed_sums[NEWER], 0.0, state.weighed_sums[NEWER], signals.since)
+        window.add(
+            state.weighed_sums[NEWER], 0.0, state.weighed_sums[NEWER], signals.since
+        )
         window.add(signals.since, 0.0, signals.since, state.weighed_sums[OLDER])
         window.clear(state.weighed_sums[NEWER])
         state.weighed_rows[OLDER] = state.weighed_rows[NEWER]
@@ -103,7 +114,9 @@ def discard(settings: Settings, state: State) -> None:
 
 
 @inner
-def is_contradicted(settings: Settings, state: State, signals: Signals, period: float) -> bool:
+def is_contradicted(
+    settings: Settings, state: State, signals: Signals, period: float
+) -> bool:
     """Compare this row with the solution; return whether the last ones contradict it."""
     if rows_since(state) < _FEWEST / period or state.load[DEVIATION] == 0.0:
         return False
@@ -113,7 +126,9 @@ def is_contradicted(settings: Settings, state: State, signals: Signals, period: 
         for j in range(settings.m):
             error += signals.row[i, j] * state.weighed_model[j]
         square += error * error / settings.n
-    state.weighed_recent[0] += min(1.0, period / _MEMORY) * (square - state.weighed_recent[0])
+    state.weighed_recent[0] += min(1.0, period / _MEMORY) * (
+        square - state.weighed_recent[0]
+    )
     return bool(state.weighed_recent[0] > _ALARM * state.weighed_noise[0])
 
 
@@ -125,7 +140,9 @@ def row_variance(settings: Settings, state: State, lasting: float) -> float:
 
 
 @inner
-def fill_equations(settings: Settings, state: State, signals: Signals, a: float) -> None:
+def fill_equations(
+    settings: Settings, state: State, signals: Signals, a: float
+) -> None:
     """Fill the upper triangle and the right-hand side of the normal equations of theta and z.
 
     With the sums S of all rows and S' of those since, and the variance a of rows that count,
@@ -133,8 +150,12 @@ def fill_equations(settings: Settings, state: State, signals: Signals, a: float)
         [S + a R       S' N D             ] [theta]   [S_u + a R theta_0]
         [D^T N^T S'    D^T N^T S' N D + a ] [z    ] = [D^T N^T S'_u     ]
     """
-    m, A, x = settings.m, signals.load_normal, signals.load_solution
-    before, since, ND = state.weighed_sums[BEFORE], signals.since, settings.load_columns
+    m = settings.m
+    A = signals.load_normal
+    x = signals.load_solution
+    before = state.weighed_sums[BEFORE]
+    since = signals.since
+    ND = settings.load_columns
     for i in range(m):
         x[i] = before[i, m] + since[i, m]
         for j in range(m):
@@ -157,7 +178,9 @@ def fill_equations(settings: Settings, state: State, signals: Signals, a: float)
 @inner
 def solve(settings: Settings, state: State, signals: Signals, lasting: float) -> None:
     """Find theta and z, and the residual before and since; `lasting` rows count as one."""
-    m, ND, x = settings.m, settings.load_columns, signals.load_solution
+    m = settings.m
+    ND = settings.load_columns
+    x = signals.load_solution
     window.add(state.weighed_sums[OLDER], 1.0, state.weighed_sums[NEWER], signals.since)
     fill_equations(settings, state, signals, row_variance(settings, state, lasting))
     cholesky_factor(signals.load_normal)
@@ -167,21 +190,26 @@ def solve(settings: Settings, state: State, signals: Signals, lasting: float) ->
         model[i] = theta[i]
         for c in range(ND.shape[1]):
             model[i] += ND[i, c] * x[m + c]
-    first, last = max(state.weighed_rows[BEFORE], lasting), max(rows_since(state), lasting)
+    first = max(state.weighed_rows[BEFORE], lasting)
+    last = max(rows_since(state), lasting)
     before = window_residual(state.weighed_sums[BEFORE], theta)
     state.weighed_noise[0] = before / (settings.n * first)
     state.weighed_noise[1] = window_residual(signals.since, model) / (settings.n * last)
 
 
 @inner
-def describe(settings: Settings, state: State, signals: Signals, lasting: float) -> None:
+def describe(
+    settings: Settings, state: State, signals: Signals, lasting: float
+) -> None:
     """Write mass and centre of the load to `state.load`, and their standard deviations.
 
     The covariance of z is a (U^T U)^-1 with the last rows U of the factor.  The centre is unknown
     where the mass is not twice its deviation.
     """
     m, k = settings.m, settings.load_scale.shape[1]
-    U, z, v = signals.load_normal[m:, m:], signals.load_solution[m:], signals.load_spread
+    U = signals.load_normal[m:, m:]
+    z = signals.load_solution[m:]
+    v = signals.load_spread
     a = row_variance(settings, state, lasting)
     for r in range(4):
         state.load[r] = 0.0
@@ -201,19 +229,20 @@ def describe(settings: Settings, state: State, signals: Signals, lasting: float)
         if r > 0:
             is_known = abs(mass) > 2.0 * state.load[DEVIATION]
             state.load[r] = centre if is_known else 0.0
-            state.load[DEVIATION + r] = state.load[DEVIATION + r] / abs(mass) if is_known else 0.0
+            state.load[DEVIATION + r] = (
+                state.load[DEVIATION + r] / abs(mass) if is_known else 0.0
+            )
 
 
 @kernel
 def weigh(
     model: ArmModel,
-    sizes: np.dtype[np.void],
     settings_vector: Array,
     state_vector: Array,
     signals_vector: Array,
     dt: float,
 ) -> None:
     """Take the row of the last sample on packed vectors: see `add_row`; `dt` [s] is its length."""
-    settings = settings_of(settings_vector, sizes, model)
+    settings = settings_of(settings_vector, model)
     state = state_of(state_vector, settings)
     add_row(settings, state, signals_of(signals_vector, settings), dt)

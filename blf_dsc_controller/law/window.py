@@ -27,8 +27,11 @@ def push_row(state: State, row: Array) -> None:
     The oldest row of the ring is at the cursor, and counts once the window is full.  The sums of
     [X | u]^T [X | u], S, F and L, have only their upper triangle filled.
     """
-    running, fresh, half = state.running, state.fresh, state.half
-    cursor, length = int(state.cursor[0]), int(state.ring.shape[0])
+    running = state.running
+    fresh = state.fresh
+    half = state.half
+    cursor = int(state.cursor[0])
+    length = int(state.ring.shape[0])
     old = state.ring[cursor]
     n, size = row.shape
     keep = 1.0 if state.rows[0] == length else 0.0
@@ -83,7 +86,8 @@ def clear(matrix: Array) -> None:
 @inner
 def newer_part(state: State, newer: Array) -> int:
     """Fill `newer` with the sum of the newer part of a full ring; return its number of rows."""
-    cursor, length = int(state.cursor[0]), int(state.ring.shape[0])
+    cursor = int(state.cursor[0])
+    length = int(state.ring.shape[0])
     middle = length // 2
     if 4 * cursor < length:
         add(state.fresh, 1.0, state.half, newer)
@@ -107,7 +111,9 @@ def average_window(running: Array, samples: int, Phi: Array, b: Array) -> None:
 
 
 @inner
-def pull_to(target: Array, weight: float, information: Array, Phi: Array, b: Array) -> None:
+def pull_to(
+    target: Array, weight: float, information: Array, Phi: Array, b: Array
+) -> None:
     """Pull theta to `target` (m,) by `weight` a times R:  Phi + a R,  b + a R target."""
     for i in range(b.size):
         pull = weight * target[i]
@@ -192,14 +198,19 @@ def reset_direction(state: State) -> None:
 
 
 @inner
-def excitation(settings: Settings, state: State, signals: Signals, iterations: int) -> float:
+def excitation(
+    settings: Settings, state: State, signals: Signals, iterations: int
+) -> float:
     """Return lambda_min of the current window's Phi; leave Phi, b and its factor in `signals`."""
-    Phi, b, R = signals.Phi, signals.b, settings.information
+    Phi = signals.Phi
+    b = signals.b
+    R = settings.information
     average_window(state.running, int(state.rows[0]), Phi, b)
     if settings.prior_weight > 0.0:
         pull_to(settings.initial_estimate, settings.prior_weight, R, Phi, b)
     regularized_factor(state.active, settings.rho, R, Phi, b, signals.factor)
-    direction, work = state.min_eigenvector, signals.work
+    direction = state.min_eigenvector
+    work = signals.work
     return min_eigenvector(Phi, R, signals.factor, direction, work, iterations)
 
 

@@ -21,23 +21,22 @@ from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 from tqdm import tqdm
 
 from blf_dsc_controller.analysis.metrics import aligned, write_json
 from blf_dsc_controller.arms.model import ArmModel
-from blf_dsc_controller.arms.tuning import over_postures
 from blf_dsc_controller.compiled.elementary import tanh
 from blf_dsc_controller.compiled.jit import compile_methods, kernel
-from blf_dsc_controller.compiled.layout import Array, part, view
+from blf_dsc_controller.compiled.layout import Array
+from blf_dsc_controller.compiled.views import part, view
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.nodes import LoopConfig, load_loop
-from blf_dsc_controller.configuration.robot import parameters_of
 from blf_dsc_controller.configuration.schema import change
 from blf_dsc_controller.errors import BlfDscError
-from blf_dsc_controller.law.factory import model_of
+from blf_dsc_controller.law.factory import joint_inertia, model_of
 from blf_dsc_controller.law.telemetry import sample_columns
 from blf_dsc_controller.reference import terms as reference
 from blf_dsc_controller.reference.approach import plan_start
@@ -50,7 +49,13 @@ from blf_dsc_controller.studies.monte_carlo import (
     torque_rows,
 )
 from blf_dsc_controller.studies.runs import cores
-from blf_dsc_controller.studies.tuning import Gain, bounded, parameters_at, search, value_at
+from blf_dsc_controller.studies.tuning import (
+    Gain,
+    bounded,
+    parameters_at,
+    search,
+    value_at,
+)
 from sim_plant import kernels as plants
 from sim_plant.arm import Arm
 from sim_plant.plant import plant_of, steps_of
@@ -81,6 +86,8 @@ class Known(NamedTuple):
     model: ArmModel
     P: Array  # (p,) P0
     inertia: Array  # (n,) kg m^2, m
+    # (3, n) k_p [1/s^2], k_d [1/s], k_i [1/s^3] of the proposed law at small errors
+    linear_gains: Array
     viscous: Array  # (n,) N m s/rad
     coulomb: Array  # (n,) N m
     coulomb_velocity: float  # rad/s
@@ -109,9 +116,9 @@ class Law(Protocol):
 class ComputedTorque(NamedTuple):
     """Computed torque with an integrator."""
 
-    position: float  # k_p, 1/s^2
-    velocity: float  # k_d, 1/s
-    integral: float  # k_i, 1/s^3
+    position: Array  # (n,) k_p, 1/s^2
+    velocity: Array  # (n,) k_d, 1/s
+    integral: Array  # (n,) k_i, 1/s^3
     integrated: Array  # (n,) rad s, int e
     a: Array  # (n,) rad/s^2
     H: Array  # (n, p)
@@ -120,9 +127,9 @@ class ComputedTorque(NamedTuple):
         """Write the torque."""
         n = now.q.size
         for i in range(n):
-            u = -self.position * (now.q[i] - now.qr[i])
-            u -= self.velocity * (now.dq[i] - now.dqr[i])
-            u -= self.integral * self.integrated[i]
+            u = -self.position[i] * (now.q[i] - now.qr[i])
+            u -= self.velocity[i] * (now.dq[i] - now.dqr[i])
+            u -= self.integral[i] * self.integrated[i]
             self.a[i] = now.ddqr[i] + u
         arm.model.regressor(now.q, now.dq, now.dq, self.a, self.H)
         cut = False
@@ -138,9 +145,20 @@ class ComputedTorque(NamedTuple):
 
 
 def computed_torque(gains: Mapping[str, float], arm: Known) -> ComputedTorque:
-    """Return the law with gains `position`, `velocity` and `integral`."""
-    integrated, a = np.zeros((2, arm.inertia.size))
-    return ComputedTorque(**gains, integrated=integrated, a=a, H=np.zeros((a.size, arm.P.size)))
+    """Return the law with gains `position`, `velocity` and `integral`.
+
+    Without any they are those of the proposed law at small errors: equal bandwidth.
+    """
+    n = arm.inertia.size
+    position, velocity, integral = arm.linear_gains
+    if gains:
+        position = np.full(n, gains['position'])
+        velocity = np.full(n, gains['velocity'])
+        integral = np.full(n, gains['integral'])
+    H = np.zeros((n, arm.P.size))
+    return ComputedTorque(
+        position, velocity, integral, integrated=np.zeros(n), a=np.zeros(n), H=H
+    )
 
 
 def _run(
@@ -159,8 +177,12 @@ def _run(
     every = view(rows)
     for k in range(rows.shape[0]):
         row = every[k]
-        q, dq, torque = part(row, 0, (n,)), part(row, n, (n,)), part(row, 7 * n, (n,))
-        qr, dqr, ddqr = part(row, 3 * n, (n,)), part(row, 4 * n, (n,)), part(row, 5 * n, (n,))
+        q = part(row, 0, (n,))
+        dq = part(row, n, (n,))
+        torque = part(row, 7 * n, (n,))
+        qr = part(row, 3 * n, (n,))
+        dqr = part(row, 4 * n, (n,))
+        ddqr = part(row, 5 * n, (n,))
         plants.observe(plant, state, rng, part(row, 0, (3 * n,)))
         reference.evaluate(view(motion), (k * plant.period_ns) * 1e-9, qr, dqr, ddqr)
         law.fill_torque(known, Now(dt, q, dq, qr, dqr, ddqr), torque)
@@ -184,7 +206,8 @@ def known_of(config: ControllerConfig) -> Known:
     return Known(
         model=model_of(config),
         P=np.array(config.learning.initial_estimate),
-        inertia=joint_inertia(config),
+        inertia=inertia_of_joints(config),
+        linear_gains=linear_gains(config),
         viscous=np.array(on_joints['viscous']),
         coulomb=np.array(on_joints['coulomb']),
         coulomb_velocity=config.learning.coulomb_velocity,
@@ -204,7 +227,8 @@ def simulate_with(
 
     Raises MotionError if there is no approach within the limits.
     """
-    config, plant = loop.controller, plant_of(loop.plant)
+    config = loop.controller
+    plant = plant_of(loop.plant)
     n, known = plant.joints, known_of(config)
     q, dq, _ = plant.measure().reshape(3, n)
     motion = plan_start(config, np.array(config.barrier.widest), q, dq)
@@ -252,11 +276,20 @@ _PID = (
 CONTENDERS = {
     'proposed': Contender('proposed, gains from the URDF'),
     'no_learning': Contender('the same without learning', learns=False),
-    'slotine_li': Contender('Slotine-Li, the same gains', law='slotine_li'),
+    'slotine_li': Contender(
+        'Slotine-Li with integrator, the same gains', law='slotine_li'
+    ),
+    'computed_torque': Contender(
+        'computed torque with integrator, the same gains', law=computed_torque
+    ),
     'proposed_tuned': Contender('proposed, tuned', (*_FEEDBACK, _ADAPTATION)),
     'no_learning_tuned': Contender('without learning, tuned', _FEEDBACK, learns=False),
-    'slotine_li_tuned': Contender('Slotine-Li with integrator, tuned', _SLOTINE_LI, 'slotine_li'),
-    'computed_torque': Contender('computed torque with integrator, tuned', _PID, computed_torque),
+    'slotine_li_tuned': Contender(
+        'Slotine-Li with integrator, tuned', _SLOTINE_LI, 'slotine_li'
+    ),
+    'computed_torque_tuned': Contender(
+        'computed torque with integrator, tuned', _PID, computed_torque
+    ),
 }
 
 
@@ -266,8 +299,10 @@ class Figures:
 
     errors: tuple[float, ...]  # rad
     ratio: float  # largest error of the whole run, relative to the bound
-    roughness: float  # rms change of the torque from sample to sample, relative to its limit
-    model: tuple[float, ...]  # torque error on another motion: before the pick-up, at the end
+    # rms change of the torque from sample to sample, relative to its limit
+    roughness: float
+    # torque error on another motion: before the pick-up, at the end
+    model: tuple[float, ...]
 
 
 def law_changes(
@@ -275,15 +310,19 @@ def law_changes(
 ) -> dict[str, object]:
     """Return the parameters that turn the configured law into a contender with these gains."""
     changes: dict[str, object] = {'law': contender.law}
+    config = change(config, changes)  # a law of a file has gains of its own
     if contender.law == 'slotine_li':  # the slope of the proposed law's surface at zero
         slope = np.array(config.surface.gain) / 2.0 + config.surface.mu
         changes['comparison.surface_gain'] = slope.tolist()
+        changes['comparison.integral_gain'] = list(config.disturbance.gain)
     elif not contender.learns:
         without = [0.0] * len(config.learning.initial_estimate)
         changes |= {'learning.weight': 0.0, 'learning.adaptation_gain': without}
     gains = contender.gains
     each = (values[gain.name] for gain in gains)
-    changes |= parameters_at(config, gains, each, joint_inertia(config) if gains else 1.0)
+    changes |= parameters_at(
+        config, gains, each, inertia_of_joints(config) if gains else 1.0
+    )
     if 'barrier.weight' in changes:
         weight = np.array(changes['barrier.weight'], dtype=float)
         limit = np.maximum(config.barrier.slope_limit, _STIFFEST * weight)
@@ -291,26 +330,45 @@ def law_changes(
     return changes
 
 
-def joint_inertia(config: ControllerConfig) -> np.ndarray:
+def inertia_of_joints(config: ControllerConfig) -> np.ndarray:
     """Return m (n,) [kg m^2] of the gains: the least inertia of a joint with the others free."""
-    robot, limits = config.robot, (config.limits.position_lower, config.limits.position_upper)
-    chain, P0 = robot.chain(config.joints), config.learning.initial_estimate
-    return over_postures(chain, parameters_of(robot, chain), robot.payload, P0, *limits)[0]
+    return joint_inertia(config, config.learning.initial_estimate)
 
 
-def run(name: str, loop: LoopConfig, values: Mapping[str, float], unseen: Floats) -> Figures:
+def linear_gains(config: ControllerConfig) -> np.ndarray:
+    """Return k_p [1/s^2], k_d [1/s] and k_i [1/s^3] (3, n) of the proposed law at small errors.
+
+    With r = K/2 + mu, tau = M0 (qr'' - k_p e - k_d e' - k_i int e) has
+
+        k_p = omega_v r + (w + gamma) / m,   k_d = omega_v + r,   k_i = gamma r / m
+    """
+    m = inertia_of_joints(config)
+    damping = config.feedback.damping_rate
+    slope = 0.5 * np.array(config.surface.gain) + config.surface.mu
+    weight = np.array(config.barrier.weight) / m
+    integral = np.array(config.disturbance.gain) / m
+    position = damping * slope + weight + integral
+    return np.stack((position, damping + slope, integral * slope))
+
+
+def run(
+    name: str, loop: LoopConfig, values: Mapping[str, float], unseen: Floats
+) -> Figures:
     """Run a contender with `values` of its gains by name.
 
     `unseen` (k, p) are the rows of H on which the learned model is evaluated.
     """
-    contender, config = CONTENDERS[name], loop.controller
+    contender = CONTENDERS[name]
+    config = loop.controller
     model: tuple[float, ...] = ()
     with np.errstate(all='ignore'):  # a run that diverges has figures too
         if isinstance(contender.law, str):
             config = change(config, law_changes(contender, config, values))
             record = simulate(config, loop.plant, supervised=False)
             samples = sample_columns(record.samples, record.controller.settings)
-            errors, torques, p = record.true_errors(), samples.torque, unseen.shape[1]
+            errors = record.true_errors()
+            torques = samples.torque
+            p = unseen.shape[1]
             model = tuple(
                 torque_error(unseen, samples.estimate[row, :p], record.truths[row, :p])
                 for row in (round(_BEFORE / config.sample_time), -1)
@@ -341,13 +399,17 @@ def load_laws(path: Path) -> list[str]:
     finally:
         sys.path.remove(str(path.parent))
     if getattr(module, '__file__', '') != str(path):
-        raise BlfDscError(f'{path}: there is another module of this name: rename the file')
+        raise BlfDscError(
+            f'{path}: there is another module of this name: rename the file'
+        )
     added: dict[str, Contender] = getattr(module, 'CONTENDERS', {})
     if not added or not all(isinstance(each, Contender) for each in added.values()):
         raise BlfDscError(f'{path}: CONTENDERS must be a dict of Contender by name')
     for name, contender in added.items():
         if CONTENDERS.setdefault(name, contender) is not contender:
-            raise BlfDscError(f'{path}: the study has a law {name} already: choose another name')
+            raise BlfDscError(
+                f'{path}: the study has a law {name} already: choose another name'
+            )
     return list(added)
 
 
@@ -361,18 +423,26 @@ class Result:
 
     def columns(self) -> Floats:
         """Return the values of all runs for each of COLUMNS, in mrad or %; NaN without a model."""
-        rows = [(*figures.errors, *(figures.model or (np.nan, np.nan))) for figures in self.runs]
+        rows = [
+            (*figures.errors, *(figures.model or (np.nan, np.nan)))
+            for figures in self.runs
+        ]
         units = np.where(np.arange(len(COLUMNS)) < len(INTERVALS), 1e3, 1e2)
         return np.asarray((np.array(rows) * units).T)
 
 
-def trial(name: str, seed: int) -> LoopConfig:
+def trial(
+    name: str, seed: int, overrides: Mapping[str, Mapping[str, Any]] | None = None
+) -> LoopConfig:
     """Return the loop of a preset: seed 0 keeps its truth and motion, other seeds vary them.
+
+    `overrides` are those of `load_loop`.
 
     Raises BlfDscError if it has no arm of a URDF that follows sinusoids.
     """
-    loop = load_loop(name)
-    reference, events = loop.controller.reference, loop.plant.events
+    loop = load_loop(name, overrides)
+    reference = loop.controller.reference
+    events = loop.plant.events
     if loop.controller.model != 'urdf' or reference.type != 'sinusoids':
         raise BlfDscError(
             f'--config {name}: got model {loop.controller.model} and reference {reference.type}, '
@@ -387,7 +457,9 @@ def trial(name: str, seed: int) -> LoopConfig:
         'events.payload': [max(events.payload, default=0.0)],
     }
     # No funnel, since the other laws have none: all approach the motion from rest.
-    law = change(loop.controller, {'barrier.initial_bound': [0.0] * len(loop.plant.joints)})
+    law = change(
+        loop.controller, {'barrier.initial_bound': [0.0] * len(loop.plant.joints)}
+    )
     law = another_motion(law, seed) if seed > 0 else law
     return loop._replace(controller=law, plant=change(loop.plant, plant))
 
@@ -407,7 +479,9 @@ def cost_of(figures: Figures) -> float:
     return bounded(np.mean(np.log10(1e3 * np.array(figures.errors))) + 10.0 * rough)
 
 
-def tuning_cost(exponents: Floats, name: str, loop: LoopConfig, unseen: Floats) -> float:
+def tuning_cost(
+    exponents: Floats, name: str, loop: LoopConfig, unseen: Floats
+) -> float:
     """Return `cost_of` a contender with one more sample of delay, to keep a stability margin."""
     delayed = change(loop.plant, {'actuator.delay': loop.plant.actuator.delay + 1})
     values = values_of(name, exponents)
@@ -432,7 +506,9 @@ def chosen_laws(given: Sequence[str]) -> list[str]:
     return list(dict.fromkeys(names))
 
 
-def compare(folder: Path, arms: Sequence[str], laws: Sequence[str]) -> dict[str, dict[str, Result]]:
+def compare(
+    folder: Path, arms: Sequence[str], laws: Sequence[str]
+) -> dict[str, dict[str, Result]]:
     """Tune and run everything, and write figures.json; return the results by arm and contender.
 
     `laws` are as in `chosen_laws`.
@@ -440,7 +516,9 @@ def compare(folder: Path, arms: Sequence[str], laws: Sequence[str]) -> dict[str,
     names = chosen_laws(laws)
     results: dict[str, dict[str, Result]] = {arm: {} for arm in arms}
     rows = [(arm, name) for arm in arms for name in names]
-    with ProcessPoolExecutor(cores(), initializer=chosen_laws, initargs=(laws,)) as pool:
+    with ProcessPoolExecutor(
+        cores(), initializer=chosen_laws, initargs=(laws,)
+    ) as pool:
         for arm, name in tqdm(rows, unit='law'):
             first, *others = (trial(arm, seed) for seed in range(TRUTHS + 1))
             unseen = torque_rows(trial(arm, UNSEEN).controller)
@@ -452,7 +530,8 @@ def compare(folder: Path, arms: Sequence[str], laws: Sequence[str]) -> dict[str,
                 of_gains = partial(tuning_cost, name=name, loop=first, unseen=unseen)
                 options = {'workers': pool.map, 'updating': 'deferred'}
                 found = search(of_gains, searched, POPULATION, GENERATIONS, **options)
-                gains, cost = values_of(name, found.x), float(found.fun)
+                gains = values_of(name, found.x)
+                cost = float(found.fun)
             runs = pool.map(partial(run, name, values=gains, unseen=unseen), others)
             results[arm][name] = Result(gains, cost, list(runs))
     write_json(results, folder / 'figures.json')
@@ -461,14 +540,18 @@ def compare(folder: Path, arms: Sequence[str], laws: Sequence[str]) -> dict[str,
 
 def format_results(results: dict[str, Result]) -> str:
     """Return the worst of each figure on an arm, a line for each contender, and tuned gains."""
-    rows, gains = [['worst', *COLUMNS, 'roughness', 'bound kept']], []
+    rows = [['worst', *COLUMNS, 'roughness', 'bound kept']]
+    gains = []
     for name, result in results.items():
-        label, worst = CONTENDERS[name].label, result.columns().max(axis=1)
+        label = CONTENDERS[name].label
+        worst = result.columns().max(axis=1)
         rough = 100.0 * max(figures.roughness for figures in result.runs)
         kept = sum(figures.ratio < 1.0 for figures in result.runs)
         cells = ('-' if np.isnan(value) else f'{value:.2f}' for value in worst)
         rows.append([label, *cells, f'{rough:.1f} %', f'{kept} of {len(result.runs)}'])
         if result.gains:
-            each = ', '.join(f'{gain} {value:g}' for gain, value in result.gains.items())
+            each = ', '.join(
+                f'{gain} {value:g}' for gain, value in result.gains.items()
+            )
             gains.append(f'{label}: {each}')
     return '\n'.join([aligned(rows), *gains])

@@ -36,7 +36,13 @@ import numpy as np
 from blf_dsc_controller.arms.model import regressors_at
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.files import Entry
-from blf_dsc_controller.configuration.nodes import CONTROLLER, PLANT, LoopConfig, load_loop, read
+from blf_dsc_controller.configuration.nodes import (
+    CONTROLLER,
+    PLANT,
+    LoopConfig,
+    load_loop,
+    read,
+)
 from blf_dsc_controller.configuration.plant import PlantConfig
 from blf_dsc_controller.configuration.schema import (
     Parameter,
@@ -107,10 +113,15 @@ class Study:
         """Return every value by node and name, as `dumps` takes them; distributions as written."""
         own = flatten(self.settings)
         for variation in self.variations:
-            name, text = f'{_VARY}{variation.name}', str(variation.distribution)
+            name = f'{_VARY}{variation.name}'
+            text = str(variation.distribution)
             before = cast('tuple[str, ...]', own.get(name, ()))
             own[name] = text if variation.entry < 0 else (*before, text)
-        return {PLANT: flatten(self.plant), CONTROLLER: flatten(self.controller), _NODE: own}
+        return {
+            PLANT: flatten(self.plant),
+            CONTROLLER: flatten(self.controller),
+            _NODE: own,
+        }
 
     @cached_property
     def origin(self) -> tuple[Floats, Floats, Floats]:
@@ -129,11 +140,14 @@ class Study:
 
 def another_motion(config: ControllerConfig, seed: int) -> ControllerConfig:
     """Return a configuration with other signs and phases of the reference's sinusoids."""
-    random, reference = np.random.default_rng(seed), config.reference
+    random = np.random.default_rng(seed)
+    reference = config.reference
     signs = random.choice((-1.0, 1.0), len(reference.amplitude))
     motion = {
         'reference.amplitude': (signs * reference.amplitude).tolist(),
-        'reference.phase': random.uniform(0.0, 2.0 * np.pi, len(reference.phase)).tolist(),
+        'reference.phase': random.uniform(
+            0.0, 2.0 * np.pi, len(reference.phase)
+        ).tolist(),
     }
     return change(config, motion)
 
@@ -151,7 +165,9 @@ def torque_error(rows: Floats, estimate: Floats, P: Floats) -> float:
     return float(np.linalg.norm(rows @ (estimate - P)) / np.linalg.norm(rows @ P))
 
 
-def load_study(path: str | Path, overrides: Mapping[str, object] | None = None) -> Study:
+def load_study(
+    path: str | Path, overrides: Mapping[str, object] | None = None
+) -> Study:
     """Read a study; `overrides` of the section `monte_carlo` take precedence over the file.
 
     Raises ConfigurationError with all problems of all sections, and their lines.
@@ -168,16 +184,23 @@ def load_study(path: str | Path, overrides: Mapping[str, object] | None = None) 
     given = {name: entry.value for name, entry in entries.items()}
     varied = {name: given.pop(name) for name in entries if name.startswith(_VARY)}
     if loop is None:  # the number of events is unknown
-        varied = {name: v for name, v in varied.items() if not name.startswith(f'{_VARY}events.')}
+        varied = {
+            name: v
+            for name, v in varied.items()
+            if not name.startswith(f'{_VARY}events.')
+        }
     variations = tuple(_variations(varied, loop.plant if loop else PlantConfig(), own))
     try:
         settings = build(MonteCarloConfig, {**given, **(overrides or {})})
     except ConfigurationError as error:
         own += error.problems
     if loop and settings:
-        end, settled = loop.plant.duration, settings.settled_after
+        end = loop.plant.duration
+        settled = settings.settled_after
         if end == 0.0:
-            own.append('sim_plant.duration: got 0 s, but every run must end: give its duration')
+            own.append(
+                'sim_plant.duration: got 0 s, but every run must end: give its duration'
+            )
         elif settled >= end:
             own.append(f'settled_after: got {settled:g} s, but a run ends at {end:g} s')
     for problem in own:
@@ -185,7 +208,9 @@ def load_study(path: str | Path, overrides: Mapping[str, object] | None = None) 
         where = f'line {entries[name].line}: ' if name in entries else ''
         problems.append(f'{_NODE}: {where}{problem}')
     if loop and loop.plant.joints != loop.controller.joints:
-        problems.append(f'joints: {PLANT} and {CONTROLLER} have them in different orders')
+        problems.append(
+            f'joints: {PLANT} and {CONTROLLER} have them in different orders'
+        )
     if problems or loop is None or settings is None:
         raise ConfigurationError(problems, str(path))
     return Study(loop.controller, loop.plant, settings, variations)
@@ -221,13 +246,17 @@ def draw(study: Study, run: int) -> dict[str, Drawn]:
 
     def bits(name: str) -> int:
         text = f'{study.settings.seed} {run} {name}'
-        return int.from_bytes(blake2b(text.encode(), digest_size=8).digest(), 'big') >> 11
+        return (
+            int.from_bytes(blake2b(text.encode(), digest_size=8).digest(), 'big') >> 11
+        )
 
     drawn: dict[str, Drawn] = {'run': run, 'seed': bits('seed')}
     if study.settings.pairs:
         drawn[f'{NOISE}seed'] = bits('seed 1')
     for variation in study.variations:
-        drawn[variation.column] = variation.distribution.at(bits(variation.column) / 2**53)
+        drawn[variation.column] = variation.distribution.at(
+            bits(variation.column) / 2**53
+        )
     return drawn
 
 
@@ -236,8 +265,11 @@ def plant_with(study: Study, drawn: Mapping[str, Drawn], law: str = '') -> Plant
     changes: dict[str, dict[str, Any]] = {}
     for variation in study.variations:
         group, _, field = variation.name.partition('.')
-        section, value = changes.setdefault(group, {}), drawn[variation.column]
-        section[field] = value if variation.entry < 0 else (*section.get(field, ()), value)
+        section = changes.setdefault(group, {})
+        value = drawn[variation.column]
+        section[field] = (
+            value if variation.entry < 0 else (*section.get(field, ()), value)
+        )
     relative = changes.pop('initial', {})
     if relative:
         qr, dqr, bound = study.origin
@@ -247,11 +279,16 @@ def plant_with(study: Study, drawn: Mapping[str, Drawn], law: str = '') -> Plant
         if 'velocity_error' in relative:
             start['velocity'] = tuple((dqr + relative['velocity_error']).tolist())
     if 'gap' in changes.get('events', {}):
-        changes['events']['begin'] = tuple(np.cumsum(changes['events'].pop('gap')).tolist())
+        changes['events']['begin'] = tuple(
+            np.cumsum(changes['events'].pop('gap')).tolist()
+        )
     groups = {
-        group: replace(getattr(study.plant, group), **section) for group, section in changes.items()
+        group: replace(getattr(study.plant, group), **section)
+        for group, section in changes.items()
     }
-    return replace(study.plant, seed=int(drawn.get(f'{law}seed', drawn['seed'])), **groups)
+    return replace(
+        study.plant, seed=int(drawn.get(f'{law}seed', drawn['seed'])), **groups
+    )
 
 
 _INVERSES: dict[str, Callable[..., Drawn]] = {
@@ -262,7 +299,9 @@ _INVERSES: dict[str, Callable[..., Drawn]] = {
     'maybe(probability, low, high)': lambda u, probability, low, high: (
         low + u / probability * (high - low) if u < probability else 0.0
     ),
-    'integers(low, high)': lambda u, low, high: low + min(int(u * (high - low + 1)), high - low),
+    'integers(low, high)': lambda u, low, high: (
+        low + min(int(u * (high - low + 1)), high - low)
+    ),
     'choice(a, b, ...)': lambda u, *values: values[int(u * len(values))],
 }
 _UNIFORM, _LOGUNIFORM, _MAYBE, _INTEGERS, _CHOICE = _INVERSES
@@ -293,20 +332,28 @@ class Distribution:
         return (0.0, *self.arguments[1:]) if self.written == _MAYBE else self.arguments
 
     def __str__(self) -> str:
-        return f'{self.written.partition("(")[0]}({", ".join(map(str, self.arguments))})'
+        return (
+            f'{self.written.partition("(")[0]}({", ".join(map(str, self.arguments))})'
+        )
 
 
 def parse(text: object, type_: type) -> Distribution:
     """Parse a distribution of a number or word; raises ValueError naming what is expected."""
     call = _CALL.fullmatch(text) if isinstance(text, str) else None
     argument, known = _EXPECTED[type_]
-    written = next((each for each in known if call and each.startswith(f'{call[1]}(')), None)
+    written = next(
+        (each for each in known if call and each.startswith(f'{call[1]}(')), None
+    )
     if call is None or written is None:
-        raise ValueError(f'got {text!r}, but one of these is expected: {", ".join(known)}')
+        raise ValueError(
+            f'got {text!r}, but one of these is expected: {", ".join(known)}'
+        )
     try:
         arguments = tuple(type_(word.strip()) for word in call[2].split(','))
     except ValueError:
-        raise ValueError(f'got {text!r}, but {argument} is expected between commas') from None
+        raise ValueError(
+            f'got {text!r}, but {argument} is expected between commas'
+        ) from None
     if written != _CHOICE:
         if len(arguments) != written.count(',') + 1:
             raise ValueError(
@@ -350,7 +397,13 @@ def _variable_parameters() -> Mapping[str, Parameter]:
         *(param for param in parameters(PlantConfig) if param.name.startswith(_GROUPS)),
         replace(relative, name='initial.error', above=-1.0, below=1.0),
         replace(relative, name='initial.velocity_error', unit='rad/s'),
-        replace(relative, name='events.gap', unit='s', at_least=0.0, length=('events.begin',)),
+        replace(
+            relative,
+            name='events.gap',
+            unit='s',
+            at_least=0.0,
+            length=('events.begin',),
+        ),
     ]
     return {p.name: p for p in found if p.type in _EXPECTED and p.name not in _REALTIME}
 
@@ -372,14 +425,18 @@ def _variations(
                 problems.append(f'{name}: {error}')
 
 
-def _variations_of(param: Parameter, given: object, plant: PlantConfig) -> Iterator[Variation]:
+def _variations_of(
+    param: Parameter, given: object, plant: PlantConfig
+) -> Iterator[Variation]:
     column = f'plant.{param.name}'
     if not param.is_array:
         yield Variation(param.name, -1, column, _distribution(param, given))
         return
     names = _entries(param, plant)
     if not names:
-        raise ValueError('got a distribution, but there are no events: give events.begin')
+        raise ValueError(
+            'got a distribution, but there are no events: give events.begin'
+        )
     each = list(given) if isinstance(given, (list, tuple)) else [given] * len(names)
     if len(each) == len({name.rpartition('.')[2] for name in names}):
         each *= len(names) // len(each)  # the same row for each event
@@ -397,7 +454,9 @@ def _entries(param: Parameter, plant: PlantConfig) -> tuple[str, ...]:
     each = []
     for name in param.length or (param.name,):
         count = int(name) if name.isdigit() else len(operator.attrgetter(name)(plant))
-        each.append(plant.joints if name == 'joints' else tuple(map(str, range(1, count + 1))))
+        each.append(
+            plant.joints if name == 'joints' else tuple(map(str, range(1, count + 1)))
+        )
     return tuple('.'.join(names) for names in itertools.product(*each))
 
 
@@ -408,5 +467,7 @@ def _distribution(param: Parameter, text: object) -> Distribution:
     for value in distribution.extremes:
         for problem in scalar.problems(value):
             reason = problem.removeprefix(f'{param.name}: ')
-            raise ValueError(f'{distribution} can give values that are not allowed: {reason}')
+            raise ValueError(
+                f'{distribution} can give values that are not allowed: {reason}'
+            )
     return distribution

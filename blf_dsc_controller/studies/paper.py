@@ -19,7 +19,12 @@ from numpy.typing import NDArray
 from tqdm.contrib.concurrent import process_map
 
 from blf_dsc_controller.analysis.figures import Picture, draw_panels
-from blf_dsc_controller.analysis.metrics import Metrics, estimates_of, measure, write_json
+from blf_dsc_controller.analysis.metrics import (
+    Metrics,
+    estimates_of,
+    measure,
+    write_json,
+)
 from blf_dsc_controller.analysis.panels import ALARM, COLOURS, panels
 from blf_dsc_controller.configuration.nodes import LoopConfig, dump, load_loop
 from blf_dsc_controller.configuration.schema import change
@@ -84,9 +89,11 @@ class Case(NamedTuple):
 
     def loop(self) -> LoopConfig:
         """Return the configuration of the case."""
-        loop, plant = load_loop(self.preset), {'duration': self.duration, **self.plant}
+        loop = load_loop(self.preset)
+        plant = {'duration': self.duration, **self.plant}
         return loop._replace(
-            controller=change(loop.controller, self.law), plant=change(loop.plant, plant)
+            controller=change(loop.controller, self.law),
+            plant=change(loop.plant, plant),
         )
 
 
@@ -102,7 +109,9 @@ _LEAKY = {  # in the paper's form, eta = 0.02
 }
 
 
-SWEEPS: dict[str, tuple[tuple[float, ...], Callable[[float], tuple[Changes, Changes]]]] = {
+SWEEPS: dict[
+    str, tuple[tuple[float, ...], Callable[[float], tuple[Changes, Changes]]]
+] = {
     'sample time [ms]': (
         (0.5, 1.0, 2.0, 3.0, 5.0, 7.0, 10.0),
         lambda value: ({'sample_time': value * 1e-3}, {'sample_time': value * 1e-3}),
@@ -134,7 +143,9 @@ CASES = {
     'paper_at_rest': Case('paper', _AT_REST),
     'paper_from_zero': Case('paper', {'learning.initial_estimate': [0.0] * 3}),
     'leaky': Case('recommended', {**_LEAKY, 'truth.amplitude': [0.1, 0.1]}),
-    'leaky_constant': Case('recommended', _LEAKY, {'disturbance.amplitude': [0.0, 0.0]}),
+    'leaky_constant': Case(
+        'recommended', _LEAKY, {'disturbance.amplitude': [0.0, 0.0]}
+    ),
     'paper_pushed': Case('paper', plant=_PUSHED),
     'recommended_pushed': Case('recommended', plant=_PUSHED),
     **{
@@ -156,7 +167,9 @@ class Results(NamedTuple):
     def swept(self, condition: str, law: str) -> dict[float, Metrics]:
         """Return the metrics of a law at each value of a condition."""
         values, _ = SWEEPS[condition]
-        return {value: self.metrics[case_name(condition, law, value)] for value in values}
+        return {
+            value: self.metrics[case_name(condition, law, value)] for value in values
+        }
 
     def ratios(self, *names: str) -> list[float]:
         """Return the largest |xi1| / k_c of each case."""
@@ -179,7 +192,9 @@ def run_all() -> Results:
     """Simulate every case on all cores."""
     run_case(CASES['paper']._replace(duration=1.0))  # compiles what the workers load
     cases = CASES.values()
-    found = process_map(run_case, cases, max_workers=cores(), chunksize=1, desc='runs', unit='run')
+    found = process_map(
+        run_case, cases, max_workers=cores(), chunksize=1, desc='runs', unit='run'
+    )
     named = dict(zip(CASES, found, strict=True))
     return Results(
         {name: metrics for name, (metrics, _) in named.items()},
@@ -214,8 +229,11 @@ def claims(results: Results) -> Iterator[Claim]:
     yield from _of_section_4(results)
     names = ('paper_quiet', 'paper')
     runs = [results.runs[name] for name in names]
-    explained = [_exponential_fit(run.time, _parameter_error(run), _latched(run)) for run in runs]
-    shares, residues = _percents(explained), _percents(results.parameter_errors(*names))
+    explained = [
+        _exponential_fit(run.time, _parameter_error(run), _latched(run)) for run in runs
+    ]
+    shares = _percents(explained)
+    residues = _percents(results.parameter_errors(*names))
     yield Claim(
         'V',
         'Tracking and parameter errors converge exponentially.',
@@ -231,7 +249,8 @@ def _of_abstract(results: Results) -> Iterator[Claim]:
     paper = results.metrics['paper']
     swept = {condition: results.swept(condition, 'paper_tuned') for condition in SWEEPS}
     times, delays, limits, _ = (
-        [value for value, metrics in each.items() if metrics.held] for each in swept.values()
+        [value for value, metrics in each.items() if metrics.held]
+        for each in swept.values()
     )
     yield Claim(
         'Abstract',
@@ -240,7 +259,9 @@ def _of_abstract(results: Results) -> Iterator[Claim]:
         f'gains the bound is kept up to a delay of {max(delays, default=0):g} samples, up to a '
         f'sample time of {max(times, default=0):g} ms and down to a torque limit of '
         f'{min(limits, default=np.nan):g} N m',
-        verdict(paper.held, all(m.held for each in swept.values() for m in each.values())),
+        verdict(
+            paper.held, all(m.held for each in swept.values() for m in each.values())
+        ),
         'torque, sample time and delay allow it',
     )
     final = results.parameter_errors('paper_quiet', 'paper', 'paper_at_rest')
@@ -264,7 +285,8 @@ def _of_abstract(results: Results) -> Iterator[Claim]:
     names = ('paper_tuned', 'comparison', 'comparison_detuned')
     rms = [float(np.linalg.norm(results.metrics[name].rms_error)) for name in names]
     learned = results.parameter_errors(*names)
-    micro, errors = [f'{1e6 * each:.0f}' for each in rms], _percents(learned)
+    micro = [f'{1e6 * each:.0f}' for each in rms]
+    errors = _percents(learned)
     only_detuned = '; the tracking is better only if the comparison is not tuned'
     yield Claim(
         'Abstract, IV, V',
@@ -299,7 +321,9 @@ def _of_section_3(results: Results) -> Iterator[Claim]:
         'the lag of the filter (13) is neglected',
     )
     rate, leaky_rate = (decay_rate(_settings(name)) for name in ('paper', 'leaky'))
-    met = [_fraction_met(results.runs[name], name) for name in ('leaky_constant', 'leaky')]
+    met = [
+        _fraction_met(results.runs[name], name) for name in ('leaky_constant', 'leaky')
+    ]
     constant, sinusoidal = _percents(met)
     yield Claim(
         'III-B, (32)',
@@ -354,15 +378,24 @@ def _of_section_4(results: Results) -> Iterator[Claim]:
         f'excited, the second one weakly',
         verdict(least < 1e-6),
     )
-    zero, laws = results.metrics['paper_from_zero'], ('paper_tuned', 'recommended')
-    kept = [results.metrics[case_name('initial parameters', law, 0.0)].held for law in laws]
+    zero = results.metrics['paper_from_zero']
+    laws = ('paper_tuned', 'recommended')
+    kept = [
+        results.metrics[case_name('initial parameters', law, 0.0)].held for law in laws
+    ]
     pairs = zip(laws, kept, strict=True)
     yield Claim(
         'IV',
         'P^(0) cannot be zero: the error would reach the boundary at once.',
         f"with the paper's choices |xi1| / k_c reaches {zero.max_error_ratio:.2f}"
-        + ('' if zero.held else f' (violated after {1e3 * zero.first_violation:.0f} ms)')
-        + ''.join(f'; {law} from zero: {"kept" if on else "violated"}' for law, on in pairs),
+        + (
+            ''
+            if zero.held
+            else f' (violated after {1e3 * zero.first_violation:.0f} ms)'
+        )
+        + ''.join(
+            f'; {law} from zero: {"kept" if on else "violated"}' for law, on in pairs
+        ),
         verdict(not zero.held, *(not each for each in kept)),
         'the feedback is too weak to carry the arm by itself',
     )
@@ -370,11 +403,14 @@ def _of_section_4(results: Results) -> Iterator[Claim]:
 
 def _swift_torque(results: Results) -> Claim:
     """Evaluate the barrier's torque at the largest error, and the error of a pushed arm."""
-    run, barrier = results.runs['paper'], CASES['paper'].loop().controller.barrier
+    run = results.runs['paper']
+    barrier = CASES['paper'].loop().controller.barrier
     error = np.abs(np.asarray(run.error))
     ratio = error / np.array(barrier.bound)
     k, i = np.unravel_index(ratio.argmax(), ratio.shape)
-    torque = barrier.weight[i] * error[k, i] / np.cos(0.5 * np.pi * ratio[k, i] ** 2) ** 2
+    torque = (
+        barrier.weight[i] * error[k, i] / np.cos(0.5 * np.pi * ratio[k, i] ** 2) ** 2
+    )
     pushed = ('paper_pushed', 'recommended_pushed')
     paper, recommended = results.ratios(*pushed)
     return Claim(
@@ -443,7 +479,10 @@ def compare(folder: Path) -> tuple[list[Claim], list[list[str]]]:
         dump(file, case.loop().by_node)
     results = run_all()
     found = list(claims(results))
-    numbers = {'claims': [claim._asdict() for claim in found], 'metrics': results.metrics}
+    numbers = {
+        'claims': [claim._asdict() for claim in found],
+        'metrics': results.metrics,
+    }
     write_json(numbers, folder / 'results.json')
     draw_pairs(results, folder)
     draw_robustness(results, folder)
@@ -465,7 +504,9 @@ def side_by_side(results: Results) -> Iterator[list[str]]:
         yield [
             label,
             *(
-                ' / '.join(f'{factor * value:.{decimals}f}' for value in getattr(metrics, name))
+                ' / '.join(
+                    f'{factor * value:.{decimals}f}' for value in getattr(metrics, name)
+                )
                 for name, factor, decimals in columns.values()
             ),
             '-' if math.isnan(error) else f'{100 * error:.2g} %',
@@ -488,7 +529,8 @@ def draw_pairs(results: Results, folder: Path) -> None:
             (2, tracking, 2, _TRACKING),
             (3, estimates, 1, _ESTIMATES),
         ):
-            path, title = folder / f'figure_{number}_{name}.png', f'Fig. {number}, {caption}'
+            path = folder / f'figure_{number}_{name}.png'
+            title = f'Fig. {number}, {caption}'
             draw_panels(path, title, drawn, columns, size, ['proposed', 'comparison'])
 
 
@@ -499,7 +541,12 @@ def draw_robustness(results: Results, folder: Path) -> None:
     for condition, (upper, lower) in zip(SWEEPS, picture.axes.T, strict=True):
         for law, colour, mark in zip(SWEPT, COLOURS, _MARKS, strict=False):
             found = results.swept(condition, law)
-            style = {'color': colour, 'marker': mark, 'ms': 4.5, 'label': SIDE_BY_SIDE[law]}
+            style = {
+                'color': colour,
+                'marker': mark,
+                'ms': 4.5,
+                'label': SIDE_BY_SIDE[law],
+            }
             ratios = [min(each.max_error_ratio, _BROKEN) for each in found.values()]
             errors = [100.0 * each.tail_parameter_error for each in found.values()]
             upper.plot([*found], ratios, **style)

@@ -20,7 +20,13 @@ from blf_dsc_controller.configuration.nodes import CONTROLLER, PLANT, dump
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.run import Floats
 from blf_dsc_controller.simulation.loop import simulate, write_bag
-from blf_dsc_controller.studies.monte_carlo import NOISE, WITHOUT, Study, draw, plant_with
+from blf_dsc_controller.studies.monte_carlo import (
+    NOISE,
+    WITHOUT,
+    Study,
+    draw,
+    plant_with,
+)
 from blf_dsc_controller.studies.runs import (
     DIVERGED,
     KEPT,
@@ -68,7 +74,11 @@ def summarize(study: Study, results: Columns) -> Summary:
             'seed': study.settings.seed,
             'duration_s': study.plant.duration,
             'outcomes': {outcome: outcomes.count(outcome) for outcome in OUTCOMES},
-            'kept': {'fraction': kept / runs, 'low': interval.low, 'high': interval.high},
+            'kept': {
+                'fraction': kept / runs,
+                'low': interval.low,
+                'high': interval.high,
+            },
             'pairs': pairs,
             'table': None if pairs is None else _pair_figures(pairs),
             'worst': [
@@ -113,11 +123,16 @@ def _compare(study: Study, results: Columns, law: str) -> Summary:
     above = np.flatnonzero(~(factors <= ALLOWED))
     of = factors if factors.size else [np.nan]
     quantiles = np.quantile(of, [*_FACTORS.values()], method='higher')
-    largest, before = (_worst_of(study, results, 'max_error_ratio', each) for each in laws)
+    largest, before = (
+        _worst_of(study, results, 'max_error_ratio', each) for each in laws
+    )
     near = (_NEAR[0] <= before) & (before <= _NEAR[1])
     change = largest[near] / before[near]
     return {
-        'near': {'larger': int((change >= 1.01).sum()), 'smaller': int((change <= 0.99).sum())},
+        'near': {
+            'larger': int((change >= 1.01).sum()),
+            'smaller': int((change <= 0.99).sum()),
+        },
         'kept': {'with': int(kept.sum()), 'without': int(without.sum())},
         'broken_only_with': results['run'][without & ~kept].tolist(),
         'broken_only_without': results['run'][kept & ~without].tolist(),
@@ -145,18 +160,25 @@ def _worst_of(study: Study, results: Columns, name: str, law: str = '') -> Float
 def _known(study: Study, results: Columns, name: str, law: str) -> Floats:
     """Return the finite values of a figure, of the runs that keep the bound without learning."""
     column = f'{law}{name}'
-    values = results[column] if column in results else _worst_of(study, results, name, law)
+    values = (
+        results[column] if column in results else _worst_of(study, results, name, law)
+    )
     kept = results[f'{WITHOUT}outcome'] == KEPT
     return np.asarray(values[kept & np.isfinite(values)])
 
 
 def _pair_figures(pairs: Summary) -> dict[str, str]:
     """Return the figures of a comparison of pairs, by their titles."""
-    kept, factor, noise = pairs['kept'], pairs['factor'], pairs['noise']
+    kept = pairs['kept']
+    factor = pairs['factor']
+    noise = pairs['noise']
     broken, noisy = (
-        [len(each[f'broken_only_{law}']) for law in _LAWS.values()] for each in (pairs, noise)
+        [len(each[f'broken_only_{law}']) for law in _LAWS.values()]
+        for each in (pairs, noise)
     )
-    interval = binomtest(broken[0], max(1, kept['without'])).proportion_ci(method='exact')
+    interval = binomtest(broken[0], max(1, kept['without'])).proportion_ci(
+        method='exact'
+    )
     rms, model = (
         ' / '.join(f'{unit * value:.3g}' for value in pairs['median'][name].values())
         for name, unit in (('rms_error_rad', 1e3), ('torque_error.end', 1e2))
@@ -167,7 +189,9 @@ def _pair_figures(pairs: Summary) -> dict[str, str]:
         'of those kept without, 95 % interval': (
             f'{100.0 * interval.low:.2f} to {100.0 * interval.high:.2f} %'
         ),
-        'near the bound: error larger / smaller with': ' / '.join(map(str, pairs['near'].values())),
+        'near the bound: error larger / smaller with': ' / '.join(
+            map(str, pairs['near'].values())
+        ),
         'largest error at most 1.3 times that without': f'{100.0 * pairs["allowed"]:.2f} %',
         'other noise instead of learning: broken only with / only without, at most 1.3 times': (
             f'{noisy[0]} / {noisy[1]}, {100.0 * noise["allowed"]:.2f} %'
@@ -182,7 +206,9 @@ def _pair_figures(pairs: Summary) -> dict[str, str]:
 
 def format_report(summary: Summary, folder: Path) -> str:
     """Format a summary for the terminal, with the command that repeats the worst run."""
-    outcomes = (f'{count} {outcome}' for outcome, count in summary['outcomes'].items() if count)
+    outcomes = (
+        f'{count} {outcome}' for outcome, count in summary['outcomes'].items() if count
+    )
     share, low, high = map(_percent, summary['kept'].values())
     runs = {'the worst': [each['run'] for each in summary['worst']]}
     lines = [
@@ -193,7 +219,9 @@ def format_report(summary: Summary, folder: Path) -> str:
         lines += [f'{title}: {figure}' for title, figure in summary['table'].items()]
         runs['bound broken only with learning'] = summary['pairs']['broken_only_with']
         runs[f'error above {ALLOWED:g} times that without'] = summary['pairs']['above']
-    lines += [f'{what}: {", ".join(map(str, each))}' for what, each in runs.items() if each]
+    lines += [
+        f'{what}: {", ".join(map(str, each))}' for what, each in runs.items() if each
+    ]
     worst = runs['the worst'][0]
     out = shlex.quote(f'{folder.name}-run-{worst}')
     command = f'blf_dsc monte-carlo --reproduce {shlex.quote(str(folder))} {worst} --out {out}'
@@ -231,7 +259,9 @@ def reproduce(store: Store, run: str, out: Path) -> None:
     study, results = store.study, store.results()
     rows = np.flatnonzero(results['run'].astype(str) == run)
     if not rows.size:
-        raise BlfDscError(f'{store.folder} has no run {run}: it has {results["run"].size} runs')
+        raise BlfDscError(
+            f'{store.folder} has no run {run}: it has {results["run"].size} runs'
+        )
     for prefix, law in study.laws().items():
         plant = plant_with(study, draw(study, int(run)), prefix)
         folder = out / _FOLDERS[prefix]
@@ -240,7 +270,9 @@ def reproduce(store: Store, run: str, out: Path) -> None:
         record = simulate(law, plant, supervised=False)
         write_bag(folder / 'bag', record)
         here = figures_of(study, record, plant)
-        different = differences({name: results[f'{prefix}{name}'][rows[0]] for name in here}, here)
+        different = differences(
+            {name: results[f'{prefix}{name}'][rows[0]] for name in here}, here
+        )
         if different:
             raise BlfDscError(
                 f'run {run} differs from the stored one: was it computed on another kind of '
@@ -251,19 +283,32 @@ def reproduce(store: Store, run: str, out: Path) -> None:
 def _draw_pairs(studies: Studies, path: Path) -> None:
     """Compare studies of pairs: errors and learned models, with learning and without."""
     picture = Picture(
-        1, 3, 'The same random runs with learning and without it', (5.2, 4.2), share_time=False
+        1,
+        3,
+        'The same random runs with learning and without it',
+        (5.2, 4.2),
+        share_time=False,
     )
     largest, rms, model = picture.axes[0]
-    for (title, (study, results)), colour in zip(studies.items(), COLOURS, strict=False):
-        x, y = (_worst_of(study, results, 'settled_error_ratio', law) for law in (WITHOUT, ''))
+    for (title, (study, results)), colour in zip(
+        studies.items(), COLOURS, strict=False
+    ):
+        x, y = (
+            _worst_of(study, results, 'settled_error_ratio', law)
+            for law in (WITHOUT, '')
+        )
         lost = (results['outcome'] != KEPT) & (results[f'{WITHOUT}outcome'] == KEPT)
         x, y = (np.clip(values, *_SHOWN) for values in (x, y))
         chosen = np.flatnonzero(~lost)[:_MOST_DOTS]
-        largest.plot(x[chosen], y[chosen], '.', ms=4, color=colour, alpha=0.6, mew=0, label=title)
+        largest.plot(
+            x[chosen], y[chosen], '.', ms=4, color=colour, alpha=0.6, mew=0, label=title
+        )
         largest.plot(x[lost], y[lost], 'o', ms=5, color=ALARM, mew=0)
     ends = np.array(_SHOWN)
     largest.loglog(ends, ends, color=MUTED, lw=1.0, label='equal')
-    largest.loglog(ends, ALLOWED * ends, color=MUTED, lw=1.0, ls=':', label=f'{ALLOWED:g} times')
+    largest.loglog(
+        ends, ALLOWED * ends, color=MUTED, lw=1.0, ls=':', label=f'{ALLOWED:g} times'
+    )
     _make_logarithmic(largest, both=True)
     largest.axhline(1.0, color=INK, ls='--', lw=1.0, label='bound')
     largest.axvline(1.0, color=INK, ls='--', lw=1.0)
@@ -290,9 +335,13 @@ def _draw_boxes(axes: Axes, name: str, unit: float, studies: Studies) -> None:
             known = unit * _known(study, results, name, law)
             y = 2 * [-len(labels)]
             if known.size:
-                least, *quartiles, most = np.quantile(known, (0.01, 0.25, 0.5, 0.75, 0.99))
+                least, *quartiles, most = np.quantile(
+                    known, (0.01, 0.25, 0.5, 0.75, 0.99)
+                )
                 axes.plot([least, most], y, color=colour, lw=1.2)
-                axes.plot([quartiles[0], quartiles[2]], y, color=colour, lw=7, alpha=0.6)
+                axes.plot(
+                    [quartiles[0], quartiles[2]], y, color=colour, lw=7, alpha=0.6
+                )
                 axes.plot(quartiles[1:2], y[:1], 'o', color=INK, ms=4)
             labels.append(f'{title}, {label}')
     axes.set_yticks(-np.arange(len(labels)), labels)

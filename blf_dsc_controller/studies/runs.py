@@ -20,7 +20,12 @@ import os
 import signal
 import threading
 from collections.abc import Iterable, Iterator
-from concurrent.futures import BrokenExecutor, Executor, ProcessPoolExecutor, as_completed
+from concurrent.futures import (
+    BrokenExecutor,
+    Executor,
+    ProcessPoolExecutor,
+    as_completed,
+)
 from contextlib import contextmanager
 from dataclasses import replace
 from math import nan
@@ -35,7 +40,8 @@ from blf_dsc_controller.analysis.metrics import write_json
 from blf_dsc_controller.compiled.jit import cache_folder
 from blf_dsc_controller.configuration.nodes import dump
 from blf_dsc_controller.configuration.plant import PlantConfig
-from blf_dsc_controller.errors import BlfDscError, MissingExtraError, StartError
+from blf_dsc_controller.errors import BlfDscError, StartError
+from blf_dsc_controller.extras import import_extra
 from blf_dsc_controller.law.factory import controller_of
 from blf_dsc_controller.law.state import sample_of
 from blf_dsc_controller.messages.journal import Journal
@@ -99,20 +105,27 @@ def figures_of(study: Study, record: Record, plant: PlantConfig) -> Row:
 
     Nothing counts from the first number on that is not finite.
     """
-    law, t = record.controller.settings, record.stamps * 1e-9
-    at, efforts = sample_of(np.arange(record.samples.shape[1]), law), 2 * law.n
+    law = record.controller.settings
+    t = record.stamps * 1e-9
+    at = sample_of(np.arange(record.samples.shape[1]), law)
+    efforts = 2 * law.n
     xi1, bound, torque, latched, estimate = (
         record.samples[:, columns.astype(np.intp)]
         for columns in (at.xi1, at.bound, at.torque, at.latched, at.estimate[: law.p])
     )
-    finite = np.isfinite(record.measurements).all(axis=1) & np.isfinite(torque).all(axis=1)
+    finite = np.isfinite(record.measurements).all(axis=1) & np.isfinite(torque).all(
+        axis=1
+    )
     end = t.size if finite.all() else int(finite.argmin())
     error, bound = np.abs(xi1[:end]), bound[:end]
     outside = np.flatnonzero((error >= bound).any(axis=1))
-    violation = outside[0] if outside.size else end  # where a number is not finite, if at all
+    # where a number is not finite, if at all
+    violation = outside[0] if outside.size else end
     latch = np.flatnonzero(latched[:end])
     motors = np.array(plant.actuator.torque_limit)  # 0: as strong as the law assumes
-    limit = np.where(motors > 0.0, np.minimum(law.torque_limit, motors), law.torque_limit)
+    limit = np.where(
+        motors > 0.0, np.minimum(law.torque_limit, motors), law.torque_limit
+    )
     row: Row = {
         'outcome': DIVERGED if end < t.size else VIOLATED if outside.size else KEPT,
         'first_violation_s': float(t[violation]) if violation < t.size else nan,
@@ -121,18 +134,26 @@ def figures_of(study: Study, record: Record, plant: PlantConfig) -> Row:
     }
     settled = round(study.settings.settled_after / plant.sample_time)
     for i, joint in enumerate(study.plant.joints):
-        ratio, late = error[:, i] / bound[:, i], error[settled:, i]
+        ratio = error[:, i] / bound[:, i]
+        late = error[settled:, i]
         effort = np.abs(record.measurements[:end, efforts + i])
         row[f'max_error_ratio.{joint}'] = float(ratio.max(initial=0.0))
-        row[f'settled_error_ratio.{joint}'] = float(ratio[settled:].max()) if late.size else nan
-        row[f'rms_error_rad.{joint}'] = float(np.sqrt(np.mean(late**2))) if late.size else nan
+        row[f'settled_error_ratio.{joint}'] = (
+            float(ratio[settled:].max()) if late.size else nan
+        )
+        row[f'rms_error_rad.{joint}'] = (
+            float(np.sqrt(np.mean(late**2))) if late.size else nan
+        )
         row[f'peak_torque_nm.{joint}'] = float(effort.max(initial=0.0))
     order = parameter_order(law.model.parameter_names, plant)
     row |= {'parameter_error.end': nan, 'torque_error.end': nan}
     if order.min() >= 0:
-        found, P = estimate[-1], record.truths[-1, order]
+        found = estimate[-1]
+        P = record.truths[-1, order]
         if end == t.size:
-            row['parameter_error.end'] = float(np.linalg.norm(found - P) / np.linalg.norm(P))
+            row['parameter_error.end'] = float(
+                np.linalg.norm(found - P) / np.linalg.norm(P)
+            )
         if study.unseen is not None:
             row['torque_error.end'] = torque_error(study.unseen, found, P)
     return row
@@ -156,13 +177,9 @@ def _run(study: Study, run: int, records: dict[str, Record]) -> Row:
 
 
 def require_pyarrow() -> Any:
-    """Return pyarrow with its Parquet module; raises MissingExtraError if it is not installed."""
-    try:
-        import pyarrow as pa
-        import pyarrow.parquet
-    except ImportError:
-        raise MissingExtraError('pyarrow', 'monte-carlo', 'keeping the results') from None
-    return pa
+    """Return pyarrow with its Parquet module; raises as `import_extra`."""
+    import_extra('pyarrow.parquet', 'monte-carlo', 'keeping the results')
+    return import_extra('pyarrow', 'monte-carlo', 'keeping the results')
 
 
 def versions() -> dict[str, str]:
@@ -177,7 +194,10 @@ def versions() -> dict[str, str]:
 
 def differences(there: dict[str, Any], here: dict[str, Any]) -> str:
     """Return lines for a message, one for each value that differs; empty if none does."""
-    pairs = {name: (there.get(name, 'nothing'), here.get(name, 'nothing')) for name in there | here}
+    pairs = {
+        name: (there.get(name, 'nothing'), here.get(name, 'nothing'))
+        for name in there | here
+    }
     return ''.join(
         f'\n  - {name}: there {old}, here {new}'
         for name, (old, new) in pairs.items()
@@ -194,7 +214,8 @@ class Store:
     def __init__(self, folder: Path) -> None:
         if not (folder / _STUDY).is_file():
             raise BlfDscError(f'{folder} holds no study: choose another folder')
-        self.folder, self.study = folder, load_study(folder / _STUDY)
+        self.folder = folder
+        self.study = load_study(folder / _STUDY)
 
     @classmethod
     def create_or_open(cls, folder: Path, study: Study) -> Store:
@@ -208,7 +229,9 @@ class Store:
             dump(folder / _STUDY, study.values())
         store = cls(folder)
         there = json.loads((folder / _VERSIONS).read_text(encoding='utf-8'))
-        if different := differences(there | _flat(store.study), versions() | _flat(study)):
+        if different := differences(
+            there | _flat(store.study), versions() | _flat(study)
+        ):
             raise BlfDscError(
                 f'{folder} holds another study, which is neither resumed nor overwritten: '
                 f'choose another folder, or make them equal:{different}'
@@ -230,7 +253,9 @@ class Store:
         """Return the chunks of runs without results."""
         runs = self.study.settings.runs
         size = max(1, min(runs // _CHUNKS, _MOST))
-        chunks = (range(first, min(first + size, runs)) for first in range(0, runs, size))
+        chunks = (
+            range(first, min(first + size, runs)) for first in range(0, runs, size)
+        )
         return [chunk for chunk in chunks if not self._path(chunk).exists()]
 
     def _path(self, runs: range) -> Path:
@@ -256,18 +281,27 @@ class Store:
 
 def _flat(study: Study) -> dict[str, object]:
     nodes = study.values().items()
-    return {f'{node}.{name}': value for node, values in nodes for name, value in values.items()}
+    return {
+        f'{node}.{name}': value
+        for node, values in nodes
+        for name, value in values.items()
+    }
 
 
 def cores() -> int:
     """Return the number of cores that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, 'sched_getaffinity') else os.cpu_count() or 1
+    return (
+        len(os.sched_getaffinity(0))
+        if hasattr(os, 'sched_getaffinity')
+        else os.cpu_count() or 1
+    )
 
 
 def processes(workers: int) -> Executor:
     """Return processes of this machine, each of which ends with this one."""
     context = multiprocessing.get_context('forkserver')
-    context.set_forkserver_preload([run_chunk.__module__])  # imported once, for all workers
+    # imported once, for all workers
+    context.set_forkserver_preload([run_chunk.__module__])
     return ProcessPoolExecutor(workers, context, _end_with_parent)
 
 
@@ -277,10 +311,7 @@ def dask(address: str) -> Iterator[Executor]:
 
     Dask itself repeats the work of a lost worker, unless it fails repeatedly.
     """
-    try:
-        import distributed
-    except ImportError:
-        raise MissingExtraError('dask.distributed', 'dask', '--dask') from None
+    distributed = import_extra('distributed', 'dask', '--dask')
     with distributed.Client(address) as client:
         try:
             yield client.get_executor(pure=False)

@@ -45,7 +45,8 @@ class Gain(NamedTuple):
     name: str
     least: float
     most: float
-    inertial: bool = False  # multiplies the inertia m of each joint of an arm from a URDF
+    # multiplies the inertia m of each joint of an arm from a URDF
+    inertial: bool = False
     joint: int = -1  # that of a per-joint parameter; -1: all
 
 
@@ -80,7 +81,9 @@ _COMPARISON = (
 TASKS = {
     'proposed': Task('paper', {}, _PROPOSED),
     'comparison': Task('recommended', {'law': 'backstepping'}, _COMPARISON),
-    'slotine_li': Task('recommended', {'law': 'slotine_li'}, (*_SHARED, _SURFACE_OF_35)),
+    'slotine_li': Task(
+        'recommended', {'law': 'slotine_li'}, (*_SHARED, _SURFACE_OF_35)
+    ),
 }
 
 
@@ -101,14 +104,17 @@ def parameters_at(
     inertia: Floats | float = 1.0,
 ) -> dict[str, Value]:
     """Return the parameters that these values of the gains set; `inertia` (n,) is m of the arm."""
-    present, chosen = flatten(config), dict[str, Floats]()
+    present = flatten(config)
+    chosen = dict[str, Floats]()
     for gain, value in zip(gains, values, strict=True):
         if gain.inertial:
             chosen[gain.name] = np.asarray(value * inertia)
         else:
             of = chosen.setdefault(gain.name, np.array(present[gain.name], dtype=float))
             of[gain.joint if gain.joint >= 0 else ...] = value
-    return {name: tuple(v.tolist()) if v.ndim else v.item() for name, v in chosen.items()}
+    return {
+        name: tuple(v.tolist()) if v.ndim else v.item() for name, v in chosen.items()
+    }
 
 
 def cost_of(metrics: Metrics, sample_time: float) -> float:
@@ -156,7 +162,9 @@ def search(
     law; `options` are passed to scipy.
     """
     ranges = np.log10([(gain.least, gain.most) for gain in gains])
-    points = qmc.LatinHypercube(len(ranges), seed=np.random.default_rng(SEED)).random(population)
+    points = qmc.LatinHypercube(len(ranges), seed=np.random.default_rng(SEED)).random(
+        population
+    )
     return differential_evolution(
         cost,
         ranges,

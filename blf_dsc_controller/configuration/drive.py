@@ -1,0 +1,66 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Parameters of `blf_dsc drive`: which driver, what it sets before the start, how it ends."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import partial
+
+from blf_dsc_controller.configuration.schema import (
+    Vector,
+    non_negative,
+    parameter,
+    positive,
+)
+
+_WHY = 'it is read once, before the motion starts'
+_fixed = partial(parameter, read_only=_WHY)
+_thresholds = partial(positive, (), read_only=_WHY, omittable=True)
+_FORCE = 6
+
+
+@dataclass(frozen=True)
+class DriveConfig:
+    """Parameters of `blf_dsc drive`, a loop on a robot's own interface without ROS."""
+
+    driver: str = _fixed(
+        'franka', 'franka, or a Python file with a class DRIVER (drive/driver.py)'
+    )
+    collision_torque: tuple[float, ...] = _thresholds(
+        'external torque of each joint that stops the robot; empty: as the robot has it',
+        'N m',
+    )
+    collision_force: tuple[float, ...] = _thresholds(
+        'external force (3) and torque (3) at the hand that stop the robot; empty: likewise',
+        'N, N m',
+    )
+    set_load: bool = _fixed(
+        True,
+        'send robot.drive_payload to the robot as its load; false: the robot has it already',
+    )
+    load_inertia: Vector = non_negative(
+        (0.001, 0.001, 0.001),
+        'inertia of that load about its centre, along the axes of the flange',
+        'kg m^2',
+        read_only=_WHY,
+    )
+    settle_time: float = positive(
+        3.0,
+        'longest time for the arm to come to rest before its motion is ended',
+        's',
+        read_only=_WHY,
+    )
+
+    def problems(self) -> Iterator[str]:
+        """Check that thresholds come together, and that those of the hand are six."""
+        if bool(self.collision_torque) != bool(self.collision_force):
+            yield (
+                'collision_torque and collision_force: got one of them, but a robot takes both: '
+                'give both, or neither'
+            )
+        if len(self.collision_force) not in (0, _FORCE):
+            yield (
+                f'collision_force: got {len(self.collision_force)} entries, but three forces and '
+                'three torques are needed'
+            )

@@ -1,0 +1,284 @@
+# SPDX-License-Identifier: Apache-2.0
+"""An arm under the guarded law in a loop of your own, without ROS."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from types import TracebackType
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from blf_dsc_controller.bags.topic_recorder import TopicRecorder
+from blf_dsc_controller.configuration.controller import ControllerConfig
+from blf_dsc_controller.configuration.nodes import CONTROLLER, load, locate
+from blf_dsc_controller.control.guarded_loop import GuardedLoop
+from blf_dsc_controller.errors import BlfDscError
+from blf_dsc_controller.law.telemetry import disturbance_names
+from blf_dsc_controller.law.weighing import DEVIATION, TWO_SIDED
+from blf_dsc_controller.messages import topics
+from blf_dsc_controller.messages.codecs import JointStateEncoder
+from blf_dsc_controller.reference.trajectory import Trajectory, TrajectoryPoint
+from blf_dsc_controller.supervision.supervisor import Phase
+
+Vector = NDArray[np.float64]
+_NANO = 1e9
+_FIRST = 1_000_000_000  # ns
+
+
+class StateError(BlfDscError):
+    """A joint state that no arm of this configuration can have."""
+
+
+class Load(NamedTuple):
+    """What the tip holds, with half the width of its 95 % interval; NaN while it is unknown."""
+
+    mass: float  # kg
+    interval: float  # kg
+
+
+class ArmController:
+    """Joint states in, torques out: the law with its learning, its checks and its safe stops.
+
+        with ArmController('my.yaml', record='my_bag') as controller:
+            while running:
+                torque = controller.update(stamp, q, dq, effort)
+                if torque is not None:
+                    robot.command(torque)
+
+    It does what the node `blf_dsc_controller` does with each joint state, and computes the same
+    bits.  `update` is called for every state, at the rate of `sample_time`; a state that fails to
+    arrive is noticed with the next one.  A recorded bag is that of a run over ROS: `blf_dsc`
+    reports, plots, replays and identifies from it.
+
+    Attributes:
+        config: the configuration in force.
+        joints: names of the n joints, in the order of all arrays.
+    """
+
+    def __init__(
+        self, config: ControllerConfig | str | Path, *, record: str | Path | None = None
+    ) -> None:
+        """Compile the law of a configuration, a parameter file or a preset, and take command.
+
+        `record` is the folder of a bag, which must not exist.
+
+        Raises:
+            ConfigurationError: with all problems of the file.
+            BagError: there is such a folder.
+        """
+        if not isinstance(config, ControllerConfig):
+            config = load(locate(config), CONTROLLER, ControllerConfig)
+        self.config = config
+        self.joints = config.joints
+        self._loop = GuardedLoop(config)
+        self._recorder = TopicRecorder(Path(record)) if record is not None else None
+        self._states = JointStateEncoder(config.joints)
+        self._shift: int | None = None  # ns, of the stamps
+        self._loop.guard.activate()
+
+    def __enter__(self) -> ArmController:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self.close()
+
+    def update(
+        self,
+        stamp: float,
+        q: ArrayLike,
+        dq: ArrayLike,
+        effort: ArrayLike | None = None,
+        *,
+        send: Callable[[Vector | None], None] | None = None,
+    ) -> Vector | None:
+        """Return the torques (n,) [N m] for a joint state; None: command nothing.
+
+        Args:
+            stamp: time of the state [s], on any clock that only goes forward.
+            q: positions (n,) [rad], or [m] of prismatic joints.
+            dq: velocities (n,) [rad/s].
+            effort: torques (n,) [N m] over the last interval, as `robot.effort` describes them;
+                without them, the law takes those that it commanded.
+            send: called with the torques as soon as they are known; weighing and recording come
+                after it, and an error of it is raised after them.
+
+        Raises:
+            StateError: an array has another shape, or the stamp is not finite.
+        """
+        if not math.isfinite(stamp):
+            raise StateError(f'stamp: got {stamp}, but a finite time in s is needed')
+        n = len(self.joints)
+        measurement = np.empty((3, n))
+        measurement[0] = self._checked('q', q)
+        measurement[1] = self._checked('dq', dq)
+        measurement[2] = math.nan if effort is None else self._checked('effort', effort)
+        nanoseconds = self._nanoseconds(stamp)
+        values = measurement.reshape(-1)
+        torque = self._loop.guard.update(nanoseconds, values)
+        answer = None if torque is None else np.array(torque)
+        try:
+            if send is not None:
+                send(answer)
+        finally:
+            self._loop.guard.weigh()
+            if self._recorder is not None:
+                self._record(nanoseconds, values, torque)
+        return answer
+
+    def _nanoseconds(self, stamp: float) -> int:
+        """Return the stamp [ns]; a clock from zero, which ROS takes for none, starts at 1 s."""
+        nanoseconds = round(stamp * _NANO)
+        if self._shift is None:
+            self._shift = 0 if nanoseconds > 0 else _FIRST - nanoseconds
+        return nanoseconds + self._shift
+
+    def _checked(self, name: str, values: ArrayLike) -> Vector:
+        array = np.asarray(values, dtype=np.float64)
+        n = len(self.joints)
+        if array.shape != (n,):
+            raise StateError(
+                f'{name}: got an array of shape {array.shape}, but ({n},) is needed: one value for '
+                f'each of {", ".join(self.joints)}'
+            )
+        return array
+
+    def follow(
+        self,
+        points: Sequence[TrajectoryPoint],
+        joints: Sequence[str] = (),
+        begin: float | None = None,
+    ) -> None:
+        """Follow a trajectory, whose values are in the order of `joints`, by default the arm's.
+
+        It begins at once, or at the time `begin` [s] since the start.
+
+        Raises:
+            TrajectoryError: with the reasons why it cannot be followed; the reference stays.
+        """
+        names = tuple(joints) or self.joints
+        trajectory = Trajectory(names, tuple(points), begin)
+        guard = self._loop.guard
+        guard.adopt(guard.plan(trajectory))
+
+    def stop(self) -> None:
+        """Ramp to the safe torque, which `update` returns from then on, until `start`."""
+        self._loop.guard.deactivate()
+
+    def start(self) -> None:
+        """Take command with the next state, with what was learned."""
+        self._loop.guard.activate()
+
+    def reset(self) -> None:
+        """Forget what was learned, and any fault; take command with the next state."""
+        self._loop.guard.reset()
+
+    def fail(self, text: str) -> Vector | None:
+        """Stop for a reason of the caller; return the torque (n,) [N m] on the way to the safe one.
+
+        None: none has been commanded yet, so command nothing.
+        """
+        torque = self._loop.guard.fail(text)
+        if self._recorder is not None:
+            stamp = max(self._loop.guard.journal.stamp, 0)
+            if torque is not None:
+                self._recorder.write(stamp, *self._loop.telemetry.command(torque))
+            self._record_events(stamp)
+        return None if torque is None else np.array(torque)
+
+    def withdraw(self, text: str) -> None:
+        """Command nothing until `reset` or `start`, for a reason: the arm is somebody else's."""
+        self._loop.guard.withdraw(text)
+
+    @property
+    def is_settled(self) -> bool:
+        """Whether it is out of command, and the arm rests under the safe torque, or never moved."""
+        guard = self._loop.guard
+        if guard.commanding:
+            return guard.is_settled
+        return not guard.supervisor.running
+
+    @property
+    def missed(self) -> int:
+        """States missing between the stamps of the others, since the start."""
+        return self._loop.guard.states.missed
+
+    @property
+    def phase(self) -> Phase:
+        """What the controller does, such as `Phase.TRACKING` or `Phase.STOPPED`."""
+        return self._loop.guard.supervisor.phase
+
+    @property
+    def reason(self) -> str:
+        """Why it stopped or does not start, in words; empty while all is well."""
+        guard = self._loop.guard
+        return guard.supervisor.text or guard.waiting_for
+
+    @property
+    def error(self) -> Vector:
+        """Tracking error (n,) [rad] of the last sample."""
+        return np.array(self._loop.guard.controller.sample.xi1)
+
+    @property
+    def bound(self) -> Vector:
+        """Bound (n,) [rad] on the error at the last sample."""
+        return np.array(self._loop.guard.controller.sample.bound)
+
+    @property
+    def disturbance(self) -> dict[str, float]:
+        """Torque that the model does not explain [N m], by its name."""
+        values = self._loop.guard.controller.sample.disturbance
+        names = disturbance_names(self.joints)
+        return dict(zip(names, values.tolist(), strict=True))
+
+    @property
+    def estimates(self) -> dict[str, float]:
+        """Learned parameters and friction by their names; NaN where a column was rejected."""
+        values = self._loop.guard.controller.sample.estimate
+        return dict(zip(self._loop.estimates, values.tolist(), strict=True))
+
+    @property
+    def load(self) -> Load:
+        """What the tip has picked up since the first window, by weighing."""
+        values = self._loop.guard.controller.state.load
+        if values[DEVIATION] <= 0.0:
+            return Load(math.nan, math.nan)
+        return Load(float(values[0]), TWO_SIDED * float(values[DEVIATION]))
+
+    def close(self) -> Vector | None:
+        """Return the torque (n,) [N m] that a drive may hold from now on; end the recording."""
+        guard = self._loop.guard
+        torque = guard.release()
+        if self._recorder is not None:
+            stamp = max(guard.journal.stamp, 0)
+            if torque is not None:
+                self._recorder.write(stamp, *self._loop.telemetry.command(torque))
+            self._record_events(stamp)
+            self._recorder.close()
+            self._recorder = None
+        return None if torque is None else np.array(torque)
+
+    def _record(self, stamp: int, values: Vector, torque: Vector | None) -> None:
+        assert self._recorder is not None  # noqa: S101 - the caller has checked
+        state = self._states.encode(stamp, *values.reshape(3, -1))
+        self._recorder.write(stamp, topics.JOINT_STATES, state)
+        if torque is not None:
+            self._recorder.write(stamp, *self._loop.telemetry.command(torque))
+        for message in self._loop.messages(torque):
+            self._recorder.write(stamp, *message)
+        self._record_events(stamp)
+
+    def _record_events(self, stamp: int) -> None:
+        assert self._recorder is not None  # noqa: S101
+        pending = self._loop.guard.journal.pending
+        while pending:
+            event = pending.popleft()
+            self._recorder.write(stamp, topics.JOURNAL, event.encode())

@@ -1,0 +1,65 @@
+# SPDX-License-Identifier: Apache-2.0
+"""One joint state after the other through the guarded law: a torque, and the messages about it.
+
+The node publishes these messages, `ArmController` records them.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+
+import numpy as np
+from numpy.typing import NDArray
+
+from blf_dsc_controller.configuration.controller import ControllerConfig
+from blf_dsc_controller.law.factory import estimate_names
+from blf_dsc_controller.law.telemetry import ControllerTelemetry, Message
+from blf_dsc_controller.supervision.guard import Guard
+
+Vector = NDArray[np.float64]
+
+
+class GuardedLoop:
+    """The guarded law of one arm with its telemetry.
+
+    Attributes:
+        guard: the law between its checks.
+        telemetry: encoders of the messages.
+        estimates: names of the entries of theta^.
+    """
+
+    def __init__(
+        self,
+        config: ControllerConfig,
+        steady: Callable[[], int] = time.monotonic_ns,
+        wall: Callable[[], int] = time.time_ns,
+    ) -> None:
+        """Compile the law; `steady` and `wall` are the clocks [ns]."""
+        self.guard = Guard(config, steady, wall)
+        self.estimates = estimate_names(config)
+        self.telemetry = ControllerTelemetry(config, self.estimates)
+
+    def messages(
+        self, torque: Vector | None, *, errors_wanted: bool = True
+    ) -> Iterator[Message]:
+        """Yield the messages about the last joint state, which `torque` (n,) [N m] answered.
+
+        They are the telemetry of the law's sample, or the answer of a safe torque.  The tracking
+        errors are left out if nobody wants them; the command is not among them.
+        """
+        guard = self.guard
+        if guard.has_sample:
+            controller = guard.controller
+            if controller.samples == 1:
+                self.telemetry.restart()
+            yield from self.telemetry.sample(
+                guard.last_stamp,
+                controller.sample,
+                controller.settings.torque_limit,
+                guard.samples.ratio,
+                guard.compute_time,
+                heard=errors_wanted,
+            )
+        elif torque is not None and errors_wanted:
+            yield self.telemetry.answer(guard.journal.stamp, torque)

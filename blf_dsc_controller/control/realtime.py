@@ -1,0 +1,48 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a process requests from the operating system: real-time scheduling, locked memory."""
+
+from __future__ import annotations
+
+import ctypes
+import os
+from collections.abc import Callable
+from contextlib import suppress
+from pathlib import Path
+
+from blf_dsc_controller.configuration.robot import Realtime
+
+_THREADS = Path('/proc/self/task')
+_MCL_CURRENT = 1
+_MCL_FUTURE = 2
+
+
+def request_realtime(realtime: Realtime, warn: Callable[[str], object]) -> None:
+    """Request SCHED_FIFO and locked memory as configured; `warn` is called with a refusal."""
+    if realtime.priority > 0:
+        try:
+            _schedule(realtime.priority)
+        except OSError as error:
+            warn(
+                f'SCHED_FIFO priority {realtime.priority} refused ({error.strerror}): running with '
+                'the default scheduling; allow it with a limit on rtprio for this user'
+            )
+    if realtime.lock_memory:
+        libc = ctypes.CDLL(None, use_errno=True)
+        if libc.mlockall(_MCL_CURRENT | _MCL_FUTURE) != 0:
+            reason = os.strerror(ctypes.get_errno())
+            warn(
+                f'locking memory refused ({reason}): pages may be swapped out; allow it with a '
+                'limit on memlock for this user'
+            )
+
+
+def _schedule(priority: int) -> None:
+    """Schedule all threads alike: states and torques also pass through the middleware's threads.
+
+    A single thread left behind, even at the next lower priority, delays the others [measured].
+    """
+    for thread in _THREADS.iterdir():
+        with suppress(ProcessLookupError):  # it has ended in the meantime
+            os.sched_setscheduler(
+                int(thread.name), os.SCHED_FIFO, os.sched_param(priority)
+            )

@@ -1,0 +1,71 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The laws that the paper compares itself with: backstepping (35), and Slotine-Li.
+
+    z1 = q - qr,    alpha2 = dqr - lambda_s z1,    z2 = dq - alpha2
+    tau = H P^ - K_p z2 - w z1 - mu_bar sat(z2 / b)                                    (35)
+    P^' = -Gamma (H^T z2 + W_c P^)
+
+Slotine and Li's law has neither the position gain w nor mu_bar nor the leakage W_c; it may have the
+integral of z2, by (30).  Both adapt by the tracking error alone.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+from blf_dsc_controller.compiled.jit import inner
+from blf_dsc_controller.law import adaptation, apparent_inertia, learning
+from blf_dsc_controller.law.compensation import compensated
+from blf_dsc_controller.law.state import Settings, Signals, State
+from blf_dsc_controller.law.torque import clip
+
+
+class Backstepping(NamedTuple):
+    """The law (35), and Slotine-Li."""
+
+    layer: float = 0.01  # b, rad/s: z2 at which the robust term saturates
+
+    @property
+    def has_barrier(self) -> bool:
+        """Nothing keeps the error inside a bound."""
+        return False
+
+    def compute_demand(
+        self, settings: Settings, state: State, signals: Signals, t: float, dt: float
+    ) -> None:
+        """Compute the torque (35)."""
+        compute_surface(settings, state, signals)
+        learning.observe(settings, state, signals, t, dt)
+        if settings.rotors_unsure == 1:
+            apparent_inertia.measure(settings, state, signals, dt)
+            apparent_inertia.correct_feedback(settings, state, signals)
+        for i in range(settings.n):
+            torque = settings.Kp[i] * signals.xi2[i]
+            torque += settings.mu_bar[i] * clip(signals.xi2[i] / self.layer, -1.0, 1.0)
+            torque = -torque
+            if settings.follows_inertia == 0:
+                torque += signals.restoring[i]
+            signals.demand[i] = compensated(settings, state, signals, i, torque)
+
+    def finish(
+        self,
+        settings: Settings,
+        state: State,
+        signals: Signals,
+        dt: float,
+        saturated: bool,
+    ) -> None:
+        """Adapt P^, and the integral of z2 if there is one."""
+        adaptation.adapt(settings, state, signals, dt, saturated)
+
+
+@inner
+def compute_surface(settings: Settings, state: State, signals: Signals) -> None:
+    """Compute alpha2 = dqr - lambda_s z1, its derivative, which needs ddqr, and z2."""
+    for i in range(settings.n):
+        state.alpha2[i] = signals.dqr[i] - settings.K[i] * signals.xi1[i]
+        signals.beta2[i] = state.alpha2[i]
+        rate = signals.dq[i] - signals.dqr[i]
+        signals.dalpha2[i] = signals.ddqr[i] - settings.K[i] * rate
+        signals.xi2[i] = signals.dq[i] - state.alpha2[i]
+        signals.restoring[i] = -settings.weight[i] * signals.xi1[i]

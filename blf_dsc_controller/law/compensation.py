@@ -1,0 +1,88 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Torque of the model in a law: P^(0) at the state, what is learned along the reference.
+
+The paper's compensation is H(q, dq, alpha2, alpha2') P^ (`compensation: state`).  alpha2' contains
+the feedback, which is thus multiplied by the learned inertia: an estimate of 2.65 times the inertia
+makes a loop at 1 kHz unstable.  So what is learned acts along the reference only, and the feedback
+keeps the model from before the start, as in the desired compensation law of Sadegh and Horowitz
+(1990):
+
+    tau_m = H(q, dq, alpha2, alpha2' - omega_v xi2) P^(0) + H(qr, dqr, dqr, ddqr) (P^ - P^(0))
+
+A wrong estimate is then a bounded disturbance, never a gain.  Where the inertias are roughly known,
+the damping can scale with them: - omega_v M(q, P^(0)) xi2, part of the first term, is added to
+- K_p xi2 and damps every direction at the same rate.  On an arm of a URDF the torque by the error,
+the barrier's, acts through M(q, P^(0)) as well: as the acceleration -dV/dxi1 / m of each joint, m
+being its least inertia.
+"""
+
+from __future__ import annotations
+
+from blf_dsc_controller.compiled.jit import inner
+from blf_dsc_controller.compiled.layout import Array
+from blf_dsc_controller.law import friction
+from blf_dsc_controller.law.state import (
+    FILTERED,
+    REFERENCE,
+    Settings,
+    Signals,
+    State,
+)
+
+
+@inner
+def compute_regressors(settings: Settings, state: State, signals: Signals) -> None:
+    """Compute H P^(0) of the feedback, H of what is learned; if the row needs them, Yp and Yr."""
+    model = settings.model
+    H = signals.H
+    q = signals.q
+    dq = signals.dq
+    for i in range(settings.n):
+        signals.damped[i] = signals.dalpha2[i] - settings.damping_rate * signals.xi2[i]
+        if settings.follows_inertia == 1:
+            signals.damped[i] += signals.restoring[i] / settings.joint_inertia[i]
+    if settings.prediction == FILTERED:
+        Yp = signals.momentum
+        Yr = signals.rest
+        model.regressors(q, dq, state.alpha2, signals.damped, H, Yp, Yr)
+    else:
+        model.regressor(q, dq, state.alpha2, signals.damped, H)
+    for i in range(settings.n):
+        signals.model_torque[i] = 0.0
+        for j in range(settings.p):
+            signals.model_torque[i] += H[i, j] * settings.initial_estimate[j]
+    if settings.compensation == REFERENCE:
+        model.regressor(signals.qr, signals.dqr, signals.dqr, signals.ddqr, H)
+    elif settings.damping_rate > 0.0 or settings.follows_inertia == 1:
+        model.regressor(q, dq, state.alpha2, signals.dalpha2, H)
+
+
+@inner
+def fill_known_torque(
+    settings: Settings, state: State, signals: Signals, v: Array, a: Array, dt: float
+) -> None:
+    """Write H(q, dq, v, a) P^(0) and the known friction at dqr to `signals.model_torque` [N m]."""
+    H = signals.H
+    settings.model.regressor(signals.q, signals.dq, v, a, H)
+    friction.fill_compensation(settings, state, signals, dt)
+    for i in range(settings.n):
+        signals.model_torque[i] = signals.friction[i]
+        for j in range(settings.m):
+            signals.model_torque[i] += H[i, j] * settings.initial_estimate[j]
+
+
+@inner
+def compensated(
+    settings: Settings, state: State, signals: Signals, i: int, feedback: float
+) -> float:
+    """Return the demand of joint i [N m]: feedback, model, d^3, and what is learned."""
+    torque = feedback + signals.model_torque[i]
+    torque += state.disturbance[i] + signals.friction[i]
+    if settings.feed_forward == 1:
+        torque += signals.known[i]
+    for j in range(settings.m):
+        learned = state.estimate[j]
+        if j < settings.p:
+            learned -= settings.initial_estimate[j]
+        torque += signals.H[i, j] * learned
+    return float(torque)

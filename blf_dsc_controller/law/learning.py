@@ -1,0 +1,38 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What composite learning does with each sample: a row of the prediction error, and the window.
+
+prediction   a row [X | u] with X theta = u, of the last interval
+window       sums of the rows over tau_d
+excitation   whether a window is excited, latched, or contradicted by a changed arm
+friction     friction from reversals, and how much of it is used
+adaptation   the step of the estimate, once the torque is known
+"""
+
+from __future__ import annotations
+
+from blf_dsc_controller.compiled.jit import inner
+from blf_dsc_controller.law import excitation, friction, prediction, window
+from blf_dsc_controller.law.compensation import compute_regressors
+from blf_dsc_controller.law.state import Settings, Signals, State
+
+
+@inner
+def observe(
+    settings: Settings, state: State, signals: Signals, t: float, dt: float
+) -> None:
+    """Compute the regressors; add the row of the last interval; check the excitation when due."""
+    compute_regressors(settings, state, signals)
+    friction.fill_compensation(settings, state, signals, dt)
+    friction.follow_motion(settings, state, signals)
+    prediction.fill_columns(settings, t, signals.dq, signals.rest)
+    prediction.form_row(settings, state, signals, dt)
+    friction.filter_shapes(settings, state, signals, dt)
+    if state.samples[0] == 0.0:
+        return
+    if int(state.samples[0]) % settings.row_interval == 0:
+        window.push_row(state, signals.row)
+        friction.measure_reversals(settings, state, settings.row_interval * dt)
+    if settings.change_detection == 1:
+        excitation.detect_change(settings, state, signals, dt)
+    if int(state.samples[0]) % settings.interval == 0:
+        excitation.update_excitation(settings, state, signals, t, dt)

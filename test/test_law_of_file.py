@@ -1,0 +1,135 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A law of a user's file runs wherever the package's laws do, bit for bit the same."""
+
+from __future__ import annotations
+
+import importlib.util
+import pickle
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import blf_dsc_controller as blf
+from blf_dsc_controller.cli.main import main
+from blf_dsc_controller.configuration.controller import ControllerConfig
+from blf_dsc_controller.configuration.law_file import load_law
+from blf_dsc_controller.configuration.schema import build, change, flatten
+from blf_dsc_controller.errors import BlfDscError, ConfigurationError
+from blf_dsc_controller.law.factory import controller_of, law_of
+from blf_dsc_controller.supervision.retuning import apply_bumpless
+
+LAW = str(Path(__file__).with_name('computed_torque_law.py'))
+GAINS = ('gains.position', 'gains.velocity', 'gains.integral')
+
+
+def loop_with(preset, duration, **gains):
+    given = {f'gains.{name}': value for name, value in gains.items()}
+    overrides = {
+        'blf_dsc_controller': {'law': LAW, **given},
+        'sim_plant': {'duration': duration},
+    }
+    return blf.load_loop(preset, overrides)
+
+
+def test_gains_are_parameters_with_their_declaration_and_defaults():
+    config = build(ControllerConfig, {'law': LAW, 'gains.velocity': 80.0})
+    assert [flatten(config)[name] for name in GAINS] == [900.0, 80.0, 4500.0]
+    assert law_of(config)[:] == (900.0, 80.0, 4500.0)
+    assert law_of(change(config, {'gains.position': 1.0})).position == 1.0
+    assert pickle.loads(pickle.dumps(config)) == config  # noqa: S301 - our own
+
+
+@pytest.mark.parametrize(
+    ('given', 'problem'),
+    [
+        ({'law': 'blf_dcs'}, 'did you mean blf_dsc?'),
+        ({'law': '/nowhere/law.py'}, '/nowhere/law.py cannot be read: No such file'),
+        ({'law': LAW, 'gains.velocity': -1.0}, 'gains.velocity: got -1.0, but it must'),
+        ({'law': LAW, 'gains.speed': 1.0}, 'gains.speed: unknown parameter'),
+        ({'gains.velocity': 1.0}, 'gains.velocity: unknown parameter'),
+    ],
+)
+def test_mistakes_in_the_configuration_are_named(given, problem):
+    with pytest.raises(ConfigurationError) as raised:
+        build(ControllerConfig, given)
+    assert problem in str(raised.value)
+
+
+@pytest.mark.parametrize(
+    ('text', 'problem'),
+    [
+        ('1 / 0', 'cannot be imported: ZeroDivisionError'),
+        ('law = 3', 'expected LAW, a NamedTuple of gains'),
+        ('class LAW(NamedTuple):\n    k: float', 'LAW.k must be declared'),
+        ('class LAW(NamedTuple):\n    pass', 'LAW has no gains'),
+        (
+            "class LAW(NamedTuple):\n    k: Annotated[float, positive(1.0, 'gain')]",
+            'LAW has no method compute_demand',
+        ),
+    ],
+)
+def test_file_that_defines_no_law_is_refused(text, problem, tmp_path):
+    imports = (
+        'from typing import Annotated, NamedTuple\n'
+        'from blf_dsc_controller.configuration.schema import positive\n'
+    )
+    path = tmp_path / 'law.py'
+    path.write_text(imports + text, encoding='utf-8')
+    with pytest.raises(BlfDscError, match=r'law\.py') as raised:
+        load_law(str(path))
+    assert problem in str(raised.value)
+
+
+@pytest.mark.parametrize(('preset', 'bound'), [('recommended', 0.1), ('panda', 0.01)])
+def test_law_tracks_and_keeps_its_memory_in_the_state(preset, bound):
+    """Its integral removes the constant part of what its model lacks."""
+    loop = loop_with(preset, 3.0)
+    record = blf.simulate(loop.controller, loop.plant)
+    errors = np.abs(record.true_errors())
+    assert errors[2000:].max() < bound
+    controller = record.controller
+    integral = controller.state.memory
+    assert integral.size == len(loop.controller.joints)
+    samples = record.run().error
+    np.testing.assert_allclose(
+        integral, 1e-3 * samples.sum(axis=0), rtol=1e-6, atol=1e-6
+    )
+    saved = controller.save()
+    controller.reset()
+    assert not controller.state.memory.any()
+    controller.restore(saved)
+    assert controller.state.memory.any()
+
+
+def test_gains_change_while_it_runs():
+    loop = loop_with('recommended', 1.0)
+    controller = controller_of(loop.controller)
+    q, dq = np.array(loop.plant.initial.position), np.zeros(2)
+    measurement = np.concatenate((q, dq, dq))
+    before = controller.trial(0.0, 1e-3, measurement)
+    stiffer = change(loop.controller, {'gains.position': 1800.0})
+    apply_bumpless(controller, stiffer, 0.0, measurement)
+    after = controller.trial(0.0, 1e-3, measurement)
+    assert np.abs(after - before).max() > 0.0
+    assert controller.law.position == 1800.0
+
+
+@pytest.mark.skipif(importlib.util.find_spec('rclpy') is None, reason='needs ROS 2')
+@pytest.mark.usefixtures('blank_pictures')
+def test_node_offline_run_and_replay_compute_the_same_bits(tmp_path):
+    file = tmp_path / 'mine.yaml'
+    file.write_text(
+        f'/**/blf_dsc_controller:\n  ros__parameters:\n    law: {LAW}\n'
+        '    gains: {velocity: 80.0}\n',
+        encoding='utf-8',
+    )
+    common = ['run', '--config', str(file), '--duration', '1.0', '--out']
+    assert main([*common, str(tmp_path / 'offline'), '--offline']) == 0
+    assert main([*common, str(tmp_path / 'ros'), '--mode', 'lockstep']) == 0
+    offline, ros = (
+        blf.read_run(tmp_path / name / 'bag') for name in ('offline', 'ros')
+    )
+    np.testing.assert_array_equal(offline.error, ros.error)
+    np.testing.assert_array_equal(offline.torque, ros.torque)
+    assert blf.verify(tmp_path / 'ros' / 'bag').difference is None
