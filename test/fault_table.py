@@ -27,9 +27,14 @@ from blf_dsc_controller.messages.codecs import (
     JointStateEncoder,
     MessageError,
 )
-from blf_dsc_controller.reference.trajectory import Trajectory, TrajectoryError, TrajectoryPoint
-from blf_dsc_controller.supervision.checks import PERIOD, Phase, Reason
+from blf_dsc_controller.reference.trajectory import (
+    Trajectory,
+    TrajectoryError,
+    TrajectoryPoint,
+)
 from blf_dsc_controller.supervision.guard import Guard
+from blf_dsc_controller.supervision.state_watchdog import PERIOD
+from blf_dsc_controller.supervision.supervisor import Phase, Reason
 from sim_plant.plant import TorqueInput, plant_of
 
 JOINTS = ('joint1', 'joint2')
@@ -180,12 +185,16 @@ def run(fault: Fault, rig: Rig | None = None) -> Outcome:
         rig.step()
         if noticed < 0 and rig.supervisor.phase is Phase.SAFE_STOP:
             noticed, stop = sample + 1, commanded
-    reason, text = rig.supervisor.reason, rig.supervisor.text
+    reason = rig.supervisor.reason
+    text = rig.supervisor.text
     error = float(rig.guard.samples.ratio.max())
-    before, after = np.array(rig.commands[start:stop]), np.array(rig.commands[stop:])
+    before = np.array(rig.commands[start:stop])
+    after = np.array(rig.commands[stop:])
     rig.clear_fault()
     rig.step(LEAD)
-    recovered = rig.supervisor.phase is Phase.TRACKING and bool(rig.guard.samples.ratio.max() < 1.0)
+    recovered = rig.supervisor.phase is Phase.TRACKING and bool(
+        rig.guard.samples.ratio.max() < 1.0
+    )
     return Outcome(noticed, reason, text, before, after, last, error, recovered)
 
 
@@ -232,7 +241,9 @@ def arranged(names, values=lambda *both: both):
     """Send the joints by these `names`, with `values` made of those of the two joints."""
 
     def change(state):
-        q, dq, effort = (np.array(values(*v)) for v in (state.q, state.dq, state.effort))
+        q, dq, effort = (
+            np.array(values(*v)) for v in (state.q, state.dq, state.effort)
+        )
         return [state.raw(named(*names), q=q, dq=dq, effort=effort)]
 
     return change
@@ -290,7 +301,8 @@ def same_stamp(rig: Rig) -> None:
 def delayed(rig: Rig) -> None:
     """Send twenty late states in one burst, after a newer one."""
     old = [
-        rig.state()._replace(stamp=rig.state().stamp - k * MILLISECOND) for k in range(20, 0, -1)
+        rig.state()._replace(stamp=rig.state().stamp - k * MILLISECOND)
+        for k in range(20, 0, -1)
     ]
     rig.sense = lambda _: [state.raw() for state in old]
 
@@ -317,7 +329,9 @@ def pushed(rig: Rig) -> None:
 
 
 def reversed_motor(rig: Rig) -> None:
-    rig.actuate = lambda raw: [Float64MultiArrayEncoder(2).encode(-np.frombuffer(raw[-16:], '<f8'))]
+    rig.actuate = lambda raw: [
+        Float64MultiArrayEncoder(2).encode(-np.frombuffer(raw[-16:], '<f8'))
+    ]
 
 
 def commanded(values: np.ndarray, *, always: bool) -> Callable[[Rig], None]:
@@ -350,8 +364,15 @@ def weak(rig: Rig) -> None:
 
 def random_gains(rig: Rig) -> None:
     """Change all gains by up to a fifth in every sample, as `ros2 param set` does."""
-    rng, start = np.random.default_rng(0), flatten(rig.guard.config)
-    names = ('surface.gain', 'surface.mu', 'feedback.gain', 'barrier.weight', 'disturbance.gain')
+    rng = np.random.default_rng(0)
+    start = flatten(rig.guard.config)
+    names = (
+        'surface.gain',
+        'surface.mu',
+        'feedback.gain',
+        'barrier.weight',
+        'disturbance.gain',
+    )
 
     def sense(state):
         given = {name: tuple(start[name] * rng.uniform(0.8, 1.2, 2)) for name in names}
@@ -375,13 +396,14 @@ def rejection(name: str, value: list[float]) -> Callable[[Rig], None]:
 
 
 def replaced(*, possible: bool) -> Callable[[Rig], None]:
-    """Send a trajectory every 30 ms, before the last one ends; too fast unless `possible`."""
+    """Send a trajectory every 30 ms, before the last one ends; too far unless `possible`."""
 
     def inject(rig):
         def sense(state):
             if rig.plant.sample % 30 == 0:
-                goal = tuple(state.q + (0.2 if rig.plant.sample % 60 else -0.2))
-                point = TrajectoryPoint(time=1.5 if possible else 0.001, positions=goal)
+                size = 0.2 if possible else 20.0  # rad
+                goal = tuple(state.q + (size if rig.plant.sample % 60 else -size))
+                point = TrajectoryPoint(time=1.5, positions=goal)
                 try:
                     rig.guard.adopt(rig.guard.plan(Trajectory(JOINTS, (point,))))
                 except TrajectoryError:
@@ -428,16 +450,30 @@ FAULTS = (
     Fault('position of joint1 jumps by 3 mrad', spoil('q', 0, 2.296), R.OUTSIDE_BOUND),
     Fault('position of joint2 is 1e300 rad', spoil('q', 1, 1e300), R.OUTSIDE_BOUND),
     Fault('velocity of joint1 is 60 rad/s', spoil('dq', 0, 60.0), R.VELOCITY),
-    Fault('joints in another order', every(arranged(JOINTS[::-1], lambda a, b: (b, a)))),
+    Fault(
+        'joints in another order', every(arranged(JOINTS[::-1], lambda a, b: (b, a)))
+    ),
     Fault(
         'extra joints, one of them NaN',
         every(arranged(AMONG, lambda a, b: (NAN, b, 7.0, a))),
     ),
-    Fault('duplicate joint', once(arranged(TWICE, lambda a, b: (a, b, a))), R.JOINT_DUPLICATED),
+    Fault(
+        'duplicate joint',
+        once(arranged(TWICE, lambda a, b: (a, b, a))),
+        R.JOINT_DUPLICATED,
+    ),
     Fault('missing joint', once(arranged(('joint1', 'joint3'))), R.JOINT_MISSING),
     Fault('no joints', once(arranged((), lambda *_: ())), R.JOINT_MISSING),
-    Fault('states of another robot in between', every(lambda s: [s.raw(OTHERS), s.raw()])),
-    Fault('only states of another robot', every(arranged('ab')), R.STATE_TIMEOUT, 60, live=True),
+    Fault(
+        'states of another robot in between', every(lambda s: [s.raw(OTHERS), s.raw()])
+    ),
+    Fault(
+        'only states of another robot',
+        every(arranged('ab')),
+        R.STATE_TIMEOUT,
+        60,
+        live=True,
+    ),
     Fault('no positions', once(unmeasured('position')), R.FIELD_MISSING),
     Fault('no velocities', once(unmeasured('velocity')), R.NOT_FINITE),
     Fault(
@@ -449,9 +485,15 @@ FAULTS = (
     Fault('truncated message', once(lambda s: [s.raw()[:-9]]), R.BAD_MESSAGE),
     Fault('empty message', once(lambda _: [b'']), R.BAD_MESSAGE),
     Fault(
-        'message in another encoding', once(lambda s: [b'\x00\x03' + s.raw()[2:]]), R.BAD_MESSAGE
+        'message in another encoding',
+        once(lambda s: [b'\x00\x03' + s.raw()[2:]]),
+        R.BAD_MESSAGE,
     ),
-    Fault('garbage message', once(lambda _: [b'\x00\x01\x00\x00' + b'\xff' * 60]), R.BAD_MESSAGE),
+    Fault(
+        'garbage message',
+        once(lambda _: [b'\x00\x01\x00\x00' + b'\xff' * 60]),
+        R.BAD_MESSAGE,
+    ),
     Fault('one state sent twice', once(lambda s: [s.raw(), s.raw()])),
     Fault('every state sent four times', every(lambda s: [s.raw()] * 4)),
     Fault('stamp stops advancing', same_stamp, R.STAMP_REPEATED, 5),
@@ -460,11 +502,19 @@ FAULTS = (
     Fault('stamp is zero', once(lambda s: [s.raw(stamp=0)]), R.STAMP_MISSING),
     Fault('stamp before 1970', once(lambda s: [s.raw(stamp=-1)]), R.STAMP_MISSING),
     Fault('burst of twenty old states', delayed, R.STAMP_BACKWARD),
-    Fault('10 ms of silence, then all delayed states at once', silence(10, queued=True)),
+    Fault(
+        '10 ms of silence, then all delayed states at once', silence(10, queued=True)
+    ),
     Fault('30 ms of silence', silence(30), live=True),
     Fault('50 ms of silence', silence(50), R.STATE_TIMEOUT, 50, live=True),
     Fault('50 ms of silence, watchdog off', silence(50), R.STAMP_JUMP, 50),
-    Fault('joint states stop for good', every(lambda _: []), R.STATE_TIMEOUT, 60, live=True),
+    Fault(
+        'joint states stop for good',
+        every(lambda _: []),
+        R.STATE_TIMEOUT,
+        60,
+        live=True,
+    ),
     Fault('controller process stalls for 200 ms', stalled, live=True),
     Fault('only every third state arrives', sparse(3), R.OVERRUN, 100, STRICT),
     Fault('wall clock set back by an hour', wall_clock_back, live=True),
@@ -473,22 +523,35 @@ FAULTS = (
     Fault('arm pushed with 40 N m', pushed, R.OUTSIDE_BOUND, 40),
     Fault('motors reversed', reversed_motor, R.OUTSIDE_BOUND, 40),
     Fault('torque limit below the gravity torque', weak, R.OUTSIDE_BOUND, 60),
-    Fault('torque at its limit for longer than allowed', weak, R.SATURATED, 12, IMPATIENT),
+    Fault(
+        'torque at its limit for longer than allowed', weak, R.SATURATED, 12, IMPATIENT
+    ),
     Fault('an estimate is NaN', poisoned('estimate', NAN), R.ESTIMATE),
     Fault('the disturbance estimate is NaN', poisoned('disturbance', NAN), R.ESTIMATE),
     Fault('the surface filter is NaN', poisoned('alpha2', NAN), R.TORQUE),
-    Fault('estimates driven to the projection ball', poisoned('estimate', 1.0), given=IN_THE_BALL),
+    Fault(
+        'estimates driven to the projection ball',
+        poisoned('estimate', 1.0),
+        given=IN_THE_BALL,
+    ),
     Fault('all gains changed in every sample', random_gains),
     Fault('trajectory replaced repeatedly in motion', replaced(possible=True)),
-    Fault('requested trajectory too fast', replaced(possible=False)),
+    Fault('requested trajectory past the limits', replaced(possible=False)),
     Fault('requested bound below the error', rejection('barrier.bound', [1e-9, 1e-9])),
-    Fault('requested torque limit below the torque', rejection('torque.limit', [1.0, 1.0])),
+    Fault(
+        'requested torque limit below the torque', rejection('torque.limit', [1.0, 1.0])
+    ),
     Fault('one command of the wrong length', commanded(np.zeros(3), always=False)),
     Fault('one command that is NaN', commanded(np.array([NAN, 1.0]), always=False)),
     Fault(
-        'all commands are NaN', commanded(np.array([NAN, NAN]), always=True), R.OUTSIDE_BOUND, 80
+        'all commands are NaN',
+        commanded(np.array([NAN, NAN]), always=True),
+        R.OUTSIDE_BOUND,
+        80,
     ),
-    Fault('plant killed and restarted', lambda rig: rig.plant.reset(), R.STAMP_BACKWARD),
+    Fault(
+        'plant killed and restarted', lambda rig: rig.plant.reset(), R.STAMP_BACKWARD
+    ),
     Fault(
         'controller killed and restarted outside the bound',
         restarted_controller,

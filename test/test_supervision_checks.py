@@ -14,8 +14,11 @@ from plain_law import dynamics
 
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.schema import build
-from blf_dsc_controller.law.checks import INVALID, OUTSIDE, SUSPECT, check_sample
-from blf_dsc_controller.supervision.checks import Phase, Reason, SampleCheck, Velocity
+from blf_dsc_controller.law.check_state import INVALID, OUTSIDE, SUSPECT
+from blf_dsc_controller.law.checks import check_sample
+from blf_dsc_controller.supervision.sample_check import SampleCheck
+from blf_dsc_controller.supervision.supervisor import Phase, Reason
+from blf_dsc_controller.supervision.velocity import Velocity
 
 DT = 1e-3
 LIMIT = 20.0  # N m, the default torque limit
@@ -37,9 +40,12 @@ def verdict(law, error_ratio=1.0):
 
 
 def test_estimates_of_a_valid_sample_are_kept(law):
-    law.checks.ratio[:], law.checks.kept[:] = (0.9, 0.0), 0.0
+    law.checks.ratio[:] = (0.9, 0.0)
+    law.checks.kept[:] = 0.0
     assert verdict(law) == 0
-    np.testing.assert_array_equal(law.checks.kept, [*law.state.estimate, *law.state.disturbance])
+    np.testing.assert_array_equal(
+        law.checks.kept, [*law.state.estimate, *law.state.disturbance]
+    )
     # The largest ratio so far is kept; a smaller one is replaced.
     assert law.checks.ratio[0] == 0.9
     assert law.checks.ratio[1] == abs(law.sample.xi1[1]) / law.sample.bound[1]
@@ -69,7 +75,9 @@ BAD = [
         ('sample', 'estimate', 4, nan, 1.0, 0),  # of a rejected column
     ],
 )
-def test_suspect_samples_are_flagged_and_not_kept(law, part, name, i, value, error_ratio, flags):
+def test_suspect_samples_are_flagged_and_not_kept(
+    law, part, name, i, value, error_ratio, flags
+):
     getattr(getattr(law, part), name)[i] = value
     law.checks.kept[:] = 3.0
     assert verdict(law, error_ratio) == flags
@@ -95,7 +103,13 @@ def test_cuts_add_up_if_they_take_more_than_a_fifth_of_the_time(law, every, stop
 
 @pytest.mark.parametrize(
     ('index', 'value', 'is_valid'),
-    [(0, nan, False), (1, -inf, False), (3, nan, False), (2, 50.0, True), (3, -50.1, False)],
+    [
+        (0, nan, False),
+        (1, -inf, False),
+        (3, nan, False),
+        (2, 50.0, True),
+        (3, -50.1, False),
+    ],
 )
 def test_invalid_state_leaves_the_law_as_it_was(law, index, value, is_valid):
     measurement, before = plant().measure(), law.save()
@@ -121,11 +135,16 @@ def estimated(*states, index=2):
 
 def test_velocity_is_the_difference_quotient_of_two_states():
     """A repeated stamp keeps it, and where the stamps restart, or after a pause, it is zero."""
-    np.testing.assert_allclose(estimated((1, 0.5), (2, 0.502), (4, 0.501)), [0.0, 2.0, -0.5])
+    np.testing.assert_allclose(
+        estimated((1, 0.5), (2, 0.502), (4, 0.501)), [0.0, 2.0, -0.5]
+    )
     found = estimated((1, 0.5), (2, 0.502), (2, 0.502), (2, 0.502), (3, 0.503))
     np.testing.assert_allclose(found, [0.0, 2.0, 2.0, 2.0, 1.0])
-    np.testing.assert_allclose(estimated((5, 0.5), (6, 0.502), (1, 0.1), (2, 0.1)), [0, 2, 0, 0])
-    reset = (2, 0.502), (1002, 0.1), (1003, 0.102)  # of the simulated arm: a second later
+    np.testing.assert_allclose(
+        estimated((5, 0.5), (6, 0.502), (1, 0.1), (2, 0.1)), [0, 2, 0, 0]
+    )
+    # of the simulated arm: a second later
+    reset = (2, 0.502), (1002, 0.1), (1003, 0.102)
     np.testing.assert_allclose(estimated((1, 0.5), *reset), [0.0, 2.0, 0.0, 2.0])
 
 
@@ -134,8 +153,12 @@ def test_repeated_reading_with_a_new_stamp_is_continued_at_its_velocity():
     moving = (1, 0.5), (2, 0.502)
     found = estimated(*moving, (3, 0.502), (3, 0.504), (4, 0.506), (5, 0.508))
     np.testing.assert_allclose(found, [0.0, 2.0, 2.0, 2.0, 2.0, 2.0])
-    np.testing.assert_allclose(estimated(*moving, (3, 0.502), (4, 0.502)), [0.0, 2.0, 2.0, 0.0])
-    np.testing.assert_allclose(estimated(*moving, (3, 0.502), index=0), [0.5, 0.502, 0.504])
+    np.testing.assert_allclose(
+        estimated(*moving, (3, 0.502), (4, 0.502)), [0.0, 2.0, 2.0, 0.0]
+    )
+    np.testing.assert_allclose(
+        estimated(*moving, (3, 0.502), index=0), [0.5, 0.502, 0.504]
+    )
     coarse = (1, 0.5), (2, 0.5002), (3, 0.5002)  # less than three counts of 16 bits
     np.testing.assert_allclose(estimated(*coarse), [0.0, 0.2, 0.0])
 
@@ -233,7 +256,8 @@ def test_outdated_velocity_is_not_damped(raw):
 @pytest.mark.parametrize('raw', UNUSABLE.values(), ids=UNUSABLE)
 def test_held_gravity_fades_out_without_states_and_returns_with_them(raw):
     rig = moving(HOLDING)
-    good, rig.sense = rig.sense, lambda state: [raw(state)]
+    good = rig.sense
+    rig.sense = lambda state: [raw(state)]
     rig.step(10)
     first = len(rig.commands)
     rig.step(500)
@@ -272,7 +296,9 @@ def test_gravity_is_held_in_silence_only_for_the_fade_time(calls, phase, late):
     assert rig.supervisor.phase is phase
     rig.base += rig.steady - 5_000_000_000
     rig.step(1)
-    assert rig.supervisor.phase is (Phase.TRACKING if phase is Phase.STARTING else phase)
+    assert rig.supervisor.phase is (
+        Phase.TRACKING if phase is Phase.STARTING else phase
+    )
 
 
 def test_torque_that_has_faded_is_not_commanded_again_after_a_reset():
@@ -307,7 +333,9 @@ def test_after_a_long_silence_nothing_is_commanded_until_a_reset():
     assert len(rig.commands) == commands + 6
 
 
-@pytest.mark.parametrize('dq', [NAN, np.array([60.0, np.inf])], ids=['missing', 'too fast'])
+@pytest.mark.parametrize(
+    'dq', [NAN, np.array([60.0, np.inf])], ids=['missing', 'too fast']
+)
 def test_missing_and_implausible_velocities_are_differenced_from_the_positions(dq):
     """Also without a velocity, gravity is held and the motion damped."""
     rig = moving(LEARNED)
@@ -326,7 +354,9 @@ def test_joint_that_is_really_too_fast_is_damped_most():
     state, torque = rig.state(), None
     for k in range(1, 3):
         later = state.q + k * 1e-3 * np.array([3.0, 0.1])
-        torque = rig.deliver(state.raw(stamp=state.stamp + k * 10**6, q=later, dq=[3.0, 0.1]))
+        torque = rig.deliver(
+            state.raw(stamp=state.stamp + k * 10**6, q=later, dq=[3.0, 0.1])
+        )
     np.testing.assert_allclose(torque, [-2.0, -0.1])  # D is 2 and 1 N m s/rad
 
 
@@ -338,9 +368,14 @@ def test_last_torque_is_the_safe_torque_of_an_arm_at_rest(safety, on_a_ramp):
     if on_a_ramp:
         rig.guard.deactivate()
     torque = rig.guard.release()
-    samples, q = rig.guard.samples, rig.guard._safe_torque.last.q
-    holding = dynamics(samples.estimate[:3], 9.8, q, (0.0, 0.0))[2] + samples.disturbance
-    np.testing.assert_allclose(torque, holding if safety == 'hold_gravity' else [0.0, 0.0])
+    samples = rig.guard.samples
+    q = rig.guard._safe_torque.last.q
+    holding = (
+        dynamics(samples.estimate[:3], 9.8, q, (0.0, 0.0))[2] + samples.disturbance
+    )
+    np.testing.assert_allclose(
+        torque, holding if safety == 'hold_gravity' else [0.0, 0.0]
+    )
     assert np.abs(samples.disturbance).min() > 0.01
 
 

@@ -14,16 +14,13 @@ from blf_dsc_controller.arms.model import inertia_matrices
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.nodes import load, load_loop, locate
 from blf_dsc_controller.configuration.robot import read_urdf
-from blf_dsc_controller.configuration.schema import change
+from blf_dsc_controller.configuration.schema import build, change
+from blf_dsc_controller.errors import ConfigurationError
 from blf_dsc_controller.law.factory import settings_of_config
 from blf_dsc_controller.simulation.loop import simulate
-from blf_dsc_controller.supervision.gains import (
-    config_warnings,
-    expected_errors,
-    reference_load,
-    transition,
-    worsened,
-)
+from blf_dsc_controller.supervision.config_warnings import config_warnings, worsened
+from blf_dsc_controller.supervision.expected_errors import expected_errors, transition
+from blf_dsc_controller.supervision.reference_load import reference_load
 
 BOUND = 0.002  # rad
 
@@ -32,7 +29,9 @@ def warnings(changes, preset='recommended'):
     return config_warnings(configured(preset, 1.0, changes).controller)
 
 
-@pytest.mark.parametrize('preset', ['recommended', 'paper', 'noisy', 'two_tone', 'model_based'])
+@pytest.mark.parametrize(
+    'preset', ['recommended', 'paper', 'noisy', 'two_tone', 'model_based']
+)
 def test_presets_cause_no_warnings(preset):
     assert config_warnings(load_loop(preset).controller) == []
 
@@ -58,7 +57,12 @@ def test_unworkable_gains_are_named(parameter, changes):
 
 @pytest.mark.parametrize(
     ('gain', 'accepted'),
-    [((60.0, 120.0), True), ((60.0, 110.0), True), ((60.0, 121.0), False), ((4000.0, 15.0), False)],
+    [
+        ((60.0, 120.0), True),
+        ((60.0, 110.0), True),
+        ((60.0, 121.0), False),
+        ((4000.0, 15.0), False),
+    ],
 )
 def test_change_must_not_worsen_an_existing_warning_nor_cause_one(gain, accepted):
     """A user who chose gains with a warning can change them back."""
@@ -67,13 +71,21 @@ def test_change_must_not_worsen_an_existing_warning_nor_cause_one(gain, accepted
     assert len(config_warnings(before, load=load)) == 1
     found = worsened(before, change(before, {'feedback.gain': gain}), load)
     assert (found == []) == accepted
-    assert all(text.startswith('feedback.gain: K_p over the inertia is ') for text in found)
+    assert all(
+        text.startswith('feedback.gain: K_p over the inertia is ') for text in found
+    )
     (text,) = worsened(before, change(before, {'surface.time_constant': 0.0005}), load)
-    assert text.startswith('surface.time_constant: 0.0005 s is less than the sample time')
+    assert text.startswith(
+        'surface.time_constant: 0.0005 s is less than the sample time'
+    )
 
 
 def test_laws_cause_no_warnings_about_gains_they_do_not_have():
-    changes = {'surface.time_constant': 0.05, 'learning.window': 5.0, 'law': 'backstepping'}
+    changes = {
+        'surface.time_constant': 0.05,
+        'learning.window': 5.0,
+        'law': 'backstepping',
+    }
     assert warnings(changes) == []
 
 
@@ -81,7 +93,8 @@ def test_reference_load_predicts_the_torque_of_the_run():
     """True parameters, no disturbance: the run's largest torque, up to the filter's lag."""
     undisturbed = {'truth.constant': [0.0, 0.0], 'truth.amplitude': [0.0, 0.0]}
     loop = configured('model_based', 7.0, undisturbed, NO_DISTURBANCE)
-    config, torque = loop.controller, np.abs(run(loop).torque[1000:])
+    config = loop.controller
+    torque = np.abs(run(loop).torque[1000:])
     load = reference_load(config, settings_of_config(config))
     np.testing.assert_allclose(load.torque, torque.max(axis=0), rtol=2e-3)
 
@@ -115,7 +128,12 @@ STRONG = {'learning.adaptation_gain': [0.02] * 3, 'learning.weight': 2100.0}
             lambda loop: loop.error_at(12.0) > 0.01,
         ),
         ('', {}, 12.0, lambda loop: loop.error_at(12.0) > 1e-4),
-        ('feedback.gain: K_p over', EXACT | {'feedback.gain': [60.0, 500.0]}, 4.0, chatters),
+        (
+            'feedback.gain: K_p over',
+            EXACT | {'feedback.gain': [60.0, 500.0]},
+            4.0,
+            chatters,
+        ),
         ('', EXACT | {'feedback.gain': [60.0, 60.0]}, 4.0, chatters),
         (
             'torque.limit: joint1',
@@ -140,7 +158,9 @@ def of_bound(changes):
 
 def test_pick_up_past_the_bound_is_named_with_what_would_hold():
     (warning,) = of_bound({})
-    assert warning.startswith('barrier.bound: when 2 kg (robot.payload) are picked up in motion, ')
+    assert warning.startswith(
+        'barrier.bound: when 2 kg (robot.payload) are picked up in motion, '
+    )
     bound, payload = (
         float(re.search(pattern, warning)[1])
         for pattern in ('a bound of ([0-9.]+) rad would', 'hold, or ([0-9.]+) kg')
@@ -151,7 +171,9 @@ def test_pick_up_past_the_bound_is_named_with_what_would_hold():
 
 URDF = read_urdf('panda.urdf')
 IN_KG_MM2 = re.sub(
-    r'\b(i[xyz]{2})="(.+?)"', lambda found: f'{found[1]}="{1e6 * float(found[2])}"', URDF
+    r'\b(i[xyz]{2})="(.+?)"',
+    lambda found: f'{found[1]}="{1e6 * float(found[2])}"',
+    URDF,
 )
 UNLIMITED = URDF.replace('effort="12"', 'effort="0"')
 PLACEHOLDERS = re.sub('effort="[0-9.]+"', 'effort="2000"', URDF)
@@ -165,11 +187,20 @@ BARE = {'robot.viscous': [], 'robot.coulomb': []}
         ({}, []),
         (
             {'robot.urdf': UNLIMITED},
-            [f'torque.limit: panda_joint{k} has no effort in the URDF' for k in (5, 6, 7)],
+            [
+                f'torque.limit: panda_joint{k} has no effort in the URDF'
+                for k in (5, 6, 7)
+            ],
         ),
-        ({'barrier.bound': [0.0002] * 7}, ['barrier.bound: friction and unmodelled torque']),
+        (
+            {'barrier.bound': [0.0002] * 7},
+            ['barrier.bound: friction and unmodelled torque'],
+        ),
         ({'robot.urdf': IN_KG_MM2}, ['robot.urdf: panda_joint7 accelerates at only ']),
-        ({'robot.urdf': PLACEHOLDERS}, ['torque.limit: an effort of up to 2000 N m for']),
+        (
+            {'robot.urdf': PLACEHOLDERS},
+            ['torque.limit: an effort of up to 2000 N m for'],
+        ),
         (
             {'robot.urdf': STICKY, **BARE},
             ['a quarter of the effort of panda_joint5, panda_joint6, panda_joint7'],
@@ -191,7 +222,8 @@ def test_neither_gains_nor_the_residual_floor_rest_on_placeholders():
     assert max(rotors) < 0.2  # kg m^2, instead of 5
     assert arm_of('panda').learning.residual_floor == (0.87,) * 4 + (0.12,) * 3
     bare = arm_of('panda', changes={'robot.urdf': STICKY, **BARE})
-    assert not settings_of_config(bare).initial_estimate[-14:].any()  # learned before it is used
+    # learned before it is used
+    assert not settings_of_config(bare).initial_estimate[-14:].any()
 
 
 # Margins and expected errors of the gains derived from a URDF, at three sample rates.
@@ -207,7 +239,9 @@ def arm_of(preset, sample_time=0.001, changes=None):
 def inertias(config, settings):
     limits = config.limits.position_lower, config.limits.position_upper
     q = np.random.default_rng(1).uniform(*limits, (8, len(config.joints)))
-    return inertia_matrices(settings.model, np.array(config.learning.initial_estimate), q)
+    return inertia_matrices(
+        settings.model, np.array(config.learning.initial_estimate), q
+    )
 
 
 def growth(settings, T, lag, M, M0, stiffness):
@@ -222,11 +256,71 @@ def test_default_gains_have_margins_at_every_rate(preset, sample_time):
     """Inertias coupled, with the barrier at its softest and at its stiffest."""
     config = arm_of(preset, sample_time)
     settings = settings_of_config(config)
-    lag, M0 = config.robot.lag, inertias(config, settings)
+    lag = config.robot.lag
+    M0 = inertias(config, settings)
     later = lag + 1.5 * sample_time
     assert growth(settings, sample_time, lag, M0 / 1.5, M0, settings.weight) < 1.0
     assert growth(settings, sample_time, later, M0, M0, settings.weight) < 1.0
     assert growth(settings, sample_time, lag, M0, M0, settings.slope_limit) < 1.0
+
+
+@pytest.mark.parametrize('preset', ['panda', 'ur5e'])
+def test_the_loop_is_that_of_one_joint_in_every_posture(preset):
+    """Damping, barrier and disturbance estimate follow the inertia: n equal, decoupled loops."""
+    config = arm_of(preset)
+    settings = settings_of_config(config)
+    lag = config.robot.lag
+    M0 = inertias(config, settings)
+    one = np.eye(settings.n)[np.newaxis]
+    for M, stiffness in ((1.0, settings.weight), (0.6, settings.slope_limit)):
+        A, _ = transition(settings, 0.001, lag, M * M0, M0, stiffness)
+        alone, _ = transition(settings, 0.001, lag, M * one, one, stiffness)
+        found = np.abs(np.linalg.eigvals(A)).max(axis=-1)
+        (expected,) = np.abs(np.linalg.eigvals(alone)).max(axis=-1)
+        np.testing.assert_allclose(found, np.full(len(M0), expected), atol=1e-3)
+
+
+def test_softer_loop_has_lower_gains_and_larger_errors():
+    stiff = arm_of('panda')
+    soft = arm_of('panda', changes={'feedback.stiffness': 0.5})
+    rates = ('damping_rate', 0.5, stiff.feedback, soft.feedback)
+    weights = ('weight', 0.25, stiff.barrier, soft.barrier)
+    for name, factor, before, after in (rates, weights):
+        expected = factor * np.array(getattr(before, name))
+        np.testing.assert_allclose(getattr(after, name), expected, rtol=1e-3)
+    peak, wider = (
+        expected_errors(config, settings_of_config(config)).pick_up.max()
+        for config in (stiff, soft)
+    )
+    assert 3.0 < wider / peak < 4.0  # the delay matters less
+    assert soft.safety.damping == stiff.safety.damping
+    free = build(
+        ControllerConfig,
+        {
+            'robot.urdf': 'panda.urdf',
+            'robot.tip': 'panda_link7',
+            'feedback.stiffness': 0.5,
+        },
+    )
+    assert free.barrier.bound == (0.008,) * 7
+
+
+def test_soft_loop_that_leaves_its_bound_is_named_with_the_stiffness_that_holds():
+    def of_bound(stiffness):
+        found = config_warnings(
+            arm_of('panda', changes={'feedback.stiffness': stiffness})
+        )
+        return [text for text in found if 'picked up' in text]
+
+    (warning,) = of_bound(0.5)
+    stiffer = float(re.search(r'a feedback.stiffness of ([0-9.]+)', warning)[1])
+    assert 0.5 < stiffer <= 1.0
+    assert of_bound(stiffer) == []
+
+
+def test_stiffness_of_an_arm_without_a_urdf_is_rejected():
+    with pytest.raises(ConfigurationError, match=r'feedback.stiffness: got 0.5 with'):
+        configured('recommended', 1.0, {'feedback.stiffness': 0.5})
 
 
 def test_a_surface_filter_of_two_samples_costs_the_margin_at_low_rates():
@@ -234,7 +328,8 @@ def test_a_surface_filter_of_two_samples_costs_the_margin_at_low_rates():
     for factor in (1.0, 2.0):
         config = arm_of('panda', 0.004, {'surface.time_constant': factor * 0.004})
         settings = settings_of_config(config)
-        M0, size = inertias(config, settings), partial(growth, settings, 0.004, config.robot.lag)
+        M0 = inertias(config, settings)
+        size = partial(growth, settings, 0.004, config.robot.lag)
         found.append([size(M0 / x, M0, settings.weight) < 1.0 for x in lighter])
     assert found == [[True, True], [True, False]]
 
@@ -242,7 +337,7 @@ def test_a_surface_filter_of_two_samples_costs_the_margin_at_low_rates():
 def test_gains_follow_the_sample_time():
     fast, slow = (arm_of('panda', T) for T in (0.001, 0.004))
     assert slow.feedback.damping_rate < fast.feedback.damping_rate
-    assert (fast.surface.time_constant, slow.surface.time_constant) == (0.0015, 0.004)
+    assert (fast.surface.time_constant, slow.surface.time_constant) == (0.00155, 0.004)
     planar = (arm_of('noisy', T) for T in (0.001, 0.004))
     settings = map(settings_of_config, (fast, slow, *planar))
     intervals = [(each.row_interval, each.interval) for each in settings]
@@ -251,9 +346,12 @@ def test_gains_follow_the_sample_time():
 
 @pytest.mark.parametrize(('preset', 'n'), ARMS)
 @pytest.mark.parametrize(
-    'sample_time', [0.001, *(pytest.param(T, marks=pytest.mark.nightly) for T in (0.002, 0.004))]
+    'sample_time',
+    [0.001, *(pytest.param(T, marks=pytest.mark.nightly) for T in (0.002, 0.004))],
 )
-def test_expected_peak_at_a_pick_up_is_that_of_the_simulated_arm(preset, n, sample_time):
+def test_expected_peak_at_a_pick_up_is_that_of_the_simulated_arm(
+    preset, n, sample_time
+):
     """The largest of ten moments of the simulated motion; the bound is far away."""
     largest = 0.0
     for begin in np.arange(8.0, 13.0, 0.5).tolist():
@@ -273,3 +371,17 @@ def test_expected_peak_at_a_pick_up_is_that_of_the_simulated_arm(preset, n, samp
     config = arm_of(preset, sample_time, {'robot.payload': 2.0})
     expected = expected_errors(config, settings_of_config(config)).pick_up.max()
     assert 0.85 * largest < expected < 1.45 * largest  # friction, which it lacks, helps
+
+
+@pytest.mark.parametrize(
+    ('given', 'remedy'),
+    [
+        ({'robot.lag': 5.0}, 'robot.lag: 5 s .* is it in ms. Give 0.005'),
+        ({'barrier.bound': [0.5, 0.5]}, 'is it in degrees. Give 0.00873'),
+        ({'barrier.bound': [0.05, 2.0]}, 'barrier.bound: 2 rad is 115 degrees'),
+    ],
+)
+def test_values_of_another_unit_are_named_before_the_start(given, remedy):
+    (found,) = [text for text in warnings(given) if re.search(remedy, text)]
+    assert found
+    assert not [text for text in warnings({}) if re.search(remedy, text)]

@@ -10,12 +10,20 @@ from plain_law import dynamics
 
 from blf_dsc_controller.configuration.controller import ControllerConfig, Safety
 from blf_dsc_controller.configuration.schema import change
+from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.law.factory import controller_of, settings_of_config
-from blf_dsc_controller.reference.trajectory import Trajectory, TrajectoryError, TrajectoryPoint
-from blf_dsc_controller.supervision.checks import Phase, Reason, StateCheck
-from blf_dsc_controller.supervision.gains import apply, apply_bumpless
-from blf_dsc_controller.supervision.guard import LatePlanError
-from blf_dsc_controller.supervision.safe_torque import LastState, SafeTorque, safe_torque
+from blf_dsc_controller.reference.terms import unpack
+from blf_dsc_controller.reference.trajectory import (
+    Trajectory,
+    TrajectoryError,
+    TrajectoryPoint,
+)
+from blf_dsc_controller.supervision.guard import Guard, LatePlanError
+from blf_dsc_controller.supervision.last_state import LastState
+from blf_dsc_controller.supervision.retuning import apply, apply_bumpless
+from blf_dsc_controller.supervision.safe_torque import SafeTorque, safe_torque
+from blf_dsc_controller.supervision.state_check import StateCheck
+from blf_dsc_controller.supervision.supervisor import Phase, Reason
 
 Q, DQ = np.array([0.3, -0.4]), np.array([0.5, -2.0])
 P = np.array([1.0, 0.32, 0.4])
@@ -46,13 +54,15 @@ def test_safe_torque_does_what_its_name_says_limited_and_finite(
 ):
     last = LastState(2)
     last.take(1, np.concatenate((Q, dq, np.zeros(2))))
-    safety, limited = Safety(torque=torque, damping=(2.0, 1.0)), {'torque.limit': (limit, limit)}
+    safety = Safety(torque=torque, damping=(2.0, 1.0))
+    limited = {'torque.limit': (limit, limit)}
     got = safe_torque(safety, settings(**limited), last, estimate, np.zeros(2))
     np.testing.assert_allclose(got, expected)
 
 
 def test_ramp_is_linear_and_ends_at_a_moving_goal():
-    ramp, safety = SafeTorque(2), Safety(torque='damping', damping=(1.0, 1.0))
+    ramp = SafeTorque(2)
+    safety = Safety(torque='damping', damping=(1.0, 1.0))
 
     def advance(goal):
         ramp.last.take(1, np.array([0.0, 0.0, -goal, 0.0, 0.0, 0.0]))
@@ -95,7 +105,9 @@ def test_missed_states_are_averaged():
         ('off', 0.0, '', False),
     ],
 )
-def test_silence_stops_if_stamps_are_live_or_the_watchdog_is_on(watchdog, late, why_off, stops):
+def test_silence_stops_if_stamps_are_live_or_the_watchdog_is_on(
+    watchdog, late, why_off, stops
+):
     """Of stamps that are `late` by some seconds; what is switched off says why."""
     rig = Rig({'safety.watchdog': watchdog}, live=True)
     rig.base -= int(late * 1e9)
@@ -121,21 +133,29 @@ def test_torque_ramps_after_a_fault_or_a_deactivation_as_configured(ramp):
         rig.step()
     rig.step(12)
     ramp = np.array(rig.commands[-13:])
-    np.testing.assert_allclose(ramp[:10], np.outer(np.linspace(0.9, 0.0, 10), last), atol=1e-12)
+    np.testing.assert_allclose(
+        ramp[:10], np.outer(np.linspace(0.9, 0.0, 10), last), atol=1e-12
+    )
     assert not ramp[10:].any()
 
 
 @pytest.mark.parametrize(('factor', 'angle'), [(1.0, 0.12), (0.5, 0.2), (1.5, 0.2)])
 def test_stopped_arm_rests_although_its_model_may_be_wrong(factor, angle):
     """The safe torque observes what the model lacks; with zero torque the arm falls by 1.5 rad."""
-    estimate = {'learning.initial_estimate': (factor * P).tolist(), 'learning.weight': 0.0}
+    estimate = {
+        'learning.initial_estimate': (factor * P).tolist(),
+        'learning.weight': 0.0,
+    }
     rig = Rig(
-        estimate | {'safety.torque': 'hold_gravity'}, plant={'disturbance.constant': [0.0, 0.0]}
+        estimate | {'safety.torque': 'hold_gravity'},
+        plant={'disturbance.constant': [0.0, 0.0]},
     )
     rig.step(500)
     assert (np.abs(rig.state().dq) > 0.1).all()
     rig.deliver(b'')
-    np.testing.assert_array_equal(rig.guard._safe_torque.load, rig.guard.samples.disturbance)
+    np.testing.assert_array_equal(
+        rig.guard._safe_torque.load, rig.guard.samples.disturbance
+    )
     start = rig.state().q
     rig.step(3000)
     assert rig.supervisor.phase is Phase.SAFE_STOP
@@ -146,7 +166,8 @@ def test_stopped_arm_rests_although_its_model_may_be_wrong(factor, angle):
 
 def test_load_is_bounded_and_left_as_it_is_while_brakes_hold_the_arm():
     """Without motion, the commanded torque says nothing about the load."""
-    ramp, safety = SafeTorque(2), Safety(torque='hold_gravity', damping=(1.0, 1.0))
+    ramp = SafeTorque(2)
+    safety = Safety(torque='hold_gravity', damping=(1.0, 1.0))
     ramp.commanded[:] = ramp.last.q[:] = 0.0
     ramp.begin_ramp(0.0, np.array([15.0, -2.0]))
     measurement = np.concatenate((Q, np.zeros(4)))
@@ -155,7 +176,8 @@ def test_load_is_bounded_and_left_as_it_is_while_brakes_hold_the_arm():
         ramp.last.take_usable(k * MILLISECOND, measurement, 50.0, 1e-3)
         torque = ramp.advance(safety, settings(), 0.1 * P, 1e-3)
     load = [10.0, -2.0]  # half of the limit of 20 N m
-    np.testing.assert_allclose(ramp.load, load, atol=0.1)  # the first torque before it was zero
+    # the first torque before it was zero
+    np.testing.assert_allclose(ramp.load, load, atol=0.1)
     np.testing.assert_allclose(torque, 0.1 * weight(Q) + load, atol=0.1)
 
 
@@ -200,7 +222,8 @@ def test_estimates_are_kept_over_an_activation_and_forgotten_by_a_reset(again):
     rig, keep = Rig(), again == 'activate'
     rig.step(200)
     state = rig.guard.controller.state
-    learned, window = state.estimate.copy(), state.rows[0]
+    learned = state.estimate.copy()
+    window = state.rows[0]
     rig.guard.deactivate()
     getattr(rig.guard, again)()
     start = rig.guard.controller.settings.initial_estimate
@@ -212,20 +235,28 @@ def test_estimates_are_kept_over_an_activation_and_forgotten_by_a_reset(again):
 
 
 def test_estimates_before_a_fault_are_kept_but_not_the_window():
-    rig = Rig({'safety.error_ratio': 0.35})  # exceeded during the motion, without saturation
+    # exceeded during the motion, without saturation
+    rig = Rig({'safety.error_ratio': 0.35})
+    seen = []
     while rig.supervisor.reason is Reason.NONE:
-        learned = rig.guard.controller.state.estimate.copy()
+        seen.append(rig.guard.controller.state.estimate.copy())
         rig.step()
     assert rig.supervisor.reason is Reason.OUTSIDE_BOUND
     start = rig.guard.controller.settings.initial_estimate
+    learned = rig.guard.samples.estimate.copy()
+    at = np.flatnonzero((np.array(seen) == learned).all(axis=1))
+    assert at.size
+    assert at[-1] < len(seen) - 1  # from before the error grew
     for other in (start, rig.guard.controller.state.estimate):
         assert not np.array_equal(other, learned)
     rig.guard.deactivate()
     rig.guard.activate()
     controller = rig.guard.controller
-    kept, disturbance = controller.save(), controller.state.disturbance.copy()
+    kept = controller.save()
+    disturbance = controller.state.disturbance.copy()
     controller.reset()  # nothing else of the state survives
-    controller.state.estimate[:], controller.state.disturbance[:] = learned, disturbance
+    controller.state.estimate[:] = learned
+    controller.state.disturbance[:] = disturbance
     np.testing.assert_array_equal(kept, controller.state_vector)
 
 
@@ -256,7 +287,8 @@ def test_reactivation_restarts_the_surface_filter_at_the_current_state():
     rig.guard.activate()
     assert rig.guard.controller.samples == 0
     rig.step(1)
-    assert np.abs(rig.guard.controller.sample.xi2).max() < 1e-3  # rad/s; it was at 0.3 rad/s
+    # rad/s; it was at 0.3 rad/s
+    assert np.abs(rig.guard.controller.sample.xi2).max() < 1e-3
 
 
 def test_learning_waits_for_a_full_window_after_a_reset_in_motion():
@@ -297,7 +329,10 @@ def jump(given, *, bumpless, samples):
 
 @pytest.mark.parametrize(
     ('given', 'samples', 'most'),
-    [*((given, 1, 2.0) for given in NEW_GAINS), *((given, 20, 1.2) for given in NEW_GAINS[1:3])],
+    [
+        *((given, 1, 2.0) for given in NEW_GAINS),
+        *((given, 20, 1.2) for given in NEW_GAINS[1:3]),
+    ],
 )
 def test_gain_change_is_bumpless(given, samples, most):
     """The torque changes about as little as from sample to sample without new gains.
@@ -320,10 +355,15 @@ EXCITED = {
     ('start', 'given', 'message'),
     [
         ({}, {'barrier.bound': (1e-6, 0.002)}, 'barrier.bound: joint1 is'),
-        ({}, {'torque.limit': (20.0, 2.6)}, 'torque.limit: joint2 is held with'),  # 2.675 N m
+        # 2.675 N m
+        ({}, {'torque.limit': (20.0, 2.6)}, 'torque.limit: joint2 is held with'),
         ({}, {'learning.radius': 0.58}, 'learning.radius: the norm of the estimate is'),
         # Gradient: kappa Gamma lambda_max T >= 2; here kappa is 100 and lambda_max about 100.
-        (EXCITED, {'learning.update': 'gradient'}, 'learning.weight: with the update gradient'),
+        (
+            EXCITED,
+            {'learning.update': 'gradient'},
+            'learning.weight: with the update gradient',
+        ),
         (EXCITED, {'learning.update': 'gradient', 'learning.weight': 2.0}, ''),
     ],
 )
@@ -344,7 +384,29 @@ def test_gains_can_change_while_the_projection_holds_the_estimate():
     estimate = rig.guard.controller.state.estimate
     estimate[:] *= np.nextafter(0.7, 1.0) / np.linalg.norm(estimate)
     assert np.linalg.norm(estimate) > 0.7
-    assert rig.guard.problems(change(rig.guard.config, {'feedback.gain': (60.0, 25.0)})) == []
+    assert (
+        rig.guard.problems(change(rig.guard.config, {'feedback.gain': (60.0, 25.0)}))
+        == []
+    )
+
+
+def test_plan_keeps_one_in_force_that_has_not_begun():
+    """Two within the lead of the first: the reference continues until each of them begins."""
+    rig = Rig()
+    rig.step(100)
+    to = Trajectory(JOINTS, (TrajectoryPoint(1.0, (2.1, 1.5)),))
+    guard = rig.guard
+    running = guard.controller.reference_at
+    times = guard.time + np.linspace(0.001, 0.02, 20)
+    before = [running(t) for t in times]
+    guard.adopt(guard.plan(to, guard.time + 0.02))
+    rig.step(10)
+    guard.adopt(guard.plan(to, guard.time + 0.02))
+    np.testing.assert_allclose([running(t) for t in times], before, atol=1e-12)
+    rig.step(1200)
+    assert rig.supervisor.phase is Phase.TRACKING
+    guard.adopt(guard.plan(to))
+    assert len(unpack(guard.controller.reference_vector)) == 1  # the past is forgotten
 
 
 def test_plan_is_followed_from_its_start_unless_late_or_from_a_replaced_reference():
@@ -361,16 +423,21 @@ def test_plan_is_followed_from_its_start_unless_late_or_from_a_replaced_referenc
     rig.guard.adopt(plan)
     with pytest.raises(TrajectoryError, match='replaced while it was planned'):
         rig.guard.adopt(replaced)
-    np.testing.assert_allclose(rig.guard.controller.reference_at(plan.at), before, atol=1e-12)
+    np.testing.assert_allclose(
+        rig.guard.controller.reference_at(plan.at), before, atol=1e-12
+    )
     rig.step(1200)
-    np.testing.assert_allclose(rig.guard.controller.reference_at(rig.guard.time)[0], (2.1, 1.5))
+    np.testing.assert_allclose(
+        rig.guard.controller.reference_at(rig.guard.time)[0], (2.1, 1.5)
+    )
     assert rig.supervisor.phase is Phase.TRACKING
 
 
 def test_retuning_leaves_the_estimate_of_a_joint_without_integrator():
     """A gain of 0 says that its disturbance is not estimated: the torque of that joint steps."""
     config = change(ControllerConfig(), {'disturbance.gain': [0.0, 100.0]})
-    law, measurement = controller_of(config), np.array([2.2935, 1.6961, 0.1, 0.1, 0.0, 0.0])
+    law = controller_of(config)
+    measurement = np.array([2.2935, 1.6961, 0.1, 0.1, 0.0, 0.0])
     for k in range(2):
         law.update(k * 1e-3, 1e-3, measurement)
     before = law.state.disturbance.copy()
@@ -404,7 +471,10 @@ def test_stop_names_both_rates_where_the_states_come_at_another():
     rig.push = np.array([40.0, 0.0])
     rig.step(60)
     assert rig.supervisor.reason is Reason.OUTSIDE_BOUND
-    assert 'joint states come every 0.003 s, but sample_time is 0.001 s' in rig.supervisor.text
+    assert (
+        'joint states come every 0.003 s, but sample_time is 0.001 s'
+        in rig.supervisor.text
+    )
 
 
 def test_commands_without_effect_stop_the_arm_with_the_model_from_before():
@@ -416,7 +486,9 @@ def test_commands_without_effect_stop_the_arm_with_the_model_from_before():
     jammed(rig)
     rig.step(500)
     assert rig.supervisor.reason is Reason.NO_EFFECT
-    assert 'release the brakes, and activate the effort controller' in rig.supervisor.text
+    assert (
+        'release the brakes, and activate the effort controller' in rig.supervisor.text
+    )
     np.testing.assert_allclose(rig.guard.samples.estimate, before, rtol=1e-3)
     state = rig.state()
     rig.sense = lambda state: [state.raw()]  # the brakes open
@@ -425,10 +497,14 @@ def test_commands_without_effect_stop_the_arm_with_the_model_from_before():
 
 
 @pytest.mark.parametrize(('effort', 'stops'), [('unknown', False), ('commanded', True)])
-def test_constant_command_that_does_not_reach_the_arm_shows_only_in_its_effort(effort, stops):
+def test_constant_command_that_does_not_reach_the_arm_shows_only_in_its_effort(
+    effort, stops
+):
     """An inactive effort controller, on an arm that its drives hold."""
     hold = {'reference.type': 'hold', 'learning.initial_estimate': P.tolist()}
-    rig = Rig(hold | {'robot.effort': effort}, plant={'disturbance.amplitude': [0.0, 0.0]})
+    rig = Rig(
+        hold | {'robot.effort': effort}, plant={'disturbance.amplitude': [0.0, 0.0]}
+    )
     rig.step(100)
     assert rig.supervisor.running
     q = rig.state().q
@@ -454,3 +530,74 @@ def test_arm_that_stands_still_under_noise_is_named_but_not_taken_for_braked():
     assert measured == pytest.approx(np.sqrt((steps**2).mean(axis=0)), rel=0.2)
     assert 'joint1 changes by' in status.chatter_of(rig.guard)
     assert status.chatter_of(quiet.guard) == ''
+
+
+def test_estimates_are_discarded_by_a_reset_at_once():
+    """The safe torque between a reset and the next start must not be that of what it discards."""
+    rig = Rig({'safety.torque': 'hold_gravity'})
+    rig.step(300)
+    initial = rig.guard.controller.settings.initial_estimate
+    assert rig.guard.samples.disturbance.any()
+    rig.guard.reset()
+    np.testing.assert_array_equal(rig.guard.samples.estimate, initial)
+    assert not rig.guard.samples.disturbance.any()
+
+
+def test_velocity_limit_changed_at_run_time_holds_from_the_next_state_on():
+    rig = Rig()
+    rig.step(100)
+    speed = np.abs(rig.state().dq).max()
+    safety = {'safety.velocity_limit': 0.5 * float(speed)}
+    rig.guard.retune(change(rig.config, safety))
+    rig.step()
+    assert rig.supervisor.reason is Reason.VELOCITY
+
+
+@pytest.mark.parametrize(
+    ('gap', 'missed'), [(1.0, 0), (1.4, 0), (1.6, 1), (1.9, 1), (2.1, 1), (2.9, 2)]
+)
+def test_gap_counts_to_the_nearest_number_of_missed_states(gap, missed):
+    check = StateCheck(('joint1', 'joint2'), 1e-3)
+    safety = ControllerConfig().safety
+    assert check.check(safety, 10**9) is None
+    assert check.check(safety, 10**9 + round(gap * 10**6)) is None
+    assert check.missed == missed
+
+
+def test_acceleration_is_unknown_after_a_missed_state():
+    """Else it would count again and again, as if the arm went on accelerating."""
+    last = LastState(2)
+    for k in range(3):
+        state = np.array([k * k * 1e-3, 0.0, 2e-3 * k, 0.0, 0.0, 0.0])
+        last.take_usable(10**9 + k * 10**6, state, 50.0, 1e-3)
+    assert last.ddq is not None
+    last.miss(1e-3)
+    assert last.ddq is None
+    assert not last.dq.any()
+
+
+def test_clock_that_is_set_is_named_instead_of_the_error_it_makes():
+    """By 35 ms, which safety.state_timeout allows: the reference would jump by 10 mrad."""
+    rig = Rig(live=True)
+    rig.step(1000)
+    rig.base += 35 * 10**6
+    rig.step(2)
+    assert rig.supervisor.reason is Reason.STAMP_JUMP
+    assert 'the clock was set' in rig.supervisor.text
+
+
+def test_states_that_are_really_missed_are_no_step_of_the_clock():
+    rig = Rig(live=True)
+    rig.step(1000)
+    rig.sense = lambda _: []
+    rig.step(8)
+    rig.sense = lambda state: [state.raw()]
+    rig.step(20)
+    assert rig.supervisor.phase is Phase.TRACKING, rig.supervisor.text
+
+
+@pytest.mark.parametrize('shape', [(5,), (7,), (1,), (), (3, 2), (2, 6)])
+def test_measurement_of_another_shape_is_rejected(shape):
+    law = Guard(ControllerConfig()).controller
+    with pytest.raises(BlfDscError, match=r'2 joints need \(6,\)'):
+        law.update(0.0, 1e-3, np.zeros(shape))

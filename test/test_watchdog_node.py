@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The second line as a process: the controller killed, stopped and crashed beside a held torque."""
+"""The watchdog as a process: the controller killed, stopped and crashed beside a held torque."""
 
 from __future__ import annotations
 
@@ -15,21 +15,33 @@ import pytest
 
 pytest.importorskip('rclpy', reason='needs ROS 2')
 
+from diagnostic_msgs.msg import DiagnosticStatus
 from random_arm import CONFIG
 from rclpy.parameter import Parameter
-from ros_rig import JOINTS, START
+from ros_rig import JOINTS, START, FakeClock
+from std_msgs.msg import String
 
 from blf_dsc_controller import load_loop
-from blf_dsc_controller.configuration.schema import flatten
+from blf_dsc_controller.configuration.controller import ControllerConfig
+from blf_dsc_controller.configuration.schema import build, change, differences, flatten
+from blf_dsc_controller.law.factory import settings_of_config
 from blf_dsc_controller.messages import topics
-from blf_dsc_controller.messages.codecs import Float64MultiArrayEncoder, JointStateEncoder
+from blf_dsc_controller.messages.codecs import (
+    Float64MultiArrayEncoder,
+    JointStateEncoder,
+)
+from blf_dsc_controller.messages.journal import EventType, Journal
 from blf_dsc_controller.nodes.controller_node import ControllerNode
+from blf_dsc_controller.nodes.endpoints import RawSubscriptions
 from blf_dsc_controller.nodes.plant_node import PlantNode
 from blf_dsc_controller.nodes.watchdog_node import WatchdogNode
+from blf_dsc_controller.supervision.model_torque import model_torque
 from sim_plant.plant import plant_of
 
-FR3, UR5E = CONFIG / 'fr3.yaml', CONFIG / 'ur5e_driver.yaml'
+FR3 = CONFIG / 'fr3.yaml'
+UR5E = CONFIG / 'ur5e_driver.yaml'
 SLOWER = 3  # times slower than real time: any computer keeps up
+LOG = topics.STREAM, topics.STREAM
 ENDS = {'killed': signal.SIGKILL, 'stopped': signal.SIGSTOP, 'crashed': signal.SIGSEGV}
 
 
@@ -40,12 +52,28 @@ def controller(ros):
 
     def start(**parameters):
         """Start it with patience for a slow arm."""
-        patient = {'safety.state_timeout': 10.0, 'safety.overrun_fraction': 1.0} | parameters
-        words = [word for name, value in patient.items() for word in ('-p', f'{name}:={value}')]
+        patient = {
+            'safety.state_timeout': 10.0,
+            'safety.overrun_fraction': 1.0,
+        } | parameters
+        words = [
+            word
+            for name, value in patient.items()
+            for word in ('-p', f'{name}:={value}')
+        ]
         module = ('-m', 'blf_dsc_controller.nodes.controller_node')
-        command = [sys.executable, *module, '--ros-args', '--params-file', str(UR5E), *words]
+        command = [
+            sys.executable,
+            *module,
+            '--ros-args',
+            '--params-file',
+            str(UR5E),
+            *words,
+        ]
         domain = str(ros.context.get_domain_id())
-        started.append(subprocess.Popen(command, env=os.environ | {'ROS_DOMAIN_ID': domain}))
+        started.append(
+            subprocess.Popen(command, env=os.environ | {'ROS_DOMAIN_ID': domain})
+        )
         return started[-1]
 
     yield start
@@ -67,23 +95,25 @@ def test_arm_in_motion_comes_to_rest_beside_a_dead_process(ros, controller, end)
     arm = ros.add(PlantNode, flatten(load_loop(UR5E).plant), clock=steady)
     watchdog = ros.add(partial(WatchdogNode, steady=steady))
     process = controller()
-    ros.until(lambda: watchdog.line is not None and arm.plant.sample > 425)
+    ros.until(lambda: watchdog.watchdog is not None and arm.plant.sample > 425)
     process.send_signal(ENDS[end])
     ros.until(lambda: end == 'stopped' or process.poll() is not None)
     start = arm.plant.measure()[:6].copy()
     ros.run(arm, 500)
-    assert watchdog.line.takeovers == 1
-    assert watchdog.line.active
+    assert watchdog.watchdog.takeovers == 1
+    assert watchdog.watchdog.active
     assert np.abs(arm.plant.measure()[:6] - start).max() < 0.5
     if end == 'stopped':
         process.send_signal(signal.SIGCONT)
     elif end == 'killed':
         controller(**{'safety.first_torque': 'send'})
-    ros.until(lambda: end == 'crashed' or not watchdog.line.active)
+    ros.until(lambda: end == 'crashed' or not watchdog.watchdog.active)
 
 
 @pytest.mark.parametrize('held', [0.0, 5.0], ids=['restarted afterwards', 'watching'])
-def test_watchdog_continues_from_the_torque_that_the_drive_holds(ros, monkeypatch, held):
+def test_watchdog_continues_from_the_torque_that_the_drive_holds(
+    ros, monkeypatch, held
+):
     """At most 1 N m away, as an FR3 demands.
 
     If it was restarted after the controller had died, it cannot know it: that of the model is sent
@@ -91,11 +121,19 @@ def test_watchdog_continues_from_the_torque_that_the_drive_holds(ros, monkeypatc
     """
     monkeypatch.setattr(sys, 'argv', ['node', '--ros-args', '--params-file', str(FR3)])
     config = load_loop(FR3).plant
-    plant, torque = plant_of(config), np.append(held, np.zeros(6))
-    commands, states = ros.listen(topics.COMMANDS), ros.publisher(topics.JOINT_STATES)
+    plant = plant_of(config)
+    torque = np.append(held, np.zeros(6))
+    commands = ros.listen(topics.COMMANDS)
+    states = ros.publisher(topics.JOINT_STATES)
     controller = ros.publisher(topics.COMMANDS)
-    watchdog = ros.add(partial(WatchdogNode, steady=lambda: plant.elapsed_ns), {'armed': True})
-    ros.until(lambda: states.get_subscription_count() and controller.get_subscription_count() == 2)
+    watchdog = ros.add(
+        partial(WatchdogNode, steady=lambda: plant.elapsed_ns), {'armed': True}
+    )
+    ros.until(
+        lambda: (
+            states.get_subscription_count() and controller.get_subscription_count() == 2
+        )
+    )
     encoder = JointStateEncoder(config.joints)
     for k in range(100):
         stamp = 10**9 + plant.elapsed_ns
@@ -103,13 +141,14 @@ def test_watchdog_continues_from_the_torque_that_the_drive_holds(ros, monkeypatc
             controller.publish(Float64MultiArrayEncoder(7).encode(torque))
             ros.until(lambda k=k: len(commands) > k)
         states.publish(encoder.encode(stamp, *plant.measure().reshape(3, -1)))
-        ros.until(lambda stamp=stamp: watchdog.line.stamp == stamp)
+        ros.until(lambda stamp=stamp: watchdog.watchdog.stamp == stamp)
         plant.step(torque)
     own = 30 if held else 0
     ros.until(lambda: len(commands) > own)
-    assert watchdog.line.active
-    assert watchdog._timer.timer_period_ns == 10**6  # not 4 ms, at the limit of the torque's rate
-    assert watchdog.line.silence == pytest.approx(0.05, abs=0.01)
+    assert watchdog.watchdog.active
+    # not 4 ms, at the limit of the torque's rate
+    assert watchdog._timer.timer_period_ns == 10**6
+    assert watchdog.watchdog.silence == pytest.approx(0.05, abs=0.01)
     np.testing.assert_allclose(commands[own].data, torque, atol=1.01 if held else 0.1)
     ros.executor.remove_node(watchdog)
     ros.spin(0.1)
@@ -118,17 +157,318 @@ def test_watchdog_continues_from_the_torque_that_the_drive_holds(ros, monkeypatc
     ros.until(lambda: len(commands) > count)
 
 
+class ByHand:
+    """A controller and an arm by hand, at 1 kHz of a clock of their own, beside a watchdog."""
+
+    def __init__(self, ros, config):
+        self.ros = ros
+        self.clock = FakeClock()
+        self.node = ros.add(partial(WatchdogNode, steady=self.clock))
+        self.config = config
+        self._stamp = 10**9
+        self._events = Journal()
+        self._states = ros.publisher(topics.JOINT_STATES)
+        self._commands = ros.publisher(topics.COMMANDS)
+        self._journal = ros.publisher(topics.JOURNAL)
+        self._rest = np.zeros(len(config.joints))
+        self._q = np.full(len(config.joints), 0.3)
+        settings = settings_of_config(config)
+        # by which the arm rests
+        self.holding = model_torque(settings, settings.initial_estimate, self._q)
+        self._encoder = JointStateEncoder(config.joints)
+        self.torques = []  # of the watchdog
+        self._sent = 0
+        publishers = self._states, self._commands, self._journal
+        ros.until(lambda: all(each.get_subscription_count() for each in publishers))
+        self._received = ros.listen(topics.COMMANDS)
+        ros.until(lambda: self._commands.get_subscription_count() == 2)
+        self.note(EventType.CONFIGURE, parameters=flatten(config))
+        ros.until(lambda: self.node.watchdog is not None)
+
+    @property
+    def watchdog(self):
+        return self.node.watchdog
+
+    def note(self, event, **content):
+        """Publish an event of the controller, and wait until the watchdog knows it."""
+        self._events.note(event, **content)
+        known = []
+        take_event = self.node._take_event
+
+        def take(each):
+            take_event(each)
+            known.append(each)
+
+        self.node._take_event = take
+        self._journal.publish(self._events.pending.popleft().encode())
+        self.ros.until(lambda: known)
+        self.node._take_event = take_event
+
+    def go_on(self, seconds, *, commands):
+        """Send states, each with a torque of the controller if it `commands`."""
+        for _ in range(round(seconds * 1e3)):
+            self._stamp += 10**6
+            self.clock.advance(1e-3)
+            self._states.publish(
+                self._encoder.encode(self._stamp, self._q, self._rest, self._rest)
+            )
+            self.ros.until(lambda: self.watchdog.stamp == self._stamp)
+            if commands:
+                encoder = Float64MultiArrayEncoder(len(self._q))
+                self._commands.publish(encoder.encode(self.holding))
+                self.ros.until(
+                    lambda: (
+                        self.watchdog._commanded_stamp == self._stamp
+                        and not self.watchdog.active
+                    )
+                )
+
+    def pause(self, seconds):
+        """Send nothing for a while."""
+        self._stamp += round(seconds * 1e9)
+        self.clock.advance(seconds)
+
+    def torque(self):
+        """Torque (n,) [N m] of the watchdog after the controller has fallen silent."""
+        self.go_on(0.2, commands=False)
+        assert self.watchdog.active
+        self.ros.until(lambda: self._received and self._received[-1].layout.dim)
+        count = len(self._received)
+        self.ros.until(lambda: len(self._received) > count + 1)
+        return np.array(self._received[-1].data)
+
+
+HOLDING = {'safety.torque': 'hold_gravity'}
+
+
+@pytest.mark.parametrize(
+    ('given', 'changed', 'restarted'),
+    [
+        ({}, HOLDING, False),
+        (HOLDING, {'torque.limit': [3.0, 1.0]}, False),
+        (HOLDING, {'torque.limit': [3.0, 1.0]}, True),
+    ],
+)
+def test_watchdog_acts_by_the_parameters_in_force(ros, given, changed, restarted):
+    """Those of yesterday would drop the arm, or throw it."""
+    before = build(ControllerConfig, given)
+    after = change(before, changed)
+    loop = ByHand(ros, before)
+    loop.go_on(0.05, commands=True)
+    yesterday = loop.torque()
+    loop.go_on(0.01, commands=True)
+    if restarted:
+        loop.note(EventType.CONFIGURE, parameters=flatten(after))
+    else:
+        loop.note(EventType.PARAMETERS, parameters=differences(before, after))
+    loop.go_on(0.05, commands=True)
+    today = loop.torque()
+    held = loop.holding if given else np.zeros(2)
+    np.testing.assert_allclose(yesterday, held, atol=0.1)
+    limited = np.clip(loop.holding, *np.outer((-1.0, 1.0), after.torque.limit))
+    np.testing.assert_allclose(today, limited, atol=0.1)
+    assert np.abs(today - yesterday).min() > 0.5
+
+
+def test_watchdog_acts_by_what_the_drives_of_a_restarted_controller_compensate(ros):
+    """Without that an FR3 would get its gravity twice: 12 N m on joint 2."""
+    right = load_loop(FR3).controller
+    wrong = change(right, {'robot.drive_compensates': 'none'})
+    loop = ByHand(ros, wrong)
+    assert np.abs(loop.holding).max() > 10.0
+    loop.holding[:] = 0.0  # as the drives do it
+    loop.go_on(0.005, commands=True)
+    loop.note(EventType.CONFIGURE, parameters=flatten(right))
+    loop.go_on(0.005, commands=True)
+    np.testing.assert_allclose(loop.torque(), 0.0, atol=0.1)
+
+
+WITHDRAWN = EventType.WITHDRAW, {'text': 'of the test'}
+ENDED = EventType.RELEASE, {'resting': True}
+
+
+@pytest.mark.parametrize('event', [WITHDRAWN, ENDED], ids=lambda event: event[0])
+def test_watchdog_stands_down_when_silence_is_meant_until_the_next_command(ros, event):
+    """Whatever the order in which its last torque and the event arrive."""
+    loop = ByHand(ros, build(ControllerConfig, HOLDING))
+    loop.go_on(0.02, commands=True)
+    loop.note(event[0], **event[1])
+    loop.go_on(0.002, commands=True)
+    loop.go_on(0.2, commands=False)
+    assert loop.watchdog.takeovers == 0
+    loop.note(EventType.RESET)
+    loop.go_on(0.1, commands=False)
+    assert loop.watchdog.takeovers == 0
+    loop.go_on(0.02, commands=True)
+    assert np.abs(loop.torque()).min() > 0.5
+    assert loop.watchdog.takeovers == 1
+
+
+def test_watchdog_takes_over_from_a_controller_that_ends_in_motion(ros):
+    loop = ByHand(ros, build(ControllerConfig, HOLDING))
+    loop.go_on(0.02, commands=True)
+    loop.note(EventType.RELEASE, resting=False)
+    assert np.abs(loop.torque()).min() > 0.5
+
+
+def test_watchdog_stays_silent_when_states_are_back_after_a_long_silence(ros):
+    """As the controller does: whoever restarted the driver may not expect a torque."""
+    loop = ByHand(ros, build(ControllerConfig, HOLDING))
+    loop.go_on(0.02, commands=True)
+    loop.pause(3.0)
+    loop.go_on(0.2, commands=False)
+    assert loop.watchdog.takeovers == 0
+
+
+def test_watchdog_knows_its_own_torques_from_middleware_that_counts_no_messages(
+    ros, monkeypatch
+):
+    """As Cyclone DDS: it must not take them for those of the controller, and step back."""
+    take = RawSubscriptions.take
+
+    def without_numbers(self):
+        return [each._replace(sequence=0) for each in take(self)]
+
+    monkeypatch.setattr(RawSubscriptions, 'take', without_numbers)
+    loop = ByHand(ros, build(ControllerConfig, HOLDING))
+    loop.go_on(0.02, commands=True)
+    loop.torque()
+    for _ in range(20):
+        loop.torque()
+    assert loop.watchdog.takeovers == 1
+
+
+def test_journal_that_cannot_be_read_is_reported_and_ends_nothing(ros):
+    diagnostics = ros.listen(topics.DIAGNOSTICS)
+    journal = ros.publisher(topics.JOURNAL)
+
+    def reported(text):
+        return any(
+            text in status.message and status.level == DiagnosticStatus.ERROR
+            for message in diagnostics
+            for status in message.status
+        )
+
+    loop = ByHand(ros, build(ControllerConfig, HOLDING))
+    ros.until(lambda: journal.get_subscription_count() == 1)
+    journal.publish(String(data='{"of": "another version"}'))
+    ros.until(lambda: reported('acts by the parameters from before'))
+    loop.note(EventType.PARAMETERS, parameters={'torque.limit': 'none'})
+    assert not loop.node.finished
+    loop.go_on(0.02, commands=True)
+    assert np.abs(loop.torque()).min() > 0.5
+
+
+def test_watchdog_without_a_readable_configuration_says_that_it_cannot_watch(ros):
+    diagnostics = ros.listen(topics.DIAGNOSTICS)
+    journal = ros.publisher(topics.JOURNAL)
+    node = ros.add(WatchdogNode)
+    ros.until(journal.get_subscription_count)
+    events = Journal()
+    events.note(EventType.CONFIGURE, parameters={'of.another.version': 1.0})
+    journal.publish(events.pending.popleft().encode())
+    ros.until(lambda: node.problem)
+    assert 'of.another.version' in node.problem
+    ros.until(
+        lambda: any(
+            'cannot watch the controller' in status.message
+            for message in diagnostics
+            for status in message.status
+        )
+    )
+    assert not node.finished
+
+
+def test_controller_that_goes_silent_on_purpose_says_so_to_its_watchdog(ros):
+    """After a pause of its driver, and at an orderly end: no torque of the watchdog, no FATAL."""
+    clock = FakeClock()
+    given = HOLDING | {'safety.watchdog': 'on', 'learning.window': 1.0}
+    law = ros.add(ControllerNode, given | {'reference.type': 'hold'}, clock=clock)
+    watchdog = ros.add(partial(WatchdogNode, steady=clock))
+    states = ros.publisher(topics.JOINT_STATES)
+    commands = ros.listen(topics.COMMANDS)
+    encoder = JointStateEncoder(JOINTS)
+    ros.until(
+        lambda: watchdog.watchdog is not None and states.get_subscription_count() == 2
+    )
+    rest = np.zeros(2)
+
+    def go_on(begin, samples):
+        for k in range(samples):
+            stamp = begin + k * 10**6
+            clock.advance(1e-3)
+            states.publish(encoder.encode(stamp, START, rest, rest))
+            ros.until(
+                lambda stamp=stamp: (
+                    watchdog.watchdog.stamp == law.guard.journal.stamp == stamp
+                )
+            )
+
+    go_on(10**9, 20)
+    assert law.guard.supervisor.running
+    ros.until(lambda: len(commands) == 20)
+    for _ in range(300):  # the driver is restarted
+        clock.advance(0.01)
+        ros.spin(0.01)
+    go_on(5 * 10**9, 1)
+    ros.until(lambda: watchdog.watchdog.stands_down)
+    go_on(5 * 10**9 + 10**6, 150)
+    assert watchdog.watchdog.takeovers == 0
+    ros.reset(law)
+    go_on(6 * 10**9, 20)
+    ros.until(lambda: not watchdog.watchdog.stands_down)
+    ros.until(lambda: law.ready_to_end() or go_on(law.guard.journal.stamp + 10**6, 1))
+    law.close()
+    ros.until(lambda: watchdog.watchdog.stands_down)
+    ros.kill(law)
+    assert watchdog.watchdog.takeovers == 0
+
+
+@pytest.mark.parametrize('promised', [True, False])
+def test_controller_reports_a_watchdog_that_is_missing(ros, promised):
+    """One that was promised, or one that has been there before."""
+    log = ros.listen(topics.Topic('', '/rosout', 'rcl_interfaces/msg/Log', *LOG))
+    diagnostics = ros.listen(topics.DIAGNOSTICS)
+
+    def missing():
+        return any(
+            'torque_watchdog is missing' in status.message
+            for message in diagnostics[-1:]
+            for status in message.status
+        )
+
+    law = ros.add(ControllerNode, {'safety.expect_watchdog': promised})
+    if not promised:
+        for _ in range(20):
+            law._on_second()
+        watchdog = ros.add(WatchdogNode)
+        ros.until(lambda: law._on_second() or law._watchdog._seen)
+        assert not any('torque_watchdog is missing' in line.msg for line in log)
+        ros.kill(watchdog)
+        watchdog._raw_subscriptions.close()
+    ros.until(lambda: law._on_second() or missing())
+    ros.until(lambda: any('torque_watchdog is missing' in line.msg for line in log))
+    ros.add(WatchdogNode)
+    ros.until(lambda: law._on_second() or not missing())
+
+
 def test_controller_does_not_take_the_watchdog_for_an_arm(ros):
-    """Nothing listens to its commands but the second line: it waits with its first torque."""
+    """Nothing listens to its commands but the watchdog: it waits with its first torque."""
     law = ros.add(ControllerNode)
-    assert law.set_parameters([Parameter('torque.limit', value=[15.0, 9.0])])[0].successful
+    assert law.set_parameters([Parameter('torque.limit', value=[15.0, 9.0])])[
+        0
+    ].successful
     watchdog = ros.add(WatchdogNode)
     states = ros.publisher(topics.JOINT_STATES)
-    ros.until(lambda: watchdog.line is not None and states.get_subscription_count() == 2)
-    states.publish(JointStateEncoder(JOINTS).encode(10**9, START, np.zeros(2), np.zeros(2)))
-    ros.until(lambda: watchdog.line.stamp == 10**9)
+    ros.until(
+        lambda: watchdog.watchdog is not None and states.get_subscription_count() == 2
+    )
+    states.publish(
+        JointStateEncoder(JOINTS).encode(10**9, START, np.zeros(2), np.zeros(2))
+    )
+    ros.until(lambda: watchdog.watchdog.stamp == 10**9)
     ros.spin(0.2)
-    assert watchdog.line.config.torque.limit == (15.0, 9.0)  # as changed before
+    assert watchdog.watchdog.config.torque.limit == (15.0, 9.0)  # as changed before
     assert law.guard.journal.messages == 0
     law._on_second()
     assert law.others == 0

@@ -19,36 +19,49 @@ from numpy.typing import NDArray
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.schema import differences, flatten
 from blf_dsc_controller.errors import BlfDscError, StartError
-from blf_dsc_controller.law.checks import INVALID, is_valid_state
+from blf_dsc_controller.law.check_state import CONTRADICTION, INVALID
+from blf_dsc_controller.law.checks import is_valid_state
 from blf_dsc_controller.law.factory import begin, controller_of
 from blf_dsc_controller.messages import codecs
 from blf_dsc_controller.messages.journal import EventType, Journal
-from blf_dsc_controller.reference.approach import BlendedReference, MotionError, check_takeover
-from blf_dsc_controller.reference.trajectory import Trajectory, TrajectoryError, plan_trajectory
-from blf_dsc_controller.supervision import gains
-from blf_dsc_controller.supervision.checks import (
-    PERIOD,
-    SKIP,
-    Phase,
-    Reason,
-    SampleCheck,
-    StateCheck,
-    Supervisor,
-    Velocity,
-    Watchdog,
-    rate_mismatch,
+from blf_dsc_controller.reference.approach import MotionError, check_takeover
+from blf_dsc_controller.reference.retargeting import (
+    PlannedMotion,
+    Target,
+    TrajectoryError,
+    plan_stop,
+    plan_target,
 )
-from blf_dsc_controller.supervision.safe_torque import (
-    SafeTorque,
+from blf_dsc_controller.reference.terms import remaining
+from blf_dsc_controller.reference.trajectory import (
+    Trajectory,
+    plan_trajectory,
+)
+from blf_dsc_controller.supervision import retuning
+from blf_dsc_controller.supervision.first_torque import (
     check_first_torque,
-    check_support,
     limit_first_torque,
 )
+from blf_dsc_controller.supervision.safe_torque import SafeTorque
+from blf_dsc_controller.supervision.sample_check import SampleCheck
+from blf_dsc_controller.supervision.state_check import SKIP, StateCheck, rate_mismatch
+from blf_dsc_controller.supervision.state_watchdog import LONG_SILENCE, PERIOD, Watchdog
+from blf_dsc_controller.supervision.supervisor import Fault, Phase, Reason, Supervisor
+from blf_dsc_controller.supervision.support import check_support
+from blf_dsc_controller.supervision.velocity import Velocity
 
 Vector = NDArray[np.float64]
 _NANO = 1e-9
-_LONG_SILENCE = 2.0  # s
 _MANY = 0.5  # states missed for each that came
+_LONG_GAP = 2.5  # samples
+_IN_A_ROW = 0.1  # s between two states, at most
+# rad/s over twice the speed at the stop, for _SPEEDS_UP: a load that is new makes less of it
+_FASTER = 0.5
+_GROWING = 0.95  # of the largest speed so far
+_SPEEDS_UP = 0.2  # s
+
+# Commands that do not reach the arm may be why.
+_PERHAPS_UNREACHED = (Reason.OUTSIDE_BOUND, Reason.SATURATED, Reason.VELOCITY)
 
 _REASONS: dict[type[codecs.MessageError], Reason] = {
     codecs.MissingJointError: Reason.JOINT_MISSING,
@@ -62,12 +75,12 @@ class LatePlanError(TrajectoryError):
 
 
 class Plan(NamedTuple):
-    """A planned trajectory."""
+    """A planned trajectory, or a target of a stream."""
 
-    trajectory: Trajectory
+    command: Trajectory | Target
     at: float  # s since the start, when it takes effect
     before: np.ndarray  # packed reference that it continues
-    motion: BlendedReference
+    motion: PlannedMotion
 
 
 class Guard:
@@ -101,6 +114,7 @@ class Guard:
     ) -> None:
         """Compile the law; `steady` and `wall` are the clocks [ns]."""
         n = len(config.joints)
+        self._n = n
         self.config = config
         self.controller = controller_of(config)
         self.supervisor = Supervisor()
@@ -118,6 +132,11 @@ class Guard:
         self._velocity = Velocity(n) if config.safety.velocity == 'estimated' else None
         self._safe_torque = SafeTorque(n)
         self._safe_torque.scale = self.controller.state.gain_scale
+        self._seen = 0  # ns, stamp of the last state, used or not
+        self._gap = 0.0  # s, since the one before
+        self._stop_speed = 0.0  # rad/s, largest of a joint at the stop
+        self._peak_speed = 0.0  # rad/s, since then
+        self._speeding = 0.0  # s, for which the arm has been faster in the stop
         self._clean = True  # whether the window holds valid samples only
         self._resumable = False  # whether the law may continue along its reference
         self.journal.note(EventType.CONFIGURE, parameters=flatten(config))
@@ -138,7 +157,9 @@ class Guard:
         `measurement` is [q (n,) rad, dq (n,) rad/s, applied torque of the last interval (n,) N m].
         """
         self._begin_message()
-        gap, self.journal.stamp = (stamp - self.journal.stamp) * _NANO, stamp
+        gap = (stamp - self.journal.stamp) * _NANO
+        self.journal.stamp = stamp
+        self._take_stamp(stamp)
         self.watchdog.restart()
         if self._velocity is not None:
             self._velocity.replace(stamp, measurement)
@@ -146,6 +167,8 @@ class Guard:
             fault = self.states.check(self.config.safety, stamp)
             if fault is SKIP:
                 return None
+            if fault is None and self.supervisor.running:
+                fault = self._clock_step(measurement)
             if fault is None:
                 return self._use(stamp, measurement)
             if self.supervisor.phase is Phase.STARTING:
@@ -163,17 +186,39 @@ class Guard:
         another. `gap` [s] is the time since the state before.
         """
         faded = self._safe_torque.last.age >= self.config.safety.fade_time
-        if not self.silenced and faded and self.commanding and gap > _LONG_SILENCE:
-            self.silenced = True
-            self.supervisor.add(
+        if not self.silenced and faded and self.commanding and gap > LONG_SILENCE:
+            self.withdraw(
                 f'joint states are back after {gap:.3g} s, and no torque is commanded until the '
                 'next reset or activation'
             )
         return self.silenced
 
+    def withdraw(self, text: str) -> None:
+        """Command nothing until the next reset or activation, for a reason."""
+        self._note(EventType.WITHDRAW, text=text)
+        self.silenced = True
+        self.supervisor.add(text)
+
+    def _take_stamp(self, stamp: int) -> None:
+        """Compare velocities with positions only between states in a row."""
+        self._gap = (stamp - self._seen) * _NANO
+        self._seen = stamp
+        if not 0.0 <= self._gap < _IN_A_ROW:
+            self.controller.checks.readings[0] = 0.0
+
+    def _clock_step(self, measurement: Vector) -> Fault | None:
+        """Return the fault of a stamp that has stepped with its clock, not with the arm."""
+        last = self._safe_torque.last
+        if self._gap < _LONG_GAP * self.config.sample_time or last.age > 0.0:
+            return None
+        q, dq, _ = measurement.reshape(3, -1)
+        mean = 0.5 * (dq + last.dq)
+        return self.states.clock_step(self._gap, q - last.q, mean)
+
     def _use(self, stamp: int, measurement: Vector) -> Vector | None:
         """Pass a state to the law, or stop if the law finds it invalid."""
-        law, last = self.controller, self._safe_torque.last
+        law = self.controller
+        last = self._safe_torque.last
         is_first = self.supervisor.phase is Phase.STARTING
         if is_first:
             if not is_valid_state(law.settings, law.checks, measurement):
@@ -186,6 +231,9 @@ class Guard:
         before = perf_counter()
         torque = law.update(self._time_of(stamp), dt, measurement)
         self.compute_time = perf_counter() - before
+        if law.flags & CONTRADICTION:
+            self._distrust_velocities(stamp, measurement)
+            return self._safe_at(stamp, measurement)
         if law.flags & INVALID:
             self._stop(*self.states.invalid(self.config.safety, measurement))
             return self._safe_at(stamp, measurement)
@@ -214,9 +262,54 @@ class Guard:
 
     def _safe_at(self, stamp: int, measurement: Vector) -> Vector | None:
         """Return the safe torque for a state that the law has not used."""
-        limit, dt = self.config.safety.velocity_limit, self.config.sample_time
+        self._compare_velocities(stamp, measurement)
+        limit = self.config.safety.velocity_limit
+        dt = self.config.sample_time
         self._safe_torque.last.take_usable(stamp, measurement, limit, dt)
+        self._check_speed()
         return self._safe(dt)
+
+    def observe(self, stamp: int, measurement: Vector) -> None:
+        """Compare velocities with positions by a state that is held back before the start."""
+        self._take_stamp(stamp)
+        self._compare_velocities(stamp, measurement)
+
+    def _compare_velocities(self, stamp: int, measurement: Vector) -> None:
+        is_next = 0.0 < self._gap < _IN_A_ROW
+        if not is_next or not np.isfinite(measurement[: -self._n]).all():
+            return
+        if self.controller.contradicts(self._gap, measurement):
+            self._distrust_velocities(stamp, measurement)
+
+    def _distrust_velocities(self, stamp: int, measurement: Vector) -> None:
+        """Stop, and difference all velocities from the positions from this state on."""
+        checks = self.controller.checks
+        fault = self.states.contradicted(checks.derived, checks.measured)
+        if self.supervisor.uses_states:
+            self._stop(*fault)
+        else:
+            self.supervisor.add(fault.text)
+        q, dq, _ = measurement.reshape(3, -1)
+        limit = self.config.safety.velocity_limit
+        dq[:] = np.clip(checks.derived, -limit, limit)
+        self._velocity = Velocity(self._n)
+        self._velocity.begin(stamp, q)
+        checks.readings[0] = 0.0
+
+    def _check_speed(self) -> None:
+        """Return to the load known before if the arm speeds up in the safe stop."""
+        if self.supervisor.phase is not Phase.SAFE_STOP or self._speeding > _SPEEDS_UP:
+            return
+        speed = float(np.abs(self.controller.checks.derived).max())
+        self._peak_speed = max(speed, self._peak_speed)
+        is_faster = speed > 2.0 * self._stop_speed + _FASTER
+        is_faster = is_faster and speed > _GROWING * self._peak_speed
+        self._speeding = self._speeding + self._gap if is_faster else 0.0
+        if self._speeding > _SPEEDS_UP and self.config.safety.torque != 'zero':
+            self._safe_torque.stop_observing()
+            self.supervisor.add(
+                f'the arm speeds up in the safe stop, to {speed:.3g} rad/s: engage the brakes'
+            )
 
     def _start(self, stamp: int, measurement: Vector) -> bool:
         """Resume along the running reference if the law can take over, or else start at t = 0."""
@@ -271,6 +364,7 @@ class Guard:
         All checks passed, and `samples.ratio` and the kept estimates are up to date.
         """
         self.journal.stamp = stamp
+        self._seen = stamp
         self.journal.messages += count
         self.journal.commands += count
         self.has_sample = True
@@ -283,7 +377,9 @@ class Guard:
     def reject(self, error: codecs.MessageError) -> Vector | None:
         """Return the torque for an unreadable message, None if it is for another arm."""
         self._begin_message()
-        if isinstance(error, codecs.MissingJointError) and error.is_foreign(self.config.joints):
+        if isinstance(error, codecs.MissingJointError) and error.is_foreign(
+            self.config.joints
+        ):
             self.foreign += 1
             return None
         self.watchdog.restart()
@@ -329,14 +425,24 @@ class Guard:
         return (stamp - self.start_stamp) * _NANO
 
     def _stop(self, reason: Reason, text: str) -> None:
-        missed = self.states.missed / max(self.controller.samples - 1, 1)  # for each that came
+        # for each that came
+        missed = self.states.missed / max(self.controller.samples - 1, 1)
         if missed > _MANY and reason is not Reason.OVERRUN:
             T = self.config.sample_time
             text += f'; {rate_mismatch((1.0 + missed) * T, T)}'
+        was_running = self.supervisor.running
         if self.supervisor.stop(reason, text):
+            if was_running and reason in _PERHAPS_UNREACHED:
+                self.samples.return_to_consistent()
+            reached = reason not in (*_PERHAPS_UNREACHED, Reason.NO_EFFECT)
+            self._stop_speed = float(np.abs(self.controller.checks.derived).max())
+            self._peak_speed = 0.0
+            self._speeding = 0.0
             self.journal.note(EventType.STOP, reason=reason, text=text)
             self._clean = self._resumable = False
-            self._safe_torque.begin_ramp(self.config.safety.stop_ramp, self.samples.disturbance)
+            self._safe_torque.begin_ramp(
+                self.config.safety.stop_ramp, self.samples.disturbance, reached=reached
+            )
 
     def _safe_without_state(self, dt: float) -> Vector | None:
         self.has_sample = False
@@ -385,18 +491,23 @@ class Guard:
         self.samples.keep()
         self._start_over()
 
-    def plan(self, trajectory: Trajectory, at: float | None = None) -> Plan:
-        """Plan a trajectory, in any thread, to `adopt` by the time `at` [s], which defaults to now.
+    def plan(self, command: Trajectory | Target, at: float | None = None) -> Plan:
+        """Plan a motion, in any thread, to `adopt` by the time `at` [s], which defaults to now.
 
         Raises:
             TrajectoryError: it cannot be followed.
         """
         self._check_running()
-        at, before = self.time if at is None else at, self.controller.reference_vector
-        return Plan(trajectory, at, before, plan_trajectory(trajectory, before, at, self.config))
+        at = self.time if at is None else at
+        before = self.controller.reference_vector
+        if isinstance(command, Trajectory):
+            motion = plan_trajectory(command, before, at, self.config)
+        else:
+            motion = plan_target(command, before, at, self.config)
+        return Plan(command, at, before, motion)
 
     def adopt(self, planned: Plan) -> None:
-        """Follow a planned trajectory.
+        """Follow a planned motion.
 
         Raises:
             LatePlanError: it begins in the past.
@@ -408,25 +519,52 @@ class Guard:
                 ['the reference was replaced while it was planned: send it again']
             )
         if planned.at < self.time:
-            text = (
-                f'it should begin at {planned.at:.6g} s, but was planned only at {self.time:.6g} s'
-            )
-            raise LatePlanError([text])
-        joints, points, begin = planned.trajectory
+            due = f'it should begin at {planned.at:.6g} s'
+            raise LatePlanError([f'{due}, but was planned only at {self.time:.6g} s'])
+        command = planned.command
+        if isinstance(command, Target):
+            self._note(EventType.TARGET, **command._asdict(), at=planned.at)
+            self._follow(planned.motion.vector)
+            return
+        joints, points, begin = command
         given = [point._asdict() for point in points]
-        self._note(EventType.TRAJECTORY, joints=joints, points=given, begin=begin, at=planned.at)
-        self.controller.reference_vector, self.settled = planned.motion
+        self._note(
+            EventType.TRAJECTORY,
+            joints=joints,
+            points=given,
+            begin=begin,
+            at=planned.at,
+        )
+        self._follow(planned.motion.vector)
+        self.settled = planned.motion.settled
         is_settled = self.settled <= self.time
         self.supervisor.enter(Phase.TRACKING if is_settled else Phase.APPROACHING)
+
+    def brake(self) -> float:
+        """Bring the reference to rest within the limits, from now on; return when it rests [s].
+
+        Raises:
+            TrajectoryError: the controller is not in command.
+        """
+        self._check_running()
+        self._note(EventType.BRAKE)
+        before = self.controller.reference_vector
+        motion = plan_stop(before, self.time, self.config)
+        self._follow(motion.vector)
+        return motion.end
+
+    def _follow(self, vector: np.ndarray) -> None:
+        self.controller.reference_vector = remaining(vector, self.time)
+        self.settled = min(self.settled, self.time)
 
     def retune(self, config: ControllerConfig) -> None:
         """Apply a configuration, between two samples."""
         self._note(EventType.PARAMETERS, parameters=differences(self.config, config))
         if self.supervisor.running:
             last = self._safe_torque.last.measurement
-            gains.apply_bumpless(self.controller, config, self.time, last)
+            retuning.apply_bumpless(self.controller, config, self.time, last)
         else:
-            gains.apply(self.controller, config)
+            retuning.apply(self.controller, config)
         self.config = config
         self.samples.set_limits(config.safety)
 
@@ -434,7 +572,7 @@ class Guard:
         """Return why a configuration cannot be applied now; empty if it can."""
         if not self.supervisor.running:
             return []
-        return list(gains.problems(self.controller, config, self.time))
+        return list(retuning.problems(self.controller, config, self.time))
 
     @property
     def is_settled(self) -> bool:
@@ -443,7 +581,7 @@ class Guard:
 
     def release(self) -> Vector | None:
         """Return the last torque, if any was commanded: the safe torque of an arm at rest."""
-        self._note(EventType.RELEASE)
+        self._note(EventType.RELEASE, resting=bool(self.is_settled))
         self.has_sample = False  # the last torque is not the law's
         if not self.commanding or self.silenced:
             return None
@@ -466,7 +604,8 @@ class Guard:
         self.has_sample = False
         self._clean = True
         if self._safe_torque.last.age >= self.config.safety.fade_time:
-            self.watchdog.wait()  # else a torque may have to fade, which a driver must not hold
+            # else a torque may have to fade, which a driver must not hold
+            self.watchdog.wait()
 
     def _check_running(self) -> None:
         supervisor = self.supervisor

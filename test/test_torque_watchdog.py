@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The second line: a dead or stopped controller, against a drive that holds the last torque."""
+"""A dead or stopped controller and a drive that holds the last torque: the watchdog takes over."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from random_arm import CONFIG
 from blf_dsc_controller import load_loop
 from blf_dsc_controller.configuration.schema import change
 from blf_dsc_controller.supervision.guard import Guard
-from blf_dsc_controller.supervision.safe_torque import SecondLine
+from blf_dsc_controller.supervision.torque_watchdog import TorqueWatchdog
 from sim_plant.plant import plant_of
 
 TIMEOUT = 0.05  # s
@@ -26,14 +26,15 @@ class Watched(Rig):
 
     def __init__(self, given, period=4):
         super().__init__(given, plant=ARM)
-        self.line = SecondLine(self.config, TIMEOUT)
-        self.period = period  # ms, of the second line
+        self.line = TorqueWatchdog(self.config, TIMEOUT)
+        self.period = period  # ms, of the watchdog
         self.dead = False
-        self.taken = []  # torques of the second line
+        self.taken = []  # torques of the watchdog
 
     def step(self, count=1):
         for _ in range(count):
-            state, now = self.state(), self.plant.sample * 1e-3
+            state = self.state()
+            now = self.plant.sample * 1e-3
             if not self.dead:
                 self.deliver(state.raw())
                 self.line.torque_of_controller(self.commands[-1], now)
@@ -52,7 +53,7 @@ class Watched(Rig):
     ('given', 'angle'), [(AT_REST, 0.01), (HOLDING, 0.15)], ids=['at rest', 'in motion']
 )
 def test_arm_of_a_dead_controller_comes_to_rest(given, angle, period):
-    """The initial estimate is half the truth. Without a second line, the arm in motion goes on."""
+    """The initial estimate is half the truth. Without a watchdog, the arm in motion goes on."""
     rig, alone = Watched(given, period), Watched(given)
     alone.line.poll = lambda _: None
     for each in (rig, alone):
@@ -71,7 +72,9 @@ def test_arm_of_a_dead_controller_comes_to_rest(given, angle, period):
 
 
 @pytest.mark.parametrize(('preset', 'angle'), [('fr3', 0.2), ('ur5e_driver', 0.15)])
-@pytest.mark.parametrize('armed', [False, True], ids=['watching', 'restarted afterwards'])
+@pytest.mark.parametrize(
+    'armed', [False, True], ids=['watching', 'restarted afterwards']
+)
 def test_named_arm_of_a_dead_controller_comes_to_rest(preset, angle, armed):
     """In motion; an FR3 brakes at jumps of 1 N m in a cycle, if its driver lets them pass.
 
@@ -79,10 +82,12 @@ def test_named_arm_of_a_dead_controller_comes_to_rest(preset, angle, armed):
     """
     loop = load_loop(CONFIG / f'{preset}.yaml')
     unlimited = {} if armed else {'actuator.rate_limit': 0.0}
-    guard, plant = Guard(loop.controller), plant_of(change(loop.plant, unlimited))
+    guard = Guard(loop.controller)
+    plant = plant_of(change(loop.plant, unlimited))
     guard.activate()
-    line = SecondLine(loop.controller, TIMEOUT, armed=armed)
-    T, n = loop.controller.sample_time, len(loop.controller.joints)
+    line = TorqueWatchdog(loop.controller, TIMEOUT, armed=armed)
+    T = loop.controller.sample_time
+    n = len(loop.controller.joints)
     death = round(1.1 / T)
     for k in range(death + round(3.0 / T)):
         now, measurement = k * T, plant.measure().copy()
@@ -90,7 +95,9 @@ def test_named_arm_of_a_dead_controller_comes_to_rest(preset, angle, armed):
             start = plant.truth()[-2 * n : -n].copy()
             assert np.abs(measurement[n : 2 * n]).max() > 0.3
         if k < death:
-            torque = guard.update(START + k * loop.controller.sample_time_ns, measurement).copy()
+            torque = guard.update(
+                START + k * loop.controller.sample_time_ns, measurement
+            ).copy()
             if not armed:
                 line.torque_of_controller(torque, now)
         if k >= death or not armed:
@@ -100,7 +107,8 @@ def test_named_arm_of_a_dead_controller_comes_to_rest(preset, angle, armed):
         plant.step(torque)
     assert line.takeovers == 1
     assert not plant.is_stopped
-    q, dq = plant.truth()[-2 * n :].reshape(2, n)  # a count of 17 bits shows as 0.013 rad/s
+    # a count of 17 bits shows as 0.013 rad/s
+    q, dq = plant.truth()[-2 * n :].reshape(2, n)
     assert np.abs(dq).max() < 0.01
     assert np.abs(q - start).max() < angle
 
@@ -145,7 +153,8 @@ def test_torque_is_finite_and_within_its_rate_from_what_the_controller_commanded
     """Polled every 4 ms, by the rate of a sample of 1 ms; an unknown torque is not continued."""
     limited = AT_REST | {'torque.rate_limit': [300.0, 300.0]}
     rig, restarted = Watched(limited), Watched(limited)
-    restarted.line, restarted.dead = SecondLine(rig.config, TIMEOUT, armed=True), True
+    restarted.line = TorqueWatchdog(rig.config, TIMEOUT, armed=True)
+    restarted.dead = True
     rig.step(100)
     last = np.array([20.0, np.nan])
     rig.line.torque_of_controller(last, rig.plant.sample * 1e-3)

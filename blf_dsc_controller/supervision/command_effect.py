@@ -1,0 +1,42 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Whether the arm accelerates after a stop, as one does on which commands or a load act."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+Vector = NDArray[np.float64]
+
+_SETTLING = 0.01  # s, for which the velocities lag behind the stop
+_AVERAGED = 0.02  # s, against their noise
+_NOTICED = 0.05  # of the torque limit
+
+
+class CommandEffect:
+    """Average of the torque M ddq that accelerates the arm.
+
+    An arm held by brakes, or by drives whose effort controller is inactive, does not accelerate,
+    whatever is commanded.  One that brakes by the commanded damping does, or that falls with a load
+    that the model lacks.
+    """
+
+    def __init__(self, n: int) -> None:
+        self._average = np.zeros(n)
+        self.restart()
+
+    def restart(self) -> None:
+        """Forget all that has been seen."""
+        self._elapsed = 0.0
+        self._average[:] = 0.0
+        self.is_proven = False
+
+    def update(self, accelerating: Vector, limit: Vector, dt: float) -> None:
+        """Take the torque (n,) [N m] that has accelerated the arm for `dt` [s]."""
+        self._elapsed += dt
+        if self._elapsed < _SETTLING:
+            return
+        share = min(1.0, dt / _AVERAGED)
+        self._average += share * (accelerating - self._average)
+        largest = float((np.abs(self._average) / limit).max())
+        self.is_proven = self.is_proven or largest > _NOTICED

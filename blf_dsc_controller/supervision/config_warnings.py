@@ -1,0 +1,243 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Warnings about a configuration that is valid but cannot work well.
+
+They concern gains, limits and windows, and are based on the initial parameter estimate, which is a
+guess. doc/tuning.md derives them.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import numpy as np
+
+from blf_dsc_controller.arms.tuning import SAMPLES, UNKNOWN_EFFORT, loop_delay
+from blf_dsc_controller.configuration.controller import ControllerConfig
+from blf_dsc_controller.configuration.robot import implausible_friction
+from blf_dsc_controller.law.factory import settings_of_config
+from blf_dsc_controller.law.state import NEWTON, Settings
+from blf_dsc_controller.supervision.expected_errors import expected_errors
+from blf_dsc_controller.supervision.reference_load import ReferenceLoad, reference_load
+from blf_dsc_controller.supervision.retuning import settings_in_loop
+
+_MARGIN = 1.25  # recommended torque limit over what the reference needs
+_PERIODS = 0.02  # periods by which a window may differ from a whole number
+_LONGEST_LAG = 0.1  # s; drivers have up to 0.03
+_WIDEST_BOUND = 0.35  # rad, 20 degrees
+# exponent of an error in the stiffness it needs: 0.5 without delays
+_STIFFENING = 0.6
+_SLUGGISH = 1.0  # rad/s^2; the weakest joint of the presets has 60
+
+
+class Finding(NamedTuple):
+    """A limit of the gains: on what, how much of it is used, and what follows above 1."""
+
+    subject: str
+    use: float
+    text: str  # goes on after the subject
+
+
+def _of_units(config: ControllerConfig) -> Iterator[str]:
+    """Check for values that are those of another unit."""
+    lag = config.robot.lag
+    if lag > _LONGEST_LAG:
+        yield (
+            f'robot.lag: {lag:g} s between a state and its torque is too long for any loop: is it '
+            f'in ms? Give {1e-3 * lag:g}'
+        )
+    widest = max(config.barrier.widest)
+    if widest > _WIDEST_BOUND:
+        yield (
+            f'barrier.bound: {widest:g} rad is {math.degrees(widest):.3g} degrees and bounds '
+            f'nothing: is it in degrees? Give {math.radians(widest):.3g}'
+        )
+
+
+def config_warnings(
+    config: ControllerConfig, load: ReferenceLoad | None = None
+) -> list[str]:
+    """Return the warnings, one sentence each, beginning with the parameter to change first.
+
+    `load` is that of the reference, if known.
+    """
+    settings = settings_of_config(config)
+    load = load or reference_load(config, settings)
+    found = [*_of_units(config)]
+    if config.model == 'urdf':
+        found += _of_urdf(config, load)
+    found += [f'{each.subject} {each.text}' for each in _of_gains(config, load)]
+    if config.model == 'urdf' and config.law == 'blf_dsc':
+        found += _of_errors(config, settings)
+    if settings.has_barrier == 1 and settings.kappa > 0.0 and settings.Gamma.any():
+        found += _of_learning(config, settings, load)
+    return found
+
+
+def worsened(
+    before: ControllerConfig, after: ControllerConfig, load: ReferenceLoad
+) -> list[str]:
+    """Return the warnings on gains that are new or worse after a change."""
+    known = {each.subject: each.use for each in _of_gains(before, load)}
+    return [
+        f'{each.subject} {each.text}'
+        for each in _of_gains(after, load)
+        if each.use > known.get(each.subject, 1.0)
+    ]
+
+
+def _of_urdf(config: ControllerConfig, load: ReferenceLoad) -> Iterator[str]:
+    """Check for figures that nobody can have measured, and for defaults that are hardly meant."""
+    robot = config.robot
+    chain = robot.chain(config.joints)
+    if (joints := robot.placeholder_efforts(chain)) and not robot.rotor_inertia:
+        largest = max(joint.effort for joint in chain.joints)
+        yield (
+            f'torque.limit: an effort of up to {largest:g} N m for {", ".join(joints)} limits '
+            'nothing on an arm of this weight, from which the inertia of the drives and '
+            'learning.residual_floor follow instead: give the rated torques'
+        )
+    if (joints := implausible_friction(chain)) and not (
+        robot.viscous and robot.coulomb
+    ):
+        yield (
+            f'robot.coulomb: the friction in <dynamics> takes a quarter of the effort of '
+            f'{", ".join(joints)} or more, hardly real, and is not compensated before it is '
+            'learned: give robot.viscous and robot.coulomb'
+        )
+    for joint, limit, inertia in zip(
+        chain.joints, config.torque.limit, load.free_inertia, strict=True
+    ):
+        if math.isinf(joint.effort) and limit == UNKNOWN_EFFORT:
+            yield (
+                f'torque.limit: {joint.name} has no effort in the URDF: {limit:g} N m is assumed; '
+                'set what its drive can withstand'
+            )
+        if limit / inertia < _SLUGGISH:
+            yield (
+                f'robot.urdf: {joint.name} accelerates at only {limit / inertia:.2g} rad/s^2 at '
+                'its torque limit: are masses in kg, inertias in kg m^2, lengths in m?'
+            )
+
+
+def _of_errors(config: ControllerConfig, settings: Settings) -> Iterator[str]:
+    """Check that the errors to expect are within the bound."""
+    bound = settings.bound
+    T = config.sample_time
+    robot = config.robot
+    errors = expected_errors(config, settings)
+    worst = int(np.argmax(errors.unmodelled / bound))
+    if errors.unmodelled[worst] > bound[worst]:
+        yield (
+            'barrier.bound: friction and unmodelled torque (learning.residual_floor) alone push '
+            f'{config.joints[worst]} about {errors.unmodelled[worst]:.2g} rad from its reference: '
+            f'give more than {bound[worst]:g} rad'
+        )
+    worst = int(np.argmax(errors.pick_up / bound))
+    peak = errors.pick_up[worst]
+    if peak > bound[worst]:
+        share = bound[worst] / peak
+        faster = loop_delay(T, robot.lag) * math.sqrt(share) - robot.lag
+        remedy = f'a lower robot.lag than {robot.lag:g} s'
+        stiffer = config.feedback.stiffness / share**_STIFFENING
+        if stiffer <= 1.0:
+            remedy = f'a feedback.stiffness of {math.ceil(100.0 * stiffer) / 100.0:g}'
+        elif faster > 0.0:
+            remedy = f'a sample time of {faster / SAMPLES:.2g} s'
+        yield (
+            f'barrier.bound: when {robot.payload:g} kg (robot.payload) are picked up in motion, '
+            f'{config.joints[worst]} is expected to be {peak:.2g} rad from its reference, past its '
+            f'bound of {bound[worst]:g} rad: a bound of {1.1 * peak:.2g} rad would hold, or '
+            f'{share * robot.payload:.2g} kg, or {remedy}'
+        )
+
+
+def _of_gains(config: ControllerConfig, load: ReferenceLoad) -> list[Finding]:
+    # a limit of next to nothing is exceeded infinitely
+    with np.errstate(over='ignore'):
+        return [each for each in _limits_of_gains(config, load) if each.use > 1.0]
+
+
+def _limits_of_gains(
+    config: ControllerConfig, load: ReferenceLoad
+) -> Iterator[Finding]:
+    settings = settings_in_loop(config)
+    T = config.sample_time
+    damping = np.maximum(load.damping(settings), 1e-12)
+    for joint, need, limit in zip(
+        config.joints, load.torque, config.torque.limit, strict=True
+    ):
+        yield Finding(
+            f'torque.limit: {joint}',
+            _MARGIN * need / limit,
+            f'has {limit:g} N m, but with learning.initial_estimate the reference alone needs '
+            f'{need:.3g} N m: give that and a quarter more',
+        )
+    rate = load.rate(settings)
+    yield Finding(
+        'feedback.gain: K_p over the inertia',
+        rate * T,
+        f'is {rate:.3g} 1/s with learning.initial_estimate, {rate * T:.2g} times the inverse of '
+        'sample_time: above 1 the loop has little margin for delays, and above 2 it chatters '
+        'between the limits: lower either',
+    )
+    absorbed = float(np.max(settings.gamma * T / damping))
+    yield Finding(
+        'disturbance.gain: in each sample the disturbance estimate absorbs',
+        2.0 * absorbed,
+        f'{absorbed:.2g} of the velocity feedback, and above a half it oscillates against '
+        'feedback.gain: lower it',
+    )
+    if settings.has_barrier == 0:
+        return
+    filtering = config.surface.time_constant
+    yield Finding(
+        'surface.time_constant:',
+        T / filtering,
+        f'{filtering:g} s is less than the sample time, {T:g} s: alpha2 follows the measurement '
+        'noise, and its derivative enters the torque: give more',
+    )
+    rate = float(np.max(settings.K / 2.0 + settings.mu))
+    yield Finding(
+        'surface.gain, surface.mu: K/2 + mu',
+        filtering * rate,
+        f'is {rate:.3g} 1/s, but a filter of {filtering:g} s rings above '
+        f'{0.25 / filtering:.3g} 1/s: lower surface.time_constant or the gains',
+    )
+    for joint, ratio in zip(
+        config.joints, settings.slope_limit * T / damping, strict=True
+    ):
+        yield Finding(
+            f'barrier.slope_limit: past the knee of its barrier {joint} is corrected by',
+            ratio / 2.0,
+            f'{ratio:.2g} times its error in a sample, and above 2 the error grows: give less than '
+            '2 feedback.gain / sample_time',
+        )
+
+
+def _of_learning(
+    config: ControllerConfig, settings: Settings, load: ReferenceLoad
+) -> Iterator[str]:
+    learning = config.learning
+    rate = float(settings.Gamma.max())
+    what = 'kappa Gamma T'
+    if settings.update != NEWTON:
+        scale = np.sqrt(settings.Gamma[: settings.p])
+        rate = float(np.linalg.eigvalsh(load.excitation * np.outer(scale, scale))[-1])
+        what = 'kappa lambda_max(Gamma Phi) T'
+    step = settings.kappa * rate * config.sample_time
+    if step > 1.0:
+        yield (
+            f'learning.weight: {what} is {step:.2g}; above 1 the estimate overshoots, above 2 it '
+            'diverges: lower it, or learning.adaptation_gain'
+        )
+    if config.reference.type == 'sinusoids':
+        for frequency in config.reference.frequency:
+            periods = learning.window * frequency / (2.0 * np.pi)
+            if frequency > 0.0 and abs(periods - round(periods)) > _PERIODS:
+                yield (
+                    f'learning.window: {learning.window:g} s are {periods:.3g} periods of the '
+                    f"reference's {frequency:g} rad/s: give whole ones, over which a disturbance "
+                    'of that period averages out'
+                )

@@ -1,0 +1,140 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The first torque, checked before it is sent to an arm that nobody has commanded yet.
+
+Whether drives compensate gravity cannot be told from positions, but from the effort with which they
+hold a resting arm: gravity if they do, nothing if the brakes hold it.  Only its direction and order
+of magnitude are used, so it may also be a current.  An effort of nothing shows nothing if it may
+not be measured, or not contain what the drives add: then a live arm gets no torque of gravity
+without being told that its drives tolerate it (`support`).
+"""
+
+from __future__ import annotations
+
+from math import inf
+
+import numpy as np
+from numpy.typing import NDArray
+
+from blf_dsc_controller.configuration.controller import ControllerConfig
+from blf_dsc_controller.errors import StartError
+from blf_dsc_controller.law.controller import Controller
+from blf_dsc_controller.law.torque import RATE_CUT
+from blf_dsc_controller.supervision.model_torque import model_torque
+
+Vector = NDArray[np.float64]
+
+AT_REST = 0.01
+"""Largest velocity of an arm at rest [rad/s]."""
+
+MATTERS = 0.05
+"""Share of the torque limit from which a torque of gravity matters."""
+
+_NOTICED = 0.02  # of the torque of gravity; a few amperes for some fifty N m
+_ALIKE = 0.9  # cosine of the angle between two torques
+_SEND = 'safety.first_torque: send'
+
+
+def check_first_torque(
+    controller: Controller, config: ControllerConfig, measurement: Vector
+) -> None:
+    """Raise StartError if the first torque must not be sent; the controller has begun.
+
+    `measurement` is [q (n,) rad, dq (n,) rad/s, effort (n,) N m].
+    """
+    if config.safety.first_torque == 'send':
+        return
+    torque = controller.trial(0.0, config.sample_time, measurement)
+    q, dq, effort = measurement.reshape(3, -1)
+    gravity = np.zeros_like(q)
+    if config.robot.urdf:
+        gravity = model_torque(controller.settings, controller.state.estimate, q)
+        _check_gravity(config, dq, effort, gravity, torque)
+    step = np.array(config.torque.first_step)
+    # Of an effort that only contains commands, a torque is held that this one replaces.
+    held = effort if config.robot.effort == 'commanded' else 0.0
+    excess = np.where(step > 0.0, np.abs(torque - held) - step, 0.0)
+    worst = int(np.argmax(excess))
+    if excess[worst] <= 0.0:
+        return
+    text = (
+        f'the first torque would step to {torque[worst]:.4g} N m on joint '
+        f'{config.joints[worst]!r}, more than the {step[worst]:g} N m that its drive tolerates '
+        '(torque.first_step)'
+    )
+    if is_like(torque, gravity):
+        text += (
+            ': it is the gravity of the URDF; if the drives compensate it themselves, set '
+            'robot.drive_compensates to gravity, or to gravity_and_friction'
+        )
+    raise StartError(text)
+
+
+def is_like(torque: Vector, gravity: Vector) -> bool:
+    """Whether a torque (n,) has the direction of gravity, and its order of magnitude."""
+    sizes = float(np.linalg.norm(torque)), float(np.linalg.norm(gravity))
+    return (
+        sizes[0] > _NOTICED * sizes[1]
+        and float(torque @ gravity) > _ALIKE * sizes[0] * sizes[1]
+    )
+
+
+def _check_gravity(
+    config: ControllerConfig,
+    dq: Vector,
+    effort: Vector,
+    gravity: Vector,
+    torque: Vector,
+) -> None:
+    """Raise StartError if the arm would get gravity twice, or not at all."""
+    worst = int(np.argmax(np.abs(gravity)))
+    matters = np.abs(gravity[worst]) > MATTERS * config.torque.limit[worst]
+    if not (matters and np.abs(dq).max() <= AT_REST and np.isfinite(effort).all()):
+        return
+    compensates = config.robot.drive_compensates
+    joint = config.joints[worst]
+    holds = is_like(effort, gravity)
+    is_commanded = config.robot.effort == 'commanded'
+    if compensates == 'none':
+        if not holds or is_commanded:
+            return
+        raise StartError(
+            f'gravity twice: the first torque would be {torque[worst]:.4g} N m on joint {joint!r}, '
+            f'but it rests with an effort of {effort[worst]:.4g} N m before any command: '
+            'the drives compensate gravity (set robot.drive_compensates to gravity), or a torque '
+            'of another or an earlier controller holds the arm (set robot.effort to commanded if '
+            f'the effort never contains anything else, or {_SEND})'
+        )
+    no_gravity = f'no gravity: robot.drive_compensates is {compensates}, but joint {joint!r} rests'
+    if is_commanded and holds:
+        raise StartError(
+            f'{no_gravity} with a commanded effort of {effort[worst]:.4g} N m where none should be '
+            'needed: set it to none, or robot.effort to whole if the effort contains what the '
+            f'drives add, or, if a torque of another controller holds the arm, {_SEND}'
+        )
+    if not is_commanded and np.linalg.norm(effort) <= _NOTICED * np.linalg.norm(
+        gravity
+    ):
+        raise StartError(
+            f'{no_gravity} with an effort of {effort[worst]:.4g} N m where the drives should hold '
+            f'{gravity[worst]:.4g} N m: the first torque, {torque[worst]:.4g} N m, would drop the '
+            'arm. Release the brakes if they hold it, or set robot.drive_compensates to none, or '
+            f'robot.effort to commanded if the effort does not contain what the drives add, or '
+            f'{_SEND}'
+        )
+
+
+def limit_first_torque(controller: Controller, last: Vector, dt: float) -> None:
+    """Limit the rate of the law's first torque, `dt` [s] after the torque `last` (n,) [N m].
+
+    The law does not know `last`.
+    """
+    settings = controller.settings
+    state = controller.state
+    sample = controller.sample
+    step = np.where(settings.rate_limit > 0.0, settings.rate_limit * dt, inf)
+    slowed = np.clip(sample.torque, last - step, last + step)
+    limited = np.clip(slowed, -settings.torque_limit, settings.torque_limit)
+    cut = limited != sample.torque
+    state.rate_cuts[cut] += 1.0
+    sample.cuts[cut] += RATE_CUT
+    sample.torque[:] = state.torque[:] = limited

@@ -1,0 +1,70 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The last usable joint state, from which the safe torque is computed."""
+
+from __future__ import annotations
+
+from math import inf
+
+import numpy as np
+from numpy.typing import NDArray
+
+Vector = NDArray[np.float64]
+
+
+class LastState:
+    """The last usable joint state.
+
+    Attributes:
+        measurement: [q, dq, applied torque] (3 n,) [rad, rad/s, N m].
+        q, dq: views of it; a velocity that is currently unknown is zero.
+        ddq: acceleration since the state before (n,) [rad/s^2], None if it is unknown.
+        age: time without a usable state [s]; infinite before the first.
+    """
+
+    def __init__(self, n: int) -> None:
+        self.measurement = np.zeros(3 * n)
+        self.q = self.measurement[:n]
+        self.dq = self.measurement[n : 2 * n]
+        self.ddq: Vector | None = None
+        self.age = inf
+        self._stamp = -1
+
+    def take(self, stamp: int, measurement: Vector) -> None:
+        """Store a valid state with its stamp [ns]."""
+        self.measurement[:] = measurement
+        self.ddq = None
+        self.age = 0.0
+        self._stamp = stamp
+
+    def take_usable(
+        self, stamp: int, measurement: Vector, velocity_limit: float, period: float
+    ) -> None:
+        """Store the usable part of any other state, `period` [s] after the last.
+
+        Positions that are not finite or have a repeated stamp do not show where the arm is now. A
+        velocity that is missing, not finite or beyond the limit is replaced with the one
+        differenced from the positions, within the limit.
+        """
+        q, dq, _ = measurement.reshape(3, -1)
+        if stamp == self._stamp or not np.isfinite(q).all():
+            self.miss(period)
+            return
+        elapsed = (stamp - self._stamp) * 1e-9
+        is_next = self.age == 0.0 and elapsed > 0.0
+        differenced = np.zeros_like(q)
+        if is_next:
+            differenced = np.clip(
+                (q - self.q) / elapsed, -velocity_limit, velocity_limit
+            )
+        usable = np.where(np.abs(dq) <= velocity_limit, dq, differenced)
+        self.ddq = (usable - self.dq) / elapsed if is_next else None
+        self.q[:] = q
+        self.dq[:] = usable
+        self.age = 0.0
+        self._stamp = stamp
+
+    def miss(self, period: float) -> None:
+        """Account for `period` [s] without a usable state."""
+        self.dq[:] = 0.0
+        self.ddq = None
+        self.age += period

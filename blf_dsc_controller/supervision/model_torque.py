@@ -1,0 +1,37 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Torques of the estimated model: of a motion, and of friction."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from blf_dsc_controller.arms.model import regressors_at
+from blf_dsc_controller.compiled.elementary import tanh
+from blf_dsc_controller.law.state import Settings
+
+Vector = NDArray[np.float64]
+
+
+def model_torque(settings: Settings, estimate: Vector, *motion: Vector) -> Vector:
+    """Return H(q, dq, dq, ddq) P^ (n,) [N m] of a motion q, dq, ddq (n,); at rest of q alone."""
+    q, dq, ddq = motion if len(motion) > 1 else (*motion, *np.zeros((2, settings.n)))
+    (H,) = regressors_at(
+        settings.model, *(vector[np.newaxis] for vector in (q, dq, dq, ddq))
+    )
+    return np.asarray((H * estimate[: settings.p]).sum(axis=1))
+
+
+def friction_torque(settings: Settings, estimate: Vector, dq: Vector) -> Vector:
+    """Return the friction (n,) [N m] of the estimate at dq (n,) [rad/s], zero without columns."""
+    n = settings.n
+    at = settings.p + settings.n * settings.bias
+    torque = np.zeros(n)
+    for is_on, effect in (
+        (settings.viscous, dq),
+        (settings.coulomb, [tanh(speed) for speed in dq / settings.coulomb_velocity]),
+    ):
+        if is_on:
+            torque += estimate[at : at + n] * effect
+            at += n
+    return torque

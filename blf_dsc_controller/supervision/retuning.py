@@ -1,0 +1,106 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Changes of the gains of a running law without a jump of its torque.
+
+A jump of the gains at unchanged errors would make the torque jump. Two states of the law absorb
+the difference: the surface filter is shifted with the virtual control, so that alpha2' does not
+change, and the disturbance estimate, the integrator of the law, absorbs the rest; it then returns
+to its own value at the rate of its gain. A joint whose disturbance gain is 0 has no integrator, so
+its torque steps.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+from blf_dsc_controller.configuration.controller import ControllerConfig
+from blf_dsc_controller.law import barrier
+from blf_dsc_controller.law.controller import Controller
+from blf_dsc_controller.law.factory import law_of, settings_of_config
+
+Floats = NDArray[np.float64]
+
+settings_in_loop = lru_cache(maxsize=2)(settings_of_config)
+"""As `settings_of_config`, computed once for the configurations before and after a change.
+
+It takes some samples of the loop, in whose thread a change is checked and applied. The arrays are
+for reading only.
+"""
+
+_STABLE = 2.0  # x += -a x diverges for a >= 2
+_ROUNDED = 1.0 + 1e-9  # times the radius, on which the projection may hold an estimate
+
+
+def apply(controller: Controller, config: ControllerConfig) -> None:
+    """Replace the gains of a law."""
+    controller.retune(law_of(config), settings_in_loop(config))
+
+
+def apply_bumpless(
+    controller: Controller, config: ControllerConfig, t: float, measurement: Floats
+) -> None:
+    """Replace the settings of a running law without a jump of its torque.
+
+    `t` [s] and `measurement` (3 n,) are those of the last sample.
+    """
+    state = controller.state
+    signals = controller.signals
+    T = config.sample_time
+    controller.trial(t, T, measurement)
+    beta2 = signals.beta2.copy()
+    demand = signals.demand.copy()
+    apply(controller, config)
+    if controller.settings.has_barrier == 1:
+        controller.trial(t, T, measurement)
+        state.alpha2[:] += signals.beta2 - beta2
+    controller.trial(t, T, measurement)
+    integrates = controller.settings.gamma > 0.0
+    state.disturbance[integrates] -= (signals.demand - demand)[integrates]
+
+
+def problems(
+    controller: Controller, config: ControllerConfig, t: float
+) -> Iterator[str]:
+    """Yield reasons why a running law cannot accept a valid configuration at time t [s]."""
+    state = controller.state
+    p = controller.settings.p
+    learning = config.learning
+    errors = np.abs(controller.sample.xi1)
+    torques = np.abs(controller.sample.torque)
+    settings = settings_in_loop(config)
+    barrier.update_bound(settings, controller.signals, t)
+    for joint, error, bound in zip(
+        config.joints, errors, controller.signals.bound, strict=True
+    ):
+        if not error < bound:
+            yield (
+                f'barrier.bound: {joint} is {error:.6g} rad from its reference now, outside of a '
+                f'bound of {bound:g} rad: choose a wider one, or try again with a smaller error'
+            )
+    for joint, torque, limit in zip(
+        config.joints, torques, config.torque.limit, strict=True
+    ):
+        if torque > limit:
+            yield (
+                f'torque.limit: {joint} is held with {torque:.4g} N m now, more than a limit of '
+                f'{limit:g} N m: choose a higher one'
+            )
+    norm = float(np.linalg.norm(state.estimate[:p]))
+    if norm > _ROUNDED * learning.radius:
+        yield (
+            f'learning.radius: the norm of the estimate is {norm:.4g} kg m^2 now, above a '
+            f'radius of {learning.radius:g} kg m^2: choose a larger one'
+        )
+    stretch = (
+        1.0 if learning.update == 'newton' else float(np.linalg.norm(state.Phi, 2))
+    )
+    step = learning.weight * float(settings.Gamma.max()) * stretch * config.sample_time
+    if state.latched[0] and step >= _STABLE:
+        yield (
+            f'learning.weight: with the update {learning.update}, each sample would correct the '
+            f'estimates by {step:.3g} times their error, which diverges at {_STABLE:g} or more: '
+            'lower learning.weight or learning.adaptation_gain'
+        )

@@ -1,0 +1,205 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Checks of every sample that the law computed, before its torque is sent."""
+
+from __future__ import annotations
+
+from math import inf
+
+import numpy as np
+from numpy.typing import NDArray
+
+from blf_dsc_controller.configuration.controller import ControllerConfig, Safety
+from blf_dsc_controller.law.check_state import NO_EFFECT, OUTSIDE, SUSPECT
+from blf_dsc_controller.law.controller import Controller
+from blf_dsc_controller.supervision.supervisor import Fault, Reason
+
+Vector = NDArray[np.float64]
+_LIGHT = 0.5  # of the assumed inertia: less is worth saying
+_NOTHING = 0.02  # of it: no drive has so little
+# s without saturation that make up for one with it: more than a fifth adds up
+_RELIEF = 4
+
+
+class SampleCheck:
+    """Checks each sample of a controller, and keeps the estimates of the last valid one.
+
+    Attributes:
+        ratio: largest |xi1| / k_c of each joint since the start (n,).
+        outside: samples past the bound since the start.
+        saturated: samples with a torque at its limit since the start.
+    """
+
+    def __init__(self, config: ControllerConfig, controller: Controller) -> None:
+        """Enable the checks of the controller."""
+        controller.checks.sample_time[0] = config.sample_time
+        controller.checks.compares[0] = float(
+            config.robot.effort in ('whole', 'commanded')
+        )
+        self._joints = config.joints
+        self._controller = controller
+        self.ratio = controller.checks.ratio
+        self._kept = controller.checks.kept
+        self._saturation = 0  # ns, times _RELIEF
+        self.set_limits(config.safety)
+        self.keep()
+        self.restart()
+
+    def set_limits(self, safety: Safety) -> None:
+        """Apply these limits to the next samples."""
+        self._safety = safety
+        checks = self._controller.checks
+        checks.velocity_limit[0] = safety.velocity_limit
+        checks.error_ratio[0] = safety.error_ratio
+
+    def restart(self) -> None:
+        """Reset the counts, starting with the next sample."""
+        self.ratio[:] = 0.0
+        self.outside = self.saturated = 0
+        self._controller.checks.consistent[:] = self._kept
+        self._controller.checks.moved[:] = self._kept
+        self.relax()
+
+    @property
+    def saturated_time(self) -> float:
+        """Time at a torque limit [s], less a quarter of the time without since then."""
+        return self._saturation * 1e-9 / _RELIEF
+
+    def relax(self, duration: float = inf) -> None:
+        """Account for some time without saturation [s]."""
+        # Whole nanoseconds: many samples at once leave what they leave one by one.
+        left = self._saturation - round(duration * 1e9) if duration < inf else 0
+        self._saturation = max(0, left)
+
+    @property
+    def estimate(self) -> Vector:
+        """The kept estimate (m,)."""
+        return self._kept[: self._controller.settings.m]
+
+    @property
+    def disturbance(self) -> Vector:
+        """The kept disturbance estimate d^3 (n,) [N m]."""
+        return self._kept[self._controller.settings.m :]
+
+    def keep(self) -> None:
+        """Keep the current estimates."""
+        state = self._controller.state
+        np.concatenate((state.estimate, state.disturbance), out=self._kept)
+
+    def return_to_consistent(self) -> None:
+        """Keep the estimates from before the error grew: the commands may not reach the arm."""
+        self._kept[:] = self._controller.checks.consistent
+
+    def restore(self) -> None:
+        """Reset the controller, but set its estimates to the kept ones."""
+        self._controller.reset()
+        state = self._controller.state
+        state.estimate[:] = self.estimate
+        state.disturbance[:] = self.disturbance
+
+    def check(self, dt: float) -> Fault | None:
+        """Return why the torque of a sample, `dt` [s] after the one before, must not be used."""
+        flags = self._controller.flags
+        if flags & OUTSIDE:
+            self.outside += 1
+        if not flags & SUSPECT:
+            self.relax(dt)
+            return None
+        if flags & NO_EFFECT:
+            return self._without_effect()
+        fault = self._not_finite() or self._outside() or self._saturated(dt)
+        if fault is None:
+            self.keep()
+        return fault
+
+    def _not_finite(self) -> Fault | None:
+        state = self._controller.state
+        demand = self._controller.signals.demand
+        if not (
+            np.isfinite(state.estimate).all() and np.isfinite(state.disturbance).all()
+        ):
+            text = f'an estimate is not finite: {state.estimate}, disturbance {state.disturbance}'
+            return Fault(Reason.ESTIMATE, text)
+        # Saturation turns an infinite demand into a finite torque.
+        if not (
+            np.isfinite(demand).all()
+            and np.isfinite(self._controller.sample.torque).all()
+        ):
+            return Fault(Reason.TORQUE, f'the demanded torque is not finite: {demand}')
+        return None
+
+    def _without_effect(self) -> Fault:
+        """Return to the estimates from before the commands had no effect."""
+        checks = self._controller.checks
+        limit = self._controller.settings.torque_limit
+        self._kept[:] = checks.moved
+        if checks.lacking[0] > 0.0:
+            lack = checks.lack - checks.known
+            worst = int(np.argmax(np.abs(lack) / limit))
+            text = (
+                f'the effort of joint {self._joints[worst]!r} lacks {lack[worst]:+.4g} N m of '
+                'what is commanded: release the brakes, and activate the effort controller; if the '
+                'effort is not a torque in N m, set robot.effort to current or unknown'
+            )
+            return Fault(Reason.NO_EFFECT, text)
+        change = checks.recent - checks.before
+        worst = int(np.argmax(np.abs(change) / limit))
+        text = (
+            f'the torque of joint {self._joints[worst]!r} has changed by {change[worst]:+.4g} N m, '
+            'but no joint has moved: release the brakes, and activate the effort controller'
+        )
+        return Fault(Reason.NO_EFFECT, text)
+
+    def _outside(self) -> Fault | None:
+        safety = self._safety
+        if safety.error_ratio == 0.0 or self._controller.settings.has_barrier == 0:
+            return None
+        xi1 = self._controller.sample.xi1
+        bound = self._controller.sample.bound
+        ratio = np.abs(xi1) / bound
+        worst = int(np.argmax(ratio))
+        if ratio[worst] < safety.error_ratio:
+            return None
+        share = '' if safety.error_ratio == 1.0 else f'{safety.error_ratio:g} times '
+        text = (
+            f'joint {self._joints[worst]!r} is {xi1[worst]:+.6g} rad from its reference: '
+            f'past {share}its bound of {bound[worst]:.6g} rad'
+        )
+        return Fault(Reason.OUTSIDE_BOUND, text + self._lightness(worst))
+
+    def _lightness(self, joint: int) -> str:
+        """Return what was found if the inertia of a joint's drive is far below the assumed."""
+        settings = self._controller.settings
+        state = self._controller.state
+        if state.gain_scale[joint] > _LIGHT:
+            return ''
+        assumed = settings.unsure_rotor[joint]
+        error = state.rotor_error[joint]
+        if assumed + error < _NOTHING * assumed:
+            return (
+                '; it moves as if nothing were commanded: release the brakes, and activate the '
+                'effort controller'
+            )
+        return (
+            f'; its drive seems to have {assumed + error:.2g} kg m^2 instead of the {assumed:.2g} '
+            f'assumed, too little for these gains to hold: give robot.rotor_inertia, or a wider '
+            f'bound'
+        )
+
+    def _saturated(self, dt: float) -> Fault | None:
+        """Count a sample in which a torque is at its limit: what else is suspect has stopped."""
+        signals = self._controller.signals
+        limit = self._controller.settings.torque_limit
+        needed = np.maximum(
+            np.abs(signals.demand), np.abs(signals.demand - signals.added)
+        )
+        self.saturated += 1
+        self._saturation += _RELIEF * round(dt * 1e9)
+        if self.saturated_time <= self._safety.saturation_time:
+            return None
+        worst = int(np.argmax(needed - limit))
+        text = (
+            f'joint {self._joints[worst]!r} needs {needed[worst]:.4g} N m and has been at '
+            f'its limit of {limit[worst]:g} N m for {self.saturated_time:.4g} s (less a quarter '
+            'of the time in between)'
+        )
+        return Fault(Reason.SATURATED, text)

@@ -1,0 +1,167 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Checks of joint states before the law uses them: stamps, missed and invalid states.
+
+They read no clock, so the same states always have the same faults.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from blf_dsc_controller.configuration.controller import Safety
+from blf_dsc_controller.supervision.supervisor import Fault, Reason
+
+Vector = NDArray[np.float64]
+_NANO = 1e-9
+_PUBLISHER_PERIOD = 0.015  # s: joint_state_publisher has 10 Hz by default, Franka's 30
+_REPEATS = 3  # states in a row with the stamp of the one before that are ignored
+_FEW = 2.5  # samples: a shorter step of the clock is no matter
+_MOVING = 0.02  # rad/s: a slower motion shows no time
+_LESS = 0.5  # of the time by the stamps
+_AVERAGED = 1.0  # s, over which missed states are
+
+SKIP = Fault(Reason.NONE, '')
+"""Returned for a state to ignore."""
+
+
+def rate_mismatch(period: float, sample_time: float) -> str:
+    """Return what to do about joint states that come every `period` [s]."""
+    found = f'joint states come every {period:.3g} s, but sample_time is {sample_time:g} s: '
+    if period > _PUBLISHER_PERIOD and sample_time < _PUBLISHER_PERIOD:
+        return (
+            f'{found}this is the rate of a joint_state_publisher, not of an arm: subscribe to the '
+            'topic of the joint_state_broadcaster itself (of franka_ros2: '
+            '-r joint_states:=franka/joint_states), whose rate is update_rate of '
+            'controller_manager'
+        )
+    return (
+        f'{found}set update_rate of controller_manager (100 Hz by default) to '
+        f'{1.0 / sample_time:.6g}, or '
+        'sample_time to the period of the topic'
+    )
+
+
+class StateCheck:
+    """Checks joint states, one after the other.
+
+    Attributes:
+        repeated: states ignored because their stamp was repeated.
+        missed: states missing between consecutive stamps, since the start.
+        missed_fraction: fraction of missed states, averaged exponentially over a second; by their
+            stamps, so a slow computer in lock-step misses none.
+    """
+
+    def __init__(self, joints: Sequence[str], sample_time: float) -> None:
+        """`sample_time` is T [s]."""
+        self._joints = tuple(joints)
+        self._sample_time = sample_time
+        self.repeated = 0
+        self.restart()
+
+    def restart(self) -> None:
+        """Start with the next state, whatever its stamp."""
+        self.missed = 0
+        self.missed_fraction = 0.0
+        self._last_stamp = -1
+        self._repeats = 0
+
+    def advance(self, stamp: int) -> None:
+        """Mark all states up to a stamp [ns] as checked."""
+        self._last_stamp = stamp
+
+    def check(self, safety: Safety, stamp: int) -> Fault | None:
+        """Return why the controller must stop, SKIP to ignore the state, or None to use it.
+
+        The stamp is in ns; the values are checked by the law (`law.checks.is_valid_state`).
+        """
+        if stamp <= 0:
+            text = f'a joint state has the stamp {stamp} ns, which is not a valid time'
+            return Fault(Reason.STAMP_MISSING, text)
+        is_first = self._last_stamp < 0
+        step = self._sample_time if is_first else (stamp - self._last_stamp) * _NANO
+        if step == 0.0:
+            return self._check_repeats()
+        self._repeats = 0
+        if step < 0.0:
+            text = f'the stamp of a joint state is {-step:.6g} s before the last one'
+            return Fault(Reason.STAMP_BACKWARD, text)
+        if step > self._sample_time + safety.state_timeout:
+            text = (
+                f'the stamp of a joint state is {step:.6g} s after the last one: '
+                f'{self._sample_time:g} s is the sample time, and it may be late by '
+                f'{safety.state_timeout:g} s (safety.state_timeout)'
+            )
+            return Fault(Reason.STAMP_JUMP, text)
+        self._last_stamp = stamp
+        return self._count_missed(safety, max(1, round(step / self._sample_time)) - 1)
+
+    def _check_repeats(self) -> Fault:
+        self.repeated += 1
+        self._repeats += 1
+        if self._repeats <= _REPEATS:
+            return SKIP
+        text = f'{self._repeats} joint states in a row repeat the stamp of the one before them'
+        return Fault(Reason.STAMP_REPEATED, text)
+
+    def _count_missed(self, safety: Safety, missed: int) -> Fault | None:
+        keep = 1.0 - min(1.0, self._sample_time / _AVERAGED)
+        self.missed += missed
+        self.missed_fraction *= keep
+        if missed:
+            self.missed_fraction = 1.0 - (1.0 - self.missed_fraction) * keep**missed
+        if self.missed_fraction <= safety.overrun_fraction:
+            return None
+        text = (
+            f'{100.0 * self.missed_fraction:.0f} % of the joint states were missed: more than '
+            'safety.overrun_fraction allows, or the arm sends them less often than every '
+            f'{self._sample_time:g} s (sample_time)'
+        )
+        return Fault(Reason.OVERRUN, text)
+
+    def contradicted(self, derived: Vector, measured: Vector) -> Fault:
+        """Return the fault of velocities (n,) [rad/s] that are not those of the positions."""
+        worst = int(np.argmax(np.abs(derived - measured)))
+        text = (
+            f'the velocity of joint {self._joints[worst]!r} is {measured[worst]:+.3g} rad/s, but '
+            f'its positions change by {derived[worst]:+.3g} rad/s: a sensor is stuck or has the '
+            'wrong sign, or the velocities are those of other joints; they are differenced from '
+            'the positions from now on'
+        )
+        return Fault(Reason.VELOCITY, text)
+
+    def clock_step(self, gap: float, q_step: Vector, dq: Vector) -> Fault | None:
+        """Return a fault if the arm has moved for much less than `gap` [s] since the last state.
+
+        `q_step` (n,) [rad] is the motion since then, `dq` (n,) [rad/s] its mean velocity.
+        """
+        speed = float(dq @ dq)
+        if gap < _FEW * self._sample_time or speed < _MOVING**2:
+            return None
+        moved_for = float(q_step @ dq) / speed
+        if moved_for > _LESS * gap:
+            return None
+        text = (
+            f'the stamp of a joint state is {gap:.4g} s after the last one, but the arm has moved '
+            f'as in {max(0.0, moved_for):.2g} s: the clock was set; let it be slewed instead '
+            '(chrony: no makestep after the start)'
+        )
+        return Fault(Reason.STAMP_JUMP, text)
+
+    def invalid(self, safety: Safety, measurement: Vector) -> Fault:
+        """Return the fault of an invalid [q (n,) rad, dq (n,) rad/s, effort (n,) N m]."""
+        q, dq, _ = measurement.reshape(3, -1)
+        if not np.isfinite(q).all():
+            return Fault(Reason.NOT_FINITE, f'the positions are not finite: {q}')
+        if not np.isfinite(dq).all():
+            text = f'velocities are missing or not finite: {dq}'
+            remedy = 'if the hardware measures none, set safety.velocity to estimated'
+            return Fault(Reason.NOT_FINITE, f'{text}; {remedy}')
+        worst = int(np.argmax(np.abs(dq)))
+        text = (
+            f'the velocity of joint {self._joints[worst]!r} is {dq[worst]:+.6g} rad/s: more '
+            f'than safety.velocity_limit, {safety.velocity_limit:g} rad/s'
+        )
+        return Fault(Reason.VELOCITY, text)

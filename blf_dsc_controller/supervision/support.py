@@ -1,0 +1,43 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Whether anything shows what holds a live arm at rest before the start."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from blf_dsc_controller.configuration.controller import ControllerConfig
+from blf_dsc_controller.errors import StartError
+from blf_dsc_controller.law.controller import Controller
+from blf_dsc_controller.supervision.first_torque import AT_REST, MATTERS, is_like
+from blf_dsc_controller.supervision.model_torque import model_torque
+
+Vector = NDArray[np.float64]
+
+
+def check_support(
+    controller: Controller, config: ControllerConfig, measurement: Vector
+) -> None:
+    """Raise StartError if nothing shows what holds a live arm at rest, and nothing limits a step.
+
+    It may be brakes, or drives that compensate gravity, to which gravity would be added.
+    """
+    robot = config.robot
+    is_known = robot.drive_compensates != 'none' or robot.effort in ('whole', 'current')
+    if not robot.urdf or is_known or config.safety.first_torque == 'send':
+        return
+    q, dq, effort = measurement.reshape(3, -1)
+    gravity = model_torque(controller.settings, controller.state.estimate, q)
+    unlimited = np.where(np.array(config.torque.first_step) > 0.0, 0.0, np.abs(gravity))
+    worst = int(np.argmax(unlimited))
+    matters = unlimited[worst] > MATTERS * config.torque.limit[worst]
+    # which the check above sees
+    is_held = np.isfinite(effort).all() and is_like(effort, gravity)
+    if matters and not is_held and not np.abs(dq).max() > AT_REST:
+        raise StartError(
+            f'what holds the arm? It rests, its gravity is {gravity[worst]:.4g} N m on joint '
+            f'{config.joints[worst]!r}, and its effort of {effort[worst]:.4g} N m does not show '
+            'whether brakes hold it or drives that compensate gravity. Set robot.drive_compensates '
+            'if they do; if not, set robot.effort to whole if the drives measure torques, or '
+            'torque.first_step to the torques that may be sent at once'
+        )

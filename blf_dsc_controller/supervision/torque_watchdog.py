@@ -1,0 +1,151 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The safe torque in the place of a silent controller."""
+
+from __future__ import annotations
+
+from math import inf
+
+import numpy as np
+from numpy.typing import NDArray
+
+from blf_dsc_controller.configuration.controller import ControllerConfig
+from blf_dsc_controller.law.factory import settings_of_config
+from blf_dsc_controller.supervision.model_torque import model_torque
+from blf_dsc_controller.supervision.safe_torque import SafeTorque
+from blf_dsc_controller.supervision.state_watchdog import LONG_SILENCE
+
+Vector = NDArray[np.float64]
+
+
+class TorqueWatchdog:
+    """Decides when to command in the place of a silent controller, and what.
+
+    Times are those [s] of a steady clock. It commands when no torque of the controller has been
+    seen for `timeout` while joint states went on by half of that, by their stamps: a plant in
+    lock-step, which waits for a torque, is left alone. It ends with the next torque of the
+    controller, or when the safe torque has faded because the states stopped, too.
+
+    It then waits for the next torque of the controller before it watches again, as it does after
+    a silence of the states of LONG_SILENCE, and after the controller has said that its silence is
+    meant (`stand_down`).
+
+    The gravity is that of the initial estimate, and what it lacks (a payload, say) is observed from
+    the motion and the controller's torques all along, as in a safe stop.
+
+    Attributes:
+        config: configuration of the controller.
+        active: whether it commands now.
+        takeovers: how often it began to.
+        stamp: of the last joint state [ns]; -1 before the first.
+        silence: time [s] without a torque of the controller at the last takeover.
+        stands_down: whether the controller has said that its silence is meant.
+    """
+
+    def __init__(
+        self, config: ControllerConfig, timeout: float, *, armed: bool = False
+    ) -> None:
+        """Compile the model of a controller's configuration.
+
+        With `armed` it does not wait for a first torque: the controller has died before.
+        """
+        self.active = False
+        self.takeovers = 0
+        self.silence = 0.0
+        self.stands_down = False
+        self._timeout = timeout
+        self._safe = SafeTorque(len(config.joints))
+        self.config = config
+        self.configure(config)
+        self.stamp = -1
+        self._commanded_stamp = -1  # of the last state before the last torque
+        self._seen_at = -inf
+        self._polled_at = -inf
+        self._commanded_at = inf  # no takeover before the first torque
+        self._knows_torque = False
+        self._armed = armed
+        model_torque(self._settings, self._estimate, np.zeros(self._settings.n))
+
+    def configure(self, config: ControllerConfig) -> None:
+        """Use another configuration of the same joints, from the next torque on."""
+        if config.robot != self.config.robot:
+            self._safe.load[:] = 0.0  # what was missing was missing from another model
+        self.config = config
+        self._settings = settings_of_config(config)
+        self._estimate = self._settings.initial_estimate
+        self._safe.longest_step = config.sample_time
+
+    def stand_down(self) -> None:
+        """Command nothing until the controller commands again after `stand_by`."""
+        self.stands_down = True
+        self._forget_controller()
+
+    def stand_by(self) -> None:
+        """Watch again from the next torque of the controller on."""
+        if self.stands_down:
+            self.stands_down = False
+            self._forget_controller()
+
+    def state(self, stamp: int, measurement: Vector, now: float) -> None:
+        """Take a joint state with its stamp [ns]; `measurement` is [q, dq, effort] (3 n,)."""
+        limit = self.config.safety.velocity_limit
+        self._safe.last.take_usable(stamp, measurement, limit, self.config.sample_time)
+        if now - self._seen_at > LONG_SILENCE:
+            self._forget_controller()
+        if stamp > self.stamp or self.stamp < 0:
+            self._seen_at = now
+        self.stamp = stamp
+        if self._armed:
+            self._armed = False
+            self._commanded_at = now
+            self._commanded_stamp = stamp
+
+    def torque_of_controller(self, torque: Vector, now: float) -> None:
+        """Take a torque (n,) [N m] that the controller has commanded, and hand over to it."""
+        self._safe.commanded[:] = np.nan_to_num(torque)
+        self._knows_torque = True
+        self._commanded_at = now
+        self._commanded_stamp = self.stamp
+        self.active = False
+
+    def poll(self, now: float) -> Vector | None:
+        """Return the torque (n,) [N m] to command now, None to stay silent."""
+        dt = min(now - self._polled_at, self._timeout)
+        self._polled_at = now
+        safety = self.config.safety
+        safe = self._safe
+        if now - self._seen_at > self.config.sample_time + safety.state_timeout:
+            safe.last.miss(dt)
+        if not self.active:
+            if self._knows_torque:
+                safe.observe(self._settings, self._estimate, dt)
+            self._begin_if_due(now)
+        if not self.active:
+            return None
+        torque = safe.advance(safety, self._settings, self._estimate, dt)
+        if safe.last.age >= safety.fade_time:
+            self._forget_controller()
+        return torque
+
+    def leave(self) -> Vector | None:
+        """Return the torque to leave behind, None if the controller commands."""
+        if not self.active:
+            return None
+        return self._safe.leave(self.config.safety, self._settings, self._estimate)
+
+    def _forget_controller(self) -> None:
+        """Wait for a torque of the controller."""
+        self.active = False
+        self._commanded_at = inf
+
+    def _begin_if_due(self, now: float) -> None:
+        silence = now - self._commanded_at
+        gone_on = (self.stamp - self._commanded_stamp) * 1e-9
+        is_silent = silence > self._timeout and gone_on > 0.5 * self._timeout
+        if self.stands_down or not is_silent:
+            return
+        self.active = True
+        self.silence = silence
+        self.takeovers += 1
+        # as if the torque that the drive holds were the model's
+        if not self._knows_torque:
+            self._safe.leave(self.config.safety, self._settings, self._estimate)

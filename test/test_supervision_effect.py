@@ -1,0 +1,146 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Commands that have no effect are found on any bound; a healthy arm is not taken for one.
+
+Whatever stops an arm whose commands do not reach it, nothing that the law made of that is
+commanded afterwards.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from fault_table import Rig
+
+from blf_dsc_controller.configuration.controller import ControllerConfig
+from blf_dsc_controller.configuration.nodes import load_loop
+from blf_dsc_controller.configuration.schema import build, change
+from blf_dsc_controller.simulation.loop import START, simulate
+from blf_dsc_controller.supervision.command_effect import CommandEffect
+from blf_dsc_controller.supervision.guard import Guard
+from blf_dsc_controller.supervision.supervisor import Reason
+from sim_plant.plant import plant_of
+
+
+@pytest.mark.parametrize('bound', [0.03, 0.5, 5.0])
+def test_bound_does_not_decide_whether_an_arm_has_moved(bound):
+    """With motion from 2 % of the bound on, nothing moved within the first 0.05 s."""
+    loop = load_loop('recommended')
+    config = change(loop.controller, {'barrier.bound': [bound] * 2})
+    record = simulate(config, change(loop.plant, {'duration': 0.3}))
+    assert record.run().stops == ()
+
+
+@pytest.mark.parametrize(
+    ('effort', 'bound'), [('whole', 0.005), ('unknown', 0.005), ('whole', 0.05)]
+)
+def test_arm_at_rest_that_gently_receives_a_load_is_not_stopped(effort, bound):
+    """2 kg within 0.5 s: the Panda sags by 0.4 mrad, a hundred times the step of its sensors."""
+    arm = {'robot.urdf': 'panda.urdf', 'robot.tip': 'panda_hand_tcp'}
+    law = {'reference.type': 'hold', 'robot.effort': effort}
+    config = build(ControllerConfig, arm | law | {'barrier.bound': [bound] * 7})
+    load = {
+        'events.begin': [0.5],
+        'events.duration': [0.0],
+        'events.ramp': [0.5],
+        'events.payload': [2.0],
+        'duration': 1.5,
+    }
+    record = simulate(config, change(load_loop('panda').plant, load))
+    assert record.run().stops == ()
+    torque = record.run().torque
+    assert np.abs(torque[-1] - torque[400]).max() > 10.0  # N m: the load is held
+
+
+@pytest.mark.parametrize('bound', [0.002, 0.05])
+def test_brakes_are_found_on_any_bound_and_through_the_noise_of_the_encoders(bound):
+    given = {'barrier.bound': [bound] * 2, 'safety.torque': 'hold_gravity'}
+    rig = Rig(given)
+    rng = np.random.default_rng(0)
+    step = 2e-5  # rad, of an encoder of 18 bits
+
+    def read(q):
+        return step * np.round((q + 1e-5 * rng.normal(size=2)) / step)
+
+    rig.sense = lambda state: [state.raw(q=read(state.q))]
+    rig.step(40)
+    q = rig.state().q
+    rig.sense = lambda state: [state.raw(q=read(q), dq=np.zeros(2))]
+    rig.step(1000)
+    assert rig.supervisor.reason in {Reason.NO_EFFECT, Reason.OUTSIDE_BOUND}
+    assert rig.supervisor.reason is Reason.NO_EFFECT or bound < 0.01
+
+
+def stopped_by(config, plant, spoil=None, reach=None, at=2.0, after=3.0):
+    """Run an arm by hand until `after` [s] from its stop; return guard, states, torques, the stop.
+
+    From `at` [s] on `spoil(q, dq)` changes the readings, and the arm gets `reach(torque)` until 1 s
+    after the stop.
+    """
+    arm = plant_of(plant)
+    n = len(config.joints)
+    guard = Guard(config, lambda: 0, lambda: 0)
+    guard.activate()
+    torques = []
+    positions = []
+    speeds = []
+    stop = None
+    T = config.sample_time
+    for k in range(round(10.0 / T)):
+        measurement = arm.measure().copy()
+        q, dq, _ = measurement.reshape(3, n)
+        positions.append(q.copy())
+        speeds.append(dq.copy())
+        is_spoilt = k * T >= at
+        if is_spoilt and spoil is not None:
+            spoil(q, dq)
+        torque = guard.update(START + round(k * T * 1e9), measurement)
+        torques.append(np.zeros(n) if torque is None else torque.copy())
+        if stop is None and not guard.supervisor.running:
+            stop = k
+        is_lost = stop is None or k < stop + 1.0 / T
+        applied = torques[-1]
+        if is_spoilt and is_lost and reach is not None:
+            applied = reach(applied)
+        arm.step(applied)
+        if stop is not None and k * T > stop * T + after:
+            break
+    assert stop is not None, 'the arm was not stopped'
+    return guard, np.array(positions), np.array(speeds), np.array(torques), stop
+
+
+@pytest.mark.parametrize('preset', ['fr3', 'ur5e_driver'])
+def test_commands_that_do_not_arrive_leave_nothing_in_the_safe_torque(preset):
+    """An effort controller that becomes inactive in motion, and is activated 1 s after the stop.
+
+    The drives hold the arm, so next to nothing is right; the law has wound up to -10.5 N m (FR3)
+    and -17.9 N m (UR5e) by then.
+    """
+    loop = load_loop(preset)
+    plant = change(loop.plant, {'duration': 0.0})
+    guard, q, _, torques, stop = stopped_by(
+        loop.controller, plant, reach=lambda torque: 0.0 * torque
+    )
+    assert guard.supervisor.reason is Reason.OUTSIDE_BOUND
+    assert np.abs(guard.samples.disturbance).max() < 2.0
+    assert np.abs(torques[-1]).max() < 3.0
+    again = stop + round(1.0 / loop.controller.sample_time)
+    assert np.abs(np.diff(torques[again:], axis=0)).max() < 1.0
+    speeds = np.abs(np.diff(q[again:], axis=0)) / loop.controller.sample_time
+    assert speeds[-1].max() < speeds[0].max() + 0.05
+
+
+def test_effect_is_proven_by_a_lasting_acceleration_after_the_stop():
+    """Not by the noise of differenced velocities, nor by what they show late."""
+    rng = np.random.default_rng(0)
+    limit = np.full(2, 20.0)
+    effect = CommandEffect(2)
+    for _ in range(9):
+        effect.update(np.full(2, 15.0), limit, 1e-3)
+    for _ in range(500):
+        effect.update(rng.normal(0.0, 1.0, 2), limit, 1e-3)
+    assert not effect.is_proven
+    for _ in range(100):
+        effect.update(np.array([0.0, -3.0]), limit, 1e-3)
+    assert effect.is_proven
+    effect.restart()
+    assert not effect.is_proven

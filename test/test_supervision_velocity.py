@@ -1,0 +1,84 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Velocities that are plausible but not those of the positions stop the arm, which then rests."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from fault_table import MILLISECOND, Rig
+from test_supervision_effect import stopped_by
+
+from blf_dsc_controller.configuration.nodes import load_loop
+from blf_dsc_controller.configuration.schema import change
+from blf_dsc_controller.simulation.loop import simulate
+from blf_dsc_controller.supervision.supervisor import Phase, Reason
+
+
+def stuck(_, dq):
+    dq[1] = 0.0
+
+
+def reversed_sign(_, dq):
+    dq[1] *= -1.0
+
+
+@pytest.mark.parametrize(
+    ('spoil', 'at', 'travel'),
+    [
+        (stuck, 0.0, 0.4),
+        (stuck, 2.0, 0.5),
+        (reversed_sign, 0.0, 0.25),
+        (reversed_sign, 2.0, 1.6),
+    ],
+)
+def test_fr3_with_a_wrong_velocity_of_joint_2_comes_to_rest(spoil, at, travel):
+    """Damped by those velocities, it moved by 7 to 13 rad in the safe stop, at up to 11 rad/s."""
+    loop = load_loop('fr3')
+    plant = change(loop.plant, {'duration': 0.0})
+    guard, q, dq, _, stop = stopped_by(loop.controller, plant, spoil, at=at)
+    assert "the velocity of joint 'fr3_joint2' is" in guard.supervisor.text
+    assert 'its positions change by' in guard.supervisor.text
+    assert np.abs(q[stop:] - q[stop]).max() < travel
+    assert np.abs(dq[-1]).max() < 0.2
+
+
+def test_velocities_are_those_of_the_positions_after_the_stop_and_a_reset():
+    rig = Rig({'safety.torque': 'hold_gravity'})
+    rig.step(200)
+    rig.sense = lambda state: [state.raw(dq=-state.dq)]
+    rig.step(300)
+    assert rig.supervisor.reason is Reason.VELOCITY
+    rig.clear_fault()
+    rig.sense = lambda state: [state.raw(dq=-state.dq)]
+    rig.step(500)
+    assert rig.supervisor.phase is Phase.TRACKING
+
+
+def test_wrong_velocity_is_found_before_the_start():
+    """In motion, by the states that are held back until the rate is known."""
+    rig = Rig()
+    n = 2
+    for k in range(30):
+        q = np.full(n, 1.0 + 5e-4 * k)  # 0.5 rad/s
+        measurement = np.concatenate((q, np.zeros(2 * n)))
+        rig.guard.observe(rig.base + k * MILLISECOND, measurement)
+    assert rig.supervisor.reason is Reason.VELOCITY
+    assert not rig.guard.commanding
+
+
+@pytest.mark.parametrize('preset', ['recommended', 'noisy', 'panda', 'ur5e_driver'])
+def test_noise_lag_and_steps_of_sensors_contradict_nothing(preset):
+    """Filtered and differenced velocities, quantised positions, all that the presets have."""
+    loop = load_loop(preset)
+    T = loop.controller.sample_time
+    coarse = {
+        'sensor.resolution': 1e-4,
+        'sensor.position_noise': 1e-5,
+        'sensor.velocity_noise': 0.02,
+    }
+
+    record = simulate(
+        change(loop.controller, {'safety.error_ratio': 0.0}),
+        change(loop.plant, coarse | {'duration': 2000 * T}),
+    )
+    assert all(stop.reason != 'velocity not plausible' for stop in record.run().stops)
