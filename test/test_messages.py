@@ -44,7 +44,9 @@ def made(type_name, *fields):
 
 def joint_state(names, *arrays, frame_id='', stamp=STAMP):
     header = made(
-        'std_msgs/Header', made('builtin_interfaces/Time', *divmod(stamp, 10**9)), frame_id
+        'std_msgs/Header',
+        made('builtin_interfaces/Time', *divmod(stamp, 10**9)),
+        frame_id,
     )
     fields = (np.array(values, dtype=float) for values in arrays)
     return cdr('sensor_msgs/JointState', header, list(names), *fields)
@@ -58,8 +60,11 @@ def multi_array(data, *dimensions):
 @given(NAMES, st.sets(st.sampled_from(JOINT_STATE_FIELDS)), st.data())
 def test_encoded_messages_equal_full_serialisation(names, fields, data):
     values = st.lists(VALUES, min_size=len(names), max_size=len(names))
-    arrays = {name: data.draw(values) if name in fields else [] for name in JOINT_STATE_FIELDS}
-    encoder, array = JointStateEncoder(names, fields), Float64MultiArrayEncoder(len(names))
+    arrays = {
+        name: data.draw(values) if name in fields else [] for name in JOINT_STATE_FIELDS
+    }
+    encoder = JointStateEncoder(names, fields)
+    array = Float64MultiArrayEncoder(len(names))
     encoder.encode(7, *([0.5] * len(each) for each in arrays.values()))
     assert encoder.encode(STAMP, **arrays) == joint_state(names, *arrays.values())
     numbers = data.draw(values)
@@ -73,7 +78,9 @@ def test_encoded_messages_equal_full_serialisation(names, fields, data):
 
 @given(NAMES, st.text('base_', max_size=9), STAMPS, st.randoms())
 def test_decoder_matches_joints_by_name(names, frame_id, stamp, random):
-    values = {name: [index + 0.25, -index, 1e3 * index] for index, name in enumerate(names)}
+    values = {
+        name: [index + 0.25, -index, 1e3 * index] for index, name in enumerate(names)
+    }
     wanted = random.sample(names, random.randint(1, len(names)))
     decoder = JointStateDecoder(wanted)
     for _ in range(3):
@@ -117,8 +124,16 @@ def test_decoder_follows_a_change_of_layout(before, raw, values):
 @pytest.mark.parametrize(
     ('raw', 'error', 'words'),
     [
-        (joint_state('ac', [7, 7], [7, 7], [7, 7]), MissingJointError, "'b' is .* names a, c: set"),
-        (joint_state('aba', [1, 2, 3], [4, 5, 6], []), DuplicatedJointError, "'a' appears 2"),
+        (
+            joint_state('ac', [7, 7], [7, 7], [7, 7]),
+            MissingJointError,
+            "'b' is .* names a, c: set",
+        ),
+        (
+            joint_state('aba', [1, 2, 3], [4, 5, 6], []),
+            DuplicatedJointError,
+            "'a' appears 2",
+        ),
         *(
             (joint_state('ab', [1, 2], [4.0] * k, []), ShortArrayError, f'{k} values')
             for k in (0, 1, 3)
@@ -162,14 +177,19 @@ def test_multi_array_with_dimensions_of_the_expected_size_is_decoded(data):
     assert decoder.values.tolist() == data
 
 
-@given(NAMES, st.sets(st.sampled_from(JOINT_STATE_FIELDS)), st.text('base_', max_size=9))
+@given(
+    NAMES, st.sets(st.sampled_from(JOINT_STATE_FIELDS)), st.text('base_', max_size=9)
+)
 def test_messages_pass_through_rclpy_unchanged(names, fields, frame_id):
     rclpy = pytest.importorskip('rclpy.serialization', reason='needs ROS 2')
     from sensor_msgs.msg import JointState
     from std_msgs.msg import Float64MultiArray
 
     count = len(names)
-    values = {name: (k - np.arange(count) / 3).tolist() for k, name in enumerate(sorted(fields))}
+    values = {
+        name: (k - np.arange(count) / 3).tolist()
+        for k, name in enumerate(sorted(fields))
+    }
     raw = JointStateEncoder(names, fields).encode(STAMP, **values)
     message = rclpy.deserialize_message(raw, JointState)
     message.header.frame_id = frame_id
@@ -179,9 +199,7 @@ def test_messages_pass_through_rclpy_unchanged(names, fields, frame_id):
         expected = values.get(field, [NAN] * count)
         np.testing.assert_array_equal(getattr(decoder, field)[::-1], expected)
     raw = Float64MultiArrayEncoder(count).encode(range(count))
-    array, message = (
-        Float64MultiArrayDecoder(count),
-        rclpy.deserialize_message(raw, Float64MultiArray),
-    )
+    array = Float64MultiArrayDecoder(count)
+    message = rclpy.deserialize_message(raw, Float64MultiArray)
     assert array.decode(rclpy.serialize_message(message)) == count
     assert array.values.tolist() == list(range(count))

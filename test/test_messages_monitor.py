@@ -12,15 +12,24 @@ from blf_dsc_controller.analysis.panels import panels
 from blf_dsc_controller.bags.reader import read_run
 from blf_dsc_controller.law import barrier
 from blf_dsc_controller.law.barrier import virtual_control
-from blf_dsc_controller.law.factory import controller_of, estimate_names, settings_of_config
-from blf_dsc_controller.law.lyapunov import decay_rate, exponential_bound, largest_inertia
+from blf_dsc_controller.law.factory import (
+    controller_of,
+    estimate_names,
+    settings_of_config,
+)
+from blf_dsc_controller.law.lyapunov import (
+    decay_rate,
+    exponential_bound,
+    largest_inertia,
+)
 from blf_dsc_controller.law.telemetry import ControllerTelemetry
 from blf_dsc_controller.messages import topics
 from blf_dsc_controller.messages.codecs import JointStateDecoder
 from blf_dsc_controller.simulation.loop import simulate, write_bag
 
 LARGEST = np.linalg.eigvalsh([[2.12, 0.72], [0.72, 0.32]])[-1]  # kg m^2, of M stretched
-PAPER = {'learning.compensation': 'state', 'learning.bumpless': False}  # (32) is for this form
+# (32) is for this form
+PAPER = {'learning.compensation': 'state', 'learning.bumpless': False}
 LEAKY = EXACT | PAPER | {'disturbance.leakage': 0.02, 'disturbance.gain': [50.0, 80.0]}
 
 
@@ -45,7 +54,10 @@ def test_largest_inertia_is_that_of_the_stretched_arm():
         ({}, 0.02 * 50.0),
         ({'surface.gain': [0.3, 9.0]}, 0.3),
         ({'learning.weight': 0.1}, 2.0 * 0.1 * 0.5 * 0.003 / (0.003 + 1e-5)),
-        ({'learning.update': 'gradient', 'learning.weight': 9.0}, 2.0 * 9.0 * 0.5 * 0.003),
+        (
+            {'learning.update': 'gradient', 'learning.weight': 9.0},
+            2.0 * 9.0 * 0.5 * 0.003,
+        ),
         ({'feedback.gain': [9.0, 0.4]}, 2.0 * 0.4 / LARGEST),
     ],
 )
@@ -58,9 +70,17 @@ def test_bound_starts_at_the_latch_and_decays_to_theta_over_kappa_e():
     law = settings(LEAKY)
     rate = decay_rate(law)
     floor = 0.5 * 0.02 * 2.0 * 0.2**2 / rate
-    t, V = np.array([1.0, 2.0, 3.5, 1e3, 1001.0, 1002.0]), np.array([3.0, 0.7, 0.1, 0.0, 9.0, 0.5])
+    t = np.array([1.0, 2.0, 3.5, 1e3, 1001.0, 1002.0])
+    V = np.array([3.0, 0.7, 0.1, 0.0, 9.0, 0.5])
     holds = np.array([0, 1, 1, 1, 0, 1]) > 0  # and begins anew
-    expected = [np.nan, 0.7, floor + (0.7 - floor) * np.exp(-rate * 1.5), floor, np.nan, 0.5]
+    expected = [
+        np.nan,
+        0.7,
+        floor + (0.7 - floor) * np.exp(-rate * 1.5),
+        floor,
+        np.nan,
+        0.5,
+    ]
     assert exponential_bound(law, t, V, holds) == pytest.approx(expected, nan_ok=True)
     assert np.isnan(exponential_bound(settings({}), t, V, holds)).all()
 
@@ -101,10 +121,13 @@ def test_message_contains_the_distance_and_with_known_truth_the_terms(known):
     names += [*estimate_names(config), 'lambda_min', 'latched', 'model_changes']
     terms = ['V barrier', 'V velocity', 'V parameters', 'V disturbance'] * known
     sent = [
-        list(telemetry.sample(10**9, law.sample, np.ones(2), np.array([0.3, 0.2]), time))
+        list(
+            telemetry.sample(10**9, law.sample, np.ones(2), np.array([0.3, 0.2]), time)
+        )
         for time in (9e-5, 1e-5, 4e-5, 2e-5)
     ]
-    error, slow = topics.TRACKING_ERROR, [topics.REFERENCE, topics.MONITOR]
+    error = topics.TRACKING_ERROR
+    slow = [topics.REFERENCE, topics.MONITOR]
     assert [[topic for topic, _ in each] for each in sent] == [
         [topics.BOUND, error, *slow],
         [error],
@@ -115,7 +138,8 @@ def test_message_contains_the_distance_and_with_known_truth_the_terms(known):
     assert known or b'V barrier' not in message
     values = decoded(message, *names, *terms, 'compute_time')
     assert values['max_error_ratio joint1'] == 0.3
-    bound, error = law.sample.bound, np.abs(law.sample.xi1)
+    bound = law.sample.bound
+    error = np.abs(law.sample.xi1)
     assert values['distance_to_bound joint1'] == pytest.approx(bound[0] - error[0])
     assert values['distance_to_bound joint2'] == pytest.approx(bound[1] - error[1])
     assert values['compute_time'] == 4e-5  # the largest since the last message
@@ -126,7 +150,8 @@ def test_bound_is_sent_at_once_when_it_widens_and_with_the_monitor_while_it_narr
     config = configured('recommended', 1.0, {'telemetry.decimation': 3}).controller
     law = controller_of(config)
     law.update(0.0, 1e-3, np.array([2.293, 1.696, 0.0, 0.0, 0.0, 0.0]))
-    telemetry, sent = ControllerTelemetry(config, estimate_names(config)), []
+    telemetry = ControllerTelemetry(config, estimate_names(config))
+    sent = []
     for k, bound in enumerate((9.0, 8.0, 7.0, 7.0, 6.0, 6.5, 6.5, 7.0, 7.0)):
         sample = law.sample._replace(bound=np.array([5.0, bound]))
         limit = ratio = np.ones(2)
@@ -136,7 +161,9 @@ def test_bound_is_sent_at_once_when_it_widens_and_with_the_monitor_while_it_narr
     assert sent == [(0, 9.0), (3, 7.0), (6, 6.5), (7, 7.0)]
 
 
-def test_rejected_columns_are_in_the_summary_and_the_lyapunov_function_is_a_panel(tmp_path):
+def test_rejected_columns_are_in_the_summary_and_the_lyapunov_function_is_a_panel(
+    tmp_path,
+):
     """Run of 8 s from a bag, truth known, with a cosine column that the reference cannot excite."""
     learning = {'learning.frequencies': [1.0], 'learning.bias': False}
     config = configured('recommended', 8.0, LEAKY | learning)
@@ -149,5 +176,10 @@ def test_rejected_columns_are_in_the_summary_and_the_lyapunov_function_is_a_pane
     assert metrics.final_parameter_error < 0.5
     (panel,) = (panel for panel in panels([run]) if panel.group == 'Monitors')
     *terms, V = panel.lines
-    assert [line.name for line in terms] == ['barrier', 'velocity', 'parameters', 'disturbance']
+    assert [line.name for line in terms] == [
+        'barrier',
+        'velocity',
+        'parameters',
+        'disturbance',
+    ]
     assert V.values[0] == pytest.approx(sum(line.values[0] for line in terms))

@@ -30,18 +30,28 @@ from blf_dsc_controller.reference.approach import (
     stop,
     worst_violation,
 )
-from blf_dsc_controller.reference.terms import minimum_jerk, pack, sampled, sinusoids_term, unpack
+from blf_dsc_controller.reference.terms import (
+    minimum_jerk,
+    pack,
+    sampled,
+    sinusoids_term,
+    unpack,
+)
 from blf_dsc_controller.simulation.loop import simulate
 
 JOINTS = ('shoulder', 'elbow')
 PAPER = sinusoids_term((1.9935, 1.3961), (0.3, 0.3), (1.0,), (0.0,))
-POINTS = minimum_jerk(np.array([0.0, 5.0, 11.0]), np.array([[0.0, 1.0], [1.0, -1.0], [0.3, 0.0]]))
+POINTS = minimum_jerk(
+    np.array([0.0, 5.0, 11.0]), np.array([[0.0, 1.0], [1.0, -1.0], [0.3, 0.0]])
+)
 T0 = 1.7  # s
 AT_REST = np.array([[-0.4, 2.9], [0.0, 0.0]])
 MOVING = np.array([[0.8, 1.5], [0.6, -0.9]])
 
 
-def limits(velocity=(1.5, 1.0), acceleration=(4.0, 1.5), reach=(6.0, 6.0), longest=30.0):
+def limits(
+    velocity=(1.5, 1.0), acceleration=(4.0, 1.5), reach=(6.0, 6.0), longest=30.0
+):
     lower = tuple(-limit for limit in reach)
     allowed = MotionLimits(lower, reach, velocity, acceleration)
     return ControllerConfig(JOINTS, limits=allowed, approach=Approach(longest=longest))
@@ -64,14 +74,19 @@ def at(vector, t):
 
 @pytest.mark.parametrize('main', [PAPER, POINTS], ids=['sinusoids', 'points'])
 @pytest.mark.parametrize('start', [AT_REST, MOVING], ids=['at rest', 'moving'])
-def test_approach_leads_from_the_measured_state_to_the_reference_as_fast_as_allowed(main, start):
+def test_approach_leads_from_the_measured_state_to_the_reference_as_fast_as_allowed(
+    main, start
+):
     motion = approach_to(main, start, limits())
-    before, after = motion.settled - 1e-7, motion.settled
+    before = motion.settled - 1e-7
+    after = motion.settled
     np.testing.assert_allclose(at(motion.vector, T0), [*start, (0.0, 0.0)], atol=1e-12)
     for t in (after, after + 1.0, 1e4):
         np.testing.assert_array_equal(at(motion.vector, t), at(pack(2, [main]), t))
     # 1e-5 allows for the jerk over 1e-7 s: position, velocity and acceleration do not jump.
-    np.testing.assert_allclose(at(motion.vector, before), at(motion.vector, after), atol=1e-5)
+    np.testing.assert_allclose(
+        at(motion.vector, before), at(motion.vector, after), atol=1e-5
+    )
     # The planner looks at times a 200th of the approach apart or closer: it misses at most 0.1 %.
     allowed = limits().limits.velocity, limits().limits.acceleration
     assert np.all(maxima(motion, motion.settled + 10.0) <= 1.001 * np.array(allowed))
@@ -92,7 +107,11 @@ def test_motion_beyond_the_limits_is_rejected_with_the_name_of_the_joint():
     with pytest.raises(MotionError) as rejection:
         approach_to(PAPER, start, limits())
     violation = rejection.value.violation
-    assert (violation.joint, violation.quantity, violation.limit) == ('shoulder', 'velocity', -1.5)
+    assert (violation.joint, violation.quantity, violation.limit) == (
+        'shoulder',
+        'velocity',
+        -1.5,
+    )
     assert violation.value <= -1.7
     for part in ('shoulder', '-1.5 rad/s', 'at most 30 s', 'approach.longest'):
         assert part in str(rejection.value)
@@ -102,7 +121,11 @@ def test_positions_are_checked_relative_to_the_middle_of_their_range():
     allowed = MotionLimits((-1.0, 0.5), (3.0, 1.5), (9.0, 9.0), (9.0, 9.0))
     config = ControllerConfig(JOINTS, limits=allowed)
     violation = worst_violation(pack(2, [PAPER]), np.linspace(0.0, 7.0, 1001), config)
-    assert (violation.joint, violation.quantity, violation.limit) == ('elbow', 'position', 1.5)
+    assert (violation.joint, violation.quantity, violation.limit) == (
+        'elbow',
+        'position',
+        1.5,
+    )
     assert violation.value == pytest.approx(1.6961, abs=1e-5)
     assert worst_violation(pack(2, [PAPER]), np.linspace(2.0, 4.0, 101), config) is None
 
@@ -154,7 +177,9 @@ def test_fast_reference_is_approached_through_rest_at_its_middle():
     assert np.all(np.abs(ddq) <= config.limits.acceleration)
     assert np.abs(np.diff(q, axis=0)).max() < 1e-2
     after = t >= motion.settled
-    np.testing.assert_array_equal(q[after], sampled(reference_of(config), t[after])[:, 0])
+    np.testing.assert_array_equal(
+        q[after], sampled(reference_of(config), t[after])[:, 0]
+    )
 
 
 def test_start_inside_the_bound_needs_no_approach():
@@ -174,7 +199,8 @@ SWINGING = {'reference.phase': [-np.pi / 2]}  # passes its middle at 0.3 rad/s a
 def test_start_that_is_too_slow_is_rejected_if_approaches_are_disabled():
     config = build(ControllerConfig, SWINGING | {'approach.enabled': False})
     law = controller_of(config)
-    offset, moving = np.array(config.reference.offset), np.full(2, 0.3)
+    offset = np.array(config.reference.offset)
+    moving = np.full(2, 0.3)
     with pytest.raises(StartError, match=r'starts -0.* velocity'):
         begin(law, config, offset, STILL)
     assert begin(law, config, offset, moving) == 0.0
@@ -197,7 +223,9 @@ def test_hold_reference_stays_where_the_arm_is_or_where_it_comes_to_rest():
 
 @pytest.mark.parametrize('velocity', ['measured', 'estimated'])
 @pytest.mark.parametrize('rest', [True, False])
-def test_reactivation_on_the_reference_tracks_at_once_only_at_its_velocity(rest, velocity):
+def test_reactivation_on_the_reference_tracks_at_once_only_at_its_velocity(
+    rest, velocity
+):
     """An arm that the brakes hold needs an approach; one that moves with the reference does not."""
     rig = Rig({'safety.velocity': velocity, 'torque.limit': [40.0, 40.0]})
     rig.step(1500)  # at 0.3 rad/s
@@ -232,8 +260,12 @@ def test_reference_continues_after_a_deactivation_but_begins_anew_after_a_stop()
 
 def test_waypoints_are_passed_at_their_times_and_the_last_is_held():
     points = np.array([[2.0, 1.0], [2.4, 1.5], [1.8, 1.2]])
-    reference = Reference(type='waypoints', times=(0.0, 1.5, 3.5), points=tuple(points.T.ravel()))
-    motion = sampled(reference_of(replace(CONFIG, reference=reference)), [0.0, 1.5, 3.5, 5.0])
+    reference = Reference(
+        type='waypoints', times=(0.0, 1.5, 3.5), points=tuple(points.T.ravel())
+    )
+    motion = sampled(
+        reference_of(replace(CONFIG, reference=reference)), [0.0, 1.5, 3.5, 5.0]
+    )
     np.testing.assert_allclose(motion[:, 0], points[[0, 1, 2, 2]], atol=1e-12)
     np.testing.assert_array_equal(motion[[0, 2, 3], 1], 0.0)
 
@@ -246,7 +278,10 @@ def test_waypoints_are_passed_at_their_times_and_the_last_is_held():
         (REPEATED, 'times: got 1 s after 1 s, but they must increase'),
         (TIMES, 'points: got 3, but 4 entries are needed'),
         ({'limits.velocity': [0.0, 1.0]}, 'limits.velocity: got 0.0 at entry 1'),
-        ({'limits.position_lower': [1.0, 7.0]}, 'position_upper: got 6.28319 rad for joint2, but'),
+        (
+            {'limits.position_lower': [1.0, 7.0]},
+            'position_upper: got 6.28319 rad for joint2, but',
+        ),
     ],
 )
 def test_invalid_reference_is_rejected_with_the_reason(given, problem):
@@ -268,7 +303,9 @@ def test_new_bound_is_validated_by_its_present_width():
 def test_arm_far_beyond_its_limits_is_not_held(at):
     """For example, an arm that reports degrees."""
     config = replace(CONFIG, reference=Reference(type='hold'))
-    with pytest.raises(StartError, match=r"joint 'joint2' is at .* rad, and its limits are -6.2"):
+    with pytest.raises(
+        StartError, match=r"joint 'joint2' is at .* rad, and its limits are -6.2"
+    ):
         plan_start(config, np.full(2, BOUND), np.array([0.0, at]), STILL)
     at_rest = np.array([0.0, 2.0 * np.pi + 0.09])
     assert plan_start(config, np.full(2, BOUND), at_rest, STILL).settled == 0.0

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import itertools
+import os
 
 import hypothesis
 import numpy as np
@@ -11,15 +12,18 @@ import pytest
 from hypothesis import strategies as st
 
 from blf_dsc_controller.configuration.controller import ControllerConfig, MotionLimits
+from blf_dsc_controller.reference import retargeting
 from blf_dsc_controller.reference import terms as reference
 from blf_dsc_controller.reference.approach import MotionError
 from blf_dsc_controller.reference.terms import (
     minimum_jerk,
     pack,
     pieces_of,
+    remaining,
     sampled,
     sinusoids_term,
     spline_term,
+    turning_times,
     unpack,
 )
 from blf_dsc_controller.reference.trajectory import (
@@ -57,7 +61,9 @@ def test_terms_are_sums_of_tones_or_polynomials_of_the_current_piece():
         expected = OFFSET + np.array(AMPLITUDE) @ tones
         np.testing.assert_allclose(value_at([SINUSOIDS], t)[0], expected, atol=1e-15)
     for piece, t in ((0, 0.4), (0, 0.9), (1, 1.0), (2, 1.5), (3, 3.0), (3, 5)):
-        expected = np.polynomial.polynomial.polyval(t - KNOTS[piece], COEFFICIENTS[piece].T)
+        expected = np.polynomial.polynomial.polyval(
+            t - KNOTS[piece], COEFFICIENTS[piece].T
+        )
         np.testing.assert_allclose(value_at([SPLINE], t)[0], expected, rtol=1e-13)
     before = value_at([SPLINE], 0.39)  # at rest at its first point
     np.testing.assert_array_equal(before, [COEFFICIENTS[0, :, 0], [0] * 3, [0] * 3])
@@ -79,7 +85,9 @@ def test_velocity_and_acceleration_are_the_derivatives_of_the_reference(terms, t
 def test_terms_are_blended_by_the_minimum_jerk_step():
     both = [SINUSOIDS, LATER]
     for t, s in ((0.5, 0.0), (1.3, 0.5), (2.1, 1.0)):
-        expected = (1.0 - s) * value_at([SINUSOIDS], t)[0] + s * value_at([SPLINE], t)[0]
+        expected = (1.0 - s) * value_at([SINUSOIDS], t)[0] + s * value_at([SPLINE], t)[
+            0
+        ]
         np.testing.assert_allclose(value_at(both, t)[0], expected, rtol=1e-13)
     # Before and after only one of them counts, to the last bit; also without a blend.
     at_once = [SINUSOIDS, SPLINE._replace(begin=1.5)]
@@ -91,7 +99,8 @@ def test_terms_are_blended_by_the_minimum_jerk_step():
     ):
         for t in times:
             np.testing.assert_array_equal(value_at(terms, t), value_at([alone], t))
-    for t in (0.5, 2.1):  # over 2e-9 s the jerk, below 1e4 here, moves the acceleration by 2e-5
+    # over 2e-9 s the jerk, below 1e4 here, moves the acceleration by 2e-5
+    for t in (0.5, 2.1):
         before, after = (value_at(both, t + side) for side in (-1e-9, 1e-9))
         np.testing.assert_allclose(before, after, atol=1e-4)
 
@@ -139,7 +148,9 @@ FIELDS = {
 
 def trajectory(fields=(GOALS,), times=TIMES, joints=JOINTS, begin=None):
     rows = zip(times, *fields, strict=True)
-    points = tuple(TrajectoryPoint(t, *(tuple(row.tolist()) for row in each)) for t, *each in rows)
+    points = tuple(
+        TrajectoryPoint(t, *(tuple(row.tolist()) for row in each)) for t, *each in rows
+    )
     return Trajectory(joints, points, begin)
 
 
@@ -152,7 +163,9 @@ def at(vector, t):
 
 
 @pytest.mark.parametrize('fields', FIELDS.values(), ids=FIELDS)
-def test_trajectory_continues_the_reference_passes_its_points_and_holds_the_last(fields):
+def test_trajectory_continues_the_reference_passes_its_points_and_holds_the_last(
+    fields,
+):
     motion = plan(trajectory(fields))
     assert motion.settled == NOW
     np.testing.assert_allclose(at(motion.vector, NOW), at(PAPER, NOW), atol=1e-13)
@@ -204,7 +217,9 @@ def test_single_point_at_time_zero_is_reached_as_fast_as_the_limits_allow():
     motion = plan(trajectory((GOALS[:1],), times=(0.0,)))
     after = at(motion.vector, motion.settled)
     np.testing.assert_allclose(after, [GOALS[0], (0, 0), (0, 0)], atol=1e-12)
-    _, dqr, ddqr = sampled(motion.vector, np.linspace(NOW, motion.settled, 5001)).transpose(1, 0, 2)
+    _, dqr, ddqr = sampled(
+        motion.vector, np.linspace(NOW, motion.settled, 5001)
+    ).transpose(1, 0, 2)
     used = max((np.abs(dqr) / 1.5).max(), (np.abs(ddqr) / 6.0).max())
     assert used == pytest.approx(1.0, abs=0.05)
 
@@ -227,17 +242,19 @@ def test_later_trajectory_replaces_running_and_waiting_ones():
     np.testing.assert_allclose(at(last, NOW + 1.5), at(first, NOW + 1.5), atol=1e-12)
     for t in (NOW + 5.0, 22.0):
         np.testing.assert_allclose(at(last, t)[0], GOALS[0] + 0.1, atol=1e-12)
-    assert len(unpack(last)) == 2
     for k in range(20):  # what is finished is forgotten
         last = plan(trajectory((GOALS + 0.01 * k,)), last, NOW + 2.0 + k).vector
-        assert len(unpack(last)) == 2
+        last = remaining(last, NOW + 2.0 + k)
+        assert len(unpack(last)) == 1
 
 
 NAN = float('nan')
 
 
 def points_at(*times):
-    return Trajectory(JOINTS, tuple(TrajectoryPoint(float(t), (1.0, 1.0)) for t in times))
+    return Trajectory(
+        JOINTS, tuple(TrajectoryPoint(float(t), (1.0, 1.0)) for t in times)
+    )
 
 
 def one_point(*fields, **more):
@@ -247,16 +264,24 @@ def one_point(*fields, **more):
 MIXED = (TrajectoryPoint(1.0, (1.6, 1.2), (0.0, 0.0)), TrajectoryPoint(2.0, (1.6, 1.2)))
 REPEATED = trajectory((np.hstack((GOALS, GOALS[:, 1:])),), joints=(*JOINTS, 'elbow'))
 MOVING_ON = VELOCITIES + np.array([[0.0], [np.inf], [0.0]])
-TOO_FAST = trajectory((GOALS * [[1.0, 1.0], [1.9, 1.0], [1.0, 1.0]],), times=(2.0, 3.0, 6.0))
 BAD = (
-    (trajectory(joints=('shoulder', 'wrist')), "'wrist', but each of 'shoulder', 'elbow' is"),
-    (trajectory((GOALS[:, :1],), joints=JOINTS[:1]), "its joints are 'shoulder', but each of"),
+    (
+        trajectory(joints=('shoulder', 'wrist')),
+        "'wrist', but each of 'shoulder', 'elbow' is",
+    ),
+    (
+        trajectory((GOALS[:, :1],), joints=JOINTS[:1]),
+        "its joints are 'shoulder', but each of",
+    ),
     (REPEATED, "'shoulder', 'elbow' is needed once"),
     (Trajectory((), ()), 'its joints are none, but'),
     (Trajectory(JOINTS, ()), 'it has no points'),
     (one_point(()), 'point 1 has no positions'),
     (one_point((1.0,)), 'point 1 has positions [1.0], but 2 finite'),
-    (one_point((1.0, 1.0), (0.0, 0.0, 0.0)), 'point 1 has velocities [0.0, 0.0, 0.0], but'),
+    (
+        one_point((1.0, 1.0), (0.0, 0.0, 0.0)),
+        'point 1 has velocities [0.0, 0.0, 0.0], but',
+    ),
     (one_point((1.0, 1.0), (), (0.0, 0.0)), 'accelerations, but no velocities'),
     (one_point((1.0, 1.0), effort=(1.0, 1.0)), 'leave effort empty'),
     (Trajectory(JOINTS, MIXED), 'do not all give the same'),
@@ -266,13 +291,16 @@ BAD = (
     (trajectory(times=(1.0, 2.0, 1.5)), 'point 3 is at 1.5 s, not after'),
     (trajectory(times=(-1.0, 1.0, 2.0)), 'point 1 is 1 s before the beginning'),
     (trajectory(begin=-0.5), 'it ended 0.3 s ago'),
-    (trajectory((GOALS, VELOCITIES[::-1])), 'it ends with shoulder at 0.2 rad/s, but the last'),
-    (TOO_FAST, "the velocity of joint 'shoulder' would be"),
-    (trajectory((GOALS[:1],), times=(0.2,)), 'past its limit of -6 rad/s^2'),
-    (trajectory((FAR,), times=(5.0, 10.0, 15.0)), "the position of joint 'elbow' would be"),
+    (
+        trajectory((FAR,), times=(5.0, 10.0, 15.0)),
+        "the position of joint 'elbow' would be",
+    ),
     (trajectory((FAR,), times=(0.0, 5.0, 10.0)), 'limits.position_lower'),
     (points_at(1.0, 3601.0), 'it takes 3601 s, longer than 3600 s: send it in pieces'),
-    (points_at(*range(1, 1002)), 'it has 1001 points, more than 1000: send it in pieces'),
+    (
+        points_at(*range(1, 10_002)),
+        'it has 10001 points, more than 10000: send it in pieces',
+    ),
 )
 
 
@@ -294,7 +322,8 @@ def test_all_problems_are_reported_at_once():
 def moving(velocity, acceleration=(0.0, 0.0)):
     """A reference at zero with these derivatives at t = 0."""
     terms = np.zeros((1, 2, 6))
-    terms[0, :, 1], terms[0, :, 2] = velocity, 0.5 * np.asarray(acceleration)
+    terms[0, :, 1] = velocity
+    terms[0, :, 2] = 0.5 * np.asarray(acceleration)
     return pack(2, [spline_term(np.zeros(1), terms)])
 
 
@@ -313,7 +342,9 @@ def test_goal_with_much_time_is_not_overshot_by_more_than_the_braking_distance(
 ):
     """Without braking first, the reference swings by 0.2 v T: 56 m for a joint with 1.4 rad/s."""
     fields = np.array([goal, np.zeros(2), np.zeros(2)])[:count, np.newaxis]
-    motion = plan(trajectory(fields, times=(time,)), moving(velocity, acceleration), 0.0)
+    motion = plan(
+        trajectory(fields, times=(time,)), moving(velocity, acceleration), 0.0
+    )
     times = np.linspace(0.0, time + 1.0, 20_001)
     qr, dqr, _ = sampled(motion.vector, times).transpose(1, 0, 2)
     # All joints brake together, at no more than half of 6 rad/s^2, ddqr aside.
@@ -330,4 +361,213 @@ def test_point_that_needs_more_time_for_braking_is_still_reached(speed, goal, ti
     """The gentle braking does not fit, or leaves too little time; up to all the time there is."""
     sent = trajectory((np.array([[goal, 0.0]]),), times=(time,))
     motion = plan(sent, moving((speed, 0.0)), 0.0)
-    np.testing.assert_allclose(at(motion.vector, time), [(goal, 0.0), (0, 0), (0, 0)], atol=1e-9)
+    np.testing.assert_allclose(
+        at(motion.vector, time), [(goal, 0.0), (0, 0), (0, 0)], atol=1e-9
+    )
+
+
+def test_jerk_free_of_zeros_or_not_the_acceleration_is_monotonic_between_turning_times():
+    """With jerk zeros at 0.2 and 0.5 of a piece of 1 s, at 0.75 of one, none, and outside."""
+    derivative = np.polynomial.polynomial.polyfromroots
+    jerks = derivative([0.2, 0.5]), derivative([0.75]), (3.0,), derivative([-1.0, 2.0])
+    pieces = np.zeros((4, 1, 6))
+    for piece, jerk in zip(pieces, jerks, strict=True):
+        rise = np.polynomial.Polynomial(jerk).integ(3).coef
+        piece[0, : rise.size] = rise
+    knots = np.arange(4.0)
+    found = turning_times(spline_term(knots, pieces), 1)
+    np.testing.assert_allclose(
+        np.unique(found.round(9)), [0.0, 0.2, 0.5, 1.0, 1.75, 2.0, 3.0], atol=1e-9
+    )
+
+
+MIDDLE = ControllerConfig(  # positions about -1.57 and 1, as of a Panda's elbow
+    JOINTS, limits=MotionLimits((-3.07, -1.0), (-0.07, 3.0), (1.5, 1.5), (6.0, 6.0))
+)
+
+
+@pytest.mark.parametrize(
+    ('goal', 'limit'),
+    [((-0.05, 1.0), -0.07), ((-3.09, 1.0), -3.07), ((-1.0, -1.02), -1.0)],
+)
+def test_position_limits_about_a_middle_that_is_not_zero_are_kept(goal, limit):
+    """Also where the position itself is smaller than the other limit of the joint."""
+    at_rest = pack(2, [minimum_jerk(np.zeros(1), np.array([[-1.57, 1.0]]))])
+    sent = trajectory((np.array([goal]),), times=(6.0,))
+    with pytest.raises(TrajectoryError, match=f'past its limit of {limit:g} rad'):
+        plan_trajectory(sent, at_rest, 0.0, MIDDLE)
+    inside = np.array([goal]) + 0.04 * np.sign([-1.57 - goal[0], 1.0 - goal[1]])
+    plan_trajectory(trajectory((inside,), times=(6.0,)), at_rest, 0.0, MIDDLE)
+
+
+# Trajectories that the limits do not allow as they are sent.
+
+
+def limits_used(motion, begin, end):
+    _, dqr, ddqr = sampled(motion.vector, np.linspace(begin, end, 20_001)).transpose(
+        1, 0, 2
+    )
+    return (np.abs(dqr) / 1.5).max(), (np.abs(ddqr) / 6.0).max()
+
+
+def test_path_that_is_too_fast_is_stretched_and_passes_its_points_in_order():
+    sent = trajectory((GOALS,), times=(0.3, 0.5, 0.7))
+    motion = plan(sent)
+    assert motion.note.startswith('as fast as the limits allow: its end is ')
+    assert motion.end > NOW + 0.7
+    assert max(limits_used(motion, NOW, motion.end)) <= 1.0 + 1e-9
+    times = np.linspace(NOW, motion.end, 20_001)
+    q = sampled(motion.vector, times)[:, 0]
+    nearest = [np.abs(q - goal).max(axis=1) for goal in GOALS]
+    # 20,000 samples of a motion of some seconds at 1.5 rad/s are less than 1 mrad apart
+    assert max(distance.min() for distance in nearest) < 1e-3
+    passed = [int(distance.argmin()) for distance in nearest]
+    assert passed == sorted(passed)
+    np.testing.assert_allclose(at(motion.vector, motion.end)[0], GOALS[-1], atol=1e-9)
+
+
+def test_point_that_is_too_near_in_time_is_reached_as_soon_as_the_limits_allow():
+    """From rest over 1.5 rad: not before velocity, acceleration and jerk allow, 1.37 s."""
+    at_rest = pack(2, [minimum_jerk(np.zeros(1), np.zeros((1, 2)))])
+    sent = trajectory((np.array([[1.5, 0.3]]),), times=(0.2,))
+    motion = plan(sent, at_rest, 0.0)
+    # 1.5 rad at 1.5 rad/s, 0.25 s of acceleration and half of the 0.05 s to change it, twice half
+    assert motion.end == pytest.approx(1.0 + 0.25 + 0.05, abs=1e-9)
+    np.testing.assert_allclose(at(motion.vector, motion.end)[0], (1.5, 0.3), atol=1e-8)
+    assert limits_used(motion, 0.0, motion.end) == pytest.approx((1.0, 1.0), abs=1e-6)
+    assert f'{motion.end - 0.2:.3g} s later' in motion.note
+
+
+def test_chunk_whose_first_points_cannot_be_reached_in_time_keeps_the_later_ones():
+    chunk = trajectory(
+        (GOALS[:1] + 0.02 * np.arange(10)[:, None],), times=0.05 * np.arange(1, 11)
+    )
+    at_rest = pack(2, [minimum_jerk(np.zeros(1), GOALS[:1] - 0.02)])
+    motion = plan(chunk, at_rest, NOW)
+    assert motion.note.startswith('its path is joined after ')
+    assert motion.end == pytest.approx(NOW + 0.5)
+    np.testing.assert_allclose(
+        at(motion.vector, NOW + 0.5)[0], GOALS[0] + 0.18, atol=1e-9
+    )
+    assert max(limits_used(motion, NOW, motion.end)) <= 1.0 + 1e-9
+
+
+@pytest.mark.parametrize('fields', [2, 3])
+def test_trajectory_that_ends_in_motion_brakes_after_its_last_point(fields):
+    sent = trajectory((GOALS, VELOCITIES[::-1], ACCELERATIONS)[:fields])
+    motion = plan(sent)
+    passed = at(motion.vector, NOW + 3.5)
+    np.testing.assert_allclose(passed[:2], (GOALS[-1], VELOCITIES[0]), atol=1e-9)
+    # from 0.2 rad/s at 6 rad/s^2 in 0.05 s: rest is 0.04 to 0.1 s later
+    np.testing.assert_array_equal(at(motion.vector, NOW + 4.0)[1:], 0.0)
+    ended = at(motion.vector, NOW + 4.0)[0, 0] - GOALS[-1, 0]
+    assert 0.2**2 / (2.0 * 6.0) < ended < 0.2 * 0.1
+    assert max(limits_used(motion, NOW, NOW + 4.0)) <= 1.0 + 1e-9
+
+
+def test_three_thousand_points_are_planned():
+    times = 0.01 * np.arange(1, 3001)
+    path = 0.3 * np.sin(0.5 * times)[:, None] + at(PAPER, NOW)[0]
+    motion = plan(trajectory((path,), times=times))
+    np.testing.assert_allclose(at(motion.vector, NOW + 20.0)[0], path[1999], atol=1e-9)
+
+
+def test_without_ruckig_what_exceeds_the_limits_says_what_is_missing(monkeypatch):
+    monkeypatch.setattr(retargeting, 'ruckig', None)
+    with pytest.raises(TrajectoryError, match='pip install ruckig') as rejection:
+        plan(trajectory((GOALS[:1],), times=(0.2,)))
+    assert 'past its limit of -6 rad/s^2' in str(rejection.value)
+    plan(trajectory((GOALS, VELOCITIES[::-1])))  # brakes after its end all the same
+
+
+# Random sequences of trajectories, adopted as the guard does: planned from the reference in force
+# at one sample for a time ahead, and followed from a later sample on.
+SEQUENCES = 10_000 if os.environ.get('NIGHTLY') else 300
+PERIOD = 1e-3  # s
+FASTEST = np.array(LIMITS.limits.velocity)
+STRONGEST = np.array(LIMITS.limits.acceleration)
+
+
+def random_trajectory(rng, at, vector):
+    """Return a trajectory of 1 to 4 points near the reference, that may begin later or earlier."""
+    count = rng.integers(1, 5)
+    times = np.cumsum(rng.uniform(0.02, 0.8, count))
+    if rng.random() < 0.1:
+        times[0] = 0.0
+    start = sampled(vector, np.array([at]))[0]
+    steps = (
+        rng.normal(size=(count, 2)) * 0.3 * np.append(times[0], np.diff(times))[:, None]
+    )
+    ballistic = start[0] + 0.7 * start[1] * times[0]
+    fields = [ballistic + np.cumsum(steps, axis=0)]
+    for _ in range(rng.integers(0, 3)):
+        rates = rng.normal(size=(count, 2)) * 0.1
+        rates[-1] = 0.0
+        fields.append(rates)
+    begin = None
+    if rng.random() < 0.4:
+        begin = at + rng.uniform(-0.3, 0.5)
+    return trajectory(fields, times=times.tolist(), begin=begin)
+
+
+def check_seams(before, vector, first, last):
+    """Check a reference against that before it until it begins, and both sides of each seam."""
+    times = PERIOD * np.arange(first, last + 1)
+    old, new = (sampled(each, times)[:, :2] for each in (before, vector))
+    np.testing.assert_allclose(new, old, rtol=0.0, atol=1e-9)
+    seams = []
+    for term in unpack(vector):
+        seams += [term.begin, term.settled]
+        if term.code == reference.SPLINE:
+            seams += pieces_of(term, 2)[0].tolist()
+    after = np.array([seam for seam in seams if seam > times[0]])
+    both = [sampled(vector, each)[:, :2] for each in (np.nextafter(after, 0.0), after)]
+    np.testing.assert_allclose(*both, rtol=0.0, atol=1e-9)
+
+
+def sequence_of_references(seed):
+    """Return the reference (k, 3, 2) at every sample, while ten trajectories are sent."""
+    rng = np.random.default_rng(seed)
+    vector, sample, seen, accepted = PAPER, 3300, [], 0
+    for _ in range(10):
+        lead = int(rng.choice([0, 5, 20, 160, 320]))
+        taken = int(rng.integers(0, lead + 1))  # samples that planning takes
+        at = (sample + lead) * PERIOD
+        try:
+            sent = random_trajectory(rng, at, vector)
+            planned = plan(sent, vector, at).vector
+        except TrajectoryError:
+            planned = vector
+        seen.append(sampled(vector, PERIOD * np.arange(sample, sample + taken)))
+        sample += taken
+        accepted += planned is not vector
+        before, vector = vector, remaining(planned, (sample - 1) * PERIOD)
+        check_seams(before, vector, sample - 1, sample + lead - taken)
+        gap = int(rng.choice([1, 7, 10, 50, 400, 1500]))
+        seen.append(sampled(vector, PERIOD * np.arange(sample, sample + gap)))
+        sample += gap
+    return np.concatenate(seen), accepted
+
+
+def test_random_sequences_of_trajectories_never_jump_and_keep_the_limits():
+    """What velocity and acceleration at two samples explain: Taylor's remainders.
+
+    Between two samples h apart, the velocity changes by at most the largest acceleration a times
+    h, and the position by h times the mean of the velocities, up to a h^2 / 4. `check_seams`
+    finds smaller jumps.
+    """
+    accepted = 0
+    for seed in range(SEQUENCES):
+        reference, count = sequence_of_references(seed)
+        accepted += count
+        q, v, a = reference.transpose(1, 0, 2)
+        # Blends are checked every 5 ms or 200 times: between, 1e-3 of their acceleration is missed.
+        assert np.all(np.abs(a) <= STRONGEST * 1.001), seed
+        assert np.all(np.abs(v) <= FASTEST * 1.001), seed
+        rise = np.abs(np.diff(v, axis=0))
+        assert np.all(rise <= PERIOD * STRONGEST * 1.001 + 1e-9), seed
+        mean = 0.5 * PERIOD * (v[1:] + v[:-1])
+        slack = 0.25 * PERIOD * PERIOD * STRONGEST * 1.001
+        slip = np.abs(np.diff(q, axis=0) - mean)
+        assert np.all(slip <= slack + 1e-9), seed
+    assert accepted > 3 * SEQUENCES  # of ten in each

@@ -77,9 +77,8 @@ class MissingJointError(MessageError):
 
     def __init__(self, joint: str, names: tuple[str, ...]) -> None:
         self.joint, self.names = joint, names
-        self.fact = (
-            f'joint {joint!r} is not in the message, which names {", ".join(names) or "none"}'
-        )
+        listed = ', '.join(names) or 'none'
+        self.fact = f'joint {joint!r} is not in the message, which names {listed}'
         super().__init__(
             f'{self.fact}: set the parameter `joints` to names from this list, or publish the joint'
         )
@@ -142,7 +141,9 @@ class Layout:
         """Return whether a message has this layout."""
         return len(raw) == self.size and self._parts_of(raw) == self._parts
 
-    def places_of(self, joints: Sequence[str], required: Collection[str]) -> NDArray[np.intp]:
+    def places_of(
+        self, joints: Sequence[str], required: Collection[str]
+    ) -> NDArray[np.intp]:
         """Return the places of position, velocity and effort of n `joints` (3, n); -1: empty.
 
         Raises:
@@ -263,7 +264,8 @@ class TrajectoryContent(NamedTuple):
 
     stamp: int  # ns
     names: tuple[str, ...]
-    points: tuple[tuple[int, list[tuple[float, ...]]], ...]  # ns from the start, the four arrays
+    # ns from the start, the four arrays
+    points: tuple[tuple[int, list[tuple[float, ...]]], ...]
 
 
 def joint_trajectory(raw: bytes) -> TrajectoryContent:
@@ -288,15 +290,20 @@ class JointStateEncoder:
     Those of position, velocity, effort in `fields` hold a value for each name; others are empty.
     """
 
-    def __init__(self, names: Sequence[str], fields: Collection[str] = JOINT_STATE_FIELDS) -> None:
+    def __init__(
+        self, names: Sequence[str], fields: Collection[str] = JOINT_STATE_FIELDS
+    ) -> None:
         types = typestore().types
         stamp = types['builtin_interfaces/msg/Time'](sec=0, nanosec=0)
         header = types['std_msgs/msg/Header'](stamp=stamp, frame_id='')
-        arrays = [np.zeros(len(names) * (field in fields)) for field in JOINT_STATE_FIELDS]
+        arrays = [
+            np.zeros(len(names) * (field in fields)) for field in JOINT_STATE_FIELDS
+        ]
         message = types[JOINT_STATE](header, list(names), *arrays)
         self._buffer = bytearray(typestore().serialize_cdr(message, JOINT_STATE))
         self._position, self._velocity, self._effort = (
-            _view(self._buffer, each) for each in joint_state_layout(self._buffer).arrays.values()
+            _view(self._buffer, each)
+            for each in joint_state_layout(self._buffer).arrays.values()
         )
 
     def encode(
@@ -319,19 +326,32 @@ class JointStateEncoder:
 
 
 class Float64MultiArrayEncoder:
-    """Encoder of std_msgs/Float64MultiArray of a fixed size, without dimensions."""
+    """Encoder of std_msgs/Float64MultiArray of a fixed size.
 
-    def __init__(self, size: int) -> None:
+    Without a `label` it has no dimensions; with one, its only dimension carries it.
+    """
+
+    def __init__(self, size: int, label: str = '') -> None:
         types = typestore().types
-        layout = types['std_msgs/msg/MultiArrayLayout'](dim=[], data_offset=0)
+        dimension = types['std_msgs/msg/MultiArrayDimension'](label, size, size)
+        dimensions = [dimension] if label else []
+        layout = types['std_msgs/msg/MultiArrayLayout'](dim=dimensions, data_offset=0)
         message = types[FLOAT64_MULTI_ARRAY](layout=layout, data=np.zeros(size))
-        self._buffer = bytearray(typestore().serialize_cdr(message, FLOAT64_MULTI_ARRAY))
-        self._data = _view(self._buffer, array_layout(self._buffer).arrays['effort'])
+        self._buffer = bytearray(
+            typestore().serialize_cdr(message, FLOAT64_MULTI_ARRAY)
+        )
+        doubles = array_layout(self._buffer).arrays['effort']
+        self._data = _view(self._buffer, doubles)
+        self._head = bytes(self._buffer[: doubles.offset])
 
     def encode(self, data: ArrayLike) -> bytes:
         """Return the serialised message of `data` (size,); ValueError for another length."""
         self._data[:] = data
         return bytes(self._buffer)
+
+    def has_layout(self, raw: bytes) -> bool:
+        """Whether a serialised message has the size and the label of this encoder."""
+        return raw.startswith(self._head)
 
 
 def encode_clock(stamp_ns: int) -> bytes:
@@ -340,7 +360,9 @@ def encode_clock(stamp_ns: int) -> bytes:
 
 
 def _view(buffer: bytearray, doubles: Doubles) -> Floats:
-    return np.frombuffer(buffer, '<f8', doubles.size, doubles.offset if doubles.size else 0)
+    return np.frombuffer(
+        buffer, '<f8', doubles.size, doubles.offset if doubles.size else 0
+    )
 
 
 _OTHER = -1  # ns: a message of this very time is read the long way each time
@@ -394,7 +416,11 @@ class _Decoder:
         for part in layout.fixed:
             expected[0, part] = np.frombuffer(raw[part], np.uint8)
             expected[1, part] = 255
-        self._known = expected, np.where(places < 0, -1, ORIGIN + 8 * places), self._bytes
+        self._known = (
+            expected,
+            np.where(places < 0, -1, ORIGIN + 8 * places),
+            self._bytes,
+        )
         self.values[:] = np.nan
         self._read(raw, *self._known)
 
@@ -411,10 +437,13 @@ class JointStateDecoder(_Decoder):
     """
 
     def __init__(
-        self, joints: Sequence[str], required: Collection[str] = ('position', 'velocity')
+        self,
+        joints: Sequence[str],
+        required: Collection[str] = ('position', 'velocity'),
     ) -> None:
         super().__init__(3 * len(joints))
-        self._joints, self._required = tuple(joints), frozenset(required)
+        self._joints = tuple(joints)
+        self._required = frozenset(required)
         self.position, self.velocity, self.effort = self.values.reshape(3, -1)
 
     def decode(self, raw: bytes) -> int:

@@ -16,6 +16,7 @@ from typing import Any, NamedTuple
 from blf_dsc_controller import __version__
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.messages.codecs import typestore
+from blf_dsc_controller.messages.event_content import FORMAT, check_event
 from blf_dsc_controller.messages.topics import JOURNAL
 
 OUTSIDE_BOUND = 'error past the bound'
@@ -23,19 +24,22 @@ OUTSIDE_BOUND = 'error past the bound'
 
 
 class EventType(str, Enum):
-    """Type of an event, with the event's content."""
+    """Type of an event; its content is in `event_content.SCHEMA`."""
 
     __str__ = str.__str__
 
-    CONFIGURE = 'configure'  # parameters: all of them by name; version: of this package
+    CONFIGURE = 'configure'
     ACTIVATE = 'activate'
-    START = 'start'  # the law receives its first state; resumed: on the running reference
-    TRAJECTORY = 'trajectory'  # joints, points, begin: as sent; at: followed from then on
-    PARAMETERS = 'parameters'  # parameters: the changed ones by name
-    STOP = 'stop'  # reason, text
-    SILENCE = 'silence'  # torques: commanded by the watchdog before the next message
+    START = 'start'  # the law receives its first state
+    TRAJECTORY = 'trajectory'
+    TARGET = 'target'  # of a stream; these are on `~/targets`
+    BRAKE = 'brake'
+    PARAMETERS = 'parameters'
+    STOP = 'stop'
+    SILENCE = 'silence'  # of the joint states, in which the watchdog commanded
     DEACTIVATE = 'deactivate'
     RESET = 'reset'
+    WITHDRAW = 'withdraw'  # nothing is commanded until a reset or activation
     RELEASE = 'release'
 
 
@@ -54,7 +58,9 @@ class Event(NamedTuple):
         return _json(self._asdict())
 
 
-def encode_change(stamp: int, parameters: Mapping[str, Any], *, configured: bool = False) -> bytes:
+def encode_change(
+    stamp: int, parameters: Mapping[str, Any], *, configured: bool = False
+) -> bytes:
     """Return the message of `~/changes` on parameters of the plant, in force from a stamp [ns] on.
 
     `configured`: these are all of them, at the start.
@@ -75,11 +81,15 @@ def decode(raw: bytes) -> Event:
     """
     try:
         message: Any = typestore().deserialize_cdr(raw, JOURNAL.type)
-        event = Event(**json.loads(message.data))
-        return event._replace(type=EventType(event.type), content={**event.content})
-    except Exception as error:
+        given = json.loads(message.data)
+        check_event(given)
+    except Exception as error:  # libraries raise nearly anything
         reason = f'a message of {JOURNAL.resolved} holds no event: {error}'
-        raise BlfDscError(reason) from error
+        raise BlfDscError(' '.join(reason.split())) from error
+    known = {name: given[name] for name in Event._fields}
+    known['type'] = EventType(given['type'])
+    known['content'] = {**given['content']}
+    return Event(**known)
 
 
 class Journal:
@@ -101,6 +111,9 @@ class Journal:
         """Add an event that happens now."""
         if event is EventType.CONFIGURE:
             content['version'] = __version__
-        noted = Event(self._number, event, self.stamp, self.messages, self.commands, content)
+            content['format'] = FORMAT
+        noted = Event(
+            self._number, event, self.stamp, self.messages, self.commands, content
+        )
         self._number += 1
         self.pending.append(noted)

@@ -81,14 +81,22 @@ REFERENCE = Topic(CONTROLLER, '~/reference', JOINT_STATE, STREAM, STREAM)
 TRACKING_ERROR = Topic(CONTROLLER, '~/tracking_error', JOINT_STATE, STREAM, STREAM)
 BOUND = Topic(CONTROLLER, '~/bound', JOINT_STATE, HISTORY, LATCHED_QUALITY)
 STATE = Topic(
-    CONTROLLER, '~/state', 'diagnostic_msgs/msg/DiagnosticStatus', LATCHED_QUALITY, LATCHED_QUALITY
+    CONTROLLER,
+    '~/state',
+    'diagnostic_msgs/msg/DiagnosticStatus',
+    LATCHED_QUALITY,
+    LATCHED_QUALITY,
 )
 MONITOR = Topic(CONTROLLER, '~/monitor', JOINT_STATE, HISTORY, STREAM)
 TRUTH = Topic(PLANT, '~/truth', JOINT_STATE, HISTORY, STREAM)
 TIMING = Topic(PLANT, '~/timing', JOINT_STATE, STREAM, STREAM)
 CLOCK = Topic(PLANT, '/clock', 'rosgraph_msgs/msg/Clock', STREAM, LATEST)
 DIAGNOSTICS = Topic(
-    CONTROLLER, '/diagnostics', 'diagnostic_msgs/msg/DiagnosticArray', DIAGNOSTIC, DIAGNOSTIC
+    CONTROLLER,
+    '/diagnostics',
+    'diagnostic_msgs/msg/DiagnosticArray',
+    DIAGNOSTIC,
+    DIAGNOSTIC,
 )
 ROBOT_DESCRIPTION = Topic(
     PLANT, 'robot_description', 'std_msgs/msg/String', LATCHED_QUALITY, LATCHED_QUALITY
@@ -106,6 +114,12 @@ JOINT_TRAJECTORY = Topic(
 """Published by other nodes for the controller."""
 JOURNAL = Topic(CONTROLLER, '~/journal', 'std_msgs/msg/String', HISTORY, HISTORY)
 """Every event of the controller, also for late recorders: see messages.journal."""
+TARGETS = Topic(CONTROLLER, '~/targets', 'std_msgs/msg/String', STREAM, STREAM)
+"""Events of the journal that come with each target of a stream, which would fill its history."""
+JOINT_POSITIONS = Topic(
+    CONTROLLER, '~/joint_positions', FLOAT64_MULTI_ARRAY, LATEST, LATEST
+)
+"""Published by other nodes for the controller."""
 
 TOPICS = (
     JOINT_STATES,
@@ -115,6 +129,7 @@ TOPICS = (
     BOUND,
     STATE,
     JOURNAL,
+    TARGETS,
     MONITOR,
     TRUTH,
     TIMING,
@@ -124,7 +139,8 @@ TOPICS = (
 
 # In the vectors truth, timing, monitor.
 DISTURBANCE = 'disturbance '  # followed by the joint
-COLUMNS = ('bias ', 'viscous ', 'coulomb ', 'sin ', 'cos ')  # prefixes of disturbance columns
+# prefixes of disturbance columns
+COLUMNS = ('bias ', 'viscous ', 'coulomb ', 'sin ', 'cos ')
 POSITION = 'position '  # followed by the joint
 VELOCITY = 'velocity '  # followed by the joint
 RATIO = 'max_error_ratio '  # followed by the joint: the largest |xi1| / k_c so far

@@ -51,11 +51,14 @@ class Violation(NamedTuple):
     value: float
     limit: float
     time: float  # s
-    ratio: float  # value over limit; positions are relative to the middle of their range
+    # value over limit; positions are relative to the middle of their range
+    ratio: float
 
     def __str__(self) -> str:
         """Describe the violation: joint, quantity, value and limit with their unit."""
-        unit = {'position': 'rad', 'velocity': 'rad/s', 'acceleration': 'rad/s^2'}[self.quantity]
+        unit = {'position': 'rad', 'velocity': 'rad/s', 'acceleration': 'rad/s^2'}[
+            self.quantity
+        ]
         return (
             f'the {self.quantity} of joint {self.joint!r} would be {self.value:.6g} {unit} at '
             f't = {self.time:.6g} s, past its limit of {self.limit:.6g} {unit}'
@@ -90,7 +93,8 @@ def worst_violation(
     qr, dqr, ddqr = sampled(vector, times).transpose(1, 0, 2)
     limits = config.limits
     lower, upper = np.array((limits.position_lower, limits.position_upper))
-    middle, reach = 0.5 * (upper + lower), 0.5 * (upper - lower)
+    middle = 0.5 * (upper + lower)
+    reach = 0.5 * (upper - lower)
     worst = None
     for quantity, value, allowed in (
         ('position', qr - middle, reach),
@@ -106,7 +110,9 @@ def worst_violation(
         reached = float(value[at, i])
         limit = shift + float(np.copysign(allowed[i], reached))
         time = float(times[at])
-        worst = Violation(config.joints[i], quantity, shift + reached, limit, time, ratio)
+        worst = Violation(
+            config.joints[i], quantity, shift + reached, limit, time, ratio
+        )
     return worst
 
 
@@ -124,7 +130,9 @@ def hold(position: np.ndarray) -> Term:
 
 def braking_time(dq: np.ndarray, config: ControllerConfig) -> float:
     """Return the time [s] to come to rest from dq (n,) [rad/s], within half of the limits."""
-    return max(_SHORTEST, float(np.max(_BRAKE * np.abs(dq) / config.limits.acceleration)))
+    return max(
+        _SHORTEST, float(np.max(_BRAKE * np.abs(dq) / config.limits.acceleration))
+    )
 
 
 def stop(t0: float, q: np.ndarray, dq: np.ndarray, config: ControllerConfig) -> Term:
@@ -144,7 +152,8 @@ def blend(
     Raises:
         MotionError: `target` or every blend within approach.longest violates a limit.
     """
-    n, longest = len(config.joints), config.approach.longest
+    n = len(config.joints)
+    longest = config.approach.longest
     found = worst_violation(pack(n, [target]), check_times(t0, t0 + longest), config)
     if found is not None:
         raise MotionError(
@@ -157,7 +166,9 @@ def blend(
         return pack(n, [*before, target._replace(begin=t0, fade=duration)])
 
     def violation(duration: float) -> Violation | None:
-        return worst_violation(attempt(duration), check_times(t0, t0 + duration), config)
+        return worst_violation(
+            attempt(duration), check_times(t0, t0 + duration), config
+        )
 
     too_short, duration = 0.0, min(_SHORTEST, longest)
     while (found := violation(duration)) is not None:
@@ -168,7 +179,8 @@ def blend(
                 f'at rest, or relax {found.parameters} or approach.longest',
                 found,
             )
-        too_short, duration = duration, min(duration * _STEP, longest)
+        too_short = duration
+        duration = min(duration * _STEP, longest)
     for _ in range(_BISECTIONS):
         middle = 0.5 * (too_short + duration)
         if violation(middle) is None:
@@ -217,7 +229,9 @@ def check_takeover(
                 f'joint {joint!r} starts {error:+.6g} rad from the reference, outside its bound of '
                 f'{limit:.6g} rad: start closer to the reference, or widen barrier.bound'
             )
-    limits = np.sqrt(2.0 * np.array(config.limits.acceleration) * (bound - np.abs(q - qr)))
+    limits = np.sqrt(
+        2.0 * np.array(config.limits.acceleration) * (bound - np.abs(q - qr))
+    )
     for joint, difference, limit in zip(config.joints, dq - dqr, limits, strict=True):
         if not abs(difference) < limit:
             raise StartError(
@@ -244,7 +258,9 @@ def _via_centre(
 
 def _check_limits(config: ControllerConfig, q: np.ndarray) -> None:
     """Check that the arm can be held at q (n,) [rad], at most `_PAST` past its limits."""
-    limits = zip(config.limits.position_lower, config.limits.position_upper, strict=True)
+    limits = zip(
+        config.limits.position_lower, config.limits.position_upper, strict=True
+    )
     for joint, at, (lower, upper) in zip(config.joints, q, limits, strict=True):
         if not lower - _PAST <= at <= upper + _PAST:
             raise StartError(
@@ -255,7 +271,11 @@ def _check_limits(config: ControllerConfig, q: np.ndarray) -> None:
 
 
 def plan_start(
-    config: ControllerConfig, bound: np.ndarray, q: np.ndarray, dq: np.ndarray, t: float = 0.0
+    config: ControllerConfig,
+    bound: np.ndarray,
+    q: np.ndarray,
+    dq: np.ndarray,
+    t: float = 0.0,
 ) -> BlendedReference:
     """Plan the configured reference, with an approach unless the law can take over at once.
 

@@ -32,7 +32,8 @@ import numpy as np
 from blf_dsc_controller.compiled.algebra import product
 from blf_dsc_controller.compiled.elementary import cos, sin
 from blf_dsc_controller.compiled.jit import inner, kernel
-from blf_dsc_controller.compiled.layout import Array, part, view
+from blf_dsc_controller.compiled.layout import Array
+from blf_dsc_controller.compiled.views import part, view
 
 SINUSOIDS = 0
 SPLINE = 1
@@ -83,11 +84,34 @@ def pieces_of(term: Term, n: int) -> tuple[Array, Array]:
     return knots, coefficients.reshape(count, n, 6)
 
 
+def turning_times(term: Term, n: int) -> Array:
+    """Return the times [s] between which the acceleration of each joint of a spline is monotonic.
+
+    They are its knots, the last times before them, since the acceleration of cubics jumps there,
+    and the zeros of its jerk, 6 c3 + 24 c4 x + 60 c5 x^2.
+    """
+    knots, coefficients = pieces_of(term, n)
+    duration = np.append(np.diff(knots), 0.0)[:, np.newaxis]
+    constant, linear, square = np.moveaxis(coefficients[:, :, 3:], -1, 0)
+    linear = 4.0 * linear
+    square = 10.0 * square
+    with np.errstate(all='ignore'):  # a jerk without zeros has none that are finite
+        root = np.sqrt(linear * linear - 4.0 * square * constant)
+        half = -0.5 * (linear + np.copysign(root, linear))
+        zeros = np.stack((half / square, constant / half))
+        inside = (zeros > 0.0) & (zeros < duration)
+    at = (knots[:, np.newaxis] + zeros)[inside]
+    return np.concatenate((knots, np.nextafter(knots, -inf), at))
+
+
 def pack(n: int, terms: Sequence[Term]) -> Array:
     """Return the vector of a reference for n joints; `unpack` is the inverse."""
     packed = [
         np.concatenate(
-            ((term.code, _HEAD + term.content.size, term.begin, term.fade), term.content)
+            (
+                (term.code, _HEAD + term.content.size, term.begin, term.fade),
+                term.content,
+            )
         )
         for term in terms
     ]
@@ -101,13 +125,24 @@ def unpack(vector: Array) -> list[Term]:
     for _ in range(int(vector[1])):
         size = int(vector[at + 1])
         content = vector[at + _HEAD : at + size].copy()
-        terms.append(Term(int(vector[at]), content, float(vector[at + 2]), float(vector[at + 3])))
+        terms.append(
+            Term(int(vector[at]), content, float(vector[at + 2]), float(vector[at + 3]))
+        )
         at += size
     return terms
 
 
+def remaining(vector: Array, t: float) -> Array:
+    """Return a packed reference without the terms that have no effect from time t [s] on."""
+    terms = unpack(vector)
+    in_force = max((k for k, term in enumerate(terms) if term.settled <= t), default=0)
+    return pack(int(vector[0]), terms[in_force:])
+
+
 @inner
-def sinusoids(vector: Array, at: int, n: int, i: int, t: float) -> tuple[float, float, float]:
+def sinusoids(
+    vector: Array, at: int, n: int, i: int, t: float
+) -> tuple[float, float, float]:
     """Return q, q', q'' at t [s] of joint i of n, of sinusoids with content from entry `at` on."""
     tones = int(vector[at])
     offset = part(vector, at + 1, (n,))
@@ -141,7 +176,9 @@ def piece_at(knots: Array, t: float) -> int:
 
 
 @inner
-def spline(vector: Array, at: int, n: int, i: int, t: float) -> tuple[float, float, float]:
+def spline(
+    vector: Array, at: int, n: int, i: int, t: float
+) -> tuple[float, float, float]:
     """Return q, q', q'' at t [s] of joint i of n, of a spline with content from entry `at` on."""
     pieces = int(vector[at])
     knots = part(vector, at + 1, (pieces,))
@@ -175,7 +212,9 @@ def term_in_force(vector: Array, t: float) -> tuple[int, int]:
 
 
 @inner
-def term_at(vector: Array, at: int, n: int, i: int, t: float) -> tuple[float, float, float]:
+def term_at(
+    vector: Array, at: int, n: int, i: int, t: float
+) -> tuple[float, float, float]:
     """Return q, q', q'' at time t [s] of joint i of n, of the term that starts at entry `at`."""
     if vector[at] == SPLINE:
         return spline(vector, at + _HEAD, n, i, t)
@@ -228,7 +267,8 @@ def quintics(h: Array, begin: Array, end: Array) -> Array:
     `begin` and `end` are the positions, velocities and accelerations (3, pieces, n) at the ends.
     """
     h = np.asarray(h, dtype=np.float64)[:, np.newaxis]
-    square, cube = h * h, h * h * h  # not h**3: powers are rounded otherwise on other processors
+    # not h**3: powers are rounded otherwise on other processors
+    square, cube = h * h, h * h * h
     p, v, a = begin
     dp = end[0] - p - v * h - 0.5 * a * square
     dv = (end[1] - v - a * h) * h
@@ -265,13 +305,17 @@ def hermite(times: Array, points: Array) -> Term:
     return ending_at_rest(times, pieces, points[0, -1])
 
 
-def minimum_jerk(times: Array, positions: Array) -> Term:
-    """Return the minimum jerk from rest to rest through positions (k, n) [rad].
+def minimum_jerk(
+    times: Array, positions: Array, start: Array | float = 0.0, end: Array | float = 0.0
+) -> Term:
+    """Return the minimum jerk through positions (k, n) [rad] at increasing times (k,) [s].
 
-    The times (k,) [s] increase.
+    `start` and `end` are velocity and acceleration (2, n) at the ends, by default at rest.
     """
     points = np.zeros((3, *positions.shape))
     points[0] = positions
+    points[1:, 0] = start
+    points[1:, -1] = end
     if len(times) > 2:
         _solve_inner_points(np.diff(times), points)
     return hermite(times, points)
@@ -287,7 +331,10 @@ def _solve_inner_points(h: Array, points: Array) -> None:
     upper, right = [np.zeros((2, 2))], [points[1:, 0]]
     for k in inner:
         l, r = 1.0 / h[k - 1], 1.0 / h[k]
-        l2, r2, l3, r3 = l * l, r * r, l * l * l, r * r * r
+        l2 = l * l
+        r2 = r * r
+        l3 = l * l * l
+        r3 = r * r * r
         before = np.array([[-24.0 * l2, -3.0 * l], [-168.0 * l3, -24.0 * l2]])
         after = np.array([[24.0 * r2, -3.0 * r], [-168.0 * r3, 24.0 * r2]])
         here = np.array(
@@ -301,6 +348,8 @@ def _solve_inner_points(h: Array, points: Array) -> None:
         (a, b), (c, d) = here - product(before, upper[-1])
         solved = np.array([[d, -b], [-c, a]]) / (a * d - b * c)  # the inverse
         upper.append(product(solved, after))
-        right.append(product(solved, np.stack((jerk, snap)) - product(before, right[-1])))
+        right.append(
+            product(solved, np.stack((jerk, snap)) - product(before, right[-1]))
+        )
     for k in reversed(inner):
         points[1:, k] = right[k] - product(upper[k], points[1:, k + 1])

@@ -1,0 +1,177 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What each event of the journal holds, and the number of the journal's format.
+
+Every event that is read is checked against this schema, whoever wrote it. A new event, or a new
+field, gets its line in `SCHEMA`; where older versions would replay it wrongly, `FORMAT` is raised.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Mapping
+from typing import Any, NamedTuple
+
+from blf_dsc_controller.errors import BlfDscError
+
+FORMAT = 1
+"""Number of this journal's format; it is in the first event. 0 is from before the first release."""
+
+_LARGEST = 2**63 - 1  # of an integer
+_SHOWN = 40  # characters of a wrong value
+
+
+class Kind(NamedTuple):
+    """A kind of value."""
+
+    text: str  #: for messages, as "a number"
+    accepts: Callable[[Any], bool]
+
+
+class Field(NamedTuple):
+    """A field of an event."""
+
+    kind: Kind
+    optional: bool = False
+
+
+def _is_whole(value: object) -> bool:
+    """Return whether it is an integer of 64 bits; true and false are none."""
+    is_integer = isinstance(value, int) and not isinstance(value, bool)
+    return is_integer and -_LARGEST <= value <= _LARGEST  # type: ignore[operator]
+
+
+def _is_number(value: object) -> bool:
+    return _is_whole(value) or (isinstance(value, float) and math.isfinite(value))
+
+
+def _is_scalar(value: object) -> bool:
+    return isinstance(value, (bool, str, float)) or _is_whole(value)
+
+
+def _is_parameter(value: object) -> bool:
+    return _is_scalar(value) or _is_list(value, _is_scalar)
+
+
+def _is_list(value: object, is_item: Callable[[Any], bool]) -> bool:
+    return isinstance(value, (list, tuple)) and all(map(is_item, value))
+
+
+def _is_mapping(value: object, is_item: Callable[[Any], bool]) -> bool:
+    return (
+        isinstance(value, Mapping)
+        and all(isinstance(key, str) for key in value)
+        and all(map(is_item, value.values()))
+    )
+
+
+TEXT = Kind('a text', lambda value: isinstance(value, str))
+FLAG = Kind('true or false', lambda value: isinstance(value, bool))
+COUNT = Kind('a count', lambda value: _is_whole(value) and value >= 0)
+STAMP = Kind('a stamp in ns, or -1', lambda value: _is_whole(value) and value >= -1)
+NUMBER = Kind('a finite number', _is_number)
+NUMBER_OR_NULL = Kind(
+    'a finite number or null', lambda value: value is None or _is_number(value)
+)
+NUMBERS = Kind('a list of finite numbers', lambda value: _is_list(value, _is_number))
+NAMES = Kind('a list of texts', lambda value: _is_list(value, TEXT.accepts))
+NAMES_BY_NAME = Kind('texts by name', lambda value: _is_mapping(value, TEXT.accepts))
+CONTENT = Kind('fields by name', lambda value: isinstance(value, Mapping))
+PARAMETERS = Kind('parameters by name', lambda value: _is_mapping(value, _is_parameter))
+
+_POINT = {
+    'time': Field(NUMBER),
+    'positions': Field(NUMBERS),
+    'velocities': Field(NUMBERS, optional=True),
+    'accelerations': Field(NUMBERS, optional=True),
+    'effort': Field(NUMBERS, optional=True),
+}
+
+
+def _is_point(value: object) -> bool:
+    return (
+        isinstance(value, Mapping)
+        and value.keys() <= _POINT.keys()
+        and not [*_problems(value, _POINT)]
+    )
+
+
+POINTS = Kind(
+    'a list of points of a trajectory', lambda value: _is_list(value, _is_point)
+)
+
+EVENT = {
+    'number': Field(COUNT),
+    'type': Field(TEXT),
+    'stamp': Field(STAMP),
+    'messages': Field(COUNT),
+    'commands': Field(COUNT),
+    'content': Field(CONTENT),
+}
+"""Fields of every event; see `Event`."""
+
+SCHEMA: Mapping[str, Mapping[str, Field]] = {
+    'configure': {
+        'parameters': Field(PARAMETERS),  # all of them
+        'format': Field(COUNT, optional=True),  # of the journal; 0 without
+        'version': Field(TEXT, optional=True),  # of the package
+        'topics': Field(NAMES_BY_NAME, optional=True),  # used, by our name
+    },
+    'activate': {},
+    'start': {'resumed': Field(FLAG)},
+    'trajectory': {
+        'joints': Field(NAMES),
+        'points': Field(POINTS),
+        'begin': Field(NUMBER_OR_NULL),  # s since the start; null: at once
+        'at': Field(NUMBER),  # s since the start, followed from then on
+    },
+    'target': {
+        'positions': Field(NUMBERS),  # rad, in the order of `joints`
+        'velocities': Field(NUMBERS),  # rad/s
+        'due': Field(NUMBER),  # s since the start, when the reference should be there
+        'until': Field(NUMBER),  # s, when it brakes if nothing follows
+        'held': Field(FLAG),  # whether it then returns to the positions
+        'at': Field(NUMBER),  # s, followed from then on
+    },
+    'brake': {},
+    'parameters': {'parameters': Field(PARAMETERS)},  # the changed ones
+    'stop': {'reason': Field(TEXT), 'text': Field(TEXT)},
+    'silence': {'torques': Field(COUNT)},  # by the watchdog, before the next message
+    'deactivate': {},
+    'reset': {},
+    'withdraw': {'text': Field(TEXT)},  # nothing is commanded until a reset, and why
+    'release': {'resting': Field(FLAG, optional=True)},  # under the last torque
+}
+"""Fields of the content of each type of event. Others that a later version adds are ignored."""
+
+
+def check_event(given: object) -> None:
+    """Check the fields of an event and its content.
+
+    Raises:
+        BlfDscError: its type is unknown, or a field is missing or of another kind.
+    """
+    if not isinstance(given, Mapping):
+        raise BlfDscError('it is no object with fields by name')
+    _check(given, EVENT)
+    fields = SCHEMA.get(given['type'])
+    if fields is None:
+        raise BlfDscError(
+            f'the type {given["type"][:_SHOWN]!r} is none of {", ".join(SCHEMA)}: it may be of a '
+            'later version'
+        )
+    _check(given['content'], fields)
+
+
+def _check(given: Mapping[str, Any], fields: Mapping[str, Field]) -> None:
+    problem = next(_problems(given, fields), '')
+    if problem:
+        raise BlfDscError(problem)
+
+
+def _problems(given: Mapping[str, Any], fields: Mapping[str, Field]) -> Iterator[str]:
+    for name, (kind, is_optional) in fields.items():
+        if name not in given:
+            if not is_optional:
+                yield f'`{name}` is missing, expected {kind.text}'
+        elif not kind.accepts(given[name]):
+            yield f'`{name}` is {str(given[name])[:_SHOWN]!r}, expected {kind.text}'

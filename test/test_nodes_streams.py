@@ -1,0 +1,184 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Streams of targets, chunks, and stops over ROS, in lock-step in one process."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+pytest.importorskip('rclpy', reason='needs ROS 2')
+pytest.importorskip('ruckig', reason='needs ruckig')
+
+from rclpy.duration import Duration
+from rclpy.serialization import serialize_message
+from ros_rig import JOINTS
+from std_msgs.msg import Float64MultiArray
+from std_srvs.srv import Trigger
+from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
+
+from blf_dsc_controller.messages import topics
+from blf_dsc_controller.supervision.supervisor import Phase
+
+PATIENT = {
+    'safety__state_timeout': 60.0,
+    'limits__acceleration': [6.0, 6.0],
+    'telemetry__decimation': 1,
+}
+
+
+def inputs(law):
+    return law._status.trajectories
+
+
+def positions(values):
+    return serialize_message(Float64MultiArray(data=list(values)))
+
+
+def point(values, ahead, velocities=()):
+    at = Duration(nanoseconds=round(ahead * 1e9)).to_msg()
+    given = JointTrajectoryPoint(positions=list(values), velocities=list(velocities))
+    given.time_from_start = at
+    return given
+
+
+def trajectory(*points):
+    return serialize_message(JointTrajectory(joint_names=JOINTS, points=points))
+
+
+def call_stop(ros):
+    """Call ~/stop; return its response."""
+    client = ros.tester.create_client(Trigger, '/blf_dsc_controller/stop')
+    ros.until(client.service_is_ready)
+    future = client.call_async(Trigger.Request())
+    ros.until(future.done)
+    return future.result()
+
+
+def sway(t):
+    return np.array([1.9, 1.4]) + 0.1 * np.sin(2.0 * t) * np.array([1.0, -1.0])
+
+
+def positions_of(law, k, period):
+    inputs(law)._on_positions(positions(sway(k * period)))
+
+
+def points_of(law, k, period):
+    inputs(law)._on_trajectory(trajectory(point(sway(k * period), period)))
+
+
+def chunks_of(law, k, period):
+    """Send ten points each time, of which the next replaces all but one."""
+    if k % 5 == 0:
+        times = (k + 1 + np.arange(10)) * period
+        chunk = [point(sway(t), t - k * period) for t in times]
+        inputs(law)._on_trajectory(trajectory(*chunk))
+
+
+@pytest.mark.parametrize('send', [positions_of, points_of, chunks_of])
+def test_stream_is_followed_at_most_an_interval_behind_without_a_jump(ros, send):
+    """At 50 Hz, 20 ms behind at most 0.2 rad/s; chunks at 10 Hz keep their own times."""
+    references = ros.listen(topics.REFERENCE)
+    arm, law = ros.loop(None, PATIENT)
+    ros.run(arm, 50)
+    hold = trajectory(point(sway(0.0), 1.5))
+    inputs(law)._on_trajectory(hold)
+    ros.run(arm, 1700)
+    start = law.guard.time
+    period = 0.02
+    for k in range(150):
+        send(law, k, period)
+        ros.run(arm, 20)
+    assert inputs(law).rejected == 0, inputs(law).reason
+    ros.until(lambda: len(references) >= 4750)
+    q = np.array([each.position for each in references])
+    v = np.array([each.velocity for each in references])
+    rise = np.abs(np.diff(v, axis=0))
+    assert rise.max() <= 6.0e-3 * 1.001  # the limit over a millisecond
+    mean = 0.5e-3 * (v[1:] + v[:-1])
+    np.testing.assert_allclose(np.diff(q, axis=0), mean, atol=2e-6)
+    # one interval and the sample's own, after a second to get under way
+    t = 1e-3 * np.arange(1000, 2900)
+    behind = 0.0 if send is chunks_of else period
+    wanted = np.array([sway(each - behind) for each in t])
+    first = round(start * 1e3)
+    found = q[first + 1000 : first + 2900]
+    # the acceleration, 0.4 rad/s^2, over an interval each way: 0.2 mrad
+    assert np.abs(found - wanted).max() < 0.5e-3
+    assert law.guard.samples.ratio.max() < 1.0
+    assert law.guard.supervisor.phase is Phase.TRACKING
+
+
+@pytest.mark.parametrize('send', [positions_of, points_of])
+def test_reference_brakes_when_a_stream_ends(ros, send):
+    arm, law = ros.loop(None, PATIENT)
+    ros.run(arm, 50)
+    for k in range(20):
+        send(law, k, 0.02)
+        ros.run(arm, 20)
+    ros.run(arm, 800)
+    reference = law.guard.controller.reference_at(law.guard.time)
+    np.testing.assert_array_equal(reference[1:], 0.0)
+    if send is points_of:  # the last point of a trajectory is held
+        np.testing.assert_allclose(reference[0], sway(0.38), atol=1e-7)
+    assert law.guard.supervisor.phase is Phase.TRACKING
+
+
+def test_stop_brakes_and_outlasts_a_stream_until_that_pauses(ros):
+    arm, law = ros.loop(None, PATIENT)
+    ros.run(arm, 50)
+    far = trajectory(point((1.0, 0.5), 2.0))
+    inputs(law)._on_trajectory(far)
+    ros.run(arm, 1000)
+    moving = law.guard.controller.reference_at(law.guard.time)
+    assert np.abs(moving[1]).min() > 0.1
+    response = call_stop(ros)
+    assert response.success
+    assert 'braking for ' in response.message
+    np.testing.assert_allclose(
+        law.guard.controller.reference_at(law.guard.time), moving, atol=0.02
+    )
+    for _ in range(40):
+        inputs(law)._on_trajectory(far)
+        ros.run(arm, 20)
+    at_rest = law.guard.controller.reference_at(law.guard.time)
+    np.testing.assert_array_equal(at_rest[1:], 0.0)
+    # from v at 6 rad/s^2, which is reached in 0.05 s
+    distance = np.abs(at_rest[0] - moving[0])
+    assert np.all(distance < 0.5 * np.abs(moving[1]) * (np.abs(moving[1]) / 6.0 + 0.1))
+    ros.run(arm, 1100)
+    inputs(law)._on_trajectory(far)
+    ros.run(arm, 1000)
+    assert np.abs(law.guard.controller.reference_at(law.guard.time)[1]).min() > 0.1
+
+
+def test_stop_and_a_trajectory_without_points_are_always_accepted(ros):
+    arm, law = ros.loop(None, PATIENT)
+    response = call_stop(ros)
+    assert (response.success, 'nothing to stop' in response.message) == (True, True)
+    ros.run(arm, 1100)
+    inputs(law)._on_trajectory(trajectory(point((1.0, 0.5), 1.0)))
+    ros.run(arm, 300)
+    inputs(law)._on_trajectory(trajectory())
+    ros.run(arm, 800)
+    reference = law.guard.controller.reference_at(law.guard.time)
+    np.testing.assert_array_equal(reference[1:], 0.0)
+    assert inputs(law).rejected == 0
+
+
+WRONG = {
+    'it has 3 positions for 2 joints': (1.0, 1.0, 1.0),
+    'its positions are': (1.0, float('nan')),
+}
+
+
+@pytest.mark.parametrize('reason', WRONG)
+def test_wrong_positions_are_rejected_with_the_reason(ros, reason):
+    arm, law = ros.loop(None, PATIENT)
+    ros.run(arm, 50)
+    inputs(law)._on_positions(positions(WRONG[reason]))
+    assert reason in inputs(law).reason
+    inputs(law)._on_positions(
+        positions((9.0, 9.0))
+    )  # past the limits: as near as it may
+    ros.run(arm, 50)
+    assert inputs(law).targets == 1
