@@ -18,7 +18,12 @@ from blf_dsc_controller.run import Floats
 
 
 def corrected_urdf(
-    text: str, chain: Chain, inertias: Floats, viscous: Floats, coulomb: Floats, note: str
+    text: str,
+    chain: Chain,
+    inertias: Floats,
+    viscous: Floats,
+    coulomb: Floats,
+    note: str,
 ) -> str:
     """Return the URDF with inertias (n, 10) of the bodies and friction (n,) of the joints.
 
@@ -45,8 +50,16 @@ def _inertial(J: Floats) -> str:
     T = np.eye(4)
     T[:3, 3] = -centre
     I = rotational_inertia(T @ J @ T.T)
-    entries = {'ixx': (0, 0), 'ixy': (0, 1), 'ixz': (0, 2), 'iyy': (1, 1), 'iyz': (1, 2)}
-    tensor = ' '.join(f'{key}="{I[at]:.12g}"' for key, at in (entries | {'izz': (2, 2)}).items())
+    entries = {
+        'ixx': (0, 0),
+        'ixy': (0, 1),
+        'ixz': (0, 2),
+        'iyy': (1, 1),
+        'iyz': (1, 2),
+    }
+    tensor = ' '.join(
+        f'{key}="{I[at]:.12g}"' for key, at in (entries | {'izz': (2, 2)}).items()
+    )
     xyz = ' '.join(f'{x:.12g}' for x in centre)
     return (
         f'<inertial>\n      <origin xyz="{xyz}" rpy="0 0 0" />\n'
@@ -99,6 +112,7 @@ def _elements(raw: bytes) -> dict[tuple[str, str, str], _Element]:
         elif len(stack) == 2:
             found[stack[1][0], stack[1][1], tag] = opening, closing
 
-    parser.StartElementHandler, parser.EndElementHandler = begin, end
+    parser.StartElementHandler = begin
+    parser.EndElementHandler = end
     parser.Parse(raw, True)  # noqa: FBT003 - positional only
     return found

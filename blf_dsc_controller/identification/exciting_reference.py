@@ -51,7 +51,9 @@ class Clearance:
     """
 
     def __init__(self, chain: Chain, radius: float, floor: float) -> None:
-        self._chain, self._radius, self._floor = chain, radius, floor
+        self._chain = chain
+        self._radius = radius
+        self._floor = floor
         centres = [joint.inertia[:4] / joint.inertia[0] for joint in chain.joints]
         self._centres = [np.append(centre[1:], 1.0) for centre in centres]
         self._aside = [False] * len(centres)
@@ -60,7 +62,10 @@ class Clearance:
         for i, (begin, end) in enumerate(pairwise(origins[1:])):
             centre = (frames(chain, rest)[i + 1] @ self._centres[i])[:3]
             self._aside[i] = bool(distance(centre, centre, begin, end) > radius)
-        links = [0, *(k for i, aside in enumerate(self._aside, 1) for k in [i] * (1 + aside))]
+        links = [
+            0,
+            *(k for i, aside in enumerate(self._aside, 1) for k in [i] * (1 + aside)),
+        ]
         length = np.linalg.norm(np.diff(origins, axis=0), axis=1)
         end = np.cumsum(length)
         pairs = [
@@ -90,10 +95,15 @@ class Clearance:
         At q (..., n), as (distance / required) - 1: two radii are required, or one above the floor.
         """
         corners = self.corners(q)
-        begin, end = corners[..., :-1, :], corners[..., 1:, :]
+        begin = corners[..., :-1, :]
+        end = corners[..., 1:, :]
         a, b = self._first, self._second
-        apart = distance(begin[..., a, :], end[..., a, :], begin[..., b, :], end[..., b, :])
-        above = corners[..., 1 + _CARRIED + sum(self._aside[:_CARRIED]) :, 2] - self._floor
+        apart = distance(
+            begin[..., a, :], end[..., a, :], begin[..., b, :], end[..., b, :]
+        )
+        above = (
+            corners[..., 1 + _CARRIED + sum(self._aside[:_CARRIED]) :, 2] - self._floor
+        )
         room = (apart / (2.0 * self._radius), above / self._radius)
         return np.concatenate(room, axis=-1) - 1.0
 
@@ -103,8 +113,12 @@ def distance(a: np.ndarray, b: np.ndarray, c: np.ndarray, d: np.ndarray) -> np.n
 
     Ericson, Real-Time Collision Detection, 2005, 5.1.9; a segment may be a point.
     """
-    u, v, w = b - a, d - c, a - c
-    uu, uv, vv = (u * u).sum(-1), (u * v).sum(-1), (v * v).sum(-1)
+    u = b - a
+    v = d - c
+    w = a - c
+    uu = (u * u).sum(-1)
+    uv = (u * v).sum(-1)
+    vv = (v * v).sum(-1)
     uw, vw = (u * w).sum(-1), (v * w).sum(-1)
     tiny = np.finfo(float).tiny
     s = np.clip((uv * vw - vv * uw) / np.maximum(uu * vv - uv * uv, tiny), 0.0, 1.0)
@@ -118,10 +132,14 @@ class Excitation(NamedTuple):
     """Excitation by a periodic reference in the steady state, and its use of the limits."""
 
     gain: float  # objective of the search
-    left: float  # of the prior's deviation after a window, geometric mean over all directions
-    ratios: np.ndarray  # (4, n) largest position, velocity, acceleration, torque, over the limit
-    room: np.ndarray  # (k,) least room between pairs of links and to the floor; negative: too close
-    excess: float  # mean square violation of the limits, relative, and of the room, in m
+    # of the prior's deviation after a window, geometric mean over all directions
+    left: float
+    # (4, n) largest position, velocity, acceleration, torque, over the limit
+    ratios: np.ndarray
+    # (k,) least room between pairs of links and to the floor; negative: too close
+    room: np.ndarray
+    # mean square violation of the limits, relative, and of the room, in m
+    excess: float
 
     @property
     def is_allowed(self) -> bool:
@@ -138,7 +156,11 @@ class ExcitationProblem:
     """
 
     def __init__(
-        self, config: ControllerConfig, harmonics: int, radius: float = 0.07, floor: float = 0.0
+        self,
+        config: ControllerConfig,
+        harmonics: int,
+        radius: float = 0.07,
+        floor: float = 0.0,
     ) -> None:
         settings = self._settings = settings_of_config(config)
         chain = config.robot.chain(config.joints)
@@ -149,8 +171,10 @@ class ExcitationProblem:
         )
         self._scale = np.linalg.cholesky(prior_covariance(config))
         limits = config.limits
-        lower, upper = np.array(limits.position_lower), np.array(limits.position_upper)
-        self._middle, self._reach = 0.5 * (lower + upper), 0.5 * (upper - lower)
+        lower = np.array(limits.position_lower)
+        upper = np.array(limits.position_upper)
+        self._middle = 0.5 * (lower + upper)
+        self._reach = 0.5 * (upper - lower)
         torque = _TORQUE * settings.torque_limit
         tracked = self._reach - settings.bound
         self._limits = np.array((tracked, limits.velocity, limits.acceleration, torque))
@@ -160,17 +184,21 @@ class ExcitationProblem:
         self._base = 2.0 * np.pi / config.learning.window
         rates = self._base * np.arange(1, harmonics + 1)
         self._units = np.min(
-            [np.outer(limit, rates**-k) for k, limit in enumerate(self._limits[:3])], axis=0
+            [np.outer(limit, rates**-k) for k, limit in enumerate(self._limits[:3])],
+            axis=0,
         )
         samples = _SAMPLES_PER_HARMONIC * max(harmonics, 2)
         self._times = np.arange(samples) * (config.learning.window / samples)
         omega = self._base * np.arange(samples // 2 + 1)
-        self._filter = 1.0 / (1.0 + 1j * omega / settings.pole) ** 2  # two poles in series
+        # two poles in series
+        self._filter = 1.0 / (1.0 + 1j * omega / settings.pole) ** 2
 
     def start(self, random: np.random.Generator) -> np.ndarray:
         """Return a random x around the middle of each joint's range; see `parameters`."""
         n, h = self.n, self.harmonics
-        return np.append(random.uniform(-0.5, 0.5, n), random.normal(0.0, _SPREAD, 2 * n * h))
+        return np.append(
+            random.uniform(-0.5, 0.5, n), random.normal(0.0, _SPREAD, 2 * n * h)
+        )
 
     def parameters(self, x: np.ndarray) -> dict[str, tuple[float, ...]]:
         """Return the parameters of `reference` for x: offsets (n,), cosines and sines (n, h).
@@ -194,21 +222,29 @@ class ExcitationProblem:
         q, dq, ddq = motion.transpose(1, 0, 2)
         rows = self._rows(q, dq, ddq)
         torque = np.abs(rows @ self._guess.T).max(axis=2)
-        ratios = np.abs(np.stack((q - self._middle, dq, ddq, torque), axis=1)) / self._limits
+        ratios = (
+            np.abs(np.stack((q - self._middle, dq, ddq, torque), axis=1)) / self._limits
+        )
         room = self._clearance.room(q)
         over = (ratios - 1.0 + _MARGIN, _MARGIN - room)
         excess = sum((np.maximum(each, 0.0) ** 2).sum() for each in over) / len(q)
         mu = np.linalg.eigvalsh(self._relative_excitation(dq, rows))
         gain = np.log1p(np.maximum(mu, 0.0) / self._settings.prior_weight).sum()
         left = float(np.exp(-0.5 * gain / len(mu)))
-        return Excitation(float(gain), left, ratios.max(axis=0), room.min(axis=0), float(excess))
+        return Excitation(
+            float(gain), left, ratios.max(axis=0), room.min(axis=0), float(excess)
+        )
 
     def _rows(self, q: np.ndarray, dq: np.ndarray, ddq: np.ndarray) -> np.ndarray:
         """Return [H(q, dq, dq, ddq) | D] (k, n, m) of a motion, as `law.prediction` describes D."""
-        given, ones, t = self._settings, np.ones_like(dq), self._times[:, np.newaxis]
+        given = self._settings
+        ones = np.ones_like(dq)
+        t = self._times[:, np.newaxis]
         columns = [ones] * given.bias + [dq] * given.viscous
         columns += [np.tanh(dq / given.coulomb_velocity)] * given.coulomb
-        columns += [wave(w * t) * ones for w in given.frequencies for wave in (np.sin, np.cos)]
+        columns += [
+            wave(w * t) * ones for w in given.frequencies for wave in (np.sin, np.cos)
+        ]
         H = regressors_at(given.model, q, dq, dq, ddq)
         D = [column[:, :, np.newaxis] * np.eye(self.n) for column in columns]
         return np.concatenate((H, *D), axis=2)
@@ -218,7 +254,9 @@ class ExcitationProblem:
         settings = self._settings
         coarse = dq[::_COARSE]
         spectrum = np.fft.rfft(rows, axis=0)[: len(coarse) // 2 + 1] / _COARSE
-        X = np.fft.irfft(spectrum * self._filter[: len(spectrum), None, None], len(coarse), axis=0)
+        X = np.fft.irfft(
+            spectrum * self._filter[: len(spectrum), None, None], len(coarse), axis=0
+        )
         X *= settings.row_weight[:, None]
         if settings.motion_scale > 0.0:
             X *= (np.abs(coarse) / np.hypot(coarse, settings.motion_scale))[..., None]

@@ -1,0 +1,94 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The most likely values over physical bodies only: a convex problem, by the barrier method.
+
+    minimise  |A z - b|^2 / 2 + |z|^2 / 2  - mu sum_i log det J_i(z) - mu sum_k log s_k(z)
+
+with the pseudo-inertias J_i > 0 and scalars s_k > 0 affine in z, by Newton steps with decreasing mu
+(Boyd and Vandenberghe, Convex Optimization, 2004, chapter 11).  At the end the sum of squares is at
+most mu times the number of rows of all J_i and s_k above its minimum.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from blf_dsc_controller.errors import BlfDscError
+from blf_dsc_controller.run import Floats
+
+_LAST = 1e-3  # mu; one standard deviation adds 0.5 to the objective
+_REDUCTION = 0.1  # of mu, from one centring to the next
+_STEPS = 100
+_CENTRED = 1e-3  # of mu, Newton decrement at which mu is reduced
+_SUFFICIENT = 0.1  # of the linear decrease, in the line search
+_SHORTEST = 1e-9  # step of the line search
+
+
+class Cone(NamedTuple):
+    """A symmetric matrix (d, d) that must be positive definite: J0 + sum_a z[at + a] E[a]."""
+
+    at: int
+    J0: Floats  # (d, d)
+    E: Floats  # (k, d, d)
+
+    def of(self, z: Floats) -> Floats:
+        """Return the matrix at z."""
+        return np.asarray(self.J0 + np.tensordot(z[self.entries], self.E, 1))
+
+    @property
+    def entries(self) -> slice:
+        """The entries of z on which the matrix depends."""
+        return slice(self.at, self.at + self.E.shape[0])
+
+
+def solve(A: Floats, b: Floats, cones: list[Cone], z: Floats) -> Floats:
+    """Return the minimum, starting from z inside all cones; raises BlfDscError if not found."""
+    mu = max(1.0, float(np.sum((A @ z - b) ** 2)))
+    information = A.T @ A + np.eye(z.size)
+    target = A.T @ b
+    while mu > _LAST:
+        mu = max(_LAST, _REDUCTION * mu)
+        z = _centred(information, target, cones, z, mu)
+    return z
+
+
+def _centred(
+    information: Floats, target: Floats, cones: list[Cone], z: Floats, mu: float
+) -> Floats:
+    """Return the minimum for one mu."""
+    for _ in range(_STEPS):
+        gradient = information @ z - target
+        hessian = information.copy()
+        for cone in cones:
+            own = cone.entries
+            T = np.linalg.solve(cone.of(z), cone.E)
+            gradient[own] -= mu * np.trace(T, axis1=1, axis2=2)
+            hessian[own, own] += mu * np.einsum('aij,bji->ab', T, T)
+        step = np.linalg.solve(hessian, -gradient)
+        decrement = float(-gradient @ step)
+        if decrement < _CENTRED * mu:
+            return z
+        size = 1.0
+        least = _objective(information, target, cones, z, mu)
+        while size > _SHORTEST:
+            there = _objective(information, target, cones, z + size * step, mu)
+            if there <= least - _SUFFICIENT * size * decrement:
+                break
+            size *= 0.5
+        z = z + size * step
+    raise BlfDscError(f'no physical inertias found in {_STEPS} Newton steps')
+
+
+def _objective(
+    information: Floats, target: Floats, cones: list[Cone], z: Floats, mu: float
+) -> float:
+    """Return the objective, up to a constant; infinite outside a cone."""
+    value = 0.5 * float(z @ information @ z) - float(target @ z)
+    for cone in cones:
+        try:
+            L = np.linalg.cholesky(cone.of(z))
+        except np.linalg.LinAlgError:
+            return np.inf
+        value -= 2.0 * mu * float(np.log(np.diag(L)).sum())
+    return value

@@ -1,0 +1,34 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Recordings from any file: bags, and tables."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from blf_dsc_controller.bags.content import NO_NAMES, NameMap
+from blf_dsc_controller.identification.from_bag import read_bag
+from blf_dsc_controller.identification.from_table import TABLES, read_table
+from blf_dsc_controller.identification.recording import Recording
+
+
+def read_recording(
+    path: Path,
+    text: str,
+    joints: Sequence[str] = (),
+    namespace: str = '',
+    names: NameMap = NO_NAMES,
+    *,
+    commanded: bool = False,
+) -> Recording:
+    """Read a recording of the arm of a URDF (its text) from a bag or a table.
+
+    `joints` are the arm's, from its base to its tip; none: see `read_bag`, `read_table`.  `names`
+    are those that differ in the file.  `commanded`: commands of a bag are read instead of efforts.
+
+    Raises:
+        BlfDscError: the file cannot be read, or does not hold positions and torques of the arm.
+    """
+    if path.suffix.lower() in TABLES:
+        return read_table(path, text, joints, names)
+    return read_bag(path, text, joints, namespace, names, commanded)

@@ -1,0 +1,139 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What the model is, by cross-validation: contacts, optional terms, and widths of the prior.
+
+The recording is cut into five parts; each is predicted by the values found from the others.  Only
+the part that is fitted is used, never the one held back for the score.  Bounds are ignored here.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from blf_dsc_controller.identification.prior import Entry, Prior
+from blf_dsc_controller.identification.regression import Regression, regression
+from blf_dsc_controller.identification.sliding import DISTANCES
+from blf_dsc_controller.identification.windows import Indices, Rows
+from blf_dsc_controller.run import Floats
+
+# of the squared error of cross-validation, least reduction by what is not the default ...
+_WORTH = 0.01
+_WORTH_OF_TERM = 0.003  # ... and by an optional term
+_WIDTHS = (1.0, 3.0, 10.0, 30.0)  # of the prior
+
+
+class Selected(NamedTuple):
+    """A choice of the model."""
+
+    distances: Floats  # (n,) x_s of `sliding`, rad or m
+    prior: Prior  # with the terms that are kept, and their widths
+    widths: dict[str, float]  # factors of the groups of the prior
+
+
+def select(rows: Rows, fit: Indices, G: Floats, full: Prior) -> Selected:
+    """Return the model that predicts best, and set the columns of the rows for its contacts."""
+    distances = _contacts(rows, fit, G, full)
+    rows.set_sliding(distances)
+    found = regression(rows, fit, G, full)
+    found = found._replace(folds=found.folds.sum(axis=1, keepdims=True))
+    prior = full.only(_worthwhile(found, full))
+    widths = _widths(found, prior)
+    return Selected(distances, prior.widened(_factors(prior, widths)), widths)
+
+
+def _contacts(rows: Rows, fit: Indices, G: Floats, full: Prior) -> Floats:
+    """Return for each joint the distance x_s with which its own torque is predicted best."""
+    errors = []
+    every = np.ones(full.mean.size)
+    for distance in DISTANCES:
+        rows.set_sliding(np.full(rows.speed.size, distance))
+        found = regression(rows, fit, G, full)
+        of_joints = cross_validated(found, every).sum(axis=0)
+        errors.append(of_joints * found.deviation**2)
+    table = np.array(errors)
+    table[0] *= 1.0 - _WORTH
+    best = np.argmin(table, axis=0)
+    return np.asarray(np.array(DISTANCES)[best])
+
+
+def _worthwhile(found: Regression, prior: Prior) -> list[Entry]:
+    """Return the optional entries of z that predict the folds better.
+
+    Entries that cannot be negative must be positive in each prediction.
+    """
+    kept: list[Entry] = []
+    optional = prior.optional
+    cones = {cone.at for cone in prior.cones}
+    positive = [k for entry in optional for k in entry if k in cones]
+    used = np.ones(prior.mean.size)
+    for entry in optional:
+        used[list(entry)] = 0.0
+    least = float(cross_validated(found, used, positive).sum())
+    left = list(optional)
+    while left:
+        errors = []
+        for entry in left:
+            extended = used.copy()
+            extended[list(entry)] = 1.0
+            errors.append(float(cross_validated(found, extended, positive).sum()))
+        best = int(np.argmin(errors))
+        if errors[best] > (1.0 - _WORTH_OF_TERM) * least:
+            break
+        least = errors[best]
+        kept.append(left.pop(best))
+        used[list(kept[-1])] = 1.0
+    return kept
+
+
+def _widths(found: Regression, prior: Prior) -> dict[str, float]:
+    """Return the factor of each group's width, raised as long as that predicts better.
+
+    Every fold must agree: a disturbance that lasts for a part of the recording looks like other
+    inertias there, and only there.
+    """
+    used = prior.D.any(axis=0).astype(float)
+    widths = dict.fromkeys(prior.groups, 1.0)
+    least = cross_validated(found, used).sum(axis=1)
+    for group in prior.groups:
+        for width in _WIDTHS[1:]:
+            wider = widths | {group: width}
+            errors = cross_validated(found, used * _factors(prior, wider)).sum(axis=1)
+            is_worth_it = errors.sum() < (1.0 - _WORTH) * least.sum()
+            if is_worth_it and (errors < least).all():
+                widths = wider
+                least = errors
+    return widths
+
+
+def _factors(prior: Prior, widths: dict[str, float]) -> Floats:
+    """Return the factor of each entry of z."""
+    factors = np.ones(prior.mean.size)
+    for group, entries in prior.groups.items():
+        factors[list(entries)] = widths[group]
+    return factors
+
+
+def cross_validated(
+    found: Regression, factors: Floats, positive: list[int] | None = None
+) -> Floats:
+    """Return the squared error (parts, n) of each fold and joint, predicted by the other folds.
+
+    `factors` (k,) are widths of the prior, 0 for what is not in the model.  The error is infinite
+    where an entry of the model that must be `positive` is not.
+    """
+    used = np.flatnonzero(factors)
+    scale = np.append(factors[used], 1.0)
+    at = np.append(used, factors.size)
+    folds = found.folds[:, :, at[:, None], at] * np.outer(scale, scale)
+    of_joints = folds.sum(axis=1)
+    rest = of_joints.sum(axis=0) - of_joints
+    must = np.isin(used, positive or [])
+    errors = np.zeros(folds.shape[:2])
+    for k, (own, others) in enumerate(zip(folds, rest, strict=True)):
+        z = np.linalg.solve(others[:-1, :-1] + np.eye(used.size), others[:-1, -1])
+        if (z[must] <= 0.0).any():
+            return np.full(errors.shape, np.inf)
+        both = np.append(z, -1.0)
+        errors[k] = np.einsum('a,iab,b->i', both, own, both)
+    return errors

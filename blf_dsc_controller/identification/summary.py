@@ -1,0 +1,230 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What was identified, as text: tables with units and 95 % intervals, notes and problems."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from blf_dsc_controller.analysis.metrics import aligned
+from blf_dsc_controller.identification.identified import Identified, mass_and_centre
+from blf_dsc_controller.identification.plausibility import LEAST_GRAVITY, MOST_GRAVITY
+from blf_dsc_controller.identification.values import (
+    JOINT_TERMS,
+    OFFSET,
+    base_matrix,
+    units_of,
+)
+from blf_dsc_controller.identification.windows import SMOOTHING, WINDOW
+
+_TWO_SIDED = 1.96  # standard deviations of a 95 % interval
+_UNSEEN = 0.5  # of the prior's variance; parameters that keep more are not shown
+_LASTING = 3.0 * WINDOW  # s; noise is correlated over one window
+_POOR = 0.2  # of the torque, largest accepted error on the part held back
+_LATE = 0.01  # s, longest plausible delay
+_LARGE_OFFSET = 0.1  # of the torque
+_HARDLY = 0.01  # of the largest torque: a joint whose torque is mostly noise
+_ALL_WRONG = 1.0  # of the torque, error of a joint that the model does not explain
+
+
+def interval(value: float, deviation: float, digits: str = '.4g') -> str:
+    """Return a value with its 95 % interval."""
+    return f'{value:{digits}} +- {_TWO_SIDED * deviation:.2g}'
+
+
+def header_of(found: Identified) -> str:
+    """Return where the recording is from, and how velocities were found."""
+    joints = len(found.chain.joints)
+    return (
+        f'{found.source}: {found.duration:.1f} s of {joints} joints; velocities from positions, '
+        f'smoothed over {1e3 * SMOOTHING:.0f} ms'
+    )
+
+
+def load_table(found: Identified) -> Iterator[str]:
+    """Yield the load that was picked up, if any."""
+    if found.picked_up is None:
+        return
+    values, deviations = found.load
+    mass = interval(values[0], deviations[0], '.3f')
+    centre = [
+        interval(1e3 * c, 1e3 * s, '.1f')
+        for c, s in zip(values[1:], deviations[1:], strict=True)
+    ]
+    yield (
+        f'load from {found.picked_up:.1f} s on: {mass} kg, its centre at {", ".join(centre)} mm '
+        f'in {found.chain.tip}'
+    )
+
+
+def bodies_table(found: Identified) -> str:
+    """Return masses and centres before and after."""
+    rows = [('body', 'mass [kg]', 'centre of mass [mm]')]
+    for i, joint in enumerate(found.chain.joints):
+        at = slice(10 * i, 10 * i + 4)
+        values, deviations = mass_and_centre(
+            found.values[at], found.covariance[at, at], np.eye(4)
+        )
+        before = joint.inertia[1:4] / joint.inertia[0]
+        after = [
+            interval(1e3 * c, 1e3 * s, '.1f')
+            for c, s in zip(values[1:], deviations[1:], strict=True)
+        ]
+        centre = [
+            f'{1e3 * old:.1f} -> {new}' for old, new in zip(before, after, strict=True)
+        ]
+        mass = interval(values[0], deviations[0], '.3f')
+        rows.append(
+            (joint.link, f'{joint.inertia[0]:.3f} -> {mass}', ', '.join(centre))
+        )
+    return aligned(rows)
+
+
+def joints_table(found: Identified) -> str:
+    """Return rotors and friction of each joint, with their units."""
+    terms = found.parts.terms
+    shown = np.flatnonzero(terms.any(axis=1))
+    rows = [('joint', *(JOINT_TERMS[k] for k in shown))]
+    for i, joint in enumerate(found.chain.joints):
+        units = units_of(joint.kind)
+        cells = [
+            f'{interval(terms[k, i], found.deviations.terms[k, i])} {units[k]}'
+            if terms[k, i]
+            else ''
+            for k in shown
+        ]
+        rows.append((joint.name, *cells))
+    return aligned(rows)
+
+
+def base_table(found: Identified) -> Iterator[str]:
+    """Yield the base parameters before and after, and which of them the recording shows."""
+    parameters = found.parameters
+    K = base_matrix(parameters, len(found.chain.joints))[: len(parameters.combinations)]
+    before = K @ found.prior
+    after = K @ found.values
+    prior = np.einsum('ia,ab,ib->i', K, found.prior_covariance, K)
+    posterior = np.einsum('ia,ab,ib->i', K, found.covariance, K)
+    yield 'base parameters (all that torques can show), in kg, kg m, kg m^2:'
+    for k, name in enumerate(parameters.combinations):
+        half = f'{_TWO_SIDED * posterior[k] ** 0.5:<8.2g}'
+        unseen = posterior[k] > _UNSEEN * prior[k]
+        mark = '  NOT SHOWN by this recording: from the URDF' if unseen else ''
+        yield f'{before[k]:10.4g} -> {after[k]:10.4g} +- {half}  {name}{mark}'
+
+
+def errors_table(found: Identified) -> str:
+    """Return the torque errors of the part held back."""
+    score = found.score
+    shares = 100.0 * score.errors / score.torque
+    rows = [['joint', 'URDF', 'corrected', 'with all terms', 'rms torque']]
+    for i, joint in enumerate(found.chain.joints):
+        errors = [f'{share:.2f}' for share in shares[:, i]]
+        unit = 'N' if joint.kind == 'prismatic' else 'N m'
+        rows.append([joint.name, *errors, f'{score.torque[i]:.3g} {unit}'])
+    rows.append(['all', *(f'{total:.2f}' for total in score.total), ''])
+    begin, end = score.held_back
+    title = (
+        f'torque error from {begin:.1f} to {end:.1f} s, which was held back while the model was '
+        'chosen and fitted\n[% of rms torque]; the values above are then from all of the motion:'
+    )
+    return f'{title}\n{aligned(rows)}'
+
+
+def notes_of(found: Identified) -> Iterator[str]:
+    """Yield what else was found, and what follows from it."""
+    coupling = found.parts.coupling
+    if coupling.any():
+        deviations = found.deviations.coupling
+        inertia, viscous, coulomb = map(interval, coupling, deviations)
+        yield (
+            f'one motor drives {found.joints[-2]} and {found.joints[-1]}: inertia {inertia} kg '
+            f'm^2, viscous friction {viscous} N m s and Coulomb friction {coulomb} N m act on both'
+        )
+    if found.reversed:
+        yield (
+            f'the efforts of {", ".join(found.reversed)} have the opposite sign, and were '
+            'reversed: give --gains with -1 for them to confirm this'
+        )
+    yield from _delay_notes(found)
+    yield from _joint_notes(found)
+    wider = [f'{name} {width:g}' for name, width in found.widths.items() if width > 1.0]
+    if wider:
+        yield (
+            'the recording contradicts the URDF more than expected; it was given less weight by a '
+            f'factor of deviations: {", ".join(wider)}'
+        )
+    urdf, corrected, _ = found.score.total
+    if corrected > urdf:
+        yield (
+            'the corrected URDF alone predicts worse than the original: what it has no place for, '
+            'offsets and rotors above all, is large here; use the .xml or .yaml of --out'
+        )
+    if found.rest:
+        yield f'{found.rest:.1f} s in which no joint moves were left out'
+
+
+def _delay_notes(found: Identified) -> Iterator[str]:
+    delay = found.parts.delay[0]
+    text = interval(1e3 * delay, 1e3 * found.deviations.delay[0], '.2f')
+    yield f'delay of the torques relative to the positions: {text} ms'
+    if abs(delay) > _LATE:
+        late = 'torques' if delay > 0.0 else 'positions'
+        yield (
+            f'a delay of {1e3 * delay:.0f} ms is long: are the {late} filtered, or stamped when '
+            'they were received? Inertias take up what is left of it'
+        )
+
+
+def _joint_notes(found: Identified) -> Iterator[str]:
+    score = found.score
+    share = score.errors[2] / score.torque
+    for i, joint in enumerate(found.chain.joints):
+        name = joint.name
+        unit = units_of(joint.kind)[OFFSET]
+        offset = found.parts.terms[OFFSET, i]
+        if abs(offset) > _LARGE_OFFSET * score.torque[i]:
+            yield (
+                f'{name} has an offset of {offset:.2g} {unit}, for which a URDF has no place: '
+                'calibrate its torque sensor, or let the controller learn it (learning.bias)'
+            )
+        if found.lasting[i] > _LASTING:
+            yield (
+                f'the residual of {name} lasts ({found.lasting[i]:.2g} s): it is a torque, not '
+                'noise, and may have shifted values beyond their intervals'
+            )
+        if name in found.still:
+            yield f'{name} did not move: its rotor and friction are guesses'
+        elif share[i] > _ALL_WRONG and score.torque[i] < _HARDLY * score.torque.max():
+            yield (
+                f'{name} hardly needs a torque ({score.torque[i]:.2g} {unit}): its error in % '
+                'says little'
+            )
+
+
+def problems_of(found: Identified, effort: str) -> Iterator[str]:
+    """Yield why the efforts or the result are doubtful."""
+    if found.gravity < LEAST_GRAVITY:
+        yield (
+            f"GRAVITY IS MISSING: the efforts contain {found.gravity:.2f} of the URDF's. If the "
+            'drives compensate it, give --effort without-gravity; if the arm is not mounted '
+            'upright, --gravity'
+        )
+    elif found.gravity > MOST_GRAVITY:
+        cause = 'Are the masses of the URDF far too small, or is it without its tool?'
+        if effort == 'without-gravity':
+            cause = 'The efforts are the whole torque: give --effort torque'
+        yield f"GRAVITY IS DOUBLE: the efforts contain {found.gravity:.2f} of the URDF's. {cause}"
+    if not is_usable(found):
+        yield (
+            'DO NOT USE this URDF: it does not explain the torques held back. Are the efforts in '
+            'N m (currents need --gains), is --gravity given in the base frame, and was the load '
+            'the same throughout?'
+        )
+
+
+def is_usable(found: Identified) -> bool:
+    """Whether the model explains the torques held back, better than the URDF."""
+    total = found.score.total
+    return bool(total[2] <= min(100.0 * _POOR, total[0]))

@@ -1,0 +1,130 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What `identify` says of doubtful recordings: delay, offsets, faint torques, gravity, a load."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from friction_laws import with_friction
+from random_arm import (
+    PANDA,
+    PANDA_CHAIN,
+    PANDA_TEXT,
+    PERIOD,
+    is_covered,
+    measured,
+    recording_of,
+    reference_of,
+    shake,
+    truth_of,
+)
+
+from blf_dsc_controller.arms.urdf import inertia_of
+from blf_dsc_controller.configuration.robot import Robot
+from blf_dsc_controller.identification.identify import identify_arm
+from blf_dsc_controller.identification.recording import joined
+from blf_dsc_controller.identification.summary import notes_of, problems_of
+
+ROBOT = Robot(urdf=PANDA_TEXT, tip='panda_hand_tcp')
+TRUTH = truth_of(PANDA_CHAIN, 1)
+TORQUE = 2  # row of a state
+
+
+def moved(duration, seed=2, truth=TRUTH):
+    return shake(PANDA_CHAIN, truth, reference_of(PANDA_CHAIN, seed), duration)
+
+
+def identified(states):
+    return identify_arm(recording_of(measured(states, 3)), ROBOT)
+
+
+@pytest.fixture(scope='module')
+def plain():
+    return moved(20.0)
+
+
+@pytest.fixture(scope='module')
+def simple(plain):
+    return identified(plain)
+
+
+def mentions(found, words):
+    return any(words in note for note in notes_of(found))
+
+
+def test_recording_without_faults_has_neither_problems_nor_these_notes(simple):
+    assert not list(problems_of(simple, 'torque'))
+    for words in ('is long', 'has an offset', 'hardly needs', 'predicts worse'):
+        assert not mentions(simple, words)
+
+
+@pytest.mark.parametrize(
+    ('milliseconds', 'late'), [(20, 'torques'), (-20, 'positions')]
+)
+def test_long_delay_is_named_with_what_is_late(plain, milliseconds, late):
+    samples = round(1e-3 * milliseconds / PERIOD)
+    states = plain.copy()
+    states[:, TORQUE] = np.roll(plain[:, TORQUE], samples, axis=0)
+    found = identified(states[abs(samples) : -abs(samples)])
+    assert found.values[-1] == pytest.approx(1e-3 * milliseconds, abs=2e-3)
+    assert mentions(found, f'{milliseconds} ms is long: are the {late} filtered')
+
+
+def test_offset_for_which_a_urdf_has_no_place_is_named(plain):
+    states = plain.copy()
+    states[:, TORQUE, 4] += 1.5
+    found = identified(states)
+    assert mentions(found, f'{PANDA[4]} has an offset of 1.5 N m')
+    assert not mentions(found, f'{PANDA[1]} has an offset')
+
+
+def test_joint_that_hardly_needs_a_torque_is_named(plain):
+    """Its error in % is large, though it is but a torque that drifts by 20 mN m."""
+    states = plain.copy()
+    late = len(states) * 4 // 5
+    states[:late, TORQUE, 6] = 0.02
+    states[late:, TORQUE, 6] = -0.02
+    found = identified(states)
+    assert found.score.errors[2, 6] > found.score.torque[6]
+    assert mentions(found, f'{PANDA[6]} hardly needs a torque (0.02 N m)')
+
+
+def test_corrected_urdf_that_predicts_worse_than_the_original_is_named(simple):
+    errors = simple.score.errors.copy()
+    errors[1] = 1.1 * errors[0]
+    worse = simple._replace(score=simple.score._replace(errors=errors))
+    assert mentions(worse, 'the corrected URDF alone predicts worse than the original')
+
+
+def test_load_that_is_weighed_is_not_taken_for_double_gravity(plain):
+    """6 kg in the hand of an arm of 18 kg: without its columns, gravity looks double."""
+    mass = 6.0  # kg
+    bodies = TRUTH.inertias.copy()
+    T = PANDA_CHAIN.tip_placement
+    bodies[-1] += inertia_of(T @ (mass * np.diag((2e-4, 2e-4, 2e-4, 1.0))) @ T.T)
+    loaded = moved(20.0, 5, TRUTH._replace(inertias=bodies))
+    heavy = recording_of(measured(loaded, 4))
+    together, (boundary,) = joined(recording_of(measured(plain, 3)), heavy)
+    found = identify_arm(together, ROBOT, picked_up=boundary)
+    assert found.load[0][0] == pytest.approx(mass, rel=0.05)
+    assert found.gravity == pytest.approx(1.0, abs=0.3)
+    assert not list(problems_of(found, 'torque'))
+    assert 'GRAVITY IS DOUBLE' in next(
+        problems_of(identify_arm(heavy, ROBOT), 'torque')
+    )
+
+
+@pytest.mark.parametrize('law', ['Stribeck', 'elastic'])
+def test_intervals_of_friction_hold_where_its_law_is_another_one(law):
+    """Of 42 intervals, 35 allow for chance; by the fit alone 28 and 11 hold."""
+    held = []
+    zero = np.zeros(7)
+    for seed in (0, 3, 6):
+        truth = truth_of(PANDA_CHAIN, seed)
+        smooth = truth._replace(viscous=zero, coulomb=zero)
+        motion = moved(20.0, 2 * seed, smooth)
+        states = with_friction(law, motion, truth.viscous, truth.coulomb, seed)
+        seen = measured(states, seed)[::10]
+        found = identify_arm(recording_of(seen, period=10 * PERIOD), ROBOT)
+        held += is_covered(found, truth)[-14:].tolist()
+    assert sum(held) >= 35
