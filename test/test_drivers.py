@@ -79,7 +79,9 @@ def test_file_has_the_joints_and_the_rate_of_the_driver(robot):
         assert config.robot.drive_compensates == 'gravity_and_friction'
     assert loop.plant.actuator.without_command == 'hold'
     if robot == 'fr3':  # whose driver has no effort controller of its own
-        (section,) = yaml.safe_load((CONFIG / 'fr3_effort_controller.yml').read_text()).items()
+        (section,) = yaml.safe_load(
+            (CONFIG / 'fr3_effort_controller.yml').read_text()
+        ).items()
         assert f'/{section[0]}/commands' == facts.commands
         assert tuple(section[1]['ros__parameters']['joints']) == facts.joints
 
@@ -94,14 +96,18 @@ def test_urdf_of_the_fr3_has_its_mass_and_its_reach():
     q = np.zeros(7)
     pinocchio.framesForwardKinematics(model, data, q)
     flange = data.oMf[model.getFrameId('fr3_link8')].translation
-    np.testing.assert_allclose(flange, [0.088, 0.0, 0.333 + 0.316 + 0.384 - 0.107], atol=1e-6)
+    np.testing.assert_allclose(
+        flange, [0.088, 0.0, 0.333 + 0.316 + 0.384 - 0.107], atol=1e-6
+    )
 
 
 @ROBOTS
 def test_launched_nodes_use_the_topics_of_the_driver(launched, start, tmp_path, robot):  # noqa: F811
     facts = FACTS[robot]
     for node in launched(driver=robot):
-        remaps = [word for names in node.remappings for word in ('-r', ':='.join(names))]
+        remaps = [
+            word for names in node.remappings for word in ('-r', ':='.join(names))
+        ]
         controller = start(*arguments_of(node, tmp_path), *remaps)  # the last
     types = dict(controller.get_topic_names_and_types())
     assert types[facts.joint_states] == ['sensor_msgs/msg/JointState']
@@ -127,7 +133,9 @@ def test_launched_nodes_use_the_topics_of_the_driver(launched, start, tmp_path, 
         ('shoulder_pan_joint', 1000.0, 'ur5e'),
     ],
 )
-def test_parameter_file_of_the_page_runs_on_the_simulated_driver(joint, rate, preset, tmp_path):
+def test_parameter_file_of_the_page_runs_on_the_simulated_driver(
+    joint, rate, preset, tmp_path
+):
     """The arm holds its posture, and 2 kg from 1 s on, of which nobody was told."""
     texts = [block.content for block in fences() if block.info == 'yaml']
     found = []
@@ -162,13 +170,17 @@ def test_lost_commands_neither_stop_the_drives_nor_cost_the_bound(robot, lost):
     """In a row, twenty times a second or more; 2 kg are picked up at 4 s, and put down at 7 s."""
     loop = load_loop(FACTS[robot].preset)
     events = {'events.begin': [4.0], 'events.duration': [3.0]}
-    guard, plant = Guard(loop.controller), plant_of(change(loop.plant, events))
+    guard = Guard(loop.controller)
+    plant = plant_of(change(loop.plant, events))
     guard.activate()
-    ratio, random, left = 0.0, np.random.default_rng(0), 0
+    ratio = 0.0
+    random = np.random.default_rng(0)
+    left = 0
     for k in range(round(9.0 / loop.plant.sample_time)):
         torque = guard.update(START + k * loop.plant.sample_time_ns, plant.measure())
         if left == 0:
-            applied, left = torque.copy(), lost if random.random() < 0.05 else 0
+            applied = torque.copy()
+            left = lost if random.random() < 0.05 else 0
         else:
             left -= 1
         plant.step(applied)
@@ -180,19 +192,26 @@ def test_lost_commands_neither_stop_the_drives_nor_cost_the_bound(robot, lost):
 
 
 @pytest.mark.usefixtures('blank_pictures')
-def test_every_own_shell_line_of_the_page_is_executed(launched, start, tmp_path, monkeypatch):  # noqa: F811
+def test_every_own_shell_line_of_the_page_is_executed(
+    launched,  # noqa: F811
+    start,  # noqa: F811
+    tmp_path,
+    monkeypatch,
+):
     """The rest belongs to packages of the robots; nodes that a line starts find each other."""
     monkeypatch.chdir(tmp_path)
     own, files = [], []
     for block in fences():
         if block.info == 'yaml':
-            files.append(block.content.replace('topic://robot_description', 'ur5e.urdf'))
+            files.append(
+                block.content.replace('topic://robot_description', 'ur5e.urdf')
+            )
         if block.info == 'sh':
             for line in block.content.splitlines():
                 words = shlex.split(line)
                 for name in (w for w in re.findall(r'\w+\.yaml', line) if files):
                     (tmp_path / name).write_text(files[-1])
-                if words[0] == 'blf_dsc':
+                if words[:2] == ['blf_dsc', 'run']:  # others need a robot, or its bag
                     words[words.index('--duration') + 1] = '0.2'
                     assert main([*words[1:], '--out', f'out{len(own)}']) == 0
                 elif words[:3] == ['ros2', 'launch', 'blf_dsc_controller']:
@@ -212,4 +231,4 @@ def test_every_own_shell_line_of_the_page_is_executed(launched, start, tmp_path,
                 else:
                     continue
                 own.append(line)
-    assert len(own) == 6
+    assert len(own) == 8

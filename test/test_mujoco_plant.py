@@ -39,7 +39,11 @@ def example():
 
 
 PANDA = {'robot.urdf': 'panda.urdf', 'robot.tip': 'panda_hand_tcp'}
-UR5E = {'robot.urdf': 'ur5e.urdf', 'robot.tip': 'tool0', 'robot.gravity': [1.0, 3.0, 9.0]}
+UR5E = {
+    'robot.urdf': 'ur5e.urdf',
+    'robot.tip': 'tool0',
+    'robot.gravity': [1.0, 3.0, 9.0],
+}
 REAL = {
     'truth.mass_deviation': 0.3,
     'truth.centre_deviation': 0.01,
@@ -56,15 +60,26 @@ REAL = {
 
 def event(kind):
     """Return the parameters of events of one kind."""
-    return {f'events.{k}': ALL_KINDS[f'events.{k}'] for k in ('begin', 'duration', 'ramp', kind)}
+    return {
+        f'events.{k}': ALL_KINDS[f'events.{k}']
+        for k in ('begin', 'duration', 'ramp', kind)
+    }
 
 
 @pytest.mark.parametrize(
     ('arm', 'given', 'tolerance'),  # rad, after 0.2 s, of a URDF 0.3 s
     [
-        *(({}, event(kind), 1e-5) for kind in ('payload', 'force', 'torque', 'viscous', 'offset')),
-        ({}, event('coulomb'), 1.3e-3),  # dry friction in MuJoCo, smoothed by tanh in ours
-        (PANDA | {'disturbance.coulomb': [1.0] * 7}, {'disturbance.stribeck': 0.5}, 4e-3),
+        *(
+            ({}, event(kind), 1e-5)
+            for kind in ('payload', 'force', 'torque', 'viscous', 'offset')
+        ),
+        # dry friction in MuJoCo, smoothed by tanh in ours
+        ({}, event('coulomb'), 1.3e-3),
+        (
+            PANDA | {'disturbance.coulomb': [1.0] * 7},
+            {'disturbance.stribeck': 0.5},
+            4e-3,
+        ),
         (PANDA, {'actuator.ripple': 0.01}, 4e-4),  # held over a sample in MuJoCo
         (PANDA, REAL | {'disturbance.viscous': [1.0] * 7}, 1e-5),
         (UR5E, REAL | {'disturbance.viscous': [1.0] * 6}, 1e-5),
@@ -73,7 +88,9 @@ def event(kind):
 def test_it_moves_like_the_simulated_plant(example, arm, given, tolerance):
     """Events, truth, sensors and drives included."""
     makes = ((example.MujocoArm, arm | given), (plant_of, arm | given), (plant_of, arm))
-    theirs, ours, without = (swing(make, build(PlantConfig, values)) for make, values in makes)
+    theirs, ours, without = (
+        swing(make, build(PlantConfig, values)) for make, values in makes
+    )
     np.testing.assert_allclose(theirs[:, 0], ours[:, 0], rtol=0.0, atol=tolerance)
     np.testing.assert_allclose(theirs[:, 1], ours[:, 1], rtol=0.0, atol=1e3 * tolerance)
     np.testing.assert_array_equal(theirs[:, 2], ours[:, 2])
@@ -82,7 +99,9 @@ def test_it_moves_like_the_simulated_plant(example, arm, given, tolerance):
 
 def swing(make, config):
     """Measurements (samples, 3, n) of either arm with all joints swinging."""
-    arm, n, torques = make(config), len(config.joints), commands(200)
+    arm = make(config)
+    n = len(config.joints)
+    torques = commands(200)
     if n > 2:
         t = 1e-3 * np.arange(300)[:, None]
         torques = 0.1 * np.sin(20.0 * t) * config.actuator.torque_limit
@@ -107,16 +126,24 @@ def test_reset_repeats_the_run_and_disturbances_can_change(example):
 def test_closed_loop_runs_the_same_with_both_plants(example):
     """With every imperfection except dry friction and ripple, which differ over a sample."""
     loop = load_loop('panda')
-    given = {'disturbance.coulomb': [0.0] * 7, 'actuator.ripple': 0.0, 'load.payload': 0.3}
+    given = {
+        'disturbance.coulomb': [0.0] * 7,
+        'actuator.ripple': 0.0,
+        'load.payload': 0.3,
+    }
     config = change(loop.plant, given)
     theirs, ours = (
-        close_loop(loop.controller, make(config), 2000)[1] for make in (example.MujocoArm, plant_of)
+        close_loop(loop.controller, make(config), 2000)[1]
+        for make in (example.MujocoArm, plant_of)
     )
     np.testing.assert_allclose(theirs, ours, rtol=0.0, atol=1e-8)
     assert np.ptp(ours, axis=0).min() > 1e-3  # rad
 
 
-@pytest.mark.parametrize(('name', 'settled', 'peak'), [('panda', 0.48, 2.4), ('ur5e', 1.4, 1.7)])
+@pytest.mark.parametrize(
+    ('name', 'settled', 'peak'),
+    [('panda', 0.24, 2.2), ('ur5e', 0.56, 1.5), ('openarm', 0.18, 0.79)],
+)
 def test_errors_with_dry_friction_are_as_documented(example, name, settled, peak):
     """In mrad, from 8 s on and when 2 kg are picked up at 20 s: doc/arms.md."""
     loop = load_loop(name)
@@ -141,6 +168,32 @@ def close_loop(config, arm, samples):
     return guard, angles, errors
 
 
+def test_drives_that_compensate_hold_the_arm(example):
+    """Zero holds an FR3: its drives add gravity, in MuJoCo as in our plant."""
+    loop = load_loop('fr3')
+    quiet = {
+        'drive.mass_deviation': 0.0,
+        'drive.centre_deviation': 0.0,
+        'truth.mass_deviation': 0.0,
+        'truth.centre_deviation': 0.0,
+        'sensor.incomplete_states': 0,
+    }
+    arm = example.MujocoArm(change(loop.plant, quiet))
+    start = arm.measure()[:7].copy()
+    for _ in range(500):
+        arm.measure()
+        arm.step(np.zeros(7))
+    assert np.abs(arm.measure()[:7] - start).max() < 1e-3
+    assert np.abs(arm.measure()[14:]).max() > 10.0  # what the drives add
+
+
+def test_reflex_stops_the_arm(example):
+    limited = change(load_loop('fr3').plant, {'actuator.rate_limit': 0.0})
+    arm = example.MujocoArm(limited)
+    arm.step(np.full(7, 5.0))
+    assert arm.is_stopped
+
+
 def test_node_keeps_the_bound_and_learns_the_parameters(ros, example):
     guard = ros.add(ControllerNode, {'telemetry.enabled': False}).guard
     published = {'sensor.published_joints': ['joint2', 'gripper', 'joint1']}
@@ -161,9 +214,12 @@ CHANGES = ROWS if os.environ.get('NIGHTLY') else ['payload to 0.75 kg at 8 s']
 @pytest.mark.parametrize('name', CHANGES)
 def test_bound_holds_while_the_arm_changes_and_learning_does_no_harm(example, name):
     """Two windows after the last change the parameters are known again."""
-    plant, end = build(PlantConfig, ROWS[name]), end_of(ROWS[name])
+    plant = build(PlantConfig, ROWS[name])
+    end = end_of(ROWS[name])
     learning, without = (
-        close_loop(build(ControllerConfig, law), example.MujocoArm(plant), round(1e3 * end))[0]
+        close_loop(
+            build(ControllerConfig, law), example.MujocoArm(plant), round(1e3 * end)
+        )[0]
         for law in ({}, OFF)
     )
     assert np.all(learning.samples.ratio < 1.0)

@@ -25,17 +25,29 @@ DRAWN = {'recommended', 'slotine_li', 'panda'}
 
 
 def offline(preset, out, duration):
-    arguments = ['--config', preset, '--offline', '--duration', str(duration), '--out', str(out)]
+    arguments = [
+        '--config',
+        preset,
+        '--offline',
+        '--duration',
+        str(duration),
+        '--out',
+        str(out),
+    ]
     return main(['run', *arguments])
 
 
 @pytest.mark.parametrize('preset', PRESETS)
-def test_preset_runs_by_name_and_saves_its_configuration(preset, tmp_path, capsys, request):
+def test_preset_runs_by_name_and_saves_its_configuration(
+    preset, tmp_path, capsys, request
+):
     if preset not in DRAWN:
         request.getfixturevalue('blank_pictures')
     assert offline(preset, tmp_path / 'out', 0.5) == 0
     printed = capsys.readouterr().out
-    summary = json.loads((tmp_path / 'out' / 'summary.json').read_text(encoding='utf-8'))
+    summary = json.loads(
+        (tmp_path / 'out' / 'summary.json').read_text(encoding='utf-8')
+    )
     assert summary['samples'] == round(0.5 / load_loop(preset).plant.sample_time) + 1
     saved = load_loop(tmp_path / 'out' / 'config.yaml').controller
     assert saved.law == LAW.get(preset, 'blf_dsc')

@@ -8,10 +8,11 @@ from argparse import Namespace
 from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
-from blf_dsc_controller.bags import reader, writer
+from blf_dsc_controller.bags import reader, recovery
 from blf_dsc_controller.bags.content import NameMap, read_content
 from blf_dsc_controller.bags.sources import open_bag
-from blf_dsc_controller.cli.main import make_room, require_ros
+from blf_dsc_controller.cli.main import make_room
+from blf_dsc_controller.cli.ros_check import require_ros
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.run import Run
 
@@ -22,7 +23,7 @@ DIFFERENT = 3
 """Exit code if the replay differs from the bag."""
 
 PARTIAL = 4
-"""Exit code if all compared outputs are equal, but some outputs could not be compared."""
+"""Exit code if all compared outputs are equal, but others are missing or could not be compared."""
 
 _DISCOVERY = 1.0  # s, until subscribers have found the publishers
 
@@ -75,7 +76,7 @@ def recover(options: Namespace) -> int:
     """Make a clean bag from a damaged one and list the losses; return 1 if nothing is left."""
     bag = options.bag.resolve()
     out = options.out or bag.with_name(f'{bag.stem}_recovered')
-    messages, losses = writer.recover(options.bag, out)
+    messages, losses = recovery.recover(options.bag, out)
     for topic, count in messages.items():
         print(f'{topic}: {count} messages')
     for loss in losses:
@@ -98,13 +99,14 @@ def replay(options: Namespace) -> int:
 
     begin = time.perf_counter()
     result = verify(options.bag, options.namespace, NameMap.parse(options.map))
-    seconds, took = result.duration, time.perf_counter() - begin
+    seconds = result.duration
+    took = time.perf_counter() - begin
     speed = f'{seconds:.3f} s in {took:.2f} s: {seconds / took:.0f}x real time'
     print(f'{result.samples} samples, {speed}')
     print('\n'.join(_verification(result)))
     if result.difference is not None:
         return DIFFERENT
-    return PARTIAL if result.compared < 1.0 else 0
+    return PARTIAL if result.is_partial else 0
 
 
 def play(options: Namespace) -> None:
@@ -152,6 +154,8 @@ def _verification(result: Verification) -> Iterator[str]:
             f'PARTLY COMPARED: {percent:g} % of the numbers in the bag, which are bit-equal; the '
             'others could not be compared'
         )
+    elif result.is_partial:
+        yield 'INCOMPLETE: what the bag holds of the controller is bit-equal, the rest is missing'
     else:
         yield 'bit-equal: all numbers of the controller in the bag'
 
@@ -162,4 +166,7 @@ def _events(result: Verification) -> Iterator[str]:
         yield f'replayed in order: {", ".join(result.transitions)}'
     if result.passed_over:
         yield f'{result.passed_over} states skipped: the controller did not use them'
-    yield from (f'note: {remark}' for remark in result.remarks)
+    for remark in result.remarks:
+        yield f'note: {remark}'
+    for lacking in result.incomplete:
+        yield f'MISSING in the bag: {lacking}'

@@ -7,6 +7,7 @@ Sub-commands are imported when they run, so `--help` is fast and needs neither R
 from __future__ import annotations
 
 import argparse
+import difflib
 import importlib
 import os
 import shlex
@@ -19,6 +20,8 @@ from functools import partial
 from pathlib import Path
 from typing import Any, TypeAlias
 
+from blf_dsc_controller import __version__
+from blf_dsc_controller.cli.ros_check import require_ros
 from blf_dsc_controller.errors import BlfDscError
 
 INTERRUPTED = 130
@@ -35,7 +38,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run a sub-command and return its exit code; errors print a message to stderr and return 1."""
     parser = make_parser()
     words = sys.argv[1:] if arguments is None else arguments
-    options = parser.parse_args(words, argparse.Namespace(line=shlex.join(['blf_dsc', *words])))
+    _check_command(parser, words)
+    options = parser.parse_args(
+        words, argparse.Namespace(line=shlex.join(['blf_dsc', *words]))
+    )
     _keep_to_one_thread()
     if options.command is None:
         parser.print_help(sys.stderr)
@@ -48,7 +54,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if options.command == 'run' and not options.offline:
             require_ros()  # before what takes a second to import
         module, function = options.handler
-        command = getattr(importlib.import_module(f'blf_dsc_controller.cli.{module}'), function)
+        command = getattr(
+            importlib.import_module(f'blf_dsc_controller.cli.{module}'), function
+        )
         code: int | None = command(options)
     except (BlfDscError, OSError) as error:
         print(f'blf_dsc {options.command}: {error}', file=sys.stderr)
@@ -57,6 +65,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(f'blf_dsc {options.command}: interrupted', file=sys.stderr)
         return INTERRUPTED
     return code or 0
+
+
+def _check_command(parser: argparse.ArgumentParser, words: Sequence[str]) -> None:
+    """End with a suggestion if the first word is meant for a command, but is none."""
+    known = parser.get_default('commands')
+    if words and not words[0].startswith('-') and words[0] not in known:
+        close = difflib.get_close_matches(words[0], known, n=1)
+        guess = f', did you mean {close[0]}?' if close else ''
+        parser.error(f'no command {words[0]}{guess}; there are {", ".join(known)}')
 
 
 def _keep_to_one_thread() -> None:
@@ -78,18 +95,6 @@ def _interrupt(command: str, _number: int, _frame: object) -> None:
     raise KeyboardInterrupt
 
 
-def require_ros() -> None:
-    """Raise BlfDscError if ROS 2 cannot be imported."""
-    try:
-        importlib.import_module('rclpy')
-    except ImportError as error:
-        raise BlfDscError(
-            f'ROS 2 cannot be imported ({error}): source ROS 2 Jazzy '
-            '(source /opt/ros/jazzy/setup.bash), or install it as wheels '
-            "(pip install 'blf_dsc_controller[ros]')"
-        ) from error
-
-
 def make_room(*paths: Path, force: bool) -> None:
     """Prepare `paths` for writing; a symbolic link is replaced instead of followed.
 
@@ -97,7 +102,9 @@ def make_room(*paths: Path, force: bool) -> None:
     """
     existing = [path for path in paths if os.path.lexists(path)]
     if existing and not force:
-        raise BlfDscError(f'{existing[0]} exists already: choose another path, or use --force')
+        raise BlfDscError(
+            f'{existing[0]} exists already: choose another path, or use --force'
+        )
     for path in existing:
         if path.is_symlink():
             path.unlink()
@@ -105,7 +112,8 @@ def make_room(*paths: Path, force: bool) -> None:
 
 def _node(module: str) -> int:
     _keep_to_one_thread()
-    for number in (signal.SIGINT, signal.SIGTERM):  # until the node installs its own handlers
+    # until the node installs its own handlers
+    for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: os._exit(0))
     try:
         require_ros()
@@ -131,10 +139,19 @@ def make_parser() -> argparse.ArgumentParser:
         'study it.',
         epilog='blf_dsc COMMAND --help lists the options of a command, with an example.',
     )
-    commands = parser.add_subparsers(title='commands', dest='command', metavar='COMMAND')
+    parser.add_argument(
+        '--version', action='version', version=f'blf_dsc_controller {__version__}'
+    )
+    commands = parser.add_subparsers(
+        title='commands', dest='command', metavar='COMMAND'
+    )
 
     def command(
-        module: str, name: str, about: str, example: str, *shared: argparse.ArgumentParser
+        module: str,
+        name: str,
+        about: str,
+        example: str,
+        *shared: argparse.ArgumentParser,
     ) -> Callable[..., Any]:
         """Add a command with these shared options, and return what adds its own."""
         made = commands.add_parser(
@@ -149,14 +166,23 @@ def make_parser() -> argparse.ArgumentParser:
         return made.add_argument
 
     names, force = (argparse.ArgumentParser(add_help=False) for _ in range(2))
-    theirs = 'name of a topic or a joint in the bag, such as joint1=shoulder'
-    names.add_argument('--map', action='append', default=[], metavar='OURS=THEIRS', help=theirs)
-    names.add_argument('--namespace', default='', help='robot to use, if a bag holds several')
+    theirs = (
+        'name of a topic or a joint in the bag, such as joint1=shoulder; columns of a table: '
+        'time=, q=, tau='
+    )
+    names.add_argument(
+        '--map', action='append', default=[], metavar='OURS=THEIRS', help=theirs
+    )
+    names.add_argument(
+        '--namespace', default='', help='robot to use, if a bag holds several'
+    )
     force.add_argument('--force', action='store_true', help='overwrite existing files')
     _add_run(partial(command, 'run'))
+    _add_drive(partial(command, 'drive'))
     _add_bags(partial(command, 'bags'), names, force)
     _add_identification(partial(command, 'identify'), names, force)
     _add_studies(partial(command, 'studies'))
+    parser.set_defaults(commands=tuple(commands.choices))
     return parser
 
 
@@ -169,11 +195,23 @@ def _add_run(command: _Command) -> None:
         '--config noisy --duration 30 --mode realtime --out first',
     )
     option('--config', default='recommended', help=_CONFIG)
-    option('--duration', type=float, help='simulated time [s] (as configured, or else 60)')
-    option('--mode', choices=('realtime', 'lockstep'), help='mode of the plant (as configured)')
+    option(
+        '--duration',
+        type=float,
+        help='simulated time [s]; 0: until Ctrl-C (as configured, or else 60)',
+    )
+    option(
+        '--mode',
+        choices=('realtime', 'lockstep'),
+        help='mode of the plant (as configured)',
+    )
     option('--seed', type=int, help='seed of the sensor noise (as configured)')
-    option('--offline', action='store_true', help='without ROS: no processes, no topics')
-    option('--out', type=Path, default=Path('closed_loop'), help='new folder (closed_loop)')
+    option(
+        '--offline', action='store_true', help='without ROS: no processes, no topics'
+    )
+    option(
+        '--out', type=Path, default=Path('closed_loop'), help='new folder (closed_loop)'
+    )
     option('--view', action='store_true', help='show the run on a page in the browser')
     option = command(
         'precompile',
@@ -185,6 +223,22 @@ def _add_run(command: _Command) -> None:
     option('--config', default='recommended', help=_CONFIG)
     package = 'copy them into the package, for wheels, workspaces and images made of it'
     option('--package', action='store_true', help=package)
+
+
+def _add_drive(command: _Command) -> None:
+    option = command(
+        'drive',
+        'Control a robot over its own interface, without ROS: a Franka Research 3. The law runs in '
+        'the loop that reads states and writes torques. Ctrl-C or SIGTERM brings the arm to rest '
+        'and ends; a second one ends at once. Exit code: 0 the duration is over, 5 the controller '
+        'or the robot stopped before, 130 interrupted, 1 an error.',
+        '--robot 172.16.0.2 --config fr3_direct.yaml --duration 60 --out first',
+    )
+    option('--robot', required=True, help='address of the robot')
+    preset = 'parameter file, or a preset (fr3_direct)'
+    option('--config', default='fr3_direct', help=preset)
+    option('--duration', type=float, default=0.0, help='time [s]; 0: until Ctrl-C (0)')
+    option('--out', type=Path, help='new folder of a bag; none: record nothing')
 
 
 def _add_bags(
@@ -219,7 +273,9 @@ def _add_bags(
     )
     option('bag', type=Path, help='folder of the bag, or its .mcap file')
     option('--out', type=Path, help='new folder (BAG_recovered)')
-    about = 'Write a bag as a table, in CSV or Parquet. It has a row for each joint state.'
+    about = (
+        'Write a bag as a table, in CSV or Parquet. It has a row for each joint state.'
+    )
     option = command('export', about, 'run1/bag --out run1.csv', names, force)
     option('bag', type=Path, help=_BAG)
     option('--out', type=Path, required=True, help='FILE.csv or FILE.parquet')
@@ -243,25 +299,59 @@ def _add_identification(
     )
     option('out', type=Path, help='parameter file to write')
     option('--config', required=True, help=_CONFIG)
-    option('--harmonics', type=int, default=3, help='number of harmonics of the window (3)')
-    option('--starts', type=int, default=4, help='number of searches; the best result is kept (4)')
+    option(
+        '--harmonics', type=int, default=3, help='number of harmonics of the window (3)'
+    )
+    option(
+        '--starts',
+        type=int,
+        default=4,
+        help='number of searches; the best result is kept (4)',
+    )
     option('--radius', type=float, default=0.07, help='radius of the links [m] (0.07)')
-    option('--floor', type=float, default=0.0, help='height of the floor in the base frame [m] (0)')
+    option(
+        '--floor',
+        type=float,
+        default=0.0,
+        help='height of the floor in the base frame [m] (0)',
+    )
     option = command(
         'identify',
-        'Correct the inertias and friction of a URDF from a bag with positions and efforts. The '
-        'new URDF has physical inertias that reproduce the torques and are closest to the original '
-        'ones; what changed is printed, with 95 % intervals, and the torque error on the last '
-        'fifth of the motion, which was held back. With --payload, weigh what the arm holds.',
+        'Correct the inertias and friction of a URDF from recordings with positions and efforts. '
+        'The new URDF has physical inertias that reproduce the torques and are closest to the '
+        'original ones; what changed is printed, with 95 % intervals, and the torque error on the '
+        'last fifth of the motion, which was held back. With --payload, weigh what the arm holds. '
+        'Exit code: 0 done, 3 the result is not to be used (and is written with --force only), 1 '
+        'an error.',
         'run1/bag --urdf robot.urdf --out corrected.urdf --report page.html\n'
+        '  blf_dsc identify run.csv --urdf robot.urdf --map time=t --map tau=tau_* --out new.xml\n'
         '  blf_dsc identify empty/bag --urdf robot.urdf --payload loaded/bag',
         names,
         force,
     )
-    option('bag', type=Path, help=_BAG)
-    option('--urdf', required=True, help='URDF: a file, package://name/path, or a file in config/')
-    option('--out', type=Path, help='URDF to write')
-    option('--report', type=Path, help='page with measured and predicted torques and the tables')
+    option(
+        'bags',
+        type=Path,
+        nargs='+',
+        metavar='RECORDING',
+        help=f'{_BAG}, or a table (.csv, .txt, .npz, .mat)',
+    )
+    option(
+        '--urdf',
+        required=True,
+        help='URDF: a file, package://name/path, or a file in config/',
+    )
+    results = (
+        'file to write: .urdf, .xml (MJCF), .yaml (our parameters); can be repeated'
+    )
+    option(
+        '--out', type=Path, action='append', default=[], metavar='FILE', help=results
+    )
+    option(
+        '--report',
+        type=Path,
+        help='page with measured and predicted torques and the tables',
+    )
     load = 'identify a load: carried in this other bag, or without one, picked up in the first'
     option('--payload', type=Path, nargs='?', const=True, metavar='BAG', help=load)
     efforts = ('torque', 'without-gravity', 'command')
@@ -271,8 +361,16 @@ def _add_identification(
     option('--gains', type=float, nargs='+', default=(), help=per_effort)
     option('--base', default='', help='fixed link (the root)')
     option('--tip', default='', help='last link (that of the last joint in the bag)')
-    upright, given = (0.0, 0.0, -9.81), 'gravity in the base frame [m/s^2] (0 0 -9.81)'
-    option('--gravity', type=float, nargs=3, default=upright, metavar=tuple('XYZ'), help=given)
+    upright = (0.0, 0.0, -9.81)
+    given = 'gravity in the base frame [m/s^2] (0 0 -9.81)'
+    option(
+        '--gravity',
+        type=float,
+        nargs=3,
+        default=upright,
+        metavar=tuple('XYZ'),
+        help=given,
+    )
     largest = 'largest mass on the last link that is not in the URDF [kg] (3)'
     option('--rated-payload', type=float, default=3.0, help=largest)
 
@@ -284,14 +382,24 @@ def _add_studies(command: _Command) -> None:
         'breaks is found; offline, on all cores.',
         '--out paper_study',
     )
-    option('--out', type=Path, default=Path('paper_study'), help='new folder for the report')
+    option(
+        '--out',
+        type=Path,
+        default=Path('paper_study'),
+        help='new folder for the report',
+    )
     option = command(
         'arms',
         'Compare laws on arms whose URDF is wrong. Each law is tuned on one arm with wrong masses '
         'and run on others, for a table of the errors; offline, on all cores, in some minutes.',
         '--config panda --out arms',
     )
-    option('--config', nargs='+', default=['panda', 'ur5e'], help='presets or files (panda ur5e)')
+    option(
+        '--config',
+        nargs='+',
+        default=['panda', 'ur5e'],
+        help='presets or files (panda ur5e)',
+    )
     laws = 'laws of the study by name, or Python files that add some (all of the study)'
     option('--laws', nargs='+', default=[], metavar='LAW', help=laws)
     option('--out', type=Path, default=Path('arms'), help='new folder for the figures')
@@ -302,12 +410,20 @@ def _add_studies(command: _Command) -> None:
         'again.',
         '--config my_study.yaml --out study\n  blf_dsc monte-carlo --reproduce study 365',
     )
-    option('--config', default='monte_carlo', help='study file, or a preset (monte_carlo)')
+    option(
+        '--config', default='monte_carlo', help='study file, or a preset (monte_carlo)'
+    )
     option('--runs', type=int, help='number of runs (as configured)')
-    option('--workers', type=_positive, help='number of processes (one per core of this computer)')
+    option(
+        '--workers',
+        type=_positive,
+        help='number of processes (one per core of this computer)',
+    )
     scheduler = 'scheduler of a dask cluster that computes the runs, in place of these processes'
     option('--dask', metavar='ADDRESS', help=scheduler)
-    reported = 'put the studies of pairs in these folders side by side, into --out (changes)'
+    reported = (
+        'put the studies of pairs in these folders side by side, into --out (changes)'
+    )
     option('--report', type=Path, nargs='+', metavar='DIR', help=reported)
     again = 'compute one run of a study again, with a bag, into --out'
     option('--reproduce', nargs=2, metavar=('DIR', 'RUN'), help=again)

@@ -17,16 +17,26 @@ from blf_dsc_controller.bags.reader import recorded_run
 from blf_dsc_controller.cli.main import INTERRUPTED
 from blf_dsc_controller.compiled.jit import announced_compilation, ship
 from blf_dsc_controller.configuration.controller import ControllerConfig
-from blf_dsc_controller.configuration.nodes import CONTROLLER, PLANT, LoopConfig, dump, load_loop
+from blf_dsc_controller.configuration.nodes import (
+    CONTROLLER,
+    PLANT,
+    LoopConfig,
+    dump,
+    ignored_sections,
+    load_loop,
+    locate,
+    read,
+)
 from blf_dsc_controller.configuration.plant import PlantConfig
 from blf_dsc_controller.configuration.schema import change
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.messages.codecs import JointStateDecoder
 from blf_dsc_controller.reference.approach import plan_start
 from blf_dsc_controller.simulation.loop import simulate, write_bag
-from blf_dsc_controller.supervision.checks import Reason
-from blf_dsc_controller.supervision.gains import config_warnings, expectation
+from blf_dsc_controller.supervision.config_warnings import config_warnings
+from blf_dsc_controller.supervision.expected_errors import expectation
 from blf_dsc_controller.supervision.guard import Guard
+from blf_dsc_controller.supervision.supervisor import Reason
 from sim_plant.plant import plant_of
 
 STOPPED = 5
@@ -59,7 +69,9 @@ def run(options: Namespace) -> int:
     if options.offline:
         with announced_compilation(print_notice):
             record = simulate(config.controller, config.plant)
-        write_bag(out / 'bag', record, config.plant, compression=config.recorder.compression)
+        write_bag(
+            out / 'bag', record, config.plant, compression=config.recorder.compression
+        )
     else:
         from blf_dsc_controller.cli.session import run_session
 
@@ -69,7 +81,9 @@ def run(options: Namespace) -> int:
     except BlfDscError as error:
         if completed:
             raise
-        print(f'blf_dsc run: interrupted, and nothing to draw: {error}', file=sys.stderr)
+        print(
+            f'blf_dsc run: interrupted, and nothing to draw: {error}', file=sys.stderr
+        )
     if not completed:
         return INTERRUPTED
     return STOPPED if stopped else 0
@@ -92,15 +106,26 @@ def _configuration(options: Namespace) -> LoopConfig:
     Prints configuration warnings, and raises StartError or MotionError if the controller would
     reject the true start.
     """
+    path = locate(options.config)
+    ignored = ignored_sections(read(path), (PLANT, CONTROLLER))
+    if ignored:
+        print_notice(f'warning: {path}: {ignored}')
     chosen = {'duration': options.duration, 'mode': options.mode, 'seed': options.seed}
     given = {name: value for name, value in chosen.items() if value is not None}
     recorded: dict[str, Any] = {'wait_for_subscribers': 1}
     config = load_loop(options.config, {PLANT: given | recorded, CONTROLLER: recorded})
-    if config.plant.duration == 0.0:
+    if options.duration == 0.0 and options.offline:
+        raise BlfDscError(
+            '--duration 0 is no limit, which --offline cannot have: give a duration in s'
+        )
+    if config.plant.duration == 0.0 and options.duration is None:
         config = config._replace(plant=change(config.plant, {'duration': _DURATION}))
     controller, plant = config.controller, config.plant
     order = [plant.joints.index(joint) for joint in controller.joints]
-    q, dq = (np.array(values)[order] for values in (plant.initial.position, plant.initial.velocity))
+    q, dq = (
+        np.array(values)[order]
+        for values in (plant.initial.position, plant.initial.velocity)
+    )
     plan_start(controller, np.array(controller.barrier.widest), q, dq)
     for warning in config_warnings(controller):
         print(f'warning: {warning}', file=sys.stderr)
@@ -111,7 +136,8 @@ def _configuration(options: Namespace) -> LoopConfig:
 
 def _report(out: Path) -> bool:
     """Draw and summarise the bag of a run; return whether the controller stopped in it."""
-    from blf_dsc_controller.analysis.figures import draw  # slow: the libraries of the pictures
+    # slow: the libraries of the pictures
+    from blf_dsc_controller.analysis.figures import draw
     from blf_dsc_controller.analysis.metrics import format_table, measure, write_json
 
     print_notice('reading the bag and drawing the pictures')
@@ -123,9 +149,14 @@ def _report(out: Path) -> bool:
     print(format_table(metrics))
     for topic, text in content.losses.items():
         print(f'warning: messages of {topic} are missing in the bag: {text}')
-    print(f'wrote       {out}: bag, summary.json, {", ".join(path.name for path in pictures)}')
+    print(
+        f'wrote       {out}: bag, summary.json, {", ".join(path.name for path in pictures)}'
+    )
     last = recorded.stamp[-1]  # the plant ends after it, so the controller times out
-    return any(stop.stamp < last or stop.reason != Reason.STATE_TIMEOUT for stop in recorded.stops)
+    return any(
+        stop.stamp < last or stop.reason != Reason.STATE_TIMEOUT
+        for stop in recorded.stops
+    )
 
 
 def precompile(options: Namespace) -> None:
@@ -134,9 +165,13 @@ def precompile(options: Namespace) -> None:
     with ProcessPoolExecutor(2, get_context('spawn')) as pool:
         list(pool.map(_compile, (config.controller, config.plant)))
     if options.package:
-        print(f'{options.config}: the kernels are in {ship()}, for all who use this copy')
+        print(
+            f'{options.config}: the kernels are in {ship()}, for all who use this copy'
+        )
         return
-    print(f'{options.config}: the kernels are compiled; the nodes of this user now start at once')
+    print(
+        f'{options.config}: the kernels are compiled; the nodes of this user now start at once'
+    )
 
 
 def _compile(config: ControllerConfig | PlantConfig) -> None:

@@ -11,11 +11,12 @@ import os
 import re
 import shutil
 import signal
-import socket
 import subprocess
 import sys
+import time
 from collections.abc import Iterator
 from contextlib import ExitStack, closing, contextmanager
+from importlib import metadata
 from pathlib import Path
 
 import rclpy
@@ -23,9 +24,16 @@ from rclpy.experimental import EventsExecutor
 from sensor_msgs.msg import JointState
 from tqdm import tqdm
 
+from blf_dsc_controller.cli.domains import own_domain, strangers
 from blf_dsc_controller.compiled.jit import COMPILING
 from blf_dsc_controller.configuration.files import share_folder
-from blf_dsc_controller.configuration.nodes import CONTROLLER, PLANT, RECORDER, VIEW, LoopConfig
+from blf_dsc_controller.configuration.nodes import (
+    CONTROLLER,
+    PLANT,
+    RECORDER,
+    VIEW,
+    LoopConfig,
+)
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.messages import topics
 from blf_dsc_controller.messages.topics import RATIO
@@ -47,9 +55,9 @@ _PR_SET_PDEATHSIG = 1
 _LIBC = ctypes.CDLL(None)  # loaded before there are threads
 _PAGE = 'open http'  # in the log of the node that serves it
 _BAR = '{desc} |{bar}| {n:.1f}/{total:g} s [{elapsed}<{remaining}]{postfix}'
+_DISCOVERY = 0.5  # s, until the nodes of a domain have answered
 _RANGE = 'ROS_AUTOMATIC_DISCOVERY_RANGE'
 _PROFILES = 'FASTRTPS_DEFAULT_PROFILES_FILE'
-_DOMAINS = range(1, 101)  # 0 is the default; above 101, ports are ephemeral
 
 
 def run_session(config: LoopConfig, out: Path, *, view: bool) -> bool:
@@ -61,25 +69,42 @@ def run_session(config: LoopConfig, out: Path, *, view: bool) -> bool:
     """
     logs = out / 'logs'
     logs.mkdir()
-    with own_domain() as domain:
-        values = {'ROS_DOMAIN_ID': str(domain), 'ROS_LOG_DIR': str(logs / 'ros')}
-        try:
-            with environment(values | localhost_environment()):
-                return _run_nodes(config, out / 'config.yaml', logs, view=view)
-        except BlfDscError:
-            if shutil.disk_usage(out).free < _ROOM:
-                print(f'no space left on the disk of {out}', file=sys.stderr)
-            if (out / 'bag' / 'metadata.yaml').exists():
-                print(f'the recording up to then is in {out / "bag"}', file=sys.stderr)
-            elif (out / 'bag').exists():
-                print(f'blf_dsc recover {out / "bag"} saves what was recorded', file=sys.stderr)
-            raise
+    try:
+        return _run_alone(config, out / 'config.yaml', logs, view=view)
+    except BlfDscError:
+        if shutil.disk_usage(out).free < _ROOM:
+            print(f'no space left on the disk of {out}', file=sys.stderr)
+        bag = out / 'bag'
+        if (bag / 'metadata.yaml').exists():
+            print(f'the recording up to then is in {bag}', file=sys.stderr)
+        elif bag.exists():
+            print(f'blf_dsc recover {bag} saves what was recorded', file=sys.stderr)
+        raise
+
+
+def _run_alone(
+    config: LoopConfig, params_file: Path, logs: Path, *, view: bool
+) -> bool:
+    """Run the nodes in a domain in which nobody else is, also after it was entered."""
+    left: list[int] = []
+    while True:
+        with own_domain(left) as domain:
+            values = {'ROS_DOMAIN_ID': str(domain), 'ROS_LOG_DIR': str(logs / 'ros')}
+            with (
+                environment(values | localhost_environment()),
+                closing(ProgressMonitor(config.plant.duration)) as monitor,
+            ):
+                if not monitor.others(domain):
+                    return _run_nodes(config, monitor, params_file, logs, view=view)
+            left.append(domain)
 
 
 class NodeProcess:
     """A process of nodes, which does not outlive this one."""
 
-    def __init__(self, name: str, params_file: Path, logs: Path, *arguments: str) -> None:
+    def __init__(
+        self, name: str, params_file: Path, logs: Path, *arguments: str
+    ) -> None:
         self.name = name
         self._noticed = 0
         self._log = logs / f'{name}.log'
@@ -94,7 +119,8 @@ class NodeProcess:
                 stderr=subprocess.STDOUT,
                 env={**os.environ, 'PYTHONUNBUFFERED': '1'},
                 start_new_session=True,
-                close_fds=False,  # it holds the claim of the domain, which ends with the last node
+                # it holds the claim of the domain, which ends with the last node
+                close_fds=False,
                 preexec_fn=_die_with_parent,  # noqa: PLW1509 - takes no lock that a thread could hold
             )
 
@@ -113,7 +139,8 @@ class NodeProcess:
         lines = self._log.read_text(encoding='utf-8', errors='replace').splitlines()
         found = (re.search(f'({COMPILING}|{_PAGE}).*', line) for line in lines)
         notices = [each[0] for each in found if each]
-        new, self._noticed = notices[self._noticed :], len(notices)
+        new = notices[self._noticed :]
+        self._noticed = len(notices)
         return [f'{self.name}: {notice}' for notice in new]
 
     def check(self) -> None:
@@ -124,7 +151,9 @@ class NodeProcess:
         end = f'exited with code {code}'
         if code < 0:
             end = f'was terminated by {signal.Signals(-code).name}'
-        lines = self._log.read_text(encoding='utf-8', errors='replace').splitlines()[-_TAIL:]
+        lines = self._log.read_text(encoding='utf-8', errors='replace').splitlines()[
+            -_TAIL:
+        ]
         tail = ''.join(f'\n  {line}' for line in lines)
         raise BlfDscError(f'{self.name} {end}:{tail}\n(full log: {self._log})')
 
@@ -139,9 +168,18 @@ class NodeProcess:
             self._process.wait()
 
 
-def _run_nodes(config: LoopConfig, params_file: Path, logs: Path, *, view: bool) -> bool:
+def _run_nodes(
+    config: LoopConfig,
+    monitor: ProgressMonitor,
+    params_file: Path,
+    logs: Path,
+    *,
+    view: bool,
+) -> bool:
+    """Run the nodes until the plant has ended; return False if something else ended the run."""
     interrupts: list[int] = []
-    with ExitStack() as ending:  # stops the nodes in reverse, then restores the handlers
+    # stops the nodes in reverse, then restores the handlers
+    with ExitStack() as ending:
         for number in (signal.SIGINT, signal.SIGTERM):
             handler = signal.signal(number, lambda number, _: interrupts.append(number))
             ending.callback(signal.signal, number, handler)
@@ -152,8 +190,8 @@ def _run_nodes(config: LoopConfig, params_file: Path, logs: Path, *, view: bool)
             return node
 
         is_lockstep = config.plant.mode == 'lockstep'
-        nodes = list(map(started, (RECORDER, *((_LOOP,) if is_lockstep else (CONTROLLER, PLANT)))))
-        monitor = ending.enter_context(closing(ProgressMonitor(config.plant.duration)))
+        loop = [_LOOP] if is_lockstep else [CONTROLLER, PLANT]
+        nodes = [started(name) for name in (RECORDER, *loop)]
         starting = nodes
         while all(node.is_running for node in nodes) and not interrupts:
             monitor.wait(0.1)
@@ -162,7 +200,8 @@ def _run_nodes(config: LoopConfig, params_file: Path, logs: Path, *, view: bool)
                 tqdm.write(notice, file=sys.stderr)
             if monitor.start is not None and (starting is nodes or notices):
                 # Only now, since the nodes wait for a subscriber, which must be the recorder.
-                starting, view = [started(VIEW)] if view else [], False
+                starting = [started(VIEW)] if view else []
+                view = False
         completed = not (interrupts or nodes[-1].is_running)
         if completed:
             monitor.show(config.plant.duration)
@@ -182,12 +221,18 @@ class ProgressMonitor:
         """Wait for a loop of this simulated duration [s]."""
         self._duration = duration
         # Disabled (None) in a log, where a bar would be one long line.
-        self._bar = tqdm(total=duration, desc='closed loop', bar_format=_BAR, disable=None)
+        self._bar = tqdm(
+            total=duration, desc='closed loop', bar_format=_BAR, disable=None
+        )
         self.start: float | None = None  # s, stamp of the first message
         self._received: list[JointState] = []
         self._context = rclpy.Context()
-        rclpy.init(context=self._context, signal_handler_options=rclpy.SignalHandlerOptions.NO)
-        self._node = rclpy.create_node('closed_loop', context=self._context, enable_rosout=False)
+        rclpy.init(
+            context=self._context, signal_handler_options=rclpy.SignalHandlerOptions.NO
+        )
+        self._node = rclpy.create_node(
+            'closed_loop', context=self._context, enable_rosout=False
+        )
         self._executor = EventsExecutor(context=self._context)
         self._executor.add_node(self._node)
         self._node.create_subscription(
@@ -196,6 +241,14 @@ class ProgressMonitor:
             self._received.append,
             qos_profile(topics.MONITOR.offered),
         )
+
+    def others(self, domain: int) -> list[str]:
+        """Return who else is in this domain: nodes found by discovery, and ports of others."""
+        time.sleep(_DISCOVERY)
+        nodes = self._node.get_node_names_and_namespaces()
+        names = [f'{space.rstrip("/")}/{name}' for name, space in nodes]
+        names.remove(self._node.get_fully_qualified_name())
+        return names + [f'UDP port {port}' for port in strangers(domain)]
 
     def wait(self, seconds: float) -> None:
         """Wait for a message and show it."""
@@ -226,14 +279,20 @@ class ProgressMonitor:
 def localhost_environment() -> dict[str, str]:
     """Return the environment in which nodes find only those on this computer.
 
-    A profile that the user has chosen, and middleware other than Fast DDS, are left as they are.
+    A profile that the user has chosen, and middleware other than Jazzy's Fast DDS, are left as they
+    are: the one of Kilted rejects this package's profile, and would then find the whole network.
     """
     profiles = str(share_folder() / 'config/fastdds.xml')
     chosen = os.environ.get(_PROFILES, profiles)
-    if chosen != profiles or 'fastrtps' not in rclpy.get_rmw_implementation_identifier():
+    if chosen != profiles or not _is_jazzys_fast_dds():
         return {_RANGE: 'LOCALHOST'}
     # With LOCALHOST, rmw_fastrtps would add shared memory to the transports of the profile.
     return {_RANGE: 'SYSTEM_DEFAULT', 'ROS_LOCALHOST_ONLY': '', _PROFILES: profiles}
+
+
+def _is_jazzys_fast_dds() -> bool:
+    name = rclpy.get_rmw_implementation_identifier()
+    return 'fastrtps' in name and metadata.version('rclpy').startswith('7.')
 
 
 @contextmanager
@@ -249,22 +308,3 @@ def environment(values: dict[str, str]) -> Iterator[None]:
     finally:
         os.environ.clear()
         os.environ.update(before)
-
-
-@contextmanager
-def own_domain() -> Iterator[int]:
-    """Claim a ROS domain that no other run on this machine holds; BlfDscError if none is free.
-
-    Processes that inherit open files hold it as well, as the nodes of a run that was killed do.
-    """
-    first = os.getpid() % len(_DOMAINS)
-    with socket.socket(socket.AF_UNIX) as claim:
-        claim.set_inheritable(True)
-        for domain in (*_DOMAINS[first:], *_DOMAINS[:first]):
-            try:
-                claim.bind(f'\0blf_dsc_controller domain {domain}')
-            except OSError:  # held by another process, and released when that exits
-                continue
-            yield domain
-            return
-    raise BlfDscError(f'{len(_DOMAINS)} runs are active: no ROS domain is free')

@@ -15,7 +15,7 @@ from blf_dsc_controller.analysis.metrics import aligned, write_json
 from blf_dsc_controller.cli.run import make_folder, print_notice
 from blf_dsc_controller.compiled.jit import announced_compilation
 from blf_dsc_controller.configuration.nodes import locate
-from blf_dsc_controller.studies import laws, report, runs
+from blf_dsc_controller.studies import laws, report, runs, stiffness
 from blf_dsc_controller.studies import paper as paper_study
 from blf_dsc_controller.studies.monte_carlo import load_study
 
@@ -27,19 +27,32 @@ def paper(options: Namespace) -> None:
     claims, table = paper_study.compare(make_folder(options.out))
     print(*claims, sep='\n')
     print(aligned(table))
-    print(f'wrote {options.out}: results.json, five pictures, configurations of all runs')
+    print(
+        f'wrote {options.out}: results.json, five pictures, configurations of all runs'
+    )
 
 
 def arms(options: Namespace) -> None:
-    """Tune and run every law on URDF arms, write figures.json and print the table."""
+    """Tune and run every law on URDF arms, write figures.json and print the table.
+
+    Without a choice of laws also compare them at parts of the bandwidth.
+    """
     laws.chosen_laws(options.laws)  # before there is a folder
     folder = make_folder(options.out)
     with announced_compilation(print_notice):
         found = laws.compare(folder, options.config, options.laws)
+        soft = {} if options.laws else stiffness.compare(folder, options.config)
     for arm, results in found.items():
-        print(f'{arm}: {laws.TRUTHS} runs of each law; errors in mrad, of the model in %')
+        print(
+            f'{arm}: {laws.TRUTHS} runs of each law; errors in mrad, of the model in %'
+        )
         print(laws.format_results(results))
-    print(f'wrote {options.out / "figures.json"}')
+    for arm, errors in soft.items():
+        print(f'{arm}: parts of the bandwidth')
+        print(stiffness.format_errors(errors))
+    print(
+        f'wrote {options.out}: {", ".join(sorted(path.name for path in folder.iterdir()))}'
+    )
 
 
 def monte_carlo(options: Namespace) -> None:
@@ -50,7 +63,9 @@ def monte_carlo(options: Namespace) -> None:
         chosen = make_folder(options.out or Path(f'{store.folder.name}-run-{run}'))
         report.reproduce(store, run, chosen)
         print(f'the same figures as in {folder}, bit for bit')
-        print(f'wrote       {chosen}: config.yaml and bag, which blf_dsc plot and report draw')
+        print(
+            f'wrote       {chosen}: config.yaml and bag, which blf_dsc plot and report draw'
+        )
     elif options.report:
         folder = options.out or Path('changes')
         folder.mkdir(parents=True, exist_ok=True)
@@ -69,7 +84,11 @@ def _run_study(options: Namespace) -> None:
         with announced_compilation(print_notice):
             runs.warm_up(study)
         workers = options.workers or runs.cores()
-        with runs.dask(options.dask) if options.dask else runs.processes(workers) as executor:
+        with (
+            runs.dask(options.dask)
+            if options.dask
+            else runs.processes(workers) as executor
+        ):
             _compute(store, chunks, executor)
     summary = report.summarize(study, store.results())
     write_json(summary, store.folder / 'summary.json')
@@ -84,7 +103,9 @@ def _compute(store: runs.Store, chunks: list[range], executor: Executor) -> None
         print(f'{done} of {total} runs are done already', file=sys.stderr)
     lost = 0
     pause = 0.5 if sys.stderr.isatty() else _PAUSE_IN_A_LOG
-    with tqdm(total=total, initial=done, unit='run', desc='monte carlo', mininterval=pause) as bar:
+    with tqdm(
+        total=total, initial=done, unit='run', desc='monte carlo', mininterval=pause
+    ) as bar:
         for chunk, columns in runs.compute(store.study, chunks, executor):
             store.keep(chunk, columns)
             lost += int(np.count_nonzero(columns['outcome'] != runs.KEPT))

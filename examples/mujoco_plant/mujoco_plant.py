@@ -16,7 +16,7 @@ import numpy as np
 from blf_dsc_controller.configuration.plant import PlantConfig
 from blf_dsc_controller.nodes import process
 from blf_dsc_controller.nodes.plant_node import PlantNode
-from sim_plant.kernels import actuate
+from sim_plant.kernels import actuate, compensate, let_pass
 from sim_plant.layout import PlantSettings
 from sim_plant.motion import update_loads
 from sim_plant.plant import Plant, plant_settings
@@ -56,7 +56,9 @@ def _apply_truth(config: PlantConfig, model: mujoco.MjModel) -> None:
         config.joints, *config.truth.changes(len(config.joints)), strict=True
     ):
         moved = model.joint(joint).bodyid[0]
-        for body in np.flatnonzero((model.body_weldid == moved) & (model.body_mass > 0.0)):
+        for body in np.flatnonzero(
+            (model.body_weldid == moved) & (model.body_mass > 0.0)
+        ):
             own, carrier = (data.xmat[each].reshape(3, 3) for each in (body, moved))
             model.body_mass[body] *= factor
             model.body_inertia[body] *= factor
@@ -86,23 +88,36 @@ class MujocoArm(Plant):
         """Return to sample 0."""
         super().reset()
         mujoco.mj_resetData(self.model, self.data)
-        self.data.qpos[:], self.data.qvel[:] = self._q, self._dq
+        self.data.qpos[:] = self._q
+        self.data.qvel[:] = self._dq
 
     def step(self, torque: np.ndarray) -> None:
         """Take a step with this torque (n,) [N m] and the loads that act at its start."""
-        settings, now, data = self._settings, self._now, self.data
-        friction, acting = settings.disturbance, now.acting
+        settings = self._settings
+        now = self._now
+        data = self.data
+        friction = settings.disturbance
+        acting = now.acting
+        drives = now.drives
+        if let_pass(settings, now, torque):
+            data.qvel[:] = self._dq[:] = drives.applied[:] = drives.motor[:] = 0.0
+            now.sample[0] += 1.0
+            return
+        actuate(settings, now, drives.command)
         update_loads(settings, now)
+        compensate(settings, now)
         self._tip.mass[0] = self._mass + acting.payload[0]
         speed = data.qvel / friction.stribeck_velocity
         self.model.dof_damping[:] = acting.viscous
         self.model.dof_frictionloss[:] = acting.coulomb
         self.model.dof_frictionloss *= 1.0 + friction.stribeck * np.exp(-(speed**2))
         data.xfrc_applied[self._tip.id, :3] = acting.force
-        wave = friction.amplitude * np.sin(friction.frequency * data.time + friction.phase)
+        wave = friction.amplitude * np.sin(
+            friction.frequency * data.time + friction.phase
+        )
         ripple = friction.ripple * np.sin(friction.ripple_frequency * data.qpos)
-        actuate(settings, now, torque)
-        data.qfrc_applied[:] = now.drives.applied - (acting.constant + wave + ripple)
+        data.qfrc_applied[:] = drives.applied + drives.added
+        data.qfrc_applied -= acting.constant + wave + ripple
         mujoco.mj_step(self.model, data)
         self._q[:], self._dq[:] = data.qpos, data.qvel
         now.sample[0] += 1.0

@@ -1,0 +1,103 @@
+# SPDX-License-Identifier: Apache-2.0
+"""ROS domains in which nobody else is.
+
+Runs of this package claim their domain by the name of a socket. Any other participant shows in the
+UDP ports that the protocol assigns to its domain (DDSI-RTPS 2.5, 9.6.2.3), whatever its node is
+called and whether or not it has one.
+"""
+
+from __future__ import annotations
+
+import os
+import socket
+from collections.abc import Collection, Iterator
+from contextlib import closing, contextmanager, suppress
+from pathlib import Path
+
+from blf_dsc_controller.errors import BlfDscError
+
+DOMAINS = range(1, 101)  # 0 is the default; above 101, ports are ephemeral
+_FIRST_PORT = 7400  # of domain 0
+_PORTS = 250  # of a domain
+_TABLES = ('udp', 'udp6')  # sockets of this network, of all users
+_LOCAL_ADDRESS, _INODE = 1, 9  # columns of a table
+
+
+@contextmanager
+def own_domain(avoided: Collection[int] = ()) -> Iterator[int]:
+    """Claim a ROS domain in which nobody is, neither another run nor any other participant.
+
+    It is none of the `avoided`, and not the domain of this shell. Processes that inherit open files
+    hold the claim as well, as the nodes of a run that was killed do.
+
+    Raises:
+        BlfDscError: none is free.
+    """
+    first = os.getpid() % len(DOMAINS)
+    for domain in (*DOMAINS[first:], *DOMAINS[:first]):
+        if domain in avoided or domain == shell_domain():
+            continue
+        claim = claimed(domain)
+        if claim is None:
+            continue
+        with closing(claim):
+            if not strangers(domain):
+                yield domain
+                return
+    raise BlfDscError(
+        f'no ROS domain is free: runs or other nodes are in each of {DOMAINS[0]} to '
+        f'{DOMAINS[-1]} on this computer, or it is the ROS_DOMAIN_ID of this shell; '
+        'end some of them'
+    )
+
+
+def shell_domain() -> int:
+    """Return the domain that nodes started from this shell would enter."""
+    with suppress(ValueError):
+        return int(os.environ.get('ROS_DOMAIN_ID') or 0)
+    return 0
+
+
+def claimed(domain: int) -> socket.socket | None:
+    """Return the claim of a domain, held until it is closed; None if another process has it."""
+    claim = socket.socket(socket.AF_UNIX)
+    claim.set_inheritable(True)
+    try:
+        claim.bind(f'\0blf_dsc_controller domain {domain}')
+    except OSError:
+        claim.close()
+        return None
+    return claim
+
+
+def strangers(domain: int) -> list[int]:
+    """Return the UDP ports of a domain that other processes of this computer have bound."""
+    begin = _FIRST_PORT + _PORTS * domain
+    ports = range(begin, begin + _PORTS)
+    own = _own_sockets()
+    return [
+        port for port, inode in _bound_ports() if port in ports and inode not in own
+    ]
+
+
+def _bound_ports() -> Iterator[tuple[int, str]]:
+    """Yield each bound UDP port with the number of its socket."""
+    for table in _TABLES:
+        path = Path('/proc/net') / table
+        if not path.exists():  # IPv6 may be off
+            continue
+        for line in path.read_text(encoding='ascii').splitlines()[1:]:
+            columns = line.split()
+            _, _, port = columns[_LOCAL_ADDRESS].rpartition(':')
+            yield int(port, 16), columns[_INODE]
+
+
+def _own_sockets() -> set[str]:
+    """Return the numbers of the sockets of this process."""
+    found = set()
+    for each in Path('/proc/self/fd').iterdir():
+        with suppress(OSError):  # closed meanwhile
+            kind, _, number = str(each.readlink()).partition(':')
+            if kind == 'socket':
+                found.add(number.strip('[]'))
+    return found

@@ -1,0 +1,102 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`blf_dsc drive`: the guarded law on a robot's own interface, without ROS."""
+
+from __future__ import annotations
+
+import math
+import signal
+from argparse import Namespace
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+
+from blf_dsc_controller.cli.main import INTERRUPTED
+from blf_dsc_controller.cli.run import STOPPED, print_notice
+from blf_dsc_controller.compiled.jit import announced_compilation
+from blf_dsc_controller.configuration.controller import ControllerConfig
+from blf_dsc_controller.configuration.drive import DriveConfig
+from blf_dsc_controller.configuration.nodes import CONTROLLER, DRIVE, load, locate
+from blf_dsc_controller.control.arm_controller import ArmController
+from blf_dsc_controller.control.realtime import request_realtime
+from blf_dsc_controller.drive.driver import disagreements
+from blf_dsc_controller.drive.drivers import find_driver
+from blf_dsc_controller.drive.loop import DriveLoop, End, Outcome
+from blf_dsc_controller.errors import BlfDscError, ConfigurationError
+from blf_dsc_controller.supervision.config_warnings import config_warnings
+from blf_dsc_controller.supervision.expected_errors import expectation
+
+_CODES = {
+    End.DURATION: 0,
+    End.REQUESTED: INTERRUPTED,
+    End.STOPPED: STOPPED,
+    End.REFLEX: STOPPED,
+    End.LOST: STOPPED,
+}
+
+
+def drive(options: Namespace) -> int:
+    """Control a robot until the end, and print how it went."""
+    if not (options.duration >= 0.0 and math.isfinite(options.duration)):
+        raise BlfDscError(
+            f'--duration: got {options.duration:g} s, but a time is needed; 0: until Ctrl-C'
+        )
+    path = locate(options.config)
+    config = load(path, CONTROLLER, ControllerConfig)
+    settings = load(path, DRIVE, DriveConfig)
+    made = find_driver(settings.driver)
+    problems = disagreements(made.facts, config)
+    if problems:
+        raise ConfigurationError(problems, str(path))
+    for warning in config_warnings(config):
+        print_notice(f'warning: {warning}')
+    if config.model == 'urdf':
+        print(f'errors to expect: {expectation(config)}')
+    driver = made(options.robot, config, settings)
+    with announced_compilation(print_notice):
+        controller = ArmController(config, record=options.out)
+    with controller:
+        for remark in driver.connect():
+            print_notice(remark)
+        request_realtime(config.realtime, lambda text: print_notice(f'warning: {text}'))
+        loop = DriveLoop(
+            driver,
+            controller,
+            duration=options.duration or math.inf,
+            settle_time=settings.settle_time,
+        )
+        with _signals_to(loop.request_end):
+            print_notice(f'controlling {options.robot}: Ctrl-C ends')
+            outcome = loop.run()
+        _print(outcome, loop, controller)
+    if options.out is not None:
+        print(
+            f'recorded      {options.out}: blf_dsc replay, report, plot and identify read it'
+        )
+    return _CODES[outcome.end]
+
+
+@contextmanager
+def _signals_to(request_end: Callable[[], None]) -> Iterator[None]:
+    """Request the end on SIGINT and SIGTERM, instead of interrupting a step."""
+    numbers = (signal.SIGINT, signal.SIGTERM)
+    before = [signal.signal(number, lambda *_: request_end()) for number in numbers]
+    try:
+        yield
+    finally:
+        for number, handler in zip(numbers, before, strict=True):
+            signal.signal(number, handler)
+
+
+def _print(outcome: Outcome, loop: DriveLoop, controller: ArmController) -> None:
+    """Print the end, the largest error, the load, and how fast the torques were."""
+    reason = f': {outcome.text}' if outcome.text else ''
+    print(f'end           {outcome.end}{reason}')
+    print(f'states        {outcome.states}, and {controller.missed} missed')
+    print(f'tracking      largest error {loop.worst:.0%} of its bound')
+    mass, interval = controller.load
+    if not math.isnan(mass):
+        print(f'load          {mass:.2f} +- {interval:.2f} kg more than at the start')
+    median, most = loop.latency.quantile(0.5), loop.latency.quantile(0.99)
+    print(
+        f'torques after {1e6 * median:.0f} us in the median, {1e6 * most:.0f} us at 99 %, '
+        f'{1e6 * loop.latency.largest:.0f} us at most'
+    )

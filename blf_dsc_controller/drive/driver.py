@@ -1,0 +1,135 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What `blf_dsc drive` needs of a robot, for one file per robot: facts, states in, torques out.
+
+A driver of your own is a Python file with a subclass of `Driver` that is called `DRIVER`, named by
+the parameter `driver`.  It is made with the robot's address and both configurations.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from typing import ClassVar, NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from blf_dsc_controller.configuration.controller import ControllerConfig
+from blf_dsc_controller.configuration.drive import DriveConfig
+from blf_dsc_controller.errors import BlfDscError
+
+Vector = NDArray[np.float64]
+
+
+class DriverError(BlfDscError):
+    """The robot cannot be reached, or refuses; the message says what to do."""
+
+
+class ReflexError(DriverError):
+    """The robot ended the motion by itself, such as after a collision."""
+
+
+class ConnectionLostError(DriverError):
+    """The robot sends no more states."""
+
+
+class RobotState(NamedTuple):
+    """What a robot reports in one cycle; the arrays have an entry for each of its n joints."""
+
+    stamp: float  # s, of the robot's clock
+    q: ArrayLike  # rad
+    dq: ArrayLike  # rad/s
+    effort: ArrayLike  # N m, as `Facts.effort` says
+
+
+class Facts(NamedTuple):
+    """What is true of every robot of a kind; a configuration must agree with it."""
+
+    joints: int
+    period: float  # s, between two states
+    drive_compensates: str  # as `robot.drive_compensates`
+    effort: str  # as `robot.effort`
+    torque_limit: Sequence[float]  # N m
+    torque_rate: Sequence[float]  # N m/s, beyond which the robot stops by itself
+
+
+class Driver(ABC):
+    """A robot with a torque interface.
+
+    All methods may raise `DriverError`; between `start` and `finish` they raise `ReflexError` when
+    the robot has stopped by itself, and `ConnectionLostError` when it has fallen silent.
+    """
+
+    facts: ClassVar[Facts]
+
+    def __init__(
+        self, address: str, controller: ControllerConfig, config: DriveConfig
+    ) -> None:
+        """Keep what `connect` needs."""
+        self.address = address
+        self.controller = controller
+        self.config = config
+
+    @abstractmethod
+    def connect(self) -> Sequence[str]:
+        """Reach the robot, and set its thresholds and its load; return remarks for the user."""
+
+    @abstractmethod
+    def start(self) -> None:
+        """Begin to command torques; from now on the robot waits for one after each state."""
+
+    @abstractmethod
+    def read(self) -> RobotState:
+        """Wait for the next state."""
+
+    @abstractmethod
+    def write(self, torque: Vector | None) -> None:
+        """Command torques (n,) [N m]; None: whatever lets the robot go on as it is."""
+
+    @abstractmethod
+    def finish(self) -> None:
+        """End the motion; the robot holds itself by its own means."""
+
+    @abstractmethod
+    def recover(self) -> None:
+        """Make a robot that has stopped by itself ready for another start."""
+
+
+def disagreements(facts: Facts, config: ControllerConfig) -> list[str]:
+    """Return in what a configuration contradicts the facts of its robot, with remedies."""
+    problems = []
+    if len(config.joints) != facts.joints:
+        problems.append(
+            f'joints: got {len(config.joints)}, but the robot has {facts.joints}: give the URDF of '
+            'this robot'
+        )
+        return problems
+    if config.sample_time_ns != round(facts.period * 1e9):
+        problems.append(
+            f'sample_time: got {config.sample_time:g} s, but the robot sends a state every '
+            f'{facts.period:g} s: write {facts.period:g}'
+        )
+    for name, needed in (
+        ('drive_compensates', facts.drive_compensates),
+        ('effort', facts.effort),
+    ):
+        got = getattr(config.robot, name)
+        if got != needed:
+            problems.append(
+                f'robot.{name}: got {got}, but of this robot it is {needed}: write {needed}'
+            )
+    problems += _excesses('torque.limit', config.torque.limit, facts.torque_limit)
+    rates = [rate or float('inf') for rate in config.torque.rate_limit]
+    problems += _excesses('torque.rate_limit', rates, facts.torque_rate)
+    return problems
+
+
+def _excesses(name: str, given: Sequence[float], largest: Sequence[float]) -> list[str]:
+    """Return a problem if a limit is above what the robot takes."""
+    if all(got <= most for got, most in zip(given, largest, strict=True)):
+        return []
+    problem = (
+        f'{name}: got {list(given)}, but the robot stops by itself beyond {list(largest)}: stay '
+        'below'
+    )
+    return [problem]

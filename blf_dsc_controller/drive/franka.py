@@ -1,0 +1,206 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A Franka Research 3 by libfranka's protocol, with Franka's own bindings `pylibfranka`.
+
+The robot adds gravity and motor friction to the torques that it gets, and reports the whole torque
+of each joint (tau_J).  It needs a torque after each state, every millisecond.  One that misses
+twenty states in a row, or changes a torque by more than 1 N m between two, is stopped by it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from typing import ClassVar
+
+import numpy as np
+import pylibfranka
+from numpy.typing import NDArray
+
+from blf_dsc_controller.configuration.controller import ControllerConfig
+from blf_dsc_controller.configuration.drive import DriveConfig
+from blf_dsc_controller.drive.driver import (
+    ConnectionLostError,
+    Driver,
+    DriverError,
+    Facts,
+    ReflexError,
+    RobotState,
+)
+
+Vector = NDArray[np.float64]
+_JOINTS = 7
+_FLANGE = 0.107  # m, along the axis of joint 7, from its frame
+_SAME_MASS = 0.01  # kg
+_REMEDIES = {
+    'Reflex': 'it had a reflex: see Desk, and clear the way of the arm',
+    'UserStopped': 'release the external activation device or the stop button',
+    'Guiding': 'let go of the guiding buttons',
+    'Move': 'another program controls it: end that one',
+    'Other': 'unlock the joints in Desk, and activate the FCI',
+}
+
+
+class FrankaDriver(Driver):
+    """A Franka Research 3."""
+
+    facts: ClassVar[Facts] = Facts(
+        joints=_JOINTS,
+        period=0.001,
+        drive_compensates='gravity_and_friction',
+        effort='whole',
+        torque_limit=(87.0, 87.0, 87.0, 87.0, 12.0, 12.0, 12.0),
+        torque_rate=(1000.0,) * _JOINTS,
+    )
+
+    def __init__(
+        self, address: str, controller: ControllerConfig, config: DriveConfig
+    ) -> None:
+        super().__init__(address, controller, config)
+        self._torque = np.zeros(_JOINTS)
+
+    def connect(self) -> Sequence[str]:
+        """Reach the robot, recover it from a reflex, and set thresholds and load.
+
+        Raises:
+            DriverError: it cannot be reached, is not ready, or refuses a setting.
+        """
+        is_realtime = self.controller.realtime.priority > 0
+        wanted = pylibfranka.RealtimeConfig
+        with self._explained(f'{self.address} cannot be reached'):
+            self._robot = pylibfranka.Robot(
+                self.address, wanted.kEnforce if is_realtime else wanted.kIgnore
+            )
+            state = self._robot.read_once()
+        if state.robot_mode == pylibfranka.RobotMode.Reflex:
+            self.recover()
+            state = self._robot.read_once()
+        if state.robot_mode != pylibfranka.RobotMode.Idle:
+            mode = state.robot_mode.name
+            raise DriverError(
+                f'{self.address} is not idle, but in mode {mode}: '
+                f'{_REMEDIES.get(mode, "see Desk")}'
+            )
+        self._set_thresholds()
+        self._set_load()
+        return [f'connected to {self.address}', *self._remarks()]
+
+    def _set_thresholds(self) -> None:
+        torque = list(self.config.collision_torque)
+        force = list(self.config.collision_force)
+        if not torque:
+            return
+        if len(torque) != _JOINTS:
+            raise DriverError(
+                f'drive: collision_torque: got {len(torque)} entries, but the robot has {_JOINTS} '
+                'joints: give one for each'
+            )
+        with self._explained('the collision thresholds were refused'):
+            self._robot.set_collision_behavior(torque, torque, force, force)
+
+    def _set_load(self) -> None:
+        """Declare `robot.drive_payload` to the robot, whose model then includes it."""
+        if not self.config.set_load:
+            return
+        robot = self.controller.robot
+        chain = robot.chain(self.controller.joints)
+        point = chain.tip_placement @ np.append(robot.drive_payload_centre, 1.0)
+        centre = point[:3] - (0.0, 0.0, _FLANGE)
+        has_load = robot.drive_payload > 0.0
+        inertia = np.diag(self.config.load_inertia) if has_load else np.zeros((3, 3))
+        with self._explained('the load was refused'):
+            self._robot.set_load(
+                robot.drive_payload,
+                (centre if has_load else np.zeros(3)).tolist(),
+                inertia.ravel(order='F').tolist(),
+            )
+
+    def _remarks(self) -> Iterator[str]:
+        """Yield what the robot carries in its own model, if the configuration has another mass."""
+        with self._explained('no state was received'):
+            state = self._robot.read_once()
+        known = self.controller.robot.drive_payload
+        if self.config.set_load and abs(state.m_ee) > _SAME_MASS:
+            yield (
+                f'note: the robot adds the weight of an end effector of {state.m_ee:.2f} kg (of '
+                'Desk): the URDF should have it, too; what is missing there is learned'
+            )
+        elif not self.config.set_load and abs(state.m_total - known) > _SAME_MASS:
+            yield (
+                f'note: the robot adds the weight of {state.m_total:.2f} kg at its flange, but '
+                f'robot.drive_payload is {known:g} kg: what the URDF lacks of it should be there'
+            )
+
+    def start(self) -> None:
+        """Begin torque control."""
+        with self._explained('torque control was refused'):
+            self._control = self._robot.start_torque_control()
+
+    def read(self) -> RobotState:
+        """Wait for the next state; libfranka gives up after a second."""
+        with self._in_motion():
+            state, _ = self._control.readOnce()
+        return RobotState(state.time.to_sec(), state.q, state.dq, state.tau_J)
+
+    def write(self, torque: Vector | None) -> None:
+        """Command torques (7,) [N m] beyond gravity; None repeats those before, or zero."""
+        if torque is not None:
+            self._torque = torque
+        with self._in_motion():
+            self._control.writeOnce(pylibfranka.Torques(self._torque.tolist()))
+
+    def finish(self) -> None:
+        """End torque control with the last torque; the robot's own controller holds the arm."""
+        last = pylibfranka.Torques(self._torque.tolist())
+        last.motion_finished = True
+        with self._in_motion():
+            self._control.writeOnce(last)
+
+    def recover(self) -> None:
+        """Clear the errors of a reflex.
+
+        Raises:
+            DriverError: it takes a person to do it.
+        """
+        with self._explained('automatic error recovery was refused'):
+            self._robot.automatic_error_recovery()
+
+    @contextmanager
+    def _explained(self, what: str) -> Iterator[None]:
+        """Raise the errors of libfranka as `DriverError`, with what to do."""
+        try:
+            yield
+        except pylibfranka.NetworkException as error:
+            raise DriverError(
+                f'{what} ({_reason(error)}): check the address and the cable, activate the FCI in '
+                'Desk, and end other programs that control the robot'
+            ) from error
+        except pylibfranka.RealtimeException as error:
+            raise DriverError(
+                f'{what} ({_reason(error)}): install a kernel with PREEMPT_RT and allow rtprio to '
+                'this user, or set realtime.priority to 0'
+            ) from error
+        except (
+            pylibfranka.CommandException,
+            pylibfranka.ControlException,
+            pylibfranka.InvalidOperationException,
+            pylibfranka.FrankaException,
+        ) as error:
+            raise DriverError(
+                f'{what} ({_reason(error)}): see Desk, which names the cause'
+            ) from error
+
+    @contextmanager
+    def _in_motion(self) -> Iterator[None]:
+        """Raise the errors of libfranka during the motion as those of a driver."""
+        try:
+            yield
+        except pylibfranka.NetworkException as error:
+            raise ConnectionLostError(
+                f'{_reason(error)}: the robot stops by itself; check its computer and the cable'
+            ) from error
+        except pylibfranka.ControlException as error:
+            raise ReflexError(_reason(error)) from error
+
+
+def _reason(error: Exception) -> str:
+    return str(error).removeprefix('libfranka: ').strip()

@@ -1,0 +1,194 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The loop on a robot: a torque for each state, and an end at rest whatever happens.
+
+    read -> ArmController -> write          while it runs
+    read -> safe torque   -> write          to the end: on request, after a fault or an error
+    finish                                  at rest, or after `settle_time`
+
+A robot that stops by itself is made ready for the next start, but its motion is not resumed.
+"""
+
+from __future__ import annotations
+
+import gc
+import math
+from enum import Enum
+from time import perf_counter
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from blf_dsc_controller.control.arm_controller import ArmController
+from blf_dsc_controller.drive.driver import (
+    ConnectionLostError,
+    Driver,
+    DriverError,
+    ReflexError,
+    RobotState,
+)
+from blf_dsc_controller.drive.latency import Latency
+from blf_dsc_controller.supervision.supervisor import Phase
+
+Vector = NDArray[np.float64]
+
+
+class End(str, Enum):
+    """Why a run ended."""
+
+    __str__ = str.__str__
+
+    DURATION = 'the duration is over'
+    REQUESTED = 'ended on request'
+    STOPPED = 'the controller stopped'
+    REFLEX = 'the robot stopped by itself'
+    LOST = 'the connection was lost'
+
+
+class Outcome(NamedTuple):
+    """How a run ended; `text` has the reason in words, empty after one that was planned."""
+
+    end: End
+    text: str
+    states: int
+
+
+class DriveLoop:
+    """A controller on a robot.
+
+    Attributes:
+        latency: of the torques, from the return of `read` to that of `write`.
+        worst: largest tracking error so far, relative to its bound.
+    """
+
+    def __init__(
+        self,
+        driver: Driver,
+        controller: ArmController,
+        *,
+        duration: float = math.inf,
+        settle_time: float = 3.0,
+    ) -> None:
+        """Run for `duration` [s] of the robot's time; the end may take `settle_time` [s] more."""
+        self.latency = Latency()
+        self.worst = 0.0
+        self._driver = driver
+        self._controller = controller
+        self._duration = duration
+        self._settle_time = settle_time
+        self._requests = 0
+        self._states = 0
+        self._begin = math.nan  # s, stamp of the first state
+        self._end: End | None = None
+        self._end_at = math.nan  # s, stamp at which the end began
+        self._text = ''
+        self._error: Exception | None = None
+
+    def request_end(self) -> None:
+        """Bring the arm to rest and end; a second request ends at once.  For signal handlers."""
+        self._requests += 1
+
+    def run(self) -> Outcome:
+        """Control the robot until the end.
+
+        Raises:
+            DriverError: the robot refused to start.
+            Exception: an error of the controller, after the arm was brought to rest.
+        """
+        gc.collect()
+        gc.freeze()  # what is loaded by now stays: scanning it would stall the loop
+        try:
+            self._driver.start()
+            self._control()
+        except ReflexError as error:
+            self._withdraw(End.REFLEX, str(error))
+            self._recover()
+        except ConnectionLostError as error:
+            self._withdraw(End.LOST, str(error))
+        finally:
+            gc.unfreeze()
+        if self._error is not None:
+            raise self._error
+        return Outcome(self._end or End.REQUESTED, self._text, self._states)
+
+    def _control(self) -> None:
+        """Answer states until the arm rests, then end the motion."""
+        try:
+            while not self._is_over(state := self._driver.read()):
+                self._received = perf_counter()
+                self._step(state)
+        except (ReflexError, ConnectionLostError):
+            raise
+        except BaseException:
+            self._driver.finish()
+            raise
+        self._driver.finish()
+
+    def _step(self, state: RobotState) -> None:
+        """Answer a state; the first error leads to the safe torque, a second one ends the run."""
+        self._states += 1
+        try:
+            self._controller.update(*state, send=self._send)
+        except DriverError:
+            raise
+        except Exception as error:
+            if self._error is not None:
+                raise self._error from error
+            self._error = error
+            text = f'{type(error).__name__}: {error}'
+            self._send(self._controller.fail(text))
+            self._begin_end(End.STOPPED, text, state.stamp)
+            return
+        self._watch(state.stamp)
+
+    def _send(self, torque: Vector | None) -> None:
+        self._driver.write(torque)
+        self.latency.add(perf_counter() - self._received)
+
+    def _watch(self, stamp: float) -> None:
+        """Begin the end if it is time, or if the controller has stopped."""
+        if math.isnan(self._begin):
+            self._begin = stamp
+        if self._end is not None:
+            return
+        controller = self._controller
+        self.worst = max(
+            self.worst, float((abs(controller.error) / controller.bound).max())
+        )
+        if controller.phase is Phase.SAFE_STOP:
+            self._begin_end(End.STOPPED, controller.reason, stamp)
+        elif self._requests:
+            controller.stop()
+            self._begin_end(End.REQUESTED, '', stamp)
+        elif stamp - self._begin >= self._duration:
+            controller.stop()
+            self._begin_end(End.DURATION, '', stamp)
+
+    def _begin_end(self, end: End, text: str, stamp: float) -> None:
+        if self._end is None:
+            self._end = end
+            self._text = text
+            self._end_at = stamp
+
+    def _is_over(self, state: RobotState) -> bool:
+        """Whether the arm rests under the safe torque, or there is no more time for it."""
+        if self._requests > 1:
+            return True
+        if self._end is None:
+            return False
+        is_late = state.stamp - self._end_at > self._settle_time
+        return is_late or self._controller.is_settled
+
+    def _withdraw(self, end: End, text: str) -> None:
+        """Note that the robot takes no more torques."""
+        self._end = None
+        self._begin_end(end, text, math.nan)
+        self._controller.withdraw(text)
+
+    def _recover(self) -> None:
+        try:
+            self._driver.recover()
+        except DriverError as error:
+            self._text += f'; {error}'
+        else:
+            self._text += '; it has recovered, and may be started again'

@@ -1,0 +1,139 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`blf_dsc drive` on franky-sim's FR3: Franka's bindings on one side, nothing of ours on the other.
+
+The simulator is a process of its own, in lock-step (`franka_simulator.py`), and so is the command.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import blf_dsc_controller as blf
+
+if not all(map(importlib.util.find_spec, ('pylibfranka', 'franky_sim'))):
+    pytest.skip('needs pylibfranka and franky-sim', allow_module_level=True)
+
+SIMULATOR = Path(__file__).with_name('franka_simulator.py')
+PATIENCE = 300.0  # s: starts and ends on a computer that is ten times too slow
+BOUND = 0.01  # rad, of the preset
+
+
+class Wire:
+    """Simulators and commands of a test; each simulator has an address of its own."""
+
+    def __init__(self, folder):
+        self.folder = folder
+        self.processes = []
+
+    def start(self, *words):
+        process = subprocess.Popen(
+            [sys.executable, *map(str, words)],
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            text=True,
+        )
+        self.processes.append(process)
+        return process
+
+    def simulate(self, address, *events):
+        """Start a simulator, and wait until it accepts connections."""
+        process = self.start(SIMULATOR, address, *events)
+        assert process.stdout.readline().strip() == 'ready'
+        return process
+
+    def drive(self, address, duration, *options):
+        words = ['--robot', address, '--duration', duration, *options]
+        out = ['--out', self.folder / 'bag']
+        return self.start('-m', 'blf_dsc_controller', 'drive', *words, *out)
+
+    def until(self, process, words):
+        """Read what a process prints up to a line with these words."""
+        for line in process.stdout:
+            if words in line:
+                return
+        pytest.fail(f'{words!r} was not printed')
+
+    def close(self):
+        for process in self.processes:
+            process.kill()
+            process.communicate()
+
+
+@pytest.fixture
+def wire(tmp_path):
+    found = Wire(tmp_path)
+    yield found
+    found.close()
+
+
+def ended(process):
+    """Return exit code and output of a command."""
+    output, _ = process.communicate(timeout=PATIENCE)
+    return process.returncode, output
+
+
+def assert_replays(folder):
+    verified = blf.verify(folder)
+    assert verified.difference is None
+    assert not any(found.missing for found in verified.comparisons)
+
+
+def test_it_tracks_and_holds_two_kilograms_that_appear_in_the_hand(wire):
+    wire.simulate('127.0.0.11', 'load=2@1000', 'load=0@2000')
+    code, output = ended(wire.drive('127.0.0.11', 3))
+    assert code == 0, output
+    assert 'end effector of 0.73 kg' in output
+    recorded = blf.read_run(wire.folder / 'bag')
+    assert set(np.diff(recorded.stamp)) == {1_000_000}  # ns: no state was missed
+    assert recorded.stamp.size > 3000  # 3 s, and the end
+    assert np.nanmax(np.abs(recorded.error)) < BOUND
+    assert_replays(wire.folder / 'bag')
+
+
+@pytest.mark.parametrize(
+    ('address', 'event', 'texts'),
+    [
+        ('127.0.0.12', 'reflex@500', ['the robot stopped by itself', 'recovered']),
+        (
+            '127.0.0.13',
+            'lose=100@500',
+            ['the controller stopped', 'after the last one'],
+        ),
+        ('127.0.0.14', 'die@500', ['the connection was lost', 'check its computer']),
+    ],
+)
+def test_faults_on_the_wire_end_the_run_with_a_reason(wire, address, event, texts):
+    wire.simulate(address, event)
+    code, output = ended(wire.drive(address, 60))
+    assert code == 5, output
+    assert all(text in output for text in texts), output
+    assert_replays(wire.folder / 'bag')
+
+
+def test_sigterm_ends_at_rest_and_a_killed_command_leaves_a_robot_that_can_be_used(
+    wire,
+):
+    wire.simulate('127.0.0.15')
+    killed = wire.start('-m', 'blf_dsc_controller', 'drive', '--robot', '127.0.0.15')
+    wire.until(killed, 'controlling')
+    killed.kill()
+    killed.wait()
+    process = wire.drive('127.0.0.15', 60)
+    wire.until(process, 'controlling')
+    process.send_signal(signal.SIGTERM)
+    code, output = ended(process)
+    assert code == 130, output
+    assert 'ended on request' in output
+
+
+def test_an_address_without_a_robot_is_an_error_with_a_remedy(wire):
+    code, output = ended(wire.drive('127.0.0.16', 1))
+    assert code == 1
+    assert 'activate the FCI in Desk' in output

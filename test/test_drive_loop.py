@@ -1,0 +1,252 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`blf_dsc drive` on the simulated arm in lock-step: how it starts, answers, ends and replays."""
+
+from __future__ import annotations
+
+import re
+import signal
+from math import inf
+from pathlib import Path
+
+import numpy as np
+import pytest
+from plant_driver import PlantDriver
+
+import blf_dsc_controller as blf
+from blf_dsc_controller.cli.main import main
+from blf_dsc_controller.configuration.drive import DriveConfig
+from blf_dsc_controller.configuration.schema import build, change
+from blf_dsc_controller.drive.driver import Facts, disagreements
+from blf_dsc_controller.drive.drivers import find_driver
+from blf_dsc_controller.drive.latency import Latency
+from blf_dsc_controller.drive.loop import DriveLoop, End
+from blf_dsc_controller.errors import BlfDscError, ConfigurationError
+from blf_dsc_controller.supervision.supervisor import Phase
+
+HERE = Path(__file__).parent
+HOLD = {'safety.torque': 'hold_gravity'}
+CONFIG = change(blf.load_loop('recommended').controller, HOLD)
+LONG = 0.6  # s: the arm is on its reference, and moves
+
+
+def drive(address, tmp_path, duration=LONG):
+    """Run the loop on the simulated arm; return driver, controller, outcome."""
+    driver = PlantDriver(address, CONFIG, DriveConfig())
+    driver.connect()
+    with blf.ArmController(CONFIG, record=tmp_path / 'bag') as controller:
+        loop = DriveLoop(driver, controller, duration=duration)
+        handlers = {
+            number: signal.signal(number, lambda *_: loop.request_end())
+            for number in (signal.SIGINT, signal.SIGTERM)
+        }
+        try:
+            outcome = loop.run()
+        finally:
+            for number, handler in handlers.items():
+                signal.signal(number, handler)
+    return driver, controller, outcome
+
+
+def assert_replays(folder):
+    """The bag holds what the controller needs to compute every torque again."""
+    verified = blf.verify(folder)
+    assert verified.difference is None
+    assert not any(found.missing for found in verified.comparisons)
+    assert verified.samples > 0
+
+
+@pytest.mark.parametrize(
+    ('address', 'end'),
+    [
+        ('plant', End.DURATION),
+        ('interrupt@300', End.REQUESTED),
+        ('terminate@300', End.REQUESTED),
+        ('late@300', End.STOPPED),
+    ],
+)
+def test_it_ends_at_rest_and_the_bag_replays_bit_equal(address, end, tmp_path):
+    driver, controller, outcome = drive(address, tmp_path)
+    assert outcome.end is end
+    assert driver.calls == ['connect', 'start', 'finish']
+    assert driver.velocity < 0.01  # rad/s, at rest
+    assert len(driver.torques) == outcome.states
+    assert controller.phase is (
+        Phase.SAFE_STOP if end is End.STOPPED else Phase.INACTIVE
+    )
+    assert ('is 0.061 s after the last one' in outcome.text) is (end is End.STOPPED)
+    assert_replays(tmp_path / 'bag')
+    recorded = blf.read_run(tmp_path / 'bag')
+    np.testing.assert_array_equal(
+        recorded.torque, driver.torques[: len(recorded.torque)]
+    )
+
+
+def test_a_second_request_ends_at_once(tmp_path):
+    driver, _, outcome = drive('impatient@300', tmp_path)
+    assert outcome.end is End.REQUESTED
+    assert outcome.states == 309  # those before the state with the second
+    assert driver.calls[-1] == 'finish'
+
+
+@pytest.mark.parametrize(
+    ('address', 'end', 'last', 'text'),
+    [
+        ('silent@300', End.LOST, 'start', 'no state for 1 s: check the cable'),
+        ('reflex@300', End.REFLEX, 'recover', 'joint_reflex; it has recovered'),
+        ('broken@300', End.REFLEX, 'recover', 'joint_reflex; it cannot recover'),
+    ],
+)
+def test_nothing_is_commanded_to_a_robot_that_took_over_or_is_gone(
+    address, end, last, text, tmp_path
+):
+    driver, controller, outcome = drive(address, tmp_path)
+    assert outcome.end is end
+    assert text in outcome.text
+    assert driver.calls[-1] == last
+    assert len(driver.torques) == outcome.states == 299
+    assert text.partition(';')[0] in controller.reason
+    assert_replays(tmp_path / 'bag')
+
+
+def test_a_mistake_of_the_driver_ends_the_motion_and_is_shown(tmp_path):
+    with pytest.raises(RuntimeError, match='a mistake of the driver'):
+        drive('mistaken@300', tmp_path)
+
+
+def test_an_error_of_the_controller_brings_the_arm_to_rest_before_it_is_shown(
+    monkeypatch,
+):
+    driver = PlantDriver('plant', CONFIG, DriveConfig())
+    driver.connect()
+    controller = blf.ArmController(CONFIG)
+    update = controller.update
+    states = []
+
+    def failing(*state, send):
+        states.append(state)
+        if len(states) == 300:
+            raise OSError('the disk is full')
+        return update(*state, send=send)
+
+    monkeypatch.setattr(controller, 'update', failing)
+    with pytest.raises(OSError, match='the disk is full'):
+        DriveLoop(driver, controller).run()
+    assert 'OSError: the disk is full' in controller.reason
+    assert driver.velocity < 0.01
+    assert driver.calls[-1] == 'finish'
+
+
+def test_torques_are_sent_before_weighing_and_recording(tmp_path):
+    with blf.ArmController(CONFIG, record=tmp_path / 'bag') as controller:
+        driver = PlantDriver('plant', CONFIG, DriveConfig())
+        driver.connect()
+        order = []
+        controller._loop.guard.weigh = lambda: order.append('weighed')
+        controller.update(*driver.read(), send=lambda _torque: order.append('sent'))
+    assert order == ['sent', 'weighed']
+
+
+FACTS = Facts(2, 0.001, 'none', 'unknown', (20.0, 20.0), (inf, inf))
+
+
+@pytest.mark.parametrize(
+    ('facts', 'problem'),
+    [
+        ({'joints': 7}, 'joints: got 2, but the robot has 7'),
+        ({'period': 0.002}, 'sample_time: got 0.001 s, but .* every 0.002 s'),
+        ({'drive_compensates': 'gravity'}, 'robot.drive_compensates: got none, but'),
+        ({'effort': 'whole'}, 'robot.effort: got unknown, but .* write whole'),
+        ({'torque_limit': (20.0, 19.0)}, r'torque.limit: got \[20.0, 20.0\], but'),
+        ({'torque_rate': (1e3, inf)}, r'torque.rate_limit: got \[inf, inf\], but'),
+    ],
+)
+def test_a_configuration_that_contradicts_its_robot_is_refused(facts, problem):
+    assert disagreements(FACTS, CONFIG) == []
+    (found,) = disagreements(FACTS._replace(**facts), CONFIG)
+    assert re.match(problem, found)
+
+
+@pytest.mark.parametrize(
+    ('given', 'problem'),
+    [
+        ({'collision_torque': [1.0]}, 'give both, or neither'),
+        (
+            {'collision_torque': [1.0], 'collision_force': [1.0] * 5},
+            'collision_force: got 5 entries',
+        ),
+    ],
+)
+def test_thresholds_are_checked(given, problem):
+    with pytest.raises(ConfigurationError, match=problem):
+        build(DriveConfig, given)
+
+
+def test_latency_has_the_quantiles_of_numpy():
+    durations = np.random.default_rng(1).gamma(4.0, 3e-5, 2000)
+    latency = Latency()
+    assert latency.quantile(0.5) == 0.0
+    for duration in durations:
+        latency.add(duration)
+    for share in (0.5, 0.99, 1.0):
+        expected = np.quantile(durations, share, method='inverted_cdf')
+        assert latency.quantile(share) == pytest.approx(expected, abs=1e-6)  # a bin
+
+
+def command(tmp_path, address, **options):
+    """Run the command with this driver's file; return its exit code."""
+    text = (blf.share_folder() / 'config/recommended.yaml').read_text(encoding='utf-8')
+    driver = (HERE / 'plant_driver.py').as_posix()
+    parameters = f'/**/drive:\n  ros__parameters:\n    driver: {driver}\n'
+    (tmp_path / 'my.yaml').write_text(text + parameters, encoding='utf-8')
+    words = [f'--{name}={value}' for name, value in options.items()]
+    files = ['--config', str(tmp_path / 'my.yaml'), '--out', str(tmp_path / 'bag')]
+    return main(['drive', '--robot', address, *files, *words])
+
+
+@pytest.mark.parametrize(
+    ('address', 'code', 'printed'),
+    [
+        ('plant', 0, 'the duration is over'),
+        ('interrupt@200', 130, 'ended on request'),
+        ('late@200', 5, 'the controller stopped: the stamp of a joint state'),
+        (
+            'reflex@200',
+            5,
+            'the robot stopped by itself: joint_reflex; it has recovered',
+        ),
+        ('silent@200', 5, 'the connection was lost: no state for 1 s'),
+        ('absent', 1, 'there is no robot: switch it on'),
+    ],
+)
+def test_the_command_says_how_it_ended(address, code, printed, tmp_path, capsys):
+    assert command(tmp_path, address, duration=0.3) == code
+    output = capsys.readouterr()
+    assert printed in output.out + output.err
+    if code != 1:
+        assert 'connected to the simulated arm' in output.err
+        assert 'largest error' in output.out
+        assert_replays(tmp_path / 'bag')
+
+
+@pytest.mark.parametrize('duration', ['-1', 'nan', 'inf'])
+def test_the_command_refuses_a_duration_that_is_none(duration, tmp_path, capsys):
+    assert command(tmp_path, 'plant', duration=duration) == 1
+    assert '--duration' in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ('content', 'problem'),
+    [
+        (None, 'there is no file'),
+        ('DRIVER = 3', 'expected a class DRIVER'),
+        ('1 / 0', 'cannot be imported: ZeroDivisionError'),
+    ],
+)
+def test_a_driver_is_a_file_with_a_class(content, problem, tmp_path):
+    path = tmp_path / 'mine.py'
+    if content is not None:
+        path.write_text(content)
+    with pytest.raises(BlfDscError, match=problem):
+        find_driver(str(path))
+    with pytest.raises(BlfDscError, match='expected franka, or a Python file'):
+        find_driver('kuka')
