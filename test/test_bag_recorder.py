@@ -31,17 +31,27 @@ from sensor_msgs.msg import JointState
 
 from blf_dsc_controller.analysis.report import read_bag
 from blf_dsc_controller.bags.content import read_content
-from blf_dsc_controller.bags.writer import recover
+from blf_dsc_controller.bags.recovery import recover
 from blf_dsc_controller.messages import topics
-from blf_dsc_controller.messages.codecs import JointStateEncoder, definition, joint_state_stamp
+from blf_dsc_controller.messages.codecs import (
+    JointStateEncoder,
+    definition,
+    joint_state_stamp,
+)
 from blf_dsc_controller.messages.topics import FOREVER, Quality
 from blf_dsc_controller.nodes import recorder_node
 from blf_dsc_controller.nodes.endpoints import quality_of
 from blf_dsc_controller.nodes.recorder_node import BagRecorderNode
 
-KILLS, MOST, DURATION = (20, 10_000, 60) if os.environ.get('NIGHTLY') else (3, 1000, 3)  # s
+# s
+KILLS, MOST, DURATION = (20, 10_000, 60) if os.environ.get('NIGHTLY') else (3, 1000, 3)
 PATIENCE = 300.0  # s, until a test gives up on what should take a moment
-RECORDER = (sys.executable, '-m', 'blf_dsc_controller.nodes.recorder_node', '--ros-args')
+RECORDER = (
+    sys.executable,
+    '-m',
+    'blf_dsc_controller.nodes.recorder_node',
+    '--ros-args',
+)
 ODD_PARTICIPANT = Path(__file__).with_name('odd_participant.py')
 ENCODER = JointStateEncoder(['joint1', 'joint2'])
 # Kept for the recorder, which may match slightly later than the publisher.
@@ -72,7 +82,11 @@ def connected(ros, type_, topic, quality=100):
 def until_recorded(ros, recorder, **counts):
     """Spin until the recorder has at least these numbers of messages by topic."""
     found = recorder._bag
-    ros.until(lambda: all(found.message_counts.get(f'/{k}', 0) >= n for k, n in counts.items()))
+    ros.until(
+        lambda: all(
+            found.message_counts.get(f'/{k}', 0) >= n for k, n in counts.items()
+        )
+    )
 
 
 def test_messages_are_recorded_byte_for_byte(ros, bag):
@@ -112,6 +126,23 @@ def test_plant_as_the_clock_logs_at_the_stamp_of_the_last_joint_state(ros, bag):
     ]
 
 
+def test_best_effort_publisher_that_joins_a_reliable_one_is_recorded_too(ros, bag):
+    """And what the reliable one sends is recorded once, though it arrives twice."""
+    best_effort = QoSProfile(depth=10, reliability=ReliabilityPolicy.BEST_EFFORT)
+    recorder = ros.add(BagRecorderNode, output=str(bag), topics=['mixed'])
+    reliable = connected(ros, JointState, 'mixed')
+    reliable.publish(encoded(1))
+    until_recorded(ros, recorder, mixed=1)
+    late = connected(ros, JointState, 'mixed', best_effort)
+    ros.until(lambda: reliable.get_subscription_count() == 2)
+    reliable.publish(encoded(2))
+    late.publish(encoded(3))
+    until_recorded(ros, recorder, mixed=3)
+    ros.spin(0.2)
+    recorder.close()
+    assert sorted(raw for _, _, raw in read(bag)) == sorted(map(encoded, (1, 2, 3)))
+
+
 def test_topics_of_every_quality_and_type_are_recorded_as_offered(ros, bag):
     """Latched before the recorder came, best effort, and both on one topic; not those of others.
 
@@ -131,7 +162,10 @@ def test_topics_of_every_quality_and_type_are_recorded_as_offered(ros, bag):
         publisher.publish(publisher.msg_type())
     until_recorded(ros, recorder, bound=1, sensor=1, mixed=2, goals=1)
     assert other.get_subscription_count() == 0
-    infos = [recorder.get_publishers_info_by_topic(f'/{topic}')[0] for topic in ('bound', 'goals')]
+    infos = [
+        recorder.get_publishers_info_by_topic(f'/{topic}')[0]
+        for topic in ('bound', 'goals')
+    ]
     recorder.close()
     messages = read(bag)
     assert Counter(topic for topic, _, _ in messages) == {
@@ -140,7 +174,9 @@ def test_topics_of_every_quality_and_type_are_recorded_as_offered(ros, bag):
         '/sensor': 1,
         '/goals': 1,
     }
-    assert [b'early' in raw for topic, _, raw in messages if topic == '/bound'] == [True]
+    assert [b'early' in raw for topic, _, raw in messages if topic == '/bound'] == [
+        True
+    ]
     with Reader(bag) as reader:
         found = {connection.topic: connection for connection in reader.connections}
     bound, goals = found['/bound'], found['/goals']
@@ -148,10 +184,17 @@ def test_topics_of_every_quality_and_type_are_recorded_as_offered(ros, bag):
     assert hashes == [bound.digest, goals.digest]
     assert bound.digest == definition(bound.msgtype)[1]
     assert 'geometry_msgs/Quaternion' in goals.msgdef.data
-    (offered,), mixed = bound.ext.offered_qos_profiles, found['/mixed'].ext.offered_qos_profiles
+    (offered,) = bound.ext.offered_qos_profiles
+    mixed = found['/mixed'].ext.offered_qos_profiles
     # The graph knows neither history nor depth.
-    assert (offered.durability.name, offered.history.name) == ('TRANSIENT_LOCAL', 'UNKNOWN')
-    assert {quality.reliability.name for quality in mixed} == {'RELIABLE', 'BEST_EFFORT'}
+    assert (offered.durability.name, offered.history.name) == (
+        'TRANSIENT_LOCAL',
+        'UNKNOWN',
+    )
+    assert {quality.reliability.name for quality in mixed} == {
+        'RELIABLE',
+        'BEST_EFFORT',
+    }
     assert bound.msgdef == found['/sensor'].msgdef
     assert quality_of(infos[0].qos_profile) == Quality(
         depth=0, durability='transient_local', history='unknown', deadline=FOREVER
@@ -164,7 +207,9 @@ def test_received_messages_are_on_disk_before_a_type_is_imported(ros, bag, monke
         return original(type_name)
 
     on_disk, original = [], recorder_node.message_class
-    recorder = ros.add(BagRecorderNode, output=str(bag), topics=['joint_states', 'goals'])
+    recorder = ros.add(
+        BagRecorderNode, output=str(bag), topics=['joint_states', 'goals']
+    )
     publisher = connected(ros, JointState, 'joint_states')
     monkeypatch.setattr(recorder_node, 'message_class', import_slowly)
     ros.tester.create_publisher(Goals, 'goals', 10)
@@ -181,7 +226,9 @@ def test_losses_are_counted_and_reported(ros, bag, capfd):
     publisher = ros.tester.create_publisher(JointState, 'joint_states', 100)
     for k in range(7):  # nobody subscribes yet, and nothing is kept
         publisher.publish(encoded(k))
-    recorder = ros.add(BagRecorderNode, output=str(bag), topics=['joint_states'], queue_depth=5)
+    recorder = ros.add(
+        BagRecorderNode, output=str(bag), topics=['joint_states'], queue_depth=5
+    )
     ros.until(publisher.get_subscription_count)
     for burst, count in ((range(8, 9), 1), (range(9, 59), 6)):
         for k in burst:
@@ -230,7 +277,8 @@ class Rig(RosRig):
         for number in numbers:
             for publisher in self.publishers:
                 publisher.publish(encoded(number))
-            if number % 20 == 19:  # not faster than the 20,000 a second of a fast lock-step run
+            # not faster than the 20,000 a second of a fast lock-step run
+            if number % 20 == 19:
                 time.sleep(0.005)
 
     def end(self, process, number=signal.SIGINT):
@@ -266,16 +314,22 @@ def test_all_is_on_disk_while_it_runs_and_a_signal_completes_the_bag(rig, bag, n
     rig.until(lambda: messages_on_disk(bag / 'bag_0.mcap') == 10_000)
     code, output = rig.end(process, number)
     assert code == 0, output
-    assert Counter(topic for topic, *_ in read(bag)) == {f'/{topic}': 2000 for topic in TOPICS}
+    assert Counter(topic for topic, *_ in read(bag)) == {
+        f'/{topic}': 2000 for topic in TOPICS
+    }
     assert all(f'/{topic}: 2000 messages' in output for topic in TOPICS)
     assert 'invalid' not in output  # a context that was shut down
 
 
-def test_signal_before_any_message_leaves_an_empty_bag_that_is_not_overwritten(rig, bag):
+def test_signal_before_any_message_leaves_an_empty_bag_that_is_not_overwritten(
+    rig, bag
+):
     for code, words in ((0, '/never: never appeared'), (1, f'{bag} exists already')):
         process = rig.record(bag, ['never'])
         rig.until(lambda code=code: code or bag.exists())
-        returned, output = rig.end(process, signal.SIGTERM) if code == 0 else rig.output(process)
+        returned, output = (
+            rig.end(process, signal.SIGTERM) if code == 0 else rig.output(process)
+        )
         assert (returned, words in output) == (code, True), output
         assert read(bag) == []
 
@@ -293,14 +347,26 @@ def test_full_disk_stops_the_recorder_with_one_error(rig, tmp_path):
         assert recover(disk / 'bag', tmp_path / 'clean').messages['/a'] > 1000
 
 
-def test_unknown_message_packages_are_not_imported_and_do_not_stop_the_recorder(rig, bag):
+def test_unknown_message_packages_are_not_imported_and_do_not_stop_the_recorder(
+    rig, bag
+):
     process = rig.record(bag, ['a', 'f', 'g', 'h', 'i'])
-    names = {'f': 'unittest::__main__::X', 'g': 'foo::X', 'h': 'unittest::msg::X', 'i': 'X'}
+    names = {
+        'f': 'unittest::__main__::X',
+        'g': 'foo::X',
+        'h': 'unittest::msg::X',
+        'i': 'X',
+    }
     odd = [sys.executable, ODD_PARTICIPANT]
     rig.start([*odd, *(f'{topic}={name}' for topic, name in names.items())])
-    output = wait_for_lines(process, [f'/{topic} is not recorded: its type' for topic in names])
+    output = wait_for_lines(
+        process, [f'/{topic} is not recorded: its type' for topic in names]
+    )
     assert output.count('/g is not recorded') == 1
-    assert '/f is not recorded: its type unittest/__main__/X is not installed here' in output
+    assert (
+        '/f is not recorded: its type unittest/__main__/X is not installed here'
+        in output
+    )
     assert '/g is not recorded: its type foo/X is not installed here' in output
     rig.publish(1)
     rig.start([*odd, 'j=std_msgs::msg::\udce4'])  # not UTF-8
@@ -343,7 +409,8 @@ def test_kill_loses_nothing_that_was_written(k, rig, bag, tmp_path):
 def test_real_time_loop_is_timed_and_every_message_of_it_is_in_the_bag(tmp_path):
     # Only one node in real time, which cannot keep the others from both processors.
     fifo = 'sim_plant:\n  ros__parameters:\n    realtime: {priority: 10, lock_memory: true}\n'
-    config, out = tmp_path / 'fifo.yaml', tmp_path / 'out'
+    config = tmp_path / 'fifo.yaml'
+    out = tmp_path / 'out'
     config.write_text(fifo + PATIENT)
     arguments = ('--config', config, '--mode', 'realtime', '--duration', DURATION)
     run = closed_loop(*arguments, '--out', out)
@@ -356,16 +423,25 @@ def test_real_time_loop_is_timed_and_every_message_of_it_is_in_the_bag(tmp_path)
     assert list(timing['latency']) == ['p50', 'p99', 'p99.9', 'max']
     assert timing['late_steps'] >= 0
     logs = [
-        (out / 'logs' / f'{node}.log').read_text() for node in (topics.PLANT, topics.CONTROLLER)
+        (out / 'logs' / f'{node}.log').read_text()
+        for node in (topics.PLANT, topics.CONTROLLER)
     ]
     numbers = defaultdict(list)
     with (out / 'bag' / 'bag_0.mcap').open('rb') as stream:
         for _, channel, message in make_reader(stream).iter_messages():
             numbers[channel.topic].append(message.sequence)
     found = Counter()
-    answered, tenth = topics.TRACKING_ERROR, (topics.REFERENCE, topics.MONITOR)
-    for topic in (topics.JOINT_STATES, topics.TIMING, topics.COMMANDS, answered, *tenth):
-        name, found[topic] = topic.resolved, len(numbers[topic.resolved])
+    answered = topics.TRACKING_ERROR
+    tenth = (topics.REFERENCE, topics.MONITOR)
+    for topic in (
+        topics.JOINT_STATES,
+        topics.TIMING,
+        topics.COMMANDS,
+        answered,
+        *tenth,
+    ):
+        name = topic.resolved
+        found[topic] = len(numbers[topic.resolved])
         assert numbers[name] == list(range(1, found[topic] + 1))
     assert read_content(out / 'bag').losses == {}
     # On a busy machine the first torque may take seconds, and the plant sends its state again.

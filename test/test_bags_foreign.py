@@ -18,7 +18,13 @@ from mcap.opcode import Opcode
 from mcap.writer import Writer as McapWriter
 from recorded_run import Synthetic, raw_records
 from rosbags.rosbag1 import Writer as Writer1
-from rosbags.rosbag2 import CompressionFormat, CompressionMode, Reader, StoragePlugin, Writer
+from rosbags.rosbag2 import (
+    CompressionFormat,
+    CompressionMode,
+    Reader,
+    StoragePlugin,
+    Writer,
+)
 from rosbags.typesys import Stores, get_typestore
 
 from blf_dsc_controller.bags.content import NameMap, read_content
@@ -43,7 +49,7 @@ from blf_dsc_controller.messages.topics import (
 
 pytestmark = pytest.mark.usefixtures('blank_pictures')
 
-pytest.importorskip('plotly', reason='needs plotly: pip install blf_dsc_controller[report]')
+pytest.importorskip('plotly', reason='needs plotly: pip install .[report]')
 
 SHUFFLED = ('gripper', 'elbow_pitch', 'base', 'shoulder_pitch')
 MAP = {
@@ -61,7 +67,9 @@ def bag(tmp_path_factory):
 
 
 def names_of(**changes):
-    return NameMap.parse(f'{our}={their}' for our, their in {**MAP, **changes}.items() if their)
+    return NameMap.parse(
+        f'{our}={their}' for our, their in {**MAP, **changes}.items() if their
+    )
 
 
 def spread(values):
@@ -73,10 +81,19 @@ def foreign(torque='array', fields=('position', 'velocity', 'effort')):
     """Topic, type, time and bytes of each message as another robot's software writes it."""
     states = JointStateEncoder(SHUFFLED, fields)
     for k, stamp in enumerate(ARM.stamp.tolist()):
-        known = [spread(field[k]) for field in (ARM.position, ARM.error, ARM.disturbance)]
-        yield '/arm/states', JOINT_STATE, stamp, states.encode(stamp, *known[: len(fields)])
+        known = [
+            spread(field[k]) for field in (ARM.position, ARM.error, ARM.disturbance)
+        ]
+        yield (
+            '/arm/states',
+            JOINT_STATE,
+            stamp,
+            states.encode(stamp, *known[: len(fields)]),
+        )
         command = ARM.torque[k]
-        sent = {'array': spread(command), 'pair': command, 'three': [1, 2, 3]}.get(torque)
+        sent = {'array': spread(command), 'pair': command, 'three': [1, 2, 3]}.get(
+            torque
+        )
         if sent is not None:
             raw = Float64MultiArrayEncoder(len(sent)).encode(sent)
             yield '/arm/torque', FLOAT64_MULTI_ARRAY, stamp + 9, raw
@@ -85,25 +102,36 @@ def foreign(torque='array', fields=('position', 'velocity', 'effort')):
             yield '/arm/torque', JOINT_STATE, stamp + 9, raw
 
 
-def write(path, messages, storage=StoragePlugin.MCAP, version=9, compression=CompressionMode.NONE):
+def write(
+    path,
+    messages,
+    storage=StoragePlugin.MCAP,
+    version=9,
+    compression=CompressionMode.NONE,
+):
     """Write a bag of rosbag2, or of ROS 1 (version 1)."""
     if version == 1:
-        writer, store = Writer1(path), get_typestore(Stores.ROS1_NOETIC)
+        writer = Writer1(path)
+        store = get_typestore(Stores.ROS1_NOETIC)
     else:
-        writer, store = Writer(path, version=version, storage_plugin=storage), typestore()
+        writer = Writer(path, version=version, storage_plugin=storage)
+        store = typestore()
         writer.set_compression(compression, CompressionFormat.ZSTD)
     with writer:
         connections = {}
         for topic, type_name, at, raw in messages:
             if topic not in connections:
-                connections[topic] = writer.add_connection(topic, type_name, typestore=store)
+                connections[topic] = writer.add_connection(
+                    topic, type_name, typestore=store
+                )
             if version == 1:
                 raw = typestore().cdr_to_ros1(raw, type_name)  # noqa: PLW2901
             writer.write(connections[topic], at, raw)
     return path
 
 
-MCAP, SQLITE3 = StoragePlugin.MCAP, StoragePlugin.SQLITE3
+MCAP = StoragePlugin.MCAP
+SQLITE3 = StoragePlugin.SQLITE3
 
 
 @pytest.mark.parametrize(
@@ -160,7 +188,11 @@ def test_torques_are_those_of_the_commands_or_measured_or_unknown(tmp_path):
     ):
         with pytest.raises(BlfDscError, match=words):
             torque_of(tmp_path / words[:3], messages, names)
-    kept = [entry for k, entry in enumerate(pairs) if entry[0] != '/arm/torque' or k % 4 == 1]
+    kept = [
+        entry
+        for k, entry in enumerate(pairs)
+        if entry[0] != '/arm/torque' or k % 4 == 1
+    ]
     source, torque = torque_of(tmp_path / 'slow', kept, names_of())
     assert source == '/arm/torque'
     np.testing.assert_array_equal(torque[1], ARM.torque[0])  # previous command held
@@ -186,8 +218,11 @@ def test_wrong_names_are_reported_with_the_names_in_the_bag(bag, tmp_path):
             NameMap.parse(*entries)
 
 
-def test_gripper_on_the_same_topic_is_told_from_the_arm_under_any_name(bag, tmp_path, capsys):
-    fingers, entries = JointStateEncoder(('left_finger',)), []
+def test_gripper_on_the_same_topic_is_told_from_the_arm_under_any_name(
+    bag, tmp_path, capsys
+):
+    fingers = JointStateEncoder(('left_finger',))
+    entries = []
     for k, entry in enumerate(recorded_run.messages(bag)):
         if entry[0] == JOINT_STATES.resolved and k % 7 == 0:  # of some states only
             at = entry[2] - 5
@@ -203,7 +238,8 @@ def test_gripper_on_the_same_topic_is_told_from_the_arm_under_any_name(bag, tmp_
     messages = [[names.get(topic, topic), *rest] for topic, *rest in entries]
     shared = recorded_run.write(tmp_path / 'shared', entries)
     renamed = recorded_run.write(tmp_path / 'renamed', messages)
-    mapped, tables = ['--map', 'joint_states=/arm/states', '--map', 'commands=/arm/torque'], []
+    mapped = ['--map', 'joint_states=/arm/states', '--map', 'commands=/arm/torque']
+    tables = []
     for each, words in ((bag, []), (shared, []), (renamed, mapped)):
         out = tmp_path / f'{each.name}.csv'
         for command in (
@@ -221,7 +257,8 @@ def test_gripper_on_the_same_topic_is_told_from_the_arm_under_any_name(bag, tmp_
 
 # Unusable bags.
 
-ODD = ['/odd', 'my_msgs/msg/Odd', 5, b'\0\1\0\0\7\0\0\0']  # of a package that does not exist
+# of a package that does not exist
+ODD = ['/odd', 'my_msgs/msg/Odd', 5, b'\0\1\0\0\7\0\0\0']
 TOOLS = {
     'replay': (),
     'report': ('--out', 'page.html'),
@@ -278,7 +315,9 @@ def write_mcap(folder, entries, schema):
         for topic, type_name, at, raw in entries:
             if topic not in channels:
                 found = schema(type_name)
-                number = 0 if found is None else writer.register_schema(type_name, *found)
+                number = (
+                    0 if found is None else writer.register_schema(type_name, *found)
+                )
                 channels[topic] = writer.register_channel(topic, 'cdr', number)
             writer.add_message(channels[topic], at, raw, at)
         writer.finish()
@@ -295,9 +334,12 @@ def of_type_string(entries):
 
 def with_joints(*joints):
     """Replace the joint states by those of another robot."""
-    encoder, zeros = JointStateEncoder(joints), [[0.0] * len(joints)] * 3
+    encoder = JointStateEncoder(joints)
+    zeros = [[0.0] * len(joints)] * 3
     return lambda entries: [
-        [*entry[:3], encoder.encode(entry[2], *zeros)] if entry[0] == '/joint_states' else entry
+        [*entry[:3], encoder.encode(entry[2], *zeros)]
+        if entry[0] == '/joint_states'
+        else entry
         for entry in entries
     ]
 
@@ -307,14 +349,26 @@ def unnamed(_):
     return [['/joint_states', JOINT_STATE, k, raw] for k in range(9)]
 
 
-OTHER = ("'joint1' is not in the message, which names", 'another robot', '--map joint1=ITS_NAME')
+OTHER = (
+    "'joint1' is not in the message, which names",
+    'another robot',
+    '--map joint1=ITS_NAME',
+)
 
 
 @pytest.mark.parametrize(
     ('change', 'words', 'but'),
     [
-        (without_states, ("name ends in 'joint_states' of type", 'commands (std_msgs/msg'), ()),
-        (of_type_string, ('of type sensor_msgs/msg/JointState', '(std_msgs/msg/String)'), ()),
+        (
+            without_states,
+            ("name ends in 'joint_states' of type", 'commands (std_msgs/msg'),
+            (),
+        ),
+        (
+            of_type_string,
+            ('of type sensor_msgs/msg/JointState', '(std_msgs/msg/String)'),
+            (),
+        ),
         (with_joints('wheel', 'arm'), OTHER, ('identify',)),
         (with_joints('base', 'shoulder', 'elbow'), OTHER, ('identify',)),
         (unnamed, ('it names no joint',), ('replay', 'identify')),
@@ -326,11 +380,15 @@ def test_bag_of_other_content(entries, tmp_path, all_say, change, words, but):
 
 
 @pytest.mark.parametrize('schema', [('', b''), ('ros2msg', b'{{ no definition'), None])
-def test_missing_definition_of_another_topic_loses_no_other_message(entries, tmp_path, run, schema):
+def test_missing_definition_of_another_topic_loses_no_other_message(
+    entries, tmp_path, run, schema
+):
     file = write_mcap(
         tmp_path / 'bag',
         [ODD, *entries],
-        lambda name: schema if name == ODD[1] else ('ros2msg', definition(name)[0].encode()),
+        lambda name: (
+            schema if name == ODD[1] else ('ros2msg', definition(name)[0].encode())
+        ),
     )
     for command in ('replay', 'report', 'export', 'plot'):
         assert run(command, file)[0] == 0
@@ -344,7 +402,9 @@ def test_missing_definition_of_another_topic_loses_no_other_message(entries, tmp
     assert (lost in output) == (schema is None)  # not even the type's name is known
 
 
-def test_types_of_this_package_need_a_name_but_no_definition(entries, tmp_path, run, all_say):
+def test_types_of_this_package_need_a_name_but_no_definition(
+    entries, tmp_path, run, all_say
+):
     file = write_mcap(tmp_path / 'bag', entries, lambda _: ('', b''))
     assert run('recover', file, '--out', 'clean')[0] == 0
     for each in (file, tmp_path / 'clean'):
@@ -356,7 +416,9 @@ def test_types_of_this_package_need_a_name_but_no_definition(entries, tmp_path, 
     assert (code, lost in output, 'ALL LOST: no message' in output) == (1, True, True)
 
 
-def test_files_that_are_missing_or_hold_other_numbers_than_stated(entries, copy, run, all_say):
+def test_files_that_are_missing_or_hold_other_numbers_than_stated(
+    entries, copy, run, all_say
+):
     all_say(copy.parent, f'did you mean {copy}?')
     others = without_states(entries)
     for changed, count in ((others, 0), (entries + entries, 602)):
@@ -391,19 +453,34 @@ def test_bag_of_another_format_or_without_metadata(
     assert (code, 'none of the recorded messages was lost' in output) == (0, True)
 
 
-@pytest.mark.parametrize('declared', [1 << 29 | 1, 1 << 62])
+@pytest.mark.parametrize('declared', [1 << 27 | 1, 1 << 62])
 def test_chunk_that_declares_too_large_a_size_is_not_unpacked(copy, all_say, declared):
     file = copy / 'bag_0.mcap'
     data = file.read_bytes()
-    (chunk, _), *_ = ((at, raw) for at, raw in raw_records(data) if raw[0] == Opcode.CHUNK)
+    (chunk, _), *_ = (
+        (at, raw) for at, raw in raw_records(data) if raw[0] == Opcode.CHUNK
+    )
     size = chunk + 9 + 16  # after its times
     file.write_bytes(data[:size] + declared.to_bytes(8, 'little') + data[size + 8 :])
     all_say(file, f'a chunk would unpack to {declared} bytes')
 
 
+@pytest.mark.parametrize('inside', [False, True])
+def test_named_pipe_is_no_bag(tmp_path, all_say, run, inside):
+    folder = tmp_path / 'pipes'
+    folder.mkdir()
+    os.mkfifo(folder / 'bag_0.mcap')
+    path = folder if inside else folder / 'bag_0.mcap'
+    all_say(path, f'{folder / "bag_0.mcap"} is not a regular file')
+    code, _, error = run('recover', path, '--out', 'clean')
+    assert (code, 'is not a regular file' in error) == (1, True)
+
+
 # Malicious files.
 
-BOMB = '- &a [x, x]\n' + ''.join(f'- &{b} [*{a}, *{a}]\n' for a, b in pairwise('abcdefghi'))
+BOMB = '- &a [x, x]\n' + ''.join(
+    f'- &{b} [*{a}, *{a}]\n' for a, b in pairwise('abcdefghi')
+)
 
 
 def test_named_pipe_is_rejected_as_parameter_file_and_urdf(tmp_path, capsys):
@@ -438,7 +515,10 @@ NUMBERS = r'of at most 1e\+06 in magnitude'
     [
         (lambda _: '<!DOCTYPE r [<!ENTITY a "x">]>', 'DOCTYPE'),
         (lambda _: ROBOT + '<link name="a"/>' * 100_000 + '</robot>', 'at most 500'),
-        (lambda _: ROBOT + '<a>' * 10**5 + '</a>' * 10**5 + '</robot>', 'the links are none'),
+        (
+            lambda _: ROBOT + '<a>' * 10**5 + '</a>' * 10**5 + '</robot>',
+            'the links are none',
+        ),
         (lambda text: text.replace(' izz="', ' izz="1e308" was="'), NUMBERS),
         (lambda text: text.replace(' xyz="', ' xyz="1e200 0 0" was="'), NUMBERS),
     ],
@@ -458,10 +538,15 @@ def test_nothing_is_overwritten_without_force(bag, tmp_path, capsys):
         ('out', 'report', bag, '--out', tmp_path / 'out'),
         ('out.csv', 'export', bag, '--out', tmp_path / 'out.csv'),
         ('tracking.png', 'plot', bag, '--out', tmp_path),
-        ('out', 'identify', bag, '--urdf', 'panda.urdf', '--out', tmp_path / 'out'),
+        (
+            *('new.urdf', 'identify', bag, '--urdf', 'panda.urdf'),
+            *('--out', tmp_path / 'new.urdf'),
+        ),
         ('out', 'excite', tmp_path / 'out', '--config', 'panda'),
     ):
-        out, kept, command = tmp_path / name, tmp_path / 'kept', [str(word) for word in words]
+        out = tmp_path / name
+        kept = tmp_path / 'kept'
+        command = [str(word) for word in words]
         kept.write_text('kept')
         out.symlink_to(kept)
         assert main(command) == 1

@@ -4,11 +4,15 @@
 from __future__ import annotations
 
 import csv
+import os
 import re
+import tracemalloc
 
+import lz4.frame
 import numpy as np
 import pytest
 import recorded_run
+import zstandard
 from mcap.opcode import Opcode
 from mcap.records import Chunk
 from recorded_run import BOUND_RAD, JOINTS, LIMIT_NM, PARAMETERS, TRUE, Synthetic
@@ -17,9 +21,14 @@ from blf_dsc_controller.bags.content import NameMap, read_content
 from blf_dsc_controller.bags.reader import read_run
 from blf_dsc_controller.bags.sources import BagError, BagMessage, records_in
 from blf_dsc_controller.bags.topic_messages import TopicMessages, UnreadableMessageError
+from blf_dsc_controller.bags.unpacking import unpacked
 from blf_dsc_controller.bags.writer import BagWriter
 from blf_dsc_controller.cli.main import main
-from blf_dsc_controller.messages.codecs import JOINT_STATE_FIELDS, JointStateEncoder
+from blf_dsc_controller.messages.codecs import (
+    JOINT_STATE_FIELDS,
+    JointStateEncoder,
+    typestore,
+)
 from blf_dsc_controller.messages.journal import EventType, Journal
 from blf_dsc_controller.messages.topics import (
     COMMANDS,
@@ -77,7 +86,10 @@ def test_journal_tells_which_joint_states_the_controller_used(tmp_path):
     journal.note(EventType.CONFIGURE, parameters={}, topics={'joint_states': used})
     with BagWriter(tmp_path / 'bag') as bag:
         told = bag.add_topic(JOURNAL.resolved, JOURNAL.type, [])
-        handles = [bag.add_topic(name, JOINT_STATES.type, []) for name in ('/joint_states', used)]
+        handles = [
+            bag.add_topic(name, JOINT_STATES.type, [])
+            for name in ('/joint_states', used)
+        ]
         bag.write(told, journal.pending[0].encode(), STATES[0][1])
         for number, (_, stamp, raw) in enumerate(STATES):
             for handle in handles if number % 30 == 0 else handles[1:]:
@@ -101,6 +113,26 @@ def test_namespace_selects_one_of_several_robots(tmp_path):
     assert read_run(tmp_path / 'bag', '/right').stamp.size < SAMPLES
 
 
+def test_stop_before_the_first_state_is_at_the_first_state(tmp_path):
+    journal = Journal()
+    journal.note(EventType.STOP, reason='failed', text='too early')
+    raw = journal.pending[0].encode()
+    path = recorded_run.write_made(tmp_path / 'bag', [(JOURNAL, 0, raw), *MESSAGES])
+    ((time, stop),) = read_run(path).timed_stops
+    assert (time, stop.stamp, stop.text) == (0.0, MADE.stamp[0], 'too early')
+
+
+def test_namespace_is_no_beginning_of_another_one(tmp_path):
+    ten = [(f'/arm10{topic.resolved}', topic, at, raw) for topic, at, raw in MESSAGES]
+    one = [(f'/arm1{topic.resolved}', topic, at, raw) for topic, at, raw in STATES[7:]]
+    path = recorded_run.write(
+        tmp_path / 'bag',
+        [[name, topic.type, at, raw] for name, topic, at, raw in ten + one],
+    )
+    assert read_run(path, 'arm1').stamp.size == SAMPLES - 7
+    assert read_run(path, 'arm10').stamp.size == SAMPLES
+
+
 def test_only_joint_states_are_required(tmp_path):
     decoy = (DIAGNOSTICS, 0, b'\0\1\0\0')
     path = recorded_run.write_made(
@@ -119,7 +151,9 @@ def test_what_is_missing_is_computed_from_what_is_there(tmp_path):
     path = recorded_run.write_made(tmp_path / 'bag', without(REFERENCE))
     np.testing.assert_allclose(read_run(path).reference, MADE.reference, atol=1e-15)
     lost = next(k for k, entry in enumerate(MESSAGES) if entry[0] is COMMANDS)
-    path = recorded_run.write_made(tmp_path / 'one', MESSAGES[:lost] + MESSAGES[lost + 1 :])
+    path = recorded_run.write_made(
+        tmp_path / 'one', MESSAGES[:lost] + MESSAGES[lost + 1 :]
+    )
     np.testing.assert_array_equal(read_run(path).torque, MADE.torque)
 
 
@@ -128,7 +162,11 @@ def test_stamps_that_fall_once_begin_another_run(tmp_path, longest):
     """A simulator was reset: the longer run is read, and what is left out is counted."""
     later = without(COMMANDS)
     short = [entry for entry in later if entry[1] < MADE.stamp[50]]
-    kept = [entry for entry in later if not (entry[0] is MONITOR and entry[1] == MADE.stamp[10])]
+    kept = [
+        entry
+        for entry in later
+        if not (entry[0] is MONITOR and entry[1] == MADE.stamp[10])
+    ]
     first, second = (short, kept) if longest == 2 else (kept, short)
     again = [(topic, at + 10**9, raw) for topic, at, raw in second]
     run = read_run(recorded_run.write_made(tmp_path / 'bag', first + again))
@@ -155,8 +193,11 @@ SHARED = 'several publishers share /joint_states'
         ('unset', 'all 400 messages of /joint_states have the stamp 0 ns'),
     ],
 )
-def test_states_of_several_publishers_or_without_stamps_are_refused(tmp_path, kind, words):
-    delay = 500_000 if kind == 'numbered' else 400_000  # ns; only numbers show two in even turns
+def test_states_of_several_publishers_or_without_stamps_are_refused(
+    tmp_path, kind, words
+):
+    # ns; only numbers show two in even turns
+    delay = 500_000 if kind == 'numbered' else 400_000
     states = []
     for _, at, raw in STATES:
         times = (0, 0) if kind == 'unset' else (at, at + delay)
@@ -209,7 +250,8 @@ def test_any_rows_of_long_topics_of_many_layouts_are_read():
     ):
         np.testing.assert_array_equal(states.number, expected)
         for rows in (slice(None), slice(600, 900), np.array([999, 3, 700]), slice(0)):
-            known, found = expected[rows], states.select(rows)
+            known = expected[rows]
+            found = states.select(rows)
             for values, offset in (
                 (found.received, 7),
                 (found.sequence, 1),
@@ -218,7 +260,9 @@ def test_any_rows_of_long_topics_of_many_layouts_are_read():
             ):
                 np.testing.assert_array_equal(values, known + offset)
         effort = states.field(2)[:, -1]
-        np.testing.assert_array_equal(effort, np.where(expected < 600, np.nan, expected))
+        np.testing.assert_array_equal(
+            effort, np.where(expected < 600, np.nan, expected)
+        )
         lost = states.select(np.array([-1, 900, -1])).field(1)[:, -1]
         np.testing.assert_array_equal(lost, [np.nan, expected[900], np.nan])
 
@@ -226,6 +270,70 @@ def test_any_rows_of_long_topics_of_many_layouts_are_read():
 def test_series_holds_its_values_and_the_first_before_it_begins():
     series = Series(('a',), np.array([5, 9]), np.array([[1.0], [2.0]]))
     assert series.held(np.array([0, 5, 8, 9, 20])).ravel().tolist() == [1, 1, 1, 2, 2]
+
+
+def test_states_are_held_from_their_own_stamp_on():
+    messages = TopicMessages('/x', JOINT_STATES.type)
+    for stamp in (5, 9):
+        raw = ENCODER.encode(stamp, [stamp] * 2, [0, 0], [0, 0])
+        messages.add(BagMessage('/x', stamp, raw))
+    held = messages.joint_states(JOINTS).held(np.array([0, 5, 8, 9, 20]))
+    assert held.stamp.tolist() == [5, 5, 5, 9, 9]
+
+
+def joint_states(names):
+    """Return a topic with one message for each list of names."""
+    messages = TopicMessages('/x', JOINT_STATES.type)
+    for k, each in enumerate(names):
+        raw = JointStateEncoder(each).encode(k, *[[k] * len(each)] * 3)
+        messages.add(BagMessage('/x', k, raw))
+    return messages
+
+
+def test_columns_are_kept_only_for_names_that_stay():
+    """With a column for each name in each block, this would be 13 MB."""
+    names = [('a', f'tool{k}') for k in range(3000)]
+    messages = joint_states([*names, *[('a',)] * 100_000])
+    assert messages.joint_states(('a',)).field(0)[102_999:, 0] == 102_999
+    blocks = os.fstat(messages._file.fileno()).st_size
+    assert blocks < 1.2 * 8 * (7 * 103_000 + 3000 * 3 * 512)
+
+
+@pytest.mark.parametrize(
+    'names',
+    [
+        [[f'joint {k} {j}' for j in range(100)] for k in range(100)],
+        [[f'{j}' for j in range(k, k - 1000, -1)] for k in range(1000, 1400)],
+    ],
+    ids=['all different', 'in many orders'],
+)
+def test_names_without_end_are_refused(names):
+    with pytest.raises(BagError, match='these are no states of one robot'):
+        joint_states(names)
+
+
+def test_text_without_end_is_refused(tmp_path):
+    """It compresses to nothing."""
+    message = typestore().types[JOURNAL.type](data='x' * (1 << 24))
+    raw = bytes(typestore().serialize_cdr(message, JOURNAL.type))
+    entries = [[t.resolved, t.type, at, raw] for t, at, raw in STATES]
+    entries.insert(3, [JOURNAL.resolved, JOURNAL.type, 0, raw])
+    with pytest.raises(BagError, match=f'a message of {JOURNAL.resolved} has 17 MB'):
+        read_run(recorded_run.write(tmp_path / 'bag', entries))
+
+
+@pytest.mark.parametrize('compression', ['zstd', 'lz4', ''])
+def test_stated_sizes_of_compressed_data_are_not_believed(compression):
+    data = bytes(50_000_000)
+    packed = {'zstd': zstandard.compress, 'lz4': lz4.frame.compress, '': bytes}
+    raw = packed[compression](data)
+    assert unpacked(raw, compression, len(data)) == data
+    tracemalloc.start()
+    with pytest.raises(ValueError, match='more than 1000 bytes'):
+        unpacked(raw, compression, 1000)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 1_000_000
 
 
 def test_gaps_in_sequence_numbers_are_losses():
@@ -242,7 +350,9 @@ def test_gaps_in_sequence_numbers_are_losses():
 def test_undecodable_message_is_reported_with_topic_and_number(tmp_path):
     bad = [*MESSAGES[:100], (MONITOR, MESSAGES[100][1], b'\0\1\0\0'), *MESSAGES[100:]]
     number = 1 + sum(topic is MONITOR for topic, *_ in MESSAGES[:100])
-    with pytest.raises(UnreadableMessageError, match=f'message {number} of /blf.*/monitor'):
+    with pytest.raises(
+        UnreadableMessageError, match=f'message {number} of /blf.*/monitor'
+    ):
         read_run(recorded_run.write_made(tmp_path / 'bag', bad))
 
 
@@ -252,7 +362,10 @@ def test_undecodable_message_is_reported_with_topic_and_number(tmp_path):
 def read_table(path):
     if path.suffix == '.parquet':
         parquet = pytest.importorskip('pyarrow.parquet', reason='needs pyarrow')
-        return {name: np.array(v) for name, v in parquet.read_table(path).to_pydict().items()}
+        return {
+            name: np.array(v)
+            for name, v in parquet.read_table(path).to_pydict().items()
+        }
     with path.open(newline='') as stream:
         names, *rows = csv.reader(stream)
     return dict(zip(names, np.array(rows, dtype=float).T, strict=True))
@@ -262,12 +375,19 @@ def read_table(path):
 def test_exported_table_round_trips_row_by_row(tmp_path, ending, capsys):
     if ending == 'parquet':
         pytest.importorskip('pyarrow', reason='needs pyarrow')
-    kept = [m for m in MESSAGES if not (m[0] in (REFERENCE, MONITOR) and m[1] == MADE.stamp[5])]
+    kept = [
+        m
+        for m in MESSAGES
+        if not (m[0] in (REFERENCE, MONITOR) and m[1] == MADE.stamp[5])
+    ]
     bag = recorded_run.write_made(tmp_path / 'bag', kept)
     out = tmp_path / f'table.{ending}'
     code = main(['export', str(bag), '--out', str(out)])
     if ending == 'xlsx':
-        assert (code, 'neither .csv nor .parquet' in capsys.readouterr().err) == (1, True)
+        assert (code, 'neither .csv nor .parquet' in capsys.readouterr().err) == (
+            1,
+            True,
+        )
         return
     found = read_table(out)
     estimate = found['monitor m2*l2^2 [kg m^2]']
@@ -278,12 +398,17 @@ def test_exported_table_round_trips_row_by_row(tmp_path, ending, capsys):
         (estimate[6:], MADE.estimate[6:, 1]),
         (estimate[5], MADE.estimate[4, 1]),  # lost: the last before it holds
         # Published every tenth sample, and held in between.
-        (found['truth disturbance elbow [N m]'], np.repeat(MADE.disturbance[::10, 1], 10)),
+        (
+            found['truth disturbance elbow [N m]'],
+            np.repeat(MADE.disturbance[::10, 1], 10),
+        ),
         (found['bound shoulder [rad]'], np.full(SAMPLES, BOUND_RAD)),
     ):
         np.testing.assert_array_equal(values, expected)
     # Lost, too, but known from position and error.
-    np.testing.assert_allclose(found['reference elbow [rad]'], MADE.reference[:, 1], atol=1e-15)
+    np.testing.assert_allclose(
+        found['reference elbow [rad]'], MADE.reference[:, 1], atol=1e-15
+    )
 
 
 def test_every_exported_column_has_a_unit(tmp_path):
@@ -309,6 +434,7 @@ def test_every_exported_column_has_a_unit(tmp_path):
         ('received [ns]', states.received),
     ):
         np.testing.assert_array_equal(found[name], values)
-    velocity = found['reference_velocity joint1 [rad/s]']  # known where there is a message
+    # known where there is a message
+    velocity = found['reference_velocity joint1 [rad/s]']
     np.testing.assert_array_equal(velocity[::10], references.field(1)[:, 0])
     assert np.isnan(np.delete(velocity, np.s_[::10])).all()

@@ -15,12 +15,20 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from mcap.opcode import Opcode
 from mcap.reader import make_reader
+from mcap.writer import Writer as McapWriter
 from recorded_run import MILLISECOND, messages_on_disk, raw_records, read
-from rosbags.rosbag2 import CompressionFormat, CompressionMode, Reader, StoragePlugin, Writer
+from rosbags.rosbag2 import (
+    CompressionFormat,
+    CompressionMode,
+    Reader,
+    StoragePlugin,
+    Writer,
+)
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
+from blf_dsc_controller.bags.recovery import recover
 from blf_dsc_controller.bags.sources import BagError, open_bag
-from blf_dsc_controller.bags.writer import BagWriter, recover
+from blf_dsc_controller.bags.writer import BagWriter
 from blf_dsc_controller.cli.main import main
 from blf_dsc_controller.messages.codecs import (
     Float64MultiArrayEncoder,
@@ -46,11 +54,19 @@ def message(k):
 def write_messages(path, count, per_chunk=0, **options):
     """Write messages of two topics; return the size of the bag."""
     with BagWriter(path, **options) as bag:
-        first = bag.add_topic(JOINT_STATES.resolved, JOINT_STATES.type, [Quality(depth=100)])
+        first = bag.add_topic(
+            JOINT_STATES.resolved, JOINT_STATES.type, [Quality(depth=100)]
+        )
         second = bag.add_topic(COMMANDS.resolved, COMMANDS.type, [Quality(depth=100)])
         for k in range(count):
             stamp = START + k * MILLISECOND
-            bag.write(first, STATES.encode(stamp, [k, -k], [0, 1], [2, 3]), stamp, stamp - 5, k + 1)
+            bag.write(
+                first,
+                STATES.encode(stamp, [k, -k], [0, 1], [2, 3]),
+                stamp,
+                stamp - 5,
+                k + 1,
+            )
             bag.write(second, TORQUES.encode([k, k]), stamp + 1)
             if per_chunk and k % per_chunk == per_chunk - 1:
                 bag.flush()
@@ -58,13 +74,18 @@ def write_messages(path, count, per_chunk=0, **options):
 
 
 def information(path):
-    return yaml.safe_load((path / 'metadata.yaml').read_text())['rosbag2_bagfile_information']
+    return yaml.safe_load((path / 'metadata.yaml').read_text())[
+        'rosbag2_bagfile_information'
+    ]
 
 
 @pytest.mark.parametrize('compression', ['none', 'zstd'])
-def test_other_libraries_read_the_whole_bag_by_its_own_definitions(tmp_path, compression):
+def test_other_libraries_read_the_whole_bag_by_its_own_definitions(
+    tmp_path, compression
+):
     size = write_messages(tmp_path / 'bag', 300, compression=compression)
-    assert (size < 60_000) == (compression == 'zstd')  # names and counts repeat in each message
+    # names and counts repeat in each message
+    assert (size < 60_000) == (compression == 'zstd')
     stamps = [START + k * MILLISECOND for k in range(300)]
     in_order = [
         entry
@@ -79,12 +100,19 @@ def test_other_libraries_read_the_whole_bag_by_its_own_definitions(tmp_path, com
         reader = make_reader(stream)
         found = list(reader.iter_messages(log_time_order=False))
         assert reader.get_header().profile == 'ros2'
-    assert [(c.topic, m.log_time, m.publish_time, m.sequence) for _, c, m in found] == in_order
+    assert [
+        (c.topic, m.log_time, m.publish_time, m.sequence) for _, c, m in found
+    ] == in_order
     for schema in {schema.name: schema for schema, _, _ in found}.values():
         assert schema.encoding == 'ros2msg'
         types.register(get_types_from_msg(schema.data.decode(), schema.name))
-    channels = {(c.topic, c.message_encoding, c.metadata['topic_type_hash']) for _, c, _ in found}
-    assert channels == {(topic.resolved, 'cdr', hash_) for topic, hash_ in HASHES.items()}
+    channels = {
+        (c.topic, c.message_encoding, c.metadata['topic_type_hash'])
+        for _, c, _ in found
+    }
+    assert channels == {
+        (topic.resolved, 'cdr', hash_) for topic, hash_ in HASHES.items()
+    }
     with Reader(tmp_path / 'bag') as bag:
         assert [c.msgcount for c in bag.connections] == [300, 300]
         messages = list(bag.messages())
@@ -150,11 +178,15 @@ def test_metadata_matches_rosbag2(tmp_path):
 
 
 def test_empty_bag_is_valid_and_an_existing_folder_is_left_alone(tmp_path):
-    with BagWriter(tmp_path / 'bag') as bag, pytest.raises(UnknownTypeError, match='nowhere_msgs'):
+    with (
+        BagWriter(tmp_path / 'bag') as bag,
+        pytest.raises(UnknownTypeError, match='nowhere_msgs'),
+    ):
         bag.add_topic('/nothing', 'nowhere_msgs/msg/Nothing', [])
     assert read(tmp_path / 'bag') == []
     before = information(tmp_path / 'bag')
-    assert before['files'][0]['duration'] == {'nanoseconds': 0}  # rosbag2 reads it as unsigned
+    # rosbag2 reads it as unsigned
+    assert before['files'][0]['duration'] == {'nanoseconds': 0}
     with pytest.raises(BagError, match=r'bag exists already.*choose another folder'):
         BagWriter(tmp_path / 'bag')
     assert information(tmp_path / 'bag') == before
@@ -170,7 +202,8 @@ def test_data_is_flushed_periodically(tmp_path, compression, monkeypatch):
     for k in range(1, 1001):
         now = k * 1e-3
         bag.write(handle, TORQUES.encode([1, 2]), START + k)
-        if k % 7 == 0:  # at every phase of the flush interval; one message per millisecond
+        # at every phase of the flush interval; one message per millisecond
+        if k % 7 == 0:
             assert messages_on_disk(path / 'bag_0.mcap') >= k - 100
     bag.close()
     complete = read(path)
@@ -198,7 +231,9 @@ def test_memory_of_a_recorder_is_bounded_and_its_files_are_read_as_one(tmp_path)
         {'nanoseconds': 59_999},
     )
     files = [(file['starting_time'], file['message_count']) for file in found['files']]
-    assert files == [({'nanoseconds_since_epoch': k}, 10_000) for k in range(0, 60_000, 10_000)]
+    assert files == [
+        ({'nanoseconds_since_epoch': k}, 10_000) for k in range(0, 60_000, 10_000)
+    ]
     with open_bag(tmp_path / 'bag' / 'bag_3.mcap') as opened:
         assert len(list(opened.messages({'/a'}))) == 10_000
     expected = [*map(message, range(60_000))]
@@ -224,7 +259,9 @@ def write(path, compression='none'):
 
 def chunks(data):
     """Start and end of each chunk of an intact file."""
-    return [(at, at + len(raw)) for at, raw in raw_records(data) if raw[0] == Opcode.CHUNK]
+    return [
+        (at, at + len(raw)) for at, raw in raw_records(data) if raw[0] == Opcode.CHUNK
+    ]
 
 
 @pytest.fixture(scope='module', params=['none', 'zstd'])
@@ -256,7 +293,9 @@ def recovered(folder, data):
 def test_every_intact_chunk_is_recovered_at_any_truncation(plain, tmp_path):
     data, written = plain
     ends = [end for _, end in chunks(data)]
-    (closed,) = [at + len(raw) for at, raw in raw_records(data) if raw[0] == Opcode.DATA_END]
+    (closed,) = [
+        at + len(raw) for at, raw in raw_records(data) if raw[0] == Opcode.DATA_END
+    ]
     for size in sorted({*ends, *range(0, len(data), 499), len(data)}):
         messages, losses = recovered(tmp_path / str(size), data[:size])
         assert messages == written[: 2 * PER_CHUNK * sum(end <= size for end in ends)]
@@ -267,8 +306,11 @@ def test_every_intact_chunk_is_recovered_at_any_truncation(plain, tmp_path):
 @given(data=st.data())
 def test_flipped_bytes_lose_nothing_silently(whole, tmp_path_factory, data):
     """Reading fails or returns what was written; recovery loses only the chunks that were hit."""
-    original, written = whole.read_bytes(), read(whole.parent)
-    places = data.draw(st.lists(st.integers(0, len(original) - 1), min_size=1, max_size=4))
+    original = whole.read_bytes()
+    written = read(whole.parent)
+    places = data.draw(
+        st.lists(st.integers(0, len(original) - 1), min_size=1, max_size=4)
+    )
     content = bytearray(original)
     for place in places:
         content[place] ^= data.draw(st.integers(1, 255))
@@ -279,7 +321,9 @@ def test_flipped_bytes_lose_nothing_silently(whole, tmp_path_factory, data):
     # Topics are defined in the first chunk and in the description at the end.
     (first, *_, last) = spans = chunks(original)
     hit = sum(any(at <= place < end for place in places) for at, end in spans)
-    defined = not any(first[0] <= place < first[1] or place >= last[1] for place in places)
+    defined = not any(
+        first[0] <= place < first[1] or place >= last[1] for place in places
+    )
     assert len(found) >= 2 * PER_CHUNK * (CHUNKS - hit) or not defined
     try:
         with open_bag(folder / 'bag' / 'bag_0.mcap') as opened:
@@ -313,21 +357,36 @@ def test_topics_are_not_taken_from_a_damaged_description(plain, tmp_path):
     content[name] ^= 1
     messages, losses = recovered(tmp_path / 'both', content)
     assert messages == []
-    assert any(f'{len(kept)} messages of topics whose name or' in loss for loss in losses)
+    assert any(
+        f'{len(kept)} messages of topics whose name or' in loss for loss in losses
+    )
 
 
 @pytest.mark.parametrize(
     ('damage', 'lost', 'words'),
     [
-        (lambda chunk: chunk[:-9] + bytes([chunk[-9] ^ 0x40]) + chunk[-8:], 1, 'at byte {at} ('),
+        (
+            lambda chunk: chunk[:-9] + bytes([chunk[-9] ^ 0x40]) + chunk[-8:],
+            1,
+            'at byte {at} (',
+        ),
         (lambda _: b'', 1, '5 of 30 messages of /blf_dsc_controller/commands'),
-        (lambda chunk: 2 * chunk, 0, 'at byte {end} (a chunk that the file holds twice), after 17'),
+        (
+            lambda chunk: 2 * chunk,
+            0,
+            'at byte {end} (a chunk that the file holds twice), after 17',
+        ),
     ],
 )
-def test_damaged_missing_or_doubled_chunk_is_reported(whole, tmp_path, capsys, damage, lost, words):
-    content, written = whole.read_bytes(), read(whole.parent)
+def test_damaged_missing_or_doubled_chunk_is_reported(
+    whole, tmp_path, capsys, damage, lost, words
+):
+    content = whole.read_bytes()
+    written = read(whole.parent)
     at, end = chunks(content)[2]
-    folder = damaged(tmp_path / 'bag', content[:at] + damage(content[at:end]) + content[end:])
+    folder = damaged(
+        tmp_path / 'bag', content[:at] + damage(content[at:end]) + content[end:]
+    )
     assert main(['recover', str(folder), '--out', str(tmp_path / 'clean')]) == 0
     output = capsys.readouterr().out
     (loss, *missing) = re.findall('LOST bag_0.mcap: (.*)', output)
@@ -337,15 +396,24 @@ def test_damaged_missing_or_doubled_chunk_is_reported(whole, tmp_path, capsys, d
     assert f'/joint_states: {30 - 5 * lost} messages' in output
     assert 'none of the recorded' not in output
     begin = 4 * PER_CHUNK
-    assert read(tmp_path / 'clean') == written[:begin] + written[begin + 2 * PER_CHUNK * lost :]
+    assert (
+        read(tmp_path / 'clean')
+        == written[:begin] + written[begin + 2 * PER_CHUNK * lost :]
+    )
 
 
-def test_recording_that_was_not_closed_is_reported_and_keeps_its_topics(whole, tmp_path, capsys):
+def test_recording_that_was_not_closed_is_reported_and_keeps_its_topics(
+    whole, tmp_path, capsys
+):
     content = whole.read_bytes()
     folder = damaged(tmp_path / 'bag', content[: chunks(content)[-1][0]])
     assert main(['recover', str(folder)]) == 0
-    output, clean = capsys.readouterr().out, tmp_path / 'bag_recovered'
-    assert 'bag_0.mcap: the recording was not closed; it ends at 1734000000.024000 s' in output
+    output = capsys.readouterr().out
+    clean = tmp_path / 'bag_recovered'
+    assert (
+        'bag_0.mcap: the recording was not closed; it ends at 1734000000.024000 s'
+        in output
+    )
     assert f'wrote {clean}' in output
     with open_bag(clean) as opened:
         assert list(opened.messages(())) == []
@@ -353,6 +421,35 @@ def test_recording_that_was_not_closed_is_reported_and_keeps_its_topics(whole, t
         for found, original in zip(reader.connections, before.connections, strict=True):
             assert (found.topic, found.digest) == (original.topic, original.digest)
             assert found.ext.offered_qos_profiles == original.ext.offered_qos_profiles
+
+
+def test_recovery_keeps_the_numbers_of_the_publishers(plain, tmp_path):
+    recovered(tmp_path / 'bag', plain[0][:-1])
+    with open_bag(tmp_path / 'bag_clean') as opened:
+        found = [each.sequence for each in opened.messages({JOINT_STATES.resolved})]
+    assert found == [*range(1, CHUNKS * PER_CHUNK + 1)]
+
+
+def test_message_before_its_topic_does_not_lose_the_later_ones(tmp_path):
+    """In a file without chunks and without an index, as after a kill."""
+    with (tmp_path / 'made.mcap').open('wb') as stream:
+        made = McapWriter(stream, use_chunking=False)
+        made.start()
+        schema = made.register_schema(COMMANDS.type, 'ros2msg', b'')
+        channel = made.register_channel('/x', 'cdr', schema)
+        for k in range(5):
+            made.add_message(channel, k, TORQUES.encode([k, k]), k, k)
+        made.finish()
+    data = (tmp_path / 'made.mcap').read_bytes()
+    records = [raw for _, raw in raw_records(data)]
+    place = next(k for k, raw in enumerate(records) if raw[0] == Opcode.CHANNEL)
+    first = next(k for k, raw in enumerate(records) if raw[0] == Opcode.MESSAGE)
+    last = next(k for k, raw in enumerate(records) if raw[0] == Opcode.DATA_END)
+    records.insert(first, records.pop(place))
+    content = data[:8] + b''.join(records[:last])
+    messages, losses = recovered(tmp_path / 'bag', content)
+    assert [at for _, at, _ in messages] == [1, 2, 3, 4]
+    assert any('1 messages of topics whose name or type' in loss for loss in losses)
 
 
 def test_files_of_a_split_bag_are_recovered_together(plain, tmp_path):
@@ -363,7 +460,9 @@ def test_files_of_a_split_bag_are_recovered_together(plain, tmp_path):
         (folder / name).write_bytes(b'')
         messages, (loss,) = recover(folder, tmp_path / f'{name}_clean')
         assert sum(messages.values()) == 2 * ALL
-        assert loss.startswith(f'{name}: the recording was not closed; nothing in it could be read')
+        assert loss.startswith(
+            f'{name}: the recording was not closed; nothing in it could be read'
+        )
 
 
 @pytest.mark.parametrize('mode', [CompressionMode.NONE, CompressionMode.MESSAGE])

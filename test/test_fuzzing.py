@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Random external input: names, metadata, MCAP files, messages, parameter files, URDFs; and a soak.
+"""Random external input: names, bags in all their parts, parameter files, URDFs; and a soak.
 
 Each property states that a command ends with its result or an error of the package: no other
 exception, no hang, bounded memory, nothing opened outside of the folder, nothing imported.
@@ -12,6 +12,7 @@ from __future__ import annotations
 import contextlib
 import functools
 import io
+import json
 import os
 import resource
 import signal
@@ -27,7 +28,7 @@ from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
 
 pytest.importorskip('rclpy', reason='needs ROS 2')
-pytest.importorskip('plotly', reason='needs plotly: pip install blf_dsc_controller[report]')
+pytest.importorskip('plotly', reason='needs plotly: pip install .[report]')
 
 import recorded_run
 from recorded_run import raw_records
@@ -36,6 +37,8 @@ from blf_dsc_controller.bags.sources import open_bag
 from blf_dsc_controller.cli.main import main
 from blf_dsc_controller.configuration.files import share_folder
 from blf_dsc_controller.errors import BlfDscError
+from blf_dsc_controller.messages.codecs import typestore
+from blf_dsc_controller.messages.topics import JOURNAL
 
 MOST_SECONDS = 60.0  # of CPU time
 MOST_MEMORY = 3 << 30  # bytes on top of what the process had before
@@ -50,7 +53,9 @@ fuzzed = settings(
     suppress_health_check=list(HealthCheck),
 )
 # The suite removes its folder of logs at the end; a folder of our own goes with the process.
-_made = tempfile.TemporaryDirectory(prefix='fuzzing_', dir=os.environ.get('ROS_LOG_DIR'))
+_made = tempfile.TemporaryDirectory(
+    prefix='fuzzing_', dir=os.environ.get('ROS_LOG_DIR')
+)
 _folder = Path(_made.name)
 _opened: list[str] = []
 
@@ -76,7 +81,9 @@ def bounded():
     """Run the tested code within limits."""
     before = set(sys.modules)
     _opened.clear()
-    used = int(Path('/proc/self/statm').read_text().split()[0]) * os.sysconf('SC_PAGE_SIZE')
+    used = int(Path('/proc/self/statm').read_text().split()[0]) * os.sysconf(
+        'SC_PAGE_SIZE'
+    )
     limits = resource.getrlimit(resource.RLIMIT_AS)
     handler = signal.signal(signal.SIGPROF, _hang)
     resource.setrlimit(resource.RLIMIT_AS, (used + MOST_MEMORY, limits[1]))
@@ -90,7 +97,11 @@ def bounded():
         resource.setrlimit(resource.RLIMIT_AS, limits)
         signal.signal(signal.SIGPROF, handler)
     assert not _opened, _opened
-    odd = {module for module in set(sys.modules) - before if module.split('.')[0] in ODD_MODULES}
+    odd = {
+        module
+        for module in set(sys.modules) - before
+        if module.split('.')[0] in ODD_MODULES
+    }
     assert not odd, odd
 
 
@@ -108,7 +119,9 @@ def command(*words):
 
 ODD_MODULES = ('unittest', 'this', 'antigravity', 'idlelib', 'turtle', 'test')
 PARTS = st.one_of(
-    st.sampled_from(('std_msgs', 'msg', 'srv', 'String', '__main__', *ODD_MODULES, '..', '')),
+    st.sampled_from(
+        ('std_msgs', 'msg', 'srv', 'String', '__main__', *ODD_MODULES, '..', '')
+    ),
     st.text(max_size=8),
 )
 
@@ -179,9 +192,15 @@ def folder():
 
 
 WORDS = st.one_of(
-    st.sampled_from(('nan', '.inf', '-1', '1e308', '0', '[]', '[[1.0]]', '{}', 'null', '""', '*a')),
-    st.sampled_from(('&a [1]', '!!binary x', '[' * 200, '0x', '"\\0"', '2.0e-320', '1e999', '~')),
-    st.sampled_from(('mcap', 'sqlite3', 'zstd', 'file', 'message', f'../../{ASIDE}/secret.mcap')),
+    st.sampled_from(
+        ('nan', '.inf', '-1', '1e308', '0', '[]', '[[1.0]]', '{}', 'null', '""', '*a')
+    ),
+    st.sampled_from(
+        ('&a [1]', '!!binary x', '[' * 200, '0x', '"\\0"', '2.0e-320', '1e999', '~')
+    ),
+    st.sampled_from(
+        ('mcap', 'sqlite3', 'zstd', 'file', 'message', f'../../{ASIDE}/secret.mcap')
+    ),
     st.integers().map(str),
     st.floats().map(str),
     st.lists(st.floats(), max_size=4).map(str),
@@ -212,7 +231,9 @@ def damaged(data, text):
         begin = data.draw(st.sampled_from((line, f'{line.partition(":")[0]}: ')))
         return begin + data.draw(WORDS)
 
-    return '\n'.join(disordered(data, text.splitlines(), change)).encode('utf-8', 'surrogatepass')
+    return '\n'.join(disordered(data, text.splitlines(), change)).encode(
+        'utf-8', 'surrogatepass'
+    )
 
 
 NUMBERS = st.sampled_from((0, 1, 3, 2**31 - 1, 2**32 - 1, 0x7FF00000, 2**63, 2**64 - 1))
@@ -274,8 +295,11 @@ def test_messages_are_survived(data, way):
     topics = sorted({message[0] for message in messages})
 
     def change(message):
-        at, other = data.draw(st.integers(0, 2**63 - 1)), data.draw(st.sampled_from(messages))[3]
-        raw = corrupted(data, data.draw(st.sampled_from((message[3], message[3], other))))
+        at = data.draw(st.integers(0, 2**63 - 1))
+        other = data.draw(st.sampled_from(messages))[3]
+        raw = corrupted(
+            data, data.draw(st.sampled_from((message[3], message[3], other)))
+        )
         return [*message[:2], data.draw(st.sampled_from((message[2], at))), raw]
 
     topic = data.draw(st.sampled_from(topics))
@@ -288,11 +312,93 @@ def test_messages_are_survived(data, way):
             read(bag, way)
 
 
+@functools.cache
+def eventful():
+    """Return messages of a rig that went through every kind of event."""
+    from test_replay_events import eventful as made
+
+    rig = made()
+    rig.publish_events()
+    return rig.entries
+
+
+JSON = st.recursive(
+    st.one_of(
+        st.none(),
+        st.booleans(),
+        st.sampled_from((-1, 0, 1, 2**31, 2**53, 2**63 - 1, 2**63, -(2**70), 10**300)),
+        st.sampled_from((0.5, -1.0, 1e308, 5e-324, float('nan'), float('inf'))),
+        st.sampled_from(
+            ('', 'joint1', 'blf_dsc', 'failed', 'stop', 'dance', 'x' * 300)
+        ),
+        st.text(max_size=8),
+    ),
+    lambda inner: st.one_of(
+        st.lists(inner, max_size=4),
+        st.dictionaries(st.text(max_size=8), inner, max_size=3),
+    ),
+    max_leaves=8,
+)
+
+
+def restructured(data, value):
+    """Return JSON data of which one part, at any depth, is replaced, removed, added or repeated."""
+    is_nested = (
+        isinstance(value, (dict, list)) and value and data.draw(st.integers(0, 3))
+    )
+    if not is_nested:
+        return data.draw(JSON)
+    action = data.draw(st.sampled_from(('within', 'within', 'within', 'remove', 'add')))
+    if isinstance(value, dict):
+        return restructured_object(data, value, action)
+    at = data.draw(st.integers(0, len(value) - 1))
+    within = {
+        'within': lambda: [restructured(data, value[at])],
+        'remove': list,
+        'add': lambda: [value[at]] * data.draw(st.integers(2, 50)),
+    }
+    return [*value[:at], *within[action](), *value[at + 1 :]]
+
+
+def restructured_object(data, value, action):
+    key = data.draw(st.sampled_from(sorted(value)))
+    if action == 'add':
+        return value | {data.draw(st.sampled_from((*value, 'x'))): data.draw(JSON)}
+    rest = {name: each for name, each in value.items() if name != key}
+    if action == 'remove':
+        return rest
+    return rest | {key: restructured(data, value[key])}
+
+
+@fuzzed
+@given(data=st.data(), way=WAYS)
+def test_structure_of_the_journal_is_survived(data, way):
+    """Events with other fields and values, which are valid JSON; removed, repeated, in disorder."""
+    journal, text = JOURNAL.resolved, typestore().types[JOURNAL.type]
+    entries = [list(entry) for entry in eventful()]
+    events = [entry for entry in entries if entry[0] == journal]
+    for _ in range(data.draw(st.integers(1, 3))):
+        entry = data.draw(st.sampled_from(events))
+        message = typestore().deserialize_cdr(entry[3], JOURNAL.type)
+        changed = json.dumps(restructured(data, json.loads(message.data)))
+        entry[3] = bytes(typestore().serialize_cdr(text(data=changed), JOURNAL.type))
+    if data.draw(st.integers(0, 4)) == 0:
+        at = data.draw(st.integers(0, len(entries) - 1))
+        entries.insert(at, data.draw(st.sampled_from(events)))
+    with folder() as bag:
+        bag.rmdir()
+        recorded_run.write(bag, entries)
+        with bounded():
+            read(bag, way)
+
+
 # Parameter files and URDFs.
 
 
 @fuzzed
-@given(data=st.data(), preset=st.sampled_from(('recommended', 'noisy', 'payload', 'panda')))
+@given(
+    data=st.data(), preset=st.sampled_from(('recommended', 'noisy', 'payload', 'panda'))
+)
 def test_parameters_are_survived(data, preset):
     """Parameter files: other values; lines repeated, removed or extended."""
     text = (share_folder() / 'config' / f'{preset}.yaml').read_text()
@@ -307,7 +413,9 @@ def test_parameters_are_survived(data, preset):
 
 
 NUMBERS_OF_XML = st.one_of(
-    st.sampled_from(('', 'nan', 'inf', '-1', '0', '1e308', '1e-320', '0 0 0', '1 0', 'x', '1_0')),
+    st.sampled_from(
+        ('', 'nan', 'inf', '-1', '0', '1e308', '1e-320', '0 0 0', '1 0', 'x', '1_0')
+    ),
     st.lists(st.floats(), min_size=1, max_size=4).map(lambda x: ' '.join(map(str, x))),
     st.text(max_size=8),
 )
@@ -329,10 +437,14 @@ XML = (
 def test_urdfs_are_survived(data, arm):
     """URDFs: other attributes, also within links and joints; those removed or repeated."""
     root = ET.fromstring((share_folder() / 'config' / f'{arm}.urdf').read_text())  # noqa: S314 - ours
-    values = sorted({value for element in root.iter() for value in element.attrib.values()})
+    values = sorted(
+        {value for element in root.iter() for value in element.attrib.values()}
+    )
 
     def change(element):
-        within = data.draw(st.sampled_from([each for each in element.iter() if each.attrib]))
+        within = data.draw(
+            st.sampled_from([each for each in element.iter() if each.attrib])
+        )
         key = data.draw(st.sampled_from(sorted(within.attrib)))
         within.set(key, data.draw(NUMBERS_OF_XML | st.sampled_from(values)))
         return element
@@ -342,7 +454,9 @@ def test_urdfs_are_survived(data, arm):
     if data.draw(st.integers(0, 9)) == 0:
         at = data.draw(st.integers(0, len(text)))
         text = (
-            text[:at] + data.draw(st.one_of(st.text(max_size=9), st.sampled_from(XML))) + text[at:]
+            text[:at]
+            + data.draw(st.one_of(st.text(max_size=9), st.sampled_from(XML)))
+            + text[at:]
         )
     with folder() as inside:
         path = inside / 'arm.urdf'

@@ -12,6 +12,7 @@ from fault_table import FAULTS, JOINTS, MILLISECOND, Rig, run
 from recorded_run import compared, of
 
 from blf_dsc_controller.configuration.schema import change
+from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.law.factory import estimate_names
 from blf_dsc_controller.law.telemetry import ControllerTelemetry
 from blf_dsc_controller.messages.journal import decode
@@ -22,13 +23,15 @@ from blf_dsc_controller.messages.topics import (
     JOURNAL,
     TRACKING_ERROR,
 )
+from blf_dsc_controller.reference.retargeting import Target
 from blf_dsc_controller.reference.trajectory import Trajectory, TrajectoryPoint
 from blf_dsc_controller.replay.verify import verify
 
 # Messages show neither a corrupted state of the law nor the end of a process.
 IN_MESSAGES = [fault for fault in FAULTS if 'poison' not in fault.inject.__qualname__]
 NAN = struct.pack('<d', float('nan'))
-DAMPED = {'safety.torque': 'hold_gravity', 'safety.stop_ramp': 0.02}  # no two torques alike
+# no two torques alike
+DAMPED = {'safety.torque': 'hold_gravity', 'safety.stop_ramp': 0.02}
 
 
 class Recorder(Rig):
@@ -92,14 +95,23 @@ def test_every_fault_replays_with_identical_torques(fault, tmp_path):
     if any('another controller' in remark for remark in result.remarks):
         return  # the replay ends where the controller was killed
     assert compared(result)['commands'] == 2 * len(of(rig.entries, COMMANDS))
-    assert compared(result)['tracking_error'] == 6 * len(of(rig.entries, TRACKING_ERROR))
+    assert compared(result)['tracking_error'] == 6 * len(
+        of(rig.entries, TRACKING_ERROR)
+    )
     assert ('safe stop' in ' '.join(result.transitions)) == (outcome.noticed >= 0)
     assert [item for item in result.comparisons if 'torques' in item.left_out] == []
 
 
 def eventful():
     """Run a rig through every kind of event."""
-    rig = Recorder({**DAMPED, 'safety.watchdog': 'on', 'limits.acceleration': [40.0, 40.0]})
+    rig = Recorder(
+        {
+            **DAMPED,
+            'safety.watchdog': 'on',
+            'limits.acceleration': [40.0, 40.0],
+            'limits.jerk': [100.0, 100.0],
+        }
+    )
     rig.step(50)
     point = TrajectoryPoint(0.4, (2.2, 1.6), (0.0, 0.0), (0.0, 0.0))
     rig.guard.adopt(rig.guard.plan(Trajectory(JOINTS, (point,))))
@@ -107,6 +119,24 @@ def eventful():
     plan = rig.guard.plan(Trajectory(JOINTS, (point,)), rig.guard.time + 0.02)
     rig.step(10)
     rig.guard.adopt(plan)
+    rig.step(50)
+    for k in range(5):  # a stream, each target before the one before is reached
+        now = rig.guard.time
+        ahead = rig.guard.controller.reference_at(now + 0.03)
+        beside = tuple((ahead[0] + 1e-4 * k).tolist())
+        rates = tuple(ahead[1].tolist())
+        target = Target(beside, rates, now + 0.03, now + 0.06, k > 2)
+        plan = rig.guard.plan(target, now + 0.004)
+        rig.step(4)
+        rig.guard.adopt(plan)
+        rig.step(20)
+    rig.guard.brake()
+    rig.step(50)
+    here = rig.guard.controller.reference_at(rig.guard.time)[0]
+    near = TrajectoryPoint(0.005, tuple((here + 0.002).tolist()))
+    stretched = rig.guard.plan(Trajectory(JOINTS, (near,)))
+    assert stretched.motion.note
+    rig.guard.adopt(stretched)
     rig.step(50)
     rig.guard.retune(change(rig.config, {'feedback.gain': (50.0, 25.0)}))
     rig.step(50)
@@ -134,8 +164,11 @@ def test_every_kind_of_event_and_watchdog_torques_replay(tmp_path):
         'activate, deactivate, activate, safe stop (state timeout), reset, safe stop (bad message)'
     )
     types = Counter(event.type for event in result.events)
-    assert [types[each] for each in ('silence', 'trajectory', 'parameters')] == [2, 2, 1]
-    states, commands = (len(of(rig.entries, topic)) for topic in (JOINT_STATES, COMMANDS))
+    kinds = ('silence', 'trajectory', 'target', 'brake', 'parameters')
+    assert [types[each] for each in kinds] == [2, 3, 5, 1, 1]
+    states, commands = (
+        len(of(rig.entries, topic)) for topic in (JOINT_STATES, COMMANDS)
+    )
     assert compared(result)['commands'] == 2 * commands
     assert commands > states + 10
 
@@ -164,7 +197,9 @@ def test_replay_ends_where_the_law_failed(tmp_path):
     rig.step(30)
     result = rig.verify(tmp_path)
     assert (result.difference, result.samples) == (None, 50)
-    assert result.remarks == ('the law failed, ZeroDivisionError: x: the replay ends there',)
+    assert result.remarks == (
+        'the law failed, ZeroDivisionError: x: the replay ends there',
+    )
 
 
 def test_replay_ends_where_the_stamps_restart(tmp_path):
@@ -178,7 +213,9 @@ def test_replay_ends_where_the_stamps_restart(tmp_path):
     result = rig.verify(tmp_path)
     stamp = rig.base + 55 * MILLISECOND
     assert (result.difference, result.samples) == (None, 50)
-    assert result.remarks == (f'the stamps restart at {stamp} ns: the replay ends there',)
+    assert result.remarks == (
+        f'the stamps restart at {stamp} ns: the replay ends there',
+    )
 
 
 def altered(**content):
@@ -228,18 +265,27 @@ def test_changed_event_is_a_difference(tmp_path, kind, alter, topic, field):
 def test_flipped_bit_of_a_safe_torque_is_found(tmp_path, part):
     rig = eventful()
     safe = [entry for entry in of(rig.entries, TRACKING_ERROR) if NAN in entry[3]]
-    safe[0][3] = safe[0][3].replace(NAN, struct.pack('<d', -float('nan')), 1)  # another NaN
+    # another NaN
+    safe[0][3] = safe[0][3].replace(NAN, struct.pack('<d', -float('nan')), 1)
     entry = safe[int(part * len(safe))]
     entry[3] = entry[3][:-8] + bytes([entry[3][-8] ^ 1]) + entry[3][-7:]
     difference = rig.verify(tmp_path).difference
-    assert (difference.topic, difference.field) == (TRACKING_ERROR.resolved, 'effort of joint2')
+    assert (difference.topic, difference.field) == (
+        TRACKING_ERROR.resolved,
+        'effort of joint2',
+    )
     assert difference.recorded == pytest.approx(difference.replayed, abs=1e-12)
 
 
 @pytest.mark.parametrize(
     ('topic', 'number', 'samples', 'remark'),
     [
-        (TRACKING_ERROR, 40, 40, f'the recorder missed messages of {TRACKING_ERROR.resolved}'),
+        (
+            TRACKING_ERROR,
+            40,
+            40,
+            f'the recorder missed messages of {TRACKING_ERROR.resolved}',
+        ),
         (JOURNAL, 3, 1, 'an event of the journal is not in the bag'),
     ],
 )
@@ -271,3 +317,22 @@ def test_second_controller_in_a_bag_is_not_replayed(tmp_path, drops):
     assert (result.difference, result.samples) == (None, 40)
     assert result.remarks == ('another controller was started: the replay ends there',)
     assert result.compared == pytest.approx(0.5)
+
+
+@pytest.mark.parametrize(
+    ('kind', 'content', 'words'),
+    [
+        ('stop', {'reason': 'boredom'}, "a stop for the unknown reason 'boredom'"),
+        ('parameters', {'parameters': {'joints': ['a']}}, 'fixed at the start: joints'),
+        ('silence', {'torques': 10**9}, '1000000000 torques of the watchdog'),
+    ],
+)
+def test_event_that_cannot_be_repeated_is_named(tmp_path, kind, content, words):
+    rig = eventful()
+    rig.publish_events()
+    events = [(entry, decode(entry[3])) for entry in of(rig.entries, JOURNAL)]
+    entry, event = next(found for found in events if found[1].type == kind)
+    event.content.update(content)
+    entry[3] = event.encode()
+    with pytest.raises(BlfDscError, match=rf'event {event.number} .* {words}'):
+        rig.verify(tmp_path)

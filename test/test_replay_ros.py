@@ -41,7 +41,8 @@ BRISK = {
     'limits__acceleration': [4.0, 4.0],  # rad/s^2, for a trajectory of one second
     'barrier__bound': [0.02, 0.02],  # rad, twenty times what this run needs
 }
-DAMPED = {'safety__torque': 'hold_gravity', 'safety__damping': [2.0, 1.0]}  # no two torques alike
+# no two torques alike
+DAMPED = {'safety__torque': 'hold_gravity', 'safety__damping': [2.0, 1.0]}
 
 
 class Recording:
@@ -85,7 +86,9 @@ def test_trajectories_and_gain_change_replay_where_they_took_effect(tmp_path):
     run.change('feedback.gain', [50.0, 25.0])
     run.run(200)
     begin = run.law.guard.last_stamp + SECOND // 4
-    later = trajectory(JOINTS[::-1], np.array([0.05, -0.1]), duration=0.5, fields=2, stamp=begin)
+    later = trajectory(
+        JOINTS[::-1], np.array([0.05, -0.1]), duration=0.5, fields=2, stamp=begin
+    )
     assert send(run.ros, run.law, later) == ''
     run.run(600)
     result = verify(run.end())
@@ -183,14 +186,18 @@ def test_bag_is_played_in_its_time_and_order_byte_for_byte(bag, ros):
         thread = threading.Thread(target=player.play)
         thread.start()
         ros.until(lambda: not thread.is_alive())
-        assert time.monotonic() - begin >= 0.199  # never early, however slow the machine
+        # never early, however slow the machine
+        assert time.monotonic() - begin >= 0.199
         listen(String, '/robot_description', latched)  # late, as RViz is
         sent = [raw for _, _, _, raw in of(recorded_run.messages(bag), JOINT_STATES)]
         ros.until(lambda: len(received['/joint_states']) == len(sent))
         ros.until(lambda: received['/robot_description'])
         player.destroy_node()
     assert [bytes(raw) for raw in received['/joint_states']] == sent
-    assert deserialize_message(received['/robot_description'][0], String).data == '<robot/>'
+    assert (
+        deserialize_message(received['/robot_description'][0], String).data
+        == '<robot/>'
+    )
 
 
 def test_bag_is_played_by_command_or_refused_in_one_line(bag, tmp_path, capfd):

@@ -14,13 +14,15 @@ from command import OLDER, finished
 from random_arm import random_urdf
 from recorded_run import MILLISECOND, START, compared, of
 
+from blf_dsc_controller.bags import older_parameters
 from blf_dsc_controller.bags.content import read_content
 from blf_dsc_controller.bags.reader import read_run
 from blf_dsc_controller.cli.bags import DIFFERENT, PARTIAL
 from blf_dsc_controller.cli.main import main
 from blf_dsc_controller.configuration.nodes import load_loop
-from blf_dsc_controller.errors import BlfDscError, ConfigurationError
+from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.messages.codecs import JointStateEncoder
+from blf_dsc_controller.messages.event_content import FORMAT
 from blf_dsc_controller.messages.journal import EventType, decode
 from blf_dsc_controller.messages.topics import (
     BOUND,
@@ -69,19 +71,24 @@ def test_every_number_is_reproduced(bag, tmp_path):
         'bound': 4,
     }
     assert compared(result) == counts
-    assert [item.left_out for item in result.comparisons if item.left_out] == ['compute_time']
+    assert [item.left_out for item in result.comparisons if item.left_out] == [
+        'compute_time'
+    ]
     run = read_run(bag)
     # Otherwise this would not cover the composite learning.
     assert run.monitor.column('latched')[-1] == 1.0
 
     for decimation, given in ((10, {}), (7, {'telemetry.decimation': 7})):
         sparse = recorded_run.record(tmp_path / f'{decimation}', **given)
-        result, few = verify(sparse), -(-SAMPLES // decimation)
+        result = verify(sparse)
+        few = -(-SAMPLES // decimation)
         assert (result.difference, result.compared) == (None, 1.0)
         assert compared(result) == counts | {'reference': 4 * few, 'monitor': 14 * few}
         thinned = read_run(sparse)
         np.testing.assert_array_equal(thinned.error, run.error)
-        np.testing.assert_allclose(thinned.reference, run.reference, rtol=0.0, atol=1e-15)
+        np.testing.assert_allclose(
+            thinned.reference, run.reference, rtol=0.0, atol=1e-15
+        )
         assert np.isfinite(thinned.reference_velocity[:, 0]).sum() == few
 
 
@@ -105,13 +112,18 @@ def test_other_laws_and_a_narrowing_bound_replay_from_compressed_bags(tmp_path, 
         (COMMANDS, -8, 'effort of joint2'),
         (TRACKING_ERROR, -8, 'effort of joint2'),
         (REFERENCE, -8 - 4, 'velocity of joint2'),  # followed by the empty effort
-        (MONITOR, -32, 'latched'),  # before model_changes, compute_time, velocity and effort
+        # before model_changes, compute_time, velocity and effort
+        (MONITOR, -32, 'latched'),
     ],
 )
 def test_flipped_bit_is_located_and_named_and_the_earliest_counts(
     entries, tmp_path, capsys, topic, at, field
 ):
-    for flipped, k, place in ((topic, 700, at), (COMMANDS, 800, -8), (MONITOR, 900, -40)):
+    for flipped, k, place in (
+        (topic, 700, at),
+        (COMMANDS, 800, -8),
+        (MONITOR, 900, -40),
+    ):
         entry = of(entries, flipped)[k]
         raw = bytearray(entry[3])
         raw[place] ^= 1
@@ -126,13 +138,21 @@ def test_flipped_bit_is_located_and_named_and_the_earliest_counts(
     assert difference.recorded == pytest.approx(difference.replayed, abs=1e-12)
     assert main(['replay', str(path)]) == DIFFERENT
     *lines, last = capsys.readouterr().out.splitlines()
-    assert last.startswith('DIFFERENT, first at 0.700000 s (stamp 1700000000 ns), /blf_dsc_c')
+    assert last.startswith(
+        'DIFFERENT, first at 0.700000 s (stamp 1700000000 ns), /blf_dsc_c'
+    )
     assert f'recorded {difference.recorded!r}, replayed {difference.replayed!r}' in last
     for found in result.comparisons:
-        assert (found.difference is None) == (found.topic not in (topic.resolved, *FLIPPED))
+        assert (found.difference is None) == (
+            found.topic not in (topic.resolved, *FLIPPED)
+        )
         assert (found.largest > 0.0) == (found.difference is not None)
-    largest = max(found.largest for found in result.comparisons if found.topic == topic.resolved)
-    assert any(f'{topic.resolved}: ' in x and f'at most {largest:.3g}' in x for x in lines)
+    largest = max(
+        found.largest for found in result.comparisons if found.topic == topic.resolved
+    )
+    assert any(
+        f'{topic.resolved}: ' in x and f'at most {largest:.3g}' in x for x in lines
+    )
 
 
 FLIPPED = COMMANDS.resolved, MONITOR.resolved
@@ -179,7 +199,10 @@ def test_lost_message_leaves_the_others_to_compare(
         assert result.samples == number
         stamp = f'the state with stamp {lost[2]} ns was used but is not in the bag'
         assert any(remark.startswith(stamp) for remark in result.remarks)
-        assert result.comparisons[0].left_out == '668 torques that the replay does not reach'
+        assert (
+            result.comparisons[0].left_out
+            == '668 torques that the replay does not reach'
+        )
     if percent:
         assert main(['replay', str(path)]) == PARTIAL
         last = capsys.readouterr().out.splitlines()[-1]
@@ -187,12 +210,66 @@ def test_lost_message_leaves_the_others_to_compare(
         assert found == pytest.approx(percent, abs=1.5)
 
 
+def replayed(path, capsys):
+    """Return the exit code of the command, and what it prints."""
+    code = main(['replay', str(path)])
+    return code, capsys.readouterr().out
+
+
+@pytest.mark.parametrize('topic', [COMMANDS, REFERENCE, MONITOR, BOUND])
+def test_missing_topic_is_named_in_the_verdict(entries, tmp_path, capsys, topic):
+    kept = [entry for entry in entries if entry[0] != topic.resolved]
+    code, text = replayed(recorded_run.write(tmp_path / 'bag', kept), capsys)
+    assert code == PARTIAL
+    missing = 1 if topic is BOUND else SAMPLES
+    assert f'MISSING in the bag: {missing} messages of {topic.resolved}' in text
+    assert 'INCOMPLETE' in text.splitlines()[-1]
+
+
+@pytest.mark.parametrize('publishers', [0, 1], ids=['no numbers', 'numbers'])
+@pytest.mark.parametrize('number', [0, 333, SAMPLES - 1])
+def test_missing_answer_makes_no_difference(
+    entries, tmp_path, capsys, number, publishers
+):
+    """Without sequence numbers its state may as well have been dropped by the middleware."""
+    of(entries, TRACKING_ERROR)[number][3] = None
+    path = recorded_run.write(tmp_path / 'bag', entries, publishers=publishers)
+    result = verify(path)
+    assert result.difference is None
+    assert compared(result)['tracking_error'] == 6 * number
+    assert compared(result)['commands'] >= 2 * number
+    code, text = replayed(path, capsys)
+    assert code == PARTIAL
+    assert 'could not be compared' in text.splitlines()[-1]
+
+
+def test_cut_recording_of_a_node_is_incomplete(entries, tmp_path, capsys):
+    configured(entries, lambda content: content.update(topics={}))
+    half = [entry for entry in entries if entry[2] < START + 500 * MILLISECOND]
+    code, text = replayed(recorded_run.write(tmp_path / 'bag', half), capsys)
+    assert code == PARTIAL
+    assert 'MISSING in the bag: the end of the run' in text
+    assert 'has no release' in text
+
+
+def test_nan_is_not_equal_to_a_number(entries, tmp_path):
+    entry = of(entries, TRACKING_ERROR)[40]
+    entry[3] = entry[3][:-8] + np.float64(np.nan).tobytes()
+    difference = verify(recorded_run.write(tmp_path / 'bag', entries)).difference
+    assert difference.stamp == START + 40 * MILLISECOND
+    assert np.isnan(difference.recorded)
+    assert np.isfinite(difference.replayed)
+
+
 @pytest.mark.parametrize(
     ('keep', 'words'),
     [
         (lambda name, _: name == JOINT_STATES.resolved, r'/joint_states \(1001\)'),
         (lambda name, _: 'jo' in name, r'/joint_states \(1001\)'),  # and the journal
-        (lambda name, at: name == JOURNAL.resolved or at >= 200, f'stamp {START} ns, .* start the'),
+        (
+            lambda name, at: name == JOURNAL.resolved or at >= 200,
+            f'stamp {START} ns, .* start the',
+        ),
         (
             lambda name, at: name != JOURNAL.resolved or at,
             'the beginning of /blf_.*/journal: start',
@@ -200,7 +277,9 @@ def test_lost_message_leaves_the_others_to_compare(
     ],
 )
 def test_bag_without_what_a_replay_needs_is_refused(entries, tmp_path, keep, words):
-    kept = [entry for entry in entries if keep(entry[0], (entry[2] - START) / MILLISECOND)]
+    kept = [
+        entry for entry in entries if keep(entry[0], (entry[2] - START) / MILLISECOND)
+    ]
     path = recorded_run.write(tmp_path / 'bag', kept)
     with pytest.raises(BlfDscError, match=words):
         verify(path)
@@ -241,7 +320,56 @@ def test_bag_of_an_earlier_version_is_read_and_its_replay_is_refused(capsys):
     assert run.stamp.size == 21
     assert np.isfinite([run.position, run.error, run.torque, run.bound]).all()
     assert main(['replay', str(bag)]) == 1
-    assert 'robot.learn: unknown parameter' in capsys.readouterr().err
+    error = capsys.readouterr().err
+    assert 'robot.learn: unknown parameter' in error
+    assert 'no rule says how to do without it' in error
+
+
+@pytest.mark.parametrize(
+    ('value', 'code', 'words'),
+    [
+        ([1, 2.0], 0, 'bit-equal: all'),
+        ([1.0, 3.0], 1, 'old.gain: recorded with [1.0, 3.0], but this version has the'),
+    ],
+)
+def test_removed_parameter_leaves_a_rule(
+    entries, tmp_path, capsys, monkeypatch, value, code, words
+):
+    monkeypatch.setitem(older_parameters.REMOVED, 'old.gain', (1.0, 2.0))
+
+    def change(content):
+        content['parameters']['old.gain'] = value
+
+    configured(entries, change)
+    path = recorded_run.write(tmp_path / 'bag', entries)
+    assert main(['replay', str(path)]) == code
+    assert words in ''.join(capsys.readouterr())
+
+
+def test_added_parameter_has_its_rule_for_older_bags(entries, tmp_path, monkeypatch):
+    name = 'learning.compensation'
+
+    def change(content):
+        del content['parameters'][name]
+
+    configured(entries, change)
+    path = recorded_run.write(tmp_path / 'bag', entries)
+    found = []
+    for value in ('reference', 'state'):
+        monkeypatch.setitem(older_parameters.ADDED, name, value)
+        config = read_content(path).controller_config(exactly=True)
+        found.append(config.learning.compensation)
+    assert found == ['reference', 'state']
+
+
+def test_journal_of_a_later_format_is_refused(entries, tmp_path):
+    def change(content):
+        content.update(format=FORMAT + 1, version='9.0.0')
+
+    configured(entries, change)
+    path = recorded_run.write(tmp_path / 'bag', entries)
+    with pytest.raises(BlfDscError, match=r'format 2, recorded by version 9\.0\.0'):
+        verify(path)
 
 
 # The command.
@@ -256,7 +384,8 @@ sys.exit(main(['replay', *sys.argv[1:]]))
 
 def test_identical_replay_exits_with_zero_and_a_verdict_on_an_older_processor(bag):
     command = [sys.executable, '-c', WITHOUT_ROS, str(bag)]
-    run = finished(*command, env=os.environ | OLDER)  # of the bag, which is recorded without
+    # of the bag, which is recorded without
+    run = finished(*command, env=os.environ | OLDER)
     assert run.returncode == 0, run.stderr
     assert '/blf_dsc_controller/commands: 2002 values bit-equal' in run.stdout
     assert 'x real time' in run.stdout
@@ -265,7 +394,8 @@ def test_identical_replay_exits_with_zero_and_a_verdict_on_an_older_processor(ba
 def test_bag_replays_without_its_urdf_file_and_is_read_with_unknown_parameters(
     tmp_path, monkeypatch
 ):
-    urdf, file = tmp_path / 'arm.urdf', tmp_path / 'arm.yaml'
+    urdf = tmp_path / 'arm.urdf'
+    file = tmp_path / 'arm.yaml'
     urdf.write_text(random_urdf(3, seed=5)[0])
     file.write_text(OF_URDF.format(urdf=urdf))
     loop, bag = load_loop(file), tmp_path / 'bag'
@@ -276,11 +406,17 @@ def test_bag_replays_without_its_urdf_file_and_is_read_with_unknown_parameters(
         assert verify(bag).difference is None
         assert read_run(bag).arm is not None
     entries = recorded_run.messages(bag)
-    configured(entries, lambda content: content['parameters'].update({'barrier.shape': 2}))
+    configured(
+        entries, lambda content: content['parameters'].update({'barrier.shape': 2})
+    )
     bag = recorded_run.write(tmp_path / 'newer', entries)
     monkeypatch.setattr('blf_dsc_controller.bags.content.__version__', '9.9.9')
-    with pytest.raises(ConfigurationError, match=r'(?s)by version 0\.1\.0, not 9.*barrier\.shape'):
+    with pytest.raises(
+        BlfDscError, match=r'(?s)by version 0\.1\.0, not 9.*barrier\.shape'
+    ):
         verify(bag)
     run = read_run(bag)
     assert run.arm is not None
-    assert run.notes == ('recorded parameters that this version does not have: barrier.shape',)
+    assert run.notes == (
+        'recorded parameters that this version does not have: barrier.shape',
+    )

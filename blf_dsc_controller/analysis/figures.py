@@ -44,7 +44,10 @@ _BEFORE, _AFTER = 1.0, 2.0  # s, shown of a change
 _FLAT, _DECADE = 2.0, 10.0
 _SHADED = 0.1
 _ABOVE = 1.15  # of the height of a panel, where the legend of its column is
-_NARROW, _WIDE, _WIDEST = 1.3, 2.4, 5.0  # points, widths of lines
+# points, widths of lines
+_NARROW = 1.3
+_WIDE = 2.4
+_WIDEST = 5.0
 
 _DPI = 130
 _CHARACTER = 0.085  # inches, approximate width in a title or legend
@@ -89,8 +92,12 @@ class Picture:
                 layout=ConstrainedLayoutEngine(w_pad=0.12, h_pad=0.08, hspace=0.04),
             )
             self._canvas = FigureCanvasAgg(self._figure)
-            self._figure.suptitle(title, x=0.01, ha='left', fontsize=14, fontweight='bold')
-            self.axes = self._figure.subplots(rows, columns, sharex=share_time, squeeze=False)
+            self._figure.suptitle(
+                title, x=0.01, ha='left', fontsize=14, fontweight='bold'
+            )
+            self.axes = self._figure.subplots(
+                rows, columns, sharex=share_time, squeeze=False
+            )
             for axes in self.axes.flat:
                 axes.spines[['top', 'right']].set_visible(False)
                 axes.grid(visible=True, color='#E5E7EB', linewidth=0.8)
@@ -121,7 +128,9 @@ def head(axes: Axes, title: str, *, legend_at: float | None = None) -> None:
         return
     grid = axes.get_subplotspec()
     width = axes.figure.get_figwidth() / (grid.get_gridspec().ncols if grid else 1)  # type: ignore[union-attr]
-    fits = _CHARACTER * len(title + ''.join(labels)) + _HANDLE * entries < width - _MARGIN
+    fits = (
+        _CHARACTER * len(title + ''.join(labels)) + _HANDLE * entries < width - _MARGIN
+    )
     above = fits or legend_at is not None
     axes.legend(
         loc='lower right' if above else 'center left',
@@ -143,7 +152,9 @@ def draw(run: Run, folder: Path) -> list[Path]:
     """
     folder.mkdir(parents=True, exist_ok=True)
     tracking, change, parameters = (folder / name for name in NAMES)
-    metrics, n, found = measure(run), len(run.joints), panels([run])
+    metrics = measure(run)
+    n = len(run.joints)
+    found = panels([run])
 
     def of(*groups: str) -> list[Panel]:
         return [panel for panel in found if panel.group in groups]
@@ -154,7 +165,8 @@ def draw(run: Run, folder: Path) -> list[Path]:
         title = f'Tracking over {run.duration:.4g} s: bound {kept}'
     for time, stop in run.timed_stops[:1]:
         title += f', stopped at {time:.3f} s ({stop.reason})'
-    motion, paths = of('Motion', 'Tracking', 'Torque'), [tracking]
+    motion = of('Motion', 'Tracking', 'Torque')
+    paths = [tracking]
     if n <= _ABREAST:
         draw_panels(tracking, title, motion, n, _SIZE)
     else:
@@ -167,7 +179,8 @@ def draw(run: Run, folder: Path) -> list[Path]:
         title = f'The first change of the arm, from {changes[0] - _BEFORE:g} s on'
         draw_panels(change, title, list(_close_up(run, changes[0])), 1, _CLOSE_UP)
     if of('Parameters'):
-        title, error = 'Learning', metrics.final_parameter_error
+        title = 'Learning'
+        error = metrics.final_parameter_error
         if not math.isnan(error):
             what = 'relative parameter error' if run.arm is None else 'torque error'
             title += f': {what} {100 * error:.2g} % at the end'
@@ -182,14 +195,18 @@ def _close_up(run: Run, change: float) -> Iterator[Panel]:
     begin, end = change - _BEFORE, change + _AFTER
     found = panels([run], begin, end)
     marks = [Mark(change, 'the arm changes', INK)]
-    marks += [Mark(t, 'learning restarts', BLUE) for t in change_times(run) if begin < t < end]
+    marks += [
+        Mark(t, 'learning restarts', BLUE) for t in change_times(run) if begin < t < end
+    ]
     for group, kind in (('Tracking', 'error of '), ('Torque', 'torque of ')):
         of_joints = [panel for panel in found if panel.title.startswith(kind)]
         lines = [
             next(iter(panel.lines))._replace(name=joint)
             for panel, joint in zip(of_joints, run.joints, strict=False)
         ]
-        lines += [line for panel in of_joints[:1] for line in panel.lines if line.shaded]
+        lines += [
+            line for panel in of_joints[:1] for line in panel.lines if line.shaded
+        ]
         if lines:
             unit = of_joints[0].unit
             yield Panel(group, f'{kind}each joint', unit, lines, marks=tuple(marks))
@@ -234,7 +251,9 @@ def _draw_panel(axes: Axes, panel: Panel, runs: Sequence[str]) -> None:
             colour = ORANGE
         width, alpha = (_WIDE, 0.6) if followed else (_NARROW, 1.0)
         if runs and followed:
-            width, alpha = (_WIDEST, _WIDE)[line.run % 2], 1.0  # one upon the other
+            # one upon the other
+            width = (_WIDEST, _WIDE)[line.run % 2]
+            alpha = 1.0
         label = runs[line.run] if runs else line.name
         _draw_line(axes, line, label=label, color=colour, lw=width, alpha=alpha)
     for line in panel.lines:
@@ -277,7 +296,9 @@ def _draw_mark(axes: Axes, mark: Mark, row: int) -> None:
     if mark.colour == ALARM:
         axes.axvline(mark.time, color=mark.colour, lw=1.4)
     else:
-        axes.axvline(mark.time, color=mark.colour or INK, lw=1.1, ls=(0, (1, 2)), zorder=1)
+        axes.axvline(
+            mark.time, color=mark.colour or INK, lw=1.1, ls=(0, (1, 2)), zorder=1
+        )
     if not mark.colour:
         return
     is_early = mark.time < sum(axes.get_xlim()) / 2.0

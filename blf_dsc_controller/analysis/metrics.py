@@ -68,9 +68,12 @@ class Estimates:
     names: tuple[str, ...]
     time: Floats  # (m,) s since the first sample of the run
     estimate: Floats  # (m, p)
-    true: Floats | None  # (m, p); None if unknown, or if the plant's parameters have other names
-    relative_error: Floats | None  # (m,) |P^ - P| / |P|, or of torques; None if P is unknown
-    of_torques: bool  # of H P^ and H P along the reference, as the P of a URDF has mixed units
+    # (m, p); None if unknown, or if the plant's parameters have other names
+    true: Floats | None
+    # (m,) |P^ - P| / |P|, or of torques; None if P is unknown
+    relative_error: Floats | None
+    # of H P^ and H P along the reference, as the P of a URDF has mixed units
+    of_torques: bool
 
 
 def estimates_of(run: Run) -> Estimates | None:
@@ -81,7 +84,9 @@ def estimates_of(run: Run) -> Estimates | None:
     """
     if run.monitor is None:
         return None
-    names, truth, arm = _parameters(run.monitor.names), run.truth, run.arm
+    names = _parameters(run.monitor.names)
+    truth = run.truth
+    arm = run.arm
     step = -(-run.monitor.stamp.size // _MOST)
     rows = slice((run.monitor.stamp.size - 1) % step, None, step)
     stamp = run.monitor.stamp[rows]
@@ -114,7 +119,8 @@ def _relative_error(estimate: Floats, P: Floats, R: Floats | None) -> Floats:
         off, size = estimate[some] - P[some], P[some]
         if R is not None:
             off, size = off @ R.T, size @ R.T
-        with np.errstate(over='ignore', invalid='ignore'):  # no motion, no torques: unknown
+        # no motion, no torques: unknown
+        with np.errstate(over='ignore', invalid='ignore'):
             found[some] = np.linalg.norm(off, axis=1) / np.linalg.norm(size, axis=1)
     return found
 
@@ -130,7 +136,8 @@ def _torques(run: Run, regressor: Regressor) -> Floats:
     rows = known[np.linspace(0, known.size - 1, min(_POSTURES, known.size)).astype(int)]
     after, before = (np.diff(run.time)[rows + k, np.newaxis] for k in (0, -1))
     earlier, q, later = (getattr(run, name)[rows + k] for k in (-1, 0, 1))
-    forward, backward = (later - q) / after, (q - earlier) / before
+    forward = (later - q) / after
+    backward = (q - earlier) / before
     dq = (after * backward + before * forward) / (after + before)
     ddq = 2.0 * (forward - backward) / (after + before)
     H = regressor(q, dq, dq, ddq)
@@ -155,14 +162,19 @@ def bodies_of(names: Sequence[str]) -> dict[str, list[int]]:
 
 
 def errors_of_bodies(
-    bodies: Mapping[str, Sequence[int]], estimate: Floats, true: Floats | None, prior: Floats
+    bodies: Mapping[str, Sequence[int]],
+    estimate: Floats,
+    true: Floats | None,
+    prior: Floats,
 ) -> Floats:
     """Return how far the estimates (m, p) of each body are off, (b, m): rms [% of the prior].
 
     Off the truth or, where none is known, off the first estimates; a rejected estimate is NaN.
     `prior` (p,) are deviations.
     """
-    origin = estimate[:1] if true is None else np.where(np.isnan(true), estimate[0], true)
+    origin = (
+        estimate[:1] if true is None else np.where(np.isnan(true), estimate[0], true)
+    )
     square = (100.0 * (estimate - origin) / prior) ** 2
     with np.errstate(divide='ignore', invalid='ignore'):  # all rejected: 0 / 0
         each = [
@@ -186,7 +198,9 @@ def _rises(run: Run, name: str) -> list[float]:
     """Return the times [s] at which a count of the learning rises."""
     if run.monitor is None or name not in run.monitor.names:
         return []
-    rises = np.flatnonzero(np.diff(np.nan_to_num(run.monitor.column(name)), prepend=0.0) > 0.0)
+    rises = np.flatnonzero(
+        np.diff(np.nan_to_num(run.monitor.column(name)), prepend=0.0) > 0.0
+    )
     return [float(t) for t in run.time_of(run.monitor.stamp[rises])]
 
 
@@ -202,8 +216,11 @@ def true_change_times(run: Run) -> list[float]:
 
 def outside(run: Run, i: int) -> NDArray[np.bool_] | None:
     """Return where |xi1| >= k_c for a joint, (N,); None if error or bound is unknown."""
-    error, bound = run.column('error', i), run.column('bound', i)
-    return None if error is None or bound is None else np.asarray(np.abs(error) >= bound)
+    error = run.column('error', i)
+    bound = run.column('bound', i)
+    return (
+        None if error is None or bound is None else np.asarray(np.abs(error) >= bound)
+    )
 
 
 def _known(run: Run, name: str, i: int) -> Floats:
@@ -254,7 +271,8 @@ class Metrics:
     model_changes: list[float]  #: s, when the controller found that the arm had changed
     rejected_columns: list[str]
     loads: list[dict[str, float]]  #: what the tip held `until` [s], where known
-    timing: dict[str, Any] | None  #: `rate` [Hz], `latency` [s], `late_steps`, in real time
+    #: `rate` [Hz], `latency` [s], `late_steps`, in real time
+    timing: dict[str, Any] | None
     estimate: dict[str, float] | None = None  #: at the end
     true: dict[str, float] | None = None  #: at the end
     of_torques: bool = False  #: whether the following are errors of the model's torques
@@ -263,14 +281,16 @@ class Metrics:
     )  #: `Estimates.relative_error` at MOMENTS
     final_parameter_error: float = math.nan
     tail_parameter_error: float = math.nan  #: rms over the last ten seconds
-    time_to_1_percent: float = math.nan  #: s, after which the parameter error stays below 1 %
+    #: s, after which the parameter error stays below 1 %
+    time_to_1_percent: float = math.nan
 
 
 @np.errstate(all='ignore')  # a bag may hold any number
 def measure(run: Run) -> Metrics:
     """Compute the metrics of a run."""
     step = float(run.time[1]) if run.stamp.size > 1 else math.nan
-    ratio, (violation, joint) = _largest_ratio(run), first_violation(run)
+    ratio = _largest_ratio(run)
+    (violation, joint) = first_violation(run)
     held = None if math.isnan(ratio) else True
     estimates = estimates_of(run)
 
@@ -343,19 +363,25 @@ def _loads(run: Run) -> list[dict[str, float]]:
 def _timing(run: Run) -> dict[str, Any] | None:
     if run.timing is None or not {LATENCY, LATE_STEPS} <= {*run.timing.names}:
         return None
-    moving = run.received[1:]  # the first state waits, with brakes on, for the controller
+    # the first state waits, with brakes on, for the controller
+    moving = run.received[1:]
     elapsed = float(moving[-1] - moving[0]) * 1e-9 if moving.size else 0.0
     latency = run.timing.column(LATENCY)
     return {
         'rate': (moving.size - 1) / elapsed if elapsed > 0 else math.nan,
-        'latency': {k: _reduced(latency, partial(np.percentile, q=q)) for k, q in _QUANTILES},
+        'latency': {
+            k: _reduced(latency, partial(np.percentile, q=q)) for k, q in _QUANTILES
+        },
         'late_steps': int(run.timing.column(LATE_STEPS)[-1]),
     }
 
 
 def _largest_ratio(run: Run) -> float:
     """Return the largest |xi1| / k_c; NaN if it is unknown."""
-    pairs = ((_known(run, 'error', i), _known(run, 'bound', i)) for i in range(len(run.joints)))
+    pairs = (
+        (_known(run, 'error', i), _known(run, 'bound', i))
+        for i in range(len(run.joints))
+    )
     return float(np.fmax.reduce([_peak(error / bound) for error, bound in pairs]))
 
 
@@ -396,7 +422,9 @@ def _settled(time: Floats, error: Floats) -> float:
 
 def write_json(numbers: Any, path: Path) -> None:
     """Write metrics, or other data in dictionaries and lists, as JSON."""
-    path.write_text(json.dumps(plain(numbers), indent=2, allow_nan=False) + '\n', encoding='utf-8')
+    path.write_text(
+        json.dumps(plain(numbers), indent=2, allow_nan=False) + '\n', encoding='utf-8'
+    )
 
 
 def plain(value: Any) -> Any:
@@ -427,7 +455,8 @@ def aligned(rows: Sequence[Sequence[str]]) -> str:
     """Return a table for the terminal: the first column flush left, the others flush right."""
     first, *widths = (max(map(len, column)) for column in zip(*rows, strict=True))
     return '\n'.join(
-        '  '.join([name.ljust(first), *map(str.rjust, values, widths)]) for name, *values in rows
+        '  '.join([name.ljust(first), *map(str.rjust, values, widths)])
+        for name, *values in rows
     )
 
 
@@ -439,7 +468,9 @@ def _sentences(of: Metrics) -> Iterator[str]:
     yield f'bound       {kept}{" until the stop" * bool(of.stops and of.held)}'
     bounds = zip(of.joints, of.widest_bound, of.bound, strict=True)
     wider = [
-        f'{joint} {1e3 * widest:.3g} mrad' for joint, widest, bound in bounds if widest > bound
+        f'{joint} {1e3 * widest:.3g} mrad'
+        for joint, widest, bound in bounds
+        if widest > bound
     ]
     if wider:
         yield f'at widest   {", ".join(wider)}'
@@ -456,12 +487,19 @@ def _sentences(of: Metrics) -> Iterator[str]:
             microseconds = '/'.join(f'{1e6 * each:.1f}' for each in latency.values())
             figures.append(f'state to torque {microseconds} us ({"/".join(latency)})')
         is_slow = late > _OFTEN * of.samples
-        busy = ': the computer was too busy for real time (--mode lockstep waits)' * is_slow
+        busy = (
+            ': the computer was too busy for real time (--mode lockstep waits)'
+            * is_slow
+        )
         yield f'real time   {", ".join([*figures, f"{late} late steps"])}{busy}'
 
 
 def _learning_lines(of: Metrics) -> Iterator[str]:
-    begun = 'never began' if math.isnan(of.latch_time) else f'began at {of.latch_time:.3f} s'
+    begun = (
+        'never began'
+        if math.isnan(of.latch_time)
+        else f'began at {of.latch_time:.3f} s'
+    )
     yield f'learning    {begun if of.learns else "not used by this law"}'
     if of.model_changes:
         times = ', '.join(f'{t:.3f} s' for t in of.model_changes)
@@ -471,9 +509,21 @@ def _learning_lines(of: Metrics) -> Iterator[str]:
         yield f'rejected    {columns}: the motion does not tell them from the other columns'
     if math.isnan(of.final_parameter_error):
         return
-    what = 'model       torque error of the learned model' if of.of_torques else 'parameters  error'
-    known = [(f'{t} s', error) for t, error in of.parameter_error.items() if not math.isnan(error)]
-    moments = (f'{t} {100 * e:.3g} %' for t, e in (*known, ('end', of.final_parameter_error)))
+    what = (
+        'model       torque error of the learned model'
+        if of.of_torques
+        else 'parameters  error'
+    )
+    known = [
+        (f'{t} s', error)
+        for t, error in of.parameter_error.items()
+        if not math.isnan(error)
+    ]
+    moments = (
+        f'{t} {100 * e:.3g} %' for t, e in (*known, ('end', of.final_parameter_error))
+    )
     settled = of.time_to_1_percent
-    ending = 'not below 1 %' if math.isnan(settled) else f'below 1 % from {settled:.3f} s on'
+    ending = (
+        'not below 1 %' if math.isnan(settled) else f'below 1 % from {settled:.3f} s on'
+    )
     yield f'{what} {", ".join(moments)}; {ending}'

@@ -41,7 +41,15 @@ MUTED = '#6B7280'
 SHADE = '#DCE9F5'
 ALARM = '#B3001B'
 
-GROUPS = ('Motion', 'Tracking', 'Torque', 'Parameters', 'Disturbance', 'Excitation', 'Monitors')
+GROUPS = (
+    'Motion',
+    'Tracking',
+    'Torque',
+    'Parameters',
+    'Disturbance',
+    'Excitation',
+    'Monitors',
+)
 _STOPPED = GROUPS[:3]
 _CHANGED = ('Tracking', 'Parameters')
 _LEARNING = GROUPS[3:]
@@ -89,7 +97,8 @@ class Panel:
     note: str = ''  # only if a single run is shown
     log: bool = False
     marks: tuple[Mark, ...] = ()
-    span: float = 0.0  # limit of the axis in pictures, in both directions; 0: everything
+    # limit of the axis in pictures, in both directions; 0: everything
+    span: float = 0.0
 
 
 @np.errstate(over='ignore', invalid='ignore')  # a bag may hold any number
@@ -107,9 +116,16 @@ def panels(runs: Sequence[Run], begin: float = -inf, end: float = inf) -> list[P
             marks = (*marks, *(stops if panel.group in _STOPPED else ()))
             if panel.group in _CHANGED:
                 texts = (changed.pop(panel.group, ''), *[''] * len(changes))  # once
-                marks = (*marks, *(Mark(*each, INK) for each in zip(changes, texts, strict=False)))
-            marks = tuple(mark._replace(run=k) for mark in marks if begin <= mark.time <= end)
-            lines = tuple(_drawn(line, begin, end)._replace(run=k) for line in panel.lines)
+                marks = (
+                    *marks,
+                    *(Mark(*each, INK) for each in zip(changes, texts, strict=False)),
+                )
+            marks = tuple(
+                mark._replace(run=k) for mark in marks if begin <= mark.time <= end
+            )
+            lines = tuple(
+                _drawn(line, begin, end)._replace(run=k) for line in panel.lines
+            )
             before = found.get((panel.group, panel.title))
             found[panel.group, panel.title] = replace(
                 panel,
@@ -124,7 +140,9 @@ def panels(runs: Sequence[Run], begin: float = -inf, end: float = inf) -> list[P
 
 def _drawn(line: Line, begin: float, end: float) -> Line:
     """Return what is drawn of a line: between two times, finite, thinned without losing a peak."""
-    shown = slice(np.searchsorted(line.time, begin), np.searchsorted(line.time, end, side='right'))
+    shown = slice(
+        np.searchsorted(line.time, begin), np.searchsorted(line.time, end, side='right')
+    )
     time, values = line.time[shown], line.values[shown]
     values = np.where(np.abs(values) < _LARGEST, values, np.nan)
     changes = np.flatnonzero(np.diff(values) != 0.0)
@@ -135,7 +153,9 @@ def _drawn(line: Line, begin: float, end: float) -> Line:
     return line._replace(time=time, values=values)
 
 
-def envelope(time: Floats, values: Floats, pieces: int = PIECES) -> tuple[Floats, Floats]:
+def envelope(
+    time: Floats, values: Floats, pieces: int = PIECES
+) -> tuple[Floats, Floats]:
     """Return the lowest and highest sample of each piece of a series (N,), in order of time.
 
     NaN is unknown; a piece without known values stays a gap. A series of at most two samples per
@@ -165,7 +185,8 @@ def _stops(run: Run) -> Iterator[Mark]:
 def _motion(run: Run) -> Iterator[Panel]:
     t = run.time
     for i, joint in enumerate(run.joints):
-        position, reference = run.column('position', i), run.column('reference', i)
+        position = run.column('position', i)
+        reference = run.column('reference', i)
         lines = [Line('measured', t, np.asarray(position))]
         if reference is not None:
             lines.append(Line('reference', t, reference, INK, dashed=True))
@@ -173,7 +194,8 @@ def _motion(run: Run) -> Iterator[Panel]:
         error = run.column('error', i)
         if error is not None:
             yield _error(run, t, i, 1e3 * error)
-        torque, limit = run.column('torque', i), run.column('torque_limit', i)
+        torque = run.column('torque', i)
+        limit = run.column('torque_limit', i)
         if torque is None or np.isnan(torque).all():
             continue
         lines = [Line('torque', t, torque)]
@@ -188,15 +210,19 @@ def _motion(run: Run) -> Iterator[Panel]:
 
 
 def _error(run: Run, t: Floats, i: int, error: Floats) -> Panel:
-    lines, marks, note = [Line('error', t, error)], [], ''
-    bound, violated = run.column('bound', i), outside(run, i)
+    lines = [Line('error', t, error)]
+    marks = []
+    note = ''
+    bound = run.column('bound', i)
+    violated = outside(run, i)
     if bound is not None and violated is not None:
         lines.append(Line('bound', t, 1e3 * bound, MUTED, True, True, True))  # noqa: FBT003
         first = t[violated][:1].tolist()
         marks = [Mark(time, f'outside from {time:.3f} s', ALARM) for time in first]
     if not np.isnan(error).all():
         note = f'max {np.nanmax(np.abs(error)):.3g}, rms {rms(error):.3g}'
-    title, span = f'error of {run.joints[i]}', _span(bound, error)
+    title = f'error of {run.joints[i]}'
+    span = _span(bound, error)
     return Panel('Tracking', title, 'mrad', lines, note, marks=tuple(marks), span=span)
 
 
@@ -236,9 +262,13 @@ def _learning(run: Run) -> Iterator[Panel]:
         for j, name in enumerate(estimates.names):
             lines = [Line('estimate', estimates.time, estimates.estimate[:, j])]
             if estimates.true is not None:
-                lines.append(Line('true', estimates.time, estimates.true[:, j], INK, dashed=True))
+                lines.append(
+                    Line('true', estimates.time, estimates.true[:, j], INK, dashed=True)
+                )
             yield Panel('Parameters', name, 'kg m²', lines)
-    yield Panel('Disturbance', 'disturbance estimates', 'N m', _disturbances(run, run.monitor))
+    yield Panel(
+        'Disturbance', 'disturbance estimates', 'N m', _disturbances(run, run.monitor)
+    )
 
 
 def _disturbances(run: Run, learning: Series) -> Iterator[Line]:
@@ -246,7 +276,9 @@ def _disturbances(run: Run, learning: Series) -> Iterator[Line]:
         if name.startswith(DISTURBANCE):
             yield from _column(run, learning, name, name.removeprefix(DISTURBANCE))
             if run.arm is None:  # else it includes the learned friction
-                yield from _column(run, run.truth, name, 'true', colour=INK, dashed=True)
+                yield from _column(
+                    run, run.truth, name, 'true', colour=INK, dashed=True
+                )
 
 
 def _of_links(arm: LearnedArm, estimates: Estimates) -> Panel:
@@ -254,7 +286,9 @@ def _of_links(arm: LearnedArm, estimates: Estimates) -> Panel:
     bodies = bodies_of(estimates.names)
     prior = np.array([arm.deviations[name] for name in estimates.names])
     off = errors_of_bodies(bodies, estimates.estimate, estimates.true, prior)
-    lines = [Line(body, estimates.time, each) for body, each in zip(bodies, off, strict=True)]
+    lines = [
+        Line(body, estimates.time, each) for body, each in zip(bodies, off, strict=True)
+    ]
     what = 'changes' if estimates.true is None else 'errors'
     return Panel('Parameters', f'{what} of the estimates, by link', '% of prior', lines)
 
@@ -269,11 +303,16 @@ def _relative_error(estimates: Estimates) -> Panel:
 
 def _monitors(run: Run) -> Iterator[Panel]:
     latched = latch_time(run)
-    note = 'learning never began' if isnan(latched) else f'learning from {latched:.4g} s on'
+    note = (
+        'learning never began'
+        if isnan(latched)
+        else f'learning from {latched:.4g} s on'
+    )
     note = note if run.learns else 'not used by this law'
     title = 'minimum eigenvalue of Φ'
     excitation = [
-        line._replace(values=np.where(line.values > 0.0, line.values, np.nan))  # 0: no update yet
+        # 0: no update yet
+        line._replace(values=np.where(line.values > 0.0, line.values, np.nan))
         for line in _column(run, run.monitor, LAMBDA_MIN, title)
     ]
     yield Panel('Excitation', title, '', excitation, note, log=True)
@@ -283,18 +322,24 @@ def _monitors(run: Run) -> Iterator[Panel]:
 
 def _lyapunov(run: Run, monitor: Series) -> Panel:
     """Return the panel of V (29) and its terms."""
-    V = Line('V', run.time_of(monitor.stamp), monitor.select(LYAPUNOV_TERMS).sum(axis=1), INK)
+    V = Line(
+        'V', run.time_of(monitor.stamp), monitor.select(LYAPUNOV_TERMS).sum(axis=1), INK
+    )
     terms = [
         line
         for term in LYAPUNOV_TERMS
         for line in _column(run, monitor, term, term.removeprefix(LYAPUNOV))
         if np.any(line.values > 0.0)
     ]
-    lines = [line._replace(values=np.maximum(line.values, _LEAST)) for line in (*terms, V)]
+    lines = [
+        line._replace(values=np.maximum(line.values, _LEAST)) for line in (*terms, V)
+    ]
     return Panel('Monitors', 'V (29) and its terms', 'J', lines, log=True)
 
 
-def _column(run: Run, series: Series | None, column: str, name: str, **style: Any) -> list[Line]:
+def _column(
+    run: Run, series: Series | None, column: str, name: str, **style: Any
+) -> list[Line]:
     """Return a column as one line, if there is one."""
     if series is None or column not in series.names:
         return []

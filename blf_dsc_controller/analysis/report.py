@@ -25,7 +25,7 @@ from blf_dsc_controller.analysis.metrics import (
 from blf_dsc_controller.analysis.panels import COLOURS, INK, PIECES, Panel, panels
 from blf_dsc_controller.bags.content import NO_NAMES, Content, NameMap, read_content
 from blf_dsc_controller.bags.reader import recorded_run
-from blf_dsc_controller.errors import MissingExtraError
+from blf_dsc_controller.extras import import_extra
 from blf_dsc_controller.messages.codecs import typestore
 from blf_dsc_controller.messages.topics import DIAGNOSTICS
 from blf_dsc_controller.run import Floats, Run
@@ -43,7 +43,10 @@ _TEMPLATES = Environment(
     trim_blocks=True,
     lstrip_blocks=True,
 )
-_TEMPLATES.policies['json.dumps_kwargs'] = {'allow_nan': False, 'separators': (',', ':')}
+_TEMPLATES.policies['json.dumps_kwargs'] = {
+    'allow_nan': False,
+    'separators': (',', ':'),
+}
 _TEMPLATES.filters['anchor'] = lambda title: title.lower().replace(' ', '-')
 _TEMPLATES.filters['embedded'] = lambda png: (
     f'data:image/png;base64,{base64.b64encode(png.read_bytes()).decode("ascii")}'
@@ -84,7 +87,9 @@ def read_bag(path: Path, namespace: str = '', names: NameMap = NO_NAMES) -> Repo
         for parameter, value in sorted(values.items())
     }
     name = '/'.join(path.resolve().parts[-2:])
-    return ReportedBag(name, run, content, parameters, sorted(events, key=itemgetter(0)))
+    return ReportedBag(
+        name, run, content, parameters, sorted(events, key=itemgetter(0))
+    )
 
 
 def _events(run: Run) -> Iterator[Happened]:
@@ -98,18 +103,27 @@ def _events(run: Run) -> Iterator[Happened]:
     for i, joint in enumerate(run.joints):
         violated = outside(run, i)
         if violated is not None:
-            yield from _intervals(run, violated, 'violation', joint, 'outside its bound')
-        torque, limit = run.column('torque', i), run.column('torque_limit', i)
+            yield from _intervals(
+                run, violated, 'violation', joint, 'outside its bound'
+            )
+        torque = run.column('torque', i)
+        limit = run.column('torque_limit', i)
         if torque is not None and limit is not None:
             limited = np.abs(torque) >= _AT_LIMIT * limit
-            yield from _intervals(run, limited, 'saturation', joint, 'at its torque limit')
+            yield from _intervals(
+                run, limited, 'saturation', joint, 'at its torque limit'
+            )
 
 
-def _intervals(run: Run, holds: np.ndarray, kind: str, joint: str, what: str) -> Iterator[Happened]:
+def _intervals(
+    run: Run, holds: np.ndarray, kind: str, joint: str, what: str
+) -> Iterator[Happened]:
     edges = np.flatnonzero(np.diff(holds, prepend=False, append=False))
     begins, ends = edges[::2], edges[1::2]
     times = run.time_of(run.stamp[begins])
-    for time, begin, end in list(zip(times, begins, ends, strict=True))[:_MOST_OF_A_KIND]:
+    for time, begin, end in list(zip(times, begins, ends, strict=True))[
+        :_MOST_OF_A_KIND
+    ]:
         yield (float(time), kind, f'{joint} {what} for {end - begin} samples')
     if begins.size > _MOST_OF_A_KIND:
         text = f'{joint}: {begins.size - _MOST_OF_A_KIND} more intervals, not listed'
@@ -120,7 +134,7 @@ def _diagnosed(content: Content, run: Run) -> Iterator[Happened]:
     """Yield each change of a level or message, at the time of the last sample received."""
     shown: dict[str, tuple[int, str]] = {}
     messages = content.topics.get(DIAGNOSTICS)
-    for received, raw in zip(messages.received, messages.raw, strict=True) if messages else ():
+    for received, raw in messages.raw() if messages else ():
         message: Any = typestore().deserialize_cdr(raw, DIAGNOSTICS.type)
         k = int(np.searchsorted(run.received, received)) - 1
         time = float(run.time[max(k, 0)])
@@ -136,7 +150,9 @@ def _changed(content: Content, run: Run) -> Iterator[Happened]:
     """Yield each change of the simulated plant's parameters during the run."""
     for change in content.changes:
         time = (change['stamp'] - int(run.stamp[0])) * 1e-9
-        for parameter, value in () if change.get('configured') else change['parameters'].items():
+        for parameter, value in (
+            () if change.get('configured') else change['parameters'].items()
+        ):
             yield (time, 'plant', f'{parameter}: {_shown(value)}')
 
 
@@ -149,12 +165,11 @@ def _shown(value: object) -> str:
 
 def write_report(bags: Sequence[ReportedBag], path: Path) -> None:
     """Write the page of some bags; raises MissingExtraError without plotly."""
-    try:
-        from plotly.offline import get_plotlyjs
-    except ImportError:
-        raise MissingExtraError('plotly', 'report', 'the page') from None
+    plotly = import_extra('plotly.offline', 'report', 'the page')
     events = sorted(
-        (time, k, kind, text) for k, bag in enumerate(bags) for time, kind, text in bag.events
+        (time, k, kind, text)
+        for k, bag in enumerate(bags)
+        for time, kind, text in bag.events
     )
     parameters = []  # name, value in each bag, and whether these differ
     for name in dict.fromkeys(name for bag in bags for name in bag.parameters):
@@ -172,7 +187,7 @@ def write_report(bags: Sequence[ReportedBag], path: Path) -> None:
             'seconds': max(bag.run.duration for bag in bags),
         },
         pieces=PIECES,
-        plotly=get_plotlyjs(),
+        plotly=plotly.get_plotlyjs(),
         colours=[_colour(k) for k in range(len(bags))],
         events=events,
         alarming=_ALARMING,
@@ -214,14 +229,20 @@ def _traces(panel: Panel, prefixes: Sequence[str]) -> Iterator[dict[str, Any]]:
                 'name': (prefixes[line.run] if prefixes else '') + line.name,
                 'x': _numbers(line.time),
                 'y': _numbers(sign * line.values),
-                'line': {'width': 1.3, 'color': shade, 'dash': 'dash' if line.dashed else 'solid'},
+                'line': {
+                    'width': 1.3,
+                    'color': shade,
+                    'dash': 'dash' if line.dashed else 'solid',
+                },
                 # Lines with a colour of their own look the same in all bags.
                 'showlegend': bool(line.name) and sign > 0.0 and not is_known,
             }
 
 
 def _numbers(values: Floats) -> list[float | None]:
-    return [float(f'{y:.{_DIGITS}g}') if np.isfinite(y) else None for y in values.tolist()]
+    return [
+        float(f'{y:.{_DIGITS}g}') if np.isfinite(y) else None for y in values.tolist()
+    ]
 
 
 def _colour(k: int) -> str:

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import json
+from bisect import bisect_right
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
@@ -12,16 +13,22 @@ from pathlib import Path
 from typing import Any
 
 from blf_dsc_controller import __version__
+from blf_dsc_controller.bags.older_parameters import completed, current, known_names
 from blf_dsc_controller.bags.sources import BagError, OpenBag, open_bag
 from blf_dsc_controller.bags.topic_messages import TopicMessages
 from blf_dsc_controller.configuration.controller import ControllerConfig
-from blf_dsc_controller.configuration.schema import build, parameters
+from blf_dsc_controller.configuration.schema import build
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.messages import topics
 from blf_dsc_controller.messages.codecs import typestore
 from blf_dsc_controller.messages.journal import Event, EventType, decode
+from blf_dsc_controller.messages.topics import Topic
 
-_OF_INTEREST = (*(topic for topic in topics.TOPICS if topic is not topics.CLOCK), topics.CHANGES)
+_OF_INTEREST = (
+    *(topic for topic in topics.TOPICS if topic is not topics.CLOCK),
+    topics.CHANGES,
+)
+_MOST_JOURNAL = 1 << 26  # bytes
 _FEW = topics.DIAGNOSTIC.depth  # messages kept by publishers of what is no stream
 
 
@@ -49,7 +56,9 @@ class NameMap:
                 raise _bad_entry(entry, 'a name is given twice')
             side[ours] = theirs
         by_leaf, joints = sides
-        return cls({leaf: '/' + name.lstrip('/') for leaf, name in by_leaf.items()}, joints)
+        return cls(
+            {leaf: '/' + name.lstrip('/') for leaf, name in by_leaf.items()}, joints
+        )
 
     def joints_of(self, joints: Sequence[str]) -> tuple[str, ...]:
         """Return the names that these joints have in the bag.
@@ -88,15 +97,37 @@ class Content:
     @property
     def losses(self) -> dict[str, str]:
         """What is missing in the streams of the loop, which have one publisher each, by topic."""
-        streams = (each for topic, each in self.topics.items() if topic.offered.depth > _FEW)
+        streams = (
+            each for topic, each in self.topics.items() if topic.offered.depth > _FEW
+        )
         return {each.name: each.lost for each in streams if each.lost}
 
     @cached_property
     def events(self) -> list[tuple[int, Event]]:
         """Events of the journal and when they were received [ns]; others' messages are skipped."""
-        journal = self.topics.get(topics.JOURNAL)
-        found = []
-        for received, raw in zip(journal.received, journal.raw, strict=True) if journal else ():
+        found = self._events_on(topics.JOURNAL)
+        targets = self._events_on(topics.TARGETS)
+        if not targets:
+            return found
+        begins = [at for at, event in found if event.type is EventType.CONFIGURE]
+
+        def place(entry: tuple[int, Event]) -> tuple[int, int]:
+            received, event = entry
+            return bisect_right(begins, received), event.number
+
+        return sorted(found + targets, key=place)
+
+    def _events_on(self, topic: Topic) -> list[tuple[int, Event]]:
+        messages = self.topics.get(topic)
+        found: list[tuple[int, Event]] = []
+        size = 0
+        for received, raw in messages.raw() if messages else ():
+            size += len(raw)
+            if size > _MOST_JOURNAL:
+                raise BagError(
+                    f'{self.path}: {messages and messages.name} holds more than '
+                    f'{_MOST_JOURNAL / 1e6:.0f} MB, which no controller publishes there'
+                )
             with suppress(BlfDscError):
                 found.append((received, decode(raw)))
         return found
@@ -106,7 +137,7 @@ class Content:
         """What the plant said of its parameters: all of them first, then each change."""
         changes = self.topics.get(topics.CHANGES)
         found = []
-        for raw in changes.raw if changes else ():
+        for _, raw in changes.raw() if changes else ():
             with suppress(Exception):  # of another node
                 message: Any = typestore().deserialize_cdr(raw, topics.CHANGES.type)
                 found.append({'stamp': 0, 'parameters': {}, **json.loads(message.data)})
@@ -128,16 +159,17 @@ class Content:
     def unknown_parameters(self) -> list[str]:
         """Recorded parameters of the controller that this version does not have."""
         recorded = self.configurations.get(topics.CONTROLLER, {})
-        known = {parameter.name for parameter in parameters(ControllerConfig)}
+        known = known_names(recorded)
         return [name for name in recorded if name not in known]
 
     def controller_config(self, *, exactly: bool = False) -> ControllerConfig:
         """Return the configuration of the controller as first recorded.
 
-        Unknown parameters are left out, or an error if it should be `exactly` as recorded.
+        Unknown parameters are left out. If it should be `exactly` as recorded, only those that had
+        no effect are.
 
         Raises:
-            BagError: the bag holds none.
+            BagError: the bag holds none, or a parameter without which the law may act differently.
             ConfigurationError: this version of the package cannot run the configuration.
         """
         values = self.configurations.get(topics.CONTROLLER)
@@ -149,9 +181,11 @@ class Content:
         source = f'{self.path}, {topics.JOURNAL.resolved}'
         if self.version != __version__:
             source += f' by version {self.version or "unknown"}, not {__version__}'
-        left_out = () if exactly else self.unknown_parameters
+        if exactly:
+            return build(ControllerConfig, completed(current(values, source)), source)
+        left_out = self.unknown_parameters
         given = {name: value for name, value in values.items() if name not in left_out}
-        return build(ControllerConfig, given, source)
+        return build(ControllerConfig, completed(given), source)
 
 
 def read_content(path: Path, namespace: str = '', names: NameMap = NO_NAMES) -> Content:
@@ -165,10 +199,14 @@ def read_content(path: Path, namespace: str = '', names: NameMap = NO_NAMES) -> 
         if not any(bag.counts.values()):
             raise BagError(f'{path} is empty: it holds no message')
         names = _recorded_names(bag, namespace, names)
-        found = {topic: _find(topic, bag.held, namespace, names) for topic in _OF_INTEREST}
+        found = {
+            topic: _find(topic, bag.held, namespace, names) for topic in _OF_INTEREST
+        }
         states = found[topics.JOINT_STATES]
         if states is None:
-            raise _missing_topic(topics.JOINT_STATES.name, topics.JOINT_STATES.type, bag.held)
+            raise _missing_topic(
+                topics.JOINT_STATES.name, topics.JOINT_STATES.type, bag.held
+            )
         if not bag.counts[states]:
             raise BagError(f'{path} is empty: it holds no message of {states}')
         kept = {
@@ -191,7 +229,9 @@ def _recorded_names(bag: OpenBag, namespace: str, names: NameMap) -> NameMap:
     recorded: dict[str, str] = {}
     with suppress(BlfDscError, StopIteration):
         if journal is not None:
-            recorded = decode(next(bag.messages([journal])).raw).content.get('topics', {})
+            recorded = decode(next(bag.messages([journal])).raw).content.get(
+                'topics', {}
+            )
     own = {leaf: name for leaf, name in recorded.items() if name in bag.held}
     return NameMap({**own, **names.topics}, names.joints)
 
@@ -206,7 +246,11 @@ def _find(
     """
     name = names.topics.get(topic.leaf)
     if name is not None:
-        types = (topic.type, topics.JOINT_STATE) if topic is topics.COMMANDS else (topic.type,)
+        types = (
+            (topic.type, topics.JOINT_STATE)
+            if topic is topics.COMMANDS
+            else (topic.type,)
+        )
         if held.get(name) not in types:
             raise _missing_topic(name, ' or '.join(types), held)
         return name
@@ -214,7 +258,9 @@ def _find(
         return topic.name if held.get(topic.name) == topic.type else None
     prefix = f'/{namespace.strip("/")}/' if namespace.strip('/') else '/'
     candidates = [
-        name for name, type_ in held.items() if type_ == topic.type and name.startswith(prefix)
+        name
+        for name, type_ in held.items()
+        if type_ == topic.type and name.startswith(prefix)
     ]
     for ending in (topic.resolved, f'/{topic.leaf}'):
         fitting = sorted(name for name in candidates if name.endswith(ending))
@@ -230,7 +276,9 @@ def _find(
 
 
 def _missing_topic(wanted: str, type_name: str, held: Mapping[str, str]) -> BagError:
-    listing = ''.join(f'\n  {name} ({type_ or "of unknown type"})' for name, type_ in held.items())
+    listing = ''.join(
+        f'\n  {name} ({type_ or "of unknown type"})' for name, type_ in held.items()
+    )
     named = 'called' if wanted.startswith('/') else 'whose name ends in'
     return BagError(
         f'the bag has no topic {named} {wanted!r} of type {type_name}; it holds:{listing}'

@@ -15,7 +15,8 @@ from numpy.typing import NDArray
 from blf_dsc_controller.bags.content import NO_NAMES, Content, NameMap, read_content
 from blf_dsc_controller.bags.sources import BagError
 from blf_dsc_controller.bags.topic_messages import JointStates, TopicMessages, Values
-from blf_dsc_controller.errors import BlfDscError, MissingExtraError
+from blf_dsc_controller.errors import BlfDscError
+from blf_dsc_controller.extras import import_extra
 from blf_dsc_controller.messages import topics
 from blf_dsc_controller.messages.journal import Event, EventType
 from blf_dsc_controller.run import LearnedArm, Run, Series, Stop
@@ -42,7 +43,9 @@ _VALUES = {  # prefix of names in the vectors: unit
     topics.VELOCITY: 'rad/s',
     topics.DISTANCE: 'rad',
     topics.LYAPUNOV: 'J',
-    **dict.fromkeys((topics.RATIO, topics.LATCHED, topics.MODEL_CHANGES, topics.LATE_STEPS), '1'),
+    **dict.fromkeys(
+        (topics.RATIO, topics.LATCHED, topics.MODEL_CHANGES, topics.LATE_STEPS), '1'
+    ),
     **dict.fromkeys((topics.COMPUTE_TIME, topics.LATENCY, topics.LATENESS), 's'),
 }
 _ROWS = 1 << 14
@@ -62,7 +65,9 @@ def read_run(path: str | Path, namespace: str = '', names: NameMap = NO_NAMES) -
     return recorded_run(read_content(Path(path), namespace, names), np.asarray)
 
 
-def recorded_run(content: Content, loaded: Callable[[Values], Any] = lambda values: values) -> Run:
+def recorded_run(
+    content: Content, loaded: Callable[[Values], Any] = lambda values: values
+) -> Run:
     """Return the run of a bag; errors as for `read_run`.
 
     Its `Values` are read when needed, unless `loaded` reads them into memory.
@@ -86,10 +91,15 @@ def recorded_run(content: Content, loaded: Callable[[Values], Any] = lambda valu
 
     def series(topic: topics.Topic) -> Series | None:
         found = within(topic)
-        return None if found is None else Series(found.names, found.stamp, loaded(found.field(0)))
+        return (
+            None
+            if found is None
+            else Series(found.names, found.stamp, loaded(found.field(0)))
+        )
 
     errors, references, bounds = (
-        within(topic, joints) for topic in (topics.TRACKING_ERROR, topics.REFERENCE, topics.BOUND)
+        within(topic, joints)
+        for topic in (topics.TRACKING_ERROR, topics.REFERENCE, topics.BOUND)
     )
     try:
         _, torques = applied_torque(content, states)
@@ -108,7 +118,9 @@ def recorded_run(content: Content, loaded: Callable[[Values], Any] = lambda valu
     }
     if errors:  # its messages are not decimated: the reference is known at every sample
         known = messages['references'] or states.select(np.full(states.size, -1))
-        arrays['reference'] = Values(known, 0, (states.field(0), messages['errors'].field(0)))
+        arrays['reference'] = Values(
+            known, 0, (states.field(0), messages['errors'].field(0))
+        )
     arrays = {name: values and loaded(values) for name, values in arrays.items()}
     events = [event for at, event in content.events if span[0] <= at < span[1]]
     return Run(
@@ -164,7 +176,8 @@ def single_run(
         int(received[last]) if last < stamp.size else np.iinfo(np.int64).max,
     )
     run = states.select(slice(first, last)).by_stamp()
-    foreign, others = messages.size - stamp.size, stamp.size - (last - first)
+    foreign = messages.size - stamp.size
+    others = stamp.size - (last - first)
     repeated = last - first - run.size
     notes = {
         f'{foreign} of {messages.size} joint states left out: they name other joints': foreign,
@@ -191,7 +204,9 @@ def _alternates(states: JointStates) -> bool:
 def _joints(content: Content) -> tuple[str, ...]:
     """Return the controller's joints in its order; without it, those with other names, or all."""
     sources = (topics.TRACKING_ERROR, topics.REFERENCE, topics.BOUND)
-    of_controller = [content.topics[topic] for topic in sources if topic in content.topics]
+    of_controller = [
+        content.topics[topic] for topic in sources if topic in content.topics
+    ]
     if not of_controller and content.names.joints:
         return tuple(content.names.joints)
     return (*of_controller, content.topics[topics.JOINT_STATES])[0].joint_names()
@@ -212,15 +227,21 @@ def _stops(events: Iterable[Event], first: int) -> Iterator[Stop]:
     ordered = list(events)
     for k, event in enumerate(ordered):
         if event.type is EventType.STOP:
-            starts = [later.stamp for later in ordered[k:] if later.type is EventType.START]
+            starts = [
+                later.stamp for later in ordered[k:] if later.type is EventType.START
+            ]
             what = event.content['reason'], event.content['text']
-            yield Stop(max(event.stamp, first), *what, until=starts[0] if starts else None)
+            yield Stop(
+                max(event.stamp, first), *what, until=starts[0] if starts else None
+            )
 
 
 def _learns(settings: Sequence[Mapping[str, Any]]) -> bool:
     """Return whether the law ever used the prediction error; true if the journal does not say."""
     laws = {values['law'] for values in settings if 'law' in values}
-    weights = [each['learning.weight'] for each in settings if 'learning.weight' in each]
+    weights = [
+        each['learning.weight'] for each in settings if 'learning.weight' in each
+    ]
     return laws <= {'blf_dsc'} and any(weights or [1.0])
 
 
@@ -263,7 +284,9 @@ def next_effort(states: JointStates) -> JointStates:
     return states.select(np.append(np.arange(1, states.size), -1))
 
 
-def _by_joint(content: Content, commands: TopicMessages, joints: tuple[str, ...]) -> JointStates:
+def _by_joint(
+    content: Content, commands: TopicMessages, joints: tuple[str, ...]
+) -> JointStates:
     """Return commands by name; without names, in the order of `joints` or of the joint states."""
     if commands.type == topics.JOINT_STATE:
         return commands.joint_states(joints, ('effort',))
@@ -271,7 +294,9 @@ def _by_joint(content: Content, commands: TopicMessages, joints: tuple[str, ...]
     lists = content.topics[topics.JOINT_STATES].name_lists()
     names = next(names for names in lists if {*joints} <= {*names})
     if others:
-        raise TorqueError(f'{commands.name}: not every message holds the same number of values')
+        raise TorqueError(
+            f'{commands.name}: not every message holds the same number of values'
+        )
     if len(numbers) == len(joints):
         return commands.joint_states(numbers, ('effort',))
     if len(numbers) == len(names):
@@ -347,15 +372,14 @@ def _write_csv(tables: Iterator[dict[str, NDArray[Any]]], path: Path) -> None:
         for k, block in enumerate(tables):
             if k == 0:
                 writer.writerow(block)
-            writer.writerows(zip(*(values.tolist() for values in block.values()), strict=True))
+            writer.writerows(
+                zip(*(values.tolist() for values in block.values()), strict=True)
+            )
 
 
 def _write_parquet(tables: Iterator[dict[str, NDArray[Any]]], path: Path) -> None:
-    try:
-        import pyarrow as pa
-        from pyarrow import parquet
-    except ImportError:
-        raise MissingExtraError('pyarrow', 'parquet', 'writing Parquet') from None
+    pa = import_extra('pyarrow', 'parquet', 'writing Parquet')
+    parquet = import_extra('pyarrow.parquet', 'parquet', 'writing Parquet')
     first = pa.table(next(tables))
     with parquet.ParquetWriter(path, first.schema) as writer:
         writer.write_table(first)

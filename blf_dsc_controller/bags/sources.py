@@ -15,15 +15,16 @@ from io import SEEK_CUR, SEEK_END, BytesIO
 from pathlib import Path
 from struct import Struct
 from typing import Any, BinaryIO, NamedTuple
+from zlib import crc32
 
 from mcap.data_stream import ReadDataStream
 from mcap.opcode import Opcode
 from mcap.records import Channel, Chunk, Schema
-from mcap.stream_reader import get_chunk_data_stream
 from rosbags.interfaces import QosDurability
 from rosbags.rosbag1 import Reader as Ros1Reader
 from rosbags.rosbag2 import Reader
 
+from blf_dsc_controller.bags.unpacking import LARGEST, unpacked
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.messages.codecs import typestore
 
@@ -32,7 +33,6 @@ MAGIC_SIZE = 8
 HEAD = Struct('<BQ')  # opcode and content length, at the start of each record
 _MESSAGE = Struct('<HIQQ')
 _MESSAGE_CODE = int(Opcode.MESSAGE)  # compared for each message: an enumeration is slow
-_LARGEST_CHUNK = 1 << 29  # bytes, unpacked
 _KINDS: dict[int, Any] = {
     Opcode.CHUNK: Chunk,
     Opcode.SCHEMA: Schema,
@@ -73,7 +73,9 @@ class OpenBag:
             self.counts[each.topic] += each.msgcount
             ext: Any = each.ext
             offered = getattr(ext, 'offered_qos_profiles', ())
-            kept = any(qos.durability is QosDurability.TRANSIENT_LOCAL for qos in offered)
+            kept = any(
+                qos.durability is QosDurability.TRANSIENT_LOCAL for qos in offered
+            )
             if kept or getattr(ext, 'latching', False):
                 self.latched.add(each.topic)
         self.times: tuple[int, int] = reader.start_time, reader.end_time
@@ -137,6 +139,8 @@ def next_record(stream: BinaryIO, size: int, kinds: Mapping[int, Any]) -> Any:
     opcode, length = HEAD.unpack(head)
     if stream.tell() + length > size:
         raise ValueError('cut off')
+    if length > LARGEST and (opcode == Opcode.MESSAGE or opcode in kinds):
+        raise ValueError(f'a record has {length} bytes')
     if opcode == Opcode.MESSAGE:
         content = stream.read(length)
         return *_MESSAGE.unpack_from(content), content[_MESSAGE.size :]
@@ -155,15 +159,20 @@ def records_in(chunk: Chunk) -> Iterator[Any]:
 
     A message is a tuple: channel number, sequence number, log time and publish time [ns], content.
     """
-    if chunk.uncompressed_size > _LARGEST_CHUNK:
-        raise ValueError(f'a chunk would unpack to {chunk.uncompressed_size} bytes')
-    stream, size = get_chunk_data_stream(chunk, validate_crc=True)
-    if size != chunk.uncompressed_size:
-        raise ValueError(f'a chunk of {chunk.uncompressed_size} bytes unpacks to {size}')
-    records, at, message = stream.read(size), 0, _MESSAGE.unpack_from
+    size = chunk.uncompressed_size
+    if size > LARGEST:
+        raise ValueError(f'a chunk would unpack to {size} bytes')
+    records = unpacked(chunk.data, chunk.compression, size)
+    if len(records) != size:
+        raise ValueError(f'a chunk of {size} bytes unpacks to {len(records)}')
+    if chunk.uncompressed_crc not in (0, crc32(records)):
+        raise ValueError('a chunk does not match its checksum')
+    at = 0
+    message = _MESSAGE.unpack_from
     while at < size:
         opcode, length = HEAD.unpack_from(records, at)
-        begin, at = at + HEAD.size, at + HEAD.size + length
+        begin = at + HEAD.size
+        at = at + HEAD.size + length
         if at > size:
             raise ValueError('a record does not match its length')
         if opcode == _MESSAGE_CODE:
@@ -181,6 +190,7 @@ def open_bag(path: Path) -> Iterator[OpenBag]:
     Raises:
         BagError: there is no bag, or it is damaged; also raised while it is read.
     """
+    check_regular(path)
     try:
         reader: Any = Ros1Reader(path) if path.suffix == '.bag' else Reader(path)
         with reader:
@@ -188,7 +198,17 @@ def open_bag(path: Path) -> Iterator[OpenBag]:
     except BlfDscError:
         raise
     except Exception as error:  # libraries raise nearly anything on damaged files
-        raise BagError(f'{path} cannot be read as a bag: {_reason(path, error)}') from error
+        raise BagError(
+            f'{path} cannot be read as a bag: {_reason(path, error)}'
+        ) from error
+
+
+def check_regular(path: Path) -> None:
+    """Raise BagError if a file of the bag is a pipe or a device, which might be read for ever."""
+    files = path.iterdir() if path.is_dir() else [path]
+    for file in files:
+        if file.exists() and not (file.is_file() or file.is_dir()):
+            raise BagError(f'{file} is not a regular file, so it is no file of a bag')
 
 
 def _reason(path: Path, error: Exception) -> str:
@@ -199,7 +219,9 @@ def _reason(path: Path, error: Exception) -> str:
     if path.is_dir() and not (path / METADATA).exists():
         text = f'the folder has no {METADATA}'
         if not is_mcap:
-            within = [f'; did you mean {each.parent}?' for each in path.glob(f'*/{METADATA}')]
+            within = [
+                f'; did you mean {each.parent}?' for each in path.glob(f'*/{METADATA}')
+            ]
             return text + min(within, default=': it is not a bag')
         text += ', as after an interrupted recording'
     elif isinstance(error, OSError) or not is_mcap:

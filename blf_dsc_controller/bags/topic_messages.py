@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import os
 import tempfile
-from collections.abc import Collection, Sequence
-from typing import Any
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,12 +30,18 @@ from blf_dsc_controller.messages.topics import FLOAT64_MULTI_ARRAY, JOINT_STATE
 from blf_dsc_controller.run import Floats, Stamps
 
 _BLOCK = 512  # messages decoded at once, which then are in the cache
-_RECENT = 100  # layouts that a message is compared with: more only where no two messages are alike
+# layouts that a message is compared with: more only where no two messages are alike
+_RECENT = 100
 _LAYOUTS = {JOINT_STATE: joint_state_layout, FLOAT64_MULTI_ARRAY: array_layout}
 _UNREADABLE = -1  # instead of a layout
-_LAYOUT, _RECEIVED, _SEQUENCE, _STAMP, _VALUES = range(5)  # columns, the last with all others
+# columns, the last with all others
+_LAYOUT, _RECEIVED, _SEQUENCE, _STAMP, _VALUES = range(5)
+_MOST_NAMES = 20_000  # and fields, of a topic
+_MOST_PLACES = 500_000  # in all layouts of a topic
+_MOST_TEXT = 1 << 24  # bytes of a message that is kept as it is
 _MOST_PUBLISHERS = 10  # of a topic, one after the other or at once
 _NAN = np.float64(np.nan).view(np.int64)
+_TIME = np.dtype([('s', '<i4'), ('ns', '<u4')])
 _ALL = slice(None)
 Rows = slice | NDArray[np.intp]
 
@@ -60,16 +66,23 @@ class Values:
     """
 
     def __init__(
-        self, states: JointStates, field: int, difference: tuple[Values, Values] | None = None
+        self,
+        states: JointStates,
+        field: int,
+        difference: tuple[Values, Values] | None = None,
     ) -> None:
-        self._states, self._field, self._difference = states, field, difference
+        self._states = states
+        self._field = field
+        self._difference = difference
 
     def __getitem__(self, key: Any) -> Floats:
         rows, columns = key if isinstance(key, tuple) else (key, _ALL)
         states = self._states.select(rows)
         joints = np.arange(len(states.names))[columns]
         values = np.empty((joints.size, states.size))
-        for row, j in zip(values, states.places[self._field, joints.ravel()].tolist(), strict=True):
+        for row, j in zip(
+            values, states.places[self._field, joints.ravel()].tolist(), strict=True
+        ):
             row[:] = states.messages.column(j, states.number).view(float)
         values = values.T if joints.ndim else values[0]
         if self._difference is not None and np.isnan(values).any():
@@ -96,8 +109,11 @@ class JointStates:
 
         Their positions, velocities and efforts are in the columns `places` (3, n), -1 if unknown.
         """
-        self.names, self.size = tuple(names), number.size
-        self.messages, self.places, self.number = messages, places, number
+        self.names = tuple(names)
+        self.size = number.size
+        self.messages = messages
+        self.places = places
+        self.number = number
 
     @property
     def received(self) -> Stamps:
@@ -141,33 +157,46 @@ class JointStates:
 
     def held(self, stamp: Stamps) -> JointStates:
         """Return the last states at or before these stamps, else the first."""
-        return self.select(np.maximum(np.searchsorted(self.stamp, stamp, side='right') - 1, 0))
+        return self.select(
+            np.maximum(np.searchsorted(self.stamp, stamp, side='right') - 1, 0)
+        )
+
+
+class _Block(NamedTuple):
+    """Messages one after the other in the file, column by column."""
+
+    offset: int  # bytes
+    size: int  # messages
+    rows: Mapping[int, int]  # where each column is that the block has
 
 
 class TopicMessages:
     """All messages of one topic: the numbers of known types in a file, others as bytes.
 
-    The file has blocks of messages, each column by column: one for each name and field so far.
+    The file has blocks of messages, with a column for each name and field of its own messages.
 
     Attributes:
         name, type: of the topic.
         size: number of messages.
-        raw: messages of other types, which are few.
-        received: when those were received [ns].
     """
 
     def __init__(self, name: str, type_name: str) -> None:
-        self.name, self.type, self.size = name, type_name, 0
-        self.raw: list[bytes] = []
-        self.received: list[int] = []
+        self.name = name
+        self.type = type_name
+        self.size = 0
         self._file = tempfile.TemporaryFile()  # noqa: SIM115 - closed below
-        self._blocks: list[tuple[int, int, int]] = []  # offset [bytes], columns, messages
-        self._waiting: list[tuple[int, BagMessage]] = []  # with the number of the layout
+        self._blocks: list[_Block] = []
+        # with the number of the layout
+        self._waiting: list[tuple[int, BagMessage]] = []
         self._layouts: list[Layout] = []
         self._columns: dict[tuple[str, str], int] = {}  # by field and name
         self._last = _UNREADABLE  # layout of the last message
         self._unreadable: dict[int, MessageError] = {}
-        self._next: list[int] = []  # sequence number of each publisher, that of the last one last
+        self._places = 0
+        # received [ns], offset, size [bytes]
+        self._kept: list[tuple[int, int, int]] = []
+        # sequence number of each publisher, that of the last one last
+        self._next: list[int] = []
         self._missed = self._before = 0
 
     def __del__(self) -> None:
@@ -178,8 +207,7 @@ class TopicMessages:
         if message.sequence:
             self._count(message.sequence)
         if self.type not in _LAYOUTS:
-            self.raw.append(message.raw)
-            self.received.append(message.received)
+            self._keep(message)
         else:
             if self._last < 0 or not self._layouts[self._last].fits(message.raw):
                 self._last = self._layout_of(message.raw)
@@ -188,12 +216,31 @@ class TopicMessages:
                 self._flush()
         self.size += 1
 
+    def _keep(self, message: BagMessage) -> None:
+        """Keep a message as it is."""
+        size = len(message.raw)
+        if size > _MOST_TEXT:
+            raise BagError(
+                f'a message of {self.name} has {size / 1e6:.0f} MB, more than '
+                f'{_MOST_TEXT / 1e6:.0f}: the bag is damaged or was not recorded from this topic'
+            )
+        self._kept.append((message.received, self._file.tell(), size))
+        self._file.write(message.raw)
+
+    def raw(self) -> Iterator[tuple[int, bytes]]:
+        """Yield when each message of another type was received [ns], and the message."""
+        self._file.flush()
+        for received, offset, size in self._kept:
+            yield received, os.pread(self._file.fileno(), size, offset)
+
     def _count(self, sequence: int) -> None:
         """Count the messages that are missing before the one with this number."""
         if self._next and self._next[-1] == sequence:
             self._next[-1] += 1
         elif len(self._next) <= _MOST_PUBLISHERS:
-            expected = max((number for number in self._next if number <= sequence), default=0)
+            expected = max(
+                (number for number in self._next if number <= sequence), default=0
+            )
             if expected:
                 self._next.remove(expected)
                 self._missed += sequence - expected
@@ -206,7 +253,11 @@ class TopicMessages:
         """How many messages are missing, by their numbers; empty if none, or if unknown."""
         if len(self._next) > _MOST_PUBLISHERS or not self._missed + self._before:
             return ''
-        earlier = f', {self._before} sent before the recorder connected' if self._before else ''
+        earlier = (
+            f', {self._before} sent before the recorder connected'
+            if self._before
+            else ''
+        )
         return f'{self._missed} missed{earlier}'
 
     def _layout_of(self, raw: bytes) -> int:
@@ -218,46 +269,81 @@ class TopicMessages:
         except MessageError as error:
             self._unreadable[self.size] = error
             return _UNREADABLE
+        self._places += len(layout.places)
+        names = self._columns.keys() | layout.places.keys()
+        if len(names) > _MOST_NAMES or self._places > _MOST_PLACES:
+            raise BagError(
+                f'{self.name} has {len(names)} names and fields in {len(self._layouts) + 1} lists: '
+                'these are no states of one robot'
+            )
         for key in layout.places:
             self._columns.setdefault(key, _VALUES + len(self._columns))
         self._layouts.append(layout)
         return len(self._layouts) - 1
 
     def _flush(self) -> None:
-        """Decode the messages added last."""
-        waiting, self._waiting = self._waiting, []
+        """Decode the messages added last, and write their block."""
+        waiting = self._waiting
+        self._waiting = []
         if not waiting:
             return
-        columns = np.full((_VALUES + len(self._columns), len(waiting)), _NAN)
-        columns[_LAYOUT] = [k for k, _ in waiting]
-        columns[_RECEIVED] = [message.received for _, message in waiting]
-        columns[_SEQUENCE] = [message.sequence for _, message in waiting]
-        for k in {k for k, _ in waiting} - {_UNREADABLE}:
-            rows, layout = np.flatnonzero(columns[_LAYOUT] == k), self._layouts[k]
-            joined = b''.join([message.raw for of, message in waiting if of == k])
-            if self.type == JOINT_STATE:
-                kind = np.dtype([('s', '<i4'), ('ns', '<u4')])
-                stamp = np.ndarray(rows.size, kind, joined, STAMP_OFFSET, (layout.size,))
-                columns[_STAMP, rows] = stamp['s'].astype(np.int64) * NANOSECONDS + stamp['ns']
-            grid = (rows.size, (layout.size - ORIGIN) // 8), '<i8', joined, ORIGIN, (layout.size, 8)
-            values = np.ndarray(*grid)
-            for key, place in layout.places.items():
-                columns[self._columns[key], rows] = values[:, place]
-        self._blocks.append((self._file.tell(), *columns.shape))
-        self._file.write(columns.tobytes())
+        used = {k for k, _ in waiting} - {_UNREADABLE}
+        rows = self._rows_of(used)
+        block = np.full((len(rows), len(waiting)), _NAN)
+        block[_LAYOUT] = [k for k, _ in waiting]
+        block[_RECEIVED] = [message.received for _, message in waiting]
+        block[_SEQUENCE] = [message.sequence for _, message in waiting]
+        for k in used:
+            raw = [message.raw for of, message in waiting if of == k]
+            where = np.flatnonzero(block[_LAYOUT] == k)
+            self._decode(self._layouts[k], b''.join(raw), block, rows, where)
+        self._blocks.append(_Block(self._file.tell(), len(waiting), rows))
+        self._file.write(block.tobytes())
         self._file.flush()
+
+    def _rows_of(self, layouts: Collection[int]) -> Mapping[int, int]:
+        """Return the row in a block of each column that messages of these layouts have."""
+        columns = set(range(_VALUES))
+        for k in layouts:
+            columns.update(self._columns[key] for key in self._layouts[k].places)
+        rows = {column: row for row, column in enumerate(sorted(columns))}
+        if self._blocks and self._blocks[-1].rows == rows:
+            return self._blocks[-1].rows
+        return rows
+
+    def _decode(
+        self,
+        layout: Layout,
+        joined: bytes,
+        block: NDArray[np.int64],
+        rows: Mapping[int, int],
+        where: NDArray[np.intp],
+    ) -> None:
+        """Decode the joined messages of one layout into a block, at their places (k,) in it."""
+        if self.type == JOINT_STATE:
+            strides = (layout.size,)
+            stamp = np.ndarray(where.shape, _TIME, joined, STAMP_OFFSET, strides)
+            seconds = stamp['s'].astype(np.int64)
+            block[_STAMP, where] = seconds * NANOSECONDS + stamp['ns']
+        shape = (where.size, (layout.size - ORIGIN) // 8)
+        values = np.ndarray(shape, '<i8', joined, ORIGIN, (layout.size, 8))
+        for key, place in layout.places.items():
+            block[rows[self._columns[key]], where] = values[:, place]
 
     def column(self, j: int, number: NDArray[np.int32]) -> NDArray[np.int64]:
         """Return a column of messages by number; NaN where a message or its column is unknown."""
         self._flush()
-        found, known = np.full(number.size, _NAN), number >= 0
+        found = np.full(number.size, _NAN)
+        known = number >= 0
         if j < 0 or not known.any():
             return found
-        first, last = number[known].min() // _BLOCK, number.max() // _BLOCK + 1
+        first = number[known].min() // _BLOCK
+        last = number.max() // _BLOCK + 1
         values = np.full((last - first, _BLOCK), _NAN)
-        for block, (offset, columns, size) in zip(values, self._blocks[first:last], strict=True):
-            if j < columns:
-                os.preadv(self._file.fileno(), [block[:size].data], offset + 8 * size * j)
+        for row, block in zip(values, self._blocks[first:last], strict=True):
+            if j in block.rows:
+                at = block.offset + 8 * block.size * block.rows[j]
+                os.preadv(self._file.fileno(), [row[: block.size].data], at)
         found[known] = values.ravel()[number[known] - first * _BLOCK]
         return found
 
@@ -283,17 +369,26 @@ class TopicMessages:
                 problems[k] = error
         last = len(self._layouts)  # of what has no layout
         is_read = np.array([k not in problems for k in range(last)] + [False])
-        is_bad = np.array([not _is_foreign(problems.get(k), names) for k in range(last)] + [True])
+        is_bad = np.array(
+            [not _is_foreign(problems.get(k), names) for k in range(last)] + [True]
+        )
         layouts = self.column(_LAYOUT, np.arange(self.size, dtype=np.int32))
         number = np.flatnonzero(is_read[layouts]).astype(np.int32)
-        bad = np.flatnonzero((is_bad & ~is_read)[layouts]) if number.size else range(self.size)
-        found = {k: self._unreadable.get(k) or problems[layouts[k]] for k in map(int, bad)}
+        bad = (
+            np.flatnonzero((is_bad & ~is_read)[layouts])
+            if number.size
+            else range(self.size)
+        )
+        found = {
+            k: self._unreadable.get(k) or problems[layouts[k]] for k in map(int, bad)
+        }
         if found and (errors is None or not number.size):
             raise UnreadableMessageError(self.name, *min(found.items()))
         if errors is not None:
             errors.update(found)
         places = [
-            [self._columns.get((field, name), -1) for name in names] for field in JOINT_STATE_FIELDS
+            [self._columns.get((field, name), -1) for name in names]
+            for field in JOINT_STATE_FIELDS
         ]
         return JointStates(self, names, np.array(places, np.intp), number)
 
@@ -307,7 +402,9 @@ class TopicMessages:
         """Return the longest list of names in a message; UnreadableMessageError if it is empty."""
         names = max(self.name_lists(), key=len)
         if not names:
-            unnamed = MessageError('it names no joint, so its values cannot be assigned to joints')
+            unnamed = MessageError(
+                'it names no joint, so its values cannot be assigned to joints'
+            )
             raise UnreadableMessageError(self.name, 0, unnamed)
         return names
 

@@ -1,42 +1,21 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Writer of bags like those of `ros2 bag record`: a folder of metadata.yaml and MCAP files.
-
-It also makes a clean bag of a damaged one, which is only read. Every chunk whose checksum matches
-is kept. After a record that cannot be read, the next chunk is where the index at the end of the
-file says; without that index, as after a kill, the rest is lost.
-"""
+"""Writer of bags like those of `ros2 bag record`: a folder of metadata.yaml and MCAP files."""
 
 from __future__ import annotations
 
-from collections import Counter
-from collections.abc import Iterator, Sequence
-from contextlib import AbstractContextManager, suppress
+from collections.abc import Sequence
+from contextlib import AbstractContextManager
 from dataclasses import asdict, dataclass
-from io import SEEK_END
 from math import inf
 from pathlib import Path
-from struct import Struct
 from time import monotonic
-from typing import Any, BinaryIO, NamedTuple
-from zlib import crc32
+from typing import Any
 
 import yaml
-from mcap import records
-from mcap.opcode import Opcode
-from mcap.records import Channel, Chunk, ChunkIndex, DataEnd, Schema, Statistics
-from mcap.summary import Summary
 from mcap.writer import CompressionType, Writer
-from zstandard import FRAME_HEADER, ZstdDecompressor
 
 from blf_dsc_controller import __version__
-from blf_dsc_controller.bags.sources import (
-    MAGIC_SIZE,
-    METADATA,
-    BagError,
-    next_record,
-    records_in,
-)
-from blf_dsc_controller.configuration.files import load_yaml
+from blf_dsc_controller.bags.sources import METADATA, BagError
 from blf_dsc_controller.messages.codecs import NANOSECONDS, Definition, definition
 from blf_dsc_controller.messages.topics import FOREVER, Quality
 
@@ -57,7 +36,8 @@ class _File:
 
 def _period(files: Sequence[_File]) -> dict[str, Any]:
     """Return the time from the first message to the last, as rosbag2 writes it."""
-    start, end = min(file.start for file in files), max(file.end for file in files)
+    start = min(file.start for file in files)
+    end = max(file.end for file in files)
     return {
         'duration': {'nanoseconds': max(end - start, 0)},
         'starting_time': {'nanoseconds_since_epoch': start},
@@ -68,7 +48,9 @@ def _profile(quality: Quality) -> dict[str, Any]:
     """Return a quality of service as rosbag2 writes it, in its order."""
     profile = {'history': quality.history, **asdict(quality)}
     for name in _DURATIONS:
-        profile[name] = dict(zip(('sec', 'nsec'), divmod(profile[name], NANOSECONDS), strict=True))
+        profile[name] = dict(
+            zip(('sec', 'nsec'), divmod(profile[name], NANOSECONDS), strict=True)
+        )
     return {**profile, 'avoid_ros_namespace_conventions': False}
 
 
@@ -99,7 +81,8 @@ class BagWriter(AbstractContextManager['BagWriter']):
         self.closed = False
         self._compression = CompressionType[compression.upper()]
         self._flush_interval = inf if flush_interval is None else flush_interval
-        self._topics: list[dict[str, Any]] = []  # as in metadata.yaml, with definitions beside
+        # as in metadata.yaml, with definitions beside
+        self._topics: list[dict[str, Any]] = []
         self._definitions: list[Definition] = []
         self._files: list[_File] = []
         try:
@@ -126,7 +109,9 @@ class BagWriter(AbstractContextManager['BagWriter']):
             UnknownTypeError: no definition is given and the type is not one of Jazzy's common ones.
         """
         found = definition(type_name) if known is None else known
-        profiles = [_profile(each) if isinstance(each, Quality) else each for each in offered]
+        profiles = [
+            _profile(each) if isinstance(each, Quality) else each for each in offered
+        ]
         metadata = {
             'name': name,
             'type': type_name,
@@ -185,7 +170,10 @@ class BagWriter(AbstractContextManager['BagWriter']):
     @property
     def message_counts(self) -> dict[str, int]:
         """Messages written so far, by topic."""
-        return {topic['topic_metadata']['name']: topic['message_count'] for topic in self._topics}
+        return {
+            topic['topic_metadata']['name']: topic['message_count']
+            for topic in self._topics
+        }
 
     def __exit__(self, *_: object) -> None:
         self.close()
@@ -194,7 +182,9 @@ class BagWriter(AbstractContextManager['BagWriter']):
         """Begin the next file, with the topics of the previous one."""
         self._files.append(_File(f'{self.path.name}_{len(self._files)}.mcap'))
         self._stream = (self.path / self._files[-1].name).open('xb')
-        self._writer = Writer(self._stream, chunk_size=_CHUNK_SIZE, compression=self._compression)
+        self._writer = Writer(
+            self._stream, chunk_size=_CHUNK_SIZE, compression=self._compression
+        )
         self._writer.start(profile='ros2', library=f'blf_dsc_controller {__version__}')
         self._schemas: dict[str, int] = {}
         self._chunks = 0
@@ -227,7 +217,9 @@ class BagWriter(AbstractContextManager['BagWriter']):
         """Add a topic to the file and return its number, the same in each file."""
         type_name = topic['type']
         if type_name not in self._schemas:
-            schema = self._writer.register_schema(type_name, known.encoding, known.text.encode())
+            schema = self._writer.register_schema(
+                type_name, known.encoding, known.text.encode()
+            )
             self._schemas[type_name] = schema
         metadata = {
             'offered_qos_profiles': _dump(topic['offered_qos_profiles']),
@@ -246,151 +238,3 @@ class BagWriter(AbstractContextManager['BagWriter']):
         self._end_chunk()
         self._writer.finish()  # type: ignore[no-untyped-call]
         self._stream.close()
-
-
-# Recovery.
-
-_END = Struct('<QQI')  # in the footer: begin of the summary and its offsets, and their checksum
-_KINDS: dict[int, Any] = {
-    opcode: getattr(records, opcode.name.title().replace('_', ''))
-    for opcode in Opcode
-    if opcode != Opcode.MESSAGE
-}
-
-
-class Recovery(NamedTuple):
-    """Result of a recovery."""
-
-    messages: dict[str, int]  # in the clean bag, by topic
-    losses: list[str]
-
-
-def recover(path: Path, out: Path) -> Recovery:
-    """Write what a damaged folder or MCAP file still holds to a clean bag `out`.
-
-    Raises:
-        BagError: there is no MCAP file, or `out` exists already.
-    """
-    files = [file for file in (path.glob('*.mcap') if path.is_dir() else [path]) if file.is_file()]
-    if not files:
-        raise BagError(f'{path} cannot be read as a bag: there is no MCAP file to recover')
-    files.sort(key=lambda file: (len(file.name), file.name))  # bag_10 after bag_9
-    with BagWriter(out, flush_interval=None) as bag:
-        losses = [f'{file.name}: {loss}' for file in files for loss in _copied(file, bag)]
-    return Recovery(bag.message_counts, losses)
-
-
-def _copied(path: Path, bag: BagWriter) -> Iterator[str]:
-    """Copy what a damaged file holds to a clean bag, and yield its losses."""
-    handles: dict[int, int] = {}  # by number of the channel; 0 where its topic is unknown
-    found, last, is_closed = Counter[int](), -1, False  # `last`: latest time of a message [ns]
-    with path.open('rb') as stream:
-        size = stream.seek(0, SEEK_END)
-        summary = _summary(stream, size)
-        for record in _records(stream, size, summary):
-            if isinstance(record, tuple):
-                number, sequence, received, published, raw = record
-                found[number] += 1
-                if number not in handles:
-                    handles[number] = _handle(bag, summary, number)
-                if handles[number]:
-                    last = max(last, received)
-                    bag.write(handles[number], _plain(raw), received, published, sequence)
-            elif not isinstance(record, str):
-                _note(record, summary)
-            elif not is_closed:
-                yield record if last < 0 else f'{record}, after {last * 1e-9:.6f} s'
-            is_closed |= isinstance(record, DataEnd)
-    if not is_closed:
-        ends = 'nothing in it could be read' if last < 0 else f'it ends at {last * 1e-9:.6f} s'
-        yield (
-            f'the recording was not closed; {ends}. Later messages are lost: usually the last '
-            '0.1 s before a kill, more if the computer was overloaded or lost power'
-        )
-    if unknown := sum(found[number] for number, handle in handles.items() if not handle):
-        yield f'{unknown} messages of topics whose name or type is unknown'
-    yield from _missing(summary, found)
-
-
-def _note(record: Any, summary: Summary) -> None:
-    """Note a type, a topic, numbers of messages, or the place of a chunk."""
-    if isinstance(record, Schema):
-        summary.schemas[record.id] = record
-    elif isinstance(record, Channel):
-        summary.channels[record.id] = record
-    elif isinstance(record, Statistics):
-        summary.statistics = record
-    elif isinstance(record, ChunkIndex):
-        summary.chunk_indexes.append(record)
-
-
-def _missing(summary: Summary, found: Counter[int]) -> Iterator[str]:
-    """Yield what is missing of the numbers of messages that are stated at the end of a file."""
-    stated = Counter(summary.statistics.channel_message_counts if summary.statistics else ())
-    for number, count in (stated - found).items():
-        topic = summary.channels[number].topic if number in summary.channels else f'{number}'
-        yield f'{count} of {stated[number]} messages of {topic}'
-
-
-def _plain(raw: bytes) -> bytes:
-    """Return a message, which may be compressed by itself: CDR never begins like that."""
-    return ZstdDecompressor().decompress(raw) if raw.startswith(FRAME_HEADER) else raw
-
-
-def _handle(bag: BagWriter, summary: Summary, number: int) -> int:
-    """Return the handle of a channel in the clean bag, 0 if its topic or type is unknown."""
-    channel = summary.channels.get(number)
-    schema = summary.schemas.get(channel.schema_id) if channel else None
-    if channel is None or schema is None:
-        return 0
-    earlier = [*bag.message_counts]  # from other files
-    if channel.topic in earlier:
-        return 1 + earlier.index(channel.topic)
-    hash_, offered = channel.metadata.get('topic_type_hash', ''), None
-    definition = Definition(schema.data.decode(errors='replace'), hash_, schema.encoding)
-    with suppress(yaml.YAMLError):
-        offered = load_yaml(channel.metadata.get('offered_qos_profiles', ''))
-    profiles = offered if isinstance(offered, list) else []
-    return bag.add_topic(channel.topic, schema.name, profiles, definition)
-
-
-def _summary(stream: BinaryIO, size: int) -> Summary:
-    """Return the topics and the index at the end of a file, empty unless they match a checksum.
-
-    Only there are the topics known if the first chunk is damaged.
-    """
-    summary = Summary()
-    with suppress(Exception):  # anything, if the bytes are arbitrary
-        stream.seek(size - MAGIC_SIZE - _END.size)
-        start, _, checksum = _END.unpack(stream.read(_END.size))
-        stream.seek(start)
-        if checksum in (0, crc32(stream.read(size - MAGIC_SIZE - 4 - start))):
-            stream.seek(start)
-            while stream.tell() < size - MAGIC_SIZE:
-                _note(next_record(stream, size, _KINDS), summary)
-    return summary
-
-
-def _records(stream: BinaryIO, size: int, summary: Summary) -> Iterator[Any]:
-    """Yield each record, also those in chunks, and where and why something is none."""
-    starts = [index.chunk_start_offset for index in summary.chunk_indexes]
-    at, chunks = MAGIC_SIZE, set[int]()
-    while at < size:
-        stream.seek(at)
-        end = 0
-        try:
-            record = next_record(stream, size, _KINDS)
-            if record is None or ((starts or chunks) and isinstance(record, tuple)):
-                raise ValueError('no such record belongs here')  # noqa: TRY301
-            end = stream.tell()
-            if not isinstance(record, Chunk):
-                yield record
-            elif hash(record.data) in chunks:
-                yield f'{end - at} bytes at byte {at} (a chunk that the file holds twice)'
-            else:
-                chunks.add(hash(record.data))
-                yield from records_in(record)
-        except Exception as error:  # noqa: BLE001 - anything, if the bytes are arbitrary
-            end = end or min((start for start in starts if start > at), default=size)
-            yield f'{end - at} bytes at byte {at} ({f"{error}" or type(error).__name__})'
-        at = end

@@ -9,28 +9,41 @@ Both together give the exact order of messages and events; what was dropped has 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 
+from blf_dsc_controller.bags.older_parameters import current
 from blf_dsc_controller.bags.sources import BagMessage
 from blf_dsc_controller.bags.topic_messages import JointStates, TopicMessages
 from blf_dsc_controller.configuration.controller import ControllerConfig
-from blf_dsc_controller.configuration.schema import change
+from blf_dsc_controller.configuration.schema import change, parameters
+from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.law.factory import estimate_names
 from blf_dsc_controller.law.telemetry import ControllerTelemetry, Message
 from blf_dsc_controller.messages.codecs import MessageError
 from blf_dsc_controller.messages.journal import Event, EventType
 from blf_dsc_controller.messages.topics import TRACKING_ERROR, Topic
-from blf_dsc_controller.reference.trajectory import Trajectory, TrajectoryError, TrajectoryPoint
+from blf_dsc_controller.reference.retargeting import Target, TrajectoryError
+from blf_dsc_controller.reference.trajectory import (
+    Trajectory,
+    TrajectoryPoint,
+)
 from blf_dsc_controller.run import Floats
-from blf_dsc_controller.supervision.checks import Reason
 from blf_dsc_controller.supervision.guard import Guard
+from blf_dsc_controller.supervision.supervisor import Reason
 
 _UNREADABLE = frozenset(
-    (Reason.BAD_MESSAGE, Reason.JOINT_MISSING, Reason.JOINT_DUPLICATED, Reason.FIELD_MISSING)
+    (
+        Reason.BAD_MESSAGE,
+        Reason.JOINT_MISSING,
+        Reason.JOINT_DUPLICATED,
+        Reason.FIELD_MISSING,
+    )
 )
 _EXTERNAL = (Reason.STATE_TIMEOUT, Reason.FAILED)
 _BLOCK = 4096  # states in memory
+_MOST_TORQUES = 1_000_000  # of the watchdog: an hour without joint states
 
 
 class Rerun:
@@ -41,6 +54,7 @@ class Rerun:
         topics: what its node would have published, received at the stamp of its state.
         samples: number of samples of the law.
         first, last: stamps [ns] of its first and last sample; -1 before the first.
+        answers: number of answers reached.
         passed_over: number of joint states that the controller did not answer.
         departure: in what, and at which stamp [ns], the controller first started, stopped or
             accepted otherwise than the recorded one, which ends the replay.
@@ -53,32 +67,48 @@ class Rerun:
         states: JointStates,
         errors: Mapping[int, MessageError],
         answers: JointStates,
+        commands: int,
     ) -> None:
-        """Start with `config`; `errors` maps the number of each unreadable state to its error."""
+        """Start with `config`; `errors` maps the number of each unreadable state to its error.
+
+        `commands` is the number of torques in the bag.
+        """
         self.events: list[Event] = []
         self.topics: dict[Topic, TopicMessages] = {}
-        self.samples = self.passed_over = 0
-        self.first = self.last = -1
+        self.samples = 0
+        self.passed_over = 0
+        self.answers = 0
+        self.first = -1
+        self.last = -1
         self.departure: tuple[str, int] | None = None
         self.end = ''
         self._guard = Guard(config, lambda: 0, lambda: 0)
         self._guard.journal.pending.clear()
         self._telemetry = ControllerTelemetry(config, estimate_names(config))
         self._states = states
-        self._values, self._loaded = np.empty((0, 3, 0)), range(0)
+        self._values = np.empty((0, 3, 0))
+        self._loaded = range(0)
         # All messages in order: row of the state, or of an error after them, whose stamp is -1.
         numbers = np.append(states.number, np.array([*errors], dtype=np.int64))
         self._row = np.argsort(numbers, kind='stable').astype(np.int32)
         self._stamp = np.append(states.stamp, np.full(len(errors), -1))[self._row]
         self._unreadable = dict(enumerate(errors.values(), states.size))
         self._answered = answers.stamp
+        self._states_stamp = states.stamp
+        self._commands = commands
+        self._numbered = bool(answers.sequence.any())
         self._gap = _first_gap(answers)
-        self._answer = 0  # number of answers reached
         self._position = -1  # of the last message processed or passed over
         self._answered_at = -1  # stamp of the last answer
 
     def run(self, events: Sequence[Event]) -> None:
-        """Process the joint states with the events after the configuration, in order."""
+        """Process the joint states with the events after the configuration, in order.
+
+        Raises:
+            BlfDscError: an event cannot be repeated.
+        """
+        _check(events)
+        self._gap = min(self._gap, self._first_unknown(events))
         for event in events:
             if event.number != len(self.events) + 1:
                 self.end = 'an event of the journal is not in the bag'
@@ -98,6 +128,26 @@ class Rerun:
     def _is_over(self) -> bool:
         return bool(self.end or self.departure)
 
+    def _first_unknown(self, events: Sequence[Event]) -> int:
+        """Return the number of answers before the first that may be missing.
+
+        Answers without sequence numbers are counted by the torques that the journal states. If some
+        are missing, the first state without an answer may have been used as well as dropped.
+        """
+        size = self._answered.size
+        if self._numbered:
+            return size + 1
+        starts = [event.stamp for event in events if event.type is EventType.START]
+        if starts and starts[0] not in self._answered[:1]:
+            return 0
+        if not starts or size >= _commanded_by_states(events, self._commands):
+            return size + 1
+        used = self._states_stamp[self._states_stamp >= starts[0]]
+        unanswered = used[~np.isin(used, self._answered)]
+        if not unanswered.size:
+            return size + 1
+        return int(np.searchsorted(self._answered, unanswered[0]))
+
     # Messages.
 
     def _next(self) -> bool:
@@ -105,16 +155,16 @@ class Rerun:
         if self._guard.journal.pending:  # the controller started or stopped on its own
             self._report_departure(self._guard.journal.pending[0], None)
             return False
-        if self._answer == self._gap:
+        if self.answers == self._gap:
             self.end = f'the recorder missed messages of {TRACKING_ERROR.resolved}'
-        if self._answer >= min(self._gap, self._answered.size):
+        if self.answers >= min(self._gap, self._answered.size):
             return False
-        stamp = int(self._answered[self._answer])
+        stamp = int(self._answered[self.answers])
         k = self._find(stamp)
         if k < 0:
             self.end = f'the state with stamp {stamp} ns was used but is not in the bag'
             return False
-        self._answer += 1
+        self.answers += 1
         commands = self._guard.journal.commands
         self._process(k)
         while stamp == self._answered_at and self._guard.journal.commands == commands:
@@ -157,7 +207,7 @@ class Rerun:
 
     def _reach(self, event: Event) -> None:
         """Process the message in which the controller should start or stop."""
-        if self._answered[self._answer :][:1].tolist() == [event.stamp]:
+        if self._answered[self.answers :][:1].tolist() == [event.stamp]:
             self._next()  # it was answered, at least with a safe torque
         else:
             k = self._find(-1 if _reason(event) in _UNREADABLE else event.stamp)
@@ -187,17 +237,21 @@ class Rerun:
         if row not in self._loaded:
             self._loaded = range(row, min(row + _BLOCK, self._states.size))
             rows = slice(self._loaded.start, self._loaded.stop)
-            self._values = np.stack([self._states.field(k)[rows] for k in range(3)], axis=1)
+            self._values = np.stack(
+                [self._states.field(k)[rows] for k in range(3)], axis=1
+            )
         return np.ravel(self._values[row - self._loaded.start])
 
     # Outputs.
 
     def _add_sample(self, stamp: int) -> None:
         """Add the last sample of the law, for the state with this stamp [ns]."""
-        guard, controller = self._guard, self._guard.controller
+        guard = self._guard
+        controller = self._guard.controller
         if self.first < 0:
             self.first = stamp
-        self.last, self.samples = stamp, self.samples + 1
+        self.last = stamp
+        self.samples = self.samples + 1
         if controller.samples == 1:
             self._telemetry.restart()
         known = controller.sample, controller.settings.torque_limit, guard.samples.ratio
@@ -238,27 +292,37 @@ class Rerun:
             self._report_departure(pending[0], event)
         else:
             is_stop = event.type is EventType.STOP
-            self._depart(f'{event.type}: {_reason(event)}' if is_stop else event.type, event.stamp)
+            self._depart(
+                f'{event.type}: {_reason(event)}' if is_stop else event.type,
+                event.stamp,
+            )
 
-    def _act(self, event: Event) -> None:
+    def _act(self, event: Event) -> None:  # noqa: C901 - one branch for each type
         """Do what caused an event, unless a message did."""
         guard, content = self._guard, event.content
         if _reason(event) is Reason.STATE_TIMEOUT:
             self._command(event.stamp, guard.time_out(content['text']))
         elif event.type in (EventType.ACTIVATE, EventType.RESET, EventType.DEACTIVATE):
             getattr(guard, event.type.value)()
+        elif event.type is EventType.WITHDRAW:
+            guard.withdraw(content['text'])
         elif event.type is EventType.RELEASE:
             torque = guard.release()
             guard.journal.commands += torque is not None  # after the event's count
             self._command(event.stamp, torque)
         elif event.type is EventType.TRAJECTORY:
-            points = tuple(TrajectoryPoint(**point) for point in content['points'])
-            trajectory = Trajectory(tuple(content['joints']), points, content['begin'])
-            guard.adopt(guard.plan(trajectory, content['at']))
+            guard.adopt(guard.plan(_trajectory(content), content['at']))
+        elif event.type is EventType.TARGET:
+            guard.adopt(guard.plan(_target(content), content['at']))
+        elif event.type is EventType.BRAKE:
+            guard.brake()
         elif event.type is EventType.PARAMETERS:
-            guard.retune(change(guard.config, content['parameters']))
+            where = f'event {event.number} of the journal'
+            given = current(content['parameters'], where)
+            guard.retune(change(guard.config, given, where))
             if guard.last_stamp >= 0:
-                stamp, limit = guard.journal.stamp, guard.controller.settings.torque_limit
+                stamp = guard.journal.stamp
+                limit = guard.controller.settings.torque_limit
                 bound = guard.controller.bound_at(guard.time)
                 self._add(stamp, self._telemetry.bound(stamp, bound, limit))
         elif event.type is EventType.SILENCE:
@@ -269,7 +333,11 @@ class Rerun:
     def _report_departure(self, own: Event, event: Event | None) -> None:
         """Note that the controller started or stopped differently from the recorded one."""
         text = own.content['text'] if own.type is EventType.STOP else own.type
-        is_stop = event is not None and event.type is EventType.STOP and event.stamp == own.stamp
+        is_stop = (
+            event is not None
+            and event.type is EventType.STOP
+            and event.stamp == own.stamp
+        )
         what = f'stop: {_reason(event)}' if is_stop else 'used by the law'
         self._depart(f'{what} ({text})', own.stamp)
 
@@ -277,17 +345,74 @@ class Rerun:
         self.departure = self.departure or (what, stamp)
 
 
+def _trajectory(content: Mapping[str, Any]) -> Trajectory:
+    points = tuple(TrajectoryPoint(**point) for point in content['points'])
+    return Trajectory(tuple(content['joints']), points, content['begin'])
+
+
+def _target(content: Mapping[str, Any]) -> Target:
+    fields = {name: content[name] for name in Target._fields}
+    return Target(**fields)
+
+
 def _first_gap(answers: JointStates) -> int:
     """Return the number of answers before the first that the recorder missed, by their sequence."""
     sequence = answers.sequence
-    gaps = np.flatnonzero(np.diff(sequence) > 1)
-    return int(gaps[0]) + 1 if gaps.size and sequence[0] > 0 else sequence.size + 1
+    if not sequence.any():
+        return sequence.size + 1
+    gaps = np.flatnonzero(np.diff(sequence, prepend=0) > 1)
+    return int(gaps[0]) if gaps.size else sequence.size + 1
+
+
+def _commanded_by_states(events: Sequence[Event], commands: int) -> int:
+    """Return how many torques, of so many in the bag, were commanded for states.
+
+    The others are those of the watchdog and of the release.
+    """
+    by_watchdog = 0
+    stated = 0
+    for event in events:
+        if event.type is EventType.SILENCE:
+            by_watchdog += int(event.content['torques'])
+        stated = event.commands
+    is_released = bool(events) and events[-1].type is EventType.RELEASE
+    return max(stated, commands - is_released) - by_watchdog
+
+
+def _check(events: Sequence[Event]) -> None:
+    """Raise BlfDscError if an event cannot be repeated."""
+    fixed = {each.name for each in parameters(ControllerConfig) if each.read_only}
+    reasons = {reason.value for reason in Reason}
+    torques = 0
+    for event in events:
+        problem = ''
+        content = event.content
+        if event.type is EventType.STOP and content['reason'] not in reasons:
+            problem = f'a stop for the unknown reason {content["reason"][:40]!r}'
+        elif (
+            event.type is EventType.PARAMETERS and fixed & content['parameters'].keys()
+        ):
+            names = ', '.join(sorted(fixed & content['parameters'].keys()))
+            problem = f'a change of what is fixed at the start: {names}'
+        elif event.type is EventType.SILENCE:
+            torques += content['torques']
+            if torques > _MOST_TORQUES:
+                problem = (
+                    f'{torques} torques of the watchdog, more than {_MOST_TORQUES}'
+                )
+        if problem:
+            raise BlfDscError(
+                f'event {event.number} of the journal cannot be repeated: {problem}; it is '
+                'damaged or of a later version'
+            )
 
 
 def _is_own(event: Event) -> bool:
     """Whether the controller decides on an event itself, because of a message."""
     is_stop = event.type is EventType.STOP
-    return event.type is EventType.START or (is_stop and _reason(event) not in _EXTERNAL)
+    return event.type is EventType.START or (
+        is_stop and _reason(event) not in _EXTERNAL
+    )
 
 
 def _reason(event: Event | None) -> Reason:

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
@@ -12,11 +13,16 @@ import numpy as np
 
 from blf_dsc_controller import __version__
 from blf_dsc_controller.bags.content import NO_NAMES, Content, NameMap, read_content
-from blf_dsc_controller.bags.topic_messages import JointStates, TopicMessages
+from blf_dsc_controller.bags.topic_messages import (
+    JointStates,
+    TopicMessages,
+    UnreadableMessageError,
+)
 from blf_dsc_controller.configuration.schema import flatten
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.messages import topics
 from blf_dsc_controller.messages.codecs import JOINT_STATE_FIELDS, MessageError
+from blf_dsc_controller.messages.event_content import FORMAT
 from blf_dsc_controller.messages.journal import Event, EventType
 from blf_dsc_controller.replay.rerun import Rerun
 from blf_dsc_controller.run import Floats, Stamps
@@ -30,7 +36,12 @@ _COMPARED = {  # topic: fields
     topics.BOUND: (0, 2),
 }
 _TEXTS = (topics.STATE, topics.DIAGNOSTICS)
-_TRANSITIONS = (EventType.ACTIVATE, EventType.DEACTIVATE, EventType.RESET, EventType.STOP)
+_TRANSITIONS = (
+    EventType.ACTIVATE,
+    EventType.DEACTIVATE,
+    EventType.RESET,
+    EventType.STOP,
+)
 
 
 class Difference(NamedTuple):
@@ -58,11 +69,18 @@ class Comparison:
     recorded: int  # numbers in the bag that a complete replay would give
     values: int = 0  # numbers compared
     difference: Difference | None = None
-    largest: float = 0.0  # difference of two numbers; infinite if only one of them is finite
+    # difference of two numbers; infinite if only one of them is finite
+    largest: float = 0.0
     left_out: str = ''  # what was not compared, and why
+    missing: int = 0  # messages that the replay gives and the bag does not hold
 
     def add(
-        self, stamp: Stamps, start: int, names: Sequence[str], recorded: Floats, replayed: Floats
+        self,
+        stamp: Stamps,
+        start: int,
+        names: Sequence[str],
+        recorded: Floats,
+        replayed: Floats,
     ) -> None:
         """Compare tables (N, names) with the stamps (N,) of a run that began at `start`."""
         self.values += recorded.size
@@ -78,7 +96,9 @@ class Comparison:
             k, j = np.argwhere(unlike)[0]
             pair = float(recorded[k, j]), float(replayed[k, j])
             time = (int(stamp[k]) - start) * 1e-9
-            self.difference = Difference(self.topic, names[j], int(stamp[k]), time, *pair)
+            self.difference = Difference(
+                self.topic, names[j], int(stamp[k]), time, *pair
+            )
 
 
 class Verification(NamedTuple):
@@ -87,23 +107,36 @@ class Verification(NamedTuple):
     samples: int  #: number of states that the law used
     duration: float  #: s, from the first of them to the last
     passed_over: int  #: number of states that the controller did not answer
-    comparisons: tuple[Comparison, ...]  #: one for each topic of the controller with numbers
+    #: one for each topic of the controller with numbers
+    comparisons: tuple[Comparison, ...]
     not_compared: tuple[str, ...]  #: topics with text
     events: tuple[Event, ...]  #: replayed events
     remarks: tuple[str, ...]  #: limitations of the result
+    incomplete: tuple[str, ...]  #: what the recording lacks
     difference: Difference | None  #: the earliest, in a topic or in an event
 
     @property
     def compared(self) -> float:
         """Fraction of the controller's outputs in the bag that could be compared."""
         recorded = sum(found.recorded for found in self.comparisons)
-        return sum(found.values for found in self.comparisons) / recorded if recorded else 0.0
+        return (
+            sum(found.values for found in self.comparisons) / recorded
+            if recorded
+            else 0.0
+        )
+
+    @property
+    def is_partial(self) -> bool:
+        """Whether a number could not be compared, or is missing in the bag."""
+        return self.compared < 1.0 or bool(self.incomplete)
 
     @property
     def transitions(self) -> list[str]:
         """Activations, deactivations, resets and safe stops in order."""
         return [
-            f'safe stop ({event.content["reason"]})' if event.type is EventType.STOP else event.type
+            f'safe stop ({event.content["reason"]})'
+            if event.type is EventType.STOP
+            else event.type
             for event in self.events
             if event.type in _TRANSITIONS
         ]
@@ -121,48 +154,79 @@ def verify(path: Path, namespace: str = '', names: NameMap = NO_NAMES) -> Verifi
             or cannot be read.
     """
     content = read_content(path, namespace, names)
-    events, until, end = _events(content)
+    events, until, other = _events(content)
+    _check_format(path, events[0])
     config = content.controller_config(exactly=True)
     newer = sorted(flatten(config).keys() - events[0].content['parameters'].keys())
     errors: dict[int, MessageError] = {}
     states = content.topics[topics.JOINT_STATES].joint_states(
         names.joints_of(config.joints), ('position',), errors
     )
-    start = next((event.stamp for event in events if event.type is EventType.START), None)
-    if start is not None and start not in states.stamp:
-        raise BlfDscError(
-            f'{path} does not hold the first state that the controller used, with the stamp '
-            f'{start} ns, so its outputs cannot be reproduced: start the recorder first'
-        )
-    answers = _before(content.topics[topics.TRACKING_ERROR].joint_states(config.joints, ()), until)
-    run = Rerun(config, _before(states, until), errors, answers)
+    _check_first_state(path, events, states)
+    messages = content.topics[topics.TRACKING_ERROR]
+    answers = _before(messages.joint_states(config.joints, ()), until)
+    commands = _commands_before(content, until)
+    run = Rerun(config, _before(states, until), errors, answers, commands)
     run.run(events[1:])
     comparisons = tuple(_compared(content, run, answers, config.joints))
     differences = [found.difference for found in comparisons if found.difference]
     if run.departure is not None:
-        what, stamp = run.departure
-        time = (stamp - max(run.first, 0)) * 1e-9
-        found = Difference(topics.TRACKING_ERROR.resolved, what, stamp, time, 1.0, 0.0)
-        differences.insert(0, found)
+        differences.insert(0, _departed(run, *run.departure))
     elif not any(found.values for found in comparisons):
         raise _nothing_to_compare(content)
+    texts = [content.topics[topic] for topic in _TEXTS if topic in content.topics]
+    end = run.end or other
     return Verification(
         run.samples,
         (run.last - run.first) * 1e-9,
         run.passed_over,
         comparisons,
-        tuple(content.topics[topic].name for topic in _TEXTS if topic in content.topics),
+        tuple(each.name for each in texts),
         tuple(run.events),
-        tuple(_remarks(content, run.end or end, newer)),
+        tuple(_remarks(content, end, newer)),
+        tuple(_incomplete(content, events, comparisons, end)),
         min(differences, key=lambda found: found.stamp, default=None),
     )
+
+
+def _check_format(path: Path, configure: Event) -> None:
+    """Raise BlfDscError if a journal is of a later version."""
+    number = configure.content.get('format', 0)
+    if number > FORMAT:
+        version = configure.content.get('version', 'unknown')
+        raise BlfDscError(
+            f'{path} has a journal of format {number}, recorded by version {version}; this '
+            f'version, {__version__}, reads formats up to {FORMAT}: replay it with that version'
+        )
+
+
+def _check_first_state(
+    path: Path, events: Sequence[Event], states: JointStates
+) -> None:
+    """Raise BlfDscError if the bag lacks the state with which the law started."""
+    starts = [event.stamp for event in events if event.type is EventType.START]
+    if starts and starts[0] not in states.stamp:
+        raise BlfDscError(
+            f'{path} does not hold the first state that the controller used, with the stamp '
+            f'{starts[0]} ns, so its outputs cannot be reproduced: start the recorder first'
+        )
+
+
+def _departed(run: Rerun, what: str, stamp: int) -> Difference:
+    """Return the departure of a replay as a difference."""
+    time = (stamp - max(run.first, 0)) * 1e-9
+    return Difference(topics.TRACKING_ERROR.resolved, what, stamp, time, 1.0, 0.0)
 
 
 def _events(content: Content) -> tuple[list[Event], int, str]:
     """Return the events of a bag's first controller, when the next begins [ns], and a remark."""
     if not {topics.JOURNAL, topics.TRACKING_ERROR} <= content.topics.keys():
         raise _nothing_to_compare(content)
-    begins = [k for k, (_, event) in enumerate(content.events) if event.type is EventType.CONFIGURE]
+    begins = [
+        k
+        for k, (_, event) in enumerate(content.events)
+        if event.type is EventType.CONFIGURE
+    ]
     events = [event for _, event in content.events]
     if not begins or begins[0] > 0:
         raise BlfDscError(
@@ -170,7 +234,11 @@ def _events(content: Content) -> tuple[list[Event], int, str]:
             'start the recorder first'
         )
     if len(begins) > 1:
-        return events[: begins[1]], content.events[begins[1]][0], 'another controller was started'
+        return (
+            events[: begins[1]],
+            content.events[begins[1]][0],
+            'another controller was started',
+        )
     return events, topics.FOREVER, ''
 
 
@@ -180,8 +248,20 @@ def _before(states: JointStates, until: int) -> JointStates:
     return states if rows.size == states.size else states.select(rows)
 
 
+def _commands_before(content: Content, until: int) -> int:
+    """Return the number of torques received before a time [ns]; 0 if it is not known."""
+    messages = content.topics.get(topics.COMMANDS)
+    if messages is None:
+        return 0
+    with suppress(UnreadableMessageError):
+        return _before(messages.joint_states(messages.joint_names(), ()), until).size
+    return 0
+
+
 def _nothing_to_compare(content: Content) -> BlfDscError:
-    listing = ''.join(f'\n  {name} ({count})' for name, count in content.message_counts.items())
+    listing = ''.join(
+        f'\n  {name} ({count})' for name, count in content.message_counts.items()
+    )
     return BlfDscError(
         f'{content.path} lacks the messages of the controller or its journal, so '
         f'there is nothing to compare; it holds:{listing}'
@@ -199,11 +279,14 @@ def _compared(
         messages = content.topics.get(topic)
         own = run.topics.get(topic)
         if messages is None:
+            if own is not None:
+                lacking = 'the bag holds none of its messages'
+                yield Comparison(topic.resolved, 0, left_out=lacking, missing=own.size)
             continue
         result = Comparison(messages.name, messages.size * len(joints) * len(fields))
         try:
             if own is not None:
-                _compare(topic, messages, own, answers, joints, result, run.first)
+                _compare(topic, messages, own, answers, joints, result, run)
         except BlfDscError as error:  # unreadable, or in an unknown order
             result.left_out = f'{error}'
         yield result
@@ -216,36 +299,56 @@ def _compare(
     answers: JointStates,
     joints: Sequence[str],
     result: Comparison,
-    start: int,
+    run: Rerun,
 ) -> None:
     """Compare the messages of the same stamp or number; those that have other stamps differ."""
-    fields, theirs, ours = _COMPARED[topic], messages.joint_names(), own.joint_names()
+    fields = _COMPARED[topic]
+    theirs = messages.joint_names()
+    ours = own.joint_names()
     shared = [name for name in ours if name in theirs and name != topics.COMPUTE_TIME]
-    result.left_out = ', '.join(n for n in dict.fromkeys((*ours, *theirs)) if n not in shared)
+    result.left_out = ', '.join(
+        n for n in dict.fromkeys((*ours, *theirs)) if n not in shared
+    )
     result.recorded = messages.size * len(shared) * len(fields)
     recorded, replayed = (each.joint_states(shared, ()) for each in (messages, own))
     names = shared
     if topic is not topics.MONITOR:
-        names = [f'{JOINT_STATE_FIELDS[k]} of {joint}' for k in fields for joint in joints]
+        names = [
+            f'{JOINT_STATE_FIELDS[k]} of {joint}' for k in fields for joint in joints
+        ]
     if topic is topics.TRACKING_ERROR:
         recorded = answers
     if topic in (topics.REFERENCE, topics.MONITOR):
-        recorded, replayed = recorded.by_stamp(), replayed.by_stamp()
-        keys, wanted = recorded.stamp, replayed.stamp
+        recorded = recorded.by_stamp()
+        replayed = replayed.by_stamp()
+        keys = recorded.stamp
+        wanted = replayed.stamp
     else:
-        keys, wanted = _numbers(topic, recorded, answers.size), replayed.sequence
+        keys = _numbers(topic, recorded, answers.size)
+        wanted = replayed.sequence
     index = np.minimum(np.searchsorted(keys, wanted), keys.size - 1)
-    known = np.flatnonzero(keys[index] == wanted)
-    recorded, replayed = recorded.select(index[known]), replayed.select(known)
-    stamp, has_moved = replayed.received, recorded.stamp != replayed.stamp
+    is_known = keys[index] == wanted
+    if topic is topics.TRACKING_ERROR:
+        is_known[run.answers :] = False  # their order is not known
+    known = np.flatnonzero(is_known)
+    result.missing = replayed.size - known.size
+    recorded = recorded.select(index[known])
+    replayed = replayed.select(known)
+    stamp = replayed.received
+    has_moved = recorded.stamp != replayed.stamp
     for begin in range(0, known.size, _BLOCK):
         rows = slice(begin, begin + _BLOCK)
         pair = [
-            np.hstack([states.field(k)[rows] for k in fields]) for states in (recorded, replayed)
+            np.hstack([states.field(k)[rows] for k in fields])
+            for states in (recorded, replayed)
         ]
         pair[1][has_moved[rows]] = np.inf
-        result.add(stamp[rows], start, names, *pair)
-    unreached = (result.recorded - result.values) // len(joints) if topic is topics.COMMANDS else 0
+        result.add(stamp[rows], run.first, names, *pair)
+    unreached = (
+        (result.recorded - result.values) // len(joints)
+        if topic is topics.COMMANDS
+        else 0
+    )
     if unreached:
         result.left_out = f'{unreached} torques that the replay does not reach'
 
@@ -253,13 +356,18 @@ def _compare(
 def _numbers(topic: topics.Topic, recorded: JointStates, answers: int) -> Stamps:
     """Return the numbers of messages among those of their publisher; BlfDscError if unknown."""
     sequence = recorded.sequence
-    if topic is not topics.COMMANDS or not sequence.any():
+    numbered = topic in (topics.COMMANDS, topics.TRACKING_ERROR) and sequence.any()
+    if not numbered:
         if topic is topics.COMMANDS and recorded.size < answers:  # of another recorder
-            raise BlfDscError('some are missing, and they have neither stamps nor numbers')
+            raise BlfDscError(
+                'some are missing, and they have neither stamps nor numbers'
+            )
         return np.arange(1, recorded.size + 1)
-    if (np.diff(sequence) <= 0).any():
+    if (np.diff(sequence) > 0).all():
+        return sequence
+    if topic is topics.COMMANDS:
         raise BlfDscError('they are of several publishers')
-    return sequence
+    return np.arange(1, recorded.size + 1)
 
 
 # Remarks.
@@ -276,4 +384,24 @@ def _remarks(content: Content, end: str, newer: Sequence[str]) -> Iterator[str]:
         yield (
             f'recorded by version {content.version or "unknown"}{lacking} and replayed by '
             f'{__version__}: differences may come from the software'
+        )
+
+
+def _incomplete(
+    content: Content,
+    events: Sequence[Event],
+    comparisons: Sequence[Comparison],
+    end: str,
+) -> Iterator[str]:
+    """Yield what the recording lacks: messages, or its end."""
+    for found in comparisons:
+        if found.missing:
+            yield f'{found.missing} messages of {found.topic}'
+    if end:
+        yield f'what follows: {end}'
+    is_of_node = 'topics' in events[0].content
+    if is_of_node and not end and events[-1].type is not EventType.RELEASE:
+        yield (
+            f'the end of the run: {content.topics[topics.JOURNAL].name} has no release, so the '
+            'recording ended before the controller, or its last messages are missing'
         )

@@ -1,0 +1,74 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Rules by which parameters recorded by an earlier release are those of this one.
+
+A parameter that goes away leaves its last default in `REMOVED`: a bag that has this value replays
+without it. A parameter that arrives leaves in `ADDED` the value that repeats what the law did
+before, unless that is its default.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from blf_dsc_controller.bags.sources import BagError
+from blf_dsc_controller.configuration.controller import ControllerConfig
+from blf_dsc_controller.configuration.schema import (
+    Value,
+    format_value,
+    parameters,
+    unknown,
+    variant_of,
+)
+
+REMOVED: dict[str, Value] = {}
+"""Last default of each parameter that the first release had and this version has not."""
+
+ADDED: dict[str, Value] = {}
+"""Value of parameters that older bags do not have, where it is not the default."""
+
+
+def current(recorded: Mapping[str, Any], source: str) -> dict[str, Any]:
+    """Return recorded parameters of a controller as those of this version.
+
+    Raises:
+        BagError: one of them is gone, and no rule says that the law does the same without it.
+    """
+    known = known_names(recorded)
+    problems = []
+    for name, value in recorded.items():
+        if name in known:
+            continue
+        if name not in REMOVED:
+            problems.append(
+                f'{unknown(name, known)}: no rule says how to do without it'
+            )
+        elif not _is_same(value, REMOVED[name]):
+            problems.append(
+                f'{name}: recorded with {format_value(value)}, but this version has the law only '
+                f'as with {format_value(REMOVED[name])}'
+            )
+    if problems:
+        listing = ''.join(f'\n  - {problem}' for problem in problems)
+        raise BagError(
+            f'{source} cannot be replayed by this version; use the one that recorded it:{listing}'
+        )
+    return {name: value for name, value in recorded.items() if name in known}
+
+
+def known_names(recorded: Mapping[str, Any]) -> set[str]:
+    """Return the parameters that a controller has, with those of its law if that is a file's."""
+    cls = variant_of(ControllerConfig, recorded)
+    return {parameter.name for parameter in parameters(cls)}
+
+
+def completed(recorded: Mapping[str, Any]) -> dict[str, Any]:
+    """Return all parameters of a controller with those that came after the recording."""
+    return {**ADDED, **recorded}
+
+
+def _is_same(value: Any, default: Value) -> bool:
+    """Return whether two values are the same; JSON has lists for tuples."""
+    if isinstance(value, (list, tuple)) and isinstance(default, (list, tuple)):
+        return list(value) == list(default)
+    return bool(value == default)
