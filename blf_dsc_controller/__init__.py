@@ -14,10 +14,18 @@ if TYPE_CHECKING:
     from blf_dsc_controller.analysis.figures import draw as draw
     from blf_dsc_controller.analysis.metrics import measure as measure
     from blf_dsc_controller.bags.reader import read_run as read_run
-    from blf_dsc_controller.configuration.controller import ControllerConfig as ControllerConfig
+    from blf_dsc_controller.configuration.controller import (
+        ControllerConfig as ControllerConfig,
+    )
+    from blf_dsc_controller.configuration.files import share_folder as share_folder
     from blf_dsc_controller.configuration.nodes import load_loop as load_loop
     from blf_dsc_controller.configuration.plant import PlantConfig as PlantConfig
+    from blf_dsc_controller.configuration.schema import change as change
+    from blf_dsc_controller.control.arm_controller import ArmController as ArmController
     from blf_dsc_controller.law.factory import controller_of as controller_of
+    from blf_dsc_controller.reference.trajectory import (
+        TrajectoryPoint as TrajectoryPoint,
+    )
     from blf_dsc_controller.replay.verify import verify as verify
     from blf_dsc_controller.run import Run as Run
     from blf_dsc_controller.simulation.loop import simulate as simulate
@@ -27,9 +35,11 @@ if TYPE_CHECKING:
 __version__ = '0.1.0'
 
 _PUBLIC = {
+    'ArmController': 'control.arm_controller',
     'ControllerConfig': 'configuration.controller',
     'PlantConfig': 'configuration.plant',
     'Run': 'run',
+    'change': 'configuration.schema',
     'controller_of': 'law.factory',
     'draw': 'analysis.figures',
     'load_loop': 'configuration.nodes',
@@ -37,7 +47,9 @@ _PUBLIC = {
     'measure': 'analysis.metrics',
     'read_run': 'bags.reader',
     'run_chunk': 'studies.runs',
+    'share_folder': 'configuration.files',
     'simulate': 'simulation.loop',
+    'TrajectoryPoint': 'reference.trajectory',
     'verify': 'replay.verify',
 }
 __all__ = list(_PUBLIC)

@@ -28,11 +28,3 @@ class StartError(BlfDscError):
 
 class MissingExtraError(BlfDscError):
     """A package from one of the optional extras is not installed."""
-
-    def __str__(self) -> str:
-        """Return how to install it; the arguments are package, extra, and what needs it."""
-        module, extra, purpose = self.args
-        return (
-            f'{purpose} needs {module}, which is not installed: '
-            f"pip install 'blf_dsc_controller[{extra}]'"
-        )

@@ -34,7 +34,9 @@ class Series:
         """Return the values of one name, (m,)."""
         return self.values[:, self.names.index(name)]
 
-    def held(self, stamp: Stamps, columns: slice | NDArray[np.intp] = slice(None)) -> Floats:
+    def held(
+        self, stamp: Stamps, columns: slice | NDArray[np.intp] = slice(None)
+    ) -> Floats:
         """Return the last values at or before each stamp; the first values for earlier stamps."""
         index = np.searchsorted(self.stamp, stamp, side='right') - 1
         return self.values[np.maximum(index, 0)][:, columns]
@@ -59,7 +61,8 @@ class LearnedArm:
     """Scales of the estimates of an arm, whose units are mixed (kg and kg m^2)."""
 
     units: Mapping[str, str]  # of each estimate by name
-    deviations: Mapping[str, float]  # standard deviations of their prior, in these units
+    # standard deviations of their prior, in these units
+    deviations: Mapping[str, float]
     regressor: Regressor
 
 

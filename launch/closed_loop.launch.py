@@ -29,9 +29,18 @@ ARGUMENTS = {  # choices and description; the default is empty
         None,
         'parameter file of all nodes, or a preset; empty: of the driver, or recommended',
     ),
-    'driver': (['', *DRIVERS], 'driver of an arm, whose topics are used; empty: the simulated arm'),
-    'namespace': (None, 'of all nodes; in a file, the key /**/NODE matches any namespace'),
-    'bag': (None, 'folder to record into, which must not exist yet; empty: no recording'),
+    'driver': (
+        ['', *DRIVERS],
+        'driver of an arm, whose topics are used; empty: the simulated arm',
+    ),
+    'namespace': (
+        None,
+        'of all nodes; in a file, the key /**/NODE matches any namespace',
+    ),
+    'bag': (
+        None,
+        'folder to record into, which must not exist yet; empty: no recording',
+    ),
 }
 
 
@@ -50,14 +59,23 @@ def nodes(context: LaunchContext) -> list[Node]:
         LaunchConfiguration(name).perform(context) for name in ARGUMENTS
     )
     own = f'{PACKAGE}/commands'  # as other nodes than the controller write it
-    of_driver, states, commands = DRIVERS.get(robot, ('recommended', 'joint_states', own))
+    of_driver, states, commands = DRIVERS.get(
+        robot, ('recommended', 'joint_states', own)
+    )
     remappings = [('joint_states', states), ('~/commands', commands), (own, commands)]
     is_simulated = not robot
     file = str(locate(config or of_driver))
     # The first sample must be recorded too, so the loop starts after the recorder subscribes.
     of_loop = {'wait_for_subscribers': 1} if bag else {}
+    of_controller = of_loop | {'safety.expect_watchdog': True}
 
-    def node(executable: str, given: dict[str, Any], *, required: bool = True) -> Node:
+    def node(
+        executable: str,
+        given: dict[str, Any],
+        *,
+        required: bool = True,
+        respawned: bool = False,
+    ) -> Node:
         return Node(
             package=PACKAGE,
             executable=executable,
@@ -69,6 +87,8 @@ def nodes(context: LaunchContext) -> list[Node]:
             remappings=remappings,
             output='screen',
             on_exit=Shutdown(reason=f'{executable} has ended') if required else None,
+            respawn=respawned,
+            respawn_delay=1.0,
         )
 
     started = []
@@ -77,9 +97,10 @@ def nodes(context: LaunchContext) -> list[Node]:
         clock = 'plant' if is_simulated and mode == 'lockstep' else 'wall'
         recorded = {'output': bag, 'clock': clock}
         started.append(node('bag_recorder', recorded, required=is_simulated))
-    started.append(node('torque_watchdog', {}, required=False))
+    # A new one reads the journal of the controller that is still there.
+    started.append(node('torque_watchdog', {}, required=False, respawned=True))
     # On an arm, the watchdog outlives a controller that crashes, and both outlive the recorder.
-    started.append(node('blf_dsc_controller', of_loop, required=is_simulated))
+    started.append(node('blf_dsc_controller', of_controller, required=is_simulated))
     if is_simulated:
         started.append(node('sim_plant', of_loop))
     return started

@@ -44,7 +44,8 @@ class RigidBodies(NamedTuple):
     n: int
     p: int
     gravity: Annotated[Array, 3]  # m/s^2, in the base
-    rotation: Annotated[Array, 'n', 3, 3]  # of a joint's frame at q = 0, to the previous body
+    # of a joint's frame at q = 0, to the previous body
+    rotation: Annotated[Array, 'n', 3, 3]
     offset: Annotated[Array, 'n', 3]  # of its origin in the previous body, m
     axis: Annotated[Array, 'n', 3]
     prismatic: Annotated[Array, 'n']  # 1: prismatic, 0: revolute
@@ -53,7 +54,8 @@ class RigidBodies(NamedTuple):
     inertia: Annotated[Array, 'n', 3, 3]  # kg m^2, about the frame's origin
     rotor: Annotated[Array, 'n']  # kg m^2, or kg, reflected to the joint
     tip: Annotated[Array, 3]  # m, in the last body
-    P: Annotated[Array, 'p']  # base parameters without payload; none in a model of the drives
+    # base parameters without payload; none in a model of the drives
+    P: Annotated[Array, 'p']
     P_payload: Annotated[Array, 'p']  # contribution of 1 kg at the tip
     rest: Annotated[Array, 'n']  # zero velocities
 
@@ -65,8 +67,10 @@ class BodyMotion(NamedTuple):
     origin: Annotated[Array, 'n + 1', 3]  # m
     axis: Annotated[Array, 'n + 1', 3]
     turning: Annotated[Array, 'n + 1', 3]  # angular velocity, rad/s
-    turning_rate: Annotated[Array, 'n + 1', 3]  # angular acceleration without ddq, rad/s^2
-    bias: Annotated[Array, 'n + 1', 3]  # acceleration of the origin without ddq and gravity, m/s^2
+    # angular acceleration without ddq, rad/s^2
+    turning_rate: Annotated[Array, 'n + 1', 3]
+    # acceleration of the origin without ddq and gravity, m/s^2
+    bias: Annotated[Array, 'n + 1', 3]
     # Working memory: sums over a body and all beyond it, about its origin.
     mass: Annotated[Array, 'n + 1']
     moment: Annotated[Array, 'n + 1', 3]
@@ -78,7 +82,8 @@ class BodyMotion(NamedTuple):
 
 
 bodies_of = view_of(RigidBodies)
-motion_of, motion_size = view_of(BodyMotion), size_of(BodyMotion)
+motion_of = view_of(BodyMotion)
+motion_size = size_of(BodyMotion)
 
 
 def rigid_bodies(
@@ -98,7 +103,9 @@ def rigid_bodies(
         rotation=np.array([joint.placement[:3, :3] for joint in chain.joints]),
         offset=np.array([joint.placement[:3, 3] for joint in chain.joints]),
         axis=np.array([joint.axis for joint in chain.joints]),
-        prismatic=np.array([float(joint.kind == 'prismatic') for joint in chain.joints]),
+        prismatic=np.array(
+            [float(joint.kind == 'prismatic') for joint in chain.joints]
+        ),
         mass=inertias[:, 0].copy(),
         moment=inertias[:, 1:4].copy(),
         inertia=np.array([rotational_inertia(J) for J in tensors]),
@@ -126,11 +133,13 @@ def locate(arm: RigidBodies, q: np.ndarray, dq: np.ndarray, now: BodyMotion) -> 
                 R[r, c] = column[r]
         axis = transform(R, vector(arm.axis[i]))
         lever = transform(before, vector(arm.offset[i]))
-        slides, turns = arm.prismatic[i], 1.0 - arm.prismatic[i]
+        slides = arm.prismatic[i]
+        turns = 1.0 - arm.prismatic[i]
         turn(R, axis, turns * q[i])
         lever = plus(lever, times(slides * q[i], axis))
         own = times(dq[i], axis)
-        w, dw = vector(now.turning[i]), vector(now.turning_rate[i])
+        w = vector(now.turning[i])
+        dw = vector(now.turning_rate[i])
         swept, speed = cross(w, own), cross(w, lever)
         put(axis, now.axis[i + 1])
         put(plus(vector(now.origin[i]), lever), now.origin[i + 1])
@@ -168,15 +177,19 @@ def combine_bodies(arm: RigidBodies, now: BodyMotion, payload: float) -> None:
             h = plus(h, times(payload, lever))
             m += payload
             add_point(payload, lever, I)
-        w, dw = vector(now.turning[i]), vector(now.turning_rate[i])
+        w = vector(now.turning[i])
+        dw = vector(now.turning_rate[i])
         a = plus(vector(now.bias[i]), times(-1.0, vector(arm.gravity)))
         F = plus(F, plus(times(m, a), plus(cross(dw, h), cross(w, cross(w, h)))))
-        N = plus(N, plus(cross(h, a), plus(transform(I, dw), cross(w, transform(I, w)))))
+        N = plus(
+            N, plus(cross(h, a), plus(transform(I, dw), cross(w, transform(I, w))))
+        )
         put(F, now.force[i])
         put(N, now.torque[i])
         if i < n:
             lever = plus(vector(now.origin[i + 1]), times(-1.0, vector(now.origin[i])))
-            beyond, M = vector(now.moment[i + 1]), now.mass[i + 1]
+            beyond = vector(now.moment[i + 1])
+            M = now.mass[i + 1]
             add_inertia(now.inertia[i + 1], beyond, M, lever, I)
             h = plus(h, plus(beyond, times(M, lever)))
             m += M
@@ -197,7 +210,9 @@ def rotate(R: np.ndarray, A: np.ndarray, out: np.ndarray) -> None:
 
 
 @inner
-def add_inertia(I: np.ndarray, h: Vector, m: float, lever: Vector, out: np.ndarray) -> None:
+def add_inertia(
+    I: np.ndarray, h: Vector, m: float, lever: Vector, out: np.ndarray
+) -> None:
     """Add the inertia I (3, 3) of a mass m with first moment h, both about a point at `lever`."""
     sphere = 2.0 * dot(h, lever) + m * dot(lever, lever)
     for r in range(3):
@@ -219,11 +234,14 @@ def add_point(m: float, lever: Vector, out: np.ndarray) -> None:
 def fill_inertia(arm: RigidBodies, now: BodyMotion) -> None:
     """Fill M (n, n), the inertia matrix of the joints, rotors included."""
     for j in range(arm.n):
-        axis, h = vector(now.axis[j + 1]), vector(now.moment[j + 1])
+        axis = vector(now.axis[j + 1])
+        h = vector(now.moment[j + 1])
         if arm.prismatic[j] == 1.0:
-            F, N = times(now.mass[j + 1], axis), cross(h, axis)
+            F = times(now.mass[j + 1], axis)
+            N = cross(h, axis)
         else:
-            F, N = cross(axis, h), transform(now.inertia[j + 1], axis)
+            F = cross(axis, h)
+            N = transform(now.inertia[j + 1], axis)
         for i in range(j, -1, -1):
             now.M[i, j] = now.M[j, i] = along_joint(arm, now, i, F, N)
             lever = plus(vector(now.origin[i + 1]), times(-1.0, vector(now.origin[i])))
@@ -232,14 +250,18 @@ def fill_inertia(arm: RigidBodies, now: BodyMotion) -> None:
 
 
 @inner
-def along_joint(arm: RigidBodies, now: BodyMotion, i: int, F: Vector, N: Vector) -> float:
+def along_joint(
+    arm: RigidBodies, now: BodyMotion, i: int, F: Vector, N: Vector
+) -> float:
     """Return the torque [N m], or force [N], of joint i under F and a moment N about its origin."""
     axis = vector(now.axis[i + 1])
     return dot(axis, F) if arm.prismatic[i] == 1.0 else dot(axis, N)
 
 
 @called
-def fill_tip(bodies: Array, memory: Array, q: Array, position: Array, jacobian: Array) -> None:
+def fill_tip(
+    bodies: Array, memory: Array, q: Array, position: Array, jacobian: Array
+) -> None:
     """Implement `RigidArm.fill_tip`."""
     arm = bodies_of(bodies)
     now = motion_of(memory, arm)
@@ -263,12 +285,20 @@ def fill_gravity(bodies: Array, memory: Array, q: Array, out: Array) -> None:
     locate(arm, q, arm.rest, now)
     combine_bodies(arm, now, 0.0)
     for j in range(arm.n):
-        out[j] = along_joint(arm, now, j, vector(now.force[j + 1]), vector(now.torque[j + 1]))
+        out[j] = along_joint(
+            arm, now, j, vector(now.force[j + 1]), vector(now.torque[j + 1])
+        )
 
 
 @called
 def accelerate(
-    bodies: Array, memory: Array, payload: float, q: Array, dq: Array, torque: Array, ddq: Array
+    bodies: Array,
+    memory: Array,
+    payload: float,
+    q: Array,
+    dq: Array,
+    torque: Array,
+    ddq: Array,
 ) -> None:
     """Implement `RigidArm.accelerate`."""
     arm = bodies_of(bodies)
@@ -309,7 +339,9 @@ class RigidArm(NamedTuple):
         """Write the tip position (3,) [m] at q (n,), and its Jacobian (3, n) [m/rad, or 1]."""
         fill_tip(self.bodies, self.memory, q, position, jacobian)
 
-    def accelerate(self, payload: float, q: Array, dq: Array, torque: Array, ddq: Array) -> None:
+    def accelerate(
+        self, payload: float, q: Array, dq: Array, torque: Array, ddq: Array
+    ) -> None:
         """Write ddq (n,) with a point mass `payload` [kg] at the tip.
 
         `ddq` may alias the joint `torque` (n,) [N m, or N].
@@ -353,14 +385,20 @@ class PointMassArm(NamedTuple):
 
     def fill_tip(self, q: Array, position: Array, jacobian: Array) -> None:
         """Write the position (3,) [m] of the tip and its Jacobian (3, n) [m/rad]."""
-        x1, z1 = self.l1 * cos(q[0]), self.l1 * sin(q[0])
-        x2, z2 = self.l2 * cos(q[0] + q[1]), self.l2 * sin(q[0] + q[1])
-        position[0], position[1], position[2] = x1 + x2, 0.0, z1 + z2
+        x1 = self.l1 * cos(q[0])
+        z1 = self.l1 * sin(q[0])
+        x2 = self.l2 * cos(q[0] + q[1])
+        z2 = self.l2 * sin(q[0] + q[1])
+        position[0] = x1 + x2
+        position[1] = 0.0
+        position[2] = z1 + z2
         jacobian[0, 0], jacobian[0, 1] = -z1 - z2, -z2
         jacobian[1, 0], jacobian[1, 1] = 0.0, 0.0
         jacobian[2, 0], jacobian[2, 1] = x1 + x2, x2
 
-    def accelerate(self, payload: float, q: Array, dq: Array, torque: Array, ddq: Array) -> None:
+    def accelerate(
+        self, payload: float, q: Array, dq: Array, torque: Array, ddq: Array
+    ) -> None:
         """Write ddq = M^-1 (torque - C dq - G) (2,) [rad/s^2]; `ddq` may alias `torque`."""
         m2 = self.m2 + payload
         outer = m2 * self.l2**2
@@ -394,10 +432,15 @@ class Arm(Protocol):
     def fill_tip(self, q: Array, position: Array, jacobian: Array) -> None:
         """Write the tip position (3,) [m] in the base frame and its Jacobian (3, n) [m/rad]."""
 
-    def accelerate(self, payload: float, q: Array, dq: Array, torque: Array, ddq: Array) -> None:
+    def accelerate(
+        self, payload: float, q: Array, dq: Array, torque: Array, ddq: Array
+    ) -> None:
         """Write ddq (n,) [rad/s^2] of M ddq + C dq + G = torque; `ddq` may alias `torque`."""
 
 
 compile_methods(
-    Arm, ('joint_count', 'fill_parameters', 'fill_tip', 'accelerate'), PointMassArm, RigidArm
+    Arm,
+    ('joint_count', 'fill_parameters', 'fill_tip', 'accelerate'),
+    PointMassArm,
+    RigidArm,
 )

@@ -18,14 +18,24 @@ import numpy as np
 
 from blf_dsc_controller.compiled.elementary import exp, tanh
 from blf_dsc_controller.compiled.jit import inner, kernel
-from blf_dsc_controller.compiled.layout import Array, part, view
+from blf_dsc_controller.compiled.layout import Array
+from blf_dsc_controller.compiled.views import part, view
 from sim_plant.arm import Arm, fill_gravity
-from sim_plant.layout import MEASURED, Encoders, PlantSettings, PlantState, settings_of, state_of
+from sim_plant.layout import (
+    MEASURED,
+    Encoders,
+    PlantSettings,
+    PlantState,
+    settings_of,
+    state_of,
+)
 from sim_plant.motion import disturbing_torque, integrate, update_loads
 
 
 @inner
-def plant_views(arm: Arm, settings: Array, state: Array) -> tuple[PlantSettings, PlantState]:
+def plant_views(
+    arm: Arm, settings: Array, state: Array
+) -> tuple[PlantSettings, PlantState]:
     """Return views of both vectors, not reference-counted."""
     plant = settings_of(view(settings), arm, arm.joint_count())
     return plant, state_of(view(state), plant)
@@ -64,13 +74,17 @@ def sense(plant: PlantSettings, now: PlantState) -> None:
     A differenced velocity spans the samples since the last reading; the first reading has no
     predecessor and gets the true velocity.
     """
-    n, encoders, reading = plant.n, plant.encoders, now.reading
+    n = plant.n
+    encoders = plant.encoders
+    reading = now.reading
     first = reading.sample[0] < 0
     span = (int(now.sample[0]) - reading.sample[0]) * (plant.period_ns * 1e-9)
     filters = encoders.velocity_pole > 0.0 and not first
     old = exp(-encoders.velocity_pole * span) if filters else 0.0
     for i in range(n):
-        position = now.x[i] + now.acting.offset[i] + encoders.position_noise * reading.noise[i]
+        position = (
+            now.x[i] + now.acting.offset[i] + encoders.position_noise * reading.noise[i]
+        )
         position = quantised(position, encoders.resolution)
         if encoders.velocity_source == MEASURED:
             velocity = now.x[n + i] + encoders.velocity_noise * reading.noise[n + i]
@@ -141,7 +155,10 @@ def lag(time_constant: float, period: float) -> tuple[float, float]:
 @inner
 def compensate(plant: PlantSettings, now: PlantState) -> None:
     """Write what the drives add in this sample, by the true state and the true friction."""
-    n, drives, state, acting = plant.n, plant.drives, now.drives, now.acting
+    n = plant.n
+    drives = plant.drives
+    state = now.drives
+    acting = now.acting
     if drives.bodies.size == 0:
         return
     fill_gravity(drives.bodies, state.memory, part(now.x, 0, (n,)), state.added)
@@ -156,7 +173,8 @@ def compensate(plant: PlantSettings, now: PlantState) -> None:
 @inner
 def is_due(plant: PlantSettings, now: PlantState) -> bool:
     """Return whether the encoders read this sample, which they have not done yet."""
-    sample, every = int(now.sample[0]), plant.encoders.repeat_every
+    sample = int(now.sample[0])
+    every = plant.encoders.repeat_every
     is_repeat = every > 0 and sample > 0 and sample % every == 0
     return now.reading.sample[0] != now.sample[0] and not is_repeat
 
@@ -225,7 +243,11 @@ def truth(plant: PlantSettings, now: PlantState, out: Array) -> None:
 
 @kernel
 def observe_plant(
-    arm: Arm, settings: Array, state: Array, rng: np.random.Generator, measurement: Array
+    arm: Arm,
+    settings: Array,
+    state: Array,
+    rng: np.random.Generator,
+    measurement: Array,
 ) -> None:
     """Call `observe` with packed vectors."""
     plant, now = plant_views(arm, settings, state)

@@ -19,7 +19,8 @@ class Encoders(NamedTuple):
     resolution: float  # rad, 0 = none
     velocity_source: int  # MEASURED or DIFFERENCED
     velocity_pole: float  # rad/s, 0 = no filter
-    repeat_every: int  # samples after which the last reading is sent once more; 0: never
+    # samples after which the last reading is sent once more; 0: never
+    repeat_every: int
 
 
 class Disturbance(NamedTuple):
@@ -54,7 +55,8 @@ class Drives(NamedTuple):
     effort_scale: float  # of the measured effort: 1, or A/N m of a current
     step: float  # N m from one command to the next that their driver lets pass; 0: any
     jump: float  # N m from one torque to the next at which they stop; 0: none
-    bodies: Annotated[Array, 'bodies_size']  # RigidBodies of their model; empty: they add nothing
+    # RigidBodies of their model; empty: they add nothing
+    bodies: Annotated[Array, 'bodies_size']
 
 
 class Load(NamedTuple):
@@ -136,7 +138,8 @@ class Acting(NamedTuple):
     sloshing: Cell  # kg
     force: Annotated[Array, 3]  # N
     offset: Annotated[Array, 'n']  # rad
-    constant: Annotated[Array, 'n']  # N m, of the disturbance, less torques that push the joints
+    # N m, of the disturbance, less torques that push the joints
+    constant: Annotated[Array, 'n']
     viscous: Annotated[Array, 'n']  # N m s/rad, not below zero
     coulomb: Annotated[Array, 'n']  # N m, not below zero
 
@@ -156,7 +159,8 @@ class PlantState(NamedTuple):
     """Everything that changes from sample to sample except the random generator."""
 
     sample: Cell  # k
-    x: Annotated[Array, '2 * n + 6']  # q [rad], dq [rad/s], noise-free; load: y [m], v [m/s]
+    # q [rad], dq [rad/s], noise-free; load: y [m], v [m/s]
+    x: Annotated[Array, '2 * n + 6']
     sloshes: Cell  # 1: y and v are those of a load
     reading: EncoderReading
     drives: DriveState
@@ -165,4 +169,5 @@ class PlantState(NamedTuple):
 
 
 settings_of = view_of(PlantSettings)
-state_of, state_size = view_of(PlantState), size_of(PlantState)
+state_of = view_of(PlantState)
+state_size = size_of(PlantState)

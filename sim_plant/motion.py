@@ -19,7 +19,8 @@ import numpy as np
 
 from blf_dsc_controller.compiled.elementary import exp, sin, tanh
 from blf_dsc_controller.compiled.jit import inner
-from blf_dsc_controller.compiled.layout import Array, part
+from blf_dsc_controller.compiled.layout import Array
+from blf_dsc_controller.compiled.views import part
 from sim_plant.layout import PlantSettings, PlantState
 
 
@@ -50,7 +51,10 @@ def put(target: Array, values: Array) -> None:
 @inner
 def update_loads(plant: PlantSettings, now: PlantState) -> None:
     """Sum load and events of this sample, unless already done."""
-    sample, load, events, acting = now.sample[0], plant.load, plant.schedule, now.acting
+    sample = now.sample[0]
+    load = plant.load
+    events = plant.schedule
+    acting = now.acting
     if acting.sample[0] == sample:
         return
     acting.sample[0] = sample
@@ -111,7 +115,9 @@ def disturbing_torque(
     Friction has the sign of the velocity; Coulomb friction is smoothed by tanh, so that the
     fixed-step integrator keeps its order.
     """
-    n, given, acting = plant.n, plant.disturbance, now.acting
+    n = plant.n
+    given = plant.disturbance
+    acting = now.acting
     for i in range(n):
         q, dq = x[i], x[n + i]
         angle = given.frequency[i] * t + given.phase[i]
@@ -130,9 +136,14 @@ def disturbing_torque(
 
 
 @inner
-def subtract_tip_torque(plant: PlantSettings, now: PlantState, x: Array, torque: Array) -> None:
+def subtract_tip_torque(
+    plant: PlantSettings, now: PlantState, x: Array, torque: Array
+) -> None:
     """Subtract the torque J^T f (n,) [N m] of the force at the tip from `torque`, in place."""
-    n, push, load, memory = plant.n, now.acting.force, plant.load, now.memory
+    n = plant.n
+    push = now.acting.force
+    load = plant.load
+    memory = now.memory
     mass = now.acting.sloshing[0]
     if push[0] == 0.0 and push[1] == 0.0 and push[2] == 0.0 and mass == 0.0:
         return
@@ -181,7 +192,9 @@ _A = np.array(
 
 
 @inner
-def combine(x: Array, h: float, stage: int, k: Array, begin: int, end: int, out: Array) -> None:
+def combine(
+    x: Array, h: float, stage: int, k: Array, begin: int, end: int, out: Array
+) -> None:
     """Write entries `begin` to `end` of x + h sum_j a_ij k_j; after the last stage, with b_j."""
     for i in range(begin, end):
         slope = 0.0
@@ -191,12 +204,17 @@ def combine(x: Array, h: float, stage: int, k: Array, begin: int, end: int, out:
 
 
 @inner
-def integrate(plant: PlantSettings, now: PlantState, t: float, h: float, torque: Array) -> None:
+def integrate(
+    plant: PlantSettings, now: PlantState, t: float, h: float, torque: Array
+) -> None:
     """Advance x in place from t to t + h [s] under a held torque (n,) [N m].
 
     y and v are advanced only while a load sloshes.
     """
-    x, point, k, end = now.x, now.memory.point, now.memory.k, 2 * plant.n
+    x = now.x
+    point = now.memory.point
+    k = now.memory.k
+    end = 2 * plant.n
     sloshes = now.acting.sloshing[0] > 0.0
     for stage in range(_C.size):
         combine(x, h, stage, k, 0, end, point)

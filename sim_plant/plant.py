@@ -59,7 +59,11 @@ class Plant:
     """
 
     def __init__(
-        self, settings: PlantSettings, position: ArrayLike, velocity: ArrayLike, seed: int = 0
+        self,
+        settings: PlantSettings,
+        position: ArrayLike,
+        velocity: ArrayLike,
+        seed: int = 0,
     ) -> None:
         self.arm = settings.arm
         self.settings = pack(settings)
@@ -220,11 +224,17 @@ def plant_of(config: PlantConfig) -> Plant:
 
 def plant_settings(config: PlantConfig) -> PlantSettings:
     """Return the settings of a configured plant."""
-    arm, n, T = arm_of(config), len(config.joints), config.sample_time
-    sensor, actuator, events, robot = config.sensor, config.actuator, config.events, config.robot
+    arm = arm_of(config)
+    n = len(config.joints)
+    T = config.sample_time
+    sensor = config.sensor
+    actuator = config.actuator
+    events = config.events
+    robot = config.robot
     decay, mean_decay = lag(actuator.time_constant, T)
     overcomes_friction = robot.drive_compensates == 'gravity_and_friction'
-    bodies, omega = drive_bodies(config), events.sloshing_frequency
+    bodies = drive_bodies(config)
+    omega = events.sloshing_frequency
     return PlantSettings(
         arm=arm,
         n=n,
@@ -234,7 +244,9 @@ def plant_settings(config: PlantConfig) -> PlantSettings:
         events=len(events.begin),
         bodies_size=bodies.size,
         memory_size=motion_size(arm) if bodies.size else 0,
-        encoders=_filled(Encoders, sensor, velocity_source=VELOCITY_SOURCES[sensor.velocity]),
+        encoders=_filled(
+            Encoders, sensor, velocity_source=VELOCITY_SOURCES[sensor.velocity]
+        ),
         disturbance=_filled(
             Disturbance,
             config.disturbance,
@@ -259,7 +271,9 @@ def plant_settings(config: PlantConfig) -> PlantSettings:
             sensor,
             stiffness=omega**2,
             damping=2.0 * events.sloshing_damping * omega,
-            gravity=np.array(robot.gravity if robot.urdf else (0.0, 0.0, -config.arm.gravity)),
+            gravity=np.array(
+                robot.gravity if robot.urdf else (0.0, 0.0, -config.arm.gravity)
+            ),
         ),
         schedule=_schedule_of(config),
     )
@@ -270,14 +284,22 @@ def _steps_of(config: PlantConfig, arm: Arm) -> int:
 
     There it damps a joint at its slope over the inertia, at the initial position.
     """
-    n, given, events = len(config.joints), config.disturbance, config.events
+    n = len(config.joints)
+    given = config.disturbance
+    events = config.events
     viscous, coulomb = (
         np.reshape(each or 0.0, (-1, n) if each else (1, 1)).max(axis=0)
         for each in (events.viscous, events.coulomb)
     )
-    slope = (np.array(given.coulomb) + coulomb) * (1.0 + given.stribeck) / given.coulomb_velocity
+    slope = (
+        (np.array(given.coulomb) + coulomb)
+        * (1.0 + given.stribeck)
+        / given.coulomb_velocity
+    )
     slope += np.array(given.viscous) + viscous
-    position, rest, ddq = np.array(config.initial.position), np.zeros(n), np.zeros((2, n))
+    position = np.array(config.initial.position)
+    rest = np.zeros(n)
+    ddq = np.zeros((2, n))
     arm.accelerate(0.0, position, rest, rest, ddq[0])
     rate = 0.0
     for i, torque in enumerate(np.eye(n)):
@@ -299,16 +321,21 @@ def _filled(layout: type[T], *groups: object, **computed: object) -> T:
 
 def _schedule_of(config: PlantConfig) -> Events:
     """Return the events with times in samples, and zeros for what is not given."""
-    events, count, n = config.events, len(config.events.begin), len(config.joints)
+    events = config.events
+    count = len(config.events.begin)
+    n = len(config.joints)
 
     def values(name: str, *shape: int) -> np.ndarray:
         given = getattr(events, name)
-        return np.reshape(given, (count, *shape)) if given else np.zeros((count, *shape))
+        return (
+            np.reshape(given, (count, *shape)) if given else np.zeros((count, *shape))
+        )
 
     def samples(times: np.ndarray) -> np.ndarray:
         return np.rint(times / config.sample_time)
 
-    begin, duration = values('begin'), values('duration')
+    begin = values('begin')
+    duration = values('duration')
     return Events(
         begin=samples(begin),
         end=np.where(duration > 0.0, samples(begin + duration), np.inf),
@@ -316,7 +343,9 @@ def _schedule_of(config: PlantConfig) -> Events:
         payload=values('payload'),
         sloshing=values('sloshing'),
         force=values('force', 3),
-        **{name: values(name, n) for name in ('torque', 'viscous', 'coulomb', 'offset')},
+        **{
+            name: values(name, n) for name in ('torque', 'viscous', 'coulomb', 'offset')
+        },
     )
 
 
@@ -332,7 +361,8 @@ def arm_of(config: PlantConfig) -> Arm:
         return PointMassArm(*vars(config.arm).values())
     chain = robot.chain(config.joints)
     rotors = config.truth.rotor_factor * robot.rotors(chain)
-    inertias, parameters = true_inertias(chain, config.truth), parameters_of(robot, chain)
+    inertias = true_inertias(chain, config.truth)
+    parameters = parameters_of(robot, chain)
     return rigid_arm(rigid_bodies(chain, robot.gravity, inertias, rotors, parameters))
 
 
@@ -343,14 +373,18 @@ def drive_bodies(config: PlantConfig) -> np.ndarray:
         return np.zeros(0)
     chain = robot.chain(config.joints)
     inertias = robot.drive_inertias(chain, true_inertias(chain, config.drive))
-    return pack(rigid_bodies(chain, robot.gravity, inertias, np.zeros(len(chain.joints))))
+    return pack(
+        rigid_bodies(chain, robot.gravity, inertias, np.zeros(len(chain.joints)))
+    )
 
 
 def true_inertias(chain: Chain, truth: Deviation) -> np.ndarray:
     """Return the inertias (n, 10) of the URDF with each mass distribution scaled and shifted."""
     placement = np.eye(4)
     inertias = np.empty((len(chain.joints), 10))
-    for i, (factor, shift) in enumerate(zip(*truth.changes(len(inertias)), strict=True)):
+    for i, (factor, shift) in enumerate(
+        zip(*truth.changes(len(inertias)), strict=True)
+    ):
         placement[:3, 3] = shift
         J = pseudo_inertia(chain.joints[i].inertia)
         inertias[i] = inertia_of(factor * moved(J, placement))

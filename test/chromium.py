@@ -7,7 +7,11 @@ import shutil
 from contextlib import contextmanager
 
 # 3D scenes are rendered by the CPU.
-WEBGL = ('--use-angle=swiftshader', '--enable-unsafe-swiftshader', '--ignore-gpu-blocklist')
+WEBGL = (
+    '--use-angle=swiftshader',
+    '--enable-unsafe-swiftshader',
+    '--ignore-gpu-blocklist',
+)
 NAMES = ('chromium', 'chromium-browser', 'google-chrome')
 PATIENCE = 300e3  # ms, until a test gives up on what should take seconds
 

@@ -14,6 +14,8 @@ from plain_law import R
 from blf_dsc_controller.arms.two_link import TwoLink
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.law import barrier
+from blf_dsc_controller.law.backstepping import Backstepping
+from blf_dsc_controller.law.blf_dsc import BlfDsc
 from blf_dsc_controller.law.controller import Controller
 from blf_dsc_controller.law.factory import settings_of_config
 from blf_dsc_controller.law.state import (
@@ -36,13 +38,18 @@ JOINTS = ('shoulder', 'elbow')
 
 
 def recommended(
-    *, bias: bool = True, viscous: bool = False, frequencies: Sequence[float] = (), **changes: Any
+    *,
+    bias: bool = True,
+    viscous: bool = False,
+    frequencies: Sequence[float] = (),
+    **changes: Any,
 ) -> Settings:
     """Return the settings of the default configuration with changes, and the knee for them.
 
     Change detection is off, since the paper has none: test_law_consistency.py covers it.
     """
-    config, columns = ControllerConfig(), {'viscous': viscous, 'frequencies': frequencies}
+    config = ControllerConfig()
+    columns = {'viscous': viscous, 'frequencies': frequencies}
     config = replace(config, learning=replace(config.learning, bias=bias, **columns))
     settings = settings_of_config(config)._replace(**{'change_detection': 0} | changes)
     barriers = zip(settings.bound, settings.weight, settings.slope_limit, strict=True)
@@ -51,12 +58,15 @@ def recommended(
 
 def quick(**changes: Any) -> Settings:
     """Return settings that learn within seconds: a window of 1 s, which is less excited."""
-    return recommended(**{'window': 1000, 'learning_start': 1.2, 'sigma': 1e-6} | changes)
+    return recommended(
+        **{'window': 1000, 'learning_start': 1.2, 'sigma': 1e-6} | changes
+    )
 
 
 def controller(settings: Settings) -> Controller:
     """Return a controller that tracks the paper's reference."""
-    return Controller(settings, REFERENCE)
+    law = BlfDsc() if settings.has_barrier else Backstepping()
+    return Controller(law, settings, REFERENCE)
 
 
 def plant(**changes: Any) -> Plant:
@@ -85,7 +95,9 @@ def closed_loop(law: Controller, arm: Plant, duration: float) -> Iterator[Sample
 
 def arbitrary(seed: int, **changes: Any) -> tuple[Settings, State, Signals]:
     """Return settings with a window of eight rows, and standard normal state and signals."""
-    settings = recommended(**{'window': 8, 'interval': 1, 'learning_start': 0.0} | changes)
+    settings = recommended(
+        **{'window': 8, 'interval': 1, 'learning_start': 0.0} | changes
+    )
     random = np.random.default_rng(seed)
     state = state_of(random.normal(size=state_size(settings)), settings)
     signals = signals_of(random.normal(size=signals_size(settings)), settings)

@@ -70,7 +70,9 @@ class Running:
         wait_for(lambda: bag.exists() and bag.stat().st_size > 500_000)
         self.children = [
             int(child)
-            for child in Path(f'/proc/{self.process.pid}/task/{self.process.pid}/children')
+            for child in Path(
+                f'/proc/{self.process.pid}/task/{self.process.pid}/children'
+            )
             .read_text()
             .split()
         ]
@@ -79,7 +81,9 @@ class Running:
     def child(self, module):
         """Return the process id of the child that runs a module."""
         (found,) = (
-            child for child in self.children if module in Path(f'/proc/{child}/cmdline').read_text()
+            child
+            for child in self.children
+            if module in Path(f'/proc/{child}/cmdline').read_text()
         )
         return found
 

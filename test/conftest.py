@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """ROS environment of the test process and its child processes; profile of hypothesis.
 
-Both are set here, before any test module imports rclpy. The environment has a domain that no other
-run on this machine is likely to share, discovery on this machine only, and a log folder that is
+Both are set here, before any test module imports rclpy. The environment has a domain in which
+nobody else is, discovery on this machine only, and a log folder that is
 removed at the end.
 """
 
@@ -27,10 +27,11 @@ os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')  # numpy is not imported yet
 os.environ['ROS_LOG_DIR'] = os.environ['DASK_TEMPORARY_DIRECTORY'] = _LOG_FOLDER
 os.environ.pop('FASTRTPS_DEFAULT_PROFILES_FILE', None)
 if find_spec('rclpy'):  # some tests run without ROS
-    from own_domain import own_domain
+    from own_domain import avoid_domain_of_shell, own_domain
 
     from blf_dsc_controller.cli.session import localhost_environment
 
+    avoid_domain_of_shell()
     os.environ.update({'ROS_DOMAIN_ID': str(own_domain()), **localhost_environment()})
 
 # The longest tests start first, so that no worker is left with one of them at the end.
@@ -73,7 +74,9 @@ def bare_node():
             namespace=space,
             context=context,
             cli_args=['--ros-args', '--params-file', str(path)] if path else None,
-            parameter_overrides=[Parameter(k, value=v) for k, v in (overrides or {}).items()],
+            parameter_overrides=[
+                Parameter(k, value=v) for k, v in (overrides or {}).items()
+            ],
             enable_rosout=False,
         )
         nodes.append(node)

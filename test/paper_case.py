@@ -15,7 +15,10 @@ from blf_dsc_controller.law.telemetry import sample_columns
 from blf_dsc_controller.simulation.loop import simulate
 
 P = np.array([1.0, 0.32, 0.4])
-NO_DISTURBANCE = {'disturbance.constant': [0.0, 0.0], 'disturbance.amplitude': [0.0, 0.0]}
+NO_DISTURBANCE = {
+    'disturbance.constant': [0.0, 0.0],
+    'disturbance.amplitude': [0.0, 0.0],
+}
 EXACT = {
     'truth.parameters': [1.0, 0.32, 0.4],
     'truth.constant': [0.1, 0.1],
@@ -32,7 +35,8 @@ def configured(
     """Return a preset with changes to the controller (`law`) and to the plant (`arm`)."""
     config = load_loop(preset, {'sim_plant': {'duration': duration}})
     return config._replace(
-        controller=change(config.controller, law or {}), plant=change(config.plant, arm or {})
+        controller=change(config.controller, law or {}),
+        plant=change(config.plant, arm or {}),
     )
 
 
@@ -91,7 +95,11 @@ def push(joint, torque, seconds, begin=CHANGED):
     """Return parameters of a plant with a torque [N m] on a joint for some seconds."""
     torques = [0.0, 0.0]
     torques[joint] = torque
-    return {'events.begin': [begin], 'events.duration': [seconds], 'events.torque': torques}
+    return {
+        'events.begin': [begin],
+        'events.duration': [seconds],
+        'events.torque': torques,
+    }
 
 
 def several(*events):
@@ -101,7 +109,9 @@ def several(*events):
         f'events.{name}': [
             value
             for event in events
-            for value in np.ravel(event.get(name, [0.0, 0.0] if name == 'torque' else 0.0)).tolist()
+            for value in np.ravel(
+                event.get(name, [0.0, 0.0] if name == 'torque' else 0.0)
+            ).tolist()
         ]
         for name in sorted(names)
     }
@@ -111,10 +121,15 @@ ROWS = {
     **{f'payload to {m2} kg': payload(m2) for m2 in (0.6, 0.65, 0.7, 0.75, 0.8, 1.0)},
     'payload to 0.75 kg at 8 s': payload(0.75, begin=8.0),
     **{
-        f'release from {m2} kg': several({'begin': 10.0, 'duration': 10.0, 'payload': m2 - 0.5})
+        f'release from {m2} kg': several(
+            {'begin': 10.0, 'duration': 10.0, 'payload': m2 - 0.5}
+        )
         for m2 in (0.75, 1.0)
     },
-    **{f'push {row}': push(*row) for row in [(1, 1.0, 3.0), (1, 2.0, 2.0), (0, 3.0, 3.0)]},
+    **{
+        f'push {row}': push(*row)
+        for row in [(1, 1.0, 3.0), (1, 2.0, 2.0), (0, 3.0, 3.0)]
+    },
     **{
         f'payload to 0.75 kg within {ramp} s': payload(0.75) | {'events.ramp': [ramp]}
         for ramp in (0.5, 2.0)
@@ -133,7 +148,10 @@ ROWS = {
 
 def end_of(row):
     """Return the time two windows after the last change of a row [s], in whole samples."""
-    times = (np.array(row.get(f'events.{name}', 0.0)) for name in ('begin', 'duration', 'ramp'))
+    times = (
+        np.array(row.get(f'events.{name}', 0.0))
+        for name in ('begin', 'duration', 'ramp')
+    )
     return round(float(np.max(sum(times))) + 2.0 * WINDOW, 3)
 
 

@@ -61,7 +61,10 @@ def plant(*, start=START, velocity=QUIET, **changes):
     given = IDEAL | {'initial.position': start, 'initial.velocity': velocity}
     given |= {NAMES.get(name, name): value for name, value in changes.items()}
     lists = (np.ndarray, tuple)
-    given = {k: [float(x) for x in v] if isinstance(v, lists) else v for k, v in given.items()}
+    given = {
+        k: [float(x) for x in v] if isinstance(v, lists) else v
+        for k, v in given.items()
+    }
     return plant_of(build(PlantConfig, given))
 
 

@@ -15,7 +15,10 @@ from rosbags.rosbag2 import Reader
 from blf_dsc_controller.bags.sources import open_bag
 from blf_dsc_controller.bags.writer import BagWriter
 from blf_dsc_controller.configuration.nodes import CONTROLLER, PLANT, load_loop
-from blf_dsc_controller.messages.codecs import Float64MultiArrayEncoder, JointStateEncoder
+from blf_dsc_controller.messages.codecs import (
+    Float64MultiArrayEncoder,
+    JointStateEncoder,
+)
 from blf_dsc_controller.messages.topics import (
     BOUND,
     COMMANDS,
@@ -57,7 +60,9 @@ def messages(path):
     """Return every message as [topic, type, time, bytes]."""
     with open_bag(path) as bag:
         types = bag.held
-        return [[m.topic, types[m.topic], m.received, m.raw] for m in bag.messages(types)]
+        return [
+            [m.topic, types[m.topic], m.received, m.raw] for m in bag.messages(types)
+        ]
 
 
 def write(path, entries, *, publishers=0):
@@ -116,7 +121,16 @@ def messages_on_disk(path):
 def small_disk(path, megabytes):
     """Mount a disk of this size at a new folder; skip the test where only root may."""
     path.mkdir()
-    command = ['env', 'mount', '-t', 'tmpfs', '-o', f'size={megabytes}m', 'tmpfs', str(path)]
+    command = [
+        'env',
+        'mount',
+        '-t',
+        'tmpfs',
+        '-o',
+        f'size={megabytes}m',
+        'tmpfs',
+        str(path),
+    ]
     if subprocess.run(command, capture_output=True, check=False).returncode != 0:
         pytest.skip('a small disk cannot be mounted here: root may')
     try:
@@ -149,7 +163,9 @@ class Synthetic:
     def __init__(self, samples):
         self.stamp = START + MILLISECOND * np.arange(samples)
         self.time = 1e-3 * np.arange(samples)
-        wave = np.array([np.sin(2 * np.pi * self.time), np.cos(2 * np.pi * self.time)]).T
+        wave = np.array(
+            [np.sin(2 * np.pi * self.time), np.cos(2 * np.pi * self.time)]
+        ).T
         self.reference = 1.5 + 0.3 * wave
         self.error = wave * [0.0008, -0.0005]
         self.position = self.reference + self.error
@@ -161,12 +177,14 @@ class Synthetic:
     def messages(self, *, with_timing=False):
         """Yield every message as (topic, stamp, bytes)."""
         columns = (*PARAMETERS, *(f'disturbance {joint}' for joint in JOINTS))
-        states = JointStateEncoder(JOINTS[::-1])  # in a different joint order than elsewhere
+        # in a different joint order than elsewhere
+        states = JointStateEncoder(JOINTS[::-1])
         commands = Float64MultiArrayEncoder(2)
         reference = JointStateEncoder(JOINTS, ('position', 'velocity'))
         tracking = JointStateEncoder(JOINTS)
         learning = JointStateEncoder(
-            (*columns, 'bias elbow', 'lambda_min', 'latched', 'compute_time'), ('position',)
+            (*columns, 'bias elbow', 'lambda_min', 'latched', 'compute_time'),
+            ('position',),
         )
         truth = JointStateEncoder((*columns, 'position elbow'), ('position',))
         timing = JointStateEncoder(('latency', 'lateness', 'late_steps'), ('position',))
@@ -174,18 +192,36 @@ class Synthetic:
         bound = JointStateEncoder(JOINTS, ('position', 'effort'))
         yield BOUND, START, bound.encode(START, [BOUND_RAD] * 2, (), [LIMIT_NM] * 2)
         for k, stamp in enumerate(self.stamp.tolist()):
-            yield JOINT_STATES, stamp, states.encode(stamp, self.position[k, ::-1], zero, zero)
+            yield (
+                JOINT_STATES,
+                stamp,
+                states.encode(stamp, self.position[k, ::-1], zero, zero),
+            )
             yield COMMANDS, stamp, commands.encode(self.torque[k])
             yield REFERENCE, stamp, reference.encode(stamp, self.reference[k], zero)
-            yield TRACKING_ERROR, stamp, tracking.encode(stamp, self.error[k], zero, self.torque[k])
+            yield (
+                TRACKING_ERROR,
+                stamp,
+                tracking.encode(stamp, self.error[k], zero, self.torque[k]),
+            )
             vector = [*self.estimate[k], *(0.9 * self.disturbance[k]), 0.1, 0.004]
-            yield MONITOR, stamp, learning.encode(stamp, [*vector, self.latched[k], 1e-9 * k])
+            yield (
+                MONITOR,
+                stamp,
+                learning.encode(stamp, [*vector, self.latched[k], 1e-9 * k]),
+            )
             if k % 10 == 0:
-                yield TRUTH, stamp, truth.encode(stamp, [*TRUE, *self.disturbance[k], 1.0])
+                yield (
+                    TRUTH,
+                    stamp,
+                    truth.encode(stamp, [*TRUE, *self.disturbance[k], 1.0]),
+                )
             if with_timing:
                 yield TIMING, stamp, timing.encode(stamp, [1e-6 * k, 0.0, k // 100])
 
 
 def write_made(path, messages, rename=lambda topic: topic.resolved):
     """Write messages into a bag, with their stamps as times of receipt."""
-    return write(path, [[rename(topic), topic.type, at, raw] for topic, at, raw in messages])
+    return write(
+        path, [[rename(topic), topic.type, at, raw] for topic, at, raw in messages]
+    )

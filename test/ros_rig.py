@@ -16,6 +16,7 @@ from rclpy.experimental import EventsExecutor
 from rclpy.parameter import Parameter
 from std_srvs.srv import Trigger
 
+from blf_dsc_controller.cli.domains import strangers
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.plant import PlantConfig
 from blf_dsc_controller.configuration.schema import build
@@ -31,20 +32,32 @@ JOINTS = ('joint1', 'joint2')
 START = (2.293, 1.696)  # rad, inside the bound at the reference's start
 
 
+def _joined():
+    """Return a context in a domain in which nobody else is, also after it was entered."""
+    while True:
+        context = rclpy.Context()
+        rclpy.init(
+            context=context,
+            domain_id=own_domain(),
+            signal_handler_options=rclpy.SignalHandlerOptions.NO,
+        )
+        if not strangers(context.get_domain_id()):
+            return context
+        rclpy.try_shutdown(context=context)
+
+
 class RosRig:
     """A ROS context of its own; call `close` at the end."""
 
     def __init__(self):
-        self.context = rclpy.Context()
-        rclpy.init(
-            context=self.context,
-            domain_id=own_domain(),
-            signal_handler_options=rclpy.SignalHandlerOptions.NO,
-        )
+        self.context = _joined()
         self.executor = EventsExecutor(context=self.context)
         self.nodes = []
-        self.tester = self._keep(rclpy.create_node('record_tester', context=self.context))
-        self._clients = {}  # by the name of their service; kept, since events may be pending
+        self.tester = self._keep(
+            rclpy.create_node('record_tester', context=self.context)
+        )
+        # by the name of their service; kept, since events may be pending
+        self._clients = {}
 
     def _keep(self, node):
         self.nodes.append(node)
@@ -108,7 +121,11 @@ class RosRig:
         messages = []
         name = topic.relative if isinstance(topic, topics.Topic) else topic
         self.tester.create_subscription(
-            message_class(topic.type), name, messages.append, qos_profile(topic.offered), raw=raw
+            message_class(topic.type),
+            name,
+            messages.append,
+            qos_profile(topic.offered),
+            raw=raw,
         )
         return messages
 
@@ -129,7 +146,9 @@ class RosRig:
 
     def reset(self, node):
         """Call `~/reset` of a node."""
-        return self.call(Trigger, f'{node.get_fully_qualified_name()}/reset', Trigger.Request())
+        return self.call(
+            Trigger, f'{node.get_fully_qualified_name()}/reset', Trigger.Request()
+        )
 
     def change(self, node, transition):
         """Request a lifecycle transition by its id; return whether it was made."""
@@ -168,7 +187,9 @@ def states(messages, names=JOINTS):
 
 def simulated(plant, controller=None):
     """Return the run of the compiled loop with the same parameters."""
-    return simulate(build(ControllerConfig, controller or {}), build(PlantConfig, plant)).run()
+    return simulate(
+        build(ControllerConfig, controller or {}), build(PlantConfig, plant)
+    ).run()
 
 
 def values(status):

@@ -14,8 +14,9 @@ from collections import Counter
 from pathlib import Path
 
 # Before anything of ROS is imported.
-os.environ['FASTRTPS_DEFAULT_PROFILES_FILE'] = str(Path(__file__).with_name('one_process.xml'))
-os.environ.setdefault('ROS_DOMAIN_ID', str(1 + os.getpid() % 101))
+os.environ['FASTRTPS_DEFAULT_PROFILES_FILE'] = str(
+    Path(__file__).with_name('one_process.xml')
+)
 os.environ.setdefault('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
 
 import numpy as np
@@ -25,7 +26,7 @@ from ros_rig import RosRig, activate, deactivate
 
 from blf_dsc_controller.nodes.controller_node import ControllerNode
 from blf_dsc_controller.nodes.plant_node import PlantNode
-from blf_dsc_controller.supervision.checks import Phase
+from blf_dsc_controller.supervision.supervisor import Phase
 
 
 class Loop:
@@ -61,35 +62,55 @@ class Loop:
         self.ros.reset(self.arm)
 
     def pause_both(self):
-        for change, nodes in ((deactivate, (self.law, self.arm)), (activate, (self.arm, self.law))):
+        for change, nodes in (
+            (deactivate, (self.law, self.arm)),
+            (activate, (self.arm, self.law)),
+        ):
             assert all(change(self.ros, node) for node in nodes)
 
     def reset_one(self):
         self.ros.reset(self.arm if self.rng.random() < 0.5 else self.law)
 
 
-FAULTS = ('push', 'new_gains', 'kill_controller', 'kill_plant', 'pause_both', 'reset_one')
+FAULTS = (
+    'push',
+    'new_gains',
+    'kill_controller',
+    'kill_plant',
+    'pause_both',
+    'reset_one',
+)
 
 
 def soak(loop, samples):
     """Run for `samples`, not counting those during faults; fail if anything grows."""
-    done, worst, faults, used = 0, 0.0, Counter(), []
+    done = 0
+    worst = 0.0
+    faults = Counter()
+    used = []
     while done < samples:
         count = int(loop.rng.integers(1000, 4000))
         loop.ros.run(loop.arm, count)
         assert loop.law.guard.supervisor.running, loop.law.guard.supervisor.text
-        done, worst = done + count, max(worst, float(loop.law.guard.samples.ratio.max()))
+        done = done + count
+        worst = max(worst, float(loop.law.guard.samples.ratio.max()))
         fault = loop.rng.choice(FAULTS)
         faults[str(fault)] += 1
         getattr(loop, fault)()
         loop.ros.spin(0.02)
-        if loop.law.guard.supervisor.phase is Phase.SAFE_STOP or loop.arm.plant.sample == 0:
+        if (
+            loop.law.guard.supervisor.phase is Phase.SAFE_STOP
+            or loop.arm.plant.sample == 0
+        ):
             assert loop.ros.reset(loop.arm).success
         loop.ros.until(lambda: loop.law.guard.supervisor.phase is Phase.TRACKING)
         gc.collect()
         pages = int(Path('/proc/self/statm').read_text().split()[1])
         used.append(
-            (pages * os.sysconf('SC_PAGE_SIZE') / 1e6, len(list(Path('/proc/self/fd').iterdir())))
+            (
+                pages * os.sysconf('SC_PAGE_SIZE') / 1e6,
+                len(list(Path('/proc/self/fd').iterdir())),
+            )
         )
     growth, extra = np.subtract(used[-1], used[max(1, len(used) // 4)])
     print(
@@ -106,7 +127,9 @@ def soak(loop, samples):
 
 if __name__ == '__main__':
     options = argparse.ArgumentParser(description=__doc__)
-    options.add_argument('--minutes', type=float, default=30.0, help='of the plant (30)')
+    options.add_argument(
+        '--minutes', type=float, default=30.0, help='of the plant (30)'
+    )
     options.add_argument('--seed', type=int, default=0)
     given = options.parse_args()
     loop = Loop(given.seed)

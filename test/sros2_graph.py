@@ -37,7 +37,9 @@ HEAD = """\
 def granted(ros, names):
     """Return the names of the topics or services of nodes, by kind of access."""
     return {
-        access: sorted({f for name in names for f, _ in getattr(ros.tester, method)(name, '/')})
+        access: sorted(
+            {f for name in names for f, _ in getattr(ros.tester, method)(name, '/')}
+        )
         for _, access, _, method in KINDS
     }
 
@@ -45,7 +47,9 @@ def granted(ros, names):
 def is_recording_all(ros):
     """Return whether the recorder has found every topic."""
     there = {name for name, _ in ros.tester.get_topic_names_and_types()}
-    found = ros.tester.get_subscriber_names_and_types_by_node('_bag_recorder_subscriptions', '/')
+    found = ros.tester.get_subscriber_names_and_types_by_node(
+        '_bag_recorder_subscriptions', '/'
+    )
     published = {name for name in there if ros.tester.count_publishers(name)}
     return published <= {name for name, _ in found}
 
@@ -60,15 +64,19 @@ def live():
             ros.add(PlantNode, publish_clock=True, sample_time=0.02)
             ros.add(ControllerNode, sample_time=0.02)
             ros.add(ViewNode)
-            planner = '/blf_dsc_controller/joint_trajectory'  # of a user: it is recorded
+            # of a user: it is recorded
+            planner = '/blf_dsc_controller/joint_trajectory'
             ros.tester.create_publisher(JointTrajectory, planner, 1)
             watchdog = ros.add(WatchdogNode)
             recorder = ros.add(BagRecorderNode, output=bag)
-            ros.until(lambda: is_recording_all(ros) and watchdog.line)
+            ros.until(lambda: is_recording_all(ros) and watchdog.watchdog)
             nodes = {
                 'sim_plant': ['sim_plant'],
                 'blf_dsc_controller': ['blf_dsc_controller'],
-                'torque_watchdog': ['torque_watchdog', '_torque_watchdog_subscriptions'],
+                'torque_watchdog': [
+                    'torque_watchdog',
+                    '_torque_watchdog_subscriptions',
+                ],
                 'view': ['view', '_view_subscriptions'],
                 'bag_recorder': ['bag_recorder', '_bag_recorder_subscriptions'],
             }

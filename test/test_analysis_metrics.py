@@ -37,7 +37,9 @@ SAMPLES = 10_000
 @pytest.fixture(scope='module')
 def run(tmp_path_factory):
     messages = Synthetic(SAMPLES).messages(with_timing=True)
-    return read_run(recorded_run.write_made(tmp_path_factory.mktemp('made') / 'bag', messages))
+    return read_run(
+        recorded_run.write_made(tmp_path_factory.mktemp('made') / 'bag', messages)
+    )
 
 
 def test_tracking(run):
@@ -61,18 +63,27 @@ def test_tracking(run):
 def test_first_violation_is_the_earliest_of_all_joints(run):
     error = run.error.copy()
     error[4000, 0] = 0.0021
-    error[3000, 1] = -BOUND_RAD  # on the bound counts as outside: the barrier is infinite there
+    # on the bound counts as outside: the barrier is infinite there
+    error[3000, 1] = -BOUND_RAD
     metrics = measure(replace(run, error=error))
     assert metrics.held is False
-    assert (metrics.first_violation, metrics.violating_joint) == (pytest.approx(3.0), 'elbow')
+    assert (metrics.first_violation, metrics.violating_joint) == (
+        pytest.approx(3.0),
+        'elbow',
+    )
 
 
 def test_learning(run):
     metrics = measure(run)
     assert metrics.latch_time == pytest.approx(LATCH_S)
-    errors = {t: error for t, error in metrics.parameter_error.items() if not np.isnan(error)}
+    errors = {
+        t: error for t, error in metrics.parameter_error.items() if not np.isnan(error)
+    }
     # The run ends one sample before 10 s, which counts as 10 s.
-    assert errors == {5: pytest.approx(0.5 * np.exp(-3.5)), 10: metrics.final_parameter_error}
+    assert errors == {
+        5: pytest.approx(0.5 * np.exp(-3.5)),
+        10: metrics.final_parameter_error,
+    }
     assert metrics.final_parameter_error == pytest.approx(0.5 * np.exp(-8.499))
     # 0.5 exp(-t) = 0.01 at t = ln 50 after the latch, seen at the next sample.
     assert metrics.time_to_1_percent == pytest.approx(LATCH_S + np.log(50), abs=1e-3)
@@ -84,11 +95,37 @@ def test_learning(run):
     assert np.isnan(measure(left).time_to_1_percent)
 
 
+def test_tail_is_the_last_ten_seconds_of_a_longer_run(run):
+    """Three times slower: 30 s, of which the parameter error of the last 10 s counts."""
+    stamp = run.stamp[0] + 3 * (run.stamp - run.stamp[0])
+    slow = replace(run, stamp=stamp, monitor=replace(run.monitor, stamp=stamp))
+    error = recorded_run.relative_error(1e-3 * np.arange(SAMPLES))
+    last = error[3e-3 * np.arange(SAMPLES) >= 29.997 - 10.0]
+    expected = np.sqrt(np.mean(last**2))
+    assert measure(slow).tail_parameter_error == pytest.approx(expected, rel=1e-9)
+
+
+def test_smallest_bound_and_torque_limit_count(run):
+    bound = run.bound.copy()
+    bound[4000:5000, 1] = 3.0 * BOUND_RAD
+    limit = run.torque_limit.copy()
+    limit[7000:, 0] = 0.5 * LIMIT_NM
+    metrics = measure(replace(run, bound=bound, torque_limit=limit))
+    assert metrics.torque_limit == (0.5 * LIMIT_NM, LIMIT_NM)
+    assert metrics.bound == (BOUND_RAD, BOUND_RAD)
+    assert metrics.widest_bound == (BOUND_RAD, 3.0 * BOUND_RAD)
+
+
 def test_timing(run):
     timing = measure(run).timing
     assert timing['rate'] == pytest.approx(1000.0)
     # Latencies of 0, 1, 2 ... 9999 us.
-    expected = {'p50': 4999.5e-6, 'p99': 9899.01e-6, 'p99.9': 9989.001e-6, 'max': 9999e-6}
+    expected = {
+        'p50': 4999.5e-6,
+        'p99': 9899.01e-6,
+        'p99.9': 9989.001e-6,
+        'max': 9999e-6,
+    }
     assert timing['latency'] == pytest.approx(expected)
     assert timing['late_steps'] == 99
     slow = replace(run, received=run.received * 2)  # the rate is by the wall clock
@@ -96,15 +133,33 @@ def test_timing(run):
 
 
 def test_unknown_values_are_null_and_never_nan(run, tmp_path):
-    optional = ('reference', 'error', 'bound', 'torque_limit', 'monitor', 'truth', 'timing')
+    optional = (
+        'reference',
+        'error',
+        'bound',
+        'torque_limit',
+        'monitor',
+        'truth',
+        'timing',
+    )
     unknown = dict.fromkeys(optional) | {'torque': np.full_like(run.torque, np.nan)}
     metrics = measure(replace(run, **unknown))
     write_json(metrics, tmp_path / 'summary.json')
     written = json.loads((tmp_path / 'summary.json').read_text())
     assert written == plain(metrics)
-    known = {name for name, value in written.items() if value not in (None, [None, None])}
+    known = {
+        name for name, value in written.items() if value not in (None, [None, None])
+    }
     assert known == {
-        *('duration', 'samples', 'joints', 'violating_joint', 'stops', 'learns', 'model_changes'),
+        *(
+            'duration',
+            'samples',
+            'joints',
+            'violating_joint',
+            'stops',
+            'learns',
+            'model_changes',
+        ),
         *('rejected_columns', 'loads', 'of_torques', 'parameter_error'),
     }
 
@@ -122,7 +177,8 @@ def test_estimates_are_compared_only_with_a_truth_of_the_same_parameters(run):
 
 
 def test_table_shows_the_metrics_and_what_is_unusual(run):
-    bound, late = run.bound.copy(), run.timing.values.copy()
+    bound = run.bound.copy()
+    late = run.timing.values.copy()
     bound[:100, 1] = 0.0123
     late[-1, run.timing.names.index(LATE_STEPS)] = 0.02 * SAMPLES
     timing = replace(run.timing, values=late)
@@ -167,7 +223,8 @@ def test_learning_begins_only_in_a_law_that_learns_in_simulation_and_its_bag(
     config = recorded_run.loop_config(**changes)
     record = simulate(config.controller, config.plant)
     write_bag(tmp_path / 'bag', record)
-    simulated, recorded = measure(record.run()), measure(read_run(tmp_path / 'bag'))
+    simulated = measure(record.run())
+    recorded = measure(read_run(tmp_path / 'bag'))
     tail = simulated.tail_parameter_error  # of every sample
     assert plain(replace(recorded, tail_parameter_error=tail)) == plain(simulated)
     assert record.run().monitor.column('latched')[-1] == 1.0
@@ -207,16 +264,22 @@ def run_of(estimate, true=P, regressor=pendulum):
         monitor=Series((*names, LAMBDA_MIN, LATCHED), stamp, learned),
         truth=Series(names, stamp, np.broadcast_to(true, (TIME.size, 3))),
         arm=LearnedArm(
-            dict.fromkeys(names, 'kg'), dict(zip(names, (0.5, 1.0, 2.0), strict=True)), regressor
+            dict.fromkeys(names, 'kg'),
+            dict(zip(names, (0.5, 1.0, 2.0), strict=True)),
+            regressor,
         ),
     )
 
 
 def test_parameter_error_is_the_torque_error_along_the_reference():
     assert measure(run_of(1.1 * P)).final_parameter_error == pytest.approx(0.1)
-    assert measure(run_of(P * (1.0, 1.0, 7.0))).final_parameter_error == pytest.approx(0.0)
+    assert measure(run_of(P * (1.0, 1.0, 7.0))).final_parameter_error == pytest.approx(
+        0.0
+    )
     off = measure(run_of(P * (1.25, 1.0, 1.0))).final_parameter_error
-    expected = np.linalg.norm(0.5 * np.sin(TIME)) / np.linalg.norm(3.0 - 2.0 * np.sin(TIME))
+    expected = np.linalg.norm(0.5 * np.sin(TIME)) / np.linalg.norm(
+        3.0 - 2.0 * np.sin(TIME)
+    )
     assert off == pytest.approx(expected, rel=0.01)
 
 
@@ -238,7 +301,9 @@ def test_regressor_is_evaluated_along_the_reference():
 def test_table_and_summary_name_the_torque_error():
     run = run_of(1.1 * P)
     assert measure(run).of_torques
-    line = 'torque error of the learned model 5 s 10 %, 10 s 10 %, end 10 %; not below 1 %'
+    line = (
+        'torque error of the learned model 5 s 10 %, 10 s 10 %, end 10 %; not below 1 %'
+    )
     assert f'model       {line}' in format_table(measure(run)).splitlines()
     still = replace(run, reference=np.full_like(run.reference, np.nan))
     assert np.isnan(measure(still).final_parameter_error)
@@ -256,16 +321,24 @@ def test_estimate_errors_are_shown_in_deviations_of_the_prior(known, share):
 
 
 def test_estimates_are_grouped_by_link_and_friction():
-    names = (*(f'{kind}{link}' for link in (1, 2) for kind in ('m*cx', 'Izz', 'rotor')),)
+    names = (
+        *(f'{kind}{link}' for link in (1, 2) for kind in ('m*cx', 'Izz', 'rotor')),
+    )
     names += ('viscous joint1', 'viscous joint2', 'coulomb joint1', 'coulomb joint2')
     bodies = bodies_of(names)
     sizes = {'link 1': 3, 'link 2': 3, 'viscous': 2, 'coulomb': 2}
     assert {body: len(members) for body, members in bodies.items()} == sizes
     assert bodies_of(names[:3]) == {name: [k] for k, name in enumerate(names[:3])}
-    true = np.array([0.0] * 6 + [np.nan] * 4)  # the friction is unknown: how far does it move?
-    estimate = np.array([[9.0] * 10, [0.0, 0.0, 0.0, 3.0, 4.0, 0.0, np.nan, 10.0, np.nan, np.nan]])
-    found = errors_of_bodies(bodies, estimate, np.tile(true, (2, 1)), np.full(10, 2.0))[:, 1]
-    np.testing.assert_allclose(found, (0.0, 250.0 / np.sqrt(3.0), 50.0, np.nan))  # rejected
+    # the friction is unknown: how far does it move?
+    true = np.array([0.0] * 6 + [np.nan] * 4)
+    estimate = np.array(
+        [[9.0] * 10, [0.0, 0.0, 0.0, 3.0, 4.0, 0.0, np.nan, 10.0, np.nan, np.nan]]
+    )
+    found = errors_of_bodies(bodies, estimate, np.tile(true, (2, 1)), np.full(10, 2.0))[
+        :, 1
+    ]
+    # rejected
+    np.testing.assert_allclose(found, (0.0, 250.0 / np.sqrt(3.0), 50.0, np.nan))
 
 
 def test_change_of_the_true_arm_is_marked():
@@ -288,18 +361,33 @@ def test_seven_joints_and_sixty_parameters_fit_into_the_figures(tmp_path, config
     learned = np.ones((50, len(names) + 2)) * np.arange(len(names) + 2)
     series = Series((*names, LAMBDA_MIN, LATCHED), stamp, learned)
     run = Run(
-        *(config.joints, stamp, stamp, wide, wide, wide, wide + 0.001, wide / 1e3, wide, wide),
+        *(
+            config.joints,
+            stamp,
+            stamp,
+            wide,
+            wide,
+            wide,
+            wide + 0.001,
+            wide / 1e3,
+            wide,
+            wide,
+        ),
         monitor=series,
         truth=series,
         arm=arm if configured else None,
     )
     with warnings.catch_warnings():
-        warnings.simplefilter('error')  # matplotlib warns when there is no room for the axes
+        # matplotlib warns when there is no room for the axes
+        warnings.simplefilter('error')
         drawn = draw(run, tmp_path)
     assert [path.name for path in drawn] == ['tracking.png', 'parameters.png']
     for path in drawn:
         assert 1200 < matplotlib.image.imread(path).shape[1] < 2000
-    shown = {panel.title: panel for panel in panels([run]) if panel.group == 'Parameters'}
-    assert all(len(panel.lines) <= 8 for panel in shown.values())  # as there are colours
+    shown = {
+        panel.title: panel for panel in panels([run]) if panel.group == 'Parameters'
+    }
+    # as there are colours
+    assert all(len(panel.lines) <= 8 for panel in shown.values())
     of_links = {'torque error', 'errors of the estimates, by link'}
     assert set(shown) == (of_links if configured else {'relative parameter error'})

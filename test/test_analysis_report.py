@@ -37,15 +37,17 @@ from blf_dsc_controller.messages.topics import (
     TRACKING_ERROR,
 )
 from blf_dsc_controller.simulation.loop import simulate
-from blf_dsc_controller.supervision.checks import Reason
+from blf_dsc_controller.supervision.supervisor import Reason
 
-pytest.importorskip('plotly', reason='needs plotly: pip install blf_dsc_controller[report]')
+pytest.importorskip('plotly', reason='needs plotly: pip install .[report]')
 
 
 @pytest.fixture(scope='module')
 def run(tmp_path_factory):
     messages = Synthetic(5000).messages()
-    return read_run(recorded_run.write_made(tmp_path_factory.mktemp('made') / 'bag', messages))
+    return read_run(
+        recorded_run.write_made(tmp_path_factory.mktemp('made') / 'bag', messages)
+    )
 
 
 def pixels(path):
@@ -64,7 +66,11 @@ def lightened(colour, opacity=0.75):
 
 
 def test_a_change_of_the_arm_is_drawn_from_close_by(tmp_path):
-    event = {'events.begin': (1.0,), 'events.duration': (0.0,), 'events.payload': (0.25,)}
+    event = {
+        'events.begin': (1.0,),
+        'events.duration': (0.0,),
+        'events.payload': (0.25,),
+    }
     loop = load_loop('recommended', {'sim_plant': {'duration': 4.0, **event}})
     drawn = draw(simulate(loop.controller, loop.plant).run(), tmp_path)
     assert [path.name for path in drawn[:2]] == ['tracking.png', 'change.png']
@@ -76,7 +82,10 @@ def test_a_change_of_the_arm_is_drawn_from_close_by(tmp_path):
 
 def test_draw_writes_both_figures_and_leaves_no_trace(run, tmp_path):
     before = dict(rcParams)
-    assert draw(run, tmp_path) == [tmp_path / 'tracking.png', tmp_path / 'parameters.png']
+    assert draw(run, tmp_path) == [
+        tmp_path / 'tracking.png',
+        tmp_path / 'parameters.png',
+    ]
     assert (dict(rcParams), plt.get_fignums()) == (before, [])  # no changed settings
     tracking = pixels(tmp_path / 'tracking.png')
     parameters = pixels(tmp_path / 'parameters.png')
@@ -117,7 +126,16 @@ def test_missing_series_and_a_single_sample_are_drawn(run, tmp_path):
     minimal = replace(partial, reference=None, bound=None, monitor=None)
     assert draw(minimal, tmp_path / 'alone') == [tmp_path / 'alone' / 'tracking.png']
     assert not (tmp_path / 'alone' / 'parameters.png').exists()
-    arrays = ('stamp', 'received', 'position', 'velocity', 'torque', 'reference', 'error', 'bound')
+    arrays = (
+        'stamp',
+        'received',
+        'position',
+        'velocity',
+        'torque',
+        'reference',
+        'error',
+        'bound',
+    )
     one = {name: getattr(run, name)[:1] for name in (*arrays, 'torque_limit')}
     assert draw(replace(run, **one), tmp_path)
 
@@ -150,7 +168,9 @@ def test_constant_series_on_a_logarithmic_axis_is_drawn(run, tmp_path, level):
 
 @given(st.integers(1, 400), st.integers(1, 50), st.randoms(use_true_random=False))
 def test_envelope_keeps_the_extremes_of_every_piece(size, pieces, random):
-    values = np.array([random.choice([random.gauss(0, 1), np.nan]) for _ in range(size)])
+    values = np.array(
+        [random.choice([random.gauss(0, 1), np.nan]) for _ in range(size)]
+    )
     time = np.arange(size) * 0.5
     thin_time, thin = envelope(time, values, pieces)
     assert thin.size <= max(2 * pieces, size if size <= 2 * pieces else 0)
@@ -173,15 +193,21 @@ def folder(tmp_path_factory):
     synthetic = Synthetic(4000)
     synthetic.error[1234, 0] = -0.005  # one sample far outside
     synthetic.torque[2000:2010, 1] = 20.0  # ten samples at the limit
-    data = json.dumps({'stamp': START + 2_500_000_000, 'parameters': {'load.torque': [1.0, 0.0]}})
+    data = json.dumps(
+        {'stamp': START + 2_500_000_000, 'parameters': {'load.torque': [1.0, 0.0]}}
+    )
     message = typestore().types[CHANGES.type](data=data)
     change = (CHANGES, START, bytes(typestore().serialize_cdr(message, CHANGES.type)))
-    recorded_run.write_made(path / 'synthetic', [*synthetic.messages(with_timing=True), change])
+    recorded_run.write_made(
+        path / 'synthetic', [*synthetic.messages(with_timing=True), change]
+    )
     return path
 
 
 def by_title(bags):
-    return {plot['title']: plot for plot in plots(panels([bag.run for bag in bags]), bags)}
+    return {
+        plot['title']: plot for plot in plots(panels([bag.run for bag in bags]), bags)
+    }
 
 
 def test_every_quantity_has_a_panel(folder, run, tmp_path, monkeypatch):
@@ -195,7 +221,9 @@ def test_every_quantity_has_a_panel(folder, run, tmp_path, monkeypatch):
     expected |= {'minimum eigenvalue of Φ', 'disturbance estimates'}
     assert titles == expected
     drawn = []  # in the pictures, each once
-    monkeypatch.setattr(figures, 'draw_panels', lambda _p, _t, shown, *_, **__: drawn.extend(shown))
+    monkeypatch.setattr(
+        figures, 'draw_panels', lambda _p, _t, shown, *_, **__: drawn.extend(shown)
+    )
     draw(run, tmp_path)
     assert sorted(panel.title for panel in drawn) == sorted(expected)
 
@@ -220,16 +248,21 @@ def test_events_list_violation_latch_saturation_and_plant_change(folder):
     }
 
 
-def test_several_bags_are_overlaid_and_their_parameter_differences_listed(folder, tmp_path):
+def test_several_bags_are_overlaid_and_their_parameter_differences_listed(
+    folder, tmp_path
+):
     bags = [read_bag(folder / 'one'), read_bag(folder / 'other')]
     panel = by_title(bags)['error of joint1']
     names = [trace['name'] for trace in panel['traces']]
     one, other = (bag.name for bag in bags)
-    assert names == [f'{bag}: {line}' for bag in (one, other) for line in ('error', *['bound'] * 2)]
+    assert names == [
+        f'{bag}: {line}' for bag in (one, other) for line in ('error', *['bound'] * 2)
+    ]
     assert panel['traces'][0]['line']['color'] != panel['traces'][3]['line']['color']
     shown = [trace['name'] for trace in panel['traces'] if trace['showlegend']]
     assert (one, other) == (f'{folder.name}/one', f'{folder.name}/other')
-    assert shown == [f'{one}: error', f'{one}: bound', f'{other}: error']  # what they share, once
+    # what they share, once
+    assert shown == [f'{one}: error', f'{one}: bound', f'{other}: error']
     write_report(bags, tmp_path / 'page.html')
     text = (tmp_path / 'page.html').read_text()
     assert '<p>1 parameters differ.</p>' in text
@@ -243,7 +276,8 @@ def test_page_is_self_contained_and_escapes_names(tmp_path, monkeypatch):
     bag = read_bag(recorded_run.write_made(tmp_path / 'bag', Synthetic(200).messages()))
     write_report([replace(bag, name=nasty)], tmp_path / 'page.html')
     text = (tmp_path / 'page.html').read_text()
-    own = text.split('<script>')[0] + text.rsplit('<script>', 1)[1]  # without plotly's own script
+    # without plotly's own script
+    own = text.split('<script>')[0] + text.rsplit('<script>', 1)[1]
     assert not re.search(r'(?:src|href)="(?!#|data:)|https?:', own)
     embedded = re.search(r'id="data">(.*?)</script>', text, re.DOTALL)[1]
     titles = {panel['title'] for panel in json.loads(embedded)['panels']}
@@ -256,9 +290,17 @@ def test_page_is_self_contained_and_escapes_names(tmp_path, monkeypatch):
 def test_joint_states_alone_suffice_for_a_page(tmp_path, capsys):
     states = [entry for entry in Synthetic(500).messages() if entry[0] is JOINT_STATES]
     recorded_run.write_made(tmp_path / 'bag', states)
-    assert main(['report', str(tmp_path / 'bag'), '--out', str(tmp_path / 'page.html')]) == 0
+    assert (
+        main(['report', str(tmp_path / 'bag'), '--out', str(tmp_path / 'page.html')])
+        == 0
+    )
     assert 'not recorded in the bag' in (tmp_path / 'page.html').read_text()
-    assert main(['report', str(tmp_path / 'nowhere'), '--out', str(tmp_path / 'none.html')]) == 1
+    assert (
+        main(
+            ['report', str(tmp_path / 'nowhere'), '--out', str(tmp_path / 'none.html')]
+        )
+        == 1
+    )
     assert capsys.readouterr().err.startswith('blf_dsc report: ')
     assert not (tmp_path / 'none.html').exists()
 
@@ -273,8 +315,14 @@ def test_absurd_numbers_and_characters_missing_from_the_font_cause_no_warning(
     made.position[50, 0] = made.error[100, 1] = made.reference[70, 0] = value
     made.error[200:, 0] = made.torque[:, 1] = made.estimate[:, 1] = value
     made.disturbance[100:, 0] = made.latched[:] = value
-    bag = str(recorded_run.write_made(tmp_path / 'bag', made.messages(with_timing=True)))
-    for command, out in (('report', 'page.html'), ('plot', 'plots'), ('export', 'table.csv')):
+    bag = str(
+        recorded_run.write_made(tmp_path / 'bag', made.messages(with_timing=True))
+    )
+    for command, out in (
+        ('report', 'page.html'),
+        ('plot', 'plots'),
+        ('export', 'table.csv'),
+    ):
         assert main([command, bag, '--out', str(tmp_path / out)]) == 0
     out, errors = capfd.readouterr()
     assert errors == ''
@@ -291,7 +339,9 @@ LATE = 40 * MILLISECOND  # from the stamp of a message to its reception
 def stopped(folder, reason=Reason.OUTSIDE_BOUND):
     """Bag of a run whose controller stops at `STOP_S`; its messages are received late."""
     stop = START + round(STOP_S * 1e3) * MILLISECOND
-    text = "joint 'elbow' is +0.0023 rad from its reference: past its bound of 0.002 rad"
+    text = (
+        "joint 'elbow' is +0.0023 rad from its reference: past its bound of 0.002 rad"
+    )
     event = Event(2, EventType.STOP, stop, 1, 1, {'reason': reason, 'text': text})
     messages = [
         (topic, stamp + LATE, raw)
@@ -299,7 +349,9 @@ def stopped(folder, reason=Reason.OUTSIDE_BOUND):
         if topic not in (TRACKING_ERROR, REFERENCE, MONITOR) or stamp < stop
     ]
     messages.append((JOURNAL, stop + 2 * LATE, event.encode()))
-    return recorded_run.write_made(folder / 'bag', sorted(messages, key=lambda entry: entry[1]))
+    return recorded_run.write_made(
+        folder / 'bag', sorted(messages, key=lambda entry: entry[1])
+    )
 
 
 @pytest.mark.parametrize(
@@ -328,7 +380,11 @@ def test_stop_outside_the_bound_is_a_violation_at_the_stamp_of_the_last_state(
 def test_figures_and_page_show_the_stop(tmp_path):
     path = stopped(tmp_path)
     run = read_run(path)
-    shown = [panel for panel in panels([run]) if panel.group in ('Motion', 'Tracking', 'Torque')]
+    shown = [
+        panel
+        for panel in panels([run])
+        if panel.group in ('Motion', 'Tracking', 'Torque')
+    ]
     assert len(shown) == 8
     for panel in shown:
         assert [(mark.text, mark.colour) for mark in panel.marks] == [
@@ -341,7 +397,9 @@ def test_figures_and_page_show_the_stop(tmp_path):
     assert amount(figure, ALARM) > 100
     assert amount(figure, lightened(ALARM, 0.1)) > 50_000  # shaded after the stop
     bag = read_bag(path)
-    ((time, text),) = ((time, text) for time, kind, text in bag.events if kind == 'stop')
+    ((time, text),) = (
+        (time, text) for time, kind, text in bag.events if kind == 'stop'
+    )
     assert time == pytest.approx(STOP_S)
     assert text.startswith("error past the bound: joint 'elbow'")
 
@@ -349,13 +407,25 @@ def test_figures_and_page_show_the_stop(tmp_path):
 def test_stop_is_shaded_until_the_controller_restarts(tmp_path):
     stop, start = (START + k * MILLISECOND for k in (1000, 1800))
     events = [
-        Event(1, EventType.STOP, stop, 1, 1, {'reason': Reason.VELOCITY, 'text': 'too fast'}),
+        Event(
+            1,
+            EventType.STOP,
+            stop,
+            1,
+            1,
+            {'reason': Reason.VELOCITY, 'text': 'too fast'},
+        ),
         Event(2, EventType.START, start, 1, 1, {'resumed': False}),
     ]
-    messages = [*Synthetic(4000).messages(), *((JOURNAL, START, each.encode()) for each in events)]
+    messages = [
+        *Synthetic(4000).messages(),
+        *((JOURNAL, START, each.encode()) for each in events),
+    ]
     path = recorded_run.write_made(tmp_path / 'bag', messages)
     bag = read_bag(path)
-    (plot,) = (p for p in plots(panels([bag.run]), [bag]) if p['title'] == 'torque of elbow')
+    (plot,) = (
+        p for p in plots(panels([bag.run]), [bag]) if p['title'] == 'torque of elbow'
+    )
     assert plot['marks'] == [
         (pytest.approx(1.0), 'stop: velocity not plausible', ALARM, pytest.approx(1.8))
     ]

@@ -56,14 +56,18 @@ def test_loop_compared_with_c_and_numpy(monkeypatch):
     offline = tiny(monkeypatch, 'offline', _LONG=0.1, _SHORT=0.02)
     monkeypatch.setattr(offline, '_PEERS', {'numpy': offline._PEERS['numpy']})
     assert contestants(list(offline.measure())) == ['blf_dsc_controller', 'numpy']
-    assert offline.disagreement() < 1e-9  # angles, torques and estimates are of order 1 to 10
+    # angles, torques and estimates are of order 1 to 10
+    assert offline.disagreement() < 1e-9
 
 
 def test_simulators_of_the_peers_run_the_same_arm():
     offline = importlib.import_module('offline')
     numpy, *others = (loop(0.2) for loop, _ in offline._PEERS.values())
-    for errors in others:  # MuJoCo holds the disturbance over a sample, the URDF has 1e-6 kg m^2
-        np.testing.assert_allclose(errors, numpy, rtol=0.0, atol=1e-4 * np.abs(numpy).max())
+    # MuJoCo holds the disturbance over a sample, the URDF has 1e-6 kg m^2
+    for errors in others:
+        np.testing.assert_allclose(
+            errors, numpy, rtol=0.0, atol=1e-4 * np.abs(numpy).max()
+        )
 
 
 def test_node_compared_with_null_node(monkeypatch):
@@ -78,7 +82,9 @@ def test_node_compared_with_null_node(monkeypatch):
 
 def test_dead_or_silent_contestant_aborts_the_measurement(monkeypatch):
     nodes = tiny(monkeypatch, 'nodes', _STEPS=2, _WARM_UP=1, _NULL_NODE='not_there')
-    with pytest.raises(BlfDscError, match=r'not_there exited with code 1:[^!]*No module'):
+    with pytest.raises(
+        BlfDscError, match=r'not_there exited with code 1:[^!]*No module'
+    ):
         list(nodes.measure())
     monkeypatch.setattr(nodes, '_PATIENCE', 0.1)
     silent = nodes.StandIn('silent node')

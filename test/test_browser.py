@@ -16,20 +16,23 @@ import pytest
 import recorded_run
 
 pytest.importorskip('playwright', reason='make test-browser installs it')
-pytest.importorskip('plotly', reason='needs plotly: pip install blf_dsc_controller[report]')
-pytest.importorskip('yourdfpy', reason='needs viser: pip install blf_dsc_controller[view]')
+pytest.importorskip('plotly', reason='needs plotly: pip install .[report]')
+pytest.importorskip('yourdfpy', reason='needs viser: pip install .[view]')
 
 from blf_dsc_controller.analysis.report import read_bag, write_report
 from blf_dsc_controller.view.node import ViewNode
 
 pytestmark = [
     pytest.mark.skipif(chromium.find() is None, reason='there is no Chromium here'),
-    pytest.mark.skipif(not os.environ.get('BROWSER_TESTS'), reason='runs in make test-browser'),
+    pytest.mark.skipif(
+        not os.environ.get('BROWSER_TESTS'), reason='runs in make test-browser'
+    ),
 ]
 
 SHOTS = Path(os.environ.get('BROWSER_SHOTS') or tempfile.gettempdir())
 TEXT = '(document.body?.innerText ?? "")'
-HARMLESS = ('THREE.Clock', 'GPU stall due to ReadPixels')  # warnings of libraries that viser uses
+# warnings of libraries that viser uses
+HARMLESS = ('THREE.Clock', 'GPU stall due to ReadPixels')
 PLOTS = "document.querySelectorAll('.js-plotly-plot')"
 
 
@@ -37,7 +40,9 @@ PLOTS = "document.querySelectorAll('.js-plotly-plot')"
 def pages(tmp_path_factory):
     folder = tmp_path_factory.mktemp('pages')
     first = recorded_run.record(folder / 'one', 4.0)
-    other = recorded_run.record(folder / 'other', 4.0, **{'feedback.gain': [30.0, 10.0]})
+    other = recorded_run.record(
+        folder / 'other', 4.0, **{'feedback.gain': [30.0, 10.0]}
+    )
     write_report([read_bag(first)], folder / 'one.html')
     write_report([read_bag(first), read_bag(other)], folder / 'both.html')
     return folder
@@ -64,7 +69,8 @@ def test_every_panel_is_drawn_and_fits_the_window(pages, name, width):
         drawn = f"Array.from({PLOTS}).filter(p => p.querySelector('.trace')).length"
         panels = page.evaluate(drawn)
         assert panels == page.evaluate('data.panels.length')
-        assert panels >= 12  # two joints, each with error, position, torque; parameters; excitation
+        # two joints, each with error, position, torque; parameters; excitation
+        assert panels >= 12
         assert page.locator('.scatterlayer path.js-line').count() > panels
         assert page.evaluate('document.documentElement.scrollWidth') <= width
         covered = page.evaluate(
@@ -90,7 +96,9 @@ def test_dragging_zooms_all_time_panels(pages):
         page.mouse.down()
         page.mouse.move(box['x'] + box['width'] * 0.5, middle, steps=5)
         page.mouse.up()
-        page.wait_for_function(f'Array.from({PLOTS}).every(p => p.layout.xaxis.range[1] < 2.5)')
+        page.wait_for_function(
+            f'Array.from({PLOTS}).every(p => p.layout.xaxis.range[1] < 2.5)'
+        )
         for low, high in ranges(page):
             assert low == pytest.approx(1.0, abs=0.05)
             assert high == pytest.approx(2.0, abs=0.05)
@@ -114,7 +122,9 @@ def test_view_of_a_loop_in_the_browser(ros):
         page.get_by_text('Events', exact=True).click()
         page.wait_for_function(f"{TEXT}.includes('0.25 kg picked up')")
         page.screenshot(path=SHOTS / 'view_events.png')
-    assert [line for line in log if not any(word in f'{line}' for word in HARMLESS)] == []
+    assert [
+        line for line in log if not any(word in f'{line}' for word in HARMLESS)
+    ] == []
     own = (view.page.url, 'data:', 'blob:')
     assert log.requests
     assert [url for url in log.requests if not url.startswith(own)] == []

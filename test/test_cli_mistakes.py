@@ -4,6 +4,8 @@
 from __future__ import annotations
 
 import json
+import os
+import re
 import subprocess
 import sys
 
@@ -12,7 +14,9 @@ import recorded_run
 from command import finished
 from recorded_run import Synthetic, small_disk
 
-from blf_dsc_controller.cli.main import main
+from blf_dsc_controller import __version__
+from blf_dsc_controller.cli.main import main, make_parser
+from blf_dsc_controller.cli.run import _configuration
 from blf_dsc_controller.compiled.jit import COMPILING
 
 INTERRUPTED_WHILE_COMPILING = """
@@ -42,12 +46,16 @@ def bag(tmp_path_factory):
     return recorded_run.write_made(path, Synthetic(100).messages())
 
 
-COMMANDS = 'run --offline, report, plot, recover, export, excite, paper, arms, monte-carlo'
+COMMANDS = (
+    'run --offline, report, plot, recover, export, excite, paper, arms, monte-carlo'
+)
 
 
 @pytest.mark.parametrize('place', ['file/below', '/proc/none', '/dev/full'])
 @pytest.mark.parametrize('command', COMMANDS.split(', '))
-def test_unwritable_output_path_is_reported(bag, tmp_path, monkeypatch, capfd, command, place):
+def test_unwritable_output_path_is_reported(
+    bag, tmp_path, monkeypatch, capfd, command, place
+):
     monkeypatch.chdir(tmp_path)
     (tmp_path / 'file').touch()
     (tmp_path / 'full.csv').symlink_to('/dev/full')
@@ -103,13 +111,16 @@ def write_params(folder, plant='', controller=''):
 
 
 def test_invalid_configuration_is_rejected_before_anything_starts(tmp_path, capsys):
-    out, below = tmp_path / 'out', 'initial.position: [2.293, 0.1696]'
+    out = tmp_path / 'out'
+    below = 'initial.position: [2.293, 0.1696]'
     for plant, controller, expected in (
         ('', 'barier.bound: [0.1, 0.1]', 'barier.bound: unknown parameter'),
         ('', 'joints: [joint1, wrist]', 'joints: sim_plant has joint1, joint2'),
         (below, 'approach.enabled: false', "joint 'joint2' starts -1.5265 rad"),
     ):
-        run = here(capsys, '--config', write_params(tmp_path, plant, controller), '--out', out)
+        run = here(
+            capsys, '--config', write_params(tmp_path, plant, controller), '--out', out
+        )
         assert run.returncode == 1
         assert run.stderr.startswith('blf_dsc run: ')
         assert expected in run.stderr
@@ -135,7 +146,8 @@ def test_full_disk_is_reported(tmp_path, capsys):
 
 
 @pytest.mark.parametrize(
-    'command', [('main', 'run'), ('sim_plant',), ('blf_dsc_controller',), ('bag_recorder',)]
+    'command',
+    [('main', 'run'), ('sim_plant',), ('blf_dsc_controller',), ('bag_recorder',)],
 )
 def test_without_ros_the_error_tells_how_to_source_it(tmp_path, command):
     out = tmp_path / 'out'
@@ -166,7 +178,8 @@ def test_exit_code_shows_that_the_controller_stopped(tmp_path, capsys):
 
 def test_node_reports_what_is_wrong_with_its_arguments(tmp_path):
     pytest.importorskip('rclpy', reason='needs ROS 2')
-    broken, misspelt = tmp_path / 'broken.yaml', tmp_path / 'misspelt.yaml'
+    broken = tmp_path / 'broken.yaml'
+    misspelt = tmp_path / 'misspelt.yaml'
     broken.write_text('sim_plant:\n  ros__parameters:\n    seed: [1,\n')
     misspelt.write_text('sim_plant:\n  ros__parameters:\n    sede: 1\n')
     for words, expected in (
@@ -179,3 +192,100 @@ def test_node_reports_what_is_wrong_with_its_arguments(tmp_path):
         assert run.returncode == 1
         assert expected in run.stderr
         assert 'Traceback' not in run.stderr
+
+
+def test_unknown_command_is_answered_with_the_closest_one(capsys):
+    with pytest.raises(SystemExit) as ended:
+        main(['rnu'])
+    assert ended.value.code == 2
+    assert 'no command rnu, did you mean run?' in capsys.readouterr().err
+
+
+def test_version_is_that_of_the_package(capsys):
+    with pytest.raises(SystemExit) as ended:
+        main(['--version'])
+    assert ended.value.code == 0
+    assert capsys.readouterr().out == f'blf_dsc_controller {__version__}\n'
+
+
+def test_duration_of_zero_is_no_limit_which_no_offline_run_can_have(tmp_path, capsys):
+    out = tmp_path / 'out'
+    run = here(capsys, '--offline', '--duration', 0, '--out', out)
+    assert run.returncode == 1
+    assert '--duration 0 is no limit' in run.stderr
+    assert not out.exists()
+
+
+def test_run_over_ros_without_a_limit_gets_a_plant_without_a_limit():
+    options = make_parser().parse_args(['run', '--duration', '0'])
+    assert _configuration(options).plant.duration == 0.0
+    options = make_parser().parse_args(['run'])
+    assert _configuration(options).plant.duration == 60.0
+
+
+def test_sections_that_no_node_reads_are_named_once(tmp_path, capsys):
+    path = tmp_path / 'given.yaml'
+    names = ['controller', '/**/blf_dsc', '/robot/**', 'joint_state_broadcaster']
+    path.write_text(
+        ''.join(f'{name}:\n  ros__parameters: {{seed: 1}}\n' for name in names)
+        + 'sim_plant:\n  ros__parameters: {seed: 1}\n'
+        + 'monte_carlo:\n  ros__parameters: {runs: 10}\n'
+    )
+    words = '--config', path, '--offline', '--duration', 0.1, '--out', tmp_path / 'out'
+    (warning,) = (
+        line for line in here(capsys, *words).stderr.splitlines() if 'no node' in line
+    )
+    found = warning.partition(' the sections ')[2].partition(': ')[0]
+    assert found == (
+        '/controller (line 2), /**/blf_dsc (line 4), /joint_state_broadcaster (line 8), '
+        '/robot/** (line 6)'
+    )
+
+
+def test_node_names_the_sections_that_it_does_not_read(tmp_path):
+    pytest.importorskip('rclpy', reason='needs ROS 2')
+    path = tmp_path / 'given.yaml'
+    path.write_text(
+        '/**:\n  ros__parameters: {seed: 1}\n'
+        'controller:\n  ros__parameters: {duration: 0.1}\n'
+        'sim_plant:\n  ros__parameters: {sede: 1}\n'
+    )
+    from blf_dsc_controller.nodes.process import check_sections
+
+    argv = ['node', '--ros-args', '--params-file', str(path)]
+    (remark,) = check_sections(argv, '/sim_plant')
+    assert 'reads the sections /controller (line 4)' in remark
+    assert '(line 2)' not in remark
+
+
+TOO_OLD = """
+import sys, types
+import rclpy
+sys.modules['rclpy.experimental'] = types.ModuleType('rclpy.experimental')
+from blf_dsc_controller.cli import main
+command = sys.argv.pop(1)
+sys.exit(getattr(main, command)())
+"""
+
+
+@pytest.mark.parametrize('command', [('bag_recorder',), ('main', 'run')])
+@pytest.mark.parametrize(
+    ('program', 'middleware', 'answer'),
+    [
+        (TOO_OLD, '', r'rclpy [\d.]+ has no EventsExecutor.* 7\.1\.4 or newer'),
+        (
+            WITHOUT_ROS.replace("'rclpy'", "'hides nothing'"),
+            'rmw_absent_cpp',
+            r'RMW_IMPLEMENTATION=rmw_absent_cpp: .*apt install ros-jazzy-rmw-absent-cpp',
+        ),
+    ],
+)
+def test_old_ros_and_missing_middleware_are_answered_in_one_line(
+    command, program, middleware, answer
+):
+    pytest.importorskip('rclpy', reason='needs ROS 2')
+    environment = {**os.environ, 'RMW_IMPLEMENTATION': middleware}
+    run = finished(sys.executable, '-c', program, *command, env=environment)
+    assert run.returncode == 1
+    (line,) = run.stderr.splitlines()
+    assert re.search(answer, line)

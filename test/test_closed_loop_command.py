@@ -20,7 +20,7 @@ from ros_rig import simulated
 from rosbags.highlevel import AnyReader
 
 from blf_dsc_controller.bags.reader import read_run
-from blf_dsc_controller.bags.writer import recover
+from blf_dsc_controller.bags.recovery import recover
 from blf_dsc_controller.cli.main import main
 
 HALF = {'learning.initial_estimate': [0.5, 0.16, 0.2]}
@@ -32,7 +32,8 @@ SAMPLES = 3001
 def out(tmp_path_factory):
     """Results of a run in lock-step."""
     folder = tmp_path_factory.mktemp('run')
-    config, out = folder / 'chain.yaml', folder / 'results' / 'first'
+    config = folder / 'chain.yaml'
+    out = folder / 'results' / 'first'
     config.write_text(f'blf_dsc_controller:\n  ros__parameters: {json.dumps(HALF)}\n')
     arguments = ('--config', config, '--mode', 'lockstep', '--duration', DURATION)
     run = closed_loop(*arguments, '--out', out)
@@ -42,9 +43,17 @@ def out(tmp_path_factory):
 
 
 def test_torques_over_ros_match_the_offline_run_bit_for_bit(out, tmp_path):
-    again = ['run', '--config', out / 'config.yaml', '--offline', '--out', tmp_path / 'out']
+    again = [
+        'run',
+        '--config',
+        out / 'config.yaml',
+        '--offline',
+        '--out',
+        tmp_path / 'out',
+    ]
     assert main([str(each) for each in again]) == 0
-    recorded, computed = read_run(out / 'bag'), read_run(tmp_path / 'out' / 'bag')
+    recorded = read_run(out / 'bag')
+    computed = read_run(tmp_path / 'out' / 'bag')
     np.testing.assert_array_equal(recorded.torque, computed.torque)
     np.testing.assert_array_equal(recorded.position, computed.position)
     np.testing.assert_array_equal(recorded.stamp, computed.stamp)
@@ -60,7 +69,9 @@ def test_bag_has_every_message(out):
     assert counts['/sim_plant/truth'] >= 301
     expected = {'tracking_error': SAMPLES, 'reference': 301, 'monitor': 301, 'bound': 1}
     expected['commands'] = SAMPLES + 1  # the last torque, when it ends
-    assert {topic: counts[f'/blf_dsc_controller/{topic}'] for topic in expected} == expected
+    assert {
+        topic: counts[f'/blf_dsc_controller/{topic}'] for topic in expected
+    } == expected
 
 
 def test_command_reports_where_the_results_are(out):
@@ -73,7 +84,9 @@ def test_command_reports_where_the_results_are(out):
     assert 'bound       held by every joint' in output
     assert 'parameters  error end 41.5 %' in output
     assert 'closed loop ' not in output  # no bar, as this is no terminal
-    assert f'wrote       {out}: bag, summary.json, tracking.png, parameters.png' in output
+    assert (
+        f'wrote       {out}: bag, summary.json, tracking.png, parameters.png' in output
+    )
     for process in ('loop', 'bag_recorder'):
         log = (out / 'logs' / f'{process}.log').read_text()
         assert log
@@ -83,7 +96,8 @@ def test_command_reports_where_the_results_are(out):
 @pytest.fixture
 def running(tmp_path, monkeypatch):
     monkeypatch.delenv('FASTRTPS_DEFAULT_PROFILES_FILE', raising=False)
-    monkeypatch.setenv('ROS_LOCALHOST_ONLY', '1')  # of a user; Fast DDS would share memory
+    # of a user; Fast DDS would share memory
+    monkeypatch.setenv('ROS_LOCALHOST_ONLY', '1')
     command = Running(tmp_path / 'out')
     yield command
     command.close()
@@ -110,7 +124,10 @@ def test_signal_shuts_down_cleanly_with_bag_and_report(running, number):
 
 
 def test_killed_node_is_reported_and_ends_the_others(running):
-    for process in (running.process.pid, running.child('blf_dsc_controller.nodes.lockstep_loop')):
+    for process in (
+        running.process.pid,
+        running.child('blf_dsc_controller.nodes.lockstep_loop'),
+    ):
         # A killed process would leave it broken, and crash the others.
         assert 'shm/fastrtps' not in Path(f'/proc/{process}/maps').read_text()
     os.kill(running.child('blf_dsc_controller.nodes.lockstep_loop'), signal.SIGKILL)
@@ -151,7 +168,9 @@ def test_full_disk_ends_the_run_and_tells_how_to_recover_the_bag(tmp_path, mode)
     config.write_text(PATIENT)
     with small_disk(tmp_path / 'disk', 2) as disk:  # a second takes over 1 MB
         out = disk / 'out'
-        run = closed_loop('--config', config, '--mode', mode, '--duration', 10_000, '--out', out)
+        run = closed_loop(
+            '--config', config, '--mode', mode, '--duration', 10_000, '--out', out
+        )
         assert run.returncode == 1
         assert 'bag_recorder exited with code 1:' in run.stderr
         assert f'no space left on the disk of {out}' in run.stderr

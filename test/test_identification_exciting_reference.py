@@ -42,20 +42,26 @@ def parameter_error(record):
 
 
 def test_chosen_reference_excites_far_more_than_that_of_the_paper_within_the_limits():
-    paper, chosen = (run(name).sample(-1).lambda_min[0] for name in ('recommended', 'excitation'))
+    paper, chosen = (
+        run(name).sample(-1).lambda_min[0] for name in ('recommended', 'excitation')
+    )
     assert SIGMA < paper < 2.0 * SIGMA
     # A bias column alone has an eigenvalue of 1: with these columns no more is possible.
     assert 0.99 < chosen <= 1.001
-    found, limits = run('excitation').run(), load_loop('excitation').controller.limits
+    found = run('excitation').run()
+    limits = load_loop('excitation').controller.limits
     assert np.abs(found.error / found.bound).max() < 1.0
-    assert (np.abs(run('excitation').truths[:, -2:]).max(axis=0) < limits.velocity).all()
+    assert (
+        np.abs(run('excitation').truths[:, -2:]).max(axis=0) < limits.velocity
+    ).all()
     # On the paper's, a cosine of its frequency looks like one of the parameters.
     quarter = 0.5 * np.pi
     assert parameter_error(run('recommended', quarter)) > 0.1
     assert parameter_error(run('excitation', quarter)) < 0.01
 
 
-LIGHT = {'robot.payload': 0.2, 'torque.limit': [60.0] * 3}  # leave a random arm some room
+# leave a random arm some room
+LIGHT = {'robot.payload': 0.2, 'torque.limit': [60.0] * 3}
 
 
 @cache
@@ -74,7 +80,9 @@ def test_search_keeps_its_limits_is_repeatable_and_beats_random_motions():
     assert reached.is_allowed
     assert reached.ratios.max() > 0.9  # a limit is active
     random = np.random.default_rng(0)
-    others = [problem.evaluate(problem.parameters(problem.start(random))) for _ in range(100)]
+    others = [
+        problem.evaluate(problem.parameters(problem.start(random))) for _ in range(100)
+    ]
     allowed = [other.gain for other in others if other.is_allowed]
     assert len(allowed) > 3
     assert max(allowed) < reached.gain
@@ -90,7 +98,9 @@ def test_predicted_information_of_a_panda_matches_its_loop():
     Phi = upper + np.triu(upper, 1).T
     settings = settings_of_config(loop.controller)
     a = settings.prior_weight
-    gain = np.linalg.slogdet(np.linalg.solve(settings.information, Phi) / a + np.eye(len(Phi)))[1]
+    gain = np.linalg.slogdet(
+        np.linalg.solve(settings.information, Phi) / a + np.eye(len(Phi))
+    )[1]
 
     problem = ExcitationProblem(loop.controller, 3)
 
@@ -110,21 +120,26 @@ def test_lack_of_room_counts_as_an_excess():
 
 def test_torque_ratio_is_the_larger_with_and_without_the_payload():
     config, problem = chain_problem()
-    motion, P = problem.parameters(np.full(9, 0.1)), config.learning.initial_estimate
+    motion = problem.parameters(np.full(9, 0.1))
+    P = config.learning.initial_estimate
     load = parameters_of(config.robot, config.robot.chain(config.joints)).load
 
     def ratios(payload, start):
-        robot, learning = replace(config.robot, payload=payload), config.learning
+        robot = replace(config.robot, payload=payload)
+        learning = config.learning
         learning = replace(learning, initial_estimate=tuple(start))
         other = replace(config, robot=robot, learning=learning)
         return ExcitationProblem(other, 1).evaluate(motion).ratios
 
-    light, heavy = ratios(0.0, P), ratios(0.0, P + 0.2 * load)
+    light = ratios(0.0, P)
+    heavy = ratios(0.0, P + 0.2 * load)
     np.testing.assert_allclose(ratios(0.2, P), np.maximum(heavy, light))
     assert (heavy[3] > light[3]).any()
 
 
-def test_tool_writes_a_preset_for_an_arm_from_a_urdf_that_keeps_it_from_the_floor(tmp_path, capsys):
+def test_tool_writes_a_preset_for_an_arm_from_a_urdf_that_keeps_it_from_the_floor(
+    tmp_path, capsys
+):
     (tmp_path / 'arm.urdf').write_text(random_urdf(3, seed=5)[0])
     config = tmp_path / 'arm.yaml'
     config.write_text(
@@ -133,7 +148,16 @@ def test_tool_writes_a_preset_for_an_arm_from_a_urdf_that_keeps_it_from_the_floo
         '    limits.velocity: [0.1, 0.1, 0.1]\n'
     )
     out = tmp_path / 'mine.yaml'
-    command = ['excite', str(out), '--config', str(config), '--harmonics', '1', '--starts', '1']
+    command = [
+        'excite',
+        str(out),
+        '--config',
+        str(config),
+        '--harmonics',
+        '1',
+        '--starts',
+        '1',
+    ]
     assert main([*command, '--radius', '0.02', '--floor', '3.0']) == 1
     assert 'no reference found in 1 searches' in capsys.readouterr().err
     assert main([*command, '--radius', '0.02', '--floor', '-3.0']) == 0
@@ -159,7 +183,8 @@ def panda(radius=0.07, floor=0.0):
 def test_distance_is_the_minimum_over_all_points_of_both_lines():
     along = np.linspace(0.0, 1.0, 300)[:, np.newaxis]
     for a, b, c, d in np.random.default_rng(0).normal(size=(100, 4, 3)):
-        first, second = a + (b - a) * along, c + (d - c) * along
+        first = a + (b - a) * along
+        second = c + (d - c) * along
         minimum = np.linalg.norm(first[:, np.newaxis] - second, axis=-1).min()
         assert distance(a, b, c, d) == pytest.approx(minimum, abs=1e-3)
     for line, other, expected in (
@@ -168,7 +193,9 @@ def test_distance_is_the_minimum_over_all_points_of_both_lines():
         ([(0, 0, 0), (0, 0, 0)], [(-1, 2, 0), (1, 2, 0)], 2.0),  # a point
         ([(0, 0, 0), (0, 0, 0)], [(0, 0, 3), (0, 0, 3)], 3.0),  # two points
     ):
-        assert distance(*np.array([*line, *other], dtype=float)) == pytest.approx(expected)
+        assert distance(*np.array([*line, *other], dtype=float)) == pytest.approx(
+            expected
+        )
 
 
 def test_panda_must_not_touch_itself_or_the_floor():
@@ -192,7 +219,8 @@ def test_links_that_touch_in_every_posture_do_not_count():
 def test_link_with_an_offset_from_its_joints_is_checked_where_it_is():
     """The upper arm of a UR5e is 11 cm beside the line from shoulder to elbow."""
     corners, straight = (
-        Clearance(chain_of('ur5e'), radius, 0.0).corners(np.zeros(6)) for radius in (0.07, 0.2)
+        Clearance(chain_of('ur5e'), radius, 0.0).corners(np.zeros(6))
+        for radius in (0.07, 0.2)
     )
     assert len(corners) == len(straight) + 1 == 9
     apart = distance(corners[3], corners[3], straight[2], straight[3])

@@ -5,8 +5,10 @@ from __future__ import annotations
 
 import ctypes
 import errno
+import inspect
 import os
 import runpy
+import socket
 import subprocess
 import sys
 from operator import itemgetter
@@ -21,14 +23,15 @@ import rclpy
 from command import finished
 from own_domain import own_domain
 
-from blf_dsc_controller.cli import session as isolation
-from blf_dsc_controller.cli.session import localhost_environment
-from blf_dsc_controller.configuration.nodes import dump
+from blf_dsc_controller.cli import domains, session
+from blf_dsc_controller.cli.session import ProgressMonitor, localhost_environment
+from blf_dsc_controller.configuration.nodes import dump, load_loop
 from blf_dsc_controller.configuration.robot import Realtime
+from blf_dsc_controller.control.realtime import request_realtime
 from blf_dsc_controller.errors import BlfDscError, ConfigurationError
 from blf_dsc_controller.nodes.controller_node import ControllerNode
 from blf_dsc_controller.nodes.plant_node import PlantNode
-from blf_dsc_controller.nodes.process import assigned, request_realtime
+from blf_dsc_controller.nodes.process import assigned
 from blf_dsc_controller.nodes.recorder_node import BagRecorderNode
 from blf_dsc_controller.nodes.watchdog_node import WatchdogNode
 from blf_dsc_controller.studies.runs import cores
@@ -57,13 +60,19 @@ print(code, rclpy.ok(), [name for name in names if name.startswith('dds.')])
 
 @pytest.mark.parametrize(
     ('node', 'error'),
-    [('ControllerNode', 'RCLError'), ('PlantNode', 'OSError'), ('PlantNode', 'BlfDscError')],
+    [
+        ('ControllerNode', 'RCLError'),
+        ('PlantNode', 'OSError'),
+        ('PlantNode', 'BlfDscError'),
+    ],
 )
 def test_middleware_ends_with_the_node_even_if_its_shutdown_fails(node, error):
     """And not only with the process: otherwise its threads may crash at the end."""
     process = finished(sys.executable, '-c', BROKEN.format(node=node, error=error))
     assert process.stdout == '0 False []\n', process.stderr
-    assert process.stderr.endswith(' could not shut down cleanly: the middleware is gone\n')
+    assert process.stderr.endswith(
+        ' could not shut down cleanly: the middleware is gone\n'
+    )
     assert 'Traceback' not in process.stderr
 
 
@@ -85,13 +94,19 @@ def test_real_time_is_requested_for_all_threads_and_a_refusal_named_with_its_rem
         return -refused
 
     monkeypatch.setattr(os, 'sched_setscheduler', schedule)
-    monkeypatch.setattr(ctypes, 'CDLL', lambda *_, **__: SimpleNamespace(mlockall=mlockall))
-    log = SimpleNamespace(warning=lines.append)
-    request_realtime(Realtime(), log)
+    monkeypatch.setattr(
+        ctypes, 'CDLL', lambda *_, **__: SimpleNamespace(mlockall=mlockall)
+    )
+    request_realtime(Realtime(), lines.append)
     assert (scheduled, lines) == (set(), [])
-    request_realtime(Realtime(priority=50, lock_memory=True), log)
+    request_realtime(Realtime(priority=50, lock_memory=True), lines.append)
     if refused:
-        wanted = ['(Operation not permitted)', 'rtprio', '(Cannot allocate memory)', 'memlock']
+        wanted = [
+            '(Operation not permitted)',
+            'rtprio',
+            '(Cannot allocate memory)',
+            'memlock',
+        ]
         assert all(word in lines[k // 2] for k, word in enumerate(wanted))
         return
     threads = {int(name) for name in os.listdir('/proc/self/task')}  # noqa: PTH208
@@ -116,20 +131,30 @@ def test_profile_of_the_user_is_kept_and_other_middleware_limited_as_well(monkey
     with monkeypatch.context() as own:
         own.setenv('FASTRTPS_DEFAULT_PROFILES_FILE', 'own.xml')
         assert localhost_environment() == LOCALHOST
+    with monkeypatch.context() as kilted:  # its Fast DDS 3 rejects the profile
+        kilted.setattr(session.metadata, 'version', lambda _: '9.1.1')
+        assert localhost_environment() == LOCALHOST
     name = 'get_rmw_implementation_identifier'
-    monkeypatch.setattr(isolation.rclpy, name, lambda: 'rmw_cyclonedds_cpp')
+    monkeypatch.setattr(rclpy, name, lambda: 'rmw_cyclonedds_cpp')
     assert localhost_environment() == LOCALHOST
 
 
 @pytest.mark.parametrize(
     'command',
-    [('main', 'plot', '/none'), ('blf_dsc_controller', '--ros-args', '--params-file', '/none')],
+    [
+        ('main', 'plot', '/none'),
+        ('blf_dsc_controller', '--ros-args', '--params-file', '/none'),
+    ],
 )
 def test_libraries_start_no_threads_unless_the_environment_asks_for_them(command):
     """Such a thread would spin beside the nodes, and at the priority of a real-time node."""
     outputs = []
     for given in ({}, {'OPENBLAS_NUM_THREADS': '1'}, {'OPENBLAS_NUM_THREADS': '2'}):
-        kept = {name: value for name, value in os.environ.items() if 'NUM_THREADS' not in name}
+        kept = {
+            name: value
+            for name, value in os.environ.items()
+            if 'NUM_THREADS' not in name
+        }
         run = finished(sys.executable, '-c', MULTIPLY, *command, env=kept | given)
         outputs.append([int(number) for number in run.stdout.split()])
     (code, threads), same, more = outputs
@@ -139,16 +164,100 @@ def test_libraries_start_no_threads_unless_the_environment_asks_for_them(command
 
 def test_domain_is_held_until_the_last_node_of_a_run_has_ended(monkeypatch):
     mine = 1000 + os.getpid()  # that no other test claims
-    monkeypatch.setattr(isolation, '_DOMAINS', (mine,))
-    with isolation.own_domain():
+    monkeypatch.setattr(domains, 'DOMAINS', (mine,))
+    with domains.own_domain():
         node = subprocess.Popen(
             [sys.executable, '-c', 'input()'], stdin=subprocess.PIPE, close_fds=False
         )
-    with pytest.raises(BlfDscError, match='no ROS domain is free'), isolation.own_domain():
+    with (
+        pytest.raises(BlfDscError, match='no ROS domain is free'),
+        domains.own_domain(),
+    ):
         pass
     node.communicate(b'\n')
-    with isolation.own_domain() as domain:
+    with domains.own_domain() as domain:
         assert domain == mine
+
+
+PARTICIPANT = """
+import rclpy
+rclpy.init(args=[])
+node = rclpy.create_node('stranger')
+print('ready', flush=True)
+input()
+"""
+
+
+@pytest.fixture
+def participant():
+    """Return a function that lets another process enter a domain."""
+    started = []
+
+    def start(domain, **variables):
+        variables['ROS_DOMAIN_ID'] = str(domain)
+        process = subprocess.Popen(
+            [sys.executable, '-c', PARTICIPANT],
+            env=os.environ | variables,
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+        )
+        started.append(process)
+        assert process.stdout.readline() == b'ready\n'
+
+    yield start
+    for process in started:
+        process.communicate(b'\n')
+
+
+PROFILE = {  # without limits to this computer
+    'FASTRTPS_DEFAULT_PROFILES_FILE': str(Path(__file__).with_name('one_process.xml'))
+}
+
+
+@pytest.mark.parametrize('variables', [{}, PROFILE], ids=['local', 'default'])
+def test_run_does_not_claim_a_domain_in_which_somebody_is(
+    participant, monkeypatch, variables
+):
+    taken, free = own_domain(), own_domain()
+    monkeypatch.setattr(domains, 'claimed', lambda _: socket.socket(socket.AF_UNIX))
+    monkeypatch.setattr(domains, 'DOMAINS', (taken, free))
+    participant(taken, **variables)
+    with domains.own_domain() as domain:
+        assert domain == free
+    monkeypatch.setenv('ROS_DOMAIN_ID', str(free))
+    with (
+        pytest.raises(BlfDscError, match='no ROS domain is free'),
+        domains.own_domain(),
+    ):
+        pass
+
+
+def test_run_leaves_a_domain_that_somebody_enters_with_it(
+    participant, monkeypatch, tmp_path
+):
+    shared, free = own_domain(), own_domain()
+    monkeypatch.setattr(domains, 'claimed', lambda _: socket.socket(socket.AF_UNIX))
+    monkeypatch.setattr(domains, 'DOMAINS', (shared, free))
+
+    class Entered(ProgressMonitor):
+        """A monitor that another process follows into its first domain."""
+
+        def others(self, domain):
+            if domain == shared:
+                participant(shared)
+            found = super().others(domain)
+            assert bool(found) == (domain == shared)
+            return found
+
+    used = []
+    monkeypatch.setattr(session, 'ProgressMonitor', Entered)
+    monkeypatch.setattr(
+        session,
+        '_run_nodes',
+        lambda *_, **__: used.append(os.environ['ROS_DOMAIN_ID']),
+    )
+    session.run_session(load_loop('recommended'), tmp_path, view=False)
+    assert used == [str(free)]
 
 
 # The launch file and the command line: which parameters reach the nodes. `launch` comes only with a
@@ -170,12 +279,16 @@ def launched(monkeypatch):
     stand_ins = {
         'launch': {'LaunchContext': dict, 'LaunchDescription': list},
         'launch.actions': {
-            'DeclareLaunchArgument': lambda name, **options: SimpleNamespace(name=name, **options),
+            'DeclareLaunchArgument': lambda name, **options: SimpleNamespace(
+                name=name, **options
+            ),
             'OpaqueFunction': SimpleNamespace,
             'Shutdown': SimpleNamespace,
         },
         'launch.substitutions': {
-            'LaunchConfiguration': lambda name: SimpleNamespace(perform=itemgetter(name))
+            'LaunchConfiguration': lambda name: SimpleNamespace(
+                perform=itemgetter(name)
+            )
         },
         'launch_ros': {},
         'launch_ros.actions': {'Node': SimpleNamespace},
@@ -230,7 +343,9 @@ def start(monkeypatch):
 
 
 @pytest.mark.parametrize('namespace', ['', 'left'])
-def test_launch_arguments_override_the_parameter_file(launched, start, tmp_path, namespace):
+def test_launch_arguments_override_the_parameter_file(
+    launched, start, tmp_path, namespace
+):
     """A section `/**/NODE` of the preset takes precedence over one for any node."""
     bag, file = tmp_path / 'run1', tmp_path / 'my.yaml'
     given = '{mode: lockstep, wait_for_subscribers: 0}'
@@ -260,9 +375,10 @@ def test_no_end_of_another_node_ends_what_holds_an_arm(launched):
     nodes = {node.executable: node for node in launched(driver='ur5e', bag='run1')}
     assert nodes.keys() == NODES.keys() - {'sim_plant'}
     assert not any(node.on_exit for node in nodes.values())
-    assert ('blf_dsc_controller/commands', 'forward_effort_controller/commands') in nodes[
-        'torque_watchdog'
-    ].remappings
+    assert (
+        'blf_dsc_controller/commands',
+        'forward_effort_controller/commands',
+    ) in nodes['torque_watchdog'].remappings
 
 
 def test_command_line_parameter_overrides_a_file(start, tmp_path):
@@ -270,9 +386,18 @@ def test_command_line_parameter_overrides_a_file(start, tmp_path):
     path = tmp_path / 'my.yaml'
     own = '{mode: realtime, arm.l2: 0.5, initial.position: [2.0, 1.0], seed: 0}'
     sections = {'/**': '{sample_time: 0.001}', '/**/sim_plant': own}
-    path.write_text(''.join(f'{k}:\n  ros__parameters: {v}\n' for k, v in sections.items()))
+    path.write_text(
+        ''.join(f'{k}:\n  ros__parameters: {v}\n' for k, v in sections.items())
+    )
     argv = ('sim_plant', '--ros-args', '--params-file', path)
-    given = ('-p', 'mode:=lockstep', '-p', 'arm.l2:=0.7', '-p', 'initial.position:=[2.29, 1.69]')
+    given = (
+        '-p',
+        'mode:=lockstep',
+        '-p',
+        'arm.l2:=0.7',
+        '-p',
+        'initial.position:=[2.29, 1.69]',
+    )
     config = start(*argv, *given, '-p', 'elsewhere:seed:=3').config
     assert (config.mode, config.arm.l2) == ('lockstep', 0.7)
     assert config.initial.position == (2.29, 1.69)
@@ -287,11 +412,32 @@ def test_section_that_does_not_match_the_node_is_an_error(start, tmp_path):
     with pytest.raises(ConfigurationError) as caught:
         start(*argv)
     remedy = '/right/sim_plant does not match /left/sim_plant: write /**/sim_plant'
-    assert [found.startswith(f'line 2: {remedy}') for found in caught.value.problems] == [True]
-    path.write_text(right + right.replace('right', 'left').replace('1', '2'))  # for two arms
+    assert [
+        found.startswith(f'line 2: {remedy}') for found in caught.value.problems
+    ] == [True]
+    # for two arms
+    path.write_text(right + right.replace('right', 'left').replace('1', '2'))
     assert start(*argv).config.seed == 2
 
 
 def test_value_with_a_comma_or_brace_is_not_split():
     argv = ['node', '--ros-args', '-p', 'output:=run, 1 {a}', '-p', 'topics:=[/a, /b]']
     assert assigned(argv) == {'output': 'run, 1 {a}', 'topics': ['/a', '/b']}
+
+
+def test_callbacks_of_timers_take_no_argument(ros, tmp_path, monkeypatch):
+    """Newer releases of rclpy pass information about the call to those that take any."""
+    callbacks = []
+    create = rclpy.node.Node.create_timer
+
+    def seen(node, period, callback, *arguments, **options):
+        callbacks.append(callback)
+        return create(node, period, callback, *arguments, **options)
+
+    monkeypatch.setattr(rclpy.node.Node, 'create_timer', seen)
+    ros.loop()
+    ros.add(WatchdogNode)
+    ros.add(BagRecorderNode, {'output': str(tmp_path / 'bag')})
+    assert len(callbacks) >= 8
+    for callback in callbacks:
+        assert not inspect.signature(callback).parameters, callback

@@ -24,7 +24,10 @@ from std_srvs.srv import Trigger
 from blf_dsc_controller.configuration import schema
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.plant import PlantConfig
-from blf_dsc_controller.messages.codecs import Float64MultiArrayEncoder, JointStateEncoder
+from blf_dsc_controller.messages.codecs import (
+    Float64MultiArrayEncoder,
+    JointStateEncoder,
+)
 from blf_dsc_controller.nodes.controller_node import ControllerNode
 from blf_dsc_controller.nodes.plant_node import PlantNode
 
@@ -43,7 +46,11 @@ names = st.lists(st.sampled_from(['joint1', 'joint2', 'joint3', '', 'ü']), max_
 @st.composite
 def joint_states(draw):
     """Serialised joint states: valid ones, invalid ones, and random bytes."""
-    kind = draw(st.sampled_from(['good', 'good', 'good', 'near', 'wrong', 'names', 'bytes', 'cut']))
+    kind = draw(
+        st.sampled_from(
+            ['good', 'good', 'good', 'near', 'wrong', 'names', 'bytes', 'cut']
+        )
+    )
     step = draw(st.sampled_from([1, 1, 1, 1, 0, 2, 60, -1, -1000, 10**7]))
     q = [start + draw(st.floats(-1e-3, 1e-3)) for start in START]
     dq = [draw(st.floats(-0.1, 0.1)) for _ in START]
@@ -85,10 +92,13 @@ LIVE = {
     if not each.read_only
 }
 parameters = st.one_of(
-    st.sampled_from(sorted(LIVE)).flatmap(lambda name: st.tuples(st.just(name), LIVE[name])),
+    st.sampled_from(sorted(LIVE)).flatmap(
+        lambda name: st.tuples(st.just(name), LIVE[name])
+    ),
     st.tuples(st.just('joints'), st.just(['a', 'b'])),
 )
-transitions = st.sampled_from([0, 1, 2, 3, 4, 77])  # create, configure to deactivate, none
+# create, configure to deactivate, none
+transitions = st.sampled_from([0, 1, 2, 3, 4, 77])
 
 
 def events(messages):
@@ -164,7 +174,10 @@ def test_plant_survives_arbitrary_input(ros, sequence):
         Parameter('actuator.torque_limit', value=[20.0, 20.0]),
     ]
     node = PlantNode(
-        context=ros.context, cli_args=[], enable_rosout=False, parameter_overrides=overrides
+        context=ros.context,
+        cli_args=[],
+        enable_rosout=False,
+        parameter_overrides=overrides,
     )
     node._is_observed = lambda: True
     node._peers = iter(())  # all there

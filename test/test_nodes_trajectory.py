@@ -20,11 +20,13 @@ from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 from blf_dsc_controller.messages import topics
 from blf_dsc_controller.messages.codecs import MessageError, joint_trajectory
 from blf_dsc_controller.reference.trajectory import plan_trajectory
-from blf_dsc_controller.supervision.checks import Phase
+from blf_dsc_controller.supervision.supervisor import Phase
 
 BRISK = {'limits__acceleration': [4.0, 4.0]}  # rad/s^2, for a lead of a second
 PATIENT = {'safety__state_timeout': 60.0}
-PLANNED = {watchdog: PATIENT | {'safety__watchdog': watchdog} for watchdog in ('on', 'off')}
+PLANNED = {
+    watchdog: PATIENT | {'safety__watchdog': watchdog} for watchdog in ('on', 'off')
+}
 
 
 SECOND = 1_000_000_000
@@ -33,7 +35,8 @@ FIELDS = ('positions', 'velocities', 'accelerations')
 
 def two_tones(t, shift):
     """Return position, velocity and acceleration (3, 2) at t [s] of two tones on each joint."""
-    rates, sizes = np.array([1.0, 2.3]), np.array([[0.2, 0.08], [0.25, -0.05]])
+    rates = np.array([1.0, 2.3])
+    sizes = np.array([[0.2, 0.08], [0.25, -0.05]])
     tones = sizes * np.exp(1j * (rates * t + [0.2, -0.9]))
     motion = np.array([(tones * (1j * rates) ** k).sum(axis=1).real for k in range(3)])
     motion[0] += [1.9, 1.4] + shift * np.ones(2)
@@ -77,7 +80,9 @@ def phase(law):
 
 
 @pytest.mark.parametrize('watchdog', ['on', 'off'])
-def test_two_tone_trajectory_is_tracked_within_the_bound_and_replaced_twice(ros, watchdog):
+def test_two_tone_trajectory_is_tracked_within_the_bound_and_replaced_twice(
+    ros, watchdog
+):
     references = ros.listen(topics.REFERENCE)
     errors = ros.listen(topics.TRACKING_ERROR)
     # Planned in a thread, it is followed the later, the busier the computer: then in less time.
@@ -99,7 +104,9 @@ def test_two_tone_trajectory_is_tracked_within_the_bound_and_replaced_twice(ros,
     assert inputs(law).rejected == 0
     # The last of the three has ended, and its last point is held.
     reference = law.guard.controller.reference_at(last[0] + 3.4)
-    np.testing.assert_allclose(reference, [two_tones(3.95, np.array(shifts[2]))[0], [0, 0], [0, 0]])
+    np.testing.assert_allclose(
+        reference, [two_tones(3.95, np.array(shifts[2]))[0], [0, 0], [0, 0]]
+    )
     assert law.guard.samples.ratio.max() < 1.0
     assert np.max([np.abs(message.position) for message in errors]) < 2e-3
     positions = np.array([message.position for message in references])
@@ -107,7 +114,9 @@ def test_two_tone_trajectory_is_tracked_within_the_bound_and_replaced_twice(ros,
     # At most the limit over a millisecond: no jump where one trajectory replaces another.
     assert np.abs(np.diff(velocities, axis=0)).max() < 1.025e-3 * limit
     np.testing.assert_allclose(
-        np.diff(positions, axis=0), 0.5e-3 * (velocities[1:] + velocities[:-1]), atol=1e-8
+        np.diff(positions, axis=0),
+        0.5e-3 * (velocities[1:] + velocities[:-1]),
+        atol=1e-8,
     )
     assert phase(law) is Phase.TRACKING
 
@@ -117,7 +126,7 @@ def of_another_arm(sent):
 
 
 def oversized(sent):
-    sent.points *= 1000
+    sent.points *= 8000
 
 
 def unplannable(*_):
@@ -126,7 +135,7 @@ def unplannable(*_):
 
 REJECTED = {
     of_another_arm: "its joints are 'joint1', 'elbow', but each of 'joint1', 'joint2' is needed",
-    oversized: 'bytes, more than 1000 points can have',
+    oversized: 'bytes, more than 10000 points can have',
     unplannable: 'trajectory rejected: MemoryError: no room',
 }
 
@@ -140,7 +149,9 @@ def test_rejected_trajectory_changes_nothing(ros, monkeypatch, spoil, watchdog):
     before = law.guard.controller.reference_vector.copy()
     sent = trajectory(JOINTS, np.zeros(2), duration=0.1)
     if spoil is unplannable:
-        monkeypatch.setattr('blf_dsc_controller.supervision.guard.plan_trajectory', spoil)
+        monkeypatch.setattr(
+            'blf_dsc_controller.supervision.guard.plan_trajectory', spoil
+        )
     else:
         spoil(sent)
     assert REJECTED[spoil] in send(ros, law, sent)
@@ -168,33 +179,50 @@ def test_header_stamp_sets_the_start_of_a_trajectory(ros):
 
 def test_narrowing_bound_is_published_with_every_tenth_sample(ros):
     bounds = ros.listen(replace(topics.BOUND, requested=topics.STREAM))
-    arm, _ = ros.loop(None, {'barrier__initial_bound': [0.02, 0.01], 'barrier__funnel_rate': 5.0})
+    arm, _ = ros.loop(
+        None, {'barrier__initial_bound': [0.02, 0.01], 'barrier__funnel_rate': 5.0}
+    )
     ros.run(arm, 300)
     ros.until(lambda: len(bounds) >= 30)
     t = np.arange(0, 300, 10) * 1e-3
     published = np.array([message.position for message in bounds[:30]])
-    np.testing.assert_allclose(published[:, 0], 0.002 + 0.018 * np.exp(-5.0 * t), rtol=1e-12)
-    np.testing.assert_allclose(published[:, 1], 0.002 + 0.008 * np.exp(-5.0 * t), rtol=1e-12)
+    np.testing.assert_allclose(
+        published[:, 0], 0.002 + 0.018 * np.exp(-5.0 * t), rtol=1e-12
+    )
+    np.testing.assert_allclose(
+        published[:, 1], 0.002 + 0.008 * np.exp(-5.0 * t), rtol=1e-12
+    )
 
 
 @pytest.mark.parametrize('fields', [1, 2, 3])
 def test_trajectory_message_is_decoded_as_by_rclpy(fields):
-    message = trajectory(JOINTS, np.zeros(2), duration=0.2, fields=fields, stamp=5 * SECOND + 7)
+    message = trajectory(
+        JOINTS, np.zeros(2), duration=0.2, fields=fields, stamp=5 * SECOND + 7
+    )
     message.header.frame_id = 'base'
     message.points[0].effort = [1.0, 2.0, 3.0]
     raw = serialize_message(message)
     read = joint_trajectory(raw)
     assert (read.stamp, read.names) == (5 * SECOND + 7, JOINTS)
     for (time, arrays), point in zip(read.points, message.points, strict=True):
-        expected = (point.positions, point.velocities, point.accelerations, point.effort)
+        expected = (
+            point.positions,
+            point.velocities,
+            point.accelerations,
+            point.effort,
+        )
         assert arrays == [tuple(values) for values in expected]
-        assert time == point.time_from_start.sec * SECOND + point.time_from_start.nanosec
+        assert (
+            time == point.time_from_start.sec * SECOND + point.time_from_start.nanosec
+        )
     for end in range(0, len(raw) // 2, 7):
         with pytest.raises(MessageError):
             joint_trajectory(raw[:end])
 
 
-def test_trajectory_that_is_planned_too_late_is_planned_again_further_ahead(ros, monkeypatch):
+def test_trajectory_that_is_planned_too_late_is_planned_again_further_ahead(
+    ros, monkeypatch
+):
     begins, may_end = [], Event()
 
     def plan(trajectory, before, at, config):

@@ -21,13 +21,24 @@ import pytest
 import yaml
 
 import blf_dsc_controller
-from blf_dsc_controller.errors import ConfigurationError, MissingExtraError
+from blf_dsc_controller.errors import (
+    BlfDscError,
+    ConfigurationError,
+    MissingExtraError,
+)
+from blf_dsc_controller.extras import import_extra, missing_extra
 
 ROOT = Path(__file__).resolve().parents[1]
 NAME = 'blf_dsc_controller'
 PACKAGES = (NAME, 'sim_plant')
 URL = 'https://example.org/blf_dsc_controller'
-NODES = {'sim_plant', 'blf_dsc_controller', 'bag_recorder', 'torque_watchdog', 'arm_view'}
+NODES = {
+    'sim_plant',
+    'blf_dsc_controller',
+    'bag_recorder',
+    'torque_watchdog',
+    'arm_view',
+}
 
 # rosdep's names for what pip installs. rosdep has no key for mcap alone.
 ROSDEP_KEYS = {
@@ -54,7 +65,9 @@ def depends(kind):
 
 
 def sources():
-    return [path for package in PACKAGES for path in sorted((ROOT / package).rglob('*.py'))]
+    return [
+        path for package in PACKAGES for path in sorted((ROOT / package).rglob('*.py'))
+    ]
 
 
 @pytest.fixture(scope='module')
@@ -65,7 +78,9 @@ def sdist(tmp_path_factory):
     shutil.copytree(ROOT, copy, ignore=shutil.ignore_patterns(*unwanted))
     text = (copy / 'package.xml').read_text()
     url = f'<url type="repository">{URL}</url>'  # as its publisher would add it
-    (copy / 'package.xml').write_text(text.replace('<exec_depend>', f'{url}<exec_depend>', 1))
+    (copy / 'package.xml').write_text(
+        text.replace('<exec_depend>', f'{url}<exec_depend>', 1)
+    )
     subprocess.run([sys.executable, 'setup.py', '-q', 'sdist'], cwd=copy, check=True)
     (path,) = copy.glob('dist/*.tar.gz')
     return path
@@ -77,7 +92,8 @@ def wheel(sdist, tmp_path_factory):
     build = [sys.executable, '-m', 'pip', 'wheel', '--quiet', '--no-deps', '--no-index']
     out = tmp_path_factory.mktemp('wheel')
     subprocess.run(
-        [*build, '--no-build-isolation', '--wheel-dir', str(out), str(sdist)], check=True
+        [*build, '--no-build-isolation', '--wheel-dir', str(out), str(sdist)],
+        check=True,
     )
     (path,) = out.glob('*.whl')
     return zipfile.ZipFile(path)
@@ -86,7 +102,9 @@ def wheel(sdist, tmp_path_factory):
 @pytest.fixture(scope='module')
 def distribution(wheel):
     """Metadata, requirements and entry points of the wheel."""
-    (folder,) = {name.split('/')[0] for name in wheel.namelist() if '.dist-info/' in name}
+    (folder,) = {
+        name.split('/')[0] for name in wheel.namelist() if '.dist-info/' in name
+    }
     return PathDistribution(zipfile.Path(wheel.filename, f'{folder}/'))
 
 
@@ -101,7 +119,9 @@ def requirements(distribution, extra=None):
 
 def test_version_is_the_same_everywhere(distribution):
     version = blf_dsc_controller.__version__
-    citation = re.search(r'^version: (.+)$', (ROOT / 'CITATION.cff').read_text(), re.MULTILINE)
+    citation = re.search(
+        r'^version: (.+)$', (ROOT / 'CITATION.cff').read_text(), re.MULTILINE
+    )
     assert distribution.version == version
     assert manifest().findtext('version') == version
     assert citation.group(1) == version
@@ -109,8 +129,10 @@ def test_version_is_the_same_everywhere(distribution):
 
 
 def test_metadata_matches_the_manifest_and_readme(distribution):
-    fields, text = distribution.metadata, distribution.read_text('METADATA')
-    assert not re.search(r'\]\((?!https?://|#)', text)  # PyPI shows no relative picture or link
+    fields = distribution.metadata
+    text = distribution.read_text('METADATA')
+    # PyPI shows no relative picture or link
+    assert not re.search(r'\]\((?!https?://|#)', text)
     for place in ('raw', 'blob'):
         text = text.replace(f'({URL}/{place}/{blf_dsc_controller.__version__}/', '(')
     assert text.endswith((ROOT / 'README.md').read_text())
@@ -118,7 +140,8 @@ def test_metadata_matches_the_manifest_and_readme(distribution):
     assert fields['Project-URL'] == f'repository, {URL}'
     assert fields['Author'] == fields['Maintainer'] == manifest().findtext('maintainer')
     assert fields['Maintainer-email'] == manifest().find('maintainer').get('email')
-    license_name = fields.get('License-Expression') or fields['License']  # depends on setuptools
+    # depends on setuptools
+    license_name = fields.get('License-Expression') or fields['License']
     assert license_name == manifest().findtext('license') == 'Apache-2.0'
     assert fields['Requires-Python'] == '>=3.10'
     assert fields['Keywords']
@@ -127,7 +150,9 @@ def test_metadata_matches_the_manifest_and_readme(distribution):
 def test_continuous_integration_runs_every_supported_python(distribution):
     jobs = yaml.safe_load((ROOT / '.github/workflows/ci.yml').read_text())['jobs']
     classifiers = distribution.metadata.get_all('Classifier')
-    classified = {value.split(' :: ')[-1] for value in classifiers if 'Python :: 3.' in value}
+    classified = {
+        value.split(' :: ')[-1] for value in classifiers if 'Python :: 3.' in value
+    }
     assert set(jobs['suite']['strategy']['matrix']['python']) == classified
     container = json.loads((ROOT / '.devcontainer/devcontainer.json').read_text())
     assert (ROOT / '.devcontainer' / container['build']['dockerfile']).is_file()
@@ -141,7 +166,9 @@ def test_colcon_and_ros2_run_find_the_package():
     assert root.findtext('name') == NAME
     assert root.findtext('export/build_type') == 'ament_python'
     # colcon silently treats a package with an invalid address as plain Python.
-    assert re.fullmatch(r'[\w.+-]+@([\w-]+\.)+[a-zA-Z]{2,}', root.find('maintainer').get('email'))
+    assert re.fullmatch(
+        r'[\w.+-]+@([\w-]+\.)+[a-zA-Z]{2,}', root.find('maintainer').get('email')
+    )
     setup = configparser.ConfigParser()
     setup.read(ROOT / 'setup.cfg')
     assert setup['develop']['script_dir'] == f'$base/lib/{NAME}'
@@ -157,13 +184,22 @@ def test_wheel_contains_every_module_with_its_types_and_no_tests(wheel, sdist):
     assert {f'{package}/py.typed' for package in PACKAGES} <= installed
     with tarfile.open(sdist) as archive:
         folders = {name.split('/')[1] for name in archive.getnames() if '/' in name}
-    assert {*PACKAGES, 'config', 'launch', 'resource', 'setup.py', 'package.xml'} <= folders
+    assert {
+        *PACKAGES,
+        'config',
+        'launch',
+        'resource',
+        'setup.py',
+        'package.xml',
+    } <= folders
     assert 'test' not in folders
 
 
 def test_wheel_installs_the_share_files_that_ros_expects(wheel):
     start = f'{NAME}-{blf_dsc_controller.__version__}.data/data/share/'
-    shared = {name.removeprefix(start) for name in wheel.namelist() if name.startswith(start)}
+    shared = {
+        name.removeprefix(start) for name in wheel.namelist() if name.startswith(start)
+    }
     assert {
         f'ament_index/resource_index/packages/{NAME}',
         f'{NAME}/package.xml',
@@ -172,9 +208,9 @@ def test_wheel_installs_the_share_files_that_ros_expects(wheel):
         f'{NAME}/launch/closed_loop.launch.py',
         f'{NAME}/config/recommended.yaml',
     } <= shared
-    assert {Path(name).name for name in shared if name.startswith(f'{NAME}/config/')} == {
-        path.name for path in (ROOT / 'config').iterdir() if path.is_file()
-    }
+    assert {
+        Path(name).name for name in shared if name.startswith(f'{NAME}/config/')
+    } == {path.name for path in (ROOT / 'config').iterdir() if path.is_file()}
 
 
 def test_every_executable_has_a_callable_entry_point(distribution):
@@ -187,7 +223,9 @@ def test_setup_runs_in_the_links_of_a_colcon_symlink_install(tmp_path):
     for name in ('setup.py', 'setup.cfg', 'package.xml', *PACKAGES):
         (tmp_path / name).symlink_to(ROOT / name)
     run = [sys.executable, 'setup.py', '--version']
-    output = subprocess.run(run, cwd=tmp_path, check=True, capture_output=True, text=True).stdout
+    output = subprocess.run(
+        run, cwd=tmp_path, check=True, capture_output=True, text=True
+    ).stdout
     assert output.split()[-1] == blf_dsc_controller.__version__
 
 
@@ -203,17 +241,22 @@ def imports(path):
 def test_every_import_is_a_declared_dependency(distribution):
     used = {name for path in sources() for name in imports(path)}
     used |= set(imports(ROOT / 'launch/closed_loop.launch.py'))
-    foreign = used - set(sys.stdlib_module_names) - set(PACKAGES) - {'llvmlite'}  # a part of numba
+    # a part of numba
+    foreign = used - set(sys.stdlib_module_names) - set(PACKAGES) - {'llvmlite'}
     distributions = {'pyyaml' if name == 'yaml' else name for name in foreign}
-    extras = ('monte-carlo', 'dask', 'report', 'view')
+    extras = ('monte-carlo', 'dask', 'report', 'view', 'streams', 'mujoco', 'franka')
     optional = set().union(*(requirements(distribution, extra) for extra in extras))
-    assert distributions <= requirements(distribution) | optional | depends('exec_depend')
+    assert distributions <= requirements(distribution) | optional | depends(
+        'exec_depend'
+    )
 
 
 def test_rosdep_and_pip_install_the_same_dependencies(distribution):
     assert requirements(distribution) == set(ROSDEP_KEYS)
     assert set(ROSDEP_KEYS.values()) <= depends('exec_depend')
-    assert {'ros-jazzy-rclpy', 'ros-jazzy-rmw-fastrtps-cpp'} <= requirements(distribution, 'ros')
+    assert {'ros-jazzy-rclpy', 'ros-jazzy-rmw-fastrtps-cpp'} <= requirements(
+        distribution, 'ros'
+    )
     assert 'pytest' in requirements(distribution, 'test')  # where colcon looks
 
 
@@ -227,8 +270,103 @@ def test_public_names_are_documented_and_imported_on_first_use(tmp_path):
 def test_errors_can_be_passed_between_processes():
     for error in (
         ConfigurationError(['a: got 1', 'b: got 2'], 'my.yaml'),
-        MissingExtraError('dask', 'dask', 'a cluster'),
+        missing_extra('dask', 'dask', 'a cluster'),
     ):
         copied = pickle.loads(pickle.dumps(error))  # noqa: S301 - our own
         assert type(copied) is type(error)
         assert (str(copied), vars(copied)) == (str(error), vars(error))
+
+
+@pytest.mark.parametrize(
+    ('target', 'extra'),
+    [
+        ('changes', 'monte-carlo'),
+        ('bench', 'bench'),
+        ('docs', 'docs'),
+        ('test', 'test'),
+        ('lint', 'lint'),
+        ('release', 'release'),
+    ],
+)
+def test_make_installs_the_extra_that_a_target_needs(target, extra, tmp_path):
+    make = ['make', '-n', target, f'VENV={tmp_path}', f'PYTHON={sys.executable}']
+    recipe = subprocess.run(make, cwd=ROOT, check=True, capture_output=True, text=True)
+    assert f"-e '.[{extra}]'" in recipe.stdout
+
+
+@pytest.mark.parametrize('numpy', ['1.26.4', '2.4.6'])
+@pytest.mark.parametrize('file', ['Makefile', 'Dockerfile'])
+def test_sourced_ros_keeps_its_numpy_and_a_pyarrow_that_loads_with_it(
+    file, numpy, tmp_path
+):
+    text = (ROOT / file).read_text().replace('\\\n', '')
+    (program,) = re.findall(r"-c '(import numpy;[^']*)'", text)
+    (tmp_path / 'numpy.py').write_text(f'__version__ = "{numpy}"')
+    python = [sys.executable, '-c', program]
+    output = subprocess.run(
+        python, cwd=tmp_path, check=True, capture_output=True, text=True
+    ).stdout.split()
+    assert f'numpy=={numpy}' in output
+    if numpy < '2':
+        assert 'pyarrow<26' in output
+
+
+def test_every_dependency_has_a_lower_bound(distribution):
+    bare = [line for line in distribution.requires if 'extra' not in line]
+    bare += [line for line in distribution.requires if 'trimesh' in line]
+    assert bare
+    assert [line for line in bare if '>=' not in line] == []
+
+
+@pytest.mark.parametrize(
+    ('program', 'error', 'message'),
+    [
+        (None, MissingExtraError, 'the page needs absent, which is not installed'),
+        ('import nowhere', MissingExtraError, 'pip install .*view'),
+        (
+            'raise ImportError("old numpy")',
+            BlfDscError,
+            r'cannot be loaded \(old numpy',
+        ),
+    ],
+)
+def test_package_that_cannot_be_loaded_is_not_called_missing(
+    program, error, message, tmp_path, monkeypatch
+):
+    if program:
+        (tmp_path / 'absent.py').write_text(program)
+    monkeypatch.syspath_prepend(tmp_path)
+    with pytest.raises(BlfDscError, match=message) as raised:
+        import_extra('absent', 'view', 'the page')
+    assert type(raised.value) is error
+
+
+def test_pyarrow_that_does_not_load_names_the_release_that_does(tmp_path, monkeypatch):
+    (tmp_path / 'pyarrow.py').write_text('raise ImportError("numpy 1.26.4")')
+    monkeypatch.syspath_prepend(tmp_path)
+    for name in [name for name in sys.modules if name.split('.')[0] == 'pyarrow']:
+        monkeypatch.delitem(sys.modules, name)
+    with pytest.raises(BlfDscError, match="pip install 'pyarrow<26'"):
+        import_extra('pyarrow', 'parquet', 'writing Parquet')
+
+
+def test_install_command_names_the_checkout():
+    assert str(missing_extra('x', 'view', 'the page')).endswith(
+        f"pip install '{ROOT}[view]'"
+    )
+
+
+@pytest.mark.parametrize(
+    ('target', 'limit'), [('test', 900), ('test-nightly', 7200), ('fuzz', 7200)]
+)
+def test_every_test_has_an_end(target, limit, tmp_path):
+    """One that waits for a process that never answers would otherwise last for ever."""
+    make = ['make', '-n', target, f'VENV={tmp_path}', f'PYTHON={sys.executable}']
+    recipe = subprocess.run(make, cwd=ROOT, check=True, capture_output=True, text=True)
+    assert f'-p pytest_timeout --timeout {limit} ' in recipe.stdout, recipe.stdout
+    hanging = tmp_path / 'test_hanging.py'
+    hanging.write_text('import time\n\ndef test_hangs():\n    time.sleep(1000.0)\n')
+    options = ['-p', 'pytest_timeout', '--timeout', '1', '-p', 'no:cacheprovider']
+    run = [sys.executable, '-m', 'pytest', *options, str(hanging)]
+    ended = subprocess.run(run, cwd=tmp_path, check=False, capture_output=True)
+    assert b'Timeout' in ended.stdout

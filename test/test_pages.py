@@ -39,7 +39,11 @@ def tokens(page):
 
 
 def fences(page, language):
-    return [item.content for item in tokens(page) if item.type == 'fence' and item.info == language]
+    return [
+        item.content
+        for item in tokens(page)
+        if item.type == 'fence' and item.info == language
+    ]
 
 
 def each_page(pages):
@@ -49,7 +53,9 @@ def each_page(pages):
 
 
 @each_page([page for page in PAGES if fences(page, 'python')])
-def test_python_blocks_run_and_print_the_output_shown_below_them(page, tmp_path, monkeypatch):
+def test_python_blocks_run_and_print_the_output_shown_below_them(
+    page, tmp_path, monkeypatch
+):
     """The blocks of a page are run as one program, in a folder with the page's YAML file.
 
     Those below "Save this as `name.py`" are saved in this folder instead, to be imported.
@@ -59,12 +65,7 @@ def test_python_blocks_run_and_print_the_output_shown_below_them(page, tmp_path,
     for text in fences(page, 'yaml'):
         Path('my.yaml').write_text(text)
     program = {'__name__': page.stem}
-    blocks, saved = [], {}
-    for before, token in pairwise(tokens(page)):
-        if token.type == 'fence':
-            blocks.append(token)
-        elif before.type == 'paragraph_open' and (name := SAVED.search(token.content)):
-            saved[len(blocks)] = name[1]
+    blocks, saved = blocks_of(page)
     for index, (block, below) in enumerate(pairwise([*blocks, None])):
         if index in saved:
             Path(saved[index]).write_text(block.content)
@@ -76,9 +77,23 @@ def test_python_blocks_run_and_print_the_output_shown_below_them(page, tmp_path,
                 assert printed.getvalue() == below.content
 
 
+def blocks_of(page):
+    """Return the blocks of a page, and the names of those that are saved as Python files."""
+    blocks, saved = [], {}
+    for before, token in pairwise(tokens(page)):
+        if token.type == 'fence':
+            blocks.append(token)
+        elif before.type == 'paragraph_open' and (name := SAVED.search(token.content)):
+            saved[len(blocks)] = name[1]
+    return blocks, saved
+
+
 @each_page([page for page in PAGES if fences(page, 'yaml')])
 def test_parameter_files_of_a_page_load(page, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
+    blocks, saved = blocks_of(page)
+    for index, name in saved.items():
+        Path(name).write_text(blocks[index].content)
     urdf = (ROOT / 'config/ur5e.urdf').as_posix()
     for text in fences(page, 'yaml'):
         file = Path('my.yaml')
@@ -141,7 +156,9 @@ def check(words):
             check_ros2(rest)
         case ['pip', *rest]:
             extras = re.findall(r'blf_dsc_controller\[(.+?)\]', ' '.join(rest))
-            assert all(f'\n{name} =\n' in SETUP for name in ','.join(extras).split(',') if name)
+            assert all(
+                f'\n{name} =\n' in SETUP for name in ','.join(extras).split(',') if name
+            )
         case [program, *rest] if f'\n    {program} = ' in SETUP:  # a node
             check_parameters(rest)
         case [program, *_]:
@@ -181,7 +198,9 @@ def test_inline_commands_of_a_page_exist(page):
             check([program, first])
         elif first.islower() and first[0] != '-':
             options = subcommand(first)._option_string_actions
-            assert {word for word in rest if word.startswith('--')} <= set(options), code
+            assert {word for word in rest if word.startswith('--')} <= set(options), (
+                code
+            )
 
 
 def subcommand(name):
@@ -198,7 +217,17 @@ DOC = ROOT / 'doc'
 def site(tmp_path_factory):
     """Every page of the site by its name, built as by `make docs`, which fails at a dead link."""
     out = tmp_path_factory.mktemp('site')
-    sphinx = [sys.executable, '-m', 'sphinx', '-q', '-W', '--keep-going', '-n', str(DOC), str(out)]
+    sphinx = [
+        sys.executable,
+        '-m',
+        'sphinx',
+        '-q',
+        '-W',
+        '--keep-going',
+        '-n',
+        str(DOC),
+        str(out),
+    ]
     built = subprocess.run(sphinx, check=False, capture_output=True, text=True)
     assert built.returncode == 0, built.stderr
     return {path: path.read_text() for path in out.rglob('*.html')}
@@ -207,21 +236,30 @@ def site(tmp_path_factory):
 @pytest.mark.nightly
 def test_site_has_every_page_and_loads_no_external_resources(site):
     names = {path.stem for path in site}
-    assert {path.stem for path in DOC.iterdir() if path.suffix in ('.md', '.rst')} <= names
+    assert {
+        path.stem for path in DOC.iterdir() if path.suffix in ('.md', '.rst')
+    } <= names
     for path, text in site.items():
         for url in re.findall(r'<(?!a )[^>]* (?:src|href)="([^"]*)"', text):
             assert not urlsplit(url).netloc, (path.name, url)
-            assert url.startswith(('#', 'data:')) or (path.parent / urlsplit(url).path).exists()
+            assert (
+                url.startswith(('#', 'data:'))
+                or (path.parent / urlsplit(url).path).exists()
+            )
     (folder,) = {path.parent for path in site if path.name == 'index.html'}
     for sheet in folder.rglob('*.css'):
-        assert not re.search(r'(url\(|@import)\s*["\']?(https?:)?//', sheet.read_text()), sheet
+        assert not re.search(
+            r'(url\(|@import)\s*["\']?(https?:)?//', sheet.read_text()
+        ), sheet
 
 
 @pytest.mark.nightly
 @pytest.mark.parametrize('name', OUTSIDE)
 def test_links_outside_the_site_are_valid(name, site):
     page = ROOT / name
-    anchors = {path.stem: re.findall(r' id="([^"]*)"', text) for path, text in site.items()}
+    anchors = {
+        path.stem: re.findall(r' id="([^"]*)"', text) for path, text in site.items()
+    }
     for link in re.findall(r'\]\(([^)\s]+)\)', page.read_text()):
         url = urlsplit(link)
         if not url.scheme:
@@ -233,6 +271,10 @@ def test_links_outside_the_site_are_valid(name, site):
 @pytest.mark.nightly
 def test_every_picture_has_a_make_command():
     text = (DOC / 'figures.md').read_text()
-    shown = {path.name for folder in ('doc', 'benchmark') for path in (ROOT / folder).glob('*.png')}
+    shown = {
+        path.name
+        for folder in ('doc', 'benchmark')
+        for path in (ROOT / folder).glob('*.png')
+    }
     rows = re.findall(r'^\| \S*?([\w-]+\.png)\S* \| `make (\w+)', text, re.MULTILINE)
     assert {picture for picture, _ in rows} == shown

@@ -42,11 +42,15 @@ def swinging_torques(samples):
 def test_urdf_and_tip_are_a_complete_configuration_which_given_parameters_override():
     config = panda_config({})
     assert config.joints == tuple(f'panda_joint{i}' for i in range(1, 8))
-    assert config.initial.position == pytest.approx((0, 0, 0, -1.5708, 0, 1.8675, 0), abs=1e-9)
+    assert config.initial.position == pytest.approx(
+        (0, 0, 0, -1.5708, 0, 1.8675, 0), abs=1e-9
+    )
     assert config.initial.velocity == config.disturbance.amplitude == (0.0,) * 7
     assert config.actuator.torque_limit == (87.0,) * 4 + (12.0,) * 3
     assert change(config, {'seed': 3}).joints == config.joints
-    config = panda_config({'actuator.torque_limit': [50.0] * 7, 'initial.position': [0.1] * 7})
+    config = panda_config(
+        {'actuator.torque_limit': [50.0] * 7, 'initial.position': [0.1] * 7}
+    )
     assert config.actuator.torque_limit == (50.0,) * 7
     assert config.initial.position == (0.1,) * 7
     rippled = plant_settings(change(config, {'actuator.ripple': 0.01}))  # of the limit
@@ -56,16 +60,21 @@ def test_urdf_and_tip_are_a_complete_configuration_which_given_parameters_overri
 def test_truth_contains_the_base_parameters_with_payload_and_factors():
     config = panda_config({'events.begin': [0.5], 'events.payload': [2.0]})
     chain = config.robot.chain(config.joints)
-    base, rotors = base_parameters(chain), config.robot.rotors(chain)
+    base = base_parameters(chain)
+    rotors = config.robot.rotors(chain)
     expected = base.of(chain.inertias, rotors)
     np.testing.assert_allclose(true_parameters(config, 0.4), expected, rtol=1e-12)
     loaded = chain.inertias.copy()
     point = chain.tip_placement[:3, 3]
     loaded[-1] += pinocchio.Inertia(2.0, point, np.zeros((3, 3))).toDynamicParameters()
-    np.testing.assert_allclose(true_parameters(config, 0.6), base.of(loaded, rotors), rtol=1e-12)
+    np.testing.assert_allclose(
+        true_parameters(config, 0.6), base.of(loaded, rotors), rtol=1e-12
+    )
     scaled = panda_config({'truth.mass_factor': 1.3, 'truth.rotor_factor': 1.2})
     expected = base.of(1.3 * chain.inertias, 1.2 * rotors)
-    np.testing.assert_allclose(true_parameters(scaled), expected, rtol=1e-12, atol=1e-15)
+    np.testing.assert_allclose(
+        true_parameters(scaled), expected, rtol=1e-12, atol=1e-15
+    )
 
 
 def test_random_truth_deviates_as_configured_and_stays_physical():
@@ -73,18 +82,32 @@ def test_random_truth_deviates_as_configured_and_stays_physical():
     config = panda_config({'truth.mass_deviation': 0.3, 'truth.centre_deviation': 0.01})
     chain = config.robot.chain(config.joints)
     bodies = np.array(
-        [true_inertias(chain, change(config, {'truth.seed': seed}).truth) for seed in range(100)]
+        [
+            true_inertias(chain, change(config, {'truth.seed': seed}).truth)
+            for seed in range(100)
+        ]
     )
     masses = bodies[:, :, 0] / chain.inertias[:, 0]
-    centres, original = (rows[..., 1:4] / rows[..., :1] for rows in (bodies, chain.inertias))
-    for found, nearly, most in ((masses - 1.0, 0.29, 0.3), (centres - original, 0.0099, 0.01)):
+    centres, original = (
+        rows[..., 1:4] / rows[..., :1] for rows in (bodies, chain.inertias)
+    )
+    for found, nearly, most in (
+        (masses - 1.0, 0.29, 0.3),
+        (centres - original, 0.0099, 0.01),
+    ):
         assert nearly < found.max() < most
         assert -most < found.min() < -nearly
     assert abs(masses.mean() - 1.0) < 0.03
-    for true, urdf in zip(bodies.reshape(-1, 10), np.tile(chain.inertias, (100, 1)), strict=True):
-        least, expected = (np.linalg.eigvalsh(pseudo_inertia(phi))[0] for phi in (true, urdf))
+    for true, urdf in zip(
+        bodies.reshape(-1, 10), np.tile(chain.inertias, (100, 1)), strict=True
+    ):
+        least, expected = (
+            np.linalg.eigvalsh(pseudo_inertia(phi))[0] for phi in (true, urdf)
+        )
         assert least > -1e-12 * abs(expected)
-        about = [pinocchio.Inertia.FromDynamicParameters(phi).inertia for phi in (true, urdf)]
+        about = [
+            pinocchio.Inertia.FromDynamicParameters(phi).inertia for phi in (true, urdf)
+        ]
         np.testing.assert_allclose(about[0] / true[0], about[1] / urdf[0], atol=1e-12)
     again = true_inertias(chain, change(config, {'truth.seed': 99}).truth)
     np.testing.assert_array_equal(again, bodies[-1])
@@ -93,21 +116,32 @@ def test_random_truth_deviates_as_configured_and_stays_physical():
 def test_events_act_on_all_seven_joints_at_their_time():
     """A push at the tip acts through its Jacobian; friction, torques and offsets add up."""
     names = ('force', 'torque', 'viscous', 'coulomb', 'offset')
-    values = ([3.0, -2.0, 5.0], *(np.linspace(low, 2.0 * low, 7) for low in (2.0, 1.0, 0.5, 1e-3)))
-    given = {f'events.{name}': list(value) for name, value in zip(names, values, strict=True)}
+    values = (
+        [3.0, -2.0, 5.0],
+        *(np.linspace(low, 2.0 * low, 7) for low in (2.0, 1.0, 0.5, 1e-3)),
+    )
+    given = {
+        f'events.{name}': list(value) for name, value in zip(names, values, strict=True)
+    }
     arm = plant_of(panda_config({'events.begin': [0.1], **given}))
     for torque in swinging_torques(100):
         arm.step(torque)
     load, q, dq = arm.truth()[arm.arm.p :].reshape(3, 7)
     position, jacobian = np.zeros(3), np.zeros((3, 7))
     arm.arm.fill_tip(q, position, jacobian)
-    expected = -values[1] + values[2] * dq + values[3] * np.tanh(dq / 0.01) - values[0] @ jacobian
+    expected = (
+        -values[1]
+        + values[2] * dq
+        + values[3] * np.tanh(dq / 0.01)
+        - values[0] @ jacobian
+    )
     np.testing.assert_allclose(load, expected, rtol=1e-12)
     np.testing.assert_allclose(arm.measure()[:7] - q, values[4], atol=1e-12)
 
 
 def test_two_plants_of_a_urdf_are_independent_and_repeatable():
-    first, second = plant_of(panda_config({})), plant_of(panda_config({'load.payload': 1.0}))
+    first = plant_of(panda_config({}))
+    second = plant_of(panda_config({'load.payload': 1.0}))
     rows = [], []
     for torque in swinging_torques(50):
         first.step(torque)
@@ -148,11 +182,16 @@ def test_drives_hold_the_arm_and_a_told_payload_without_any_command(payload, eff
 
 
 def test_drives_overcome_their_share_of_friction():
-    given = {'robot.drive_compensates': 'gravity_and_friction', 'initial.velocity': [0.2] * 7}
+    given = {
+        'robot.drive_compensates': 'gravity_and_friction',
+        'initial.velocity': [0.2] * 7,
+    }
     slowed = []
     for viscous, share in ((0.0, 0.0), (1.0, 0.0), (1.0, 0.5), (1.0, 1.0)):
         friction = {'disturbance.viscous': [viscous] * 7, 'drive.friction': share}
-        plant = panda(given | NO_FRICTION | friction | {'robot.gravity': [0.0, 0.0, 0.0]})
+        plant = panda(
+            given | NO_FRICTION | friction | {'robot.gravity': [0.0, 0.0, 0.0]}
+        )
         plant.step(np.zeros(7))
         slowed.append(0.2 - plant.measure()[13])
     by_friction = np.subtract(slowed[1:], slowed[0])
@@ -161,9 +200,12 @@ def test_drives_overcome_their_share_of_friction():
 
 
 @pytest.mark.parametrize(
-    ('step', 'rate', 'stops'), [(0.99, 0.0, False), (1.01, 0.0, True), (1.01, 1000.0, False)]
+    ('step', 'rate', 'stops'),
+    [(0.99, 0.0, False), (1.01, 0.0, True), (1.01, 1000.0, False)],
 )
-def test_reflex_stops_the_arm_after_a_jump_of_the_torque_until_a_reset(step, rate, stops):
+def test_reflex_stops_the_arm_after_a_jump_of_the_torque_until_a_reset(
+    step, rate, stops
+):
     """1000 N m/s at 1 kHz: 1 N m from torque to torque, the first from none."""
     given = {'actuator.reflex_rate': 1000.0, 'actuator.rate_limit': rate}
     plant = panda(HELD | NO_FRICTION | given)
@@ -177,9 +219,12 @@ def test_reflex_stops_the_arm_after_a_jump_of_the_torque_until_a_reset(step, rat
 
 
 def test_joint_states_may_have_another_order_and_other_joints():
-    joints, names, measurement = ('a', 'b'), ('finger', 'b', 'a'), np.arange(1.0, 7.0)
+    joints = ('a', 'b')
+    names = ('finger', 'b', 'a')
+    measurement = np.arange(1.0, 7.0)
     _, raw = PlantTelemetry(joints, (), names).joint_states(5, measurement)
-    ours, others = JointStateDecoder(joints), JointStateDecoder(names)
+    ours = JointStateDecoder(joints)
+    others = JointStateDecoder(names)
     assert ours.decode(raw) == others.decode(raw) == 5
     np.testing.assert_array_equal(ours.values, measurement)
     np.testing.assert_array_equal(others.position, [0.0, 2.0, 1.0])
@@ -188,11 +233,26 @@ def test_joint_states_may_have_another_order_and_other_joints():
 @pytest.mark.parametrize(
     ('given', 'problem'),
     [
-        ({'robot.drive_payload': 1.5}, 'robot.drive_payload: got 1.5 kg, but drive_compensates is'),
-        ({'robot.urdf': '', 'robot.tip': ''} | HELD, 'drive_compensates: got gravity, which needs'),
-        ({'robot.urdf': '', 'truth.mass_factor': 1.1}, 'truth: it applies only to a URDF'),
-        ({'robot.urdf': '', 'actuator.ripple': 0.1}, 'actuator.ripple: .* give actuator.torque_'),
-        ({'drive.mass_factor': 0.9}, 'drive: without robot.drive_compensates the drives need no'),
+        (
+            {'robot.drive_payload': 1.5},
+            'robot.drive_payload: got 1.5 kg, but drive_compensates is',
+        ),
+        (
+            {'robot.urdf': '', 'robot.tip': ''} | HELD,
+            'drive_compensates: got gravity, which needs',
+        ),
+        (
+            {'robot.urdf': '', 'truth.mass_factor': 1.1},
+            'truth: it applies only to a URDF',
+        ),
+        (
+            {'robot.urdf': '', 'actuator.ripple': 0.1},
+            'actuator.ripple: .* give actuator.torque_',
+        ),
+        (
+            {'drive.mass_factor': 0.9},
+            'drive: without robot.drive_compensates the drives need no',
+        ),
         (
             {'sensor.published_joints': ['panda_joint1', 'gripper']},
             'sensor.published_joints: panda_joint2, .* of `joints` is missing',
@@ -224,13 +284,17 @@ OPTIONS = {  # without any imperfection, and with some
 
 def applied(torques, noise, given):
     """Torques at the joints (samples, 2): limited in rate, late, limited, lagging, noisy."""
-    step, limit = (np.where(each, each, np.inf) for each in (rate_of(given), given['torque_limit']))
-    last, found = np.zeros(2), np.zeros((given['delay'] + len(torques), 2))
+    step, limit = (
+        np.where(each, each, np.inf) for each in (rate_of(given), given['torque_limit'])
+    )
+    last = np.zeros(2)
+    found = np.zeros((given['delay'] + len(torques), 2))
     for row, torque in zip(found[given['delay'] :], torques, strict=True):
         row[:] = last = last + np.clip(torque - last, -step, step)
     found = np.clip(found[: len(torques)], -limit, limit)
     if tau := given['time_constant']:  # the mean of an exponential over a sample
-        motor, decay = np.zeros(2), np.exp(-PERIOD / tau)
+        motor = np.zeros(2)
+        decay = np.exp(-PERIOD / tau)
         for k, torque in enumerate(found.copy()):
             lacking = motor - torque
             motor = torque + decay * lacking
@@ -251,7 +315,11 @@ def readings(true, noise, reads, given):
     rows, last = [], None  # sample of the last reading that was new
     for k in reads:
         if is_new(k, given):
-            q = true[k, :2] + given['sensor.offset'] + given['position_noise'] * noise[k, :2]
+            q = (
+                true[k, :2]
+                + given['sensor.offset']
+                + given['position_noise'] * noise[k, :2]
+            )
             if step := given['resolution']:
                 q = np.rint(q / step) * step
             dq = true[k, 2:]
@@ -271,16 +339,24 @@ def readings(true, noise, reads, given):
 def test_readings_and_torques_are_those_of_encoders_and_drives_in_plain_numpy(seed):
     """Also where a sample is read twice, or not at all; the arm moves by the torques reported."""
     drawn = np.random.default_rng(seed)
-    given = {name: values[drawn.integers(len(values))] for name, values in OPTIONS.items()}
-    reads, torques, start = range(0, SAMPLES, [1, 1, 4][seed % 3]), commands(SAMPLES), (0.4, -0.3)
+    given = {
+        name: values[drawn.integers(len(values))] for name, values in OPTIONS.items()
+    }
+    reads = range(0, SAMPLES, [1, 1, 4][seed % 3])
+    torques = commands(SAMPLES)
+    start = (0.4, -0.3)
     if seed == 0:
         given = {name: values[0] for name, values in OPTIONS.items()}
     arm = plant(seed=seed, velocity=start, **given)
     random = np.random.Generator(np.random.PCG64(np.random.SeedSequence(seed)))
-    true, noise, found = np.zeros((SAMPLES, 4)), np.zeros((SAMPLES, 6)), []
+    true = np.zeros((SAMPLES, 4))
+    noise = np.zeros((SAMPLES, 6))
+    found = []
     for k, torque in enumerate(torques):
         if k in reads:
-            if is_new(k, given) and (given['position_noise'] or given['velocity_noise']):
+            if is_new(k, given) and (
+                given['position_noise'] or given['velocity_noise']
+            ):
                 noise[k:, :4] = random.standard_normal(4)
             if is_new(k, given) and given['torque_noise']:
                 noise[k:, 4:] = random.standard_normal(2)

@@ -12,7 +12,12 @@ from scipy.integrate import RK45, cumulative_simpson
 from blf_dsc_controller.configuration.plant import PlantConfig
 from blf_dsc_controller.configuration.schema import build
 from sim_plant.kernels import plant_views
-from sim_plant.motion import disturbing_torque, integrate, state_derivative, update_loads
+from sim_plant.motion import (
+    disturbing_torque,
+    integrate,
+    state_derivative,
+    update_loads,
+)
 from sim_plant.plant import plant_of, plant_settings
 
 INITIAL = np.array([*START, 0.5, -1.0])
@@ -59,14 +64,20 @@ def torque_of(arm, t, q, dq):
     """The disturbance in plain numpy: friction has the sign of the velocity, and more near rest."""
     load = arm.disturbance
     near_rest = 1.0 + load.stribeck * np.exp(-((dq / load.stribeck_velocity) ** 2))
-    friction = load.viscous * dq + load.coulomb * near_rest * np.tanh(dq / load.coulomb_velocity)
+    friction = load.viscous * dq + load.coulomb * near_rest * np.tanh(
+        dq / load.coulomb_velocity
+    )
     ripple = load.ripple * np.sin(load.ripple_frequency * q)
     sine = load.amplitude * np.sin(load.frequency * t + load.phase)
     return load.constant + sine + friction + ripple
 
 
 def test_disturbances_of_every_kind_add_up_for_each_joint():
-    for changes in (FULL, {'coulomb': (0.3, 0.5)}, {'ripple': 0.1, 'torque_limit': (1.0, 2.0)}):
+    for changes in (
+        FULL,
+        {'coulomb': (0.3, 0.5)},
+        {'ripple': 0.1, 'torque_limit': (1.0, 2.0)},
+    ):
         arm, now = views(**changes)
         for q, dq in np.random.default_rng(0).normal(size=(10, 2, 2)) * [[1.0], [0.2]]:
             found = np.empty(2)
@@ -76,7 +87,8 @@ def test_disturbances_of_every_kind_add_up_for_each_joint():
 
 def test_positive_disturbance_decelerates_the_joint_and_is_in_the_truth():
     """In the equation of motion tau_dist is on the side of M ddq."""
-    undisturbed, disturbed = plant(), plant(constant=(0.0, 1.0))
+    undisturbed = plant()
+    disturbed = plant(constant=(0.0, 1.0))
     undisturbed.step(np.zeros(2))
     disturbed.step(np.zeros(2))
     assert disturbed.truth()[-1] < undisturbed.truth()[-1]
@@ -136,7 +148,8 @@ ALL_KINDS = {
 
 def truths(given, samples=SAMPLES):
     """True values (samples, 9) under the usual torques."""
-    arm, rows = plant_of(build(PlantConfig, given)), np.empty((samples, 9))
+    arm = plant_of(build(PlantConfig, given))
+    rows = np.empty((samples, 9))
     for row, torque in zip(rows, commands(samples), strict=True):
         row[:] = arm.truth()
         arm.step(torque)
@@ -151,7 +164,10 @@ OFFSET = {'sensor.offset': [0.01, -0.02]}
     [
         ({'payload': [0.25]}, {'arm.m2': 0.75}),
         ({'payload': [0.25]}, {'load.payload': 0.25}),
-        ({'payload': [0.25]}, {'events.begin': [0.0, 0.0], 'events.payload': [0.125, 0.125]}),
+        (
+            {'payload': [0.25]},
+            {'events.begin': [0.0, 0.0], 'events.payload': [0.125, 0.125]},
+        ),
         ({'torque': [2.0, -1.0]}, {'disturbance.constant': [-1.9, 1.1]}),
         ({'torque': [2.0, -1.0]}, {'load.torque': [2.0, -1.0]}),
         ({'force': [1.0, 0.0, -2.0]}, {'load.force': [1.0, 0.0, -2.0]}),
@@ -163,7 +179,8 @@ OFFSET = {'sensor.offset': [0.01, -0.02]}
 def test_event_is_equivalent_to_changing_the_plant_at_its_time(events, lasting):
     given = {f'events.{name}': value for name, value in events.items()}
     scheduled = plant_of(build(PlantConfig, {'events.begin': [AT * 1e-3], **given}))
-    changed, unchanged = plant_of(PlantConfig()), plant_of(PlantConfig())
+    changed = plant_of(PlantConfig())
+    unchanged = plant_of(PlantConfig())
     torques = commands(SAMPLES)
     before = [run(arm, torques[:AT]) for arm in (scheduled, changed, unchanged)]
     changed.truth()  # what acts in this sample is summed once
@@ -177,17 +194,23 @@ def test_event_is_equivalent_to_changing_the_plant_at_its_time(events, lasting):
 
 def test_payload_is_ramped_in_and_out_and_the_truth_follows():
     events = {'begin': [0.01], 'duration': [0.02], 'ramp': [0.004], 'payload': [0.5]}
-    m2_l2_squared = truths({f'events.{name}': value for name, value in events.items()})[:, 1]
+    m2_l2_squared = truths({f'events.{name}': value for name, value in events.items()})[
+        :, 1
+    ]
     k = np.arange(SAMPLES)
     present = np.clip((k - 10) / 4, 0.0, 1.0) - np.clip((k - 30) / 4, 0.0, 1.0)
-    np.testing.assert_allclose(m2_l2_squared, (0.5 + 0.5 * present) * 0.8**2, rtol=1e-14)
+    np.testing.assert_allclose(
+        m2_l2_squared, (0.5 + 0.5 * present) * 0.8**2, rtol=1e-14
+    )
 
 
 def test_events_do_not_make_friction_negative():
     for name in ('viscous', 'coulomb'):
         decrease = {'events.begin': [0.0], f'events.{name}': [-1.0, -0.1]}
         found = truths({f'disturbance.{name}': [0.3, 0.3], **decrease})
-        np.testing.assert_array_equal(found, truths({f'disturbance.{name}': [0.0, 0.3 - 0.1]}))
+        np.testing.assert_array_equal(
+            found, truths({f'disturbance.{name}': [0.0, 0.3 - 0.1]})
+        )
 
 
 OMEGA, MASS = 12.0, 0.4  # rad/s, kg
@@ -197,7 +220,8 @@ def sloshing(samples, **events):
     """State x (samples, 10) of an arm that falls, carrying a sloshing load from the start."""
     given = {'begin': [0.0], 'sloshing': [MASS], 'sloshing_frequency': OMEGA} | events
     events = {f'events.{name}': value for name, value in given.items()}
-    arm, rows = plant_of(build(PlantConfig, NO_DISTURBANCE | events)), np.empty((samples, 10))
+    arm = plant_of(build(PlantConfig, NO_DISTURBANCE | events))
+    rows = np.empty((samples, 10))
     for row in rows:
         arm.measure()
         row[:] = arm._now.x

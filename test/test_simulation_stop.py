@@ -44,13 +44,16 @@ def test_bag_of_a_stopped_run_replays_with_its_stop(tmp_path, reason):
     simulated = record.run()
     assert simulated.timed_stops[0][0] == recorded.timed_stops[0][0]
     for field in ('position', 'torque', 'reference', 'error', 'bound'):
-        np.testing.assert_array_equal(getattr(simulated, field), getattr(recorded, field))
+        np.testing.assert_array_equal(
+            getattr(simulated, field), getattr(recorded, field)
+        )
     for field in ('max_error', 'rms_error', 'bound', 'peak_torque', 'held', 'stops'):
         assert getattr(measure(simulated), field) == getattr(measure(recorded), field)
 
 
 def test_unguarded_law_continues_past_every_limit():
-    stopped, alone = run(CASES['error past the bound']), run(WEAK, supervised=False)
+    stopped = run(CASES['error past the bound'])
+    alone = run(WEAK, supervised=False)
     (row,) = np.flatnonzero(stopped.stamps == stopped.run().stops[0].stamp)
     assert 0 < row < 100
     np.testing.assert_array_equal(stopped.samples[:row], alone.samples[:row])
@@ -62,7 +65,9 @@ def test_switching_between_guard_and_compiled_loop_does_not_change_the_run():
     """A run in chunks, the first of them run by the guard, equals the run of the law alone."""
     chunked = run(SATURATED).run()
     assert not chunked.stops
-    np.testing.assert_array_equal(chunked.torque, run(SATURATED, supervised=False).run().torque)
+    np.testing.assert_array_equal(
+        chunked.torque, run(SATURATED, supervised=False).run().torque
+    )
     assert (np.abs(chunked.torque[:1000]) == SATURATED['torque.limit']).any()
     assert not (np.abs(chunked.torque[1001:2000]) == SATURATED['torque.limit']).any()
 

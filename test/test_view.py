@@ -17,7 +17,7 @@ import pytest
 from random_arm import random_urdf
 
 pytest.importorskip('rclpy', reason='needs ROS 2')
-pytest.importorskip('yourdfpy', reason='needs viser: pip install blf_dsc_controller[view]')
+pytest.importorskip('yourdfpy', reason='needs viser: pip install .[view]')
 
 from command import COMMAND, wait_for
 from rclpy.parameter import Parameter
@@ -39,15 +39,19 @@ LOAD = (2.0, *[np.nan] * 3, 0.05, *[np.nan] * 3)
 
 CONNECTIONS = []
 sys.addaudithook(
-    lambda event, args: CONNECTIONS.append(args[1]) if event == 'socket.connect' else None
+    lambda event, args: (
+        CONNECTIONS.append(args[1]) if event == 'socket.connect' else None
+    )
 )
 
 
 def moving(seconds, error=0.001):
     """Snapshots of a two-link arm that moves, with this tracking error of its first joint [rad]."""
-    times, unknown = np.arange(0.0, seconds, 1 / 30), np.full(5, np.nan)
-    of_joints = np.array([[error, 0.0], [0.002, 0.002], [3.0, np.nan]])  # error, bound, torque
-    learned = unknown, unknown, 0.1
+    times = np.arange(0.0, seconds, 1 / 30)
+    unknown = np.full(5, np.nan)
+    # error, bound, torque
+    of_joints = np.array([[error, 0.0], [0.002, 0.002], [3.0, np.nan]])
+    learned = unknown, unknown, 0.1, np.array([1.0, 9.0, 100.0])
     first = (Snapshot(t, np.array([1.0 + t, 0.5]), *of_joints, *learned) for t in times)
     return [each._replace(load=LOAD) if each.time > 1.0 else each for each in first]
 
@@ -93,6 +97,9 @@ def test_plots_show_the_share_of_the_bound_and_a_caption_what_is_held(page):
     np.testing.assert_allclose(errors[1], 50.0)  # % of the bound
     np.testing.assert_allclose(errors[3], 100.0)
     assert (torques[1][-1], torques[2][-1]) == (3.0, -1.0)  # unknown: below the axis
+    model, weight = (plot.data for plot in page._plots[2:])
+    assert (model[1][-1], model[2][-1]) == pytest.approx((10.0, 30.0))  # %
+    assert [line[-1] for line in weight[1:4]] == pytest.approx([2.0, 1.95, 2.05])  # kg
 
 
 def test_events_are_lines_in_the_plots_and_named_at_the_arm(page):
@@ -117,7 +124,9 @@ def test_payloads_and_other_events_of_a_plant_are_listed():
     assert plant_events({}) == []
 
 
-def test_meshes_of_an_installed_description_are_drawn_only_for_the_same_arm(tmp_path, monkeypatch):
+def test_meshes_of_an_installed_description_are_drawn_only_for_the_same_arm(
+    tmp_path, monkeypatch
+):
     text = random_urdf(3, 0)[0]
     chain = read_chain(text, '', 'tip', ('j1', 'j2', 'j3'))
     folder = tmp_path / 'cmeel.prefix/share/example-robot-data/robots/any/urdf'
@@ -135,7 +144,9 @@ def test_meshes_of_an_installed_description_are_drawn_only_for_the_same_arm(tmp_
 
 def test_server_opens_no_external_connections(page):
     page.move(moving(1.0))
-    assert [peer for peer in CONNECTIONS if isinstance(peer, tuple) and peer[0] != HOST] == []
+    assert [
+        peer for peer in CONNECTIONS if isinstance(peer, tuple) and peer[0] != HOST
+    ] == []
 
 
 @pytest.mark.parametrize('seed', range(2))
@@ -150,7 +161,9 @@ def test_links_without_shapes_become_cylinders_from_joint_to_joint(seed):
         if drawn is not None:
             assert drawn.centroid == pytest.approx(end / 2, abs=1e-9)
             along = drawn.vertices @ end / np.linalg.norm(end)
-            assert (along.min(), along.max()) == pytest.approx((0.0, np.linalg.norm(end)))
+            assert (along.min(), along.max()) == pytest.approx(
+                (0.0, np.linalg.norm(end))
+            )
             cylinders += 1
     assert cylinders > 4
     q = np.random.default_rng(seed).uniform(-1.0, 1.0, 4)
@@ -167,13 +180,15 @@ def test_port_in_use_is_skipped(page):
     assert other.url != page.url
     other.close()
     for host in ('192.0.2.1', 'nowhere.invalid'):
-        with pytest.raises(BlfDscError, match=f"cannot be served at '{host}'.*of this computer"):
+        with pytest.raises(
+            BlfDscError, match=f"cannot be served at '{host}'.*of this computer"
+        ):
             Page(host, PORT)
 
 
 def test_missing_viser_is_reported_with_the_pip_command(monkeypatch):
     monkeypatch.setattr(pages.importlib.util, 'find_spec', lambda _: None)
-    with pytest.raises(MissingExtraError, match=r"pip install 'blf_dsc_controller\[view\]'"):
+    with pytest.raises(MissingExtraError, match=r'viser.*pip install .*view'):
         Page(HOST, PORT)
 
 
@@ -194,7 +209,9 @@ def events_with(view, word):
 
 def test_page_shows_the_loop_its_events_and_that_its_controller_is_gone(ros):
     view = ros.add(ViewNode, port=18180)
-    ros.until(lambda: view.page._state == ('STALE', 'waiting for /blf_dsc_controller/journal'))
+    ros.until(
+        lambda: view.page._state == ('STALE', 'waiting for /blf_dsc_controller/journal')
+    )
     arm, law = ros.loop({**EVENT, 'autostart': False})
     ros.until(lambda: view._plant)
     assert configure(ros, arm)
@@ -217,6 +234,8 @@ def test_page_shows_the_loop_its_events_and_that_its_controller_is_gone(ros):
     ros.until(lambda: events_with(view, 'reset'))
     ros.until(lambda: 0.1 < view.past[-1].time < 1.0)  # counted from the new start
 
+    learned, initial, true = now.squares
+    assert 0.0 < learned < initial < true  # the estimates began at half the parameters
     ros.kill(law)
     ros.until(lambda: view.page._state[0] == 'ERROR' and 'gone' in view.page._state[1])
     # The arm goes on without it: its last error is no longer shown.
@@ -231,7 +250,16 @@ def test_page_shows_the_loop_its_events_and_that_its_controller_is_gone(ros):
 
 def test_page_of_a_run_is_served_until_the_run_ends(tmp_path):
     out = tmp_path / 'run'
-    command = (*COMMAND, '--view', '--mode', 'lockstep', '--duration', '100000', '--out', str(out))
+    command = (
+        *COMMAND,
+        '--view',
+        '--mode',
+        'lockstep',
+        '--duration',
+        '100000',
+        '--out',
+        str(out),
+    )
     with subprocess.Popen(command, stdout=PIPE, stderr=STDOUT, text=True) as process:
         output = ''
         while not (found := re.search(r'open (http://127.0.0.1:\d+)', output)):

@@ -27,7 +27,9 @@ TIMES = np.arange(17.0, 26.0, 0.25)  # s; it picks up 2 kg at 20 s
 SETTLE = 1.5  # s, until the browser has drawn a frame without a GPU
 RATE = 8.0  # frames per second
 WINDOW = (1200, 880)
-NOTICE = "document.querySelectorAll('[class*=Notification]').forEach(each => each.remove())"
+NOTICE = (
+    "document.querySelectorAll('[class*=Notification]').forEach(each => each.remove())"
+)
 
 
 def advance(ros, arm, view, end):
@@ -47,7 +49,9 @@ def pictures():
         advance(ros, arm, view, TIMES[0])
         with chromium.opened(*WINDOW, chromium.WEBGL) as (page, _):
             page.goto(view.page.url)
-            page.wait_for_function("(document.body?.innerText ?? '').includes('torque')")
+            page.wait_for_function(
+                "(document.body?.innerText ?? '').includes('torque')"
+            )
             time.sleep(10 * SETTLE)  # the page fades in
             page.evaluate(NOTICE)
             for at in TIMES:

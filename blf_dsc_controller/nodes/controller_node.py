@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 
 from blf_dsc_controller.configuration.controller import ControllerConfig
+from blf_dsc_controller.control.guarded_loop import GuardedLoop
 from blf_dsc_controller.errors import StartError
-from blf_dsc_controller.law import factory
-from blf_dsc_controller.law.telemetry import ControllerTelemetry, rejected_columns
+from blf_dsc_controller.law.telemetry import rejected_columns
 from blf_dsc_controller.messages import topics
 from blf_dsc_controller.messages.codecs import (
     Float64MultiArrayEncoder,
@@ -24,24 +24,22 @@ from blf_dsc_controller.nodes import parameters, process
 from blf_dsc_controller.nodes.diagnostics import ControllerStatus
 from blf_dsc_controller.nodes.lifecycle import LoopNode
 from blf_dsc_controller.nodes.trajectory_input import TrajectoryInput
-from blf_dsc_controller.supervision.checks import SAME_CLOCK, Phase, rate_mismatch
-from blf_dsc_controller.supervision.gains import (
-    ReferenceLoad,
-    config_warnings,
-    reference_load,
-    worsened,
-)
+from blf_dsc_controller.nodes.watchdog_presence import WatchdogPresence
+from blf_dsc_controller.supervision.config_warnings import config_warnings, worsened
 from blf_dsc_controller.supervision.guard import Guard
+from blf_dsc_controller.supervision.reference_load import ReferenceLoad, reference_load
+from blf_dsc_controller.supervision.start_gate import GateState, StartGate
+from blf_dsc_controller.supervision.state_check import rate_mismatch
+from blf_dsc_controller.supervision.state_watchdog import SAME_CLOCK
+from blf_dsc_controller.supervision.supervisor import Phase
 
 _RARELY = 10  # samples between looks at what rarely changes
 _RATE_SAMPLES = 1001  # samples before the rate is checked
 _FAST = 0.9  # fraction of the sample time
-_MEASURED = 10  # intervals between live states, measured before the start ...
-_ALIKE = 1.5  # ... which may differ from the sample time by this factor ...
-_TYPICAL = 0.2, 0.5  # ... at these quantiles: a busy computer loses states between two others
-_PATIENCE = 25  # checks without a newer state (0.2 s): a simulated arm waits for its first torque
+_NANO = 1e-9
 _WAITING_PERIOD = 5.0  # s between two warnings
-_LONGEST_END = 3.0  # s from a signal to the end; ros2 launch sends the next signal after 5 s
+# s from a signal to the end; ros2 launch sends the next signal after 5 s
+_LONGEST_END = 3.0
 _SILENT = 0.1  # s without joint states, after which nothing is left to bring to rest
 
 
@@ -54,32 +52,34 @@ class ControllerNode(LoopNode[ControllerConfig]):
     def __init__(self, **options: Any) -> None:
         super().__init__(topics.CONTROLLER, ControllerConfig, **options)
         self.guard: Guard | None = None
+        self._loop: GuardedLoop | None = None
         self._load: ReferenceLoad | None = None
         joints = self.config.joints
-        self._estimates = factory.estimate_names(self.config)
-        self._telemetry = ControllerTelemetry(self.config, self._estimates)
         self._columns = b''  # those that are estimated, and whether they were checked
         self._model_changes = 0.0
         self._decoder = JointStateDecoder(joints, required=('position',))
         self._encoder = Float64MultiArrayEncoder(len(joints))
         self._pending: bytes | None = None
-        self._arrivals: list[int] | None = []  # stamps before the start [ns]; None: measured
-        self._checks = 0  # of the timer since the last of them
+        self._gate = StartGate(self.config.sample_time)
         self._warned_at = -1  # stamp of the start that the last warning was about
-        self._heard = False  # whether the tracking errors had subscribers at the last count
+        # whether the tracking errors had subscribers at the last count
+        self._heard = False
         self._observed = self._started = False
         self._logged = Phase.INACTIVE, 0, False  # phase, stops, silenced
         self._ends_at = 0.0  # s, at the latest, since a signal
-        self._last_seen = 0, 0.0  # joint states processed by then, and when the last was
+        # joint states processed by then, and when the last was
+        self._last_seen = 0, 0.0
         self._status = ControllerStatus(self, joints)
-        parameters.on_change(self, ControllerConfig, self._retune, self._problems)
+        self._watchdog = WatchdogPresence(expected=self.config.safety.expect_watchdog)
+        parameters.on_change(self, type(self.config), self._retune, self._problems)
         self.start()
 
     # Life cycle.
 
     def configure(self) -> None:
         """Compile the law; create the topics of the loop on the first call."""
-        self.guard = Guard(self.config, self._steady, self._wall)
+        self._loop = GuardedLoop(self.config, self._steady, self._wall)
+        self.guard = self._loop.guard
         self.guard.journal.pending[-1].content['topics'] = {
             topic.leaf: self.resolve_topic_name(topic.relative)
             for topic in (topics.JOINT_STATES, topics.COMMANDS)
@@ -89,7 +89,12 @@ class ControllerNode(LoopNode[ControllerConfig]):
             self.get_logger().warning(warning)
         outputs = [topics.COMMANDS]
         if self.config.telemetry.enabled:
-            outputs += [topics.REFERENCE, topics.TRACKING_ERROR, topics.BOUND, topics.MONITOR]
+            outputs += [
+                topics.REFERENCE,
+                topics.TRACKING_ERROR,
+                topics.BOUND,
+                topics.MONITOR,
+            ]
         if self.connect(outputs, topics.JOINT_STATES, self._on_joint_state):
             self._status.trajectories = TrajectoryInput(
                 self, len(self.config.joints), lambda: self.guard
@@ -98,10 +103,12 @@ class ControllerNode(LoopNode[ControllerConfig]):
 
     def activate(self) -> None:
         """Take command with the next joint state."""
-        self._arrivals = []
+        self._gate.restart()
         if self.guard is not None:
             self.guard.activate()
-        self.get_logger().info(f'ready for joint states of {", ".join(self.config.joints)}')
+        self.get_logger().info(
+            f'ready for joint states of {", ".join(self.config.joints)}'
+        )
         self._report()
 
     def deactivate(self) -> None:
@@ -115,6 +122,7 @@ class ControllerNode(LoopNode[ControllerConfig]):
         """Command the torque to leave behind and release the law."""
         self._leave()
         self.guard = None
+        self._loop = None
         self._report()
 
     def close(self) -> None:
@@ -127,14 +135,17 @@ class ControllerNode(LoopNode[ControllerConfig]):
         guard = self.guard
         if guard is None or not guard.commanding or self.config.safety.torque == 'zero':
             return True
-        now, messages = self._steady() * 1e-9, guard.journal.messages
+        now = self._steady() * 1e-9
+        messages = guard.journal.messages
         if not self._ends_at:
             self._ends_at = now + _LONGEST_END
             if guard.supervisor.running:
                 self.deactivate()
         if messages > self._last_seen[0]:
             self._last_seen = messages, now
-        return guard.is_settled or now > min(self._last_seen[1] + _SILENT, self._ends_at)
+        return guard.is_settled or now > min(
+            self._last_seen[1] + _SILENT, self._ends_at
+        )
 
     def _leave(self) -> None:
         """Command the torque that drivers may hold from now on, and release the guard."""
@@ -146,7 +157,7 @@ class ControllerNode(LoopNode[ControllerConfig]):
         """Restart with the next joint state and the initial estimates."""
         if self.guard is not None:
             if self.guard.start_error is not None:
-                self._arrivals = []
+                self._gate.restart()
             self.guard.reset()
         self.failure = None
         self._report()
@@ -163,7 +174,7 @@ class ControllerNode(LoopNode[ControllerConfig]):
             if not self._observed:
                 self._pending = raw
                 return
-        if self._arrivals is not None and self._measures_rate(guard, raw):
+        if self._gate.state is GateState.MEASURING and self._holds_back(guard, raw):
             return
         trajectories = self._status.trajectories
         if trajectories is not None and trajectories.job is not None:
@@ -176,9 +187,8 @@ class ControllerNode(LoopNode[ControllerConfig]):
         self._command(torque)
         guard.weigh()
         if guard.has_sample:
-            self._publish_telemetry(guard)
-        elif torque is not None and self._heard:
-            self._publish(self._telemetry.answer(guard.journal.stamp, torque))
+            self._look_at_learning(guard)
+        self._publish_telemetry(torque)
         if guard.waiting_for:
             self.get_logger().warning(
                 f'not started, waiting for a usable joint state: {guard.waiting_for}',
@@ -186,36 +196,38 @@ class ControllerNode(LoopNode[ControllerConfig]):
             )
         self._report_if_changed(guard)
 
-    def _measures_rate(self, guard: Guard, raw: bytes) -> bool:
-        """Measure the rate of live states before the start; return whether to wait for more.
-
-        At another rate than that of `sample_time` the gains are wrong, up to instability. A live
-        arm whose support is not known is refused, too.
-        """
+    def _holds_back(self, guard: Guard, raw: bytes) -> bool:
+        """Whether a state before the start is only for the gate; a live arm must be supported."""
         try:
             stamp = self._decoder.decode(raw)
         except MessageError:
             return False
-        if guard.supervisor.phase is not Phase.STARTING or self._arrivals is None:
+        if guard.supervisor.phase is not Phase.STARTING:
             return False
-        if abs(self._wall() - stamp) * 1e-9 >= SAME_CLOCK:  # a plant in lock-step waits
-            self._arrivals = None
+        is_live = abs(self._wall() - stamp) * _NANO < SAME_CLOCK
+        if not is_live and self._is_simulated():  # a plant in lock-step waits
             return False
-        if self._arrivals and stamp <= self._arrivals[-1]:
+        guard.observe(stamp, self._decoder.values)
+        state = self._gate.take(stamp)
+        self._pending = raw
+        if state is GateState.MEASURING:
             return True
-        self._arrivals.append(stamp)
-        self._pending, self._checks = raw, 0
-        if len(self._arrivals) <= _MEASURED:
-            return True
-        often, period = 1e-9 * np.quantile(np.diff(self._arrivals), _TYPICAL)
-        self._arrivals, self._pending = None, None
-        T = self.config.sample_time
-        if period <= T / _ALIKE or often >= T * _ALIKE:
-            guard.refuse(StartError(rate_mismatch(period, T)))
-        else:
+        self._pending = None
+        if state is GateState.REFUSED:
+            guard.refuse(StartError(self._gate.problem))
+        return self._lacks_support(guard)
+
+    def _lacks_support(self, guard: Guard) -> bool:
+        """Whether the start is refused, by the gate or since nothing shows what holds the arm."""
+        if guard.start_error is None:
             guard.check_support(self._decoder.values)
         self._report_if_changed(guard)
         return guard.start_error is not None
+
+    def _is_simulated(self) -> bool:
+        """Whether all joint states are of this package's simulated arm."""
+        found = self.get_publishers_info_by_topic(topics.JOINT_STATES.relative)
+        return all(each.node_name == topics.PLANT for each in found)
 
     def survive(self, error: Exception) -> bool:
         """Make a safe stop after an unexpected error, instead of leaving the arm without torque."""
@@ -233,31 +245,31 @@ class ControllerNode(LoopNode[ControllerConfig]):
             foreign = guard.foreign
             torque = guard.reject(error)
             if guard.foreign != foreign:
-                self.get_logger().warning(f'ignored: {error}', throttle_duration_sec=10.0)
+                self.get_logger().warning(
+                    f'ignored: {error}', throttle_duration_sec=10.0
+                )
             return torque
         return guard.update(stamp, self._decoder.values)
 
-    def _publish_telemetry(self, guard: Guard) -> None:
-        controller, stamp = guard.controller, guard.last_stamp
-        sample, samples = controller.sample, controller.samples
+    def _look_at_learning(self, guard: Guard) -> None:
+        """Look, now and then, at what rarely changes: who subscribes, what is learned, the rate."""
+        samples = guard.controller.samples
         if (samples - 1) % _RARELY == 0:
             errors = self._outputs.get(topics.TRACKING_ERROR)
             self._heard = errors is not None and errors.get_subscription_count() > 0
             self._report_learning(guard)
             if samples == _RATE_SAMPLES:
                 self._warn_of_rate(guard)
-        if not self.config.telemetry.enabled:
-            return
-        if samples == 1:
-            self._telemetry.restart()
-        limit, ratio = controller.settings.torque_limit, guard.samples.ratio
-        for message in self._telemetry.sample(
-            stamp, sample, limit, ratio, guard.compute_time, heard=self._heard
-        ):
-            self._publish(message)
+
+    def _publish_telemetry(self, torque: np.ndarray | None) -> None:
+        """Publish the messages about the last state, which this torque (n,) [N m] answered."""
+        if self._loop is not None and self.config.telemetry.enabled:
+            for message in self._loop.messages(torque, errors_wanted=self._heard):
+                self._publish(message)
 
     def _warn_of_rate(self, guard: Guard) -> None:
-        period, expected = guard.time / (_RATE_SAMPLES - 1), self.config.sample_time
+        period = guard.time / (_RATE_SAMPLES - 1)
+        expected = self.config.sample_time
         if period < _FAST * expected:
             self.get_logger().warning(rate_mismatch(period, expected))
 
@@ -275,7 +287,8 @@ class ControllerNode(LoopNode[ControllerConfig]):
             )
         if columns != self._columns:
             self._columns = columns
-            self._status.rejected = rejected_columns(guard.controller, self._estimates)
+            names = self._loop.estimates if self._loop is not None else ()
+            self._status.rejected = rejected_columns(guard.controller, names)
             for reason in self._status.rejected.values():
                 self.get_logger().warning(reason)
             has_changed |= bool(self._status.rejected)
@@ -290,14 +303,22 @@ class ControllerNode(LoopNode[ControllerConfig]):
         """Check for missing states; a timer reset by its own callback would multiply under load."""
         guard = self.guard
         if guard is not None:
-            self._checks += 1
-            measures = self._arrivals and self._checks < _PATIENCE
-            if self._pending is not None and not measures and self._is_observed():
-                raw, self._pending = self._pending, None
-                self._arrivals = None if self._arrivals else self._arrivals
-                self._on_joint_state(raw)
+            self._start_from_pending(guard)
             self._command(guard.watch())
             self._report_if_changed(guard)
+
+    def _start_from_pending(self, guard: Guard) -> None:
+        """Use a state that was held back, once it is observed or its sender turns out to wait."""
+        waits = self._gate.poll()
+        if self._pending is None or not self._is_observed():
+            return
+        if self._gate.state is GateState.MEASURING and self._gate.count:
+            return
+        raw = self._pending
+        self._pending = None
+        if waits and not self._is_simulated() and self._lacks_support(guard):
+            return
+        self._on_joint_state(raw)
 
     # Changes of the configuration, and reports.
 
@@ -312,29 +333,52 @@ class ControllerNode(LoopNode[ControllerConfig]):
         self.config, guard = config, self.guard
         if guard is not None:
             guard.retune(config)
-            if guard.last_stamp >= 0 and config.telemetry.enabled:
+            if (
+                self._loop is not None
+                and guard.last_stamp >= 0
+                and config.telemetry.enabled
+            ):
                 bound = guard.controller.bound_at(guard.time)
                 limit = guard.controller.settings.torque_limit
-                self._publish(self._telemetry.bound(guard.journal.stamp, bound, limit))
+                telemetry = self._loop.telemetry
+                self._publish(telemetry.bound(guard.journal.stamp, bound, limit))
 
     def _report_if_changed(self, guard: Guard) -> None:
         if not self._status.has_news(guard):
+            self._status.publish_events(guard)
             return
         supervisor = guard.supervisor
         self._log_phase(guard)
         self._started = self._started or supervisor.running
-        if guard.start_error is not None and self.config.autostart and not self._started:
-            self.failure, self.finished = guard.start_error, True
+        if (
+            guard.start_error is not None
+            and self.config.autostart
+            and not self._started
+        ):
+            self.failure = guard.start_error
+            self.finished = True
         self._report()
 
     def _on_second(self) -> None:
+        self._look_for_watchdog()
         super()._on_second()
         guard = self.guard
-        if guard is not None and guard.watchdog.why_off and guard.start_stamp != self._warned_at:
+        if (
+            guard is not None
+            and guard.watchdog.why_off
+            and guard.start_stamp != self._warned_at
+        ):
             self._warned_at = guard.start_stamp
-            found = self.get_publishers_info_by_topic(topics.JOINT_STATES.relative)
-            if any(each.node_name != topics.PLANT for each in found):  # which waits in lock-step
+            if not self._is_simulated():  # which waits in lock-step
                 self.get_logger().warning(guard.watchdog.why_off)
+
+    def _look_for_watchdog(self) -> None:
+        commands = self._outputs.get(topics.COMMANDS)
+        if commands is None or process.interrupted():
+            return
+        there = self._subscribers(commands, topics.WATCHDOG_NODE) > 0
+        if self._watchdog.look(there=there):
+            self.get_logger().error(self._watchdog.problem)
 
     def _log_phase(self, guard: Guard) -> None:
         supervisor = guard.supervisor
@@ -346,7 +390,9 @@ class ControllerNode(LoopNode[ControllerConfig]):
             self.get_logger().warning(supervisor.text)
         elif supervisor.phase is Phase.SAFE_STOP:
             stop = f'{self.config.safety.torque} torque: {supervisor.text}'
-            self.get_logger().fatal(f'{stop}; {self.get_fully_qualified_name()}/reset starts again')
+            self.get_logger().fatal(
+                f'{stop}; {self.get_fully_qualified_name()}/reset starts again'
+            )
         elif supervisor.phase is Phase.APPROACHING:
             left = guard.settled - guard.time
             self.get_logger().info(f'approaching the reference, for {left:.3g} s')
@@ -354,7 +400,9 @@ class ControllerNode(LoopNode[ControllerConfig]):
             self.get_logger().info('tracking the reference')
 
     def _report(self) -> None:
-        self._status.report(self.state_label, self.guard, self.others)
+        self._status.report(
+            self.state_label, self.guard, self.others, self._watchdog.problem
+        )
 
 
 main = partial(process.run, ControllerNode)

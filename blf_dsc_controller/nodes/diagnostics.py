@@ -16,11 +16,12 @@ from rclpy.node import Node
 
 from blf_dsc_controller.law.telemetry import load_text
 from blf_dsc_controller.messages import topics
+from blf_dsc_controller.messages.journal import EventType
 from blf_dsc_controller.messages.topics import LOAD, PHASE, REASON, REJECTED, STOPS
 from blf_dsc_controller.nodes.endpoints import create_publisher
 from blf_dsc_controller.nodes.trajectory_input import TrajectoryInput
-from blf_dsc_controller.supervision.checks import Phase, Supervisor
 from blf_dsc_controller.supervision.guard import Guard
+from blf_dsc_controller.supervision.supervisor import Phase, Supervisor
 
 OK = DiagnosticStatus.OK
 WARN = DiagnosticStatus.WARN
@@ -46,9 +47,13 @@ class DiagnosticsPublisher:
         array = DiagnosticArray()
         array.header.stamp = self._node.get_clock().now().to_msg()
         for part, level, message, values in parts:
-            status = DiagnosticStatus(level=level, message=message, hardware_id=self._hardware)
+            status = DiagnosticStatus(
+                level=level, message=message, hardware_id=self._hardware
+            )
             status.name = f'{self._name}/{part}'
-            status.values = [KeyValue(key=key, value=f'{value}') for key, value in values.items()]
+            status.values = [
+                KeyValue(key=key, value=f'{value}') for key, value in values.items()
+            ]
             array.status.append(status)
         self._diagnostics.publish(array)
         return array.status[0]
@@ -78,6 +83,7 @@ class ControllerStatus:
     def __init__(self, node: Node, joints: Sequence[str]) -> None:
         """Create the publishers of a node that controls `joints`."""
         self.journal = create_publisher(node, topics.JOURNAL)
+        self._targets = create_publisher(node, topics.TARGETS)
         self.rejected: Mapping[str, str] = {}
         self.trajectories: TrajectoryInput | None = None
         self._diagnostics = DiagnosticsPublisher(node, joints)
@@ -87,22 +93,27 @@ class ControllerStatus:
         self._has_warned = False
 
     def has_news(self, guard: Guard) -> bool:
-        """Whether there are events or a state to publish."""
-        return bool(guard.journal.pending) or guard.supervisor.revision != self._published[1]
+        """Whether there are events or a state to publish, besides targets of a stream."""
+        if guard.supervisor.revision != self._published[1]:
+            return True
+        return any(each.type is not EventType.TARGET for each in guard.journal.pending)
 
-    def report(self, lifecycle: str, guard: Guard | None, others: int) -> None:
+    def report(
+        self, lifecycle: str, guard: Guard | None, others: int, missing: str
+    ) -> None:
         """Publish diagnostics, new events and, if it has changed, the state.
 
         Args:
             lifecycle: state of the node.
             guard: None while the node is not configured.
             others: other publishers of torques.
+            missing: what is wrong with the node torque_watchdog; empty if nothing is.
         """
         if guard is not None:
             self.publish_events(guard)
         parts = [self._state(lifecycle, guard)]
         if guard is not None:
-            parts += [self._loop(guard, others), self._learning(guard)]
+            parts += [self._loop(guard, others, missing), self._learning(guard)]
             if guard.controller.settings.weighed:
                 parts.append(_load(guard))
         state = self._diagnostics.publish(*parts)
@@ -114,7 +125,10 @@ class ControllerStatus:
     def publish_events(self, guard: Guard) -> None:
         """Publish the new events."""
         while guard.journal.pending:
-            self.journal.publish(guard.journal.pending.popleft().encode())
+            event = guard.journal.pending.popleft()
+            is_target = event.type is EventType.TARGET
+            publisher = self._targets if is_target else self.journal
+            publisher.publish(event.encode())
 
     def _state(self, lifecycle: str, guard: Guard | None) -> Part:
         supervisor = guard.supervisor if guard else Supervisor()
@@ -130,8 +144,10 @@ class ControllerStatus:
             message += f': {supervisor.text}'
         return 'state', level, message, values
 
-    def _loop(self, guard: Guard, others: int) -> Part:
-        states, samples, state = guard.states, guard.samples, guard.controller.state
+    def _loop(self, guard: Guard, others: int, missing: str) -> Part:
+        states = guard.states
+        samples = guard.samples
+        state = guard.controller.state
         off = f'off: {guard.watchdog.why_off}'.removesuffix(': ')
         values = {
             'samples': guard.controller.samples,
@@ -146,9 +162,13 @@ class ControllerStatus:
             'samples cut by the torque rate limit': _by_joint(guard, state.rate_cuts),
             **(self.trajectories.values if self.trajectories else {}),
         }
-        level, message = WARN, 'torque{} at its limit: adaptation by the tracking error is frozen'
+        level = WARN
+        message = 'torque{} at its limit: adaptation by the tracking error is frozen'
         if others:
-            level, message = ERROR, 'another node commands torques, too'
+            level = ERROR
+            message = 'another node commands torques, too'
+        elif missing:
+            message = missing
         elif samples.outside:
             message = 'the error has left its bound'
         elif samples.saturated_time > 0.0:
@@ -161,7 +181,8 @@ class ControllerStatus:
                 self._has_warned = True
                 self._logger.warning(chatter)
         else:
-            level, message = OK, _PHASES[guard.supervisor.phase][1]
+            level = OK
+            message = _PHASES[guard.supervisor.phase][1]
         return 'loop', level, message, values
 
     def _learning(self, guard: Guard) -> Part:
@@ -169,9 +190,16 @@ class ControllerStatus:
         learning = 'latched' if state.latched[0] else 'not yet excited'
         values = {'lambda_min': f'{state.lambda_min[0]:.3g}', 'learning': learning}
         values['model changes'] = f'{state.changes[0]:.0f}'
-        values |= {f'{REJECTED}{column}': reason for column, reason in self.rejected.items()}
+        values |= {
+            f'{REJECTED}{column}': reason for column, reason in self.rejected.items()
+        }
         if self.rejected:
-            return 'learning', WARN, f'not estimated: {", ".join(self.rejected)}', values
+            return (
+                'learning',
+                WARN,
+                f'not estimated: {", ".join(self.rejected)}',
+                values,
+            )
         return 'learning', OK, learning, values
 
 
@@ -183,7 +211,9 @@ def _load(guard: Guard) -> Part:
 
 def _by_joint(guard: Guard, counts: np.ndarray) -> str:
     pairs = zip(guard.config.joints, counts, strict=True)
-    return ', '.join(f'{joint} {count:.0f}' for joint, count in pairs if count) or 'none'
+    return (
+        ', '.join(f'{joint} {count:.0f}' for joint, count in pairs if count) or 'none'
+    )
 
 
 def chatter_of(guard: Guard) -> str:

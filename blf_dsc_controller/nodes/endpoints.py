@@ -69,7 +69,9 @@ def register_definition(type_name: str) -> None:
     if match is None:
         raise UnknownTypeError(type_name)
     try:
-        text = (_share(match[1]) / 'msg' / f'{match[2]}.msg').read_text(encoding='utf-8')
+        text = (_share(match[1]) / 'msg' / f'{match[2]}.msg').read_text(
+            encoding='utf-8'
+        )
     except OSError:
         raise UnknownTypeError(type_name) from None
     found = get_types_from_msg(text, type_name)
@@ -94,7 +96,9 @@ def qos_profile(quality: Quality) -> QoSProfile:
         durability=DurabilityPolicy[quality.durability.upper()],
         deadline=Duration(nanoseconds=quality.deadline),
         liveliness=LivelinessPolicy[quality.liveliness.upper()],
-        liveliness_lease_duration=Duration(nanoseconds=quality.liveliness_lease_duration),
+        liveliness_lease_duration=Duration(
+            nanoseconds=quality.liveliness_lease_duration
+        ),
     )
 
 
@@ -112,7 +116,9 @@ def create_publisher(node: Node, topic: Topic) -> Publisher:
     )
 
 
-def create_subscription(node: Node, topic: Topic, callback: Callable[[bytes], None]) -> None:
+def create_subscription(
+    node: Node, topic: Topic, callback: Callable[[bytes], None]
+) -> None:
     """Subscribe to a topic of another node; the callback receives serialised messages."""
     node.create_subscription(
         message_class(topic.type),
@@ -124,9 +130,13 @@ def create_subscription(node: Node, topic: Topic, callback: Callable[[bytes], No
     )
 
 
-def create_steady_timer(node: Node, period: float, callback: Callable[[], None]) -> Timer:
+def create_steady_timer(
+    node: Node, period: float, callback: Callable[[], None]
+) -> Timer:
     """Create a timer [s] on the steady clock, which also runs while simulated time is paused."""
-    return node.create_timer(period, callback, clock=Clock(clock_type=ClockType.STEADY_TIME))
+    return node.create_timer(
+        period, callback, clock=Clock(clock_type=ClockType.STEADY_TIME)
+    )
 
 
 _BATCH = 1000  # messages taken from one topic before the next one's turn
@@ -161,14 +171,19 @@ class RawSubscriptions:
 
     def follow(self, topic: Topic, quality: Quality) -> None:
         """Subscribe to a topic of the owner's namespace, which is the handle of its messages."""
-        self.subscribe(self._owner.resolve_topic_name(topic.relative), topic.type, quality, topic)
+        self.subscribe(
+            self._owner.resolve_topic_name(topic.relative), topic.type, quality, topic
+        )
 
-    def subscribe(self, topic: str, type_name: str, quality: Quality, handle: Any) -> None:
+    def subscribe(
+        self, topic: str, type_name: str, quality: Quality, handle: Any
+    ) -> None:
         """Subscribe to a topic; its messages carry `handle`. Raises what `message_class` raises."""
         subscription = self.node.create_subscription(
             message_class(type_name),
             topic,
-            lambda _: None,  # rclpy requires a callback; the messages are taken, not delivered
+            # rclpy requires a callback; the messages are taken, not delivered
+            lambda _: None,
             qos_profile(quality),
             raw=True,
         )
@@ -178,12 +193,14 @@ class RawSubscriptions:
         """Take the waiting messages, in the order in which they were received."""
         messages: list[RawMessage] = []
         for handle, subscription in self._subscriptions:
-            take, type_ = subscription.handle.take_message, subscription.msg_type
+            take = subscription.handle.take_message
+            type_ = subscription.msg_type
             for _ in range(_BATCH):
                 taken = take(type_, True)  # noqa: FBT003 - serialised; positional in rclpy
                 if taken is None:
                     break
-                raw, info = taken  # times and number are None if the middleware knows none
+                # times and number are None if the middleware knows none
+                raw, info = taken
                 received = info['received_timestamp'] or time.time_ns()
                 published = info['source_timestamp'] or received
                 sequence = info['publication_sequence_number'] or 0

@@ -18,6 +18,7 @@ from std_srvs.srv import Trigger
 from blf_dsc_controller.compiled.jit import announced_compilation
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.plant import PlantConfig
+from blf_dsc_controller.control.realtime import request_realtime
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.law.telemetry import Message
 from blf_dsc_controller.messages.topics import WATCHDOG_NODE, Topic
@@ -27,7 +28,7 @@ from blf_dsc_controller.nodes.endpoints import (
     create_steady_timer,
     create_subscription,
 )
-from blf_dsc_controller.supervision.checks import PERIOD
+from blf_dsc_controller.supervision.state_watchdog import PERIOD
 
 Config = TypeVar('Config', ControllerConfig, PlantConfig)
 
@@ -104,7 +105,9 @@ class LoopNode(LifecycleNode, process.PlainNode, Generic[Config]):
                 error = self._transition_error
                 if isinstance(error, BlfDscError):
                     raise error
-                raise BlfDscError(f'{self.get_name()} could not {name}: {error!r}') from error
+                raise BlfDscError(
+                    f'{self.get_name()} could not {name}: {error!r}'
+                ) from error
 
     def on_configure(self, _state: LifecycleState) -> TransitionCallbackReturn:  # noqa: D102
         with announced_compilation(self.get_logger().info):
@@ -151,7 +154,9 @@ class LoopNode(LifecycleNode, process.PlainNode, Generic[Config]):
             return change_state(request, response)
         except RCLError:
             wanted = request.transition.label or request.transition.id
-            self.get_logger().warning(f'no transition {wanted} from {self.state_label}: rejected')
+            self.get_logger().warning(
+                f'no transition {wanted} from {self.state_label}: rejected'
+            )
             response.success = False
             return response
 
@@ -171,9 +176,11 @@ class LoopNode(LifecycleNode, process.PlainNode, Generic[Config]):
             return False
         self._outputs = {topic: create_publisher(self, topic) for topic in outputs}
         # This takes half the time of `publish`, while the node exists.
-        self._senders = {topic: self._outputs[topic].handle.publish_raw for topic in outputs}
+        self._senders = {
+            topic: self._outputs[topic].handle.publish_raw for topic in outputs
+        }
         create_subscription(self, source, callback)
-        process.request_realtime(self.config.realtime, self.get_logger())
+        request_realtime(self.config.realtime, self.get_logger().warning)
         return True
 
     @abstractmethod
@@ -201,7 +208,9 @@ class LoopNode(LifecycleNode, process.PlainNode, Generic[Config]):
                 )
         self._report()
 
-    def _on_reset(self, _request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+    def _on_reset(
+        self, _request: Trigger.Request, response: Trigger.Response
+    ) -> Trigger.Response:
         response.success = self.state_label == 'active'
         inactive = f'{self.get_name()} is {self.state_label}: activate it first'
         response.message = self.reset() if response.success else inactive
@@ -213,7 +222,8 @@ class LoopNode(LifecycleNode, process.PlainNode, Generic[Config]):
 
     def _is_observed(self) -> bool:
         """Whether each output has its recorders, and the first one also the other node."""
-        wanted, publishers = self.config.wait_for_subscribers, [*self._outputs.values()]
+        wanted = self.config.wait_for_subscribers
+        publishers = [*self._outputs.values()]
         others = publishers[0].get_subscription_count()
         others -= self._subscribers(publishers[0], WATCHDOG_NODE)
         recorders = (self._subscribers(each, _RECORDER) for each in publishers)

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable
-from typing import Any, TypeVar
+from typing import Any, Generic, TypeVar
 
 from rcl_interfaces.msg import ParameterDescriptor, SetParametersResult
 from rclpy.node import Node
@@ -39,18 +39,24 @@ def declare(node: Node, cls: type[Config]) -> Config:
     """
     given = _overrides(node, cls)
     if str(given.get('robot.urdf', '')).startswith(TOPIC):
-        given['robot.urdf'] = wait_for_description(node, given['robot.urdf'].removeprefix(TOPIC))
+        given['robot.urdf'] = wait_for_description(
+            node, given['robot.urdf'].removeprefix(TOPIC)
+        )
     config = build(cls, given, node.get_fully_qualified_name())
     values = flatten(config)
     initial = []
-    for parameter in parameters(cls):
+    declared = parameters(type(config))  # with those of a law of a file
+    for parameter in declared:
         # By its type, since rclpy would take an empty list for one of bytes.
-        name, kind = parameter.name, RosParameter.Type[parameter.ros_type]
+        name = parameter.name
+        kind = RosParameter.Type[parameter.ros_type]
         node.declare_parameter(name, kind, descriptor(parameter), ignore_override=True)
         value = values[name]
-        initial.append(RosParameter(name, kind, list(value) if isinstance(value, tuple) else value))
+        initial.append(
+            RosParameter(name, kind, list(value) if isinstance(value, tuple) else value)
+        )
     node.set_parameters_atomically(initial)
-    fixed = {parameter.name: parameter for parameter in parameters(cls) if parameter.read_only}
+    fixed = {parameter.name: parameter for parameter in declared if parameter.read_only}
 
     def refuse_fixed(requested: list[RosParameter]) -> SetParametersResult:
         names = [each.name for each in requested if each.name in fixed]
@@ -82,24 +88,37 @@ def on_change(
     accept it now. `apply` receives the new configuration once it is in effect, and must not fail.
     """
     names = {parameter.name for parameter in parameters(cls)}
+    changes = _Changes(read(node, cls))
 
     def validate(requested: list[RosParameter]) -> SetParametersResult:
         values = {each.name: each.value for each in requested if each.name in names}
         if not values:
             return SetParametersResult(successful=True)
         try:
-            candidate = change(read(node, cls), values)
+            candidate = change(changes.config, values)
         except ConfigurationError as error:
-            return SetParametersResult(successful=False, reason='\n'.join(error.problems))
+            return SetParametersResult(
+                successful=False, reason='\n'.join(error.problems)
+            )
         found = problems(candidate) if problems else []
+        changes.candidate = candidate
         return SetParametersResult(successful=not found, reason='\n'.join(found))
 
     def apply_changes(changed: list[RosParameter]) -> None:
         if any(each.name in names for each in changed):
-            apply(read(node, cls))
+            changes.config = changes.candidate
+            apply(changes.config)
 
     node.add_on_set_parameters_callback(validate)
     node.add_post_set_parameters_callback(apply_changes)
+
+
+class _Changes(Generic[Config]):
+    """The configuration in force, and the one that was checked last."""
+
+    def __init__(self, config: Config) -> None:
+        self.config = config
+        self.candidate = config
 
 
 def descriptor(parameter: Parameter) -> ParameterDescriptor:
@@ -128,7 +147,8 @@ def _overrides(node: Node, cls: type[Config]) -> dict[str, Any]:
     """
     own = {parameter.name: parameter for parameter in parameters(cls)}
     others = known_names() - own.keys()
-    check_sections(sys.argv, node.get_fully_qualified_name())
+    for remark in check_sections(sys.argv, node.get_fully_qualified_name()):
+        node.get_logger().warning(remark)
     overrides = node._parameter_overrides  # noqa: SLF001 - those in start files and arguments
     given = {name: parameter.value for name, parameter in overrides.items()}
     given |= assigned(sys.argv)
@@ -147,16 +167,23 @@ def wait_for_description(node: Node, name: str) -> str:
 
     Raises ConfigurationError if none is received within a minute.
     """
-    topic, quality = node.resolve_topic_name(name), qos_profile(ROBOT_DESCRIPTION.offered)
+    topic = node.resolve_topic_name(name)
+    quality = qos_profile(ROBOT_DESCRIPTION.offered)
     for _ in range(TIMEOUT):
-        found, message = wait_for_message(String, node, topic, qos_profile=quality, time_to_wait=1)
+        found, message = wait_for_message(
+            String, node, topic, qos_profile=quality, time_to_wait=1
+        )
         if process.interrupted():
             raise SystemExit(0)
         if found:
             if message.data.strip():
                 return str(message.data)
-            raise ConfigurationError([f'robot.urdf: the one on {topic} is empty: did xacro fail?'])
-        node.get_logger().info(f'waiting for the URDF on {topic}', throttle_duration_sec=5.0)
+            raise ConfigurationError(
+                [f'robot.urdf: the one on {topic} is empty: did xacro fail?']
+            )
+        node.get_logger().info(
+            f'waiting for the URDF on {topic}', throttle_duration_sec=5.0
+        )
     count = node.count_publishers(topic)
     problem = f'no URDF within {TIMEOUT} s on {topic}, which has {count} publishers'
     remedy = 'start robot_state_publisher, whose topic is latched, correct the name, or give a file'

@@ -33,7 +33,13 @@ from blf_dsc_controller.messages import topics
 from blf_dsc_controller.messages.codecs import Float64MultiArrayDecoder, MessageError
 from blf_dsc_controller.messages.journal import encode_change
 from blf_dsc_controller.nodes import parameters, process
-from blf_dsc_controller.nodes.diagnostics import ERROR, OK, STALE, WARN, DiagnosticsPublisher
+from blf_dsc_controller.nodes.diagnostics import (
+    ERROR,
+    OK,
+    STALE,
+    WARN,
+    DiagnosticsPublisher,
+)
 from blf_dsc_controller.nodes.endpoints import create_publisher, create_steady_timer
 from blf_dsc_controller.nodes.lifecycle import LoopNode
 from sim_plant.plant import (
@@ -52,10 +58,13 @@ LOCKSTEP_START = 1_000_000_000
 
 _STALE = {'zero': ': not applied', 'hold': ', and still applied'}
 _REPEAT_PERIOD = 3.0  # s, until a state without a torque is sent again
-_IN_FLIGHT = 1000  # samples in lock-step on their way to a subscriber: a fifth of its queue
+# samples in lock-step on their way to a subscriber: a fifth of its queue
+_IN_FLIGHT = 1000
 _EARLY = 0.05  # fraction of a sample by which a timer may fire early
-_BETWEEN_RUNS = 1_000_000_000  # ns from the last stamp before a reset to the first after it
-_SETTLING_TIME = 0.2  # s from the discovery of all peers until they have discovered this node
+# ns from the last stamp before a reset to the first after it
+_BETWEEN_RUNS = 1_000_000_000
+# s from the discovery of all peers until they have discovered this node
+_SETTLING_TIME = 0.2
 _RESET_TIMEOUT = 2.0  # s for the controller to respond
 
 
@@ -76,7 +85,9 @@ class PlantNode(LoopNode[PlantConfig]):
         self._steps = steps_of(self.config)
         self._lockstep = self.config.mode == 'lockstep'
         published = self.config.sensor.published_joints
-        self._telemetry = PlantTelemetry(joints, parameter_names_of(self.config), published)
+        self._telemetry = PlantTelemetry(
+            joints, parameter_names_of(self.config), published
+        )
         self._decoder = Float64MultiArrayDecoder(len(joints))
         self.input = TorqueInput(len(joints))
         self._reported_rejected = 0
@@ -171,7 +182,11 @@ class PlantNode(LoopNode[PlantConfig]):
         """
         settled = inf
         while self._now() < settled:
-            settled = min(settled, self._now() + _SETTLING_TIME) if self._is_observed() else inf
+            settled = (
+                min(settled, self._now() + _SETTLING_TIME)
+                if self._is_observed()
+                else inf
+            )
             yield True
         response = self._reset_controller() if reset else None
         if response is None:
@@ -181,7 +196,9 @@ class PlantNode(LoopNode[PlantConfig]):
         if not response.done():
             self.get_logger().warning('the controller did not respond to the reset')
         elif not response.result().success:
-            self.get_logger().warning(f'no reset of the controller: {response.result().message}')
+            self.get_logger().warning(
+                f'no reset of the controller: {response.result().message}'
+            )
 
     def _reset_controller(self) -> Any:
         """Request a reset of the controller; return the future, or None without such a service."""
@@ -207,7 +224,9 @@ class PlantNode(LoopNode[PlantConfig]):
         try:
             size = self._decoder.decode(raw)
         except MessageError as error:
-            self.get_logger().error(f'command rejected: {error}', throttle_duration_sec=1.0)
+            self.get_logger().error(
+                f'command rejected: {error}', throttle_duration_sec=1.0
+            )
             return
         if not self._offered and self.state_label != 'inactive':
             return
@@ -248,14 +267,19 @@ class PlantNode(LoopNode[PlantConfig]):
             self._advance()
             lateness = max(0.0, self._now() - self._began - deadline)
             late_steps = self.latency.late_steps
-            self._publish(self._telemetry.timing(self.stamp, waited, lateness, late_steps))
+            self._publish(
+                self._telemetry.timing(self.stamp, waited, lateness, late_steps)
+            )
 
     def _advance(self) -> None:
         if self._is_over():
             return
-        was_stale, limit = self._stale, self.config.actuator.command_timeout
+        was_stale = self._stale
+        limit = self.config.actuator.command_timeout
         samples = round(limit / self.config.sample_time)
-        self._stale = not self._lockstep and self.input.is_stale(self.plant.sample, samples)
+        self._stale = not self._lockstep and self.input.is_stale(
+            self.plant.sample, samples
+        )
         if self._stale and self.config.actuator.without_command == 'zero':
             self.input.torque[:] = 0.0
         self._step()
@@ -290,7 +314,8 @@ class PlantNode(LoopNode[PlantConfig]):
 
     def _publish_state(self) -> None:
         if self._lockstep and self.plant.sample % _IN_FLIGHT == 0:
-            process.drain(self._outputs.values())  # the loop must not outrun its recorder
+            # the loop must not outrun its recorder
+            process.drain(self._outputs.values())
         stamp = self.stamp
         measurement = self.plant.measure()
         self._has_torque = False
@@ -331,14 +356,17 @@ class PlantNode(LoopNode[PlantConfig]):
         if self.state_label != 'active':
             level, message = STALE, self.state_label
         elif self.others:
-            level, message = ERROR, 'another node publishes joint states, too'
+            level = ERROR
+            message = 'another node publishes joint states, too'
         elif not self._running:
-            level, message = WARN, 'braked: waiting for the first torque'
+            level = WARN
+            message = 'braked: waiting for the first torque'
         elif self._halt:
             level, message = ERROR, self._halt
         elif self._stale:
             after = _STALE[self.config.actuator.without_command]
-            level, message = ERROR, f'the last torque is too old (actuator.command_timeout){after}'
+            level = ERROR
+            message = f'the last torque is too old (actuator.command_timeout){after}'
         elif rejected > self._reported_rejected:
             level, message = WARN, self.input.problem
         self._reported_rejected = rejected

@@ -25,11 +25,17 @@ class PlayerNode(Node):
         for name, type_ in bag.held.items():
             try:
                 profile = qos_profile(HISTORY if name in bag.latched else STREAM)
-                self.outputs[name] = self.create_publisher(message_class(type_), name, profile)
+                self.outputs[name] = self.create_publisher(
+                    message_class(type_), name, profile
+                )
             except (ImportError, AttributeError):
-                self.get_logger().warning(f'{name} is not played: {type_} is not installed here')
+                self.get_logger().warning(
+                    f'{name} is not played: {type_} is not installed here'
+                )
             except NameValidationException:
-                self.get_logger().warning(f'{name} is not played: it is not the name of a topic')
+                self.get_logger().warning(
+                    f'{name} is not played: it is not the name of a topic'
+                )
 
     def play(self) -> None:
         """Publish all messages, each at its time after the first."""

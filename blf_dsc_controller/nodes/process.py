@@ -8,38 +8,34 @@ that match a node, ROS uses the last in the order in which their names first app
 
 from __future__ import annotations
 
-import ctypes
 import gc
-import os
 import signal
 import sys
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import ExitStack, suppress
-from pathlib import Path
+from contextlib import ExitStack
 from typing import Any
 
 import rclpy
 from rclpy._rclpy_pybind11 import RCLError, UnknownROSArgsError
 from rclpy.duration import Duration
 from rclpy.experimental import EventsExecutor
-from rclpy.impl.rcutils_logger import RcutilsLogger
 from rclpy.logging import get_logger
 from rclpy.node import Node
 from rclpy.publisher import Publisher
 from rclpy.utilities import remove_ros_args
 
 from blf_dsc_controller.configuration.files import parse
-from blf_dsc_controller.configuration.nodes import read, unmatched_sections
-from blf_dsc_controller.configuration.robot import Realtime
+from blf_dsc_controller.configuration.nodes import (
+    ignored_sections,
+    read,
+    unmatched_sections,
+)
 from blf_dsc_controller.errors import BlfDscError, ConfigurationError
 
 _POLL = 0.1  # s; EventsExecutor has no usable spin()
-_DRAIN_TIMEOUT = 10.0  # s for all topics; a recorder on a busy machine has been seen 2 s behind
-
-_THREADS = Path('/proc/self/task')
-_MCL_CURRENT = 1
-_MCL_FUTURE = 2
+# s for all topics; a recorder on a busy machine has been seen 2 s behind
+_DRAIN_TIMEOUT = 10.0
 
 
 _signals: list[int] = []  # received; only recorded, so that no callback is interrupted
@@ -87,7 +83,9 @@ def run(*make_nodes: Callable[[], PlainNode]) -> int:
             ending.callback(signal.signal, number, signal.SIG_IGN)
         try:
             refuse_unknown(sys.argv)
-            rclpy.init(args=sys.argv, signal_handler_options=rclpy.SignalHandlerOptions.NO)
+            rclpy.init(
+                args=sys.argv, signal_handler_options=rclpy.SignalHandlerOptions.NO
+            )
             ending.callback(rclpy.try_shutdown)
             with EventsExecutor() as executor:
                 for make in make_nodes:
@@ -131,8 +129,10 @@ def spin_once(executor: Any, *nodes: PlainNode) -> None:
 def _close(node: PlainNode) -> None:
     try:
         node.close()
-    except (BlfDscError, OSError, RCLError) as error:  # such as a full disk, or ROS shut down
-        print(f'{node.get_name()} could not shut down cleanly: {error}', file=sys.stderr)  # noqa: T201
+    # such as a full disk, or ROS shut down
+    except (BlfDscError, OSError, RCLError) as error:
+        problem = f'{node.get_name()} could not shut down cleanly: {error}'
+        print(problem, file=sys.stderr)  # noqa: T201
     finally:
         node.destroy_node()
 
@@ -148,36 +148,6 @@ def drain(publishers: Iterable[Publisher]) -> None:
             )
 
 
-def request_realtime(realtime: Realtime, logger: RcutilsLogger) -> None:
-    """Request SCHED_FIFO and locked memory as configured; a refusal is logged as a warning."""
-    if realtime.priority > 0:
-        try:
-            _schedule(realtime.priority)
-        except OSError as error:
-            logger.warning(
-                f'SCHED_FIFO priority {realtime.priority} refused ({error.strerror}): running with '
-                'the default scheduling; allow it with a limit on rtprio for this user'
-            )
-    if realtime.lock_memory:
-        libc = ctypes.CDLL(None, use_errno=True)
-        if libc.mlockall(_MCL_CURRENT | _MCL_FUTURE) != 0:
-            reason = os.strerror(ctypes.get_errno())
-            logger.warning(
-                f'locking memory refused ({reason}): pages may be swapped out; allow it with a '
-                'limit on memlock for this user'
-            )
-
-
-def _schedule(priority: int) -> None:
-    """Schedule all threads alike: states and torques also pass through the middleware's threads.
-
-    A single thread left behind, even at the next lower priority, delays the others [measured].
-    """
-    for thread in _THREADS.iterdir():
-        with suppress(ProcessLookupError):  # it has ended in the meantime
-            os.sched_setscheduler(int(thread.name), os.SCHED_FIFO, os.sched_param(priority))
-
-
 def refuse_unknown(argv: Sequence[str]) -> None:
     """Raise BlfDscError if there are arguments that ROS does not handle itself."""
     foreign = remove_ros_args(args=list(argv))[1:]
@@ -186,12 +156,21 @@ def refuse_unknown(argv: Sequence[str]) -> None:
         raise BlfDscError(f'unknown arguments {" ".join(foreign)}: {remedy}')
 
 
-def check_sections(argv: Sequence[str], node: str) -> None:
-    """Raise ConfigurationError if a section meant for `node` (a full name) does not match it."""
+def check_sections(argv: Sequence[str], node: str) -> list[str]:
+    """Return remarks on sections of parameter files that no node of this package reads.
+
+    Raises ConfigurationError if a section meant for `node` (a full name) does not match it.
+    """
+    remarks = []
     for path in parameter_files(argv):
-        problems = list(unmatched_sections(read(path), [node]))
+        sections = read(path)
+        problems = list(unmatched_sections(sections, [node]))
         if problems:
             raise ConfigurationError(problems, path)
+        ignored = ignored_sections(sections, [node])
+        if ignored:
+            remarks.append(f'{path}: {ignored}')
+    return remarks
 
 
 def parameter_files(argv: Sequence[str]) -> list[str]:

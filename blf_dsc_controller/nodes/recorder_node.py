@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import sys
+from collections import deque
 from collections.abc import Iterator
 from contextlib import suppress
 from functools import partial
@@ -36,6 +37,27 @@ _FLUSH_INTERVAL = 0.05  # s; below 0.1 s including _TAKE_PERIOD, unless overload
 _REPEAT = 60.0  # s between repeats of a warning
 
 
+class RecentMessages:
+    """Remembers the last messages of a topic, by sender's time, number and content."""
+
+    def __init__(self, depth: int) -> None:
+        """Remember at most this number."""
+        self._order: deque[tuple[int, int, bytes]] = deque()
+        self._known: set[tuple[int, int, bytes]] = set()
+        self._depth = depth
+
+    def add(self, message: RawMessage) -> bool:
+        """Remember a message; return whether it was new."""
+        key = message.published, message.sequence, message.raw
+        if key in self._known:
+            return False
+        self._known.add(key)
+        self._order.append(key)
+        if len(self._order) > self._depth:
+            self._known.remove(self._order.popleft())
+        return True
+
+
 class BagRecorderNode(PlainNode):
     """Subscribes to topics as they appear and records their messages.
 
@@ -49,12 +71,16 @@ class BagRecorderNode(PlainNode):
         self._raw_subscriptions = RawSubscriptions(self)
         self._recorded: set[str] = set()
         self._skipped: set[str] = set()
+        # handles of topics whose publishers are all reliable so far
+        self._reliable: dict[str, int] = {}
+        # by the handle of a topic with two subscriptions
+        self._twice: dict[int, RecentMessages] = {}
         self._joint_states = self.resolve_topic_name(JOINT_STATES.relative)
         self._handle_of_states = 0
         self._waiting: list[RawMessage] = []  # for the first joint state
         self._plant_time = -1  # ns; -1 before the first joint state
         create_steady_timer(self, _DISCOVERY_PERIOD, self._discover)
-        create_steady_timer(self, _TAKE_PERIOD, self._record)
+        create_steady_timer(self, _TAKE_PERIOD, self._record_due)
         # The folder is created last: from here on, any end of the node also completes the bag.
         self._bag = BagWriter(
             self._config.output,
@@ -78,15 +104,34 @@ class BagRecorderNode(PlainNode):
     def _discover(self) -> None:
         try:
             found = self.get_topic_names_and_types()
-        except UnicodeDecodeError:  # caused by one participant, but rclpy then returns no topics
+        # caused by one participant, but rclpy then returns no topics
+        except UnicodeDecodeError:
             self.get_logger().warning(
                 'new topics cannot be found: the name of a topic or type is not UTF-8',
                 throttle_duration_sec=_REPEAT,
             )
             return
         for topic, types in found:
-            if topic not in self._recorded | self._skipped and self._wanted(topic):
+            if topic in self._reliable:
+                self._follow_unreliable(topic, types[0])
+            elif topic not in self._recorded | self._skipped and self._wanted(topic):
                 self._offer_topic(topic, types)
+
+    def _follow_unreliable(self, topic: str, type_name: str) -> None:
+        """Subscribe a second time where a best-effort publisher has joined reliable ones.
+
+        A reliable subscription gets nothing from it, and a best-effort one may lose messages of
+        the others: both are kept, and what arrives twice is recorded once.
+        """
+        publishers = self.get_publishers_info_by_topic(topic)
+        offered = [quality_of(each.qos_profile) for each in publishers]
+        if all(each.reliability == 'reliable' for each in offered):
+            return
+        handle = self._reliable.pop(topic)
+        quality = compatible(offered, self._config.queue_depth)
+        self._raw_subscriptions.subscribe(topic, type_name, quality, handle)
+        self._twice[handle] = RecentMessages(self._config.queue_depth)
+        self.get_logger().info(f'recording the best-effort publishers of {topic}, too')
 
     def _wanted(self, topic: str) -> bool:
         if self._chosen:
@@ -100,7 +145,8 @@ class BagRecorderNode(PlainNode):
         if len(types) > 1:
             self._skip(topic, f'it has several types, {" and ".join(types)}')
             return
-        self._record(flush=True)  # importing a type and first subscribing to it may take 0.1 s
+        # importing a type and first subscribing to it may take 0.1 s
+        self._record(flush=True)
         try:
             message_class(types[0])
             register_definition(types[0])
@@ -115,6 +161,8 @@ class BagRecorderNode(PlainNode):
         self._recorded.add(topic)
         quality = compatible(offered, self._config.queue_depth)
         self._raw_subscriptions.subscribe(topic, types[0], quality, handle)
+        if quality.reliability == 'reliable':
+            self._reliable[topic] = handle
         if topic == self._joint_states:
             self._handle_of_states = handle
         self.get_logger().info(f'recording {topic} ({types[0]})')
@@ -123,20 +171,32 @@ class BagRecorderNode(PlainNode):
         self._skipped.add(topic)
         self.get_logger().warning(f'{topic} is not recorded: {reason}')
 
+    def _record_due(self) -> None:
+        self._record()
+
     def _record(self, *, flush: bool = False) -> None:
         """Write the waiting messages, and flush them to disk: all with `flush`, else those due."""
         if self.failure is not None:
             return
         try:
-            for message in self._timed(self._raw_subscriptions.take()):
+            messages = filter(self._is_first, self._raw_subscriptions.take())
+            for message in self._timed([*messages]):
                 self._bag.write(*message)
-            (self._bag.flush if flush else self._bag.flush_if_due)()
+            if flush:
+                self._bag.flush()
+            else:
+                self._bag.flush_if_due()
         except OSError as error:
             self.finished = True
             self.failure = BagError(
                 f'{self._bag.path} cannot be written any further: {error.strerror}; '
                 f'blf_dsc recover {self._bag.path} saves what was written before'
             )
+
+    def _is_first(self, message: RawMessage) -> bool:
+        """Whether a message has not been taken from another subscription before."""
+        recent = self._twice.get(message.handle)
+        return recent is None or recent.add(message)
 
     def _timed(self, messages: list[RawMessage]) -> list[RawMessage]:
         """Return messages as they are logged: where the plant is the clock, in its time.
@@ -149,10 +209,14 @@ class BagRecorderNode(PlainNode):
         for message in messages:
             if message.handle == self._handle_of_states:
                 with suppress(MessageError):
-                    self._plant_time = max(self._plant_time, joint_state_stamp(message.raw))
+                    self._plant_time = max(
+                        self._plant_time, joint_state_stamp(message.raw)
+                    )
             self._waiting.append(message)
             if self._plant_time >= 0:
-                timed += [each._replace(received=self._plant_time) for each in self._waiting]
+                timed += [
+                    each._replace(received=self._plant_time) for each in self._waiting
+                ]
                 self._waiting = []
         return timed
 

@@ -3,15 +3,18 @@
 
 Effort controllers hold the last torque for ever. When commands stop while joint states go on, this
 node commands the safe torque of the controller's configuration until the controller is back. It
-reads that configuration from the controller's journal, so it needs no parameters of the arm; only
-if it is `armed`, to take over from a controller that has died before, it needs the parameter file.
+reads that configuration, each change of it, and whether a silence is meant from the controller's
+journal, so it needs no parameters of the arm; only if it is `armed`, to take over from a controller
+that has died before, it needs the parameter file.
+
+Its own torques carry a label, by which it tells them from those of the controller under any
+middleware.
 """
 
 from __future__ import annotations
 
 import sys
 import time
-from collections import deque
 from collections.abc import Callable, Iterable
 from functools import partial
 from typing import Any
@@ -29,7 +32,7 @@ from blf_dsc_controller.messages.codecs import (
     JointStateDecoder,
     MessageError,
 )
-from blf_dsc_controller.messages.journal import EventType, decode
+from blf_dsc_controller.messages.journal import Event, EventType, decode
 from blf_dsc_controller.messages.topics import Quality
 from blf_dsc_controller.nodes.diagnostics import ERROR, OK, WARN, DiagnosticsPublisher
 from blf_dsc_controller.nodes.endpoints import (
@@ -41,37 +44,45 @@ from blf_dsc_controller.nodes.endpoints import (
 )
 from blf_dsc_controller.nodes.parameters import declare
 from blf_dsc_controller.nodes.process import PlainNode, drain, parameter_files, run
-from blf_dsc_controller.supervision.safe_torque import SecondLine
+from blf_dsc_controller.supervision.torque_watchdog import TorqueWatchdog
 
 _PERIOD = 0.004  # s, of the checks and of the torques
 _REPORT_PERIOD = 1.0  # s
 _DEPTH = 20  # messages of a topic in a period
+_BACK_IN_COMMAND = (EventType.CONFIGURE, EventType.ACTIVATE, EventType.RESET)
 
 
 class WatchdogNode(PlainNode):
     """Publishes the safe torque on the controller's `~/commands` while the controller cannot.
 
-    `line` decides when, None until the controller's parameters have been read; `steady` is its
-    clock [ns].
+    `steady` is its clock [ns].
+
+    Attributes:
+        watchdog: decides when to command; None until the controller's parameters are known.
+        problem: why the controller's journal cannot be read; empty if it can.
     """
 
-    def __init__(self, *, steady: Callable[[], int] = time.monotonic_ns, **options: Any) -> None:
+    def __init__(
+        self, *, steady: Callable[[], int] = time.monotonic_ns, **options: Any
+    ) -> None:
         super().__init__(topics.WATCHDOG_NODE, **options)
         self._steady = steady
         self._config = declare(self, WatchdogConfig)
-        self.line: SecondLine | None = None
+        self.watchdog: TorqueWatchdog | None = None
+        self.problem = ''
+        self._given: dict[str, Any] = {}  # parameters of the controller
         self._states: JointStateDecoder
         self._commands: Float64MultiArrayDecoder
         self._encoder: Float64MultiArrayEncoder
-        self._sent: deque[tuple[int, bytes]] = deque(maxlen=10 * _DEPTH)
-        self._sequence = 0
         self._raw_subscriptions = RawSubscriptions(self)
         for topic in (topics.JOINT_STATES, topics.COMMANDS):
             self._raw_subscriptions.follow(topic, Quality(_DEPTH, 'best_effort'))
         self._raw_subscriptions.follow(topics.JOURNAL, topics.JOURNAL.requested)
         topic = topics.COMMANDS
         offered = qos_profile(topic.offered)
-        self._output = self.create_publisher(message_class(topic.type), topic.relative, offered)
+        self._output = self.create_publisher(
+            message_class(topic.type), topic.relative, offered
+        )
         self._diagnostics = DiagnosticsPublisher(self, ())
         self._controller = f'{self.get_namespace().rstrip("/")}/{topics.CONTROLLER}'
         self._timer = create_steady_timer(self, _PERIOD, self._poll)
@@ -84,84 +95,151 @@ class WatchdogNode(PlainNode):
 
     def close(self) -> None:
         """Leave the torque that a driver may hold, if this node was the one to command it."""
-        if self.line is not None:
-            self._publish(self.line.leave())
+        if self.watchdog is not None:
+            self._publish(self.watchdog.leave())
             drain([self._output])
         self._raw_subscriptions.close()
 
+    # The journal.
+
     def _read_journal(self, messages: Iterable[RawMessage]) -> None:
-        """Watch the controller once it has told its parameters, with what was changed since."""
-        given: dict[str, Any] = {}
+        """Follow the controller's configuration, and when its silence is meant."""
+        events = []
         for message in messages:
-            event = decode(message.raw)
-            if event.type is EventType.CONFIGURE or given:
-                given |= event.content.get('parameters', {})
-        if given:
-            self._watch(build(ControllerConfig, given, self._controller))
+            try:
+                events.append(decode(message.raw))
+            except BlfDscError as error:  # of another version, or of somebody else
+                self._report_problem(f'{error}')
+        given = dict(self._given)
+        try:
+            for event in events:
+                if event.type is EventType.CONFIGURE:
+                    given = {}
+                if event.type is EventType.CONFIGURE or given:
+                    given |= event.content.get('parameters', {})
+            if given != self._given:
+                self._watch(build(ControllerConfig, given, self._controller))
+                self._given = given
+        except BlfDscError as error:
+            self._report_problem(f'the journal of {self._controller}: {error}')
+        for event in events:
+            self._take_event(event)
+
+    def _take_event(self, event: Event) -> None:
+        watchdog = self.watchdog
+        if watchdog is None:
+            self._report_problem(
+                self.problem
+                or f'the journal of {self._controller} holds events, but no configuration: '
+                'configure or restart the controller'
+            )
+            return
+        if event.type is EventType.CONFIGURE:
+            self.problem = ''
+        if event.type in _BACK_IN_COMMAND:
+            watchdog.stand_by()
+        is_zero = watchdog.config.safety.torque == 'zero'
+        is_end = event.type is EventType.RELEASE
+        is_orderly = is_end and (is_zero or event.content.get('resting', True))
+        if event.type is EventType.WITHDRAW or is_orderly:
+            watchdog.stand_down()
+            self.get_logger().info(f'{self._controller} is silent on purpose')
+
+    def _report_problem(self, problem: str) -> None:
+        if problem != self.problem:
+            self.problem = problem
+            self.get_logger().error(f'{problem}; {self._state_of_problem}')
+            self._report()
+
+    @property
+    def _state_of_problem(self) -> str:
+        if self.watchdog is None:
+            return 'this node cannot watch the controller'
+        return 'this node acts by the parameters from before'
 
     def _watch(self, config: ControllerConfig) -> None:
+        """Watch a controller of this configuration."""
         count = len(config.joints)
-        self._states = JointStateDecoder(config.joints, required=('position',))
-        self._commands = Float64MultiArrayDecoder(count)
-        self._encoder = Float64MultiArrayEncoder(count)
-        self.line = SecondLine(config, self._config.timeout, armed=self._config.armed)
+        if self.watchdog is not None and config.joints == self.watchdog.config.joints:
+            self.watchdog.configure(config)
+        else:
+            self._states = JointStateDecoder(config.joints, required=('position',))
+            self._commands = Float64MultiArrayDecoder(count)
+            self._encoder = Float64MultiArrayEncoder(count, topics.WATCHDOG_NODE)
+            self.watchdog = TorqueWatchdog(
+                config, self._config.timeout, armed=self._config.armed
+            )
         self.get_logger().info(
             f'ready: {config.safety.torque} torque once {self._controller} is silent for '
             f'{self._config.timeout:g} s'
         )
 
-    def _poll(self) -> None:
-        messages, now = self._raw_subscriptions.take(), self._steady() * 1e-9
-        if self.line is None:
-            try:
-                self._read_journal(each for each in messages if each.handle is topics.JOURNAL)
-            except BlfDscError as error:  # it is of another version
-                self.failure, self.finished = error, True
-            return
-        was_active = self.line.active
-        for message in messages:
-            self._take(self.line, message, now)
-        self._publish(self.line.poll(now))
-        if self.line.active != was_active:
-            fast = min(_PERIOD, self.line.config.sample_time)  # at the limit of the torque's rate
-            self._timer.timer_period_ns = round(1e9 * (fast if self.line.active else _PERIOD))
-            self._log(self.line)
-            self._report()
+    # States and torques.
 
-    def _take(self, line: SecondLine, message: RawMessage, now: float) -> None:
-        raw, sequence = message.raw, message.sequence
+    def _poll(self) -> None:
+        messages = self._raw_subscriptions.take()
+        was_active = self.watchdog is not None and self.watchdog.active
+        journal = [each for each in messages if each.handle is topics.JOURNAL]
+        if journal:
+            self._read_journal(journal)
+        watchdog = self.watchdog
+        if watchdog is None:
+            return
+        now = self._steady() * 1e-9
+        for message in messages:
+            self._take(watchdog, message, now)
+        self._publish(watchdog.poll(now))
+        if watchdog.active != was_active:
+            self._change_command(watchdog)
+
+    def _take(self, watchdog: TorqueWatchdog, message: RawMessage, now: float) -> None:
+        raw = message.raw
         try:
             if message.handle is topics.JOINT_STATES:
                 stamp = self._states.decode(raw)
-                line.state(stamp, self._states.values, now)
-            elif message.handle is topics.COMMANDS and (sequence, raw) not in self._sent:
+                watchdog.state(stamp, self._states.values, now)
+            elif message.handle is topics.COMMANDS and not self._encoder.has_layout(
+                raw
+            ):
                 self._commands.decode(raw)
-                line.torque_of_controller(self._commands.values, now)
+                watchdog.torque_of_controller(self._commands.values, now)
         except MessageError as error:
             self.get_logger().warning(f'ignored: {error}', throttle_duration_sec=10.0)
 
-    def _log(self, line: SecondLine) -> None:
-        if line.active:
+    def _change_command(self, watchdog: TorqueWatchdog) -> None:
+        """Report who commands from now on, and poll at the limit of the torque's rate."""
+        period = _PERIOD
+        if watchdog.active:
+            period = min(_PERIOD, watchdog.config.sample_time)
             self.get_logger().fatal(
-                f'no command for {line.silence:.3g} s while joint states go on: '
-                f'{line.config.safety.torque} torque until {self._controller} is back'
+                f'no command for {watchdog.silence:.3g} s while joint states go on: '
+                f'{watchdog.config.safety.torque} torque until {self._controller} is back'
             )
         else:
             self.get_logger().warning('this node no longer commands a torque')
+        self._timer.timer_period_ns = round(1e9 * period)
+        self._report()
 
     def _publish(self, torque: np.ndarray | None) -> None:
         if torque is not None:
-            raw = self._encoder.encode(torque)
-            self._sequence += 1
-            self._sent.append((self._sequence, raw))
-            self._output.publish(raw)
+            self._output.publish(self._encoder.encode(torque))
 
     def _report(self) -> None:
-        level, message, takeovers = WARN, f'waiting for {self._controller}', 0
-        if self.line is not None:
-            level, message, takeovers = OK, 'watching', self.line.takeovers
-            if self.line.active:
-                level, message = ERROR, 'commands the safe torque: the controller is silent'
+        watchdog = self.watchdog
+        takeovers = 0 if watchdog is None else watchdog.takeovers
+        level = OK
+        message = 'watching'
+        if watchdog is not None and watchdog.active:
+            level = ERROR
+            message = 'commands the safe torque: the controller is silent'
+        elif self.problem:
+            level = ERROR
+            message = f'{self.problem}; {self._state_of_problem}'
+        elif watchdog is None:
+            level = WARN
+            message = f'waiting for {self._controller}'
+        elif watchdog.stands_down:
+            message = 'the controller is silent on purpose'
         self._diagnostics.publish(('torque', level, message, {'takeovers': takeovers}))
 
 

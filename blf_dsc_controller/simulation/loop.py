@@ -9,25 +9,34 @@ stop.
 
 from __future__ import annotations
 
-from collections import Counter, deque
+from collections import deque
 from collections.abc import Iterator
+from contextlib import closing
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
 from blf_dsc_controller.arms.model import ArmModel
-from blf_dsc_controller.bags.writer import BagWriter
+from blf_dsc_controller.bags.topic_recorder import TopicRecorder
 from blf_dsc_controller.compiled.jit import kernel
-from blf_dsc_controller.compiled.layout import view
+from blf_dsc_controller.compiled.views import view
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.plant import PlantConfig
 from blf_dsc_controller.configuration.schema import flatten
-from blf_dsc_controller.law.checks import INVALID, SUSPECT, checks_of
+from blf_dsc_controller.law.check_state import INVALID, SUSPECT, checks_of
 from blf_dsc_controller.law.controller import Controller, step
 from blf_dsc_controller.law.factory import begin, controller_of, estimate_names
+from blf_dsc_controller.law.interface import Law
+from blf_dsc_controller.law.laws import for_law
 from blf_dsc_controller.law.lyapunov import fill_energies
-from blf_dsc_controller.law.state import Sample, sample_of, settings_of, signals_of, state_of
+from blf_dsc_controller.law.state import (
+    Sample,
+    sample_of,
+    settings_of,
+    signals_of,
+    state_of,
+)
 from blf_dsc_controller.law.telemetry import (
     DECIMATION,
     ControllerTelemetry,
@@ -57,9 +66,9 @@ def run_loop(
     plant_settings: np.ndarray,
     plant_state: np.ndarray,
     rng: np.random.Generator,
+    law: Law,
     model: ArmModel,
-    sizes: np.dtype[np.void],
-    settings: np.ndarray,
+    settings_vector: np.ndarray,
     reference: np.ndarray,
     state: np.ndarray,
     signals: np.ndarray,
@@ -77,27 +86,39 @@ def run_loop(
     What no torque depends on, the terms of (29) and the weighing, is computed with `observed`.
     With checks (`law.checks`), stop at the first invalid or suspect sample and return False.
     """
-    law = settings_of(settings, sizes, model)
-    law_state = state_of(state, law)
-    law_signals = signals_of(signals, law)
+    settings = settings_of(settings_vector, model)
+    law_state = state_of(state, settings)
+    law_signals = signals_of(signals, settings)
     plant, now = plants.plant_views(arm, plant_settings, plant_state)
-    reference_view, measured, true = view(reference), view(measurements), view(truths)
+    reference_view = view(reference)
+    measured = view(measurements)
+    true = view(truths)
     rows = view(samples)
-    checks = checks_of(view(checks_vector), law)
+    checks = checks_of(view(checks_vector), settings)
     dt = plant.period_ns * 1e-9
     for k in range(first, last + 1):
-        measurement, sample = measured[k - first], sample_of(rows[k - first], law)
+        measurement = measured[k - first]
+        sample = sample_of(rows[k - first], settings)
         t = (k * plant.period_ns) * 1e-9
         plants.observe(plant, now, rng, measurement)
         flags = step(
-            law, checks, reference_view, law_state, law_signals, t, dt, measurement, sample
+            law,
+            settings,
+            checks,
+            reference_view,
+            law_state,
+            law_signals,
+            t,
+            dt,
+            measurement,
+            sample,
         )
         if flags & (INVALID | SUSPECT):
             return False
         plants.truth(plant, now, true[k - first])
         if observed:
-            fill_energies(law, law_state, law_signals, sample)
-            add_row(law, law_state, law_signals, dt)
+            fill_energies(settings, law_state, law_signals, sample)
+            add_row(settings, law_state, law_signals, dt)
         if not (is_end and k == last):
             plants.step(plant, now, sample.torque)
     return True
@@ -121,11 +142,15 @@ def simulate(
     if supervised:
         guard = Guard(controller_config, lambda: 0, lambda: 0)
         guard.activate()
-        record = new_record(guard.controller, controller_config, plant_config, guard.journal)
+        record = new_record(
+            guard.controller, controller_config, plant_config, guard.journal
+        )
         _run_supervised(guard, plant, record)
         return record
     journal = Journal()
-    record = new_record(controller_of(controller_config), controller_config, plant_config, journal)
+    record = new_record(
+        controller_of(controller_config), controller_config, plant_config, journal
+    )
     run_alone(record, plant)
     journal.note(EventType.CONFIGURE, parameters=flatten(controller_config))
     journal.note(EventType.ACTIVATE)
@@ -169,7 +194,9 @@ def _run_compiled(guard: Guard, plant: Plant, record: Record, chunk: range) -> b
     samples = chunk.start, chunk.stop - 1, chunk.stop == record.stamps.size, True
     if _run_samples(controller, plant, samples, arrays):
         last = chunk.stop - 1
-        guard.advance(START + int(record.stamps[last]), record.measurements[last], len(chunk))
+        guard.advance(
+            START + int(record.stamps[last]), record.measurements[last], len(chunk)
+        )
         return True
     controller.restore(before[0])
     plant.restore(before[1])
@@ -206,13 +233,14 @@ def _run_samples(
     arrays: tuple[np.ndarray, np.ndarray, np.ndarray],
 ) -> bool:
     """Call `run_loop` on samples (first, last, is_end, observed), into measurements and so on."""
-    return run_loop(
+    run_with = for_law(run_loop, controller.law)
+    kept: bool = run_with(
         plant.arm,
         plant.settings,
         plant.state,
         plant.rng,
+        controller.law,
         controller.settings.model,
-        controller.sizes,
         controller.settings_vector,
         controller.reference_vector,
         controller.state_vector,
@@ -221,6 +249,7 @@ def _run_samples(
         *arrays,
         controller.checks_vector,
     )
+    return kept
 
 
 @dataclass(frozen=True)
@@ -229,7 +258,8 @@ class Record:
 
     stamps: np.ndarray  # (k,) ns, since the start
     measurements: np.ndarray  # (k, 3 n) [q, dq, applied torque of the last interval]
-    samples: np.ndarray  # (k, s) rows of `law.state.Sample`; after a stop NaN except bound, torque
+    # (k, s) rows of `law.state.Sample`; after a stop NaN except bound, torque
+    samples: np.ndarray
     truths: np.ndarray  # (k, p + 3 n) [P, tau_dist, q, dq]
     parameters: tuple[str, ...]  # names of the entries of P
     config: ControllerConfig
@@ -242,20 +272,27 @@ class Record:
 
     def true_errors(self) -> np.ndarray:
         """Return the errors (k, n) [rad] of the true positions, not of the measured ones."""
-        n, p = len(self.config.joints), len(self.parameters)
+        n = len(self.config.joints)
+        p = len(self.parameters)
         qr = sample_columns(self.samples, self.controller.settings).qr
         return np.asarray(self.truths[:, p + n : p + 2 * n] - qr)
 
     def run(self) -> Run:
         """Return all samples as a `Run`, with the truth and the terms of (29) that the law has."""
         config = self.config
-        run = run_of(config, self.controller, self.stamps, self.measurements, self.samples)
+        run = run_of(
+            config, self.controller, self.stamps, self.measurements, self.samples
+        )
         true = (*self.parameters, *disturbance_names(config.joints))
         return replace(
             run,
             truth=Series(true, self.stamps, self.truths[:, : len(true)]),
             stops=tuple(
-                Stop(event.stamp - START, f'{event.content["reason"]}', event.content['text'])
+                Stop(
+                    event.stamp - START,
+                    f'{event.content["reason"]}',
+                    event.content['text'],
+                )
                 for event in self.journal.pending
                 if event.type is EventType.STOP
             ),
@@ -263,7 +300,10 @@ class Record:
 
 
 def new_record(
-    controller: Controller, config: ControllerConfig, plant: PlantConfig, journal: Journal
+    controller: Controller,
+    config: ControllerConfig,
+    plant: PlantConfig,
+    journal: Journal,
 ) -> Record:
     """Return a record for a run of a plant, to be filled."""
     rows, n = steps_of(plant) + 1, len(plant.joints)
@@ -281,27 +321,24 @@ def new_record(
 
 
 def write_bag(
-    path: Path, record: Record, plant: PlantConfig | None = None, *, compression: str = 'none'
+    path: Path,
+    record: Record,
+    plant: PlantConfig | None = None,
+    *,
+    compression: str = 'none',
 ) -> None:
     """Write the messages that the nodes would have published in a run as a bag.
 
     It has the configuration of the controller and, if given, of the plant; `compression` is `none`
     or `zstd`. Raises BagError if `path` exists already.
     """
-    with BagWriter(path, compression=compression, flush_interval=None) as bag:
-        handles: dict[topics.Topic, int] = {}
-        sent: Counter[topics.Topic] = Counter()
-
-        def write(stamp: int, topic: topics.Topic, raw: bytes) -> None:
-            if topic not in handles:
-                handles[topic] = bag.add_topic(topic.resolved, topic.type, [topic.offered])
-            sent[topic] += 1
-            bag.write(handles[topic], raw, stamp, sequence=sent[topic])
-
+    bag = TopicRecorder(path, compression=compression, flush_interval=None)
+    with closing(bag):
         if plant is not None:
-            write(START, topics.CHANGES, encode_change(START, flatten(plant), configured=True))
+            configured = encode_change(START, flatten(plant), configured=True)
+            bag.write(START, topics.CHANGES, configured)
         for stamp, message in _messages(record):
-            write(stamp, *message)
+            bag.write(stamp, *message)
 
 
 def _messages(record: Record) -> Iterator[tuple[int, Message]]:

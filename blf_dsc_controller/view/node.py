@@ -23,7 +23,11 @@ from blf_dsc_controller.configuration.nodes import VIEW, ViewConfig
 from blf_dsc_controller.configuration.schema import build
 from blf_dsc_controller.law.factory import estimate_names
 from blf_dsc_controller.messages import topics
-from blf_dsc_controller.messages.codecs import JointStateDecoder, MessageError, joint_state_layout
+from blf_dsc_controller.messages.codecs import (
+    JointStateDecoder,
+    MessageError,
+    joint_state_layout,
+)
 from blf_dsc_controller.messages.journal import Event, EventType, decode
 from blf_dsc_controller.messages.topics import Topic
 from blf_dsc_controller.nodes.endpoints import (
@@ -34,6 +38,7 @@ from blf_dsc_controller.nodes.endpoints import (
 from blf_dsc_controller.nodes.parameters import declare
 from blf_dsc_controller.nodes.process import PlainNode, run
 from blf_dsc_controller.run import Floats
+from blf_dsc_controller.view.model_error import ModelError
 from blf_dsc_controller.view.page import PAST, Page, Snapshot
 
 _PERIOD = 1.0 / 30.0  # s
@@ -43,7 +48,13 @@ _OUTDATED = 500_000_000  # ns
 _LISTED = 12  # events
 _NICE = 10  # lower priority than the loop
 _LOCAL = ('127.0.0.1', 'localhost')  # hosts that only this computer can reach
-_STREAMS = (topics.JOINT_STATES, topics.TRACKING_ERROR, topics.BOUND, topics.MONITOR, topics.TRUTH)
+_STREAMS = (
+    topics.JOINT_STATES,
+    topics.TRACKING_ERROR,
+    topics.BOUND,
+    topics.MONITOR,
+    topics.TRUTH,
+)
 _LATCHED = (topics.BOUND, topics.JOURNAL, topics.CHANGES, topics.STATE)
 _FIGURES = (*topics.LOAD, topics.LAMBDA_MIN, topics.LATCHED)
 
@@ -70,9 +81,13 @@ class ViewNode(PlainNode):
         self._plant: dict[str, Any] = {}  # parameters of the simulated plant
         self._events: deque[tuple[float, str, str]] = deque(maxlen=_LISTED)
         self._noted = -1.0  # s, time up to which the plant's events are on the page
-        self._state = 'STALE', f'waiting for {self.resolve_topic_name(topics.JOURNAL.relative)}'
+        self._state = (
+            'STALE',
+            f'waiting for {self.resolve_topic_name(topics.JOURNAL.relative)}',
+        )
         self._start = self._sampled = -1  # ns, stamps of start and last tracking error
         self._pictures = self._silent = 0
+        self._finished = False  # the controller has released the arm
         self._clients_seen: frozenset[int] = frozenset()
         self._raw_subscriptions = RawSubscriptions(self)
         for topic in {*_STREAMS, *_LATCHED}:
@@ -102,7 +117,8 @@ class ViewNode(PlainNode):
         self._silent = 0 if has_state else self._silent + 1
         self.page.state(*self._health())
         self.page.events(list(self._events))
-        before, self._clients_seen = self._clients_seen, frozenset(self.page.server.get_clients())
+        before = self._clients_seen
+        self._clients_seen = frozenset(self.page.server.get_clients())
         is_new = before != self._clients_seen
         if self.past and self._clients_seen and (has_state or is_new):
             self._pictures += 1
@@ -114,9 +130,17 @@ class ViewNode(PlainNode):
         """Return the state of the controller, or that it or the arm has gone silent."""
         if self._config is None or self._silent < _SILENCE:
             return self._state
-        for topic, node in ((topics.TRACKING_ERROR, 'controller'), (topics.JOINT_STATES, 'arm')):
+        if self._finished:
+            return 'OK', 'finished: the controller has ended as it should'
+        for topic, node in (
+            (topics.TRACKING_ERROR, 'controller'),
+            (topics.JOINT_STATES, 'arm'),
+        ):
             if not self.count_publishers(topic.relative):
-                return 'ERROR', f'the {node} is gone: {topic.relative} is no longer published'
+                return (
+                    'ERROR',
+                    f'the {node} is gone: {topic.relative} is no longer published',
+                )
         return self._state[0], f'{self._state[1]} (no joint states received)'
 
     # Events.
@@ -131,7 +155,8 @@ class ViewNode(PlainNode):
             return
         said = json.loads(content.data)
         if said.get('configured'):
-            self._plant, self._noted = said['parameters'], -1.0
+            self._plant = said['parameters']
+            self._noted = -1.0
             if self._config is not None:
                 self.page.draw_arm(self._config, self._plant)
             return
@@ -145,19 +170,28 @@ class ViewNode(PlainNode):
         if event.type is EventType.CONFIGURE:
             self._configure(build(ControllerConfig, content['parameters']))
             return
+        self._finished = event.type is EventType.RELEASE
         if event.type is EventType.START:
             self._start, self._noted = event.stamp, -1.0
             self.past.clear()
-        details = [f'{content[k]}' for k in ('reason', 'text', 'parameters') if k in content]
-        self._events.append((self._time(event.stamp), event.type.value, ', '.join(details)))
+        details = [
+            f'{content[k]}' for k in ('reason', 'text', 'parameters') if k in content
+        ]
+        self._events.append(
+            (self._time(event.stamp), event.type.value, ', '.join(details))
+        )
 
     def _configure(self, config: ControllerConfig) -> None:
         self._config = config
         estimates = estimate_names(config)
         names = *[config.joints] * 3, (*estimates, *_FIGURES), estimates
         self._names = dict(zip(_STREAMS, names, strict=True))
-        self._values = {topic: np.full((3, len(of)), np.nan) for topic, of in self._names.items()}
-        self._first_truth, self._latched = self._values[topics.TRUTH][0], np.nan
+        self._values = {
+            topic: np.full((3, len(of)), np.nan) for topic, of in self._names.items()
+        }
+        self._first_truth = self._values[topics.TRUTH][0]
+        self._latched = np.nan
+        self._model_error = ModelError(config)
         self.page.draw_arm(config, self._plant)
 
     # Samples.
@@ -175,33 +209,46 @@ class ViewNode(PlainNode):
             try:
                 stamps[topic], self._values[topic] = _read(raw, self._names[topic])
             except MessageError as error:
-                self.get_logger().warning(f'not shown: {error}', throttle_duration_sec=10.0)
+                self.get_logger().warning(
+                    f'not shown: {error}', throttle_duration_sec=10.0
+                )
         self._sampled = max(stamps.get(topics.TRACKING_ERROR, -1), self._sampled)
         stamp = stamps.get(topics.JOINT_STATES)
         if stamp is None:
             return False
         if stamp - self._sampled > _OUTDATED:  # the law is not running
-            self._values[topics.TRACKING_ERROR] = np.nan * self._values[topics.TRACKING_ERROR]
+            self._values[topics.TRACKING_ERROR] = (
+                np.nan * self._values[topics.TRACKING_ERROR]
+            )
         self._keep(self._time(stamp))
         return True
 
     def _keep(self, time: float) -> None:
-        state, (xi1, _, tau), (k_c, *_), (monitor, *_), (truth, *_) = self._values.values()
+        state, (xi1, _, tau), (k_c, *_), (monitor, *_), (truth, *_) = (
+            self._values.values()
+        )
         m = len(truth)
         *load, lambda_min, latched = monitor[m:].tolist()
         if latched != self._latched and np.isfinite(self._latched):
-            text = 'excited window latched' if latched else 'restarts: the arm has changed'
+            text = (
+                'excited window latched' if latched else 'restarts: the arm has changed'
+            )
             self._events.append((time, 'learning', text))
         self._latched = latched
         if np.isnan(self._first_truth).all():
             self._first_truth = truth
         loaded = bool((np.abs(truth - self._first_truth) > 0.0).any())
         tau = state[2] if np.isnan(tau).any() else tau
-        learned = monitor[:m], truth, lambda_min, load, loaded
+        squares = self._model_error.squares(
+            time, state[0], state[1], monitor[:m], truth
+        )
+        learned = monitor[:m], truth, lambda_min, squares, load, loaded
         self.past.append(Snapshot(time, state[0], xi1, k_c, tau, *learned))
         while self.past[0].time < time - PAST - 1.0:
             self.past.popleft()
-        self._events += [e for e in plant_events(self._plant) if self._noted < e[0] <= time]
+        self._events += [
+            e for e in plant_events(self._plant) if self._noted < e[0] <= time
+        ]
         self._noted = time
 
 
@@ -218,9 +265,13 @@ def plant_events(values: Mapping[str, Any]) -> list[tuple[float, str, str]]:
     """Return time [s], kind and text of what a simulated arm with these parameters undergoes."""
     begin = values.get('events.begin', ())
     nothing = (0.0,) * len(begin)
-    duration, masses = (values.get(f'events.{k}') or nothing for k in ('duration', 'payload'))
+    duration, masses = (
+        values.get(f'events.{k}') or nothing for k in ('duration', 'payload')
+    )
     found = []
-    for k, (at, lasts, mass) in enumerate(zip(begin, duration, masses, strict=False), 1):
+    for k, (at, lasts, mass) in enumerate(
+        zip(begin, duration, masses, strict=False), 1
+    ):
         texts = (f'{mass:g} kg picked up', f'{mass:g} kg put down')
         first, last = texts if mass else (f'event {k} begins', f'event {k} ends')
         found.append((at, 'plant', first))

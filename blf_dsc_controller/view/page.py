@@ -22,16 +22,16 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from blf_dsc_controller.analysis.metrics import bodies_of, errors_of_bodies
 from blf_dsc_controller.analysis.panels import ALARM, COLOURS, GREEN, INK, MUTED, ORANGE
 from blf_dsc_controller.arms.two_link import urdf
 from blf_dsc_controller.arms.urdf import Chain, frames, read_chain
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.files import resolve
-from blf_dsc_controller.errors import BlfDscError, MissingExtraError
-from blf_dsc_controller.law.factory import estimate_names, prior_covariance
+from blf_dsc_controller.errors import BlfDscError
+from blf_dsc_controller.extras import missing_extra
 from blf_dsc_controller.law.telemetry import load_text
 from blf_dsc_controller.run import Floats
+from blf_dsc_controller.view.model_error import shares
 
 PAST = 20.0
 """Time span of the plots [s]."""
@@ -49,7 +49,9 @@ _HEIGHT = 130  # px of a plot: three fit below the state at 900 px
 _VIEW = np.array((0.42, -0.88, 0.22))  # direction from the arm to the camera
 _LINE = {'width': 1.5, 'points': {'show': False}}
 _AUTO: Mapping[str, Any] = {}
-_FROM_ZERO = {'range': {'min': {'hard': 0.0, 'soft': 0.0, 'mode': 1}, 'max': {'pad': 0.1}}}
+_FROM_ZERO = {
+    'range': {'min': {'hard': 0.0, 'soft': 0.0, 'mode': 1}, 'max': {'pad': 0.1}}
+}
 _SETTLED = 2.0  # s
 _NARROW = 576  # px, width up to which viser shows the panel below
 # viser's sheet for narrow windows is as wide as a panel and covers the arm on one side.
@@ -71,6 +73,7 @@ class Snapshot(NamedTuple):
     estimate: Floats  # (m,) theta^; NaN: a rejected column
     truth: Floats  # (m,)
     lambda_min: float
+    squares: Floats  # (3,) (N m)^2, see `ModelError`
     load: Sequence[float] = (np.nan,) * 8  # of topics.LOAD
     loaded: bool = False  # the true parameters differ from those at the start
 
@@ -79,7 +82,7 @@ def require_viser() -> None:
     """Raise MissingExtraError unless viser and its URDF support are installed."""
     for module in ('viser', 'yourdfpy'):
         if importlib.util.find_spec(module) is None:
-            raise MissingExtraError(module, 'view', 'the page')
+            raise missing_extra(module, 'view', 'the page')
 
 
 class Page:
@@ -118,7 +121,9 @@ class Page:
         self._list: Any = None
         server.scene.reset()
         gui.reset()
-        gui.configure_theme(show_logo=False, show_share_button=False, control_width='large')
+        gui.configure_theme(
+            show_logo=False, show_share_button=False, control_width='large'
+        )
         gui.main_panel.dock_right()
         server.scene.configure_default_lights(cast_shadow=False)  # costly without a GPU
         self._header = gui.add_html('')
@@ -132,9 +137,9 @@ class Page:
         self._arm = arm = arm_of(config, plant)
         self._joints = [joint.name for joint in arm.chain.joints]
         prefix, names = _shortened(self._joints)
-        self._bodies = bodies_of(estimate_names(config))
-        self._prior = np.sqrt(np.diag(prior_covariance(config)))  # standard deviations (m,)
-        server, gui, reach = self.server, self.server.gui, arm.reach
+        server = self.server
+        gui = self.server.gui
+        reach = arm.reach
         model = arm.model()
         self._held = dict.fromkeys(model.actuated_joint_names, 0.0)
         self._drawn = ViserUrdf(server, model, root_node_name='/arm')
@@ -148,20 +153,29 @@ class Page:
         with tabs.add_tab('Plots'):
             log = {'distr': 3, 'range': (_LEAST, _MOST)}
             self._plots = [
-                self._plot(f'{prefix}: largest error in 1 s [% of bound]', names, log, 'bound'),
+                self._plot(
+                    f'{prefix}: largest error in 1 s [% of bound]', names, log, 'bound'
+                ),
                 self._plot(f'{prefix}: torque [N m]', names),
-                self._plot('error of the estimates [% of prior]', tuple(self._bodies), _FROM_ZERO),
-                self._plot('excitation: log10 of lambda_min', ('lambda_min',)),
+                self._plot(
+                    'torque error of the model [%]', ('learned', 'initial'), _FROM_ZERO
+                ),
+                self._plot('held in the tip [kg]', ('weight', 'from', 'to')),
             ]
             self._caption = gui.add_html('')
         with tabs.add_tab('Events'):
             self._list = gui.add_html(event_list(self._events))
 
     def _plot(
-        self, title: str, names: Sequence[str], y: Mapping[str, Any] = _AUTO, limit: str = ''
+        self,
+        title: str,
+        names: Sequence[str],
+        y: Mapping[str, Any] = _AUTO,
+        limit: str = '',
     ) -> Any:
         lines: list[dict[str, Any]] = [
-            {'label': name, 'stroke': COLOURS[k % len(COLOURS)]} for k, name in enumerate(names)
+            {'label': name, 'stroke': COLOURS[k % len(COLOURS)]}
+            for k, name in enumerate(names)
         ]
         if limit:
             lines.append({'label': limit, 'stroke': ALARM, 'dash': [6, 4]})
@@ -195,7 +209,9 @@ class Page:
     def move(self, past: Sequence[Snapshot]) -> None:
         """Move the arm to the last of these snapshots."""
         now = past[-1]
-        chain, reach, scene = self._arm.chain, self._arm.reach, self.server.scene
+        chain = self._arm.chain
+        reach = self._arm.reach
+        scene = self.server.scene
         with self.server.atomic():
             self._drawn.update_cfg(self._posture(now.position))
             if self._corners is None:
@@ -207,18 +223,30 @@ class Page:
             if np.isfinite(reference).all():
                 self._ghost.update_cfg(self._posture(reference))
             scene.add_icosphere(
-                '/payload', 0.045 * reach, color=(213, 94, 0), position=tip, visible=now.loaded
+                '/payload',
+                0.045 * reach,
+                color=(213, 94, 0),
+                position=tip,
+                visible=now.loaded,
             )
             happened = [e for e in self._events if now.time - _SHOWN < e[0] <= now.time]
             _, kind, text = happened[-1] if happened else (0.0, '', '')
             above = tip + np.array((0.0, 0.0, 0.1 * reach))
-            scene.add_label('/event', f'{kind}: {text}', position=above, visible=bool(kind))
-            recent = np.array([each.position for each in past if each.time > now.time - _TRAIL])
+            scene.add_label(
+                '/event', f'{kind}: {text}', position=above, visible=bool(kind)
+            )
+            recent = np.array(
+                [each.position for each in past if each.time > now.time - _TRAIL]
+            )
             if len(recent) > 1:
                 path = self._at(frames(chain, recent)[-1])
                 points = np.stack((path[:-1], path[1:]), axis=1)
                 scene.add_line_segments(
-                    '/path', points, (0, 114, 178), thickness=3.0, thickness_units='screen'
+                    '/path',
+                    points,
+                    (0, 114, 178),
+                    thickness=3.0,
+                    thickness_units='screen',
                 )
 
     def plot(self, past: Sequence[Snapshot]) -> None:
@@ -232,8 +260,8 @@ class Page:
             curves = (
                 np.vstack((_peaks(share), np.full(t.size, 100.0))),
                 of.torque.T,
-                errors_of_bodies(self._bodies, of.estimate, of.truth, self._prior),
-                np.log10([of.lambda_min]),
+                shares(of.squares, _PEAK),
+                weights(np.array(of.load)),
             )
         marks = [e[0] for e in self._events if t[0] <= e[0] <= t[-1]]
         with self.server.atomic():
@@ -245,14 +273,19 @@ class Page:
         """Point a camera at the arm, which then fills a picture of this width [px]."""
         if self._corners is None:
             return
-        low, high = self._corners.min(axis=0), self._corners.max(axis=0)
-        centre, size = 0.5 * (low + high), float(np.linalg.norm(high - low))
+        low = self._corners.min(axis=0)
+        high = self._corners.max(axis=0)
+        centre = 0.5 * (low + high)
+        size = float(np.linalg.norm(high - low))
         if width <= _NARROW:  # the lower half is covered
-            centre, size = centre - (0.0, 0.0, 0.4 * size), 1.7 * size
-        camera.position, camera.look_at = centre + 1.15 * size * _VIEW, centre
+            centre = centre - (0.0, 0.0, 0.4 * size)
+            size = 1.7 * size
+        camera.position = centre + 1.15 * size * _VIEW
+        camera.look_at = centre
 
     def _welcome(self, client: Any) -> None:
-        for pause in (0.0, _SETTLED):  # the browser begins with the common camera, at some time
+        # the browser begins with the common camera, at some time
+        for pause in (0.0, _SETTLED):
             time.sleep(pause)
             self._aim(client.camera, client.camera.image_width)
 
@@ -285,7 +318,9 @@ def _shortened(joints: Sequence[str]) -> tuple[str, Sequence[str]]:
 def _peaks(values: Floats) -> Floats:
     """Return the largest of the last values (n, k) up to each."""
     padded = np.pad(values, ((0, 0), (_PEAK - 1, 0)), mode='edge')
-    peaks: Floats = np.fmax.reduce([padded[:, j : j + values.shape[1]] for j in range(_PEAK)])
+    peaks: Floats = np.fmax.reduce(
+        [padded[:, j : j + values.shape[1]] for j in range(_PEAK)]
+    )
     return peaks
 
 
@@ -298,13 +333,25 @@ def with_marks(t: Floats, curves: Floats, marks: Sequence[float]) -> tuple[Float
     at = np.repeat(np.searchsorted(t, marks), 3)
     line = np.insert(np.full(t.size, -1.0), at, (-1.0, 1.0, -1.0) * len(marks))
     held = known[:, np.maximum(at - 1, 0)]
-    return (np.insert(t, at, np.repeat(marks, 3)), *np.insert(known, at, held, axis=1), line)
+    return (
+        np.insert(t, at, np.repeat(marks, 3)),
+        *np.insert(known, at, held, axis=1),
+        line,
+    )
 
 
 def caption(now: Snapshot) -> str:
-    """Return the time, and what the tip holds, as a line of the page."""
+    """Return the time, what the tip holds, and how excited learning is, as a line of the page."""
     held = f', held: {load_text(now.load)}' if np.isfinite(now.load[0]) else ''
-    return f'<div style="margin:4px">t = {now.time:.2f} s{held}</div>'
+    excited = f', lambda_min {now.lambda_min:.2g}' if now.lambda_min > 0.0 else ''
+    return f'<div style="margin:4px">t = {now.time:.2f} s{held}{excited}</div>'
+
+
+def weights(load: Floats) -> Floats:
+    """Return the weight of the load and its 95 % interval (3, k) [kg] from LOAD (k, 8)."""
+    mass = load[:, 0]
+    half = load[:, 4]
+    return np.vstack((mass, mass - half, mass + half))
 
 
 def event_list(events: Sequence[tuple[float, str, str]]) -> str:
@@ -379,7 +426,9 @@ def _add_cylinders(model: Any, radius: float) -> None:
 
     def add(shape: Any, joint: str, link: str) -> None:
         name = f'{joint} {link}'
-        model.scene.add_geometry(shape, node_name=name, geom_name=name, parent_node_name=link)
+        model.scene.add_geometry(
+            shape, node_name=name, geom_name=name, parent_node_name=link
+        )
 
     for joint in model.robot.joints:
         end = model.get_transform(joint.child, joint.parent)[:3, 3]
@@ -387,13 +436,16 @@ def _add_cylinders(model: Any, radius: float) -> None:
             cylinder = trimesh.creation.cylinder(radius, segment=(np.zeros(3), end))
             add(cylinder, joint.name, joint.parent)
         if joint.type != 'fixed':
-            add(trimesh.creation.icosphere(radius=1.6 * radius), joint.name, joint.child)
+            add(
+                trimesh.creation.icosphere(radius=1.6 * radius), joint.name, joint.child
+            )
 
 
 def _load(text: str) -> Any:
     import yourdfpy
 
-    logging.getLogger('yourdfpy').setLevel(logging.ERROR)  # it warns about missing meshes
+    # it warns about missing meshes
+    logging.getLogger('yourdfpy').setLevel(logging.ERROR)
     model = yourdfpy.URDF.load(io.BytesIO(text.encode()), filename_handler=_file)
     for joint in model.robot.joints:
         if joint.axis is not None:  # yourdfpy scales prismatic motion by its length

@@ -1,0 +1,105 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The guarded law in a loop of one's own: the same bits as the nodes', and a bag like theirs."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+import blf_dsc_controller as blf
+from blf_dsc_controller.control.arm_controller import StateError
+from blf_dsc_controller.errors import BlfDscError, ConfigurationError
+from blf_dsc_controller.reference.trajectory import TrajectoryError
+from blf_dsc_controller.simulation.loop import START
+from blf_dsc_controller.supervision.supervisor import Phase
+from sim_plant.plant import plant_of, steps_of
+
+LOOP = blf.load_loop('recommended', {'sim_plant': {'duration': 1.0}})
+
+
+def run(controller, plant, config, steps):
+    """Run the loop as a user does; return the torques (steps, n)."""
+    torques = []
+    for step in range(steps):
+        q, dq, effort = plant.measure().reshape(3, -1)
+        stamp = START * 1e-9 + step * config.sample_time
+        torque = controller.update(stamp, q, dq, effort)
+        torques.append(torque)
+        plant.step(torque)
+    return np.array(torques)
+
+
+def test_it_computes_the_bits_of_the_simulation_and_its_bag_replays_them(tmp_path):
+    plant = plant_of(LOOP.plant)
+    steps = steps_of(LOOP.plant) + 1
+    with blf.ArmController(LOOP.controller, record=tmp_path / 'bag') as controller:
+        torques = run(controller, plant, LOOP.plant, steps)
+        assert controller.phase is Phase.TRACKING
+        assert (np.abs(controller.error) < controller.bound).all()
+        assert set(controller.estimates) > {'m2*l1*l2'}
+        assert math.isnan(controller.load.mass)
+    simulated = blf.simulate(LOOP.controller, LOOP.plant).run()
+    np.testing.assert_array_equal(torques, simulated.torque)
+    recorded = blf.read_run(tmp_path / 'bag')
+    np.testing.assert_array_equal(recorded.torque, simulated.torque)
+    verified = blf.verify(tmp_path / 'bag')
+    assert verified.difference is None
+    assert verified.samples == steps
+    assert not any(found.missing for found in verified.comparisons)
+
+
+@pytest.mark.parametrize(
+    ('given', 'problem'),
+    [
+        ((0.0, [0.0] * 3, [0.0] * 2), r'q: got an array of shape \(3,\), but \(2,\)'),
+        ((0.0, [0.0] * 2, 0.0), r'dq: got an array of shape \(\), but \(2,\)'),
+        ((0.0, [0.0] * 2, [0.0] * 2, [0.0]), r'effort: got an array of shape \(1,\)'),
+        ((math.nan, [0.0] * 2, [0.0] * 2), 'stamp: got nan, but a finite time'),
+    ],
+)
+def test_states_of_another_shape_are_errors_and_change_nothing(given, problem):
+    controller = blf.ArmController(LOOP.controller)
+    with pytest.raises(StateError, match=problem):
+        controller.update(*given)
+    assert controller.phase is Phase.STARTING
+
+
+def test_faults_stop_it_with_a_reason_and_a_safe_torque():
+    controller = blf.ArmController(LOOP.controller)
+    plant = plant_of(LOOP.plant)
+    run(controller, plant, LOOP.plant, 100)
+    q, dq, _ = plant.measure().reshape(3, -1)
+    torque = controller.update(1.1, [math.nan, q[1]], dq)
+    assert controller.phase is Phase.SAFE_STOP
+    assert 'the positions are not finite' in controller.reason
+    assert torque is not None
+    assert np.isfinite(torque).all()
+
+
+def test_it_follows_trajectories_and_stops_on_request():
+    controller = blf.ArmController(LOOP.controller)
+    plant = plant_of(LOOP.plant)
+    run(controller, plant, LOOP.plant, 10)
+    goal = blf.TrajectoryPoint(2.0, (2.2, 1.6))
+    controller.follow([goal])
+    with pytest.raises(TrajectoryError, match='rejected'):
+        controller.follow([blf.TrajectoryPoint(1e-3, (90.0, 90.0))])
+    for step in range(10, 2500):
+        q, dq, effort = plant.measure().reshape(3, -1)
+        plant.step(controller.update(1.0 + 1e-3 * step, q, dq, effort))
+    np.testing.assert_allclose(q, (2.2, 1.6), atol=2e-3)  # the bound
+    controller.stop()
+    assert controller.phase is Phase.INACTIVE
+    controller.start()
+    assert controller.phase is Phase.STARTING
+
+
+def test_presets_and_files_are_found_by_name_and_bags_are_not_overwritten(tmp_path):
+    assert blf.ArmController('recommended').joints == ('joint1', 'joint2')
+    with pytest.raises(ConfigurationError, match='does not exist'):
+        blf.ArmController('nowhere.yaml')
+    (tmp_path / 'bag').mkdir()
+    with pytest.raises(BlfDscError, match='exists'):
+        blf.ArmController('recommended', record=tmp_path / 'bag')
