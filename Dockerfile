@@ -5,9 +5,10 @@ FROM ros:jazzy-ros-base
 RUN apt-get update && apt-get install --yes --no-install-recommends python3-pip python3-venv \
     && rm -rf /var/lib/apt/lists/*
 
-# ROS's messages were compiled against Ubuntu's numpy, and colcon installs by an older setuptools.
+# ROS's messages were compiled against Ubuntu's numpy, with which pyarrow 26 does not load, and
+# colcon installs by an older setuptools.
 ENV PIP_BREAK_SYSTEM_PACKAGES=1
-RUN python3 -c 'import numpy; print(f"numpy=={numpy.__version__}\nsetuptools<80")' > /constraints.txt
+RUN python3 -c 'import numpy; print(f"numpy=={numpy.__version__}\npyarrow<26\nsetuptools<80")' > /constraints.txt
 
 WORKDIR /ws/src/blf_dsc_controller
 COPY . .

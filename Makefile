@@ -11,6 +11,8 @@ DURATION ?= 60
 # Of tests on two cores: many wait for other processes.
 WORKERS ?= 3
 MINUTES ?= 30
+# s, after which a test ends: far more than any needs, also one that compiles first.
+LIMIT ?= 900
 EXAMPLES ?= 300
 CHANGING := events panda panda_500hz ur5e ur5e_500hz
 
@@ -39,9 +41,10 @@ READY := $(VENV)/.ready-$(FLAVOUR)-$(VERSION)
 PIP_INSTALL := $(VENV)/bin/python -m pip --disable-pip-version-check install --no-compile
 # This checkout comes first, also before a workspace that has the package installed.
 RUN := PYTHONPATH="$(CURDIR)$${PYTHONPATH:+:$$PYTHONPATH}" $(VENV)/bin/python
-PIP_FAILED := { echo 'The installation failed: see above. It needs a package index: behind a proxy' \
-  'set HTTPS_PROXY, for a mirror PIP_INDEX_URL, without a network PIP_FIND_LINKS and' \
-  'PIP_NO_INDEX=1, and run make again.' >&2; exit 1; }
+PIP_LOG := $(VENV)/pip.log
+PIP_FAILED := { tail -n 5 $(PIP_LOG) >&2; echo 'The installation failed: $(PIP_LOG) says why.' \
+  'It needs a package index: behind a proxy set HTTPS_PROXY, for a mirror PIP_INDEX_URL,' \
+  'without a network PIP_FIND_LINKS and PIP_NO_INDEX=1, and run make again.' >&2; exit 1; }
 
 .PHONY: help venv demo paper arms changes test test-browser pictures test-nightly soak fuzz docs lint clean bench release
 
@@ -72,20 +75,22 @@ arms: $(READY) ## Compare laws on a Panda and a UR5e with wrong URDFs, into out/
 # as containers do: each of the many processes would compile the package's sources again.
 test: $(READY)-test ## Run the tests (TESTS=test/test_x.py for some, WORKERS=0 in one process)
 	@PYTHONDONTWRITEBYTECODE= PYTEST_DISABLE_PLUGIN_AUTOLOAD=1 $(RUN) -m pytest -p xdist \
-	    -p _hypothesis_pytestplugin -n $(WORKERS) --dist loadfile --no-loadscope-reorder $(TESTS)
+	    -p _hypothesis_pytestplugin -p pytest_timeout --timeout $(LIMIT) \
+	    -n $(WORKERS) --dist loadfile --no-loadscope-reorder $(TESTS)
 
 test-browser: $(READY)-test ## Test the pages of report and view in a headless Chromium, if installed
-	@$(PIP_INSTALL) --quiet playwright || $(PIP_FAILED)
+	@$(PIP_INSTALL) --quiet playwright > $(PIP_LOG) 2>&1 || $(PIP_FAILED)
 	@BROWSER_TESTS=1 $(RUN) -m pytest -rs test/test_browser.py
 
 pictures: $(READY)-test ## Make the README's animation, doc/view.webp, with a headless Chromium
-	@$(PIP_INSTALL) --quiet playwright -e '.[meshes]' --no-build-isolation || $(PIP_FAILED)
+	@$(PIP_INSTALL) --quiet playwright -e '.[meshes]' --no-build-isolation \
+	    > $(PIP_LOG) 2>&1 || $(PIP_FAILED)
 	@PYTHONPATH="$(CURDIR):$(CURDIR)/test" $(VENV)/bin/python test/view_pictures.py
 
 test-nightly: ## Run all tests, those left out by make test as well, at length and with random examples
-	@NIGHTLY=1 PYTEST_ADDOPTS='-m "" -rP' $(MAKE) test
+	@NIGHTLY=1 PYTEST_ADDOPTS='-m "" -rP' $(MAKE) test LIMIT=7200
 
-changes: $(READY) ## Simulate 14,000 randomly changing arms, each with and without learning, into out/changes
+changes: $(READY)-monte-carlo ## Simulate 14,000 randomly changing arms, each with and without learning, into out/changes
 	@for study in $(CHANGING); do $(RUN) -m blf_dsc_controller monte-carlo \
 	    --config monte_carlo_$$study --out out/changes/$$study || exit 1; done; \
 	$(RUN) -m blf_dsc_controller monte-carlo --report $(CHANGING:%=out/changes/%) --out out/changes
@@ -102,13 +107,15 @@ docs: $(READY)-docs ## Build the documentation site, into out/docs; dead links a
 
 release: $(READY)-release ## Check versions and metadata, and build sdist and wheel into out/dist
 	@$(MAKE) test TESTS=test/test_package.py
+	@rm -rf blf_dsc_controller/compiled/kernels; for arm in recommended panda; do \
+	    $(RUN) -m blf_dsc_controller precompile --package --config $$arm || exit 1; done
 	@rm -rf out/dist && $(VENV)/bin/python -m build --outdir out/dist . && \
 	$(VENV)/bin/python -m twine check --strict out/dist/*
 	@! grep -q '@.*[.]invalid' package.xml || echo 'package.xml has no maintainer that can be' \
 	    'reached, and so has what is in out/dist: see CONTRIBUTING.md before you publish it.'
 
 fuzz: $(READY)-test ## Feed random files and names to everything that reads them (EXAMPLES of each kind)
-	@EXAMPLES="$(EXAMPLES)" NIGHTLY=1 PYTEST_ADDOPTS='-m ""' $(MAKE) test \
+	@EXAMPLES="$(EXAMPLES)" NIGHTLY=1 PYTEST_ADDOPTS='-m ""' $(MAKE) test LIMIT=7200 \
 	    TESTS='test/test_fuzzing.py -k survived'
 
 lint: $(READY)-lint ## Check style, types and layers
@@ -128,16 +135,19 @@ $(READY): setup.py setup.cfg
 	    "$(BASE)" -m venv --clear $(venv_options_$(FLAVOUR)) $(VENV); } || { \
 	    echo 'python -m venv failed: see above. On Debian and Ubuntu: apt install python3-venv' >&2; \
 	    exit 1; }
-	@echo 'Installing what runs and pictures need: 250 MB to download, 800 MB unpacked'
+	@echo '1/2 Installing what runs and pictures need: 250 MB to download, 800 MB' \
+	    'unpacked, 1 to 3 minutes; pip writes into $(PIP_LOG)'
 	@: > $(VENV)/constraints.txt; $(constrain_$(FLAVOUR))
 	@{ $(PIP_INSTALL) 'pip>=22' 'setuptools>=70.1' && $(PIP_INSTALL) -c $(VENV)/constraints.txt \
-	    --no-build-isolation -e '.[$(extras_$(FLAVOUR))]'; } || $(PIP_FAILED)
+	    --no-build-isolation -e '.[$(extras_$(FLAVOUR))]'; } > $(PIP_LOG) 2>&1 || $(PIP_FAILED)
+	@echo '2/2 Installed. A first run compiles, for 1 to 2 minutes: each kernel is announced'
 	@touch $@
 
 # Further packages, named after the extra in setup.cfg.
 $(READY)-%: $(READY)
-	@echo 'Installing what make $* needs besides'
-	@$(PIP_INSTALL) -c $(VENV)/constraints.txt --no-build-isolation -e '.[$*]' || $(PIP_FAILED)
+	@echo 'Installing what make $* needs besides: up to a minute; pip writes into $(PIP_LOG)'
+	@$(PIP_INSTALL) -c $(VENV)/constraints.txt --no-build-isolation -e '.[$*]' \
+	    > $(PIP_LOG) 2>&1 || $(PIP_FAILED)
 	@touch $@
 
 define check_python
@@ -160,12 +170,13 @@ test -z '$(ROS_DISTRO)' || echo 'ROS 2 $(ROS_DISTRO) is sourced here, but this p
     'Jazzy: it is left aside, and Jazzy is taken from wheels.'
 endef
 
-# numpy stays as it is, because the sourced ROS's messages were compiled against it.
+# numpy stays as it is, because the sourced ROS's messages were compiled against it; nor does
+# pyarrow 26 load with a numpy before 2, which pip cannot know.
 about_sourced := the ROS 2 Jazzy sourced in this shell
 extras_sourced := report,view
 venv_options_sourced := --system-site-packages
-constrain_sourced := "$(BASE)" -c 'import numpy; print("numpy==" + numpy.__version__)' \
-    > $(VENV)/constraints.txt
+constrain_sourced := "$(BASE)" -c 'import numpy; v = numpy.__version__; \
+    print(f"numpy=={v}"); v < "2" and print("pyarrow<26")' > $(VENV)/constraints.txt
 define check_sourced
 "$(BASE)" -c 'import rclpy' || { echo 'ROS 2 Jazzy is sourced here, but $(BASE) (Python $(VERSION))' \
     'cannot import its rclpy: see above. Name the Python that this ROS was built for, as in' \

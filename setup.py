@@ -7,7 +7,8 @@ from pathlib import Path
 
 from setuptools import setup
 
-HERE = Path(__file__).resolve().parent  # colcon --symlink-install runs a link to this file
+# colcon --symlink-install runs a link to this file
+HERE = Path(__file__).resolve().parent
 MANIFEST = ET.parse(HERE / 'package.xml').getroot()  # noqa: S314 - our own file
 (MAINTAINER,) = MANIFEST.findall('maintainer')
 URLS = {url.get('type', 'website'): url.text for url in MANIFEST.findall('url')}

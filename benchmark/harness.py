@@ -49,14 +49,21 @@ class Ratio(NamedTuple):
 
 
 def ratio(
-    group: str, what: str, baseline: str, mine: np.ndarray, theirs: np.ndarray, note: str = ''
+    group: str,
+    what: str,
+    baseline: str,
+    mine: np.ndarray,
+    theirs: np.ndarray,
+    note: str = '',
 ) -> Ratio:
     """Return the ratio of two interleaved series (rounds,)."""
     low, median, high = np.quantile(mine / theirs, (0.0, 0.5, 1.0)).tolist()
     return Ratio(group, what, median, low, high, baseline, note)
 
 
-def interleaved(contestants: Mapping[str, Callable[[], int]], rounds: int) -> dict[str, np.ndarray]:
+def interleaved(
+    contestants: Mapping[str, Callable[[], int]], rounds: int
+) -> dict[str, np.ndarray]:
     """Return seconds per unit of work (rounds,) of each contestant, all run in each round.
 
     A contestant does its work and returns the number of units. The first round is a warm-up.
@@ -85,18 +92,25 @@ def machine() -> str:
     """Describe the machine and the versions, without the host name."""
     models = re.findall(r'model name\s*:\s*(.*)', Path('/proc/cpuinfo').read_text())
     model = models[0] if models else 'unknown processor'
-    versions = [f'Python {platform.python_version()}', f'blf_dsc_controller {__version__}']
+    versions = [
+        f'Python {platform.python_version()}',
+        f'blf_dsc_controller {__version__}',
+    ]
     for package in _PACKAGES:
         with suppress(importlib.metadata.PackageNotFoundError):
             versions.append(f'{package} {importlib.metadata.version(package)}')
-    return f'{model}, {os.cpu_count()} cores, {platform.system()}; {", ".join(versions)}'
+    return (
+        f'{model}, {os.cpu_count()} cores, {platform.system()}; {", ".join(versions)}'
+    )
 
 
 def main() -> None:
     """Run the groups and write RESULTS.md."""
     options = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     options.add_argument('groups', nargs='*', metavar='GROUP', help=', '.join(_GROUPS))
-    options.add_argument('--out', type=Path, default=_HERE, help='folder for the results')
+    options.add_argument(
+        '--out', type=Path, default=_HERE, help='folder for the results'
+    )
     chosen = options.parse_args()
     chosen.out.mkdir(parents=True, exist_ok=True)
     rows: list[Ratio] = []
@@ -104,7 +118,10 @@ def main() -> None:
         print(f'measuring: {name}', flush=True)
         module, function = _GROUPS[name]
         for row in getattr(importlib.import_module(module), function)():
-            print(f'  {row.what}: {row.median:.3g} times {row.baseline}  {row.note}', flush=True)
+            print(
+                f'  {row.what}: {row.median:.3g} times {row.baseline}  {row.note}',
+                flush=True,
+            )
             rows.append(row)
     today = dt.datetime.now(dt.timezone.utc).date()
     with (chosen.out / 'RESULTS.md').open('w', encoding='utf-8') as file:
@@ -117,7 +134,12 @@ def main() -> None:
         for group, members in groupby(rows, key=lambda row: row.group):
             file.write(f'\n## {group}\n\n')
             cells = (
-                (row.what, f'**{row.median:.3g}**', f'{row.low:.3g} to {row.high:.3g}', *row[-2:])
+                (
+                    row.what,
+                    f'**{row.median:.3g}**',
+                    f'{row.low:.3g} to {row.high:.3g}',
+                    *row[-2:],
+                )
                 for row in members
             )
             print_table(('what', 'ratio', 'range', 'to', ''), cells, file)

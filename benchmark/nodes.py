@@ -24,11 +24,11 @@ import rclpy
 from harness import Ratio, ratio
 from rclpy.experimental import EventsExecutor
 
+from blf_dsc_controller.cli.domains import own_domain
 from blf_dsc_controller.cli.session import (
     NodeProcess,
     environment,
     localhost_environment,
-    own_domain,
 )
 from blf_dsc_controller.configuration.controller import ControllerConfig, Telemetry
 from blf_dsc_controller.configuration.nodes import (
@@ -82,20 +82,31 @@ class StandIn:
         self._executor: Any = EventsExecutor(context=self._context)
         self._executor.add_node(self._node)
         self._states: Any = self._node.create_publisher(
-            message_class(JOINT_STATES.type), JOINT_STATES.name, qos_profile(JOINT_STATES.offered)
+            message_class(JOINT_STATES.type),
+            JOINT_STATES.name,
+            qos_profile(JOINT_STATES.offered),
         )
-        taken, requested = message_class(COMMANDS.type), qos_profile(COMMANDS.requested)
-        self._node.create_subscription(taken, COMMANDS.relative, self._take, requested, raw=True)
+        taken = message_class(COMMANDS.type)
+        requested = qos_profile(COMMANDS.requested)
+        self._node.create_subscription(
+            taken, COMMANDS.relative, self._take, requested, raw=True
+        )
 
     def _take(self, _torque: bytes) -> None:
         self.has_torque = True
 
     def greet(self, state: bytes, begin: float) -> None:
         """Send a state until its torque arrives: a half-matched reader loses messages."""
-        self.until(lambda: self.has_torque, 'the first torque', lambda: self._states.publish(state))
+        self.until(
+            lambda: self.has_torque,
+            'the first torque',
+            lambda: self._states.publish(state),
+        )
         self.first_torque = time.perf_counter() - begin
         takers = len(self.nodes)  # a recorder takes states, too
-        self.until(lambda: self._states.get_subscription_count() == takers, 'its recorder')
+        self.until(
+            lambda: self._states.get_subscription_count() == takers, 'its recorder'
+        )
         self._spin(_SETTLING)
 
     def until(
@@ -109,7 +120,9 @@ class StandIn:
         while not condition():
             self.check()
             if time.perf_counter() - begin > _PATIENCE:
-                raise BlfDscError(f'{self.name}: no sign of {what} after {_PATIENCE:g} s')
+                raise BlfDscError(
+                    f'{self.name}: no sign of {what} after {_PATIENCE:g} s'
+                )
             act()
             self._spin(_PACE)
 
@@ -129,7 +142,8 @@ class StandIn:
         due, busy = time.perf_counter(), 0.0
         for k in range(latency.size):
             if k == _WARM_UP:
-                due, busy = time.perf_counter(), time.clock_gettime(clock)
+                due = time.perf_counter()
+                busy = time.clock_gettime(clock)
             while (left := due - time.perf_counter()) > 0.0:
                 self._executor.spin_once(timeout_sec=left)
             due += _PERIOD
@@ -168,7 +182,9 @@ def _started(
     law = replace(config, telemetry=telemetry, wait_for_subscribers=int(is_recorded))
     folder.mkdir()
     dump(folder / 'config.yaml', {CONTROLLER: law})
-    nodes: dict[str, tuple[str, ...]] = {_NULL_NODE if name == _NULL else CONTROLLER: ()}
+    nodes: dict[str, tuple[str, ...]] = {
+        _NULL_NODE if name == _NULL else CONTROLLER: ()
+    }
     if is_recorded:
         nodes = {RECORDER: ('-p', f'output:={folder / "bag"}'), **nodes}
     with own_domain() as domain, ExitStack() as ending:
@@ -177,7 +193,9 @@ def _started(
         arm = ending.enter_context(closing(StandIn(name)))
         begin = time.perf_counter()
         for node, arguments in nodes.items():
-            arm.nodes.append(NodeProcess(node, folder / 'config.yaml', folder, *arguments))
+            arm.nodes.append(
+                NodeProcess(node, folder / 'config.yaml', folder, *arguments)
+            )
             ending.callback(arm.nodes[-1].stop)
         arm.greet(state, begin)
         yield arm
@@ -192,7 +210,9 @@ def measure() -> Iterator[Ratio]:
             baseline = found[_NULL][:, column]
             for name in (_QUIET, _RECORDED):
                 title = f'{group}, real time at 1 kHz'
-                yield ratio(title, f'{name}: {what}', _NULL, found[name][:, column], baseline)
+                yield ratio(
+                    title, f'{name}: {what}', _NULL, found[name][:, column], baseline
+                )
 
 
 def measure_start() -> Iterator[Ratio]:
@@ -211,7 +231,9 @@ def _figures(
     record = simulate(loop.controller, plant)
     telemetry = PlantTelemetry(plant.joints, record.parameters)
     rows = zip(record.stamps.tolist(), record.measurements, strict=True)
-    first, *states = [telemetry.joint_states(_START + stamp, row)[1] for stamp, row in rows]
+    first, *states = [
+        telemetry.joint_states(_START + stamp, row)[1] for stamp, row in rows
+    ]
     found: dict[str, list[tuple[float, ...]]] = {name: [] for name in names}
     with tempfile.TemporaryDirectory() as folder:
         for k, (name, figures) in itertools.product(range(rounds), found.items()):

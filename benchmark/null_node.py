@@ -17,11 +17,16 @@ def main() -> None:
     """Run until the process is interrupted."""
     rclpy.init()
     node = rclpy.create_node(CONTROLLER)
-    offered, requested = qos_profile(COMMANDS.offered), qos_profile(JOINT_STATES.requested)
+    offered = qos_profile(COMMANDS.offered)
+    requested = qos_profile(JOINT_STATES.requested)
     commands = node.create_publisher(Float64MultiArray, COMMANDS.relative, offered)
     torque = serialize_message(Float64MultiArray(data=[1.0, 2.0]))
     node.create_subscription(
-        JointState, JOINT_STATES.relative, lambda _: commands.publish(torque), requested, raw=True
+        JointState,
+        JOINT_STATES.relative,
+        lambda _: commands.publish(torque),
+        requested,
+        raw=True,
     )
     executor = EventsExecutor()
     executor.add_node(node)

@@ -50,7 +50,10 @@ SOURCE = Path(__file__).with_name('reference.c')
 # The package's kernels are compiled for the native processor too; contraction would change the
 # numbers that are compared.
 FLAGS = ('-O3', '-march=native', '-ffp-contract=off')
-_N, _P, _COLUMNS = 2, 3, 9  # joints, parameters, columns of a row: xi1, torque, theta
+# joints, parameters, columns of a row: xi1, torque, theta
+_N = 2
+_P = 3
+_COLUMNS = 9
 Step = Callable[[float, np.ndarray], None]
 State = Callable[[], tuple[np.ndarray, np.ndarray]]
 CONTROLLER = ControllerConfig()
@@ -63,7 +66,16 @@ def _reference() -> Callable[..., int]:
     """Compile the reference; needs a C compiler named cc."""
     with tempfile.TemporaryDirectory() as folder:
         library = Path(folder, 'reference.so')
-        command = ['cc', *FLAGS, '-shared', '-fPIC', '-o', str(library), str(SOURCE), '-lm']
+        command = [
+            'cc',
+            *FLAGS,
+            '-shared',
+            '-fPIC',
+            '-o',
+            str(library),
+            str(SOURCE),
+            '-lm',
+        ]
         subprocess.run(command, check=True)
         run = ctypes.CDLL(str(library)).run
     run.argtypes = (ctypes.c_void_p, ctypes.c_long, ctypes.c_void_p)
@@ -72,7 +84,8 @@ def _reference() -> Callable[..., int]:
 
 def reference_rows(duration: float) -> np.ndarray:
     """Return rows (samples, 9) of a run in C, without the sample at `duration`."""
-    settings, rows = _settings(), np.zeros((round(duration / T), _COLUMNS))
+    settings = _settings()
+    rows = np.zeros((round(duration / T), _COLUMNS))
     if _reference()(settings.ctypes.data, len(rows), rows.ctypes.data) != 0:
         raise MemoryError
     return rows
@@ -81,18 +94,32 @@ def reference_rows(duration: float) -> np.ndarray:
 def _settings() -> np.ndarray:
     """Lay out `struct settings` of the C file: the same fields in order, integers as long."""
     law = settings_of_config(CONTROLLER)
-    arm, torque, reference = PLANT.arm, PLANT.disturbance, CONTROLLER.reference
+    arm = PLANT.arm
+    torque = PLANT.disturbance
+    reference = CONTROLLER.reference
     values: dict[str, Any] = {
         **{name: getattr(arm, name) for name in ('l1', 'l2', 'm1', 'm2', 'gravity')},
-        **{name: getattr(torque, name) for name in ('constant', 'amplitude', 'frequency', 'phase')},
-        **{name: getattr(torque, name) for name in ('viscous', 'coulomb', 'coulomb_velocity')},
+        **{
+            name: getattr(torque, name)
+            for name in ('constant', 'amplitude', 'frequency', 'phase')
+        },
+        **{
+            name: getattr(torque, name)
+            for name in ('viscous', 'coulomb', 'coulomb_velocity')
+        },
         'q0': PLANT.initial.position,
         'dq0': PLANT.initial.velocity,
         'offset': reference.offset,
         'swing': reference.amplitude,
         'tone': reference.frequency[0],
-        **{name: getattr(law, name) for name in ('bound', 'weight', 'slope_limit', 'knee')},
-        **{name: getattr(law, name) for name in ('K', 'mu', 'time_constant', 'Kp', 'gamma')},
+        **{
+            name: getattr(law, name)
+            for name in ('bound', 'weight', 'slope_limit', 'knee')
+        },
+        **{
+            name: getattr(law, name)
+            for name in ('K', 'mu', 'time_constant', 'Kp', 'gamma')
+        },
         'limit': law.torque_limit,
         'P0': law.initial_estimate[:_P],
         **{name: getattr(law, name) for name in ('Gamma', 'kappa', 'rho', 'sigma')},
@@ -122,7 +149,9 @@ def run(duration: float, state: State, step: Step) -> np.ndarray:
     errors = np.zeros((times.size, 2))
     for k, (qr, dqr, ddqr) in enumerate(sampled(reference_of(CONTROLLER), times)):
         q, dq = state()
-        law.tau = law.update(times[k], T, qr, dqr, ddqr, np.concatenate((q, dq, law.tau)))
+        law.tau = law.update(
+            times[k], T, qr, dqr, ddqr, np.concatenate((q, dq, law.tau))
+        )
         errors[k] = q - qr
         step(times[k], law.tau)
     return errors
@@ -174,7 +203,9 @@ def _integrated(acceleration: Callable[..., np.ndarray], duration: float) -> np.
     return run(duration, lambda: (x[:2].copy(), x[2:].copy()), step)
 
 
-def _numpy_acceleration(q: np.ndarray, dq: np.ndarray, torque: np.ndarray) -> np.ndarray:
+def _numpy_acceleration(
+    q: np.ndarray, dq: np.ndarray, torque: np.ndarray
+) -> np.ndarray:
     arm = PLANT.arm
     P = ((arm.m1 + arm.m2) * arm.l1**2, arm.m2 * arm.l2**2, arm.m2 * arm.l1 * arm.l2)
     M, C, G = dynamics(P, arm.gravity / arm.l1, q, dq)
@@ -225,7 +256,9 @@ def updates(name: str) -> tuple[str, Callable[[], int], int]:
     counts all estimates, the m of the law. Raises RuntimeError if the run learns nothing.
     """
     ahead = (_GROWTH_ROUNDS + 1) * _UPDATES
-    quiet: dict[str, object] = {f'events.{each}': [] for each in ('begin', 'duration', 'payload')}
+    quiet: dict[str, object] = {
+        f'events.{each}': [] for each in ('begin', 'duration', 'payload')
+    }
     duration = _FULL + T * ahead
     loop = load_loop(name, {topics.PLANT: {'duration': duration, **quiet}})
     record = simulate(loop.controller, loop.plant, supervised=False)
@@ -252,10 +285,13 @@ def updates(name: str) -> tuple[str, Callable[[], int], int]:
 def measure_growth() -> Iterator[Ratio]:
     """Measure the time per update relative to the two-link arm's, once the window is full."""
     found = {name: updates(name) for name in ('recommended', 'panda', 'ur5e')}
-    times = interleaved({name: update for name, (_, update, _) in found.items()}, _GROWTH_ROUNDS)
+    times = interleaved(
+        {name: update for name, (_, update, _) in found.items()}, _GROWTH_ROUNDS
+    )
     baseline = times.pop('recommended')
     for name, seconds in times.items():
         size, _, memory = found[name]
         note = f'{1e6 * np.median(seconds):.1f} us an update here, {1e-6 * memory:.1f} MB of state'
-        group, what = 'growth with joints and unknowns', f'{name}: {size}'
+        group = 'growth with joints and unknowns'
+        what = f'{name}: {size}'
         yield ratio(group, what, _TWO_LINKS, seconds, baseline, note)

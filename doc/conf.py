@@ -33,7 +33,8 @@ copyright = author  # noqa: A001 - Sphinx's name
 release = version = __version__
 
 extensions = ['myst_parser', 'sphinx.ext.autodoc', 'sphinx.ext.napoleon']
-exclude_patterns = ['user_docs*', 'standard*', '__*', 'modules.rst', f'{project}*']  # rosdoc2's
+# rosdoc2's
+exclude_patterns = ['user_docs*', 'standard*', '__*', 'modules.rst', f'{project}*']
 myst_enable_extensions = ['dollarmath']
 myst_fence_as_directive = ['math']  # as GitHub writes equations
 myst_heading_anchors = 3
@@ -64,7 +65,9 @@ def draw(translator: HTML5Translator, node: nodes.math | nodes.math_block) -> No
     """Write an equation as SVG; LaTeX that is not understood is a warning of the build."""
     inline = isinstance(node, nodes.math)
     size = 16.0  # of a letter, to which the text's size is 1 em
-    equation = ziamath.Latex(node.astext(), size=size, color='currentColor', inline=inline)
+    equation = ziamath.Latex(
+        node.astext(), size=size, color='currentColor', inline=inline
+    )
     if '\\' in equation.mathmlstr():
         getLogger(__name__).warning('unknown LaTeX: %s', node.astext(), location=node)
     drawing = equation.svgxml()
