@@ -111,7 +111,7 @@ release: $(READY)-release ## Check versions and metadata, and build sdist and wh
 	    $(RUN) -m blf_dsc_controller precompile --package --config $$arm || exit 1; done
 	@rm -rf out/dist && $(VENV)/bin/python -m build --outdir out/dist . && \
 	$(VENV)/bin/python -m twine check --strict out/dist/*
-	@! grep -q '@.*[.]invalid' package.xml || echo 'package.xml has no maintainer that can be' \
+	@! grep -q '@users[.]noreply' package.xml || echo 'package.xml has no maintainer that can be' \
 	    'reached, and so has what is in out/dist: see CONTRIBUTING.md before you publish it.'
 
 fuzz: $(READY)-test ## Feed random files and names to everything that reads them (EXAMPLES of each kind)

@@ -50,7 +50,7 @@ nitpicky = True
 nitpick_ignore_regex = [('py:.*', '.*')]
 
 html_theme = 'furo'
-html_title = f'{project} {release}'
+html_title = f'BLF-DSC {release}'
 html_show_copyright = False
 # Drawn when the site is made: no script, no font, no request, in any browser.
 html_math_renderer = 'drawn' if ziamath else 'mathjax'

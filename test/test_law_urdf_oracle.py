@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The law of an arm from a URDF equals the one that doc/theory.md describes, over 20 s."""
+"""The law of an arm from a URDF equals the one that the pages describe, over 20 s."""
 
 from __future__ import annotations
 

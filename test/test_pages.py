@@ -11,6 +11,7 @@ import re
 import shlex
 import subprocess
 import sys
+import textwrap
 from itertools import pairwise
 from pathlib import Path
 from urllib.parse import urlsplit
@@ -23,6 +24,7 @@ from blf_dsc_controller.configuration.nodes import NODES, known_names, load, rea
 from blf_dsc_controller.studies.monte_carlo import load_study
 
 ROOT = Path(__file__).resolve().parents[1]
+DOC = ROOT / 'doc'
 OUTSIDE = ('README.md', 'CONTRIBUTING.md', 'examples/mujoco_plant/README.md')
 PAGES = [*(ROOT / name for name in OUTSIDE), *sorted((ROOT / 'doc').glob('*.md'))]
 SAVED = re.compile(r'Save this as\s`(\w+\.py)`')
@@ -75,6 +77,16 @@ def test_python_blocks_run_and_print_the_output_shown_below_them(
                 exec(compile(block.content, page, 'exec'), program)  # noqa: S102 - our own pages
             if below and below.info == 'text':
                 assert printed.getvalue() == below.content
+
+
+def test_python_of_the_home_page_keeps_the_bound(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    text = (DOC / 'index.rst').read_text()
+    (block,) = re.findall(r'code-block:: python\n\n((?: {3}.*\n|\n)+)', text)
+    program = {}
+    exec(textwrap.dedent(block), program)  # noqa: S102 - our own pages
+    assert program['metrics'].max_error_ratio < 1.0
+    assert Path('pictures/change.png').is_file()
 
 
 def blocks_of(page):
@@ -210,9 +222,6 @@ def subcommand(name):
     raise AssertionError
 
 
-DOC = ROOT / 'doc'
-
-
 @pytest.fixture(scope='module')
 def site(tmp_path_factory):
     """Every page of the site by its name, built as by `make docs`, which fails at a dead link."""
@@ -270,7 +279,7 @@ def test_links_outside_the_site_are_valid(name, site):
 
 @pytest.mark.nightly
 def test_every_picture_has_a_make_command():
-    text = (DOC / 'figures.md').read_text()
+    text = (DOC / 'gallery.md').read_text()
     shown = {
         path.name
         for folder in ('doc', 'benchmark')

@@ -128,7 +128,7 @@ def test_saved_configurations_are_those_that_ran(report, found):
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = {
     name: (ROOT / 'doc' / f'{name}.md').read_text()
-    for name in ('theory', 'errata', 'tuning')
+    for name in ('theory', 'departures', 'learning', 'stability', 'errata', 'tuning')
 }
 TESTS = ''.join(path.read_text() for path in (ROOT / 'test').glob('test_*.py'))
 
@@ -198,14 +198,14 @@ def test_parameter_error_depends_on_the_phase_of_the_disturbance_as_documented()
     for phase in (0.0, np.pi / 2, 17.0):
         assert error_at_phase('two_tone', phase) < 5e-5
         assert 0.004 < error_at_phase('excitation', phase) < 0.008
-    for page in ('README.md', 'doc/theory.md', 'doc/comparison.md'):
+    for page in ('README.md', 'doc/stability.md', 'doc/comparison.md'):
         text = ' '.join((ROOT / page).read_text().split())
         assert '14.8 %' in text
         assert 'below 0.005 %' in text
 
 
 def test_numbers_on_the_pages_match_the_runs():
-    assert 'a fifth is left' in ' '.join(PAGES['theory'].split())
+    assert 'a fifth is left' in ' '.join(PAGES['stability'].split())
     errors = [
         run(
             configured('recommended', 60.0, {'learning.weight': weight})

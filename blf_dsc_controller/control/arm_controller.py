@@ -43,6 +43,8 @@ class Load(NamedTuple):
 class ArmController:
     """Joint states in, torques out: the law with its learning, its checks and its safe stops.
 
+    Use it as a context manager::
+
         with ArmController('my.yaml', record='my_bag') as controller:
             while running:
                 torque = controller.update(stamp, q, dq, effort)
