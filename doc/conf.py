@@ -59,6 +59,9 @@ if ziamath:
     ziamath.config.precision = 2
 html_static_path = ['_static']
 html_css_files = ['site.css']
+# An excerpt would be fetched, which browsers refuse for files on disk: the list of results would end
+# after the first.
+html_show_search_summary = False
 
 
 def draw(translator: HTML5Translator, node: nodes.math | nodes.math_block) -> None:

@@ -48,8 +48,8 @@ _of_watchdog = partial(parameter, read_only='it is read once, when the node star
 _of_view = partial(parameter, read_only='the page is served once, when the node starts')
 Config = TypeVar('Config')
 _HEADER = (
-    '| name | description | default | unit | range | live | type | symbol |\n'
-    '| --- | --- | --- | --- | --- | --- | --- | --- |\n'
+    '| name | default | unit | live | description | type and range |\n'
+    '| --- | --- | --- | --- | --- | --- |\n'
 )
 
 
@@ -357,23 +357,33 @@ def _is_of_others(section: Section) -> bool:
 def with_tables(page: str) -> str:
     """Return the Markdown page of all parameters: what is above its first table stays."""
     above = page.partition('\n## ')[0]
-    tables = (
-        f'\n## {node}\n\n{_HEADER}{"".join(map(_row, parameters(cls)))}'
-        for node, cls in NODES.items()
-    )
-    return above + ''.join(tables)
+    sections = (_section(node, parameters(cls)) for node, cls in NODES.items())
+    return above + ''.join(sections)
+
+
+def _section(node: str, params: Iterable[Parameter]) -> str:
+    """Return a node's section: a table of its own parameters, then one for each group."""
+    groups: dict[str, list[Parameter]] = {}
+    for param in params:
+        group, _, _ = param.name.rpartition('.')
+        groups.setdefault(group, []).append(param)
+    tables = [f'\n## {node}\n']
+    for group, members in groups.items():
+        heading = f'\n### {node}: {group}\n' if group else ''
+        tables.append(f'{heading}\n{_HEADER}{"".join(map(_row, members))}')
+    return ''.join(tables)
 
 
 def _row(param: Parameter) -> str:
+    symbol = f' ({param.symbol})' if param.symbol else ''
+    kind = '; '.join(part for part in (param.kind, param.constraints) if part)
     cells = (
         f'`{param.name}`',
-        param.description,
         f'`{format_value(param.default)}`',
         param.unit,
-        param.constraints,
         '' if param.read_only else '•',
-        param.kind,
-        param.symbol,
+        f'{param.description}{symbol}',
+        kind,
     )
     return '| ' + ' | '.join(cell.replace('|', '\\|') for cell in cells) + ' |\n'
 
