@@ -59,8 +59,8 @@ if ziamath:
     ziamath.config.precision = 2
 html_static_path = ['_static']
 html_css_files = ['site.css']
-# An excerpt would be fetched, which browsers refuse for files on disk: the list of results would end
-# after the first.
+# An excerpt would be fetched, which browsers refuse for files on disk: the list of results would
+# end after the first.
 html_show_search_summary = False
 
 
