@@ -3,9 +3,9 @@
 
     python franka_simulator.py ADDRESS [WHAT@CYCLE ...]
 
-Once the first torque of a motion has come, each step waits for the torque of the last state, so
-that results do not depend on the computer.  Cycles are counted from that torque.  It prints
-`ready` when it accepts connections.  WHAT is one of
+Once the first torque of a motion has come, each step waits for the torque of the last
+state, and until then time passes slowly, so that results do not depend on the computer.
+Cycles are counted from that torque.  It prints `ready` when it accepts connections.  WHAT is one of
 
     load=KG     a mass appears in the hand, or disappears again (0)
     reflex      the motion is aborted, as after a collision
@@ -30,6 +30,7 @@ _HAND = 'robot0_hand'
 _GRASP = np.array([0.0, 0.0, 0.12])  # m, of the load in the frame of the hand
 _PATIENCE = 20.0  # s, for a torque; then the client is gone
 _STEP = 0.001  # s
+_SLOW = 0.3  # s, for a step of a motion that waits for its first torque
 
 
 class Simulator:
@@ -64,7 +65,7 @@ class Simulator:
         if not self.robot.current_motion_id:
             self.cycle = 0
         if self.cycle == 0:
-            time.sleep(_STEP)
+            time.sleep(_SLOW if self.robot.current_motion_id else _STEP)
         else:
             self.wait()
         for what in self.events[self.cycle] if self.cycle else ():

@@ -42,6 +42,9 @@ class PlantDriver(Driver):
         self.torques = []
         return ['connected to the simulated arm']
 
+    def positions(self):
+        return self.plant.measure().reshape(3, -1)[0]
+
     def start(self):
         self.calls.append('start')
 

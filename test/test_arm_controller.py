@@ -103,3 +103,18 @@ def test_presets_and_files_are_found_by_name_and_bags_are_not_overwritten(tmp_pa
     (tmp_path / 'bag').mkdir()
     with pytest.raises(BlfDscError, match='exists'):
         blf.ArmController('recommended', record=tmp_path / 'bag')
+
+
+@pytest.mark.parametrize(('away', 'is_used'), [(0.0, True), (0.01, False)])
+def test_prepared_start_is_used_if_the_arm_is_still_there(away, is_used, tmp_path):
+    """From elsewhere the approach is planned again; both replay."""
+    loop = blf.load_loop('recommended', {'sim_plant': {'initial.position': [2.0, 1.5]}})
+    plant = plant_of(loop.plant)
+    q = plant.measure().reshape(3, -1)[0]
+    with blf.ArmController(loop.controller, record=tmp_path / 'bag') as controller:
+        controller.prepare(q + 1e-5 + away)
+        torques = run(controller, plant, loop.plant, 100)
+        assert (np.abs(controller.error) < controller.bound).all()
+    unprepared = blf.simulate(loop.controller, loop.plant).run().torque[:100]
+    assert np.array_equal(torques, unprepared) is not is_used
+    assert blf.verify(tmp_path / 'bag').difference is None

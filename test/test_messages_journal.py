@@ -17,6 +17,7 @@ POINT = {'time': 1.0, 'positions': [0.5, 1], 'velocities': []}
 EXAMPLES = {
     'configure': {'parameters': {'joints': ['a'], 'law': 'dsc', 'x': 1.5, 'y': True}},
     'activate': {},
+    'prepare': {'positions': [0.5, 1]},
     'start': {'resumed': False},
     'trajectory': {'joints': ['a', 'b'], 'points': [POINT], 'begin': None, 'at': 0.0},
     'target': {

@@ -136,6 +136,19 @@ class ArmController:
                 self._record(nanoseconds, values, torque)
         return answer
 
+    def prepare(self, q: ArrayLike) -> None:
+        """Plan the start of an arm that rests at positions q (n,) [rad].
+
+        Call it before the first `update`, if the robot waits for a torque from its
+        first state on: planning the approach takes several milliseconds.
+
+        Raises:
+            StateError: q has another shape.
+            StartError: the law cannot take over there.
+            MotionError: no approach from there keeps the limits.
+        """
+        self._loop.guard.prepare(self._checked('q', q))
+
     def _nanoseconds(self, stamp: float) -> int:
         """Return the stamp [ns]; a clock from zero, which ROS takes for none, starts at 1 s."""
         nanoseconds = round(stamp * _NANO)

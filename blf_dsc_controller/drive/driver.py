@@ -75,6 +75,10 @@ class Driver(ABC):
         """Reach the robot, and set its thresholds and its load; return remarks for the user."""
 
     @abstractmethod
+    def positions(self) -> ArrayLike:
+        """Return the joint positions (n,) [rad] of the robot at rest, before `start`."""
+
+    @abstractmethod
     def start(self) -> None:
         """Begin to command torques; from now on the robot waits for one after each state."""
 

@@ -130,6 +130,11 @@ class FrankaDriver(Driver):
                 f'robot.drive_payload is {known:g} kg: what the URDF lacks of it should be there'
             )
 
+    def positions(self) -> Vector:
+        """Return the joint positions (7,) [rad]."""
+        with self._explained('no state was received'):
+            return np.array(self._robot.read_once().q)
+
     def start(self) -> None:
         """Begin torque control."""
         with self._explained('torque control was refused'):

@@ -93,11 +93,14 @@ class DriveLoop:
 
         Raises:
             DriverError: the robot refused to start.
+            StartError: the law cannot take over where the arm is.
+            MotionError: no approach from there keeps the limits.
             Exception: an error of the controller, after the arm was brought to rest.
         """
         gc.collect()
         gc.freeze()  # what is loaded by now stays: scanning it would stall the loop
         try:
+            self._controller.prepare(self._driver.positions())
             self._driver.start()
             self._control()
         except ReflexError as error:

@@ -117,6 +117,7 @@ SCHEMA: Mapping[str, Mapping[str, Field]] = {
         'topics': Field(NAMES_BY_NAME, optional=True),  # used, by our name
     },
     'activate': {},
+    'prepare': {'positions': Field(NUMBERS)},  # rad, of the arm at rest
     'start': {'resumed': Field(FLAG)},
     'trajectory': {
         'joints': Field(NAMES),

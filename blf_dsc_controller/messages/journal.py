@@ -30,6 +30,7 @@ class EventType(str, Enum):
 
     CONFIGURE = 'configure'
     ACTIVATE = 'activate'
+    PREPARE = 'prepare'  # the approach is planned before the first state
     START = 'start'  # the law receives its first state
     TRAJECTORY = 'trajectory'
     TARGET = 'target'  # of a stream; these are on `~/targets`

@@ -21,10 +21,15 @@ from blf_dsc_controller.configuration.schema import differences, flatten
 from blf_dsc_controller.errors import BlfDscError, StartError
 from blf_dsc_controller.law.check_state import CONTRADICTION, INVALID
 from blf_dsc_controller.law.checks import is_valid_state
-from blf_dsc_controller.law.factory import begin, controller_of
+from blf_dsc_controller.law.factory import controller_of
 from blf_dsc_controller.messages import codecs
 from blf_dsc_controller.messages.journal import EventType, Journal
-from blf_dsc_controller.reference.approach import MotionError, check_takeover
+from blf_dsc_controller.reference.approach import (
+    BlendedReference,
+    MotionError,
+    check_takeover,
+    plan_start,
+)
 from blf_dsc_controller.reference.retargeting import (
     PlannedMotion,
     Target,
@@ -52,6 +57,7 @@ from blf_dsc_controller.supervision.velocity import Velocity
 
 Vector = NDArray[np.float64]
 _NANO = 1e-9
+_SAME_PLACE = 0.05  # of the bound
 _MANY = 0.5  # states missed for each that came
 _LONG_GAP = 2.5  # samples
 _IN_A_ROW = 0.1  # s between two states, at most
@@ -81,6 +87,13 @@ class Plan(NamedTuple):
     at: float  # s since the start, when it takes effect
     before: np.ndarray  # packed reference that it continues
     motion: PlannedMotion
+
+
+class PreparedStart(NamedTuple):
+    """A start that was planned before the first state."""
+
+    positions: Vector  # rad, from which it begins at rest
+    motion: BlendedReference
 
 
 class Guard:
@@ -137,6 +150,7 @@ class Guard:
         self._stop_speed = 0.0  # rad/s, largest of a joint at the stop
         self._peak_speed = 0.0  # rad/s, since then
         self._speeding = 0.0  # s, for which the arm has been faster in the stop
+        self._prepared: PreparedStart | None = None
         self._clean = True  # whether the window holds valid samples only
         self._resumable = False  # whether the law may continue along its reference
         self.journal.note(EventType.CONFIGURE, parameters=flatten(config))
@@ -317,7 +331,9 @@ class Guard:
         resumed = self._resumes(stamp, q, dq)
         if not resumed:
             try:
-                self.settled = begin(self.controller, self.config, q, dq)
+                motion = self._plan_start(q, dq)
+                self.controller.reference_vector = motion.vector
+                self.settled = motion.settled
                 if not self.commanding:
                     check_first_torque(self.controller, self.config, measurement)
             except (StartError, MotionError) as error:
@@ -329,6 +345,32 @@ class Guard:
         self.watchdog.switch(self.config.safety.watchdog, stamp)
         self.supervisor.enter(Phase.APPROACHING)
         return True
+
+    def prepare(self, positions: Vector) -> None:
+        """Plan the start from rest at `positions` (n,) [rad], before the first state.
+
+        The first torque is then ready within a sample.  If the arm is elsewhere by
+        then, the start is planned again.
+
+        Raises:
+            StartError: the law cannot take over there.
+            MotionError: no approach from there keeps the limits.
+        """
+        bound = self.controller.bound_at(0.0)
+        motion = plan_start(self.config, bound, positions, np.zeros(self._n))
+        self._note(EventType.PREPARE, positions=positions.tolist())
+        self._prepared = PreparedStart(np.array(positions), motion)
+
+    def _plan_start(self, q: Vector, dq: Vector) -> BlendedReference:
+        """Return the reference from q (n,) [rad] and dq (n,) [rad/s] on, at t = 0."""
+        prepared = self._prepared
+        self._prepared = None
+        if prepared is not None:
+            moved = np.abs(q - prepared.positions)
+            is_there = np.all(moved < _SAME_PLACE * np.array(self.config.barrier.bound))
+            if is_there and self._takes_over(0.0, q, dq, prepared.motion.vector):
+                return prepared.motion
+        return plan_start(self.config, self.controller.bound_at(0.0), q, dq)
 
     def check_support(self, measurement: Vector) -> None:
         """Refuse to start if nothing shows what holds a live arm."""
@@ -347,8 +389,15 @@ class Guard:
         law, t = self.controller, self._time_of(stamp)
         if not self._resumable or stamp <= self.last_stamp:
             return False
+        return self._takes_over(t, q, dq, law.reference_vector)
+
+    def _takes_over(
+        self, t: float, q: Vector, dq: Vector, reference_vector: Vector
+    ) -> bool:
+        """Whether the law can take over at time t [s] along a reference."""
+        bound = self.controller.bound_at(t)
         try:
-            check_takeover(self.config, law.bound_at(t), q, dq, law.reference_vector, t)
+            check_takeover(self.config, bound, q, dq, reference_vector, t)
         except StartError:
             return False
         return True
@@ -560,6 +609,7 @@ class Guard:
     def retune(self, config: ControllerConfig) -> None:
         """Apply a configuration, between two samples."""
         self._note(EventType.PARAMETERS, parameters=differences(self.config, config))
+        self._prepared = None
         if self.supervisor.running:
             last = self._safe_torque.last.measurement
             retuning.apply_bumpless(self.controller, config, self.time, last)
