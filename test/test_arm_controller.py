@@ -108,7 +108,8 @@ def test_presets_and_files_are_found_by_name_and_bags_are_not_overwritten(tmp_pa
 @pytest.mark.parametrize(('away', 'is_used'), [(0.0, True), (0.01, False)])
 def test_prepared_start_is_used_if_the_arm_is_still_there(away, is_used, tmp_path):
     """From elsewhere the approach is planned again; both replay."""
-    loop = blf.load_loop('recommended', {'sim_plant': {'initial.position': [2.0, 1.5]}})
+    start = {'initial.position': [2.0, 1.5], 'duration': 0.2}
+    loop = blf.load_loop('recommended', {'sim_plant': start})
     plant = plant_of(loop.plant)
     q = plant.measure().reshape(3, -1)[0]
     with blf.ArmController(loop.controller, record=tmp_path / 'bag') as controller:
