@@ -116,6 +116,12 @@ def test_a_stop_is_logged_once_with_how_to_continue_on_a_real_arm(ros, log):
     ros.spin(0.2)
     (stop,) = log('real', '', FATAL)
     assert stop.endswith('/real/blf_dsc_controller/reset starts again')
+    node.guard.supervisor.add(
+        'the arm speeds up in the safe stop'
+    )  # as it may do later
+    node._report_if_changed(node.guard)
+    ros.until(lambda: len(log('real', '', FATAL)) == 2)
+    assert log('real', 'the arm speeds up in the safe stop', FATAL)
 
 
 def test_diagnostics_tell_what_is_held(ros):

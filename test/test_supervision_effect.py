@@ -17,6 +17,8 @@ from blf_dsc_controller.configuration.schema import build, change
 from blf_dsc_controller.simulation.loop import START, simulate
 from blf_dsc_controller.supervision.command_effect import CommandEffect
 from blf_dsc_controller.supervision.guard import Guard
+from blf_dsc_controller.supervision.last_state import LastState
+from blf_dsc_controller.supervision.safe_torque import safe_torque
 from blf_dsc_controller.supervision.supervisor import Reason
 from sim_plant.plant import plant_of
 
@@ -120,7 +122,9 @@ def test_commands_that_do_not_arrive_leave_nothing_in_the_safe_torque(preset):
     guard, q, _, torques, stop = stopped_by(
         loop.controller, plant, reach=lambda torque: 0.0 * torque
     )
-    assert guard.supervisor.reason is Reason.OUTSIDE_BOUND
+    is_told = guard.supervisor.reason is Reason.NO_EFFECT  # by the effort of an FR3
+    assert is_told or 'but the arm has not accelerated' in guard.supervisor.text
+    assert 'activate the effort controller' in guard.supervisor.text
     assert np.abs(guard.samples.disturbance).max() < 2.0
     assert np.abs(torques[-1]).max() < 3.0
     again = stop + round(1.0 / loop.controller.sample_time)
@@ -144,3 +148,83 @@ def test_effect_is_proven_by_a_lasting_acceleration_after_the_stop():
     assert effect.is_proven
     effect.restart()
     assert not effect.is_proven
+
+
+def brakes():
+    """Return what makes all readings stay at the first ones, at rest."""
+    held = []
+
+    def hold(q, dq):
+        held.append(q.copy())
+        q[:] = held[0]
+        dq[:] = 0.0
+
+    return hold
+
+
+@pytest.mark.parametrize('preset', ['panda', 'ur5e_driver'])
+def test_brakes_in_motion_are_told_after_the_error_has_passed_the_bound(preset):
+    """Within 6 to 64 ms: too soon for what tells them from an error at rest."""
+    loop = load_loop(preset)
+    plant = change(loop.plant, {'duration': 0.0})
+    guard, *_ = stopped_by(loop.controller, plant, spoil=brakes())
+    assert guard.supervisor.reason is Reason.OUTSIDE_BOUND
+    assert guard.supervisor.text.count('but the arm has not accelerated') == 1
+
+
+@pytest.mark.parametrize('preset', ['fr3', 'panda'])
+def test_measured_efforts_explain_an_error_past_the_bound(preset):
+    """One joint whose commands are lost in motion; nothing is learned from it."""
+    loop = load_loop(preset)
+    plant = change(loop.plant, {'duration': 0.0})
+
+    def lose(torque):
+        return np.where(np.arange(7) == 1, 0.0, torque)
+
+    guard, *_ = stopped_by(loop.controller, plant, reach=lose)
+    assert guard.supervisor.reason is Reason.NO_EFFECT
+    assert "_joint2' lacks -" in guard.supervisor.text
+    assert np.abs(guard.samples.disturbance).max() < 2.0
+
+
+@pytest.mark.parametrize('effort', ['whole', 'unknown'])
+def test_commands_that_arrive_are_not_said_to_have_no_effect(effort):
+    """A load far too heavy: the error passes the bound, and the arm accelerates with it."""
+    loop = load_loop('panda')
+    fall = {
+        'duration': 0.0,
+        'events.begin': [1.0],
+        'events.duration': [0.0],
+        'events.payload': [12.0],
+    }
+    config = change(loop.controller, {'robot.effort': effort})
+    guard, *_ = stopped_by(config, change(loop.plant, fall))
+    assert guard.supervisor.reason is Reason.OUTSIDE_BOUND
+    assert 'effort controller' not in guard.supervisor.text
+
+
+def test_load_known_before_is_used_if_the_arm_speeds_up_in_the_stop():
+    """A drive of the wrong sign: damping drives the arm, and so does what is observed."""
+    rig = Rig({'safety.torque': 'hold_gravity'})
+    rig.step(300)
+    rig.guard.fail('by the test')
+    known = rig.guard.samples.disturbance.copy()
+    rig.push[:] = [0.0, 2.0]
+    rig.actuate = lambda raw: []  # the last torque is held: nothing brakes
+    seen = []
+    rig.sense = lambda state: [state.raw()] if seen.append(state) is None else []
+    for _ in range(3000):
+        rig.step()
+        if 'speeds up' in rig.supervisor.text:
+            break
+    assert rig.supervisor.text.endswith('rad/s: engage the brakes')
+    guard = rig.guard
+    safety = rig.config.safety
+    settings = guard.controller.settings
+    for _ in range(50):
+        rig.step()
+    last = LastState(2)
+    last.take(0, np.concatenate(seen[-1][1:]))
+    goal = safe_torque(safety, settings, last, guard.samples.estimate, known)
+    np.testing.assert_allclose(rig.commands[-1], goal, rtol=0.0, atol=1e-9)
+    assert rig.supervisor.text.count('speeds up') == 1

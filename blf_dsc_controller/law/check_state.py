@@ -43,12 +43,15 @@ class Checks(NamedTuple):
     least_ratio: Cell
     # estimates and d^3 from before the error grew
     consistent: Annotated[Array, 'm + n']
+    # measured inertia of each joint over the assumed, of the same sample
+    consistent_scale: Annotated[Array, 'n']
     recent: Annotated[Array, 'n']  # N m, average of the commands over _RECENT
     before: Annotated[Array, 'n']  # N m, average of them over _BEFORE
     compares: Cell  # 1: measured efforts are torques, to be compared with the commands
     lack: Annotated[Array, 'n']  # N m, average of commands less efforts over _RECENT
     # N m, of it the error of the model of what the drives add
     known: Annotated[Array, 'n']
+    usual: Annotated[Array, 'n']  # N m, average of the lack over _BEFORE
     lacking: Cell  # s, since a lack has become too large
     read: Annotated[Array, '2 * n']  # q and dq as last read
     age: Cell  # s, since they were new

@@ -91,6 +91,8 @@ def keep_consistent(
     checks.least_ratio[0] = ratio
     for j in range(settings.m + settings.n):
         checks.consistent[j] = checks.kept[j]
+    for i in range(settings.n):
+        checks.consistent_scale[i] = state.gain_scale[i]
 
 
 @inner

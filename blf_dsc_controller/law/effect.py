@@ -102,7 +102,8 @@ def compare_effort(
     """Return the flags for efforts that do not follow the commands.
 
     The drives' own model of what they add may differ from the law's: then what the efforts lack
-    must not change while no joint moves.
+    must not change while no joint moves.  In motion its usual value explains an error past the
+    bound.
     """
     if checks.compares[0] == 0.0:
         return 0
@@ -114,8 +115,10 @@ def compare_effort(
             lack += signals.added[i]
         if begins:
             checks.lack[i] = lack if is_relative else 0.0
+            checks.usual[i] = checks.lack[i]
         elif isfinite(lack):
             checks.lack[i] += min(1.0, T / _RECENT) * (lack - checks.lack[i])
+            checks.usual[i] += min(1.0, T / _BEFORE) * (lack - checks.usual[i])
         if moves:
             checks.known[i] = checks.lack[i] if is_relative else 0.0
         excess = abs(checks.lack[i] - checks.known[i])

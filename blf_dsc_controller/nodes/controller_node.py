@@ -65,7 +65,8 @@ class ControllerNode(LoopNode[ControllerConfig]):
         # whether the tracking errors had subscribers at the last count
         self._heard = False
         self._observed = self._started = False
-        self._logged = Phase.INACTIVE, 0, False  # phase, stops, silenced
+        # phase, stops, silenced, text of a stop
+        self._logged = Phase.INACTIVE, 0, False, ''
         self._ends_at = 0.0  # s, at the latest, since a signal
         # joint states processed by then, and when the last was
         self._last_seen = 0, 0.0
@@ -382,13 +383,15 @@ class ControllerNode(LoopNode[ControllerConfig]):
 
     def _log_phase(self, guard: Guard) -> None:
         supervisor = guard.supervisor
-        now = supervisor.phase, supervisor.stops, guard.silenced
+        is_stopped = supervisor.phase is Phase.SAFE_STOP  # its text may grow
+        text = supervisor.text if is_stopped else ''
+        now = supervisor.phase, supervisor.stops, guard.silenced, text
         if now == self._logged:
             return
         self._logged = now
         if guard.silenced:
             self.get_logger().warning(supervisor.text)
-        elif supervisor.phase is Phase.SAFE_STOP:
+        elif is_stopped:
             stop = f'{self.config.safety.torque} torque: {supervisor.text}'
             self.get_logger().fatal(
                 f'{stop}; {self.get_fully_qualified_name()}/reset starts again'

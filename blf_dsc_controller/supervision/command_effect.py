@@ -11,6 +11,8 @@ Vector = NDArray[np.float64]
 _SETTLING = 0.01  # s, for which the velocities lag behind the stop
 _AVERAGED = 0.02  # s, against their noise
 _NOTICED = 0.05  # of the torque limit
+_CHANGED = 0.2  # of it: a command that changes by more would have accelerated the arm
+_PATIENCE = 0.1  # s
 
 
 class CommandEffect:
@@ -28,6 +30,7 @@ class CommandEffect:
     def restart(self) -> None:
         """Forget all that has been seen."""
         self._elapsed = 0.0
+        self._unanswered = 0.0
         self._average[:] = 0.0
         self.is_proven = False
 
@@ -40,3 +43,14 @@ class CommandEffect:
         self._average += share * (accelerating - self._average)
         largest = float((np.abs(self._average) / limit).max())
         self.is_proven = self.is_proven or largest > _NOTICED
+
+    def is_missing(self, change: Vector, limit: Vector, dt: float) -> bool:
+        """Whether commands that changed by these torques (n,) [N m] have had none for some time.
+
+        `dt` [s] is the time since the last call; it answers once.
+        """
+        has_changed = bool((np.abs(change) > _CHANGED * limit).any())
+        if self.is_proven or not has_changed or self._unanswered > _PATIENCE:
+            return False
+        self._unanswered += dt
+        return self._unanswered > _PATIENCE

@@ -66,8 +66,10 @@ _FASTER = 0.5
 _GROWING = 0.95  # of the largest speed so far
 _SPEEDS_UP = 0.2  # s
 
-# Commands that do not reach the arm may be why.
-_PERHAPS_UNREACHED = (Reason.OUTSIDE_BOUND, Reason.SATURATED, Reason.VELOCITY)
+# Commands that do not reach the arm may be why, or velocities that are not its own: both wind up
+# the estimates.
+_PERHAPS_UNREACHED = (Reason.OUTSIDE_BOUND, Reason.SATURATED)
+_WINDING_UP = (*_PERHAPS_UNREACHED, Reason.VELOCITY)
 
 _REASONS: dict[type[codecs.MessageError], Reason] = {
     codecs.MissingJointError: Reason.JOINT_MISSING,
@@ -303,11 +305,14 @@ class Guard:
             self._stop(*fault)
         else:
             self.supervisor.add(fault.text)
-        q, dq, _ = measurement.reshape(3, -1)
-        limit = self.config.safety.velocity_limit
-        dq[:] = np.clip(checks.derived, -limit, limit)
         self._velocity = Velocity(self._n)
-        self._velocity.begin(stamp, q)
+        before = stamp - round(self._gap / _NANO)
+        self._velocity.begin(before, checks.read_before[: self._n])
+        self._velocity.replace(stamp, measurement)
+        # What the wrong velocities showed of the rotors is as wrong.
+        self.controller.state.gain_scale[:] = checks.consistent_scale
+        # Else the change from the wrong velocity would pass for an acceleration.
+        self._safe_torque.last.dq[:] = measurement[self._n : -self._n]
         checks.readings[0] = 0.0
 
     def _check_speed(self) -> None:
@@ -481,7 +486,7 @@ class Guard:
             text += f'; {rate_mismatch((1.0 + missed) * T, T)}'
         was_running = self.supervisor.running
         if self.supervisor.stop(reason, text):
-            if was_running and reason in _PERHAPS_UNREACHED:
+            if was_running and reason in _WINDING_UP:
                 self.samples.return_to_consistent()
             reached = reason not in (*_PERHAPS_UNREACHED, Reason.NO_EFFECT)
             self._stop_speed = float(np.abs(self.controller.checks.derived).max())
@@ -509,7 +514,21 @@ class Guard:
             self.config.safety, self.controller.settings, self.samples.estimate, dt
         )
         self.journal.commands += torque is not None
+        if self._safe_torque.missed_change is not None:
+            self._add_missing_effect(self._safe_torque.missed_change)
         return torque
+
+    def _add_missing_effect(self, change: Vector) -> None:
+        """Say that commands that have changed by these torques (n,) [N m] do not move the arm."""
+        if self.supervisor.reason is Reason.NO_EFFECT:
+            return
+        limit = self.controller.settings.torque_limit
+        worst = int(np.argmax(np.abs(change) / limit))
+        self.supervisor.add(
+            f'the torque of joint {self.config.joints[worst]!r} has changed by '
+            f'{change[worst]:+.4g} N m since, but the arm has not accelerated: release the brakes, '
+            'activate the effort controller, or free it from what holds it'
+        )
 
     def activate(self) -> None:
         """Take command with the next state and what was learned, after a fault: before it."""

@@ -70,6 +70,8 @@ class SafeTorque:
         load: torque (n,) [N m] that the model lacks; initially the disturbance estimate of the law.
         commanded: the last torque (n,) [N m], from the law or this ramp.
         last: the last usable joint state.
+        missed_change: change (n,) [N m] of the commands since the stop to which the arm has not
+            answered, for the torque that showed it; else None.
         longest_step: time [s] for which one torque may change at the rate limit.
         scale: factor (n,) on the damping: measured inertia of the joints over the assumed.
     """
@@ -78,6 +80,7 @@ class SafeTorque:
         self.commanded = np.zeros(n)
         self.load = np.zeros(n)
         self.scale = np.ones(n)
+        self.missed_change: Vector | None = None
         self.longest_step = inf
         self.last = LastState(n)
         self._start = np.zeros(n)
@@ -135,6 +138,7 @@ class SafeTorque:
         """Return the torque (n,) [N m] `dt` [s] later; None before the first usable state."""
         if self.last.age == inf:
             return None
+        self.missed_change = None
         if safety.torque == 'hold_gravity' and self._observes:
             needed = self._needed(settings, estimate)
             if needed is not None:
@@ -163,8 +167,12 @@ class SafeTorque:
         if not self._reached:
             still = model_torque(settings, estimate, self.last.q)
             still -= added_torque(settings, self.last.q)
-            self._effect.update(needed - still, settings.torque_limit, dt)
+            limit = settings.torque_limit
+            self._effect.update(needed - still, limit, dt)
             self._reached = self._effect.is_proven
+            change = self.commanded - self._start
+            if self._effect.is_missing(change, limit, dt):
+                self.missed_change = change
         if self._reached:
             self._update_load(settings, needed, dt)
 

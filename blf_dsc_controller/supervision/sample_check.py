@@ -14,6 +14,9 @@ from blf_dsc_controller.law.controller import Controller
 from blf_dsc_controller.supervision.supervisor import Fault, Reason
 
 Vector = NDArray[np.float64]
+# of the torque limit: what an effort lacks, on average and now, that explains an error past the
+# bound
+_LACKS, _LACKS_NOW = 0.05, 0.1
 _LIGHT = 0.5  # of the assumed inertia: less is worth saying
 _NOTHING = 0.02  # of it: no drive has so little
 # s without saturation that make up for one with it: more than a fifth adds up
@@ -55,8 +58,10 @@ class SampleCheck:
         """Reset the counts, starting with the next sample."""
         self.ratio[:] = 0.0
         self.outside = self.saturated = 0
-        self._controller.checks.consistent[:] = self._kept
-        self._controller.checks.moved[:] = self._kept
+        checks = self._controller.checks
+        checks.consistent[:] = self._kept
+        checks.consistent_scale[:] = self._controller.state.gain_scale
+        checks.moved[:] = self._kept
         self.relax()
 
     @property
@@ -134,13 +139,7 @@ class SampleCheck:
         self._kept[:] = checks.moved
         if checks.lacking[0] > 0.0:
             lack = checks.lack - checks.known
-            worst = int(np.argmax(np.abs(lack) / limit))
-            text = (
-                f'the effort of joint {self._joints[worst]!r} lacks {lack[worst]:+.4g} N m of '
-                'what is commanded: release the brakes, and activate the effort controller; if the '
-                'effort is not a torque in N m, set robot.effort to current or unknown'
-            )
-            return Fault(Reason.NO_EFFECT, text)
+            return self._lacking(int(np.argmax(np.abs(lack) / limit)), lack)
         change = checks.recent - checks.before
         worst = int(np.argmax(np.abs(change) / limit))
         text = (
@@ -148,6 +147,34 @@ class SampleCheck:
             'but no joint has moved: release the brakes, and activate the effort controller'
         )
         return Fault(Reason.NO_EFFECT, text)
+
+    def _lacking(self, joint: int, lack: Vector) -> Fault:
+        """Return the fault of a joint whose effort lacks `lack` (n,) [N m] of what is commanded."""
+        text = (
+            f'the effort of joint {self._joints[joint]!r} lacks {lack[joint]:+.4g} N m of '
+            'what is commanded: release the brakes, and activate the effort controller; if the '
+            'effort is not a torque in N m, set robot.effort to current or unknown'
+        )
+        return Fault(Reason.NO_EFFECT, text)
+
+    def _unreached(self) -> Fault | None:
+        """Return the fault if measured efforts show that the commands do not reach a moving arm."""
+        settings = self._controller.settings
+        checks = self._controller.checks
+        if checks.compares[0] == 0.0:
+            return None
+        lack = checks.lack - checks.usual
+        now = self._controller.sample.torque - checks.used[2 * settings.n :]
+        if settings.drive > 0 and settings.effort_is_whole == 1:
+            now += self._controller.signals.added
+        now -= checks.usual
+        share = np.abs(lack) / settings.torque_limit
+        share_now = np.abs(now) / settings.torque_limit
+        lacks = (share > _LACKS) & (share_now > _LACKS_NOW) & (lack * now > 0.0)
+        if not lacks.any():
+            return None
+        self.return_to_consistent()
+        return self._lacking(int(np.argmax(np.where(lacks, share, 0.0))), lack)
 
     def _outside(self) -> Fault | None:
         safety = self._safety
@@ -159,6 +186,8 @@ class SampleCheck:
         worst = int(np.argmax(ratio))
         if ratio[worst] < safety.error_ratio:
             return None
+        if (unreached := self._unreached()) is not None:
+            return unreached
         share = '' if safety.error_ratio == 1.0 else f'{safety.error_ratio:g} times '
         text = (
             f'joint {self._joints[worst]!r} is {xi1[worst]:+.6g} rad from its reference: '
