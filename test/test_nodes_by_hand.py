@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+import re
+import threading
 import time
 from functools import lru_cache
 
@@ -12,7 +14,7 @@ import pytest
 pytest.importorskip('rclpy', reason='needs ROS 2')
 
 from random_arm import random_urdf
-from rcl_interfaces.srv import SetParameters
+from rcl_interfaces.srv import SetParameters, SetParametersAtomically
 from rclpy.parameter import Parameter
 from rclpy.timer import Timer
 from ros_rig import JOINTS, PATIENCE, START, FakeClock, states, torques
@@ -372,13 +374,16 @@ def test_change_of_a_gain_builds_each_configuration_once(ros, monkeypatch):
     arm.torque_for(0, START)
     built = []
     built_settings = []
+    threads = []
 
     def counted_build(*arguments):
         built.append(arguments)
+        threads.append(threading.get_ident())
         return build(*arguments)
 
     def counted_settings(config):
         built_settings.append(config)
+        threads.append(threading.get_ident())
         return settings_of_config(config)
 
     monkeypatch.setattr(schema, 'build', counted_build)
@@ -392,3 +397,23 @@ def test_change_of_a_gain_builds_each_configuration_once(ros, monkeypatch):
     assert node.config.feedback.gain == (30.0, 10.0)
     assert len(built) == 1
     assert built_settings[1:] == [node.config]
+
+    # By the services, as `ros2 param set` and `load` do: beside the loop.
+    loop = threading.get_ident()
+    assert threads == [loop] * 3
+    changes = [
+        Parameter('feedback.gain', value=[31.0, 10.0]),
+        Parameter('barrier.bound', value=[0.003, 0.003]),
+    ]
+    request = [each.to_parameter_msg() for each in changes]
+    for service in (SetParameters, SetParametersAtomically):
+        name = re.sub(r'(?<!^)(?=[A-Z])', '_', service.__name__).lower()
+        done = ros.call(
+            service, f'{node.get_name()}/{name}', service.Request(parameters=request)
+        )
+        results = done.results if service is SetParameters else [done.result]
+        assert all(each.successful for each in results)
+        assert node.config.feedback.gain == (31.0, 10.0)
+        assert node.config.barrier.bound == (0.003, 0.003)
+    assert len(threads) == 3 + 2 + 1 + 2
+    assert loop not in threads[3:]

@@ -210,7 +210,7 @@ def test_load_known_before_is_used_if_the_arm_speeds_up_in_the_stop():
     rig.guard.fail('by the test')
     known = rig.guard.samples.disturbance.copy()
     rig.push[:] = [0.0, 2.0]
-    rig.actuate = lambda raw: []  # the last torque is held: nothing brakes
+    rig.actuate = lambda _: []  # the last torque is held: nothing brakes
     seen = []
     rig.sense = lambda state: [state.raw()] if seen.append(state) is None else []
     for _ in range(3000):
@@ -228,3 +228,35 @@ def test_load_known_before_is_used_if_the_arm_speeds_up_in_the_stop():
     goal = safe_torque(safety, settings, last, guard.samples.estimate, known)
     np.testing.assert_allclose(rig.commands[-1], goal, rtol=0.0, atol=1e-9)
     assert rig.supervisor.text.count('speeds up') == 1
+
+
+def estimates_of(scale):
+    """Return what is learned within 12 s from a driver that scales commands."""
+    loop = load_loop('recommended')
+    config = change(loop.controller, {'robot.effort': 'whole'})
+    arm = plant_of(change(loop.plant, {'duration': 0.0}))
+    guard = Guard(config, lambda: 0, lambda: 0)
+    guard.activate()
+    for k in range(12_000):
+        torque = guard.update(START + k * 1_000_000, arm.measure().copy())
+        arm.step(scale * torque)
+    assert guard.supervisor.running, guard.supervisor.text
+    return guard.controller.state.estimate[:3].copy()
+
+
+def test_driver_that_scales_commands_is_learned_as_such_an_arm():
+    """As doc/arms.md says: it is what the next torque has to be computed with."""
+    np.testing.assert_allclose(estimates_of(0.9), estimates_of(1.0) / 0.9, rtol=0.02)
+
+
+def test_driver_that_clips_commands_is_told_by_its_effort():
+    loop = load_loop('recommended')
+    config = change(loop.controller, {'robot.effort': 'whole'})
+    guard, *_ = stopped_by(
+        config,
+        change(loop.plant, {'duration': 0.0}),
+        reach=lambda torque: np.clip(torque, -4.0, 4.0),
+        at=0.0,
+    )
+    assert guard.supervisor.reason is Reason.NO_EFFECT
+    assert 'N m of what is commanded' in guard.supervisor.text

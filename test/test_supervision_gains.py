@@ -55,6 +55,27 @@ def test_unworkable_gains_are_named(parameter, changes):
     assert warning.startswith(parameter)
 
 
+@pytest.mark.parametrize(('preset', 'bound'), [('recommended', 5e-4), ('paper', 1e-3)])
+def test_bound_that_these_gains_cannot_hold_at_first_names_one_that_they_can(
+    preset, bound
+):
+    loop = load_loop(preset)
+    config = change(loop.controller, {'barrier.bound': [bound] * 2})
+    (warning,) = config_warnings(config)
+    assert warning.startswith('barrier.bound: until the arm is learned')
+    given = float(re.search(r'give ([\d.]+) rad', warning)[1])
+
+    def stops(bound):
+        config = change(loop.controller, {'barrier.bound': [bound] * 2})
+        record = simulate(config, change(loop.plant, {'duration': 0.5}))
+        return [stop.reason for stop in record.run().stops]
+
+    assert stops(bound) == ['error past the bound']
+    assert stops(given) == []
+    wider = change(loop.controller, {'barrier.bound': [given] * 2})
+    assert config_warnings(wider) == []
+
+
 @pytest.mark.parametrize(
     ('gain', 'accepted'),
     [

@@ -72,7 +72,9 @@ class ControllerNode(LoopNode[ControllerConfig]):
         self._last_seen = 0, 0.0
         self._status = ControllerStatus(self, joints)
         self._watchdog = WatchdogPresence(expected=self.config.safety.expect_watchdog)
-        parameters.on_change(self, type(self.config), self._retune, self._problems)
+        self._changes = parameters.on_change(
+            self, type(self.config), self._retune, self._problems, self._check
+        )
         self.start()
 
     # Life cycle.
@@ -302,6 +304,7 @@ class ControllerNode(LoopNode[ControllerConfig]):
 
     def _on_poll(self) -> None:
         """Check for missing states; a timer reset by its own callback would multiply under load."""
+        self._changes.poll()
         guard = self.guard
         if guard is not None:
             self._start_from_pending(guard)
@@ -324,11 +327,14 @@ class ControllerNode(LoopNode[ControllerConfig]):
     # Changes of the configuration, and reports.
 
     def _problems(self, config: ControllerConfig) -> list[str]:
+        return [] if self.guard is None else self.guard.problems(config)
+
+    def _check(self, before: ControllerConfig, after: ControllerConfig) -> list[str]:
+        """Return what is worse than before; called beside the loop."""
         if self.guard is None or self._load is None:
             return []
         remedy = '; to use it anyway, start the node with it'
-        warnings = [text + remedy for text in worsened(self.config, config, self._load)]
-        return self.guard.problems(config) + warnings
+        return [text + remedy for text in worsened(before, after, self._load)]
 
     def _retune(self, config: ControllerConfig) -> None:
         self.config, guard = config, self.guard

@@ -5,9 +5,11 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable
-from typing import Any, Generic, TypeVar
+from functools import partial
+from typing import Any, Generic, NamedTuple, TypeVar
 
 from rcl_interfaces.msg import ParameterDescriptor, SetParametersResult
+from rcl_interfaces.srv import SetParameters, SetParametersAtomically
 from rclpy.node import Node
 from rclpy.parameter import Parameter as RosParameter
 from rclpy.wait_for_message import wait_for_message
@@ -26,9 +28,11 @@ from blf_dsc_controller.errors import ConfigurationError
 from blf_dsc_controller.messages.topics import ROBOT_DESCRIPTION
 from blf_dsc_controller.nodes import process
 from blf_dsc_controller.nodes.endpoints import qos_profile
+from blf_dsc_controller.nodes.late_answers import LateAnswers
 from blf_dsc_controller.nodes.process import assigned, check_sections
 
 Config = TypeVar('Config')
+_PREPARED = 8  # changes kept
 
 
 def declare(node: Node, cls: type[Config]) -> Config:
@@ -80,28 +84,33 @@ def on_change(
     cls: type[Config],
     apply: Callable[[Config], None],
     problems: Callable[[Config], list[str]] | None = None,
-) -> None:
+    check: Callable[[Config, Config], list[str]] | None = None,
+) -> LateAnswers:
     """Accept parameter changes while the node runs: all changes of a request or none.
 
     Call it after `declare`. A request is validated as the complete resulting configuration,
     and rejected with the reasons if that is invalid, or if `problems` finds that the node cannot
     accept it now. `apply` receives the new configuration once it is in effect, and must not fail.
+
+    `check`, for what takes long, returns reasons against a change from one configuration to
+    another. With it the node's services build and check a change in a thread: poll what is
+    returned.
     """
     names = {parameter.name for parameter in parameters(cls)}
-    changes = _Changes(read(node, cls))
+    changes = _Changes(read(node, cls), check)
 
     def validate(requested: list[RosParameter]) -> SetParametersResult:
         values = {each.name: each.value for each in requested if each.name in names}
         if not values:
             return SetParametersResult(successful=True)
         try:
-            candidate = change(changes.config, values)
+            change = changes.find(values)
         except ConfigurationError as error:
             return SetParametersResult(
                 successful=False, reason='\n'.join(error.problems)
             )
-        found = problems(candidate) if problems else []
-        changes.candidate = candidate
+        found = [*change.problems, *(problems(change.after) if problems else [])]
+        changes.candidate = change.after
         return SetParametersResult(successful=not found, reason='\n'.join(found))
 
     def apply_changes(changed: list[RosParameter]) -> None:
@@ -111,14 +120,59 @@ def on_change(
 
     node.add_on_set_parameters_callback(validate)
     node.add_post_set_parameters_callback(apply_changes)
+    answers = LateAnswers()
+    if check is not None:
+        for service in node.services:
+            if service.srv_type in {SetParameters, SetParametersAtomically}:
+                answers.delay(service, partial(_prepare, changes, names))
+    return answers
+
+
+def _prepare(changes: _Changes[Any], names: set[str], request: Any) -> None:
+    """Build and check what a request changes, as if all of it were accepted."""
+    is_atomic = isinstance(request, SetParametersAtomically.Request)
+    given = [RosParameter.from_parameter_msg(each) for each in request.parameters]
+    config = changes.config
+    for group in [given] if is_atomic else [[each] for each in given]:
+        values = {each.name: each.value for each in group if each.name in names}
+        if values:
+            config = changes.prepare(config, values).after
+
+
+class _Change(NamedTuple, Generic[Config]):
+    """A change of the configuration, and what the check found."""
+
+    before: Config
+    values: dict[str, Any]
+    after: Config
+    problems: list[str]
 
 
 class _Changes(Generic[Config]):
-    """The configuration in force, and the one that was checked last."""
+    """The configuration in force, the one that was checked last, and changes that are prepared."""
 
-    def __init__(self, config: Config) -> None:
+    def __init__(
+        self, config: Config, check: Callable[[Config, Config], list[str]] | None
+    ) -> None:
         self.config = config
         self.candidate = config
+        self._check = check
+        self._prepared: tuple[_Change[Config], ...] = ()
+
+    def prepare(self, before: Config, values: dict[str, Any]) -> _Change[Config]:
+        """Build and check a change; raises ConfigurationError with the problems of its values."""
+        after = change(before, values)
+        found = self._check(before, after) if self._check else []
+        prepared = _Change(before, values, after, found)
+        self._prepared = (*self._prepared[-_PREPARED:], prepared)
+        return prepared
+
+    def find(self, values: dict[str, Any]) -> _Change[Config]:
+        """Return a change of the configuration in force, which is prepared unless it has been."""
+        for each in self._prepared:
+            if each.before is self.config and each.values == values:
+                return each
+        return self.prepare(self.config, values)
 
 
 def descriptor(parameter: Parameter) -> ParameterDescriptor:

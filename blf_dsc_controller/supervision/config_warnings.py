@@ -23,6 +23,7 @@ from blf_dsc_controller.supervision.reference_load import ReferenceLoad, referen
 from blf_dsc_controller.supervision.retuning import settings_in_loop
 
 _MARGIN = 1.25  # recommended torque limit over what the reference needs
+_FIRST_ERROR = 1.5  # recommended bound over the first error
 _PERIODS = 0.02  # periods by which a window may differ from a whole number
 _LONGEST_LAG = 0.1  # s; drivers have up to 0.03
 _WIDEST_BOUND = 0.35  # rad, 20 degrees
@@ -70,6 +71,8 @@ def config_warnings(
     found += [f'{each.subject} {each.text}' for each in _of_gains(config, load)]
     if config.model == 'urdf' and config.law == 'blf_dsc':
         found += _of_errors(config, settings)
+    if config.model != 'urdf' and config.law == 'blf_dsc':
+        found += _of_first_error(config, settings, load)
     if settings.has_barrier == 1 and settings.kappa > 0.0 and settings.Gamma.any():
         found += _of_learning(config, settings, load)
     return found
@@ -150,6 +153,28 @@ def _of_errors(config: ControllerConfig, settings: Settings) -> Iterator[str]:
             f'{config.joints[worst]} is expected to be {peak:.2g} rad from its reference, past its '
             f'bound of {bound[worst]:g} rad: a bound of {1.1 * peak:.2g} rad would hold, or '
             f'{share * robot.payload:.2g} kg, or {remedy}'
+        )
+
+
+def _of_first_error(
+    config: ControllerConfig, settings: Settings, load: ReferenceLoad
+) -> Iterator[str]:
+    """Check that these gains keep the first error within the bound, before anything is learned.
+
+    The prior of such an arm is as wide as its parameters: at first the torque may err by all that
+    the reference needs, which feedback and barrier make up for: K_p (K/2 + mu) xi1 + w xi1.
+    """
+    stiffness = settings.Kp * (settings.K / 2.0 + settings.mu) + settings.weight
+    errors = load.torque / np.maximum(stiffness, 1e-12)
+    widest = settings.initial_bound
+    worst = int(np.argmax(errors / widest))
+    if errors[worst] > widest[worst]:
+        needed = _FIRST_ERROR * errors[worst]
+        yield (
+            'barrier.bound: until the arm is learned, these gains may leave '
+            f'{config.joints[worst]} {errors[worst]:.2g} rad from its reference, past its '
+            f'bound of {widest[worst]:g} rad: give {needed:.2g} rad or more, a '
+            'barrier.initial_bound of that, or, at a shorter sample_time, larger gains'
         )
 
 
