@@ -35,7 +35,7 @@ release = version = __version__
 extensions = ['myst_parser', 'sphinx.ext.autodoc', 'sphinx.ext.napoleon']
 # rosdoc2's
 exclude_patterns = ['user_docs*', 'standard*', '__*', 'modules.rst', f'{project}*']
-myst_enable_extensions = ['dollarmath']
+myst_enable_extensions = ['dollarmath', 'tasklist']
 myst_fence_as_directive = ['math']  # as GitHub writes equations
 myst_heading_anchors = 3
 
