@@ -66,7 +66,7 @@ def pictures():
 
 def main():
     """Write the animation."""
-    first, *others = pictures()
+    _, first, *others = pictures()  # at the first one the camera is not there yet
     first.save(
         OUT,
         save_all=True,

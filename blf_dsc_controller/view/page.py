@@ -160,7 +160,9 @@ class Page:
                 self._plot(
                     'torque error of the model [%]', ('learned', 'initial'), _FROM_ZERO
                 ),
-                self._plot('held in the tip [kg]', ('weight', 'from', 'to')),
+                self._plot(
+                    'held in the tip [kg]', ('weight', 'from', 'to'), _FROM_ZERO
+                ),
             ]
             self._caption = gui.add_html('')
         with tabs.add_tab('Events'):
