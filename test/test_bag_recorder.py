@@ -407,11 +407,16 @@ def test_kill_loses_nothing_that_was_written(k, rig, bag, tmp_path):
 
 
 def test_real_time_loop_is_timed_and_every_message_of_it_is_in_the_bag(tmp_path):
+    """The arm rests in a horizontal plane, whatever a busy computer does to the loop."""
     # Only one node in real time, which cannot keep the others from both processors.
-    fifo = 'sim_plant:\n  ros__parameters:\n    realtime: {priority: 10, lock_memory: true}\n'
+    fifo = (
+        'sim_plant:\n  ros__parameters:\n    arm: {gravity: 0.0}\n'
+        '    realtime: {priority: 10, lock_memory: true}\n'
+    )
+    at_rest = '    arm: {gravity: 0.0}\n    reference: {type: hold}\n'
     config = tmp_path / 'fifo.yaml'
     out = tmp_path / 'out'
-    config.write_text(fifo + PATIENT)
+    config.write_text(fifo + PATIENT + at_rest)
     arguments = ('--config', config, '--mode', 'realtime', '--duration', DURATION)
     run = closed_loop(*arguments, '--out', out)
     assert run.returncode == 0, run.stderr
