@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The simulated arm: its physics, sensors and actuators, and its ROS 2 node."""
+"""The simulated arm: dynamics, loads, sensors and drives, as kernels without ROS."""

@@ -155,7 +155,9 @@ def test_bound_is_sent_at_once_when_it_widens_and_with_the_monitor_while_it_narr
     for k, bound in enumerate((9.0, 8.0, 7.0, 7.0, 6.0, 6.5, 6.5, 7.0, 7.0)):
         sample = law.sample._replace(bound=np.array([5.0, bound]))
         limit = ratio = np.ones(2)
-        for topic, raw in telemetry.sample(k, sample, limit, ratio, 0.0, heard=False):
+        for topic, raw in telemetry.sample(
+            k, sample, limit, ratio, 0.0, subscribed=False
+        ):
             if topic is topics.BOUND:
                 sent.append((k, decoded(raw, 'joint2')['joint2']))
     assert sent == [(0, 9.0), (3, 7.0), (6, 6.5), (7, 7.0)]

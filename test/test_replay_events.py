@@ -184,7 +184,7 @@ def test_dropped_states_are_detected(tmp_path):
     rig.step(50)
     rig.guard.release()
     result = rig.verify(tmp_path)
-    assert (result.difference, result.passed_over) == (None, 3)
+    assert (result.difference, result.skipped) == (None, 3)
     assert compared(result)['tracking_error'] == 6 * 147
     assert compared(result)['commands'] == 2 * 147
 

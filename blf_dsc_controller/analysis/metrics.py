@@ -40,10 +40,10 @@ MOMENTS = (5, 10, 20, 40, 60)
 """Times at which the parameter error is reported [s]."""
 
 _LEARNED = 0.01
-_FEW = 8  # estimates that are shown one by one
+_SHOWN_SINGLY = 8  # estimates that are shown one by one
 _POSTURES = 400  # of the reference, at which torques are compared
 _TAIL = 10.0  # s
-_MOST = 100_000  # samples of the estimates, evenly spaced
+_MAX_SAMPLES = 100_000  # samples of the estimates, evenly spaced
 _BLOCK = 8192
 _QUANTILES = (('p50', 50.0), ('p99', 99.0), ('p99.9', 99.9), ('max', 100.0))  # %
 _OFTEN = 0.01  # of the samples
@@ -87,7 +87,7 @@ def estimates_of(run: Run) -> Estimates | None:
     names = _parameters(run.monitor.names)
     truth = run.truth
     arm = run.arm
-    step = -(-run.monitor.stamp.size // _MOST)
+    step = -(-run.monitor.stamp.size // _MAX_SAMPLES)
     rows = slice((run.monitor.stamp.size - 1) % step, None, step)
     stamp = run.monitor.stamp[rows]
     estimate = run.monitor.values[rows][:, run.monitor.indices(names)]
@@ -151,7 +151,7 @@ def _parameters(names: Iterable[str]) -> tuple[str, ...]:
 
 def bodies_of(names: Sequence[str]) -> dict[str, list[int]]:
     """Return the indices of the estimates of each link and kind of friction; of few, each alone."""
-    if len(names) <= _FEW:
+    if len(names) <= _SHOWN_SINGLY:
         return {name: [k] for k, name in enumerate(names)}
     bodies: dict[str, list[int]] = {}
     for k, name in enumerate(names):

@@ -54,7 +54,7 @@ _STOPPED = GROUPS[:3]
 _CHANGED = ('Tracking', 'Parameters')
 _LEARNING = GROUPS[3:]
 _LEAST = 1e-12  # J, the smallest value on a logarithmic axis
-_ROOM = 1.2  # limit of an axis as a multiple of the largest value
+_AXIS_MARGIN = 1.2  # limit of an axis as a multiple of the largest value
 _LEAST_ERROR = 1e-5  # %
 _PIECES = 300  # of a run, each with its largest error
 _LARGEST = 1e100
@@ -231,7 +231,7 @@ def _span(bound: Floats | None, error: Floats) -> float:
     if bound is None or bound[0] <= bound[-1]:
         return 0.0
     known = np.abs(error[np.abs(error) < _LARGEST])
-    return float(_ROOM * known.max(initial=1e3 * bound[-1]))
+    return float(_AXIS_MARGIN * known.max(initial=1e3 * bound[-1]))
 
 
 def _error_size(run: Run, t: Floats, i: int, error: Floats) -> Panel:

@@ -55,7 +55,7 @@ _TEMPLATES.filters['embedded'] = lambda png: (
 LEVELS = ('OK', 'WARN', 'ERROR', 'STALE')
 """Levels of /diagnostics."""
 
-Happened = tuple[float, str, str]
+TimedEvent = tuple[float, str, str]
 """An event: s since the first sample, kind, text."""
 
 
@@ -67,7 +67,7 @@ class ReportedBag:
     run: Run
     content: Content
     parameters: dict[str, str]  # `node name: parameter` to its value as text
-    events: list[Happened]  # by time
+    events: list[TimedEvent]  # by time
 
 
 def read_bag(path: Path, namespace: str = '', names: NameMap = NO_NAMES) -> ReportedBag:
@@ -92,7 +92,7 @@ def read_bag(path: Path, namespace: str = '', names: NameMap = NO_NAMES) -> Repo
     )
 
 
-def _events(run: Run) -> Iterator[Happened]:
+def _events(run: Run) -> Iterator[TimedEvent]:
     latched = latch_time(run)
     if not math.isnan(latched):
         yield (latched, 'learning', 'first excited window: learning began')
@@ -117,7 +117,7 @@ def _events(run: Run) -> Iterator[Happened]:
 
 def _intervals(
     run: Run, holds: np.ndarray, kind: str, joint: str, what: str
-) -> Iterator[Happened]:
+) -> Iterator[TimedEvent]:
     edges = np.flatnonzero(np.diff(holds, prepend=False, append=False))
     begins, ends = edges[::2], edges[1::2]
     times = run.time_of(run.stamp[begins])
@@ -130,7 +130,7 @@ def _intervals(
         yield (float(times[_MOST_OF_A_KIND]), kind, text)
 
 
-def _diagnosed(content: Content, run: Run) -> Iterator[Happened]:
+def _diagnosed(content: Content, run: Run) -> Iterator[TimedEvent]:
     """Yield each change of a level or message, at the time of the last sample received."""
     shown: dict[str, tuple[int, str]] = {}
     messages = content.topics.get(DIAGNOSTICS)
@@ -146,7 +146,7 @@ def _diagnosed(content: Content, run: Run) -> Iterator[Happened]:
                 yield (time, level, f'{status.name}: {now[1]}')
 
 
-def _changed(content: Content, run: Run) -> Iterator[Happened]:
+def _changed(content: Content, run: Run) -> Iterator[TimedEvent]:
     """Yield each change of the simulated plant's parameters during the run."""
     for change in content.changes:
         time = (change['stamp'] - int(run.stamp[0])) * 1e-9

@@ -29,7 +29,9 @@ _OF_INTEREST = (
     topics.CHANGES,
 )
 _MOST_JOURNAL = 1 << 26  # bytes
-_FEW = topics.DIAGNOSTIC.depth  # messages kept by publishers of what is no stream
+_HISTORY_OF_EVENTS = (
+    topics.DIAGNOSTIC.depth
+)  # messages kept by publishers of what is no stream
 
 
 @dataclass(frozen=True)
@@ -98,7 +100,9 @@ class Content:
     def losses(self) -> dict[str, str]:
         """What is missing in the streams of the loop, which have one publisher each, by topic."""
         streams = (
-            each for topic, each in self.topics.items() if topic.offered.depth > _FEW
+            each
+            for topic, each in self.topics.items()
+            if topic.offered.depth > _HISTORY_OF_EVENTS
         )
         return {each.name: each.lost for each in streams if each.lost}
 

@@ -23,7 +23,7 @@ from blf_dsc_controller.run import LearnedArm, Run, Series, Stop
 
 _MOST_FALLS = 10  # of the stamps, by resets of a simulator
 _ALTERNATING = 0.9  # ratio of the intervals to and from the state of another publisher
-_FEW = 100  # states
+_FEWEST_STATES = 100  # from which intervals are judged
 _ARRAYS = {  # of a run, with a column per joint: unit, messages, field
     'position': ('rad', 'states', 0),
     'velocity': ('rad/s', 'states', 1),
@@ -195,7 +195,7 @@ def _alternates(states: JointStates) -> bool:
     if (np.diff(sequence) <= 0).sum() > _MOST_FALLS and sequence.any():
         return True
     intervals = np.diff(states.stamp)
-    if intervals.size < _FEW:
+    if intervals.size < _FEWEST_STATES:
         return False
     pauses = sorted(float(np.median(intervals[k::2])) for k in (0, 1))
     return pauses[0] < _ALTERNATING * pauses[1]

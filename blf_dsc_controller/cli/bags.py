@@ -164,8 +164,8 @@ def _events(result: Verification) -> Iterator[str]:
     """Yield what happened in the run, and what limits the result."""
     if len(result.transitions) > 1:
         yield f'replayed in order: {", ".join(result.transitions)}'
-    if result.passed_over:
-        yield f'{result.passed_over} states skipped: the controller did not use them'
+    if result.skipped:
+        yield f'{result.skipped} states skipped: the controller did not use them'
     for remark in result.remarks:
         yield f'note: {remark}'
     for lacking in result.incomplete:

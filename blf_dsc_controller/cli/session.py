@@ -50,7 +50,7 @@ _MODULES = {
 }
 _ENDING = 20.0  # s that a node may take to exit before it is killed
 _TAIL = 12  # lines of a failed node's log that are shown
-_ROOM = 1_000_000  # bytes; with less free space the disk counts as full
+_MIN_FREE_SPACE = 1_000_000  # bytes; with less free space the disk counts as full
 _PR_SET_PDEATHSIG = 1
 _LIBC = ctypes.CDLL(None)  # loaded before there are threads
 _PAGE = 'open http'  # in the log of the node that serves it
@@ -72,7 +72,7 @@ def run_session(config: LoopConfig, out: Path, *, view: bool) -> bool:
     try:
         return _run_alone(config, out / 'config.yaml', logs, view=view)
     except BlfDscError:
-        if shutil.disk_usage(out).free < _ROOM:
+        if shutil.disk_usage(out).free < _MIN_FREE_SPACE:
             print(f'no space left on the disk of {out}', file=sys.stderr)
         bag = out / 'bag'
         if (bag / 'metadata.yaml').exists():

@@ -89,7 +89,7 @@ class Robot:
         'none', 'what the drives add to a commanded torque by themselves'
     )
     drive_payload: float = _magnitude(
-        0.0, 'payload told to the drives that the URDF lacks', 'kg'
+        0.0, 'payload configured in the drives that the URDF lacks', 'kg'
     )
     drive_payload_centre: Vector = _fixed(
         (0.0, 0.0, 0.0), 'centre of mass of drive_payload, in the frame of the tip', 'm'
@@ -114,7 +114,7 @@ class Robot:
         if self.drive_compensates == 'none' and self.drive_payload:
             yield (
                 f'drive_payload: got {self.drive_payload:g} kg, but drive_compensates is none: the '
-                'drives reckon with no payload'
+                'drives compensate no payload'
             )
 
     @property

@@ -59,7 +59,7 @@ class GuardedLoop:
                 controller.settings.torque_limit,
                 guard.samples.ratio,
                 guard.compute_time,
-                heard=errors_wanted,
+                subscribed=errors_wanted,
             )
         elif torque is not None and errors_wanted:
             yield self.telemetry.answer(guard.journal.stamp, torque)

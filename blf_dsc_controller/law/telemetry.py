@@ -123,13 +123,13 @@ class ControllerTelemetry:
         ratio: np.ndarray,
         compute_time: float,
         *,
-        heard: bool = True,
+        subscribed: bool = True,
     ) -> Iterator[Message]:
         """Yield the messages for a joint state: its stamp [ns] and telemetry sample.
 
         `ratio` is the largest |xi1| / k_c so far (n,). Of the times of updates, `compute_time`
         [s], the largest since the last message is sent. The tracking errors come with every
-        sample, if they are `heard`: they tell a replay which states were used.
+        sample, if they are `subscribed`: they tell a replay which states were used.
         """
         is_due = self._samples % self._decimation == 0
         self._samples += 1
@@ -139,7 +139,7 @@ class ControllerTelemetry:
             is_due or (bound > self._sent).any()
         ):
             yield self.bound(stamp, bound, torque_limit)
-        if heard:
+        if subscribed:
             error = self._error.encode(stamp, sample.xi1, sample.xi2, sample.torque)
             yield topics.TRACKING_ERROR, error
         if is_due:

@@ -63,7 +63,7 @@ class ControllerNode(LoopNode[ControllerConfig]):
         self._gate = StartGate(self.config.sample_time)
         self._warned_at = -1  # stamp of the start that the last warning was about
         # whether the tracking errors had subscribers at the last count
-        self._heard = False
+        self._errors_subscribed = False
         self._observed = self._started = False
         # phase, stops, silenced, text of a stop
         self._logged = Phase.INACTIVE, 0, False, ''
@@ -259,7 +259,9 @@ class ControllerNode(LoopNode[ControllerConfig]):
         samples = guard.controller.samples
         if (samples - 1) % _RARELY == 0:
             errors = self._outputs.get(topics.TRACKING_ERROR)
-            self._heard = errors is not None and errors.get_subscription_count() > 0
+            self._errors_subscribed = (
+                errors is not None and errors.get_subscription_count() > 0
+            )
             self._report_learning(guard)
             if samples == _RATE_SAMPLES:
                 self._warn_of_rate(guard)
@@ -267,7 +269,9 @@ class ControllerNode(LoopNode[ControllerConfig]):
     def _publish_telemetry(self, torque: np.ndarray | None) -> None:
         """Publish the messages about the last state, which this torque (n,) [N m] answered."""
         if self._loop is not None and self.config.telemetry.enabled:
-            for message in self._loop.messages(torque, errors_wanted=self._heard):
+            for message in self._loop.messages(
+                torque, errors_wanted=self._errors_subscribed
+            ):
                 self._publish(message)
 
     def _warn_of_rate(self, guard: Guard) -> None:
@@ -277,7 +281,7 @@ class ControllerNode(LoopNode[ControllerConfig]):
             self.get_logger().warning(rate_mismatch(period, expected))
 
     def _report_learning(self, guard: Guard) -> None:
-        """Report columns that were rejected or taken back, and changes of the arm."""
+        """Report columns that were rejected or restored, and changes of the arm."""
         state = guard.controller.state
         columns = state.active.tobytes() + state.columns_checked.tobytes()
         has_changed = state.changes[0] > self._model_changes

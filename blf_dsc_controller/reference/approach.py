@@ -38,8 +38,8 @@ _PAST = 0.1  # rad, tolerance of the position limits
 _BRAKE = 3.0
 """Braking from v in the time h takes up to 1.5 v / h, so that h = 3 v / limit takes half of it."""
 _PERIOD = 0.005  # s, between two checked samples
-_LEAST = 200  # samples, for short motions
-_MOST = 1_000_000  # samples, for very long ones
+_FEWEST_CHECKED = 200  # samples, for short motions
+_MOST_CHECKED = 1_000_000  # samples, for very long ones
 _ROUNDING = 1e-9  # relative, for motions that just reach a limit
 
 
@@ -83,7 +83,7 @@ class MotionError(BlfDscError):
 def check_times(begin: float, end: float) -> np.ndarray:
     """Return times from `begin` to `end` [s], dense enough to catch the largest velocity."""
     count = 1 + (end - begin) / _PERIOD
-    return np.linspace(begin, end, int(min(max(_LEAST, count), _MOST)))
+    return np.linspace(begin, end, int(min(max(_FEWEST_CHECKED, count), _MOST_CHECKED)))
 
 
 def worst_violation(

@@ -55,7 +55,7 @@ class Rerun:
         samples: number of samples of the law.
         first, last: stamps [ns] of its first and last sample; -1 before the first.
         answers: number of answers reached.
-        passed_over: number of joint states that the controller did not answer.
+        skipped: number of joint states that the controller did not answer.
         departure: in what, and at which stamp [ns], the controller first started, stopped or
             accepted otherwise than the recorded one, which ends the replay.
         end: any other reason why the replay ended before the bag, or empty.
@@ -76,7 +76,7 @@ class Rerun:
         self.events: list[Event] = []
         self.topics: dict[Topic, TopicMessages] = {}
         self.samples = 0
-        self.passed_over = 0
+        self.skipped = 0
         self.answers = 0
         self.first = -1
         self.last = -1
@@ -216,7 +216,7 @@ class Rerun:
 
     def _process(self, k: int) -> None:
         guard, stamp = self._guard, int(self._stamp[k])
-        self.passed_over += k - self._position - 1
+        self.skipped += k - self._position - 1
         self._position, row = k, int(self._row[k])
         if row in self._unreadable:
             torque = guard.reject(self._unreadable[row])

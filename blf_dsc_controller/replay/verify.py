@@ -106,7 +106,7 @@ class Verification(NamedTuple):
 
     samples: int  #: number of states that the law used
     duration: float  #: s, from the first of them to the last
-    passed_over: int  #: number of states that the controller did not answer
+    skipped: int  #: number of states that the controller did not answer
     #: one for each topic of the controller with numbers
     comparisons: tuple[Comparison, ...]
     not_compared: tuple[str, ...]  #: topics with text
@@ -179,7 +179,7 @@ def verify(path: Path, namespace: str = '', names: NameMap = NO_NAMES) -> Verifi
     return Verification(
         run.samples,
         (run.last - run.first) * 1e-9,
-        run.passed_over,
+        run.skipped,
         comparisons,
         tuple(each.name for each in texts),
         tuple(run.events),

@@ -72,7 +72,7 @@ _STUDY = 'study.yaml'
 _VERSIONS = 'versions.json'
 _RUNS = 'runs'
 _CHUNKS = 200  # of a study, unless they would be of more than so many runs
-_MOST = 1000
+_MAX_RUNS_OF_CHUNK = 1000
 _LOST = (
     'a worker was lost ({}): is there enough memory? The same command resumes the study, since '
     'finished runs are kept'
@@ -188,7 +188,8 @@ def versions() -> dict[str, str]:
         'blf_dsc_controller': blf_dsc_controller.__version__,
         'kernels': cache_folder(run_loop).name,
         'numpy': np.__version__,
-        'chunks': f'{_CHUNKS} of at most {_MOST} runs',  # by whose names `missing` goes
+        # `missing` goes by the names of the chunks
+        'chunks': f'{_CHUNKS} of at most {_MAX_RUNS_OF_CHUNK} runs',
     }
 
 
@@ -252,7 +253,7 @@ class Store:
     def missing(self) -> list[range]:
         """Return the chunks of runs without results."""
         runs = self.study.settings.runs
-        size = max(1, min(runs // _CHUNKS, _MOST))
+        size = max(1, min(runs // _CHUNKS, _MAX_RUNS_OF_CHUNK))
         chunks = (
             range(first, min(first + size, runs)) for first in range(0, runs, size)
         )

@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Browser page that shows an arm and its controller, live or from a bag."""
+"""The live page: an arm, its reference and its controller in the browser."""

@@ -44,7 +44,7 @@ _SHOWN = 3.0  # s that an event is named beside the arm
 _GHOST = (0, 200, 120, 0.35)
 _APART = 0.01  # rad, error from which on the reference is drawn beside the arm
 _PEAK = 30  # snapshots, a second, of which the largest error is plotted
-_LEAST, _MOST = 0.1, 300.0  # % of the bound, the ends of its axis
+_AXIS_OF_SHARE = (0.1, 300.0)  # % of the bound
 _HEIGHT = 130  # px of a plot: three fit below the state at 900 px
 _VIEW = np.array((0.42, -0.88, 0.22))  # direction from the arm to the camera
 _LINE = {'width': 1.5, 'points': {'show': False}}
@@ -151,7 +151,7 @@ class Page:
         self._corners = None
         tabs = gui.add_tab_group()
         with tabs.add_tab('Plots'):
-            log = {'distr': 3, 'range': (_LEAST, _MOST)}
+            log = {'distr': 3, 'range': _AXIS_OF_SHARE}
             self._plots = [
                 self._plot(
                     f'{prefix}: largest error in 1 s [% of bound]', names, log, 'bound'
