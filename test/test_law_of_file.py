@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import importlib.util
 import pickle
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -14,12 +13,17 @@ import blf_dsc_controller as blf
 from blf_dsc_controller.cli.main import main
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.law_file import load_law
+from blf_dsc_controller.configuration.nodes import locate
 from blf_dsc_controller.configuration.schema import build, change, flatten
 from blf_dsc_controller.errors import BlfDscError, ConfigurationError
 from blf_dsc_controller.law.factory import controller_of, law_of
+from blf_dsc_controller.studies import laws
+from blf_dsc_controller.studies.laws import COMPUTED_TORQUE
+from blf_dsc_controller.studies.monte_carlo import UNSEEN, load_study, torque_rows
+from blf_dsc_controller.studies.runs import run_chunk
 from blf_dsc_controller.supervision.retuning import apply_bumpless
 
-LAW = str(Path(__file__).with_name('computed_torque_law.py'))
+LAW = COMPUTED_TORQUE
 GAINS = ('gains.position', 'gains.velocity', 'gains.integral')
 
 
@@ -133,3 +137,41 @@ def test_node_offline_run_and_replay_compute_the_same_bits(tmp_path):
     np.testing.assert_array_equal(offline.error, ros.error)
     np.testing.assert_array_equal(offline.torque, ros.torque)
     assert blf.verify(tmp_path / 'ros' / 'bag').difference is None
+
+
+@pytest.mark.parametrize('base', ['monte_carlo', 'monte_carlo_panda'])
+def test_random_study_runs_it(base, tmp_path):
+    """On two links and on a Panda, with its own results."""
+    file = tmp_path / 'study.yaml'
+    file.write_text(
+        f'/**/blf_dsc_controller:\n  ros__parameters:\n    law: {LAW}\n'
+        f'monte_carlo:\n  ros__parameters: {{base: {base}, runs: 2, seed: 1}}\n',
+        encoding='utf-8',
+    )
+    study = load_study(file)
+    assert study.controller.law == LAW
+    largest = f'max_error_ratio.{study.controller.joints[0]}'
+    (mine,) = run_chunk(study, 0, 1)[largest]
+    (of_package,) = run_chunk(load_study(locate(base)), 0, 1)[largest]
+    assert 0.0 < mine < 10.0
+    assert mine != of_package
+
+
+def test_comparison_of_laws_runs_it(tmp_path, monkeypatch):
+    """With its gains searched in the ranges that the file of the study gives."""
+    monkeypatch.setattr(laws, 'LAWS', dict(laws.LAWS))
+    file = tmp_path / 'contest_of_laws.py'
+    file.write_text(
+        'from blf_dsc_controller.studies.laws import StudiedLaw\n'
+        'from blf_dsc_controller.studies.tuning import Gain\n'
+        "GAINS = (Gain('gains.position', 100.0, 3e4),)\n"
+        f"LAWS = {{'mine': StudiedLaw('mine', GAINS, {LAW!r})}}\n",
+        encoding='utf-8',
+    )
+    assert laws.chosen_laws([str(file)]) == ['proposed', 'mine']
+    trial = laws.trial('ur5e', 1)
+    unseen = torque_rows(laws.trial('ur5e', UNSEEN).controller)
+    soft, stiff = (
+        laws.run('mine', trial, {'gains.position': gain}, unseen) for gain in (2e3, 1e4)
+    )
+    assert stiff.errors[1] < soft.errors[1] < 0.03

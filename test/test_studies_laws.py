@@ -22,6 +22,7 @@ from blf_dsc_controller.configuration.plant import PlantConfig
 from blf_dsc_controller.configuration.robot import parameters_of
 from blf_dsc_controller.configuration.schema import build, change
 from blf_dsc_controller.law.factory import settings_of_config
+from blf_dsc_controller.law.telemetry import sample_columns
 from blf_dsc_controller.reference import terms
 from blf_dsc_controller.reference.approach import reference_of
 from blf_dsc_controller.simulation.loop import simulate
@@ -219,9 +220,9 @@ def test_numbers_on_the_pages_match_the_runs():
     assert window.error_at(30.0) == pytest.approx(0.07, abs=0.015)
 
 
-IMPORT = 'from blf_dsc_controller.studies.laws import Contender\n'
+IMPORT = 'from blf_dsc_controller.studies.laws import StudiedLaw\n'
 E0 = 0.004 * np.array([1.0, -0.5, 0.2, 0.8, -1.0, 0.6])  # rad, inside the bound
-GAINS = {'position': 900.0, 'velocity': 50.0, 'integral': 0.0}
+GAINS = {'gains.position': 900.0, 'gains.velocity': 50.0, 'gains.integral': 1e-9}
 FRICTIONLESS = {'robot.viscous': [0.0] * 6, 'robot.coulomb': [0.0] * 6}
 
 
@@ -242,9 +243,17 @@ def ideal(period, law=FRICTIONLESS):
     return loop._replace(plant=plant, controller=config)
 
 
+def simulated(loop, gains):
+    """Return true errors [rad] and torques [N m] of computed torque with these gains."""
+    config = change(loop.controller, {'law': laws.COMPUTED_TORQUE} | gains)
+    record = simulate(config, loop.plant, supervised=False)
+    torques = sample_columns(record.samples, record.controller.settings).torque
+    return record.true_errors(), torques
+
+
 def deviation(period):
     """Largest difference to the errors of e'' + k_d e' + k_p e = 0."""
-    errors, torques = laws.simulate_with(ideal(period), laws.computed_torque, GAINS)
+    errors, torques = simulated(ideal(period), GAINS)
     A = np.array([[0.0, 1.0], [-900.0, -50.0]])
     decay = [expm(A * period * k)[0, 0] for k in range(len(errors))]
     np.testing.assert_allclose(errors[0], E0, atol=1e-15)
@@ -260,8 +269,8 @@ def test_law_of_a_file_acts_at_the_right_time():
 
 
 def test_torque_is_cut_at_its_limit():
-    gains, loop = GAINS | {'position': 1e9}, ideal(1e-3)
-    _, torques = laws.simulate_with(loop, laws.computed_torque, gains)
+    gains, loop = GAINS | {'gains.position': 1e9}, ideal(1e-3)
+    _, torques = simulated(loop, gains)
     np.testing.assert_array_equal(
         np.abs(torques).max(axis=0), loop.controller.torque.limit
     )
@@ -272,16 +281,15 @@ def test_integrator_of_computed_torque_removes_the_error_of_a_push():
     push = {'load.torque': [3.0, -2.0, 1.0, 0.3, -0.2, 0.1], 'duration': 3.0}
     loop = rest._replace(plant=change(rest.plant, push))
     (pushed, _), (integrated, _) = (
-        laws.simulate_with(loop, laws.computed_torque, GAINS | {'integral': integral})
-        for integral in (0.0, 5000.0)
+        simulated(loop, GAINS | {'gains.integral': integral})
+        for integral in (1e-9, 5000.0)
     )
     assert np.all(np.abs(integrated[-1]) < 1e-3 * np.abs(pushed[-1]))
 
 
 def test_computed_torque_compensates_known_friction_along_the_reference():
     (_, without), (_, compensated) = (
-        laws.simulate_with(ideal(1e-3, law), laws.computed_torque, GAINS)
-        for law in (FRICTIONLESS, {})
+        simulated(ideal(1e-3, law), GAINS) for law in (FRICTIONLESS, {})
     )
     config = load_loop('ur5e').controller
     ((_, dq, _),) = terms.sampled(reference_of(config), np.zeros(1))
@@ -294,11 +302,11 @@ def test_computed_torque_compensates_known_friction_along_the_reference():
 def test_computed_torque_without_gains_has_those_of_the_law_at_small_errors():
     """k_p = 1.8 w^2, k_d = 2.1 w, k_i = 0.6 w^3 with the rate w = 0.625 / 7.5 ms."""
     config = load_loop('ur5e').controller
-    law = laws.computed_torque({}, laws.known_of(config))
+    found = laws.law_changes(laws.LAWS['computed_torque'], config, {})
     rate = 0.625 / 7.5e-3
-    np.testing.assert_allclose(law.position, 1.8 * rate**2, rtol=1e-3)
-    np.testing.assert_allclose(law.velocity, 2.1 * rate, rtol=1e-3)
-    np.testing.assert_allclose(law.integral, 0.6 * rate**3, rtol=1e-3)
+    np.testing.assert_allclose(found['gains.position'], 1.8 * rate**2, rtol=1e-3)
+    np.testing.assert_allclose(found['gains.velocity'], 2.1 * rate, rtol=1e-3)
+    np.testing.assert_allclose(found['gains.integral'], 0.6 * rate**3, rtol=1e-3)
 
 
 def test_soft_trial_has_a_part_of_the_bandwidth_and_a_bound_that_fits():
@@ -333,15 +341,13 @@ def test_integral_gain_of_slotine_li_is_the_gain_of_its_disturbance_estimate():
     assert not settings_of_config(change(config, {'law': 'slotine_li'})).gamma.any()
 
 
-@pytest.mark.parametrize(
-    'name', [k for k, c in laws.CONTENDERS.items() if isinstance(c.law, str)]
-)
+@pytest.mark.parametrize('name', laws.LAWS)
 def test_limits_of_the_gain_search_are_valid_configurations(name):
     config = load_loop('panda').controller
-    contender = laws.CONTENDERS[name]
+    studied = laws.LAWS[name]
     for side in ('least', 'most'):
-        values = {gain.name: getattr(gain, side) for gain in contender.gains}
-        change(config, laws.law_changes(contender, config, values))
+        values = {gain.name: getattr(gain, side) for gain in studied.gains}
+        change(config, laws.law_changes(studied, config, values))
 
 
 def test_every_trial_has_its_own_truth_motion_and_noise():
@@ -358,7 +364,9 @@ def test_every_trial_has_its_own_truth_motion_and_noise():
 
 
 def test_cost_penalises_rough_torque_and_is_largest_for_a_diverged_run():
-    figures = laws.Figures((1e-3, 1e-2, 1e-1, 1e0), 200.0, laws.ROUGHEST / 2.0, ())
+    figures = laws.Figures(
+        (1e-3, 1e-2, 1e-1, 1e0), 200.0, laws.ROUGHEST / 2.0, (0.0, 0.0)
+    )
     assert laws.cost_of(figures) == pytest.approx(1.5)
     assert laws.cost_of(
         replace(figures, roughness=10.0 * laws.ROUGHEST)
@@ -374,7 +382,7 @@ def test_table_shows_the_worst_run_of_each_law():
     results = {
         'proposed': laws.Result({}, None, [inside, outside]),
         'slotine_li_tuned': laws.Result(
-            {'position': 3.0}, 1.0, [replace(inside, model=())]
+            {'position': 3.0}, 1.0, [replace(inside, model=(np.nan, np.nan))]
         ),
     }
     heads, proposed, tuned, gains = (
@@ -395,10 +403,10 @@ def test_every_law_is_tuned_and_run_and_learning_finds_the_model(tmp_path, monke
     found = json.loads((tmp_path / 'out/figures.json').read_text(encoding='utf-8'))[
         'ur5e'
     ]
-    assert list(found) == list(laws.CONTENDERS)
+    assert list(found) == list(laws.LAWS)
     rows = torque_rows(laws.trial('ur5e', 1000).controller)
-    for name, contender in laws.CONTENDERS.items():
-        assert list(found[name]['gains']) == [gain.name for gain in contender.gains]
+    for name, studied in laws.LAWS.items():
+        assert list(found[name]['gains']) == [gain.name for gain in studied.gains]
         # in this process
         again = laws.run(name, laws.trial('ur5e', 1), found[name]['gains'], rows)
         assert found[name]['runs'] == [json.loads(json.dumps(asdict(again)))]
@@ -410,12 +418,12 @@ def test_every_law_is_tuned_and_run_and_learning_finds_the_model(tmp_path, monke
 
 
 def test_file_without_a_usable_law_is_rejected(tmp_path, capsys):
-    taken = f"{IMPORT}CONTENDERS = {{'slotine_li': Contender('mine')}}"
+    taken = f"{IMPORT}LAWS = {{'slotine_li': StudiedLaw('mine')}}"
     for name, text, problem in (
         ('missing.py', None, 'expected a law of the study (proposed, '),
         ('json.py', '', 'there is another module of this name'),
         ('broken.py', '1 / 0', 'cannot be imported: ZeroDivisionError'),
-        ('empty.py', '', 'CONTENDERS must be a dict of Contender by name'),
+        ('empty.py', '', 'LAWS must be a dict of StudiedLaw by name'),
         ('taken.py', taken, 'has a law slotine_li already'),
     ):
         if text is not None:
@@ -431,10 +439,10 @@ def test_laws_of_a_file_join_those_chosen_by_name(tmp_path, monkeypatch, capsys)
         main(['arms', '--config', 'recommended', '--out', str(tmp_path / 'out')]) == 1
     )
     assert 'got model two_link' in capsys.readouterr().err
-    monkeypatch.setattr(laws, 'CONTENDERS', dict(laws.CONTENDERS))
+    monkeypatch.setattr(laws, 'LAWS', dict(laws.LAWS))
     file = tmp_path / 'law_of_mine.py'
-    file.write_text(f"{IMPORT}CONTENDERS = {{'mine': Contender('mine')}}")
-    assert laws.chosen_laws([]) == list(laws.CONTENDERS)
+    file.write_text(f"{IMPORT}LAWS = {{'mine': StudiedLaw('mine')}}")
+    assert laws.chosen_laws([]) == list(laws.LAWS)
     for _ in range(2):  # a worker that was forked has it already
         assert laws.chosen_laws(['slotine_li', str(file)]) == [
             'proposed',

@@ -38,7 +38,6 @@ from blf_dsc_controller.compiled.layout import size_of
 from blf_dsc_controller.configuration import law_file
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.robot import drive_model, parameters_of
-from blf_dsc_controller.configuration.schema import parameters
 from blf_dsc_controller.law import barrier
 from blf_dsc_controller.law.backstepping import Backstepping
 from blf_dsc_controller.law.blf_dsc import BlfDsc
@@ -46,6 +45,36 @@ from blf_dsc_controller.law.controller import Controller
 from blf_dsc_controller.law.interface import Law
 from blf_dsc_controller.law.state import CHOICES, Settings
 from blf_dsc_controller.reference.approach import plan_start, reference_of
+
+_PARAMETER_OF = {
+    'bound': 'barrier.bound',
+    'funnel_rate': 'barrier.funnel_rate',
+    'weight': 'barrier.weight',
+    'slope_limit': 'barrier.slope_limit',
+    'K': 'surface.gain',
+    'mu': 'surface.mu',
+    'time_constant': 'surface.time_constant',
+    'damping_rate': 'feedback.damping_rate',
+    'd2': 'feedback.damping',
+    'gamma': 'disturbance.gain',
+    'eta': 'disturbance.leakage',
+    'rate_limit': 'torque.rate_limit',
+    'kappa': 'learning.weight',
+    'update': 'learning.update',
+    'prediction': 'learning.prediction',
+    'rho': 'learning.regularization',
+    'sigma': 'learning.excitation_threshold',
+    'bias': 'learning.bias',
+    'viscous': 'learning.viscous',
+    'coulomb': 'learning.coulomb',
+    'coulomb_velocity': 'learning.coulomb_velocity',
+    'frequencies': 'learning.frequencies',
+    'radius': 'learning.radius',
+    'compensation': 'learning.compensation',
+    'bumpless': 'learning.bumpless',
+    'anchor_weight': 'learning.anchor_weight',
+}
+"""Parameters that settings take as they are; the others are computed from several."""
 
 _COLUMNS = 1.0  # Gamma of the disturbance columns
 _OMEGA = 100.0  # rad/s, of the filter (8)
@@ -226,24 +255,17 @@ def settings_of_config(config: ControllerConfig) -> Settings:
 
 
 def _gains(config: ControllerConfig) -> dict[str, Any]:
-    """Return the parameters that are settings, under the name of the field."""
-    groups = (
-        config.barrier,
-        config.surface,
-        config.feedback,
-        config.disturbance,
-        config.torque,
-    )
-    found: dict[str, Any] = {}
-    for group in (*groups, config.learning):
-        for param in parameters(type(group)):
-            name = param.symbol if param.symbol in Settings._fields else param.name
-            if name in Settings._fields:
-                value = getattr(group, param.name)
-                if name in CHOICES:
-                    value = CHOICES[name].index(value)
-                found[name] = np.array(value) if param.is_array else value
-    return found
+    """Return the settings that are parameters of the configuration."""
+    return {name: _setting(config, name, at) for name, at in _PARAMETER_OF.items()}
+
+
+def _setting(config: ControllerConfig, name: str, parameter: str) -> Any:
+    """Return the value of a parameter as kernels take it: choices as their number."""
+    group, _, key = parameter.partition('.')
+    value = getattr(getattr(config, group), key)
+    if name in CHOICES:
+        return CHOICES[name].index(value)
+    return np.array(value) if isinstance(value, tuple) else value
 
 
 def joint_inertia(config: ControllerConfig, P: tuple[float, ...]) -> np.ndarray:

@@ -1,45 +1,32 @@
 # SPDX-License-Identifier: Apache-2.0
 """Laws compared on arms from URDFs: each is tuned on one truth, run on others, and has figures.
 
-Laws of the package are chosen by name. Any other is a `Law`: a named tuple of gains and arrays with
-a method that computes the torque, compiled into the closed loop. One is here, computed torque:
-
-    tau = M0 (qr'' - k_p e - k_d e' - k_i int e) + C0 q' + G0 + F0(qr'),   e = q - qr
-
-M0, C0, G0 are those of P0, the initial estimate of the law.  F0 is the friction known to the
-controller, at the velocity of the reference as in the law.  The integrator is held while any torque
-is saturated.  `load_laws` adds those of a file.
+A law is one of the package, by its name, or one of a file (doc/tutorial_law.md), as computed
+torque is here (`computed_torque.py`).  All run in the same loop.  `load_laws` adds those that
+a file names.
 """
 
 from __future__ import annotations
 
-import functools
 import importlib
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import numpy as np
 from tqdm import tqdm
 
 from blf_dsc_controller.analysis.metrics import aligned, write_json
-from blf_dsc_controller.arms.model import ArmModel
-from blf_dsc_controller.compiled.elementary import tanh
-from blf_dsc_controller.compiled.jit import compile_methods, kernel
-from blf_dsc_controller.compiled.layout import Array
-from blf_dsc_controller.compiled.views import part, view
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.nodes import LoopConfig, load_loop
 from blf_dsc_controller.configuration.schema import change
 from blf_dsc_controller.errors import BlfDscError
-from blf_dsc_controller.law.factory import joint_inertia, model_of
+from blf_dsc_controller.law.factory import joint_inertia
 from blf_dsc_controller.law.telemetry import sample_columns
-from blf_dsc_controller.reference import terms as reference
-from blf_dsc_controller.reference.approach import plan_start
 from blf_dsc_controller.run import Floats
 from blf_dsc_controller.simulation.loop import simulate
 from blf_dsc_controller.studies.monte_carlo import (
@@ -56,9 +43,6 @@ from blf_dsc_controller.studies.tuning import (
     search,
     value_at,
 )
-from sim_plant import kernels as plants
-from sim_plant.arm import Arm
-from sim_plant.plant import plant_of, steps_of
 
 PICK_UP = 15.0  # s
 DURATION = 30.0  # s
@@ -80,176 +64,18 @@ _BEFORE = PICK_UP - 0.01  # s, when the model is evaluated for the first time
 _STIFFEST = 4.0  # least slope limit of the barrier, as a multiple of its weight
 
 
-class Known(NamedTuple):
-    """What every law is told of an arm of n joints; P0, m and friction are those of its URDF."""
-
-    model: ArmModel
-    P: Array  # (p,) P0
-    inertia: Array  # (n,) kg m^2, m
-    # (3, n) k_p [1/s^2], k_d [1/s], k_i [1/s^3] of the proposed law at small errors
-    linear_gains: Array
-    viscous: Array  # (n,) N m s/rad
-    coulomb: Array  # (n,) N m
-    coulomb_velocity: float  # rad/s
-    limit: Array  # (n,) N m
-    bound: Array  # (n,) rad, on the error
-
-
-class Now(NamedTuple):
-    """What every law is told in a sample."""
-
-    dt: float  # s
-    q: Array  # (n,) rad, measured
-    dq: Array  # (n,) rad/s, measured
-    qr: Array  # (n,) rad
-    dqr: Array  # (n,) rad/s
-    ddqr: Array  # (n,) rad/s^2
-
-
-class Law(Protocol):
-    """A law: a `NamedTuple` of its gains (float), its memory and its scratch (arrays)."""
-
-    def fill_torque(self, arm: Known, now: Now, torque: Array) -> None:
-        """Write the torque (n,) [N m]; the loop cuts it at its limit afterwards."""
-
-
-class ComputedTorque(NamedTuple):
-    """Computed torque with an integrator."""
-
-    position: Array  # (n,) k_p, 1/s^2
-    velocity: Array  # (n,) k_d, 1/s
-    integral: Array  # (n,) k_i, 1/s^3
-    integrated: Array  # (n,) rad s, int e
-    a: Array  # (n,) rad/s^2
-    H: Array  # (n, p)
-
-    def fill_torque(self, arm: Known, now: Now, torque: Array) -> None:
-        """Write the torque."""
-        n = now.q.size
-        for i in range(n):
-            u = -self.position[i] * (now.q[i] - now.qr[i])
-            u -= self.velocity[i] * (now.dq[i] - now.dqr[i])
-            u -= self.integral[i] * self.integrated[i]
-            self.a[i] = now.ddqr[i] + u
-        arm.model.regressor(now.q, now.dq, now.dq, self.a, self.H)
-        cut = False
-        for i in range(n):
-            torque[i] = arm.viscous[i] * now.dqr[i]
-            torque[i] += arm.coulomb[i] * tanh(now.dqr[i] / arm.coulomb_velocity)
-            for j in range(arm.P.size):
-                torque[i] += self.H[i, j] * arm.P[j]
-            cut = cut or abs(torque[i]) > arm.limit[i]
-        if not cut:
-            for i in range(n):
-                self.integrated[i] += now.dt * (now.q[i] - now.qr[i])
-
-
-def computed_torque(gains: Mapping[str, float], arm: Known) -> ComputedTorque:
-    """Return the law with gains `position`, `velocity` and `integral`.
-
-    Without any they are those of the proposed law at small errors: equal bandwidth.
-    """
-    n = arm.inertia.size
-    position, velocity, integral = arm.linear_gains
-    if gains:
-        position = np.full(n, gains['position'])
-        velocity = np.full(n, gains['velocity'])
-        integral = np.full(n, gains['integral'])
-    H = np.zeros((n, arm.P.size))
-    return ComputedTorque(
-        position, velocity, integral, integrated=np.zeros(n), a=np.zeros(n), H=H
-    )
-
-
-def _run(
-    arm: Arm,
-    plant_settings: np.ndarray,
-    plant_state: np.ndarray,
-    rng: np.random.Generator,
-    law: Law,
-    known: Known,
-    motion: np.ndarray,
-    rows: np.ndarray,
-) -> None:
-    """Run a sample for each of `rows` (k, 8 n): [q, dq, effort, qr, dqr, ddqr, true q, torque]."""
-    plant, state = plants.plant_views(arm, plant_settings, plant_state)
-    n, dt = plant.n, plant.period_ns * 1e-9
-    every = view(rows)
-    for k in range(rows.shape[0]):
-        row = every[k]
-        q = part(row, 0, (n,))
-        dq = part(row, n, (n,))
-        torque = part(row, 7 * n, (n,))
-        qr = part(row, 3 * n, (n,))
-        dqr = part(row, 4 * n, (n,))
-        ddqr = part(row, 5 * n, (n,))
-        plants.observe(plant, state, rng, part(row, 0, (3 * n,)))
-        reference.evaluate(view(motion), (k * plant.period_ns) * 1e-9, qr, dqr, ddqr)
-        law.fill_torque(known, Now(dt, q, dq, qr, dqr, ddqr), torque)
-        for i in range(n):
-            row[6 * n + i] = state.x[i]
-            torque[i] = min(max(torque[i], -known.limit[i]), known.limit[i])
-        plants.step(plant, state, torque)
-
-
-@functools.cache
-def _loop_with(law: type) -> Callable[..., None]:
-    """Return the loop compiled for a type of law, from its cache if its file has not changed."""
-    compile_methods(Law, ('fill_torque',), law)
-    return kernel(_run)
-
-
-def known_of(config: ControllerConfig) -> Known:
-    """Return what a law is told of the arm of a configuration."""
-    robot = config.robot
-    on_joints = robot.friction(robot.chain(config.joints))
-    return Known(
-        model=model_of(config),
-        P=np.array(config.learning.initial_estimate),
-        inertia=inertia_of_joints(config),
-        linear_gains=linear_gains(config),
-        viscous=np.array(on_joints['viscous']),
-        coulomb=np.array(on_joints['coulomb']),
-        coulomb_velocity=config.learning.coulomb_velocity,
-        limit=np.array(config.torque.limit),
-        bound=np.array(config.barrier.bound),
-    )
-
-
-def simulate_with(
-    loop: LoopConfig,
-    make: Callable[[Mapping[str, float], Known], Law],
-    gains: Mapping[str, float],
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return true errors (k, n) [rad] and torques (k, n) [N m] of `make(gains, known)`.
-
-    The loop starts as that of the package's law does.
-
-    Raises MotionError if there is no approach within the limits.
-    """
-    config = loop.controller
-    plant = plant_of(loop.plant)
-    n, known = plant.joints, known_of(config)
-    q, dq, _ = plant.measure().reshape(3, n)
-    motion = plan_start(config, np.array(config.barrier.widest), q, dq)
-    rows = np.zeros((steps_of(loop.plant) + 1, 8, n))
-    law = make(gains, known)
-    run_with = _loop_with(type(law))
-    run_with(
-        *(plant.arm, plant.settings, plant.state, plant.rng),
-        *(law, known, motion.vector, rows.reshape(len(rows), -1)),
-    )
-    return rows[:, 6] - rows[:, 3], rows[:, 7]
-
-
-class Contender(NamedTuple):
+class StudiedLaw(NamedTuple):
     """A law and its tuned gains; without any, all gains follow from the URDF."""
 
     label: str
     gains: tuple[Gain, ...] = ()
-    law: str | Callable[[Mapping[str, float], Known], Law] = 'blf_dsc'
-    """Law of the package by its name, or a function of the gains by name that makes another."""
+    law: str = 'blf_dsc'
+    """The parameter `law`: a law of the package by its name, or a Python file."""
     learns: bool = True
+
+
+COMPUTED_TORQUE = str(Path(__file__).with_name('computed_torque.py'))
+"""Computed torque with an integrator, as a law of a file."""
 
 
 _DAMPING = Gain('feedback.damping_rate', 10.0, 200.0)
@@ -268,27 +94,27 @@ _SLOTINE_LI = (
     _ADAPTATION,
 )
 _PID = (
-    Gain('position', 100.0, 3e4),
-    Gain('velocity', 10.0, 200.0),
-    Gain('integral', 100.0, 3e6),
+    Gain('gains.position', 100.0, 3e4),
+    Gain('gains.velocity', 10.0, 200.0),
+    Gain('gains.integral', 100.0, 3e6),
 )
 
-CONTENDERS = {
-    'proposed': Contender('proposed, gains from the URDF'),
-    'no_learning': Contender('the same without learning', learns=False),
-    'slotine_li': Contender(
+LAWS = {
+    'proposed': StudiedLaw('proposed, gains from the URDF'),
+    'no_learning': StudiedLaw('the same without learning', learns=False),
+    'slotine_li': StudiedLaw(
         'Slotine-Li with integrator, the same gains', law='slotine_li'
     ),
-    'computed_torque': Contender(
-        'computed torque with integrator, the same gains', law=computed_torque
+    'computed_torque': StudiedLaw(
+        'computed torque with integrator, the same gains', law=COMPUTED_TORQUE
     ),
-    'proposed_tuned': Contender('proposed, tuned', (*_FEEDBACK, _ADAPTATION)),
-    'no_learning_tuned': Contender('without learning, tuned', _FEEDBACK, learns=False),
-    'slotine_li_tuned': Contender(
+    'proposed_tuned': StudiedLaw('proposed, tuned', (*_FEEDBACK, _ADAPTATION)),
+    'no_learning_tuned': StudiedLaw('without learning, tuned', _FEEDBACK, learns=False),
+    'slotine_li_tuned': StudiedLaw(
         'Slotine-Li with integrator, tuned', _SLOTINE_LI, 'slotine_li'
     ),
-    'computed_torque_tuned': Contender(
-        'computed torque with integrator, tuned', _PID, computed_torque
+    'computed_torque_tuned': StudiedLaw(
+        'computed torque with integrator, tuned', _PID, COMPUTED_TORQUE
     ),
 }
 
@@ -306,19 +132,24 @@ class Figures:
 
 
 def law_changes(
-    contender: Contender, config: ControllerConfig, values: Mapping[str, float]
+    studied: StudiedLaw, config: ControllerConfig, values: Mapping[str, float]
 ) -> dict[str, object]:
-    """Return the parameters that turn the configured law into a contender with these gains."""
-    changes: dict[str, object] = {'law': contender.law}
+    """Return the parameters that turn the configured law into this one with these gains."""
+    changes: dict[str, object] = {'law': studied.law}
     config = change(config, changes)  # a law of a file has gains of its own
-    if contender.law == 'slotine_li':  # the slope of the proposed law's surface at zero
+    if studied.law == 'slotine_li':  # the slope of the proposed law's surface at zero
         slope = np.array(config.surface.gain) / 2.0 + config.surface.mu
         changes['comparison.surface_gain'] = slope.tolist()
         changes['comparison.integral_gain'] = list(config.disturbance.gain)
-    elif not contender.learns:
+    elif studied.law == COMPUTED_TORQUE:  # of equal bandwidth
+        position, velocity, integral = linear_gains(config).mean(axis=1).tolist()
+        changes['gains.position'] = position
+        changes['gains.velocity'] = velocity
+        changes['gains.integral'] = integral
+    elif not studied.learns:
         without = [0.0] * len(config.learning.initial_estimate)
         changes |= {'learning.weight': 0.0, 'learning.adaptation_gain': without}
-    gains = contender.gains
+    gains = studied.gains
     each = (values[gain.name] for gain in gains)
     changes |= parameters_at(
         config, gains, each, inertia_of_joints(config) if gains else 1.0
@@ -354,40 +185,33 @@ def linear_gains(config: ControllerConfig) -> np.ndarray:
 def run(
     name: str, loop: LoopConfig, values: Mapping[str, float], unseen: Floats
 ) -> Figures:
-    """Run a contender with `values` of its gains by name.
+    """Run a law with `values` of its gains by name.
 
     `unseen` (k, p) are the rows of H on which the learned model is evaluated.
     """
-    contender = CONTENDERS[name]
-    config = loop.controller
-    model: tuple[float, ...] = ()
+    config = change(loop.controller, law_changes(LAWS[name], loop.controller, values))
     with np.errstate(all='ignore'):  # a run that diverges has figures too
-        if isinstance(contender.law, str):
-            config = change(config, law_changes(contender, config, values))
-            record = simulate(config, loop.plant, supervised=False)
-            samples = sample_columns(record.samples, record.controller.settings)
-            errors = record.true_errors()
-            torques = samples.torque
-            p = unseen.shape[1]
-            model = tuple(
-                torque_error(unseen, samples.estimate[row, :p], record.truths[row, :p])
-                for row in (round(_BEFORE / config.sample_time), -1)
-            )
-        else:
-            errors, torques = simulate_with(loop, contender.law, values)
+        record = simulate(config, loop.plant, supervised=False)
+        samples = sample_columns(record.samples, record.controller.settings)
+        errors = record.true_errors()
+        p = unseen.shape[1]
+        model = tuple(
+            torque_error(unseen, samples.estimate[row, :p], record.truths[row, :p])
+            for row in (round(_BEFORE / config.sample_time), -1)
+        )
         time = np.arange(len(errors)) * loop.plant.sample_time
         peaks = [
             float(np.abs(errors[(time >= begin) & (time < end)]).max(initial=0.0))
             for begin, end in INTERVALS.values()
         ]
-        steps = np.diff(torques, axis=0) / config.torque.limit
+        steps = np.diff(samples.torque, axis=0) / config.torque.limit
         rough = np.sqrt(np.mean(steps**2, axis=0)).max()
     ratio = np.abs(errors / config.barrier.bound).max()
     return Figures(tuple(peaks), float(ratio), float(rough), model)
 
 
 def load_laws(path: Path) -> list[str]:
-    """Add the contenders of a Python file, by name in its `CONTENDERS`, and return their names.
+    """Add the laws of a Python file, by name in its `LAWS`, and return their names.
 
     Raises BlfDscError if it has none, if it cannot be imported, or if a name is taken.
     """
@@ -402,11 +226,11 @@ def load_laws(path: Path) -> list[str]:
         raise BlfDscError(
             f'{path}: there is another module of this name: rename the file'
         )
-    added: dict[str, Contender] = getattr(module, 'CONTENDERS', {})
-    if not added or not all(isinstance(each, Contender) for each in added.values()):
-        raise BlfDscError(f'{path}: CONTENDERS must be a dict of Contender by name')
-    for name, contender in added.items():
-        if CONTENDERS.setdefault(name, contender) is not contender:
+    added: dict[str, StudiedLaw] = getattr(module, 'LAWS', {})
+    if not added or not all(isinstance(each, StudiedLaw) for each in added.values()):
+        raise BlfDscError(f'{path}: LAWS must be a dict of StudiedLaw by name')
+    for name, law in added.items():
+        if LAWS.setdefault(name, law) is not law:
             raise BlfDscError(
                 f'{path}: the study has a law {name} already: choose another name'
             )
@@ -415,18 +239,15 @@ def load_laws(path: Path) -> list[str]:
 
 @dataclass(frozen=True)
 class Result:
-    """A contender on one arm: tuned gains and their cost (None if not tuned), validation runs."""
+    """A law on one arm: tuned gains and their cost (None if not tuned), validation runs."""
 
     gains: dict[str, float]
     cost: float | None
     runs: list[Figures]
 
     def columns(self) -> Floats:
-        """Return the values of all runs for each of COLUMNS, in mrad or %; NaN without a model."""
-        rows = [
-            (*figures.errors, *(figures.model or (np.nan, np.nan)))
-            for figures in self.runs
-        ]
+        """Return the values of all runs for each of COLUMNS, in mrad or %."""
+        rows = [(*figures.errors, *figures.model) for figures in self.runs]
         units = np.where(np.arange(len(COLUMNS)) < len(INTERVALS), 1e3, 1e2)
         return np.asarray((np.array(rows) * units).T)
 
@@ -465,8 +286,8 @@ def trial(
 
 
 def values_of(name: str, exponents: Floats) -> dict[str, float]:
-    """Return the gains of a contender from their decimal logarithms."""
-    pairs = zip(CONTENDERS[name].gains, exponents, strict=True)
+    """Return the gains of a law from their decimal logarithms."""
+    pairs = zip(LAWS[name].gains, exponents, strict=True)
     return {gain.name: value_at(exponent) for gain, exponent in pairs}
 
 
@@ -482,34 +303,34 @@ def cost_of(figures: Figures) -> float:
 def tuning_cost(
     exponents: Floats, name: str, loop: LoopConfig, unseen: Floats
 ) -> float:
-    """Return `cost_of` a contender with one more sample of delay, to keep a stability margin."""
+    """Return `cost_of` a law with one more sample of delay, to keep a stability margin."""
     delayed = change(loop.plant, {'actuator.delay': loop.plant.actuator.delay + 1})
     values = values_of(name, exponents)
     return cost_of(run(name, loop._replace(plant=delayed), values, unseen))
 
 
 def chosen_laws(given: Sequence[str]) -> list[str]:
-    """Return the names of contenders from names and Python files, `proposed` first; all for none.
+    """Return the names of laws from names and Python files, `proposed` first; all for none.
 
-    Raises BlfDscError if there is no such contender or file.
+    Raises BlfDscError if there is no such law or file.
     """
     if not given:
-        return list(CONTENDERS)
+        return list(LAWS)
     names = ['proposed']
     for name in given:
-        if name not in CONTENDERS and not Path(name).is_file():
+        if name not in LAWS and not Path(name).is_file():
             raise BlfDscError(
-                f'--laws {name}: expected a law of the study ({", ".join(CONTENDERS)}), or a '
-                'Python file with CONTENDERS'
+                f'--laws {name}: expected a law of the study ({", ".join(LAWS)}), or a '
+                'Python file with LAWS'
             )
-        names += [name] if name in CONTENDERS else load_laws(Path(name).resolve())
+        names += [name] if name in LAWS else load_laws(Path(name).resolve())
     return list(dict.fromkeys(names))
 
 
 def compare(
     folder: Path, arms: Sequence[str], laws: Sequence[str]
 ) -> dict[str, dict[str, Result]]:
-    """Tune and run everything, and write figures.json; return the results by arm and contender.
+    """Tune and run everything, and write figures.json; return the results by arm and law.
 
     `laws` are as in `chosen_laws`.
     """
@@ -522,7 +343,7 @@ def compare(
         for arm, name in tqdm(rows, unit='law'):
             first, *others = (trial(arm, seed) for seed in range(TRUTHS + 1))
             unseen = torque_rows(trial(arm, UNSEEN).controller)
-            searched = CONTENDERS[name].gains
+            searched = LAWS[name].gains
             least = {gain.name: gain.least for gain in searched}
             run(name, first, least, unseen)  # compiles what the workers load
             gains, cost = {}, None
@@ -539,11 +360,11 @@ def compare(
 
 
 def format_results(results: dict[str, Result]) -> str:
-    """Return the worst of each figure on an arm, a line for each contender, and tuned gains."""
+    """Return the worst of each figure on an arm, a line for each law, and tuned gains."""
     rows = [['worst', *COLUMNS, 'roughness', 'bound kept']]
     gains = []
     for name, result in results.items():
-        label = CONTENDERS[name].label
+        label = LAWS[name].label
         worst = result.columns().max(axis=1)
         rough = 100.0 * max(figures.roughness for figures in result.runs)
         kept = sum(figures.ratio < 1.0 for figures in result.runs)

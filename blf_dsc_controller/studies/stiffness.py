@@ -78,7 +78,7 @@ def format_errors(errors: Errors) -> str:
     """Return a table of the errors [mrad] on one arm: a line for each law and interval."""
     rows = [['worst [mrad] at a stiffness of', *(f'{part:g}' for part in PARTS)]]
     for interval, (law, of_law) in product(SHOWN, errors.items()):
-        label = f'{interval}: {laws.CONTENDERS[law].label}'
+        label = f'{interval}: {laws.LAWS[law].label}'
         rows.append([label, *(f'{1e3 * value:.2f}' for value in of_law[interval])])
     return aligned(rows)
 
@@ -90,7 +90,7 @@ def draw(found: dict[str, Errors], path: Path) -> None:
     for axes, (arm, errors) in zip(picture.axes[0], found.items(), strict=True):
         for interval, (law, of_law) in product(SHOWN, errors.items()):
             dashes = '--' if interval == 'before' else '-'
-            label = f'{laws.CONTENDERS[law].label}, {interval}'
+            label = f'{laws.LAWS[law].label}, {interval}'
             milliradians = 1e3 * np.array(of_law[interval])
             axes.loglog(PARTS, milliradians, dashes, color=LAWS[law], label=label)
         axes.set_xlabel('feedback.stiffness')

@@ -1,13 +1,21 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A law of a file for tests: computed torque with an integrator, which has a memory."""
+"""Computed torque with an integrator, the rival of the studies: a law of a file with a memory.
+
+    tau = M0 (qr'' - k_p e - k_d e' - k_i int e) + C0 q' + G0 + F0(qr'),   e = q - qr
+
+M0, C0, G0 are those of P0, the initial estimate; F0 is the friction known to the controller,
+at the velocity of the reference.  The integrator is held while any torque is cut.
+"""
 
 from __future__ import annotations
 
 from typing import Annotated, NamedTuple
 
+from blf_dsc_controller.compiled.elementary import tanh
+from blf_dsc_controller.compiled.jit import inner
 from blf_dsc_controller.compiled.layout import Array, view_of
 from blf_dsc_controller.configuration.schema import positive
-from blf_dsc_controller.law.compensation import fill_known_torque
+from blf_dsc_controller.law.friction import first_coulomb
 from blf_dsc_controller.law.state import Settings, Signals, State
 
 
@@ -20,8 +28,21 @@ class Memory(NamedTuple):
 memory_of = view_of(Memory)
 
 
+@inner
+def known_friction(settings: Settings, i: int, velocity: float) -> float:
+    """Return the friction of joint i [N m] that the initial estimate has at a velocity."""
+    friction = 0.0
+    if settings.viscous == 1:
+        viscous = settings.p + settings.n * settings.bias
+        friction += settings.initial_estimate[viscous + i] * velocity
+    if settings.coulomb == 1:
+        coulomb = settings.initial_estimate[first_coulomb(settings) + i]
+        friction += coulomb * tanh(velocity / settings.coulomb_velocity)
+    return friction
+
+
 class ComputedTorque(NamedTuple):
-    """tau = M0 (qr'' - k_p e - k_d e' - k_i int e) + C0 q' + G0 + F0(qr'),   e = q - qr."""
+    """Computed torque with an integrator."""
 
     position: Annotated[float, positive(900.0, 'gain on the error', '1/s^2', 'k_p')]
     velocity: Annotated[float, positive(60.0, 'gain on its rate', '1/s', 'k_d')]
@@ -42,9 +63,12 @@ class ComputedTorque(NamedTuple):
             a[i] = signals.ddqr[i] - self.position * signals.xi1[i]
             a[i] -= self.velocity * (signals.dq[i] - signals.dqr[i])
             a[i] -= self.integral * memory.integral[i]
-        fill_known_torque(settings, state, signals, signals.dq, a, dt)
+        H = signals.H
+        settings.model.regressor(signals.q, signals.dq, signals.dq, a, H)
         for i in range(settings.n):
-            signals.demand[i] = signals.model_torque[i]
+            signals.demand[i] = known_friction(settings, i, signals.dqr[i])
+            for j in range(settings.p):
+                signals.demand[i] += H[i, j] * settings.initial_estimate[j]
 
     def finish(
         self,
