@@ -3,8 +3,8 @@
 
     .venv/bin/python benchmark/friction_intervals.py --runs 50
 
-The arms are those of `identification.py arms`, at 100 Hz.  Each recording is made with several
-laws, whose parameters are random for each joint: `test/friction_laws.py`.
+The arms are those of `identification.py arms`, at 100 Hz.  Each recording is made with
+several laws, whose parameters are random for each joint: `test/friction_laws.py`.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Run all benchmarks and write a table: python benchmark/harness.py [GROUP ...] [--out FOLDER].
 
-Each figure is the ratio of interleaved measurements: on a shared machine only they can be compared.
-Contestants may be processes.
+Each figure is the ratio of interleaved measurements: on a shared machine only they can
+be compared. Contestants may be processes.
 """
 
 from __future__ import annotations
@@ -66,7 +66,8 @@ def interleaved(
 ) -> dict[str, np.ndarray]:
     """Return seconds per unit of work (rounds,) of each contestant, all run in each round.
 
-    A contestant does its work and returns the number of units. The first round is a warm-up.
+    A contestant does its work and returns the number of units. The first round is a
+    warm-up.
     """
     seconds: dict[str, list[float]] = {name: [] for name in contestants}
     for counted in range(-1, rounds):

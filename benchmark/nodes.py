@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """The controller's node against a null node, which answers without decoding messages.
 
-This process stands in for the plant: it publishes the joint states of a simulated run, one a
-millisecond. Every contestant is started in each round, as processes in a ROS domain of their own.
+This process stands in for the plant: it publishes the joint states of a simulated run,
+one a millisecond. Every contestant is started in each round, as processes in a ROS
+domain of their own.
 """
 
 from __future__ import annotations
@@ -115,7 +116,10 @@ class StandIn:
         what: str,
         act: Callable[[], object] = lambda: None,
     ) -> None:
-        """Act until the condition holds; BlfDscError if it takes too long or a node has failed."""
+        """Act until the condition holds.
+
+        BlfDscError if it takes too long or a node has failed.
+        """
         begin = time.perf_counter()
         while not condition():
             self.check()
@@ -134,8 +138,8 @@ class StandIn:
     def play(self, states: Iterator[bytes]) -> tuple[float, float]:
         """Publish states, one per millisecond.
 
-        Returns the median latency [s], from state published to torque received, and the CPU [s] of
-        the node's process.
+        Returns the median latency [s], from state published to torque received, and the
+        CPU [s] of the node's process.
         """
         clock = ~self.nodes[-1].pid << 3 | _CPUCLOCK_SCHED
         latency = np.zeros(_WARM_UP + _STEPS)
@@ -176,7 +180,10 @@ class StandIn:
 def _started(
     name: str, config: ControllerConfig, folder: Path, state: bytes, **variables: str
 ) -> Iterator[StandIn]:
-    """Start a contestant: its recorder, if it has one, then its node; wait for the first torque."""
+    """Start a contestant: its recorder, if it has one, then its node.
+
+    Wait for the first torque.
+    """
     is_recorded = name == _RECORDED
     telemetry = Telemetry(enabled=is_recorded)
     law = replace(config, telemetry=telemetry, wait_for_subscribers=int(is_recorded))

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Offline loop against C, numpy, MuJoCo and pinocchio; growth with joints and unknowns.
 
-The C reference is compiled on demand and called through ctypes. The peers run the recommended
-configuration: all hold the torque over the sample and apply the disturbance, only the integration
-of the arm differs.
+The C reference is compiled on demand and called through ctypes. The peers run the
+recommended configuration: all hold the torque over the sample and apply the
+disturbance, only the integration of the arm differs.
 """
 
 from __future__ import annotations
@@ -47,8 +47,8 @@ _GROWTH_ROUNDS = 9
 _UPDATES = 2000
 _FULL = 10.0  # s, after which learning has begun and the window is full
 SOURCE = Path(__file__).with_name('reference.c')
-# The package's kernels are compiled for the native processor too; contraction would change the
-# numbers that are compared.
+# The package's kernels are compiled for the native processor too; contraction would
+# change the numbers that are compared.
 FLAGS = ('-O3', '-march=native', '-ffp-contract=off')
 # joints, parameters, columns of a row: xi1, torque, theta
 _N = 2
@@ -252,8 +252,9 @@ def _package(duration: float) -> Callable[[], int]:
 def updates(name: str) -> tuple[str, Callable[[], int], int]:
     """Return the size of a preset's problem, a function that does some updates, and its memory.
 
-    They are those of a simulated run without events, once the window is full. The p of the size
-    counts all estimates, the m of the law. Raises RuntimeError if the run learns nothing.
+    They are those of a simulated run without events, once the window is full. The p of
+    the size counts all estimates, the m of the law. Raises RuntimeError if the run
+    learns nothing.
     """
     ahead = (_GROWTH_ROUNDS + 1) * _UPDATES
     quiet: dict[str, object] = {

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Output-constrained tracking of robot arms with unknown dynamics, as ROS 2 nodes and in Python.
+"""Output-constrained tracking of robot arms with unknown dynamics.
 
-The names below are the public interface. Each is imported on first use, so that a node does not
-load modules that only an analysis needs.
+The names below are the public interface. Each is imported on first use, so that a node
+does not load modules that only an analysis needs.
 """
 
 from __future__ import annotations

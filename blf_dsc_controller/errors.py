@@ -15,7 +15,7 @@ class ConfigurationError(BlfDscError):
         self.source = source
 
     def __str__(self) -> str:
-        """Return one line for each problem, below a line with their number and source."""
+        """Return a line for each problem, below one with their number and source."""
         where = f' in {self.source}' if self.source else ''
         count = 'problem' if len(self.problems) == 1 else 'problems'
         lines = ''.join(f'\n  - {problem}' for problem in self.problems)

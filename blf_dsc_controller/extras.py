@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Packages of the optional extras: how they are imported, and installed where they are missing."""
+"""Packages of the optional extras: their import, and how to install them."""
 
 from __future__ import annotations
 
@@ -16,7 +16,9 @@ _REMEDY = {'pyarrow': "with a numpy before 2: pip install 'pyarrow<26'"}
 
 
 def install_command(extra: str) -> str:
-    """Return the command that installs an extra; it names the checkout that this package runs from.
+    """Return the command that installs an extra.
+
+    It names the checkout that this package runs from.
 
     pip finds a package that is installed otherwise by its name.
     """

@@ -37,7 +37,10 @@ class Series:
     def held(
         self, stamp: Stamps, columns: slice | NDArray[np.intp] = slice(None)
     ) -> Floats:
-        """Return the last values at or before each stamp; the first values for earlier stamps."""
+        """Return the last values at or before each stamp.
+
+        The first values for earlier stamps.
+        """
         index = np.searchsorted(self.stamp, stamp, side='right') - 1
         return self.values[np.maximum(index, 0)][:, columns]
 
@@ -53,7 +56,10 @@ class Stop(NamedTuple):
 
 
 Regressor = Callable[[Floats, Floats, Floats, Floats], Floats]
-"""Returns H (k, n, p) for (q, dq, v, a), (k, n) each: H P = M(q) a + C(q, dq) v + G(q) [N m]."""
+"""Returns H (k, n, p) for (q, dq, v, a), (k, n) each.
+
+H P = M(q) a + C(q, dq) v + G(q) [N m].
+"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,7 +74,10 @@ class LearnedArm:
 
 @dataclass(frozen=True)
 class Run:
-    """N samples of n joints, simulated, recorded or replayed; None or NaN where unknown."""
+    """N samples of n joints, simulated, recorded or replayed.
+
+    None or NaN where unknown.
+    """
 
     joints: tuple[str, ...]
     stamp: Stamps  #: (N,) ns, of the joint states
@@ -92,7 +101,10 @@ class Run:
     notes: tuple[str, ...] = ()  #: samples of a bag that are left out, and why
 
     def column(self, name: str, i: int) -> Floats | None:
-        """Return the values of one joint (N,) in an array by name; None if it is unknown."""
+        """Return the values of one joint (N,) in an array by name.
+
+        None if it is unknown.
+        """
         values = getattr(self, name)
         return None if values is None else values[:, i]
 

@@ -16,7 +16,8 @@ try:
 except ImportError:  # as where ROS runs rosdoc2
     ziamath = None
 
-# rosdoc2 runs a conf.py of its own, in a copy of doc/, which executes this one by its path.
+# rosdoc2 runs a conf.py of its own, in a copy of doc/, which executes this one by its
+# path.
 HERE = Path(__file__).resolve()
 executed = re.search(r'exec\(open\("(.+)"\)', HERE.read_text(encoding='utf-8'))
 ROOT = (Path(executed[1]) if executed else HERE).parents[1]
@@ -46,7 +47,8 @@ autodoc_type_aliases = {name: name for name in ('Array', 'Floats', 'Stamps')}
 autodoc_typehints_format = 'short'
 python_use_unqualified_type_names = True
 nitpicky = True
-# Types of other packages, and those of the package that the page on Python does not show.
+# Types of other packages, and those of the package that the page on Python does not
+# show.
 nitpick_ignore_regex = [('py:.*', '.*')]
 
 html_theme = 'furo'
@@ -59,8 +61,8 @@ if ziamath:
     ziamath.config.precision = 2
 html_static_path = ['_static']
 html_css_files = ['site.css']
-# An excerpt would be fetched, which browsers refuse for files on disk: the list of results would
-# end after the first.
+# An excerpt would be fetched, which browsers refuse for files on disk: the list of
+# results would end after the first.
 html_show_search_summary = False
 
 

@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Start the controller with its watchdog, the simulated arm, and, with `bag`, the recorder.
 
-For instance: ros2 launch blf_dsc_controller closed_loop.launch.py config:=noisy bag:=run1
-and for the driver of an arm: ros2 launch blf_dsc_controller closed_loop.launch.py driver:=fr3
+For instance: ros2 launch blf_dsc_controller closed_loop.launch.py config:=noisy
+bag:=run1 and for the driver of an arm: ros2 launch blf_dsc_controller
+closed_loop.launch.py driver:=fr3
 """
 
 from typing import Any
@@ -20,7 +21,8 @@ PACKAGE = 'blf_dsc_controller'
 
 # Of each driver: its parameter file, joint states and commands.
 DRIVERS = {
-    # joint_state_broadcaster at update_rate; joint_states is joint_state_publisher's, at 30 Hz
+    # joint_state_broadcaster at update_rate; joint_states is joint_state_publisher's,
+    # at 30 Hz
     'fr3': ('fr3', 'franka/joint_states', 'fr3_effort_controller/commands'),
     'ur5e': ('ur5e_driver', 'joint_states', 'forward_effort_controller/commands'),
 }
@@ -65,7 +67,8 @@ def nodes(context: LaunchContext) -> list[Node]:
     remappings = [('joint_states', states), ('~/commands', commands), (own, commands)]
     is_simulated = not robot
     file = str(locate(config or of_driver))
-    # The first sample must be recorded too, so the loop starts after the recorder subscribes.
+    # The first sample must be recorded too, so the loop starts after the recorder
+    # subscribes.
     of_loop = {'wait_for_subscribers': 1} if bag else {}
     of_controller = of_loop | {'safety.expect_watchdog': True}
 
@@ -79,8 +82,8 @@ def nodes(context: LaunchContext) -> list[Node]:
         return Node(
             package=PACKAGE,
             executable=executable,
-            # With a name, `given` is for this node: a section /**/NODE of the file would override
-            # parameters for any node.
+            # With a name, `given` is for this node: a section /**/NODE of the file
+            # would override parameters for any node.
             name=executable,
             namespace=namespace,
             parameters=[file, given] if given else [file],
@@ -99,7 +102,8 @@ def nodes(context: LaunchContext) -> list[Node]:
         started.append(node('bag_recorder', recorded, required=is_simulated))
     # A new one reads the journal of the controller that is still there.
     started.append(node('torque_watchdog', {}, required=False, respawned=True))
-    # On an arm, the watchdog outlives a controller that crashes, and both outlive the recorder.
+    # On an arm, the watchdog outlives a controller that crashes, and both outlive the
+    # recorder.
     started.append(node('blf_dsc_controller', of_controller, required=is_simulated))
     if is_simulated:
         started.append(node('sim_plant', of_loop))

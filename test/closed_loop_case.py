@@ -46,7 +46,8 @@ def recommended(
 ) -> Settings:
     """Return the settings of the default configuration with changes, and the knee for them.
 
-    Change detection is off, since the paper has none: test_law_consistency.py covers it.
+    Change detection is off, since the paper has none: test_law_consistency.py covers
+    it.
     """
     config = ControllerConfig()
     columns = {'viscous': viscous, 'frequencies': frequencies}

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """ROS environment of the test process and its child processes; profile of hypothesis.
 
-Both are set here, before any test module imports rclpy. The environment has a domain in which
-nobody else is, discovery on this machine only, and a log folder that is
-removed at the end.
+Both are set here, before any test module imports rclpy. The environment has a domain in
+which nobody else is, discovery on this machine only, and a log folder that is removed
+at the end.
 """
 
 import os
@@ -14,8 +14,8 @@ from importlib.util import find_spec
 import hypothesis
 import pytest
 
-# The time that an example takes depends on the machine, not on the package. Each run has the same
-# examples; `make test-nightly` (NIGHTLY=1) draws others, and more.
+# The time that an example takes depends on the machine, not on the package. Each run
+# has the same examples; `make test-nightly` (NIGHTLY=1) draws others, and more.
 hypothesis.settings.register_profile(
     'suite', deadline=None, derandomize='NIGHTLY' not in os.environ
 )

@@ -1,10 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """A closed loop for fault injection, all injected faults, and the table of their outcomes.
 
-In the loop of arm, messages, guarded law and clocks that the test sets, everything passes through
-the same decoders, supervisor and torque input as in the nodes.
+In the loop of arm, messages, guarded law and clocks that the test sets, everything
+passes through the same decoders, supervisor and torque input as in the nodes.
 
-`python test/fault_table.py doc/faults.md` runs all faults and rewrites the table of the page.
+`python test/fault_table.py doc/faults.md` runs all faults and rewrites the table of the
+page.
 """
 
 from __future__ import annotations
@@ -92,7 +93,10 @@ class Rig:
         return State(self.base + self.plant.elapsed_ns, q, dq, effort)
 
     def deliver(self, raw):
-        """Pass one message to the controller; return the torque it commands, or None."""
+        """Pass one message to the controller.
+
+        Return the torque it commands, or None.
+        """
         try:
             stamp = self._decoder.decode(raw)
         except MessageError as error:
@@ -396,7 +400,10 @@ def rejection(name: str, value: list[float]) -> Callable[[Rig], None]:
 
 
 def replaced(*, possible: bool) -> Callable[[Rig], None]:
-    """Send a trajectory every 30 ms, before the last one ends; too far unless `possible`."""
+    """Send a trajectory every 30 ms, before the last one ends.
+
+    Too far unless `possible`.
+    """
 
     def inject(rig):
         def sense(state):
@@ -418,7 +425,10 @@ def replaced(*, possible: bool) -> Callable[[Rig], None]:
 
 
 def wall_clock_back(rig: Rig) -> None:
-    """Set the wall clock back by an hour; stamps of a driver with its own clock continue."""
+    """Set the wall clock back by an hour.
+
+    Stamps of a driver with its own clock continue.
+    """
     rig.wall -= 3600 * 10**9
 
 

@@ -5,7 +5,8 @@
 
 Once the first torque of a motion has come, each step waits for the torque of the last
 state, and until then time passes slowly, so that results do not depend on the computer.
-Cycles are counted from that torque.  It prints `ready` when it accepts connections.  WHAT is one of
+Cycles are counted from that torque.  It prints `ready` when it accepts connections.
+WHAT is one of
 
     load=KG     a mass appears in the hand, or disappears again (0)
     reflex      the motion is aborted, as after a collision

@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """A DDS participant that publishes types of no ROS package until it is killed.
 
-`python odd_participant.py a=foo::bar::X` publishes `foo::bar::dds_::X_` on /a. The middleware
-derives the name from the type support of a message, where it is replaced here.
+`python odd_participant.py a=foo::bar::X` publishes `foo::bar::dds_::X_` on /a. The
+middleware derives the name from the type support of a message, where it is replaced
+here.
 """
 
 from __future__ import annotations

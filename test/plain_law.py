@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The law in plain numpy, as a control engineer would write it, sharing nothing with the package.
 
-It is the tests' oracle, and the law of every peer in benchmark/ that is only a simulator.
+It is the tests' oracle, and the law of every peer in benchmark/ that is only a
+simulator.
 """
 
 from __future__ import annotations
@@ -70,7 +71,10 @@ class PlainLaw:
         return g.bound + wider, -g.funnel_rate * wider
 
     def barrier_torque(self, xi1, t):
-        """Return tau_c of (16) with its weight, a straight line beyond the knee; of (35) -w z1."""
+        """Return tau_c of (16) with its weight, a straight line beyond the knee.
+
+        Of (35) -w z1.
+        """
         g = self.gains
         if self.linear:
             return -g.weight * xi1
@@ -105,7 +109,10 @@ class PlainLaw:
         return Yp, np.column_stack([Yr, *columns])
 
     def learn(self, t, dt, q, dq, dqr, applied):
-        """Filter the row of the last interval into the window; when due, latch the window."""
+        """Filter the row of the last interval into the window.
+
+        When due, latch the window.
+        """
         g = self.gains
         Yp, Yr = self.momentum_regressors(t, q, dq)
         if self.previous is not None:
@@ -179,7 +186,8 @@ class PlainLaw:
     def update(self, t, dt, qr, dqr, ddqr, measurement):
         """Return the torque (28) or (35); the caller sets `tau`, the last one sent.
 
-        What is learned acts along the reference, or at the measured state as in the paper.
+        What is learned acts along the reference, or at the measured state as in the
+        paper.
         """
         g = self.gains
         q, dq, _ = np.reshape(measurement, (3, 2)).copy()

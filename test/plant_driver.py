@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """A driver on the simulated arm in lock-step: a robot that answers, falls silent or has reflexes.
 
-`address` says what happens: `plant`, or a word such as `silent@300` or `late@300` with the number
-of the state at which it does.
+`address` says what happens: `plant`, or a word such as `silent@300` or `late@300` with
+the number of the state at which it does.
 """
 
 from __future__ import annotations

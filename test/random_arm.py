@@ -71,7 +71,9 @@ def joint(name, kind, parent, child, random):
 
 
 def random_urdf(n, seed):
-    """Return the URDF of a chain from `base` to `tip`, and its joints j1 .. jn of all kinds.
+    """Return the URDF of a chain from `base` to `tip`, and its joints j1 ..
+
+    Jn of all kinds.
 
     Each joint is followed by a fixed joint, and links with mass branch off.
     """
@@ -203,7 +205,9 @@ def reference_of(chain, seed, tones=3):
 
 @kernel
 def _shake(arm, viscous, coulomb, motion, gains, work, states):
-    """Follow `motion` (N, 3, n) by PD, torques held for a period; fill states (N, 3, n).
+    """Follow `motion` (N, 3, n) by PD, torques held for a period.
+
+    Fill states (N, 3, n).
 
     The rows of `work` (8, n) are zero at first.
     """
@@ -257,7 +261,10 @@ def shake(chain, truth, reference, duration):
 
 
 def measured(states, seed, encoder=2.0 * np.pi / 2**20, noise=0.01):
-    """Return the states as measured by encoders and torque sensors; noise is of the rms torque."""
+    """Return the states as measured by encoders and torque sensors.
+
+    Noise is of the rms torque.
+    """
     random = np.random.default_rng(seed)
     seen = states.copy()
     seen[:, 0] = np.round(states[:, 0] / encoder) * encoder

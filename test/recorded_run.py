@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Bags of short offline runs, their messages, other readers, a small disk; and a made-up run."""
+"""Bags of short offline runs, their messages, other readers, a small disk.
+
+And a made-up run.
+"""
 
 from __future__ import annotations
 

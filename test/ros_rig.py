@@ -68,7 +68,8 @@ class RosRig:
         while self.nodes:
             self.kill(self.nodes[-1])
         rclpy.try_shutdown(context=self.context)
-        # A node's services keep its participant, visible to others, until it is collected.
+        # A node's services keep its participant, visible to others, until it is
+        # collected.
         self.tester = self.executor = None
         self._clients.clear()
         gc.collect()

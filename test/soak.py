@@ -120,7 +120,8 @@ def soak(loop, samples):
         file=sys.stderr,
     )
     assert worst < 1.0
-    # Every restarted node costs the middleware about 50 kB, and the heap takes time to settle.
+    # Every restarted node costs the middleware about 50 kB, and the heap takes time to
+    # settle.
     assert growth < 0.02 * len(used) + 10.0
     assert extra <= 0
 

@@ -81,7 +81,8 @@ def live():
                 'bag_recorder': ['bag_recorder', '_bag_recorder_subscriptions'],
             }
             found = {name: granted(ros, parts) for name, parts in nodes.items()}
-            # With robot.urdf: topic://robot_description, a separate node waits for that topic.
+            # With robot.urdf: topic://robot_description, a separate node waits for that
+            # topic.
             found['blf_dsc_controller']['subscribe'].append('/robot_description')
             hidden = '/_blf_dsc_controller_subscriptions/get_type_description'
             found['blf_dsc_controller']['reply'].insert(0, hidden)

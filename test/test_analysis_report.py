@@ -329,15 +329,18 @@ def test_absurd_numbers_and_characters_missing_from_the_font_cause_no_warning(
     assert ('VIOLATED, first by elbow at 0.100 s' in out) is not np.isnan(value)
 
 
-# A safe stop, with its reason and time. The sample that causes it is published without its error:
-# only the journal has the cause.
+# A safe stop, with its reason and time. The sample that causes it is published without
+# its error: only the journal has the cause.
 
 STOP_S = 2.345
 LATE = 40 * MILLISECOND  # from the stamp of a message to its reception
 
 
 def stopped(folder, reason=Reason.OUTSIDE_BOUND):
-    """Bag of a run whose controller stops at `STOP_S`; its messages are received late."""
+    """Bag of a run whose controller stops at `STOP_S`.
+
+    Its messages are received late.
+    """
     stop = START + round(STOP_S * 1e3) * MILLISECOND
     text = (
         "joint 'elbow' is +0.0023 rad from its reference: past its bound of 0.002 rad"

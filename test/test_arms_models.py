@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Arms against pinocchio and plain formulas; base parameters, and their prior; rules of URDFs."""
+"""Arms against pinocchio and plain formulas; base parameters, and their prior.
+
+Rules of URDFs.
+"""
 
 from __future__ import annotations
 
@@ -111,7 +114,8 @@ def test_chain_and_its_placements_agree_with_pinocchio(name):
 def test_regressors_and_accelerations_agree_with_pinocchio(name):
     """Property III with the Christoffel C, where v and a are not the derivatives of q.
 
-    The plant's accelerations are from another derivation, which shares only the geometry.
+    The plant's accelerations are from another derivation, which shares only the
+    geometry.
     """
     case = Case(name)
     q = case.q
@@ -273,7 +277,10 @@ def test_base_parameters_are_the_smallest_set_that_gives_the_same_torques(chain)
 
 
 def test_base_parameters_agree_with_the_literature():
-    """43 for a Panda (Gaz et al., 2019), 36 for an arm like the UR; rotors except at the base."""
+    """43 for a Panda (Gaz et al., 2019), 36 for an arm like the UR.
+
+    Rotors except at the base.
+    """
     for chain, inertial, rotors in ((PANDA_CHAIN, 43, 5), (UR5E_CHAIN, 36, 4)):
         names = base_parameters(chain).model.parameter_names
         found = sum(name.startswith('rotor') for name in names)

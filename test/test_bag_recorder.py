@@ -102,14 +102,18 @@ def test_messages_are_recorded_byte_for_byte(ros, bag):
     assert publisher.wait_for_all_acked()
     recorder.close()
     states = [entry for entry in read(bag) if entry[0] == '/joint_states']
-    # The last ones were received before it was closed, without spinning the executor once more.
+    # The last ones were received before it was closed, without spinning the executor
+    # once more.
     assert [raw for _, _, raw in states] == sent
     stamps = [stamp for _, stamp, _ in states[:1000]]
     assert [before, *stamps, after] == sorted([before, *stamps, after])
 
 
 def test_plant_as_the_clock_logs_at_the_stamp_of_the_last_joint_state(ros, bag):
-    """What comes before the first of them waits for it; stamps that fall do not set time back."""
+    """What comes before the first of them waits for it.
+
+    Stamps that fall do not set time back.
+    """
     topics = ['early', 'joint_states']
     given = {'output': str(bag), 'clock': 'plant', 'topics': topics}
     recorder = ros.add(BagRecorderNode, given)
@@ -144,7 +148,9 @@ def test_best_effort_publisher_that_joins_a_reliable_one_is_recorded_too(ros, ba
 
 
 def test_topics_of_every_quality_and_type_are_recorded_as_offered(ros, bag):
-    """Latched before the recorder came, best effort, and both on one topic; not those of others.
+    """Latched before the recorder came, best effort, and both on one topic.
+
+    Not those of others.
 
     Also a type of a package that rosbags does not know.
     """
@@ -449,11 +455,13 @@ def test_real_time_loop_is_timed_and_every_message_of_it_is_in_the_bag(tmp_path)
         found[topic] = len(numbers[topic.resolved])
         assert numbers[name] == list(range(1, found[topic] + 1))
     assert read_content(out / 'bag').losses == {}
-    # On a busy machine the first torque may take seconds, and the plant sends its state again.
+    # On a busy machine the first torque may take seconds, and the plant sends its state
+    # again.
     again = logs[0].count('sending the state again')
     assert found[topics.JOINT_STATES] == 1000 * DURATION + 1 + again
     assert found[topics.TIMING] == 1000 * DURATION  # one for each step
-    # On a busy machine the controller may skip a state; it then publishes nothing for it.
+    # On a busy machine the controller may skip a state; it then publishes nothing for
+    # it.
     assert {found[topic] for topic in tenth} == {-(-found[answered] // 10)}
     # Nor were the last ones lost, which no later sequence number would reveal.
     assert not any('not reach every' in log for log in logs)

@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Bags of other software: other topics, joints and orders, shared topics, other formats.
 
-Unusable ones, and malicious files of all kinds, give one clear error line from every command.
+Unusable ones, and malicious files of all kinds, give one clear error line from every
+command.
 """
 
 from __future__ import annotations
@@ -306,7 +307,10 @@ def all_say(run):
 
 
 def write_mcap(folder, entries, schema):
-    """Write one MCAP file; `schema` returns encoding and text of a type, or None for no schema."""
+    """Write one MCAP file.
+
+    `schema` returns encoding and text of a type, or None for no schema.
+    """
     folder.mkdir()
     with (folder / 'bag_0.mcap').open('wb') as stream:
         writer = McapWriter(stream)

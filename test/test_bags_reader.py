@@ -232,7 +232,10 @@ def test_record_longer_than_its_chunk_is_an_error_without_a_checksum_too():
 
 
 def test_any_rows_of_long_topics_of_many_layouts_are_read():
-    """Of two devices; the arm's joints change their order, the tool its name, later the fields."""
+    """Of two devices.
+
+    The arm's joints change their order, the tool its name, later the fields.
+    """
     lists = [
         names
         for k in range(150)

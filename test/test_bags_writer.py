@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Bags are what rosbag2 would have written, also at their limits, and damaged ones are recovered.
 
-Every intact chunk of a damaged bag is recovered, losses are reported, the bag is untouched.
+Every intact chunk of a damaged bag is recovered, losses are reported, the bag is
+untouched.
 """
 
 from __future__ import annotations
@@ -305,7 +306,10 @@ def test_every_intact_chunk_is_recovered_at_any_truncation(plain, tmp_path):
 @settings(max_examples=60, suppress_health_check=list(HealthCheck))
 @given(data=st.data())
 def test_flipped_bytes_lose_nothing_silently(whole, tmp_path_factory, data):
-    """Reading fails or returns what was written; recovery loses only the chunks that were hit."""
+    """Reading fails or returns what was written.
+
+    Recovery loses only the chunks that were hit.
+    """
     original = whole.read_bytes()
     written = read(whole.parent)
     places = data.draw(
@@ -334,7 +338,10 @@ def test_flipped_bytes_lose_nothing_silently(whole, tmp_path_factory, data):
 
 
 def test_every_flipped_head_of_a_record_is_noticed(plain, tmp_path):
-    """A chunk may look like another record, or the end; no later chunk is lost with it."""
+    """A chunk may look like another record, or the end.
+
+    No later chunk is lost with it.
+    """
     original, _ = plain
     last = chunks(original)[-1][1]
     for at, _ in raw_records(original):

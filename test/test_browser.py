@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The pages of report and view in a browser; runs in `make test-browser`.
 
-Their contents are checked without a browser in test_analysis_report.py and test_view.py.
+Their contents are checked without a browser in test_analysis_report.py and
+test_view.py.
 """
 
 from __future__ import annotations

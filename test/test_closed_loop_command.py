@@ -104,7 +104,10 @@ def running(tmp_path, monkeypatch):
 
 
 def whole(bag):
-    """Check that no sample of a bag is missing up to its end; return the number of samples."""
+    """Check that no sample of a bag is missing up to its end.
+
+    Return the number of samples.
+    """
     run = read_run(bag)
     assert set(np.diff(run.stamp)) == {1_000_000}
     return run.stamp.size
@@ -150,7 +153,10 @@ def test_no_node_outlives_the_command(running):
 
 
 def test_loop_in_lockstep_waits_for_its_recorder(running):
-    """Which holds 5000 messages of each topic; the loop takes thousands of steps a second."""
+    """Which holds 5000 messages of each topic.
+
+    The loop takes thousands of steps a second.
+    """
     recorder = running.child('recorder_node')
     os.kill(recorder, signal.SIGSTOP)
     time.sleep(8.0)

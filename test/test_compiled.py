@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Kernels: their vectors, compilation and cache; accuracy, and the same bits everywhere."""
+"""Kernels: their vectors, compilation and cache.
+
+Accuracy, and the same bits everywhere.
+"""
 
 from __future__ import annotations
 
@@ -74,7 +77,10 @@ compiling = pytest.mark.skipif(numba.config.DISABLE_JIT, reason='nothing is comp
 
 
 def test_kernel_depends_on_the_files_and_constants_it_is_compiled_from():
-    """Changing the plant does not recompile the law; changing the configuration, no kernel."""
+    """Changing the plant does not recompile the law.
+
+    Changing the configuration, no kernel.
+    """
     for kernel, needed, foreign in (
         (update, LAW, PLANT),
         (run_loop, LAW | PLANT, set()),

@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Parameter files: read as ROS reads them, written back, documented; which section applies."""
+"""Parameter files: read as ROS reads them, written back, documented.
+
+Which section applies.
+"""
 
 from __future__ import annotations
 
@@ -70,7 +73,10 @@ def file(tmp_path):
 
 @pytest.fixture
 def with_ros(bare_node):
-    """Return a function to the parameters that rcl reads for a node; None: it rejects the file."""
+    """Return a function to the parameters that rcl reads for a node.
+
+    None: it rejects the file.
+    """
 
     def values(path, name):
         try:

@@ -80,7 +80,8 @@ def test_limits_are_inclusive_and_arrays_as_long_as_others_say():
             {'sensr.offset': [1.0, 1.0]},
             'unknown parameter, did you mean sensor.offset?',
         ),
-        # Types. ROS does not accept an integer for a double, nor does a run without ROS.
+        # Types. ROS does not accept an integer for a double, nor does a run without
+        # ROS.
         (
             PLANT,
             {'duration': 1},
@@ -302,7 +303,10 @@ def test_defaults_are_valid_and_every_parameter_is_described(cls):
 
 
 def test_valid_values_are_not_put_into_words(monkeypatch):
-    """A gain changes between two samples; the words of all values would take several."""
+    """A gain changes between two samples.
+
+    The words of all values would take several.
+    """
     config = load_loop('panda').controller
     monkeypatch.setattr(
         schema, 'format_value', lambda _: pytest.fail('a valid value was formatted')

@@ -271,8 +271,9 @@ def test_slow_drift_of_commands_without_effect_shows_in_the_effort(drive, effort
 def test_bound_holds_with_a_wrong_model_of_the_drive(preset, model, worst, learned):
     """Each body up to 80 % off, or all of them half or twice as heavy, and 2 kg at 10 s.
 
-    Where the drives hold the true arm the Panda reaches 0.50 and 0.06, the UR5e 0.30 and 0.26; with
-    half the weight missing the UR5e reaches 0.350 (0.300 with `compensation: state`).
+    Where the drives hold the true arm the Panda reaches 0.50 and 0.06, the UR5e 0.30
+    and 0.26; with half the weight missing the UR5e reaches 0.350 (0.300 with
+    `compensation: state`).
     """
     pick_up = {'events.begin': [10.0], 'events.duration': [0.0]}
     record = run(preset, 17.0, HELD, None, pick_up | model)
@@ -299,7 +300,10 @@ def test_stop_in_motion_comes_to_rest_and_replays_bit_for_bit(tmp_path):
 
 
 def test_friction_that_the_drive_compensates_is_not_fed_forward_a_second_time():
-    """80 % are compensated; what is left is learned, and fits the bound better than all of it."""
+    """80 % are compensated.
+
+    What is left is learned, and fits the bound better than all of it.
+    """
     none = {
         'robot.viscous': [],
         'robot.coulomb': [],

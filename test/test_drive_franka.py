@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """`blf_dsc drive` on franky-sim's FR3: Franka's bindings on one side, nothing of ours on the other.
 
-The simulator is a process of its own, in lock-step (`franka_simulator.py`), and so is the command.
+The simulator is a process of its own, in lock-step (`franka_simulator.py`), and so is
+the command.
 """
 
 from __future__ import annotations

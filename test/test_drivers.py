@@ -42,7 +42,8 @@ FACTS = {
         joint_states='/franka/joint_states',
         commands='/fr3_effort_controller/commands',  # config/fr3_effort_controller.yml
         rate=1000.0,  # Hz; franka_bringup/config/controllers.yaml: update_rate
-        # franka_description 566ba44, robots/common/franka_arm.xacro with the prefix fr3_
+        # franka_description 566ba44, robots/common/franka_arm.xacro with the prefix
+        # fr3_
         joints=tuple(f'fr3_joint{i}' for i in range(1, 8)),
     ),
     # Universal_Robots_ROS2_Driver jazzy a16a268 (3.8.0)
@@ -52,12 +53,14 @@ FACTS = {
         # ur_robot_driver/config/ur_controllers.yaml: a forward_command_controller
         commands='/forward_effort_controller/commands',
         rate=500.0,  # ur_robot_driver/config/ur5e_update_rate.yaml
-        # the same file: forward_effort_controller.joints, in this order, without a tf_prefix
+        # the same file: forward_effort_controller.joints, in this order, without a
+        # tf_prefix
         joints=UR5E,
     ),
 }
-# ros2_controllers 4, tried with its real parts: joint_state_broadcaster publishes reliably and
-# latched, the effort controllers subscribe with best effort: any of our qualities is compatible.
+# ros2_controllers 4, tried with its real parts: joint_state_broadcaster publishes
+# reliably and latched, the effort controllers subscribe with best effort: any of our
+# qualities is compatible.
 
 
 def fences():
@@ -87,7 +90,10 @@ def test_file_has_the_joints_and_the_rate_of_the_driver(robot):
 
 
 def test_urdf_of_the_fr3_has_its_mass_and_its_reach():
-    """franka_description: 2.3966 kg of base and 15.4948 kg of links; the flange at q = 0."""
+    """franka_description: 2.3966 kg of base and 15.4948 kg of links.
+
+    The flange at q = 0.
+    """
     model = pinocchio.buildModelFromXML((CONFIG / 'fr3.urdf').read_text())
     assert sum(inertia.mass for inertia in model.inertias) == pytest.approx(
         2.3966 + 15.4948, abs=1e-3
@@ -167,7 +173,10 @@ def test_repeated_reading_does_not_make_the_torque_of_the_ur5e_jump():
 @ROBOTS
 @pytest.mark.parametrize('lost', [1, 3])
 def test_lost_commands_neither_stop_the_drives_nor_cost_the_bound(robot, lost):
-    """In a row, twenty times a second or more; 2 kg are picked up at 4 s, and put down at 7 s."""
+    """In a row, twenty times a second or more.
+
+    2 kg are picked up at 4 s, and put down at 7 s.
+    """
     loop = load_loop(FACTS[robot].preset)
     events = {'events.begin': [4.0], 'events.duration': [3.0]}
     guard = Guard(loop.controller)
@@ -198,7 +207,10 @@ def test_every_own_shell_line_of_the_page_is_executed(
     tmp_path,
     monkeypatch,
 ):
-    """The rest belongs to packages of the robots; nodes that a line starts find each other."""
+    """The rest belongs to packages of the robots.
+
+    Nodes that a line starts find each other.
+    """
     monkeypatch.chdir(tmp_path)
     own, files = [], []
     for block in fences():

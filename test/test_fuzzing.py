@@ -1,10 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Random external input: names, bags in all their parts, parameter files, URDFs; and a soak.
+"""Random external input: names, bags in all their parts, parameter files, URDFs.
 
-Each property states that a command ends with its result or an error of the package: no other
-exception, no hang, bounded memory, nothing opened outside of the folder, nothing imported.
-`make fuzz EXAMPLES=1000` looks for counterexamples, the nightly tests try a few; `make soak` runs
-soak.py for half an hour, here it runs for seconds.
+And a soak.
+
+Each property states that a command ends with its result or an error of the package: no
+other exception, no hang, bounded memory, nothing opened outside of the folder, nothing
+imported. `make fuzz EXAMPLES=1000` looks for counterexamples, the nightly tests try a
+few; `make soak` runs soak.py for half an hour, here it runs for seconds.
 """
 
 from __future__ import annotations
@@ -52,7 +54,8 @@ fuzzed = settings(
     phases=(Phase.reuse, Phase.generate),
     suppress_health_check=list(HealthCheck),
 )
-# The suite removes its folder of logs at the end; a folder of our own goes with the process.
+# The suite removes its folder of logs at the end; a folder of our own goes with the
+# process.
 _made = tempfile.TemporaryDirectory(
     prefix='fuzzing_', dir=os.environ.get('ROS_LOG_DIR')
 )
@@ -106,7 +109,10 @@ def bounded():
 
 
 def command(*words):
-    """Run a command and return its exit code; its output must not contain a traceback."""
+    """Run a command and return its exit code.
+
+    Its output must not contain a traceback.
+    """
     said = io.StringIO()
     with contextlib.redirect_stdout(said), contextlib.redirect_stderr(said):
         code = main([str(word) for word in words])
@@ -266,7 +272,10 @@ def test_metadata_is_survived(data, way):
 @fuzzed
 @given(data=st.data(), way=WAYS)
 def test_records_are_survived(data, way):
-    """MCAP files: records changed, removed or repeated, their lengths, too; files truncated."""
+    """MCAP files: records changed, removed or repeated, their lengths, too.
+
+    Files truncated.
+    """
 
     def change(raw):
         length = data.draw(st.none() | NUMBERS | st.integers(0, 2**64 - 1))
@@ -373,7 +382,10 @@ def restructured_object(data, value, action):
 @fuzzed
 @given(data=st.data(), way=WAYS)
 def test_structure_of_the_journal_is_survived(data, way):
-    """Events with other fields and values, which are valid JSON; removed, repeated, in disorder."""
+    """Events with other fields and values, which are valid JSON.
+
+    Removed, repeated, in disorder.
+    """
     journal, text = JOURNAL.resolved, typestore().types[JOURNAL.type]
     entries = [list(entry) for entry in eventful()]
     events = [entry for entry in entries if entry[0] == journal]
@@ -435,7 +447,10 @@ XML = (
 @fuzzed
 @given(data=st.data(), arm=st.sampled_from(('panda', 'ur5e')))
 def test_urdfs_are_survived(data, arm):
-    """URDFs: other attributes, also within links and joints; those removed or repeated."""
+    """URDFs: other attributes, also within links and joints.
+
+    Those removed or repeated.
+    """
     root = ET.fromstring((share_folder() / 'config' / f'{arm}.urdf').read_text())  # noqa: S314 - ours
     values = sorted(
         {value for element in root.iter() for value in element.attrib.values()}

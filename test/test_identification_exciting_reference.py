@@ -46,7 +46,8 @@ def test_chosen_reference_excites_far_more_than_that_of_the_paper_within_the_lim
         run(name).sample(-1).lambda_min[0] for name in ('recommended', 'excitation')
     )
     assert SIGMA < paper < 2.0 * SIGMA
-    # A bias column alone has an eigenvalue of 1: with these columns no more is possible.
+    # A bias column alone has an eigenvalue of 1: with these columns no more is
+    # possible.
     assert 0.99 < chosen <= 1.001
     found = run('excitation').run()
     limits = load_loop('excitation').controller.limits

@@ -107,7 +107,8 @@ SPARSE = joint_state('ab', [1, 2], [], [7, 8])
         (joint_state('bcac', [8, 0, 7, 0], [10, 0, 9, 0], []), [7, 8, 9, 10, NAN, NAN]),
         (SPARSE, [1, 2, NAN, NAN, 7, 8]),
         (SPARSE + bytes(4), [1, 2, NAN, NAN, 7, 8]),
-        # Anything may be in the option byte of the encapsulation, in padding, and after the end.
+        # Anything may be in the option byte of the encapsulation, in padding, and after
+        # the end.
         (GOOD[:3] + b'\xff' + GOOD[4:17] + b'\xff' + GOOD[18:], [1, 2, 3, 4, 5, 6]),
         (GOOD + b'\xff' * 5, [1, 2, 3, 4, 5, 6]),
     ],

@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Arms from MJCF: their dynamics are MuJoCo's own; what no serial chain has is refused by name."""
+"""Arms from MJCF: their dynamics are MuJoCo's own.
+
+What no serial chain has is refused by name.
+"""
 
 from __future__ import annotations
 

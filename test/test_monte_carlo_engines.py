@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Engines give the same results in any order, also after a kill; the report can be reproduced."""
+"""Engines give the same results in any order, also after a kill.
+
+The report can be reproduced.
+"""
 
 from __future__ import annotations
 
@@ -217,7 +220,8 @@ def test_runs_are_sorted_worst_first_with_diverged_runs_before_all_others(whole_
     outcome[:] = 'kept'
     outcome[5] = 'diverged'
     results['outcome'] = outcome
-    # The worse of both joints counts: ends before the middle, ties in the order of the runs.
+    # The worse of both joints counts: ends before the middle, ties in the order of the
+    # runs.
     summary = summarize(whole_store.study, results)
     assert [entry['run'] for entry in summary['worst'][:5]] == [5, 0, 23, 1, 22]
     assert summary['outcomes'] == {
@@ -227,7 +231,8 @@ def test_runs_are_sorted_worst_first_with_diverged_runs_before_all_others(whole_
         'rejected': 0,
     }
     assert summary['kept']['fraction'] == 23 / 24
-    # (23 + z^2 / 2 -+ z sqrt(23 / 24 + z^2 / 4)) / (24 + z^2), z = 1.959964, Wilson (1927)
+    # (23 + z^2 / 2 -+ z sqrt(23 / 24 + z^2 / 4)) / (24 + z^2), z = 1.959964, Wilson
+    # (1927)
     assert summary['kept']['low'] == pytest.approx(0.797582, abs=1e-6)
     assert summary['kept']['high'] == pytest.approx(0.992607, abs=1e-6)
 

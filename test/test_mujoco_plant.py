@@ -202,12 +202,13 @@ def test_node_keeps_the_bound_and_learns_the_parameters(ros, example):
     ros.until(lambda: arm.plant.sample >= 8000 or guard.supervisor.text)
     assert not guard.supervisor.text
     assert guard.samples.ratio.max() < 1.0
-    # Learning begins after 6.8 s, with half of each parameter missing; a second later an error
-    # of 0.1 % is left with our own plant, which holds its torque the same way.
+    # Learning begins after 6.8 s, with half of each parameter missing; a second later
+    # an error of 0.1 % is left with our own plant, which holds its torque the same way.
     np.testing.assert_allclose(guard.controller.state.estimate[:3], P, rtol=0.01)
 
 
-# All of them in `make test-nightly`; test_law_consistency.py has them with our own plant.
+# All of them in `make test-nightly`; test_law_consistency.py has them with our own
+# plant.
 CHANGES = ROWS if os.environ.get('NIGHTLY') else ['payload to 0.75 kg at 8 s']
 
 

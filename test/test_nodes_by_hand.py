@@ -209,7 +209,10 @@ TORQUE = (5.0, 3.0)  # N m
 
 
 def start_plant(ros, **values):
-    """Start a plant in lock-step; return it, what it publishes, and a way to send torques."""
+    """Start a plant in lock-step.
+
+    Return it, what it publishes, and a way to send torques.
+    """
     received = ros.listen(topics.JOINT_STATES, raw=True)
     node = ros.add(PlantNode, {'mode': 'lockstep', **values})
     commands = ros.publisher(topics.COMMANDS)
@@ -301,9 +304,11 @@ ONCE = (
 @pytest.mark.parametrize(
     ('events', 'waits', 'late'),
     [
-        # A controller that is 2.5 samples late must not pass for one that is half a sample late.
+        # A controller that is 2.5 samples late must not pass for one that is half a
+        # sample late.
         (LATE, [1.0, 2.0, 2.5], 2),
-        # The longest wait is published once: the first torque is late, for the state at 0.
+        # The longest wait is published once: the first torque is late, for the state at
+        # 0.
         (ONCE, [1.0, 1.75, 0.25], 1),
     ],
 )
@@ -323,7 +328,10 @@ def test_latency_is_that_of_the_oldest_state_without_a_torque(events, waits, lat
 
 
 def start_live(ros, node, arm):
-    """Send live states at 1 kHz until the law has commanded; return the last stamp [ns]."""
+    """Send live states at 1 kHz until the law has commanded.
+
+    Return the last stamp [ns].
+    """
     stamp = time.time_ns()
     while not arm.commands:
         stamp += 10**6

@@ -34,8 +34,9 @@ from blf_dsc_controller.nodes.controller_node import ControllerNode
 from blf_dsc_controller.nodes.plant_node import PlantNode
 from blf_dsc_controller.supervision.supervisor import Phase
 
-# Transient local, to get from /rosout what was logged before discovery. rcl keeps one publisher
-# for each logger name, so the nodes of each test are in a namespace of their own.
+# Transient local, to get from /rosout what was logged before discovery. rcl keeps one
+# publisher for each logger name, so the nodes of each test are in a namespace of their
+# own.
 KEPT = QoSProfile(depth=1000, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 PLAIN = {'disturbance.constant': [0.0, 0.0], 'disturbance.amplitude': [0.0, 0.0]}
 ZERO = (0.0, 0.0)
@@ -47,7 +48,10 @@ FATAL = (
 
 @pytest.fixture
 def log(ros):
-    """Return what the nodes of a namespace logged; each test uses its own (see KEPT)."""
+    """Return what the nodes of a namespace logged.
+
+    Each test uses its own (see KEPT).
+    """
     received = []
     ros.tester.create_subscription(Log, '/rosout', received.append, KEPT)
 
@@ -70,7 +74,10 @@ def statuses(diagnostics, begin):
 
 
 def driver(ros, space):
-    """Stand in for an arm: subscribe to commands; return the publisher of joint states."""
+    """Stand in for an arm: subscribe to commands.
+
+    Return the publisher of joint states.
+    """
     commands = f'/{space}/blf_dsc_controller/commands'
     ros.tester.create_subscription(Float64MultiArray, commands, lambda _: None, 1)
     states = ros.tester.create_publisher(JointState, f'/{space}/joint_states', 50)
@@ -132,7 +139,10 @@ def test_diagnostics_tell_what_is_held(ros):
 
 
 def test_leaving_node_commands_the_safe_torque_last(ros):
-    """A driver holds it: zero would drop the arm. In motion, the arm is brought to rest first."""
+    """A driver holds it: zero would drop the arm.
+
+    In motion, the arm is brought to rest first.
+    """
     commands = ros.listen(topics.COMMANDS)
     given = {
         'safety.torque': 'hold_gravity',

@@ -207,7 +207,8 @@ def test_plant_counts_real_time_in_whole_samples(ros):
     stamps, _ = states(received[topics.JOINT_STATES])
     np.testing.assert_array_equal(stamps, stamps[0] + MILLISECOND * np.arange(301))
 
-    # However late the torque for a state was, the reference is that of the state's own time.
+    # However late the torque for a state was, the reference is that of the state's own
+    # time.
     reference_stamps, values = states(received[topics.REFERENCE])
     assert set(reference_stamps) <= set(stamps)
     vector = reference_of(ControllerConfig())

@@ -114,7 +114,8 @@ def test_real_time_is_requested_for_all_threads_and_a_refusal_named_with_its_rem
     assert lines == []
 
 
-# The environment of the nodes of a run: the middleware's settings, domains, numpy's threads.
+# The environment of the nodes of a run: the middleware's settings, domains, numpy's
+# threads.
 
 MULTIPLY = """
 import os, sys
@@ -260,9 +261,9 @@ def test_run_leaves_a_domain_that_somebody_enters_with_it(
     assert used == [str(free)]
 
 
-# The launch file and the command line: which parameters reach the nodes. `launch` comes only with a
-# ROS installation: here stand-ins replace the few classes needed, and the real nodes get the
-# arguments that `launch_ros` would pass to their processes.
+# The launch file and the command line: which parameters reach the nodes. `launch` comes
+# only with a ROS installation: here stand-ins replace the few classes needed, and the
+# real nodes get the arguments that `launch_ros` would pass to their processes.
 
 ROOT = Path(__file__).resolve().parents[1]
 NODES = {

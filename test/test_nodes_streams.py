@@ -76,7 +76,10 @@ def chunks_of(law, k, period):
 
 @pytest.mark.parametrize('send', [positions_of, points_of, chunks_of])
 def test_stream_is_followed_at_most_an_interval_behind_without_a_jump(ros, send):
-    """At 50 Hz, 20 ms behind at most 0.2 rad/s; chunks at 10 Hz keep their own times."""
+    """At 50 Hz, 20 ms behind at most 0.2 rad/s.
+
+    Chunks at 10 Hz keep their own times.
+    """
     references = ros.listen(topics.REFERENCE)
     arm, law = ros.loop(None, PATIENT)
     ros.run(arm, 50)

@@ -64,7 +64,10 @@ def inputs(law):
 
 
 def send(ros, law, sent):
-    """Send a trajectory; return the reason of the last rejection, empty if there was none."""
+    """Send a trajectory.
+
+    Return the reason of the last rejection, empty if there was none.
+    """
     name = '/' + topics.JOINT_TRAJECTORY.relative
     publisher = ros.tester.create_publisher(JointTrajectory, name, 10)
     ros.until(lambda: publisher.get_subscription_count() > 0)
@@ -85,7 +88,8 @@ def test_two_tone_trajectory_is_tracked_within_the_bound_and_replaced_twice(
 ):
     references = ros.listen(topics.REFERENCE)
     errors = ros.listen(topics.TRACKING_ERROR)
-    # Planned in a thread, it is followed the later, the busier the computer: then in less time.
+    # Planned in a thread, it is followed the later, the busier the computer: then in
+    # less time.
     limit = {'off': 4.0, 'on': 8.0}[watchdog]  # rad/s^2
     brisk = {'limits__acceleration': [limit, limit], 'telemetry__decimation': 1}
     arm, law = ros.loop(None, brisk | PLANNED[watchdog])
@@ -111,7 +115,8 @@ def test_two_tone_trajectory_is_tracked_within_the_bound_and_replaced_twice(
     assert np.max([np.abs(message.position) for message in errors]) < 2e-3
     positions = np.array([message.position for message in references])
     velocities = np.array([message.velocity for message in references])
-    # At most the limit over a millisecond: no jump where one trajectory replaces another.
+    # At most the limit over a millisecond: no jump where one trajectory replaces
+    # another.
     assert np.abs(np.diff(velocities, axis=0)).max() < 1.025e-3 * limit
     np.testing.assert_allclose(
         np.diff(positions, axis=0),

@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""README and doc/: code runs, files load, commands exist; the site is whole and loads nothing."""
+"""README and doc/: code runs, files load, commands exist.
+
+The site is whole and loads nothing.
+"""
 
 from __future__ import annotations
 
@@ -60,7 +63,8 @@ def test_python_blocks_run_and_print_the_output_shown_below_them(
 ):
     """The blocks of a page are run as one program, in a folder with the page's YAML file.
 
-    Those below "Save this as `name.py`" are saved in this folder instead, to be imported.
+    Those below "Save this as `name.py`" are saved in this folder instead, to be
+    imported.
     """
     monkeypatch.chdir(tmp_path)
     monkeypatch.syspath_prepend(tmp_path)

@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Interfaces of real nodes: parameters declared, described and changed; QoS; policy; viewers."""
+"""Interfaces of real nodes: parameters declared, described and changed; QoS.
+
+Policy; viewers.
+"""
 
 from __future__ import annotations
 

@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The plant of an arm from a URDF: truth, events, drives, odd states; its encoders and drives."""
+"""The plant of an arm from a URDF: truth, events, drives, odd states.
+
+Its encoders and drives.
+"""
 
 from __future__ import annotations
 
@@ -114,7 +117,10 @@ def test_random_truth_deviates_as_configured_and_stays_physical():
 
 
 def test_events_act_on_all_seven_joints_at_their_time():
-    """A push at the tip acts through its Jacobian; friction, torques and offsets add up."""
+    """A push at the tip acts through its Jacobian.
+
+    Friction, torques and offsets add up.
+    """
     names = ('force', 'torque', 'viscous', 'coulomb', 'offset')
     values = (
         [3.0, -2.0, 5.0],
@@ -337,7 +343,10 @@ def readings(true, noise, reads, given):
 
 @pytest.mark.parametrize('seed', range(40))
 def test_readings_and_torques_are_those_of_encoders_and_drives_in_plain_numpy(seed):
-    """Also where a sample is read twice, or not at all; the arm moves by the torques reported."""
+    """Also where a sample is read twice, or not at all.
+
+    The arm moves by the torques reported.
+    """
     drawn = np.random.default_rng(seed)
     given = {
         name: values[drawn.integers(len(values))] for name, values in OPTIONS.items()

@@ -20,7 +20,8 @@ LAW = {'comparison': 'backstepping', 'comparison_detuned': 'backstepping'} | {
     name: name for name in ('model_based', 'slotine_li')
 }
 
-# Figures are drawn with and without a barrier, and of an arm from a URDF; others have no more.
+# Figures are drawn with and without a barrier, and of an arm from a URDF; others have
+# no more.
 DRAWN = {'recommended', 'slotine_li', 'panda'}
 
 

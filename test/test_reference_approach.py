@@ -83,11 +83,13 @@ def test_approach_leads_from_the_measured_state_to_the_reference_as_fast_as_allo
     np.testing.assert_allclose(at(motion.vector, T0), [*start, (0.0, 0.0)], atol=1e-12)
     for t in (after, after + 1.0, 1e4):
         np.testing.assert_array_equal(at(motion.vector, t), at(pack(2, [main]), t))
-    # 1e-5 allows for the jerk over 1e-7 s: position, velocity and acceleration do not jump.
+    # 1e-5 allows for the jerk over 1e-7 s: position, velocity and acceleration do not
+    # jump.
     np.testing.assert_allclose(
         at(motion.vector, before), at(motion.vector, after), atol=1e-5
     )
-    # The planner looks at times a 200th of the approach apart or closer: it misses at most 0.1 %.
+    # The planner looks at times a 200th of the approach apart or closer: it misses at
+    # most 0.1 %.
     allowed = limits().limits.velocity, limits().limits.acceleration
     assert np.all(maxima(motion, motion.settled + 10.0) <= 1.001 * np.array(allowed))
     with pytest.raises(MotionError):
@@ -204,7 +206,8 @@ def test_start_that_is_too_slow_is_rejected_if_approaches_are_disabled():
     with pytest.raises(StartError, match=r'starts -0.* velocity'):
         begin(law, config, offset, STILL)
     assert begin(law, config, offset, moving) == 0.0
-    # Catching up takes v^2 / (2 a) = 0.9 bounds at a = 2 rad/s^2, which leaves a tenth of it.
+    # Catching up takes v^2 / (2 a) = 0.9 bounds at a = 2 rad/s^2, which leaves a tenth
+    # of it.
     slower = moving - np.sqrt(2.0 * 2.0 * 0.9 * BOUND)
     assert begin(law, config, offset + 0.09 * BOUND, slower) == 0.0
     with pytest.raises(StartError, match='velocity'):
@@ -226,7 +229,10 @@ def test_hold_reference_stays_where_the_arm_is_or_where_it_comes_to_rest():
 def test_reactivation_on_the_reference_tracks_at_once_only_at_its_velocity(
     rest, velocity
 ):
-    """An arm that the brakes hold needs an approach; one that moves with the reference does not."""
+    """An arm that the brakes hold needs an approach.
+
+    One that moves with the reference does not.
+    """
     rig = Rig({'safety.velocity': velocity, 'torque.limit': [40.0, 40.0]})
     rig.step(1500)  # at 0.3 rad/s
     rig.guard.deactivate()

@@ -72,7 +72,8 @@ def test_terms_are_sums_of_tones_or_polynomials_of_the_current_piece():
 @pytest.mark.parametrize('terms', KINDS.values(), ids=KINDS)
 @pytest.mark.parametrize('t', [0.1, 0.7, 1.05, 1.234, 3.5])
 def test_velocity_and_acceleration_are_the_derivatives_of_the_reference(terms, t):
-    # Five-point stencil with step 1e-3: the fifth derivative, below 1e3 here, leaves 1e-10.
+    # Five-point stencil with step 1e-3: the fifth derivative, below 1e3 here, leaves
+    # 1e-10.
     h = 1e-3
     points = np.array([value_at(terms, t + side * h) for side in (-2, -1, 1, 2)])
     rate = (points[0] - 8.0 * points[1] + 8.0 * points[2] - points[3]) / (12.0 * h)
@@ -174,7 +175,8 @@ def test_trajectory_continues_the_reference_passes_its_points_and_holds_the_last
     np.testing.assert_allclose(passed[: len(fields)], fields, atol=1e-12)
     times = np.linspace(NOW, NOW + 4.0, 40_001)
     qr, dqr, ddqr = sampled(motion.vector, times).transpose(1, 0, 2)
-    # 6 rad/s^2 times 1e-4 s is the most that a velocity may change from one time to the next.
+    # 6 rad/s^2 times 1e-4 s is the most that a velocity may change from one time to the
+    # next.
     assert np.abs(np.diff(dqr, axis=0)).max() <= 6.0e-4 * 1.001
     if len(fields) != 2:  # cubics jump in acceleration at their points
         assert np.abs(np.diff(ddqr, axis=0)).max() < 0.02  # a jerk below 200 rad/s^3
@@ -188,7 +190,8 @@ def test_trajectory_continues_the_reference_passes_its_points_and_holds_the_last
 def test_cubics_are_hermite_splines_with_a_smooth_lead_in():
     """Halfway between two points, h apart: their mean plus h/8 times the decrease in velocity.
 
-    After braking, the lead-in is the quintic that set out from rest when the trajectory began.
+    After braking, the lead-in is the quintic that set out from rest when the trajectory
+    began.
     """
     motion = plan(trajectory((GOALS, VELOCITIES)))
     halfway = at(motion.vector, NOW + 1.5)[0]
@@ -358,7 +361,10 @@ def test_goal_with_much_time_is_not_overshot_by_more_than_the_braking_distance(
 
 @pytest.mark.parametrize(('speed', 'goal', 'time'), [(1.4, 0.3, 0.45), (0.6, 0.9, 1.0)])
 def test_point_that_needs_more_time_for_braking_is_still_reached(speed, goal, time):
-    """The gentle braking does not fit, or leaves too little time; up to all the time there is."""
+    """The gentle braking does not fit, or leaves too little time.
+
+    Up to all the time there is.
+    """
     sent = trajectory((np.array([[goal, 0.0]]),), times=(time,))
     motion = plan(sent, moving((speed, 0.0)), 0.0)
     np.testing.assert_allclose(
@@ -431,7 +437,8 @@ def test_point_that_is_too_near_in_time_is_reached_as_soon_as_the_limits_allow()
     at_rest = pack(2, [minimum_jerk(np.zeros(1), np.zeros((1, 2)))])
     sent = trajectory((np.array([[1.5, 0.3]]),), times=(0.2,))
     motion = plan(sent, at_rest, 0.0)
-    # 1.5 rad at 1.5 rad/s, 0.25 s of acceleration and half of the 0.05 s to change it, twice half
+    # 1.5 rad at 1.5 rad/s, 0.25 s of acceleration and half of the 0.05 s to change it,
+    # twice half
     assert motion.end == pytest.approx(1.0 + 0.25 + 0.05, abs=1e-9)
     np.testing.assert_allclose(at(motion.vector, motion.end)[0], (1.5, 0.3), atol=1e-8)
     assert limits_used(motion, 0.0, motion.end) == pytest.approx((1.0, 1.0), abs=1e-6)
@@ -480,8 +487,9 @@ def test_without_ruckig_what_exceeds_the_limits_says_what_is_missing(monkeypatch
     plan(trajectory((GOALS, VELOCITIES[::-1])))  # brakes after its end all the same
 
 
-# Random sequences of trajectories, adopted as the guard does: planned from the reference in force
-# at one sample for a time ahead, and followed from a later sample on.
+# Random sequences of trajectories, adopted as the guard does: planned from the
+# reference in force at one sample for a time ahead, and followed from a later sample
+# on.
 SEQUENCES = 10_000 if os.environ.get('NIGHTLY') else 300
 PERIOD = 1e-3  # s
 FASTEST = np.array(LIMITS.limits.velocity)
@@ -552,16 +560,17 @@ def sequence_of_references(seed):
 def test_random_sequences_of_trajectories_never_jump_and_keep_the_limits():
     """What velocity and acceleration at two samples explain: Taylor's remainders.
 
-    Between two samples h apart, the velocity changes by at most the largest acceleration a times
-    h, and the position by h times the mean of the velocities, up to a h^2 / 4. `check_seams`
-    finds smaller jumps.
+    Between two samples h apart, the velocity changes by at most the largest
+    acceleration a times h, and the position by h times the mean of the velocities, up
+    to a h^2 / 4. `check_seams` finds smaller jumps.
     """
     accepted = 0
     for seed in range(SEQUENCES):
         reference, count = sequence_of_references(seed)
         accepted += count
         q, v, a = reference.transpose(1, 0, 2)
-        # Blends are checked every 5 ms or 200 times: between, 1e-3 of their acceleration is missed.
+        # Blends are checked every 5 ms or 200 times: between, 1e-3 of their
+        # acceleration is missed.
         assert np.all(np.abs(a) <= STRONGEST * 1.001), seed
         assert np.all(np.abs(v) <= FASTEST * 1.001), seed
         rise = np.abs(np.diff(v, axis=0))

@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Events between two samples replay bit for bit from the bag of the nodes; bags are played."""
+"""Events between two samples replay bit for bit from the bag of the nodes.
+
+Bags are played.
+"""
 
 from __future__ import annotations
 

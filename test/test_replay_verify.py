@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A bag replays to exactly the numbers it holds; any difference is located and named."""
+"""A bag replays to exactly the numbers it holds.
+
+Any difference is located and named.
+"""
 
 from __future__ import annotations
 
@@ -66,7 +69,8 @@ def test_every_number_is_reproduced(bag, tmp_path):
         'commands': 2 * SAMPLES,
         'tracking_error': 6 * SAMPLES,
         'reference': 4 * SAMPLES,
-        # Two ratios, two distances, three parameters, two biases, two disturbances, three more.
+        # Two ratios, two distances, three parameters, two biases, two disturbances,
+        # three more.
         'monitor': 14 * SAMPLES,
         'bound': 4,
     }

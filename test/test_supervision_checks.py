@@ -283,7 +283,10 @@ def test_held_gravity_fades_out_without_states_and_returns_with_them(raw):
     ],
 )
 def test_gravity_is_held_in_silence_only_for_the_fade_time(calls, phase, late):
-    """A driver would apply the last torque forever; `late` [ms] the torque fades already."""
+    """A driver would apply the last torque forever.
+
+    `late` [ms] the torque fades already.
+    """
     rig = Rig(HOLDING | {'safety.fade_time': 0.2}, live=True)
     rig.step(20)
     rig.wait(late)

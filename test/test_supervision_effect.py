@@ -1,8 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Commands that have no effect are found on any bound; a healthy arm is not taken for one.
+"""Commands that have no effect are found on any bound.
 
-Whatever stops an arm whose commands do not reach it, nothing that the law made of that is
-commanded afterwards.
+A healthy arm is not taken for one.
+
+Whatever stops an arm whose commands do not reach it, nothing that the law made of that
+is commanded afterwards.
 """
 
 from __future__ import annotations
@@ -73,10 +75,12 @@ def test_brakes_are_found_on_any_bound_and_through_the_noise_of_the_encoders(bou
 
 
 def stopped_by(config, plant, spoil=None, reach=None, at=2.0, after=3.0):
-    """Run an arm by hand until `after` [s] from its stop; return guard, states, torques, the stop.
+    """Run an arm by hand until `after` [s] from its stop.
 
-    From `at` [s] on `spoil(q, dq)` changes the readings, and the arm gets `reach(torque)` until 1 s
-    after the stop.
+    Return guard, states, torques, the stop.
+
+    From `at` [s] on `spoil(q, dq)` changes the readings, and the arm gets
+    `reach(torque)` until 1 s after the stop.
     """
     arm = plant_of(plant)
     n = len(config.joints)
@@ -114,8 +118,8 @@ def stopped_by(config, plant, spoil=None, reach=None, at=2.0, after=3.0):
 def test_commands_that_do_not_arrive_leave_nothing_in_the_safe_torque(preset):
     """An effort controller that becomes inactive in motion, and is activated 1 s after the stop.
 
-    The drives hold the arm, so next to nothing is right; the law has wound up to -10.5 N m (FR3)
-    and -17.9 N m (UR5e) by then.
+    The drives hold the arm, so next to nothing is right; the law has wound up to -10.5
+    N m (FR3) and -17.9 N m (UR5e) by then.
     """
     loop = load_loop(preset)
     plant = change(loop.plant, {'duration': 0.0})

@@ -266,7 +266,10 @@ def inertias(config, settings):
 
 
 def growth(settings, T, lag, M, M0, stiffness):
-    """Largest factor by which errors grow from sample to sample; the loop is stable below 1."""
+    """Largest factor by which errors grow from sample to sample.
+
+    The loop is stable below 1.
+    """
     A, _ = transition(settings, T, lag, M, M0, stiffness)
     return np.abs(np.linalg.eigvals(A)).max()
 

@@ -141,7 +141,10 @@ def test_torque_ramps_after_a_fault_or_a_deactivation_as_configured(ramp):
 
 @pytest.mark.parametrize(('factor', 'angle'), [(1.0, 0.12), (0.5, 0.2), (1.5, 0.2)])
 def test_stopped_arm_rests_although_its_model_may_be_wrong(factor, angle):
-    """The safe torque observes what the model lacks; with zero torque the arm falls by 1.5 rad."""
+    """The safe torque observes what the model lacks.
+
+    With zero torque the arm falls by 1.5 rad.
+    """
     estimate = {
         'learning.initial_estimate': (factor * P).tolist(),
         'learning.weight': 0.0,
@@ -190,8 +193,8 @@ def test_torque_continues_after_immediate_reactivation():
     rig.guard.activate()
     rig.step(100)
     assert rig.supervisor.phase is Phase.TRACKING
-    # The surface filter restarts: that changes the torque of 9 N m by K_p = 60 N m s/rad times
-    # the few mrad/s that it lagged behind.
+    # The surface filter restarts: that changes the torque of 9 N m by K_p = 60 N m
+    # s/rad times the few mrad/s that it lagged behind.
     assert np.abs(rig.commands[201] - before).max() < 0.3
     assert rig.guard.samples.ratio.max() < 0.5
 
@@ -358,7 +361,8 @@ EXCITED = {
         # 2.675 N m
         ({}, {'torque.limit': (20.0, 2.6)}, 'torque.limit: joint2 is held with'),
         ({}, {'learning.radius': 0.58}, 'learning.radius: the norm of the estimate is'),
-        # Gradient: kappa Gamma lambda_max T >= 2; here kappa is 100 and lambda_max about 100.
+        # Gradient: kappa Gamma lambda_max T >= 2; here kappa is 100 and lambda_max
+        # about 100.
         (
             EXCITED,
             {'learning.update': 'gradient'},

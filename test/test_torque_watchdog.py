@@ -53,7 +53,10 @@ class Watched(Rig):
     ('given', 'angle'), [(AT_REST, 0.01), (HOLDING, 0.15)], ids=['at rest', 'in motion']
 )
 def test_arm_of_a_dead_controller_comes_to_rest(given, angle, period):
-    """The initial estimate is half the truth. Without a watchdog, the arm in motion goes on."""
+    """The initial estimate is half the truth.
+
+    Without a watchdog, the arm in motion goes on.
+    """
     rig, alone = Watched(given, period), Watched(given)
     alone.line.poll = lambda _: None
     for each in (rig, alone):
@@ -76,9 +79,12 @@ def test_arm_of_a_dead_controller_comes_to_rest(given, angle, period):
     'armed', [False, True], ids=['watching', 'restarted afterwards']
 )
 def test_named_arm_of_a_dead_controller_comes_to_rest(preset, angle, armed):
-    """In motion; an FR3 brakes at jumps of 1 N m in a cycle, if its driver lets them pass.
+    """In motion.
 
-    Which torque its drives hold, a restarted one cannot know: that is left to the driver.
+    An FR3 brakes at jumps of 1 N m in a cycle, if its driver lets them pass.
+
+    Which torque its drives hold, a restarted one cannot know: that is left to the
+    driver.
     """
     loop = load_loop(CONFIG / f'{preset}.yaml')
     unlimited = {} if armed else {'actuator.rate_limit': 0.0}
@@ -150,7 +156,10 @@ def test_controller_that_is_back_takes_over_at_once_and_the_torque_fades_with_th
 
 
 def test_torque_is_finite_and_within_its_rate_from_what_the_controller_commanded():
-    """Polled every 4 ms, by the rate of a sample of 1 ms; an unknown torque is not continued."""
+    """Polled every 4 ms, by the rate of a sample of 1 ms.
+
+    An unknown torque is not continued.
+    """
     limited = AT_REST | {'torque.rate_limit': [300.0, 300.0]}
     rig, restarted = Watched(limited), Watched(limited)
     restarted.line = TorqueWatchdog(rig.config, TIMEOUT, armed=True)

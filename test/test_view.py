@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The live view without a browser: what is drawn, where it is served, wrong usage; of a loop."""
+"""The live view without a browser: what is drawn, where it is served, wrong usage.
+
+Of a loop.
+"""
 
 from __future__ import annotations
 

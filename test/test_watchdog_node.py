@@ -116,8 +116,8 @@ def test_watchdog_continues_from_the_torque_that_the_drive_holds(
 ):
     """At most 1 N m away, as an FR3 demands.
 
-    If it was restarted after the controller had died, it cannot know it: that of the model is sent
-    at once.
+    If it was restarted after the controller had died, it cannot know it: that of the
+    model is sent at once.
     """
     monkeypatch.setattr(sys, 'argv', ['node', '--ros-args', '--params-file', str(FR3)])
     config = load_loop(FR3).plant

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The README's animation: the live view of a Panda that picks up 2 kg. `make pictures`.
 
-Controller, arm and view are nodes of this process, and the loop is in lock-step: it stands still
-while the browser draws.
+Controller, arm and view are nodes of this process, and the loop is in lock-step: it
+stands still while the browser draws.
 """
 
 from __future__ import annotations

@@ -72,7 +72,7 @@ _SETTINGS: Any = {
 
 
 class Picture:
-    """A figure of panels, made with these settings and without pyplot's global state."""
+    """A figure of panels, with these settings and without pyplot's global state."""
 
     def __init__(
         self,
@@ -116,10 +116,10 @@ class Picture:
 
 
 def head(axes: Axes, title: str, *, legend_at: float | None = None) -> None:
-    """Put the title above a panel and the legend off the data: above as well, or beside it.
+    """Put the title above a panel, and the legend above or beside it.
 
-    With `legend_at` it is at this height of the axes; at 0, and if the title names its only line,
-    there is none.
+    With `legend_at` it is at this height of the axes; at 0, and if the title names its
+    only line, there is none.
     """
     axes.set_title(title, loc='left', fontsize=11.5)
     labels = axes.get_legend_handles_labels()[1]
@@ -145,10 +145,10 @@ def head(axes: Axes, title: str, *, legend_at: float | None = None) -> None:
 
 
 def draw(run: Run, folder: Path) -> list[Path]:
-    """Draw tracking.png and the other files that the run has data for, and return the paths.
+    """Draw tracking.png and what else the run has data for; return the paths.
 
-    These are change.png if a simulated arm changed, and parameters.png if parameters were learned.
-    The folder is created if necessary.
+    These are change.png if a simulated arm changed, and parameters.png if parameters
+    were learned. The folder is created if necessary.
     """
     folder.mkdir(parents=True, exist_ok=True)
     tracking, change, parameters = (folder / name for name in NAMES)
@@ -191,7 +191,7 @@ def draw(run: Run, folder: Path) -> list[Path]:
 
 
 def _close_up(run: Run, change: float) -> Iterator[Panel]:
-    """Yield the errors of all joints, their torques and the model's error around a change."""
+    """Yield errors, torques and the error of the model around a change."""
     begin, end = change - _BEFORE, change + _AFTER
     found = panels([run], begin, end)
     marks = [Mark(change, 'the arm changes', INK)]
@@ -228,8 +228,8 @@ def draw_panels(
 ) -> None:
     """Draw panels of this size [inches] row by row.
 
-    `runs` are the names of several runs, to be shown in the legends. With `legend_above`, each
-    column has a single legend above its first row.
+    `runs` are the names of several runs, to be shown in the legends. With
+    `legend_above`, each column has a single legend above its first row.
     """
     columns = min(columns, len(shown))
     picture = Picture(-(-len(shown) // columns), columns, title, size)
@@ -265,7 +265,10 @@ def _draw_panel(axes: Axes, panel: Panel, runs: Sequence[str]) -> None:
 
 
 def _set_scale(axes: Axes, panel: Panel) -> None:
-    """Scale the value axis; a logarithmic one spans two decades if the values hardly change."""
+    """Scale the value axis.
+
+    A logarithmic one spans two decades if the values hardly change.
+    """
     low, high = axes.dataLim.minposy, axes.dataLim.ymax
     if panel.log and math.isfinite(low):  # else no value is known
         if high < _FLAT * low:

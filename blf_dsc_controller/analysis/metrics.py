@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Metrics of a run, each as one number: as JSON (summary.json), and as a table for the terminal."""
+"""Metrics of a run: as JSON (summary.json), and as a table for the terminal."""
 
 from __future__ import annotations
 
@@ -79,8 +79,8 @@ class Estimates:
 def estimates_of(run: Run) -> Estimates | None:
     """Return the estimates of the model parameters, None if nothing was learned.
 
-    They are compared with the truth by name, and only if the plant has the same parameters; those
-    of a URDF arm are compared by their torques.
+    They are compared with the truth by name, and only if the plant has the same
+    parameters; those of a URDF arm are compared by their torques.
     """
     if run.monitor is None:
         return None
@@ -103,7 +103,7 @@ def estimates_of(run: Run) -> Estimates | None:
 
 
 def rejected_columns(run: Run) -> list[str]:
-    """Return the disturbance columns that are not estimated at the end: this tells them by NaN."""
+    """Return the disturbance columns that are rejected, NaN, at the end."""
     if run.monitor is None:
         return []
     last = run.monitor.values[run.monitor.stamp.size - 1 :][0]
@@ -126,7 +126,7 @@ def _relative_error(estimate: Floats, P: Floats, R: Floats | None) -> Floats:
 
 
 def _torques(run: Run, regressor: Regressor) -> Floats:
-    """Return rows of H(q, dq, dq, ddq) (k n, p) along the reference, else along the motion.
+    """Return H(q, dq, dq, ddq) (k n, p) along the reference, else the motion.
 
     The derivatives are three-point differences.
     """
@@ -150,7 +150,10 @@ def _parameters(names: Iterable[str]) -> tuple[str, ...]:
 
 
 def bodies_of(names: Sequence[str]) -> dict[str, list[int]]:
-    """Return the indices of the estimates of each link and kind of friction; of few, each alone."""
+    """Return the indices of the estimates of each link and kind of friction.
+
+    Of few, each alone.
+    """
     if len(names) <= _SHOWN_SINGLY:
         return {name: [k] for k, name in enumerate(names)}
     bodies: dict[str, list[int]] = {}
@@ -167,10 +170,10 @@ def errors_of_bodies(
     true: Floats | None,
     prior: Floats,
 ) -> Floats:
-    """Return how far the estimates (m, p) of each body are off, (b, m): rms [% of the prior].
+    """Return the rms error (b, m) of each body's estimates (m, p) [% of the prior].
 
-    Off the truth or, where none is known, off the first estimates; a rejected estimate is NaN.
-    `prior` (p,) are deviations.
+    Off the truth or, where none is known, off the first estimates; a rejected estimate
+    is NaN. `prior` (p,) are deviations.
     """
     origin = (
         estimate[:1] if true is None else np.where(np.isnan(true), estimate[0], true)
@@ -185,7 +188,10 @@ def errors_of_bodies(
 
 
 def latch_time(run: Run) -> float:
-    """Return the time at which learning began [s], NaN if it never did or is not recorded."""
+    """Return the time at which learning began [s].
+
+    It is NaN if it never did, or is not recorded.
+    """
     return next(iter(_rises(run, LATCHED)), math.nan) if run.learns else math.nan
 
 
@@ -215,7 +221,10 @@ def true_change_times(run: Run) -> list[float]:
 
 
 def outside(run: Run, i: int) -> NDArray[np.bool_] | None:
-    """Return where |xi1| >= k_c for a joint, (N,); None if error or bound is unknown."""
+    """Return where |xi1| >= k_c for a joint, (N,).
+
+    None if error or bound is unknown.
+    """
     error = run.column('error', i)
     bound = run.column('bound', i)
     return (
@@ -230,9 +239,12 @@ def _known(run: Run, name: str, i: int) -> Floats:
 
 
 def first_violation(run: Run) -> tuple[float, str]:
-    """Return when [s] a joint first left its bound, and which; NaN and empty if none did.
+    """Return when [s] a joint first left its bound, and which.
 
-    The error of the sample that causes a stop is not published, so the stop itself counts.
+    NaN and empty if none did.
+
+    The error of the sample that causes a stop is not published, so the stop itself
+    counts.
     """
     found = [
         (time, next((joint for joint in run.joints if f'{joint!r}' in stop.text), ''))
@@ -248,7 +260,10 @@ def first_violation(run: Run) -> tuple[float, str]:
 
 @dataclass(frozen=True)
 class Metrics:
-    """Metrics of a run of n joints; NaN, or None, for what is unknown or has not happened."""
+    """Metrics of a run of n joints.
+
+    NaN, or None, for what is unknown or has not happened.
+    """
 
     duration: float  #: s
     samples: int
@@ -404,7 +419,10 @@ def _least(values: Floats) -> float:
 
 
 def _at_moments(time: Floats, error: Floats) -> dict[int, float]:
-    """Return the error at the sample nearest to each moment; NaN where the run did not reach it."""
+    """Return the error at the sample nearest to each moment.
+
+    NaN where the run did not reach it.
+    """
     end = time[-1] + 1.5 * (float(np.median(np.diff(time))) if time.size > 1 else 0.0)
     return {
         moment: float(error[np.abs(time - moment).argmin()])
@@ -428,7 +446,10 @@ def write_json(numbers: Any, path: Path) -> None:
 
 
 def plain(value: Any) -> Any:
-    """Convert to data for JSON: lists and dictionaries, None instead of NaN and infinity."""
+    """Convert to lists and dictionaries for JSON.
+
+    NaN and infinity become None.
+    """
     if is_dataclass(value) and not isinstance(value, type):
         value = asdict(value)
     if isinstance(value, dict):
@@ -452,7 +473,7 @@ def format_table(metrics: Metrics) -> str:
 
 
 def aligned(rows: Sequence[Sequence[str]]) -> str:
-    """Return a table for the terminal: the first column flush left, the others flush right."""
+    """Return a table for the terminal: first column flush left, others right."""
     first, *widths = (max(map(len, column)) for column in zip(*rows, strict=True))
     return '\n'.join(
         '  '.join([name.ljust(first), *map(str.rjust, values, widths)])

@@ -103,7 +103,10 @@ class Panel:
 
 @np.errstate(over='ignore', invalid='ignore')  # a bag may hold any number
 def panels(runs: Sequence[Run], begin: float = -inf, end: float = inf) -> list[Panel]:
-    """Return every panel that a run has data for from `begin` to `end` [s]; runs are overlaid."""
+    """Return every panel that a run has data for from `begin` to `end` [s].
+
+    Runs are overlaid.
+    """
     found: dict[tuple[str, str], Panel] = {}
     for k, run in enumerate(runs):
         latched = latch_time(run)
@@ -139,7 +142,10 @@ def panels(runs: Sequence[Run], begin: float = -inf, end: float = inf) -> list[P
 
 
 def _drawn(line: Line, begin: float, end: float) -> Line:
-    """Return what is drawn of a line: between two times, finite, thinned without losing a peak."""
+    """Return what is drawn of a line between two times.
+
+    It is finite, and thinned without losing a peak.
+    """
     shown = slice(
         np.searchsorted(line.time, begin), np.searchsorted(line.time, end, side='right')
     )
@@ -156,10 +162,10 @@ def _drawn(line: Line, begin: float, end: float) -> Line:
 def envelope(
     time: Floats, values: Floats, pieces: int = PIECES
 ) -> tuple[Floats, Floats]:
-    """Return the lowest and highest sample of each piece of a series (N,), in order of time.
+    """Return the lowest and highest sample of each piece of a series (N,), by time.
 
-    NaN is unknown; a piece without known values stays a gap. A series of at most two samples per
-    piece is returned unchanged.
+    NaN is unknown; a piece without known values stays a gap. A series of at most two
+    samples per piece is returned unchanged.
     """
     if values.size <= 2 * pieces:
         return time, values
@@ -227,7 +233,10 @@ def _error(run: Run, t: Floats, i: int, error: Floats) -> Panel:
 
 
 def _span(bound: Floats | None, error: Floats) -> float:
-    """Return the axis limit for a funnel, whose wide start would hide the error; 0 otherwise."""
+    """Return the axis limit for a funnel, whose wide start would hide the error.
+
+    0 otherwise.
+    """
     if bound is None or bound[0] <= bound[-1]:
         return 0.0
     known = np.abs(error[np.abs(error) < _LARGEST])
@@ -235,7 +244,7 @@ def _span(bound: Floats | None, error: Floats) -> float:
 
 
 def _error_size(run: Run, t: Floats, i: int, error: Floats) -> Panel:
-    """Return the panel of the largest error in each piece of the run, on a logarithmic axis."""
+    """Return the panel of the largest error in each piece of the run, logarithmic."""
     begins = np.linspace(0, error.size, _PIECES, endpoint=False).astype(np.intp)
     size = np.fmax.reduceat(np.abs(error), begins)
     size[size == 0.0] = np.nan
@@ -282,7 +291,10 @@ def _disturbances(run: Run, learning: Series) -> Iterator[Line]:
 
 
 def _of_links(arm: LearnedArm, estimates: Estimates) -> Panel:
-    """Return the panel of the errors by link and kind of friction, in deviations of the prior."""
+    """Return the panel of the errors by link and kind of friction.
+
+    They are in standard deviations of the prior.
+    """
     bodies = bodies_of(estimates.names)
     prior = np.array([arm.deviations[name] for name in estimates.names])
     off = errors_of_bodies(bodies, estimates.estimate, estimates.true, prior)

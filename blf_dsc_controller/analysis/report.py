@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Bags with their events, and the HTML page of one or several (plotly, 4.8 MB, is embedded)."""
+"""Bags with their events, and the HTML page of one or several.
+
+The page embeds plotly, 4.8 MB.
+"""
 
 from __future__ import annotations
 
@@ -71,7 +74,10 @@ class ReportedBag:
 
 
 def read_bag(path: Path, namespace: str = '', names: NameMap = NO_NAMES) -> ReportedBag:
-    """Read a bag, named by its folder and the folder above; raises BlfDscError if it cannot."""
+    """Read a bag, named by its folder and the folder above.
+
+    Raises BlfDscError if it cannot.
+    """
     content = read_content(path, namespace, names)
     run = recorded_run(content)
     events = [
@@ -131,7 +137,7 @@ def _intervals(
 
 
 def _diagnosed(content: Content, run: Run) -> Iterator[TimedEvent]:
-    """Yield each change of a level or message, at the time of the last sample received."""
+    """Yield each change of a level or message, at the time of the last sample."""
     shown: dict[str, tuple[int, str]] = {}
     messages = content.topics.get(DIAGNOSTICS)
     for received, raw in messages.raw() if messages else ():

@@ -23,7 +23,7 @@ DIFFERENT = 3
 """Exit code if the replay differs from the bag."""
 
 PARTIAL = 4
-"""Exit code if all compared outputs are equal, but others are missing or could not be compared."""
+"""Exit code if all compared outputs are equal, but others could not be compared."""
 
 _DISCOVERY = 1.0  # s, until subscribers have found the publishers
 
@@ -73,7 +73,10 @@ def plot(options: Namespace) -> None:
 
 
 def recover(options: Namespace) -> int:
-    """Make a clean bag from a damaged one and list the losses; return 1 if nothing is left."""
+    """Make a clean bag from a damaged one and list the losses.
+
+    Return 1 if nothing is left.
+    """
     bag = options.bag.resolve()
     out = options.out or bag.with_name(f'{bag.stem}_recovered')
     messages, losses = recovery.recover(options.bag, out)

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """ROS domains in which nobody else is.
 
-Runs of this package claim their domain by the name of a socket. Any other participant shows in the
-UDP ports that the protocol assigns to its domain (DDSI-RTPS 2.5, 9.6.2.3), whatever its node is
-called and whether or not it has one.
+Runs of this package claim their domain by the name of a socket. Any other participant
+shows in the UDP ports that the protocol assigns to its domain (DDSI-RTPS 2.5, 9.6.2.3),
+whatever its node is called and whether or not it has one.
 """
 
 from __future__ import annotations
@@ -25,10 +25,10 @@ _LOCAL_ADDRESS, _INODE = 1, 9  # columns of a table
 
 @contextmanager
 def own_domain(avoided: Collection[int] = ()) -> Iterator[int]:
-    """Claim a ROS domain in which nobody is, neither another run nor any other participant.
+    """Claim a ROS domain without any other participant.
 
-    It is none of the `avoided`, and not the domain of this shell. Processes that inherit open files
-    hold the claim as well, as the nodes of a run that was killed do.
+    It is none of the `avoided`, and not the domain of this shell. Processes that
+    inherit open files hold the claim as well, as the nodes of a run that was killed do.
 
     Raises:
         BlfDscError: none is free.
@@ -59,7 +59,10 @@ def shell_domain() -> int:
 
 
 def claimed(domain: int) -> socket.socket | None:
-    """Return the claim of a domain, held until it is closed; None if another process has it."""
+    """Return the claim of a domain, held until it is closed.
+
+    None if another process has it.
+    """
     claim = socket.socket(socket.AF_UNIX)
     claim.set_inheritable(True)
     try:
@@ -71,7 +74,7 @@ def claimed(domain: int) -> socket.socket | None:
 
 
 def strangers(domain: int) -> list[int]:
-    """Return the UDP ports of a domain that other processes of this computer have bound."""
+    """Return the UDP ports of a domain that other processes here have bound."""
     begin = _FIRST_PORT + _PORTS * domain
     ports = range(begin, begin + _PORTS)
     own = _own_sockets()

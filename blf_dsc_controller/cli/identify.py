@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`blf_dsc excite` and `identify`: a motion that shows an arm, and the URDF that explains it."""
+"""`blf_dsc excite` and `identify`: an exciting motion, and a corrected URDF."""
 
 from __future__ import annotations
 
@@ -112,7 +112,10 @@ def _outputs(options: Namespace) -> list[Path]:
 
 
 def _facts(found: Identified, options: Namespace) -> list[str]:
-    """Return what was identified from what, and when; then problems and notes; wrapped."""
+    """Return what was identified from what, and when.
+
+    Then problems and notes; wrapped.
+    """
     today = datetime.now().astimezone().strftime('%Y-%m-%d %H:%M')
     origin = (
         f'{options.urdf} identified from {_listed(options.bags)} on {today} by '

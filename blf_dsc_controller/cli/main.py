@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The command `blf_dsc` with its sub-commands and their options, and the executables of the nodes.
+"""The command `blf_dsc` with its sub-commands, and the executables of the nodes.
 
-Sub-commands are imported when they run, so `--help` is fast and needs neither ROS nor extras.
+Sub-commands are imported when they run, so `--help` is fast and needs neither ROS nor
+extras.
 """
 
 from __future__ import annotations
@@ -35,7 +36,10 @@ _Command: TypeAlias = Callable[..., Callable[..., Any]]
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run a sub-command and return its exit code; errors print a message to stderr and return 1."""
+    """Run a sub-command and return its exit code.
+
+    Errors print a message to stderr and return 1.
+    """
     parser = make_parser()
     words = sys.argv[1:] if arguments is None else arguments
     _check_command(parser, words)
@@ -77,17 +81,22 @@ def _check_command(parser: argparse.ArgumentParser, words: Sequence[str]) -> Non
 
 
 def _keep_to_one_thread() -> None:
-    """Let numpy's libraries, not loaded yet, start no threads unless the environment says so.
+    """Let numpy's libraries start no threads, unless the environment says so.
 
-    The matrices here are small. The threads would spin, beside nodes that run at the same time and,
-    in a real-time node, at its priority.
+    They must not be loaded yet.
+
+    The matrices here are small. The threads would spin, beside nodes that run at the
+    same time and, in a real-time node, at its priority.
     """
     for name in _THREADS:
         os.environ.setdefault(name, '1')
 
 
 def _interrupt(command: str, _number: int, _frame: object) -> None:
-    """Raise KeyboardInterrupt, or exit at once during compilation, which would swallow it."""
+    """Raise KeyboardInterrupt, or exit at once during compilation.
+
+    Compilation would swallow the exception.
+    """
     numba = sys.modules.get('numba.core.compiler_lock')
     if numba is not None and numba.global_compiler_lock.is_locked():
         os.write(2, f'blf_dsc {command}: interrupted\n'.encode())
@@ -132,7 +141,10 @@ arm_view = partial(_node, 'blf_dsc_controller.view.node')
 
 
 def make_parser() -> argparse.ArgumentParser:
-    """Return the parser; the option `handler` is the (module, function) of a sub-command."""
+    """Return the parser.
+
+    The option `handler` is the (module, function) of a sub-command.
+    """
     parser = argparse.ArgumentParser(
         prog='blf_dsc',
         description='Output-constrained tracking control of robot arms: run it, look at its bags, '

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Whether ROS 2 is there, new enough, and with its middleware: checked before anything needs it."""
+"""Checks that ROS 2 and its middleware are there and new enough."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _LOAD = 'import rclpy; rclpy.get_rmw_implementation_identifier()'
 
 
 def require_ros() -> None:
-    """Raise BlfDscError, with a remedy, if ROS 2 or its middleware is missing or too old."""
+    """Raise BlfDscError if ROS 2 or its middleware is missing or too old."""
     _require_middleware(os.environ.get('RMW_IMPLEMENTATION') or _DEFAULT)
     try:
         importlib.import_module('rclpy')
@@ -39,7 +39,10 @@ def require_ros() -> None:
 
 
 def _require_middleware(name: str) -> None:
-    """Raise BlfDscError if a chosen middleware cannot be loaded: ROS would end the process."""
+    """Raise BlfDscError if a chosen middleware cannot be loaded.
+
+    ROS would end the process.
+    """
     if name == _DEFAULT or importlib.util.find_spec('rclpy') is None:
         return
     load = [sys.executable, '-c', _LOAD]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`blf_dsc run` and `precompile`: plant, controller and recorder, with a bag and pictures."""
+"""`blf_dsc run` and `precompile`: a closed loop with its bag and pictures."""
 
 from __future__ import annotations
 
@@ -101,10 +101,10 @@ def make_folder(path: Path) -> Path:
 
 
 def _configuration(options: Namespace) -> LoopConfig:
-    """Return the configuration of the three nodes, from the file and the overriding options.
+    """Return the configuration of the three nodes, from file and options.
 
-    Prints configuration warnings, and raises StartError or MotionError if the controller would
-    reject the true start.
+    Prints configuration warnings, and raises StartError or MotionError if the
+    controller would reject the true start.
     """
     path = locate(options.config)
     ignored = ignored_sections(read(path), (PLANT, CONTROLLER))
@@ -135,7 +135,10 @@ def _configuration(options: Namespace) -> LoopConfig:
 
 
 def _report(out: Path) -> bool:
-    """Draw and summarise the bag of a run; return whether the controller stopped in it."""
+    """Draw and summarise the bag of a run.
+
+    Return whether the controller stopped in it.
+    """
     # slow: the libraries of the pictures
     from blf_dsc_controller.analysis.figures import draw
     from blf_dsc_controller.analysis.metrics import format_table, measure, write_json
@@ -160,7 +163,7 @@ def _report(out: Path) -> bool:
 
 
 def precompile(options: Namespace) -> None:
-    """Compile the kernels of a configuration's controller and plant, in two parallel processes."""
+    """Compile the kernels of controller and plant, in two parallel processes."""
     config = load_loop(options.config)
     with ProcessPoolExecutor(2, get_context('spawn')) as pool:
         list(pool.map(_compile, (config.controller, config.plant)))

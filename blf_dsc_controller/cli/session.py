@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""One run over ROS: its processes, their isolation from all other nodes, and their progress.
+"""One run over ROS: its processes, their isolation, and their progress.
 
 Plant and controller are one process in lock-step, and the recorder is another.
 """
@@ -61,11 +61,11 @@ _PROFILES = 'FASTRTPS_DEFAULT_PROFILES_FILE'
 
 
 def run_session(config: LoopConfig, out: Path, *, view: bool) -> bool:
-    """Run recorder, controller and plant on `out/config.yaml` until the plant has ended.
+    """Run recorder, controller and plant on `out/config.yaml` to the end.
 
-    They run in a ROS domain of their own, and with a page if they should be viewed. Returns False
-    if a signal to this process, or to another node than the plant, ended the run; raises
-    BlfDscError if a node exited with an error.
+    They run in a ROS domain of their own, and with a page if they should be viewed.
+    Returns False if a signal to this process, or to another node than the plant, ended
+    the run; raises BlfDscError if a node exited with an error.
     """
     logs = out / 'logs'
     logs.mkdir()
@@ -111,7 +111,8 @@ class NodeProcess:
         module = _MODULES.get(name, name)  # of the benchmark, for instance
         command = [sys.executable, '-m', module, '--ros-args', '--params-file']
         with self._log.open('wb') as output:
-            # In its own session: Ctrl-C reaches only the parent, which stops the nodes in order.
+            # In its own session: Ctrl-C reaches only the parent, which stops the nodes
+            # in order.
             self._process = subprocess.Popen(
                 [*command, str(params_file), *arguments],
                 stdin=subprocess.DEVNULL,
@@ -135,7 +136,7 @@ class NodeProcess:
         return self._process.poll() is None
 
     def new_notices(self) -> list[str]:
-        """Return what the node has newly reported about compiling its kernels, or its page."""
+        """Return what the node newly reports of its kernels or its page."""
         lines = self._log.read_text(encoding='utf-8', errors='replace').splitlines()
         found = (re.search(f'({COMPILING}|{_PAGE}).*', line) for line in lines)
         notices = [each[0] for each in found if each]
@@ -144,7 +145,7 @@ class NodeProcess:
         return [f'{self.name}: {notice}' for notice in new]
 
     def check(self) -> None:
-        """Raise BlfDscError, with the end of the log, if the node exited with an error."""
+        """Raise BlfDscError, with the end of the log, if the node failed."""
         code = self._process.poll()
         if not code:
             return
@@ -176,7 +177,10 @@ def _run_nodes(
     *,
     view: bool,
 ) -> bool:
-    """Run the nodes until the plant has ended; return False if something else ended the run."""
+    """Run the nodes until the plant has ended.
+
+    Return False if something else ended the run.
+    """
     interrupts: list[int] = []
     # stops the nodes in reverse, then restores the handlers
     with ExitStack() as ending:
@@ -199,7 +203,8 @@ def _run_nodes(
             for notice in notices:
                 tqdm.write(notice, file=sys.stderr)
             if monitor.start is not None and (starting is nodes or notices):
-                # Only now, since the nodes wait for a subscriber, which must be the recorder.
+                # Only now, since the nodes wait for a subscriber, which must be the
+                # recorder.
                 starting = [started(VIEW)] if view else []
                 view = False
         completed = not (interrupts or nodes[-1].is_running)
@@ -215,7 +220,7 @@ def _die_with_parent() -> None:
 
 
 class ProgressMonitor:
-    """Progress bar over simulated time of the loop in this ROS domain, with max |xi1| / k_c."""
+    """Progress bar over simulated time of the loop, with max |xi1| / k_c."""
 
     def __init__(self, duration: float) -> None:
         """Wait for a loop of this simulated duration [s]."""
@@ -243,7 +248,7 @@ class ProgressMonitor:
         )
 
     def others(self, domain: int) -> list[str]:
-        """Return who else is in this domain: nodes found by discovery, and ports of others."""
+        """Return who else is in this domain: discovered nodes, and bound ports."""
         time.sleep(_DISCOVERY)
         nodes = self._node.get_node_names_and_namespaces()
         names = [f'{space.rstrip("/")}/{name}' for name, space in nodes]
@@ -279,14 +284,16 @@ class ProgressMonitor:
 def localhost_environment() -> dict[str, str]:
     """Return the environment in which nodes find only those on this computer.
 
-    A profile that the user has chosen, and middleware other than Jazzy's Fast DDS, are left as they
-    are: the one of Kilted rejects this package's profile, and would then find the whole network.
+    A profile that the user has chosen, and middleware other than Jazzy's Fast DDS, are
+    left as they are: the one of Kilted rejects this package's profile, and would then
+    find the whole network.
     """
     profiles = str(share_folder() / 'config/fastdds.xml')
     chosen = os.environ.get(_PROFILES, profiles)
     if chosen != profiles or not _is_jazzys_fast_dds():
         return {_RANGE: 'LOCALHOST'}
-    # With LOCALHOST, rmw_fastrtps would add shared memory to the transports of the profile.
+    # With LOCALHOST, rmw_fastrtps would add shared memory to the transports of the
+    # profile.
     return {_RANGE: 'SYSTEM_DEFAULT', 'ROS_LOCALHOST_ONLY': '', _PROFILES: profiles}
 
 

@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`blf_dsc paper`, `blf_dsc arms`: laws side by side; `blf_dsc monte-carlo`: random plants."""
+"""`blf_dsc paper`, `blf_dsc arms`: laws side by side.
+
+`blf_dsc monte-carlo`: random plants.
+"""
 
 from __future__ import annotations
 
@@ -23,7 +26,7 @@ _PAUSE_IN_A_LOG = 10.0  # s between two updates of the bar
 
 
 def paper(options: Namespace) -> None:
-    """Run the paper's Section IV with every law, and print its claims and the table of the laws."""
+    """Run the paper's Section IV with every law; print its claims and a table."""
     claims, table = paper_study.compare(make_folder(options.out))
     print(*claims, sep='\n')
     print(aligned(table))
@@ -56,7 +59,7 @@ def arms(options: Namespace) -> None:
 
 
 def monte_carlo(options: Namespace) -> None:
-    """Compute the missing runs of a study and report it, compare studies, or repeat one run."""
+    """Compute and report a study, compare studies, or repeat one run."""
     if options.reproduce:
         folder, run = options.reproduce
         store = runs.Store(Path(folder))

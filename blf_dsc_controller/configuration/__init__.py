@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Configuration: frozen dataclasses of parameters, and the parameter files that set them."""
+"""Frozen dataclasses of parameters, and the files that set them."""

@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Parameters of the controller: reference, limits, safety, telemetry, gains.
 
-The gains are those of the control laws (28) and (35), and of composite learning (20) to (27).
+The gains are those of the control laws (28) and (35), and of composite learning (20) to
+(27).
 """
 
 from __future__ import annotations
@@ -61,8 +62,8 @@ _SAMPLES = (10, 1_000_000)
 class Reference:
     """The reference to track, until a trajectory arrives on `~/joint_trajectory`.
 
-    Sinusoids are qr_i = offset_i + sum_k amplitude_ik cos(frequency_k t + phase_k); waypoints are
-    passed with minimum jerk, at rest at both ends.
+    Sinusoids are qr_i = offset_i + sum_k amplitude_ik cos(frequency_k t + phase_k);
+    waypoints are passed with minimum jerk, at rest at both ends.
     """
 
     type: Literal['sinusoids', 'waypoints', 'hold'] = _of_reference(
@@ -95,7 +96,7 @@ class Reference:
     )
 
     def problems(self) -> list[str]:
-        """Check that there are waypoints if they are used, and that their times increase."""
+        """Check that waypoints are given if used, and that their times increase."""
         if self.type == 'waypoints' and not self.times:
             return [
                 'reference.times: got none, but reference.type waypoints needs at least one'
@@ -109,7 +110,10 @@ class Reference:
 
 @dataclass(frozen=True)
 class Approach:
-    """Motion to the reference from a start outside the bound; the bound applies along it."""
+    """Motion to the reference from a start outside the bound.
+
+    The bound applies along it.
+    """
 
     enabled: bool = parameter(
         True, 'guide an arm into the bound; false: do not start outside'
@@ -154,7 +158,7 @@ class MotionLimits:
 
 @dataclass(frozen=True)
 class Safety:
-    """Limits past which the controller makes a safe stop, and the torque of that stop."""
+    """Limits past which the controller stops, and the torque of the stop."""
 
     state_timeout: float = positive(
         0.04, 'largest delay of a state, by steady clock or stamp', 's'
@@ -225,7 +229,10 @@ class Telemetry:
 
 @dataclass(frozen=True)
 class ArmGeometry:
-    """Known geometry in the regressor; the masses and the length of the second link are learned."""
+    """Known geometry in the regressor.
+
+    The masses and the length of the second link are learned.
+    """
 
     l1: float = _in_window(1.0, 'length of the first link', 'm', 'l1', above=0.0)
     gravity: float = _in_window(9.8, 'gravity; 0 for a horizontal arm', 'm/s^2', 'g')
@@ -369,7 +376,10 @@ class Torque:
 
 @dataclass(frozen=True)
 class ComparisonGains:
-    """Gains of the laws `backstepping` (35) and `slotine_li`, besides feedback and learning."""
+    """Gains of the laws `backstepping` (35) and `slotine_li`.
+
+    Feedback and learning have groups of their own.
+    """
 
     surface_gain: PerJoint = positive(
         (70.0, 70.0),
@@ -403,7 +413,7 @@ class ComparisonGains:
 def _misfits(
     name: str, P: tuple[float, ...], model: str, count: int, radius: float
 ) -> Iterator[str]:
-    """Check that parameters P are those of a model, and inside the ball of the projection."""
+    """Check that parameters P are those of a model, and inside the ball."""
     if len(P) != count:
         yield f'{name}: got {len(P)}, but model {model} has {count} parameters'
     if (norm := math.hypot(*P)) >= radius:
@@ -417,7 +427,8 @@ def _misfits(
 class KnownArm:
     """Known data of the arm: required by the law `model_based`, shown by the monitors.
 
-    The known disturbance is constant + amplitude*sin(frequency*t + phase) on each joint.
+    The known disturbance is constant + amplitude*sin(frequency*t + phase) on each
+    joint.
     """
 
     parameters: tuple[float, ...] = _known(
@@ -435,7 +446,7 @@ class KnownArm:
     def problems(
         self, law: str, model: str, count: int, radius: float
     ) -> Iterator[str]:
-        """Check that the parameters fit the model and the ball, and are given if required."""
+        """Check that the parameters fit model and ball, and are given if required."""
         if law == 'model_based' and not self.parameters:
             yield 'truth.parameters: got none, but the law model_based needs them'
         if self.parameters:
@@ -536,7 +547,7 @@ class Learning:
     )
 
     def problems(self, sample_time: float, model: str, count: int) -> Iterator[str]:
-        """Check the size of the window, and the initial estimate against the model and the ball."""
+        """Check the window's size, and the initial estimate against model and ball."""
         samples = round(self.window / sample_time)
         (fewest, most) = _SAMPLES
         if not fewest <= samples <= most:
@@ -559,7 +570,10 @@ LAWS = ('blf_dsc', 'model_based', 'backstepping', 'slotine_li')
 
 @dataclass(frozen=True)
 class ControllerConfig(ArmConfig):
-    """Parameters of the node `blf_dsc_controller`; the defaults are the recommended set."""
+    """Parameters of the node `blf_dsc_controller`.
+
+    The defaults are the recommended set.
+    """
 
     law: str = _size(
         'blf_dsc',
@@ -584,7 +598,7 @@ class ControllerConfig(ArmConfig):
 
     @classmethod
     def variant(cls, given: Mapping[str, Any]) -> type[ControllerConfig]:
-        """Return the configuration with the gains of a law of a file as the group `gains`.
+        """Return the configuration with a law's own gains as the group `gains`.
 
         Raises BlfDscError if there is no such law.
         """
@@ -599,12 +613,18 @@ class ControllerConfig(ArmConfig):
         return _with_gains(law_file.gains_of(law_file.load_law(law)))
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Pickle by values, since the class of a law of a file is made when it is loaded."""
+        """Pickle by values.
+
+        The class of a law of a file is made when it is loaded.
+        """
         return build, (ControllerConfig, flatten(self))
 
     @classmethod
     def defaults(cls, given: Mapping[str, Any]) -> Mapping[str, Value]:
-        """Return gains and limits for the arm of a URDF; the defaults suit the two-link arm."""
+        """Return gains and limits for the arm of a URDF.
+
+        The defaults suit the two-link arm.
+        """
         period = given.get('sample_time', ArmConfig.sample_time)
         if given.get('model', 'urdf' if given.get('robot.urdf') else '') != 'urdf':
             return {'surface.time_constant': max(period, Surface().time_constant)}
@@ -632,7 +652,7 @@ class ControllerConfig(ArmConfig):
         }
 
     def problems(self) -> Iterator[str]:
-        """Check the parameters against each other, joints and estimates against the model."""
+        """Check the parameters against each other and against the model."""
         if self.model == 'urdf':
             needed = None
             count = parameters_of(self.robot, self.robot.chain(self.joints)).model.p

@@ -1,9 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a URDF of this package can say beyond the format: its reader and others ignore it.
+"""What a URDF of this package can say beyond the format.
 
-`<dynamics armature="">` is the inertia of the drive at its joint, `<link gravity="">` is gravity
-in the frame of a link that no joint moves, and `<joint><unsupported reason=""/>` a joint that has
-to be held.  MJCF has all three: `mjcf`.
+Other readers ignore it.
+
+`<dynamics armature="">` is the inertia of the drive at its joint, `<link gravity="">`
+is gravity in the frame of a link that no joint moves, and `<joint><unsupported
+reason=""/>` a joint that has to be held.  MJCF has all three: `mjcf`.
 """
 
 from __future__ import annotations
@@ -58,7 +60,7 @@ def describe(text: str) -> Description:
 
 
 def check_supported(text: str, chain: Chain) -> None:
-    """Raise BlfDscError with all joints of the chain that cannot be part of one, and why."""
+    """Raise BlfDscError with all joints that cannot be part of a chain, and why."""
     reasons = describe(text).unsupported
     problems = [
         f'joint {joint.name!r} cannot be part of a serial chain: {reasons[joint.name]}'
@@ -70,7 +72,10 @@ def check_supported(text: str, chain: Chain) -> None:
 
 
 def rotors_of(text: str, chain: Chain) -> tuple[float, ...]:
-    """Return the armatures of the joints; empty if one is missing, or none is above zero."""
+    """Return the armatures of the joints.
+
+    Empty if one is missing, or none is above zero.
+    """
     armature = describe(text).armature
     found = [armature.get(joint.name) for joint in chain.joints]
     known = tuple(value for value in found if value is not None)

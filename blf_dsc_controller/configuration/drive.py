@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Parameters of `blf_dsc drive`: which driver, what it sets before the start, how it ends."""
+"""Parameters of `blf_dsc drive`: driver, preparation of the robot, end."""
 
 from __future__ import annotations
 

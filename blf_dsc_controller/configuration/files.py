@@ -1,15 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Files that are not trusted: their place, their limits, and parameter files as ROS 2 reads them.
+"""Untrusted files: their place, their limits, and parameter files as ROS 2 reads.
 
-Data files of this package and of others are found with or without a sourced ROS. YAML is limited in
-size and nesting, and has no aliases: a few lines of these can expand to a billion entries, and
-deeply nested brackets exceed the recursion limit of the interpreter.
+Data files of this package and of others are found with or without a sourced ROS. YAML
+is limited in size and nesting, and has no aliases: a few lines of these can expand to a
+billion entries, and deeply nested brackets exceed the recursion limit of the
+interpreter.
 
-In a parameter file node names nest or are joined by `/`; `*` matches one part of a name, `**` any
-number of parts. If several sections match a node, the last one wins, even if another is more
-specific. The types of unquoted words differ from those of YAML libraries: `1e-5` is a number and
-`1_000` a string for ROS, the other way round for PyYAML; `yes` is a bool, `010` is eight, `null` a
-string.
+In a parameter file node names nest or are joined by `/`; `*` matches one part of a
+name, `**` any number of parts. If several sections match a node, the last one wins,
+even if another is more specific. The types of unquoted words differ from those of YAML
+libraries: `1e-5` is a number and `1_000` a string for ROS, the other way round for
+PyYAML; `yes` is a bool, `010` is eight, `null` a string.
 """
 
 from __future__ import annotations
@@ -57,7 +58,7 @@ class Entry(NamedTuple):
 
 
 class Section(NamedTuple):
-    """The parameters under one `ros__parameters`, for all nodes that match `pattern`."""
+    """The parameters under one `ros__parameters`, for nodes that match `pattern`."""
 
     pattern: str
     line: int
@@ -78,7 +79,8 @@ class Section(NamedTuple):
 def parse(text: str) -> tuple[Section, ...]:
     """Read the sections of a parameter file, in order.
 
-    Raises ConfigurationError, with the line, if the text is not YAML or not a parameter file.
+    Raises ConfigurationError, with the line, if the text is not YAML or not a parameter
+    file.
     """
     try:
         root = _Composer(text).get_single_node()
@@ -119,7 +121,7 @@ def parse(text: str) -> tuple[Section, ...]:
 
 
 def parse_scalar(word: str) -> bool | int | float | str:
-    """Return the value that ROS reads from an unquoted word, as get_value() of its parser does.
+    """Return the value of an unquoted word, as get_value() of ROS's parser does.
 
     Hexadecimal fractions, such as 0x1p3, are left as text.
     """
@@ -231,15 +233,18 @@ class _Loader(_Limited, yaml.SafeLoader):
 
 
 def load_yaml(text: str) -> Any:
-    """Return the plain data of a YAML text; raises yaml.YAMLError if damaged or unreasonable."""
+    """Return the plain data of a YAML text.
+
+    Raises yaml.YAMLError if damaged or unreasonable.
+    """
     return yaml.load(text, Loader=_Loader)  # noqa: S506 - a safe loader
 
 
 def share_folder() -> Path:
-    """Return the folder that holds `config/` and `launch/`, regardless of the current folder.
+    """Return the folder that holds `config/` and `launch/`.
 
-    That is the source tree, as in an editable install, or `share/blf_dsc_controller` of the prefix
-    where colcon or pip installed this file.
+    That is the source tree, as in an editable install, or `share/blf_dsc_controller` of
+    the prefix where colcon or pip installed this file.
 
     Raises BlfDscError if there is neither.
     """
@@ -257,9 +262,9 @@ def share_folder() -> Path:
 def resolve(url: str) -> Path:
     """Return the path of a file, or of a resource as `package://name/path`.
 
-    A path that does not exist is looked up in `config/` of this package. A package is one of ROS,
-    or a Python package that pip installed: its folder in `share/` or its own. Raises BlfDscError
-    if there is no such folder or package.
+    A path that does not exist is looked up in `config/` of this package. A package is
+    one of ROS, or a Python package that pip installed: its folder in `share/` or its
+    own. Raises BlfDscError if there is no such folder or package.
     """
     if not url.startswith('package://'):
         path = Path(url).expanduser()
@@ -283,7 +288,10 @@ def resolve(url: str) -> Path:
 
 
 def _of_python(package: str) -> Iterator[Path]:
-    """Yield the folders that can hold the data of a package installed by pip, not imported."""
+    """Yield the folders that can hold the data of a package.
+
+    pip has installed it; it is not imported.
+    """
     yield Path(sysconfig.get_path('data')) / 'share' / package
     spec = importlib.util.find_spec(package) if package.isidentifier() else None
     if spec is not None:
@@ -299,7 +307,10 @@ def places_of(url: str) -> str:
 
 
 def read_text(path: Path) -> str:
-    """Return the text of a file; OSError if not regular or too large, or UnicodeDecodeError."""
+    """Return the text of a file.
+
+    OSError if not regular or too large, or UnicodeDecodeError.
+    """
     state = path.stat()
     if not stat.S_ISREG(state.st_mode):
         raise OSError(f'{path} is not a regular file: give a file')

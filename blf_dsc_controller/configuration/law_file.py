@@ -2,8 +2,9 @@
 """A control law of a user's own: a Python file, named by the parameter `law`.
 
 The file defines `LAW`, a `NamedTuple` of gains with the methods of `law.interface.Law`,
-and, if the law keeps anything between samples, `MEMORY`, a `NamedTuple` of arrays.  Each
-gain is declared once, where the law is, and is a parameter `gains.NAME` of the controller:
+and, if the law keeps anything between samples, `MEMORY`, a `NamedTuple` of arrays.
+Each gain is declared once, where the law is, and is a parameter `gains.NAME` of the
+controller:
 
     class LogBarrier(NamedTuple):
         rate: Annotated[float, positive(20.0, 'decay of the error', '1/s', 'k_1')]
@@ -33,7 +34,7 @@ def is_file(law: str) -> bool:
 
 
 def kept(law: str) -> str:
-    """Return the parameter `law` as a configuration holds it: a file by its absolute path."""
+    """Return the parameter `law` as kept: a file by its absolute path."""
     return str(Path(law).expanduser().resolve()) if is_file(law) else law
 
 

@@ -1,10 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """An arm from MJCF: MuJoCo's compiler reads it, a URDF says what it found.
 
-The compiler resolves includes, defaults, classes, angles and frames, so that a configuration holds
-one text that replays without MuJoCo and without the files of the arm.  Geometry is left out.  What
-a URDF has no place for stands in the attributes and elements of `description`: the armature of a
-joint, gravity at a link, and why a joint cannot be part of a serial chain.
+The compiler resolves includes, defaults, classes, angles and frames, so that a
+configuration holds one text that replays without MuJoCo and without the files of the
+arm.  Geometry is left out.  What a URDF has no place for stands in the attributes and
+elements of `description`: the armature of a joint, gravity at a link, and why a joint
+cannot be part of a serial chain.
 """
 
 from __future__ import annotations
@@ -43,14 +44,18 @@ def is_mjcf(text: str) -> bool:
 def urdf_of_file(path: Path) -> str:
     """Return the URDF of an MJCF file.
 
-    Raises BlfDscError, with the file and the element, if MuJoCo is missing or cannot compile it.
+    Raises BlfDscError, with the file and the element, if MuJoCo is missing or cannot
+    compile it.
     """
     return _urdf(_model(path, str(path)))
 
 
 @lru_cache(maxsize=16)
 def urdf_of_text(text: str) -> str:
-    """Return the URDF of MJCF text, as `urdf_of_file` does; it can include absolute paths only."""
+    """Return the URDF of MJCF text, as `urdf_of_file` does.
+
+    It can include absolute paths only.
+    """
     return _urdf(_model(text, 'the MJCF text'))
 
 
@@ -76,7 +81,10 @@ def _model(source: str | Path, name: str) -> Any:
 
 
 def _remove_shapes(spec: Any) -> None:
-    """Remove shapes that inertias do not depend on, so that their files need not exist."""
+    """Remove shapes that inertias do not depend on.
+
+    Their files need not exist.
+    """
     import mujoco
 
     from_shapes = mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_TRUE
@@ -117,9 +125,12 @@ def _urdf(model: Any) -> str:
 
 
 class _Writer:
-    """Bodies become links, in the frame of their last joint; several joints of one body, several.
+    """Bodies become links, in the frame of their last joint.
 
-    Positions are those of MuJoCo's joints (`qpos`), so that 0 is 0 whatever the `ref` of a joint.
+    Several joints of one body, several.
+
+    Positions are those of MuJoCo's joints (`qpos`), so that 0 is 0 whatever the `ref`
+    of a joint.
     """
 
     def __init__(self, model: Any, root: ET.Element) -> None:
@@ -179,7 +190,7 @@ class _Writer:
         self._add_inertial(body)
 
     def _zero(self, joint: int) -> Floats:
-        """Return the motion (4, 4) of a joint from its placement in the file to position 0."""
+        """Return the motion (4, 4) of a joint from its place in the file to 0."""
         model = self._model
         motion = np.eye(4)
         kind = self._mujoco.mjtJoint(model.jnt_type[joint])
@@ -264,7 +275,7 @@ class _Writer:
         )
 
     def _kind(self, joint: int, *, limited: bool) -> str:
-        """Return the type in a URDF, or MuJoCo's word for a type that no serial chain has."""
+        """Return the type in a URDF, or MuJoCo's word if no serial chain has it."""
         kinds = self._mujoco.mjtJoint
         kind = kinds(self._model.jnt_type[joint])
         if kind == kinds.mjJNT_HINGE:
@@ -275,7 +286,7 @@ class _Writer:
 
 
 def _dynamics(model: Any, joint: int) -> tuple[float, float]:
-    """Return damping and armature of a joint with those of its actuators, through their gears."""
+    """Return damping and armature of a joint and, through gears, its actuators."""
     dof = model.jnt_dofadr[joint]
     damping = float(model.dof_damping[dof])
     armature = float(model.dof_armature[dof])
@@ -287,7 +298,10 @@ def _dynamics(model: Any, joint: int) -> tuple[float, float]:
 
 
 def _effort(model: Any, joint: int) -> float:
-    """Return the torque [N m] or force [N] that joint and actuators allow; infinity: any."""
+    """Return the torque [N m] or force [N] that joint and actuators allow.
+
+    Infinity: any.
+    """
     limit = inf
     if model.jnt_actfrclimited[joint]:
         limit = float(np.abs(model.jnt_actfrcrange[joint]).min()) or inf
@@ -455,7 +469,10 @@ def _shift(position: Floats) -> Floats:
 
 
 def _add_origin(element: ET.Element, placement: Floats) -> None:
-    """Add an <origin>: roll, pitch and yaw about fixed axes; exact at 90 degrees, too."""
+    """Add an <origin>: roll, pitch and yaw about fixed axes.
+
+    Exact at 90 degrees, too.
+    """
     R = placement[:3, :3]
     yaw = atan2(R[1, 0], R[0, 0])
     across = np.array([-np.sin(yaw), np.cos(yaw), 0.0])  # y after the yaw

@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The nodes by name: their configurations, the files and presets that set them, and their page.
+"""The nodes by name: their configurations, files, presets, and their page.
 
-`python -m blf_dsc_controller.configuration.nodes doc/parameters.md` writes the tables of the page.
+`python -m blf_dsc_controller.configuration.nodes doc/parameters.md` writes the tables
+of the page.
 """
 
 from __future__ import annotations
@@ -159,8 +160,9 @@ def is_builtin(name: str) -> bool:
 def locate(given: str | Path) -> Path:
     """Return the path of a preset by its name, or of a file by its path.
 
-    A preset takes precedence over a file of the same name in the current folder; `./name` is the
-    file. Raises ConfigurationError, which lists the presets, if neither exists.
+    A preset takes precedence over a file of the same name in the current folder;
+    `./name` is the file. Raises ConfigurationError, which lists the presets, if neither
+    exists.
     """
     presets = {
         path.stem: path for path in sorted((share_folder() / 'config').glob('*.yaml'))
@@ -179,10 +181,12 @@ def locate(given: str | Path) -> Path:
 
 
 def read(path: str | Path, based: tuple[str, ...] = ()) -> Sequence[Section]:
-    """Read the sections of a parameter file; ConfigurationError names the file and the line.
+    """Read the sections of a parameter file.
 
-    Those of the preset or file that it names as `base` under `monte_carlo`, if any, come first;
-    `based` are the files that are based on it.
+    ConfigurationError names the file and the line.
+
+    Those of the preset or file that it names as `base` under `monte_carlo`, if any,
+    come first; `based` are the files that are based on it.
     """
     try:
         sections = parse(read_text(Path(path)))
@@ -213,11 +217,14 @@ def load(
     cls: type[Config],
     overrides: Mapping[str, object] | None = None,
 ) -> Config:
-    """Load the configuration of one node, whose name may have a namespace (`/left/sim_plant`).
+    """Load the configuration of one node.
 
-    `overrides`, by dotted name, take precedence over the file. Raises ConfigurationError with all
-    problems and their line numbers. Unknown names are rejected; in a section for several nodes, a
-    name that any node of the package knows is accepted.
+    Its name may have a namespace (`/left/sim_plant`).
+
+    `overrides`, by dotted name, take precedence over the file. Raises
+    ConfigurationError with all problems and their line numbers. Unknown names are
+    rejected; in a section for several nodes, a name that any node of the package knows
+    is accepted.
     """
     config: Config = _load_all(path, {node: cls}, {node: overrides or {}})[node]
     return config
@@ -226,10 +233,11 @@ def load(
 def load_loop(
     given: str | Path, overrides: Mapping[str, Mapping[str, object]] | None = None
 ) -> LoopConfig:
-    """Load the configurations of plant, controller and recorder from a preset or a file.
+    """Load plant, controller and recorder from a preset or a file.
 
-    `overrides`, by node and dotted name, take precedence over the file. Raises ConfigurationError
-    with the problems of all nodes, or if plant and controller disagree.
+    `overrides`, by node and dotted name, take precedence over the file. Raises
+    ConfigurationError with the problems of all nodes, or if plant and controller
+    disagree.
     """
     path = locate(given)
     configs = _load_all(path, NODES, overrides or {})
@@ -289,9 +297,12 @@ def _load_all(
 
 
 def dump(path: Path, nodes: Mapping[str, object], comment: str = '') -> None:
-    """Write all parameters of the nodes to a parameter file; loading it restores them exactly.
+    """Write all parameters of the nodes to a parameter file.
 
-    `nodes` are configurations, or values by dotted name, by node name with or without a namespace.
+    Loading it restores them exactly.
+
+    `nodes` are configurations, or values by dotted name, by node name with or without a
+    namespace.
     """
     lines = [comment]
     for node, config in nodes.items():
@@ -306,10 +317,11 @@ def dump(path: Path, nodes: Mapping[str, object], comment: str = '') -> None:
 def unmatched_sections(
     sections: Sequence[Section], nodes: Iterable[str]
 ) -> Iterator[str]:
-    """Yield a problem for each section that is meant for one of these nodes but would be ignored.
+    """Yield a problem for each section of these nodes that would be ignored.
 
-    Either its name is misspelt, or its namespace differs from the node's and no other section of
-    that name matches. `nodes` are full names; in the root namespace the slash may be omitted.
+    Either its name is misspelt, or its namespace differs from the node's and no other
+    section of that name matches. `nodes` are full names; in the root namespace the
+    slash may be omitted.
     """
     by_name = {section.pattern.rsplit('/', 1)[-1]: section for section in sections}
     absent = [node for node in NODES if node not in by_name]
@@ -330,9 +342,12 @@ def unmatched_sections(
 
 
 def ignored_sections(sections: Sequence[Section], nodes: Iterable[str]) -> str:
-    """Return the sections that no node of this package reads, in words; empty without any.
+    """Return the sections that no node of this package reads, in words.
 
-    They may belong to others in the same file, or be misspelt. `nodes` are those that are started.
+    Empty without any.
+
+    They may belong to others in the same file, or be misspelt. `nodes` are those that
+    are started.
     """
     full = ['/' + node.removeprefix('/') for node in nodes]
     by_wildcard = [section for section in sections if section.is_wildcard]
@@ -355,14 +370,14 @@ def _is_of_others(section: Section) -> bool:
 
 
 def with_tables(page: str) -> str:
-    """Return the Markdown page of all parameters: what is above its first table stays."""
+    """Return the page of all parameters; what is above its tables stays."""
     above = page.partition('\n## ')[0]
     sections = (_section(node, parameters(cls)) for node, cls in NODES.items())
     return above + ''.join(sections)
 
 
 def _section(node: str, params: Iterable[Parameter]) -> str:
-    """Return a node's section: a table of its own parameters, then one for each group."""
+    """Return a node's section: a table of its parameters for each group."""
     groups: dict[str, list[Parameter]] = {}
     for param in params:
         group, _, _ = param.name.rpartition('.')

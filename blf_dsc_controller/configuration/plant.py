@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Parameters of the simulated plant: arm, disturbance, sensors, actuators, loads, events, clock.
+"""Parameters of the simulated plant: arm, sensors, actuators, loads, events.
 
-A load acts as long as it is set, an event from its time on. Vectors at the tip are in the base
-frame: x to the right, z upwards. Deviations from the URDF are unknown to the controller.
+A load acts as long as it is set, an event from its time on. Vectors at the tip are in
+the base frame: x to the right, z upwards. Deviations from the URDF are unknown to the
+controller.
 """
 
 from __future__ import annotations
@@ -51,9 +52,10 @@ class Load:
 
 @dataclass(frozen=True)
 class Events:
-    """Events, each of which adds to the load, the friction and the encoder offsets for a while.
+    """Events, which add to load, friction and encoder offsets for a time.
 
-    Events begin and end at whole samples from the start; a ramp scales one by the elapsed fraction.
+    Events begin and end at whole samples from the start; a ramp scales one by the
+    elapsed fraction.
     """
 
     begin: tuple[float, ...] = _of_events(
@@ -82,7 +84,8 @@ class Events:
 class Deviation:
     """Deviations of masses from those of the URDF.
 
-    A changed body stays physically consistent: its mass distribution is only scaled and shifted.
+    A changed body stays physically consistent: its mass distribution is only scaled and
+    shifted.
     """
 
     mass_factor: float = _fixed(1.0, 'factor on all masses and inertias', above=0.0)
@@ -95,7 +98,7 @@ class Deviation:
     seed: int = _magnitude(0, 'seed of the random deviations')
 
     def changes(self, n: int) -> tuple[np.ndarray, np.ndarray]:
-        """Return the factor on the mass (n,) and the shift of mass (n, 3) [m] of each body."""
+        """Return each body's factor on the mass (n,) and shift of mass (n, 3) [m]."""
         random = np.random.Generator(np.random.PCG64(np.random.SeedSequence(self.seed)))
         drawn = random.uniform(-1.0, 1.0, (n, 4))
         factors = self.mass_factor * (1.0 + self.mass_deviation * drawn[:, 0])
@@ -137,8 +140,9 @@ class PlantDisturbance:
     """Torque that opposes each joint, `tau_dist` in the equation of motion.
 
     tau_dist = constant + amplitude*sin(frequency*t + phase) + viscous*dq
-             + coulomb*(1 + stribeck*exp(-(dq/stribeck_velocity)^2))*tanh(dq/coulomb_velocity)
-             + the ripple of the actuator
+             + coulomb*(1 +
+             stribeck*exp(-(dq/stribeck_velocity)^2))*tanh(dq/coulomb_velocity) + the
+             ripple of the actuator
     """
 
     constant: PerJoint = parameter((0.1, 0.1), 'constant part', 'N m')
@@ -267,7 +271,7 @@ class PlantConfig(ArmConfig):
 
     @classmethod
     def defaults(cls, given: Mapping[str, Any]) -> dict[str, Value]:
-        """Return joints, limits and friction from a URDF, and a start at rest in mid-range."""
+        """Return joints, limits and friction from a URDF, and a start at rest."""
         if not given.get('robot.urdf'):
             return {}
         robot, chain = given_robot(given)

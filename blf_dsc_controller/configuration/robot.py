@@ -58,7 +58,10 @@ _ROUNDING = 1e-12
 
 @dataclass(frozen=True)
 class Robot:
-    """Arm from a URDF or MJCF, for the model `urdf`; MJCF is held as the URDF that it becomes."""
+    """Arm from a URDF or MJCF, for the model `urdf`.
+
+    MJCF is held as the URDF that it becomes.
+    """
 
     urdf: str = _fixed(
         '',
@@ -123,7 +126,10 @@ class Robot:
         return read_urdf(self.urdf)
 
     def chain(self, joints: tuple[str, ...]) -> Chain:
-        """Return the serial chain of the joints; raises BlfDscError if there is none."""
+        """Return the serial chain of the joints.
+
+        Raises BlfDscError if there is none.
+        """
         text = self.text
         chain = read_chain(text, self.base, self.tip, joints)
         check_supported(text, chain)
@@ -141,7 +147,7 @@ class Robot:
         }
 
     def drive_inertias(self, chain: Chain, links: np.ndarray) -> np.ndarray:
-        """Return the inertias (n, 10) of `links` with the payload that the drives know."""
+        """Return the inertias (n, 10) of `links` with the declared payload."""
         inertias: np.ndarray = links.copy()
         point = np.asarray(
             chain.tip_placement @ np.append(self.drive_payload_centre, 1.0)
@@ -150,7 +156,10 @@ class Robot:
         return inertias
 
     def efforts(self, chain: Chain) -> np.ndarray:
-        """Return the rated torques (n,) [N m], from the weight where the URDF has placeholders."""
+        """Return the rated torques (n,) [N m].
+
+        They follow from the weight where the URDF has placeholders.
+        """
         efforts = np.array([joint.effort for joint in chain.joints])
         needed = _NEEDED * self._weight_at_reach(chain)
         known = (
@@ -168,7 +177,7 @@ class Robot:
         )
 
     def _weight_at_reach(self, chain: Chain) -> np.ndarray:
-        """Return the torque (n,) [N m] of the weight beyond each joint, if stretched out flat."""
+        """Return the torque (n,) [N m] of the weight beyond each joint, stretched flat."""
         weight = float(np.linalg.norm(self.gravity)) or _GRAVITY
         force = self.payload * weight
         torque = force * (
@@ -184,11 +193,11 @@ class Robot:
         return np.array(needed[::-1])
 
     def known_rotors(self, chain: Chain) -> tuple[float, ...]:
-        """Return drive inertias (n,) [kg m^2] as given or as in the description, else empty."""
+        """Return drive inertias (n,) [kg m^2] as given or described, else empty."""
         return self.rotor_inertia or rotors_of(self.text, chain)
 
     def rotors(self, chain: Chain) -> np.ndarray:
-        """Return drive inertias (n,) [kg m^2]: as known, or rated torque / 400 rad/s^2."""
+        """Return drive inertias (n,) [kg m^2]: given, or rated torque / 400 rad/s^2."""
         known = self.known_rotors(chain)
         if len(known) == len(chain.joints):
             return np.array(known)
@@ -196,9 +205,10 @@ class Robot:
 
 
 def implausible_friction(chain: Chain) -> tuple[str, ...]:
-    """Return the joints whose friction in the URDF takes a quarter of their effort or more.
+    """Return the joints whose friction takes a quarter of their effort or more.
 
-    One is enough: then the friction of the URDF is a placeholder, and not known for any joint.
+    One is enough: then the friction of the URDF is a placeholder, and not known for any
+    joint.
     """
     return tuple(
         joint.name
@@ -212,7 +222,7 @@ def implausible_friction(chain: Chain) -> tuple[str, ...]:
 
 
 def read_urdf(given: str) -> str:
-    """Return the text of a URDF from a URDF or MJCF, which is a file, a resource or text.
+    """Return the text of a URDF from a file, resource or text; it may be MJCF.
 
     Raises BlfDscError if it cannot be read.
     """
@@ -246,9 +256,12 @@ def parameters_of(robot: Robot, chain: Chain) -> BaseParameters:
 
 
 def drive_model(robot: Robot, joints: tuple[str, ...]) -> tuple[np.ndarray, np.ndarray]:
-    """Return the gravity that the drives add: a packed chain, and what its columns multiply.
+    """Return the gravity that the drives add.
 
-    The columns are mass and first moments of each body, payload included; empty if they add none.
+    It is a packed chain, and what its columns multiply.
+
+    The columns are mass and first moments of each body, payload included; empty if they
+    add none.
     """
     if robot.drive_compensates == 'none':
         return np.zeros(0), np.zeros(0)
@@ -320,8 +333,8 @@ class Realtime:
 class ArmConfig:
     """Parameters that plant and controller have in common.
 
-    Create their configurations with `load` from a parameter file, or with `build` and `change` from
-    values by dotted name; these validate them, the constructors do not.
+    Create their configurations with `load` from a parameter file, or with `build` and
+    `change` from values by dotted name; these validate them, the constructors do not.
     """
 
     joints: tuple[str, ...] = _fixed(
@@ -354,7 +367,7 @@ class ArmConfig:
         return round(self.sample_time * 1e9)
 
     def arm_problems(self, arm: str, needed: int | None) -> Iterator[str]:
-        """Check the number of joints, their names, by which they are matched, and the rate."""
+        """Check number and names of the joints, and the rate."""
         for name in sorted(
             {name for name in self.joints if self.joints.count(name) > 1}
         ):

@@ -1,10 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """Configurations: frozen dataclasses of validated and described ROS parameters.
 
-Each field is declared with `parameter`, or is itself such a dataclass: a group, whose parameters
-have dotted names (`arm.l1`). The method `problems()` of a configuration, if it has one, checks
-parameters against each other; its class method `defaults(given)` returns the defaults that follow
-from the given parameters, `variant(given)` a class with further parameters.
+Each field is declared with `parameter`, or is itself such a dataclass: a group, whose
+parameters have dotted names (`arm.l1`). The method `problems()` of a configuration, if
+it has one, checks parameters against each other; its class method `defaults(given)`
+returns the defaults that follow from the given parameters, `variant(given)` a class
+with further parameters.
 """
 
 from __future__ import annotations
@@ -37,11 +38,12 @@ _ARRAYS = (list, tuple, array.array)  # rclpy gives array.array
 class Parameter:
     """A parameter of a node: what it means and which values are valid.
 
-    Ranges and choices apply to each entry of an array. `read_only` is the reason why the parameter
-    cannot change while the node runs; empty: it can. An `omittable` array may be empty. `kept`
-    converts a given value to the one that a configuration holds, or raises BlfDscError. The last
-    three are derived from the field of the dataclass: `length` names the parameters whose lengths
-    multiply to the length of this array; a number is itself a length.
+    Ranges and choices apply to each entry of an array. `read_only` is the reason why
+    the parameter cannot change while the node runs; empty: it can. An `omittable` array
+    may be empty. `kept` converts a given value to the one that a configuration holds,
+    or raises BlfDscError. The last three are derived from the field of the dataclass:
+    `length` names the parameters whose lengths multiply to the length of this array; a
+    number is itself a length.
     """
 
     default: Value
@@ -68,25 +70,34 @@ class Parameter:
 
     @property
     def ros_type(self) -> str:
-        """The type as a name of `rclpy.parameter.Parameter.Type`, such as `DOUBLE_ARRAY`."""
+        """The type as in `rclpy.parameter.Parameter.Type`, such as `DOUBLE_ARRAY`."""
         return self.kind.upper().replace(' ', '_')
 
     @property
     def allowed(self) -> str:
-        """The valid range or choices, such as `above 0 and at most 1`; empty: any value."""
+        """The valid range or choices, such as `above 0 and at most 1`.
+
+        Empty: any value.
+        """
         if self.choices:
             return 'one of ' + ', '.join(self.choices)
         return ' and '.join(f'{words} {limit:g}' for words, limit, _ in self._limits())
 
     @property
     def constraints(self) -> str:
-        """What is allowed, and the number of entries, such as `above 0; entries: joints`."""
+        """What is allowed, and the number of entries, such as `above 0.
+
+        Entries: joints`.
+        """
         entries = f'entries: {" times ".join(self.length)}' if self.length else ''
         empty = 'may be empty' if self.omittable else ''
         return '; '.join(filter(None, (self.allowed, entries, empty)))
 
     def problems(self, given: Any) -> Iterator[str]:
-        """Check a value; each problem names the parameter, what it got, and what is expected."""
+        """Check a value.
+
+        Each problem names the parameter, what it got, and what is expected.
+        """
         article = 'an' if self.type is int and not self.is_array else 'a'
         expected = f'but {article} {self.kind} is expected'
         if self.is_array and not isinstance(given, _ARRAYS):
@@ -117,7 +128,10 @@ class Parameter:
             yield f'{self.name}: got {format_value(entry)}{place}, but {expected}'
 
     def spelt(self, given: Any) -> Any:
-        """Return a value as it was written: of `on` and `off`, YAML makes true and false."""
+        """Return a value as it was written.
+
+        Of `on` and `off`, YAML makes true and false.
+        """
         word = 'on' if given is True else 'off'
         return word if isinstance(given, bool) and word in self.choices else given
 
@@ -141,8 +155,9 @@ def parameter(
 ) -> Any:
     """Declare a field of a configuration; the arguments are those of `Parameter`.
 
-    The length of an array is annotated: `Annotated[tuple[float, ...], 'joints']` has one entry for
-    each entry of the parameter `joints`. A `Literal` annotation gives the choices.
+    The length of an array is annotated: `Annotated[tuple[float, ...], 'joints']` has
+    one entry for each entry of the parameter `joints`. A `Literal` annotation gives the
+    choices.
     """
     declared = Parameter(default, description, unit, symbol, **options)
     return dataclasses.field(default=default, metadata={'parameter': declared})
@@ -153,7 +168,10 @@ non_negative = functools.partial(parameter, at_least=0.0)
 
 
 def parameters(cls: Any) -> tuple[Parameter, ...]:
-    """Return every parameter of a configuration, in the order of declaration, by dotted name."""
+    """Return every parameter of a configuration, by dotted name.
+
+    They are in the order of declaration.
+    """
     return _parameters(cls)
 
 
@@ -177,16 +195,18 @@ def flatten(config: object) -> dict[str, Value]:
 
 
 def differences(before: object, after: object) -> dict[str, Value]:
-    """Return the values of `after`, by dotted name, that differ from those of `before`."""
+    """Return the values of `after` that differ from `before`, by dotted name."""
     old = flatten(before)
     return {name: value for name, value in flatten(after).items() if value != old[name]}
 
 
 def build(cls: type[Config], given: Mapping[str, Any], source: str = '') -> Config:
-    """Make a configuration from values by dotted name; missing ones keep their defaults.
+    """Make a configuration from values by dotted name.
 
-    Raises ConfigurationError with all problems: unknown names, types and ranges, and, if each value
-    is valid by itself, lengths and conflicts between parameters.
+    Missing ones keep their defaults.
+
+    Raises ConfigurationError with all problems: unknown names, types and ranges, and,
+    if each value is valid by itself, lengths and conflicts between parameters.
     """
     try:
         cls = variant_of(cls, given)
@@ -258,7 +278,7 @@ def format_value(value: object) -> str:
 
 
 def suggestion(name: str, known: Iterable[str], cutoff: float = 0.6) -> str:
-    """Return `, did you mean X?` with the known name that is most like this one, or nothing."""
+    """Return `, did you mean X?` with the known name most like this one, or ''."""
     close = difflib.get_close_matches(name, known, n=1, cutoff=cutoff)
     return f', did you mean {close[0]}?' if close else ''
 

@@ -34,14 +34,17 @@ class StateError(BlfDscError):
 
 
 class Load(NamedTuple):
-    """What the tip holds, with half the width of its 95 % interval; NaN while it is unknown."""
+    """What the tip holds, with half the width of its 95 % interval.
+
+    NaN while it is unknown.
+    """
 
     mass: float  # kg
     interval: float  # kg
 
 
 class ArmController:
-    """Joint states in, torques out: the law with its learning, its checks and its safe stops.
+    """Joint states in, torques out: the law with learning, checks and safe stops.
 
     Use it as a context manager::
 
@@ -51,10 +54,10 @@ class ArmController:
                 if torque is not None:
                     robot.command(torque)
 
-    It does what the node `blf_dsc_controller` does with each joint state, and computes the same
-    bits.  `update` is called for every state, at the rate of `sample_time`; a state that fails to
-    arrive is noticed with the next one.  A recorded bag is that of a run over ROS: `blf_dsc`
-    reports, plots, replays and identifies from it.
+    It does what the node `blf_dsc_controller` does with each joint state, and computes
+    the same bits.  `update` is called for every state, at the rate of `sample_time`; a
+    state that fails to arrive is noticed with the next one.  A recorded bag is that of
+    a run over ROS: `blf_dsc` reports, plots, replays and identifies from it.
 
     Attributes:
         config: the configuration in force.
@@ -64,7 +67,7 @@ class ArmController:
     def __init__(
         self, config: ControllerConfig | str | Path, *, record: str | Path | None = None
     ) -> None:
-        """Compile the law of a configuration, a parameter file or a preset, and take command.
+        """Compile the law of a configuration, file or preset, and take command.
 
         `record` is the folder of a bag, which must not exist.
 
@@ -108,10 +111,10 @@ class ArmController:
             stamp: time of the state [s], on any clock that only goes forward.
             q: positions (n,) [rad], or [m] of prismatic joints.
             dq: velocities (n,) [rad/s].
-            effort: torques (n,) [N m] over the last interval, as `robot.effort` describes them;
-                without them, the law takes those that it commanded.
-            send: called with the torques as soon as they are known; weighing and recording come
-                after it, and an error of it is raised after them.
+            effort: torques (n,) [N m] over the last interval, as `robot.effort`
+                describes them; without them, the law takes those that it commanded.
+            send: called with the torques as soon as they are known; weighing and
+                recording come after it, and an error of it is raised after them.
 
         Raises:
             StateError: an array has another shape, or the stamp is not finite.
@@ -150,7 +153,10 @@ class ArmController:
         self._loop.guard.prepare(self._checked('q', q))
 
     def _nanoseconds(self, stamp: float) -> int:
-        """Return the stamp [ns]; a clock from zero, which ROS takes for none, starts at 1 s."""
+        """Return the stamp [ns].
+
+        A clock from zero, which ROS takes for none, starts at 1 s.
+        """
         nanoseconds = round(stamp * _NANO)
         if self._shift is None:
             self._shift = 0 if nanoseconds > 0 else _FIRST - nanoseconds
@@ -172,12 +178,15 @@ class ArmController:
         joints: Sequence[str] = (),
         begin: float | None = None,
     ) -> None:
-        """Follow a trajectory, whose values are in the order of `joints`, by default the arm's.
+        """Follow a trajectory.
+
+        Its values are in the order of `joints`, by default the arm's.
 
         It begins at once, or at the time `begin` [s] since the start.
 
         Raises:
-            TrajectoryError: with the reasons why it cannot be followed; the reference stays.
+            TrajectoryError: with the reasons why it cannot be followed; the reference
+                stays.
         """
         names = tuple(joints) or self.joints
         trajectory = Trajectory(names, tuple(points), begin)
@@ -185,7 +194,7 @@ class ArmController:
         guard.adopt(guard.plan(trajectory))
 
     def stop(self) -> None:
-        """Ramp to the safe torque, which `update` returns from then on, until `start`."""
+        """Ramp to the safe torque, which `update` then returns until `start`."""
         self._loop.guard.deactivate()
 
     def start(self) -> None:
@@ -197,7 +206,9 @@ class ArmController:
         self._loop.guard.reset()
 
     def fail(self, text: str) -> Vector | None:
-        """Stop for a reason of the caller; return the torque (n,) [N m] on the way to the safe one.
+        """Stop for a reason of the caller.
+
+        Return the torque (n,) [N m] on the way to the safe one.
 
         None: none has been commanded yet, so command nothing.
         """
@@ -210,12 +221,18 @@ class ArmController:
         return None if torque is None else np.array(torque)
 
     def withdraw(self, text: str) -> None:
-        """Command nothing until `reset` or `start`, for a reason: the arm is somebody else's."""
+        """Command nothing until `reset` or `start`, for a reason.
+
+        Somebody else commands the arm.
+        """
         self._loop.guard.withdraw(text)
 
     @property
     def is_settled(self) -> bool:
-        """Whether it is out of command, and the arm rests under the safe torque, or never moved."""
+        """Whether it is out of command, and the arm is at rest.
+
+        The arm rests under the safe torque, or never moved.
+        """
         guard = self._loop.guard
         if guard.commanding:
             return guard.is_settled
@@ -256,7 +273,10 @@ class ArmController:
 
     @property
     def estimates(self) -> dict[str, float]:
-        """Learned parameters and friction by their names; NaN where a column was rejected."""
+        """Learned parameters and friction by their names.
+
+        NaN where a column was rejected.
+        """
         values = self._loop.guard.controller.sample.estimate
         return dict(zip(self._loop.estimates, values.tolist(), strict=True))
 
@@ -269,7 +289,10 @@ class ArmController:
         return Load(float(values[0]), TWO_SIDED * float(values[DEVIATION]))
 
     def close(self) -> Vector | None:
-        """Return the torque (n,) [N m] that a drive may hold from now on; end the recording."""
+        """Return the torque (n,) [N m] that a drive may hold from now on.
+
+        End the recording.
+        """
         guard = self._loop.guard
         torque = guard.release()
         if self._recorder is not None:

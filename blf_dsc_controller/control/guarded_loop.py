@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""One joint state after the other through the guarded law: a torque, and the messages about it.
+"""The guarded law, state after state: a torque, and the messages about it.
 
 The node publishes these messages, `ArmController` records them.
 """
@@ -43,10 +43,11 @@ class GuardedLoop:
     def messages(
         self, torque: Vector | None, *, errors_wanted: bool = True
     ) -> Iterator[Message]:
-        """Yield the messages about the last joint state, which `torque` (n,) [N m] answered.
+        """Yield the messages about the last state, answered by `torque` (n,) [N m].
 
-        They are the telemetry of the law's sample, or the answer of a safe torque.  The tracking
-        errors are left out if nobody wants them; the command is not among them.
+        They are the telemetry of the law's sample, or the answer of a safe torque.  The
+        tracking errors are left out if nobody wants them; the command is not among
+        them.
         """
         guard = self.guard
         if guard.has_sample:

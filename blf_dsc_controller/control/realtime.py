@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a process requests from the operating system: real-time scheduling, locked memory."""
+"""Real-time scheduling and locked memory, requested from the system."""
 
 from __future__ import annotations
 
@@ -17,7 +17,10 @@ _MCL_FUTURE = 2
 
 
 def request_realtime(realtime: Realtime, warn: Callable[[str], object]) -> None:
-    """Request SCHED_FIFO and locked memory as configured; `warn` is called with a refusal."""
+    """Request SCHED_FIFO and locked memory as configured.
+
+    `warn` is called with a refusal.
+    """
     if realtime.priority > 0:
         try:
             _schedule(realtime.priority)
@@ -37,9 +40,12 @@ def request_realtime(realtime: Realtime, warn: Callable[[str], object]) -> None:
 
 
 def _schedule(priority: int) -> None:
-    """Schedule all threads alike: states and torques also pass through the middleware's threads.
+    """Schedule all threads alike.
 
-    A single thread left behind, even at the next lower priority, delays the others [measured].
+    States and torques also pass through the middleware's threads.
+
+    A single thread left behind, even at the next lower priority, delays the others
+    [measured].
     """
     for thread in _THREADS.iterdir():
         with suppress(ProcessLookupError):  # it has ended in the meantime

@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What `blf_dsc drive` needs of a robot, for one file per robot: facts, states in, torques out.
+"""What `blf_dsc drive` needs of a robot: facts, states in, torques out.
 
-A driver of your own is a Python file with a subclass of `Driver` that is called `DRIVER`, named by
-the parameter `driver`.  It is made with the robot's address and both configurations.
+A driver of your own is a Python file with a subclass of `Driver` that is called
+`DRIVER`, named by the parameter `driver`.  It is made with the robot's address and both
+configurations.
 """
 
 from __future__ import annotations
@@ -34,7 +35,10 @@ class ConnectionLostError(DriverError):
 
 
 class RobotState(NamedTuple):
-    """What a robot reports in one cycle; the arrays have an entry for each of its n joints."""
+    """What a robot reports in one cycle.
+
+    The arrays have an entry for each of its n joints.
+    """
 
     stamp: float  # s, of the robot's clock
     q: ArrayLike  # rad
@@ -56,8 +60,9 @@ class Facts(NamedTuple):
 class Driver(ABC):
     """A robot with a torque interface.
 
-    All methods may raise `DriverError`; between `start` and `finish` they raise `ReflexError` when
-    the robot has stopped by itself, and `ConnectionLostError` when it has fallen silent.
+    All methods may raise `DriverError`; between `start` and `finish` they raise
+    `ReflexError` when the robot has stopped by itself, and `ConnectionLostError` when
+    it has fallen silent.
     """
 
     facts: ClassVar[Facts]
@@ -72,15 +77,21 @@ class Driver(ABC):
 
     @abstractmethod
     def connect(self) -> Sequence[str]:
-        """Reach the robot, and set its thresholds and its load; return remarks for the user."""
+        """Reach the robot, and set its thresholds and its load.
+
+        Return remarks for the user.
+        """
 
     @abstractmethod
     def positions(self) -> ArrayLike:
-        """Return the joint positions (n,) [rad] of the robot at rest, before `start`."""
+        """Return the positions (n,) [rad] of the robot at rest, before `start`."""
 
     @abstractmethod
     def start(self) -> None:
-        """Begin to command torques; from now on the robot waits for one after each state."""
+        """Begin to command torques.
+
+        From now on the robot waits for one after each state.
+        """
 
     @abstractmethod
     def read(self) -> RobotState:
@@ -100,7 +111,7 @@ class Driver(ABC):
 
 
 def disagreements(facts: Facts, config: ControllerConfig) -> list[str]:
-    """Return in what a configuration contradicts the facts of its robot, with remedies."""
+    """Return where a configuration contradicts its robot, with remedies."""
     problems = []
     if len(config.joints) != facts.joints:
         problems.append(

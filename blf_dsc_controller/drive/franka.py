@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A Franka Research 3 by libfranka's protocol, with Franka's own bindings `pylibfranka`.
+"""A Franka Research 3 by libfranka's protocol, with `pylibfranka`.
 
-The robot adds gravity and motor friction to the torques that it gets, and reports the whole torque
-of each joint (tau_J).  It needs a torque after each state, every millisecond.  One that misses
-twenty states in a row, or changes a torque by more than 1 N m between two, is stopped by it.
+The robot adds gravity and motor friction to the torques that it gets, and reports the
+whole torque of each joint (tau_J).  It needs a torque after each state, every
+millisecond.  One that misses twenty states in a row, or changes a torque by more than 1
+N m between two, is stopped by it.
 """
 
 from __future__ import annotations
@@ -115,7 +116,7 @@ class FrankaDriver(Driver):
             )
 
     def _remarks(self) -> Iterator[str]:
-        """Yield what the robot carries in its own model, if the configuration has another mass."""
+        """Yield the robot's own payload, if the configuration has another mass."""
         with self._explained('no state was received'):
             state = self._robot.read_once()
         known = self.controller.robot.drive_payload
@@ -147,14 +148,20 @@ class FrankaDriver(Driver):
         return RobotState(state.time.to_sec(), state.q, state.dq, state.tau_J)
 
     def write(self, torque: Vector | None) -> None:
-        """Command torques (7,) [N m] beyond gravity; None repeats those before, or zero."""
+        """Command torques (7,) [N m] beyond gravity.
+
+        None repeats those before, or zero.
+        """
         if torque is not None:
             self._torque = torque
         with self._in_motion():
             self._control.writeOnce(pylibfranka.Torques(self._torque.tolist()))
 
     def finish(self) -> None:
-        """End torque control with the last torque; the robot's own controller holds the arm."""
+        """End torque control with the last torque.
+
+        The robot's own controller holds the arm.
+        """
         last = pylibfranka.Torques(self._torque.tolist())
         last.motion_finished = True
         with self._in_motion():

@@ -5,7 +5,8 @@
     read -> safe torque   -> write          to the end: on request, after a fault or an error
     finish                                  at rest, or after `settle_time`
 
-A robot that stops by itself is made ready for the next start, but its motion is not resumed.
+A robot that stops by itself is made ready for the next start, but its motion is not
+resumed.
 """
 
 from __future__ import annotations
@@ -46,7 +47,10 @@ class End(str, Enum):
 
 
 class Outcome(NamedTuple):
-    """How a run ended; `text` has the reason in words, empty after one that was planned."""
+    """How a run ended.
+
+    `text` has the reason in words, empty after one that was planned.
+    """
 
     end: End
     text: str
@@ -69,7 +73,10 @@ class DriveLoop:
         duration: float = math.inf,
         settle_time: float = 3.0,
     ) -> None:
-        """Run for `duration` [s] of the robot's time; the end may take `settle_time` [s] more."""
+        """Run for `duration` [s] of the robot's time.
+
+        The end may take `settle_time` [s] more.
+        """
         self.latency = Latency()
         self.worst = 0.0
         self._driver = driver
@@ -85,7 +92,10 @@ class DriveLoop:
         self._error: Exception | None = None
 
     def request_end(self) -> None:
-        """Bring the arm to rest and end; a second request ends at once.  For signal handlers."""
+        """Bring the arm to rest and end; a second request ends at once.
+
+        For signal handlers.
+        """
         self._requests += 1
 
     def run(self) -> Outcome:
@@ -128,7 +138,10 @@ class DriveLoop:
         self._driver.finish()
 
     def _step(self, state: RobotState) -> None:
-        """Answer a state; the first error leads to the safe torque, a second one ends the run."""
+        """Answer a state.
+
+        The first error leads to the safe torque, a second one ends the run.
+        """
         self._states += 1
         try:
             self._controller.update(*state, send=self._send)
@@ -174,7 +187,7 @@ class DriveLoop:
             self._end_at = stamp
 
     def _is_over(self, state: RobotState) -> bool:
-        """Whether the arm rests under the safe torque, or there is no more time for it."""
+        """Whether the arm rests under the safe torque, or its time is over."""
         if self._requests > 1:
             return True
         if self._end is None:

@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """What each event of the journal holds, and the number of the journal's format.
 
-Every event that is read is checked against this schema, whoever wrote it. A new event, or a new
-field, gets its line in `SCHEMA`; where older versions would replay it wrongly, `FORMAT` is raised.
+Every event that is read is checked against this schema, whoever wrote it. A new event,
+or a new field, gets its line in `SCHEMA`; where older versions would replay it wrongly,
+`FORMAT` is raised.
 """
 
 from __future__ import annotations
@@ -14,7 +15,10 @@ from typing import Any, NamedTuple
 from blf_dsc_controller.errors import BlfDscError
 
 FORMAT = 1
-"""Number of this journal's format; it is in the first event. 0 is from before the first release."""
+"""Number of this journal's format; it is in the first event.
+
+0 is from before the first release.
+"""
 
 _LARGEST = 2**63 - 1  # of an integer
 _SHOWN = 40  # characters of a wrong value
@@ -142,7 +146,10 @@ SCHEMA: Mapping[str, Mapping[str, Field]] = {
     'withdraw': {'text': Field(TEXT)},  # nothing is commanded until a reset, and why
     'release': {'resting': Field(FLAG, optional=True)},  # under the last torque
 }
-"""Fields of the content of each type of event. Others that a later version adds are ignored."""
+"""Fields of the content of each type of event.
+
+Others that a later version adds are ignored.
+"""
 
 
 def check_event(given: object) -> None:

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`~/journal`: every event of the controller as JSON in a std_msgs/String, one message each.
+"""`~/journal`: every event of the controller, as JSON in a std_msgs/String.
 
-With the journal and the joint states, a replay repeats a run exactly: each event states the number
-of joint-state messages it follows, and the stamp of the last of them.
+With the journal and the joint states, a replay repeats a run exactly: each event states
+the number of joint-state messages it follows, and the stamp of the last of them.
 """
 
 from __future__ import annotations
@@ -62,7 +62,7 @@ class Event(NamedTuple):
 def encode_change(
     stamp: int, parameters: Mapping[str, Any], *, configured: bool = False
 ) -> bytes:
-    """Return the message of `~/changes` on parameters of the plant, in force from a stamp [ns] on.
+    """Return the message of `~/changes` on parameters in force from a stamp [ns].
 
     `configured`: these are all of them, at the start.
     """

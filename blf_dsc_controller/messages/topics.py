@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Topics of the package: name, message type, quality of service, names of their values.
 
-Nodes, offline writer and reader share this table, so that a bag made without ROS holds the same
-topics as a recording of the running nodes.
+Nodes, offline writer and reader share this table, so that a bag made without ROS holds
+the same topics as a recording of the running nodes.
 """
 
 from __future__ import annotations
@@ -32,10 +32,13 @@ class Quality:
 
 @dataclass(frozen=True, eq=False)
 class Topic:
-    """One topic; compared by identity, because publishers are looked up by it in each sample.
+    """One topic.
 
-    `name` is as its publisher `node` writes it: `~/x` is private to the node, `x` relative to the
-    namespace, `/x` absolute. `offered` is the publisher's quality, `requested` the subscriber's.
+    Compared by identity, because publishers are looked up by it in each sample.
+
+    `name` is as its publisher `node` writes it: `~/x` is private to the node, `x`
+    relative to the namespace, `/x` absolute. `offered` is the publisher's quality,
+    `requested` the subscriber's.
     """
 
     node: str
@@ -46,7 +49,10 @@ class Topic:
 
     @property
     def relative(self) -> str:
-        """Name as another node of the same namespace writes it, e.g. `sim_plant/truth`."""
+        """Name as another node of the same namespace writes it, e.g.
+
+        `sim_plant/truth`.
+        """
         return self.name.replace('~', self.node, 1)
 
     @property
@@ -56,17 +62,17 @@ class Topic:
 
     @property
     def leaf(self) -> str:
-        """Last part of the name, the same under any namespace and node name, e.g. `truth`."""
+        """Last part of the name, under any namespace and node, e.g. `truth`."""
         return self.name.rsplit('/', 1)[-1]
 
 
 JOINT_STATE = 'sensor_msgs/msg/JointState'
 FLOAT64_MULTI_ARRAY = 'std_msgs/msg/Float64MultiArray'
 
-# The subscribers of the control loop keep one message: a late state or torque is useless once the
-# next one has arrived. Publishers keep more, so that a recorder misses none. Most are volatile: an
-# arm must never receive an old torque. A recorder that starts late reports it, and closed_loop
-# waits until the recorder has subscribed.
+# The subscribers of the control loop keep one message: a late state or torque is
+# useless once the next one has arrived. Publishers keep more, so that a recorder misses
+# none. Most are volatile: an arm must never receive an old torque. A recorder that
+# starts late reports it, and closed_loop waits until the recorder has subscribed.
 LATEST = Quality(depth=1)
 UNRELIABLE = Quality(depth=1, reliability='best_effort')
 STREAM = Quality(depth=5000)
@@ -103,7 +109,7 @@ ROBOT_DESCRIPTION = Topic(
 )
 """The URDF; not in TOPICS, since the offline writer does not write it."""
 CHANGES = Topic(PLANT, '~/changes', 'std_msgs/msg/String', HISTORY, HISTORY)
-"""Parameters of the plant changed while it runs, as JSON: `stamp` of their first sample [ns]."""
+"""Changed parameters of the plant, as JSON: `stamp` of their first sample [ns]."""
 JOINT_TRAJECTORY = Topic(
     CONTROLLER,
     '~/joint_trajectory',
@@ -115,7 +121,7 @@ JOINT_TRAJECTORY = Topic(
 JOURNAL = Topic(CONTROLLER, '~/journal', 'std_msgs/msg/String', HISTORY, HISTORY)
 """Every event of the controller, also for late recorders: see messages.journal."""
 TARGETS = Topic(CONTROLLER, '~/targets', 'std_msgs/msg/String', STREAM, STREAM)
-"""Events of the journal that come with each target of a stream, which would fill its history."""
+"""Events with each target of a stream, which would fill the journal's history."""
 JOINT_POSITIONS = Topic(
     CONTROLLER, '~/joint_positions', FLOAT64_MULTI_ARRAY, LATEST, LATEST
 )

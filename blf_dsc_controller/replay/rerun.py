@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """The guarded controller on recorded joint states, with every event of its journal.
 
-For each message that the controller answered, it published a tracking error with that message's
-stamp: `answers`. An event of the journal states how many torques had been commanded before it.
-Both together give the exact order of messages and events; what was dropped has no answer.
+For each message that the controller answered, it published a tracking error with that
+message's stamp: `answers`. An event of the journal states how many torques had been
+commanded before it. Both together give the exact order of messages and events; what was
+dropped has no answer.
 """
 
 from __future__ import annotations
@@ -56,8 +57,8 @@ class Rerun:
         first, last: stamps [ns] of its first and last sample; -1 before the first.
         answers: number of answers reached.
         skipped: number of joint states that the controller did not answer.
-        departure: in what, and at which stamp [ns], the controller first started, stopped or
-            accepted otherwise than the recorded one, which ends the replay.
+        departure: in what, and at which stamp [ns], the controller first started,
+            stopped or accepted otherwise than the recorded one, which ends the replay.
         end: any other reason why the replay ended before the bag, or empty.
     """
 
@@ -69,7 +70,9 @@ class Rerun:
         answers: JointStates,
         commands: int,
     ) -> None:
-        """Start with `config`; `errors` maps the number of each unreadable state to its error.
+        """Start with `config`.
+
+        `errors` maps the number of each unreadable state to its error.
 
         `commands` is the number of torques in the bag.
         """
@@ -88,7 +91,8 @@ class Rerun:
         self._states = states
         self._values = np.empty((0, 3, 0))
         self._loaded = range(0)
-        # All messages in order: row of the state, or of an error after them, whose stamp is -1.
+        # All messages in order: row of the state, or of an error after them, whose
+        # stamp is -1.
         numbers = np.append(states.number, np.array([*errors], dtype=np.int64))
         self._row = np.argsort(numbers, kind='stable').astype(np.int32)
         self._stamp = np.append(states.stamp, np.full(len(errors), -1))[self._row]
@@ -131,8 +135,9 @@ class Rerun:
     def _first_unknown(self, events: Sequence[Event]) -> int:
         """Return the number of answers before the first that may be missing.
 
-        Answers without sequence numbers are counted by the torques that the journal states. If some
-        are missing, the first state without an answer may have been used as well as dropped.
+        Answers without sequence numbers are counted by the torques that the journal
+        states. If some are missing, the first state without an answer may have been
+        used as well as dropped.
         """
         size = self._answered.size
         if self._numbered:
@@ -180,7 +185,8 @@ class Rerun:
     def _find(self, stamp: int) -> int:
         """Return the next message with a stamp, -1 if there is none.
 
-        Unreadable ones have the stamp -1; after the last message, one with its stamp may be one.
+        Unreadable ones have the stamp -1; after the last message, one with its stamp
+        may be one.
         """
         wanted = (stamp, -1) if stamp == self._answered_at else (stamp,)
         for k in range(self._position + 1, self._stamp.size):
@@ -189,7 +195,7 @@ class Rerun:
         return -1
 
     def _approach(self, event: Event) -> None:
-        """Process the messages before an event, and that which causes it, if one does."""
+        """Process the messages before an event, and the one that causes it."""
         guard = self._guard
         before = event.commands
         if event.type is EventType.SILENCE:  # noted after its torques
@@ -259,7 +265,7 @@ class Rerun:
             self._add(stamp, message)
 
     def _command(self, stamp: int, torque: Floats | None) -> None:
-        """Add a torque (n,) [N m], if any, that is commanded after a state with this stamp [ns]."""
+        """Add a torque (n,) [N m], if any, commanded after a state of this stamp [ns]."""
         if torque is not None:
             self._add(stamp, self._telemetry.command(torque))
 
@@ -333,7 +339,7 @@ class Rerun:
             guard.end_silence()
 
     def _report_departure(self, own: Event, event: Event | None) -> None:
-        """Note that the controller started or stopped differently from the recorded one."""
+        """Note that the controller started or stopped unlike the recorded one."""
         text = own.content['text'] if own.type is EventType.STOP else own.type
         is_stop = (
             event is not None
@@ -358,7 +364,7 @@ def _target(content: Mapping[str, Any]) -> Target:
 
 
 def _first_gap(answers: JointStates) -> int:
-    """Return the number of answers before the first that the recorder missed, by their sequence."""
+    """Return the number of answers before the first that the recorder missed."""
     sequence = answers.sequence
     if not sequence.any():
         return sequence.size + 1

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Replay of a bag with its own configuration: the same numbers, or the first difference."""
+"""Replay of a bag with its own configuration: equal, or the first difference."""
 
 from __future__ import annotations
 
@@ -82,7 +82,7 @@ class Comparison:
         recorded: Floats,
         replayed: Floats,
     ) -> None:
-        """Compare tables (N, names) with the stamps (N,) of a run that began at `start`."""
+        """Compare tables (N, names) of stamps (N,), of a run that began at `start`."""
         self.values += recorded.size
         bits = np.ascontiguousarray(recorded).view(np.int64)
         unlike = bits != np.ascontiguousarray(replayed).view(np.int64)
@@ -145,13 +145,13 @@ class Verification(NamedTuple):
 def verify(path: Path, namespace: str = '', names: NameMap = NO_NAMES) -> Verification:
     """Replay a bag and compare every number of the controller bit for bit.
 
-    `namespace` is that of the robot, if the bag holds several; `names` maps topics and joints that
-    have other names in the bag.
+    `namespace` is that of the robot, if the bag holds several; `names` maps topics and
+    joints that have other names in the bag.
 
     Raises:
         ConfigurationError: this version of the package cannot run the configuration.
-        BlfDscError: the bag holds no journal or nothing to compare, begins after the controller,
-            or cannot be read.
+        BlfDscError: the bag holds no journal or nothing to compare, begins after the
+            controller, or cannot be read.
     """
     content = read_content(path, namespace, names)
     events, until, other = _events(content)
@@ -219,7 +219,7 @@ def _departed(run: Rerun, what: str, stamp: int) -> Difference:
 
 
 def _events(content: Content) -> tuple[list[Event], int, str]:
-    """Return the events of a bag's first controller, when the next begins [ns], and a remark."""
+    """Return the first controller's events, when the next begins [ns], a remark."""
     if not {topics.JOURNAL, topics.TRACKING_ERROR} <= content.topics.keys():
         raise _nothing_to_compare(content)
     begins = [
@@ -249,7 +249,10 @@ def _before(states: JointStates, until: int) -> JointStates:
 
 
 def _commands_before(content: Content, until: int) -> int:
-    """Return the number of torques received before a time [ns]; 0 if it is not known."""
+    """Return the number of torques received before a time [ns].
+
+    0 if it is not known.
+    """
     messages = content.topics.get(topics.COMMANDS)
     if messages is None:
         return 0
@@ -274,7 +277,10 @@ def _nothing_to_compare(content: Content) -> BlfDscError:
 def _compared(
     content: Content, run: Rerun, answers: JointStates, joints: Sequence[str]
 ) -> Iterator[Comparison]:
-    """Yield the comparison of each topic in a bag; `answers` are those of tracking errors."""
+    """Yield the comparison of each topic in a bag.
+
+    `answers` are those of tracking errors.
+    """
     for topic, fields in _COMPARED.items():
         messages = content.topics.get(topic)
         own = run.topics.get(topic)
@@ -301,7 +307,10 @@ def _compare(
     result: Comparison,
     run: Rerun,
 ) -> None:
-    """Compare the messages of the same stamp or number; those that have other stamps differ."""
+    """Compare the messages of the same stamp or number.
+
+    Those that have other stamps differ.
+    """
     fields = _COMPARED[topic]
     theirs = messages.joint_names()
     ours = own.joint_names()
@@ -354,7 +363,10 @@ def _compare(
 
 
 def _numbers(topic: topics.Topic, recorded: JointStates, answers: int) -> Stamps:
-    """Return the numbers of messages among those of their publisher; BlfDscError if unknown."""
+    """Return the numbers of messages among those of their publisher.
+
+    BlfDscError if unknown.
+    """
     sequence = recorded.sequence
     numbered = topic in (topics.COMMANDS, topics.TRACKING_ERROR) and sequence.any()
     if not numbered:

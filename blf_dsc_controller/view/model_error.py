@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How far the torques of the learned model are off, where the truth is known: in simulations."""
+"""Torque error of the learned model, in simulations, whose truth is known."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from blf_dsc_controller.run import Floats
 
 
 class ModelError:
-    """Torques of the learned, the initial and the true model along the motion of an arm."""
+    """Torques of the learned, initial and true model along the motion of an arm."""
 
     def __init__(self, config: ControllerConfig) -> None:
         self._model = model_of(config)
@@ -25,7 +25,8 @@ class ModelError:
     ) -> Floats:
         """Return |tau^ - tau|^2, |tau_0 - tau|^2 and |tau|^2 (3,) [(N m)^2] at a state.
 
-        The acceleration is that since the last call, at `time` [s]; NaN where anything is unknown.
+        The acceleration is that since the last call, at `time` [s]; NaN where anything
+        is unknown.
         """
         ddq = (
             (dq - self._dq) / (time - self._time) if time > self._time else dq * np.nan
@@ -45,7 +46,7 @@ class ModelError:
 
 
 def shares(squares: Floats, frames: int) -> Floats:
-    """Return the errors (2, k) of the learned and the initial model [%] from squares (k, 3).
+    """Return the errors (2, k) of both models [%] from squares (k, 3).
 
     Each is the rms over the last `frames` frames, relative to that of the true torques.
     """

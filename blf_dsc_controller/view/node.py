@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The node `view`, which feeds the page from the topics.
 
-It runs in its own low-priority process, takes the newest messages thirty times a second, and
-tolerates lost ones. The controller's configuration comes from its journal.
+It runs in its own low-priority process, takes the newest messages thirty times a
+second, and tolerates lost ones. The controller's configuration comes from its journal.
 """
 
 from __future__ import annotations
@@ -197,13 +197,16 @@ class ViewNode(PlainNode):
     # Samples.
 
     def _time(self, stamp: int) -> float:
-        """Return the time [s] since the controller's start, or since the first known stamp."""
+        """Return the time [s] since the controller's start, or the first stamp."""
         if self._start < 0 <= stamp:
             self._start = stamp
         return max(0.0, (stamp - self._start) * 1e-9)
 
     def _take(self, newest: Mapping[Topic, bytes]) -> bool:
-        """Take the newest message of each topic; return whether there was a joint state."""
+        """Take the newest message of each topic.
+
+        Return whether there was a joint state.
+        """
         stamps: dict[Topic, int] = {}
         for topic, raw in newest.items():
             try:
@@ -253,7 +256,10 @@ class ViewNode(PlainNode):
 
 
 def _read(raw: bytes, names: Sequence[str]) -> tuple[int, Floats]:
-    """Return stamp [ns] and values (3, m) of these names in a message, NaN where it lacks them."""
+    """Return stamp [ns] and values (3, m) of these names in a message.
+
+    Missing values are NaN.
+    """
     theirs = joint_state_layout(raw).names
     decoder = JointStateDecoder(theirs, ())
     stamp = decoder.decode(raw)
@@ -262,7 +268,7 @@ def _read(raw: bytes, names: Sequence[str]) -> tuple[int, Floats]:
 
 
 def plant_events(values: Mapping[str, Any]) -> list[tuple[float, str, str]]:
-    """Return time [s], kind and text of what a simulated arm with these parameters undergoes."""
+    """Return time [s], kind and text of a simulated arm's events."""
     begin = values.get('events.begin', ())
     nothing = (0.0,) * len(begin)
     duration, masses = (

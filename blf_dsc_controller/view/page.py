@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The page: 3D view of the arm, plots and events, drawn from snapshots.
 
-viser serves the page with everything that the browser needs: nothing is loaded from elsewhere.
+viser serves the page with everything that the browser needs: nothing is loaded from
+elsewhere.
 """
 
 from __future__ import annotations
@@ -194,7 +195,7 @@ class Page:
         )
 
     def state(self, level: str, text: str) -> None:
-        """Show the controller's state: level (OK, WARN, ERROR or STALE) and description."""
+        """Show the state: level (OK, WARN, ERROR or STALE) and description."""
         self._state = level, text
         self._header.content = (
             f'{_SHEET}<div style="margin:4px 12px;padding:6px 10px;border-radius:6px;color:white;'
@@ -311,7 +312,10 @@ class Page:
 
 
 def _shortened(joints: Sequence[str]) -> tuple[str, Sequence[str]]:
-    """Return what all names begin with, and what is left of each, as a legend has little room."""
+    """Return what all names begin with, and what is left of each.
+
+    A legend has little room.
+    """
     prefix = os.path.commonprefix(joints).rstrip('0123456789')  # noqa: RUF071 - of characters
     rest = [name.removeprefix(prefix) for name in joints]
     return (prefix, rest) if all(rest) and prefix else ('joints', joints)
@@ -327,7 +331,7 @@ def _peaks(values: Floats) -> Floats:
 
 
 def with_marks(t: Floats, curves: Floats, marks: Sequence[float]) -> tuple[Floats, ...]:
-    """Return times (k,), curves (c, k) and a vertical line at each mark, as rows of a plot.
+    """Return times (k,), curves (c, k) and a line at each mark, as rows of a plot.
 
     uPlot draws no line through NaN, and no axis: unknown values are put below the axis.
     """
@@ -343,14 +347,14 @@ def with_marks(t: Floats, curves: Floats, marks: Sequence[float]) -> tuple[Float
 
 
 def caption(now: Snapshot) -> str:
-    """Return the time, what the tip holds, and how excited learning is, as a line of the page."""
+    """Return time, load and excitation as a line of the page."""
     held = f', held: {load_text(now.load)}' if np.isfinite(now.load[0]) else ''
     excited = f', lambda_min {now.lambda_min:.2g}' if now.lambda_min > 0.0 else ''
     return f'<div style="margin:4px">t = {now.time:.2f} s{held}{excited}</div>'
 
 
 def weights(load: Floats) -> Floats:
-    """Return the weight of the load and its 95 % interval (3, k) [kg] from LOAD (k, 8)."""
+    """Return the load and its 95 % interval (3, k) [kg] from LOAD (k, 8)."""
     mass = load[:, 0]
     half = load[:, 4]
     return np.vstack((mass, mass - half, mass + half))
@@ -381,7 +385,7 @@ class ShownArm(NamedTuple):
         return float(np.linalg.norm(steps, axis=1).sum())
 
     def model(self) -> Any:
-        """Return the yourdfpy model with the first shapes found: meshes, others, cylinders."""
+        """Return the yourdfpy model with meshes, else other shapes, else cylinders."""
         has_meshes = '<mesh' in self.text
         model = _load(self.text if has_meshes else known_model(self.text, self.chain))
         if not model.scene.geometry:
@@ -390,7 +394,10 @@ class ShownArm(NamedTuple):
 
 
 def arm_of(config: ControllerConfig, plant: Mapping[str, Any]) -> ShownArm:
-    """Return the arm of a controller; planar links have the lengths of its plant, if known."""
+    """Return the arm of a controller.
+
+    Planar links have the lengths of its plant, if known.
+    """
     robot = config.robot
     if config.model == 'urdf':
         return ShownArm(robot.text, robot.chain(config.joints))
@@ -400,7 +407,7 @@ def arm_of(config: ControllerConfig, plant: Mapping[str, Any]) -> ShownArm:
 
 
 def known_model(text: str, chain: Chain) -> str:
-    """Return the URDF with meshes that the wheel `example-robot-data` has of an arm, else its own.
+    """Return the URDF with the meshes of `example-robot-data`, else its own.
 
     The same arm has the same joints, in the same places.
     """
@@ -423,7 +430,7 @@ def _installed(package: str) -> Path:
 
 
 def _add_cylinders(model: Any, radius: float) -> None:
-    """Draw a cylinder of this radius [m] between joints, a ball at each joint that moves."""
+    """Draw a cylinder of this radius [m] between joints, a ball at each joint."""
     import trimesh
 
     def add(shape: Any, joint: str, link: str) -> None:

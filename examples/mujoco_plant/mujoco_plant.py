@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The same arm with the mechanics of MuJoCo, as a node like `sim_plant`, with its parameters.
 
-The arm comes from arm.xml or from a URDF that MuJoCo reads. Encoders, drives and the schedule of
-events are those of `sim_plant`, all mechanics are MuJoCo's.
+The arm comes from arm.xml or from a URDF that MuJoCo reads. Encoders, drives and the
+schedule of events are those of `sim_plant`, all mechanics are MuJoCo's.
 """
 
 from __future__ import annotations
@@ -49,7 +49,10 @@ def model_of(config: PlantConfig) -> mujoco.MjModel:
 
 
 def _apply_truth(config: PlantConfig, model: mujoco.MjModel) -> None:
-    """Scale and shift the masses that each joint moves; shifts are along its body's axes."""
+    """Scale and shift the masses that each joint moves.
+
+    Shifts are along its body's axes.
+    """
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
     for joint, factor, shift in zip(
@@ -67,7 +70,10 @@ def _apply_truth(config: PlantConfig, model: mujoco.MjModel) -> None:
 
 
 class MujocoArm(Plant):
-    """The arm with its loads and events; arrays are in the order of the parameter `joints`."""
+    """The arm with its loads and events.
+
+    Arrays are in the order of the parameter `joints`.
+    """
 
     def __init__(self, config: PlantConfig) -> None:
         self._settings = plant_settings(config)
