@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+from importlib.util import find_spec
+
 import numpy as np
 import pytest
 
@@ -185,3 +187,15 @@ def test_wrong_positions_are_rejected_with_the_reason(ros, reason):
     )  # past the limits: as near as it may
     ros.run(arm, 50)
     assert inputs(law).targets == 1
+
+
+@pytest.mark.skipif(find_spec('control_msgs') is not None, reason='it is installed')
+def test_without_control_msgs_the_reason_is_said_once_and_all_else_works(ros, capfd):
+    arm, law = ros.loop(None, PATIENT)
+    ros.run(arm, 1100)
+    inputs(law)._on_trajectory(trajectory(point((1.9, 1.4), 1.0)))
+    ros.run(arm, 1500)
+    reference = law.guard.controller.reference_at(law.guard.time)
+    np.testing.assert_allclose(reference[0], (1.9, 1.4), atol=1e-9)
+    said = capfd.readouterr().err
+    assert said.count('control_msgs is not installed') == 1

@@ -23,6 +23,7 @@ from blf_dsc_controller.messages.codecs import (
 from blf_dsc_controller.nodes import parameters, process
 from blf_dsc_controller.nodes.diagnostics import ControllerStatus
 from blf_dsc_controller.nodes.lifecycle import LoopNode
+from blf_dsc_controller.nodes.trajectory_action import TrajectoryAction, offered_action
 from blf_dsc_controller.nodes.trajectory_input import TrajectoryInput
 from blf_dsc_controller.nodes.watchdog_presence import WatchdogPresence
 from blf_dsc_controller.supervision.config_warnings import config_warnings, worsened
@@ -71,6 +72,7 @@ class ControllerNode(LoopNode[ControllerConfig]):
         # joint states processed by then, and when the last was
         self._last_seen = 0, 0.0
         self._status = ControllerStatus(self, joints)
+        self._action: TrajectoryAction | None = None
         self._watchdog = WatchdogPresence(expected=self.config.safety.expect_watchdog)
         self._changes = parameters.on_change(
             self, type(self.config), self._retune, self._problems, self._check
@@ -99,9 +101,10 @@ class ControllerNode(LoopNode[ControllerConfig]):
                 topics.MONITOR,
             ]
         if self.connect(outputs, topics.JOINT_STATES, self._on_joint_state):
-            self._status.trajectories = TrajectoryInput(
-                self, len(self.config.joints), lambda: self.guard
-            )
+            joints = self.config.joints
+            inputs = TrajectoryInput(self, len(joints), lambda: self.guard)
+            self._status.trajectories = inputs
+            self._action = offered_action(self, inputs, joints)
         self._report()
 
     def activate(self) -> None:
@@ -132,6 +135,13 @@ class ControllerNode(LoopNode[ControllerConfig]):
         """Command the torque to leave behind, and wait until all subscribers have received it."""
         self._leave()
         process.drain([*self._outputs.values(), self._status.journal])
+
+    def destroy_node(self) -> None:
+        """Destroy the node, and end the process of its action."""
+        if self._action is not None:
+            self._action.close()
+            self._action = None
+        super().destroy_node()
 
     def ready_to_end(self) -> bool:
         """Bring the arm to rest first, unless the safe torque is zero."""
@@ -192,6 +202,8 @@ class ControllerNode(LoopNode[ControllerConfig]):
         if guard.has_sample:
             self._look_at_learning(guard)
         self._publish_telemetry(torque)
+        if self._action is not None:
+            self._action.poll(guard)
         if guard.waiting_for:
             self.get_logger().warning(
                 f'not started, waiting for a usable joint state: {guard.waiting_for}',
@@ -314,6 +326,8 @@ class ControllerNode(LoopNode[ControllerConfig]):
             self._start_from_pending(guard)
             self._command(guard.watch())
             self._report_if_changed(guard)
+        if self._action is not None:
+            self._action.poll(guard)
 
     def _start_from_pending(self, guard: Guard) -> None:
         """Use a state that was held back, once it is observed or its sender turns out to wait."""

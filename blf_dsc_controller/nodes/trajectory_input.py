@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """New references while the controller runs: trajectories, streams of targets, stops.
 
-`~/joint_trajectory`, `~/joint_positions` and `~/stop`; every rejection has a reason.
+They come by `~/joint_trajectory`, `~/joint_positions`, `~/stop` and the goals of the action. Every
+rejection has a reason.
 """
 
 from __future__ import annotations
@@ -50,6 +51,9 @@ _LONGEST_LEAD = 2.0
 _SWITCH_INTERVAL = 1e-4  # s after which the planning thread yields to the loop
 _PAUSE = 1.0  # s without messages, after which a stopped sender is followed again
 _RARELY = 1.0  # s between two warnings of a stream
+_ON_TRAJECTORY = JOINT_TRAJECTORY.name
+_ON_POSITIONS = JOINT_POSITIONS.name
+_REPLACED = 'a newer one arrived before it was planned'
 
 Command = Trajectory | Target
 Report = Callable[[Plan | None, str], None]
@@ -62,6 +66,8 @@ class _Request(NamedTuple):
     make: Callable[[], Command]  # may take a while: called where it is planned
     report: Report
     lead: float  # s
+    source: str  # who wants it
+    check: Callable[[Plan], None] | None = None  # raises TrajectoryError: not like this
 
 
 class _Job(NamedTuple):
@@ -81,6 +87,7 @@ class TrajectoryInput:
         accepted, rejected: number of trajectories that are or were followed, or are not.
         targets: number of targets of streams that are or were followed.
         reason: why the last one was rejected.
+        source: what has set the present reference.
         job: the motion that is being planned, if any.
     """
 
@@ -92,6 +99,7 @@ class TrajectoryInput:
         self.rejected = 0
         self.targets = 0
         self.reason = ''
+        self.source = ''
         self.job: _Job | None = None
         self._next: _Request | None = None
         self._log = node.get_logger()
@@ -134,7 +142,7 @@ class TrajectoryInput:
             request, self._next = self._next, None
             self._submit(guard, request)
 
-    def stop(self, guard: Guard) -> float:
+    def stop(self, guard: Guard, source: str) -> float:
         """Brake and hold; return when the reference rests [s since the start].
 
         Raises:
@@ -143,7 +151,27 @@ class TrajectoryInput:
         self._drop('the reference was stopped')
         for stream in (self._positions, self._points):
             stream.restart()
-        return guard.brake()
+        end = guard.brake()
+        self.source = source
+        return end
+
+    def follow(
+        self,
+        guard: Guard,
+        raw: bytes,
+        source: str,
+        check: Callable[[Plan], None],
+        report: Report,
+    ) -> None:
+        """Follow a serialised trajectory with points that came by another way than a topic."""
+
+        def tell(plan: Plan | None, reason: str) -> None:
+            self._report(plan, reason)
+            report(plan, reason)
+
+        start = guard.start_stamp
+        request = _Request(lambda: _trajectory(raw, start), tell, _LEAD, source, check)
+        self._request(guard, request)
 
     # Requests.
 
@@ -160,8 +188,12 @@ class TrajectoryInput:
             return
         start = guard.start_stamp
         if len(raw) > _SMALL:
-            request = _Request(lambda: _trajectory(raw, start), self._report, _LEAD)
-            self._request(guard, request)
+            self._request(
+                guard,
+                _Request(
+                    lambda: _trajectory(raw, start), self._report, _LEAD, _ON_TRAJECTORY
+                ),
+            )
             return
         try:
             self._on_few_points(guard, _trajectory(raw, start))
@@ -175,7 +207,8 @@ class TrajectoryInput:
             return
         command = self._target_of(guard, trajectory) or trajectory
         lead = self._target_lead if isinstance(command, Target) else _LEAD
-        self._request(guard, _Request(lambda: command, self._report, lead))
+        request = _Request(lambda: command, self._report, lead, _ON_TRAJECTORY)
+        self._request(guard, request)
 
     def _target_of(self, guard: Guard, trajectory: Trajectory) -> Target | None:
         """Return a single point within the time-out as a target, None for anything else."""
@@ -219,7 +252,9 @@ class TrajectoryInput:
             timeout=guard.config.reference.stream_timeout,
             fastest=np.array(guard.config.limits.velocity),
         )
-        self._request(guard, _Request(lambda: target, self._report, self._target_lead))
+        lead = self._target_lead
+        request = _Request(lambda: target, self._report, lead, _ON_POSITIONS)
+        self._request(guard, request)
 
     def _read_positions(self, raw: bytes) -> np.ndarray:
         size = self._decoder.decode(raw)
@@ -243,7 +278,7 @@ class TrajectoryInput:
             response.message = 'the controller is not in command: nothing to stop'
             return response
         self._last_message = guard.time
-        left = self.stop(guard) - guard.time
+        left = self.stop(guard, '~/stop') - guard.time
         ignored = f'topics are ignored until they pause for {_PAUSE:g} s'
         response.message = f'braking for {left:.3g} s; {ignored}'
         self._log.info(response.message)
@@ -264,7 +299,7 @@ class TrajectoryInput:
 
     def _brake(self, guard: Guard) -> None:
         try:
-            self.stop(guard)
+            self.stop(guard, _ON_TRAJECTORY)
         except TrajectoryError as error:
             self._reject(_reason(error))
             return
@@ -283,7 +318,7 @@ class TrajectoryInput:
         elif self.job is None:
             self._submit(guard, request)
         else:
-            self._drop_next('a newer one arrived before it was planned')
+            self._drop_next(_REPLACED)
             self._next = request
 
     def _submit(self, guard: Guard, request: _Request) -> None:
@@ -307,11 +342,16 @@ class TrajectoryInput:
                 self._target_lead = lead
             if self._next is None:
                 self._submit(guard, request._replace(lead=lead))
+            else:
+                request.report(None, _REPLACED)
         except Exception as error:  # noqa: BLE001 - the current reference continues
             request.report(None, _reason(error))
 
     def _adopt(self, guard: Guard, plan: Plan, request: _Request) -> None:
+        if request.check is not None:
+            request.check(plan)
         guard.adopt(plan)
+        self.source = request.source
         request.report(plan, '')
 
     def _drop(self, reason: str) -> None:

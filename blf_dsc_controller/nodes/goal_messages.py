@@ -1,0 +1,79 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What the controller and the process of its action tell each other, pickled, over a pipe.
+
+Joint values are in the order of the controller's joints.
+"""
+
+from __future__ import annotations
+
+from enum import Enum
+from typing import NamedTuple
+
+SUCCESSFUL = 'SUCCESSFUL'
+INVALID = 'INVALID_GOAL'
+PATH_VIOLATED = 'PATH_TOLERANCE_VIOLATED'
+GOAL_VIOLATED = 'GOAL_TOLERANCE_VIOLATED'
+
+
+class JointTolerance(NamedTuple):
+    """A tolerance as it was sent: 0 is the default, -1 none."""
+
+    joint: str
+    position: float  # rad
+    velocity: float  # rad/s
+
+
+# From the process of the action.
+
+
+class Goal(NamedTuple):
+    """A goal that a client has sent."""
+
+    number: int
+    trajectory: bytes  # serialised trajectory_msgs/JointTrajectory
+    path: tuple[JointTolerance, ...]
+    goal: tuple[JointTolerance, ...]
+    time: float  # s, as sent: 0 is the default, negative without end
+
+
+class Cancel(NamedTuple):
+    """A client wants the end of a goal."""
+
+    number: int
+
+
+# To the process of the action.
+
+
+class Answer(NamedTuple):
+    """Whether a goal is followed from now on."""
+
+    number: int
+    accepted: bool
+
+
+class Feedback(NamedTuple):
+    """Where the arm is: reference [q, dq, ddq] and arm [q, dq]."""
+
+    number: int
+    stamp: int  # ns, of the joint state
+    time: float  # s since the trajectory's beginning
+    desired: list[list[float]]  # rad, rad/s, rad/s^2
+    actual: list[list[float]]  # rad, rad/s
+
+
+class Outcome(str, Enum):
+    """The final state of a goal."""
+
+    SUCCEEDED = 'succeeded'
+    ABORTED = 'aborted'
+    CANCELLED = 'cancelled'
+
+
+class End(NamedTuple):
+    """The end of a goal that was accepted."""
+
+    number: int
+    outcome: Outcome
+    code: str  # the name of an error code of the action's result
+    text: str

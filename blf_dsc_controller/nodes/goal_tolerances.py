@@ -1,0 +1,79 @@
+# SPDX-License-Identifier: Apache-2.0
+"""How far an arm may be from its reference while it follows a goal, and when it has arrived.
+
+As for joint_trajectory_controller: 0 is the default and -1 none. Here the default of a position is
+the bound, that of a velocity none. Accelerations are not measured, so that theirs are not checked.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from math import inf, nan
+from typing import NamedTuple
+
+import numpy as np
+
+from blf_dsc_controller.errors import BlfDscError
+from blf_dsc_controller.nodes.goal_messages import JointTolerance
+
+_NONE = -1.0  # as sent
+_ROUNDING = 1e-6
+
+
+class Tolerances(NamedTuple):
+    """The largest errors of all joints; where a position's (n,) [rad] is NaN, it is the bound."""
+
+    position: np.ndarray
+    velocity: np.ndarray  # (n,) [rad/s]
+
+    def violation(
+        self, joints: Sequence[str], error: np.ndarray, bound: np.ndarray
+    ) -> str:
+        """Return which joint exceeds what; empty if none.
+
+        Args:
+            joints: names.
+            error: (2, n), of positions [rad] and velocities [rad/s].
+            bound: (n,) [rad].
+        """
+        largest = np.where(np.isnan(self.position), bound, self.position)
+        ratio = np.abs(error) / (largest, self.velocity)
+        if ratio.max() <= 1.0:
+            return ''
+        kind, i = divmod(int(ratio.argmax()), len(joints))
+        unit = ('rad', 'rad/s')[kind]
+        allowed = (largest, self.velocity)[kind][i]
+        return (
+            f'{joints[i]!r} is {error[kind, i]:+.3g} {unit} from its reference, and '
+            f'{allowed:.3g} {unit} are allowed'
+        )
+
+
+def tolerances(joints: Sequence[str], given: Sequence[JointTolerance]) -> Tolerances:
+    """Return the tolerances of all joints.
+
+    Raises:
+        BlfDscError: a joint is unknown, or a value is negative but not -1, or not finite.
+    """
+    position = np.full(len(joints), nan)
+    velocity = np.full(len(joints), inf)
+    for each in given:
+        if each.joint not in joints:
+            raise BlfDscError(
+                f'the tolerance of {each.joint!r}: the joints are {", ".join(joints)}'
+            )
+        i = joints.index(each.joint)
+        position[i] = _value(each.joint, each.position, nan)
+        velocity[i] = _value(each.joint, each.velocity, inf)
+    return Tolerances(position, velocity)
+
+
+def _value(joint: str, sent: float, default: float) -> float:
+    if abs(sent - _NONE) < _ROUNDING:
+        return inf
+    if not 0.0 <= sent < inf:
+        raise BlfDscError(
+            f'the tolerance of {joint!r} is {sent:g}: it must be above 0, 0 for the default, or -1 '
+            'for none'
+        )
+    return sent or default

@@ -1,0 +1,49 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The action `~/follow_joint_trajectory`, as the controller's loop uses it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from rclpy.node import Node
+
+from blf_dsc_controller.nodes.action_process import ACTION, ActionProcess, can_offer
+from blf_dsc_controller.nodes.goals import Goals
+from blf_dsc_controller.nodes.trajectory_input import TrajectoryInput
+from blf_dsc_controller.supervision.guard import Guard
+
+_WITHOUT = (
+    f'{ACTION} is not offered, since control_msgs is not installed: apt install '
+    'ros-jazzy-control-msgs; trajectories can be sent as a topic, ~/joint_trajectory'
+)
+
+
+class TrajectoryAction:
+    """The action of one controller: its process, and the goals."""
+
+    def __init__(
+        self, node: Node, inputs: TrajectoryInput, joints: Sequence[str]
+    ) -> None:
+        self._process = ActionProcess(node, joints)
+        self._goals = Goals(inputs, joints, self._process.send, node.get_logger())
+
+    def poll(self, guard: Guard | None) -> None:
+        """Take what clients want, and watch the goal; between two samples."""
+        while self._process.inbox:
+            self._goals.take(guard, self._process.inbox.popleft())
+        self._goals.watch(guard)
+
+    def close(self) -> None:
+        """End the goal and the process."""
+        self._goals.close()
+        self._process.close()
+
+
+def offered_action(
+    node: Node, inputs: TrajectoryInput, joints: Sequence[str]
+) -> TrajectoryAction | None:
+    """Offer the action; without control_msgs say why not, and return None."""
+    if can_offer():
+        return TrajectoryAction(node, inputs, joints)
+    node.get_logger().info(_WITHOUT)
+    return None
