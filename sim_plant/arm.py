@@ -57,7 +57,7 @@ class RigidBodies(NamedTuple):
     # base parameters without payload; none in a model of the drives
     P: Annotated[Array, 'p']
     P_payload: Annotated[Array, 'p']  # contribution of 1 kg at the tip
-    rest: Annotated[Array, 'n']  # zero velocities
+    zeros: Annotated[Array, 'n']
 
 
 class BodyMotion(NamedTuple):
@@ -113,7 +113,7 @@ def rigid_bodies(
         tip=chain.tip_placement[:3, 3].copy(),
         P=P,
         P_payload=parameters.load if parameters else P,
-        rest=np.zeros(len(chain.joints)),
+        zeros=np.zeros(len(chain.joints)),
     )
 
 
@@ -265,7 +265,7 @@ def fill_tip(
     """Implement `RigidArm.fill_tip`."""
     arm = bodies_of(bodies)
     now = motion_of(memory, arm)
-    locate(arm, q, arm.rest, now)
+    locate(arm, q, arm.zeros, now)
     lever = transform(now.rotation[arm.n], vector(arm.tip))
     end = plus(vector(now.origin[arm.n]), lever)
     put(end, position)
@@ -282,7 +282,7 @@ def fill_gravity(bodies: Array, memory: Array, q: Array, out: Array) -> None:
     """Write the torque (n,) [N m, or N] that holds the bodies at q against gravity."""
     arm = bodies_of(bodies)
     now = motion_of(memory, arm)
-    locate(arm, q, arm.rest, now)
+    locate(arm, q, arm.zeros, now)
     combine_bodies(arm, now, 0.0)
     for j in range(arm.n):
         out[j] = along_joint(

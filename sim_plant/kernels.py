@@ -8,10 +8,11 @@ A reading has an offset, white noise and quantisation; its velocity is either me
 of its own, or differenced from the measured positions, and a low-pass filter may follow.  Noise
 comes from one seeded generator, so the same seed repeats a run exactly.
 
-A command is limited in rate, late, limited, lagging and noisy.  Drives of cobots hold the arm
-against gravity, and overcome part of their friction, by a model of their own, right or wrong, with
-the payload that they have been told of.  Some brake when the torque jumps (a reflex stop), until
-the plant is reset; their driver may limit its rate before.
+A command is limited in rate, late, limited, lagging and noisy.  Drives of cobots hold
+the arm against gravity, and compensate part of their friction, by a model of their own,
+right or wrong, with the payload that they are configured for.  Some brake when the
+torque jumps (a reflex stop), until the plant is reset; their driver may limit its rate
+before.
 """
 
 import numpy as np
@@ -108,8 +109,8 @@ def limited(torque: float, limit: float) -> float:
 
 
 @inner
-def let_pass(plant: PlantSettings, now: PlantState, command: Array) -> bool:
-    """Store what the driver lets pass of a command (n,); return whether the drives have stopped."""
+def apply_rate_limit(plant: PlantSettings, now: PlantState, command: Array) -> bool:
+    """Store the rate-limited command (n,); return whether the drives have stopped."""
     drives, state = plant.drives, now.drives
     for i in range(plant.n):
         last = state.command[i]
@@ -212,7 +213,7 @@ def observe(
 def step(plant: PlantSettings, now: PlantState, command: Array) -> None:
     """Apply the commanded torque (n,) [N m] of this sample and advance to the next one."""
     drives = now.drives
-    if let_pass(plant, now, command):
+    if apply_rate_limit(plant, now, command):
         for i in range(plant.n):
             now.x[plant.n + i] = drives.applied[i] = drives.motor[i] = 0.0
         now.sample[0] += 1.0

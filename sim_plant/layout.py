@@ -50,7 +50,7 @@ class Drives(NamedTuple):
     decay: float  # of the lag over a sample, exp(-T / time constant); 0: no lag
     mean_decay: float  # its mean over the sample
     torque_noise: float  # standard deviation, relative to the torque
-    friction: float  # share of viscous and Coulomb friction that they overcome
+    friction: float  # share of viscous and Coulomb friction that they compensate
     effort_is_whole: int  # 1: the measured effort contains what they add
     effort_scale: float  # of the measured effort: 1, or A/N m of a current
     step: float  # N m from one command to the next that their driver lets pass; 0: any

@@ -25,7 +25,7 @@ from sim_plant.layout import PlantSettings, PlantState
 
 
 @inner
-def come(sample: float, at: float, ramp: float) -> float:
+def ramp_fraction(sample: float, at: float, ramp: float) -> float:
     """Return the fraction, from 0 to 1, of a ramp of `ramp` samples that begins at sample `at`."""
     if sample < at:
         return 0.0
@@ -67,8 +67,8 @@ def update_loads(plant: PlantSettings, now: PlantState) -> None:
     put(acting.coulomb, plant.disturbance.coulomb)
     add(acting.constant, -1.0, load.torque)
     for e in range(plant.events):
-        fraction = come(sample, events.begin[e], events.ramp[e])
-        fraction -= come(sample, events.end[e], events.ramp[e])
+        fraction = ramp_fraction(sample, events.begin[e], events.ramp[e])
+        fraction -= ramp_fraction(sample, events.end[e], events.ramp[e])
         if fraction != 0.0:
             acting.payload[0] += fraction * events.payload[e]
             acting.sloshing[0] += fraction * events.sloshing[e]

@@ -35,7 +35,7 @@ INERTIA_NAMES = ('m', 'm*cx', 'm*cy', 'm*cz', 'Ixx', 'Ixy', 'Iyy', 'Ixz', 'Iyz',
 INERTIA_UNITS = ('kg', *('kg m',) * 3, *('kg m^2',) * 6)
 
 _MOVING = ('revolute', 'continuous', 'prismatic')
-_MOST = 500  # at most, of links and of joints
+_MAX_ELEMENTS = 500  # of links, and of joints
 _LIMITS = ('lower', 'upper', 'velocity', 'effort')
 _ROUNDED = 1e-12  # kg m^2, of moments of inertia
 _LARGEST = 1e6  # m, kg, kg m^2 and so on; limits may be larger
@@ -298,9 +298,9 @@ def _moving(path: Sequence[ET.Element]) -> tuple[str, ...]:
 def _named(robot: ET.Element, tag: str) -> dict[str, ET.Element]:
     """Return the elements with a tag by name."""
     elements = robot.findall(tag)
-    if len(elements) > _MOST:
+    if len(elements) > _MAX_ELEMENTS:
         raise BlfDscError(
-            f'the URDF has {len(elements)} {tag}s; at most {_MOST} can be read'
+            f'the URDF has {len(elements)} {tag}s; at most {_MAX_ELEMENTS} can be read'
         )
     named = {element.get('name', ''): element for element in elements}
     if len(named) < len(elements):

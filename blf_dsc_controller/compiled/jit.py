@@ -84,9 +84,9 @@ if not _chosen and all(map(get_host_cpu_features().get, _X86_64_V3)):
 
 _OTHERS_WRITE = stat.S_IWGRP | stat.S_IWOTH
 
-_ROOM = Path(__file__).resolve().parents[1]
+_PACKAGE = Path(__file__).resolve().parents[1]
 # Layouts and arm models reach a kernel through the types of its arguments.
-_IN_EVERY_KERNEL = (*_ROOM.glob('compiled/*.py'), *_ROOM.glob('arms/*.py'))
+_IN_EVERY_KERNEL = (*_PACKAGE.glob('compiled/*.py'), *_PACKAGE.glob('arms/*.py'))
 _COMPILED: dict[str, set[str]] = {}
 """Modules with functions for kernels, each with those of the types whose methods it calls."""
 
@@ -149,8 +149,8 @@ def _is_private(folder: Path) -> bool:
 
 def _name(source: Path) -> str:
     """Return the place of a file in the packages, which cached types refer to."""
-    inside = source.is_relative_to(_ROOM.parent)
-    return str(source.relative_to(_ROOM.parent)) if inside else source.name
+    inside = source.is_relative_to(_PACKAGE.parent)
+    return str(source.relative_to(_PACKAGE.parent)) if inside else source.name
 
 
 def inner(function: F) -> F:

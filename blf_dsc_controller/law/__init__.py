@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Control laws and their learning: compiled kernels, independent of ROS, files and clocks."""
+"""Control laws, their learning, and the controller: compiled kernels without ROS."""

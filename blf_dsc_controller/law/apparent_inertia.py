@@ -58,7 +58,7 @@ def begin(settings: Settings, state: State, signals: Signals) -> None:
 
 @inner
 def pass_band(settings: Settings, state: State, signals: Signals, dt: float) -> None:
-    """Write torque and acceleration in the band to `signals.unit` and `signals.swing`."""
+    """Write the torque in the band to `unit`, the acceleration to `band_acceleration`."""
     lags, dq = state.lags, signals.dq
     late = barrier.filter_gain(0.5 * settings.lag, dt) if settings.lag > 0.0 else 1.0
     smooth = barrier.filter_gain(dt / _SMOOTH, dt)
@@ -74,10 +74,16 @@ def pass_band(settings: Settings, state: State, signals: Signals, dt: float) -> 
         rate = (dq[i] - lags[_VELOCITY, i]) / dt
         a = low_pass(lags, _RATE1, i, smooth, rate)
         a = low_pass(lags, _RATE2, i, smooth, a)
-        signals.swing[i] = a - low_pass(lags, _RATE_MEAN, i, slow, a)
+        signals.band_acceleration[i] = a - low_pass(lags, _RATE_MEAN, i, slow, a)
         noise = rate - 2.0 * lags[_LAST, i] + lags[_BEFORE, i]
         low_pass(lags, _NOISE, i, brief, noise * noise)
-        low_pass(lags, _POWER, i, brief, signals.swing[i] * signals.swing[i])
+        low_pass(
+            lags,
+            _POWER,
+            i,
+            brief,
+            signals.band_acceleration[i] * signals.band_acceleration[i],
+        )
         lags[_BEFORE, i] = lags[_LAST, i]
         lags[_LAST, i] = rate
         lags[_VELOCITY, i] = dq[i]
@@ -93,7 +99,7 @@ def measure(settings: Settings, state: State, signals: Signals, dt: float) -> No
     if state.samples[0] * dt < _RELEASE:
         return
     settings.model.momentum_regressor(
-        signals.q, signals.swing, signals.momentum, signals.rest
+        signals.q, signals.band_acceleration, signals.momentum, signals.rest
     )
     for i in range(settings.n):
         J = settings.unsure_rotor[i]
@@ -103,7 +109,7 @@ def measure(settings: Settings, state: State, signals: Signals, dt: float) -> No
         for j in range(settings.p):
             unexplained -= signals.momentum[i, j] * settings.initial_estimate[j]
         state.rotor_sums[0, i] += dt * signals.unit[i] * unexplained
-        state.rotor_sums[1, i] += dt * signals.unit[i] * signals.swing[i]
+        state.rotor_sums[1, i] += dt * signals.unit[i] * signals.band_acceleration[i]
         least = _EVIDENCE * settings.joint_inertia[i]
         if state.rotor_sums[1, i] < least:
             continue

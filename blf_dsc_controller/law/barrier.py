@@ -19,7 +19,7 @@ The bound is constant, or a funnel that narrows to k_c:
 The potential has the form k^2 v(xi / k), including its continuation past the knee, so that
 V' = dV/dxi (xi1' - xi1 k'/k) + 2 (k'/k) V.  With xi1 k'/k added to the virtual control, V' is that
 of a constant bound plus 2 (k'/k) V, which is not positive while the bound narrows
-(doc/theory-funnel.md).
+(doc/stability.md, 'A bound that narrows').
 """
 
 from math import pi

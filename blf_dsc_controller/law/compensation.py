@@ -79,7 +79,7 @@ def compensated(
     torque = feedback + signals.model_torque[i]
     torque += state.disturbance[i] + signals.friction[i]
     if settings.feed_forward == 1:
-        torque += signals.known[i]
+        torque += signals.feedforward[i]
     for j in range(settings.m):
         learned = state.estimate[j]
         if j < settings.p:

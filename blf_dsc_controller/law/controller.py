@@ -107,7 +107,7 @@ def step(
     torque.find_added(settings, signals)
     torque.find_applied(settings, state, signals)
     reference.evaluate(reference_vector, t, signals.qr, signals.dqr, signals.ddqr)
-    torque.known_disturbance(settings, signals, t)
+    torque.update_feedforward(settings, signals, t)
     barrier.update_bound(settings, signals, t)
     for i in range(n):
         signals.xi1[i] = signals.q[i] - signals.qr[i]
@@ -255,9 +255,11 @@ class Controller:
     def update(self, t: float, dt: float, measurement: Array) -> Array:
         """Return the torque (n,) [N m] for a measurement: a view that the next update overwrites.
 
-        The measurement is [q (n,) rad, dq (n,) rad/s, applied torque of the last interval (n,)
-        N m], t [s] the time since the start and dt [s] since the last sample. If INVALID is among
-        the `flags`, nothing has changed, including the torque.
+        The measurement is [q (n,) rad, dq (n,) rad/s, effort (n,) N m]. The effort is
+        that of the last interval, and for the checks alone: the law learns from the
+        torque that it commanded. t [s] is the time since the start, dt [s] since the
+        last sample. If INVALID is among the `flags`, nothing has changed, including the
+        torque.
 
         Raises BlfDscError if the measurement has another shape than (3 n,).
         """

@@ -68,7 +68,7 @@ def fill_energies(
             V[2] += 0.5 * error * error / settings.Gamma[j]
     for i in range(n):
         if settings.gamma[i] > 0.0:
-            error = signals.known[i] - state.disturbance[i]
+            error = signals.feedforward[i] - state.disturbance[i]
             V[3] += 0.5 * error * error / (state.gain_scale[i] * settings.gamma[i])
 
 
@@ -88,7 +88,7 @@ def decay_rate(settings: Settings) -> float:
     """Return kappa_e of (32) [1/s]; 0 if (32) is void: eta, gamma or kappa 0, or unknown truth.
 
     It is void for other forms than the paper's, too: with compensation along the reference, or with
-    the handover to d^3, V of (29) need not fall (doc/theory.md: stability).  A Newton step
+    the handover to d^3, V of (29) need not fall (doc/stability.md).  A Newton step
     replaces sigma, the smallest eigenvalue of Phi_e, by sigma / (sigma + rho).
     """
     if settings.has_barrier == 0 or settings.truth_known == 0:

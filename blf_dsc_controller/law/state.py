@@ -221,7 +221,7 @@ class Signals(NamedTuple):
     # alpha2' - omega_v xi2; of a URDF with the restoring torque over m, rad/s^2
     damped: Annotated[Array, 'n']
     model_torque: Annotated[Array, 'n']  # H(q, dq, alpha2, damped) P^(0), N m
-    known: Annotated[Array, 'n']  # disturbance known to the law, N m
+    feedforward: Annotated[Array, 'n']  # known disturbance, fed forward, N m
     acceleration: Annotated[Array, 'n']  # estimated ddq, rad/s^2
     added: Annotated[Array, 'n']  # torque that the drive adds to the command, N m
     applied: Annotated[Array, 'n']  # mean whole torque of the last interval, N m
@@ -248,10 +248,10 @@ class Signals(NamedTuple):
     # M^(q) minus its least admissible value, or its factor
     inertia: Annotated[Array, 'n', 'n']
     unit: Annotated[Array, 'n']  # scratch
-    still: Annotated[Array, 'n']  # zeros
+    zeros: Annotated[Array, 'n']
     drive: Annotated[Array, 'n', 'drive']  # columns of the gravity that the drive adds
     # acceleration in the band of `apparent_inertia`, rad/s^2
-    swing: Annotated[Array, 'n']
+    band_acceleration: Annotated[Array, 'n']
     rate: Annotated[Array, 'm']  # theta^' [1/s]
     work: Annotated[Array, 'm']  # scratch
     # sum of the rows since the first window

@@ -44,13 +44,13 @@ def clip(x: float, low: float, high: float) -> float:
 
 
 @inner
-def known_disturbance(settings: Settings, signals: Signals, t: float) -> None:
-    """Compute the known disturbance `signals.known` (n,) [N m] at time t [s]."""
+def update_feedforward(settings: Settings, signals: Signals, t: float) -> None:
+    """Compute the known disturbance `signals.feedforward` (n,) [N m] at time t [s]."""
     if settings.truth_known == 0 and settings.feed_forward == 0:
         return
     d = settings.true_disturbance
     for i in range(settings.n):
-        signals.known[i] = d[0, i] + d[1, i] * sin(d[2, i] * t + d[3, i])
+        signals.feedforward[i] = d[0, i] + d[1, i] * sin(d[2, i] * t + d[3, i])
 
 
 @inner
@@ -58,8 +58,8 @@ def find_added(settings: Settings, signals: Signals) -> None:
     """Write G_d(q) to `signals.added` (n,) [N m]."""
     if settings.drive == 0:
         return
-    still = signals.still
-    fill_regressor(settings.drive_chain, signals.q, still, still, still, signals.drive)
+    zeros = signals.zeros
+    fill_regressor(settings.drive_chain, signals.q, zeros, zeros, zeros, signals.drive)
     for i in range(settings.n):
         signals.added[i] = 0.0
         for j in range(settings.drive):
