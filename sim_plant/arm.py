@@ -1,16 +1,18 @@
 # SPDX-License-Identifier: Apache-2.0
 """Mechanics of the simulated arms: any serial chain of rigid bodies, and the arm of Section IV.
 
-An arm is a `NamedTuple` of numbers and arrays with the methods of `Arm`.  Kernels call them as
-plain Python does; each kernel is compiled for the type of arm that is passed to it.  Both arms are
-derived independently of the controller's regressors, so that each checks the other:
+An arm is a `NamedTuple` of numbers and arrays with the methods of `Arm`.  Kernels call
+them as plain Python does; each kernel is compiled for the type of arm that is passed to
+it.  Both arms are derived independently of the controller's regressors, so that each
+checks the other:
 
     (M(q) + rotors) ddq + C(q, dq) dq + G(q) = torque    (33), (34)
 
-For a chain by the Newton-Euler equations in the base frame: the bias C dq + G is the torque of the
-motion without acceleration; a column of M is the torque of a unit acceleration of one joint, which
-moves all bodies beyond it as one (Featherstone, Rigid Body Dynamics Algorithms, 2008, chapters 5
-and 6).  For two links with point masses at their ends, in a vertical plane, from the Lagrangian.
+For a chain by the Newton-Euler equations in the base frame: the bias C dq + G is the
+torque of the motion without acceleration; a column of M is the torque of a unit
+acceleration of one joint, which moves all bodies beyond it as one (Featherstone, Rigid
+Body Dynamics Algorithms, 2008, chapters 5 and 6).  For two links with point masses at
+their ends, in a vertical plane, from the Lagrangian.
 """
 
 from __future__ import annotations
@@ -61,7 +63,10 @@ class RigidBodies(NamedTuple):
 
 
 class BodyMotion(NamedTuple):
-    """Pose and motion of the bodies in the base frame; entry 0 of each field is the base."""
+    """Pose and motion of the bodies in the base frame.
+
+    Entry 0 of each field is the base.
+    """
 
     rotation: Annotated[Array, 'n + 1', 3, 3]
     origin: Annotated[Array, 'n + 1', 3]  # m
@@ -357,8 +362,8 @@ def rigid_arm(bodies: RigidBodies) -> RigidArm:
 class PointMassArm(NamedTuple):
     """Lengths, masses and gravity; l2, m1 and m2 are unknown to the controller.
 
-    Joint 1 is measured from the horizontal, joint 2 from link 1.  G is the gradient of the
-    potential; its first term has cos q1, where (34) prints cos q2.
+    Joint 1 is measured from the horizontal, joint 2 from link 1.  G is the gradient of
+    the potential; its first term has cos q1, where (34) prints cos q2.
     """
 
     l1: float  # m
@@ -399,7 +404,10 @@ class PointMassArm(NamedTuple):
     def accelerate(
         self, payload: float, q: Array, dq: Array, torque: Array, ddq: Array
     ) -> None:
-        """Write ddq = M^-1 (torque - C dq - G) (2,) [rad/s^2]; `ddq` may alias `torque`."""
+        """Write ddq = M^-1 (torque - C dq - G) (2,) [rad/s^2].
+
+        `ddq` may alias `torque`.
+        """
         m2 = self.m2 + payload
         outer = m2 * self.l2**2
         coupling = m2 * self.l1 * self.l2 * cos(q[1])
@@ -435,7 +443,10 @@ class Arm(Protocol):
     def accelerate(
         self, payload: float, q: Array, dq: Array, torque: Array, ddq: Array
     ) -> None:
-        """Write ddq (n,) [rad/s^2] of M ddq + C dq + G = torque; `ddq` may alias `torque`."""
+        """Write ddq (n,) [rad/s^2] of M ddq + C dq + G = torque.
+
+        `ddq` may alias `torque`.
+        """
 
 
 compile_methods(

@@ -1,12 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """The sampled plant: a reading at each sample k, then a torque held over [k, k + 1].
 
-Time is counted in whole nanoseconds, t_k = (k T_ns) 1e-9 s, so every caller computes the same
-floats.  The ROS 2 node and the compiled offline loop run the same kernels and agree bit for bit.
+Time is counted in whole nanoseconds, t_k = (k T_ns) 1e-9 s, so every caller computes
+the same floats.  The ROS 2 node and the compiled offline loop run the same kernels and
+agree bit for bit.
 
-A reading has an offset, white noise and quantisation; its velocity is either measured, with noise
-of its own, or differenced from the measured positions, and a low-pass filter may follow.  Noise
-comes from one seeded generator, so the same seed repeats a run exactly.
+A reading has an offset, white noise and quantisation; its velocity is either measured,
+with noise of its own, or differenced from the measured positions, and a low-pass filter
+may follow.  Noise comes from one seeded generator, so the same seed repeats a run
+exactly.
 
 A command is limited in rate, late, limited, lagging and noisy.  Drives of cobots hold
 the arm against gravity, and compensate part of their friction, by a model of their own,
@@ -72,8 +74,8 @@ def quantised(angle: float, resolution: float) -> float:
 def sense(plant: PlantSettings, now: PlantState) -> None:
     """Write the reading of this sample, including offset and noise.
 
-    A differenced velocity spans the samples since the last reading; the first reading has no
-    predecessor and gets the true velocity.
+    A differenced velocity spans the samples since the last reading; the first reading
+    has no predecessor and gets the true velocity.
     """
     n = plant.n
     encoders = plant.encoders
@@ -186,8 +188,9 @@ def observe(
 ) -> None:
     """Write [q, dq, effort] (3n,) of this sample, and draw its noise.
 
-    `effort` is the torque applied over the last interval [N m], before the first one that with
-    which the drives hold the arm.  Reading a sample again gives the same numbers.
+    `effort` is the torque applied over the last interval [N m], before the first one
+    that with which the drives hold the arm.  Reading a sample again gives the same
+    numbers.
     """
     n = plant.n
     if now.sample[0] == 0.0:

@@ -24,7 +24,10 @@ class Encoders(NamedTuple):
 
 
 class Disturbance(NamedTuple):
-    """Disturbance of each joint; constant, viscous and coulomb as they are without events."""
+    """Disturbance of each joint.
+
+    Constant, viscous and coulomb as they are without events.
+    """
 
     constant: Annotated[Array, 'n']  # N m
     amplitude: Annotated[Array, 'n']  # N m
@@ -42,7 +45,8 @@ class Disturbance(NamedTuple):
 class Drives(NamedTuple):
     """Properties of the drives of all joints, what they add, and the jump at which they stop.
 
-    The lag is solved exactly for a held command; the torque applied in a sample is its mean.
+    The lag is solved exactly for a held command; the torque applied in a sample is its
+    mean.
     """
 
     torque_limit: Annotated[Array, 'n']  # N m, 0 = none

@@ -1,18 +1,19 @@
 # SPDX-License-Identifier: Apache-2.0
 """Equation of motion of an arm under a torque, a disturbance, events, and forces at its tip.
 
-Vectors are in the base frame: x to the right, z up.  A force f at the tip loads the joints with
-J^T f, where J is the Jacobian of the tip position.  The sloshing load is a point mass m on a damped
-spring at the tip. With its position y and velocity v, those of the tip x and dx, and
-a = omega^2 (y - x) + 2 zeta omega (v - dx),
+Vectors are in the base frame: x to the right, z up.  A force f at the tip loads the
+joints with J^T f, where J is the Jacobian of the tip position.  The sloshing load is a
+point mass m on a damped spring at the tip. With its position y and velocity v, those of
+the tip x and dx, and a = omega^2 (y - x) + 2 zeta omega (v - dx),
 
     y' = v,   v' = g - a,   force on the tip: m a,
 
-so its motion does not depend on m, which may be ramped.  Loads and events are held over a sample.
+so its motion does not depend on m, which may be ramped.  Loads and events are held over
+a sample.
 
-A step is fixed, with the torque held and the disturbance varying: the fifth-order solution of
-Dormand and Prince (1980), which MATLAB calls ode5.  Stage i is evaluated at t + c_i h and
-x + h sum_j a_ij k_j; the step ends at x + h sum_i b_i k_i.
+A step is fixed, with the torque held and the disturbance varying: the fifth-order
+solution of Dormand and Prince (1980), which MATLAB calls ode5.  Stage i is evaluated at
+t + c_i h and x + h sum_j a_ij k_j; the step ends at x + h sum_i b_i k_i.
 """
 
 import numpy as np
@@ -43,7 +44,10 @@ def add(total: Array, fraction: float, vector: Array) -> None:
 
 @inner
 def put(target: Array, values: Array) -> None:
-    """Copy a vector; `target[:] = values` compiles ten functions just for a shape error."""
+    """Copy a vector.
+
+    `target[:] = values` compiles ten functions just for a shape error.
+    """
     for i in range(target.size):
         target[i] = values[i]
 
@@ -112,8 +116,8 @@ def disturbing_torque(
 ) -> None:
     """Write tau_dist (n,) [N m] at time t [s]; `x` as in `state_derivative`.
 
-    Friction has the sign of the velocity; Coulomb friction is smoothed by tanh, so that the
-    fixed-step integrator keeps its order.
+    Friction has the sign of the velocity; Coulomb friction is smoothed by tanh, so that
+    the fixed-step integrator keeps its order.
     """
     n = plant.n
     given = plant.disturbance
@@ -195,7 +199,10 @@ _A = np.array(
 def combine(
     x: Array, h: float, stage: int, k: Array, begin: int, end: int, out: Array
 ) -> None:
-    """Write entries `begin` to `end` of x + h sum_j a_ij k_j; after the last stage, with b_j."""
+    """Write entries `begin` to `end` of x + h sum_j a_ij k_j.
+
+    After the last stage, with b_j.
+    """
     for i in range(begin, end):
         slope = 0.0
         for j in range(stage):

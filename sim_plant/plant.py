@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """The simulated plant of a configuration: its arm, its vectors and its random generator.
 
-`TorqueInput` and `Latency` follow the torques that its node receives.  They are the counterpart of
-the controller's checks of joint states: a motor that applies an outdated torque, or one that is not
-finite, is as dangerous as a law that commands one.
+`TorqueInput` and `Latency` follow the torques that its node receives.  They are the
+counterpart of the controller's checks of joint states: a motor that applies an outdated
+torque, or one that is not finite, is as dangerous as a law that commands one.
 """
 
 from __future__ import annotations
@@ -48,14 +48,17 @@ _CURRENT = 0.1  # A/N m, of motors with their gears, roughly that of cobots
 
 
 LARGEST = 1e4
-"""Largest valid torque [N m] of a command; a step with 1e6 N m makes the arm diverge."""
+"""Largest valid torque [N m] of a command.
+
+A step with 1e6 N m makes the arm diverge.
+"""
 
 
 class Plant:
     """A sampled arm: call `measure()`, then `step(torque)`, in turn.
 
-    It starts at `position` (n,) [rad] with `velocity` (n,) [rad/s]; `seed` determines the noise, so
-    the same seed repeats the run.
+    It starts at `position` (n,) [rad] with `velocity` (n,) [rad/s]; `seed` determines
+    the noise, so the same seed repeats the run.
     """
 
     def __init__(
@@ -112,7 +115,10 @@ class Plant:
         self._now.acting.sample[0] = -1.0
 
     def truth(self) -> np.ndarray:
-        """Return [P, tau_dist, q, dq] (p + 3n,) of this sample; the next call overwrites it."""
+        """Return [P, tau_dist, q, dq] (p + 3n,) of this sample.
+
+        The next call overwrites it.
+        """
         plant_truth(self.arm, self.settings, self.state, self._truth)
         return self._truth
 
@@ -139,8 +145,8 @@ class Plant:
 class TorqueInput:
     """The last valid `torque` (n,) [N m] of the n joints, and counts of rejected commands.
 
-    `problem` describes the last rejected command; `stale_steps` counts the steps for which the
-    torque was too old.
+    `problem` describes the last rejected command; `stale_steps` counts the steps for
+    which the torque was too old.
     """
 
     def __init__(self, n: int) -> None:
@@ -179,9 +185,9 @@ class TorqueInput:
 class Latency:
     """Time from a published state to the torque that follows it, and the number of late steps.
 
-    A torque does not identify its state. It is matched with the oldest state that has had no
-    torque yet, so that a late torque counts with its full delay. Times are in s; `late_steps`
-    counts the steps taken before a torque for their state had arrived.
+    A torque does not identify its state. It is matched with the oldest state that has
+    had no torque yet, so that a late torque counts with its full delay. Times are in s;
+    `late_steps` counts the steps taken before a torque for their state had arrived.
     """
 
     def __init__(self) -> None:
@@ -201,7 +207,10 @@ class Latency:
             self._since = None
 
     def step(self, now: float) -> float:
-        """End a sample; return its longest wait, or the wait of the oldest state so far."""
+        """End a sample.
+
+        Return its longest wait, or the wait of the oldest state so far.
+        """
         if self._since is not None:
             self.late_steps += 1
             return now - self._since
@@ -210,7 +219,10 @@ class Latency:
 
 
 def parameter_order(names: Sequence[str], config: PlantConfig) -> np.ndarray:
-    """Return the index in P of each parameter of a model; all -1 if the model has others."""
+    """Return the index in P of each parameter of a model.
+
+    All -1 if the model has others.
+    """
     true = parameter_names_of(config)
     known = set(names) == set(true)
     return np.array([true.index(name) if known else -1 for name in names])
@@ -367,7 +379,10 @@ def arm_of(config: PlantConfig) -> Arm:
 
 
 def drive_bodies(config: PlantConfig) -> np.ndarray:
-    """Return the packed `RigidBodies` by which the drives compensate gravity; empty without."""
+    """Return the packed `RigidBodies` by which the drives compensate gravity.
+
+    Empty without.
+    """
     robot = config.robot
     if robot.drive_compensates == 'none':
         return np.zeros(0)

@@ -1,16 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
 """Base parameters of a chain, and the prior that its URDF gives of them.
 
-Torques show only certain combinations of the inertias.  Of the columns of the full regressor Y (ten
-per body, a rotor per joint), a maximal set of independent ones, Y_B, is kept; the others are
-Y_D = Y_B X, so that Y phi = Y_B K phi, where K has unit columns for B and X for D (Gautier,
-Numerical calculation of the base inertial parameters of robots, 1991).  The columns are tried from
-base to tip, so that what a body has in common with the bodies before it is grouped with those,
-which is the usual grouping.
+Torques show only certain combinations of the inertias.  Of the columns of the full
+regressor Y (ten per body, a rotor per joint), a maximal set of independent ones, Y_B,
+is kept; the others are Y_D = Y_B X, so that Y phi = Y_B K phi, where K has unit columns
+for B and X for D (Gautier, Numerical calculation of the base inertial parameters of
+robots, 1991).  The columns are tried from base to tip, so that what a body has in
+common with the bodies before it is grouped with those, which is the usual grouping.
 
-The prior says how far a URDF may be off, and in which directions.  Bodies vary independently, in
-terms of their pseudo-inertia: the mass with all that scales with it, the centre of mass, and the
-spread of the mass around it.  The last body also carries a payload.
+The prior says how far a URDF may be off, and in which directions.  Bodies vary
+independently, in terms of their pseudo-inertia: the mass with all that scales with it,
+the centre of mass, and the spread of the mass around it.  The last body also carries a
+payload.
 """
 
 from __future__ import annotations
@@ -28,7 +29,10 @@ LINKS = 0.3
 """Standard deviation of the mass of a body and of its spread, relative to their values."""
 
 CENTRE = 0.01
-"""Standard deviation of the centre of mass [m]; also the least assumed extent of a body."""
+"""Standard deviation of the centre of mass [m].
+
+Also the least assumed extent of a body.
+"""
 
 PAYLOAD_SIZE = 0.05
 """Extent of a payload, and standard deviation of its centre of mass from the tip [m]."""
@@ -37,7 +41,10 @@ ROTORS = 0.5
 """Standard deviation of the inertia of a drive, relative to its value ..."""
 
 UNKNOWN_ROTOR = 0.01
-"""... and absolute where that is 0, as neither effort nor inertia is known [kg m^2, or kg]."""
+"""...
+
+And absolute where that is 0, as neither effort nor inertia is known [kg m^2, or kg].
+"""
 
 # for columns of order 1; rounding of pi / 2 in URDFs gives about 1e-10
 _DEPENDENT = 1e-6
@@ -106,9 +113,9 @@ def prior_factor(
 ) -> np.ndarray:
     """Return L (p, k) of P = P0 + L theta, with theta (k,) of mean 0 and covariance 1.
 
-    P0 are the base parameters of the URDF, `payload` is the rated payload of the arm [kg], and
-    `rotors` (n,) are the standard deviations of the rotor inertias [kg m^2, or kg], which a URDF
-    does not contain.
+    P0 are the base parameters of the URDF, `payload` is the rated payload of the arm
+    [kg], and `rotors` (n,) are the standard deviations of the rotor inertias [kg m^2,
+    or kg], which a URDF does not contain.
     """
     n = len(chain.joints)
     without_rotor = ((0, 1), (0, 0))
@@ -131,7 +138,8 @@ def payload_inertia(payload: float) -> np.ndarray:
 def deviations(J: np.ndarray, share: float, centre: float) -> np.ndarray:
     """Return one standard deviation of the ten along each of ten independent directions (10, 10).
 
-    `share` is that of mass and spread, relative to them, `centre` that of the centre of mass [m].
+    `share` is that of mass and spread, relative to them, `centre` that of the centre of
+    mass [m].
     """
     if J[3, 3] == 0.0:
         return np.zeros((10, 10))

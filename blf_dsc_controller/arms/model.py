@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """Interface between the laws and an arm whose dynamics are linear in p parameters.
 
-An arm is a `NamedTuple` of the geometry that its regressors need (numbers and arrays), with the
-properties and methods of `ArmModel`.  Kernels call the methods as Python does: only those of the
-type that a kernel receives are compiled into it.  To add an arm, write its class in a file of its
-own, and add it to `arm_model` and `compile_methods` below and to the choices of the parameter
-`model`.
+An arm is a `NamedTuple` of the geometry that its regressors need (numbers and arrays),
+with the properties and methods of `ArmModel`.  Kernels call the methods as Python does:
+only those of the type that a kernel receives are compiled into it.  To add an arm,
+write its class in a file of its own, and add it to `arm_model` and `compile_methods`
+below and to the choices of the parameter `model`.
 """
 
 from __future__ import annotations
@@ -41,7 +41,10 @@ class ArmModel(Protocol):
         """Units of the entries of P."""
 
     def sizes(self) -> tuple[int, int]:
-        """Return n and p, in kernels too; literal numbers are constants of the kernels."""
+        """Return n and p, in kernels too.
+
+        Literal numbers are constants of the kernels.
+        """
 
     def regressor(self, q: Array, dq: Array, v: Array, a: Array, H: Array) -> None:
         """Fill H (n, p) so that H P = M(q) a + C(q, dq) v + G(q)   [N m], Property III."""

@@ -1,18 +1,20 @@
 # SPDX-License-Identifier: Apache-2.0
 """Model of a serial chain of rigid bodies, linear in its inertial parameters: an `ArmModel`.
 
-Spatial vectors are (angular, linear) at the origin of a body's frame.  S_j is the axis of joint j,
-v_i = sum_j S_j dq_j and w_i = sum_j S_j v_j over the joints j <= i that carry body i, and
-alpha_i = sum_j (S_j a_j + S_j' v_j) - gravity with S_j' = v_j x S_j.  Over the bodies i >= j,
+Spatial vectors are (angular, linear) at the origin of a body's frame.  S_j is the axis
+of joint j, v_i = sum_j S_j dq_j and w_i = sum_j S_j v_j over the joints j <= i that
+carry body i, and alpha_i = sum_j (S_j a_j + S_j' v_j) - gravity with S_j' = v_j x S_j.
+Over the bodies i >= j,
 
     (M a + C v + G)_j = sum_i S_j . (I_i alpha_i + B(I_i, v_i) w_i)
     B(I, v) w = (v x* I w + w x* I v - I (v x w)) / 2,    for which M' - 2 C is skew
     (M dq)_j = sum_i S_j . I_i v_i
     (G - C^T dq)_j = -sum_i (S_j' . I_i v_i + S_j . weight_i)
 
-(Echeandia and Wensing, Numerical methods to compute the Coriolis matrix and Christoffel symbols for
-rigid-body systems, 2021.)  All of it is linear in the ten parameters (`urdf.INERTIA_NAMES`) of
-each body in its joint's frame.  A rotor inertia J, reflected to its joint, adds J a_j and J dq_j.
+(Echeandia and Wensing, Numerical methods to compute the Coriolis matrix and Christoffel
+symbols for rigid-body systems, 2021.)  All of it is linear in the ten parameters
+(`urdf.INERTIA_NAMES`) of each body in its joint's frame.  A rotor inertia J, reflected
+to its joint, adds J a_j and J dq_j.
 """
 
 from __future__ import annotations
@@ -35,7 +37,10 @@ VELOCITY, REFERENCE, ACCELERATION, GRAVITY, AXES = range(5)
 
 
 class Bodies(NamedTuple):
-    """A chain and the columns of its regressors; motions and products are working memory."""
+    """A chain and the columns of its regressors.
+
+    Motions and products are working memory.
+    """
 
     n: int
     p: int
@@ -123,7 +128,10 @@ def begin(bodies: Bodies) -> None:
 
 @inner
 def advance(bodies: Bodies, i: int, q: float, dq: float, v: float, a: float) -> None:
-    """Transform all motions from the frame of body i - 1 to that of i; add those of joint i."""
+    """Transform all motions from the frame of body i - 1 to that of i.
+
+    Add those of joint i.
+    """
     motions = bodies.motions
     rotation = bodies.rotation[i]
     c, s = cos(q), sin(q)
@@ -220,7 +228,10 @@ def add_momentum(bodies: Bodies, i: int, dq: float, Yp: Array, Yr: Array) -> Non
 
 @inner
 def choose(bodies: Bodies, i: int, j: int, products: Array, Y: Array) -> None:
-    """Copy the products that are columns of body i to row j of Y; zero the rows below i."""
+    """Copy the products that are columns of body i to row j of Y.
+
+    Zero the rows below i.
+    """
     for k in range(int(bodies.first[i]), int(bodies.first[i + 1])):
         Y[j, k] = products[int(bodies.entry[k])]
         if j == i:
@@ -232,12 +243,15 @@ def choose(bodies: Bodies, i: int, j: int, products: Array, Y: Array) -> None:
 def torque_products(
     S: Array, alpha: Vector, A: Vector, v: Vector, w: Vector, out: Array
 ) -> None:
-    """Fill S . (I alpha + B(I, v) w) for a unit of each of the ten; h = m c are the moments.
+    """Fill S . (I alpha + B(I, v) w) for a unit of each of the ten.
+
+    H = m c are the moments.
 
         force = m A + alpha x h + w x (v x h)
         moment = h x A + I (alpha - v x w / 2) + (v x I w + w x I v) / 2
 
-    Here alpha, v and w are the angular parts; A is alpha's linear part + w x (v's linear part).
+    Here alpha, v and w are the angular parts; A is alpha's linear part + w x (v's
+    linear part).
     """
     s, t = angular(S), linear(S)
     turn = cross(t, alpha)
@@ -268,7 +282,10 @@ def torque_products(
 
 @inner
 def momentum_products(S: Array, w: Vector, u: Vector, out: Array) -> None:
-    """Fill S . I v for a unit of each of the ten; w and u are v's angular and linear parts."""
+    """Fill S . I v for a unit of each of the ten.
+
+    W and u are v's angular and linear parts.
+    """
     s, t = angular(S), linear(S)
     turn, lever = cross(t, w), cross(u, s)
     out[0] = dot(t, u)
@@ -339,8 +356,8 @@ def serial_chain(
 ) -> SerialChain:
     """Return the model of a chain; `gravity` [m/s^2] is given in its base.
 
-    `columns` are the parameters as (body, entry), both counted from 0, in ascending order of the
-    bodies; ROTOR is the entry after the ten. None selects all n * 11.
+    `columns` are the parameters as (body, entry), both counted from 0, in ascending
+    order of the bodies; ROTOR is the entry after the ten. None selects all n * 11.
     """
     n = len(chain.joints)
     if columns is None:

@@ -1,15 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
 """Design rules: the gains and limits of the controller that follow from the URDF of an arm.
 
-The delay of the loop, 3 T + robot.lag, gives the rate omega_b = 0.625 / delay; feedback.stiffness
-is the part of it that is used. Gains are multiples of this rate and of the inertia of each joint
-with the others free, m_i = 1 / (M^-1)_ii, minimised over several postures; the law multiplies what
-acts on errors by M(q, P^(0)) / m. Three samples: half a sample for which torques are held, one
-until they are applied, half a sample of differenced velocities, and one for the surface filter and
-alpha2', so that gain margins are alike at 1 kHz and 250 Hz (doc/arms.md: margins).
+The delay of the loop, 3 T + robot.lag, gives the rate omega_b = 0.625 / delay;
+feedback.stiffness is the part of it that is used. Gains are multiples of this rate and
+of the inertia of each joint with the others free, m_i = 1 / (M^-1)_ii, minimised over
+several postures; the law multiplies what acts on errors by M(q, P^(0)) / m. Three
+samples: half a sample for which torques are held, one until they are applied, half a
+sample of differenced velocities, and one for the surface filter and alpha2', so that
+gain margins are alike at 1 kHz and 250 Hz (doc/arms.md: margins).
 
-Errors of the modelled gravity, including the rated payload, make a joint sag at the start until the
-disturbance estimate compensates them. If it sags by more than the bound, the bound is a funnel.
+Errors of the modelled gravity, including the rated payload, make a joint sag at the
+start until the disturbance estimate compensates them. If it sags by more than the
+bound, the bound is a funnel.
 """
 
 from __future__ import annotations
@@ -64,8 +66,8 @@ def gains_of(
 ) -> Mapping[str, bool | int | float | str | tuple[float, ...] | tuple[str, ...]]:
     """Return gains and limits by the dotted name of their parameter.
 
-    `stiffness` is the part of the rate omega_b that is used, `bound` (n,) [rad] or None the one
-    that is given.
+    `stiffness` is the part of the rate omega_b that is used, `bound` (n,) [rad] or None
+    the one that is given.
     """
     chain = arm.chain
     n = len(chain.joints)

@@ -6,11 +6,12 @@ Point masses at the link ends, angles from the horizontal, q2 relative to q1:
     P = [(m1 + m2) l1^2, m2 l2^2, m2 l1 l2]   [kg m^2]
     r = g / l1                                [1/s^2]
 
-The masses and l2 appear in P alone; the only geometry that the regressor needs is r.  Equation (34)
-prints cos q2 in the first gravity term, which must be cos q1 (doc/errata.md).
+The masses and l2 appear in P alone; the only geometry that the regressor needs is r.
+Equation (34) prints cos q2 in the first gravity term, which must be cos q1
+(doc/errata.md).
 
-Its URDF is in the vertical x-z plane.  URDF joints turn counterclockwise about their axis, and q1
-counts from the horizontal upwards: from x to z, which is about -y.
+Its URDF is in the vertical x-z plane.  URDF joints turn counterclockwise about their
+axis, and q1 counts from the horizontal upwards: from x to z, which is about -y.
 """
 
 from __future__ import annotations
@@ -124,8 +125,8 @@ def urdf(
 ) -> str:
     """Return the URDF of the arm, whose tip is the link `tip`.
 
-    `lengths` and `masses` are those of the links [m] and at their ends [kg].  Point masses have a
-    tiny inertia: most parsers reject zero.
+    `lengths` and `masses` are those of the links [m] and at their ends [kg].  Point
+    masses have a tiny inertia: most parsers reject zero.
     """
     text = '<robot name="two_link">\n  <link name="base_link" />\n'
     parent, x = 'base_link', 0.0

@@ -1,14 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
 """Serial chain between two links of a URDF: placements, axes, limits and inertias.
 
-A body is what one joint moves: its link, with everything that is fixed to it.  The rules:
+A body is what one joint moves: its link, with everything that is fixed to it.  The
+rules:
 
 - Fixed joints are merged, including those beyond the tip.
-- Moving joints beside the chain or beyond its tip, such as a gripper's fingers, are held at
-  position 0 and their links merged.
+- Moving joints beside the chain or beyond its tip, such as a gripper's fingers, are
+  held at position 0 and their links merged.
 - A link without `<inertial>` has no mass, but each body must have one.
-- Continuous joints, and joints without `<limit>`, have infinite limits; an effort or a velocity of
-  0 means no limit.
+- Continuous joints, and joints without `<limit>`, have infinite limits; an effort or a
+  velocity of 0 means no limit.
 
 Not supported: `floating`, `planar` and `mimic` joints in the chain, and closed chains.
 """
@@ -44,8 +45,8 @@ _LARGEST = 1e6  # m, kg, kg m^2 and so on; limits may be larger
 class Joint(NamedTuple):
     """A moving joint, with the body that it moves.
 
-    The frame of the joint is that of its link; its placement is in the frame of the previous joint,
-    of the first joint in the base.
+    The frame of the joint is that of its link; its placement is in the frame of the
+    previous joint, of the first joint in the base.
     """
 
     name: str
@@ -83,8 +84,8 @@ class Chain:
 def read_chain(text: str, base: str, tip: str, joints: tuple[str, ...]) -> Chain:
     """Return the serial chain of the moving `joints`, in order, between two links of a URDF text.
 
-    An empty base means the root, an empty tip the link of the last joint, no joints all that move;
-    without tip and joints, these must form one chain.
+    An empty base means the root, an empty tip the link of the last joint, no joints all
+    that move; without tip and joints, these must form one chain.
 
     Raises BlfDscError, which says what was found and how to correct it.
     """
@@ -352,10 +353,12 @@ def _joint(element: ET.Element, placement: np.ndarray, body: _Body) -> Joint:
 
 
 def pseudo_inertia(inertia: np.ndarray) -> np.ndarray:
-    """Return the pseudo-inertia J (4, 4) of the ten; a placement T (4, 4) maps it to T J T^T.
+    """Return the pseudo-inertia J (4, 4) of the ten.
 
-    Physical consistency requires J >= 0 (Wensing, Kim and Slotine, Linear matrix inequalities for
-    physically consistent inertial parameter identification, 2018).
+    A placement T (4, 4) maps it to T J T^T.
+
+    Physical consistency requires J >= 0 (Wensing, Kim and Slotine, Linear matrix
+    inequalities for physically consistent inertial parameter identification, 2018).
     """
     m, hx, hy, hz, xx, xy, yy, xz, yz, zz = inertia
     half = 0.5 * (xx + yy + zz)

@@ -1,10 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """Linear algebra: of vectors of three, in kernels, and with the same bits on every processor.
 
-Vectors of three entries are tuples, which kernels keep in registers; the Cholesky factorisation is
-in place, since numpy's allocates memory.  Products, inverses and dependent columns of numpy call a
-BLAS, which sums in another order on each kind of processor: what kernels start from is computed
-with those below, of elementwise operations and sums over rows.
+Vectors of three entries are tuples, which kernels keep in registers; the Cholesky
+factorisation is in place, since numpy's allocates memory.  Products, inverses and
+dependent columns of numpy call a BLAS, which sums in another order on each kind of
+processor: what kernels start from is computed with those below, of elementwise
+operations and sums over rows.
 """
 
 from math import sqrt
@@ -68,9 +69,10 @@ def transform(A: np.ndarray, b: Vector) -> Vector:
 def cholesky_factor(U: np.ndarray) -> bool:
     """Replace the upper triangle of A (m, m) by U, U^T U = A; return whether A > 0.
 
-    The diagonal is stored inverted.  A pivot lost to rounding is replaced by the rounding level,
-    so that every regularized excitation matrix has a factor.  Rows, contiguous, are subtracted four
-    at a time: 2.3 times as fast for m = 62, with the same sums in the same order.
+    The diagonal is stored inverted.  A pivot lost to rounding is replaced by the
+    rounding level, so that every regularized excitation matrix has a factor.  Rows,
+    contiguous, are subtracted four at a time: 2.3 times as fast for m = 62, with the
+    same sums in the same order.
     """
     is_positive = True
     for j in range(U.shape[0]):
@@ -139,8 +141,8 @@ def inverse(A: np.ndarray) -> np.ndarray:
 def independent_columns(Y: np.ndarray, least: float) -> tuple[np.ndarray, np.ndarray]:
     """Return the indices of independent columns of Y, tried in order, and X of Y = Y[:, kept] X.
 
-    A column is dependent if less than `least` remains of it without its part along those before
-    (modified Gram-Schmidt).
+    A column is dependent if less than `least` remains of it without its part along
+    those before (modified Gram-Schmidt).
     """
     rest = Y.copy()
     kept = []

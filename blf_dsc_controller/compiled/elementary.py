@@ -1,14 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
 """Sine, cosine, exponential and tanh in IEEE additions, multiplications and divisions alone.
 
-Those of the C library depend on its release and on the processor, for which it chooses among
-several versions: they differ in the last digit, and so would every number after it.  These give the
-same bits everywhere, compiled or not, within 0.9 units of the last place.
+Those of the C library depend on its release and on the processor, for which it chooses
+among several versions: they differ in the last digit, and so would every number after
+it.  These give the same bits everywhere, compiled or not, within 0.9 units of the last
+place.
 
-Each reduces its argument to a small remainder by a constant in parts (Cody and Waite, Software
-Manual for the Elementary Functions, 1980): the products of a whole number with all parts but the
-last are exact.  On the remainder it evaluates a polynomial of least largest relative error, below
-2^-57, and adds its leading terms last, with what their rounding lost.
+Each reduces its argument to a small remainder by a constant in parts (Cody and Waite,
+Software Manual for the Elementary Functions, 1980): the products of a whole number with
+all parts but the last are exact.  On the remainder it evaluates a polynomial of least
+largest relative error, below 2^-57, and adds its leading terms last, with what their
+rounding lost.
 """
 
 from math import copysign, inf, isnan, ldexp, nan
@@ -42,8 +44,9 @@ _LARGEST_EXPONENT = 709.782712893384  # log of the largest float
 def sine_and_cosine(x: float) -> tuple[float, float]:
     """Return sin x and cos x.
 
-    Above 1.6e6 rad, they are those of an angle within a unit of the last place of x, and above
-    2^50 rad those of 0, which is as good: x has no digit left after the point.
+    Above 1.6e6 rad, they are those of an angle within a unit of the last place of x,
+    and above 2^50 rad those of 0, which is as good: x has no digit left after the
+    point.
     """
     if not abs(x) < _FARTHEST:
         return (0.0, 1.0) if abs(x) < inf else (nan, nan)

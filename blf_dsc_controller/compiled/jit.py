@@ -1,15 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
 """Compilation of the numerical kernels, with a cache that tracks their dependencies.
 
-Numba keys a cached function by the contents of its own file, not by those of the functions it
-calls in other files, so an edit there would leave stale machine code behind, and by the place of
-that file.  Here the cache folder of a kernel is named after a digest of every source file it is
-compiled from and of the constants it uses, and of nothing else: an edit recompiles what depends on
-it, and a reinstall or a second checkout finds the existing cache.
+Numba keys a cached function by the contents of its own file, not by those of the
+functions it calls in other files, so an edit there would leave stale machine code
+behind, and by the place of that file.  Here the cache folder of a kernel is named after
+a digest of every source file it is compiled from and of the constants it uses, and of
+nothing else: an edit recompiles what depends on it, and a reinstall or a second
+checkout finds the existing cache.
 
-The package's own folder `SHIPPED` is looked at first, and never written to when kernels run.  If
-the user's cache folder is not writable, the cache is in the folder for temporary files.  Machine
-code is loaded only from a folder of this user that nobody else can write.
+The package's own folder `SHIPPED` is looked at first, and never written to when kernels
+run.  If the user's cache folder is not writable, the cache is in the folder for
+temporary files.  Machine code is loaded only from a folder of this user that nobody
+else can write.
 
 Compilation is announced, since the wait would look like a hang.
 """
@@ -78,7 +80,8 @@ SHIPPED = Path(__file__).with_name('kernels')
 _X86_64_V3 = ('avx2', 'bmi', 'bmi2', 'f16c', 'fma', 'lzcnt', 'movbe')
 _chosen = config.CPU_NAME is not None or config.CPU_FEATURES is not None
 if not _chosen and all(map(get_host_cpu_features().get, _X86_64_V3)):
-    # The same code for all these processors, about as fast, so that kernels can be shipped.
+    # The same code for all these processors, about as fast, so that kernels can be
+    # shipped.
     config.CPU_NAME = 'x86-64-v3'
     config.CPU_FEATURES = ''
 
@@ -94,8 +97,8 @@ _COMPILED: dict[str, set[str]] = {}
 def dependencies(function: Callable[..., object]) -> tuple[set[Path], set[str]]:
     """Return the source files of a kernel, and the constants in them as `name=value`.
 
-    They are those of its module, of the modules with functions for kernels that this one imports,
-    and so on.
+    They are those of its module, of the modules with functions for kernels that this
+    one imports, and so on.
     """
     pending = [function.__module__]
     modules = set()
@@ -170,7 +173,8 @@ def called(function: F) -> F:
 def compile_methods(interface: type, names: Sequence[str], *types: type) -> None:
     """Let kernels call these methods of named tuples; only those of the actual type are compiled.
 
-    `interface` declares them, `types` implement them; a kernel depends on the files of all types.
+    `interface` declares them, `types` implement them; a kernel depends on the files of
+    all types.
     """
     depend_on(interface, *types)
     for name in names:
@@ -280,8 +284,8 @@ def announced_compilation(
 ) -> AbstractContextManager[object]:
     """Call `say` with a notice for each kernel not in the cache that is compiled in this context.
 
-    Only numba knows this: a kernel has a version for each type of arguments. Of those that are
-    loaded, some may not be called.
+    Only numba knows this: a kernel has a version for each type of arguments. Of those
+    that are loaded, some may not be called.
     """
     listener: AbstractContextManager[object] = event.install_listener(
         'numba:compile', _Listener(say)

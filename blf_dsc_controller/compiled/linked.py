@@ -1,16 +1,18 @@
 # SPDX-License-Identifier: Apache-2.0
 """Everything that rests on parts of numba that are not public: it is optional.
 
-It is tested with the releases `FIRST` to before `AFTER` of numba; with others, importing
-this module raises ImportError, and kernels are compiled in numba's ordinary way (`jit`,
-`views`).
+It is tested with the releases `FIRST` to before `AFTER` of numba; with others,
+importing this module raises ImportError, and kernels are compiled in numba's ordinary
+way (`jit`, `views`).
 
-Numba optimises every function that a kernel calls and generates machine code for it before linking
-it into its caller, which it optimises again: a function five calls deep is compiled six times.
-Here such a function is only translated, and the kernel optimised as a whole, in 0.6 of the time.
+Numba optimises every function that a kernel calls and generates machine code for it
+before linking it into its caller, which it optimises again: a function five calls deep
+is compiled six times. Here such a function is only translated, and the kernel optimised
+as a whole, in 0.6 of the time.
 
-Numba also counts the references to every array in every tuple argument, which makes up more than
-half of the code, for LLVM to remove again. Here nothing is counted, which halves the time.
+Numba also counts the references to every array in every tuple argument, which makes up
+more than half of the code, for LLVM to remove again. Here nothing is counted, which
+halves the time.
 """
 
 from __future__ import annotations
@@ -73,7 +75,8 @@ class _Linked(JITCodeLibrary):  # type: ignore[misc]
 def _without_reference_counts(state: Any) -> None:
     """Compile without counting the references to arrays.
 
-    The caller of a kernel keeps its arrays alive; a kernel allocates none: nothing would free it.
+    The caller of a kernel keeps its arrays alive; a kernel allocates none: nothing
+    would free it.
     """
     state.targetctx = state.targetctx.subtarget(enable_nrt=False)
     state.targetctx.cached_internal_func = _INTERNAL
@@ -100,7 +103,8 @@ class _LowerKernel(NativeLowering):  # type: ignore[misc]
         if any(
             isinstance(argument, NumPyRandomGeneratorType) for argument in state.args
         ):
-            # It is allocated for the call, and freed by the wrapper that counts references.
+            # It is allocated for the call, and freed by the wrapper that counts
+            # references.
             state.targetctx.create_cpython_wrapper = counting.create_cpython_wrapper
         changed = bool(super().run_pass(state))
         library = state.library
@@ -189,7 +193,8 @@ class ShippedKernels(FunctionCache):  # type: ignore[misc]
 class KernelCache(FunctionCache):  # type: ignore[misc]
     """Machine code of a kernel in a folder, or in that of the shipped kernels.
 
-    Of several processes that need a kernel at once, one compiles it; the others wait, and load it.
+    Of several processes that need a kernel at once, one compiles it; the others wait,
+    and load it.
     """
 
     def __init__(self, function: Any, path: Path, shipped: Path) -> None:

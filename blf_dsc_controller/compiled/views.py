@@ -2,9 +2,10 @@
 """Views of parts of vectors, which cost nothing in compiled code.
 
 Numba counts the references to every slice of an array with an atomic operation, and
-checks every slice and reshape, which in a step of a few hundred floating point operations
-costs more than the arithmetic.  The vectors of a kernel belong to its caller, which keeps
-them alive during the call, and their layout is fixed: nothing needs counting or checking.
+checks every slice and reshape, which in a step of a few hundred floating point
+operations costs more than the arithmetic.  The vectors of a kernel belong to its
+caller, which keeps them alive during the call, and their layout is fixed: nothing needs
+counting or checking.
 """
 
 from __future__ import annotations

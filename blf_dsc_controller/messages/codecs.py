@@ -1,12 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """Definitions of messages, and those of the control loop to bytes and back, in a microsecond.
 
-Plain CDR, version 1, little-endian, as ROS 2 sends it on all processors that it supports: two bytes
-that say so, two unused, then the fields, each number aligned to its own size, from the fifth byte
-on. Padding bytes, and bytes after the last field, may hold anything. An encoder serialises a
-template once and then only overwrites its numbers. A decoder finds the values once and keeps their
-places for as long as the messages have the same names and lengths, which a kernel compares as it
-reads them. Messages of all other types are left to the library rosbags.
+Plain CDR, version 1, little-endian, as ROS 2 sends it on all processors that it
+supports: two bytes that say so, two unused, then the fields, each number aligned to its
+own size, from the fifth byte on. Padding bytes, and bytes after the last field, may
+hold anything. An encoder serialises a template once and then only overwrites its
+numbers. A decoder finds the values once and keeps their places for as long as the
+messages have the same names and lengths, which a kernel compares as it reads them.
+Messages of all other types are left to the library rosbags.
 """
 
 from __future__ import annotations
@@ -110,7 +111,8 @@ class Layout:
     Attributes:
         names: in the message; numbers as text if it has none.
         arrays: where its arrays are, by field.
-        places: index of each value in a grid of doubles that starts at ORIGIN, by field and name.
+        places: index of each value in a grid of doubles that starts at ORIGIN, by field
+            and name.
         size: of the message [bytes].
         fixed: bytes that are no numbers.
     """
@@ -147,8 +149,10 @@ class Layout:
         """Return the places of position, velocity and effort of n `joints` (3, n); -1: empty.
 
         Raises:
-            MissingJointError, DuplicatedJointError: a joint is not named, or more than once.
-            ShortArrayError: an array differs in length from the names, or is empty but `required`.
+            MissingJointError, DuplicatedJointError: a joint is not named, or more than
+                once.
+            ShortArrayError: an array differs in length from the names, or is empty but
+                `required`.
         """
         for joint in joints:
             count = self.names.count(joint)
@@ -271,8 +275,8 @@ class TrajectoryContent(NamedTuple):
 def joint_trajectory(raw: bytes) -> TrajectoryContent:
     """Read a trajectory_msgs/JointTrajectory; MessageError as above.
 
-    Decoding by rclpy would block all other threads, for 10 ms with a thousand points, and rosbags
-    rejects the bytes that rclpy may add at the end.
+    Decoding by rclpy would block all other threads, for 10 ms with a thousand points,
+    and rosbags rejects the bytes that rclpy may add at the end.
     """
     cursor = _Cursor(raw)
     stamp = cursor.time()
@@ -287,7 +291,8 @@ def joint_trajectory(raw: bytes) -> TrajectoryContent:
 class JointStateEncoder:
     """Encoder of sensor_msgs/JointState with fixed names.
 
-    Those of position, velocity, effort in `fields` hold a value for each name; others are empty.
+    Those of position, velocity, effort in `fields` hold a value for each name; others
+    are empty.
     """
 
     def __init__(
@@ -377,8 +382,8 @@ def _read(
 ) -> int:
     """Read the doubles that start at these bytes, unless -1, if a message is as `expected`.
 
-    The rows of that are bytes, and 255 where they must agree.
-    Returns the time [ns] at STAMP_OFFSET, of messages that have one there; _OTHER if it differs.
+    The rows of that are bytes, and 255 where they must agree. Returns the time [ns] at
+    STAMP_OFFSET, of messages that have one there; _OTHER if it differs.
     """
     size = len(message)
     if size != expected.shape[1] or size < STAMP_OFFSET + 8:
@@ -428,8 +433,8 @@ class _Decoder:
 class JointStateDecoder(_Decoder):
     """Decoder of sensor_msgs/JointState into arrays in the order of the n `joints`, by name.
 
-    Other joints in the message are ignored. A field that is not `required` and is empty in the
-    message reads as NaN. Values are not checked: NaN passes through.
+    Other joints in the message are ignored. A field that is not `required` and is empty
+    in the message reads as NaN. Values are not checked: NaN passes through.
 
     Attributes:
         position, velocity, effort: (n,) of the last message.
