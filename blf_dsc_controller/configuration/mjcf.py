@@ -27,10 +27,11 @@ from blf_dsc_controller.configuration.description import (
     UNSUPPORTED,
 )
 from blf_dsc_controller.errors import BlfDscError
+from blf_dsc_controller.extras import install_command
 
 Floats: TypeAlias = np.ndarray
 
-_INSTALL = "pip install 'blf_dsc_controller[mujoco]' (or pip install mujoco)"
+_INSTALL = f'{install_command("mujoco")} (or pip install mujoco)'
 # the first element, after declaration and comments
 _ROOT = re.compile(r'\s*(?:<\?.*?\?>\s*|<!--.*?-->\s*)*<([\w:.-]+)', re.DOTALL)
 
