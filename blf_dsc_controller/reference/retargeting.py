@@ -29,6 +29,7 @@ from blf_dsc_controller.reference.terms import (
     pack,
     quintics,
     sampled,
+    turning_times,
     unpack,
 )
 
@@ -387,8 +388,10 @@ def keeps_limits(
     largest = [limits.velocity, limits.acceleration]
     if with_jerk:
         largest.append(limits.largest_jerk)
-    x = np.linspace(0.0, motion.duration, _CHECKS)
     c = motion.coefficients[0].T
+    turning = turning_times(at_rest_after(0.0, motion), c.shape[1])
+    inside = turning[(turning > 0.0) & (turning < motion.duration)]
+    x = np.concatenate((np.linspace(0.0, motion.duration, _CHECKS), inside))
     for limit in largest:
         c = c[1:] * np.arange(1.0, len(c))[:, np.newaxis]  # the derivative
         values = np.polynomial.polynomial.polyval(x, c)

@@ -18,8 +18,9 @@ import numpy as np
 
 from blf_dsc_controller.reference.retargeting import Target
 
-_POSITION_GAIN = 0.02  # of the filter, in the long run
-_INTERVAL_GAIN = 0.001
+# Of the filter in the long run: as little damped as keeps it from swinging.
+_POSITION_GAIN = 0.02
+_INTERVAL_GAIN = _POSITION_GAIN**2 / (2.0 - _POSITION_GAIN)
 _MISSING = 0.7  # of an interval; a message that is later counts as one more
 _SPAN = 0.02  # s over which a velocity is averaged
 _COAST = 0.03  # s on the line after its time, at least ...
@@ -110,9 +111,13 @@ class TargetStream:
         passed = max(1, int((arrived - self._sent) / self.interval + 1.0 - _MISSING))
         self._count += passed - 1
         late = arrived - self._sent - passed * self.interval
-        early_gain = 1.0 / (self._count + 1)
-        self._sent += passed * self.interval + max(_POSITION_GAIN, early_gain) * late
-        self.interval += max(_INTERVAL_GAIN, early_gain) * late / passed
+        # at first those of the line of least squares through all arrivals
+        k = self._count
+        area = (k + 1.0) * (k + 2.0)
+        position_gain = max(_POSITION_GAIN, (4.0 * k + 2.0) / area)
+        interval_gain = max(_INTERVAL_GAIN, 6.0 / area)
+        self._sent += passed * self.interval + position_gain * late
+        self.interval += interval_gain * late / passed
 
     def _velocity(self, fastest: np.ndarray) -> np.ndarray:
         """Return the velocity (n,) [rad/s] at the last target; zero after a step.
