@@ -9,6 +9,8 @@ is commanded afterwards.
 
 from __future__ import annotations
 
+import re
+
 import numpy as np
 import pytest
 from fault_table import Rig
@@ -171,9 +173,16 @@ def test_brakes_in_motion_are_told_after_the_error_has_passed_the_bound(preset):
     """Within 6 to 64 ms: too soon for what tells them from an error at rest."""
     loop = load_loop(preset)
     plant = change(loop.plant, {'duration': 0.0})
-    guard, *_ = stopped_by(loop.controller, plant, spoil=brakes())
+    guard, _, _, torques, stop = stopped_by(loop.controller, plant, spoil=brakes())
     assert guard.supervisor.reason is Reason.OUTSIDE_BOUND
     assert guard.supervisor.text.count('but the arm has not accelerated') == 1
+    joint, told = re.search(
+        r"torque of joint '(\w+)' has changed by ([-+\d.]+) N m", guard.supervisor.text
+    ).groups()
+    i = loop.controller.joints.index(joint)
+    later = stop + round(1.0 / loop.controller.sample_time)
+    changed = torques[later, i] - torques[stop - 1, i]
+    assert float(told) == pytest.approx(changed, rel=0.2)
 
 
 @pytest.mark.parametrize('preset', ['fr3', 'panda'])

@@ -74,6 +74,12 @@ def test_bound_that_these_gains_cannot_hold_at_first_names_one_that_they_can(
     assert stops(given) == []
     wider = change(loop.controller, {'barrier.bound': [given] * 2})
     assert config_warnings(wider) == []
+    # The joint that is named is the one whose error is largest by its bound.
+    for joint in (0, 1):
+        bounds = [1.0 / 20.0] * 2
+        bounds[joint] = bound / 10.0
+        (warning,) = config_warnings(change(config, {'barrier.bound': bounds}))
+        assert f'may leave joint{joint + 1} ' in warning
 
 
 @pytest.mark.parametrize(

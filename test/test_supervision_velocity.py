@@ -82,3 +82,19 @@ def test_noise_lag_and_steps_of_sensors_contradict_nothing(preset):
         change(loop.plant, coarse | {'duration': 2000 * T}),
     )
     assert all(stop.reason != 'velocity not plausible' for stop in record.run().stops)
+
+
+def test_change_to_velocities_of_the_positions_is_no_acceleration():
+    """Which would pass for a load of 0.03 of the torque limit."""
+    guard = Rig({'safety.torque': 'hold_gravity', 'safety.error_ratio': 0.0}).guard
+    moving = np.array([0.3, -0.2])
+    for k in range(200):
+        q = 1.0 + 1e-3 * k * moving
+        measurement = np.concatenate((q, -moving, np.zeros(2)))
+        guard.update(1_000_000_000 + k * MILLISECOND, measurement)
+        if guard.supervisor.reason is Reason.VELOCITY:
+            break
+    assert guard.supervisor.reason is Reason.VELOCITY
+    last = guard._safe_torque.last
+    np.testing.assert_allclose(last.dq, moving, rtol=1e-6)
+    np.testing.assert_allclose(last.ddq, 0.0, atol=1e-6)

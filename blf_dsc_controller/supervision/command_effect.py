@@ -47,10 +47,10 @@ class CommandEffect:
     def is_missing(self, change: Vector, limit: Vector, dt: float) -> bool:
         """Whether commands that changed by these torques (n,) [N m] have had none for some time.
 
-        `dt` [s] is the time since the last call; it answers once.
+        `dt` [s] is the time since the last call; it answers once.  Call it until one is proven.
         """
         has_changed = bool((np.abs(change) > _CHANGED * limit).any())
-        if self.is_proven or not has_changed or self._unanswered > _PATIENCE:
+        if not has_changed or self._unanswered > _PATIENCE:
             return False
         self._unanswered += dt
         return self._unanswered > _PATIENCE
