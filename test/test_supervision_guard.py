@@ -437,6 +437,21 @@ def test_plan_is_followed_from_its_start_unless_late_or_from_a_replaced_referenc
     assert rig.supervisor.phase is Phase.TRACKING
 
 
+def test_trajectory_in_the_sample_of_a_stop_continues_from_there():
+    rig = Rig()
+    rig.step(100)
+    away = Trajectory(JOINTS, (TrajectoryPoint(1.0, (2.1, 1.5)),))
+    rig.guard.adopt(rig.guard.plan(away))
+    rig.step(200)
+    rig.guard.brake()
+    before = rig.guard.controller.reference_at(rig.guard.time)
+    rig.guard.adopt(rig.guard.plan(away))
+    after = rig.guard.controller.reference_at(rig.guard.time)
+    np.testing.assert_allclose(after[:2], before[:2], atol=1e-12)
+    rig.step(1500)
+    assert rig.supervisor.phase is Phase.TRACKING
+
+
 def test_retuning_leaves_the_estimate_of_a_joint_without_integrator():
     """A gain of 0 says that its disturbance is not estimated: the torque of that joint steps."""
     config = change(ControllerConfig(), {'disturbance.gain': [0.0, 100.0]})

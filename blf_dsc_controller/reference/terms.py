@@ -105,7 +105,12 @@ def turning_times(term: Term, n: int) -> Array:
 
 
 def pack(n: int, terms: Sequence[Term]) -> Array:
-    """Return the vector of a reference for n joints; `unpack` is the inverse."""
+    """Return the vector of a reference for n joints; `unpack` is the inverse.
+
+    Raises ValueError without terms: there would be nothing to evaluate.
+    """
+    if not terms:
+        raise ValueError('a reference needs at least one term')
     packed = [
         np.concatenate(
             (

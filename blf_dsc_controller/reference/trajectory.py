@@ -112,7 +112,9 @@ def plan_trajectory(
     begin = now if trajectory.begin is None else trajectory.begin
     t0 = max(now, begin)
     times, points = _remaining_points(trajectory, config.joints, begin, t0)
-    before = [term for term in unpack(vector) if term.begin < t0]
+    terms = unpack(vector)
+    # the first is in force even if it begins just now, as a stop of this sample does
+    before = [term for term in terms if term.begin < t0] or terms[:1]
     try:
         return _in_time(before, now, t0, times, points, config)
     except MotionError as error:
