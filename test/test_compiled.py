@@ -45,10 +45,9 @@ from blf_dsc_controller.compiled.layout import (
 from blf_dsc_controller.configuration.nodes import load_loop
 from blf_dsc_controller.configuration.schema import flatten
 from blf_dsc_controller.law.controller import update
-from blf_dsc_controller.law.weighing import weigh
+from blf_dsc_controller.law.laws import for_law
 from blf_dsc_controller.reference.terms import cubics, minimum_jerk
 from blf_dsc_controller.simulation.loop import run_loop, simulate
-from blf_dsc_controller.studies import laws
 from blf_dsc_controller.supervision.model_torque import friction_torque, model_torque
 from sim_plant.kernels import step_plant
 from sim_plant.plant import plant_settings
@@ -99,8 +98,11 @@ def test_kernel_depends_on_the_files_and_constants_it_is_compiled_from():
 class OwnLaw(NamedTuple):
     gain: float
 
-    def fill_torque(self, _arm, now, torque):
-        torque[:] = -self.gain * (now.q - now.qr)
+    def compute_demand(self, _settings, _state, signals, _t, _dt):
+        signals.demand[:] = -self.gain * signals.xi1
+
+    def finish(self, *_):
+        pass
 
 
 def test_kernel_depends_on_the_file_of_a_type_whose_methods_it_calls(monkeypatch):
@@ -108,18 +110,27 @@ def test_kernel_depends_on_the_file_of_a_type_whose_methods_it_calls(monkeypatch
         jit, '_COMPILED', {name: {*uses} for name, uses in jit._COMPILED.items()}
     )
     monkeypatch.setattr(jit, 'KERNELS', [])
-    assert Path(__file__) in jit.dependencies(laws._loop_with(OwnLaw))[0]
+    assert Path(__file__) not in jit.dependencies(update)[0]
+    assert Path(__file__) in jit.dependencies(for_law(update, OwnLaw(1.0)))[0]
+
+
+FOLDERS = """
+from blf_dsc_controller.compiled import jit
+from blf_dsc_controller.law.controller import update, weigh
+from blf_dsc_controller.simulation.loop import run_loop
+from sim_plant.plant import step_plant
+
+assert {update, weigh, run_loop, step_plant} <= {*jit.KERNELS}
+for kernel in jit.KERNELS:
+    assert str(jit.cache_folder(kernel)) in kernel._cache.cache_path, kernel
+"""
 
 
 @compiling
 def test_cache_folders_of_kernels_follow_from_their_dependencies():
     """A kernel must be defined after what it calls, or edits would run stale machine code."""
-    own = [
-        kernel for kernel in jit.KERNELS if kernel.__module__.startswith(('blf', 'sim'))
-    ]
-    assert {update, weigh, run_loop, step_plant} <= {*own}
-    for kernel in own:
-        assert str(jit.cache_folder(kernel)) in kernel._cache.cache_path, kernel
+    checked = finished(sys.executable, '-c', FOLDERS)
+    assert checked.returncode == 0, checked.stderr
 
 
 COMPILE = """

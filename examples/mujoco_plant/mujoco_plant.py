@@ -16,7 +16,7 @@ import numpy as np
 from blf_dsc_controller.configuration.plant import PlantConfig
 from blf_dsc_controller.nodes import process
 from blf_dsc_controller.nodes.plant_node import PlantNode
-from sim_plant.kernels import actuate, compensate, let_pass
+from sim_plant.kernels import actuate, apply_rate_limit, compensate
 from sim_plant.layout import PlantSettings
 from sim_plant.motion import update_loads
 from sim_plant.plant import Plant, plant_settings
@@ -105,7 +105,7 @@ class MujocoArm(Plant):
         friction = settings.disturbance
         acting = now.acting
         drives = now.drives
-        if let_pass(settings, now, torque):
+        if apply_rate_limit(settings, now, torque):
             data.qvel[:] = self._dq[:] = drives.applied[:] = drives.motor[:] = 0.0
             now.sample[0] += 1.0
             return
