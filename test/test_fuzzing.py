@@ -18,16 +18,23 @@ import json
 import os
 import resource
 import signal
+import struct
 import subprocess
 import sys
 import tempfile
 import warnings
+from dataclasses import fields
 from pathlib import Path
 from xml.etree import ElementTree as ET
+from zlib import crc32
 
 import pytest
 from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
+from mcap import records
+from mcap.data_stream import ReadDataStream, RecordBuilder
+from mcap.opcode import Opcode
+from mcap.records import Chunk, Message
 
 pytest.importorskip('rclpy', reason='needs ROS 2')
 pytest.importorskip('plotly', reason='needs plotly: pip install .[report]')
@@ -36,6 +43,7 @@ import recorded_run
 from recorded_run import raw_records
 
 from blf_dsc_controller.bags.sources import open_bag
+from blf_dsc_controller.bags.unpacking import unpacked
 from blf_dsc_controller.cli.main import main
 from blf_dsc_controller.configuration.files import share_folder
 from blf_dsc_controller.errors import BlfDscError
@@ -43,7 +51,8 @@ from blf_dsc_controller.messages.codecs import typestore
 from blf_dsc_controller.messages.topics import JOURNAL
 
 MOST_SECONDS = 60.0  # of CPU time
-MOST_MEMORY = 3 << 30  # bytes on top of what the process had before
+MOST_MEMORY = 600_000_000  # bytes on top of what the process had before
+MOST_ADDRESSES = 3 << 30  # bytes, likewise: where an allocation fails
 ASIDE = 'elsewhere'
 
 pytestmark = pytest.mark.nightly
@@ -79,17 +88,23 @@ def _hang(*_):
     raise HangError
 
 
+def status_of(name):
+    """Return a size of this process [bytes]."""
+    text = Path('/proc/self/status').read_text()
+    return int(text.partition(f'{name}:')[2].split()[0]) * 1024
+
+
 @contextlib.contextmanager
 def bounded():
     """Run the tested code within limits."""
     before = set(sys.modules)
     _opened.clear()
-    used = int(Path('/proc/self/statm').read_text().split()[0]) * os.sysconf(
-        'SC_PAGE_SIZE'
-    )
     limits = resource.getrlimit(resource.RLIMIT_AS)
     handler = signal.signal(signal.SIGPROF, _hang)
-    resource.setrlimit(resource.RLIMIT_AS, (used + MOST_MEMORY, limits[1]))
+    Path('/proc/self/clear_refs').write_text('5')  # the peak begins anew
+    memory = status_of('VmRSS')
+    most = status_of('VmSize') + MOST_ADDRESSES
+    resource.setrlimit(resource.RLIMIT_AS, (most, limits[1]))
     signal.setitimer(signal.ITIMER_PROF, MOST_SECONDS)
     try:
         with warnings.catch_warnings():
@@ -100,6 +115,7 @@ def bounded():
         resource.setrlimit(resource.RLIMIT_AS, limits)
         signal.signal(signal.SIGPROF, handler)
     assert not _opened, _opened
+    assert status_of('VmHWM') < memory + MOST_MEMORY
     odd = {
         module
         for module in set(sys.modules) - before
@@ -167,7 +183,7 @@ def secret():
     return folder
 
 
-READ = ('export', 'replay', 'recover', 'part')
+READ = ('export', 'replay', 'recover', 'part', 'identify')
 DRAW = ('report', 'plot')
 WAYS = st.sampled_from((*READ * 5, *DRAW))
 
@@ -182,6 +198,9 @@ def read(bag, way):
         command('replay', bag)
     elif way == 'report':
         command('report', bag, '--out', out / 'page.html')
+    elif way == 'identify':
+        urdf = share_folder() / 'config' / 'two_link.urdf'
+        command('identify', bag, '--urdf', urdf, '--out', bag.parent / 'out.urdf')
     elif way == 'export':
         command('export', bag, '--out', bag.parent / 'out.csv')
     else:
@@ -291,6 +310,65 @@ def test_records_are_survived(data, way):
         content = content[: data.draw(st.integers(0, len(content)))]
     with folder() as bag:
         (bag / 'base_0.mcap').write_bytes(content)
+        (bag / 'metadata.yaml').write_bytes((base() / 'metadata.yaml').read_bytes())
+        with bounded():
+            read(data.draw(st.sampled_from((bag, bag / 'base_0.mcap'))), way)
+
+
+def rewritten(data, raw):
+    """Return a record whose fields have other values, within their widths; a chunk's content."""
+    opcode = Opcode(raw[0])
+    if opcode == Opcode.CHUNK and data.draw(st.integers(0, 4)):
+        return repacked(data, Chunk.read(ReadDataStream(io.BytesIO(raw[9:]))))
+    kind = getattr(records, opcode.name.title().replace('_', ''))
+    length = [len(raw) - 9] if kind is Message else []
+    record = kind.read(ReadDataStream(io.BytesIO(raw[9:])), *length)
+    name = data.draw(st.sampled_from([each.name for each in fields(kind)] or ['']))
+    if not name:
+        return raw
+    value = getattr(record, name)
+    others = {
+        int: lambda: NUMBERS | st.integers(0, 2**16 - 1),
+        str: lambda: WORDS.map(lambda text: text.encode('utf-8', 'ignore').decode()),
+        bytes: lambda: st.binary(max_size=20) | st.just(value[:9]),
+    }
+    strategy = others.get(type(value), lambda: st.just(type(value)()))
+    setattr(record, name, data.draw(strategy()))
+    builder = RecordBuilder()
+    try:
+        record.write(builder)
+    except struct.error:  # the number is too large for its field
+        return raw
+    return builder.end()
+
+
+def repacked(data, chunk):
+    """Return a chunk whose records are others, though its size and its checksum match."""
+    content = unpacked(chunk.data, chunk.compression)
+    inside = [raw for _, raw in raw_records(bytes(8) + content + bytes(8))]
+    content = b''.join(disordered(data, inside, lambda raw: rewritten(data, raw)))
+    builder = RecordBuilder()
+    Chunk(
+        '',
+        content,
+        chunk.message_end_time,
+        chunk.message_start_time,
+        crc32(content),
+        len(content),
+    ).write(builder)
+    return builder.end()
+
+
+@fuzzed
+@given(data=st.data(), way=WAYS)
+def test_structure_of_records_is_survived(data, way):
+    """MCAP files whose records have other fields, lengths and checksums that match, or others."""
+    (file,) = base().glob('*.mcap')
+    found = [raw for _, raw in raw_records(file.read_bytes())]
+    magic = b'\x89MCAP0\r\n'
+    changed = disordered(data, found, lambda raw: rewritten(data, raw))
+    with folder() as bag:
+        (bag / 'base_0.mcap').write_bytes(magic + b''.join(changed) + magic)
         (bag / 'metadata.yaml').write_bytes((base() / 'metadata.yaml').read_bytes())
         with bounded():
             read(data.draw(st.sampled_from((bag, bag / 'base_0.mcap'))), way)
