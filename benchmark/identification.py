@@ -165,7 +165,7 @@ def _errors(found: Identified, unseen: Recording) -> tuple[float, float]:
     errors = []
     for values in (found.prior, found.values):
         rows.set_load((G @ values)[: found.parameters.model.p])
-        left = rows.X @ (G @ values)[:-1] - u
+        left = rows.matrix() @ (G @ values)[:-1] - u
         errors.append(100.0 * float(np.linalg.norm(left) / np.linalg.norm(u)))
     return errors[0], errors[1]
 

@@ -115,11 +115,13 @@ def _peers(
     """Return the scores of least squares and of semidefinite least squares."""
     n = len(recording.joints)
     signs = [-1.0 if name in found.reversed else 1.0 for name in recording.joints]
-    recording = recording._replace(torque=recording.torque * np.array(signs))
+    recording = recording._replace(
+        torque=np.asarray(recording.torque) * np.array(signs)
+    )
     rows = rows_of(recording, found.parameters.model)
     windows = split(rows)
     rows.set_sliding(found.distances)
-    largest = np.abs(rows.torque).max(axis=0)
+    largest = rows.largest_torque
     speed = np.maximum(rows.speed, STILL)
     full = prior_of(taken.robot, found.chain, largest, speed, load=False)
     G = base_matrix(found.parameters, n)

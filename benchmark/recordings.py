@@ -16,7 +16,7 @@ import numpy as np
 import random_arm
 
 from blf_dsc_controller.configuration.robot import Robot, parameters_of
-from blf_dsc_controller.identification.windows import Rows
+from blf_dsc_controller.identification.windows import COLUMNS, Rows
 from blf_dsc_controller.run import Floats
 
 PANDA = tuple(f'panda_joint{i}' for i in range(1, 8))
@@ -86,13 +86,12 @@ def _of_panda(rows: Rows, robot: Robot) -> Floats:
     chain = robot.chain(PANDA)
     parameters = parameters_of(robot, chain)
     p = parameters.model.p
-    joints = np.arange(7)
-    v = rows.X[:, joints, p + joints]
+    v = rows.friction[:, COLUMNS.index('viscous')]
     a, b, c = _PANDA_FRICTION
     friction = a / (1.0 + np.exp(-b * (v + c))) - a / (1.0 + np.exp(-b * c))
     rotors = np.zeros(7)
     return np.asarray(
-        rows.X[:, :, :p] @ parameters.of(chain.inertias, rotors) + friction
+        rows.matrix()[:, :, :p] @ parameters.of(chain.inertias, rotors) + friction
     )
 
 
@@ -112,7 +111,7 @@ def _ur10e(folder: Path, bags: Path) -> Iterator[Taken]:
         n = len(UR)
         columns = [*range(p + 2 * n), *range(p + 3 * n, p + 4 * n)]
         return np.asarray(
-            rows.X[:, :, columns] @ np.append(P, friction) * _UR10E_GAINS / gains
+            rows.matrix()[:, :, columns] @ np.append(P, friction) * _UR10E_GAINS / gains
         )
 
     def bag(name: str) -> Path:

@@ -7,6 +7,7 @@ import base64
 import importlib
 import re
 import sys
+import tracemalloc
 from pathlib import Path
 
 import mujoco
@@ -40,14 +41,17 @@ from blf_dsc_controller.arms.model import regressors_at
 from blf_dsc_controller.arms.urdf import inertia_of, pseudo_inertia, read_chain
 from blf_dsc_controller.bags.content import NameMap
 from blf_dsc_controller.cli.main import main
+from blf_dsc_controller.configuration.files import share_folder
 from blf_dsc_controller.configuration.nodes import PLANT, load_loop
 from blf_dsc_controller.configuration.robot import Robot
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.identification.corrected_urdf import corrected_urdf
 from blf_dsc_controller.identification.identify import identify_arm, identify_bag
 from blf_dsc_controller.identification.physical import Cone, solve
+from blf_dsc_controller.identification.prior import Prior
 from blf_dsc_controller.identification.reading import read_recording
 from blf_dsc_controller.identification.recording import Recording, joined
+from blf_dsc_controller.identification.regression import regression
 from blf_dsc_controller.identification.sliding import sliding_direction
 from blf_dsc_controller.identification.summary import problems_of
 from blf_dsc_controller.identification.values import base_matrix
@@ -580,12 +584,34 @@ def test_rows_hold_for_an_exact_motion(period, tolerance):
     gap = np.zeros(len(t), dtype=bool)
     gap[len(t) // 2] = True
     rows = rows_of(Recording(PANDA, period, np.sin(speed * t), torque, gap, ''), model)
-    residual = rows.X[:, :, : model.p] @ P - rows.u(delay)
+    residual = rows.matrix()[:, :, : model.p] @ P - rows.u(delay)
     inner = slice(1, -1)  # at both ends the torque has no delayed values
     scale = np.abs(torque).max(axis=0)
     assert (np.abs(residual[inner]) < tolerance * scale).all()
     # No window contains the gap.
     assert np.abs(rows.time - t[len(t) // 2]).min() >= 0.1
+
+
+def test_memory_of_identification_does_not_grow_with_the_recording():
+    """In memory, the samples and the regression of the longer one would be 35 MB more."""
+    urdf = (share_folder() / 'config' / 'two_link.urdf').read_text()
+    chain = Robot(urdf=urdf).chain(('joint1', 'joint2'))
+    model = base_parameters(chain, GRAVITY).model
+    peaks = []
+    for duration in (50.0, 50.0, 250.0):  # the first compiles
+        t = np.arange(0.0, duration, 0.001)[:, None]
+        q = np.sin(np.array([1.0, 2.0]) * t)
+        gap = np.zeros(len(t), dtype=bool)
+        recording = Recording(('joint1', 'joint2'), 0.001, q, q, gap, '')
+        tracemalloc.start()
+        rows = rows_of(recording, model)
+        windows = np.arange(rows.time.size)
+        size = rows.unknowns + 1
+        prior = Prior(np.zeros(size), np.eye(size), [], np.zeros(size))
+        regression(rows, windows, np.eye(size), prior)
+        peaks.append(tracemalloc.get_traced_memory()[1])
+        tracemalloc.stop()
+    assert peaks[2] < peaks[1] + 7_000_000
 
 
 def test_nearest_physical_body_is_found():

@@ -3,8 +3,11 @@
 
 from __future__ import annotations
 
+import tracemalloc
+
 import numpy as np
 import pytest
+import recorded_run
 from paper_case import configured, several
 
 from blf_dsc_controller.analysis.metrics import measure
@@ -12,8 +15,9 @@ from blf_dsc_controller.bags.reader import read_run
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.plant import PlantConfig
 from blf_dsc_controller.configuration.schema import build
+from blf_dsc_controller.errors import StartError
 from blf_dsc_controller.replay.verify import verify
-from blf_dsc_controller.simulation.loop import simulate, write_bag
+from blf_dsc_controller.simulation.loop import simulate, simulate_into_bag, write_bag
 
 HELD = {'safety.torque': 'hold_gravity', 'safety.stop_ramp': 0.05}
 NOISY = {'sensor.position_noise': 1e-6, 'sensor.velocity': 'differenced', 'seed': 3}
@@ -49,6 +53,38 @@ def test_bag_of_a_stopped_run_replays_with_its_stop(tmp_path, reason):
         )
     for field in ('max_error', 'rms_error', 'bound', 'peak_torque', 'held', 'stops'):
         assert getattr(measure(simulated), field) == getattr(measure(recorded), field)
+
+
+@pytest.mark.parametrize('given', [{}, *CASES.values()], ids=['no stop', *CASES])
+def test_bag_written_while_simulating_has_the_same_messages(tmp_path, given):
+    config = build(ControllerConfig, given)
+    plant = build(PlantConfig, {'duration': 2.5} | NOISY)
+    write_bag(tmp_path / 'after', simulate(config, plant), plant)
+    simulate_into_bag(tmp_path / 'while', config, plant)
+    assert recorded_run.read(tmp_path / 'while') == recorded_run.read(
+        tmp_path / 'after'
+    )
+
+
+def test_memory_of_a_run_into_a_bag_does_not_grow_with_its_length(tmp_path):
+    """All samples of the longer run would be 7 MB."""
+    config = build(ControllerConfig, {})
+    peaks = []
+    for duration in (2.0, 2.0, 8.0):  # the first imports
+        plant = build(PlantConfig, {'duration': duration} | NOISY)
+        tracemalloc.start()
+        simulate_into_bag(tmp_path / f'{len(peaks)}', config, plant)
+        peaks.append(tracemalloc.get_traced_memory()[1])
+        tracemalloc.stop()
+    assert peaks[2] < peaks[1] + 1_000_000
+
+
+def test_run_that_cannot_start_leaves_no_bag(tmp_path):
+    config = build(ControllerConfig, {'approach.enabled': False})
+    plant = build(PlantConfig, {'duration': 1.0, 'initial.position': [0.3, 0.3]})
+    with pytest.raises(StartError):
+        simulate_into_bag(tmp_path / 'bag', config, plant)
+    assert not (tmp_path / 'bag').exists()
 
 
 def test_unguarded_law_continues_past_every_limit():

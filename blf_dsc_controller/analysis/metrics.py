@@ -43,7 +43,7 @@ _LEARNED = 0.01
 _SHOWN_SINGLY = 8  # estimates that are shown one by one
 _POSTURES = 400  # of the reference, at which torques are compared
 _TAIL = 10.0  # s
-_MAX_SAMPLES = 100_000  # samples of the estimates, evenly spaced
+_MAX_SAMPLES = 20_000  # samples of the estimates, evenly spaced
 _BLOCK = 8192
 _QUANTILES = (('p50', 50.0), ('p99', 99.0), ('p99.9', 99.9), ('max', 100.0))  # %
 _OFTEN = 0.01  # of the samples
@@ -90,7 +90,7 @@ def estimates_of(run: Run) -> Estimates | None:
     step = -(-run.monitor.stamp.size // _MAX_SAMPLES)
     rows = slice((run.monitor.stamp.size - 1) % step, None, step)
     stamp = run.monitor.stamp[rows]
-    estimate = run.monitor.values[rows][:, run.monitor.indices(names)]
+    estimate = run.monitor.values[rows, run.monitor.indices(names)]
     of_torques = arm is not None and _parameters(arm.units) == names
     true = error = None
     if truth is not None and set(names) == set(_parameters(truth.names)):
@@ -214,8 +214,14 @@ def true_change_times(run: Run) -> list[float]:
     """Return the times [s] at which the plant's true parameters began to change."""
     if run.truth is None:
         return []
-    true = run.truth.select(_parameters(run.truth.names))
-    changed = np.any(np.diff(true, axis=0) != 0.0, axis=1)
+    columns = run.truth.indices(_parameters(run.truth.names))
+    changes = [
+        np.any(
+            np.diff(run.truth.values[begin : begin + _BLOCK + 1, columns], axis=0), 1
+        )
+        for begin in range(0, run.truth.stamp.size, _BLOCK)
+    ]
+    changed = np.concatenate(changes)
     begins = np.flatnonzero(np.diff(changed, prepend=False) & changed) + 1
     return [float(t) for t in run.time_of(run.truth.stamp[begins])]
 

@@ -32,7 +32,7 @@ from blf_dsc_controller.configuration.schema import change
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.messages.codecs import JointStateDecoder
 from blf_dsc_controller.reference.approach import plan_start
-from blf_dsc_controller.simulation.loop import simulate, write_bag
+from blf_dsc_controller.simulation.loop import simulate_into_bag
 from blf_dsc_controller.supervision.config_warnings import config_warnings
 from blf_dsc_controller.supervision.expected_errors import expectation
 from blf_dsc_controller.supervision.guard import Guard
@@ -68,10 +68,12 @@ def run(options: Namespace) -> int:
     completed = True
     if options.offline:
         with announced_compilation(print_notice):
-            record = simulate(config.controller, config.plant)
-        write_bag(
-            out / 'bag', record, config.plant, compression=config.recorder.compression
-        )
+            simulate_into_bag(
+                out / 'bag',
+                config.controller,
+                config.plant,
+                compression=config.recorder.compression,
+            )
     else:
         from blf_dsc_controller.cli.session import run_session
 

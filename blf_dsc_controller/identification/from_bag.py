@@ -12,6 +12,8 @@ from blf_dsc_controller.arms.urdf import Tree
 from blf_dsc_controller.bags.content import NO_NAMES, NameMap, read_content
 from blf_dsc_controller.bags.reader import applied_torque, single_run
 from blf_dsc_controller.bags.sources import BagError
+from blf_dsc_controller.bags.topic_messages import Values
+from blf_dsc_controller.identification.on_disk import blocks_of
 from blf_dsc_controller.identification.recording import Recording, resampled
 from blf_dsc_controller.messages.topics import JOINT_STATES
 
@@ -38,16 +40,21 @@ def read_bag(
     joints = tuple(joints) or _arm_joints(text, set().union(*named), names)
     theirs = names.joints_of(joints)
     states, _, _ = single_run(content, theirs)
-    torque = np.asarray(states.field(2))
+    torque = states.field(2)
     source = f'effort of {content.topics[JOINT_STATES].name}'
-    if commanded or not np.nan_to_num(torque).any():
+    if commanded or not _any(torque, states.size):
         source, applied = applied_torque(content, states)
-        torque = np.asarray(applied.field(2))
-        if not np.nan_to_num(torque).any():
+        torque = applied.field(2)
+        if not _any(torque, states.size):
             raise BagError(
                 f'{path}: all torques in the {source} are zero: record measured efforts'
             )
-    return resampled(joints, states.stamp, np.asarray(states.field(0)), torque, source)
+    return resampled(joints, states.stamp, states.field(0), torque, source)
+
+
+def _any(values: Values, size: int) -> bool:
+    """Return whether one of the values in so many rows is known and not zero."""
+    return any(np.nan_to_num(values[rows]).any() for rows in blocks_of(size))
 
 
 def _arm_joints(text: str, in_bag: set[str], names: NameMap) -> tuple[str, ...]:

@@ -18,6 +18,7 @@ from blf_dsc_controller.configuration.robot import Robot
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.identification.friction_doubt import friction_doubt
 from blf_dsc_controller.identification.identified import Identified
+from blf_dsc_controller.identification.on_disk import mapped
 from blf_dsc_controller.identification.problem import Effort, problem_of
 from blf_dsc_controller.identification.reading import read_recording
 from blf_dsc_controller.identification.recording import Recording, joined
@@ -67,9 +68,10 @@ def identify_bag(
     if loaded:
         picked_up = begins[-1]
     if len(gains):
-        recording = recording._replace(
-            torque=recording.torque * checked_gains(gains, joints)
-        )
+        factors = checked_gains(gains, joints)
+        measured = recording.torque
+        torque = mapped(recording.gap.size, lambda rows: measured[rows] * factors)
+        recording = recording._replace(torque=torque)
     return identify_arm(recording, robot, effort, picked_up, find_signs=not len(gains))
 
 
@@ -104,7 +106,7 @@ def identify_arm(
     dynamics = nearest_friction(rows, windows, final.values)
     return Identified(
         source=recording.source,
-        duration=recording.q.shape[0] * recording.period,
+        duration=recording.duration,
         chain=problem.chain,
         parameters=problem.parameters,
         prior=problem.prior.mean,

@@ -8,9 +8,12 @@ of the effort is reversed.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import numpy as np
 from numpy.typing import NDArray
 
+from blf_dsc_controller.identification.regression import triangle
 from blf_dsc_controller.identification.values import LOAD
 from blf_dsc_controller.identification.windows import COLUMNS, Indices, Rows
 from blf_dsc_controller.run import Floats
@@ -21,6 +24,7 @@ LEAST_GRAVITY = 0.4
 MOST_GRAVITY = 1.6
 """Share of the URDF's gravity above which it is double."""
 
+_FRICTION = ('viscous', 'Coulomb', 'offset')
 _FAINT = 0.1  # of the torque, least gravity that can be checked
 _TINY = 1e-6  # N m or N
 _DRIVEN = 0.3  # of the torque, least work of friction that shows a sign
@@ -36,14 +40,20 @@ def gravity_share(rows: Rows, fit: Indices, P: Floats) -> float:
     gravity, inertial = _shares_of(rows, fit, P)
     if np.sqrt(np.mean((gravity.std(axis=0) / size) ** 2)) < _FAINT:
         return float('nan')
-    n = size.size
-    X = rows.X[fit]
-    friction = [k for i in range(n) for k in _friction_columns(rows, i)]
-    known = np.stack((gravity, inertial), axis=2)
-    columns = np.concatenate((known, X[:, :, friction], X[:, :, -LOAD:]), axis=2)
-    weighted = (columns * weight[:, :, None]).reshape(-1, columns.shape[2])
     u = rows.u(0.0)[fit]
-    return float(_solved(weighted, (u * weight).ravel())[0])
+    names = [COLUMNS.index(name) for name in _FRICTION]
+    used = [*(rows.p + np.arange(size.size) + k * size.size for k in names)]
+    used.append(np.arange(rows.unknowns - LOAD, rows.unknowns))
+
+    def weighted() -> Iterator[Floats]:
+        known = np.stack((gravity, inertial), axis=2)
+        for block in rows.blocks(fit):
+            X = rows.matrix(fit[block])[:, :, np.concatenate(used)]
+            columns = np.concatenate((known[block], X, u[block, :, None]), axis=2)
+            yield (columns * weight[block, :, None]).reshape(-1, columns.shape[2])
+
+    R = triangle(weighted())
+    return float(_solved(R[:, :-1], R[:, -1])[0])
 
 
 def reversed_joints(rows: Rows, fit: Indices, P: Floats) -> NDArray[np.bool_]:
@@ -55,8 +65,9 @@ def reversed_joints(rows: Rows, fit: Indices, P: Floats) -> NDArray[np.bool_]:
     size = _sizes(rows, fit)
     gravity, inertial = _shares_of(rows, fit, P)
     found = np.zeros(size.size, dtype=bool)
+    names = [COLUMNS.index(name) for name in _FRICTION]
     for i in range(size.size):
-        friction = rows.X[fit][:, i, _friction_columns(rows, i)]
+        friction = rows.friction[fit][:, names, i]
         columns = np.column_stack((gravity[:, i], inertial[:, i], friction))
         weight = rows.weight[fit, i]
         share = _solved(columns * weight[:, None], u[:, i] * weight)
@@ -77,15 +88,10 @@ def _sizes(rows: Rows, fit: Indices) -> Floats:
 
 def _shares_of(rows: Rows, fit: Indices, P: Floats) -> tuple[Floats, Floats]:
     """Return the torques of gravity and of all other inertial terms of P in the windows."""
-    gravity = rows.over_windows(rows.gravity_torque(P), rows.g)[fit]
-    return gravity, rows.X[fit][:, :, : rows.p] @ P - gravity
-
-
-def _friction_columns(rows: Rows, joint: int) -> list[int]:
-    """Return the columns of viscous and Coulomb friction and the offset of a joint."""
-    n = rows.speed.size
-    names = ('viscous', 'Coulomb', 'offset')
-    return [rows.p + COLUMNS.index(name) * n + joint for name in names]
+    gravity = rows.over_windows(lambda at: rows.gravity_torque(P, at), rows.g)[fit]
+    theta = np.zeros(rows.unknowns)
+    theta[: rows.p] = P
+    return gravity, rows.torques(fit, theta) - gravity
 
 
 def _solved(A: Floats, b: Floats) -> Floats:

@@ -20,7 +20,7 @@ from blf_dsc_controller.identification.plausibility import (
 )
 from blf_dsc_controller.identification.prior import Prior, prior_of
 from blf_dsc_controller.identification.recording import Recording
-from blf_dsc_controller.identification.values import LOAD, base_matrix
+from blf_dsc_controller.identification.values import base_matrix
 from blf_dsc_controller.identification.windows import STILL, Rows, Split, rows_of, split
 from blf_dsc_controller.run import Floats
 
@@ -62,21 +62,21 @@ def problem_of(
     chain = robot.chain(recording.joints)
     n = len(chain.joints)
     parameters = base_parameters(chain, robot.gravity)
-    duration = recording.q.shape[0] * recording.period
-    if duration < _SHORTEST:
+    if recording.duration < _SHORTEST:
         raise BlfDscError(
-            f'the bag holds {duration:.3g} s; record at least {_SHORTEST:g} s'
+            f'the bag holds {recording.duration:.3g} s; record at least {_SHORTEST:g} s'
         )
     rows = rows_of(recording, parameters.model)
     windows = split(rows)
     P = parameters.of(chain.inertias, robot.rotors(chain))
     opposite = np.zeros(n, dtype=bool)
     if effort == 'without-gravity':
-        rows = rows._replace(torque=rows.torque + rows.gravity_torque(P))
+        rows = rows.with_torque(lambda at: rows.torque[at] + rows.gravity_torque(P, at))
     elif find_signs:
         opposite = reversed_joints(rows, windows.fit, P)
-        rows = rows._replace(torque=np.where(opposite, -rows.torque, rows.torque))
-    largest = np.maximum(np.abs(rows.torque).max(axis=0), _TINY)
+        signs = np.where(opposite, -1.0, 1.0)
+        rows = rows.with_torque(lambda at: rows.torque[at] * signs)
+    largest = np.maximum(rows.largest_torque, _TINY)
     speed = np.maximum(rows.speed, STILL)
     prior = prior_of(robot, chain, largest, speed, load=picked_up is not None)
     G = base_matrix(parameters, n)
@@ -85,15 +85,13 @@ def problem_of(
     )
     if picked_up is None:
         return problem
-    return problem._replace(picked_up=_set_load(problem, picked_up))
+    return _with_load(problem, picked_up)
 
 
-def _set_load(problem: Problem, picked_up: float) -> float:
-    """Set the columns of a load, and return when it is picked up [s]; NaN: find it."""
-    rows = problem.rows
+def _with_load(problem: Problem, picked_up: float) -> Problem:
+    """Return the problem with a load that is picked up at that time [s]; NaN: find it."""
     last_body = problem.parameters.K[:, -(ROTOR + 1) : -1]
-    rows.X[:, :, -LOAD:] = rows.X[:, :, : rows.p] @ last_body
+    rows = problem.rows._replace(load=last_body)
     if np.isnan(picked_up):
         picked_up = pick_up_time(rows, problem.windows.fit, problem.G, problem.prior)
-    rows.X[rows.time < picked_up, :, -LOAD:] = 0.0
-    return picked_up
+    return problem._replace(rows=rows._replace(loaded=picked_up), picked_up=picked_up)

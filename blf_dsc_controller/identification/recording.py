@@ -8,7 +8,13 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from blf_dsc_controller.bags.topic_messages import Values
 from blf_dsc_controller.errors import BlfDscError
+from blf_dsc_controller.identification.on_disk import (
+    Samples,
+    blocks_of,
+    mapped,
+)
 from blf_dsc_controller.run import Floats, Stamps
 
 _SLOWEST = 0.02  # s between states
@@ -18,18 +24,27 @@ _GAP = 3.0  # intervals between two states
 
 
 class Recording(NamedTuple):
-    """N samples of n joints, a period apart."""
+    """N samples of n joints, a period apart; of a long one, most is on disk."""
 
     joints: tuple[str, ...]
     period: float  # s
-    q: Floats  # (N, n) rad, or m
-    torque: Floats  # (N, n) N m, or N
+    q: Samples  # (N, n) rad, or m
+    torque: Samples  # (N, n) N m, or N
     gap: NDArray[np.bool_]  # (N,) whether nothing was recorded here
     source: str  # of the torques: a topic, or columns of a table
 
+    @property
+    def duration(self) -> float:
+        """Time that it takes [s]."""
+        return self.gap.size * self.period
+
 
 def resampled(
-    joints: tuple[str, ...], stamp: Stamps, q: Floats, torque: Floats, source: str
+    joints: tuple[str, ...],
+    stamp: Stamps,
+    q: Floats | Values,
+    torque: Floats | Values,
+    source: str,
 ) -> Recording:
     """Resample evenly, interpolating over uneven stamps and up to two lost states.
 
@@ -38,10 +53,14 @@ def resampled(
     Raises:
         BlfDscError: there are too few states, or their stamps cannot be of one clock.
     """
-    known = np.isfinite(np.column_stack((q, torque))).all(axis=1)
-    stamp, order = np.unique(stamp[known], return_index=True)
-    q = q[known][order]
-    torque = torque[known][order]
+    known = [
+        np.isfinite(np.column_stack((q[rows], torque[rows]))).all(axis=1)
+        for rows in blocks_of(stamp.size)
+    ]
+    order = np.flatnonzero(np.concatenate([np.zeros(0, dtype=bool), *known]))
+    if not (np.diff(stamp[order]) > 0).all():
+        order = order[np.unique(stamp[order], return_index=True)[1]]
+    stamp = stamp[order]
     if stamp.size < 2:
         raise BlfDscError(
             f'there are {stamp.size} joint state(s) with a position, a torque and a unique '
@@ -62,20 +81,29 @@ def resampled(
         )
     grid = np.arange(0.0, time[-1], period)
     gap = (intervals > _GAP * period)[np.searchsorted(time, grid, side='right') - 1]
-    return Recording(
-        joints,
-        period,
-        interpolated(grid, time, q),
-        interpolated(grid, time, torque),
-        gap,
-        source,
-    )
+
+    def evenly(values: Floats | Values) -> Samples:
+        def block(rows: slice) -> Floats:
+            at = grid[rows]
+            near = _around(at, time)
+            return interpolated(at, time[near], values[order[near]])
+
+        return mapped(grid.size, block)
+
+    return Recording(joints, period, evenly(q), evenly(torque), gap, source)
 
 
 def interpolated(at: np.ndarray, time: np.ndarray, values: np.ndarray) -> Floats:
     """Return the values (N, n) of these times at other times (k,), linearly interpolated."""
     columns = [np.interp(at, time, column) for column in values.T]
     return np.asarray(np.transpose(columns))
+
+
+def _around(at: np.ndarray, time: np.ndarray) -> slice:
+    """Return which of the times are needed to interpolate at some others (k,); all increase."""
+    first = np.searchsorted(time, at[0], side='right') - 1
+    last = np.searchsorted(time, at[-1], side='left') + 1
+    return slice(max(int(first), 0), int(last))
 
 
 def joined(first: Recording, *others: Recording) -> tuple[Recording, list[float]]:
@@ -86,17 +114,28 @@ def joined(first: Recording, *others: Recording) -> tuple[Recording, list[float]
     together = first
     begins = []
     for other in others:
-        begins.append(together.q.shape[0] * together.period)
-        times = np.arange(other.q.shape[0]) * other.period
+        begins.append(together.duration)
+        times = np.asarray(np.arange(other.gap.size) * other.period, dtype=np.float64)
         grid = np.arange(0.0, times[-1], first.period)
         gap = np.interp(grid, times, other.gap) > 0.0
         gap[0] = True
-        q = interpolated(grid, times, other.q)
-        torque = interpolated(grid, times, other.torque)
         together = together._replace(
-            q=np.vstack((together.q, q)),
-            torque=np.vstack((together.torque, torque)),
+            q=_followed(together.q, together.gap.size, other.q, grid, times),
+            torque=_followed(
+                together.torque, together.gap.size, other.torque, grid, times
+            ),
             gap=np.append(together.gap, gap),
             source=f'{together.source}, {other.source}',
         )
     return together, begins
+
+
+def _followed(
+    first: Samples, size: int, other: Samples, grid: Floats, times: Floats
+) -> Samples:
+    """Return the first `size` rows, and those of the other times on a grid."""
+    found = mapped(size, lambda rows: np.asarray(first[rows]))
+    for rows in blocks_of(grid.size):
+        near = _around(grid[rows], times)
+        found.append(interpolated(grid[rows], times[near], other[near]))
+    return found

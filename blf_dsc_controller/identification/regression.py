@@ -15,7 +15,8 @@ generalized linear models, 1986), and ignores the bounds, which can only reduce 
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from collections.abc import Iterable, Iterator, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -30,6 +31,7 @@ FOLDS = 5
 _PASSES = 6
 _DEVIATION = 0.1  # of a joint's torque, of its residual at first
 _FLOOR = 1e-3  # of that, least deviation
+_AT_ONCE = 8  # times the columns, rows of a triangle that are reduced at once
 
 
 class Regression(NamedTuple):
@@ -42,62 +44,112 @@ class Regression(NamedTuple):
     scatter: Floats  # (k, k) covariance of A^T b
     lasting: Floats  # (n,) correlation length of each joint's residual, s
     deviation: Floats  # (n,) of each joint's residual, N m or N
+    delay: float  # s, of the torques in A
 
 
-def regression(
-    rows: Rows, fit: Indices, G: Floats, prior: Prior, parts: int = FOLDS
-) -> Regression:
+def regression(rows: Rows, fit: Indices, G: Floats, prior: Prior) -> Regression:
     """Return the problem of the prior's z, with deviations and gravity of its own solution."""
-    n = rows.speed.size
     mean = G @ prior.mean
     B = G @ prior.D
     theta = mean
     deviation = _DEVIATION * np.sqrt(np.mean(rows.u(0.0)[fit] ** 2, axis=0))
     floor = _FLOOR * deviation + 1e-12
-    counted = np.sum(rows.weight[fit] ** 2, axis=0) - theta.size / n
+    counted = np.sum(rows.weight[fit] ** 2, axis=0) - theta.size / deviation.size
     counted = np.maximum(counted, 1.0)
     for _ in range(_PASSES):
         rows.set_load(theta[: rows.p])
-        weighted = _weighted(rows, fit, float(theta[-1]))
-        scaled = weighted / deviation[:, None]
-        R = np.asarray(np.linalg.qr(scaled.reshape(-1, theta.size + 1), mode='r'))
+        weighted = _Weighted(rows, fit, float(theta[-1]))
+        of_joints = triangle(np.moveaxis(each, 1, 0) for each in weighted.blocks())
+        scaled = of_joints / deviation[:, None, None]
+        R = triangle([scaled.reshape(-1, theta.size + 1)])
         A = R[:, :-1] @ B
         b = R[:, -1] - R[:, :-1] @ mean
         theta = mean + B @ np.linalg.solve(A.T @ A + np.eye(A.shape[1]), A.T @ b)
-        residual = weighted[:, :, :-1] @ theta - weighted[:, :, -1]
-        found = np.sqrt(np.sum(residual**2, axis=0) / counted)
+        left = of_joints @ np.append(theta, -1.0)
+        found = np.sqrt(np.sum(left**2, axis=1) / counted)
         deviation_used = deviation
         deviation = np.maximum(found, floor)
+    residual = np.concatenate(
+        [each @ np.append(theta, -1.0) for each in weighted.blocks()]
+    )
     lengths = np.array([correlation_length(column) for column in residual.T])
-    folds = _folds(scaled, B, mean, parts)
-    of_joints = folds.sum(axis=0)[:, :-1, :-1]
-    scatter = np.tensordot(lengths, of_joints, 1)
-    return Regression(A, b, folds, scatter, lengths * HOP, deviation_used)
+    solved = Regression(
+        A, b, np.empty(0), np.empty(0), lengths * HOP, deviation_used, weighted.delay
+    )
+    folds = np.array(list(successive(rows, fit, G, prior, solved, FOLDS)))
+    together = folds.sum(axis=0)[:, :-1, :-1]
+    return solved._replace(folds=folds, scatter=np.tensordot(lengths, together, 1))
 
 
-def _weighted(rows: Rows, fit: Indices, delay: float) -> Floats:
-    """Return [X | -du/dt | u] (R, n, m + 2), the last of torques without their delay."""
-    rate = rows.rate(delay)[fit][:, :, None]
-    u = rows.u(delay)[fit][:, :, None]
-    columns = (rows.X[fit], -rate, u - delay * rate)
-    weight = rows.weight[fit][:, :, None]
-    return np.asarray(weight * np.concatenate(columns, axis=2))
-
-
-def _folds(scaled: Floats, B: Floats, mean: Floats, parts: int) -> Floats:
-    """Return the products (parts, n, k + 1, k + 1) of the columns [A | b]."""
-    n = scaled.shape[1]
-    k = B.shape[1] + 1
-    to_z = np.zeros((scaled.shape[2], k))
+def successive(
+    rows: Rows, fit: Indices, G: Floats, prior: Prior, found: Regression, parts: int
+) -> Iterator[Floats]:
+    """Yield the products of `Regression.folds` for so many parts, as the rows are now."""
+    weighted = _Weighted(rows, fit, found.delay)
+    B = G @ prior.D
+    to_z = np.zeros((B.shape[0] + 1, B.shape[1] + 1))
     to_z[:-1, :-1] = B
-    to_z[:-1, -1] = -mean
+    to_z[:-1, -1] = -G @ prior.mean
     to_z[-1, -1] = 1.0
-    folds = np.zeros((parts, n, k, k))
-    for fold, part in zip(folds, np.array_split(scaled, parts), strict=True):
-        for i in range(n):
-            own = part[:, i]
-            fold[i] = to_z.T @ (own.T @ own) @ to_z
-    return folds
+    for products in weighted.products(parts):
+        yield to_z.T @ (products / found.deviation[:, None, None] ** 2) @ to_z
+
+
+class _Weighted:
+    """The rows [X | -du/dt | u] (k, n, m + 2), the last of torques without their delay.
+
+    They are those of some windows (k,), times the weights, and computed block by block.
+
+    Attributes:
+        delay: of the torques, about which they are linearised [s].
+    """
+
+    def __init__(self, rows: Rows, windows: Indices, delay: float) -> None:
+        rate = rows.rate(delay)[windows]
+        self._columns = np.stack((-rate, rows.u(delay)[windows] - delay * rate), axis=2)
+        self._rows = rows
+        self._windows = windows
+        self.delay = delay
+
+    def blocks(self) -> Iterator[Floats]:
+        """Yield all of them, one after the other."""
+        for block in self._rows.blocks(self._windows):
+            X = self._rows.matrix(self._windows[block])
+            weight = self._rows.weight[self._windows[block]]
+            rows = np.concatenate((X, self._columns[block]), axis=2)
+            yield weight[:, :, None] * rows
+
+    def products(self, parts: int) -> Iterator[Floats]:
+        """Yield the products (n, m + 2, m + 2) of the columns in each of successive parts."""
+        ends = np.cumsum([part.size for part in np.array_split(self._windows, parts)])
+        done = 0
+        products: Any = 0.0
+        for block in self.blocks():
+            of_joints = np.moveaxis(block, 1, 0)
+            inside = ends[(ends > done) & (ends <= done + len(block))] - done
+            *whole, rest = np.split(of_joints, inside, axis=1)
+            for part in whole:
+                yield products + np.swapaxes(part, 1, 2) @ part
+                products = 0.0
+            products = products + np.swapaxes(rest, 1, 2) @ rest
+            done += len(block)
+
+
+def triangle(blocks: Iterable[Floats]) -> Floats:
+    """Return the R of the QR decomposition of the rows in blocks (..., k, m), one below another.
+
+    R^T R is that of all rows.
+    """
+    waiting: list[Floats] = []
+    for block in blocks:
+        waiting.append(block)
+        if sum(each.shape[-2] for each in waiting) > _AT_ONCE * block.shape[-1]:
+            waiting = [_triangle(waiting)]
+    return _triangle(waiting)
+
+
+def _triangle(blocks: Sequence[Floats]) -> Floats:
+    return np.asarray(np.linalg.qr(np.concatenate(blocks, axis=-2), mode='r'))
 
 
 def correlation_length(residual: Floats) -> float:

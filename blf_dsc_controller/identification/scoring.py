@@ -8,7 +8,6 @@ import numpy as np
 from blf_dsc_controller.identification.identified import Score
 from blf_dsc_controller.identification.values import (
     COULOMB,
-    LOAD,
     OFFSET,
     VISCOUS,
     parts,
@@ -32,7 +31,7 @@ def scored(
     friction = nearest_friction(rows, windows, values)
     parts(corrected).terms[[VISCOUS, COULOMB]] = friction
     models = (urdf, corrected, values)
-    predicted = np.array([rows.X[moving] @ (G @ model)[:-1] for model in models])
+    predicted = np.array([rows.torques(moving, (G @ model)[:-1]) for model in models])
     measured = rows.u(values[-1])[moving]
     shown = np.isin(moving, windows.test)
     residual = predicted[:, shown] - measured[shown]
@@ -49,15 +48,18 @@ def scored(
 
 def nearest_friction(rows: Rows, windows: Split, values: Floats) -> Floats:
     """Return the viscous and Coulomb friction (2, n) nearest to that of all terms."""
-    n = rows.speed.size
     terms = parts(values).terms[1:].copy()
     terms[OFFSET - 1] = 0.0
-    both = np.append(terms, parts(values).coupling)
-    X = rows.X[windows.fit][:, :, rows.p : -LOAD]
-    weight = rows.weight[windows.fit]
-    friction = (X @ both) * weight
-    found = []
-    for i in range(n):
-        columns = X[:, i, [i, n + i]] * weight[:, i, None]
-        found.append(np.linalg.lstsq(columns, friction[:, i], rcond=None)[0])
+    fit = windows.fit
+    columns = rows.friction[fit]
+    friction = np.sum(columns * terms, axis=1)
+    friction[:, -2:] += rows.coupling[fit] @ parts(values).coupling
+    weight = rows.weight[fit]
+    viscous_and_coulomb = columns[:, :2] * weight[:, None]
+    found = [
+        np.linalg.lstsq(
+            viscous_and_coulomb[:, :, i], friction[:, i] * weight[:, i], rcond=None
+        )[0]
+        for i in range(rows.speed.size)
+    ]
     return np.asarray(np.maximum(np.transpose(found), 0.0))

@@ -24,12 +24,19 @@ COULOMB_SPEED = 0.005
 """Scale v_c of the tanh that replaces the sign [rad/s, or m/s]."""
 
 
-def sliding_direction(q: Floats, dq: Floats, distances: Floats) -> Floats:
-    """Return s (N, n) along positions and speeds (N, n), for distances x_s (n,)."""
+def sliding_direction(
+    q: Floats, dq: Floats, distances: Floats, first: Floats | None = None
+) -> Floats:
+    """Return s (N, n) along positions and speeds (N, n), for distances x_s (n,).
+
+    `first` (n,) is s at the first of them where x_s > 0; None: zero.
+    """
     direction = np.tanh(dq / COULOMB_SPEED)
     elastic = np.flatnonzero(distances)
     if elastic.size:
         own = np.zeros((len(q), elastic.size))
+        if first is not None:
+            own[0] = first[elastic]
         follow_contacts(np.ascontiguousarray(q[:, elastic]), distances[elastic], own)
         direction[:, elastic] = own
     return np.asarray(direction)
@@ -37,7 +44,7 @@ def sliding_direction(q: Floats, dq: Floats, distances: Floats) -> Floats:
 
 @kernel
 def follow_contacts(q: np.ndarray, distances: np.ndarray, s: np.ndarray) -> None:
-    """Fill s (N, k) along the positions (N, k), from s = 0: exact for a monotone step."""
+    """Fill s (N, k) along the positions (N, k), from its first row: exact for a monotone step."""
     for k in range(1, q.shape[0]):
         for i in range(q.shape[1]):
             moved = q[k, i] - q[k - 1, i]

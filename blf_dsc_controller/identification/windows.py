@@ -16,6 +16,8 @@ Smoothing and differentiation of data, 1964).
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -26,12 +28,21 @@ from blf_dsc_controller.arms.model import regressors_at
 from blf_dsc_controller.arms.serial_chain import SerialChain
 from blf_dsc_controller.compiled.jit import kernel
 from blf_dsc_controller.errors import BlfDscError
+from blf_dsc_controller.identification.on_disk import (
+    BLOCK,
+    OnDisk,
+    Samples,
+    blocks_of,
+    mapped,
+)
 from blf_dsc_controller.identification.recording import Recording, interpolated
 from blf_dsc_controller.identification.sliding import COULOMB_SPEED, sliding_direction
 from blf_dsc_controller.identification.values import COUPLING, LOAD
 from blf_dsc_controller.run import Floats
 
 Indices = NDArray[np.intp]
+OfSamples = Callable[[slice], Floats]
+"""Returns values (k, n) of some samples."""
 
 WINDOW = 0.2
 """Length of a window [s]."""
@@ -59,58 +70,129 @@ _WINDOWS_OF_JOINT = 10  # least number
 
 
 class Rows(NamedTuple):
-    """R windows of n joints and m unknowns [P; COLUMNS of all joints; COUPLING; LOAD]."""
+    """R windows of n joints and m unknowns [P; COLUMNS of all joints; COUPLING; LOAD].
+
+    The N samples are on disk, and so is what is large; `blocks` of windows come into memory.
+    """
 
     time: Floats  # (R,) of their centres, s
-    X: Floats  # (R, n, m)
+    inertial: OnDisk  # (R, n p) columns of P
+    friction: Floats  # (R, c, n) COLUMNS of each joint, which are zero for the others
+    coupling: Floats  # (R, 2, 3) columns of COUPLING for the last two joints
+    load: Floats  # (p, 10) columns of P that are those of a load, from `loaded` on
+    loaded: float  # s
     weight: Floats  # (R, n) of each row, at most 1
     speeds: Floats  # (R, n) mean speed in each window, rad/s or m/s
     speed: Floats  # (n,) 95th percentile of each joint's speed, rad/s or m/s
-    q: Floats  # (N, n) smoothed positions at all samples
-    dq: Floats  # (N, n) their velocities
-    torque: Floats  # (N, n) likewise
+    q: OnDisk  # (N, n) smoothed positions at all samples
+    dq: OnDisk  # (N, n) their velocities
+    torque: Samples  # (N, n) likewise
     g: Floats  # (L,) with sum 1
     slope: Floats  # (L,) g' in 1/s, scaled likewise
     starts: np.ndarray  # (R,) first sample of each window
     period: float  # s
-    sliding: Floats  # (N, n) s
-    gravity: Floats  # (N / every, n, p) regressor of the torque of gravity
+    sliding: OnDisk  # (N, n) s
+    gravity: OnDisk  # (N / every, n p) regressor of the torque of gravity
     every: int  # samples between its positions
 
     @property
     def p(self) -> int:
         """Number of base parameters."""
-        return int(self.gravity.shape[2])
+        return int(self.load.shape[0])
 
-    def gravity_torque(self, P: Floats) -> Floats:
-        """Return the torque of gravity (N, n) of the base parameters P (p,)."""
-        samples = np.arange(len(self.q))
-        return interpolated(samples, samples[:: self.every], self.gravity @ P)
+    @property
+    def unknowns(self) -> int:
+        """Number m."""
+        return self.p + len(COLUMNS) * self.speed.size + COUPLING + LOAD
+
+    def blocks(self, windows: Indices) -> Iterator[slice]:
+        """Yield slices of windows (k,), which increase, one after the other."""
+        of_samples = np.arange(0, len(self.q) + BLOCK, BLOCK)
+        edges = np.searchsorted(self.starts[windows], of_samples).tolist()
+        return (slice(*pair) for pair in pairwise(edges) if pair[0] < pair[1])
+
+    def matrix(self, windows: Indices | None = None) -> Floats:
+        """Return X (k, n, m) of some windows, which increase; by default of all."""
+        if windows is None:
+            windows = np.arange(self.time.size)
+        n = self.speed.size
+        p = self.p
+        X = np.zeros((windows.size, n, self.unknowns))
+        if not windows.size:
+            return X
+        read = self.inertial[int(windows[0]) : int(windows[-1]) + 1]
+        inertial = read[windows - windows[0]].reshape(-1, n, p)
+        X[:, :, :p] = inertial
+        joints = np.arange(n)
+        for c in range(len(COLUMNS)):
+            X[:, joints, p + c * n + joints] = self.friction[windows, c]
+        at = X.shape[2] - LOAD - COUPLING
+        if n > 1:
+            X[:, -2:, at : at + COUPLING] = self.coupling[windows]
+        with_load = self.time[windows] >= self.loaded
+        X[with_load, :, -LOAD:] = inertial[with_load] @ self.load
+        return X
+
+    def torques(self, windows: Indices, theta: Floats) -> Floats:
+        """Return X theta (k, n) of some windows, which increase."""
+        found = np.zeros((windows.size, self.speed.size))
+        for block in self.blocks(windows):
+            found[block] = self.matrix(windows[block]) @ theta
+        return found
+
+    @property
+    def largest_torque(self) -> Floats:
+        """Largest torque of each joint (n,) [N m or N]."""
+        largest = [
+            np.abs(self.torque[rows]).max(axis=0) for rows in blocks_of(len(self.q))
+        ]
+        return np.asarray(np.max(largest, axis=0))
+
+    def with_torque(self, torque: OfSamples) -> Rows:
+        """Return the rows with other torques."""
+        return self._replace(torque=mapped(len(self.q), torque))
+
+    def gravity_torque(self, P: Floats, samples: slice) -> Floats:
+        """Return the torque of gravity (k, n) of the base parameters P (p,) at some samples."""
+        first = samples.start // self.every
+        knots = self.gravity[first : (samples.stop - 1) // self.every + 2]
+        torque = knots.reshape(len(knots), -1, self.p) @ P
+        at = np.arange(samples.start, samples.stop)
+        return interpolated(at, (first + np.arange(len(knots))) * self.every, torque)
 
     def set_load(self, P: Floats) -> None:
-        """Compute the columns of the load friction in X for the gravity of P (p,)."""
-        self.set_column('load', np.abs(self.gravity_torque(P)) * self.sliding)
+        """Compute the columns of the load friction for the gravity of P (p,)."""
+        self.set_column(
+            'load',
+            lambda rows: np.abs(self.gravity_torque(P, rows)) * self.sliding[rows],
+        )
 
     def set_sliding(self, distances: Floats) -> None:
-        """Compute the columns of friction in X for the distances x_s (n,) of `sliding`.
+        """Compute the columns of friction for the distances x_s (n,) of `sliding`.
 
         Those of the load friction follow with the next `set_load`.
         """
-        self.sliding[:] = sliding_direction(self.q, self.dq, distances)
-        self.set_column('Coulomb', self.sliding)
+        last: Floats | None = None
+        for rows in blocks_of(len(self.q)):
+            before = slice(max(rows.start - 1, 0), rows.stop)
+            s = sliding_direction(self.q[before], self.dq[before], distances, last)
+            self.sliding[before] = s
+            last = s[-1]
+        self.set_column('Coulomb', lambda rows: self.sliding[rows])
         self.set_stribeck(STRIBECK_SPEED, 2.0)
 
     def set_stribeck(self, speed: float, exponent: float) -> None:
-        """Compute the columns of the Stribeck friction in X, s exp(-|v / speed|^exponent)."""
-        fading = np.exp(-(np.abs(self.dq / speed) ** exponent))
-        self.set_column('Stribeck', self.sliding * fading)
+        """Compute the columns of the Stribeck friction, s exp(-|v / speed|^exponent)."""
 
-    def set_column(self, name: str, values: Floats) -> None:
-        """Set a column of each joint in X to the values (N, n), filtered."""
-        n = values.shape[1]
-        joints = np.arange(n)
-        columns = self.p + COLUMNS.index(name) * n + joints
-        self.X[:, joints, columns] = self.over_windows(values, self.g)
+        def fading(rows: slice) -> Floats:
+            over = np.abs(self.dq[rows] / speed) ** exponent
+            return np.asarray(self.sliding[rows] * np.exp(-over))
+
+        self.set_column('Stribeck', fading)
+
+    def set_column(self, name: str, values: OfSamples) -> None:
+        """Set a column of each joint to the values of the samples, filtered."""
+        self.friction[:, COLUMNS.index(name)] = self.over_windows(values, self.g)
 
     def u(self, delay: float) -> Floats:
         """Return the right-hand side (R, n) of torques recorded `delay` [s] late."""
@@ -120,38 +202,60 @@ class Rows(NamedTuple):
         """Return the time derivative (R, n) of `u`."""
         return -self.over_windows(self._shifted(delay), self.slope)
 
-    def _shifted(self, delay: float) -> Floats:
-        samples = np.arange(self.torque.shape[0])
-        return interpolated(samples + delay / self.period, samples, self.torque)
+    def _shifted(self, delay: float) -> OfSamples:
+        shift = delay / self.period
+        last = len(self.q) - 1
 
-    def over_windows(self, values: np.ndarray, factors: Floats) -> Floats:
-        """Return the sums (R, n) of the values (N, n) in each window times factors (L,)."""
-        windows = sliding_window_view(values, factors.size, axis=0)[self.starts]
-        return np.asarray(windows @ factors)
+        def shifted(rows: slice) -> Floats:
+            at = np.arange(rows.start, rows.stop) + shift
+            first = int(np.clip(np.floor(at[0]), 0, last))
+            until = int(np.clip(np.floor(at[-1]), 0, last)) + 2
+            near = np.asarray(self.torque[first:until])
+            return interpolated(at, first + np.arange(len(near)), near)
+
+        return shifted
+
+    def over_windows(self, values: OfSamples, factors: Floats) -> Floats:
+        """Return the sums (R, n) of the values in each window times factors (L,)."""
+        columns = values(slice(0, 1)).shape[1]
+        found = np.zeros((self.starts.size, columns))
+        for block, samples in self.in_blocks():
+            windows = sliding_window_view(values(samples), factors.size, axis=0)
+            found[block] = windows[self.starts[block] - samples.start] @ factors
+        return found
+
+    def in_blocks(self) -> Iterator[tuple[slice, slice]]:
+        """Yield slices of windows and of their samples."""
+        for block in self.blocks(np.arange(self.starts.size)):
+            starts = self.starts[block]
+            yield block, slice(int(starts[0]), int(starts[-1]) + self.g.size)
 
 
 def rows_of(recording: Recording, model: SerialChain) -> Rows:
     """Return the rows of all windows of a recording without gaps."""
-    from scipy.signal import savgol_filter
-
     h = recording.period
     n = len(recording.joints)
+    size = recording.gap.size
     g, slope = _weighting(h)
-    width = 2 * max(2, round(0.5 * SMOOTHING / h)) + 1
-    q = savgol_filter(recording.q, width, 3, 0, h, axis=0)
-    dq = savgol_filter(recording.q, width, 3, 1, h, axis=0)
-    near_gap = np.convolve(recording.gap, np.ones(width), 'same') > 0.0
+    q, dq, near_gap = _smoothed(recording)
     starts = _starts(near_gap, g.size, h)
     every = max(1, round(_GRAVITY / h))
-    postures = q[::every]
-    zeros = np.zeros_like(postures)
-    columns = model.p + len(COLUMNS) * n + COUPLING + LOAD
+    gravity = OnDisk(n * model.p)
+    for block in blocks_of(size):
+        postures = q[block][-block.start % every :: every]
+        zeros = np.zeros_like(postures)
+        H = regressors_at(model, postures, zeros, zeros, zeros)
+        gravity.append(H.reshape(len(H), -1))
     rows = Rows(
         time=np.asarray((starts + 0.5 * (g.size - 1)) * h, dtype=np.float64),
-        X=np.zeros((starts.size, n, columns)),
+        inertial=OnDisk(n * model.p),
+        friction=np.zeros((starts.size, len(COLUMNS), n)),
+        coupling=np.zeros((starts.size, min(n, 2), COUPLING)),
+        load=np.zeros((model.p, LOAD)),
+        loaded=-np.inf,
         weight=np.empty(0),
         speeds=np.empty(0),
-        speed=np.percentile(np.abs(dq[~near_gap]), 95.0, axis=0),
+        speed=_fast(dq, ~near_gap),
         q=q,
         dq=dq,
         torque=recording.torque,
@@ -159,23 +263,71 @@ def rows_of(recording: Recording, model: SerialChain) -> Rows:
         slope=slope,
         starts=starts,
         period=h,
-        sliding=np.zeros_like(dq),
-        gravity=regressors_at(model, postures, zeros, zeros, zeros),
+        sliding=mapped(size, lambda rows: np.zeros((rows.stop - rows.start, n))),
+        gravity=gravity,
         every=every,
     )
-    regressors = np.zeros((2, n, model.p))
-    add_windows(model, q, dq, g, slope, starts, regressors, rows.X[:, :, : model.p])
+    _add_inertial(rows, model)
     rows.set_sliding(np.zeros(n))
-    rows.set_column('viscous', dq)
-    rows.set_column('offset', np.ones_like(dq))
-    rows.set_column('quadratic', dq * np.abs(dq))
+    rows.set_column('viscous', lambda at: dq[at])
+    rows.set_column('offset', lambda at: np.ones_like(dq[at]))
+    rows.set_column('quadratic', lambda at: dq[at] * np.abs(dq[at]))
     if n > 1:
         _set_coupling(rows)
-    in_motion = dq**2 / (dq**2 + _REST**2)
+
+    def in_motion(at: slice) -> Floats:
+        return np.asarray(dq[at] ** 2 / (dq[at] ** 2 + _REST**2))
+
     return rows._replace(
         weight=rows.over_windows(in_motion, g) ** 2,
-        speeds=rows.over_windows(np.abs(dq), g),
+        speeds=rows.over_windows(lambda at: np.abs(dq[at]), g),
     )
+
+
+def _smoothed(recording: Recording) -> tuple[OnDisk, OnDisk, NDArray[np.bool_]]:
+    """Return smoothed positions, velocities (N, n), and where they are near a gap (N,)."""
+    from scipy.ndimage import maximum_filter1d
+    from scipy.signal import savgol_filter
+
+    h = recording.period
+    size = recording.gap.size
+    half = max(2, round(0.5 * SMOOTHING / h))
+    width = 2 * half + 1
+
+    def smoothed(rows: slice, derivative: int) -> Floats:
+        first = max(rows.start - width, 0)
+        found = savgol_filter(
+            recording.q[first : rows.stop + width], width, 3, derivative, h, axis=0
+        )
+        return np.asarray(found[rows.start - first : rows.stop - first])
+
+    near_gap = maximum_filter1d(recording.gap, width, mode='constant')
+    q = mapped(size, lambda rows: smoothed(rows, 0))
+    return q, mapped(size, lambda rows: smoothed(rows, 1)), near_gap
+
+
+def _fast(dq: OnDisk, chosen: NDArray[np.bool_]) -> Floats:
+    """Return the 95th percentile of each joint's speed (n,) in the chosen samples."""
+    found = []
+    for i in range(dq.shape[1]):
+        speed = np.concatenate(
+            [np.abs(dq[rows][chosen[rows], i]) for rows in blocks_of(len(dq))]
+        )
+        found.append(np.percentile(speed, 95.0, overwrite_input=True))
+    return np.array(found)
+
+
+def _add_inertial(rows: Rows, model: SerialChain) -> None:
+    """Compute the columns of P."""
+    n = rows.speed.size
+    regressors = np.zeros((2, n, model.p))
+    for block, samples in rows.in_blocks():
+        starts = rows.starts[block] - samples.start
+        X = np.zeros((starts.size, n, model.p))
+        q = rows.q[samples]
+        dq = rows.dq[samples]
+        add_windows(model, q, dq, rows.g, rows.slope, starts, regressors, X)
+        rows.inertial.append(X.reshape(len(X), -1))
 
 
 def _weighting(h: float) -> tuple[Floats, Floats]:
@@ -201,13 +353,17 @@ def _starts(near_gap: np.ndarray, length: int, h: float) -> Indices:
 
 def _set_coupling(rows: Rows) -> None:
     """Set the columns of one motor that drives the last two joints."""
-    at = rows.X.shape[2] - LOAD - COUPLING
-    last = rows.dq[:, -2:]
-    others = last[:, ::-1]
-    both = np.tanh(last.sum(axis=1, keepdims=True) / COULOMB_SPEED)
-    rows.X[:, -2:, at] = -rows.over_windows(others, rows.slope)
-    rows.X[:, -2:, at + 1] = rows.over_windows(others, rows.g)
-    rows.X[:, -2:, at + 2] = rows.over_windows(both, rows.g)
+
+    def others(at: slice) -> Floats:
+        return rows.dq[at][:, :-3:-1]
+
+    def both(at: slice) -> Floats:
+        speed = rows.dq[at][:, -2:].sum(axis=1, keepdims=True)
+        return np.repeat(np.tanh(speed / COULOMB_SPEED), 2, axis=1)
+
+    rows.coupling[:, :, 0] = -rows.over_windows(others, rows.slope)
+    rows.coupling[:, :, 1] = rows.over_windows(others, rows.g)
+    rows.coupling[:, :, 2] = rows.over_windows(both, rows.g)
 
 
 class Split(NamedTuple):

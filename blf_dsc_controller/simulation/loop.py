@@ -10,9 +10,10 @@ stop.
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import closing
 from dataclasses import dataclass, replace
+from itertools import chain, islice
 from pathlib import Path
 
 import numpy as np
@@ -145,7 +146,8 @@ def simulate(
         record = new_record(
             guard.controller, controller_config, plant_config, guard.journal
         )
-        _run_supervised(guard, plant, record)
+        for _ in _run_supervised(guard, plant, record.rows, record.stamps.size):
+            pass
         return record
     journal = Journal()
     record = new_record(
@@ -172,30 +174,36 @@ def run_alone(record: Record, plant: Plant, *, observed: bool = True) -> None:
     _run_samples(record.controller, plant, samples, arrays)
 
 
-def _run_supervised(guard: Guard, plant: Plant, record: Record) -> None:
-    rows = record.stamps.size
-    _run_guarded(guard, plant, record, range(1))
-    if guard.start_error is not None:
-        raise guard.start_error
-    for first in range(1, rows, _CHUNK):
-        chunk = range(first, min(first + _CHUNK, rows))
-        if not _run_compiled(guard, plant, record, chunk):
-            _run_guarded(guard, plant, record, chunk)
+def _run_supervised(
+    guard: Guard, plant: Plant, rows_of: Callable[[range], Record], size: int
+) -> Iterator[Record]:
+    """Run `size` samples in chunks; fill and yield the rows of each, which come from `rows_of`."""
+    bound = np.zeros(len(guard.config.joints))
+    for first in (0, *range(1, size, _CHUNK)):
+        chunk = range(first, min(first + _CHUNK, size) if first else 1)
+        record = rows_of(chunk)
+        is_end = chunk.stop == size
+        if not (first and _run_compiled(guard, plant, record, chunk, is_end=is_end)):
+            _run_guarded(guard, plant, record, bound, is_end=is_end)
+        if guard.start_error is not None:
+            raise guard.start_error
+        bound[:] = record.sample(-1).bound
+        yield record
 
 
-def _run_compiled(guard: Guard, plant: Plant, record: Record, chunk: range) -> bool:
+def _run_compiled(
+    guard: Guard, plant: Plant, record: Record, chunk: range, *, is_end: bool
+) -> bool:
     """Run a chunk in the compiled loop; return False, with nothing changed, if a check fails."""
     controller = guard.controller
     if not guard.supervisor.running or guard.config.safety.velocity != 'measured':
         return False
     before = controller.save(), plant.save(), controller.checks_vector.copy()
-    rows = slice(chunk.start, chunk.stop)
-    arrays = record.measurements[rows], record.samples[rows], record.truths[rows]
-    samples = chunk.start, chunk.stop - 1, chunk.stop == record.stamps.size, True
+    arrays = record.measurements, record.samples, record.truths
+    samples = chunk.start, chunk.stop - 1, is_end, True
     if _run_samples(controller, plant, samples, arrays):
-        last = chunk.stop - 1
         guard.advance(
-            START + int(record.stamps[last]), record.measurements[last], len(chunk)
+            START + int(record.stamps[-1]), record.measurements[-1], len(chunk)
         )
         return True
     controller.restore(before[0])
@@ -204,10 +212,13 @@ def _run_compiled(guard: Guard, plant: Plant, record: Record, chunk: range) -> b
     return False
 
 
-def _run_guarded(guard: Guard, plant: Plant, record: Record, chunk: range) -> None:
-    """Run a chunk of samples as the nodes do."""
+def _run_guarded(
+    guard: Guard, plant: Plant, record: Record, bound: np.ndarray, *, is_end: bool
+) -> None:
+    """Run the samples of a chunk as the nodes do; `bound` (n,) is that of the sample before."""
     settings = guard.controller.settings
-    for row in chunk:
+    size = record.stamps.size
+    for row in range(size):
         measurement = plant.measure()
         record.measurements[row] = measurement
         record.truths[row] = plant.truth()
@@ -221,8 +232,8 @@ def _run_guarded(guard: Guard, plant: Plant, record: Record, chunk: range) -> No
             record.samples[row] = np.nan
             sample = sample_of(record.samples[row], settings)
             sample.torque[:] = torque
-            sample.bound[:] = record.sample(row - 1).bound
-        if row + 1 < record.stamps.size:
+            sample.bound[:] = record.sample(row - 1).bound if row else bound
+        if not (is_end and row + 1 == size):
             plant.step(torque)
 
 
@@ -266,6 +277,17 @@ class Record:
     controller: Controller  # after the run
     journal: Journal  # events of the run, their stamps from `START` on
 
+    def rows(self, chosen: range) -> Record:
+        """Return some rows, as views."""
+        rows = slice(chosen.start, chosen.stop)
+        return replace(
+            self,
+            stamps=self.stamps[rows],
+            measurements=self.measurements[rows],
+            samples=self.samples[rows],
+            truths=self.truths[rows],
+        )
+
     def sample(self, row: int) -> Sample:
         """Return one row of `samples` with named fields."""
         return sample_of(self.samples[row], self.controller.settings)
@@ -304,15 +326,18 @@ def new_record(
     config: ControllerConfig,
     plant: PlantConfig,
     journal: Journal,
+    rows: range | None = None,
 ) -> Record:
-    """Return a record for a run of a plant, to be filled."""
-    rows, n = steps_of(plant) + 1, len(plant.joints)
+    """Return a record for a run of a plant, or some of its rows, to be filled."""
+    chosen = rows or range(steps_of(plant) + 1)
+    size = len(chosen)
+    n = len(plant.joints)
     names = parameter_names_of(plant)
     return Record(
-        stamps=np.arange(rows, dtype=np.int64) * plant.sample_time_ns,
-        measurements=np.zeros((rows, 3 * n)),
-        samples=np.zeros((rows, controller.sample_vector.size)),
-        truths=np.zeros((rows, len(names) + 3 * n)),
+        stamps=np.array(chosen, dtype=np.int64) * plant.sample_time_ns,
+        measurements=np.zeros((size, 3 * n)),
+        samples=np.zeros((size, controller.sample_vector.size)),
+        truths=np.zeros((size, len(names) + 3 * n)),
         parameters=names,
         config=config,
         controller=controller,
@@ -332,35 +357,72 @@ def write_bag(
     It has the configuration of the controller and, if given, of the plant; `compression` is `none`
     or `zstd`. Raises BagError if `path` exists already.
     """
+    _write_bag(path, [record], plant, compression)
+
+
+def simulate_into_bag(
+    path: Path,
+    controller: ControllerConfig,
+    plant: PlantConfig,
+    *,
+    compression: str = 'none',
+) -> None:
+    """Run as `simulate` does and write the bag of `write_bag`, in the memory of a short run.
+
+    Arguments and errors are those of both.
+    """
+    guard = Guard(controller, lambda: 0, lambda: 0)
+    guard.activate()
+
+    def rows_of(rows: range) -> Record:
+        return new_record(guard.controller, controller, plant, guard.journal, rows)
+
+    size = steps_of(plant) + 1
+    parts = _run_supervised(guard, plant_of(plant), rows_of, size)
+    first = next(parts)  # before there is a bag: it may not start
+    _write_bag(path, chain([first], parts), plant, compression)
+
+
+def _write_bag(
+    path: Path, parts: Iterable[Record], plant: PlantConfig | None, compression: str
+) -> None:
+    """Write the messages of the parts of a record, one after the other."""
     bag = TopicRecorder(path, compression=compression, flush_interval=None)
     with closing(bag):
         if plant is not None:
             configured = encode_change(START, flatten(plant), configured=True)
             bag.write(START, topics.CHANGES, configured)
-        for stamp, message in _messages(record):
+        for stamp, message in _messages(parts):
             bag.write(stamp, *message)
 
 
-def _messages(record: Record) -> Iterator[tuple[int, Message]]:
-    config = record.config
-    plant = PlantTelemetry(config.joints, record.parameters)
-    controller = ControllerTelemetry(config, estimate_names(config))
-    limit = np.array(config.torque.limit)
-    events = deque(record.journal.pending)
-    ratio = np.zeros(len(config.joints))
-    for row, elapsed in enumerate(record.stamps.tolist()):
-        stamp = START + elapsed
-        sample = record.sample(row)
-        while events and events[0].messages <= row:
-            yield stamp, (topics.JOURNAL, events.popleft().encode())
-        yield stamp, plant.joint_states(stamp, record.measurements[row])
-        yield stamp, controller.command(sample.torque)
-        if row % DECIMATION == 0:
-            yield stamp, plant.truth(stamp, record.truths[row])
-        if np.isnan(sample.qr[0]):  # stopped
-            continue
-        np.maximum(ratio, np.abs(sample.xi1) / sample.bound, out=ratio)
-        for message in controller.sample(stamp, sample, limit, ratio, float('nan')):
-            yield stamp, message
-    for event in events:
-        yield START + int(record.stamps[-1]), (topics.JOURNAL, event.encode())
+def _messages(parts: Iterable[Record]) -> Iterator[tuple[int, Message]]:
+    """Yield the messages of a run, whose record comes in parts, with their times [ns]."""
+    row = noted = 0
+    ratio = np.zeros(0)
+    for record in parts:
+        if not row:
+            config = record.config
+            plant = PlantTelemetry(config.joints, record.parameters)
+            controller = ControllerTelemetry(config, estimate_names(config))
+            limit = np.array(config.torque.limit)
+            ratio = np.zeros(len(config.joints))
+        events = deque(islice(record.journal.pending, noted, None))
+        for k, elapsed in enumerate(record.stamps.tolist()):
+            stamp = START + elapsed
+            sample = record.sample(k)
+            while events and events[0].messages <= row:
+                yield stamp, (topics.JOURNAL, events.popleft().encode())
+                noted += 1
+            yield stamp, plant.joint_states(stamp, record.measurements[k])
+            yield stamp, controller.command(sample.torque)
+            if row % DECIMATION == 0:
+                yield stamp, plant.truth(stamp, record.truths[k])
+            row += 1
+            if np.isnan(sample.qr[0]):  # stopped
+                continue
+            np.maximum(ratio, np.abs(sample.xi1) / sample.bound, out=ratio)
+            for message in controller.sample(stamp, sample, limit, ratio, float('nan')):
+                yield stamp, message
+    for event in islice(record.journal.pending, noted, None):
+        yield stamp, (topics.JOURNAL, event.encode())
