@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import importlib.util
 import pickle
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -14,6 +15,7 @@ from blf_dsc_controller.cli.main import main
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.law_file import load_law
 from blf_dsc_controller.configuration.nodes import locate
+from blf_dsc_controller.configuration.plant import PlantConfig
 from blf_dsc_controller.configuration.schema import build, change, flatten
 from blf_dsc_controller.errors import BlfDscError, ConfigurationError
 from blf_dsc_controller.law.factory import controller_of, law_of
@@ -117,6 +119,50 @@ def test_gains_change_while_it_runs():
     after = controller.trial(0.0, 1e-3, measurement)
     assert np.abs(after - before).max() > 0.0
     assert controller.law.position == 1800.0
+
+
+def section_of_all_nodes(folder, entries):
+    file = folder / 'all.yaml'
+    text = f'/**:\n  ros__parameters: {{law: {LAW}, {entries}}}\n'
+    file.write_text(text, encoding='utf-8')
+    return file
+
+
+def test_gains_may_be_in_the_section_of_all_nodes(tmp_path):
+    file = section_of_all_nodes(tmp_path, 'gains: {velocity: 80.0}')
+    assert law_of(blf.load_loop(file).controller).velocity == 80.0
+    file = section_of_all_nodes(tmp_path, 'gains: {velocty: 80.0}')
+    with pytest.raises(ConfigurationError) as raised:
+        blf.load_loop(file)
+    (problem,) = raised.value.problems
+    assert problem == (
+        'blf_dsc_controller: line 2: gains.velocty: unknown parameter, '
+        'did you mean gains.velocity?'
+    )
+
+
+def test_nodes_over_ros_take_their_own_of_the_section_of_all_nodes(bare_node, tmp_path):
+    from blf_dsc_controller.nodes.parameters import declare
+
+    file = section_of_all_nodes(tmp_path, 'gains: {velocity: 80.0}')
+    controller = declare(bare_node('blf_dsc_controller', file), ControllerConfig)
+    assert law_of(controller).velocity == 80.0
+    assert declare(bare_node('sim_plant', file), PlantConfig) == PlantConfig()
+
+
+def test_replay_remarks_that_the_file_of_the_law_has_changed(tmp_path):
+    """A bag holds the digest of the file, not the file."""
+    law = tmp_path / 'my_law.py'
+    law.write_bytes(Path(LAW).read_bytes())
+    loop = blf.load_loop('recommended', {'blf_dsc_controller': {'law': str(law)}})
+    bag = tmp_path / 'bag'
+    with blf.ArmController(loop.controller, record=bag) as controller:
+        for step in range(3):
+            controller.update(1.0 + step * 1e-3, loop.plant.initial.position, [0.0] * 2)
+    assert blf.verify(bag).remarks == ()
+    law.write_text(law.read_text(encoding='utf-8') + '# changed', encoding='utf-8')
+    (remark,) = blf.verify(bag).remarks
+    assert remark.startswith(f'{law} is another file than the one recorded')
 
 
 @pytest.mark.skipif(importlib.util.find_spec('rclpy') is None, reason='needs ROS 2')

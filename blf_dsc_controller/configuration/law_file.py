@@ -43,12 +43,19 @@ def load_law(path: str) -> type:
 
     Raises BlfDscError if it cannot be imported, or defines no law.
     """
-    place = Path(path).expanduser().resolve()
+    return _load(Path(path).expanduser().resolve(), digest(path))
+
+
+def digest(path: str) -> str:
+    """Return the beginning of the SHA-256 of a file, in hexadecimal.
+
+    Raises BlfDscError if it cannot be read.
+    """
     try:
-        content = place.read_bytes()
+        content = Path(path).expanduser().read_bytes()
     except OSError as error:
         raise BlfDscError(f'{path} cannot be read: {error.strerror}') from error
-    return _load(place, hashlib.sha256(content).hexdigest()[:12])
+    return hashlib.sha256(content).hexdigest()[:12]
 
 
 @functools.cache

@@ -14,6 +14,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Literal, NamedTuple, TypeVar
 
+from blf_dsc_controller.configuration import law_file
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.drive import DriveConfig
 from blf_dsc_controller.configuration.files import (
@@ -151,6 +152,21 @@ def known_names() -> frozenset[str]:
     return frozenset(param.name for cls in NODES.values() for param in parameters(cls))
 
 
+def is_of_node(name: str, cls: type) -> bool:
+    """Return whether a parameter in a section for several nodes is one of this node.
+
+    The gains of a law of a file are the controller's, whatever they are called.
+    """
+    if is_gain_of_law(name):
+        return cls is ControllerConfig
+    return name in {param.name for param in parameters(cls)}
+
+
+def is_gain_of_law(name: str) -> bool:
+    """Return whether the name is one of the group of a law of a file."""
+    return name.startswith(f'{law_file.GROUP}.')
+
+
 def is_builtin(name: str) -> bool:
     """Whether ROS itself, not this package, declares the parameter."""
     builtin = ('use_sim_time', 'start_type_description_service')
@@ -261,20 +277,21 @@ def _load_all(
         f'line {entry.line}: {unknown(name, known)}'
         for section in sections
         for name, entry in section.entries.items()
-        if section.is_wildcard and name not in known and not is_builtin(name)
+        if section.is_wildcard and name not in known
+        if not (is_builtin(name) or is_gain_of_law(name))
     ]
     problems += unmatched_sections(sections, nodes)
     configs: dict[str, Any] = {}
     nodes_with: dict[str, list[str]] = {}
     for node, cls in nodes.items():
         chosen = overrides.get(node, {})
-        own = {param.name for param in parameters(cls)}
         entries = {
             name: entry
             for section in sections
             if section.matches('/' + node.removeprefix('/'))
             for name, entry in section.entries.items()
-            if name in own or not (section.is_wildcard or is_builtin(name))
+            if not section.is_wildcard or is_of_node(name, cls)
+            if not is_builtin(name)
         }
         values = {name: entry.value for name, entry in entries.items()}
         try:

@@ -119,6 +119,7 @@ SCHEMA: Mapping[str, Mapping[str, Field]] = {
         'format': Field(COUNT, optional=True),  # of the journal; 0 without
         'version': Field(TEXT, optional=True),  # of the package
         'topics': Field(NAMES_BY_NAME, optional=True),  # used, by our name
+        'law_digest': Field(TEXT, optional=True),  # of the file of a law
     },
     'activate': {},
     'prepare': {'positions': Field(NUMBERS)},  # rad, of the arm at rest

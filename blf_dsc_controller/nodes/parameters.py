@@ -15,7 +15,12 @@ from rclpy.parameter import Parameter as RosParameter
 from rclpy.wait_for_message import wait_for_message
 from std_msgs.msg import String
 
-from blf_dsc_controller.configuration.nodes import is_builtin, known_names
+from blf_dsc_controller.configuration.nodes import (
+    is_builtin,
+    is_gain_of_law,
+    is_of_node,
+    known_names,
+)
 from blf_dsc_controller.configuration.robot import TOPIC
 from blf_dsc_controller.configuration.schema import (
     Parameter,
@@ -200,7 +205,7 @@ def _overrides(node: Node, cls: type[Config]) -> dict[str, Any]:
     are accepted, as in a section for several nodes.
     """
     own = {parameter.name: parameter for parameter in parameters(cls)}
-    others = known_names() - own.keys()
+    known = known_names()
     for remark in check_sections(sys.argv, node.get_fully_qualified_name()):
         node.get_logger().warning(remark)
     overrides = node._parameter_overrides  # noqa: SLF001 - those in start files and arguments
@@ -209,7 +214,8 @@ def _overrides(node: Node, cls: type[Config]) -> dict[str, Any]:
     return {
         name: [] if value is None and name in own and own[name].is_array else value
         for name, value in given.items()
-        if name not in others and not is_builtin(name)
+        if is_of_node(name, cls) or not (name in known or is_gain_of_law(name))
+        if not is_builtin(name)
     }
 
 

@@ -18,6 +18,8 @@ from blf_dsc_controller.bags.topic_messages import (
     TopicMessages,
     UnreadableMessageError,
 )
+from blf_dsc_controller.configuration import law_file
+from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.schema import flatten
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.messages import topics
@@ -183,7 +185,7 @@ def verify(path: Path, namespace: str = '', names: NameMap = NO_NAMES) -> Verifi
         comparisons,
         tuple(each.name for each in texts),
         tuple(run.events),
-        tuple(_remarks(content, end, newer)),
+        tuple(_remarks(content, end, newer, _changed_law(config, events[0]))),
         tuple(_incomplete(content, events, comparisons, end)),
         min(differences, key=lambda found: found.stamp, default=None),
     )
@@ -385,8 +387,12 @@ def _numbers(topic: topics.Topic, recorded: JointStates, answers: int) -> Stamps
 # Remarks.
 
 
-def _remarks(content: Content, end: str, newer: Sequence[str]) -> Iterator[str]:
+def _remarks(
+    content: Content, end: str, newer: Sequence[str], changed_law: str
+) -> Iterator[str]:
     """Yield what limits the result."""
+    if changed_law:
+        yield f'{changed_law} is another file than the one recorded: differences may come from it'
     if end:
         yield f'{end}: the replay ends there'
     for topic, what in content.losses.items():
@@ -397,6 +403,14 @@ def _remarks(content: Content, end: str, newer: Sequence[str]) -> Iterator[str]:
             f'recorded by version {content.version or "unknown"}{lacking} and replayed by '
             f'{__version__}: differences may come from the software'
         )
+
+
+def _changed_law(config: ControllerConfig, configure: Event) -> str:
+    """Return the file of the law if it has changed since the recording, or nothing."""
+    recorded = configure.content.get('law_digest')
+    if recorded is None or law_file.digest(config.law) == recorded:
+        return ''
+    return config.law
 
 
 def _incomplete(

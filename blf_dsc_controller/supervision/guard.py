@@ -16,6 +16,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from blf_dsc_controller.configuration import law_file
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.schema import differences, flatten
 from blf_dsc_controller.errors import BlfDscError, StartError
@@ -155,7 +156,12 @@ class Guard:
         self._prepared: PreparedStart | None = None
         self._clean = True  # whether the window holds valid samples only
         self._resumable = False  # whether the law may continue along its reference
-        self.journal.note(EventType.CONFIGURE, parameters=flatten(config))
+        digest = (
+            {'law_digest': law_file.digest(config.law)}
+            if law_file.is_file(config.law)
+            else {}
+        )
+        self.journal.note(EventType.CONFIGURE, parameters=flatten(config), **digest)
 
     @property
     def commanding(self) -> bool:
