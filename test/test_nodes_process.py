@@ -11,6 +11,7 @@ import runpy
 import socket
 import subprocess
 import sys
+import time
 from operator import itemgetter
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
@@ -30,6 +31,7 @@ from blf_dsc_controller.configuration.robot import Realtime
 from blf_dsc_controller.control.realtime import request_realtime
 from blf_dsc_controller.errors import BlfDscError, ConfigurationError
 from blf_dsc_controller.nodes.controller_node import ControllerNode
+from blf_dsc_controller.nodes.endpoints import PollingTimer
 from blf_dsc_controller.nodes.plant_node import PlantNode
 from blf_dsc_controller.nodes.process import assigned
 from blf_dsc_controller.nodes.recorder_node import BagRecorderNode
@@ -442,3 +444,26 @@ def test_callbacks_of_timers_take_no_argument(ros, tmp_path, monkeypatch):
     assert len(callbacks) >= 8
     for callback in callbacks:
         assert not inspect.signature(callback).parameters, callback
+
+
+def test_nodes_without_work_poll_rarely_and_at_once_often_again(ros):
+    """Idle nodes would otherwise take several percent of a core."""
+    work, polls = [], []
+
+    def poll():
+        polls.append(time.monotonic())
+        return bool(work)
+
+    timer = PollingTimer(ros.tester, 0.002, poll)
+    for _ in range(3):
+        ros.until(timer._timer.is_canceled)
+        del polls[:]
+        ros.until(lambda: len(polls) > 5)
+        assert polls[-1] - polls[0] > 0.1  # and not every 2 ms
+        work.append(1)
+        ros.until(lambda: not timer._timer.is_canceled())
+        del polls[:]
+        ros.until(lambda: len(polls) > 100)
+        # resets of a timer must not add up
+        assert polls[-1] - polls[0] > 0.75 * 100 * 0.002
+        work.clear()

@@ -61,6 +61,7 @@ class ControllerNode(LoopNode[ControllerConfig]):
         self._decoder = JointStateDecoder(joints, required=('position',))
         self._encoder = Float64MultiArrayEncoder(len(joints))
         self._pending: bytes | None = None
+        self._polled = 0  # joint states at the last poll
         self._gate = StartGate(self.config.sample_time)
         self._warned_at = -1  # stamp of the start that the last warning was about
         # whether the tracking errors had subscribers at the last count
@@ -318,16 +319,20 @@ class ControllerNode(LoopNode[ControllerConfig]):
         if torque is not None:
             self._senders[topics.COMMANDS](self._encoder.encode(torque))
 
-    def _on_poll(self) -> None:
-        """Check for missing states; a timer reset by its own callback would multiply under load."""
+    def _on_poll(self) -> bool:
+        """Check for missing states."""
         self._changes.poll()
         guard = self.guard
-        if guard is not None:
-            self._start_from_pending(guard)
-            self._command(guard.watch())
-            self._report_if_changed(guard)
         if self._action is not None:
             self._action.poll(guard)
+        if guard is None:
+            return False
+        self._start_from_pending(guard)
+        self._command(guard.watch())
+        self._report_if_changed(guard)
+        is_watched = guard.watchdog.on and guard.commanding
+        polled, self._polled = self._polled, guard.journal.messages
+        return is_watched or self._pending is not None or polled != self._polled
 
     def _start_from_pending(self, guard: Guard) -> None:
         """Use a state that was held back, once it is observed or its sender turns out to wait."""

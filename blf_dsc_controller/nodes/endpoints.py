@@ -102,6 +102,10 @@ def qos_profile(quality: Quality) -> QoSProfile:
     )
 
 
+_RARE_PERIOD = 0.05  # s, of a node that has nothing to do
+_IDLE_AFTER = 0.1  # s without work
+
+
 # Declares `qos_overrides.TOPIC.publisher.depth`, and likewise for history and reliability.
 _overridable = QoSOverridingOptions.with_default_policies
 
@@ -137,6 +141,42 @@ def create_steady_timer(
     return node.create_timer(
         period, callback, clock=Clock(clock_type=ClockType.STEADY_TIME)
     )
+
+
+class PollingTimer:
+    """Calls `poll` in a period [s] while it finds work, and rarely after a while without any.
+
+    An idle node would otherwise take several percent of a core. `poll` returns whether it found
+    work. In between a second timer polls: it goes on for ever, since one that is reset by its own
+    callback would multiply under load.
+    """
+
+    def __init__(self, node: Node, period: float, poll: Callable[[], bool]) -> None:
+        self._poll = poll
+        self._worked = time.monotonic()
+        self._timer = create_steady_timer(node, period, self._poll_often)
+        create_steady_timer(node, _RARE_PERIOD, self._poll_rarely)
+
+    @property
+    def period(self) -> float:
+        """Period while there is work [s]."""
+        return float(self._timer.timer_period_ns * 1e-9)
+
+    @period.setter
+    def period(self, value: float) -> None:
+        self._timer.timer_period_ns = round(1e9 * value)
+
+    def _poll_often(self) -> None:
+        now = time.monotonic()
+        if self._poll():
+            self._worked = now
+        elif now > self._worked + _IDLE_AFTER:
+            self._timer.cancel()
+
+    def _poll_rarely(self) -> None:
+        if self._timer.is_canceled() and self._poll():
+            self._worked = time.monotonic()
+            self._timer.reset()
 
 
 _BATCH = 1000  # messages taken from one topic before the next one's turn

@@ -24,6 +24,7 @@ from blf_dsc_controller.law.telemetry import Message
 from blf_dsc_controller.messages.topics import WATCHDOG_NODE, Topic
 from blf_dsc_controller.nodes import parameters, process
 from blf_dsc_controller.nodes.endpoints import (
+    PollingTimer,
     create_publisher,
     create_steady_timer,
     create_subscription,
@@ -162,7 +163,7 @@ class LoopNode(LifecycleNode, process.PlainNode, Generic[Config]):
 
     def start(self) -> None:
         """Start timers and services, and the node itself if `autostart` is set."""
-        create_steady_timer(self, PERIOD, self._on_poll)
+        PollingTimer(self, PERIOD, self._on_poll)
         create_steady_timer(self, _DIAGNOSTICS_PERIOD, self._on_second)
         self.create_service(Trigger, '~/reset', self._on_reset)
         if self.config.autostart:
@@ -188,7 +189,8 @@ class LoopNode(LifecycleNode, process.PlainNode, Generic[Config]):
         """Restart the active node; return the message of the response."""
 
     @abstractmethod
-    def _on_poll(self) -> None: ...
+    def _on_poll(self) -> bool:
+        """Do what cannot wait for a message; return whether there is anything to do."""
 
     @abstractmethod
     def _report(self) -> None:

@@ -163,9 +163,9 @@ class PlantNode(LoopNode[PlantConfig]):
 
     # The loop.
 
-    def _on_poll(self) -> None:
+    def _on_poll(self) -> bool:
         if self.finished or self.state_label != 'active':
-            return
+            return False
         waits = (self._lockstep or not self._running) and not self._has_torque
         if not self._offered:
             if not next(self._peers, False):
@@ -173,6 +173,7 @@ class PlantNode(LoopNode[PlantConfig]):
         elif waits and self._now() - self._published > _REPEAT_PERIOD:
             self.get_logger().info('no torque yet: sending the state again')
             self._publish_state()
+        return waits
 
     def _wait_for_peers(self, *, reset: bool) -> Iterator[bool]:
         """Yield True until the first state can be sent.

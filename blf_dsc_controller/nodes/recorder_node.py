@@ -20,6 +20,7 @@ from blf_dsc_controller.messages.codecs import (
 )
 from blf_dsc_controller.messages.topics import JOINT_STATES
 from blf_dsc_controller.nodes.endpoints import (
+    PollingTimer,
     RawMessage,
     RawSubscriptions,
     compatible,
@@ -33,6 +34,7 @@ from blf_dsc_controller.nodes.process import PlainNode, run
 
 _DISCOVERY_PERIOD = 0.1  # s
 _TAKE_PERIOD = 0.01  # s
+_RARE = 5  # messages at once, such as diagnostics; those of a loop are more
 _FLUSH_INTERVAL = 0.05  # s; below 0.1 s including _TAKE_PERIOD, unless overloaded
 _REPEAT = 60.0  # s between repeats of a warning
 
@@ -73,6 +75,7 @@ class BagRecorderNode(PlainNode):
         self._skipped: set[str] = set()
         # handles of topics whose publishers are all reliable so far
         self._reliable: dict[str, int] = {}
+        self._publisher_counts: dict[str, int] = {}  # when they were last looked at
         # by the handle of a topic with two subscriptions
         self._twice: dict[int, RecentMessages] = {}
         self._joint_states = self.resolve_topic_name(JOINT_STATES.relative)
@@ -80,7 +83,7 @@ class BagRecorderNode(PlainNode):
         self._waiting: list[RawMessage] = []  # for the first joint state
         self._plant_time = -1  # ns; -1 before the first joint state
         create_steady_timer(self, _DISCOVERY_PERIOD, self._discover)
-        create_steady_timer(self, _TAKE_PERIOD, self._record_due)
+        PollingTimer(self, _TAKE_PERIOD, self._record)
         # The folder is created last: from here on, any end of the node also completes the bag.
         self._bag = BagWriter(
             self._config.output,
@@ -123,6 +126,10 @@ class BagRecorderNode(PlainNode):
         A reliable subscription gets nothing from it, and a best-effort one may lose messages of
         the others: both are kept, and what arrives twice is recorded once.
         """
+        count = self.count_publishers(topic)
+        if count == self._publisher_counts.get(topic):
+            return
+        self._publisher_counts[topic] = count
         publishers = self.get_publishers_info_by_topic(topic)
         offered = [quality_of(each.qos_profile) for each in publishers]
         if all(each.reliability == 'reliable' for each in offered):
@@ -171,16 +178,16 @@ class BagRecorderNode(PlainNode):
         self._skipped.add(topic)
         self.get_logger().warning(f'{topic} is not recorded: {reason}')
 
-    def _record_due(self) -> None:
-        self._record()
+    def _record(self, *, flush: bool = False) -> bool:
+        """Write the waiting messages, and flush them to disk: all with `flush`, else those due.
 
-    def _record(self, *, flush: bool = False) -> None:
-        """Write the waiting messages, and flush them to disk: all with `flush`, else those due."""
+        Returns whether there were so many that more are due soon.
+        """
         if self.failure is not None:
-            return
+            return False
+        taken = self._raw_subscriptions.take()
         try:
-            messages = filter(self._is_first, self._raw_subscriptions.take())
-            for message in self._timed([*messages]):
+            for message in self._timed([*filter(self._is_first, taken)]):
                 self._bag.write(*message)
             if flush:
                 self._bag.flush()
@@ -192,6 +199,7 @@ class BagRecorderNode(PlainNode):
                 f'{self._bag.path} cannot be written any further: {error.strerror}; '
                 f'blf_dsc recover {self._bag.path} saves what was written before'
             )
+        return len(taken) > _RARE
 
     def _is_first(self, message: RawMessage) -> bool:
         """Whether a message has not been taken from another subscription before."""

@@ -36,6 +36,7 @@ from blf_dsc_controller.messages.journal import Event, EventType, decode
 from blf_dsc_controller.messages.topics import Quality
 from blf_dsc_controller.nodes.diagnostics import ERROR, OK, WARN, DiagnosticsPublisher
 from blf_dsc_controller.nodes.endpoints import (
+    PollingTimer,
     RawMessage,
     RawSubscriptions,
     create_steady_timer,
@@ -85,7 +86,7 @@ class WatchdogNode(PlainNode):
         )
         self._diagnostics = DiagnosticsPublisher(self, ())
         self._controller = f'{self.get_namespace().rstrip("/")}/{topics.CONTROLLER}'
-        self._timer = create_steady_timer(self, _PERIOD, self._poll)
+        self._timer = PollingTimer(self, _PERIOD, self._poll)
         create_steady_timer(self, _REPORT_PERIOD, self._report)
         if self._config.armed:
             files = parameter_files(sys.argv) or ['recommended']
@@ -176,7 +177,8 @@ class WatchdogNode(PlainNode):
 
     # States and torques.
 
-    def _poll(self) -> None:
+    def _poll(self) -> bool:
+        """Take what has arrived, and command if the controller does not."""
         messages = self._raw_subscriptions.take()
         was_active = self.watchdog is not None and self.watchdog.active
         journal = [each for each in messages if each.handle is topics.JOURNAL]
@@ -184,13 +186,14 @@ class WatchdogNode(PlainNode):
             self._read_journal(journal)
         watchdog = self.watchdog
         if watchdog is None:
-            return
+            return bool(messages)
         now = self._steady() * 1e-9
         for message in messages:
             self._take(watchdog, message, now)
         self._publish(watchdog.poll(now))
         if watchdog.active != was_active:
             self._change_command(watchdog)
+        return bool(messages) or watchdog.active
 
     def _take(self, watchdog: TorqueWatchdog, message: RawMessage, now: float) -> None:
         raw = message.raw
@@ -217,7 +220,7 @@ class WatchdogNode(PlainNode):
             )
         else:
             self.get_logger().warning('this node no longer commands a torque')
-        self._timer.timer_period_ns = round(1e9 * period)
+        self._timer.period = period
         self._report()
 
     def _publish(self, torque: np.ndarray | None) -> None:
