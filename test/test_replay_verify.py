@@ -329,6 +329,14 @@ def test_bag_of_an_earlier_version_is_read_and_its_replay_is_refused(capsys):
     assert 'no rule says how to do without it' in error
 
 
+def test_bag_of_the_first_release_is_replayed_with_every_number_compared():
+    """20 samples of the Panda; a parameter that goes away needs its rule."""
+    replayed = verify(Path(__file__).with_name('first_release.mcap'))
+    assert replayed.samples == 20
+    assert replayed.compared == 1.0
+    assert replayed.events[-1].type is EventType.RELEASE
+
+
 @pytest.mark.parametrize(
     ('value', 'code', 'words'),
     [
