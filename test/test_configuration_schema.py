@@ -15,6 +15,7 @@ from blf_dsc_controller.configuration.schema import build, change, flatten, para
 from blf_dsc_controller.errors import ConfigurationError
 from blf_dsc_controller.law import factory, state
 
+NAN = float('nan')
 TRUE_MODEL = {'law': 'model_based', 'truth.parameters': [1.0, 0.32, 0.4]}
 PLANT = (PlantConfig,)
 CONTROLLER = (ControllerConfig,)
@@ -242,6 +243,20 @@ def test_limits_are_inclusive_and_arrays_as_long_as_others_say():
             CONTROLLER,
             {'limits.position_upper': [1.0, 1.0], 'limits.position_lower': [-1.0, 1.0]},
             'got 1 rad for joint2, but it must be above',
+        ),
+        (CONTROLLER, {'limits.jerk': [0.0, 1.0]}, 'got 0.0 at entry 1 of'),
+        (CONTROLLER, {'limits.jerk': [1.0, -1.0]}, 'got -1.0 at entry 2 of'),
+        (CONTROLLER, {'limits.jerk': [1.0, NAN]}, 'got .nan at entry 2 of'),
+        (CONTROLLER, {'limits.jerk': [1.0]}, 'got 1, but 2 entries are needed'),
+        (CONTROLLER, {'limits.jerk': 1.0}, 'got 1.0, but a double array is expected'),
+        *(
+            (CONTROLLER, {'reference.stream_timeout': value}, message)
+            for value, message in (
+                (0.0, 'got 0.0, but it must be above 0 s'),
+                (-1.0, 'got -1.0, but it must be above 0 s'),
+                (NAN, 'got .nan, but a finite number is needed'),
+                ([0.2, 0.2], 'got [0.2, 0.2], but a double is expected'),
+            )
         ),
         # Of an arm that cannot be read, no lengths are known.
         (

@@ -15,6 +15,7 @@ from blf_dsc_controller.configuration.controller import ControllerConfig, Motion
 from blf_dsc_controller.reference import retargeting
 from blf_dsc_controller.reference import terms as reference
 from blf_dsc_controller.reference.approach import MotionError
+from blf_dsc_controller.reference.stream import TargetStream
 from blf_dsc_controller.reference.terms import (
     minimum_jerk,
     pack,
@@ -487,10 +488,10 @@ def test_without_ruckig_what_exceeds_the_limits_says_what_is_missing(monkeypatch
     plan(trajectory((GOALS, VELOCITIES[::-1])))  # brakes after its end all the same
 
 
-# Random sequences of trajectories, adopted as the guard does: planned from the
-# reference in force at one sample for a time ahead, and followed from a later sample
-# on.
-SEQUENCES = 10_000 if os.environ.get('NIGHTLY') else 300
+# Random sequences of trajectories, chunks, streamed targets and stops, adopted as the
+# guard does: planned from the reference in force at one sample for a time ahead, and
+# followed from a later sample on. A stop takes effect at once.
+SEQUENCES = 10_000 if os.environ.get('NIGHTLY') else 150
 PERIOD = 1e-3  # s
 FASTEST = np.array(LIMITS.limits.velocity)
 STRONGEST = np.array(LIMITS.limits.acceleration)
@@ -533,17 +534,58 @@ def check_seams(before, vector, first, last):
     np.testing.assert_allclose(*both, rtol=0.0, atol=1e-9)
 
 
+def random_chunk(rng, at, vector):
+    """Return bare positions every 50 ms, the first ones late or in the past, that end in motion."""
+    times = 0.05 * np.arange(1.0, rng.integers(4, 20))
+    start = sampled(vector, np.array([at]))[0]
+    slope = start[1] + rng.normal(size=2) * 0.2
+    curve = rng.normal(size=2) * 0.5
+    t = times[:, np.newaxis]
+    positions = start[0] + rng.normal(size=2) * 0.003 + t * slope + t * t * curve
+    begin = at + rng.uniform(-0.1, 0.05)
+    return trajectory((positions,), times=times.tolist(), begin=begin)
+
+
+def random_target(rng, stream, at, vector):
+    """Return the next target of a stream, which moves, jumps, or gives its velocity."""
+    start = sampled(vector, np.array([at]))[0]
+    size = rng.choice([0.001, 0.02, 0.5])
+    given = rng.normal(size=2) if rng.random() < 0.3 else None
+    return stream.target(
+        at,
+        start[0] + 0.05 * start[1] + size * rng.normal(size=2),
+        timeout=0.25,
+        fastest=FASTEST,
+        velocities=given,
+        ahead=float(rng.uniform(0.0, 0.2)) if given is not None else None,
+    )
+
+
+def random_plan(rng, stream, at, vector):
+    """Return the reference of a random command that is planned for a time."""
+    kind = rng.choice(['trajectory', 'chunk', 'target'], p=[0.4, 0.2, 0.4])
+    if kind == 'target':
+        target = random_target(rng, stream, at, vector)
+        return retargeting.plan_target(target, vector, at, LIMITS).vector
+    make = random_trajectory if kind == 'trajectory' else random_chunk
+    return plan(make(rng, at, vector), vector, at).vector
+
+
 def sequence_of_references(seed):
-    """Return the reference (k, 3, 2) at every sample, while ten trajectories are sent."""
+    """Return the reference (k, 3, 2) at every sample, while ten commands are sent."""
     rng = np.random.default_rng(seed)
+    stream = TargetStream()
     vector, sample, seen, accepted = PAPER, 3300, [], 0
     for _ in range(10):
-        lead = int(rng.choice([0, 5, 20, 160, 320]))
+        is_stop = rng.random() < 0.15
+        lead = 0 if is_stop else int(rng.choice([0, 4, 20, 160, 320]))
         taken = int(rng.integers(0, lead + 1))  # samples that planning takes
         at = (sample + lead) * PERIOD
         try:
-            sent = random_trajectory(rng, at, vector)
-            planned = plan(sent, vector, at).vector
+            if is_stop:
+                planned = retargeting.plan_stop(vector, at, LIMITS).vector
+            else:
+                planned = random_plan(rng, stream, at, vector)
         except TrajectoryError:
             planned = vector
         seen.append(sampled(vector, PERIOD * np.arange(sample, sample + taken)))
@@ -557,7 +599,7 @@ def sequence_of_references(seed):
     return np.concatenate(seen), accepted
 
 
-def test_random_sequences_of_trajectories_never_jump_and_keep_the_limits():
+def test_random_sequences_of_commands_never_jump_and_keep_the_limits():
     """What velocity and acceleration at two samples explain: Taylor's remainders.
 
     Between two samples h apart, the velocity changes by at most the largest

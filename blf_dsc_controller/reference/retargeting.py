@@ -50,6 +50,7 @@ _GROWTH = 1.2
 _ATTEMPTS = 60
 # of the lead, tried before a motion at the limits
 _SMOOTH_LEADS = (1.0, 2.0, 4.0)
+_LONGEST_SMOOTH = 0.2  # s; after losses, longer ones would stay behind
 _CHASES = 8  # attempts to join a line that moves on meanwhile ...
 _LATE = 1e-6  # ... up to this part of the duration
 _CHECKS = 17  # times at which a quintic is checked
@@ -161,11 +162,13 @@ def profile(
     config: ControllerConfig,
     target: np.ndarray | None = None,
     duration: float = 0.0,
+    drift: np.ndarray | float = 0.0,
 ) -> Pieces:
     """Return the fastest motion of limited jerk from a state (3, n) to a target (2, n).
 
     The target is a position and a velocity, to be reached with constant velocity; without one, the
     motion comes to rest anywhere. All joints arrive together, after a `duration` [s] at least.
+    State, target and motion are given relative to a point that moves with `drift` (n,) [rad/s].
 
     Raises:
         MotionError: there is none, or ruckig is not installed.
@@ -177,7 +180,9 @@ def profile(
     given.current_position, given.current_velocity, given.current_acceleration = (
         state.tolist()
     )
-    given.max_velocity = config.limits.velocity
+    fastest = np.array(config.limits.velocity)
+    given.max_velocity = (fastest - drift).tolist()
+    given.min_velocity = (-fastest - drift).tolist()
     given.max_acceleration = config.limits.acceleration
     given.max_jerk = config.limits.largest_jerk
     if target is None:
@@ -189,8 +194,13 @@ def profile(
     if duration > 0.0:
         given.minimum_duration = duration
     found = ruckig.Trajectory(n)
-    result = ruckig.Ruckig(n).calculate(given, found)
-    if result not in (ruckig.Result.Working, ruckig.Result.Finished):
+    try:
+        result = ruckig.Ruckig(n).calculate(given, found)
+    # it fails by an exception, by one of its own numbers that it has no name for, ...
+    except (ruckig.RuckigError, ValueError) as error:
+        reason = str(error).strip().partition('\n')[0]
+        raise MotionError(f'no motion from {state.tolist()} found: {reason}') from error
+    if result not in (ruckig.Result.Working, ruckig.Result.Finished):  # ... or so
         raise MotionError(f'no motion from {state.tolist()} found: {result.name}')
     return _pieces_of(found, state)
 
@@ -348,19 +358,48 @@ def _joined(
 ) -> Pieces:
     """Return the motion from a state (3, n) now [s] onto a moving target, after `lead` [s].
 
-    If the smoothest one exceeds a limit, it is of limited jerk, and longer where it must be.
+    If the smoothest one exceeds a limit, it is the fastest one of limited jerk, relative to the
+    target.
     """
     free = np.full((1, present.shape[1]), nan)
     for factor in _SMOOTH_LEADS:
-        end = np.concatenate((line(now + factor * lead), free))
-        smooth = quintic(present, end, factor * lead)
+        duration = factor * lead
+        if duration > max(lead, _LONGEST_SMOOTH):
+            break
+        end = np.concatenate((line(now + duration), free))
+        smooth = quintic(present, end, duration)
         if keeps_limits(smooth, config):
             return smooth
-    for _ in range(_CHASES):
-        motion = profile(present, config, line(now + lead), lead)
-        if motion.duration <= lead * (1.0 + _LATE):
-            break
-        lead = motion.duration
+    return _caught_up(present, line, now, lead, config)
+
+
+def _caught_up(
+    present: np.ndarray,
+    line: Callable[[float], np.ndarray],
+    now: float,
+    lead: float,
+    config: ControllerConfig,
+) -> Pieces:
+    """Return the fastest motion of limited jerk onto a moving target.
+
+    It is found relative to the target. One that is as fast as the arm may be can not be caught up
+    with: the motion then ends where the target was a while before.
+    """
+    begin = line(now)
+    behind = present.copy()
+    behind[:2] -= begin
+    try:
+        motion = profile(behind, config, np.zeros_like(begin), lead, drift=begin[1])
+    except MotionError:
+        for _ in range(_CHASES):
+            motion = profile(present, config, line(now + lead), lead)
+            if motion.duration <= lead * (1.0 + _LATE):
+                break
+            lead = motion.duration
+        return motion
+    elapsed = (np.cumsum(motion.durations) - motion.durations)[:, np.newaxis]
+    motion.coefficients[:, :, 0] += begin[0] + elapsed * begin[1]
+    motion.coefficients[:, :, 1] += begin[1]
     return motion
 
 

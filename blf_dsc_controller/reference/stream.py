@@ -2,9 +2,9 @@
 """Streams of targets: when each was sent, and with which velocity the sender moves.
 
 The messages carry no time, and arrive late, early or not at all. Their sender is taken to be
-periodic: an alpha-beta filter estimates its clock from the arrivals, and a message that is missing
-is counted as a whole interval. A velocity that the sender does not give is the mean of the last
-`_SPAN`, at least of the last interval.
+periodic: the arrivals are numbered, each by the whole intervals since the one before, and a line of
+least squares through them is its clock. A velocity that the sender does not give is the mean of the
+last `_SPAN`, at least of the last interval.
 
 The reference is at a target one interval after it was sent, when the next one is due: it then
 interpolates and never has to guess what the sender will do.
@@ -18,17 +18,15 @@ import numpy as np
 
 from blf_dsc_controller.reference.retargeting import Target
 
-# Of the filter in the long run: as little damped as keeps it from swinging.
-_POSITION_GAIN = 0.02
-_INTERVAL_GAIN = _POSITION_GAIN**2 / (2.0 - _POSITION_GAIN)
-_MISSING = 0.7  # of an interval; a message that is later counts as one more
 _SPAN = 0.02  # s over which a velocity is averaged
 _COAST = 0.03  # s on the line after its time, at least ...
 _INTERVALS = 2.0  # ... and so many intervals
 _STEP = 1.5  # of the velocity limit; a faster change of positions is a step
-_KEPT = 64  # targets
-_GAPS = 15  # between arrivals, whose median the interval must resemble ...
-_UNLIKE = 1.4  # ... up to this factor
+_KEPT = 64  # messages: a clock's error is a quarter of a single arrival's
+_SHORTEST = 1e-3  # s, of an interval
+_RECENT = 15  # gaps between arrivals, by which the interval must not be ...
+_UNLIKE = 1.4  # ... so many times as long as their mean, ...
+_MOSTLY = 0.1  # ... or as much shorter than all but this share: losses make gaps longer
 
 
 class TargetStream:
@@ -41,14 +39,14 @@ class TargetStream:
     def __init__(self) -> None:
         self.interval = 0.0
         self._sent = 0.0  # s, estimated
-        self._arrived = -np.inf
-        self._count = 0
-        self._targets: deque[tuple[int, np.ndarray]] = deque(maxlen=_KEPT)
-        self._gaps: deque[float] = deque(maxlen=_GAPS)
+        self._arrivals: deque[float] = deque(maxlen=_KEPT)  # s
+        self._positions: deque[np.ndarray] = deque(maxlen=_KEPT)
+        self._numbers = np.zeros(1)  # of the messages, in intervals
 
     def restart(self) -> None:
         """Forget all messages: the next one is the first of a stream."""
-        self._arrived = -np.inf
+        self._arrivals.clear()
+        self._positions.clear()
 
     def target(
         self,
@@ -71,8 +69,11 @@ class TargetStream:
             ahead: time [s] from sending to the positions; without, one interval, and the reference
                 rests where it has braked if nothing follows.
         """
-        self._arrive(arrived, timeout)
-        self._targets.append((self._count, positions))
+        if self._arrivals and arrived - self._arrivals[-1] > timeout:
+            self.restart()
+        self._arrivals.append(arrived)
+        self._positions.append(positions)
+        self._estimate_clock()
         if velocities is None:
             velocities = self._velocity(fastest)
         due = self._sent + (self.interval if ahead is None else ahead)
@@ -87,49 +88,45 @@ class TargetStream:
             held=ahead is not None,
         )
 
-    def _arrive(self, arrived: float, timeout: float) -> None:
-        """Estimate when a message was sent, and the interval."""
-        gap = arrived - self._arrived
-        self._arrived = arrived
-        if gap > timeout:
+    def _estimate_clock(self) -> None:
+        """Estimate the interval, and when the last message was sent."""
+        arrivals = np.array(self._arrivals)
+        gaps = np.diff(arrivals)
+        if gaps.size == 0:
             self.interval = 0.0
-            self._sent = arrived
-            self._count = 0
-            self._targets.clear()
-            self._gaps.clear()
+            self._sent = arrivals[0]
+            self._numbers = np.zeros(1)
             return
-        self._count += 1
-        self._gaps.append(gap)
-        typical = float(np.median(self._gaps))
-        if not 1.0 / _UNLIKE < self.interval / max(typical, 1e-3) < _UNLIKE:
+        recent = np.sort(gaps[-_RECENT:])
+        mean = max(float(np.mean(recent)), _SHORTEST)
+        is_faster = self.interval > _UNLIKE * mean
+        is_slower = self.interval * _UNLIKE < recent[int(_MOSTLY * recent.size)]
+        if gaps.size < _RECENT:
+            self.interval = mean
+        elif is_faster or is_slower:
+            for each in (self._arrivals, self._positions):
+                while len(each) > 2:
+                    each.popleft()
             self.interval = 0.0
-            self._targets.clear()
-        if self.interval == 0.0:
-            self.interval = max(typical, 1e-3)
-            self._sent = arrived
+            self._estimate_clock()
             return
-        passed = max(1, int((arrived - self._sent) / self.interval + 1.0 - _MISSING))
-        self._count += passed - 1
-        late = arrived - self._sent - passed * self.interval
-        # at first those of the line of least squares through all arrivals
-        k = self._count
-        area = (k + 1.0) * (k + 2.0)
-        position_gain = max(_POSITION_GAIN, (4.0 * k + 2.0) / area)
-        interval_gain = max(_INTERVAL_GAIN, 6.0 / area)
-        self._sent += passed * self.interval + position_gain * late
-        self.interval += interval_gain * late / passed
+        passed = _whole_intervals(gaps / self.interval)
+        self._numbers = np.concatenate(([0.0], np.cumsum(passed)))
+        centred = self._numbers - np.mean(self._numbers)
+        slope = centred @ arrivals / (centred @ centred)
+        self.interval = max(float(slope), _SHORTEST)
+        self._sent = float(np.mean(arrivals) + self.interval * centred[-1])
 
     def _velocity(self, fastest: np.ndarray) -> np.ndarray:
         """Return the velocity (n,) [rad/s] at the last target; zero after a step.
 
         It is the slope of the parabola through the last target and two before, or of the line.
         """
-        last, position = self._targets[-1]
-        if len(self._targets) < 2 or self.interval == 0.0:
-            return np.zeros_like(position)
+        if self.interval == 0.0:
+            return np.zeros_like(fastest)
         wanted = max(1, int(_SPAN / self.interval))
-        x, slope = self._slope(last - wanted)
-        farther, chord = self._slope(last - 2 * wanted)
+        x, slope = self._slope(wanted)
+        farther, chord = self._slope(2 * wanted)
         velocity = slope
         if farther > x:
             velocity = (farther * slope - x * chord) / (farther - x)
@@ -137,11 +134,26 @@ class TargetStream:
         velocity[np.abs(velocity) > _STEP * fastest] = 0.0
         return velocity
 
-    def _slope(self, number: int) -> tuple[int, np.ndarray]:
-        """Return the intervals from a target with a number, or before, and the mean rise in one."""
-        last, position = self._targets[-1]
-        for earlier, before in reversed(self._targets):  # noqa: B007 - the last is used
-            if earlier <= number or earlier == self._targets[0][0]:
-                break
-        passed = last - earlier
-        return passed, (position - before) / passed
+    def _slope(self, intervals: int) -> tuple[float, np.ndarray]:
+        """Return the time since a target at least so long ago, or the first, and the mean rise.
+
+        Both in intervals.
+        """
+        before = self._numbers[-1] - self._numbers
+        i = max(int(np.count_nonzero(before >= intervals)) - 1, 0)
+        passed = float(before[i])
+        return passed, (self._positions[-1] - self._positions[i]) / passed
+
+
+def _whole_intervals(gaps: np.ndarray) -> np.ndarray:
+    """Return by how many intervals (k,) messages are apart from gaps between arrivals (k,).
+
+    Messages that arrive together were no losses in the gap before.
+    """
+    passed: np.ndarray = np.maximum(np.rint(gaps), 0.0)
+    for i in np.flatnonzero(passed == 0.0):
+        passed[i] = 1.0
+        longer = np.flatnonzero(passed[:i] > 1.0)
+        if longer.size:
+            passed[longer[-1]] -= 1.0
+    return passed

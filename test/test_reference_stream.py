@@ -1,0 +1,142 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Streams: the sender's clock is found whatever the network does, and losses cost little."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+pytest.importorskip('ruckig', reason='needs ruckig')
+
+from blf_dsc_controller.reference.stream import TargetStream
+
+BENCHMARK = Path(__file__).parents[1] / 'benchmark'
+FASTEST = np.array([1.5, 1.5])
+SLOPE = np.array([0.3, -0.2])  # rad/s
+TIMEOUT = 1.0  # s
+
+
+@pytest.fixture
+def streams(monkeypatch):
+    """Return benchmark/streams.py for short streams at 50 Hz."""
+    monkeypatch.syspath_prepend(str(BENCHMARK))
+    import streams
+
+    monkeypatch.setattr(streams, 'RATES', (50.0,))
+    monkeypatch.setattr(streams, '_DURATION', 4.6)
+    yield streams
+    del sys.modules['streams']
+
+
+def receive(stream, sent, late=0.0):
+    """Pass targets of a motion at constant velocity to a stream; return the last ones."""
+    delays = np.broadcast_to(late, np.shape(sent))
+    return [
+        stream.target(at + delay, SLOPE * at, timeout=TIMEOUT, fastest=FASTEST)
+        for at, delay in zip(sent, delays, strict=True)
+    ]
+
+
+@pytest.mark.parametrize('interval', [0.004, 0.01, 0.1])
+def test_clock_of_a_sender_is_found_from_late_arrivals(interval):
+    """Up to a third of an interval late, at random: a mean of a sixth, 0.096 rms.
+
+    A line through 64 arrivals leaves a quarter of that at its end, and 12^0.5 / 64^1.5
+    in its slope: five times that hold for 800 messages, of which a tenth is lost.
+    """
+    stream = TargetStream()
+    rng = np.random.default_rng(1)
+    numbers = np.arange(1000)
+    sent = interval * numbers[(numbers < 100) | (rng.uniform(size=1000) > 0.1)]
+    late = interval * rng.uniform(0.0, 1.0 / 3.0, sent.size)
+    receive(stream, sent[:200], late[:200])
+    for at, delay in zip(sent[200:], late[200:], strict=True):
+        target = receive(stream, [at], delay)[0]
+        expected = at + (1.0 + 1.0 / 6.0) * interval
+        assert abs(target.due - expected) < 5.0 * 0.024 * interval
+        assert abs(stream.interval - interval) < 5.0 * 0.00065 * interval
+
+
+@pytest.mark.parametrize('factor', [0.5, 0.7, 1.5, 3.0])
+def test_another_rate_is_found_within_fifteen_messages(factor):
+    stream = TargetStream()
+    receive(stream, 0.02 * np.arange(100))
+    sent = 2.0 + factor * 0.02 * np.arange(100)
+    receive(stream, sent[:20])
+    targets = receive(stream, sent[20:])
+    assert stream.interval == pytest.approx(factor * 0.02, rel=1e-3)
+    np.testing.assert_allclose(targets[-1].velocities, SLOPE, rtol=1e-3)
+
+
+def test_burst_of_losses_is_no_slower_sender():
+    """Twelve of 27 messages; every target still has its velocity and its time."""
+    stream = TargetStream()
+    numbers = np.arange(127)
+    lost = [101, 103, 105, 106, 108, 110, 112, 113, 115, 117, 119, 121]
+    receive(stream, 0.01 * numbers[:100], 0.002)
+    kept = np.setdiff1d(numbers[100:], lost)
+    for at, target in zip(
+        0.01 * kept, receive(stream, 0.01 * kept, 0.002), strict=True
+    ):
+        assert stream.interval == pytest.approx(0.01, rel=1e-6)
+        assert target.due == pytest.approx(at + 0.012, abs=1e-6)
+        np.testing.assert_allclose(target.velocities, SLOPE, rtol=1e-5)
+
+
+def test_stream_begins_anew_at_rest_after_a_pause():
+    stream = TargetStream()
+    receive(stream, 0.01 * np.arange(100))
+    target = receive(stream, [2.1])[0]
+    assert (stream.interval, target.due) == (0.0, 2.1)
+    assert target.velocities == (0.0, 0.0)
+
+
+def test_messages_that_arrive_together_are_counted_once():
+    """Three wait for the third: the clock goes on as if they had come in time."""
+    stream = TargetStream()
+    receive(stream, 0.01 * np.arange(100))
+    sent = 0.01 * np.arange(100, 140)
+    late = np.zeros(40)
+    late[:3] = 0.02, 0.01, 0.0
+    target = receive(stream, sent, late)[-1]
+    # three arrivals of 64 are late by a mean of 0.01 s
+    assert target.due == pytest.approx(sent[-1] + 0.01, abs=0.001)
+    np.testing.assert_allclose(target.velocities, SLOPE, rtol=0.02)
+
+
+def test_lost_messages_cost_little_more_than_none(streams):
+    """A tenth is lost: at most the next interval on the line, then the way back to the stream.
+
+    In 20 ms on the line, the motion with 1.8 rad/s^2 leaves it by 0.4 mrad and
+    36 mrad/s. Its way back within 6 rad/s^2 and 120 rad/s^3 takes 35 ms, 0.6 mrad.
+    """
+    found = {}
+    for lost in (0.0, 0.1):
+        times, reference = streams.followed(streams.messages(0.01, 0.0, lost), 0.01)
+        found[lost] = streams.lag_of(times, reference[:, 0])
+    assert found[0.1][0] <= found[0.0][0] + 0.001
+    assert found[0.1][1] <= found[0.0][1] + 0.001
+
+
+def test_tables_of_streams_and_chunks_are_printed(streams, monkeypatch, capsys):
+    """A stream at 50 Hz is an interval behind, and what latency and planning take."""
+    monkeypatch.setattr(streams, '_SAMPLE', 2e-3)
+    streams.main()
+    text = capsys.readouterr().out
+    rows = [line.split(' | ') for line in text.splitlines() if 'mrad |' in line]
+    assert [row[0].lstrip('| ') for row in rows] == [
+        *('positions', 'positions, late', 'positions, lost'),
+        *('with velocities', 'with velocities, late', 'with velocities, lost'),
+    ]
+    for row in rows:
+        lag, off = (float(each.split()[0]) for each in row[1].split(','))
+        assert 19.0 <= lag <= 30.0
+        assert off < 5.0
+    chunks = [line for line in text.splitlines() if 'this package' in line]
+    # 6 rad/s^2 is the limit
+    accelerations = [float(line.split(' | ')[4]) for line in chunks]
+    assert len(accelerations) == 3
+    assert max(accelerations) <= 6.0
