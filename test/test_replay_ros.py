@@ -100,7 +100,8 @@ def test_trajectories_and_gain_change_replay_where_they_took_effect(tmp_path):
     assert result.samples >= 1300
     assert compared(result)['commands'] == 2 * result.samples
     assert compared(result)['reference'] == 4 * -(-result.samples // 10)
-    first, second = (e.content for e in result.events if e.type is EventType.TRAJECTORY)
+    assert result.motions == 2
+    first, second = (each.content for _, each in read_content(run.path).motions)
     assert (tuple(first['joints']), tuple(second['joints'])) == (JOINTS, JOINTS[::-1])
     errors = read_content(run.path).topics[TRACKING_ERROR].joint_states(JOINTS, ())
     assert first['begin'] is None

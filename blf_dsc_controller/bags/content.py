@@ -3,9 +3,10 @@
 
 from __future__ import annotations
 
+import heapq
 import json
 from bisect import bisect_right
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -21,7 +22,7 @@ from blf_dsc_controller.configuration.schema import build
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.messages import topics
 from blf_dsc_controller.messages.codecs import typestore
-from blf_dsc_controller.messages.journal import Event, EventType, decode
+from blf_dsc_controller.messages.journal import MOTIONS, Event, EventType, decode
 from blf_dsc_controller.messages.topics import Topic
 
 _OF_INTEREST = (
@@ -108,33 +109,47 @@ class Content:
 
     @cached_property
     def events(self) -> list[tuple[int, Event]]:
-        """Events of the journal and when they were received [ns]; others' messages are skipped."""
-        found = self._events_on(topics.JOURNAL)
-        targets = self._events_on(topics.TARGETS)
-        if not targets:
-            return found
-        begins = [at for at, event in found if event.type is EventType.CONFIGURE]
+        """Events of the journal but motions, and when they were received [ns].
+
+        Others' messages are skipped.
+        """
+        return list(self._events_on(topics.JOURNAL, are_motions=False))
+
+    @property
+    def motions(self) -> Iterator[tuple[int, Event]]:
+        """Trajectories and targets in the same way, which may be many: read one by one."""
+        begins = [at for at, event in self.events if event.type is EventType.CONFIGURE]
 
         def place(entry: tuple[int, Event]) -> tuple[int, int]:
             received, event = entry
             return bisect_right(begins, received), event.number
 
-        return sorted(found + targets, key=place)
+        found = (
+            self._events_on(topic, are_motions=True)
+            for topic in (topics.JOURNAL, topics.TARGETS)
+        )
+        return heapq.merge(*found, key=place)
 
-    def _events_on(self, topic: Topic) -> list[tuple[int, Event]]:
+    def _events_on(
+        self, topic: Topic, *, are_motions: bool
+    ) -> Iterator[tuple[int, Event]]:
         messages = self.topics.get(topic)
-        found: list[tuple[int, Event]] = []
         size = 0
         for received, raw in messages.raw() if messages else ():
+            try:
+                event = decode(raw)
+            except BlfDscError:
+                continue
+            if (event.type in MOTIONS) != are_motions:
+                continue
             size += len(raw)
-            if size > _MOST_JOURNAL:
+            if size > _MOST_JOURNAL and not are_motions:
                 raise BagError(
                     f'{self.path}: {messages and messages.name} holds more than '
-                    f'{_MOST_JOURNAL / 1e6:.0f} MB, which no controller publishes there'
+                    f'{_MOST_JOURNAL / 1e6:.0f} MB besides motions, which no controller '
+                    'publishes there'
                 )
-            with suppress(BlfDscError):
-                found.append((received, decode(raw)))
-        return found
+            yield received, event
 
     @cached_property
     def changes(self) -> list[dict[str, Any]]:

@@ -33,7 +33,7 @@ class EventType(str, Enum):
     PREPARE = 'prepare'  # the approach is planned before the first state
     START = 'start'  # the law receives its first state
     TRAJECTORY = 'trajectory'
-    TARGET = 'target'  # of a stream; these are on `~/targets`
+    TARGET = 'target'  # of a stream
     BRAKE = 'brake'
     PARAMETERS = 'parameters'
     STOP = 'stop'
@@ -42,6 +42,10 @@ class EventType(str, Enum):
     RESET = 'reset'
     WITHDRAW = 'withdraw'  # nothing is commanded until a reset or activation
     RELEASE = 'release'
+
+
+MOTIONS = frozenset((EventType.TRAJECTORY, EventType.TARGET))
+"""Events that a sender repeats at its rate, for hours: nodes publish them on `~/targets`."""
 
 
 class Event(NamedTuple):

@@ -121,7 +121,7 @@ JOINT_TRAJECTORY = Topic(
 JOURNAL = Topic(CONTROLLER, '~/journal', 'std_msgs/msg/String', HISTORY, HISTORY)
 """Every event of the controller, also for late recorders: see messages.journal."""
 TARGETS = Topic(CONTROLLER, '~/targets', 'std_msgs/msg/String', STREAM, STREAM)
-"""Events with each target of a stream, which would fill the journal's history."""
+"""Events with each trajectory and target, which would fill the journal's history."""
 JOINT_POSITIONS = Topic(
     CONTROLLER, '~/joint_positions', FLOAT64_MULTI_ARRAY, LATEST, LATEST
 )

@@ -16,7 +16,7 @@ from rclpy.node import Node
 
 from blf_dsc_controller.law.telemetry import load_text
 from blf_dsc_controller.messages import topics
-from blf_dsc_controller.messages.journal import EventType
+from blf_dsc_controller.messages.journal import MOTIONS, EventType
 from blf_dsc_controller.messages.topics import LOAD, PHASE, REASON, REJECTED, STOPS
 from blf_dsc_controller.nodes.endpoints import create_publisher
 from blf_dsc_controller.nodes.trajectory_input import TrajectoryInput
@@ -126,8 +126,7 @@ class ControllerStatus:
         """Publish the new events."""
         while guard.journal.pending:
             event = guard.journal.pending.popleft()
-            is_target = event.type is EventType.TARGET
-            publisher = self._targets if is_target else self.journal
+            publisher = self._targets if event.type in MOTIONS else self.journal
             publisher.publish(event.encode())
 
     def _state(self, lifecycle: str, guard: Guard | None) -> Part:

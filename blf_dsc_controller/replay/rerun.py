@@ -9,7 +9,8 @@ dropped has no answer.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import heapq
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -23,7 +24,7 @@ from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.law.factory import estimate_names
 from blf_dsc_controller.law.telemetry import ControllerTelemetry, Message
 from blf_dsc_controller.messages.codecs import MessageError
-from blf_dsc_controller.messages.journal import Event, EventType
+from blf_dsc_controller.messages.journal import MOTIONS, Event, EventType
 from blf_dsc_controller.messages.topics import TRACKING_ERROR, Topic
 from blf_dsc_controller.reference.retargeting import Target, TrajectoryError
 from blf_dsc_controller.reference.trajectory import (
@@ -51,7 +52,8 @@ class Rerun:
     """Replay of the guarded controller.
 
     Attributes:
-        events: replayed events.
+        events: replayed events but motions.
+        motions: number of replayed trajectories and targets.
         topics: what its node would have published, received at the stamp of its state.
         samples: number of samples of the law.
         first, last: stamps [ns] of its first and last sample; -1 before the first.
@@ -77,6 +79,7 @@ class Rerun:
         `commands` is the number of torques in the bag.
         """
         self.events: list[Event] = []
+        self.motions = 0
         self.topics: dict[Topic, TopicMessages] = {}
         self.samples = 0
         self.skipped = 0
@@ -105,24 +108,29 @@ class Rerun:
         self._position = -1  # of the last message processed or passed over
         self._answered_at = -1  # stamp of the last answer
 
-    def run(self, events: Sequence[Event]) -> None:
+    def run(self, events: Sequence[Event], motions: Iterable[Event] = ()) -> None:
         """Process the joint states with the events after the configuration, in order.
+
+        `motions` are the trajectories and targets among them, of which one is held at a time.
 
         Raises:
             BlfDscError: an event cannot be repeated.
         """
         _check(events)
         self._gap = min(self._gap, self._first_unknown(events))
-        for event in events:
-            if event.number != len(self.events) + 1:
-                self.end = 'an event of the journal is not in the bag'
+        for event in heapq.merge(events, motions, key=lambda each: each.number):
+            if event.number != len(self.events) + self.motions + 1:
+                self.end = 'an event of the journal, or a target, is not in the bag'
                 return
             self._approach(event)
             if not self._is_over:
                 self._repeat(event)
             if self._is_over:
                 return
-            self.events.append(event)
+            if event.type in MOTIONS:
+                self.motions += 1
+            else:
+                self.events.append(event)
             if event.type is EventType.RELEASE:
                 return
         while not self._is_over and self._next():

@@ -112,7 +112,8 @@ class Verification(NamedTuple):
     #: one for each topic of the controller with numbers
     comparisons: tuple[Comparison, ...]
     not_compared: tuple[str, ...]  #: topics with text
-    events: tuple[Event, ...]  #: replayed events
+    events: tuple[Event, ...]  #: replayed events but motions
+    motions: int  #: number of replayed trajectories and targets of streams
     remarks: tuple[str, ...]  #: limitations of the result
     incomplete: tuple[str, ...]  #: what the recording lacks
     difference: Difference | None  #: the earliest, in a topic or in an event
@@ -169,7 +170,8 @@ def verify(path: Path, namespace: str = '', names: NameMap = NO_NAMES) -> Verifi
     answers = _before(messages.joint_states(config.joints, ()), until)
     commands = _commands_before(content, until)
     run = Rerun(config, _before(states, until), errors, answers, commands)
-    run.run(events[1:])
+    motions = (event for received, event in content.motions if received < until)
+    run.run(events[1:], motions)
     comparisons = tuple(_compared(content, run, answers, config.joints))
     differences = [found.difference for found in comparisons if found.difference]
     if run.departure is not None:
@@ -185,6 +187,7 @@ def verify(path: Path, namespace: str = '', names: NameMap = NO_NAMES) -> Verifi
         comparisons,
         tuple(each.name for each in texts),
         tuple(run.events),
+        run.motions,
         tuple(_remarks(content, end, newer, _changed_law(config, events[0]))),
         tuple(_incomplete(content, events, comparisons, end)),
         min(differences, key=lambda found: found.stamp, default=None),
