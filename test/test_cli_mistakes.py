@@ -17,7 +17,7 @@ from recorded_run import Synthetic, small_disk
 from blf_dsc_controller import __version__
 from blf_dsc_controller.cli.main import main, make_parser
 from blf_dsc_controller.cli.run import _configuration
-from blf_dsc_controller.compiled.jit import COMPILING
+from blf_dsc_controller.compiled.announcement import COMPILING
 
 INTERRUPTED_WHILE_COMPILING = """
 import os, signal, sys

@@ -31,7 +31,7 @@ from random_arm import _shake, random_urdf
 import blf_dsc_controller
 from blf_dsc_controller.arms import model
 from blf_dsc_controller.arms.two_link import TwoLink
-from blf_dsc_controller.compiled import elementary, jit
+from blf_dsc_controller.compiled import dependencies, elementary, jit, kernel_cache
 from blf_dsc_controller.compiled.algebra import independent_columns, inverse, product
 from blf_dsc_controller.compiled.layout import (
     Array,
@@ -68,7 +68,8 @@ ALWAYS = sources('compiled/layout', 'arms/two_link')
 
 def names(kernel):
     return {
-        str(path.relative_to(PACKAGE.parent)) for path in jit.dependencies(kernel)[0]
+        str(path.relative_to(PACKAGE.parent))
+        for path in dependencies.dependencies(kernel)[0]
     }
 
 
@@ -88,9 +89,11 @@ def test_kernel_depends_on_the_files_and_constants_it_is_compiled_from():
         assert names(kernel) >= needed | ALWAYS
         assert not names(kernel) & foreign
     assert not any('configuration' in name for name in names(run_loop))
-    assert {'SUSPECT=1', 'OUTSIDE=2', 'LEVEL_CUT=1.0'} <= jit.dependencies(update)[1]
+    assert {'SUSPECT=1', 'OUTSIDE=2', 'LEVEL_CUT=1.0'} <= dependencies.dependencies(
+        update
+    )[1]
     # a kernel of these tests
-    outside = {path.name for path in jit.dependencies(_shake)[0]}
+    outside = {path.name for path in dependencies.dependencies(_shake)[0]}
     assert outside >= {'random_arm.py', 'arm.py', 'algebra.py'}
     assert 'controller.py' not in outside
 
@@ -107,22 +110,24 @@ class OwnLaw(NamedTuple):
 
 def test_kernel_depends_on_the_file_of_a_type_whose_methods_it_calls(monkeypatch):
     monkeypatch.setattr(
-        jit, '_COMPILED', {name: {*uses} for name, uses in jit._COMPILED.items()}
+        dependencies,
+        '_COMPILED',
+        {name: {*uses} for name, uses in dependencies._COMPILED.items()},
     )
-    monkeypatch.setattr(jit, 'KERNELS', [])
-    assert Path(__file__) not in jit.dependencies(update)[0]
-    assert Path(__file__) in jit.dependencies(for_law(update, OwnLaw(1.0)))[0]
+    monkeypatch.setattr(kernel_cache, 'KERNELS', [])
+    assert Path(__file__) not in dependencies.dependencies(update)[0]
+    assert Path(__file__) in dependencies.dependencies(for_law(update, OwnLaw(1.0)))[0]
 
 
 FOLDERS = """
-from blf_dsc_controller.compiled import jit
+from blf_dsc_controller.compiled import kernel_cache
 from blf_dsc_controller.law.controller import update, weigh
 from blf_dsc_controller.simulation.loop import run_loop
 from sim_plant.plant import step_plant
 
-assert {update, weigh, run_loop, step_plant} <= {*jit.KERNELS}
-for kernel in jit.KERNELS:
-    assert str(jit.cache_folder(kernel)) in kernel._cache.cache_path, kernel
+assert {update, weigh, run_loop, step_plant} <= {*kernel_cache.KERNELS}
+for kernel in kernel_cache.KERNELS:
+    assert str(kernel_cache.cache_folder(kernel)) in kernel._cache.cache_path, kernel
 """
 
 
@@ -138,9 +143,9 @@ import sys
 import numpy as np
 from blf_dsc_controller.arms import model
 from blf_dsc_controller.arms.two_link import TwoLink
-from blf_dsc_controller.compiled import jit
+from blf_dsc_controller.compiled import announcement, kernel_cache
 
-with jit.announced_compilation(lambda text: print(text, file=sys.stderr)):
+with announcement.announced_compilation(lambda text: print(text, file=sys.stderr)):
     H = model.regressors_at(TwoLink(10.0), *np.full((4, 1, 2), 0.5))
 print(float(H[0, 0, 0]), *(sum(model._fill_regressors.stats[k].values()) for k in (1, 2)))
 """
@@ -168,7 +173,7 @@ def test_kernels_of_another_checkout_or_of_the_package_are_found_and_never_of_ot
         for package in (PACKAGE, PACKAGE.parent / 'sim_plant'):
             unwanted = shutil.ignore_patterns('__pycache__', 'kernels')
             shutil.copytree(package, checkout / package.name, ignore=unwanted)
-    entry, *counts = compiled_in(first, cache, ending='jit.ship()')
+    entry, *counts = compiled_in(first, cache, ending='kernel_cache.ship()')
     assert counts == [0, 1]
     assert compiled_in(second, cache) == (entry, 1, 0)
     shipped = first / PACKAGE.name / 'compiled/kernels'
@@ -355,7 +360,7 @@ import sys
 from pathlib import Path
 from blf_dsc_controller.cli import run
 from blf_dsc_controller.cli.main import main
-from blf_dsc_controller.compiled import jit
+from blf_dsc_controller.compiled import kernel_cache
 from blf_dsc_controller.configuration.nodes import load_loop
 from blf_dsc_controller.law.controller import update
 from blf_dsc_controller.messages.codecs import _read
@@ -370,10 +375,10 @@ if __name__ == '__main__':  # the command has processes of its own
     for kernel in (update, _read, _sample, *of_plant):
         print(kernel.__name__, len(kernel.signatures))
     assert main(['precompile', '--config', 'recommended']) == 0
-    jit.SHIPPED = Path(sys.argv[1])
+    kernel_cache.SHIPPED = Path(sys.argv[1])
     assert main(['precompile', '--config', 'recommended', '--package']) == 0
     for kernel in (update, *of_plant):
-        assert list(jit.SHIPPED.glob(f'*/*.{kernel.__name__}-*.nbc')), kernel
+        assert list(kernel_cache.SHIPPED.glob(f'*/*.{kernel.__name__}-*.nbc')), kernel
 """
 
 
@@ -382,11 +387,12 @@ import sys
 import numpy as np
 import blf_dsc_controller as blf
 from blf_dsc_controller.cli import run
-from blf_dsc_controller.compiled import jit
+from blf_dsc_controller.compiled import kernel_cache
 from sim_plant.kernels import observe_plant, plant_truth, step_plant
 
 def signatures():
-    return {(kernel.__name__, each) for kernel in jit.KERNELS for each in kernel.signatures}
+    kernels = kernel_cache.KERNELS
+    return {(each.__name__, found) for each in kernels for found in each.signatures}
 
 first, *others = (blf.load_loop(path) for path in sys.argv[1:])
 run._compile(first.controller)
@@ -441,7 +447,7 @@ def test_machine_code_is_loaded_only_from_a_folder_that_nobody_else_can_write(
     everybodys = tmp_path / 'everybodys'
     everybodys.mkdir()
     everybodys.chmod(0o1777)
-    base = jit._base.__wrapped__
+    base = kernel_cache._base.__wrapped__
     inside = everybodys / f'blf_dsc_controller-{os.getuid()}'
     assert (base(str(own)), base(str(everybodys))) == (own, inside)
     assert inside.stat().st_mode & 0o777 == 0o700
@@ -653,7 +659,7 @@ def test_every_processor_computes_the_same_bits(processor):
 
 RACE = """
 import sys, time
-from blf_dsc_controller.compiled import jit
+from blf_dsc_controller.compiled import announcement, jit
 
 @jit.kernel
 def slow(x):
@@ -663,11 +669,11 @@ def slow(x):
     return total
 
 notices = []
-with jit.announced_compilation(notices.append):
+with announcement.announced_compilation(notices.append):
     print('ready', flush=True)
     sys.stdin.readline()
     slow(1.0)
-print(len([text for text in notices if text.startswith(jit.COMPILING)]))
+print(len([text for text in notices if text.startswith(announcement.COMPILING)]))
 """
 
 

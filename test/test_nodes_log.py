@@ -24,7 +24,7 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray
 
 from blf_dsc_controller.compiled import jit
-from blf_dsc_controller.compiled.jit import COMPILING
+from blf_dsc_controller.compiled.announcement import COMPILING
 from blf_dsc_controller.configuration.nodes import load_loop
 from blf_dsc_controller.configuration.schema import flatten
 from blf_dsc_controller.messages import topics

@@ -11,7 +11,7 @@ from contextlib import contextmanager
 
 from blf_dsc_controller.cli.main import INTERRUPTED
 from blf_dsc_controller.cli.run import STOPPED, print_notice
-from blf_dsc_controller.compiled.jit import announced_compilation
+from blf_dsc_controller.compiled.announcement import announced_compilation
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.drive import DriveConfig
 from blf_dsc_controller.configuration.nodes import CONTROLLER, DRIVE, load, locate

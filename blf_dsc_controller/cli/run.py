@@ -15,7 +15,8 @@ import numpy as np
 from blf_dsc_controller.bags.content import read_content
 from blf_dsc_controller.bags.reader import recorded_run
 from blf_dsc_controller.cli.main import INTERRUPTED
-from blf_dsc_controller.compiled.jit import announced_compilation, ship
+from blf_dsc_controller.compiled.announcement import announced_compilation
+from blf_dsc_controller.compiled.kernel_cache import ship
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.nodes import (
     CONTROLLER,

@@ -25,7 +25,7 @@ from sensor_msgs.msg import JointState
 from tqdm import tqdm
 
 from blf_dsc_controller.cli.domains import own_domain, strangers
-from blf_dsc_controller.compiled.jit import COMPILING
+from blf_dsc_controller.compiled.announcement import COMPILING
 from blf_dsc_controller.configuration.files import share_folder
 from blf_dsc_controller.configuration.nodes import (
     CONTROLLER,

@@ -16,7 +16,7 @@ from tqdm import tqdm
 
 from blf_dsc_controller.analysis.metrics import aligned, write_json
 from blf_dsc_controller.cli.run import make_folder, print_notice
-from blf_dsc_controller.compiled.jit import announced_compilation
+from blf_dsc_controller.compiled.announcement import announced_compilation
 from blf_dsc_controller.configuration.nodes import locate
 from blf_dsc_controller.studies import laws, report, runs, stiffness
 from blf_dsc_controller.studies import paper as paper_study

@@ -12,7 +12,8 @@ import functools
 from collections.abc import Callable
 from typing import Any
 
-from blf_dsc_controller.compiled.jit import compile_methods, depend_on, kernel
+from blf_dsc_controller.compiled.dependencies import depend_on
+from blf_dsc_controller.compiled.jit import compile_methods, kernel
 from blf_dsc_controller.law.backstepping import Backstepping
 from blf_dsc_controller.law.blf_dsc import BlfDsc
 from blf_dsc_controller.law.interface import Law

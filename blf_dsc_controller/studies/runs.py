@@ -37,7 +37,7 @@ import numpy as np
 
 import blf_dsc_controller
 from blf_dsc_controller.analysis.metrics import write_json
-from blf_dsc_controller.compiled.jit import cache_folder
+from blf_dsc_controller.compiled.kernel_cache import cache_folder
 from blf_dsc_controller.configuration.nodes import dump
 from blf_dsc_controller.configuration.plant import PlantConfig
 from blf_dsc_controller.errors import BlfDscError, StartError

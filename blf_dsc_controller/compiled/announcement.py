@@ -1,0 +1,52 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Compilation is announced, since the wait would look like a hang."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from contextlib import AbstractContextManager
+from typing import Any
+
+from numba.core import event
+
+from blf_dsc_controller.compiled.jit import SLOW
+from blf_dsc_controller.compiled.kernel_cache import KERNELS
+
+COMPILING = 'compiling kernel '
+"""How a notice begins."""
+
+
+def announced_compilation(
+    say: Callable[[str], object],
+) -> AbstractContextManager[object]:
+    """Call `say` with a notice for each kernel not in the cache that is compiled in this context.
+
+    Only numba knows this: a kernel has a version for each type of arguments. Of those
+    that are loaded, some may not be called.
+    """
+    listener: AbstractContextManager[object] = event.install_listener(
+        'numba:compile', _Listener(say)
+    )
+    return listener
+
+
+class _Listener(event.Listener):  # type: ignore[misc]
+    def __init__(self, say: Callable[[str], object]) -> None:
+        self._say = say
+        self._count = 0
+
+    def on_start(self, started: Any) -> None:
+        kernel = started.data['dispatcher']
+        if not any(kernel is other for other in KERNELS):
+            return
+        if SLOW and self._count == 0:
+            self._say(SLOW)
+        self._count += 1
+        total = max(self._count, len(KERNELS))
+        self._say(
+            f'{COMPILING}{self._count} of at most {total}, once for this version and kind of arm: '
+            f'{kernel.py_func.__name__}'
+        )
+
+    def on_end(self, _event: object) -> None:
+        pass
