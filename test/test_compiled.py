@@ -42,12 +42,14 @@ from blf_dsc_controller.compiled.layout import (
     source_of,
     view_of,
 )
+from blf_dsc_controller.configuration.law_file import load_law
 from blf_dsc_controller.configuration.nodes import load_loop
 from blf_dsc_controller.configuration.schema import flatten
 from blf_dsc_controller.law.controller import update
 from blf_dsc_controller.law.laws import for_law
 from blf_dsc_controller.reference.terms import cubics, minimum_jerk
 from blf_dsc_controller.simulation.loop import run_loop, simulate
+from blf_dsc_controller.studies.laws import COMPUTED_TORQUE
 from blf_dsc_controller.supervision.model_torque import friction_torque, model_torque
 from sim_plant.kernels import step_plant
 from sim_plant.plant import plant_settings
@@ -108,15 +110,18 @@ class OwnLaw(NamedTuple):
         pass
 
 
-def test_kernel_depends_on_the_file_of_a_type_whose_methods_it_calls(monkeypatch):
-    monkeypatch.setattr(
-        dependencies,
-        '_COMPILED',
-        {name: {*uses} for name, uses in dependencies._COMPILED.items()},
-    )
+def test_kernel_of_a_law_depends_on_its_file_and_on_no_other_law(monkeypatch):
+    """Whatever laws were loaded before: each would else be compiled again."""
     monkeypatch.setattr(kernel_cache, 'KERNELS', [])
-    assert Path(__file__) not in dependencies.dependencies(update)[0]
-    assert Path(__file__) in dependencies.dependencies(for_law(update, OwnLaw(1.0)))[0]
+    function = update.py_func
+    packaged = kernel_cache.cache_folder(function)
+    own = kernel_cache.cache_folder(function, OwnLaw)
+    assert Path(__file__) not in dependencies.dependencies(function)[0]
+    assert Path(__file__) in dependencies.dependencies(function, OwnLaw)[0]
+    for_law(update, load_law(COMPUTED_TORQUE)(1.0, 1.0, 1.0))
+    assert str(own) in for_law(update, OwnLaw(1.0))._cache.cache_path
+    assert kernel_cache.cache_folder(function) == packaged
+    assert kernel_cache.cache_folder(function, OwnLaw) == own
 
 
 FOLDERS = """

@@ -28,7 +28,7 @@ def add_module(name: str) -> None:
 
 
 def depend_on(interface: type, *types: type) -> None:
-    """Let kernels that are defined from now on depend on the files of further types."""
+    """Let all kernels that use an interface depend on the files of these types."""
     add_module(interface.__module__)
     uses = _COMPILED[interface.__module__]
     for module in (type_.__module__ for type_ in types):
@@ -36,13 +36,15 @@ def depend_on(interface: type, *types: type) -> None:
         uses.add(module)
 
 
-def dependencies(function: Callable[..., object]) -> tuple[set[Path], set[str]]:
+def dependencies(
+    function: Callable[..., object], *types: type
+) -> tuple[set[Path], set[str]]:
     """Return the source files of a kernel, and the constants in them as `name=value`.
 
-    They are those of its module, of the modules with functions for kernels that this
-    one imports, and so on.
+    They are those of its module and of these types', of the modules with functions for
+    kernels that those import, and so on.
     """
-    pending = [function.__module__]
+    pending = [function.__module__, *(type_.__module__ for type_ in types)]
     modules = set()
     constants = set()
     while pending:

@@ -86,8 +86,11 @@ def _compile_method(name: str, signature: inspect.Signature) -> None:
     overload_method(BaseNamedTuple, name, strict=False, jit_options=INLINED)(chosen)
 
 
-def kernel(function: F) -> F:
-    """Compile `function` for calls from Python: IEEE arithmetic (no fast-math), cached."""
+def kernel(function: F, *types: type) -> F:
+    """Compile `function` for calls from Python: IEEE arithmetic (no fast-math), cached.
+
+    The machine code depends on the files of `types`, too: those of a law of a file.
+    """
     compiled = numba.njit(
         function,
         error_model='numpy',
@@ -95,7 +98,7 @@ def kernel(function: F) -> F:
         no_cfunc_wrapper=True,
         **_KERNEL_COMPILER,
     )
-    add_kernel(compiled)
+    add_kernel(compiled, *types)
     return cast('F', compiled)
 
 

@@ -45,16 +45,16 @@ SHIPPED = Path(__file__).with_name('kernels')
 _OTHERS_WRITE = stat.S_IWGRP | stat.S_IWOTH
 
 
-def add_kernel(kernel: Any) -> None:
-    """Keep the machine code of a kernel in its folder."""
+def add_kernel(kernel: Any, *types: type) -> None:
+    """Keep the machine code of a kernel, which is compiled with these types, in its folder."""
     KERNELS.append(kernel)
     if not config.DISABLE_JIT:
-        _keep(kernel, cache_folder(kernel.py_func))
+        _keep(kernel, cache_folder(kernel.py_func, *types))
 
 
-def cache_folder(function: Callable[..., object]) -> Path:
+def cache_folder(function: Callable[..., object], *types: type) -> Path:
     """Return the folder of a kernel's machine code, in NUMBA_CACHE_DIR or else the user's cache."""
-    files, constants = dependencies(function)
+    files, constants = dependencies(function, *types)
     digest = hashlib.sha256(' '.join([numba.__version__, *sorted(constants)]).encode())
     for name, source in sorted((_name(source), source) for source in files):
         digest.update(name.encode() + b'\0' + source.read_bytes())

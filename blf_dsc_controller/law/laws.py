@@ -12,7 +12,6 @@ import functools
 from collections.abc import Callable
 from typing import Any
 
-from blf_dsc_controller.compiled.dependencies import depend_on
 from blf_dsc_controller.compiled.jit import compile_methods, kernel
 from blf_dsc_controller.law.backstepping import Backstepping
 from blf_dsc_controller.law.blf_dsc import BlfDsc
@@ -33,5 +32,4 @@ def for_law(compiled: Callable[..., Any], law: Law) -> Callable[..., Any]:
 
 @functools.cache
 def _compiled_with(compiled: Callable[..., Any], law: type) -> Callable[..., Any]:
-    depend_on(Law, law)
-    return kernel(getattr(compiled, 'py_func', compiled))
+    return kernel(getattr(compiled, 'py_func', compiled), law)
