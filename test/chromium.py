@@ -13,7 +13,7 @@ WEBGL = (
     '--ignore-gpu-blocklist',
 )
 NAMES = ('chromium', 'chromium-browser', 'google-chrome')
-PATIENCE = 300e3  # ms, until a test gives up on what should take seconds
+PATIENCE = 60e3  # ms, until a test gives up on what should take seconds
 
 
 def find():

@@ -9,8 +9,11 @@ import numpy as np
 import pytest
 
 import blf_dsc_controller as blf
+from blf_dsc_controller.bags.content import read_content
 from blf_dsc_controller.control.arm_controller import StateError
 from blf_dsc_controller.errors import BlfDscError, ConfigurationError
+from blf_dsc_controller.messages.journal import EventType
+from blf_dsc_controller.messages.topics import COMMANDS
 from blf_dsc_controller.reference.trajectory import TrajectoryError
 from blf_dsc_controller.simulation.loop import START
 from blf_dsc_controller.supervision.supervisor import Phase
@@ -119,3 +122,26 @@ def test_prepared_start_is_used_if_the_arm_is_still_there(away, is_used, tmp_pat
     unprepared = blf.simulate(loop.controller, loop.plant).run().torque[:100]
     assert np.array_equal(torques, unprepared) is not is_used
     assert blf.verify(tmp_path / 'bag').difference is None
+
+
+@pytest.mark.parametrize('samples', [0, 100])
+def test_failure_of_the_caller_is_a_stop_that_the_bag_holds(samples, tmp_path):
+    """Before the first torque nothing is commanded, afterwards what leads to the safe one."""
+    plant = plant_of(LOOP.plant)
+    with blf.ArmController(LOOP.controller, record=tmp_path / 'bag') as controller:
+        torques = run(controller, plant, LOOP.plant, samples)
+        torque = controller.fail('the bus is silent')
+        assert (torque is None) == (samples == 0)
+        assert controller.phase is Phase.SAFE_STOP
+        assert 'the bus is silent' in controller.reason
+        q, dq, _ = plant.measure().reshape(3, -1)
+        controller.update(3.0, q, dq)  # a bag without a state cannot be read
+    content = read_content(tmp_path / 'bag')
+    (stop,) = (event for _, event in content.events if event.type is EventType.STOP)
+    assert stop.content['text'] == 'the bus is silent'
+    assert stop.commands == samples
+    if samples:
+        commands = content.topics[COMMANDS]
+        names = commands.joint_names()
+        recorded = commands.joint_states(names, ()).field(2)[:]
+        np.testing.assert_array_equal(recorded[: samples + 1], [*torques, torque])

@@ -330,6 +330,31 @@ def test_prior_without_payload_is_tighter():
     assert np.linalg.norm(empty[tool]) == pytest.approx(0.365 * CENTRE)
 
 
+def test_prior_of_a_body_turns_with_it_and_holds_its_mass_and_centre():
+    """The share is that of the mass with all of J; the centre moves by its deviation."""
+    rng = np.random.default_rng(3)
+    points = rng.normal(size=(4, 20)) * 0.1
+    points[3] = 1.0
+    J = 0.15 * points @ points.T  # 3 kg
+    turn = np.eye(4)
+    turn[:3, :3] = np.linalg.qr(rng.normal(size=(3, 3)))[0]
+    ten = deviations(J, 0.3, CENTRE)
+    assert np.linalg.matrix_rank(ten) == 10
+    of_turned = deviations(turn @ J @ turn.T, 0.3, CENTRE)
+    turned = np.transpose(
+        [inertia_of(turn @ pseudo_inertia(d) @ turn.T) for d in ten.T]
+    )
+    np.testing.assert_allclose(
+        turned @ turned.T, of_turned @ of_turned.T, rtol=1e-9, atol=1e-15
+    )
+    covariance = ten @ ten.T
+    assert covariance[0, 0] == pytest.approx((0.3 * 3.0) ** 2)
+    first = J[:3, 3]
+    moments = np.outer(0.3 * first, 0.3 * first) + (3.0 * CENTRE) ** 2 * np.eye(3)
+    np.testing.assert_allclose(covariance[1:4, 1:4], moments, rtol=1e-9)
+    np.testing.assert_array_equal(deviations(np.zeros((4, 4)), 0.3, CENTRE), 0.0)
+
+
 def test_prior_of_a_ball_is_the_same_in_every_direction():
     J, turn = payload_inertia(2.0), np.eye(4)
     turn[:3, :3] = np.linalg.qr(np.random.default_rng(0).normal(size=(3, 3)))[0]

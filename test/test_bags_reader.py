@@ -4,8 +4,10 @@
 from __future__ import annotations
 
 import csv
+import io
 import os
 import re
+import struct
 import tracemalloc
 
 import lz4.frame
@@ -19,9 +21,14 @@ from recorded_run import BOUND_RAD, JOINTS, LIMIT_NM, PARAMETERS, TRUE, Syntheti
 
 from blf_dsc_controller.bags.content import NameMap, read_content
 from blf_dsc_controller.bags.reader import read_run
-from blf_dsc_controller.bags.sources import BagError, BagMessage, records_in
+from blf_dsc_controller.bags.sources import (
+    BagError,
+    BagMessage,
+    next_record,
+    records_in,
+)
 from blf_dsc_controller.bags.topic_messages import TopicMessages, UnreadableMessageError
-from blf_dsc_controller.bags.unpacking import unpacked
+from blf_dsc_controller.bags.unpacking import LARGEST, unpacked
 from blf_dsc_controller.bags.writer import BagWriter
 from blf_dsc_controller.cli.main import main
 from blf_dsc_controller.messages.codecs import (
@@ -229,6 +236,32 @@ def test_record_longer_than_its_chunk_is_an_error_without_a_checksum_too():
     data = bytes([Opcode.MESSAGE, 30, *bytes(7), *bytes(25)])
     with pytest.raises(match='does not match its length'):
         list(records_in(Chunk('', data, 0, 0, 0, len(data))))
+
+
+@pytest.mark.parametrize(
+    ('opcode', 'length', 'held', 'problem'),
+    [
+        (Opcode.MESSAGE, 26, 26, ''),
+        (Opcode.MESSAGE, 27, 26, 'cut off'),
+        (Opcode.MESSAGE, LARGEST + 1, LARGEST + 1, f'a record has {LARGEST + 1} bytes'),
+        (Opcode.CHUNK, LARGEST + 1, LARGEST + 1, f'a record has {LARGEST + 1} bytes'),
+        (Opcode.ATTACHMENT, LARGEST + 1, LARGEST + 1, ''),  # not read
+        (Opcode.ATTACHMENT, 27, 26, 'cut off'),
+    ],
+)
+def test_records_that_are_cut_off_or_too_long_are_errors(opcode, length, held, problem):
+    """Of a file of this size, of which nothing is held but the beginning."""
+    head = struct.pack('<BQ', opcode, length)
+    stream = io.BytesIO(head + bytes(26))
+    kinds = {Opcode.CHUNK: Chunk}
+    size = len(head) + held
+    if problem:
+        with pytest.raises(ValueError, match=problem):
+            next_record(stream, size, kinds)
+    else:
+        found = next_record(stream, size, kinds)
+        assert (found is None) == (opcode is Opcode.ATTACHMENT)
+        assert stream.tell() == size
 
 
 def test_any_rows_of_long_topics_of_many_layouts_are_read():

@@ -14,13 +14,18 @@ from blf_dsc_controller import load_loop, simulate
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.schema import build, change
 from blf_dsc_controller.errors import StartError
-from blf_dsc_controller.law.factory import controller_of, estimate_names
+from blf_dsc_controller.law.factory import (
+    controller_of,
+    estimate_names,
+    settings_of_config,
+)
 from blf_dsc_controller.law.torque import added_torque
 from blf_dsc_controller.replay.verify import verify
 from blf_dsc_controller.simulation.loop import write_bag
+from blf_dsc_controller.supervision.first_torque import is_like
 from blf_dsc_controller.supervision.guard import Guard
 from blf_dsc_controller.supervision.last_state import LastState
-from blf_dsc_controller.supervision.model_torque import model_torque
+from blf_dsc_controller.supervision.model_torque import friction_torque, model_torque
 from blf_dsc_controller.supervision.safe_torque import safe_torque
 from blf_dsc_controller.supervision.support import check_support
 
@@ -328,3 +333,33 @@ def test_friction_that_the_drive_compensates_is_not_fed_forward_a_second_time():
     # in motion; at a reversal Stribeck's friction adds up to half of 6 N m
     left = 0.2 * 6.0
     assert np.all((learned['rest'][:3] > left) & (learned['rest'][:3] < left + 3.0))
+
+
+@pytest.mark.parametrize(
+    ('torque', 'expected'),
+    [
+        ([4.0, 40.0], True),
+        ([40.0, 4.0], False),  # of another direction
+        ([-4.0, -40.0], False),
+        ([0.02, 0.2], False),  # nothing but noise
+        ([0.0, 80.0], True),  # twice as much, on a payload
+    ],
+)
+def test_torque_is_like_gravity_by_direction_and_magnitude(torque, expected):
+    assert is_like(np.array(torque), np.array([4.0, 40.0])) is expected
+
+
+def test_friction_of_an_estimate_is_that_of_its_columns():
+    given = {'learning.viscous': True, 'learning.coulomb': True}
+    settings = settings_of_config(build(ControllerConfig, given))
+    names = estimate_names(build(ControllerConfig, given))
+    estimate = np.arange(1.0, len(names) + 1.0)
+    dq = np.array([0.02, -0.5])
+    columns = dict(zip(names, estimate, strict=True))
+    expected = [
+        columns[f'viscous {joint}'] * speed
+        + columns[f'coulomb {joint}'] * np.tanh(speed / settings.coulomb_velocity)
+        for joint, speed in zip(('joint1', 'joint2'), dq, strict=True)
+    ]
+    found = friction_torque(settings, estimate, dq)
+    np.testing.assert_allclose(found, expected, rtol=1e-12)

@@ -11,10 +11,12 @@ import importlib.util
 import signal
 import subprocess
 import sys
+import threading
 from pathlib import Path
 
 import numpy as np
 import pytest
+from command import COMPILED, PATIENCE
 
 import blf_dsc_controller as blf
 
@@ -22,16 +24,21 @@ if not all(map(importlib.util.find_spec, ('pylibfranka', 'franky_sim'))):
     pytest.skip('needs pylibfranka and franky-sim', allow_module_level=True)
 
 SIMULATOR = Path(__file__).with_name('franka_simulator.py')
-PATIENCE = 300.0  # s: starts and ends on a computer that is ten times too slow
 BOUND = 0.01  # rad, of the preset
 
 
 class Wire:
-    """Simulators and commands of a test; each simulator has an address of its own."""
+    """Simulators and commands of a test; each simulator has an address of its own.
+
+    Every process is killed when the patience with it ends.
+    """
+
+    patience = COMPILED  # s; of the first test, whose kernels may be compiled
 
     def __init__(self, folder):
         self.folder = folder
         self.processes = []
+        self.timers = []
 
     def start(self, *words):
         process = subprocess.Popen(
@@ -41,6 +48,8 @@ class Wire:
             text=True,
         )
         self.processes.append(process)
+        self.timers.append(threading.Timer(self.patience, process.kill))
+        self.timers[-1].start()
         return process
 
     def simulate(self, address, *events):
@@ -62,9 +71,12 @@ class Wire:
         pytest.fail(f'{words!r} was not printed')
 
     def close(self):
-        for process in self.processes:
+        for timer, process in zip(self.timers, self.processes, strict=True):
+            timer.cancel()
             process.kill()
-            process.communicate()
+            process.wait()
+            process.stdout.close()
+        Wire.patience = PATIENCE
 
 
 @pytest.fixture
@@ -76,7 +88,7 @@ def wire(tmp_path):
 
 def ended(process):
     """Return exit code and output of a command."""
-    output, _ = process.communicate(timeout=PATIENCE)
+    output, _ = process.communicate()
     return process.returncode, output
 
 

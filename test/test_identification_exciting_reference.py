@@ -73,6 +73,37 @@ def chain_problem():
     return config, ExcitationProblem(config, 1, 0.02, -3.0)
 
 
+def test_unknowns_of_the_search_are_in_units_of_the_limits():
+    """An amplitude of 1 alone reaches one limit of position, velocity or acceleration."""
+    config, _ = chain_problem()
+    two = ExcitationProblem(config, 2, 0.02, -3.0)
+    limits = config.limits
+    lower, upper = np.array((limits.position_lower, limits.position_upper))
+    n, h = two.n, two.harmonics
+    for k in range(n, n + 2 * n * h):
+        x = np.zeros(n + 2 * n * h)
+        x[:n] = 0.5
+        x[k] = 1.0
+        found = two.parameters(x)
+        middle = 0.5 * (lower + upper)
+        np.testing.assert_allclose(
+            found['offset'] - middle, 0.5 * two._reach, atol=1e-12
+        )
+        amplitude = np.reshape(found['amplitude'], (n, 2 * h))
+        assert np.count_nonzero(amplitude) == 1
+        joint, tone = np.argwhere(amplitude)[0]
+        # first all cosines, joint by joint, then all sines
+        which, at = divmod(k - n, n * h)
+        assert (joint, tone) == (at // h, which * h + at % h)
+        assert found['phase'][tone] == pytest.approx(-0.5 * np.pi * which)
+        rate = found['frequency'][tone]
+        assert rate == pytest.approx(
+            2.0 * np.pi / config.learning.window * (at % h + 1)
+        )
+        reached = amplitude[joint, tone] * rate ** np.arange(3.0)
+        assert (reached / two._limits[:3, joint]).max() == pytest.approx(1.0)
+
+
 def test_search_keeps_its_limits_is_repeatable_and_beats_random_motions():
     problem = chain_problem()[1]
     x = search(problem, 0, 1)

@@ -433,6 +433,22 @@ def test_path_that_is_too_fast_is_stretched_and_passes_its_points_in_order():
     np.testing.assert_allclose(at(motion.vector, motion.end)[0], GOALS[-1], atol=1e-9)
 
 
+def test_path_is_stretched_no_more_than_the_limits_ask_for():
+    """From rest: its velocities are those that were sent, over the factor of its times."""
+    still = pack(2, [minimum_jerk(np.zeros(1), GOALS[:1])])
+    times = np.array([0.4, 0.8, 1.2])
+    rates = np.diff(GOALS, axis=0, prepend=GOALS[:1]) / 0.4
+    motion = plan(trajectory((GOALS, rates), times=times.tolist()), still, 0.0)
+    factor = motion.end / times[-1]
+    assert factor > 1.5
+    for k in (1, 2):
+        q, dq, _ = at(motion.vector, np.nextafter(factor * times[k], 0.0))
+        np.testing.assert_allclose(q, GOALS[k], atol=1e-6)
+        np.testing.assert_allclose(dq, rates[k] / factor, atol=1e-5)
+    # each try is 1 % slower than needed (`_MARGIN`)
+    assert max(limits_used(motion, 0.0, motion.end)) > 0.95
+
+
 def test_point_that_is_too_near_in_time_is_reached_as_soon_as_the_limits_allow():
     """From rest over 1.5 rad: not before velocity, acceleration and jerk allow, 1.37 s."""
     at_rest = pack(2, [minimum_jerk(np.zeros(1), np.zeros((1, 2)))])
@@ -611,8 +627,8 @@ def test_random_sequences_of_commands_never_jump_and_keep_the_limits():
         reference, count = sequence_of_references(seed)
         accepted += count
         q, v, a = reference.transpose(1, 0, 2)
-        # Blends are checked every 5 ms or 200 times: between, 1e-3 of their
-        # acceleration is missed.
+        # Blends are checked every 1 ms and where their jerk jumps: between, 1e-3 of
+        # their acceleration is missed.
         assert np.all(np.abs(a) <= STRONGEST * 1.001), seed
         assert np.all(np.abs(v) <= FASTEST * 1.001), seed
         rise = np.abs(np.diff(v, axis=0))

@@ -273,3 +273,18 @@ def test_driver_that_clips_commands_is_told_by_its_effort():
     )
     assert guard.supervisor.reason is Reason.NO_EFFECT
     assert 'N m of what is commanded' in guard.supervisor.text
+
+
+def test_command_has_no_effect_if_it_changed_by_a_fifth_of_its_limit_for_a_while():
+    """For 0.1 s, whichever joint it is; this is said once."""
+    limit = np.array([20.0, 10.0])
+    for changed, is_missing in (([3.9, -1.9], False), ([0.0, -2.1], True)):
+        effect = CommandEffect(2)
+        answers = [
+            effect.is_missing(np.array(changed), limit, 1e-3) for _ in range(300)
+        ]
+        assert answers == [is_missing and k == answers.index(True) for k in range(300)]
+        if is_missing:
+            assert 0.0999 <= 1e-3 * (answers.index(True) + 1) <= 0.1021
+    effect = CommandEffect(2)
+    assert not any(effect.is_missing(np.zeros(2), limit, 1e-3) for _ in range(300))

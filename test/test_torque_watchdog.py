@@ -10,6 +10,7 @@ from random_arm import CONFIG
 
 from blf_dsc_controller import load_loop
 from blf_dsc_controller.configuration.schema import change
+from blf_dsc_controller.nodes.watchdog_presence import WatchdogPresence
 from blf_dsc_controller.supervision.guard import Guard
 from blf_dsc_controller.supervision.torque_watchdog import TorqueWatchdog
 from sim_plant.plant import plant_of
@@ -173,3 +174,15 @@ def test_torque_is_finite_and_within_its_rate_from_what_the_controller_commanded
     steps = np.diff([np.nan_to_num(last), *rig.taken], axis=0)
     assert np.abs(steps).max() == pytest.approx(0.3)
     assert np.abs(restarted.taken[0]).min() > 1.0  # half of gravity
+
+
+@pytest.mark.parametrize('expected', [False, True])
+def test_watchdog_is_missed_once_it_was_seen_or_after_ten_looks_if_promised(expected):
+    presence = WatchdogPresence(expected=expected)
+    reports = [presence.look(there=False) for _ in range(12)]
+    assert reports == [expected and k == 10 for k in range(12)]
+    assert ('is missing' in presence.problem) is expected
+    assert not presence.look(there=True)
+    assert presence.problem == ''
+    assert [presence.look(there=False) for _ in range(2)] == [True, False]
+    assert 'is missing' in presence.problem

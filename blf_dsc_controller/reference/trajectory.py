@@ -49,6 +49,7 @@ from blf_dsc_controller.reference.retargeting import (
     shifted,
 )
 from blf_dsc_controller.reference.terms import (
+    SPLINE,
     Term,
     cubics,
     ending_at_rest,
@@ -148,9 +149,19 @@ def _in_time(
         motion = PlannedMotion(*blend(before, term, t0, config), end)
     _check(motion.vector, term, t0, config)
     if motion.settled > t0:  # a blend between two motions is nowhere a polynomial
-        closely = np.arange(t0, motion.settled, _CLOSE)
+        closely = _times_of_blend(motion, t0, n)
         _raise_found(worst_violation(motion.vector, closely, config))
     return motion
+
+
+def _times_of_blend(motion: PlannedMotion, t0: float, n: int) -> np.ndarray:
+    """Return times [s] close to each other, and those at which a blended jerk jumps."""
+    times = [np.arange(t0, motion.settled, _CLOSE)]
+    times += [
+        turning_times(term, n) for term in unpack(motion.vector) if term.code == SPLINE
+    ]
+    joined = np.concatenate(times)
+    return joined[(joined >= t0) & (joined < motion.settled)]
 
 
 def _check(
