@@ -155,7 +155,7 @@ class Reversals:
     def solution(self, i):
         """Return c and k by all sums."""
         g = self.gains
-        pull = 0.1 * self.f[i] ** 2 / g.variance[self.of][i]
+        pull = 0.015 * self.f[i] ** 2 / g.variance[self.of][i]
         sums = self.past[i] + self.latest[i]
         A = sums[:, :2] + np.diag([pull, 0.1 * pull])
         B = sums[:, 2] + np.array([pull * self.c0[i], 0.0])

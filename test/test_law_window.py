@@ -274,10 +274,8 @@ def test_friction_columns_recover_friction():
     estimate, active = learned('recommended', 20.0, learning, arm)
     assert all(active.values())
     for name, values in (true | {'bias': (0.0, 0.0)}).items():
-        # Learned together with a breakaway term, it is up to 2 % low: not understood yet.
-        within = 6e-3 if name == 'coulomb' else 2e-3
         for joint, value in zip(('joint1', 'joint2'), values, strict=True):
-            assert estimate[f'{name} {joint}'] == pytest.approx(value, abs=within)
+            assert estimate[f'{name} {joint}'] == pytest.approx(value, abs=2e-3)
 
 
 def test_same_columns_are_accepted_on_a_two_tone_reference():

@@ -142,7 +142,7 @@ def test_closed_loop_runs_the_same_with_both_plants(example):
 
 @pytest.mark.parametrize(
     ('name', 'settled', 'peak'),
-    [('panda', 0.24, 2.2), ('ur5e', 0.56, 1.5), ('openarm', 0.18, 0.79)],
+    [('panda', 0.19, 2.2), ('ur5e', 0.52, 1.5), ('openarm', 0.19, 0.79)],
 )
 def test_errors_with_dry_friction_are_as_documented(example, name, settled, peak):
     """In mrad, from 8 s on and when 2 kg are picked up at 20 s: doc/arms.md."""

@@ -44,7 +44,7 @@ from blf_dsc_controller.law.state import FILTERED, Settings, Signals, State
 
 _ENERGY = 1.0  # of p int s_h^2 dt; a reversal has an eighth of it
 _SHOWN = 0.06  # of p int (g s)_h^2 dt: half a reversal, which shows its friction
-_PRIOR = 0.1  # 1 / (reversals that outweigh the initial estimate where f is unmodelled)
+_PRIOR = 0.015  # pull to c_0, of (f / its deviation)^2; that of a reversal is an eighth
 _STRIBECK_PRIOR = 0.1  # pull of c k to zero, over that of c to c_0
 _STRIBECK_VELOCITY = 0.1  # v_s, rad/s
 _MOST_STRIBECK = 1.0  # k^: breakaway takes at most twice the Coulomb friction
