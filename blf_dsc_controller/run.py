@@ -55,6 +55,12 @@ class Stop(NamedTuple):
     """ns, of the last joint state before the next start; None: the end of the run"""
 
 
+ToolErrors = Callable[[Floats, Floats, Floats], Floats]
+"""Returns errors and bounds at the tool (k, 4) for references, errors, bounds (k, n).
+
+They are named `topics.TOOL`.
+"""
+
 Regressor = Callable[[Floats, Floats, Floats, Floats], Floats]
 """Returns H (k, n, p) for (q, dq, v, a), (k, n) each.
 
@@ -98,6 +104,7 @@ class Run:
     effort: Floats | None = None  #: (N, n) N m, as measured
     reference_velocity: Floats | None = None  #: (N, n) rad/s
     xi2: Floats | None = None  #: (N, n) rad/s
+    tool: ToolErrors | None = None  #: of an arm with a bound at its tool
     notes: tuple[str, ...] = ()  #: samples of a bag that are left out, and why
 
     def column(self, name: str, i: int) -> Floats | None:

@@ -32,6 +32,7 @@ from blf_dsc_controller.messages.topics import (
     MODEL_CHANGES,
     POSITION,
     RATIO,
+    TOOL,
     VELOCITY,
 )
 from blf_dsc_controller.run import Floats, Regressor, Run
@@ -57,7 +58,7 @@ _TABLE = {  # title: metric, unit, factor, decimals
 }
 _NO_PARAMETERS = (
     *(*COLUMNS, DISTURBANCE, POSITION, VELOCITY, RATIO, DISTANCE, *LOAD, LYAPUNOV),
-    *(LAMBDA_MIN, LATCHED, MODEL_CHANGES, COMPUTE_TIME),
+    *(LAMBDA_MIN, LATCHED, MODEL_CHANGES, *TOOL, COMPUTE_TIME),
 )
 
 
@@ -238,6 +239,24 @@ def outside(run: Run, i: int) -> NDArray[np.bool_] | None:
     )
 
 
+def tool_errors(run: Run) -> Floats | None:
+    """Return `topics.TOOL` (N, 4) [m, rad] of every sample, NaN where unknown.
+
+    None of an arm without a bound at its tool.
+    """
+    arrays = [
+        each for each in (run.reference, run.error, run.bound) if each is not None
+    ]
+    if run.tool is None or len(arrays) < 3:
+        return None
+    found = np.empty((run.stamp.size, len(TOOL)))
+    for begin in range(0, len(found), _BLOCK):
+        some = slice(begin, begin + _BLOCK)
+        reference, error, bound = (np.asarray(each[some]) for each in arrays)
+        found[some] = run.tool(reference, error, bound)
+    return found
+
+
 def _known(run: Run, name: str, i: int) -> Floats:
     """Return the values of one joint, NaN where they are unknown."""
     found = run.column(name, i)
@@ -292,6 +311,8 @@ class Metrics:
     model_changes: list[float]  #: s, when the controller found that the arm had changed
     rejected_columns: list[str]
     loads: list[dict[str, float]]  #: what the tip held `until` [s], where known
+    #: largest `error` [m] and `angle` [rad] at the tool, with their certified bounds then
+    tool: dict[str, float] | None
     #: `rate` [Hz], `latency` [s], `late_steps`, in real time
     timing: dict[str, Any] | None
     estimate: dict[str, float] | None = None  #: at the end
@@ -343,6 +364,7 @@ def measure(run: Run) -> Metrics:
         model_changes=change_times(run),
         rejected_columns=rejected_columns(run),
         loads=_loads(run),
+        tool=_tool(run),
         timing=_timing(run),
         **({} if estimates is None else _learning(estimates)),
     )
@@ -379,6 +401,24 @@ def _loads(run: Run) -> list[dict[str, float]]:
         {'until': float(t), **dict(zip(LOAD, load.tolist(), strict=True))}
         for t, load in zip(times, values[ends], strict=True)
     ]
+
+
+def _tool(run: Run) -> dict[str, float] | None:
+    """Return the largest error and angle at the tool, each with the bound that it had."""
+    values = tool_errors(run)
+    if values is None or not np.isfinite(values[:, 0]).any():
+        return None
+    error, bound, angle, angle_bound = values.T
+    at = int(np.nanargmax(error))
+    turned = int(np.nanargmax(angle))
+    return {
+        'error': float(error[at]),
+        'bound': float(bound[at]),
+        'ratio': _peak(error / bound),
+        'angle': float(angle[turned]),
+        'angle_bound': float(angle_bound[turned]),
+        'angle_ratio': _peak(angle / angle_bound),
+    }
 
 
 def _timing(run: Run) -> dict[str, Any] | None:
@@ -501,6 +541,8 @@ def _sentences(of: Metrics) -> Iterator[str]:
     ]
     if wider:
         yield f'at widest   {", ".join(wider)}'
+    if of.tool is not None:
+        yield f'tool        {tool_text(of.tool)}'
     for stop in of.stops:
         yield f'stopped     at {stop["time"]:.3f} s, {stop["reason"]}: {stop["text"]}'
     if of.estimate is not None:
@@ -519,6 +561,14 @@ def _sentences(of: Metrics) -> Iterator[str]:
             * is_slow
         )
         yield f'real time   {", ".join([*figures, f"{late} late steps"])}{busy}'
+
+
+def tool_text(tool: Mapping[str, float]) -> str:
+    """Return `Metrics.tool` in words."""
+    mm = f'{1e3 * tool["error"]:.3g} mm off at most, {1e3 * tool["bound"]:.3g} mm certified there'
+    mrad = f'turned {1e3 * tool["angle"]:.3g} mrad, {1e3 * tool["angle_bound"]:.3g} mrad certified'
+    share = f'{100.0 * tool["ratio"]:.3g} % and {100.0 * tool["angle_ratio"]:.3g} % of the bounds'
+    return f'{mm}; {mrad}; at most {share}'
 
 
 def _learning_lines(of: Metrics) -> Iterator[str]:

@@ -22,6 +22,7 @@ from blf_dsc_controller.analysis.metrics import (
     latch_time,
     outside,
     rms,
+    tool_errors,
     true_change_times,
 )
 from blf_dsc_controller.messages.topics import (
@@ -213,6 +214,23 @@ def _motion(run: Run) -> Iterator[Panel]:
         error = run.column('error', i)
         if error is not None:
             yield _error_size(run, t, i, 1e3 * error)
+    yield from _tool(run, t)
+
+
+def _tool(run: Run, t: Floats) -> Iterator[Panel]:
+    """Yield the panels of the error at the tool and of its angle, with certified bounds."""
+    values = tool_errors(run)
+    if values is None:
+        return
+    for title, unit, column in (('error', 'mm', 0), ('angle', 'mrad', 2)):
+        error = 1e3 * values[:, column]
+        bound = 1e3 * values[:, column + 1]
+        lines = [
+            Line('error', t, error),
+            Line('certified bound', t, bound, MUTED, dashed=True),
+        ]
+        note = '' if np.isnan(error).all() else f'max {np.nanmax(error):.3g}'
+        yield Panel('Tracking', f'{title} at the tool', unit, lines, note)
 
 
 def _error(run: Run, t: Floats, i: int, error: Floats) -> Panel:

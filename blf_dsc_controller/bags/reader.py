@@ -19,7 +19,7 @@ from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.extras import import_extra
 from blf_dsc_controller.messages import topics
 from blf_dsc_controller.messages.journal import Event, EventType
-from blf_dsc_controller.run import LearnedArm, Run, Series, Stop
+from blf_dsc_controller.run import LearnedArm, Run, Series, Stop, ToolErrors
 
 _MOST_FALLS = 10  # of the stamps, by resets of a simulator
 _ALTERNATING = 0.9  # ratio of the intervals to and from the state of another publisher
@@ -133,6 +133,7 @@ def recorded_run(
         timing=series(topics.TIMING),
         stops=tuple(_stops(events, int(stamp[0]))),
         arm=_arm(content),
+        tool=_tool(content),
         learns=_learns([event.content.get('parameters', {}) for event in events]),
         notes=notes,
     )
@@ -219,6 +220,17 @@ def _arm(content: Content) -> LearnedArm | None:
 
         with suppress(BlfDscError):
             return learned_arm(content.controller_config())
+    return None
+
+
+def _tool(content: Content) -> ToolErrors | None:
+    """Return the errors at the tool of the recorded configuration; None without a bound there."""
+    if content.configurations.get(topics.CONTROLLER, {}).get('model') == 'urdf':
+        from blf_dsc_controller.configuration.tool_bound import tool_of  # as above
+
+        with suppress(BlfDscError):
+            tool = tool_of(content.controller_config())
+            return tool.errors if tool else None
     return None
 
 

@@ -416,6 +416,22 @@ def _add_studies(command: _Command) -> None:
     option('--laws', nargs='+', default=[], metavar='LAW', help=laws)
     option('--out', type=Path, default=Path('arms'), help='new folder for the figures')
     option = command(
+        'tool',
+        'Try a bound at the tool: random errors within the joint bounds that follow from it, and '
+        'closed loops of arms whose URDF is wrong; offline, on all cores, in a minute.',
+        '--config panda --bound 0.003 --out tool',
+    )
+    option(
+        '--config',
+        nargs='+',
+        default=['panda', 'ur5e', 'fr3'],
+        help='presets or files (panda ur5e fr3)',
+    )
+    option('--bound', type=float, default=0.005, help='bound at the tool [m] (0.005)')
+    option('--runs', type=_positive, default=10_000, help='random motions (10000)')
+    option('--truths', type=_positive, default=5, help='closed loops of each arm (5)')
+    option('--out', type=Path, default=Path('tool'), help='new folder for the figures')
+    option = command(
         'monte-carlo',
         'Run a study of many random plants. Thousands of closed loops run in parallel, and the '
         'report says how many kept the bound. Interrupted studies resume: start the same command '

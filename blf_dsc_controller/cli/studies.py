@@ -20,6 +20,7 @@ from blf_dsc_controller.compiled.announcement import announced_compilation
 from blf_dsc_controller.configuration.nodes import locate
 from blf_dsc_controller.studies import laws, report, runs, stiffness
 from blf_dsc_controller.studies import paper as paper_study
+from blf_dsc_controller.studies import tool as tool_study
 from blf_dsc_controller.studies.monte_carlo import load_study
 
 _PAUSE_IN_A_LOG = 10.0  # s between two updates of the bar
@@ -56,6 +57,17 @@ def arms(options: Namespace) -> None:
     print(
         f'wrote {options.out}: {", ".join(sorted(path.name for path in folder.iterdir()))}'
     )
+
+
+def tool(options: Namespace) -> None:
+    """Try a bound at the tool, write tool.json and tool.png, and print the table."""
+    folder = make_folder(options.out)
+    with announced_compilation(print_notice):
+        found = tool_study.compare(
+            folder, options.config, options.bound, options.runs, options.truths
+        )
+    print(tool_study.format_figures(found))
+    print(f'wrote {options.out}: tool.json, tool.png')
 
 
 def monte_carlo(options: Namespace) -> None:

@@ -20,7 +20,7 @@ import numpy as np
 
 from blf_dsc_controller.arms import tuning
 from blf_dsc_controller.arms.model import arm_model
-from blf_dsc_controller.configuration import law_file
+from blf_dsc_controller.configuration import law_file, tool_bound
 from blf_dsc_controller.configuration.robot import (
     ArmConfig,
     described,
@@ -40,6 +40,10 @@ from blf_dsc_controller.configuration.schema import (
 )
 from blf_dsc_controller.errors import BlfDscError
 
+_of_tool = partial(
+    non_negative,
+    read_only='the joint bounds follow from it when they are read: change those',
+)
 _of_reference = partial(
     parameter,
     read_only='the reference would jump: send a trajectory on ~/joint_trajectory',
@@ -245,6 +249,12 @@ class Barrier:
     bound: PerJoint = positive(
         (0.002, 0.002), 'bound on the tracking error', 'rad', 'k_c'
     )
+    tool_bound: float = _of_tool(
+        0.0, 'bound on the error of robot.tip, from which `bound` follows; 0: none', 'm'
+    )
+    tool_angle_bound: float = _of_tool(
+        0.0, 'bound on the angle by which robot.tip is turned, likewise; 0: none', 'rad'
+    )
     initial_bound: PerJoint = non_negative(
         (0.0, 0.0),
         'initial bound of a funnel that narrows to `bound`; 0: constant',
@@ -266,6 +276,11 @@ class Barrier:
         'N m/rad',
         'S_lim',
     )
+
+    @property
+    def bounds_tool(self) -> bool:
+        """Whether there is a bound at the tool."""
+        return self.tool_bound > 0.0 or self.tool_angle_bound > 0.0
 
     @property
     def widest(self) -> tuple[float, ...]:
@@ -629,26 +644,31 @@ class ControllerConfig(ArmConfig):
         if given.get('model', 'urdf' if given.get('robot.urdf') else '') != 'urdf':
             return {'surface.time_constant': max(period, Surface().time_constant)}
         robot, chain = given_robot(given)
+        base = parameters_of(robot, chain)
         arm = tuning.Design(
             chain,
-            parameters_of(robot, chain),
+            base,
             robot.efforts(chain),
             robot.rotors(chain),
             robot.payload,
             robot.lag,
         )
-        bound = np.array(given.get('barrier.bound', ()))
+        stiffness = given.get('feedback.stiffness', Feedback().stiffness)
+        bound = given.get('barrier.bound')
+        if bound is None and tool_bound.is_given(given):
+            usual = tuning.gains_of(arm, period, stiffness, None)
+            bound = tool_bound.joint_bounds({**usual, **given}, robot, chain, base)
+        followed = {} if bound is None else {'barrier.bound': bound}
+        is_whole = bound is not None and len(bound) == len(chain.joints)
         return {
             'model': 'urdf',
             **described(robot, chain),
             'learning.weighing': given.get('learning.prediction', 'filtered')
             == 'filtered',
             **tuning.gains_of(
-                arm,
-                period,
-                given.get('feedback.stiffness', Feedback().stiffness),
-                bound if bound.size == len(chain.joints) else None,
+                arm, period, stiffness, np.array(bound) if is_whole else None
             ),
+            **followed,
         }
 
     def problems(self) -> Iterator[str]:
@@ -675,6 +695,7 @@ class ControllerConfig(ArmConfig):
         yield from self.reference.problems()
         yield from self.limits.problems(self.joints)
         yield from self.barrier.problems(self.joints)
+        yield from tool_bound.problems(self)
         yield from self.truth.problems(
             self.law, self.model, count, self.learning.radius
         )

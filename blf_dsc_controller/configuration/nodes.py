@@ -251,9 +251,9 @@ def load_loop(
 ) -> LoopConfig:
     """Load plant, controller and recorder from a preset or a file.
 
-    `overrides`, by node and dotted name, take precedence over the file. Raises
-    ConfigurationError with the problems of all nodes, or if plant and controller
-    disagree.
+    `overrides`, by node and dotted name, take precedence over the file; None removes
+    what the file gives. Raises ConfigurationError with the problems of all nodes, or if
+    plant and controller disagree.
     """
     path = locate(given)
     configs = _load_all(path, NODES, overrides or {})
@@ -293,9 +293,11 @@ def _load_all(
             if not section.is_wildcard or is_of_node(name, cls)
             if not is_builtin(name)
         }
-        values = {name: entry.value for name, entry in entries.items()}
+        written = {name: entry.value for name, entry in entries.items()}
+        given: dict[str, object] = {**written, **chosen}
+        values = {name: value for name, value in given.items() if value is not None}
         try:
-            configs[node] = build(cls, {**values, **chosen})
+            configs[node] = build(cls, values)
         except ConfigurationError as error:
             for problem in error.problems:
                 name = problem.split(':', 1)[0]

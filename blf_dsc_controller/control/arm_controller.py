@@ -43,6 +43,18 @@ class Load(NamedTuple):
     interval: float  # kg
 
 
+class ToolError(NamedTuple):
+    """Error at the tool, with what the joint bounds keep it within at this posture.
+
+    NaN without `barrier.tool_bound` and `barrier.tool_angle_bound`.
+    """
+
+    error: float  # m
+    bound: float  # m
+    angle: float  # rad
+    angle_bound: float  # rad
+
+
 class ArmController:
     """Joint states in, torques out: the law with learning, checks and safe stops.
 
@@ -263,6 +275,13 @@ class ArmController:
     def bound(self) -> Vector:
         """Bound (n,) [rad] on the error at the last sample."""
         return np.array(self._loop.guard.controller.sample.bound)
+
+    @property
+    def tool(self) -> ToolError:
+        """Error at the tool at the last sample."""
+        errors = self._loop.guard.samples.tool_errors
+        unknown = (math.nan,) * 4
+        return ToolError(*(unknown if errors is None else errors.tolist()))
 
     @property
     def disturbance(self) -> dict[str, float]:

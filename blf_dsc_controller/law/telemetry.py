@@ -18,6 +18,7 @@ import numpy as np
 
 from blf_dsc_controller.arms.model import regressors_at
 from blf_dsc_controller.configuration.controller import ControllerConfig
+from blf_dsc_controller.configuration.tool_bound import tool_of
 from blf_dsc_controller.law.controller import Controller
 from blf_dsc_controller.law.factory import (
     columns_of,
@@ -79,7 +80,9 @@ class ControllerTelemetry:
         names = [
             what + joint for what in (topics.RATIO, topics.DISTANCE) for joint in joints
         ]
-        names = [*names, *chain.from_iterable(parts.values()), topics.COMPUTE_TIME]
+        self._tool = tool_of(config)
+        of_tool = topics.TOOL if self._tool else ()
+        names += [*chain.from_iterable(parts.values()), *of_tool, topics.COMPUTE_TIME]
         self._command = Float64MultiArrayEncoder(len(joints))
         self._reference = JointStateEncoder(joints, ('position', 'velocity'))
         self._error = JointStateEncoder(joints)
@@ -145,8 +148,11 @@ class ControllerTelemetry:
         if is_due:
             yield topics.REFERENCE, self._reference.encode(stamp, sample.qr, sample.dqr)
             distance = bound - np.abs(sample.xi1)
+            of_tool = np.empty(0)
+            if self._tool is not None:
+                of_tool = self._tool.errors(sample.qr, sample.xi1, bound)
             values = np.concatenate(
-                (ratio, distance, *self._parts(sample), (self._slowest,))
+                (ratio, distance, *self._parts(sample), of_tool, (self._slowest,))
             )
             yield topics.MONITOR, self._monitor.encode(stamp, values)
             self._slowest = 0.0
@@ -252,6 +258,7 @@ def run_of(
     samples = sample_columns(rows, controller.settings)
     used = ~np.isnan(samples.qr[:, 0])
     position, velocity, _ = np.split(measurements, 3, axis=1)
+    tool = tool_of(config)
     parts = monitored(config, estimate_names(config))
     monitor = np.hstack([getattr(samples, part)[used] for part in parts])
     return Run(
@@ -269,6 +276,7 @@ def run_of(
             tuple(chain.from_iterable(parts.values())), stamps[used], monitor
         ),
         arm=learned_arm(config),
+        tool=tool.errors if tool else None,
         learns=config.law == 'blf_dsc' and config.learning.weight > 0.0,
     )
 

@@ -159,6 +159,8 @@ MODEL_CHANGES = 'model_changes'
 LOAD = tuple(
     f'load {name}{what}' for what in ('', ' +-') for name in ('mass', 'x', 'y', 'z')
 )  # kg and m in the tip, and half of their 95 % intervals
+TOOL = ('tool_error', 'tool_bound', 'tool_angle', 'tool_angle_bound')
+"""At the tip: error and bound on it [m], angle and bound on it [rad], of this posture."""
 COMPUTE_TIME = 'compute_time'
 LATENCY = 'latency'
 LATENESS = 'lateness'

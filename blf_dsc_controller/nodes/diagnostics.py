@@ -153,6 +153,7 @@ class ControllerStatus:
             'repeated states ignored': states.repeated,
             'samples outside the bound': samples.outside,
             'largest error against the bound': f'{samples.ratio.max():.3g}',
+            **_at_tool(guard),
             'states missed': states.missed,
             'samples with a torque at its limit': samples.saturated,
             'messages for other joints': guard.foreign,
@@ -200,6 +201,17 @@ class ControllerStatus:
                 values,
             )
         return 'learning', OK, learning, values
+
+
+def _at_tool(guard: Guard) -> Mapping[str, str]:
+    errors = guard.samples.tool_errors
+    if errors is None:
+        return {}
+    error, bound, angle, angle_bound = (1e3 * errors).tolist()
+    return {
+        'error at the tool': f'{error:.3g} of {bound:.3g} mm',
+        'angle at the tool': f'{angle:.3g} of {angle_bound:.3g} mrad',
+    }
 
 
 def _load(guard: Guard) -> Part:

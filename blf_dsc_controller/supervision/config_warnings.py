@@ -16,6 +16,7 @@ import numpy as np
 from blf_dsc_controller.arms.tuning import SAMPLES, UNKNOWN_EFFORT, loop_delay
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.robot import implausible_friction
+from blf_dsc_controller.configuration.tool_bound import ANGLE, POSITION
 from blf_dsc_controller.law.factory import settings_of_config
 from blf_dsc_controller.law.state import NEWTON, Settings
 from blf_dsc_controller.supervision.expected_errors import expected_errors
@@ -56,6 +57,19 @@ def _of_units(config: ControllerConfig) -> Iterator[str]:
         )
 
 
+def _of_stop(config: ControllerConfig) -> Iterator[str]:
+    """Check that the joint bounds from which a bound at the tool follows are kept."""
+    share = config.safety.error_ratio
+    if config.barrier.bounds_tool and not 0.0 < share <= 1.0:
+        stop = (
+            f'only {share:g} times past a joint bound' if share else 'at no joint bound'
+        )
+        yield (
+            f'safety.error_ratio: the arm stops {stop}, and up to there the tool may leave its '
+            'bound: give 1'
+        )
+
+
 def config_warnings(
     config: ControllerConfig, load: ReferenceLoad | None = None
 ) -> list[str]:
@@ -65,7 +79,7 @@ def config_warnings(
     """
     settings = settings_of_config(config)
     load = load or reference_load(config, settings)
-    found = [*_of_units(config)]
+    found = [*_of_units(config), *_of_stop(config)]
     if config.model == 'urdf':
         found += _of_urdf(config, load)
     found += [f'{each.subject} {each.text}' for each in _of_gains(config, load)]
@@ -129,13 +143,23 @@ def _of_errors(config: ControllerConfig, settings: Settings) -> Iterator[str]:
     bound = settings.bound
     T = config.sample_time
     robot = config.robot
+    of_tool = ''
+    if config.barrier.bounds_tool:
+        of_tool = POSITION if config.barrier.tool_bound > 0.0 else ANGLE
     errors = expected_errors(config, settings)
     worst = int(np.argmax(errors.unmodelled / bound))
     if errors.unmodelled[worst] > bound[worst]:
+        least = f'give more than {bound[worst]:g} rad'
+        if of_tool:
+            wider = float(errors.unmodelled[worst] / bound[worst])
+            least = (
+                f'past the {bound[worst]:g} rad that the bound leaves it; give more than '
+                f'{wider:.2g} times that bound'
+            )
         yield (
-            'barrier.bound: friction and unmodelled torque (learning.residual_floor) alone push '
-            f'{config.joints[worst]} about {errors.unmodelled[worst]:.2g} rad from its reference: '
-            f'give more than {bound[worst]:g} rad'
+            f'{of_tool or "barrier.bound"}: friction and unmodelled torque '
+            f'(learning.residual_floor) alone push {config.joints[worst]} about '
+            f'{errors.unmodelled[worst]:.2g} rad from its reference: {least}'
         )
     worst = int(np.argmax(errors.pick_up / bound))
     peak = errors.pick_up[worst]
@@ -148,10 +172,13 @@ def _of_errors(config: ControllerConfig, settings: Settings) -> Iterator[str]:
             remedy = f'a feedback.stiffness of {math.ceil(100.0 * stiffer) / 100.0:g}'
         elif faster > 0.0:
             remedy = f'a sample time of {faster / SAMPLES:.2g} s'
+        holding = f'a bound of {1.1 * peak:.2g} rad'
+        if of_tool:
+            holding = f'{1.1 / share:.2g} times that bound at the tool'
         yield (
-            f'barrier.bound: when {robot.payload:g} kg (robot.payload) are picked up in motion, '
-            f'{config.joints[worst]} is expected to be {peak:.2g} rad from its reference, past its '
-            f'bound of {bound[worst]:g} rad: a bound of {1.1 * peak:.2g} rad would hold, or '
+            f'{of_tool or "barrier.bound"}: when {robot.payload:g} kg (robot.payload) are picked '
+            f'up in motion, {config.joints[worst]} is expected to be {peak:.2g} rad from its '
+            f'reference, past its bound of {bound[worst]:g} rad: {holding} would hold, or '
             f'{share * robot.payload:.2g} kg, or {remedy}'
         )
 

@@ -9,9 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from blf_dsc_controller.configuration.controller import ControllerConfig, Safety
+from blf_dsc_controller.configuration.tool_bound import tool_of
 from blf_dsc_controller.law.check_state import NO_EFFECT, OUTSIDE, SUSPECT
 from blf_dsc_controller.law.controller import Controller
 from blf_dsc_controller.supervision.supervisor import Fault, Reason
+from blf_dsc_controller.tool.errors import in_words
 
 Vector = NDArray[np.float64]
 # of the torque limit: what an effort lacks, on average and now, that explains an error past the
@@ -39,6 +41,7 @@ class SampleCheck:
             config.robot.effort in ('whole', 'commanded')
         )
         self._joints = config.joints
+        self._tool = tool_of(config)
         self._controller = controller
         self.ratio = controller.checks.ratio
         self._kept = controller.checks.kept
@@ -74,6 +77,17 @@ class SampleCheck:
         # Whole nanoseconds: many samples at once leave what they leave one by one.
         left = self._saturation - round(duration * 1e9) if duration < inf else 0
         self._saturation = max(0, left)
+
+    @property
+    def tool_errors(self) -> Vector | None:
+        """Errors and bounds at the tool (4,) of the last sample, as of `Tool.errors`.
+
+        None of an arm without a bound there.
+        """
+        if self._tool is None:
+            return None
+        sample = self._controller.sample
+        return self._tool.errors(sample.qr, sample.xi1, sample.bound)
 
     @property
     def estimate(self) -> Vector:
@@ -193,6 +207,8 @@ class SampleCheck:
             f'joint {self._joints[worst]!r} is {xi1[worst]:+.6g} rad from its reference: '
             f'past {share}its bound of {bound[worst]:.6g} rad'
         )
+        if (at_tool := self.tool_errors) is not None:
+            text += f'; {in_words(at_tool)}'
         return Fault(Reason.OUTSIDE_BOUND, text + self._lightness(worst))
 
     def _lightness(self, joint: int) -> str:

@@ -56,7 +56,7 @@ _STREAMS = (
     topics.TRUTH,
 )
 _LATCHED = (topics.BOUND, topics.JOURNAL, topics.CHANGES, topics.STATE)
-_FIGURES = (*topics.LOAD, topics.LAMBDA_MIN, topics.LATCHED)
+_FIGURES = (*topics.TOOL, *topics.LOAD, topics.LAMBDA_MIN, topics.LATCHED)
 
 
 class ViewNode(PlainNode):
@@ -231,7 +231,8 @@ class ViewNode(PlainNode):
             self._values.values()
         )
         m = len(truth)
-        *load, lambda_min, latched = monitor[m:].tolist()
+        tool = monitor[m : m + len(topics.TOOL)].tolist()
+        *load, lambda_min, latched = monitor[m + len(topics.TOOL) :].tolist()
         if latched != self._latched and np.isfinite(self._latched):
             text = (
                 'excited window latched' if latched else 'restarts: the arm has changed'
@@ -245,7 +246,7 @@ class ViewNode(PlainNode):
         squares = self._model_error.squares(
             time, state[0], state[1], monitor[:m], truth
         )
-        learned = monitor[:m], truth, lambda_min, squares, load, loaded
+        learned = monitor[:m], truth, lambda_min, squares, load, loaded, tool
         self.past.append(Snapshot(time, state[0], xi1, k_c, tau, *learned))
         while self.past[0].time < time - PAST - 1.0:
             self.past.popleft()

@@ -77,6 +77,7 @@ class Snapshot(NamedTuple):
     squares: Floats  # (3,) (N m)^2, see `ModelError`
     load: Sequence[float] = (np.nan,) * 8  # of topics.LOAD
     loaded: bool = False  # the true parameters differ from those at the start
+    tool: Sequence[float] = (np.nan,) * 4  # of topics.TOOL
 
 
 def require_viser() -> None:
@@ -347,10 +348,14 @@ def with_marks(t: Floats, curves: Floats, marks: Sequence[float]) -> tuple[Float
 
 
 def caption(now: Snapshot) -> str:
-    """Return time, load and excitation as a line of the page."""
+    """Return time, error at the tool, load and excitation as a line of the page."""
+    tool = ''
+    if np.isfinite(now.tool[0]):
+        error, bound = (1e3 * each for each in now.tool[:2])
+        tool = f', tool {error:.2f} of {bound:.2f} mm'
     held = f', held: {load_text(now.load)}' if np.isfinite(now.load[0]) else ''
     excited = f', lambda_min {now.lambda_min:.2g}' if now.lambda_min > 0.0 else ''
-    return f'<div style="margin:4px">t = {now.time:.2f} s{held}{excited}</div>'
+    return f'<div style="margin:4px">t = {now.time:.2f} s{tool}{held}{excited}</div>'
 
 
 def weights(load: Floats) -> Floats:

@@ -1,0 +1,189 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Joint bounds that follow from a bound at the tool.
+
+They are k = lambda w, with the largest lambda for which the tool keeps its bound at
+every posture.  w are the errors to expect of the joints: a loop whose gains follow from
+the arm turns a torque d that its model lacks into errors in proportion to M^-1 d, with
+friction and the residual floor in d, or the weight of the rated payload.  So all joints
+use about the same part of their bounds, which leaves the most room.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from functools import lru_cache
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from blf_dsc_controller.arms.base_parameters import BaseParameters
+from blf_dsc_controller.arms.model import inertia_matrices, regressors_at
+from blf_dsc_controller.arms.urdf import Chain
+from blf_dsc_controller.compiled.algebra import inverse, product
+from blf_dsc_controller.configuration.robot import Robot
+from blf_dsc_controller.tool.errors import MOST_JOINTS, Tool
+
+if TYPE_CHECKING:
+    from blf_dsc_controller.configuration.controller import ControllerConfig
+
+Floats = NDArray[np.float64]
+
+POSITION = 'barrier.tool_bound'
+ANGLE = 'barrier.tool_angle_bound'
+
+_POSTURES = 40
+# of Coulomb friction: half of it too much at breakaway, with either sign
+_REVERSAL = 0.75
+_PAST = 0.1  # rad or m, by which an arm may be past its position limits
+_DOWN = 0.9995  # four digits of a joint bound round up by less
+_FINEST = 1e-6  # rad, a sixth of a step of a 20 bit encoder
+_ROUNDED = 1.0 + 1e-9
+_BARRIERLESS = ('backstepping', 'slotine_li')
+
+
+def is_given(values: Mapping[str, Any]) -> bool:
+    """Whether parameters by dotted name have a bound at the tool."""
+    return any(values.get(name, 0.0) > 0.0 for name in (POSITION, ANGLE))
+
+
+def tool_of(config: ControllerConfig) -> Tool | None:
+    """Return the tool of a configuration; None without a bound on its error."""
+    if not config.barrier.bounds_tool:
+        return None
+    limits = config.limits
+    return _tool(
+        config.robot.chain(config.joints), limits.position_lower, limits.position_upper
+    )
+
+
+def _tool(chain: Chain, lower: tuple[float, ...], upper: tuple[float, ...]) -> Tool:
+    return Tool(chain, np.maximum(np.abs(lower), np.abs(upper)) + _PAST)
+
+
+def joint_bounds(
+    values: Mapping[str, Any], robot: Robot, chain: Chain, base: BaseParameters
+) -> tuple[float, ...] | None:
+    """Return the joint bounds (n,) [rad] of parameters by dotted name.
+
+    None if these do not fit the arm, as `ControllerConfig.problems` then says.
+    """
+    lower = tuple(values['limits.position_lower'])
+    upper = tuple(values['limits.position_upper'])
+    floor = tuple(values['learning.residual_floor'])
+    P0 = tuple(values['learning.initial_estimate'])
+    friction = robot.friction(chain)['coulomb']
+    n = len(chain.joints)
+    lengths = {len(each) for each in (lower, upper, floor, friction)}
+    if lengths != {n} or len(P0) != base.model.p or n > MOST_JOINTS:
+        return None
+    unmodelled = tuple(
+        rms + _REVERSAL * coulomb for rms, coulomb in zip(floor, friction, strict=True)
+    )
+    region = _region(values, n) or (lower, upper)
+    expected = _expected(base, P0, robot.payload, unmodelled, *region)
+    k = _scaled(
+        _tool(chain, lower, upper),
+        np.array(expected),
+        (values.get(POSITION, 0.0), values.get(ANGLE, 0.0)),
+    )
+    return tuple(float(f'{_DOWN * each:.4g}') for each in k.tolist())
+
+
+def _region(
+    values: Mapping[str, Any], n: int
+) -> tuple[tuple[float, ...], tuple[float, ...]] | None:
+    """Return the least and largest positions (n,) of sinusoids; None of other references."""
+    if values['reference.type'] != 'sinusoids':
+        return None
+    offset = np.array(values['reference.offset'])
+    amplitude = np.abs(values['reference.amplitude'])
+    if offset.size != n or amplitude.size == 0 or amplitude.size % n:
+        return None
+    reach = amplitude.reshape(n, -1).sum(axis=1)
+    return tuple((offset - reach).tolist()), tuple((offset + reach).tolist())
+
+
+def _scaled(tool: Tool, w: Floats, bounds: tuple[float, float]) -> Floats:
+    """Return the largest lambda w (n,) that keeps the bounds [m, rad], 0 for none."""
+    scales = [
+        bound / used
+        for bound, used in zip(bounds, tool.everywhere(w).tolist(), strict=True)
+        if bound > 0.0 and used > 0.0
+    ]
+    return np.asarray(min(scales, default=0.0) * w)
+
+
+@lru_cache(maxsize=16)
+def _expected(
+    base: BaseParameters,
+    P0: tuple[float, ...],
+    payload: float,
+    unmodelled: tuple[float, ...],
+    lower: tuple[float, ...],
+    upper: tuple[float, ...],
+) -> tuple[float, ...]:
+    """Return w (n,), the largest |M^-1 d| of random postures between two."""
+    n = len(unmodelled)
+    random = np.random.default_rng(0)
+    q = random.uniform(lower, np.maximum(lower, upper), (_POSTURES, n))
+    load = payload * base.load
+    zero = np.zeros_like(q)
+    weight = product(
+        regressors_at(base.model, q, zero, zero, zero), load[:, np.newaxis]
+    )
+    friction = np.broadcast_to(np.array(unmodelled)[:, np.newaxis], weight.shape)
+    found = np.zeros(n)
+    for P, d in ((np.array(P0), friction), (np.array(P0) + load, weight)):
+        M = inertia_matrices(base.model, P, q)
+        is_arm = np.linalg.eigvalsh(M)[:, 0] > 0.0
+        pushed = product(inverse(M[is_arm]), d[is_arm])[..., 0]
+        found += np.abs(pushed).max(axis=0, initial=0.0)
+    even = found.max() == 0.0  # of no arm at all
+    return tuple((np.ones(n) if even else found).tolist())
+
+
+def certified(config: ControllerConfig) -> tuple[float, float]:
+    """Return the bounds [m, rad] at the tool that the joint bounds keep at every posture."""
+    tool = tool_of(config)
+    assert tool is not None  # noqa: S101 - the caller has looked
+    position, angle = tool.everywhere(np.array(config.barrier.bound)).tolist()
+    return position, angle
+
+
+def problems(config: ControllerConfig) -> Iterator[str]:
+    """Check that there is a tool, and that the joint bounds keep it within its bound."""
+    barrier = config.barrier
+    if not barrier.bounds_tool:
+        return
+    name = POSITION if barrier.tool_bound > 0.0 else ANGLE
+    if config.model != 'urdf':
+        yield (
+            f'{name}: model {config.model} has no tool: give robot.urdf and robot.tip'
+        )
+        return
+    if not config.robot.tip:
+        yield f'{name}: give robot.tip, the link whose origin is the tool'
+    if len(config.joints) > MOST_JOINTS:
+        yield f'{name}: got {len(config.joints)} joints, but at most {MOST_JOINTS} are allowed'
+        return
+    if config.law in _BARRIERLESS:
+        yield f'{name}: the law {config.law} keeps no bound: choose blf_dsc, or drop it'
+    least = min(barrier.bound)
+    if least < _FINEST:
+        joint = config.joints[barrier.bound.index(least)]
+        yield (
+            f'{name}: it leaves {joint} {least:.2g} rad, finer than any encoder: give '
+            f'{_FINEST / max(least, 1e-300):.2g} times as much or more'
+        )
+    kept = certified(config)
+    for name, unit, bound, tool in (
+        (POSITION, 'm', barrier.tool_bound, kept[0]),
+        (ANGLE, 'rad', barrier.tool_angle_bound, kept[1]),
+    ):
+        if 0.0 < bound * _ROUNDED < tool:
+            yield (
+                f'barrier.bound: these joint bounds keep the tool within {tool:.4g} {unit} only, '
+                f'but {name} is {bound:g} {unit}: drop barrier.bound, which then follows from it, '
+                f'or drop {name}'
+            )

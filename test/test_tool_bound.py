@@ -1,0 +1,362 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A bound at the tool: joint bounds that keep it, and what is shown of its error."""
+
+from __future__ import annotations
+
+import json
+from itertools import product
+
+import numpy as np
+import pytest
+from random_arm import chain_of
+from recorded_run import compared
+
+from blf_dsc_controller.analysis.metrics import format_table, measure
+from blf_dsc_controller.analysis.panels import panels
+from blf_dsc_controller.arms.two_link import urdf
+from blf_dsc_controller.arms.urdf import frames, read_chain
+from blf_dsc_controller.bags.reader import read_run
+from blf_dsc_controller.cli.main import main
+from blf_dsc_controller.configuration.controller import ControllerConfig
+from blf_dsc_controller.configuration.nodes import (
+    CONTROLLER,
+    PLANT,
+    dump,
+    load,
+    load_loop,
+)
+from blf_dsc_controller.configuration.schema import build, change, flatten
+from blf_dsc_controller.configuration.tool_bound import certified, tool_of
+from blf_dsc_controller.control.arm_controller import ArmController
+from blf_dsc_controller.errors import ConfigurationError
+from blf_dsc_controller.law.factory import settings_of_config
+from blf_dsc_controller.messages.topics import TOOL
+from blf_dsc_controller.replay.verify import verify
+from blf_dsc_controller.simulation.loop import simulate, write_bag
+from blf_dsc_controller.supervision.config_warnings import config_warnings
+from blf_dsc_controller.supervision.expected_errors import expected_errors
+from blf_dsc_controller.tool.errors import ANGLE, ANGLE_BOUND, BOUND, ERROR, Tool
+
+TRAVEL = 2.5  # m, limit of the prismatic joints of random arms
+ROUNDING = 1e-13  # m and rad, of placements
+
+
+def preset(name, **controller):
+    """Return the loop of a preset with a bound at the tool in place of its joint bounds."""
+    given = {'barrier.bound': None, **controller}
+    return load_loop(name, {CONTROLLER: given, PLANT: {'duration': 1.0}})
+
+
+def arm(name):
+    """Return the chain of a preset, of the paper's arm or of a random one."""
+    if name == 'paper':
+        text = urdf(('joint1', 'joint2'), (1.0, 0.8), (0.5, 0.5))
+        return read_chain(text, '', 'tip', ())
+    if name in ('fr3', 'openarm'):
+        config = load_loop(name).controller
+        return config.robot.chain(config.joints)
+    return chain_of(name)
+
+
+def true_errors(chain, qr, errors):
+    """Return error [m] and angle [rad] (m, 2) by the placements of the tip, and their log."""
+    there, here = frames(chain, qr + errors)[-1], frames(chain, qr)[-1]
+    off = np.linalg.norm(there[:, :3, 3] - here[:, :3, 3], axis=1)
+    turned = np.swapaxes(here[:, :3, :3], 1, 2) @ there[:, :3, :3]
+    sines = np.linalg.norm(turned - np.swapaxes(turned, 1, 2), axis=(1, 2)) / 8.0**0.5
+    cosines = (np.trace(turned, axis1=1, axis2=2) - 1.0) / 2.0
+    return np.stack((off, np.arctan2(sines, cosines)), axis=1)
+
+
+def worst_errors(chain, q, k, random):
+    """Return the largest error and angle (2,) found in the box |e| <= k about q (n,)."""
+    n = q.size
+    some = random.choice((-1.0, 1.0), (200, n))
+    if n <= 7:
+        some = np.array(list(product((-1.0, 1.0), repeat=n)))
+    some = np.vstack((some, random.uniform(-1.0, 1.0, (100, n))))
+    largest = np.zeros(2)
+    for column in range(2):
+        best = some
+        for spread in (0.5, 0.2, 0.05):
+            found = true_errors(chain, np.broadcast_to(q, best.shape), k * best)
+            top = best[np.argsort(-found[:, column])[:10]]
+            shifted = top + spread * random.normal(size=(10, *top.shape))
+            best = np.vstack((top, np.clip(shifted.reshape(-1, n), -1.0, 1.0)))
+        found = true_errors(chain, np.broadcast_to(q, best.shape), k * best)
+        largest[column] = found[:, column].max()
+    return largest
+
+
+ARMS = ('panda', 'ur5e', 'fr3', 'paper', 'one', 'two', 'three', 'six', 'nine')
+
+
+@pytest.mark.parametrize('size', [1e-3, 0.05])
+@pytest.mark.parametrize('name', ARMS)
+def test_no_error_in_the_box_moves_the_tool_past_its_bound(name, size):
+    """Nine joints of all kinds among them, and errors far beyond the linear range."""
+    chain = arm(name)
+    n = len(chain.joints)
+    random = np.random.default_rng(n)
+    tool = Tool(chain, np.full(n, TRAVEL))
+    for _ in range(5):
+        q = random.uniform(-2.4, 2.4, n)
+        k = size * random.uniform(0.1, 1.0, n)
+        found = worst_errors(chain, q, k, random)
+        here = tool.at_postures(q[np.newaxis], k)[0]
+        everywhere = tool.everywhere(k)
+        assert (found <= here + ROUNDING).all()
+        assert (found <= everywhere + ROUNDING).all()
+        if size < 0.01 and n <= 7:  # all corners were tried
+            assert (here <= 1.02 * found + 1e-12).all()
+
+
+@pytest.mark.parametrize('name', ['panda', 'six', 'nine'])
+def test_errors_are_those_of_the_placements(name):
+    chain = arm(name)
+    n = len(chain.joints)
+    random = np.random.default_rng(1)
+    qr = random.uniform(-2.0, 2.0, (30, n))
+    # up to half a turn
+    errors = np.geomspace(1e-6, 1.0, 30)[:, np.newaxis] * random.normal(size=(30, n))
+    tool = Tool(chain, np.full(n, TRAVEL))
+    found = tool.errors(qr, errors, np.ones(n))
+    true = true_errors(chain, qr, errors)
+    np.testing.assert_allclose(found[:, ERROR], true[:, 0], rtol=1e-8, atol=1e-15)
+    small = true[:, 1] < 2.0
+    assert small.sum() > 20
+    np.testing.assert_allclose(
+        found[small, ANGLE], true[small, 1], rtol=1e-8, atol=1e-14
+    )
+    # one sample or many: the same bits
+    rows = zip(qr, errors, strict=True)
+    each = [tool.errors(*row, np.ones(n)) for row in rows]
+    np.testing.assert_array_equal(found, each)
+
+
+@pytest.mark.parametrize('name', ['panda', 'ur5e', 'fr3', 'openarm'])
+def test_bound_at_every_posture_is_tight(name):
+    """Compare with the worst of many postures, which are not all: the true ratio is lower."""
+    chain = arm(name)
+    n = len(chain.joints)
+    random = np.random.default_rng(3)
+    tool = Tool(chain, np.zeros(n))
+    lower = np.array([max(joint.lower, -np.pi) for joint in chain.joints])
+    upper = np.array([min(joint.upper, np.pi) for joint in chain.joints])
+    q = random.uniform(lower, upper, (20_000, n))
+    for k in (np.full(n, 1e-5), random.uniform(1e-6, 1e-5, n)):
+        worst = tool.at_postures(q, k).max(axis=0)
+        assert (worst <= 1.01 * tool.everywhere(k)).all()  # but for their remainder
+        assert (tool.everywhere(k) <= 1.3 * worst).all()
+
+
+@pytest.mark.parametrize('name', ['panda', 'ur5e', 'fr3'])
+def test_joint_bounds_follow_from_the_bound_at_the_tool(name):
+    loop = preset(name, **{'barrier.tool_bound': 0.003})
+    config = loop.controller
+    position, angle = certified(config)
+    assert 0.99 * 0.003 < position <= 0.003
+    # along the reference, at most 1.5 times the worst there
+    w = 2.0 * np.pi / 5.0
+    reference = config.reference
+    amplitude = np.reshape(reference.amplitude, (len(config.joints), -1))
+    tones = np.arange(1, 4) * w
+    t = np.linspace(0.0, 5.0, 200)
+    angles = np.multiply.outer(t, tones) + reference.phase
+    q = reference.offset + np.cos(angles) @ amplitude.T
+    k = np.array(config.barrier.bound)
+    assert position <= 1.5 * tool_of(config).at_postures(q, k)[:, 0].max()
+    # what is to be expected uses about the same part of each
+    expected = sum(expected_errors(config, settings_of_config(config)))
+    even = expected / np.array(load_loop(name).controller.barrier.bound)
+    assert np.ptp(np.log(expected / k)) < 0.5 * np.ptp(np.log(even))
+
+    turned = preset(name, **{'barrier.tool_angle_bound': angle / 2.0}).controller
+    np.testing.assert_allclose(turned.barrier.bound, k / 2.0, rtol=2e-3)
+    both = {'barrier.tool_bound': 0.003, 'barrier.tool_angle_bound': angle / 2.0}
+    assert preset(name, **both).controller.barrier.bound == turned.barrier.bound
+
+
+def test_configuration_with_its_joint_bounds_can_be_read_again(tmp_path):
+    config = preset('panda', **{'barrier.tool_bound': 0.003}).controller
+    assert change(config, {}) == config
+    dump(tmp_path / 'config.yaml', {CONTROLLER: config})
+    assert load(tmp_path / 'config.yaml', CONTROLLER, ControllerConfig) == config
+    halved = [each / 2.0 for each in config.barrier.bound]
+    assert change(config, {'barrier.bound': halved}).barrier.tool_bound == 0.003
+    with pytest.raises(ConfigurationError, match=r'within 0\.0059.* m only'):
+        change(config, {'barrier.bound': [2.0 * each for each in config.barrier.bound]})
+
+
+PANDA = {'robot.urdf': 'panda.urdf', 'robot.tip': 'panda_hand_tcp'}
+POSITION = {'barrier.tool_bound': 0.001}
+MISTAKES = {
+    'negative': (
+        PANDA | {'barrier.tool_bound': -0.001},
+        'barrier.tool_bound: got -0.001, but it must be at least 0 m',
+    ),
+    'negative angle': (
+        PANDA | {'barrier.tool_angle_bound': -0.1},
+        'barrier.tool_angle_bound: got -0.1, but it must be at least 0 rad',
+    ),
+    'no number': (
+        PANDA | {'barrier.tool_bound': float('nan')},
+        'barrier.tool_bound: got .nan, but a finite number is needed',
+    ),
+    'a list': (
+        PANDA | {'barrier.tool_bound': [0.001]},
+        'barrier.tool_bound: got [0.001], but a double is expected',
+    ),
+    'no tip': (
+        {'robot.urdf': 'panda.urdf', 'joints': [f'panda_joint{i}' for i in range(1, 8)]}
+        | POSITION,
+        'barrier.tool_bound: give robot.tip, the link whose origin is the tool',
+    ),
+    'no URDF': (
+        POSITION,
+        'barrier.tool_bound: model two_link has no tool: give robot.urdf and robot.tip',
+    ),
+    'joint bounds, too': (
+        PANDA | POSITION | {'barrier.bound': [0.005] * 7},
+        (
+            'barrier.bound: these joint bounds keep the tool within 0.01332 m only, but '
+            'barrier.tool_bound is 0.001 m: drop barrier.bound, which then follows from it, or '
+            'drop barrier.tool_bound'
+        ),
+    ),
+    'joint bounds, too, for the angle': (
+        PANDA | {'barrier.tool_angle_bound': 0.01, 'barrier.bound': [0.005] * 7},
+        (
+            'barrier.bound: these joint bounds keep the tool within 0.025 rad only, but '
+            'barrier.tool_angle_bound is 0.01 rad: drop barrier.bound, which then follows from '
+            'it, or drop barrier.tool_angle_bound'
+        ),
+    ),
+    'unreachable': (
+        PANDA | {'barrier.tool_bound': 1e-7},
+        'rad, finer than any encoder: give',
+    ),
+    'no barrier': (
+        PANDA | POSITION | {'law': 'slotine_li'},
+        'barrier.tool_bound: the law slotine_li keeps no bound: choose blf_dsc, or drop it',
+    ),
+}
+
+
+@pytest.mark.parametrize('mistake', MISTAKES)
+def test_mistakes_are_named_with_their_remedy(mistake):
+    given, problem = MISTAKES[mistake]
+    with pytest.raises(ConfigurationError) as caught:
+        build(ControllerConfig, given)
+    (found,) = caught.value.problems
+    assert problem in found
+
+
+def test_warnings_speak_of_the_bound_at_the_tool():
+    """The rate cannot hold joint bounds this narrow; a wider one as said can."""
+    tight = preset('panda', **{'barrier.tool_bound': 0.0005, 'safety.error_ratio': 2.0})
+    share, friction, load = config_warnings(tight.controller)
+    assert share.startswith('safety.error_ratio: the arm stops only 2 times past')
+    assert friction.startswith('barrier.tool_bound: friction and unmodelled torque')
+    assert load.startswith('barrier.tool_bound: when 2 kg')
+    times = float(load.partition(' times that bound at the tool')[0].split()[-1])
+    wide = preset('panda', **{'barrier.tool_bound': 0.0005 * times})
+    assert config_warnings(wide.controller) == []
+
+
+@pytest.fixture(scope='module')
+def tracked():
+    """A Panda that tracks with its tool within 3 mm, once its bound has narrowed."""
+    given = {'barrier.tool_bound': 0.003, 'telemetry.decimation': 1}
+    loop = preset('panda', **given)
+    return loop, simulate(loop.controller, loop.plant)
+
+
+def test_run_shows_the_error_at_the_tool(tracked, tmp_path):
+    loop, record = tracked
+    write_bag(tmp_path / 'bag', record, loop.plant)
+    run = read_run(tmp_path / 'bag')
+    values = run.monitor.select(TOOL)
+    assert values.shape == (run.stamp.size, 4)
+    errors = run.position - run.reference
+    chain = loop.controller.robot.chain(run.joints)
+    true = true_errors(chain, run.reference, errors)
+    np.testing.assert_allclose(values[:, :3:2], true, rtol=1e-6, atol=1e-12)
+    assert (values[:, ERROR] < values[:, BOUND]).all()
+    assert (values[:, ANGLE] < values[:, ANGLE_BOUND]).all()
+    # the funnel narrows
+    assert values[0, BOUND] > 1.5 * values[-1, BOUND]
+
+    metrics = measure(run)
+    assert metrics.tool['error'] == values[:, ERROR].max()
+    assert metrics.tool == measure(record.run()).tool
+    at = values[:, ERROR].argmax()
+    text = f'tool        {1e3 * values[at, ERROR]:.3g} mm off at most, '
+    text += f'{1e3 * values[at, BOUND]:.3g} mm certified there'
+    assert text in format_table(metrics)
+    titles = {panel.title for panel in panels([run])}
+    assert {'error at the tool', 'angle at the tool'} <= titles
+
+    result = verify(tmp_path / 'bag')
+    assert (result.difference, result.remarks) == (None, ())
+    assert compared(result)['monitor'] >= run.monitor.values[:, :-1].size
+
+
+def test_stop_says_both_errors():
+    given = {
+        'barrier.tool_bound': 0.003,
+        'barrier.initial_bound': [0.0] * 7,
+        'torque.limit': [40.0, 40.0, 40.0, 12.0, 12.0, 12.0, 12.0],
+        'safety.saturation_time': 10.0,
+    }
+    loop = preset('panda', **given)
+    record = simulate(loop.controller, loop.plant)
+    (stop,) = record.run().stops
+    assert stop.reason == 'error past the bound'
+    assert 'rad from its reference: past its bound of' in stop.text
+    told = stop.text.partition('; the tool is ')[2]
+    error, bound = (float(told.split(' mm')[k].split()[-1]) for k in (0, 1))
+    assert 0.0 < error < bound < 3.0  # at one joint's bound, with room of the others
+
+
+def test_library_has_the_same_bounds_and_errors(tracked):
+    loop, record = tracked
+    run = record.run()
+    with ArmController(loop.controller) as controller:
+        assert np.isfinite(controller.tool).all()
+        for k in range(50):
+            controller.update(
+                1.0 + 1e-9 * record.stamps[k], *record.measurements[k].reshape(3, -1)
+            )
+        sample = (each[49] for each in (run.reference, run.error, run.bound))
+        np.testing.assert_array_equal(controller.tool, run.tool(*sample))
+    with ArmController('recommended') as controller:
+        assert np.isnan(controller.tool).all()
+
+
+def test_without_a_bound_at_the_tool_nothing_of_it_is_shown():
+    config = load_loop('panda').controller
+    assert tool_of(config) is None
+    assert flatten(config)['barrier.bound'] == (0.005,) * 7
+
+
+def test_study_tries_the_bound_by_one_command(tmp_path, capsys):
+    out = tmp_path / 'out'
+    words = ['tool', '--config', 'ur5e', '--bound', '0.005', '--runs', '150']
+    assert main([*words, '--truths', '1', '--out', str(out)]) == 0
+    header, row, wrote = capsys.readouterr().out.splitlines()
+    assert header.startswith('mm at the tool')
+    assert row.split()[:2] == ['ur5e', '5.00']
+    assert wrote.endswith('tool.json, tool.png')
+    assert (out / 'tool.png').stat().st_size > 10_000
+    figures = json.loads((out / 'tool.json').read_text())['ur5e']
+    assert figures['random runs'] == 150
+    assert figures['above the certified bound'] == 0
+    assert figures['above that of their posture'] == 0
+    assert figures['certified at a posture over its worst corner']['largest'] < 1.05
+    assert 1.0 < figures['along the reference']['ratio'] < 1.5
+    (loop,) = figures['closed loops']
+    assert loop['stops'] == []
+    assert 0.0 < loop['error'] < loop['bound'] < 0.005
+    # what is measured is really near what is certified: the study can find a violation
+    assert figures['certified over measured']['least'] < 1.5
