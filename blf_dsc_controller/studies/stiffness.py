@@ -18,7 +18,7 @@ from pathlib import Path
 import numpy as np
 from tqdm import tqdm
 
-from blf_dsc_controller.analysis.figures import Picture, head
+from blf_dsc_controller.analysis.figures import Picture
 from blf_dsc_controller.analysis.metrics import aligned, write_json
 from blf_dsc_controller.analysis.panels import BLUE, MUTED, ORANGE
 from blf_dsc_controller.configuration.nodes import CONTROLLER, LoopConfig, load_loop
@@ -31,6 +31,8 @@ PARTS = (1.0, 0.5, 0.25, 0.125)
 LAWS = {'proposed': BLUE, 'no_learning': ORANGE, 'computed_torque': MUTED}
 SHOWN = {'before': '8 to 15 s', 'with the load': 'from 20 s'}
 """Intervals of `laws.INTERVALS` that are compared."""
+
+_TICKS = (0.1, 1.0, 10.0, 100.0)  # mrad
 
 Errors = dict[str, dict[str, list[float]]]
 """Largest error [rad] of the worst run, by law and interval, for each of PARTS."""
@@ -89,12 +91,20 @@ def draw(found: dict[str, Errors], path: Path) -> None:
     picture = Picture(1, len(found), title, (5.2, 4.2), share_time=False)
     for axes, (arm, errors) in zip(picture.axes[0], found.items(), strict=True):
         for interval, (law, of_law) in product(SHOWN, errors.items()):
-            dashes = '--' if interval == 'before' else '-'
-            label = f'{laws.LAWS[law].label}, {interval}'
-            milliradians = 1e3 * np.array(of_law[interval])
-            axes.loglog(PARTS, milliradians, dashes, color=LAWS[law], label=label)
+            is_before = interval == 'before'
+            axes.loglog(
+                PARTS,
+                1e3 * np.array(of_law[interval]),
+                '--' if is_before else '-',
+                color=LAWS[law],
+                label=None if is_before else laws.LAWS[law].label,
+            )
+        axes.set_title(f'{arm}: with 2 kg (before: dashed)', loc='left', fontsize=11.5)
+        axes.set_ylim(0.05, 200.0)
+        axes.set_xticks(PARTS, [f'{part:g}' for part in PARTS])
+        axes.set_xticks([], minor=True)
+        axes.set_yticks(_TICKS, [f'{tick:g}' for tick in _TICKS])
         axes.set_xlabel('feedback.stiffness')
         axes.set_ylabel('largest error [mrad]')
-        axes.legend(fontsize=7)
-        head(axes, arm)
+    picture.axes[0, 0].legend(frameon=False, fontsize=9, loc='lower left')
     picture.save(path)
