@@ -154,6 +154,7 @@ def test_bound_at_every_posture_is_tight(name):
 def test_joint_bounds_follow_from_the_bound_at_the_tool(name):
     loop = preset(name, **{'barrier.tool_bound': 0.003})
     config = loop.controller
+    assert config.barrier.widest == config.barrier.bound  # from the start on
     position, angle = certified(config)
     assert 0.99 * 0.003 < position <= 0.003
     # along the reference, at most 1.5 times the worst there
@@ -267,7 +268,11 @@ def test_warnings_speak_of_the_bound_at_the_tool():
 @pytest.fixture(scope='module')
 def tracked():
     """A Panda that tracks with its tool within 3 mm, once its bound has narrowed."""
-    given = {'barrier.tool_bound': 0.003, 'telemetry.decimation': 1}
+    given = {
+        'barrier.tool_bound': 0.003,
+        'barrier.initial_bound': [0.01] * 7,
+        'telemetry.decimation': 1,
+    }
     loop = preset('panda', **given)
     return loop, simulate(loop.controller, loop.plant)
 
@@ -305,7 +310,6 @@ def test_run_shows_the_error_at_the_tool(tracked, tmp_path):
 def test_stop_says_both_errors():
     given = {
         'barrier.tool_bound': 0.003,
-        'barrier.initial_bound': [0.0] * 7,
         'torque.limit': [40.0, 40.0, 40.0, 12.0, 12.0, 12.0, 12.0],
         'safety.saturation_time': 10.0,
     }

@@ -655,10 +655,13 @@ class ControllerConfig(ArmConfig):
         )
         stiffness = given.get('feedback.stiffness', Feedback().stiffness)
         bound = given.get('barrier.bound')
-        if bound is None and tool_bound.is_given(given):
+        bounds_tool = tool_bound.is_given(given)
+        if bound is None and bounds_tool:
             usual = tuning.gains_of(arm, period, stiffness, None)
             bound = tool_bound.joint_bounds({**usual, **given}, robot, chain, base)
         followed = {} if bound is None else {'barrier.bound': bound}
+        if bounds_tool:  # which holds from the start on
+            followed['barrier.initial_bound'] = (0.0,) * len(chain.joints)
         is_whole = bound is not None and len(bound) == len(chain.joints)
         return {
             'model': 'urdf',
