@@ -8,6 +8,7 @@ the same topics as a recording of the running nodes.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 CONTROLLER = 'blf_dsc_controller'
 PLANT = 'sim_plant'
@@ -47,7 +48,7 @@ class Topic:
     offered: Quality
     requested: Quality
 
-    @property
+    @cached_property
     def relative(self) -> str:
         """Name as another node of the same namespace writes it, e.g.
 
@@ -55,12 +56,12 @@ class Topic:
         """
         return self.name.replace('~', self.node, 1)
 
-    @property
+    @cached_property
     def resolved(self) -> str:
         """Full name in the root namespace without remaps, e.g. `/sim_plant/truth`."""
         return '/' + self.relative.lstrip('/')
 
-    @property
+    @cached_property
     def leaf(self) -> str:
         """Last part of the name, under any namespace and node, e.g. `truth`."""
         return self.name.rsplit('/', 1)[-1]

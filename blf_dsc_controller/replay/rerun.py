@@ -282,7 +282,7 @@ class Rerun:
         if topic not in self.topics:
             self.topics[topic] = TopicMessages(topic.resolved, topic.type)
         messages = self.topics[topic]
-        messages.add(BagMessage(topic.resolved, stamp, raw, messages.size + 1))
+        messages.add(BagMessage(messages.name, stamp, raw, messages.size + 1))
 
     # Events.
 
