@@ -26,28 +26,37 @@ class PlainArm:
     def __init__(self, model, names):
         self.model = model
         self.data = model.createData()
-        self.columns = []
-        for name in names:
-            entry, joint = re.fullmatch(r'(.*?)(\d+)', name).groups()
-            self.columns.append((entry, int(joint) - 1))
+        self.columns = []  # of pinocchio's regressor, for each name
+        self.rotors = []  # a name's place, and its joint
+        for k, name in enumerate(names):
+            entry, number = re.fullmatch(r'(.*?)(\d+)', name).groups()
+            joint = int(number) - 1
+            if entry == 'rotor':
+                self.columns.append(0)
+                self.rotors.append((k, joint))
+            else:
+                self.columns.append(10 * joint + ENTRIES.index(entry))
 
     def whole(self, q, dq, ddq):
         """Return the regressor of M ddq + c(q, dq) + G, with a rotor on each joint."""
         full = pinocchio.computeJointTorqueRegressor(self.model, self.data, q, dq, ddq)
-        found = np.zeros((len(q), len(self.columns)))
-        for k, (entry, joint) in enumerate(self.columns):
-            if entry == 'rotor':
-                found[joint, k] = ddq[joint]
-            else:
-                found[:, k] = full[:, 10 * joint + ENTRIES.index(entry)]
+        found = full[:, self.columns]
+        for k, joint in self.rotors:
+            found[:, k] = 0.0
+            found[joint, k] = ddq[joint]
         return found
 
-    def coriolis(self, q, dq, v):
-        """Return the regressor of C(q, dq) v + G."""
+    def at_rate(self, q, dq):
+        """Return the regressors of c(q, dq) + G and of G."""
         nothing = np.zeros(len(q))
-        both, first, second, gravity = (
-            self.whole(q, each, nothing) for each in (dq + v, dq, v, nothing)
-        )
+        return self.whole(q, dq, nothing), self.whole(q, nothing, nothing)
+
+    def coriolis(self, q, dq, v, known=None):
+        """Return the regressor of C(q, dq) v + G; `known` is that of `at_rate`, if it is."""
+        first, gravity = known or self.at_rate(q, dq)
+        nothing = np.zeros(len(q))
+        both = self.whole(q, dq + v, nothing)
+        second = self.whole(q, v, nothing)
         return 0.5 * (both - first - second + gravity) + gravity
 
     def regressor(self, q, dq, v, a):
@@ -60,10 +69,11 @@ class PlainArm:
         """Return Yp and Yr: Yp P = M dq, Yr P = G - C^T dq."""
         n = len(q)
         nothing = np.zeros(n)
-        gravity = self.whole(q, nothing, nothing)
+        known = self.at_rate(q, dq)
+        _, gravity = known
         Yr = gravity.copy()
         for k, unit in enumerate(np.eye(n)):
-            Yr[k] -= dq @ (self.coriolis(q, dq, unit) - gravity)
+            Yr[k] -= dq @ (self.coriolis(q, dq, unit, known) - gravity)
         return self.whole(q, nothing, dq) - gravity, Yr
 
 
