@@ -46,7 +46,11 @@ from blf_dsc_controller.configuration.nodes import PLANT, load_loop
 from blf_dsc_controller.configuration.robot import Robot
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.identification.corrected_urdf import corrected_urdf
-from blf_dsc_controller.identification.identify import identify_arm, identify_bag
+from blf_dsc_controller.identification.identify import (
+    STAGES,
+    identify_arm,
+    identify_bag,
+)
 from blf_dsc_controller.identification.physical import Cone, solve
 from blf_dsc_controller.identification.prior import Prior
 from blf_dsc_controller.identification.reading import read_recording
@@ -204,7 +208,11 @@ def test_commands_replace_efforts_that_are_missing_or_not_wanted(
     some = states[:8000]
     currents = some * [[1.0], [1.0], [0.1]]
     write_states(tmp_path / 'bag', joints, currents, fields=fields, commands=some[:, 2])
-    found = identify_bag(tmp_path / 'bag', ROBOT, names=names, effort=effort)
+    stages = []
+    found = identify_bag(
+        tmp_path / 'bag', ROBOT, names=names, effort=effort, begin=stages.append
+    )
+    assert stages == [*STAGES]
     assert found.source == '/arm/commands'
     assert not list(problems_of(found, effort))
     commanded = effort == 'command'

@@ -10,6 +10,8 @@ from datetime import datetime
 from pathlib import Path
 from tempfile import TemporaryFile
 
+from tqdm import tqdm
+
 from blf_dsc_controller import __version__
 from blf_dsc_controller.bags.content import NameMap
 from blf_dsc_controller.cli.main import make_room
@@ -23,7 +25,7 @@ from blf_dsc_controller.identification.exciting_reference import (
     search,
 )
 from blf_dsc_controller.identification.identified import Identified
-from blf_dsc_controller.identification.identify import identify_bag
+from blf_dsc_controller.identification.identify import STAGES, identify_bag
 from blf_dsc_controller.identification.mjcf import mjcf
 from blf_dsc_controller.identification.parameters import robot_parameters
 from blf_dsc_controller.identification.summary import (
@@ -57,16 +59,23 @@ def identify(options: Namespace) -> int:
         payload=options.rated_payload,
     )
     pick_up = options.payload is True
-    found = identify_bag(
-        options.bags,
-        robot,
-        options.namespace,
-        NameMap.parse(options.map),
-        options.effort,
-        options.gains,
-        None if pick_up else options.payload,
-        pick_up=pick_up,
-    )
+    with tqdm(total=len(STAGES), unit='stage', leave=False, disable=None) as bar:
+
+        def begin(stage: str) -> None:
+            bar.set_description(stage)
+            bar.update(STAGES.index(stage) - bar.n)
+
+        found = identify_bag(
+            options.bags,
+            robot,
+            options.namespace,
+            NameMap.parse(options.map),
+            options.effort,
+            options.gains,
+            None if pick_up else options.payload,
+            pick_up=pick_up,
+            begin=begin,
+        )
     facts = _facts(found, options)
     bodies = bodies_table(found)
     base = '\n'.join(base_table(found))

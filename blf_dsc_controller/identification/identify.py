@@ -8,7 +8,7 @@ fitted to all of the motion.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -28,6 +28,13 @@ from blf_dsc_controller.identification.selection import select
 from blf_dsc_controller.identification.windows import HOP, STILL
 from blf_dsc_controller.run import Floats
 
+STAGES = ('reading', 'checking efforts', 'selecting terms', 'fitting', 'intervals')
+"""What takes time, in this order."""
+
+
+def _tell_nobody(_stage: str) -> None:
+    pass
+
 
 def identify_bag(
     path: Path | Sequence[Path],
@@ -39,6 +46,7 @@ def identify_bag(
     loaded: Path | None = None,
     *,
     pick_up: bool = False,
+    begin: Callable[[str], None] = _tell_nobody,
 ) -> Identified:
     """Identify the arm of one or several bags or tables from its URDF.
 
@@ -46,11 +54,13 @@ def identify_bag(
     torque, the torque without that of gravity, or the commanded torque instead of them; `gains`
     [N m/A] turn currents into torques, and if there are none, signs are found.  A load is
     identified if there is a bag in which the arm is `loaded`, or if it does `pick_up` one.
+    `begin` is called with each of STAGES when it begins.
 
     Raises:
         BlfDscError: a bag or the URDF cannot be read, or there are no torques of the arm, too
             little of it, or no motion.
     """
+    begin(STAGES[0])
     paths = [path] if isinstance(path, Path) else list(path)
     joints: tuple[str, ...] = ()
     if robot.tip:
@@ -72,7 +82,9 @@ def identify_bag(
         measured = recording.torque
         torque = mapped(recording.gap.size, lambda rows: measured[rows] * factors)
         recording = recording._replace(torque=torque)
-    return identify_arm(recording, robot, effort, picked_up, find_signs=not len(gains))
+    return identify_arm(
+        recording, robot, effort, picked_up, find_signs=not len(gains), begin=begin
+    )
 
 
 def checked_gains(gains: Sequence[float], joints: Sequence[str]) -> Floats:
@@ -90,20 +102,25 @@ def identify_arm(
     picked_up: float | None = None,
     *,
     find_signs: bool = True,
+    begin: Callable[[str], None] = _tell_nobody,
 ) -> Identified:
     """Identify the arm of a recording, and the load picked up at that time [s]; NaN: find it.
 
     Raises:
         BlfDscError: the recording is too short or has no motion.
     """
+    begin(STAGES[1])
     problem = problem_of(recording, robot, effort, picked_up, find_signs=find_signs)
     rows = problem.rows
     windows = problem.windows
+    begin(STAGES[2])
     selected = select(rows, windows.fit, problem.G, problem.prior)
+    begin(STAGES[3])
     trained = fitted(rows, windows.fit, problem.G, selected.prior)
     score = scored(rows, windows, problem.G, problem.prior.mean, trained.values)
     final = fitted(rows, windows.moving, problem.G, selected.prior)
     dynamics = nearest_friction(rows, windows, final.values)
+    begin(STAGES[4])
     return Identified(
         source=recording.source,
         duration=recording.duration,
