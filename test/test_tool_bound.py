@@ -364,3 +364,19 @@ def test_study_tries_the_bound_by_one_command(tmp_path, capsys):
     assert 0.0 < loop['error'] < loop['bound'] < 0.005
     # what is measured is really near what is certified: the study can find a violation
     assert figures['certified over measured']['least'] < 1.5
+
+
+@pytest.mark.parametrize(
+    ('words', 'problem'),
+    [
+        (['--bound', '0'], '--bound: got 0 m, but it must be above 0'),
+        (['--bound', '1e-9'], 'finer than any encoder'),
+        (['--config', 'recommended'], 'model two_link has no tool'),
+        (['--config', 'nowhere'], 'nowhere does not exist'),
+    ],
+)
+def test_study_refuses_what_it_cannot_try(tmp_path, capsys, words, problem):
+    out = tmp_path / 'out'
+    assert main(['tool', *words, '--out', str(out)]) == 1
+    assert problem in capsys.readouterr().err
+    assert not out.exists()

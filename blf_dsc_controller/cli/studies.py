@@ -61,10 +61,14 @@ def arms(options: Namespace) -> None:
 
 def tool(options: Namespace) -> None:
     """Try a bound at the tool, write tool.json and tool.png, and print the table."""
-    folder = make_folder(options.out)
     with announced_compilation(print_notice):
+        configs = tool_study.configured(options.config, options.bound)
         found = tool_study.compare(
-            folder, options.config, options.bound, options.runs, options.truths
+            make_folder(options.out),
+            configs,
+            options.bound,
+            options.runs,
+            options.truths,
         )
     print(tool_study.format_figures(found))
     print(f'wrote {options.out}: tool.json, tool.png')

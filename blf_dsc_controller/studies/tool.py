@@ -12,7 +12,7 @@ bounds that follow from the bound at the tool, from the first sample on.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from functools import partial
 from itertools import product
@@ -132,19 +132,40 @@ def closed_loop(seed: int, arm: str, given: dict[str, Any]) -> dict[str, Any]:
     }
 
 
+def bounded(bound: float) -> dict[str, Any]:
+    """Return the parameters that put a bound at the tool [m] in place of joint bounds."""
+    if not bound > 0.0:
+        raise BlfDscError(f'--bound: got {bound:g} m, but it must be above 0')
+    return {'barrier.bound': None, 'barrier.tool_bound': bound}
+
+
+def configured(arms: Sequence[str], bound: float) -> dict[str, ControllerConfig]:
+    """Return the configurations of presets or files with a bound at the tool [m].
+
+    Raises BlfDscError if there is none, or no trial of it.
+    """
+    given = {CONTROLLER: bounded(bound)}
+    for arm in arms:
+        laws.trial(arm, 1, given)
+    return {arm: load_loop(arm, given).controller for arm in arms}
+
+
 def compare(
-    folder: Path, arms: Sequence[str], bound: float, runs: int, truths: int
+    folder: Path,
+    configs: Mapping[str, ControllerConfig],
+    bound: float,
+    runs: int,
+    truths: int,
 ) -> dict[str, dict[str, Any]]:
     """Try everything; write tool.json and tool.png; return the figures by arm."""
-    given = {'barrier.bound': None, 'barrier.tool_bound': bound}
+    given = bounded(bound)
     found: dict[str, dict[str, Any]] = {}
     motions: dict[str, Motions] = {}
-    for arm in arms:
-        config = load_loop(arm, {CONTROLLER: given}).controller
+    for arm, config in configs.items():
         motions[arm] = try_motions(config, runs)
         found[arm] = figures_of(config, motions[arm])
     with ProcessPoolExecutor(cores()) as pool:
-        for arm in arms:
+        for arm in configs:
             trials = pool.map(
                 partial(closed_loop, arm=arm, given=given), range(1, truths + 1)
             )
