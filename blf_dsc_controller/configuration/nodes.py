@@ -18,6 +18,7 @@ from blf_dsc_controller.configuration import law_file
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.drive import DriveConfig
 from blf_dsc_controller.configuration.files import (
+    Entry,
     Section,
     parse,
     read_text,
@@ -268,51 +269,64 @@ def _load_all(
     nodes: Mapping[str, Any],
     overrides: Mapping[str, Mapping[str, object]],
 ) -> dict[str, Any]:
-    """Load the configurations of some nodes; a problem of several is reported once.
-
-    Names of other nodes in sections for several nodes are left out.
-    """
-    sections, known = read(path), known_names()
+    """Load the configurations of some nodes; a problem of several is reported once."""
+    sections = read(path)
     problems = [
-        f'line {entry.line}: {unknown(name, known)}'
-        for section in sections
-        for name, entry in section.entries.items()
-        if section.is_wildcard and name not in known
-        if not (is_builtin(name) or is_gain_of_law(name))
+        *_unknown_in_wildcards(sections),
+        *unmatched_sections(sections, nodes),
     ]
-    problems += unmatched_sections(sections, nodes)
     configs: dict[str, Any] = {}
     nodes_with: dict[str, list[str]] = {}
     for node, cls in nodes.items():
+        entries = _entries_of(sections, node, cls)
+        values = {name: entry.value for name, entry in entries.items()}
         chosen = overrides.get(node, {})
-        entries = {
-            name: entry
-            for section in sections
-            if section.matches('/' + node.removeprefix('/'))
-            for name, entry in section.entries.items()
-            if not section.is_wildcard or is_of_node(name, cls)
-            if not is_builtin(name)
-        }
-        written = {name: entry.value for name, entry in entries.items()}
-        given: dict[str, object] = {**written, **chosen}
-        values = {name: value for name, value in given.items() if value is not None}
         try:
-            configs[node] = build(cls, values)
+            configs[node] = build(cls, {**values, **chosen})
         except ConfigurationError as error:
             for problem in error.problems:
-                name = problem.split(':', 1)[0]
-                line = f'line {entries[name].line}: ' if name in entries else ''
-                told = (
-                    f'{problem} (given as an override)'
-                    if name in chosen
-                    else line + problem
-                )
-                nodes_with.setdefault(told, []).append(node)
+                located = _located(problem, entries, chosen)
+                nodes_with.setdefault(located, []).append(node)
     for problem, names in nodes_with.items():
         problems.append(f'{", ".join(names)}: {problem}' if len(nodes) > 1 else problem)
     if problems:
         raise ConfigurationError(problems, str(path))
     return configs
+
+
+def _unknown_in_wildcards(sections: Iterable[Section]) -> Iterator[str]:
+    """Yield a problem for each name that no node has, in sections for several nodes."""
+    known = known_names()
+    for section in sections:
+        if not section.is_wildcard:
+            continue
+        for name, entry in section.entries.items():
+            if not (name in known or is_builtin(name) or is_gain_of_law(name)):
+                yield f'line {entry.line}: {unknown(name, known)}'
+
+
+def _entries_of(sections: Iterable[Section], node: str, cls: type) -> dict[str, Entry]:
+    """Return the entries for a node; names of other nodes, and ROS's own, are left out."""
+    return {
+        name: entry
+        for section in sections
+        if section.matches('/' + node.removeprefix('/'))
+        for name, entry in section.entries.items()
+        if not section.is_wildcard or is_of_node(name, cls)
+        if not is_builtin(name)
+    }
+
+
+def _located(
+    problem: str, entries: Mapping[str, Entry], chosen: Mapping[str, object]
+) -> str:
+    """Return a problem of a parameter with where its value comes from."""
+    name = problem.split(':', 1)[0]
+    if name in chosen:
+        return f'{problem} (given as an override)'
+    if name in entries:
+        return f'line {entries[name].line}: {problem}'
+    return problem
 
 
 def dump(path: Path, nodes: Mapping[str, object], comment: str = '') -> None:
