@@ -32,11 +32,12 @@ JOINTS = ('joint1', 'joint2')
 START = (2.293, 1.696)  # rad, inside the bound at the reference's start
 
 
-def _joined():
+def _joined(args):
     """Return a context in a domain in which nobody else is, also after it was entered."""
     while True:
         context = rclpy.Context()
         rclpy.init(
+            args=args,
             context=context,
             domain_id=own_domain(),
             signal_handler_options=rclpy.SignalHandlerOptions.NO,
@@ -49,8 +50,8 @@ def _joined():
 class RosRig:
     """A ROS context of its own; call `close` at the end."""
 
-    def __init__(self):
-        self.context = _joined()
+    def __init__(self, args=None):
+        self.context = _joined(args)
         self.executor = EventsExecutor(context=self.context)
         self.nodes = []
         self.tester = self._keep(

@@ -26,6 +26,15 @@ KINDS = (
     ('services', 'reply', 'service', 'get_service_names_and_types_by_node'),
     ('services', 'request', 'service', 'get_client_names_and_types_by_node'),
 )
+# of the process of the action, which needs control_msgs: test_nodes_action compares it
+ACTION = 'blf_dsc_controller/follow_joint_trajectory'
+ACTION_NODE = '_blf_dsc_controller_action'
+ACTION_ACCESS = {
+    'publish': ['/parameter_events'],
+    'subscribe': [],
+    'reply': [f'/{ACTION_NODE}/get_type_description'],
+    'request': [],
+}
 HEAD = """\
 <?xml version="1.0" encoding="UTF-8"?>
 <!-- SPDX-License-Identifier: Apache-2.0 -->
@@ -94,6 +103,15 @@ def live():
         ros.close()
 
 
+def _grant(profile, access):
+    """Add access by kind to a profile."""
+    for group, kind, element, _ in KINDS:
+        if access[kind]:
+            part = ET.SubElement(profile, group, {kind: 'ALLOW'})
+            for name in access[kind]:
+                ET.SubElement(part, element).text = name
+
+
 def policy(found):
     """Return the policy as XML."""
     root = ET.Element('policy', version='0.2.0')
@@ -101,12 +119,12 @@ def policy(found):
     for node, access in found.items():
         enclave = ET.SubElement(enclaves, 'enclave', path=f'/{node}')
         profiles = ET.SubElement(enclave, 'profiles')
-        profile = ET.SubElement(profiles, 'profile', ns='/', node=node)
-        for group, kind, element, _ in KINDS:
-            if access[kind]:
-                part = ET.SubElement(profile, group, {kind: 'ALLOW'})
-                for name in access[kind]:
-                    ET.SubElement(part, element).text = name
+        _grant(ET.SubElement(profiles, 'profile', ns='/', node=node), access)
+        if node == 'blf_dsc_controller':
+            profile = ET.SubElement(profiles, 'profile', ns='/', node=ACTION_NODE)
+            part = ET.SubElement(profile, 'actions', execute='ALLOW')
+            ET.SubElement(part, 'action').text = f'/{ACTION}'
+            _grant(profile, ACTION_ACCESS)
     ET.indent(root)
     return HEAD + ET.tostring(root, encoding='unicode') + '\n'
 

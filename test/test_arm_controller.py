@@ -137,7 +137,10 @@ def test_failure_of_the_caller_is_a_stop_that_the_bag_holds(samples, tmp_path):
         q, dq, _ = plant.measure().reshape(3, -1)
         controller.update(3.0, q, dq)  # a bag without a state cannot be read
     content = read_content(tmp_path / 'bag')
-    (stop,) = (event for _, event in content.events if event.type is EventType.STOP)
+    ((received, stop),) = (
+        each for each in content.events if each[1].type is EventType.STOP
+    )
+    assert received < 3_000_000_000  # at once, not with the next state
     assert stop.content['text'] == 'the bus is silent'
     assert stop.commands == samples
     if samples:
@@ -145,3 +148,5 @@ def test_failure_of_the_caller_is_a_stop_that_the_bag_holds(samples, tmp_path):
         names = commands.joint_names()
         recorded = commands.joint_states(names, ()).field(2)[:]
         np.testing.assert_array_equal(recorded[: samples + 1], [*torques, torque])
+        # the failure's, that for the state, and the last one at the end
+        assert len(recorded) == samples + 3

@@ -353,6 +353,12 @@ def test_prior_of_a_body_turns_with_it_and_holds_its_mass_and_centre():
     moments = np.outer(0.3 * first, 0.3 * first) + (3.0 * CENTRE) ** 2 * np.eye(3)
     np.testing.assert_allclose(covariance[1:4, 1:4], moments, rtol=1e-9)
     np.testing.assert_array_equal(deviations(np.zeros((4, 4)), 0.3, CENTRE), 0.0)
+    # a point of 3 kg has the extent of that deviation in every direction
+    point = deviations(np.diag([0.0, 0.0, 0.0, 3.0]), 0.3, CENTRE)
+    moments = [pseudo_inertia(d)[:3, :3] for d in point.T[4:]]
+    diagonal = np.array([np.diag(each) for each in moments if np.diag(each).any()])
+    spread = 0.3 * 3.0 * CENTRE**2 * np.eye(3)
+    np.testing.assert_allclose(diagonal, spread, rtol=1e-9, atol=1e-15)
 
 
 def test_prior_of_a_ball_is_the_same_in_every_direction():

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import importlib
 import os
+import signal
 import sys
 from pathlib import Path
 
@@ -18,6 +19,7 @@ pytest.importorskip('rclpy', reason='needs ROS 2')
 pytest.importorskip('ruckig', reason='needs ruckig')
 
 import interfaces
+import sros2_graph
 from action_msgs.msg import GoalStatus
 from rclpy.action import ActionClient
 from rclpy.duration import Duration
@@ -44,6 +46,7 @@ BRISK = {
     'telemetry__decimation': 1,
     'reference__type': 'hold',
 }
+ENCLAVE = '/arm/controller'
 NEAR = np.add(START, (0.1, -0.1))
 FAR = np.add(START, (0.5, -0.6))
 SUCCEEDED = GoalStatus.STATUS_SUCCEEDED
@@ -155,7 +158,7 @@ class Loop:
 @pytest.fixture(scope='module')
 def shared(control_msgs):
     """Provide a loop for several tests: to start it takes longer than any of them."""
-    ros = RosRig()
+    ros = RosRig(['--ros-args', '--enclave', ENCLAVE])
     loop = Loop(ros, control_msgs)
     yield loop
     loop.client.close()
@@ -470,6 +473,32 @@ def test_goal_too_fast_for_the_limits_takes_longer_and_says_so(loop):
     np.testing.assert_allclose(rests_at(law), FAR, atol=1e-9)
 
 
+def test_process_of_the_action_has_the_enclave_of_its_controller_and_the_policys_access(
+    shared,
+):
+    """Its profile in config/sros2_policy.xml, whose action stands for services and topics."""
+    tester = shared.client.ros.tester
+    nodes = tester.get_node_names_and_namespaces_with_enclaves()
+    assert (sros2_graph.ACTION_NODE, '/', ENCLAVE) in nodes
+    found = sros2_graph.granted(shared.client.ros, [sros2_graph.ACTION_NODE])
+    action = f'/{sros2_graph.ACTION}/_action/'
+    of_action = {
+        kind: [name.removeprefix(action) for name in names if name.startswith(action)]
+        for kind, names in found.items()
+    }
+    assert of_action == {
+        'publish': ['feedback', 'status'],
+        'subscribe': [],
+        'reply': ['cancel_goal', 'get_result', 'send_goal'],
+        'request': [],
+    }
+    others = {
+        kind: [name for name in names if not name.startswith(action)]
+        for kind, names in found.items()
+    }
+    assert others == sros2_graph.ACTION_ACCESS
+
+
 def test_long_goal_is_followed(loop):
     """Of 2,000 points."""
     _, law, client = loop
@@ -495,12 +524,15 @@ def test_controller_goes_on_when_the_process_of_the_action_dies(own_loop, capfd)
     )
 
 
-def test_process_of_the_action_ends_with_its_node(own_loop):
+def test_process_of_the_action_ends_with_its_node(own_loop, capfd):
+    """Without a word, and not by Ctrl-C, which a terminal sends it, too: goals still end."""
     _, law, client = own_loop
-    pid = law._action._process._process.pid
+    process = law._action._process._process
+    os.kill(process.pid, signal.SIGINT)
+    assert client.result(client.follow(point(NEAR, 0.5)))[0] == SUCCEEDED
     client.ros.kill(law)
-    with pytest.raises(ProcessLookupError):
-        os.kill(pid, 0)
+    assert process.returncode == 0
+    assert 'Traceback' not in capfd.readouterr().err
 
 
 def test_streams_chunks_stops_and_goals_in_one_bag_replay_bit_for_bit(

@@ -19,6 +19,8 @@ from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 from blf_dsc_controller.messages import topics
 from blf_dsc_controller.messages.codecs import MessageError, joint_trajectory
+from blf_dsc_controller.messages.journal import decode
+from blf_dsc_controller.reference.terms import sampled
 from blf_dsc_controller.reference.trajectory import plan_trajectory
 from blf_dsc_controller.supervision.supervisor import Phase
 
@@ -43,11 +45,11 @@ def two_tones(t, shift):
     return motion
 
 
-def trajectory(joints, shift, *, duration, fields=3, stamp=0):
+def trajectory(joints, shift, *, duration, fields=3, stamp=0, spacing=0.05):
     """Return a trajectory into two tones within a second, at rest a second after them."""
     sent = JointTrajectory(joint_names=joints)
     sent.header.stamp = Time(nanoseconds=stamp).to_msg()
-    times = 1.0 + 0.05 * np.arange(round(duration / 0.05))
+    times = 1.0 + spacing * np.arange(round(duration / spacing))
     points = [two_tones(t, shift) for t in times]
     rest = np.vstack((points[-1][:1], np.zeros((2, 2))))
     for t, point in zip((*times, times[-1] + 1.0), (*points, rest), strict=True):
@@ -124,6 +126,30 @@ def test_two_tone_trajectory_is_tracked_within_the_bound_and_replaced_twice(
         atol=1e-8,
     )
     assert phase(law) is Phase.TRACKING
+
+
+def test_long_chunk_is_followed_from_the_sample_that_was_promised_on(ros):
+    """2,000 points, decoded and planned beside the loop: every sample comes, none is late."""
+    references = ros.listen(topics.REFERENCE)
+    motions = ros.listen(topics.TARGETS, raw=True)
+    arm, law = ros.loop(None, PLANNED['on'] | {'telemetry__decimation': 1})
+    ros.run(arm, 200)
+    before = law.guard.controller.reference_vector.copy()
+    sent = trajectory(JOINTS, np.zeros(2), duration=10.0, spacing=5e-3)
+    assert send(ros, law, sent) == ''
+    ros.run(arm, 3000)
+    after = law.guard.controller.reference_vector
+    ros.until(lambda: motions and len(references) > 3000)
+    promised = decode(motions[0]).content['at']
+    begin = law.guard.start_stamp
+    stamps = [Time.from_msg(each.header.stamp).nanoseconds for each in references]
+    assert set(np.diff(stamps)) == {SECOND // 1000}
+    times = 1e-9 * (np.array(stamps) - begin)
+    q = np.array([each.position for each in references])
+    is_old = times < promised
+    assert 200 < np.count_nonzero(is_old) < 3000
+    np.testing.assert_array_equal(q[is_old], sampled(before, times[is_old])[:, 0])
+    np.testing.assert_array_equal(q[~is_old], sampled(after, times[~is_old])[:, 0])
 
 
 def of_another_arm(sent):

@@ -20,6 +20,18 @@ TIMEOUT = 1.0  # s
 
 
 @pytest.fixture
+def scaling(monkeypatch):
+    """Return benchmark/scaling.py for a few motions."""
+    monkeypatch.syspath_prepend(str(BENCHMARK))
+    import scaling
+
+    monkeypatch.setattr(scaling, 'MOTIONS', 8)
+    monkeypatch.setattr(scaling, 'SPACINGS', (0.1,))
+    yield scaling
+    del sys.modules['scaling']
+
+
+@pytest.fixture
 def streams(monkeypatch):
     """Return benchmark/streams.py for short streams at 50 Hz."""
     monkeypatch.syspath_prepend(str(BENCHMARK))
@@ -69,6 +81,16 @@ def test_another_rate_is_found_within_fifteen_messages(factor):
     targets = receive(stream, sent[20:])
     assert stream.interval == pytest.approx(factor * 0.02, rel=1e-3)
     np.testing.assert_allclose(targets[-1].velocities, SLOPE, rtol=1e-3)
+
+
+def test_step_of_the_targets_is_no_velocity():
+    """0.03 rad in 10 ms are 3 rad/s, twice as fast as the arm: only its other joint moves on."""
+    stream = TargetStream()
+    receive(stream, 0.01 * np.arange(50))
+    stepped = SLOPE * 0.5 + (0.03, 0.0)
+    target = stream.target(0.5, stepped, timeout=TIMEOUT, fastest=FASTEST)
+    assert target.velocities[0] == 0.0
+    assert target.velocities[1] == pytest.approx(SLOPE[1])
 
 
 def test_burst_of_losses_is_no_slower_sender():
@@ -140,3 +162,19 @@ def test_tables_of_streams_and_chunks_are_printed(streams, monkeypatch, capsys):
     accelerations = [float(line.split(' | ')[4]) for line in chunks]
     assert len(accelerations) == 3
     assert max(accelerations) <= 6.0
+
+
+def test_motions_of_moveit_are_stretched_as_little_as_the_table_says(scaling, capsys):
+    """With all of the limits all are, with 0.9 of the velocity and 0.6 few and little."""
+    scaling.main()
+    rows = [
+        line.strip('| ').split(' | ') for line in capsys.readouterr().out.splitlines()
+    ]
+    found = {tuple(row[:2]): row[2] for row in rows[2:]}
+    shares = [
+        [float(each.strip(' %|')) for each in found[scale].split(',')]
+        for scale in (('1', '1'), ('0.9', '0.6'))
+    ]
+    assert shares[0][0] == 100.0
+    assert shares[1][0] < 50.0
+    assert shares[1][1] <= 2.0

@@ -24,14 +24,18 @@ pytest.importorskip('yourdfpy', reason='needs viser: pip install .[view]')
 
 from command import COMMAND, wait_for
 from rclpy.parameter import Parameter
+from rclpy.serialization import serialize_message
 from ros_rig import activate, configure
 from sensor_msgs.msg import JointState
+from std_msgs.msg import Float64MultiArray
+from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 from blf_dsc_controller.arms.urdf import frames, read_chain
 from blf_dsc_controller.bags.reader import read_run
 from blf_dsc_controller.cli.main import INTERRUPTED, main
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.errors import BlfDscError, MissingExtraError
+from blf_dsc_controller.messages import topics
 from blf_dsc_controller.view import page as pages
 from blf_dsc_controller.view.node import ViewNode, plant_events
 from blf_dsc_controller.view.page import Page, ShownArm, Snapshot, known_model
@@ -228,6 +232,25 @@ def test_page_shows_the_loop_its_events_and_that_its_controller_is_gone(ros):
     assert view.page._state == ('OK', 'tracking')
     assert [t for t, *_ in events_with(view, '0.25 kg picked up')] == [1.0]
     assert [t for t, *_ in events_with(view, '0.25 kg put down')] == [1.5]
+
+    streamed = ros.publisher(topics.JOINT_POSITIONS)
+    ros.until(streamed.get_subscription_count)
+    ahead = now.position.copy()
+    inputs = law._status.trajectories
+    for _ in range(20):
+        ahead += 2e-3
+        streamed.publish(Float64MultiArray(data=ahead.tolist()))
+        ros.until(lambda count=inputs.targets: inputs.targets > count)
+        ros.run(arm, 10)
+    ros.until(lambda: events_with(view, 'of targets'))
+    assert len(events_with(view, 'of targets')) == 1
+    assert np.abs(view.past[-1].error).max() < 0.002
+    assert view.page._state == ('OK', 'tracking')
+    chunk = JointTrajectory(joint_names=['joint1', 'joint2'])
+    chunk.points.append(JointTrajectoryPoint(positions=ahead.tolist()))
+    chunk.points[0].time_from_start.sec = 1
+    inputs._on_trajectory(serialize_message(chunk))
+    ros.until(lambda: events_with(view, '1 points'))
 
     arm.set_parameters([Parameter('load.payload', value=0.5)])
     ros.until(lambda: view.past[-1].loaded)

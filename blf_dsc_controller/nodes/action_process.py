@@ -55,6 +55,7 @@ class ActionProcess:
                 f'_{owner.get_name()}_action',
                 owner.get_namespace(),
                 owner.resolve_service_name(ACTION),
+                _enclave_of(owner),
                 *joints,
             ],
             pass_fds=[theirs.fileno()],
@@ -109,3 +110,10 @@ class ActionProcess:
         twin = socket.socket(fileno=os.dup(self._connection.fileno()))
         with twin, suppress(OSError):
             twin.shutdown(socket.SHUT_RDWR)
+
+
+def _enclave_of(node: Node) -> str:
+    """Return the security enclave of a node's process, which that of the action shares."""
+    own = node.get_name(), node.get_namespace()
+    known = node.get_node_names_and_namespaces_with_enclaves()
+    return next((enclave for *name, enclave in known if tuple(name) == own), '/')

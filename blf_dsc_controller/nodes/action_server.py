@@ -212,13 +212,13 @@ def _listen(
 
 def main() -> int:
     """Run until the controller ends."""
-    descriptor, domain, node_name, namespace, action, *joints = sys.argv[1:]
+    descriptor, domain, node_name, namespace, action, enclave, *joints = sys.argv[1:]
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the controller may still brake
     # the controller's real-time priority is not for goals
     os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
     connection = Connection(int(descriptor))
     rclpy.init(
-        args=None,
+        args=['--ros-args', '--enclave', enclave],
         domain_id=int(domain),
         signal_handler_options=rclpy.SignalHandlerOptions.NO,
     )

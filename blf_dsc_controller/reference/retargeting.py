@@ -292,8 +292,10 @@ def plan_target(
             position limits.
     """
     n = len(config.joints)
-    if not len(target.positions) == len(target.velocities) == n:
-        raise TrajectoryError([f'it has {len(target.positions)} values for {n} joints'])
+    counts = len(target.positions), len(target.velocities)
+    if counts != (n, n):
+        given = '{} positions and {} velocities'.format(*counts)
+        raise TrajectoryError([f'it has {given} for {n} joints'])
     if not np.isfinite((*target.positions, *target.velocities)).all():
         raise TrajectoryError(['its values are not all finite'])
     try:

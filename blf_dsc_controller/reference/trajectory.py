@@ -23,6 +23,7 @@ later. To bound the time of planning, a trajectory longer than `LONGEST` or with
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -69,6 +70,7 @@ LONGEST = 3600.0
 """Longest time [s] from the beginning of a trajectory to its last point."""
 
 _SMOOTH = 0.2  # s of braking at least, since the acceleration ends, too
+_BELOW = 0.999  # of the velocity limit, for a path that is stretched
 _CLOSE = 1e-3  # s between two checks of a blend
 _SHORTEST_LEAD = 0.02  # s to a path that is joined late, at first ...
 _LEAD_GROWTH = 1.25  # ... and from attempt to attempt
@@ -251,6 +253,9 @@ def _stretched(
 ) -> tuple[np.ndarray, Term]:
     """Return times and path of the points, slowed down until the path keeps the limits."""
     n = len(config.joints)
+    # between the times checked here and those checked at the end, velocities may be higher
+    velocity = tuple(_BELOW * each for each in config.limits.velocity)
+    within = replace(config, limits=replace(config.limits, velocity=velocity))
     factor = 1.0
     for _ in range(_STRETCHES):
         slower = t0 + factor * (times - t0)
@@ -258,7 +263,7 @@ def _stretched(
         scaled = points / factor**powers
         path = _through_points(slower, scaled)
         span = _times_to_check(path, float(slower[0]), float(slower[-1]), n)
-        found = worst_violation(pack(n, [path]), span, config)
+        found = worst_violation(pack(n, [path]), span, within)
         if found is None or found.quantity == 'position':
             break
         root = 1.0 if found.quantity == 'velocity' else 0.5

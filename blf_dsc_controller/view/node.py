@@ -12,6 +12,7 @@ import os
 import sys
 from collections import deque
 from collections.abc import Mapping, Sequence
+from math import inf
 from typing import Any
 
 import numpy as np
@@ -43,6 +44,7 @@ from blf_dsc_controller.view.page import PAST, Page, Snapshot
 
 _PERIOD = 1.0 / 30.0  # s
 _PLOTTED = 6  # frames between updates of the plots
+_PAUSE = 1.0  # s without targets, after which another stream is listed
 _SILENCE = 30  # frames without a joint state before the page reports it
 _OUTDATED = 500_000_000  # ns
 _LISTED = 12  # events
@@ -87,11 +89,12 @@ class ViewNode(PlainNode):
         )
         self._start = self._sampled = -1  # ns, stamps of start and last tracking error
         self._pictures = self._silent = 0
+        self._last_target = -inf  # s
         self._finished = False  # the controller has released the arm
         self._clients_seen: frozenset[int] = frozenset()
         self._raw_subscriptions = RawSubscriptions(self)
-        for topic in {*_STREAMS, *_LATCHED}:
-            quality = topic.requested if topic in _LATCHED else topics.UNRELIABLE
+        for topic in {*_STREAMS, *_LATCHED, topics.TARGETS}:
+            quality = topics.UNRELIABLE if topic in _STREAMS else topic.requested
             self._raw_subscriptions.follow(topic, quality)
         self.get_logger().info(f'open {self.page.url}')
         if config.host not in _LOCAL:
@@ -149,6 +152,9 @@ class ViewNode(PlainNode):
         if topic is topics.JOURNAL:
             self._follow(decode(raw))
             return
+        if topic is topics.TARGETS:
+            self._list_motion(decode(raw))
+            return
         content: Any = deserialize_message(raw, message_class(topic.type))
         if topic is topics.STATE:
             self._state = LEVELS[content.level[0]], content.message
@@ -180,6 +186,17 @@ class ViewNode(PlainNode):
         self._events.append(
             (self._time(event.stamp), event.type.value, ', '.join(details))
         )
+
+    def _list_motion(self, event: Event) -> None:
+        """List a trajectory, and a stream of targets when it begins."""
+        time = self._time(event.stamp)
+        if event.type is EventType.TARGET:
+            if not 0.0 <= time - self._last_target < _PAUSE:
+                self._events.append((time, 'stream', 'of targets'))
+            self._last_target = time
+            return
+        points = len(event.content['points'])
+        self._events.append((time, event.type.value, f'{points} points'))
 
     def _configure(self, config: ControllerConfig) -> None:
         self._config = config
