@@ -370,3 +370,20 @@ def test_every_test_has_an_end(target, limit, tmp_path):
     run = [sys.executable, '-m', 'pytest', *options, str(hanging)]
     ended = subprocess.run(run, cwd=tmp_path, check=False, capture_output=True)
     assert b'Timeout' in ended.stdout
+
+
+def test_hooks_of_pre_commit_have_the_versions_of_make_lint():
+    """They install them by themselves, so a commit needs no .venv."""
+    config = configparser.ConfigParser()
+    config.read(ROOT / 'setup.cfg')
+    lint = config['options.extras_require']['lint'].split()
+    found = yaml.safe_load((ROOT / '.pre-commit-config.yaml').read_text())
+    hooks = [hook for repo in found['repos'] for hook in repo['hooks']]
+    assert {hook['entry'].split()[0] for hook in hooks} == {
+        'ruff',
+        'mypy',
+        'lint-imports',
+    }
+    for hook in hooks:
+        (checker, *_) = hook['additional_dependencies']
+        assert checker in lint, hook['id']
