@@ -352,6 +352,10 @@ def test_prior_of_a_body_turns_with_it_and_holds_its_mass_and_centre():
     first = J[:3, 3]
     moments = np.outer(0.3 * first, 0.3 * first) + (3.0 * CENTRE) ** 2 * np.eye(3)
     np.testing.assert_allclose(covariance[1:4, 1:4], moments, rtol=1e-9)
+    # each axis of the spread, which is at least that of such a deviation, by itself
+    spread = J[:3, :3] - np.outer(first, first) / 3.0 + 3.0 * CENTRE**2 * np.eye(3)
+    along = sum(pseudo_inertia(ten[:, k])[:3, :3] for k in (4, 6, 9))
+    np.testing.assert_allclose(along, 0.3 * spread, rtol=1e-9)
     np.testing.assert_array_equal(deviations(np.zeros((4, 4)), 0.3, CENTRE), 0.0)
     # a point of 3 kg has the extent of that deviation in every direction
     point = deviations(np.diag([0.0, 0.0, 0.0, 3.0]), 0.3, CENTRE)
