@@ -10,7 +10,13 @@ import pytest
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.messages.codecs import typestore
 from blf_dsc_controller.messages.event_content import FORMAT, SCHEMA
-from blf_dsc_controller.messages.journal import Event, EventType, Journal, decode
+from blf_dsc_controller.messages.journal import (
+    Event,
+    EventType,
+    Journal,
+    decode,
+    trajectory_content,
+)
 from blf_dsc_controller.messages.topics import JOURNAL
 
 POINT = {'time': 1.0, 'positions': [0.5, 1], 'velocities': []}
@@ -137,3 +143,19 @@ def test_what_is_no_event_is_named_in_one_line(text, reason):
 def test_fields_of_a_later_version_are_ignored():
     text = event('start', {'resumed': True, 'mood': 'good'}, colour='red')
     assert decode(encoded(text)).content['resumed'] is True
+
+
+def test_content_that_was_encoded_beforehand_gives_the_same_message():
+    """Without another look at its points, of which there may be thousands."""
+    given = EXAMPLES['trajectory'] | {'begin': None, 'at': 1.5}
+    plain = Event(3, EventType.TRAJECTORY, 7, 8, 9, given)
+    content = trajectory_content(
+        *(given[k] for k in ('joints', 'points', 'begin', 'at'))
+    )
+    assert content == given
+    encoded = plain._replace(content=content)
+    assert encoded.encode() == plain.encode()
+    journal = Journal()
+    journal.add(EventType.TRAJECTORY, content)
+    content['points'] = [object()]  # which has no JSON
+    assert decode(journal.pending[0].encode()).content == given

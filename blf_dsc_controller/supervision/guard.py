@@ -24,7 +24,11 @@ from blf_dsc_controller.law.check_state import CONTRADICTION, INVALID
 from blf_dsc_controller.law.checks import is_valid_state
 from blf_dsc_controller.law.factory import controller_of
 from blf_dsc_controller.messages import codecs
-from blf_dsc_controller.messages.journal import EventType, Journal
+from blf_dsc_controller.messages.journal import (
+    EventType,
+    Journal,
+    trajectory_content,
+)
 from blf_dsc_controller.reference.approach import (
     BlendedReference,
     MotionError,
@@ -90,6 +94,7 @@ class Plan(NamedTuple):
     at: float  # s since the start, when it takes effect
     before: np.ndarray  # packed reference that it continues
     motion: PlannedMotion
+    content: dict[str, Any]  # of its event
 
 
 class PreparedStart(NamedTuple):
@@ -576,9 +581,13 @@ class Guard:
         before = self.controller.reference_vector
         if isinstance(command, Trajectory):
             motion = plan_trajectory(command, before, at, self.config)
+            joints, points, begin = command
+            given = [point._asdict() for point in points]
+            content: dict[str, Any] = trajectory_content(joints, given, begin, at)
         else:
             motion = plan_target(command, before, at, self.config)
-        return Plan(command, at, before, motion)
+            content = {**command._asdict(), 'at': at}
+        return Plan(command, at, before, motion, content)
 
     def adopt(self, planned: Plan) -> None:
         """Follow a planned motion.
@@ -597,18 +606,11 @@ class Guard:
             raise LatePlanError([f'{due}, but was planned only at {self.time:.6g} s'])
         command = planned.command
         if isinstance(command, Target):
-            self._note(EventType.TARGET, **command._asdict(), at=planned.at)
+            self._note(EventType.TARGET, **planned.content)
             self._follow(planned.motion.vector)
             return
-        joints, points, begin = command
-        given = [point._asdict() for point in points]
-        self._note(
-            EventType.TRAJECTORY,
-            joints=joints,
-            points=given,
-            begin=begin,
-            at=planned.at,
-        )
+        self.end_silence()
+        self.journal.add(EventType.TRAJECTORY, planned.content)
         self._follow(planned.motion.vector)
         self.settled = planned.motion.settled
         is_settled = self.settled <= self.time
