@@ -111,6 +111,35 @@ def test_it_tracks_and_holds_two_kilograms_that_appear_in_the_hand(wire):
     assert_replays(wire.folder / 'bag')
 
 
+def test_weighed_load_is_told_in_motion_and_no_torque_steps(wire, tmp_path):
+    """The robot adds 2 kg in the end, and the whole torque of each joint (tau_J) goes on.
+
+    Steps are those of the motion before, and 0.5 % of the torque limit.
+    """
+    preset = (blf.share_folder() / 'config/fr3_direct.yaml').read_text()
+    section = '/**/blf_dsc_controller:\n  ros__parameters:\n'
+    told = preset.replace(section, f'{section}    learning: {{tell_drive: true}}\n')
+    (tmp_path / 'my.yaml').write_text(told)
+    wire.simulate('127.0.0.17', 'load=2@6000')
+    code, output = ended(wire.drive('127.0.0.17', 11, '--config', tmp_path / 'my.yaml'))
+    assert code == 0, output
+    assert 'told no more' not in output
+    events = blf.verify(wire.folder / 'bag').events
+    loads = [event for event in events if event.type == 'drive load']
+    assert loads[-1].content['mass'] == pytest.approx(2.0, abs=0.15)
+    recorded = blf.read_run(wire.folder / 'bag')
+    effort = recorded.effort
+    begin, end = (
+        int(np.searchsorted(recorded.stamp, each.stamp))
+        for each in (loads[0], loads[-1])
+    )
+    usual = np.abs(np.diff(effort[begin - 1000 : begin], axis=0)).max(axis=0)
+    steps = np.abs(np.diff(effort[begin - 5 : end + 5], axis=0)).max(axis=0)
+    limit = np.array((87.0,) * 4 + (12.0,) * 3)
+    assert (steps < 1.5 * usual + 0.005 * limit).all()
+    assert_replays(wire.folder / 'bag')
+
+
 @pytest.mark.parametrize(
     ('address', 'event', 'texts'),
     [

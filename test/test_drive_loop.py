@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import re
 import signal
+from dataclasses import replace
 from math import inf
 from pathlib import Path
 
@@ -16,12 +17,14 @@ import blf_dsc_controller as blf
 from blf_dsc_controller.cli.main import main
 from blf_dsc_controller.configuration.drive import DriveConfig
 from blf_dsc_controller.configuration.schema import build, change
-from blf_dsc_controller.drive.driver import Facts, disagreements
+from blf_dsc_controller.drive.driver import DriverError, Facts, disagreements
 from blf_dsc_controller.drive.drivers import find_driver
 from blf_dsc_controller.drive.latency import Latency
 from blf_dsc_controller.drive.loop import DriveLoop, End
 from blf_dsc_controller.errors import BlfDscError, ConfigurationError
+from blf_dsc_controller.supervision.drive_load import DriveLoad
 from blf_dsc_controller.supervision.supervisor import Phase
+from sim_plant.plant import plant_of, plant_settings
 
 HERE = Path(__file__).parent
 HOLD = {'safety.torque': 'hold_gravity'}
@@ -141,9 +144,129 @@ def test_torques_are_sent_before_weighing_and_recording(tmp_path):
         driver = PlantDriver('plant', CONFIG, DriveConfig())
         driver.connect()
         order = []
-        controller._loop.guard.weigh = lambda: order.append('weighed')
+        controller._loop.guard.perceive = lambda: order.append('weighed')
         controller.update(*driver.read(), send=lambda _torque: order.append('sent'))
     assert order == ['sent', 'weighed']
+
+
+PICKED_UP = 6.0  # s; it is known about a second later
+TOLD = {'learning.tell_drive': True}
+
+
+class LoadedDriver(PlantDriver):
+    """The simulated FR3, which picks up 2 kg, and can be told so."""
+
+    facts = Facts(7, 0.001, 'gravity_and_friction', 'whole', (87.0,) * 7, (1e3,) * 7)
+    facts = facts._replace(load_in_motion=True)
+    refuses = False
+
+    def connect(self):
+        event = {'begin': [PICKED_UP], 'duration': [0.0], 'payload': [2.0]}
+        changes = {f'events.{name}': value for name, value in event.items()}
+        loop = blf.load_loop('fr3_direct')
+        self.what, self.at = '', -1
+        self.config = change(loop.plant, changes)
+        self.plant = plant_of(self.config)
+        self.told = []
+        self.efforts = []
+        self.count = self.late = self.mass = 0
+        self.torques, self.calls = [], []
+
+    def read(self):
+        state = super().read()
+        self.efforts.append(np.array(state.effort))
+        return state
+
+    def write(self, torque):
+        if self.told and self.told[-1].mass != self.mass:  # it is in force from now on
+            load = self.told[-1]
+            robot = replace(
+                self.config.robot,
+                drive_payload=load.mass,
+                drive_payload_centre=load.centre,
+            )
+            self.plant.change(plant_settings(replace(self.config, robot=robot)))
+            self.mass = load.mass
+        self.torques.append(torque)
+        self.plant.step(np.zeros(7) if torque is None else torque)
+
+    def tell_load(self, load):
+        if self.refuses:
+            raise DriverError('the load was refused: see Desk')
+        self.told.append(load)
+
+    def load_in_force(self):
+        return self.mass
+
+
+def run_with_load(tmp_path, driver, duration):
+    config = change(blf.load_loop('fr3_direct').controller, TOLD)
+    made = driver('plant', config, DriveConfig())
+    made.connect()
+    with blf.ArmController(config, record=tmp_path / 'bag') as controller:
+        loop = DriveLoop(made, controller, duration=duration)
+        outcome = loop.run()
+    assert outcome.end is End.DURATION, outcome.text
+    return made, loop, controller
+
+
+def test_weighed_load_is_told_to_the_drives_without_a_step_of_any_torque(tmp_path):
+    """The robot adds what the law gives up; steps are those of the motion, and 0.5 % of 87 N m."""
+    driver, loop, controller = run_with_load(tmp_path, LoadedDriver, 10.0)
+    assert not loop.remark
+    assert driver.mass == pytest.approx(2.0, abs=0.1)
+    masses = [load.mass for load in driver.told]
+    assert len(masses) > 10
+    assert (np.diff(masses) > 0.0).all()
+    event = [e for e in blf.verify(tmp_path / 'bag').events if e.type == 'drive load']
+    assert len(event) == len(masses)
+    efforts = np.array(driver.efforts)
+    limit = np.array(controller.config.torque.limit)
+    stamps = 1.0 + 1e-3 * np.arange(1, len(efforts) + 1)
+    told = [(each.stamp * 1e-9) for each in event]
+    begin, end = np.searchsorted(stamps, (told[0], told[-1]))
+    usual = np.abs(np.diff(efforts[begin - 1000 : begin], axis=0)).max(axis=0)
+    steps = np.abs(np.diff(efforts[begin - 5 : end + 5], axis=0)).max(axis=0)
+    assert (steps < 1.5 * usual + 0.005 * limit).all()
+    # the weight that the commands bore is the drives' afterwards
+    before, after = (
+        np.abs(np.array(driver.torques[k - 500 : k]))[:, 1].mean()
+        for k in (begin, end + 500)
+    )
+    assert after < 0.6 * before  # friction and the motion are left
+    assert_replays(tmp_path / 'bag')
+
+
+def test_drives_that_refuse_a_load_are_asked_once(tmp_path):
+    class Refusing(LoadedDriver):
+        refuses = True
+
+    driver, loop, _ = run_with_load(tmp_path, Refusing, 8.0)
+    assert loop.remark == 'the load was refused: see Desk'
+    assert driver.mass == 0
+
+
+def test_drives_that_forbid_it_are_not_told_while_they_move(tmp_path):
+    class Forbidding(LoadedDriver):
+        facts = LoadedDriver.facts._replace(load_in_motion=False)
+
+    driver, loop, _ = run_with_load(tmp_path, Forbidding, 8.0)
+    assert not driver.told
+    assert not loop.remark
+
+
+def test_load_is_not_taken_over_unless_the_user_allows_it():
+    controller = blf.ArmController(CONFIG)
+    assert controller.load_to_tell() is None
+    with pytest.raises(BlfDscError, match=r'learning\.tell_drive: got false'):
+        controller.take_over(DriveLoad(1.0, (0.0, 0.0, 0.0)))
+
+
+def test_tell_drive_needs_a_weighed_load_and_drives_that_compensate():
+    with pytest.raises(ConfigurationError, match=r'robot\.drive_compensates none, but'):
+        change(blf.load_loop('panda').controller, {'learning.tell_drive': True})
+    with pytest.raises(ConfigurationError, match='got 1, but a bool'):
+        change(CONFIG, {'learning.tell_drive': 1})
 
 
 FACTS = Facts(2, 0.001, 'none', 'unknown', (20.0, 20.0), (inf, inf))

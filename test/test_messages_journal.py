@@ -36,6 +36,8 @@ EXAMPLES = {
     },
     'brake': {},
     'parameters': {'parameters': {'feedback.gain': [1.0, 2.0]}},
+    'drive load': {'mass': 1.5, 'centre': [0.0, 0.0, 0.1]},
+    'contact': {'reaction': 'hold', 'text': 'something touches the arm'},
     'stop': {'reason': 'failed', 'text': ''},
     'silence': {'torques': 3},
     'deactivate': {},

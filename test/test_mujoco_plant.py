@@ -18,11 +18,15 @@ from paper_case import OFF, ROWS, P, end_of
 from plants import commands, true_parameters
 from test_plant_sampled import ALL_KINDS
 
+from blf_dsc_controller.arms.urdf import frames
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.nodes import load_loop
 from blf_dsc_controller.configuration.plant import PlantConfig
 from blf_dsc_controller.configuration.schema import build, change
+from blf_dsc_controller.messages.journal import EventType
 from blf_dsc_controller.nodes.controller_node import ControllerNode
+from blf_dsc_controller.reference.approach import reference_of
+from blf_dsc_controller.reference.terms import sampled
 from blf_dsc_controller.simulation.loop import START
 from blf_dsc_controller.supervision.guard import Guard
 from sim_plant.plant import plant_of, plant_settings
@@ -228,3 +232,89 @@ def test_bound_holds_while_the_arm_changes_and_learning_does_no_harm(example, na
     true = true_parameters(plant, end)
     error = learning.controller.state.estimate[:3] - true
     assert np.linalg.norm(error) < 0.01 * np.linalg.norm(true)
+
+
+PICKED_UP, THERE, ENDED = 7.0, 12.0, 15.0  # s; a wall is there from 12 s on
+LOAD = 2.0  # kg
+DEPTH = 0.01  # m, by which the tip would enter the wall
+SOFT = [0.05, 1.0]  # MuJoCo's solref of both: s, damping ratio
+
+
+def beside_a_wall(example, monkeypatch, config, wall):
+    """The arm with a finger of 2 cm at its tip, and a wall at x = `wall` [m], 1 m farther off."""
+    spec_of = example.spec_of
+
+    def with_wall(config):
+        spec = spec_of(config)
+        finger = example.mujoco.mjtGeom.mjGEOM_SPHERE
+        spec.body(config.robot.tip).add_geom(
+            type=finger, size=[0.02, 0, 0], mass=0.0, solref=SOFT
+        )
+        spec.worldbody.add_geom(
+            name='wall',
+            type=example.mujoco.mjtGeom.mjGEOM_BOX,
+            size=[0.1, 2.0, 2.0],
+            pos=[wall + 0.02 + 0.1 + 1.0, 0.0, 0.0],
+            solref=SOFT,
+        )
+        return spec
+
+    monkeypatch.setattr(example, 'spec_of', with_wall)
+    return example.MujocoArm(config)
+
+
+@pytest.mark.parametrize('reaction', ['hold', 'none'])
+def test_load_is_learned_and_a_wall_is_not(example, monkeypatch, reaction):
+    """Both in one run of a Panda with wrong links; without a reaction the weight is lost.
+
+    At half its usual speed and with brakes like an arm's own, it stops in the wall's padding.
+    """
+    loop = load_loop('panda')
+    joints = len(loop.controller.joints)
+    amplitude = [0.5 * each for each in loop.controller.reference.amplitude]
+    controller = change(
+        loop.controller,
+        {
+            'contact.enabled': True,
+            'contact.reaction': reaction,
+            'barrier.bound': [0.02] * joints,
+            'barrier.initial_bound': [0.0] * joints,
+            'limits.acceleration': [15.0] * joints,  # rad/s^2
+            'reference.amplitude': amplitude,
+        },
+    )
+    pick_up = {'begin': [PICKED_UP], 'duration': [0.0], 'payload': [LOAD]}
+    plant = change(loop.plant, {f'events.{k}': v for k, v in pick_up.items()})
+    t = np.arange(THERE, ENDED, 1e-3)
+    qr = sampled(reference_of(controller), t)[:, 0]
+    farthest = frames(controller.robot.chain(controller.joints), qr)[-1][:, 0, 3].max()
+    arm = beside_a_wall(example, monkeypatch, plant, farthest - DEPTH)
+    guard = Guard(controller, lambda: 0, lambda: 0)
+    guard.activate()
+    state = guard.controller.state
+    touched = 0
+    for k in range(round(1e3 * ENDED)):
+        if k == round(1e3 * THERE):
+            arm.model.geom('wall').pos[0] -= 1.0
+        torque = guard.update(START + k * 1_000_000, arm.measure())
+        guard.perceive()
+        arm.step(torque)
+        if arm.data.ncon and not touched:
+            touched = k
+            before = state.estimate.copy()
+            changes = state.changes[0]
+            assert state.load[0] == pytest.approx(LOAD, abs=0.05)
+    assert touched > 1e3 * THERE
+    events = [e for e in guard.journal.pending if e.type is EventType.CONTACT]
+    found = (events[0].stamp - START) // 1_000_000
+    assert 0 <= found - touched < 50  # ms
+    if reaction == 'hold':
+        assert not guard.supervisor.stops
+        assert state.contact[0] == 1.0  # it leans on the wall
+        # what was learned in the milliseconds before it was found
+        assert np.abs(state.estimate - before).max() < 1e-3 * np.abs(before).max()
+        assert state.changes[0] == changes
+        assert state.load[0] == pytest.approx(LOAD, abs=0.05)
+    else:
+        assert state.changes[0] > changes
+        assert state.load[0] == 0.0  # unknown

@@ -34,6 +34,7 @@ from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.plant import PlantConfig
 from blf_dsc_controller.configuration.schema import build
 from blf_dsc_controller.messages import topics
+from blf_dsc_controller.messages.codecs import JointStateDecoder
 from blf_dsc_controller.nodes.controller_node import ControllerNode
 from blf_dsc_controller.nodes.endpoints import message_class
 from blf_dsc_controller.nodes.plant_node import LOCKSTEP_START, PlantNode
@@ -86,6 +87,15 @@ CASES = {
     'noise, differenced velocity and delay': (
         {'duration': 2.0, 'seed': 5, **NOISY},
         {},
+    ),
+    'a push against which it holds': (
+        {
+            'duration': 8.5,
+            'events.begin': [8.0],
+            'events.duration': [0.2],
+            'events.torque': [2.0, 0.0],
+        },
+        {'contact.enabled': True, 'contact.reaction': 'hold'},
     ),
     'all kinds of events': ({'duration': 0.2, **ALL_KINDS}, {}),
     'three joints of a URDF with a truth of their own, and a payload': (
@@ -162,6 +172,18 @@ def test_two_arms_in_one_domain_do_not_interfere(ros):
         )
         np.testing.assert_array_equal(torques, alone.torque)
     assert not np.array_equal(received['left'][-1].data, received['right'][-1].data)
+
+
+def test_external_torque_and_its_interval_are_published(ros):
+    received = ros.listen(topics.EXTERNAL_TORQUE, raw=True)
+    arm = ros.add(PlantNode, {'mode': 'lockstep', 'duration': 0.2, **OBSERVED})
+    ros.add(ControllerNode, {'contact.enabled': True, **OBSERVED})
+    ros.until(lambda: arm.finished and len(received) == 21)  # every tenth sample
+    joints = arm.config.joints
+    names = (*joints, *(joint + topics.INTERVAL for joint in joints))
+    decoder = JointStateDecoder(names, required=('effort',))
+    decoder.decode(received[-1])
+    assert (decoder.effort[2:] > np.abs(decoder.effort[:2])).all()
 
 
 def test_nodes_on_simulated_time_follow_the_clock_of_the_plant(ros):

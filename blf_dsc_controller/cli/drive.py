@@ -95,6 +95,8 @@ def _print(outcome: Outcome, loop: DriveLoop, controller: ArmController) -> None
     mass, interval = controller.load
     if not math.isnan(mass):
         print(f'load          {mass:.2f} +- {interval:.2f} kg more than at the start')
+    if loop.remark:
+        print(f'load          told no more: {loop.remark}')
     median, most = loop.latency.quantile(0.5), loop.latency.quantile(0.99)
     print(
         f'torques after {1e6 * median:.0f} us in the median, {1e6 * most:.0f} us at 99 %, '

@@ -560,6 +560,10 @@ class Learning:
     weighing: bool = _size(
         False, 'weigh what the tip of a URDF holds since the first window'
     )
+    tell_drive: bool = _size(
+        False,
+        'tell drives that compensate gravity the load once it is weighed well (blf_dsc drive)',
+    )
 
     def problems(self, sample_time: float, model: str, count: int) -> Iterator[str]:
         """Check the window's size, and the initial estimate against model and ball."""
@@ -577,6 +581,33 @@ class Learning:
             count,
             self.radius,
         )
+
+
+@dataclass(frozen=True)
+class Contact:
+    """Torque from outside that the learned model does not explain, and what follows from it."""
+
+    enabled: bool = _size(
+        False, 'find the external torque with its interval, and contacts'
+    )
+    bandwidth: float = _in_window(
+        30.0, 'pole of the external torque: faster is noisier', 'rad/s', 'L', above=0.0
+    )
+    threshold: float = positive(
+        8.0,
+        'distance of the external torque from what model, noise and a load explain, in standard '
+        'deviations, from which it is a contact',
+        symbol='h',
+    )
+    reaction: Literal['none', 'stop', 'hold', 'yield'] = parameter(
+        'none',
+        'reaction to a contact: none, safe stop, hold where it can brake, or give way with gravity '
+        'and damping alone; with one, nothing is learned while a contact lasts',
+    )
+    loads: bool = parameter(
+        True,
+        'with learning.weighing: what a load in the tip explains is no contact',
+    )
 
 
 LAWS = ('blf_dsc', 'model_based', 'backstepping', 'slotine_li')
@@ -606,6 +637,7 @@ class ControllerConfig(ArmConfig):
     disturbance: DisturbanceEstimate = DisturbanceEstimate()
     torque: Torque = Torque()
     learning: Learning = Learning()
+    contact: Contact = Contact()
     comparison: ComparisonGains = ComparisonGains()
     truth: KnownArm = KnownArm()
     safety: Safety = Safety()
@@ -688,6 +720,27 @@ class ControllerConfig(ArmConfig):
             needs = 'model urdf and learning.prediction filtered'
             yield f'learning.weighing: got true with {", ".join(learned)}, but needs {needs}'
             return
+        compensates = self.robot.drive_compensates != 'none'
+        if learning.tell_drive and not (learning.weighing and compensates):
+            yield (
+                f'learning.tell_drive: got true with learning.weighing '
+                f'{str(learning.weighing).lower()} and robot.drive_compensates '
+                f'{self.robot.drive_compensates}, but needs a load that is weighed and drives that '
+                'compensate gravity'
+            )
+        if self.contact.enabled and (self.law, learning.prediction) != (
+            LAWS[0],
+            'filtered',
+        ):
+            yield (
+                f'contact.enabled: got true with {self.law}, {learning.prediction}, but the '
+                f'external torque needs law {LAWS[0]} and learning.prediction filtered'
+            )
+        if self.contact.reaction != 'none' and not self.contact.enabled:
+            yield (
+                f'contact.reaction: got {self.contact.reaction}, but without contact.enabled '
+                'nothing finds contacts: set it to true'
+            )
         if self.model != 'urdf' and self.feedback.stiffness != Feedback().stiffness:
             yield (
                 f'feedback.stiffness: got {self.feedback.stiffness:g} with model {self.model}, but '

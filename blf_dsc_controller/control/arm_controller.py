@@ -22,11 +22,13 @@ from blf_dsc_controller.law.weighing import DEVIATION, TWO_SIDED
 from blf_dsc_controller.messages import topics
 from blf_dsc_controller.messages.codecs import JointStateEncoder
 from blf_dsc_controller.reference.trajectory import Trajectory, TrajectoryPoint
+from blf_dsc_controller.supervision.drive_load import DriveLoad
 from blf_dsc_controller.supervision.supervisor import Phase
 
 Vector = NDArray[np.float64]
 _NANO = 1e9
 _FIRST = 1_000_000_000  # ns
+_AT_REST = 0.01  # rad/s
 
 
 class StateError(BlfDscError):
@@ -146,7 +148,7 @@ class ArmController:
             if send is not None:
                 send(answer)
         finally:
-            self._loop.guard.weigh()
+            self._loop.guard.perceive()
             if self._recorder is not None:
                 self._record(nanoseconds, values, torque)
         return answer
@@ -204,6 +206,28 @@ class ArmController:
         trajectory = Trajectory(names, tuple(points), begin)
         guard = self._loop.guard
         guard.adopt(guard.plan(trajectory))
+
+    def load_to_tell(self) -> DriveLoad | None:
+        """Return the load that drives should be told to compensate next, a step at a time.
+
+        None: there is none, or `learning.tell_drive` is false.
+        """
+        return self._loop.guard.load_to_tell()
+
+    def take_over(self, load: DriveLoad) -> None:
+        """Command less by the weight of a load that the drives add from the next state on.
+
+        Raises:
+            BlfDscError: `learning.tell_drive` is false.
+        """
+        self._loop.guard.take_over(load)
+
+    @property
+    def is_at_rest(self) -> bool:
+        """Whether the reference and the arm rest."""
+        signals = self._loop.guard.controller.signals
+        speed = np.abs(np.concatenate((signals.dq, signals.dqr))).max()
+        return bool(speed < _AT_REST)
 
     def stop(self) -> None:
         """Ramp to the safe torque, which `update` then returns until `start`."""

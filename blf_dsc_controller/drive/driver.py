@@ -18,6 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.drive import DriveConfig
 from blf_dsc_controller.errors import BlfDscError
+from blf_dsc_controller.supervision.drive_load import DriveLoad
 
 Vector = NDArray[np.float64]
 
@@ -55,6 +56,7 @@ class Facts(NamedTuple):
     effort: str  # as `robot.effort`
     torque_limit: Sequence[float]  # N m
     torque_rate: Sequence[float]  # N m/s, beyond which the robot stops by itself
+    load_in_motion: bool = False  # whether it may be told a load while it moves
 
 
 class Driver(ABC):
@@ -100,6 +102,24 @@ class Driver(ABC):
     @abstractmethod
     def write(self, torque: Vector | None) -> None:
         """Command torques (n,) [N m]; None: whatever lets the robot go on as it is."""
+
+    def tell_load(self, load: DriveLoad) -> None:
+        """Tell the robot to compensate this load, in the frame of the tip; in another thread.
+
+        Raises:
+            DriverError: it refuses, or cannot be told.
+        """
+        raise DriverError(
+            f'this robot cannot be told a load of {load.mass:.2f} kg: set learning.tell_drive to '
+            'false'
+        )
+
+    def load_in_force(self) -> float | None:
+        """Return the mass [kg] whose weight the robot adds since the last state.
+
+        None: it does not report it.
+        """
+        return None
 
     @abstractmethod
     def finish(self) -> None:

@@ -27,6 +27,7 @@ from blf_dsc_controller.drive.driver import (
     ReflexError,
     RobotState,
 )
+from blf_dsc_controller.supervision.drive_load import DriveLoad
 
 Vector = NDArray[np.float64]
 _JOINTS = 7
@@ -51,6 +52,7 @@ class FrankaDriver(Driver):
         effort='whole',
         torque_limit=(87.0, 87.0, 87.0, 87.0, 12.0, 12.0, 12.0),
         torque_rate=(1000.0,) * _JOINTS,
+        load_in_motion=True,
     )
 
     def __init__(
@@ -58,6 +60,10 @@ class FrankaDriver(Driver):
     ) -> None:
         super().__init__(address, controller, config)
         self._torque = np.zeros(_JOINTS)
+        self._load = 0.0
+        # of the tip in the frame of the flange
+        self._tip = controller.robot.chain(controller.joints).tip_placement.copy()
+        self._tip[2, 3] -= _FLANGE
 
     def connect(self) -> Sequence[str]:
         """Reach the robot, recover it from a reflex, and set thresholds and load.
@@ -100,19 +106,18 @@ class FrankaDriver(Driver):
 
     def _set_load(self) -> None:
         """Declare `robot.drive_payload` to the robot, whose model then includes it."""
-        if not self.config.set_load:
-            return
-        robot = self.controller.robot
-        chain = robot.chain(self.controller.joints)
-        point = chain.tip_placement @ np.append(robot.drive_payload_centre, 1.0)
-        centre = point[:3] - (0.0, 0.0, _FLANGE)
-        has_load = robot.drive_payload > 0.0
+        if self.config.set_load:
+            robot = self.controller.robot
+            self.tell_load(DriveLoad(robot.drive_payload, robot.drive_payload_centre))
+
+    def tell_load(self, load: DriveLoad) -> None:
+        """Send a load; the robot takes it in motion, too."""
+        has_load = load.mass > 0.0
+        centre = self._tip @ np.append(load.centre, 1.0) if has_load else np.zeros(4)
         inertia = np.diag(self.config.load_inertia) if has_load else np.zeros((3, 3))
         with self._explained('the load was refused'):
             self._robot.set_load(
-                robot.drive_payload,
-                (centre if has_load else np.zeros(3)).tolist(),
-                inertia.ravel(order='F').tolist(),
+                load.mass, centre[:3].tolist(), inertia.ravel(order='F').tolist()
             )
 
     def _remarks(self) -> Iterator[str]:
@@ -145,7 +150,12 @@ class FrankaDriver(Driver):
         """Wait for the next state; libfranka gives up after a second."""
         with self._in_motion():
             state, _ = self._control.readOnce()
+        self._load = state.m_load
         return RobotState(state.time.to_sec(), state.q, state.dq, state.tau_J)
+
+    def load_in_force(self) -> float:
+        """Return the mass [kg] of the load that the last state had."""
+        return float(self._load)
 
     def write(self, torque: Vector | None) -> None:
         """Command torques (7,) [N m] beyond gravity.

@@ -29,6 +29,7 @@ from blf_dsc_controller.drive.driver import (
     RobotState,
 )
 from blf_dsc_controller.drive.latency import Latency
+from blf_dsc_controller.drive.load_teller import LoadTeller
 from blf_dsc_controller.supervision.supervisor import Phase
 
 Vector = NDArray[np.float64]
@@ -83,6 +84,7 @@ class DriveLoop:
         self._controller = controller
         self._duration = duration
         self._settle_time = settle_time
+        self._teller = LoadTeller(driver, controller)
         self._requests = 0
         self._states = 0
         self._begin = math.nan  # s, stamp of the first state
@@ -90,6 +92,11 @@ class DriveLoop:
         self._end_at = math.nan  # s, stamp at which the end began
         self._text = ''
         self._error: Exception | None = None
+
+    @property
+    def remark(self) -> str:
+        """Why the robot is told no more loads, or empty."""
+        return self._teller.problem
 
     def request_end(self) -> None:
         """Bring the arm to rest and end; a second request ends at once.
@@ -120,6 +127,7 @@ class DriveLoop:
             self._withdraw(End.LOST, str(error))
         finally:
             gc.unfreeze()
+            self._teller.close()
         if self._error is not None:
             raise self._error
         return Outcome(self._end or End.REQUESTED, self._text, self._states)
@@ -144,6 +152,7 @@ class DriveLoop:
         """
         self._states += 1
         try:
+            self._teller.follow()
             self._controller.update(*state, send=self._send)
         except DriverError:
             raise

@@ -152,7 +152,13 @@ def adapt(
     While a torque is saturated, the tracking error reflects the limit, not the parameters, so only
     the prediction error, which uses the applied torque, adapts the estimate.  While a full window
     is not excited, as at standstill, H^T xi2 is correlated noise and ignored (`change_detection`).
+    While a contact lasts, and something reacts to it, only d^3 follows.
     """
+    if state.frozen[0] > 0.0:
+        if not saturated:
+            integrate(settings, state, signals, dt)
+        friction.hand_over(settings, state, signals)
+        return
     prediction_error(settings, state, signals)
     unexcited = (
         settings.change_detection == 1

@@ -23,6 +23,7 @@ from blf_dsc_controller.law.check_state import (
     checks_size,
 )
 from blf_dsc_controller.law.checks import bridge_repeats, check_sample, is_valid_state
+from blf_dsc_controller.law.external_torque import sense
 from blf_dsc_controller.law.friction import first_coulomb
 from blf_dsc_controller.law.interface import Law
 from blf_dsc_controller.law.laws import for_law
@@ -218,10 +219,12 @@ class Controller:
         self._compare = direct(compare, *self._compared, 0.0)
         if self.settings.weighed:
             self._weigh = direct(weigh, *self._vectors[:4], 0.0)
+        if self.settings.senses:
+            self._sense = direct(sense, *self._vectors[:5], 0.0)
         self.reset()
         self.reference_at(0.0)
         self.update(0.0, 1e-3, np.zeros(3 * self.settings.n))
-        self.weigh(1e-3)
+        self.perceive(1e-3)
         self.reset()
 
     def bound_at(self, t: float) -> Array:
@@ -288,10 +291,14 @@ class Controller:
             )
         self._measurement[:] = measurement
 
-    def weigh(self, dt: float) -> None:
-        """Weigh the load by the row of the last update, `dt` [s] after the one before."""
+    def perceive(self, dt: float) -> bool:
+        """Weigh the load and find the external torque, by the row of the last update.
+
+        It was `dt` [s] after the one before.  Returns whether a contact begins.
+        """
         if self.settings.weighed:
             self._weigh(*self._vectors[:4], dt)
+        return bool(self.settings.senses and self._sense(*self._vectors[:5], dt))
 
     def trial(self, t: float, dt: float, measurement: Array) -> Array:
         """Return the torque of an unchecked update that only changes `signals` and `sample`."""

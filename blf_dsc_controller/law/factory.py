@@ -73,6 +73,8 @@ _PARAMETER_OF = {
     'compensation': 'learning.compensation',
     'bumpless': 'learning.bumpless',
     'anchor_weight': 'learning.anchor_weight',
+    'contact_pole': 'contact.bandwidth',
+    'contact_threshold': 'contact.threshold',
 }
 """Parameters that settings take as they are; the others are computed from several."""
 
@@ -223,6 +225,10 @@ def settings_of_config(config: ControllerConfig) -> Settings:
         'learning_start': learning.window + learning.settling_time,
         'residual_floor': model.n * least * least,
         'prior_weight': (_PRIOR if is_urdf else 0.0) * least * least,
+        'row_variance': _PRIOR * least * least,
+        'senses': int(config.contact.enabled),
+        'freezes': int(config.contact.reaction != 'none'),
+        'expects_loads': int(config.contact.loads and learning.weighing),
         'motion_scale': _SLOW if is_urdf else 0.0,
         'pole': learning.filter_pole,
         'omega': _OMEGA,

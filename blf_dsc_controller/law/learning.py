@@ -29,6 +29,9 @@ def observe(
     friction.filter_shapes(settings, state, signals, dt)
     if state.samples[0] == 0.0:
         return
+    if state.frozen[0] > 0.0:  # the row is of a contact
+        state.frozen[0] = max(0.0, state.frozen[0] - dt)
+        return
     if int(state.samples[0]) % settings.row_interval == 0:
         window.push_row(state, signals.row)
         friction.measure_reversals(settings, state, settings.row_interval * dt)

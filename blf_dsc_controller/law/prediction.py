@@ -26,7 +26,7 @@ from math import sqrt
 from blf_dsc_controller.compiled.elementary import cos, exp, sin, tanh
 from blf_dsc_controller.compiled.jit import inner
 from blf_dsc_controller.compiled.layout import Array
-from blf_dsc_controller.law import barrier
+from blf_dsc_controller.law import barrier, external_torque
 from blf_dsc_controller.law.state import FILTERED, Settings, Signals, State
 
 
@@ -100,6 +100,7 @@ def filter_row(settings: Settings, state: State, signals: Signals, dt: float) ->
         for j in range(p):
             row[i, j] += (signals.momentum[i, j] - state.momentum[i, j]) * (1.0 / dt)
         row[i, m] = state.late[1, i]
+        external_torque.filter_interval(settings, state, signals, i, dt)
         for j in range(m + 1):
             state.filter1[i, j] += gain * (row[i, j] - state.filter1[i, j])
             state.filter2[i, j] += gain * (state.filter1[i, j] - state.filter2[i, j])

@@ -27,10 +27,12 @@ from blf_dsc_controller.law.factory import (
     prior_covariance,
 )
 from blf_dsc_controller.law.state import Sample, Settings, sample_of
+from blf_dsc_controller.law.tip_wrench import TipWrench
 from blf_dsc_controller.messages import topics
 from blf_dsc_controller.messages.codecs import (
     Float64MultiArrayEncoder,
     JointStateEncoder,
+    WrenchEncoder,
     encode_clock,
 )
 from blf_dsc_controller.run import Floats, LearnedArm, Run, Series, Stamps
@@ -57,6 +59,8 @@ def monitored(
     }
     if config.learning.weighing:
         names['load'] = topics.LOAD
+    if config.contact.enabled:
+        names['contact'] = topics.CONTACT
     if config.truth.parameters:
         names['lyapunov'] = topics.LYAPUNOV_TERMS
     return names
@@ -88,6 +92,9 @@ class ControllerTelemetry:
         self._error = JointStateEncoder(joints)
         self._bound = JointStateEncoder(joints, ('position', 'effort'))
         self._monitor = JointStateEncoder(names, ('position',))
+        self._external = None
+        if config.contact.enabled:
+            self._external = ExternalTelemetry(config)
         self._parts = attrgetter(*parts)
         self._decimation = config.telemetry.decimation
         self.restart()
@@ -156,6 +163,33 @@ class ControllerTelemetry:
             )
             yield topics.MONITOR, self._monitor.encode(stamp, values)
             self._slowest = 0.0
+            if self._external is not None:
+                yield from self._external.sample(stamp, sample)
+
+
+class ExternalTelemetry:
+    """Messages of the torque from outside; of the wrench where `robot.tip` says at which link."""
+
+    def __init__(self, config: ControllerConfig) -> None:
+        joints = config.joints
+        names = (*joints, *(joint + topics.INTERVAL for joint in joints))
+        self._torque = JointStateEncoder(names, ('effort',))
+        self._wrench = None
+        if config.model == 'urdf' and config.robot.tip:
+            self._wrench = WrenchEncoder(config.robot.tip)
+            self._tip = TipWrench(config.robot.chain(joints))
+
+    def sample(self, stamp: int, sample: Sample) -> Iterator[Message]:
+        """Yield the messages of a telemetry sample with its stamp [ns]."""
+        torque = sample.external
+        interval = sample.external_interval
+        yield (
+            topics.EXTERNAL_TORQUE,
+            self._torque.encode(stamp, effort=np.concatenate((torque, interval))),
+        )
+        if self._wrench is not None:
+            wrench = self._tip.of(sample.qr + sample.xi1, torque, interval)
+            yield topics.EXTERNAL_WRENCH, self._wrench.encode(stamp, wrench)
 
 
 class PlantTelemetry:

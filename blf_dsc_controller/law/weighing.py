@@ -54,7 +54,8 @@ def add_row(settings: Settings, state: State, signals: Signals, dt: float) -> No
     """Add the row of this sample if one is due, and solve for the load ten times a second."""
     samples = int(state.samples[0])
     interval = settings.row_interval
-    if settings.weighed == 0 or samples % interval != interval // 2:
+    is_due = samples % interval == interval // 2 and state.frozen[0] == 0.0
+    if settings.weighed == 0 or not is_due:
         return
     period = interval * dt
     for i in range(settings.n):  # those of slow joints count little

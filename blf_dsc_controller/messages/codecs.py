@@ -25,7 +25,11 @@ from rosbags.typesys.store import Typestore
 
 from blf_dsc_controller.compiled.jit import direct, kernel
 from blf_dsc_controller.errors import BlfDscError
-from blf_dsc_controller.messages.topics import FLOAT64_MULTI_ARRAY, JOINT_STATE
+from blf_dsc_controller.messages.topics import (
+    FLOAT64_MULTI_ARRAY,
+    JOINT_STATE,
+    WRENCH,
+)
 from blf_dsc_controller.run import Floats
 
 NANOSECONDS = 1_000_000_000
@@ -357,6 +361,27 @@ class Float64MultiArrayEncoder:
     def has_layout(self, raw: bytes) -> bool:
         """Whether a serialised message has the size and the label of this encoder."""
         return raw.startswith(self._head)
+
+
+class WrenchEncoder:
+    """Encoder of geometry_msgs/WrenchStamped in a fixed frame."""
+
+    def __init__(self, frame: str) -> None:
+        types = typestore().types
+        stamp = types['builtin_interfaces/msg/Time'](sec=0, nanosec=0)
+        vector = types['geometry_msgs/msg/Vector3'](x=0.0, y=0.0, z=0.0)
+        message = types[WRENCH](
+            types['std_msgs/msg/Header'](stamp=stamp, frame_id=frame),
+            types['geometry_msgs/msg/Wrench'](force=vector, torque=vector),
+        )
+        self._buffer = bytearray(typestore().serialize_cdr(message, WRENCH))
+        self._values = np.frombuffer(self._buffer, '<f8', 6, len(self._buffer) - 48)
+
+    def encode(self, stamp_ns: int, wrench: ArrayLike) -> bytes:
+        """Return the serialised message: header stamp [ns], force [N] and moment [N m] (6,)."""
+        _STAMP.pack_into(self._buffer, STAMP_OFFSET, *divmod(stamp_ns, NANOSECONDS))
+        self._values[:] = wrench
+        return bytes(self._buffer)
 
 
 def encode_clock(stamp_ns: int) -> bytes:

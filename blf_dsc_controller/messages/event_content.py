@@ -140,6 +140,11 @@ SCHEMA: Mapping[str, Mapping[str, Field]] = {
     },
     'brake': {},
     'parameters': {'parameters': Field(PARAMETERS)},  # the changed ones
+    'drive load': {  # of the tip, that the drives add from the next state on
+        'mass': Field(NUMBER),  # kg
+        'centre': Field(NUMBERS),  # m
+    },
+    'contact': {'reaction': Field(TEXT), 'text': Field(TEXT)},
     'stop': {'reason': Field(TEXT), 'text': Field(TEXT)},
     'silence': {'torques': Field(COUNT)},  # by the watchdog, before the next message
     'deactivate': {},

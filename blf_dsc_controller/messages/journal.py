@@ -36,6 +36,8 @@ class EventType(str, Enum):
     TARGET = 'target'  # of a stream
     BRAKE = 'brake'
     PARAMETERS = 'parameters'
+    DRIVE_LOAD = 'drive load'  # the drives add the weight of a load from now on
+    CONTACT = 'contact'  # something touches the arm
     STOP = 'stop'
     SILENCE = 'silence'  # of the joint states, in which the watchdog commanded
     DEACTIVATE = 'deactivate'

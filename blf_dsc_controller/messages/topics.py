@@ -69,6 +69,7 @@ class Topic:
 
 JOINT_STATE = 'sensor_msgs/msg/JointState'
 FLOAT64_MULTI_ARRAY = 'std_msgs/msg/Float64MultiArray'
+WRENCH = 'geometry_msgs/msg/WrenchStamped'
 
 # The subscribers of the control loop keep one message: a late state or torque is
 # useless once the next one has arrived. Publishers keep more, so that a recorder misses
@@ -95,6 +96,10 @@ STATE = Topic(
     LATCHED_QUALITY,
 )
 MONITOR = Topic(CONTROLLER, '~/monitor', JOINT_STATE, HISTORY, STREAM)
+EXTERNAL_TORQUE = Topic(CONTROLLER, '~/external_torque', JOINT_STATE, STREAM, STREAM)
+"""Of each joint, and half of its 95 % interval as that of `joint +-`."""
+EXTERNAL_WRENCH = Topic(CONTROLLER, '~/external_wrench', WRENCH, STREAM, STREAM)
+"""The same at `robot.tip`, in its axes."""
 TRUTH = Topic(PLANT, '~/truth', JOINT_STATE, HISTORY, STREAM)
 TIMING = Topic(PLANT, '~/timing', JOINT_STATE, STREAM, STREAM)
 CLOCK = Topic(PLANT, '/clock', 'rosgraph_msgs/msg/Clock', STREAM, LATEST)
@@ -138,6 +143,8 @@ TOPICS = (
     JOURNAL,
     TARGETS,
     MONITOR,
+    EXTERNAL_TORQUE,
+    EXTERNAL_WRENCH,
     TRUTH,
     TIMING,
     CLOCK,
@@ -162,6 +169,8 @@ LOAD = tuple(
 )  # kg and m in the tip, and half of their 95 % intervals
 TOOL = ('tool_error', 'tool_bound', 'tool_angle', 'tool_angle_bound')
 """At the tip: error and bound on it [m], angle and bound on it [rad], of this posture."""
+INTERVAL = ' +-'  # after a joint: half of the 95 % interval of its external torque
+CONTACT = ('contact', 'contact distance')
 COMPUTE_TIME = 'compute_time'
 LATENCY = 'latency'
 LATENESS = 'lateness'

@@ -58,6 +58,7 @@ class ControllerNode(LoopNode[ControllerConfig]):
         joints = self.config.joints
         self._columns = b''  # those that are estimated, and whether they were checked
         self._model_changes = 0.0
+        self._contacts = 0
         self._decoder = JointStateDecoder(joints, required=('position',))
         self._encoder = Float64MultiArrayEncoder(len(joints))
         self._pending: bytes | None = None
@@ -86,6 +87,7 @@ class ControllerNode(LoopNode[ControllerConfig]):
         """Compile the law; create the topics of the loop on the first call."""
         self._loop = GuardedLoop(self.config, self._steady, self._wall)
         self.guard = self._loop.guard
+        self._contacts = 0
         self.guard.journal.pending[-1].content['topics'] = {
             topic.leaf: self.resolve_topic_name(topic.relative)
             for topic in (topics.JOINT_STATES, topics.COMMANDS)
@@ -101,6 +103,10 @@ class ControllerNode(LoopNode[ControllerConfig]):
                 topics.BOUND,
                 topics.MONITOR,
             ]
+            if self.config.contact.enabled:
+                outputs += [topics.EXTERNAL_TORQUE]
+                if self.config.robot.tip:
+                    outputs += [topics.EXTERNAL_WRENCH]
         if self.connect(outputs, topics.JOINT_STATES, self._on_joint_state):
             joints = self.config.joints
             inputs = TrajectoryInput(self, len(joints), lambda: self.guard)
@@ -199,7 +205,7 @@ class ControllerNode(LoopNode[ControllerConfig]):
             self.survive(error)
             return
         self._command(torque)
-        guard.weigh()
+        guard.perceive()
         if guard.has_sample:
             self._look_at_learning(guard)
         self._publish_telemetry(torque)
@@ -412,6 +418,9 @@ class ControllerNode(LoopNode[ControllerConfig]):
 
     def _log_phase(self, guard: Guard) -> None:
         supervisor = guard.supervisor
+        if guard.contacts != self._contacts:
+            self._contacts = guard.contacts
+            self.get_logger().warning(guard.contact)
         is_stopped = supervisor.phase is Phase.SAFE_STOP  # its text may grow
         text = supervisor.text if is_stopped else ''
         now = supervisor.phase, supervisor.stops, guard.silenced, text

@@ -32,6 +32,7 @@ from blf_dsc_controller.reference.trajectory import (
     TrajectoryPoint,
 )
 from blf_dsc_controller.run import Floats
+from blf_dsc_controller.supervision.drive_load import DriveLoad
 from blf_dsc_controller.supervision.guard import Guard
 from blf_dsc_controller.supervision.supervisor import Reason
 
@@ -45,6 +46,7 @@ _UNREADABLE = frozenset(
 )
 _EXTERNAL = (Reason.STATE_TIMEOUT, Reason.FAILED)
 _BLOCK = 4096  # states in memory
+_AXES = 3
 _MOST_TORQUES = 1_000_000  # of the watchdog: an hour without joint states
 
 
@@ -237,7 +239,7 @@ class Rerun:
             stamp = guard.journal.stamp
         else:
             torque = guard.update(stamp, self._measurement(row))
-            guard.weigh()
+            guard.perceive()
         if guard.has_sample:
             if stamp <= self.last:
                 self.end = f'the stamps restart at {stamp} ns'
@@ -311,7 +313,7 @@ class Rerun:
                 event.stamp,
             )
 
-    def _act(self, event: Event) -> None:  # noqa: C901 - one branch for each type
+    def _act(self, event: Event) -> None:  # noqa: C901, PLR0912 - one branch for each type
         """Do what caused an event, unless a message did."""
         guard, content = self._guard, event.content
         if _reason(event) is Reason.STATE_TIMEOUT:
@@ -332,6 +334,8 @@ class Rerun:
             guard.adopt(guard.plan(_target(content), content['at']))
         elif event.type is EventType.BRAKE:
             guard.brake()
+        elif event.type is EventType.DRIVE_LOAD:
+            guard.take_over(DriveLoad(content['mass'], tuple(content['centre'])))
         elif event.type is EventType.PARAMETERS:
             where = f'event {event.number} of the journal'
             given = current(content['parameters'], where)
@@ -410,6 +414,8 @@ def _check(events: Sequence[Event]) -> None:
         ):
             names = ', '.join(sorted(fixed & content['parameters'].keys()))
             problem = f'a change of what is fixed at the start: {names}'
+        elif event.type is EventType.DRIVE_LOAD and len(content['centre']) != _AXES:
+            problem = f'a centre with {len(content["centre"])} coordinates'
         elif event.type is EventType.SILENCE:
             torques += content['torques']
             if torques > _MOST_TORQUES:
@@ -426,7 +432,7 @@ def _check(events: Sequence[Event]) -> None:
 def _is_own(event: Event) -> bool:
     """Whether the controller decides on an event itself, because of a message."""
     is_stop = event.type is EventType.STOP
-    return event.type is EventType.START or (
+    return event.type in (EventType.START, EventType.CONTACT) or (
         is_stop and _reason(event) not in _EXTERNAL
     )
 

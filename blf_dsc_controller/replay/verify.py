@@ -36,8 +36,10 @@ _COMPARED = {  # topic: fields
     topics.REFERENCE: (0, 1),
     topics.MONITOR: (0,),
     topics.BOUND: (0, 2),
+    topics.EXTERNAL_TORQUE: (2,),
 }
-_TEXTS = (topics.STATE, topics.DIAGNOSTICS)
+_OTHERS = (topics.STATE, topics.DIAGNOSTICS, topics.EXTERNAL_WRENCH)
+_BY_STAMP = (topics.REFERENCE, topics.MONITOR, topics.EXTERNAL_TORQUE)
 _TRANSITIONS = (
     EventType.ACTIVATE,
     EventType.DEACTIVATE,
@@ -111,7 +113,7 @@ class Verification(NamedTuple):
     skipped: int  #: number of states that the controller did not answer
     #: one for each topic of the controller with numbers
     comparisons: tuple[Comparison, ...]
-    not_compared: tuple[str, ...]  #: topics with text
+    not_compared: tuple[str, ...]  #: topics with text, and what follows from others
     events: tuple[Event, ...]  #: replayed events but motions
     motions: int  #: number of replayed trajectories and targets of streams
     remarks: tuple[str, ...]  #: limitations of the result
@@ -178,7 +180,7 @@ def verify(path: Path, namespace: str = '', names: NameMap = NO_NAMES) -> Verifi
         differences.insert(0, _departed(run, *run.departure))
     elif not any(found.values for found in comparisons):
         raise _nothing_to_compare(content)
-    texts = [content.topics[topic] for topic in _TEXTS if topic in content.topics]
+    texts = [content.topics[topic] for topic in _OTHERS if topic in content.topics]
     end = run.end or other
     return Verification(
         run.samples,
@@ -327,12 +329,13 @@ def _compare(
     recorded, replayed = (each.joint_states(shared, ()) for each in (messages, own))
     names = shared
     if topic is not topics.MONITOR:
+        labels = shared if topic is topics.EXTERNAL_TORQUE else joints
         names = [
-            f'{JOINT_STATE_FIELDS[k]} of {joint}' for k in fields for joint in joints
+            f'{JOINT_STATE_FIELDS[k]} of {joint}' for k in fields for joint in labels
         ]
     if topic is topics.TRACKING_ERROR:
         recorded = answers
-    if topic in (topics.REFERENCE, topics.MONITOR):
+    if topic in _BY_STAMP:
         recorded = recorded.by_stamp()
         replayed = replayed.by_stamp()
         keys = recorded.stamp

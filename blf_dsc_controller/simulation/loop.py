@@ -27,6 +27,7 @@ from blf_dsc_controller.configuration.plant import PlantConfig
 from blf_dsc_controller.configuration.schema import flatten
 from blf_dsc_controller.law.check_state import INVALID, SUSPECT, checks_of
 from blf_dsc_controller.law.controller import Controller, step
+from blf_dsc_controller.law.external_torque import feel
 from blf_dsc_controller.law.factory import begin, controller_of, estimate_names
 from blf_dsc_controller.law.interface import Law
 from blf_dsc_controller.law.laws import for_law
@@ -84,8 +85,10 @@ def run_loop(
 ) -> bool:
     """Run the samples `first` to `last`; with `is_end`, the torque of the last is not applied.
 
-    What no torque depends on, the terms of (29) and the weighing, is computed with `observed`.
-    With checks (`law.checks`), stop at the first invalid or suspect sample and return False.
+    What no torque depends on, the terms of (29), the weighing and the external torque, is computed
+    with `observed`.
+    With checks (`law.checks`), stop at the first invalid or suspect sample, or where a contact
+    begins, and return False.
     """
     settings = settings_of(settings_vector, model)
     law_state = state_of(state, settings)
@@ -119,7 +122,11 @@ def run_loop(
         plants.truth(plant, now, true[k - first])
         if observed:
             fill_energies(settings, law_state, law_signals, sample)
+        if observed or settings.freezes == 1:
             add_row(settings, law_state, law_signals, dt)
+            begins = feel(settings, law_state, law_signals, dt, sample)
+            if begins and checks.velocity_limit[0] > 0.0:
+                return False
         if not (is_end and k == last):
             plants.step(plant, now, sample.torque)
     return True
@@ -223,7 +230,7 @@ def _run_guarded(
         record.measurements[row] = measurement
         record.truths[row] = plant.truth()
         torque = guard.update(START + int(record.stamps[row]), measurement)
-        guard.weigh()
+        guard.perceive()
         if torque is None:
             return
         if guard.has_sample:

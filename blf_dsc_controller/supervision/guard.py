@@ -48,6 +48,8 @@ from blf_dsc_controller.reference.trajectory import (
     plan_trajectory,
 )
 from blf_dsc_controller.supervision import retuning
+from blf_dsc_controller.supervision.contact import contact_text
+from blf_dsc_controller.supervision.drive_load import DriveLoad, DriveLoads
 from blf_dsc_controller.supervision.first_torque import (
     check_first_torque,
     limit_first_torque,
@@ -74,7 +76,8 @@ _SPEEDS_UP = 0.2  # s
 # Commands that do not reach the arm may be why, or velocities that are not its own: both wind up
 # the estimates.
 _PERHAPS_UNREACHED = (Reason.OUTSIDE_BOUND, Reason.SATURATED)
-_WINDING_UP = (*_PERHAPS_UNREACHED, Reason.VELOCITY)
+# A contact does so, too.
+_WINDING_UP = (*_PERHAPS_UNREACHED, Reason.VELOCITY, Reason.CONTACT)
 
 _REASONS: dict[type[codecs.MessageError], Reason] = {
     codecs.MissingJointError: Reason.JOINT_MISSING,
@@ -119,6 +122,9 @@ class Guard:
         has_sample: whether the law used the last message, so that there is new telemetry.
         start_error: why the law could not start; None if it could.
         waiting_for: what is wrong with the last state that the law could not start from; or empty.
+        contact: what touched the arm last, in words; or empty.
+        contacts: contacts so far.
+        holds: whether the reference rests since then, until the next trajectory.
         silenced: whether nothing is commanded until the next reset or activation.
         foreign: messages ignored because they name none of the joints.
         start_stamp: stamp of t = 0 [ns]; -1 before the first start.
@@ -145,11 +151,14 @@ class Guard:
         self.journal = Journal()
         self.has_sample = False
         self.start_error: BlfDscError | None = None
-        self.waiting_for = ''
-        self.silenced = False
+        self.waiting_for = self.contact = ''
+        self.contacts = 0
+        self.silenced = self.holds = False
         self.foreign = 0
         self.start_stamp = self.last_stamp = -1
         self.settled = self.compute_time = 0.0
+        tells = config.learning.tell_drive
+        self._drive_loads = DriveLoads(config) if tells else None
         self._velocity = Velocity(n) if config.safety.velocity == 'estimated' else None
         self._safe_torque = SafeTorque(n)
         self._safe_torque.scale = self.controller.state.gain_scale
@@ -277,10 +286,44 @@ class Guard:
         self.journal.commands += 1
         return torque
 
-    def weigh(self) -> None:
-        """Weigh what the tip holds by the last state, after its torque has been sent."""
-        if self.has_sample:
-            self.controller.weigh(self.config.sample_time)
+    def load_to_tell(self) -> DriveLoad | None:
+        """Return the load to tell the drives next, None if there is none: `learning.tell_drive`."""
+        if self._drive_loads is None or not self.has_sample:
+            return None
+        return self._drive_loads.next(self.controller)
+
+    def take_over(self, load: DriveLoad) -> None:
+        """Command less by the weight of a load that the drives add from the next state on."""
+        if self._drive_loads is None:
+            raise BlfDscError(
+                'learning.tell_drive: got false, but a load is told to the drives: set it to true'
+            )
+        self._note(EventType.DRIVE_LOAD, mass=load.mass, centre=list(load.centre))
+        self._drive_loads.take(self.controller, load)
+
+    def perceive(self) -> None:
+        """Weigh what the tip holds, and feel what touches the arm, by the last state.
+
+        Call it after its torque has been sent.
+        """
+        if self.has_sample and self.controller.perceive(self.config.sample_time):
+            self._react()
+
+    def _react(self) -> None:
+        """Do what `contact.reaction` wants when something touches the arm."""
+        reaction = self.config.contact.reaction
+        self.contact = contact_text(self.controller, self.config)
+        self.contacts += 1
+        self._note(EventType.CONTACT, reaction=reaction, text=self.contact)
+        if reaction == 'hold':
+            before = self.controller.reference_vector
+            self._follow(plan_stop(before, self.time, self.config).vector)
+            self.holds = True
+            self.supervisor.add(f'{self.contact}: it holds where it can brake')
+        elif reaction != 'none':
+            self._stop(Reason.CONTACT, self.contact)
+            if reaction == 'yield':
+                self._safe_torque.yield_to_contact()
 
     def _wait(self, problem: str) -> None:
         """Go on waiting for a state to start from."""
@@ -606,12 +649,16 @@ class Guard:
             raise LatePlanError([f'{due}, but was planned only at {self.time:.6g} s'])
         command = planned.command
         if isinstance(command, Target):
+            if self.holds:
+                remedy = 'send a trajectory that leads away from it, or call reset'
+                raise TrajectoryError([f'{self.contact}, and it holds: {remedy}'])
             self._note(EventType.TARGET, **planned.content)
             self._follow(planned.motion.vector)
             return
         self.end_silence()
         self.journal.add(EventType.TRAJECTORY, planned.content)
         self._follow(planned.motion.vector)
+        self.holds = False
         self.settled = planned.motion.settled
         is_settled = self.settled <= self.time
         self.supervisor.enter(Phase.TRACKING if is_settled else Phase.APPROACHING)
@@ -642,6 +689,8 @@ class Guard:
             retuning.apply_bumpless(self.controller, config, self.time, last)
         else:
             retuning.apply(self.controller, config)
+        if self._drive_loads is not None:
+            self._drive_loads.take(self.controller, self._drive_loads.told)
         self.config = config
         self.samples.set_limits(config.safety)
 
@@ -677,7 +726,7 @@ class Guard:
         self.states.restart()
         self.samples.restart()
         self.start_error = None
-        self.silenced = False
+        self.silenced = self.holds = False
         self.has_sample = False
         self._clean = True
         if self._safe_torque.last.age >= self.config.safety.fade_time:

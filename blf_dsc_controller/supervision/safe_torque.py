@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from math import inf
 
 import numpy as np
@@ -89,6 +90,7 @@ class SafeTorque:
         self._effect = CommandEffect(n)
         self._reached = True
         self._observes = True
+        self._yields = False
 
     def begin_ramp(
         self, duration: float, load: Vector, *, reached: bool = True
@@ -102,9 +104,15 @@ class SafeTorque:
         self._effect.restart()
         self._reached = reached
         self._observes = True
+        self._yields = False
         self._start[:] = self.commanded
         self._duration = duration
         self._elapsed = 0.0
+
+    def yield_to_contact(self) -> None:
+        """Give way: gravity with damping, until the next ramp; what pushes is no load."""
+        self.stop_observing()
+        self._yields = True
 
     def stop_observing(self) -> None:
         """Return to the load that was known at the stop, until the next ramp."""
@@ -139,6 +147,8 @@ class SafeTorque:
         if self.last.age == inf:
             return None
         self.missed_change = None
+        if self._yields:
+            safety = replace(safety, torque='hold_gravity')
         if safety.torque == 'hold_gravity' and self._observes:
             needed = self._needed(settings, estimate)
             if needed is not None:

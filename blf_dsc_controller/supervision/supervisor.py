@@ -43,6 +43,7 @@ class Reason(str, Enum):
     NO_EFFECT = 'commands without effect'
     SATURATED = 'torque saturated'
     OVERRUN = 'loop overrun'
+    CONTACT = 'contact'
     ESTIMATE = 'estimate not finite'
     TORQUE = 'torque not finite'
     FAILED = 'failed'

@@ -25,10 +25,10 @@ TIP = 'link2'  # body of arm.xml: a point mass at the tip
 PAYLOAD = 'payload of mujoco_plant'  # massless body at the tip of a URDF
 
 
-def model_of(config: PlantConfig) -> mujoco.MjModel:
-    """Build the MuJoCo model of the arm."""
+def spec_of(config: PlantConfig) -> mujoco.MjSpec:
+    """Return the arm as a description to which others may add what surrounds it."""
     if not config.robot.urdf:
-        return mujoco.MjModel.from_xml_path(str(Path(__file__).with_name('arm.xml')))
+        return mujoco.MjSpec.from_file(str(Path(__file__).with_name('arm.xml')))
     chain = config.robot.chain(config.joints)
     spec = mujoco.MjSpec.from_string(config.robot.text)
     spec.compiler.boundmass = spec.compiler.boundinertia = 0.0
@@ -39,7 +39,15 @@ def model_of(config: PlantConfig) -> mujoco.MjModel:
         if joint.name not in config.joints:  # fingers and the like are fixed
             spec.delete(joint)
     spec.body(chain.tip).add_body(name=PAYLOAD)
-    model = spec.compile()
+    return spec
+
+
+def model_of(config: PlantConfig) -> mujoco.MjModel:
+    """Build the MuJoCo model of the arm."""
+    model = spec_of(config).compile()
+    if not config.robot.urdf:
+        return model
+    chain = config.robot.chain(config.joints)
     model.opt.timestep = config.sample_time
     model.opt.integrator = mujoco.mjtIntegrator.mjINT_RK4
     model.opt.gravity[:] = config.robot.gravity

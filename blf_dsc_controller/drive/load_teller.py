@@ -1,0 +1,70 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Tells a robot the load that the law has weighed, step by step, beside the loop."""
+
+from __future__ import annotations
+
+from concurrent.futures import Future, ThreadPoolExecutor
+
+from blf_dsc_controller.control.arm_controller import ArmController
+from blf_dsc_controller.drive.driver import Driver, DriverError
+from blf_dsc_controller.supervision.drive_load import DriveLoad
+
+_EVERY = 20  # states, from one step to the next
+_SAME = 1e-5  # kg; robots report single precision
+
+
+class LoadTeller:
+    """What a robot is told of its load, while `learning.tell_drive` is true.
+
+    The law takes a step over with the state that reports it, or, of a robot that
+    reports no load, with the first one after the robot has accepted it.
+
+    Attributes:
+        problem: why the robot is told nothing more, or empty.
+    """
+
+    def __init__(self, driver: Driver, controller: ArmController) -> None:
+        self.problem = ''
+        self._driver = driver
+        self._controller = controller
+        self._asked: DriveLoad | None = None
+        self._answer: Future[None] | None = None
+        self._states = 0
+        self._thread: ThreadPoolExecutor | None = None
+        if controller.config.learning.tell_drive:
+            self._thread = ThreadPoolExecutor(1, 'load')
+
+    def follow(self) -> None:
+        """Take over what the robot adds since the last state; ask for the next step."""
+        if self._thread is None or self.problem:
+            return
+        if self._asked is not None:
+            self._await(self._asked)
+            return
+        self._states += 1
+        if self._states % _EVERY:
+            return
+        if self._driver.facts.load_in_motion or self._controller.is_at_rest:
+            self._asked = self._controller.load_to_tell()
+            if self._asked is not None:
+                self._answer = self._thread.submit(self._driver.tell_load, self._asked)
+
+    def _await(self, asked: DriveLoad) -> None:
+        """Take a step over once it is in force."""
+        assert self._answer is not None  # noqa: S101 - for mypy
+        is_answered = self._answer.done()
+        error = self._answer.exception() if is_answered else None
+        if isinstance(error, DriverError):
+            self.problem = str(error)
+            return
+        if error is not None:
+            raise error
+        mass = self._driver.load_in_force()
+        if is_answered if mass is None else abs(mass - asked.mass) < _SAME:
+            self._controller.take_over(asked)
+            self._asked = None
+
+    def close(self) -> None:
+        """Wait for the last answer."""
+        if self._thread is not None:
+            self._thread.shutdown()

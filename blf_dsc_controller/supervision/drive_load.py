@@ -1,0 +1,125 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Telling the drives what has been weighed, so that the torque of no joint steps.
+
+Drives that compensate gravity know of a load what they are told.  A law that has weighed it can
+tell them: they then add its weight, and the command gives it up,
+
+    whole torque = command + G_d(q) = command' + G_d'(q),    G_d' = G_d + that of the load
+
+so that the whole torque of the joint is that of before.  Only the moment of the change is the
+drives': a command that was on its way belongs to the load of before, and is wrong by the change for
+a cycle.  The load is therefore told in steps that change no torque by more than `_STEP` of its
+limit, each once the one before is in force.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from blf_dsc_controller.arms.model import regressors_at
+from blf_dsc_controller.arms.serial_chain import SerialChain
+from blf_dsc_controller.configuration.controller import ControllerConfig
+from blf_dsc_controller.law.controller import Controller
+from blf_dsc_controller.law.torque import added_torque
+from blf_dsc_controller.law.weighing import DEVIATION, MASS, TWO_SIDED
+
+Vector = NDArray[np.float64]
+
+_NARROW = 0.05  # kg, half of the interval of a mass that is told
+_SHARE = 0.05  # or this part of the mass
+_CENTRE = 0.03  # m, likewise of its centre
+_STEP = 0.005  # of the torque limit
+
+
+class DriveLoad(NamedTuple):
+    """A load that drives compensate, in the frame of the tip."""
+
+    mass: float  # kg
+    centre: tuple[float, ...]  # (3,) m
+
+    @property
+    def moments(self) -> Vector:
+        """Mass and first moments (4,) [kg, kg m]."""
+        return self.mass * np.array((1.0, *self.centre))
+
+    @classmethod
+    def of(cls, moments: Vector) -> DriveLoad:
+        """Return the load with these mass and first moments."""
+        mass = float(moments[0])
+        if mass <= 0.0:
+            return cls(0.0, (0.0, 0.0, 0.0))
+        return cls(mass, tuple((moments[1:] / mass).tolist()))
+
+
+class DriveLoads:
+    """What the drives of an arm are told.
+
+    Attributes:
+        declared: what they had at the start, `robot.drive_payload`.
+        told: what they have now.
+    """
+
+    def __init__(self, config: ControllerConfig) -> None:
+        robot = config.robot
+        self.declared = DriveLoad(robot.drive_payload, robot.drive_payload_centre)
+        self.told = self.declared
+        self._robot = robot
+        self._chain = robot.chain(config.joints)
+        self._goes_on = False  # not all of a load has been told
+
+    def take(self, controller: Controller, load: DriveLoad) -> None:
+        """Let the law know that the drives add the weight of this load from now on."""
+        self.told = load
+        settings = controller.settings
+        settings.drive_inertias[:] = self._columns(load)
+        # the last command met the drives with this load already
+        controller.state.added[:] = added_torque(settings, controller.signals.q)
+
+    def next(self, controller: Controller) -> DriveLoad | None:
+        """Return the load to tell next; None: there is nothing to tell, or not well enough known.
+
+        Nothing is told while something touches the arm.
+        """
+        target = self._weighed(controller)
+        if target is None or controller.state.contact[0] > 0.0:
+            return None
+        settings = controller.settings
+        chain = SerialChain(settings.n, settings.drive, settings.drive_chain)
+        q = controller.signals.q[np.newaxis]
+        (H,) = regressors_at(chain, q, *np.zeros((3, 1, settings.n)))
+        change = H @ (self._columns(DriveLoad.of(target)) - self._columns(self.told))
+        largest = float((np.abs(change) / (_STEP * settings.torque_limit)).max())
+        part = min(1.0, 1.0 / largest) if largest > 0.0 else 1.0
+        moments = self.told.moments
+        self._goes_on = part < 1.0
+        return DriveLoad.of(moments + part * (target - moments))
+
+    def _weighed(self, controller: Controller) -> Vector | None:
+        """Return mass and moments (4,) that the drives should have; None: those they have."""
+        load = controller.state.load
+        half = TWO_SIDED * load[DEVIATION]
+        narrow = max(_NARROW, _SHARE * abs(load[MASS]))
+        if not 0.0 < half < narrow:
+            return None
+        picked_up = np.zeros(4)
+        if abs(load[MASS]) > narrow:
+            spread = TWO_SIDED * load[DEVIATION + 1 :]
+            if not ((spread > 0.0) & (spread < _CENTRE)).all():
+                return None
+            picked_up[:] = load[MASS] * np.array((1.0, *load[MASS + 1 : DEVIATION]))
+        target = self.declared.moments + picked_up
+        target = np.asarray(DriveLoad.of(target).moments)
+        is_new = abs(target[0] - self.told.mass) > narrow
+        return target if is_new or self._goes_on else None
+
+    def _columns(self, load: DriveLoad) -> Vector:
+        """Return what the columns of the drives' gravity are multiplied by, with this load."""
+        robot = replace(
+            self._robot, drive_payload=load.mass, drive_payload_centre=load.centre
+        )
+        inertias = robot.drive_inertias(self._chain, self._chain.inertias)
+        return np.asarray(inertias[:, :4].ravel())

@@ -1,0 +1,283 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Torque from outside, told from the model's errors, from a load, and what follows from it."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from paper_case import configured
+from random_arm import PANDA
+
+from blf_dsc_controller.arms.urdf import frames
+from blf_dsc_controller.bags.reader import read_run
+from blf_dsc_controller.configuration.controller import ControllerConfig
+from blf_dsc_controller.configuration.schema import build
+from blf_dsc_controller.control.arm_controller import ArmController
+from blf_dsc_controller.errors import ConfigurationError
+from blf_dsc_controller.law.external_torque import CONTACT, absorb
+from blf_dsc_controller.law.telemetry import sample_columns
+from blf_dsc_controller.law.tip_wrench import TipWrench
+from blf_dsc_controller.messages import topics
+from blf_dsc_controller.messages.journal import EventType
+from blf_dsc_controller.reference.retargeting import Target, TrajectoryError
+from blf_dsc_controller.replay.verify import verify
+from blf_dsc_controller.simulation.loop import START, simulate, write_bag
+from blf_dsc_controller.supervision.guard import Guard
+from blf_dsc_controller.supervision.supervisor import Phase, Reason
+from sim_plant.plant import plant_of
+
+# s
+TOUCHED = 8.0
+RELEASED = 9.0
+END = 10.0
+ON = {'contact.enabled': True}
+PUSH = [20.0, 0.0, 0.0]  # N, horizontal
+NOTHING = {'events.begin': [], 'events.duration': [], 'events.payload': []}
+
+
+def pushed(force, begin=TOUCHED, end=RELEASED):
+    return {
+        'events.begin': [begin],
+        'events.duration': [end - begin],
+        'events.payload': [0.0],
+        'events.force': force,
+    }
+
+
+def loop_of(events, **controller):
+    plant = {'truth.mass_deviation': 0.3, 'sensor.incomplete_states': 0, **events}
+    return configured('panda', END, ON | controller, plant)
+
+
+def run_of(events, **controller):
+    config = loop_of(events, **controller)
+    return simulate(config.controller, config.plant)
+
+
+def columns(record):
+    """Samples by name, and their times [s]."""
+    samples = sample_columns(record.samples, record.controller.settings)
+    return samples, record.stamps * 1e-9
+
+
+def contacts(record):
+    """Times of the contacts [s]."""
+    return [
+        (event.stamp - START) * 1e-9
+        for event in record.journal.pending
+        if event.type is EventType.CONTACT
+    ]
+
+
+@pytest.fixture(scope='module')
+def free():
+    return run_of(NOTHING)
+
+
+@pytest.fixture(scope='module')
+def held():
+    """A push that makes the arm hold."""
+    return run_of(pushed(PUSH), **{'contact.reaction': 'hold'})
+
+
+def test_interval_covers_what_model_and_noise_leave(free):
+    """95 % of a free motion, without being ten times as wide as it needs to be."""
+    samples, t = columns(free)
+    late = t > TOUCHED
+    inside = np.abs(samples.external[late]) < samples.external_interval[late]
+    assert inside.mean(axis=0).min() > 0.95
+    rms = np.sqrt((samples.external[late] ** 2).mean(axis=0))
+    assert (samples.external_interval[late].mean(axis=0) < 10.0 * rms).all()
+    assert not contacts(free)
+
+
+def test_interval_is_wide_before_the_first_window_and_narrow_after(free):
+    """By what the prior doubts: links 30 % off, a load."""
+    samples, t = columns(free)
+    wide = samples.external_interval[(t > 1.0) & (t < 4.0)].mean(axis=0)
+    narrow = samples.external_interval[t > TOUCHED].mean(axis=0)
+    assert (wide[[1, 3]] > 10.0 * narrow[[1, 3]]).all()  # joints that bear gravity
+
+
+def test_no_torque_depends_on_it(free):
+    without = run_of(NOTHING, **{'contact.enabled': False})
+    np.testing.assert_array_equal(columns(free)[0].torque, columns(without)[0].torque)
+    assert columns(without)[0].external.shape[1] == 0
+
+
+def test_force_on_the_tip_is_found_in_the_joints_and_at_the_tip(held):
+    """To 15 % of 20 N, 0.3 s after it began; the tip's axes are turned to the base's."""
+    samples, t = columns(held)
+    config = held.config
+    k = int(np.argmin(np.abs(t - TOUCHED - 0.3)))
+    q = samples.qr[k] + samples.xi1[k]
+    tip = TipWrench(config.robot.chain(PANDA))
+    needed = tip.jacobian(q)[:3].T @ (rotation(config, q).T @ PUSH)
+    error = np.abs(samples.external[k] - needed)
+    assert (error < samples.external_interval[k] + 0.15 * np.abs(needed)).all()
+    wrench = tip.of(q, samples.external[k], samples.external_interval[k])
+    force = rotation(config, q) @ wrench[:3]
+    assert np.linalg.norm(force - PUSH) < 0.15 * 20.0
+
+
+def rotation(config, q):
+    return frames(config.robot.chain(PANDA), q)[-1][:3, :3]
+
+
+def test_jacobian_is_the_rate_of_the_tip():
+    """By the difference of two postures 1e-6 rad apart."""
+    chain = loop_of(NOTHING).controller.robot.chain(PANDA)
+    q, step = np.linspace(-1.0, 1.0, 7), 1e-6
+    J = TipWrench(chain).jacobian(q)
+    tip = frames(chain, q)[-1]
+    for i in range(7):
+        moved = frames(chain, q + step * np.eye(7)[i])[-1]
+        shift = tip[:3, :3].T @ (moved[:3, 3] - tip[:3, 3]) / step
+        turn = tip[:3, :3].T @ moved[:3, :3]
+        spin = np.array([turn[2, 1], turn[0, 2], turn[1, 0]]) / step
+        np.testing.assert_allclose(J[:, i], [*shift, *spin], atol=1e-5)
+
+
+def test_load_is_no_contact_but_learned():
+    """2 kg are picked up at 7 s: 10 N m more, all of which a load explains."""
+    event = {'events.begin': [7.0], 'events.duration': [10.0], 'events.payload': [2.0]}
+    record = run_of(event, **{'contact.reaction': 'stop'})
+    samples, t = columns(record)
+    assert np.abs(samples.external[(t > 7.0) & (t < 7.2)]).max() > 8.0
+    assert not contacts(record)
+    assert samples.load[-1, 0] == pytest.approx(2.0, abs=0.05)
+    alone = run_of(event, **{'contact.reaction': 'stop', 'contact.loads': False})
+    assert contacts(alone)[0] == pytest.approx(7.02, abs=0.03)  # the same, unexpected
+
+
+@pytest.mark.parametrize('reaction', ['none', 'stop', 'hold', 'yield'])
+def test_contact_is_found_and_answered_as_chosen(reaction, held):
+    """20 N within 60 ms; after a stop nothing is commanded by the law."""
+    record = (
+        held
+        if reaction == 'hold'
+        else run_of(pushed(PUSH), **{'contact.reaction': reaction})
+    )
+    samples, t = columns(record)
+    found = contacts(record)
+    assert 0.0 < found[0] - TOUCHED < 0.06
+    stops = [e for e in record.journal.pending if e.type is EventType.STOP]
+    runs = ~np.isnan(samples.qr[:, 0])
+    if reaction in ('none', 'hold'):
+        assert runs.all()
+        assert not stops
+    else:
+        assert stops[0].content['reason'] == Reason.CONTACT
+        assert 'something touches the arm' in stops[0].content['text']
+        assert not runs[t > found[0]].any()
+    moves = np.abs(samples.dqr[(t > found[0] + 0.5) & runs]).max(initial=0.0)
+    assert (moves > 0.0) == (reaction == 'none')
+
+
+def test_contact_is_not_learned_where_something_reacts(held):
+    """Nothing but d^3 changes from the detection on; without a reaction the model does."""
+    samples, t = columns(held)
+    (found, *_) = contacts(held)
+    touched = (t > found + 2e-3) & (samples.contact[:, CONTACT] > 0.0)
+    assert np.ptp(samples.estimate[touched], axis=0).max() == 0.0
+    assert samples.changes[-1, 0] == 0.0
+    ignored, t = columns(run_of(pushed(PUSH)))
+    assert ignored.changes[-1, 0] > 0.0
+
+
+def test_contact_ends_and_learning_goes_on(held):
+    samples, t = columns(held)
+    on = t[samples.contact[:, CONTACT] > 0.0]
+    assert RELEASED < on[-1] < RELEASED + 0.6
+    assert np.ptp(samples.estimate[t > on[-1] + 0.5], axis=0).max() > 0.0
+
+
+def test_arm_that_yields_gives_way_and_one_that_stops_resists():
+    """For a second each, pushed by 20 N from the contact on."""
+    way = []
+    for reaction in ('stop', 'yield'):
+        record = run_of(pushed(PUSH, end=END), **{'contact.reaction': reaction})
+        q = record.measurements[:, :7]
+        way.append(np.abs(q[-1] - q[round(1e3 * TOUCHED) + 200]).max())
+    assert way[1] > 3.0 * way[0]
+
+
+def test_arm_that_holds_takes_no_targets_until_a_trajectory_leads_away():
+    config = loop_of(pushed(PUSH), **{'contact.reaction': 'hold'})
+    guard = Guard(config.controller, lambda: 0, lambda: 0)
+    guard.activate()
+    guard.update(START, plant_of(config.plant).measure())
+    guard.controller.sample.external_interval[:] = 1.0
+    guard._react()
+    q = guard.controller.signals.q
+    target = Target(tuple(q), (0.0,) * 7, 0.1, 0.3, held=True)
+    with pytest.raises(TrajectoryError, match='it holds: send a trajectory'):
+        guard.adopt(guard.plan(target))
+    assert guard.supervisor.phase is not Phase.SAFE_STOP
+    guard.reset()
+    assert not guard.holds
+
+
+def test_replay_repeats_it_bit_for_bit(tmp_path, held):
+    write_bag(tmp_path / 'bag', held)
+    result = verify(tmp_path / 'bag')
+    assert result.difference is None
+    assert not result.is_partial
+    assert EventType.CONTACT in [event.type for event in result.events]
+    compared = {each.topic: each.values for each in result.comparisons}
+    assert compared[topics.EXTERNAL_TORQUE.resolved] > 14 * 700
+    assert topics.EXTERNAL_WRENCH.resolved in result.not_compared
+    names = read_run(tmp_path / 'bag').monitor.names
+    assert set(topics.CONTACT) <= set(names)
+
+
+def test_replay_repeats_the_torques_of_an_arm_that_yields(tmp_path):
+    """As the library's loop records them, the safe torques included."""
+    loop = loop_of(pushed(PUSH), **{'contact.reaction': 'yield'})
+    plant = plant_of(loop.plant)
+    with ArmController(loop.controller, record=tmp_path / 'bag') as controller:
+        for k in range(round(1e3 * RELEASED)):
+            state = plant.measure().reshape(3, -1)
+            plant.step(controller.update(1.0 + 1e-3 * k, *state))
+        assert 'something touches the arm' in controller.reason
+    result = verify(tmp_path / 'bag')
+    assert result.difference is None
+    assert not result.is_partial
+
+
+def test_load_is_filtered_as_least_squares_would():
+    """All rows at once with the prior; the innovations sum to the chi-square of the batch."""
+    random = np.random.default_rng(3)
+    C = random.normal(size=(7, 10))
+    e = random.normal(size=7)
+    z, doubt = np.zeros(10), np.eye(10)
+    square = absorb(C, e, 0.5, z, doubt, np.zeros(10))
+    covariance = np.linalg.inv(C.T @ C / 0.5 + np.eye(10))
+    np.testing.assert_allclose(z, covariance @ C.T @ e / 0.5, rtol=1e-10)
+    np.testing.assert_allclose(doubt, covariance, atol=1e-12)
+    whole = e @ np.linalg.solve(C @ C.T + 0.5 * np.eye(7), e)
+    assert square == pytest.approx(whole)
+
+
+@pytest.mark.parametrize(
+    ('given', 'problem'),
+    [
+        ({'contact.enabled': 1}, 'contact.enabled: got 1, but a bool'),
+        ({'contact.bandwidth': 0.0}, 'contact.bandwidth: got 0'),
+        ({'contact.threshold': -1.0}, 'contact.threshold: got -1'),
+        ({'contact.loads': 'yes'}, 'contact.loads: got .yes.'),
+        ({'contact.reaction': 'flee'}, 'contact.reaction: got .flee.'),
+        (
+            {'contact.reaction': 'stop'},
+            'contact.reaction: got stop, but without contact.enabled',
+        ),
+        (
+            ON | {'learning.prediction': 'lambda'},
+            'contact.enabled: got true with blf_dsc, lambda',
+        ),
+        (ON | {'law': 'slotine_li'}, 'contact.enabled: got true with slotine_li'),
+    ],
+)
+def test_bad_values_are_named_with_a_remedy(given, problem):
+    with pytest.raises(ConfigurationError, match=problem):
+        build(ControllerConfig, given)
