@@ -432,6 +432,30 @@ def _add_studies(command: _Command) -> None:
     option('--truths', type=_positive, default=5, help='closed loops of each arm (5)')
     option('--out', type=Path, default=Path('tool'), help='new folder for the figures')
     option = command(
+        'contacts',
+        'Compare how soon pushes are found at equal false alarms. Random arms with wrong links and '
+        "an unknown load are pushed; the learned model stands beside the URDF's; offline, on all "
+        'cores, half a second of CPU for each second of an arm.',
+        '--arms 100 --force 10 20 --out contacts',
+    )
+    option(
+        '--config',
+        nargs='+',
+        default=['panda', 'ur5e'],
+        help='presets or files (panda ur5e)',
+    )
+    option('--arms', type=_positive, default=1000, help='random arms (1000)')
+    option(
+        '--force',
+        type=float,
+        nargs='+',
+        default=[10.0, 20.0],
+        help='of the pushes [N] (10 20)',
+    )
+    option(
+        '--out', type=Path, default=Path('contacts'), help='new folder for the figures'
+    )
+    option = command(
         'monte-carlo',
         'Run a study of many random plants. Thousands of closed loops run in parallel, and the '
         'report says how many kept the bound. Interrupted studies resume: start the same command '

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`blf_dsc paper`, `blf_dsc arms`: laws side by side.
+"""`blf_dsc paper`, `blf_dsc arms`: laws side by side; `blf_dsc contacts`: pushes.
 
 `blf_dsc monte-carlo`: random plants.
 """
@@ -18,6 +18,7 @@ from blf_dsc_controller.analysis.metrics import aligned, write_json
 from blf_dsc_controller.cli.run import make_folder, print_notice
 from blf_dsc_controller.compiled.announcement import announced_compilation
 from blf_dsc_controller.configuration.nodes import locate
+from blf_dsc_controller.studies import contacts as contact_study
 from blf_dsc_controller.studies import laws, report, runs, stiffness
 from blf_dsc_controller.studies import paper as paper_study
 from blf_dsc_controller.studies import tool as tool_study
@@ -72,6 +73,17 @@ def tool(options: Namespace) -> None:
         )
     print(tool_study.format_figures(found))
     print(f'wrote {options.out}: tool.json, tool.png')
+
+
+def contacts(options: Namespace) -> None:
+    """Push random arms; write contacts.json and contacts.png, and print the table."""
+    folder = make_folder(options.out)
+    with announced_compilation(print_notice):
+        study = contact_study.compare(
+            folder, options.config, options.arms, options.force
+        )
+    print(contact_study.format_results(study))
+    print(f'wrote {options.out}: contacts.json, contacts.png')
 
 
 def monte_carlo(options: Namespace) -> None:
