@@ -111,15 +111,19 @@ def test_it_tracks_and_holds_two_kilograms_that_appear_in_the_hand(wire):
     assert_replays(wire.folder / 'bag')
 
 
+def told_config():
+    """Return the preset with `learning.tell_drive`."""
+    preset = (blf.share_folder() / 'config/fr3_direct.yaml').read_text()
+    section = '/**/blf_dsc_controller:\n  ros__parameters:\n'
+    return preset.replace(section, f'{section}    learning: {{tell_drive: true}}\n')
+
+
 def test_weighed_load_is_told_in_motion_and_no_torque_steps(wire, tmp_path):
     """The robot adds 2 kg in the end, and the whole torque of each joint (tau_J) goes on.
 
     Steps are those of the motion before, and 0.5 % of the torque limit.
     """
-    preset = (blf.share_folder() / 'config/fr3_direct.yaml').read_text()
-    section = '/**/blf_dsc_controller:\n  ros__parameters:\n'
-    told = preset.replace(section, f'{section}    learning: {{tell_drive: true}}\n')
-    (tmp_path / 'my.yaml').write_text(told)
+    (tmp_path / 'my.yaml').write_text(told_config())
     wire.simulate('127.0.0.17', 'load=2@6000')
     code, output = ended(wire.drive('127.0.0.17', 11, '--config', tmp_path / 'my.yaml'))
     assert code == 0, output
