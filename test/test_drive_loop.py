@@ -14,6 +14,7 @@ import pytest
 from plant_driver import PlantDriver
 
 import blf_dsc_controller as blf
+from blf_dsc_controller.analysis.metrics import tool_errors
 from blf_dsc_controller.cli.main import main
 from blf_dsc_controller.configuration.drive import DriveConfig
 from blf_dsc_controller.configuration.schema import build, change
@@ -349,6 +350,24 @@ def test_the_command_says_how_it_ended(address, code, printed, tmp_path, capsys)
         assert 'connected to the simulated arm' in output.err
         assert 'largest error' in output.out
         assert_replays(tmp_path / 'bag')
+
+
+def test_the_command_says_how_far_the_tool_was_off(tmp_path, capsys):
+    urdf = (blf.share_folder() / 'config/two_link.urdf').as_posix()
+    driver = (HERE / 'plant_driver.py').as_posix()
+    (tmp_path / 'my.yaml').write_text(
+        f'/**:\n  ros__parameters:\n    driver: {driver}\n'
+        f'    robot: {{urdf: {urdf}, tip: link2}}\n    barrier.tool_bound: 0.02\n'
+        '    torque.limit: [20.0, 20.0]\n',
+        encoding='utf-8',
+    )
+    files = ['--config', str(tmp_path / 'my.yaml'), '--out', str(tmp_path / 'bag')]
+    assert main(['drive', '--robot', 'plant', *files, '--duration', '0.3']) == 0
+    (error,) = re.findall(
+        'tool          largest error (.*) mm', capsys.readouterr().out
+    )
+    recorded = tool_errors(blf.read_run(tmp_path / 'bag'))
+    assert float(error) == pytest.approx(1e3 * np.nanmax(recorded[:, 0]), rel=1e-2)
 
 
 @pytest.mark.parametrize('duration', ['-1', 'nan', 'inf'])

@@ -92,6 +92,8 @@ def _print(outcome: Outcome, loop: DriveLoop, controller: ArmController) -> None
     print(f'end           {outcome.end}{reason}')
     print(f'states        {outcome.states}, and {controller.missed} missed')
     print(f'tracking      largest error {loop.worst:.0%} of its bound')
+    if not math.isnan(loop.worst_at_tool):
+        print(f'tool          largest error {1e3 * loop.worst_at_tool:.3g} mm')
     mass, interval = controller.load
     if not math.isnan(mass):
         print(f'load          {mass:.2f} +- {interval:.2f} kg more than at the start')

@@ -64,6 +64,7 @@ class DriveLoop:
     Attributes:
         latency: of the torques, from the return of `read` to that of `write`.
         worst: largest tracking error so far, relative to its bound.
+        worst_at_tool: largest error at the tool so far [m]; NaN without a bound there.
     """
 
     def __init__(
@@ -80,6 +81,7 @@ class DriveLoop:
         """
         self.latency = Latency()
         self.worst = 0.0
+        self.worst_at_tool = math.nan
         self._driver = driver
         self._controller = controller
         self._duration = duration
@@ -180,6 +182,8 @@ class DriveLoop:
         self.worst = max(
             self.worst, float((abs(controller.error) / controller.bound).max())
         )
+        at_tool = controller.tool.error
+        self.worst_at_tool = float(np.fmax(self.worst_at_tool, at_tool))
         if controller.phase is Phase.SAFE_STOP:
             self._begin_end(End.STOPPED, controller.reason, stamp)
         elif self._requests:
