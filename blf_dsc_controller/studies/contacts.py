@@ -295,11 +295,11 @@ def draw(found: Mapping[str, Any], path: Path) -> None:
         for name, colour in DETECTORS.items():
             times = np.sort(results[name][f'{DRAWN:g}']['delays'])
             share = 100.0 * np.arange(1, times.size + 1) / times.size
-            axes.step(1e3 * times, share, where='post', color=colour, label=name)
+            label = name if axes is picture.axes[0, -1] else None
+            axes.step(1e3 * times, share, where='post', color=colour, label=label)
         axes.set_xlim(0.0, 1e3 * WATCHED)
         axes.set_ylim(0.0, 100.0)
         axes.set_xlabel('since the push [ms]')
         axes.set_ylabel('found [%]')
-        axes.legend(fontsize=7, loc='lower right')
         head(axes, f'{force} N at the tip')
     picture.save(path)
