@@ -176,9 +176,9 @@ def test_two_arms_in_one_domain_do_not_interfere(ros):
 
 def test_external_torque_and_its_interval_are_published(ros):
     received = ros.listen(topics.EXTERNAL_TORQUE, raw=True)
-    arm = ros.add(PlantNode, {'mode': 'lockstep', 'duration': 0.2, **OBSERVED})
-    ros.add(ControllerNode, {'contact.enabled': True, **OBSERVED})
-    ros.until(lambda: arm.finished and len(received) == 21)  # every tenth sample
+    arm = ros.add(PlantNode, {'mode': 'lockstep'})
+    ros.add(ControllerNode, {'contact.enabled': True})
+    ros.until(lambda: received)
     joints = arm.config.joints
     names = (*joints, *(joint + topics.INTERVAL for joint in joints))
     decoder = JointStateDecoder(names, required=('effort',))
