@@ -14,6 +14,7 @@ from pathlib import Path
 from ros_rig import RosRig
 from trajectory_msgs.msg import JointTrajectory
 
+from blf_dsc_controller.configuration.files import share_folder
 from blf_dsc_controller.nodes.controller_node import ControllerNode
 from blf_dsc_controller.nodes.plant_node import PlantNode
 from blf_dsc_controller.nodes.recorder_node import BagRecorderNode
@@ -34,6 +35,12 @@ ACTION_ACCESS = {
     'subscribe': [],
     'reply': [f'/{ACTION_NODE}/get_type_description'],
     'request': [],
+}
+# parameters with which the controller has every topic
+ALL_TOPICS = {
+    'robot.urdf': str(share_folder() / 'config/two_link.urdf'),
+    'robot.tip': 'link2',
+    'contact.enabled': True,
 }
 HEAD = """\
 <?xml version="1.0" encoding="UTF-8"?>
@@ -71,7 +78,7 @@ def live():
             bag = str(Path(folder, 'bag'))
             # One thread serves all nodes: the arm must leave time for the others.
             ros.add(PlantNode, publish_clock=True, sample_time=0.02)
-            ros.add(ControllerNode, sample_time=0.02)
+            ros.add(ControllerNode, ALL_TOPICS, sample_time=0.02)
             ros.add(ViewNode)
             # of a user: it is recorded
             planner = '/blf_dsc_controller/joint_trajectory'

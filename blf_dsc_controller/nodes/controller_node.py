@@ -95,6 +95,11 @@ class ControllerNode(LoopNode[ControllerConfig]):
         self._load = reference_load(self.config, self.guard.controller.settings)
         for warning in config_warnings(self.config, load=self._load):
             self.get_logger().warning(warning)
+        if self.config.learning.tell_drive:
+            self.get_logger().warning(
+                'learning.tell_drive: over ROS the drives are told nothing, only `blf_dsc drive` '
+                'tells its robot: set robot.drive_payload and the load of the driver instead'
+            )
         outputs = [topics.COMMANDS]
         if self.config.telemetry.enabled:
             outputs += [
