@@ -193,6 +193,7 @@ def folder(tmp_path_factory):
     synthetic = Synthetic(4000)
     synthetic.error[1234, 0] = -0.005  # one sample far outside
     synthetic.torque[2000:2010, 1] = 20.0  # ten samples at the limit
+    synthetic.torque[3996:, 1] = -20.0  # and the last four
     data = json.dumps(
         {'stamp': START + 2_500_000_000, 'parameters': {'load.torque': [1.0, 0.0]}}
     )
@@ -244,6 +245,7 @@ def test_events_list_violation_latch_saturation_and_plant_change(folder):
         ('violation', 1.234): 'shoulder outside its bound for 1 samples',
         ('learning', 1.5): 'first excited window: learning began',
         ('saturation', 2.0): 'elbow at its torque limit for 10 samples',
+        ('saturation', 3.996): 'elbow at its torque limit for 4 samples',
         ('plant', 2.5): 'load.torque: [1.0, 0.0]',
     }
 

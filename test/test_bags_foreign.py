@@ -214,6 +214,7 @@ def test_wrong_names_are_reported_with_the_names_in_the_bag(bag, tmp_path):
     for entries, words in (
         *((([entry],), 'one side is missing') for entry in ('joint1', '=x', 'joint1=')),
         ((['joint1=a', 'joint2=a'],), 'given twice'),
+        ((['joint1=a', 'joint1=b'],), 'given twice'),
     ):
         with pytest.raises(BlfDscError, match=words):
             NameMap.parse(*entries)

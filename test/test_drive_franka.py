@@ -19,9 +19,14 @@ import pytest
 from command import COMPILED, PATIENCE
 
 import blf_dsc_controller as blf
+from blf_dsc_controller.configuration.drive import DriveConfig
+from blf_dsc_controller.configuration.schema import build, change
+from blf_dsc_controller.supervision.drive_load import DriveLoad
 
 if not all(map(importlib.util.find_spec, ('pylibfranka', 'franky_sim'))):
     pytest.skip('needs pylibfranka and franky-sim', allow_module_level=True)
+
+from blf_dsc_controller.drive.franka import FrankaDriver
 
 SIMULATOR = Path(__file__).with_name('franka_simulator.py')
 BOUND = 0.01  # rad, of the preset
@@ -178,6 +183,28 @@ def test_sigterm_ends_at_rest_and_a_killed_command_leaves_a_robot_that_can_be_us
     code, output = ended(process)
     assert code == 130, output
     assert 'ended on request' in output
+
+
+class ToldRobot:
+    """Keeps the load that it was sent last."""
+
+    def set_load(self, *load):
+        self.load = load
+
+
+def test_load_is_told_in_the_frame_of_the_flange_and_none_without_mass():
+    """With the frame of joint 7 as the tip: the flange is 0.107 m further along its axis."""
+    tip = {'robot.tip': 'fr3_link7'}
+    controller = change(blf.load_loop('fr3_direct').controller, tip)
+    config = build(DriveConfig, {'load_inertia': [0.1, 0.2, 0.3]})
+    driver = FrankaDriver('', controller, config)
+    driver._robot = ToldRobot()
+    driver.tell_load(DriveLoad(2.0, (0.02, 0.0, 0.01)))
+    mass, centre, inertia = driver._robot.load
+    assert (mass, inertia) == (2.0, np.diag([0.1, 0.2, 0.3]).ravel().tolist())
+    np.testing.assert_allclose(centre, [0.02, 0.0, 0.01 - 0.107], atol=1e-9)
+    driver.tell_load(DriveLoad(0.0, (0.0, 0.0, 0.0)))
+    assert driver._robot.load == (0.0, [0.0] * 3, [0.0] * 9)
 
 
 def test_an_address_without_a_robot_is_an_error_with_a_remedy(wire):

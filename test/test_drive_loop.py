@@ -115,6 +115,7 @@ def test_nothing_is_commanded_to_a_robot_that_took_over_or_is_gone(
 def test_a_mistake_of_the_driver_ends_the_motion_and_is_shown(tmp_path):
     with pytest.raises(RuntimeError, match='a mistake of the driver'):
         drive('mistaken@300', tmp_path)
+    assert PlantDriver.last.calls == ['connect', 'start', 'finish']
 
 
 def test_an_error_of_the_controller_brings_the_arm_to_rest_before_it_is_shown(

@@ -8,6 +8,7 @@ import importlib
 import re
 import sys
 import tracemalloc
+from dataclasses import replace
 from pathlib import Path
 
 import mujoco
@@ -52,7 +53,7 @@ from blf_dsc_controller.identification.identify import (
     identify_bag,
 )
 from blf_dsc_controller.identification.physical import Cone, solve
-from blf_dsc_controller.identification.prior import Prior
+from blf_dsc_controller.identification.prior import Prior, prior_of
 from blf_dsc_controller.identification.reading import read_recording
 from blf_dsc_controller.identification.recording import Recording, joined
 from blf_dsc_controller.identification.regression import regression
@@ -644,6 +645,18 @@ def test_nearest_physical_body_is_found():
     far = [Cone(k, np.array([[1e3]]), np.array([[[1.0]]])) for k in range(3)]
     expected = np.linalg.solve(A.T @ A + np.eye(3), A.T @ b)
     np.testing.assert_allclose(solve(A, b, far, np.zeros(3)), expected, atol=1e-3)
+
+
+def test_search_begins_inside_all_cones():
+    """With a link whose inertia in the URDF is that of no body, too: J < 0 along an axis."""
+    joints = list(PANDA_CHAIN.joints)
+    inertia = joints[2].inertia.copy()
+    inertia[4:] *= -0.5
+    joints[2] = joints[2]._replace(inertia=inertia)
+    for chain in (PANDA_CHAIN, replace(PANDA_CHAIN, joints=joints)):
+        found = prior_of(ROBOT, chain, np.full(7, 80.0), np.ones(7), load=True)
+        for cone in found.cones:
+            assert np.linalg.eigvalsh(cone.of(found.start))[0] > 0.0
 
 
 @pytest.mark.parametrize('seed', range(2))

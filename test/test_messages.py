@@ -76,6 +76,14 @@ def test_encoded_messages_equal_full_serialisation(names, fields, data):
     assert encode_clock(STAMP) == cdr('rosgraph_msgs/Clock', time)
 
 
+def test_array_of_another_size_or_label_has_another_layout():
+    own = Float64MultiArrayEncoder(2, 'arm')
+    assert own.has_layout(own.encode([3.0, 4.0]))
+    for other in ((3, 'arm'), (2, 'leg'), (2, '')):
+        raw = Float64MultiArrayEncoder(*other).encode(np.zeros(other[0]))
+        assert not own.has_layout(raw)
+
+
 @given(NAMES, st.text('base_', max_size=9), STAMPS, st.randoms())
 def test_decoder_matches_joints_by_name(names, frame_id, stamp, random):
     values = {

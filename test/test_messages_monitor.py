@@ -22,7 +22,7 @@ from blf_dsc_controller.law.lyapunov import (
     exponential_bound,
     largest_inertia,
 )
-from blf_dsc_controller.law.telemetry import ControllerTelemetry
+from blf_dsc_controller.law.telemetry import ControllerTelemetry, rejected_columns
 from blf_dsc_controller.messages import topics
 from blf_dsc_controller.messages.codecs import JointStateDecoder
 from blf_dsc_controller.simulation.loop import simulate, write_bag
@@ -169,11 +169,16 @@ def test_rejected_columns_are_in_the_summary_and_the_lyapunov_function_is_a_pane
     """Run of 8 s from a bag, truth known, with a cosine column that the reference cannot excite."""
     learning = {'learning.frequencies': [1.0], 'learning.bias': False}
     config = configured('recommended', 8.0, LEAKY | learning)
-    write_bag(tmp_path / 'bag', simulate(config.controller, config.plant))
+    names = estimate_names(config.controller)
+    assert rejected_columns(controller_of(config.controller), names) == {}
+    record = simulate(config.controller, config.plant)
+    write_bag(tmp_path / 'bag', record)
     run = read_run(tmp_path / 'bag')
     metrics = measure(run)
     (column,) = metrics.rejected_columns
     assert column.startswith('cos 1 rad/s ')
+    (name,) = rejected_columns(record.controller, names)
+    assert name == column.partition(':')[0]
     assert f'rejected    {column}: ' in format_table(metrics)
     assert metrics.final_parameter_error < 0.5
     (panel,) = (panel for panel in panels([run]) if panel.group == 'Monitors')

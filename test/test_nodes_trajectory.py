@@ -22,6 +22,7 @@ from blf_dsc_controller.messages.codecs import MessageError, joint_trajectory
 from blf_dsc_controller.messages.journal import decode
 from blf_dsc_controller.reference.terms import sampled
 from blf_dsc_controller.reference.trajectory import plan_trajectory
+from blf_dsc_controller.supervision.guard import LatePlanError
 from blf_dsc_controller.supervision.supervisor import Phase
 
 BRISK = {'limits__acceleration': [4.0, 4.0]}  # rad/s^2, for a lead of a second
@@ -270,3 +271,22 @@ def test_trajectory_that_is_planned_too_late_is_planned_again_further_ahead(
     may_end.set()
     ros.until(lambda: inputs(law).accepted + inputs(law).rejected)
     assert (inputs(law).accepted, len(begins) > 1) == (1, True)
+
+
+def test_trajectory_that_cannot_be_planned_two_seconds_ahead_is_rejected(
+    ros, monkeypatch
+):
+    """Each lead is twice the one before, from 0.02 s on; the last is the first beyond 2 s."""
+    arm, law = ros.loop(None, BRISK | PLANNED['on'])
+    ros.run(arm, 20)
+    plans = []
+
+    def late(plan):
+        plans.append(plan.at)
+        raise LatePlanError(['it was planned too late'])
+
+    monkeypatch.setattr(law.guard, 'adopt', late)
+    sent = trajectory(JOINTS, np.zeros(2), duration=0.1)
+    assert 'it was planned too late' in send(ros, law, sent)
+    assert len(plans) == 8
+    assert phase(law) is Phase.TRACKING

@@ -18,7 +18,7 @@ from sim_plant.motion import (
     state_derivative,
     update_loads,
 )
-from sim_plant.plant import plant_of, plant_settings
+from sim_plant.plant import TorqueInput, plant_of, plant_settings
 
 INITIAL = np.array([*START, 0.5, -1.0])
 TORQUE = np.array([-6.0, -2.0])
@@ -99,6 +99,16 @@ def test_positive_disturbance_decelerates_the_joint_and_is_in_the_truth():
     assert pytest.approx([1.0, 0.32, 0.4]) == P
     expected = torque_of(views(**ROUGH)[0], 100_000_000 * 1e-9, q, dq)
     np.testing.assert_allclose(load, expected, rtol=1e-13)
+
+
+def test_torque_is_stale_after_its_limit_and_each_such_step_counts():
+    received = TorqueInput(2)
+    assert received.take(2, TORQUE, 5)
+    assert [received.is_stale(k, 3) for k in range(7, 11)] == [False] * 2 + [True] * 2
+    assert received.stale_steps == 2
+    received.renew(10)
+    assert not received.is_stale(13, 3)
+    assert received.stale_steps == 2
 
 
 def test_sample_times_are_whole_nanoseconds():

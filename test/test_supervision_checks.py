@@ -102,6 +102,55 @@ def test_cuts_add_up_if_they_take_more_than_a_fifth_of_the_time(law, every, stop
 
 
 @pytest.mark.parametrize(
+    ('lack', 'now', 'reason'),
+    [
+        (1.8, 4.8, Reason.OUTSIDE_BOUND),  # what it lacks now does not last
+        (3.8, 2.3, Reason.OUTSIDE_BOUND),  # what it lacked is over
+        (3.8, 4.8, Reason.NO_EFFECT),
+    ],
+)
+def test_only_an_effort_that_lacks_more_than_usual_explains_an_error(
+    law, lack, now, reason
+):
+    """Of drives whose efforts always lack 1.8 N m, 9 % of the torque limit."""
+    given = {'robot.effort': 'whole', 'safety.error_ratio': 1.0}
+    check = SampleCheck(build(ControllerConfig, given), law)
+    law.checks.usual[0] = 1.8
+    law.checks.lack[0] = lack
+    law.checks.used[4:] = law.sample.torque - [now, 0.0]
+    law.sample.xi1[0] = 2.0 * law.sample.bound[0]
+    law.flags = verdict(law)
+    fault = check.check(DT)
+    assert fault.reason is reason
+    assert ('lacks +2 N m' in fault.text) == (reason is Reason.NO_EFFECT)
+
+
+def test_usual_lack_of_an_effort_is_its_average_over_a_second():
+    law, arm, effort = controller(recommended()), plant(), np.zeros(2)
+    SampleCheck(build(ControllerConfig, {'robot.effort': 'whole'}), law)
+    for k in range(1001):
+        measurement = arm.measure().copy()
+        measurement[4:] = effort - [1.5, 0.0]
+        law.update(k * DT, DT, measurement)
+        effort = law.signals.torque.copy()
+        arm.step(effort)
+    expected = [1.5 * (1.0 - np.exp(-1.0)), 0.0]
+    np.testing.assert_allclose(law.checks.usual, expected, atol=0.02)
+
+
+def test_estimates_of_before_a_restart_are_consistent_with_it(law):
+    """A stop at once does not return to the estimates of an earlier run."""
+    check = SampleCheck(ControllerConfig(), law)
+    law.state.estimate[:] = 0.5
+    law.state.disturbance[:] = 0.25
+    check.keep()
+    check.restart()
+    check.return_to_consistent()
+    assert (check.estimate == 0.5).all()
+    assert (check.disturbance == 0.25).all()
+
+
+@pytest.mark.parametrize(
     ('index', 'value', 'is_valid'),
     [
         (0, nan, False),

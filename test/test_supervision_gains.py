@@ -294,6 +294,29 @@ def test_default_gains_have_margins_at_every_rate(preset, sample_time):
     assert growth(settings, sample_time, lag, M0, M0, settings.slope_limit) < 1.0
 
 
+def test_lags_of_the_loop_have_their_time_constants():
+    """A held velocity and what alpha2' follows are approached as by lags of first order."""
+    config = arm_of('panda')
+    settings = settings_of_config(config)
+    n, T, lag = settings.n, 0.001, 0.02
+    M0 = inertias(config, settings)[:1]
+    A = transition(settings, T, lag, M0, M0, settings.weight)[0][0]
+    q, before, speed, alpha2 = (slice(k * n, k * n + n) for k in (0, 4, 5, 6))
+    share = 1.0 - np.exp(-1.0)
+    x = np.zeros(8 * n)
+    for _ in range(round(0.5 * lag / T)):
+        x[q], x[before] = 3.0 * T, 0.0  # 3 rad/s
+        x = A @ x
+    np.testing.assert_allclose(x[speed], 3.0 * share)
+    x = np.zeros(8 * n)
+    for _ in range(2):
+        x[q] = x[before] = 0.1
+        x = A @ x
+    rate = settings.K / 2.0 + settings.mu
+    share = 1.0 - np.exp(-2.0 * T / settings.time_constant)
+    np.testing.assert_allclose(x[alpha2], -0.1 * rate * share)
+
+
 @pytest.mark.parametrize('preset', ['panda', 'ur5e'])
 def test_the_loop_is_that_of_one_joint_in_every_posture(preset):
     """Damping, barrier and disturbance estimate follow the inertia: n equal, decoupled loops."""
