@@ -24,7 +24,12 @@ from collections import defaultdict
 import mujoco
 import numpy as np
 from franky_sim import SimulationServer
-from franky_sim.franka_robot_protocol import BaseCommand, MoveStatus, RobotCommand
+from franky_sim.franka_robot_protocol import (
+    BaseCommand,
+    MoveStatus,
+    RobotCommand,
+    UDPCommand,
+)
 from franky_sim.mujoco_simulator import MujocoSimulator
 
 _HAND = 'robot0_hand'
@@ -44,6 +49,7 @@ class Simulator:
         self.events = events
         self.cycle = 0  # since the first torque of the motion
         self.unanswered = False
+        self.last = 0  # number of the last state
         self.hand = mujoco.mj_name2id(sim.model, mujoco.mjtObj.mjOBJ_BODY, _HAND)
         if self.hand < 0:
             raise LookupError(f'the model has no body {_HAND}')
@@ -54,7 +60,8 @@ class Simulator:
         handle = self.robot._handle_udp_command
 
         def answered(data):
-            self.unanswered = False
+            # A torque for an earlier state would leave one more on its way for good.
+            self.unanswered = UDPCommand.from_bytes(data).message_id < self.last
             self.cycle = max(self.cycle, 1)
             handle(data)
 
@@ -72,6 +79,7 @@ class Simulator:
         for what in self.events[self.cycle] if self.cycle else ():
             self.happen(what)
         self.sim.step()
+        self.last = self.robot._FrankaServer__message_id
         self.robot.send_state()
         self.unanswered = True
         self.cycle += self.cycle > 0

@@ -279,10 +279,12 @@ def _load_all(
     nodes_with: dict[str, list[str]] = {}
     for node, cls in nodes.items():
         entries = _entries_of(sections, node, cls)
-        values = {name: entry.value for name, entry in entries.items()}
+        written = {name: entry.value for name, entry in entries.items()}
         chosen = overrides.get(node, {})
+        given: dict[str, object] = {**written, **chosen}
+        values = {name: value for name, value in given.items() if value is not None}
         try:
-            configs[node] = build(cls, {**values, **chosen})
+            configs[node] = build(cls, values)
         except ConfigurationError as error:
             for problem in error.problems:
                 located = _located(problem, entries, chosen)
