@@ -13,6 +13,7 @@ import subprocess
 import sys
 import threading
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -204,6 +205,27 @@ def test_load_is_told_in_the_frame_of_the_flange_and_none_without_mass():
     np.testing.assert_allclose(centre, [0.02, 0.0, 0.01 - 0.107], atol=1e-9)
     driver.tell_load(DriveLoad(0.0, (0.0, 0.0, 0.0)))
     assert driver._robot.load == (0.0, [0.0] * 3, [0.0] * 9)
+
+
+@pytest.mark.parametrize(
+    ('set_load', 'm_ee', 'm_total', 'words'),
+    [
+        (True, 0.73, 1.23, 'an end effector of 0.73 kg'),
+        (True, 0.005, 2.0, ''),
+        (False, 0.73, 0.73, 'adds the weight of 0.73 kg at its flange, but'),
+        (False, 0.73, 0.505, ''),
+    ],
+)
+def test_mass_that_only_the_robot_knows_is_remarked(set_load, m_ee, m_total, words):
+    """That of the end effector if we set the load, else both; the configuration has 0.5 kg."""
+    known = {'robot.drive_payload': 0.5}
+    controller = change(blf.load_loop('fr3_direct').controller, known)
+    driver = FrankaDriver('', controller, build(DriveConfig, {'set_load': set_load}))
+    driver._robot = ToldRobot()
+    driver._robot.read_once = lambda: SimpleNamespace(m_ee=m_ee, m_total=m_total)
+    remarks = list(driver._remarks())
+    assert len(remarks) == bool(words)
+    assert words in ''.join(remarks)
 
 
 def test_an_address_without_a_robot_is_an_error_with_a_remedy(wire):

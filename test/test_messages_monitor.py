@@ -170,7 +170,8 @@ def test_rejected_columns_are_in_the_summary_and_the_lyapunov_function_is_a_pane
     learning = {'learning.frequencies': [1.0], 'learning.bias': False}
     config = configured('recommended', 8.0, LEAKY | learning)
     names = estimate_names(config.controller)
-    assert rejected_columns(controller_of(config.controller), names) == {}
+    for fresh in (config.controller, configured('model_based', 1.0).controller):
+        assert rejected_columns(controller_of(fresh), estimate_names(fresh)) == {}
     record = simulate(config.controller, config.plant)
     write_bag(tmp_path / 'bag', record)
     run = read_run(tmp_path / 'bag')

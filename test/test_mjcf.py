@@ -425,11 +425,16 @@ def test_file_with_includes_becomes_one_text_that_needs_neither_files_nor_mujoco
 
 
 def test_given_rotors_and_gravity_win():
-    given = {'robot.rotor_inertia': [1.0, 2.0], 'robot.gravity': [0.0, 0.0, 9.81]}
+    given = {'robot.rotor_inertia': [1.0, 2.0], 'robot.gravity': [0.0, 0.0, 3.7]}
     arm_given = {'robot.urdf': arm(), 'robot.tip': 'tool'}
     robot = robot_of(arm_given | given)[0]
     assert robot.rotor_inertia == (1.0, 2.0)
-    assert robot.gravity == (0.0, 0.0, 9.81)
+    assert robot.gravity == (0.0, 0.0, 3.7)
+    own, other = (
+        build(ControllerConfig, arm_given | changes).learning.residual_floor
+        for changes in ({}, given)
+    )
+    np.testing.assert_allclose(other, np.multiply(own, 3.7 / 9.81), rtol=1e-3)
 
 
 def test_without_any_armature_drives_are_guessed_as_for_a_urdf():

@@ -464,6 +464,17 @@ def test_path_is_stretched_no_more_than_the_limits_ask_for():
     assert max(limits_used(motion, 0.0, motion.end)) > 0.95
 
 
+def test_path_that_is_only_too_fast_is_stretched_by_the_ratio_of_its_velocity():
+    """Over 3 rad within 3 s, by minimum jerk: at most 1.875 rad/s of 1.5, 1.9 rad/s^2 of 6."""
+    at_rest = pack(2, [minimum_jerk(np.zeros(1), np.zeros((1, 2)))])
+    middle = np.array([[1.5, 0.0]]), np.array([[1.875, 0.0]]), np.zeros((1, 2))
+    end = np.array([[3.0, 0.0]]), np.zeros((1, 2)), np.zeros((1, 2))
+    points = tuple(np.vstack(each) for each in zip(middle, end, strict=True))
+    motion = plan(trajectory(points, times=(1.5, 3.0)), at_rest, 0.0)
+    assert motion.end == pytest.approx(3.0 * 1.875 / 1.5, rel=2e-3)
+    assert max(limits_used(motion, 0.0, motion.end)) == pytest.approx(1.0, rel=2e-3)
+
+
 def test_point_that_is_too_near_in_time_is_reached_as_soon_as_the_limits_allow():
     """From rest over 1.5 rad: not before velocity, acceleration and jerk allow, 1.37 s."""
     at_rest = pack(2, [minimum_jerk(np.zeros(1), np.zeros((1, 2)))])

@@ -285,6 +285,23 @@ def test_changed_event_is_a_difference(tmp_path, kind, alter, topic, field):
         assert abs(difference.stamp - event.stamp) <= MILLISECOND
 
 
+def test_stop_that_the_recorded_controller_did_not_make_is_the_difference(tmp_path):
+    """Its journal ends before the stop, but it answered all states that came after."""
+    rig = Recorder(DAMPED)
+    rig.step(50)
+    rig.publish_events()
+    rig.deliver(b'')
+    rig.step(10)
+    rig.publish_events()
+    stops = [
+        each for each in of(rig.entries, JOURNAL) if decode(each[3]).type == 'stop'
+    ]
+    rig.entries.remove(stops[0])
+    result = rig.verify(tmp_path)
+    assert result.difference.field.startswith('used by the law (')
+    assert result.difference.topic == TRACKING_ERROR.resolved
+
+
 @pytest.mark.parametrize('part', [0.1, 0.5, 0.9])
 def test_flipped_bit_of_a_safe_torque_is_found(tmp_path, part):
     rig = eventful()

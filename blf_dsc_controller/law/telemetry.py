@@ -325,8 +325,6 @@ def rejected_columns(controller: Controller, names: Sequence[str]) -> dict[str, 
     `names` are those of the m entries of theta^, as returned by `factory.estimate_names`.
     """
     state, reasons = controller.state, {}
-    if controller.settings.kappa == 0.0 or state.columns_checked[0] == 0.0:
-        return {}
     upper = np.triu(state.running[:-1, :-1])
     Phi = upper + np.triu(upper, 1).T
     kept = np.flatnonzero(state.active > 0.0)
