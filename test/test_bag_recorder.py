@@ -419,7 +419,14 @@ def test_real_time_loop_is_timed_and_every_message_of_it_is_in_the_bag(tmp_path)
         'sim_plant:\n  ros__parameters:\n    arm: {gravity: 0.0}\n'
         '    realtime: {priority: 10, lock_memory: true}\n'
     )
-    at_rest = '    arm: {gravity: 0.0}\n    reference: {type: hold}\n'
+    # Soft: with the delays of a busy computer, the gains for 1 kHz would shake the arm.
+    at_rest = (
+        '    arm: {gravity: 0.0}\n    reference: {type: hold}\n'
+        '    barrier.weight: [1.0, 1.0]\n    barrier.slope_limit: [9.0, 9.0]\n'
+        '    surface: {gain: [1.0, 1.0], mu: [1.0, 1.0]}\n'
+        '    feedback.gain: [1.0, 1.0]\n    disturbance.gain: [0.0, 0.0]\n'
+        '    learning.weight: 0.0\n'
+    )
     config = tmp_path / 'fifo.yaml'
     out = tmp_path / 'out'
     config.write_text(fifo + PATIENT + at_rest)
