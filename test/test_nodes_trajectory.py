@@ -148,7 +148,8 @@ def test_long_chunk_is_followed_from_the_sample_that_was_promised_on(ros):
     times = 1e-9 * (np.array(stamps) - begin)
     q = np.array([each.position for each in references])
     is_old = times < promised
-    assert 200 < np.count_nonzero(is_old) < 3000
+    # how many depends on the computer: lock-step does not wait for the planning
+    assert 200 < np.count_nonzero(is_old) < times.size
     np.testing.assert_array_equal(q[is_old], sampled(before, times[is_old])[:, 0])
     np.testing.assert_array_equal(q[~is_old], sampled(after, times[~is_old])[:, 0])
 
