@@ -15,14 +15,17 @@ from plant_driver import PlantDriver
 
 import blf_dsc_controller as blf
 from blf_dsc_controller.analysis.metrics import tool_errors
+from blf_dsc_controller.bags.reader import read_run
 from blf_dsc_controller.cli.main import main
 from blf_dsc_controller.configuration.drive import DriveConfig
+from blf_dsc_controller.configuration.nodes import CONTROLLER
 from blf_dsc_controller.configuration.schema import build, change
 from blf_dsc_controller.drive.driver import DriverError, Facts, disagreements
 from blf_dsc_controller.drive.drivers import find_driver
 from blf_dsc_controller.drive.latency import Latency
 from blf_dsc_controller.drive.loop import DriveLoop, End
 from blf_dsc_controller.errors import BlfDscError, ConfigurationError
+from blf_dsc_controller.messages import topics
 from blf_dsc_controller.supervision.drive_load import DriveLoad
 from blf_dsc_controller.supervision.supervisor import Phase
 from sim_plant.plant import plant_of, plant_settings
@@ -151,20 +154,32 @@ def test_torques_are_sent_before_weighing_and_recording(tmp_path):
     assert order == ['sent', 'weighed']
 
 
-PICKED_UP = 6.0  # s; it is known about a second later
+# s; the load is known about a second later
+PICKED_UP, PUSHED = 6.0, 9.2
 TOLD = {'learning.tell_drive': True}
+ALL = TOLD | {
+    'barrier.bound': None,
+    'barrier.tool_bound': 0.02,
+    'barrier.tool_angle_bound': 0.1,
+    'contact.enabled': True,
+    'contact.reaction': 'hold',
+}
 
 
 class LoadedDriver(PlantDriver):
-    """The simulated FR3, which picks up 2 kg, and can be told so."""
+    """The simulated FR3, which picks up 2 kg, can be told so, and is pushed from the side."""
 
     facts = Facts(7, 0.001, 'gravity_and_friction', 'whole', (87.0,) * 7, (1e3,) * 7)
     facts = facts._replace(load_in_motion=True)
     refuses = False
 
     def connect(self):
-        event = {'begin': [PICKED_UP], 'duration': [0.0], 'payload': [2.0]}
-        changes = {f'events.{name}': value for name, value in event.items()}
+        changes = {
+            'events.begin': [PICKED_UP, PUSHED],
+            'events.duration': [0.0, 0.3],
+            'events.payload': [2.0, 0.0],
+            'events.force': [0.0, 0.0, 0.0, 0.0, 20.0, 0.0],
+        }
         loop = blf.load_loop('fr3_direct')
         self.what, self.at = '', -1
         self.config = change(loop.plant, changes)
@@ -201,8 +216,8 @@ class LoadedDriver(PlantDriver):
         return self.mass
 
 
-def run_with_load(tmp_path, driver, duration):
-    config = change(blf.load_loop('fr3_direct').controller, TOLD)
+def run_with_load(tmp_path, driver, duration, given=TOLD):
+    config = blf.load_loop('fr3_direct', {CONTROLLER: given}).controller
     made = driver('plant', config, DriveConfig())
     made.connect()
     with blf.ArmController(config, record=tmp_path / 'bag') as controller:
@@ -212,15 +227,23 @@ def run_with_load(tmp_path, driver, duration):
     return made, loop, controller
 
 
-def test_weighed_load_is_told_to_the_drives_without_a_step_of_any_torque(tmp_path):
+@pytest.fixture(scope='module')
+def all_of_it(tmp_path_factory):
+    """Run with learning, a bound at the tool, a load that is told, and a contact."""
+    folder = tmp_path_factory.mktemp('all_of_it')
+    made = run_with_load(folder, LoadedDriver, 10.0, ALL)
+    return *made, read_run(folder / 'bag'), blf.verify(folder / 'bag')
+
+
+def test_weighed_load_is_told_to_the_drives_without_a_step_of_any_torque(all_of_it):
     """The robot adds what the law gives up; steps are those of the motion, and 0.5 % of 87 N m."""
-    driver, loop, controller = run_with_load(tmp_path, LoadedDriver, 10.0)
+    driver, loop, controller, _, verified = all_of_it
     assert not loop.remark
     assert driver.mass == pytest.approx(2.0, abs=0.1)
     masses = [load.mass for load in driver.told]
     assert len(masses) > 10
     assert (np.diff(masses) > 0.0).all()
-    event = [e for e in blf.verify(tmp_path / 'bag').events if e.type == 'drive load']
+    event = [each for each in verified.events if each.type == 'drive load']
     assert len(event) == len(masses)
     efforts = np.array(driver.efforts)
     limit = np.array(controller.config.torque.limit)
@@ -236,7 +259,30 @@ def test_weighed_load_is_told_to_the_drives_without_a_step_of_any_torque(tmp_pat
         for k in (begin, end + 500)
     )
     assert after < 0.6 * before  # friction and the motion are left
-    assert_replays(tmp_path / 'bag')
+
+
+def test_run_with_all_of_it_replays_bit_for_bit(all_of_it):
+    """What each part says is in the bag, and computed again from the joint states and events."""
+    *_, run, verified = all_of_it
+    assert verified.difference is None
+    assert not verified.is_partial
+    assert not any(found.missing for found in verified.comparisons)
+    kinds = [event.type for event in verified.events]
+    assert kinds.index('drive load') < kinds.index('contact')
+    assert kinds.count('contact') == 1
+    compared = {found.topic: found.values for found in verified.comparisons}
+    assert compared[topics.EXTERNAL_TORQUE.resolved] > 14 * 900
+    shown = (*topics.TOOL, topics.LOAD[0], topics.CONTACT[0], topics.LATCHED)
+    error, certified, angle, certified_angle, mass, contact, latched = (
+        run.monitor.select(shown).T
+    )
+    assert (error < certified).all()
+    assert (angle < certified_angle).all()
+    assert 0.001 < certified.max() <= 0.02
+    assert mass[-1] == pytest.approx(2.0, abs=0.1)
+    t = run.time_of(run.monitor.stamp)
+    assert PUSHED < t[contact > 0.0].min() < PUSHED + 0.1
+    assert latched[-1] == 1.0
 
 
 def test_drives_that_refuse_a_load_are_asked_once(tmp_path):
