@@ -10,6 +10,7 @@ from test_supervision_effect import stopped_by
 
 from blf_dsc_controller.configuration.nodes import load_loop
 from blf_dsc_controller.configuration.schema import change
+from blf_dsc_controller.law.factory import controller_of
 from blf_dsc_controller.simulation.loop import simulate
 from blf_dsc_controller.supervision.supervisor import Phase, Reason
 
@@ -98,3 +99,41 @@ def test_change_to_velocities_of_the_positions_is_no_acceleration():
     last = guard._safe_torque.last
     np.testing.assert_allclose(last.dq, moving, rtol=1e-6)
     np.testing.assert_allclose(last.ddq, 0.0, atol=1e-6)
+
+
+GAPS = {
+    'one in ten of 30 ms': lambda random: 0.030 if random.random() < 0.1 else 0.001,
+    'half of 2 to 5 ms': lambda random: 1e-3 * random.integers(1, 6),
+    'up to 90 ms': lambda random: 1e-3 * random.choice([1, 1, 1, 1, 20, 90]),
+}
+
+
+@pytest.mark.parametrize('frequency', [0.0, 0.5, 10.0])
+@pytest.mark.parametrize('gaps', GAPS)
+def test_states_that_are_lost_contradict_nothing(gaps, frequency):
+    """The arm is healthy: at constant velocity, swinging, or shaken by the lost states."""
+    controller = controller_of(load_loop('recommended').controller)
+    random = np.random.default_rng(1)
+    t = 0.0
+    for _ in range(3000):
+        dt = GAPS[gaps](random)
+        t += dt
+        phase = 2.0 * np.pi * frequency * t
+        q = 0.2 * np.sin(phase) / (2.0 * np.pi * frequency) if frequency else 0.2 * t
+        measurement = np.repeat([q, 0.2 * np.cos(phase), 0.0], 2)
+        assert not controller.contradicts(dt, measurement), t
+
+
+@pytest.mark.parametrize('factor', [0.0, -1.0])
+def test_wrong_velocity_is_found_although_states_are_lost(factor):
+    controller = controller_of(load_loop('recommended').controller)
+    random = np.random.default_rng(1)
+    t = 0.0
+    found = []
+    while t < 1.0 and not any(found):
+        dt = GAPS['one in ten of 30 ms'](random)
+        t += dt
+        q = 0.2 * np.sin(2.0 * t) / 2.0
+        measurement = np.repeat([q, factor * 0.2 * np.cos(2.0 * t), 0.0], 2)
+        found.append(controller.contradicts(dt, measurement))
+    assert t < 0.5

@@ -62,7 +62,6 @@ class Checks(NamedTuple):
     read_before: Annotated[Array, '2 * n']
     noise: Annotated[Array, '2 * n']  # mean square
     resolution: Annotated[Array, 'n']  # rad, smallest change of a position; 0: none yet
-    lagged: Annotated[Array, 'n']  # rad, filtered position
     derived: Annotated[Array, 'n']  # rad/s, filtered velocity by the positions
     measured: Annotated[Array, 'n']  # rad/s, measured velocity through the same filter
     # (rad/s)^2, mean squares of their difference and of the larger of both

@@ -9,9 +9,11 @@ turns damping into its opposite.  Positions and velocities pass the same filter,
 
     derived = s/(tau s + 1) q,        measured = 1/(tau s + 1) dq
 
-They are equal except for noise and the lag of the velocity.  A velocity is contradicted when the
-mean square of their difference exceeds half of the larger one's: one that is stuck at 0 gives 1,
-the wrong sign 4, a lag of 6 ms 0.5 at 20 Hz.
+They are equal except for noise and the lag of the velocity: in an interval, the filter's input
+is the change of the position over it, or the mean of the velocities at both ends.  Where readings
+are missing, these ends show little of what was between them: the filters skip such an interval.
+A velocity is contradicted when the mean square of their difference exceeds half of the larger
+one's: one that is stuck at 0 gives 1, the wrong sign 4, a lag of 6 ms 0.5 at 20 Hz.
 """
 
 from __future__ import annotations
@@ -31,6 +33,8 @@ _FILTER = 0.03  # s, tau
 _POWER = 0.1  # s, over which the mean squares are
 _WRONG = 0.5  # of the larger mean square
 _SECOND = 2.0  # readings before that of a second difference
+_ROW = 0.01  # s: up to here, the ends of an interval show the velocity within it
+_GAP = 2.5  # samples: readings are missing in an interval that is also longer than this
 _SLOW = 0.03  # rad/s: slower motion shows nothing
 
 
@@ -71,18 +75,20 @@ def compare_velocities(checks: Checks, dt: float, measurement: Array, n: int) ->
     checks.readings[0] += 1.0
     share = min(1.0, dt / _FILTER)
     slow = min(1.0, dt / _POWER)
+    is_gap = dt > max(_ROW, _GAP * checks.sample_time[0])
     is_wrong = False
     for i in range(n):
         if begins:
-            checks.lagged[i] = measurement[i] - _FILTER * measurement[n + i]
             checks.measured[i] = measurement[n + i]
             checks.derived[i] = measurement[n + i]
             checks.mismatch[i] = checks.speed[i] = 0.0
             continue
-        change = share * (measurement[i] - checks.lagged[i])
-        checks.lagged[i] += change
-        checks.derived[i] = change / dt
-        checks.measured[i] += share * (measurement[n + i] - checks.measured[i])
+        if is_gap:
+            continue
+        change = (measurement[i] - checks.read_before[i]) / dt
+        velocity = 0.5 * (measurement[n + i] + checks.read_before[n + i])
+        checks.derived[i] += share * (change - checks.derived[i])
+        checks.measured[i] += share * (velocity - checks.measured[i])
         difference = checks.derived[i] - checks.measured[i]
         checks.mismatch[i] += slow * (difference * difference - checks.mismatch[i])
         larger = max(abs(checks.derived[i]), abs(checks.measured[i]))
