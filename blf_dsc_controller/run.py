@@ -55,6 +55,16 @@ class Stop(NamedTuple):
     """ns, of the last joint state before the next start; None: the end of the run"""
 
 
+class Contact(NamedTuple):
+    """Something that touched the arm."""
+
+    stamp: int  #: ns, of the joint state that showed it
+    joint: str  #: that showed it most
+    torque: float  #: N m, from outside, on this joint
+    interval: float  #: N m, up to which model and noise explain it
+    text: str = ''  #: sentence with the numbers
+
+
 ToolErrors = Callable[[Floats, Floats, Floats], Floats]
 """Returns errors and bounds at the tool (k, 4) for references, errors, bounds (k, n).
 
@@ -98,7 +108,9 @@ class Run:
     monitor: Series | None = None  #: estimates and what else the law says of its state
     truth: Series | None = None
     timing: Series | None = None
+    external: Series | None = None  #: N m, torque from outside and `topics.INTERVAL`
     stops: tuple[Stop, ...] = ()
+    contacts: tuple[Contact, ...] | None = None  #: None: nothing looked for any
     arm: LearnedArm | None = None  #: from a URDF
     learns: bool = True  #: whether the law uses the prediction error
     effort: Floats | None = None  #: (N, n) N m, as measured
@@ -132,4 +144,12 @@ class Run:
     @property
     def timed_stops(self) -> list[tuple[float, Stop]]:
         """Stops with their times [s]."""
-        return [((stop.stamp - int(self.stamp[0])) * 1e-9, stop) for stop in self.stops]
+        return [(self._seconds(stop.stamp), stop) for stop in self.stops]
+
+    @property
+    def timed_contacts(self) -> list[tuple[float, Contact]]:
+        """Contacts with their times [s]."""
+        return [(self._seconds(each.stamp), each) for each in self.contacts or ()]
+
+    def _seconds(self, stamp: int) -> float:
+        return (stamp - int(self.stamp[0])) * 1e-9

@@ -8,8 +8,11 @@ import pytest
 from paper_case import configured
 from random_arm import PANDA
 
+from blf_dsc_controller.analysis.metrics import format_table, measure
+from blf_dsc_controller.analysis.panels import panels
+from blf_dsc_controller.analysis.report import read_bag, write_report
 from blf_dsc_controller.arms.urdf import frames
-from blf_dsc_controller.bags.reader import read_run
+from blf_dsc_controller.bags.reader import read_run, table
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.schema import build
 from blf_dsc_controller.control.arm_controller import ArmController
@@ -101,6 +104,8 @@ def test_interval_is_wide_before_the_first_window_and_narrow_after(free):
 
 def test_no_torque_depends_on_it(free):
     without = run_of(NOTHING, **{'contact.enabled': False})
+    assert without.run().contacts is None
+    assert 'contacts' not in format_table(measure(without.run()))
     np.testing.assert_array_equal(columns(free)[0].torque, columns(without)[0].torque)
     assert columns(without)[0].external.shape[1] == 0
 
@@ -216,6 +221,36 @@ def test_arm_that_holds_takes_no_targets_until_a_trajectory_leads_away():
     assert guard.supervisor.phase is not Phase.SAFE_STOP
     guard.reset()
     assert not guard.holds
+
+
+def test_run_and_its_bag_say_what_touched_the_arm(tmp_path, held, free):
+    """In table, page and export; the arm's estimates are shown as without contacts."""
+    write_bag(tmp_path / 'bag', held)
+    bag = read_bag(tmp_path / 'bag')
+    for run in (held.run(), bag.run):
+        ((time, contact),) = run.timed_contacts
+        assert TOUCHED < time < TOUCHED + 0.06
+        assert contact.joint in PANDA
+        assert abs(contact.torque) > contact.interval
+        metrics = measure(run)
+        (found,) = metrics.contacts
+        assert (found['time'], found['joint']) == (time, contact.joint)
+        line = f'contacts    1: at {time:.3f} s {contact.torque:+.3g} N m on {contact.joint}'
+        assert line in format_table(metrics)
+        assert metrics.final_parameter_error < 0.01
+        shown = {panel.title: panel for panel in panels([run])}
+        panel = shown[f'torque from outside on {contact.joint}']
+        torque, interval = panel.lines
+        k = int(np.argmin(np.abs(torque.time - TOUCHED - 0.3)))
+        assert abs(torque.values[k]) > interval.values[k]
+        assert [mark.time for mark in panel.marks if 'contact' in mark.text] == [time]
+    assert (time, 'contact', contact.text) in bag.events
+    write_report([bag], tmp_path / 'report.html')
+    assert contact.text.split(':')[0] in (tmp_path / 'report.html').read_text()
+    columns_of_table = table(bag.run, slice(1))
+    assert f'external {contact.joint} [N m]' in columns_of_table
+    assert 'monitor contact [1]' in columns_of_table
+    assert 'contacts    0\n' in format_table(measure(free.run())) + '\n'
 
 
 def test_replay_repeats_it_bit_for_bit(tmp_path, held):

@@ -23,9 +23,10 @@ pytest.importorskip('rclpy', reason='needs ROS 2')
 pytest.importorskip('yourdfpy', reason='needs viser: pip install .[view]')
 
 from command import COMMAND, wait_for
+from diagnostic_msgs.msg import DiagnosticStatus
 from rclpy.parameter import Parameter
 from rclpy.serialization import serialize_message
-from ros_rig import activate, configure
+from ros_rig import activate, configure, values
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
@@ -34,6 +35,7 @@ from blf_dsc_controller.arms.urdf import frames, read_chain
 from blf_dsc_controller.bags.reader import read_run
 from blf_dsc_controller.cli.main import INTERRUPTED, main
 from blf_dsc_controller.configuration.controller import ControllerConfig
+from blf_dsc_controller.configuration.schema import build
 from blf_dsc_controller.errors import BlfDscError, MissingExtraError
 from blf_dsc_controller.messages import topics
 from blf_dsc_controller.view import page as pages
@@ -121,6 +123,29 @@ def test_events_are_lines_in_the_plots_and_named_at_the_arm(page):
         assert np.isfinite(plot.data).all()
     assert node(page, '/event').text == 'plant: 2 kg picked up'
     assert '2 kg picked up' in page._list.content
+
+
+def test_contact_is_marked_at_its_joint_with_torque_and_interval(page):
+    past = moving(2.0)
+    felt = {'external': np.array([0.1, -2.0]), 'interval': np.array([0.5, 0.4])}
+    touched = past[-1]._replace(**felt, touched=True)
+    page.draw_arm(build(ControllerConfig, {'contact.enabled': True}), {})
+    page.move([*past, touched])
+    mark, text = node(page, '/contact'), node(page, '/contact/text')
+    assert mark.visible
+    first = past[-1].position[0]  # the second joint is at the end of the first link
+    elbow = np.array([np.cos(first), 0.0, np.sin(first)])
+    np.testing.assert_allclose(mark.position, elbow, atol=1e-6)
+    assert text.text == '-2 N m from outside on joint2, +-0.4 N m explained'
+    shown = [each._replace(**felt) for each in past]
+    page.plot([*shown, touched])
+    assert text.text in page._caption.content
+    assert (page._plots[2].data[1][-1], page._plots[2].data[2][-1]) == (0.1, -2.0)
+    page.move(shown)
+    page.plot(shown)
+    assert not node(page, '/contact').visible
+    assert 'outside' not in page._caption.content
+    page.draw_arm(ControllerConfig(), {})
 
 
 def test_payloads_and_other_events_of_a_plant_are_listed():
@@ -271,6 +296,47 @@ def test_page_shows_the_loop_its_events_and_that_its_controller_is_gone(ros):
     state.header.stamp.sec = view._sampled // 10**9 + 2
     ros.until(lambda: states.publish(state) or view.past[-1].position[0] == 0.1)
     assert np.isnan(view.past[-1].error).all()
+    view.close()
+
+
+def test_contact_is_on_the_page_and_in_diagnostics(ros):
+    """4 N at 8 s, once the arm has been learned."""
+    view = ros.add(ViewNode, port=18280)
+    said = ros.listen(topics.DIAGNOSTICS)
+
+    def contact_status():
+        found = [each for message in said for each in message.status]
+        return [each for each in found if each.name.endswith('/contact')][-1]
+
+    push = {'events.begin': [8.0], 'events.duration': [60.0], 'events.payload': [0.0]}
+    force = {'events.force': [4.0, 0.0, 0.0]}
+    arm, _ = ros.loop({**push, **force, 'autostart': False}, {'contact.enabled': True})
+    ros.until(lambda: view._config)
+    assert configure(ros, arm)
+    assert activate(ros, arm)
+    ros.until(lambda: view.past and view.past[-1].time > 7.5)
+    assert view.past[-1].felt_at is None
+    assert np.isfinite(view.past[-1].external).all()
+    assert contact_status().message == 'nothing touches the arm'
+    assert values(contact_status())['contacts'] == '0'
+    ros.until(lambda: view.past[-1].touched)
+    now = view.past[-1]
+    assert now.felt_at == 0
+    assert abs(now.external[0]) > now.interval[0]
+    ros.until(lambda: contact_status().level == DiagnosticStatus.WARN)
+    status = contact_status()
+    assert 'something touches the arm' in status.message
+    details = values(status)
+    assert details['contacts'] == '1'
+    assert details['joint'] == 'joint1'
+    at, torque = (
+        float(details[name].removeprefix('at ').split()[0])
+        for name in ('last contact', 'torque from outside')
+    )
+    assert 8.0 < at < 8.1
+    assert abs(torque) > float(details['explained by model and noise'].split()[0])
+    (event,) = events_with(view, 'N m from outside on joint1')
+    assert event[:2] == (pytest.approx(at, abs=1e-3), 'contact')
     view.close()
 
 

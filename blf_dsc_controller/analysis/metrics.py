@@ -21,6 +21,7 @@ from blf_dsc_controller.messages.journal import OUTSIDE_BOUND
 from blf_dsc_controller.messages.topics import (
     COLUMNS,
     COMPUTE_TIME,
+    CONTACT,
     DISTANCE,
     DISTURBANCE,
     LAMBDA_MIN,
@@ -42,6 +43,7 @@ MOMENTS = (5, 10, 20, 40, 60)
 
 _LEARNED = 0.01
 _SHOWN_SINGLY = 8  # estimates that are shown one by one
+_SHOWN_CONTACTS = 3
 _POSTURES = 400  # of the reference, at which torques are compared
 _TAIL = 10.0  # s
 _MAX_SAMPLES = 100_000  # samples of the estimates, evenly spaced
@@ -58,7 +60,7 @@ _TABLE = {  # title: metric, unit, factor, decimals
 }
 _NO_PARAMETERS = (
     *(*COLUMNS, DISTURBANCE, POSITION, VELOCITY, RATIO, DISTANCE, *LOAD, LYAPUNOV),
-    *(LAMBDA_MIN, LATCHED, MODEL_CHANGES, *TOOL, COMPUTE_TIME),
+    *(LAMBDA_MIN, LATCHED, MODEL_CHANGES, *CONTACT, *TOOL, COMPUTE_TIME),
 )
 
 
@@ -306,6 +308,8 @@ class Metrics:
     first_violation: float  #: s
     violating_joint: str
     stops: list[dict[str, Any]]  #: `time` [s], `reason` and `text` of each
+    #: `time` [s], `joint`, `torque`, `interval` [N m] of each; None: nothing looked for any
+    contacts: list[dict[str, Any]] | None
     learns: bool  #: whether the law uses what it learns
     latch_time: float  #: s
     model_changes: list[float]  #: s, when the controller found that the arm had changed
@@ -359,6 +363,7 @@ def measure(run: Run) -> Metrics:
             {'time': time, 'reason': stop.reason, 'text': stop.text}
             for time, stop in run.timed_stops
         ],
+        contacts=_contacts(run),
         learns=run.learns,
         latch_time=latch_time(run),
         model_changes=change_times(run),
@@ -387,6 +392,15 @@ def _learning(of: Estimates) -> dict[str, Any]:
         'tail_parameter_error': rms(error[at >= at[-1] - _TAIL]),
         'time_to_1_percent': _settled(at, error),
     }
+
+
+def _contacts(run: Run) -> list[dict[str, Any]] | None:
+    if run.contacts is None:
+        return None
+    found = [{'time': time, **each._asdict()} for time, each in run.timed_contacts]
+    for each in found:
+        del each['stamp'], each['text']
+    return found
 
 
 def _loads(run: Run) -> list[dict[str, float]]:
@@ -545,6 +559,8 @@ def _sentences(of: Metrics) -> Iterator[str]:
         yield f'tool        {tool_text(of.tool)}'
     for stop in of.stops:
         yield f'stopped     at {stop["time"]:.3f} s, {stop["reason"]}: {stop["text"]}'
+    if of.contacts is not None:
+        yield f'contacts    {contacts_text(of.contacts)}'
     if of.estimate is not None:
         yield from _learning_lines(of)
     for load in of.loads:
@@ -569,6 +585,17 @@ def tool_text(tool: Mapping[str, float]) -> str:
     mrad = f'turned {1e3 * tool["angle"]:.3g} mrad, {1e3 * tool["angle_bound"]:.3g} mrad certified'
     share = f'{100.0 * tool["ratio"]:.3g} % and {100.0 * tool["angle_ratio"]:.3g} % of the bounds'
     return f'{mm}; {mrad}; at most {share}'
+
+
+def contacts_text(contacts: Sequence[Mapping[str, Any]]) -> str:
+    """Return `Metrics.contacts` in words."""
+    first = '; '.join(
+        f'at {each["time"]:.3f} s {each["torque"]:+.3g} N m on {each["joint"]}, where model '
+        f'and noise explain {each["interval"]:.2g} N m'
+        for each in contacts[:_SHOWN_CONTACTS]
+    )
+    more = len(contacts) - _SHOWN_CONTACTS
+    return f'{len(contacts)}{": " * bool(first)}{first}' + f'; {more} more' * (more > 0)
 
 
 def _learning_lines(of: Metrics) -> Iterator[str]:

@@ -27,6 +27,7 @@ from blf_dsc_controller.analysis.metrics import (
 )
 from blf_dsc_controller.messages.topics import (
     DISTURBANCE,
+    INTERVAL,
     LAMBDA_MIN,
     LYAPUNOV,
     LYAPUNOV_TERMS,
@@ -46,14 +47,15 @@ GROUPS = (
     'Motion',
     'Tracking',
     'Torque',
+    'Contact',
     'Parameters',
     'Disturbance',
     'Excitation',
     'Monitors',
 )
-_STOPPED = GROUPS[:3]
+_STOPPED = GROUPS[:4]
 _CHANGED = ('Tracking', 'Parameters')
-_LEARNING = GROUPS[3:]
+_LEARNING = GROUPS[4:]
 _LEAST = 1e-12  # J, the smallest value on a logarithmic axis
 _AXIS_MARGIN = 1.2  # limit of an axis as a multiple of the largest value
 _LEAST_ERROR = 1e-5  # %
@@ -115,7 +117,8 @@ def panels(runs: Sequence[Run], begin: float = -inf, end: float = inf) -> list[P
         changes = true_change_times(run)
         changed = dict.fromkeys(_CHANGED, 'the arm changes')
         stops = list(_stops(run))
-        for panel in chain(_motion(run), _learning(run), _monitors(run)):
+        shown = chain(_motion(run), _contact(run), _learning(run), _monitors(run))
+        for panel in shown:
             marks = latch if panel.group in _LEARNING else panel.marks
             marks = (*marks, *(stops if panel.group in _STOPPED else ()))
             if panel.group in _CHANGED:
@@ -138,8 +141,8 @@ def panels(runs: Sequence[Run], begin: float = -inf, end: float = inf) -> list[P
                 note=panel.note if len(runs) == 1 else '',
                 span=panel.span if len(runs) == 1 else 0.0,
             )
-    shown = [panel for panel in found.values() if panel.lines]
-    return sorted(shown, key=lambda panel: GROUPS.index(panel.group))
+    drawn = [panel for panel in found.values() if panel.lines]
+    return sorted(drawn, key=lambda panel: GROUPS.index(panel.group))
 
 
 def _drawn(line: Line, begin: float, end: float) -> Line:
@@ -231,6 +234,27 @@ def _tool(run: Run, t: Floats) -> Iterator[Panel]:
         ]
         note = '' if np.isnan(error).all() else f'max {np.nanmax(error):.3g}'
         yield Panel('Tracking', f'{title} at the tool', unit, lines, note)
+
+
+def _contact(run: Run) -> Iterator[Panel]:
+    """Yield the torque from outside on each joint, what explains it, and the contacts."""
+    if run.external is None:
+        return
+    t = run.time_of(run.external.stamp)
+    marks = tuple(
+        Mark(time, f'contact: {contact.joint}', ORANGE)
+        for time, contact in run.timed_contacts
+    )
+    for joint in run.joints:
+        torque = run.external.column(joint)
+        interval = run.external.column(joint + INTERVAL)
+        lines = [
+            Line('torque', t, torque),
+            Line('model and noise', t, interval, MUTED, True, True, True),  # noqa: FBT003
+        ]
+        note = '' if np.isnan(torque).all() else f'peak {np.nanmax(np.abs(torque)):.3g}'
+        title = f'torque from outside on {joint}'
+        yield Panel('Contact', title, 'N m', lines, note, marks=marks)
 
 
 def _error(run: Run, t: Floats, i: int, error: Floats) -> Panel:

@@ -18,8 +18,16 @@ from blf_dsc_controller.bags.topic_messages import JointStates, TopicMessages, V
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.extras import import_extra
 from blf_dsc_controller.messages import topics
-from blf_dsc_controller.messages.journal import Event, EventType
-from blf_dsc_controller.run import LearnedArm, Run, Series, Stop, ToolErrors
+from blf_dsc_controller.messages.codecs import JOINT_STATE_FIELDS
+from blf_dsc_controller.messages.journal import Event, EventType, contact_in
+from blf_dsc_controller.run import (
+    Contact,
+    LearnedArm,
+    Run,
+    Series,
+    Stop,
+    ToolErrors,
+)
 
 _MOST_FALLS = 10  # of the stamps, by resets of a simulator
 _ALTERNATING = 0.9  # ratio of the intervals to and from the state of another publisher
@@ -47,6 +55,11 @@ _VALUES = {  # prefix of names in the vectors: unit
         (topics.RATIO, topics.LATCHED, topics.MODEL_CHANGES, topics.LATE_STEPS), '1'
     ),
     **dict.fromkeys((topics.COMPUTE_TIME, topics.LATENCY, topics.LATENESS), 's'),
+    **dict.fromkeys(topics.CONTACT, '1'),
+    **dict.fromkeys(topics.TOOL[:2], 'm'),
+    **dict.fromkeys(topics.TOOL[2:], 'rad'),
+    'load mass': 'kg',
+    'load ': 'm',
 }
 _ROWS = 1 << 14
 _PARAMETER = 'kg m^2'  # of arms without a URDF
@@ -79,23 +92,24 @@ def recorded_run(
         notes = *notes, f'recorded parameters that this version does not have: {names}'
     stamp = states.stamp
 
-    def within(topic: topics.Topic, names: Sequence[str] = ()) -> JointStates | None:
+    def within(
+        topic: topics.Topic, names: Sequence[str] = (), required: str = 'position'
+    ) -> JointStates | None:
         """Return a topic's messages in the run, by stamp; None if there are none."""
         messages = content.topics.get(topic)
         if messages is None:
             return None
-        found = messages.joint_states(names or messages.joint_names(), ('position',))
+        found = messages.joint_states(names or messages.joint_names(), (required,))
         received = found.received
         inside = (received >= span[0]) & (received < span[1])
         return found.select(np.flatnonzero(inside)).by_stamp() if inside.any() else None
 
-    def series(topic: topics.Topic) -> Series | None:
-        found = within(topic)
-        return (
-            None
-            if found is None
-            else Series(found.names, found.stamp, loaded(found.field(0)))
-        )
+    def series(topic: topics.Topic, kind: str = 'position') -> Series | None:
+        found = within(topic, required=kind)
+        if found is None:
+            return None
+        values = loaded(found.field(JOINT_STATE_FIELDS.index(kind)))
+        return Series(found.names, found.stamp, values)
 
     errors, references, bounds = (
         within(topic, joints)
@@ -131,7 +145,9 @@ def recorded_run(
         monitor=series(topics.MONITOR),
         truth=series(topics.TRUTH),
         timing=series(topics.TIMING),
+        external=series(topics.EXTERNAL_TORQUE, 'effort'),
         stops=tuple(_stops(events, int(stamp[0]))),
+        contacts=_contacts(content, events),
         arm=_arm(content),
         tool=_tool(content),
         learns=_learns([event.content.get('parameters', {}) for event in events]),
@@ -248,6 +264,16 @@ def _stops(events: Iterable[Event], first: int) -> Iterator[Stop]:
             )
 
 
+def _contacts(content: Content, events: Iterable[Event]) -> tuple[Contact, ...] | None:
+    """Return the contacts in the journal; None if nothing looked for any."""
+    given = content.configurations.get(topics.CONTROLLER, {})
+    if not given.get('contact.enabled'):
+        return None
+    return tuple(
+        contact_in(event) for event in events if event.type is EventType.CONTACT
+    )
+
+
 def _learns(settings: Sequence[Mapping[str, Any]]) -> bool:
     """Return whether the law ever used the prediction error; true if the journal does not say."""
     laws = {values['law'] for values in settings if 'law' in values}
@@ -327,7 +353,7 @@ def table(run: Run, rows: slice = slice(None)) -> dict[str, NDArray[Any]]:
 
     They are aligned to the stamps of its joint states. `stamp` and `received` are integers, all
     others floats, NaN where unknown, as is the reference's velocity between its messages. Named
-    values (monitor, truth, timing) are held until the next message.
+    values (monitor, external, truth, timing) are held until the next message.
     """
     stamp = run.stamp[rows]
     columns: dict[str, NDArray[Any]] = {
@@ -340,11 +366,12 @@ def table(run: Run, rows: slice = slice(None)) -> dict[str, NDArray[Any]]:
         if values is not None:
             for joint, column in zip(run.joints, values[rows].T, strict=True):
                 columns[f'{field} {joint} [{unit}]'] = column
-    for topic in ('monitor', 'truth', 'timing'):
+    for topic in ('monitor', 'external', 'truth', 'timing'):
         series = getattr(run, topic)
         if series is not None:
             for name, column in zip(series.names, series.held(stamp).T, strict=True):
-                columns[f'{topic} {name} [{_unit(name, run)}]'] = column
+                unit = 'N m' if topic == 'external' else _unit(name, run)
+                columns[f'{topic} {name} [{unit}]'] = column
     return columns
 
 

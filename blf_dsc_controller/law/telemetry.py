@@ -71,6 +71,11 @@ def disturbance_names(joints: Sequence[str]) -> tuple[str, ...]:
     return tuple(topics.DISTURBANCE + joint for joint in joints)
 
 
+def external_names(joints: Sequence[str]) -> tuple[str, ...]:
+    """Return the names of the torques from outside, and of half of their 95 % intervals."""
+    return *joints, *(joint + topics.INTERVAL for joint in joints)
+
+
 class ControllerTelemetry:
     """Messages of the controller of n joints; `estimates` are the names of theta^ (m,).
 
@@ -172,8 +177,7 @@ class ExternalTelemetry:
 
     def __init__(self, config: ControllerConfig) -> None:
         joints = config.joints
-        names = (*joints, *(joint + topics.INTERVAL for joint in joints))
-        self._torque = JointStateEncoder(names, ('effort',))
+        self._torque = JointStateEncoder(external_names(joints), ('effort',))
         self._wrench = None
         if config.model == 'urdf' and config.robot.tip:
             self._wrench = WrenchEncoder(config.robot.tip)
@@ -293,6 +297,10 @@ def run_of(
     used = ~np.isnan(samples.qr[:, 0])
     position, velocity, _ = np.split(measurements, 3, axis=1)
     tool = tool_of(config)
+    external = None
+    if config.contact.enabled:
+        values = np.hstack((samples.external[used], samples.external_interval[used]))
+        external = Series(external_names(config.joints), stamps[used], values)
     parts = monitored(config, estimate_names(config))
     monitor = np.hstack([getattr(samples, part)[used] for part in parts])
     return Run(
@@ -309,6 +317,7 @@ def run_of(
         monitor=Series(
             tuple(chain.from_iterable(parts.values())), stamps[used], monitor
         ),
+        external=external,
         arm=learned_arm(config),
         tool=tool.errors if tool else None,
         learns=config.law == 'blf_dsc' and config.learning.weight > 0.0,

@@ -144,7 +144,13 @@ SCHEMA: Mapping[str, Mapping[str, Field]] = {
         'mass': Field(NUMBER),  # kg
         'centre': Field(NUMBERS),  # m
     },
-    'contact': {'reaction': Field(TEXT), 'text': Field(TEXT)},
+    'contact': {
+        'reaction': Field(TEXT),
+        'joint': Field(TEXT),  # that shows it most
+        'torque': Field(NUMBER),  # N m, from outside, on this joint
+        'interval': Field(NUMBER),  # N m, up to which model and noise explain it
+        'text': Field(TEXT),
+    },
     'stop': {'reason': Field(TEXT), 'text': Field(TEXT)},
     'silence': {'torques': Field(COUNT)},  # by the watchdog, before the next message
     'deactivate': {},

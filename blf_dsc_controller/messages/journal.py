@@ -18,6 +18,7 @@ from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.messages.codecs import typestore
 from blf_dsc_controller.messages.event_content import FORMAT, check_event
 from blf_dsc_controller.messages.topics import JOURNAL
+from blf_dsc_controller.run import Contact
 
 OUTSIDE_BOUND = 'error past the bound'
 """Reason for a stop: the error left its bound."""
@@ -95,6 +96,18 @@ class Event(NamedTuple):
         is_encoded = isinstance(content, EncodedContent)
         text = content.text if is_encoded else json.dumps(content)
         return _message(f'{json.dumps(fields)[:-1]}, "content": {text}}}')
+
+
+def contact_in(event: Event) -> Contact:
+    """Return the contact of such an event."""
+    content = event.content
+    return Contact(
+        event.stamp,
+        content['joint'],
+        content['torque'],
+        content['interval'],
+        content['text'],
+    )
 
 
 def encode_change(

@@ -423,9 +423,9 @@ class ControllerNode(LoopNode[ControllerConfig]):
 
     def _log_phase(self, guard: Guard) -> None:
         supervisor = guard.supervisor
-        if guard.contacts != self._contacts:
+        if guard.contact is not None and guard.contacts != self._contacts:
             self._contacts = guard.contacts
-            self.get_logger().warning(guard.contact)
+            self.get_logger().warning(guard.contact.text)
         is_stopped = supervisor.phase is Phase.SAFE_STOP  # its text may grow
         text = supervisor.text if is_stopped else ''
         now = supervisor.phase, supervisor.stops, guard.silenced, text

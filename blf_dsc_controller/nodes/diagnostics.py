@@ -14,6 +14,7 @@ import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rclpy.node import Node
 
+from blf_dsc_controller.law.external_torque import DISTANCE
 from blf_dsc_controller.law.telemetry import load_text
 from blf_dsc_controller.messages import topics
 from blf_dsc_controller.messages.journal import MOTIONS, EventType
@@ -116,6 +117,8 @@ class ControllerStatus:
             parts += [self._loop(guard, others, missing), self._learning(guard)]
             if guard.controller.settings.weighed:
                 parts.append(_load(guard))
+            if guard.config.contact.enabled:
+                parts.append(_contact(guard))
         state = self._diagnostics.publish(*parts)
         now = lifecycle, guard.supervisor.revision if guard else -1
         if now != self._published:
@@ -218,6 +221,28 @@ def _load(guard: Guard) -> Part:
     load = guard.controller.sample.load.tolist()
     values = {name: f'{value:.6g}' for name, value in zip(LOAD, load, strict=True)}
     return 'load', OK, f'held: {load_text(load)}', values
+
+
+def _contact(guard: Guard) -> Part:
+    """Return whether something touches the arm, and what did last."""
+    last = guard.contact
+    values: dict[str, Any] = {
+        'contacts': guard.contacts,
+        'distance': f'{guard.controller.sample.contact[DISTANCE]:.3g}',
+        'threshold': f'{guard.config.contact.threshold:g}',
+    }
+    if last is not None:
+        values |= {
+            'last contact': f'at {(last.stamp - guard.start_stamp) * 1e-9:.3f} s',
+            'joint': last.joint,
+            'torque from outside': f'{last.torque:+.3g} N m',
+            'explained by model and noise': f'{last.interval:.3g} N m',
+        }
+    if not guard.supervisor.running:
+        return 'contact', OK, 'not looked for: the law is not in command', values
+    if last is not None and guard.controller.state.contact[0] > 0.0:
+        return 'contact', WARN, last.text, values
+    return 'contact', OK, 'nothing touches the arm', values
 
 
 def _by_joint(guard: Guard, counts: np.ndarray) -> str:

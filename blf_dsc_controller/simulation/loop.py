@@ -50,7 +50,12 @@ from blf_dsc_controller.law.telemetry import (
 )
 from blf_dsc_controller.law.weighing import add_row
 from blf_dsc_controller.messages import topics
-from blf_dsc_controller.messages.journal import EventType, Journal, encode_change
+from blf_dsc_controller.messages.journal import (
+    EventType,
+    Journal,
+    contact_in,
+    encode_change,
+)
 from blf_dsc_controller.run import Run, Series, Stop
 from blf_dsc_controller.supervision.guard import Guard
 from sim_plant import kernels as plants
@@ -312,10 +317,16 @@ class Record:
         run = run_of(
             config, self.controller, self.stamps, self.measurements, self.samples
         )
+        contacts = tuple(
+            contact_in(event)._replace(stamp=event.stamp - START)
+            for event in self.journal.pending
+            if event.type is EventType.CONTACT
+        )
         true = (*self.parameters, *disturbance_names(config.joints))
         return replace(
             run,
             truth=Series(true, self.stamps, self.truths[:, : len(true)]),
+            contacts=contacts if config.contact.enabled else None,
             stops=tuple(
                 Stop(
                     event.stamp - START,

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a contact is called in events, logs and stops."""
+"""A contact as events, logs, stops and diagnostics have it."""
 
 from __future__ import annotations
 
@@ -8,16 +8,19 @@ import numpy as np
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.law.controller import Controller
 from blf_dsc_controller.law.external_torque import DISTANCE
+from blf_dsc_controller.run import Contact
 
 
-def contact_text(controller: Controller, config: ControllerConfig) -> str:
-    """Return what the last sample shows of a contact: the joint that shows it most."""
+def contact_of(controller: Controller, config: ControllerConfig, stamp: int) -> Contact:
+    """Return what the last sample, of a stamp [ns], shows of a contact."""
     sample = controller.sample
     worst = int(np.argmax(np.abs(sample.external) / sample.external_interval))
-    torque = sample.external[worst]
-    interval = sample.external_interval[worst]
-    return (
+    joint = config.joints[worst]
+    torque = float(sample.external[worst])
+    interval = float(sample.external_interval[worst])
+    text = (
         f'something touches the arm: {torque:+.3g} N m from outside on joint '
-        f'{config.joints[worst]!r}, where model and noise explain {interval:.3g} N m '
+        f'{joint!r}, where model and noise explain {interval:.3g} N m '
         f'(distance {sample.contact[DISTANCE]:.3g}, threshold {config.contact.threshold:g})'
     )
+    return Contact(stamp, joint, torque, interval, text)

@@ -47,8 +47,9 @@ from blf_dsc_controller.reference.trajectory import (
     Trajectory,
     plan_trajectory,
 )
+from blf_dsc_controller.run import Contact
 from blf_dsc_controller.supervision import retuning
-from blf_dsc_controller.supervision.contact import contact_text
+from blf_dsc_controller.supervision.contact import contact_of
 from blf_dsc_controller.supervision.drive_load import DriveLoad, DriveLoads
 from blf_dsc_controller.supervision.first_torque import (
     check_first_torque,
@@ -122,7 +123,7 @@ class Guard:
         has_sample: whether the law used the last message, so that there is new telemetry.
         start_error: why the law could not start; None if it could.
         waiting_for: what is wrong with the last state that the law could not start from; or empty.
-        contact: what touched the arm last, in words; or empty.
+        contact: what touched the arm last; None: nothing so far.
         contacts: contacts so far.
         holds: whether the reference rests since then, until the next trajectory.
         silenced: whether nothing is commanded until the next reset or activation.
@@ -151,7 +152,8 @@ class Guard:
         self.journal = Journal()
         self.has_sample = False
         self.start_error: BlfDscError | None = None
-        self.waiting_for = self.contact = ''
+        self.waiting_for = ''
+        self.contact: Contact | None = None
         self.contacts = 0
         self.silenced = self.holds = False
         self.foreign = 0
@@ -312,16 +314,20 @@ class Guard:
     def _react(self) -> None:
         """Do what `contact.reaction` wants when something touches the arm."""
         reaction = self.config.contact.reaction
-        self.contact = contact_text(self.controller, self.config)
+        contact = contact_of(self.controller, self.config, self.last_stamp)
+        self.contact = contact
         self.contacts += 1
-        self._note(EventType.CONTACT, reaction=reaction, text=self.contact)
+        text = contact.text
+        content = contact._asdict()
+        del content['stamp']
+        self._note(EventType.CONTACT, reaction=reaction, **content)
         if reaction == 'hold':
             before = self.controller.reference_vector
             self._follow(plan_stop(before, self.time, self.config).vector)
             self.holds = True
-            self.supervisor.add(f'{self.contact}: it holds where it can brake')
+            self.supervisor.add(f'{text}: it holds where it can brake')
         elif reaction != 'none':
-            self._stop(Reason.CONTACT, self.contact)
+            self._stop(Reason.CONTACT, text)
             if reaction == 'yield':
                 self._safe_torque.yield_to_contact()
 
@@ -651,7 +657,8 @@ class Guard:
         if isinstance(command, Target):
             if self.holds:
                 remedy = 'send a trajectory that leads away from it, or call reset'
-                raise TrajectoryError([f'{self.contact}, and it holds: {remedy}'])
+                why = self.contact.text if self.contact else ''
+                raise TrajectoryError([f'{why}, and it holds: {remedy}'])
             self._note(EventType.TARGET, **planned.content)
             self._follow(planned.motion.vector)
             return

@@ -23,13 +23,19 @@ from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.nodes import VIEW, ViewConfig
 from blf_dsc_controller.configuration.schema import build
 from blf_dsc_controller.law.factory import estimate_names
+from blf_dsc_controller.law.telemetry import external_names
 from blf_dsc_controller.messages import topics
 from blf_dsc_controller.messages.codecs import (
     JointStateDecoder,
     MessageError,
     joint_state_layout,
 )
-from blf_dsc_controller.messages.journal import Event, EventType, decode
+from blf_dsc_controller.messages.journal import (
+    Event,
+    EventType,
+    contact_in,
+    decode,
+)
 from blf_dsc_controller.messages.topics import Topic
 from blf_dsc_controller.nodes.endpoints import (
     RawSubscriptions,
@@ -40,7 +46,7 @@ from blf_dsc_controller.nodes.parameters import declare
 from blf_dsc_controller.nodes.process import PlainNode, run
 from blf_dsc_controller.run import Floats
 from blf_dsc_controller.view.model_error import ModelError
-from blf_dsc_controller.view.page import PAST, Page, Snapshot
+from blf_dsc_controller.view.page import PAST, Page, Snapshot, contact_text
 
 _PERIOD = 1.0 / 30.0  # s
 _PLOTTED = 6  # frames between updates of the plots
@@ -56,9 +62,16 @@ _STREAMS = (
     topics.BOUND,
     topics.MONITOR,
     topics.TRUTH,
+    topics.EXTERNAL_TORQUE,
 )
 _LATCHED = (topics.BOUND, topics.JOURNAL, topics.CHANGES, topics.STATE)
-_FIGURES = (*topics.TOOL, *topics.LOAD, topics.LAMBDA_MIN, topics.LATCHED)
+_FIGURES = (
+    *topics.TOOL,
+    *topics.LOAD,
+    topics.LAMBDA_MIN,
+    topics.CONTACT[0],
+    topics.LATCHED,
+)
 
 
 class ViewNode(PlainNode):
@@ -183,6 +196,9 @@ class ViewNode(PlainNode):
         details = [
             f'{content[k]}' for k in ('reason', 'text', 'parameters') if k in content
         ]
+        if event.type is EventType.CONTACT:
+            _, joint, torque, interval, _ = contact_in(event)
+            details = [contact_text(joint, torque, interval)]
         self._events.append(
             (self._time(event.stamp), event.type.value, ', '.join(details))
         )
@@ -201,7 +217,13 @@ class ViewNode(PlainNode):
     def _configure(self, config: ControllerConfig) -> None:
         self._config = config
         estimates = estimate_names(config)
-        names = *[config.joints] * 3, (*estimates, *_FIGURES), estimates
+        joints = config.joints
+        names = (
+            *[joints] * 3,
+            (*estimates, *_FIGURES),
+            estimates,
+            external_names(joints),
+        )
         self._names = dict(zip(_STREAMS, names, strict=True))
         self._values = {
             topic: np.full((3, len(of)), np.nan) for topic, of in self._names.items()
@@ -237,19 +259,18 @@ class ViewNode(PlainNode):
         if stamp is None:
             return False
         if stamp - self._sampled > _OUTDATED:  # the law is not running
-            self._values[topics.TRACKING_ERROR] = (
-                np.nan * self._values[topics.TRACKING_ERROR]
-            )
+            for topic in (topics.TRACKING_ERROR, topics.EXTERNAL_TORQUE):
+                self._values[topic] = np.nan * self._values[topic]
         self._keep(self._time(stamp))
         return True
 
     def _keep(self, time: float) -> None:
-        state, (xi1, _, tau), (k_c, *_), (monitor, *_), (truth, *_) = (
+        state, (xi1, _, tau), (k_c, *_), (monitor, *_), (truth, *_), (*_, external) = (
             self._values.values()
         )
         m = len(truth)
         tool = monitor[m : m + len(topics.TOOL)].tolist()
-        *load, lambda_min, latched = monitor[m + len(topics.TOOL) :].tolist()
+        *load, lambda_min, contact, latched = monitor[m + len(topics.TOOL) :].tolist()
         if latched != self._latched and np.isfinite(self._latched):
             text = (
                 'excited window latched' if latched else 'restarts: the arm has changed'
@@ -264,7 +285,9 @@ class ViewNode(PlainNode):
             time, state[0], state[1], monitor[:m], truth
         )
         learned = monitor[:m], truth, lambda_min, squares, load, loaded, tool
-        self.past.append(Snapshot(time, state[0], xi1, k_c, tau, *learned))
+        felt, interval = np.split(external, 2)
+        now = Snapshot(time, state[0], xi1, k_c, tau, *learned, felt, interval)
+        self.past.append(now._replace(touched=bool(contact > 0.0)))
         while self.past[0].time < time - PAST - 1.0:
             self.past.popleft()
         self._events += [

@@ -78,6 +78,16 @@ class Snapshot(NamedTuple):
     load: Sequence[float] = (np.nan,) * 8  # of topics.LOAD
     loaded: bool = False  # the true parameters differ from those at the start
     tool: Sequence[float] = (np.nan,) * 4  # of topics.TOOL
+    external: Floats = np.zeros(0)  # (n,) N m, from outside
+    interval: Floats = np.zeros(0)  # (n,) N m, what model and noise explain of it
+    touched: bool = False  # whether something touches the arm
+
+    @property
+    def felt_at(self) -> int | None:
+        """Number of the joint that shows most what touches the arm; None: nothing does."""
+        if not self.touched or not np.isfinite(self.external).all():
+            return None
+        return int(np.argmax(np.abs(self.external) / self.interval))
 
 
 def require_viser() -> None:
@@ -138,6 +148,7 @@ class Page:
         self._clear()
         self._arm = arm = arm_of(config, plant)
         self._joints = [joint.name for joint in arm.chain.joints]
+        self._feels = config.contact.enabled
         prefix, names = _shortened(self._joints)
         server = self.server
         gui = self.server.gui
@@ -159,6 +170,11 @@ class Page:
                     f'{prefix}: largest error in 1 s [% of bound]', names, log, 'bound'
                 ),
                 self._plot(f'{prefix}: torque [N m]', names),
+                *(
+                    [self._plot(f'{prefix}: torque from outside [N m]', names)]
+                    if self._feels
+                    else []
+                ),
                 self._plot(
                     'torque error of the model [%]', ('learned', 'initial'), _FROM_ZERO
                 ),
@@ -221,7 +237,9 @@ class Page:
             if self._corners is None:
                 self._corners = self._at(np.array(frames(chain, now.position)))
                 self._aim_all()
-            tip = self._at(frames(chain, now.position)[-1])
+            placements = self._at(np.array(frames(chain, now.position)))
+            tip = placements[-1]
+            self._mark_contact(now, placements[1:-1])
             reference = now.position - now.error
             self._ghost.show_visual = bool(np.abs(now.error).max() > _APART)  # NaN: not
             if np.isfinite(reference).all():
@@ -253,6 +271,27 @@ class Page:
                     thickness_units='screen',
                 )
 
+    def _mark_contact(self, now: Snapshot, joints: Floats) -> None:
+        """Mark the joint that feels something, of those at these places (n, 3) [m]."""
+        felt = now.felt_at
+        reach = self._arm.reach
+        k = felt or 0
+        scene = self.server.scene
+        scene.add_icosphere(
+            '/contact',
+            0.07 * reach,
+            color=(179, 0, 27),
+            opacity=0.6,
+            position=joints[k],
+            visible=felt is not None,
+        )
+        scene.add_label(
+            '/contact/text',
+            contact_of(self._joints, now),
+            position=(0.0, 0.0, 0.1 * reach),
+            visible=felt is not None,
+        )
+
     def plot(self, past: Sequence[Snapshot]) -> None:
         """Draw these snapshots in the plots, with a caption of the last one."""
         now = past[-1]
@@ -264,6 +303,7 @@ class Page:
             curves = (
                 np.vstack((_peaks(share), np.full(t.size, 100.0))),
                 of.torque.T,
+                *([np.array(of.external).T] if self._feels else []),
                 shares(of.squares, _PEAK),
                 weights(np.array(of.load)),
             )
@@ -271,7 +311,7 @@ class Page:
         with self.server.atomic():
             for plot, values in zip(self._plots, curves, strict=True):
                 plot.data = with_marks(t, values, marks)
-            self._caption.content = caption(now)
+            self._caption.content = caption(now, contact_of(self._joints, now))
 
     def _aim(self, camera: Any, width: float = inf) -> None:
         """Point a camera at the arm, which then fills a picture of this width [px]."""
@@ -347,15 +387,31 @@ def with_marks(t: Floats, curves: Floats, marks: Sequence[float]) -> tuple[Float
     )
 
 
-def caption(now: Snapshot) -> str:
-    """Return time, error at the tool, load and excitation as a line of the page."""
+def contact_text(joint: str, torque: float, interval: float) -> str:
+    """Return what a joint shows of a contact: torque from outside, and what explains it."""
+    return f'{torque:+.3g} N m from outside on {joint}, +-{interval:.2g} N m explained'
+
+
+def contact_of(joints: Sequence[str], now: Snapshot) -> str:
+    """Return what touches the arm; empty if nothing does."""
+    k = now.felt_at
+    if k is None:
+        return ''
+    return contact_text(joints[k], float(now.external[k]), float(now.interval[k]))
+
+
+def caption(now: Snapshot, contact: str = '') -> str:
+    """Return time, contact, error at the tool, load and excitation as a line of the page."""
     tool = ''
     if np.isfinite(now.tool[0]):
         error, bound = (1e3 * each for each in now.tool[:2])
         tool = f', tool {error:.2f} of {bound:.2f} mm'
     held = f', held: {load_text(now.load)}' if np.isfinite(now.load[0]) else ''
     excited = f', lambda_min {now.lambda_min:.2g}' if now.lambda_min > 0.0 else ''
-    return f'<div style="margin:4px">t = {now.time:.2f} s{tool}{held}{excited}</div>'
+    felt = f', <b style="color:{ALARM}">{escape(contact)}</b>' if contact else ''
+    return (
+        f'<div style="margin:4px">t = {now.time:.2f} s{felt}{tool}{held}{excited}</div>'
+    )
 
 
 def weights(load: Floats) -> Floats:
