@@ -8,7 +8,9 @@ untouched.
 from __future__ import annotations
 
 import re
+import resource
 import tracemalloc
+from threading import Event
 
 import pytest
 import yaml
@@ -27,6 +29,7 @@ from rosbags.rosbag2 import (
 )
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
+from blf_dsc_controller.bags.background_file import BackgroundFile
 from blf_dsc_controller.bags.recovery import recover
 from blf_dsc_controller.bags.sources import BagError, open_bag
 from blf_dsc_controller.bags.writer import BagWriter
@@ -37,6 +40,7 @@ from blf_dsc_controller.messages.codecs import (
     UnknownTypeError,
     typestore,
 )
+from blf_dsc_controller.messages.journal import encode_string
 from blf_dsc_controller.messages.topics import COMMANDS, JOINT_STATES, STREAM, Quality
 
 START = 1_734_000_000_000_000_000
@@ -483,3 +487,68 @@ def test_bag_from_rosbags_writer_is_recovered(tmp_path, mode):
     (file,) = (tmp_path / 'bag').glob('*.mcap')
     messages, _ = recovered(tmp_path / 'cut', file.read_bytes()[:-1])
     assert messages == read(tmp_path / 'bag')
+
+
+class Stuck:
+    """A disk that takes nothing until it is told to."""
+
+    def __init__(self, file):
+        self._file = file
+        self.goes_on = Event()
+
+    def write(self, data):
+        self.goes_on.wait(60.0)
+        return self._file.write(data[:1000])  # in pieces, as a disk may
+
+    def close(self):
+        self._file.close()
+
+
+def test_a_loop_does_not_wait_for_a_disk_that_does_not_write(tmp_path):
+    file = BackgroundFile(tmp_path / 'file', most=5000)
+    disk = file._file = Stuck(file._file)
+    pieces = [bytes([k]) * 100 * k for k in range(10)]
+    for piece in pieces:
+        assert file.write(piece) == len(piece)
+        file.flush()
+    assert file.tell() == 4500
+    file.write(bytes(501))
+    with pytest.raises(BagError, match='the disk, which is too slow'):
+        file.flush()
+    file.write(b'nothing is written from now on')
+    disk.goes_on.set()
+    file.close()
+    assert (tmp_path / 'file').read_bytes() == b''.join(pieces)
+
+
+def test_an_error_of_the_disk_is_raised_once_by_a_later_call(tmp_path):
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    file = BackgroundFile(tmp_path / 'file')
+
+    def write_on():
+        while True:
+            file.write(bytes(600))
+            file.flush()
+
+    try:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (1000, hard))
+        with pytest.raises(OSError, match='too large'):
+            write_on()
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    file.write(b'')
+    file.close()
+
+
+@pytest.mark.parametrize('in_background', [False, True])
+def test_bag_is_the_same_whichever_thread_writes_it(tmp_path, in_background):
+    stamps = range(1, 2000)
+    with BagWriter(
+        tmp_path / 'bag', flush_interval=0.0, in_background=in_background
+    ) as bag:
+        handle = bag.add_topic('/x', 'std_msgs/msg/String', [Quality(1)])
+        for stamp in stamps:
+            bag.write(handle, encode_string(f'{stamp}'), stamp)
+    with (tmp_path / 'bag' / 'bag_0.mcap').open('rb') as file:
+        found = [message.log_time for *_, message in make_reader(file).iter_messages()]
+    assert found == list(stamps)

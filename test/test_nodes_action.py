@@ -347,7 +347,7 @@ def by_a_goal(_law, client):
 
 def by_the_topic(law, _client, q=NEAR):
     sent = JointTrajectory(joint_names=JOINTS, points=[point(q, 1.0)])
-    law._status.trajectories._on_trajectory(serialize_message(sent))
+    law._status.trajectories.take_trajectory(serialize_message(sent))
 
 
 def by_stop(_law, client):

@@ -61,11 +61,11 @@ def sway(t):
 
 
 def positions_of(law, k, period):
-    inputs(law)._on_positions(positions(sway(k * period)))
+    inputs(law).take_positions(positions(sway(k * period)))
 
 
 def points_of(law, k, period):
-    inputs(law)._on_trajectory(trajectory(point(sway(k * period), period)))
+    inputs(law).take_trajectory(trajectory(point(sway(k * period), period)))
 
 
 def chunks_of(law, k, period):
@@ -73,7 +73,7 @@ def chunks_of(law, k, period):
     if k % 5 == 0:
         times = (k + 1 + np.arange(10)) * period
         chunk = [point(sway(t), t - k * period) for t in times]
-        inputs(law)._on_trajectory(trajectory(*chunk))
+        inputs(law).take_trajectory(trajectory(*chunk))
 
 
 @pytest.mark.parametrize('send', [positions_of, points_of, chunks_of])
@@ -86,7 +86,7 @@ def test_stream_is_followed_at_most_an_interval_behind_without_a_jump(ros, send)
     arm, law = ros.loop(None, PATIENT)
     ros.run(arm, 50)
     hold = trajectory(point(sway(0.0), 1.5))
-    inputs(law)._on_trajectory(hold)
+    inputs(law).take_trajectory(hold)
     ros.run(arm, 1700)
     start = law.guard.time
     period = 0.02
@@ -132,7 +132,7 @@ def test_stop_brakes_and_outlasts_a_stream_until_that_pauses(ros):
     arm, law = ros.loop(None, PATIENT)
     ros.run(arm, 50)
     far = trajectory(point((1.0, 0.5), 2.0))
-    inputs(law)._on_trajectory(far)
+    inputs(law).take_trajectory(far)
     ros.run(arm, 1000)
     moving = law.guard.controller.reference_at(law.guard.time)
     assert np.abs(moving[1]).min() > 0.1
@@ -143,7 +143,7 @@ def test_stop_brakes_and_outlasts_a_stream_until_that_pauses(ros):
         law.guard.controller.reference_at(law.guard.time), moving, atol=0.02
     )
     for _ in range(40):
-        inputs(law)._on_trajectory(far)
+        inputs(law).take_trajectory(far)
         ros.run(arm, 20)
     at_rest = law.guard.controller.reference_at(law.guard.time)
     np.testing.assert_array_equal(at_rest[1:], 0.0)
@@ -151,7 +151,7 @@ def test_stop_brakes_and_outlasts_a_stream_until_that_pauses(ros):
     distance = np.abs(at_rest[0] - moving[0])
     assert np.all(distance < 0.5 * np.abs(moving[1]) * (np.abs(moving[1]) / 6.0 + 0.1))
     ros.run(arm, 1100)
-    inputs(law)._on_trajectory(far)
+    inputs(law).take_trajectory(far)
     ros.run(arm, 1000)
     assert np.abs(law.guard.controller.reference_at(law.guard.time)[1]).min() > 0.1
 
@@ -161,9 +161,9 @@ def test_stop_and_a_trajectory_without_points_are_always_accepted(ros):
     response = call_stop(ros)
     assert (response.success, 'nothing to stop' in response.message) == (True, True)
     ros.run(arm, 1100)
-    inputs(law)._on_trajectory(trajectory(point((1.0, 0.5), 1.0)))
+    inputs(law).take_trajectory(trajectory(point((1.0, 0.5), 1.0)))
     ros.run(arm, 300)
-    inputs(law)._on_trajectory(trajectory())
+    inputs(law).take_trajectory(trajectory())
     ros.run(arm, 800)
     reference = law.guard.controller.reference_at(law.guard.time)
     np.testing.assert_array_equal(reference[1:], 0.0)
@@ -180,9 +180,9 @@ WRONG = {
 def test_wrong_positions_are_rejected_with_the_reason(ros, reason):
     arm, law = ros.loop(None, PATIENT)
     ros.run(arm, 50)
-    inputs(law)._on_positions(positions(WRONG[reason]))
+    inputs(law).take_positions(positions(WRONG[reason]))
     assert reason in inputs(law).reason
-    inputs(law)._on_positions(
+    inputs(law).take_positions(
         positions((9.0, 9.0))
     )  # past the limits: as near as it may
     ros.run(arm, 50)
@@ -193,7 +193,7 @@ def test_wrong_positions_are_rejected_with_the_reason(ros, reason):
 def test_without_control_msgs_the_reason_is_said_once_and_all_else_works(ros, capfd):
     arm, law = ros.loop(None, PATIENT)
     ros.run(arm, 1100)
-    inputs(law)._on_trajectory(trajectory(point((1.9, 1.4), 1.0)))
+    inputs(law).take_trajectory(trajectory(point((1.9, 1.4), 1.0)))
     ros.run(arm, 1500)
     reference = law.guard.controller.reference_at(law.guard.time)
     np.testing.assert_allclose(reference[0], (1.9, 1.4), atol=1e-9)

@@ -267,7 +267,7 @@ def test_trajectory_that_is_planned_too_late_is_planned_again_further_ahead(
     arm, law = ros.loop(None, BRISK | PLANNED['on'])
     ros.run(arm, 20)
     raw = serialize_message(trajectory(JOINTS, np.zeros(2), duration=3.0))
-    inputs(law)._on_trajectory(raw)
+    inputs(law).take_trajectory(raw)
     ros.run(arm, 100)
     may_end.set()
     ros.until(lambda: inputs(law).accepted + inputs(law).rejected)

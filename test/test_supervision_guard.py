@@ -10,6 +10,7 @@ from plain_law import dynamics
 
 from blf_dsc_controller.configuration.controller import ControllerConfig, Safety
 from blf_dsc_controller.configuration.schema import change
+from blf_dsc_controller.control.status_report import chatter_of
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.law.factory import controller_of, settings_of_config
 from blf_dsc_controller.reference.terms import unpack
@@ -535,7 +536,6 @@ def test_constant_command_that_does_not_reach_the_arm_shows_only_in_its_effort(
 
 def test_arm_that_stands_still_under_noise_is_named_but_not_taken_for_braked():
     """Coarse encoders make the torque chatter although nothing moves."""
-    status = pytest.importorskip('blf_dsc_controller.nodes.diagnostics')
     hold = {'reference.type': 'hold', 'learning.initial_estimate': P.tolist()}
     rig, quiet = Rig(hold), Rig(hold)
     rng = np.random.default_rng(0)
@@ -547,8 +547,8 @@ def test_arm_that_stands_still_under_noise_is_named_but_not_taken_for_braked():
     assert np.abs(steps).max() > 2.0  # a tenth of the limit
     measured = np.sqrt(rig.guard.controller.checks.chatter)
     assert measured == pytest.approx(np.sqrt((steps**2).mean(axis=0)), rel=0.2)
-    assert 'joint1 changes by' in status.chatter_of(rig.guard)
-    assert status.chatter_of(quiet.guard) == ''
+    assert 'joint1 changes by' in chatter_of(rig.guard)
+    assert chatter_of(quiet.guard) == ''
 
 
 def test_estimates_are_discarded_by_a_reset_at_once():

@@ -19,10 +19,14 @@ class TopicRecorder:
         *,
         compression: str = 'none',
         flush_interval: float | None = 0.1,
+        in_background: bool = False,
     ) -> None:
         """Open a new bag; the arguments and errors are those of `BagWriter`."""
         self._bag = BagWriter(
-            path, compression=compression, flush_interval=flush_interval
+            path,
+            compression=compression,
+            flush_interval=flush_interval,
+            in_background=in_background,
         )
         self._handles: dict[Topic, int] = {}
         self._sent: Counter[Topic] = Counter()

@@ -3,9 +3,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import asdict, dataclass
+from functools import partial
 from math import inf
 from pathlib import Path
 from time import monotonic
@@ -15,6 +16,7 @@ import yaml
 from mcap.writer import CompressionType, Writer
 
 from blf_dsc_controller import __version__
+from blf_dsc_controller.bags.background_file import BackgroundFile
 from blf_dsc_controller.bags.sources import METADATA, BagError
 from blf_dsc_controller.messages.codecs import NANOSECONDS, Definition, definition
 from blf_dsc_controller.messages.topics import FOREVER, Quality
@@ -64,6 +66,7 @@ class BagWriter(AbstractContextManager['BagWriter']):
     Data leaves the process within `flush_interval` [s] plus the time to the next call of `write` or
     `flush_if_due`, and then survives a kill of the process. Without an interval it leaves when a
     chunk is full. The compression of chunks is `none` or `zstd`. A file ends after 10,000 chunks.
+    With `in_background`, a thread writes to the disk; errors are raised by a later call.
     After an OSError, such as that of a full disk, `recover` saves what was written before.
 
     Raises:
@@ -76,8 +79,10 @@ class BagWriter(AbstractContextManager['BagWriter']):
         *,
         compression: str = 'none',
         flush_interval: float | None = 0.1,
+        in_background: bool = False,
     ) -> None:
         self.path = Path(path)
+        self._in_background = in_background
         self.closed = False
         self._compression = CompressionType[compression.upper()]
         self._flush_interval = inf if flush_interval is None else flush_interval
@@ -181,7 +186,11 @@ class BagWriter(AbstractContextManager['BagWriter']):
     def _begin_file(self) -> None:
         """Begin the next file, with the topics of the previous one."""
         self._files.append(_File(f'{self.path.name}_{len(self._files)}.mcap'))
-        self._stream = (self.path / self._files[-1].name).open('xb')
+        path = self.path / self._files[-1].name
+        make: Callable[[Path], Any] = partial(Path.open, mode='xb')
+        if self._in_background:
+            make = BackgroundFile
+        self._stream = make(path)
         self._writer = Writer(
             self._stream, chunk_size=_CHUNK_SIZE, compression=self._compression
         )

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`blf_dsc drive`: the guarded law on a robot's own interface, without ROS."""
+"""`blf_dsc drive`: the guarded law on a robot's own interface, with topics beside it or without."""
 
 from __future__ import annotations
 
@@ -7,9 +7,10 @@ import math
 import signal
 from argparse import Namespace
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 
 from blf_dsc_controller.cli.main import INTERRUPTED
+from blf_dsc_controller.cli.ros_check import require_ros
 from blf_dsc_controller.cli.run import STOPPED, print_notice
 from blf_dsc_controller.compiled.announcement import announced_compilation
 from blf_dsc_controller.configuration.controller import ControllerConfig
@@ -20,6 +21,7 @@ from blf_dsc_controller.control.realtime import request_realtime
 from blf_dsc_controller.drive.driver import disagreements
 from blf_dsc_controller.drive.drivers import find_driver
 from blf_dsc_controller.drive.loop import DriveLoop, End, Outcome
+from blf_dsc_controller.drive.ros_topics import RosTopics
 from blf_dsc_controller.errors import BlfDscError, ConfigurationError
 from blf_dsc_controller.supervision.config_warnings import config_warnings
 from blf_dsc_controller.supervision.expected_errors import expectation
@@ -35,10 +37,7 @@ _CODES = {
 
 def drive(options: Namespace) -> int:
     """Control a robot until the end, and print how it went."""
-    if not (options.duration >= 0.0 and math.isfinite(options.duration)):
-        raise BlfDscError(
-            f'--duration: got {options.duration:g} s, but a time is needed; 0: until Ctrl-C'
-        )
+    _check(options)
     path = locate(options.config)
     config = load(path, CONTROLLER, ControllerConfig)
     settings = load(path, DRIVE, DriveConfig)
@@ -52,8 +51,13 @@ def drive(options: Namespace) -> int:
         print(f'errors to expect: {expectation(config)}')
     driver = made(options.robot, config, settings)
     with announced_compilation(print_notice):
-        controller = ArmController(config, record=options.out)
-    with controller:
+        controller = ArmController(config, record=options.out, stamps='wall')
+    with ExitStack() as ending:
+        ros = None
+        if options.ros:
+            ros = RosTopics(controller, options.namespace)
+            ending.callback(ros.close)
+        ending.enter_context(controller)
         for remark in driver.connect():
             print_notice(remark)
         request_realtime(config.realtime, lambda text: print_notice(f'warning: {text}'))
@@ -62,16 +66,31 @@ def drive(options: Namespace) -> int:
             controller,
             duration=options.duration or math.inf,
             settle_time=settings.settle_time,
+            ros=ros,
         )
         with _signals_to(loop.request_end):
             print_notice(f'controlling {options.robot}: Ctrl-C ends')
             outcome = loop.run()
         _print(outcome, loop, controller)
+    if ros is not None and ros.problem:
+        print(f'topics        {ros.problem}')
     if options.out is not None:
         print(
             f'recorded      {options.out}: blf_dsc replay, report, plot and identify read it'
         )
     return _CODES[outcome.end]
+
+
+def _check(options: Namespace) -> None:
+    """Raise BlfDscError if the options are wrong, or ROS is missing that they ask for."""
+    if not (options.duration >= 0.0 and math.isfinite(options.duration)):
+        raise BlfDscError(
+            f'--duration: got {options.duration:g} s, but a time is needed; 0: until Ctrl-C'
+        )
+    if options.ros:
+        require_ros()
+    elif options.namespace:
+        raise BlfDscError('--namespace: it is that of the topics: give --ros, too')
 
 
 @contextmanager

@@ -240,10 +240,10 @@ def _add_run(command: _Command) -> None:
 def _add_drive(command: _Command) -> None:
     option = command(
         'drive',
-        'Control a robot over its own interface, without ROS: a Franka Research 3. The law runs in '
-        'the loop that reads states and writes torques. Ctrl-C or SIGTERM brings the arm to rest '
-        'and ends; a second one ends at once. Exit code: 0 the duration is over, 5 the controller '
-        'or the robot stopped before, 130 interrupted, 1 an error.',
+        'Control a robot over its own interface: a Franka Research 3. The law runs in the loop '
+        'that reads states and writes torques; --ros adds its topics. Ctrl-C or SIGTERM '
+        'brings the arm to rest and ends; a second one ends at once. Exit code: 0 the duration is '
+        'over, 5 the controller or the robot stopped before, 130 interrupted, 1 an error.',
         '--robot 172.16.0.2 --config fr3_direct.yaml --duration 60 --out first',
     )
     option('--robot', required=True, help='address of the robot')
@@ -251,6 +251,11 @@ def _add_drive(command: _Command) -> None:
     option('--config', default='fr3_direct', help=preset)
     option('--duration', type=float, default=0.0, help='time [s]; 0: until Ctrl-C (0)')
     option('--out', type=Path, help='new folder of a bag; none: record nothing')
+    beside = (
+        'publish the topics of the controller, and follow those that command motions'
+    )
+    option('--ros', action='store_true', help=beside)
+    option('--namespace', default='', help='namespace of these topics (none)')
 
 
 def _add_bags(

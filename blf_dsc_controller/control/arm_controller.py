@@ -4,10 +4,11 @@
 from __future__ import annotations
 
 import math
+import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from types import TracebackType
-from typing import NamedTuple
+from typing import Literal, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -21,8 +22,11 @@ from blf_dsc_controller.law.telemetry import disturbance_names
 from blf_dsc_controller.law.weighing import DEVIATION, TWO_SIDED
 from blf_dsc_controller.messages import topics
 from blf_dsc_controller.messages.codecs import JointStateEncoder
+from blf_dsc_controller.messages.journal import MOTIONS
+from blf_dsc_controller.messages.topics import Topic
 from blf_dsc_controller.reference.trajectory import Trajectory, TrajectoryPoint
 from blf_dsc_controller.supervision.drive_load import DriveLoad
+from blf_dsc_controller.supervision.guard import Guard
 from blf_dsc_controller.supervision.supervisor import Phase
 
 Vector = NDArray[np.float64]
@@ -33,6 +37,13 @@ _AT_REST = 0.01  # rad/s
 
 class StateError(BlfDscError):
     """A joint state that no arm of this configuration can have."""
+
+
+class Output(Protocol):
+    """Takes the messages of a loop."""
+
+    def write(self, stamp: int, topic: Topic, raw: bytes) -> None:
+        """Take a serialised message with the time [ns] of its state."""
 
 
 class Load(NamedTuple):
@@ -79,11 +90,16 @@ class ArmController:
     """
 
     def __init__(
-        self, config: ControllerConfig | str | Path, *, record: str | Path | None = None
+        self,
+        config: ControllerConfig | str | Path,
+        *,
+        record: str | Path | None = None,
+        stamps: Literal['given', 'wall'] = 'given',
     ) -> None:
         """Compile the law of a configuration, file or preset, and take command.
 
-        `record` is the folder of a bag, which must not exist.
+        `record` is the folder of a bag, which must not exist.  Messages have the stamps
+        that are given; with `wall`, as much later as the wall clock was at the first.
 
         Raises:
             ConfigurationError: with all problems of the file.
@@ -94,7 +110,12 @@ class ArmController:
         self.config = config
         self.joints = config.joints
         self._loop = GuardedLoop(config)
-        self._recorder = TopicRecorder(Path(record)) if record is not None else None
+        self._recorder: TopicRecorder | None = None
+        self._outputs: list[Output] = []
+        if record is not None:
+            self._recorder = TopicRecorder(Path(record), in_background=True)
+            self.add_output(self._recorder)
+        self._is_on_wall = stamps == 'wall'
         self._states = JointStateEncoder(config.joints)
         self._shift: int | None = None  # ns, of the stamps
         self._loop.guard.activate()
@@ -149,8 +170,8 @@ class ArmController:
                 send(answer)
         finally:
             self._loop.guard.perceive()
-            if self._recorder is not None:
-                self._record(nanoseconds, values, torque)
+            if self._outputs:
+                self._tell(nanoseconds, values, torque)
         return answer
 
     def prepare(self, q: ArrayLike) -> None:
@@ -172,7 +193,9 @@ class ArmController:
         A clock from zero, which ROS takes for none, starts at 1 s.
         """
         nanoseconds = round(stamp * _NANO)
-        if self._shift is None:
+        if self._shift is None and self._is_on_wall:
+            self._shift = time.time_ns() - nanoseconds
+        elif self._shift is None:
             self._shift = 0 if nanoseconds > 0 else _FIRST - nanoseconds
         return nanoseconds + self._shift
 
@@ -249,11 +272,7 @@ class ArmController:
         None: none has been commanded yet, so command nothing.
         """
         torque = self._loop.guard.fail(text)
-        if self._recorder is not None:
-            stamp = max(self._loop.guard.journal.stamp, 0)
-            if torque is not None:
-                self._recorder.write(stamp, *self._loop.telemetry.command(torque))
-            self._record_events(stamp)
+        self._tell_end(torque)
         return None if torque is None else np.array(torque)
 
     def withdraw(self, text: str) -> None:
@@ -336,30 +355,54 @@ class ArmController:
 
         End the recording.
         """
-        guard = self._loop.guard
-        torque = guard.release()
+        torque = self._loop.guard.release()
+        self._tell_end(torque)
         if self._recorder is not None:
-            stamp = max(guard.journal.stamp, 0)
-            if torque is not None:
-                self._recorder.write(stamp, *self._loop.telemetry.command(torque))
-            self._record_events(stamp)
+            self._outputs.remove(self._recorder)
             self._recorder.close()
             self._recorder = None
         return None if torque is None else np.array(torque)
 
-    def _record(self, stamp: int, values: Vector, torque: Vector | None) -> None:
-        assert self._recorder is not None  # noqa: S101 - the caller has checked
-        state = self._states.encode(stamp, *values.reshape(3, -1))
-        self._recorder.write(stamp, topics.JOINT_STATES, state)
-        if torque is not None:
-            self._recorder.write(stamp, *self._loop.telemetry.command(torque))
-        for message in self._loop.messages(torque):
-            self._recorder.write(stamp, *message)
-        self._record_events(stamp)
+    def add_output(self, output: Output) -> None:
+        """Give all messages from now on to an output, too: those that a bag has."""
+        self._outputs.append(output)
 
-    def _record_events(self, stamp: int) -> None:
-        assert self._recorder is not None  # noqa: S101
+    @property
+    def guard(self) -> Guard:
+        """The law between its checks, for shells such as `blf_dsc drive`."""
+        return self._loop.guard
+
+    @property
+    def estimate_names(self) -> tuple[str, ...]:
+        """Names of the learned parameters."""
+        return tuple(self._loop.estimates)
+
+    def _tell(self, stamp: int, values: Vector, torque: Vector | None) -> None:
+        """Give the messages about a state to the outputs."""
+        state = self._states.encode(stamp, *values.reshape(3, -1))
+        self._write(stamp, topics.JOINT_STATES, state)
+        if torque is not None:
+            self._write(stamp, *self._loop.telemetry.command(torque))
+        for message in self._loop.messages(torque):
+            self._write(stamp, *message)
+        self._tell_events(stamp)
+
+    def _tell_end(self, torque: Vector | None) -> None:
+        """Give a torque that no state asked for to the outputs, and the events."""
+        if not self._outputs:
+            return
+        stamp = max(self._loop.guard.journal.stamp, 0)
+        if torque is not None:
+            self._write(stamp, *self._loop.telemetry.command(torque))
+        self._tell_events(stamp)
+
+    def _tell_events(self, stamp: int) -> None:
         pending = self._loop.guard.journal.pending
         while pending:
             event = pending.popleft()
-            self._recorder.write(stamp, topics.JOURNAL, event.encode())
+            topic = topics.TARGETS if event.type in MOTIONS else topics.JOURNAL
+            self._write(stamp, topic, event.encode())
+
+    def _write(self, stamp: int, topic: Topic, raw: bytes) -> None:
+        for output in self._outputs:
+            output.write(stamp, topic, raw)

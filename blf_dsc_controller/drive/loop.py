@@ -30,6 +30,7 @@ from blf_dsc_controller.drive.driver import (
 )
 from blf_dsc_controller.drive.latency import Latency
 from blf_dsc_controller.drive.load_teller import LoadTeller
+from blf_dsc_controller.drive.ros_topics import RosTopics
 from blf_dsc_controller.supervision.supervisor import Phase
 
 Vector = NDArray[np.float64]
@@ -74,8 +75,9 @@ class DriveLoop:
         *,
         duration: float = math.inf,
         settle_time: float = 3.0,
+        ros: RosTopics | None = None,
     ) -> None:
-        """Run for `duration` [s] of the robot's time.
+        """Run for `duration` [s] of the robot's time, with topics beside the loop or without.
 
         The end may take `settle_time` [s] more.
         """
@@ -87,6 +89,7 @@ class DriveLoop:
         self._duration = duration
         self._settle_time = settle_time
         self._teller = LoadTeller(driver, controller)
+        self._ros = ros
         self._requests = 0
         self._states = 0
         self._begin = math.nan  # s, stamp of the first state
@@ -156,6 +159,8 @@ class DriveLoop:
         try:
             self._teller.follow()
             self._controller.update(*state, send=self._send)
+            if self._ros is not None:
+                self._ros.follow()
         except DriverError:
             raise
         except Exception as error:

@@ -95,7 +95,7 @@ class Event(NamedTuple):
         content = fields.pop('content')
         is_encoded = isinstance(content, EncodedContent)
         text = content.text if is_encoded else json.dumps(content)
-        return _message(f'{json.dumps(fields)[:-1]}, "content": {text}}}')
+        return encode_string(f'{json.dumps(fields)[:-1]}, "content": {text}}}')
 
 
 def contact_in(event: Event) -> Contact:
@@ -118,10 +118,11 @@ def encode_change(
     `configured`: these are all of them, at the start.
     """
     given = {'stamp': stamp, 'parameters': parameters, 'configured': configured}
-    return _message(json.dumps(given))
+    return encode_string(json.dumps(given))
 
 
-def _message(text: str) -> bytes:
+def encode_string(text: str) -> bytes:
+    """Return the serialised std_msgs/String of a text."""
     message = typestore().types[JOURNAL.type](data=text)
     return bytes(typestore().serialize_cdr(message, JOURNAL.type))
 

@@ -21,7 +21,7 @@ from typing import Any
 
 from rclpy.node import Node
 
-from blf_dsc_controller.nodes.goal_messages import Cancel, Goal
+from blf_dsc_controller.control.goal_messages import Cancel, Goal
 
 ACTION = '~/follow_joint_trajectory'
 _PATIENCE = 5.0  # s for its end

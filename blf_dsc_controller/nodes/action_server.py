@@ -31,7 +31,7 @@ from rclpy.serialization import serialize_message
 from rclpy.task import Future
 from trajectory_msgs.msg import JointTrajectoryPoint
 
-from blf_dsc_controller.nodes.goal_messages import (
+from blf_dsc_controller.control.goal_messages import (
     Answer,
     Cancel,
     End,

@@ -24,7 +24,7 @@ from blf_dsc_controller.nodes import parameters, process
 from blf_dsc_controller.nodes.diagnostics import ControllerStatus
 from blf_dsc_controller.nodes.lifecycle import LoopNode
 from blf_dsc_controller.nodes.trajectory_action import TrajectoryAction, offered_action
-from blf_dsc_controller.nodes.trajectory_input import TrajectoryInput
+from blf_dsc_controller.nodes.trajectory_input import motion_input_of
 from blf_dsc_controller.nodes.watchdog_presence import WatchdogPresence
 from blf_dsc_controller.supervision.config_warnings import config_warnings, worsened
 from blf_dsc_controller.supervision.guard import Guard
@@ -114,7 +114,7 @@ class ControllerNode(LoopNode[ControllerConfig]):
                     outputs += [topics.EXTERNAL_WRENCH]
         if self.connect(outputs, topics.JOINT_STATES, self._on_joint_state):
             joints = self.config.joints
-            inputs = TrajectoryInput(self, len(joints), lambda: self.guard)
+            inputs = motion_input_of(self, len(joints), lambda: self.guard)
             self._status.trajectories = inputs
             self._action = offered_action(self, inputs, joints)
         self._report()

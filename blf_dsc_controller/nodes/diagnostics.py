@@ -7,31 +7,25 @@ hardware is named by its joints.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from typing import Any
+from collections.abc import Sequence
 
-import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rclpy.node import Node
 
-from blf_dsc_controller.law.external_torque import DISTANCE
-from blf_dsc_controller.law.telemetry import load_text
+from blf_dsc_controller.control.status_report import (
+    ERROR,
+    OK,
+    STALE,
+    WARN,
+    Part,
+    StatusReport,
+)
 from blf_dsc_controller.messages import topics
 from blf_dsc_controller.messages.journal import MOTIONS, EventType
-from blf_dsc_controller.messages.topics import LOAD, PHASE, REASON, REJECTED, STOPS
 from blf_dsc_controller.nodes.endpoints import create_publisher
-from blf_dsc_controller.nodes.trajectory_input import TrajectoryInput
 from blf_dsc_controller.supervision.guard import Guard
-from blf_dsc_controller.supervision.supervisor import Phase, Supervisor
 
-OK = DiagnosticStatus.OK
-WARN = DiagnosticStatus.WARN
-ERROR = DiagnosticStatus.ERROR
-STALE = DiagnosticStatus.STALE
-
-
-Part = tuple[str, bytes, str, Mapping[str, Any]]
-"""Status of a part of a node: its name, level, message and values."""
+__all__ = ['ERROR', 'OK', 'STALE', 'WARN', 'ControllerStatus', 'DiagnosticsPublisher']
 
 
 class DiagnosticsPublisher:
@@ -60,38 +54,21 @@ class DiagnosticsPublisher:
         return array.status[0]
 
 
-_PHASES = {
-    Phase.INACTIVE: (STALE, 'not in command'),
-    Phase.STARTING: (WARN, 'waiting for a joint state to start from'),
-    Phase.APPROACHING: (OK, 'approaching the reference'),
-    Phase.TRACKING: (OK, 'tracking'),
-    Phase.SAFE_STOP: (ERROR, 'stopped'),
-}
-
-
-_CHATTER = 0.11  # of the torque limit; 20 bits leave a Panda 0.01, 16 bits 0.13
-
-
-class ControllerStatus:
+class ControllerStatus(StatusReport):
     """Publishes the state of the controller.
 
     Attributes:
         journal: publisher of `~/journal`.
-        rejected: disturbance columns that are not estimated, and why.
-        trajectories: accepted and rejected trajectories.
     """
 
     def __init__(self, node: Node, joints: Sequence[str]) -> None:
         """Create the publishers of a node that controls `joints`."""
+        super().__init__(node.get_logger())
         self.journal = create_publisher(node, topics.JOURNAL)
         self._targets = create_publisher(node, topics.TARGETS)
-        self.rejected: Mapping[str, str] = {}
-        self.trajectories: TrajectoryInput | None = None
         self._diagnostics = DiagnosticsPublisher(node, joints)
         self._latched = create_publisher(node, topics.STATE)
         self._published = '', -1  # lifecycle and revision of the state
-        self._logger = node.get_logger()
-        self._has_warned = False
 
     def has_news(self, guard: Guard) -> bool:
         """Whether there are events or a state to publish, besides targets of a stream."""
@@ -112,13 +89,7 @@ class ControllerStatus:
         """
         if guard is not None:
             self.publish_events(guard)
-        parts = [self._state(lifecycle, guard)]
-        if guard is not None:
-            parts += [self._loop(guard, others, missing), self._learning(guard)]
-            if guard.controller.settings.weighed:
-                parts.append(_load(guard))
-            if guard.config.contact.enabled:
-                parts.append(_contact(guard))
+        parts = self.parts(lifecycle, guard, others, missing)
         state = self._diagnostics.publish(*parts)
         now = lifecycle, guard.supervisor.revision if guard else -1
         if now != self._published:
@@ -131,135 +102,3 @@ class ControllerStatus:
             event = guard.journal.pending.popleft()
             publisher = self._targets if event.type in MOTIONS else self.journal
             publisher.publish(event.encode())
-
-    def _state(self, lifecycle: str, guard: Guard | None) -> Part:
-        supervisor = guard.supervisor if guard else Supervisor()
-        level, message = _PHASES[supervisor.phase]
-        values: dict[str, Any] = {PHASE: supervisor.phase, REASON: supervisor.reason}
-        values['lifecycle'] = lifecycle
-        if guard is None:
-            message = 'not configured'
-        else:
-            values[STOPS] = supervisor.stops
-            values['safe torque'] = guard.config.safety.torque
-        if supervisor.text:
-            message += f': {supervisor.text}'
-        return 'state', level, message, values
-
-    def _loop(self, guard: Guard, others: int, missing: str) -> Part:
-        states = guard.states
-        samples = guard.samples
-        state = guard.controller.state
-        off = f'off: {guard.watchdog.why_off}'.removesuffix(': ')
-        values = {
-            'samples': guard.controller.samples,
-            'repeated states ignored': states.repeated,
-            'samples outside the bound': samples.outside,
-            'largest error against the bound': f'{samples.ratio.max():.3g}',
-            **_at_tool(guard),
-            'states missed': states.missed,
-            'samples with a torque at its limit': samples.saturated,
-            'messages for other joints': guard.foreign,
-            'watchdog on the steady clock': 'on' if guard.watchdog.on else off,
-            'samples cut by the torque limit': _by_joint(guard, state.level_cuts),
-            'samples cut by the torque rate limit': _by_joint(guard, state.rate_cuts),
-            **(self.trajectories.values if self.trajectories else {}),
-        }
-        level = WARN
-        message = 'torque{} at its limit: adaptation by the tracking error is frozen'
-        if others:
-            level = ERROR
-            message = 'another node commands torques, too'
-        elif missing:
-            message = missing
-        elif samples.outside:
-            message = 'the error has left its bound'
-        elif samples.saturated_time > 0.0:
-            message = message.format('')
-        elif guard.has_sample and guard.controller.sample.cuts.any():
-            message = message.format(' rate')
-        elif chatter := chatter_of(guard):
-            message = chatter
-            if not self._has_warned:
-                self._has_warned = True
-                self._logger.warning(chatter)
-        else:
-            level = OK
-            message = _PHASES[guard.supervisor.phase][1]
-        return 'loop', level, message, values
-
-    def _learning(self, guard: Guard) -> Part:
-        state = guard.controller.state
-        learning = 'latched' if state.latched[0] else 'not yet excited'
-        values = {'lambda_min': f'{state.lambda_min[0]:.3g}', 'learning': learning}
-        values['model changes'] = f'{state.changes[0]:.0f}'
-        values |= {
-            f'{REJECTED}{column}': reason for column, reason in self.rejected.items()
-        }
-        if self.rejected:
-            return (
-                'learning',
-                WARN,
-                f'not estimated: {", ".join(self.rejected)}',
-                values,
-            )
-        return 'learning', OK, learning, values
-
-
-def _at_tool(guard: Guard) -> Mapping[str, str]:
-    errors = guard.samples.tool_errors
-    if errors is None:
-        return {}
-    error, bound, angle, angle_bound = (1e3 * errors).tolist()
-    return {
-        'error at the tool': f'{error:.3g} of {bound:.3g} mm',
-        'angle at the tool': f'{angle:.3g} of {angle_bound:.3g} mrad',
-    }
-
-
-def _load(guard: Guard) -> Part:
-    load = guard.controller.sample.load.tolist()
-    values = {name: f'{value:.6g}' for name, value in zip(LOAD, load, strict=True)}
-    return 'load', OK, f'held: {load_text(load)}', values
-
-
-def _contact(guard: Guard) -> Part:
-    """Return whether something touches the arm, and what did last."""
-    last = guard.contact
-    values: dict[str, Any] = {
-        'contacts': guard.contacts,
-        'distance': f'{guard.controller.sample.contact[DISTANCE]:.3g}',
-        'threshold': f'{guard.config.contact.threshold:g}',
-    }
-    if last is not None:
-        values |= {
-            'last contact': f'at {(last.stamp - guard.start_stamp) * 1e-9:.3f} s',
-            'joint': last.joint,
-            'torque from outside': f'{last.torque:+.3g} N m',
-            'explained by model and noise': f'{last.interval:.3g} N m',
-        }
-    if not guard.supervisor.running:
-        return 'contact', OK, 'not looked for: the law is not in command', values
-    if last is not None and guard.controller.state.contact[0] > 0.0:
-        return 'contact', WARN, last.text, values
-    return 'contact', OK, 'nothing touches the arm', values
-
-
-def _by_joint(guard: Guard, counts: np.ndarray) -> str:
-    pairs = zip(guard.config.joints, counts, strict=True)
-    return (
-        ', '.join(f'{joint} {count:.0f}' for joint, count in pairs if count) or 'none'
-    )
-
-
-def chatter_of(guard: Guard) -> str:
-    """Return the warning about a torque that chatters, as with coarse encoders; empty if none."""
-    steps = np.sqrt(guard.controller.checks.chatter)
-    worst = int(np.argmax(steps / guard.controller.settings.torque_limit))
-    if steps[worst] <= _CHATTER * guard.controller.settings.torque_limit[worst]:
-        return ''
-    return (
-        f'the torque of {guard.config.joints[worst]} changes by {steps[worst]:.2g} N m rms each '
-        'sample: its measured velocity is coarse or noisy. Lower the pole of the velocity filter '
-        'and add its lag to robot.lag, whose gains are softer'
-    )

@@ -7,9 +7,9 @@ from collections.abc import Sequence
 
 from rclpy.node import Node
 
+from blf_dsc_controller.control.goals import Goals
+from blf_dsc_controller.control.motion_input import MotionInput
 from blf_dsc_controller.nodes.action_process import ACTION, ActionProcess, can_offer
-from blf_dsc_controller.nodes.goals import Goals
-from blf_dsc_controller.nodes.trajectory_input import TrajectoryInput
 from blf_dsc_controller.supervision.guard import Guard
 
 _WITHOUT = (
@@ -21,9 +21,7 @@ _WITHOUT = (
 class TrajectoryAction:
     """The action of one controller: its process, and the goals."""
 
-    def __init__(
-        self, node: Node, inputs: TrajectoryInput, joints: Sequence[str]
-    ) -> None:
+    def __init__(self, node: Node, inputs: MotionInput, joints: Sequence[str]) -> None:
         self._process = ActionProcess(node, joints)
         self._goals = Goals(inputs, joints, self._process.send, node.get_logger())
 
@@ -40,7 +38,7 @@ class TrajectoryAction:
 
 
 def offered_action(
-    node: Node, inputs: TrajectoryInput, joints: Sequence[str]
+    node: Node, inputs: MotionInput, joints: Sequence[str]
 ) -> TrajectoryAction | None:
     """Offer the action; without control_msgs say why not, and return None."""
     if can_offer():

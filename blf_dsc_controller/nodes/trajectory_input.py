@@ -1,409 +1,57 @@
 # SPDX-License-Identifier: Apache-2.0
-"""New references while the controller runs: trajectories, streams of targets, stops.
-
-They come by `~/joint_trajectory`, `~/joint_positions`, `~/stop` and the goals of the action. Every
-rejection has a reason.
-"""
+"""Topics and service by which a node takes new references."""
 
 from __future__ import annotations
 
-import sys
 import time
 from collections.abc import Callable
-from concurrent.futures import Future, ThreadPoolExecutor
-from typing import NamedTuple
 
-import numpy as np
 from rclpy.node import Node
 from std_msgs.msg import Float64MultiArray
 from std_srvs.srv import Trigger
 from trajectory_msgs.msg import JointTrajectory
 
-from blf_dsc_controller.messages.codecs import (
-    Float64MultiArrayDecoder,
-    MessageError,
-    joint_trajectory,
-)
+from blf_dsc_controller.control.motion_input import MotionInput
 from blf_dsc_controller.messages.topics import JOINT_POSITIONS, JOINT_TRAJECTORY
 from blf_dsc_controller.nodes.endpoints import qos_profile
-from blf_dsc_controller.reference.retargeting import (
-    Target,
-    TrajectoryError,
-    can_retarget,
-)
-from blf_dsc_controller.reference.stream import TargetStream
-from blf_dsc_controller.reference.trajectory import (
-    MOST_POINTS,
-    Trajectory,
-    TrajectoryPoint,
-    trajectory_problems,
-)
-from blf_dsc_controller.supervision.guard import Guard, LatePlanError, Plan
+from blf_dsc_controller.supervision.guard import Guard
 from blf_dsc_controller.supervision.state_watchdog import SAME_CLOCK
 
 _NANO = 1e-9
-# bytes per joint of a point with all its fields, each with a header of 8 bytes
-_POINT_SIZE = 32
-_SMALL = 4096  # bytes of a message that is read at once: a few points
-_LEAD = 0.02  # s from now to the time for which a trajectory is planned, at first
-_TARGET_LEAD = 0.004  # likewise for a target
-_LONGEST_LEAD = 2.0
-_SWITCH_INTERVAL = 1e-4  # s after which the planning thread yields to the loop
-_PAUSE = 1.0  # s without messages, after which a stopped sender is followed again
-_RARELY = 1.0  # s between two warnings of a stream
-_ON_TRAJECTORY = JOINT_TRAJECTORY.name
-_ON_POSITIONS = JOINT_POSITIONS.name
-_REPLACED = 'a newer one arrived before it was planned'
-
-Command = Trajectory | Target
-Report = Callable[[Plan | None, str], None]
-"""Called with the plan that is followed, or with None and why none is."""
 
 
-class _Request(NamedTuple):
-    """A motion that is wanted."""
-
-    make: Callable[[], Command]  # may take a while: called where it is planned
-    report: Report
-    lead: float  # s
-    source: str  # who wants it
-    check: Callable[[Plan], None] | None = None  # raises TrajectoryError: not like this
-
-
-class _Job(NamedTuple):
-    """A motion that is being planned."""
-
-    request: _Request
-    plan: Future[Plan]
+def motion_input_of(
+    node: Node, joints: int, guard: Callable[[], Guard | None]
+) -> MotionInput:
+    """Return the input of motions of a node, subscribed for `joints` joints."""
+    inputs = MotionInput(joints, guard, _is_live, node.get_logger())
+    connect(node, inputs.take_trajectory, inputs.take_positions, inputs.take_stop)
+    return inputs
 
 
-class TrajectoryInput:
-    """Passes motions to the guard, between two samples.
+def connect(
+    node: Node,
+    take_trajectory: Callable[[bytes], None],
+    take_positions: Callable[[bytes], None],
+    take_stop: Callable[[], str],
+) -> None:
+    """Subscribe to both topics, and offer `~/stop`."""
 
-    In lock-step the plant waits while a motion is planned. Otherwise it is planned in a thread, for
-    a time slightly ahead, and further ahead if planning takes longer. The latest one wins.
-
-    Attributes:
-        accepted, rejected: number of trajectories that are or were followed, or are not.
-        targets: number of targets of streams that are or were followed.
-        reason: why the last one was rejected.
-        source: what has set the present reference.
-        job: the motion that is being planned, if any.
-    """
-
-    def __init__(
-        self, node: Node, joints: int, guard: Callable[[], Guard | None]
-    ) -> None:
-        """Subscribe for `joints` joints; `guard` returns None while the node is not configured."""
-        self.accepted = 0
-        self.rejected = 0
-        self.targets = 0
-        self.reason = ''
-        self.source = ''
-        self.job: _Job | None = None
-        self._next: _Request | None = None
-        self._log = node.get_logger()
-        self._largest = MOST_POINTS * _POINT_SIZE * (joints + 2)
-        self._guard = guard
-        self._thread = ThreadPoolExecutor(1, 'trajectories')
-        self._decoder = Float64MultiArrayDecoder(joints)
-        self._positions = TargetStream()
-        self._points = TargetStream()
-        self._target_lead = _TARGET_LEAD
-        self._is_stopped = False
-        self._last_message = -np.inf  # s since the start
-        sys.setswitchinterval(_SWITCH_INTERVAL)
-        for topic, type_, callback in (
-            (JOINT_TRAJECTORY, JointTrajectory, self._on_trajectory),
-            (JOINT_POSITIONS, Float64MultiArray, self._on_positions),
-        ):
-            quality = qos_profile(topic.requested)
-            node.create_subscription(type_, topic.name, callback, quality, raw=True)
-        node.create_service(Trigger, '~/stop', self._on_stop)
-
-    @property
-    def values(self) -> dict[str, str]:
-        """Values for the diagnostics."""
-        return {
-            'trajectories followed': f'{self.accepted}',
-            'trajectories rejected': f'{self.rejected}',
-            'streamed targets followed': f'{self.targets}',
-            'last rejection': self.reason or 'none',
-        }
-
-    def poll(self, guard: Guard) -> None:
-        """Follow the motion whose plan is ready, if there is one."""
-        job = self.job
-        if job is None or not job.plan.done():
-            return
-        self.job = None
-        self._finish(guard, job)
-        if self.job is None and self._next is not None:
-            request, self._next = self._next, None
-            self._submit(guard, request)
-
-    def stop(self, guard: Guard, source: str) -> float:
-        """Brake and hold; return when the reference rests [s since the start].
-
-        Raises:
-            TrajectoryError: the controller is not in command.
-        """
-        self._drop('the reference was stopped')
-        for stream in (self._positions, self._points):
-            stream.restart()
-        end = guard.brake()
-        self.source = source
-        return end
-
-    def follow(
-        self,
-        guard: Guard,
-        raw: bytes,
-        source: str,
-        check: Callable[[Plan], None],
-        report: Report,
-    ) -> None:
-        """Follow a serialised trajectory with points that came by another way than a topic."""
-
-        def tell(plan: Plan | None, reason: str) -> None:
-            self._report(plan, reason)
-            report(plan, reason)
-
-        start = guard.start_stamp
-        request = _Request(lambda: _trajectory(raw, start), tell, _LEAD, source, check)
-        self._request(guard, request)
-
-    # Requests.
-
-    def _on_trajectory(self, raw: bytes) -> None:
-        guard = self._guard()
-        if guard is None:
-            self._reject('trajectory rejected: the controller is not configured')
-            return
-        if self._is_ignored(guard):
-            return
-        if len(raw) > self._largest:
-            size = f'it has {len(raw)} bytes, more than {MOST_POINTS} points can have'
-            self._reject(f'trajectory rejected: {size}: send it in pieces')
-            return
-        start = guard.start_stamp
-        if len(raw) > _SMALL:
-            self._request(
-                guard,
-                _Request(
-                    lambda: _trajectory(raw, start), self._report, _LEAD, _ON_TRAJECTORY
-                ),
-            )
-            return
-        try:
-            self._on_few_points(guard, _trajectory(raw, start))
-        except MessageError as error:
-            self._reject(_reason(error))
-
-    def _on_few_points(self, guard: Guard, trajectory: Trajectory) -> None:
-        """Stop without points, follow one that is near as a target of a stream."""
-        if not trajectory.points:
-            self._brake(guard)
-            return
-        command = self._target_of(guard, trajectory) or trajectory
-        lead = self._target_lead if isinstance(command, Target) else _LEAD
-        request = _Request(lambda: command, self._report, lead, _ON_TRAJECTORY)
-        self._request(guard, request)
-
-    def _target_of(self, guard: Guard, trajectory: Trajectory) -> Target | None:
-        """Return a single point within the time-out as a target, None for anything else."""
-        config = guard.config
-        timeout = config.reference.stream_timeout
-        now = guard.time
-        point = trajectory.points[0]
-        begin = now if trajectory.begin is None else trajectory.begin
-        ahead = begin + point.time - now
-        if (
-            not can_retarget()
-            or not guard.supervisor.running
-            or len(trajectory.points) > 1
-            or not 0.0 <= ahead <= timeout
-            or trajectory_problems(trajectory, config.joints, now)
-        ):
-            return None
-        order = [trajectory.joints.index(joint) for joint in config.joints]
-        velocities = np.array(point.velocities)
-        return self._points.target(
-            now,
-            np.array(point.positions)[order],
-            timeout=timeout,
-            fastest=np.array(config.limits.velocity),
-            velocities=velocities[order] if velocities.size else None,
-            ahead=ahead,
-        )
-
-    def _on_positions(self, raw: bytes) -> None:
-        guard = self._guard()
-        if guard is None or self._is_ignored(guard):
-            return
-        try:
-            positions = self._read_positions(raw)
-        except (MessageError, TrajectoryError) as error:
-            self._reject(_reason(error))
-            return
-        target = self._positions.target(
-            guard.time,
-            positions,
-            timeout=guard.config.reference.stream_timeout,
-            fastest=np.array(guard.config.limits.velocity),
-        )
-        lead = self._target_lead
-        request = _Request(lambda: target, self._report, lead, _ON_POSITIONS)
-        self._request(guard, request)
-
-    def _read_positions(self, raw: bytes) -> np.ndarray:
-        size = self._decoder.decode(raw)
-        positions: np.ndarray = self._decoder.values.copy()
-        if size != positions.size:
-            raise TrajectoryError(
-                [f'it has {size} positions for {positions.size} joints']
-            )
-        if not np.isfinite(positions).all():
-            raise TrajectoryError([f'its positions are {positions.tolist()}'])
-        return positions
-
-    def _on_stop(
-        self, _request: Trigger.Request, response: Trigger.Response
-    ) -> Trigger.Response:
-        """Stop; what keeps on arriving on the topics is ignored until it pauses."""
-        guard = self._guard()
-        self._is_stopped = True
+    def stop(_request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         response.success = True
-        if guard is None or not guard.supervisor.running:
-            response.message = 'the controller is not in command: nothing to stop'
-            return response
-        self._last_message = guard.time
-        left = self.stop(guard, '~/stop') - guard.time
-        ignored = f'topics are ignored until they pause for {_PAUSE:g} s'
-        response.message = f'braking for {left:.3g} s; {ignored}'
-        self._log.info(response.message)
+        response.message = take_stop()
         return response
 
-    def _is_ignored(self, guard: Guard) -> bool:
-        """Whether a message comes from a sender that has not paused since `~/stop`."""
-        pause = guard.time - self._last_message
-        self._last_message = guard.time
-        if self._is_stopped and 0.0 <= pause < _PAUSE:
-            self._log.warning(
-                f'ignored after ~/stop, until messages pause for {_PAUSE:g} s',
-                throttle_duration_sec=_RARELY,
-            )
-            return True
-        self._is_stopped = False
-        return False
-
-    def _brake(self, guard: Guard) -> None:
-        try:
-            self.stop(guard, _ON_TRAJECTORY)
-        except TrajectoryError as error:
-            self._reject(_reason(error))
-            return
-        self.accepted += 1
-        self._log.info('stopping: a trajectory without points arrived')
-
-    # Plans.
-
-    def _request(self, guard: Guard, request: _Request) -> None:
-        """Plan a motion and follow it, now or as soon as the one before is planned."""
-        if not _is_live(guard):
-            try:
-                self._adopt(guard, guard.plan(request.make()), request)
-            except Exception as error:  # noqa: BLE001 - the current reference continues
-                request.report(None, _reason(error))
-        elif self.job is None:
-            self._submit(guard, request)
-        else:
-            self._drop_next(_REPLACED)
-            self._next = request
-
-    def _submit(self, guard: Guard, request: _Request) -> None:
-        at = guard.time + request.lead
-
-        def plan() -> Plan:
-            return guard.plan(request.make(), at)
-
-        self.job = _Job(request, self._thread.submit(plan))
-
-    def _finish(self, guard: Guard, job: _Job) -> None:
-        request = job.request
-        try:
-            self._adopt(guard, job.plan.result(), request)
-        except LatePlanError as error:
-            if request.lead > _LONGEST_LEAD:
-                request.report(None, _reason(error))
-                return
-            lead = 2.0 * request.lead
-            if request.lead == self._target_lead < _LEAD:
-                self._target_lead = lead
-            if self._next is None:
-                self._submit(guard, request._replace(lead=lead))
-            else:
-                request.report(None, _REPLACED)
-        except Exception as error:  # noqa: BLE001 - the current reference continues
-            request.report(None, _reason(error))
-
-    def _adopt(self, guard: Guard, plan: Plan, request: _Request) -> None:
-        if request.check is not None:
-            request.check(plan)
-        guard.adopt(plan)
-        self.source = request.source
-        request.report(plan, '')
-
-    def _drop(self, reason: str) -> None:
-        """Drop what is being planned."""
-        if self.job is not None:
-            self.job.request.report(None, reason)
-            self.job = None
-        self._drop_next(reason)
-
-    def _drop_next(self, reason: str) -> None:
-        if self._next is not None:
-            self._next.report(None, reason)
-            self._next = None
-
-    # Reports.
-
-    def _report(self, plan: Plan | None, reason: str) -> None:
-        """Count what the topics' senders sent."""
-        if plan is None:
-            self._reject(reason)
-        elif isinstance(plan.command, Target):
-            self.targets += 1
-        else:
-            self.accepted += 1
-            points = len(plan.command.points)
-            note = f' {plan.motion.note}' if plan.motion.note else ''
-            self._log.info(f'following a trajectory of {points} points{note}')
-
-    def _reject(self, reason: str) -> None:
-        self.rejected += 1
-        if reason == self.reason:  # a stream may repeat it at its rate
-            self._log.warning(reason, throttle_duration_sec=_RARELY)
-        else:
-            self._log.warning(reason)
-        self.reason = reason
+    for topic, type_, callback in (
+        (JOINT_TRAJECTORY, JointTrajectory, take_trajectory),
+        (JOINT_POSITIONS, Float64MultiArray, take_positions),
+    ):
+        quality = qos_profile(topic.requested)
+        node.create_subscription(type_, topic.name, callback, quality, raw=True)
+    node.create_service(Trigger, '~/stop', stop)
 
 
 def _is_live(guard: Guard) -> bool:
     """Whether the plant does not wait for the controller."""
     behind = (time.time_ns() - guard.last_stamp) * _NANO
     return guard.watchdog.on or abs(behind) < SAME_CLOCK
-
-
-def _reason(error: Exception) -> str:
-    if isinstance(error, TrajectoryError):
-        return f'{error}'
-    return f'trajectory rejected: {type(error).__name__}: {error}'
-
-
-def _trajectory(raw: bytes, start_stamp: int) -> Trajectory:
-    """Return a message's trajectory in times since the controller's start; stamp 0 means now."""
-    stamp, names, points = joint_trajectory(raw)
-    begin = (stamp - start_stamp) * _NANO if stamp else None
-    own = (TrajectoryPoint(time * _NANO, *arrays) for time, arrays in points)
-    return Trajectory(names, tuple(own), begin)

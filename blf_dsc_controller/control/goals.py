@@ -12,10 +12,8 @@ from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
-from rclpy.impl.rcutils_logger import RcutilsLogger
 
-from blf_dsc_controller.errors import BlfDscError
-from blf_dsc_controller.nodes.goal_messages import (
+from blf_dsc_controller.control.goal_messages import (
     GOAL_VIOLATED,
     INVALID,
     PATH_VIOLATED,
@@ -27,8 +25,10 @@ from blf_dsc_controller.nodes.goal_messages import (
     Goal,
     Outcome,
 )
-from blf_dsc_controller.nodes.goal_tolerances import Tolerances, tolerances
-from blf_dsc_controller.nodes.trajectory_input import TrajectoryInput
+from blf_dsc_controller.control.goal_tolerances import Tolerances, tolerances
+from blf_dsc_controller.control.log import Log
+from blf_dsc_controller.control.motion_input import MotionInput
+from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.reference.retargeting import TrajectoryError
 from blf_dsc_controller.reference.trajectory import Trajectory
 from blf_dsc_controller.supervision.guard import Guard, Plan
@@ -59,10 +59,10 @@ class Goals:
 
     def __init__(
         self,
-        inputs: TrajectoryInput,
+        inputs: MotionInput,
         joints: Sequence[str],
         send: Callable[[Any], None],
-        log: RcutilsLogger,
+        log: Log,
     ) -> None:
         """Follow through `inputs`; `send` passes a message to the clients' side."""
         self._inputs = inputs

@@ -13,8 +13,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from blf_dsc_controller.control.goal_messages import JointTolerance
 from blf_dsc_controller.errors import BlfDscError
-from blf_dsc_controller.nodes.goal_messages import JointTolerance
 
 _NONE = -1.0  # as sent
 _ROUNDING = 1e-6

@@ -1,0 +1,205 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What `/diagnostics` says about a controller: its state, loop, learning and load."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from blf_dsc_controller.control.log import Log
+from blf_dsc_controller.control.motion_input import MotionInput
+from blf_dsc_controller.law.external_torque import DISTANCE
+from blf_dsc_controller.law.telemetry import load_text
+from blf_dsc_controller.messages.topics import LOAD, PHASE, REASON, REJECTED, STOPS
+from blf_dsc_controller.supervision.guard import Guard
+from blf_dsc_controller.supervision.supervisor import Phase, Supervisor
+
+# Levels of diagnostic_msgs/msg/DiagnosticStatus.
+OK = b'\x00'
+WARN = b'\x01'
+ERROR = b'\x02'
+STALE = b'\x03'
+
+Part = tuple[str, bytes, str, Mapping[str, Any]]
+"""Status of a part: its name, level, message and values."""
+
+_PHASES = {
+    Phase.INACTIVE: (STALE, 'not in command'),
+    Phase.STARTING: (WARN, 'waiting for a joint state to start from'),
+    Phase.APPROACHING: (OK, 'approaching the reference'),
+    Phase.TRACKING: (OK, 'tracking'),
+    Phase.SAFE_STOP: (ERROR, 'stopped'),
+}
+
+
+_CHATTER = 0.11  # of the torque limit; 20 bits leave a Panda 0.01, 16 bits 0.13
+
+
+class StatusReport:
+    """The parts of a controller's status.
+
+    Attributes:
+        rejected: disturbance columns that are not estimated, and why.
+        trajectories: accepted and rejected trajectories.
+    """
+
+    def __init__(self, log: Log) -> None:
+        """Warn, once, of a torque that chatters."""
+        self.rejected: Mapping[str, str] = {}
+        self.trajectories: MotionInput | None = None
+        self._log = log
+        self._has_warned = False
+
+    def parts(
+        self, lifecycle: str, guard: Guard | None, others: int = 0, missing: str = ''
+    ) -> list[Part]:
+        """Return the parts, first the state.
+
+        Args:
+            lifecycle: state of the node.
+            guard: None while the node is not configured.
+            others: other publishers of torques.
+            missing: what is wrong with the node torque_watchdog; empty if nothing is.
+        """
+        parts = [self._state(lifecycle, guard)]
+        if guard is not None:
+            parts += [self._loop(guard, others, missing), self._learning(guard)]
+            if guard.controller.settings.weighed:
+                parts.append(_load(guard))
+            if guard.config.contact.enabled:
+                parts.append(_contact(guard))
+        return parts
+
+    def _state(self, lifecycle: str, guard: Guard | None) -> Part:
+        supervisor = guard.supervisor if guard else Supervisor()
+        level, message = _PHASES[supervisor.phase]
+        values: dict[str, Any] = {PHASE: supervisor.phase, REASON: supervisor.reason}
+        values['lifecycle'] = lifecycle
+        if guard is None:
+            message = 'not configured'
+        else:
+            values[STOPS] = supervisor.stops
+            values['safe torque'] = guard.config.safety.torque
+        if supervisor.text:
+            message += f': {supervisor.text}'
+        return 'state', level, message, values
+
+    def _loop(self, guard: Guard, others: int, missing: str) -> Part:
+        states = guard.states
+        samples = guard.samples
+        state = guard.controller.state
+        off = f'off: {guard.watchdog.why_off}'.removesuffix(': ')
+        values = {
+            'samples': guard.controller.samples,
+            'repeated states ignored': states.repeated,
+            'samples outside the bound': samples.outside,
+            'largest error against the bound': f'{samples.ratio.max():.3g}',
+            **_at_tool(guard),
+            'states missed': states.missed,
+            'samples with a torque at its limit': samples.saturated,
+            'messages for other joints': guard.foreign,
+            'watchdog on the steady clock': 'on' if guard.watchdog.on else off,
+            'samples cut by the torque limit': _by_joint(guard, state.level_cuts),
+            'samples cut by the torque rate limit': _by_joint(guard, state.rate_cuts),
+            **(self.trajectories.values if self.trajectories else {}),
+        }
+        level = WARN
+        message = 'torque{} at its limit: adaptation by the tracking error is frozen'
+        if others:
+            level = ERROR
+            message = 'another node commands torques, too'
+        elif missing:
+            message = missing
+        elif samples.outside:
+            message = 'the error has left its bound'
+        elif samples.saturated_time > 0.0:
+            message = message.format('')
+        elif guard.has_sample and guard.controller.sample.cuts.any():
+            message = message.format(' rate')
+        elif chatter := chatter_of(guard):
+            message = chatter
+            if not self._has_warned:
+                self._has_warned = True
+                self._log.warning(chatter)
+        else:
+            level = OK
+            message = _PHASES[guard.supervisor.phase][1]
+        return 'loop', level, message, values
+
+    def _learning(self, guard: Guard) -> Part:
+        state = guard.controller.state
+        learning = 'latched' if state.latched[0] else 'not yet excited'
+        values = {'lambda_min': f'{state.lambda_min[0]:.3g}', 'learning': learning}
+        values['model changes'] = f'{state.changes[0]:.0f}'
+        values |= {
+            f'{REJECTED}{column}': reason for column, reason in self.rejected.items()
+        }
+        if self.rejected:
+            return (
+                'learning',
+                WARN,
+                f'not estimated: {", ".join(self.rejected)}',
+                values,
+            )
+        return 'learning', OK, learning, values
+
+
+def _at_tool(guard: Guard) -> Mapping[str, str]:
+    errors = guard.samples.tool_errors
+    if errors is None:
+        return {}
+    error, bound, angle, angle_bound = (1e3 * errors).tolist()
+    return {
+        'error at the tool': f'{error:.3g} of {bound:.3g} mm',
+        'angle at the tool': f'{angle:.3g} of {angle_bound:.3g} mrad',
+    }
+
+
+def _load(guard: Guard) -> Part:
+    load = guard.controller.sample.load.tolist()
+    values = {name: f'{value:.6g}' for name, value in zip(LOAD, load, strict=True)}
+    return 'load', OK, f'held: {load_text(load)}', values
+
+
+def _contact(guard: Guard) -> Part:
+    """Return whether something touches the arm, and what did last."""
+    last = guard.contact
+    values: dict[str, Any] = {
+        'contacts': guard.contacts,
+        'distance': f'{guard.controller.sample.contact[DISTANCE]:.3g}',
+        'threshold': f'{guard.config.contact.threshold:g}',
+    }
+    if last is not None:
+        values |= {
+            'last contact': f'at {(last.stamp - guard.start_stamp) * 1e-9:.3f} s',
+            'joint': last.joint,
+            'torque from outside': f'{last.torque:+.3g} N m',
+            'explained by model and noise': f'{last.interval:.3g} N m',
+        }
+    if not guard.supervisor.running:
+        return 'contact', OK, 'not looked for: the law is not in command', values
+    if last is not None and guard.controller.state.contact[0] > 0.0:
+        return 'contact', WARN, last.text, values
+    return 'contact', OK, 'nothing touches the arm', values
+
+
+def _by_joint(guard: Guard, counts: np.ndarray) -> str:
+    pairs = zip(guard.config.joints, counts, strict=True)
+    return (
+        ', '.join(f'{joint} {count:.0f}' for joint, count in pairs if count) or 'none'
+    )
+
+
+def chatter_of(guard: Guard) -> str:
+    """Return the warning about a torque that chatters, as with coarse encoders; empty if none."""
+    steps = np.sqrt(guard.controller.checks.chatter)
+    worst = int(np.argmax(steps / guard.controller.settings.torque_limit))
+    if steps[worst] <= _CHATTER * guard.controller.settings.torque_limit[worst]:
+        return ''
+    return (
+        f'the torque of {guard.config.joints[worst]} changes by {steps[worst]:.2g} N m rms each '
+        'sample: its measured velocity is coarse or noisy. Lower the pole of the velocity filter '
+        'and add its lag to robot.lag, whose gains are softer'
+    )

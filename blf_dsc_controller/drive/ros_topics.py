@@ -1,0 +1,222 @@
+# SPDX-License-Identifier: Apache-2.0
+"""ROS beside the loop: the controller's topics, in a process that the loop never waits for.
+
+The process (`nodes/topics_process.py`) has the name, the topics and `~/stop` of the
+node.  If it ends or hangs, the loop goes on without.
+"""
+
+from __future__ import annotations
+
+import os
+import socket
+import subprocess
+import sys
+from time import monotonic
+
+from blf_dsc_controller.control.arm_controller import ArmController
+from blf_dsc_controller.control.motion_input import MotionInput
+from blf_dsc_controller.control.status_report import StatusReport
+from blf_dsc_controller.errors import BlfDscError
+from blf_dsc_controller.law.telemetry import rejected_columns
+from blf_dsc_controller.messages import topic_link, topics
+from blf_dsc_controller.messages.journal import encode_string
+from blf_dsc_controller.messages.link import Link
+from blf_dsc_controller.messages.topic_link import KINDS, LOG, READY, STATUS, STOP
+from blf_dsc_controller.messages.topics import Topic
+from blf_dsc_controller.supervision.guard import Guard
+
+_PROCESS = 'blf_dsc_controller.nodes.topics_process'
+_START = 30.0  # s, for ROS to start
+_END = 10.0  # s, for its last messages
+_STATUS_PERIOD = 1.0  # s
+_TELEMETRY = (
+    topics.REFERENCE,
+    topics.TRACKING_ERROR,
+    topics.BOUND,
+    topics.MONITOR,
+    topics.EXTERNAL_TORQUE,
+    topics.EXTERNAL_WRENCH,
+)
+_ALWAYS = (
+    topics.JOINT_STATES,
+    topics.COMMANDS,
+    topics.JOURNAL,
+    topics.TARGETS,
+    topics.STATE,
+    topics.DIAGNOSTICS,
+)
+
+
+class RosTopics:
+    """The topics of a controller that runs in a loop without ROS.
+
+    It takes the messages of the loop, and passes on trajectories, targets and stops.
+
+    Attributes:
+        problem: why there are no topics any more, or how many messages were lost; or empty.
+    """
+
+    def __init__(self, controller: ArmController, namespace: str = '') -> None:
+        """Start the process, with the names in a namespace, and wait for ROS.
+
+        Raises:
+            BlfDscError: it did not start.
+        """
+        config = controller.config
+        self._guard = controller.guard
+        self._estimates = controller.estimate_names
+        self._sent = frozenset(_ALWAYS)
+        if config.telemetry.enabled:
+            self._sent |= frozenset(_TELEMETRY)
+        self._link, self._process = _start(config.joints, namespace, self._sent)
+        self._inputs = MotionInput(
+            len(config.joints), lambda: self._guard, _is_live, _LinkLog(self._link)
+        )
+        self._report = StatusReport(_LinkLog(self._link))
+        self._report.trajectories = self._inputs
+        self._late = ''
+        self._reported = -1.0, -1  # s, and revision of the state
+        self._columns = b''
+        self._await_ros()
+        if config.robot.urdf:
+            description = encode_string(config.robot.text)
+            self._link.put(KINDS[topics.ROBOT_DESCRIPTION], description)
+        controller.add_output(self)
+
+    @property
+    def problem(self) -> str:
+        """Why there are no topics any more, or how many messages were lost; or empty."""
+        if self._link.broken:
+            return 'ROS ended before the loop, which went on without its topics'
+        if self._link.lost:
+            return f'ROS did not take {self._link.lost} messages in time: they were dropped'
+        return self._late
+
+    def write(self, _stamp: int, topic: Topic, raw: bytes) -> None:
+        """Publish a serialised message, or drop it."""
+        if topic in self._sent:
+            self._link.put(KINDS[topic], raw)
+
+    def follow(self) -> None:
+        """Send what waits and take what has arrived; after each state's torque."""
+        if self._link.broken:
+            return
+        guard = self._guard
+        self._inputs.poll(guard)
+        for kind, content in self._link.messages():
+            self._take(kind, content)
+        self._report_now_and_then(guard)
+        self._link.flush()
+
+    def close(self) -> None:
+        """Publish what waits, and end the process."""
+        if not self._link.broken:
+            self._tell_status(self._guard)
+        end = monotonic() + _END
+        self._link.close(_END)
+        try:
+            self._process.wait(max(end - monotonic(), 0.0))
+        except subprocess.TimeoutExpired:
+            self._late = 'ROS did not take the last messages'
+            self._process.kill()
+            self._process.wait()
+
+    def _take(self, kind: int, content: bytes) -> None:
+        if kind == STOP:
+            text = self._inputs.take_stop()
+            self._link.put(STOP, topic_link.encode(text))
+        elif kind == KINDS[topics.JOINT_TRAJECTORY]:
+            self._inputs.take_trajectory(content)
+        elif kind == KINDS[topics.JOINT_POSITIONS]:
+            self._inputs.take_positions(content)
+
+    def _report_now_and_then(self, guard: Guard) -> None:
+        """Tell the status every second, and when the state changes."""
+        since, revision = self._reported
+        now = monotonic()
+        if now - since > _STATUS_PERIOD or guard.supervisor.revision != revision:
+            self._reported = now, guard.supervisor.revision
+            self._tell_status(guard)
+
+    def _tell_status(self, guard: Guard) -> None:
+        columns = guard.controller.state.active.tobytes()
+        if columns != self._columns:
+            self._columns = columns
+            rejected = rejected_columns(guard.controller, self._estimates)
+            self._report.rejected = rejected
+        parts = [
+            (
+                name,
+                level[0],
+                message,
+                {key: f'{value}' for key, value in values.items()},
+            )
+            for name, level, message, values in self._report.parts('active', guard)
+        ]
+        status = {'revision': guard.supervisor.revision, 'parts': parts}
+        self._link.put(STATUS, topic_link.encode(status))
+
+    def _await_ros(self) -> None:
+        """Wait until the topics exist."""
+        end = monotonic() + _START
+        while monotonic() < end and not self._link.broken:
+            self._link.wait(0.1)
+            if any(kind == READY for kind, _ in self._link.messages()):
+                return
+        self._process.kill()
+        self._process.wait()
+        raise BlfDscError(
+            'ROS did not start: see above; without --ros the robot is controlled without topics'
+        )
+
+
+def _start(
+    joints: tuple[str, ...], namespace: str, sent: frozenset[Topic]
+) -> tuple[Link, subprocess.Popen[bytes]]:
+    """Start the process, which ends with the other end of the link."""
+    ours, theirs = socket.socketpair()
+    kinds = ','.join(str(KINDS[topic]) for topic in sent)
+    with theirs:
+        process = subprocess.Popen(
+            [
+                sys.executable,
+                '-m',
+                _PROCESS,
+                f'{theirs.fileno()}',
+                f'/{namespace.strip("/")}',
+                kinds,
+                *joints,
+            ],
+            pass_fds=[theirs.fileno()],
+            env=os.environ | {'PYTHONPATH': os.pathsep.join(filter(None, sys.path))},
+        )
+    return Link(ours), process
+
+
+def _is_live(_guard: Guard) -> bool:
+    """Whether the robot does not wait: never, also if it is a simulated one."""
+    return True
+
+
+class _LinkLog:
+    """The log of the node in the other process."""
+
+    def __init__(self, link: Link) -> None:
+        self._link = link
+        self._warned: dict[str, float] = {}
+
+    def info(self, message: str) -> None:
+        self._send('info', message)
+
+    def warning(self, message: str, *, throttle_duration_sec: float = 0.0) -> None:
+        now = monotonic()
+        if now - self._warned.get(message, -1e9) >= throttle_duration_sec:
+            self._warned = {message: now}
+            self._send('warning', message)
+
+    def error(self, message: str) -> None:
+        self._send('error', message)
+
+    def _send(self, level: str, text: str) -> None:
+        content = topic_link.encode({'level': level, 'text': text})
+        self._link.put(LOG, content)

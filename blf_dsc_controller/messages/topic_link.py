@@ -1,0 +1,46 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a loop without ROS and the process of its topics send each other over a `Link`.
+
+The kind of a message is that of a topic, whose content is the serialised message, or
+one of those below, whose content is JSON.
+"""
+
+from __future__ import annotations
+
+import json
+from typing import Any
+
+from blf_dsc_controller.messages import topics
+from blf_dsc_controller.messages.topics import Topic
+
+TOPICS = (
+    *topics.TOPICS,
+    topics.ROBOT_DESCRIPTION,
+    topics.JOINT_TRAJECTORY,
+    topics.JOINT_POSITIONS,
+)
+KINDS = {topic: kind for kind, topic in enumerate(TOPICS)}
+
+READY = 100
+"""The topics exist: null."""
+STATUS = 101
+"""What `/diagnostics` says: `revision` of the state, `parts` (name, level, message, values)."""
+LOG = 102
+"""For the log of the node: `level` and `text`."""
+STOP = 103
+"""`~/stop` was called, and what became of it: text."""
+
+
+def topic_of(kind: int) -> Topic | None:
+    """Return the topic of a kind; None if it is not a topic's."""
+    return TOPICS[kind] if kind < len(TOPICS) else None
+
+
+def encode(content: Any) -> bytes:
+    """Return JSON."""
+    return json.dumps(content).encode()
+
+
+def decode(content: bytes) -> Any:
+    """Return what JSON says."""
+    return json.loads(content)

@@ -1,0 +1,147 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The process of the topics of `blf_dsc drive --ros`: the controller's node without its loop.
+
+It publishes what the loop sends, and sends the loop what arrives: trajectories, streamed positions
+and stops. It ends with the connection.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+import socket
+import sys
+import threading
+from collections.abc import Callable, Sequence
+from queue import Empty, SimpleQueue
+from typing import Any
+
+import rclpy
+from diagnostic_msgs.msg import DiagnosticStatus
+from rclpy.experimental import EventsExecutor
+from rclpy.node import Node
+
+from blf_dsc_controller.messages import topic_link, topics
+from blf_dsc_controller.messages.link import Link
+from blf_dsc_controller.messages.topic_link import (
+    KINDS,
+    LOG,
+    READY,
+    STATUS,
+    STOP,
+    TOPICS,
+)
+from blf_dsc_controller.nodes import process
+from blf_dsc_controller.nodes.diagnostics import DiagnosticsPublisher
+from blf_dsc_controller.nodes.endpoints import create_publisher
+from blf_dsc_controller.nodes.trajectory_input import connect
+
+_POLL = 0.1  # s
+_PATIENCE = 1.0  # s, for the loop's answer to ~/stop
+_NICE = 5  # less urgent than the loop
+_SILENT = 'no answer from the loop: use the emergency stop'
+
+
+class LoopTopics:
+    """The topics of a loop in another process, by its node."""
+
+    def __init__(
+        self, node: Node, link: Link, kinds: Sequence[int], joints: Sequence[str]
+    ) -> None:
+        """Create the topics of these kinds."""
+        self._node = node
+        self._link = link
+        self._log: dict[str, Callable[[str], Any]] = {
+            'info': node.get_logger().info,
+            'warning': node.get_logger().warning,
+            'error': node.get_logger().error,
+        }
+        shared = {topics.STATE, topics.DIAGNOSTICS}
+        self.publishers = {
+            kind: create_publisher(node, TOPICS[kind])
+            for kind in (*kinds, KINDS[topics.ROBOT_DESCRIPTION])
+            if TOPICS[kind] not in shared
+        }
+        self._state = create_publisher(node, topics.STATE)
+        self._diagnostics = DiagnosticsPublisher(node, joints)
+        self._revision = -1
+        self._answers: SimpleQueue[str] = SimpleQueue()
+        connect(
+            node,
+            lambda raw: self._pass_on(topics.JOINT_TRAJECTORY, raw),
+            lambda raw: self._pass_on(topics.JOINT_POSITIONS, raw),
+            self._stop,
+        )
+
+    def take(self, kind: int, content: bytes) -> None:
+        """Do what a message of the loop says."""
+        publisher = self.publishers.get(kind)
+        if publisher is not None:
+            publisher.publish(content)
+        elif kind == STATUS:
+            self._report(topic_link.decode(content))
+        elif kind == STOP:
+            self._answers.put(topic_link.decode(content))
+        elif kind == LOG:
+            entry = topic_link.decode(content)
+            self._log[entry['level']](entry['text'])
+
+    def _report(self, status: dict[str, Any]) -> None:
+        parts = (
+            (name, bytes([level]), message, values)
+            for name, level, message, values in status['parts']
+        )
+        state: DiagnosticStatus = self._diagnostics.publish(*parts)
+        if status['revision'] != self._revision:
+            self._revision = status['revision']
+            self._state.publish(state)
+
+    def _pass_on(self, topic: topics.Topic, raw: bytes) -> None:
+        self._link.put(KINDS[topic], bytes(raw))
+        self._link.flush()
+
+    def _stop(self) -> str:
+        self._link.put(STOP, b'null')
+        self._link.flush()
+        try:
+            return self._answers.get(timeout=_PATIENCE)
+        except Empty:
+            return _SILENT
+
+
+def _listen(link: Link, loop: LoopTopics) -> None:
+    """Take the loop's messages until it ends."""
+    while not link.broken:
+        link.wait(_POLL)
+        for kind, content in link.messages():
+            loop.take(kind, content)
+
+
+def main() -> int:
+    """Run until the loop ends."""
+    descriptor, namespace, kinds, *joints = sys.argv[1:]
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the loop may still brake
+    signal.signal(signal.SIGTERM, signal.SIG_IGN)
+    os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
+    os.nice(_NICE)
+    link = Link(socket.socket(fileno=int(descriptor)))
+    rclpy.init(args=[], signal_handler_options=rclpy.SignalHandlerOptions.NO)
+    node = Node(topics.CONTROLLER, namespace=namespace, start_parameter_services=False)
+    loop = LoopTopics(node, link, [int(kind) for kind in kinds.split(',')], joints)
+    with EventsExecutor() as executor:
+        executor.add_node(node)
+        listener = threading.Thread(target=_listen, args=(link, loop), daemon=True)
+        listener.start()
+        link.put(READY, b'null')
+        while listener.is_alive():
+            link.flush()
+            executor.spin_once(timeout_sec=_POLL)
+        process.drain(loop.publishers.values())
+        executor.remove_node(node)
+    node.destroy_node()
+    rclpy.try_shutdown()
+    return 0
+
+
+if __name__ == '__main__':
+    sys.exit(main())
