@@ -29,6 +29,7 @@ from blf_dsc_controller import __version__
 _GROUPS = {  # module and function of each
     'offline': ('offline', 'measure'),
     'growth': ('offline', 'measure_growth'),
+    'guarded': ('guarded', 'measure'),
     'node': ('nodes', 'measure'),
     'startup': ('nodes', 'measure_start'),
 }

@@ -50,6 +50,18 @@ def test_growth_is_written_as_a_table(monkeypatch, tmp_path):
         offline.updates('recommended')
 
 
+def test_cost_of_tool_bound_and_contacts_is_measured_in_turns(monkeypatch):
+    guarded = tiny(monkeypatch, 'guarded', _STATES=5)
+    assert contestants(list(guarded.measure())) == [
+        f'{name}: {part}'
+        for name in ('bound at the tool', 'contacts', 'both')
+        for part in ('until the torque', 'whole')
+    ]
+    monkeypatch.setattr(guarded, '_FULL', 1.0)
+    with pytest.raises(RuntimeError, match='nothing is learned in 1 s'):
+        guarded.Contestant({})
+
+
 @pytest.mark.skipif(shutil.which('cc') is None, reason='there is no C compiler')
 def test_loop_compared_with_c_and_numpy(monkeypatch):
     """Over 10 s, in which learning begins, C gives the same trajectory."""

@@ -6,7 +6,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from paper_case import configured
-from random_arm import PANDA
+from random_arm import PANDA, chain_of
 
 from blf_dsc_controller.analysis.metrics import format_table, measure
 from blf_dsc_controller.analysis.panels import panels
@@ -129,14 +129,16 @@ def rotation(config, q):
     return frames(config.robot.chain(PANDA), q)[-1][:3, :3]
 
 
-def test_jacobian_is_the_rate_of_the_tip():
-    """By the difference of two postures 1e-6 rad apart."""
-    chain = loop_of(NOTHING).controller.robot.chain(PANDA)
-    q, step = np.linspace(-1.0, 1.0, 7), 1e-6
+@pytest.mark.parametrize('name', ['panda', 'nine'])
+def test_jacobian_is_the_rate_of_the_tip(name):
+    """By the difference of two postures 1e-6 rad apart, or m of a joint that slides."""
+    chain = chain_of(name)
+    n = len(chain.joints)
+    q, step = np.linspace(-1.0, 1.0, n), 1e-6
     J = TipWrench(chain).jacobian(q)
     tip = frames(chain, q)[-1]
-    for i in range(7):
-        moved = frames(chain, q + step * np.eye(7)[i])[-1]
+    for i in range(n):
+        moved = frames(chain, q + step * np.eye(n)[i])[-1]
         shift = tip[:3, :3].T @ (moved[:3, 3] - tip[:3, 3]) / step
         turn = tip[:3, :3].T @ moved[:3, :3]
         spin = np.array([turn[2, 1], turn[0, 2], turn[1, 0]]) / step
