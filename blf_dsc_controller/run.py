@@ -34,15 +34,17 @@ class Series:
         """Return the values of one name, (m,)."""
         return self.values[:, self.names.index(name)]
 
-    def held(
-        self, stamp: Stamps, columns: slice | NDArray[np.intp] = slice(None)
-    ) -> Floats:
-        """Return the last values at or before each stamp.
+    def held(self, stamp: Stamps, names: Sequence[str]) -> Floats:
+        """Return the last values of these names at or before each stamp.
 
         The first values for earlier stamps.
         """
-        index = np.searchsorted(self.stamp, stamp, side='right') - 1
-        return self.values[np.maximum(index, 0)][:, columns]
+        before = np.searchsorted(self.stamp, stamp, side='right') - 1
+        rows = np.maximum(before, 0)
+        found = np.empty((len(rows), len(names)))
+        for column, j in zip(found.T, self.indices(names), strict=True):
+            column[:] = self.values[rows, j]  # one at a time: it may be on disk
+        return found
 
 
 class Stop(NamedTuple):

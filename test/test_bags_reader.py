@@ -310,7 +310,13 @@ def test_any_rows_of_long_topics_of_many_layouts_are_read():
 
 def test_series_holds_its_values_and_the_first_before_it_begins():
     series = Series(('a',), np.array([5, 9]), np.array([[1.0], [2.0]]))
-    assert series.held(np.array([0, 5, 8, 9, 20])).ravel().tolist() == [1, 1, 1, 2, 2]
+    assert series.held(np.array([0, 5, 8, 9, 20]), ['a']).ravel().tolist() == [
+        1,
+        1,
+        1,
+        2,
+        2,
+    ]
 
 
 def test_states_are_held_from_their_own_stamp_on():

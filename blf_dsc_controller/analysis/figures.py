@@ -16,7 +16,12 @@ from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.ticker import FuncFormatter
 
-from blf_dsc_controller.analysis.metrics import change_times, measure, true_change_times
+from blf_dsc_controller.analysis.metrics import (
+    Metrics,
+    change_times,
+    measure,
+    true_change_times,
+)
 from blf_dsc_controller.analysis.panels import (
     ALARM,
     BLUE,
@@ -144,15 +149,16 @@ def head(axes: Axes, title: str, *, legend_at: float | None = None) -> None:
     )
 
 
-def draw(run: Run, folder: Path) -> list[Path]:
+def draw(run: Run, folder: Path, metrics: Metrics | None = None) -> list[Path]:
     """Draw tracking.png and what else the run has data for; return the paths.
 
     These are change.png if a simulated arm changed, and parameters.png if parameters
-    were learned. The folder is created if necessary.
+    were learned. The folder is created if necessary. `metrics` are those of the run, if
+    they have been measured already.
     """
     folder.mkdir(parents=True, exist_ok=True)
     tracking, change, parameters = (folder / name for name in NAMES)
-    metrics = measure(run)
+    metrics = metrics or measure(run)
     n = len(run.joints)
     found = panels([run])
 

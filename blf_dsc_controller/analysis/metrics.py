@@ -90,17 +90,18 @@ def estimates_of(run: Run) -> Estimates | None:
     names = _parameters(run.monitor.names)
     truth = run.truth
     arm = run.arm
+    of_torques = arm is not None and _parameters(arm.units) == names
+    is_known = truth is not None and set(names) == set(_parameters(truth.names))
+    R = None  # |R (P^ - P)| is the norm of the torques H P^ - H P
+    if arm is not None and of_torques and is_known:  # before the memory is full
+        R = np.asarray(np.linalg.qr(_torques(run, arm.regressor), 'r'))
     step = -(-run.monitor.stamp.size // _MAX_SAMPLES)
     rows = slice((run.monitor.stamp.size - 1) % step, None, step)
     stamp = run.monitor.stamp[rows]
     estimate = run.monitor.values[rows, run.monitor.indices(names)]
-    of_torques = arm is not None and _parameters(arm.units) == names
     true = error = None
-    if truth is not None and set(names) == set(_parameters(truth.names)):
-        true = truth.held(stamp, truth.indices(names))
-        R = None  # |R (P^ - P)| is the norm of the torques H P^ - H P
-        if arm is not None and of_torques:
-            R = np.asarray(np.linalg.qr(_torques(run, arm.regressor), 'r'))
+    if truth is not None and is_known:
+        true = truth.held(stamp, names)
         error = _relative_error(estimate, true, R)
     return Estimates(names, run.time_of(stamp), estimate, true, error, of_torques)
 
@@ -178,16 +179,28 @@ def errors_of_bodies(
     Off the truth or, where none is known, off the first estimates; a rejected estimate
     is NaN. `prior` (p,) are deviations.
     """
-    origin = (
-        estimate[:1] if true is None else np.where(np.isnan(true), estimate[0], true)
+    return np.array(
+        [
+            _rms_of_known(
+                estimate[:, body],
+                None if true is None else true[:, body],
+                prior[body],
+            )
+            for body in bodies.values()
+        ]
     )
+
+
+def _rms_of_known(estimate: Floats, true: Floats | None, prior: Floats) -> Floats:
+    """Return the rms error (m,) of the estimates (m, k) of one body."""
+    origin = estimate[:1]
+    if true is not None:
+        origin = np.where(np.isnan(true), estimate[0], true)
     square = (100.0 * (estimate - origin) / prior) ** 2
     with np.errstate(divide='ignore', invalid='ignore'):  # all rejected: 0 / 0
-        each = [
-            np.nansum(square[:, k], axis=1) / np.isfinite(square[:, k]).sum(axis=1)
-            for k in bodies.values()
-        ]
-        return np.sqrt(each)
+        mean = np.nansum(square, axis=1) / np.isfinite(square).sum(axis=1)
+    rms: Floats = np.sqrt(mean)
+    return rms
 
 
 def latch_time(run: Run) -> float:

@@ -369,7 +369,8 @@ def table(run: Run, rows: slice = slice(None)) -> dict[str, NDArray[Any]]:
     for topic in ('monitor', 'external', 'truth', 'timing'):
         series = getattr(run, topic)
         if series is not None:
-            for name, column in zip(series.names, series.held(stamp).T, strict=True):
+            held = series.held(stamp, series.names)
+            for name, column in zip(series.names, held.T, strict=True):
                 unit = 'N m' if topic == 'external' else _unit(name, run)
                 columns[f'{topic} {name} [{unit}]'] = column
     return columns

@@ -67,7 +67,7 @@ def plot(options: Namespace) -> None:
     metrics = measure(run)
     options.out.mkdir(parents=True, exist_ok=True)
     write_json(metrics, options.out / 'summary.json')
-    written = [options.out / 'summary.json', *figures.draw(run, options.out)]
+    written = [options.out / 'summary.json', *figures.draw(run, options.out, metrics)]
     print(format_table(metrics))
     print('wrote', ', '.join(str(path) for path in written))
 

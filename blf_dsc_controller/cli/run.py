@@ -151,7 +151,7 @@ def _report(out: Path) -> bool:
     recorded = recorded_run(content)
     metrics = measure(recorded)
     write_json(metrics, out / 'summary.json')
-    pictures = draw(recorded, out)
+    pictures = draw(recorded, out, metrics)
     print(format_table(metrics))
     for topic, text in content.losses.items():
         print(f'warning: messages of {topic} are missing in the bag: {text}')
