@@ -19,11 +19,15 @@ from random_arm import (
     truth_of,
 )
 
+from blf_dsc_controller.arms.model import regressors_at
 from blf_dsc_controller.arms.urdf import inertia_of
+from blf_dsc_controller.cli.main import main
 from blf_dsc_controller.configuration.robot import Robot
+from blf_dsc_controller.identification.foresight import foresee, foresight_lines
 from blf_dsc_controller.identification.identify import identify_arm
 from blf_dsc_controller.identification.recording import joined
 from blf_dsc_controller.identification.summary import notes_of, problems_of
+from blf_dsc_controller.identification.values import base_matrix
 
 ROBOT = Robot(urdf=PANDA_TEXT, tip='panda_hand_tcp')
 TRUTH = truth_of(PANDA_CHAIN, 1)
@@ -128,3 +132,46 @@ def test_intervals_of_friction_hold_where_its_law_is_another_one(law):
         found = identify_arm(recording_of(seen, period=10 * PERIOD), ROBOT)
         held += is_covered(found, truth)[-14:].tolist()
     assert sum(held) >= 35
+
+
+def test_what_a_motion_can_show_is_foreseen_without_torques(plain, simple):
+    """Intervals are those of the fit, times 2 % over its own residuals; the rank is numpy's."""
+    recording = recording_of(plain)
+    blind = recording._replace(torque=np.zeros_like(recording.torque))
+    foreseen = foresee(blind, ROBOT)
+    K = base_matrix(simple.parameters, len(PANDA))[: len(foreseen.names)]
+    fitted = np.sqrt(np.einsum('ia,ab,ib->i', K, simple.covariance, K))
+    ratio = foreseen.after[foreseen.shown] / fitted[foreseen.shown]
+    share = np.median(simple.score.errors[2] / simple.score.torque)
+    assert 0.5 < np.median(ratio) * share / 0.02 < 2.0
+    assert np.percentile(ratio, 90) < 3.0 * np.percentile(ratio, 10)
+    assert foreseen.shown.mean() > 0.8
+    few = plain.copy()
+    few[:, 0, 2:] = few[0, 0, 2:]
+    foreseen = foresee(recording_of(few), ROBOT)
+    still = np.zeros((200, 7))
+    q, dq, ddq = (
+        np.hstack((row[:, :2], still[:, 2:]))
+        for row in np.random.default_rng(0).normal(size=(3, 200, 7))
+    )
+    q[:, 2:] = few[0, 0, 2:]
+    model = simple.parameters.model
+    moving = regressors_at(model, q, dq, dq, ddq)[:, :2]  # others may stick
+    rows = moving.reshape(-1, model.p)
+    assert foreseen.rank == np.linalg.matrix_rank(rows, tol=1e-8)
+    assert not foreseen.shown[-1]  # the rotor of a joint at rest
+    assert any('NOT SHOWN' in line for line in foresight_lines(foreseen))
+
+
+def test_plan_without_torques_is_foreseen_and_nothing_written(tmp_path, capsys):
+    (tmp_path / 'panda.urdf').write_text(PANDA_TEXT)
+    time = np.arange(0.0, 10.0, 0.01)
+    columns = [time, *reference_of(PANDA_CHAIN, 2).at(time)[:, 0].T]
+    names = ','.join(['t', *(f'q_{i}' for i in range(1, 8))])
+    plan = tmp_path / 'plan.csv'
+    np.savetxt(plan, np.column_stack(columns), delimiter=',', header=names, comments='')
+    words = ['identify', str(plan), '--urdf', str(tmp_path / 'panda.urdf')]
+    assert main([*words, '--tip', 'panda_hand_tcp', '--foresee']) == 0
+    assert 'columns of rank 48 for 48 base parameters' in capsys.readouterr().out
+    assert main([*words, '--out', str(tmp_path / 'new.urdf')]) == 1
+    assert 'which columns are tau' in capsys.readouterr().err

@@ -24,8 +24,16 @@ from blf_dsc_controller.identification.exciting_reference import (
     ExcitationProblem,
     search,
 )
+from blf_dsc_controller.identification.foresight import (
+    foresee,
+    foresight_lines,
+)
 from blf_dsc_controller.identification.identified import Identified
-from blf_dsc_controller.identification.identify import STAGES, identify_bag
+from blf_dsc_controller.identification.identify import (
+    STAGES,
+    foresee_recordings,
+    identify_bag,
+)
 from blf_dsc_controller.identification.mjcf import mjcf
 from blf_dsc_controller.identification.parameters import robot_parameters
 from blf_dsc_controller.identification.summary import (
@@ -50,7 +58,7 @@ _WIDTH = 98
 
 def identify(options: Namespace) -> int:
     """Identify the arm, print what changed, and write the results and the page."""
-    outputs = _outputs(options)
+    outputs = [] if options.foresee else _outputs(options)
     robot = Robot(
         urdf=options.urdf,
         base=options.base,
@@ -58,6 +66,11 @@ def identify(options: Namespace) -> int:
         gravity=tuple(options.gravity),
         payload=options.rated_payload,
     )
+    if options.foresee:
+        names = NameMap.parse(options.map)
+        motion = foresee_recordings(options.bags, robot, options.namespace, names)
+        print('\n'.join(foresight_lines(motion)))
+        return 0
     pick_up = options.payload is True
     with tqdm(total=len(STAGES), unit='stage', leave=False, disable=None) as bar:
 
@@ -100,7 +113,9 @@ def _outputs(options: Namespace) -> list[Path]:
     """Return the files to write, and make room for them and the page."""
     outputs: list[Path] = options.out
     if not (outputs or options.report or options.payload):
-        raise BlfDscError('nothing to write: give --out, --report or --payload')
+        raise BlfDscError(
+            'nothing to write: give --out, --report, --payload or --foresee'
+        )
     suffixes = [path.suffix for path in outputs]
     for path in outputs:
         if path.suffix not in _FORMATS:
@@ -182,6 +197,8 @@ def excite(options: Namespace) -> None:
         f'mean over all directions, instead of {100.0 * before.left:.0f} % with the configured '
         'reference. First the cosines, then the sines.'
     )
+    shown, _, *_ = foresight_lines(foresee(problem.recording(parameters), config.robot))
+    about += f' For `blf_dsc identify`, {shown}.'
     lines = [*textwrap.wrap(about, _WIDTH), options.line]
     reference = {f'reference.{name}': value for name, value in parameters.items()}
     node = {f'**/{CONTROLLER}': {'reference.type': 'sinusoids', **reference}}

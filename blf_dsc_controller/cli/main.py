@@ -371,6 +371,11 @@ def _add_identification(
     )
     load = 'identify a load: carried in this other bag, or without one, picked up in the first'
     option('--payload', type=Path, nargs='?', const=True, metavar='BAG', help=load)
+    before = (
+        'say what the recording, or the table of a planned motion without torques, can show: '
+        'nothing is fitted'
+    )
+    option('--foresee', action='store_true', help=before)
     efforts = ('torque', 'without-gravity', 'command')
     what = 'what efforts are: whole torque, or without that of gravity; or use commands (torque)'
     option('--effort', choices=efforts, default='torque', help=what)

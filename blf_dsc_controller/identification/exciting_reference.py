@@ -23,6 +23,7 @@ from blf_dsc_controller.arms.model import regressors_at
 from blf_dsc_controller.arms.urdf import Chain, frames
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.robot import parameters_of
+from blf_dsc_controller.identification.recording import Recording
 from blf_dsc_controller.law.factory import prior_covariance, settings_of_config
 from blf_dsc_controller.reference.approach import MotionError
 from blf_dsc_controller.reference.terms import pack, sampled, sinusoids_term
@@ -36,6 +37,7 @@ _PENALTY = 1e4  # on the mean square excess: limits are exceeded by a few percen
 _SHRINKS = 30  # most reductions of the amplitudes, by 1 % each, to keep the limits
 _LEAST = 1e-6  # m, length of a line; shorter ones are points of the next line
 _CARRIED = 2  # joints, counted from the base, that may be near the floor
+_DURATION, _RECORDED = 30.0, 0.01  # s, of a recording of it, and between its samples
 _SPREAD = 0.2  # standard deviation of a search's initial amplitudes
 
 
@@ -180,6 +182,7 @@ class ExcitationProblem:
         self._limits = np.array((tracked, limits.velocity, limits.acceleration, torque))
         self._limits[1:3] *= _SPEED
         self.n = settings.n
+        self._joints = config.joints
         self.harmonics = harmonics
         self._base = 2.0 * np.pi / config.learning.window
         rates = self._base * np.arange(1, harmonics + 1)
@@ -234,6 +237,14 @@ class ExcitationProblem:
         return Excitation(
             float(gain), left, ratios.max(axis=0), room.min(axis=0), float(excess)
         )
+
+    def recording(self, parameters: dict[str, tuple[float, ...]]) -> Recording:
+        """Return half a minute of the reference, without torques."""
+        times = _RECORDED * np.arange(round(_DURATION / _RECORDED))
+        q = sampled(pack(self.n, [sinusoids_term(**parameters)]), times)[:, 0]
+        gap = np.zeros(times.size, dtype=bool)
+        joints = self._joints
+        return Recording(joints, _RECORDED, q, np.zeros_like(q), gap, 'planned')
 
     def _rows(self, q: np.ndarray, dq: np.ndarray, ddq: np.ndarray) -> np.ndarray:
         """Return [H(q, dq, dq, ddq) | D] (k, n, m) of a motion, as `law.prediction` describes D."""

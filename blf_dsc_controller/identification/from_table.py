@@ -52,8 +52,12 @@ def read_table(
     text: str,
     joints: Sequence[str] = (),
     names: NameMap = NO_NAMES,
+    *,
+    planned: bool = False,
 ) -> Recording:
     """Read a recording of the arm of a URDF (its text) from a table.
+
+    A `planned` motion has no torques: they are zero.
 
     `joints` are the arm's, by default all from the root to where it branches, or as many of them as
     the table has.  `names.joints` may have `time`, `q` and `tau`, as above, and the joints' names.
@@ -69,7 +73,9 @@ def read_table(
     arm = tuple(joints) or Tree.of(text).trunk()
     theirs = NameMap(joints=given).joints_of(arm)
     q_columns = _columns(path, table, 'q', wanted['q'], theirs)
-    tau_columns = _columns(path, table, 'tau', wanted['tau'], theirs)
+    tau_columns = q_columns
+    if not planned:
+        tau_columns = _columns(path, table, 'tau', wanted['tau'], theirs)
     n = len(q_columns)
     if len(tau_columns) != n:
         raise BlfDscError(
@@ -83,13 +89,17 @@ def read_table(
         )
     stamp = np.round(1e9 * _time(path, table, wanted['time'], q_columns[0]))
     positions = f'{q_columns[0]!r} to {q_columns[-1]!r}'
-    torques = f'{tau_columns[0]!r} to {tau_columns[-1]!r}'
-    source = f'{path.name}: positions {positions}, torques {torques}'
+    source = f'{path.name}: positions {positions}'
+    torques = np.column_stack([table[name] for name in tau_columns])
+    if planned:
+        torques = np.zeros_like(torques)
+    else:
+        source += f', torques {tau_columns[0]!r} to {tau_columns[-1]!r}'
     return resampled(
         arm[:n],
         stamp.astype(np.int64),
         np.column_stack([table[name] for name in q_columns]),
-        np.column_stack([table[name] for name in tau_columns]),
+        torques,
         source,
     )
 

@@ -16,6 +16,7 @@ import numpy as np
 from blf_dsc_controller.bags.content import NO_NAMES, NameMap
 from blf_dsc_controller.configuration.robot import Robot
 from blf_dsc_controller.errors import BlfDscError
+from blf_dsc_controller.identification.foresight import Foresight, foresee
 from blf_dsc_controller.identification.friction_doubt import friction_doubt
 from blf_dsc_controller.identification.identified import Identified
 from blf_dsc_controller.identification.on_disk import mapped
@@ -62,17 +63,14 @@ def identify_bag(
     """
     begin(STAGES[0])
     paths = [path] if isinstance(path, Path) else list(path)
-    joints: tuple[str, ...] = ()
-    if robot.tip:
-        joints = tuple(joint.name for joint in robot.chain(()).joints)
-    recordings: list[Recording] = []
-    for each in [*paths, *([loaded] if loaded else [])]:
-        is_commanded = effort == 'command'
-        recording = read_recording(
-            each, robot.text, joints, namespace, names, commanded=is_commanded
-        )
-        joints = recording.joints
-        recordings.append(recording)
+    recordings = _read(
+        [*paths, *([loaded] if loaded else [])],
+        robot,
+        namespace,
+        names,
+        commanded=effort == 'command',
+    )
+    joints = recordings[0].joints
     recording, begins = joined(*recordings)
     picked_up = float('nan') if pick_up else None
     if loaded:
@@ -85,6 +83,33 @@ def identify_bag(
     return identify_arm(
         recording, robot, effort, picked_up, find_signs=not len(gains), begin=begin
     )
+
+
+def foresee_recordings(
+    paths: Sequence[Path], robot: Robot, namespace: str = '', names: NameMap = NO_NAMES
+) -> Foresight:
+    """Return what recordings together can show, or tables of a planned motion without torques.
+
+    Raises:
+        BlfDscError: as `identify_bag` does.
+    """
+    recordings = _read(paths, robot, namespace, names, planned=True)
+    return foresee(joined(*recordings)[0], robot)
+
+
+def _read(
+    paths: Sequence[Path], robot: Robot, namespace: str, names: NameMap, **how: bool
+) -> list[Recording]:
+    """Return the recordings of one arm; `how` is as for `read_recording`."""
+    joints: tuple[str, ...] = ()
+    if robot.tip:
+        joints = tuple(joint.name for joint in robot.chain(()).joints)
+    recordings: list[Recording] = []
+    for path in paths:
+        recording = read_recording(path, robot.text, joints, namespace, names, **how)
+        joints = recording.joints
+        recordings.append(recording)
+    return recordings
 
 
 def checked_gains(gains: Sequence[float], joints: Sequence[str]) -> Floats:

@@ -18,8 +18,10 @@ from blf_dsc_controller.identification.values import (
 )
 from blf_dsc_controller.identification.windows import SMOOTHING, WINDOW
 
+UNSEEN = 0.5
+"""Share of the prior's variance; parameters that keep more are not shown."""
+
 _TWO_SIDED = 1.96  # standard deviations of a 95 % interval
-_UNSEEN = 0.5  # of the prior's variance; parameters that keep more are not shown
 _LASTING = 3.0 * WINDOW  # s; noise is correlated over one window
 _POOR = 0.2  # of the torque, largest accepted error on the part held back
 _LATE = 0.01  # s, longest plausible delay
@@ -109,7 +111,7 @@ def base_table(found: Identified) -> Iterator[str]:
     yield 'base parameters (all that torques can show), in kg, kg m, kg m^2:'
     for k, name in enumerate(parameters.combinations):
         half = f'{_TWO_SIDED * posterior[k] ** 0.5:<8.2g}'
-        unseen = posterior[k] > _UNSEEN * prior[k]
+        unseen = posterior[k] > UNSEEN * prior[k]
         mark = '  NOT SHOWN by this recording: from the URDF' if unseen else ''
         yield f'{before[k]:10.4g} -> {after[k]:10.4g} +- {half}  {name}{mark}'
 

@@ -1,0 +1,146 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a motion can show of an arm, before anything is fitted, or even recorded.
+
+Torques are not used: the residual of each joint is taken to be a fiftieth of the torque that the
+URDF needs, and to last for a window, as those of real robots do at least.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import numpy as np
+
+from blf_dsc_controller.analysis.metrics import aligned
+from blf_dsc_controller.arms.base_parameters import base_parameters
+from blf_dsc_controller.configuration.robot import Robot
+from blf_dsc_controller.identification.prior import prior_of
+from blf_dsc_controller.identification.recording import Recording
+from blf_dsc_controller.identification.regression import triangle
+from blf_dsc_controller.identification.summary import UNSEEN
+from blf_dsc_controller.identification.values import (
+    COULOMB,
+    JOINT_TERMS,
+    ROTOR_INERTIA,
+    VISCOUS,
+    base_matrix,
+    indices,
+    units_of,
+)
+from blf_dsc_controller.identification.windows import HOP, STILL, WINDOW, rows_of, split
+from blf_dsc_controller.run import Floats
+
+_RESIDUAL = 0.02  # of the torque
+_FAINT = (
+    0.01  # of the largest torque of all joints, least that a joint is taken to have
+)
+_RANK = 1e-6  # of the largest singular value, least that counts
+_TWO_SIDED = 1.96  # standard deviations in half of a 95 % interval
+_TERMS = {term: JOINT_TERMS[term] for term in (ROTOR_INERTIA, VISCOUS, COULOMB)}
+
+
+class Foresight(NamedTuple):
+    """What a motion can show of p base parameters and of joints' terms (3, n)."""
+
+    names: tuple[str, ...]  # of the base parameters
+    joints: tuple[tuple[str, str], ...]  # name and kind
+    seconds: float  # of motion
+    rank: int  # of the columns of base parameters, each times its deviation `before`
+    condition: float  # of these columns, within that rank
+    before: Floats  # (p,) standard deviations that the URDF leaves
+    after: Floats  # (p,) those that are expected from the motion
+    terms: Floats  # (2, 3, n) likewise of rotor, viscous and Coulomb friction
+    values: Floats  # (p,) of the URDF
+
+    @property
+    def shown(self) -> np.ndarray:
+        """Which base parameters (p,) the motion shows."""
+        return np.asarray(self.after**2 <= UNSEEN * self.before**2)
+
+
+def foresee(recording: Recording, robot: Robot) -> Foresight:
+    """Return what the motion of a recording can show; its torques are not used.
+
+    Raises:
+        BlfDscError: it is too short, or has no motion.
+    """
+    chain = robot.chain(recording.joints)
+    n = len(chain.joints)
+    base = base_parameters(chain, robot.gravity)
+    rows = rows_of(recording, base.model)
+    windows = split(rows)
+    P = base.of(chain.inertias, robot.rotors(chain))
+    theta = np.zeros(rows.unknowns)
+    theta[: rows.p] = P
+    needed = rows.torques(windows.moving, theta)
+    torque = np.sqrt(np.mean(needed**2, axis=0))
+    torque = np.maximum(torque, _FAINT * torque.max())
+    largest = np.abs(needed).max(axis=0)
+    speed = np.maximum(rows.speed, STILL)
+    prior = prior_of(robot, chain, largest, speed, load=False).only([])
+    G = base_matrix(base, n)
+    to_base = G[: rows.p]
+    before = prior.D @ prior.D.T
+    scale = _deviations(to_base @ before @ to_base.T)
+    weight = rows.weight[windows.moving] / (_RESIDUAL * torque)
+
+    def weighted() -> Iterator[Floats]:
+        for block in rows.blocks(windows.moving):
+            X = rows.matrix(windows.moving[block]) * weight[block, :, None]
+            yield X.reshape(-1, X.shape[2])
+
+    R = triangle(weighted())
+    sizes = np.linalg.svd(R[:, : rows.p] * scale, compute_uv=False)
+    sizes = sizes[sizes > _RANK * sizes[0]]
+    A = R @ (G @ prior.D)[:-1]
+    information = HOP / WINDOW * A.T @ A  # windows overlap
+    inverse = np.linalg.inv(np.eye(len(information)) + information)
+    after = prior.D @ inverse @ prior.D.T
+    at = indices(n).terms[list(_TERMS)].astype(int)
+    return Foresight(
+        names=base.combinations,
+        joints=tuple((joint.name, joint.kind) for joint in chain.joints),
+        seconds=windows.moving.size * HOP,
+        rank=sizes.size,
+        condition=float(sizes[0] / sizes[-1]),
+        before=scale,
+        after=_deviations(to_base @ after @ to_base.T),
+        terms=np.array([_deviations(C)[at] for C in (before, after)]),
+        values=P,
+    )
+
+
+def foresight_lines(found: Foresight) -> Iterator[str]:
+    """Yield what the motion can show, as text."""
+    p = len(found.names)
+    yield (
+        f'{found.seconds:.1f} s of motion have columns of rank {found.rank} for {p} base '
+        f'parameters (condition {found.condition:.2g}); {int(found.shown.sum())} of these will be '
+        'known better than from the URDF'
+    )
+    yield (
+        '95 % intervals, from the URDF and expected from the motion, with residuals of '
+        f'{100.0 * _RESIDUAL:g} % of the torque, in kg, kg m, kg m^2:'
+    )
+    for k, name in enumerate(found.names):
+        mark = '' if found.shown[k] else '  NOT SHOWN by this motion: from the URDF'
+        halves = f'{_half(found.before[k])} -> {_half(found.after[k])}'
+        yield f'{found.values[k]:10.4g} {halves}  {name}{mark}'
+    rows = [('joint', *_TERMS.values())]
+    for i, (name, kind) in enumerate(found.joints):
+        units = units_of(kind)
+        cells = [
+            f'{_half(deviation)} {units[term]}'
+            for term, deviation in zip(_TERMS, found.terms[1, :, i], strict=True)
+        ]
+        rows.append((name, *cells))
+    yield aligned(rows)
+
+
+def _half(deviation: float) -> str:
+    return f'+- {_TWO_SIDED * deviation:.2g}'
+
+
+def _deviations(covariance: Floats) -> Floats:
+    return np.asarray(np.sqrt(np.diag(covariance)))
