@@ -551,25 +551,34 @@ def test_coupling_and_load_friction_that_would_drive_are_not_identified(plain, t
     assert not found.parts.coupling.any()
 
 
-def test_table_of_recordings_has_a_row_for_a_folder_with_a_bag(
+def test_league_has_a_row_in_each_table_for_a_folder_with_a_bag(
     plain, tmp_path, capsys, monkeypatch
 ):
     monkeypatch.syspath_prepend(str(Path(__file__).parents[1] / 'benchmark'))
     benchmark = importlib.import_module('league')
+    monkeypatch.setattr(benchmark.rivals, 'MISSING', ['figaroh', 'mujoco.sysid'])
     write_states(tmp_path / 'bag', PANDA, measured(plain, 3))
     (tmp_path / 'panda.urdf').write_text(PANDA_TEXT)
-    monkeypatch.setattr(sys, 'argv', ['league.py', str(tmp_path)])
+    monkeypatch.setattr(sys, 'argv', ['league.py', str(tmp_path), '--last-only'])
     benchmark.main()
-    row = next(
-        line
-        for line in capsys.readouterr().out.splitlines()
-        if line.startswith('| bag ')
+    lines = capsys.readouterr().out.splitlines()
+
+    def cells_of(first):
+        found = (line for line in lines if line.startswith(f'| {first}'))
+        return [[cell.strip(' *') for cell in line.split('|')[1:-1]] for line in found]
+
+    heads = cells_of('recording')
+    rows = cells_of('bag ')
+    torque, rollout, seconds = (
+        dict(zip(head, row, strict=True)) for head, row in zip(heads, rows, strict=True)
     )
-    cells = [cell.strip() for cell in row.split('|')[1:-1]]
-    urdf, least_squares, bounded, ours = (float(cells[k]) for k in (1, 3, 4, 5))
-    assert urdf > 10.0
-    assert max(least_squares, bounded, ours) < 1.0
-    assert cells[7] == 'yes'
+    methods = ('least squares', 'semidefinite', 'identify')
+    for table, worst, best in ((torque, 10.0, 1.0), (rollout, 10.0, 5.0)):
+        assert float(table['URDF']) > worst
+        for method in methods:
+            assert table[method] == '-' or float(table[method]) < best
+    assert float(rollout['identify']) < 2.0
+    assert float(seconds['identify']) > 0.0
 
 
 UNIT = np.array([pseudo_inertia(e) for e in np.eye(10)])  # E_a of sum_a ten_a E_a
