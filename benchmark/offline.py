@@ -175,7 +175,7 @@ def mujoco_loop(duration: float) -> np.ndarray:
     """Run the arm of the example by MuJoCo's RK4 at the sample time, with the disturbance held."""
     import mujoco
 
-    model = mujoco.MjModel.from_xml_path(str(_ROOT / 'examples/mujoco_plant/arm.xml'))
+    model = mujoco.MjModel.from_xml_path(str(_ROOT / 'benchmark/two_link.xml'))
     data = mujoco.MjData(model)
     data.qpos[:] = PLANT.initial.position
     data.qvel[:] = PLANT.initial.velocity

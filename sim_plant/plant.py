@@ -59,7 +59,12 @@ class Plant:
 
     It starts at `position` (n,) [rad] with `velocity` (n,) [rad/s]; `seed` determines
     the noise, so the same seed repeats the run.
+
+    Attributes:
+        is_compiled: whether compiled loops can step it, from `arm`, `settings` and `state`.
     """
+
+    is_compiled = True
 
     def __init__(
         self,
@@ -229,7 +234,15 @@ def parameter_order(names: Sequence[str], config: PlantConfig) -> np.ndarray:
 
 
 def plant_of(config: PlantConfig) -> Plant:
-    """Return the plant of a configuration, at sample 0."""
+    """Return the plant of a configuration, at sample 0.
+
+    Raises:
+        BlfDscError: its physics is MuJoCo's, which is missing or cannot read the arm.
+    """
+    if config.physics == 'mujoco':
+        from sim_plant.mujoco_plant import MujocoPlant  # its base is in this module
+
+        return MujocoPlant(config)
     start = config.initial
     return Plant(plant_settings(config), start.position, start.velocity, config.seed)
 

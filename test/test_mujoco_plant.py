@@ -1,12 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The example plant with MuJoCo's mechanics: the same motion, the same controller."""
+"""The plant with MuJoCo's mechanics: the same motion, the same controller."""
 
 from __future__ import annotations
 
-import importlib.util
 import os
 import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -14,33 +12,34 @@ import pytest
 pytest.importorskip('rclpy', reason='needs ROS 2')
 pytest.importorskip('mujoco', reason='needs MuJoCo: pip install mujoco')
 
+import mujoco
 from paper_case import OFF, ROWS, P, end_of
 from plants import commands, true_parameters
 from test_plant_sampled import ALL_KINDS
 
+from blf_dsc_controller import read_run, share_folder
 from blf_dsc_controller.arms.urdf import frames
+from blf_dsc_controller.cli.main import main
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.nodes import load_loop
 from blf_dsc_controller.configuration.plant import PlantConfig
 from blf_dsc_controller.configuration.schema import build, change
+from blf_dsc_controller.errors import (
+    BlfDscError,
+    ConfigurationError,
+    MissingExtraError,
+)
 from blf_dsc_controller.messages.journal import EventType
 from blf_dsc_controller.nodes.controller_node import ControllerNode
+from blf_dsc_controller.nodes.plant_node import PlantNode
 from blf_dsc_controller.reference.approach import reference_of
 from blf_dsc_controller.reference.terms import sampled
-from blf_dsc_controller.simulation.loop import START
+from blf_dsc_controller.replay.verify import verify
+from blf_dsc_controller.simulation.loop import START, simulate
 from blf_dsc_controller.supervision.guard import Guard
+from sim_plant import mujoco_plant
+from sim_plant.mujoco_plant import MujocoPlant
 from sim_plant.plant import plant_of, plant_settings
-
-EXAMPLE = Path(__file__).parents[1] / 'examples/mujoco_plant/mujoco_plant.py'
-
-
-@pytest.fixture(scope='module')
-def example():
-    spec = importlib.util.spec_from_file_location('mujoco_plant', EXAMPLE)
-    module = sys.modules[spec.name] = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
-
 
 PANDA = {'robot.urdf': 'panda.urdf', 'robot.tip': 'panda_hand_tcp'}
 UR5E = {
@@ -89,9 +88,9 @@ def event(kind):
         (UR5E, REAL | {'disturbance.viscous': [1.0] * 6}, 1e-5),
     ],
 )
-def test_it_moves_like_the_simulated_plant(example, arm, given, tolerance):
+def test_it_moves_like_the_simulated_plant(arm, given, tolerance):
     """Events, truth, sensors and drives included."""
-    makes = ((example.MujocoArm, arm | given), (plant_of, arm | given), (plant_of, arm))
+    makes = ((MujocoPlant, arm | given), (plant_of, arm | given), (plant_of, arm))
     theirs, ours, without = (
         swing(make, build(PlantConfig, values)) for make, values in makes
     )
@@ -116,9 +115,84 @@ def swing(make, config):
     return rows
 
 
-def test_reset_repeats_the_run_and_disturbances_can_change(example):
+def mounted():
+    """Return the URDF of a Panda on a slanted mount, with which its base turns."""
+    text = (share_folder() / 'config/panda.urdf').read_text()
+    mount = (
+        '<link name="mount"/><joint name="slanted" type="fixed"><parent link="mount"/>'
+        '<child link="panda_link0"/><origin xyz="1 2 3" rpy="0.3 -0.8 1.1"/></joint>'
+    )
+    return text.replace('</robot>', f'{mount}</robot>')
+
+
+@pytest.mark.parametrize(
+    'arm',
+    [
+        {'robot.base': 'panda_link0', 'robot.tip': 'panda_hand_tcp'},
+        {
+            'robot.urdf': 'package://openarm_mujoco/v2/openarm_bimanual.xml',
+            'robot.base': 'openarm_left_base_link',
+            'robot.tip': 'openarm_left_ee_base_link',
+            'disturbance.coulomb': [0.0] * 7,  # dry in MuJoCo
+        },
+    ],
+)
+def test_gravity_and_forces_are_in_the_frame_of_the_base(arm):
+    """Of an arm from a URDF, and one of two from MJCF, whose base is turned."""
+    given = {'robot.urdf': mounted(), 'load.force': [5.0, -3.0, 10.0]} | arm
+    config = build(PlantConfig, given)
+    theirs, ours = (swing(make, config) for make in (MujocoPlant, plant_of))
+    np.testing.assert_allclose(theirs[:, 0], ours[:, 0], rtol=0.0, atol=1e-5)
+    assert np.ptp(ours[:, 0], axis=0).max() > 0.01  # rad
+
+
+@pytest.mark.parametrize('preset', ['panda', 'recommended'])
+def test_run_with_this_physics_is_one_command_and_replays(tmp_path, preset):
+    words = [
+        '--config',
+        preset,
+        '--physics',
+        'mujoco',
+        '--offline',
+        '--duration',
+        '0.5',
+    ]
+    assert main(['run', *words, '--out', str(tmp_path / 'run')]) == 0
+    assert verify(tmp_path / 'run' / 'bag').difference is None
+    given = {'duration': 0.5, 'physics': 'mujoco'}
+    loop = load_loop(preset, {'sim_plant': given})
+    first = simulate(loop.controller, loop.plant).run()
+    recorded = read_run(tmp_path / 'run' / 'bag')
+    np.testing.assert_array_equal(recorded.position, first.position)
+
+
+def test_what_mujoco_has_not_is_an_error_with_a_remedy(monkeypatch):
+    sloshing = {'events.begin': [1.0], 'events.sloshing': [0.5], 'physics': 'mujoco'}
+    with pytest.raises(ConfigurationError, match='no sloshing loads: use own'):
+        build(PlantConfig, sloshing)
+    with pytest.raises(ConfigurationError, match='physics: got "bullet"'):
+        build(PlantConfig, {'physics': 'bullet'})
+    config = build(PlantConfig, {'physics': 'mujoco', 'duration': 1.0})
+    with pytest.raises(BlfDscError, match='a compiled loop: use own here'):
+        simulate(build(ControllerConfig, {}), config, supervised=False)
+    floating = mounted().replace(
+        'type="fixed"><parent link="mount"', 'type="odd"><parent link="mount"'
+    )
+    odd = PANDA | {
+        'robot.urdf': floating,
+        'robot.base': 'panda_link0',
+        'physics': 'mujoco',
+    }
+    with pytest.raises(BlfDscError, match=r'MuJoCo cannot read the arm: .*joint type'):
+        plant_of(build(PlantConfig, odd))
+    monkeypatch.setitem(sys.modules, 'mujoco', None)
+    with pytest.raises(MissingExtraError, match=r'physics: mujoco needs .*\[mujoco\]'):
+        plant_of(config)
+
+
+def test_reset_repeats_the_run_and_disturbances_can_change():
     config = build(PlantConfig, {'sensor.position_noise': 1e-6})
-    arm = example.MujocoArm(config)
+    arm = MujocoPlant(config)
     first = swing(lambda _: arm, config)
     arm.reset()
     np.testing.assert_array_equal(swing(lambda _: arm, config), first)
@@ -127,7 +201,7 @@ def test_reset_repeats_the_run_and_disturbances_can_change(example):
     assert np.abs(swing(lambda _: arm, config) - first)[:, 0].max() > 1e-3
 
 
-def test_closed_loop_runs_the_same_with_both_plants(example):
+def test_closed_loop_runs_the_same_with_both_plants():
     """With every imperfection except dry friction and ripple, which differ over a sample."""
     loop = load_loop('panda')
     given = {
@@ -138,7 +212,7 @@ def test_closed_loop_runs_the_same_with_both_plants(example):
     config = change(loop.plant, given)
     theirs, ours = (
         close_loop(loop.controller, make(config), 2000)[1]
-        for make in (example.MujocoArm, plant_of)
+        for make in (MujocoPlant, plant_of)
     )
     np.testing.assert_allclose(theirs, ours, rtol=0.0, atol=1e-8)
     assert np.ptp(ours, axis=0).min() > 1e-3  # rad
@@ -148,14 +222,14 @@ def test_closed_loop_runs_the_same_with_both_plants(example):
     ('name', 'settled', 'peak'),
     [('panda', 0.22, 2.4), ('ur5e', 0.6, 1.7), ('openarm', 0.22, 0.9)],
 )
-def test_errors_with_dry_friction_are_as_documented(example, name, settled, peak):
+def test_errors_with_dry_friction_are_as_documented(name, settled, peak):
     """In mrad, from 8 s on and when 2 kg are picked up at 20 s: doc/arms.md.
 
     Below these, and not far below: dry friction amplifies last digits, so that other releases of
     the libraries give 9 % more.
     """
     loop = load_loop(name)
-    *_, errors = close_loop(loop.controller, example.MujocoArm(loop.plant), 22_000)
+    *_, errors = close_loop(loop.controller, MujocoPlant(loop.plant), 22_000)
     largest = 1e3 * np.abs(errors).max(axis=1)
     for measured, documented in (
         (largest[8000:20_000].max(), settled),
@@ -179,7 +253,7 @@ def close_loop(config, arm, samples):
     return guard, angles, errors
 
 
-def test_drives_that_compensate_hold_the_arm(example):
+def test_drives_that_compensate_hold_the_arm():
     """Zero holds an FR3: its drives add gravity, in MuJoCo as in our plant."""
     loop = load_loop('fr3')
     quiet = {
@@ -189,7 +263,7 @@ def test_drives_that_compensate_hold_the_arm(example):
         'truth.centre_deviation': 0.0,
         'sensor.incomplete_states': 0,
     }
-    arm = example.MujocoArm(change(loop.plant, quiet))
+    arm = MujocoPlant(change(loop.plant, quiet))
     start = arm.measure()[:7].copy()
     for _ in range(500):
         arm.measure()
@@ -198,18 +272,18 @@ def test_drives_that_compensate_hold_the_arm(example):
     assert np.abs(arm.measure()[14:]).max() > 10.0  # what the drives add
 
 
-def test_reflex_stops_the_arm(example):
+def test_reflex_stops_the_arm():
     limited = change(load_loop('fr3').plant, {'actuator.rate_limit': 0.0})
-    arm = example.MujocoArm(limited)
+    arm = MujocoPlant(limited)
     arm.step(np.full(7, 5.0))
     assert arm.is_stopped
 
 
-def test_node_keeps_the_bound_and_learns_the_parameters(ros, example):
+def test_node_keeps_the_bound_and_learns_the_parameters(ros):
     guard = ros.add(ControllerNode, {'telemetry.enabled': False}).guard
     published = {'sensor.published_joints': ['joint2', 'gripper', 'joint1']}
-    arm = ros.add(example.MujocoPlant, published, mode='lockstep')
-    assert isinstance(arm.plant, example.MujocoArm)
+    arm = ros.add(PlantNode, published, mode='lockstep', physics='mujoco')
+    assert isinstance(arm.plant, MujocoPlant)
     ros.until(lambda: arm.plant.sample >= 8000 or guard.supervisor.text)
     assert not guard.supervisor.text
     assert guard.samples.ratio.max() < 1.0
@@ -224,14 +298,14 @@ CHANGES = ROWS if os.environ.get('NIGHTLY') else ['payload to 0.75 kg at 8 s']
 
 
 @pytest.mark.parametrize('name', CHANGES)
-def test_bound_holds_while_the_arm_changes_and_learning_does_no_harm(example, name):
+def test_bound_holds_while_the_arm_changes_and_learning_does_no_harm(name):
     """Two windows after the last change the parameters are known again."""
     plant = build(PlantConfig, ROWS[name])
     end = end_of(ROWS[name])
     learning, without = (
-        close_loop(
-            build(ControllerConfig, law), example.MujocoArm(plant), round(1e3 * end)
-        )[0]
+        close_loop(build(ControllerConfig, law), MujocoPlant(plant), round(1e3 * end))[
+            0
+        ]
         for law in ({}, OFF)
     )
     assert np.all(learning.samples.ratio < 1.0)
@@ -247,31 +321,31 @@ DEPTH = 0.01  # m, by which the tip would enter the wall
 SOFT = [0.05, 1.0]  # MuJoCo's solref of both: s, damping ratio
 
 
-def beside_a_wall(example, monkeypatch, config, wall):
+def beside_a_wall(monkeypatch, config, wall):
     """The arm with a finger of 2 cm at its tip, and a wall at x = `wall` [m], 1 m farther off."""
-    spec_of = example.spec_of
+    spec_of = mujoco_plant.spec_of
 
     def with_wall(config):
         spec = spec_of(config)
-        finger = example.mujoco.mjtGeom.mjGEOM_SPHERE
+        finger = mujoco.mjtGeom.mjGEOM_SPHERE
         spec.body(config.robot.tip).add_geom(
             type=finger, size=[0.02, 0, 0], mass=0.0, solref=SOFT
         )
         spec.worldbody.add_geom(
             name='wall',
-            type=example.mujoco.mjtGeom.mjGEOM_BOX,
+            type=mujoco.mjtGeom.mjGEOM_BOX,
             size=[0.1, 2.0, 2.0],
             pos=[wall + 0.02 + 0.1 + 1.0, 0.0, 0.0],
             solref=SOFT,
         )
         return spec
 
-    monkeypatch.setattr(example, 'spec_of', with_wall)
-    return example.MujocoArm(config)
+    monkeypatch.setattr(mujoco_plant, 'spec_of', with_wall)
+    return MujocoPlant(config)
 
 
 @pytest.mark.parametrize('reaction', ['hold', 'none'])
-def test_load_is_learned_and_a_wall_is_not(example, monkeypatch, reaction):
+def test_load_is_learned_and_a_wall_is_not(monkeypatch, reaction):
     """Both in one run of a Panda with wrong links; without a reaction the weight is lost.
 
     At half its usual speed and with brakes like an arm's own, it stops in the wall's padding.
@@ -295,7 +369,7 @@ def test_load_is_learned_and_a_wall_is_not(example, monkeypatch, reaction):
     t = np.arange(THERE, ENDED, 1e-3)
     qr = sampled(reference_of(controller), t)[:, 0]
     farthest = frames(controller.robot.chain(controller.joints), qr)[-1][:, 0, 3].max()
-    arm = beside_a_wall(example, monkeypatch, plant, farthest - DEPTH)
+    arm = beside_a_wall(monkeypatch, plant, farthest - DEPTH)
     guard = Guard(controller, lambda: 0, lambda: 0)
     guard.activate()
     state = guard.controller.state

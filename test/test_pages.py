@@ -28,7 +28,7 @@ from blf_dsc_controller.studies.monte_carlo import load_study
 
 ROOT = Path(__file__).resolve().parents[1]
 DOC = ROOT / 'doc'
-OUTSIDE = ('README.md', 'CONTRIBUTING.md', 'examples/mujoco_plant/README.md')
+OUTSIDE = ('README.md', 'CONTRIBUTING.md')
 PAGES = [*(ROOT / name for name in OUTSIDE), *sorted((ROOT / 'doc').glob('*.md'))]
 SAVED = re.compile(r'Save this as\s`(\w+\.py)`')
 MAKEFILE = (ROOT / 'Makefile').read_text()

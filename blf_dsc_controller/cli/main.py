@@ -218,6 +218,8 @@ def _add_run(command: _Command) -> None:
         help='mode of the plant (as configured)',
     )
     option('--seed', type=int, help='seed of the sensor noise (as configured)')
+    physics = 'mechanics of the plant (as configured); mujoco: an independent one'
+    option('--physics', choices=('own', 'mujoco'), help=physics)
     option(
         '--offline', action='store_true', help='without ROS: no processes, no topics'
     )

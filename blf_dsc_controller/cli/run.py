@@ -113,7 +113,8 @@ def _configuration(options: Namespace) -> LoopConfig:
     ignored = ignored_sections(read(path), (PLANT, CONTROLLER))
     if ignored:
         print_notice(f'warning: {path}: {ignored}')
-    chosen = {'duration': options.duration, 'mode': options.mode, 'seed': options.seed}
+    names = ('duration', 'mode', 'seed', 'physics')
+    chosen = {name: getattr(options, name) for name in names}
     given = {name: value for name, value in chosen.items() if value is not None}
     recorded: dict[str, Any] = {'wait_for_subscribers': 1}
     config = load_loop(options.config, {PLANT: given | recorded, CONTROLLER: recorded})

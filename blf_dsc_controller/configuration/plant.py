@@ -259,6 +259,9 @@ class PlantConfig(ArmConfig):
     )
     seed: int = _magnitude(0, 'seed of the noise; equal seeds give equal runs')
     publish_clock: bool = _fixed(False, 'publish the simulated time on /clock')
+    physics: Literal['own', 'mujoco'] = _fixed(
+        'own', 'mechanics of the arm: compiled equations, or MuJoCo (an extra)'
+    )
     arm: PlantArm = PlantArm()
     truth: Truth = Truth()
     drive: Drive = Drive()
@@ -308,6 +311,8 @@ class PlantConfig(ArmConfig):
             lacking := [name for name in self.joints if name not in published]
         ):
             yield f'sensor.published_joints: {", ".join(lacking)} of `joints` is missing'
+        if self.physics == 'mujoco' and any(self.events.sloshing):
+            yield 'physics: got mujoco, which has no sloshing loads: use own, or payload'
         if self.actuator.ripple > 0.0 and not all(self.actuator.torque_limit):
             yield 'actuator.ripple: a fraction of the rated torque: give actuator.torque_limit'
         if 0.0 < self.duration < self.sample_time:

@@ -17,7 +17,7 @@ end of its duration.
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from functools import partial
 from math import inf, nan
 from typing import Any
@@ -71,11 +71,8 @@ _RESET_TIMEOUT = 2.0  # s for the controller to respond
 class PlantNode(LoopNode[PlantConfig]):
     """Node that publishes measured joint states and applies the received torques.
 
-    `latency` measures how long, in real time, the arm waits for its torques. `plant_of` makes the
-    arm, in a subclass another one (examples/mujoco_plant).
+    `latency` measures how long, in real time, the arm waits for its torques.
     """
-
-    plant_of: Callable[[PlantConfig], Plant] = staticmethod(plant_of)
 
     def __init__(self, **options: Any) -> None:
         super().__init__(topics.PLANT, PlantConfig, **options)
@@ -109,7 +106,7 @@ class PlantNode(LoopNode[PlantConfig]):
 
     def configure(self) -> None:
         """Put the arm at its start; create the topics on the first call."""
-        self.plant = self.plant_of(self.config)
+        self.plant = plant_of(self.config)
         self._halt = ''  # why the arm stands still until a reset
         if self._changed:
             self._tell_parameters()

@@ -25,6 +25,7 @@ from blf_dsc_controller.compiled.views import view
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.plant import PlantConfig
 from blf_dsc_controller.configuration.schema import flatten
+from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.law.check_state import INVALID, SUSPECT, checks_of
 from blf_dsc_controller.law.controller import Controller, step
 from blf_dsc_controller.law.external_torque import feel
@@ -177,8 +178,13 @@ def run_alone(record: Record, plant: Plant, *, observed: bool = True) -> None:
     """Fill a record, by its law alone from the beginning; `observed` as in `run_loop`.
 
     Raises StartError if the law cannot take over and approach.enabled is false, and MotionError if
-    there is no approach within the limits.
+    there is no approach within the limits; BlfDscError if the plant is not compiled.
     """
+    if not plant.is_compiled:
+        raise BlfDscError(
+            'physics: got mujoco, but this computes in a compiled loop: use own here, or '
+            '`blf_dsc run`'
+        )
     q, dq, _ = plant.measure().reshape(3, -1)
     begin(record.controller, record.config, q, dq)
     arrays = record.measurements, record.samples, record.truths
@@ -208,7 +214,9 @@ def _run_compiled(
 ) -> bool:
     """Run a chunk in the compiled loop; return False, with nothing changed, if a check fails."""
     controller = guard.controller
-    if not guard.supervisor.running or guard.config.safety.velocity != 'measured':
+    if not (plant.is_compiled and guard.supervisor.running):
+        return False
+    if guard.config.safety.velocity != 'measured':
         return False
     before = controller.save(), plant.save(), controller.checks_vector.copy()
     arrays = record.measurements, record.samples, record.truths
