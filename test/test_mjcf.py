@@ -240,6 +240,16 @@ def test_preset_openarm_is_the_arm_of_the_package():
             assert getattr(each, field) == getattr(expected, field)
 
 
+def test_preset_widowx_has_the_armatures_and_limits_of_its_mjcf():
+    """As trossen_arm_sim 0.2.3 has them."""
+    robot, chain = robot_of({'robot.urdf': 'widowx.urdf', 'robot.tip': 'ee_site'})
+    assert robot.rotor_inertia == (0.032,) * 3 + (0.0018,) * 3
+    assert [each.effort for each in chain.joints] == [27.0] * 3 + [7.0] * 3
+    guessed = [each.effort / 400.0 for each in chain.joints]
+    ratios = np.array(guessed) / robot.rotor_inertia
+    np.testing.assert_allclose(ratios, [2.1] * 3 + [9.7] * 3, atol=0.05)
+
+
 def test_mjcf_of_an_fr3_is_its_own_urdf():
     """Two files that franky-sim ships, and neither of us wrote."""
     chain = robot_of({'robot.urdf': FR3, 'robot.tip': 'fr3_link7'})[1]

@@ -220,7 +220,12 @@ def test_closed_loop_runs_the_same_with_both_plants():
 
 @pytest.mark.parametrize(
     ('name', 'settled', 'peak'),
-    [('panda', 0.22, 2.4), ('ur5e', 0.6, 1.7), ('openarm', 0.22, 0.9)],
+    [
+        ('panda', 0.22, 2.4),
+        ('ur5e', 0.6, 1.7),
+        ('openarm', 0.22, 0.9),
+        ('widowx', 0.45, 6.3),
+    ],
 )
 def test_errors_with_dry_friction_are_as_documented(name, settled, peak):
     """In mrad, from 8 s on and when 2 kg are picked up at 20 s: doc/arms.md.
