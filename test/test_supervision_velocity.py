@@ -43,6 +43,21 @@ def test_fr3_with_a_wrong_velocity_of_joint_2_comes_to_rest(spoil, at, travel):
     assert np.abs(dq[-1]).max() < 0.02
 
 
+def test_wrist_does_not_drift_after_its_wrong_velocity_has_broken_the_bound():
+    """It went on at 0.36 rad/s: by 0.16 N m of a disturbance that was none."""
+    loop = load_loop('fr3')
+    plant = change(loop.plant, {'duration': 0.0})
+
+    def spoil(_, dq):
+        dq[6] *= -1.0
+
+    guard, q, dq, _, stop = stopped_by(loop.controller, plant, spoil, at=5.0)
+    assert guard.supervisor.reason is Reason.OUTSIDE_BOUND
+    assert "the velocity of joint 'fr3_joint7' is" in guard.supervisor.text
+    assert np.abs(q[stop:] - q[stop]).max() < 0.4
+    assert np.abs(dq[-1]).max() < 0.02
+
+
 def test_velocities_are_those_of_the_positions_after_the_stop_and_a_reset():
     rig = Rig({'safety.torque': 'hold_gravity'})
     rig.step(200)

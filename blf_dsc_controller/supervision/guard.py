@@ -365,6 +365,7 @@ class Guard:
             self._stop(*fault)
         else:
             self.supervisor.add(fault.text)
+            self._safe_torque.start_observing()  # this has let the error grow
         self._velocity = Velocity(self._n)
         before = stamp - round(self._gap / _NANO)
         self._velocity.begin(before, checks.read_before[: self._n])

@@ -114,6 +114,10 @@ class SafeTorque:
         self.stop_observing()
         self._yields = True
 
+    def start_observing(self) -> None:
+        """Observe the load from now on: it is known that commands reach the arm."""
+        self._reached = True
+
     def stop_observing(self) -> None:
         """Return to the load that was known at the stop, until the next ramp."""
         self.load[:] = self._known_load
