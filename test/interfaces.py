@@ -97,7 +97,8 @@ def _generate(name: str, definitions: Path, package: Path) -> None:
     )
 
     include = [f'{Path(sys.prefix, "share")}']
-    found = sorted([*definitions.rglob('*.msg'), *definitions.rglob('*.action')])
+    kinds = ('*.msg', '*.srv', '*.action')
+    found = sorted(each for kind in kinds for each in definitions.rglob(kind))
     files = [f'{definitions}:{each.relative_to(definitions)}' for each in found]
     given = {'package_name': name, 'include_paths': include, 'output_path': package}
     with redirect_stdout(io.StringIO()):

@@ -562,7 +562,19 @@ class Learning:
     )
     tell_drive: bool = _size(
         False,
-        'tell drives that compensate gravity the load once it is weighed well (blf_dsc drive)',
+        'tell drives that compensate gravity the load once it is weighed well',
+    )
+    load_service: str = _size(
+        '',
+        'over ROS: service of the driver that takes the load, a ur_msgs/srv/SetPayload or '
+        'franka_msgs/srv/SetLoad; empty: the drives are told nothing',
+    )
+    load_frame: str = _size(
+        '',
+        'over ROS: link in whose frame that service wants the centre; empty: robot.tip',
+    )
+    load_in_motion: bool = parameter(
+        False, 'over ROS: whether the drives take a load while the arm moves'
     )
 
     def problems(self, sample_time: float, model: str, count: int) -> Iterator[str]:
@@ -728,6 +740,18 @@ class ControllerConfig(ArmConfig):
                 f'{self.robot.drive_compensates}, but needs a load that is weighed and drives that '
                 'compensate gravity'
             )
+        if learning.load_service and not learning.tell_drive:
+            yield (
+                f'learning.load_service: got {learning.load_service}, but learning.tell_drive is '
+                'false: set it to true'
+            )
+        if learning.load_frame:
+            try:
+                dataclasses.replace(self.robot, tip=learning.load_frame).chain(
+                    self.joints
+                )
+            except BlfDscError as error:
+                yield f'learning.load_frame: {error}'
         if self.contact.enabled and (self.law, learning.prediction) != (
             LAWS[0],
             'filtered',

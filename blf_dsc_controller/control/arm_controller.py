@@ -32,7 +32,6 @@ from blf_dsc_controller.supervision.supervisor import Phase
 Vector = NDArray[np.float64]
 _NANO = 1e9
 _FIRST = 1_000_000_000  # ns
-_AT_REST = 0.01  # rad/s
 
 
 class StateError(BlfDscError):
@@ -248,9 +247,7 @@ class ArmController:
     @property
     def is_at_rest(self) -> bool:
         """Whether the reference and the arm rest."""
-        signals = self._loop.guard.controller.signals
-        speed = np.abs(np.concatenate((signals.dq, signals.dqr))).max()
-        return bool(speed < _AT_REST)
+        return self._loop.guard.is_at_rest
 
     def stop(self) -> None:
         """Ramp to the safe torque, which `update` then returns until `start`."""

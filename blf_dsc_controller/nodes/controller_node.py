@@ -23,6 +23,7 @@ from blf_dsc_controller.messages.codecs import (
 from blf_dsc_controller.nodes import parameters, process
 from blf_dsc_controller.nodes.diagnostics import ControllerStatus
 from blf_dsc_controller.nodes.lifecycle import LoopNode
+from blf_dsc_controller.nodes.load_service import LoadService
 from blf_dsc_controller.nodes.trajectory_action import TrajectoryAction, offered_action
 from blf_dsc_controller.nodes.trajectory_input import motion_input_of
 from blf_dsc_controller.nodes.watchdog_presence import WatchdogPresence
@@ -55,6 +56,7 @@ class ControllerNode(LoopNode[ControllerConfig]):
         self.guard: Guard | None = None
         self._loop: GuardedLoop | None = None
         self._load: ReferenceLoad | None = None
+        self._load_service: LoadService | None = None
         joints = self.config.joints
         self._columns = b''  # those that are estimated, and whether they were checked
         self._model_changes = 0.0
@@ -95,10 +97,15 @@ class ControllerNode(LoopNode[ControllerConfig]):
         self._load = reference_load(self.config, self.guard.controller.settings)
         for warning in config_warnings(self.config, load=self._load):
             self.get_logger().warning(warning)
-        if self.config.learning.tell_drive:
+        learning = self.config.learning
+        if learning.load_service:
+            if self._load_service is None:
+                self._load_service = LoadService(self, self.config)
+            self._load_service.begin()
+        elif learning.tell_drive:
             self.get_logger().warning(
-                'learning.tell_drive: over ROS the drives are told nothing, only `blf_dsc drive` '
-                'tells its robot: set robot.drive_payload and the load of the driver instead'
+                'learning.tell_drive: the drives are told nothing without learning.load_service: '
+                "give the driver's service, or set robot.drive_payload and the load of the driver"
             )
         outputs = [topics.COMMANDS]
         if self.config.telemetry.enabled:
@@ -266,6 +273,8 @@ class ControllerNode(LoopNode[ControllerConfig]):
         return True
 
     def _torque_for(self, guard: Guard, raw: bytes) -> np.ndarray | None:
+        if self._load_service is not None:
+            self._load_service.follow(guard, self.config)
         try:
             stamp = self._decoder.decode(raw)
         except MessageError as error:
@@ -402,6 +411,8 @@ class ControllerNode(LoopNode[ControllerConfig]):
 
     def _on_second(self) -> None:
         self._look_for_watchdog()
+        if self._load_service is not None:
+            self._load_service.look()
         super()._on_second()
         guard = self.guard
         if (

@@ -60,13 +60,14 @@ class DriveLoads:
 
     Attributes:
         declared: what they had at the start, `robot.drive_payload`.
+        base: what they had when the law began to learn: at the start, or at a reset.
         told: what they have now.
     """
 
     def __init__(self, config: ControllerConfig) -> None:
         robot = config.robot
         self.declared = DriveLoad(robot.drive_payload, robot.drive_payload_centre)
-        self.told = self.declared
+        self.told = self.base = self.declared
         self._robot = robot
         self._chain = robot.chain(config.joints)
         self._goes_on = False  # not all of a load has been told
@@ -75,9 +76,18 @@ class DriveLoads:
         """Let the law know that the drives add the weight of this load from now on."""
         self.told = load
         settings = controller.settings
-        settings.drive_inertias[:] = self._columns(load)
+        settings.drive_inertias[:] = self._added()
         # the last command met the drives with this load already
         controller.state.added[:] = added_torque(settings, controller.signals.q)
+
+    def forget(self, controller: Controller) -> None:
+        """Begin again with a law that has forgotten what the tip holds.
+
+        It is held by what the drives have been told: both are left out of account.
+        """
+        self.base = self.told
+        self._goes_on = False
+        controller.settings.drive_inertias[:] = self._added()
 
     def next(self, controller: Controller) -> DriveLoad | None:
         """Return the load to tell next; None: there is nothing to tell, or not well enough known.
@@ -111,10 +121,17 @@ class DriveLoads:
             if not ((spread > 0.0) & (spread < _CENTRE)).all():
                 return None
             picked_up[:] = load[MASS] * np.array((1.0, *load[MASS + 1 : DEVIATION]))
-        target = self.declared.moments + picked_up
+        target = self.base.moments + picked_up
         target = np.asarray(DriveLoad.of(target).moments)
         is_new = abs(target[0] - self.told.mass) > narrow
         return target if is_new or self._goes_on else None
+
+    def _added(self) -> Vector:
+        """Return what the columns of the drives' gravity are multiplied by, for the law."""
+        if self.base is self.declared:
+            return self._columns(self.told)
+        since = self._columns(self.told) - self._columns(self.base)
+        return self._columns(self.declared) + since
 
     def _columns(self, load: DriveLoad) -> Vector:
         """Return what the columns of the drives' gravity are multiplied by, with this load."""

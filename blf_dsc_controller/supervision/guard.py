@@ -71,6 +71,7 @@ _LONG_GAP = 2.5  # samples
 _IN_A_ROW = 0.1  # s between two states, at most
 # rad/s over twice the speed at the stop, for _SPEEDS_UP: a load that is new makes less of it
 _FASTER = 0.5
+_AT_REST = 0.01  # rad/s
 _GROWING = 0.95  # of the largest speed so far
 _SPEEDS_UP = 0.2  # s
 
@@ -617,6 +618,8 @@ class Guard:
         self._note(EventType.RESET)
         self._resumable = False
         self.controller.reset()
+        if self._drive_loads is not None:
+            self._drive_loads.forget(self.controller)
         self.samples.keep()
         self._start_over()
 
@@ -707,6 +710,13 @@ class Guard:
         if not self.supervisor.running:
             return []
         return list(retuning.problems(self.controller, config, self.time))
+
+    @property
+    def is_at_rest(self) -> bool:
+        """Whether the reference and the arm rest, while the law is in command."""
+        signals = self.controller.signals
+        speed = np.abs(np.concatenate((signals.dq, signals.dqr))).max()
+        return bool(speed < _AT_REST)
 
     @property
     def is_settled(self) -> bool:

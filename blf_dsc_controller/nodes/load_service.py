@@ -1,0 +1,157 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Tells a driver's service the load that the law has weighed, step by step, between two states.
+
+The message packages of the drivers are imported when their service is there: a sourced workspace
+that runs such a driver has them.
+"""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from math import pi
+from typing import Any
+
+import numpy as np
+from rclpy.node import Node
+
+from blf_dsc_controller.configuration.controller import ControllerConfig
+from blf_dsc_controller.supervision.drive_load import DriveLoad
+from blf_dsc_controller.supervision.guard import Guard
+
+_EVERY = 20  # states, from one step to the next
+_PATIENCE = 2000  # states, until an answer is no longer waited for
+_DENSITY = 1000.0  # kg/m^3, of the ball that stands for the shape of a load
+
+
+class LoadService:
+    """What the drives are told over ROS, while `learning.tell_drive` is true.
+
+    The law takes a step over with the first state after the service has accepted it.
+
+    Attributes:
+        problem: why the drives are told nothing more, or empty.
+        told: what they have accepted last; None: nothing.
+    """
+
+    def __init__(self, node: Node, config: ControllerConfig) -> None:
+        robot = config.robot
+        tip = robot.chain(config.joints).tip_placement
+        link = config.learning.load_frame or robot.tip
+        frame = replace(robot, tip=link).chain(config.joints).tip_placement
+        self.problem = ''
+        self.told: DriveLoad | None = None
+        self._node = node
+        self._name = node.resolve_service_name(config.learning.load_service)
+        self._to_frame = np.linalg.solve(frame, tip)
+        self._client: Any = None
+        self._type = ''
+        self._asked: DriveLoad | None = None
+        self._answer: Any = None
+        self._states = 0
+
+    def look(self) -> None:
+        """Look for the service, rarely: its type says what it needs."""
+        if self._client is not None or self.problem:
+            return
+        types = dict(self._node.get_service_names_and_types()).get(self._name, ())
+        if not types:
+            return
+        package, _, name = types[0].partition('/srv/')
+        if types[0] not in _FILLS:
+            known = ' and '.join(_FILLS)
+            self._give_up(f'{self._name} is a {types[0]}, but {known} can be called')
+            return
+        try:
+            service = getattr(importlib.import_module(f'{package}.srv'), name)
+        except ImportError:
+            self._give_up(
+                f'{self._name} is there, but {package} cannot be imported: source the workspace '
+                'that has it'
+            )
+            return
+        self._type = types[0]
+        self._client = self._node.create_client(service, self._name)
+
+    def begin(self) -> None:
+        """Begin with a new law, which knows of no load that the drives were told before."""
+        if self.told is not None and not self.problem:
+            self._give_up(
+                f'the drives still have the load of {self.told.mass:.2f} kg that they were told '
+                'before the node was configured again: set it back to robot.drive_payload, and '
+                'start the node anew'
+            )
+
+    def follow(self, guard: Guard, config: ControllerConfig) -> None:
+        """Take over what was accepted since the last state; ask for the next step."""
+        if self._client is None or self.problem:
+            return
+        self._states += 1
+        if self._asked is not None:
+            self._await(guard, self._asked)
+        elif self._states >= _EVERY and self._client.service_is_ready():
+            self._states = 0
+            if config.learning.load_in_motion or guard.is_at_rest:
+                self._ask(guard.load_to_tell())
+
+    def _ask(self, load: DriveLoad | None) -> None:
+        if load is None:
+            return
+        centre = (self._to_frame @ np.append(load.centre, 1.0))[:3]
+        request = self._client.srv_type.Request()
+        try:
+            _FILLS[self._type](request, load.mass, centre * (load.mass > 0.0))
+        except AttributeError as error:
+            self._give_up(f'{self._name}: its request has other fields ({error})')
+            return
+        self._asked = load
+        self._answer = self._client.call_async(request)
+
+    def _await(self, guard: Guard, asked: DriveLoad) -> None:
+        if not self._answer.done():
+            if self._states > _PATIENCE:
+                self._give_up(
+                    f'{self._name} has not answered for {self._states} states'
+                )
+            return
+        answer = self._answer.result()
+        self._states = 0
+        self._asked = None
+        if not answer.success:
+            why = getattr(answer, 'error', '') or 'it does not say why'
+            self._give_up(f'{self._name} refused {asked.mass:.2f} kg: {why}')
+            return
+        self.told = asked
+        guard.take_over(asked)
+
+    def _give_up(self, problem: str) -> None:
+        self.problem = problem
+        self._node.get_logger().warning(
+            f'learning.tell_drive: {problem}; the drives are told nothing more'
+        )
+
+
+def _ball(mass: float) -> float:
+    """Return the moment of inertia [kg m^2] of a ball of water: only its mass is weighed."""
+    radius = float(np.cbrt(0.75 * mass / (pi * _DENSITY)))
+    return 0.4 * mass * radius * radius
+
+
+def _fill_ur(request: Any, mass: float, centre: np.ndarray) -> None:
+    request.mass = mass
+    at = request.center_of_gravity
+    at.x, at.y, at.z = centre.tolist()
+    request.ixx = request.iyy = request.izz = _ball(mass)
+
+
+def _fill_franka(request: Any, mass: float, centre: np.ndarray) -> None:
+    request.mass = mass
+    request.center_of_mass = centre.tolist()
+    request.load_inertia = (_ball(mass) * np.eye(3)).ravel().tolist()
+
+
+_FILLS: Mapping[str, Callable[[Any, float, np.ndarray], None]] = {
+    'ur_msgs/srv/SetPayload': _fill_ur,
+    'franka_msgs/srv/SetLoad': _fill_franka,
+}

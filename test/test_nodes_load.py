@@ -1,0 +1,226 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A load that is weighed is told to the service of a driver, over DDS, in lock-step."""
+
+from __future__ import annotations
+
+import importlib
+import re
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+pytest.importorskip('rclpy', reason='needs ROS 2')
+
+import interfaces
+from rclpy.parameter import Parameter
+from ros_rig import RosRig, activate, cleanup, configure, deactivate
+from std_srvs.srv import Trigger
+
+from blf_dsc_controller.bags.content import read_content
+from blf_dsc_controller.configuration.nodes import load_loop
+from blf_dsc_controller.configuration.schema import change, flatten
+from blf_dsc_controller.errors import ConfigurationError
+from blf_dsc_controller.nodes import load_service
+from blf_dsc_controller.nodes.controller_node import ControllerNode
+from blf_dsc_controller.nodes.plant_node import PlantNode
+from blf_dsc_controller.nodes.process import drain
+from blf_dsc_controller.nodes.recorder_node import BagRecorderNode
+from blf_dsc_controller.replay.verify import verify
+from sim_plant.plant import plant_settings
+
+PACKAGES = ('ur_msgs', 'franka_msgs')
+SERVICE = '/driver/set_load'
+TOLD = {'learning.tell_drive': True, 'learning.load_service': SERVICE}
+PICKED_UP = 6.0  # s; it is weighed about a second later
+FR3 = load_loop('fr3_direct')
+EVENT = {
+    'events.begin': [PICKED_UP],
+    'events.duration': [0.0],
+    'events.payload': [2.0],
+    'mode': 'lockstep',
+}
+
+
+@pytest.fixture(scope='module')
+def services(tmp_path_factory):
+    """Provide the drivers' services by their type."""
+    missing = [each for each in PACKAGES if importlib.util.find_spec(each) is None]
+    if missing and interfaces.why_not():
+        pytest.skip(
+            f'{missing[0]} is not installed, and not built: {interfaces.why_not()}'
+        )
+    with pytest.MonkeyPatch.context() as patch:
+        for name in missing:
+            folder = tmp_path_factory.mktemp(name)
+            interfaces.build(Path(__file__).parent / 'definitions' / name, folder)
+            patch.syspath_prepend(folder)
+        yield {
+            'ur': importlib.import_module('ur_msgs.srv').SetPayload,
+            'franka': importlib.import_module('franka_msgs.srv').SetLoad,
+        }
+    for name in [
+        each for each in sys.modules if each.startswith(tuple(missing) or '?')
+    ]:
+        del sys.modules[name]
+
+
+class Arm:
+    """An FR3 whose drives take a load from a service, and its controller."""
+
+    def __init__(self, ros, service, *, accepts=True, **controller):
+        self.ros, self.accepts = ros, accepts
+        self.requests = []
+        ros.tester.create_service(service, SERVICE, self.take)
+        given = flatten(FR3.controller) | TOLD | controller
+        self.plant = ros.add(PlantNode, flatten(FR3.plant) | EVENT)
+        self.law = ros.add(ControllerNode, given)
+        ros.until(
+            lambda: self.law._load_service._client or self.law._load_service.problem
+        )
+
+    def take(self, request, response):
+        """Answer as a driver; the drives add the weight from their next step on."""
+        self.requests.append(request)
+        response.success = self.accepts
+        if self.accepts:
+            at = getattr(request, 'center_of_gravity', None)
+            centre = request.center_of_mass if at is None else (at.x, at.y, at.z)
+            robot = replace(
+                self.plant.config.robot,
+                drive_payload=request.mass,
+                drive_payload_centre=tuple(map(float, centre)),
+            )
+            config = replace(self.plant.config, robot=robot)
+            self.plant.plant.change(plant_settings(config))
+        else:
+            response.error = 'a controller is active'
+        return response
+
+    def run_until(self, time):
+        self.ros.until(lambda: self.law.guard.time > time)
+
+
+def test_load_is_told_to_the_service_in_steps_that_no_joint_notices(services, tmp_path):
+    """The arm of a UR's driver: at first it must rest for it, which it never does; then not."""
+    ros = RosRig()
+    recorder = ros.add(BagRecorderNode, output=str(tmp_path / 'bag'))
+    arm = Arm(ros, services['ur'], wait_for_subscribers=1)
+    guard = arm.law.guard
+    arm.run_until(8.0)
+    assert guard.controller.state.load[0] == pytest.approx(2.0, abs=0.1)
+    assert not arm.requests
+    arm.law.set_parameters([Parameter('learning.load_in_motion', value=True)])
+    arm.run_until(9.5)
+    masses = [request.mass for request in arm.requests]
+    assert len(masses) > 10
+    assert (np.diff(masses) > 0.0).all()
+    assert masses[-1] == pytest.approx(2.0, abs=0.1)
+    last = arm.requests[-1]
+    ball = 0.4 * last.mass * (0.75 * last.mass / (np.pi * 1000.0)) ** (2.0 / 3.0)
+    assert last.ixx == last.iyy == last.izz == pytest.approx(ball, rel=1e-6)
+    assert guard.supervisor.running
+    assert guard.samples.ratio.max() < 0.6
+    deactivate(ros, arm.plant)
+    ros.until(lambda: guard.journal.stamp == arm.plant.stamp)
+    for node in (arm.plant, arm.law):
+        drain(node.publishers)
+    recorder.close()
+    ros.close()
+    events = [event for _, event in read_content(tmp_path / 'bag').events]
+    loads = [event.content['mass'] for event in events if event.type == 'drive load']
+    assert loads == pytest.approx(masses, abs=1e-6)
+    assert verify(tmp_path / 'bag').difference is None
+
+
+def test_driver_that_refuses_is_asked_once(services, ros):
+    """As that of a Franka does while a controller is active."""
+    arm = Arm(
+        ros, services['franka'], accepts=False, **{'learning.load_in_motion': True}
+    )
+    arm.run_until(8.0)
+    assert len(arm.requests) == 1
+    asked = f'/driver/set_load refused {arm.requests[0].mass:.2f} kg'
+    assert arm.law._load_service.problem == f'{asked}: a controller is active'
+    assert arm.requests[0].center_of_mass[2] != 0.0
+    assert arm.law.guard.supervisor.running
+
+
+def test_law_that_begins_again_leaves_the_load_to_the_drives(services, ros):
+    """After a reset it knows of no load: nor may its commands take away what the drives add."""
+    arm = Arm(ros, services['ur'], **{'learning.load_in_motion': True})
+    arm.run_until(8.5)
+    told = arm.law._load_service.told
+    assert told.mass == pytest.approx(2.0, abs=0.1)
+    ros.reset(arm.law)
+    guard = arm.law.guard
+    ros.until(lambda: guard.time < 8.0)
+    ros.until(lambda: guard.time > 0.5 or guard.supervisor.text)
+    assert guard.supervisor.running, guard.supervisor.text
+    assert guard.samples.ratio.max() < 0.6
+    assert deactivate(ros, arm.law)
+    ros.until(lambda: guard.is_settled)
+    assert cleanup(ros, arm.law)
+    assert configure(ros, arm.law)
+    problem = arm.law._load_service.problem
+    assert problem.startswith('the drives still have the load of 2.0')
+    assert 'set it back to robot.drive_payload, and start the node anew' in problem
+    assert activate(ros, arm.law)
+    guard = arm.law.guard
+    ros.until(lambda: guard.time > 0.2 or guard.supervisor.text or guard.waiting_for)
+    assert guard.supervisor.running, (guard.supervisor.text, guard.waiting_for)
+
+
+def test_service_that_cannot_be_called_is_named(ros, monkeypatch):
+    """Of another type, and of a package that is not in this workspace."""
+    given = flatten(FR3.controller) | TOLD | {'autostart': False}
+    ros.tester.create_service(Trigger, SERVICE, lambda *_: None)
+    law = ros.add(ControllerNode, given)
+    assert configure(ros, law)
+    service = law._load_service
+    ros.until(lambda: service.look() or service.problem)
+    assert re.fullmatch(
+        r'/driver/set_load is a std_srvs/srv/Trigger, but ur_msgs/srv/SetPayload and .* can be '
+        'called',
+        service.problem,
+    )
+    service.problem = ''
+    types = [(SERVICE, ['nowhere_msgs/srv/SetLoad'])]
+    monkeypatch.setattr(law, 'get_service_names_and_types', lambda: types)
+    monkeypatch.setitem(load_service._FILLS, 'nowhere_msgs/srv/SetLoad', None)
+    service.look()
+    assert 'nowhere_msgs cannot be imported: source the workspace' in service.problem
+
+
+@pytest.mark.parametrize(
+    ('given', 'problem'),
+    [
+        ({'learning.load_service': 3}, 'learning.load_service: got 3'),
+        (
+            {'learning.tell_drive': False},
+            'learning.load_service: got /driver/set_load, but learning.tell_drive is false',
+        ),
+        ({'learning.load_frame': 'nowhere'}, 'learning.load_frame: .*nowhere'),
+        (
+            {'learning.load_frame': 'fr3_link2'},
+            'learning.load_frame: the moving joints',
+        ),
+        ({'learning.load_in_motion': 'yes'}, 'learning.load_in_motion: got .yes.'),
+    ],
+)
+def test_bad_values_are_named_with_a_remedy(given, problem):
+    with pytest.raises(ConfigurationError, match=problem):
+        change(FR3.controller, TOLD | given)
+
+
+def test_centre_is_in_the_frame_that_the_service_wants(ros):
+    """The FR3's flange is 0.107 m beyond its last joint; its tip is not the flange."""
+    config = change(FR3.controller, TOLD | {'learning.load_frame': 'fr3_link8'})
+    service = load_service.LoadService(ros.tester, config)
+    tip = config.robot.chain(config.joints).tip_placement
+    point = tip @ (0.01, 0.02, 0.03, 1.0)
+    found = service._to_frame @ (0.01, 0.02, 0.03, 1.0)
+    assert found[2] == pytest.approx(point[2] - 0.107)
+    assert found[:2] == pytest.approx(point[:2])
