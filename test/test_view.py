@@ -6,6 +6,8 @@ Of a loop.
 
 from __future__ import annotations
 
+import os
+import pty
 import re
 import signal
 import subprocess
@@ -26,7 +28,7 @@ from command import COMMAND, wait_for
 from diagnostic_msgs.msg import DiagnosticStatus
 from rclpy.parameter import Parameter
 from rclpy.serialization import serialize_message
-from ros_rig import activate, configure, values
+from ros_rig import activate, cleanup, configure, deactivate, values
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
@@ -65,6 +67,12 @@ def moving(seconds, error=0.001):
     return [each._replace(load=LOAD) if each.time > 1.0 else each for each in first]
 
 
+def tip_of(q):
+    """The tip of two links of 1 m."""
+    angles = np.cumsum(q)
+    return np.array([np.cos(angles).sum(), 0.0, np.sin(angles).sum()])
+
+
 @pytest.fixture(scope='module')
 def page():
     page = Page(HOST, PORT)
@@ -85,8 +93,7 @@ def test_arm_ghost_and_path_are_drawn(page):
         names = page.server.scene._handle_from_node_name
         assert sum(name.startswith(root) for name in names) > 5
     assert node(page, '/path').points.shape == (len(past) - 1, 2, 3)
-    angles = np.cumsum(past[-1].position)
-    tip = np.array([np.cos(angles).sum(), 0.0, np.sin(angles).sum()])
+    tip = tip_of(past[-1].position)
     np.testing.assert_allclose(node(page, '/payload').position, tip, atol=1e-6)
     assert not node(page, '/payload').visible
     assert not page._ghost.show_visual  # the error is too small to be seen
@@ -146,6 +153,23 @@ def test_contact_is_marked_at_its_joint_with_torque_and_interval(page):
     assert not node(page, '/contact').visible
     assert 'outside' not in page._caption.content
     page.draw_arm(ControllerConfig(), {})
+
+
+def test_run_that_has_ended_is_replayed_by_a_slider(page):
+    run = moving(30.0)
+    page.offer_replay(run)
+    slider = page._slider
+    assert (slider.min, slider.max) == (run[0].time, run[-1].time)
+    slider.value = 10.01
+    assert 't = 10.00 s' in page._caption.content
+    assert page._plots[0].data[0][[0, -1]] == pytest.approx([0.0, 10.0])
+    np.testing.assert_allclose(
+        node(page, '/path').points[-1, 1], tip_of(run[300].position), atol=1e-6
+    )
+    slider.value = 25.0
+    assert page._plots[0].data[0][0] == pytest.approx(5.0, abs=0.1)
+    page.offer_replay([])
+    assert page._slider is None
 
 
 def test_payloads_and_other_events_of_a_plant_are_listed():
@@ -274,7 +298,7 @@ def test_page_shows_the_loop_its_events_and_that_its_controller_is_gone(ros):
     chunk = JointTrajectory(joint_names=['joint1', 'joint2'])
     chunk.points.append(JointTrajectoryPoint(positions=ahead.tolist()))
     chunk.points[0].time_from_start.sec = 1
-    inputs._on_trajectory(serialize_message(chunk))
+    inputs.take_trajectory(serialize_message(chunk))
     ros.until(lambda: events_with(view, '1 points'))
 
     arm.set_parameters([Parameter('load.payload', value=0.5)])
@@ -310,7 +334,9 @@ def test_contact_is_on_the_page_and_in_diagnostics(ros):
 
     push = {'events.begin': [8.0], 'events.duration': [60.0], 'events.payload': [0.0]}
     force = {'events.force': [4.0, 0.0, 0.0]}
-    arm, _ = ros.loop({**push, **force, 'autostart': False}, {'contact.enabled': True})
+    arm, law = ros.loop(
+        {**push, **force, 'autostart': False}, {'contact.enabled': True}
+    )
     ros.until(lambda: view._config)
     assert configure(ros, arm)
     assert activate(ros, arm)
@@ -337,7 +363,39 @@ def test_contact_is_on_the_page_and_in_diagnostics(ros):
     assert abs(torque) > float(details['explained by model and noise'].split()[0])
     (event,) = events_with(view, 'N m from outside on joint1')
     assert event[:2] == (pytest.approx(at, abs=1e-3), 'contact')
+    # Once it has ended, all of it can be looked at.
+    assert view.page._slider is None
+    assert deactivate(ros, law)
+    assert cleanup(ros, law)
+    ros.until(lambda: view.page._slider)
+    assert view.page._state == ('OK', 'finished: the controller has ended as it should')
+    assert view.page._slider.max > 8.0
+    view.page._slider.value = 7.0
+    shown = float(re.search(r't = (.*?) s', view.page._caption.content)[1])
+    assert 6.0 < shown <= 7.0
     view.close()
+
+
+def test_page_replays_a_run_until_the_user_goes_on(tmp_path):
+    """With a terminal; the results follow."""
+    out = tmp_path / 'run'
+    words = ('--view', '--mode', 'lockstep', '--duration', '3', '--out', str(out))
+    ours, theirs = pty.openpty()
+    with subprocess.Popen((*COMMAND, *words), stdout=PIPE, stderr=theirs) as process:
+        os.close(theirs)
+        said = b''
+        expected = rb'(?s)(?=.*the run has ended).*open (http://127.0.0.1:\d+)\s'
+        while not (found := re.match(expected, said)):
+            assert process.poll() is None, said
+            said += os.read(ours, 1000)
+        address = found[1].decode()
+        with urlopen(address) as served:  # noqa: S310 - an address of our own
+            assert b'<html' in served.read()
+        process.send_signal(signal.SIGINT)
+        results = process.communicate()[0]
+    os.close(ours)
+    assert process.returncode == 0
+    assert b'bound       held by every joint' in results
 
 
 def test_page_of_a_run_is_served_until_the_run_ends(tmp_path):

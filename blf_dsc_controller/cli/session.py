@@ -14,7 +14,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, closing, contextmanager
 from importlib import metadata
 from pathlib import Path
@@ -57,6 +57,7 @@ _PAGE = 'open http'  # in the log of the node that serves it
 _BAR = '{desc} |{bar}| {n:.1f}/{total:g} s [{elapsed}<{remaining}]{postfix}'
 _DISCOVERY = 0.5  # s, until the nodes of a domain have answered
 _RANGE = 'ROS_AUTOMATIC_DISCOVERY_RANGE'
+_ENDED = 'the run has ended: its page replays it until Ctrl-C, then the results follow'
 _PROFILES = 'FASTRTPS_DEFAULT_PROFILES_FILE'
 
 
@@ -197,6 +198,7 @@ def _run_nodes(
         loop = [_LOOP] if is_lockstep else [CONTROLLER, PLANT]
         nodes = [started(name) for name in (RECORDER, *loop)]
         starting = nodes
+        pages: list[NodeProcess] = []
         while all(node.is_running for node in nodes) and not interrupts:
             monitor.wait(0.1)
             notices = [notice for node in starting for notice in node.new_notices()]
@@ -205,14 +207,35 @@ def _run_nodes(
             if monitor.start is not None and (starting is nodes or notices):
                 # Only now, since the nodes wait for a subscriber, which must be the
                 # recorder.
-                starting = [started(VIEW)] if view else []
+                if view:
+                    pages.append(started(VIEW))
+                starting = pages if view else []
                 view = False
         completed = not (interrupts or nodes[-1].is_running)
         if completed:
             monitor.show(config.plant.duration)
+            _keep(pages, nodes[1:], monitor, interrupts)
     for node in nodes:
         node.check()
     return completed
+
+
+def _keep(
+    pages: Sequence[NodeProcess],
+    loop: Sequence[NodeProcess],
+    monitor: ProgressMonitor,
+    interrupts: Sequence[int],
+) -> None:
+    """Keep the page of a loop that has ended until an interrupt, if there is a terminal."""
+    if not (pages and sys.stderr.isatty()):
+        return
+    for node in reversed(loop):
+        node.stop()  # so that the page says that they have finished
+    tqdm.write(_ENDED, file=sys.stderr)
+    while pages[0].is_running and not interrupts:
+        for notice in pages[0].new_notices():
+            tqdm.write(notice, file=sys.stderr)
+        monitor.wait(0.1)
 
 
 def _die_with_parent() -> None:

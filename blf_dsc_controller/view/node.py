@@ -54,6 +54,7 @@ _PAUSE = 1.0  # s without targets, after which another stream is listed
 _SILENCE = 30  # frames without a joint state before the page reports it
 _OUTDATED = 500_000_000  # ns
 _LISTED = 12  # events
+_KEPT = 2000  # snapshots of a run
 _NICE = 10  # lower priority than the loop
 _LOCAL = ('127.0.0.1', 'localhost')  # hosts that only this computer can reach
 _STREAMS = (
@@ -85,6 +86,7 @@ class ViewNode(PlainNode):
     Attributes:
         page: what is served.
         past: the snapshots of the last `PAST` seconds.
+        run: snapshots of the whole run, at most `_KEPT`, evenly spaced.
     """
 
     def __init__(self, **options: Any) -> None:
@@ -92,6 +94,9 @@ class ViewNode(PlainNode):
         config = declare(self, ViewConfig)
         self.page = Page(config.host, config.port)
         self.past: deque[Snapshot] = deque()
+        self.run: list[Snapshot] = []
+        self._stride, self._taken = 1, 0  # of the snapshots that are kept
+        self._is_offered = False  # whether the page offers to replay them
         self._config: ControllerConfig | None = None
         self._plant: dict[str, Any] = {}  # parameters of the simulated plant
         self._events: deque[tuple[float, str, str]] = deque(maxlen=_LISTED)
@@ -133,6 +138,7 @@ class ViewNode(PlainNode):
         self._silent = 0 if has_state else self._silent + 1
         self.page.state(*self._health())
         self.page.events(list(self._events))
+        self._offer_replay()
         before = self._clients_seen
         self._clients_seen = frozenset(self.page.server.get_clients())
         is_new = before != self._clients_seen
@@ -141,6 +147,22 @@ class ViewNode(PlainNode):
             self.page.move(list(self.past))
             if self._pictures % _PLOTTED == 0 or is_new:
                 self.page.plot(list(self.past))
+
+    def _offer_replay(self) -> None:
+        """Let the page replay a run that has ended, until another one begins."""
+        has_ended = self._finished and self._silent >= _SILENCE
+        if has_ended != self._is_offered:
+            self._is_offered = has_ended
+            self.page.offer_replay(list(self.run) if has_ended else [])
+
+    def _keep_for_replay(self, snapshot: Snapshot) -> None:
+        """Keep every `_stride`-th snapshot of the run; half of them where there are too many."""
+        if self._taken % self._stride == 0:
+            self.run.append(snapshot)
+        self._taken += 1
+        if len(self.run) > _KEPT:
+            del self.run[1::2]
+            self._stride *= 2
 
     def _health(self) -> tuple[str, str]:
         """Return the state of the controller, or that it or the arm has gone silent."""
@@ -193,6 +215,8 @@ class ViewNode(PlainNode):
         if event.type is EventType.START:
             self._start, self._noted = event.stamp, -1.0
             self.past.clear()
+            self.run.clear()
+            self._stride, self._taken = 1, 0
         details = [
             f'{content[k]}' for k in ('reason', 'text', 'parameters') if k in content
         ]
@@ -287,7 +311,9 @@ class ViewNode(PlainNode):
         learned = monitor[:m], truth, lambda_min, squares, load, loaded, tool
         felt, interval = np.split(external, 2)
         now = Snapshot(time, state[0], xi1, k_c, tau, *learned, felt, interval)
-        self.past.append(now._replace(touched=bool(contact > 0.0)))
+        now = now._replace(touched=bool(contact > 0.0))
+        self.past.append(now)
+        self._keep_for_replay(now)
         while self.past[0].time < time - PAST - 1.0:
             self.past.popleft()
         self._events += [

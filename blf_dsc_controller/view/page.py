@@ -14,6 +14,7 @@ import os
 import socket
 import sysconfig
 import time
+from bisect import bisect_left, bisect_right
 from collections.abc import Mapping, Sequence
 from contextlib import redirect_stdout, suppress
 from html import escape
@@ -48,6 +49,8 @@ _PEAK = 30  # snapshots, a second, of which the largest error is plotted
 _AXIS_OF_SHARE = (0.1, 300.0)  # % of the bound
 _HEIGHT = 130  # px of a plot: three fit below the state at 900 px
 _VIEW = np.array((0.42, -0.88, 0.22))  # direction from the arm to the camera
+_FEWEST = 2  # snapshots of a run that can be replayed
+_REPLAYED = 1000  # steps of the slider
 _LINE = {'width': 1.5, 'points': {'show': False}}
 _AUTO: Mapping[str, Any] = {}
 _FROM_ZERO = {
@@ -131,6 +134,7 @@ class Page:
         """Show only the state until `draw_arm` is called."""
         server, gui = self.server, self.server.gui
         self._list: Any = None
+        self._slider: Any = None
         server.scene.reset()
         gui.reset()
         gui.configure_theme(
@@ -162,7 +166,7 @@ class Page:
         self._base = np.array(model.get_transform(arm.chain.base))
         server.scene.add_grid('/floor', 4 * reach, 4 * reach, cell_size=0.25)
         self._corners = None
-        tabs = gui.add_tab_group()
+        tabs = self._tabs = gui.add_tab_group()
         with tabs.add_tab('Plots'):
             log = {'distr': 3, 'range': _AXIS_OF_SHARE}
             self._plots = [
@@ -210,6 +214,32 @@ class Page:
             legend={'show': True, 'live': False},
             height=_HEIGHT,
         )
+
+    def offer_replay(self, run: Sequence[Snapshot]) -> None:
+        """Offer a slider over these snapshots of a run that has ended; without any, none."""
+        if self._slider is not None:
+            self._slider.remove()
+            self._slider = None
+        if len(run) < _FEWEST:
+            return
+        times = [each.time for each in run]
+        first, last = times[0], times[-1]
+        self._slider = self.server.gui.add_slider(
+            'replay [s]',
+            first,
+            last,
+            (last - first) / _REPLAYED,
+            last,
+            order=self._tabs.order - 0.5,
+        )
+
+        def show(_: Any) -> None:
+            at = bisect_right(times, self._slider.value)
+            past = run[bisect_left(times, times[at - 1] - PAST) : at]
+            self.move(past)
+            self.plot(past)
+
+        self._slider.on_update(show)
 
     def state(self, level: str, text: str) -> None:
         """Show the state: level (OK, WARN, ERROR or STALE) and description."""
