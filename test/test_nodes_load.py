@@ -159,7 +159,8 @@ def test_law_that_begins_again_leaves_the_load_to_the_drives(services, ros):
     ros.until(lambda: guard.time < 8.0)
     ros.until(lambda: guard.time > 0.5 or guard.supervisor.text)
     assert guard.supervisor.running, guard.supervisor.text
-    assert guard.samples.ratio.max() < 0.6
+    # if the commands took away what the drives add, it would be 0.2
+    assert guard.samples.ratio.max() < 0.1
     assert deactivate(ros, arm.law)
     ros.until(lambda: guard.is_settled)
     assert cleanup(ros, arm.law)
