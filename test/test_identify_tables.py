@@ -12,6 +12,7 @@ from random_arm import (
     PANDA_CHAIN,
     PANDA_TEXT,
     measured,
+    recording_of,
     reference_of,
     shake,
     truth_of,
@@ -30,6 +31,7 @@ from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.identification.from_table import read_table
 from blf_dsc_controller.identification.identify import identify_arm
 from blf_dsc_controller.identification.mjcf import mjcf
+from blf_dsc_controller.identification.problem import problem_of
 from blf_dsc_controller.identification.recording import Recording
 
 RATE = 100.0  # Hz
@@ -230,6 +232,20 @@ def test_efforts_of_opposite_sign_are_found_and_named(states, tmp_path, capsys):
     assert code == 0
     wrong = [name for name, sign in zip(PANDA, signs, strict=True) if sign < 0.0]
     assert f'the efforts of {", ".join(wrong)} have the opposite sign' in output
+
+
+@pytest.mark.parametrize('sign', [-1.0, 1.0])
+def test_sign_that_neither_gravity_nor_friction_shows_is_that_of_the_others(
+    states, sign
+):
+    """The first joint's torque is hardly more than noise."""
+    faint = states[::5].copy()
+    faint[:, 2, 0] = np.random.default_rng(0).normal(size=len(faint))
+    faint[:, 2] *= sign
+    recording = recording_of(faint, period=0.005)
+    robot = Robot(urdf=PANDA_TEXT, tip='panda_hand_tcp')
+    problem = problem_of(recording, robot, 'torque', None, find_signs=True)
+    assert (problem.reversed == (sign < 0.0)).all()
 
 
 def test_urdf_that_is_not_to_be_used_is_written_on_demand_only(

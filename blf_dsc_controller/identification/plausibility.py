@@ -59,11 +59,14 @@ def gravity_share(rows: Rows, fit: Indices, P: Floats) -> float:
 def reversed_joints(rows: Rows, fit: Indices, P: Floats) -> NDArray[np.bool_]:
     """Return which joints (n,) have efforts of the opposite sign.
 
-    Gravity shows it; where a joint carries hardly any, friction does, which cannot drive.
+    Gravity shows it; where a joint carries hardly any, friction does, which cannot drive.  What
+    neither shows is taken to be as in all joints that carry some.
     """
     u = rows.u(0.0)[fit]
     size = _sizes(rows, fit)
     gravity, inertial = _shares_of(rows, fit, P)
+    carries = gravity.std(axis=0) > _FAINT * size
+    drags = np.zeros(size.size, dtype=bool)  # friction shows the sign
     found = np.zeros(size.size, dtype=bool)
     names = [COLUMNS.index(name) for name in _FRICTION]
     for i in range(size.size):
@@ -71,12 +74,14 @@ def reversed_joints(rows: Rows, fit: Indices, P: Floats) -> NDArray[np.bool_]:
         columns = np.column_stack((gravity[:, i], inertial[:, i], friction))
         weight = rows.weight[fit, i]
         share = _solved(columns * weight[:, None], u[:, i] * weight)
-        if gravity[:, i].std() > _FAINT * size[i]:
+        if carries[i]:
             found[i] = share[0] < -LEAST_GRAVITY
         else:
             sliding = friction[:, :2] @ share[2:4]
-            power = float(np.mean(sliding * friction[:, 0]))
-            found[i] = power < 0.0 and _rms(sliding) > _DRIVEN * size[i]
+            drags[i] = _rms(sliding) > _DRIVEN * size[i]
+            found[i] = drags[i] and np.mean(sliding * friction[:, 0]) < 0.0
+    if carries.any() and found[carries].all():
+        found |= ~(carries | drags)
     return found
 
 
