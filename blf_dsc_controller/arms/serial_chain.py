@@ -204,7 +204,7 @@ def add_momentum(bodies: Bodies, i: int, dq: float, Yp: Array, Yr: Array) -> Non
     """Fill the columns of body i in M dq and in G - C^T dq."""
     motions = bodies.motions
     momenta = bodies.products[1]
-    rest = bodies.products[2]
+    forces = bodies.products[2]
     w = angular(motions[VELOCITY])
     u = linear(motions[VELOCITY])
     g = linear(motions[GRAVITY])
@@ -214,16 +214,16 @@ def add_momentum(bodies: Bodies, i: int, dq: float, Yp: Array, Yr: Array) -> Non
         momentum_products(S, w, u, momenta)
         momenta[ROTOR] = dq if j == i else 0.0
         choose(bodies, i, j, momenta, Yp)
-        momentum_products(dS, w, u, rest)
+        momentum_products(dS, w, u, forces)
         lever = cross(g, angular(S))
-        rest[0] += dot(linear(S), g)
-        rest[1] += lever[0]
-        rest[2] += lever[1]
-        rest[3] += lever[2]
+        forces[0] += dot(linear(S), g)
+        forces[1] += lever[0]
+        forces[2] += lever[1]
+        forces[3] += lever[2]
         for entry in range(ROTOR):
-            rest[entry] = -rest[entry]
-        rest[ROTOR] = 0.0
-        choose(bodies, i, j, rest, Yr)
+            forces[entry] = -forces[entry]
+        forces[ROTOR] = 0.0
+        choose(bodies, i, j, forces, Yr)
 
 
 @inner

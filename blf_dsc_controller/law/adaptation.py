@@ -136,11 +136,11 @@ def scale_by_inertia(settings: Settings, state: State, signals: Signals) -> None
     x = signals.unit
     for i in range(settings.n):
         x[i] /= settings.joint_inertia[i]
-    settings.model.momentum_regressor(signals.q, x, signals.momentum, signals.rest)
+    settings.model.momentum_regressor(signals.q, x, signals.Yp, signals.Yr)
     for i in range(settings.n):
         x[i] *= state.rotor_error[i]
         for j in range(settings.p):
-            x[i] += signals.momentum[i, j] * settings.initial_estimate[j]
+            x[i] += signals.Yp[i, j] * settings.initial_estimate[j]
 
 
 @inner

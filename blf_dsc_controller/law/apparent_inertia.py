@@ -99,7 +99,7 @@ def measure(settings: Settings, state: State, signals: Signals, dt: float) -> No
     if state.samples[0] * dt < _RELEASE:
         return
     settings.model.momentum_regressor(
-        signals.q, signals.band_acceleration, signals.momentum, signals.rest
+        signals.q, signals.band_acceleration, signals.Yp, signals.Yr
     )
     for i in range(settings.n):
         J = settings.unsure_rotor[i]
@@ -107,7 +107,7 @@ def measure(settings: Settings, state: State, signals: Signals, dt: float) -> No
             continue
         unexplained = signals.unit[i]
         for j in range(settings.p):
-            unexplained -= signals.momentum[i, j] * settings.initial_estimate[j]
+            unexplained -= signals.Yp[i, j] * settings.initial_estimate[j]
         state.rotor_sums[0, i] += dt * signals.unit[i] * unexplained
         state.rotor_sums[1, i] += dt * signals.unit[i] * signals.band_acceleration[i]
         least = _EVIDENCE * settings.joint_inertia[i]

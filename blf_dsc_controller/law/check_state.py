@@ -36,7 +36,7 @@ class Checks(NamedTuple):
     last: Annotated[Array, 'n']  # N m, command of the last sample
     # (N m)^2, mean square step of the commands over _CHATTERS
     chatter: Annotated[Array, 'n']
-    still: Cell  # s, since a joint has last moved
+    at_rest: Cell  # s, since a joint has last moved
     q: Annotated[Array, 'n']  # rad, where it has
     moved: Annotated[Array, 'm + n']  # estimates and d^3 of then
     # |xi1| / k of the sample that `consistent` is of, relaxed since
@@ -50,7 +50,7 @@ class Checks(NamedTuple):
     compares: Cell  # 1: measured efforts are torques, to be compared with the commands
     lack: Annotated[Array, 'n']  # N m, average of commands less efforts over _RECENT
     # N m, of it the error of the model of what the drives add
-    known: Annotated[Array, 'n']
+    lack_in_motion: Annotated[Array, 'n']
     usual: Annotated[Array, 'n']  # N m, average of the lack over _BEFORE
     lacking: Cell  # s, since a lack has become too large
     read: Annotated[Array, '2 * n']  # q and dq as last read

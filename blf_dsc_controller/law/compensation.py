@@ -42,8 +42,8 @@ def compute_regressors(settings: Settings, state: State, signals: Signals) -> No
         if settings.follows_inertia == 1:
             signals.damped[i] += signals.restoring[i] / settings.joint_inertia[i]
     if settings.prediction == FILTERED:
-        Yp = signals.momentum
-        Yr = signals.rest
+        Yp = signals.Yp
+        Yr = signals.Yr
         model.regressors(q, dq, state.alpha2, signals.damped, H, Yp, Yr)
     else:
         model.regressor(q, dq, state.alpha2, signals.damped, H)

@@ -60,7 +60,7 @@ def check_effect(
     T = checks.sample_time[0]
     flags = compare_effort(settings, checks, signals, sample, begins, moves)
     follows = effort_follows(settings, checks)
-    checks.still[0] = 0.0 if moves else checks.still[0] + T
+    checks.at_rest[0] = 0.0 if moves else checks.at_rest[0] + T
     for i in range(settings.n):
         smooth = 1.0 if begins else min(1.0, T / _RECENT)
         checks.recent[i] += smooth * (sample.torque[i] - checks.recent[i])
@@ -73,7 +73,7 @@ def check_effect(
             )
         change = abs(checks.recent[i] - checks.before[i])
         has_changed = change > _CHANGED * settings.torque_limit[i]
-        if has_changed and checks.still[0] > _RECENT and not follows:
+        if has_changed and checks.at_rest[0] > _RECENT and not follows:
             flags |= NO_EFFECT | SUSPECT
     if moves and checks.lacking[0] == 0.0:
         for j in range(settings.m + settings.n):
@@ -120,8 +120,8 @@ def compare_effort(
             checks.lack[i] += min(1.0, T / _RECENT) * (lack - checks.lack[i])
             checks.usual[i] += min(1.0, T / _BEFORE) * (lack - checks.usual[i])
         if moves:
-            checks.known[i] = checks.lack[i] if is_relative else 0.0
-        excess = abs(checks.lack[i] - checks.known[i])
+            checks.lack_in_motion[i] = checks.lack[i] if is_relative else 0.0
+        excess = abs(checks.lack[i] - checks.lack_in_motion[i])
         is_lacking = is_lacking or excess > _CHANGED * settings.torque_limit[i]
     checks.lacking[0] = checks.lacking[0] + T if is_lacking else 0.0
     return NO_EFFECT | SUSPECT if checks.lacking[0] > _LASTING else 0

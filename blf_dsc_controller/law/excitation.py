@@ -131,13 +131,13 @@ def is_physical(settings: Settings, signals: Signals, theta: Array) -> bool:
         for i in range(settings.n):
             signals.unit[i] = 1.0 if i == k else 0.0
         settings.model.momentum_regressor(
-            signals.q, signals.unit, signals.momentum, signals.rest
+            signals.q, signals.unit, signals.Yp, signals.Yr
         )
         for i in range(k, settings.n):
             signals.inertia[k, i] = 0.0
             for j in range(settings.p):
                 parameter = theta[j] - _LEAST_INERTIA * settings.initial_estimate[j]
-                signals.inertia[k, i] += signals.momentum[i, j] * parameter
+                signals.inertia[k, i] += signals.Yp[i, j] * parameter
     return cholesky_factor(signals.inertia)
 
 

@@ -24,7 +24,7 @@ def observe(
     compute_regressors(settings, state, signals)
     friction.fill_compensation(settings, state, signals, dt)
     friction.follow_motion(settings, state, signals)
-    prediction.fill_columns(settings, t, signals.dq, signals.rest)
+    prediction.fill_columns(settings, t, signals.dq, signals.Yr)
     prediction.form_row(settings, state, signals, dt)
     friction.filter_shapes(settings, state, signals, dt)
     if state.samples[0] == 0.0:

@@ -57,8 +57,8 @@ def fill_energies(
         V[k] = 0.0 if settings.truth_known == 1 else nan
     if settings.truth_known == 0:
         return
-    P, Yp = settings.true_parameters, signals.momentum
-    settings.model.momentum_regressor(signals.q, signals.xi2, Yp, signals.rest)
+    P, Yp = settings.true_parameters, signals.Yp
+    settings.model.momentum_regressor(signals.q, signals.xi2, Yp, signals.Yr)
     for i in range(n):
         for j in range(p):
             V[1] += 0.5 * signals.xi2[i] * Yp[i, j] * P[j]

@@ -96,9 +96,9 @@ def filter_row(settings: Settings, state: State, signals: Signals, dt: float) ->
                 signals.dqr[i] ** 2 + settings.motion_scale**2
             )
         for j in range(m):
-            row[i, j] = 0.5 * (signals.rest[i, j] + state.rest[i, j])
+            row[i, j] = 0.5 * (signals.Yr[i, j] + state.Yr[i, j])
         for j in range(p):
-            row[i, j] += (signals.momentum[i, j] - state.momentum[i, j]) * (1.0 / dt)
+            row[i, j] += (signals.Yp[i, j] - state.Yp[i, j]) * (1.0 / dt)
         row[i, m] = state.late[1, i]
         external_torque.filter_interval(settings, state, signals, i, dt)
         for j in range(m + 1):
@@ -135,7 +135,7 @@ def lambda_row(settings: Settings, state: State, signals: Signals) -> None:
     """
     products = 1.0
     squares = 1.0
-    X = signals.momentum
+    X = signals.Yp
     for i in range(settings.n):
         products += (
             signals.acceleration[i] * signals.dalpha2[i]
@@ -146,9 +146,7 @@ def lambda_row(settings: Settings, state: State, signals: Signals) -> None:
     settings.model.regressor(signals.q, signals.dq, state.alpha2, signals.dalpha2, X)
     for i in range(settings.n):
         for j in range(settings.m):
-            signals.row[i, j] = (
-                X[i, j] if j < settings.p else scale * signals.rest[i, j]
-            )
+            signals.row[i, j] = X[i, j] if j < settings.p else scale * signals.Yr[i, j]
         signals.row[i, settings.m] = scale * signals.applied[i]
 
 
@@ -164,6 +162,6 @@ def form_row(settings: Settings, state: State, signals: Signals, dt: float) -> N
         filter_row(settings, state, signals, dt)
     for i in range(settings.n):  # Yp and [Yr | D] for the next interval
         for j in range(settings.m):
-            state.rest[i, j] = signals.rest[i, j]
+            state.Yr[i, j] = signals.Yr[i, j]
             if j < settings.p:
-                state.momentum[i, j] = signals.momentum[i, j]
+                state.Yp[i, j] = signals.Yp[i, j]

@@ -157,8 +157,8 @@ class State(NamedTuple):
     # number of samples in which it was cut at its rate limit
     rate_cuts: Annotated[Array, 'n']
     estimate: Annotated[Array, 'm']  # theta^ = [P^; columns]
-    momentum: Annotated[Array, 'n', 'p']  # Yp of the last sample
-    rest: Annotated[Array, 'n', 'm']  # [Yr | columns] of the last sample
+    Yp: Annotated[Array, 'n', 'p']  # Yp of the last sample
+    Yr: Annotated[Array, 'n', 'm']  # [Yr | columns] of the last sample
     late: Annotated[
         Array, 2, 'n'
     ]  # applied torque behind half of `lag`, and behind all
@@ -262,8 +262,8 @@ class Signals(NamedTuple):
     stribeck: Annotated[Array, 'n']  # exp(-(v / v_s)^2)
     friction: Annotated[Array, 'n']  # compensation of Coulomb friction, N m
     breakaway_rate: Annotated[Array, 'n']  # what k^ lacks
-    momentum: Annotated[Array, 'n', 'p']  # Yp
-    rest: Annotated[Array, 'n', 'm']  # [Yr | columns]
+    Yp: Annotated[Array, 'n', 'p']  # Yp P = M dq
+    Yr: Annotated[Array, 'n', 'm']  # [Yr | columns], Yr P = G - C^T dq
     row: Annotated[Array, 'n', 'm + 1']  # filtered [X | u]
     Phi: Annotated[Array, 'm', 'm']  # of the current window
     b: Annotated[Array, 'm']

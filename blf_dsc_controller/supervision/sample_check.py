@@ -152,7 +152,7 @@ class SampleCheck:
         limit = self._controller.settings.torque_limit
         self._kept[:] = checks.moved
         if checks.lacking[0] > 0.0:
-            lack = checks.lack - checks.known
+            lack = checks.lack - checks.lack_in_motion
             return self._lacking(int(np.argmax(np.abs(lack) / limit)), lack)
         change = checks.recent - checks.before
         worst = int(np.argmax(np.abs(change) / limit))
