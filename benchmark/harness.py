@@ -32,6 +32,7 @@ _GROUPS = {  # module and function of each
     'guarded': ('guarded', 'measure'),
     'node': ('nodes', 'measure'),
     'startup': ('nodes', 'measure_start'),
+    'wire': ('wire', 'measure'),
 }
 _HERE = Path(__file__).parent
 _PACKAGES = ('numpy', 'numba', 'scipy', 'mujoco', 'pin', 'ros-jazzy-rclpy')

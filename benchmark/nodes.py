@@ -222,6 +222,11 @@ def measure() -> Iterator[Ratio]:
                 )
 
 
+def latencies(preset: str, rounds: int) -> np.ndarray:
+    """Return the median latency [s] of the controller's node (rounds,), telemetry off."""
+    return _figures(load_loop(preset), (_QUIET,), rounds)[_QUIET][:, 0]
+
+
 def measure_start() -> Iterator[Ratio]:
     """Measure the time to the first torque without compiled kernels relative to the null node's."""
     found = _figures(load_loop('recommended'), (_NULL, _QUIET), _STARTS, cold=True)

@@ -105,15 +105,38 @@ def assert_replays(folder):
 
 
 def test_it_tracks_and_holds_two_kilograms_that_appear_in_the_hand(wire):
+    """With topics beside it, where there is ROS."""
     wire.simulate('127.0.0.11', 'load=2@1000', 'load=0@2000')
-    code, output = ended(wire.drive('127.0.0.11', 3))
+    topics = ['--ros'] if importlib.util.find_spec('rclpy') else []
+    code, output = ended(wire.drive('127.0.0.11', 3, *topics))
     assert code == 0, output
+    assert not any(line.startswith('topics') for line in output.splitlines()), output
     assert 'end effector of 0.73 kg' in output
     recorded = blf.read_run(wire.folder / 'bag')
     assert set(np.diff(recorded.stamp)) == {1_000_000}  # ns: no state was missed
     assert recorded.stamp.size > 3000  # 3 s, and the end
     assert np.nanmax(np.abs(recorded.error)) < BOUND
     assert_replays(wire.folder / 'bag')
+
+
+# In a process of its own: libfranka raises the priority of the thread that connects.
+DECLARED = """
+import sys, pylibfranka
+robot = pylibfranka.Robot(sys.argv[1], pylibfranka.RealtimeConfig.kIgnore)
+robot.set_load(1.0, [0.0, 0.0, 0.1], [0.001, 0, 0, 0, 0.001, 0, 0, 0, 0.001])
+"""
+
+
+def test_load_that_is_declared_and_not_there_is_refused_before_its_step(wire, tmp_path):
+    """1 kg in Desk, of which nobody tells the law: benchmark/wrong_load.py has other loads."""
+    preset = (blf.share_folder() / 'config/fr3_direct.yaml').read_text()
+    untold = preset.replace('driver: franka', 'driver: franka\n    set_load: false')
+    (tmp_path / 'my.yaml').write_text(untold)
+    wire.simulate('127.0.0.18')
+    assert ended(wire.start('-c', DECLARED, '127.0.0.18'))[0] == 0
+    code, output = ended(wire.drive('127.0.0.18', 1, '--config', tmp_path / 'my.yaml'))
+    assert code != 0, output
+    assert 'more than the 1 N m that its drive tolerates' in output
 
 
 def told_config():
