@@ -132,6 +132,20 @@ def test_positions_are_checked_relative_to_the_middle_of_their_range():
     assert worst_violation(pack(2, [PAPER]), np.linspace(2.0, 4.0, 101), config) is None
 
 
+@pytest.mark.parametrize(
+    ('speed', 'acceleration', 'quantity'),
+    [(0.2, 0.1, 'acceleration'), (0.1, 0.2, 'velocity')],
+)
+def test_violation_is_the_largest_of_all_quantities(speed, acceleration, quantity):
+    """Of 0.3 sin t, whose velocity and acceleration reach 0.3."""
+    wide = (9.0, 9.0)
+    allowed = MotionLimits((-9.0, -9.0), wide, (9.0, speed), (9.0, acceleration))
+    config = ControllerConfig(JOINTS, limits=allowed)
+    violation = worst_violation(pack(2, [PAPER]), np.linspace(0.0, 7.0, 1001), config)
+    assert (violation.joint, violation.quantity) == ('elbow', quantity)
+    assert violation.ratio == pytest.approx(3.0, rel=1e-3)
+
+
 CONFIG = ControllerConfig()
 FIRST = np.array([2.2935, 1.6961])  # qr(0)
 STILL = np.zeros(2)

@@ -11,7 +11,11 @@ import pytest
 
 pytest.importorskip('ruckig', reason='needs ruckig')
 
+from blf_dsc_controller.configuration.controller import ControllerConfig
+from blf_dsc_controller.reference.approach import hold
+from blf_dsc_controller.reference.retargeting import Target, plan_target
 from blf_dsc_controller.reference.stream import TargetStream
+from blf_dsc_controller.reference.terms import pack, sampled
 
 BENCHMARK = Path(__file__).parents[1] / 'benchmark'
 FASTEST = np.array([1.5, 1.5])
@@ -178,3 +182,19 @@ def test_motions_of_moveit_are_stretched_as_little_as_the_table_says(scaling, ca
     assert shares[0][0] == 100.0
     assert shares[1][0] < 50.0
     assert shares[1][1] <= 2.0
+
+
+@pytest.mark.parametrize('held', [True, False])
+def test_target_that_nothing_follows_is_held_or_left_behind_while_braking(held):
+    """It is due at 1 s; its line is left at 1.2 s."""
+    q = np.array([2.1, 1.5])
+    target = Target(tuple(q), (0.1, -0.1), 1.0, 1.2, held)
+    config = ControllerConfig()
+    motion = plan_target(target, pack(2, [hold(q)]), 0.0, config)
+    on_line, last = sampled(motion.vector, np.array([1.1, motion.end + 1.0]))
+    np.testing.assert_allclose(on_line[0], np.add(q, (0.01, -0.01)), atol=1e-9)
+    np.testing.assert_array_equal(last[1:], 0.0)
+    if held:
+        np.testing.assert_allclose(last[0], q, atol=1e-9)
+    else:
+        assert np.all((last[0] - q) * [1.0, -1.0] > 0.02)
