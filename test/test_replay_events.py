@@ -213,6 +213,24 @@ def test_dropped_states_are_detected(tmp_path):
     assert compared(result)['commands'] == 2 * 147
 
 
+def test_dropped_state_is_told_from_a_missing_answer_beside_torques_of_the_watchdog(
+    tmp_path,
+):
+    """Without sequence numbers, by the number of torques in the journal."""
+    rig = Recorder({**DAMPED, 'safety.watchdog': 'on'})
+    rig.drops = (20,)
+    rig.step(50)
+    rig.wait(100)
+    rig.guard.reset()
+    rig.step(30)
+    rig.guard.release()
+    result = rig.verify(tmp_path)
+    torques = len(of(rig.entries, COMMANDS))
+    assert torques > 80  # those of 79 states, and the watchdog's
+    assert (result.difference, result.skipped) == (None, 1)
+    assert compared(result)['commands'] == 2 * torques
+
+
 def test_replay_ends_where_the_law_failed(tmp_path):
     """Nothing in the bag shows how far the law got."""
     rig = Recorder(DAMPED)
