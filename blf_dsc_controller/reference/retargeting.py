@@ -12,7 +12,6 @@ is on its way; then the reference brakes. So every motion ends at rest by itself
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from math import nan
 from typing import Any, NamedTuple
 
@@ -304,16 +303,30 @@ def plan_target(
         raise TrajectoryError([str(error)]) from error
 
 
+class _Pursuit(NamedTuple):
+    """What a motion from the present state onto a moving target begins from and leads to."""
+
+    present: np.ndarray  # position, velocity, acceleration (3, n) of the reference now
+    q: np.ndarray  # (n,) rad, of the target when it is due
+    dq: np.ndarray  # (n,) rad/s, of the target, constant
+    due: float  # s
+    now: float  # s
+    lead: float  # s from now, after which the motion should have joined the target
+
+    def target_in(self, duration: float) -> np.ndarray:
+        """Return position and velocity (2, n) of the target, a duration [s] from now."""
+        t = self.now + duration
+        return np.stack((self.q + (t - self.due) * self.dq, self.dq))
+
+
 def _plan_line(
     target: Target, vector: np.ndarray, now: float, config: ControllerConfig
 ) -> PlannedMotion:
-    present = state_at(vector, now)
+    """Return `plan_target` of a valid target; raises MotionError."""
     q, dq = _within_limits(target, config)
-
-    def line(t: float) -> np.ndarray:
-        return np.stack((q + (t - target.due) * dq, dq))
-
-    join = _joined(present, line, now, max(target.due - now, _SOONEST), config)
+    lead = max(target.due - now, _SOONEST)
+    pursuit = _Pursuit(state_at(vector, now), q, dq, target.due, now, lead)
+    join = _joined(pursuit, config)
     parts = [join]
     coast = target.until - now - join.duration
     is_late = coast < 0.0 and bool(np.any(dq))
@@ -351,50 +364,39 @@ def _within_limits(
     return q, np.clip(dq, -most, most)
 
 
-def _joined(
-    present: np.ndarray,
-    line: Callable[[float], np.ndarray],
-    now: float,
-    lead: float,
-    config: ControllerConfig,
-) -> Pieces:
-    """Return the motion from a state (3, n) now [s] onto a moving target, after `lead` [s].
+def _joined(pursuit: _Pursuit, config: ControllerConfig) -> Pieces:
+    """Return the motion onto a moving target.
 
     If the smoothest one exceeds a limit, it is the fastest one of limited jerk, relative to the
     target.
     """
-    free = np.full((1, present.shape[1]), nan)
+    free = np.full((1, pursuit.present.shape[1]), nan)
     for factor in _SMOOTH_LEADS:
-        duration = factor * lead
-        if duration > max(lead, _LONGEST_SMOOTH):
+        duration = factor * pursuit.lead
+        if duration > max(pursuit.lead, _LONGEST_SMOOTH):
             break
-        end = np.concatenate((line(now + duration), free))
-        smooth = quintic(present, end, duration)
+        end = np.concatenate((pursuit.target_in(duration), free))
+        smooth = quintic(pursuit.present, end, duration)
         if keeps_limits(smooth, config):
             return smooth
-    return _caught_up(present, line, now, lead, config)
+    return _caught_up(pursuit, config)
 
 
-def _caught_up(
-    present: np.ndarray,
-    line: Callable[[float], np.ndarray],
-    now: float,
-    lead: float,
-    config: ControllerConfig,
-) -> Pieces:
+def _caught_up(pursuit: _Pursuit, config: ControllerConfig) -> Pieces:
     """Return the fastest motion of limited jerk onto a moving target.
 
     It is found relative to the target. One that is as fast as the arm may be can not be caught up
     with: the motion then ends where the target was a while before.
     """
-    begin = line(now)
-    behind = present.copy()
+    lead = pursuit.lead
+    begin = pursuit.target_in(0.0)
+    behind = pursuit.present.copy()
     behind[:2] -= begin
     try:
         motion = profile(behind, config, np.zeros_like(begin), lead, drift=begin[1])
     except MotionError:
         for _ in range(_CHASES):
-            motion = profile(present, config, line(now + lead), lead)
+            motion = profile(pursuit.present, config, pursuit.target_in(lead), lead)
             if motion.duration <= lead * (1.0 + _LATE):
                 break
             lead = motion.duration
