@@ -720,18 +720,43 @@ class ControllerConfig(ArmConfig):
 
     def problems(self) -> Iterator[str]:
         """Check the parameters against each other and against the model."""
-        if self.model == 'urdf':
-            needed = None
-            count = parameters_of(self.robot, self.robot.chain(self.joints)).model.p
-        else:
-            model = arm_model(self.model, self.arm.l1, self.arm.gravity)
-            needed, count = model.n, model.p
-        learning = self.learning
-        learned = (self.model, self.learning.prediction)
-        if learning.weighing and learned != ('urdf', 'filtered'):
-            needs = 'model urdf and learning.prediction filtered'
-            yield f'learning.weighing: got true with {", ".join(learned)}, but needs {needs}'
+        needed, count = self._sizes()
+        misfits = list(self._weighing_problems())
+        if misfits:
+            yield from misfits
             return
+        yield from self._drive_load_problems()
+        yield from self._contact_problems()
+        yield from self._stiffness_problems()
+        yield from self.arm_problems(f'model {self.model}', needed)
+        yield from self.reference.problems()
+        yield from self.limits.problems(self.joints)
+        yield from self.barrier.problems(self.joints)
+        yield from tool_bound.problems(self)
+        radius = self.learning.radius
+        yield from self.truth.problems(self.law, self.model, count, radius)
+        yield from self.learning.problems(self.sample_time, self.model, count)
+
+    def _sizes(self) -> tuple[int | None, int]:
+        """Return how many joints the model needs, None for any, and its parameters."""
+        if self.model == 'urdf':
+            base = parameters_of(self.robot, self.robot.chain(self.joints))
+            return None, base.model.p
+        model = arm_model(self.model, self.arm.l1, self.arm.gravity)
+        return model.n, model.p
+
+    def _weighing_problems(self) -> Iterator[str]:
+        """Check that the load in the tip can be weighed."""
+        learned = (self.model, self.learning.prediction)
+        if self.learning.weighing and learned != ('urdf', 'filtered'):
+            yield (
+                f'learning.weighing: got true with {", ".join(learned)}, but needs model urdf and '
+                'learning.prediction filtered'
+            )
+
+    def _drive_load_problems(self) -> Iterator[str]:
+        """Check that the drives can be told the load, and by which service and frame."""
+        learning = self.learning
         compensates = self.robot.drive_compensates != 'none'
         if learning.tell_drive and not (learning.weighing and compensates):
             yield (
@@ -746,40 +771,37 @@ class ControllerConfig(ArmConfig):
                 'false: set it to true'
             )
         if learning.load_frame:
+            to_frame = dataclasses.replace(self.robot, tip=learning.load_frame)
             try:
-                dataclasses.replace(self.robot, tip=learning.load_frame).chain(
-                    self.joints
-                )
+                to_frame.chain(self.joints)
             except BlfDscError as error:
                 yield f'learning.load_frame: {error}'
-        if self.contact.enabled and (self.law, learning.prediction) != (
-            LAWS[0],
-            'filtered',
-        ):
+
+    def _contact_problems(self) -> Iterator[str]:
+        """Check that contacts are found, and by a law that can find them."""
+        contact = self.contact
+        prediction = self.learning.prediction
+        can_find = self.law == LAWS[0] and prediction == 'filtered'
+        if contact.enabled and not can_find:
             yield (
-                f'contact.enabled: got true with {self.law}, {learning.prediction}, but the '
-                f'external torque needs law {LAWS[0]} and learning.prediction filtered'
+                f'contact.enabled: got true with {self.law}, {prediction}, but the external torque '
+                f'needs law {LAWS[0]} and learning.prediction filtered'
             )
-        if self.contact.reaction != 'none' and not self.contact.enabled:
+        if contact.reaction != 'none' and not contact.enabled:
             yield (
-                f'contact.reaction: got {self.contact.reaction}, but without contact.enabled '
-                'nothing finds contacts: set it to true'
+                f'contact.reaction: got {contact.reaction}, but without contact.enabled nothing '
+                'finds contacts: set it to true'
             )
-        if self.model != 'urdf' and self.feedback.stiffness != Feedback().stiffness:
+
+    def _stiffness_problems(self) -> Iterator[str]:
+        """Check that the gains follow from the stiffness, if it is given."""
+        stiffness = self.feedback.stiffness
+        if self.model != 'urdf' and stiffness != Feedback().stiffness:
             yield (
-                f'feedback.stiffness: got {self.feedback.stiffness:g} with model {self.model}, but '
-                'only the gains of model urdf follow from it: leave it at 1, and lower '
-                'feedback.gain and surface.gain'
+                f'feedback.stiffness: got {stiffness:g} with model {self.model}, but only the '
+                'gains of model urdf follow from it: leave it at 1, and lower feedback.gain and '
+                'surface.gain'
             )
-        yield from self.arm_problems(f'model {self.model}', needed)
-        yield from self.reference.problems()
-        yield from self.limits.problems(self.joints)
-        yield from self.barrier.problems(self.joints)
-        yield from tool_bound.problems(self)
-        yield from self.truth.problems(
-            self.law, self.model, count, self.learning.radius
-        )
-        yield from self.learning.problems(self.sample_time, self.model, count)
 
 
 @functools.cache

@@ -11,6 +11,7 @@ FILE.py       a law of a user's own                                        its `
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 from copy import deepcopy
 from typing import Any, NamedTuple
 
@@ -51,6 +52,7 @@ _PARAMETER_OF = {
     'funnel_rate': 'barrier.funnel_rate',
     'weight': 'barrier.weight',
     'slope_limit': 'barrier.slope_limit',
+    'Kp': 'feedback.gain',
     'K': 'surface.gain',
     'mu': 'surface.mu',
     'time_constant': 'surface.time_constant',
@@ -58,6 +60,7 @@ _PARAMETER_OF = {
     'd2': 'feedback.damping',
     'gamma': 'disturbance.gain',
     'eta': 'disturbance.leakage',
+    'torque_limit': 'torque.limit',
     'rate_limit': 'torque.rate_limit',
     'kappa': 'learning.weight',
     'update': 'learning.update',
@@ -69,6 +72,7 @@ _PARAMETER_OF = {
     'coulomb': 'learning.coulomb',
     'coulomb_velocity': 'learning.coulomb_velocity',
     'frequencies': 'learning.frequencies',
+    'pole': 'learning.filter_pole',
     'radius': 'learning.radius',
     'compensation': 'learning.compensation',
     'bumpless': 'learning.bumpless',
@@ -184,77 +188,23 @@ def settings_of_config(config: ControllerConfig) -> Settings:
     A gain that is not computed here is the parameter of the same symbol, or of the same name.
     """
     model = model_of(config)
-    learning = config.learning
-    p, columns = model.p, columns_of(config)
-    m = p + len(columns)
-    is_urdf = config.model == 'urdf'
-    T = config.sample_time
-    row_interval = max(1, round(_ROWS / T)) if is_urdf else 1
-    truth = config.truth
-    per_joint = zip(
-        config.barrier.bound,
-        config.barrier.weight,
-        config.barrier.slope_limit,
-        strict=True,
-    )
-    floor = np.array(learning.residual_floor)
-    least = float(floor.min())
-    covariance = prior_covariance(config)
-    drive_chain, drive_inertias = drive_model(config.robot, config.joints)
+    columns = columns_of(config)
+    m = model.p + len(columns)
     computed = {
         'model': model,
         'n': model.n,
-        'p': p,
+        'p': model.p,
         'm': m,
-        'has_barrier': int(law_of(config).has_barrier),
-        'Wc': 0.0,
-        'memory': 0,
-        'effort_is_whole': int(config.robot.effort != 'commanded'),
-        'drive': drive_inertias.size,
-        'drive_size': drive_chain.size,
-        'window': round(learning.window / (T * row_interval)),
-        'row_interval': row_interval,
-        'interval': max(1, round((_SLOWER_CHECKS if is_urdf else _CHECKS) / T)),
-        'tones': len(learning.frequencies),
-        'truth_known': int(bool(truth.parameters)),
-        'feed_forward': 0,
-        # Lambda is a heuristic: its rows contradict each other on any arm.
-        'change_detection': int(
-            learning.change_detection and learning.prediction != 'lambda'
-        ),
-        'learning_start': learning.window + learning.settling_time,
-        'residual_floor': model.n * least * least,
-        'prior_weight': (_PRIOR if is_urdf else 0.0) * least * least,
-        'row_variance': _PRIOR * least * least,
-        'senses': int(config.contact.enabled),
-        'freezes': int(config.contact.reaction != 'none'),
-        'expects_loads': int(config.contact.loads and learning.weighing),
-        'motion_scale': _SLOW if is_urdf else 0.0,
-        'pole': learning.filter_pole,
-        'omega': _OMEGA,
-        'initial_bound': np.array(config.barrier.widest),
-        'knee': np.array([barrier.knee(*joint) for joint in per_joint]),
-        'Kp': np.array(config.feedback.gain),
-        'mu_bar': np.zeros(model.n),
-        'row_weight': least / floor,
-        'torque_limit': np.array(config.torque.limit),
-        'true_disturbance': np.array(
-            (truth.constant, truth.amplitude, truth.frequency, truth.phase)
-        ),
-        'Gamma': np.array(learning.adaptation_gain + (_COLUMNS,) * len(columns)),
-        'initial_estimate': np.array(
-            (*learning.initial_estimate, *(c.initial for c in columns))
-        ),
-        'information': inverse(covariance),
-        'variance': np.diag(covariance).copy(),
-        'follows_inertia': int(is_urdf),
+        **_of_other_laws(model.n),
+        **_barrier(config),
+        **_window(config),
+        **_residuals(config, model.n),
+        **_contact(config),
+        **_estimates(config, model.p, columns),
+        **_known_arm(config, model.p),
         **_inertias(config, model.n),
         **_load(config, m),
-        'least': np.array([-np.inf] * p + [column.least for column in columns]),
-        'most': np.array([np.inf] * p + [column.most for column in columns]),
-        'true_parameters': np.array(truth.parameters or (0.0,) * p),
-        'drive_chain': drive_chain,
-        'drive_inertias': drive_inertias,
+        **_drive(config),
     }
     settings = Settings(**(_gains(config) | computed))
     return settings._replace(**_of_law(config, settings))
@@ -274,6 +224,110 @@ def _setting(config: ControllerConfig, name: str, parameter: str) -> Any:
     return np.array(value) if isinstance(value, tuple) else value
 
 
+def _of_other_laws(n: int) -> dict[str, Any]:
+    """Return what `blf_dsc` does without: terms of other laws, that are zero."""
+    return {'Wc': 0.0, 'memory': 0, 'feed_forward': 0, 'mu_bar': np.zeros(n)}
+
+
+def _barrier(config: ControllerConfig) -> dict[str, Any]:
+    """Return the bound at the start [rad], and where the slope is limited [rad], (n,) each."""
+    given = config.barrier
+    joints = zip(given.bound, given.weight, given.slope_limit, strict=True)
+    return {
+        'has_barrier': int(law_of(config).has_barrier),
+        'initial_bound': np.array(given.widest),
+        'knee': np.array([barrier.knee(*joint) for joint in joints]),
+    }
+
+
+def _window(config: ControllerConfig) -> dict[str, Any]:
+    """Return what enters the excitation window, and when it is checked."""
+    learning = config.learning
+    is_urdf = config.model == 'urdf'
+    T = config.sample_time
+    row_interval = max(1, round(_ROWS / T)) if is_urdf else 1
+    between_checks = _SLOWER_CHECKS if is_urdf else _CHECKS
+    is_lambda = learning.prediction == 'lambda'
+    return {
+        'window': round(learning.window / (T * row_interval)),
+        'row_interval': row_interval,
+        'interval': max(1, round(between_checks / T)),
+        'tones': len(learning.frequencies),
+        'learning_start': learning.window + learning.settling_time,
+        'motion_scale': _SLOW if is_urdf else 0.0,
+        'omega': _OMEGA,
+        # Lambda is a heuristic: its rows contradict each other on any arm.
+        'change_detection': int(learning.change_detection and not is_lambda),
+    }
+
+
+def _residuals(config: ControllerConfig, n: int) -> dict[str, Any]:
+    """Return what follows from the rms unmodelled torque [N m] of each joint.
+
+    The rows of all joints are scaled to the least of them.
+    """
+    floor = np.array(config.learning.residual_floor)
+    least = float(floor.min())
+    prior = _PRIOR if config.model == 'urdf' else 0.0
+    return {
+        'row_weight': least / floor,
+        'residual_floor': n * least * least,
+        'prior_weight': prior * least * least,
+        'row_variance': _PRIOR * least * least,
+    }
+
+
+def _contact(config: ControllerConfig) -> dict[str, Any]:
+    """Return whether contacts are found, and what they do."""
+    contact = config.contact
+    return {
+        'senses': int(contact.enabled),
+        'freezes': int(contact.reaction != 'none'),
+        'expects_loads': int(contact.loads and config.learning.weighing),
+    }
+
+
+def _estimates(
+    config: ControllerConfig, p: int, columns: Sequence[Column]
+) -> dict[str, Any]:
+    """Return what is known of theta before the start: p parameters, then the columns."""
+    learning = config.learning
+    initial = [column.initial for column in columns]
+    gains = learning.adaptation_gain + (_COLUMNS,) * len(columns)
+    covariance = prior_covariance(config)
+    return {
+        'Gamma': np.array(gains),
+        'initial_estimate': np.array((*learning.initial_estimate, *initial)),
+        'information': inverse(covariance),
+        'variance': np.diag(covariance).copy(),
+        'least': np.array([-np.inf] * p + [column.least for column in columns]),
+        'most': np.array([np.inf] * p + [column.most for column in columns]),
+    }
+
+
+def _known_arm(config: ControllerConfig, p: int) -> dict[str, Any]:
+    """Return the truth: p parameters, zero where unknown, and the disturbance."""
+    truth = config.truth
+    disturbance = (truth.constant, truth.amplitude, truth.frequency, truth.phase)
+    return {
+        'truth_known': int(bool(truth.parameters)),
+        'true_parameters': np.array(truth.parameters or (0.0,) * p),
+        'true_disturbance': np.array(disturbance),
+    }
+
+
+def _drive(config: ControllerConfig) -> dict[str, Any]:
+    """Return the gravity that the drive adds, and whether measured efforts contain it."""
+    chain, inertias = drive_model(config.robot, config.joints)
+    return {
+        'effort_is_whole': int(config.robot.effort != 'commanded'),
+        'drive': inertias.size,
+        'drive_size': chain.size,
+        'drive_chain': chain,
+        'drive_inertias': inertias,
+    }
+
+
 def joint_inertia(config: ControllerConfig, P: tuple[float, ...]) -> np.ndarray:
     """Return m (n,) [kg m^2] of parameters P: least inertia of a joint with the others free."""
     robot = config.robot
@@ -286,14 +340,16 @@ def joint_inertia(config: ControllerConfig, P: tuple[float, ...]) -> np.ndarray:
 
 def _inertias(config: ControllerConfig, n: int) -> dict[str, Any]:
     """Return m of each joint, and what `apparent_inertia` needs to measure assumed rotors."""
+    is_urdf = config.model == 'urdf'
     settings = {
+        'follows_inertia': int(is_urdf),
         'rotors_unsure': 0,
-        'lag': config.robot.lag if config.model == 'urdf' else 0.0,
+        'lag': config.robot.lag if is_urdf else 0.0,
         'unsure_rotor': np.zeros(n),
         'joint_inertia': np.ones(n),
         'link_inertia': np.ones(n),
     }
-    if config.model != 'urdf':
+    if not is_urdf:
         return settings
     robot = config.robot
     chain = robot.chain(config.joints)
