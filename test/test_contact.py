@@ -12,7 +12,8 @@ from blf_dsc_controller.analysis.metrics import format_table, measure
 from blf_dsc_controller.analysis.panels import panels
 from blf_dsc_controller.analysis.report import read_bag, write_report
 from blf_dsc_controller.arms.urdf import frames
-from blf_dsc_controller.bags.reader import read_run, table
+from blf_dsc_controller.bags.reader import read_run
+from blf_dsc_controller.bags.table import table
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.schema import build
 from blf_dsc_controller.control.arm_controller import ArmController

@@ -1,13 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A bag as one run: joints matched by name, samples by stamp, torques by order; and as a table."""
+"""A bag as one run: joints matched by name, samples by stamp, torques by order."""
 
 from __future__ import annotations
 
-import csv
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,7 +15,6 @@ from blf_dsc_controller.bags.content import NO_NAMES, Content, NameMap, read_con
 from blf_dsc_controller.bags.sources import BagError
 from blf_dsc_controller.bags.topic_messages import JointStates, TopicMessages, Values
 from blf_dsc_controller.errors import BlfDscError
-from blf_dsc_controller.extras import import_extra
 from blf_dsc_controller.messages import topics
 from blf_dsc_controller.messages.codecs import JOINT_STATE_FIELDS
 from blf_dsc_controller.messages.journal import Event, EventType, contact_in
@@ -25,6 +23,7 @@ from blf_dsc_controller.run import (
     LearnedArm,
     Run,
     Series,
+    Stamps,
     Stop,
     ToolErrors,
 )
@@ -32,37 +31,18 @@ from blf_dsc_controller.run import (
 _MOST_FALLS = 10  # of the stamps, by resets of a simulator
 _ALTERNATING = 0.9  # ratio of the intervals to and from the state of another publisher
 _FEWEST_STATES = 100  # from which intervals are judged
-_ARRAYS = {  # of a run, with a column per joint: unit, messages, field
-    'position': ('rad', 'states', 0),
-    'velocity': ('rad/s', 'states', 1),
-    'effort': ('N m', 'states', 2),
-    'torque': ('N m', 'torques', 2),
-    'reference': ('rad', 'references', 0),
-    'reference_velocity': ('rad/s', 'references', 1),
-    'error': ('rad', 'errors', 0),
-    'xi2': ('rad/s', 'errors', 1),
-    'bound': ('rad', 'bounds', 0),
-    'torque_limit': ('N m', 'bounds', 2),
+_ARRAYS = {  # of a run, with a column per joint: messages, field
+    'position': ('states', 0),
+    'velocity': ('states', 1),
+    'effort': ('states', 2),
+    'torque': ('torques', 2),
+    'reference': ('references', 0),
+    'reference_velocity': ('references', 1),
+    'error': ('errors', 0),
+    'xi2': ('errors', 1),
+    'bound': ('bounds', 0),
+    'torque_limit': ('bounds', 2),
 }
-_VALUES = {  # prefix of names in the vectors: unit
-    **dict.fromkeys((topics.DISTURBANCE, 'bias ', 'coulomb ', 'sin ', 'cos '), 'N m'),
-    'viscous ': 'N m s/rad',
-    topics.POSITION: 'rad',
-    topics.VELOCITY: 'rad/s',
-    topics.DISTANCE: 'rad',
-    topics.LYAPUNOV: 'J',
-    **dict.fromkeys(
-        (topics.RATIO, topics.LATCHED, topics.MODEL_CHANGES, topics.LATE_STEPS), '1'
-    ),
-    **dict.fromkeys((topics.COMPUTE_TIME, topics.LATENCY, topics.LATENESS), 's'),
-    **dict.fromkeys(topics.CONTACT, '1'),
-    **dict.fromkeys(topics.TOOL[:2], 'm'),
-    **dict.fromkeys(topics.TOOL[2:], 'rad'),
-    'load mass': 'kg',
-    'load ': 'm',
-}
-_ROWS = 1 << 14
-_PARAMETER = 'kg m^2'  # of arms without a URDF
 
 
 def read_run(path: str | Path, namespace: str = '', names: NameMap = NO_NAMES) -> Run:
@@ -86,62 +66,28 @@ def recorded_run(
     Its `Values` are read when needed, unless `loaded` reads them into memory.
     """
     joints = _joints(content)
-    states, notes, span = single_run(content, content.names.joints_of(joints))
-    if content.unknown_parameters:
-        names = ', '.join(content.unknown_parameters)
-        notes = *notes, f'recorded parameters that this version does not have: {names}'
-    stamp = states.stamp
-
-    def within(
-        topic: topics.Topic, names: Sequence[str] = (), required: str = 'position'
-    ) -> JointStates | None:
-        """Return a topic's messages in the run, by stamp; None if there are none."""
-        messages = content.topics.get(topic)
-        if messages is None:
-            return None
-        found = messages.joint_states(names or messages.joint_names(), (required,))
-        received = found.received
-        inside = (received >= span[0]) & (received < span[1])
-        return found.select(np.flatnonzero(inside)).by_stamp() if inside.any() else None
+    run = single_run(content, content.names.joints_of(joints))
+    stamp = run.states.stamp
+    begin, end = run.received
+    events = [event for at, event in content.events if begin <= at < end]
+    arrays: dict[str, Any] = {
+        name: None if values is None else loaded(values)
+        for name, values in _arrays(content, run, joints).items()
+    }
 
     def series(topic: topics.Topic, kind: str = 'position') -> Series | None:
-        found = within(topic, required=kind)
+        """Return the named values of a topic in the run; None if there are none."""
+        found = run.messages_of(content, topic, required=kind)
         if found is None:
             return None
         values = loaded(found.field(JOINT_STATE_FIELDS.index(kind)))
         return Series(found.names, found.stamp, values)
 
-    errors, references, bounds = (
-        within(topic, joints)
-        for topic in (topics.TRACKING_ERROR, topics.REFERENCE, topics.BOUND)
-    )
-    try:
-        _, torques = applied_torque(content, states)
-    except TorqueError:
-        torques = next_effort(states)
-    messages: dict[str, Any] = {
-        'states': states,
-        'torques': torques,
-        'errors': errors and errors.at_stamps(stamp),
-        'references': references and references.at_stamps(stamp),
-        'bounds': bounds and bounds.held(stamp),
-    }
-    arrays: dict[str, Any] = {
-        name: messages[source] and Values(messages[source], k)
-        for name, (_, source, k) in _ARRAYS.items()
-    }
-    if errors:  # its messages are not decimated: the reference is known at every sample
-        known = messages['references'] or states.select(np.full(states.size, -1))
-        arrays['reference'] = Values(
-            known, 0, (states.field(0), messages['errors'].field(0))
-        )
-    arrays = {name: values and loaded(values) for name, values in arrays.items()}
-    events = [event for at, event in content.events if span[0] <= at < span[1]]
     return Run(
         **arrays,
         joints=joints,
         stamp=stamp,
-        received=states.received,
+        received=run.states.received,
         monitor=series(topics.MONITOR),
         truth=series(topics.TRUTH),
         timing=series(topics.TIMING),
@@ -151,16 +97,90 @@ def recorded_run(
         arm=_arm(content),
         tool=_tool(content),
         learns=_learns([event.content.get('parameters', {}) for event in events]),
-        notes=notes,
+        notes=(*run.notes, *_unknown_parameters(content)),
     )
 
 
-def single_run(
-    content: Content, joints: Sequence[str]
-) -> tuple[JointStates, tuple[str, ...], tuple[int, int]]:
-    """Return the states of one run of one arm, what is left out, and when it was received [ns].
+class SingleRun(NamedTuple):
+    """One run of one arm in a bag: its joint states, and when its messages were received."""
 
-    The stamps of the states increase. Where they fall, as when a simulator is reset, another run
+    states: JointStates  # in the order of their stamps, which increase
+    notes: tuple[str, ...]  # what is left out, and why
+    # ns, of its first state and of the first of the next run
+    received: tuple[int, int]
+
+    def messages_of(
+        self,
+        content: Content,
+        topic: topics.Topic,
+        names: Sequence[str] = (),
+        required: str = 'position',
+    ) -> JointStates | None:
+        """Return a topic's messages in the run, by stamp; None if there are none.
+
+        They hold the values of `names`, by default of all, in the field `required`.
+        """
+        messages = content.topics.get(topic)
+        if messages is None:
+            return None
+        found = messages.joint_states(names or messages.joint_names(), (required,))
+        received = found.received
+        begin, end = self.received
+        is_inside = (received >= begin) & (received < end)
+        if not is_inside.any():
+            return None
+        return found.select(np.flatnonzero(is_inside)).by_stamp()
+
+
+def _arrays(
+    content: Content, run: SingleRun, joints: Sequence[str]
+) -> dict[str, Values | None]:
+    """Return the arrays of a run by name, one row per state; None if unknown."""
+    states = run.states
+    stamp = states.stamp
+    errors = run.messages_of(content, topics.TRACKING_ERROR, joints)
+    references = run.messages_of(content, topics.REFERENCE, joints)
+    bounds = run.messages_of(content, topics.BOUND, joints)
+    sources = {
+        'states': states,
+        'torques': _torques(content, states),
+        'errors': None if errors is None else errors.at_stamps(stamp),
+        'references': None if references is None else references.at_stamps(stamp),
+        'bounds': None if bounds is None else bounds.held(stamp),
+    }
+    arrays: dict[str, Values | None] = {}
+    for name, (source, field) in _ARRAYS.items():
+        messages = sources[source]
+        arrays[name] = None if messages is None else Values(messages, field)
+    errors, references = sources['errors'], sources['references']
+    if errors is not None:
+        # Errors are not decimated: q - xi1 is the reference at every sample.
+        if references is None:
+            references = states.select(np.full(states.size, -1))
+        arrays['reference'] = Values(references, 0, (states.field(0), errors.field(0)))
+    return arrays
+
+
+def _torques(content: Content, states: JointStates) -> JointStates:
+    """Return the torque from each state to the next, unknown where the bag does not hold it."""
+    try:
+        _, torques = applied_torque(content, states)
+    except TorqueError:
+        return next_effort(states)
+    return torques
+
+
+def _unknown_parameters(content: Content) -> Iterator[str]:
+    """Yield a note on recorded parameters that this version does not have."""
+    if content.unknown_parameters:
+        names = ', '.join(content.unknown_parameters)
+        yield f'recorded parameters that this version does not have: {names}'
+
+
+def single_run(content: Content, joints: Sequence[str]) -> SingleRun:
+    """Return one run of one arm.
+
+    The stamps of its states increase. Where they fall, as when a simulator is reset, another run
     begins; the longest one is taken.
 
     Raises:
@@ -168,42 +188,68 @@ def single_run(
     """
     messages = content.topics[topics.JOINT_STATES]
     states = messages.joint_states(joints, ('position',))
-    stamp, received = states.stamp, states.received
-    if stamp.size > 1 and (stamp == stamp[0]).all():
-        raise BagError(
-            f'all {stamp.size} messages of {messages.name} have the stamp {stamp[0]} ns: each '
-            'needs a unique stamp, so the driver has to set header.stamp'
-        )
-    falls = np.flatnonzero(np.diff(stamp) < 0)
-    if falls.size > _MOST_FALLS or _alternates(states):
-        where = ''
-        if falls.size:
-            before, after = stamp[falls[0] : falls[0] + 2] * 1e-9
-            where = f': its stamps fall {falls.size} times, the first time '
-            where += f'from {before:.9g} s to {after:.9g} s'
-        raise BagError(
-            f'several publishers share {messages.name}, or its clock runs backwards{where}; '
-            'record one arm for each topic'
-        )
-    edges = np.concatenate([[0], falls + 1, [stamp.size]])
+    falls = np.flatnonzero(np.diff(states.stamp) < 0)
+    _check_publisher(messages.name, states, falls)
+    edges = np.concatenate([[0], falls + 1, [states.size]])
     longest = int(np.diff(edges).argmax())
     first, last = edges[longest : longest + 2].tolist()
-    span = (
-        int(received[first]) if first else np.iinfo(np.int64).min,
-        int(received[last]) if last < stamp.size else np.iinfo(np.int64).max,
+    in_run = states.select(slice(first, last))
+    run = in_run.by_stamp()
+
+    notes = []
+    foreign = messages.size - states.size
+    if foreign:
+        notes.append(
+            f'{foreign} of {messages.size} joint states left out: they name other joints'
+        )
+    others = states.size - in_run.size
+    if others:
+        notes.append(
+            f'{others} of {states.size} joint states left out: their stamps fall {falls.size} '
+            f'times, so that {falls.size + 1} runs are in the bag; run {longest + 1}, the longest, '
+            'is shown'
+        )
+    repeated = in_run.size - run.size
+    if repeated:
+        notes.append(f'{repeated} joint states left out: they repeat the stamp before')
+    return SingleRun(run, tuple(notes), _span(states.received, first, last))
+
+
+def _span(received: Stamps, first: int, last: int) -> tuple[int, int]:
+    """Return when [ns] the messages of the states `first` to `last` - 1 were received.
+
+    Before the first state of the bag and after its last one nothing bounds the run.
+    """
+    no_bound = np.iinfo(np.int64)
+    begin = int(received[first]) if first else no_bound.min
+    end = int(received[last]) if last < received.size else no_bound.max
+    return begin, end
+
+
+def _check_publisher(topic: str, states: JointStates, falls: NDArray[np.intp]) -> None:
+    """Raise BagError unless the states can be those of one publisher with a clock.
+
+    `falls` are the states after which the stamp is an earlier one.
+    """
+    stamp = states.stamp
+    if stamp.size > 1 and (stamp == stamp[0]).all():
+        raise BagError(
+            f'all {stamp.size} messages of {topic} have the stamp {stamp[0]} ns: each '
+            'needs a unique stamp, so the driver has to set header.stamp'
+        )
+    if falls.size <= _MOST_FALLS and not _alternates(states):
+        return
+    where = ''
+    if falls.size:
+        before, after = stamp[falls[0] : falls[0] + 2] * 1e-9
+        where = (
+            f': its stamps fall {falls.size} times, the first time from {before:.9g} s '
+            f'to {after:.9g} s'
+        )
+    raise BagError(
+        f'several publishers share {topic}, or its clock runs backwards{where}; '
+        'record one arm for each topic'
     )
-    run = states.select(slice(first, last)).by_stamp()
-    foreign = messages.size - stamp.size
-    others = stamp.size - (last - first)
-    repeated = last - first - run.size
-    notes = {
-        f'{foreign} of {messages.size} joint states left out: they name other joints': foreign,
-        f'{others} of {stamp.size} joint states left out: their stamps fall {falls.size} times, '
-        f'so that {falls.size + 1} runs are in the bag; run {longest + 1}, the longest, is '
-        'shown': others,
-        f'{repeated} joint states left out: they repeat the stamp before': repeated,
-    }
-    return run, tuple(text for text, count in notes.items() if count), span
 
 
 def _alternates(states: JointStates) -> bool:
@@ -343,85 +389,3 @@ def _by_joint(
         f'{commands.name} has {len(numbers)} values, but there are {len(joints)} joints, and '
         f'{len(names)} in the joint states ({", ".join(names)}): their order is not known'
     )
-
-
-# The table, for spreadsheets, pandas and MATLAB.
-
-
-def table(run: Run, rows: slice = slice(None)) -> dict[str, NDArray[Any]]:
-    """Return some rows of every series of a run by name and unit, as `torque joint1 [N m]`.
-
-    They are aligned to the stamps of its joint states. `stamp` and `received` are integers, all
-    others floats, NaN where unknown, as is the reference's velocity between its messages. Named
-    values (monitor, external, truth, timing) are held until the next message.
-    """
-    stamp = run.stamp[rows]
-    columns: dict[str, NDArray[Any]] = {
-        'stamp [ns]': stamp,
-        'received [ns]': run.received[rows],
-        'time [s]': run.time_of(stamp),
-    }
-    for field, (unit, _, _) in _ARRAYS.items():
-        values = getattr(run, field)
-        if values is not None:
-            for joint, column in zip(run.joints, values[rows].T, strict=True):
-                columns[f'{field} {joint} [{unit}]'] = column
-    for topic in ('monitor', 'external', 'truth', 'timing'):
-        series = getattr(run, topic)
-        if series is not None:
-            held = series.held(stamp, series.names)
-            for name, column in zip(series.names, held.T, strict=True):
-                unit = 'N m' if topic == 'external' else _unit(name, run)
-                columns[f'{topic} {name} [{unit}]'] = column
-    return columns
-
-
-def _unit(name: str, run: Run) -> str:
-    """Return the unit of a named value; parameters of a URDF have their own."""
-    if run.arm is not None and name in run.arm.units:
-        return run.arm.units[name] or '1'
-    if name == topics.LAMBDA_MIN and run.arm is None:
-        return 's^-4'
-    known = [unit for beginning, unit in _VALUES.items() if name.startswith(beginning)]
-    return known[0] if known else '1' if run.arm is not None else _PARAMETER
-
-
-def export(run: Run, path: Path) -> int:
-    """Write the table as CSV or Parquet, by the suffix of `path`; return the number of columns.
-
-    It is written block by block: a run may be larger than memory. Numbers are read back exactly.
-
-    Raises:
-        BlfDscError: the suffix is neither .csv nor .parquet.
-        MissingExtraError: pyarrow is not installed.
-    """
-    if path.suffix not in ('.csv', '.parquet'):
-        raise BlfDscError(
-            f'{path} ends in neither .csv nor .parquet: the file extension selects the format'
-        )
-    blocks = (slice(begin, begin + _ROWS) for begin in range(0, run.stamp.size, _ROWS))
-    (_write_csv if path.suffix == '.csv' else _write_parquet)(
-        (table(run, rows) for rows in blocks), path
-    )
-    return len(table(run, slice(1)))
-
-
-def _write_csv(tables: Iterator[dict[str, NDArray[Any]]], path: Path) -> None:
-    with path.open('w', encoding='utf-8', newline='') as stream:
-        writer = csv.writer(stream)
-        for k, block in enumerate(tables):
-            if k == 0:
-                writer.writerow(block)
-            writer.writerows(
-                zip(*(values.tolist() for values in block.values()), strict=True)
-            )
-
-
-def _write_parquet(tables: Iterator[dict[str, NDArray[Any]]], path: Path) -> None:
-    pa = import_extra('pyarrow', 'parquet', 'writing Parquet')
-    parquet = import_extra('pyarrow.parquet', 'parquet', 'writing Parquet')
-    first = pa.table(next(tables))
-    with parquet.ParquetWriter(path, first.schema) as writer:
-        writer.write_table(first)
-        for block in tables:
-            writer.write_table(pa.table(block))

@@ -8,7 +8,7 @@ from argparse import Namespace
 from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
-from blf_dsc_controller.bags import reader, recovery
+from blf_dsc_controller.bags import reader, recovery, table
 from blf_dsc_controller.bags.content import NameMap, read_content
 from blf_dsc_controller.bags.sources import open_bag
 from blf_dsc_controller.cli.main import make_room
@@ -52,7 +52,7 @@ def export(options: Namespace) -> None:
     """Write a bag as a table."""
     make_room(options.out, force=options.force)
     run = _run(options)
-    columns = reader.export(run, options.out)
+    columns = table.export(run, options.out)
     print(f'wrote {options.out}: {run.stamp.size} rows of {columns} columns')
 
 
