@@ -129,6 +129,11 @@ class Run:
         values = getattr(self, name)
         return None if values is None else values[:, i]
 
+    def known(self, name: str, i: int) -> Floats:
+        """Return the values of one joint (N,) in an array by name, NaN where unknown."""
+        found = self.column(name, i)
+        return np.full(self.stamp.size, np.nan) if found is None else found
+
     @property
     def time(self) -> Floats:
         """Time since the first sample (N,) [s]."""

@@ -14,16 +14,15 @@ import recorded_run
 from recorded_run import BOUND_RAD, LATCH_S, LIMIT_NM, PARAMETERS, TRUE, Synthetic
 from test_law_urdf import panda
 
-from blf_dsc_controller.analysis.figures import draw
-from blf_dsc_controller.analysis.metrics import (
+from blf_dsc_controller.analysis.estimates import (
     bodies_of,
     errors_of_bodies,
     estimates_of,
-    format_table,
-    measure,
-    plain,
-    write_json,
 )
+from blf_dsc_controller.analysis.figures import draw
+from blf_dsc_controller.analysis.metrics import measure
+from blf_dsc_controller.analysis.metrics_table import format_table
+from blf_dsc_controller.analysis.output import plain, write_json
 from blf_dsc_controller.analysis.panels import panels
 from blf_dsc_controller.bags.reader import read_run
 from blf_dsc_controller.law.telemetry import learned_arm

@@ -20,7 +20,8 @@ from recorded_run import JOINTS, MILLISECOND, START, Synthetic
 
 from blf_dsc_controller.analysis import figures
 from blf_dsc_controller.analysis.figures import draw
-from blf_dsc_controller.analysis.metrics import format_table, measure
+from blf_dsc_controller.analysis.metrics import measure
+from blf_dsc_controller.analysis.metrics_table import format_table
 from blf_dsc_controller.analysis.panels import ALARM, COLOURS, envelope, panels
 from blf_dsc_controller.analysis.report import plots, read_bag, write_report
 from blf_dsc_controller.bags.reader import read_run

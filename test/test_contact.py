@@ -8,7 +8,8 @@ import pytest
 from paper_case import configured
 from random_arm import PANDA, chain_of
 
-from blf_dsc_controller.analysis.metrics import format_table, measure
+from blf_dsc_controller.analysis.metrics import measure
+from blf_dsc_controller.analysis.metrics_table import format_table
 from blf_dsc_controller.analysis.panels import panels
 from blf_dsc_controller.analysis.report import read_bag, write_report
 from blf_dsc_controller.arms.urdf import frames

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 from paper_case import EXACT, configured
 
-from blf_dsc_controller.analysis.metrics import format_table, measure
+from blf_dsc_controller.analysis.metrics import measure
+from blf_dsc_controller.analysis.metrics_table import format_table
 from blf_dsc_controller.analysis.panels import panels
 from blf_dsc_controller.bags.reader import read_run
 from blf_dsc_controller.law import barrier

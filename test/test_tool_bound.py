@@ -11,7 +11,8 @@ import pytest
 from random_arm import chain_of
 from recorded_run import compared
 
-from blf_dsc_controller.analysis.metrics import format_table, measure
+from blf_dsc_controller.analysis.metrics import measure
+from blf_dsc_controller.analysis.metrics_table import format_table
 from blf_dsc_controller.analysis.panels import panels
 from blf_dsc_controller.arms.two_link import urdf
 from blf_dsc_controller.arms.urdf import frames, read_chain

@@ -16,12 +16,8 @@ from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.ticker import FuncFormatter
 
-from blf_dsc_controller.analysis.metrics import (
-    Metrics,
-    change_times,
-    measure,
-    true_change_times,
-)
+from blf_dsc_controller.analysis.event_times import change_times, true_change_times
+from blf_dsc_controller.analysis.metrics import Metrics, measure
 from blf_dsc_controller.analysis.panels import (
     ALARM,
     BLUE,

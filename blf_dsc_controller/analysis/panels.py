@@ -14,17 +14,18 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from blf_dsc_controller.analysis.metrics import (
+from blf_dsc_controller.analysis.estimates import (
     Estimates,
     bodies_of,
     errors_of_bodies,
     estimates_of,
+)
+from blf_dsc_controller.analysis.event_times import (
     latch_time,
     outside,
-    rms,
-    tool_errors,
     true_change_times,
 )
+from blf_dsc_controller.analysis.metrics import rms, tool_errors
 from blf_dsc_controller.messages.topics import (
     DISTURBANCE,
     INTERVAL,

@@ -18,13 +18,9 @@ from typing import Any
 import numpy as np
 from jinja2 import Environment, PackageLoader, StrictUndefined
 
-from blf_dsc_controller.analysis.metrics import (
-    change_times,
-    format_table,
-    latch_time,
-    measure,
-    outside,
-)
+from blf_dsc_controller.analysis.event_times import change_times, latch_time, outside
+from blf_dsc_controller.analysis.metrics import measure
+from blf_dsc_controller.analysis.metrics_table import format_table
 from blf_dsc_controller.analysis.panels import COLOURS, INK, PIECES, Panel, panels
 from blf_dsc_controller.bags.content import NO_NAMES, Content, NameMap, read_content
 from blf_dsc_controller.bags.reader import recorded_run

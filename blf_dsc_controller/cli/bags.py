@@ -59,7 +59,9 @@ def export(options: Namespace) -> None:
 def plot(options: Namespace) -> None:
     """Plot and summarise a bag."""
     from blf_dsc_controller.analysis import figures
-    from blf_dsc_controller.analysis.metrics import format_table, measure, write_json
+    from blf_dsc_controller.analysis.metrics import measure
+    from blf_dsc_controller.analysis.metrics_table import format_table
+    from blf_dsc_controller.analysis.output import write_json
 
     names = ('summary.json', *figures.NAMES)
     make_room(*(options.out / name for name in names), force=options.force)

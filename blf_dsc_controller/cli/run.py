@@ -145,7 +145,9 @@ def _report(out: Path) -> bool:
     """
     # slow: the libraries of the pictures
     from blf_dsc_controller.analysis.figures import draw
-    from blf_dsc_controller.analysis.metrics import format_table, measure, write_json
+    from blf_dsc_controller.analysis.metrics import measure
+    from blf_dsc_controller.analysis.metrics_table import format_table
+    from blf_dsc_controller.analysis.output import write_json
 
     print_notice('reading the bag and drawing the pictures')
     content = read_content(out / 'bag')

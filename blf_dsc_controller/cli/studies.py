@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 from tqdm import tqdm
 
-from blf_dsc_controller.analysis.metrics import aligned, write_json
+from blf_dsc_controller.analysis.output import aligned, write_json
 from blf_dsc_controller.cli.run import make_folder, print_notice
 from blf_dsc_controller.compiled.announcement import announced_compilation
 from blf_dsc_controller.configuration.nodes import locate

@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from blf_dsc_controller.analysis.metrics import aligned
+from blf_dsc_controller.analysis.output import aligned
 from blf_dsc_controller.arms.base_parameters import base_parameters
 from blf_dsc_controller.configuration.robot import Robot
 from blf_dsc_controller.identification.prior import prior_of

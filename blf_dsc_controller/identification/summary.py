@@ -7,7 +7,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from blf_dsc_controller.analysis.metrics import aligned
+from blf_dsc_controller.analysis.output import aligned
 from blf_dsc_controller.identification.identified import Identified, mass_and_centre
 from blf_dsc_controller.identification.plausibility import LEAST_GRAVITY, MOST_GRAVITY
 from blf_dsc_controller.identification.values import (

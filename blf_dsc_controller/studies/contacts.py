@@ -26,7 +26,7 @@ import numpy as np
 from tqdm import tqdm
 
 from blf_dsc_controller.analysis.figures import Picture, head
-from blf_dsc_controller.analysis.metrics import aligned, write_json
+from blf_dsc_controller.analysis.output import aligned, write_json
 from blf_dsc_controller.analysis.panels import BLUE, MUTED, ORANGE
 from blf_dsc_controller.configuration.nodes import LoopConfig
 from blf_dsc_controller.configuration.schema import change

@@ -18,13 +18,10 @@ from matplotlib.ticker import NullFormatter
 from numpy.typing import NDArray
 from tqdm.contrib.concurrent import process_map
 
+from blf_dsc_controller.analysis.estimates import estimates_of
 from blf_dsc_controller.analysis.figures import Picture, draw_panels
-from blf_dsc_controller.analysis.metrics import (
-    Metrics,
-    estimates_of,
-    measure,
-    write_json,
-)
+from blf_dsc_controller.analysis.metrics import Metrics, measure
+from blf_dsc_controller.analysis.output import write_json
 from blf_dsc_controller.analysis.panels import ALARM, COLOURS, panels
 from blf_dsc_controller.configuration.nodes import LoopConfig, dump, load_loop
 from blf_dsc_controller.configuration.schema import change

@@ -14,7 +14,7 @@ from matplotlib.ticker import LogLocator, NullFormatter
 from scipy.stats import binomtest
 
 from blf_dsc_controller.analysis.figures import Picture, head
-from blf_dsc_controller.analysis.metrics import plain
+from blf_dsc_controller.analysis.output import plain
 from blf_dsc_controller.analysis.panels import ALARM, BLUE, COLOURS, INK, MUTED, ORANGE
 from blf_dsc_controller.configuration.nodes import CONTROLLER, PLANT, dump
 from blf_dsc_controller.errors import BlfDscError

@@ -36,7 +36,7 @@ from typing import Any
 import numpy as np
 
 import blf_dsc_controller
-from blf_dsc_controller.analysis.metrics import write_json
+from blf_dsc_controller.analysis.output import write_json
 from blf_dsc_controller.compiled.kernel_cache import cache_folder
 from blf_dsc_controller.configuration.nodes import dump
 from blf_dsc_controller.configuration.plant import PlantConfig

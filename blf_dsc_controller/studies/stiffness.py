@@ -19,7 +19,7 @@ import numpy as np
 from tqdm import tqdm
 
 from blf_dsc_controller.analysis.figures import Picture
-from blf_dsc_controller.analysis.metrics import aligned, write_json
+from blf_dsc_controller.analysis.output import aligned, write_json
 from blf_dsc_controller.analysis.panels import BLUE, MUTED, ORANGE
 from blf_dsc_controller.configuration.nodes import CONTROLLER, LoopConfig, load_loop
 from blf_dsc_controller.studies import laws

@@ -22,7 +22,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from blf_dsc_controller.analysis.figures import Picture, head
-from blf_dsc_controller.analysis.metrics import aligned, measure, write_json
+from blf_dsc_controller.analysis.metrics import measure
+from blf_dsc_controller.analysis.output import aligned, write_json
 from blf_dsc_controller.analysis.panels import BLUE, INK, MUTED, ORANGE
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.nodes import CONTROLLER, load_loop

@@ -1,0 +1,146 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Metrics of a run for the terminal: a table of the joints, and sentences below it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
+
+from blf_dsc_controller.analysis.metrics import Metrics
+from blf_dsc_controller.analysis.output import aligned
+from blf_dsc_controller.law.telemetry import load_text
+from blf_dsc_controller.messages.topics import LOAD
+
+_SHOWN_CONTACTS = 3
+_OFTEN = 0.01  # of the samples
+_TABLE = {  # title: metric, unit, factor, decimals
+    'max |xi1|': ('max_error', 'mrad', 1e3, 3),
+    'rms xi1': ('rms_error', 'mrad', 1e3, 3),
+    'bound': ('bound', 'mrad', 1e3, 3),
+    'peak torque': ('peak_torque', 'N m', 1.0, 2),
+    'rms torque': ('rms_torque', 'N m', 1.0, 2),
+    'limit': ('torque_limit', 'N m', 1.0, 2),
+}
+
+
+def format_table(metrics: Metrics) -> str:
+    """Format metrics as a few lines for the terminal, without a newline at the end."""
+    rows = [['', *_TABLE]]
+    for i, joint in enumerate(metrics.joints):
+        values = ((getattr(metrics, name)[i], *form) for name, *form in _TABLE.values())
+        cells = (
+            f'{factor * value:.{decimals}f} {unit}' if math.isfinite(value) else '-'
+            for value, unit, factor, decimals in values
+        )
+        rows.append([joint, *cells])
+    return '\n'.join([aligned(rows), '', *_sentences(metrics)])
+
+
+def _sentences(of: Metrics) -> Iterator[str]:
+    """Yield a line for each of what was measured, beginning with its title."""
+    yield f'run         {of.duration:.3f} s, {of.samples} samples'
+    yield f'bound       {_bound_text(of)}'
+    bounds = zip(of.joints, of.widest_bound, of.bound, strict=True)
+    wider = [
+        f'{joint} {1e3 * widest:.3g} mrad'
+        for joint, widest, bound in bounds
+        if widest > bound
+    ]
+    if wider:
+        yield f'at widest   {", ".join(wider)}'
+    if of.tool is not None:
+        yield f'tool        {tool_text(of.tool)}'
+    for stop in of.stops:
+        yield f'stopped     at {stop["time"]:.3f} s, {stop["reason"]}: {stop["text"]}'
+    if of.contacts is not None:
+        yield f'contacts    {contacts_text(of.contacts)}'
+    if of.estimate is not None:
+        yield from _learning_lines(of)
+    for load in of.loads:
+        yield f'held        {load_text([load[name] for name in LOAD])}, until {load["until"]:.1f} s'
+    if of.timing is not None:
+        yield f'real time   {_timing_text(of.timing, of.samples)}'
+
+
+def _bound_text(of: Metrics) -> str:
+    """Return whether the bound was held, or which joint left it and when."""
+    kept = 'unknown' if of.held is None else 'held by every joint'
+    if not math.isnan(of.first_violation):
+        kept = f'VIOLATED, first by {of.violating_joint} at {of.first_violation:.3f} s'
+    if of.stops and of.held:
+        kept += ' until the stop'
+    return kept
+
+
+def _timing_text(timing: Mapping[str, Any], samples: int) -> str:
+    """Return `Metrics.timing` in words; `samples` are those of the run."""
+    figures = []
+    if not math.isnan(timing['rate']):
+        figures.append(f'{timing["rate"]:.2f} Hz')
+    latency = timing['latency']
+    if not math.isnan(latency['max']):
+        microseconds = '/'.join(f'{1e6 * each:.1f}' for each in latency.values())
+        figures.append(f'state to torque {microseconds} us ({"/".join(latency)})')
+    late = timing['late_steps']
+    figures.append(f'{late} late steps')
+    text = ', '.join(figures)
+    if late > _OFTEN * samples:
+        text += ': the computer was too busy for real time (--mode lockstep waits)'
+    return text
+
+
+def tool_text(tool: Mapping[str, float]) -> str:
+    """Return `Metrics.tool` in words."""
+    mm = f'{1e3 * tool["error"]:.3g} mm off at most, {1e3 * tool["bound"]:.3g} mm certified there'
+    mrad = f'turned {1e3 * tool["angle"]:.3g} mrad, {1e3 * tool["angle_bound"]:.3g} mrad certified'
+    share = f'{100.0 * tool["ratio"]:.3g} % and {100.0 * tool["angle_ratio"]:.3g} % of the bounds'
+    return f'{mm}; {mrad}; at most {share}'
+
+
+def contacts_text(contacts: Sequence[Mapping[str, Any]]) -> str:
+    """Return `Metrics.contacts` in words."""
+    if not contacts:
+        return '0'
+    shown = [
+        f'at {each["time"]:.3f} s {each["torque"]:+.3g} N m on {each["joint"]}, where model '
+        f'and noise explain {each["interval"]:.2g} N m'
+        for each in contacts[:_SHOWN_CONTACTS]
+    ]
+    more = len(contacts) - len(shown)
+    if more:
+        shown.append(f'{more} more')
+    return f'{len(contacts)}: {"; ".join(shown)}'
+
+
+def _learning_lines(of: Metrics) -> Iterator[str]:
+    """Yield what was learned, and how well where the truth is known."""
+    if not of.learns:
+        begun = 'not used by this law'
+    elif math.isnan(of.latch_time):
+        begun = 'never began'
+    else:
+        begun = f'began at {of.latch_time:.3f} s'
+    yield f'learning    {begun}'
+    if of.model_changes:
+        times = ', '.join(f'{t:.3f} s' for t in of.model_changes)
+        yield f'arm         changed at {times}: learning restarted'
+    if of.rejected_columns:
+        columns = ', '.join(of.rejected_columns)
+        yield f'rejected    {columns}: the motion does not tell them from the other columns'
+    if math.isnan(of.final_parameter_error):
+        return
+    what = 'parameters  error'
+    if of.of_torques:
+        what = 'model       torque error of the learned model'
+    shown = [
+        f'{t} s {100 * error:.3g} %'
+        for t, error in of.parameter_error.items()
+        if not math.isnan(error)
+    ]
+    shown.append(f'end {100 * of.final_parameter_error:.3g} %')
+    settled = of.time_to_1_percent
+    ending = 'not below 1 %'
+    if not math.isnan(settled):
+        ending = f'below 1 % from {settled:.3f} s on'
+    yield f'{what} {", ".join(shown)}; {ending}'

@@ -1,0 +1,41 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Numbers as people and programs read them: a table for the terminal, and JSON."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Sequence
+from dataclasses import asdict, is_dataclass
+from pathlib import Path
+from typing import Any
+
+
+def aligned(rows: Sequence[Sequence[str]]) -> str:
+    """Return a table for the terminal: first column flush left, others right."""
+    first, *widths = (max(map(len, column)) for column in zip(*rows, strict=True))
+    return '\n'.join(
+        '  '.join([name.ljust(first), *map(str.rjust, values, widths)])
+        for name, *values in rows
+    )
+
+
+def write_json(numbers: Any, path: Path) -> None:
+    """Write metrics, or other data in dictionaries and lists, as JSON."""
+    path.write_text(
+        json.dumps(plain(numbers), indent=2, allow_nan=False) + '\n', encoding='utf-8'
+    )
+
+
+def plain(value: Any) -> Any:
+    """Convert to lists and dictionaries for JSON.
+
+    NaN and infinity become None.
+    """
+    if is_dataclass(value) and not isinstance(value, type):
+        value = asdict(value)
+    if isinstance(value, dict):
+        return {str(key): plain(each) for key, each in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [plain(each) for each in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
