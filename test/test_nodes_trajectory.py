@@ -22,7 +22,7 @@ from blf_dsc_controller.messages.codecs import MessageError, joint_trajectory
 from blf_dsc_controller.messages.journal import decode
 from blf_dsc_controller.reference.terms import sampled
 from blf_dsc_controller.reference.trajectory import plan_trajectory
-from blf_dsc_controller.supervision.guard import LatePlanError
+from blf_dsc_controller.supervision.plan import LatePlanError
 from blf_dsc_controller.supervision.supervisor import Phase
 
 BRISK = {'limits__acceleration': [4.0, 4.0]}  # rad/s^2, for a lead of a second
@@ -183,7 +183,7 @@ def test_rejected_trajectory_changes_nothing(ros, monkeypatch, spoil, watchdog):
     sent = trajectory(JOINTS, np.zeros(2), duration=0.1)
     if spoil is unplannable:
         monkeypatch.setattr(
-            'blf_dsc_controller.supervision.guard.plan_trajectory', spoil
+            'blf_dsc_controller.supervision.plan.plan_trajectory', spoil
         )
     else:
         spoil(sent)
@@ -263,7 +263,7 @@ def test_trajectory_that_is_planned_too_late_is_planned_again_further_ahead(
         assert len(begins) > 1 or may_end.wait(PATIENCE)
         return plan_trajectory(trajectory, before, at, config)
 
-    monkeypatch.setattr('blf_dsc_controller.supervision.guard.plan_trajectory', plan)
+    monkeypatch.setattr('blf_dsc_controller.supervision.plan.plan_trajectory', plan)
     arm, law = ros.loop(None, BRISK | PLANNED['on'])
     ros.run(arm, 20)
     raw = serialize_message(trajectory(JOINTS, np.zeros(2), duration=3.0))

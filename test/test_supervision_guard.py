@@ -19,8 +19,9 @@ from blf_dsc_controller.reference.trajectory import (
     TrajectoryError,
     TrajectoryPoint,
 )
-from blf_dsc_controller.supervision.guard import Guard, LatePlanError
+from blf_dsc_controller.supervision.guard import Guard
 from blf_dsc_controller.supervision.last_state import LastState
+from blf_dsc_controller.supervision.plan import LatePlanError
 from blf_dsc_controller.supervision.retuning import apply, apply_bumpless
 from blf_dsc_controller.supervision.safe_torque import SafeTorque, safe_torque
 from blf_dsc_controller.supervision.state_check import StateCheck

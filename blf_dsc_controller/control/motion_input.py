@@ -33,7 +33,8 @@ from blf_dsc_controller.reference.trajectory import (
     TrajectoryPoint,
     trajectory_problems,
 )
-from blf_dsc_controller.supervision.guard import Guard, LatePlanError, Plan
+from blf_dsc_controller.supervision.guard import Guard
+from blf_dsc_controller.supervision.plan import LatePlanError, Plan
 
 _NANO = 1e-9
 # bytes per joint of a point with all its fields, each with a header of 8 bytes

@@ -11,7 +11,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from time import perf_counter
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,26 +27,19 @@ from blf_dsc_controller.messages import codecs
 from blf_dsc_controller.messages.journal import (
     EventType,
     Journal,
-    trajectory_content,
 )
 from blf_dsc_controller.reference.approach import (
     BlendedReference,
     MotionError,
-    check_takeover,
     plan_start,
 )
 from blf_dsc_controller.reference.retargeting import (
-    PlannedMotion,
     Target,
     TrajectoryError,
     plan_stop,
-    plan_target,
 )
 from blf_dsc_controller.reference.terms import remaining
-from blf_dsc_controller.reference.trajectory import (
-    Trajectory,
-    plan_trajectory,
-)
+from blf_dsc_controller.reference.trajectory import Trajectory
 from blf_dsc_controller.run import Contact
 from blf_dsc_controller.supervision import retuning
 from blf_dsc_controller.supervision.contact import contact_of
@@ -55,25 +48,27 @@ from blf_dsc_controller.supervision.first_torque import (
     check_first_torque,
     limit_first_torque,
 )
+from blf_dsc_controller.supervision.plan import Plan, plan_motion
 from blf_dsc_controller.supervision.safe_torque import SafeTorque
 from blf_dsc_controller.supervision.sample_check import SampleCheck
+from blf_dsc_controller.supervision.start import (
+    PreparedStart,
+    can_take_over,
+    prepared_start,
+)
 from blf_dsc_controller.supervision.state_check import SKIP, StateCheck, rate_mismatch
 from blf_dsc_controller.supervision.state_watchdog import LONG_SILENCE, PERIOD, Watchdog
+from blf_dsc_controller.supervision.stop_speed import StopSpeed
 from blf_dsc_controller.supervision.supervisor import Fault, Phase, Reason, Supervisor
 from blf_dsc_controller.supervision.support import check_support
 from blf_dsc_controller.supervision.velocity import Velocity
 
 Vector = NDArray[np.float64]
 _NANO = 1e-9
-_SAME_PLACE = 0.05  # of the bound
 _MANY = 0.5  # states missed for each that came
 _LONG_GAP = 2.5  # samples
 _IN_A_ROW = 0.1  # s between two states, at most
-# rad/s over twice the speed at the stop, for _SPEEDS_UP: a load that is new makes less of it
-_FASTER = 0.5
 _AT_REST = 0.01  # rad/s
-_GROWING = 0.95  # of the largest speed so far
-_SPEEDS_UP = 0.2  # s
 
 # Commands that do not reach the arm may be why, or velocities that are not its own: both wind up
 # the estimates.
@@ -86,27 +81,6 @@ _REASONS: dict[type[codecs.MessageError], Reason] = {
     codecs.DuplicatedJointError: Reason.JOINT_DUPLICATED,
     codecs.ShortArrayError: Reason.FIELD_MISSING,
 }
-
-
-class LatePlanError(TrajectoryError):
-    """The time at which a trajectory should take effect passed while it was planned."""
-
-
-class Plan(NamedTuple):
-    """A planned trajectory, or a target of a stream."""
-
-    command: Trajectory | Target
-    at: float  # s since the start, when it takes effect
-    before: np.ndarray  # packed reference that it continues
-    motion: PlannedMotion
-    content: dict[str, Any]  # of its event
-
-
-class PreparedStart(NamedTuple):
-    """A start that was planned before the first state."""
-
-    positions: Vector  # rad, from which it begins at rest
-    motion: BlendedReference
 
 
 class Guard:
@@ -167,9 +141,7 @@ class Guard:
         self._safe_torque.scale = self.controller.state.gain_scale
         self._seen = 0  # ns, stamp of the last state, used or not
         self._gap = 0.0  # s, since the one before
-        self._stop_speed = 0.0  # rad/s, largest of a joint at the stop
-        self._peak_speed = 0.0  # rad/s, since then
-        self._speeding = 0.0  # s, for which the arm has been faster in the stop
+        self._stop_speed = StopSpeed()
         self._prepared: PreparedStart | None = None
         self._clean = True  # whether the window holds valid samples only
         self._resumable = False  # whether the law may continue along its reference
@@ -379,14 +351,11 @@ class Guard:
 
     def _check_speed(self) -> None:
         """Return to the load known before if the arm speeds up in the safe stop."""
-        if self.supervisor.phase is not Phase.SAFE_STOP or self._speeding > _SPEEDS_UP:
+        if self.supervisor.phase is not Phase.SAFE_STOP:
             return
-        speed = float(np.abs(self.controller.checks.derived).max())
-        self._peak_speed = max(speed, self._peak_speed)
-        is_faster = speed > 2.0 * self._stop_speed + _FASTER
-        is_faster = is_faster and speed > _GROWING * self._peak_speed
-        self._speeding = self._speeding + self._gap if is_faster else 0.0
-        if self._speeding > _SPEEDS_UP and self.config.safety.torque != 'zero':
+        speed = self._speed
+        speeds_up = self._stop_speed.speeds_up(speed, self._gap)
+        if speeds_up and self.config.safety.torque != 'zero':
             self._safe_torque.stop_observing()
             self.supervisor.add(
                 f'the arm speeds up in the safe stop, to {speed:.3g} rad/s: engage the brakes'
@@ -424,20 +393,18 @@ class Guard:
             MotionError: no approach from there keeps the limits.
         """
         bound = self.controller.bound_at(0.0)
-        motion = plan_start(self.config, bound, positions, np.zeros(self._n))
+        prepared = prepared_start(self.config, bound, positions)
         self._note(EventType.PREPARE, positions=positions.tolist())
-        self._prepared = PreparedStart(np.array(positions), motion)
+        self._prepared = prepared
 
     def _plan_start(self, q: Vector, dq: Vector) -> BlendedReference:
         """Return the reference from q (n,) [rad] and dq (n,) [rad/s] on, at t = 0."""
         prepared = self._prepared
         self._prepared = None
-        if prepared is not None:
-            moved = np.abs(q - prepared.positions)
-            is_there = np.all(moved < _SAME_PLACE * np.array(self.config.barrier.bound))
-            if is_there and self._takes_over(0.0, q, dq, prepared.motion.vector):
-                return prepared.motion
-        return plan_start(self.config, self.controller.bound_at(0.0), q, dq)
+        bound = self.controller.bound_at(0.0)
+        if prepared is not None and prepared.fits(self.config, bound, q, dq):
+            return prepared.motion
+        return plan_start(self.config, bound, q, dq)
 
     def check_support(self, measurement: Vector) -> None:
         """Refuse to start if nothing shows what holds a live arm."""
@@ -453,21 +420,13 @@ class Guard:
         self._stop(Reason.START_REJECTED, str(error))
 
     def _resumes(self, stamp: int, q: Vector, dq: Vector) -> bool:
-        law, t = self.controller, self._time_of(stamp)
+        """Whether the law can continue along the running reference."""
         if not self._resumable or stamp <= self.last_stamp:
             return False
-        return self._takes_over(t, q, dq, law.reference_vector)
-
-    def _takes_over(
-        self, t: float, q: Vector, dq: Vector, reference_vector: Vector
-    ) -> bool:
-        """Whether the law can take over at time t [s] along a reference."""
+        t = self._time_of(stamp)
         bound = self.controller.bound_at(t)
-        try:
-            check_takeover(self.config, bound, q, dq, reference_vector, t)
-        except StartError:
-            return False
-        return True
+        vector = self.controller.reference_vector
+        return can_take_over(self.config, bound, q, dq, vector, t)
 
     def _advance_to(self, stamp: int) -> None:
         self.last_stamp = stamp
@@ -537,6 +496,11 @@ class Guard:
         self.has_sample = False
         self.journal.messages += 1
 
+    @property
+    def _speed(self) -> float:
+        """Largest speed of a joint [rad/s], as the positions show it."""
+        return float(np.abs(self.controller.checks.derived).max())
+
     def _time_of(self, stamp: int) -> float:
         return (stamp - self.start_stamp) * _NANO
 
@@ -551,9 +515,7 @@ class Guard:
             if was_running and reason in _WINDING_UP:
                 self.samples.return_to_consistent()
             reached = reason not in (*_PERHAPS_UNREACHED, Reason.NO_EFFECT)
-            self._stop_speed = float(np.abs(self.controller.checks.derived).max())
-            self._peak_speed = 0.0
-            self._speeding = 0.0
+            self._stop_speed.begin(self._speed)
             self.journal.note(EventType.STOP, reason=reason, text=text)
             self._clean = self._resumable = False
             self._safe_torque.begin_ramp(
@@ -632,15 +594,7 @@ class Guard:
         self._check_running()
         at = self.time if at is None else at
         before = self.controller.reference_vector
-        if isinstance(command, Trajectory):
-            motion = plan_trajectory(command, before, at, self.config)
-            joints, points, begin = command
-            given = [point._asdict() for point in points]
-            content: dict[str, Any] = trajectory_content(joints, given, begin, at)
-        else:
-            motion = plan_target(command, before, at, self.config)
-            content = {**command._asdict(), 'at': at}
-        return Plan(command, at, before, motion, content)
+        return plan_motion(command, before, at, self.config)
 
     def adopt(self, planned: Plan) -> None:
         """Follow a planned motion.
@@ -650,21 +604,9 @@ class Guard:
             TrajectoryError: it does not continue the current reference, which stays in force.
         """
         self._check_running()
-        if planned.before is not self.controller.reference_vector:
-            raise TrajectoryError(
-                ['the reference was replaced while it was planned: send it again']
-            )
-        if planned.at < self.time:
-            due = f'it should begin at {planned.at:.6g} s'
-            raise LatePlanError([f'{due}, but was planned only at {self.time:.6g} s'])
-        command = planned.command
-        if isinstance(command, Target):
-            if self.holds:
-                remedy = 'send a trajectory that leads away from it, or call reset'
-                why = self.contact.text if self.contact else ''
-                raise TrajectoryError([f'{why}, and it holds: {remedy}'])
-            self._note(EventType.TARGET, **planned.content)
-            self._follow(planned.motion.vector)
+        planned.check(self.controller.reference_vector, self.time)
+        if isinstance(planned.command, Target):
+            self._adopt_target(planned)
             return
         self.end_silence()
         self.journal.add(EventType.TRAJECTORY, planned.content)
@@ -673,6 +615,15 @@ class Guard:
         self.settled = planned.motion.settled
         is_settled = self.settled <= self.time
         self.supervisor.enter(Phase.TRACKING if is_settled else Phase.APPROACHING)
+
+    def _adopt_target(self, planned: Plan) -> None:
+        """Follow a target; raises TrajectoryError where the reference holds after a contact."""
+        if self.holds:
+            remedy = 'send a trajectory that leads away from it, or call reset'
+            why = self.contact.text if self.contact else ''
+            raise TrajectoryError([f'{why}, and it holds: {remedy}'])
+        self._note(EventType.TARGET, **planned.content)
+        self._follow(planned.motion.vector)
 
     def brake(self) -> float:
         """Bring the reference to rest within the limits, from now on; return when it rests [s].
