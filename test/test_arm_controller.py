@@ -108,7 +108,10 @@ def test_presets_and_files_are_found_by_name_and_bags_are_not_overwritten(tmp_pa
         blf.ArmController('recommended', record=tmp_path / 'bag')
 
 
-@pytest.mark.parametrize(('away', 'is_used'), [(0.0, True), (0.01, False)])
+# 0.0005 rad is inside the bound, where the law could take over, but not the same place.
+@pytest.mark.parametrize(
+    ('away', 'is_used'), [(0.0, True), (0.0005, False), (0.01, False)]
+)
 def test_prepared_start_is_used_if_the_arm_is_still_there(away, is_used, tmp_path):
     """From elsewhere the approach is planned again; both replay."""
     start = {'initial.position': [2.0, 1.5], 'duration': 0.2}
