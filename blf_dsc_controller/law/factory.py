@@ -123,40 +123,44 @@ def columns_of(config: ControllerConfig) -> tuple[Column, ...]:
     its initial estimate and three times that, or between 0 and those 5 %: a push that is learned
     as friction, negative or none, turns over where the joint does.
     """
-    learning, joints = config.learning, config.joints
+    known: dict[str, Any] = {}
+    if config.model == 'urdf':
+        known = config.robot.friction(config.robot.chain(config.joints))
+    return tuple(
+        _column(config, block, i, known[block][i] if block in known else 0.0)
+        for block in _column_blocks(config)
+        for i in range(len(config.joints))
+    )
+
+
+def _column_blocks(config: ControllerConfig) -> list[str]:
+    """Return the names of the blocks of columns, each with a column per joint."""
+    learning = config.learning
     switched = {
         'bias': learning.bias,
         'viscous': learning.viscous,
         'coulomb': learning.coulomb,
     }
     blocks = [name for name, is_on in switched.items() if is_on]
-    blocks += [
-        f'{wave} {w:g} rad/s' for w in learning.frequencies for wave in ('sin', 'cos')
-    ]
-    known = (
-        config.robot.friction(config.robot.chain(joints))
-        if config.model == 'urdf'
-        else {}
+    for w in learning.frequencies:
+        blocks += [f'sin {w:g} rad/s', f'cos {w:g} rad/s']
+    return blocks
+
+
+def _column(config: ControllerConfig, block: str, i: int, initial: float) -> Column:
+    """Return the column of a block for joint i, with its initial estimate."""
+    is_viscous = block == 'viscous'
+    is_friction = block in {'viscous', 'coulomb'}
+    velocity = config.limits.velocity[i] if is_viscous else 1.0
+    usual = _FRICTION * config.torque.limit[i] / velocity
+    return Column(
+        name=f'{block} {config.joints[i]}',
+        unit='N m s/rad' if is_viscous else 'N m',
+        initial=initial,
+        deviation=0.5 * initial or usual,
+        least=initial / _MOST_FRICTION if is_friction else -np.inf,
+        most=(_MOST_FRICTION * initial or usual) if is_friction else np.inf,
     )
-    columns = []
-    for block in blocks:
-        is_viscous = block == 'viscous'
-        is_friction = block in {'viscous', 'coulomb'}
-        for i, joint in enumerate(joints):
-            initial = known[block][i] if block in known else 0.0
-            velocity = config.limits.velocity[i] if is_viscous else 1.0
-            usual = _FRICTION * config.torque.limit[i] / velocity
-            columns.append(
-                Column(
-                    name=f'{block} {joint}',
-                    unit='N m s/rad' if is_viscous else 'N m',
-                    initial=initial,
-                    deviation=0.5 * initial or usual,
-                    least=initial / _MOST_FRICTION if is_friction else -np.inf,
-                    most=(_MOST_FRICTION * initial or usual) if is_friction else np.inf,
-                )
-            )
-    return tuple(columns)
 
 
 def estimate_names(config: ControllerConfig) -> tuple[str, ...]:
