@@ -243,4 +243,4 @@ def test_every_own_shell_line_of_the_page_is_executed(
                 else:
                     continue
                 own.append(line)
-    assert len(own) == 8
+    assert len(own) == 9
