@@ -13,12 +13,15 @@ from fault_table import FAULTS, Rig, named, page, run
 from plain_law import dynamics
 
 from blf_dsc_controller.configuration.controller import ControllerConfig
-from blf_dsc_controller.configuration.schema import build
+from blf_dsc_controller.configuration.nodes import load_loop
+from blf_dsc_controller.configuration.schema import build, change
 from blf_dsc_controller.law.check_state import INVALID, OUTSIDE, SUSPECT
 from blf_dsc_controller.law.checks import check_sample
+from blf_dsc_controller.law.factory import controller_of
 from blf_dsc_controller.supervision.sample_check import SampleCheck
 from blf_dsc_controller.supervision.supervisor import Phase, Reason
 from blf_dsc_controller.supervision.velocity import Velocity
+from sim_plant.plant import plant_of
 
 DT = 1e-3
 LIMIT = 20.0  # N m, the default torque limit
@@ -123,6 +126,23 @@ def test_only_an_effort_that_lacks_more_than_usual_explains_an_error(
     fault = check.check(DT)
     assert fault.reason is reason
     assert ('lacks +2 N m' in fault.text) == (reason is Reason.NO_EFFECT)
+
+
+def test_what_drives_add_is_no_lack_of_a_whole_effort():
+    """An FR3 of which a joint did lack a third of its limit, and now has what is commanded."""
+    loop = load_loop('fr3')
+    config = change(loop.controller, {'safety.error_ratio': 1.0})
+    law = controller_of(config)
+    law.update(0.0, DT, plant_of(loop.plant).measure())
+    check = SampleCheck(config, law)
+    added, limit = law.signals.added, law.settings.torque_limit
+    i = int(np.argmax(np.abs(added) / limit))
+    assert abs(added[i]) > 0.1 * limit[i]
+    law.checks.lack[i] = -np.sign(added[i]) * limit[i] / 3.0
+    law.checks.used[14:] = law.sample.torque + added
+    law.sample.xi1[i] = 2.0 * law.sample.bound[i]
+    law.flags = verdict(law)
+    assert check.check(DT).reason is Reason.OUTSIDE_BOUND
 
 
 def test_usual_lack_of_an_effort_is_its_average_over_a_second():
