@@ -35,8 +35,17 @@ from trajectory_msgs.msg import (
     MultiDOFJointTrajectoryPoint,
 )
 
+from blf_dsc_controller.control.goal_messages import (
+    Answer,
+    Cancel,
+    End,
+    Goal,
+    Outcome,
+)
+from blf_dsc_controller.control.goals import Goals
 from blf_dsc_controller.messages import topics
 from blf_dsc_controller.messages.journal import EventType
+from blf_dsc_controller.reference.trajectory import Trajectory, TrajectoryPoint
 from blf_dsc_controller.replay.verify import verify
 from blf_dsc_controller.supervision.supervisor import Reason
 
@@ -322,6 +331,23 @@ def test_tolerance_of_minus_one_allows_everything(loop):
     found = followed.path.violation(JOINTS, outside, law.guard.controller.sample.bound)
     assert "'joint2' is " in found
     client.cancel(handle)
+
+
+def test_cancel_of_a_goal_does_not_brake_the_motion_that_has_replaced_it(loop):
+    """Both arrive between two samples."""
+    _, law, client = loop
+    sent = []
+    inputs = law._status.trajectories
+    goals = Goals(inputs, JOINTS, sent.append, law.get_logger())
+    far = JointTrajectory(joint_names=JOINTS, points=[point(FAR, 1.0)])
+    goals.take(law.guard, Goal(7, serialize_message(far), (), (), 0.0))
+    client.ros.until(lambda: sent)
+    newer = Trajectory(JOINTS, (TrajectoryPoint(1.0, tuple(NEAR)),))
+    law.guard.adopt(law.guard.plan(newer))
+    goals.take(law.guard, Cancel(7))
+    np.testing.assert_allclose(rests_at(law), NEAR, atol=1e-9)
+    assert [type(each) for each in sent] == [Answer, End]
+    assert sent[1].outcome is Outcome.CANCELLED
 
 
 def test_cancelled_goal_decelerates_within_the_limits_and_holds(loop):

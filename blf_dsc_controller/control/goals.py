@@ -179,7 +179,11 @@ class Goals:
         if followed is None or followed.goal.number != number:
             return  # it has ended meanwhile, and its result is on the way
         text = 'cancelled'
-        if guard is not None and guard.supervisor.running:
+        if (
+            guard is not None
+            and guard.supervisor.running
+            and guard.controller.reference_vector is followed.vector
+        ):
             left = self._inputs.stop(guard, 'a cancel') - guard.time
             text = f'cancelled: braking for {left:.3g} s'
         self._end(Outcome.CANCELLED, SUCCESSFUL, text)
