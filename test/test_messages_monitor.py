@@ -11,6 +11,7 @@ from blf_dsc_controller.analysis.metrics import measure
 from blf_dsc_controller.analysis.metrics_table import format_table
 from blf_dsc_controller.analysis.panels import panels
 from blf_dsc_controller.bags.reader import read_run
+from blf_dsc_controller.configuration.nodes import load_loop
 from blf_dsc_controller.law import barrier
 from blf_dsc_controller.law.barrier import virtual_control
 from blf_dsc_controller.law.factory import (
@@ -192,3 +193,18 @@ def test_rejected_columns_are_in_the_summary_and_the_lyapunov_function_is_a_pane
         'disturbance',
     ]
     assert V.values[0] == pytest.approx(sum(line.values[0] for line in terms))
+
+
+def test_rejected_column_is_named_with_the_columns_that_it_resembles():
+    """The last of m columns is twice the first less the third; the others are random."""
+    config = load_loop('panda').controller
+    law = controller_of(config)
+    names = estimate_names(config)
+    X = np.random.default_rng(0).normal(size=(1000, len(names)))
+    X[:, -1] = 2.0 * X[:, 0] - X[:, 2]
+    law.state.running[:-1, :-1] = np.triu(X.T @ X)
+    law.state.active[:] = 1.0
+    law.state.active[-1] = 0.0
+    ((name, reason),) = rejected_columns(law, names).items()
+    assert name == names[-1]
+    assert f'it from {names[0]} + {names[2]} (100 % of it' in reason
