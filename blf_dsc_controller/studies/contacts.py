@@ -52,7 +52,7 @@ DRAWN = 10.0
 """One of them, of the picture."""
 
 LEARNED = 'learned, its own covariance'
-TOLD = 'URDF, told its error on each arm'
+TOLD = 'URDF, known error on each arm'
 USUAL = 'URDF, one limit for each joint'
 DETECTORS = {LEARNED: BLUE, TOLD: ORANGE, USUAL: MUTED}
 
@@ -273,7 +273,7 @@ def format_results(found: Mapping[str, Any]) -> str:
             rows.append(row)
         lines.append(aligned(rows))
         lines.append(
-            'as it is by default, with loads expected: '
+            'with the default settings, which expect loads: '
             f'{default["pick-ups taken for a contact"]} of {results["arms"]} pick-ups taken for '
             f'a contact, {default["false alarms"] / hours:.2g} false alarms per hour, '
             f'median {milliseconds(default["median delay"])} ms, '
