@@ -156,14 +156,18 @@ print(float(H[0, 0, 0]), *(sum(model._fill_regressors.stats[k].values()) for k i
 """
 
 
-def compiled_in(checkout, cache, ending='', **target):
-    """Return an entry of a regressor, and how often its kernel was found and was compiled."""
+def compiled_in(checkout, cache, ending=''):
+    """Return an entry of a regressor, and how often its kernel was found and was compiled.
+
+    Only what is compiled needs the part of numba that knows how to.
+    """
     paths = {'PYTHONPATH': str(checkout), 'NUMBA_CACHE_DIR': str(cache)}
-    environment = os.environ | paths | target
-    run = finished(
-        sys.executable, '-c', COMPILE + ending, cwd=checkout, env=environment
-    )
-    entry, found, compiled = map(float, run.stdout.split())
+    environment = os.environ | paths
+    code = f"{COMPILE}{ending}\nprint('numba.np.npyimpl' in sys.modules)"
+    run = finished(sys.executable, '-c', code, cwd=checkout, env=environment)
+    *numbers, loaded = run.stdout.split()
+    entry, found, compiled = map(float, numbers)
+    assert loaded == str(compiled > 0), run.stderr
     return entry, found, compiled
 
 

@@ -18,7 +18,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from typing import NamedTuple
-from xml.sax.saxutils import quoteattr
 
 from blf_dsc_controller.compiled.elementary import cos, sin
 from blf_dsc_controller.compiled.jit import inner
@@ -128,6 +127,8 @@ def urdf(
     `lengths` and `masses` are those of the links [m] and at their ends [kg].  Point
     masses have a tiny inertia: most parsers reject zero.
     """
+    from xml.sax.saxutils import quoteattr  # slow: it imports what reads from networks
+
     text = '<robot name="two_link">\n  <link name="base_link" />\n'
     parent, x = 'base_link', 0.0
     for k, (joint, length, mass) in enumerate(

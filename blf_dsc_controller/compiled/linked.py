@@ -31,6 +31,7 @@ from numba.core.compiler import CompilerBase, DefaultPassBuilder
 from numba.core.compiler_machinery import PassManager, register_pass
 from numba.core.environment import lookup_environment
 from numba.core.errors import UnsupportedError
+from numba.core.runtime import rtsys
 from numba.core.typed_passes import NativeLowering
 from numba.core.types import NumPyRandomGeneratorType
 from numba.extending import intrinsic
@@ -182,15 +183,24 @@ class _CachedCode(CompileResultCacheImpl):  # type: ignore[misc]
         super().__init__(function)
 
 
-class ShippedKernels(FunctionCache):  # type: ignore[misc]
-    """Machine code of a kernel in a folder that is only read."""
+class _Stored(FunctionCache):  # type: ignore[misc]
+    """Machine code of a kernel in a folder."""
 
     def __init__(self, function: Any, path: Path) -> None:
         self._impl_class = partial(_CachedCode, path)
         super().__init__(function)
 
+    def load_overload(self, signature: Any, context: Any) -> Any:
+        """Return the compiled kernel, or None.
 
-class KernelCache(FunctionCache):  # type: ignore[misc]
+        numba's own would first load all that a compilation may need, for a third of a
+        second.
+        """
+        rtsys.initialize(context)  # counts the references of a kernel's arguments
+        return self._load_overload(signature, context)
+
+
+class KernelCache(_Stored):
     """Machine code of a kernel in a folder, or in that of the shipped kernels.
 
     Of several processes that need a kernel at once, one compiles it; the others wait,
@@ -198,9 +208,8 @@ class KernelCache(FunctionCache):  # type: ignore[misc]
     """
 
     def __init__(self, function: Any, path: Path, shipped: Path) -> None:
-        self._impl_class = partial(_CachedCode, path)
-        super().__init__(function)
-        self._shipped = ShippedKernels(function, shipped)
+        super().__init__(function, path)
+        self._shipped = _Stored(function, shipped)
         self._lock = FileLock(path / f'{function.__name__}.lock')
 
     def load_overload(self, signature: Any, context: Any) -> Any:
