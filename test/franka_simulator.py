@@ -20,6 +20,7 @@ import os
 import sys
 import time
 from collections import defaultdict
+from select import select
 
 import mujoco
 import numpy as np
@@ -35,7 +36,8 @@ from franky_sim.mujoco_simulator import MujocoSimulator
 _HAND = 'robot0_hand'
 _GRASP = np.array([0.0, 0.0, 0.12])  # m, of the load in the frame of the hand
 _PATIENCE = 20.0  # s, for a torque; then the client is gone
-_STEP = 0.001  # s
+_POLL = 0.02  # s, in which also what needs no message is noticed
+_IDLE = 0.01  # s, for a step while nothing moves
 _SLOW = 0.3  # s, for a step of a motion that waits for its first torque
 
 
@@ -73,7 +75,7 @@ class Simulator:
         if not self.robot.current_motion_id:
             self.cycle = 0
         if self.cycle == 0:
-            time.sleep(_SLOW if self.robot.current_motion_id else _STEP)
+            time.sleep(_SLOW if self.robot.current_motion_id else _IDLE)
         else:
             self.wait()
         for what in self.events[self.cycle] if self.cycle else ():
@@ -89,7 +91,8 @@ class Simulator:
         while self.unanswered and self.robot.current_motion_id:
             if time.monotonic() > deadline:
                 return
-            time.sleep(0.0)
+            sockets = self.robot._FrankaServer__udp_socket, self.robot._tcp_socket
+            select(sockets, (), (), _POLL)
             self.robot.process_commands()
 
     def happen(self, what):
