@@ -220,7 +220,7 @@ def test_arm_that_holds_takes_no_targets_until_a_trajectory_leads_away():
     guard._react()
     q = guard.controller.signals.q
     target = Target(tuple(q), (0.0,) * 7, 0.1, 0.3, held=True)
-    with pytest.raises(TrajectoryError, match='it holds: send a trajectory'):
+    with pytest.raises(TrajectoryError, match='the arm holds: send a trajectory'):
         guard.adopt(guard.plan(target))
     assert guard.supervisor.phase is not Phase.SAFE_STOP
     guard.reset()
@@ -243,7 +243,7 @@ def test_run_and_its_bag_say_what_touched_the_arm(tmp_path, held, free):
         assert line in format_table(metrics)
         assert metrics.final_parameter_error < 0.01
         shown = {panel.title: panel for panel in panels([run])}
-        panel = shown[f'torque from outside on {contact.joint}']
+        panel = shown[f'external torque on {contact.joint}']
         torque, interval = panel.lines
         k = int(np.argmin(np.abs(torque.time - TOUCHED - 0.3)))
         assert abs(torque.values[k]) > interval.values[k]

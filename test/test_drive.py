@@ -147,7 +147,7 @@ COMMANDED = {'robot.effort': 'commanded'}  # without what the drives add: here 0
 STEPS = {'torque.first_step': [1.0] * 7}
 TWICE = '^gravity twice: the first torque would be -(32.4|18.12) N m'
 NONE = '^no gravity: .* an effort of 0 N m where the drives should hold -'
-STEP = r"'panda_joint2', more than the 1 N m .* it is the gravit"
+STEP = r"'panda_joint2', more than the 1 N m .* this is the gravit"
 OTHERS = r'no gravity: .* rests with a commanded effort of'  # of another controller
 
 

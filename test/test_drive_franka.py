@@ -235,7 +235,7 @@ def test_load_is_told_in_the_frame_of_the_flange_and_none_without_mass():
     [
         (True, 0.73, 1.23, 'an end effector of 0.73 kg'),
         (True, 0.005, 2.0, ''),
-        (False, 0.73, 0.73, 'adds the weight of 0.73 kg at its flange, but'),
+        (False, 0.73, 0.73, 'compensates 0.73 kg at its flange, but'),
         (False, 0.73, 0.505, ''),
     ],
 )

@@ -166,8 +166,8 @@ def test_law_that_begins_again_leaves_the_load_to_the_drives(services, ros):
     assert cleanup(ros, arm.law)
     assert configure(ros, arm.law)
     problem = arm.law._load_service.problem
-    assert problem.startswith('the drives still have the load of 2.0')
-    assert 'set it back to robot.drive_payload, and start the node anew' in problem
+    assert problem.startswith('a load of 2.0')
+    assert 'set it back to robot.drive_payload, and restart the node' in problem
     assert activate(ros, arm.law)
     guard = arm.law.guard
     ros.until(lambda: guard.time > 0.2 or guard.supervisor.text or guard.waiting_for)
@@ -183,8 +183,8 @@ def test_service_that_cannot_be_called_is_named(ros, monkeypatch):
     service = law._load_service
     ros.until(lambda: service.look() or service.problem)
     assert re.fullmatch(
-        r'/driver/set_load is a std_srvs/srv/Trigger, but ur_msgs/srv/SetPayload and .* can be '
-        'called',
+        r'/driver/set_load is a std_srvs/srv/Trigger, but only ur_msgs/srv/SetPayload and .* '
+        'can be called',
         service.problem,
     )
     service.problem = ''

@@ -135,7 +135,7 @@ def test_a_load_that_nobody_tells_the_drives_is_warned_of(ros, log):
     fr3 = flatten(load_loop('fr3').controller)
     ros.add(ControllerNode, fr3 | {'learning.tell_drive': True}, namespace='told')
     ros.until(
-        lambda: log('told', 'learning.tell_drive: the drives are told nothing', WARN)
+        lambda: log('told', 'without learning.load_service no load is declared', WARN)
     )
 
 

@@ -79,7 +79,7 @@ def test_bound_that_these_gains_cannot_hold_at_first_names_one_that_they_can(
         bounds = [1.0 / 20.0] * 2
         bounds[joint] = bound / 10.0
         (warning,) = config_warnings(change(config, {'barrier.bound': bounds}))
-        assert f'may leave joint{joint + 1} ' in warning
+        assert f'learned, joint{joint + 1} may be ' in warning
 
 
 @pytest.mark.parametrize(
@@ -190,7 +190,7 @@ def test_pick_up_past_the_bound_is_named_with_what_would_hold():
     )
     bound, payload = (
         float(re.search(pattern, warning)[1])
-        for pattern in ('a bound of ([0-9.]+) rad would', 'hold, or ([0-9.]+) kg')
+        for pattern in ('give ([0-9.]+) rad', 'at most ([0-9.]+) kg')
     )
     for changes in ({'barrier.bound': [bound] * 7}, {'robot.payload': 0.95 * payload}):
         assert of_bound(changes) == []

@@ -236,11 +236,11 @@ MISTAKES = {
     ),
     'unreachable': (
         PANDA | {'barrier.tool_bound': 1e-7},
-        'rad, finer than any encoder: give',
+        'rad, finer than any encoder: give at least',
     ),
     'no barrier': (
         PANDA | POSITION | {'law': 'slotine_li'},
-        'barrier.tool_bound: the law slotine_li keeps no bound: choose blf_dsc, or drop it',
+        'barrier.tool_bound: the law slotine_li keeps no bound: choose blf_dsc, or remove',
     ),
 }
 
@@ -261,7 +261,7 @@ def test_warnings_speak_of_the_bound_at_the_tool():
     assert share.startswith('safety.error_ratio: the arm stops only 2 times past')
     assert friction.startswith('barrier.tool_bound: friction and unmodelled torque')
     assert load.startswith('barrier.tool_bound: when 2 kg')
-    times = float(load.partition(' times that bound at the tool')[0].split()[-1])
+    times = float(load.partition(' times this bound at the tool')[0].split()[-1])
     wide = preset('panda', **{'barrier.tool_bound': 0.0005 * times})
     assert config_warnings(wide.controller) == []
 
@@ -297,7 +297,7 @@ def test_run_shows_the_error_at_the_tool(tracked, tmp_path):
     assert metrics.tool['error'] == values[:, ERROR].max()
     assert metrics.tool == measure(record.run()).tool
     at = values[:, ERROR].argmax()
-    text = f'tool        {1e3 * values[at, ERROR]:.3g} mm off at most, '
+    text = f'tool        at most {1e3 * values[at, ERROR]:.3g} mm off, '
     text += f'{1e3 * values[at, BOUND]:.3g} mm certified there'
     assert text in format_table(metrics)
     titles = {panel.title for panel in panels([run])}

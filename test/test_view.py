@@ -143,7 +143,8 @@ def test_contact_is_marked_at_its_joint_with_torque_and_interval(page):
     first = past[-1].position[0]  # the second joint is at the end of the first link
     elbow = np.array([np.cos(first), 0.0, np.sin(first)])
     np.testing.assert_allclose(mark.position, elbow, atol=1e-6)
-    assert text.text == '-2 N m from outside on joint2, +-0.4 N m explained'
+    assert text.text.startswith('external torque on joint2: -2 N m, ')
+    assert text.text.endswith('at most 0.4 N m')
     shown = [each._replace(**felt) for each in past]
     page.plot([*shown, touched])
     assert text.text in page._caption.content
@@ -151,7 +152,7 @@ def test_contact_is_marked_at_its_joint_with_torque_and_interval(page):
     page.move(shown)
     page.plot(shown)
     assert not node(page, '/contact').visible
-    assert 'outside' not in page._caption.content
+    assert 'external' not in page._caption.content
     page.draw_arm(ControllerConfig(), {})
 
 
@@ -256,6 +257,7 @@ def test_view_of_an_offline_run_is_rejected_before_the_run(tmp_path):
 
 # Live, of a running loop in lock-step.
 
+WAITING = 'waiting for a controller (/blf_dsc_controller/journal)'
 EVENT = {'events.begin': [1.0], 'events.duration': [0.5], 'events.payload': [0.25]}
 
 
@@ -265,9 +267,7 @@ def events_with(view, word):
 
 def test_page_shows_the_loop_its_events_and_that_its_controller_is_gone(ros):
     view = ros.add(ViewNode, port=18180)
-    ros.until(
-        lambda: view.page._state == ('STALE', 'waiting for /blf_dsc_controller/journal')
-    )
+    ros.until(lambda: view.page._state == ('STALE', WAITING))
     arm, law = ros.loop({**EVENT, 'autostart': False})
     ros.until(lambda: view._plant)
     assert configure(ros, arm)
@@ -357,18 +357,18 @@ def test_contact_is_on_the_page_and_in_diagnostics(ros):
     assert details['joint'] == 'joint1'
     at, torque = (
         float(details[name].removeprefix('at ').split()[0])
-        for name in ('last contact', 'torque from outside')
+        for name in ('last contact', 'external torque')
     )
     assert 8.0 < at < 8.1
-    assert abs(torque) > float(details['explained by model and noise'].split()[0])
-    (event,) = events_with(view, 'N m from outside on joint1')
+    assert abs(torque) > float(details['model error and noise'].split()[0])
+    (event,) = events_with(view, 'external torque on joint1')
     assert event[:2] == (pytest.approx(at, abs=1e-3), 'contact')
     # Once it has ended, all of it can be looked at.
     assert view.page._slider is None
     assert deactivate(ros, law)
     assert cleanup(ros, law)
     ros.until(lambda: view.page._slider)
-    assert view.page._state == ('OK', 'finished: the controller has ended as it should')
+    assert view.page._state == ('OK', 'finished: the controller has ended normally')
     assert view.page._slider.max > 8.0
     view.page._slider.value = 7.0
     shown = float(re.search(r't = (.*?) s', view.page._caption.content)[1])

@@ -25,10 +25,10 @@ BEFORE, AFTER = 1.5, 1.0  # s, shown besides the telling
 JOINTS = (1, 3)  # those that bear the load
 
 
-def recorded(folder):
-    """The bag of a run in which 2 kg are picked up, weighed and told."""
+def recorded(folder, text):
+    """The bag of a run with this configuration in which 2 kg are picked up."""
     config = folder / 'my.yaml'
-    config.write_text(told_config())
+    config.write_text(text)
     event = f'load=2@{round(1e3 * PICKED_UP)}'
     simulator = subprocess.Popen(
         [sys.executable, str(SIMULATOR), ADDRESS, event],
@@ -78,4 +78,4 @@ def draw(bag, path):
 
 if __name__ == '__main__':
     with tempfile.TemporaryDirectory() as folder:
-        draw(recorded(Path(folder)), OUT)
+        draw(recorded(Path(folder), told_config()), OUT)

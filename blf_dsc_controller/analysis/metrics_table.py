@@ -92,8 +92,11 @@ def _timing_text(timing: Mapping[str, Any], samples: int) -> str:
 
 def tool_text(tool: Mapping[str, float]) -> str:
     """Return `Metrics.tool` in words."""
-    mm = f'{1e3 * tool["error"]:.3g} mm off at most, {1e3 * tool["bound"]:.3g} mm certified there'
-    mrad = f'turned {1e3 * tool["angle"]:.3g} mrad, {1e3 * tool["angle_bound"]:.3g} mrad certified'
+    mm = f'at most {1e3 * tool["error"]:.3g} mm off, {1e3 * tool["bound"]:.3g} mm certified there'
+    mrad = (
+        f'at most {1e3 * tool["angle"]:.3g} mrad turned, '
+        f'{1e3 * tool["angle_bound"]:.3g} mrad certified there'
+    )
     share = f'{100.0 * tool["ratio"]:.3g} % and {100.0 * tool["angle_ratio"]:.3g} % of the bounds'
     return f'{mm}; {mrad}; at most {share}'
 
@@ -103,8 +106,8 @@ def contacts_text(contacts: Sequence[Mapping[str, Any]]) -> str:
     if not contacts:
         return '0'
     shown = [
-        f'at {each["time"]:.3f} s {each["torque"]:+.3g} N m on {each["joint"]}, where model '
-        f'and noise explain {each["interval"]:.2g} N m'
+        f'at {each["time"]:.3f} s {each["torque"]:+.3g} N m on {each["joint"]} (model error and '
+        f'noise: {each["interval"]:.2g} N m)'
         for each in contacts[:_SHOWN_CONTACTS]
     ]
     more = len(contacts) - len(shown)
@@ -127,7 +130,7 @@ def _learning_lines(of: Metrics) -> Iterator[str]:
         yield f'arm         changed at {times}: learning restarted'
     if of.rejected_columns:
         columns = ', '.join(of.rejected_columns)
-        yield f'rejected    {columns}: the motion does not tell them from the other columns'
+        yield f'rejected    {columns}: this motion cannot distinguish them from the other columns'
     if math.isnan(of.final_parameter_error):
         return
     what = 'parameters  error'

@@ -238,7 +238,7 @@ def _tool(run: Run, t: Floats) -> Iterator[Panel]:
 
 
 def _contact(run: Run) -> Iterator[Panel]:
-    """Yield the torque from outside on each joint, what explains it, and the contacts."""
+    """Yield the external torque on each joint with its interval, and the contacts."""
     if run.external is None:
         return
     t = run.time_of(run.external.stamp)
@@ -251,10 +251,10 @@ def _contact(run: Run) -> Iterator[Panel]:
         interval = run.external.column(joint + INTERVAL)
         lines = [
             Line('torque', t, torque),
-            Line('model and noise', t, interval, MUTED, True, True, True),  # noqa: FBT003
+            Line('model error and noise', t, interval, MUTED, True, True, True),  # noqa: FBT003
         ]
         note = '' if np.isnan(torque).all() else f'peak {np.nanmax(np.abs(torque)):.3g}'
-        title = f'torque from outside on {joint}'
+        title = f'external torque on {joint}'
         yield Panel('Contact', title, 'N m', lines, note, marks=marks)
 
 

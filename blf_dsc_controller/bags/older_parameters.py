@@ -41,12 +41,12 @@ def current(recorded: Mapping[str, Any], source: str) -> dict[str, Any]:
             continue
         if name not in REMOVED:
             problems.append(
-                f'{unknown(name, known)}: no rule says how to do without it'
+                f'{unknown(name, known)}: this version cannot do without it'
             )
         elif not _is_same(value, REMOVED[name]):
             problems.append(
-                f'{name}: recorded with {format_value(value)}, but this version has the law only '
-                f'as with {format_value(REMOVED[name])}'
+                f'{name}: recorded with {format_value(value)}, but this version only knows '
+                f'{format_value(REMOVED[name])}'
             )
     if problems:
         listing = ''.join(f'\n  - {problem}' for problem in problems)

@@ -85,12 +85,15 @@ def _check(options: Namespace) -> None:
     """Raise BlfDscError if the options are wrong, or ROS is missing that they ask for."""
     if not (options.duration >= 0.0 and math.isfinite(options.duration)):
         raise BlfDscError(
-            f'--duration: got {options.duration:g} s, but a time is needed; 0: until Ctrl-C'
+            f'--duration: got {options.duration:g} s, but a finite time of at least 0 is needed '
+            '(0: until Ctrl-C)'
         )
     if options.ros:
         require_ros()
     elif options.namespace:
-        raise BlfDscError('--namespace: it is that of the topics: give --ros, too')
+        raise BlfDscError(
+            '--namespace is for the topics, which need --ros: give it, too'
+        )
 
 
 @contextmanager
@@ -117,9 +120,9 @@ def _print(outcome: Outcome, loop: DriveLoop, controller: ArmController) -> None
     if not math.isnan(mass):
         print(f'load          {mass:.2f} +- {interval:.2f} kg more than at the start')
     if loop.remark:
-        print(f'load          told no more: {loop.remark}')
+        print(f'load          no longer declared to the drives: {loop.remark}')
     median, most = loop.latency.quantile(0.5), loop.latency.quantile(0.99)
     print(
-        f'torques after {1e6 * median:.0f} us in the median, {1e6 * most:.0f} us at 99 %, '
-        f'{1e6 * loop.latency.largest:.0f} us at most'
+        f'latency       from state to torque: median {1e6 * median:.0f} us, 99 % '
+        f'{1e6 * most:.0f} us, largest {1e6 * loop.latency.largest:.0f} us'
     )

@@ -147,8 +147,8 @@ def make_parser() -> argparse.ArgumentParser:
     """
     parser = argparse.ArgumentParser(
         prog='blf_dsc',
-        description='Output-constrained tracking control of robot arms: run it, look at its bags, '
-        'study it.',
+        description='Track a trajectory within a bound, with a robot arm whose masses are '
+        'unknown: run the controller, examine bags, identify arms, study laws.',
         epilog='blf_dsc COMMAND --help lists the options of a command, with an example.',
     )
     parser.add_argument(
@@ -179,8 +179,8 @@ def make_parser() -> argparse.ArgumentParser:
 
     names, force = (argparse.ArgumentParser(add_help=False) for _ in range(2))
     theirs = (
-        'name of a topic or a joint in the bag, such as joint1=shoulder; columns of a table: '
-        'time=, q=, tau='
+        'what a topic or a joint is called in the bag, such as joint1=shoulder; or which '
+        'columns of a table are the time=, q= and tau=; can be repeated'
     )
     names.add_argument(
         '--map', action='append', default=[], metavar='OURS=THEIRS', help=theirs
@@ -201,9 +201,10 @@ def make_parser() -> argparse.ArgumentParser:
 def _add_run(command: _Command) -> None:
     option = command(
         'run',
-        'Run the closed loop and plot the results. The simulated arm, the controller and the '
-        'recorder run over ROS 2, and leave a bag, pictures and summary.json in a new folder. Exit '
-        'code: 0 done, 5 the controller stopped before the end, 130 interrupted, 1 an error.',
+        'Run the controller on the simulated arm and plot the results. Arm, controller and '
+        'recorder run over ROS 2; a bag, pictures and summary.json are written into a new '
+        'folder. Exit code: 0 done, 5 the controller stopped before the end, 130 interrupted, '
+        '1 an error.',
         '--config noisy --duration 30 --mode realtime --out first',
     )
     option('--config', default='recommended', help=_CONFIG)
@@ -215,14 +216,15 @@ def _add_run(command: _Command) -> None:
     option(
         '--mode',
         choices=('realtime', 'lockstep'),
-        help='mode of the plant (as configured)',
+        help='steps by the wall clock, or one for each torque (as configured)',
     )
     option('--seed', type=int, help='seed of the sensor noise (as configured)')
-    physics = 'mechanics of the plant (as configured); mujoco: an independent one'
-    option('--physics', choices=('own', 'mujoco'), help=physics)
-    option(
-        '--offline', action='store_true', help='without ROS: no processes, no topics'
+    physics = (
+        'mechanics of the simulated arm: our own equations, or MuJoCo (as configured)'
     )
+    option('--physics', choices=('own', 'mujoco'), help=physics)
+    offline = 'run without ROS, in this process; nothing is published'
+    option('--offline', action='store_true', help=offline)
     option(
         '--out', type=Path, default=Path('closed_loop'), help='new folder (closed_loop)'
     )
@@ -230,20 +232,21 @@ def _add_run(command: _Command) -> None:
     option = command(
         'precompile',
         'Compile the kernels of a configuration before its first start. Controller and simulated '
-        'arm then start within seconds: after an installation, or when a container is built. The '
-        'kernels go into the cache of the user (NUMBA_CACHE_DIR, or ~/.cache/blf_dsc_controller).',
+        'arm then start within seconds. Use it after an installation, or when you build an image. '
+        'The kernels go into the cache of the user (NUMBA_CACHE_DIR, or '
+        '~/.cache/blf_dsc_controller).',
         '--config my.yaml',
     )
     option('--config', default='recommended', help=_CONFIG)
-    package = 'copy them into the package, for wheels, workspaces and images made of it'
+    package = 'also copy them into the package, for wheels, workspaces and images made from it'
     option('--package', action='store_true', help=package)
 
 
 def _add_drive(command: _Command) -> None:
     option = command(
         'drive',
-        'Control a robot over its own interface: a Franka Research 3. The law runs in the loop '
-        'that reads states and writes torques; --ros adds its topics. Ctrl-C or SIGTERM '
+        'Control a Franka Research 3 over its own interface, without ROS. The law runs in the '
+        'loop that reads states and writes torques; --ros adds the topics. Ctrl-C or SIGTERM '
         'brings the arm to rest and ends; a second one ends at once. Exit code: 0 the duration is '
         'over, 5 the controller or the robot stopped before, 130 interrupted, 1 an error.',
         '--robot 172.16.0.2 --config fr3_direct.yaml --duration 60 --out first',
@@ -252,10 +255,10 @@ def _add_drive(command: _Command) -> None:
     preset = 'parameter file, or a preset (fr3_direct)'
     option('--config', default='fr3_direct', help=preset)
     option('--duration', type=float, default=0.0, help='time [s]; 0: until Ctrl-C (0)')
-    option('--out', type=Path, help='new folder of a bag; none: record nothing')
-    beside = (
-        'publish the topics of the controller, and follow those that command motions'
+    option(
+        '--out', type=Path, help='new folder for a bag (without it nothing is recorded)'
     )
+    beside = 'publish the topics of the controller, and accept motions on its topics'
     option('--ros', action='store_true', help=beside)
     option('--namespace', default='', help='namespace of these topics (none)')
 
@@ -265,10 +268,10 @@ def _add_bags(
 ) -> None:
     option = command(
         'replay',
-        'Run a bag through the controller again and compare every output bit for bit. Its joint '
-        'states meet the recorded configuration; or with --play, the bag is published. Exit code: '
-        '0 all outputs are bit-equal, 3 some differ, 4 some could not be compared and the others '
-        'are bit-equal, 1 an error.',
+        'Run a bag through the controller again and compare every output bit for bit. The '
+        'controller has the recorded configuration and gets the recorded joint states. With '
+        '--play, publish the bag instead. Exit code: 0 all outputs are bit-equal, 3 some differ, '
+        '4 some could not be compared and the others are bit-equal, 1 an error.',
         'run1/bag',
         names,
     )
@@ -286,8 +289,8 @@ def _add_bags(
     option('--out', type=Path, default=Path('report.html'), help='file (report.html)')
     option = command(
         'recover',
-        'Make a clean bag from one that was cut off or damaged, and list what was lost. The '
-        'damaged bag is not touched. Exit code: 1 if nothing could be recovered.',
+        'Write a clean bag from one that was cut off or damaged, and list what was lost. The '
+        'damaged bag is not changed. Exit code: 1 if nothing could be recovered.',
         'run1/bag --out rescued',
     )
     option('bag', type=Path, help='folder of the bag, or its .mcap file')
@@ -309,10 +312,10 @@ def _add_identification(
 ) -> None:
     option = command(
         'excite',
-        'Find a reference that excites the learning of an arm from a URDF, and write it as a '
-        'preset. It is the sum of sinusoids with the period of the learning window that excites '
-        'the learning most within the joint and torque limits, with the links clear of each other '
-        'and of the floor.',
+        'Find the motion from which most is learned about an arm from a URDF. It is a sum of '
+        'sinusoids with the period of the learning window. It keeps the joint and torque limits, '
+        'and the links clear of each other and of the floor; nothing else around the arm is known. '
+        'It is written as a parameter file.',
         'exciting.yaml --config my.yaml',
         force,
     )
@@ -327,7 +330,8 @@ def _add_identification(
         default=4,
         help='number of searches; the best result is kept (4)',
     )
-    option('--radius', type=float, default=0.07, help='radius of the links [m] (0.07)')
+    radius = 'radius of the links, for their clearance [m] (0.07)'
+    option('--radius', type=float, default=0.07, help=radius)
     option(
         '--floor',
         type=float,
@@ -337,11 +341,10 @@ def _add_identification(
     option = command(
         'identify',
         'Correct the inertias and friction of a URDF from recordings with positions and efforts. '
-        'The new URDF has physical inertias that reproduce the torques and are closest to the '
-        'original ones; what changed is printed, with 95 % intervals, and the torque error on the '
-        'last fifth of the motion, which was held back. With --payload, weigh what the arm holds. '
-        'Exit code: 0 done, 3 the result is not to be used (and is written with --force only), 1 '
-        'an error.',
+        'The new URDF has physical inertias that reproduce the torques. The changes are printed, '
+        'with 95 % intervals, and the torque error on the last fifth of the motion, which is held '
+        'back for this test. With --payload, weigh what the arm holds. Exit code: 0 done, 3 do '
+        'not use the result (it is written with --force only), 1 an error.',
         'run1/bag --urdf robot.urdf --out corrected.urdf --report page.html\n'
         '  blf_dsc identify run.csv --urdf robot.urdf --map time=t --map tau=tau_* --out new.xml\n'
         '  blf_dsc identify empty/bag --urdf robot.urdf --payload loaded/bag',
@@ -371,17 +374,23 @@ def _add_identification(
         type=Path,
         help='page with measured and predicted torques and the tables',
     )
-    load = 'identify a load: carried in this other bag, or without one, picked up in the first'
+    load = (
+        'weigh the load that the arm carries in this bag and not in the first; without BAG, '
+        'the load that it picks up in the first'
+    )
     option('--payload', type=Path, nargs='?', const=True, metavar='BAG', help=load)
     before = (
-        'say what the recording, or the table of a planned motion without torques, can show: '
-        'nothing is fitted'
+        'fit nothing, but say what can be identified from the recording, or from the table of '
+        'a planned motion without torques'
     )
     option('--foresee', action='store_true', help=before)
     efforts = ('torque', 'without-gravity', 'command')
-    what = 'what efforts are: whole torque, or without that of gravity; or use commands (torque)'
+    what = (
+        'what the efforts contain: the whole torque, or all but gravity; or use the commands '
+        'instead (torque)'
+    )
     option('--effort', choices=efforts, default='torque', help=what)
-    per_effort = 'torque per effort of each joint, for currents [N m/A]'
+    per_effort = 'if efforts are currents: torque per current, of each joint [N m/A]'
     option('--gains', type=float, nargs='+', default=(), help=per_effort)
     option('--base', default='', help='fixed link (the root)')
     option('--tip', default='', help='last link (that of the last joint in the bag)')
@@ -402,8 +411,8 @@ def _add_identification(
 def _add_studies(command: _Command) -> None:
     option = command(
         'paper',
-        "Compare all laws in the paper's simulation. Its claims are checked, and where each law "
-        'breaks is found; offline, on all cores.',
+        "Compare all laws in the paper's simulation. Check the paper's claims, and find where "
+        'each law breaks. Runs without ROS, on all cores.',
         '--out paper_study',
     )
     option(
@@ -414,8 +423,9 @@ def _add_studies(command: _Command) -> None:
     )
     option = command(
         'arms',
-        'Compare laws on arms whose URDF is wrong. Each law is tuned on one arm with wrong masses '
-        'and run on others, for a table of the errors; offline, on all cores, in some minutes.',
+        'Compare laws on arms whose URDF is wrong. Each law is tuned on one simulated arm and run '
+        'on others; the errors are printed as a table. Runs without ROS, on all cores, for some '
+        'minutes.',
         '--config panda --out arms',
     )
     option(
@@ -424,13 +434,16 @@ def _add_studies(command: _Command) -> None:
         default=['panda', 'ur5e'],
         help='presets or files (panda ur5e)',
     )
-    laws = 'laws of the study by name, or Python files that add some (all of the study)'
+    laws = (
+        'laws of the study by name, or Python files with more laws (all of the study)'
+    )
     option('--laws', nargs='+', default=[], metavar='LAW', help=laws)
     option('--out', type=Path, default=Path('arms'), help='new folder for the figures')
     option = command(
         'tool',
-        'Try a bound at the tool: random errors within the joint bounds that follow from it, and '
-        'closed loops of arms whose URDF is wrong; offline, on all cores, in a minute.',
+        'Test a bound at the tool. It is tried with random errors inside the joint bounds that '
+        'follow from it, and with closed loops of arms whose URDF is wrong. Runs without ROS, on '
+        'all cores, for a minute.',
         '--config panda --bound 0.003 --out tool',
     )
     option(
@@ -445,9 +458,9 @@ def _add_studies(command: _Command) -> None:
     option('--out', type=Path, default=Path('tool'), help='new folder for the figures')
     option = command(
         'contacts',
-        'Compare how soon pushes are found at equal false alarms. Random arms with wrong links and '
-        "an unknown load are pushed; the learned model stands beside the URDF's; offline, on all "
-        'cores, half a second of CPU for each second of an arm.',
+        'Measure how soon contacts are detected. Random arms with wrong links and an unknown load '
+        "are pushed; the learned model is compared with the URDF's, at equal false-alarm rates. "
+        'Runs without ROS, on all cores, with half a second of CPU for each second of an arm.',
         '--arms 100 --force 10 20 --out contacts',
     )
     option(
@@ -462,16 +475,16 @@ def _add_studies(command: _Command) -> None:
         type=float,
         nargs='+',
         default=[10.0, 20.0],
-        help='of the pushes [N] (10 20)',
+        help='forces of the pushes [N] (10 20)',
     )
     option(
         '--out', type=Path, default=Path('contacts'), help='new folder for the figures'
     )
     option = command(
         'monte-carlo',
-        'Run a study of many random plants. Thousands of closed loops run in parallel, and the '
-        'report says how many kept the bound. Interrupted studies resume: start the same command '
-        'again.',
+        'Run a study of many random arms. Thousands of closed loops run in parallel, and the '
+        'report says how many kept the bound. To resume an interrupted study, start the same '
+        'command again.',
         '--config my_study.yaml --out study\n  blf_dsc monte-carlo --reproduce study 365',
     )
     option(
@@ -483,13 +496,11 @@ def _add_studies(command: _Command) -> None:
         type=_positive,
         help='number of processes (one per core of this computer)',
     )
-    scheduler = 'scheduler of a dask cluster that computes the runs, in place of these processes'
+    scheduler = 'compute the runs on the dask cluster of this scheduler instead'
     option('--dask', metavar='ADDRESS', help=scheduler)
-    reported = (
-        'put the studies of pairs in these folders side by side, into --out (changes)'
-    )
+    reported = 'compare the studies of pairs in these folders, into --out (changes)'
     option('--report', type=Path, nargs='+', metavar='DIR', help=reported)
-    again = 'compute one run of a study again, with a bag, into --out'
+    again = 'repeat one run of a study, with a bag, into --out'
     option('--reproduce', nargs=2, metavar=('DIR', 'RUN'), help=again)
     option('--out', type=Path, help='folder of the study (monte_carlo)')
 

@@ -76,9 +76,7 @@ class Reference:
     )
     offset: PerJoint = _of_reference((1.9935, 1.3961), 'centre of the motion', 'rad')
     amplitude: Annotated[tuple[float, ...], 'joints', 'reference.frequency'] = (
-        _of_reference(
-            (0.3, 0.3), 'amplitude of each tone: one row per joint, row by row', 'rad'
-        )
+        _of_reference((0.3, 0.3), 'amplitude of each tone, one row per joint', 'rad')
     )
     frequency: tuple[float, ...] = _of_reference(
         (1.0,), 'angular frequency of each tone', 'rad/s', at_least=0.0
@@ -90,12 +88,12 @@ class Reference:
         (), 'time of each waypoint from the start', 's', at_least=0.0, omittable=True
     )
     points: Annotated[tuple[float, ...], 'joints', 'reference.times'] = _of_reference(
-        (), 'position at each waypoint: one row per joint, row by row', 'rad'
+        (), 'position at each waypoint, one row per joint', 'rad'
     )
 
     stream_timeout: float = positive(
         0.25,
-        'time after which a target of a stream is its last: the reference brakes',
+        'time without a new target after which the reference of a stream brakes',
         's',
     )
 
@@ -120,7 +118,9 @@ class Approach:
     """
 
     enabled: bool = parameter(
-        True, 'guide an arm into the bound; false: do not start outside'
+        True,
+        'guide an arm that starts outside the bound into it; false: refuse '
+        'such a start',
     )
     longest: float = positive(30.0, 'longest duration of the approach', 's')
 
@@ -139,7 +139,8 @@ class MotionLimits:
     acceleration: PerJoint = positive((2.0, 2.0), 'largest acceleration', 'rad/s^2')
     jerk: PerJoint = positive(
         (),
-        'largest jerk of motions to streamed targets; empty: reaches the acceleration in 0.05 s',
+        'largest jerk of motions to streamed targets; empty: the acceleration is '
+        'reached in 0.05 s',
         'rad/s^3',
         omittable=True,
     )
@@ -190,7 +191,7 @@ class Safety:
     )
     saturation_time: float = positive(
         0.5,
-        'longest time of torques at their limit, less a quarter of the time without',
+        'longest time with a torque at its limit, less a quarter of the time below it',
         's',
     )
     overrun_fraction: float = positive(
@@ -253,7 +254,9 @@ class Barrier:
         0.0, 'bound on the error of robot.tip, from which `bound` follows; 0: none', 'm'
     )
     tool_angle_bound: float = _of_tool(
-        0.0, 'bound on the angle by which robot.tip is turned, likewise; 0: none', 'rad'
+        0.0,
+        'bound on the angle error of robot.tip, from which `bound` follows; 0: none',
+        'rad',
     )
     initial_bound: PerJoint = non_negative(
         (0.0, 0.0),
@@ -377,14 +380,16 @@ class Torque:
     """Saturation of the commanded torque."""
 
     limit: PerJoint = positive(
-        (20.0, 20.0), 'largest torque, as commanded and with what the drives add', 'N m'
+        (20.0, 20.0),
+        'largest torque, both as commanded and including what the drives add',
+        'N m',
     )
     rate_limit: PerJoint = non_negative(
-        (0.0, 0.0), 'largest rate of commands; 0: any', 'N m/s'
+        (0.0, 0.0), 'largest rate of commands; 0: no limit', 'N m/s'
     )
     first_step: PerJoint = non_negative(
         (0.0, 0.0),
-        'largest first torque, a step from none, that the drives tolerate; 0: any',
+        'largest first torque, a step from zero, that the drives tolerate; 0: no limit',
         'N m',
     )
 
@@ -547,7 +552,7 @@ class Learning:
         'let the disturbance estimate offset the torque that the prediction error adds',
     )
     change_detection: bool = _size(
-        True, 'discard a window that torques contradict: a changed arm'
+        True, 'discard a window that torques contradict, because the arm has changed'
     )
     residual_floor: PerJoint = positive(
         (0.07, 0.07),
@@ -558,23 +563,28 @@ class Learning:
         0.1, 'pull to the estimate before a change, until a new window is full'
     )
     weighing: bool = _size(
-        False, 'weigh what the tip of a URDF holds since the first window'
+        False,
+        'weigh what has been added to robot.tip since the first window (arm '
+        'from a URDF)',
     )
     tell_drive: bool = _size(
         False,
-        'tell drives that compensate gravity the load once it is weighed well',
+        'declare the weighed load to drives that compensate gravity, once it is '
+        'known well',
     )
     load_service: str = _size(
         '',
-        'over ROS: service of the driver that takes the load, a ur_msgs/srv/SetPayload or '
-        'franka_msgs/srv/SetLoad; empty: the drives are told nothing',
+        'over ROS: service of the driver that accepts the load, a '
+        'ur_msgs/srv/SetPayload or franka_msgs/srv/SetLoad; empty: no load is '
+        'declared',
     )
     load_frame: str = _size(
         '',
-        'over ROS: link in whose frame that service wants the centre; empty: robot.tip',
+        'over ROS: link in whose frame that service expects the centre; empty: '
+        'robot.tip',
     )
     load_in_motion: bool = parameter(
-        False, 'over ROS: whether the drives take a load while the arm moves'
+        False, 'over ROS: whether the drives accept a load while the arm moves'
     )
 
     def problems(self, sample_time: float, model: str, count: int) -> Iterator[str]:
@@ -597,28 +607,34 @@ class Learning:
 
 @dataclass(frozen=True)
 class Contact:
-    """Torque from outside that the learned model does not explain, and what follows from it."""
+    """External torque, which the learned model does not explain, and reactions to it."""
 
     enabled: bool = _size(
-        False, 'find the external torque with its interval, and contacts'
+        False, 'compute the external torque with its interval, and detect contacts'
     )
     bandwidth: float = _in_window(
-        30.0, 'pole of the external torque: faster is noisier', 'rad/s', 'L', above=0.0
+        30.0,
+        'pole of the filter of the external torque: a larger one is faster, '
+        'but noisier',
+        'rad/s',
+        'L',
+        above=0.0,
     )
     threshold: float = positive(
         8.0,
-        'distance of the external torque from what model, noise and a load explain, in standard '
-        'deviations, from which it is a contact',
+        'threshold of a contact: distance of the external torque from what model, '
+        'noise and a load explain, in standard deviations',
         symbol='h',
     )
     reaction: Literal['none', 'stop', 'hold', 'yield'] = parameter(
         'none',
-        'reaction to a contact: none, safe stop, hold where it can brake, or give way with gravity '
-        'and damping alone; with one, nothing is learned while a contact lasts',
+        'reaction to a contact: none, safe stop, brake and hold, or give way with '
+        'only gravity and damping; with a reaction, nothing is learned while a '
+        'contact lasts',
     )
     loads: bool = parameter(
         True,
-        'with learning.weighing: what a load in the tip explains is no contact',
+        'with learning.weighing: what a load at the tip could explain is not a contact',
     )
 
 

@@ -28,11 +28,13 @@ class DriveConfig:
         'franka', 'franka, or a Python file with a class DRIVER (drive/driver.py)'
     )
     collision_torque: tuple[float, ...] = _thresholds(
-        'external torque of each joint that stops the robot; empty: as the robot has it',
+        'external torque of each joint that stops the robot; empty: as configured in'
+        ' the robot',
         'N m',
     )
     collision_force: tuple[float, ...] = _thresholds(
-        'external force (3) and torque (3) at the hand that stop the robot; empty: likewise',
+        'external force (3) and torque (3) at the hand that stop the robot; empty: '
+        'as configured in the robot',
         'N, N m',
     )
     set_load: bool = _fixed(
@@ -47,7 +49,7 @@ class DriveConfig:
     )
     settle_time: float = positive(
         3.0,
-        'longest time for the arm to come to rest before its motion is ended',
+        'longest time to wait for the arm to come to rest at the end',
         's',
         read_only=_WHY,
     )

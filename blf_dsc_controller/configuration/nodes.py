@@ -85,7 +85,8 @@ class WatchdogConfig:
 
     timeout: float = _of_watchdog(
         0.05,
-        'silence of the controller, while joint states go on, until it commands',
+        'time without a command, while joint states continue, until the watchdog '
+        'commands',
         's',
         at_least=0.005,
         at_most=10.0,

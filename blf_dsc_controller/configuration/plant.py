@@ -160,7 +160,7 @@ class PlantDisturbance:
         0.0, 'breakaway in excess of Coulomb friction, relative to it'
     )
     stribeck_velocity: float = positive(
-        0.1, 'velocity scale at which this excess fades', 'rad/s'
+        0.1, 'velocity scale over which this excess fades', 'rad/s'
     )
 
 
@@ -172,7 +172,7 @@ class Sensor:
         0.0, 'rms of the white noise on measured positions', 'rad'
     )
     velocity_noise: float = _magnitude(
-        0.0, 'rms of the white noise on velocities', 'rad/s'
+        0.0, 'rms of the white noise on measured velocities', 'rad/s'
     )
     resolution: float = _magnitude(0.0, 'resolution of the encoders; 0: ideal', 'rad')
     velocity: Literal['measured', 'differenced'] = _fixed(
@@ -184,16 +184,18 @@ class Sensor:
     )
     offset: PerJoint = parameter((0.0, 0.0), 'measured minus true position', 'rad')
     repeat_every: int = _magnitude(
-        0, 'samples until a reading repeats, newly stamped; 0: never'
+        0, 'after so many samples, a reading is sent again with a new stamp; 0: never'
     )
     published_joints: tuple[str, ...] = _fixed(
         (),
-        'names in joint states, in order; others stay at 0; empty: `joints`',
+        'names in the joint states, in this order; those not in `joints` stay at 0; '
+        'empty: `joints`',
         omittable=True,
     )
     incomplete_states: int = _magnitude(
         0,
-        'joint states with velocities and efforts of NaN before the first one',
+        'number of joint states without velocities and efforts (NaN) before the '
+        'first complete one',
         at_most=100,
     )
 
@@ -219,13 +221,13 @@ class Actuator:
         20.0, 'periods of the ripple per turn, or per metre', above=0.0
     )
     command_timeout: float = positive(
-        0.05, 'largest age of an applied torque, in real time', 's'
+        0.05, 'age after which a torque is no longer applied, in real time', 's'
     )
     without_command: Literal['zero', 'hold'] = parameter(
         'zero', 'without a command: zero torque, or the last command'
     )
     rate_limit: float = _magnitude(
-        0.0, 'rate to which the driver limits commands; 0: any', 'N m/s'
+        0.0, 'rate to which the driver limits commands; 0: no limit', 'N m/s'
     )
     reflex_rate: float = _magnitude(
         0.0,

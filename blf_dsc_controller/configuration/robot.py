@@ -75,17 +75,20 @@ class Robot:
     )
     gravity: Vector = _fixed(
         (0.0, 0.0, -9.81),
-        'gravity in the base frame, by default of an MJCF its own; (0, 0, 9.81): ceiling mount',
+        'gravity in the base frame (default for an MJCF: its own); (0, 0, 9.81): '
+        'ceiling mount',
         'm/s^2',
         'g',
     )
     lag: float = _magnitude(
-        0.005, 'delay of velocities and torques besides the sampling', 's'
+        0.005,
+        'delay of velocities and torques in addition to that of the sampling',
+        's',
     )
     payload: float = _magnitude(3.0, 'rated payload', 'kg')
     rotor_inertia: PerJoint = _omitted(
-        'inertia of each drive at its joint; empty: the armature of an MJCF, else by its effort, '
-        'then as measured',
+        'inertia of each drive at its joint; empty: the armature of an MJCF, '
+        'otherwise a guess from the effort, which is corrected in operation',
         'kg m^2',
     )
     drive_compensates: Literal['none', 'gravity', 'gravity_and_friction'] = _fixed(
@@ -99,15 +102,19 @@ class Robot:
     )
     effort: Literal['unknown', 'whole', 'commanded', 'current'] = _fixed(
         'unknown',
-        'what `effort` in joint states is: torques, whole or without what the drives add, or only '
-        'proportional to the whole, as currents are',
+        'what `effort` in joint states is: the whole torque, only the commanded part'
+        ' without what the drives add, or a current, proportional to the whole '
+        'torque',
     )
     viscous: PerJoint = _omitted(
-        'initial viscous friction; empty: that of the URDF, or 0 if compensated',
+        'initial viscous friction; empty: that of the URDF, or 0 if the drives '
+        'compensate it',
         'N m s/rad',
     )
     coulomb: PerJoint = _omitted(
-        'initial Coulomb friction; empty: that of the URDF, or 0 if compensated', 'N m'
+        'initial Coulomb friction; empty: that of the URDF, or 0 if the drives '
+        'compensate it',
+        'N m',
     )
 
     def problems(self) -> Iterator[str]:
@@ -350,7 +357,8 @@ class ArmConfig:
     )
     wait_for_subscribers: int = non_negative(
         0,
-        'recorders (nodes with `record` in their names) of each topic to wait for at first',
+        'number of recorders (nodes with `record` in their names) to wait for on '
+        'each topic',
         read_only='topics are created once, when the node starts',
     )
     autostart: bool = parameter(

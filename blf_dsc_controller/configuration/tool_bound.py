@@ -168,13 +168,13 @@ def problems(config: ControllerConfig) -> Iterator[str]:
         yield f'{name}: got {len(config.joints)} joints, but at most {MOST_JOINTS} are allowed'
         return
     if config.law in _BARRIERLESS:
-        yield f'{name}: the law {config.law} keeps no bound: choose blf_dsc, or drop it'
+        yield f'{name}: the law {config.law} keeps no bound: choose blf_dsc, or remove {name}'
     least = min(barrier.bound)
     if least < _FINEST:
         joint = config.joints[barrier.bound.index(least)]
         yield (
-            f'{name}: it leaves {joint} {least:.2g} rad, finer than any encoder: give '
-            f'{_FINEST / max(least, 1e-300):.2g} times as much or more'
+            f'{name}: the joint bound of {joint} would be {least:.2g} rad, finer than any '
+            f'encoder: give at least {_FINEST / max(least, 1e-300):.2g} times this bound'
         )
     kept = certified(config)
     for name, unit, bound, tool in (

@@ -175,11 +175,11 @@ def _contact(guard: Guard) -> Part:
         values |= {
             'last contact': f'at {(last.stamp - guard.start_stamp) * 1e-9:.3f} s',
             'joint': last.joint,
-            'torque from outside': f'{last.torque:+.3g} N m',
-            'explained by model and noise': f'{last.interval:.3g} N m',
+            'external torque': f'{last.torque:+.3g} N m',
+            'model error and noise': f'{last.interval:.3g} N m',
         }
     if not guard.supervisor.running:
-        return 'contact', OK, 'not looked for: the law is not in command', values
+        return 'contact', OK, 'not monitored: the law is not in command', values
     if last is not None and guard.controller.state.contact[0] > 0.0:
         return 'contact', WARN, last.text, values
     return 'contact', OK, 'nothing touches the arm', values
@@ -201,5 +201,5 @@ def chatter_of(guard: Guard) -> str:
     return (
         f'the torque of {guard.config.joints[worst]} changes by {steps[worst]:.2g} N m rms each '
         'sample: its measured velocity is coarse or noisy. Lower the pole of the velocity filter '
-        'and add its lag to robot.lag, whose gains are softer'
+        'and add its lag to robot.lag, which makes the gains softer'
     )

@@ -110,8 +110,8 @@ class Driver(ABC):
             DriverError: it refuses, or cannot be told.
         """
         raise DriverError(
-            f'this robot cannot be told a load of {load.mass:.2f} kg: set learning.tell_drive to '
-            'false'
+            f'the driver of this robot cannot declare a load of {load.mass:.2f} kg: set '
+            'learning.tell_drive to false'
         )
 
     def load_in_force(self) -> float | None:

@@ -127,13 +127,13 @@ class FrankaDriver(Driver):
         known = self.controller.robot.drive_payload
         if self.config.set_load and abs(state.m_ee) > _SAME_MASS:
             yield (
-                f'note: the robot adds the weight of an end effector of {state.m_ee:.2f} kg (of '
-                'Desk): the URDF should have it, too; what is missing there is learned'
+                f'note: the robot compensates an end effector of {state.m_ee:.2f} kg, which is '
+                'configured in Desk. The URDF should contain it, too; a difference is learned'
             )
         elif not self.config.set_load and abs(state.m_total - known) > _SAME_MASS:
             yield (
-                f'note: the robot adds the weight of {state.m_total:.2f} kg at its flange, but '
-                f'robot.drive_payload is {known:g} kg: what the URDF lacks of it should be there'
+                f'note: the robot compensates {state.m_total:.2f} kg at its flange, but '
+                f'robot.drive_payload is {known:g} kg: give there what the URDF lacks of this mass'
             )
 
     def positions(self) -> Vector:

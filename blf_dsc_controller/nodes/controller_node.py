@@ -104,8 +104,9 @@ class ControllerNode(LoopNode[ControllerConfig]):
             self._load_service.begin()
         elif learning.tell_drive:
             self.get_logger().warning(
-                'learning.tell_drive: the drives are told nothing without learning.load_service: '
-                "give the driver's service, or set robot.drive_payload and the load of the driver"
+                'learning.tell_drive: without learning.load_service no load is declared to the '
+                "drives: give the driver's service, or set robot.drive_payload and the load of "
+                'the driver'
             )
         outputs = [topics.COMMANDS]
         if self.config.telemetry.enabled:

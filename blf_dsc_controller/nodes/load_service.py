@@ -61,7 +61,9 @@ class LoadService:
         package, _, name = types[0].partition('/srv/')
         if types[0] not in _FILLS:
             known = ' and '.join(_FILLS)
-            self._give_up(f'{self._name} is a {types[0]}, but {known} can be called')
+            self._give_up(
+                f'{self._name} is a {types[0]}, but only {known} can be called'
+            )
             return
         try:
             service = getattr(importlib.import_module(f'{package}.srv'), name)
@@ -78,9 +80,9 @@ class LoadService:
         """Begin with a new law, which knows of no load that the drives were told before."""
         if self.told is not None and not self.problem:
             self._give_up(
-                f'the drives still have the load of {self.told.mass:.2f} kg that they were told '
-                'before the node was configured again: set it back to robot.drive_payload, and '
-                'start the node anew'
+                f'a load of {self.told.mass:.2f} kg is still declared to the drives, from before '
+                'the node was configured again: set it back to robot.drive_payload, and restart '
+                'the node'
             )
 
     def follow(self, guard: Guard, config: ControllerConfig) -> None:
@@ -128,7 +130,7 @@ class LoadService:
     def _give_up(self, problem: str) -> None:
         self.problem = problem
         self._node.get_logger().warning(
-            f'learning.tell_drive: {problem}; the drives are told nothing more'
+            f'learning.tell_drive: {problem}; no more loads are declared to the drives'
         )
 
 

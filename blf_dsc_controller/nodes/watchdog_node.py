@@ -144,7 +144,9 @@ class WatchdogNode(PlainNode):
         is_orderly = is_end and (is_zero or event.content.get('resting', True))
         if event.type is EventType.WITHDRAW or is_orderly:
             watchdog.stand_down()
-            self.get_logger().info(f'{self._controller} is silent on purpose')
+            self.get_logger().info(
+                f'{self._controller} has stopped commanding on purpose'
+            )
 
     def _report_problem(self, problem: str) -> None:
         if problem != self.problem:

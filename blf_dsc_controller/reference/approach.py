@@ -236,9 +236,9 @@ def check_takeover(
         if not abs(difference) < limit:
             raise StartError(
                 f'joint {joint!r} starts {difference:+.6g} rad/s from the velocity of the '
-                f'reference; at limits.acceleration {limit:.6g} rad/s can be made up within its '
-                'bound: start with the velocity of the reference, or enable the approach '
-                '(approach.enabled)'
+                f'reference, but within its bound and limits.acceleration it can make up only '
+                f'{limit:.6g} rad/s: start with the velocity of the reference, or enable the '
+                'approach (approach.enabled)'
             )
 
 

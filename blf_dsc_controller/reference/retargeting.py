@@ -198,9 +198,15 @@ def profile(
     # it fails by an exception, by one of its own numbers that it has no name for, ...
     except (ruckig.RuckigError, ValueError) as error:
         reason = str(error).strip().partition('\n')[0]
-        raise MotionError(f'no motion from {state.tolist()} found: {reason}') from error
+        raise MotionError(
+            f'ruckig found no motion from position, velocity and acceleration '
+            f'{state.tolist()}: {reason}'
+        ) from error
     if result not in (ruckig.Result.Working, ruckig.Result.Finished):  # ... or so
-        raise MotionError(f'no motion from {state.tolist()} found: {result.name}')
+        raise MotionError(
+            f'ruckig found no motion from position, velocity and acceleration '
+            f'{state.tolist()}: {result.name}'
+        )
     return _pieces_of(found, state)
 
 

@@ -65,7 +65,7 @@ def _of_stop(config: ControllerConfig) -> Iterator[str]:
             f'only {share:g} times past a joint bound' if share else 'at no joint bound'
         )
         yield (
-            f'safety.error_ratio: the arm stops {stop}, and up to there the tool may leave its '
+            f'safety.error_ratio: the arm stops {stop}; before that, the tool may leave its '
             'bound: give 1'
         )
 
@@ -111,17 +111,17 @@ def _of_urdf(config: ControllerConfig, load: ReferenceLoad) -> Iterator[str]:
     if (joints := robot.placeholder_efforts(chain)) and not robot.rotor_inertia:
         largest = max(joint.effort for joint in chain.joints)
         yield (
-            f'torque.limit: an effort of up to {largest:g} N m for {", ".join(joints)} limits '
-            'nothing on an arm of this weight, from which the inertia of the drives and '
-            'learning.residual_floor follow instead: give the rated torques'
+            f'torque.limit: an effort of up to {largest:g} N m for {", ".join(joints)} looks like '
+            'a placeholder on an arm of this weight. The assumed inertia of the drives and '
+            'learning.residual_floor follow from the weight instead: give the rated torques'
         )
     if (joints := implausible_friction(chain)) and not (
         robot.viscous and robot.coulomb
     ):
         yield (
-            f'robot.coulomb: the friction in <dynamics> takes a quarter of the effort of '
-            f'{", ".join(joints)} or more, hardly real, and is not compensated before it is '
-            'learned: give robot.viscous and robot.coulomb'
+            'robot.coulomb: the friction in <dynamics> takes a quarter of the effort of '
+            f'{", ".join(joints)} or more, which looks like a placeholder. Friction is not '
+            'compensated until it is learned: give robot.viscous and robot.coulomb'
         )
     for joint, limit, inertia in zip(
         chain.joints, config.torque.limit, load.free_inertia, strict=True
@@ -129,7 +129,7 @@ def _of_urdf(config: ControllerConfig, load: ReferenceLoad) -> Iterator[str]:
         if math.isinf(joint.effort) and limit == UNKNOWN_EFFORT:
             yield (
                 f'torque.limit: {joint.name} has no effort in the URDF: {limit:g} N m is assumed; '
-                'set what its drive can withstand'
+                'give the rated torque of its drive'
             )
         if limit / inertia < _SLUGGISH:
             yield (
@@ -153,12 +153,12 @@ def _of_errors(config: ControllerConfig, settings: Settings) -> Iterator[str]:
         if of_tool:
             wider = float(errors.unmodelled[worst] / bound[worst])
             least = (
-                f'past the {bound[worst]:g} rad that the bound leaves it; give more than '
-                f'{wider:.2g} times that bound'
+                f'past its joint bound of {bound[worst]:g} rad; give more than {wider:.2g} times '
+                'this bound at the tool'
             )
         yield (
             f'{of_tool or "barrier.bound"}: friction and unmodelled torque '
-            f'(learning.residual_floor) alone push {config.joints[worst]} about '
+            f'(learning.residual_floor) alone are expected to move {config.joints[worst]} '
             f'{errors.unmodelled[worst]:.2g} rad from its reference: {least}'
         )
     worst = int(np.argmax(errors.pick_up / bound))
@@ -166,20 +166,20 @@ def _of_errors(config: ControllerConfig, settings: Settings) -> Iterator[str]:
     if peak > bound[worst]:
         share = bound[worst] / peak
         faster = loop_delay(T, robot.lag) * math.sqrt(share) - robot.lag
-        remedy = f'a lower robot.lag than {robot.lag:g} s'
+        remedy = f'a robot.lag below {robot.lag:g} s'
         stiffer = config.feedback.stiffness / share**_STIFFENING
         if stiffer <= 1.0:
             remedy = f'a feedback.stiffness of {math.ceil(100.0 * stiffer) / 100.0:g}'
         elif faster > 0.0:
             remedy = f'a sample time of {faster / SAMPLES:.2g} s'
-        holding = f'a bound of {1.1 * peak:.2g} rad'
+        holding = f'{1.1 * peak:.2g} rad'
         if of_tool:
-            holding = f'{1.1 / share:.2g} times that bound at the tool'
+            holding = f'{1.1 / share:.2g} times this bound at the tool'
         yield (
             f'{of_tool or "barrier.bound"}: when {robot.payload:g} kg (robot.payload) are picked '
             f'up in motion, {config.joints[worst]} is expected to be {peak:.2g} rad from its '
-            f'reference, past its bound of {bound[worst]:g} rad: {holding} would hold, or '
-            f'{share * robot.payload:.2g} kg, or {remedy}'
+            f'reference, past its bound of {bound[worst]:g} rad: give {holding}, or '
+            f'{remedy}, or pick up at most {share * robot.payload:.2g} kg'
         )
 
 
@@ -198,10 +198,10 @@ def _of_first_error(
     if errors[worst] > widest[worst]:
         needed = _FIRST_ERROR * errors[worst]
         yield (
-            'barrier.bound: until the arm is learned, these gains may leave '
-            f'{config.joints[worst]} {errors[worst]:.2g} rad from its reference, past its '
-            f'bound of {widest[worst]:g} rad: give {needed:.2g} rad or more, a '
-            'barrier.initial_bound of that, or, at a shorter sample_time, larger gains'
+            f'barrier.bound: until the arm is learned, {config.joints[worst]} may be '
+            f'{errors[worst]:.2g} rad from its reference with these gains, past its bound of '
+            f'{widest[worst]:g} rad: give {needed:.2g} rad or more, or a barrier.initial_bound '
+            'of that, or larger gains at a shorter sample_time'
         )
 
 
@@ -224,22 +224,22 @@ def _limits_of_gains(
             f'torque.limit: {joint}',
             _MARGIN * need / limit,
             f'has {limit:g} N m, but with learning.initial_estimate the reference alone needs '
-            f'{need:.3g} N m: give that and a quarter more',
+            f'{need:.3g} N m: give a quarter more than that',
         )
     rate = load.rate(settings)
     yield Finding(
         'feedback.gain: K_p over the inertia',
         rate * T,
         f'is {rate:.3g} 1/s with learning.initial_estimate, {rate * T:.2g} times the inverse of '
-        'sample_time: above 1 the loop has little margin for delays, and above 2 it chatters '
-        'between the limits: lower either',
+        'sample_time. Above 1 the loop has little margin for delays, above 2 it chatters between '
+        'the limits: lower feedback.gain or sample_time',
     )
     absorbed = float(np.max(settings.gamma * T / damping))
     yield Finding(
         'disturbance.gain: in each sample the disturbance estimate absorbs',
         2.0 * absorbed,
-        f'{absorbed:.2g} of the velocity feedback, and above a half it oscillates against '
-        'feedback.gain: lower it',
+        f'{absorbed:.2g} of the velocity feedback. Above a half it oscillates against '
+        'feedback.gain: lower disturbance.gain',
     )
     if settings.has_barrier == 0:
         return
@@ -263,7 +263,7 @@ def _limits_of_gains(
         yield Finding(
             f'barrier.slope_limit: past the knee of its barrier {joint} is corrected by',
             ratio / 2.0,
-            f'{ratio:.2g} times its error in a sample, and above 2 the error grows: give less than '
+            f'{ratio:.2g} times its error in a sample. Above 2 the error grows: give less than '
             '2 feedback.gain / sample_time',
         )
 
@@ -281,8 +281,8 @@ def _of_learning(
     step = settings.kappa * rate * config.sample_time
     if step > 1.0:
         yield (
-            f'learning.weight: {what} is {step:.2g}; above 1 the estimate overshoots, above 2 it '
-            'diverges: lower it, or learning.adaptation_gain'
+            f'learning.weight: {what} is {step:.2g}. Above 1 the estimate overshoots, above 2 it '
+            'diverges: lower learning.weight or learning.adaptation_gain'
         )
     if config.reference.type == 'sinusoids':
         for frequency in config.reference.frequency:
@@ -290,6 +290,6 @@ def _of_learning(
             if frequency > 0.0 and abs(periods - round(periods)) > _PERIODS:
                 yield (
                     f'learning.window: {learning.window:g} s are {periods:.3g} periods of the '
-                    f"reference's {frequency:g} rad/s: give whole ones, over which a disturbance "
-                    'of that period averages out'
+                    f"reference's {frequency:g} rad/s: give a whole number of periods, over which "
+                    'a disturbance of that frequency averages out'
                 )

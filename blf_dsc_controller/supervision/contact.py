@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A contact as events, logs, stops and diagnostics have it."""
+"""Describe a contact for events, logs, stops and diagnostics."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ def contact_of(controller: Controller, config: ControllerConfig, stamp: int) -> 
     torque = float(sample.external[worst])
     interval = float(sample.external_interval[worst])
     text = (
-        f'something touches the arm: {torque:+.3g} N m from outside on joint '
-        f'{joint!r}, where model and noise explain {interval:.3g} N m '
+        f'something touches the arm: the external torque is {torque:+.3g} N m on joint '
+        f'{joint!r}, and model error and noise explain at most {interval:.3g} N m '
         f'(distance {sample.contact[DISTANCE]:.3g}, threshold {config.contact.threshold:g})'
     )
     return Contact(stamp, joint, torque, interval, text)

@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The first torque, checked before it is sent to an arm that nobody has commanded yet.
+"""Check the first torque before it is sent to an arm that nobody has commanded yet.
 
-Whether drives compensate gravity cannot be told from positions, but from the effort with which they
-hold a resting arm: gravity if they do, nothing if the brakes hold it.  Only its direction and order
-of magnitude are used, so it may also be a current.  An effort of nothing shows nothing if it may
-not be measured, or not contain what the drives add: then a live arm gets no torque of gravity
-without being told that its drives tolerate it (`support`).
+The effort of a resting arm shows whether its drives compensate gravity: it equals gravity if they
+do, and is zero if the brakes hold the arm.  Only its direction and order of magnitude are used, so
+it may also be a current.  A zero effort is inconclusive if it may not be measured, or may not
+contain what the drives add.  Then no torque of gravity is sent unless the configuration says that
+the drives tolerate it (`support`).
 """
 
 from __future__ import annotations
@@ -63,7 +63,7 @@ def check_first_torque(
     )
     if is_like(torque, gravity):
         text += (
-            ': it is the gravity of the URDF; if the drives compensate it themselves, set '
+            ': this is the gravity of the URDF. If the drives compensate it themselves, set '
             'robot.drive_compensates to gravity, or to gravity_and_friction'
         )
     raise StartError(text)
@@ -99,27 +99,28 @@ def _check_gravity(
             return
         raise StartError(
             f'gravity twice: the first torque would be {torque[worst]:.4g} N m on joint {joint!r}, '
-            f'but it rests with an effort of {effort[worst]:.4g} N m before any command: '
-            'the drives compensate gravity (set robot.drive_compensates to gravity), or a torque '
-            'of another or an earlier controller holds the arm (set robot.effort to commanded if '
-            f'the effort never contains anything else, or {_SEND})'
+            f'but the joint already rests with an effort of {effort[worst]:.4g} N m, before any '
+            'command. If the drives compensate gravity, set robot.drive_compensates to gravity. '
+            'If a torque of another or an earlier controller holds the arm, set robot.effort to '
+            f'commanded (if efforts contain only commands), or {_SEND}'
         )
     no_gravity = f'no gravity: robot.drive_compensates is {compensates}, but joint {joint!r} rests'
     if is_commanded and holds:
         raise StartError(
-            f'{no_gravity} with a commanded effort of {effort[worst]:.4g} N m where none should be '
-            'needed: set it to none, or robot.effort to whole if the effort contains what the '
-            f'drives add, or, if a torque of another controller holds the arm, {_SEND}'
+            f'{no_gravity} with a commanded effort of {effort[worst]:.4g} N m, where none should '
+            'be needed. If the drives compensate nothing, set robot.drive_compensates to none. If '
+            'the effort contains what the drives add, set robot.effort to whole. If a torque of '
+            f'another controller holds the arm, set {_SEND}'
         )
     if not is_commanded and np.linalg.norm(effort) <= _NOTICED * np.linalg.norm(
         gravity
     ):
         raise StartError(
             f'{no_gravity} with an effort of {effort[worst]:.4g} N m where the drives should hold '
-            f'{gravity[worst]:.4g} N m: the first torque, {torque[worst]:.4g} N m, would drop the '
-            'arm. Release the brakes if they hold it, or set robot.drive_compensates to none, or '
-            f'robot.effort to commanded if the effort does not contain what the drives add, or '
-            f'{_SEND}'
+            f'{gravity[worst]:.4g} N m. The first torque, {torque[worst]:.4g} N m, would drop the '
+            'arm. If the brakes hold it, release them. If the drives compensate nothing, set '
+            'robot.drive_compensates to none. If the effort does not contain what the drives add, '
+            f'set robot.effort to commanded, or {_SEND}'
         )
 
 

@@ -271,7 +271,8 @@ class Guard:
         """Command less by the weight of a load that the drives add from the next state on."""
         if self._drive_loads is None:
             raise BlfDscError(
-                'learning.tell_drive: got false, but a load is told to the drives: set it to true'
+                'learning.tell_drive: got false, but a load is declared to the drives: set it to '
+                'true'
             )
         self._note(EventType.DRIVE_LOAD, mass=load.mass, centre=list(load.centre))
         self._drive_loads.take(self.controller, load)
@@ -298,7 +299,7 @@ class Guard:
             before = self.controller.reference_vector
             self._follow(plan_stop(before, self.time, self.config).vector)
             self.holds = True
-            self.supervisor.add(f'{text}: it holds where it can brake')
+            self.supervisor.add(f'{text}: the reference brakes, and the arm holds')
         elif reaction != 'none':
             self._stop(Reason.CONTACT, text)
             if reaction == 'yield':
@@ -551,7 +552,7 @@ class Guard:
         self.supervisor.add(
             f'the torque of joint {self.config.joints[worst]!r} has changed by '
             f'{change[worst]:+.4g} N m since, but the arm has not accelerated: release the brakes, '
-            'activate the effort controller, or free it from what holds it'
+            'activate the effort controller, or free the arm'
         )
 
     def activate(self) -> None:
@@ -621,7 +622,7 @@ class Guard:
         if self.holds:
             remedy = 'send a trajectory that leads away from it, or call reset'
             why = self.contact.text if self.contact else ''
-            raise TrajectoryError([f'{why}, and it holds: {remedy}'])
+            raise TrajectoryError([f'{why}, and the arm holds: {remedy}'])
         self._note(EventType.TARGET, **planned.content)
         self._follow(planned.motion.vector)
 

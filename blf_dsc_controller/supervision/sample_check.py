@@ -225,9 +225,9 @@ class SampleCheck:
                 'effort controller'
             )
         return (
-            f'; its drive seems to have {assumed + error:.2g} kg m^2 instead of the {assumed:.2g} '
-            f'assumed, too little for these gains to hold: give robot.rotor_inertia, or a wider '
-            f'bound'
+            f'; its drive seems to have {assumed + error:.2g} kg m^2 instead of the assumed '
+            f'{assumed:.2g}, too little for these gains: give robot.rotor_inertia, or a wider '
+            'bound'
         )
 
     def _saturated(self, dt: float) -> Fault | None:
@@ -245,6 +245,6 @@ class SampleCheck:
         text = (
             f'joint {self._joints[worst]!r} needs {needed[worst]:.4g} N m and has been at '
             f'its limit of {limit[worst]:g} N m for {self.saturated_time:.4g} s (less a quarter '
-            'of the time in between)'
+            'of the time below it)'
         )
         return Fault(Reason.SATURATED, text)

@@ -145,8 +145,8 @@ class StateCheck:
             return None
         text = (
             f'the stamp of a joint state is {gap:.4g} s after the last one, but the arm has moved '
-            f'as in {max(0.0, moved_for):.2g} s: the clock was set; let it be slewed instead '
-            '(chrony: no makestep after the start)'
+            f'as far as in {max(0.0, moved_for):.2g} s, so the clock was set: let it be slewed '
+            'instead (chrony: no makestep after the start)'
         )
         return Fault(Reason.STAMP_JUMP, text)
 

@@ -35,9 +35,10 @@ def check_support(
     is_held = np.isfinite(effort).all() and is_like(effort, gravity)
     if matters and not is_held and not np.abs(dq).max() > AT_REST:
         raise StartError(
-            f'what holds the arm? It rests, its gravity is {gravity[worst]:.4g} N m on joint '
-            f'{config.joints[worst]!r}, and its effort of {effort[worst]:.4g} N m does not show '
-            'whether brakes hold it or drives that compensate gravity. Set robot.drive_compensates '
-            'if they do; if not, set robot.effort to whole if the drives measure torques, or '
-            'torque.first_step to the torques that may be sent at once'
+            'what holds the arm? The arm rests, but the joint states do not show whether its '
+            'brakes hold it, or drives that compensate gravity: on joint '
+            f'{config.joints[worst]!r} gravity is {gravity[worst]:.4g} N m, and the effort is '
+            f'{effort[worst]:.4g} N m. If the drives compensate gravity, set '
+            'robot.drive_compensates. If not, set robot.effort to whole, if the drives measure '
+            'torques, or set torque.first_step to the torques that may be sent at once'
         )

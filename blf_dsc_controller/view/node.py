@@ -103,7 +103,7 @@ class ViewNode(PlainNode):
         self._noted = -1.0  # s, time up to which the plant's events are on the page
         self._state = (
             'STALE',
-            f'waiting for {self.resolve_topic_name(topics.JOURNAL.relative)}',
+            f'waiting for a controller ({self.resolve_topic_name(topics.JOURNAL.relative)})',
         )
         self._start = self._sampled = -1  # ns, stamps of start and last tracking error
         self._pictures = self._silent = 0
@@ -169,7 +169,7 @@ class ViewNode(PlainNode):
         if self._config is None or self._silent < _SILENCE:
             return self._state
         if self._finished:
-            return 'OK', 'finished: the controller has ended as it should'
+            return 'OK', 'finished: the controller has ended normally'
         for topic, node in (
             (topics.TRACKING_ERROR, 'controller'),
             (topics.JOINT_STATES, 'arm'),

@@ -175,7 +175,7 @@ class Page:
                 ),
                 self._plot(f'{prefix}: torque [N m]', names),
                 *(
-                    [self._plot(f'{prefix}: torque from outside [N m]', names)]
+                    [self._plot(f'{prefix}: external torque [N m]', names)]
                     if self._feels
                     else []
                 ),
@@ -183,7 +183,9 @@ class Page:
                     'torque error of the model [%]', ('learned', 'initial'), _FROM_ZERO
                 ),
                 self._plot(
-                    'held in the tip [kg]', ('weight', 'from', 'to'), _FROM_ZERO
+                    'load at the tip, 95 % interval [kg]',
+                    ('weight', 'from', 'to'),
+                    _FROM_ZERO,
                 ),
             ]
             self._caption = gui.add_html('')
@@ -418,8 +420,11 @@ def with_marks(t: Floats, curves: Floats, marks: Sequence[float]) -> tuple[Float
 
 
 def contact_text(joint: str, torque: float, interval: float) -> str:
-    """Return what a joint shows of a contact: torque from outside, and what explains it."""
-    return f'{torque:+.3g} N m from outside on {joint}, +-{interval:.2g} N m explained'
+    """Return the external torque of a contact, and how much of it is no contact."""
+    return (
+        f'external torque on {joint}: {torque:+.3g} N m, of which model error and noise '
+        f'explain at most {interval:.2g} N m'
+    )
 
 
 def contact_of(joints: Sequence[str], now: Snapshot) -> str:
