@@ -130,7 +130,7 @@ class Run:
         return None if values is None else values[:, i]
 
     def known(self, name: str, i: int) -> Floats:
-        """Return the values of one joint (N,) in an array by name, NaN where unknown."""
+        """Return the values (N,) of one joint by name, NaN where unknown."""
         found = self.column(name, i)
         return np.full(self.stamp.size, np.nan) if found is None else found
 

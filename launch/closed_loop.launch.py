@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Start the controller with its watchdog, the simulated arm, and, with `bag`, the recorder.
+"""Start the controller, its watchdog, the simulated arm, and the recorder.
 
 For instance: ros2 launch blf_dsc_controller closed_loop.launch.py config:=noisy
 bag:=run1 and for the driver of an arm: ros2 launch blf_dsc_controller

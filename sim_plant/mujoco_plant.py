@@ -65,7 +65,7 @@ class MujocoPlant(Plant):
         self.data.qvel[:] = self._dq
 
     def step(self, torque: np.ndarray) -> None:
-        """Apply the commanded torque (n,) [N m], with the loads that act at its start."""
+        """Apply the commanded torque (n,) [N m] and the loads at its start."""
         settings = self._settings
         now = self._now
         data = self.data

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The simulated plant of a configuration: its arm, its vectors and its random generator.
+"""The simulated plant: its arm, its vectors and its random generator.
 
 `TorqueInput` and `Latency` follow the torques that its node receives.  They are the
 counterpart of the controller's checks of joint states: a motor that applies an outdated
@@ -104,7 +104,7 @@ class Plant:
         return self.sample * self.period_ns
 
     def measure(self) -> np.ndarray:
-        """Return [q, dq, effort] (3n,) of this sample: a view, overwritten by the next call."""
+        """Return [q, dq, effort] (3n,) of this sample, overwritten by the next call."""
         observe_plant(self.arm, self.settings, self.state, self.rng, self._measurement)
         return self._measurement
 
@@ -139,7 +139,7 @@ class Plant:
         self.reset()
 
     def save(self) -> tuple[np.ndarray, Mapping[str, Any]]:
-        """Return a copy of everything that changes: the state and that of the generator."""
+        """Return a copy of everything that changes, with the generator's state."""
         return self.state.copy(), self.rng.bit_generator.state
 
     def restore(self, saved: tuple[np.ndarray, Mapping[str, Any]]) -> None:
@@ -148,7 +148,7 @@ class Plant:
 
 
 class TorqueInput:
-    """The last valid `torque` (n,) [N m] of the n joints, and counts of rejected commands.
+    """The last valid `torque` (n,) [N m], and counts of rejected commands.
 
     `problem` describes the last rejected command; `stale_steps` counts the steps for
     which the torque was too old.
@@ -177,7 +177,7 @@ class TorqueInput:
         return False
 
     def is_stale(self, sample: int, limit: int) -> bool:
-        """Return whether the torque is older than `limit` samples at `sample`, and count it."""
+        """Return whether the torque is older than `limit` samples, and count it."""
         stale = sample - self._taken_at > limit
         self.stale_steps += stale
         return stale
@@ -188,7 +188,7 @@ class TorqueInput:
 
 
 class Latency:
-    """Time from a published state to the torque that follows it, and the number of late steps.
+    """Time from a published state to its torque, and the number of late steps.
 
     A torque does not identify its state. It is matched with the oldest state that has
     had no torque yet, so that a late torque counts with its full delay. Times are in s;
@@ -305,7 +305,7 @@ def plant_settings(config: PlantConfig) -> PlantSettings:
 
 
 def _steps_of(config: PlantConfig, arm: Arm) -> int:
-    """Return how many steps of the integrator a sample needs to resolve friction near rest.
+    """Return the integrator's steps per sample that friction near rest needs.
 
     There it damps a joint at its slope over the inertia, at the initial position.
     """
@@ -407,7 +407,7 @@ def drive_bodies(config: PlantConfig) -> np.ndarray:
 
 
 def true_inertias(chain: Chain, truth: Deviation) -> np.ndarray:
-    """Return the inertias (n, 10) of the URDF with each mass distribution scaled and shifted."""
+    """Return the URDF's inertias (n, 10) with masses scaled and shifted."""
     placement = np.eye(4)
     inertias = np.empty((len(chain.joints), 10))
     for i, (factor, shift) in enumerate(

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""When something happened in a run: learning began, the arm changed, a bound was left."""
+"""Times of events in a run: learning began, the arm changed, a bound was left."""
 
 from __future__ import annotations
 

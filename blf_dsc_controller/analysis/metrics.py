@@ -189,7 +189,7 @@ def _loads(run: Run) -> list[dict[str, float]]:
 
 
 def _tool(run: Run) -> dict[str, float] | None:
-    """Return the largest error and angle at the tool, each with the bound that it had."""
+    """Return the largest error and angle at the tool, each with its bound then."""
     values = tool_errors(run)
     if values is None or not np.isfinite(values[:, 0]).any():
         return None

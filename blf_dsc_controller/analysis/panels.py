@@ -222,7 +222,7 @@ def _motion(run: Run) -> Iterator[Panel]:
 
 
 def _tool(run: Run, t: Floats) -> Iterator[Panel]:
-    """Yield the panels of the error at the tool and of its angle, with certified bounds."""
+    """Yield panels of error and angle at the tool, with certified bounds."""
     values = tool_errors(run)
     if values is None:
         return

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Messages of a bag, with its topics and joints matched by name to those of the package."""
+"""Messages of a bag, with topics and joints matched by name to the package's."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ _HISTORY_OF_EVENTS = (
 
 @dataclass(frozen=True)
 class NameMap:
-    """Names that differ in a bag: topics by the last part of our name, joints by our name."""
+    """Other names in a bag: of topics, by the last part of ours, and of joints."""
 
     topics: Mapping[str, str] = field(default_factory=dict)
     joints: Mapping[str, str] = field(default_factory=dict)
@@ -81,7 +81,7 @@ NO_NAMES = NameMap()
 
 @dataclass(frozen=True)
 class Content:
-    """Messages of the package's topics in a bag, and the number of messages of every topic.
+    """Messages of the package's topics in a bag, and counts of every topic.
 
     `names` are those that differ.
     """
@@ -99,7 +99,7 @@ class Content:
 
     @property
     def losses(self) -> dict[str, str]:
-        """What is missing in the streams of the loop, which have one publisher each, by topic."""
+        """Missing messages of the loop's streams, which have one publisher each."""
         streams = (
             each
             for topic, each in self.topics.items()
@@ -117,7 +117,7 @@ class Content:
 
     @property
     def motions(self) -> Iterator[tuple[int, Event]]:
-        """Trajectories and targets in the same way, which may be many: read one by one."""
+        """Trajectories and targets likewise; as they may be many, read one by one."""
         begins = [at for at, event in self.events if event.type is EventType.CONFIGURE]
 
         def place(entry: tuple[int, Event]) -> tuple[int, int]:
@@ -153,7 +153,7 @@ class Content:
 
     @cached_property
     def changes(self) -> list[dict[str, Any]]:
-        """What the plant said of its parameters: all of them first, then each change."""
+        """Parameters of the plant: all of them first, then each change."""
         changes = self.topics.get(topics.CHANGES)
         found = []
         for _, raw in changes.raw() if changes else ():
@@ -184,8 +184,8 @@ class Content:
     def controller_config(self, *, exactly: bool = False) -> ControllerConfig:
         """Return the configuration of the controller as first recorded.
 
-        Unknown parameters are left out. If it should be `exactly` as recorded, only those that had
-        no effect are.
+        Unknown parameters are left out. If it should be `exactly` as recorded, only
+        those that had no effect are.
 
         Raises:
             BagError: the bag holds none, or a parameter without which the law may act differently.
@@ -208,7 +208,7 @@ class Content:
 
 
 def read_content(path: Path, namespace: str = '', names: NameMap = NO_NAMES) -> Content:
-    """Read the messages of the package's topics from a folder, a storage file or a ROS 1 `.bag`.
+    """Read the messages of our topics from a folder, storage file or ROS 1 `.bag`.
 
     Raises:
         BagError: there is no bag, it is damaged, it lacks the joint states or a topic of `names`,
@@ -260,8 +260,8 @@ def _find(
 ) -> str | None:
     """Return the name of a topic in a bag, None if it is missing.
 
-    Type and full name must match; unless the name is absolute, it may also follow any namespace,
-    or match in its last part only.
+    Type and full name must match; unless the name is absolute, it may also follow any
+    namespace, or match in its last part only.
     """
     name = names.topics.get(topic.leaf)
     if name is not None:

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Rules by which parameters recorded by an earlier release are those of this one.
 
-A parameter that goes away leaves its last default in `REMOVED`: a bag that has this value replays
-without it. A parameter that arrives leaves in `ADDED` the value that repeats what the law did
-before, unless that is its default.
+A parameter that goes away leaves its last default in `REMOVED`: a bag that has this
+value replays without it. A parameter that arrives leaves in `ADDED` the value that
+repeats what the law did before, unless that is its default.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from blf_dsc_controller.configuration.schema import (
 )
 
 REMOVED: dict[str, Value] = {}
-"""Last default of each parameter that the first release had and this version has not."""
+"""Last default of each parameter of the first release that is gone now."""
 
 ADDED: dict[str, Value] = {}
 """Value of parameters that older bags do not have, where it is not the default."""
@@ -57,13 +57,13 @@ def current(recorded: Mapping[str, Any], source: str) -> dict[str, Any]:
 
 
 def known_names(recorded: Mapping[str, Any]) -> set[str]:
-    """Return the parameters that a controller has, with those of its law if that is a file's."""
+    """Return the parameters of a controller, with those of a law of a file."""
     cls = variant_of(ControllerConfig, recorded)
     return {parameter.name for parameter in parameters(cls)}
 
 
 def completed(recorded: Mapping[str, Any]) -> dict[str, Any]:
-    """Return all parameters of a controller with those that came after the recording."""
+    """Return all parameters of a controller, with those added after the recording."""
     return {**ADDED, **recorded}
 
 

@@ -102,7 +102,7 @@ def recorded_run(
 
 
 class SingleRun(NamedTuple):
-    """One run of one arm in a bag: its joint states, and when its messages were received."""
+    """One run of one arm in a bag: its joint states, and reception times."""
 
     states: JointStates  # in the order of their stamps, which increase
     notes: tuple[str, ...]  # what is left out, and why
@@ -162,7 +162,7 @@ def _arrays(
 
 
 def _torques(content: Content, states: JointStates) -> JointStates:
-    """Return the torque from each state to the next, unknown where the bag does not hold it."""
+    """Return the torque from each state to the next, NaN where it is unknown."""
     try:
         _, torques = applied_torque(content, states)
     except TorqueError:
@@ -180,8 +180,8 @@ def _unknown_parameters(content: Content) -> Iterator[str]:
 def single_run(content: Content, joints: Sequence[str]) -> SingleRun:
     """Return one run of one arm.
 
-    The stamps of its states increase. Where they fall, as when a simulator is reset, another run
-    begins; the longest one is taken.
+    The stamps of its states increase. Where they fall, as when a simulator is reset,
+    another run begins; the longest one is taken.
 
     Raises:
         BagError: all stamps are the same, or several publishers share the topic.
@@ -265,7 +265,7 @@ def _alternates(states: JointStates) -> bool:
 
 
 def _joints(content: Content) -> tuple[str, ...]:
-    """Return the controller's joints in its order; without it, those with other names, or all."""
+    """Return the controller's joints in order; without it, other names, or all."""
     sources = (topics.TRACKING_ERROR, topics.REFERENCE, topics.BOUND)
     of_controller = [
         content.topics[topic] for topic in sources if topic in content.topics
@@ -276,7 +276,7 @@ def _joints(content: Content) -> tuple[str, ...]:
 
 
 def _arm(content: Content) -> LearnedArm | None:
-    """Return the arm of the recorded configuration; None if it has no URDF or cannot be built."""
+    """Return the arm of the recorded configuration, None if it cannot be built."""
     if content.configurations.get(topics.CONTROLLER, {}).get('model') == 'urdf':
         from blf_dsc_controller.law.telemetry import learned_arm  # slow: compiles
 
@@ -286,7 +286,7 @@ def _arm(content: Content) -> LearnedArm | None:
 
 
 def _tool(content: Content) -> ToolErrors | None:
-    """Return the errors at the tool of the recorded configuration; None without a bound there."""
+    """Return the errors at the tool as configured; None without a bound there."""
     if content.configurations.get(topics.CONTROLLER, {}).get('model') == 'urdf':
         from blf_dsc_controller.configuration.tool_bound import tool_of  # as above
 
@@ -297,7 +297,7 @@ def _tool(content: Content) -> ToolErrors | None:
 
 
 def _stops(events: Iterable[Event], first: int) -> Iterator[Stop]:
-    """Yield the stops in the journal; one before the first state gets that state's stamp [ns]."""
+    """Yield the stops in the journal; an early one gets the first stamp [ns]."""
     ordered = list(events)
     for k, event in enumerate(ordered):
         if event.type is EventType.STOP:
@@ -321,7 +321,7 @@ def _contacts(content: Content, events: Iterable[Event]) -> tuple[Contact, ...] 
 
 
 def _learns(settings: Sequence[Mapping[str, Any]]) -> bool:
-    """Return whether the law ever used the prediction error; true if the journal does not say."""
+    """Return whether the law ever used the prediction error; true if unknown."""
     laws = {values['law'] for values in settings if 'law' in values}
     weights = [
         each['learning.weight'] for each in settings if 'learning.weight' in each
@@ -336,9 +336,9 @@ class TorqueError(BlfDscError):
 def applied_torque(content: Content, states: JointStates) -> tuple[str, JointStates]:
     """Return the torque from each state to the next as efforts, and its source.
 
-    The states are ordered by stamp. It is the first available of these: commands, if there is one
-    for each state; the saturated torque of the controller's telemetry; the last command before the
-    next state; the effort of the next state.
+    The states are ordered by stamp. It is the first available of these: commands, if
+    there is one for each state; the saturated torque of the controller's telemetry; the
+    last command before the next state; the effort of the next state.
 
     Raises:
         TorqueError: the bag holds none of them, or commands in an unknown order.
@@ -371,7 +371,7 @@ def next_effort(states: JointStates) -> JointStates:
 def _by_joint(
     content: Content, commands: TopicMessages, joints: tuple[str, ...]
 ) -> JointStates:
-    """Return commands by name; without names, in the order of `joints` or of the joint states."""
+    """Return commands by name, or else in the order of `joints` or of the states."""
     if commands.type == topics.JOINT_STATE:
         return commands.joint_states(joints, ('effort',))
     numbers, *others = commands.name_lists()

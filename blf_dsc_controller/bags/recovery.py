@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Recovery of a damaged bag, which is only read, as a clean one.
 
-Every chunk whose checksum matches is kept. After a record that cannot be read, the next chunk is
-where the index at the end of the file says; without that index, as after a kill, the rest is lost.
+Every chunk whose checksum matches is kept. After a record that cannot be read, the next
+chunk is where the index at the end of the file says; without that index, as after a
+kill, the rest is lost.
 """
 
 from __future__ import annotations
@@ -158,7 +159,7 @@ def _note(record: Any, summary: Summary) -> None:
 
 
 def _missing(summary: Summary, found: Counter[int]) -> Iterator[str]:
-    """Yield what is missing of the numbers of messages that are stated at the end of a file."""
+    """Yield how many messages are missing of those stated at the end of a file."""
     stated = Counter(
         summary.statistics.channel_message_counts if summary.statistics else ()
     )
@@ -172,12 +173,12 @@ def _missing(summary: Summary, found: Counter[int]) -> Iterator[str]:
 
 
 def _plain(raw: bytes) -> bytes:
-    """Return a message, which may be compressed by itself: CDR never begins like that."""
+    """Return a message, decompressed if needed: CDR never begins like that."""
     return unpacked(raw, 'zstd') if raw.startswith(FRAME_HEADER) else raw
 
 
 def _handle(bag: BagWriter, summary: Summary, number: int) -> int:
-    """Return the handle of a channel in the clean bag, 0 if its topic or type is unknown."""
+    """Return the handle of a channel in the clean bag, 0 if it is unknown."""
     channel = summary.channels.get(number)
     schema = summary.schemas.get(channel.schema_id) if channel else None
     if channel is None or schema is None:
@@ -197,7 +198,7 @@ def _handle(bag: BagWriter, summary: Summary, number: int) -> int:
 
 
 def _summary(stream: BinaryIO, size: int) -> Summary:
-    """Return the topics and the index at the end of a file, empty unless they match a checksum.
+    """Return topics and index at the end of a file, if they match a checksum.
 
     Only there are the topics known if the first chunk is damaged.
     """

@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """All kinds of bags as topics and CDR messages, of which none is lost without an error.
 
-The library rosbags opens them. It also reads the messages of sqlite3, ROS 1 and compressed ones.
-Plain MCAP files are read here, which is faster, from begin to end, with each chunk's checksum. What
-no checksum covers, such as a chunk whose opcode has flipped, shows in the number of messages.
+The library rosbags opens them. It also reads the messages of sqlite3, ROS 1 and
+compressed ones. Plain MCAP files are read here, which is faster, from begin to end,
+with each chunk's checksum. What no checksum covers, such as a chunk whose opcode has
+flipped, shows in the number of messages.
 """
 
 from __future__ import annotations
@@ -116,7 +117,8 @@ class OpenBag:
         chosen = [each for each in self._reader.connections if each.topic in topics]
         for each, received, raw in self._reader.messages(chosen) if chosen else ():
             if isinstance(self._reader, Ros1Reader):
-                # ROS 1 and 2 serialise the common types alike, except for padding and `seq`.
+                # ROS 1 and 2 serialise the common types alike, except for padding and
+                # `seq`.
                 raw = typestore().ros1_to_cdr(raw, each.msgtype)  # noqa: PLW2901
             yield BagMessage(each.topic, received, bytes(raw))
 
@@ -131,7 +133,7 @@ def _records(stream: BinaryIO) -> Iterator[Any]:
 
 
 def next_record(stream: BinaryIO, size: int, kinds: Mapping[int, Any]) -> Any:
-    """Return the next record of a file of `size` bytes, None if it is not of these kinds.
+    """Return the next record of a file of `size` bytes, None if it is of another kind.
 
     Raises any error if it does not match its length.
     """
@@ -157,7 +159,8 @@ def next_record(stream: BinaryIO, size: int, kinds: Mapping[int, Any]) -> Any:
 def records_in(chunk: Chunk) -> Iterator[Any]:
     """Yield the content of a chunk; ValueError if it differs from what was written.
 
-    A message is a tuple: channel number, sequence number, log time and publish time [ns], content.
+    A message is a tuple: channel number, sequence number, log time and publish time
+    [ns], content.
     """
     size = chunk.uncompressed_size
     if size > LARGEST:
@@ -204,7 +207,7 @@ def open_bag(path: Path) -> Iterator[OpenBag]:
 
 
 def check_regular(path: Path) -> None:
-    """Raise BagError if a file of the bag is a pipe or a device, which might be read for ever."""
+    """Raise BagError if a file of the bag is a pipe or a device."""
     files = path.iterdir() if path.is_dir() else [path]
     for file in files:
         if file.exists() and not (file.is_file() or file.is_dir()):

@@ -49,11 +49,12 @@ _PARAMETER = 'kg m^2'  # of arms without a URDF
 
 
 def table(run: Run, rows: slice = slice(None)) -> dict[str, NDArray[Any]]:
-    """Return some rows of every series of a run by name and unit, as `torque joint1 [N m]`.
+    """Return some rows of every series of a run by name and unit.
 
-    They are aligned to the stamps of its joint states. `stamp` and `received` are integers, all
-    others floats, NaN where unknown, as is the reference's velocity between its messages. Named
-    values (monitor, external, truth, timing) are held until the next message.
+    They are aligned to the stamps of its joint states. `stamp` and `received` are
+    integers, all others floats, NaN where unknown, as is the reference's velocity
+    between its messages. Named values (monitor, external, truth, timing) are held until
+    the next message.
     """
     stamp = run.stamp[rows]
     columns: dict[str, NDArray[Any]] = {
@@ -87,9 +88,10 @@ def _unit(name: str, run: Run) -> str:
 
 
 def export(run: Run, path: Path) -> int:
-    """Write the table as CSV or Parquet, by the suffix of `path`; return the number of columns.
+    """Write the table as CSV or Parquet, by suffix; return the number of columns.
 
-    It is written block by block: a run may be larger than memory. Numbers are read back exactly.
+    It is written block by block: a run may be larger than memory. Numbers are read back
+    exactly.
 
     Raises:
         BlfDscError: the suffix is neither .csv nor .parquet.

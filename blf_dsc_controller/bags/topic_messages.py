@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Messages of one topic of a bag, decoded block by block while it is read.
 
-Their numbers are in a temporary file, of which only what is asked for comes into memory.
+Their numbers are in a temporary file, of which only what is asked for comes into
+memory.
 """
 
 from __future__ import annotations
@@ -60,9 +61,10 @@ class UnreadableMessageError(BagError):
 
 
 class Values:
-    """Values (N, n) of states, read when they are indexed: by rows, or by rows and columns.
+    """Values (N, n) of states, which are read when they are indexed.
 
-    Where they are unknown, they are NaN, or the difference of two others if these are given.
+    Where they are unknown, they are NaN, or the difference of two others if these are
+    given.
     """
 
     def __init__(
@@ -107,7 +109,8 @@ class JointStates:
     ) -> None:
         """Take messages by their `number` (N,) in the topic; -1 is an unknown one.
 
-        Their positions, velocities and efforts are in the columns `places` (3, n), -1 if unknown.
+        Their positions, velocities and efforts are in the columns `places` (3, n), -1
+        if unknown.
         """
         self.names = tuple(names)
         self.size = number.size
@@ -173,7 +176,8 @@ class _Block(NamedTuple):
 class TopicMessages:
     """All messages of one topic: the numbers of known types in a file, others as bytes.
 
-    The file has blocks of messages, with a column for each name and field of its own messages.
+    The file has blocks of messages, with a column for each name and field of its own
+    messages.
 
     Attributes:
         name, type: of the topic.
@@ -228,7 +232,7 @@ class TopicMessages:
         self._file.write(message.raw)
 
     def raw(self) -> Iterator[tuple[int, bytes]]:
-        """Yield when each message of another type was received [ns], and the message."""
+        """Yield reception time [ns] and content of each message of another type."""
         self._file.flush()
         for received, offset, size in self._kept:
             yield received, os.pread(self._file.fileno(), size, offset)
@@ -250,7 +254,7 @@ class TopicMessages:
 
     @property
     def lost(self) -> str:
-        """How many messages are missing, by their numbers; empty if none, or if unknown."""
+        """Number of missing messages, by their numbers; empty if none or unknown."""
         if len(self._next) > _MOST_PUBLISHERS or not self._missed + self._before:
             return ''
         earlier = (
@@ -302,7 +306,7 @@ class TopicMessages:
         self._file.flush()
 
     def _rows_of(self, layouts: Collection[int]) -> Mapping[int, int]:
-        """Return the row in a block of each column that messages of these layouts have."""
+        """Return the row in a block of each column of these layouts."""
         columns = set(range(_VALUES))
         for k in layouts:
             columns.update(self._columns[key] for key in self._layouts[k].places)
@@ -319,7 +323,7 @@ class TopicMessages:
         rows: Mapping[int, int],
         where: NDArray[np.intp],
     ) -> None:
-        """Decode the joined messages of one layout into a block, at their places (k,) in it."""
+        """Decode the joined messages of one layout into places (k,) of a block."""
         if self.type == JOINT_STATE:
             strides = (layout.size,)
             stamp = np.ndarray(where.shape, _TIME, joined, STAMP_OFFSET, strides)
@@ -331,7 +335,7 @@ class TopicMessages:
             block[rows[self._columns[key]], where] = values[:, place]
 
     def column(self, j: int, number: NDArray[np.int32]) -> NDArray[np.int64]:
-        """Return a column of messages by number; NaN where a message or its column is unknown."""
+        """Return a column of messages by number, NaN where it is unknown."""
         self._flush()
         found = np.full(number.size, _NAN)
         known = number >= 0
@@ -355,8 +359,8 @@ class TopicMessages:
     ) -> JointStates:
         """Return the states of these names, without messages that name none of them.
 
-        The values of a std_msgs/Float64MultiArray are efforts; their names are their numbers.
-        Messages that cannot be decoded are added to `errors` by number.
+        The values of a std_msgs/Float64MultiArray are efforts; their names are their
+        numbers. Messages that cannot be decoded are added to `errors` by number.
 
         Raises:
             UnreadableMessageError: a message cannot be decoded and `errors` is None, or none can.
@@ -393,13 +397,13 @@ class TopicMessages:
         return JointStates(self, names, np.array(places, np.intp), number)
 
     def name_lists(self) -> list[tuple[str, ...]]:
-        """Return the different lists of names; UnreadableMessageError if there is none."""
+        """Return the different lists of names; raise UnreadableMessageError if none."""
         if not self._layouts:
             raise UnreadableMessageError(self.name, *min(self._unreadable.items()))
         return list(dict.fromkeys(layout.names for layout in self._layouts))
 
     def joint_names(self) -> tuple[str, ...]:
-        """Return the longest list of names in a message; UnreadableMessageError if it is empty."""
+        """Return the longest list of names; raise UnreadableMessageError if empty."""
         names = max(self.name_lists(), key=len)
         if not names:
             unnamed = MessageError(

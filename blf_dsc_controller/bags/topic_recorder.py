@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Recording of the package's own messages without ROS: each topic is added with its first one."""
+"""Recording of the package's own messages without ROS."""
 
 from __future__ import annotations
 

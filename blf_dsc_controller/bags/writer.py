@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Writer of bags like those of `ros2 bag record`: a folder of metadata.yaml and MCAP files."""
+"""Writer of bags like those of `ros2 bag record`: metadata.yaml and MCAP files."""
 
 from __future__ import annotations
 
@@ -63,11 +63,12 @@ def _dump(tree: object) -> str:
 class BagWriter(AbstractContextManager['BagWriter']):
     """Writer of serialised messages to a new bag.
 
-    Data leaves the process within `flush_interval` [s] plus the time to the next call of `write` or
-    `flush_if_due`, and then survives a kill of the process. Without an interval it leaves when a
-    chunk is full. The compression of chunks is `none` or `zstd`. A file ends after 10,000 chunks.
-    With `in_background`, a thread writes to the disk; errors are raised by a later call.
-    After an OSError, such as that of a full disk, `recover` saves what was written before.
+    Data leaves the process within `flush_interval` [s] plus the time to the next call
+    of `write` or `flush_if_due`, and then survives a kill of the process. Without an
+    interval it leaves when a chunk is full. The compression of chunks is `none` or
+    `zstd`. A file ends after 10,000 chunks. With `in_background`, a thread writes to
+    the disk; errors are raised by a later call. After an OSError, such as that of a
+    full disk, `recover` saves what was written before.
 
     Raises:
         BagError: `path` exists already.
@@ -108,7 +109,8 @@ class BagWriter(AbstractContextManager['BagWriter']):
     ) -> int:
         """Add a topic by its full name, with the quality of service of each publisher.
 
-        A quality may also be plain data, as in another bag. Returns the handle for `write`.
+        A quality may also be plain data, as in another bag. Returns the handle for
+        `write`.
 
         Raises:
             UnknownTypeError: no definition is given and the type is not one of Jazzy's common ones.
@@ -138,8 +140,9 @@ class BagWriter(AbstractContextManager['BagWriter']):
     ) -> None:
         """Write one serialised message.
 
-        It was received at `log_time` [ns] and published at `publish_time` [ns], or `log_time` if
-        not known, with the `sequence` number of the publisher, 0 if not known.
+        It was received at `log_time` [ns] and published at `publish_time` [ns], or
+        `log_time` if not known, with the `sequence` number of the publisher, 0 if not
+        known.
         """
         if self._chunks >= _MOST_CHUNKS:
             self._end_file()

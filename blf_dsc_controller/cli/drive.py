@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`blf_dsc drive`: the guarded law on a robot's own interface, with topics beside it or without."""
+"""`blf_dsc drive`: the guarded law on a robot's own interface."""
 
 from __future__ import annotations
 
@@ -82,7 +82,7 @@ def drive(options: Namespace) -> int:
 
 
 def _check(options: Namespace) -> None:
-    """Raise BlfDscError if the options are wrong, or ROS is missing that they ask for."""
+    """Raise BlfDscError if the options are wrong, or if they need a missing ROS."""
     if not (options.duration >= 0.0 and math.isfinite(options.duration)):
         raise BlfDscError(
             f'--duration: got {options.duration:g} s, but a finite time of at least 0 is needed '

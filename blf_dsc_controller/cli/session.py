@@ -226,7 +226,7 @@ def _keep(
     monitor: ProgressMonitor,
     interrupts: Sequence[int],
 ) -> None:
-    """Keep the page of a loop that has ended until an interrupt, if there is a terminal."""
+    """Keep the page of an ended loop until an interrupt, if there is a terminal."""
     if not (pages and sys.stderr.isatty()):
         return
     for node in reversed(loop):

@@ -607,7 +607,7 @@ class Learning:
 
 @dataclass(frozen=True)
 class Contact:
-    """External torque, which the learned model does not explain, and reactions to it."""
+    """External torque, which the learned model does not explain; reactions."""
 
     enabled: bool = _size(
         False, 'compute the external torque with its interval, and detect contacts'
@@ -771,7 +771,7 @@ class ControllerConfig(ArmConfig):
             )
 
     def _drive_load_problems(self) -> Iterator[str]:
-        """Check that the drives can be told the load, and by which service and frame."""
+        """Check that the load can be declared to the drives, and how."""
         learning = self.learning
         compensates = self.robot.drive_compensates != 'none'
         if learning.tell_drive and not (learning.weighing and compensates):

@@ -309,7 +309,7 @@ def _unknown_in_wildcards(sections: Iterable[Section]) -> Iterator[str]:
 
 
 def _entries_of(sections: Iterable[Section], node: str, cls: type) -> dict[str, Entry]:
-    """Return the entries for a node; names of other nodes, and ROS's own, are left out."""
+    """Return the entries for a node, without those of other nodes and of ROS."""
     return {
         name: entry
         for section in sections

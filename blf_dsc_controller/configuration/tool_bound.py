@@ -93,7 +93,7 @@ def joint_bounds(
 def _region(
     values: Mapping[str, Any], n: int
 ) -> tuple[tuple[float, ...], tuple[float, ...]] | None:
-    """Return the least and largest positions (n,) of sinusoids; None of other references."""
+    """Return least and largest positions (n,) of sinusoids; None for other types."""
     if values['reference.type'] != 'sinusoids':
         return None
     offset = np.array(values['reference.offset'])
@@ -144,7 +144,7 @@ def _expected(
 
 
 def certified(config: ControllerConfig) -> tuple[float, float]:
-    """Return the bounds [m, rad] at the tool that the joint bounds keep at every posture."""
+    """Return the bounds [m, rad] at the tool that the joint bounds ensure."""
     tool = tool_of(config)
     assert tool is not None  # noqa: S101 - the caller has looked
     position, angle = tool.everywhere(np.array(config.barrier.bound)).tolist()
@@ -152,7 +152,7 @@ def certified(config: ControllerConfig) -> tuple[float, float]:
 
 
 def problems(config: ControllerConfig) -> Iterator[str]:
-    """Check that there is a tool, and that the joint bounds keep it within its bound."""
+    """Check that there is a tool, and that the joint bounds keep its bound."""
     barrier = config.barrier
     if not barrier.bounds_tool:
         return

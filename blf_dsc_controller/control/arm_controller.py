@@ -230,14 +230,14 @@ class ArmController:
         guard.adopt(guard.plan(trajectory))
 
     def load_to_tell(self) -> DriveLoad | None:
-        """Return the load that drives should be told to compensate next, a step at a time.
+        """Return the load to declare to the drives next, a step at a time.
 
         None: there is none, or `learning.tell_drive` is false.
         """
         return self._loop.guard.load_to_tell()
 
     def take_over(self, load: DriveLoad) -> None:
-        """Command less by the weight of a load that the drives add from the next state on.
+        """Subtract the weight of a load that the drives add from the next state on.
 
         Raises:
             BlfDscError: `learning.tell_drive` is false.

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the controller and the process of its action tell each other, pickled, over a pipe.
+"""Messages between the controller and the process of its action, pickled.
 
 Joint values are in the order of the controller's joints.
 """

@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How far an arm may be from its reference while it follows a goal, and when it has arrived.
+"""Tolerances of a goal: errors on the path, and at its end.
 
-As for joint_trajectory_controller: 0 is the default and -1 none. Here the default of a position is
-the bound, that of a velocity none. Accelerations are not measured, so that theirs are not checked.
+As for joint_trajectory_controller: 0 is the default and -1 none. Here the default of a
+position is the bound, that of a velocity none. Accelerations are not measured, so that
+theirs are not checked.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ _ROUNDING = 1e-6
 
 
 class Tolerances(NamedTuple):
-    """The largest errors of all joints; where a position's (n,) [rad] is NaN, it is the bound."""
+    """Largest errors of all joints; a position's (n,) [rad] of NaN is the bound."""
 
     position: np.ndarray
     velocity: np.ndarray  # (n,) [rad/s]

@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Goals of the action `~/follow_joint_trajectory`: followed, watched, and ended with a result.
+"""Goals of the action `~/follow_joint_trajectory`, from acceptance to result.
 
-They become trajectories like those of the topic. The newest motion wins, whoever sent it: a goal
-ends when its trajectory is no longer the reference. What clients see is `action_server`'s.
+They become trajectories like those of the topic. The newest motion wins, whoever sent
+it: a goal ends when its trajectory is no longer the reference. What clients see is
+`action_server`'s.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """New references while the controller runs: trajectories, streams of targets, stops.
 
-They come as the messages of `~/joint_trajectory` and `~/joint_positions`, by `~/stop` and by the
-goals of the action, whoever receives them. Every rejection has a reason.
+They come as the messages of `~/joint_trajectory` and `~/joint_positions`, by `~/stop`
+and by the goals of the action, whoever receives them. Every rejection has a reason.
 """
 
 from __future__ import annotations
@@ -75,8 +75,9 @@ class _Job(NamedTuple):
 class MotionInput:
     """Passes motions to the guard, between two samples.
 
-    In lock-step the plant waits while a motion is planned. A live one does not: it is planned in a
-    thread, for a time slightly ahead, and further ahead if planning takes longer. The latest wins.
+    In lock-step the plant waits while a motion is planned. A live one does not: it is
+    planned in a thread, for a time slightly ahead, and further ahead if planning takes
+    longer. The latest wins.
 
     Attributes:
         accepted, rejected: number of trajectories that are or were followed, or are not.
@@ -156,7 +157,7 @@ class MotionInput:
         check: Callable[[Plan], None],
         report: Report,
     ) -> None:
-        """Follow a serialised trajectory with points that came by another way than a topic."""
+        """Follow a serialised trajectory whose points came by another way."""
 
         def tell(plan: Plan | None, reason: str) -> None:
             self._report(plan, reason)
@@ -205,7 +206,7 @@ class MotionInput:
         self._request(guard, request)
 
     def _target_of(self, guard: Guard, trajectory: Trajectory) -> Target | None:
-        """Return a single point within the time-out as a target, None for anything else."""
+        """Return a single point within the time-out as a target, otherwise None."""
         config = guard.config
         timeout = config.reference.stream_timeout
         now = guard.time
@@ -390,7 +391,7 @@ def _reason(error: Exception) -> str:
 
 
 def _trajectory(raw: bytes, start_stamp: int) -> Trajectory:
-    """Return a message's trajectory in times since the controller's start; stamp 0 means now."""
+    """Return a message's trajectory, in times since the controller's start."""
     stamp, names, points = joint_trajectory(raw)
     begin = (stamp - start_stamp) * _NANO if stamp else None
     own = (TrajectoryPoint(time * _NANO, *arrays) for time, arrays in points)

@@ -193,7 +193,7 @@ def _by_joint(guard: Guard, counts: np.ndarray) -> str:
 
 
 def chatter_of(guard: Guard) -> str:
-    """Return the warning about a torque that chatters, as with coarse encoders; empty if none."""
+    """Return the warning about a chattering torque; empty if there is none."""
     steps = np.sqrt(guard.controller.checks.chatter)
     worst = int(np.argmax(steps / guard.controller.settings.torque_limit))
     if steps[worst] <= _CHATTER * guard.controller.settings.torque_limit[worst]:

@@ -104,7 +104,7 @@ class Driver(ABC):
         """Command torques (n,) [N m]; None: whatever lets the robot go on as it is."""
 
     def tell_load(self, load: DriveLoad) -> None:
-        """Tell the robot to compensate this load, in the frame of the tip; in another thread.
+        """Declare this load, in the frame of the tip; called in another thread.
 
         Raises:
             DriverError: it refuses, or cannot be told.

@@ -77,7 +77,7 @@ class DriveLoop:
         settle_time: float = 3.0,
         ros: RosTopics | None = None,
     ) -> None:
-        """Run for `duration` [s] of the robot's time, with topics beside the loop or without.
+        """Run for `duration` [s] of the robot's time, with or without topics.
 
         The end may take `settle_time` [s] more.
         """

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""ROS beside the loop: the controller's topics, in a process that the loop never waits for.
+"""The controller's topics, in a process for which the loop never waits.
 
 The process (`nodes/topics_process.py`) has the name, the topics and `~/stop` of the
 node.  If it ends or hangs, the loop goes on without.
@@ -85,7 +85,7 @@ class RosTopics:
 
     @property
     def problem(self) -> str:
-        """Why there are no topics any more, or how many messages were lost; or empty."""
+        """Why there are no topics any more, or the number of lost messages."""
         if self._link.broken:
             return 'ROS ended before the loop, which went on without its topics'
         if self._link.lost:

@@ -48,13 +48,14 @@ class EventType(str, Enum):
 
 
 MOTIONS = frozenset((EventType.TRAJECTORY, EventType.TARGET))
-"""Events that a sender repeats at its rate, for hours: nodes publish them on `~/targets`."""
+"""Events that may come at a high rate: nodes publish them on `~/targets`."""
 
 
 class EncodedContent(dict[str, Any]):
     """Content of an event with its JSON, which was made where there is time for it.
 
-    The JSON of 2,000 points takes 9 ms, in which a loop of 1 kHz would miss nine states.
+    The JSON of 2,000 points takes 9 ms, in which a loop of 1 kHz would miss nine
+    states.
     """
 
     def __init__(self, content: Mapping[str, Any], text: str) -> None:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Messages between a loop and a process beside it, over a socket on which the loop never waits.
+"""Messages between a loop and a process beside it, over a non-blocking socket.
 
 What the other side does not take is kept, up to a limit, and then dropped: message by
 message, so that those that arrive are whole.
@@ -27,7 +27,7 @@ class Link:
     """
 
     def __init__(self, end: socket.socket, most: int = _MOST) -> None:
-        """Take over a connected stream socket; at most `most` bytes wait for the other side."""
+        """Take over a connected stream socket, with at most `most` waiting bytes."""
         end.settimeout(0.0)
         self.lost = 0
         self.broken = False
@@ -47,7 +47,7 @@ class Link:
         self._out += content
 
     def flush(self) -> bool:
-        """Send what the other side takes at once; return whether nothing waits any more."""
+        """Send what the other side accepts now; return whether nothing waits."""
         while self._out and not self.broken:
             try:
                 sent = self._end.send(self._out)
@@ -77,7 +77,7 @@ class Link:
             select.select([self._end], [], [], seconds)
 
     def close(self, patience: float = 0.0) -> None:
-        """End the connection, after what waits has been sent or the patience [s] is over."""
+        """End the connection after all is sent, or after the patience [s]."""
         end = monotonic() + patience
         while not self.flush() and (left := end - monotonic()) > 0.0:
             select.select([], [self._end], [], left)

@@ -24,7 +24,7 @@ KINDS = {topic: kind for kind, topic in enumerate(TOPICS)}
 READY = 100
 """The topics exist: null."""
 STATUS = 101
-"""What `/diagnostics` says: `revision` of the state, `parts` (name, level, message, values)."""
+"""For `/diagnostics`: `revision`, `parts` (name, level, message, values)."""
 LOG = 102
 """For the log of the node: `level` and `text`."""
 STOP = 103

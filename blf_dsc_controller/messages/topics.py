@@ -168,7 +168,7 @@ LOAD = tuple(
     f'load {name}{what}' for what in ('', ' +-') for name in ('mass', 'x', 'y', 'z')
 )  # kg and m in the tip, and half of their 95 % intervals
 TOOL = ('tool_error', 'tool_bound', 'tool_angle', 'tool_angle_bound')
-"""At the tip: error and bound on it [m], angle and bound on it [rad], of this posture."""
+"""At the tip, for this posture: error and bound [m], angle and bound [rad]."""
 INTERVAL = ' +-'  # after a joint: half of the 95 % interval of its external torque
 CONTACT = ('contact', 'contact distance')
 COMPUTE_TIME = 'compute_time'

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Starts the process of the action, and exchanges messages with it without ever waiting.
+"""The process of the action, and messages to and from it without waiting.
 
 The threads only pass pickled messages on: they cost a sample some microseconds.
 """
@@ -106,14 +106,14 @@ class ActionProcess:
         self._shut()
 
     def _shut(self) -> None:
-        """End the connection in both directions, also for a thread that reads from it."""
+        """End the connection in both directions, even while a thread reads from it."""
         twin = socket.socket(fileno=os.dup(self._connection.fileno()))
         with twin, suppress(OSError):
             twin.shutdown(socket.SHUT_RDWR)
 
 
 def _enclave_of(node: Node) -> str:
-    """Return the security enclave of a node's process, which that of the action shares."""
+    """Return the security enclave of a node, which its action's process shares."""
     own = node.get_name(), node.get_namespace()
     known = node.get_node_names_and_namespaces_with_enclaves()
     return next((enclave for *name, enclave in known if tuple(name) == own), '/')

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """The process of the action `~/follow_joint_trajectory`: what its clients see.
 
-rclpy holds Python's lock while it converts a goal, for 4 ms with 200 points: the controller would
-lose as many samples. So the action has a process of its own, which the controller starts. It only
-translates: what happens to a goal is decided by `goals`.
+rclpy holds Python's lock while it converts a goal, for 4 ms with 200 points: the
+controller would lose as many samples. So the action has a process of its own, which the
+controller starts. It only translates: what happens to a goal is decided by `goals`.
 
 No coroutine waits for the end of a goal, since rclpy's executors poll those that wait.
 """
@@ -65,7 +65,7 @@ class TrajectoryActionServer:
     def __init__(
         self, node: Node, name: str, joints: list[str], connection: Connection
     ) -> None:
-        """Offer the action `name`; the controller is at the other end of the connection."""
+        """Offer the action `name` for the controller at the other end."""
         self._log = node.get_logger()
         self._joints = joints
         self._connection = connection
@@ -188,7 +188,7 @@ def _tolerances(sent: Any) -> tuple[JointTolerance, ...]:
 
 
 def _point(time: float, values: list[list[float]]) -> JointTrajectoryPoint:
-    """Return a point with positions, and velocities and accelerations if there are such."""
+    """Return a point with positions, and with velocities and accelerations if any."""
     names = ('positions', 'velocities', 'accelerations')
     point = JointTrajectoryPoint(**dict(zip(names, values, strict=False)))
     point.time_from_start = Duration(nanoseconds=round(time / _NANO)).to_msg()

@@ -138,7 +138,7 @@ class ControllerNode(LoopNode[ControllerConfig]):
         self._report()
 
     def deactivate(self) -> None:
-        """Ramp to the safe torque, which is commanded for all joint states from then on."""
+        """Ramp to the safe torque, and answer all further states with it."""
         if self.guard is not None:
             self.guard.deactivate()
         self.get_logger().info(f'deactivated: {self.config.safety.torque} torque')
@@ -152,7 +152,7 @@ class ControllerNode(LoopNode[ControllerConfig]):
         self._report()
 
     def close(self) -> None:
-        """Command the torque to leave behind, and wait until all subscribers have received it."""
+        """Command the torque to leave behind; wait until all have received it."""
         self._leave()
         process.drain([*self._outputs.values(), self._status.journal])
 
@@ -181,7 +181,7 @@ class ControllerNode(LoopNode[ControllerConfig]):
         )
 
     def _leave(self) -> None:
-        """Command the torque that drivers may hold from now on, and release the guard."""
+        """Command the torque that drivers may hold, and release the guard."""
         if self.guard is not None:
             self._command(self.guard.release())
             self._status.publish_events(self.guard)
@@ -232,7 +232,7 @@ class ControllerNode(LoopNode[ControllerConfig]):
         self._report_if_changed(guard)
 
     def _holds_back(self, guard: Guard, raw: bytes) -> bool:
-        """Whether a state before the start is only for the gate; a live arm must be supported."""
+        """Whether a state before the start is only for the gate."""
         try:
             stamp = self._decoder.decode(raw)
         except MessageError:
@@ -253,7 +253,7 @@ class ControllerNode(LoopNode[ControllerConfig]):
         return self._lacks_support(guard)
 
     def _lacks_support(self, guard: Guard) -> bool:
-        """Whether the start is refused, by the gate or since nothing shows what holds the arm."""
+        """Whether the start is refused, by the gate or for lack of support."""
         if guard.start_error is None:
             guard.check_support(self._decoder.values)
         self._report_if_changed(guard)
@@ -265,7 +265,7 @@ class ControllerNode(LoopNode[ControllerConfig]):
         return all(each.node_name == topics.PLANT for each in found)
 
     def survive(self, error: Exception) -> bool:
-        """Make a safe stop after an unexpected error, instead of leaving the arm without torque."""
+        """Make a safe stop after an unexpected error."""
         if self.guard is None:
             return False
         self.get_logger().fatal(''.join(traceback.format_exception(error)))
@@ -289,7 +289,7 @@ class ControllerNode(LoopNode[ControllerConfig]):
         return guard.update(stamp, self._decoder.values)
 
     def _look_at_learning(self, guard: Guard) -> None:
-        """Look, now and then, at what rarely changes: who subscribes, what is learned, the rate."""
+        """Update from time to time what rarely changes: subscribers, learning, rate."""
         samples = guard.controller.samples
         if (samples - 1) % _RARELY == 0:
             errors = self._outputs.get(topics.TRACKING_ERROR)
@@ -301,7 +301,7 @@ class ControllerNode(LoopNode[ControllerConfig]):
                 self._warn_of_rate(guard)
 
     def _publish_telemetry(self, torque: np.ndarray | None) -> None:
-        """Publish the messages about the last state, which this torque (n,) [N m] answered."""
+        """Publish the messages about the last state and its torque (n,) [N m]."""
         if self._loop is not None and self.config.telemetry.enabled:
             for message in self._loop.messages(
                 torque, errors_wanted=self._errors_subscribed
@@ -356,7 +356,7 @@ class ControllerNode(LoopNode[ControllerConfig]):
         return is_watched or self._pending is not None or polled != self._polled
 
     def _start_from_pending(self, guard: Guard) -> None:
-        """Use a state that was held back, once it is observed or its sender turns out to wait."""
+        """Use a state that was held back, once the gate opens or the sender waits."""
         waits = self._gate.poll()
         if self._pending is None or not self._is_observed():
             return

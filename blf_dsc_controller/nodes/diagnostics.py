@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`/diagnostics` of a node, once a second and on a change, and the controller's state and journal.
+"""`/diagnostics` of a node, and state and journal of the controller.
 
-Names are paths (`left/blf_dsc_controller/loop`), which rqt_robot_monitor shows as a tree; the
-hardware is named by its joints.
+Names are paths (`left/blf_dsc_controller/loop`), which rqt_robot_monitor shows as a
+tree; the hardware is named by its joints.
 """
 
 from __future__ import annotations
@@ -71,7 +71,7 @@ class ControllerStatus(StatusReport):
         self._published = '', -1  # lifecycle and revision of the state
 
     def has_news(self, guard: Guard) -> bool:
-        """Whether there are events or a state to publish, besides targets of a stream."""
+        """Whether there are events or a state to publish, besides streamed targets."""
         if guard.supervisor.revision != self._published[1]:
             return True
         return any(each.type is not EventType.TARGET for each in guard.journal.pending)

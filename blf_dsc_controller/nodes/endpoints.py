@@ -1,11 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """Message types, qualities of service, publishers, subscriptions and timers.
 
-`RawSubscriptions` are for messages that are taken in batches, serialised. An executor would run a
-callback for each message. Here the messages of all topics are taken from the middleware's queues
-at the owner's pace, which costs a third less, and each carries the middleware's metadata: when it
-was sent and received, and its sequence number, which reveals losses. The subscriptions therefore
-belong to a separate node that no executor spins.
+`RawSubscriptions` are for messages that are taken in batches, serialised. An executor
+would run a callback for each message. Here the messages of all topics are taken from
+the middleware's queues at the owner's pace, which costs a third less, and each carries
+the middleware's metadata: when it was sent and received, and its sequence number, which
+reveals losses. The subscriptions therefore belong to a separate node that no executor
+spins.
 """
 
 from __future__ import annotations
@@ -40,9 +41,11 @@ _MESSAGE = re.compile(r'([a-z][a-z0-9_]*)/msg/([A-Z][A-Za-z0-9]*)')
 def message_class(type_name: str) -> Any:
     """Return the class of a message type such as `sensor_msgs/msg/JointState`.
 
-    Only ROS packages are imported, since the name may come from a bag or any DDS participant.
+    Only ROS packages are imported, since the name may come from a bag or any DDS
+    participant.
 
-    Raises ImportError if there is no such package, AttributeError if it has no such type.
+    Raises ImportError if there is no such package, AttributeError if it has no such
+    type.
     """
     match = _MESSAGE.fullmatch(type_name)
     if match is None or not (_share(match[1]) / 'package.xml').is_file():
@@ -59,7 +62,7 @@ def _share(package: str) -> Path:
 
 
 def register_definition(type_name: str) -> None:
-    """Register a type, and those nested in it, from the .msg files of their installed packages.
+    """Register a type and its nested types from their installed .msg files.
 
     Raises UnknownTypeError if there is no such file.
     """
@@ -106,7 +109,8 @@ _RARE_PERIOD = 0.05  # s, of a node that has nothing to do
 _IDLE_AFTER = 0.1  # s without work
 
 
-# Declares `qos_overrides.TOPIC.publisher.depth`, and likewise for history and reliability.
+# Declares `qos_overrides.TOPIC.publisher.depth`, and likewise for history and
+# reliability.
 _overridable = QoSOverridingOptions.with_default_policies
 
 
@@ -123,7 +127,7 @@ def create_publisher(node: Node, topic: Topic) -> Publisher:
 def create_subscription(
     node: Node, topic: Topic, callback: Callable[[bytes], None]
 ) -> None:
-    """Subscribe to a topic of another node; the callback receives serialised messages."""
+    """Subscribe to a topic of another node; the callback gets raw messages."""
     node.create_subscription(
         message_class(topic.type),
         topic.relative,
@@ -137,18 +141,18 @@ def create_subscription(
 def create_steady_timer(
     node: Node, period: float, callback: Callable[[], None]
 ) -> Timer:
-    """Create a timer [s] on the steady clock, which also runs while simulated time is paused."""
+    """Create a timer [s] on the steady clock, which no simulated time pauses."""
     return node.create_timer(
         period, callback, clock=Clock(clock_type=ClockType.STEADY_TIME)
     )
 
 
 class PollingTimer:
-    """Calls `poll` in a period [s] while it finds work, and rarely after a while without any.
+    """Calls `poll` periodically while it finds work, and rarely otherwise.
 
-    An idle node would otherwise take several percent of a core. `poll` returns whether it found
-    work. In between a second timer polls: it goes on for ever, since one that is reset by its own
-    callback would multiply under load.
+    An idle node would otherwise take several percent of a core. `poll` returns whether
+    it found work. In between a second timer polls: it goes on for ever, since one that
+    is reset by its own callback would multiply under load.
     """
 
     def __init__(self, node: Node, period: float, poll: Callable[[], bool]) -> None:
@@ -210,7 +214,7 @@ class RawSubscriptions:
         self._subscriptions: list[tuple[Any, Subscription]] = []
 
     def follow(self, topic: Topic, quality: Quality) -> None:
-        """Subscribe to a topic of the owner's namespace, which is the handle of its messages."""
+        """Subscribe to a topic of the owner's namespace, the handle of its messages."""
         self.subscribe(
             self._owner.resolve_topic_name(topic.relative), topic.type, quality, topic
         )
@@ -218,7 +222,7 @@ class RawSubscriptions:
     def subscribe(
         self, topic: str, type_name: str, quality: Quality, handle: Any
     ) -> None:
-        """Subscribe to a topic; its messages carry `handle`. Raises what `message_class` raises."""
+        """Subscribe to a topic with a handle. Raises what `message_class` raises."""
         subscription = self.node.create_subscription(
             message_class(type_name),
             topic,
@@ -255,7 +259,7 @@ class RawSubscriptions:
 
 
 def compatible(offered: Sequence[Quality], depth: int) -> Quality:
-    """Return the strictest quality of service that is compatible with all publishers."""
+    """Return the strictest quality of service compatible with all publishers."""
     reliable = all(quality.reliability == 'reliable' for quality in offered)
     latched = all(quality.durability == 'transient_local' for quality in offered)
     reliability = 'reliable' if reliable else 'best_effort'
@@ -264,7 +268,7 @@ def compatible(offered: Sequence[Quality], depth: int) -> Quality:
 
 
 def quality_of(profile: QoSProfile) -> Quality:
-    """Return a publisher's quality of service; the ROS graph omits history and depth."""
+    """Return a publisher's quality of service, without history and depth."""
     return Quality(
         depth=profile.depth,
         reliability=profile.reliability.name.lower(),

@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Services whose requests are prepared in a thread, and answered later in that of the node.
+"""Services whose requests are prepared in a thread and answered later.
 
-rclpy's EventsExecutor sends at once what a callback returns, and awaits nothing.  So the callback
-returns a placeholder, which is not sent but kept with the header of the request.  Once the thread
-is done, `poll` calls the original callback, which finds its work prepared, and sends the answer.
+rclpy's EventsExecutor sends at once what a callback returns, and awaits nothing.  So
+the callback returns a placeholder, which is not sent but kept with the header of the
+request.  Once the thread is done, `poll` calls the original callback, which finds its
+work prepared, and sends the answer.
 """
 
 from __future__ import annotations
@@ -31,14 +32,14 @@ class _Waiting(NamedTuple):
 
 
 class LateAnswers:
-    """Requests that wait for their preparation; they are answered in the order of their arrival."""
+    """Requests that wait for their preparation, in the order of their arrival."""
 
     def __init__(self) -> None:
         self._thread = ThreadPoolExecutor(1, 'preparation')
         self._waiting: deque[_Waiting] = deque()
 
     def delay(self, service: Any, prepare: Callable[[Any], None]) -> None:
-        """Call `prepare` with each request of an rclpy Service in the thread, and answer after it.
+        """Call `prepare` with each request of a Service in the thread, then answer.
 
         What it raises is left to the original callback, which finds the same problem.
         """

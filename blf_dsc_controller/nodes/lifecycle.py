@@ -40,10 +40,11 @@ _RECORDER = 'record'  # in the names bag_recorder and rosbag2_recorder
 class LoopNode(LifecycleNode, process.PlainNode, Generic[Config]):
     """A node that can configure and activate itself, and survives invalid requests.
 
-    Override `configure`, `activate`, `deactivate` and `release`. Topics, services and parameters
-    exist as long as the node; everything it computes with is created when it is configured and
-    released when it is cleaned up. `steady` [ns] is the clock for timeouts and real time, `wall`
-    [ns] the one for live stamps. Raises ConfigurationError if a parameter is invalid.
+    Override `configure`, `activate`, `deactivate` and `release`. Topics, services and
+    parameters exist as long as the node; everything it computes with is created when it
+    is configured and released when it is cleaned up. `steady` [ns] is the clock for
+    timeouts and real time, `wall` [ns] the one for live stamps. Raises
+    ConfigurationError if a parameter is invalid.
 
     Attributes:
         config: configuration in force.
@@ -72,8 +73,8 @@ class LoopNode(LifecycleNode, process.PlainNode, Generic[Config]):
     def destroy_node(self) -> None:
         """Destroy the node with its state machine, which rclpy forgets.
 
-        It would keep the middleware's threads alive until the process exits: a known cause of
-        crashes.
+        It would keep the middleware's threads alive until the process exits: a known
+        cause of crashes.
         """
         super().destroy_node()
         self._state_machine.destroy_when_not_in_use()
@@ -100,7 +101,7 @@ class LoopNode(LifecycleNode, process.PlainNode, Generic[Config]):
         return str(self._state_machine.current_state[1])
 
     def autostart(self) -> None:
-        """Configure and activate the node as a manager would; raise BlfDscError if a step fails."""
+        """Configure and activate the node as a manager would, or raise BlfDscError."""
         for name in ('configure', 'activate'):
             if getattr(self, f'trigger_{name}')() != TransitionCallbackReturn.SUCCESS:
                 error = self._transition_error
@@ -172,7 +173,7 @@ class LoopNode(LifecycleNode, process.PlainNode, Generic[Config]):
     def connect(
         self, outputs: Sequence[Topic], source: Topic, callback: Callable[[bytes], None]
     ) -> bool:
-        """Create the loop's topics, `outputs[0]` to the other node; return False if they exist."""
+        """Create the loop's topics; return False if they exist."""
         if self._outputs:
             return False
         self._outputs = {topic: create_publisher(self, topic) for topic in outputs}
@@ -197,7 +198,7 @@ class LoopNode(LifecycleNode, process.PlainNode, Generic[Config]):
         """Publish diagnostics."""
 
     def _on_second(self) -> None:
-        """Warn of other publishers of the output that only this node should publish, and report."""
+        """Warn of other publishers of this node's output, and report."""
         if self._outputs:
             publisher = next(iter(self._outputs.values()))
             found = self.get_publishers_info_by_topic(publisher.topic_name)
@@ -223,7 +224,7 @@ class LoopNode(LifecycleNode, process.PlainNode, Generic[Config]):
         self._senders[topic](raw)
 
     def _is_observed(self) -> bool:
-        """Whether each output has its recorders, and the first one also the other node."""
+        """Whether each output has its recorders, and the first one the other node."""
         wanted = self.config.wait_for_subscribers
         publishers = [*self._outputs.values()]
         others = publishers[0].get_subscription_count()

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Tells a driver's service the load that the law has weighed, step by step, between two states.
+"""Declares the weighed load to a driver's service, step by step.
 
-The message packages of the drivers are imported when their service is there: a sourced workspace
-that runs such a driver has them.
+The message packages of the drivers are imported when their service is there: a sourced
+workspace that runs such a driver has them.
 """
 
 from __future__ import annotations
@@ -77,7 +77,7 @@ class LoadService:
         self._client = self._node.create_client(service, self._name)
 
     def begin(self) -> None:
-        """Begin with a new law, which knows of no load that the drives were told before."""
+        """Begin with a new law, which knows nothing of loads declared before."""
         if self.told is not None and not self.problem:
             self._give_up(
                 f'a load of {self.told.mass:.2f} kg is still declared to the drives, from before '
@@ -135,7 +135,7 @@ class LoadService:
 
 
 def _ball(mass: float) -> float:
-    """Return the moment of inertia [kg m^2] of a ball of water: only its mass is weighed."""
+    """Return the moment of inertia [kg m^2] of a ball of water of this mass."""
     radius = float(np.cbrt(0.75 * mass / (pi * _DENSITY)))
     return 0.4 * mass * radius * radius
 

@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Controller and plant in one process, for lock-step.
 
-These are the nodes of the two processes, with the same topics and messages. The middleware hands a
-message to a node of the same process without the network, and no process waits to be scheduled:
-in lock-step, where each waits for the other, a sample takes a fraction of the time.
+These are the nodes of the two processes, with the same topics and messages. The
+middleware hands a message to a node of the same process without the network, and no
+process waits to be scheduled: in lock-step, where each waits for the other, a sample
+takes a fraction of the time.
 """
 
 from __future__ import annotations

@@ -41,10 +41,11 @@ _PREPARED = 8  # changes kept
 
 
 def declare(node: Node, cls: type[Config]) -> Config:
-    """Declare all parameters of a configuration, and return the one the node was started with.
+    """Declare all parameters of a configuration, and return the one to start with.
 
-    Waits for a URDF that comes from a topic. Raises ConfigurationError with all problems of the
-    files and arguments the node was started with; no parameter is declared in that case.
+    Waits for a URDF that comes from a topic. Raises ConfigurationError with all
+    problems of the files and arguments the node was started with; no parameter is
+    declared in that case.
     """
     given = _overrides(node, cls)
     if str(given.get('robot.urdf', '')).startswith(TOPIC):
@@ -93,13 +94,14 @@ def on_change(
 ) -> LateAnswers:
     """Accept parameter changes while the node runs: all changes of a request or none.
 
-    Call it after `declare`. A request is validated as the complete resulting configuration,
-    and rejected with the reasons if that is invalid, or if `problems` finds that the node cannot
-    accept it now. `apply` receives the new configuration once it is in effect, and must not fail.
+    Call it after `declare`. A request is validated as the complete resulting
+    configuration, and rejected with the reasons if that is invalid, or if `problems`
+    finds that the node cannot accept it now. `apply` receives the new configuration
+    once it is in effect, and must not fail.
 
-    `check`, for what takes long, returns reasons against a change from one configuration to
-    another. With it the node's services build and check a change in a thread: poll what is
-    returned.
+    `check`, for what takes long, returns reasons against a change from one
+    configuration to another. With it the node's services build and check a change in a
+    thread: poll what is returned.
     """
     names = {parameter.name for parameter in parameters(cls)}
     changes = _Changes(read(node, cls), check)
@@ -154,7 +156,7 @@ class _Change(NamedTuple, Generic[Config]):
 
 
 class _Changes(Generic[Config]):
-    """The configuration in force, the one that was checked last, and changes that are prepared."""
+    """The configuration in force, the last checked one, and prepared changes."""
 
     def __init__(
         self, config: Config, check: Callable[[Config, Config], list[str]] | None
@@ -165,7 +167,7 @@ class _Changes(Generic[Config]):
         self._prepared: tuple[_Change[Config], ...] = ()
 
     def prepare(self, before: Config, values: dict[str, Any]) -> _Change[Config]:
-        """Build and check a change; raises ConfigurationError with the problems of its values."""
+        """Build and check a change; raise ConfigurationError with its problems."""
         after = change(before, values)
         found = self._check(before, after) if self._check else []
         prepared = _Change(before, values, after, found)
@@ -173,7 +175,7 @@ class _Changes(Generic[Config]):
         return prepared
 
     def find(self, values: dict[str, Any]) -> _Change[Config]:
-        """Return a change of the configuration in force, which is prepared unless it has been."""
+        """Return a change of the configuration in force, prepared only once."""
         for each in self._prepared:
             if each.before is self.config and each.values == values:
                 return each
@@ -183,7 +185,8 @@ class _Changes(Generic[Config]):
 def descriptor(parameter: Parameter) -> ParameterDescriptor:
     """Return what `ros2 param describe` shows for a parameter.
 
-    Its range is told as a constraint, since those of ROS are inclusive, and not for lists.
+    Its range is told as a constraint, since those of ROS are inclusive, and not for
+    lists.
     """
     symbol = f'{parameter.symbol}: ' if parameter.symbol else ''
     unit = f' [{parameter.unit}]' if parameter.unit else ''
@@ -201,8 +204,8 @@ def _fixed(parameter: Parameter) -> str:
 def _overrides(node: Node, cls: type[Config]) -> dict[str, Any]:
     """Return the values the node was started with, without parameters of other nodes.
 
-    rclpy does not show which section a value comes from, so parameters of any node of the package
-    are accepted, as in a section for several nodes.
+    rclpy does not show which section a value comes from, so parameters of any node of
+    the package are accepted, as in a section for several nodes.
     """
     own = {parameter.name: parameter for parameter in parameters(cls)}
     known = known_names()
@@ -223,7 +226,7 @@ TIMEOUT = 60  # s
 
 
 def wait_for_description(node: Node, name: str) -> str:
-    """Return the URDF from a topic, resolving its name for the node; a signal ends the process.
+    """Return the URDF from a topic of the node; a signal ends the process.
 
     Raises ConfigurationError if none is received within a minute.
     """

@@ -1,17 +1,19 @@
 # SPDX-License-Identifier: Apache-2.0
 """The node `sim_plant`: the simulated arm and the time base of the loop.
 
-In lock-step, a step is taken when the torque for the last state has arrived: deterministic, and as
-fast as the machine allows. In real time, a step is taken each sample time of the steady clock; if
-the new torque is late, the last one is held and the delay published, but a torque older than
-`actuator.command_timeout` is not applied. The arm is braked until the first torque arrives.
+In lock-step, a step is taken when the torque for the last state has arrived:
+deterministic, and as fast as the machine allows. In real time, a step is taken each
+sample time of the steady clock; if the new torque is late, the last one is held and the
+delay published, but a torque older than `actuator.command_timeout` is not applied. The
+arm is braked until the first torque arrives.
 
-Load, events, disturbance and encoder offsets can be changed at run time, from the next sample
-on; `~/changes` publishes the time, so that an event at that time repeats the run.
+Load, events, disturbance and encoder offsets can be changed at run time, from the next
+sample on; `~/changes` publishes the time, so that an event at that time repeats the
+run.
 
-A reset returns the arm to its start, which no real arm does by itself. The node therefore also
-resets the controller, if there is one, before it sends the first state and, in real time, at the
-end of its duration.
+A reset returns the arm to its start, which no real arm does by itself. The node
+therefore also resets the controller, if there is one, before it sends the first state
+and, in real time, at the end of its duration.
 """
 
 from __future__ import annotations
@@ -121,7 +123,7 @@ class PlantNode(LoopNode[PlantConfig]):
             description.publish(String(data=urdf_of(self.config)))
 
     def activate(self) -> None:
-        """Send the present state once a controller subscribes, and continue with its torque."""
+        """Send the present state once a controller subscribes, then use its torque."""
         self._peers = self._wait_for_peers(reset=False)
         self.get_logger().info(f'{self.config.mode}, waiting for a controller')
 
@@ -143,7 +145,7 @@ class PlantNode(LoopNode[PlantConfig]):
         process.drain(self._outputs.values())
 
     def reset(self) -> str:
-        """Return the arm to its start, braked, and reset the controller before the first state."""
+        """Return the arm to its start, braked, and then reset the controller."""
         self._start_stamp = self.stamp + _BETWEEN_RUNS
         self.deactivate()
         self.plant.reset()
@@ -175,8 +177,9 @@ class PlantNode(LoopNode[PlantConfig]):
     def _wait_for_peers(self, *, reset: bool) -> Iterator[bool]:
         """Yield True until the first state can be sent.
 
-        With `reset`, the wait also lets torques of the previous run expire, and the controller is
-        reset if it offers the service; any other controller must be reset by hand.
+        With `reset`, the wait also lets torques of the previous run expire, and the
+        controller is reset if it offers the service; any other controller must be reset
+        by hand.
         """
         settled = inf
         while self._now() < settled:
@@ -199,7 +202,7 @@ class PlantNode(LoopNode[PlantConfig]):
             )
 
     def _reset_controller(self) -> Any:
-        """Request a reset of the controller; return the future, or None without such a service."""
+        """Request a reset of the controller; return the future, or None."""
         ready = self._controller.service_is_ready()
         return self._controller.call_async(Trigger.Request()) if ready else None
 
@@ -335,7 +338,7 @@ class PlantNode(LoopNode[PlantConfig]):
         self.config = config
 
     def _apply_changes(self) -> None:
-        """Apply changed parameters at the present sample, which is not published yet."""
+        """Apply changed parameters at the present sample, before it is published."""
         if not self._changed:
             return
         self.plant.change(plant_settings(self.config))
@@ -343,7 +346,7 @@ class PlantNode(LoopNode[PlantConfig]):
         self._changed = {}
 
     def _report(self) -> None:
-        """Publish diagnostics; the level depends on what happened since the last report."""
+        """Publish diagnostics, with a level for all since the last report."""
         rejected = self.input.rejected
         values = {
             'rejected commands': rejected,

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The node `rosbag2_player`: publishes a bag's messages where no `ros2 bag play` is at hand."""
+"""The node `rosbag2_player`: publishes a bag's messages without `ros2 bag play`."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from blf_dsc_controller.nodes.endpoints import message_class, qos_profile
 
 
 class PlayerNode(Node):
-    """Publishes an open bag, latched where it was; messages are read as they are played."""
+    """Publishes an open bag while it is read, latched where it was."""
 
     def __init__(self, bag: OpenBag, **options: Any) -> None:
         super().__init__('rosbag2_player', start_parameter_services=False, **options)

@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Running nodes as a process: arguments, scheduling, spinning, and the right exit code.
 
-Arguments are checked for mistakes that ROS ignores, and `-p` is put before files: of all sections
-that match a node, ROS uses the last in the order in which their names first appear, so a section
-`/**/sim_plant` of a file would override `-p`, which belongs to `/**`.
+Arguments are checked for mistakes that ROS ignores, and `-p` is put before files: of
+all sections that match a node, ROS uses the last in the order in which their names
+first appear, so a section `/**/sim_plant` of a file would override `-p`, which belongs
+to `/**`.
 """
 
 from __future__ import annotations
@@ -49,7 +50,8 @@ def interrupted() -> bool:
 class PlainNode(Node):
     """A node for `run`.
 
-    It sets `finished` once it has nothing more to do, with `failure` if it cannot continue.
+    It sets `finished` once it has nothing more to do, with `failure` if it cannot
+    continue.
     """
 
     finished = False
@@ -59,27 +61,28 @@ class PlainNode(Node):
         """Save data and release resources while ROS is still up."""
 
     def ready_to_end(self) -> bool:
-        """Return whether the process may end after a signal; called again and again until then."""
+        """Return whether the process may end after a signal; called repeatedly."""
         return True
 
     def survive(self, error: Exception) -> bool:  # noqa: ARG002
-        """Return whether the node continues after an error that escaped from a callback."""
+        """Return whether the node continues after an error in a callback."""
         return False
 
 
 def run(*make_nodes: Callable[[], PlainNode]) -> int:
     """Run nodes until one finishes or fails, or the process receives a signal.
 
-    Those made last are closed first. Only a node that runs alone survives errors of its callbacks.
-    Returns the exit code: 0 at the end or on SIGINT and SIGTERM, 1 after an error, which is printed
-    to stderr.
+    Those made last are closed first. Only a node that runs alone survives errors of its
+    callbacks. Returns the exit code: 0 at the end or on SIGINT and SIGTERM, 1 after an
+    error, which is printed to stderr.
     """
     nodes: list[PlainNode] = []
     problem = ''
     with ExitStack() as ending:
         for number in (signal.SIGINT, signal.SIGTERM):
             signal.signal(number, lambda number, _: _signals.append(number))
-            # ros2 launch forwards the terminal's signal: the second copy arrives at the end.
+            # ros2 launch forwards the terminal's signal: the second copy arrives at the
+            # end.
             ending.callback(signal.signal, number, signal.SIG_IGN)
         try:
             refuse_unknown(sys.argv)
@@ -92,7 +95,8 @@ def run(*make_nodes: Callable[[], PlainNode]) -> int:
                     nodes.append(make())
                     ending.callback(_close, nodes[-1])
                     executor.add_node(nodes[-1])
-                # What is loaded by now stays: scanning it again would stall the loop for 0.1 s.
+                # What is loaded by now stays: scanning it again would stall the loop
+                # for 0.1 s.
                 gc.collect()
                 gc.freeze()
                 while not _is_over(nodes):
@@ -116,7 +120,7 @@ def _is_over(nodes: list[PlainNode]) -> bool:
 
 
 def spin_once(executor: Any, *nodes: PlainNode) -> None:
-    """Wait for work and execute it; an error is raised unless the only node survives it."""
+    """Wait for work and execute it; raise errors that the only node does not survive."""
     try:
         executor.spin_once(timeout_sec=_POLL)
     except RCLError:
@@ -138,7 +142,7 @@ def _close(node: PlainNode) -> None:
 
 
 def drain(publishers: Iterable[Publisher]) -> None:
-    """Wait until every subscriber has received what was published, so that bags are complete."""
+    """Wait until every subscriber has received everything."""
     deadline = time.monotonic() + _DRAIN_TIMEOUT
     for publisher in publishers:
         left = max(0.0, deadline - time.monotonic())
@@ -159,7 +163,8 @@ def refuse_unknown(argv: Sequence[str]) -> None:
 def check_sections(argv: Sequence[str], node: str) -> list[str]:
     """Return remarks on sections of parameter files that no node of this package reads.
 
-    Raises ConfigurationError if a section meant for `node` (a full name) does not match it.
+    Raises ConfigurationError if a section meant for `node` (a full name) does not match
+    it.
     """
     remarks = []
     for path in parameter_files(argv):
@@ -179,7 +184,7 @@ def parameter_files(argv: Sequence[str]) -> list[str]:
 
 
 def assigned(argv: Sequence[str]) -> dict[str, object]:
-    """Return the values of `-p name:=value`; those prefixed with a node name are left to ROS."""
+    """Return the values of `-p name:=value`, except those for one node."""
     given: dict[str, object] = {}
     for option, rule in _ros_options(argv):
         name, _, value = rule.partition(':=')

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The node `bag_recorder`: records every message of the chosen topics without decoding it."""
+"""The node `bag_recorder`: records messages without decoding them."""
 
 from __future__ import annotations
 
@@ -63,7 +63,8 @@ class RecentMessages:
 class BagRecorderNode(PlainNode):
     """Subscribes to topics as they appear and records their messages.
 
-    Raises ConfigurationError if a parameter is invalid, BagError if the bag's folder exists.
+    Raises ConfigurationError if a parameter is invalid, BagError if the bag's folder
+    exists.
     """
 
     def __init__(self, **options: Any) -> None:
@@ -84,7 +85,8 @@ class BagRecorderNode(PlainNode):
         self._plant_time = -1  # ns; -1 before the first joint state
         create_steady_timer(self, _DISCOVERY_PERIOD, self._discover)
         PollingTimer(self, _TAKE_PERIOD, self._record)
-        # The folder is created last: from here on, any end of the node also completes the bag.
+        # The folder is created last: from here on, any end of the node also completes
+        # the bag.
         self._bag = BagWriter(
             self._config.output,
             compression=self._config.compression,
@@ -121,10 +123,10 @@ class BagRecorderNode(PlainNode):
                 self._offer_topic(topic, types)
 
     def _follow_unreliable(self, topic: str, type_name: str) -> None:
-        """Subscribe a second time where a best-effort publisher has joined reliable ones.
+        """Subscribe again where a best-effort publisher has joined reliable ones.
 
-        A reliable subscription gets nothing from it, and a best-effort one may lose messages of
-        the others: both are kept, and what arrives twice is recorded once.
+        A reliable subscription gets nothing from it, and a best-effort one may lose
+        messages of the others: both are kept, and what arrives twice is recorded once.
         """
         count = self.count_publishers(topic)
         if count == self._publisher_counts.get(topic):
@@ -179,7 +181,7 @@ class BagRecorderNode(PlainNode):
         self.get_logger().warning(f'{topic} is not recorded: {reason}')
 
     def _record(self, *, flush: bool = False) -> bool:
-        """Write the waiting messages, and flush them to disk: all with `flush`, else those due.
+        """Write the waiting messages and flush them: all with `flush`, else those due.
 
         Returns whether there were so many that more are due soon.
         """
@@ -207,7 +209,7 @@ class BagRecorderNode(PlainNode):
         return recent is None or recent.add(message)
 
     def _timed(self, messages: list[RawMessage]) -> list[RawMessage]:
-        """Return messages as they are logged: where the plant is the clock, in its time.
+        """Return messages with log times, those of the plant if it is the clock.
 
         That is the stamp of the last joint state; until the first one, messages wait.
         """

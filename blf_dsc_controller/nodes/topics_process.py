@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The process of the topics of `blf_dsc drive --ros`: the controller's node without its loop.
+"""The process of the topics of `blf_dsc drive --ros`.
 
-It publishes what the loop sends, and sends the loop what arrives: trajectories, streamed positions
-and stops. It ends with the connection.
+It publishes what the loop sends, and sends the loop what arrives: trajectories,
+streamed positions and stops. It ends with the connection.
 """
 
 from __future__ import annotations

@@ -1,14 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The node `torque_watchdog`: the safe torque when the controller's process is dead or stopped.
+"""The node `torque_watchdog`: the safe torque if the controller is dead.
 
-Effort controllers hold the last torque for ever. When commands stop while joint states go on, this
-node commands the safe torque of the controller's configuration until the controller is back. It
-reads that configuration, each change of it, and whether a silence is meant from the controller's
-journal, so it needs no parameters of the arm; only if it is `armed`, to take over from a controller
-that has died before, it needs the parameter file.
+Effort controllers hold the last torque for ever. When commands stop while joint states
+go on, this node commands the safe torque of the controller's configuration until the
+controller is back. It reads that configuration, each change of it, and whether a
+silence is meant from the controller's journal, so it needs no parameters of the arm;
+only if it is `armed`, to take over from a controller that has died before, it needs the
+parameter file.
 
-Its own torques carry a label, by which it tells them from those of the controller under any
-middleware.
+Its own torques carry a label, by which it tells them from those of the controller under
+any middleware.
 """
 
 from __future__ import annotations
@@ -54,7 +55,7 @@ _BACK_IN_COMMAND = (EventType.CONFIGURE, EventType.ACTIVATE, EventType.RESET)
 
 
 class WatchdogNode(PlainNode):
-    """Publishes the safe torque on the controller's `~/commands` while the controller cannot.
+    """Publishes the safe torque on `~/commands` while the controller cannot.
 
     `steady` is its clock [ns].
 
@@ -95,7 +96,7 @@ class WatchdogNode(PlainNode):
             self.get_logger().info(f'waiting for {self._controller}')
 
     def close(self) -> None:
-        """Leave the torque that a driver may hold, if this node was the one to command it."""
+        """Leave a torque that a driver may hold, if this node commanded last."""
         if self.watchdog is not None:
             self._publish(self.watchdog.leave())
             drain([self._output])
@@ -212,7 +213,7 @@ class WatchdogNode(PlainNode):
             self.get_logger().warning(f'ignored: {error}', throttle_duration_sec=10.0)
 
     def _change_command(self, watchdog: TorqueWatchdog) -> None:
-        """Report who commands from now on, and poll at the limit of the torque's rate."""
+        """Report who commands now, and poll as fast as the torque's rate needs."""
         period = _PERIOD
         if watchdog.active:
             period = min(_PERIOD, watchdog.config.sample_time)

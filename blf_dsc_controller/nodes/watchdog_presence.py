@@ -7,7 +7,7 @@ _GRACE = 10  # looks in vain, until one that was promised but never seen is miss
 
 
 class WatchdogPresence:
-    """Follows whether a watchdog is there; one that has been seen once is expected from then on.
+    """Follows whether a watchdog is present; once seen, it is expected.
 
     Attributes:
         is_missing: whether one is expected, but not there.
@@ -31,7 +31,7 @@ class WatchdogPresence:
         )
 
     def look(self, *, there: bool) -> bool:
-        """Note whether one is there now; return whether it has become missing by that."""
+        """Note whether one is present; return whether it has just disappeared."""
         was_missing = self.is_missing
         self._seen = self._seen or there
         self._absences = 0 if there else self._absences + 1

@@ -1,10 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The configured reference, the approach to it from the present position, and limits of motions.
+"""The configured reference, the approach to it, and limits of motions.
 
-The reference is blended into the present motion (see `terms`), starting at t0, in the shortest time
-that keeps the limits, found in 10 % steps and refined by bisection.  A blend exceeds the speed of
-its parts only by a multiple of their distance over its duration, so one exists if both parts stay
-strictly within the limits and their distance is finite.
+The reference is blended into the present motion (see `terms`), starting at t0, in the
+shortest time that keeps the limits, found in 10 % steps and refined by bisection.  A
+blend exceeds the speed of its parts only by a multiple of their distance over its
+duration, so one exists if both parts stay strictly within the limits and their distance
+is finite.
 """
 
 from __future__ import annotations
@@ -36,7 +37,7 @@ _STEP = 1.1
 _BISECTIONS = 5
 _PAST = 0.1  # rad, tolerance of the position limits
 _BRAKE = 3.0
-"""Braking from v in the time h takes up to 1.5 v / h, so that h = 3 v / limit takes half of it."""
+"""Braking from v in the time h takes up to 1.5 v / h: h = 3 v / limit takes half."""
 _PERIOD = 0.005  # s, between two checked samples
 _FEWEST_CHECKED = 200  # samples, for short motions
 _MOST_CHECKED = 1_000_000  # samples, for very long ones
@@ -81,7 +82,7 @@ class MotionError(BlfDscError):
 
 
 def check_times(begin: float, end: float) -> np.ndarray:
-    """Return times from `begin` to `end` [s], dense enough to catch the largest velocity."""
+    """Return times from `begin` to `end` [s], dense enough for peak velocities."""
     count = 1 + (end - begin) / _PERIOD
     return np.linspace(begin, end, int(min(max(_FEWEST_CHECKED, count), _MOST_CHECKED)))
 
@@ -129,14 +130,14 @@ def hold(position: np.ndarray) -> Term:
 
 
 def braking_time(dq: np.ndarray, config: ControllerConfig) -> float:
-    """Return the time [s] to come to rest from dq (n,) [rad/s], within half of the limits."""
+    """Return the time [s] to rest from dq (n,) [rad/s], with half of the limits."""
     return max(
         _SHORTEST, float(np.max(_BRAKE * np.abs(dq) / config.limits.acceleration))
     )
 
 
 def stop(t0: float, q: np.ndarray, dq: np.ndarray, config: ControllerConfig) -> Term:
-    """Return the term that comes to rest from q (n,) [rad] and dq (n,) [rad/s] at t0 [s]."""
+    """Return the term that comes to rest from q (n,) [rad], dq (n,) [rad/s] at t0."""
     h = braking_time(dq, config)
     points = np.zeros((3, 2, q.size))
     points[0] = q, q + 0.5 * h * dq
@@ -191,7 +192,7 @@ def blend(
 
 
 def reference_of(config: ControllerConfig) -> np.ndarray:
-    """Pack the configured reference; `hold` is at reference.offset until `plan_start`."""
+    """Pack the configured reference; `hold` is at reference.offset at first."""
     reference = config.reference
     if reference.type == 'hold':
         term = hold(np.array(reference.offset))
@@ -213,13 +214,14 @@ def check_takeover(
     reference_vector: np.ndarray,
     t: float = 0.0,
 ) -> None:
-    """Check that the law can take over an arm at q (n,) [rad] with dq (n,) [rad/s] at time t [s].
+    """Check that the law can take over an arm at q, dq (n,) at time t [s].
 
-    A velocity difference v increases the error |xi1| by v^2 / (2 a) until it is removed at the
-    acceleration a of `limits`: the error must stay inside the bound k(t) (n,) [rad].
+    A velocity difference v increases the error |xi1| by v^2 / (2 a) until it is removed
+    at the acceleration a of `limits`: the error must stay inside the bound k(t) (n,)
+    [rad].
 
-    Raises StartError if an error is already outside its bound, where the law is undefined, or if it
-    would leave it.
+    Raises StartError if an error is already outside its bound, where the law is
+    undefined, or if it would leave it.
     """
     qr, dqr, ddqr = np.zeros((3, q.size))
     evaluate(reference_vector, t, qr, dqr, ddqr)
@@ -245,7 +247,7 @@ def check_takeover(
 def _via_centre(
     begin: Sequence[Term], target: Term, t: float, config: ControllerConfig
 ) -> BlendedReference | None:
-    """Plan an approach to fast sinusoids that rests at their centre first; None if impossible."""
+    """Plan an approach to fast sinusoids via rest at their centre, or None."""
     if config.reference.type != 'sinusoids':
         return None
     try:
@@ -257,7 +259,7 @@ def _via_centre(
 
 
 def _check_limits(config: ControllerConfig, q: np.ndarray) -> None:
-    """Check that the arm can be held at q (n,) [rad], at most `_PAST` past its limits."""
+    """Check that the arm at q (n,) [rad] is at most `_PAST` past its limits."""
     limits = zip(
         config.limits.position_lower, config.limits.position_upper, strict=True
     )
@@ -277,10 +279,10 @@ def plan_start(
     dq: np.ndarray,
     t: float = 0.0,
 ) -> BlendedReference:
-    """Plan the configured reference, with an approach unless the law can take over at once.
+    """Plan the configured reference, with an approach if it is needed.
 
-    At time t [s], the arm is at q (n,) [rad] with dq (n,) [rad/s], and the bound is `bound` (n,)
-    [rad].
+    At time t [s], the arm is at q (n,) [rad] with dq (n,) [rad/s], and the bound is
+    `bound` (n,) [rad].
 
     Raises:
         StartError: the law cannot take over (`check_takeover`), and approach.enabled is false;

@@ -1,13 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """Motions from a moving state: time-optimal to a target, along a line, to rest.
 
-They are lists of pieces, as splines are: a profile of limited jerk is cubic between the times at
-which its jerk changes. The library ruckig computes such profiles (Berscheid and Kroeger, 2021,
-doi:10.15607/RSS.2021.XVII.015). It is optional: without it, `braking` is a polynomial, and a target
-can only be reached in a given time.
+They are lists of pieces, as splines are: a profile of limited jerk is cubic between the
+times at which its jerk changes. The library ruckig computes such profiles (Berscheid
+and Kroeger, 2021, doi:10.15607/RSS.2021.XVII.015). It is optional: without it,
+`braking` is a polynomial, and a target can only be reached in a given time.
 
-A streamed target is a line that the reference joins, and follows for a while, since the next target
-is on its way; then the reference brakes. So every motion ends at rest by itself.
+A streamed target is a line that the reference joins, and follows for a while, since the
+next target is on its way; then the reference brakes. So every motion ends at rest by
+itself.
 """
 
 from __future__ import annotations
@@ -66,7 +67,7 @@ class TrajectoryError(MotionError):
 
 
 class Pieces(NamedTuple):
-    """A part of a motion: durations (k,) [s] and coefficients (k, n, 6) [rad/s^j] of its pieces."""
+    """Part of a motion: durations (k,) [s], coefficients (k, n, 6) [rad/s^j]."""
 
     durations: np.ndarray
     coefficients: np.ndarray
@@ -97,7 +98,7 @@ class PlannedMotion(NamedTuple):
 
 
 class Target(NamedTuple):
-    """A streamed target: a line through `positions` (n,) [rad] with `velocities` (n,) [rad/s]."""
+    """A streamed target: a line through positions (n,), with velocities (n,)."""
 
     positions: tuple[float, ...]
     velocities: tuple[float, ...]
@@ -112,7 +113,7 @@ def can_retarget() -> bool:
 
 
 def shifted(coefficients: np.ndarray, x: float) -> np.ndarray:
-    """Return the coefficients (n, 6) of the same polynomials about a point x [s] later."""
+    """Return coefficients (n, 6) of the same polynomials about x [s] later."""
     c: np.ndarray = coefficients.copy()
     for first in range(5):  # Horner's scheme, once for each derivative
         for j in range(4, first - 1, -1):
@@ -121,13 +122,13 @@ def shifted(coefficients: np.ndarray, x: float) -> np.ndarray:
 
 
 def state_at(vector: np.ndarray, t: float) -> np.ndarray:
-    """Return position, velocity and acceleration (3, n) of a packed reference at time t [s]."""
+    """Return position, velocity, acceleration (3, n) of a reference at t [s]."""
     state: np.ndarray = sampled(vector, np.array([t]))[0]
     return state
 
 
 def at_rest_after(t0: float, *parts: Pieces) -> Term:
-    """Return the term that begins at t0 [s], follows the parts, and stays where they end."""
+    """Return the term from t0 [s] that follows the parts and stays at their end."""
     durations = np.concatenate([part.durations for part in parts])
     coefficients = np.concatenate([part.coefficients for part in parts])
     knots = np.concatenate(([t0], t0 + np.cumsum(durations)))
@@ -143,7 +144,8 @@ def following(vector: np.ndarray, term: Term) -> np.ndarray:
 def quintic(begin: np.ndarray, end: np.ndarray, duration: float) -> Pieces:
     """Return the quintic between two states (3, n) in a time [s].
 
-    Where the acceleration at the end is NaN, it is that of the least jerk: the jerk ends at 0.
+    Where the acceleration at the end is NaN, it is that of the least jerk: the jerk
+    ends at 0.
     """
     end = end.copy()
     is_free = np.isnan(end[2])
@@ -165,9 +167,10 @@ def profile(
 ) -> Pieces:
     """Return the fastest motion of limited jerk from a state (3, n) to a target (2, n).
 
-    The target is a position and a velocity, to be reached with constant velocity; without one, the
-    motion comes to rest anywhere. All joints arrive together, after a `duration` [s] at least.
-    State, target and motion are given relative to a point that moves with `drift` (n,) [rad/s].
+    The target is a position and a velocity, to be reached with constant velocity;
+    without one, the motion comes to rest anywhere. All joints arrive together, after a
+    `duration` [s] at least. State, target and motion are given relative to a point that
+    moves with `drift` (n,) [rad/s].
 
     Raises:
         MotionError: there is none, or ruckig is not installed.
@@ -211,7 +214,7 @@ def profile(
 
 
 def _pieces_of(found: Any, state: np.ndarray) -> Pieces:
-    """Return a trajectory of ruckig from a state (3, n) as pieces common to all joints."""
+    """Return a trajectory of ruckig from a state (3, n) as common pieces."""
     joints = [_phases(each, *state[:, i]) for i, each in enumerate(found.profiles[0])]
     changes = np.unique(np.concatenate([times for times, _ in joints]))
     knots = changes[:-1][np.diff(changes) > 1e-12]
@@ -231,7 +234,7 @@ def _pieces_of(found: Any, state: np.ndarray) -> Pieces:
 
 
 def _phases(joint: Any, p: float, v: float, a: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return begins (k,) [s] of phases of constant jerk, and position to jerk (k, 4) there."""
+    """Return begins (k,) [s] and states (k, 4) of phases of constant jerk."""
     t, times, states = 0.0, [], []
     spans = [*joint.brake.t, *joint.t]
     for x, j in zip(spans, [*joint.brake.j, *joint.j], strict=True):
@@ -249,7 +252,7 @@ def _phases(joint: Any, p: float, v: float, a: float) -> tuple[np.ndarray, np.nd
 
 
 def braking(state: np.ndarray, config: ControllerConfig) -> Pieces:
-    """Return the motion from a state (3, n) to rest: the fastest one, or without ruckig a quintic.
+    """Return the fastest motion from a state (3, n) to rest.
 
     Within the limits, unless the state already exceeds them.
     """
@@ -278,7 +281,7 @@ def braking(state: np.ndarray, config: ControllerConfig) -> Pieces:
 def plan_stop(
     vector: np.ndarray, now: float, config: ControllerConfig
 ) -> PlannedMotion:
-    """Return a packed reference that equals `vector` until `now` [s], then brakes and holds."""
+    """Return a reference that is `vector` until `now` [s], then brakes and holds."""
     motion = braking(state_at(vector, now), config)
     stopped = following(vector, at_rest_after(now, motion))
     return PlannedMotion(stopped, now, now + motion.duration)
@@ -287,10 +290,10 @@ def plan_stop(
 def plan_target(
     target: Target, vector: np.ndarray, now: float, config: ControllerConfig
 ) -> PlannedMotion:
-    """Return a packed reference that equals `vector` until `now` [s], then follows a target.
+    """Return a reference that is `vector` until `now` [s], then goes to a target.
 
-    It joins the target's line when it is due, or as soon as the limits allow. Positions and
-    velocities past the limits are reduced to them.
+    It joins the target's line when it is due, or as soon as the limits allow. Positions
+    and velocities past the limits are reduced to them.
 
     Raises:
         TrajectoryError: it is not valid, ruckig is not installed, or the motion would leave the
@@ -310,7 +313,7 @@ def plan_target(
 
 
 class _Pursuit(NamedTuple):
-    """What a motion from the present state onto a moving target begins from and leads to."""
+    """Begin and end of a motion from the present state onto a moving target."""
 
     present: np.ndarray  # position, velocity, acceleration (3, n) of the reference now
     q: np.ndarray  # (n,) rad, of the target when it is due
@@ -320,7 +323,7 @@ class _Pursuit(NamedTuple):
     lead: float  # s from now, after which the motion should have joined the target
 
     def target_in(self, duration: float) -> np.ndarray:
-        """Return position and velocity (2, n) of the target, a duration [s] from now."""
+        """Return position and velocity (2, n) of the target in a duration [s]."""
         t = self.now + duration
         return np.stack((self.q + (t - self.due) * self.dq, self.dq))
 
@@ -353,10 +356,10 @@ def _plan_line(
 def _within_limits(
     target: Target, config: ControllerConfig
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return position and velocity (n,) of a target that the arm can reach and stop after.
+    """Return position and velocity (n,) of a target after which the arm can stop.
 
-    From v it stops, at acceleration a and jerk j, within v (v/a + a/j)/2, after it has followed the
-    line for a while.
+    From v it stops, at acceleration a and jerk j, within v (v/a + a/j)/2, after it has
+    followed the line for a while.
     """
     limits = config.limits
     lower, upper = np.array((limits.position_lower, limits.position_upper))
@@ -373,8 +376,8 @@ def _within_limits(
 def _joined(pursuit: _Pursuit, config: ControllerConfig) -> Pieces:
     """Return the motion onto a moving target.
 
-    If the smoothest one exceeds a limit, it is the fastest one of limited jerk, relative to the
-    target.
+    If the smoothest one exceeds a limit, it is the fastest one of limited jerk,
+    relative to the target.
     """
     free = np.full((1, pursuit.present.shape[1]), nan)
     for factor in _SMOOTH_LEADS:
@@ -391,8 +394,8 @@ def _joined(pursuit: _Pursuit, config: ControllerConfig) -> Pieces:
 def _caught_up(pursuit: _Pursuit, config: ControllerConfig) -> Pieces:
     """Return the fastest motion of limited jerk onto a moving target.
 
-    It is found relative to the target. One that is as fast as the arm may be can not be caught up
-    with: the motion then ends where the target was a while before.
+    It is found relative to the target. One that is as fast as the arm may be can not be
+    caught up with: the motion then ends where the target was a while before.
     """
     lead = pursuit.lead
     begin = pursuit.target_in(0.0)
@@ -432,7 +435,7 @@ def _straight(begin: np.ndarray, duration: float) -> Pieces:
 def keeps_limits(
     motion: Pieces, config: ControllerConfig, *, with_jerk: bool = True
 ) -> bool:
-    """Whether a motion of one piece keeps the limits on velocity, acceleration and jerk."""
+    """Whether a motion of one piece keeps velocity, acceleration and jerk limits."""
     limits = config.limits
     largest = [limits.velocity, limits.acceleration]
     if with_jerk:
@@ -452,7 +455,7 @@ def keeps_limits(
 def _check_positions(
     term: Term, begin: float, end: float, config: ControllerConfig
 ) -> None:
-    """Raise MotionError if a motion goes past the position limits, or further than it begins."""
+    """Raise MotionError if a motion goes further past the limits than it begins."""
     lower, upper = np.array(
         (config.limits.position_lower, config.limits.position_upper)
     )

@@ -1,13 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """Streams of targets: when each was sent, and with which velocity the sender moves.
 
-The messages carry no time, and arrive late, early or not at all. Their sender is taken to be
-periodic: the arrivals are numbered, each by the whole intervals since the one before, and a line of
-least squares through them is its clock. A velocity that the sender does not give is the mean of the
-last `_SPAN`, at least of the last interval.
+The messages carry no time, and arrive late, early or not at all. Their sender is taken
+to be periodic: the arrivals are numbered, each by the whole intervals since the one
+before, and a line of least squares through them is its clock. A velocity that the
+sender does not give is the mean of the last `_SPAN`, at least of the last interval.
 
-The reference is at a target one interval after it was sent, when the next one is due: it then
-interpolates and never has to guess what the sender will do.
+The reference is at a target one interval after it was sent, when the next one is due:
+it then interpolates and never has to guess what the sender will do.
 """
 
 from __future__ import annotations
@@ -120,7 +120,8 @@ class TargetStream:
     def _velocity(self, fastest: np.ndarray) -> np.ndarray:
         """Return the velocity (n,) [rad/s] at the last target; zero after a step.
 
-        It is the slope of the parabola through the last target and two before, or of the line.
+        It is the slope of the parabola through the last target and two before, or of
+        the line.
         """
         if self.interval == 0.0:
             return np.zeros_like(fastest)
@@ -135,7 +136,7 @@ class TargetStream:
         return velocity
 
     def _slope(self, intervals: int) -> tuple[float, np.ndarray]:
-        """Return the time since a target at least so long ago, or the first, and the mean rise.
+        """Return time and mean rise since a target at least so long ago.
 
         Both in intervals.
         """
@@ -146,7 +147,7 @@ class TargetStream:
 
 
 def _whole_intervals(gaps: np.ndarray) -> np.ndarray:
-    """Return by how many intervals (k,) messages are apart from gaps between arrivals (k,).
+    """Return how many intervals (k,) messages are apart, from gaps (k,).
 
     Messages that arrive together were no losses in the gap before.
     """

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A trajectory that is sent while the controller runs and replaces the present reference.
+"""A trajectory that replaces the present reference at run time.
 
 It is interpolated as by joint_trajectory_controller, except where that would jump:
 
@@ -7,17 +7,18 @@ It is interpolated as by joint_trajectory_controller, except where that would ju
     positions, velocities                  cubic from point to point
     positions only                         minimum jerk through all points, at rest at the last one
 
-(That controller joins bare positions by straight lines, so the velocity jumps at each point.)  The
-motion to the first point starts from the position, velocity and acceleration of the reference when
-the trajectory begins, and brakes while it sets out from where the braking ends, so that a long time
-to that point does not make the arm swing away; if the first point is at that very time, the
-trajectory is blended into the present reference as fast as the limits allow.  Points in the past
-are skipped.  The last point is held, or the reference brakes after it if it has a velocity.
+(That controller joins bare positions by straight lines, so the velocity jumps at each
+point.)  The motion to the first point starts from the position, velocity and
+acceleration of the reference when the trajectory begins, and brakes while it sets out
+from where the braking ends, so that a long time to that point does not make the arm
+swing away; if the first point is at that very time, the trajectory is blended into the
+present reference as fast as the limits allow.  Points in the past are skipped.  The
+last point is held, or the reference brakes after it if it has a velocity.
 
-What would exceed the limits takes longer: a path that is too fast is stretched, a single point is
-reached as soon as possible, and a path whose first points are too close to reach in time is joined
-later. To bound the time of planning, a trajectory longer than `LONGEST` or with more than
-`MOST_POINTS` is rejected.
+What would exceed the limits takes longer: a path that is too fast is stretched, a
+single point is reached as soon as possible, and a path whose first points are too close
+to reach in time is joined later. To bound the time of planning, a trajectory longer
+than `LONGEST` or with more than `MOST_POINTS` is rejected.
 """
 
 from __future__ import annotations
@@ -101,10 +102,11 @@ class Trajectory(NamedTuple):
 def plan_trajectory(
     trajectory: Trajectory, vector: np.ndarray, now: float, config: ControllerConfig
 ) -> PlannedMotion:
-    """Return a packed reference that equals `vector` until `now` [s], then follows the trajectory.
+    """Return a reference that is `vector` until `now` [s], then the trajectory.
 
-    It holds all of `vector` that has an effect before, at any earlier time: `now` may lie ahead,
-    where a reference is in force that has not begun yet. `remaining` removes what is past.
+    It holds all of `vector` that has an effect before, at any earlier time: `now` may
+    lie ahead, where a reference is in force that has not begun yet. `remaining` removes
+    what is past.
 
     Raises:
         TrajectoryError: it is not valid, too late, or leaves the position limits.
@@ -138,7 +140,7 @@ def _in_time(
     points: np.ndarray,
     config: ControllerConfig,
 ) -> PlannedMotion:
-    """Return the motion that passes the points at their times; MotionError past a limit."""
+    """Return the motion that passes the points in time; MotionError past a limit."""
     n = len(config.joints)
     end = float(times[-1])
     if times[0] > t0:
@@ -189,7 +191,7 @@ def _as_soon_as_possible(
     points: np.ndarray,
     config: ControllerConfig,
 ) -> PlannedMotion:
-    """Return the motion along the path of the points that is as fast as the limits allow."""
+    """Return the fastest motion along the path within the limits."""
     n = len(config.joints)
     present = sampled(pack(n, before), np.array([t0]))[0]
     try:
@@ -225,7 +227,7 @@ def _as_soon_as_possible(
 def _moving_chunk(
     times: np.ndarray, points: np.ndarray, config: ControllerConfig
 ) -> Term:
-    """Return the path through bare positions of an arm that moves at the first and the last one.
+    """Return the path through positions of an arm that moves at both ends.
 
     It returns to the last one afterwards. MotionError if that exceeds a limit.
     """
@@ -251,9 +253,10 @@ def _moving_chunk(
 def _stretched(
     t0: float, times: np.ndarray, points: np.ndarray, config: ControllerConfig
 ) -> tuple[np.ndarray, Term]:
-    """Return times and path of the points, slowed down until the path keeps the limits."""
+    """Return times and path of the points, slowed down to keep the limits."""
     n = len(config.joints)
-    # between the times checked here and those checked at the end, velocities may be higher
+    # between the times checked here and those checked at the end, velocities may be
+    # higher
     velocity = tuple(_BELOW * each for each in config.limits.velocity)
     within = replace(config, limits=replace(config.limits, velocity=velocity))
     factor = 1.0
@@ -282,7 +285,7 @@ def _from(path: Term, t: float, n: int) -> Pieces:
 
 
 def _braked(term: Term, points: np.ndarray, config: ControllerConfig) -> Term:
-    """Return a spline through points that brakes after the last one if that has a velocity."""
+    """Return a spline through points; it brakes after a last one with velocity."""
     if len(points) == 1 or not np.any(points[1, -1]):
         return term
     n = len(config.joints)
@@ -302,7 +305,7 @@ def _braked(term: Term, points: np.ndarray, config: ControllerConfig) -> Term:
 
 
 def _times_to_check(term: Term, begin: float, end: float, n: int) -> np.ndarray:
-    """Return times [s] of all extremes of its acceleration, and of its velocity closely."""
+    """Return times [s] of extremes of its acceleration, and nearly its velocity."""
     turning = turning_times(term, n)
     inside = (turning >= begin) & (turning < end)
     return np.concatenate((check_times(begin, end), turning[inside]))
@@ -311,7 +314,7 @@ def _times_to_check(term: Term, begin: float, end: float, n: int) -> np.ndarray:
 def _remaining_points(
     trajectory: Trajectory, joints: tuple[str, ...], begin: float, t0: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return times (k,) [s] and fields (1 to 3, k, n) of points from t0 on, in the given order."""
+    """Return times (k,) [s] and fields (1 to 3, k, n) of points from t0 on."""
     order = [trajectory.joints.index(joint) for joint in joints]
     times = np.array([begin + point.time for point in trajectory.points])
     given = [
@@ -324,7 +327,7 @@ def _remaining_points(
 
 
 def _through_points(times: np.ndarray, points: np.ndarray) -> Term:
-    """Return a term through the points (1 to 3, k, n) that holds the first and the last one."""
+    """Return a term through points (1 to 3, k, n) that holds at both ends."""
     if len(points) == 1:
         return minimum_jerk(times, points[0])
     if len(points) == 3:
@@ -342,8 +345,8 @@ def _from_state(
 ) -> Term:
     """Return a term from the present qr, dqr, ddqr (3, n) at t0 [s] through the points.
 
-    It brakes gently (`braking_time`), but within the time to the first point; as gently as possible
-    if the limits cannot be kept otherwise.
+    It brakes gently (`braking_time`), but within the time to the first point; as gently
+    as possible if the limits cannot be kept otherwise.
     """
     longest = float(times[0]) - t0
     if len(points) == 1 and longest <= _SMOOTH:
@@ -364,10 +367,10 @@ def _from_state(
 def _braking(
     present: np.ndarray, t0: float, times: np.ndarray, points: np.ndarray, h: float
 ) -> Term:
-    """Return a term through the points that brakes within h [s], the sum of two motions.
+    """Return a term through the points that brakes within h [s].
 
-    One leaves from rest at the position where the braking ends, the other brakes to there: its
-    velocity is the cubic from dqr to 0 with the slopes ddqr and 0.
+    One leaves from rest at the position where the braking ends, the other brakes to
+    there: its velocity is the cubic from dqr to 0 with the slopes ddqr and 0.
     """
     n = present.shape[1]
     rest = np.zeros((3, n))
@@ -392,7 +395,7 @@ def _braking(
 def _from_rest(
     rest: np.ndarray, t0: float, times: np.ndarray, points: np.ndarray
 ) -> Term:
-    """Return a term from rest (3, n) at t0 [s] through the points, with a quintic to the first."""
+    """Return a term from rest (3, n) at t0 [s] through the points."""
     knots = np.concatenate(([t0], times))
     path = _through_points(
         knots, np.concatenate((rest[: len(points), np.newaxis], points), axis=1)
@@ -408,7 +411,7 @@ def _from_rest(
 def trajectory_problems(
     trajectory: Trajectory, joints: tuple[str, ...], now: float
 ) -> list[str]:
-    """Return all problems of a trajectory that can be found before its motion is computed."""
+    """Return all problems of a trajectory that show before it is planned."""
     points, problems = trajectory.points, []
     if len(points) > MOST_POINTS:
         return [

@@ -113,7 +113,8 @@ class Rerun:
     def run(self, events: Sequence[Event], motions: Iterable[Event] = ()) -> None:
         """Process the joint states with the events after the configuration, in order.
 
-        `motions` are the trajectories and targets among them, of which one is held at a time.
+        `motions` are the trajectories and targets among them, of which one is held at a
+        time.
 
         Raises:
             BlfDscError: an event cannot be repeated.
@@ -275,7 +276,7 @@ class Rerun:
             self._add(stamp, message)
 
     def _command(self, stamp: int, torque: Floats | None) -> None:
-        """Add a torque (n,) [N m], if any, commanded after a state of this stamp [ns]."""
+        """Add a torque (n,) [N m], if any, commanded after this state's stamp [ns]."""
         if torque is not None:
             self._add(stamp, self._telemetry.command(torque))
 

@@ -1,17 +1,19 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How soon a push is found, at how many false alarms: the learned model beside the URDF's.
+"""How soon a contact is detected, with the learned model and the URDF's.
 
-Each arm has links up to 30 % heavier or lighter than its URDF, picks up an unknown load, and is
-pushed at the tip once it has learned it, in a random direction.  Two observers of the same
-bandwidth read the same sensors behind the same lag, in the same loop:
+Each arm has links up to 30 % heavier or lighter than its URDF, picks up an unknown
+load, and is pushed at the tip once it has learned it, in a random direction.  Two
+observers of the same bandwidth read the same sensors behind the same lag, in the same
+loop:
 
     learned         X_L theta^ - u_L, with the covariance that it gives itself (law.external_torque)
     URDF            X_L P^(0) - u_L, the momentum observer of the URDF, friction included
 
-What the URDF's observer takes for outside is mostly its own error, so its threshold is told what no
-user knows: the mean square matrix of its residual on this very arm, with this load, in the seconds
-before the push; or, as is usual, one limit for each joint of all arms of a kind, in proportion to
-the rms of its residual there.  All thresholds are then scaled to equal false alarms.
+What the URDF's observer takes for outside is mostly its own error, so its threshold is
+told what no user knows: the mean square matrix of its residual on this very arm, with
+this load, in the seconds before the push; or, as is usual, one limit for each joint of
+all arms of a kind, in proportion to the rms of its residual there.  All thresholds are
+then scaled to equal false alarms.
 """
 
 from __future__ import annotations
@@ -176,7 +178,7 @@ def with_usual_limits(trials: Sequence[Trial]) -> list[Trial]:
 
 
 def alarms(distance: Floats, threshold: float, calm: int) -> int:
-    """Return how often a distance (k,) passes a threshold, after `calm` samples below it."""
+    """Return how often a distance (k,) exceeds a threshold after `calm` samples."""
     above = np.flatnonzero(distance > threshold)
     if not above.size:
         return 0
@@ -190,7 +192,7 @@ def delays(pushed: Sequence[Floats], threshold: float, period: float) -> Floats:
 
 
 def threshold_at(rate: float, free: Sequence[Floats], period: float) -> float:
-    """Return the least threshold with at most `rate` false alarms for each hour of motion."""
+    """Return the least threshold with at most `rate` false alarms per hour."""
     hours = sum(each.size for each in free) * period / 3600.0
     calm = round(CALM / period)
     low, high = 0.0, 2.0 * float(max(each.max() for each in free))
@@ -249,7 +251,7 @@ def compare(
 
 
 def format_results(found: Mapping[str, Any]) -> str:
-    """Return a table for each force: delays [ms], and what is not found within WATCHED."""
+    """Return a table for each force: delays [ms], and the share of missed pushes."""
     lines = []
     for force, results in found.items():
         default = results['default']
@@ -288,7 +290,7 @@ def milliseconds(time: float) -> str:
 
 
 def draw(found: Mapping[str, Any], path: Path) -> None:
-    """Draw the share of pushes that is found within a time, at `DRAWN` false alarms per hour."""
+    """Draw the share of pushes found over time, at `DRAWN` false alarms per hour."""
     title = f'How soon a push is found, at {DRAWN:g} false alarms per hour'
     picture = Picture(1, len(found), title, (5.2, 3.6), share_time=False)
     for axes, (force, results) in zip(picture.axes[0], found.items(), strict=True):

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Laws compared on arms from URDFs: each is tuned on one truth, run on others, and has figures.
+"""Comparison of laws on arms from URDFs: tuning, validation and figures.
 
-A law is one of the package, by its name, or one of a file (doc/tutorial_law.md), as computed
-torque is here (`computed_torque.py`).  All run in the same loop.  `load_laws` adds those that
-a file names.
+A law is one of the package, by its name, or one of a file (doc/tutorial_law.md), as
+computed torque is here (`computed_torque.py`).  All run in the same loop.  `load_laws`
+adds those that a file names.
 """
 
 from __future__ import annotations
@@ -56,10 +56,10 @@ POPULATION = 16
 GENERATIONS = 7  # of tuning, after the first
 TRUTHS = 5  # on which a tuned law runs
 ROUGHEST = 0.05
-"""rms change of a torque per sample, relative to its limit, beyond which it is penalised."""
+"""Largest rms change of a torque per sample, relative to its limit, unpenalised."""
 
 COLUMNS = (*INTERVALS, 'model before', 'model after')
-"""Largest errors [mrad], and torque errors of the model [%] before the pick-up and at the end."""
+"""Largest errors [mrad]; model errors [%] before the pick-up and at the end."""
 _BEFORE = PICK_UP - 0.01  # s, when the model is evaluated for the first time
 _STIFFEST = 4.0  # least slope limit of the barrier, as a multiple of its weight
 
@@ -121,7 +121,7 @@ LAWS = {
 
 @dataclass(frozen=True)
 class Figures:
-    """Figures of one run: largest true error of any joint in each of INTERVALS, torque, model."""
+    """Figures of one run: largest true errors in INTERVALS, torque, model."""
 
     errors: tuple[float, ...]  # rad
     ratio: float  # largest error of the whole run, relative to the bound
@@ -134,7 +134,7 @@ class Figures:
 def law_changes(
     studied: StudiedLaw, config: ControllerConfig, values: Mapping[str, float]
 ) -> dict[str, object]:
-    """Return the parameters that turn the configured law into this one with these gains."""
+    """Return the parameters for this law with these gains."""
     changes: dict[str, object] = {'law': studied.law}
     config = change(config, changes)  # a law of a file has gains of its own
     if studied.law == 'slotine_li':  # the slope of the proposed law's surface at zero
@@ -162,12 +162,12 @@ def law_changes(
 
 
 def inertia_of_joints(config: ControllerConfig) -> np.ndarray:
-    """Return m (n,) [kg m^2] of the gains: the least inertia of a joint with the others free."""
+    """Return m (n,) [kg m^2]: the least inertia of a joint with the others free."""
     return joint_inertia(config, config.learning.initial_estimate)
 
 
 def linear_gains(config: ControllerConfig) -> np.ndarray:
-    """Return k_p [1/s^2], k_d [1/s] and k_i [1/s^3] (3, n) of the proposed law at small errors.
+    """Return k_p [1/s^2], k_d [1/s], k_i [1/s^3] (3, n) of the proposed law.
 
     With r = K/2 + mu, tau = M0 (qr'' - k_p e - k_d e' - k_i int e) has
 
@@ -239,7 +239,7 @@ def load_laws(path: Path) -> list[str]:
 
 @dataclass(frozen=True)
 class Result:
-    """A law on one arm: tuned gains and their cost (None if not tuned), validation runs."""
+    """A law on one arm: tuned gains and cost (or None), validation runs."""
 
     gains: dict[str, float]
     cost: float | None
@@ -255,7 +255,7 @@ class Result:
 def trial(
     name: str, seed: int, overrides: Mapping[str, Mapping[str, Any]] | None = None
 ) -> LoopConfig:
-    """Return the loop of a preset: seed 0 keeps its truth and motion, other seeds vary them.
+    """Return the loop of a preset, with truth and motion varied by the seed.
 
     `overrides` are those of `load_loop`.
 
@@ -292,7 +292,7 @@ def values_of(name: str, exponents: Floats) -> dict[str, float]:
 
 
 def cost_of(figures: Figures) -> float:
-    """Return the mean over the intervals of log10 of the largest error in mrad; lower is better.
+    """Return the mean over the intervals of log10 of the largest error in mrad.
 
     Each decade of torque roughness beyond ROUGHEST adds ten.
     """
@@ -303,14 +303,14 @@ def cost_of(figures: Figures) -> float:
 def tuning_cost(
     exponents: Floats, name: str, loop: LoopConfig, unseen: Floats
 ) -> float:
-    """Return `cost_of` a law with one more sample of delay, to keep a stability margin."""
+    """Return `cost_of` a law with one more sample of delay, for stability."""
     delayed = change(loop.plant, {'actuator.delay': loop.plant.actuator.delay + 1})
     values = values_of(name, exponents)
     return cost_of(run(name, loop._replace(plant=delayed), values, unseen))
 
 
 def chosen_laws(given: Sequence[str]) -> list[str]:
-    """Return the names of laws from names and Python files, `proposed` first; all for none.
+    """Return names of laws from names and Python files, `proposed` first.
 
     Raises BlfDscError if there is no such law or file.
     """
@@ -330,7 +330,7 @@ def chosen_laws(given: Sequence[str]) -> list[str]:
 def compare(
     folder: Path, arms: Sequence[str], laws: Sequence[str]
 ) -> dict[str, dict[str, Result]]:
-    """Tune and run everything, and write figures.json; return the results by arm and law.
+    """Tune and run everything, write figures.json, and return the results.
 
     `laws` are as in `chosen_laws`.
     """
@@ -360,7 +360,7 @@ def compare(
 
 
 def format_results(results: dict[str, Result]) -> str:
-    """Return the worst of each figure on an arm, a line for each law, and tuned gains."""
+    """Return the worst figures on an arm, a line for each law, and tuned gains."""
     rows = [['worst', *COLUMNS, 'roughness', 'bound kept']]
     gains = []
     for name, result in results.items():

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A Monte Carlo study: a closed loop, the distributions of its parameters, and its runs.
+"""A Monte Carlo study: closed loop, distributions of its parameters, runs.
 
 Its file is a parameter file of the loop with one additional section:
 
@@ -10,12 +10,13 @@ Its file is a parameter file of the loop with one additional section:
         vary:
           arm.m2: uniform(0.4, 0.6)
 
-A value is the inverse of the distribution function at a number u in [0, 1), so each draw takes one
-random number.
+A value is the inverse of the distribution function at a number u in [0, 1), so each
+draw takes one random number.
 
-The start is relative to the reference: `initial.error` is the tracking error xi1(0) as a fraction
-of the bound, `initial.velocity_error` is dq(0) - dqr(0). So may be the events: `events.gap` is the
-time from the beginning of the event before, or from the start.
+The start is relative to the reference: `initial.error` is the tracking error xi1(0) as
+a fraction of the bound, `initial.velocity_error` is dq(0) - dqr(0). So may be the
+events: `events.gap` is the time from the beginning of the event before, or from the
+start.
 """
 
 from __future__ import annotations
@@ -76,7 +77,7 @@ _VARY = 'vary.'
 
 @dataclass(frozen=True)
 class MonteCarloConfig:
-    """Section `monte_carlo` of a study file: number of runs, and what is measured in each."""
+    """Section `monte_carlo` of a study file."""
 
     runs: int = parameter(1000, 'closed loops to run', at_least=1, at_most=100_000_000)
     seed: int = parameter(0, 'run i is determined by this seed and i alone', at_least=0)
@@ -110,7 +111,7 @@ class Study:
         return {'': self.controller, WITHOUT: without, NOISE: without}
 
     def values(self) -> dict[str, dict[str, Setting]]:
-        """Return every value by node and name, as `dumps` takes them; distributions as written."""
+        """Return every value by node and name, with distributions as written."""
         own = flatten(self.settings)
         for variation in self.variations:
             name = f'{_VARY}{variation.name}'
@@ -125,21 +126,21 @@ class Study:
 
     @cached_property
     def origin(self) -> tuple[Floats, Floats, Floats]:
-        """What a start is relative to: qr [rad], dqr [rad/s] and the bound [rad] at time 0."""
+        """Reference of a start: qr [rad], dqr [rad/s], bound [rad] at time 0."""
         controller = controller_of(self.controller)
         qr, dqr, _ = controller.reference_at(0.0)
         return qr, dqr, controller.bound_at(0.0)
 
     @cached_property
     def unseen(self) -> Floats | None:
-        """Rows of H of a motion that is never run, for `torque_error`; None without sinusoids."""
+        """Rows of H of a motion that is never run; None without sinusoids."""
         if self.controller.reference.type != 'sinusoids':
             return None
         return torque_rows(another_motion(self.controller, UNSEEN))
 
 
 def another_motion(config: ControllerConfig, seed: int) -> ControllerConfig:
-    """Return a configuration with other signs and phases of the reference's sinusoids."""
+    """Return a configuration with other signs and phases of the sinusoids."""
     random = np.random.default_rng(seed)
     reference = config.reference
     signs = random.choice((-1.0, 1.0), len(reference.amplitude))
@@ -161,14 +162,14 @@ def torque_rows(config: ControllerConfig) -> Floats:
 
 
 def torque_error(rows: Floats, estimate: Floats, P: Floats) -> float:
-    """Return the torque error of a learned model on such rows, relative to their torque."""
+    """Return the relative torque error of a learned model on such rows."""
     return float(np.linalg.norm(rows @ (estimate - P)) / np.linalg.norm(rows @ P))
 
 
 def load_study(
     path: str | Path, overrides: Mapping[str, object] | None = None
 ) -> Study:
-    """Read a study; `overrides` of the section `monte_carlo` take precedence over the file.
+    """Read a study; `overrides` take precedence over its section `monte_carlo`.
 
     Raises ConfigurationError with all problems of all sections, and their lines.
     """
@@ -238,10 +239,11 @@ Drawn = float | int | str
 
 
 def draw(study: Study, run: int) -> dict[str, Drawn]:
-    """Return what is random in a run by column, from the seed of the study and its number alone.
+    """Return the random values of a run by column, from seed and number alone.
 
-    Each variation has its own random number, by its name and regardless of what else varies: two
-    studies with the same seed that differ in one distribution have otherwise the same arms.
+    Each variation has its own random number, by its name and regardless of what else
+    varies: two studies with the same seed that differ in one distribution have
+    otherwise the same arms.
     """
 
     def bits(name: str) -> int:
@@ -323,7 +325,7 @@ class Distribution:
     arguments: tuple[Drawn, ...]
 
     def at(self, u: float) -> Drawn:
-        """Return the value below which the fraction `u`, in [0, 1), of all draws lies."""
+        """Return the value below which the fraction `u` of all draws lies."""
         return _INVERSES[self.written](u, *self.arguments)
 
     @property
@@ -338,7 +340,7 @@ class Distribution:
 
 
 def parse(text: object, type_: type) -> Distribution:
-    """Parse a distribution of a number or word; raises ValueError naming what is expected."""
+    """Parse a distribution; raise ValueError naming what is expected."""
     call = _CALL.fullmatch(text) if isinstance(text, str) else None
     argument, known = _EXPECTED[type_]
     written = next(
@@ -391,7 +393,7 @@ _REALTIME = ('actuator.command_timeout', 'actuator.without_command')
 
 @cache
 def _variable_parameters() -> Mapping[str, Parameter]:
-    """Return every parameter that may vary, by name; those of a relative start and events last."""
+    """Return every parameter that may vary, by name; relative ones last."""
     relative = Parameter((), '', is_array=True, length=('joints',))
     found = [
         *(param for param in parameters(PlantConfig) if param.name.startswith(_GROUPS)),
@@ -413,7 +415,8 @@ def _variations(
 ) -> Iterator[Variation]:
     """Yield the variations in the order of the plant's parameters; add to the problems.
 
-    Each name, `vary.` before it, has a distribution; a list parameter also takes a list of them.
+    Each name, `vary.` before it, has a distribution; a list parameter also takes a list
+    of them.
     """
     known = {f'{_VARY}{name}': param for name, param in _variable_parameters().items()}
     problems += [unknown(name, known) for name in given if name not in known]

@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The paper, side by side: laws, variations and sweeps, its claims checked by their runs, pictures.
+"""The paper's simulation with all laws: claims, sweeps, pictures.
 
-Every verdict is computed from the runs. It is `holds only if` for a claim that holds in some of
-the runs that it is about and fails in others; `condition` then says when it holds.
+Every verdict is computed from the runs. It is `holds only if` for a claim that holds in
+some of the runs that it is about and fails in others; `condition` then says when it
+holds.
 """
 
 from __future__ import annotations
@@ -178,7 +179,7 @@ class Results(NamedTuple):
 
 
 def run_case(case: Case) -> tuple[Metrics, Run | None]:
-    """Simulate a case; return its metrics and, unless it belongs to a sweep, the run."""
+    """Simulate a case; return its metrics and the run, except for sweeps."""
     loop = case.loop()
     with np.errstate(all='ignore'):  # a run that diverges has metrics too
         run = simulate(loop.controller, loop.plant, supervised=False).run()
@@ -338,7 +339,7 @@ def _settings(name: str) -> Settings:
 
 
 def _fraction_met(run: Run, name: str) -> float:
-    """Return the fraction of the samples, of those where (32) says something, that meet it."""
+    """Return the fraction of samples that meet (32), where it applies."""
     settings, V = _settings(name), _energy(run)
     assert run.bound is not None  # noqa: S101
     knee = settings.knee / settings.bound * run.bound
@@ -399,7 +400,7 @@ def _of_section_4(results: Results) -> Iterator[Claim]:
 
 
 def _swift_torque(results: Results) -> Claim:
-    """Evaluate the barrier's torque at the largest error, and the error of a pushed arm."""
+    """Evaluate the barrier's torque at the largest error, and a pushed arm."""
     run = results.runs['paper']
     barrier = CASES['paper'].loop().controller.barrier
     error = np.abs(np.asarray(run.error))
@@ -468,7 +469,8 @@ def _percents(values: Iterable[float]) -> list[str]:
 def compare(folder: Path) -> tuple[list[Claim], list[list[str]]]:
     """Run every case, and return the claims and the table of the laws.
 
-    Writes results.json, the pictures, and the configuration of each run into an empty folder.
+    Writes results.json, the pictures, and the configuration of each run into an empty
+    folder.
     """
     (folder / 'configurations').mkdir()
     for name, case in CASES.items():
@@ -487,7 +489,7 @@ def compare(folder: Path) -> tuple[list[Claim], list[list[str]]]:
 
 
 def side_by_side(results: Results) -> Iterator[list[str]]:
-    """Yield a header and a row for each law; values of the joints are separated by `/`."""
+    """Yield a header and a row for each law, joints separated by `/`."""
     columns = {  # title: field of the metrics, factor, decimals
         'max |xi1| [mrad]': ('max_error', 1e3, 3),
         'rms xi1 [mrad]': ('rms_error', 1e3, 4),
@@ -532,7 +534,7 @@ def draw_pairs(results: Results, folder: Path) -> None:
 
 
 def draw_robustness(results: Results, folder: Path) -> None:
-    """Draw the largest error and the parameter error of every sweep, a line for each law."""
+    """Draw largest error and parameter error of every sweep, by law."""
     title = 'Largest error, outside the bound above the red line; parameter error from 20 to 30 s'
     picture = Picture(2, len(SWEEPS), title, _PANEL, share_time=False)
     for condition, (upper, lower) in zip(SWEEPS, picture.axes.T, strict=True):

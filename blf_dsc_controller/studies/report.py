@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the results of a study say, pairs with learning and without it, and one run again."""
+"""Report of a study: summary, pairs with and without learning, repetition."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ Studies = dict[str, tuple[Study, Columns]]
 """Studies and their results, by title."""
 
 ALLOWED = 1.3
-"""Largest error with learning that is called no larger than that without, as a factor."""
+"""Largest allowed error with learning, relative to that without."""
 
 _WORST = 10
 _LAWS = {'': 'with', WITHOUT: 'without'}
@@ -59,8 +59,8 @@ _RATIO = r'max $|\xi_1| \; / \; k_c$'
 def summarize(study: Study, results: Columns) -> Summary:
     """Return a summary of the results as plain data for JSON; unknown values are None.
 
-    The Wilson interval, unlike p +- z sqrt(p (1 - p) / n), does not shrink to a point if all runs
-    kept the bound, and never leaves [0, 1].
+    The Wilson interval, unlike p +- z sqrt(p (1 - p) / n), does not shrink to a point
+    if all runs kept the bound, and never leaves [0, 1].
     """
     outcomes = results['outcome'].tolist()
     runs, kept = len(outcomes), outcomes.count(KEPT)
@@ -96,10 +96,10 @@ def summarize(study: Study, results: Columns) -> Summary:
 
 
 def compare_pairs(study: Study, results: Columns) -> Summary:
-    """Compare the runs with learning to those without it, and these to other sensor noise.
+    """Compare runs with and without learning, and with other sensor noise.
 
-    The latter shows how many exceptions chance makes: of the runs that nothing breaks before
-    learning would begin.
+    The latter shows how many exceptions chance makes: of the runs that nothing breaks
+    before learning would begin.
     """
     start = study.settings.settled_after
     early = [results[f'{law}first_violation_s'] < start for law in (NOISE, WITHOUT)]
@@ -110,9 +110,10 @@ def compare_pairs(study: Study, results: Columns) -> Summary:
 def _compare(study: Study, results: Columns, law: str) -> Summary:
     """Compare the runs of a law, by its prefix, with those without learning.
 
-    `factor` is the largest settled error with it over that without. It and the medians are of the
-    runs that keep the bound without. `near` counts the runs that come near the bound without, with
-    a largest error that is at least 1 % larger or smaller with it.
+    `factor` is the largest settled error with it over that without. It and the medians
+    are of the runs that keep the bound without. `near` counts the runs that come near
+    the bound without, with a largest error that is at least 1 % larger or smaller with
+    it.
     """
     laws = {law: 'with', WITHOUT: 'without'}
     kept, without = (results[f'{each}outcome'] == KEPT for each in laws)
@@ -151,14 +152,14 @@ def _compare(study: Study, results: Columns, law: str) -> Summary:
 
 
 def _worst_of(study: Study, results: Columns, name: str, law: str = '') -> Floats:
-    """Return a figure of the worst joint in each run; infinite if it diverged or did not begin."""
+    """Return a figure of the worst joint in each run; infinite if it diverged."""
     each = [results[f'{law}{name}.{joint}'] for joint in study.plant.joints]
     lost = np.isin(results[f'{law}outcome'], (DIVERGED, REJECTED))
     return np.where(lost, np.inf, np.max(each, axis=0))
 
 
 def _known(study: Study, results: Columns, name: str, law: str) -> Floats:
-    """Return the finite values of a figure, of the runs that keep the bound without learning."""
+    """Return a figure's finite values, of runs that keep the bound without learning."""
     column = f'{law}{name}'
     values = (
         results[column] if column in results else _worst_of(study, results, name, law)
@@ -205,7 +206,7 @@ def _pair_figures(pairs: Summary) -> dict[str, str]:
 
 
 def format_report(summary: Summary, folder: Path) -> str:
-    """Format a summary for the terminal, with the command that repeats the worst run."""
+    """Format a summary for the terminal, with a command to repeat the worst run."""
     outcomes = (
         f'{count} {outcome}' for outcome, count in summary['outcomes'].items() if count
     )
@@ -233,7 +234,7 @@ def _percent(fraction: float) -> str:
 
 
 def write_comparison(stores: Sequence[Store], folder: Path) -> str:
-    """Write changes.png and changes.md, studies of pairs side by side; return the table in it."""
+    """Write changes.png and changes.md for studies of pairs; return the table."""
     found = {store.folder.name: (store.study, store.results()) for store in stores}
     rows = []
     for name, (study, results) in found.items():
@@ -251,10 +252,11 @@ def write_comparison(stores: Sequence[Store], folder: Path) -> str:
 def reproduce(store: Store, run: str, out: Path) -> None:
     """Repeat the run of this number: write its config.yaml and bag to `out`.
 
-    Those without learning, of a study of pairs, go to `without_learning` and `other_noise` in it.
+    Those without learning, of a study of pairs, go to `without_learning` and
+    `other_noise` in it.
 
-    Raises BlfDscError if the run has no results, or if they are not reproduced bit for bit;
-    StartError if the controller rejects its start.
+    Raises BlfDscError if the run has no results, or if they are not reproduced bit for
+    bit; StartError if the controller rejects its start.
     """
     study, results = store.study, store.results()
     rows = np.flatnonzero(results['run'].astype(str) == run)
@@ -281,7 +283,7 @@ def reproduce(store: Store, run: str, out: Path) -> None:
 
 
 def _draw_pairs(studies: Studies, path: Path) -> None:
-    """Compare studies of pairs: errors and learned models, with learning and without."""
+    """Draw errors and learned models of studies, with and without learning."""
     picture = Picture(
         1,
         3,
@@ -325,7 +327,7 @@ def _draw_pairs(studies: Studies, path: Path) -> None:
 
 
 def _draw_boxes(axes: Axes, name: str, unit: float, studies: Studies) -> None:
-    """Draw the quartiles, and the 1 % and 99 % quantiles, of a figure with and without learning.
+    """Draw quantiles of a figure with and without learning.
 
     Of the runs that keep the bound without.
     """
@@ -349,7 +351,7 @@ def _draw_boxes(axes: Axes, name: str, unit: float, studies: Studies) -> None:
 
 
 def _make_logarithmic(axes: Axes, *, both: bool = False) -> None:
-    """Make the x axis, or both, of drawn data logarithmic, with plain numbers at 1, or 1, 2, 5."""
+    """Make the x axis, or both, logarithmic, with plain numbers."""
     axes.set_xscale('log')
     for axis in (axes.xaxis, axes.yaxis)[: 1 + both]:
         low, high = axis.get_view_interval()

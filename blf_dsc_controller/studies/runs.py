@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Runs of a Monte Carlo study: their figures, the folder that keeps them, and their workers.
+"""Runs of a Monte Carlo study: figures, folder and workers.
 
 The folder of a study:
 
@@ -7,9 +7,9 @@ The folder of a study:
     versions.json    the versions that computed the results
     runs/            Parquet files, named after the first and the last run in them
 
-Files of results are written atomically, so a study that was killed resumes with the runs that have
-none. The workers are any `concurrent.futures.Executor`: processes of this machine, or a
-dask.distributed cluster. Both give the same results.
+Files of results are written atomically, so a study that was killed resumes with the
+runs that have none. The workers are any `concurrent.futures.Executor`: processes of
+this machine, or a dask.distributed cluster. Both give the same results.
 """
 
 from __future__ import annotations
@@ -82,8 +82,8 @@ _LOST = (
 def run_chunk(study: Study, first: int, count: int) -> Columns:
     """Compute runs `first` to `first + count - 1`.
 
-    All runs share one record of each law, which takes nearly all of the memory. The result depends
-    on the arguments alone, and no file is written.
+    All runs share one record of each law, which takes nearly all of the memory. The
+    result depends on the arguments alone, and no file is written.
     """
     records = {
         prefix: new_record(controller_of(config), config, study.plant, Journal())
@@ -183,7 +183,7 @@ def require_pyarrow() -> Any:
 
 
 def versions() -> dict[str, str]:
-    """Return what must be equal, besides the configuration, where a study is resumed."""
+    """Return what must be equal to resume a study, besides the configuration."""
     return {
         'blf_dsc_controller': blf_dsc_controller.__version__,
         'kernels': cache_folder(run_loop).name,
@@ -194,7 +194,7 @@ def versions() -> dict[str, str]:
 
 
 def differences(there: dict[str, Any], here: dict[str, Any]) -> str:
-    """Return lines for a message, one for each value that differs; empty if none does."""
+    """Return a line for each value that differs; empty if none does."""
     pairs = {
         name: (there.get(name, 'nothing'), here.get(name, 'nothing'))
         for name in there | here
@@ -222,7 +222,8 @@ class Store:
     def create_or_open(cls, folder: Path, study: Study) -> Store:
         """Create the folder of a study, or open it to resume.
 
-        Raises BlfDscError if it holds no study, another one, or the same by another version.
+        Raises BlfDscError if it holds no study, another one, or the same by another
+        version.
         """
         if not folder.exists():
             (folder / _RUNS).mkdir(parents=True)
@@ -240,7 +241,7 @@ class Store:
         return store
 
     def keep(self, runs: range, columns: Columns) -> None:
-        """Write the results of consecutive runs atomically, even if the process is killed."""
+        """Write results of consecutive runs atomically."""
         pa = require_pyarrow()
         path = self._path(runs)
         unfinished = path.with_name(f'.{path.name}')

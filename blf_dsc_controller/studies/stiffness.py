@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """What learning is worth to a soft arm: errors against the stiffness of the loop.
 
-A stiff loop hides an unknown load, a soft one shows it.  The runs are those of `laws`, at parts of
-the bandwidth that the delay allows (`feedback.stiffness`): the law with and without learning, and
-computed torque with the linear gains of the law.  The bound grows as the errors do, with the
-inverse square of the stiffness.
+A stiff loop hides an unknown load, a soft one shows it.  The runs are those of `laws`,
+at parts of the bandwidth that the delay allows (`feedback.stiffness`): the law with and
+without learning, and computed torque with the linear gains of the law.  The bound grows
+as the errors do, with the inverse square of the stiffness.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ Errors = dict[str, dict[str, list[float]]]
 
 
 def soft_trial(name: str, seed: int, part: float) -> LoopConfig:
-    """Return the loop of `laws.trial` with a `part` of the bandwidth and the bound that fits it."""
+    """Return the loop of `laws.trial` at a part of the bandwidth, with its bound."""
     bound = load_loop(name).controller.barrier.bound
     wider = [each / part**2 for each in bound]
     soft = {'feedback.stiffness': part, 'barrier.bound': wider}
@@ -57,7 +57,7 @@ def largest_errors(key: tuple[str, float, int], arm: str) -> tuple[float, ...]:
 
 
 def compare(folder: Path, arms: Sequence[str]) -> dict[str, Errors]:
-    """Run everything; write stiffness.json and stiffness.png; return the errors by arm."""
+    """Run everything, write stiffness.json and stiffness.png, return the errors."""
     found: dict[str, Errors] = {}
     seeds = range(1, laws.TRUTHS + 1)
     keys = list(product(LAWS, PARTS, seeds))
@@ -77,7 +77,7 @@ def compare(folder: Path, arms: Sequence[str]) -> dict[str, Errors]:
 
 
 def format_errors(errors: Errors) -> str:
-    """Return a table of the errors [mrad] on one arm: a line for each law and interval."""
+    """Return a table of errors [mrad] on one arm, a line for each law, interval."""
     rows = [['worst [mrad] at a stiffness of', *(f'{part:g}' for part in PARTS)]]
     for interval, (law, of_law) in product(SHOWN, errors.items()):
         label = f'{interval}: {laws.LAWS[law].label}'

@@ -113,7 +113,7 @@ def corners_of(k: Floats) -> Floats:
 
 
 def worst_corners(tool: Tool, q: Floats, corners: Floats) -> Floats:
-    """Return the largest error (m,) [m] at any of the corners (c, n), at postures q (m, n)."""
+    """Return the largest error (m,) [m] at corners (c, n), for q (m, n)."""
     shape = (len(q), *corners.shape)
     postures = np.broadcast_to(q[:, np.newaxis], shape)
     errors = np.broadcast_to(corners, shape)
@@ -122,7 +122,7 @@ def worst_corners(tool: Tool, q: Floats, corners: Floats) -> Floats:
 
 
 def closed_loop(seed: int, arm: str, given: dict[str, Any]) -> dict[str, Any]:
-    """Return the figures at the tool of a loop of `laws.trial`, and whether it stopped."""
+    """Return the figures at the tool of a closed loop, and whether it stopped."""
     loop = laws.trial(arm, seed, {CONTROLLER: given})
     metrics = measure(simulate(loop.controller, loop.plant).run())
     assert metrics.tool is not None  # noqa: S101 - of a loop with a bound there
@@ -134,7 +134,7 @@ def closed_loop(seed: int, arm: str, given: dict[str, Any]) -> dict[str, Any]:
 
 
 def bounded(bound: float) -> dict[str, Any]:
-    """Return the parameters that put a bound at the tool [m] in place of joint bounds."""
+    """Return the parameters of a bound at the tool [m] instead of joint bounds."""
     if not bound > 0.0:
         raise BlfDscError(f'--bound: got {bound:g} m, but it must be above 0')
     return {'barrier.bound': None, 'barrier.tool_bound': bound}

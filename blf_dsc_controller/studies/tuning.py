@@ -5,9 +5,10 @@
     python -m blf_dsc_controller.studies.tuning comparison    # of config/comparison.yaml
     python -m blf_dsc_controller.studies.tuning slotine_li    # of config/slotine_li.yaml
 
-Common to all: the arm, its disturbance, reference, start, P^(0), sample time and torque limit; two
-runs of 30 s, with ideal and with realistic sensors (preset noisy); the objective; the number of
-gains (slotine_li has fewer) and the ranges of shared ones; the optimiser, its seed and budget.
+Common to all: the arm, its disturbance, reference, start, P^(0), sample time and torque
+limit; two runs of 30 s, with ideal and with realistic sensors (preset noisy); the
+objective; the number of gains (slotine_li has fewer) and the ranges of shared ones; the
+optimiser, its seed and budget.
 """
 
 from __future__ import annotations
@@ -103,7 +104,7 @@ def parameters_at(
     values: Iterable[float],
     inertia: Floats | float = 1.0,
 ) -> dict[str, Value]:
-    """Return the parameters that these values of the gains set; `inertia` (n,) is m of the arm."""
+    """Return the parameters for these gains; `inertia` (n,) is m of the arm."""
     present = flatten(config)
     chosen = dict[str, Floats]()
     for gain, value in zip(gains, values, strict=True):
@@ -120,7 +121,8 @@ def parameters_at(
 def cost_of(metrics: Metrics, sample_time: float) -> float:
     """Return the cost of one run in decades of largest, rms and parameter error.
 
-    Each decade beyond the bound, and each of torque rougher than `ROUGHEST`, costs ten more.
+    Each decade beyond the bound, and each of torque rougher than `ROUGHEST`, costs ten
+    more.
     """
     largest = np.log10(metrics.max_error_ratio)
     typical = np.log10(np.linalg.norm(metrics.rms_error))
@@ -143,7 +145,7 @@ def objective(exponents: Floats, task: Task, loops: Sequence[LoopConfig]) -> flo
 
 
 def loops_of(task: Task) -> list[LoopConfig]:
-    """Return the loops of the task's controller with each plant, for the tuning's duration."""
+    """Return loops of the task's controller with each plant, for the tuning."""
     law = change(load_loop(task.preset).controller, task.fixed)
     loops = (load_loop(name, {PLANT: {'duration': DURATION}}) for name in PLANTS)
     return [loop._replace(controller=law) for loop in loops]
@@ -158,8 +160,8 @@ def search(
 ) -> OptimizeResult:
     """Search the logarithms (base 10) of the gains.
 
-    Differential evolution with a fixed seed from a Latin hypercube, of the same size for every
-    law; `options` are passed to scipy.
+    Differential evolution with a fixed seed from a Latin hypercube, of the same size
+    for every law; `options` are passed to scipy.
     """
     ranges = np.log10([(gain.least, gain.most) for gain in gains])
     points = qmc.LatinHypercube(len(ranges), seed=np.random.default_rng(SEED)).random(

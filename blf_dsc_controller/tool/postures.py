@@ -47,7 +47,7 @@ class Axes(NamedTuple):
 
 
 def axes_of(chain: Chain, travel: Floats) -> Axes:
-    """Return the axes of a chain, whose prismatic joints move at most `travel` (n,) [m]."""
+    """Return the axes of a chain; prismatic ones move at most `travel` (n,) [m]."""
     joints = chain.joints
     placements = frames(chain, np.zeros(len(joints)))
     revolute = np.array([joint.kind != 'prismatic' for joint in joints])
@@ -82,7 +82,7 @@ def ways_to_tip(axes: Axes) -> Floats:
 
 
 def over_all_postures(axes: Axes, k: Floats) -> Floats:
-    """Return bounds (2,) [m, rad] on position and angle for joint bounds k (n,) [rad, m]."""
+    """Return bounds (2,) [m, rad] for joint bounds k (n,) [rad, m]."""
     slid = float(k[~axes.revolute].sum())
     components = _components(axes, k[axes.revolute])
     if not components:
@@ -132,7 +132,7 @@ def _angle(a: Floats, b: Floats) -> float:
 
 
 def _steps(axes: Axes, weights: Floats) -> Floats:
-    """Return l_j (r, 3) [m] between points on the axes with a small weighted sum of lengths."""
+    """Return l_j (r, 3) [m] between points on the axes, with short lengths."""
     points = axes.origins.copy()
     last = len(points) - 1
     for _ in range(_SWEEPS):
@@ -148,7 +148,7 @@ def _steps(axes: Axes, weights: Floats) -> Floats:
 def _pulled(
     point: Floats, direction: Floats, pulls: list[tuple[float, Floats]]
 ) -> Floats:
-    """Return a point moved along a line, nearer to the least weighted sum of distances."""
+    """Return a point moved along a line to shorten weighted distances."""
     moved = total = 0.0
     for weight, end in pulls:
         way = end - point

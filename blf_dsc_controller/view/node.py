@@ -156,7 +156,7 @@ class ViewNode(PlainNode):
             self.page.offer_replay(list(self.run) if has_ended else [])
 
     def _keep_for_replay(self, snapshot: Snapshot) -> None:
-        """Keep every `_stride`-th snapshot of the run; half of them where there are too many."""
+        """Keep every `_stride`-th snapshot of the run; thin them out if too many."""
         if self._taken % self._stride == 0:
             self.run.append(snapshot)
         self._taken += 1

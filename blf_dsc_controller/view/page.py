@@ -87,7 +87,7 @@ class Snapshot(NamedTuple):
 
     @property
     def felt_at(self) -> int | None:
-        """Number of the joint that shows most what touches the arm; None: nothing does."""
+        """Number of the joint where a contact shows most; None: no contact."""
         if not self.touched or not np.isfinite(self.external).all():
             return None
         return int(np.argmax(np.abs(self.external) / self.interval))
@@ -218,7 +218,7 @@ class Page:
         )
 
     def offer_replay(self, run: Sequence[Snapshot]) -> None:
-        """Offer a slider over these snapshots of a run that has ended; without any, none."""
+        """Offer a slider over these snapshots of an ended run; none without any."""
         if self._slider is not None:
             self._slider.remove()
             self._slider = None
@@ -436,7 +436,7 @@ def contact_of(joints: Sequence[str], now: Snapshot) -> str:
 
 
 def caption(now: Snapshot, contact: str = '') -> str:
-    """Return time, contact, error at the tool, load and excitation as a line of the page."""
+    """Return the caption: time, contact, tool, load and excitation."""
     tool = ''
     if np.isfinite(now.tool[0]):
         error, bound = (1e3 * each for each in now.tool[:2])
