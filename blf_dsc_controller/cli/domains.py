@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""ROS domains in which nobody else is.
+"""Free ROS domains: those without other participants on this computer.
 
 Runs of this package claim their domain by the name of a socket. Any other participant
 shows in the UDP ports that the protocol assigns to its domain (DDSI-RTPS 2.5, 9.6.2.3),

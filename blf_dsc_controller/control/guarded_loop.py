@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The guarded law, state after state: a torque, and the messages about it.
+"""The guarded law for each joint state: a torque, and the messages about it.
 
 The node publishes these messages, `ArmController` records them.
 """

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What is written into a log: a node's, or one of a loop without ROS."""
+"""The log of a controller: that of a node, or one of a loop without ROS."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Tells a robot the load that the law has weighed, step by step, beside the loop."""
+"""Declares the weighed load to a robot, step by step, in a thread beside the loop."""
 
 from __future__ import annotations
 

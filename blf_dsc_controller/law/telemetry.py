@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a loop tells of each sample: messages as (topic, bytes), and the columns of a `Run`.
+"""Telemetry of each sample: messages as (topic, bytes), and the columns of a `Run`.
 
-The nodes publish them and the offline loop writes them into a bag. Vectors of named values are sent
-as JointState with the values in `position`.
+The nodes publish the messages; the offline loop writes them into a bag. Vectors of named
+values are sent as JointState with the values in `position`.
 """
 
 from __future__ import annotations

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a loop without ROS and the process of its topics send each other over a `Link`.
+"""Messages over a `Link` between a loop without ROS and the process of its topics.
 
 The kind of a message is that of a topic, whose content is the serialised message, or
 one of those below, whose content is JSON.

@@ -9,11 +9,11 @@ loop:
     learned         X_L theta^ - u_L, with the covariance that it gives itself (law.external_torque)
     URDF            X_L P^(0) - u_L, the momentum observer of the URDF, friction included
 
-What the URDF's observer takes for outside is mostly its own error, so its threshold is
-told what no user knows: the mean square matrix of its residual on this very arm, with
-this load, in the seconds before the push; or, as is usual, one limit for each joint of
-all arms of a kind, in proportion to the rms of its residual there.  All thresholds are
-then scaled to equal false alarms.
+The residual of the URDF's observer is mostly its own error, so its threshold matters.
+One detector gets what no user knows: the mean square matrix of its residual on this
+very arm, with this load, in the seconds before the push.  The other has, as is usual,
+one limit for each joint of all arms of a kind, in proportion to the rms of its residual
+there.  All thresholds are then scaled to equal false alarms.
 """
 
 from __future__ import annotations

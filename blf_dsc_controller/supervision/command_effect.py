@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Whether the arm accelerates after a stop, as one does on which commands or a load act."""
+"""Whether the arm accelerates after a stop: if so, commands or a load act on it."""
 
 from __future__ import annotations
 

@@ -1,15 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Telling the drives what has been weighed, so that the torque of no joint steps.
+"""Declare a weighed load to the drives, so that no joint torque steps.
 
-Drives that compensate gravity know of a load what they are told.  A law that has weighed it can
-tell them: they then add its weight, and the command gives it up,
+Drives that compensate gravity only know the load that is declared to them.  A law that has
+weighed it can declare it.  They then add its weight, and the command is reduced by it,
 
     whole torque = command + G_d(q) = command' + G_d'(q),    G_d' = G_d + that of the load
 
-so that the whole torque of the joint is that of before.  Only the moment of the change is the
-drives': a command that was on its way belongs to the load of before, and is wrong by the change for
-a cycle.  The load is therefore told in steps that change no torque by more than `_STEP` of its
-limit, each once the one before is in force.
+so that the whole torque of the joint does not change.  But the drives decide when the
+change takes effect.  A command that is on its way belongs to the earlier load, and is
+wrong by the change for one cycle.  So the load is declared in steps that change no torque
+by more than `_STEP` of its limit, each after the one before has taken effect.
 """
 
 from __future__ import annotations

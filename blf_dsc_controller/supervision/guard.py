@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The law between its checks: a torque that is safe to apply for every joint state.
+"""The guarded law: checks before and after the law, and a torque for every joint state.
 
 joint state -> StateCheck -> law -> SampleCheck -> torque
                    |                     |

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The gate before the start: no state reaches the law until the sender's rate is known."""
+"""The gate before the start: the law gets no state until the sender's rate is known."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Whether anything shows what holds a live arm at rest before the start."""
+"""Check before the start that it is known what holds a resting arm: brakes or drives."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ Vector = NDArray[np.float64]
 def check_support(
     controller: Controller, config: ControllerConfig, measurement: Vector
 ) -> None:
-    """Raise StartError if nothing shows what holds a live arm at rest, and nothing limits a step.
+    """Raise StartError if it is unknown what holds a resting arm, and no step is limited.
 
-    It may be brakes, or drives that compensate gravity, to which gravity would be added.
+    Brakes may hold it, or drives that compensate gravity, to which gravity would be added.
     """
     robot = config.robot
     is_known = robot.drive_compensates != 'none' or robot.effort in ('whole', 'current')

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The safe torque in the place of a silent controller."""
+"""The watchdog on commands: it commands the safe torque if the controller is silent."""
 
 from __future__ import annotations
 
