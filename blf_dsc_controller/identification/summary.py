@@ -128,8 +128,8 @@ def errors_table(found: Identified) -> str:
     rows.append(['all', *(f'{total:.2f}' for total in score.total), ''])
     begin, end = score.held_back
     title = (
-        f'torque error from {begin:.1f} to {end:.1f} s, which was held back while the model was '
-        'chosen and fitted\n[% of rms torque]; the values above are then from all of the motion:'
+        f'torque error from {begin:.1f} to {end:.1f} s, a part that was held back while the model '
+        'was chosen and fitted\n[% of rms torque]; the values above are a fit to the whole motion:'
     )
     return f'{title}\n{aligned(rows)}'
 
@@ -154,14 +154,14 @@ def notes_of(found: Identified) -> Iterator[str]:
     wider = [f'{name} {width:g}' for name, width in found.widths.items() if width > 1.0]
     if wider:
         yield (
-            'the recording contradicts the URDF more than expected; it was given less weight by a '
-            f'factor of deviations: {", ".join(wider)}'
+            'the recording contradicts the URDF more than expected, so the URDF was trusted less: '
+            f'its standard deviations were multiplied by {", ".join(wider)}'
         )
     urdf, corrected, _ = found.score.total
     if corrected > urdf:
         yield (
-            'the corrected URDF alone predicts worse than the original: what it has no place for, '
-            'offsets and rotors above all, is large here; use the .xml or .yaml of --out'
+            'the corrected URDF alone predicts worse than the original: terms for which a URDF has '
+            'no place, above all offsets and rotors, are large here; use the .xml or .yaml of --out'
         )
     if found.rest:
         yield f'{found.rest:.1f} s in which no joint moves were left out'
@@ -175,7 +175,7 @@ def _delay_notes(found: Identified) -> Iterator[str]:
         late = 'torques' if delay > 0.0 else 'positions'
         yield (
             f'a delay of {1e3 * delay:.0f} ms is long: are the {late} filtered, or stamped when '
-            'they were received? Inertias take up what is left of it'
+            'they were received? What remains of the delay distorts the inertias'
         )
 
 
@@ -200,8 +200,8 @@ def _joint_notes(found: Identified) -> Iterator[str]:
             yield f'{name} did not move: its rotor and friction are guesses'
         elif share[i] > _ALL_WRONG and score.torque[i] < _HARDLY * score.torque.max():
             yield (
-                f'{name} hardly needs a torque ({score.torque[i]:.2g} {unit}): its error in % '
-                'says little'
+                f'{name} hardly needs a torque ({score.torque[i]:.2g} {unit}), so its error in % '
+                'means little'
             )
 
 
