@@ -45,11 +45,9 @@ ROWS = {
     'panda, sine on joint7': ('panda', 12.0, SINE),
     'noisy, cosines': ('noisy', 20.0, COSINES),
 }
-BROKEN = ('panda, 0.76 kg in 0.5 s', 'ur5e, 1.26 kg put down again')
-"""Rows in which the paper's compensation leaves the bound.
-
-Theirs are mixtures that `residual_floor` explains; that of 2 kg contradicts its parts.
-"""
+MIXTURES = ('panda, 0.76 kg in 0.5 s', 'ur5e, 1.26 kg put down again')
+"""Rows whose first window is a mixture with a small residual."""
+UNCHECKED = {'learning.change_detection': False}
 
 
 def spectral_radius(T, *, learned=1.0, initial=1.0, at_state=False, delay=1):
@@ -119,11 +117,14 @@ def test_learning_breaks_no_bound_that_is_kept_without_it(name):
     assert np.abs(learning.error).max() <= 1.3 * most
 
 
-@pytest.mark.parametrize('name', BROKEN)
-def test_compensation_of_the_paper_breaks_them(name):
-    assert [stop.reason for stop in run(name, AT_STATE).stops] == [
-        'error past the bound'
-    ]
+@pytest.mark.parametrize('name', MIXTURES)
+def test_compensation_of_the_paper_breaks_the_bound_by_a_mixture(name):
+    """It is a mixture that `residual_floor` explains; change detection does not latch it."""
+    (stop,) = run(name, AT_STATE | UNCHECKED).stops
+    assert stop.reason == 'error past the bound'
+    checked = run(name, AT_STATE)
+    assert not checked.stops
+    assert np.abs(checked.error).max() < 0.3 * checked.bound[0, 0]
 
 
 def test_sine_of_the_frequency_of_the_reference_is_compensated_like_a_model():
@@ -154,9 +155,10 @@ def test_torques_that_bang_between_their_limits_stop_the_arm():
 def test_learned_friction_stays_friction():
     """Between a third of its initial estimate and three times that; from 0 if it is unknown.
 
-    The first windows of the UR5e see a payload come and go, and take parts of it for friction.
+    The first window of the UR5e sees a payload come and go, and takes parts of it for friction,
+    unless the change is detected.
     """
-    record = simulated('ur5e, 1.26 kg put down again')
+    record = simulated('ur5e, 1.26 kg put down again', *UNCHECKED.items())
     settings = record.controller.settings
     names = estimate_names(record.config)
     friction = [
@@ -194,7 +196,7 @@ def test_sine_at_a_frequency_of_the_reference_is_not_learned_as_friction():
     arm = {f'disturbance.{name}': [a] * 3 + [b] * 3 for name, (a, b) in wrist.items()}
     arm |= {'events.begin': [100.0], 'disturbance.stribeck': 0.0}
     config = configured(
-        'ur5e', 15.0, {}, arm | {'disturbance.frequency': [3.0 * TONE] * 6}
+        'ur5e', 30.0, {}, arm | {'disturbance.frequency': [3.0 * TONE] * 6}
     )
     record = simulate(config.controller, config.plant)
     assert not record.run().stops

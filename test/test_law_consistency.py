@@ -21,7 +21,7 @@ from paper_case import (
 )
 
 from blf_dsc_controller import load_loop, simulate
-from blf_dsc_controller.law import excitation, window
+from blf_dsc_controller.law import change, excitation, window
 from blf_dsc_controller.law.factory import settings_of_config
 
 FRICTION = {'disturbance.viscous': [0.1, 0.1]}
@@ -241,7 +241,7 @@ def test_change_is_detected_from_eight_times_the_residual_on(
     state.anchor[:] = 0.9 * state.estimate
     before = state.estimate.copy()
     torque = signals.H @ state.estimate + state.disturbance
-    excitation.detect_change(settings, state, signals, 0.1)
+    change.detect_change(settings, state, signals, 0.1)
     assert state.changes[0] == changes
     np.testing.assert_array_equal(
         state.estimate, 0.9 * before if taken_back else before

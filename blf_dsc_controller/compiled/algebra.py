@@ -118,6 +118,18 @@ def cholesky_solve(U: np.ndarray, x: np.ndarray) -> None:
         x[i] = value * U[i, i]
 
 
+@inner
+def whiten(U: np.ndarray, x: np.ndarray) -> float:
+    """Replace x (m,) by U^-T x, with the U of `cholesky_factor`; return x^T A^-1 x."""
+    square = 0.0
+    for k in range(x.size):
+        x[k] *= U[k, k]
+        square += x[k] * x[k]
+        for i in range(k + 1, x.size):
+            x[i] -= U[k, i] * x[k]
+    return square
+
+
 def product(A: np.ndarray, B: np.ndarray) -> np.ndarray:
     """Return A B of (stacks of) matrices."""
     result: np.ndarray = (A[..., np.newaxis] * B[..., np.newaxis, :, :]).sum(axis=-2)

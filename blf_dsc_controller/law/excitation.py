@@ -14,19 +14,18 @@ unmodelled torque explains (configured, but no more than the smallest residual s
 solution gives the arm a positive inertia, which the residual does not show.  The first full
 window has only its own parts as a measure: fitted apart, neither may explain its rows better than
 by that factor, else the older part is removed from the window; again only if the residual has
-halved since, since parts of a period never agree about a lasting disturbance.  Rows that
-contradict the latched solution (their mean square error over 0.1 s exceeds eight times r^2) mean
-that the arm has changed: window, filters and latch are cleared, and learning restarts.  Until the
-new window is full, it does not average out disturbances, so its solution is pulled to the estimate
-before the change, most strongly in weakly excited directions, and if rows contradict it that early,
-what it taught is taken back: it did not predict what it was not fitted to.  Likewise, a full window
-with an unusually large residual is pulled to an earlier solution, kept once per window.
+halved since, since parts of a period never agree about a lasting disturbance.
+
+After a change of the arm (see `change`) and until the new window is full, it does not average out
+disturbances, so its solution is pulled to the estimate before the change, most strongly in weakly
+excited directions.  Likewise, a full window with an unusually large residual is pulled to an
+earlier solution, kept once per window.
 """
 
 from blf_dsc_controller.compiled.algebra import cholesky_factor, cholesky_solve
 from blf_dsc_controller.compiled.jit import inner
 from blf_dsc_controller.compiled.layout import Array
-from blf_dsc_controller.law import adaptation, window
+from blf_dsc_controller.law import window
 from blf_dsc_controller.law.state import Settings, Signals, State
 
 _WARM = 4  # inverse iterations from the previous direction
@@ -34,7 +33,6 @@ _COLD = 60  # from an arbitrary direction
 _COMPARABLE = 0.95  # fraction of the best lambda_min
 _FORGETTING = 0.1  # fraction of the best lambda_min lost per window
 _GATE = 4.0  # ratio of mean squares: twice the torque
-_ALARM = 8.0  # likewise; larger, since a solution extrapolates
 # times the smallest residual: the floor, where that is below the configured one
 _QUIET = 4.0
 _LEAST_FLOOR = 0.01  # of the configured floor: a tenth of the torque
@@ -43,7 +41,6 @@ _FALLEN = 0.5
 _USUAL = 1.25  # times the smallest residual, which varies with the motion
 _DOUBT = 3.0  # pull to the anchor per (N m)^2 above that, 1/(kg m^2)^2
 _LEAST_INERTIA = 0.1  # fraction of the initial estimate's
-_MEMORY = 0.1  # s, averaging time of the last rows
 
 
 @inner
@@ -57,55 +54,6 @@ def explained(settings: Settings, state: State, residual: float) -> float:
         shown = max(_QUIET * state.least_residual[0], _LEAST_FLOOR * floor)
         floor = min(floor, shown)
     return max(residual, floor)
-
-
-@inner
-def detect_change(
-    settings: Settings, state: State, signals: Signals, dt: float
-) -> None:
-    """Compare this row with the latched solution; forget the window if the arm has changed."""
-    if state.latched[0] == 0.0:
-        return
-    square = 0.0
-    for i in range(settings.n):
-        error = -signals.row[i, settings.m]
-        for j in range(settings.m):
-            error += signals.row[i, j] * state.solution[j]
-        square += error * error
-    state.recent_residual[0] += min(1.0, dt / _MEMORY) * (
-        square - state.recent_residual[0]
-    )
-    if state.recent_residual[0] > _ALARM * explained(
-        settings, state, state.residual[0]
-    ):
-        state.changes[0] += 1.0
-        state.contradiction[0] = state.recent_residual[0]
-        # back to the estimate before the last change
-        if state.rows[0] < settings.window:
-            for j in range(settings.m):
-                signals.work[j] = state.estimate[j]
-                state.estimate[j] = state.anchor[j]
-            if settings.bumpless == 1:
-                adaptation.hand_over(settings, state, signals)
-        forget_window(settings, state)
-
-
-@inner
-def forget_window(settings: Settings, state: State) -> None:
-    """Clear the window, its filters and the latch; the estimate stays and becomes the anchor."""
-    state.latched[0] = 0.0
-    state.best_lambda[0] = 0.0
-    state.recent_residual[0] = 0.0
-    state.rows[0] = 0.0
-    state.cursor[0] = 0.0
-    window.clear(state.running)
-    window.clear(state.fresh)
-    window.clear(state.half)
-    window.clear(state.filter1)
-    window.clear(state.filter2)
-    for j in range(settings.m):
-        state.anchor[j] = state.estimate[j]
-    window.reset_direction(state)
 
 
 @inner

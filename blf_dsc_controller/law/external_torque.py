@@ -28,7 +28,7 @@ Everything here but the filter runs after the torque has been sent.
 from math import sqrt
 
 from blf_dsc_controller.arms.model import ArmModel
-from blf_dsc_controller.compiled.algebra import cholesky_factor
+from blf_dsc_controller.compiled.algebra import cholesky_factor, whiten
 from blf_dsc_controller.compiled.jit import inner, kernel
 from blf_dsc_controller.compiled.layout import Array
 from blf_dsc_controller.law import barrier, friction
@@ -117,10 +117,7 @@ def find_spread(settings: Settings, state: State, signals: Signals) -> None:
         y = signals.felt_rows[i]
         for k in range(m):
             y[k] = state.felt[i, k]
-        for k in range(m):
-            y[k] *= U[k, k]
-            for j in range(k + 1, m):
-                y[j] -= U[k, j] * y[k]
+        whiten(U, y)
     for i in range(n):
         for other in range(i, n):
             total = 0.0
@@ -136,18 +133,6 @@ def find_spread(settings: Settings, state: State, signals: Signals) -> None:
 def regime(state: State, i: int) -> int:
     """Return 1 for a joint that reverses, else 0: the row of its noise."""
     return 1 if state.felt_reversing[i] > 0.0 else 0
-
-
-@inner
-def whiten(spread: Array, x: Array) -> float:
-    """Replace x (n,) by U^-T x, with S = U^T U; return x^T S^-1 x."""
-    square = 0.0
-    for k in range(x.size):
-        x[k] *= spread[k, k]
-        square += x[k] * x[k]
-        for i in range(k + 1, x.size):
-            x[i] -= spread[k, i] * x[k]
-    return square
 
 
 @inner
@@ -227,7 +212,7 @@ def is_lighter_than_nothing(settings: Settings, state: State) -> bool:
     """Whether the filtered load takes away more than is held, as far as that is known."""
     held = state.load[MASS]
     deviation = state.load[DEVIATION]
-    if deviation == 0.0 and not is_first(settings, state):
+    if deviation == 0.0 and not is_first(state):
         return False
     mass = 0.0
     square = deviation * deviation

@@ -3,7 +3,8 @@
 
 prediction   a row [X | u] with X theta = u, of the last interval
 window       sums of the rows over tau_d
-excitation   whether a window is excited, latched, or contradicted by a changed arm
+excitation   whether a window is excited, consistent, and latched
+change       whether the arm has changed, so that the window must be forgotten
 friction     friction from reversals, and how much of it is used
 adaptation   the step of the estimate, once the torque is known
 """
@@ -11,7 +12,7 @@ adaptation   the step of the estimate, once the torque is known
 from __future__ import annotations
 
 from blf_dsc_controller.compiled.jit import inner
-from blf_dsc_controller.law import excitation, friction, prediction, window
+from blf_dsc_controller.law import change, excitation, friction, prediction, window
 from blf_dsc_controller.law.compensation import compute_regressors
 from blf_dsc_controller.law.state import Settings, Signals, State
 
@@ -36,6 +37,6 @@ def observe(
         window.push_row(state, signals.row)
         friction.measure_reversals(settings, state, settings.row_interval * dt)
     if settings.change_detection == 1:
-        excitation.detect_change(settings, state, signals, dt)
+        change.detect_change(settings, state, signals, dt)
     if int(state.samples[0]) % settings.interval == 0:
         excitation.update_excitation(settings, state, signals, t, dt)

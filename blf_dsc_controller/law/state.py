@@ -144,6 +144,11 @@ class State(NamedTuple):
     # of the last first window that its parts contradicted, (N m)^2
     split_residual: Cell
     recent_residual: Cell  # of the last rows against `solution`, (N m)^2
+    # of `excitation`, until a full window is known to be of one arm: theta of the rows
+    # so far, the factor of its equations, and the statistics of `innovation`
+    first_fit: Annotated[Array, 'm']
+    first_factor: Annotated[Array, 'm', 'm']
+    first_statistics: Annotated[Array, 4]
     changes: Cell  # number of times that the arm was found to have changed
     contradiction: Cell  # `recent_residual` at the last change, (N m)^2
     alpha2: Annotated[Array, 'n']  # rad/s
@@ -197,13 +202,14 @@ class State(NamedTuple):
     # least and largest delta of earlier motions, or 0, since a reversal was last
     # measured, N m
     unanswered: Annotated[Array, 2, 'n']
-    # moving rows of the first window, and of two parts since
-    weighed_rows: Annotated[Array, 3]
+    # moving rows before, of two parts since, and of two that are kept apart
+    weighed_rows: Annotated[Array, 5]
     # of their [X | u]^T [X | u]
-    weighed_sums: Annotated[Array, 3, 'weighed', 'weighed']
-    weighed_model: Annotated[Array, 'weighed']  # theta with the load
-    weighed_noise: Annotated[Array, 2]  # mean square residual before and since, (N m)^2
-    weighed_recent: Cell  # of the last rows, (N m)^2
+    weighed_sums: Annotated[Array, 5, 'weighed', 'weighed']
+    weighed_complete: Cell  # 1: the rows before are complete
+    weighed_statistics: Annotated[Array, 4]  # of `innovation`
+    weighed_solution: Annotated[Array, 'weighed + 9']  # theta and z
+    weighed_factor: Annotated[Array, 'weighed + 9', 'weighed + 9']  # of their equations
     weighed_changes: Cell  # `changes` at the last row
     weighing_wait: Cell  # rows until the filters have settled
     # mass [kg] and centre [m] in the tip, their deviations; 0: unknown
@@ -268,6 +274,9 @@ class Signals(NamedTuple):
     Phi: Annotated[Array, 'm', 'm']  # of the current window
     b: Annotated[Array, 'm']
     factor: Annotated[Array, 'm', 'm']
+    predicted: Annotated[Array, 'n', 'm']  # scratch of `innovation`
+    innovation: Annotated[Array, 'n']
+    covariance: Annotated[Array, 'n', 'n']
     newer: Annotated[Array, 'm + 1', 'm + 1']  # sum of the newer part of the window
     part: Annotated[Array, 'm + 1', 'm + 1']  # of the part that is fitted
     # M^(q) minus its least admissible value, or its factor
@@ -279,11 +288,11 @@ class Signals(NamedTuple):
     band_acceleration: Annotated[Array, 'n']
     rate: Annotated[Array, 'm']  # theta^' [1/s]
     work: Annotated[Array, 'm']  # scratch
-    # sum of the rows since the first window
+    before: Annotated[Array, 'weighed', 'weighed']  # sums of `weighing`
     since: Annotated[Array, 'weighed', 'weighed']
-    # normal equations, or their factor
-    load_normal: Annotated[Array, 'weighed + 9', 'weighed + 9']
-    load_solution: Annotated[Array, 'weighed + 9']  # theta and z of `weighing`
+    load_rows: Annotated[Array, 'n', 'weighed + 9']  # scratch
+    load_torque: Annotated[Array, 'n']
+    load_covariance: Annotated[Array, 'n', 'n']
     load_spread: Annotated[Array, 4, 10]  # scratch
     felt_rows: Annotated[Array, 'n * senses', 'm']  # scratch of `external_torque`
     felt_white: Annotated[Array, 'n * senses']

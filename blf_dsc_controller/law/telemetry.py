@@ -253,6 +253,8 @@ def load_text(load: Sequence[float]) -> str:
     if not math.isfinite(mass):
         return 'unknown'
     text = f'{mass:.3f} +- {interval:.2g} kg'
+    if mass < -interval:
+        return f'{text}: lighter than at first, when something must have been held'
     if not math.isfinite(centre[0]):
         return text
     each = (

@@ -6,14 +6,19 @@ the ten inertial parameters phi changes its base parameters by N phi, so with
 
     before:  X theta = u,        since:  X (theta + N phi) = u
 
-the rows of the first window, in which nothing is held, and those since give the most likely theta
-and phi, given the prior of each: a linear problem with unknowns phi = D z, z ~ (0, 1), and theta.
-The load is thus the difference of two estimates of one arm, whatever its links and friction are.
+the rows before, in which nothing is held, and those since give the most likely theta and phi, given
+the prior of each: a linear problem with unknowns phi = D z, z ~ (0, 1), and theta.  The load is
+thus the difference of two estimates of one arm, whatever its links and friction are.
 
-Residuals of rows, with the mean square s^2, are correlated: as many rows as fit into `_LASTING`
-count as one.  Rows of slow joints count little, since they may stick.  Where the last rows
-contradict the solution, something else is held: the rows since are discarded, as they are after a
-window in any case.  Nothing here acts on the torque: `weigh` runs after it has been sent.
+The rows before are those of the first window, or of less if they contradict each other (see
+`innovation`): a load that is put down and picked up from the first cycle on is weighed, too.  Where
+later rows contradict the solution, something else is held.  If what was held until then is clearly
+less than nothing, the arm held a load before: what is lightest is taken for nothing.  If it was
+nothing, its rows are added to those before until they make a window.  Rows are kept apart until
+they are 0.15 to 0.3 s old, so that those of a change that has not been found yet can be discarded.
+
+Rows of slow joints count little, since they may stick.  Nothing here acts on the torque: `weigh`
+runs after it has been sent.
 """
 
 from math import sqrt
@@ -22,8 +27,7 @@ from blf_dsc_controller.arms.model import ArmModel
 from blf_dsc_controller.compiled.algebra import cholesky_factor, cholesky_solve
 from blf_dsc_controller.compiled.jit import inner, kernel
 from blf_dsc_controller.compiled.layout import Array
-from blf_dsc_controller.law import window
-from blf_dsc_controller.law.excitation import window_residual
+from blf_dsc_controller.law import innovation, window
 from blf_dsc_controller.law.state import (
     Settings,
     Signals,
@@ -33,18 +37,17 @@ from blf_dsc_controller.law.state import (
     state_of,
 )
 
-_PERIOD = 0.1  # s, from one solution to the next
-_LASTING = 0.2  # s, correlation length of the residual
-_MEMORY = 0.3  # s, averaging time of the last rows
-_FEWEST = 0.5  # s of motion, before which they are not compared with the solution
-# times the mean square residual of the first window: something else is held
-_ALARM = 8.0
+_FEWEST = 0.5  # s of motion that a part has
+_APART = (
+    0.15  # s, for which the latest rows are kept apart, and then those of them again
+)
 _SETTLED = 6.0  # time constants of the filters
 # rad/s or m/s, below which friction is least like its columns, and rows count less
 _SLOW = 0.3
+_NOTHING, _LESS = 2.0, 4.0  # standard deviations: within, and below minus
 
-# rows of the first window, and of the last two halves since
-BEFORE, OLDER, NEWER = range(3)
+# rows before, of two halves since, and of the two parts that are kept apart
+BEFORE, OLDER, NEWER, RECENT, LATEST = range(5)
 TWO_SIDED = 1.96  # standard deviations in half of a 95 % interval
 MASS, DEVIATION = 0, 4  # in `state.load`, each followed by three of the centre
 
@@ -58,60 +61,147 @@ def add_row(settings: Settings, state: State, signals: Signals, dt: float) -> No
     if settings.weighed == 0 or not is_due:
         return
     period = interval * dt
-    for i in range(settings.n):  # those of slow joints count little
+    rows = samples // interval
+    has_changed = state.changes[0] != state.weighed_changes[0]
+    state.weighed_changes[0] = state.changes[0]
+    weight_row(settings, signals)
+    if samples <= interval:
+        begin(settings, state, signals, period)
+    elif has_changed:
+        end_part(settings, state, signals, period)
+    elif state.weighing_wait[0] > 0.0:
+        state.weighing_wait[0] -= 1.0
+    elif is_contradicted(settings, state, signals, period):
+        end_part(settings, state, signals, period)
+    else:
+        window.add_products(signals.row, state.weighed_sums[LATEST])
+        state.weighed_rows[LATEST] += moving_share(settings, signals)
+        if is_first(state) and rows_before(state) >= settings.window:
+            state.weighed_complete[0] = 1.0
+        if rows % max(1, round(_APART / period)) == 0:
+            promote(settings, state)
+        if rows % max(1, round(innovation.REFRESH / period)) == 0:
+            solve(settings, state, signals, period)
+            if not is_first(state):
+                describe(settings, state, signals, period)
+
+
+@inner
+def weight_row(settings: Settings, signals: Signals) -> None:
+    """Let the rows of slow joints count little."""
+    for i in range(settings.n):
         weight = abs(signals.dqr[i]) / sqrt(signals.dqr[i] ** 2 + _SLOW**2)
         for j in range(settings.m + 1):
             signals.row[i, j] *= weight
-    is_new = samples <= interval or state.changes[0] != state.weighed_changes[0]
-    if is_new or is_contradicted(settings, state, signals, period):
-        state.weighed_changes[0] = state.changes[0]
-        discard(settings, state)
-        state.weighing_wait[0] = _SETTLED / (settings.pole * period)
-    if state.weighing_wait[0] > 0.0:
-        state.weighing_wait[0] -= 1.0
-        return
-    part = BEFORE if is_first(settings, state) else NEWER
-    window.add_products(signals.row, state.weighed_sums[part])
-    share = 0.0  # mean square weight of the joints' rows: 1 in motion, 0 at rest
+
+
+@inner
+def moving_share(settings: Settings, signals: Signals) -> float:
+    """Return the mean square weight of the joints' rows: 1 in motion, 0 at rest."""
+    share = 0.0
     for i in range(settings.n):
         square = signals.dqr[i] ** 2
         share += square / (square + settings.motion_scale**2 + 1e-12) / settings.n
-    state.weighed_rows[part] += share
-    if part == NEWER and state.weighed_rows[NEWER] >= 0.5 * settings.window:
-        window.add(
-            state.weighed_sums[NEWER], 0.0, state.weighed_sums[NEWER], signals.since
-        )
-        window.add(signals.since, 0.0, signals.since, state.weighed_sums[OLDER])
-        window.clear(state.weighed_sums[NEWER])
-        state.weighed_rows[OLDER] = state.weighed_rows[NEWER]
-        state.weighed_rows[NEWER] = 0.0
-    if samples // interval % max(1, round(_PERIOD / period)) == 0:
-        solve(settings, state, signals, _LASTING / period)
-        if not is_first(settings, state):
-            describe(settings, state, signals, _LASTING / period)
+    return share
 
 
 @inner
-def is_first(settings: Settings, state: State) -> bool:
-    """Whether the first window is not complete."""
-    return bool(state.weighed_rows[BEFORE] < settings.window)
+def is_first(state: State) -> bool:
+    """Whether the rows before are not complete."""
+    return bool(state.weighed_complete[0] == 0.0)
 
 
 @inner
-def rows_since(state: State) -> float:
-    """Return the number of moving rows since the first window that count."""
-    return float(state.weighed_rows[OLDER] + state.weighed_rows[NEWER])
+def rows_before(state: State) -> float:
+    """Return the number of moving rows so far, while the rows before are not complete."""
+    rows = state.weighed_rows
+    return float(rows[BEFORE] + rows[RECENT] + rows[LATEST])
 
 
 @inner
-def discard(settings: Settings, state: State) -> None:
-    """Discard the rows since the first window, or those of an incomplete first window."""
-    for part in range(BEFORE if is_first(settings, state) else OLDER, NEWER + 1):
+def begin(settings: Settings, state: State, signals: Signals, period: float) -> None:
+    """Begin with an arm of which only the prior is known."""
+    unmodelled = settings.residual_floor / settings.n
+    innovation.start(unmodelled, state.weighed_statistics)
+    discard(state, BEFORE)
+    state.weighed_complete[0] = 0.0
+    state.weighing_wait[0] = _SETTLED / (settings.pole * period)
+    solve(settings, state, signals, period)
+
+
+@inner
+def discard(state: State, first: int) -> None:
+    """Discard the rows of the parts from the `first` on, and what was held."""
+    for part in range(first, LATEST + 1):
         window.clear(state.weighed_sums[part])
         state.weighed_rows[part] = 0.0
     for k in range(state.load.size):
         state.load[k] = 0.0
-    state.weighed_recent[0] = 0.0
+
+
+@inner
+def move_rows(state: State, source: int, target: int) -> None:
+    """Add the rows of the part `source` to those of the part `target`."""
+    sums = state.weighed_sums
+    window.add(sums[target], 1.0, sums[source], sums[target])
+    state.weighed_rows[target] += state.weighed_rows[source]
+    window.clear(sums[source])
+    state.weighed_rows[source] = 0.0
+
+
+@inner
+def promote(settings: Settings, state: State) -> None:
+    """Use the rows that have been kept apart long enough; forget those of an earlier half."""
+    if is_first(state):
+        move_rows(state, RECENT, BEFORE)
+    else:
+        move_rows(state, RECENT, NEWER)
+        if state.weighed_rows[NEWER] >= 0.5 * settings.window:
+            window.clear(state.weighed_sums[OLDER])
+            state.weighed_rows[OLDER] = 0.0
+            move_rows(state, NEWER, OLDER)
+    move_rows(state, LATEST, RECENT)
+
+
+@inner
+def end_part(settings: Settings, state: State, signals: Signals, period: float) -> None:
+    """Something else is held: close the part, without its latest rows, and begin another."""
+    sums = state.weighed_sums
+    for part in (RECENT, LATEST):
+        window.clear(sums[part])
+        state.weighed_rows[part] = 0.0
+    fewest = _FEWEST / period
+    if not is_first(state):
+        move_rows(state, OLDER, NEWER)
+        if state.weighed_rows[NEWER] >= fewest:
+            compare_with_nothing(settings, state, signals, period)
+        discard(state, OLDER)
+    elif state.weighed_rows[BEFORE] >= fewest:
+        state.weighed_complete[0] = 1.0
+        discard(state, OLDER)
+    else:
+        discard(state, BEFORE)
+    state.weighed_statistics[innovation.RECENT] = 0.0
+    state.weighing_wait[0] = _SETTLED / (settings.pole * period)
+    solve(settings, state, signals, period)
+
+
+@inner
+def compare_with_nothing(
+    settings: Settings, state: State, signals: Signals, period: float
+) -> None:
+    """Take the newer rows for those of an empty hand if it held nothing, or less than before."""
+    solve(settings, state, signals, period)
+    describe(settings, state, signals, period)
+    mass = state.load[MASS]
+    deviation = state.load[DEVIATION]
+    is_full = state.weighed_rows[BEFORE] >= settings.window
+    if mass < -_LESS * deviation:
+        window.clear(state.weighed_sums[BEFORE])
+        state.weighed_rows[BEFORE] = 0.0
+        move_rows(state, NEWER, BEFORE)
+    elif abs(mass) < _NOTHING * deviation and not is_full:
+        move_rows(state, NEWER, BEFORE)
 
 
 @inner
@@ -119,25 +209,33 @@ def is_contradicted(
     settings: Settings, state: State, signals: Signals, period: float
 ) -> bool:
     """Compare this row with the solution; return whether the last ones contradict it."""
-    if rows_since(state) < _FEWEST / period or state.load[DEVIATION] == 0.0:
-        return False
-    square = 0.0
+    m = settings.m
+    ND = settings.load_columns
+    X = signals.load_rows
     for i in range(settings.n):
-        error = -signals.row[i, settings.m]
-        for j in range(settings.m):
-            error += signals.row[i, j] * state.weighed_model[j]
-        square += error * error / settings.n
-    state.weighed_recent[0] += min(1.0, period / _MEMORY) * (
-        square - state.weighed_recent[0]
+        signals.load_torque[i] = signals.row[i, m]
+        for j in range(m):
+            X[i, j] = signals.row[i, j]
+        for c in range(ND.shape[1]):
+            X[i, m + c] = 0.0
+            for j in range(m):
+                if not is_first(state):
+                    X[i, m + c] += signals.row[i, j] * ND[j, c]
+    square = innovation.normalized_square(
+        X,
+        signals.load_torque,
+        state.weighed_solution,
+        state.weighed_factor,
+        period,
+        signals.load_covariance,
     )
-    return bool(state.weighed_recent[0] > _ALARM * state.weighed_noise[0])
-
-
-@inner
-def row_variance(settings: Settings, state: State, lasting: float) -> float:
-    """Return a = `lasting` s^2; the law's assumed residual until it has been measured."""
-    noise = max(state.weighed_noise[0], state.weighed_noise[1])
-    return lasting * (noise if noise > 0.0 else settings.residual_floor / settings.n)
+    return innovation.is_change(
+        square,
+        settings.residual_floor / settings.n,
+        period,
+        settings.window,
+        state.weighed_statistics,
+    )
 
 
 @inner
@@ -152,9 +250,9 @@ def fill_equations(
         [D^T N^T S'    D^T N^T S' N D + a ] [z    ] = [D^T N^T S'_u     ]
     """
     m = settings.m
-    A = signals.load_normal
-    x = signals.load_solution
-    before = state.weighed_sums[BEFORE]
+    A = state.weighed_factor
+    x = state.weighed_solution
+    before = signals.before
     since = signals.since
     ND = settings.load_columns
     for i in range(m):
@@ -177,41 +275,34 @@ def fill_equations(
 
 
 @inner
-def solve(settings: Settings, state: State, signals: Signals, lasting: float) -> None:
-    """Find theta and z, and the residual before and since; `lasting` rows count as one."""
-    m = settings.m
-    ND = settings.load_columns
-    x = signals.load_solution
-    window.add(state.weighed_sums[OLDER], 1.0, state.weighed_sums[NEWER], signals.since)
-    fill_equations(settings, state, signals, row_variance(settings, state, lasting))
-    cholesky_factor(signals.load_normal)
-    cholesky_solve(signals.load_normal, x)
-    theta, model = x[:m], state.weighed_model[:m]
-    for i in range(m):
-        model[i] = theta[i]
-        for c in range(ND.shape[1]):
-            model[i] += ND[i, c] * x[m + c]
-    first = max(state.weighed_rows[BEFORE], lasting)
-    last = max(rows_since(state), lasting)
-    before = window_residual(state.weighed_sums[BEFORE], theta)
-    state.weighed_noise[0] = before / (settings.n * first)
-    state.weighed_noise[1] = window_residual(signals.since, model) / (settings.n * last)
+def solve(settings: Settings, state: State, signals: Signals, period: float) -> None:
+    """Find theta and z of all rows, one each `period` [s], those kept apart included."""
+    sums = state.weighed_sums
+    window.add(sums[OLDER], 1.0, sums[NEWER], signals.since)
+    window.add(sums[BEFORE], 0.0, sums[BEFORE], signals.before)
+    for part in (RECENT, LATEST):
+        if is_first(state):
+            window.add(signals.before, 1.0, sums[part], signals.before)
+        else:
+            window.add(signals.since, 1.0, sums[part], signals.since)
+    a = innovation.row_variance(state.weighed_statistics, period)
+    fill_equations(settings, state, signals, a)
+    cholesky_factor(state.weighed_factor)
+    cholesky_solve(state.weighed_factor, state.weighed_solution)
 
 
 @inner
-def describe(
-    settings: Settings, state: State, signals: Signals, lasting: float
-) -> None:
+def describe(settings: Settings, state: State, signals: Signals, period: float) -> None:
     """Write mass and centre of the load to `state.load`, and their standard deviations.
 
     The covariance of z is a (U^T U)^-1 with the last rows U of the factor.  The centre is unknown
     where the mass is not twice its deviation.
     """
     m, k = settings.m, settings.load_scale.shape[1]
-    U = signals.load_normal[m:, m:]
-    z = signals.load_solution[m:]
+    U = state.weighed_factor[m:, m:]
+    z = state.weighed_solution[m:]
     v = signals.load_spread
-    a = row_variance(settings, state, lasting)
+    a = innovation.row_variance(state.weighed_statistics, period)
     for r in range(4):
         state.load[r] = 0.0
         for c in range(k):

@@ -1,0 +1,141 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Whether the arm has changed: rows contradict the latched solution, or the rows before them.
+
+Once a window is latched, the mean square error of its solution over the last 0.1 s is compared with
+the residual that it had.  Before, and until a full window has been found to be of one arm, the rows
+so far and the prior predict each row (see `innovation`): a window that has a pick-up in it is an
+excited mixture of two arms, which may leave no more than the unmodelled torque.
+
+If the arm has changed, window, filters and latch are cleared, and learning restarts.  What a window
+has taught before it was full is taken back: it did not predict what it was not fitted to.
+"""
+
+from blf_dsc_controller.compiled.algebra import cholesky_factor, cholesky_solve
+from blf_dsc_controller.compiled.jit import inner
+from blf_dsc_controller.law import adaptation, innovation, window
+from blf_dsc_controller.law.excitation import explained
+from blf_dsc_controller.law.state import Settings, Signals, State
+
+_ALARM = (
+    8.0  # ratio of mean squares; larger than the gate's, since a solution extrapolates
+)
+_MEMORY = 0.1  # s, averaging time of the last rows
+
+
+@inner
+def detect_change(
+    settings: Settings, state: State, signals: Signals, dt: float
+) -> None:
+    """Forget the window if the arm has changed: its rows contradict the solution, or each other.
+
+    What a window has taught before it was full is taken back: back to the estimate before.
+    """
+    has_changed = contradicts_solution(settings, state, signals, dt)
+    if not has_changed and not contradicts_first_rows(settings, state, signals, dt):
+        return
+    state.changes[0] += 1.0
+    if state.latched[0] == 1.0 and state.rows[0] < settings.window:
+        for j in range(settings.m):
+            signals.work[j] = state.estimate[j]
+            state.estimate[j] = state.anchor[j]
+        if settings.bumpless == 1:
+            adaptation.hand_over(settings, state, signals)
+    forget_window(settings, state)
+    state.first_statistics[innovation.RECENT] = 0.0
+    fit_first_rows(settings, state, settings.row_interval * dt)
+
+
+@inner
+def contradicts_solution(
+    settings: Settings, state: State, signals: Signals, dt: float
+) -> bool:
+    """Compare this row with the latched solution; return whether the last ones contradict it."""
+    if state.latched[0] == 0.0:
+        return False
+    square = 0.0
+    for i in range(settings.n):
+        error = -signals.row[i, settings.m]
+        for j in range(settings.m):
+            error += signals.row[i, j] * state.solution[j]
+        square += error * error
+    state.recent_residual[0] += min(1.0, dt / _MEMORY) * (
+        square - state.recent_residual[0]
+    )
+    allowed = _ALARM * explained(settings, state, state.residual[0])
+    if state.recent_residual[0] <= allowed:
+        return False
+    state.contradiction[0] = state.recent_residual[0]
+    return True
+
+
+@inner
+def contradicts_first_rows(
+    settings: Settings, state: State, signals: Signals, dt: float
+) -> bool:
+    """Compare this row with those before it, until a full window is known to be of one arm.
+
+    Without a prior, as of planar arms, the first rows predict too little.
+    """
+    samples = int(state.samples[0])
+    is_known = state.least_residual[0] > 0.0 or settings.prior_weight == 0.0
+    if is_known or samples % settings.row_interval != 0:
+        return False
+    period = settings.row_interval * dt
+    statistics = state.first_statistics
+    unmodelled = settings.residual_floor / settings.n
+    if statistics[innovation.NOISE] == 0.0:
+        innovation.start(unmodelled, statistics)
+        fit_first_rows(settings, state, period)
+    for i in range(settings.n):
+        signals.innovation[i] = signals.row[i, settings.m]
+        for j in range(settings.m):
+            signals.predicted[i, j] = signals.row[i, j]
+    square = innovation.normalized_square(
+        signals.predicted,
+        signals.innovation,
+        state.first_fit,
+        state.first_factor,
+        period,
+        signals.covariance,
+    )
+    if innovation.is_change(square, unmodelled, period, settings.window, statistics):
+        state.contradiction[0] = settings.n * statistics[innovation.RECENT]
+        return True
+    refresh = max(1, round(innovation.REFRESH / period))
+    if samples // settings.row_interval % refresh == refresh // 2:
+        fit_first_rows(settings, state, period)
+    return False
+
+
+@inner
+def fit_first_rows(settings: Settings, state: State, period: float) -> None:
+    """Solve for theta of the rows so far, one each `period` [s], and of the prior."""
+    a = innovation.row_variance(state.first_statistics, period)
+    R = settings.information
+    theta = state.first_fit
+    for i in range(settings.m):
+        theta[i] = state.running[i, settings.m]
+        for j in range(settings.m):
+            theta[i] += a * R[i, j] * settings.initial_estimate[j]
+        for j in range(i, settings.m):
+            state.first_factor[i, j] = state.running[i, j] + a * R[i, j]
+    cholesky_factor(state.first_factor)
+    cholesky_solve(state.first_factor, theta)
+
+
+@inner
+def forget_window(settings: Settings, state: State) -> None:
+    """Clear the window, its filters and the latch; the estimate stays and becomes the anchor."""
+    state.latched[0] = 0.0
+    state.best_lambda[0] = 0.0
+    state.recent_residual[0] = 0.0
+    state.rows[0] = 0.0
+    state.cursor[0] = 0.0
+    window.clear(state.running)
+    window.clear(state.fresh)
+    window.clear(state.half)
+    window.clear(state.filter1)
+    window.clear(state.filter2)
+    for j in range(settings.m):
+        state.anchor[j] = state.estimate[j]
+    window.reset_direction(state)

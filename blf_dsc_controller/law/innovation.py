@@ -1,0 +1,101 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Whether a row is what the rows before it predict, or the arm has changed between them.
+
+Rows X theta = u with residuals of the variance s^2, correlated for `CORRELATION`, and
+the prior N(theta_0, R^-1) give theta.  With the sum S of [X | u]^T [X | u], a row each T:
+
+    theta ~ N(A^-1 b, a A^-1),  A = S_XX + a R,  b = S_Xu + a R theta_0,
+    a = s^2 CORRELATION / T.
+
+The innovation e = u - X theta of a later row has the covariance s^2 C, with
+
+    C = I + a / s^2 X A^-1 X^T.
+
+A row is thus judged by what is known of theta so far, from the first row on, when many
+theta explain the rows.  The arm has changed where e^T C^-1 e / n, on average over 0.1 s,
+exceeds five times s^2.
+
+s^2 is assumed at first, and measured as the mean of e^T C^-1 e / n.  Rows that fit ever
+worse, as under a disturbance that lasts, raise it as they come, and contradict nothing.
+"""
+
+from blf_dsc_controller.compiled.algebra import cholesky_factor, whiten
+from blf_dsc_controller.compiled.jit import inner
+from blf_dsc_controller.compiled.layout import Array
+
+CORRELATION = 0.2  # s, of the residual
+REFRESH = 0.1  # s, from one solution to the next
+# s^2; the mean square, the rows that it is of, and the mean over 0.1 s
+NOISE, MEAN, COUNT, RECENT = range(4)
+_MEMORY = 0.1  # s
+_ALARM = 5.0  # times s^2; an arm that does not change reaches 2.5
+# s^2 before any row, of the square of the torque that is unmodelled; counts as so many rows,
+# and ever less until the mean square is of a window
+_ASSUMED, _ASSUMED_ROWS = 0.1, 100.0
+_MOST = 3.0  # times s^2, as which a row counts: those of a change hardly raise it
+_LEAST = 0.001  # of that square, which s^2 is at least
+
+
+@inner
+def start(unmodelled: float, statistics: Array) -> None:
+    """Begin the `statistics` (4,), of rows in which a mean square of (N m)^2 is `unmodelled`."""
+    statistics[NOISE] = _ASSUMED * unmodelled
+    statistics[MEAN] = 0.0
+    statistics[COUNT] = 0.0
+    statistics[RECENT] = 0.0
+
+
+@inner
+def row_variance(statistics: Array, period: float) -> float:
+    """Return a, with a row each `period` [s]: s^2 times the number of rows that count as one."""
+    return float(statistics[NOISE] * CORRELATION / period)
+
+
+@inner
+def normalized_square(
+    X: Array,
+    u: Array,
+    theta: Array,
+    factor: Array,
+    period: float,
+    C: Array,
+) -> float:
+    """Return e^T C^-1 e / n of a row, with the `factor` of A and a row each `period` [s].
+
+    Overwrites X (n, m) and u (n,), and C (n, n), which is scratch.
+    """
+    n = u.size
+    for i in range(n):
+        for j in range(theta.size):
+            u[i] -= X[i, j] * theta[j]
+        whiten(factor, X[i])
+    for i in range(n):
+        for j in range(i, n):
+            total = 0.0
+            for k in range(theta.size):
+                total += X[i, k] * X[j, k]
+            C[i, j] = CORRELATION / period * total
+        C[i, i] += 1.0
+    cholesky_factor(C)
+    return whiten(C, u) / n
+
+
+@inner
+def is_change(
+    square: float, unmodelled: float, period: float, most: float, statistics: Array
+) -> bool:
+    """Take e^T C^-1 e / n of a row into the `statistics`; return whether the last ones contradict.
+
+    The mean square is of some `most` rows, a window.
+    """
+    statistics[RECENT] += min(1.0, period / _MEMORY) * (square - statistics[RECENT])
+    result = statistics[RECENT] > _ALARM * statistics[NOISE]
+    count = min(statistics[COUNT] + 1.0, most)
+    statistics[COUNT] = count
+    usual = min(square, _MOST * statistics[NOISE])
+    statistics[MEAN] += (usual - statistics[MEAN]) / count
+    assumed_rows = _ASSUMED_ROWS * (1.0 - count / most)
+    share = assumed_rows / (assumed_rows + count)
+    noise = statistics[MEAN] + share * (_ASSUMED * unmodelled - statistics[MEAN])
+    statistics[NOISE] = max(noise, _LEAST * unmodelled)
+    return bool(result)
