@@ -184,7 +184,7 @@ class Robot:
         )
 
     def _weight_at_reach(self, chain: Chain) -> np.ndarray:
-        """Return the torque (n,) [N m] of the weight beyond each joint, at full reach."""
+        """Return torques (n,) [N m] of the weight beyond each joint at full reach."""
         weight = float(np.linalg.norm(self.gravity)) or _GRAVITY
         force = self.payload * weight
         torque = force * (

@@ -120,7 +120,7 @@ def _is_over(nodes: list[PlainNode]) -> bool:
 
 
 def spin_once(executor: Any, *nodes: PlainNode) -> None:
-    """Wait for work and execute it; raise errors that the only node does not survive."""
+    """Wait for work and do it; raise errors that the only node does not survive."""
     try:
         executor.spin_once(timeout_sec=_POLL)
     except RCLError:

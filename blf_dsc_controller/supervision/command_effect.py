@@ -18,9 +18,9 @@ _PATIENCE = 0.1  # s
 class CommandEffect:
     """Average of the torque M ddq that accelerates the arm.
 
-    An arm held by brakes, or by drives whose effort controller is inactive, does not accelerate,
-    whatever is commanded.  One that brakes by the commanded damping does, or that falls with a load
-    that the model lacks.
+    An arm held by brakes, or by drives whose effort controller is inactive, does not
+    accelerate, whatever is commanded.  One that brakes by the commanded damping does,
+    or that falls with a load that the model lacks.
     """
 
     def __init__(self, n: int) -> None:
@@ -45,9 +45,10 @@ class CommandEffect:
         self.is_proven = self.is_proven or largest > _NOTICED
 
     def is_missing(self, change: Vector, limit: Vector, dt: float) -> bool:
-        """Whether commands that changed by these torques (n,) [N m] have had none for some time.
+        """Whether commands that changed by these torques (n,) [N m] had no effect.
 
-        `dt` [s] is the time since the last call; it answers once.  Call it until one is proven.
+        `dt` [s] is the time since the last call; it answers once.  Call it until one is
+        proven.
         """
         has_changed = bool((np.abs(change) > _CHANGED * limit).any())
         if not has_changed or self._unanswered > _PATIENCE:

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Warnings about a configuration that is valid but cannot work well.
 
-They concern gains, limits and windows, and are based on the initial parameter estimate, which is a
-guess. doc/tuning.md derives them.
+They concern gains, limits and windows, and are based on the initial parameter estimate,
+which is a guess. doc/tuning.md derives them.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ _SLUGGISH = 1.0  # rad/s^2; the weakest joint of the presets has 60
 
 
 class Finding(NamedTuple):
-    """A limit of the gains: on what, how much of it is used, and what follows above 1."""
+    """A limit of the gains: what it is on, how much is used, what follows above 1."""
 
     subject: str
     use: float
@@ -73,7 +73,7 @@ def _of_stop(config: ControllerConfig) -> Iterator[str]:
 def config_warnings(
     config: ControllerConfig, load: ReferenceLoad | None = None
 ) -> list[str]:
-    """Return the warnings, one sentence each, beginning with the parameter to change first.
+    """Return the warnings, each beginning with the parameter to change first.
 
     `load` is that of the reference, if known.
     """
@@ -105,7 +105,7 @@ def worsened(
 
 
 def _of_urdf(config: ControllerConfig, load: ReferenceLoad) -> Iterator[str]:
-    """Check for figures that nobody can have measured, and for defaults that are hardly meant."""
+    """Check for implausible figures, and for defaults that are hardly meant."""
     robot = config.robot
     chain = robot.chain(config.joints)
     if (joints := robot.placeholder_efforts(chain)) and not robot.rotor_inertia:
@@ -186,10 +186,11 @@ def _of_errors(config: ControllerConfig, settings: Settings) -> Iterator[str]:
 def _of_first_error(
     config: ControllerConfig, settings: Settings, load: ReferenceLoad
 ) -> Iterator[str]:
-    """Check that these gains keep the first error within the bound, before anything is learned.
+    """Check that these gains keep the first error within the bound.
 
-    The prior of such an arm is as wide as its parameters: at first the torque may err by all that
-    the reference needs, which feedback and barrier make up for: K_p (K/2 + mu) xi1 + w xi1.
+    The prior of such an arm is as wide as its parameters: at first the torque may err
+    by all that the reference needs, which feedback and barrier make up for: K_p (K/2 +
+    mu) xi1 + w xi1.
     """
     stiffness = settings.Kp * (settings.K / 2.0 + settings.mu) + settings.weight
     errors = load.torque / np.maximum(stiffness, 1e-12)

@@ -1,15 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
 """Declare a weighed load to the drives, so that no joint torque steps.
 
-Drives that compensate gravity only know the load that is declared to them.  A law that has
-weighed it can declare it.  They then add its weight, and the command is reduced by it,
+Drives that compensate gravity only know the load that is declared to them.  A law that
+has weighed it can declare it.  They then add its weight, and the command is reduced by
+it,
 
     whole torque = command + G_d(q) = command' + G_d'(q),    G_d' = G_d + that of the load
 
 so that the whole torque of the joint does not change.  But the drives decide when the
 change takes effect.  A command that is on its way belongs to the earlier load, and is
-wrong by the change for one cycle.  So the load is declared in steps that change no torque
-by more than `_STEP` of its limit, each after the one before has taken effect.
+wrong by the change for one cycle.  So the load is declared in steps that change no
+torque by more than `_STEP` of its limit, each after the one before has taken effect.
 """
 
 from __future__ import annotations
@@ -90,7 +91,7 @@ class DriveLoads:
         controller.settings.drive_inertias[:] = self._added()
 
     def next(self, controller: Controller) -> DriveLoad | None:
-        """Return the load to tell next; None: there is nothing to tell, or not well enough known.
+        """Return the load to declare next; None if there is none, or too uncertain.
 
         Nothing is told while something touches the arm.
         """
@@ -109,7 +110,7 @@ class DriveLoads:
         return DriveLoad.of(moments + part * (target - moments))
 
     def _weighed(self, controller: Controller) -> Vector | None:
-        """Return mass and moments (4,) that the drives should have; None: those they have."""
+        """Return mass and moments (4,) that the drives should get; None: no change."""
         load = controller.state.load
         half = TWO_SIDED * load[DEVIATION]
         narrow = max(_NARROW, _SHARE * abs(load[MASS]))
@@ -127,14 +128,14 @@ class DriveLoads:
         return target if is_new or self._goes_on else None
 
     def _added(self) -> Vector:
-        """Return what the columns of the drives' gravity are multiplied by, for the law."""
+        """Return the factors of the columns of the drives' gravity, for the law."""
         if self.base is self.declared:
             return self._columns(self.told)
         since = self._columns(self.told) - self._columns(self.base)
         return self._columns(self.declared) + since
 
     def _columns(self, load: DriveLoad) -> Vector:
-        """Return what the columns of the drives' gravity are multiplied by, with this load."""
+        """Return the factors of the columns of the drives' gravity, with this load."""
         robot = replace(
             self._robot, drive_payload=load.mass, drive_payload_centre=load.centre
         )

@@ -1,16 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
 """The errors to expect: those of the sampled loop at small errors.
 
-About a motion that the law
-follows, learning aside, the law is linear in the errors, and so is the arm with its inertia M of
-that posture.  From one sample to the next the errors of n joints follow x+ = A x + B d with, for
-each joint,
+About a motion that the law follows, learning aside, the law is linear in the errors,
+and so is the arm with its inertia M of that posture.  From one sample to the next the
+errors of n joints follow x+ = A x + B d with, for each joint,
 
     x = [q, dq, drive torque, torque of the last sample, q of the last sample, filtered dq,
          alpha2, d^3]
 
-where d [N m] is the torque that the model lacks.  Torques arrive a sample late and pass the drives,
-velocities are differences of positions behind a filter; each of both lags is half of `robot.lag`.
+where d [N m] is the torque that the model lacks.  Torques arrive a sample late and pass
+the drives, velocities are differences of positions behind a filter; each of both lags
+is half of `robot.lag`.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ _REVERSAL = 0.75
 def transition(
     settings: Settings, T: float, lag: float, M: Floats, M0: Floats, stiffness: Floats
 ) -> tuple[Floats, Floats]:
-    """Return A (k, 8 n, 8 n) and B (k, 8 n, n) for the inertias M and M0 of the model (k, n, n).
+    """Return A (k, 8 n, 8 n), B (k, 8 n, n) for inertias M and M0 (k, n, n).
 
     T [s] is the sample time, `lag` [s] that of velocity filter and drives together, and
     `stiffness` (n,) [N m/rad] the slope of the barrier.
@@ -49,7 +49,8 @@ def transition(
     mean = (1.0 - decay) * 0.5 * lag / T  # of the drives' transient over the sample
     rate = settings.K / 2.0 + settings.mu
     g = barrier.filter_gain(settings.time_constant, T)
-    # Rows of x, and of what the law computes in terms of x: alpha2', xi2 and the torque.
+    # Rows of x, and of what the law computes in terms of x: alpha2', xi2 and the
+    # torque.
     q, dq, drive, last, before, speed, alpha2, d3 = np.eye(8 * n).reshape(8, n, 8 * n)
     measured = speed + (1.0 - decay) * ((q - before) / T - speed)
     beta2 = -rate[:, None] * q
@@ -86,7 +87,7 @@ def transition(
 def _peak_errors(
     config: ControllerConfig, settings: Settings, M: Floats, M0: Floats, torque: Floats
 ) -> Floats:
-    """Return the largest errors (k, n) [rad] after a step of the torque d (k, n) [N m]."""
+    """Return the largest errors (k, n) [rad] after a torque step d (k, n) [N m]."""
     A, B = transition(
         settings, config.sample_time, config.robot.lag, M, M0, settings.weight
     )
@@ -101,14 +102,14 @@ def _peak_errors(
 
 
 class ExpectedErrors(NamedTuple):
-    """Largest errors (n,) [rad] along the reference, before anything is learned of their cause."""
+    """Largest errors (n,) [rad] along the reference, before anything is learned."""
 
     unmodelled: Floats  # of learning.residual_floor and friction at a reversal
     pick_up: Floats  # when robot.payload is picked up in motion
 
 
 def expected_errors(config: ControllerConfig, settings: Settings) -> ExpectedErrors:
-    """Return the errors to expect from an arm of a URDF, by the linear loop without the barrier."""
+    """Return the expected errors of an arm from a URDF, by the linear loop."""
     model, robot = settings.model, config.robot
     chain = robot.chain(config.joints)
     if config.reference.type == 'hold':  # at rest anywhere

@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """Check the first torque before it is sent to an arm that nobody has commanded yet.
 
-The effort of a resting arm shows whether its drives compensate gravity: it equals gravity if they
-do, and is zero if the brakes hold the arm.  Only its direction and order of magnitude are used, so
-it may also be a current.  A zero effort is inconclusive if it may not be measured, or may not
-contain what the drives add.  Then no torque of gravity is sent unless the configuration says that
-the drives tolerate it (`support`).
+The effort of a resting arm shows whether its drives compensate gravity: it equals
+gravity if they do, and is zero if the brakes hold the arm.  Only its direction and
+order of magnitude are used, so it may also be a current.  A zero effort is inconclusive
+if it may not be measured, or may not contain what the drives add.  Then no torque of
+gravity is sent unless the configuration says that the drives tolerate it (`support`).
 """
 
 from __future__ import annotations
@@ -70,7 +70,7 @@ def check_first_torque(
 
 
 def is_like(torque: Vector, gravity: Vector) -> bool:
-    """Whether a torque (n,) has the direction of gravity, and its order of magnitude."""
+    """Whether a torque (n,) has the direction and magnitude of gravity."""
     sizes = float(np.linalg.norm(torque)), float(np.linalg.norm(gravity))
     return (
         sizes[0] > _NOTICED * sizes[1]
@@ -125,7 +125,7 @@ def _check_gravity(
 
 
 def limit_first_torque(controller: Controller, last: Vector, dt: float) -> None:
-    """Limit the rate of the law's first torque, `dt` [s] after the torque `last` (n,) [N m].
+    """Limit the rate of the law's first torque, `dt` [s] after `last` (n,) [N m].
 
     The law does not know `last`.
     """

@@ -70,8 +70,8 @@ _LONG_GAP = 2.5  # samples
 _IN_A_ROW = 0.1  # s between two states, at most
 _AT_REST = 0.01  # rad/s
 
-# Commands that do not reach the arm may be why, or velocities that are not its own: both wind up
-# the estimates.
+# Commands that do not reach the arm may be why, or velocities that are not its own:
+# both wind up the estimates.
 _PERHAPS_UNREACHED = (Reason.OUTSIDE_BOUND, Reason.SATURATED)
 # A contact does so, too.
 _WINDING_UP = (*_PERHAPS_UNREACHED, Reason.VELOCITY, Reason.CONTACT)
@@ -86,7 +86,8 @@ _REASONS: dict[type[codecs.MessageError], Reason] = {
 class Guard:
     """The law with its checks and safe torque; it records all events in its journal.
 
-    `update`, `reject`, `watch` and `fail` return the torque (n,) [N m] to command, or None.
+    `update`, `reject`, `watch` and `fail` return the torque (n,) [N m] to command, or
+    None.
 
     Attributes:
         config: configuration in force.
@@ -163,9 +164,10 @@ class Guard:
         return self._time_of(self.last_stamp)
 
     def update(self, stamp: int, measurement: Vector) -> Vector | None:
-        """Return the torque for a joint state with its stamp [ns], None to command nothing.
+        """Return the torque for a joint state, with its stamp [ns]; None: no command.
 
-        `measurement` is [q (n,) rad, dq (n,) rad/s, applied torque of the last interval (n,) N m].
+        `measurement` is [q (n,) rad, dq (n,) rad/s, applied torque of the last interval
+        (n,) N m].
         """
         self._begin_message()
         gap = (stamp - self.journal.stamp) * _NANO
@@ -191,10 +193,10 @@ class Guard:
         return self._safe_at(stamp, measurement)
 
     def _is_silenced(self, gap: float) -> bool:
-        """Whether to stay silent out of command: once the states are back after a long silence.
+        """Whether to stay silent while not in command, after a long silence.
 
-        By then the safe torque has faded to zero, and whoever restarted the driver may not expect
-        another. `gap` [s] is the time since the state before.
+        By then the safe torque has faded to zero, and whoever restarted the driver may
+        not expect another. `gap` [s] is the time since the state before.
         """
         faded = self._safe_torque.last.age >= self.config.safety.fade_time
         if not self.silenced and faded and self.commanding and gap > LONG_SILENCE:
@@ -218,7 +220,7 @@ class Guard:
             self.controller.checks.readings[0] = 0.0
 
     def _clock_step(self, measurement: Vector) -> Fault | None:
-        """Return the fault of a stamp that has stepped with its clock, not with the arm."""
+        """Return the fault of a clock that was set while the arm moved."""
         last = self._safe_torque.last
         if self._gap < _LONG_GAP * self.config.sample_time or last.age > 0.0:
             return None
@@ -262,13 +264,13 @@ class Guard:
         return torque
 
     def load_to_tell(self) -> DriveLoad | None:
-        """Return the load to tell the drives next, None if there is none: `learning.tell_drive`."""
+        """Return the load to declare to the drives next, None if there is none."""
         if self._drive_loads is None or not self.has_sample:
             return None
         return self._drive_loads.next(self.controller)
 
     def take_over(self, load: DriveLoad) -> None:
-        """Command less by the weight of a load that the drives add from the next state on."""
+        """Subtract the weight of a load that the drives add from the next state on."""
         if self._drive_loads is None:
             raise BlfDscError(
                 'learning.tell_drive: got false, but a load is declared to the drives: set it to '
@@ -320,7 +322,7 @@ class Guard:
         return self._safe(dt)
 
     def observe(self, stamp: int, measurement: Vector) -> None:
-        """Compare velocities with positions by a state that is held back before the start."""
+        """Compare velocities with positions for a state that is held back."""
         self._take_stamp(stamp)
         self._compare_velocities(stamp, measurement)
 
@@ -363,7 +365,7 @@ class Guard:
             )
 
     def _start(self, stamp: int, measurement: Vector) -> bool:
-        """Resume along the running reference if the law can take over, or else start at t = 0."""
+        """Resume along the running reference if possible, otherwise start at t = 0."""
         q, dq, _ = measurement.reshape(3, -1)
         resumed = self._resumes(stamp, q, dq)
         if not resumed:
@@ -435,7 +437,7 @@ class Guard:
             self.supervisor.enter(Phase.TRACKING)
 
     def advance(self, stamp: int, measurement: Vector, count: int) -> None:
-        """Advance to the state of a stamp [ns], the last of `count` that the law has used.
+        """Advance to the state of a stamp [ns], the last of `count` used by the law.
 
         All checks passed, and `samples.ratio` and the kept estimates are up to date.
         """
@@ -451,7 +453,7 @@ class Guard:
         self._advance_to(stamp)
 
     def reject(self, error: codecs.MessageError) -> Vector | None:
-        """Return the torque for an unreadable message, None if it is for another arm."""
+        """Return the torque for an unreadable message, None if it is another arm's."""
         self._begin_message()
         if isinstance(error, codecs.MissingJointError) and error.is_foreign(
             self.config.joints
@@ -531,7 +533,8 @@ class Guard:
     def _safe(self, dt: float) -> Vector | None:
         """Return the safe torque, `dt` [s] further along the ramp.
 
-        None before the law has commanded any: a controller that never started stays silent.
+        None before the law has commanded any: a controller that never started stays
+        silent.
         """
         if not self.commanding:
             return None
@@ -544,7 +547,7 @@ class Guard:
         return torque
 
     def _add_missing_effect(self, change: Vector) -> None:
-        """Say that commands that have changed by these torques (n,) [N m] do not move the arm."""
+        """Report that commands that changed by these torques (n,) move nothing."""
         if self.supervisor.reason is Reason.NO_EFFECT:
             return
         limit = self.controller.settings.torque_limit
@@ -556,7 +559,7 @@ class Guard:
         )
 
     def activate(self) -> None:
-        """Take command with the next state and what was learned, after a fault: before it."""
+        """Take command with the next state, and what was learned before a fault."""
         self._note(EventType.ACTIVATE)
         if self._clean:
             self.controller.state.samples[0] = 0.0
@@ -587,7 +590,7 @@ class Guard:
         self._start_over()
 
     def plan(self, command: Trajectory | Target, at: float | None = None) -> Plan:
-        """Plan a motion, in any thread, to `adopt` by the time `at` [s], which defaults to now.
+        """Plan a motion, in any thread, to `adopt` by the time `at` [s] (now).
 
         Raises:
             TrajectoryError: it cannot be followed.
@@ -618,7 +621,7 @@ class Guard:
         self.supervisor.enter(Phase.TRACKING if is_settled else Phase.APPROACHING)
 
     def _adopt_target(self, planned: Plan) -> None:
-        """Follow a target; raises TrajectoryError where the reference holds after a contact."""
+        """Follow a target; raise TrajectoryError if the arm holds after a contact."""
         if self.holds:
             remedy = 'send a trajectory that leads away from it, or call reset'
             why = self.contact.text if self.contact else ''
@@ -627,7 +630,7 @@ class Guard:
         self._follow(planned.motion.vector)
 
     def brake(self) -> float:
-        """Bring the reference to rest within the limits, from now on; return when it rests [s].
+        """Bring the reference to rest within the limits; return when it rests [s].
 
         Raises:
             TrajectoryError: the controller is not in command.
@@ -676,7 +679,7 @@ class Guard:
         return not self.supervisor.running and self._safe_torque.is_settled
 
     def release(self) -> Vector | None:
-        """Return the last torque, if any was commanded: the safe torque of an arm at rest."""
+        """Return the last torque, if any: the safe torque of an arm at rest."""
         self._note(EventType.RELEASE, resting=bool(self.is_settled))
         self.has_sample = False  # the last torque is not the law's
         if not self.commanding or self.silenced:

@@ -41,9 +41,9 @@ class LastState:
     ) -> None:
         """Store the usable part of any other state, `period` [s] after the last.
 
-        Positions that are not finite or have a repeated stamp do not show where the arm is now. A
-        velocity that is missing, not finite or beyond the limit is replaced with the one
-        differenced from the positions, within the limit.
+        Positions that are not finite or have a repeated stamp do not show where the arm
+        is now. A velocity that is missing, not finite or beyond the limit is replaced
+        with the one differenced from the positions, within the limit.
         """
         q, dq, _ = measurement.reshape(3, -1)
         if stamp == self._stamp or not np.isfinite(q).all():

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A motion that was planned beside the loop, to be adopted between two of its samples."""
+"""A motion planned beside the loop, to be adopted between two samples."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class Plan(NamedTuple):
     content: dict[str, Any]  # of its event
 
     def check(self, reference_vector: np.ndarray, now: float) -> None:
-        """Check that it can still be adopted, now [s], by a loop with this packed reference.
+        """Check that a loop with this packed reference can still adopt it now [s].
 
         Raises:
             LatePlanError: it begins in the past.

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Torque, inertia and excitation along the reference, by the initial parameter estimate."""
+"""Torque, inertia and excitation along the reference, by the initial estimate."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ class ReferenceLoad(NamedTuple):
         return least
 
     def damping(self, settings: Settings) -> Floats:
-        """Return the smallest damping (n,) of each joint with the others free, N m s/rad."""
+        """Return the smallest damping (n,) [N m s/rad], with the other joints free."""
         rate = settings.damping_rate
         damped = rate * self.free_inertia if rate > 0.0 else 0.0
         return settings.Kp + damped

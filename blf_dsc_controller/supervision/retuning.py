@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """Changes of the gains of a running law without a jump of its torque.
 
-A jump of the gains at unchanged errors would make the torque jump. Two states of the law absorb
-the difference: the surface filter is shifted with the virtual control, so that alpha2' does not
-change, and the disturbance estimate, the integrator of the law, absorbs the rest; it then returns
-to its own value at the rate of its gain. A joint whose disturbance gain is 0 has no integrator, so
-its torque steps.
+A jump of the gains at unchanged errors would make the torque jump. Two states of the
+law absorb the difference: the surface filter is shifted with the virtual control, so
+that alpha2' does not change, and the disturbance estimate, the integrator of the law,
+absorbs the rest; it then returns to its own value at the rate of its gain. A joint
+whose disturbance gain is 0 has no integrator, so its torque steps.
 """
 
 from __future__ import annotations
@@ -24,10 +24,10 @@ from blf_dsc_controller.law.factory import law_of, settings_of_config
 Floats = NDArray[np.float64]
 
 settings_in_loop = lru_cache(maxsize=2)(settings_of_config)
-"""As `settings_of_config`, computed once for the configurations before and after a change.
+"""`settings_of_config`, computed once before and after a change.
 
-It takes some samples of the loop, in whose thread a change is checked and applied. The arrays are
-for reading only.
+It takes some samples of the loop, in whose thread a change is checked and applied. The
+arrays are for reading only.
 """
 
 _STABLE = 2.0  # x += -a x diverges for a >= 2
@@ -64,7 +64,7 @@ def apply_bumpless(
 def problems(
     controller: Controller, config: ControllerConfig, t: float
 ) -> Iterator[str]:
-    """Yield reasons why a running law cannot accept a valid configuration at time t [s]."""
+    """Yield why a running law cannot accept a valid configuration at t [s]."""
     state = controller.state
     p = controller.settings.p
     learning = config.learning

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The safe torque, computed from the last usable state; ramps lead from the last torque to it."""
+"""The safe torque from the last usable state, and ramps to it."""
 
 from __future__ import annotations
 
@@ -33,9 +33,9 @@ def safe_torque(
 ) -> Vector:
     """Return the safe torque (n,) [N m], within the torque limit and always finite.
 
-    It is zero, damping -D dq, or damping plus gravity H(q, 0, 0, 0) P^ and `load` (n,) [N m] as far
-    as the drive does not add them, and fades to zero while no usable state arrives. D is the
-    configured damping times `scale` (n,).
+    It is zero, damping -D dq, or damping plus gravity H(q, 0, 0, 0) P^ and `load` (n,)
+    [N m] as far as the drive does not add them, and fades to zero while no usable state
+    arrives. D is the configured damping times `scale` (n,).
     """
     torque = np.zeros(settings.n)
     if last.age >= safety.fade_time:
@@ -57,15 +57,16 @@ class SafeTorque:
 
     It obeys the rate limit, except for the last torque of all.
 
-    What holds the arm besides the model's gravity is observed from its motion, in the stop, too:
+    What holds the arm besides the model's gravity is observed from its motion, in the
+    stop, too:
 
         load' = L (tau - H(q, dq, dq, ddq) P^ - friction - load),   |load| <= half the torque limit
 
-    Estimated friction is not part of it, since it helps to brake.  So an arm comes to rest with a
-    payload, or with a model, that the law had not learned yet.  Commands that do not reach the arm
-    would make that sum up for ever: after a stop that this may have caused, the load stays as it is
-    until the arm accelerates, as one on which they act (`CommandEffect`).  Once the arm has sped up
-    it stays for good.
+    Estimated friction is not part of it, since it helps to brake.  So an arm comes to
+    rest with a payload, or with a model, that the law had not learned yet.  Commands
+    that do not reach the arm would make that sum up for ever: after a stop that this
+    may have caused, the load stays as it is until the arm accelerates, as one on which
+    they act (`CommandEffect`).  Once the arm has sped up it stays for good.
 
     Attributes:
         load: torque (n,) [N m] that the model lacks; initially the disturbance estimate of the law.
@@ -95,9 +96,10 @@ class SafeTorque:
     def begin_ramp(
         self, duration: float, load: Vector, *, reached: bool = True
     ) -> None:
-        """Start a linear ramp of `duration` [s] at the last torque, with the `load` as known.
+        """Start a linear ramp of `duration` [s] at the last torque, with this `load`.
 
-        If commands may not have `reached` the arm, the load is observed once they have an effect.
+        If commands may not have `reached` the arm, the load is observed once they have
+        an effect.
         """
         self.load[:] = load
         self._known_load[:] = load
@@ -110,7 +112,7 @@ class SafeTorque:
         self._elapsed = 0.0
 
     def yield_to_contact(self) -> None:
-        """Give way: gravity with damping, until the next ramp; what pushes is no load."""
+        """Give way, with gravity and damping, until the next ramp; observe no load."""
         self.stop_observing()
         self._yields = True
 
@@ -138,7 +140,8 @@ class SafeTorque:
     ) -> Vector | None:
         """Return the last torque (n,) [N m]; None before the first usable state.
 
-        It is not damped: a driver may hold it for ever, and a constant torque damps nothing.
+        It is not damped: a driver may hold it for ever, and a constant torque damps
+        nothing.
         """
         self._duration = 0.0
         self.last.dq[:] = 0.0
@@ -147,7 +150,7 @@ class SafeTorque:
     def advance(
         self, safety: Safety, settings: Settings, estimate: Vector, dt: float
     ) -> Vector | None:
-        """Return the torque (n,) [N m] `dt` [s] later; None before the first usable state."""
+        """Return the torque (n,) [N m] `dt` [s] later; None before a usable state."""
         if self.last.age == inf:
             return None
         self.missed_change = None
@@ -170,7 +173,7 @@ class SafeTorque:
         return self.commanded
 
     def observe(self, settings: Settings, estimate: Vector, dt: float) -> None:
-        """Update the load by the motion of the last `dt` [s] under the torque commanded before."""
+        """Update the load by the motion of the last `dt` [s] and its torque."""
         needed = self._needed(settings, estimate)
         if needed is not None:
             self._update_load(settings, needed, dt)
@@ -191,7 +194,7 @@ class SafeTorque:
             self._update_load(settings, needed, dt)
 
     def _needed(self, settings: Settings, estimate: Vector) -> Vector | None:
-        """Return the command (n,) [N m] that explains the last motion; None if it is unknown."""
+        """Return the command (n,) [N m] behind the last motion; None if unknown."""
         last = self.last
         if last.ddq is None:
             return None

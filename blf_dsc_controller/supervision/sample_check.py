@@ -16,8 +16,8 @@ from blf_dsc_controller.supervision.supervisor import Fault, Reason
 from blf_dsc_controller.tool.errors import in_words
 
 Vector = NDArray[np.float64]
-# of the torque limit: what an effort lacks, on average and now, that explains an error past the
-# bound
+# of the torque limit: what an effort lacks, on average and now, that explains an error
+# past the bound
 _LACKS, _LACKS_NOW = 0.05, 0.1
 _LIGHT = 0.5  # of the assumed inertia: less is worth saying
 _NOTHING = 0.02  # of it: no drive has so little
@@ -26,7 +26,7 @@ _RELIEF = 4
 
 
 class SampleCheck:
-    """Checks each sample of a controller, and keeps the estimates of the last valid one.
+    """Checks each sample, and keeps the estimates of the last valid one.
 
     Attributes:
         ratio: largest |xi1| / k_c of each joint since the start (n,).
@@ -105,7 +105,7 @@ class SampleCheck:
         np.concatenate((state.estimate, state.disturbance), out=self._kept)
 
     def return_to_consistent(self) -> None:
-        """Keep the estimates from before the error grew: the commands may not reach the arm."""
+        """Keep the estimates from before the error grew."""
         self._kept[:] = self._controller.checks.consistent
 
     def restore(self) -> None:
@@ -116,7 +116,7 @@ class SampleCheck:
         state.disturbance[:] = self.disturbance
 
     def check(self, dt: float) -> Fault | None:
-        """Return why the torque of a sample, `dt` [s] after the one before, must not be used."""
+        """Return why the torque of a sample, after `dt` [s], must not be used."""
         flags = self._controller.flags
         if flags & OUTSIDE:
             self.outside += 1
@@ -163,7 +163,7 @@ class SampleCheck:
         return Fault(Reason.NO_EFFECT, text)
 
     def _lacking(self, joint: int, lack: Vector) -> Fault:
-        """Return the fault of a joint whose effort lacks `lack` (n,) [N m] of what is commanded."""
+        """Return the fault of a joint whose effort lacks `lack` (n,) [N m]."""
         text = (
             f'the effort of joint {self._joints[joint]!r} lacks {lack[joint]:+.4g} N m of '
             'what is commanded: release the brakes, and activate the effort controller; if the '
@@ -172,7 +172,7 @@ class SampleCheck:
         return Fault(Reason.NO_EFFECT, text)
 
     def _unreached(self) -> Fault | None:
-        """Return the fault if measured efforts show that the commands do not reach a moving arm."""
+        """Return the fault if efforts show that commands do not reach a moving arm."""
         settings = self._controller.settings
         checks = self._controller.checks
         if checks.compares[0] == 0.0:
@@ -212,7 +212,7 @@ class SampleCheck:
         return Fault(Reason.OUTSIDE_BOUND, text + self._lightness(worst))
 
     def _lightness(self, joint: int) -> str:
-        """Return what was found if the inertia of a joint's drive is far below the assumed."""
+        """Return a text if the inertia of a joint's drive is far below the assumed."""
         settings = self._controller.settings
         state = self._controller.state
         if state.gain_scale[joint] > _LIGHT:
@@ -231,7 +231,7 @@ class SampleCheck:
         )
 
     def _saturated(self, dt: float) -> Fault | None:
-        """Count a sample in which a torque is at its limit: what else is suspect has stopped."""
+        """Count a sample with a torque at its limit."""
         signals = self._controller.signals
         limit = self._controller.settings.torque_limit
         needed = np.maximum(

@@ -42,7 +42,7 @@ class PreparedStart(NamedTuple):
 def prepared_start(
     config: ControllerConfig, bound: Vector, positions: Vector
 ) -> PreparedStart:
-    """Return the start from rest at `positions` (n,) [rad], inside the bound (n,) [rad].
+    """Return the start from rest at `positions` (n,) [rad] inside `bound`.
 
     Raises:
         StartError: the law cannot take over there.

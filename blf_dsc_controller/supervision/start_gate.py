@@ -27,11 +27,12 @@ class GateState(Enum):
 
 
 class StartGate:
-    """Measures the rate of the first states by their stamps, whatever clock those are of.
+    """Measures the rate of the first states by their stamps.
 
-    At another rate than that of the sample time the gains are wrong, up to instability. Only a
-    sender that sends a single state, and no newer one for 0.2 s, may start unmeasured: it waits for
-    a torque.  A pause after several states proves nothing: the measurement begins anew.
+    At another rate than that of the sample time the gains are wrong, up to instability.
+    Only a sender that sends a single state, and no newer one for 0.2 s, may start
+    unmeasured: it waits for a torque.  A pause after several states proves nothing: the
+    measurement begins anew.
 
     Attributes:
         state: what the gate does.

@@ -73,9 +73,10 @@ class StateCheck:
         self._last_stamp = stamp
 
     def check(self, safety: Safety, stamp: int) -> Fault | None:
-        """Return why the controller must stop, SKIP to ignore the state, or None to use it.
+        """Return why the controller must stop; SKIP: ignore the state; None: use it.
 
-        The stamp is in ns; the values are checked by the law (`law.checks.is_valid_state`).
+        The stamp is in ns; the values are checked by the law
+        (`law.checks.is_valid_state`).
         """
         if stamp <= 0:
             text = f'a joint state has the stamp {stamp} ns, which is not a valid time'
@@ -122,7 +123,7 @@ class StateCheck:
         return Fault(Reason.OVERRUN, text)
 
     def contradicted(self, derived: Vector, measured: Vector) -> Fault:
-        """Return the fault of velocities (n,) [rad/s] that are not those of the positions."""
+        """Return the fault of velocities (n,) [rad/s] that contradict the positions."""
         worst = int(np.argmax(np.abs(derived - measured)))
         text = (
             f'the velocity of joint {self._joints[worst]!r} is {measured[worst]:+.3g} rad/s, but '
@@ -133,9 +134,10 @@ class StateCheck:
         return Fault(Reason.VELOCITY, text)
 
     def clock_step(self, gap: float, q_step: Vector, dq: Vector) -> Fault | None:
-        """Return a fault if the arm has moved for much less than `gap` [s] since the last state.
+        """Return a fault if the arm has moved for much less than `gap` [s].
 
-        `q_step` (n,) [rad] is the motion since then, `dq` (n,) [rad/s] its mean velocity.
+        `q_step` (n,) [rad] is the motion since then, `dq` (n,) [rad/s] its mean
+        velocity.
         """
         speed = float(dq @ dq)
         if gap < _LONG_GAP * self._sample_time or speed < _MOVING**2:
@@ -151,7 +153,7 @@ class StateCheck:
         return Fault(Reason.STAMP_JUMP, text)
 
     def invalid(self, safety: Safety, measurement: Vector) -> Fault:
-        """Return the fault of an invalid [q (n,) rad, dq (n,) rad/s, effort (n,) N m]."""
+        """Return the fault of an invalid measurement [q, dq, effort] (3n,)."""
         q, dq, _ = measurement.reshape(3, -1)
         if not np.isfinite(q).all():
             return Fault(Reason.NOT_FINITE, f'the positions are not finite: {q}')

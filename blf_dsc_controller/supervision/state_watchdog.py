@@ -22,8 +22,8 @@ _IN_TRANSIT = 0.001  # s past the limit, for a state on its way
 class Watchdog:
     """Measures the silence since the last joint state.
 
-    A check that is itself late proves nothing, since states may be waiting in the queue; the next
-    check decides.
+    A check that is itself late proves nothing, since states may be waiting in the
+    queue; the next check decides.
 
     Attributes:
         on: whether a silence leads to a stop.
@@ -41,7 +41,7 @@ class Watchdog:
         self._last_check = -1
 
     def switch(self, mode: str, stamp: int) -> None:
-        """Switch on or off; `auto`: on if the stamps [ns] are close to the `wall` clock."""
+        """Switch on or off; `auto`: by whether the stamps [ns] are wall-clock time."""
         self.why_off = ''
         behind = (self._wall() - stamp) * _NANO
         if mode == 'auto' and abs(behind) >= SAME_CLOCK:

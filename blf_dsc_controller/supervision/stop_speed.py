@@ -3,7 +3,8 @@
 
 from __future__ import annotations
 
-# rad/s over twice the speed at the stop, for _SPEEDS_UP: a load that is new makes less of it
+# rad/s over twice the speed at the stop, for _SPEEDS_UP: a load that is new makes less
+# of it
 _FASTER = 0.5
 _GROWING = 0.95  # of the largest speed so far
 _SPEEDS_UP = 0.2  # s
@@ -22,9 +23,10 @@ class StopSpeed:
         self._speeding = 0.0  # s, for which the arm has been faster
 
     def speeds_up(self, speed: float, gap: float) -> bool:
-        """Return whether the arm has now been faster for long enough; true once in a stop.
+        """Return whether the arm has been faster for long enough; once in a stop.
 
-        `speed` [rad/s] is the largest of a joint, `gap` [s] the time since the last one.
+        `speed` [rad/s] is the largest of a joint, `gap` [s] the time since the last
+        one.
         """
         if self._speeding > _SPEEDS_UP:
             return False

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Check before the start that it is known what holds a resting arm: brakes or drives."""
+"""Check before the start whether brakes or drives hold the resting arm."""
 
 from __future__ import annotations
 
@@ -18,9 +18,10 @@ Vector = NDArray[np.float64]
 def check_support(
     controller: Controller, config: ControllerConfig, measurement: Vector
 ) -> None:
-    """Raise StartError if it is unknown what holds a resting arm, and no step is limited.
+    """Raise StartError if it is unknown what holds the arm, and no step is limited.
 
-    Brakes may hold it, or drives that compensate gravity, to which gravity would be added.
+    Brakes may hold it, or drives that compensate gravity, to which gravity would be
+    added.
     """
     robot = config.robot
     is_known = robot.drive_compensates != 'none' or robot.effort in ('whole', 'current')

@@ -20,17 +20,18 @@ Vector = NDArray[np.float64]
 class TorqueWatchdog:
     """Decides when to command in the place of a silent controller, and what.
 
-    Times are those [s] of a steady clock. It commands when no torque of the controller has been
-    seen for `timeout` while joint states went on by half of that, by their stamps: a plant in
-    lock-step, which waits for a torque, is left alone. It ends with the next torque of the
-    controller, or when the safe torque has faded because the states stopped, too.
+    Times are those [s] of a steady clock. It commands when no torque of the controller
+    has been seen for `timeout` while joint states went on by half of that, by their
+    stamps: a plant in lock-step, which waits for a torque, is left alone. It ends with
+    the next torque of the controller, or when the safe torque has faded because the
+    states stopped, too.
 
-    It then waits for the next torque of the controller before it watches again, as it does after
-    a silence of the states of LONG_SILENCE, and after the controller has said that its silence is
-    meant (`stand_down`).
+    It then waits for the next torque of the controller before it watches again, as it
+    does after a silence of the states of LONG_SILENCE, and after the controller has
+    said that its silence is meant (`stand_down`).
 
-    The gravity is that of the initial estimate, and what it lacks (a payload, say) is observed from
-    the motion and the controller's torques all along, as in a safe stop.
+    The gravity is that of the initial estimate, and what it lacks (a payload, say) is
+    observed from the motion and the controller's torques all along, as in a safe stop.
 
     Attributes:
         config: configuration of the controller.
@@ -46,7 +47,8 @@ class TorqueWatchdog:
     ) -> None:
         """Compile the model of a controller's configuration.
 
-        With `armed` it does not wait for a first torque: the controller has died before.
+        With `armed` it does not wait for a first torque: the controller has died
+        before.
         """
         self.active = False
         self.takeovers = 0
@@ -86,7 +88,7 @@ class TorqueWatchdog:
             self._forget_controller()
 
     def state(self, stamp: int, measurement: Vector, now: float) -> None:
-        """Take a joint state with its stamp [ns]; `measurement` is [q, dq, effort] (3 n,)."""
+        """Take a joint state [q, dq, effort] (3n,) with its stamp [ns]."""
         limit = self.config.safety.velocity_limit
         self._safe.last.take_usable(stamp, measurement, limit, self.config.sample_time)
         if now - self._seen_at > LONG_SILENCE:
@@ -100,7 +102,7 @@ class TorqueWatchdog:
             self._commanded_stamp = stamp
 
     def torque_of_controller(self, torque: Vector, now: float) -> None:
-        """Take a torque (n,) [N m] that the controller has commanded, and hand over to it."""
+        """Take a torque (n,) [N m] of the controller, and hand over to it."""
         self._safe.commanded[:] = np.nan_to_num(torque)
         self._knows_torque = True
         self._commanded_at = now

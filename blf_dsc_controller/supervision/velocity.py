@@ -15,8 +15,8 @@ _PAUSE = 1_000_000_000
 class Velocity:
     """Replaces velocities with finite differences of positions.
 
-    An arm in motion whose positions do not change for a sample has sent its last reading once more,
-    with a new stamp: it is continued at its velocity.
+    An arm in motion whose positions do not change for a sample has sent its last
+    reading once more, with a new stamp: it is continued at its velocity.
     """
 
     def __init__(self, n: int) -> None:
@@ -27,12 +27,12 @@ class Velocity:
         self._repeated = False
 
     def begin(self, stamp: int, q: Vector) -> None:
-        """Difference the next positions from a reading q (n,) [rad] with a stamp [ns]."""
+        """Difference the next positions from q (n,) [rad] with its stamp [ns]."""
         self._stamp = self._seen = stamp
         self._q[:] = q
 
     def replace(self, stamp: int, measurement: Vector) -> None:
-        """Overwrite dq in [q (n,) rad, dq (n,) rad/s, torque (n,)] with a stamp [ns]."""
+        """Overwrite dq in [q, dq, torque] (3n,) with a stamp [ns]."""
         q, dq, _ = measurement.reshape(3, -1)
         if self._stamp < 0 or not 0 <= stamp - self._stamp < _PAUSE:
             self._dq[:] = 0.0
