@@ -51,6 +51,15 @@ def run(tmp_path_factory):
     )
 
 
+@pytest.fixture(scope='module')
+def drawn(run, tmp_path_factory):
+    """The folder of the run's pictures, and what matplotlib's settings were before."""
+    folder = tmp_path_factory.mktemp('drawn')
+    before = dict(rcParams)
+    assert draw(run, folder) == [folder / 'tracking.png', folder / 'parameters.png']
+    return folder, before
+
+
 def pixels(path):
     return matplotlib.image.imread(path)[..., :3]
 
@@ -81,15 +90,11 @@ def test_a_change_of_the_arm_is_drawn_from_close_by(tmp_path):
         assert amount(image, colour) > 500
 
 
-def test_draw_writes_both_figures_and_leaves_no_trace(run, tmp_path):
-    before = dict(rcParams)
-    assert draw(run, tmp_path) == [
-        tmp_path / 'tracking.png',
-        tmp_path / 'parameters.png',
-    ]
+def test_draw_writes_both_figures_and_leaves_no_trace(drawn):
+    folder, before = drawn
     assert (dict(rcParams), plt.get_fignums()) == (before, [])  # no changed settings
-    tracking = pixels(tmp_path / 'tracking.png')
-    parameters = pixels(tmp_path / 'parameters.png')
+    tracking = pixels(folder / 'tracking.png')
+    parameters = pixels(folder / 'parameters.png')
     # Wide enough for readable labels on a page.
     assert tracking.shape[1] > 1200
     assert parameters.shape[1] > 1200
@@ -102,24 +107,26 @@ def test_draw_writes_both_figures_and_leaves_no_trace(run, tmp_path):
 
 
 def test_violation_is_marked_and_errors_stay_visible_beside_the_wide_start_of_a_funnel(
-    run, tmp_path
+    run, drawn, tmp_path
 ):
     error = run.error.copy()
     error[2000, 1] = 0.003
     widening = np.linspace(20.0, 1.0, len(run.bound))[:, None]
-    amounts = []
-    for changes in ({}, {'error': error}, {'bound': run.bound * widening}):
-        draw(replace(run, **changes), tmp_path)
-        image = pixels(tmp_path / 'tracking.png')
-        amounts.append([amount(image, colour) for colour in ('#B3001B', '#0072B2')])
-    (none, blue), (red, _), (_, beside) = amounts
+    folders = [drawn[0]]
+    for changes in ({'error': error}, {'bound': run.bound * widening}):
+        folders.append(tmp_path / next(iter(changes)))
+        # without what else would be drawn
+        draw(replace(run, monitor=None, **changes), folders[-1])
+    (none, blue), (red, _), (_, beside) = (
+        [amount(image, colour) for colour in ('#B3001B', '#0072B2')]
+        for image in (pixels(folder / 'tracking.png') for folder in folders)
+    )
     assert (none, red > 100) == (0, True)
     assert beside > 0.8 * blue
 
 
-def test_missing_series_and_a_single_sample_are_drawn(run, tmp_path):
-    draw(run, tmp_path)
-    height = pixels(tmp_path / 'tracking.png').shape[0]
+def test_missing_series_and_a_single_sample_are_drawn(run, drawn, tmp_path):
+    height = pixels(drawn[0] / 'tracking.png').shape[0]
     unknown_torque = np.full_like(run.torque, np.nan)
     partial = replace(run, error=None, truth=None, torque=unknown_torque)
     assert len(draw(partial, tmp_path)) == 2

@@ -42,6 +42,7 @@ def out(tmp_path_factory):
     return out
 
 
+@pytest.mark.usefixtures('blank_pictures')
 def test_torques_over_ros_match_the_offline_run_bit_for_bit(out, tmp_path):
     again = [
         'run',
@@ -113,8 +114,8 @@ def whole(bag):
     return run.stamp.size
 
 
-@pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
-def test_signal_shuts_down_cleanly_with_bag_and_report(running, number):
+def ended_cleanly(running, number):
+    """End a run by a signal, check that bag and report are whole, and return its output."""
     running.process.send_signal(number)
     code, output, errors = running.end()
     assert code == 130, errors
@@ -124,6 +125,11 @@ def test_signal_shuts_down_cleanly_with_bag_and_report(running, number):
     assert f'{samples} samples' in output
     for result in ('summary.json', 'tracking.png', 'bag/metadata.yaml'):
         assert (running.out / result).is_file()
+    return output
+
+
+def test_sigterm_shuts_down_cleanly_with_bag_and_report(running):
+    ended_cleanly(running, signal.SIGTERM)
 
 
 def test_killed_node_is_reported_and_ends_the_others(running):
@@ -152,8 +158,8 @@ def test_no_node_outlives_the_command(running):
     assert whole(bag) > 100
 
 
-def test_loop_in_lockstep_waits_for_its_recorder(running):
-    """Which holds 5000 messages of each topic.
+def test_loop_in_lockstep_waits_for_its_recorder_and_ctrl_c_shuts_down_cleanly(running):
+    """The recorder holds 5000 messages of each topic.
 
     The loop takes thousands of steps a second.
     """
@@ -161,11 +167,7 @@ def test_loop_in_lockstep_waits_for_its_recorder(running):
     os.kill(recorder, signal.SIGSTOP)
     time.sleep(8.0)
     os.kill(recorder, signal.SIGCONT)
-    running.process.send_signal(signal.SIGINT)
-    code, output, errors = running.end()
-    assert code == 130, errors
-    assert f'{whole(running.out / "bag")} samples' in output
-    assert 'missing' not in output
+    assert 'missing' not in ended_cleanly(running, signal.SIGINT)
 
 
 @pytest.mark.parametrize('mode', ['lockstep', 'realtime'])

@@ -310,7 +310,7 @@ def test_disturbance_that_lasts_is_not_mistaken_for_noise(paper_bag, tmp_path, c
 def test_gravity_depends_on_the_mounting(states):
     """With the gravity of a ceiling mount the same motion cannot be explained."""
     hanging = Robot(urdf=PANDA_TEXT, gravity=(0.0, 0.0, 9.81))
-    wrong = identify_arm(recording_of(states), hanging)
+    wrong = identify_arm(recording_of(states[:20_000]), hanging)
     assert np.linalg.norm(wrong.score.errors[2]) > 0.1 * np.linalg.norm(
         wrong.score.torque
     )

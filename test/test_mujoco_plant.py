@@ -146,6 +146,7 @@ def test_gravity_and_forces_are_in_the_frame_of_the_base(arm):
     assert np.ptp(ours[:, 0], axis=0).max() > 0.01  # rad
 
 
+@pytest.mark.usefixtures('blank_pictures')
 @pytest.mark.parametrize('preset', ['panda', 'recommended'])
 def test_run_with_this_physics_is_one_command_and_replays(tmp_path, preset):
     words = [

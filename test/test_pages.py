@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import functools
 import importlib.util
 import io
 import re
@@ -39,6 +40,7 @@ ROS2_CONTROL_NODES = {'controller_manager', 'effort_controller'}
 FOREIGN = 'cd colcon coverage docker export git pre-commit pytest rosdoc2 rviz2 source sudo xacro'
 
 
+@functools.cache
 def tokens(page):
     return MarkdownIt('commonmark').parse(page.read_text())
 
