@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.ticker import LogLocator, NullFormatter
-from scipy.stats import binomtest
 
 from blf_dsc_controller.analysis.figures import Picture, head
 from blf_dsc_controller.analysis.output import plain
@@ -64,7 +63,7 @@ def summarize(study: Study, results: Columns) -> Summary:
     """
     outcomes = results['outcome'].tolist()
     runs, kept = len(outcomes), outcomes.count(KEPT)
-    interval = binomtest(kept, runs).proportion_ci(0.95, method='wilson')
+    interval = _interval(kept, runs, 'wilson')
     ratios = _worst_of(study, results, 'max_error_ratio')
     pairs = compare_pairs(study, results) if study.settings.pairs else None
     summary: Summary = plain(
@@ -93,6 +92,13 @@ def summarize(study: Study, results: Columns) -> Summary:
         }
     )
     return summary
+
+
+def _interval(count: int, runs: int, method: str) -> Any:
+    """Return the 95 % interval of a fraction, with its ends `low` and `high`."""
+    from scipy.stats import binomtest  # half a second
+
+    return binomtest(count, runs).proportion_ci(0.95, method=method)
 
 
 def compare_pairs(study: Study, results: Columns) -> Summary:
@@ -177,9 +183,7 @@ def _pair_figures(pairs: Summary) -> dict[str, str]:
         [len(each[f'broken_only_{law}']) for law in _LAWS.values()]
         for each in (pairs, noise)
     )
-    interval = binomtest(broken[0], max(1, kept['without'])).proportion_ci(
-        method='exact'
-    )
+    interval = _interval(broken[0], max(1, kept['without']), 'exact')
     rms, model = (
         ' / '.join(f'{unit * value:.3g}' for value in pairs['median'][name].values())
         for name, unit in (('rms_error_rad', 1e3), ('torque_error.end', 1e2))

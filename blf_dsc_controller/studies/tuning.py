@@ -18,8 +18,6 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
-from scipy.optimize import OptimizeResult, differential_evolution
-from scipy.stats import qmc
 from tqdm import tqdm
 
 from blf_dsc_controller.analysis.metrics import Metrics, measure
@@ -157,12 +155,17 @@ def search(
     population: int,
     generations: int,
     **options: Any,
-) -> OptimizeResult:
-    """Search the logarithms (base 10) of the gains.
+) -> Any:
+    """Search the logarithms (base 10) of the gains; return scipy's OptimizeResult.
 
     Differential evolution with a fixed seed from a Latin hypercube, of the same size
     for every law; `options` are passed to scipy.
     """
+    from scipy.optimize import (
+        differential_evolution,
+    )  # slow: half a second with the next
+    from scipy.stats import qmc
+
     ranges = np.log10([(gain.least, gain.most) for gain in gains])
     points = qmc.LatinHypercube(len(ranges), seed=np.random.default_rng(SEED)).random(
         population
