@@ -54,7 +54,7 @@ class Stop(NamedTuple):
     reason: str  #: as `reason` on ~/state
     text: str  #: sentence with the numbers
     until: int | None = None
-    """ns, of the last joint state before the next start; None: the end of the run"""
+    """ns, of the last joint state before the next start, or None to the end of the run"""
 
 
 class Contact(NamedTuple):
@@ -62,8 +62,8 @@ class Contact(NamedTuple):
 
     stamp: int  #: ns, of the joint state that showed it
     joint: str  #: that showed it most
-    torque: float  #: N m, from outside, on this joint
-    interval: float  #: N m, up to which model and noise explain it
+    torque: float  #: N m, external torque on this joint
+    interval: float  #: N m, which model error and noise explain at most
     text: str = ''  #: sentence with the numbers
 
 
@@ -110,9 +110,9 @@ class Run:
     monitor: Series | None = None  #: estimates and what else the law says of its state
     truth: Series | None = None
     timing: Series | None = None
-    external: Series | None = None  #: N m, torque from outside and `topics.INTERVAL`
+    external: Series | None = None  #: N m, external torque and `topics.INTERVAL`
     stops: tuple[Stop, ...] = ()
-    contacts: tuple[Contact, ...] | None = None  #: None: nothing looked for any
+    contacts: tuple[Contact, ...] | None = None  #: None if not detected
     arm: LearnedArm | None = None  #: from a URDF
     learns: bool = True  #: whether the law uses the prediction error
     effort: Floats | None = None  #: (N, n) N m, as measured

@@ -79,14 +79,14 @@ class Metrics:
     first_violation: float  #: s
     violating_joint: str
     stops: list[dict[str, Any]]  #: `time` [s], `reason` and `text` of each
-    #: `time` [s], `joint`, `torque`, `interval` [N m] of each; None: nothing looked for any
+    #: `time` [s], `joint`, `torque`, `interval` [N m] of each, or None if not detected
     contacts: list[dict[str, Any]] | None
     learns: bool  #: whether the law uses what it learns
     latch_time: float  #: s
-    model_changes: list[float]  #: s, when the controller found that the arm had changed
+    model_changes: list[float]  #: s, when changes of the arm were detected
     rejected_columns: list[str]
-    loads: list[dict[str, float]]  #: what the tip held `until` [s], where known
-    #: largest `error` [m] and `angle` [rad] at the tool, with their certified bounds then
+    loads: list[dict[str, float]]  #: weighed loads, each held `until` [s]
+    #: largest `error` [m] and `angle` [rad] at the tool, with certified bounds
     tool: dict[str, float] | None
     #: `rate` [Hz], `latency` [s], `late_steps`, in real time
     timing: dict[str, Any] | None

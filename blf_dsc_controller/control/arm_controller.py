@@ -147,8 +147,8 @@ class ArmController:
             dq: velocities (n,) [rad/s].
             effort: torques (n,) [N m] over the last interval, as `robot.effort`
                 describes them; without them, the law takes those that it commanded.
-            send: called with the torques as soon as they are known; weighing and
-                recording come after it, and an error of it is raised after them.
+            send: called with the torques as soon as they are known, before weighing
+                and recording. Its errors are raised after these.
 
         Raises:
             StateError: an array has another shape, or the stamp is not finite.
@@ -262,28 +262,27 @@ class ArmController:
         self._loop.guard.reset()
 
     def fail(self, text: str) -> Vector | None:
-        """Stop for a reason of the caller.
+        """Stop for a reason `text` of your own.
 
-        Return the torque (n,) [N m] on the way to the safe one.
-
-        None: none has been commanded yet, so command nothing.
+        Return the next torque (n,) [N m] of the ramp to the safe torque; None: nothing
+        has been commanded yet, so command nothing.
         """
         torque = self._loop.guard.fail(text)
         self._tell_end(torque)
         return None if torque is None else np.array(torque)
 
     def withdraw(self, text: str) -> None:
-        """Command nothing until `reset` or `start`, for a reason.
+        """Command nothing until `reset` or `start`, because of `text`.
 
-        Somebody else commands the arm.
+        Use it when another program takes command of the arm.
         """
         self._loop.guard.withdraw(text)
 
     @property
     def is_settled(self) -> bool:
-        """Whether it is out of command, and the arm is at rest.
+        """Whether the law is not in command, and the arm is at rest.
 
-        The arm rests under the safe torque, or never moved.
+        The arm rests under the safe torque, or it has never been commanded.
         """
         guard = self._loop.guard
         if guard.commanding:
@@ -292,7 +291,7 @@ class ArmController:
 
     @property
     def missed(self) -> int:
-        """States missing between the stamps of the others, since the start."""
+        """Number of states missing since the start, by the stamps of the others."""
         return self._loop.guard.states.missed
 
     @property
@@ -302,7 +301,7 @@ class ArmController:
 
     @property
     def reason(self) -> str:
-        """Why it stopped or does not start, in words; empty while all is well."""
+        """Why the controller stopped or does not start; empty while all is well."""
         guard = self._loop.guard
         return guard.supervisor.text or guard.waiting_for
 
