@@ -155,7 +155,7 @@ def test_weighed_load_is_told_in_motion_and_no_torque_steps(wire, tmp_path):
     wire.simulate('127.0.0.17', 'load=2@6000')
     code, output = ended(wire.drive('127.0.0.17', 11, '--config', tmp_path / 'my.yaml'))
     assert code == 0, output
-    assert 'told no more' not in output
+    assert 'no longer declared' not in output
     events = blf.verify(wire.folder / 'bag').events
     loads = [event for event in events if event.type == 'drive load']
     assert loads[-1].content['mass'] == pytest.approx(2.0, abs=0.15)
