@@ -22,14 +22,13 @@ from mcap.data_stream import ReadDataStream
 from mcap.opcode import Opcode
 from mcap.records import Channel, Chunk, Schema
 from rosbags.interfaces import QosDurability
-from rosbags.rosbag1 import Reader as Ros1Reader
-from rosbags.rosbag2 import Reader
 
 from blf_dsc_controller.bags.unpacking import LARGEST, unpacked
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.messages.codecs import typestore
 
 METADATA = 'metadata.yaml'
+_ROS1 = '.bag'
 MAGIC_SIZE = 8
 HEAD = Struct('<BQ')  # opcode and content length, at the start of each record
 _MESSAGE = Struct('<HIQQ')
@@ -66,6 +65,7 @@ class OpenBag:
 
     def __init__(self, reader: Any, path: Path) -> None:
         self._reader, self._files = reader, list[Path]()
+        self._is_ros1 = path.suffix == _ROS1
         self.held: dict[str, str] = {}
         self.counts: Counter[str] = Counter()
         self.latched: set[str] = set()
@@ -80,7 +80,7 @@ class OpenBag:
             if kept or getattr(ext, 'latching', False):
                 self.latched.add(each.topic)
         self.times: tuple[int, int] = reader.start_time, reader.end_time
-        if isinstance(reader, Reader) and reader.compression_mode != 'message':
+        if not self._is_ros1 and reader.compression_mode != 'message':
             storage: Any = reader.storage
             parts: list[Any] = storage.storages if path.is_dir() else [storage]
             self._files = [part.path for part in parts if part.path.suffix == '.mcap']
@@ -116,7 +116,7 @@ class OpenBag:
     def _of_library(self, topics: Collection[str]) -> Iterator[BagMessage]:
         chosen = [each for each in self._reader.connections if each.topic in topics]
         for each, received, raw in self._reader.messages(chosen) if chosen else ():
-            if isinstance(self._reader, Ros1Reader):
+            if self._is_ros1:
                 # ROS 1 and 2 serialise the common types alike, except for padding and
                 # `seq`.
                 raw = typestore().ros1_to_cdr(raw, each.msgtype)  # noqa: PLW2901
@@ -193,9 +193,11 @@ def open_bag(path: Path) -> Iterator[OpenBag]:
     Raises:
         BagError: there is no bag, or it is damaged; also raised while it is read.
     """
+    from rosbags import rosbag1, rosbag2  # a recorder needs neither
+
     check_regular(path)
     try:
-        reader: Any = Ros1Reader(path) if path.suffix == '.bag' else Reader(path)
+        reader: Any = (rosbag1 if path.suffix == _ROS1 else rosbag2).Reader(path)
         with reader:
             yield OpenBag(reader, path)
     except BlfDscError:
