@@ -327,33 +327,15 @@ def _compare(
     )
     result.recorded = messages.size * len(shared) * len(fields)
     recorded, replayed = (each.joint_states(shared, ()) for each in (messages, own))
-    names = shared
-    if topic is not topics.MONITOR:
-        labels = shared if topic is topics.EXTERNAL_TORQUE else joints
-        names = [
-            f'{JOINT_STATE_FIELDS[k]} of {joint}' for k in fields for joint in labels
-        ]
     if topic is topics.TRACKING_ERROR:
         recorded = answers
-    if topic in _BY_STAMP:
-        recorded = recorded.by_stamp()
-        replayed = replayed.by_stamp()
-        keys = recorded.stamp
-        wanted = replayed.stamp
-    else:
-        keys = _numbers(topic, recorded, answers.size)
-        wanted = replayed.sequence
-    index = np.minimum(np.searchsorted(keys, wanted), keys.size - 1)
-    is_known = keys[index] == wanted
-    if topic is topics.TRACKING_ERROR:
-        is_known[run.answers :] = False  # their order is not known
-    known = np.flatnonzero(is_known)
-    result.missing = replayed.size - known.size
-    recorded = recorded.select(index[known])
-    replayed = replayed.select(known)
+    recorded, replayed, result.missing = _matched(
+        topic, recorded, replayed, answers.size, run.answers
+    )
     stamp = replayed.received
     has_moved = recorded.stamp != replayed.stamp
-    for begin in range(0, known.size, _BLOCK):
+    names = _labels(topic, shared, joints)
+    for begin in range(0, replayed.size, _BLOCK):
         rows = slice(begin, begin + _BLOCK)
         pair = [
             np.hstack([states.field(k)[rows] for k in fields])
@@ -361,13 +343,52 @@ def _compare(
         ]
         pair[1][has_moved[rows]] = np.inf
         result.add(stamp[rows], run.first, names, *pair)
-    unreached = (
-        (result.recorded - result.values) // len(joints)
-        if topic is topics.COMMANDS
-        else 0
-    )
-    if unreached:
-        result.left_out = f'{unreached} torques that the replay does not reach'
+    if topic is topics.COMMANDS:
+        unreached = (result.recorded - result.values) // len(joints)
+        if unreached:
+            result.left_out = f'{unreached} torques that the replay does not reach'
+
+
+def _labels(topic: topics.Topic, shared: list[str], joints: Sequence[str]) -> list[str]:
+    """Return what the numbers of a message are called, in their order."""
+    if topic is topics.MONITOR:
+        return shared
+    labels = shared if topic is topics.EXTERNAL_TORQUE else joints
+    return [
+        f'{JOINT_STATE_FIELDS[k]} of {label}'
+        for k in _COMPARED[topic]
+        for label in labels
+    ]
+
+
+def _matched(
+    topic: topics.Topic,
+    recorded: JointStates,
+    replayed: JointStates,
+    answers: int,
+    in_order: int,
+) -> tuple[JointStates, JointStates, int]:
+    """Return the recorded messages and their replays, and how many replays have none.
+
+    They are those of a stamp or number that occurs in both.
+
+    Of the `answers`, only the first `in_order` have a known order.
+    """
+    if topic in _BY_STAMP:
+        recorded = recorded.by_stamp()
+        replayed = replayed.by_stamp()
+        keys = recorded.stamp
+        wanted = replayed.stamp
+    else:
+        keys = _numbers(topic, recorded, answers)
+        wanted = replayed.sequence
+    index = np.minimum(np.searchsorted(keys, wanted), keys.size - 1)
+    is_known = keys[index] == wanted
+    if topic is topics.TRACKING_ERROR:
+        is_known[in_order:] = False
+    known = np.flatnonzero(is_known)
+    missing = replayed.size - known.size
+    return recorded.select(index[known]), replayed.select(known), missing
 
 
 def _numbers(topic: topics.Topic, recorded: JointStates, answers: int) -> Stamps:

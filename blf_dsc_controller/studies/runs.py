@@ -19,7 +19,7 @@ import multiprocessing
 import os
 import signal
 import threading
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import (
     BrokenExecutor,
     Executor,
@@ -43,9 +43,11 @@ from blf_dsc_controller.configuration.plant import PlantConfig
 from blf_dsc_controller.errors import BlfDscError, StartError
 from blf_dsc_controller.extras import import_extra
 from blf_dsc_controller.law.factory import controller_of
-from blf_dsc_controller.law.state import sample_of
+from blf_dsc_controller.law.state import Sample
+from blf_dsc_controller.law.telemetry import sample_columns
 from blf_dsc_controller.messages.journal import Journal
 from blf_dsc_controller.reference.approach import MotionError
+from blf_dsc_controller.run import Floats
 from blf_dsc_controller.simulation.loop import Record, new_record, run_alone, run_loop
 from blf_dsc_controller.studies.monte_carlo import (
     Drawn,
@@ -106,56 +108,76 @@ def figures_of(study: Study, record: Record, plant: PlantConfig) -> Row:
     Nothing counts from the first number on that is not finite.
     """
     law = record.controller.settings
-    t = record.stamps * 1e-9
-    at = sample_of(np.arange(record.samples.shape[1]), law)
-    efforts = 2 * law.n
-    xi1, bound, torque, latched, estimate = (
-        record.samples[:, columns.astype(np.intp)]
-        for columns in (at.xi1, at.bound, at.torque, at.latched, at.estimate[: law.p])
-    )
-    finite = np.isfinite(record.measurements).all(axis=1) & np.isfinite(torque).all(
-        axis=1
-    )
-    end = t.size if finite.all() else int(finite.argmin())
-    error, bound = np.abs(xi1[:end]), bound[:end]
-    outside = np.flatnonzero((error >= bound).any(axis=1))
-    # where a number is not finite, if at all
-    violation = outside[0] if outside.size else end
-    latch = np.flatnonzero(latched[:end])
-    motors = np.array(plant.actuator.torque_limit)  # 0: as strong as the law assumes
-    limit = np.where(
-        motors > 0.0, np.minimum(law.torque_limit, motors), law.torque_limit
-    )
-    row: Row = {
-        'outcome': DIVERGED if end < t.size else VIOLATED if outside.size else KEPT,
-        'first_violation_s': float(t[violation]) if violation < t.size else nan,
-        'latch_time_s': float(t[latch[0]]) if latch.size else nan,
-        'saturated_fraction': float((np.abs(torque[:end]) >= limit).any(axis=1).mean()),
-    }
+    samples = sample_columns(record.samples, law)
+    finite = np.isfinite(record.measurements).all(axis=1)
+    finite &= np.isfinite(samples.torque).all(axis=1)
+    end = finite.size if finite.all() else int(finite.argmin())
+    samples = Sample(*(each[:end] for each in samples))
+    effort = np.abs(record.measurements[:end, 2 * law.n :])
+    error = np.abs(samples.xi1)
     settled = round(study.settings.settled_after / plant.sample_time)
-    for i, joint in enumerate(study.plant.joints):
+    return {
+        **_events(record, samples, plant),
+        **_of_joints(study.plant.joints, error, samples.bound, effort, settled),
+        **_learned(study, record, plant, end),
+    }
+
+
+def _events(record: Record, samples: Sample, plant: PlantConfig) -> Row:
+    """Return how a run ended, when it left its bound and latched, and how often it saturated."""
+    t = record.stamps * 1e-9
+    end = len(samples.xi1)
+    outside = np.flatnonzero((np.abs(samples.xi1) >= samples.bound).any(axis=1))
+    latch = np.flatnonzero(samples.latched)
+    outcome = VIOLATED if outside.size else KEPT
+    violation = t[outside[0]] if outside.size else nan
+    if end < t.size:
+        outcome = DIVERGED
+        violation = t[outside[0] if outside.size else end]
+    limit = record.controller.settings.torque_limit
+    motors = np.array(plant.actuator.torque_limit)  # 0: as strong as the law assumes
+    limit = np.where(motors > 0.0, np.minimum(limit, motors), limit)
+    is_cut = (np.abs(samples.torque) >= limit).any(axis=1)
+    return {
+        'outcome': outcome,
+        'first_violation_s': float(violation),
+        'latch_time_s': float(t[latch[0]]) if latch.size else nan,
+        'saturated_fraction': float(is_cut.mean()),
+    }
+
+
+def _of_joints(
+    joints: Sequence[str], error: Floats, bound: Floats, effort: Floats, settled: int
+) -> Row:
+    """Return errors [rad] and peak torque [N m] of each joint, from |xi1|, k and |tau| (N, n)."""
+    row: Row = {}
+    for i, joint in enumerate(joints):
         ratio = error[:, i] / bound[:, i]
         late = error[settled:, i]
-        effort = np.abs(record.measurements[:end, efforts + i])
+        rms = float(np.sqrt(np.mean(late**2))) if late.size else nan
+        settled_ratio = float(ratio[settled:].max()) if late.size else nan
         row[f'max_error_ratio.{joint}'] = float(ratio.max(initial=0.0))
-        row[f'settled_error_ratio.{joint}'] = (
-            float(ratio[settled:].max()) if late.size else nan
-        )
-        row[f'rms_error_rad.{joint}'] = (
-            float(np.sqrt(np.mean(late**2))) if late.size else nan
-        )
-        row[f'peak_torque_nm.{joint}'] = float(effort.max(initial=0.0))
+        row[f'settled_error_ratio.{joint}'] = settled_ratio
+        row[f'rms_error_rad.{joint}'] = rms
+        row[f'peak_torque_nm.{joint}'] = float(effort[:, i].max(initial=0.0))
+    return row
+
+
+def _learned(study: Study, record: Record, plant: PlantConfig, end: int) -> Row:
+    """Return how wrong the parameters are at the end, and their torques on an unseen motion."""
+    row: Row = {'parameter_error.end': nan, 'torque_error.end': nan}
+    law = record.controller.settings
     order = parameter_order(law.model.parameter_names, plant)
-    row |= {'parameter_error.end': nan, 'torque_error.end': nan}
-    if order.min() >= 0:
-        found = estimate[-1]
-        P = record.truths[-1, order]
-        if end == t.size:
-            row['parameter_error.end'] = float(
-                np.linalg.norm(found - P) / np.linalg.norm(P)
-            )
-        if study.unseen is not None:
-            row['torque_error.end'] = torque_error(study.unseen, found, P)
+    if order.min() < 0:
+        return row
+    found = sample_columns(record.samples, law).estimate[-1, : law.p]
+    P = record.truths[-1, order]
+    if end == record.stamps.size:
+        row['parameter_error.end'] = float(
+            np.linalg.norm(found - P) / np.linalg.norm(P)
+        )
+    if study.unseen is not None:
+        row['torque_error.end'] = torque_error(study.unseen, found, P)
     return row
 
 
