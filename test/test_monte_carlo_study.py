@@ -287,6 +287,7 @@ def test_study_may_be_based_on_a_preset(tmp_path):
         study(tmp_path, text.replace(str(base), str(tmp_path / 'study.yaml')))
 
 
+PAPERS_FORM = {'compensation': 'state', 'change_detection': False}
 FIRST = {'monte_carlo_events': 16, 'monte_carlo_panda': 6, 'monte_carlo_ur5e': 6}
 
 
@@ -313,8 +314,8 @@ def test_papers_form_breaks_bounds_that_learning_here_does_not(name):
     assert torque['with'] < torque['without']
     with np.errstate(all='ignore'):  # some of these runs diverge
         assert any(
-            not is_kept(study, run, compensation='state')
-            and is_kept(study, run, compensation='state', weight=0.0)
+            not is_kept(study, run, **PAPERS_FORM)
+            and is_kept(study, run, **PAPERS_FORM, weight=0.0)
             for run in range(FIRST[name])
         )
 
