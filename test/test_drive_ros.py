@@ -213,7 +213,7 @@ def test_ros_that_does_not_start_is_an_error_with_a_remedy(monkeypatch, capfd):
 
 def test_a_namespace_without_topics_is_an_error(capsys):
     assert main(['drive', '--robot', 'plant', '--namespace', 'left']) == 1
-    assert 'give --ros, too' in capsys.readouterr().err
+    assert '--namespace is for the topics, which need --ros' in capsys.readouterr().err
 
 
 def linked(most=1 << 20):
