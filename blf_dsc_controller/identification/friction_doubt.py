@@ -11,12 +11,12 @@ from __future__ import annotations
 
 import numpy as np
 
+from blf_dsc_controller.arms.friction import STRIBECK_SPEED
 from blf_dsc_controller.identification.prior import Prior
 from blf_dsc_controller.identification.problem import Problem
 from blf_dsc_controller.identification.regression import regression
 from blf_dsc_controller.identification.selection import cross_validated
 from blf_dsc_controller.identification.values import COULOMB, STRIBECK, VISCOUS, indices
-from blf_dsc_controller.identification.windows import STRIBECK_SPEED
 from blf_dsc_controller.run import Floats
 
 # rad/s or m/s, and exponent: scales and shapes that are published for gears and bearings

@@ -6,13 +6,14 @@ that is a constant of the joint (Dahl, A solid friction model, 1968):
 
     s' = (v - |v| s) / x_s,      in one direction of motion  s = sign(v) (1 - exp(-|x| / x_s)).
 
-At rest s stays, as stiction does.  With x_s = 0 the direction is that of the speed, tanh(v / v_c).
+At rest s stays, as stiction does.  With x_s = 0 the direction is s(v) of `arms.friction`.
 """
 
 from __future__ import annotations
 
 import numpy as np
 
+from blf_dsc_controller.arms.friction import slidings
 from blf_dsc_controller.compiled.elementary import exp
 from blf_dsc_controller.compiled.jit import kernel
 from blf_dsc_controller.run import Floats
@@ -21,7 +22,7 @@ DISTANCES = (0.0, 1e-4, 3e-4, 1e-3, 3e-3)
 """Distances x_s to choose from [rad, or m]: cross-validation decides for each joint."""
 
 COULOMB_SPEED = 0.005
-"""Scale v_c of the tanh that replaces the sign [rad/s, or m/s]."""
+"""Scale v_c of s(v) [rad/s, or m/s]."""
 
 
 def sliding_direction(
@@ -31,7 +32,7 @@ def sliding_direction(
 
     `first` (n,) is s at the first of them where x_s > 0; None: zero.
     """
-    direction = np.tanh(dq / COULOMB_SPEED)
+    direction = slidings(dq, COULOMB_SPEED)
     elastic = np.flatnonzero(distances)
     if elastic.size:
         own = np.zeros((len(q), elastic.size))

@@ -24,6 +24,7 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
+from blf_dsc_controller.arms.friction import STRIBECK_SPEED, fadings, slidings
 from blf_dsc_controller.arms.model import regressors_at
 from blf_dsc_controller.arms.serial_chain import SerialChain
 from blf_dsc_controller.compiled.jit import kernel
@@ -55,9 +56,6 @@ SMOOTHING = 0.03
 
 STILL = 0.02
 """Speed of a joint that does not move [rad/s or m/s]."""
-
-STRIBECK_SPEED = 0.1
-"""Scale v_s of the Stribeck friction [rad/s or m/s]."""
 
 COLUMNS = ('viscous', 'Coulomb', 'load', 'offset', 'Stribeck', 'quadratic')
 """Columns of each joint, after those of P."""
@@ -182,13 +180,22 @@ class Rows(NamedTuple):
         self.set_stribeck(STRIBECK_SPEED, 2.0)
 
     def set_stribeck(self, speed: float, exponent: float) -> None:
-        """Compute the columns of the Stribeck friction, s exp(-|v / speed|^exponent)."""
+        """Compute the columns of the Stribeck friction, s exp(-|v / speed|^exponent).
 
-        def fading(rows: slice) -> Floats:
-            over = np.abs(self.dq[rows] / speed) ** exponent
-            return np.asarray(self.sliding[rows] * np.exp(-over))
+        That is the shape of `arms.friction`, at |v / speed|^(exponent / 2).
+        """
 
-        self.set_column('Stribeck', fading)
+        def stribeck(rows: slice) -> Floats:
+            over = np.abs(self.dq[rows] / speed) ** (0.5 * exponent)
+            return self.sliding[rows] * fadings(over, 1.0)
+
+        self.set_column('Stribeck', stribeck)
+
+    def sliding_at_once(self) -> Floats:
+        """Return the Coulomb column (R, n) of contacts that do not yield: that of a URDF."""
+        return self.over_windows(
+            lambda at: slidings(self.dq[at], COULOMB_SPEED), self.g
+        )
 
     def set_column(self, name: str, values: OfSamples) -> None:
         """Set a column of each joint to the values of the samples, filtered."""
@@ -359,7 +366,7 @@ def _set_coupling(rows: Rows) -> None:
 
     def both(at: slice) -> Floats:
         speed = rows.dq[at][:, -2:].sum(axis=1, keepdims=True)
-        return np.repeat(np.tanh(speed / COULOMB_SPEED), 2, axis=1)
+        return np.repeat(slidings(speed, COULOMB_SPEED), 2, axis=1)
 
     rows.coupling[:, :, 0] = -rows.over_windows(others, rows.slope)
     rows.coupling[:, :, 1] = rows.over_windows(others, rows.g)

@@ -7,6 +7,8 @@ breakaway (Stribeck).  Its model, at the velocity v that the reference has when 
 
     c^ g(v) s(v),    s(v) = tanh(v / v_c),    g(v) = 1 + k^ exp(-(v / v_s)^2)          [N m]
 
+with the shapes of `arms.friction`.
+
 *Learned from reversals.*  The window cannot be trusted with it: its rows are dominated by the
 frequencies of the reference, at which a sin w t against the velocity takes 0.64 a off the estimate
 and leaves no residual.  What only friction has is the step.  So the rows, and s and g s of the
@@ -36,7 +38,7 @@ changes no torque until the joint reverses.
 
 from math import sqrt
 
-from blf_dsc_controller.compiled.elementary import exp, tanh
+from blf_dsc_controller.arms.friction import STRIBECK_SPEED, fading, sliding
 from blf_dsc_controller.compiled.jit import inner
 from blf_dsc_controller.compiled.layout import Array
 from blf_dsc_controller.law import barrier
@@ -46,7 +48,6 @@ _ENERGY = 1.0  # of p int s_h^2 dt; a reversal has an eighth of it
 _SHOWN = 0.06  # of p int (g s)_h^2 dt: half a reversal, which shows its friction
 _PRIOR = 0.015  # pull to c_0, of (f / its deviation)^2; that of a reversal is an eighth
 _STRIBECK_PRIOR = 0.1  # pull of c k to zero, over that of c to c_0
-_STRIBECK_VELOCITY = 0.1  # v_s, rad/s
 _MOST_STRIBECK = 1.0  # k^: breakaway takes at most twice the Coulomb friction
 _MOVING = 0.9  # of |s|: below it a joint reverses
 
@@ -70,13 +71,6 @@ def learns_from_reversals(settings: Settings) -> bool:
 def unmodelled(settings: Settings, i: int) -> float:
     """Return the unmodelled torque f of joint i [N m]."""
     return float(sqrt(settings.residual_floor / settings.n) / settings.row_weight[i])
-
-
-@inner
-def fade(velocity: float) -> float:
-    """Return exp(-(v / v_s)^2), the share of Stribeck friction at a velocity [rad/s]."""
-    ratio = velocity / _STRIBECK_VELOCITY
-    return float(exp(-ratio * ratio))
 
 
 @inner
@@ -131,8 +125,8 @@ def fill_compensation(
         if settings.viscous == 1:
             signals.H[i, viscous + i] = velocity
         if settings.coulomb == 1:
-            signals.sign[i] = tanh(velocity / settings.coulomb_velocity)
-            signals.stribeck[i] = fade(velocity)
+            signals.sign[i] = sliding(velocity, settings.coulomb_velocity)
+            signals.stribeck[i] = fading(velocity, STRIBECK_SPEED)
             signals.friction[i] = coulomb_torque(settings, state, signals, i)
 
 
@@ -183,8 +177,8 @@ def filter_shapes(
     gain = barrier.filter_gain(1.0 / settings.pole, dt)
     lags = state.shape_lags
     for i in range(settings.n):
-        s = tanh(signals.dq[i] / settings.coulomb_velocity)
-        b = s * fade(signals.dq[i])
+        s = sliding(signals.dq[i], settings.coulomb_velocity)
+        b = s * fading(signals.dq[i], STRIBECK_SPEED)
         for k in range(2):
             now = s if k == 0 else b
             mean = 0.5 * (now + lags[k, 0, i])

@@ -23,7 +23,8 @@ which hides the parameter error.
 
 from math import sqrt
 
-from blf_dsc_controller.compiled.elementary import cos, exp, sin, tanh
+from blf_dsc_controller.arms.friction import sliding
+from blf_dsc_controller.compiled.elementary import cos, exp, sin
 from blf_dsc_controller.compiled.jit import inner
 from blf_dsc_controller.compiled.layout import Array
 from blf_dsc_controller.law import barrier, external_torque
@@ -51,7 +52,7 @@ def fill_columns(settings: Settings, t: float, dq: Array, rest: Array) -> None:
             set_block(rest, at, i, dq[i])
             at += n
         if settings.coulomb == 1:
-            set_block(rest, at, i, tanh(dq[i] / settings.coulomb_velocity))
+            set_block(rest, at, i, sliding(dq[i], settings.coulomb_velocity))
             at += n
         for k in range(settings.tones):
             set_block(rest, at, i, sin(settings.frequencies[k] * t))

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from typing import Annotated, NamedTuple
 
-from blf_dsc_controller.compiled.elementary import tanh
+from blf_dsc_controller.arms.friction import sliding
 from blf_dsc_controller.compiled.jit import inner
 from blf_dsc_controller.compiled.layout import Array, view_of
 from blf_dsc_controller.configuration.schema import positive
@@ -37,7 +37,7 @@ def known_friction(settings: Settings, i: int, velocity: float) -> float:
         friction += settings.initial_estimate[viscous + i] * velocity
     if settings.coulomb == 1:
         coulomb = settings.initial_estimate[first_coulomb(settings) + i]
-        friction += coulomb * tanh(velocity / settings.coulomb_velocity)
+        friction += coulomb * sliding(velocity, settings.coulomb_velocity)
     return friction
 
 

@@ -6,8 +6,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from blf_dsc_controller.arms.friction import sliding
 from blf_dsc_controller.arms.model import regressors_at
-from blf_dsc_controller.compiled.elementary import tanh
 from blf_dsc_controller.law.state import Settings
 
 Vector = NDArray[np.float64]
@@ -27,10 +27,8 @@ def friction_torque(settings: Settings, estimate: Vector, dq: Vector) -> Vector:
     n = settings.n
     at = settings.p + settings.n * settings.bias
     torque = np.zeros(n)
-    for is_on, effect in (
-        (settings.viscous, dq),
-        (settings.coulomb, [tanh(speed) for speed in dq / settings.coulomb_velocity]),
-    ):
+    directions = [sliding(velocity, settings.coulomb_velocity) for velocity in dq]
+    for is_on, effect in ((settings.viscous, dq), (settings.coulomb, directions)):
         if is_on:
             torque += estimate[at : at + n] * effect
             at += n
