@@ -19,6 +19,7 @@ from typing import NamedTuple
 import numpy as np
 from tqdm import tqdm
 
+from blf_dsc_controller.arms.friction import slidings
 from blf_dsc_controller.arms.model import regressors_at
 from blf_dsc_controller.arms.urdf import Chain, frames
 from blf_dsc_controller.configuration.controller import ControllerConfig
@@ -59,25 +60,36 @@ class Clearance:
         centres = [joint.inertia[:4] / joint.inertia[0] for joint in chain.joints]
         self._centres = [np.append(centre[1:], 1.0) for centre in centres]
         self._aside = [False] * len(centres)
-        rest = np.zeros(len(centres))
-        origins = self.corners(rest)
+        origins = self.corners(np.zeros(len(centres)))
+        self._aside = self._centres_aside(origins)
+        pairs = self._pairs(origins)
+        self._first, self._second = np.array(pairs, dtype=int).reshape(-1, 2).T
+
+    def _centres_aside(self, origins: np.ndarray) -> list[bool]:
+        """Return which links have a centre of mass off their line, between these origins."""
+        placements = frames(self._chain, np.zeros(len(self._centres)))[1:]
+        aside = []
         for i, (begin, end) in enumerate(pairwise(origins[1:])):
-            centre = (frames(chain, rest)[i + 1] @ self._centres[i])[:3]
-            self._aside[i] = bool(distance(centre, centre, begin, end) > radius)
-        links = [
-            0,
-            *(k for i, aside in enumerate(self._aside, 1) for k in [i] * (1 + aside)),
-        ]
+            centre = (placements[i] @ self._centres[i])[:3]
+            off = distance(centre, centre, begin, end)
+            aside.append(bool(off > self._radius))
+        return aside
+
+    def _pairs(self, origins: np.ndarray) -> list[tuple[int, int]]:
+        """Return the pairs of lines to check, of links whose joints have these origins."""
+        links = [0]  # of each line
+        for i, aside in enumerate(self._aside, 1):
+            links += [i] * (1 + aside)
         length = np.linalg.norm(np.diff(origins, axis=0), axis=1)
         end = np.cumsum(length)
-        pairs = [
-            (a, b)
-            for a, this in enumerate(links)
-            for b, other in enumerate(links)
-            if min(length[this], length[other]) > _LEAST
-            and end[other] - length[other] - end[this] > 2.0 * radius
-        ]
-        self._first, self._second = np.array(pairs, dtype=int).reshape(-1, 2).T
+        begin = end - length
+        pairs = []
+        for a, this in enumerate(links):
+            for b, other in enumerate(links):
+                is_line = min(length[this], length[other]) > _LEAST
+                if is_line and begin[other] - end[this] > 2.0 * self._radius:
+                    pairs.append((a, b))
+        return pairs
 
     def corners(self, q: np.ndarray) -> np.ndarray:
         """Return base, joints, centres of mass aside, and tip (..., k, 3) [m], at q (..., n)."""
@@ -164,37 +176,45 @@ class ExcitationProblem:
         radius: float = 0.07,
         floor: float = 0.0,
     ) -> None:
-        settings = self._settings = settings_of_config(config)
+        settings = settings_of_config(config)
         chain = config.robot.chain(config.joints)
+        load = config.robot.payload * parameters_of(config.robot, chain).load
+        self.n = settings.n
+        self.harmonics = harmonics
+        self._settings = settings
+        self._joints = config.joints
         self._clearance = Clearance(chain, radius, floor)
         self._guess = np.tile(settings.initial_estimate, (2, 1))
-        self._guess[1, : settings.p] += (
-            config.robot.payload * parameters_of(config.robot, chain).load
-        )
+        self._guess[1, : settings.p] += load
         self._scale = np.linalg.cholesky(prior_covariance(config))
-        limits = config.limits
-        lower = np.array(limits.position_lower)
-        upper = np.array(limits.position_upper)
+        lower = np.array(config.limits.position_lower)
+        upper = np.array(config.limits.position_upper)
         self._middle = 0.5 * (lower + upper)
         self._reach = 0.5 * (upper - lower)
-        torque = _TORQUE * settings.torque_limit
-        tracked = self._reach - settings.bound
-        self._limits = np.array((tracked, limits.velocity, limits.acceleration, torque))
-        self._limits[1:3] *= _SPEED
-        self.n = settings.n
-        self._joints = config.joints
-        self.harmonics = harmonics
+        self._limits = self._usable_limits(config)
         self._base = 2.0 * np.pi / config.learning.window
-        rates = self._base * np.arange(1, harmonics + 1)
-        self._units = np.min(
-            [np.outer(limit, rates**-k) for k, limit in enumerate(self._limits[:3])],
-            axis=0,
-        )
+        self._units = self._largest_amplitudes()
         samples = _SAMPLES_PER_HARMONIC * max(harmonics, 2)
         self._times = np.arange(samples) * (config.learning.window / samples)
         omega = self._base * np.arange(samples // 2 + 1)
         # two poles in series
         self._filter = 1.0 / (1.0 + 1j * omega / settings.pole) ** 2
+
+    def _usable_limits(self, config: ControllerConfig) -> np.ndarray:
+        """Return limits (4, n) of position from the middle, velocity, acceleration, torque."""
+        limits = config.limits
+        position = self._reach - self._settings.bound
+        velocity = _SPEED * np.array(limits.velocity)
+        acceleration = _SPEED * np.array(limits.acceleration)
+        torque = _TORQUE * self._settings.torque_limit
+        return np.array((position, velocity, acceleration, torque))
+
+    def _largest_amplitudes(self) -> np.ndarray:
+        """Return for each joint and harmonic (n, h) what alone would reach a limit of motion."""
+        rates = self._base * np.arange(1, self.harmonics + 1)
+        motion = self._limits[:3]  # of position, and of its first two derivatives
+        reached = [np.outer(limit, rates**-k) for k, limit in enumerate(motion)]
+        return np.asarray(np.min(reached, axis=0))
 
     def start(self, random: np.random.Generator) -> np.ndarray:
         """Return a random x around the middle of each joint's range; see `parameters`."""
@@ -252,7 +272,7 @@ class ExcitationProblem:
         ones = np.ones_like(dq)
         t = self._times[:, np.newaxis]
         columns = [ones] * given.bias + [dq] * given.viscous
-        columns += [np.tanh(dq / given.coulomb_velocity)] * given.coulomb
+        columns += [slidings(dq, given.coulomb_velocity)] * given.coulomb
         columns += [
             wave(w * t) * ones for w in given.frequencies for wave in (np.sin, np.cos)
         ]

@@ -14,8 +14,9 @@ import numpy as np
 
 from blf_dsc_controller.analysis.output import aligned
 from blf_dsc_controller.arms.base_parameters import base_parameters
+from blf_dsc_controller.arms.urdf import Chain
 from blf_dsc_controller.configuration.robot import Robot
-from blf_dsc_controller.identification.prior import prior_of
+from blf_dsc_controller.identification.prior import Prior, prior_of
 from blf_dsc_controller.identification.recording import Recording
 from blf_dsc_controller.identification.regression import triangle
 from blf_dsc_controller.identification.summary import UNSEEN
@@ -28,13 +29,20 @@ from blf_dsc_controller.identification.values import (
     indices,
     units_of,
 )
-from blf_dsc_controller.identification.windows import HOP, STILL, WINDOW, rows_of, split
+from blf_dsc_controller.identification.windows import (
+    HOP,
+    STILL,
+    WINDOW,
+    Indices,
+    Rows,
+    rows_of,
+    split,
+)
 from blf_dsc_controller.run import Floats
 
 _RESIDUAL = 0.02  # of the torque
-_FAINT = (
-    0.01  # of the largest torque of all joints, least that a joint is taken to have
-)
+# of the largest torque of all joints, least that a joint is taken to have
+_FAINT = 0.01
 _RANK = 1e-6  # of the largest singular value, least that counts
 _TWO_SIDED = 1.96  # standard deviations in half of a 95 % interval
 _TERMS = {term: JOINT_TERMS[term] for term in (ROTOR_INERTIA, VISCOUS, COULOMB)}
@@ -69,46 +77,65 @@ def foresee(recording: Recording, robot: Robot) -> Foresight:
     n = len(chain.joints)
     base = base_parameters(chain, robot.gravity)
     rows = rows_of(recording, base.model)
-    windows = split(rows)
+    moving = split(rows).moving
     P = base.of(chain.inertias, robot.rotors(chain))
-    theta = np.zeros(rows.unknowns)
-    theta[: rows.p] = P
-    needed = rows.torques(windows.moving, theta)
-    torque = np.sqrt(np.mean(needed**2, axis=0))
-    torque = np.maximum(torque, _FAINT * torque.max())
-    largest = np.abs(needed).max(axis=0)
-    speed = np.maximum(rows.speed, STILL)
-    prior = prior_of(robot, chain, largest, speed, load=False).only([])
+    needed = _needed_torque(rows, moving, P)
+    prior = _prior(robot, chain, rows, needed)
     G = base_matrix(base, n)
     to_base = G[: rows.p]
-    before = prior.D @ prior.D.T
-    scale = _deviations(to_base @ before @ to_base.T)
-    weight = rows.weight[windows.moving] / (_RESIDUAL * torque)
-
-    def weighted() -> Iterator[Floats]:
-        for block in rows.blocks(windows.moving):
-            X = rows.matrix(windows.moving[block]) * weight[block, :, None]
-            yield X.reshape(-1, X.shape[2])
-
-    R = triangle(weighted())
-    sizes = np.linalg.svd(R[:, : rows.p] * scale, compute_uv=False)
+    R = _triangle_of(rows, moving, needed)
+    covariances = prior.D @ prior.D.T, _expected_covariance(R, G, prior)
+    before, after = (_deviations(to_base @ C @ to_base.T) for C in covariances)
+    sizes = np.linalg.svd(R[:, : rows.p] * before, compute_uv=False)
     sizes = sizes[sizes > _RANK * sizes[0]]
-    A = R @ (G @ prior.D)[:-1]
-    information = HOP / WINDOW * A.T @ A  # windows overlap
-    inverse = np.linalg.inv(np.eye(len(information)) + information)
-    after = prior.D @ inverse @ prior.D.T
     at = indices(n).terms[list(_TERMS)].astype(int)
     return Foresight(
         names=base.combinations,
         joints=tuple((joint.name, joint.kind) for joint in chain.joints),
-        seconds=windows.moving.size * HOP,
+        seconds=moving.size * HOP,
         rank=sizes.size,
         condition=float(sizes[0] / sizes[-1]),
-        before=scale,
-        after=_deviations(to_base @ after @ to_base.T),
-        terms=np.array([_deviations(C)[at] for C in (before, after)]),
+        before=before,
+        after=after,
+        terms=np.array([_deviations(C)[at] for C in covariances]),
         values=P,
     )
+
+
+def _needed_torque(rows: Rows, moving: Indices, P: Floats) -> Floats:
+    """Return the torque (k, n) that base parameters need in some windows."""
+    theta = np.zeros(rows.unknowns)
+    theta[: rows.p] = P
+    return rows.torques(moving, theta)
+
+
+def _prior(robot: Robot, chain: Chain, rows: Rows, needed: Floats) -> Prior:
+    """Return the prior without optional terms, scaled by the motion and the torque it needs."""
+    largest = np.abs(needed).max(axis=0)
+    speed = np.maximum(rows.speed, STILL)
+    return prior_of(robot, chain, largest, speed, load=False).only([])
+
+
+def _triangle_of(rows: Rows, moving: Indices, needed: Floats) -> Floats:
+    """Return R of the QR decomposition of the columns, over the deviations of residuals."""
+    torque = np.sqrt(np.mean(needed**2, axis=0))
+    torque = np.maximum(torque, _FAINT * torque.max())
+    weight = rows.weight[moving] / (_RESIDUAL * torque)
+
+    def weighted() -> Iterator[Floats]:
+        for block in rows.blocks(moving):
+            X = rows.matrix(moving[block]) * weight[block, :, None]
+            yield X.reshape(-1, X.shape[2])
+
+    return triangle(weighted())
+
+
+def _expected_covariance(R: Floats, G: Floats, prior: Prior) -> Floats:
+    """Return the covariance of all values that is expected from the motion."""
+    A = R @ (G @ prior.D)[:-1]
+    information = HOP / WINDOW * A.T @ A  # windows overlap
+    inverse = np.linalg.inv(np.eye(len(information)) + information)
+    return np.asarray(prior.D @ inverse @ prior.D.T)
 
 
 def foresight_lines(found: Foresight) -> Iterator[str]:
