@@ -264,3 +264,27 @@ def test_urdf_that_is_not_to_be_used_is_written_on_demand_only(
     assert not new.exists()
     assert main([*words, '--force']) == 3
     assert new.exists()
+
+
+def test_currents_without_gains_give_no_urdf(states, tmp_path, capsys):
+    """Named so they are refused; else a tenth of the gravity shows that they are no torques."""
+    (tmp_path / 'panda.urdf').write_text(PANDA_TEXT)
+    few = states[::5]
+    motion = {'t': np.arange(len(few)) * 0.005, 'q': few[:, 0]}
+    named, unnamed = tmp_path / 'named.npz', tmp_path / 'unnamed.npz'
+    np.savez(named, **motion, current=0.1 * few[:, 2])
+    np.savez(unnamed, **motion, tau=0.1 * few[:, 2])
+    new = tmp_path / 'new.urdf'
+    words = ['--out', str(new), '--tip', 'panda_hand_tcp']
+    words += ['--urdf', str(tmp_path / 'panda.urdf')]
+    assert main(['identify', str(named), *words]) == 1
+    error = capsys.readouterr().err
+    assert 'these are currents' in error
+    assert '--gains [N m/A] of panda_joint1' in error
+    assert main(['identify', str(unnamed), *words]) == 3
+    output = ' '.join(capsys.readouterr().out.split())
+    assert 'the efforts contain 0.1' in output
+    assert 'If they are currents, give --gains' in output
+    assert not new.exists()
+    assert main(['identify', str(named), *words, '--gains', *['10'] * 7]) == 0
+    assert new.exists()

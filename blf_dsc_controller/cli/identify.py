@@ -58,7 +58,6 @@ _WIDTH = 98
 
 def identify(options: Namespace) -> int:
     """Identify the arm, print what changed, and write the results and the page."""
-    outputs = [] if options.foresee else _outputs(options)
     robot = Robot(
         urdf=options.urdf,
         base=options.base,
@@ -67,28 +66,10 @@ def identify(options: Namespace) -> int:
         payload=options.rated_payload,
     )
     if options.foresee:
-        names = NameMap.parse(options.map)
-        motion = foresee_recordings(options.bags, robot, options.namespace, names)
-        print('\n'.join(foresight_lines(motion)))
+        _foresee(options, robot)
         return 0
-    pick_up = options.payload is True
-    with tqdm(total=len(STAGES), unit='stage', leave=False, disable=None) as bar:
-
-        def begin(stage: str) -> None:
-            bar.set_description(stage)
-            bar.update(STAGES.index(stage) - bar.n)
-
-        found = identify_bag(
-            options.bags,
-            robot,
-            options.namespace,
-            NameMap.parse(options.map),
-            options.effort,
-            options.gains,
-            None if pick_up else options.payload,
-            pick_up=pick_up,
-            begin=begin,
-        )
+    outputs = _outputs(options)
+    found = _identified(options, robot)
     facts = _facts(found, options)
     bodies = bodies_table(found)
     base = '\n'.join(base_table(found))
@@ -107,6 +88,35 @@ def identify(options: Namespace) -> int:
         note = '\n'.join([*facts, *tables])
         _write(outputs, found, robot, note)
     return 0 if usable else UNUSABLE
+
+
+def _foresee(options: Namespace, robot: Robot) -> None:
+    """Print what the recordings can show."""
+    names = NameMap.parse(options.map)
+    motion = foresee_recordings(options.bags, robot, options.namespace, names)
+    print('\n'.join(foresight_lines(motion)))
+
+
+def _identified(options: Namespace, robot: Robot) -> Identified:
+    """Return the identified arm, with a progress bar on a terminal."""
+    pick_up = options.payload is True
+    with tqdm(total=len(STAGES), unit='stage', leave=False, disable=None) as bar:
+
+        def begin(stage: str) -> None:
+            bar.set_description(stage)
+            bar.update(STAGES.index(stage) - bar.n)
+
+        return identify_bag(
+            options.bags,
+            robot,
+            options.namespace,
+            NameMap.parse(options.map),
+            options.effort,
+            options.gains,
+            None if pick_up else options.payload,
+            pick_up=pick_up,
+            begin=begin,
+        )
 
 
 def _outputs(options: Namespace) -> list[Path]:

@@ -15,7 +15,7 @@ import re
 from collections.abc import Callable, Mapping, Sequence
 from fnmatch import fnmatchcase
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -25,12 +25,13 @@ from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.identification.recording import Recording, resampled
 from blf_dsc_controller.run import Floats
 
+_CURRENTS = {'current', 'currents'}
 _WORDS = {
     'time': {'t', 'time', 'times', 'timestamp', 'stamp', 'secs', 'seconds'},
     'q': {'q', 'pos', 'position', 'positions', 'angle', 'angles', 'jointposition'},
     'tau': {
         *('tau', 'torque', 'torques', 'effort', 'efforts', 'force', 'trq'),
-        *('current', 'currents', 'jointtorque'),
+        *('jointtorque', *_CURRENTS),
     },
 }
 _SIDES = {
@@ -68,40 +69,64 @@ def read_table(
     table = _TABLES[path.suffix.lower()](path)
     if min((column.size for column in table.values()), default=0) < _LEAST:
         raise BlfDscError(f'{path} has fewer than {_LEAST} rows of numbers')
+    arm = tuple(joints) or Tree.of(text).trunk()
     given = dict(names.joints)
     wanted = {kind: given.pop(kind, '') for kind in _WORDS}
-    arm = tuple(joints) or Tree.of(text).trunk()
-    theirs = NameMap(joints=given).joints_of(arm)
-    q_columns = _columns(path, table, 'q', wanted['q'], theirs)
-    tau_columns = q_columns
-    if not planned:
-        tau_columns = _columns(path, table, 'tau', wanted['tau'], theirs)
-    n = len(q_columns)
-    if len(tau_columns) != n:
-        raise BlfDscError(
-            f'{path} has {n} positions ({", ".join(q_columns)}) and {len(tau_columns)} torques '
-            f'({", ".join(tau_columns)}): choose as many, as in --map tau=tau_*'
-        )
+    chosen = _chosen(path, table, wanted, NameMap(joints=given).joints_of(arm), planned)
+    n = len(chosen.q)
     if joints and n != len(arm):
         raise BlfDscError(
-            f'{path} has the positions of {n} joints ({", ".join(q_columns)}), but from base to '
+            f'{path} has the positions of {n} joints ({", ".join(chosen.q)}), but from base to '
             f'tip there are {len(arm)}: {", ".join(arm)}'
         )
-    stamp = np.round(1e9 * _time(path, table, wanted['time'], q_columns[0]))
-    positions = f'{q_columns[0]!r} to {q_columns[-1]!r}'
-    source = f'{path.name}: positions {positions}'
-    torques = np.column_stack([table[name] for name in tau_columns])
+    time = _time(path, table, wanted['time'], chosen.q[0])
+    stamp = np.round(1e9 * time).astype(np.int64)
+    q = _stacked(table, chosen.q)
+    torque = np.zeros_like(q) if planned else _stacked(table, chosen.tau)
+    source = f'{path.name}: {chosen.text}'
+    recording = resampled(arm[:n], stamp, q, torque, source)
+    return recording._replace(currents=chosen.has_currents)
+
+
+class _Chosen(NamedTuple):
+    """Columns of the positions and torques; a planned motion has no torques."""
+
+    q: list[str]
+    tau: list[str]
+    has_currents: bool  # by the names of the torques
+
+    @property
+    def text(self) -> str:
+        """The columns, as they are reported."""
+        positions = f'positions {self.q[0]!r} to {self.q[-1]!r}'
+        if not self.tau:
+            return positions
+        return f'{positions}, torques {self.tau[0]!r} to {self.tau[-1]!r}'
+
+
+def _chosen(
+    path: Path,
+    table: Table,
+    wanted: Mapping[str, str],
+    joints: Sequence[str],
+    planned: bool,  # noqa: FBT001 - of `read_table`
+) -> _Chosen:
+    """Return the columns of the joints, which have these names in the table."""
+    q = _columns(path, table, 'q', wanted['q'], joints)
     if planned:
-        torques = np.zeros_like(torques)
-    else:
-        source += f', torques {tau_columns[0]!r} to {tau_columns[-1]!r}'
-    return resampled(
-        arm[:n],
-        stamp.astype(np.int64),
-        np.column_stack([table[name] for name in q_columns]),
-        torques,
-        source,
-    )
+        return _Chosen(q, [], has_currents=False)
+    tau = _columns(path, table, 'tau', wanted['tau'], joints)
+    if len(tau) != len(q):
+        raise BlfDscError(
+            f'{path} has {len(q)} positions ({", ".join(q)}) and {len(tau)} torques '
+            f'({", ".join(tau)}): choose as many, as in --map tau=tau_*'
+        )
+    words = set().union(*(_meaning(name, joints) for name in tau))
+    return _Chosen(q, tau, has_currents=bool(words & _CURRENTS))
+
+
+def _stacked(table: Table, columns: Sequence[str]) -> Floats:
+    return np.column_stack([table[name] for name in columns])
 
 
 def _columns(

@@ -59,7 +59,7 @@ def identify_bag(
 
     Raises:
         BlfDscError: a bag or the URDF cannot be read, or there are no torques of the arm, too
-            little of it, or no motion.
+            little of it, or no motion; or they are currents, and there are no gains.
     """
     begin(STAGES[0])
     paths = [path] if isinstance(path, Path) else list(path)
@@ -76,10 +76,12 @@ def identify_bag(
     if loaded:
         picked_up = begins[-1]
     if len(gains):
-        factors = checked_gains(gains, joints)
-        measured = recording.torque
-        torque = mapped(recording.gap.size, lambda rows: measured[rows] * factors)
-        recording = recording._replace(torque=torque)
+        recording = _with_gains(recording, gains)
+    elif any(each.currents for each in recordings):
+        raise BlfDscError(
+            f'{recording.source}: these are currents, from which no mass in kg can be told: give '
+            f'--gains [N m/A] of {", ".join(joints)}; 1 for each if they are torques'
+        )
     return identify_arm(
         recording, robot, effort, picked_up, find_signs=not len(gains), begin=begin
     )
@@ -110,6 +112,14 @@ def _read(
         joints = recording.joints
         recordings.append(recording)
     return recordings
+
+
+def _with_gains(recording: Recording, gains: Sequence[float]) -> Recording:
+    """Return the recording with torques that are its efforts times the gains."""
+    factors = checked_gains(gains, recording.joints)
+    efforts = recording.torque
+    torque = mapped(recording.gap.size, lambda rows: efforts[rows] * factors)
+    return recording._replace(torque=torque)
 
 
 def checked_gains(gains: Sequence[float], joints: Sequence[str]) -> Floats:

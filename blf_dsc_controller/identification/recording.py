@@ -32,6 +32,7 @@ class Recording(NamedTuple):
     torque: Samples  # (N, n) N m, or N
     gap: NDArray[np.bool_]  # (N,) whether nothing was recorded here
     source: str  # of the torques: a topic, or columns of a table
+    currents: bool = False  # whether the columns of the torques are named so
 
     @property
     def duration(self) -> float:

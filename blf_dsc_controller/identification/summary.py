@@ -207,18 +207,22 @@ def _joint_notes(found: Identified) -> Iterator[str]:
 
 def problems_of(found: Identified, effort: str) -> Iterator[str]:
     """Yield why the efforts or the result are doubtful."""
+    share = f"the efforts contain {found.gravity:.2f} of the URDF's"
     if found.gravity < LEAST_GRAVITY:
         yield (
-            f"GRAVITY IS MISSING: the efforts contain {found.gravity:.2f} of the URDF's. If the "
-            'drives compensate it, give --effort without-gravity; if the arm is not mounted '
-            'upright, --gravity'
+            f'GRAVITY IS MISSING: {share}, so that masses in kg cannot be told from them. If they '
+            'are currents, give --gains; if the drives compensate it, --effort without-gravity; '
+            'if the arm is not mounted upright, --gravity'
         )
     elif found.gravity > MOST_GRAVITY:
-        cause = 'Are the masses of the URDF far too small, or is it without its tool?'
+        cause = (
+            'If they are not in N m, give --gains. Are the masses of the URDF far too small, or is '
+            'it without its tool?'
+        )
         if effort == 'without-gravity':
             cause = 'The efforts are the whole torque: give --effort torque'
-        yield f"GRAVITY IS DOUBLE: the efforts contain {found.gravity:.2f} of the URDF's. {cause}"
-    if not is_usable(found):
+        yield f'GRAVITY IS DOUBLE: {share}. {cause}'
+    if not _is_explained(found):
         yield (
             'DO NOT USE this URDF: it does not explain the torques held back. Are the efforts in '
             'N m (currents need --gains), is --gravity given in the base frame, and was the load '
@@ -227,6 +231,12 @@ def problems_of(found: Identified, effort: str) -> Iterator[str]:
 
 
 def is_usable(found: Identified) -> bool:
+    """Whether the model explains the torques held back, and their gravity is that of torques."""
+    is_torque = LEAST_GRAVITY <= found.gravity <= MOST_GRAVITY
+    return _is_explained(found) and (is_torque or bool(np.isnan(found.gravity)))
+
+
+def _is_explained(found: Identified) -> bool:
     """Whether the model explains the torques held back, better than the URDF."""
     total = found.score.total
     return bool(total[2] <= min(100.0 * _POOR, total[0]))
