@@ -8,8 +8,8 @@ are those of `identification.py arms`, whose truth is known.  All methods have t
 of the motion, with the signs, the contacts and the delay that `identify` finds there, joints
 weighted by their residuals, and are judged by the last fifth:
 
-least squares  every term of friction, a coupled wrist; no bounds, no prior
-semidefinite   the same terms; physical bodies, friction not negative, hardly any prior
+least squares  every term of friction, a coupled wrist; no bounds, hardly any prior
+semidefinite   the same; physical bodies, friction not negative
 figaroh        the same terms; see `rivals`
 mujoco.sysid   the terms that MuJoCo has; see `rivals`
 identify       terms, and widths of the prior, selected by cross-validation
@@ -50,10 +50,11 @@ from random_arm import (
     shake,
     truth_of,
 )
-from recordings import SOURCES, Taken, bags_in
+from recordings import SOURCES, Published, Taken, bags_in
 from rivals import Fit
 from rollouts import rollout_error, rollouts_of
 
+from blf_dsc_controller.configuration.robot import Robot
 from blf_dsc_controller.identification.identified import Identified
 from blf_dsc_controller.identification.identify import identify_arm
 from blf_dsc_controller.identification.prior import Prior
@@ -69,9 +70,9 @@ from blf_dsc_controller.identification.values import (
     STRIBECK,
 )
 from blf_dsc_controller.identification.windows import WINDOW
+from blf_dsc_controller.run import Floats
 
-# times the prior's deviations: hardly any prior, and none
-_WEAK, _NONE = 100.0, 1e4
+_WEAK = 100.0  # times the prior's deviations: hardly any prior
 _MOST = 1000.0  # %, above which an error says no more
 _FIFTHS = 5
 _EVERY = 5  # samples of 1 ms, of simulated arms
@@ -154,64 +155,115 @@ def _result(entry: Entry, *, last_only: bool) -> Result:
     robot = entry.taken.robot
     begin = time.process_time()
     problem = problem_of(entry.recording, robot, 'torque', None, find_signs=True)
-    seconds = {'URDF': time.process_time() - begin}
-    rows, windows, G, full = problem.rows, problem.windows, problem.G, problem.prior
-    selected = select(rows, windows.fit, G, full)
-    trained = fitted(rows, windows.fit, G, selected.prior)
+    reading = time.process_time() - begin
+    selected = select(problem.rows, problem.windows.fit, problem.G, problem.prior)
     begin = time.process_time()
     arm = identify_arm(entry.recording, robot)
     own = time.process_time() - begin
+    fits, seconds = _fits(problem, selected.prior, arm, robot)
+    figures = {
+        'torque': _torque_errors(problem, arm, fits),
+        'rollout': _rollout_errors(entry, problem, selected.distances, arm, fits),
+        'covered': _coverage(entry, arm, fits),
+        'seconds': {name: reading + each for name, each in seconds.items()},
+        'fifths': {} if last_only else _of_fifths(problem),
+    }
+    figures['seconds']['identify'] = own
+    if entry.taken.published:
+        delay = float(fits['identify'].values[-1])
+        theirs = _published_error(entry.taken.published, problem, robot, delay)
+        figures['torque']['published'] = theirs
+    return Result(entry.taken.name, figures, _terms(arm))
+
+
+def _fits(
+    problem: Problem, prior: Prior, arm: Identified, robot: Robot
+) -> tuple[dict[str, Fit], dict[str, float]]:
+    """Return what the methods find in the windows to fit, and the seconds that this takes.
+
+    `prior` is the one that `identify` has selected from these, and `arm` what it finds in all.
+    """
+    rows, fit, G, full = problem.rows, problem.windows.fit, problem.G, problem.prior
     free, weak = _peers(full).values()
-    equal = regression(rows, windows.fit, G, weak)
-    gravity = robot.gravity
+    equal = regression(rows, fit, G, weak)
     methods: dict[str, Callable[[], Fit | None]] = {
-        'least squares': lambda: Fit(*fitted(rows, windows.fit, G, free)[:2]),
-        'semidefinite': lambda: Fit(*fitted(rows, windows.fit, G, weak)[:2]),
+        'URDF': lambda: Fit(full.mean, arm.covariance),
+        'least squares': lambda: Fit(*fitted(rows, fit, G, free)[:2]),
+        'semidefinite': lambda: Fit(*fitted(rows, fit, G, weak)[:2]),
         'figaroh': lambda: rivals.figaroh(arm, equal, weak),
         'mujoco.sysid': lambda: rivals.mujoco_sysid(
-            arm, rows, windows.fit, equal, full, gravity
+            arm, rows, fit, equal, full, robot.gravity
         ),
+        'identify': lambda: Fit(fitted(rows, fit, G, prior).values, arm.covariance),
     }
-    fits: dict[str, Fit | None] = {'URDF': Fit(full.mean, arm.covariance)}
+    fits: dict[str, Fit] = {}
+    seconds: dict[str, float] = {}
     for name, method in methods.items():
-        if name not in rivals.MISSING:
-            begin = time.process_time()
-            fits[name] = method()
-            seconds[name] = seconds['URDF'] + time.process_time() - begin
-    seconds['identify'] = own
-    fits['identify'] = Fit(trained.values, arm.covariance)
-    delay = float(trained.values[-1])
-    motions = rollouts_of(
-        entry.recording._replace(torque=rows.torque), rows, windows.test, delay
-    )
-    figures: dict[str, dict[str, float]] = {kind: {} for kind in _TABLES}
-    figures['seconds'] = seconds
-    for name, fit in fits.items():
-        if fit is None:
+        if name in rivals.MISSING:
             continue
-        values = fit.values
-        error = scored(rows, windows, G, full.mean, values).total[2]
-        figures['torque'][name] = error
-        figures['rollout'][name] = rollout_error(
-            arm, values, rows, windows, motions, gravity
-        )
-        if entry.truth:
-            of_all = arm.values if name == 'identify' else values
-            other = arm._replace(values=of_all, covariance=fit.covariance)
-            covered = 100.0 * float(np.mean(is_covered(other, entry.truth)))
-            figures['covered'][name] = covered
-    if entry.taken.published:
-        rows.set_sliding(np.zeros(rows.speed.size))  # theirs slides at once
-        test = windows.test
-        u = rows.u(delay)[test]
-        off = entry.taken.published(rows, robot)[test] - u
-        figures['torque']['published'] = float(
-            100.0 * np.linalg.norm(off) / np.linalg.norm(u)
-        )
-    if not last_only:
-        figures['fifths'] = _of_fifths(problem)
-    figures['torque']['URDF'], figures['torque']['its URDF'] = arm.score.total[:2]
-    return Result(entry.taken.name, figures, _terms(arm))
+        begin = time.process_time()
+        found = method()
+        seconds[name] = time.process_time() - begin
+        if found is not None:
+            fits[name] = found
+    return fits, seconds
+
+
+def _torque_errors(
+    problem: Problem, arm: Identified, fits: dict[str, Fit]
+) -> dict[str, float]:
+    """Return the torque errors [%] on the last fifth."""
+    mean = problem.prior.mean
+    errors = {}
+    for name, fit in fits.items():
+        score = scored(problem.rows, problem.windows, problem.G, mean, fit.values)
+        errors[name] = float(score.total[2])
+    errors['URDF'], errors['its URDF'] = map(float, arm.score.total[:2])
+    return errors
+
+
+def _published_error(
+    published: Published, problem: Problem, robot: Robot, delay: float
+) -> float:
+    """Return the torque error [%] on the last fifth of the model of the recording's authors."""
+    rows, test = problem.rows, problem.windows.test
+    rows.set_sliding(np.zeros(rows.speed.size))  # theirs slides at once
+    u = rows.u(delay)[test]
+    off = published(rows, robot)[test] - u
+    return float(100.0 * np.linalg.norm(off) / np.linalg.norm(u))
+
+
+def _rollout_errors(
+    entry: Entry,
+    problem: Problem,
+    distances: Floats,
+    arm: Identified,
+    fits: dict[str, Fit],
+) -> dict[str, float]:
+    """Return the errors [%] of rollouts by the measured torques on the last fifth."""
+    rows, windows = problem.rows, problem.windows
+    recording = entry.recording._replace(torque=rows.torque)
+    delay = float(fits['identify'].values[-1])
+    motions = rollouts_of(recording, rows, windows.test, delay)
+    gravity = entry.taken.robot.gravity
+    errors = {}
+    for name, fit in fits.items():
+        rows.set_sliding(np.zeros_like(distances) if fit.at_once else distances)
+        rows.set_load((problem.G @ fit.values)[: rows.p])
+        errors[name] = rollout_error(arm, fit.values, rows, windows, motions, gravity)
+    return errors
+
+
+def _coverage(entry: Entry, arm: Identified, fits: dict[str, Fit]) -> dict[str, float]:
+    """Return the share of intervals [%] that hold the truth, if it is known."""
+    if entry.truth is None:
+        return {}
+    found = {}
+    for name, fit in fits.items():
+        values = arm.values if name == 'identify' else fit.values
+        other = arm._replace(values=values, covariance=fit.covariance)
+        found[name] = 100.0 * float(np.mean(is_covered(other, entry.truth)))
+    return found
 
 
 def _of_fifths(problem: Problem) -> dict[str, float]:
@@ -235,9 +287,12 @@ def _of_fifths(problem: Problem) -> dict[str, float]:
 
 def _peers(full: Prior) -> dict[str, Prior]:
     """Return the priors of least squares, and of semidefinite least squares."""
-    free = full.widened(np.full(full.mean.size, _NONE))._replace(cones=[])
     weak = full.widened(np.full(full.mean.size, _WEAK))
-    return {'least squares': free, 'semidefinite': weak}
+    bounds = [cone._replace(power=0.0) for cone in weak.cones]
+    return {
+        'least squares': weak._replace(cones=[]),
+        'semidefinite': weak._replace(cones=bounds),
+    }
 
 
 def _print(kind: str, title: str, results: list[Result]) -> None:

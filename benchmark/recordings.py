@@ -8,6 +8,7 @@ any with bags and a URDF.
 from __future__ import annotations
 
 import re
+import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import NamedTuple
@@ -194,6 +195,25 @@ def _med7(folder: Path, bags: Path) -> Iterator[Taken]:
     yield Taken('LBR Med7', Robot(urdf=str(urdf)), bag, joints)
 
 
+def _rokae(folder: Path, bags: Path) -> Iterator[Taken]:
+    """Rokae xMate: 1 kHz, torque sensors of the joints; the URDF is put into the folder."""
+    urdf = next(folder.glob('*.urdf'), None)
+    if urdf is None:
+        sys.exit(
+            f'{folder}: put the URDF of its arm there, gazebo_xMatePro3.urdf or '
+            'gazebo_xMatePro7.urdf of RokaeRobot/rokae_ros2'
+        )
+    data = folder / 'filtering/data/excit'
+    q, torque = (
+        np.loadtxt(data / f'excit_{name}_record.txt') for name in ('ang', 'torque')
+    )
+    joints = tuple(f'joint{i}' for i in range(1, 8))
+    time = np.asarray(0.001 * np.arange(len(q)), dtype=np.float64)
+    name = urdf.stem.removeprefix('gazebo_')
+    bag = _bag(bags / name, joints, time, q, torque)
+    yield Taken(f'Rokae {name}', Robot(urdf=str(urdf)), bag, joints)
+
+
 def _figaroh(folder: Path, bags: Path) -> Iterator[Taken]:
     yield from _tx40(folder, bags)
     yield from _tiago(folder, bags)
@@ -222,5 +242,7 @@ SOURCES: dict[str, Callable[[Path, Path], Iterator[Taken]]] = {
     'dataset_ur10e': _ur10e,  # shamilmamedov/dynamic_calibration
     'examples/staubli_TX40': _figaroh,  # thanhndv212/figaroh-examples
     'src/test/measurements.csv': _med7,  # lbr-stack/dynamic_parameter_identification
+    # YanjunLIU-ac and NEUer02/Dynamic_Parameter_Identification_for_Rokae_xMate
+    'filtering/data/excit/excit_torque_record.txt': _rokae,
 }
 """Readers by a file that their folder has."""

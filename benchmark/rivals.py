@@ -13,7 +13,7 @@ import contextlib
 import importlib
 import io
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any, NamedTuple
 
 import mujoco
@@ -70,6 +70,7 @@ class Fit(NamedTuple):
 
     values: Floats  # (17 n + 14,)
     covariance: Floats  # (17 n + 14, 17 n + 14)
+    at_once: bool = False  # whether its Coulomb friction changes its sign at once
 
 
 def figaroh(found: Identified, problem: Regression, prior: Prior) -> Fit | None:
@@ -118,28 +119,12 @@ def mujoco_sysid(
 
     It starts from the prior, with physical bodies and hardly any friction.
     """
-    n = rows.speed.size
     first = np.zeros_like(prior.mean)
     parts(first).bodies[:] = parts(prior.mean + prior.D @ prior.start).bodies
-    spec = spec_of(found, first, np.zeros((2, n)), gravity, _PERIOD)
-    model = spec.compile()
-    parameters = sysid.ParameterDict()
-    for i, joint in enumerate(found.chain.joints):
-        parameters.add(_of_body(spec, model, joint.link))
-        for parameter in _of_joint(joint.name, float(rows.largest_torque[i])):
-            parameters.add(parameter)
-    predict = _Torques(rows, fit, spec)
-    weight = rows.weight[fit] / problem.deviation
-    measured = rows.u(problem.delay)[fit]
-
-    def residual(x: Floats, own: Any) -> tuple[list[Floats], list[Any], list[Any]]:
-        columns = x if x.ndim > 1 else x[:, None]
-        errors = np.empty((measured.size, columns.shape[1]))
-        for k, column in enumerate(columns.T):
-            own.update_from_vector(column)
-            errors[:, k] = ((predict(own) - measured) * weight).ravel()
-        return [errors if x.ndim > 1 else errors[:, 0]], [], []
-
+    friction = np.zeros((2, rows.speed.size))
+    spec = spec_of(found, first, friction, gravity, _PERIOD)
+    parameters = _parameters(found, rows, spec)
+    residual = _residual(rows, fit, spec, problem)
     with contextlib.redirect_stdout(io.StringIO()):
         best, result = sysid.optimize(
             parameters,
@@ -153,14 +138,42 @@ def mujoco_sysid(
     values = _values_at(x, parameters, spec, first)
     left = residual(x, parameters)[0][0]
     variance = float(left @ left) / (left.size - x.size)
-    to_values = np.column_stack(
-        [
-            (_values_at(x + own, parameters, spec, first) - values) / _STEP
-            for own in _STEP * np.eye(x.size)
-        ]
-    )
     covariance = variance * _inverse(result.jac.T @ result.jac)
-    return Fit(values, to_values @ covariance @ to_values.T)
+    others = [
+        _values_at(x + own, parameters, spec, first) for own in _STEP * np.eye(x.size)
+    ]
+    to_values = (np.column_stack(others) - values[:, None]) / _STEP
+    return Fit(values, to_values @ covariance @ to_values.T, at_once=True)
+
+
+def _parameters(found: Identified, rows: Rows, spec: Any) -> Any:
+    """Return the parameters of all bodies and joints."""
+    model = spec.compile()
+    parameters = sysid.ParameterDict()
+    for i, joint in enumerate(found.chain.joints):
+        parameters.add(_of_body(spec, model, joint.link))
+        for parameter in _of_joint(joint.name, float(rows.largest_torque[i])):
+            parameters.add(parameter)
+    return parameters
+
+
+def _residual(
+    rows: Rows, fit: Indices, spec: Any, problem: Regression
+) -> Callable[[Floats, Any], tuple[list[Floats], list[Any], list[Any]]]:
+    """Return the errors of the torques as `sysid` wants them, of one vector or several columns."""
+    predict = _Torques(rows, fit, spec)
+    weight = rows.weight[fit] / problem.deviation
+    measured = rows.u(problem.delay)[fit]
+
+    def residual(x: Floats, own: Any) -> tuple[list[Floats], list[Any], list[Any]]:
+        columns = x if x.ndim > 1 else x[:, None]
+        errors = np.empty((measured.size, columns.shape[1]))
+        for k, column in enumerate(columns.T):
+            own.update_from_vector(column)
+            errors[:, k] = ((predict(own) - measured) * weight).ravel()
+        return [errors if x.ndim > 1 else errors[:, 0]], [], []
+
+    return residual
 
 
 class _Torques:

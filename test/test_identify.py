@@ -38,6 +38,7 @@ from test_analysis_report import amount, lightened, pixels
 
 from blf_dsc_controller.analysis.panels import COLOURS, INK, ORANGE
 from blf_dsc_controller.arms.base_parameters import base_parameters
+from blf_dsc_controller.arms.friction import fading, fadings, sliding, slidings
 from blf_dsc_controller.arms.model import regressors_at
 from blf_dsc_controller.arms.urdf import inertia_of, pseudo_inertia, read_chain
 from blf_dsc_controller.bags.content import NameMap
@@ -57,10 +58,11 @@ from blf_dsc_controller.identification.prior import Prior, prior_of
 from blf_dsc_controller.identification.reading import read_recording
 from blf_dsc_controller.identification.recording import Recording, joined
 from blf_dsc_controller.identification.regression import regression
-from blf_dsc_controller.identification.sliding import sliding_direction
+from blf_dsc_controller.identification.scoring import nearest_friction
+from blf_dsc_controller.identification.sliding import COULOMB_SPEED, sliding_direction
 from blf_dsc_controller.identification.summary import problems_of
-from blf_dsc_controller.identification.values import base_matrix
-from blf_dsc_controller.identification.windows import rows_of
+from blf_dsc_controller.identification.values import COULOMB, base_matrix, parts
+from blf_dsc_controller.identification.windows import rows_of, split
 from blf_dsc_controller.simulation.loop import simulate, write_bag
 
 ROBOT = Robot(urdf=PANDA_TEXT)
@@ -656,6 +658,44 @@ def test_nearest_physical_body_is_found():
     np.testing.assert_allclose(solve(A, b, far, np.zeros(3)), expected, atol=1e-3)
 
 
+def test_what_data_would_put_on_a_bound_stays_inside():
+    """The maximum of s exp(-s^2 / 2 d^2), for a deviation d, is at s = d."""
+    deviation = 0.3
+    A = np.array([[np.sqrt(deviation**-2 - 1.0)]])  # |z|^2 / 2 is a part of it
+    positive = Cone(0, np.zeros((1, 1)), np.ones((1, 1, 1)))
+    for power, expected in ((1.0, deviation), (0.0, 0.0)):
+        cones = [positive._replace(power=power)]
+        s = solve(A, np.zeros(1), cones, np.ones(1))
+        assert s == pytest.approx(expected, rel=0.01, abs=0.05 * deviation)
+    prior = prior_of(ROBOT, ROBOT.chain(PANDA), *np.ones((2, 7)), load=False)
+    wider = prior.widened(np.full(prior.mean.size, 3.0))
+    assert [cone.power for cone in wider.cones if len(cone.J0) == 4] == [1.0] * 7
+
+
+def test_friction_of_a_urdf_is_the_nearest_that_changes_its_sign_at_once():
+    """Of contacts that yield over 3 mrad, and so build up their friction late."""
+    h = 0.002
+    t = np.arange(0.0, 10.0, h)[:, None]
+    q = 0.1 * np.sin(np.array([3.0, 4.0]) * t)
+    urdf = (share_folder() / 'config' / 'two_link.urdf').read_text()
+    chain = Robot(urdf=urdf).chain(('joint1', 'joint2'))
+    model = base_parameters(chain, GRAVITY).model
+    gap = np.zeros(len(t), dtype=bool)
+    rows = rows_of(Recording(('joint1', 'joint2'), h, q, q, gap, ''), model)
+    rows.set_sliding(np.array([0.0, 3e-3]))
+    windows = split(rows)
+    values = np.zeros(17 * 2 + 14)
+    parts(values).terms[COULOMB] = 1.0
+    viscous, coulomb = nearest_friction(rows, windows, values)
+    np.testing.assert_allclose((viscous[0], coulomb[0]), (0.0, 1.0), atol=1e-9)
+    assert 0.5 < coulomb[1] < 0.98
+    fit = windows.fit
+    columns = rows.friction[fit, 0, 1], rows.sliding_at_once()[fit, 1]
+    left = rows.friction[fit, 1, 1] - viscous[1] * columns[0] - coulomb[1] * columns[1]
+    weight = rows.weight[fit, 1] ** 2
+    assert abs(left @ (weight * columns[1])) < 1e-6 * weight.sum()
+
+
 def test_search_begins_inside_all_cones():
     """With a link whose inertia in the URDF is that of no body, too: J < 0 along an axis."""
     joints = list(PANDA_CHAIN.joints)
@@ -735,6 +775,28 @@ def test_sliding_direction_solves_the_equation_of_dahl():
     found = sliding_direction(q[:, None], speed(t)[:, None], np.array([distance]))
     np.testing.assert_allclose(found[:, 0], exact, atol=2e-3)
     assert np.ptp(found[4000:]) == 0.0  # at rest it stays
+
+
+def test_shapes_of_friction_are_those_of_the_law_over_arrays():
+    """Gaussian and exponential Stribeck friction; as numpy's to the last digits."""
+    v = np.linspace(-0.5, 0.5, 101)[:, None] * [1.0, 0.1]
+    np.testing.assert_allclose(slidings(v, 0.02), np.tanh(v / 0.02), rtol=1e-14)
+    np.testing.assert_allclose(fadings(v, 0.1), np.exp(-((v / 0.1) ** 2)), rtol=1e-13)
+    assert slidings(v, 0.02)[7, 1] == sliding(v[7, 1], 0.02)
+    assert fadings(v, 0.1)[7, 1] == fading(v[7, 1], 0.1)
+    q = np.cumsum(v[:, :1] * [1.0, 2.0], axis=0)
+    urdf = (share_folder() / 'config' / 'two_link.urdf').read_text()
+    chain = Robot(urdf=urdf).chain(('joint1', 'joint2'))
+    gap = np.zeros(len(v), dtype=bool)
+    recording = Recording(('joint1', 'joint2'), 0.01, 0.01 * q, q, gap, '')
+    rows = rows_of(recording, base_parameters(chain, GRAVITY).model)
+    rows.set_sliding(np.zeros(2))
+    dq = np.asarray(rows.dq)
+    for exponent in (2.0, 1.0):
+        rows.set_stribeck(0.2, exponent)
+        shape = np.tanh(dq / COULOMB_SPEED) * np.exp(-(np.abs(dq / 0.2) ** exponent))
+        expected = rows.over_windows(lambda at, shape=shape: shape[at], rows.g)
+        np.testing.assert_allclose(rows.friction[:, 4], expected, atol=1e-12)
 
 
 def test_contacts_that_yield_at_reversals_are_found(plain):

@@ -1,11 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """The most likely values over physical bodies only: a convex problem, by the barrier method.
 
-    minimise  |A z - b|^2 / 2 + |z|^2 / 2  - mu sum_i log det J_i(z) - mu sum_k log s_k(z)
+    minimise  |A z - b|^2 / 2 + |z|^2 / 2  - sum_i max(mu, c_i) log det J_i(z)
 
-with the pseudo-inertias J_i > 0 and scalars s_k > 0 affine in z, by Newton steps with decreasing mu
-(Boyd and Vandenberghe, Convex Optimization, 2004, chapter 11).  At the end the sum of squares is at
-most mu times the number of rows of all J_i and s_k above its minimum.
+with pseudo-inertias, or scalars, J_i > 0 affine in z, by Newton steps with decreasing mu (Boyd and
+Vandenberghe, Convex Optimization, 2004, chapter 11).  The prior's density has the determinants to
+the power c_i.  Where that is zero, the sum of squares is at the end at most mu times the number of
+rows of these J_i above its minimum.
 """
 
 from __future__ import annotations
@@ -31,6 +32,7 @@ class Cone(NamedTuple):
     at: int
     J0: Floats  # (d, d)
     E: Floats  # (k, d, d)
+    power: float = 0.0  # of its determinant in the density of the prior
 
     def of(self, z: Floats) -> Floats:
         """Return the matrix at z."""
@@ -62,9 +64,10 @@ def _centred(
         hessian = information.copy()
         for cone in cones:
             own = cone.entries
+            power = max(mu, cone.power)
             T = np.linalg.solve(cone.of(z), cone.E)
-            gradient[own] -= mu * np.trace(T, axis1=1, axis2=2)
-            hessian[own, own] += mu * np.einsum('aij,bji->ab', T, T)
+            gradient[own] -= power * np.trace(T, axis1=1, axis2=2)
+            hessian[own, own] += power * np.einsum('aij,bji->ab', T, T)
         step = np.linalg.solve(hessian, -gradient)
         decrement = float(-gradient @ step)
         if decrement < _CENTRED * mu:
@@ -90,5 +93,6 @@ def _objective(
             L = np.linalg.cholesky(cone.of(z))
         except np.linalg.LinAlgError:
             return np.inf
-        value -= 2.0 * mu * float(np.log(np.diag(L)).sum())
+        power = max(mu, cone.power)
+        value -= 2.0 * power * float(np.log(np.diag(L)).sum())
     return value

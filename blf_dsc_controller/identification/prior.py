@@ -1,6 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """Prior of the identified values, in deviations from the URDF.
 
+Its density is exp(-|z|^2 / 2) times the determinants of the pseudo-inertias: bodies have an extent.
+Else, data that contradict this leave one without, and a joint without inertia in a simulation.  A
+normal density over the positive numbers is largest at 0; times its argument it is largest at its
+deviation s, next to the mean of 0.8 s.
+
 Its widths are guesses: how far URDFs are off, how much friction drives have.  `widened` lets data
 overrule them, group by group; see `selection`.
 """
@@ -47,6 +52,7 @@ _LOAD = 0.1  # of the torque of gravity
 _ROTOR = 100.0
 _LIGHTEST = 1.0  # kg, of the mass that a load is expected to have
 _NEAREST = 0.01  # of a body's mass and extent: least value at which the search begins
+_EXTENT = 1.0  # power of the determinant of a body's pseudo-inertia
 _FIRST = 0.1  # standard deviations, of what cannot be negative, where the search begins
 
 Entry = tuple[int, ...]
@@ -99,7 +105,9 @@ class Prior(NamedTuple):
         for cone in self.cones:
             own = factors[cone.entries]
             cones.append(cone._replace(E=cone.E * own[:, None, None]))
-        return Prior(self.mean, self.D * factors, cones, self.start / factors)
+        return self._replace(
+            D=self.D * factors, cones=cones, start=self.start / factors
+        )
 
 
 def prior_of(
@@ -126,7 +134,7 @@ def prior_of(
         own = pseudo_inertia(joint.inertia) - joint.held
         inside = inertia_of(_inside(own, joint.inertia[0]) + joint.held)
         start[at.bodies[i]] = np.linalg.solve(D, inside - joint.inertia)
-        cones.append(Cone(at.bodies[i, 0], own, _pseudo_inertias(D)))
+        cones.append(Cone(at.bodies[i, 0], own, _pseudo_inertias(D), _EXTENT))
     rotors = robot.rotors(chain)
     mean[at.terms[ROTOR_INERTIA]] = rotors
     mean[at.terms[VISCOUS]] = [joint.damping for joint in chain.joints]

@@ -47,7 +47,9 @@ class Regression(NamedTuple):
     delay: float  # s, of the torques in A
 
 
-def regression(rows: Rows, fit: Indices, G: Floats, prior: Prior) -> Regression:
+def regression(
+    rows: Rows, fit: Indices, G: Floats, prior: Prior, parts: int = FOLDS
+) -> Regression:
     """Return the problem of the prior's z, with deviations and gravity of its own solution."""
     mean = G @ prior.mean
     B = G @ prior.D
@@ -76,7 +78,7 @@ def regression(rows: Rows, fit: Indices, G: Floats, prior: Prior) -> Regression:
     solved = Regression(
         A, b, np.empty(0), np.empty(0), lengths * HOP, deviation_used, weighted.delay
     )
-    folds = np.array(list(successive(rows, fit, G, prior, solved, FOLDS)))
+    folds = np.array(list(successive(rows, fit, G, prior, solved, parts)))
     together = folds.sum(axis=0)[:, :-1, :-1]
     return solved._replace(folds=folds, scatter=np.tensordot(lengths, together, 1))
 

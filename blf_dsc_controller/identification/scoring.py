@@ -12,7 +12,7 @@ from blf_dsc_controller.identification.values import (
     VISCOUS,
     parts,
 )
-from blf_dsc_controller.identification.windows import Rows, Split
+from blf_dsc_controller.identification.windows import COLUMNS, Indices, Rows, Split
 from blf_dsc_controller.run import Floats
 
 
@@ -24,14 +24,15 @@ def scored(
     moving = windows.moving
     urdf = np.zeros_like(prior)
     parts(urdf).bodies[:] = parts(prior).bodies
-    parts(urdf).terms[[VISCOUS, COULOMB]] = parts(prior).terms[[VISCOUS, COULOMB]]
     corrected = np.zeros_like(prior)
     parts(corrected).bodies[:] = parts(values).bodies
     parts(corrected).load[:] = parts(values).load
-    friction = nearest_friction(rows, windows, values)
-    parts(corrected).terms[[VISCOUS, COULOMB]] = friction
-    models = (urdf, corrected, values)
-    predicted = np.array([rows.torques(moving, (G @ model)[:-1]) for model in models])
+    predicted = np.array(
+        [rows.torques(moving, (G @ model)[:-1]) for model in (urdf, corrected, values)]
+    )
+    columns = _columns_of_urdf(rows, moving)
+    predicted[0] += np.sum(columns * parts(prior).terms[[VISCOUS, COULOMB]], axis=1)
+    predicted[1] += np.sum(columns * nearest_friction(rows, windows, values), axis=1)
     measured = rows.u(values[-1])[moving]
     shown = np.isin(moving, windows.test)
     residual = predicted[:, shown] - measured[shown]
@@ -47,19 +48,26 @@ def scored(
 
 
 def nearest_friction(rows: Rows, windows: Split, values: Floats) -> Floats:
-    """Return the viscous and Coulomb friction (2, n) nearest to that of all terms."""
+    """Return the viscous and Coulomb friction (2, n) nearest to that of all terms.
+
+    They are those of a URDF or MJCF, whose Coulomb friction changes its sign at once.
+    """
+    from scipy.optimize import nnls
+
+    fit = windows.fit
     terms = parts(values).terms[1:].copy()
     terms[OFFSET - 1] = 0.0
-    fit = windows.fit
-    columns = rows.friction[fit]
-    friction = np.sum(columns * terms, axis=1)
+    friction = np.sum(rows.friction[fit] * terms, axis=1)
     friction[:, -2:] += rows.coupling[fit] @ parts(values).coupling
     weight = rows.weight[fit]
-    viscous_and_coulomb = columns[:, :2] * weight[:, None]
-    found = [
-        np.linalg.lstsq(
-            viscous_and_coulomb[:, :, i], friction[:, i] * weight[:, i], rcond=None
-        )[0]
-        for i in range(rows.speed.size)
-    ]
-    return np.asarray(np.maximum(np.transpose(found), 0.0))
+    friction *= weight
+    columns = _columns_of_urdf(rows, fit) * weight[:, None]
+    joints = range(rows.speed.size)
+    found = [nnls(columns[:, :, i], friction[:, i])[0] for i in joints]
+    return np.transpose(found)
+
+
+def _columns_of_urdf(rows: Rows, windows: Indices) -> Floats:
+    """Return the columns (k, 2, n) of viscous and Coulomb friction as a URDF has them."""
+    viscous = rows.friction[windows, COLUMNS.index('viscous')]
+    return np.stack((viscous, rows.sliding_at_once()[windows]), axis=1)

@@ -1,8 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """What the model is, by cross-validation: contacts, optional terms, and widths of the prior.
 
-The recording is cut into five parts; each is predicted by the values found from the others.  Only
-the part that is fitted is used, never the one held back for the score.  Bounds are ignored here.
+The recording is cut into five parts; each is predicted by the values found from the others.
+Optional terms are many, and what shows one of them may be short: there it is ten parts, so that
+less is missing from what predicts.  Only the part that is fitted is used, never the one held back
+for the score.  Bounds are ignored here.
 """
 
 from __future__ import annotations
@@ -12,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from blf_dsc_controller.identification.prior import Entry, Prior
-from blf_dsc_controller.identification.regression import Regression, regression
+from blf_dsc_controller.identification.regression import FOLDS, Regression, regression
 from blf_dsc_controller.identification.sliding import DISTANCES
 from blf_dsc_controller.identification.windows import Indices, Rows
 from blf_dsc_controller.run import Floats
@@ -21,6 +23,7 @@ from blf_dsc_controller.run import Floats
 _WORTH = 0.01
 _WORTH_OF_TERM = 0.003  # ... and by an optional term
 _WIDTHS = (1.0, 3.0, 10.0, 30.0)  # of the prior
+_PARTS = 2 * FOLDS  # for optional terms
 
 
 class Selected(NamedTuple):
@@ -35,10 +38,11 @@ def select(rows: Rows, fit: Indices, G: Floats, full: Prior) -> Selected:
     """Return the model that predicts best, and set the columns of the rows for its contacts."""
     distances = _contacts(rows, fit, G, full)
     rows.set_sliding(distances)
-    found = regression(rows, fit, G, full)
-    found = found._replace(folds=found.folds.sum(axis=1, keepdims=True))
-    prior = full.only(_worthwhile(found, full))
-    widths = _widths(found, prior)
+    found = regression(rows, fit, G, full, _PARTS)
+    folds = found.folds.sum(axis=1, keepdims=True)
+    prior = full.only(_worthwhile(found._replace(folds=folds), full))
+    pairs = folds[::2] + folds[1::2]
+    widths = _widths(found._replace(folds=pairs), prior)
     return Selected(distances, prior.widened(_factors(prior, widths)), widths)
 
 
