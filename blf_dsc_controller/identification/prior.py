@@ -1,13 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """Prior of the identified values, in deviations from the URDF.
 
-Its density is exp(-|z|^2 / 2) times the determinants of the pseudo-inertias: bodies have an extent.
-Else, data that contradict this leave one without, and a joint without inertia in a simulation.  A
-normal density over the positive numbers is largest at 0; times its argument it is largest at its
-deviation s, next to the mean of 0.8 s.
-
 Its widths are guesses: how far URDFs are off, how much friction drives have.  `widened` lets data
 overrule them, group by group; see `selection`.
+
+Its density is exp(-|z|^2 / 2) times the determinants of the bodies' pseudo-inertias.  They let no
+body lose its extent where data ask for less than none; a simulated joint without inertia diverges.
+In one dimension: over positive s, a normal density of deviation d is largest at 0, s times that
+density at d, next to its mean of 0.8 d.
 """
 
 from __future__ import annotations
