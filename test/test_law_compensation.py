@@ -244,9 +244,10 @@ def test_friction_that_falls_costs_no_more_than_not_having_learned_it(joint, tim
 
 
 def reversing_law():
-    """Return a law with columns of Coulomb friction whose window is latched."""
+    """Return a law with columns of Coulomb friction whose window is full and latched."""
     law = controller_of(configured('recommended', 1.0, COULOMB).controller)
     law.state.latched[0] = 1.0
+    law.state.rows[0] = law.settings.window
     return law
 
 
@@ -260,6 +261,18 @@ def reverse(law, coulomb, reversals):
             state.shape_lags[0, 2, 0] = sign
             state.filter2[0, -1] = coulomb * sign
             friction.measure_reversals(settings, state, 0.001)
+
+
+@pytest.mark.parametrize(
+    ('rows', 'least', 'learns'), [(0.4, 0.0, False), (0.6, 0.0, True), (0.4, 0.1, True)]
+)
+def test_friction_is_measured_once_a_window_says_enough(rows, least, learns):
+    """It is half full, or a full one has been latched."""
+    law = reversing_law()
+    law.state.rows[0] = rows * law.settings.window
+    law.state.least_residual[0] = least
+    reverse(law, 0.8, 5)
+    assert bool(law.state.shown[0, 0] == pytest.approx(0.8, abs=0.05)) == learns
 
 
 def test_friction_is_not_forgotten_at_rest():

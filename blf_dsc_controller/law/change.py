@@ -1,10 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """Whether the arm has changed: rows contradict the latched solution, or the rows before them.
 
-Once a window is latched, the mean square error of its solution over the last 0.1 s is compared with
-the residual that it had.  Before, and until a full window has been found to be of one arm, the rows
-so far and the prior predict each row (see `innovation`): a window that has a pick-up in it is an
-excited mixture of two arms, which may leave no more than the unmodelled torque.
+The mean square error of the solution of a full window over the last 0.1 s is compared with the
+residual that it had.  As long as the window is not full, and until the first full one is latched,
+each row is compared with what the rows so far and the prior predict (see `innovation`): a window
+that has a pick-up in it is a mixture of two arms, which may leave no more than the unmodelled
+torque, and the solution of few rows does not predict the next ones.
 
 If the arm has changed, window, filters and latch are cleared, and learning restarts.  What a window
 has taught before it was full is taken back: it did not predict what it was not fitted to.
@@ -16,9 +17,8 @@ from blf_dsc_controller.law import adaptation, innovation, window
 from blf_dsc_controller.law.excitation import explained
 from blf_dsc_controller.law.state import Settings, Signals, State
 
-_ALARM = (
-    8.0  # ratio of mean squares; larger than the gate's, since a solution extrapolates
-)
+# ratio of mean squares; larger than the gate's, since a solution extrapolates
+_ALARM = 8.0
 _MEMORY = 0.1  # s, averaging time of the last rows
 
 
@@ -30,8 +30,11 @@ def detect_change(
 
     What a window has taught before it was full is taken back: back to the estimate before.
     """
-    has_changed = contradicts_solution(settings, state, signals, dt)
-    if not has_changed and not contradicts_first_rows(settings, state, signals, dt):
+    if is_predicted(settings, state):
+        has_changed = contradicts_rows(settings, state, signals, dt)
+    else:
+        has_changed = contradicts_solution(settings, state, signals, dt)
+    if not has_changed:
         return
     state.changes[0] += 1.0
     if state.latched[0] == 1.0 and state.rows[0] < settings.window:
@@ -42,7 +45,17 @@ def detect_change(
             adaptation.hand_over(settings, state, signals)
     forget_window(settings, state)
     state.first_statistics[innovation.RECENT] = 0.0
-    fit_first_rows(settings, state, settings.row_interval * dt)
+    fit_rows(settings, state, settings.row_interval * dt)
+
+
+@inner
+def is_predicted(settings: Settings, state: State) -> bool:
+    """Whether rows are compared with those before them, as long as no full window is known.
+
+    Without a prior, as of planar arms, the first rows predict too little.
+    """
+    is_full = state.rows[0] == settings.window and state.least_residual[0] > 0.0
+    return bool(settings.prior_weight > 0.0 and not is_full)
 
 
 @inner
@@ -69,23 +82,19 @@ def contradicts_solution(
 
 
 @inner
-def contradicts_first_rows(
+def contradicts_rows(
     settings: Settings, state: State, signals: Signals, dt: float
 ) -> bool:
-    """Compare this row with those before it, until a full window is known to be of one arm.
-
-    Without a prior, as of planar arms, the first rows predict too little.
-    """
+    """Compare this row with those before it; return whether the last ones contradict them."""
     samples = int(state.samples[0])
-    is_known = state.least_residual[0] > 0.0 or settings.prior_weight == 0.0
-    if is_known or samples % settings.row_interval != 0:
+    if samples % settings.row_interval != 0:
         return False
     period = settings.row_interval * dt
     statistics = state.first_statistics
     unmodelled = settings.residual_floor / settings.n
     if statistics[innovation.NOISE] == 0.0:
         innovation.start(unmodelled, statistics)
-        fit_first_rows(settings, state, period)
+        fit_rows(settings, state, period)
     for i in range(settings.n):
         signals.innovation[i] = signals.row[i, settings.m]
         for j in range(settings.m):
@@ -103,12 +112,12 @@ def contradicts_first_rows(
         return True
     refresh = max(1, round(innovation.REFRESH / period))
     if samples // settings.row_interval % refresh == refresh // 2:
-        fit_first_rows(settings, state, period)
+        fit_rows(settings, state, period)
     return False
 
 
 @inner
-def fit_first_rows(settings: Settings, state: State, period: float) -> None:
+def fit_rows(settings: Settings, state: State, period: float) -> None:
     """Solve for theta of the rows so far, one each `period` [s], and of the prior."""
     a = innovation.row_variance(state.first_statistics, period)
     R = settings.information

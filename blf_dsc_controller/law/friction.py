@@ -215,13 +215,19 @@ def unexplained(settings: Settings, state: State, i: int) -> float:
 def measure_reversals(settings: Settings, state: State, dt: float) -> None:
     """Add the last row, `dt` [s] after the one before it, to the sums of the present reversal.
 
-    They begin T_a after the latch, when the other columns are those of the window.
+    They begin T_a after the latch, when the other columns are those of the window, and once a
+    full window is known to be of one arm or this one is half full: those of less are too vague.
     """
     if not learns_from_reversals(settings):
         return
     settling_time = settings.learning_start - settings.window * dt
     state.since_latch[0] = state.latched[0] * (state.since_latch[0] + dt)
-    begins = state.since_latch[0] <= settling_time
+    is_known = (
+        settings.change_detection == 0
+        or state.least_residual[0] > 0.0
+        or state.rows[0] >= 0.5 * settings.window
+    )
+    begins = state.since_latch[0] <= settling_time or not is_known
     gain = barrier.filter_gain(1.0 / settings.pole, dt)
     weight = settings.pole * dt
     for i in range(settings.n):
