@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Flat vectors with named parts, each described once, by the annotated fields of a `NamedTuple`.
 
-Kernels take one float64 vector for all settings, one for the whole state, and so on: passing
-many arrays would cost more than a step.  A `NamedTuple` names the parts of such a vector, in order:
+Kernels take one float64 vector for all settings, one for the whole state, and so on:
+passing many arrays would cost more than a step.  A `NamedTuple` names the parts of such
+a vector, in order:
 
     class State(NamedTuple):
         samples: Cell  # one number that kernels write, as state.samples[0]
@@ -14,13 +15,13 @@ many arrays would cost more than a step.  A `NamedTuple` names the parts of such
     vector = np.zeros(state_size(settings))
     state = state_of(vector, settings)  # in Python and in kernels alike; nothing is copied
 
-Lengths are expressions in the attributes of the second argument, here `settings.n`, `settings.m`
-and `settings.N`; `'actuator.delay'` works as well, and any named tuple or object will do (a named
-tuple in kernels).  Fields of type `int` and `float` are numbers, read when the view is made.  An
-`int` field of the layout itself can also be a length; if the vector holds all lengths, the view
-takes the vector alone, and `pack` makes it from the tuple.  A field may itself be such a
-`NamedTuple`.  A field of any other type, or of type `Passed`, is not in the vector: the view takes
-it as an argument.
+Lengths are expressions in the attributes of the second argument, here `settings.n`,
+`settings.m` and `settings.N`; `'actuator.delay'` works as well, and any named tuple or
+object will do (a named tuple in kernels).  Fields of type `int` and `float` are
+numbers, read when the view is made.  An `int` field of the layout itself can also be a
+length; if the vector holds all lengths, the view takes the vector alone, and `pack`
+makes it from the tuple.  A field may itself be such a `NamedTuple`.  A field of any
+other type, or of type `Passed`, is not in the vector: the view takes it as an argument.
 """
 
 from __future__ import annotations

@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """A URDF with corrected inertias and friction; every other byte is unchanged.
 
-The inertia of a body is written to the link that its joint moves, and the links fixed to that link
-lose theirs.  Links with joints of their own, such as a gripper's fingers, keep theirs.
+The inertia of a body is written to the link that its joint moves, and the links fixed
+to that link lose theirs.  Links with joints of their own, such as a gripper's fingers,
+keep theirs.
 """
 
 from __future__ import annotations

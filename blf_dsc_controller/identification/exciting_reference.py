@@ -5,10 +5,11 @@ For a reference whose period is the window, the excitation matrix in the steady 
 
     Phi = 1/tau_d int X_f^T X_f dt,      X_f = [H(q, dq, dq, ddq) | D] after the learning's filter
 
-with the row weights of the learning, which adds a multiple a R of the prior's information to it.
-The search maximises, over offset, cosines and sines of each joint, the log-determinant of
-(a R)^-1 (Phi + a R): how much a window shrinks the uncertainty volume of the prior.  (The
-worst-determined combination is one that no motion reveals and that is left to the prior.)
+with the row weights of the learning, which adds a multiple a R of the prior's
+information to it.  The search maximises, over offset, cosines and sines of each joint,
+the log-determinant of (a R)^-1 (Phi + a R): how much a window shrinks the uncertainty
+volume of the prior.  (The worst-determined combination is one that no motion reveals
+and that is left to the prior.)
 """
 
 from __future__ import annotations
@@ -45,12 +46,12 @@ _SPREAD = 0.2  # standard deviation of a search's initial amplitudes
 class Clearance:
     """Clearance between the links of a chain, and between them and the floor.
 
-    Meshes are not read.  A link is modelled as all points within `radius` of the straight line from
-    its joint to the next, or to the tip; via its centre of mass, if that is farther from the line
-    than the radius.  All pairs of links are checked except those separated by less than two radii
-    of arm, from joint to joint: they touch in every posture, and only the joint limits can keep
-    them apart.  The floor is the plane z = `floor` [m] in the base; the first two joints may be
-    near it.
+    Meshes are not read.  A link is modelled as all points within `radius` of the
+    straight line from its joint to the next, or to the tip; via its centre of mass, if
+    that is farther from the line than the radius.  All pairs of links are checked
+    except those separated by less than two radii of arm, from joint to joint: they
+    touch in every posture, and only the joint limits can keep them apart.  The floor is
+    the plane z = `floor` [m] in the base; the first two joints may be near it.
     """
 
     def __init__(self, chain: Chain, radius: float, floor: float) -> None:
@@ -106,7 +107,8 @@ class Clearance:
     def room(self, q: np.ndarray) -> np.ndarray:
         """Return the room (..., k) of the pairs of links, then of the corners above the floor.
 
-        At q (..., n), as (distance / required) - 1: two radii are required, or one above the floor.
+        At q (..., n), as (distance / required) - 1: two radii are required, or one
+        above the floor.
         """
         corners = self.corners(q)
         begin = corners[..., :-1, :]
@@ -164,9 +166,9 @@ class Excitation(NamedTuple):
 class ExcitationProblem:
     """Excitation of a controller as a function of its periodic reference.
 
-    `harmonics` is the highest harmonic of the window in the reference.  The torque is computed for
-    the initial estimate, with and without the payload.  The links have this radius; the floor is at
-    this height in the base frame [m].
+    `harmonics` is the highest harmonic of the window in the reference.  The torque is
+    computed for the initial estimate, with and without the payload.  The links have
+    this radius; the floor is at this height in the base frame [m].
     """
 
     def __init__(
@@ -226,8 +228,9 @@ class ExcitationProblem:
     def parameters(self, x: np.ndarray) -> dict[str, tuple[float, ...]]:
         """Return the parameters of `reference` for x: offsets (n,), cosines and sines (n, h).
 
-        Offsets are in units of half the range, amplitudes in units of the one that alone would
-        reach a limit of position, velocity or acceleration. Sines are cosines of phase -pi/2.
+        Offsets are in units of half the range, amplitudes in units of the one that
+        alone would reach a limit of position, velocity or acceleration. Sines are
+        cosines of phase -pi/2.
         """
         n, h = self.n, self.harmonics
         unit = self._units

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """What a motion can show of an arm, before anything is fitted, or even recorded.
 
-Torques are not used: the residual of each joint is taken to be a fiftieth of the torque that the
-URDF needs, and to last for a window, as those of real robots do at least.
+Torques are not used: the residual of each joint is taken to be a fiftieth of the torque
+that the URDF needs, and to last for a window, as those of real robots do at least.
 """
 
 from __future__ import annotations

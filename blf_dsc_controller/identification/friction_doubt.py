@@ -1,10 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """What the law of friction leaves open: variances of viscous and Coulomb friction.
 
-A fit cannot tell that its law of friction is not the joint's: it finds other viscous and Coulomb
-friction, with narrow intervals.  So the recording is also fitted with other laws: a Stribeck term
-in all joints, which fades in other ways.  For each joint, those that predict its torque about as
-well are as likely; the farthest of their values is one standard deviation off.
+A fit cannot tell that its law of friction is not the joint's: it finds other viscous
+and Coulomb friction, with narrow intervals.  So the recording is also fitted with other
+laws: a Stribeck term in all joints, which fades in other ways.  For each joint, those
+that predict its torque about as well are as likely; the farthest of their values is one
+standard deviation off.
 """
 
 from __future__ import annotations
@@ -19,7 +20,8 @@ from blf_dsc_controller.identification.selection import cross_validated
 from blf_dsc_controller.identification.values import COULOMB, STRIBECK, VISCOUS, indices
 from blf_dsc_controller.run import Floats
 
-# rad/s or m/s, and exponent: scales and shapes that are published for gears and bearings
+# rad/s or m/s, and exponent: scales and shapes that are published for gears and
+# bearings
 _LAWS = ((0.05, 2.0), (0.2, 2.0), (0.1, 1.0), (0.4, 1.0))
 _AS_WELL = 1.2  # times the least rms error in cross-validation
 

@@ -28,8 +28,9 @@ def read_bag(
 ) -> Recording:
     """Read joint states with efforts, or else (or if `commanded`) commanded torques, from any bag.
 
-    `text` is the URDF; `joints` are the arm's, from its base to its tip, by default all in the bag
-    up to where the arm branches; `namespace` and `names` are as for `read_run`.
+    `text` is the URDF; `joints` are the arm's, from its base to its tip, by default all
+    in the bag up to where the arm branches; `namespace` and `names` are as for
+    `read_run`.
 
     Raises:
         BlfDscError: the bag cannot be read, has no torques or too few states, or has the joints

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Recordings from tables: CSV and text with or without a header, npz, and mat.
 
-A table needs the time, and a position and a torque of each joint.  Which columns they are is found
-from their names, or given: `time=t`, `q=pos_*`, `tau=6:12` (columns 6 to 11), `time=100Hz` if no
-column has the time.  The columns of npz and mat files are their vectors, and those of matrices, in
-which each is named after its matrix with its index.
+A table needs the time, and a position and a torque of each joint.  Which columns they
+are is found from their names, or given: `time=t`, `q=pos_*`, `tau=6:12` (columns 6 to
+11), `time=100Hz` if no column has the time.  The columns of npz and mat files are their
+vectors, and those of matrices, in which each is named after its matrix with its index.
 
 Velocities are not read: `windows` computes them from the positions.
 """
@@ -60,8 +60,9 @@ def read_table(
 
     A `planned` motion has no torques: they are zero.
 
-    `joints` are the arm's, by default all from the root to where it branches, or as many of them as
-    the table has.  `names.joints` may have `time`, `q` and `tau`, as above, and the joints' names.
+    `joints` are the arm's, by default all from the root to where it branches, or as
+    many of them as the table has.  `names.joints` may have `time`, `q` and `tau`, as
+    above, and the joints' names.
 
     Raises:
         BlfDscError: the file cannot be read, or its columns are not found.

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Inertias, rotors and friction identified from a recording, with the URDF as the prior.
 
-In four steps: the efforts are checked; the model is selected by cross-validation within the first
-four fifths of the motion; its values are fitted to these, and scored on the rest; then they are
-fitted to all of the motion.
+In four steps: the efforts are checked; the model is selected by cross-validation within
+the first four fifths of the motion; its values are fitted to these, and scored on the
+rest; then they are fitted to all of the motion.
 """
 
 from __future__ import annotations
@@ -51,11 +51,12 @@ def identify_bag(
 ) -> Identified:
     """Identify the arm of one or several bags or tables from its URDF.
 
-    Path, namespace and names are as for `read_run`.  `effort` says what the efforts are: the whole
-    torque, the torque without that of gravity, or the commanded torque instead of them; `gains`
-    [N m/A] turn currents into torques, and if there are none, signs are found.  A load is
-    identified if there is a bag in which the arm is `loaded`, or if it does `pick_up` one.
-    `begin` is called with each of STAGES when it begins.
+    Path, namespace and names are as for `read_run`.  `effort` says what the efforts
+    are: the whole torque, the torque without that of gravity, or the commanded torque
+    instead of them; `gains` [N m/A] turn currents into torques, and if there are none,
+    signs are found.  A load is identified if there is a bag in which the arm is
+    `loaded`, or if it does `pick_up` one.  `begin` is called with each of STAGES when
+    it begins.
 
     Raises:
         BlfDscError: a bag or the URDF cannot be read, or there are no torques of the arm, too

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """An identified arm as MJCF: bodies, joints, rotors and friction; no geometry.
 
-MJCF has a place for what a URDF lacks: the rotors are `armature`.  What is held at its joint, such
-as a gripper's fingers, is part of the body that carries it.
+MJCF has a place for what a URDF lacks: the rotors are `armature`.  What is held at its
+joint, such as a gripper's fingers, is part of the body that carries it.
 """
 
 from __future__ import annotations

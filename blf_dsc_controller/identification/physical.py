@@ -3,10 +3,10 @@
 
     minimise  |A z - b|^2 / 2 + |z|^2 / 2  - sum_i max(mu, c_i) log det J_i(z)
 
-with pseudo-inertias, or scalars, J_i > 0 affine in z, by Newton steps with decreasing mu (Boyd and
-Vandenberghe, Convex Optimization, 2004, chapter 11).  The prior's density has the determinants to
-the power c_i.  Where that is zero, the sum of squares is at the end at most mu times the number of
-rows of these J_i above its minimum.
+with pseudo-inertias, or scalars, J_i > 0 affine in z, by Newton steps with decreasing
+mu (Boyd and Vandenberghe, Convex Optimization, 2004, chapter 11).  The prior's density
+has the determinants to the power c_i.  Where that is zero, the sum of squares is at the
+end at most mu times the number of rows of these J_i above its minimum.
 """
 
 from __future__ import annotations

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Whether efforts are what they are said to be: their gravity, and their signs.
 
-The torque of each joint is explained by three shares, of the URDF's gravity, of its other inertial
-torque, and of friction.  A share of gravity near 1 is right; near 0 it is missing; near -1 the sign
-of the effort is reversed.
+The torque of each joint is explained by three shares, of the URDF's gravity, of its
+other inertial torque, and of friction.  A share of gravity near 1 is right; near 0 it
+is missing; near -1 the sign of the effort is reversed.
 """
 
 from __future__ import annotations
@@ -59,8 +59,8 @@ def gravity_share(rows: Rows, fit: Indices, P: Floats) -> float:
 def reversed_joints(rows: Rows, fit: Indices, P: Floats) -> NDArray[np.bool_]:
     """Return which joints (n,) have efforts of the opposite sign.
 
-    Gravity shows it; where a joint carries hardly any, friction does, which cannot drive.  What
-    neither shows is taken to be as in all joints that carry some.
+    Gravity shows it; where a joint carries hardly any, friction does, which cannot
+    drive.  What neither shows is taken to be as in all joints that carry some.
     """
     u = rows.u(0.0)[fit]
     size = _sizes(rows, fit)

@@ -1,13 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """Prior of the identified values, in deviations from the URDF.
 
-Its widths are guesses: how far URDFs are off, how much friction drives have.  `widened` lets data
-overrule them, group by group; see `selection`.
+Its widths are guesses: how far URDFs are off, how much friction drives have.  `widened`
+lets data overrule them, group by group; see `selection`.
 
-Its density is exp(-|z|^2 / 2) times the determinants of the bodies' pseudo-inertias.  They let no
-body lose its extent where data ask for less than none; a simulated joint without inertia diverges.
-In one dimension: over positive s, a normal density of deviation d is largest at 0, s times that
-density at d, next to its mean of 0.8 d.
+Its density is exp(-|z|^2 / 2) times the determinants of the bodies' pseudo-inertias.
+They let no body lose its extent where data ask for less than none; a simulated joint
+without inertia diverges.  In one dimension: over positive s, a normal density of
+deviation d is largest at 0, s times that density at d, next to its mean of 0.8 d.
 """
 
 from __future__ import annotations
@@ -115,7 +115,8 @@ def prior_of(
 ) -> Prior:
     """Return the prior of a chain: inertias as for learning, joint terms scaled by the recording.
 
-    `torque` and `speed` (n,) are the largest of each joint; `load` says whether one is picked up.
+    `torque` and `speed` (n,) are the largest of each joint; `load` says whether one is
+    picked up.
     """
     from scipy.linalg import block_diag
 

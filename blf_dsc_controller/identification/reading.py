@@ -24,9 +24,9 @@ def read_recording(
 ) -> Recording:
     """Read a recording of the arm of a URDF (its text) from a bag or a table.
 
-    `joints` are the arm's, from its base to its tip; none: see `read_bag`, `read_table`.  `names`
-    are those that differ in the file.  `commanded`: commands of a bag are read instead of efforts;
-    `planned`: a table needs no torques.
+    `joints` are the arm's, from its base to its tip; none: see `read_bag`,
+    `read_table`.  `names` are those that differ in the file.  `commanded`: commands of
+    a bag are read instead of efforts; `planned`: a table needs no torques.
 
     Raises:
         BlfDscError: the file cannot be read, or does not hold positions and torques of the arm.

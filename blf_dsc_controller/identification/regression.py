@@ -1,16 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
 """The weighted least-squares problem of a recording, with its folds and its covariance.
 
-Each joint is weighted by the inverse deviation of its own residual, the delay of the torques is
-linearised about its last estimate, and the load friction computed with the last estimate of
-gravity: a few passes until they agree.
+Each joint is weighted by the inverse deviation of its own residual, the delay of the
+torques is linearised about its last estimate, and the load friction computed with the
+last estimate of gravity: a few passes until they agree.
 
 The covariance allows for residuals that are correlated,
 
     H^-1 (I + sum_i l_i A_i^T A_i) H^-1,       H = I + sum_i A_i^T A_i,
 
-with the correlation lengths l_i of the joints (Liang and Zeger, Longitudinal data analysis using
-generalized linear models, 1986), and ignores the bounds, which can only reduce it.
+with the correlation lengths l_i of the joints (Liang and Zeger, Longitudinal data
+analysis using generalized linear models, 1986), and ignores the bounds, which can only
+reduce it.
 """
 
 from __future__ import annotations

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """What the model is, by cross-validation: contacts, optional terms, and widths of the prior.
 
-The recording is cut into five parts; each is predicted by the values found from the others.
-Optional terms are many, and what shows one of them may be short: there it is ten parts, so that
-less is missing from what predicts.  Only the part that is fitted is used, never the one held back
-for the score.  Bounds are ignored here.
+The recording is cut into five parts; each is predicted by the values found from the
+others.  Optional terms are many, and what shows one of them may be short: there it is
+ten parts, so that less is missing from what predicts.  Only the part that is fitted is
+used, never the one held back for the score.  Bounds are ignored here.
 """
 
 from __future__ import annotations
@@ -19,7 +19,8 @@ from blf_dsc_controller.identification.sliding import DISTANCES
 from blf_dsc_controller.identification.windows import Indices, Rows
 from blf_dsc_controller.run import Floats
 
-# of the squared error of cross-validation, least reduction by what is not the default ...
+# of the squared error of cross-validation, least reduction by what is not the default
+# ...
 _WORTH = 0.01
 _WORTH_OF_TERM = 0.003  # ... and by an optional term
 _WIDTHS = (1.0, 3.0, 10.0, 30.0)  # of the prior
@@ -93,8 +94,8 @@ def _worthwhile(found: Regression, prior: Prior) -> list[Entry]:
 def _widths(found: Regression, prior: Prior) -> dict[str, float]:
     """Return the factor of each group's width, raised as long as that predicts better.
 
-    Every fold must agree: a disturbance that lasts for a part of the recording looks like other
-    inertias there, and only there.
+    Every fold must agree: a disturbance that lasts for a part of the recording looks
+    like other inertias there, and only there.
     """
     used = prior.D.any(axis=0).astype(float)
     widths = dict.fromkeys(prior.groups, 1.0)
@@ -123,8 +124,8 @@ def cross_validated(
 ) -> Floats:
     """Return the squared error (parts, n) of each fold and joint, predicted by the other folds.
 
-    `factors` (k,) are widths of the prior, 0 for what is not in the model.  The error is infinite
-    where an entry of the model that must be `positive` is not.
+    `factors` (k,) are widths of the prior, 0 for what is not in the model.  The error
+    is infinite where an entry of the model that must be `positive` is not.
     """
     used = np.flatnonzero(factors)
     scale = np.append(factors[used], 1.0)

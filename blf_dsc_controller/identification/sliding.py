@@ -1,12 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """Sliding direction s of a joint, in [-1, 1]: what multiplies its Coulomb friction.
 
-At a reversal, friction does not jump: the contact yields elastically first, over a distance x_s
-that is a constant of the joint (Dahl, A solid friction model, 1968):
+At a reversal, friction does not jump: the contact yields elastically first, over a
+distance x_s that is a constant of the joint (Dahl, A solid friction model, 1968):
 
     s' = (v - |v| s) / x_s,      in one direction of motion  s = sign(v) (1 - exp(-|x| / x_s)).
 
-At rest s stays, as stiction does.  With x_s = 0 the direction is s(v) of `arms.friction`.
+At rest s stays, as stiction does.  With x_s = 0 the direction is s(v) of
+`arms.friction`.
 """
 
 from __future__ import annotations

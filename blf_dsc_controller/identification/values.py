@@ -1,15 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
 """The unknowns of identification: bodies, terms of each joint, coupling, load, delay.
 
-The friction of a joint with speed v, and sliding direction s of `sliding`, is the sum of
+The friction of a joint with speed v, and sliding direction s of `sliding`, is the sum
+of
 
     viscous     v                          Stribeck    s exp(-(v / v_s)^2)
     Coulomb     s                          quadratic   v |v|
     load        |G| s, with the torque G of gravity: gears lose what they carry
 
-A motor that drives the last two joints, which are then coupled, adds to each of them the same
-Coulomb friction s(v_1 + v_2), and viscous friction and inertia times the speed and acceleration of
-the other.
+A motor that drives the last two joints, which are then coupled, adds to each of them
+the same Coulomb friction s(v_1 + v_2), and viscous friction and inertia times the speed
+and acceleration of the other.
 """
 
 from __future__ import annotations

@@ -6,12 +6,13 @@ d/dt(Yp P) + Yr P + friction = torque gives
 
     int (g Yr - g' Yp) dt P + int g friction dt = int g torque dt
 
-exactly, by parts (modulating functions: Shinbrot, On the analysis of linear and nonlinear systems,
-1957).  Both sides pass the same low-pass filter; windows with gaps are left out.
+exactly, by parts (modulating functions: Shinbrot, On the analysis of linear and
+nonlinear systems, 1957).  Both sides pass the same low-pass filter; windows with gaps
+are left out.
 
-Velocities are not read, either: those of a driver lag behind its positions, usually by an unknown
-time.  They are the slopes of cubics fitted to the positions around each sample (Savitzky and Golay,
-Smoothing and differentiation of data, 1964).
+Velocities are not read, either: those of a driver lag behind its positions, usually by
+an unknown time.  They are the slopes of cubics fitted to the positions around each
+sample (Savitzky and Golay, Smoothing and differentiation of data, 1964).
 """
 
 from __future__ import annotations
@@ -70,7 +71,8 @@ _WINDOWS_OF_JOINT = 10  # least number
 class Rows(NamedTuple):
     """R windows of n joints and m unknowns [P; COLUMNS of all joints; COUPLING; LOAD].
 
-    The N samples are on disk, and so is what is large; `blocks` of windows come into memory.
+    The N samples are on disk, and so is what is large; `blocks` of windows come into
+    memory.
     """
 
     time: Floats  # (R,) of their centres, s

@@ -6,21 +6,22 @@
 
     d^3' = -gamma (xi2 + eta d^3) - H (theta^' + Gamma H^T xi2)
 
-As printed, (20) has + kappa eps, which drives P^ to the projection ball as soon as learning starts.
-H^T xi2 and the leakage W_c P^ of the comparison law (35) act on P^ alone.  With the Newton W every
-excited direction converges at the rate Gamma kappa; with the gradient update the rates vary with
-the eigenvalues of Phi_e.
+As printed, (20) has + kappa eps, which drives P^ to the projection ball as soon as
+learning starts.  H^T xi2 and the leakage W_c P^ of the comparison law (35) act on P^
+alone.  With the Newton W every excited direction converges at the rate Gamma kappa;
+with the gradient update the rates vary with the eigenvalues of Phi_e.
 
-(30) lacks the last term.  While the estimate is wrong, d^3 compensates for it; the prediction error
-then corrects the estimate within milliseconds, but d^3 follows only within seconds, and their sum
-is wrong in between.  With the term (`bumpless`) learning does not change the torque H P^ + d^3, and
-d^3 is left to estimate the disturbance alone.
+(30) lacks the last term.  While the estimate is wrong, d^3 compensates for it; the
+prediction error then corrects the estimate within milliseconds, but d^3 follows only
+within seconds, and their sum is wrong in between.  With the term (`bumpless`) learning
+does not change the torque H P^ + d^3, and d^3 is left to estimate the disturbance
+alone.
 
-The update stays in a ball, in the metric of the adaptation gain.  As printed, (4) acts where |P^|
-equals the radius, which a sampled update never hits: it steps over and never returns.  Here the
-outward part is removed on and beyond the sphere, in the metric that the Lyapunov function (29) uses
-for P~, and a step that leaves the ball ends at the nearest point of the ball in that metric, which
-is never farther from a true P inside.
+The update stays in a ball, in the metric of the adaptation gain.  As printed, (4) acts
+where |P^| equals the radius, which a sampled update never hits: it steps over and never
+returns.  Here the outward part is removed on and beyond the sphere, in the metric that
+the Lyapunov function (29) uses for P~, and a step that leaves the ball ends at the
+nearest point of the ball in that metric, which is never farther from a true P inside.
 """
 
 from math import isfinite, sqrt
@@ -42,8 +43,8 @@ _MOST_STEPS = 20
 def project(estimate: Array, rate: Array, gain: Array, radius: float) -> None:
     """Remove the outward part from `rate` v (p,):  v - Gamma w w^T v / (w^T Gamma w).
 
-    `estimate` P^ (p,) is the direction w, `rate` is modified in place, `gain` (p,) is the diagonal
-    of Gamma and `radius` omega_a.
+    `estimate` P^ (p,) is the direction w, `rate` is modified in place, `gain` (p,) is
+    the diagonal of Gamma and `radius` omega_a.
     """
     square = 0.0
     outward = 0.0
@@ -61,8 +62,9 @@ def project(estimate: Array, rate: Array, gain: Array, radius: float) -> None:
 def retract(estimate: Array, gain: Array, radius: float) -> None:
     """Replace a P^ (p,) outside the ball by the nearest point in it, in the metric of Gamma.
 
-    That is P^_j / (1 + nu Gamma_j) with the nu > 0 that gives it the length omega_a, found by
-    Newton's method on 1 / length: exact after one step for equal gains, monotone otherwise.
+    That is P^_j / (1 + nu Gamma_j) with the nu > 0 that gives it the length omega_a,
+    found by Newton's method on 1 / length: exact after one step for equal gains,
+    monotone otherwise.
     """
     square = 0.0
     for j in range(gain.size):
@@ -149,10 +151,11 @@ def adapt(
 ) -> None:
     """Advance theta^ and d^3 by `dt` [s]: (20), (30).
 
-    While a torque is saturated, the tracking error reflects the limit, not the parameters, so only
-    the prediction error, which uses the applied torque, adapts the estimate.  While a full window
-    is not excited, as at standstill, H^T xi2 is correlated noise and ignored (`change_detection`).
-    While a contact lasts, and something reacts to it, only d^3 follows.
+    While a torque is saturated, the tracking error reflects the limit, not the
+    parameters, so only the prediction error, which uses the applied torque, adapts the
+    estimate.  While a full window is not excited, as at standstill, H^T xi2 is
+    correlated noise and ignored (`change_detection`).  While a contact lasts, and
+    something reacts to it, only d^3 follows.
     """
     if state.frozen[0] > 0.0:
         if not saturated:

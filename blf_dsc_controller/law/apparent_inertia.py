@@ -1,22 +1,24 @@
 # SPDX-License-Identifier: Apache-2.0
 """Rotor inertias that the URDF lacks, measured while the law runs, for the gains of its feedback.
 
-The gains rest on the inertia of each joint, and a geared one's is mostly its rotor's, which nobody
-states.  The guess, rated torque over 400 rad/s^2, is an upper limit.  A joint that is much lighter
-makes the loop oscillate, and this oscillation shows its inertia before it has grown: between the
-bandwidth of the motion and that of the noise,
+The gains rest on the inertia of each joint, and a geared one's is mostly its rotor's,
+which nobody states.  The guess, rated torque over 400 rad/s^2, is an upper limit.  A
+joint that is much lighter makes the loop oscillate, and this oscillation shows its
+inertia before it has grown: between the bandwidth of the motion and that of the noise,
 
     tau = M a = M_0 a + J~ a,        z^T (tau - M_0 a) = z^T a J~,
 
-with M_0 from P^(0), J~ the error of the guess and z = tau, all through the lags of the loop and the
-same band pass.  Sums over all time give J~ in [-J, 0] of each joint.  They grow only while the
-acceleration is clear of the noise, which is known by its second difference: noise comes back
-through the feedback, where it cannot be told from an arm without inertia.
+with M_0 from P^(0), J~ the error of the guess and z = tau, all through the lags of the
+loop and the same band pass.  Sums over all time give J~ in [-J, 0] of each joint.  They
+grow only while the acceleration is clear of the noise, which is known by its second
+difference: noise comes back through the feedback, where it cannot be told from an arm
+without inertia.
 
-The feedback then acts on M_0 + J~ in place of M_0: its acceleration, damping and barrier included,
-minus qr'' gets the torque of J~ as well, as does the rate of d^3.  The damping of a safe stop is
-scaled by the inertia of each joint with the others free, interpolated between J~ = -J and 0.  Along
-the reference nothing changes: what is learned acts there.
+The feedback then acts on M_0 + J~ in place of M_0: its acceleration, damping and
+barrier included, minus qr'' gets the torque of J~ as well, as does the rate of d^3.
+The damping of a safe stop is scaled by the inertia of each joint with the others free,
+interpolated between J~ = -J and 0.  Along the reference nothing changes: what is
+learned acts there.
 """
 
 import numpy as np
@@ -33,7 +35,8 @@ _CLEAR = 0.1  # their ratio: noise has 0.005, an oscillation 100
 _EVIDENCE = 0.05
 _RELEASE = 0.02  # s, in which the arm settles on its first torque
 
-# Rows of `State.lags`: poles of the torque, those of the acceleration, and the last samples.
+# Rows of `State.lags`: poles of the torque, those of the acceleration, and the last
+# samples.
 _HELD, _DRIVE, _SENSOR, _TORQUE1, _TORQUE2, _TORQUE_MEAN = range(6)
 _RATE1, _RATE2, _RATE_MEAN, _NOISE, _POWER, _VELOCITY, _LAST, _BEFORE = range(6, 14)
 

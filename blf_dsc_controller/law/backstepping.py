@@ -5,8 +5,8 @@
     tau = H P^ - K_p z2 - w z1 - mu_bar sat(z2 / b)                                    (35)
     P^' = -Gamma (H^T z2 + W_c P^)
 
-Slotine and Li's law has neither the position gain w nor mu_bar nor the leakage W_c; it may have the
-integral of z2, by (30).  Both adapt by the tracking error alone.
+Slotine and Li's law has neither the position gain w nor mu_bar nor the leakage W_c; it
+may have the integral of z2, by (30).  Both adapt by the tracking error alone.
 """
 
 from __future__ import annotations

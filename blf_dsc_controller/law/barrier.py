@@ -1,25 +1,27 @@
 # SPDX-License-Identifier: Apache-2.0
 """The barrier (3), constant or a funnel, and the virtual control (15), (18).
 
-The weighted tan-type barrier is continued linearly past the stiffness a sampled loop can hold:
+The weighted tan-type barrier is continued linearly past the stiffness a sampled loop
+can hold:
 
     V(xi) = w (k_c^2 / pi) tan s,      s = pi xi^2 / (2 k_c^2)                        [J]
     dV/dxi = w xi / cos^2 s                                                            [N m]
 
-The paper's w = 1 makes V1 (11) add rad^2 to J; the weight [N m/rad] corrects the unit and lets the
-barrier act before the last microradian.  dV/dxi has slope w (1 + 4 s tan s) / cos^2 s, unbounded at
-the bound, but a torque held for one sample can only stabilise a finite stiffness.  Past the error
-at which the slope reaches `slope_limit` (the knee), the torque continues as a straight line of that
-slope: continuous with its derivative, strong enough to return the arm, and defined everywhere.
+The paper's w = 1 makes V1 (11) add rad^2 to J; the weight [N m/rad] corrects the unit
+and lets the barrier act before the last microradian.  dV/dxi has slope w (1 + 4 s tan
+s) / cos^2 s, unbounded at the bound, but a torque held for one sample can only
+stabilise a finite stiffness.  Past the error at which the slope reaches `slope_limit`
+(the knee), the torque continues as a straight line of that slope: continuous with its
+derivative, strong enough to return the arm, and defined everywhere.
 
 The bound is constant, or a funnel that narrows to k_c:
 
     k(t) = k_c + (k_0 - k_c) exp(-a t)                                                 [rad]
 
-The potential has the form k^2 v(xi / k), including its continuation past the knee, so that
-V' = dV/dxi (xi1' - xi1 k'/k) + 2 (k'/k) V.  With xi1 k'/k added to the virtual control, V' is that
-of a constant bound plus 2 (k'/k) V, which is not positive while the bound narrows
-(doc/stability.md, 'A bound that narrows').
+The potential has the form k^2 v(xi / k), including its continuation past the knee, so
+that V' = dV/dxi (xi1' - xi1 k'/k) + 2 (k'/k) V.  With xi1 k'/k added to the virtual
+control, V' is that of a constant bound plus 2 (k'/k) V, which is not positive while the
+bound narrows (doc/stability.md, 'A bound that narrows').
 """
 
 from math import pi
@@ -116,9 +118,9 @@ def virtual_control(
 ) -> float:
     """Return beta2 = -(K/2) xi1 sinc(pi xi1^2 / k_c^2) - mu xi1 + dqr   [rad/s], (15) and (18).
 
-    (15) is printed as a quotient that is 0/0 at xi1 = 0; sin s cos s = sin(2 s)/2 turns it into a
-    sinc.  Its barrier part falls to zero at the bound, where only mu acts; beyond, it would change
-    sign and is set to zero.
+    (15) is printed as a quotient that is 0/0 at xi1 = 0; sin s cos s = sin(2 s)/2 turns
+    it into a sinc.  Its barrier part falls to zero at the bound, where only mu acts;
+    beyond, it would change sign and is set to zero.
     """
     ratio = xi1 / bound
     barrier_part = 0.0

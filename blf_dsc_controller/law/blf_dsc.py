@@ -8,8 +8,8 @@
     tau = -dV/dxi1 - d2 |xi1| sat(xi2 / b) - K_p xi2 + tau_m + d^3                     (28)
     theta^' = Proj(-Gamma (H^T xi2 - kappa W eps)),    d^3' = -gamma (xi2 + eta d^3)   (20), (30)
 
-The model-based controller (16) is the same law with P^ = P and the disturbance known: its gains of
-adaptation are zero, and the known disturbance is fed forward.
+The model-based controller (16) is the same law with P^ = P and the disturbance known:
+its gains of adaptation are zero, and the known disturbance is fed forward.
 
 Where it departs from the paper, and why:
 

@@ -1,14 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
 """Whether the arm has changed: rows contradict the latched solution, or the rows before them.
 
-The mean square error of the solution of a full window over the last 0.1 s is compared with the
-residual that it had.  As long as the window is not full, and until the first full one is latched,
-each row is compared with what the rows so far and the prior predict (see `innovation`): a window
-that has a pick-up in it is a mixture of two arms, which may leave no more than the unmodelled
-torque, and the solution of few rows does not predict the next ones.
+The mean square error of the solution of a full window over the last 0.1 s is compared
+with the residual that it had.  As long as the window is not full, and until the first
+full one is latched, each row is compared with what the rows so far and the prior
+predict (see `innovation`): a window that has a pick-up in it is a mixture of two arms,
+which may leave no more than the unmodelled torque, and the solution of few rows does
+not predict the next ones.
 
-If the arm has changed, window, filters and latch are cleared, and learning restarts.  What a window
-has taught before it was full is taken back: it did not predict what it was not fitted to.
+If the arm has changed, window, filters and latch are cleared, and learning restarts.
+What a window has taught before it was full is taken back: it did not predict what it
+was not fitted to.
 """
 
 from blf_dsc_controller.compiled.algebra import cholesky_factor, cholesky_solve
@@ -28,7 +30,8 @@ def detect_change(
 ) -> None:
     """Forget the window if the arm has changed: its rows contradict the solution, or each other.
 
-    What a window has taught before it was full is taken back: back to the estimate before.
+    What a window has taught before it was full is taken back: back to the estimate
+    before.
     """
     if is_predicted(settings, state):
         has_changed = contradicts_rows(settings, state, signals, dt)

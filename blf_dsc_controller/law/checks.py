@@ -38,8 +38,9 @@ def bridge_repeats(
 ) -> None:
     """Write the measurement (3 n,) that the law uses to `checks.used`.
 
-    Drivers that do not wait for their arm send a reading once more, with a new stamp: an arm in
-    motion that seems to stand still for a sample.  It is continued at its velocity.
+    Drivers that do not wait for their arm send a reading once more, with a new stamp:
+    an arm in motion that seems to stand still for a sample.  It is continued at its
+    velocity.
     """
     n = settings.n
     repeats = state.samples[0] > 0.0
@@ -78,7 +79,8 @@ def keep_consistent(
 ) -> None:
     """Keep the estimates of the smallest error of late, from before an error grows.
 
-    Commands that do not reach the arm make its error grow, and the disturbance estimate with it.
+    Commands that do not reach the arm make its error grow, and the disturbance estimate
+    with it.
     """
     ratio = 0.0
     for i in range(settings.n):

@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """Torque of the model in a law: P^(0) at the state, what is learned along the reference.
 
-The paper's compensation is H(q, dq, alpha2, alpha2') P^ (`compensation: state`).  alpha2' contains
-the feedback, which is thus multiplied by the learned inertia: an estimate of 2.65 times the inertia
-makes a loop at 1 kHz unstable.  So what is learned acts along the reference only, and the feedback
-keeps the model from before the start, as in the desired compensation law of Sadegh and Horowitz
-(1990):
+The paper's compensation is H(q, dq, alpha2, alpha2') P^ (`compensation: state`).
+alpha2' contains the feedback, which is thus multiplied by the learned inertia: an
+estimate of 2.65 times the inertia makes a loop at 1 kHz unstable.  So what is learned
+acts along the reference only, and the feedback keeps the model from before the start,
+as in the desired compensation law of Sadegh and Horowitz (1990):
 
     tau_m = H(q, dq, alpha2, alpha2' - omega_v xi2) P^(0) + H(qr, dqr, dqr, ddqr) (P^ - P^(0))
 

@@ -88,9 +88,9 @@ def step(
 ) -> int:
     """Run one sample, from the measurement to the torque; return the flags of its `checks`.
 
-    The measurement is [q (n,) rad, dq (n,) rad/s, effort of the last interval (n,) N m],
-    t [s] the time since the start, dt [s] since the last sample (at the first: until the next).
-    The terms of (29) are separate: `lyapunov.fill_energies`.
+    The measurement is [q (n,) rad, dq (n,) rad/s, effort of the last interval (n,) N
+    m], t [s] the time since the start, dt [s] since the last sample (at the first:
+    until the next).  The terms of (29) are separate: `lyapunov.fill_energies`.
     """
     n = settings.n
     is_checked = checks.velocity_limit[0] > 0.0

@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Whether commands have an effect: on the positions, or on measured efforts.
 
-Whether a joint has moved is a matter of its sensor, not of the bound: its position has changed by
-more than the sensor's noise and steps explain.  A wide bound makes no difference.
+Whether a joint has moved is a matter of its sensor, not of the bound: its position has
+changed by more than the sensor's noise and steps explain.  A wide bound makes no
+difference.
 """
 
 from __future__ import annotations
@@ -49,11 +50,12 @@ def check_effect(
 ) -> int:
     """Return the flags for commands without effect; call it once the sample's values are kept.
 
-    While no joint moves, gravity does not change: the commands should not either, except by what
-    overcomes stiction. Otherwise brakes hold the arm, or its effort controller is not active, and
-    the law learns what its own commands say. Slower drifts show in efforts that are torques, and
-    an effort that follows the commands shows that they have an effect: a load does not move an arm
-    whose torque grows with it.
+    While no joint moves, gravity does not change: the commands should not either,
+    except by what overcomes stiction. Otherwise brakes hold the arm, or its effort
+    controller is not active, and the law learns what its own commands say. Slower
+    drifts show in efforts that are torques, and an effort that follows the commands
+    shows that they have an effect: a load does not move an arm whose torque grows with
+    it.
     """
     begins = state.samples[0] <= 1.0
     moves = begins or has_moved(checks, settings.n)
@@ -101,9 +103,9 @@ def compare_effort(
 ) -> int:
     """Return the flags for efforts that do not follow the commands.
 
-    The drives' own model of what they add may differ from the law's: then what the efforts lack
-    must not change while no joint moves.  In motion its usual value explains an error past the
-    bound.
+    The drives' own model of what they add may differ from the law's: then what the
+    efforts lack must not change while no joint moves.  In motion its usual value
+    explains an error past the bound.
     """
     if checks.compares[0] == 0.0:
         return 0

@@ -1,25 +1,28 @@
 # SPDX-License-Identifier: Apache-2.0
 """Which windows are learned from: those that are excited (27), and of one and the same arm.
 
-Disturbance columns that a window cannot distinguish from the parameters are rejected: theta_j = 0.
+Disturbance columns that a window cannot distinguish from the parameters are rejected:
+theta_j = 0.
 
-A window that spans a change of the arm (a payload, a contact) contradicts itself although it is
-excited; its least-squares solution is a mixture, and the Newton step would solve it exactly.  The
-mean of u^T u, kept with Phi and b, gives the residual of the solution,
+A window that spans a change of the arm (a payload, a contact) contradicts itself
+although it is excited; its least-squares solution is a mixture, and the Newton step
+would solve it exactly.  The mean of u^T u, kept with Phi and b, gives the residual of
+the solution,
 
     r^2 = mean(u^T u) - b^T theta_LS   [(N m)^2],
 
-and a window is latched only if r^2 is at most four times the smallest of any full window, or what
-unmodelled torque explains (configured, but no more than the smallest residual shows), and if its
-solution gives the arm a positive inertia, which the residual does not show.  The first full
-window has only its own parts as a measure: fitted apart, neither may explain its rows better than
-by that factor, else the older part is removed from the window; again only if the residual has
-halved since, since parts of a period never agree about a lasting disturbance.
+and a window is latched only if r^2 is at most four times the smallest of any full
+window, or what unmodelled torque explains (configured, but no more than the smallest
+residual shows), and if its solution gives the arm a positive inertia, which the
+residual does not show.  The first full window has only its own parts as a measure:
+fitted apart, neither may explain its rows better than by that factor, else the older
+part is removed from the window; again only if the residual has halved since, since
+parts of a period never agree about a lasting disturbance.
 
-After a change of the arm (see `change`) and until the new window is full, it does not average out
-disturbances, so its solution is pulled to the estimate before the change, most strongly in weakly
-excited directions.  Likewise, a full window with an unusually large residual is pulled to an
-earlier solution, kept once per window.
+After a change of the arm (see `change`) and until the new window is full, it does not
+average out disturbances, so its solution is pulled to the estimate before the change,
+most strongly in weakly excited directions.  Likewise, a full window with an unusually
+large residual is pulled to an earlier solution, kept once per window.
 """
 
 from blf_dsc_controller.compiled.algebra import cholesky_factor, cholesky_solve
@@ -47,7 +50,8 @@ _LEAST_INERTIA = 0.1  # fraction of the initial estimate's
 def explained(settings: Settings, state: State, residual: float) -> float:
     """Return the mean square residual that noise and unmodelled torque explain (>= `residual`).
 
-    Their configured floor is an upper limit: the best full window shows how little they are.
+    Their configured floor is an upper limit: the best full window shows how little they
+    are.
     """
     floor = settings.residual_floor
     if state.least_residual[0] > 0.0:
@@ -122,8 +126,8 @@ def agrees_with_parts(
 ) -> bool:
     """Check the residual of a full window against those of its two parts, each fitted apart.
 
-    If they contradict each other, only the newer part stays in the window.  Restores Phi, b, its
-    factor and the solution of the whole window in `signals`.
+    If they contradict each other, only the newer part stays in the window.  Restores
+    Phi, b, its factor and the solution of the whole window in `signals`.
     """
     length = settings.window
     newer_rows = window.newer_part(state, signals.newer)
@@ -158,8 +162,8 @@ def agrees_with_parts(
 def accept_window(settings: Settings, state: State, signals: Signals) -> bool:
     """Check that the window is consistent and its solution physical; if so, keep the solution.
 
-    A window that is not full, or has an unusually large residual, is pulled to the anchor:
-    Phi + a R, b + a R theta_anchor, in `signals`.
+    A window that is not full, or has an unusually large residual, is pulled to the
+    anchor: Phi + a R, b + a R theta_anchor, in `signals`.
     """
     m = settings.m
     solution = signals.work
@@ -199,9 +203,10 @@ def accept_window(settings: Settings, state: State, signals: Signals) -> bool:
 def reject_columns(settings: Settings, state: State, signals: Signals) -> None:
     """Reject the disturbance columns that this window cannot distinguish from the parameters.
 
-    The window must excite the parameters without any column; then the column with the largest entry
-    in the minimum eigenvector is rejected, repeatedly, until the rest is excited.  This happens at
-    the first settled window that is excited enough, and once per window while a column is rejected.
+    The window must excite the parameters without any column; then the column with the
+    largest entry in the minimum eigenvector is rejected, repeatedly, until the rest is
+    excited.  This happens at the first settled window that is excited enough, and once
+    per window while a column is rejected.
     """
     for j in range(settings.p, settings.m):
         state.active[j] = 0.0
@@ -243,8 +248,9 @@ def readmit_columns(settings: Settings, state: State, signals: Signals) -> None:
 def is_preferred(settings: Settings, state: State, value: float) -> bool:
     """Return whether a window with lambda_min `value` may replace the latched one.
 
-    When the reference stops, (27) would end with the weakest window above the threshold.  A
-    weaker window only has less information, unless the latched one is old or contradicted.
+    When the reference stops, (27) would end with the weakest window above the
+    threshold.  A weaker window only has less information, unless the latched one is old
+    or contradicted.
     """
     return bool(
         settings.change_detection == 0 or value >= _COMPARABLE * state.best_lambda[0]

@@ -1,18 +1,21 @@
 # SPDX-License-Identifier: Apache-2.0
 """Torque from outside that the learned model does not explain, its interval, and a contact.
 
-The row X theta = u + tau_ext of each interval (see `prediction`), whole, passes through a pole L:
+The row X theta = u + tau_ext of each interval (see `prediction`), whole, passes through
+a pole L:
 
     r = X_L theta^ - u_L,        tau_ext passed through the pole
 
-which is a momentum observer, with what has been learned in place of the URDF.  It is linear in
-theta, so what the last full window knows of theta, and how well, gives the covariance of r,
+which is a momentum observer, with what has been learned in place of the URDF.  It is
+linear in theta, so what the last full window knows of theta, and how well, gives the
+covariance of r,
 
     S = a X_L (Phi_e + rho R)^-1 X_L^T + diag(s^2)
 
-with the variance a of rows that count (before the first window: the prior's), and the mean square
-s^2 of r that theta leaves, measured while nothing touches: noise of the sensors, ripple, friction
-that its columns do not describe.  A joint that is about to reverse has an s^2 of its own.
+with the variance a of rows that count (before the first window: the prior's), and the
+mean square s^2 of r that theta leaves, measured while nothing touches: noise of the
+sensors, ripple, friction that its columns do not describe.  A joint that is about to
+reverse has an s^2 of its own.
 
 *A contact* is r with r^T S^-1 r > h^2, unless a load explains it.  A load in the tip with phi = D z
 adds X_L N D z (see `weighing`).  Once r is past h, z ~ (0, 1) is filtered from r, and only what is
@@ -271,7 +274,8 @@ def judge(
 def measure_noise(settings: Settings, state: State) -> None:
     """Update the mean square of r that theta leaves, over a window, while nothing touches.
 
-    At first it is the mean since the first window, with `residual_floor` as a small part of it.
+    At first it is the mean since the first window, with `residual_floor` as a small
+    part of it.
     """
     least = 1.0 / (settings.window * settings.row_interval)
     for i in range(settings.n):

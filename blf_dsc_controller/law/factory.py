@@ -118,10 +118,11 @@ class Column(NamedTuple):
 def columns_of(config: ControllerConfig) -> tuple[Column, ...]:
     """Return the disturbance columns, in the order of `prediction.fill_columns`.
 
-    The standard deviation is half the initial estimate, or 5 % of the rated torque where that is
-    zero, for `viscous` at the largest velocity of the reference.  Friction is between a third of
-    its initial estimate and three times that, or between 0 and those 5 %: a push that is learned
-    as friction, negative or none, turns over where the joint does.
+    The standard deviation is half the initial estimate, or 5 % of the rated torque
+    where that is zero, for `viscous` at the largest velocity of the reference.
+    Friction is between a third of its initial estimate and three times that, or between
+    0 and those 5 %: a push that is learned as friction, negative or none, turns over
+    where the joint does.
     """
     known: dict[str, Any] = {}
     if config.model == 'urdf':
@@ -189,7 +190,8 @@ def prior_covariance(config: ControllerConfig) -> np.ndarray:
 def settings_of_config(config: ControllerConfig) -> Settings:
     """Return the settings of a configuration, in the paper's symbols.
 
-    A gain that is not computed here is the parameter of the same symbol, or of the same name.
+    A gain that is not computed here is the parameter of the same symbol, or of the same
+    name.
     """
     model = model_of(config)
     columns = columns_of(config)

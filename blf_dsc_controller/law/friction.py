@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Friction along the reference: what reversals show of it, and how much of that is used.
 
-Coulomb friction changes its sign where a joint reverses, faster than d^3 can follow: an error of
-the estimate pushes the joint by twice that in each reversal.  In geared joints it is larger at
-breakaway (Stribeck).  Its model, at the velocity v that the reference has when the torque acts, is
+Coulomb friction changes its sign where a joint reverses, faster than d^3 can follow: an
+error of the estimate pushes the joint by twice that in each reversal.  In geared joints
+it is larger at breakaway (Stribeck).  Its model, at the velocity v that the reference
+has when the torque acts, is
 
     c^ g(v) s(v),    s(v) = tanh(v / v_c),    g(v) = 1 + k^ exp(-(v / v_s)^2)          [N m]
 
@@ -17,9 +18,9 @@ least squares give c and c k from what the other columns leave of the torque, e:
 
     min  p int (e_h - c s_h - c k b_h)^2 dt + l (c - c_0)^2 + l_b (c k)^2
 
-with b = s exp(-(v / v_s)^2).  The sums forget once they contain `_ENERGY`, some eight reversals.
-If the last two reversals both contradict them by more than the unmodelled torque f, they
-overrule what is older.
+with b = s exp(-(v / v_s)^2).  The sums forget once they contain `_ENERGY`, some eight
+reversals.  If the last two reversals both contradict them by more than the unmodelled
+torque f, they overrule what is older.
 
 *Used within the evidence.*  What is learned of friction must not cost more than not knowing it,
 which errs by |c_0 - c|.  Two things may contradict c^ before the sums do: a reversal that shows
@@ -30,10 +31,10 @@ reversal, or a push has begun, which stays.  The compensation at v is the value 
     C(v) = clip(c_0, g(v) min E, g(v) max E),
     E = c^ + {0, z(c_1 - c^), z(c_2 - c^), z(delta), z(delta_min), z(delta_max)}
 
-among all that they allow, with the dead zone z of f and the extremes of delta in earlier motions
-since a reversal was last measured.  It lies between c_0 and each of them, so that whichever is
-true, C errs by no more than c_0 does.  C is handed over to d^3 like everything that is learned: it
-changes no torque until the joint reverses.
+among all that they allow, with the dead zone z of f and the extremes of delta in
+earlier motions since a reversal was last measured.  It lies between c_0 and each of
+them, so that whichever is true, C errs by no more than c_0 does.  C is handed over to
+d^3 like everything that is learned: it changes no torque until the joint reverses.
 """
 
 from math import sqrt
@@ -114,9 +115,10 @@ def fill_compensation(
 ) -> None:
     """Compute the friction at the velocity that the reference has when the torque acts.
 
-    Torques act 1.5 samples and half of `robot.lag` late.  The measured velocity would feed its
-    noise, and chatter at rest, into the torque.  Viscous friction has columns in `signals.H`; that
-    of Coulomb's, which is not linear in theta, is `signals.friction` (n,) [N m].
+    Torques act 1.5 samples and half of `robot.lag` late.  The measured velocity would
+    feed its noise, and chatter at rest, into the torque.  Viscous friction has columns
+    in `signals.H`; that of Coulomb's, which is not linear in theta, is
+    `signals.friction` (n,) [N m].
     """
     viscous = settings.p + settings.n * settings.bias
     lead = 1.5 * dt + 0.5 * settings.lag
@@ -215,8 +217,9 @@ def unexplained(settings: Settings, state: State, i: int) -> float:
 def measure_reversals(settings: Settings, state: State, dt: float) -> None:
     """Add the last row, `dt` [s] after the one before it, to the sums of the present reversal.
 
-    They begin T_a after the latch, when the other columns are those of the window, and once a
-    full window is known to be of one arm or this one is half full: those of less are too vague.
+    They begin T_a after the latch, when the other columns are those of the window, and
+    once a full window is known to be of one arm or this one is half full: those of less
+    are too vague.
     """
     if not learns_from_reversals(settings):
         return

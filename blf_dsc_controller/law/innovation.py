@@ -2,7 +2,8 @@
 """Whether a row is what the rows before it predict, or the arm has changed between them.
 
 Rows X theta = u with residuals of the variance s^2, correlated for `CORRELATION`, and
-the prior N(theta_0, R^-1) give theta.  With the sum S of [X | u]^T [X | u], a row each T:
+the prior N(theta_0, R^-1) give theta.  With a row each T, whose [X | u]^T [X | u] add
+up to S:
 
     theta ~ N(A^-1 b, a A^-1),  A = S_XX + a R,  b = S_Xu + a R theta_0,
     a = s^2 CORRELATION / T.
@@ -12,8 +13,8 @@ The innovation e = u - X theta of a later row has the covariance s^2 C, with
     C = I + a / s^2 X A^-1 X^T.
 
 A row is thus judged by what is known of theta so far, from the first row on, when many
-theta explain the rows.  The arm has changed where e^T C^-1 e / n, on average over 0.1 s,
-exceeds five times s^2.
+theta explain the rows.  The arm has changed where e^T C^-1 e / n exceeds five times s^2
+on average over 0.1 s.
 
 s^2 is assumed at first, and measured as the mean of e^T C^-1 e / n.  Rows that fit ever
 worse, as under a disturbance that lasts, raise it as they come, and contradict nothing.
@@ -29,8 +30,8 @@ REFRESH = 0.1  # s, from one solution to the next
 NOISE, MEAN, COUNT, RECENT = range(4)
 _MEMORY = 0.1  # s
 _ALARM = 5.0  # times s^2; an arm that does not change reaches 2.5
-# s^2 before any row, of the square of the torque that is unmodelled; counts as so many rows,
-# and ever less until the mean square is of a window
+# s^2 before any row, of the square of the torque that is unmodelled; counts as so many
+# rows, and ever less until the mean square is of a window
 _ASSUMED, _ASSUMED_ROWS = 0.1, 100.0
 _MOST = 3.0  # times s^2, as which a row counts: those of a change hardly raise it
 _LEAST = 0.001  # of that square, which s^2 is at least

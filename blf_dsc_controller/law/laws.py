@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """The laws that kernels are compiled with: those of the package, and one of a user's file.
 
-`for_law(kernel, law)` is how a loop gets its kernel: the laws of the package are compiled into one
-and the same, whose cache depends on their files; a law of a file has kernels of its own, whose
-cache depends on that file, too.
+`for_law(kernel, law)` is how a loop gets its kernel: the laws of the package are
+compiled into one and the same, whose cache depends on their files; a law of a file has
+kernels of its own, whose cache depends on that file, too.
 """
 
 from __future__ import annotations

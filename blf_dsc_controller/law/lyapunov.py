@@ -45,9 +45,10 @@ def fill_energies(
 ) -> None:
     """Compute the terms of (29) for the telemetry sample; NaN where the truth is unknown.
 
-    After the error's: xi2^T M xi2 / 2, where M xi2 = Yp(q, xi2) P; P~^T Gamma^-1 P~ / 2 of the
-    parameters that are adapted (Gamma_j > 0); (tau_dist - d^3)^2 / (2 gamma) of the joints whose
-    d^3 is adapted (gamma > 0), all in J.  Overwrites Yp and Yr in `signals`.
+    After the error's: xi2^T M xi2 / 2, where M xi2 = Yp(q, xi2) P; P~^T Gamma^-1 P~ / 2
+    of the parameters that are adapted (Gamma_j > 0); (tau_dist - d^3)^2 / (2 gamma) of
+    the joints whose d^3 is adapted (gamma > 0), all in J.  Overwrites Yp and Yr in
+    `signals`.
     """
     n = settings.n
     p = settings.p
@@ -87,9 +88,10 @@ def largest_inertia(settings: Settings) -> float:
 def decay_rate(settings: Settings) -> float:
     """Return kappa_e of (32) [1/s]; 0 if (32) is void: eta, gamma or kappa 0, or unknown truth.
 
-    It is void for other forms than the paper's, too: with compensation along the reference, or with
-    the handover to d^3, V of (29) need not fall (doc/stability.md).  A Newton step
-    replaces sigma, the smallest eigenvalue of Phi_e, by sigma / (sigma + rho).
+    It is void for other forms than the paper's, too: with compensation along the
+    reference, or with the handover to d^3, V of (29) need not fall (doc/stability.md).
+    A Newton step replaces sigma, the smallest eigenvalue of Phi_e, by sigma / (sigma +
+    rho).
     """
     if settings.has_barrier == 0 or settings.truth_known == 0:
         return 0.0
@@ -112,10 +114,12 @@ def exponential_bound(settings: Settings, t: Array, V: Array, holds: Array) -> A
         V(t) <= V(T_e) exp(-kappa_e (t - T_e)) + theta / kappa_e (1 - exp(-kappa_e (t - T_e)))
         theta = eta d3^T d3 / 2
 
-    The printed theta is divided by kappa_e once too often.  d3 is the largest known disturbance.
+    The printed theta is divided by kappa_e once too often.  d3 is the largest known
+    disturbance.
 
-    At times t (k,) [s], `holds` tells whether a window is latched and all errors are within the
-    knee, past which K V1 is lost: the bound begins anew each time, and is NaN elsewhere.
+    At times t (k,) [s], `holds` tells whether a window is latched and all errors are
+    within the knee, past which K V1 is lost: the bound begins anew each time, and is
+    NaN elsewhere.
     """
     rate = decay_rate(settings)
     if rate == 0.0:

@@ -1,12 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """Rows [X | u] of the prediction error: X theta = u holds for the true theta = [P; d].
 
-`filtered` (default).  d/dt(Yp P) + Yr P + D d = tau, integrated over a sample of held torque, gives
+`filtered` (default).  d/dt(Yp P) + Yr P + D d = tau, integrated over a sample of held
+torque, gives
 
     X_k = (Yp_k - Yp_{k-1}) / T + (Yr_k + Yr_{k-1}) / 2,      X_k P + D_k d = tau on [k-1, k]
 
-up to O(T^2).  Both sides pass through the same two cascaded poles, which preserves the identity and
-filters the noise of the difference quotient.  No acceleration is needed.
+up to O(T^2).  Both sides pass through the same two cascaded poles, which preserves the
+identity and filters the noise of the difference quotient.  No acceleration is needed.
 
 `lambda`.  The paper's (24): X = H(q, dq, alpha2, alpha2'), u = Lambda tau with the scalar
 Lambda = x^T y / x^T x,  x = [xi2'^ + alpha2'; xi2 + alpha2; 1],  y = [alpha2'; alpha2; 1], and
@@ -17,8 +18,8 @@ Besides P, the learning estimates the coefficients d of the disturbance columns
 
     tau_dist = D d,    D = [ I | diag(dq) | diag(tanh(dq / v_c)) | I sin(w t) | I cos(w t) | ... ]
 
-for each block that is configured.  (22)-(24) instead subtract the estimate d^3 from the torque,
-which hides the parameter error.
+for each block that is configured.  (22)-(24) instead subtract the estimate d^3 from the
+torque, which hides the parameter error.
 """
 
 from math import sqrt
@@ -64,8 +65,8 @@ def fill_columns(settings: Settings, t: float, dq: Array, rest: Array) -> None:
 def delay_torque(settings: Settings, state: State, signals: Signals, dt: float) -> None:
     """Pass the applied torque through the lags of drives and sensors, to `state.late`.
 
-    A measured motion is that of a torque of `robot.lag` ago: half of it is the drives', half the
-    velocity filter's.
+    A measured motion is that of a torque of `robot.lag` ago: half of it is the drives',
+    half the velocity filter's.
     """
     begins = settings.lag == 0.0 or state.samples[0] <= 1.0
     gain = 0.0
@@ -84,7 +85,8 @@ def delay_torque(settings: Settings, state: State, signals: Signals, dt: float) 
 def filter_row(settings: Settings, state: State, signals: Signals, dt: float) -> None:
     """Pass [X | u] of the last interval through both poles; write the result to `signals.row`.
 
-    Rows of a joint that hardly moves count less: its stiction would be mistaken for gravity.
+    Rows of a joint that hardly moves count less: its stiction would be mistaken for
+    gravity.
     """
     gain = barrier.filter_gain(1.0 / settings.pole, dt)
     p = settings.p

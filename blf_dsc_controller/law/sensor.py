@@ -1,19 +1,21 @@
 # SPDX-License-Identifier: Apache-2.0
 """What readings show of their sensor: its noise and steps, and velocities that are wrong.
 
-The noise is that of second differences, in which a smooth motion hardly shows; the step is the
-smallest change of a position.
+The noise is that of second differences, in which a smooth motion hardly shows; the step
+is the smallest change of a position.
 
-A velocity that is plausible but not that of the arm (stuck, of the wrong sign, of another joint)
-turns damping into its opposite.  Positions and velocities pass the same filter, 1/(tau s + 1):
+A velocity that is plausible but not that of the arm (stuck, of the wrong sign, of
+another joint) turns damping into its opposite.  Positions and velocities pass the same
+filter, 1/(tau s + 1):
 
     derived = s/(tau s + 1) q,        measured = 1/(tau s + 1) dq
 
-They are equal except for noise and the lag of the velocity: in an interval, the filter's input
-is the change of the position over it, or the mean of the velocities at both ends.  Where readings
-are missing, these ends show little of what was between them: the filters skip such an interval.
-A velocity is contradicted when the mean square of their difference exceeds half of the larger
-one's: one that is stuck at 0 gives 1, the wrong sign 4, a lag of 6 ms 0.5 at 20 Hz.
+They are equal except for noise and the lag of the velocity: in an interval, the
+filter's input is the change of the position over it, or the mean of the velocities at
+both ends.  Where readings are missing, these ends show little of what was between them:
+the filters skip such an interval.  A velocity is contradicted when the mean square of
+their difference exceeds half of the larger one's: one that is stuck at 0 gives 1, the
+wrong sign 4, a lag of 6 ms 0.5 at 20 Hz.
 """
 
 from __future__ import annotations

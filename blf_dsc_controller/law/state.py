@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Settings of a law, its state between samples, signals within one, telemetry: flat vectors.
 
-A controller is saved, restored and compared by copying and comparing its state vector: the package
-keeps no other state of the loop.
+A controller is saved, restored and compared by copying and comparing its state vector:
+the package keeps no other state of the loop.
 """
 
 from __future__ import annotations

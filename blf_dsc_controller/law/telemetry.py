@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Telemetry of each sample: messages as (topic, bytes), and the columns of a `Run`.
 
-The nodes publish the messages; the offline loop writes them into a bag. Vectors of named
-values are sent as JointState with the values in `position`.
+The nodes publish the messages; the offline loop writes them into a bag. Vectors of
+named values are sent as JointState with the values in `position`.
 """
 
 from __future__ import annotations
@@ -79,8 +79,8 @@ def external_names(joints: Sequence[str]) -> tuple[str, ...]:
 class ControllerTelemetry:
     """Messages of the controller of n joints; `estimates` are the names of theta^ (m,).
 
-    Reference and monitor are sent with every `telemetry.decimation`-th sample, from the first one
-    on, and so is the bound while it narrows; one that widens is sent at once.
+    Reference and monitor are sent with every `telemetry.decimation`-th sample, from the
+    first one on, and so is the bound while it narrows; one that widens is sent at once.
     """
 
     def __init__(self, config: ControllerConfig, estimates: Sequence[str]) -> None:
@@ -142,9 +142,10 @@ class ControllerTelemetry:
     ) -> Iterator[Message]:
         """Yield the messages for a joint state: its stamp [ns] and telemetry sample.
 
-        `ratio` is the largest |xi1| / k_c so far (n,). Of the times of updates, `compute_time`
-        [s], the largest since the last message is sent. The tracking errors come with every
-        sample, if they are `subscribed`: they tell a replay which states were used.
+        `ratio` is the largest |xi1| / k_c so far (n,). Of the times of updates,
+        `compute_time` [s], the largest since the last message is sent. The tracking
+        errors come with every sample, if they are `subscribed`: they tell a replay
+        which states were used.
         """
         is_due = self._samples % self._decimation == 0
         self._samples += 1
@@ -199,7 +200,8 @@ class ExternalTelemetry:
 class PlantTelemetry:
     """Messages of the plant of n joints and p true parameters.
 
-    Joint states have the names `published`, by default the joints; other joints stay at 0.
+    Joint states have the names `published`, by default the joints; other joints stay at
+    0.
     """
 
     def __init__(
@@ -332,8 +334,9 @@ _NOTABLE = 0.1  # relative to the largest component
 def rejected_columns(controller: Controller, names: Sequence[str]) -> dict[str, str]:
     """Return why a controller that learns does not estimate columns, by their names.
 
-    Each resembles a combination of others in the current window; these are named, largest first.
-    `names` are those of the m entries of theta^, as returned by `factory.estimate_names`.
+    Each resembles a combination of others in the current window; these are named,
+    largest first.  `names` are those of the m entries of theta^, as returned by
+    `factory.estimate_names`.
     """
     state, reasons = controller.state, {}
     upper = np.triu(state.running[:-1, :-1])

@@ -60,8 +60,8 @@ class TipWrench:
     def of(self, q: Floats, torque: Floats, interval: Floats) -> Floats:
         """Return force [N] and moment [N m] (6,) at the tip, in its axes.
 
-        `torque` (n,) [N m] is the external torque at positions q (n,), `interval` (n,) its
-        uncertainty: joints that are known better count more.
+        `torque` (n,) [N m] is the external torque at positions q (n,), `interval` (n,)
+        its uncertainty: joints that are known better count more.
         """
         J = self.jacobian(q)
         weighted = J / interval**2

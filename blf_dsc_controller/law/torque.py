@@ -6,10 +6,11 @@ the arm against gravity itself, by its own model of the arm and of the payload t
 
     whole torque = command + G_d(q)
 
-`find_added` computes G_d(q); `saturate` subtracts it from the output, and `find_applied` adds it to
-the torque of the last interval.  Friction that a drive compensates appears on neither side: the
-friction columns then describe what is left of it (`Robot.friction`).  A drive that adds nothing has
-no columns here, and all sums are with zero, which changes no bit.
+`find_added` computes G_d(q); `saturate` subtracts it from the output, and
+`find_applied` adds it to the torque of the last interval.  Friction that a drive
+compensates appears on neither side: the friction columns then describe what is left of
+it (`Robot.friction`).  A drive that adds nothing has no columns here, and all sums are
+with zero, which changes no bit.
 
 *Saturation* is in level and rate.  The level limit holds for the whole torque of the joint, which
 is what its motor bears, and for the command alone, which is what its driver may cut: the two differ

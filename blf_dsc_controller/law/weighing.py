@@ -1,24 +1,27 @@
 # SPDX-License-Identifier: Apache-2.0
 """What the tip holds: mass and centre of a load, with intervals, while the arm moves as it must.
 
-The rows X theta = u of the window (see `prediction`) are those of an arm.  A load in the tip with
-the ten inertial parameters phi changes its base parameters by N phi, so with
+The rows X theta = u of the window (see `prediction`) are those of an arm.  A load in
+the tip with the ten inertial parameters phi changes its base parameters by N phi, so
+with
 
     before:  X theta = u,        since:  X (theta + N phi) = u
 
-the rows before, in which nothing is held, and those since give the most likely theta and phi, given
-the prior of each: a linear problem with unknowns phi = D z, z ~ (0, 1), and theta.  The load is
-thus the difference of two estimates of one arm, whatever its links and friction are.
+the rows before, in which nothing is held, and those since give the most likely theta
+and phi, given the prior of each: a linear problem with unknowns phi = D z, z ~ (0, 1),
+and theta.  The load is thus the difference of two estimates of one arm, whatever its
+links and friction are.
 
-The rows before are those of the first window, or of less if they contradict each other (see
-`innovation`): a load that is put down and picked up from the first cycle on is weighed, too.  Where
-later rows contradict the solution, something else is held.  If what was held until then is clearly
-less than nothing, the arm held a load before: what is lightest is taken for nothing.  If it was
-nothing, its rows are added to those before until they make a window.  Rows are kept apart until
-they are 0.15 to 0.3 s old, so that those of a change that has not been found yet can be discarded.
+The rows before are those of the first window, or of less if they contradict each other
+(see `innovation`): a load that is put down and picked up from the first cycle on is
+weighed, too.  Where later rows contradict the solution, something else is held.  If
+what was held until then is clearly less than nothing, the arm held a load before: what
+is lightest is taken for nothing.  If it was nothing, its rows are added to those before
+until they make a window.  Rows are kept apart until they are 0.15 to 0.3 s old, so that
+those of a change that has not been found yet can be discarded.
 
-Rows of slow joints count little, since they may stick.  Nothing here acts on the torque: `weigh`
-runs after it has been sent.
+Rows of slow joints count little, since they may stick.  Nothing here acts on the
+torque: `weigh` runs after it has been sent.
 """
 
 from math import sqrt
@@ -244,7 +247,8 @@ def fill_equations(
 ) -> None:
     """Fill the upper triangle and the right-hand side of the normal equations of theta and z.
 
-    With the sums S of all rows and S' of those since, and the variance a of rows that count,
+    With the sums S of all rows and S' of those since, and the variance a of rows that
+    count,
 
         [S + a R       S' N D             ] [theta]   [S_u + a R theta_0]
         [D^T N^T S'    D^T N^T S' N D + a ] [z    ] = [D^T N^T S'_u     ]
@@ -295,8 +299,8 @@ def solve(settings: Settings, state: State, signals: Signals, period: float) -> 
 def describe(settings: Settings, state: State, signals: Signals, period: float) -> None:
     """Write mass and centre of the load to `state.load`, and their standard deviations.
 
-    The covariance of z is a (U^T U)^-1 with the last rows U of the factor.  The centre is unknown
-    where the mass is not twice its deviation.
+    The covariance of z is a (U^T U)^-1 with the last rows U of the factor.  The centre
+    is unknown where the mass is not twice its deviation.
     """
     m, k = settings.m, settings.load_scale.shape[1]
     U = state.weighed_factor[m:, m:]

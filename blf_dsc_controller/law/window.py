@@ -1,15 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
 """Sliding window (21), (22): its sums, and lambda_min of its Phi.
 
-The window's sums of X^T [X | u] take constant time and do not drift.  A running sum that adds the
-new and subtracts the old term accumulates a rounding error in every sample.  The window therefore
-also keeps, beside the running sum S, the sum F of the rows written since the ring last wrapped; at
-the next wrap F is the exact sum over the ring and replaces S.  F also splits the window without
-further sums: with L, the sum of the last complete half of the ring, the newest rows sum to F + L,
-F or F - L, one of which has between a quarter and three quarters of the rows.
+The window's sums of X^T [X | u] take constant time and do not drift.  A running sum
+that adds the new and subtracts the old term accumulates a rounding error in every
+sample.  The window therefore also keeps, beside the running sum S, the sum F of the
+rows written since the ring last wrapped; at the next wrap F is the exact sum over the
+ring and replaces S.  F also splits the window without further sums: with L, the sum of
+the last complete half of the ring, the newest rows sum to F + L, F or F - L, one of
+which has between a quarter and three quarters of the rows.
 
-Eigenvalues are relative to the information R of the prior, which makes parameters of different
-units comparable: Phi x = lambda R x.
+Eigenvalues are relative to the information R of the prior, which makes parameters of
+different units comparable: Phi x = lambda R x.
 """
 
 from math import sqrt
@@ -24,8 +25,8 @@ from blf_dsc_controller.law.state import Settings, Signals, State
 def push_row(state: State, row: Array) -> None:
     """Replace the oldest row of the window by `row`, [X | u] (n, m + 1).
 
-    The oldest row of the ring is at the cursor, and counts once the window is full.  The sums of
-    [X | u]^T [X | u], S, F and L, have only their upper triangle filled.
+    The oldest row of the ring is at the cursor, and counts once the window is full.
+    The sums of [X | u]^T [X | u], S, F and L, have only their upper triangle filled.
     """
     running = state.running
     fresh = state.fresh
@@ -172,8 +173,9 @@ def min_eigenvector(
 
     The direction x is the eigenvector of Phi x = lambda R x with x^T R x = 1.
 
-    From a warm start a few iterations suffice (the error of the Rayleigh quotient is the square of
-    the direction's), at a fixed cost and without the O(m^3) of an eigenvalue decomposition.
+    From a warm start a few iterations suffice (the error of the Rayleigh quotient is
+    the square of the direction's), at a fixed cost and without the O(m^3) of an
+    eigenvalue decomposition.
 
     `factor` is the Cholesky factor of Phi + rho R, `work` (m,) scratch.
     """

@@ -4,21 +4,22 @@
     sinusoids   qr_i = offset_i + sum_k amplitude_ik cos(frequency_k t + phase_k)
     spline      qr_i = sum_j c_kij (t - knot_k)^j, j = 0 .. 5, from knot k to knot k + 1
 
-The last piece of a spline extends without end; before the first knot, the spline rests at its
-initial position.  From its `begin` on, over the time `fade`, a term is blended into the one before:
+The last piece of a spline extends without end; before the first knot, the spline rests
+at its initial position.  From its `begin` on, over the time `fade`, a term is blended
+into the one before:
 
     qr(t) = (1 - s) before(t) + s term(t),    s = 10 x^3 - 15 x^4 + 6 x^5,   x = (t - begin) / fade
 
-s is the minimum-jerk step, so the acceleration is continuous at both ends of the blend, and the
-blend exceeds the speed of its parts by at most s' times their distance.  From begin + fade on, the
-reference equals the term bit for bit.
+s is the minimum-jerk step, so the acceleration is continuous at both ends of the blend,
+and the blend exceeds the speed of its parts by at most s' times their distance.  From
+begin + fade on, the reference equals the term bit for bit.
 
     vector = [n, number of terms, term, term, ...],   term = [code, size, begin, fade, content]
 
-Splines pass through given points, with given derivatives there or of minimum jerk.  The quintic
-with given position, velocity and acceleration at both ends minimises the integrated squared jerk
-between them (Flash and Hogan, 1985).  Through several points, the optimum is the spline of such
-pieces whose jerk and snap are also continuous.
+Splines pass through given points, with given derivatives there or of minimum jerk.  The
+quintic with given position, velocity and acceleration at both ends minimises the
+integrated squared jerk between them (Flash and Hogan, 1985).  Through several points,
+the optimum is the spline of such pieces whose jerk and snap are also continuous.
 """
 
 from __future__ import annotations
@@ -64,8 +65,8 @@ def sinusoids_term(
 ) -> Term:
     """Return a sum of cosines.
 
-    `offset` (n,) and `amplitude` (n * tones,) in rad, all tones of the first joint first;
-    `frequency` (tones,) in rad/s, `phase` (tones,) in rad.
+    `offset` (n,) and `amplitude` (n * tones,) in rad, all tones of the first joint
+    first; `frequency` (tones,) in rad/s, `phase` (tones,) in rad.
     """
     content = (len(frequency), *offset, *frequency, *phase, *amplitude)
     return Term(SINUSOIDS, np.array(content, dtype=np.float64))
@@ -87,8 +88,8 @@ def pieces_of(term: Term, n: int) -> tuple[Array, Array]:
 def turning_times(term: Term, n: int) -> Array:
     """Return the times [s] between which the acceleration of each joint of a spline is monotonic.
 
-    They are its knots, the last times before them, since the acceleration of cubics jumps there,
-    and the zeros of its jerk, 6 c3 + 24 c4 x + 60 c5 x^2.
+    They are its knots, the last times before them, since the acceleration of cubics
+    jumps there, and the zeros of its jerk, 6 c3 + 24 c4 x + 60 c5 x^2.
     """
     knots, coefficients = pieces_of(term, n)
     duration = np.append(np.diff(knots), 0.0)[:, np.newaxis]
@@ -269,7 +270,8 @@ def sampled(vector: Array, times: Array) -> Array:
 def quintics(h: Array, begin: Array, end: Array) -> Array:
     """Return coefficients (pieces, n, 6) of quintics of durations h (pieces,) [s].
 
-    `begin` and `end` are the positions, velocities and accelerations (3, pieces, n) at the ends.
+    `begin` and `end` are the positions, velocities and accelerations (3, pieces, n) at
+    the ends.
     """
     h = np.asarray(h, dtype=np.float64)[:, np.newaxis]
     # not h**3: powers are rounded otherwise on other processors
@@ -315,7 +317,8 @@ def minimum_jerk(
 ) -> Term:
     """Return the minimum jerk through positions (k, n) [rad] at increasing times (k,) [s].
 
-    `start` and `end` are velocity and acceleration (2, n) at the ends, by default at rest.
+    `start` and `end` are velocity and acceleration (2, n) at the ends, by default at
+    rest.
     """
     points = np.zeros((3, *positions.shape))
     points[0] = positions
@@ -329,7 +332,8 @@ def minimum_jerk(
 def _solve_inner_points(h: Array, points: Array) -> None:
     """Fill in the velocities and accelerations that make jerk and snap continuous.
 
-    This is a block tridiagonal system with two equations per inner point, solved by elimination.
+    This is a block tridiagonal system with two equations per inner point, solved by
+    elimination.
     """
     rise = np.diff(points[0], axis=0)
     inner = range(1, len(h))

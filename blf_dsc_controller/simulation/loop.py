@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """The closed loop without ROS: the kernels that the nodes run, in one compiled loop; its bag.
 
-A lock-step run over ROS and an offline run of the same configuration agree bit for bit, stops and
-safe torques included: the compiled loop runs as long as its checks pass.  A chunk of samples in
-which one fails is run again, sample by sample, by the node's guard, and so is everything after a
-stop.
+A lock-step run over ROS and an offline run of the same configuration agree bit for bit,
+stops and safe torques included: the compiled loop runs as long as its checks pass.  A
+chunk of samples in which one fails is run again, sample by sample, by the node's guard,
+and so is everything after a stop.
 """
 
 from __future__ import annotations
@@ -91,10 +91,9 @@ def run_loop(
 ) -> bool:
     """Run the samples `first` to `last`; with `is_end`, the torque of the last is not applied.
 
-    What no torque depends on, the terms of (29), the weighing and the external torque, is computed
-    with `observed`.
-    With checks (`law.checks`), stop at the first invalid or suspect sample, or where a contact
-    begins, and return False.
+    What no torque depends on, the terms of (29), the weighing and the external torque,
+    is computed with `observed`.  With checks (`law.checks`), stop at the first invalid
+    or suspect sample, or where a contact begins, and return False.
     """
     settings = settings_of(settings_vector, model)
     law_state = state_of(state, settings)
@@ -146,11 +145,11 @@ def simulate(
 ) -> Record:
     """Run controller and plant in closed loop for `duration` and return every sample.
 
-    The plant's duration must not be 0.  If not `supervised`, the law runs alone, past its limits
-    too.
+    The plant's duration must not be 0.  If not `supervised`, the law runs alone, past
+    its limits too.
 
-    Raises StartError if the law cannot take over and approach.enabled is false, and MotionError if
-    there is no approach within the limits.
+    Raises StartError if the law cannot take over and approach.enabled is false, and
+    MotionError if there is no approach within the limits.
     """
     plant = plant_of(plant_config)
     if supervised:
@@ -177,8 +176,9 @@ def simulate(
 def run_alone(record: Record, plant: Plant, *, observed: bool = True) -> None:
     """Fill a record, by its law alone from the beginning; `observed` as in `run_loop`.
 
-    Raises StartError if the law cannot take over and approach.enabled is false, and MotionError if
-    there is no approach within the limits; BlfDscError if the plant is not compiled.
+    Raises StartError if the law cannot take over and approach.enabled is false, and
+    MotionError if there is no approach within the limits; BlfDscError if the plant is
+    not compiled.
     """
     if not plant.is_compiled:
         raise BlfDscError(
@@ -380,8 +380,8 @@ def write_bag(
 ) -> None:
     """Write the messages that the nodes would have published in a run as a bag.
 
-    It has the configuration of the controller and, if given, of the plant; `compression` is `none`
-    or `zstd`. Raises BagError if `path` exists already.
+    It has the configuration of the controller and, if given, of the plant;
+    `compression` is `none` or `zstd`. Raises BagError if `path` exists already.
     """
     _write_bag(path, [record], plant, compression)
 

@@ -3,8 +3,9 @@
 
     tau = M0 (qr'' - k_p e - k_d e' - k_i int e) + C0 q' + G0 + F0(qr'),   e = q - qr
 
-M0, C0, G0 are those of P0, the initial estimate; F0 is the friction known to the controller,
-at the velocity of the reference.  The integrator is held while any torque is cut.
+M0, C0, G0 are those of P0, the initial estimate; F0 is the friction known to the
+controller, at the velocity of the reference.  The integrator is held while any torque
+is cut.
 """
 
 from __future__ import annotations
