@@ -20,7 +20,7 @@ from scipy.integrate import solve_ivp
 
 from blf_dsc_controller.compiled.algebra import cholesky_factor
 from blf_dsc_controller.configuration.controller import ControllerConfig
-from blf_dsc_controller.configuration.schema import build
+from blf_dsc_controller.configuration.schema import build, change
 from blf_dsc_controller.law.factory import columns_of, controller_of, settings_of_config
 from blf_dsc_controller.law.state import CHOICES
 from blf_dsc_controller.reference.terms import sampled
@@ -286,7 +286,7 @@ def test_loop_continues_bit_for_bit_from_a_saved_state_and_begins_anew_after_a_r
 
 @pytest.mark.parametrize(('law', 'share'), [('backstepping', 1.0), ('slotine_li', 0.0)])
 def test_comparison_laws_are_the_linear_surface_with_their_gains(law, share):
-    """`slotine_li` without w, mu_bar and W_c; neither learns from a window that is excited."""
+    """`slotine_li` without w, mu_bar and W_c; neither learns from a window unless told to."""
     gains = {'surface_gain': [60.0, 35.0], 'position_gain': [30.0, 11.0]}
     gains |= {'robust_gain': [0.4, 0.2], 'leakage': 0.05}
     given = {f'comparison.{name}': value for name, value in gains.items()}
@@ -307,6 +307,8 @@ def test_comparison_laws_are_the_linear_surface_with_their_gains(law, share):
         settings.change_detection,
     ):
         assert not np.any(zero)
+    told = change(config, {'comparison.learning_weight': 7.0})
+    assert settings_of_config(told).kappa == 7.0  # not the 100 of learning.weight
 
 
 def test_proposed_law_with_everything_known_and_frozen_equals_model_based():

@@ -16,8 +16,12 @@ from blf_dsc_controller.configuration.files import share_folder
 from blf_dsc_controller.configuration.nodes import load_loop
 
 PRESETS = sorted(path.stem for path in (share_folder() / 'config').glob('*.yaml'))
-LAW = {'comparison': 'backstepping', 'comparison_detuned': 'backstepping'} | {
-    name: name for name in ('model_based', 'slotine_li')
+LAW = {
+    'comparison': 'backstepping',
+    'comparison_detuned': 'backstepping',
+    'composite_panda': 'slotine_li',
+    'model_based': 'model_based',
+    'slotine_li': 'slotine_li',
 }
 
 # Figures are drawn with and without a barrier, and of an arm from a URDF; others have

@@ -428,6 +428,12 @@ class ComparisonGains:
     leakage: float = non_negative(
         0.001, 'leakage of P^; not used by slotine_li', symbol='W_c'
     )
+    learning_weight: float = non_negative(
+        0.0,
+        'weight of the prediction error; 0: by the tracking error alone',
+        '',
+        'kappa',
+    )
 
 
 def _misfits(

@@ -416,13 +416,13 @@ def _of_model_based(_config: ControllerConfig, settings: Settings) -> dict[str, 
 
 
 def _of_linear_surface(config: ControllerConfig, n: int) -> dict[str, Any]:
-    """Return what the laws with a linear surface share: they adapt by the tracking error."""
+    """Return what the laws with a linear surface share; they learn if they are told to."""
     nothing = np.zeros(n)
     return {
         'K': np.array(config.comparison.surface_gain),
         'd2': nothing,
         'gamma': nothing,
-        'kappa': 0.0,
+        'kappa': config.comparison.learning_weight,
         'compensation': CHOICES['compensation'].index('state'),
         'bumpless': 0,
         'change_detection': 0,
