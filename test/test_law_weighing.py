@@ -17,9 +17,9 @@ from blf_dsc_controller.law.factory import controller_of
 from blf_dsc_controller.law.innovation import (
     CORRELATION,
     NOISE,
-    is_change,
     normalized_square,
     start,
+    update,
 )
 from blf_dsc_controller.law.telemetry import learned_arm, load_text, sample_columns
 from blf_dsc_controller.law.weighing import (
@@ -197,7 +197,7 @@ def test_lightest_hand_is_taken_for_empty_if_the_run_begins_with_a_load():
     load, t = weighed(record)
     lighter = load[t < begin[1] - 0.05][-1]
     assert lighter[0] == pytest.approx(-1.5, abs=0.05)
-    assert 'lighter than at first' in load_text(lighter)
+    assert 'lighter than at the start' in load_text(lighter)
     is_as_told(load[t < begin[1] + CARRIED - 0.05][-1], 1.5, 0.04)
     is_as_told(load[t < begin[2] - 0.05][-1], 0.0, 0.04)
 
@@ -237,7 +237,7 @@ def test_square_of_an_innovation_is_that_of_its_covariance():
         cholesky_factor(factor)
         S = noise * np.eye(n) + a * X @ np.linalg.inv(A) @ X.T
         expected = noise * u @ np.linalg.solve(S, u) / n
-        given = X.copy(), u.copy(), np.zeros(m), factor
+        given = X.copy(), u.copy(), factor
         square = normalized_square(*given, period, np.zeros((n, n)))
         assert square == pytest.approx(expected, rel=1e-9)
         squares.append(square / noise)
@@ -252,7 +252,7 @@ def test_rows_that_fit_ever_worse_are_noise_and_those_of_a_change_are_not():
     ):
         statistics = np.zeros(4)
         start(1.0, statistics)
-        found = [is_change(each, 1.0, 0.01, 500.0, statistics) for each in squares]
+        found = [update(each, 1.0, 0.01, 500.0, statistics) for each in squares]
         assert any(found) == expected
     assert np.argmax(found) - 200 < 10
 

@@ -15,6 +15,7 @@ was not fitted to.
 
 from blf_dsc_controller.compiled.algebra import cholesky_factor, cholesky_solve
 from blf_dsc_controller.compiled.jit import inner
+from blf_dsc_controller.compiled.layout import Array
 from blf_dsc_controller.law import adaptation, innovation, window
 from blf_dsc_controller.law.excitation import explained
 from blf_dsc_controller.law.state import Settings, Signals, State
@@ -40,6 +41,7 @@ def detect_change(
     if not has_changed:
         return
     state.changes[0] += 1.0
+    state.contradiction[0] = state.recent_residual[0]
     if state.latched[0] == 1.0 and state.rows[0] < settings.window:
         for j in range(settings.m):
             signals.work[j] = state.estimate[j]
@@ -47,7 +49,7 @@ def detect_change(
         if settings.bumpless == 1:
             adaptation.hand_over(settings, state, signals)
     forget_window(settings, state)
-    state.first_statistics[innovation.RECENT] = 0.0
+    state.rows_statistics[innovation.RECENT] = 0.0
     fit_rows(settings, state, settings.row_interval * dt)
 
 
@@ -62,26 +64,35 @@ def is_predicted(settings: Settings, state: State) -> bool:
 
 
 @inner
+def compare_row(
+    settings: Settings, state: State, signals: Signals, theta: Array, period: float
+) -> None:
+    """Write e = u - X theta of this row to `signals.innovation`; average its square.
+
+    `period` [s] is the time from one row to the next.
+    """
+    square = 0.0
+    for i in range(settings.n):
+        error = signals.row[i, settings.m]
+        for j in range(settings.m):
+            error -= signals.row[i, j] * theta[j]
+        signals.innovation[i] = error
+        square += error * error
+    state.recent_residual[0] += min(1.0, period / _MEMORY) * (
+        square - state.recent_residual[0]
+    )
+
+
+@inner
 def contradicts_solution(
     settings: Settings, state: State, signals: Signals, dt: float
 ) -> bool:
     """Compare this row with the latched solution; return whether the last ones contradict it."""
     if state.latched[0] == 0.0:
         return False
-    square = 0.0
-    for i in range(settings.n):
-        error = -signals.row[i, settings.m]
-        for j in range(settings.m):
-            error += signals.row[i, j] * state.solution[j]
-        square += error * error
-    state.recent_residual[0] += min(1.0, dt / _MEMORY) * (
-        square - state.recent_residual[0]
-    )
+    compare_row(settings, state, signals, state.solution, dt)
     allowed = _ALARM * explained(settings, state, state.residual[0])
-    if state.recent_residual[0] <= allowed:
-        return False
-    state.contradiction[0] = state.recent_residual[0]
-    return True
+    return bool(state.recent_residual[0] > allowed)
 
 
 @inner
@@ -93,28 +104,27 @@ def contradicts_rows(
     if samples % settings.row_interval != 0:
         return False
     period = settings.row_interval * dt
-    statistics = state.first_statistics
     unmodelled = settings.residual_floor / settings.n
+    statistics = state.rows_statistics
     if statistics[innovation.NOISE] == 0.0:
         innovation.start(unmodelled, statistics)
         fit_rows(settings, state, period)
+    compare_row(settings, state, signals, state.rows_fit, period)
     for i in range(settings.n):
-        signals.innovation[i] = signals.row[i, settings.m]
         for j in range(settings.m):
             signals.predicted[i, j] = signals.row[i, j]
     square = innovation.normalized_square(
         signals.predicted,
         signals.innovation,
-        state.first_fit,
-        state.first_factor,
+        state.rows_factor,
         period,
         signals.covariance,
     )
-    if innovation.is_change(square, unmodelled, period, settings.window, statistics):
-        state.contradiction[0] = settings.n * statistics[innovation.RECENT]
+    if innovation.update(square, unmodelled, period, settings.window, statistics):
         return True
     refresh = max(1, round(innovation.REFRESH / period))
-    if samples // settings.row_interval % refresh == refresh // 2:
+    # a quarter later than the excitation is checked: each takes its time
+    if samples // settings.row_interval % refresh == refresh // 4:
         fit_rows(settings, state, period)
     return False
 
@@ -122,17 +132,13 @@ def contradicts_rows(
 @inner
 def fit_rows(settings: Settings, state: State, period: float) -> None:
     """Solve for theta of the rows so far, one each `period` [s], and of the prior."""
-    a = innovation.row_variance(state.first_statistics, period)
-    R = settings.information
-    theta = state.first_fit
-    for i in range(settings.m):
-        theta[i] = state.running[i, settings.m]
-        for j in range(settings.m):
-            theta[i] += a * R[i, j] * settings.initial_estimate[j]
-        for j in range(i, settings.m):
-            state.first_factor[i, j] = state.running[i, j] + a * R[i, j]
-    cholesky_factor(state.first_factor)
-    cholesky_solve(state.first_factor, theta)
+    a = innovation.row_variance(state.rows_statistics, period)
+    factor = state.rows_factor
+    theta = state.rows_fit
+    window.average_window(state.running, 1, factor, theta)
+    window.pull_to(settings.initial_estimate, a, settings.information, factor, theta)
+    cholesky_factor(factor)
+    cholesky_solve(factor, theta)
 
 
 @inner

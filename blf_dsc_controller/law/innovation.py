@@ -54,43 +54,36 @@ def row_variance(statistics: Array, period: float) -> float:
 
 @inner
 def normalized_square(
-    X: Array,
-    u: Array,
-    theta: Array,
-    factor: Array,
-    period: float,
-    C: Array,
+    X: Array, e: Array, factor: Array, period: float, C: Array
 ) -> float:
     """Return e^T C^-1 e / n of a row, with the `factor` of A and a row each `period` [s].
 
-    Overwrites X (n, m) and u (n,), and C (n, n), which is scratch.
+    Overwrites X (n, m) and e (n,), and C (n, n), which is scratch.
     """
-    n = u.size
+    n = e.size
     for i in range(n):
-        for j in range(theta.size):
-            u[i] -= X[i, j] * theta[j]
         whiten(factor, X[i])
     for i in range(n):
         for j in range(i, n):
             total = 0.0
-            for k in range(theta.size):
+            for k in range(X.shape[1]):
                 total += X[i, k] * X[j, k]
             C[i, j] = CORRELATION / period * total
         C[i, i] += 1.0
     cholesky_factor(C)
-    return whiten(C, u) / n
+    return whiten(C, e) / n
 
 
 @inner
-def is_change(
+def update(
     square: float, unmodelled: float, period: float, most: float, statistics: Array
 ) -> bool:
-    """Take e^T C^-1 e / n of a row into the `statistics`; return whether the last ones contradict.
+    """Add e^T C^-1 e / n of a row to the `statistics`; return whether the arm has changed.
 
     The mean square is of some `most` rows, a window.
     """
     statistics[RECENT] += min(1.0, period / _MEMORY) * (square - statistics[RECENT])
-    result = statistics[RECENT] > _ALARM * statistics[NOISE]
+    has_changed = statistics[RECENT] > _ALARM * statistics[NOISE]
     count = min(statistics[COUNT] + 1.0, most)
     statistics[COUNT] = count
     usual = min(square, _MOST * statistics[NOISE])
@@ -99,4 +92,4 @@ def is_change(
     share = assumed_rows / (assumed_rows + count)
     noise = statistics[MEAN] + share * (_ASSUMED * unmodelled - statistics[MEAN])
     statistics[NOISE] = max(noise, _LEAST * unmodelled)
-    return bool(result)
+    return bool(has_changed)

@@ -144,11 +144,11 @@ class State(NamedTuple):
     # of the last first window that its parts contradicted, (N m)^2
     split_residual: Cell
     recent_residual: Cell  # of the last rows against `solution`, (N m)^2
-    # of `excitation`, until a full window is known to be of one arm: theta of the rows
-    # so far, the factor of its equations, and the statistics of `innovation`
-    first_fit: Annotated[Array, 'm']
-    first_factor: Annotated[Array, 'm', 'm']
-    first_statistics: Annotated[Array, 4]
+    # of `change`, until a full window is known to be of one arm: theta of the rows so
+    # far, the factor of its equations, and the statistics of `innovation`
+    rows_fit: Annotated[Array, 'm']
+    rows_factor: Annotated[Array, 'm', 'm']
+    rows_statistics: Annotated[Array, 4]
     changes: Cell  # number of times that the arm was found to have changed
     contradiction: Cell  # `recent_residual` at the last change, (N m)^2
     alpha2: Annotated[Array, 'n']  # rad/s

@@ -256,7 +256,7 @@ def load_text(load: Sequence[float]) -> str:
         return 'unknown'
     text = f'{mass:.3f} +- {interval:.2g} kg'
     if mass < -interval:
-        return f'{text}: lighter than at first, when something must have been held'
+        return f'{text}: lighter than at the start, so something was held then'
     if not math.isfinite(centre[0]):
         return text
     each = (

@@ -41,9 +41,8 @@ from blf_dsc_controller.law.state import (
 )
 
 _FEWEST = 0.5  # s of motion that a part has
-_APART = (
-    0.15  # s, for which the latest rows are kept apart, and then those of them again
-)
+# s, for which the latest rows are kept apart, and then those of them again
+_APART = 0.15
 _SETTLED = 6.0  # time constants of the filters
 # rad/s or m/s, below which friction is least like its columns, and rows count less
 _SLOW = 0.3
@@ -208,31 +207,39 @@ def compare_with_nothing(
 
 
 @inner
-def is_contradicted(
-    settings: Settings, state: State, signals: Signals, period: float
-) -> bool:
-    """Compare this row with the solution; return whether the last ones contradict it."""
+def fill_load(settings: Settings, state: State, signals: Signals) -> None:
+    """Fill [X | X N D] of this row, whose unknowns are theta and z; no load in the first rows."""
     m = settings.m
     ND = settings.load_columns
     X = signals.load_rows
+    is_held = not is_first(state)
     for i in range(settings.n):
-        signals.load_torque[i] = signals.row[i, m]
         for j in range(m):
             X[i, j] = signals.row[i, j]
         for c in range(ND.shape[1]):
             X[i, m + c] = 0.0
-            for j in range(m):
-                if not is_first(state):
+            if is_held:
+                for j in range(m):
                     X[i, m + c] += signals.row[i, j] * ND[j, c]
+
+
+@inner
+def is_contradicted(
+    settings: Settings, state: State, signals: Signals, period: float
+) -> bool:
+    """Compare this row with the solution; return whether the last ones contradict it."""
+    X = signals.load_rows
+    e = signals.load_torque
+    x = state.weighed_solution
+    fill_load(settings, state, signals)
+    for i in range(settings.n):
+        e[i] = signals.row[i, settings.m]
+        for j in range(x.size):
+            e[i] -= X[i, j] * x[j]
     square = innovation.normalized_square(
-        X,
-        signals.load_torque,
-        state.weighed_solution,
-        state.weighed_factor,
-        period,
-        signals.load_covariance,
+        X, e, state.weighed_factor, period, signals.load_covariance
     )
-    return innovation.is_change(
+    return innovation.update(
         square,
         settings.residual_floor / settings.n,
         period,

@@ -323,7 +323,7 @@ class ControllerNode(LoopNode[ControllerConfig]):
         if has_changed:
             residual = state.contradiction[0] ** 0.5
             self.get_logger().warning(
-                f'the arm has changed: torques differ by {residual:.3g} N m from those learned; '
+                f'the arm has changed: torques differ by {residual:.3g} N m from those expected; '
                 'learning restarts'
             )
         if columns != self._columns:
