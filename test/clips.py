@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+from animation import RATE, save
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from PIL import Image
@@ -27,7 +28,6 @@ from blf_dsc_controller.cli.main import main as blf_dsc
 from blf_dsc_controller.view.page import ShownArm, arm_of
 
 DOC = Path('doc')
-RATE = 8.0  # frames per second
 SPEED = 2.0  # of the clip, relative to the arm
 TRAIL = 2.0  # s, of the path of the tip
 ERROR = 'error of each joint [% of its bound]'
@@ -168,17 +168,8 @@ def main() -> None:
         with tempfile.TemporaryDirectory() as folder:
             run = blf.read_run(recorded(clip, Path(folder)))
             arm = arm_of(blf.load_loop(clip.preset).controller, {'arm.l2': 0.8})
-            first, *others = pictures(clip, run, arm)
             out = DOC / f'{name}.webp'
-            first.save(
-                out,
-                save_all=True,
-                append_images=others,
-                duration=round(1000.0 / RATE),
-                loop=0,
-                quality=60,
-                method=6,
-            )
+            save(out, pictures(clip, run, arm))
         print(f'{out}: {out.stat().st_size / 1e6:.2f} MB')
 
 

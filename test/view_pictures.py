@@ -13,6 +13,7 @@ from pathlib import Path
 
 import chromium
 import numpy as np
+from animation import save
 from PIL import Image
 from ros_rig import RosRig
 
@@ -25,7 +26,6 @@ from blf_dsc_controller.view.node import ViewNode
 OUT = Path('doc/view.webp')
 TIMES = np.arange(17.0, 26.0, 0.25)  # s; it picks up 2 kg at 20 s
 SETTLE = 1.5  # s, until the browser has drawn a frame without a GPU
-RATE = 8.0  # frames per second
 WINDOW = (1200, 880)
 NOTICE = (
     "document.querySelectorAll('[class*=Notification]').forEach(each => each.remove())"
@@ -66,16 +66,8 @@ def pictures():
 
 def main():
     """Write the animation."""
-    _, first, *others = pictures()  # at the first one the camera is not there yet
-    first.save(
-        OUT,
-        save_all=True,
-        append_images=others,
-        duration=round(1000.0 / RATE),
-        loop=0,
-        quality=60,
-        method=6,
-    )
+    _, *frames = pictures()  # at the first one the camera is not there yet
+    save(OUT, frames)
     print(f'{OUT}: {OUT.stat().st_size / 1e6:.2f} MB')
 
 
