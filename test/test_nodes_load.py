@@ -75,11 +75,15 @@ class Arm:
         self.requests = []
         ros.tester.create_service(service, SERVICE, self.take)
         given = flatten(FR3.controller) | TOLD | controller
-        self.plant = ros.add(PlantNode, flatten(FR3.plant) | EVENT)
+        waiting = {'autostart': False}
+        self.plant = ros.add(PlantNode, flatten(FR3.plant) | EVENT | waiting)
         self.law = ros.add(ControllerNode, given)
+        # the law looks for the service by the clock, lock-step does not wait for it
         ros.until(
             lambda: self.law._load_service._client or self.law._load_service.problem
         )
+        assert configure(ros, self.plant)
+        assert activate(ros, self.plant)
 
     def take(self, request, response):
         """Answer as a driver; the drives add the weight from their next step on."""
