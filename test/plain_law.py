@@ -91,6 +91,15 @@ class PlainLaw:
         tau_aux = -g.K * k**2 / (xi1 * np.pi) * np.sin(s) * np.cos(s)
         return np.where(np.abs(xi1) < k, tau_aux, 0.0) - g.mu * xi1 + dqr + xi1 * dk / k
 
+    def virtual_slope(self, xi1, t):
+        """Return the derivative of beta2 by the error, which is not zero."""
+        g = self.gains
+        k, dk = self.bound(t)
+        s = np.pi * xi1**2 / (2.0 * k**2)
+        inside = g.K * k**2 / (np.pi * xi1**2) * np.sin(s) * np.cos(s)
+        inside = inside - g.K * np.cos(2.0 * s)
+        return np.where(np.abs(xi1) < k, inside, 0.0) - g.mu + dk / k
+
     def momentum_regressors(self, t, q, dq):
         """Return Yp and [Yr | D], with the columns D of the disturbance."""
         r, g = self.gains.model.r, self.gains
@@ -195,7 +204,11 @@ class PlainLaw:
         beta2 = self.virtual_control(xi1, dqr, t)
         if self.alpha2 is None:
             self.alpha2 = beta2
-        following = beta2 + (self.alpha2 - beta2) * np.exp(-dt / g.time_constant)
+        known = np.zeros(2)
+        if g.known_rate:
+            known = ddqr + self.virtual_slope(xi1, t) * (dq - dqr)
+        lagging = (self.alpha2 - beta2) * np.exp(-dt / g.time_constant)
+        following = beta2 + lagging + dt * known
         dalpha2 = (following - self.alpha2) / dt
         if self.linear:
             self.alpha2 = dqr - g.K * xi1

@@ -349,6 +349,14 @@ class PlainUrdfLaw:
             - g.funnel_rate * wider / k * xi1
         )
 
+    def virtual_slope(self, xi1, t):
+        """Return minus the derivative of beta2 by xi1."""
+        g = self.gains
+        wider = (g.initial_bound - g.bound) * np.exp(-g.funnel_rate * t)
+        x = np.pi * (xi1 / (g.bound + wider)) ** 2
+        inside = np.where(x < np.pi, 2.0 * np.cos(x) - np.sinc(x / np.pi), 0.0)
+        return 0.5 * g.K * inside + g.mu + g.funnel_rate * wider / (g.bound + wider)
+
     def update(self, t, dt, qr, dqr, ddqr, measurement):
         """Return the command for a measurement; all is in the order of the page."""
         g = self.gains
@@ -359,10 +367,15 @@ class PlainUrdfLaw:
         self.added = added
         xi1 = q - qr
         beta2 = self.virtual_control(xi1, dqr, t)
+        known = np.zeros(g.n)
+        if g.known_rate:
+            late = 0.5 * g.lag * ddqr
+            beta2 = beta2 - late
+            known = ddqr - self.virtual_slope(xi1, t) * (dq - dqr + late)
         if self.alpha2 is None:
             self.alpha2 = beta2
         share = 1.0 - exp(-dt / g.time_constant)
-        dalpha2 = share * (beta2 - self.alpha2) / dt
+        dalpha2 = share * (beta2 - self.alpha2) / dt + known
         xi2 = dq - self.alpha2
         damped = dalpha2 - g.damping_rate * xi2
         damped = damped + self.barrier_torque(xi1, t) / g.joint_inertia
@@ -392,7 +405,7 @@ class PlainUrdfLaw:
         torque = np.clip(demand, low, high)
         is_cut = np.any(torque != demand)
         self.adapt(dt, q, H_r, xi2, ahead, coulomb, is_cut=is_cut)
-        self.alpha2 = self.alpha2 + share * (beta2 - self.alpha2)
+        self.alpha2 = self.alpha2 + share * (beta2 - self.alpha2) + dt * known
         self.samples += 1
         self.tau = torque - added
         self.xi1 = xi1

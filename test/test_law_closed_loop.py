@@ -334,6 +334,7 @@ def test_error_of_the_oracle_is_the_lag_of_the_surface_filter(
 
     xi1 compensates it by (K/2 + mu) xi1 in beta2, and by w xi1 = -K_p xi2 in the torque.  The
     reference's acceleration is 0.3 rad/s^2; the held torque adds half a sample to the lag.
+    With the known rate of beta2 neither is left.
     """
     gains = {'surface.gain': gain, 'surface.mu': mu, 'barrier.weight': weight}
     changes = {name: [value] * 2 for name, value in gains.items()}
@@ -342,6 +343,9 @@ def test_error_of_the_oracle_is_the_lag_of_the_surface_filter(
     rate = gain / 2.0 + mu + weight / np.array([60.0, 20.0])
     expected = (time_constant + 0.5e-3) * 0.3 / rate
     np.testing.assert_allclose(loop.largest(1.0), expected, rtol=0.05)
+    changes['surface.known_rate'] = True
+    loop = run_preset(8.0, preset='model_based', law=changes)
+    assert (loop.largest(1.0) < 0.2 * 0.5e-3 * 0.3 / rate).all()  # alpha2 does not lag
 
 
 def test_lyapunov_function_of_the_oracle_decreases_to_the_floor_of_the_lag():

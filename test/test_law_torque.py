@@ -109,6 +109,19 @@ def test_virtual_control_has_no_singularity():
         assert barrier.sinc(x) == pytest.approx(sin(x) / x, abs=3e-16)
 
 
+@pytest.mark.parametrize('share', [-0.99, -0.6, 0.0, 0.01, 0.3, 0.9, 1.001, 4.0])
+def test_slope_of_the_virtual_control_is_its_derivative(share):
+    """By central differences; at the bound itself the slope jumps."""
+    error, h = share * BOUND, 1e-8  # rad
+
+    def beta2(xi1):
+        return barrier.virtual_control(xi1, BOUND, 150.0, 20.0, 0.3)
+
+    difference = (beta2(error + h) - beta2(error - h)) / (2.0 * h)
+    slope = barrier.virtual_slope(error, BOUND, 150.0, 20.0)
+    assert slope == pytest.approx(-difference, abs=1e-4)
+
+
 def drawn(seed):
     """Random settings of a stable loop, every option among them, and the arm in it.
 
@@ -177,6 +190,7 @@ def drawn(seed):
     gains |= {
         'follows_inertia': int(random.integers(2)),
         'joint_inertia': each(0.2, 0.5),
+        'known_rate': int(random.integers(2)),
     }
     return quick(**columns | gains), arm
 

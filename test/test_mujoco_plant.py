@@ -222,10 +222,10 @@ def test_closed_loop_runs_the_same_with_both_plants():
 @pytest.mark.parametrize(
     ('name', 'settled', 'peak'),
     [
-        ('panda', 0.22, 2.4),
-        ('ur5e', 0.6, 1.7),
-        ('openarm', 0.22, 0.9),
-        ('widowx', 0.45, 6.3),
+        ('panda', 0.2, 2.3),
+        ('ur5e', 0.55, 1.6),
+        ('openarm', 0.21, 0.9),
+        ('widowx', 0.45, 6.2),
     ],
 )
 def test_errors_with_dry_friction_are_as_documented(name, settled, peak):

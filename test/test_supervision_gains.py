@@ -107,6 +107,12 @@ def test_change_must_not_worsen_an_existing_warning_nor_cause_one(gain, accepted
     )
 
 
+def test_filter_that_knows_the_rate_of_its_input_does_not_ring():
+    changes = {'surface.time_constant': 0.05, 'surface.known_rate': True} | EXACT
+    assert warnings(changes) == []
+    assert np.abs(run(configured('model_based', 4.0, changes)).xi1).max() < BOUND / 4.0
+
+
 def test_laws_cause_no_warnings_about_gains_they_do_not_have():
     changes = {
         'surface.time_constant': 0.05,
@@ -376,25 +382,34 @@ def test_stiffness_of_an_arm_without_a_urdf_is_rejected():
         configured('recommended', 1.0, {'feedback.stiffness': 0.5})
 
 
-def test_a_surface_filter_of_two_samples_costs_the_margin_at_low_rates():
-    found, lighter = [], (1.3, 1.5)
-    for factor in (1.0, 2.0):
-        config = arm_of('panda', 0.004, {'surface.time_constant': factor * 0.004})
+@pytest.mark.parametrize(
+    ('known_rate', 'expected'),
+    [(False, [[True, False], [False, False]]), (True, [[True, True], [True, True]])],
+)
+def test_lag_of_the_surface_filter_costs_margin_at_low_rates(known_rate, expected):
+    """Of an arm that is 1.4 and 1.6 times lighter, with time constants of one and two samples."""
+    found = []
+    for time_constant in (0.004, 0.008):
+        surface = {
+            'surface.time_constant': time_constant,
+            'surface.known_rate': known_rate,
+        }
+        config = arm_of('panda', 0.004, surface)
         settings = settings_of_config(config)
         M0 = inertias(config, settings)
         size = partial(growth, settings, 0.004, config.robot.lag)
-        found.append([size(M0 / x, M0, settings.weight) < 1.0 for x in lighter])
-    assert found == [[True, True], [True, False]]
+        found.append([size(M0 / x, M0, settings.weight) < 1.0 for x in (1.4, 1.6)])
+    assert found == expected
 
 
 def test_gains_follow_the_sample_time():
-    fast, slow = (arm_of('panda', T) for T in (0.001, 0.004))
+    fast, slow = (arm_of('panda', T) for T in (0.001, 0.005))
     assert slow.feedback.damping_rate < fast.feedback.damping_rate
-    assert (fast.surface.time_constant, slow.surface.time_constant) == (0.00155, 0.004)
-    planar = (arm_of('noisy', T) for T in (0.001, 0.004))
+    assert (fast.surface.time_constant, slow.surface.time_constant) == (0.004, 0.005)
+    planar = (arm_of('noisy', T) for T in (0.001, 0.005))
     settings = map(settings_of_config, (fast, slow, *planar))
     intervals = [(each.row_interval, each.interval) for each in settings]
-    assert intervals == [(10, 50), (2, 12), (1, 10), (1, 2)]
+    assert intervals == [(10, 50), (2, 10), (1, 10), (1, 2)]
 
 
 @pytest.mark.parametrize(('preset', 'n'), ARMS)

@@ -40,7 +40,7 @@ _WINDOW = 5.0  # s
 _REGULARISATION = 1e-5  # pulls P (about 1) to 0
 _ANCHOR = 5.0  # times the mean square of the unmodelled torque
 _POSTURES = 20
-_SURFACE = 0.00155  # s, least time constant of the surface filter: noise of alpha2'
+_SURFACE = 0.004  # s, least time constant of the surface filter: noise of alpha2'
 _FREE = 2.0 * math.pi  # rad, position limit of a joint without one
 _SLOW = 0.5  # fraction of the rated velocity
 
@@ -96,6 +96,7 @@ def gains_of(
         'surface.gain': (0.4 * rate,) * n,
         'surface.mu': (1.3 * rate,) * n,
         'surface.time_constant': max(sample_time, _SURFACE),
+        'surface.known_rate': True,
         'feedback.gain': zeros,
         'feedback.damping': zeros,
         'feedback.damping_rate': 0.6 * rate,

@@ -24,7 +24,7 @@ from blf_dsc_controller.configuration.schema import (
 REMOVED: dict[str, Value] = {}
 """Last default of each parameter of the first release that is gone now."""
 
-ADDED: dict[str, Value] = {}
+ADDED: dict[str, Value] = {'surface.known_rate': False}
 """Value of parameters that older bags do not have, where it is not the default."""
 
 

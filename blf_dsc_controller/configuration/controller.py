@@ -334,6 +334,12 @@ class Surface:
     time_constant: float = positive(
         0.002, 'time constant of the surface filter', 's', 'lambda'
     )
+    known_rate: bool = parameter(
+        False,
+        'tell the surface filter the rate of the virtual control, by the reference and the '
+        'measured velocity, so that it has no lag; the default of an arm from a URDF',
+        read_only='the torque would jump',
+    )
 
 
 @dataclass(frozen=True)

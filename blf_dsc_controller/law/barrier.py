@@ -130,6 +130,19 @@ def virtual_control(
 
 
 @inner
+def virtual_slope(
+    xi1: float, bound: float, barrier_gain: float, linear_gain: float
+) -> float:
+    """Return -d beta2 / d xi1 = (K/2) (2 cos x - sinc x) + mu,  x = pi xi1^2 / k_c^2   [1/s]."""
+    ratio = xi1 / bound
+    barrier_part = 0.0
+    if abs(ratio) < 1.0:
+        x = pi * ratio * ratio
+        barrier_part = 0.5 * barrier_gain * (2.0 * cos(x) - sinc(x))
+    return barrier_part + linear_gain
+
+
+@inner
 def filter_gain(time_constant: float, dt: float) -> float:
     """Return the exact gain 1 - exp(-dt / time_constant) of a first-order lag with held input."""
     return 1.0 - exp(-dt / time_constant)

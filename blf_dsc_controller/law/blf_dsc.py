@@ -3,7 +3,7 @@
 
     xi1 = q - qr                                                                       (rad)
     beta2 = -(K/2) xi1 sinc(pi xi1^2 / k_c^2) - mu xi1 + dqr                           (15), (18)
-    lambda alpha2' = beta2 - alpha2,    alpha2(0) = beta2(0)                           (13)
+    lambda alpha2' = beta2 - alpha2 + lambda f,    alpha2(0) = beta2(0)                (13)
     xi2 = dq - alpha2                                                                  (rad/s)
     tau = -dV/dxi1 - d2 |xi1| sat(xi2 / b) - K_p xi2 + tau_m + d^3                     (28)
     theta^' = Proj(-Gamma (H^T xi2 - kappa W eps)),    d^3' = -gamma (xi2 + eta d^3)   (20), (30)
@@ -18,9 +18,10 @@ Where it departs from the paper, and why:
 - A bound that narrows adds xi1 k'/k to the virtual control: `barrier`.
 - The feedback of an arm whose rotor inertias are guessed follows those that it measures:
   `apparent_inertia`.
+- f, zero in the paper, is what is known of beta2' if `known_rate` is 1: `follow_known_rate`.
 - beta2 is held for a sample, in which alpha2' decays from (beta2 - alpha2) / lambda by the factor
   exp(-dt / lambda).  The torque is held too, so it uses the mean of alpha2': with lambda = 2 dt the
-  initial value would be 27 % too large.
+  initial value would be 27 % too large.  With f, it is beta2 - f t that is held.
 """
 
 from __future__ import annotations
@@ -71,6 +72,7 @@ class BlfDsc(NamedTuple):
         gain = filter_gain(settings.time_constant, dt)
         for i in range(settings.n):
             state.alpha2[i] += gain * (signals.beta2[i] - state.alpha2[i])
+            state.alpha2[i] += dt * signals.beta2_rate[i]
 
 
 @inner
@@ -87,9 +89,13 @@ def compute_surface(
             settings.mu[i],
             signals.dqr[i] + signals.narrowing[i] * signals.xi1[i],
         )
+        signals.beta2_rate[i] = 0.0
+        if settings.known_rate == 1:
+            follow_known_rate(settings, signals, i)
         if state.samples[0] == 0.0:
             state.alpha2[i] = signals.beta2[i]
         signals.dalpha2[i] = gain * (signals.beta2[i] - state.alpha2[i]) / dt
+        signals.dalpha2[i] += signals.beta2_rate[i]
         signals.xi2[i] = signals.dq[i] - state.alpha2[i]
         signals.restoring[i] = -barrier.gradient(
             signals.xi1[i],
@@ -98,6 +104,26 @@ def compute_surface(
             settings.slope_limit[i],
             signals.knee[i],
         )
+
+
+@inner
+def follow_known_rate(settings: Settings, signals: Signals, i: int) -> None:
+    """Compute f, what is known of beta2', for joint i; let beta2 be of the measured velocity.
+
+        f = ddqr + (d beta2 / d xi1) (dq - dqr^)    [rad/s^2],    dqr^ = dqr - (lag / 2) ddqr
+
+    Only the changes of a funnel's k'/k are left out.  Measured velocities come half of
+    `robot.lag` late, so they are compared with the reference of that time, dqr^, in
+    beta2 as well: on the reference xi2 is then zero.
+    """
+    late = 0.5 * settings.lag * signals.ddqr[i]
+    slope = barrier.virtual_slope(
+        signals.xi1[i], signals.bound[i], settings.K[i], settings.mu[i]
+    )
+    slope -= signals.narrowing[i]
+    signals.beta2[i] -= late
+    rate = signals.dq[i] - signals.dqr[i] + late
+    signals.beta2_rate[i] = signals.ddqr[i] - slope * rate
 
 
 @inner

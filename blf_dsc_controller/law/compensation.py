@@ -3,7 +3,7 @@
 
 The paper's compensation is H(q, dq, alpha2, alpha2') P^ (`compensation: state`).
 alpha2' contains the feedback, which is thus multiplied by the learned inertia: an
-estimate of 2.65 times the inertia makes a loop at 1 kHz unstable.  So what is learned
+estimate of 2.3 times the inertia makes a loop at 1 kHz unstable.  So what is learned
 acts along the reference only, and the feedback keeps the model from before the start,
 as in the desired compensation law of Sadegh and Horowitz (1990):
 

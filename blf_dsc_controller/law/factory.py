@@ -56,6 +56,7 @@ _PARAMETER_OF = {
     'K': 'surface.gain',
     'mu': 'surface.mu',
     'time_constant': 'surface.time_constant',
+    'known_rate': 'surface.known_rate',
     'damping_rate': 'feedback.damping_rate',
     'd2': 'feedback.damping',
     'gamma': 'disturbance.gain',

@@ -45,6 +45,7 @@ class Settings(NamedTuple):
     compensation: int
     # 1: barrier and d^3 act through M(q, P^(0)) / m
     follows_inertia: int
+    known_rate: int  # 1: the surface filter follows the known rate of beta2
     rotors_unsure: int  # 1: errors of the assumed rotor inertias are measured
     memory: int  # numbers in the memory of a law of a file
     weighed: int  # m + 1 where the load in the tip is weighed, else 0
@@ -247,6 +248,8 @@ class Signals(NamedTuple):
     xi1: Annotated[Array, 'n']  # rad
     beta2: Annotated[Array, 'n']  # rad/s
     dalpha2: Annotated[Array, 'n']  # rad/s^2
+    # of beta2, as far as it is known before the filter (13); else zero, rad/s^2
+    beta2_rate: Annotated[Array, 'n']
     xi2: Annotated[Array, 'n']  # rad/s
     restoring: Annotated[Array, 'n']  # torque by the error: -dV/dxi1 or -w z1, N m
     # alpha2' - omega_v xi2; of a URDF with the restoring torque over m, rad/s^2

@@ -251,13 +251,14 @@ def _limits_of_gains(
         f'{filtering:g} s is less than the sample time, {T:g} s: alpha2 follows the measurement '
         'noise, and its derivative enters the torque: give more',
     )
-    rate = float(np.max(settings.K / 2.0 + settings.mu))
-    yield Finding(
-        'surface.gain, surface.mu: K/2 + mu',
-        filtering * rate,
-        f'is {rate:.3g} 1/s, but a filter of {filtering:g} s rings above '
-        f'{0.25 / filtering:.3g} 1/s: lower surface.time_constant or the gains',
-    )
+    if settings.known_rate == 0:
+        rate = float(np.max(settings.K / 2.0 + settings.mu))
+        yield Finding(
+            'surface.gain, surface.mu: K/2 + mu',
+            filtering * rate,
+            f'is {rate:.3g} 1/s, but a filter of {filtering:g} s rings above '
+            f'{0.25 / filtering:.3g} 1/s: lower surface.time_constant or the gains',
+        )
     for joint, ratio in zip(
         config.joints, settings.slope_limit * T / damping, strict=True
     ):

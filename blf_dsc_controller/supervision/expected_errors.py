@@ -55,6 +55,8 @@ def transition(
     measured = speed + (1.0 - decay) * ((q - before) / T - speed)
     beta2 = -rate[:, None] * q
     dalpha2 = g * (beta2 - alpha2) / T
+    if settings.known_rate == 1:
+        dalpha2 = dalpha2 - rate[:, None] * measured
     xi2 = measured - alpha2
     m = settings.joint_inertia
     push_back = (stiffness / m)[:, None] * q
