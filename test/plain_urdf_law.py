@@ -239,15 +239,25 @@ class PlainUrdfLaw:
         self.direction = np.full(m, 1.0 / np.sqrt(m))
         self.viscous = slice(g.p, g.p + n)
         self.reversals = Reversals(g, g.p + n)
+        self.ripple = slice(g.p + 2 * n, g.m)
 
     # Learning
+
+    def ripple_at(self, q):
+        """Return the columns of the ripple at this position."""
+        n = self.gains.n
+        blocks = [np.zeros((n, 0))]
+        for cycles in self.gains.ripple_cycles:
+            blocks += [np.diag(np.sin(cycles * q)), np.diag(np.cos(cycles * q))]
+        return np.hstack(blocks)
 
     def add_row(self, dt, q, dq, dqr, applied):
         """Filter the row of the last interval, and put every k-th into the window."""
         g = self.gains
         Yp, Yr = self.arm.momentum_regressors(q, dq)
         columns = np.diag(dq), np.diag(np.tanh(dq / g.coulomb_velocity))
-        now = Yp, np.column_stack([Yr, *columns])
+        ripple = self.ripple_at(q - 0.5 * g.lag * dq)
+        now = Yp, np.column_stack([Yr, *columns, ripple])
         pole = 1.0 - exp(-g.pole * dt)
         if self.samples:
             late = 1.0 - exp(-dt / (0.5 * g.lag))
@@ -382,8 +392,11 @@ class PlainUrdfLaw:
         H = self.arm.regressor(q, dq, self.alpha2, damped)
         H_r = np.zeros((g.n, g.m))
         H_r[:, :p] = self.arm.regressor(qr, dqr, dqr, ddqr)
-        ahead = dqr + (1.5 * dt + 0.5 * g.lag) * ddqr
+        lead = 1.5 * dt + 0.5 * g.lag
+        ahead = dqr + lead * ddqr
         H_r[:, self.viscous] = np.diag(ahead)
+        there = qr + lead * dqr + 0.5 * lead**2 * ddqr
+        H_r[:, self.ripple] = self.ripple_at(there)
         coulomb = self.reversals.compensation(self.theta, ahead)
         self.reversals.follow_motion(ahead)
         self.add_row(dt, q, dq, dqr, applied)
@@ -446,7 +459,8 @@ class PlainUrdfLaw:
         assert np.linalg.norm(self.theta[: g.p]) < g.radius
         self.theta = np.clip(self.theta + dt * v, g.least, g.most)
         if self.latched is not None:
-            linear = np.arange(g.m) < columns.start
+            linear = np.ones(g.m)
+            linear[columns] = 0.0
             self.d3 = self.d3 - (H_r * linear) @ (self.theta - by_tracking)
         friction.k = friction.k + dt * g.kappa * change
         after = friction.compensation(self.theta, ahead)

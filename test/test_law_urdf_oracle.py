@@ -29,6 +29,7 @@ LAW = {
 CASES = {
     'friction': {},
     'drives': {'robot.drive_compensates': 'gravity'},
+    'ripple': {'learning.ripple_cycles': [20.0, 30.0]},
     'rejection': {'learning.excitation_threshold': 1e-3},
 }
 

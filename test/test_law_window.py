@@ -19,7 +19,7 @@ from paper_case import NO_DISTURBANCE, configured, run
 from scipy.linalg import eigh
 
 from blf_dsc_controller.compiled.algebra import cholesky_factor, cholesky_solve
-from blf_dsc_controller.law import adaptation, excitation, prediction, window
+from blf_dsc_controller.law import adaptation, excitation, prediction, ripple, window
 from blf_dsc_controller.law.factory import controller_of, estimate_names
 
 
@@ -227,18 +227,25 @@ def test_columns_match_their_names():
         'learning.coulomb': True,
         'learning.coulomb_velocity': 0.2,
         'learning.frequencies': [1.5, 4.0],
+        'learning.ripple_cycles': [20.0, 30.0],
     }
     config = configured('recommended', 1.0, learning).controller
     settings = controller_of(config).settings
     t = 0.7
+    q = np.array([0.2, -0.5])
     dq = np.array([0.3, -0.1])
     rest = np.full((2, settings.m), np.nan)
     prediction.fill_columns(settings, t, dq, rest)
+    for i in range(2):
+        ripple.fill_ripple(settings, i, q[i], rest)
 
     value = {'bias': np.ones(2), 'viscous': dq, 'coulomb': np.tanh(dq / 0.2)}
     for w in (1.5, 4.0):
         value[f'sin {w:g} rad/s'] = np.full(2, np.sin(w * t))
         value[f'cos {w:g} rad/s'] = np.full(2, np.cos(w * t))
+    for cycles in (20.0, 30.0):
+        value[f'sin {cycles:g} q'] = np.sin(cycles * q)
+        value[f'cos {cycles:g} q'] = np.cos(cycles * q)
     names = estimate_names(config)[3:]
     assert names == tuple(
         f'{block} {joint}' for block in value for joint in config.joints

@@ -552,6 +552,12 @@ class Learning:
         above=0.0,
         omittable=True,
     )
+    ripple_cycles: tuple[float, ...] = _size(
+        (),
+        'also estimate a torque ripple of each joint with so many periods per turn',
+        above=0.0,
+        omittable=True,
+    )
     radius: float = positive(
         3.0, 'radius of the projection ball of P^', 'kg m^2', 'omega_a'
     )

@@ -73,6 +73,7 @@ _PARAMETER_OF = {
     'coulomb': 'learning.coulomb',
     'coulomb_velocity': 'learning.coulomb_velocity',
     'frequencies': 'learning.frequencies',
+    'ripple_cycles': 'learning.ripple_cycles',
     'pole': 'learning.filter_pole',
     'radius': 'learning.radius',
     'compensation': 'learning.compensation',
@@ -117,7 +118,7 @@ class Column(NamedTuple):
 
 
 def columns_of(config: ControllerConfig) -> tuple[Column, ...]:
-    """Return the disturbance columns, in the order of `prediction.fill_columns`.
+    """Return the disturbance columns, in the order of `prediction.fill_columns` and `ripple`.
 
     The standard deviation is half the initial estimate, or 5 % of the rated torque
     where that is zero, for `viscous` at the largest velocity of the reference.
@@ -146,6 +147,8 @@ def _column_blocks(config: ControllerConfig) -> list[str]:
     blocks = [name for name, is_on in switched.items() if is_on]
     for w in learning.frequencies:
         blocks += [f'sin {w:g} rad/s', f'cos {w:g} rad/s']
+    for cycles in learning.ripple_cycles:
+        blocks += [f'sin {cycles:g} q', f'cos {cycles:g} q']
     return blocks
 
 
@@ -260,6 +263,7 @@ def _window(config: ControllerConfig) -> dict[str, Any]:
         'row_interval': row_interval,
         'interval': max(1, round(between_checks / T)),
         'tones': len(learning.frequencies),
+        'ripples': len(learning.ripple_cycles),
         'learning_start': learning.window + learning.settling_time,
         'motion_scale': _SLOW if is_urdf else 0.0,
         'omega': _OMEGA,

@@ -5,6 +5,7 @@ prediction   a row [X | u] with X theta = u, of the last interval
 window       sums of the rows over tau_d
 excitation   whether a window is excited, consistent, and latched
 change       whether the arm has changed, so that the window must be forgotten
+ripple       columns of the torque ripple of gears and motors
 friction     friction from reversals, and how much of it is used
 adaptation   the step of the estimate, once the torque is known
 """
@@ -12,7 +13,14 @@ adaptation   the step of the estimate, once the torque is known
 from __future__ import annotations
 
 from blf_dsc_controller.compiled.jit import inner
-from blf_dsc_controller.law import change, excitation, friction, prediction, window
+from blf_dsc_controller.law import (
+    change,
+    excitation,
+    friction,
+    prediction,
+    ripple,
+    window,
+)
 from blf_dsc_controller.law.compensation import compute_regressors
 from blf_dsc_controller.law.state import Settings, Signals, State
 
@@ -25,7 +33,9 @@ def observe(
     compute_regressors(settings, state, signals)
     friction.fill_compensation(settings, state, signals, dt)
     friction.follow_motion(settings, state, signals)
+    ripple.fill_compensated_ripple(settings, signals, dt)
     prediction.fill_columns(settings, t, signals.dq, signals.Yr)
+    ripple.fill_measured_ripple(settings, signals)
     prediction.form_row(settings, state, signals, dt)
     friction.filter_shapes(settings, state, signals, dt)
     if state.samples[0] == 0.0:

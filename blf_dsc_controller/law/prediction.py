@@ -18,8 +18,8 @@ Besides P, the learning estimates the coefficients d of the disturbance columns
 
     tau_dist = D d,    D = [ I | diag(dq) | diag(tanh(dq / v_c)) | I sin(w t) | I cos(w t) | ... ]
 
-for each block that is configured.  (22)-(24) instead subtract the estimate d^3 from the
-torque, which hides the parameter error.
+for each block that is configured, and those of `ripple`.  (22)-(24) instead subtract the
+estimate d^3 from the torque, which hides the parameter error.
 """
 
 from math import sqrt

@@ -59,6 +59,8 @@ class Settings(NamedTuple):
     viscous: int  # 1: a column dq_i per joint
     coulomb: int  # 1: a column tanh(dq_i / coulomb_velocity) per joint
     tones: int  # number of frequencies, each with a sine and a cosine column per joint
+    # number of ripple cycles, each with a sine and a cosine column per joint
+    ripples: int
     truth_known: int  # 1: true_parameters and true_disturbance are valid
     feed_forward: int  # 1: the true disturbance is compensated, as by model_based
     bumpless: int  # 1: d^3 gives up what the prediction error adds to the torque
@@ -119,6 +121,7 @@ class Settings(NamedTuple):
     most: Annotated[Array, 'm']  # value that theta^ can have
     true_parameters: Annotated[Array, 'p']
     frequencies: Annotated[Array, 'tones']  # of the sine and cosine columns, rad/s
+    ripple_cycles: Annotated[Array, 'ripples']  # periods per turn
     # N D of `weighing`, and a row of zeros
     load_columns: Annotated[Array, 'weighed', 10]
     # rows of D: mass [kg] and moments [kg m] in the tip

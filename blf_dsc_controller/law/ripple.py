@@ -1,0 +1,54 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Torque ripple of gears and motors: a sine and a cosine of the joint's own position.
+
+Strain-wave gears and motors with poles disturb a joint by a torque that repeats N times
+in each turn of it.  For each N of `learning.ripple_cycles` there are two columns a joint,
+
+    tau_dist,i = a sin(N q_i) + b cos(N q_i)                                       [N m]
+
+learned from the window like the other columns, and compensated at the position that
+the reference has when the torque acts.
+"""
+
+from blf_dsc_controller.compiled.elementary import cos, sin
+from blf_dsc_controller.compiled.jit import inner
+from blf_dsc_controller.compiled.layout import Array
+from blf_dsc_controller.law.state import Settings, Signals
+
+
+@inner
+def fill_ripple(settings: Settings, i: int, angle: float, rest: Array) -> None:
+    """Fill the ripple columns of row i of `rest` (n, m) at the position `angle` [rad]."""
+    n = settings.n
+    blocks = settings.bias + settings.viscous + settings.coulomb + 2 * settings.tones
+    at = settings.p + n * blocks
+    for k in range(settings.ripples):
+        for j in range(2 * n):
+            rest[i, at + j] = 0.0
+        rest[i, at + i] = sin(settings.ripple_cycles[k] * angle)
+        rest[i, at + n + i] = cos(settings.ripple_cycles[k] * angle)
+        at += 2 * n
+
+
+@inner
+def fill_measured_ripple(settings: Settings, signals: Signals) -> None:
+    """Fill the ripple columns of `signals.Yr`, for the row.
+
+    The row's torque has passed the velocity filter, half of `robot.lag`, but positions
+    have not.
+    """
+    for i in range(settings.n):
+        angle = signals.q[i] - 0.5 * settings.lag * signals.dq[i]
+        fill_ripple(settings, i, angle, signals.Yr)
+
+
+@inner
+def fill_compensated_ripple(settings: Settings, signals: Signals, dt: float) -> None:
+    """Fill the ripple columns of `signals.H`, where the reference is when the torque acts.
+
+    Torques act 1.5 samples and half of `robot.lag` late.
+    """
+    lead = 1.5 * dt + 0.5 * settings.lag
+    for i in range(settings.n):
+        velocity = signals.dqr[i] + 0.5 * lead * signals.ddqr[i]
+        fill_ripple(settings, i, signals.qr[i] + lead * velocity, signals.H)
