@@ -34,6 +34,7 @@ from typing import Annotated, Any, TypeVar, get_type_hints
 import numpy as np
 
 from blf_dsc_controller.compiled.jit import inner
+from blf_dsc_controller.compiled.references import by_reference, reference
 from blf_dsc_controller.compiled.views import part
 
 Array = np.ndarray
@@ -75,7 +76,9 @@ def view_of(layout: type[T]) -> Callable[..., T]:
     Kernels may call it; its arrays are views that must not outlive the vector (`part`).
     """
     body = '\n    '.join(_view_lines(layout))
-    names = {'_part': part, **_tuples(layout, '')}
+    tuples = _tuples(layout, '')
+    by_reference(*tuples.values())
+    names = {'_part': part, '_reference': reference, **tuples}
     names['__name__'] = layout.__module__
     defined: Callable[..., T] = _defined(_view_arguments(layout), body, names)
     return inner(defined)
@@ -102,7 +105,7 @@ def _view_lines(layout: type) -> list[str]:
     )
     lines = ['_at = 0']
     result = _read(layout, own, lines, '')
-    return [*lines, f'return {result}']
+    return [*lines, f'return _reference({result})']
 
 
 def _tuples(layout: type, prefix: str) -> dict[str, Any]:
