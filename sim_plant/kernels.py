@@ -34,6 +34,9 @@ from sim_plant.layout import (
 )
 from sim_plant.motion import disturbing_torque, integrate, update_loads
 
+STEP, OBSERVE, TRUTH = 1, 2, 4
+"""Tasks of `run_plant`: its command, its measurement, its truth."""
+
 
 @inner
 def plant_views(
@@ -246,27 +249,21 @@ def truth(plant: PlantSettings, now: PlantState, out: Array) -> None:
 
 
 @kernel
-def observe_plant(
+def run_plant(
     arm: Arm,
     settings: Array,
     state: Array,
     rng: np.random.Generator,
+    tasks: int,
+    command: Array,
     measurement: Array,
+    out: Array,
 ) -> None:
-    """Call `observe` with packed vectors."""
+    """Do the tasks, a sum of STEP, OBSERVE and TRUTH, in this order, with packed vectors."""
     plant, now = plant_views(arm, settings, state)
-    observe(plant, now, rng, measurement)
-
-
-@kernel
-def step_plant(arm: Arm, settings: Array, state: Array, command: Array) -> None:
-    """Call `step` with packed vectors."""
-    plant, now = plant_views(arm, settings, state)
-    step(plant, now, command)
-
-
-@kernel
-def plant_truth(arm: Arm, settings: Array, state: Array, out: Array) -> None:
-    """Call `truth` with packed vectors."""
-    plant, now = plant_views(arm, settings, state)
-    truth(plant, now, out)
+    if tasks & STEP:
+        step(plant, now, command)
+    if tasks & OBSERVE:
+        observe(plant, now, rng, measurement)
+    if tasks & TRUTH:
+        truth(plant, now, out)

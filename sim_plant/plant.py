@@ -8,6 +8,7 @@ torque, or one that is not finite, is as dangerous as a law that commands one.
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Mapping, Sequence
 from typing import Any, TypeVar, get_type_hints
@@ -17,17 +18,19 @@ from numpy.typing import ArrayLike, NDArray
 
 from blf_dsc_controller.arms.two_link import PARAMETER_NAMES, urdf
 from blf_dsc_controller.arms.urdf import Chain, inertia_of, moved, pseudo_inertia
+from blf_dsc_controller.compiled.entry import Entry
 from blf_dsc_controller.compiled.layout import pack
 from blf_dsc_controller.configuration.plant import Deviation, PlantConfig
 from blf_dsc_controller.configuration.robot import parameters_of
 from sim_plant.arm import Arm, PointMassArm, motion_size, rigid_arm, rigid_bodies
 from sim_plant.kernels import (
+    OBSERVE,
+    STEP,
+    TRUTH,
     generator,
     lag,
-    observe_plant,
-    plant_truth,
     plant_views,
-    step_plant,
+    run_plant,
 )
 from sim_plant.layout import (
     VELOCITY_SOURCES,
@@ -88,6 +91,15 @@ class Plant:
         self._seed = seed
         self.rng = generator(seed)
 
+    @functools.cached_property
+    def kernel(self) -> Entry:
+        """The kernel of `step`, `measure` and `truth`, for a compiled loop."""
+        return Entry(run_plant, *self._arguments(STEP, self._truth))
+
+    def _arguments(self, tasks: int, torque: np.ndarray) -> tuple[Any, ...]:
+        vectors = self.arm, self.settings, self.state, self.rng
+        return *vectors, tasks, torque, self._measurement, self._truth
+
     @property
     def sample(self) -> int:
         """Samples stepped since the start, k."""
@@ -105,12 +117,12 @@ class Plant:
 
     def measure(self) -> np.ndarray:
         """Return [q, dq, effort] (3n,) of this sample, overwritten by the next call."""
-        observe_plant(self.arm, self.settings, self.state, self.rng, self._measurement)
+        run_plant(*self._arguments(OBSERVE, self._truth))
         return self._measurement
 
     def step(self, torque: np.ndarray) -> None:
         """Apply the commanded torque (n,) [N m] and advance to the next sample."""
-        step_plant(self.arm, self.settings, self.state, torque)
+        run_plant(*self._arguments(STEP, torque))
 
     def change(self, settings: PlantSettings) -> None:
         """Switch to settings with the same number of joints, period and delay."""
@@ -124,7 +136,7 @@ class Plant:
 
         The next call overwrites it.
         """
-        plant_truth(self.arm, self.settings, self.state, self._truth)
+        run_plant(*self._arguments(TRUTH, self._truth))
         return self._truth
 
     def reset(self) -> None:

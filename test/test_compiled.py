@@ -25,13 +25,19 @@ import plants
 import pytest
 from closed_loop_case import closed_loop, controller, quick
 from command import OLDER, finished
-from numba.core.errors import UnsupportedError
+from numba.core.errors import TypingError, UnsupportedError
 from random_arm import _shake, random_urdf
 
 import blf_dsc_controller
 from blf_dsc_controller.arms import model
 from blf_dsc_controller.arms.two_link import TwoLink
-from blf_dsc_controller.compiled import dependencies, elementary, jit, kernel_cache
+from blf_dsc_controller.compiled import (
+    dependencies,
+    elementary,
+    entry,
+    jit,
+    kernel_cache,
+)
 from blf_dsc_controller.compiled.algebra import independent_columns, inverse, product
 from blf_dsc_controller.compiled.layout import (
     Array,
@@ -48,10 +54,12 @@ from blf_dsc_controller.configuration.schema import flatten
 from blf_dsc_controller.law.controller import update
 from blf_dsc_controller.law.laws import for_law
 from blf_dsc_controller.reference.terms import cubics, minimum_jerk
-from blf_dsc_controller.simulation.loop import run_loop, simulate
+from blf_dsc_controller.simulation import compiled_loop
+from blf_dsc_controller.simulation.compiled_loop import run_loop
+from blf_dsc_controller.simulation.loop import simulate
 from blf_dsc_controller.studies.laws import COMPUTED_TORQUE
 from blf_dsc_controller.supervision.model_torque import friction_torque, model_torque
-from sim_plant.kernels import step_plant
+from sim_plant.kernels import run_plant
 from sim_plant.plant import plant_settings
 
 PACKAGE = Path(blf_dsc_controller.__file__).resolve().parent
@@ -85,12 +93,12 @@ def test_kernel_depends_on_the_files_and_constants_it_is_compiled_from():
     """
     for kernel, needed, foreign in (
         (update, LAW, PLANT),
-        (run_loop, LAW | PLANT, set()),
-        (step_plant, PLANT, LAW),
+        (run_plant, PLANT, LAW),
+        (run_loop, set(), LAW),
     ):
         assert names(kernel) >= needed | ALWAYS
         assert not names(kernel) & foreign
-    assert not any('configuration' in name for name in names(run_loop))
+    assert not any('configuration' in name for name in names(update))
     assert {'SUSPECT=1', 'OUTSIDE=2', 'LEVEL_CUT=1.0'} <= dependencies.dependencies(
         update
     )[1]
@@ -127,10 +135,10 @@ def test_kernel_of_a_law_depends_on_its_file_and_on_no_other_law(monkeypatch):
 FOLDERS = """
 from blf_dsc_controller.compiled import kernel_cache
 from blf_dsc_controller.law.controller import update, weigh
-from blf_dsc_controller.simulation.loop import run_loop
-from sim_plant.plant import step_plant
+from blf_dsc_controller.simulation.compiled_loop import run_loop
+from sim_plant.plant import run_plant
 
-assert {update, weigh, run_loop, step_plant} <= {*kernel_cache.KERNELS}
+assert {update, weigh, run_loop, run_plant} <= {*kernel_cache.KERNELS}
 for kernel in kernel_cache.KERNELS:
     assert str(kernel_cache.cache_folder(kernel)) in kernel._cache.cache_path, kernel
 """
@@ -260,6 +268,45 @@ def test_linked_functions_compute_and_raise():
         mean_root(np.array([1.0, -9.0]))
 
 
+@entry.loop
+def sum_of_means(mean, rows):
+    total = 0.0
+    for i in range(rows.shape[0]):
+        total += entry.invoke(mean, rows[i])
+    return total
+
+
+def test_kernel_calls_a_kernel_by_its_address():
+    """It computes the same as in Python, and raises what the kernel raises."""
+    rows = np.array([[1.0, 9.0], [4.0, 16.0]])
+    mean = entry.Entry(mean_root, rows[0])
+    assert sum_of_means(mean, rows) == 5.0
+    assert getattr(sum_of_means, 'py_func', sum_of_means)(mean, rows) == 5.0
+    with pytest.raises(ValueError, match='no root of a negative number'):
+        sum_of_means(mean, -rows)
+
+
+@compiling
+def test_kernel_is_called_with_the_types_that_it_is_compiled_for():
+    with pytest.raises(TypingError, match='but the kernel takes'):
+        sum_of_means(entry.Entry(mean_root, np.ones(2)), np.ones((2, 2, 2)))
+
+
+@compiling
+@pytest.mark.parametrize('preset', ['recommended', 'noisy'])
+def test_loop_that_is_not_compiled_computes_the_same_bits(preset, monkeypatch):
+    """As where numba's private parts are missing: it calls the same kernels."""
+    config = load_loop(preset)
+    plant = replace(config.plant, duration=0.2)
+    compiled = simulate(config.controller, plant)
+    monkeypatch.setattr(compiled_loop, 'run_loop', run_loop.py_func)
+    interpreted = simulate(config.controller, plant)
+    for name in ('measurements', 'samples', 'truths'):
+        np.testing.assert_array_equal(
+            getattr(compiled, name), getattr(interpreted, name)
+        )
+
+
 @jit.kernel
 def allocating(x):
     return np.zeros(3)[0] + x
@@ -359,8 +406,8 @@ def test_generated_view_can_be_read():
         '    _at += (_sizes.joints)\n'
         '    motor_delay = int(_vector[_at])\n'
         '    _at += 1\n'
-        '    return State(count=count, ring=ring, '
-        'motor=motor_Motor(limit=motor_limit, delay=motor_delay))\n'
+        '    return _reference(State(count=count, ring=ring, '
+        'motor=motor_Motor(limit=motor_limit, delay=motor_delay)))\n'
     )
 
 
@@ -374,19 +421,18 @@ from blf_dsc_controller.configuration.nodes import load_loop
 from blf_dsc_controller.law.controller import update
 from blf_dsc_controller.messages.codecs import _read
 from blf_dsc_controller.reference.terms import _sample
-from sim_plant.kernels import observe_plant, plant_truth, step_plant
+from sim_plant.kernels import run_plant
 
 if __name__ == '__main__':  # the command has processes of its own
     config = load_loop('recommended')
     run._compile(config.controller)
     run._compile(config.plant)
-    of_plant = observe_plant, step_plant, plant_truth
-    for kernel in (update, _read, _sample, *of_plant):
+    for kernel in (update, run_plant, _read, _sample):
         print(kernel.__name__, len(kernel.signatures))
     assert main(['precompile', '--config', 'recommended']) == 0
     kernel_cache.SHIPPED = Path(sys.argv[1])
     assert main(['precompile', '--config', 'recommended', '--package']) == 0
-    for kernel in (update, *of_plant):
+    for kernel in (update, run_plant):
         assert list(kernel_cache.SHIPPED.glob(f'*/*.{kernel.__name__}-*.nbc')), kernel
 """
 
@@ -397,7 +443,7 @@ import numpy as np
 import blf_dsc_controller as blf
 from blf_dsc_controller.cli import run
 from blf_dsc_controller.compiled import kernel_cache
-from sim_plant.kernels import observe_plant, plant_truth, step_plant
+from sim_plant.kernels import run_plant
 
 def signatures():
     kernels = kernel_cache.KERNELS

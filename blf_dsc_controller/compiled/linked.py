@@ -273,3 +273,29 @@ def part_of(_typing: Any, vector: Any, at: Any, shape: Any) -> Any:
         return result._getvalue()  # noqa: SLF001
 
     return view(vector, at, shape), generate
+
+
+def address_of(compiled: Any) -> int:
+    """Return the address of a compiled kernel, for `call_at`."""
+    address: int = compiled.library.get_pointer_to_function(
+        compiled.fndesc.llvm_func_name
+    )
+    return address
+
+
+def call_at(
+    context: Any, builder: ir.IRBuilder, address: Any, signature: Any, values: Any
+) -> ir.Value:
+    """Generate a call of the kernel at an address; what it raises is raised again."""
+    convention = context.call_conv
+    function = convention.get_function_type(signature.return_type, signature.args)
+    status, result = convention.call_function(
+        builder,
+        builder.bitcast(address, function.as_pointer()),
+        signature.return_type,
+        signature.args,
+        values,
+    )
+    with cgutils.if_unlikely(builder, status.is_error):
+        convention.return_status_propagate(builder, status)
+    return result

@@ -6,11 +6,14 @@ What the loop does for every law, and what a law does itself, is told in `interf
 
 from __future__ import annotations
 
+import functools
 from math import nan
+from typing import NamedTuple
 
 import numpy as np
 
 from blf_dsc_controller.arms.model import ArmModel
+from blf_dsc_controller.compiled.entry import Entry
 from blf_dsc_controller.compiled.jit import direct, inner, kernel
 from blf_dsc_controller.compiled.layout import Array, pack
 from blf_dsc_controller.errors import BlfDscError
@@ -135,8 +138,9 @@ def update(
     reference_vector: Array,
     t: float,
     dt: float,
+    observed: bool,
 ) -> int:
-    """Run `step` with all its telemetry, on packed vectors; return its flags."""
+    """Run `step` on packed vectors; return its flags.  With `observed`, find the terms of (29)."""
     settings = settings_of(settings_vector, model)
     state = state_of(state_vector, settings)
     signals = signals_of(signals_vector, settings)
@@ -154,7 +158,7 @@ def update(
         measurement,
         sample,
     )
-    if flags & INVALID == 0:
+    if observed and flags & INVALID == 0:
         fill_energies(settings, state, signals, sample)
     return flags
 
@@ -171,6 +175,38 @@ def compare(
     settings = settings_of(settings_vector, model)
     checks = checks_of(checks_vector, settings)
     return compare_velocities(checks, dt, measurement, settings.n)
+
+
+@kernel
+def weigh_nothing(
+    _model: ArmModel,
+    _settings_vector: Array,
+    _state_vector: Array,
+    _signals_vector: Array,
+    _dt: float,
+) -> None:
+    """Stand in for `weigh` where nothing is weighed."""
+
+
+@kernel
+def sense_nothing(
+    _model: ArmModel,
+    _settings_vector: Array,
+    _state_vector: Array,
+    _signals_vector: Array,
+    _sample_vector: Array,
+    _dt: float,
+) -> bool:
+    """Stand in for `sense` where no external torque is found."""
+    return False
+
+
+class LawKernels(NamedTuple):
+    """What a compiled loop calls of a controller."""
+
+    update: Entry
+    weigh: Entry
+    sense: Entry
 
 
 class Controller:
@@ -213,7 +249,7 @@ class Controller:
             self._measurement,
         )
         self._update = direct(
-            for_law(update, law), law, *self._vectors, reference_vector, 0.0, 0.0
+            for_law(update, law), law, *self._vectors, reference_vector, 0.0, 0.0, True
         )
         self._compared = (*self._vectors[:2], self.checks_vector, self._measurement)
         self._compare = direct(compare, *self._compared, 0.0)
@@ -226,6 +262,25 @@ class Controller:
         self.update(0.0, 1e-3, np.zeros(3 * self.settings.n))
         self.perceive(1e-3)
         self.reset()
+
+    @functools.cached_property
+    def kernels(self) -> LawKernels:
+        """The kernels of `update` and `perceive`, for a compiled loop."""
+        law = self.law
+        given = (*self._vectors, self.reference_vector, 0.0, 0.0, True)
+        weighs = weigh if self.settings.weighed else weigh_nothing
+        senses = sense if self.settings.senses else sense_nothing
+        return LawKernels(
+            Entry(for_law(update, law), law, *given),
+            Entry(weighs, *self._vectors[:4], 0.0),
+            Entry(senses, *self._vectors[:5], 0.0),
+        )
+
+    @property
+    def torque_at(self) -> int:
+        """Entry of `sample_vector` at which the torque begins."""
+        torque = self.sample.torque
+        return int(torque.ctypes.data - self.sample_vector.ctypes.data) // 8
 
     def bound_at(self, t: float) -> Array:
         """Return the bound k(t) (n,) [rad] at time t [s] since the start."""
@@ -268,7 +323,7 @@ class Controller:
         """
         self._take(measurement)
         self.flags = self._update(
-            self.law, *self._vectors, self.reference_vector, t, dt
+            self.law, *self._vectors, self.reference_vector, t, dt, True
         )
         return self.sample.torque
 

@@ -18,28 +18,14 @@ from pathlib import Path
 
 import numpy as np
 
-from blf_dsc_controller.arms.model import ArmModel
 from blf_dsc_controller.bags.topic_recorder import TopicRecorder
-from blf_dsc_controller.compiled.jit import kernel
-from blf_dsc_controller.compiled.views import view
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.plant import PlantConfig
 from blf_dsc_controller.configuration.schema import flatten
 from blf_dsc_controller.errors import BlfDscError
-from blf_dsc_controller.law.check_state import INVALID, SUSPECT, checks_of
-from blf_dsc_controller.law.controller import Controller, step
-from blf_dsc_controller.law.external_torque import feel
+from blf_dsc_controller.law.controller import Controller
 from blf_dsc_controller.law.factory import begin, controller_of, estimate_names
-from blf_dsc_controller.law.interface import Law
-from blf_dsc_controller.law.laws import for_law
-from blf_dsc_controller.law.lyapunov import fill_energies
-from blf_dsc_controller.law.state import (
-    Sample,
-    sample_of,
-    settings_of,
-    signals_of,
-    state_of,
-)
+from blf_dsc_controller.law.state import Sample, sample_of
 from blf_dsc_controller.law.telemetry import (
     DECIMATION,
     ControllerTelemetry,
@@ -49,7 +35,6 @@ from blf_dsc_controller.law.telemetry import (
     run_of,
     sample_columns,
 )
-from blf_dsc_controller.law.weighing import add_row
 from blf_dsc_controller.messages import topics
 from blf_dsc_controller.messages.journal import (
     EventType,
@@ -58,83 +43,13 @@ from blf_dsc_controller.messages.journal import (
     encode_change,
 )
 from blf_dsc_controller.run import Run, Series, Stop
+from blf_dsc_controller.simulation.compiled_loop import Rows, Span, run_span
 from blf_dsc_controller.supervision.guard import Guard
-from sim_plant import kernels as plants
-from sim_plant.arm import Arm
 from sim_plant.plant import Plant, parameter_names_of, plant_of, steps_of
 
 _CHUNK = 1000  # samples; the guard takes about 20 ms for them
 START = 1_000_000_000
 """Stamp of the first sample [ns], as in lock-step."""
-
-
-@kernel
-def run_loop(
-    arm: Arm,
-    plant_settings: np.ndarray,
-    plant_state: np.ndarray,
-    rng: np.random.Generator,
-    law: Law,
-    model: ArmModel,
-    settings_vector: np.ndarray,
-    reference: np.ndarray,
-    state: np.ndarray,
-    signals: np.ndarray,
-    first: int,
-    last: int,
-    is_end: bool,
-    observed: bool,
-    measurements: np.ndarray,
-    samples: np.ndarray,
-    truths: np.ndarray,
-    checks_vector: np.ndarray,
-) -> bool:
-    """Run the samples `first` to `last`; with `is_end`, the torque of the last is not applied.
-
-    What no torque depends on, the terms of (29), the weighing and the external torque,
-    is computed with `observed`.  With checks (`law.checks`), stop at the first invalid
-    or suspect sample, or where a contact begins, and return False.
-    """
-    settings = settings_of(settings_vector, model)
-    law_state = state_of(state, settings)
-    law_signals = signals_of(signals, settings)
-    plant, now = plants.plant_views(arm, plant_settings, plant_state)
-    reference_view = view(reference)
-    measured = view(measurements)
-    true = view(truths)
-    rows = view(samples)
-    checks = checks_of(view(checks_vector), settings)
-    dt = plant.period_ns * 1e-9
-    for k in range(first, last + 1):
-        measurement = measured[k - first]
-        sample = sample_of(rows[k - first], settings)
-        t = (k * plant.period_ns) * 1e-9
-        plants.observe(plant, now, rng, measurement)
-        flags = step(
-            law,
-            settings,
-            checks,
-            reference_view,
-            law_state,
-            law_signals,
-            t,
-            dt,
-            measurement,
-            sample,
-        )
-        if flags & (INVALID | SUSPECT):
-            return False
-        plants.truth(plant, now, true[k - first])
-        if observed:
-            fill_energies(settings, law_state, law_signals, sample)
-        if observed or settings.freezes == 1:
-            add_row(settings, law_state, law_signals, dt)
-            begins = feel(settings, law_state, law_signals, dt, sample)
-            if begins and checks.velocity_limit[0] > 0.0:
-                return False
-        if not (is_end and k == last):
-            plants.step(plant, now, sample.torque)
-    return True
 
 
 def simulate(
@@ -187,9 +102,8 @@ def run_alone(record: Record, plant: Plant, *, observed: bool = True) -> None:
         )
     q, dq, _ = plant.measure().reshape(3, -1)
     begin(record.controller, record.config, q, dq)
-    arrays = record.measurements, record.samples, record.truths
-    samples = 0, record.stamps.size - 1, True, observed
-    _run_samples(record.controller, plant, samples, arrays)
+    span = Span(0, record.stamps.size - 1, is_end=True, observed=observed)
+    run_span(record.controller, plant, span, record.rows_to_fill())
 
 
 def _run_supervised(
@@ -219,9 +133,8 @@ def _run_compiled(
     if guard.config.safety.velocity != 'measured':
         return False
     before = controller.save(), plant.save(), controller.checks_vector.copy()
-    arrays = record.measurements, record.samples, record.truths
-    samples = chunk.start, chunk.stop - 1, is_end, True
-    if _run_samples(controller, plant, samples, arrays):
+    span = Span(chunk.start, chunk.stop - 1, is_end, observed=True)
+    if run_span(controller, plant, span, record.rows_to_fill()):
         guard.advance(
             START + int(record.stamps[-1]), record.measurements[-1], len(chunk)
         )
@@ -257,32 +170,6 @@ def _run_guarded(
             plant.step(torque)
 
 
-def _run_samples(
-    controller: Controller,
-    plant: Plant,
-    samples: tuple[int, int, bool, bool],
-    arrays: tuple[np.ndarray, np.ndarray, np.ndarray],
-) -> bool:
-    """Call `run_loop` on samples (first, last, is_end, observed), into measurements and so on."""
-    run_with = for_law(run_loop, controller.law)
-    kept: bool = run_with(
-        plant.arm,
-        plant.settings,
-        plant.state,
-        plant.rng,
-        controller.law,
-        controller.settings.model,
-        controller.settings_vector,
-        controller.reference_vector,
-        controller.state_vector,
-        controller.signals_vector,
-        *samples,
-        *arrays,
-        controller.checks_vector,
-    )
-    return kept
-
-
 @dataclass(frozen=True)
 class Record:
     """All samples of a run, one row each."""
@@ -296,6 +183,10 @@ class Record:
     config: ControllerConfig
     controller: Controller  # after the run
     journal: Journal  # events of the run, their stamps from `START` on
+
+    def rows_to_fill(self) -> Rows:
+        """Return the matrices with a row for each sample."""
+        return Rows(self.measurements, self.samples, self.truths)
 
     def rows(self, chosen: range) -> Record:
         """Return some rows, as views."""
