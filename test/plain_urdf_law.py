@@ -137,9 +137,10 @@ class Reversals:
             self.close(i)
         self.moving = moving
 
-    def observe(self, step):
-        """Add a step of d^3 by the tracking error to delta, along the motion."""
-        self.delta += np.where(self.moving, step * self.direction, 0.0)
+    def observe(self, step, velocity):
+        """Add a step of d^3 by the tracking error to delta, until the velocity crosses zero."""
+        is_before = velocity * self.direction > 0.0
+        self.delta += np.where(is_before, step * self.direction, 0.0)
 
     def energy(self, i):
         """Return p int (g s)_h^2 dt of the present reversal."""
@@ -453,7 +454,7 @@ class PlainUrdfLaw:
             Yp, _ = self.arm.momentum_regressors(q, rate_of_d3)
             step = -dt * Yp @ g.initial_estimate[: g.p]
             self.d3 = self.d3 + step
-            friction.observe(step)
+            friction.observe(step, ahead)
         v = g.Gamma * (g.kappa * rate + tracking)
         by_tracking = self.theta + dt * g.Gamma * tracking
         assert np.linalg.norm(self.theta[: g.p]) < g.radius

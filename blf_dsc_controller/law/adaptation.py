@@ -129,7 +129,7 @@ def integrate(settings: Settings, state: State, signals: Signals, dt: float) -> 
         scale_by_inertia(settings, state, signals)
     for i in range(settings.n):
         state.disturbance[i] -= signals.unit[i]
-        friction.follow_observer(state, i, -signals.unit[i])
+        friction.follow_observer(state, signals, i, -signals.unit[i])
 
 
 @inner

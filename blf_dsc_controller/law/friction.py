@@ -26,7 +26,9 @@ torque f, they overrule what is older.
 which errs by |c_0 - c|.  Two things may contradict c^ before the sums do: a reversal that shows
 c_1, the last, or c_2, the one before; and the observer.  If d^3 rises by delta along the motion
 since the last reversal, either the friction has risen by that much, which turns over at the next
-reversal, or a push has begun, which stays.  The compensation at v is the value nearest to c_0
+reversal, or a push has begun, which stays.  delta is counted until v crosses zero: d^3 takes some
+0.05 s to follow, and what it adds while the joint slows down turns over all the same.  The
+compensation at v is the value nearest to c_0
 
     C(v) = clip(c_0, g(v) min E, g(v) max E),
     E = c^ + {0, z(c_1 - c^), z(c_2 - c^), z(delta), z(delta_min), z(delta_max)}
@@ -145,9 +147,9 @@ def hand_over(settings: Settings, state: State, signals: Signals) -> None:
 
 
 @inner
-def follow_observer(state: State, i: int, step: float) -> None:
-    """Add a step [N m] of d^3 of joint i by the tracking error to delta, while it moves."""
-    if state.moves[i] == 1.0:
+def follow_observer(state: State, signals: Signals, i: int, step: float) -> None:
+    """Add a step [N m] of d^3 of joint i by the tracking error to delta, until v crosses zero."""
+    if signals.sign[i] * state.direction[i] > 0.0:
         state.opposed[i] += step * state.direction[i]
 
 
