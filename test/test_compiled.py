@@ -712,6 +712,18 @@ def test_every_processor_computes_the_same_bits(processor):
     assert other.stdout.splitlines() == here, other.stderr
 
 
+@pytest.mark.skipif(
+    numba.config.CPU_NAME != 'x86-64-v3', reason='another processor, or one is named'
+)
+def test_kernels_are_for_the_same_processors_when_numba_reads_its_environment_again(
+    monkeypatch,
+):
+    """Before each compilation, if it has changed: kernels in the cache would not be found."""
+    monkeypatch.setenv('NUMBA_HIGHLIGHT_DUMPS', '0')
+    numba.config.reload_config()
+    assert numba.config.CPU_NAME == 'x86-64-v3'
+
+
 RACE = """
 import sys, time
 from blf_dsc_controller.compiled import announcement, jit

@@ -8,6 +8,7 @@ call, `compile_methods` for methods of named tuples.
 from __future__ import annotations
 
 import inspect
+import os
 from collections.abc import Callable, Sequence
 from typing import Any, TypeVar, cast
 
@@ -48,9 +49,10 @@ _X86_64_V3 = ('avx2', 'bmi', 'bmi2', 'f16c', 'fma', 'lzcnt', 'movbe')
 _chosen = config.CPU_NAME is not None or config.CPU_FEATURES is not None
 if not _chosen and all(map(get_host_cpu_features().get, _X86_64_V3)):
     # The same code for all these processors, about as fast, so that kernels can be
-    # shipped.
-    config.CPU_NAME = 'x86-64-v3'
-    config.CPU_FEATURES = ''
+    # shipped. Numba reads its environment again whenever it changes, and would forget
+    # what is only in its configuration.
+    os.environ |= {'NUMBA_CPU_NAME': 'x86-64-v3', 'NUMBA_CPU_FEATURES': ''}
+    config.reload_config()
 
 
 def inner(function: F) -> F:

@@ -195,10 +195,10 @@ def sense_nothing(
     _state_vector: Array,
     _signals_vector: Array,
     _sample_vector: Array,
-    _dt: float,
+    dt: float,
 ) -> bool:
-    """Stand in for `sense` where no external torque is found."""
-    return False
+    """Stand in for `sense` where no external torque is found: no contact begins."""
+    return dt < 0.0  # not False, which is a type of its own
 
 
 class LawKernels(NamedTuple):
