@@ -53,7 +53,7 @@ class Entry:
         given = tuple(map(numba.typeof, arguments))
         dispatcher.compile(given)
         compiled = dispatcher.overloads[given]
-        self.signature = compiled.signature
+        self.type = EntryType(compiled.signature)
         if not SLOW:
             self.address = address_of(compiled)
 
@@ -78,7 +78,7 @@ class EntryType(types.Type):
 
 @typeof_impl.register(Entry)
 def _type_of_entry(entry: Entry, _context: object) -> EntryType:
-    return EntryType(entry.signature)
+    return entry.type
 
 
 @register_model(EntryType)

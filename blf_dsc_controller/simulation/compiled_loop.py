@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from blf_dsc_controller.compiled.entry import invoke, loop
+from blf_dsc_controller.compiled.jit import inner
 from blf_dsc_controller.compiled.views import part
 from blf_dsc_controller.law.check_state import INVALID, SUSPECT
 from blf_dsc_controller.law.laws import for_law
@@ -37,100 +38,113 @@ class Span(NamedTuple):
     )
 
 
-@loop
-def run_loop(
-    first: int,
-    last: int,
-    is_end: bool,
-    observed: bool,
-    perceives: bool,
-    ends_at_contact: bool,
-    run_plant: Entry,
-    arm: Arm,
-    plant_settings: np.ndarray,
-    plant_state: np.ndarray,
-    rng: np.random.Generator,
-    period_ns: int,
-    of_law: LawKernels,
-    law: Law,
-    model: ArmModel,
-    settings: np.ndarray,
-    state: np.ndarray,
-    signals: np.ndarray,
-    checks: np.ndarray,
-    reference: np.ndarray,
-    torque_at: int,
-    measurements: np.ndarray,
-    samples: np.ndarray,
-    truths: np.ndarray,
-) -> bool:
-    """Implement `run_span`; the torque begins at entry `torque_at` of a sample."""
-    dt = period_ns * 1e-9
-    n = measurements.shape[1] // 3
-    torque = part(samples[0], torque_at, (n,))
-    tasks = OBSERVE | TRUTH
-    for k in range(first, last + 1):
-        row = k - first
-        t = (k * period_ns) * 1e-9
-        measurement = measurements[row]
-        sample = samples[row]
-        invoke(
-            run_plant,
-            arm,
-            plant_settings,
-            plant_state,
-            rng,
-            tasks,
-            torque,
-            measurement,
-            truths[row],
-        )
-        flags = invoke(
-            of_law.update,
-            law,
-            model,
-            settings,
-            state,
-            signals,
-            sample,
-            checks,
-            measurement,
-            reference,
-            t,
-            dt,
-            observed,
-        )
-        if flags & (INVALID | SUSPECT):
-            return False
-        if perceives:
-            invoke(of_law.weigh, model, settings, state, signals, dt)
-            begins = invoke(of_law.sense, model, settings, state, signals, sample, dt)
-            if begins and ends_at_contact:
-                return False
-        torque = part(sample, torque_at, (n,))
-        tasks = STEP | OBSERVE | TRUTH
-    if not is_end:
-        row = last - first
-        invoke(
-            run_plant,
-            arm,
-            plant_settings,
-            plant_state,
-            rng,
-            STEP,
-            torque,
-            measurements[row],
-            truths[row],
-        )
-    return True
-
-
 class Rows(NamedTuple):
     """Matrices with a row for each sample of a span."""
 
     measurements: np.ndarray
     samples: np.ndarray
     truths: np.ndarray
+
+
+class PlantArguments(NamedTuple):
+    """The kernel of a plant, and its arguments."""
+
+    run: Entry
+    arm: Arm
+    settings: np.ndarray
+    state: np.ndarray
+    rng: np.random.Generator
+    period_ns: int
+
+
+class LawArguments(NamedTuple):
+    """The kernels of a controller, and their arguments."""
+
+    kernels: LawKernels
+    law: Law
+    model: ArmModel
+    settings: np.ndarray
+    state: np.ndarray
+    signals: np.ndarray
+    checks: np.ndarray
+    reference: np.ndarray
+    torque_at: int  # entry of a sample at which its torque begins
+    perceives: bool  # find the load and contacts
+    ends_at_contact: bool
+
+
+@inner
+def run_plant(
+    plant: PlantArguments, tasks: int, torque: np.ndarray, row: int, rows: Rows
+) -> None:
+    """Do the tasks, which read a torque and write to a row."""
+    invoke(
+        plant.run,
+        plant.arm,
+        plant.settings,
+        plant.state,
+        plant.rng,
+        tasks,
+        torque,
+        rows.measurements[row],
+        rows.truths[row],
+    )
+
+
+@inner
+def run_law(
+    law: LawArguments, t: float, dt: float, observed: bool, row: int, rows: Rows
+) -> int:
+    """Run the law on the measurement of a row; return its flags."""
+    flags: int = invoke(
+        law.kernels.update,
+        law.law,
+        law.model,
+        law.settings,
+        law.state,
+        law.signals,
+        rows.samples[row],
+        law.checks,
+        rows.measurements[row],
+        law.reference,
+        t,
+        dt,
+        observed,
+    )
+    return flags
+
+
+@inner
+def perceive(law: LawArguments, dt: float, sample: np.ndarray) -> bool:
+    """Weigh the load and find the external torque; return whether a contact begins."""
+    vectors = law.settings, law.state, law.signals
+    invoke(law.kernels.weigh, law.model, *vectors, dt)
+    begins: bool = invoke(law.kernels.sense, law.model, *vectors, sample, dt)
+    return begins
+
+
+@loop
+def run_loop(span: Span, plant: PlantArguments, law: LawArguments, rows: Rows) -> bool:
+    """Implement `run_span`."""
+    dt = plant.period_ns * 1e-9
+    n = rows.measurements.shape[1] // 3
+    torque = part(rows.samples[0], law.torque_at, (n,))
+    run_plant(plant, OBSERVE | TRUTH, torque, 0, rows)
+    for k in range(span.first, span.last + 1):
+        row = k - span.first
+        t = (k * plant.period_ns) * 1e-9
+        if row > 0:
+            run_plant(plant, STEP | OBSERVE | TRUTH, torque, row, rows)
+        flags = run_law(law, t, dt, span.observed, row, rows)
+        if flags & (INVALID | SUSPECT):
+            return False
+        sample = rows.samples[row]
+        if law.perceives and perceive(law, dt, sample) and law.ends_at_contact:
+            return False
+        torque = part(sample, law.torque_at, (n,))
+    if not span.is_end:
+        run_plant(plant, STEP, torque, span.last - span.first, rows)
+    return True
 
 
 def run_span(controller: Controller, plant: Plant, span: Span, rows: Rows) -> bool:
@@ -140,21 +154,15 @@ def run_span(controller: Controller, plant: Plant, span: Span, rows: Rows) -> bo
     a contact begins.
     """
     settings = controller.settings
-    perceives = span.observed or settings.freezes == 1
-    run = for_law(run_loop, controller.law)
-    kept: bool = run(
-        span.first,
-        span.last,
-        span.is_end,
-        span.observed,
-        perceives,
-        bool(controller.checks.velocity_limit[0] > 0.0),
+    of_plant = PlantArguments(
         plant.kernel,
         plant.arm,
         plant.settings,
         plant.state,
         plant.rng,
         plant.period_ns,
+    )
+    of_law = LawArguments(
         controller.kernels,
         controller.law,
         settings.model,
@@ -164,6 +172,8 @@ def run_span(controller: Controller, plant: Plant, span: Span, rows: Rows) -> bo
         controller.checks_vector,
         controller.reference_vector,
         controller.torque_at,
-        *rows,
+        perceives=span.observed or settings.freezes == 1,
+        ends_at_contact=bool(controller.checks.velocity_limit[0] > 0.0),
     )
+    kept: bool = for_law(run_loop, controller.law)(span, of_plant, of_law, rows)
     return kept
