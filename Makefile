@@ -140,7 +140,7 @@ $(READY): setup.py setup.cfg
 	@: > $(VENV)/constraints.txt; $(constrain_$(FLAVOUR))
 	@{ $(PIP_INSTALL) 'pip>=22' 'setuptools>=70.1' && $(PIP_INSTALL) -c $(VENV)/constraints.txt \
 	    --no-build-isolation -e '.[$(extras_$(FLAVOUR))]'; } > $(PIP_LOG) 2>&1 || $(PIP_FAILED)
-	@echo '2/2 Installed. A first run compiles, for 1 to 2 minutes: each kernel is announced'
+	@echo '2/2 Installed. A first run compiles, for about a minute: each kernel is announced'
 	@touch $@
 
 # Further packages, named after the extra in setup.cfg.
