@@ -292,6 +292,17 @@ def test_kernel_is_called_with_the_types_that_it_is_compiled_for():
         sum_of_means(entry.Entry(mean_root, np.ones(2)), np.ones((2, 2, 2)))
 
 
+def test_kernels_of_two_laws_with_the_same_name_are_told_apart():
+    """Or the loop of the first would be called with the second, whose type it rejects."""
+    laws = [NamedTuple('Law', [('gain', float)]) for _ in range(2)]
+    first, other = (
+        entry.EntryType(numba.types.none(numba.typeof(law(1.0)))) for law in laws
+    )
+    assert str(first) == str(other)
+    assert first != other
+    assert first == entry.EntryType(numba.types.none(numba.typeof(laws[0](2.0))))
+
+
 @compiling
 @pytest.mark.parametrize('preset', ['recommended', 'noisy'])
 def test_loop_that_is_not_compiled_computes_the_same_bits(preset, monkeypatch):
