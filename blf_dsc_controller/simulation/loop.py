@@ -47,7 +47,7 @@ from blf_dsc_controller.simulation.compiled_loop import Rows, Span, run_span
 from blf_dsc_controller.supervision.guard import Guard
 from sim_plant.plant import Plant, parameter_names_of, plant_of, steps_of
 
-_CHUNK = 2000  # samples; the guard takes about 40 ms for them
+_CHUNK = 1000  # samples; the guard takes about 20 ms for them
 START = 1_000_000_000
 """Stamp of the first sample [ns], as in lock-step."""
 
