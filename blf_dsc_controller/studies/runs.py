@@ -43,12 +43,14 @@ from blf_dsc_controller.configuration.plant import PlantConfig
 from blf_dsc_controller.errors import BlfDscError, StartError
 from blf_dsc_controller.extras import import_extra
 from blf_dsc_controller.law.controller import update
+from blf_dsc_controller.law.external_torque import sense
 from blf_dsc_controller.law.factory import controller_of
 from blf_dsc_controller.law.state import Sample
 from blf_dsc_controller.law.telemetry import sample_columns
 from blf_dsc_controller.messages.journal import Journal
 from blf_dsc_controller.reference.approach import MotionError
 from blf_dsc_controller.run import Floats
+from blf_dsc_controller.simulation.compiled_loop import run_loop
 from blf_dsc_controller.simulation.loop import Record, new_record, run_alone
 from blf_dsc_controller.studies.monte_carlo import (
     Drawn,
@@ -210,7 +212,9 @@ def versions() -> dict[str, str]:
     """Return what must be equal to resume a study, besides the configuration."""
     return {
         'blf_dsc_controller': blf_dsc_controller.__version__,
-        'kernels': ' '.join(cache_folder(each).name for each in (update, run_plant)),
+        'kernels': ' '.join(
+            cache_folder(each).name for each in (update, sense, run_plant, run_loop)
+        ),
         'numpy': np.__version__,
         # `missing` goes by the names of the chunks
         'chunks': f'{_CHUNKS} of at most {_MAX_RUNS_OF_CHUNK} runs',
