@@ -6,13 +6,17 @@ which nobody states.  The guess, rated torque over 400 rad/s^2, is an upper limi
 joint that is much lighter makes the loop oscillate, and this oscillation shows its
 inertia before it has grown: between the bandwidth of the motion and that of the noise,
 
-    tau = M a = M_0 a + J~ a,        z^T (tau - M_0 a) = z^T a J~,
+    tau = M a = M_0 a + J~ a,        r = tau - M_0 a,        z^T r = z^T a J~,
 
 with M_0 from P^(0), J~ the error of the guess and z = tau, all through the lags of the
 loop and the same band pass.  Sums over all time give J~ in [-J, 0] of each joint.  They
 grow only while the acceleration is clear of the noise, which is known by its second
 difference: noise comes back through the feedback, where it cannot be told from an arm
 without inertia.
+
+A push at the tip, or the first torque of a wrong model, leaves an r as well, but one
+that is not J~ a: the feedback soon turns a around, and the push stays.  So J~ counts
+only while r and a are correlated, by less than -1/2.
 
 The feedback then acts on M_0 + J~ in place of M_0: its acceleration, damping and
 barrier included, minus qr'' gets the torque of J~ as well, as does the rate of d^3.
@@ -34,6 +38,10 @@ _CLEAR = 0.1  # their ratio: noise has 0.005, an oscillation 100
 # s (rad/s^2)^2, times the inertia: least sum of z a that shows anything
 _EVIDENCE = 0.05
 _RELEASE = 0.02  # s, in which the arm settles on its first torque
+_EXPLAINED = 0.25  # square of the least correlation of r with a: pushes have less
+
+# Rows of `State.rotor_sums`: z r, z a, r a, r^2, a^2.
+_ZR, _ZA, _RA, _RR, _AA = range(5)
 
 # Rows of `State.lags`: poles of the torque, those of the acceleration, and the last
 # samples.
@@ -105,21 +113,53 @@ def measure(settings: Settings, state: State, signals: Signals, dt: float) -> No
         signals.q, signals.band_acceleration, signals.Yp, signals.Yr
     )
     for i in range(settings.n):
-        J = settings.unsure_rotor[i]
-        if J == 0.0 or state.lags[_POWER, i] <= _CLEAR * state.lags[_NOISE, i]:
+        if settings.unsure_rotor[i] == 0.0:
             continue
-        unexplained = signals.unit[i]
-        for j in range(settings.p):
-            unexplained -= signals.Yp[i, j] * settings.initial_estimate[j]
-        state.rotor_sums[0, i] += dt * signals.unit[i] * unexplained
-        state.rotor_sums[1, i] += dt * signals.unit[i] * signals.band_acceleration[i]
+        if state.lags[_POWER, i] <= _CLEAR * state.lags[_NOISE, i]:
+            continue
+        add_to_sums(settings, state, signals, dt, i)
         least = _EVIDENCE * settings.joint_inertia[i]
-        if state.rotor_sums[1, i] < least:
-            continue
-        error = state.rotor_sums[0, i] / (state.rotor_sums[1, i] + least)
-        state.rotor_error[i] = min(0.0, max(-J, error))
-        lost = 1.0 - settings.link_inertia[i] / settings.joint_inertia[i]
-        state.gain_scale[i] = 1.0 + state.rotor_error[i] / J * lost
+        if state.rotor_sums[_ZA, i] >= least:
+            estimate(settings, state, least, i)
+
+
+@inner
+def add_to_sums(
+    settings: Settings, state: State, signals: Signals, dt: float, i: int
+) -> None:
+    """Add the last interval to the sums of joint i; needs Yp of the band's acceleration."""
+    sums = state.rotor_sums
+    a = signals.band_acceleration[i]
+    z = signals.unit[i]
+    r = z
+    for j in range(settings.p):
+        r -= signals.Yp[i, j] * settings.initial_estimate[j]
+    sums[_ZR, i] += dt * z * r
+    sums[_ZA, i] += dt * z * a
+    sums[_RA, i] += dt * r * a
+    sums[_RR, i] += dt * r * r
+    sums[_AA, i] += dt * a * a
+
+
+@inner
+def estimate(settings: Settings, state: State, least: float, i: int) -> None:
+    """Compute J~ of joint i, and how its inertia compares with the assumed."""
+    J = settings.unsure_rotor[i]
+    sums = state.rotor_sums
+    error = sums[_ZR, i] / (sums[_ZA, i] + least)
+    state.rotor_error[i] = min(0.0, max(-J, error)) if is_lighter(state, i) else 0.0
+    lost = 1.0 - settings.link_inertia[i] / settings.joint_inertia[i]
+    state.gain_scale[i] = 1.0 + state.rotor_error[i] / J * lost
+
+
+@inner
+def is_lighter(state: State, i: int) -> bool:
+    """Return whether an inertia below the assumed explains what the model lacks."""
+    sums = state.rotor_sums
+    explained = sums[_RA, i] * sums[_RA, i]
+    return bool(
+        sums[_RA, i] < 0.0 and explained > _EXPLAINED * sums[_RR, i] * sums[_AA, i]
+    )
 
 
 @inner
