@@ -294,24 +294,33 @@ def test_integrator_takes_as_many_steps_as_friction_on_a_light_joint_needs():
 
 
 @pytest.mark.parametrize(
-    ('evidence', 'correlation', 'share'),
-    [(1e6, -1.0, 0.0), (-1e6, -1.0, -1.0), (-1e6, -0.6, -1.0), (-1e6, -0.4, 0.0)],
+    ('counted', 'under_way', 'share'),
+    [
+        (1e6, 0.0, 0.0),
+        (-1e6, 0.0, -1.0),
+        (0.0, -0.5, -0.5),
+        (0.0, -1.5, -1.0),
+        (0.0, -1.7, 0.0),
+        (0.0, 1.5, 0.0),
+    ],
 )
 def test_error_of_the_guess_is_between_no_rotor_and_the_guess(
-    evidence, correlation, share
+    counted, under_way, share
 ):
-    """A heavier drive would need higher gains; without correlation it is a push."""
+    """A heavier drive would need higher gains; far beyond the guess it is a push."""
     law = controller_of(load_loop('panda').controller)
+    J = law.settings.unsure_rotor
     q = law.reference_at(0.0)[0]
-    sums = np.array([evidence, 1e6, correlation * 1e6, 1e6, 1e6])
     for k in range(200):
         swing = np.full(7, 0.1 * np.sin(0.4 * k))  # 64 Hz
         if k == 199:
-            law.state.rotor_sums[:] = sums[:, None]
+            sums = law.state.rotor_sums
+            sums[0] = counted
+            sums[1] = abs(counted)
+            sums[2] = 1e6 * under_way * J
+            sums[3] = 1e6 if under_way else 0.0
         law.update(k * 1e-3, 1e-3, np.concatenate((q, swing, np.zeros(7))))
-    np.testing.assert_allclose(
-        law.state.rotor_error, share * law.settings.unsure_rotor, atol=1e-12
-    )
+    np.testing.assert_allclose(law.state.rotor_error, share * J, atol=1e-5)
 
 
 @pytest.mark.parametrize('later', [-0.01, 0.03, 0.06])

@@ -15,8 +15,9 @@ difference: noise comes back through the feedback, where it cannot be told from 
 without inertia.
 
 A push at the tip, or the first torque of a wrong model, leaves an r as well, but one
-that is not J~ a: the feedback soon turns a around, and the push stays.  So J~ counts
-only while r and a are correlated, by less than -1/2.
+that is not J~ a.  So each half oscillation, from one zero of a to the next, is judged by
+itself: it is left out if no inertia near the guess explains it.  For pushes its
+quotient is some -2 to -10 J, for drives without any inertia about -J.
 
 The feedback then acts on M_0 + J~ in place of M_0: its acceleration, damping and
 barrier included, minus qr'' gets the torque of J~ as well, as does the rate of d^3.
@@ -38,10 +39,12 @@ _CLEAR = 0.1  # their ratio: noise has 0.005, an oscillation 100
 # s (rad/s^2)^2, times the inertia: least sum of z a that shows anything
 _EVIDENCE = 0.05
 _RELEASE = 0.02  # s, in which the arm settles on its first torque
-_EXPLAINED = 0.25  # square of the least correlation of r with a: pushes have less
+# times the guess, largest |J~| that half an oscillation may show by itself
+_PLAUSIBLE = 1.6
 
-# Rows of `State.rotor_sums`: z r, z a, r a, r^2, a^2.
-_ZR, _ZA, _RA, _RR, _AA = range(5)
+# Rows of `State.rotor_sums`: z r and z a, those of the half oscillation under way, and
+# the last a.
+_ZR, _ZA, _HALF_ZR, _HALF_ZA, _A = range(5)
 
 # Rows of `State.lags`: poles of the torque, those of the acceleration, and the last
 # samples.
@@ -118,9 +121,7 @@ def measure(settings: Settings, state: State, signals: Signals, dt: float) -> No
         if state.lags[_POWER, i] <= _CLEAR * state.lags[_NOISE, i]:
             continue
         add_to_sums(settings, state, signals, dt, i)
-        least = _EVIDENCE * settings.joint_inertia[i]
-        if state.rotor_sums[_ZA, i] >= least:
-            estimate(settings, state, least, i)
+        estimate(settings, state, i)
 
 
 @inner
@@ -134,32 +135,44 @@ def add_to_sums(
     r = z
     for j in range(settings.p):
         r -= signals.Yp[i, j] * settings.initial_estimate[j]
-    sums[_ZR, i] += dt * z * r
-    sums[_ZA, i] += dt * z * a
-    sums[_RA, i] += dt * r * a
-    sums[_RR, i] += dt * r * r
-    sums[_AA, i] += dt * a * a
+    if a * sums[_A, i] < 0.0:
+        if is_plausible(settings, state, i):
+            sums[_ZR, i] += sums[_HALF_ZR, i]
+            sums[_ZA, i] += sums[_HALF_ZA, i]
+        sums[_HALF_ZR, i] = 0.0
+        sums[_HALF_ZA, i] = 0.0
+    sums[_A, i] = a
+    sums[_HALF_ZR, i] += dt * z * r
+    sums[_HALF_ZA, i] += dt * z * a
 
 
 @inner
-def estimate(settings: Settings, state: State, least: float, i: int) -> None:
-    """Compute J~ of joint i, and how its inertia compares with the assumed."""
-    J = settings.unsure_rotor[i]
+def is_plausible(settings: Settings, state: State, i: int) -> bool:
+    """Return whether an inertia near the guess explains the half oscillation under way."""
     sums = state.rotor_sums
-    error = sums[_ZR, i] / (sums[_ZA, i] + least)
-    state.rotor_error[i] = min(0.0, max(-J, error)) if is_lighter(state, i) else 0.0
+    most = _PLAUSIBLE * settings.unsure_rotor[i] * sums[_HALF_ZA, i]
+    return bool(abs(sums[_HALF_ZR, i]) <= most)
+
+
+@inner
+def estimate(settings: Settings, state: State, i: int) -> None:
+    """Compute J~ of joint i, and how its inertia compares with the assumed.
+
+    Half an oscillation does not wait for its end if it is evidence enough by itself:
+    the error of a light drive grows threefold in it.
+    """
+    J = settings.unsure_rotor[i]
+    least = _EVIDENCE * settings.joint_inertia[i]
+    sums = state.rotor_sums
+    zr = sums[_ZR, i]
+    za = sums[_ZA, i]
+    if sums[_HALF_ZA, i] > least and is_plausible(settings, state, i):
+        zr += sums[_HALF_ZR, i]
+        za += sums[_HALF_ZA, i]
+    error = zr / (za + least) if za >= least else 0.0
+    state.rotor_error[i] = min(0.0, max(-J, error))
     lost = 1.0 - settings.link_inertia[i] / settings.joint_inertia[i]
     state.gain_scale[i] = 1.0 + state.rotor_error[i] / J * lost
-
-
-@inner
-def is_lighter(state: State, i: int) -> bool:
-    """Return whether an inertia below the assumed explains what the model lacks."""
-    sums = state.rotor_sums
-    explained = sums[_RA, i] * sums[_RA, i]
-    return bool(
-        sums[_RA, i] < 0.0 and explained > _EXPLAINED * sums[_RR, i] * sums[_AA, i]
-    )
 
 
 @inner
