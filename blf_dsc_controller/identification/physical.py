@@ -11,9 +11,11 @@ end at most mu times the number of rows of these J_i above its minimum.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.run import Floats
@@ -34,14 +36,39 @@ class Cone(NamedTuple):
     E: Floats  # (k, d, d)
     power: float = 0.0  # of its determinant in the density of the prior
 
-    def of(self, z: Floats) -> Floats:
-        """Return the matrix at z."""
-        return np.asarray(self.J0 + np.tensordot(z[self.entries], self.E, 1))
-
     @property
     def entries(self) -> slice:
         """The entries of z on which the matrix depends."""
         return slice(self.at, self.at + self.E.shape[0])
+
+
+class _Cones(NamedTuple):
+    """Cones of one size, g of them."""
+
+    entries: NDArray[np.intp]  # (g, k) of z, on which each depends
+    J0: Floats  # (g, d, d)
+    E: Floats  # (g, k, d, d)
+    power: Floats  # (g,)
+
+    def of(self, z: Floats) -> Floats:
+        """Return the matrices (g, d, d) at z."""
+        return np.asarray(self.J0 + np.einsum('ga,gaij->gij', z[self.entries], self.E))
+
+
+def _by_size(cones: Sequence[Cone]) -> list[_Cones]:
+    """Return the cones, those of one size together."""
+    of_size: dict[tuple[int, ...], list[Cone]] = {}
+    for cone in cones:
+        of_size.setdefault(cone.E.shape, []).append(cone)
+    return [
+        _Cones(
+            np.array([cone.at + np.arange(shape[0]) for cone in same]),
+            np.array([cone.J0 for cone in same]),
+            np.array([cone.E for cone in same]),
+            np.array([cone.power for cone in same]),
+        )
+        for shape, same in of_size.items()
+    ]
 
 
 def solve(A: Floats, b: Floats, cones: list[Cone], z: Floats) -> Floats:
@@ -49,25 +76,28 @@ def solve(A: Floats, b: Floats, cones: list[Cone], z: Floats) -> Floats:
     mu = max(1.0, float(np.sum((A @ z - b) ** 2)))
     information = A.T @ A + np.eye(z.size)
     target = A.T @ b
+    groups = _by_size(cones)
     while mu > _LAST:
         mu = max(_LAST, _REDUCTION * mu)
-        z = _centred(information, target, cones, z, mu)
+        z = _centred(information, target, groups, z, mu)
     return z
 
 
 def _centred(
-    information: Floats, target: Floats, cones: list[Cone], z: Floats, mu: float
+    information: Floats, target: Floats, cones: list[_Cones], z: Floats, mu: float
 ) -> Floats:
     """Return the minimum for one mu."""
     for _ in range(_STEPS):
         gradient = information @ z - target
         hessian = information.copy()
-        for cone in cones:
-            own = cone.entries
-            power = max(mu, cone.power)
-            T = np.linalg.solve(cone.of(z), cone.E)
-            gradient[own] -= power * np.trace(T, axis1=1, axis2=2)
-            hessian[own, own] += power * np.einsum('aij,bji->ab', T, T)
+        for group in cones:
+            own = group.entries
+            power = np.maximum(mu, group.power)
+            T = np.linalg.solve(group.of(z)[:, None], group.E)
+            slope = power[:, None] * np.einsum('gaii->ga', T)
+            curvature = power[:, None, None] * np.einsum('gaij,gbji->gab', T, T)
+            np.subtract.at(gradient, own, slope)
+            np.add.at(hessian, (own[:, :, None], own[:, None, :]), curvature)
         step = np.linalg.solve(hessian, -gradient)
         decrement = float(-gradient @ step)
         if decrement < _CENTRED * mu:
@@ -84,15 +114,15 @@ def _centred(
 
 
 def _objective(
-    information: Floats, target: Floats, cones: list[Cone], z: Floats, mu: float
+    information: Floats, target: Floats, cones: list[_Cones], z: Floats, mu: float
 ) -> float:
     """Return the objective, up to a constant; infinite outside a cone."""
     value = 0.5 * float(z @ information @ z) - float(target @ z)
-    for cone in cones:
+    for group in cones:
         try:
-            L = np.linalg.cholesky(cone.of(z))
+            L = np.linalg.cholesky(group.of(z))
         except np.linalg.LinAlgError:
             return np.inf
-        power = max(mu, cone.power)
-        value -= 2.0 * power * float(np.log(np.diag(L)).sum())
+        power = np.maximum(mu, group.power)
+        value -= 2.0 * float(power @ np.log(np.einsum('gii->gi', L)).sum(axis=1))
     return value

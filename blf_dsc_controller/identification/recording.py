@@ -100,6 +100,16 @@ def interpolated(at: np.ndarray, time: np.ndarray, values: np.ndarray) -> Floats
     return np.asarray(np.transpose(columns))
 
 
+def evenly_interpolated(at: np.ndarray, values: np.ndarray) -> Floats:
+    """Return `interpolated` for values (N, n) at 0, 1, ... N - 1, but the last ones beyond."""
+    if len(values) == 1:
+        return np.repeat(values, at.size, axis=0)
+    before = np.clip(at.astype(np.intp), 0, len(values) - 2)
+    share = np.clip(at - before, 0.0, 1.0)
+    low = values[before]
+    return np.asarray(low + share[:, None] * (values[before + 1] - low))
+
+
 def _around(at: np.ndarray, time: np.ndarray) -> slice:
     """Return which of the times are needed to interpolate at some others (k,); all increase."""
     first = np.searchsorted(time, at[0], side='right') - 1

@@ -108,8 +108,8 @@ class _Weighted:
     """
 
     def __init__(self, rows: Rows, windows: Indices, delay: float) -> None:
-        rate = rows.rate(delay)[windows]
-        self._columns = np.stack((-rate, rows.u(delay)[windows] - delay * rate), axis=2)
+        u, rate = (each[windows] for each in rows.u_and_rate(delay))
+        self._columns = np.stack((-rate, u - delay * rate), axis=2)
         self._rows = rows
         self._windows = windows
         self.delay = delay

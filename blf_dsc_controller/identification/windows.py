@@ -37,7 +37,10 @@ from blf_dsc_controller.identification.on_disk import (
     blocks_of,
     mapped,
 )
-from blf_dsc_controller.identification.recording import Recording, interpolated
+from blf_dsc_controller.identification.recording import (
+    Recording,
+    evenly_interpolated,
+)
 from blf_dsc_controller.identification.sliding import COULOMB_SPEED, sliding_direction
 from blf_dsc_controller.identification.values import COUPLING, LOAD
 from blf_dsc_controller.run import Floats
@@ -157,8 +160,8 @@ class Rows(NamedTuple):
         first = samples.start // self.every
         knots = self.gravity[first : (samples.stop - 1) // self.every + 2]
         torque = knots.reshape(len(knots), -1, self.p) @ P
-        at = np.arange(samples.start, samples.stop)
-        return interpolated(at, (first + np.arange(len(knots))) * self.every, torque)
+        at = np.arange(samples.start, samples.stop) / self.every - first
+        return evenly_interpolated(at, torque)
 
     def set_load(self, P: Floats) -> None:
         """Compute the columns of the load friction for the gravity of P (p,)."""
@@ -207,9 +210,10 @@ class Rows(NamedTuple):
         """Return the right-hand side (R, n) of torques recorded `delay` [s] late."""
         return self.over_windows(self._shifted(delay), self.g)
 
-    def rate(self, delay: float) -> Floats:
-        """Return the time derivative (R, n) of `u`."""
-        return -self.over_windows(self._shifted(delay), self.slope)
+    def u_and_rate(self, delay: float) -> tuple[Floats, Floats]:
+        """Return `u` and its time derivative (R, n)."""
+        u, falling = self._sums(self._shifted(delay), self.g, self.slope)
+        return u, -falling
 
     def _shifted(self, delay: float) -> OfSamples:
         shift = delay / self.period
@@ -219,18 +223,24 @@ class Rows(NamedTuple):
             at = np.arange(rows.start, rows.stop) + shift
             first = int(np.clip(np.floor(at[0]), 0, last))
             until = int(np.clip(np.floor(at[-1]), 0, last)) + 2
-            near = np.asarray(self.torque[first:until])
-            return interpolated(at, first + np.arange(len(near)), near)
+            return evenly_interpolated(at - first, self.torque[first:until])
 
         return shifted
 
     def over_windows(self, values: OfSamples, factors: Floats) -> Floats:
         """Return the sums (R, n) of the values in each window times factors (L,)."""
+        (found,) = self._sums(values, factors)
+        return found
+
+    def _sums(self, values: OfSamples, *factors: Floats) -> list[Floats]:
+        """Return `over_windows` for each of several factors."""
         columns = values(slice(0, 1)).shape[1]
-        found = np.zeros((self.starts.size, columns))
+        found = [np.zeros((self.starts.size, columns)) for _ in factors]
         for block, samples in self.in_blocks():
-            windows = sliding_window_view(values(samples), factors.size, axis=0)
-            found[block] = windows[self.starts[block] - samples.start] @ factors
+            all_windows = sliding_window_view(values(samples), self.g.size, axis=0)
+            windows = all_windows[self.starts[block] - samples.start]
+            for sums, own in zip(found, factors, strict=True):
+                sums[block] = windows @ own
         return found
 
     def in_blocks(self) -> Iterator[tuple[slice, slice]]:
