@@ -56,7 +56,12 @@ from blf_dsc_controller.identification.identify import (
 from blf_dsc_controller.identification.physical import Cone, solve
 from blf_dsc_controller.identification.prior import Prior, prior_of
 from blf_dsc_controller.identification.reading import read_recording
-from blf_dsc_controller.identification.recording import Recording, joined
+from blf_dsc_controller.identification.recording import (
+    Recording,
+    evenly_interpolated,
+    interpolated,
+    joined,
+)
 from blf_dsc_controller.identification.regression import regression
 from blf_dsc_controller.identification.scoring import nearest_friction
 from blf_dsc_controller.identification.sliding import COULOMB_SPEED, sliding_direction
@@ -694,6 +699,15 @@ def test_friction_of_a_urdf_is_the_nearest_that_changes_its_sign_at_once():
     left = rows.friction[fit, 1, 1] - viscous[1] * columns[0] - coulomb[1] * columns[1]
     weight = rows.weight[fit, 1] ** 2
     assert abs(left @ (weight * columns[1])) < 1e-6 * weight.sum()
+
+
+@pytest.mark.parametrize('size', [1, 2, 9])
+def test_even_interpolation_is_that_of_numpy(size):
+    values = np.random.default_rng(size).normal(size=(size, 3))
+    at = np.linspace(-2.0, size + 1.0, 50)
+    expected = interpolated(at, np.arange(size), values)
+    found = evenly_interpolated(at, values)
+    np.testing.assert_allclose(found, expected, atol=1e-14)
 
 
 def test_search_begins_inside_all_cones():

@@ -101,7 +101,7 @@ def interpolated(at: np.ndarray, time: np.ndarray, values: np.ndarray) -> Floats
 
 
 def evenly_interpolated(at: np.ndarray, values: np.ndarray) -> Floats:
-    """Return `interpolated` for values (N, n) at 0, 1, ... N - 1, but the last ones beyond."""
+    """Return `interpolated` for values (N, n) at the times 0, 1, ..., N - 1."""
     if len(values) == 1:
         return np.repeat(values, at.size, axis=0)
     before = np.clip(at.astype(np.intp), 0, len(values) - 2)
