@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from paper_case import configured, several
@@ -11,7 +13,7 @@ from random_arm import PANDA_TEXT, random_urdf
 from blf_dsc_controller import simulate
 from blf_dsc_controller.arms.tuning import over_postures
 from blf_dsc_controller.configuration.controller import ControllerConfig
-from blf_dsc_controller.configuration.nodes import load_loop
+from blf_dsc_controller.configuration.nodes import load_loop, locate
 from blf_dsc_controller.configuration.robot import parameters_of
 from blf_dsc_controller.configuration.schema import build, change
 from blf_dsc_controller.errors import ConfigurationError
@@ -23,6 +25,7 @@ from blf_dsc_controller.law.factory import (
     prior_covariance,
     settings_of_config,
 )
+from blf_dsc_controller.studies.monte_carlo import draw, load_study, plant_with
 from sim_plant.plant import plant_settings
 
 ARM = {'model': 'urdf', 'robot.urdf': 'panda.urdf', 'robot.tip': 'panda_hand_tcp'}
@@ -290,16 +293,53 @@ def test_integrator_takes_as_many_steps_as_friction_on_a_light_joint_needs():
         assert fewest <= plant_settings(loop.plant).steps <= most
 
 
+def swinging_panda(samples):
+    """Return a law that has seen all joints swing at 64 Hz, and how to let them swing on."""
+    law = controller_of(load_loop('panda').controller)
+    q = law.reference_at(0.0)[0]
+
+    def swing(first, after):
+        for k in range(first, after):
+            velocity = np.full(7, 0.1 * np.sin(0.4 * k))
+            law.update(k * 1e-3, 1e-3, np.concatenate((q, velocity, np.zeros(7))))
+
+    swing(0, samples)
+    return law, swing
+
+
 @pytest.mark.parametrize(('evidence', 'share'), [(1e6, 0.0), (-1e6, -1.0)])
 def test_error_of_the_guess_is_between_no_rotor_and_the_guess(evidence, share):
     """Whatever the sums say: a heavier drive would need higher gains, which are not for granted."""
-    law = controller_of(load_loop('panda').controller)
-    q = law.reference_at(0.0)[0]
-    for k in range(200):
-        swing = np.full(7, 0.1 * np.sin(0.4 * k))  # 64 Hz
-        if k == 199:
-            law.state.rotor_sums[:] = np.array([[evidence], [1e6]])
-        law.update(k * 1e-3, 1e-3, np.concatenate((q, swing, np.zeros(7))))
+    law, swing = swinging_panda(199)
+    law.state.rotor_sums[:2] = np.array([[evidence], [1e6]])
+    swing(199, 200)
     np.testing.assert_allclose(
         law.state.rotor_error, share * law.settings.unsure_rotor, atol=1e-12
     )
+
+
+@pytest.mark.parametrize(
+    ('asked', 'kept'), [(-0.5, True), (-1.9, True), (-2.1, False), (1.0, True)]
+)
+def test_half_oscillation_that_no_drive_explains_is_forgotten(asked, kept):
+    """As pushes are: what they ask for is several times what a drive can lack."""
+    law, swing = swinging_panda(199)
+    counted = law.state.rotor_sums[:2].copy()
+    half = 1e6 * np.array([asked * law.settings.unsure_rotor, np.ones(7)])
+    law.state.rotor_sums[2:4] = half
+    swing(199, 208)  # past the next reversal of the acceleration
+    added = law.state.rotor_sums[:2] - counted
+    np.testing.assert_allclose(added, half if kept else 0.0 * half, atol=1.0)
+
+
+@pytest.mark.parametrize('later', [-0.01, 0.0, 0.03, 0.06])
+@pytest.mark.parametrize('prefix', ['', 'without.'])
+def test_push_is_not_taken_for_light_drives(prefix, later):
+    """A Panda whose drives are heavier than assumed, pushed by 9.4 N: error was up to 50 bounds."""
+    study = load_study(locate('monte_carlo_panda'))
+    plant = plant_with(study, draw(study, 325), prefix)
+    assert plant.truth.rotor_factor > 1.2
+    begin = tuple(moment + later for moment in plant.events.begin)
+    plant = replace(plant, events=replace(plant.events, begin=begin), duration=12.0)
+    run = simulate(study.laws()[prefix], plant, supervised=False).run()
+    assert np.abs(run.error / run.bound).max() < 0.6

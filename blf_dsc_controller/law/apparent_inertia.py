@@ -6,13 +6,19 @@ which nobody states.  The guess, rated torque over 400 rad/s^2, is an upper limi
 joint that is much lighter makes the loop oscillate, and this oscillation shows its
 inertia before it has grown: between the bandwidth of the motion and that of the noise,
 
-    tau = M a = M_0 a + J~ a,        z^T (tau - M_0 a) = z^T a J~,
+    tau = M a = M_0 a + J~ a,        r = tau - M_0 a,        z^T r = z^T a J~,
 
 with M_0 from P^(0), J~ the error of the guess and z = tau, all through the lags of the
 loop and the same band pass.  Sums over all time give J~ in [-J, 0] of each joint.  They
 grow only while the acceleration is clear of the noise, which is known by its second
 difference: noise comes back through the feedback, where it cannot be told from an arm
 without inertia.
+
+A push leaves an r as well, mostly one that no drive explains: it asks for an inertia that
+is smaller by two to ten times the guess.  So what half an oscillation shows, from one zero
+of a to the next, is forgotten at its end if it asks for more than twice the guess less.
+Until then it counts, for the error of a light drive grows threefold in it; a push makes
+the gains softer for no longer than that.
 
 The feedback then acts on M_0 + J~ in place of M_0: its acceleration, damping and
 barrier included, minus qr'' gets the torque of J~ as well, as does the rate of d^3.
@@ -34,6 +40,12 @@ _CLEAR = 0.1  # their ratio: noise has 0.005, an oscillation 100
 # s (rad/s^2)^2, times the inertia: least sum of z a that shows anything
 _EVIDENCE = 0.05
 _RELEASE = 0.02  # s, in which the arm settles on its first torque
+# times the guess: most that half an oscillation may ask a drive to be lighter
+_POSSIBLE = 2.0
+
+# Rows of `State.rotor_sums`: z r and z a, those of the half oscillation under way, and
+# the last a.
+_ZR, _ZA, _HALF_ZR, _HALF_ZA, _A = range(5)
 
 # Rows of `State.lags`: poles of the torque, those of the acceleration, and the last
 # samples.
@@ -105,21 +117,57 @@ def measure(settings: Settings, state: State, signals: Signals, dt: float) -> No
         signals.q, signals.band_acceleration, signals.Yp, signals.Yr
     )
     for i in range(settings.n):
-        J = settings.unsure_rotor[i]
-        if J == 0.0 or state.lags[_POWER, i] <= _CLEAR * state.lags[_NOISE, i]:
+        if settings.unsure_rotor[i] == 0.0:
             continue
-        unexplained = signals.unit[i]
-        for j in range(settings.p):
-            unexplained -= signals.Yp[i, j] * settings.initial_estimate[j]
-        state.rotor_sums[0, i] += dt * signals.unit[i] * unexplained
-        state.rotor_sums[1, i] += dt * signals.unit[i] * signals.band_acceleration[i]
-        least = _EVIDENCE * settings.joint_inertia[i]
-        if state.rotor_sums[1, i] < least:
+        if state.lags[_POWER, i] <= _CLEAR * state.lags[_NOISE, i]:
             continue
-        error = state.rotor_sums[0, i] / (state.rotor_sums[1, i] + least)
-        state.rotor_error[i] = min(0.0, max(-J, error))
-        lost = 1.0 - settings.link_inertia[i] / settings.joint_inertia[i]
-        state.gain_scale[i] = 1.0 + state.rotor_error[i] / J * lost
+        add_to_sums(settings, state, signals, dt, i)
+        estimate(settings, state, i)
+
+
+@inner
+def add_to_sums(
+    settings: Settings, state: State, signals: Signals, dt: float, i: int
+) -> None:
+    """Add the last interval to the sums of joint i; needs Yp of the band's acceleration."""
+    sums = state.rotor_sums
+    a = signals.band_acceleration[i]
+    z = signals.unit[i]
+    r = z
+    for j in range(settings.p):
+        r -= signals.Yp[i, j] * settings.initial_estimate[j]
+    if a * sums[_A, i] < 0.0:
+        end_half_oscillation(settings, state, i)
+    sums[_A, i] = a
+    sums[_HALF_ZR, i] += dt * z * r
+    sums[_HALF_ZA, i] += dt * z * a
+
+
+@inner
+def end_half_oscillation(settings: Settings, state: State, i: int) -> None:
+    """Keep the sums of the half oscillation under way, unless no drive is so light."""
+    sums = state.rotor_sums
+    lightest = -_POSSIBLE * settings.unsure_rotor[i]
+    if sums[_HALF_ZR, i] >= min(0.0, lightest * sums[_HALF_ZA, i]):
+        sums[_ZR, i] += sums[_HALF_ZR, i]
+        sums[_ZA, i] += sums[_HALF_ZA, i]
+    sums[_HALF_ZR, i] = 0.0
+    sums[_HALF_ZA, i] = 0.0
+
+
+@inner
+def estimate(settings: Settings, state: State, i: int) -> None:
+    """Compute J~ of joint i, and how its inertia compares with the assumed."""
+    J = settings.unsure_rotor[i]
+    sums = state.rotor_sums
+    za = sums[_ZA, i] + sums[_HALF_ZA, i]
+    least = _EVIDENCE * settings.joint_inertia[i]
+    if za < least:  # J~ stays: a jump back to the guess would feed an oscillation
+        return
+    error = (sums[_ZR, i] + sums[_HALF_ZR, i]) / (za + least)
+    state.rotor_error[i] = min(0.0, max(-J, error))
+    lost = 1.0 - settings.link_inertia[i] / settings.joint_inertia[i]
+    state.gain_scale[i] = 1.0 + state.rotor_error[i] / J * lost
 
 
 @inner

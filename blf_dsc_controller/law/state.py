@@ -185,7 +185,7 @@ class State(NamedTuple):
     min_eigenvector: Annotated[Array, 'm']  # x of Phi x = lambda R x, x^T R x = 1
     active: Annotated[Array, 'm']  # 0 where a disturbance column has been rejected
     lags: Annotated[Array, 14, 'n']  # of `apparent_inertia`
-    rotor_sums: Annotated[Array, 2, 'n']  # of z (tau - M_0 a) and z a
+    rotor_sums: Annotated[Array, 5, 'n']  # of z r and z a; see `apparent_inertia`
     rotor_error: Annotated[Array, 'n']  # J~ <= 0 of the assumed rotor inertias, kg m^2
     gain_scale: Annotated[Array, 'n']  # measured inertia of each joint over the assumed
     since_latch: Cell  # s
