@@ -15,10 +15,11 @@ difference: noise comes back through the feedback, where it cannot be told from 
 without inertia.
 
 A push leaves an r as well, mostly one that no drive explains: it asks for an inertia that
-is smaller by two to ten times the guess.  So what half an oscillation shows, from one zero
-of a to the next, is forgotten at its end if it asks for more than twice the guess less.
-Until then it counts, for the error of a light drive grows threefold in it; a push makes
-the gains softer for no longer than that.
+is smaller by two to ten times the guess, or moves the arm against its torque.  So what half
+an oscillation shows, from one zero of a to the next, is forgotten at its end if z a is not
+positive, or if it asks for more than twice the guess less.  Until then it counts, for the
+error of a light drive grows threefold in it; a push makes the gains softer for no longer
+than that.
 
 The feedback then acts on M_0 + J~ in place of M_0: its acceleration, damping and
 barrier included, minus qr'' gets the torque of J~ as well, as does the rate of d^3.
@@ -145,10 +146,10 @@ def add_to_sums(
 
 @inner
 def end_half_oscillation(settings: Settings, state: State, i: int) -> None:
-    """Keep the sums of the half oscillation under way, unless no drive is so light."""
+    """Add the half oscillation under way to the sums, unless no drive explains it."""
     sums = state.rotor_sums
-    lightest = -_POSSIBLE * settings.unsure_rotor[i]
-    if sums[_HALF_ZR, i] >= min(0.0, lightest * sums[_HALF_ZA, i]):
+    za = sums[_HALF_ZA, i]
+    if za > 0.0 and sums[_HALF_ZR, i] >= -_POSSIBLE * settings.unsure_rotor[i] * za:
         sums[_ZR, i] += sums[_HALF_ZR, i]
         sums[_ZA, i] += sums[_HALF_ZA, i]
     sums[_HALF_ZR, i] = 0.0
@@ -162,9 +163,8 @@ def estimate(settings: Settings, state: State, i: int) -> None:
     sums = state.rotor_sums
     za = sums[_ZA, i] + sums[_HALF_ZA, i]
     least = _EVIDENCE * settings.joint_inertia[i]
-    if za < least:  # J~ stays: a jump back to the guess would feed an oscillation
-        return
-    error = (sums[_ZR, i] + sums[_HALF_ZR, i]) / (za + least)
+    zr = sums[_ZR, i] + sums[_HALF_ZR, i]
+    error = zr / (za + least) if za >= least else 0.0
     state.rotor_error[i] = min(0.0, max(-J, error))
     lost = 1.0 - settings.link_inertia[i] / settings.joint_inertia[i]
     state.gain_scale[i] = 1.0 + state.rotor_error[i] / J * lost
