@@ -319,13 +319,21 @@ def test_error_of_the_guess_is_between_no_rotor_and_the_guess(evidence, share):
 
 
 @pytest.mark.parametrize(
-    ('asked', 'kept'), [(-0.5, True), (-1.9, True), (-2.1, False), (1.0, True)]
+    ('asked', 'work', 'kept'),
+    [
+        (-0.5, 1.0, True),
+        (-1.9, 1.0, True),
+        (-2.1, 1.0, False),
+        (1.0, 1.0, True),
+        (1.0, -1.0, False),
+        (-1.0, -1.0, False),
+    ],
 )
-def test_half_oscillation_that_no_drive_explains_is_forgotten(asked, kept):
-    """As pushes are: what they ask for is several times what a drive can lack."""
+def test_half_oscillation_that_no_drive_explains_is_forgotten(asked, work, kept):
+    """As pushes are: they ask for more than a drive can lack, or move it against its torque."""
     law, swing = swinging_panda(199)
     counted = law.state.rotor_sums[:2].copy()
-    half = 1e6 * np.array([asked * law.settings.unsure_rotor, np.ones(7)])
+    half = 1e6 * np.array([asked * law.settings.unsure_rotor, np.full(7, work)])
     law.state.rotor_sums[2:4] = half
     swing(199, 208)  # past the next reversal of the acceleration
     added = law.state.rotor_sums[:2] - counted
