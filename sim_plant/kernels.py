@@ -26,7 +26,6 @@ from blf_dsc_controller.compiled.views import part, view
 from sim_plant.arm import Arm, fill_gravity
 from sim_plant.layout import (
     MEASURED,
-    Encoders,
     PlantSettings,
     PlantState,
     settings_of,
@@ -52,17 +51,17 @@ def generator(seed: int) -> np.random.Generator:
     return np.random.Generator(np.random.PCG64(np.random.SeedSequence(seed)))
 
 
-@inner
-def is_noisy(encoders: Encoders) -> bool:
-    """Return whether a reading needs random numbers at all."""
-    return encoders.position_noise > 0.0 or encoders.velocity_noise > 0.0
+def drawn(plant: PlantSettings) -> slice:
+    """Return which of the 3n random numbers of a reading are drawn at all.
 
-
-@inner
-def draw(rng: np.random.Generator, noise: Array) -> None:
-    """Fill `noise` with the same standard normal numbers as `rng.standard_normal(out=noise)`."""
-    for i in range(noise.size):
-        noise[i] = rng.standard_normal()
+    They are those of positions and velocities, then those of the torques.
+    """
+    encoders = plant.encoders
+    sensed = encoders.position_noise > 0.0 or encoders.velocity_noise > 0.0
+    n = plant.n
+    return slice(
+        0 if sensed else 2 * n, 3 * n if plant.drives.torque_noise > 0.0 else 2 * n
+    )
 
 
 @inner
@@ -187,9 +186,9 @@ def is_due(plant: PlantSettings, now: PlantState) -> bool:
 
 @inner
 def observe(
-    plant: PlantSettings, now: PlantState, rng: np.random.Generator, measurement: Array
+    plant: PlantSettings, now: PlantState, noise: Array, measurement: Array
 ) -> None:
-    """Write [q, dq, effort] (3n,) of this sample, and draw its noise.
+    """Write [q, dq, effort] (3n,) of this sample, with its standard normal noise (3n,).
 
     `effort` is the torque applied over the last interval [N m], before the first one
     that with which the drives hold the arm.  Reading a sample again gives the same
@@ -200,10 +199,10 @@ def observe(
         update_loads(plant, now)
         compensate(plant, now)
     if is_due(plant, now):
-        if is_noisy(plant.encoders):
-            draw(rng, now.reading.noise)
-        if plant.drives.torque_noise > 0.0:
-            draw(rng, now.drives.noise)
+        for i in range(2 * n):
+            now.reading.noise[i] = noise[i]
+        for i in range(n):
+            now.drives.noise[i] = noise[2 * n + i]
         update_loads(plant, now)
         sense(plant, now)
     for i in range(n):
@@ -253,7 +252,7 @@ def run_plant(
     arm: Arm,
     settings: Array,
     state: Array,
-    rng: np.random.Generator,
+    noise: Array,
     tasks: int,
     command: Array,
     measurement: Array,
@@ -264,6 +263,6 @@ def run_plant(
     if tasks & STEP:
         step(plant, now, command)
     if tasks & OBSERVE:
-        observe(plant, now, rng, measurement)
+        observe(plant, now, noise, measurement)
     if tasks & TRUTH:
         truth(plant, now, out)

@@ -16,7 +16,6 @@ from blf_dsc_controller.configuration.plant import PlantConfig
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.extras import import_extra
 from sim_plant.kernels import actuate, apply_rate_limit, compensate
-from sim_plant.layout import PlantSettings
 from sim_plant.motion import update_loads
 from sim_plant.plant import Plant, plant_settings, urdf_of
 
@@ -43,19 +42,13 @@ class MujocoPlant(Plant):
             BlfDscError: MuJoCo is missing, or cannot read the arm.
         """
         self._mujoco = import_extra('mujoco', 'mujoco', 'physics: mujoco')
-        self._settings = plant_settings(config)
         start = config.initial
-        super().__init__(self._settings, start.position, start.velocity, config.seed)
+        super().__init__(plant_settings(config), start.position, start.velocity, config.seed)
         self.model = model_of(config)
         self.data = self._mujoco.MjData(self.model)
         self._tip = self.model.body(PAYLOAD)
         self._to_world = _rotation_of_base(config, self.model)
         self.reset()
-
-    def change(self, settings: PlantSettings) -> None:
-        """Switch to other loads, events and friction."""
-        self._settings = settings
-        super().change(settings)
 
     def reset(self) -> None:
         """Return to sample 0 and reseed, so that the run is repeated."""

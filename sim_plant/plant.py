@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, TypeVar, get_type_hints
 
 import numpy as np
@@ -19,6 +19,7 @@ from numpy.typing import ArrayLike, NDArray
 from blf_dsc_controller.arms.two_link import PARAMETER_NAMES, urdf
 from blf_dsc_controller.arms.urdf import Chain, inertia_of, moved, pseudo_inertia
 from blf_dsc_controller.compiled.entry import Entry
+from blf_dsc_controller.compiled.jit import direct
 from blf_dsc_controller.compiled.layout import pack
 from blf_dsc_controller.configuration.plant import Deviation, PlantConfig
 from blf_dsc_controller.configuration.robot import parameters_of
@@ -27,7 +28,9 @@ from sim_plant.kernels import (
     OBSERVE,
     STEP,
     TRUTH,
+    drawn,
     generator,
+    is_due,
     lag,
     plant_views,
     run_plant,
@@ -81,7 +84,7 @@ class Plant:
         self.joints = settings.n
         self.period_ns = settings.period_ns
         self.state = np.zeros(state_size(settings))
-        self._now = plant_views(self.arm, self.settings, self.state)[1]
+        self._settings, self._now = plant_views(self.arm, self.settings, self.state)
         self._q, self._dq = self._now.x[: 2 * self.joints].reshape(2, -1)
         self._q[:], self._dq[:] = position, velocity
         self._now.reading.sample[0] = self._now.acting.sample[0] = -1.0
@@ -89,6 +92,7 @@ class Plant:
         self._measurement = np.zeros(3 * self.joints)
         self._truth = np.zeros(settings.p + 3 * self.joints)
         self._seed = seed
+        self._noise = np.zeros(3 * self.joints)
         self.rng = generator(seed)
 
     @functools.cached_property
@@ -96,8 +100,12 @@ class Plant:
         """The kernel of `step`, `measure` and `truth`, for a compiled loop."""
         return Entry(run_plant, *self._arguments(STEP, self._truth))
 
+    @functools.cached_property
+    def _run(self) -> Callable[..., None]:
+        return direct(run_plant, *self._arguments(STEP, self._truth))
+
     def _arguments(self, tasks: int, torque: np.ndarray) -> tuple[Any, ...]:
-        vectors = self.arm, self.settings, self.state, self.rng
+        vectors = self.arm, self.settings, self.state, self._noise
         return *vectors, tasks, torque, self._measurement, self._truth
 
     @property
@@ -117,18 +125,34 @@ class Plant:
 
     def measure(self) -> np.ndarray:
         """Return [q, dq, effort] (3n,) of this sample, overwritten by the next call."""
-        run_plant(*self._arguments(OBSERVE, self._truth))
+        if is_due(self._settings, self._now):
+            self.rng.standard_normal(out=self._noise[drawn(self._settings)])
+        self._run(*self._arguments(OBSERVE, self._truth))
         return self._measurement
+
+    def noise_of(self, samples: int) -> np.ndarray:
+        """Draw the noise (samples, 3n) of this sample and of those that follow, for a compiled loop.
+
+        A reading that is made already, or repeated, draws none.
+        """
+        k = self.sample + np.arange(samples)
+        every = self._settings.encoders.repeat_every or math.inf
+        due = (k != self._now.reading.sample[0]) & ((k == 0) | (k % every > 0))
+        noise = np.zeros((samples, 3 * self.joints))
+        columns = drawn(self._settings)
+        shape = np.count_nonzero(due), columns.stop - columns.start
+        noise[due, columns] = self.rng.standard_normal(shape)
+        return noise
 
     def step(self, torque: np.ndarray) -> None:
         """Apply the commanded torque (n,) [N m] and advance to the next sample."""
-        run_plant(*self._arguments(STEP, torque))
+        self._run(*self._arguments(STEP, torque))
 
     def change(self, settings: PlantSettings) -> None:
         """Switch to settings with the same number of joints, period and delay."""
         self.arm = settings.arm
         self.settings = pack(settings)
-        self._now = plant_views(self.arm, self.settings, self.state)[1]
+        self._settings, self._now = plant_views(self.arm, self.settings, self.state)
         self._now.acting.sample[0] = -1.0
 
     def truth(self) -> np.ndarray:
@@ -136,7 +160,7 @@ class Plant:
 
         The next call overwrites it.
         """
-        run_plant(*self._arguments(TRUTH, self._truth))
+        self._run(*self._arguments(TRUTH, self._truth))
         return self._truth
 
     def reset(self) -> None:

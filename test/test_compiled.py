@@ -332,17 +332,17 @@ def test_kernel_that_allocates_an_array_is_rejected():
 
 
 @jit.kernel
-def fill_with_noise(rng, out):
+def copy(given, out):
     for i in range(out.size):
-        out[i] = rng.standard_normal()
+        out[i] = given[i]
 
 
 def test_kernel_releases_references_to_its_arguments():
-    arguments = np.random.default_rng(1), np.zeros(3)
-    fill_with_noise(*arguments)
+    arguments = np.ones(3), np.zeros(3)
+    copy(*arguments)
     before = [sys.getrefcount(argument) for argument in arguments]
     for _ in range(3):
-        fill_with_noise(*arguments)
+        copy(*arguments)
     assert [sys.getrefcount(argument) for argument in arguments] == before
 
 

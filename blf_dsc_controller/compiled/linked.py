@@ -33,7 +33,6 @@ from numba.core.environment import lookup_environment
 from numba.core.errors import UnsupportedError
 from numba.core.runtime import rtsys
 from numba.core.typed_passes import NativeLowering
-from numba.core.types import NumPyRandomGeneratorType
 from numba.extending import intrinsic
 from numba.np.arrayobj import populate_array
 
@@ -99,14 +98,7 @@ class _LowerKernel(NativeLowering):  # type: ignore[misc]
 
     def run_pass(self, state: Any) -> bool:
         """Lower a kernel, and set the environments of the functions in it."""
-        counting = state.targetctx
         _without_reference_counts(state)
-        if any(
-            isinstance(argument, NumPyRandomGeneratorType) for argument in state.args
-        ):
-            # It is allocated for the call, and freed by the wrapper that counts
-            # references.
-            state.targetctx.create_cpython_wrapper = counting.create_cpython_wrapper
         changed = bool(super().run_pass(state))
         library = state.library
         module = library._final_module  # noqa: SLF001 - as numba's cache

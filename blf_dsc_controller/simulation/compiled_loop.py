@@ -53,7 +53,7 @@ class PlantArguments(NamedTuple):
     arm: Arm
     settings: np.ndarray
     state: np.ndarray
-    rng: np.random.Generator
+    noise: np.ndarray  # a row for each sample
     period_ns: int
 
 
@@ -83,7 +83,7 @@ def run_plant(
         plant.arm,
         plant.settings,
         plant.state,
-        plant.rng,
+        plant.noise[row],
         tasks,
         torque,
         rows.measurements[row],
@@ -159,7 +159,7 @@ def run_span(controller: Controller, plant: Plant, span: Span, rows: Rows) -> bo
         plant.arm,
         plant.settings,
         plant.state,
-        plant.rng,
+        plant.noise_of(span.last - span.first + 1),
         plant.period_ns,
     )
     of_law = LawArguments(
