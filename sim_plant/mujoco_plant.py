@@ -43,7 +43,9 @@ class MujocoPlant(Plant):
         """
         self._mujoco = import_extra('mujoco', 'mujoco', 'physics: mujoco')
         start = config.initial
-        super().__init__(plant_settings(config), start.position, start.velocity, config.seed)
+        super().__init__(
+            plant_settings(config), start.position, start.velocity, config.seed
+        )
         self.model = model_of(config)
         self.data = self._mujoco.MjData(self.model)
         self._tip = self.model.body(PAYLOAD)

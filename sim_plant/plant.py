@@ -131,9 +131,9 @@ class Plant:
         return self._measurement
 
     def noise_of(self, samples: int) -> np.ndarray:
-        """Draw the noise (samples, 3n) of this sample and of those that follow, for a compiled loop.
+        """Draw the noise (samples, 3n) of this sample and of those that follow.
 
-        A reading that is made already, or repeated, draws none.
+        It is for a compiled loop. A reading that is made already, or repeated, has none.
         """
         k = self.sample + np.arange(samples)
         every = self._settings.encoders.repeat_every or math.inf

@@ -55,6 +55,7 @@ from blf_dsc_controller.identification.identify import (
 )
 from blf_dsc_controller.identification.physical import Cone, solve
 from blf_dsc_controller.identification.prior import Prior, prior_of
+from blf_dsc_controller.identification.problem import problem_of
 from blf_dsc_controller.identification.reading import read_recording
 from blf_dsc_controller.identification.recording import (
     Recording,
@@ -615,6 +616,22 @@ def test_rows_hold_for_an_exact_motion(period, tolerance):
     assert (np.abs(residual[inner]) < tolerance * scale).all()
     # No window contains the gap.
     assert np.abs(rows.time - t[len(t) // 2]).min() >= 0.1
+
+
+def test_solution_from_that_of_another_problem_is_the_same(plain):
+    problem = problem_of(
+        recording_of(measured(plain, 3)), AT_TIP, 'torque', None, find_signs=False
+    )
+    rows, fit = problem.rows, problem.windows.fit
+    rows.set_sliding(np.full(7, 3e-3))
+    other = regression(rows, fit, problem.G, problem.prior)
+    rows.set_sliding(np.zeros(7))
+    alone = regression(rows, fit, problem.G, problem.prior)
+    assert np.abs(other.deviation / alone.deviation - 1.0).max() > 0.5
+    near = regression(rows, fit, problem.G, problem.prior, other)
+    np.testing.assert_allclose(near.deviation, alone.deviation, rtol=1e-4)
+    torques = rows.torques(fit, (near.theta - alone.theta)[:-1])
+    assert (np.abs(torques) < 1e-3 * alone.deviation).all()
 
 
 def test_memory_of_identification_does_not_grow_with_the_recording():

@@ -152,9 +152,9 @@ def identify_arm(
     begin(STAGES[2])
     selected = select(rows, windows.fit, problem.G, problem.prior)
     begin(STAGES[3])
-    trained = fitted(rows, windows.fit, problem.G, selected.prior)
+    trained = fitted(rows, windows.fit, problem.G, selected.prior, selected.found)
     score = scored(rows, windows, problem.G, problem.prior.mean, trained.values)
-    final = fitted(rows, windows.moving, problem.G, selected.prior)
+    final = fitted(rows, windows.moving, problem.G, selected.prior, selected.found)
     dynamics = nearest_friction(rows, windows, final.values)
     begin(STAGES[4])
     return Identified(
@@ -165,7 +165,8 @@ def identify_arm(
         prior=problem.prior.mean,
         prior_covariance=problem.prior.D @ problem.prior.D.T,
         values=final.values,
-        covariance=final.covariance + friction_doubt(problem, selected.prior),
+        covariance=final.covariance
+        + friction_doubt(problem, selected.prior, selected.found),
         dynamics=dynamics,
         score=score,
         distances=selected.distances,

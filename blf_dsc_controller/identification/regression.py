@@ -3,7 +3,8 @@
 
 Each joint is weighted by the inverse deviation of its own residual, the delay of the
 torques is linearised about its last estimate, and the load friction computed with the
-last estimate of gravity: a few passes until they agree.
+last estimate of gravity: a few passes until the deviations agree, fewer from the solution of
+a problem that is much like it.
 
 The covariance allows for residuals that are correlated,
 
@@ -29,7 +30,8 @@ from blf_dsc_controller.run import Floats
 FOLDS = 5
 """Parts of the recording for cross-validation."""
 
-_PASSES = 6
+_PASSES = 10
+_AGREE = 1e-4  # relative change of a deviation; values then agree to some 1e-6
 _DEVIATION = 0.1  # of a joint's torque, of its residual at first
 _FLOOR = 1e-3  # of that, least deviation
 _AT_ONCE = 8  # times the columns, rows of a triangle that are reduced at once
@@ -42,6 +44,7 @@ class Regression(NamedTuple):
     b: Floats  # (.,)
     # (parts, n, k + 1, k + 1) [A | b]^T [A | b] of successive windows, for each joint
     folds: Floats
+    theta: Floats  # (m + 1,) solution without bounds: unknowns of `Rows`, delay in s
     scatter: Floats  # (k, k) covariance of A^T b
     lasting: Floats  # (n,) correlation length of each joint's residual, s
     deviation: Floats  # (n,) of each joint's residual, N m or N
@@ -49,14 +52,26 @@ class Regression(NamedTuple):
 
 
 def regression(
-    rows: Rows, fit: Indices, G: Floats, prior: Prior, parts: int = FOLDS
+    rows: Rows,
+    fit: Indices,
+    G: Floats,
+    prior: Prior,
+    near: Regression | None = None,
+    *,
+    parts: int = FOLDS,
 ) -> Regression:
-    """Return the problem of the prior's z, with deviations and gravity of its own solution."""
+    """Return the problem of the prior's z, with deviations and gravity of its own solution.
+
+    The solution is looked for from that of a problem `near` it.
+    """
     mean = G @ prior.mean
     B = G @ prior.D
     theta = mean
     deviation = _DEVIATION * np.sqrt(np.mean(rows.u(0.0)[fit] ** 2, axis=0))
     floor = _FLOOR * deviation + 1e-12
+    if near:
+        theta = near.theta
+        deviation = np.maximum(near.deviation, floor)
     counted = np.sum(rows.weight[fit] ** 2, axis=0) - theta.size / deviation.size
     counted = np.maximum(counted, 1.0)
     for _ in range(_PASSES):
@@ -72,12 +87,21 @@ def regression(
         found = np.sqrt(np.sum(left**2, axis=1) / counted)
         deviation_used = deviation
         deviation = np.maximum(found, floor)
+        if (np.abs(deviation - deviation_used) <= _AGREE * deviation).all():
+            break
     residual = np.concatenate(
         [each @ np.append(theta, -1.0) for each in weighted.blocks()]
     )
     lengths = np.array([correlation_length(column) for column in residual.T])
     solved = Regression(
-        A, b, np.empty(0), np.empty(0), lengths * HOP, deviation_used, weighted.delay
+        A,
+        b,
+        np.empty(0),
+        theta,
+        np.empty(0),
+        lengths * HOP,
+        deviation_used,
+        weighted.delay,
     )
     folds = np.array(list(successive(rows, fit, G, prior, solved, parts)))
     together = folds.sum(axis=0)[:, :-1, :-1]
@@ -175,9 +199,15 @@ class Fit(NamedTuple):
     lasting: Floats  # (n,) correlation length of each joint's residual, s
 
 
-def fitted(rows: Rows, windows: Indices, G: Floats, prior: Prior) -> Fit:
+def fitted(
+    rows: Rows,
+    windows: Indices,
+    G: Floats,
+    prior: Prior,
+    near: Regression | None = None,
+) -> Fit:
     """Return the most likely values over physical bodies, from these windows."""
-    problem = regression(rows, windows, G, prior)
+    problem = regression(rows, windows, G, prior, near)
     z = solve(problem.A, problem.b, prior.cones, prior.start)
     values = prior.mean + prior.D @ z
     one = np.eye(z.size)
