@@ -251,7 +251,7 @@ def new_record(
     n = len(plant.joints)
     names = parameter_names_of(plant)
     return Record(
-        stamps=np.array(chosen, dtype=np.int64) * plant.sample_time_ns,
+        stamps=np.arange(chosen.start, chosen.stop) * plant.sample_time_ns,
         measurements=np.zeros((size, 3 * n)),
         samples=np.zeros((size, controller.sample_vector.size)),
         truths=np.zeros((size, len(names) + 3 * n)),
