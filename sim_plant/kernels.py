@@ -33,8 +33,9 @@ from sim_plant.layout import (
 )
 from sim_plant.motion import disturbing_torque, integrate, update_loads
 
-STEP, OBSERVE, TRUTH = 1, 2, 4
-"""Tasks of `run_plant`: its command, its measurement, its truth."""
+DRIVE, MOVE, OBSERVE, TRUTH = 1, 2, 4, 8
+"""Tasks of `run_plant`."""
+STEP = DRIVE | MOVE
 
 
 @inner
@@ -215,23 +216,31 @@ def observe(
 
 
 @inner
-def step(plant: PlantSettings, now: PlantState, command: Array) -> None:
-    """Apply the commanded torque (n,) [N m] of this sample and advance to the next one."""
+def drive(plant: PlantSettings, now: PlantState, command: Array) -> None:
+    """Write what the drives make of the commanded torque (n,) [N m] in this sample, and the loads.
+
+    If they stop, the arm stands still at once.
+    """
     drives = now.drives
     if apply_rate_limit(plant, now, command):
         for i in range(plant.n):
             now.x[plant.n + i] = drives.applied[i] = drives.motor[i] = 0.0
-        now.sample[0] += 1.0
         return
     actuate(plant, now, drives.command)
     update_loads(plant, now)
     compensate(plant, now)
     for i in range(plant.n):
         drives.whole[i] = drives.applied[i] + drives.added[i]
-    h = plant.period_ns * 1e-9 / plant.steps
-    for k in range(plant.steps):
-        t = now.sample[0] * plant.period_ns * 1e-9 + k * h
-        integrate(plant, now, t, h, drives.whole)
+
+
+@inner
+def move(plant: PlantSettings, now: PlantState) -> None:
+    """Advance to the next sample, with the torque of the drives."""
+    if now.drives.stopped[0] == 0.0:
+        h = plant.period_ns * 1e-9 / plant.steps
+        for k in range(plant.steps):
+            t = now.sample[0] * plant.period_ns * 1e-9 + k * h
+            integrate(plant, now, t, h, now.drives.whole)
     now.sample[0] += 1.0
 
 
@@ -258,10 +267,12 @@ def run_plant(
     measurement: Array,
     out: Array,
 ) -> None:
-    """Do the tasks, a sum of STEP, OBSERVE and TRUTH, in this order, with packed vectors."""
+    """Do the tasks, a sum of them, in their order, with packed vectors."""
     plant, now = plant_views(arm, settings, state)
-    if tasks & STEP:
-        step(plant, now, command)
+    if tasks & DRIVE:
+        drive(plant, now, command)
+    if tasks & MOVE:
+        move(plant, now)
     if tasks & OBSERVE:
         observe(plant, now, noise, measurement)
     if tasks & TRUTH:

@@ -15,8 +15,7 @@ import numpy as np
 from blf_dsc_controller.configuration.plant import PlantConfig
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.extras import import_extra
-from sim_plant.kernels import actuate, apply_rate_limit, compensate
-from sim_plant.motion import update_loads
+from sim_plant.kernels import DRIVE
 from sim_plant.plant import Plant, plant_settings, urdf_of
 
 PAYLOAD = 'payload of sim_plant'
@@ -61,19 +60,15 @@ class MujocoPlant(Plant):
 
     def step(self, torque: np.ndarray) -> None:
         """Apply the commanded torque (n,) [N m] and the loads at its start."""
-        settings = self._settings
         now = self._now
         data = self.data
-        friction = settings.disturbance
+        friction = self._settings.disturbance
         acting = now.acting
-        drives = now.drives
-        if apply_rate_limit(settings, now, torque):
-            data.qvel[:] = self._dq[:] = drives.applied[:] = drives.motor[:] = 0.0
+        self._run(*self._arguments(DRIVE, torque))
+        if self.is_stopped:
+            data.qvel[:] = 0.0
             now.sample[0] += 1.0
             return
-        actuate(settings, now, drives.command)
-        update_loads(settings, now)
-        compensate(settings, now)
         self._tip.mass[0] = acting.payload[0]
         speed = data.qvel / friction.stribeck_velocity
         self.model.dof_damping[:] = acting.viscous
@@ -84,7 +79,7 @@ class MujocoPlant(Plant):
             friction.frequency * data.time + friction.phase
         )
         ripple = friction.ripple * np.sin(friction.ripple_frequency * data.qpos)
-        data.qfrc_applied[:] = drives.applied + drives.added
+        data.qfrc_applied[:] = now.drives.whole
         data.qfrc_applied -= acting.constant + wave + ripple
         self._mujoco.mj_step(self.model, data)
         self._q[:], self._dq[:] = data.qpos, data.qvel
