@@ -23,7 +23,9 @@ import numpy as np
 
 from blf_dsc_controller.arms.base_parameters import BaseParameters
 from blf_dsc_controller.arms.urdf import Chain, pseudo_inertia, rotational_inertia
-from blf_dsc_controller.compiled.algebra import (
+from blf_dsc_controller.compiled.jit import called, compile_methods, inner
+from blf_dsc_controller.compiled.layout import Array, pack, size_of, view_of
+from blf_dsc_controller.numerics.algebra import (
     Vector,
     cholesky_factor,
     cholesky_solve,
@@ -35,9 +37,7 @@ from blf_dsc_controller.compiled.algebra import (
     transform,
     vector,
 )
-from blf_dsc_controller.compiled.elementary import cos, sin
-from blf_dsc_controller.compiled.jit import called, compile_methods, inner
-from blf_dsc_controller.compiled.layout import Array, pack, size_of, view_of
+from blf_dsc_controller.numerics.elementary import cos, sin
 
 
 class RigidBodies(NamedTuple):

@@ -19,10 +19,10 @@ before.
 
 import numpy as np
 
-from blf_dsc_controller.compiled.elementary import exp, tanh
 from blf_dsc_controller.compiled.jit import inner, kernel
 from blf_dsc_controller.compiled.layout import Array
 from blf_dsc_controller.compiled.views import part, view
+from blf_dsc_controller.numerics.elementary import exp, tanh
 from sim_plant.arm import Arm, fill_gravity
 from sim_plant.layout import (
     MEASURED,

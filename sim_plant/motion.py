@@ -18,10 +18,10 @@ t + c_i h and x + h sum_j a_ij k_j; the step ends at x + h sum_i b_i k_i.
 
 import numpy as np
 
-from blf_dsc_controller.compiled.elementary import exp, sin, tanh
 from blf_dsc_controller.compiled.jit import inner
 from blf_dsc_controller.compiled.layout import Array
 from blf_dsc_controller.compiled.views import part
+from blf_dsc_controller.numerics.elementary import exp, sin, tanh
 from sim_plant.layout import PlantSettings, PlantState
 
 

@@ -33,12 +33,10 @@ from blf_dsc_controller.arms import model
 from blf_dsc_controller.arms.two_link import TwoLink
 from blf_dsc_controller.compiled import (
     dependencies,
-    elementary,
     entry,
     jit,
     kernel_cache,
 )
-from blf_dsc_controller.compiled.algebra import independent_columns, inverse, product
 from blf_dsc_controller.compiled.layout import (
     Array,
     Cell,
@@ -53,6 +51,8 @@ from blf_dsc_controller.configuration.nodes import load_loop
 from blf_dsc_controller.configuration.schema import flatten
 from blf_dsc_controller.law.controller import update
 from blf_dsc_controller.law.laws import for_law
+from blf_dsc_controller.numerics import elementary
+from blf_dsc_controller.numerics.algebra import independent_columns, inverse, product
 from blf_dsc_controller.reference.terms import cubics, minimum_jerk
 from blf_dsc_controller.simulation import compiled_loop
 from blf_dsc_controller.simulation.compiled_loop import run_loop

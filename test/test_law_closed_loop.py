@@ -18,11 +18,11 @@ from plain_law import PlainLaw, R, dynamics, regressor
 from plants import QUIET, START
 from scipy.integrate import solve_ivp
 
-from blf_dsc_controller.compiled.algebra import cholesky_factor
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.schema import build, change
 from blf_dsc_controller.law.factory import columns_of, controller_of, settings_of_config
 from blf_dsc_controller.law.state import CHOICES
+from blf_dsc_controller.numerics.algebra import cholesky_factor
 from blf_dsc_controller.reference.terms import sampled
 
 

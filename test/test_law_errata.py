@@ -18,11 +18,11 @@ from paper_case import EXACT, P, configured, run
 from plain_law import R, dynamics, regressor
 from plants import QUIET, START
 
-from blf_dsc_controller.compiled.algebra import cholesky_factor
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.errors import StartError
 from blf_dsc_controller.law import adaptation, barrier
 from blf_dsc_controller.law.state import CHOICES, FILTERED
+from blf_dsc_controller.numerics.algebra import cholesky_factor
 from blf_dsc_controller.reference.approach import check_takeover
 
 

@@ -10,7 +10,6 @@ from paper_case import configured, several
 from blf_dsc_controller.analysis.metrics import measure
 from blf_dsc_controller.analysis.metrics_table import format_table
 from blf_dsc_controller.bags.reader import read_run
-from blf_dsc_controller.compiled.algebra import cholesky_factor
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.errors import ConfigurationError
 from blf_dsc_controller.law.factory import controller_of
@@ -32,6 +31,7 @@ from blf_dsc_controller.law.weighing import (
     solve,
 )
 from blf_dsc_controller.law.window import add_products
+from blf_dsc_controller.numerics.algebra import cholesky_factor
 from blf_dsc_controller.replay.verify import verify
 from blf_dsc_controller.simulation.loop import simulate, write_bag
 

@@ -18,9 +18,9 @@ from hypothesis import strategies as st
 from paper_case import NO_DISTURBANCE, configured, run
 from scipy.linalg import eigh
 
-from blf_dsc_controller.compiled.algebra import cholesky_factor, cholesky_solve
 from blf_dsc_controller.law import adaptation, excitation, prediction, ripple, window
 from blf_dsc_controller.law.factory import controller_of, estimate_names
+from blf_dsc_controller.numerics.algebra import cholesky_factor, cholesky_solve
 
 
 class Window:

@@ -23,7 +23,7 @@ import numpy as np
 
 from blf_dsc_controller.arms.serial_chain import ROTOR, SerialChain, serial_chain
 from blf_dsc_controller.arms.urdf import Chain, inertia_of, moved, pseudo_inertia
-from blf_dsc_controller.compiled.algebra import independent_columns, product
+from blf_dsc_controller.numerics.algebra import independent_columns, product
 
 LINKS = 0.3
 """Standard deviation of the mass of a body and of its spread, relative to their values."""

@@ -19,8 +19,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from blf_dsc_controller.compiled.elementary import exp, tanh
 from blf_dsc_controller.compiled.jit import inner, kernel
+from blf_dsc_controller.numerics.elementary import exp, tanh
 from blf_dsc_controller.run import Floats
 
 STRIBECK_SPEED = 0.1

@@ -16,9 +16,9 @@ import numpy as np
 
 from blf_dsc_controller.arms.serial_chain import SerialChain
 from blf_dsc_controller.arms.two_link import TwoLink
-from blf_dsc_controller.compiled.algebra import inverse, product
 from blf_dsc_controller.compiled.jit import compile_methods, kernel
 from blf_dsc_controller.compiled.layout import Array
+from blf_dsc_controller.numerics.algebra import inverse, product
 
 
 class ArmModel(Protocol):

@@ -24,10 +24,10 @@ from typing import Annotated, NamedTuple
 import numpy as np
 
 from blf_dsc_controller.arms.urdf import INERTIA_NAMES, INERTIA_UNITS, Chain
-from blf_dsc_controller.compiled.algebra import Vector, cross, dot, plus, product
-from blf_dsc_controller.compiled.elementary import cos, sin
 from blf_dsc_controller.compiled.jit import called, inner
 from blf_dsc_controller.compiled.layout import Array, pack, view_of
+from blf_dsc_controller.numerics.algebra import Vector, cross, dot, plus, product
+from blf_dsc_controller.numerics.elementary import cos, sin
 
 ROTOR = len(INERTIA_NAMES)
 """Entry of the rotor inertia, after the ten inertial parameters of a body."""

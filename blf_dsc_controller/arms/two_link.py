@@ -19,9 +19,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import NamedTuple
 
-from blf_dsc_controller.compiled.elementary import cos, sin
 from blf_dsc_controller.compiled.jit import inner
 from blf_dsc_controller.compiled.layout import Array
+from blf_dsc_controller.numerics.elementary import cos, sin
 
 PARAMETER_NAMES = ('(m1+m2)*l1^2', 'm2*l2^2', 'm2*l1*l2')
 

@@ -26,9 +26,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from blf_dsc_controller.compiled.algebra import product
-from blf_dsc_controller.compiled.elementary import cos, sin
 from blf_dsc_controller.errors import BlfDscError
+from blf_dsc_controller.numerics.algebra import product
+from blf_dsc_controller.numerics.elementary import cos, sin
 
 INERTIA_NAMES = ('m', 'm*cx', 'm*cy', 'm*cz', 'Ixx', 'Ixy', 'Iyy', 'Ixz', 'Iyz', 'Izz')
 """The ten inertial parameters of a body, about the origin and along the axes of a frame."""

@@ -20,8 +20,8 @@ from numpy.typing import NDArray
 from blf_dsc_controller.arms.base_parameters import BaseParameters
 from blf_dsc_controller.arms.model import inertia_matrices, regressors_at
 from blf_dsc_controller.arms.urdf import Chain
-from blf_dsc_controller.compiled.algebra import inverse, product
 from blf_dsc_controller.configuration.robot import Robot
+from blf_dsc_controller.numerics.algebra import inverse, product
 from blf_dsc_controller.tool.errors import MOST_JOINTS, Tool
 
 if TYPE_CHECKING:

@@ -15,8 +15,8 @@ from __future__ import annotations
 import numpy as np
 
 from blf_dsc_controller.arms.friction import slidings
-from blf_dsc_controller.compiled.elementary import exp
 from blf_dsc_controller.compiled.jit import kernel
+from blf_dsc_controller.numerics.elementary import exp
 from blf_dsc_controller.run import Floats
 
 DISTANCES = (0.0, 1e-4, 3e-4, 1e-3, 3e-3)

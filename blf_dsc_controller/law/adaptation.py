@@ -26,12 +26,12 @@ nearest point of the ball in that metric, which is never farther from a true P i
 
 from math import isfinite, sqrt
 
-from blf_dsc_controller.compiled.algebra import cholesky_solve
 from blf_dsc_controller.compiled.jit import inner
 from blf_dsc_controller.compiled.layout import Array
 from blf_dsc_controller.compiled.views import part
 from blf_dsc_controller.law import friction, torque
 from blf_dsc_controller.law.state import NEWTON, Settings, Signals, State
+from blf_dsc_controller.numerics.algebra import cholesky_solve
 
 _ON_SPHERE = 1.0 - 1e-12  # of radius^2: `retract` ends within rounding of the sphere
 _ROUNDED = 1.0 + 1e-14

@@ -26,9 +26,9 @@ bound narrows (doc/stability.md, 'A bound that narrows').
 
 from math import pi
 
-from blf_dsc_controller.compiled.elementary import cos, exp, sin
 from blf_dsc_controller.compiled.jit import inner
 from blf_dsc_controller.law.state import Settings, Signals
+from blf_dsc_controller.numerics.elementary import cos, exp, sin
 
 _BISECTIONS = 60
 

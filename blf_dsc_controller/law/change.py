@@ -13,12 +13,12 @@ What a window has taught before it was full is taken back: it did not predict wh
 was not fitted to.
 """
 
-from blf_dsc_controller.compiled.algebra import cholesky_factor, cholesky_solve
 from blf_dsc_controller.compiled.jit import inner
 from blf_dsc_controller.compiled.layout import Array
 from blf_dsc_controller.law import adaptation, innovation, window
 from blf_dsc_controller.law.excitation import explained
 from blf_dsc_controller.law.state import Settings, Signals, State
+from blf_dsc_controller.numerics.algebra import cholesky_factor, cholesky_solve
 
 # ratio of mean squares; larger than the gate's, since a solution extrapolates
 _ALARM = 8.0

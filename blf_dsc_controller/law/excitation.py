@@ -25,11 +25,11 @@ most strongly in weakly excited directions.  Likewise, a full window with an unu
 large residual is pulled to an earlier solution, kept once per window.
 """
 
-from blf_dsc_controller.compiled.algebra import cholesky_factor, cholesky_solve
 from blf_dsc_controller.compiled.jit import inner
 from blf_dsc_controller.compiled.layout import Array
 from blf_dsc_controller.law import window
 from blf_dsc_controller.law.state import Settings, Signals, State
+from blf_dsc_controller.numerics.algebra import cholesky_factor, cholesky_solve
 
 _WARM = 4  # inverse iterations from the previous direction
 _COLD = 60  # from an arbitrary direction

@@ -31,7 +31,6 @@ Everything here but the filter runs after the torque has been sent.
 from math import sqrt
 
 from blf_dsc_controller.arms.model import ArmModel
-from blf_dsc_controller.compiled.algebra import cholesky_factor, whiten
 from blf_dsc_controller.compiled.jit import inner, kernel
 from blf_dsc_controller.compiled.layout import Array
 from blf_dsc_controller.law import barrier, friction
@@ -47,6 +46,7 @@ from blf_dsc_controller.law.state import (
 )
 from blf_dsc_controller.law.torque import clip
 from blf_dsc_controller.law.weighing import DEVIATION, MASS, TWO_SIDED, is_first
+from blf_dsc_controller.numerics.algebra import cholesky_factor, whiten
 
 _LASTING = 0.2  # s, correlation length of r, as far as a load is concerned
 _FORGETTING = 1.0  # s, in which the filtered load returns to what is not known of it

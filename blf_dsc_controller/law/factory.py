@@ -34,7 +34,6 @@ from blf_dsc_controller.arms.model import (
 from blf_dsc_controller.arms.serial_chain import ROTOR
 from blf_dsc_controller.arms.tuning import over_postures
 from blf_dsc_controller.arms.urdf import inertia_of, moved, pseudo_inertia
-from blf_dsc_controller.compiled.algebra import inverse, product
 from blf_dsc_controller.compiled.layout import size_of
 from blf_dsc_controller.configuration import law_file
 from blf_dsc_controller.configuration.controller import ControllerConfig
@@ -45,6 +44,7 @@ from blf_dsc_controller.law.blf_dsc import BlfDsc
 from blf_dsc_controller.law.controller import Controller
 from blf_dsc_controller.law.interface import Law
 from blf_dsc_controller.law.state import CHOICES, Settings
+from blf_dsc_controller.numerics.algebra import inverse, product
 from blf_dsc_controller.reference.approach import plan_start, reference_of
 
 _PARAMETER_OF = {

@@ -20,9 +20,9 @@ s^2 is assumed at first, and measured as the mean of e^T C^-1 e / n.  Rows that 
 worse, as under a disturbance that lasts, raise it as they come, and contradict nothing.
 """
 
-from blf_dsc_controller.compiled.algebra import cholesky_factor, whiten
 from blf_dsc_controller.compiled.jit import inner
 from blf_dsc_controller.compiled.layout import Array
+from blf_dsc_controller.numerics.algebra import cholesky_factor, whiten
 
 CORRELATION = 0.2  # s, of the residual
 REFRESH = 0.1  # s, from one solution to the next

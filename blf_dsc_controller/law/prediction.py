@@ -25,11 +25,11 @@ estimate d^3 from the torque, which hides the parameter error.
 from math import sqrt
 
 from blf_dsc_controller.arms.friction import sliding
-from blf_dsc_controller.compiled.elementary import cos, exp, sin
 from blf_dsc_controller.compiled.jit import inner
 from blf_dsc_controller.compiled.layout import Array
 from blf_dsc_controller.law import barrier, external_torque
 from blf_dsc_controller.law.state import FILTERED, Settings, Signals, State
+from blf_dsc_controller.numerics.elementary import cos, exp, sin
 
 
 @inner

@@ -10,10 +10,10 @@ learned from the window like the other columns, and compensated at the position 
 the reference has when the torque acts.
 """
 
-from blf_dsc_controller.compiled.elementary import cos, sin
 from blf_dsc_controller.compiled.jit import inner
 from blf_dsc_controller.compiled.layout import Array
 from blf_dsc_controller.law.state import Settings, Signals
+from blf_dsc_controller.numerics.elementary import cos, sin
 
 
 @inner

@@ -25,10 +25,10 @@ import numpy as np
 
 from blf_dsc_controller.arms.model import regressors_at
 from blf_dsc_controller.arms.serial_chain import SerialChain, fill_regressor
-from blf_dsc_controller.compiled.elementary import sin
 from blf_dsc_controller.compiled.jit import inner
 from blf_dsc_controller.compiled.layout import Array
 from blf_dsc_controller.law.state import Settings, Signals, State
+from blf_dsc_controller.numerics.elementary import sin
 
 LEVEL_CUT = 1.0
 RATE_CUT = 2.0

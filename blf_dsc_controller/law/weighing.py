@@ -27,7 +27,6 @@ torque: `weigh` runs after it has been sent.
 from math import sqrt
 
 from blf_dsc_controller.arms.model import ArmModel
-from blf_dsc_controller.compiled.algebra import cholesky_factor, cholesky_solve
 from blf_dsc_controller.compiled.jit import inner, kernel
 from blf_dsc_controller.compiled.layout import Array
 from blf_dsc_controller.law import innovation, window
@@ -39,6 +38,7 @@ from blf_dsc_controller.law.state import (
     signals_of,
     state_of,
 )
+from blf_dsc_controller.numerics.algebra import cholesky_factor, cholesky_solve
 
 _FEWEST = 0.5  # s of motion that a part has
 # s, for which the latest rows are kept apart, and then those of them again

@@ -15,10 +15,10 @@ different units comparable: Phi x = lambda R x.
 
 from math import sqrt
 
-from blf_dsc_controller.compiled.algebra import cholesky_factor, cholesky_solve
 from blf_dsc_controller.compiled.jit import called, inner
 from blf_dsc_controller.compiled.layout import Array
 from blf_dsc_controller.law.state import Settings, Signals, State
+from blf_dsc_controller.numerics.algebra import cholesky_factor, cholesky_solve
 
 
 @inner

@@ -30,11 +30,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from blf_dsc_controller.compiled.algebra import product
-from blf_dsc_controller.compiled.elementary import cos, sin
 from blf_dsc_controller.compiled.jit import inner, kernel
 from blf_dsc_controller.compiled.layout import Array
 from blf_dsc_controller.compiled.views import part, view
+from blf_dsc_controller.numerics.algebra import product
+from blf_dsc_controller.numerics.elementary import cos, sin
 
 SINUSOIDS = 0
 SPLINE = 1

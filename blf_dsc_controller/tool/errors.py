@@ -25,7 +25,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from blf_dsc_controller.arms.urdf import Chain
-from blf_dsc_controller.compiled.algebra import (
+from blf_dsc_controller.compiled.jit import inner, kernel
+from blf_dsc_controller.compiled.layout import Array
+from blf_dsc_controller.numerics.algebra import (
     Vector,
     cross,
     dot,
@@ -36,9 +38,7 @@ from blf_dsc_controller.compiled.algebra import (
     transform,
     vector,
 )
-from blf_dsc_controller.compiled.elementary import cos, sin
-from blf_dsc_controller.compiled.jit import inner, kernel
-from blf_dsc_controller.compiled.layout import Array
+from blf_dsc_controller.numerics.elementary import cos, sin
 from blf_dsc_controller.tool.postures import (
     Axes,
     axes_of,
