@@ -27,7 +27,7 @@ from blf_dsc_controller.configuration.nodes import (
 from blf_dsc_controller.configuration.schema import change
 from blf_dsc_controller.law.telemetry import sample_columns
 from blf_dsc_controller.simulation.loop import simulate
-from blf_dsc_controller.studies.laws import LAWS, law_changes
+from blf_dsc_controller.studies.laws import LAWS, law_changes, roughness
 from blf_dsc_controller.studies.runs import cores
 
 PRESETS = ('panda', 'ur5e')
@@ -84,11 +84,10 @@ def figures(preset: str, rival: Rival, arm: _Changes) -> tuple[float, float]:
     with np.errstate(all='ignore'):  # a run that diverges has figures too
         record = simulate(loop.controller, loop.plant, supervised=False)
         error = 1e3 * np.abs(record.true_errors()).max()
-    samples = sample_columns(record.samples, record.controller.settings)
-    first = round(_STARTED / loop.controller.sample_time)
-    torque = samples.torque[first:] / np.array(loop.controller.torque.limit)
-    steps = np.diff(torque, axis=0)
-    return float(error), float(100.0 * np.sqrt((steps**2).mean(axis=0)).max())
+        samples = sample_columns(record.samples, record.controller.settings)
+        first = round(_STARTED / loop.controller.sample_time)
+        rough = roughness(samples.torque[first:], loop.controller)
+    return float(error), 100.0 * rough
 
 
 def row(preset: str, rival: Rival) -> list[str]:

@@ -18,8 +18,8 @@ A push leaves an r as well, mostly one that no drive explains: it asks for an in
 is smaller by two to ten times the guess, or moves the arm against its torque.  So what half
 an oscillation shows, from one zero of a to the next, is forgotten at its end if z a is not
 positive, or if it asks for more than twice the guess less.  Until then it counts, for the
-error of a light drive grows threefold in it; a push makes the gains softer for no longer
-than that.
+error of a light drive grows threefold in it; a push makes the gains softer for that long,
+or until the acceleration is clear of the noise again where the arm calms down before.
 
 The feedback then acts on M_0 + J~ in place of M_0: its acceleration, damping and
 barrier included, minus qr'' gets the torque of J~ as well, as does the rate of d^3.

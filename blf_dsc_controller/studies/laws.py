@@ -125,8 +125,7 @@ class Figures:
 
     errors: tuple[float, ...]  # rad
     ratio: float  # largest error of the whole run, relative to the bound
-    # rms change of the torque from sample to sample, relative to its limit
-    roughness: float
+    roughness: float  # of the function of this name
     # torque error on another motion: before the pick-up, at the end
     model: tuple[float, ...]
 
@@ -204,10 +203,15 @@ def run(
             float(np.abs(errors[(time >= begin) & (time < end)]).max(initial=0.0))
             for begin, end in INTERVALS.values()
         ]
-        steps = np.diff(samples.torque, axis=0) / config.torque.limit
-        rough = np.sqrt(np.mean(steps**2, axis=0)).max()
+        rough = roughness(samples.torque, config)
     ratio = np.abs(errors / config.barrier.bound).max()
-    return Figures(tuple(peaks), float(ratio), float(rough), model)
+    return Figures(tuple(peaks), float(ratio), rough, model)
+
+
+def roughness(torque: Floats, config: ControllerConfig) -> float:
+    """Return the largest rms change of torques (k, n) from sample to sample, of the limit."""
+    steps = np.diff(torque, axis=0) / config.torque.limit
+    return float(np.sqrt(np.mean(steps**2, axis=0)).max())
 
 
 def load_laws(path: Path) -> list[str]:
