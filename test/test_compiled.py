@@ -59,6 +59,7 @@ from blf_dsc_controller.simulation.compiled_loop import run_loop
 from blf_dsc_controller.simulation.loop import simulate
 from blf_dsc_controller.studies.laws import COMPUTED_TORQUE
 from blf_dsc_controller.supervision.model_torque import friction_torque, model_torque
+from blf_dsc_controller.tool.errors import Tool, _fill_errors
 from sim_plant.kernels import run_plant
 from sim_plant.plant import plant_settings
 
@@ -316,6 +317,18 @@ def test_loop_that_is_not_compiled_computes_the_same_bits(preset, monkeypatch):
         np.testing.assert_array_equal(
             getattr(compiled, name), getattr(interpreted, name)
         )
+
+
+@compiling
+def test_errors_at_the_tool_are_compiled_once_for_all_arrays():
+    tool = Tool(load_loop('panda').controller.robot.chain(()), np.ones(7))
+    many = np.full((4, 7), 0.3)
+    fixed = many.copy()
+    fixed.flags.writeable = False
+    for q in (many, fixed, many[0], fixed[0], np.asfortranarray(many), [0.3] * 7):
+        for k in (np.full(7, 1e-2), fixed[0]):
+            tool.errors(q, many[0], k)
+    assert len(_fill_errors.signatures) == 1
 
 
 @jit.kernel

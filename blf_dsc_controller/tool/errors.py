@@ -197,8 +197,9 @@ class Tool:
         References [rad], errors [rad] and joint bounds [rad] are (..., n).
         """
         shape = np.shape(qr)
+        # Copies: what is read-only would be another type, and compiled again.
         rows = [
-            np.ascontiguousarray(np.broadcast_to(each, shape), np.float64)
+            np.array(np.broadcast_to(each, shape), np.float64, order='C')
             for each in (qr, errors, bound)
         ]
         out = np.empty((*shape[:-1], 4))
