@@ -109,7 +109,7 @@ def direct(kernel: Callable[..., Any], *arguments: object) -> Callable[..., Any]
 
     Kernels look at all types in every call, which takes longer than many a kernel.
     """
-    if config.DISABLE_JIT:
+    if not hasattr(kernel, 'compile'):  # it is not compiled
         return kernel
     compiled: Callable[..., Any] = cast('Any', kernel).compile(
         tuple(map(numba.typeof, arguments))

@@ -12,13 +12,15 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from blf_dsc_controller.compiled.entry import invoke, loop
-from blf_dsc_controller.compiled.jit import inner
+from blf_dsc_controller.compiled.jit import direct, inner
 from blf_dsc_controller.compiled.views import part
 from blf_dsc_controller.law.check_state import INVALID, SUSPECT
 from blf_dsc_controller.law.laws import for_law
 from sim_plant.kernels import OBSERVE, STEP, TRUTH
 
 if TYPE_CHECKING:  # else the loop would be compiled again whenever one of these changes
+    from collections.abc import Callable
+
     from blf_dsc_controller.arms.model import ArmModel
     from blf_dsc_controller.compiled.entry import Entry
     from blf_dsc_controller.law.controller import Controller, LawKernels
@@ -125,7 +127,7 @@ def perceive(law: LawArguments, dt: float, sample: np.ndarray) -> bool:
 
 @loop
 def run_loop(span: Span, plant: PlantArguments, law: LawArguments, rows: Rows) -> bool:
-    """Implement `run_span`."""
+    """Implement `CompiledLoop.run`."""
     dt = plant.period_ns * 1e-9
     n = rows.measurements.shape[1] // 3
     torque = part(rows.samples[0], law.torque_at, (n,))
@@ -147,33 +149,49 @@ def run_loop(span: Span, plant: PlantArguments, law: LawArguments, rows: Rows) -
     return True
 
 
-def run_span(controller: Controller, plant: Plant, span: Span, rows: Rows) -> bool:
-    """Run a span of samples; return False where a check stops it, in mid-sample.
+class CompiledLoop:
+    """A controller and a plant, which `run_loop` runs."""
 
-    With checks (`law.checks`), that is the first invalid or suspect sample, or one in which
-    a contact begins.
-    """
-    settings = controller.settings
-    of_plant = PlantArguments(
-        plant.kernel,
-        plant.arm,
-        plant.settings,
-        plant.state,
-        plant.noise_of(span.last - span.first + 1),
-        plant.period_ns,
-    )
-    of_law = LawArguments(
-        controller.kernels,
-        controller.law,
-        settings.model,
-        controller.settings_vector,
-        controller.state_vector,
-        controller.signals_vector,
-        controller.checks_vector,
-        controller.reference_vector,
-        controller.torque_at,
-        perceives=span.observed or settings.freezes == 1,
-        ends_at_contact=bool(controller.checks.velocity_limit[0] > 0.0),
-    )
-    kept: bool = for_law(run_loop, controller.law)(span, of_plant, of_law, rows)
-    return kept
+    def __init__(self, controller: Controller, plant: Plant) -> None:
+        self._controller, self._plant = controller, plant
+        self._run: Callable[..., bool] | None = None
+
+    def run(self, span: Span, rows: Rows) -> bool:
+        """Run a span of samples; return False where a check stops it, in mid-sample.
+
+        With checks (`law.checks`), that is the first invalid or suspect sample, or one in which
+        a contact begins.
+        """
+        law = self._of_law(span)
+        arguments = span, self._of_plant(span), law, rows
+        if self._run is None:
+            self._run = direct(for_law(run_loop, law.law), *arguments)
+        return self._run(*arguments)
+
+    def _of_plant(self, span: Span) -> PlantArguments:
+        plant = self._plant
+        return PlantArguments(
+            plant.kernel,
+            plant.arm,
+            plant.settings,
+            plant.state,
+            plant.noise_of(span.last - span.first + 1),
+            plant.period_ns,
+        )
+
+    def _of_law(self, span: Span) -> LawArguments:
+        controller = self._controller
+        settings = controller.settings
+        return LawArguments(
+            controller.kernels,
+            controller.law,
+            settings.model,
+            controller.settings_vector,
+            controller.state_vector,
+            controller.signals_vector,
+            controller.checks_vector,
+            controller.reference_vector,
+            controller.torque_at,
+            perceives=span.observed or settings.freezes == 1,
+            ends_at_contact=bool(controller.checks.velocity_limit[0] > 0.0),
+        )

@@ -43,7 +43,7 @@ from blf_dsc_controller.messages.journal import (
     encode_change,
 )
 from blf_dsc_controller.run import Run, Series, Stop
-from blf_dsc_controller.simulation.compiled_loop import Rows, Span, run_span
+from blf_dsc_controller.simulation.compiled_loop import CompiledLoop, Rows, Span
 from blf_dsc_controller.supervision.guard import Guard
 from sim_plant.plant import Plant, parameter_names_of, plant_of, steps_of
 
@@ -103,7 +103,7 @@ def run_alone(record: Record, plant: Plant, *, observed: bool = True) -> None:
     q, dq, _ = plant.measure().reshape(3, -1)
     begin(record.controller, record.config, q, dq)
     span = Span(0, record.stamps.size - 1, is_end=True, observed=observed)
-    run_span(record.controller, plant, span, record.rows_to_fill())
+    CompiledLoop(record.controller, plant).run(span, record.rows_to_fill())
 
 
 def _run_supervised(
@@ -111,11 +111,14 @@ def _run_supervised(
 ) -> Iterator[Record]:
     """Run `size` samples in chunks; fill and yield the rows of each, which come from `rows_of`."""
     bound = np.zeros(len(guard.config.joints))
+    loop = CompiledLoop(guard.controller, plant)
     for first in (0, *range(1, size, _CHUNK)):
         chunk = range(first, min(first + _CHUNK, size) if first else 1)
         record = rows_of(chunk)
         is_end = chunk.stop == size
-        if not (first and _run_compiled(guard, plant, record, chunk, is_end=is_end)):
+        if not (
+            first and _run_compiled(loop, guard, plant, record, chunk, is_end=is_end)
+        ):
             _run_guarded(guard, plant, record, bound, is_end=is_end)
         if guard.start_error is not None:
             raise guard.start_error
@@ -124,7 +127,13 @@ def _run_supervised(
 
 
 def _run_compiled(
-    guard: Guard, plant: Plant, record: Record, chunk: range, *, is_end: bool
+    loop: CompiledLoop,
+    guard: Guard,
+    plant: Plant,
+    record: Record,
+    chunk: range,
+    *,
+    is_end: bool,
 ) -> bool:
     """Run a chunk in the compiled loop; return False, with nothing changed, if a check fails."""
     controller = guard.controller
@@ -134,7 +143,7 @@ def _run_compiled(
         return False
     before = controller.save(), plant.save(), controller.checks_vector.copy()
     span = Span(chunk.start, chunk.stop - 1, is_end, observed=True)
-    if run_span(controller, plant, span, record.rows_to_fill()):
+    if loop.run(span, record.rows_to_fill()):
         guard.advance(
             START + int(record.stamps[-1]), record.measurements[-1], len(chunk)
         )
