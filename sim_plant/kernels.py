@@ -17,6 +17,8 @@ torque jumps (a reflex stop), until the plant is reset; their driver may limit i
 before.
 """
 
+from typing import Any
+
 import numpy as np
 
 from blf_dsc_controller.compiled.jit import inner, kernel
@@ -26,6 +28,7 @@ from blf_dsc_controller.numerics.elementary import exp, tanh
 from sim_plant.arm import Arm, fill_gravity
 from sim_plant.layout import (
     MEASURED,
+    Encoders,
     PlantSettings,
     PlantState,
     settings_of,
@@ -177,12 +180,18 @@ def compensate(plant: PlantSettings, now: PlantState) -> None:
 
 
 @inner
+def is_repeat(encoders: Encoders, sample: Any) -> Any:
+    """Return whether the encoders repeat their reading in this sample, or in each of several."""
+    every = encoders.repeat_every
+    return (every > 0) & (sample > 0) & (sample % max(every, 1) == 0)
+
+
+@inner
 def is_due(plant: PlantSettings, now: PlantState) -> bool:
     """Return whether the encoders read this sample, which they have not done yet."""
     sample = int(now.sample[0])
-    every = plant.encoders.repeat_every
-    is_repeat = every > 0 and sample > 0 and sample % every == 0
-    return now.reading.sample[0] != now.sample[0] and not is_repeat
+    is_new = now.reading.sample[0] != now.sample[0]
+    return is_new and not is_repeat(plant.encoders, sample)
 
 
 @inner

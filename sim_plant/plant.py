@@ -31,6 +31,7 @@ from sim_plant.kernels import (
     drawn,
     generator,
     is_due,
+    is_repeat,
     lag,
     plant_views,
     run_plant,
@@ -136,8 +137,8 @@ class Plant:
         It is for a compiled loop. A reading that is made already, or repeated, has none.
         """
         k = self.sample + np.arange(samples)
-        every = self._settings.encoders.repeat_every or math.inf
-        due = (k != self._now.reading.sample[0]) & ((k == 0) | (k % every > 0))
+        is_new = k != self._now.reading.sample[0]
+        due = is_new & ~is_repeat(self._settings.encoders, k)
         noise = np.zeros((samples, 3 * self.joints))
         columns = drawn(self._settings)
         shape = np.count_nonzero(due), columns.stop - columns.start

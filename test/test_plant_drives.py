@@ -382,3 +382,33 @@ def test_readings_and_torques_are_those_of_encoders_and_drives_in_plain_numpy(se
     for state, torque in zip(true, moved, strict=True):
         np.testing.assert_allclose(ideal.truth()[5:], state, rtol=1e-11, atol=1e-12)
         ideal.step(torque)
+
+
+@pytest.mark.parametrize('read', [False, True])
+@pytest.mark.parametrize('repeat_every', [0, 3])
+@pytest.mark.parametrize('position_noise', [0.0, 1e-3])
+@pytest.mark.parametrize('torque_noise', [0.0, 0.01])
+def test_noise_of_a_span_is_that_of_its_readings(
+    read, repeat_every, position_noise, torque_noise
+):
+    """Also where the first sample has been read before."""
+    given = {
+        'repeat_every': repeat_every,
+        'position_noise': position_noise,
+        'torque_noise': torque_noise,
+    }
+    span, single = plant(seed=1, **given), plant(seed=1, **given)
+    if read:
+        span.measure()
+        single.measure()
+    noise = span.noise_of(20)
+    for k in range(20):
+        expected = np.zeros(6)
+        before = single.rng.bit_generator.state
+        single.measure()
+        if single.rng.bit_generator.state != before:
+            expected = single._noise
+        np.testing.assert_array_equal(noise[k], expected, err_msg=f'sample {k}')
+        single.step(np.zeros(2))
+    assert span.rng.bit_generator.state == single.rng.bit_generator.state
+    assert noise.any() == bool(position_noise or torque_noise)

@@ -400,7 +400,16 @@ def test_page_replays_a_run_until_the_user_goes_on(tmp_path):
 
 def test_page_of_a_run_is_served_until_the_run_ends(tmp_path):
     out = tmp_path / 'run'
-    command = (*COMMAND, '--view', '--duration', '1000', '--out', str(out))
+    command = (
+        *COMMAND,
+        '--view',
+        '--mode',
+        'lockstep',
+        '--duration',
+        '100000',
+        '--out',
+        str(out),
+    )
     with subprocess.Popen(command, stdout=PIPE, stderr=STDOUT, text=True) as process:
         output = ''
         while not (found := re.search(r'open (http://127.0.0.1:\d+)', output)):

@@ -30,7 +30,7 @@ from blf_dsc_controller.run import Floats
 FOLDS = 5
 """Parts of the recording for cross-validation."""
 
-_PASSES = 10
+_PASSES = 10  # at most: five or six are needed from afar, two or three from nearby
 _AGREE = 1e-4  # relative change of a deviation; values then agree to some 1e-6
 _DEVIATION = 0.1  # of a joint's torque, of its residual at first
 _FLOOR = 1e-3  # of that, least deviation
