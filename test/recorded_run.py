@@ -6,6 +6,7 @@ And a made-up run.
 
 from __future__ import annotations
 
+import resource
 import subprocess
 from collections import Counter
 from contextlib import contextmanager, suppress
@@ -140,6 +141,18 @@ def small_disk(path, megabytes):
         yield path
     finally:
         subprocess.run(['umount', '-l', str(path)], check=False)  # noqa: S607
+
+
+@contextmanager
+def limited_files(path, size):
+    """Let no file grow beyond a size [bytes], as anybody may; return a new folder."""
+    path.mkdir()
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, hard))
+    try:
+        yield path
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
 
 
 # A made-up run, in which every number is known in advance.

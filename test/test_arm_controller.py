@@ -4,12 +4,15 @@
 from __future__ import annotations
 
 import math
+from functools import partial
 
 import numpy as np
 import pytest
+from recorded_run import limited_files, small_disk
 
 import blf_dsc_controller as blf
 from blf_dsc_controller.bags.content import read_content
+from blf_dsc_controller.bags.recovery import recover
 from blf_dsc_controller.control.arm_controller import StateError
 from blf_dsc_controller.errors import BlfDscError, ConfigurationError
 from blf_dsc_controller.messages.journal import EventType
@@ -20,6 +23,7 @@ from blf_dsc_controller.supervision.supervisor import Phase
 from sim_plant.plant import plant_of, steps_of
 
 LOOP = blf.load_loop('recommended', {'sim_plant': {'duration': 1.0}})
+LONG = blf.load_loop('recommended', {'sim_plant': {'duration': 4.0}})
 
 
 def run(controller, plant, config, steps):
@@ -153,3 +157,58 @@ def test_failure_of_the_caller_is_a_stop_that_the_bag_holds(samples, tmp_path):
         np.testing.assert_array_equal(recorded[: samples + 1], [*torques, torque])
         # the failure's, that for the state, and the last one at the end
         assert len(recorded) == samples + 3
+
+
+# Both hold half of the run's 1.9 MB.
+@pytest.mark.parametrize(
+    'full', [partial(small_disk, megabytes=1), partial(limited_files, size=10**6)]
+)
+def test_full_disk_ends_the_recording_and_no_torque_is_lost(full, tmp_path, caplog):
+    plant = plant_of(LONG.plant)
+    with full(tmp_path / 'disk') as disk:
+        bag = disk / 'bag'
+        with blf.ArmController(LONG.controller, record=bag) as controller:
+            torques = run(controller, plant, LONG.plant, steps_of(LONG.plant) + 1)
+            assert controller.phase is Phase.TRACKING
+        saved = recover(bag, tmp_path / 'saved')
+    assert f'blf_dsc recover {bag} saves' in controller.output_problem
+    simulated = blf.simulate(LONG.controller, LONG.plant).run()
+    np.testing.assert_array_equal(torques, simulated.torque)
+    assert len(caplog.records) == 1  # said once
+    assert 500 < saved.messages[COMMANDS.resolved] < 4000
+    assert not (bag / 'metadata.yaml').exists()  # it would count what is not there
+
+
+class Failing:
+    """An output of a user that fails at its tenth message."""
+
+    def __init__(self):
+        self.taken = 0
+
+    def write(self, *_):
+        self.taken += 1
+        if self.taken == 10:
+            raise ValueError('a mistake of the user')
+
+
+def test_output_that_fails_is_dropped_and_the_others_go_on():
+    plant = plant_of(LOOP.plant)
+    failing = Failing()
+    with blf.ArmController(LOOP.controller) as controller:
+        controller.add_output(failing)
+        torques = run(controller, plant, LOOP.plant, 100)
+    assert failing.taken == 10
+    assert controller.output_problem == 'ValueError: a mistake of the user'
+    simulated = blf.simulate(LOOP.controller, LOOP.plant).run()
+    np.testing.assert_array_equal(torques, simulated.torque[:100])
+
+
+def test_error_at_the_end_of_the_recording_does_not_lose_the_last_torque(tmp_path):
+    """The disk is full when the bag is completed."""
+    plant = plant_of(LOOP.plant)
+    with limited_files(tmp_path / 'disk', 1000) as disk:  # holds no chunk
+        controller = blf.ArmController(LOOP.controller, record=disk / 'bag')
+        q, dq, effort = plant.measure().reshape(3, -1)
+        controller.update(1.0, q, dq, effort)
+        assert controller.close() is not None
+    assert 'cannot be written any further: File too large' in controller.output_problem

@@ -86,11 +86,14 @@ class BackgroundFile:
         try:
             self.flush()
         finally:
-            self._queue.put(None)
+            self.abandon()
             self._thread.join()
-            self._file.close()
-            self.closed = True
         self._raise_error()
+
+    def abandon(self) -> None:
+        """Take nothing more, and do not wait for what is not written yet."""
+        self.closed = True
+        self._queue.put(None)
 
     def _raise_error(self) -> None:
         if self._error is not None and not self._has_failed:
@@ -107,3 +110,5 @@ class BackgroundFile:
                 self._done += len(data)
         except OSError as error:
             self._error = error
+        finally:
+            self._file.close()

@@ -6,6 +6,7 @@ from __future__ import annotations
 from collections import Counter
 from pathlib import Path
 
+from blf_dsc_controller.bags.sources import BagError
 from blf_dsc_controller.bags.writer import BagWriter
 from blf_dsc_controller.messages.topics import Topic
 
@@ -32,7 +33,28 @@ class TopicRecorder:
         self._sent: Counter[Topic] = Counter()
 
     def write(self, stamp: int, topic: Topic, raw: bytes) -> None:
-        """Write a serialised message with its time [ns]."""
+        """Write a serialised message with its time [ns].
+
+        Raises:
+            BagError: the disk is full, or too slow; the bag ends there.
+        """
+        try:
+            self._write(stamp, topic, raw)
+        except (OSError, BagError) as error:
+            raise self._bag.abandon(error) from error
+
+    def close(self) -> None:
+        """Complete the bag.
+
+        Raises:
+            BagError: as `write`.
+        """
+        try:
+            self._bag.close()
+        except (OSError, BagError) as error:
+            raise self._bag.abandon(error) from error
+
+    def _write(self, stamp: int, topic: Topic, raw: bytes) -> None:
         if topic not in self._handles:
             offered = [topic.offered]
             self._handles[topic] = self._bag.add_topic(
@@ -40,7 +62,3 @@ class TopicRecorder:
             )
         self._sent[topic] += 1
         self._bag.write(self._handles[topic], raw, stamp, sequence=self._sent[topic])
-
-    def close(self) -> None:
-        """Complete the bag."""
-        self._bag.close()

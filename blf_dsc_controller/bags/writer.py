@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from contextlib import AbstractContextManager
+from contextlib import AbstractContextManager, suppress
 from dataclasses import asdict, dataclass
 from functools import partial
 from math import inf
@@ -68,7 +68,7 @@ class BagWriter(AbstractContextManager['BagWriter']):
     interval it leaves when a chunk is full. The compression of chunks is `none` or
     `zstd`. A file ends after 10,000 chunks. With `in_background`, a thread writes to
     the disk; errors are raised by a later call. After an OSError, such as that of a
-    full disk, `recover` saves what was written before.
+    full disk, `abandon` the bag.
 
     Raises:
         BagError: `path` exists already.
@@ -174,6 +174,20 @@ class BagWriter(AbstractContextManager['BagWriter']):
         self._end_file()
         text = _dump({'rosbag2_bagfile_information': self._information()})
         (self.path / METADATA).write_text(text, encoding='utf-8')
+
+    def abandon(self, error: OSError | BagError) -> BagError:
+        """End the bag as it is after an error of the disk; return what to tell of it."""
+        self.closed = True
+        if isinstance(self._stream, BackgroundFile):
+            self._stream.abandon()
+        else:
+            with suppress(OSError):  # the same error again
+                self._stream.close()
+        return BagError(
+            f'{self.path} cannot be written any further: '
+            f'{getattr(error, "strerror", None) or error}; '
+            f'blf_dsc recover {self.path} saves what was written before'
+        )
 
     @property
     def message_counts(self) -> dict[str, int]:

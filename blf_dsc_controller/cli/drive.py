@@ -74,11 +74,13 @@ def drive(options: Namespace) -> int:
         _print(outcome, loop, controller)
     if ros is not None and ros.problem:
         print(f'topics        {ros.problem}')
-    if options.out is not None:
+    if controller.output_problem:
+        print(f'recorded      only a part: {controller.output_problem}')
+    elif options.out is not None:
         print(
             f'recorded      {options.out}: blf_dsc replay, report, plot and identify read it'
         )
-    return _CODES[outcome.end]
+    return _CODES[outcome.end] or int(bool(controller.output_problem))
 
 
 def _check(options: Namespace) -> None:

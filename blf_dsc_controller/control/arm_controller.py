@@ -8,7 +8,7 @@ import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from types import TracebackType
-from typing import Literal, NamedTuple, Protocol
+from typing import Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -17,13 +17,13 @@ from blf_dsc_controller.bags.topic_recorder import TopicRecorder
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.nodes import CONTROLLER, load, locate
 from blf_dsc_controller.control.guarded_loop import GuardedLoop
+from blf_dsc_controller.control.outputs import Output, Outputs
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.law.telemetry import disturbance_names
 from blf_dsc_controller.law.weighing import DEVIATION, TWO_SIDED
 from blf_dsc_controller.messages import topics
 from blf_dsc_controller.messages.codecs import JointStateEncoder
 from blf_dsc_controller.messages.journal import MOTIONS
-from blf_dsc_controller.messages.topics import Topic
 from blf_dsc_controller.reference.trajectory import Trajectory, TrajectoryPoint
 from blf_dsc_controller.supervision.drive_load import DriveLoad
 from blf_dsc_controller.supervision.guard import Guard
@@ -36,13 +36,6 @@ _FIRST = 1_000_000_000  # ns
 
 class StateError(BlfDscError):
     """A joint state that no arm of this configuration can have."""
-
-
-class Output(Protocol):
-    """Takes the messages of a loop."""
-
-    def write(self, stamp: int, topic: Topic, raw: bytes) -> None:
-        """Take a serialised message with the time [ns] of its state."""
 
 
 class Load(NamedTuple):
@@ -81,7 +74,9 @@ class ArmController:
     It does what the node `blf_dsc_controller` does with each joint state, and computes
     the same bits.  `update` is called for every state, at the rate of `sample_time`; a
     state that fails to arrive is noticed with the next one.  A recorded bag is that of
-    a run over ROS: `blf_dsc` reports, plots, replays and identifies from it.
+    a run over ROS: `blf_dsc` reports, plots, replays and identifies from it.  If it
+    cannot be written any further, as on a full disk, the loop goes on without it:
+    `output_problem`.
 
     Attributes:
         config: the configuration in force.
@@ -110,7 +105,7 @@ class ArmController:
         self.joints = config.joints
         self._loop = GuardedLoop(config)
         self._recorder: TopicRecorder | None = None
-        self._outputs: list[Output] = []
+        self._outputs = Outputs()
         if record is not None:
             self._recorder = TopicRecorder(Path(record), in_background=True)
             self.add_output(self._recorder)
@@ -349,19 +344,26 @@ class ArmController:
     def close(self) -> Vector | None:
         """Return the torque (n,) [N m] that a drive may hold from now on.
 
-        End the recording.
+        End the recording; `output_problem` says whether it is whole.
         """
         torque = self._loop.guard.release()
         self._tell_end(torque)
         if self._recorder is not None:
-            self._outputs.remove(self._recorder)
-            self._recorder.close()
+            self._outputs.end(self._recorder, self._recorder.close)
             self._recorder = None
         return None if torque is None else np.array(torque)
 
     def add_output(self, output: Output) -> None:
-        """Give all messages from now on to an output, too: those that a bag has."""
-        self._outputs.append(output)
+        """Give all messages from now on to an output, too: those that a bag has.
+
+        One that raises an error is dropped, and the loop goes on: `output_problem`.
+        """
+        self._outputs.add(output)
+
+    @property
+    def output_problem(self) -> str:
+        """Why the recording or another output ended before the loop; or empty."""
+        return self._outputs.problem
 
     @property
     def guard(self) -> Guard:
@@ -376,11 +378,11 @@ class ArmController:
     def _tell(self, stamp: int, values: Vector, torque: Vector | None) -> None:
         """Give the messages about a state to the outputs."""
         state = self._states.encode(stamp, *values.reshape(3, -1))
-        self._write(stamp, topics.JOINT_STATES, state)
+        self._outputs.write(stamp, topics.JOINT_STATES, state)
         if torque is not None:
-            self._write(stamp, *self._loop.telemetry.command(torque))
+            self._outputs.write(stamp, *self._loop.telemetry.command(torque))
         for message in self._loop.messages(torque):
-            self._write(stamp, *message)
+            self._outputs.write(stamp, *message)
         self._tell_events(stamp)
 
     def _tell_end(self, torque: Vector | None) -> None:
@@ -389,7 +391,7 @@ class ArmController:
             return
         stamp = max(self._loop.guard.journal.stamp, 0)
         if torque is not None:
-            self._write(stamp, *self._loop.telemetry.command(torque))
+            self._outputs.write(stamp, *self._loop.telemetry.command(torque))
         self._tell_events(stamp)
 
     def _tell_events(self, stamp: int) -> None:
@@ -397,8 +399,4 @@ class ArmController:
         while pending:
             event = pending.popleft()
             topic = topics.TARGETS if event.type in MOTIONS else topics.JOURNAL
-            self._write(stamp, topic, event.encode())
-
-    def _write(self, stamp: int, topic: Topic, raw: bytes) -> None:
-        for output in self._outputs:
-            output.write(stamp, topic, raw)
+            self._outputs.write(stamp, topic, event.encode())

@@ -10,7 +10,6 @@ from contextlib import suppress
 from functools import partial
 from typing import Any
 
-from blf_dsc_controller.bags.sources import BagError
 from blf_dsc_controller.bags.writer import BagWriter
 from blf_dsc_controller.configuration.nodes import RecorderConfig
 from blf_dsc_controller.messages.codecs import (
@@ -100,9 +99,12 @@ class BagRecorderNode(PlainNode):
         self._raw_subscriptions.close()
         if self.failure is not None or self._bag.closed:
             return
-        for message in self._waiting:  # there was no joint state
-            self._bag.write(*message)
-        self._bag.close()
+        try:
+            for message in self._waiting:  # there was no joint state
+                self._bag.write(*message)
+            self._bag.close()
+        except OSError as error:
+            raise self._bag.abandon(error) from error
         for line in self._summary():
             self.get_logger().info(line)
 
@@ -197,10 +199,7 @@ class BagRecorderNode(PlainNode):
                 self._bag.flush_if_due()
         except OSError as error:
             self.finished = True
-            self.failure = BagError(
-                f'{self._bag.path} cannot be written any further: {error.strerror}; '
-                f'blf_dsc recover {self._bag.path} saves what was written before'
-            )
+            self.failure = self._bag.abandon(error)
         return len(taken) > _RARE
 
     def _is_first(self, message: RawMessage) -> bool:
