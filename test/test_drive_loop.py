@@ -24,6 +24,7 @@ from blf_dsc_controller.configuration.schema import build, change
 from blf_dsc_controller.drive.driver import DriverError, Facts, disagreements
 from blf_dsc_controller.drive.drivers import find_driver
 from blf_dsc_controller.drive.latency import Latency
+from blf_dsc_controller.drive.load_teller import LoadTeller
 from blf_dsc_controller.drive.loop import DriveLoop, End
 from blf_dsc_controller.errors import BlfDscError, ConfigurationError
 from blf_dsc_controller.messages import topics
@@ -302,6 +303,43 @@ def test_drives_that_forbid_it_are_not_told_while_they_move(tmp_path):
     driver, loop, _ = run_with_load(tmp_path, Forbidding, 8.0)
     assert not driver.told
     assert not loop.remark
+
+
+class ReportingDriver(PlantDriver):
+    """A robot that says which load is in force, or None."""
+
+    facts = LoadedDriver.facts
+    in_force = None
+
+    def tell_load(self, load):
+        pass
+
+    def load_in_force(self):
+        return self.in_force
+
+
+@pytest.mark.parametrize('reports', [True, False])
+def test_load_is_taken_over_when_it_is_in_force_not_when_it_is_accepted(
+    reports, monkeypatch
+):
+    """A robot that reports its load may add it some states after its answer."""
+    config = blf.load_loop('fr3_direct', {CONTROLLER: TOLD}).controller
+    controller = blf.ArmController(config)
+    load = DriveLoad(1.0, (0.0, 0.0, 0.0))
+    taken = []
+    monkeypatch.setattr(controller, 'load_to_tell', lambda: load)
+    monkeypatch.setattr(controller, 'take_over', taken.append)
+    driver = ReportingDriver('', config, DriveConfig())
+    driver.in_force = 0.0 if reports else None
+    teller = LoadTeller(driver, controller)
+    for _ in range(20):  # from one step to the next
+        teller.follow()
+    teller.close()  # it has answered
+    teller.follow()
+    assert taken == ([] if reports else [load])
+    driver.in_force = np.float32(1.0 + 5e-6) if reports else None
+    teller.follow()
+    assert taken == [load]
 
 
 def test_load_is_not_taken_over_unless_the_user_allows_it():

@@ -56,3 +56,12 @@ def test_repeated_state_is_no_newer_one():
         gate.take(10**9)
         found += [gate.poll() for _ in range(10)]
     assert sum(found) == 1
+
+
+def test_slow_sender_is_refused_although_it_is_asked_about_between_its_states():
+    """At 30 Hz there are four looks between two states; only a pause of 25 is one."""
+    gate = StartGate(1e-3)
+    for k in range(11):
+        gate.take(10**9 + k * 33 * MILLISECOND)
+        assert not any(gate.poll() for _ in range(4))
+    assert gate.state is GateState.REFUSED

@@ -108,7 +108,9 @@ def test_cuts_add_up_if_they_take_more_than_a_fifth_of_the_time(law, every, stop
     ('lack', 'now', 'reason'),
     [
         (1.8, 4.8, Reason.OUTSIDE_BOUND),  # what it lacks now does not last
+        (2.3, 4.8, Reason.OUTSIDE_BOUND),  # or is still little on average
         (3.8, 2.3, Reason.OUTSIDE_BOUND),  # what it lacked is over
+        (3.8, -4.8, Reason.OUTSIDE_BOUND),  # it is over, and another has come
         (3.8, 4.8, Reason.NO_EFFECT),
     ],
 )
@@ -163,11 +165,25 @@ def test_estimates_of_before_a_restart_are_consistent_with_it(law):
     check = SampleCheck(ControllerConfig(), law)
     law.state.estimate[:] = 0.5
     law.state.disturbance[:] = 0.25
+    law.state.gain_scale[:] = 0.75
     check.keep()
     check.restart()
     check.return_to_consistent()
     assert (check.estimate == 0.5).all()
     assert (check.disturbance == 0.25).all()
+    assert (law.checks.consistent_scale == 0.75).all()
+
+
+def test_law_continues_with_the_kept_estimates_after_a_stop(law):
+    check = SampleCheck(ControllerConfig(), law)
+    law.state.estimate[:] = 0.5
+    law.state.disturbance[:] = 0.25
+    check.keep()
+    law.state.estimate[:] = law.state.disturbance[:] = 9.0  # by what made it stop
+    check.restore()
+    assert (law.state.estimate == 0.5).all()
+    assert (law.state.disturbance == 0.25).all()
+    assert law.samples == 0
 
 
 @pytest.mark.parametrize(

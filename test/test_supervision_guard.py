@@ -186,6 +186,49 @@ def test_load_is_bounded_and_left_as_it_is_while_brakes_hold_the_arm():
     np.testing.assert_allclose(torque, 0.1 * weight(Q) + load, atol=0.1)
 
 
+def test_arm_yields_to_a_contact_only_until_the_next_ramp():
+    """It gives way by the torque that holds gravity, whatever is configured."""
+    ramp = SafeTorque(2)
+    ramp.last.take(1, np.concatenate((Q, np.zeros(4))))
+
+    def torque():
+        return ramp.advance(Safety(torque='zero'), settings(), P, 1e-3)
+
+    assert not torque().any()  # also before the first ramp
+    ramp.begin_ramp(0.0, np.zeros(2))
+    ramp.yield_to_contact()
+    np.testing.assert_allclose(torque(), weight(Q))
+    ramp.begin_ramp(0.0, np.zeros(2))
+    assert not torque().any()
+
+
+def test_single_jerk_changes_the_observed_load_by_what_a_torque_at_the_limit_would():
+    """Within 1 ms by 20 N m times L of 30 rad/s, however large the acceleration."""
+    ramp = SafeTorque(2)
+    ramp.last.take(1, np.concatenate((Q, np.zeros(4))))
+    ramp.last.ddq = np.array([1e5, -1e5])
+    ramp.observe(settings(), P, 1e-3)
+    np.testing.assert_allclose(np.abs(ramp.load), 0.6)
+
+
+@pytest.mark.parametrize(('last', 'speeds_up'), [(0.8, False), (2.3, True)])
+def test_arm_that_was_fast_at_the_stop_speeds_up_only_if_it_gets_faster(
+    last, speeds_up
+):
+    """At a stop from 0.8 rad/s, from 2 * 0.8 + 0.5 rad/s on."""
+    guard = Guard(change(ControllerConfig(), {'safety.torque': 'damping'}))
+    guard.activate()
+    q = np.array([0.3, -0.4])
+    for k in range(700):
+        if k == 100:
+            guard.fail('a test')
+        dq = np.full(2, 0.8 if k < 100 else last)
+        q += 1e-3 * dq
+        stamp = (1000 + k) * MILLISECOND
+        guard.update(stamp, np.concatenate((q, dq, np.zeros(2))))
+    assert ('speeds up in the safe stop' in guard.supervisor.text) == speeds_up
+
+
 def test_torque_continues_after_immediate_reactivation():
     rig = Rig({'safety.deactivation_ramp': 10.0})
     rig.step(200)
@@ -249,6 +292,8 @@ def test_estimates_before_a_fault_are_kept_but_not_the_window():
     assert rig.supervisor.reason is Reason.OUTSIDE_BOUND
     start = rig.guard.controller.settings.initial_estimate
     learned = rig.guard.samples.estimate.copy()
+    disturbance = rig.guard.samples.disturbance.copy()
+    assert disturbance.any()
     at = np.flatnonzero((np.array(seen) == learned).all(axis=1))
     assert at.size
     assert at[-1] < len(seen) - 1  # from before the error grew
@@ -258,7 +303,6 @@ def test_estimates_before_a_fault_are_kept_but_not_the_window():
     rig.guard.activate()
     controller = rig.guard.controller
     kept = controller.save()
-    disturbance = controller.state.disturbance.copy()
     controller.reset()  # nothing else of the state survives
     controller.state.estimate[:] = learned
     controller.state.disturbance[:] = disturbance
@@ -604,6 +648,26 @@ def test_clock_that_is_set_is_named_instead_of_the_error_it_makes():
     rig.step(2)
     assert rig.supervisor.reason is Reason.STAMP_JUMP
     assert 'the clock was set' in rig.supervisor.text
+
+
+@pytest.mark.parametrize(
+    ('speed', 'share', 'gap', 'is_set'),
+    [
+        (0.021, 0.0, 0.035, True),
+        (0.019, 0.0, 0.035, False),  # noise
+        (0.5, 0.49, 0.035, True),
+        (0.5, 0.51, 0.035, False),
+        (0.5, 0.0, 0.0026, True),
+        (0.5, 0.0, 0.0024, False),  # less than the law notices
+    ],
+)
+def test_clock_was_set_if_a_moving_arm_has_moved_for_less_than_half_the_gap(
+    speed, share, gap, is_set
+):
+    """`share` is the part of `gap` [s] for which it moved at its `speed` [rad/s]."""
+    dq = np.array([0.6, -0.8]) * speed
+    fault = StateCheck(JOINTS, 1e-3).clock_step(gap, share * gap * dq, dq)
+    assert (fault is not None) == is_set
 
 
 def test_states_that_are_really_missed_are_no_step_of_the_clock():

@@ -70,6 +70,20 @@ def test_velocities_are_those_of_the_positions_after_the_stop_and_a_reset():
     assert rig.supervisor.phase is Phase.TRACKING
 
 
+def test_wrong_velocity_does_not_decide_how_much_the_safe_torque_damps():
+    """What it showed of the rotors is forgotten with it: D is for the inertia of before."""
+    rig = Rig({'safety.torque': 'damping'})
+    rig.step(200)
+    rig.guard.fail('a test')
+    scale = rig.guard._safe_torque.scale
+    before = scale.copy()
+    scale[:] = 0.1
+    rig.sense = lambda state: [state.raw(dq=-state.dq)]
+    rig.step(300)
+    assert 'its positions change by' in rig.supervisor.text
+    np.testing.assert_array_equal(scale, before)
+
+
 def test_wrong_velocity_is_found_before_the_start():
     """In motion, by the states that are held back until the rate is known."""
     rig = Rig()

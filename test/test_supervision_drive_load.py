@@ -1,0 +1,122 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What the drives are told of a weighed load, step by step, and what the law makes of it."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from blf_dsc_controller.configuration.nodes import load_loop
+from blf_dsc_controller.configuration.schema import change
+from blf_dsc_controller.law.factory import controller_of
+from blf_dsc_controller.supervision.drive_load import DriveLoad, DriveLoads
+
+CONFIG = change(
+    load_loop('fr3_direct').controller,
+    {'learning.tell_drive': True, 'robot.drive_payload': 0.5},
+)
+CENTRE = (0.01, -0.02, 0.05)  # m
+SURE = (0.01, 0.005, 0.005, 0.005)  # kg and m, standard deviations
+
+
+@pytest.fixture
+def law():
+    """A law whose arm rests in the posture of the preset's reference."""
+    law = controller_of(CONFIG)
+    q = np.array(CONFIG.reference.offset)
+    law.update(0.0, 1e-3, np.concatenate((q, np.zeros(14))))
+    return law
+
+
+def weigh(law, mass, deviations=SURE):
+    """Let the law have weighed a load [kg] with these deviations [kg, m, m, m]."""
+    law.state.load[:] = (mass, *CENTRE, *deviations)
+
+
+def added_mass(law, before):
+    """Return by how much more mass [kg] of the last link the law leaves to the drives."""
+    change = law.settings.drive_inertias - before
+    return float(change.reshape(-1, 4)[-1, 0])
+
+
+def test_load_is_told_in_steps_of_half_a_percent_of_a_torque_limit(law):
+    loads = DriveLoads(CONFIG)
+    weigh(law, 2.0)
+    told = []
+    while (load := loads.next(law)) is not None:
+        before = law.state.added.copy()
+        loads.take(law, load)
+        told.append(load.mass)
+        step = np.abs(law.state.added - before) / law.settings.torque_limit
+        assert step.max() < 0.005 * (1.0 + 1e-9)
+    assert len(told) > 10
+    assert (np.diff(told) > 0.0).all()
+    assert loads.told.mass == pytest.approx(2.5)  # with the declared 0.5 kg
+    np.testing.assert_allclose(loads.told.moments[1:], 2.0 * np.array(CENTRE))
+
+
+@pytest.mark.parametrize(
+    ('mass', 'deviations', 'contact', 'is_told'),
+    [
+        (2.0, SURE, 0.0, True),
+        (2.0, SURE, 1.0, False),  # something touches the arm
+        (0.04, SURE, 0.0, False),  # kg, within 0.05: no change
+        (0.06, SURE, 0.0, True),
+        (2.0, (0.05, 0.0, 0.005, 0.005), 0.0, False),  # no interval of the centre yet
+        (2.0, (0.05, 0.005, 0.005, 0.005), 0.0, True),  # 0.098 kg, less than 5 %
+        (2.0, (0.052, 0.005, 0.005, 0.005), 0.0, False),
+        (0.5, (0.025, 0.005, 0.005, 0.005), 0.0, True),  # 0.049 kg, less than 0.05
+        (0.5, (0.026, 0.005, 0.005, 0.005), 0.0, False),
+        (2.0, (0.0, 0.005, 0.005, 0.005), 0.0, False),  # not weighed yet
+        (2.0, (0.01, 0.005, 0.005, 0.015), 0.0, True),  # 0.0294 m, less than 0.03
+        (2.0, (0.01, 0.005, 0.005, 0.016), 0.0, False),
+    ],
+)
+def test_only_a_load_that_is_well_known_is_told(
+    law, mass, deviations, contact, is_told
+):
+    weigh(law, mass, deviations)
+    law.state.contact[0] = contact
+    assert (DriveLoads(CONFIG).next(law) is not None) == is_told
+
+
+def test_law_leaves_to_the_drives_what_they_were_told_since_it_began(law):
+    """After a reset it knows of no load, so what they have been told holds that load."""
+    loads = DriveLoads(CONFIG)
+    before = law.settings.drive_inertias.copy()
+    loads.take(law, DriveLoad(2.5, CENTRE))
+    assert added_mass(law, before) == pytest.approx(2.0)
+    loads.forget(law)
+    assert added_mass(law, before) == 0.0
+    loads.take(law, DriveLoad(3.5, CENTRE))
+    assert added_mass(law, before) == pytest.approx(1.0)
+
+
+def test_load_that_is_put_down_after_a_reset_leaves_what_it_held(law):
+    """The law then weighs the whole load as negative, in the frame of its own begin."""
+    loads = DriveLoads(CONFIG)
+    loads.take(law, DriveLoad(2.5, CENTRE))
+    loads.forget(law)
+    weigh(law, -1.0)
+    for _ in range(100):
+        load = loads.next(law)
+        if load is None:
+            break
+        loads.take(law, load)
+    assert loads.told.mass == pytest.approx(1.5)
+    np.testing.assert_allclose(loads.told.centre, CENTRE)
+
+
+def test_told_load_is_left_as_it_is_until_another_is_weighed(law):
+    """Small changes are told as the rest of a load only, not as one of its own."""
+    loads = DriveLoads(CONFIG)
+    loads.take(law, DriveLoad(2.5, CENTRE))
+    weigh(law, 2.05)
+    assert loads.next(law) is None
+    weigh(law, 2.2)
+    assert loads.next(law) is not None  # the first of several steps ...
+    weigh(law, 2.05)
+    assert loads.next(law) is not None  # ... which are carried on
+    loads.forget(law)
+    weigh(law, 0.0)
+    assert loads.next(law) is None
