@@ -4,6 +4,10 @@
 from __future__ import annotations
 
 import math
+import os
+import signal
+import subprocess
+import sys
 from functools import partial
 
 import numpy as np
@@ -13,6 +17,8 @@ from recorded_run import limited_files, small_disk
 import blf_dsc_controller as blf
 from blf_dsc_controller.bags.content import read_content
 from blf_dsc_controller.bags.recovery import recover
+from blf_dsc_controller.cli.bags import PARTIAL
+from blf_dsc_controller.cli.main import main
 from blf_dsc_controller.control.arm_controller import StateError
 from blf_dsc_controller.errors import BlfDscError, ConfigurationError
 from blf_dsc_controller.messages.journal import EventType
@@ -24,6 +30,18 @@ from sim_plant.plant import plant_of, steps_of
 
 LOOP = blf.load_loop('recommended', {'sim_plant': {'duration': 1.0}})
 LONG = blf.load_loop('recommended', {'sim_plant': {'duration': 4.0}})
+
+KILLED = """
+import os, signal, sys, time
+from test_arm_controller import LOOP, blf, plant_of, run
+controller = blf.ArmController(LOOP.controller, record=sys.argv[1])
+run(controller, plant_of(LOOP.plant), LOOP.plant, 700)
+controller._recorder._bag.flush()  # as after 0.1 s
+while os.path.getsize(f'{sys.argv[1]}/bag_0.mcap') < 100_000:  # of some 300 kB
+    time.sleep(0.01)
+os.kill(os.getpid(), signal.SIGKILL)
+"""
+ENVIRONMENT = os.environ | {'PYTHONPATH': os.pathsep.join(filter(None, sys.path))}
 
 
 def run(controller, plant, config, steps):
@@ -212,3 +230,14 @@ def test_error_at_the_end_of_the_recording_does_not_lose_the_last_torque(tmp_pat
         controller.update(1.0, q, dq, effort)
         assert controller.close() is not None
     assert 'cannot be written any further: File too large' in controller.output_problem
+
+
+def test_recording_of_a_loop_that_was_killed_is_not_said_to_be_whole(tmp_path, capsys):
+    """A loop without ROS, whose process ends by SIGKILL in motion."""
+    killed = subprocess.run(
+        [sys.executable, '-c', KILLED, tmp_path / 'bag'], env=ENVIRONMENT, check=False
+    )
+    assert killed.returncode == -signal.SIGKILL
+    recover(tmp_path / 'bag', tmp_path / 'saved')
+    assert main(['replay', str(tmp_path / 'saved')]) == PARTIAL
+    assert 'MISSING in the bag: the end of the run' in capsys.readouterr().out

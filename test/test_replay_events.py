@@ -80,6 +80,12 @@ class Recorder(Rig):
             self.record(*self.telemetry.command(torque))
         super()._command(torque)
 
+    def release(self):
+        """End as the node does."""
+        torque = self.guard.release()
+        if torque is not None:
+            self.record(*self.telemetry.command(torque))
+
     def write(self, path, **options):
         """Write the bag; return it."""
         self.publish_events()
@@ -160,7 +166,7 @@ def eventful():
 
 def test_every_kind_of_event_and_watchdog_torques_replay(tmp_path):
     rig = eventful()
-    rig.guard.release()
+    rig.release()
     result = rig.verify(tmp_path)
     assert (result.difference, result.remarks) == (None, ())
     assert ', '.join(result.transitions) == (
@@ -181,7 +187,7 @@ def test_every_kind_of_event_and_watchdog_torques_replay(tmp_path):
 def test_stream_of_any_length_replays(tmp_path, monkeypatch, topic):
     """Motions are read one by one, so only other events may not exceed what memory holds."""
     rig = eventful()
-    rig.guard.release()
+    rig.release()
     rig.publish_events()
     size = 0
     for entry in of(rig.entries, JOURNAL):
@@ -206,11 +212,11 @@ def test_dropped_states_are_detected(tmp_path):
     rig.step(50)
     rig.guard.activate()
     rig.step(50)
-    rig.guard.release()
+    rig.release()
     result = rig.verify(tmp_path)
     assert (result.difference, result.skipped) == (None, 3)
     assert compared(result)['tracking_error'] == 6 * 147
-    assert compared(result)['commands'] == 2 * 147
+    assert compared(result)['commands'] == 2 * 148  # the last one when it ends
 
 
 def test_dropped_state_is_told_from_a_missing_answer_beside_torques_of_the_watchdog(
@@ -223,7 +229,7 @@ def test_dropped_state_is_told_from_a_missing_answer_beside_torques_of_the_watch
     rig.wait(100)
     rig.guard.reset()
     rig.step(30)
-    rig.guard.release()
+    rig.release()
     result = rig.verify(tmp_path)
     torques = len(of(rig.entries, COMMANDS))
     assert torques > 80  # those of 79 states, and the watchdog's

@@ -380,7 +380,7 @@ def _matched(
         keys = recorded.stamp
         wanted = replayed.stamp
     else:
-        keys = _numbers(topic, recorded, answers)
+        keys = _numbers(topic, recorded, max(answers, replayed.size))
         wanted = replayed.sequence
     index = np.minimum(np.searchsorted(keys, wanted), keys.size - 1)
     is_known = keys[index] == wanted
@@ -391,15 +391,15 @@ def _matched(
     return recorded.select(index[known]), replayed.select(known), missing
 
 
-def _numbers(topic: topics.Topic, recorded: JointStates, answers: int) -> Stamps:
+def _numbers(topic: topics.Topic, recorded: JointStates, least: int) -> Stamps:
     """Return the numbers of messages among those of their publisher.
 
-    BlfDscError if unknown.
+    It sent at least so many.  BlfDscError if they are unknown.
     """
     sequence = recorded.sequence
     numbered = topic in (topics.COMMANDS, topics.TRACKING_ERROR) and sequence.any()
     if not numbered:
-        if topic is topics.COMMANDS and recorded.size < answers:  # of another recorder
+        if topic is topics.COMMANDS and recorded.size < least:  # of another recorder
             raise BlfDscError(
                 'some are missing, and they have neither stamps nor numbers'
             )
@@ -452,8 +452,7 @@ def _incomplete(
             yield f'{found.missing} messages of {found.topic}'
     if end:
         yield f'what follows: {end}'
-    is_of_node = 'topics' in events[0].content
-    if is_of_node and not end and events[-1].type is not EventType.RELEASE:
+    if not end and events[-1].type is not EventType.RELEASE:
         yield (
             f'the end of the run: {content.topics[topics.JOURNAL].name} has no release, so the '
             'recording ended before the controller, or its last messages are missing'

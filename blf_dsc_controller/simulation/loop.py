@@ -122,8 +122,17 @@ def _run_supervised(
             _run_guarded(guard, plant, record, bound, is_end=is_end)
         if guard.start_error is not None:
             raise guard.start_error
+        if is_end:
+            _release(guard, record)
         bound[:] = record.sample(-1).bound
         yield record
+
+
+def _release(guard: Guard, record: Record) -> None:
+    """End the run as a node does: with the torque of an arm at rest, and an event."""
+    torque = guard.release()
+    if torque is not None:
+        record.left[:] = torque
 
 
 def _run_compiled(
@@ -188,6 +197,7 @@ class Record:
     # (k, s) rows of `law.state.Sample`; after a stop NaN except bound, torque
     samples: np.ndarray
     truths: np.ndarray  # (k, p + 3 n) [P, tau_dist, q, dq]
+    left: np.ndarray  # (n,) N m, commanded after the last sample; NaN: nothing was
     parameters: tuple[str, ...]  # names of the entries of P
     config: ControllerConfig
     controller: Controller  # after the run
@@ -264,6 +274,7 @@ def new_record(
         measurements=np.zeros((size, 3 * n)),
         samples=np.zeros((size, controller.sample_vector.size)),
         truths=np.zeros((size, len(names) + 3 * n)),
+        left=np.full(n, np.nan),
         parameters=names,
         config=config,
         controller=controller,
@@ -346,9 +357,12 @@ def _messages(parts: Iterable[Record]) -> Iterator[tuple[int, Message]]:
                 yield stamp, plant.truth(stamp, record.truths[k])
             row += 1
             if np.isnan(sample.qr[0]):  # stopped
+                yield stamp, controller.answer(stamp, sample.torque)
                 continue
             np.maximum(ratio, np.abs(sample.xi1) / sample.bound, out=ratio)
             for message in controller.sample(stamp, sample, limit, ratio, float('nan')):
                 yield stamp, message
+    if np.isfinite(record.left).all():
+        yield stamp, controller.command(record.left)
     for event in islice(record.journal.pending, noted, None):
         yield stamp, (topics.JOURNAL, event.encode())
