@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import csv
 import os
+import re
 import shutil
 from itertools import pairwise
 
@@ -41,6 +42,7 @@ from blf_dsc_controller.messages.codecs import (
     definition,
     typestore,
 )
+from blf_dsc_controller.messages.journal import encode_string
 from blf_dsc_controller.messages.topics import (
     COMMANDS,
     FLOAT64_MULTI_ARRAY,
@@ -252,7 +254,7 @@ def test_gripper_on_the_same_topic_is_told_from_the_arm_under_any_name(
             assert main([*command, *words]) == 0, capsys.readouterr().err
         tables.append(list(csv.reader(out.open())))
     assert tables[0] == tables[1] == tables[2]
-    assert '/arm/torque: 602 values bit-equal' in capsys.readouterr().out
+    assert '/arm/torque: 604 values bit-equal' in capsys.readouterr().out
     # Without the mapping, the joint states are not found.
     assert main(['plot', str(renamed), '--out', str(tmp_path / 'none')]) == 1
 
@@ -434,6 +436,28 @@ def test_files_that_are_missing_or_hold_other_numbers_than_stated(
     all_say(copy, f'{copy} cannot be read as a bag', 'bag_0.mcap')
     code, _, error = run('recover', copy, '--out', 'clean')
     assert (code, 'there is no MCAP file to recover' in error) == (1, True)
+
+
+@pytest.mark.parametrize(
+    ('storage', 'compression'),
+    [
+        (MCAP, CompressionMode.NONE),
+        (MCAP, CompressionMode.MESSAGE),
+        (SQLITE3, CompressionMode.NONE),
+    ],
+)
+@pytest.mark.parametrize('stated', [0, 2, 4])
+def test_count_of_a_topic_that_nobody_reads_is_checked_too(
+    entries, tmp_path, all_say, storage, compression, stated
+):
+    messages = [*entries, *(['/a', 'std_msgs/msg/String', 5, encode_string('')],) * 3]
+    bag = write(tmp_path / 'bag', messages, storage, compression=compression)
+    metadata = bag / 'metadata.yaml'
+    text = metadata.read_text()
+    counts = re.findall('message_count: 3\n', text)
+    assert len(counts) == 1
+    metadata.write_text(text.replace(counts[0], f'message_count: {stated}\n'))
+    all_say(bag, f'it holds 3 messages of /a, but counts {stated}')
 
 
 @pytest.mark.parametrize(

@@ -386,12 +386,23 @@ def test_stated_sizes_of_compressed_data_are_not_believed(compression):
 def test_gaps_in_sequence_numbers_are_losses():
     """Each publisher has its own numbers."""
     messages = TopicMessages('/x', JOINT_STATES.type)
-    for sequence in (4, 5, 0, 8, 9, 2, 3, 10, 4, 4, 5, 1, 2):
-        messages.add(BagMessage('/x', 0, b'', sequence))
+    for k, sequence in enumerate((4, 5, 0, 8, 9, 2, 3, 10, 4, 4, 5, 1, 2)):
+        messages.add(BagMessage('/x', 0, bytes([k]), sequence))
     assert messages.lost == '2 missed, 7 sent before the recorder connected'
     for sequence in range(99, 1, -1):  # of whatever it may be
         messages.add(BagMessage('/x', 0, b'', sequence))
     assert messages.lost == ''
+
+
+@pytest.mark.parametrize('apart', [1, 10])
+def test_message_that_was_recorded_twice_is_no_loss(apart):
+    """It has the number and the content of another; those of two publishers differ."""
+    messages = TopicMessages('/x', JOINT_STATES.type)
+    for sequence in (*range(1, 21), 21 - apart, 21):
+        messages.add(BagMessage('/x', 0, bytes([sequence]), sequence))
+    assert (messages.size, messages.lost) == (22, '')
+    messages.add(BagMessage('/x', 0, b'other', 3))
+    assert messages.lost == '0 missed, 2 sent before the recorder connected'
 
 
 def test_undecodable_message_is_reported_with_topic_and_number(tmp_path):

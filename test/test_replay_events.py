@@ -289,6 +289,8 @@ def strict(event):
     [
         ('stop', altered(reason='stamp jump'), TRACKING_ERROR, 'stop: '),
         ('stop', later, TRACKING_ERROR, 'used by the law ('),
+        ('stop', altered(text='all is well'), JOURNAL, 'text of event'),
+        ('start', altered(resumed=True), JOURNAL, 'resumed of event'),
         ('trajectory', later, TRACKING_ERROR, 'trajectory'),
         ('trajectory', other_point, COMMANDS, 'effort of joint'),
         ('configure', strict, TRACKING_ERROR, 'used by the law ('),
@@ -307,6 +309,25 @@ def test_changed_event_is_a_difference(tmp_path, kind, alter, topic, field):
     assert (difference.topic, difference.field[: len(field)]) == (topic.resolved, field)
     if kind in ('stop', 'trajectory'):
         assert abs(difference.stamp - event.stamp) <= MILLISECOND
+
+
+def test_text_of_another_version_is_not_compared(tmp_path, monkeypatch):
+    """Its words may be others; those of what came from outside are only repeated."""
+    rig = eventful()
+    rig.publish_events()
+    events = [(entry, decode(entry[3])) for entry in of(rig.entries, JOURNAL)]
+    outside, own = [each for each in events if each[1].type == 'stop']
+    assert outside[1].content['reason'] == 'state timeout'
+    outside[0][3] = altered(text='silence')(outside[1]).encode()
+    assert rig.verify(tmp_path / 'outside').difference is None
+    own[0][3] = altered(text='all is well')(own[1]).encode()
+    monkeypatch.setattr('blf_dsc_controller.replay.verify.__version__', '9.9.9')
+    result = rig.verify(tmp_path / 'own')
+    assert result.difference is None
+    number = own[1].number
+    assert (
+        f'text of event {number} (stop) as this version words it' in result.incomplete
+    )
 
 
 def test_stop_that_the_recorded_controller_did_not_make_is_the_difference(tmp_path):

@@ -89,14 +89,14 @@ class OpenBag:
         """Yield the messages of `topics`, nearly in order of reception.
 
         Raises:
-            ValueError: their number is not the one that the bag states.
+            ValueError: the number of messages of any topic is not the one that the bag states.
         """
         found: Counter[str] = Counter()
         for message in self._of_files() if self._files else self._of_library(topics):
             found[message.topic] += 1
             if message.topic in topics:
                 yield message
-        for topic in topics:
+        for topic in (*topics, *self.held, *found):
             if found[topic] != self.counts[topic]:
                 raise ValueError(
                     f'it holds {found[topic]} messages of {topic}, but counts {self.counts[topic]}'
@@ -114,9 +114,8 @@ class OpenBag:
                         names[record.id] = record.topic
 
     def _of_library(self, topics: Collection[str]) -> Iterator[BagMessage]:
-        chosen = [each for each in self._reader.connections if each.topic in topics]
-        for each, received, raw in self._reader.messages(chosen) if chosen else ():
-            if self._is_ros1:
+        for each, received, raw in self._reader.messages():
+            if self._is_ros1 and each.topic in topics:
                 # ROS 1 and 2 serialise the common types alike, except for padding and
                 # `seq`.
                 raw = typestore().ros1_to_cdr(raw, each.msgtype)  # noqa: PLW2901

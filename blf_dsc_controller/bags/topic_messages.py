@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import os
 import tempfile
+from collections import deque
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
@@ -40,6 +41,7 @@ _LAYOUT, _RECEIVED, _SEQUENCE, _STAMP, _VALUES = range(5)
 _MOST_NAMES = 20_000  # and fields, of a topic
 _MOST_PLACES = 500_000  # in all layouts of a topic
 _MOST_TEXT = 1 << 24  # bytes of a message that is kept as it is
+_TWINS = 1000  # messages back, among which those that were recorded twice are found
 _MOST_PUBLISHERS = 10  # of a topic, one after the other or at once
 _NAN = np.float64(np.nan).view(np.int64)
 _TIME = np.dtype([('s', '<i4'), ('ns', '<u4')])
@@ -201,6 +203,8 @@ class TopicMessages:
         self._kept: list[tuple[int, int, int]] = []
         # sequence number of each publisher, that of the last one last
         self._next: list[int] = []
+        # of the last messages: sequence number and hash
+        self._recent: deque[tuple[int, int]] = deque(maxlen=_TWINS)
         self._missed = self._before = 0
 
     def __del__(self) -> None:
@@ -209,7 +213,7 @@ class TopicMessages:
     def add(self, message: BagMessage) -> None:
         """Add a message; none may be added once a column was read."""
         if message.sequence:
-            self._count(message.sequence)
+            self._count(message.sequence, hash(message.raw))
         if self.type not in _LAYOUTS:
             self._keep(message)
         else:
@@ -237,11 +241,17 @@ class TopicMessages:
         for received, offset, size in self._kept:
             yield received, os.pread(self._file.fileno(), size, offset)
 
-    def _count(self, sequence: int) -> None:
-        """Count the messages that are missing before the one with this number."""
-        if self._next and self._next[-1] == sequence:
+    def _count(self, sequence: int, content: int) -> None:
+        """Count the messages that are missing before the one with this number.
+
+        A twin of a message has its content, too, of which `content` is the hash.
+        """
+        is_next = bool(self._next) and self._next[-1] == sequence
+        is_twin = not is_next and (sequence, content) in self._recent
+        self._recent.append((sequence, content))
+        if is_next:
             self._next[-1] += 1
-        elif len(self._next) <= _MOST_PUBLISHERS:
+        elif len(self._next) <= _MOST_PUBLISHERS and not is_twin:
             expected = max(
                 (number for number in self._next if number <= sequence), default=0
             )

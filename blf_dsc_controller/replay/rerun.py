@@ -10,8 +10,9 @@ dropped has no answer.
 from __future__ import annotations
 
 import heapq
+import json
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -50,6 +51,15 @@ _AXES = 3
 _MOST_TORQUES = 1_000_000  # of the watchdog: an hour without joint states
 
 
+class Alteration(NamedTuple):
+    """What a recorded event says otherwise than the replayed one."""
+
+    event: Event
+    name: str  # of a part of its content
+    recorded: str
+    replayed: str
+
+
 class Rerun:
     """Replay of the guarded controller.
 
@@ -63,6 +73,7 @@ class Rerun:
         skipped: number of joint states that the controller did not answer.
         departure: in what, and at which stamp [ns], the controller first started,
             stopped or accepted otherwise than the recorded one, which ends the replay.
+        alteration: the first event that happened alike, but says something else; or None.
         end: any other reason why the replay ended before the bag, or empty.
     """
 
@@ -89,6 +100,7 @@ class Rerun:
         self.first = -1
         self.last = -1
         self.departure: tuple[str, int] | None = None
+        self.alteration: Alteration | None = None
         self.end = ''
         self._guard = Guard(config, lambda: 0, lambda: 0)
         self._guard.journal.pending.clear()
@@ -304,7 +316,7 @@ class Rerun:
             self._depart(f'trajectory accepted ({error})', event.stamp)
             return
         if pending and _key(pending[0]) == _key(event):
-            pending.popleft()
+            self._compare(event, pending.popleft())
         elif pending and _is_own(event):
             self._report_departure(pending[0], event)
         else:
@@ -350,6 +362,19 @@ class Rerun:
             while guard.watchdog.torques < content['torques']:
                 self._command(event.stamp, guard.time_out(''))
             guard.end_silence()
+
+    def _compare(self, event: Event, own: Event) -> None:
+        """Note what an event says otherwise than the controller's own.
+
+        Of what came from outside, the replay only repeats the text.
+        """
+        if self.alteration is not None or _reason(event) in _EXTERNAL:
+            return
+        for name in filter(own.content.__contains__, event.content):
+            texts = [json.dumps(each.content[name]) for each in (event, own)]
+            if texts[0] != texts[1]:
+                self.alteration = Alteration(event, name, *texts)
+                return
 
     def _report_departure(self, own: Event, event: Event | None) -> None:
         """Note that the controller started or stopped unlike the recorded one."""

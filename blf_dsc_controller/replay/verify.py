@@ -26,7 +26,7 @@ from blf_dsc_controller.messages import topics
 from blf_dsc_controller.messages.codecs import JOINT_STATE_FIELDS, MessageError
 from blf_dsc_controller.messages.event_content import FORMAT
 from blf_dsc_controller.messages.journal import Event, EventType
-from blf_dsc_controller.replay.rerun import Rerun
+from blf_dsc_controller.replay.rerun import Alteration, Rerun
 from blf_dsc_controller.run import Floats, Stamps
 
 _BLOCK = 4096  # messages compared at once
@@ -49,14 +49,14 @@ _TRANSITIONS = (
 
 
 class Difference(NamedTuple):
-    """The first number of a topic that differs."""
+    """The first number of a topic, or part of an event, that differs."""
 
     topic: str
     field: str
     stamp: int  # ns
     time: float  # s since the first state
-    recorded: float
-    replayed: float
+    recorded: float | str
+    replayed: float | str
 
     def __str__(self) -> str:
         return (
@@ -180,6 +180,8 @@ def verify(path: Path, namespace: str = '', names: NameMap = NO_NAMES) -> Verifi
         differences.insert(0, _departed(run, *run.departure))
     elif not any(found.values for found in comparisons):
         raise _nothing_to_compare(content)
+    if run.alteration is not None and content.version == __version__:
+        differences.append(_altered(content, run, run.alteration))
     texts = [content.topics[topic] for topic in _OTHERS if topic in content.topics]
     end = run.end or other
     return Verification(
@@ -191,7 +193,7 @@ def verify(path: Path, namespace: str = '', names: NameMap = NO_NAMES) -> Verifi
         tuple(run.events),
         run.motions,
         tuple(_remarks(content, end, newer, _changed_law(config, events[0]))),
-        tuple(_incomplete(content, events, comparisons, end)),
+        tuple(_incomplete(content, events, comparisons, end, run.alteration)),
         min(differences, key=lambda found: found.stamp, default=None),
     )
 
@@ -223,6 +225,15 @@ def _departed(run: Rerun, what: str, stamp: int) -> Difference:
     """Return the departure of a replay as a difference."""
     time = (stamp - max(run.first, 0)) * 1e-9
     return Difference(topics.TRACKING_ERROR.resolved, what, stamp, time, 1.0, 0.0)
+
+
+def _altered(content: Content, run: Rerun, found: Alteration) -> Difference:
+    """Return an event that says something else as a difference."""
+    event = found.event
+    time = (event.stamp - max(run.first, 0)) * 1e-9
+    what = f'{found.name} of event {event.number} ({event.type})'
+    journal = content.topics[topics.JOURNAL].name
+    return Difference(journal, what, event.stamp, time, found.recorded, found.replayed)
 
 
 def _events(content: Content) -> tuple[list[Event], int, str]:
@@ -445,13 +456,19 @@ def _incomplete(
     events: Sequence[Event],
     comparisons: Sequence[Comparison],
     end: str,
+    alteration: Alteration | None,
 ) -> Iterator[str]:
-    """Yield what the recording lacks: messages, or its end."""
+    """Yield what the recording lacks: messages, its end, texts of this version."""
     for found in comparisons:
         if found.missing:
             yield f'{found.missing} messages of {found.topic}'
     if end:
         yield f'what follows: {end}'
+    if alteration is not None and content.version != __version__:
+        yield (
+            f'{alteration.name} of event {alteration.event.number} '
+            f'({alteration.event.type}) as this version words it'
+        )
     if not end and events[-1].type is not EventType.RELEASE:
         yield (
             f'the end of the run: {content.topics[topics.JOURNAL].name} has no release, so the '
