@@ -322,8 +322,47 @@ def accelerate(
     cholesky_solve(now.factor, ddq)
 
 
+@called
+def fill_mobility(
+    bodies: Array,
+    memory: Array,
+    payload: float,
+    q: Array,
+    dq: Array,
+    inverse: Array,
+    bias: Array,
+) -> None:
+    """Write M^-1 (n, n) and C dq + G (n,) of the bodies, with a payload [kg] at the tip."""
+    arm = bodies_of(bodies)
+    now = motion_of(memory, arm)
+    locate(arm, q, dq, now)
+    combine_bodies(arm, now, payload)
+    for j in range(arm.n):
+        bias[j] = along_joint(
+            arm, now, j, vector(now.force[j + 1]), vector(now.torque[j + 1])
+        )
+    fill_inertia(arm, now)
+    invert(now.M, now.factor, inverse)
+
+
+@inner
+def invert(M: Array, factor: Array, inverse: Array) -> None:
+    """Write the inverse of a positive definite M (n, n), with memory for its factor (n, n)."""
+    for i in range(M.shape[0]):
+        for j in range(i + 1):
+            factor[j, i] = M[i, j]
+    cholesky_factor(factor)
+    for i in range(M.shape[0]):
+        for j in range(M.shape[0]):
+            inverse[i, j] = 1.0 if i == j else 0.0
+        cholesky_solve(factor, inverse[i])
+
+
 class RigidArm(NamedTuple):
-    """A serial-chain arm with its working memory: threads must not share one."""
+    """A serial-chain arm with its working memory: threads must not share one.
+
+    Its bodies may begin with those of a base, which are not among its n joints.
+    """
 
     n: int
     p: int
@@ -354,9 +393,10 @@ class RigidArm(NamedTuple):
         accelerate(self.bodies, self.memory, payload, q, dq, torque, ddq)
 
 
-def rigid_arm(bodies: RigidBodies) -> RigidArm:
-    """Return the arm of some bodies."""
-    return RigidArm(bodies.n, bodies.p, pack(bodies), np.zeros(motion_size(bodies)))
+def rigid_arm(bodies: RigidBodies, mounts: int = 0) -> RigidArm:
+    """Return the arm of some bodies, of which the first ones are those of its base."""
+    memory = np.zeros(motion_size(bodies))
+    return RigidArm(bodies.n - mounts, bodies.p, pack(bodies), memory)
 
 
 class PointMassArm(NamedTuple):

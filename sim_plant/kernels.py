@@ -10,6 +10,9 @@ with noise of its own, or differenced from the measured positions, and a low-pas
 may follow.  Noise comes from one seeded generator, so the same seed repeats a run
 exactly.
 
+With springs between motors and links (`sim_plant.elastic`), the encoders are on either
+side of them.
+
 A command is limited in rate, late, limited, lagging and noisy.  Drives of cobots hold
 the arm against gravity, and compensate part of their friction, by a model of their own,
 right or wrong, with the payload that they are configured for.  Some brake when the
@@ -24,10 +27,11 @@ import numpy as np
 from blf_dsc_controller.compiled.jit import inner, kernel
 from blf_dsc_controller.compiled.layout import Array
 from blf_dsc_controller.compiled.views import part, view
-from blf_dsc_controller.numerics.elementary import exp, tanh
+from blf_dsc_controller.numerics.elementary import exp, sin, tanh
 from sim_plant.arm import Arm, fill_gravity
 from sim_plant.layout import (
     MEASURED,
+    MOTOR,
     Encoders,
     PlantSettings,
     PlantState,
@@ -77,6 +81,18 @@ def quantised(angle: float, resolution: float) -> float:
 
 
 @inner
+def motor_position(plant: PlantSettings, now: PlantState, i: int) -> float:
+    """Return the position of a motor [rad], which is that of its link without springs."""
+    return float(now.elastic.theta[i] if plant.springs > 0 else now.x[i])
+
+
+@inner
+def motor_velocity(plant: PlantSettings, now: PlantState, i: int) -> float:
+    """Return the velocity of a motor [rad/s]."""
+    return float(now.elastic.dtheta[i] if plant.springs > 0 else now.x[plant.n + i])
+
+
+@inner
 def sense(plant: PlantSettings, now: PlantState) -> None:
     """Write the reading of this sample, including offset and noise.
 
@@ -91,14 +107,17 @@ def sense(plant: PlantSettings, now: PlantState) -> None:
     filters = encoders.velocity_pole > 0.0 and not first
     old = exp(-encoders.velocity_pole * span) if filters else 0.0
     for i in range(n):
-        position = (
-            now.x[i] + now.acting.offset[i] + encoders.position_noise * reading.noise[i]
-        )
+        q, dq = now.x[i], now.x[n + i]
+        if encoders.side == MOTOR:
+            q, dq = motor_position(plant, now, i), motor_velocity(plant, now, i)
+        position = q + now.acting.offset[i] + encoders.position_noise * reading.noise[i]
+        if encoders.eccentricity[i] != 0.0:
+            position += encoders.eccentricity[i] * sin(q)
         position = quantised(position, encoders.resolution)
         if encoders.velocity_source == MEASURED:
-            velocity = now.x[n + i] + encoders.velocity_noise * reading.noise[n + i]
+            velocity = dq + encoders.velocity_noise * reading.noise[n + i]
         elif first:
-            velocity = now.x[n + i]
+            velocity = dq
         else:
             velocity = (position - reading.position[i]) / span
         if filters:
@@ -173,10 +192,11 @@ def compensate(plant: PlantSettings, now: PlantState) -> None:
     fill_gravity(drives.bodies, state.memory, part(now.x, 0, (n,)), state.added)
     if drives.friction > 0.0:
         for i in range(n):
-            dq = now.x[n + i]
+            dq = motor_velocity(plant, now, i)
             torque = acting.viscous[i] * dq
             torque += acting.coulomb[i] * tanh(dq / plant.disturbance.coulomb_velocity)
-            state.added[i] += drives.friction * torque
+            state.eased[i] = drives.friction * torque
+            state.added[i] += state.eased[i]
 
 
 @inner
@@ -201,8 +221,8 @@ def observe(
     """Write [q, dq, effort] (3n,) of this sample, with its standard normal noise (3n,).
 
     `effort` is the torque applied over the last interval [N m], before the first one
-    that with which the drives hold the arm.  Reading a sample again gives the same
-    numbers.
+    that with which the drives hold the arm; as a whole, with a torque loop, that of its
+    sensors.  Reading a sample again gives the same numbers.
     """
     n = plant.n
     if now.sample[0] == 0.0:
@@ -221,6 +241,8 @@ def observe(
         measurement[2 * n + i] = now.drives.applied[i]
         if plant.drives.effort_is_whole == 1:
             measurement[2 * n + i] += now.drives.added[i]
+            if plant.transmission.loop_gain > 0.0:
+                measurement[2 * n + i] = now.elastic.transmitted[i]
         measurement[2 * n + i] *= plant.drives.effort_scale
 
 

@@ -9,11 +9,15 @@ from sim_plant.arm import Arm
 MEASURED = 0
 DIFFERENCED = 1
 VELOCITY_SOURCES = {'measured': MEASURED, 'differenced': DIFFERENCED}
+LINK = 0
+MOTOR = 1
+SIDES = {'link': LINK, 'motor': MOTOR}
 
 
 class Encoders(NamedTuple):
-    """Quality of the encoders, the same on every joint."""
+    """Quality of the encoders, the same on every joint but for their eccentricity."""
 
+    side: int  # of the springs: LINK or MOTOR
     position_noise: float  # rad, standard deviation
     velocity_noise: float  # rad/s, standard deviation; not used when differenced
     resolution: float  # rad, 0 = none
@@ -21,6 +25,7 @@ class Encoders(NamedTuple):
     velocity_pole: float  # rad/s, 0 = no filter
     # samples after which the last reading is sent once more; 0: never
     repeat_every: int
+    eccentricity: Annotated[Array, 'n']  # rad
 
 
 class Disturbance(NamedTuple):
@@ -40,6 +45,32 @@ class Disturbance(NamedTuple):
     stribeck_velocity: float  # rad/s
     ripple: Annotated[Array, 'n']  # N m
     ripple_frequency: float  # rad/rad
+    load_share: float  # additional Coulomb friction, relative to the load on the gear
+    warm_factor: float  # friction in the end, relative to that at the start
+    warm_samples: float  # samples in which 63 % of this change has happened
+
+
+class Springs(NamedTuple):
+    """Springs between motors and links, and the loop of the drives around them.
+
+    A joint without stiffness is rigid: its motor is part of its link.
+    """
+
+    stiffness: Annotated[Array, 'springs']  # N m/rad; 0: none
+    damping: Annotated[Array, 'springs']  # N m s/rad
+    play: Annotated[Array, 'springs']  # rad, to either side
+    hysteresis: Annotated[Array, 'springs']  # N m, of dry friction within the spring
+    mobility: Annotated[Array, 'springs']  # of the motor, 1/(kg m^2)
+    loop_gain: float
+    loop_damping: float  # s
+    loop_decay: float  # of the loop's lag in half a step
+
+
+class Base(NamedTuple):
+    """Springs and dampers beneath the arm, of the coordinates of `on_base`."""
+
+    stiffness: Annotated[Array, 'mounts', 'mounts']
+    damping: Annotated[Array, 'mounts', 'mounts']
 
 
 class Drives(NamedTuple):
@@ -100,13 +131,18 @@ class PlantSettings(NamedTuple):
     n: Passed  # joints of the arm
     p: int  # parameters of the arm
     period_ns: int
-    steps: int  # of the integrator in a sample
+    steps: int  # of the integrator in a sample, or in a block of it
+    blocks: int  # in a sample, in each of which M is held; rigid arms have none
+    springs: int  # n, or 0 if joints and base are rigid
+    mounts: int  # coordinates of the base; 0: it is rigid
     events: int  # number of events
     bodies_size: int  # of drives.bodies
     memory_size: int  # of their motion
     encoders: Encoders
     disturbance: Disturbance
     drives: Drives
+    transmission: Springs
+    base: Base
     load: Load
     schedule: Events
 
@@ -130,6 +166,7 @@ class DriveState(NamedTuple):
     motor: Annotated[Array, 'n']  # at the end of the sample, N m
     applied: Annotated[Array, 'n']  # mean over the sample, N m
     added: Annotated[Array, 'n']  # by the drives, N m
+    eased: Annotated[Array, 'n']  # of it, against friction, N m
     whole: Annotated[Array, 'n']  # torque at the joints, N m
     memory: Annotated[Array, 'memory_size']  # BodyMotion
 
@@ -155,8 +192,49 @@ class Memory(NamedTuple):
     k: Annotated[Array, 6, '2 * n + 6']
     tip: Annotated[Array, 3]  # m
     tip_velocity: Annotated[Array, 3]  # m/s
-    jacobian: Annotated[Array, 3, 'n']  # m/rad
+    jacobian: Annotated[Array, 3, 'n + mounts']  # m/rad
     pull: Annotated[Array, 3]  # acceleration a of the sloshing load, m/s^2
+
+
+class Elastic(NamedTuple):
+    """Motion of base, links and motors; only of plants with springs or such a base.
+
+    The base's coordinates come before those of the links.
+    """
+
+    block: Cell  # of the present sample
+    q: Annotated[Array, 'springs + mounts']  # rad, or m
+    dq: Annotated[Array, 'springs + mounts']
+    dq_before: Annotated[Array, 'springs + mounts']  # at the start of the last block
+    theta: Annotated[Array, 'springs']  # rad, of the motors
+    dtheta: Annotated[Array, 'springs']
+    torque: Annotated[Array, 'springs']  # of the motors, behind their loop, N m
+    hysteresis: Annotated[Array, 'springs']  # N m
+    transmitted: Annotated[
+        Array, 'springs'
+    ]  # by the springs, mean over the sample, N m
+    preload: Annotated[
+        Array, 'mounts'
+    ]  # of the base's springs, by the weight of the arm
+
+
+class ElasticMemory(NamedTuple):
+    """Working memory of a block of steps."""
+
+    q: Annotated[Array, 'springs + mounts']  # in the middle of the block, as predicted
+    dq: Annotated[Array, 'springs + mounts']
+    inverse: Annotated[Array, 'springs + mounts', 'springs + mounts']  # of M
+    bias: Annotated[Array, 'springs + mounts']  # N m, less what loads the links
+    load: Annotated[Array, 'springs + mounts']  # the bias less a sloshing mass, N m
+    force: Annotated[Array, 'springs + mounts']  # of motors or springs, N m
+    spring: Annotated[Array, 'springs']  # torque by its twist, N m
+    touches: Annotated[Array, 'springs']  # 1: outside of the play
+    sum: Annotated[Array, 'springs']  # of transmitted torques, N m
+    # middle of a kick: velocities of base and links, of motors, and accelerations
+    speed: Annotated[Array, 'springs + mounts']
+    motor_speed: Annotated[Array, 'springs']
+    ddq: Annotated[Array, 'springs + mounts']
+    ddtheta: Annotated[Array, 'springs']
 
 
 class PlantState(NamedTuple):
@@ -170,6 +248,8 @@ class PlantState(NamedTuple):
     drives: DriveState
     acting: Acting
     memory: Memory
+    elastic: Elastic
+    elastic_memory: ElasticMemory
 
 
 settings_of = view_of(PlantSettings)

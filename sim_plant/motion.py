@@ -84,18 +84,32 @@ def update_loads(plant: PlantSettings, now: PlantState) -> None:
     for i in range(plant.n):
         acting.viscous[i] = max(acting.viscous[i], 0.0)
         acting.coulomb[i] = max(acting.coulomb[i], 0.0)
+    warm_up(plant, now)
     attach_load(plant, now)
 
 
 @inner
-def locate_tip(plant: PlantSettings, now: PlantState, x: Array) -> None:
-    """Write position, velocity and Jacobian of the tip in the state x."""
-    n, memory = plant.n, now.memory
-    plant.arm.fill_tip(part(x, 0, (n,)), memory.tip, memory.jacobian)
+def warm_up(plant: PlantSettings, now: PlantState) -> None:
+    """Scale friction by that of the present temperature."""
+    given, acting = plant.disturbance, now.acting
+    if given.warm_factor == 1.0:
+        return
+    cold = exp(-now.sample[0] / given.warm_samples)
+    factor = given.warm_factor + (1.0 - given.warm_factor) * cold
+    for i in range(plant.n):
+        acting.viscous[i] *= factor
+        acting.coulomb[i] *= factor
+
+
+@inner
+def locate_tip(plant: PlantSettings, now: PlantState, q: Array, dq: Array) -> None:
+    """Write position, velocity and Jacobian of the tip at q and dq (n,), those of a base first."""
+    memory = now.memory
+    plant.arm.fill_tip(q, memory.tip, memory.jacobian)
     for i in range(3):
         memory.tip_velocity[i] = 0.0
-        for j in range(n):
-            memory.tip_velocity[i] += memory.jacobian[i, j] * x[n + j]
+        for j in range(q.size):
+            memory.tip_velocity[i] += memory.jacobian[i, j] * dq[j]
 
 
 @inner
@@ -103,11 +117,29 @@ def attach_load(plant: PlantSettings, now: PlantState) -> None:
     """Place a sloshing load that begins at the tip, moving with it."""
     n, sloshes = plant.n, now.acting.sloshing[0] > 0.0
     if sloshes and now.sloshes[0] == 0.0:
-        locate_tip(plant, now, now.x)
+        if plant.springs > 0:
+            locate_tip(plant, now, now.elastic.q, now.elastic.dq)
+        else:
+            locate_tip(plant, now, part(now.x, 0, (n,)), part(now.x, n, (n,)))
         for i in range(3):
             now.x[2 * n + i] = now.memory.tip[i]
             now.x[2 * n + 3 + i] = now.memory.tip_velocity[i]
     now.sloshes[0] = 1.0 if sloshes else 0.0
+
+
+@inner
+def dry_friction(
+    plant: PlantSettings, now: PlantState, i: int, dq: float, load: float
+) -> float:
+    """Return Coulomb and Stribeck friction [N m] of a joint, with a load [N m] on its gear."""
+    given = plant.disturbance
+    level = now.acting.coulomb[i] + given.load_share * abs(load)
+    if level == 0.0:
+        return 0.0
+    if given.stribeck != 0.0:
+        speed = dq / given.stribeck_velocity
+        level *= 1.0 + given.stribeck * exp(-speed * speed)
+    return float(level * tanh(dq / given.coulomb_velocity))
 
 
 @inner
@@ -127,38 +159,42 @@ def disturbing_torque(
         angle = given.frequency[i] * t + given.phase[i]
         torque = acting.constant[i] + given.amplitude[i] * sin(angle)
         torque += acting.viscous[i] * dq
-        if acting.coulomb[i] != 0.0:
-            level = acting.coulomb[i]
-            if given.stribeck != 0.0:
-                speed = dq / given.stribeck_velocity
-                level *= 1.0 + given.stribeck * exp(-speed * speed)
-            torque += level * tanh(dq / given.coulomb_velocity)
+        torque += dry_friction(plant, now, i, dq, now.drives.whole[i])
         if given.ripple[i] != 0.0:
             torque += given.ripple[i] * sin(given.ripple_frequency * q)
         out[i] = torque
-    subtract_tip_torque(plant, now, x, out)
+    q, dq = part(x, 0, (n,)), part(x, n, (n,))
+    subtract_tip_torque(plant, now, q, dq, x, out)
 
 
 @inner
 def subtract_tip_torque(
-    plant: PlantSettings, now: PlantState, x: Array, torque: Array
+    plant: PlantSettings,
+    now: PlantState,
+    q: Array,
+    dq: Array,
+    x: Array,
+    torque: Array,
 ) -> None:
-    """Subtract the torque J^T f (n,) [N m] of the force at the tip from `torque`, in place."""
-    n = plant.n
+    """Subtract the torque J^T f (n,) [N m] of the force at the tip from `torque`, in place.
+
+    q and dq begin with those of a base; y and v of a sloshing load are in x.
+    """
+    at = 2 * plant.n
     push = now.acting.force
     load = plant.load
     memory = now.memory
     mass = now.acting.sloshing[0]
     if push[0] == 0.0 and push[1] == 0.0 and push[2] == 0.0 and mass == 0.0:
         return
-    locate_tip(plant, now, x)
+    locate_tip(plant, now, q, dq)
     for i in range(3):
         force = push[i]
         if mass > 0.0:
-            memory.pull[i] = load.stiffness * (x[2 * n + i] - memory.tip[i])
-            memory.pull[i] += load.damping * (x[2 * n + 3 + i] - memory.tip_velocity[i])
+            memory.pull[i] = load.stiffness * (x[at + i] - memory.tip[i])
+            memory.pull[i] += load.damping * (x[at + 3 + i] - memory.tip_velocity[i])
             force += mass * memory.pull[i]
-        for j in range(n):
+        for j in range(torque.size):
             torque[j] -= memory.jacobian[i, j] * force
 
 

@@ -4,6 +4,10 @@
 Encoders, drives and the schedule of events are those of `Plant`, all mechanics are
 MuJoCo's: it reads the description of the arm itself, and integrates by RK4 with the
 torque held over a sample.  Its Coulomb friction is dry.  Nothing collides.
+
+With springs, or a base that gives way, MuJoCo has base and links (M, C dq + G and the
+Jacobian of the tip); springs, motors, friction and the integration are those of
+`sim_plant.elastic`.  Joint limits are not enforced then.
 """
 
 from __future__ import annotations
@@ -15,11 +19,15 @@ import numpy as np
 from blf_dsc_controller.configuration.plant import PlantConfig
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.extras import import_extra
-from sim_plant.kernels import DRIVE
-from sim_plant.plant import Plant, plant_settings, urdf_of
+from sim_plant.elastic import PREDICT, SWING
+from sim_plant.kernels import DRIVE, MOVE
+from sim_plant.plant import Plant, plant_settings, true_rotors, urdf_of
+from sim_plant.springs import CUBE, stiffness_of
 
 PAYLOAD = 'payload of sim_plant'
 """Name of a body at the tip that has no mass but that of the payload."""
+_BASE = 'base of sim_plant'
+_PREFIX = 'arm/'
 _TIP = 'tip'  # of the two links
 
 
@@ -48,18 +56,28 @@ class MujocoPlant(Plant):
         self.model = model_of(config)
         self.data = self._mujoco.MjData(self.model)
         self._tip = self.model.body(PAYLOAD)
-        self._to_world = _rotation_of_base(config, self.model)
+        self._origin, self._to_world = _pose_of_base(config, self.model)
+        self._jacobian = np.zeros((3, self.model.nv))
+        self._unit_torques = np.eye(self.model.nv)
         self.reset()
 
     def reset(self) -> None:
         """Return to sample 0 and reseed, so that the run is repeated."""
         super().reset()
         self._mujoco.mj_resetData(self.model, self.data)
-        self.data.qpos[:] = self._q
-        self.data.qvel[:] = self._dq
+        self._show()
+
+    def _show(self) -> None:
+        """Copy the motion of base and links to MuJoCo's data."""
+        elastic, springs = self._now.elastic, self._settings.springs
+        self.data.qpos[:] = elastic.q if springs else self._q
+        self.data.qvel[:] = elastic.dq if springs else self._dq
 
     def step(self, torque: np.ndarray) -> None:
         """Apply the commanded torque (n,) [N m] and the loads at its start."""
+        if self._settings.springs:
+            self._swing(torque)
+            return
         now = self._now
         data = self.data
         friction = self._settings.disturbance
@@ -73,6 +91,7 @@ class MujocoPlant(Plant):
         speed = data.qvel / friction.stribeck_velocity
         self.model.dof_damping[:] = acting.viscous
         self.model.dof_frictionloss[:] = acting.coulomb
+        self.model.dof_frictionloss += friction.load_share * np.abs(now.drives.whole)
         self.model.dof_frictionloss *= 1.0 + friction.stribeck * np.exp(-(speed**2))
         data.xfrc_applied[self._tip.id, :3] = self._to_world @ acting.force
         wave = friction.amplitude * np.sin(
@@ -84,6 +103,33 @@ class MujocoPlant(Plant):
         self._mujoco.mj_step(self.model, data)
         self._q[:], self._dq[:] = data.qpos, data.qvel
         now.sample[0] += 1.0
+
+    def _swing(self, torque: np.ndarray) -> None:
+        """Implement `step` with springs."""
+        self._run(*self._arguments(DRIVE, torque))
+        self._tip.mass[0] = self._now.acting.payload[0]
+        if self.is_stopped:
+            self._run(*self._arguments(MOVE, torque))
+        else:
+            for _ in range(self._settings.blocks):
+                self._run(*self._arguments(PREDICT, torque))
+                self._fill_links()
+                self._run(*self._arguments(SWING, torque))
+        self._show()
+
+    def _fill_links(self) -> None:
+        """Write M^-1, C dq + G and the Jacobian of the tip where the links are predicted."""
+        mujoco, model, data = self._mujoco, self.model, self.data
+        memory = self._now.elastic_memory
+        data.qpos[:], data.qvel[:] = memory.q, memory.dq
+        mujoco.mj_fwdPosition(model, data)
+        mujoco.mj_fwdVelocity(model, data)
+        mujoco.mj_solveM(model, data, memory.inverse, self._unit_torques)
+        memory.bias[:] = data.qfrc_bias
+        mujoco.mj_jacBody(model, data, self._jacobian, None, self._tip.id)
+        tip = data.xpos[self._tip.id] - self._origin
+        self._now.memory.tip[:] = tip @ self._to_world
+        self._now.memory.jacobian[:] = self._to_world.T @ self._jacobian
 
 
 def spec_of(config: PlantConfig) -> Any:
@@ -117,7 +163,8 @@ def model_of(config: PlantConfig) -> Any:
     """
     mujoco = import_extra('mujoco', 'mujoco', 'physics: mujoco')
     try:
-        model = spec_of(config).compile()
+        spec = spec_of(config)
+        model = (_on_base(config, spec) if config.base.mass > 0.0 else spec).compile()
     except (ValueError, mujoco.FatalError) as error:
         raise _unreadable(error) from error
     model.opt.timestep = config.sample_time
@@ -126,10 +173,11 @@ def model_of(config: PlantConfig) -> Any:
     if not robot.urdf:
         model.opt.gravity[:] = (0.0, 0.0, -config.arm.gravity)
         return model
-    chain = robot.chain(config.joints)
-    model.opt.gravity[:] = _rotation_of_base(config, model) @ robot.gravity
-    model.dof_armature[:] = config.truth.rotor_factor * robot.rotors(chain)
+    model.opt.gravity[:] = _pose_of_base(config, model)[1] @ robot.gravity
+    rotors = np.where(stiffness_of(config) > 0.0, 0.0, true_rotors(config))
+    model.dof_armature[-rotors.size :] = rotors
     _apply_truth(config, model)
+    _apply_base(model)
     return model
 
 
@@ -140,18 +188,59 @@ def _unreadable(error: Exception) -> BlfDscError:
     )
 
 
-def _rotation_of_base(config: PlantConfig, model: Any) -> np.ndarray:
-    """Return the rotation (3, 3) from the frame of `robot.base` to MuJoCo's world.
+def _pose_of_base(config: PlantConfig, model: Any) -> tuple[np.ndarray, np.ndarray]:
+    """Return origin (3,) [m] and rotation (3, 3) of the frame of `robot.base` in MuJoCo's world.
 
     The root of a description is that world.
     """
     mujoco = import_extra('mujoco', 'mujoco', 'physics: mujoco')
     base = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, config.robot.base)
     if not config.robot.base or base < 0:
-        return np.eye(3)
+        return np.zeros(3), np.eye(3)
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
-    return np.array(data.xmat[base]).reshape(3, 3)
+    return np.array(data.xpos[base]), np.array(data.xmat[base]).reshape(3, 3)
+
+
+def _on_base(config: PlantConfig, arm: Any) -> Any:
+    """Return a description in which an arm stands on a base that gives way, as `on_base` does."""
+    mujoco = import_extra('mujoco', 'mujoco', 'physics: mujoco')
+    origin, rotation = _pose_of_base(config, arm.copy().compile())
+    quaternion, inverted = np.zeros(4), np.zeros(4)
+    mujoco.mju_mat2Quat(quaternion, rotation.ravel())
+    mujoco.mju_negQuat(inverted, quaternion)
+    spec = mujoco.MjSpec()
+    spec.compiler.boundmass = spec.compiler.boundinertia = 0.0
+    spec.compiler.fusestatic = False
+    centre, inertia = CUBE
+    base = spec.worldbody.add_body(
+        name=_BASE,
+        pos=origin,
+        quat=quaternion,
+        mass=config.base.mass,
+        ipos=centre,
+        inertia=config.base.mass * inertia,
+        explicitinertial=True,
+    )
+    for kind in (mujoco.mjtJoint.mjJNT_SLIDE, mujoco.mjtJoint.mjJNT_HINGE):
+        for axis in np.eye(3)[:2]:
+            base.add_joint(type=kind, axis=axis)
+    frame = base.add_frame(pos=-origin @ rotation, quat=inverted)
+    spec.attach(arm, frame=frame, prefix=_PREFIX)  # MuJoCo wants one
+    for named in (*spec.bodies, *spec.joints):
+        named.name = named.name.removeprefix(_PREFIX)
+    return spec
+
+
+def _apply_base(model: Any) -> None:
+    """Let the links that stand on the base be part of its mass."""
+    mujoco = import_extra('mujoco', 'mujoco', 'physics: mujoco')
+    base = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, _BASE)
+    if base < 0:
+        return
+    standing = (model.body_weldid == base) & (np.arange(model.nbody) != base)
+    model.body_mass[standing] = model.body_inertia[standing] = 0.0
+    mujoco.mj_setConst(model, mujoco.MjData(model))
 
 
 def _apply_truth(config: PlantConfig, model: Any) -> None:

@@ -23,7 +23,15 @@ from blf_dsc_controller.compiled.jit import direct
 from blf_dsc_controller.compiled.layout import pack
 from blf_dsc_controller.configuration.plant import Deviation, PlantConfig
 from blf_dsc_controller.configuration.robot import parameters_of
-from sim_plant.arm import Arm, PointMassArm, motion_size, rigid_arm, rigid_bodies
+from sim_plant.arm import (
+    Arm,
+    PointMassArm,
+    RigidArm,
+    motion_size,
+    rigid_arm,
+    rigid_bodies,
+)
+from sim_plant.elastic import REST, run_elastic_plant
 from sim_plant.kernels import (
     OBSERVE,
     STEP,
@@ -37,6 +45,7 @@ from sim_plant.kernels import (
     run_plant,
 )
 from sim_plant.layout import (
+    SIDES,
     VELOCITY_SOURCES,
     Disturbance,
     Drives,
@@ -45,6 +54,16 @@ from sim_plant.layout import (
     Load,
     PlantSettings,
     state_size,
+)
+from sim_plant.springs import (
+    Elasticity,
+    apparent_rotors,
+    elastic,
+    is_elastic,
+    mounts_of,
+    on_base,
+    rigid,
+    stiffness_of,
 )
 
 T = TypeVar('T')
@@ -88,22 +107,29 @@ class Plant:
         self._settings, self._now = plant_views(self.arm, self.settings, self.state)
         self._q, self._dq = self._now.x[: 2 * self.joints].reshape(2, -1)
         self._q[:], self._dq[:] = position, velocity
-        self._now.reading.sample[0] = self._now.acting.sample[0] = -1.0
-        self._initial = self.state.copy()
         self._measurement = np.zeros(3 * self.joints)
         self._truth = np.zeros(settings.p + 3 * self.joints)
         self._seed = seed
         self._noise = np.zeros(3 * self.joints)
         self.rng = generator(seed)
+        if settings.springs > 0:
+            self._now.acting.sample[0] = -1.0
+            self._run(*self._arguments(REST, self._truth))
+        self._now.reading.sample[0] = self._now.acting.sample[0] = -1.0
+        self._initial = self.state.copy()
 
     @functools.cached_property
     def kernel(self) -> Entry:
         """The kernel of `step`, `measure` and `truth`, for a compiled loop."""
-        return Entry(run_plant, *self._arguments(STEP, self._truth))
+        return Entry(self._compiled, *self._arguments(STEP, self._truth))
 
     @functools.cached_property
     def _run(self) -> Callable[..., None]:
-        return direct(run_plant, *self._arguments(STEP, self._truth))
+        return direct(self._compiled, *self._arguments(STEP, self._truth))
+
+    @property
+    def _compiled(self) -> Callable[..., None]:
+        return run_elastic_plant if self._settings.springs > 0 else run_plant
 
     def _arguments(self, tasks: int, torque: np.ndarray) -> tuple[Any, ...]:
         vectors = self.arm, self.settings, self.state, self._noise
@@ -118,6 +144,18 @@ class Plant:
     def is_stopped(self) -> bool:
         """Whether the drives have made a reflex stop, which lasts until a reset."""
         return bool(self._now.drives.stopped[0])
+
+    @property
+    def motors(self) -> np.ndarray:
+        """Positions and velocities (2, n) of the motors: those of the links without springs."""
+        if self._settings.springs == 0:
+            return np.stack((self._q, self._dq))
+        return np.stack((self._now.elastic.theta, self._now.elastic.dtheta))
+
+    @property
+    def base(self) -> np.ndarray:
+        """Deflection of the base along x and y [m] and about them [rad]; empty if it is rigid."""
+        return self._now.elastic.q[: self._settings.mounts]
 
     @property
     def elapsed_ns(self) -> int:
@@ -285,7 +323,11 @@ def plant_of(config: PlantConfig) -> Plant:
 
 
 def plant_settings(config: PlantConfig) -> PlantSettings:
-    """Return the settings of a configured plant."""
+    """Return the settings of a configured plant.
+
+    Raises:
+        BlfDscError: a joint has a spring, but no motor.
+    """
     arm = arm_of(config)
     n = len(config.joints)
     T = config.sample_time
@@ -293,6 +335,7 @@ def plant_settings(config: PlantConfig) -> PlantSettings:
     actuator = config.actuator
     events = config.events
     robot = config.robot
+    friction = config.disturbance
     decay, mean_decay = lag(actuator.time_constant, T)
     overcomes_friction = robot.drive_compensates == 'gravity_and_friction'
     bodies = drive_bodies(config)
@@ -302,18 +345,22 @@ def plant_settings(config: PlantConfig) -> PlantSettings:
         n=n,
         p=arm.p,
         period_ns=config.sample_time_ns,
-        steps=_steps_of(config, arm),
         events=len(events.begin),
         bodies_size=bodies.size,
         memory_size=motion_size(arm) if bodies.size else 0,
         encoders=_filled(
-            Encoders, sensor, velocity_source=VELOCITY_SOURCES[sensor.velocity]
+            Encoders,
+            sensor,
+            velocity_source=VELOCITY_SOURCES[sensor.velocity],
+            side=SIDES[sensor.side],
+            eccentricity=np.array(sensor.eccentricity or np.zeros(n)),
         ),
         disturbance=_filled(
             Disturbance,
-            config.disturbance,
+            friction,
             ripple=actuator.ripple * np.array(actuator.torque_limit),
             ripple_frequency=actuator.ripple_cycles,
+            warm_samples=friction.warm_time / T,
         ),
         drives=_filled(
             Drives,
@@ -338,14 +385,20 @@ def plant_settings(config: PlantConfig) -> PlantSettings:
             ),
         ),
         schedule=_schedule_of(config),
+        **_elasticity_of(config, arm)._asdict(),
     )
 
 
-def _steps_of(config: PlantConfig, arm: Arm) -> int:
-    """Return the integrator's steps per sample that friction near rest needs.
+def _elasticity_of(config: PlantConfig, arm: Arm) -> Elasticity:
+    """Return the springs of an arm, and the integrator's steps."""
+    slope = _friction_slope(config)
+    if not isinstance(arm, RigidArm) or not is_elastic(config):
+        return rigid(_steps_of(config, arm, slope))
+    return elastic(config, arm, true_rotors(config), slope)
 
-    There it damps a joint at its slope over the inertia, at the initial position.
-    """
+
+def _friction_slope(config: PlantConfig) -> np.ndarray:
+    """Return the largest slope (n,) [N m s/rad] of friction, near rest."""
     n = len(config.joints)
     given = config.disturbance
     events = config.events
@@ -353,12 +406,22 @@ def _steps_of(config: PlantConfig, arm: Arm) -> int:
         np.reshape(each or 0.0, (-1, n) if each else (1, 1)).max(axis=0)
         for each in (events.viscous, events.coulomb)
     )
+    load = given.load_share * np.array(config.actuator.torque_limit)
     slope = (
-        (np.array(given.coulomb) + coulomb)
+        (np.array(given.coulomb) + coulomb + load)
         * (1.0 + given.stribeck)
         / given.coulomb_velocity
     )
     slope += np.array(given.viscous) + viscous
+    return np.asarray(slope * max(1.0, given.warm_factor))
+
+
+def _steps_of(config: PlantConfig, arm: Arm, slope: np.ndarray) -> int:
+    """Return the integrator's steps per sample that friction near rest needs.
+
+    There it damps a joint at its slope over the inertia, at the initial position.
+    """
+    n = len(config.joints)
     position = np.array(config.initial.position)
     rest = np.zeros(n)
     ddq = np.zeros((2, n))
@@ -422,10 +485,23 @@ def arm_of(config: PlantConfig) -> Arm:
     if not robot.urdf:
         return PointMassArm(*vars(config.arm).values())
     chain = robot.chain(config.joints)
-    rotors = config.truth.rotor_factor * robot.rotors(chain)
+    rotors = true_rotors(config)
     inertias = true_inertias(chain, config.truth)
     parameters = parameters_of(robot, chain)
-    return rigid_arm(rigid_bodies(chain, robot.gravity, inertias, rotors, parameters))
+    seen = apparent_rotors(config, rotors)
+    bodies = rigid_bodies(chain, robot.gravity, inertias, seen, parameters)
+    bodies.rotor[:] = np.where(stiffness_of(config) > 0.0, 0.0, rotors)
+    if config.base.mass > 0.0:
+        bodies = on_base(bodies, config.base.mass)
+    return rigid_arm(bodies, mounts_of(config))
+
+
+def true_rotors(config: PlantConfig) -> np.ndarray:
+    """Return the inertias (n,) [kg m^2] of the drives of an arm from a URDF."""
+    if config.truth.rotor_inertia:
+        return np.array(config.truth.rotor_inertia)
+    robot = config.robot
+    return config.truth.rotor_factor * robot.rotors(robot.chain(config.joints))
 
 
 def drive_bodies(config: PlantConfig) -> np.ndarray:

@@ -38,6 +38,7 @@ PerEventAndJoint = Annotated[tuple[float, ...], 'events.begin', 'joints']
 _BUILT = 'the plant is built once, when the node starts'
 _fixed = partial(parameter, read_only=_BUILT)
 _magnitude = partial(non_negative, read_only=_BUILT)
+_omitted = partial(non_negative, (), read_only=_BUILT, omittable=True)
 _of_events = partial(parameter, (), omittable=True)
 
 
@@ -110,6 +111,38 @@ class Truth(Deviation):
     """Deviations of the true arm from its URDF."""
 
     rotor_factor: float = _magnitude(1.0, 'factor on the inertias of the drives')
+    rotor_inertia: PerJoint = _omitted(
+        'inertia of each drive at its joint; empty: rotor_factor times that of robot',
+        'kg m^2',
+    )
+
+
+@dataclass(frozen=True)
+class Joint:
+    """Springs between motors and links."""
+
+    stiffness: PerJoint = _omitted(
+        'stiffness of each joint; empty or 0: rigid', 'N m/rad'
+    )
+    damping_ratio: float = _magnitude(
+        0.03, 'damping of the springs, with motor and link free to swing'
+    )
+    backlash: PerJoint = _omitted('play of each gear; empty: none', 'rad')
+    hysteresis: PerJoint = _omitted('dry friction in each spring; empty: none', 'N m')
+
+
+@dataclass(frozen=True)
+class PlantBase:
+    """Base that gives way: two translations and two tilts."""
+
+    mass: float = _magnitude(0.0, 'mass that moves with the base; 0: rigid', 'kg')
+    frequency: float = _fixed(
+        10.0,
+        'natural frequency with the arm, its joints locked at the initial positions',
+        'Hz',
+        above=0.0,
+    )
+    damping_ratio: float = _magnitude(0.02, 'damping ratio at this frequency')
 
 
 @dataclass(frozen=True)
@@ -162,12 +195,22 @@ class PlantDisturbance:
     stribeck_velocity: float = positive(
         0.1, 'velocity scale over which this excess fades', 'rad/s'
     )
+    load_share: float = non_negative(
+        0.0, 'Coulomb friction that grows with the torque on the gear, relative to it'
+    )
+    warm_factor: float = positive(
+        1.0, 'friction of the warm arm, relative to that at the start'
+    )
+    warm_time: float = positive(600.0, 'time constant of warming up', 's')
 
 
 @dataclass(frozen=True)
 class Sensor:
     """Measurement of the true state."""
 
+    side: Literal['link', 'motor'] = _fixed(
+        'link', 'side of the springs on which positions and velocities are measured'
+    )
     position_noise: float = _magnitude(
         0.0, 'rms of the white noise on measured positions', 'rad'
     )
@@ -183,6 +226,9 @@ class Sensor:
         0.0, 'pole of a low-pass on the velocity; 0: none', 'rad/s'
     )
     offset: PerJoint = parameter((0.0, 0.0), 'measured minus true position', 'rad')
+    eccentricity: PerJoint = _omitted(
+        'error of each encoder, once per turn; empty: none', 'rad'
+    )
     repeat_every: int = _magnitude(
         0, 'after so many samples, a reading is sent again with a new stamp; 0: never'
     )
@@ -234,6 +280,13 @@ class Actuator:
         'rate of the torque above which the drives brake until a reset; 0: never',
         'N m/s',
     )
+    loop_gain: float = _magnitude(
+        0.0, 'gain of a loop at joint torque sensors; 0: no loop', '', 'k_T'
+    )
+    loop_damping: float = _magnitude(
+        0.0, 'gain of this loop on the rate of the torque', 's', 'k_S'
+    )
+    loop_lag: float = _magnitude(0.0003, 'first-order lag of this loop', 's')
 
 
 @dataclass(frozen=True)
@@ -267,6 +320,8 @@ class PlantConfig(ArmConfig):
     arm: PlantArm = PlantArm()
     truth: Truth = Truth()
     drive: Drive = Drive()
+    joint: Joint = Joint()
+    base: PlantBase = PlantBase()
     initial: Initial = Initial()
     disturbance: PlantDisturbance = PlantDisturbance()
     sensor: Sensor = Sensor()
@@ -306,6 +361,7 @@ class PlantConfig(ArmConfig):
         )
         if self.truth != Truth() and not self.robot.urdf:
             yield 'truth: it applies only to a URDF: give robot.urdf, or change arm'
+        yield from self._spring_problems()
         if self.drive != Drive() and self.robot.drive_compensates == 'none':
             yield 'drive: without robot.drive_compensates the drives need no model'
         published = self.sensor.published_joints
@@ -322,3 +378,36 @@ class PlantConfig(ArmConfig):
                 f'duration: got {self.duration:g} s, shorter than one sample of '
                 f'{self.sample_time:g} s (0 runs until stopped)'
             )
+
+    def _spring_problems(self) -> Iterator[str]:
+        """Check what springs, their loop and a base need."""
+        joint, actuator, truth = self.joint, self.actuator, self.truth
+        if not self.robot.urdf and (any(joint.stiffness) or self.base.mass):
+            yield 'joint.stiffness, base.mass: they apply only to a URDF: give robot.urdf'
+        if truth.rotor_inertia and truth.rotor_factor != 1.0:
+            yield (
+                f'truth.rotor_factor: got {truth.rotor_factor:g}, but truth.rotor_inertia '
+                'replaces the inertias that it scales: give one of them'
+            )
+        if actuator.loop_damping and not actuator.loop_gain:
+            yield 'actuator.loop_damping: without actuator.loop_gain there is no loop'
+        if actuator.loop_gain and not (joint.stiffness and all(joint.stiffness)):
+            yield (
+                'actuator.loop_gain: a loop around the springs: give joint.stiffness '
+                'above 0 for every joint'
+            )
+        springs = joint.stiffness or (0.0,) * len(self.joints)
+        for name in ('backlash', 'hysteresis'):
+            given = getattr(joint, name) or springs
+            rigid = [
+                each
+                for each, value, stiffness in zip(
+                    self.joints, given, springs, strict=True
+                )
+                if value and not stiffness
+            ]
+            if rigid:
+                yield (
+                    f'joint.{name}: {", ".join(rigid)} without a spring: give '
+                    'joint.stiffness'
+                )

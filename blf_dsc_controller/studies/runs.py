@@ -60,6 +60,7 @@ from blf_dsc_controller.studies.monte_carlo import (
     plant_with,
     torque_error,
 )
+from sim_plant.elastic import run_elastic_plant
 from sim_plant.kernels import run_plant
 from sim_plant.plant import parameter_order, plant_of
 
@@ -213,7 +214,8 @@ def versions() -> dict[str, str]:
     return {
         'blf_dsc_controller': blf_dsc_controller.__version__,
         'kernels': ' '.join(
-            cache_folder(each).name for each in (update, sense, run_plant, run_loop)
+            cache_folder(each).name
+            for each in (update, sense, run_plant, run_elastic_plant, run_loop)
         ),
         'numpy': np.__version__,
         # `missing` goes by the names of the chunks

@@ -1,0 +1,327 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Arms with springs, torque loops and a base that gives way: other integrators, and limits."""
+
+from __future__ import annotations
+
+import numpy as np
+import pinocchio
+import pytest
+from random_arm import PANDA as JOINTS
+from random_arm import PANDA_TEXT, pinocchio_model
+from scipy.integrate import solve_ivp
+
+from blf_dsc_controller.configuration.plant import PlantConfig
+from blf_dsc_controller.configuration.schema import build
+from blf_dsc_controller.errors import BlfDscError, ConfigurationError
+from sim_plant.plant import plant_of
+
+MASS, LEVER, INERTIA, ROTOR = 2.0, 0.3, 0.05, 0.2  # kg, m, kg m^2, kg m^2
+M = INERTIA + MASS * LEVER**2
+WEIGHT = MASS * 9.81 * LEVER  # N m
+K, RATIO = 5e3, 0.04
+REDUCED = M * ROTOR / (M + ROTOR)
+DAMPING = 2.0 * RATIO * np.sqrt(K * REDUCED)
+PENDULUM = f"""
+<robot name="pendulum">
+  <link name="base"/>
+  <link name="tip"><inertial><mass value="{MASS}"/><origin xyz="{LEVER} 0 0"/>
+    <inertia ixx="{INERTIA}" iyy="{INERTIA}" izz="{INERTIA}" ixy="0" ixz="0" iyz="0"/>
+  </inertial></link>
+  <joint name="swing" type="revolute"><parent link="base"/><child link="tip"/>
+    <axis xyz="0 -1 0"/><limit lower="-3" upper="3" effort="80" velocity="5"/></joint>
+</robot>
+"""
+SPRING = {
+    'robot.urdf': PENDULUM,
+    'joints': ['swing'],
+    'truth.rotor_inertia': [ROTOR],
+    'joint.stiffness': [K],
+    'joint.damping_ratio': RATIO,
+    'initial.position': [0.4],
+}
+PANDA = {'robot.urdf': 'panda.urdf', 'robot.tip': 'panda_hand_tcp'}
+
+
+def pendulum(**changes):
+    """Return a plant of one joint, with parameters by names with `__` for dots."""
+    given = {name.replace('__', '.'): value for name, value in changes.items()}
+    return plant_of(build(PlantConfig, SPRING | given))
+
+
+def step_torques(samples):
+    """Return torques (samples, 1) [N m] that hold the weight, and jump."""
+    levels = np.array([8.0, -5.0, 12.0, 0.0])
+    return np.resize(np.repeat(levels, 25), samples)[:, None]
+
+
+def states_of(arm, torques):
+    """Return q, dq, theta, dtheta (samples, 4, n) before each step."""
+    rows = []
+    for torque in torques:
+        q, dq = arm.truth()[-2 * arm.joints :].reshape(2, -1)
+        rows.append((q.copy(), dq.copy(), *arm.motors.copy()))
+        arm.step(torque)
+    return np.array(rows)
+
+
+class Written:
+    """The equations of one joint as on paper, for scipy."""
+
+    def __init__(self, viscous=0.0, coulomb=0.0, share=0.0, play=0.0, loop=()):
+        self.viscous, self.coulomb, self.share = viscous, coulomb, share
+        self.play, self.loop = play, loop
+
+    def spring(self, q, dq, theta, dtheta):
+        """Return the torque by the twist, its rate, and that of the damper."""
+        twist = theta - q
+        beyond = twist - np.clip(twist, -self.play, self.play)
+        touches = float(beyond != 0.0 or self.play == 0.0)
+        rate = touches * (dtheta - dq)
+        return K * beyond, K * rate, DAMPING * rate
+
+    def slope(self, _t, x, torque):
+        q, dq, theta, dtheta, u = x
+        spring, rate, damper = self.spring(q, dq, theta, dtheta)
+        s = spring + damper
+        level = self.coulomb + self.share * abs(s)
+        friction = self.viscous * dtheta + level * np.tanh(dtheta / 0.5)
+        du = 0.0
+        motor = torque
+        if self.loop:
+            gain, damping, lag = self.loop
+            wanted = torque + gain * (torque - spring) - damping * rate
+            du, motor = (wanted - u) / lag, u
+        load = WEIGHT * np.cos(q)
+        return dq, (s - load) / M, dtheta, (motor - friction - s) / ROTOR, du
+
+    def follow(self, torques, start):
+        """Return q, dq, theta, dtheta (samples, 4) before each step of 1 ms."""
+        x, rows = np.array(start), []
+        for (torque,) in torques:
+            rows.append(x[:4].copy())
+            x = solve_ivp(
+                self.slope, (0.0, 1e-3), x, args=(torque,), rtol=1e-10, atol=1e-12
+            ).y[:, -1]
+        return np.array(rows)
+
+
+def start_of(play=0.0):
+    """Return the state of the pendulum at rest, with its motor braked."""
+    load = WEIGHT * np.cos(0.4)
+    return 0.4, 0.0, 0.4 + load / K + play, 0.0, load
+
+
+@pytest.mark.parametrize(
+    ('given', 'written'),
+    [
+        ({}, Written()),
+        (
+            {
+                'disturbance__viscous': [2.0],
+                'disturbance__coulomb': [3.0],
+                'disturbance__load_share': 0.1,
+                'disturbance__coulomb_velocity': 0.5,
+            },
+            Written(viscous=2.0, coulomb=3.0, share=0.1),
+        ),
+        (
+            {
+                'actuator__loop_gain': 4.0,
+                'actuator__loop_damping': 8e-3,
+                'actuator__loop_lag': 3e-4,
+            },
+            Written(loop=(4.0, 8e-3, 3e-4)),
+        ),
+        ({'joint__backlash': [2e-3]}, Written(play=1e-3)),
+    ],
+    ids=['spring', 'friction', 'torque loop', 'backlash'],
+)
+def test_joint_with_a_spring_moves_as_an_independent_integration_says(given, written):
+    """To a thousandth of the largest excursion of each quantity: the steps are 25 us."""
+    torques = step_torques(200)
+    ours = states_of(pendulum(**given), torques)[..., 0]
+    theirs = written.follow(torques, start_of(written.play))
+    scale = np.abs(theirs - theirs[0]).max(axis=0)
+    np.testing.assert_array_less(np.abs(ours - theirs).max(axis=0) / scale, 1e-3)
+
+
+def panda(**changes):
+    """Return a Panda without friction at a bent posture, with the FR3's motors."""
+    given = {
+        'truth.rotor_inertia': [0.606, 0.606, 0.462, 0.462, 0.206, 0.206, 0.206],
+        'disturbance.viscous': [0.0] * 7,
+        'disturbance.coulomb': [0.0] * 7,
+        'initial.position': [0.1, 0.3, -0.4, -1.9, 0.5, 2.0, 0.3],
+    }
+    given |= {name.replace('__', '.'): value for name, value in changes.items()}
+    return build(PlantConfig, PANDA | given)
+
+
+def energy_of(model, config, q, dq, motors):
+    """Return the energy [J] of links, motors and springs by pinocchio."""
+    data = model.createData()
+    pinocchio.computeKineticEnergy(model, data, q, dq)
+    pinocchio.computePotentialEnergy(model, data, q)
+    theta, dtheta = motors
+    twist, B = theta - q, np.array(config.truth.rotor_inertia)
+    spring = np.array(config.joint.stiffness) @ twist**2
+    return data.kinetic_energy + data.potential_energy + 0.5 * (spring + B @ dtheta**2)
+
+
+def test_energy_is_kept_without_damping_friction_and_torque():
+    """For 5 s, in which the arm falls and swings at up to 10 rad/s: 80 J to 16 mJ.
+
+    The error is one of the blocks in which M is held: half as long, it is a quarter.
+    """
+    config = panda(
+        joint__stiffness=[1e4] * 7,
+        joint__damping_ratio=0.0,
+        initial__velocity=[1.0, -0.5, 0.7, -0.3, 1.0, 0.4, -1.0],
+    )
+    arm, model = plant_of(config), pinocchio_model(PANDA_TEXT, JOINTS)
+    energies = []
+    for _ in range(5000):
+        q, dq = arm.truth()[-14:].reshape(2, 7)
+        energies.append(energy_of(model, config, q, dq, arm.motors))
+        arm.step(np.zeros(7))
+    assert np.ptp(energies) < 0.02
+    released = arm.truth()[-7:] ** 2
+    assert released.sum() > 1.0  # it did move
+
+
+def swung(config, samples=300):
+    """Return the measurements (samples, 3, n) of an arm with all joints swinging."""
+    arm = plant_of(config)
+    rows = []
+    for k in range(samples):
+        rows.append(arm.measure().reshape(3, -1).copy())
+        arm.step(0.15 * np.sin(0.02 * k) * np.array(config.actuator.torque_limit))
+    return np.array(rows)
+
+
+@pytest.mark.parametrize('side', ['link', 'motor'])
+def test_stiff_springs_make_the_rigid_arm(side):
+    """At 1e6 N m/rad a motor is 30 N m / 1e6 = 3e-5 rad ahead of its link, or less."""
+    rigid = swung(panda(disturbance__viscous=[1.0] * 7))
+    stiff = swung(
+        panda(
+            disturbance__viscous=[1.0] * 7,
+            joint__stiffness=[1e6] * 7,
+            sensor__side=side,
+        )
+    )
+    assert np.abs(rigid[-1, 0] - rigid[0, 0]).max() > 0.1
+    np.testing.assert_allclose(stiff[:, 0], rigid[:, 0], rtol=0.0, atol=1e-4)
+
+
+def test_encoders_are_on_the_side_that_is_given():
+    torques = step_torques(60)
+    for side, columns in (('link', (0, 1)), ('motor', (2, 3))):
+        arm = pendulum(sensor__side=side)
+        states = states_of(pendulum(sensor__side=side), torques)[..., 0]
+        for torque, state in zip(torques, states, strict=True):
+            measured = arm.measure().copy()
+            assert (measured[:2] == state[list(columns)]).all()
+            arm.step(torque)
+
+
+def test_torque_loop_hides_the_friction_of_the_motor():
+    """Without a load the arm turns until the friction of its motor takes (1 + k_T) tau.
+
+    It does so with a time constant of (M + B / 5) / (10 / 5) = 0.14 s.
+    """
+    tau, gain, viscous = 0.2, 4.0, 10.0
+    arm = pendulum(
+        robot__effort='whole',
+        robot__gravity=[0.0, 0.0, 0.0],
+        disturbance__viscous=[viscous],
+        actuator__loop_gain=gain,
+        actuator__loop_damping=8e-3,
+    )
+    for _ in range(4000):
+        arm.step(np.array([tau]))
+    *_, disturbance, _, speed = arm.truth()
+    assert speed == pytest.approx((1.0 + gain) * tau / viscous)
+    assert disturbance == pytest.approx(tau)  # as the command sees it
+    assert arm.measure()[2] == pytest.approx(0.0, abs=1e-9)  # at the springs' sensors
+
+
+def swaying(config, samples):
+    """Return the motion of the base (samples, 4), pushed in the first ten samples."""
+    arm = plant_of(config)
+    rows = []
+    for _ in range(samples):
+        arm.step(np.zeros(7))
+        rows.append(arm.base.copy())
+    return np.array(rows)
+
+
+def test_base_swings_at_its_frequency_with_locked_joints():
+    """Joints do not move where a rotor weighs tons; the arm's weight slows tilts by 0.2 %."""
+    config = panda(
+        base__mass=60.0,
+        base__frequency=10.0,
+        base__damping_ratio=0.0,
+        truth__rotor_inertia=[1e9] * 7,
+        events__begin=[0.001],
+        events__duration=[0.008],
+        events__force=[30.0, 20.0, 10.0],
+    )
+    for coordinate in swaying(config, 1000)[20:].T:
+        crossings = np.flatnonzero(np.diff(np.sign(coordinate)))
+        half_periods = np.diff(crossings[[0, -1]])[0] / (crossings.size - 1)
+        assert 0.5e3 / half_periods == pytest.approx(10.0, rel=0.01)
+
+
+def test_configuration_says_what_springs_need():
+    for given, problem in (
+        ({'joint.stiffness': [1e4, 1e4]}, 'robot.urdf'),
+        (PANDA | {'actuator.loop_gain': 4.0}, 'joint.stiffness above 0 for every'),
+        (PANDA | {'actuator.loop_damping': 0.01}, 'actuator.loop_gain'),
+        (PANDA | {'joint.backlash': [1e-3] * 7}, 'give joint.stiffness'),
+        (
+            PANDA | {'truth.rotor_factor': 2.0, 'truth.rotor_inertia': [0.2] * 7},
+            'one of them',
+        ),
+    ):
+        with pytest.raises(ConfigurationError, match=problem):
+            build(PlantConfig, given)
+    with pytest.raises(BlfDscError, match=r'swing .*truth\.rotor_inertia'):
+        pendulum(truth__rotor_inertia=[0.0])
+
+
+def test_run_repeats_after_a_reset_and_goes_on_after_a_restore():
+    """With everything that an elastic arm has: bit for bit."""
+    config = panda(
+        joint__stiffness=[1e4] * 7,
+        joint__backlash=[4e-4] * 7,
+        joint__hysteresis=[0.5] * 7,
+        actuator__loop_gain=4.0,
+        actuator__loop_damping=8e-3,
+        actuator__delay=2,
+        actuator__torque_noise=0.01,
+        base__mass=60.0,
+        sensor__position_noise=1e-5,
+        sensor__eccentricity=[1e-3] * 7,
+        disturbance__load_share=0.1,
+        disturbance__warm_factor=0.6,
+        events__begin=[0.01],
+        events__sloshing=[1.0],
+    )
+    torques = 5.0 * np.sin(np.arange(60.0))[:, None] * np.ones(7)
+    arm = plant_of(config)
+
+    def run(torques):
+        rows = []
+        for torque in torques:
+            rows.append(np.concatenate((arm.measure(), arm.truth())))
+            arm.step(torque)
+        return np.array(rows)
+
+    first = run(torques[:30])
+    saved = arm.save()
+    second = run(torques[30:])
+    arm.restore(saved)
+    assert (run(torques[30:]) == second).all()
+    arm.reset()
+    assert (run(torques) == np.concatenate((first, second))).all()
