@@ -19,8 +19,10 @@ from blf_dsc_controller.bags.content import read_content
 from blf_dsc_controller.bags.recovery import recover
 from blf_dsc_controller.cli.bags import PARTIAL
 from blf_dsc_controller.cli.main import main
+from blf_dsc_controller.configuration.schema import change
 from blf_dsc_controller.control.arm_controller import StateError
 from blf_dsc_controller.errors import BlfDscError, ConfigurationError
+from blf_dsc_controller.law.weighing import DEVIATION
 from blf_dsc_controller.messages.journal import EventType
 from blf_dsc_controller.messages.topics import COMMANDS
 from blf_dsc_controller.reference.trajectory import TrajectoryError
@@ -101,6 +103,35 @@ def test_faults_stop_it_with_a_reason_and_a_safe_torque():
     assert 'the positions are not finite' in controller.reason
     assert torque is not None
     assert np.isfinite(torque).all()
+
+
+def test_law_takes_what_it_commanded_for_efforts_that_are_not_given():
+    """No effort is not one of 0 N m: the law would learn that its commands do not arrive."""
+    config = change(LOOP.controller, {'robot.effort': 'commanded'})
+    found = []
+    for gives in (True, False):
+        controller = blf.ArmController(config)
+        plant = plant_of(LOOP.plant)
+        torque = np.full(2, math.nan)
+        for step in range(200):
+            q, dq, _ = plant.measure().reshape(3, -1)
+            effort = torque if gives else None
+            torque = controller.update(1.0 + 1e-3 * step, q, dq, effort)
+            plant.step(torque)
+        found.append((torque, list(controller.estimates.values())))
+        assert controller.phase is Phase.TRACKING
+    for with_efforts, without in zip(*found, strict=True):
+        np.testing.assert_array_equal(with_efforts, without)
+
+
+def test_interval_of_the_load_covers_95_percent():
+    """1.96 standard deviations of a normal distribution on each side."""
+    controller = blf.ArmController('panda')
+    load = controller.guard.controller.state.load
+    load[0], load[DEVIATION] = 2.0, 0.1
+    assert controller.load == (2.0, pytest.approx(0.196))
+    load[DEVIATION] = 0.0
+    assert math.isnan(controller.load.interval)
 
 
 def test_it_follows_trajectories_and_stops_on_request():

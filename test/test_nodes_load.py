@@ -221,11 +221,8 @@ def test_bad_values_are_named_with_a_remedy(given, problem):
 
 
 def test_centre_is_in_the_frame_that_the_service_wants(ros):
-    """The FR3's flange is 0.107 m beyond its last joint; its tip is not the flange."""
-    config = change(FR3.controller, TOLD | {'learning.load_frame': 'fr3_link8'})
-    service = load_service.LoadService(ros.tester, config)
-    tip = config.robot.chain(config.joints).tip_placement
-    point = tip @ (0.01, 0.02, 0.03, 1.0)
+    """The flange, link 8, is 0.107 m beyond the frame of the last joint, link 7."""
+    given = TOLD | {'robot.tip': 'fr3_link7', 'learning.load_frame': 'fr3_link8'}
+    service = load_service.LoadService(ros.tester, change(FR3.controller, given))
     found = service._to_frame @ (0.01, 0.02, 0.03, 1.0)
-    assert found[2] == pytest.approx(point[2] - 0.107)
-    assert found[:2] == pytest.approx(point[:2])
+    np.testing.assert_allclose(found[:3], (0.01, 0.02, 0.03 - 0.107), atol=1e-12)

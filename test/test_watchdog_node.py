@@ -286,6 +286,14 @@ def test_watchdog_acts_by_what_the_drives_of_a_restarted_controller_compensate(r
     np.testing.assert_allclose(loop.torque(), 0.0, atol=0.1)
 
 
+def test_configuration_of_a_restarted_controller_replaces_the_one_before(ros):
+    """Also what only the one before had, such as a parameter of its law."""
+    loop = ByHand(ros, build(ControllerConfig, HOLDING))
+    limited = {'torque.limit': [3.0, 1.0]}
+    loop.note(EventType.CONFIGURE, parameters=limited)
+    assert loop.watchdog.config == build(ControllerConfig, limited)
+
+
 WITHDRAWN = EventType.WITHDRAW, {'text': 'of the test'}
 ENDED = EventType.RELEASE, {'resting': True}
 
