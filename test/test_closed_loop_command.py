@@ -14,7 +14,7 @@ import pytest
 
 pytest.importorskip('rclpy', reason='needs ROS 2')
 
-from command import PATIENT, Running, closed_loop, wait_for
+from command import COMMAND, PATIENT, Running, closed_loop, finished, wait_for
 from recorded_run import small_disk
 from ros_rig import simulated
 from rosbags.highlevel import AnyReader
@@ -147,6 +147,36 @@ def test_killed_node_is_reported_and_ends_the_others(running):
     assert 'Traceback' not in errors
     running.wait_for_children()
     assert whole(running.out / 'bag') > 100
+
+
+def test_killed_recorder_ends_the_run_without_waiting_for_it(running):
+    """To the others it looks alive for 20 s, but nobody takes their last messages."""
+    os.kill(running.child('recorder_node'), signal.SIGKILL)
+    code, _, errors = running.end()
+    assert code == 1
+    assert 'bag_recorder has ended: so does the run' in errors
+    assert 'bag_recorder was terminated by SIGKILL' in errors
+    assert f'blf_dsc recover {running.out / "bag"} saves what was recorded' in errors
+    assert 'Traceback' not in errors
+    running.wait_for_children()
+    # It was not waited for until its messages were given up.
+    log = (running.out / 'logs' / 'loop.log').read_text()
+    assert 'did not reach every subscriber' not in log
+
+
+def test_run_without_a_network_is_refused_at_once(tmp_path):
+    """In a container without any interface; offline runs need none."""
+    alone = ('unshare', '--map-root-user', '--net', *COMMAND)
+    out = tmp_path / 'out'
+    run = finished(*alone, '--duration', 0.1, '--out', out)
+    assert run.returncode == 1
+    assert '127.0.0.1, which cannot be reached (Network is unreachable)' in run.stderr
+    assert 'ip link set lo up' in run.stderr
+    assert not out.exists()
+    offline = finished(
+        *alone, '--offline', '--duration', 0.1, '--out', tmp_path / 'off'
+    )
+    assert offline.returncode == 0, offline.stderr
 
 
 def test_no_node_outlives_the_command(running):

@@ -17,6 +17,8 @@ from pathlib import Path
 from blf_dsc_controller.errors import BlfDscError
 
 DOMAINS = range(1, 101)  # 0 is the default; above 101, ports are ephemeral
+_LOOPBACK = '127.0.0.1'
+_DISCARD = 9  # port whose messages nobody takes (RFC 863)
 _FIRST_PORT = 7400  # of domain 0
 _PORTS = 250  # of a domain
 _TABLES = ('udp', 'udp6')  # sockets of this network, of all users
@@ -49,6 +51,22 @@ def own_domain(avoided: Collection[int] = ()) -> Iterator[int]:
         f'{DOMAINS[-1]} on this computer, or it is the ROS_DOMAIN_ID of this shell; '
         'end some of them'
     )
+
+
+def check_network() -> None:
+    """Raise BlfDscError if processes of this computer cannot reach each other.
+
+    They would wait for each other for ever, as in a container without any interface.
+    """
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        try:
+            probe.sendto(b'', (_LOOPBACK, _DISCARD))
+        except OSError as error:
+            raise BlfDscError(
+                f'the processes of a run talk over {_LOOPBACK}, which cannot be reached '
+                f'({error.strerror}): bring the loopback interface up (`ip link set lo up`), '
+                'or run with --offline'
+            ) from error
 
 
 def shell_domain() -> int:

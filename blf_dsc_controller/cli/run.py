@@ -14,6 +14,7 @@ import numpy as np
 
 from blf_dsc_controller.bags.content import read_content
 from blf_dsc_controller.bags.reader import recorded_run
+from blf_dsc_controller.cli.domains import check_network
 from blf_dsc_controller.cli.main import INTERRUPTED
 from blf_dsc_controller.compiled.announcement import announced_compilation
 from blf_dsc_controller.compiled.kernel_cache import ship
@@ -61,6 +62,8 @@ def run(options: Namespace) -> int:
         from blf_dsc_controller.view.page import require_viser  # slow, as below
 
         require_viser()
+    if not options.offline:
+        check_network()
     out = make_folder(options.out)
     clock = 'plant' if config.plant.mode == 'lockstep' else 'wall'
     recorder = {'output': str(out / 'bag'), 'clock': clock}

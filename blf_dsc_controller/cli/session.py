@@ -49,6 +49,7 @@ _MODULES = {
     VIEW: 'blf_dsc_controller.view.node',  # only on request, once the loop runs
 }
 _ENDING = 20.0  # s that a node may take to exit before it is killed
+_UNHEARD = 1.0  # s likewise, once nobody is left to record its last messages
 _TAIL = 12  # lines of a failed node's log that are shown
 _MIN_FREE_SPACE = 1_000_000  # bytes; with less free space the disk counts as full
 _PR_SET_PDEATHSIG = 1
@@ -107,6 +108,7 @@ class NodeProcess:
         self, name: str, params_file: Path, logs: Path, *arguments: str
     ) -> None:
         self.name = name
+        self.patience = _ENDING  # s
         self._noticed = 0
         self._log = logs / f'{name}.log'
         module = _MODULES.get(name, name)  # of the benchmark, for instance
@@ -164,7 +166,7 @@ class NodeProcess:
         if self.is_running:
             self._process.send_signal(signal.SIGINT)
         try:
-            self._process.wait(_ENDING)
+            self._process.wait(self.patience)
         except subprocess.TimeoutExpired:
             self._process.kill()
             self._process.wait()
@@ -211,6 +213,7 @@ def _run_nodes(
                     pages.append(started(VIEW))
                 starting = pages if view else []
                 view = False
+        _hurry_without_recorder(*nodes)
         completed = not (interrupts or nodes[-1].is_running)
         if completed:
             monitor.show(config.plant.duration)
@@ -218,6 +221,19 @@ def _run_nodes(
     for node in nodes:
         node.check()
     return completed
+
+
+def _hurry_without_recorder(recorder: NodeProcess, *others: NodeProcess) -> None:
+    """Do not wait long for the others if the recorder has ended.
+
+    To them it looks alive for some time, in which they would wait for it to take their
+    last messages.
+    """
+    if recorder.is_running:
+        return
+    tqdm.write(f'{recorder.name} has ended: so does the run', file=sys.stderr)
+    for node in others:
+        node.patience = _UNHEARD
 
 
 def _keep(

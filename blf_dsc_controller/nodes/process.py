@@ -37,6 +37,7 @@ from blf_dsc_controller.errors import BlfDscError, ConfigurationError
 _POLL = 0.1  # s; EventsExecutor has no usable spin()
 # s for all topics; a recorder on a busy machine has been seen 2 s behind
 _DRAIN_TIMEOUT = 10.0
+_SHORT = 1.0  # s likewise, until it is said
 
 
 _signals: list[int] = []  # received; only recorded, so that no callback is interrupted
@@ -142,14 +143,27 @@ def _close(node: PlainNode) -> None:
 
 
 def drain(publishers: Iterable[Publisher]) -> None:
-    """Wait until every subscriber has received everything."""
-    deadline = time.monotonic() + _DRAIN_TIMEOUT
-    for publisher in publishers:
-        left = max(0.0, deadline - time.monotonic())
-        if not publisher.wait_for_all_acked(Duration(seconds=left)):
-            get_logger('end').warning(
+    """Wait until every subscriber has received everything, and say so if it takes long."""
+    log = get_logger('end')
+    begin = time.monotonic()
+    late = [each for each in publishers if not _is_drained(each, begin + _SHORT)]
+    if late:
+        names = ', '.join(publisher.topic_name for publisher in late)
+        log.info(
+            f'waiting for subscribers of {names} to take the last messages, at most '
+            f'{_DRAIN_TIMEOUT:g} s: one that was killed does not'
+        )
+    for publisher in late:
+        if not _is_drained(publisher, begin + _DRAIN_TIMEOUT):
+            log.warning(
                 f'{publisher.topic_name}: the last messages did not reach every subscriber'
             )
+
+
+def _is_drained(publisher: Publisher, deadline: float) -> bool:
+    """Whether every subscriber has received everything by a time of the steady clock [s]."""
+    left = max(0.0, deadline - time.monotonic())
+    return bool(publisher.wait_for_all_acked(Duration(seconds=left)))
 
 
 def refuse_unknown(argv: Sequence[str]) -> None:
