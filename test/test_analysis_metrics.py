@@ -94,6 +94,15 @@ def test_learning(run):
     assert np.isnan(measure(left).time_to_1_percent)
 
 
+def test_parameter_error_is_unknown_at_moments_before_the_first_estimate(run):
+    """As of a recording that begins late: not that of the nearest sample."""
+    stamp, values = run.monitor.stamp[6000:], run.monitor.values[6000:]
+    late = replace(run, monitor=replace(run.monitor, stamp=stamp, values=values))
+    metrics = measure(late)
+    assert np.isnan(metrics.parameter_error[5])
+    assert metrics.parameter_error[10] == metrics.final_parameter_error
+
+
 def test_tail_is_the_last_ten_seconds_of_a_longer_run(run):
     """Three times slower: 30 s, of which the parameter error of the last 10 s counts."""
     stamp = run.stamp[0] + 3 * (run.stamp - run.stamp[0])
@@ -102,6 +111,31 @@ def test_tail_is_the_last_ten_seconds_of_a_longer_run(run):
     last = error[3e-3 * np.arange(SAMPLES) >= 29.997 - 10.0]
     expected = np.sqrt(np.mean(last**2))
     assert measure(slow).tail_parameter_error == pytest.approx(expected, rel=1e-9)
+
+
+def test_each_largest_error_at_the_tool_has_the_bound_of_its_own_sample(run):
+    """Position and angle are worst at different times, with bounds that change."""
+    error, bound = np.zeros((2, SAMPLES, 2))
+    error[4000, 0], error[3000, 1] = -0.001, 0.003
+    bound[:] = 0.004
+    bound[4000] = 0.002, 0.005
+    bound[3000] = 0.006, 0.0045
+
+    def tool(_, error, bound):
+        off, turned = np.abs(error).T
+        return np.column_stack((off, bound[:, 0], turned, bound[:, 1]))
+
+    metrics = measure(replace(run, error=error, bound=bound, tool=tool))
+    assert metrics.tool == pytest.approx(
+        {
+            'error': 0.001,
+            'bound': 0.002,
+            'ratio': 0.5,
+            'angle': 0.003,
+            'angle_bound': 0.0045,
+            'angle_ratio': 2.0 / 3.0,
+        }
+    )
 
 
 def test_smallest_bound_and_torque_limit_count(run):

@@ -96,6 +96,14 @@ def test_desired_and_external_values_are_not_taken_for_measured_ones(tmp_path):
     is_read(write_csv(tmp_path / 'a.csv', names, columns))
 
 
+@pytest.mark.parametrize(
+    ('name', 'unit'), [('time_s', 1.0), ('t_ms', 1e-3), ('t_us', 1e-6), ('t_ns', 1e-9)]
+)
+def test_time_is_in_the_unit_of_its_name(tmp_path, name, unit):
+    np.savez(tmp_path / 'a.npz', **{name: 3.0 + TIME / unit}, q=Q, tau=TAU)
+    is_read(tmp_path / 'a.npz')
+
+
 def test_columns_without_names_are_given_by_number_and_rows_by_rate(tmp_path):
     path = tmp_path / 'a.txt'
     np.savetxt(path, np.column_stack((Q, TAU)))

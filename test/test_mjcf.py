@@ -318,6 +318,16 @@ def arm(**parts):
             },
             3.0,
         ),
+        # of two directions, what both allow
+        ({'lower': 'actuatorfrcrange="-5 3"'}, 3.0),
+        (
+            {'more': '<actuator><motor joint="elbow" ctrlrange="-2 3"/></actuator>'},
+            2.0,
+        ),
+        (
+            {'more': '<actuator><motor joint="elbow" forcerange="-4 6"/></actuator>'},
+            4.0,
+        ),
         ({'more': '<actuator><motor joint="elbow"/></actuator>'}, np.inf),
         ({}, np.inf),
     ],
@@ -359,6 +369,33 @@ def test_what_couples_only_held_joints_is_no_matter(more):
     chain = robot_of({'robot.urdf': text, 'robot.tip': 'tool'})[1]
     assert [joint.name for joint in chain.joints] == ['shoulder', 'elbow']
     assert chain.joints[-1].inertia[0] == pytest.approx(1.2)
+
+
+def cable(acts, more=''):
+    """Return a tendon at the elbow that acts by an attribute or an actuator."""
+    fixed = f'<fixed name="cable" {acts}><joint joint="elbow" coef="1"/></fixed>'
+    return arm(more=f'<tendon>{fixed}</tendon>{more}')
+
+
+@pytest.mark.parametrize(
+    'text',
+    [
+        cable('stiffness="3"'),
+        cable('damping="3"'),
+        cable('frictionloss="3"'),
+        cable('armature="3"'),
+        cable('limited="true" range="0 1"'),
+        cable('', '<actuator><motor tendon="cable"/></actuator>'),
+    ],
+)
+def test_tendon_that_acts_by_whatever_it_has_is_refused(text):
+    with pytest.raises(ConfigurationError, match="<tendon> 'cable' acts on it"):
+        robot_of({'robot.urdf': text, 'robot.tip': 'tool'})
+
+
+def test_tendon_that_only_measures_is_no_matter():
+    chain = robot_of({'robot.urdf': cable(''), 'robot.tip': 'tool'})[1]
+    assert [joint.name for joint in chain.joints] == ['shoulder', 'elbow']
 
 
 @pytest.mark.parametrize(

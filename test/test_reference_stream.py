@@ -12,6 +12,7 @@ import pytest
 pytest.importorskip('ruckig', reason='needs ruckig')
 
 from blf_dsc_controller.configuration.controller import ControllerConfig
+from blf_dsc_controller.configuration.schema import change
 from blf_dsc_controller.reference.approach import hold
 from blf_dsc_controller.reference.retargeting import Target, plan_target
 from blf_dsc_controller.reference.stream import TargetStream
@@ -198,3 +199,35 @@ def test_target_that_nothing_follows_is_held_or_left_behind_while_braking(held):
         np.testing.assert_allclose(last[0], q, atol=1e-9)
     else:
         assert np.all((last[0] - q) * [1.0, -1.0] > 0.02)
+
+
+@pytest.mark.parametrize(
+    ('interval', 'coast'),
+    [
+        (0.004, 0.03),  # s, at least
+        (0.1, 0.2),  # two intervals
+        (0.7, TIMEOUT),  # by then the stream is over
+    ],
+)
+def test_reference_stays_on_the_line_until_the_stream_is_over(interval, coast):
+    target = receive(TargetStream(), interval * np.arange(5))[-1]
+    assert target.until - target.due == pytest.approx(coast)
+
+
+@pytest.mark.parametrize('side', [1.0, -1.0])
+@pytest.mark.parametrize('coast', [0.03, 0.3])
+def test_stream_towards_a_position_limit_is_slowed_so_that_the_arm_can_stop(
+    side, coast
+):
+    """It rests at the limit, 0.3 rad past the target, however long it follows the line."""
+    limit = {
+        'limits.position_lower': [-1.0, -1.0],
+        'limits.position_upper': [1.0, 1.0],
+    }
+    config = change(ControllerConfig(), limit)
+    q = np.full(2, side * 0.7)
+    target = Target(tuple(q), (side * 1.4,) * 2, 1.0, 1.0 + coast, held=False)
+    start = pack(2, [hold(np.full(2, side * 0.2))])
+    motion = plan_target(target, start, 0.0, config)
+    reached, _, _ = sampled(motion.vector, np.array([motion.end]))[0]
+    np.testing.assert_allclose(reached, side, atol=1e-9)

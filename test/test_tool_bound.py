@@ -37,6 +37,7 @@ from blf_dsc_controller.simulation.loop import simulate, write_bag
 from blf_dsc_controller.supervision.config_warnings import config_warnings
 from blf_dsc_controller.supervision.expected_errors import expected_errors
 from blf_dsc_controller.tool.errors import ANGLE, ANGLE_BOUND, BOUND, ERROR, Tool
+from blf_dsc_controller.tool.postures import axes_of, ways_to_tip
 
 TRAVEL = 2.5  # m, limit of the prismatic joints of random arms
 ROUNDING = 1e-13  # m and rad, of placements
@@ -149,6 +150,43 @@ def test_bound_at_every_posture_is_tight(name):
         worst = tool.at_postures(q, k).max(axis=0)
         assert (worst <= 1.01 * tool.everywhere(k)).all()  # but for their remainder
         assert (tool.everywhere(k) <= 1.3 * worst).all()
+
+
+@pytest.mark.parametrize('name', ['two', 'six', 'nine'])
+def test_tip_is_no_farther_from_an_axis_than_its_way(name):
+    """Prismatic joints in between, at both ends of their travel."""
+    chain = arm(name)
+    n = len(chain.joints)
+    axes = axes_of(chain, np.full(n, TRAVEL))
+    random = np.random.default_rng(2)
+    slides = random.choice((-TRAVEL, TRAVEL), (2000, n))
+    q = np.where(axes.revolute, random.uniform(-np.pi, np.pi, (2000, n)), slides)
+    placements = frames(chain, q)
+    tip = placements[-1][:, :3, 3]
+    ways = ways_to_tip(axes)
+    for i in range(n):
+        if not axes.revolute[i]:
+            assert ways[i] == 0.0
+            continue
+        at = placements[1 + i]
+        z = at[:, :3, :3] @ chain.joints[i].axis
+        away = np.linalg.norm(np.cross(tip - at[:, :3, 3], z), axis=1)
+        assert away.max() <= ways[i] + ROUNDING
+
+
+def test_tones_of_a_reference_add_up_to_the_region_that_it_needs():
+    """Joint bounds are the same whether a swing is one tone or the sum of two."""
+    found = []
+    for shares in ([1.0], [0.3, -0.7]):  # of 0.8 rad of each joint
+        tones = len(shares)
+        reference = {
+            'reference.amplitude': (0.8 * np.tile(shares, 7)).tolist(),
+            'reference.frequency': [1.0, 2.0][:tones],
+            'reference.phase': [0.0] * tones,
+        }
+        loop = preset('panda', **{'barrier.tool_bound': 0.003}, **reference)
+        found.append(loop.controller.barrier.bound)
+    assert found[0] == found[1]
 
 
 @pytest.mark.parametrize('name', ['panda', 'ur5e', 'fr3'])
