@@ -20,9 +20,13 @@ from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.nodes import load, load_loop, locate
 from blf_dsc_controller.law.factory import settings_of_config
 from blf_dsc_controller.simulation.loop import simulate
-from blf_dsc_controller.supervision.expected_errors import expected_errors, transition
+from blf_dsc_controller.supervision.expected_errors import (
+    expected_errors,
+    linear_feedback,
+    linear_loop,
+)
 
-ARMS = {'Panda': 'panda', 'UR5e': 'ur5e', 'FR3': 'fr3'}
+ARMS = {'Panda': 'panda_rigid', 'UR5e': 'ur5e_rigid', 'FR3': 'fr3'}
 SAMPLE_TIMES = {'1 kHz': 0.001, '500 Hz': 0.002, '250 Hz': 0.004}
 POSTURES = 8
 WEIGHT = 2.0  # kg, picked up
@@ -72,15 +76,11 @@ class Loop:
         self, stiffness: np.ndarray, inertia: float = 1.0, later: float = 0.0
     ) -> bool:
         """Return whether errors decay with M = inertia M0 and torques `later` [s] than known."""
-        A, _ = transition(
-            self.settings,
-            self.T,
-            self.lag + later,
-            inertia * self.M0,
-            self.M0,
-            stiffness,
-        )
-        return bool(np.abs(np.linalg.eigvals(A)).max() < 1.0)
+        feedback = linear_feedback(self.settings, self.M0, stiffness)
+        M = inertia * self.M0
+        return linear_loop(
+            self.settings, self.T, self.lag + later, M, feedback
+        ).is_stable()
 
     def lighter(self, stiffness: np.ndarray) -> float:
         """Return how many times lighter than M0 the arm may be."""

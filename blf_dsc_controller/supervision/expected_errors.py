@@ -2,15 +2,9 @@
 """The errors to expect: those of the sampled loop at small errors.
 
 About a motion that the law follows, learning aside, the law is linear in the errors,
-and so is the arm with its inertia M of that posture.  From one sample to the next the
-errors of n joints follow x+ = A x + B d with, for each joint,
-
-    x = [q, dq, drive torque, torque of the last sample, q of the last sample, filtered dq,
-         alpha2, d^3]
-
-where d [N m] is the torque that the model lacks.  Torques arrive a sample late and pass
-the drives, velocities are differences of positions behind a filter; each of both lags
-is half of `robot.lag`.
+and so is the arm with its inertia M of that posture (`arms.linear_loop`).  Torques
+arrive a sample late and pass the drives, velocities are differences of positions behind
+a filter; each of both lags is half of `robot.lag`.
 """
 
 from __future__ import annotations
@@ -20,10 +14,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from blf_dsc_controller.arms.linear_loop import Feedback, Joints, Loop, Timing
 from blf_dsc_controller.arms.model import inertia_matrices, regressors_at
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.robot import parameters_of
-from blf_dsc_controller.law import barrier
 from blf_dsc_controller.law.factory import settings_of_config
 from blf_dsc_controller.law.state import Settings
 from blf_dsc_controller.supervision.reference_load import along
@@ -31,73 +25,56 @@ from blf_dsc_controller.supervision.reference_load import along
 Floats = NDArray[np.float64]
 
 _RESPONSE = 20.0  # time constants of the damping, for which the response is followed
+_PEAK = 6.0  # of the surface, likewise; the peak comes before the integral acts
 _MOMENTS = 40  # of the reference
 # of Coulomb friction: half of it too much at breakaway, with either sign
 _REVERSAL = 0.75
 
 
-def transition(
-    settings: Settings, T: float, lag: float, M: Floats, M0: Floats, stiffness: Floats
-) -> tuple[Floats, Floats]:
-    """Return A (k, 8 n, 8 n), B (k, 8 n, n) for inertias M and M0 (k, n, n).
+def linear_feedback(settings: Settings, M0: Floats, stiffness: Floats) -> Feedback:
+    """Return the law at small errors, with its inertia M0 (k, n, n) [kg m^2] of k postures.
 
-    T [s] is the sample time, `lag` [s] that of velocity filter and drives together, and
-    `stiffness` (n,) [N m/rad] the slope of the barrier.
+    `stiffness` (n,) [N m/rad] is the slope of the barrier.
     """
-    n = settings.n
-    decay = np.exp(-T / max(0.5 * lag, 1e-9))  # of the drives
-    mean = (1.0 - decay) * 0.5 * lag / T  # of the drives' transient over the sample
-    rate = settings.K / 2.0 + settings.mu
-    g = barrier.filter_gain(settings.time_constant, T)
-    # Rows of x, and of what the law computes in terms of x: alpha2', xi2 and the
-    # torque.
-    q, dq, drive, last, before, speed, alpha2, d3 = np.eye(8 * n).reshape(8, n, 8 * n)
-    measured = speed + (1.0 - decay) * ((q - before) / T - speed)
-    beta2 = -rate[:, None] * q
-    dalpha2 = g * (beta2 - alpha2) / T
-    if settings.known_rate == 1:
-        dalpha2 = dalpha2 - rate[:, None] * measured
-    xi2 = measured - alpha2
-    m = settings.joint_inertia
-    push_back = (stiffness / m)[:, None] * q
-    torque = (
-        M0 @ (dalpha2 - settings.damping_rate * xi2 - push_back)
-        - settings.Kp[:, None] * xi2
-        + d3
+    one = np.broadcast_to(np.eye(settings.n), M0.shape)
+    acting = M0 / settings.joint_inertia if settings.follows_inertia == 1 else one
+    return Feedback(
+        position=acting * stiffness,
+        surface=one * settings.Kp + M0 * settings.damping_rate,
+        inertia=0.0 * M0 if settings.decoupled == 1 else M0,
+        integral=acting * settings.gamma,
+        rate=settings.K / 2.0 + settings.mu,
+        time_constant=settings.time_constant,
+        known_rate=settings.known_rate == 1,
     )
-    absorbed = M0 @ ((settings.gamma / m)[:, None] * xi2)
-    applied = mean * drive + (1.0 - mean) * last  # mean over the sample
-    free = np.linalg.inv(M)
-    push = free @ applied
-    rows = [
-        q + T * dq + 0.5 * T**2 * push,
-        dq + T * push,
-        decay * drive + (1.0 - decay) * last,
-        torque,
-        q,
-        measured,
-        alpha2 + T * dalpha2,
-        d3 - T * absorbed,
-    ]
-    A = np.concatenate(np.broadcast_arrays(*rows), axis=1)
-    B = np.zeros((*A.shape[:-1], n))
-    B[:, :n] = 0.5 * T**2 * free
-    B[:, n : 2 * n] = T * free
-    return A, B
+
+
+def linear_loop(
+    settings: Settings, T: float, lag: float, M: Floats, feedback: Feedback
+) -> Loop:
+    """Return the loop of a law and a rigid arm with inertias M (k, n, n) [kg m^2].
+
+    T [s] is the sample time, `lag` [s] that of velocity filter and drives together.
+    """
+    nothing = np.zeros(settings.n)
+    timing = Timing(T, drive_lag=0.5 * lag, velocity_lag=0.5 * lag)
+    return Loop(M, Joints(motors=nothing, viscous=nothing), timing, feedback)
 
 
 def _peak_errors(
     config: ControllerConfig, settings: Settings, M: Floats, M0: Floats, torque: Floats
 ) -> Floats:
     """Return the largest errors (k, n) [rad] after a torque step d (k, n) [N m]."""
-    A, B = transition(
-        settings, config.sample_time, config.robot.lag, M, M0, settings.weight
-    )
+    T = config.sample_time
+    feedback = linear_feedback(settings, M0, settings.weight)
+    A, B = linear_loop(settings, T, config.robot.lag, M, feedback).transition()
     push = (B @ torque[..., None])[..., 0]
     x = np.zeros_like(push)
     largest = np.zeros_like(torque)
-    rate = max(settings.damping_rate, 1.0)
-    for _ in range(round(_RESPONSE / rate / config.sample_time)):
+    duration = _PEAK / max(float(feedback.rate.min()), 1.0)
+    if settings.damping_rate > 0.0:
+        duration = _RESPONSE / max(settings.damping_rate, 1.0)
+    for _ in range(round(duration / T)):
         x = (A @ x[..., None])[..., 0] + push
         largest = np.maximum(largest, np.abs(x[:, : settings.n]))
     return largest

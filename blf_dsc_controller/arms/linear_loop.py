@@ -1,0 +1,285 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The sampled loop at small errors, of an arm with rigid or elastic joints.
+
+About a posture, each joint of an elastic arm is a motor behind a spring:
+
+    M q'' = K (th - q) + D (th' - q') + d
+    B th'' + F th' + K (th - q) + D (th' - q') = u
+
+M [kg m^2] is that of the links, B the inertia of the motors, d [N m] a torque at the
+links.  Drives with a torque sensor may close a loop around it,
+
+    u = tau + k_T (tau - s) - k_S s',      s = K (th - q) + D (th' - q') behind a lag
+
+A rigid arm is one state less for each joint: (M + B) q'' + F q' = tau + d.  Drives
+and velocity filter have lags, torques are held for a sample and arrive after whole
+samples, and velocities are differences of positions (th or q).
+
+What a law adds is linear as well: `Feedback`.  `Loop.margin` is the modulus margin,
+the least singular value of I + G C over the frequencies, for the loop cut at the
+torques of all joints: the distance from instability that no simultaneous change of
+the joints' responses may bridge.  It is looked for above 5 Hz: below, an arm is rigid,
+and its damping ratio says more.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float64]
+Complex = NDArray[np.complex128]
+
+_SHORTEST = 1e-5  # s, of a lag that is not left out
+_FREQUENCIES = 120
+_SLOWEST = 5.0  # Hz, below which no margin is looked for
+_FASTEST = 0.48  # of the sample rate
+
+
+class TorqueLoop(NamedTuple):
+    """Loop of the drives around their joint torque sensors."""
+
+    gain: float = 4.0  # k_T
+    damping: float = 8e-3  # k_S, s
+    lag: float = 3e-4  # s
+
+
+class Joints(NamedTuple):
+    """What is between the torques of the drives and the links."""
+
+    motors: Floats  # B (n,), kg m^2, reflected to the joints
+    viscous: Floats  # F (n,), N m s/rad
+    stiffness: Floats | None = None  # K (n,), N m/rad; None: rigid
+    damping_ratio: float = 0.03  # of motor and link on the spring, both free
+    torque_loop: TorqueLoop | None = None
+    motor_side: bool = False  # the encoders are at the motors
+
+
+class Timing(NamedTuple):
+    """Sampling and lags of a loop."""
+
+    period: float  # T, s
+    delay: int = 1  # whole samples until a torque arrives
+    drive_lag: float = 0.0  # s
+    velocity_lag: float = 0.0  # s, of the filter on differenced positions
+
+
+class Feedback(NamedTuple):
+    """A law at small errors, in k postures.
+
+    With measured position y and velocity v, from the reference,
+
+        tau = - position y - surface xi2 + inertia alpha2' + d3,    xi2 = v - alpha2
+        alpha2 follows -rate y by the surface filter,               d3' = - integral xi2
+    """
+
+    position: Floats  # (k, n, n) N m/rad
+    surface: Floats  # (k, n, n) N m s/rad
+    inertia: Floats  # (k, n, n) kg m^2
+    integral: Floats  # (k, n, n) N m/rad
+    rate: Floats  # (n,) 1/s
+    time_constant: float  # lambda, s
+    known_rate: bool
+
+
+class Loop(NamedTuple):
+    """Arm, sampling and law, in k postures."""
+
+    links: Floats  # M (k, n, n), kg m^2
+    joints: Joints
+    timing: Timing
+    feedback: Feedback
+
+    def transition(self) -> tuple[Floats, Floats]:
+        """Return A (k, N, N) and B (k, N, n) of the errors x+ = A x + B d.
+
+        d [N m] is held for a sample; the first n of x are the positions q [rad].
+        """
+        A, G, own, sensed = _sampled_arm(self.links, self.joints, self.timing)
+        return _with_law(A, G, own, sensed, self.timing, self.feedback)
+
+    def is_stable(self) -> bool:
+        """Return whether the errors decay in all postures."""
+        A, _ = self.transition()
+        return bool(np.abs(np.linalg.eigvals(A)).max() < 1.0)
+
+    def margin(self) -> Margin:
+        """Return the modulus margin in the worst posture; 0 if one is unstable."""
+        frequencies = np.geomspace(
+            _SLOWEST, _FASTEST / self.timing.period, _FREQUENCIES
+        )
+        s: Complex = np.asarray(2j * np.pi * frequencies, complex)
+        G = arm_response(self.links, self.joints, self.timing, s)
+        C = law_response(self.feedback, self.timing, s)
+        least = np.linalg.svd(
+            np.eye(len(self.joints.motors)) + G @ C, compute_uv=False
+        )[..., -1]
+        posture, at = np.unravel_index(int(least.argmin()), least.shape)
+        value = float(least[posture, at]) if self.is_stable() else 0.0
+        return Margin(value, float(frequencies[at]), int(posture))
+
+
+class Margin(NamedTuple):
+    """A modulus margin, with the frequency [Hz] and the posture at which it is least."""
+
+    value: float
+    frequency: float
+    posture: int
+
+
+def arm_response(links: Floats, joints: Joints, timing: Timing, s: Complex) -> Complex:
+    """Return G (k, f, n, n) [rad/(N m)] at s = i omega (f,), from torque to position."""
+    T = timing.period
+    held = (1.0 - np.exp(-T * s)) / (T * s) * np.exp(-timing.delay * T * s)
+    held = held / (1.0 + timing.drive_lag * s)
+    s = s[:, None]  # (f, n) from here on
+    motors = joints.motors * s**2 + joints.viscous * s
+    M = links[:, None] * (s**2)[..., None]  # (k, f, n, n)
+    if joints.stiffness is None:
+        return np.linalg.inv(M + _diagonals(motors)) * held[:, None, None]
+    spring = joints.stiffness + _damping(links, joints, joints.stiffness) * s
+    loop = joints.torque_loop or TorqueLoop(0.0, 0.0)
+    sensed = (loop.gain + loop.damping * s) / (1.0 + loop.lag * s)
+    free = np.linalg.inv(M + _diagonals(spring))
+    links_of_motors = free * spring[:, None, :]  # q = ... th
+    back = spring * (1.0 + sensed)
+    motor = _diagonals(motors + back) - back[..., None] * links_of_motors
+    motors_of_torque = np.linalg.inv(motor) * ((1.0 + loop.gain) * held)[:, None, None]
+    if joints.motor_side:
+        return motors_of_torque
+    return np.asarray(links_of_motors @ motors_of_torque)
+
+
+def law_response(feedback: Feedback, timing: Timing, s: Complex) -> Complex:
+    """Return C (k, f, n, n) [N m/rad] at s = i omega (f,): tau = - C y."""
+    T = timing.period
+    z = np.exp(T * s)[:, None]
+    decay = _decay(timing.velocity_lag, T)
+    velocity = (1.0 - decay) * (1.0 - 1.0 / z) / T / (1.0 - decay / z)
+    g = 1.0 - np.exp(-T / feedback.time_constant)
+    known = velocity * feedback.rate if feedback.known_rate else 0.0
+    # alpha2+ = alpha2 + g (-rate y - alpha2) - T known y
+    alpha2 = -(g * feedback.rate + T * known) / (z - 1.0 + g)
+    dalpha2 = (z - 1.0) / T * alpha2
+    xi2 = velocity - alpha2
+    d3 = -T / (z - 1.0) * xi2
+    return np.asarray(
+        feedback.position[:, None]
+        + feedback.surface[:, None] * xi2[:, None, :]
+        - feedback.inertia[:, None] * dalpha2[:, None, :]
+        - feedback.integral[:, None] * d3[:, None, :]
+    )
+
+
+def _diagonals(values: Complex) -> Complex:
+    """Return diagonal matrices (..., n, n) of values (..., n)."""
+    return np.asarray(values[..., None] * np.eye(values.shape[-1]))
+
+
+def _decay(lag: float, T: float) -> float:
+    return float(np.exp(-T / max(lag, _SHORTEST)))
+
+
+def _damping(links: Floats, joints: Joints, K: Floats) -> Floats:
+    """Return D (n,) [N m s/rad] of the springs K (n,): by the least inertia of the links."""
+    free = 1.0 / np.diagonal(np.linalg.inv(links), axis1=1, axis2=2)
+    link = free.min(axis=0)
+    reduced = joints.motors * link / (joints.motors + link)
+    return np.asarray(2.0 * joints.damping_ratio * np.sqrt(K * reduced))
+
+
+def _sampled_arm(
+    links: Floats, joints: Joints, timing: Timing
+) -> tuple[Floats, Floats, Floats, Floats]:
+    """Return the arm over a sample: x+ = A x + G [tau, d], with q = own x, y = sensed x.
+
+    x has q and q', those of the motors and the torque loop of elastic joints, and the
+    torque of the drives.
+    """
+    k, n, _ = links.shape
+    one = np.eye(n)
+    blocks = 3 if joints.stiffness is None else 6
+    rate = np.zeros((k, blocks * n, blocks * n))
+    push = np.zeros((k, blocks * n, 2 * n))  # of tau and d
+    rows = np.eye(blocks * n).reshape(blocks, n, blocks * n)
+    lag = max(timing.drive_lag, _SHORTEST)
+    q, dq, drive = rows[0], rows[1], rows[-1]
+    rate[:, :n] = dq
+    if joints.stiffness is None:
+        free = np.linalg.inv(links + np.diag(joints.motors))
+        rate[:, n : 2 * n] = free @ (drive - joints.viscous[:, None] * dq)
+        push[:, n : 2 * n, n:] = free
+        sensed = q
+    else:
+        th, dth, behind = rows[2], rows[3], rows[4]
+        K = joints.stiffness
+        D = _damping(links, joints, K)
+        spring = K[:, None] * (th - q) + D[:, None] * (dth - dq)
+        loop = joints.torque_loop or TorqueLoop(0.0, 0.0)
+        change = (spring - behind) / loop.lag
+        u = (1.0 + loop.gain) * drive - loop.gain * behind - loop.damping * change
+        free = np.linalg.inv(links)
+        rate[:, n : 2 * n] = free @ spring
+        push[:, n : 2 * n, n:] = free
+        rate[:, 2 * n : 3 * n] = dth
+        friction = joints.viscous[:, None] * dth
+        rate[:, 3 * n : 4 * n] = (u - spring - friction) / joints.motors[:, None]
+        rate[:, 4 * n : 5 * n] = change
+        sensed = th if joints.motor_side else q
+    rate[:, -n:] = -drive / lag
+    push[:, -n:, :n] = one / lag
+    size = (blocks + 2) * n
+    whole = np.zeros((k, size, size))
+    whole[:, : blocks * n, : blocks * n] = rate
+    whole[:, : blocks * n, blocks * n :] = push
+    from scipy.linalg import expm  # 0.1 s and a pool of threads: only where it is used
+
+    over = expm(timing.period * whole)[:, : blocks * n]
+    return over[..., : blocks * n], over[..., blocks * n :], q, sensed
+
+
+def _with_law(
+    arm: Floats,
+    push: Floats,
+    own: Floats,
+    sensed: Floats,
+    timing: Timing,
+    feedback: Feedback,
+) -> tuple[Floats, Floats]:
+    """Return A and B of arm, torques under way and law together."""
+    k, size, _ = arm.shape
+    n = own.shape[0]
+    T = timing.period
+    waiting = timing.delay
+    blocks = waiting + 4  # y of the last sample, its velocity, alpha2, d3
+    N = size + blocks * n
+    wide = np.zeros((n, N))
+    wide[:, :size] = sensed
+    y = wide
+    rows = np.eye(N)[size:].reshape(blocks, n, N)
+    under_way, (before, speed, alpha2, d3) = rows[:waiting], rows[waiting:]
+    decay = _decay(timing.velocity_lag, T)
+    v = decay * speed + (1.0 - decay) * (y - before) / T
+    g = 1.0 - np.exp(-T / feedback.time_constant)
+    rate = feedback.rate[:, None]
+    dalpha2 = g * (-rate * y - alpha2) / T
+    if feedback.known_rate:
+        dalpha2 = dalpha2 - rate * v
+    xi2 = v - alpha2
+    tau = feedback.inertia @ dalpha2 - feedback.position @ y - feedback.surface @ xi2
+    tau = tau + d3
+    acting = under_way[0] if waiting else tau
+    A = np.zeros((k, N, N))
+    A[:, :size, :size] = arm
+    A[:, :size] += push[..., :n] @ acting
+    later = [*under_way[1:], tau] if waiting else []
+    integrated = d3 - T * (feedback.integral @ xi2)
+    parts = [*later, y, v, alpha2 + T * dalpha2, integrated]
+    A[:, size:] = np.concatenate(
+        [np.broadcast_to(part, (k, n, N)) for part in parts], axis=1
+    )
+    B = np.zeros((k, N, n))
+    B[:, :size] = push[..., n:]
+    return A, B
