@@ -217,12 +217,13 @@ class PlainLaw:
         self.learn(t, dt, q, dq, dqr, self.tau)
         r, P0 = g.model.r, g.initial_estimate[:3]
         barrier = self.barrier_torque(xi1, t)
-        damped = dalpha2 - g.damping_rate * xi2
+        v, a = (dqr, ddqr) if g.decoupled else (self.alpha2, dalpha2)
+        damped = a - g.damping_rate * xi2
         if g.follows_inertia:
             damped = damped + barrier / g.joint_inertia
             barrier = np.zeros(2)
-        H = regressor(r, q, dq, self.alpha2, damped)
-        along = (q, dq, self.alpha2, dalpha2) if self.at_state else (qr, dqr, dqr, ddqr)
+        H = regressor(r, q, dq, v, damped)
+        along = (q, dq, v, a) if self.at_state else (qr, dqr, dqr, ddqr)
         H_r = np.zeros((2, g.m))
         H_r[:, :3] = regressor(r, *along)
         if g.viscous:

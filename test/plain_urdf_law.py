@@ -368,6 +368,16 @@ class PlainUrdfLaw:
         inside = np.where(x < np.pi, 2.0 * np.cos(x) - np.sinc(x / np.pi), 0.0)
         return 0.5 * g.K * inside + g.mu + g.funnel_rate * wider / (g.bound + wider)
 
+    def model_motion(self, dqr, ddqr, dalpha2, xi2, barrier):
+        """Return v and a of the model: with the feedback that acts through the inertia."""
+        g = self.gains
+        if g.decoupled:
+            return dqr, ddqr
+        a = dalpha2 - g.damping_rate * xi2
+        if g.follows_inertia:
+            a = a + barrier / g.joint_inertia
+        return self.alpha2, a
+
     def update(self, t, dt, qr, dqr, ddqr, measurement):
         """Return the command for a measurement; all is in the order of the page."""
         g = self.gains
@@ -388,9 +398,9 @@ class PlainUrdfLaw:
         share = 1.0 - exp(-dt / g.time_constant)
         dalpha2 = share * (beta2 - self.alpha2) / dt + known
         xi2 = dq - self.alpha2
-        damped = dalpha2 - g.damping_rate * xi2
-        damped = damped + self.barrier_torque(xi1, t) / g.joint_inertia
-        H = self.arm.regressor(q, dq, self.alpha2, damped)
+        barrier = self.barrier_torque(xi1, t)
+        v, a = self.model_motion(dqr, ddqr, dalpha2, xi2, barrier)
+        H = self.arm.regressor(q, dq, v, a)
         H_r = np.zeros((g.n, g.m))
         H_r[:, :p] = self.arm.regressor(qr, dqr, dqr, ddqr)
         lead = 1.5 * dt + 0.5 * g.lag
@@ -406,7 +416,8 @@ class PlainUrdfLaw:
             self.check_window(t)
         P0 = g.initial_estimate[:p]
         demand = (
-            -g.d2 * np.abs(xi1) * np.clip(xi2 / 0.01, -1.0, 1.0)
+            (0.0 if g.follows_inertia else barrier)
+            - g.d2 * np.abs(xi1) * np.clip(xi2 / 0.01, -1.0, 1.0)
             - g.Kp * xi2
             + H @ P0
             - H_r[:, :p] @ P0
@@ -450,9 +461,11 @@ class PlainUrdfLaw:
         tracking = np.zeros(g.m)
         if not is_cut:
             tracking[: g.p] = -(g.variance * (H_r.T @ xi2))[: g.p]
-            rate_of_d3 = g.gamma * (xi2 + g.eta * self.d3) / g.joint_inertia
-            Yp, _ = self.arm.momentum_regressors(q, rate_of_d3)
-            step = -dt * Yp @ g.initial_estimate[: g.p]
+            rate_of_d3 = g.gamma * (xi2 + g.eta * self.d3)
+            if g.follows_inertia:
+                Yp, _ = self.arm.momentum_regressors(q, rate_of_d3 / g.joint_inertia)
+                rate_of_d3 = Yp @ g.initial_estimate[: g.p]
+            step = -dt * rate_of_d3
             self.d3 = self.d3 + step
             friction.observe(step, ahead)
         v = g.Gamma * (g.kappa * rate + tracking)

@@ -192,6 +192,7 @@ def drawn(seed):
         'joint_inertia': each(0.2, 0.5),
         'known_rate': int(random.integers(2)),
     }
+    gains['decoupled'] = int(random.integers(2)) * (1 - gains['follows_inertia'])
     return quick(**columns | gains), arm
 
 

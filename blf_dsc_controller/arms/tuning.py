@@ -1,7 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Design rules: the gains and limits of the controller that follow from the URDF of an arm.
 
-The delay of the loop, 3 T + robot.lag, gives the rate omega_b = 0.625 / delay;
+Gains of joints, each on its own, follow from a stiffness and a damping (`joint_gains`).
+
+Where the whole feedback acts through M(q, P^(0)), for arms whose gears are rigid, the
+delay of the loop, 3 T + robot.lag, gives the rate omega_b = 0.625 / delay;
 feedback.stiffness is the part of it that is used. Gains are multiples of this rate and
 of the inertia of each joint with the others free, m_i = 1 / (M^-1)_ii, minimised over
 several postures; the law multiplies what acts on errors by M(q, P^(0)) / m. Three
@@ -19,11 +22,20 @@ from __future__ import annotations
 import functools
 import math
 from collections.abc import Mapping
-from typing import NamedTuple
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 
 from blf_dsc_controller.arms.base_parameters import BaseParameters, prior_factor
+from blf_dsc_controller.arms.joint_gains import (
+    SURFACE,
+    JointGains,
+    adaptation_gain,
+    funnel_rate,
+    law_gains,
+)
+from blf_dsc_controller.arms.known_gears import GearedArm, Gears
+from blf_dsc_controller.arms.linear_loop import Feedback, Timing
 from blf_dsc_controller.arms.model import free_inertias, inertia_matrices, regressors_at
 from blf_dsc_controller.arms.urdf import Chain
 
@@ -35,12 +47,19 @@ SAMPLES = 3.0
 _SAG = 1.5
 _PHASE = 0.625  # rad, phase lost to the delay at omega_b
 _BOUND = 0.002  # rad, at full stiffness
+# Of gains of joints: fraction of the rated torque that is expected beside gravity, and
+# rad, the widest bound by default
+_PUSH, _WIDEST = 0.03, 0.35
 _UNMODELLED = 0.01  # rms, fraction of the rated torque: ripple, noise, Stribeck
 _WINDOW = 5.0  # s
 _REGULARISATION = 1e-5  # pulls P (about 1) to 0
 _ANCHOR = 5.0  # times the mean square of the unmodelled torque
+# Of feedback through the inertia: over m omega_b^2, or over omega_b
+_BARRIER, _INTEGRAL, _DAMPING = 0.5, 0.4, 0.6
+_SURFACE = 0.4, 1.3  # K and mu
 _POSTURES = 20
-_SURFACE = 0.004  # s, least time constant of the surface filter: noise of alpha2'
+_FEW = 3  # postures, without and with payload, of known gears
+_ADAPTATION = 0.5  # Gamma, in units of the prior's covariance
 _FREE = 2.0 * math.pi  # rad, position limit of a joint without one
 _SLOW = 0.5  # fraction of the rated velocity
 
@@ -48,6 +67,9 @@ _SLOW = 0.5  # fraction of the rated velocity
 def loop_delay(sample_time: float, lag: float) -> float:
     """Return the delay of the loop [s] that its gains allow for."""
     return SAMPLES * sample_time + lag
+
+
+Value: TypeAlias = bool | int | float | str | tuple[float, ...] | tuple[str, ...]
 
 
 class Design(NamedTuple):
@@ -59,48 +81,113 @@ class Design(NamedTuple):
     rotors: np.ndarray  # (n,) kg m^2, inertias of the drives
     payload: float  # kg, rated
     lag: float  # s
+    # None: the whole feedback acts through the inertia matrix
+    joints: JointGains | None
+    stiffness: float  # part of the rate that is used, or factor on `joints`
+    sample_time: float  # s
+
+    @property
+    def limits(self) -> tuple[np.ndarray, np.ndarray]:
+        """Lowest and highest position (n,) [rad]."""
+        joints = self.chain.joints
+        return (
+            _finite([joint.lower for joint in joints], -_FREE),
+            _finite([joint.upper for joint in joints], _FREE),
+        )
+
+    def over_postures(self) -> Postures:
+        """Return the inertias and the gravity of the arm over its postures."""
+        P = self.parameters.of(self.chain.inertias, self.rotors)
+        limits = (tuple(each) for each in self.limits)
+        return over_postures(
+            self.chain, self.parameters, self.payload, tuple(P), *limits
+        )
 
 
-def gains_of(
-    arm: Design, sample_time: float, stiffness: float, bound: np.ndarray | None
-) -> Mapping[str, bool | int | float | str | tuple[float, ...] | tuple[str, ...]]:
+def gains_of(arm: Design, bound: np.ndarray | None) -> Mapping[str, Value]:
     """Return gains and limits by the dotted name of their parameter.
 
-    `stiffness` is the part of the rate omega_b that is used, `bound` (n,) [rad] or None
-    the one that is given.
+    `bound` (n,) [rad] is the one that is given, or None.
     """
-    chain = arm.chain
-    n = len(chain.joints)
-    effort = _finite([joint.effort for joint in chain.joints], UNKNOWN_EFFORT)
-    velocity = _finite([joint.velocity for joint in chain.joints], 2.0)
-    lower = _finite([joint.lower for joint in chain.joints], -_FREE)
-    upper = _finite([joint.upper for joint in chain.joints], _FREE)
-    P = arm.parameters.of(chain.inertias, arm.rotors)
-    fastest = _PHASE / loop_delay(sample_time, arm.lag)
-    rate = stiffness * fastest
-    usual_bound = float(f'{_BOUND / stiffness**2:.4g}')
-    limits = tuple(lower), tuple(upper)
-    m, gravity = over_postures(chain, arm.parameters, arm.payload, tuple(P), *limits)
-    sag = _SAG * gravity / (m * rate**2)
-    floor = _UNMODELLED * arm.efforts
+    if arm.joints is None:
+        return _of_arm(arm) | _through_inertia(arm, bound)
+    gains = arm.joints.scaled(arm.stiffness)
+    return _of_arm(arm) | _of_joints(arm, gains, bound)
+
+
+def _through_inertia(arm: Design, bound: np.ndarray | None) -> dict[str, Value]:
+    """Return the gains of feedback through the inertia matrix."""
+    n = len(arm.chain.joints)
+    fastest = _PHASE / loop_delay(arm.sample_time, arm.lag)
+    rate = arm.stiffness * fastest
+    usual_bound = float(f'{_BOUND / arm.stiffness**2:.4g}')
+    postures = arm.over_postures()
+    m = postures.free_inertia
+    sag = _SAG * postures.gravity / (m * rate**2)
     zeros = (0.0,) * n
     return {
-        'joints': tuple(joint.name for joint in chain.joints),
+        'feedback.inertia': 'whole',
         'barrier.bound': (usual_bound,) * n,
         'barrier.initial_bound': _listed(
             np.where(sag > (usual_bound if bound is None else bound), sag, 0.0)
         ),
         'barrier.funnel_rate': float(f'{rate / 20.0:.4g}'),
-        'barrier.weight': _listed(0.5 * m * rate**2),
+        'barrier.weight': _listed(_BARRIER * m * rate**2),
         'barrier.slope_limit': _listed(1.5 * m * rate**2),
-        'surface.gain': (0.4 * rate,) * n,
-        'surface.mu': (1.3 * rate,) * n,
-        'surface.time_constant': max(sample_time, _SURFACE),
-        'surface.known_rate': True,
+        'surface.gain': (_SURFACE[0] * rate,) * n,
+        'surface.mu': (_SURFACE[1] * rate,) * n,
         'feedback.gain': zeros,
+        'feedback.damping_rate': _DAMPING * rate,
+        'disturbance.gain': _listed(_INTEGRAL * m * rate**2),
+        'comparison.surface_gain': (rate / 3.0,) * n,
+        'comparison.position_gain': _listed(m * (rate / 4.0) ** 2),
+        'learning.adaptation_gain': (_ADAPTATION,) * arm.parameters.model.p,
+        'safety.damping': _listed(m * fastest / 4.0),
+    }
+
+
+def _of_joints(
+    arm: Design, gains: JointGains, bound: np.ndarray | None
+) -> dict[str, Value]:
+    """Return the gains of joints, each on its own."""
+    postures = arm.over_postures()
+    pushed = postures.gravity + _PUSH * arm.efforts
+    sag = np.minimum(_SAG * pushed / gains.stiffness, _WIDEST)
+    usual_bound = np.maximum(sag, _BOUND)
+    start = np.where(sag > (usual_bound if bound is None else bound), sag, 0.0)
+    inertia = postures.inertia
+    Gamma = adaptation_gain(gains, inertia, postures.gravity)
+    law = {name: _listed(each) for name, each in law_gains(gains, inertia).items()}
+    return {
+        **law,
+        'feedback.inertia': 'none',
+        'barrier.bound': _listed(usual_bound),
+        'barrier.initial_bound': _listed(start),
+        'barrier.funnel_rate': float(f'{funnel_rate(gains):.4g}'),
+        'feedback.damping_rate': 0.0,
+        'comparison.surface_gain': _listed(gains.rate),
+        'comparison.position_gain': _listed(0.5 * gains.stiffness),
+        'learning.adaptation_gain': (min(_ADAPTATION, float(f'{Gamma:.4g}')),)
+        * arm.parameters.model.p,
+        'safety.damping': _listed(gains.damping),
+    }
+
+
+def _of_arm(arm: Design) -> dict[str, Value]:
+    """Return limits, and what learning needs, whatever the feedback."""
+    chain = arm.chain
+    n = len(chain.joints)
+    effort = _finite([joint.effort for joint in chain.joints], UNKNOWN_EFFORT)
+    velocity = _finite([joint.velocity for joint in chain.joints], 2.0)
+    lower, upper = arm.limits
+    P = arm.parameters.of(chain.inertias, arm.rotors)
+    floor = _UNMODELLED * arm.efforts
+    zeros = (0.0,) * n
+    return {
+        'joints': tuple(joint.name for joint in chain.joints),
+        'surface.time_constant': max(arm.sample_time, SURFACE),
+        'surface.known_rate': True,
         'feedback.damping': zeros,
-        'feedback.damping_rate': 0.6 * rate,
-        'disturbance.gain': _listed(0.4 * m * rate**2),
         'torque.limit': _listed(effort),
         'torque.rate_limit': zeros,
         'torque.first_step': zeros,
@@ -112,7 +199,6 @@ def gains_of(
         'limits.velocity': _listed(_SLOW * velocity),
         'limits.acceleration': _listed(4.0 * _SLOW * velocity),
         'learning.initial_estimate': _listed(P),
-        'learning.adaptation_gain': (0.5,) * P.size,
         'learning.radius': 10.0 * max(float(np.sqrt((P * P).sum())), arm.payload),
         'learning.window': _WINDOW,
         'learning.regularization': _REGULARISATION,
@@ -125,17 +211,71 @@ def gains_of(
         'learning.viscous': True,
         'learning.coulomb': True,
         'learning.coulomb_velocity': 0.02,
-        'comparison.surface_gain': (rate / 3.0,) * n,
-        'comparison.position_gain': _listed(m * (rate / 4.0) ** 2),
         'comparison.robust_gain': zeros,
         'truth.constant': zeros,
         'truth.amplitude': zeros,
         'truth.frequency': (1.0,) * n,
         'truth.phase': zeros,
         'safety.torque': 'hold_gravity',
-        'safety.damping': _listed(m * fastest / 4.0),
         'safety.velocity_limit': 3.0 * float(velocity.max()),
     }
+
+
+def through_inertia(M0: np.ndarray, rate: float) -> Feedback:
+    """Return the law at small errors whose whole feedback acts through M0 (k, n, n) [kg m^2].
+
+    `rate` is omega_b [1/s].
+    """
+    n = M0.shape[-1]
+    return Feedback(
+        position=M0 * (_BARRIER * rate**2),
+        surface=M0 * (_DAMPING * rate),
+        inertia=M0,
+        integral=M0 * (_INTEGRAL * rate**2),
+        rate=np.full(n, (_SURFACE[0] / 2.0 + _SURFACE[1]) * rate),
+        time_constant=SURFACE,
+        known_rate=True,
+    )
+
+
+def geared_arm(arm: Design, gears: Gears) -> GearedArm:
+    """Return an arm with its gears, in a few postures, without and with its payload."""
+    none = np.zeros(len(arm.rotors))
+    P = arm.parameters.of(arm.chain.inertias, none)
+    q = np.random.default_rng(0).uniform(*arm.limits, (_FEW, len(none)))
+    links = [
+        inertia_matrices(arm.parameters.model, P + load * arm.parameters.load, q)
+        for load in (0.0, arm.payload)
+    ]
+    half = 0.5 * arm.lag
+    return GearedArm(
+        np.concatenate(links), gears, Timing(arm.sample_time, 1, half, half)
+    )
+
+
+def with_known_gears(arm: Design, gears: Gears) -> Design:
+    """Return the arm with the stiffest gains that its gears bear (`known_gears`).
+
+    They are those of joints if `arm.joints` is given, else those through the inertia.
+    """
+    known = geared_arm(arm, gears)
+    if arm.joints is not None:
+        return arm._replace(joints=known.joint_gains())
+    fastest = _PHASE / loop_delay(arm.sample_time, arm.lag)
+    M0 = known.links + np.diag(arm.rotors)
+
+    def feedback(stiffness: float) -> Feedback:
+        return through_inertia(M0, stiffness * fastest)
+
+    return arm._replace(stiffness=float(f'{known.stiffness(feedback):.3g}'))
+
+
+class Postures(NamedTuple):
+    """Extremes over the postures of an arm."""
+
+    free_inertia: np.ndarray  # least 1 / (M^-1)_ii (n,), kg m^2
+    inertia: np.ndarray  # largest M_ii with the rated payload (n,), kg m^2
+    gravity: np.ndarray  # largest standard deviation of gravity (n,), N m
 
 
 @functools.lru_cache(maxsize=16)
@@ -146,19 +286,24 @@ def over_postures(
     P: tuple[float, ...],
     lower: tuple[float, ...],
     upper: tuple[float, ...],
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return least 1 / (M^-1)_ii (n,) and largest standard deviation of gravity (n,) [N m].
+) -> Postures:
+    """Return extremes over random postures within the limits [rad].
 
-    Both are taken over random postures within the limits, with the rated payload [kg].
+    The rated payload [kg] counts in what is largest.
     """
     model = parameters.model
     n = model.n
     L = prior_factor(chain, parameters, payload, np.zeros(n))
     q = np.random.default_rng(0).uniform(lower, upper, (_POSTURES, n))
-    free = free_inertias(inertia_matrices(model, np.array(P), q))
+    M = inertia_matrices(model, np.array(P), q)
+    loaded = inertia_matrices(model, np.array(P) + payload * parameters.load, q)
     zero = np.zeros_like(q)
     deviation = np.linalg.norm(regressors_at(model, q, zero, zero, zero) @ L, axis=2)
-    return free.min(axis=0), deviation.max(axis=0)
+    return Postures(
+        free_inertia=free_inertias(M).min(axis=0),
+        inertia=np.diagonal(loaded, axis1=1, axis2=2).max(axis=0),
+        gravity=deviation.max(axis=0),
+    )
 
 
 def _finite(values: list[float], instead: float) -> np.ndarray:

@@ -63,8 +63,13 @@ def known_names(recorded: Mapping[str, Any]) -> set[str]:
 
 
 def completed(recorded: Mapping[str, Any]) -> dict[str, Any]:
-    """Return all parameters of a controller, with those added after the recording."""
-    return {**ADDED, **recorded}
+    """Return all parameters of a controller, with those added after the recording.
+
+    The feedback of an arm from a URDF acted through its inertia matrix.
+    """
+    is_urdf = recorded.get('model') == 'urdf'
+    feedback = {'feedback.inertia': 'whole'} if is_urdf else {}
+    return {**ADDED, **feedback, **recorded}
 
 
 def _is_same(value: Any, default: Value) -> bool:

@@ -19,10 +19,15 @@ from typing import Annotated, Any, Literal
 import numpy as np
 
 from blf_dsc_controller.arms import tuning
+from blf_dsc_controller.arms.base_parameters import BaseParameters
+from blf_dsc_controller.arms.joint_gains import JointGains, unknown_arm
+from blf_dsc_controller.arms.known_gears import Gears
 from blf_dsc_controller.arms.model import arm_model
+from blf_dsc_controller.arms.urdf import Chain
 from blf_dsc_controller.configuration import law_file, tool_bound
 from blf_dsc_controller.configuration.robot import (
     ArmConfig,
+    Robot,
     described,
     given_robot,
     parameters_of,
@@ -57,6 +62,8 @@ _in_window = partial(
 )
 _at_start = partial(parameter, read_only='it has no effect later')
 _known = partial(parameter, read_only='it is known data, not a gain')
+_FOLLOWED = 'the other gains follow from it when they are read: change those'
+_from_urdf = partial(non_negative, (), read_only=_FOLLOWED, omittable=True)
 _RISE = 0.05  # s to the largest acceleration
 # per window: fewer do not determine P, more need over 100 MB
 _SAMPLES = (10, 1_000_000)
@@ -346,11 +353,25 @@ class Surface:
 class Feedback:
     """Feedback terms of the law (28)."""
 
+    inertia: Literal['none', 'surface', 'whole'] = _at_start(
+        'surface',
+        'what of the feedback acts through the inertia matrix of '
+        'learning.initial_estimate: none of it, so that each joint has gains of its own '
+        '(default for a URDF), the rate of the surface filter (paper), or the whole',
+    )
+    joint_stiffness: PerJoint = _from_urdf(
+        'with inertia none: stiffness of each joint, from which gains follow; empty: '
+        'what arms with elastic joints bear of which nothing is known',
+        'N m/rad',
+    )
+    joint_damping: PerJoint = _from_urdf(
+        'with inertia none: damping of each joint, likewise', 'N m s/rad'
+    )
     stiffness: float = positive(
         1.0,
-        'bandwidth of the gains that follow from a URDF, relative to what the delay allows',
-        at_most=1.0,
-        read_only='the other gains follow from it when they are read: change those',
+        'factor on joint_stiffness and joint_damping; with inertia whole, the bandwidth '
+        'of the gains relative to what the delay allows, at most 1',
+        read_only=_FOLLOWED,
     )
     gain: PerJoint = non_negative(
         (60.0, 20.0), 'gain on the velocity error', 'N m s/rad', 'K_p'
@@ -723,19 +744,11 @@ class ControllerConfig(ArmConfig):
             return {'surface.time_constant': max(period, Surface().time_constant)}
         robot, chain = given_robot(given)
         base = parameters_of(robot, chain)
-        arm = tuning.Design(
-            chain,
-            base,
-            robot.efforts(chain),
-            robot.rotors(chain),
-            robot.payload,
-            robot.lag,
-        )
-        stiffness = given.get('feedback.stiffness', Feedback().stiffness)
+        arm = _design(given, robot, chain, base)
         bound = given.get('barrier.bound')
         bounds_tool = tool_bound.is_given(given)
         if bound is None and bounds_tool:
-            usual = tuning.gains_of(arm, period, stiffness, None)
+            usual = tuning.gains_of(arm, None)
             bound = tool_bound.joint_bounds({**usual, **given}, robot, chain, base)
         followed = {} if bound is None else {'barrier.bound': bound}
         if bounds_tool:  # which holds from the start on
@@ -746,9 +759,8 @@ class ControllerConfig(ArmConfig):
             **described(robot, chain),
             'learning.weighing': given.get('learning.prediction', 'filtered')
             == 'filtered',
-            **tuning.gains_of(
-                arm, period, stiffness, np.array(bound) if is_whole else None
-            ),
+            'feedback.stiffness': arm.stiffness,
+            **tuning.gains_of(arm, np.array(bound) if is_whole else None),
             **followed,
         }
 
@@ -828,14 +840,108 @@ class ControllerConfig(ArmConfig):
             )
 
     def _stiffness_problems(self) -> Iterator[str]:
-        """Check that the gains follow from the stiffness, if it is given."""
-        stiffness = self.feedback.stiffness
-        if self.model != 'urdf' and stiffness != Feedback().stiffness:
+        """Check that the gains follow from what is given of the feedback."""
+        feedback = self.feedback
+        if self.model != 'urdf' and feedback.stiffness != Feedback().stiffness:
             yield (
-                f'feedback.stiffness: got {stiffness:g} with model {self.model}, but only the '
-                'gains of model urdf follow from it: leave it at 1, and lower feedback.gain and '
-                'surface.gain'
+                f'feedback.stiffness: got {feedback.stiffness:g} with model {self.model}, but only '
+                'the gains of model urdf follow from it: leave it at 1, and lower feedback.gain '
+                'and surface.gain'
             )
+        if feedback.inertia == 'whole' and feedback.stiffness > 1.0:
+            yield (
+                f'feedback.stiffness: got {feedback.stiffness:g} with feedback.inertia whole, but '
+                'the delay of the loop allows at most 1'
+            )
+        if feedback.inertia == 'none' and feedback.damping_rate > 0.0:
+            yield (
+                f'feedback.damping_rate: got {feedback.damping_rate:g} 1/s, which acts through '
+                'the inertia matrix, with feedback.inertia none: give feedback.joint_damping'
+            )
+        given = bool(feedback.joint_stiffness), bool(feedback.joint_damping)
+        acts = feedback.inertia == 'none' and self.model == 'urdf'
+        if any(given) and self.law == LAWS[0] and not acts:
+            yield (
+                'feedback.joint_stiffness, feedback.joint_damping: gains follow from them only '
+                f'for a URDF with feedback.inertia none, but got {feedback.inertia} and model '
+                f'{self.model}'
+            )
+        elif any(given) and not all(given):
+            yield (
+                'feedback.joint_stiffness, feedback.joint_damping: one of them is given, but '
+                'they belong together: give both'
+            )
+        elif all(given) and 0.0 in (*feedback.joint_stiffness, *feedback.joint_damping):
+            yield (
+                'feedback.joint_stiffness, feedback.joint_damping: got 0 for a joint, but each '
+                'must be above 0'
+            )
+
+
+def design_of(config: ControllerConfig) -> tuple[tuning.Design, Gears | None]:
+    """Return what the gains of an arm from a URDF follow from, and its gears, if known."""
+    chain = config.robot.chain(config.joints)
+    base = parameters_of(config.robot, chain)
+    return _stated(flatten(config), config.robot, chain, base)
+
+
+def _design(
+    given: Mapping[str, Any], robot: Robot, chain: Chain, base: BaseParameters
+) -> tuning.Design:
+    """Return what the gains follow from: as given, by known gears, or of an unknown arm."""
+    arm, gears = _stated(given, robot, chain, base)
+    chosen = _given_gains(given, len(chain.joints)) is not None
+    if arm.joints is None:
+        chosen = 'feedback.stiffness' in given
+    return arm if chosen or gears is None else tuning.with_known_gears(arm, gears)
+
+
+def _stated(
+    given: Mapping[str, Any], robot: Robot, chain: Chain, base: BaseParameters
+) -> tuple[tuning.Design, Gears | None]:
+    """Return the design by what is given alone, and the gears, if known.
+
+    Other laws than the package's own have feedback through the inertia matrix.
+    """
+    motors = robot.rotors(chain)
+    gears = _gears(robot, chain, motors)
+    is_own = given.get('law', LAWS[0]) == LAWS[0]
+    usual = 'whole' if not is_own or (gears and gears.has_torque_loop) else 'none'
+    is_whole = given.get('feedback.inertia', usual) != 'none'
+    gains = _given_gains(given, len(motors)) or unknown_arm(motors)
+    arm = tuning.Design(
+        chain,
+        base,
+        robot.efforts(chain),
+        motors,
+        robot.payload,
+        robot.lag,
+        None if is_whole else gains,
+        given.get('feedback.stiffness', Feedback().stiffness),
+        given.get('sample_time', ArmConfig.sample_time),
+    )
+    return arm, gears
+
+
+def _gears(robot: Robot, chain: Chain, motors: np.ndarray) -> Gears | None:
+    """Return the gears of the arm, if their stiffness is known."""
+    stiffness = np.array(robot.joint_stiffness)
+    if stiffness.shape != motors.shape or not stiffness.all():
+        return None
+    viscous = np.array(robot.friction(chain)['viscous'])
+    return Gears(stiffness, motors, viscous, robot.torque_loop)
+
+
+def _given_gains(given: Mapping[str, Any], n: int) -> JointGains | None:
+    """Return the given gains of n joints; None: not given, or not valid (`problems`)."""
+    gains = JointGains(
+        *(
+            np.array(given.get(f'feedback.joint_{each}', ()))
+            for each in JointGains._fields
+        )
+    )
+    is_valid = all(each.shape == (n,) and (each > 0.0).all() for each in gains)
+    return gains if is_valid else None
 
 
 @functools.cache

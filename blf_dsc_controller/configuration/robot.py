@@ -91,6 +91,16 @@ class Robot:
         'otherwise a guess from the effort, which is corrected in operation',
         'kg m^2',
     )
+    joint_stiffness: PerJoint = _omitted(
+        'stiffness of each gear between motor and link, from which gains follow; empty: '
+        'unknown',
+        'N m/rad',
+    )
+    torque_loop: bool = _fixed(
+        False,
+        'the drives close a loop at joint torque sensors, which efforts show; it hides '
+        'the motors',
+    )
     drive_compensates: Literal['none', 'gravity', 'gravity_and_friction'] = _fixed(
         'none', 'what the drives add to a commanded torque by themselves'
     )

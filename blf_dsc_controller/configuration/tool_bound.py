@@ -81,13 +81,23 @@ def joint_bounds(
         rms + _REVERSAL * coulomb for rms, coulomb in zip(floor, friction, strict=True)
     )
     region = _region(values, n) or (lower, upper)
-    expected = _expected(base, P0, robot.payload, unmodelled, *region)
+    stiffness = _stiffness(values)
+    expected = _expected(base, P0, robot.payload, unmodelled, stiffness, *region)
     k = _scaled(
         _tool(chain, lower, upper),
         np.array(expected),
         (values.get(POSITION, 0.0), values.get(ANGLE, 0.0)),
     )
     return tuple(float(f'{_DOWN * each:.4g}') for each in k.tolist())
+
+
+def _stiffness(values: Mapping[str, Any]) -> tuple[float, ...]:
+    """Return the stiffness (n,) [N m/rad] of joints, each on its own; else empty."""
+    if values.get('feedback.inertia') != 'none':
+        return ()
+    names = 'barrier.weight', 'feedback.gain', 'surface.gain', 'surface.mu'
+    w, K_p, K, mu = (np.array(values[name]) for name in names)
+    return tuple((w + K_p * (K / 2.0 + mu)).tolist())
 
 
 def _region(
@@ -120,10 +130,11 @@ def _expected(
     P0: tuple[float, ...],
     payload: float,
     unmodelled: tuple[float, ...],
+    stiffness: tuple[float, ...],
     lower: tuple[float, ...],
     upper: tuple[float, ...],
 ) -> tuple[float, ...]:
-    """Return w (n,), the largest |M^-1 d| of random postures between two."""
+    """Return w (n,), the largest |M^-1 d|, or |d| over a stiffness, between two postures."""
     n = len(unmodelled)
     random = np.random.default_rng(0)
     q = random.uniform(lower, np.maximum(lower, upper), (_POSTURES, n))
@@ -135,9 +146,12 @@ def _expected(
     friction = np.broadcast_to(np.array(unmodelled)[:, np.newaxis], weight.shape)
     found = np.zeros(n)
     for P, d in ((np.array(P0), friction), (np.array(P0) + load, weight)):
-        M = inertia_matrices(base.model, P, q)
-        is_arm = np.linalg.eigvalsh(M)[:, 0] > 0.0
-        pushed = product(inverse(M[is_arm]), d[is_arm])[..., 0]
+        if stiffness:
+            pushed = d[..., 0] / np.array(stiffness)
+        else:
+            M = inertia_matrices(base.model, P, q)
+            is_arm = np.linalg.eigvalsh(M)[:, 0] > 0.0
+            pushed = product(inverse(M[is_arm]), d[is_arm])[..., 0]
         found += np.abs(pushed).max(axis=0, initial=0.0)
     even = found.max() == 0.0  # of no arm at all
     return tuple((np.ones(n) if even else found).tolist())

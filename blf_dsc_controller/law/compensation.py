@@ -11,9 +11,16 @@ as in the desired compensation law of Sadegh and Horowitz (1990):
 
 A wrong estimate is then a bounded disturbance, never a gain.  Where the inertias are roughly known,
 the damping can scale with them: - omega_v M(q, P^(0)) xi2, part of the first term, is added to
-- K_p xi2 and damps every direction at the same rate.  On an arm of a URDF the torque by the error,
-the barrier's, acts through M(q, P^(0)) as well: as the acceleration -dV/dxi1 / m of each joint, m
-being its least inertia.
+- K_p xi2 and damps every direction at the same rate.  The torque by the error, the barrier's, may
+act through M(q, P^(0)) as well: as the acceleration -dV/dxi1 / m of each joint, m being its least
+inertia.
+
+All of this multiplies the feedback by an inertia that motors behind elastic gears do not have.
+`decoupled`, the default of an arm from a URDF, has the model along the reference alone,
+
+    tau_m = H(q, dq, dqr, ddqr) P^(0) + H(qr, dqr, dqr, ddqr) (P^ - P^(0))
+
+and the feedback is that of each joint on its own.
 """
 
 from __future__ import annotations
@@ -35,24 +42,25 @@ def compute_regressors(settings: Settings, state: State, signals: Signals) -> No
     """Compute H P^(0) of the feedback, H of what is learned; if the row needs them, Yp and Yr."""
     model = settings.model
     H = signals.H
-    q = signals.q
-    dq = signals.dq
+    q, dq, v = signals.q, signals.dq, signals.model_velocity
     for i in range(settings.n):
-        signals.damped[i] = signals.dalpha2[i] - settings.damping_rate * signals.xi2[i]
+        v[i] = signals.dqr[i] if settings.decoupled == 1 else state.alpha2[i]
+        rate = signals.ddqr[i] if settings.decoupled == 1 else signals.dalpha2[i]
+        signals.damped[i] = rate - settings.damping_rate * signals.xi2[i]
         if settings.follows_inertia == 1:
             signals.damped[i] += signals.restoring[i] / settings.joint_inertia[i]
     if settings.prediction == FILTERED:
-        Yp = signals.Yp
-        Yr = signals.Yr
-        model.regressors(q, dq, state.alpha2, signals.damped, H, Yp, Yr)
+        model.regressors(q, dq, v, signals.damped, H, signals.Yp, signals.Yr)
     else:
-        model.regressor(q, dq, state.alpha2, signals.damped, H)
+        model.regressor(q, dq, v, signals.damped, H)
     for i in range(settings.n):
         signals.model_torque[i] = 0.0
         for j in range(settings.p):
             signals.model_torque[i] += H[i, j] * settings.initial_estimate[j]
     if settings.compensation == REFERENCE:
         model.regressor(signals.qr, signals.dqr, signals.dqr, signals.ddqr, H)
+    elif settings.decoupled == 1:
+        model.regressor(q, dq, signals.dqr, signals.ddqr, H)
     elif settings.damping_rate > 0.0 or settings.follows_inertia == 1:
         model.regressor(q, dq, state.alpha2, signals.dalpha2, H)
 

@@ -345,15 +345,16 @@ def joint_inertia(config: ControllerConfig, P: tuple[float, ...]) -> np.ndarray:
     chain = robot.chain(config.joints)
     limits = (config.limits.position_lower, config.limits.position_upper)
     base = parameters_of(robot, chain)
-    least, _ = over_postures(chain, base, robot.payload, P, *limits)
-    return least
+    return over_postures(chain, base, robot.payload, P, *limits).free_inertia
 
 
 def _inertias(config: ControllerConfig, n: int) -> dict[str, Any]:
     """Return m of each joint, and what `apparent_inertia` needs to measure assumed rotors."""
     is_urdf = config.model == 'urdf'
+    follows_inertia = is_urdf and config.feedback.inertia == 'whole'
     settings = {
-        'follows_inertia': int(is_urdf),
+        'follows_inertia': int(follows_inertia),
+        'decoupled': int(config.feedback.inertia == 'none'),
         'rotors_unsure': 0,
         'lag': config.robot.lag if is_urdf else 0.0,
         'unsure_rotor': np.zeros(n),
@@ -366,7 +367,7 @@ def _inertias(config: ControllerConfig, n: int) -> dict[str, Any]:
     chain = robot.chain(config.joints)
     P0 = config.learning.initial_estimate
     settings['joint_inertia'] = joint_inertia(config, P0)
-    if robot.rotor_inertia:
+    if robot.rotor_inertia or not follows_inertia:
         return settings
     links = parameters_of(robot, chain).of(chain.inertias, np.zeros(n))
     return settings | {
@@ -469,8 +470,8 @@ def least_inertias(config: ControllerConfig) -> np.ndarray:
     if config.model == 'urdf':
         chain = config.robot.chain(config.joints)
         base = parameters_of(config.robot, chain)
-        inertias = over_postures(chain, base, config.robot.payload, P0, lower, upper)[0]
-        return np.asarray(inertias)
+        payload = config.robot.payload
+        return over_postures(chain, base, payload, P0, lower, upper).free_inertia
     rng = np.random.default_rng(0)
     postures = rng.uniform(lower, upper, (_POSTURES, len(lower)))
     inertias = inertia_matrices(model_of(config), np.array(P0), postures)

@@ -45,6 +45,7 @@ class Settings(NamedTuple):
     compensation: int
     # 1: barrier and d^3 act through M(q, P^(0)) / m
     follows_inertia: int
+    decoupled: int  # 1: no feedback acts through M(q, P^(0))
     known_rate: int  # 1: the surface filter follows the known rate of beta2
     rotors_unsure: int  # 1: errors of the assumed rotor inertias are measured
     memory: int  # numbers in the memory of a law of a file
@@ -255,9 +256,11 @@ class Signals(NamedTuple):
     beta2_rate: Annotated[Array, 'n']
     xi2: Annotated[Array, 'n']  # rad/s
     restoring: Annotated[Array, 'n']  # torque by the error: -dV/dxi1 or -w z1, N m
-    # alpha2' - omega_v xi2; of a URDF with the restoring torque over m, rad/s^2
+    model_velocity: Annotated[Array, 'n']  # v of the model: alpha2, or dqr, rad/s
+    # a of the model: alpha2' - omega_v xi2, with the restoring torque over m where the
+    # feedback follows the inertia; ddqr where none of it does, rad/s^2
     damped: Annotated[Array, 'n']
-    model_torque: Annotated[Array, 'n']  # H(q, dq, alpha2, damped) P^(0), N m
+    model_torque: Annotated[Array, 'n']  # H(q, dq, v, damped) P^(0), N m
     feedforward: Annotated[Array, 'n']  # known disturbance, fed forward, N m
     acceleration: Annotated[Array, 'n']  # estimated ddq, rad/s^2
     added: Annotated[Array, 'n']  # torque that the drive adds to the command, N m

@@ -20,6 +20,7 @@ from blf_dsc_controller.configuration.tool_bound import ANGLE, POSITION
 from blf_dsc_controller.law.factory import settings_of_config
 from blf_dsc_controller.law.state import NEWTON, Settings
 from blf_dsc_controller.supervision.expected_errors import expected_errors
+from blf_dsc_controller.supervision.gear_warnings import gear_warnings
 from blf_dsc_controller.supervision.reference_load import ReferenceLoad, reference_load
 from blf_dsc_controller.supervision.retuning import settings_in_loop
 
@@ -84,6 +85,7 @@ def config_warnings(
         found += _of_urdf(config, load)
     found += [f'{each.subject} {each.text}' for each in _of_gains(config, load)]
     if config.model == 'urdf' and config.law == 'blf_dsc':
+        found += gear_warnings(config, settings)
         found += _of_errors(config, settings)
     if config.model != 'urdf' and config.law == 'blf_dsc':
         found += _of_first_error(config, settings, load)
@@ -168,7 +170,9 @@ def _of_errors(config: ControllerConfig, settings: Settings) -> Iterator[str]:
         faster = loop_delay(T, robot.lag) * math.sqrt(share) - robot.lag
         remedy = f'a robot.lag below {robot.lag:g} s'
         stiffer = config.feedback.stiffness / share**_STIFFENING
-        if stiffer <= 1.0:
+        if config.feedback.inertia == 'none':
+            remedy = 'a larger feedback.stiffness, if the arm bears it'
+        elif stiffer <= 1.0:
             remedy = f'a feedback.stiffness of {math.ceil(100.0 * stiffer) / 100.0:g}'
         elif faster > 0.0:
             remedy = f'a sample time of {faster / SAMPLES:.2g} s'

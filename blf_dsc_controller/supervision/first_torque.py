@@ -95,7 +95,8 @@ def _check_gravity(
     holds = is_like(effort, gravity)
     is_commanded = config.robot.effort == 'commanded'
     if compensates == 'none':
-        if not holds or is_commanded:
+        # A joint torque sensor shows the weight of the arm, whatever holds it.
+        if not holds or is_commanded or config.robot.torque_loop:
             return
         raise StartError(
             f'gravity twice: the first torque would be {torque[worst]:.4g} N m on joint {joint!r}, '

@@ -1,0 +1,130 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Design rules for joints whose gears give way: each has a stiffness and a damping of its own.
+
+A geared joint is a motor behind a spring.  Beyond the resonance of both, a torque moves
+the motor alone, so feedback through the inertia matrix of the links is too high there by
+their ratio, up to fifteen times, and the loop oscillates.  Gains of the joints, each on
+its own, have no such factor; makers of arms publish theirs in this form.  From the
+stiffness k and the damping d of a joint follow the gains of the law (28),
+
+    r = k / (1.8 d),    K = 0.4 r,  mu = 1.3 r,  K_p = d,  w = 0.3 r d,  gamma = c r d
+
+so that near the reference the torque is - d xi1' - (1.8 + c) r d xi1 - 1.5 c r^2 d int xi1.
+The integral's share c is at most 0.15, and less where the damping is small for the
+inertia J of the outstretched, loaded arm: d (1.8 r d) > J 1.5 c r^2 d keeps the slow
+oscillation damped, here by a factor of three.  What the tracking error adapts is an
+integral as well, so its gain is bounded by the same share.
+
+Of an arm about which nothing but its URDF is known, the gears may have any stiffness,
+the encoders may be on either side of them, and drives may have a torque loop that hides
+the motor.  Damping of 2.1 (10 1/s) times the motor's inertia then holds it, softly.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from blf_dsc_controller.arms.linear_loop import Feedback
+
+Floats = NDArray[np.float64]
+
+_POSITION = 1.8  # k / (r d), without the integral
+_BARRIER = 0.3  # w / (r d)
+_STEEPEST = 0.9  # likewise, of the barrier's slope near the bound
+_FILTERED = 0.4, 1.3  # K / r and mu / r
+_RATE = _FILTERED[0] / 2.0 + _FILTERED[1]  # of xi1 in xi2, over r
+_INTEGRAL = 0.15  # c
+_DAMPED = 0.4  # of d (1.8 r d) / (J 1.5 r^2 d), for c
+_FUNNEL = 0.1  # times r: the integral is as fast
+
+_HELD = 21.0  # 1/s, d / B of an unknown arm
+_HELD_RATE = 4.0  # 1/s, r likewise
+_DAMPING_RATIO = 0.4
+
+SURFACE = 0.004
+"""Least time constant of the surface filter [s]: noise of alpha2'."""
+
+
+class JointGains(NamedTuple):
+    """Stiffness (n,) [N m/rad] and damping (n,) [N m s/rad] of each joint's feedback."""
+
+    stiffness: Floats
+    damping: Floats
+
+    @property
+    def rate(self) -> Floats:
+        """The rate r (n,) [1/s] at which an error decays."""
+        return self.stiffness / (_POSITION * self.damping)
+
+    def integral(self, inertia: Floats) -> Floats:
+        """Return gamma (n,) [N m/rad] for the largest inertia of each joint (n,) [kg m^2]."""
+        share = _DAMPED * self.damping / (self.rate * inertia)
+        return self.rate * self.damping * np.minimum(share, _INTEGRAL)
+
+    def scaled(self, factor: float | Floats) -> JointGains:
+        """Return stiffness and damping times a factor."""
+        return JointGains(factor * self.stiffness, factor * self.damping)
+
+
+def unknown_arm(motors: Floats) -> JointGains:
+    """Return gains that hold an arm of which only motors (n,) [kg m^2] are guessed."""
+    damping = _HELD * motors
+    return JointGains(_POSITION * _HELD_RATE * damping, damping)
+
+
+def damped_arm(damping: Floats, inertia: Floats) -> JointGains:
+    """Return gains with the damping (n,) that leave the outstretched, loaded arm damped.
+
+    `inertia` (n,) [kg m^2] is the largest of each joint; friction, which damps as well,
+    is not counted.
+    """
+    return JointGains(damping**2 / (4.0 * _DAMPING_RATIO**2 * inertia), damping)
+
+
+def linear(gains: JointGains, inertia: Floats, postures: int) -> Feedback:
+    """Return the law with these gains at small errors, in as many postures."""
+    one = np.broadcast_to(np.eye(len(inertia)), (postures, len(inertia), len(inertia)))
+    rate, damping = gains.rate, gains.damping
+    return Feedback(
+        position=one * (_BARRIER * rate * damping),
+        surface=one * damping,
+        inertia=0.0 * one,
+        integral=one * gains.integral(inertia),
+        rate=_RATE * rate,
+        time_constant=SURFACE,
+        known_rate=True,
+    )
+
+
+def law_gains(gains: JointGains, inertia: Floats) -> dict[str, Floats]:
+    """Return the gains (n,) of the law, by the dotted name of their parameter.
+
+    `inertia` (n,) [kg m^2] is the largest of each joint.
+    """
+    rate, damping = gains.rate, gains.damping
+    barrier_gain, linear_gain = _FILTERED
+    return {
+        'surface.gain': barrier_gain * rate,
+        'surface.mu': linear_gain * rate,
+        'feedback.gain': damping,
+        'barrier.weight': _BARRIER * rate * damping,
+        'barrier.slope_limit': _STEEPEST * rate * damping,
+        'disturbance.gain': gains.integral(inertia),
+    }
+
+
+def adaptation_gain(gains: JointGains, inertia: Floats, deviation: Floats) -> float:
+    """Return the largest Gamma with which the tracking error adapts no faster than d^3.
+
+    `deviation` (n,) [N m] is the standard deviation of the modelled torque: adaptation
+    integrates Gamma deviation^2 xi2 where d^3 integrates gamma xi2.
+    """
+    return float((gains.integral(inertia) / deviation**2).min())
+
+
+def funnel_rate(gains: JointGains) -> float:
+    """Return the rate [1/s] at which a bound may narrow: that of the slowest integral."""
+    return float(_FUNNEL * gains.rate.min())

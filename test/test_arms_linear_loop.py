@@ -1,0 +1,206 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The linear loop of elastic joints, the gains that follow, and what they hold."""
+
+from __future__ import annotations
+
+from itertools import product
+
+import numpy as np
+import pytest
+
+from blf_dsc_controller.arms.joint_gains import (
+    JointGains,
+    damped_arm,
+    law_gains,
+    linear,
+    unknown_arm,
+)
+from blf_dsc_controller.arms.known_gears import MARGIN, GearedArm, Gears
+from blf_dsc_controller.arms.linear_loop import (
+    Feedback,
+    Joints,
+    Loop,
+    Timing,
+    TorqueLoop,
+    arm_response,
+    law_response,
+)
+from blf_dsc_controller.arms.model import inertia_matrices
+from blf_dsc_controller.configuration.controller import ControllerConfig
+from blf_dsc_controller.configuration.nodes import load, locate
+from blf_dsc_controller.configuration.robot import parameters_of
+from blf_dsc_controller.law.factory import controller_of
+
+ONE = np.ones((1, 1, 1))  # one joint with a link of 1 kg m^2, in one posture
+TIMING = Timing(0.001, delay=1, drive_lag=0.001, velocity_lag=0.0025)
+
+
+def links_of(preset, payload=0.0):
+    """Links in four postures, and the guess of the motors and the viscous friction."""
+    config = load(locate(preset), 'blf_dsc_controller', ControllerConfig, {})
+    chain = config.robot.chain(config.joints)
+    base = parameters_of(config.robot, chain)
+    n = len(config.joints)
+    P = base.of(chain.inertias, np.zeros(n)) + payload * base.load
+    limits = config.limits.position_lower, config.limits.position_upper
+    q = np.random.default_rng(1).uniform(*limits, (4, n))
+    friction = np.array(config.robot.friction(chain)['viscous'])
+    return inertia_matrices(base.model, P, q), config.robot.rotors(chain), friction
+
+
+def joints(stiffness=1e4, motors=0.2, **given):
+    """One joint; its spring keeps 3 % of damping."""
+    K = None if stiffness is None else np.array([stiffness])
+    return Joints(np.array([motors]), np.array([0.5]), K, **given)
+
+
+def by_velocity(damping):
+    """A law that feeds back the velocity of one joint, and little else."""
+    zero, little = 0.0 * ONE, 0.1 * ONE
+    return Feedback(
+        ONE, damping * ONE, zero, little, np.ones(1), 0.004, known_rate=True
+    )
+
+
+LAW = linear(JointGains(np.array([60.0]), np.array([10.0])), np.array([1.2]), 1)
+
+
+@pytest.mark.parametrize(
+    'arm',
+    [
+        joints(None),
+        joints(),
+        joints(motor_side=True),
+        joints(torque_loop=TorqueLoop()),
+        joints(torque_loop=TorqueLoop(), motor_side=True),
+    ],
+)
+def test_the_sampled_loop_and_its_frequency_response_agree(arm):
+    """Eigenvalues of the loop are zeros of 1 + G C.
+
+    Below 40 Hz, where images of the sampling add less than 1e-3.
+    """
+    A, _ = Loop(ONE, arm, TIMING, LAW).transition()
+    z = np.linalg.eigvals(A[0])
+    z = z[np.abs(z) > 0.5]
+    s = np.log(z) / TIMING.period
+    s = s[np.abs(s) < 2.0 * np.pi * 40.0]
+    assert s.size >= 4
+    G = arm_response(ONE, arm, TIMING, s)
+    C = law_response(LAW, TIMING, s)
+    np.testing.assert_allclose((G @ C)[0, :, 0, 0], -1.0, rtol=1e-3)
+
+
+def test_margin_is_the_distance_to_instability():
+    """A damping d on a rigid joint of 1.2 kg m^2 is unstable from where its margin is zero."""
+    arm = joints(None)
+
+    def loop(damping):
+        return Loop(ONE, arm, TIMING, by_velocity(damping))
+
+    margins = [loop(d).margin().value for d in (20.0, 100.0, 200.0, 2000.0)]
+    assert margins == sorted(margins, reverse=True)
+    assert margins[0] > 0.8
+    assert margins[-1] == 0.0
+    assert loop(200.0).is_stable()
+    assert not loop(2000.0).is_stable()
+
+
+def test_an_encoder_beyond_the_spring_costs_phase_that_one_at_the_motor_does_not():
+    """At 20 Hz and above the link's antiresonance; d is 0.1 of what the motor bears."""
+    law = by_velocity(20.0)
+    at_link = Loop(ONE, joints(3e3), TIMING, law).margin()
+    at_motor = Loop(ONE, joints(3e3, motor_side=True), TIMING, law).margin()
+    assert at_link.value == 0.0
+    assert at_motor.value > 0.3
+
+
+def test_a_torque_loop_hides_the_motor():
+    """Far below its bandwidth the arm responds as a link with a motor of B / (1 + k_T)."""
+    loop = TorqueLoop(gain=4.0, damping=0.0, lag=0.0003)
+    arm = joints(1e6, torque_loop=loop)._replace(viscous=np.zeros(1))
+    s = np.array([2j * np.pi * 5.0])
+    hidden = joints(None, motors=0.2 / 5.0)._replace(viscous=np.zeros(1))
+    found, expected = (arm_response(ONE, each, TIMING, s) for each in (arm, hidden))
+    np.testing.assert_allclose(found, expected, rtol=0.01)
+
+
+# What is plausible where nothing but a URDF is known.
+SPRINGS = (5e3, 3e4, 1e6)  # N m/rad
+SIDES = (False, True)
+LOOPS = (None, TorqueLoop())
+MOTORS = (0.5, 7.0)  # times the guess
+
+
+@pytest.mark.parametrize(('preset', 'payload'), [('panda', 2.0), ('ur5e', 3.0)])
+def test_gains_of_an_unknown_arm_hold_whatever_its_gears_are(preset, payload):
+    """Springs, sides, torque loops and motors of half to seven times the guess."""
+    free, guess, viscous = links_of(preset)
+    links = np.concatenate((free, links_of(preset, payload)[0][:2]))
+    inertia = np.diagonal(links, axis1=1, axis2=2).max(axis=0) + guess
+    law = linear(unknown_arm(guess), inertia, len(links))
+    for stiffness, side, loop, factor in product(SPRINGS, SIDES, LOOPS, MOTORS):
+        arm = Joints(
+            factor * guess,
+            viscous,
+            np.full(len(guess), stiffness),
+            torque_loop=loop,
+            motor_side=side,
+        )
+        loop_ = Loop(links, arm, Timing(0.002, 1, 0.002, 0.0025), law)
+        assert loop_.is_stable(), (stiffness, side, loop, factor)
+
+
+def test_gains_of_known_gears_have_the_margin_and_no_more():
+    """Of a UR5e with springs of 3e4 N m/rad; 1.5 times as stiff, the margin is gone."""
+    links, guess, viscous = links_of('ur5e')
+    gears = Gears(np.full(6, 3e4), 5.0 * guess, viscous, has_torque_loop=False)
+    arm = GearedArm(links, gears, TIMING)
+    gains = arm.joint_gains()
+    assert arm.margin(linear(gains, arm.inertia, 4)).value >= MARGIN
+    stiffer = damped_arm(1.5 * gains.damping, arm.inertia)
+    assert arm.margin(linear(stiffer, arm.inertia, 4)).value < MARGIN
+
+
+def test_gains_of_the_law_add_up_to_stiffness_and_damping():
+    """Of a static error: w + K_p (K / 2 + mu) is the stiffness; of a velocity, K_p the damping."""
+    gains = JointGains(np.array([600.0, 50.0]), np.array([30.0, 5.0]))
+    law = law_gains(gains, np.array([1.0, 0.1]))
+    rate = law['surface.gain'] / 2.0 + law['surface.mu']
+    found = law['barrier.weight'] + law['feedback.gain'] * rate
+    np.testing.assert_allclose(found, gains.stiffness)
+    np.testing.assert_allclose(law['feedback.gain'], gains.damping)
+
+
+def test_the_integral_is_smaller_where_a_heavy_arm_is_hardly_damped():
+    gains = JointGains(np.array([600.0]), np.array([30.0]))
+    light, heavy = (gains.integral(np.array([J])) for J in (0.5, 20.0))
+    assert light == pytest.approx(0.15 * gains.rate * gains.damping)
+    # stable without friction: d (1.8 r d) > J 1.5 c r^2 d, three times over
+    slow = 1.5 * gains.rate * heavy
+    assert 20.0 * slow * 3.0 == pytest.approx(gains.damping * 1.8 * gains.rate * 30.0)
+
+
+def test_a_law_of_joints_does_not_multiply_its_feedback_by_inertias():
+    """The torque changes with an error by the joint's own gains, at any posture."""
+    preset = {
+        'feedback.inertia': 'none',
+        'feedback.joint_stiffness': [600.0] * 6,
+        'feedback.joint_damping': [30.0] * 6,
+        'surface.time_constant': 0.001,
+        'surface.known_rate': False,
+        'disturbance.gain': [0.0] * 6,
+        'barrier.bound': [0.5] * 6,
+    }
+    config = load(locate('ur5e'), 'blf_dsc_controller', ControllerConfig, preset)
+    law = controller_of(config)
+    qr, dqr, _ = law.reference_at(0.0)
+    base = np.concatenate((qr, dqr, np.zeros(6)))
+    for i in range(6):
+        off, rest = base.copy(), base.copy()
+        off[6 + i] += 1e-4  # rad/s, of joint i alone
+        change = law.trial(0.0, 0.001, off) - law.trial(0.0, 0.001, rest)
+        expected = np.zeros(6)
+        expected[i] = -30.0 * 1e-4
+        # H(q, dq, dqr, ddqr) P^(0) has the Coriolis torques of dq
+        np.testing.assert_allclose(change, expected, atol=1e-4)

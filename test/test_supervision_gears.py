@@ -1,0 +1,152 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Gains of elastic joints: how they are given, what is refused, and what is warned of."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from blf_dsc_controller import load_loop, simulate
+from blf_dsc_controller.configuration.controller import ControllerConfig
+from blf_dsc_controller.configuration.schema import build
+from blf_dsc_controller.errors import ConfigurationError
+from blf_dsc_controller.law.factory import settings_of_config
+from blf_dsc_controller.supervision.config_warnings import config_warnings
+
+UR5E = {'robot.urdf': 'ur5e.urdf', 'robot.tip': 'tool0'}
+GAINS = {
+    'feedback.joint_stiffness': [900.0] * 3 + [240.0] * 3,
+    'feedback.joint_damping': [60.0] * 3 + [16.0] * 3,
+}
+GEARS = {
+    'robot.joint_stiffness': [3e4] * 6,
+    'robot.rotor_inertia': [1.9] * 3 + [0.35] * 3,
+}
+
+
+def built(**changes):
+    return build(ControllerConfig, UR5E | changes)
+
+
+def test_an_arm_of_which_nothing_is_known_is_held_softly_and_says_so():
+    config = built()
+    assert config.feedback.inertia == 'none'
+    # 21 1/s times the guess of the motors, effort / 400 rad/s^2 of 150 and 28 N m
+    np.testing.assert_allclose(config.feedback.gain, [7.875] * 3 + [1.47] * 3)
+    (warning,) = (text for text in config_warnings(config) if 'softly' in text)
+    assert warning.startswith('feedback.joint_stiffness: nothing is known of the gears')
+
+
+def test_given_gains_of_joints_are_used_and_scaled():
+    config = built(**GAINS)
+    assert config.feedback.gain == (60.0,) * 3 + (16.0,) * 3
+    assert not [text for text in config_warnings(config) if 'softly' in text]
+    half = built(**GAINS, **{'feedback.stiffness': 0.5})
+    assert half.feedback.gain == (30.0,) * 3 + (8.0,) * 3
+    assert half.surface == config.surface  # stiffness and damping, not their ratio
+    weights = np.array((config.barrier.weight, half.barrier.weight))
+    np.testing.assert_allclose(weights[1], 0.5 * weights[0], rtol=1e-3)
+
+
+@pytest.mark.parametrize(
+    ('changes', 'problem'),
+    [
+        ({'feedback.joint_damping': [60.0] * 6}, 'one of them is given'),
+        (
+            GAINS | {'feedback.inertia': 'whole'},
+            'only for a URDF with feedback.inertia none, but got whole',
+        ),
+        (
+            {'feedback.inertia': 'whole', 'feedback.stiffness': 2.0},
+            'feedback.stiffness: got 2 with feedback.inertia whole',
+        ),
+        (
+            GAINS | {'feedback.damping_rate': 10.0},
+            'feedback.damping_rate: got 10 1/s, which acts through the inertia matrix',
+        ),
+        (
+            GAINS | {'feedback.joint_damping': [60.0] * 5 + [0.0]},
+            'got 0 for a joint, but each must be above 0',
+        ),
+    ],
+)
+def test_gains_that_contradict_each_other_are_refused(changes, problem):
+    with pytest.raises(ConfigurationError, match=problem.replace('(', r'\(')):
+        built(**changes)
+
+
+def test_known_gears_choose_the_gains_and_bear_them():
+    unknown, known = built(), built(**GEARS)
+    assert known.feedback.gain[0] > 2.0 * unknown.feedback.gain[0]
+    assert not [text for text in config_warnings(known) if 'joint_stiffness' in text]
+
+
+def test_a_torque_loop_allows_feedback_through_the_inertia():
+    config = built(**GEARS, **{'robot.torque_loop': True})
+    assert config.feedback.inertia == 'whole'
+    assert 0.05 < config.feedback.stiffness < 1.0
+
+
+def test_gains_that_known_gears_do_not_bear_are_warned_of_with_the_frequency():
+    config = built(**GEARS, **GAINS, **{'feedback.stiffness': 4.0})
+    (warning,) = (text for text in config_warnings(config) if 'modulus margin' in text)
+    assert warning.startswith('feedback.stiffness: with robot.joint_stiffness the loop')
+    assert ' Hz, ' in warning
+
+
+def test_older_laws_keep_their_feedback_through_the_inertia():
+    assert built(law='slotine_li').feedback.inertia == 'whole'
+    assert build(ControllerConfig, {}).feedback.inertia == 'surface'
+
+
+def test_adaptation_integrates_no_faster_than_the_disturbance_estimate():
+    """Gamma times the variance of the gravity torque is at most gamma of each joint."""
+    config = built(**GAINS)
+    settings = settings_of_config(config)
+    L = np.linalg.cholesky(np.linalg.inv(settings.information)[:40, :40])
+    H = np.zeros((6, settings.p))
+    q = np.zeros(6)
+    settings.model.regressor(q, q, q, q, H)
+    variance = ((H @ L[: settings.p, : settings.p]) ** 2).sum(axis=1)
+    Gamma = settings.Gamma[0]
+    assert (Gamma * variance <= 1.01 * settings.gamma).all()
+
+
+@pytest.mark.parametrize(
+    ('preset', 'changes', 'moving', 'picked'),
+    [
+        ('fr3_direct', {}, 1.0, 25.0),
+        ('fr3_direct', {'joint.stiffness': [1e4] * 7}, 1.0, 25.0),
+        ('ur5e', {}, 5.0, 15.0),
+        ('ur5e', {'sensor.side': 'motor', 'joint.stiffness': [1e4] * 6}, 5.0, 15.0),
+    ],
+)
+def test_gains_of_the_presets_hold_on_elastic_joints(preset, changes, moving, picked):
+    """With encoders on either side; 2 kg are picked up in motion [mrad].
+
+    Without the integral, 2 kg at 0.7 m on 600 N m/rad are 23 mrad; friction of 6 N m on
+    900 N m/rad is 7 mrad.
+    """
+    events = {
+        'events.begin': [8.0],
+        'events.duration': [0.0],
+        'events.payload': [2.0],
+    }
+    loop = load_loop(preset, {'sim_plant': {'duration': 13.0, **events, **changes}})
+    run = simulate(loop.controller, loop.plant).run()
+    assert not run.stops
+    error = 1e3 * np.abs(np.asarray(run.error)).max(axis=1)
+    assert error[(run.time > 5.0) & (run.time < 8.0)].max() < moving
+    assert error.max() < picked
+    assert error[run.time > 11.0].max() < 1.5 * moving
+
+
+def test_gains_of_rigid_gears_stop_an_elastic_arm():
+    given = {'duration': 2.0, 'joint.stiffness': [1e4] * 7}
+    rigid = {
+        'feedback.inertia': 'whole',
+        'feedback.joint_stiffness': None,
+        'feedback.joint_damping': None,
+    }
+    loop = load_loop('fr3_direct', {'sim_plant': given, 'blf_dsc_controller': rigid})
+    assert simulate(loop.controller, loop.plant).run().stops
