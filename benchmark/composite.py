@@ -114,7 +114,7 @@ def of_equal_stiffness(
             'barrier.bound': [0.002 / part**2] * len(published.joints),
             'barrier.initial_bound': [0.0] * len(published.joints),
         }
-        return load_loop('panda', {CONTROLLER: given}).controller
+        return load_loop('panda_rigid', {CONTROLLER: given}).controller
 
     config = at(1.0)
     full = linear_gains(config)[0] * inertia_of_joints(config)

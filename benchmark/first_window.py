@@ -36,7 +36,7 @@ from blf_dsc_controller.run import Floats
 from blf_dsc_controller.simulation.loop import Record, simulate
 from sim_plant.plant import plant_of
 
-ARMS = {'Panda': 'panda', 'UR5e': 'ur5e'}
+ARMS = {'Panda': 'panda_rigid', 'UR5e': 'ur5e_rigid'}
 DURATION = 30.0  # s
 
 PERIODS = (3.0, 5.0, 6.0)  # s, of a cycle

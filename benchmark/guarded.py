@@ -46,7 +46,7 @@ class Contestant:
         }
         states = (_ROUNDS + 1) * _STATES
         plant = {'duration': _FULL + 1e-3 * states, **quiet}
-        loop = load_loop('panda', {PLANT: plant, CONTROLLER: given})
+        loop = load_loop('panda_rigid', {PLANT: plant, CONTROLLER: given})
         record = simulate(loop.controller, loop.plant)
         stamps = (START + record.stamps).tolist()
         self._states = zip(stamps, record.measurements, strict=True)

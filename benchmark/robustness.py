@@ -30,7 +30,7 @@ from blf_dsc_controller.simulation.loop import simulate
 from blf_dsc_controller.studies.laws import LAWS, law_changes, roughness
 from blf_dsc_controller.studies.runs import cores
 
-PRESETS = ('panda', 'ur5e')
+PRESETS = ('panda_rigid', 'ur5e_rigid')
 SECONDS = 6.0
 SLOWER = 0.01  # s, a surface filter with which the torque is as smooth as the rivals'
 _STARTED = 0.01  # s, from when on roughness counts

@@ -87,3 +87,26 @@ def run(a_plant, torques):
         row[:] = a_plant.measure()
         a_plant.step(torque)
     return rows
+
+
+def rigid_gears(n, bound, rotor_factor=1.2):
+    """Return overrides that make a preset of n joints what it is with rigid gears.
+
+    The feedback acts through the inertia, with a bound [rad] of what this can hold.
+    """
+    shared = {'robot.torque_loop': False}
+    plant = {
+        'joint.stiffness': [],
+        'truth.rotor_inertia': [],
+        'truth.rotor_factor': rotor_factor,
+        'actuator.loop_gain': 0.0,
+        'actuator.loop_damping': 0.0,
+        'actuator.loop_lag': 0.0,
+    }
+    law = {
+        'feedback.inertia': 'whole',
+        'feedback.joint_stiffness': None,
+        'feedback.joint_damping': None,
+        'barrier.bound': [bound] * n,
+    }
+    return {'sim_plant': shared | plant, 'blf_dsc_controller': shared | law}

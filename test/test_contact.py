@@ -51,7 +51,7 @@ def pushed(force, begin=TOUCHED, end=RELEASED):
 
 def loop_of(events, **controller):
     plant = {'truth.mass_deviation': 0.3, 'sensor.incomplete_states': 0, **events}
-    return configured('panda', END, ON | controller, plant)
+    return configured('panda_rigid', END, ON | controller, plant)
 
 
 def run_of(events, **controller):

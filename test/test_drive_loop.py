@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from plant_driver import PlantDriver
+from plants import rigid_gears
 from recorded_run import limited_files
 
 import blf_dsc_controller as blf
@@ -159,13 +160,19 @@ def test_torques_are_sent_before_weighing_and_recording(tmp_path):
 # s; the load is known about a second later
 PICKED_UP, PUSHED = 6.0, 9.2
 TOLD = {'learning.tell_drive': True}
-ALL = TOLD | {
-    'barrier.bound': None,
-    'barrier.tool_bound': 0.02,
-    'barrier.tool_angle_bound': 0.1,
-    'contact.enabled': True,
-    'contact.reaction': 'hold',
-}
+RIGID = rigid_gears(7, 0.01)
+ALL = (
+    TOLD
+    | {
+        'barrier.bound': None,
+        'barrier.tool_bound': 0.02,
+        'barrier.tool_angle_bound': 0.1,
+        'contact.enabled': True,
+        'contact.reaction': 'hold',
+    }
+    | RIGID['blf_dsc_controller']
+    | {'barrier.bound': None}
+)
 
 
 class LoadedDriver(PlantDriver):
@@ -182,7 +189,7 @@ class LoadedDriver(PlantDriver):
             'events.payload': [2.0, 0.0],
             'events.force': [0.0, 0.0, 0.0, 0.0, 20.0, 0.0],
         }
-        loop = blf.load_loop('fr3_direct')
+        loop = blf.load_loop('fr3_direct', RIGID)
         self.what, self.at = '', -1
         self.config = change(loop.plant, changes)
         self.plant = plant_of(self.config)
@@ -453,6 +460,7 @@ def test_the_command_says_how_far_the_tool_was_off(tmp_path, capsys):
     (tmp_path / 'my.yaml').write_text(
         f'/**:\n  ros__parameters:\n    driver: {driver}\n'
         f'    robot: {{urdf: {urdf}, tip: link2}}\n    barrier.tool_bound: 0.02\n'
+        '    feedback.inertia: whole\n'
         '    torque.limit: [20.0, 20.0]\n',
         encoding='utf-8',
     )

@@ -197,7 +197,8 @@ def test_lost_commands_neither_stop_the_drives_nor_cost_the_bound(robot, lost):
         ratio = max(ratio, np.max(np.abs(sample.xi1) / sample.bound))
     assert guard.supervisor.phase == 'tracking'
     assert not plant.is_stopped
-    assert ratio < 0.5
+    # of bounds of 40 and 30 mrad: 2 kg on an outstretched arm take half of either
+    assert ratio < 0.6
 
 
 @pytest.mark.usefixtures('blank_pictures')

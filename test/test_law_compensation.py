@@ -39,10 +39,10 @@ def event(begin, payload, duration=0.0, ramp=0.0):
 SINE = {'disturbance.amplitude': [0.0] * 6 + [1.2], 'disturbance.frequency': [TONE] * 7}
 COSINES = {'disturbance.amplitude': [1.5, 1.5], 'disturbance.phase': [-np.pi / 2.0] * 2}
 ROWS = {
-    'panda, 2 kg': ('panda', 9.0, event(2.0, 2.0)),
-    'panda, 0.76 kg in 0.5 s': ('panda', 9.0, event(3.4, 0.76, ramp=0.5)),
-    'ur5e, 1.26 kg put down again': ('ur5e', 12.0, event(4.14, 1.26, 3.92)),
-    'panda, sine on joint7': ('panda', 12.0, SINE),
+    'panda, 2 kg': ('panda_rigid', 9.0, event(2.0, 2.0)),
+    'panda, 0.76 kg in 0.5 s': ('panda_rigid', 9.0, event(3.4, 0.76, ramp=0.5)),
+    'ur5e, 1.26 kg put down again': ('ur5e_rigid', 12.0, event(4.14, 1.26, 3.92)),
+    'panda, sine on joint7': ('panda_rigid', 12.0, SINE),
     'noisy, cosines': ('noisy', 20.0, COSINES),
 }
 MIXTURES = ('panda, 0.76 kg in 0.5 s', 'ur5e, 1.26 kg put down again')
@@ -196,7 +196,7 @@ def test_sine_at_a_frequency_of_the_reference_is_not_learned_as_friction():
     arm = {f'disturbance.{name}': [a] * 3 + [b] * 3 for name, (a, b) in wrist.items()}
     arm |= {'events.begin': [100.0], 'disturbance.stribeck': 0.0}
     config = configured(
-        'ur5e', 30.0, {}, arm | {'disturbance.frequency': [3.0 * TONE] * 6}
+        'ur5e_rigid', 30.0, {}, arm | {'disturbance.frequency': [3.0 * TONE] * 6}
     )
     record = simulate(config.controller, config.plant)
     assert not record.run().stops
@@ -225,7 +225,7 @@ FALLS = [(4, 13.0), (4, 12.4), (5, 12.4), (0, 12.4)]
 @pytest.mark.parametrize(('joint', 'time'), FALLS)
 def test_friction_that_falls_costs_no_more_than_not_having_learned_it(joint, time):
     """Of 1.9 times the assumed Coulomb friction a tenth remains: once, learning left the bound."""
-    known = np.array(configured('ur5e', 1.0).plant.disturbance.coulomb)
+    known = np.array(configured('ur5e_rigid', 1.0).plant.disturbance.coulomb)
     high = known.copy()
     high[joint] *= 1.9
     fall = np.zeros(6)
@@ -235,7 +235,7 @@ def test_friction_that_falls_costs_no_more_than_not_having_learned_it(joint, tim
     plant |= {'events.payload': [], 'disturbance.coulomb': high.tolist()}
     largest = []
     for learning in ({}, {'learning.weight': 0.0}):
-        loop = configured('ur5e', 18.0, learning, plant)
+        loop = configured('ur5e_rigid', 18.0, learning, plant)
         record = simulate(loop.controller, loop.plant)
         assert not record.run().stops
         errors = np.abs(record.true_errors()[round(1e3 * time) :])
@@ -310,7 +310,7 @@ def test_the_last_two_reversals_overrule_older_ones(other, reversals, most):
 @pytest.mark.parametrize('seed', range(20))
 def test_compensation_lies_between_what_is_assumed_and_whatever_may_be_true(seed):
     """So none of it can cost more than not knowing it, up to the dead band."""
-    law = controller_of(configured('ur5e', 1.0).controller)
+    law = controller_of(configured('ur5e_rigid', 1.0).controller)
     settings, state, signals = law.settings, law.state, law.signals
     random = np.random.default_rng(seed)
     first = friction.first_coulomb(settings)
@@ -337,7 +337,7 @@ def test_compensation_lies_between_what_is_assumed_and_whatever_may_be_true(seed
 
 
 def test_evidence_changes_no_torque_until_the_joint_reverses():
-    law = controller_of(configured('ur5e', 1.0).controller)
+    law = controller_of(configured('ur5e_rigid', 1.0).controller)
     settings, state, signals = law.settings, law.state, law.signals
     state.estimate[friction.first_coulomb(settings) :] *= 2.0
     state.shown[:] = state.estimate[friction.first_coulomb(settings) :]
@@ -377,7 +377,7 @@ def test_friction_that_falls_costs_no_more_with_learning(begin):
     """It broke the bound with learning in three of these runs, at up to 1.16 of it."""
     ratios = []
     for weight in ({}, OFF):
-        config = configured('ur5e', 18.0, weight, falling(begin))
+        config = configured('ur5e_rigid', 18.0, weight, falling(begin))
         record = simulate(config.controller, config.plant)
         assert not record.run().stops
         errors = np.abs(record.true_errors()[round(begin * 1e3) :])
@@ -396,7 +396,7 @@ def test_friction_that_falls_as_a_joint_slows_down_is_known_at_its_reversal(
     The errors are 2.8, 2.9 and 3.3 mrad.  They were 3.9, 4.2 and 4.4 mrad when delta was
     counted only while |s| > 0.9; each limit is between the two.
     """
-    config = configured('ur5e', begin + 0.1, {}, falling(begin, joint))
+    config = configured('ur5e_rigid', begin + 0.1, {}, falling(begin, joint))
     record = simulate(config.controller, config.plant)
     assert not record.run().stops
     errors = np.abs(record.true_errors()[round(begin * 1e3) :])
@@ -424,14 +424,14 @@ def test_soft_loop_gains_by_learning_if_the_period_of_the_ripple_is_known(
     rms = []
     for learning in (RIPPLE, OFF):
         changes = {'sim_plant': of_plant, 'blf_dsc_controller': law | learning}
-        loop = load_loop('ur5e', changes)
+        loop = load_loop('ur5e_rigid', changes)
         record = simulate(loop.controller, loop.plant, supervised=False)
         rms.append(np.sqrt(np.mean(record.true_errors()[8000:] ** 2)))
     assert rms[0] < most * rms[1]
 
 
 def test_amplitude_of_the_ripple_is_learned():
-    config = configured('ur5e', 12.0, RIPPLE)
+    config = configured('ur5e_rigid', 12.0, RIPPLE)
     record = simulate(config.controller, config.plant)
     names = estimate_names(config.controller)
     first = names.index(f'sin 30 q {config.controller.joints[0]}')
@@ -445,7 +445,7 @@ def test_amplitude_of_the_ripple_is_learned():
 
 def test_geared_arm_learns_its_friction_at_breakaway():
     """Of it nothing is known before the start; without it 1.1 mrad remain."""
-    config = configured('ur5e', 15.0)
+    config = configured('ur5e_rigid', 15.0)
     record = simulate(config.controller, config.plant)
     assert np.abs(record.true_errors()[8000:]).max() < 0.6e-3
     np.testing.assert_allclose(record.controller.state.breakaway, 0.5, atol=0.12)

@@ -157,7 +157,11 @@ def test_change_detection_is_off_for_rows_of_lambda_which_contradict_each_other_
 
 @pytest.mark.parametrize(
     ('preset', 'begin', 'duration', 'mass'),
-    [('noisy', 2.0, 0.0, 0.5), ('noisy', 4.0, 0.0, 0.3), ('panda', 2.0, 25.0, 2.0)],
+    [
+        ('noisy', 2.0, 0.0, 0.5),
+        ('noisy', 4.0, 0.0, 0.3),
+        ('panda_rigid', 2.0, 25.0, 2.0),
+    ],
 )
 def test_first_window_that_spans_a_change_is_not_latched(preset, begin, duration, mass):
     """0.1 s after the first latch, the estimate explains the torque of the changed arm.
@@ -284,10 +288,10 @@ def test_residual_floor_follows_the_residual_learned():
 
 def test_half_the_rated_load_is_noticed_with_a_floor_that_is_three_times_too_large():
     """As of a URDF with placeholder efforts; the configured floor alone hides this pick-up."""
-    floor = load_loop('panda').controller.learning.residual_floor
+    floor = load_loop('panda_rigid').controller.learning.residual_floor
     law = {'learning.residual_floor': [3.0 * each for each in floor]}
     event = several({'begin': 9.0, 'duration': 0.0, 'payload': 1.5})
-    config = configured('panda', 10.0, law, event)
+    config = configured('panda_rigid', 10.0, law, event)
     record = simulate(config.controller, config.plant)
     assert [record.sample(row).changes[0] for row in (9000, 9200, -1)] == [
         0.0,

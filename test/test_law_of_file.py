@@ -87,7 +87,9 @@ def test_file_that_defines_no_law_is_refused(text, problem, tmp_path):
     assert problem in str(raised.value)
 
 
-@pytest.mark.parametrize(('preset', 'bound'), [('recommended', 0.1), ('panda', 0.01)])
+@pytest.mark.parametrize(
+    ('preset', 'bound'), [('recommended', 0.1), ('panda_rigid', 0.01)]
+)
 def test_law_tracks_and_keeps_its_memory_in_the_state(preset, bound):
     """Its integral removes the constant part of what its model lacks."""
     loop = loop_with(preset, 3.0)
@@ -215,8 +217,8 @@ def test_comparison_of_laws_runs_it(tmp_path, monkeypatch):
         encoding='utf-8',
     )
     assert laws.chosen_laws([str(file)]) == ['proposed', 'mine']
-    trial = laws.trial('ur5e', 1)
-    unseen = torque_rows(laws.trial('ur5e', UNSEEN).controller)
+    trial = laws.trial('ur5e_rigid', 1)
+    unseen = torque_rows(laws.trial('ur5e_rigid', UNSEEN).controller)
     soft, stiff = (
         laws.run('mine', trial, {'gains.position': gain}, unseen) for gain in (2e3, 1e4)
     )

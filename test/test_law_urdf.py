@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from paper_case import configured, several
+from plants import rigid_gears
 from random_arm import PANDA_TEXT, random_urdf
 
 from blf_dsc_controller import simulate
@@ -32,8 +33,10 @@ ARM = {'model': 'urdf', 'robot.urdf': 'panda.urdf', 'robot.tip': 'panda_hand_tcp
 
 
 def panda(**changes):
+    whole = {'feedback.inertia': 'whole'}
     return build(
-        ControllerConfig, ARM | {k.replace('__', '.'): v for k, v in changes.items()}
+        ControllerConfig,
+        ARM | whole | {k.replace('__', '.'): v for k, v in changes.items()},
     )
 
 
@@ -183,7 +186,9 @@ def test_bound_starts_as_a_funnel_where_an_unknown_load_makes_the_arm_sag():
 
 def test_bound_holds_from_the_start_with_an_undeclared_rated_load():
     def run(law):
-        config = configured('panda', 1.5, law, several({'begin': 0.0, 'payload': 3.0}))
+        config = configured(
+            'panda_rigid', 1.5, law, several({'begin': 0.0, 'payload': 3.0})
+        )
         return simulate(config.controller, config.plant).run()
 
     result = run({})
@@ -221,16 +226,20 @@ def ran(preset, factor, plant=None, controller=None, sample_time=0.001):
     truth = {'truth.rotor_factor': factor, 'duration': 6.0, 'events.begin': [100.0]}
     law = given | (controller or {})
     arm = given | truth | (plant or {})
+    if preset == 'fr3':
+        rigid = rigid_gears(7, 0.01)
+        law = rigid['blf_dsc_controller'] | law
+        arm = rigid['sim_plant'] | arm
     loop = load_loop(preset, {'blf_dsc_controller': law, 'sim_plant': arm})
     return simulate(loop.controller, loop.plant)
 
 
 PANDA = [
-    ('panda', factor, period)
+    ('panda_rigid', factor, period)
     for factor in (0.0, 0.1, 0.4, 1.3)
     for period in (0.001, 0.002)
 ]
-OTHERS = [('ur5e', 0.2, 0.001), ('ur5e', 0.4, 0.002), ('fr3', 0.1, 0.001)]
+OTHERS = [('ur5e_rigid', 0.2, 0.001), ('ur5e_rigid', 0.4, 0.002), ('fr3', 0.1, 0.001)]
 
 
 @pytest.mark.parametrize(('preset', 'factor', 'sample_time'), [*PANDA, *OTHERS])
@@ -243,16 +252,16 @@ def test_arm_keeps_its_bound_whatever_its_rotors_are(preset, factor, sample_time
 
 def test_wrist_that_its_friction_moves_more_than_its_gains_stops_with_the_reason():
     """1.1 N m of friction on 0.007 kg m^2: no gains that the delay allows hold 5 mrad."""
-    (stop,) = ran('ur5e', 0.1, sample_time=0.002).run().stops
+    (stop,) = ran('ur5e_rigid', 0.1, sample_time=0.002).run().stops
     assert 'its drive seems to have ' in stop.text
     assert 'give robot.rotor_inertia, or a wider bound' in stop.text
 
 
 def test_the_guess_stops_the_same_arm_where_nothing_is_measured():
-    config = load_loop('panda').controller
+    config = load_loop('panda_rigid').controller
     guess = config.robot.rotors(config.robot.chain(config.joints))
     assert (
-        ran('panda', 0.1, controller={'robot.rotor_inertia': guess.tolist()})
+        ran('panda_rigid', 0.1, controller={'robot.rotor_inertia': guess.tolist()})
         .run()
         .stops
     )
@@ -263,14 +272,14 @@ def test_the_guess_stops_the_same_arm_where_nothing_is_measured():
 )
 @pytest.mark.parametrize('factor', [1.0, 1.3])
 def test_noise_is_not_mistaken_for_a_light_arm(factor, plant):
-    state = ran('panda', factor, plant).controller.state
+    state = ran('panda_rigid', factor, plant).controller.state
     assert (state.gain_scale == 1.0).all()
     assert (state.rotor_error == 0.0).all()
 
 
 def test_measured_inertia_is_that_of_the_arm_where_the_loop_was_unstable():
     """Between the true inertia and what the loop tolerates, for each joint that was measured."""
-    record = ran('panda', 0.1)
+    record = ran('panda_rigid', 0.1)
     config = record.config
     settings = record.controller.settings
     robot = config.robot
@@ -289,13 +298,13 @@ def test_measured_inertia_is_that_of_the_arm_where_the_loop_was_unstable():
 
 def test_integrator_takes_as_many_steps_as_friction_on_a_light_joint_needs():
     for factor, fewest, most in ((1.3, 1, 1), (0.1, 6, 1000)):
-        loop = load_loop('ur5e', {'sim_plant': {'truth.rotor_factor': factor}})
+        loop = load_loop('ur5e_rigid', {'sim_plant': {'truth.rotor_factor': factor}})
         assert fewest <= plant_settings(loop.plant).steps <= most
 
 
 def swinging_panda(samples):
     """Return a law that has seen all joints swing at 64 Hz, and how to let them swing on."""
-    law = controller_of(load_loop('panda').controller)
+    law = controller_of(load_loop('panda_rigid').controller)
     q = law.reference_at(0.0)[0]
 
     def swing(first, after):

@@ -26,11 +26,17 @@ LAW = {
     'learning.change_detection': False,
     'robot.rotor_inertia': [0.4, 0.4, 0.4, 0.07, 0.07, 0.07],
 }
+WHOLE = {'feedback.inertia': 'whole'}
 CASES = {
-    'friction': {},
-    'drives': {'robot.drive_compensates': 'gravity'},
-    'ripple': {'learning.ripple_cycles': [20.0, 30.0]},
-    'rejection': {'learning.excitation_threshold': 1e-3},
+    'friction': WHOLE,
+    'drives': WHOLE | {'robot.drive_compensates': 'gravity'},
+    'ripple': WHOLE | {'learning.ripple_cycles': [20.0, 30.0]},
+    'rejection': WHOLE | {'learning.excitation_threshold': 1e-3},
+    'joints, each on its own': {
+        'feedback.inertia': 'none',
+        'feedback.joint_stiffness': [600.0] * 3 + [150.0] * 3,
+        'feedback.joint_damping': [40.0] * 3 + [8.0] * 3,
+    },
 }
 
 
@@ -39,7 +45,7 @@ def test_law_of_a_ur5e_is_the_one_of_the_page(name):
     changes = CASES[name]
     robot = {key: x for key, x in changes.items() if key.startswith('robot')}
     loop = load_loop(
-        'ur5e',
+        'ur5e_rigid',
         {
             'sim_plant': BOTH | FRICTION_FALLS | robot,
             'blf_dsc_controller': BOTH | LAW | changes,

@@ -61,7 +61,7 @@ def weighed(record):
 
 @pytest.fixture(scope='module')
 def panda():
-    return record_of('panda')
+    return record_of('panda_rigid')
 
 
 def is_as_told(load, mass, within):
@@ -73,10 +73,10 @@ def is_as_told(load, mass, within):
         assert (load[5:] < 0.05).all()
 
 
-@pytest.mark.parametrize('name', ['panda', 'ur5e', 'fr3'])
+@pytest.mark.parametrize('name', ['panda_rigid', 'ur5e_rigid', 'fr3'])
 def test_load_is_weighed_within_three_seconds_with_wrong_links(name, panda):
     """To 5 % of 2 kg, and 50 g if nothing is held; an FR3's drives compensate gravity, wrongly."""
-    load, t = weighed(panda if name == 'panda' else record_of(name))
+    load, t = weighed(panda if name == 'panda_rigid' else record_of(name))
     is_as_told(load[t == PICKED_UP][0], 0.0, 0.05)
     is_as_told(load[t == PUT_DOWN - 1.0][0], LOAD, 0.05 * LOAD)
     is_as_told(load[-1], 0.0, 0.05)
@@ -94,7 +94,7 @@ def test_change_makes_the_load_unknown_until_the_filters_have_settled(panda):
 
 
 def test_no_torque_depends_on_it(panda):
-    without = record_of('panda', **{'learning.weighing': False})
+    without = record_of('panda_rigid', **{'learning.weighing': False})
     torque, other = (
         sample_columns(record.samples, record.controller.settings).torque
         for record in (panda, without)
@@ -174,7 +174,7 @@ def cycles(name, first, mass):
 
 
 @pytest.mark.parametrize(
-    ('name', 'first', 'within'), [('panda', 1.5, 0.02), ('ur5e', 1.5, 0.15)]
+    ('name', 'first', 'within'), [('panda_rigid', 1.5, 0.02), ('ur5e_rigid', 1.5, 0.15)]
 )
 def test_load_of_every_cycle_from_the_first_on_is_weighed(name, first, within):
     """No window of 5 s is of one arm.  It used to be 0.0 +- 0.03 kg, loaded or not."""
@@ -193,7 +193,7 @@ def test_load_of_every_cycle_from_the_first_on_is_weighed(name, first, within):
 
 
 def test_lightest_hand_is_taken_for_empty_if_the_run_begins_with_a_load():
-    begin, record = cycles('panda', -1.5, 1.5)
+    begin, record = cycles('panda_rigid', -1.5, 1.5)
     load, t = weighed(record)
     lighter = load[t < begin[1] - 0.05][-1]
     assert lighter[0] == pytest.approx(-1.5, abs=0.05)
@@ -213,7 +213,7 @@ def test_arm_without_friction_or_noise_changes_only_when_it_does():
         'disturbance.coulomb': [0.0] * 6,
         'disturbance.stribeck': 0.0,
     }
-    record = record_of('ur5e', ideal)
+    record = record_of('ur5e_rigid', ideal)
     load, t = weighed(record)
     changes = measure(record.run()).model_changes
     assert changes == pytest.approx([PICKED_UP, PUT_DOWN], abs=0.2)
@@ -258,7 +258,7 @@ def test_rows_that_fit_ever_worse_are_noise_and_those_of_a_change_are_not():
 
 
 def test_light_load_that_the_law_does_not_notice_is_weighed():
-    record = record_of('panda', {'events.payload': [0.08]})
+    record = record_of('panda_rigid', {'events.payload': [0.08]})
     load, t = weighed(record)
     assert record.controller.state.changes[0] == 0.0
     is_as_told(load[t == PUT_DOWN - 0.5][0], 0.08, 0.05)
@@ -272,7 +272,7 @@ def test_weighing_what_cannot_be_weighed_is_rejected():
     with pytest.raises(
         ConfigurationError, match=r'weighing: got true with .*, but needs'
     ):
-        configured('panda', 1.0, {'learning.weighing': True, **given})
+        configured('panda_rigid', 1.0, {'learning.weighing': True, **given})
     assert not ControllerConfig().learning.weighing
 
 

@@ -14,7 +14,7 @@ pytest.importorskip('mujoco', reason='needs MuJoCo: pip install mujoco')
 
 import mujoco
 from paper_case import OFF, ROWS, P, end_of
-from plants import commands, true_parameters
+from plants import commands, rigid_gears, true_parameters
 from test_plant_sampled import ALL_KINDS
 
 from blf_dsc_controller import read_run, share_folder
@@ -147,7 +147,7 @@ def test_gravity_and_forces_are_in_the_frame_of_the_base(arm):
 
 
 @pytest.mark.usefixtures('blank_pictures')
-@pytest.mark.parametrize('preset', ['panda', 'recommended'])
+@pytest.mark.parametrize('preset', ['panda_rigid', 'recommended'])
 def test_run_with_this_physics_is_one_command_and_replays(tmp_path, preset):
     words = [
         '--config',
@@ -204,7 +204,7 @@ def test_reset_repeats_the_run_and_disturbances_can_change():
 
 def test_closed_loop_runs_the_same_with_both_plants():
     """With every imperfection except dry friction and ripple, which differ over a sample."""
-    loop = load_loop('panda')
+    loop = load_loop('panda_rigid')
     given = {
         'disturbance.coulomb': [0.0] * 7,
         'actuator.ripple': 0.0,
@@ -222,8 +222,8 @@ def test_closed_loop_runs_the_same_with_both_plants():
 @pytest.mark.parametrize(
     ('name', 'settled', 'peak'),
     [
-        ('panda', 0.2, 2.3),
-        ('ur5e', 0.55, 1.6),
+        ('panda_rigid', 0.2, 2.3),
+        ('ur5e_rigid', 0.55, 1.6),
         ('openarm', 0.21, 0.9),
         ('widowx', 0.45, 6.2),
     ],
@@ -260,8 +260,11 @@ def close_loop(config, arm, samples):
 
 
 def test_drives_that_compensate_hold_the_arm():
-    """Zero holds an FR3: its drives add gravity, in MuJoCo as in our plant."""
-    loop = load_loop('fr3')
+    """Zero holds an FR3: its drives add gravity, in MuJoCo as in our plant.
+
+    With rigid gears: released brakes leave springs to settle by 2 mrad.
+    """
+    loop = load_loop('fr3', rigid_gears(7, 0.01))
     quiet = {
         'drive.mass_deviation': 0.0,
         'drive.centre_deviation': 0.0,
@@ -356,7 +359,7 @@ def test_load_is_learned_and_a_wall_is_not(monkeypatch, reaction):
 
     At half its usual speed and with brakes like an arm's own, it stops in the wall's padding.
     """
-    loop = load_loop('panda')
+    loop = load_loop('panda_rigid')
     joints = len(loop.controller.joints)
     amplitude = [0.5 * each for each in loop.controller.reference.amplitude]
     controller = change(

@@ -112,7 +112,7 @@ def test_panda_rests_with_a_load_that_it_was_stopped_by():
     """The model lacks 3 kg: held by it alone, the arm sinks by 0.70 rad in 1 s, 1.88 in 4 s."""
     law = {'reference.type': 'hold', 'safety.error_ratio': 0.5}
     pick_up = several({'begin': 0.5, 'duration': 0.0, 'payload': 3.0})
-    config = configured('panda', 4.5, law, pick_up)
+    config = configured('panda_rigid', 4.5, law, pick_up)
     assert config.controller.safety.torque == 'hold_gravity'
     record = simulate(config.controller, config.plant)
     (stop,) = record.run().stops

@@ -228,7 +228,7 @@ FRICTIONLESS = {'robot.viscous': [0.0] * 6, 'robot.coulomb': [0.0] * 6}
 
 def ideal(period, law=FRICTIONLESS):
     """A UR5e true to its URDF, with ideal sensors and drives, in motion E0 off its reference."""
-    loop = load_loop('ur5e')
+    loop = load_loop('ur5e_rigid')
     step = {'sample_time': period}
     config = loop.controller
     robot = {'robot.urdf': 'ur5e.urdf', 'robot.tip': 'tool0'}
@@ -291,7 +291,7 @@ def test_computed_torque_compensates_known_friction_along_the_reference():
     (_, without), (_, compensated) = (
         simulated(ideal(1e-3, law), GAINS) for law in (FRICTIONLESS, {})
     )
-    config = load_loop('ur5e').controller
+    config = load_loop('ur5e_rigid').controller
     ((_, dq, _),) = terms.sampled(reference_of(config), np.zeros(1))
     slip = np.tanh(dq / config.learning.coulomb_velocity)
     friction = config.robot.viscous * dq + config.robot.coulomb * slip
@@ -301,7 +301,7 @@ def test_computed_torque_compensates_known_friction_along_the_reference():
 
 def test_computed_torque_without_gains_has_those_of_the_law_at_small_errors():
     """k_p = 1.8 w^2, k_d = 2.1 w, k_i = 0.6 w^3 with the rate w = 0.625 / 7.5 ms."""
-    config = load_loop('ur5e').controller
+    config = load_loop('ur5e_rigid').controller
     found = laws.law_changes(laws.LAWS['computed_torque'], config, {})
     rate = 0.625 / 7.5e-3
     np.testing.assert_allclose(found['gains.position'], 1.8 * rate**2, rtol=1e-3)
@@ -310,8 +310,8 @@ def test_computed_torque_without_gains_has_those_of_the_law_at_small_errors():
 
 
 def test_soft_trial_has_a_part_of_the_bandwidth_and_a_bound_that_fits():
-    stiff = laws.trial('ur5e', 1).controller
-    soft = stiffness.soft_trial('ur5e', 1, 0.25).controller
+    stiff = laws.trial('ur5e_rigid', 1).controller
+    soft = stiffness.soft_trial('ur5e_rigid', 1, 0.25).controller
     assert soft.feedback.damping_rate == pytest.approx(
         0.25 * stiff.feedback.damping_rate
     )
@@ -326,12 +326,12 @@ def test_table_and_picture_of_soft_arms_show_each_law(tmp_path):
     assert head.split()[-4:] == ['1', '0.5', '0.25', '0.125']
     assert len(lines) == 6
     assert lines[0].split()[-4:] == ['1.00', '2.00', '3.00', '4.00']
-    stiffness.draw({'ur5e': errors}, tmp_path / 'stiffness.png')
+    stiffness.draw({'ur5e_rigid': errors}, tmp_path / 'stiffness.png')
     assert (tmp_path / 'stiffness.png').stat().st_size > 10_000
 
 
 def test_integral_gain_of_slotine_li_is_the_gain_of_its_disturbance_estimate():
-    config = load_loop('ur5e').controller
+    config = load_loop('ur5e_rigid').controller
     chosen = {
         'law': 'slotine_li',
         'comparison.integral_gain': [1.0, 2.0, 3.0, 4.0, 5.0, 6.0],
@@ -343,7 +343,7 @@ def test_integral_gain_of_slotine_li_is_the_gain_of_its_disturbance_estimate():
 
 @pytest.mark.parametrize('name', laws.LAWS)
 def test_limits_of_the_gain_search_are_valid_configurations(name):
-    config = load_loop('panda').controller
+    config = load_loop('panda_rigid').controller
     studied = laws.LAWS[name]
     for side in ('least', 'most'):
         values = {gain.name: getattr(gain, side) for gain in studied.gains}
@@ -351,7 +351,7 @@ def test_limits_of_the_gain_search_are_valid_configurations(name):
 
 
 def test_every_trial_has_its_own_truth_motion_and_noise():
-    trials = [laws.trial('ur5e', seed) for seed in range(4)]
+    trials = [laws.trial('ur5e_rigid', seed) for seed in range(4)]
     for get in (
         lambda loop: loop.controller.reference.phase,
         lambda loop: loop.controller.reference.amplitude,
@@ -359,7 +359,9 @@ def test_every_trial_has_its_own_truth_motion_and_noise():
         lambda loop: loop.plant.truth.seed,
     ):
         assert len({get(each) for each in trials}) == 4
-    assert trials[0].controller.reference == load_loop('ur5e').controller.reference
+    assert (
+        trials[0].controller.reference == load_loop('ur5e_rigid').controller.reference
+    )
     assert len({each.controller.learning.initial_estimate for each in trials}) == 1
 
 
@@ -399,16 +401,16 @@ def test_every_law_is_tuned_and_run_and_learning_finds_the_model(tmp_path, monke
     """The smallest run of the command: one arm, one truth, a first population of 5."""
     for name, value in {'POPULATION': 5, 'GENERATIONS': 0, 'TRUTHS': 1}.items():
         monkeypatch.setattr(laws, name, value)
-    assert main(['arms', '--config', 'ur5e', '--out', str(tmp_path / 'out')]) == 0
+    assert main(['arms', '--config', 'ur5e_rigid', '--out', str(tmp_path / 'out')]) == 0
     found = json.loads((tmp_path / 'out/figures.json').read_text(encoding='utf-8'))[
-        'ur5e'
+        'ur5e_rigid'
     ]
     assert list(found) == list(laws.LAWS)
-    rows = torque_rows(laws.trial('ur5e', 1000).controller)
+    rows = torque_rows(laws.trial('ur5e_rigid', 1000).controller)
     for name, studied in laws.LAWS.items():
         assert list(found[name]['gains']) == [gain.name for gain in studied.gains]
         # in this process
-        again = laws.run(name, laws.trial('ur5e', 1), found[name]['gains'], rows)
+        again = laws.run(name, laws.trial('ur5e_rigid', 1), found[name]['gains'], rows)
         assert found[name]['runs'] == [json.loads(json.dumps(asdict(again)))]
     learned, guessed = (
         found[name]['runs'][0]['model'] for name in ('proposed', 'no_learning')

@@ -14,6 +14,7 @@ import re
 import numpy as np
 import pytest
 from fault_table import Rig
+from plants import rigid_gears
 
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.nodes import load_loop
@@ -42,7 +43,11 @@ def test_bound_does_not_decide_whether_an_arm_has_moved(bound):
 def test_arm_at_rest_that_gently_receives_a_load_is_not_stopped(effort, bound):
     """2 kg within 0.5 s: the Panda sags by 0.4 mrad, a hundred times the step of its sensors."""
     arm = {'robot.urdf': 'panda.urdf', 'robot.tip': 'panda_hand_tcp'}
-    law = {'reference.type': 'hold', 'robot.effort': effort}
+    law = {
+        'reference.type': 'hold',
+        'robot.effort': effort,
+        'feedback.inertia': 'whole',
+    }
     config = build(ControllerConfig, arm | law | {'barrier.bound': [bound] * 7})
     load = {
         'events.begin': [0.5],
@@ -51,7 +56,7 @@ def test_arm_at_rest_that_gently_receives_a_load_is_not_stopped(effort, bound):
         'events.payload': [2.0],
         'duration': 1.5,
     }
-    record = simulate(config, change(load_loop('panda').plant, load))
+    record = simulate(config, change(load_loop('panda_rigid').plant, load))
     assert record.run().stops == ()
     torque = record.run().torque
     assert np.abs(torque[-1] - torque[400]).max() > 10.0  # N m: the load is held
@@ -168,7 +173,7 @@ def brakes():
     return hold
 
 
-@pytest.mark.parametrize('preset', ['panda', 'ur5e_driver'])
+@pytest.mark.parametrize('preset', ['panda_rigid', 'ur5e_rigid'])
 def test_brakes_in_motion_are_told_after_the_error_has_passed_the_bound(preset):
     """Within 6 to 64 ms: too soon for what tells them from an error at rest."""
     loop = load_loop(preset)
@@ -185,10 +190,10 @@ def test_brakes_in_motion_are_told_after_the_error_has_passed_the_bound(preset):
     assert float(told) == pytest.approx(changed, rel=0.2)
 
 
-@pytest.mark.parametrize('preset', ['fr3', 'panda'])
+@pytest.mark.parametrize('preset', ['fr3', 'panda_rigid'])
 def test_measured_efforts_explain_an_error_past_the_bound(preset):
     """One joint whose commands are lost in motion; nothing is learned from it."""
-    loop = load_loop(preset)
+    loop = load_loop(preset, rigid_gears(7, 0.01) if preset == 'fr3' else None)
     plant = change(loop.plant, {'duration': 0.0})
 
     def lose(torque):
@@ -203,7 +208,7 @@ def test_measured_efforts_explain_an_error_past_the_bound(preset):
 @pytest.mark.parametrize('effort', ['whole', 'unknown'])
 def test_commands_that_arrive_are_not_said_to_have_no_effect(effort):
     """A load far too heavy: the error passes the bound, and the arm accelerates with it."""
-    loop = load_loop('panda')
+    loop = load_loop('panda_rigid')
     fall = {
         'duration': 0.0,
         'events.begin': [1.0],

@@ -9,6 +9,7 @@ from functools import partial
 import numpy as np
 import pytest
 from paper_case import EXACT, NO_DISTURBANCE, configured, run
+from plants import rigid_gears
 
 from blf_dsc_controller.arms.model import inertia_matrices
 from blf_dsc_controller.configuration.controller import ControllerConfig
@@ -19,7 +20,11 @@ from blf_dsc_controller.errors import ConfigurationError
 from blf_dsc_controller.law.factory import settings_of_config
 from blf_dsc_controller.simulation.loop import simulate
 from blf_dsc_controller.supervision.config_warnings import config_warnings, worsened
-from blf_dsc_controller.supervision.expected_errors import expected_errors, transition
+from blf_dsc_controller.supervision.expected_errors import (
+    expected_errors,
+    linear_feedback,
+    linear_loop,
+)
 from blf_dsc_controller.supervision.reference_load import reference_load
 
 BOUND = 0.002  # rad
@@ -185,7 +190,7 @@ def test_what_is_warned_of_happens(warned, changes, duration, happens):
 
 
 def of_bound(changes):
-    found = config_warnings(arm_of('panda', 0.002, changes))
+    found = config_warnings(arm_of('panda_rigid', 0.002, changes))
     return [text for text in found if text.startswith('barrier.bound')]
 
 
@@ -242,30 +247,32 @@ BARE = {'robot.viscous': [], 'robot.coulomb': []}
     ],
 )
 def test_figures_that_nobody_can_have_measured_are_named(changes, expected):
-    found = config_warnings(arm_of('panda', changes=changes))
+    found = config_warnings(arm_of('panda_rigid', changes=changes))
     assert bool(found) == bool(expected)
     for pattern in expected:
         assert [text for text in found if re.search(pattern, text)], found
 
 
 def test_neither_gains_nor_the_residual_floor_rest_on_placeholders():
-    config = arm_of('panda', changes={'robot.urdf': PLACEHOLDERS})
+    config = arm_of('panda_rigid', changes={'robot.urdf': PLACEHOLDERS})
     assert max(config.learning.residual_floor) < 1.0  # N m
     rotors = config.robot.rotors(config.robot.chain(config.joints))
     assert max(rotors) < 0.2  # kg m^2, instead of 5
-    assert arm_of('panda').learning.residual_floor == (0.87,) * 4 + (0.12,) * 3
-    bare = arm_of('panda', changes={'robot.urdf': STICKY, **BARE})
+    assert arm_of('panda_rigid').learning.residual_floor == (0.87,) * 4 + (0.12,) * 3
+    bare = arm_of('panda_rigid', changes={'robot.urdf': STICKY, **BARE})
     # learned before it is used
     assert not settings_of_config(bare).initial_estimate[-14:].any()
 
 
 # Margins and expected errors of the gains derived from a URDF, at three sample rates.
 
-ARMS = [('panda', 7), ('ur5e', 6), ('fr3', 7)]
+ARMS = [('panda_rigid', 7), ('ur5e_rigid', 6), ('fr3', 7)]
 
 
 def arm_of(preset, sample_time=0.001, changes=None):
     given = {'sample_time': sample_time, **(changes or {})}
+    if preset == 'fr3':
+        given = rigid_gears(7, 0.01)['blf_dsc_controller'] | given
     return load(locate(preset), 'blf_dsc_controller', ControllerConfig, given)
 
 
@@ -275,6 +282,12 @@ def inertias(config, settings):
     return inertia_matrices(
         settings.model, np.array(config.learning.initial_estimate), q
     )
+
+
+def transition(settings, T, lag, M, M0, stiffness):
+    """A and B of the law, whose inertias are M0, with an arm of M."""
+    feedback = linear_feedback(settings, M0, stiffness)
+    return linear_loop(settings, T, lag, M, feedback).transition()
 
 
 def growth(settings, T, lag, M, M0, stiffness):
@@ -287,7 +300,7 @@ def growth(settings, T, lag, M, M0, stiffness):
 
 
 @pytest.mark.parametrize('sample_time', [0.001, 0.002, 0.004])
-@pytest.mark.parametrize('preset', ['panda', 'ur5e', 'fr3'])
+@pytest.mark.parametrize('preset', ['panda_rigid', 'ur5e_rigid', 'fr3'])
 def test_default_gains_have_margins_at_every_rate(preset, sample_time):
     """Inertias coupled, with the barrier at its softest and at its stiffest."""
     config = arm_of(preset, sample_time)
@@ -302,7 +315,7 @@ def test_default_gains_have_margins_at_every_rate(preset, sample_time):
 
 def test_lags_of_the_loop_have_their_time_constants():
     """A held velocity and what alpha2' follows are approached as by lags of first order."""
-    config = arm_of('panda')
+    config = arm_of('panda_rigid')
     settings = settings_of_config(config)
     n, T, lag = settings.n, 0.001, 0.02
     M0 = inertias(config, settings)[:1]
@@ -323,7 +336,7 @@ def test_lags_of_the_loop_have_their_time_constants():
     np.testing.assert_allclose(x[alpha2], -0.1 * rate * share)
 
 
-@pytest.mark.parametrize('preset', ['panda', 'ur5e'])
+@pytest.mark.parametrize('preset', ['panda_rigid', 'ur5e_rigid'])
 def test_the_loop_is_that_of_one_joint_in_every_posture(preset):
     """Damping, barrier and disturbance estimate follow the inertia: n equal, decoupled loops."""
     config = arm_of(preset)
@@ -340,8 +353,8 @@ def test_the_loop_is_that_of_one_joint_in_every_posture(preset):
 
 
 def test_softer_loop_has_lower_gains_and_larger_errors():
-    stiff = arm_of('panda')
-    soft = arm_of('panda', changes={'feedback.stiffness': 0.5})
+    stiff = arm_of('panda_rigid')
+    soft = arm_of('panda_rigid', changes={'feedback.stiffness': 0.5})
     rates = ('damping_rate', 0.5, stiff.feedback, soft.feedback)
     weights = ('weight', 0.25, stiff.barrier, soft.barrier)
     for name, factor, before, after in (rates, weights):
@@ -358,6 +371,7 @@ def test_softer_loop_has_lower_gains_and_larger_errors():
         {
             'robot.urdf': 'panda.urdf',
             'robot.tip': 'panda_link7',
+            'feedback.inertia': 'whole',
             'feedback.stiffness': 0.5,
         },
     )
@@ -367,7 +381,7 @@ def test_softer_loop_has_lower_gains_and_larger_errors():
 def test_soft_loop_that_leaves_its_bound_is_named_with_the_stiffness_that_holds():
     def of_bound(stiffness):
         found = config_warnings(
-            arm_of('panda', changes={'feedback.stiffness': stiffness})
+            arm_of('panda_rigid', changes={'feedback.stiffness': stiffness})
         )
         return [text for text in found if 'picked up' in text]
 
@@ -394,7 +408,7 @@ def test_lag_of_the_surface_filter_costs_margin_at_low_rates(known_rate, expecte
             'surface.time_constant': time_constant,
             'surface.known_rate': known_rate,
         }
-        config = arm_of('panda', 0.004, surface)
+        config = arm_of('panda_rigid', 0.004, surface)
         settings = settings_of_config(config)
         M0 = inertias(config, settings)
         size = partial(growth, settings, 0.004, config.robot.lag)
@@ -403,7 +417,7 @@ def test_lag_of_the_surface_filter_costs_margin_at_low_rates(known_rate, expecte
 
 
 def test_gains_follow_the_sample_time():
-    fast, slow = (arm_of('panda', T) for T in (0.001, 0.005))
+    fast, slow = (arm_of('panda_rigid', T) for T in (0.001, 0.005))
     assert slow.feedback.damping_rate < fast.feedback.damping_rate
     assert (fast.surface.time_constant, slow.surface.time_constant) == (0.004, 0.005)
     planar = (arm_of('noisy', T) for T in (0.001, 0.005))
@@ -432,6 +446,10 @@ def test_expected_peak_at_a_pick_up_is_that_of_the_simulated_arm(
             'events.payload': [2.0],
             'truth.rotor_factor': 1.0,
         }
+        if preset == 'fr3':
+            rigid = rigid_gears(n, 0.05)
+            controller = rigid['blf_dsc_controller'] | controller
+            plant = rigid['sim_plant'] | plant
         loop = load_loop(preset, {'blf_dsc_controller': controller, 'sim_plant': plant})
         run = simulate(loop.controller, loop.plant).run()
         assert not run.stops

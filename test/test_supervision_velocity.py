@@ -6,6 +6,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from fault_table import MILLISECOND, Rig
+from plants import rigid_gears
 from test_supervision_effect import stopped_by
 
 from blf_dsc_controller.configuration.nodes import load_loop
@@ -45,7 +46,7 @@ def test_fr3_with_a_wrong_velocity_of_joint_2_comes_to_rest(spoil, at, travel):
 
 def test_wrist_does_not_drift_after_its_wrong_velocity_has_broken_the_bound():
     """It went on at 0.36 rad/s: by 0.16 N m of a disturbance that was none."""
-    loop = load_loop('fr3')
+    loop = load_loop('fr3', rigid_gears(7, 0.01))
     plant = change(loop.plant, {'duration': 0.0})
 
     def spoil(_, dq):

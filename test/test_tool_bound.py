@@ -189,7 +189,7 @@ def test_tones_of_a_reference_add_up_to_the_region_that_it_needs():
     assert found[0] == found[1]
 
 
-@pytest.mark.parametrize('name', ['panda', 'ur5e', 'fr3'])
+@pytest.mark.parametrize('name', ['panda_rigid', 'ur5e', 'fr3'])
 def test_joint_bounds_follow_from_the_bound_at_the_tool(name):
     loop = preset(name, **{'barrier.tool_bound': 0.003})
     config = loop.controller
@@ -218,7 +218,7 @@ def test_joint_bounds_follow_from_the_bound_at_the_tool(name):
 
 
 def test_configuration_with_its_joint_bounds_can_be_read_again(tmp_path):
-    config = preset('panda', **{'barrier.tool_bound': 0.003}).controller
+    config = preset('panda_rigid', **{'barrier.tool_bound': 0.003}).controller
     assert change(config, {}) == config
     dump(tmp_path / 'config.yaml', {CONTROLLER: config})
     assert load(tmp_path / 'config.yaml', CONTROLLER, ControllerConfig) == config
@@ -294,13 +294,15 @@ def test_mistakes_are_named_with_their_remedy(mistake):
 
 def test_warnings_speak_of_the_bound_at_the_tool():
     """The rate cannot hold joint bounds this narrow; a wider one as said can."""
-    tight = preset('panda', **{'barrier.tool_bound': 0.0005, 'safety.error_ratio': 2.0})
+    tight = preset(
+        'panda_rigid', **{'barrier.tool_bound': 0.0005, 'safety.error_ratio': 2.0}
+    )
     share, friction, load = config_warnings(tight.controller)
     assert share.startswith('safety.error_ratio: the arm stops only 2 times past')
     assert friction.startswith('barrier.tool_bound: friction and unmodelled torque')
     assert load.startswith('barrier.tool_bound: when 2 kg')
     times = float(load.partition(' times this bound at the tool')[0].split()[-1])
-    wide = preset('panda', **{'barrier.tool_bound': 0.0005 * times})
+    wide = preset('panda_rigid', **{'barrier.tool_bound': 0.0005 * times})
     assert config_warnings(wide.controller) == []
 
 
@@ -312,7 +314,7 @@ def tracked():
         'barrier.initial_bound': [0.01] * 7,
         'telemetry.decimation': 1,
     }
-    loop = preset('panda', **given)
+    loop = preset('panda_rigid', **given)
     return loop, simulate(loop.controller, loop.plant)
 
 
@@ -352,7 +354,7 @@ def test_stop_says_both_errors():
         'torque.limit': [40.0, 40.0, 40.0, 12.0, 12.0, 12.0, 12.0],
         'safety.saturation_time': 10.0,
     }
-    loop = preset('panda', **given)
+    loop = preset('panda_rigid', **given)
     record = simulate(loop.controller, loop.plant)
     (stop,) = record.run().stops
     assert stop.reason == 'error past the bound'
@@ -378,21 +380,21 @@ def test_library_has_the_same_bounds_and_errors(tracked):
 
 
 def test_without_a_bound_at_the_tool_nothing_of_it_is_shown():
-    config = load_loop('panda').controller
+    config = load_loop('panda_rigid').controller
     assert tool_of(config) is None
     assert flatten(config)['barrier.bound'] == (0.005,) * 7
 
 
 def test_study_tries_the_bound_by_one_command(tmp_path, capsys):
     out = tmp_path / 'out'
-    words = ['tool', '--config', 'ur5e', '--bound', '0.005', '--runs', '150']
+    words = ['tool', '--config', 'ur5e_rigid', '--bound', '0.005', '--runs', '150']
     assert main([*words, '--truths', '1', '--out', str(out)]) == 0
     header, row, wrote = capsys.readouterr().out.splitlines()
     assert header.startswith('mm at the tool')
-    assert row.split()[:2] == ['ur5e', '5.00']
+    assert row.split()[:2] == ['ur5e_rigid', '5.00']
     assert wrote.endswith('tool.json, tool.png')
     assert (out / 'tool.png').stat().st_size > 10_000
-    figures = json.loads((out / 'tool.json').read_text())['ur5e']
+    figures = json.loads((out / 'tool.json').read_text())['ur5e_rigid']
     assert figures['random runs'] == 150
     assert figures['above the certified bound'] == 0
     assert figures['above that of their posture'] == 0

@@ -426,12 +426,12 @@ def _add_studies(command: _Command) -> None:
         'Compare laws on arms whose URDF is wrong. Each law is tuned on one simulated arm and run '
         'on others; the errors are printed as a table. Runs without ROS, on all cores, for some '
         'minutes.',
-        '--config panda --out arms',
+        '--config panda_rigid --out arms',
     )
     option(
         '--config',
         nargs='+',
-        default=['panda', 'ur5e'],
+        default=['panda_rigid', 'ur5e_rigid'],
         help='presets or files (panda ur5e)',
     )
     laws = (
@@ -449,7 +449,7 @@ def _add_studies(command: _Command) -> None:
     option(
         '--config',
         nargs='+',
-        default=['panda', 'ur5e', 'fr3'],
+        default=['panda_rigid', 'ur5e_rigid', 'fr3'],
         help='presets or files (panda ur5e fr3)',
     )
     option('--bound', type=float, default=0.005, help='bound at the tool [m] (0.005)')
@@ -466,7 +466,7 @@ def _add_studies(command: _Command) -> None:
     option(
         '--config',
         nargs='+',
-        default=['panda', 'ur5e'],
+        default=['panda_rigid', 'ur5e_rigid'],
         help='presets or files (panda ur5e)',
     )
     option('--arms', type=_positive, default=1000, help='random arms (1000)')

@@ -387,7 +387,17 @@ class Variation:
     distribution: Distribution
 
 
-_GROUPS = ('arm.', 'truth.', 'disturbance.', 'sensor.', 'actuator.', 'load.', 'events.')
+_GROUPS = (
+    'arm.',
+    'truth.',
+    'joint.',
+    'base.',
+    'disturbance.',
+    'sensor.',
+    'actuator.',
+    'load.',
+    'events.',
+)
 _REALTIME = ('actuator.command_timeout', 'actuator.without_command')
 
 
