@@ -38,6 +38,7 @@ from sim_plant.kernels import (
     OBSERVE,
     TRUTH,
     drive,
+    limited,
     observe,
     plant_views,
 )
@@ -218,6 +219,7 @@ def close_loop(plant: PlantSettings, now: PlantState) -> None:
             rate *= springs.stiffness[i] * memory.touches[i]
             lacking = torque - now.drives.eased[i] - memory.spring[i]
             torque += springs.loop_gain * lacking - springs.loop_damping * rate
+            torque = limited(torque, springs.loop_limit[i])
             torque += springs.loop_decay * (state.torque[i] - torque)
         state.torque[i] = torque
 
@@ -297,15 +299,19 @@ def friction(
 
 
 @inner
-def move(arm: RigidArm, plant: PlantSettings, now: PlantState) -> None:
-    """Advance to the next sample, with the torque of the drives."""
-    if now.drives.stopped[0] != 0.0:
+def move(arm: RigidArm, plant: PlantSettings, now: PlantState, tasks: int) -> None:
+    """Advance to the next sample with the torque of the drives, or by parts of a block."""
+    moves = tasks & MOVE
+    if moves and now.drives.stopped[0] != 0.0:
         stand_still(now)
         return
-    for _ in range(plant.blocks):
-        predict(plant, now)
-        fill_links(arm, now)
-        swing(plant, now)
+    for _ in range(plant.blocks if moves else 1):
+        if moves or tasks & PREDICT:
+            predict(plant, now)
+        if moves:
+            fill_links(arm, now)
+        if moves or tasks & SWING:
+            swing(plant, now)
 
 
 @inner
@@ -389,12 +395,8 @@ def run_elastic_plant(
         rest(arm, plant, now)
     if tasks & DRIVE:
         drive(plant, now, command)
-    if tasks & MOVE:
-        move(arm, plant, now)
-    if tasks & PREDICT:
-        predict(plant, now)
-    if tasks & SWING:
-        swing(plant, now)
+    if tasks & (MOVE | PREDICT | SWING):
+        move(arm, plant, now, tasks)
     if tasks & OBSERVE:
         observe(plant, now, noise, measurement)
     if tasks & TRUTH:

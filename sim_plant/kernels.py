@@ -220,11 +220,12 @@ def observe(
 ) -> None:
     """Write [q, dq, effort] (3n,) of this sample, with its standard normal noise (3n,).
 
-    `effort` is the torque applied over the last interval [N m], before the first one
-    that with which the drives hold the arm; as a whole, with a torque loop, that of its
-    sensors.  Reading a sample again gives the same numbers.
+    `effort` is the torque applied over the last interval [N m], as a whole, with a torque
+    loop, that of its sensors; before the first interval, what the drives hold the arm with.
+    Reading a sample again gives the same numbers.
     """
     n = plant.n
+    has_sensors = plant.transmission.loop_gain > 0.0 and now.sample[0] > 0.0
     if now.sample[0] == 0.0:
         update_loads(plant, now)
         compensate(plant, now)
@@ -241,7 +242,7 @@ def observe(
         measurement[2 * n + i] = now.drives.applied[i]
         if plant.drives.effort_is_whole == 1:
             measurement[2 * n + i] += now.drives.added[i]
-            if plant.transmission.loop_gain > 0.0:
+            if has_sensors:
                 measurement[2 * n + i] = now.elastic.transmitted[i]
         measurement[2 * n + i] *= plant.drives.effort_scale
 

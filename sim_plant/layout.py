@@ -64,6 +64,7 @@ class Springs(NamedTuple):
     loop_gain: float
     loop_damping: float  # s
     loop_decay: float  # of the loop's lag in half a step
+    loop_limit: Annotated[Array, 'springs']  # of the motors, N m; 0: none
 
 
 class Base(NamedTuple):

@@ -88,7 +88,7 @@ def on_base(bodies: RigidBodies, mass: float) -> RigidBodies:
 def rigid(steps: int) -> Elasticity:
     """Return the settings of an arm without springs."""
     empty = np.zeros(0)
-    springs = Springs(empty, empty, empty, empty, empty, 0.0, 0.0, 0.0)
+    springs = Springs(empty, empty, empty, empty, empty, 0.0, 0.0, 0.0, empty)
     return Elasticity(steps, 0, 0, 0, springs, Base(np.zeros((0, 0)), np.zeros((0, 0))))
 
 
@@ -134,6 +134,7 @@ def elastic(
         loop_gain=actuator.loop_gain,
         loop_damping=actuator.loop_damping,
         loop_decay=lag(actuator.loop_lag, half)[0],
+        loop_limit=actuator.loop_limit * np.array(actuator.torque_limit),
     )
     mounts = mounts_of(config)
     return Elasticity(steps, blocks, n, mounts, springs, _base_of(config, M))

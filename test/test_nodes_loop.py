@@ -113,6 +113,18 @@ CASES = {
         },
         HELD | {'learning.window': 1.0},
     ),
+    'springs, a torque loop and a base that gives way': (
+        ARM
+        | {
+            'duration': 0.5,
+            'truth.rotor_inertia': [0.2, 0.2, 0.2],
+            'joint.stiffness': [1e5, 1e5, 1e5],
+            'actuator.loop_gain': 4.0,
+            'actuator.loop_damping': 0.008,
+            'base.mass': 200.0,
+        },
+        ARM | {'learning.window': 0.2},
+    ),
     # over 1.4 and 1.2 rad
     'approach': ({'duration': 4.0, 'initial.position': [0.9, 2.9]}, {}),
     'error past the bound': (JITTER, WEAK),

@@ -4,8 +4,12 @@
 from __future__ import annotations
 
 import numpy as np
-import pinocchio
 import pytest
+
+pytest.importorskip('mujoco', reason='needs MuJoCo: pip install mujoco')
+
+import mujoco
+import pinocchio
 from random_arm import PANDA as JOINTS
 from random_arm import PANDA_TEXT, pinocchio_model
 from scipy.integrate import solve_ivp
@@ -13,6 +17,7 @@ from scipy.integrate import solve_ivp
 from blf_dsc_controller.configuration.plant import PlantConfig
 from blf_dsc_controller.configuration.schema import build
 from blf_dsc_controller.errors import BlfDscError, ConfigurationError
+from sim_plant.mujoco_plant import spec_of
 from sim_plant.plant import plant_of
 
 MASS, LEVER, INERTIA, ROTOR = 2.0, 0.3, 0.05, 0.2  # kg, m, kg m^2, kg m^2
@@ -67,9 +72,11 @@ def states_of(arm, torques):
 class Written:
     """The equations of one joint as on paper, for scipy."""
 
-    def __init__(self, viscous=0.0, coulomb=0.0, share=0.0, play=0.0, loop=()):
+    def __init__(
+        self, viscous=0.0, coulomb=0.0, share=0.0, play=0.0, loop=(), most=0.0
+    ):
         self.viscous, self.coulomb, self.share = viscous, coulomb, share
-        self.play, self.loop = play, loop
+        self.play, self.loop, self.most = play, loop, most
 
     def spring(self, q, dq, theta, dtheta):
         """Return the torque by the twist, its rate, and that of the damper."""
@@ -80,8 +87,12 @@ class Written:
         return K * beyond, K * rate, DAMPING * rate
 
     def slope(self, _t, x, torque):
-        q, dq, theta, dtheta, u = x
+        q, dq, theta, dtheta, u, z = x
         spring, rate, damper = self.spring(q, dq, theta, dtheta)
+        spring += z
+        dz = 0.0
+        if self.most:
+            dz = K * (dtheta - dq) * (1.0 - np.sign(dtheta - dq) * z / self.most)
         s = spring + damper
         level = self.coulomb + self.share * abs(s)
         friction = self.viscous * dtheta + level * np.tanh(dtheta / 0.5)
@@ -92,7 +103,7 @@ class Written:
             wanted = torque + gain * (torque - spring) - damping * rate
             du, motor = (wanted - u) / lag, u
         load = WEIGHT * np.cos(q)
-        return dq, (s - load) / M, dtheta, (motor - friction - s) / ROTOR, du
+        return dq, (s - load) / M, dtheta, (motor - friction - s) / ROTOR, du, dz
 
     def follow(self, torques, start):
         """Return q, dq, theta, dtheta (samples, 4) before each step of 1 ms."""
@@ -108,7 +119,7 @@ class Written:
 def start_of(play=0.0):
     """Return the state of the pendulum at rest, with its motor braked."""
     load = WEIGHT * np.cos(0.4)
-    return 0.4, 0.0, 0.4 + load / K + play, 0.0, load
+    return 0.4, 0.0, 0.4 + load / K + play, 0.0, load, 0.0
 
 
 @pytest.mark.parametrize(
@@ -133,8 +144,9 @@ def start_of(play=0.0):
             Written(loop=(4.0, 8e-3, 3e-4)),
         ),
         ({'joint__backlash': [2e-3]}, Written(play=1e-3)),
+        ({'joint__hysteresis': [2.0]}, Written(most=2.0)),
     ],
-    ids=['spring', 'friction', 'torque loop', 'backlash'],
+    ids=['spring', 'friction', 'torque loop', 'backlash', 'hysteresis'],
 )
 def test_joint_with_a_spring_moves_as_an_independent_integration_says(given, written):
     """To a thousandth of the largest excursion of each quantity: the steps are 25 us."""
@@ -199,6 +211,69 @@ def swung(config, samples=300):
     return np.array(rows)
 
 
+def with_motors(config, damping):
+    """Return MuJoCo's model of an arm with a body for each motor, whose spring is a tendon."""
+    spec = spec_of(config)
+    for i, name in enumerate(config.joints):
+        rotor = config.truth.rotor_inertia[i]
+        motor = spec.worldbody.add_body(
+            name=f'motor{i}', mass=1.0, inertia=[1.0, 1.0, rotor], explicitinertial=True
+        )
+        motor.add_joint(name=f'theta{i}', type=mujoco.mjtJoint.mjJNT_HINGE)
+        spring = spec.add_tendon(name=f'spring{i}', springlength=[0.0, 0.0])
+        spring.wrap_joint(f'theta{i}', 1.0)
+        spring.wrap_joint(name, -1.0)
+    model = spec.compile()
+    model.opt.timestep = 2.5e-5
+    model.opt.integrator = mujoco.mjtIntegrator.mjINT_RK4
+    model.dof_damping[:] = [0.0] * len(damping) + [*config.disturbance.viscous]
+    model.dof_frictionloss[:] = model.jnt_limited[:] = 0.0
+    model.tendon_stiffness[:] = config.joint.stiffness
+    model.tendon_damping[:] = damping
+    return model
+
+
+def test_arm_with_springs_moves_as_mujocos_with_bodies_for_its_motors():
+    """To 1e-6 rad of 0.65 rad, in 0.3 s; the springs give way by up to 2.5 mrad."""
+    stiffness = [1e4, 2e4, 1e4, 5e3, 5e3, 5e3, 5e3]
+    config = panda(joint__stiffness=stiffness, disturbance__viscous=[1.0] * 7)
+    arm = plant_of(config)
+    model = with_motors(config, arm._settings.transmission.damping)
+    data = mujoco.MjData(model)
+    data.qpos[:] = np.concatenate((config.initial.position, arm.motors[0]))
+    for k in range(300):
+        torque = 0.15 * np.sin(0.02 * k) * np.array(config.actuator.torque_limit)
+        arm.step(torque)
+        data.qfrc_applied[7:] = torque
+        mujoco.mj_step(model, data, 40)
+        ours = np.concatenate((arm.truth()[-14:-7], arm.motors[0]))
+        np.testing.assert_allclose(ours, data.qpos, rtol=0.0, atol=1e-6)
+    assert np.abs(data.qpos[:7] - config.initial.position).max() > 0.5
+
+
+@pytest.mark.parametrize(
+    'given',
+    [
+        {'joint__stiffness': [1e4] * 7},
+        {'base__mass': 60.0},
+        {'joint__stiffness': [1e4, 0.0, 5e3, 1e4, 2e4, 1e4, 1e4], 'base__mass': 60.0},
+    ],
+)
+def test_links_and_base_are_those_of_mujoco(given):
+    """MuJoCo's M and C dq + G; all else is the same, so that only rounding differs."""
+    given = {
+        'truth__mass_deviation': 0.2,
+        'truth__centre_deviation': 0.01,
+        'load__payload': 1.0,
+        'load__force': [5.0, 3.0, -4.0],
+        **given,
+    }
+    ours, theirs = (
+        swung(panda(physics=physics, **given)) for physics in ('own', 'mujoco')
+    )
+    np.testing.assert_allclose(theirs, ours, rtol=0.0, atol=1e-9)
+
+
 @pytest.mark.parametrize('side', ['link', 'motor'])
 def test_stiff_springs_make_the_rigid_arm(side):
     """At 1e6 N m/rad a motor is 30 N m / 1e6 = 3e-5 rad ahead of its link, or less."""
@@ -212,6 +287,70 @@ def test_stiff_springs_make_the_rigid_arm(side):
     )
     assert np.abs(rigid[-1, 0] - rigid[0, 0]).max() > 0.1
     np.testing.assert_allclose(stiff[:, 0], rigid[:, 0], rtol=0.0, atol=1e-4)
+
+
+def test_loads_act_on_links_behind_springs_as_on_a_rigid_arm():
+    """Payload, sloshing, pushes and offsets, on springs of 1e6 N m/rad.
+
+    They give way: to 0.13 mrad of 0.6 rad, 0.04 mrad if four times as stiff.
+    """
+    given = {
+        'disturbance__viscous': [1.0] * 7,
+        'disturbance__amplitude': [1.0] * 7,
+        'disturbance__frequency': [20.0] * 7,
+        'events__begin': [0.02, 0.05],
+        'events__duration': [0.2, 0.0],
+        'events__payload': [1.0, 0.5],
+        'events__sloshing': [0.5, 0.0],
+        'events__force': [10.0, 5.0, -20.0, 0.0, 0.0, 0.0],
+        'events__torque': [0.0] * 7 + [3.0] * 7,
+        'events__offset': [1e-3] * 7 + [0.0] * 7,
+    }
+    rigid = swung(panda(**given))
+    stiff = swung(panda(joint__stiffness=[1e6] * 7, **given))
+    without = swung(panda(disturbance__viscous=[1.0] * 7))
+    np.testing.assert_allclose(stiff[:, 0], rigid[:, 0], rtol=0.0, atol=2e-4)
+    assert np.abs(without - rigid)[:, 0].max() > 0.01
+
+
+@pytest.mark.parametrize('loop', [0.0, 4.0])
+def test_arm_stays_at_rest_where_its_drives_hold_it(loop):
+    """They compensate gravity; the springs are loaded with it from the start."""
+    config = panda(
+        joint__stiffness=[1e4] * 7,
+        joint__backlash=[1e-3] * 7,
+        actuator__loop_gain=loop,
+        robot__drive_compensates='gravity',
+        robot__effort='whole',
+    )
+    arm = plant_of(config)
+    holding = arm.measure().copy()
+    for _ in range(200):
+        arm.step(np.zeros(7))
+    np.testing.assert_allclose(arm.measure()[:14], holding[:14], atol=1e-9)
+    np.testing.assert_allclose(arm.measure()[14:], holding[14:], atol=1e-5)
+    assert np.abs(holding[14:]).max() > 10.0
+
+
+def test_reflex_stops_links_motors_and_base_at_once():
+    arm = plant_of(
+        panda(
+            joint__stiffness=[1e4] * 7,
+            base__mass=60.0,
+            initial__velocity=[0.3] * 7,
+            actuator__reflex_rate=1000.0,
+        )
+    )
+    arm.step(np.zeros(7))
+    arm.step(np.full(7, 5.0))
+    assert arm.is_stopped
+    still = arm.truth()[-14:].copy()
+    motors = arm.motors
+    assert (still[7:] == 0.0).all()
+    arm.step(np.zeros(7))
+    np.testing.assert_array_equal(arm.truth()[-14:], still)
+    np.testing.assert_array_equal(arm.motors, motors)
+    assert arm.sample == 3
 
 
 def test_encoders_are_on_the_side_that_is_given():

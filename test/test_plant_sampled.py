@@ -6,7 +6,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from paper_case import NO_DISTURBANCE
-from plants import ARM, FULL, ROUGH, START, commands, energies, plant, run
+from plants import ARM, FULL, PERIOD, ROUGH, START, commands, energies, plant, run
 from scipy.integrate import RK45
 from scipy.interpolate import CubicSpline
 
@@ -100,6 +100,53 @@ def test_positive_disturbance_decelerates_the_joint_and_is_in_the_truth():
     assert pytest.approx([1.0, 0.32, 0.4]) == P
     expected = torque_of(views(**ROUGH)[0], 100_000_000 * 1e-9, q, dq)
     np.testing.assert_allclose(load, expected, rtol=1e-13)
+
+
+def test_friction_grows_with_the_torque_of_the_drive():
+    """Per N m, with the sign of the velocity, as Coulomb friction does."""
+    arm = plant(velocity=(0.3, -0.2), load_share=0.1, coulomb=(0.2, 0.1))
+    for _ in range(3):
+        arm.step(TORQUE)
+    _, disturbance, _, dq = np.split(arm.truth(), [3, 5, 7])
+    level = np.array([0.2, 0.1]) + 0.1 * np.abs(TORQUE)
+    np.testing.assert_allclose(disturbance, level * np.tanh(dq / 0.01), rtol=1e-13)
+
+
+def test_friction_changes_as_the_arm_gets_warm():
+    """To half of it, with a time constant of 0.2 s; drives compensate what there is."""
+    arm = plant(
+        velocity=(0.3, -0.2), viscous=(0.5, 0.5), warm_factor=0.5, warm_time=0.2
+    )
+    for k in range(300):
+        _, disturbance, _, dq = np.split(arm.truth(), [3, 5, 7])
+        factor = 0.5 + 0.5 * np.exp(-k * PERIOD / 0.2)
+        np.testing.assert_allclose(disturbance, 0.5 * factor * dq, rtol=1e-12)
+        arm.step(np.zeros(2))
+
+
+def test_eccentric_encoders_err_once_per_turn():
+    """Velocities from their own sensor are true, those of differences have the error."""
+    amplitude = np.array([2e-3, 1e-3])
+    for source in ('measured', 'differenced'):
+        arm = plant(
+            velocity=(0.3, -0.2),
+            eccentricity=tuple(amplitude),
+            **{'sensor.velocity': source},
+        )
+        read = run(arm, commands(50))
+        arm.reset()
+        true = []
+        for torque in commands(50):
+            true.append(arm.truth()[5:].copy())
+            arm.step(torque)
+        q, dq = np.array(true).reshape(-1, 2, 2).swapaxes(0, 1)
+        seen = q + amplitude * np.sin(q)
+        np.testing.assert_allclose(read[:, :2], seen, rtol=1e-14)
+        if source == 'measured':
+            np.testing.assert_array_equal(read[:, 2:4], dq)
+        else:
+            rates = np.diff(seen, axis=0) / PERIOD
+            np.testing.assert_allclose(read[1:, 2:4], rates, atol=1e-11)
 
 
 def test_torque_is_stale_after_its_limit_and_each_such_step_counts():

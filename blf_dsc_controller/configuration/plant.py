@@ -287,6 +287,9 @@ class Actuator:
         0.0, 'gain of this loop on the rate of the torque', 's', 'k_S'
     )
     loop_lag: float = _magnitude(0.0003, 'first-order lag of this loop', 's')
+    loop_limit: float = _fixed(
+        2.0, 'largest torque of this loop, relative to the rated torque', above=0.0
+    )
 
 
 @dataclass(frozen=True)
