@@ -236,7 +236,7 @@ def test_limits_are_inclusive_and_arrays_as_long_as_others_say():
         ),
         (
             CONTROLLER,
-            {'reference.times': [2.0, 2.0], 'reference.points': [0.0] * 4},
+            {'reference.times': [2.0, 2.0], 'reference.waypoints': [0.0] * 4},
             'got 2 s after 2 s, but they must increase',
         ),
         (

@@ -104,9 +104,13 @@ def test_column_rejected_at_rest_is_readmitted_in_motion():
     law = {
         'reference.type': 'waypoints',
         'reference.times': [0.0, *(10.0 + 1.5 * steps).tolist()],
-        'reference.points': [
-            *(2.293, *(2.293 - 0.5 * (steps % 2)).tolist()),
-            *(1.696, *(1.696 - 0.4 * (steps // 2 % 2)).tolist()),
+        'reference.waypoints': [
+            *(2.293, 1.696),
+            *np.column_stack(
+                (2.293 - 0.5 * (steps % 2), 1.696 - 0.4 * (steps // 2 % 2))
+            )
+            .ravel()
+            .tolist(),
         ],
     }
     constant = {

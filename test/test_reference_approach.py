@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -15,6 +16,7 @@ from blf_dsc_controller.configuration.controller import (
     MotionLimits,
     Reference,
 )
+from blf_dsc_controller.configuration.nodes import CONTROLLER, load
 from blf_dsc_controller.configuration.plant import Initial, PlantConfig
 from blf_dsc_controller.configuration.schema import build, change
 from blf_dsc_controller.errors import (
@@ -25,6 +27,7 @@ from blf_dsc_controller.law.factory import begin, controller_of
 from blf_dsc_controller.reference.approach import (
     MotionError,
     blend,
+    end_of_waypoints,
     plan_start,
     reference_of,
     stop,
@@ -207,8 +210,8 @@ def test_start_inside_the_bound_needs_no_approach():
     np.testing.assert_allclose(law.reference_at(3.0), [FIRST, STILL, STILL], atol=1e-12)
 
 
-TIMES = {'reference.times': [0.0, 1.0], 'reference.points': [0.0] * 3}
-REPEATED = {'reference.times': [0.0, 1.0, 1.0], 'reference.points': [0.0] * 6}
+TIMES = {'reference.times': [0.0, 1.0], 'reference.waypoints': [0.0] * 3}
+REPEATED = {'reference.times': [0.0, 1.0, 1.0], 'reference.waypoints': [0.0] * 6}
 SWINGING = {'reference.phase': [-np.pi / 2]}  # passes its middle at 0.3 rad/s at t = 0
 
 
@@ -281,7 +284,7 @@ def test_reference_continues_after_a_deactivation_but_begins_anew_after_a_stop()
 def test_waypoints_are_passed_at_their_times_and_the_last_is_held():
     points = np.array([[2.0, 1.0], [2.4, 1.5], [1.8, 1.2]])
     reference = Reference(
-        type='waypoints', times=(0.0, 1.5, 3.5), points=tuple(points.T.ravel())
+        type='waypoints', times=(0.0, 1.5, 3.5), waypoints=tuple(points.ravel())
     )
     motion = sampled(
         reference_of(replace(CONFIG, reference=reference)), [0.0, 1.5, 3.5, 5.0]
@@ -290,13 +293,57 @@ def test_waypoints_are_passed_at_their_times_and_the_last_is_held():
     np.testing.assert_array_equal(motion[[0, 2, 3], 1], 0.0)
 
 
+BY_JOINT = [0.0, 0.1, 0.0, -1.0, 0.0, 1.0]  # two points of three joints
+
+
+@pytest.mark.parametrize(
+    ('given', 'remedy'),
+    [
+        (
+            {'reference.times': [0.0, 5.0], 'reference.points': BY_JOINT},
+            r'write reference.waypoints: \[0.0, 0.0, 0.0, 0.1, -1.0, 1.0\]',
+        ),
+        ({'reference.points': [1.0]}, 'write them as reference.waypoints'),
+        ({'reference.points': []}, 'leave it out'),
+    ],
+)
+@pytest.mark.parametrize('section', ['blf_dsc_controller', '/**'])
+def test_waypoints_of_an_older_file_are_refused_with_the_remedy(
+    given, remedy, section, tmp_path
+):
+    """They stood joint by joint, and would silently be other postures."""
+    lines = [f'    {name}: {value}' for name, value in given.items()]
+    path = tmp_path / 'older.yaml'
+    path.write_text('\n'.join([f'{section}:', '  ros__parameters:', *lines]))
+    with pytest.raises(ConfigurationError, match='one row per point') as caught:
+        load(path, CONTROLLER, ControllerConfig)
+    (problem,) = (each for each in caught.value.problems if 'replaced by' in each)
+    assert problem.startswith(f'line {2 + len(given)}: reference.points: ')
+    assert re.search(remedy, problem)
+
+
+def test_waypoints_of_an_arm_are_read_point_by_point_and_their_end_is_told():
+    robot = {'robot.urdf': 'ur5e.urdf', 'robot.tip': 'tool0'}
+    rest, end = [0.0] * 6, [0.1, -1.0, 1.0, 0.0, 0.0, 0.0]
+    times = {'reference.type': 'waypoints', 'reference.times': [0.0, 5.0]}
+    config = build(
+        ControllerConfig, robot | times | {'reference.waypoints': rest + end}
+    )
+    np.testing.assert_allclose(sampled(reference_of(config), [5.0])[0, 0], end)
+    assert end_of_waypoints(config) == (
+        'the waypoints end after 5 s at shoulder_pan_joint 0.1 rad, shoulder_lift_joint -1 rad, '
+        'elbow_joint 1 rad, wrist_1_joint 0 rad, wrist_2_joint 0 rad, wrist_3_joint 0 rad'
+    )
+    assert end_of_waypoints(CONFIG) == ''
+
+
 @pytest.mark.parametrize(
     ('given', 'problem'),
     [
         ({'reference.type': 'spiral'}, 'type: got "spiral", but it must be one of'),
         ({'reference.type': 'waypoints'}, 'times: got none'),
         (REPEATED, 'times: got 1 s after 1 s, but they must increase'),
-        (TIMES, 'points: got 3, but 4 entries are needed'),
+        (TIMES, r'waypoints: got 3, but 4 entries are needed'),
         ({'limits.velocity': [0.0, 1.0]}, 'limits.velocity: got 0.0 at entry 1'),
         (
             {'limits.position_lower': [1.0, 7.0]},

@@ -374,6 +374,25 @@ def test_added_parameter_has_its_rule_for_older_bags(entries, tmp_path, monkeypa
     assert found == ['reference', 'state']
 
 
+def test_waypoints_of_an_older_bag_stand_joint_by_joint(tmp_path):
+    """They have another name since they stand point by point."""
+    times = {'reference.type': 'waypoints', 'reference.times': [0.0, 0.5]}
+    start, end = [2.293, 1.696], [2.3, 1.7]
+    given = times | {'reference.waypoints': start + end}
+    entries = recorded_run.messages(recorded_run.record(tmp_path / 'new', 0.3, **given))
+
+    def change(content):
+        parameters = content['parameters']
+        assert parameters.pop('reference.waypoints') == start + end
+        parameters['reference.points'] = [start[0], end[0], start[1], end[1]]
+
+    configured(entries, change)
+    bag = recorded_run.write(tmp_path / 'old', entries)
+    result = verify(bag)
+    assert (result.difference, result.remarks, result.incomplete) == (None, (), ())
+    assert read_content(bag).unknown_parameters == []
+
+
 def test_journal_of_a_later_format_is_refused(entries, tmp_path):
     def change(content):
         content.update(format=FORMAT + 1, version='9.0.0')

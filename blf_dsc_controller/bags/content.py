@@ -14,7 +14,12 @@ from pathlib import Path
 from typing import Any
 
 from blf_dsc_controller import __version__
-from blf_dsc_controller.bags.older_parameters import completed, current, known_names
+from blf_dsc_controller.bags.older_parameters import (
+    completed,
+    current,
+    known_names,
+    renamed,
+)
 from blf_dsc_controller.bags.sources import BagError, OpenBag, open_bag
 from blf_dsc_controller.bags.topic_messages import TopicMessages
 from blf_dsc_controller.configuration.controller import ControllerConfig
@@ -168,7 +173,8 @@ class Content:
         found: dict[str, dict[str, Any]] = {}
         for _, event in self.events:
             if event.type is EventType.CONFIGURE:
-                found.setdefault(topics.CONTROLLER, event.content['parameters'])
+                recorded = renamed(event.content['parameters'])
+                found.setdefault(topics.CONTROLLER, recorded)
         for change in self.changes:
             if change.get('configured'):
                 found[topics.PLANT] = change['parameters']

@@ -12,7 +12,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from blf_dsc_controller.bags.sources import BagError
-from blf_dsc_controller.configuration.controller import ControllerConfig
+from blf_dsc_controller.configuration.controller import ControllerConfig, by_point
 from blf_dsc_controller.configuration.schema import (
     Value,
     format_value,
@@ -34,6 +34,7 @@ def current(recorded: Mapping[str, Any], source: str) -> dict[str, Any]:
     Raises:
         BagError: one of them is gone, and no rule says that the law does the same without it.
     """
+    recorded = renamed(recorded)
     known = known_names(recorded)
     problems = []
     for name, value in recorded.items():
@@ -54,6 +55,20 @@ def current(recorded: Mapping[str, Any], source: str) -> dict[str, Any]:
             f'{source} cannot be replayed by this version; use the one that recorded it:{listing}'
         )
     return {name: value for name, value in recorded.items() if name in known}
+
+
+def renamed(recorded: Mapping[str, Any]) -> dict[str, Any]:
+    """Return recorded parameters of a controller by their names of this version.
+
+    `reference.points` were waypoints joint by joint.
+    """
+    values = dict(recorded)
+    points = values.get('reference.points')
+    times = values.get('reference.times', ())
+    if points is not None and (not points or by_point(points, len(times))):
+        del values['reference.points']
+        values['reference.waypoints'] = by_point(points, len(times))
+    return values
 
 
 def known_names(recorded: Mapping[str, Any]) -> set[str]:

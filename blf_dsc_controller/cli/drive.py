@@ -23,6 +23,7 @@ from blf_dsc_controller.drive.drivers import find_driver
 from blf_dsc_controller.drive.loop import DriveLoop, End, Outcome
 from blf_dsc_controller.drive.ros_topics import RosTopics
 from blf_dsc_controller.errors import BlfDscError, ConfigurationError
+from blf_dsc_controller.reference.approach import end_of_waypoints
 from blf_dsc_controller.supervision.config_warnings import config_warnings
 from blf_dsc_controller.supervision.expected_errors import expectation
 
@@ -49,6 +50,8 @@ def drive(options: Namespace) -> int:
         print_notice(f'warning: {warning}')
     if config.model == 'urdf':
         print(f'errors to expect: {expectation(config)}')
+    if end := end_of_waypoints(config):
+        print(end)
     driver = made(options.robot, config, settings)
     with announced_compilation(print_notice):
         controller = ArmController(config, record=options.out, stamps='wall')

@@ -33,7 +33,7 @@ from blf_dsc_controller.configuration.plant import PlantConfig
 from blf_dsc_controller.configuration.schema import change
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.messages.codecs import JointStateDecoder
-from blf_dsc_controller.reference.approach import plan_start
+from blf_dsc_controller.reference.approach import end_of_waypoints, plan_start
 from blf_dsc_controller.simulation.loop import simulate_into_bag
 from blf_dsc_controller.supervision.config_warnings import config_warnings
 from blf_dsc_controller.supervision.expected_errors import expectation
@@ -138,6 +138,8 @@ def _configuration(options: Namespace) -> LoopConfig:
         print(f'warning: {warning}', file=sys.stderr)
     if controller.model == 'urdf':
         print(f'errors to expect: {expectation(controller)}')
+    if end := end_of_waypoints(controller):
+        print(end)
     return config
 
 

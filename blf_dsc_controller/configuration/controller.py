@@ -10,7 +10,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from itertools import pairwise
@@ -94,8 +94,8 @@ class Reference:
     times: tuple[float, ...] = _of_reference(
         (), 'time of each waypoint from the start', 's', at_least=0.0, omittable=True
     )
-    points: Annotated[tuple[float, ...], 'joints', 'reference.times'] = _of_reference(
-        (), 'position at each waypoint, one row per joint', 'rad'
+    waypoints: Annotated[tuple[float, ...], 'reference.times', 'joints'] = (
+        _of_reference((), 'positions of all joints, one row per waypoint', 'rad')
     )
 
     stream_timeout: float = positive(
@@ -103,6 +103,10 @@ class Reference:
         'time without a new target after which the reference of a stream brakes',
         's',
     )
+
+    def rows(self, joints: int) -> np.ndarray:
+        """Return the waypoints (k, n) [rad] of so many joints."""
+        return np.reshape(self.waypoints, (-1, joints))
 
     def problems(self) -> list[str]:
         """Check that waypoints are given if used, and that their times increase."""
@@ -726,6 +730,23 @@ class ControllerConfig(ArmConfig):
             )
         return _with_gains(law_file.gains_of(law_file.load_law(law)))
 
+    @classmethod
+    def replaced(cls, given: Mapping[str, Any]) -> Mapping[str, str]:
+        """Return what to write instead of given parameters of earlier versions."""
+        points, times = (given.get(f'reference.{name}') for name in ('points', 'times'))
+        if points is None:
+            return {}
+        remedy = 'write them as reference.waypoints' if points else 'leave it out'
+        if isinstance(points, list | tuple) and isinstance(times, list | tuple):
+            rows = by_point(points, len(times))
+            remedy = (
+                f'write reference.waypoints: {format_value(rows)}' if rows else remedy
+            )
+        return {
+            'reference.points': 'replaced by reference.waypoints, which has one row per point '
+            f'as everywhere in ROS, and not one per joint: {remedy}'
+        }
+
     def __reduce__(self) -> tuple[Any, ...]:
         """Pickle by values.
 
@@ -942,6 +963,17 @@ def _given_gains(given: Mapping[str, Any], n: int) -> JointGains | None:
     )
     is_valid = all(each.shape == (n,) and (each > 0.0).all() for each in gains)
     return gains if is_valid else None
+
+
+def by_point(points: Sequence[float], count: int) -> list[float]:
+    """Return the rows of so many points, joint by joint, point by point.
+
+    Empty if these are not as many in each row.
+    """
+    if count == 0 or len(points) % count:
+        return []
+    rows: list[float] = np.reshape(points, (-1, count)).T.ravel().tolist()
+    return rows
 
 
 @functools.cache

@@ -33,7 +33,7 @@ from blf_dsc_controller.configuration.schema import (
     parameter,
     parameters,
     suggestion,
-    unknown,
+    unknown_names,
 )
 from blf_dsc_controller.errors import ConfigurationError
 
@@ -303,9 +303,13 @@ def _unknown_in_wildcards(sections: Iterable[Section]) -> Iterator[str]:
     for section in sections:
         if not section.is_wildcard:
             continue
-        for name, entry in section.entries.items():
-            if not (name in known or is_builtin(name) or is_gain_of_law(name)):
-                yield f'line {entry.line}: {unknown(name, known)}'
+        given = {
+            name: entry.value
+            for name, entry in section.entries.items()
+            if not (is_builtin(name) or is_gain_of_law(name))
+        }
+        for problem in unknown_names(ControllerConfig, given, known):
+            yield _located(problem, section.entries, {})
 
 
 def _entries_of(sections: Iterable[Section], node: str, cls: type) -> dict[str, Entry]:

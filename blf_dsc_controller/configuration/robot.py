@@ -6,7 +6,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import lru_cache, partial
 from typing import Any, Literal
 
 import numpy as np
@@ -152,6 +152,13 @@ class Robot:
         check_supported(text, chain)
         return chain
 
+    def kinds(self, joints: tuple[str, ...]) -> tuple[str, ...]:
+        """Return the kind of each joint: revolute, continuous or prismatic.
+
+        Without a URDF, they turn.
+        """
+        return _kinds(self, joints)
+
     def friction(self, chain: Chain) -> dict[str, tuple[float, ...]]:
         """Return the initial friction of each joint, by the name of its column."""
         compensated = self.drive_compensates == 'gravity_and_friction'
@@ -219,6 +226,13 @@ class Robot:
         if len(known) == len(chain.joints):
             return np.array(known)
         return self.efforts(chain) / _DRIVE_ACCELERATION
+
+
+@lru_cache(maxsize=16)
+def _kinds(robot: Robot, joints: tuple[str, ...]) -> tuple[str, ...]:
+    if not robot.urdf:
+        return ('revolute',) * len(joints)
+    return tuple(joint.kind for joint in robot.chain(joints).joints)
 
 
 def implausible_friction(chain: Chain) -> tuple[str, ...]:

@@ -5,7 +5,8 @@ Each field is declared with `parameter`, or is itself such a dataclass: a group,
 parameters have dotted names (`arm.l1`). The method `problems()` of a configuration, if
 it has one, checks parameters against each other; its class method `defaults(given)`
 returns the defaults that follow from the given parameters, `variant(given)` a class
-with further parameters.
+with further parameters, `replaced(given)` what to write instead of those of earlier
+versions.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ import json
 import math
 import operator
 import typing
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Annotated, Any, TypeAlias, TypeVar
 
@@ -213,7 +214,7 @@ def build(cls: type[Config], given: Mapping[str, Any], source: str = '') -> Conf
     except BlfDscError as error:
         raise ConfigurationError([str(error)], source) from error
     known = {param.name: param for param in parameters(cls)}
-    problems = [unknown(name, known) for name in given if name not in known]
+    problems = list(unknown_names(cls, given, known))
     valid: dict[str, Any] = {}
     for name in (name for name in known if name in given):
         param = known[name]
@@ -261,6 +262,20 @@ def variant_of(cls: type[Config], given: Mapping[str, Any]) -> type[Config]:
 def change(config: Config, given: Mapping[str, object], source: str = '') -> Config:
     """Return a configuration with some parameters changed, validated as a whole."""
     return build(type(config), {**flatten(config), **given}, source)
+
+
+def unknown_names(
+    cls: Any, given: Mapping[str, Any], known: Collection[str]
+) -> Iterator[str]:
+    """Yield the problem of each name that is unknown, with the remedy of `cls`."""
+    replaced: Mapping[str, str] = getattr(cls, 'replaced', lambda _: {})(given)
+    for name in given:
+        if name not in known:
+            yield (
+                f'{name}: {replaced[name]}'
+                if name in replaced
+                else unknown(name, known)
+            )
 
 
 def unknown(name: str, known: Iterable[str]) -> str:

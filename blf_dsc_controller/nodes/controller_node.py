@@ -27,6 +27,7 @@ from blf_dsc_controller.nodes.load_service import LoadService
 from blf_dsc_controller.nodes.trajectory_action import TrajectoryAction, offered_action
 from blf_dsc_controller.nodes.trajectory_input import motion_input_of
 from blf_dsc_controller.nodes.watchdog_presence import WatchdogPresence
+from blf_dsc_controller.reference.approach import end_of_waypoints
 from blf_dsc_controller.supervision.config_warnings import config_warnings, worsened
 from blf_dsc_controller.supervision.guard import Guard
 from blf_dsc_controller.supervision.reference_load import ReferenceLoad, reference_load
@@ -97,6 +98,8 @@ class ControllerNode(LoopNode[ControllerConfig]):
         self._load = reference_load(self.config, self.guard.controller.settings)
         for warning in config_warnings(self.config, load=self._load):
             self.get_logger().warning(warning)
+        if end := end_of_waypoints(self.config):
+            self.get_logger().info(end)
         learning = self.config.learning
         if learning.load_service:
             if self._load_service is None:

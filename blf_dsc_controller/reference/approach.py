@@ -197,13 +197,28 @@ def reference_of(config: ControllerConfig) -> np.ndarray:
     if reference.type == 'hold':
         term = hold(np.array(reference.offset))
     elif reference.type == 'waypoints':
-        points = np.reshape(reference.points, (len(config.joints), -1)).T
+        points = reference.rows(len(config.joints))
         term = minimum_jerk(np.array(reference.times), points)
     else:
         term = sinusoids_term(
             reference.offset, reference.amplitude, reference.frequency, reference.phase
         )
     return pack(len(config.joints), [term])
+
+
+def end_of_waypoints(config: ControllerConfig) -> str:
+    """Return where configured waypoints end, in words; empty for another reference."""
+    reference = config.reference
+    if reference.type != 'waypoints':
+        return ''
+    kinds = config.robot.kinds(config.joints)
+    posture = ', '.join(
+        f'{joint} {value:g} {"m" if kind == "prismatic" else "rad"}'
+        for joint, value, kind in zip(
+            config.joints, reference.rows(len(kinds))[-1], kinds, strict=True
+        )
+    )
+    return f'the waypoints end after {reference.times[-1]:g} s at {posture}'
 
 
 def check_takeover(

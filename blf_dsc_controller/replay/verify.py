@@ -162,7 +162,8 @@ def verify(path: Path, namespace: str = '', names: NameMap = NO_NAMES) -> Verifi
     events, until, other = _events(content)
     _check_format(path, events[0])
     config = content.controller_config(exactly=True)
-    newer = sorted(flatten(config).keys() - events[0].content['parameters'].keys())
+    recorded = content.configurations[topics.CONTROLLER]
+    newer = sorted(flatten(config).keys() - recorded.keys())
     errors: dict[int, MessageError] = {}
     states = content.topics[topics.JOINT_STATES].joint_states(
         names.joints_of(config.joints), ('position',), errors
