@@ -29,6 +29,7 @@ from blf_dsc_controller.nodes.plant_node import PlantNode
 from blf_dsc_controller.nodes.process import drain
 from blf_dsc_controller.nodes.recorder_node import BagRecorderNode
 from blf_dsc_controller.replay.verify import verify
+from blf_dsc_controller.supervision.drive_load import DriveLoad
 from sim_plant.plant import plant_settings
 
 PACKAGES = ('ur_msgs', 'franka_msgs')
@@ -226,3 +227,28 @@ def test_centre_is_in_the_frame_that_the_service_wants(ros):
     service = load_service.LoadService(ros.tester, change(FR3.controller, given))
     found = service._to_frame @ (0.01, 0.02, 0.03, 1.0)
     np.testing.assert_allclose(found[:3], (0.01, 0.02, 0.03 - 0.107), atol=1e-12)
+
+
+@pytest.mark.parametrize('kind', ['ur', 'franka'])
+@pytest.mark.parametrize('mass', [2.0, 0.0])
+def test_load_that_is_put_down_has_no_centre(services, ros, kind, mass):
+    """Although the origin of the tip is 0.107 m from that of the frame."""
+    given = TOLD | {'robot.tip': 'fr3_link7', 'learning.load_frame': 'fr3_link8'}
+    requests = []
+
+    def take(request, response):
+        requests.append(request)
+        return response
+
+    ros.tester.create_service(services[kind], SERVICE, take)
+    service = load_service.LoadService(ros.tester, change(FR3.controller, given))
+    ros.until(lambda: service.look() or service._client)
+    ros.until(service._client.service_is_ready)
+    service._ask(DriveLoad(mass, (0.01, 0.02, 0.03) if mass else (0.0,) * 3))
+    ros.until(lambda: requests)
+    (request,) = requests
+    at = getattr(request, 'center_of_gravity', None)
+    centre = request.center_of_mass if at is None else (at.x, at.y, at.z)
+    expected = (0.01, 0.02, 0.03 - 0.107) if mass else (0.0,) * 3
+    assert request.mass == mass
+    np.testing.assert_allclose(centre, expected, atol=1e-9)

@@ -104,6 +104,16 @@ def test_cuts_add_up_if_they_take_more_than_a_fifth_of_the_time(law, every, stop
     assert (check.saturated, check.saturated_time) == (0, 0.0)
 
 
+def test_what_is_learned_at_the_torque_limit_is_kept_while_it_is_tolerated(law):
+    check = SampleCheck(ControllerConfig(), law)
+    law.state.estimate[:] = 0.5
+    law.signals.demand[1] = 2.0 * LIMIT
+    law.flags = verdict(law)
+    assert law.flags == SUSPECT
+    assert check.check(DT) is None
+    assert (check.estimate == 0.5).all()
+
+
 @pytest.mark.parametrize(
     ('lack', 'now', 'reason'),
     [

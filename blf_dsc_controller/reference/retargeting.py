@@ -239,8 +239,6 @@ def _phases(joint: Any, p: float, v: float, a: float) -> tuple[np.ndarray, np.nd
     t, times, states = 0.0, [], []
     spans = [*joint.brake.t, *joint.t]
     for x, j in zip(spans, [*joint.brake.j, *joint.j], strict=True):
-        if x <= 0.0:
-            continue
         times.append(t)
         states.append((p, v, a, j))
         p += x * (v + x * (a / 2.0 + x * j / 6.0))
