@@ -19,7 +19,7 @@ from blf_dsc_controller.analysis.estimates import (
     errors_of_bodies,
     estimates_of,
 )
-from blf_dsc_controller.analysis.figures import draw
+from blf_dsc_controller.analysis.figures import _close_up, draw
 from blf_dsc_controller.analysis.metrics import measure
 from blf_dsc_controller.analysis.metrics_table import format_table
 from blf_dsc_controller.analysis.output import plain, write_json
@@ -111,6 +111,21 @@ def test_tail_is_the_last_ten_seconds_of_a_longer_run(run):
     last = error[3e-3 * np.arange(SAMPLES) >= 29.997 - 10.0]
     expected = np.sqrt(np.mean(last**2))
     assert measure(slow).tail_parameter_error == pytest.approx(expected, rel=1e-9)
+
+
+def test_parameter_error_is_shown_in_percent(run):
+    title = 'relative parameter error'
+    (panel,) = (each for each in panels([run]) if each.title == title)
+    error, one_percent = panel.lines
+    share = estimates_of(run).relative_error
+    assert error.values[[0, -1]] == pytest.approx(100.0 * share[[0, -1]])
+    assert panel.unit == '%'
+    assert (one_percent.values == 1.0).all()
+
+
+def test_close_up_of_a_change_without_errors_shows_torques_and_parameters(run):
+    shown = [panel.title for panel in _close_up(replace(run, error=None), 5.0)]
+    assert shown == ['torque of each joint', 'relative parameter error']
 
 
 def test_each_largest_error_at_the_tool_has_the_bound_of_its_own_sample(run):
