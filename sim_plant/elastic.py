@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Arms with springs: motors that drive their links through gears that give, on such a base.
+"""Arms with elastic joints: motors that drive their links through springs, on a base that may sway.
 
 For each joint, with the position theta of its motor and q of its link,
 
