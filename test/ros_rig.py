@@ -27,7 +27,7 @@ from blf_dsc_controller.nodes.endpoints import message_class, qos_profile
 from blf_dsc_controller.nodes.plant_node import PlantNode
 from blf_dsc_controller.simulation.loop import simulate
 
-PATIENCE = 60.0  # s, until a test gives up waiting
+PATIENCE = 240.0  # s, until a test gives up waiting: only a failing test takes it
 JOINTS = ('joint1', 'joint2')
 START = (2.293, 1.696)  # rad, inside the bound at the reference's start
 
