@@ -14,6 +14,7 @@ COMPILED = 300.0  # s, likewise with kernels, which a first run compiles in two 
 # For real time on a machine too slow for it, where a controller would rightly stop.
 PATIENT = """blf_dsc_controller:
   ros__parameters:
+    insist: [safety.velocity_limit]
     safety:
       state_timeout: 1000.0
       watchdog: 'off'

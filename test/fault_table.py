@@ -10,6 +10,7 @@ page.
 
 from __future__ import annotations
 
+import math
 import sys
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -459,6 +460,7 @@ FAULTS = (
     Fault('effort is NaN', spoil('effort', 0, NAN)),
     Fault('position of joint1 jumps by 3 mrad', spoil('q', 0, 2.296), R.OUTSIDE_BOUND),
     Fault('position of joint2 is 1e300 rad', spoil('q', 1, 1e300), R.OUTSIDE_BOUND),
+    Fault('position of joint1 wraps', spoil('q', 0, 2.293 - math.tau), R.WRAPPED),
     Fault('velocity of joint1 is 60 rad/s', spoil('dq', 0, 60.0), R.VELOCITY),
     Fault(
         'joints in another order', every(arranged(JOINTS[::-1], lambda a, b: (b, a)))

@@ -62,7 +62,11 @@ def test_chosen_reference_excites_far_more_than_that_of_the_paper_within_the_lim
 
 
 # leave a random arm some room
-LIGHT = {'robot.payload': 0.2, 'torque.limit': [60.0] * 3}
+LIGHT = {
+    'robot.payload': 0.2,
+    'torque.limit': [60.0] * 3,
+    'insist': ['torque.limit'],  # twice the URDF's
+}
 
 
 @cache
@@ -177,6 +181,7 @@ def test_tool_writes_a_preset_for_an_arm_from_a_urdf_that_keeps_it_from_the_floo
     config.write_text(
         '/**:\n  ros__parameters:\n    robot: {tip: tip, payload: 0.2, '
         f'urdf: {tmp_path}/arm.urdf}}\n    torque.limit: [60.0, 60.0, 60.0]\n'
+        '    insist: [torque.limit]\n'
         '    limits.velocity: [0.1, 0.1, 0.1]\n'
     )
     out = tmp_path / 'mine.yaml'

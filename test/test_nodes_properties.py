@@ -84,6 +84,7 @@ VALUES = {
     'double array': st.one_of(
         st.lists(st.floats(0.0, 19.0), max_size=3), st.lists(numbers, max_size=3)
     ),
+    'string array': st.lists(st.sampled_from(['torque.limit', 'x']), max_size=2),
 }
 LIVE = {
     each.name: VALUES[each.kind]

@@ -374,6 +374,15 @@ def test_added_parameter_has_its_rule_for_older_bags(entries, tmp_path, monkeypa
     assert found == ['reference', 'state']
 
 
+def test_values_of_an_older_bag_need_no_word_to_insist(tmp_path):
+    """It has been recorded with what is refused now."""
+    given = {'barrier.bound': [2.0, 2.0], 'insist': ['barrier.bound']}
+    entries = recorded_run.messages(recorded_run.record(tmp_path / 'new', 0.3, **given))
+    configured(entries, lambda content: content['parameters'].pop('insist'))
+    result = verify(recorded_run.write(tmp_path / 'old', entries))
+    assert (result.difference, result.remarks, result.incomplete) == (None, (), ())
+
+
 def test_waypoints_of_an_older_bag_stand_joint_by_joint(tmp_path):
     """They have another name since they stand point by point."""
     times = {'reference.type': 'waypoints', 'reference.times': [0.0, 0.5]}

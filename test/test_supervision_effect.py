@@ -32,7 +32,8 @@ from sim_plant.plant import plant_of
 def test_bound_does_not_decide_whether_an_arm_has_moved(bound):
     """With motion from 2 % of the bound on, nothing moved within the first 0.05 s."""
     loop = load_loop('recommended')
-    config = change(loop.controller, {'barrier.bound': [bound] * 2})
+    given = {'barrier.bound': [bound] * 2, 'insist': ['barrier.bound']}
+    config = change(loop.controller, given)
     record = simulate(config, change(loop.plant, {'duration': 0.3}))
     assert record.run().stops == ()
 

@@ -464,7 +464,7 @@ def test_expected_peak_at_a_pick_up_is_that_of_the_simulated_arm(
     [
         ({'robot.lag': 5.0}, 'robot.lag: 5 s .* is it in ms. Give 0.005'),
         ({'barrier.bound': [0.5, 0.5]}, 'is it in degrees. Give 0.00873'),
-        ({'barrier.bound': [0.05, 2.0]}, 'barrier.bound: 2 rad is 115 degrees'),
+        ({'barrier.bound': [0.05, 1.0]}, 'barrier.bound: 1 rad is 57.3 degrees'),
     ],
 )
 def test_values_of_another_unit_are_named_before_the_start(given, remedy):

@@ -79,6 +79,15 @@ class Chain:
         """Ten inertial parameters of each body (n, 10)."""
         return np.array([joint.inertia for joint in self.joints])
 
+    @property
+    def reach(self) -> float:
+        """Length [m] of the stretched arm, from its first joint to the tip."""
+        placements = [joint.placement for joint in self.joints[1:]]
+        return sum(
+            float(np.linalg.norm(each[:3, 3]))
+            for each in (*placements, self.tip_placement)
+        )
+
 
 @lru_cache(maxsize=16)
 def read_chain(text: str, base: str, tip: str, joints: tuple[str, ...]) -> Chain:

@@ -13,6 +13,7 @@ from typing import Any
 
 from blf_dsc_controller.bags.sources import BagError
 from blf_dsc_controller.configuration.controller import ControllerConfig, by_point
+from blf_dsc_controller.configuration.plausibility import CHECKED
 from blf_dsc_controller.configuration.schema import (
     Value,
     format_value,
@@ -24,7 +25,7 @@ from blf_dsc_controller.configuration.schema import (
 REMOVED: dict[str, Value] = {}
 """Last default of each parameter of the first release that is gone now."""
 
-ADDED: dict[str, Value] = {'surface.known_rate': False}
+ADDED: dict[str, Value] = {'surface.known_rate': False, 'insist': CHECKED}
 """Value of parameters that older bags do not have, where it is not the default."""
 
 

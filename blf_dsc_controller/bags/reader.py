@@ -18,6 +18,7 @@ from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.messages import topics
 from blf_dsc_controller.messages.codecs import JOINT_STATE_FIELDS
 from blf_dsc_controller.messages.journal import Event, EventType, contact_in
+from blf_dsc_controller.reference.turns import turns_freely
 from blf_dsc_controller.run import (
     Contact,
     LearnedArm,
@@ -154,11 +155,20 @@ def _arrays(
         arrays[name] = None if messages is None else Values(messages, field)
     errors, references = sources['errors'], sources['references']
     if errors is not None:
-        # Errors are not decimated: q - xi1 is the reference at every sample.
-        if references is None:
+        # Errors are not decimated: q - xi1 is the reference at every sample. Where the
+        # positions may wrap, the controller's is whole turns off.
+        if references is None or _may_wrap(content):
             references = states.select(np.full(states.size, -1))
         arrays['reference'] = Values(references, 0, (states.field(0), errors.field(0)))
     return arrays
+
+
+def _may_wrap(content: Content) -> bool:
+    """Return whether the controller counts turns on for a joint, as a continuous one."""
+    if content.configurations.get(topics.CONTROLLER, {}).get('model') == 'urdf':
+        with suppress(BlfDscError):
+            return bool(turns_freely(content.controller_config()).any())
+    return False
 
 
 def _torques(content: Content, states: JointStates) -> JointStates:

@@ -34,6 +34,7 @@ from blf_dsc_controller.configuration.schema import change
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.messages.codecs import JointStateDecoder
 from blf_dsc_controller.reference.approach import end_of_waypoints, plan_start
+from blf_dsc_controller.reference.turns import reference_near
 from blf_dsc_controller.simulation.loop import simulate_into_bag
 from blf_dsc_controller.supervision.config_warnings import config_warnings
 from blf_dsc_controller.supervision.expected_errors import expectation
@@ -134,6 +135,8 @@ def _configuration(options: Namespace) -> LoopConfig:
         for values in (plant.initial.position, plant.initial.velocity)
     )
     plan_start(controller, np.array(controller.barrier.widest), q, dq)
+    if turned := reference_near(controller, q)[1]:
+        print(f'the reference {turned}')
     for warning in config_warnings(controller):
         print(f'warning: {warning}', file=sys.stderr)
     if controller.model == 'urdf':

@@ -24,7 +24,7 @@ from blf_dsc_controller.arms.joint_gains import JointGains, unknown_arm
 from blf_dsc_controller.arms.known_gears import Gears
 from blf_dsc_controller.arms.model import arm_model
 from blf_dsc_controller.arms.urdf import Chain
-from blf_dsc_controller.configuration import law_file, tool_bound
+from blf_dsc_controller.configuration import law_file, plausibility, tool_bound
 from blf_dsc_controller.configuration.robot import (
     ArmConfig,
     Robot,
@@ -803,6 +803,7 @@ class ControllerConfig(ArmConfig):
         radius = self.learning.radius
         yield from self.truth.problems(self.law, self.model, count, radius)
         yield from self.learning.problems(self.sample_time, self.model, count)
+        yield from plausibility.problems_of_controller(self)
 
     def _sizes(self) -> tuple[int | None, int]:
         """Return how many joints the model needs, None for any, and its parameters."""

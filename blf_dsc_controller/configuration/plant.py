@@ -16,6 +16,7 @@ from typing import Annotated, Any, Literal
 
 import numpy as np
 
+from blf_dsc_controller.configuration import plausibility
 from blf_dsc_controller.configuration.robot import (
     ArmConfig,
     described,
@@ -381,6 +382,7 @@ class PlantConfig(ArmConfig):
                 f'duration: got {self.duration:g} s, shorter than one sample of '
                 f'{self.sample_time:g} s (0 runs until stopped)'
             )
+        yield from plausibility.problems_of_plant(self)
 
     def _spring_problems(self) -> Iterator[str]:
         """Check what springs, their loop and a base need."""

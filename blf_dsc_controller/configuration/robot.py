@@ -195,10 +195,25 @@ class Robot:
 
     def placeholder_efforts(self, chain: Chain) -> tuple[str, ...]:
         """Return the joints whose effort no drive of such an arm has."""
-        most = _PLACEHOLDER * float(self._weight_at_reach(chain).max())
+        most = self.largest_effort(chain)
         return tuple(
             joint.name for joint in chain.joints if most < joint.effort < math.inf
         )
+
+    def largest_effort(self, chain: Chain) -> float:
+        """Return what no drive of an arm of this weight exceeds [N m]."""
+        return _PLACEHOLDER * float(self._weight_at_reach(chain).max())
+
+    def carried(self, chain: Chain) -> float:
+        """Return the mass [kg] that the strongest joint holds at full reach.
+
+        0 if nothing tells.
+        """
+        weight = float(np.linalg.norm(self.gravity)) or _GRAVITY
+        efforts = [each.effort for each in chain.joints if math.isfinite(each.effort)]
+        if chain.reach == 0.0:
+            return 0.0
+        return max(efforts, default=0.0) / (weight * chain.reach)
 
     def _weight_at_reach(self, chain: Chain) -> np.ndarray:
         """Return torques (n,) [N m] of the weight beyond each joint at full reach."""
@@ -389,6 +404,12 @@ class ArmConfig:
         True,
         'configure and activate the node at once; false: wait for a lifecycle manager',
         read_only='it has no effect later',
+    )
+    insist: tuple[str, ...] = parameter(
+        (),
+        'parameters whose values are meant although no arm seems to have them, such as '
+        'torque.limit: they are not refused',
+        omittable=True,
     )
     robot: Robot = Robot()
     realtime: Realtime = Realtime()

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import logging
 import math
 import time
 from collections.abc import Callable, Sequence
@@ -112,6 +113,7 @@ class ArmController:
         self._is_on_wall = stamps == 'wall'
         self._states = JointStateEncoder(config.joints)
         self._shift: int | None = None  # ns, of the stamps
+        self._told_turns: set[str] = set()
         self._loop.guard.activate()
 
     def __enter__(self) -> ArmController:
@@ -166,6 +168,7 @@ class ArmController:
             self._loop.guard.perceive()
             if self._outputs:
                 self._tell(nanoseconds, values, torque)
+            self._tell_turns('the reference', self._loop.guard.turned)
         return answer
 
     def prepare(self, q: ArrayLike) -> None:
@@ -222,7 +225,15 @@ class ArmController:
         names = tuple(joints) or self.joints
         trajectory = Trajectory(names, tuple(points), begin)
         guard = self._loop.guard
-        guard.adopt(guard.plan(trajectory))
+        plan = guard.plan(trajectory)
+        guard.adopt(plan)
+        self._tell_turns('a motion', plan.motion.turned)
+
+    def _tell_turns(self, what: str, turned: str) -> None:
+        """Log once that the reference or a motion is shifted by whole turns."""
+        if turned and what not in self._told_turns:
+            self._told_turns.add(what)
+            logging.getLogger(__name__).warning('%s %s', what, turned)
 
     def load_to_tell(self) -> DriveLoad | None:
         """Return the load to declare to the drives next, a step at a time.

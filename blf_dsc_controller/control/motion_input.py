@@ -33,6 +33,7 @@ from blf_dsc_controller.reference.trajectory import (
     TrajectoryPoint,
     trajectory_problems,
 )
+from blf_dsc_controller.reference.turns import short_way
 from blf_dsc_controller.supervision.guard import Guard
 from blf_dsc_controller.supervision.plan import LatePlanError, Plan
 
@@ -112,6 +113,7 @@ class MotionInput:
         self._points = TargetStream()
         self._target_lead = _TARGET_LEAD
         self._is_stopped = False
+        self._has_told_turns = False
         self._last_message = -np.inf  # s since the start
         sys.setswitchinterval(_SWITCH_INTERVAL)
 
@@ -223,9 +225,10 @@ class MotionInput:
             return None
         order = [trajectory.joints.index(joint) for joint in config.joints]
         velocities = np.array(point.velocities)
+        positions = np.array(point.positions)[order]
         return self._points.target(
             now,
-            np.array(point.positions)[order],
+            self._short_way(guard, self._points, positions),
             timeout=timeout,
             fastest=np.array(config.limits.velocity),
             velocities=velocities[order] if velocities.size else None,
@@ -244,13 +247,31 @@ class MotionInput:
             return
         target = self._positions.target(
             guard.time,
-            positions,
+            self._short_way(guard, self._positions, positions),
             timeout=guard.config.reference.stream_timeout,
             fastest=np.array(guard.config.limits.velocity),
         )
         lead = self._target_lead
         request = _Request(lambda: target, self._report, lead, _ON_POSITIONS)
         self._request(guard, request)
+
+    def _short_way(
+        self, guard: Guard, stream: TargetStream, positions: np.ndarray
+    ) -> np.ndarray:
+        """Return positions (n,) [rad] nearest to the last ones of a stream, or the reference."""
+        config = guard.config
+        near = stream.last(guard.time, config.reference.stream_timeout)
+        if near is None:
+            near = guard.controller.reference_at(guard.time)[0]
+        (shifted,), turned = short_way(positions[np.newaxis], near, config)
+        self._tell_turns(turned)
+        return np.asarray(shifted)
+
+    def _tell_turns(self, turned: str) -> None:
+        """Say once that motions are shifted by whole turns."""
+        if turned and not self._has_told_turns:
+            self._has_told_turns = True
+            self._log.info(f'a motion {turned}; others are shifted likewise')
 
     def _read_positions(self, raw: bytes) -> np.ndarray:
         size = self._decoder.decode(raw)
@@ -374,6 +395,7 @@ class MotionInput:
             points = len(plan.command.points)
             note = f' {plan.motion.note}' if plan.motion.note else ''
             self._log.info(f'following a trajectory of {points} points{note}')
+            self._tell_turns(plan.motion.turned)
 
     def _reject(self, reason: str) -> None:
         self.rejected += 1

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -11,6 +12,7 @@ from numpy.typing import NDArray
 from blf_dsc_controller.bags.topic_messages import Values
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.identification.on_disk import (
+    OnDisk,
     Samples,
     blocks_of,
     mapped,
@@ -50,6 +52,7 @@ def resampled(
     """Resample evenly, interpolating over uneven stamps and up to two lost states.
 
     Positions and torques are (N, n) at the stamps (N,) [ns]; NaN where one is unknown.
+    Turns are counted on where positions wrap.
 
     Raises:
         BlfDscError: there are too few states, or their stamps cannot be of one clock.
@@ -83,15 +86,31 @@ def resampled(
     grid = np.arange(0.0, time[-1], period)
     gap = (intervals > _GAP * period)[np.searchsorted(time, grid, side='right') - 1]
 
-    def evenly(values: Floats | Values) -> Samples:
+    def evenly(values: Callable[[slice], Floats]) -> Samples:
         def block(rows: slice) -> Floats:
             at = grid[rows]
             near = _around(at, time)
-            return interpolated(at, time[near], values[order[near]])
+            return interpolated(at, time[near], values(near))
 
         return mapped(grid.size, block)
 
-    return Recording(joints, period, evenly(q), evenly(torque), gap, source)
+    positions = evenly(_counted_on(q, order).__getitem__)
+    torques = evenly(lambda rows: torque[order[rows]])
+    return Recording(joints, period, positions, torques, gap, source)
+
+
+def _counted_on(q: Floats | Values, order: NDArray[np.intp]) -> OnDisk:
+    """Return positions (k, n) in an order, with turns counted on where an encoder wraps.
+
+    From one state to the next no joint moves by half a turn, and none by three metres.
+    """
+    before = q[order[:1]]
+    counted = OnDisk(before.shape[1])
+    for rows in blocks_of(order.size):
+        found = np.unwrap(np.concatenate((before, q[order[rows]])), axis=0)
+        counted.append(found[1:])
+        before = found[-1:]
+    return counted
 
 
 def interpolated(at: np.ndarray, time: np.ndarray, values: np.ndarray) -> Floats:

@@ -68,6 +68,7 @@ class ControllerNode(LoopNode[ControllerConfig]):
         self._polled = 0  # joint states at the last poll
         self._gate = StartGate(self.config.sample_time)
         self._warned_at = -1  # stamp of the start that the last warning was about
+        self._turned_at = -1  # likewise, of the last reference shifted by turns
         # whether the tracking errors had subscribers at the last count
         self._errors_subscribed = False
         self._observed = self._started = False
@@ -447,6 +448,9 @@ class ControllerNode(LoopNode[ControllerConfig]):
         if now == self._logged:
             return
         self._logged = now
+        if guard.turned and guard.start_stamp != self._turned_at:
+            self._turned_at = guard.start_stamp
+            self.get_logger().info(f'the reference {guard.turned}')
         if guard.silenced:
             self.get_logger().warning(supervisor.text)
         elif is_stopped:

@@ -31,6 +31,7 @@ from blf_dsc_controller.reference.terms import (
     sinusoids_term,
     unpack,
 )
+from blf_dsc_controller.reference.turns import reference_near
 
 _SHORTEST = 0.02  # s
 _STEP = 1.1
@@ -297,13 +298,14 @@ def plan_start(
     """Plan the configured reference, with an approach if it is needed.
 
     At time t [s], the arm is at q (n,) [rad] with dq (n,) [rad/s], and the bound is
-    `bound` (n,) [rad].
+    `bound` (n,) [rad].  Continuous joints go the short way (`turns`).
 
     Raises:
         StartError: the law cannot take over (`check_takeover`), and approach.enabled is false;
             or the arm would be held far past its limits.
         MotionError: no approach keeps the limits.
     """
+    config, _ = reference_near(config, q)
     vector = reference_of(config)
     if config.reference.type == 'hold':
         _check_limits(config, q)

@@ -95,6 +95,7 @@ class PlannedMotion(NamedTuple):
     settled: float  # s, end of the blend or of the way to the path
     end: float  # s, when the last point is reached, or the reference rests
     note: str = ''  # how the motion deviates from the times that were sent
+    turned: str = ''  # how it is shifted by whole turns
 
 
 class Target(NamedTuple):

@@ -48,6 +48,15 @@ class TargetStream:
         self._arrivals.clear()
         self._positions.clear()
 
+    def last(self, now: float, timeout: float) -> np.ndarray | None:
+        """Return the last positions (n,) [rad]; None if the next ones begin a stream.
+
+        They do after a pause of `timeout` [s].
+        """
+        if not self._arrivals or now - self._arrivals[-1] > timeout:
+            return None
+        return self._positions[-1]
+
     def target(
         self,
         arrived: float,

@@ -17,8 +17,9 @@ last point is held, or the reference brakes after it if it has a velocity.
 
 What would exceed the limits takes longer: a path that is too fast is stretched, a
 single point is reached as soon as possible, and a path whose first points are too close
-to reach in time is joined later. To bound the time of planning, a trajectory longer
-than `LONGEST` or with more than `MOST_POINTS` is rejected.
+to reach in time is joined later. Continuous joints go the short way (`turns`). To bound
+the time of planning, a trajectory longer than `LONGEST` or with more than `MOST_POINTS`
+is rejected.
 """
 
 from __future__ import annotations
@@ -65,6 +66,7 @@ from blf_dsc_controller.reference.terms import (
     turning_times,
     unpack,
 )
+from blf_dsc_controller.reference.turns import short_way
 
 MOST_POINTS = 10_000
 LONGEST = 3600.0
@@ -120,6 +122,21 @@ def plan_trajectory(
     terms = unpack(vector)
     # the first is in force even if it begins just now, as a stop of this sample does
     before = [term for term in terms if term.begin < t0] or terms[:1]
+    present = sampled(pack(len(config.joints), before), np.array([t0]))[0, 0]
+    points[0], turned = short_way(points[0], present, config)
+    motion = _planned(before, now, t0, times, points, config)
+    return motion._replace(turned=turned)
+
+
+def _planned(
+    before: list[Term],
+    now: float,
+    t0: float,
+    times: np.ndarray,
+    points: np.ndarray,
+    config: ControllerConfig,
+) -> PlannedMotion:
+    """Return the motion in time, or else as soon as possible; TrajectoryError without."""
     try:
         return _in_time(before, now, t0, times, points, config)
     except MotionError as error:

@@ -163,7 +163,7 @@ def verify(path: Path, namespace: str = '', names: NameMap = NO_NAMES) -> Verifi
     _check_format(path, events[0])
     config = content.controller_config(exactly=True)
     recorded = content.configurations[topics.CONTROLLER]
-    newer = sorted(flatten(config).keys() - recorded.keys())
+    newer = sorted(flatten(config).keys() - recorded.keys() - {'insist'})
     errors: dict[int, MessageError] = {}
     states = content.topics[topics.JOINT_STATES].joint_states(
         names.joints_of(config.joints), ('position',), errors

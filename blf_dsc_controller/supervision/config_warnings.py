@@ -29,6 +29,14 @@ _FIRST_ERROR = 1.5  # recommended bound over the first error
 _PERIODS = 0.02  # periods by which a window may differ from a whole number
 _LONGEST_LAG = 0.1  # s; drivers have up to 0.03
 _WIDEST_BOUND = 0.35  # rad, 20 degrees
+_LONG = 5.0  # s: a time in ms is a thousand times as long as it should be
+_TIMES = (
+    'state_timeout',
+    'saturation_time',
+    'stop_ramp',
+    'deactivation_ramp',
+    'fade_time',
+)
 # exponent of an error in the stiffness it needs: 0.5 without delays
 _STIFFENING = 0.6
 _SLUGGISH = 1.0  # rad/s^2; the weakest joint of the presets has 60
@@ -50,12 +58,28 @@ def _of_units(config: ControllerConfig) -> Iterator[str]:
             f'robot.lag: {lag:g} s between a state and its torque is too long for any loop: is it '
             f'in ms? Give {1e-3 * lag:g}'
         )
-    widest = max(config.barrier.widest)
+    barrier = config.barrier
+    widest = max(barrier.widest)
     if widest > _WIDEST_BOUND:
-        yield (
-            f'barrier.bound: {widest:g} rad is {math.degrees(widest):.3g} degrees and bounds '
-            f'nothing: is it in degrees? Give {math.radians(widest):.3g}'
+        bounds_nothing = (
+            f'{widest:g} rad is {math.degrees(widest):.3g} degrees and bounds nothing'
         )
+        name = 'barrier.bound' if widest in barrier.bound else 'barrier.initial_bound'
+        remedy = f'is it in degrees? Give {math.radians(widest):.3g}'
+        if barrier.bounds_tool:
+            name = POSITION if barrier.tool_bound > 0.0 else ANGLE
+            remedy = 'the bound of a joint follows from this one: give less'
+        yield f'{name}: {bounds_nothing}: {remedy}'
+    limits = config.limits
+    widths = np.subtract(limits.position_upper, limits.position_lower)
+    crossed = max(_LONG, float(np.max(widths / limits.velocity)))
+    for name in _TIMES:
+        seconds = getattr(config.safety, name)
+        if seconds > crossed:
+            yield (
+                f'safety.{name}: in {seconds:g} s the arm can cross its range (limits): is it in '
+                f'ms? Give {1e-3 * seconds:g}'
+            )
 
 
 def _of_stop(config: ControllerConfig) -> Iterator[str]:

@@ -40,6 +40,7 @@ from blf_dsc_controller.reference.retargeting import (
 )
 from blf_dsc_controller.reference.terms import remaining
 from blf_dsc_controller.reference.trajectory import Trajectory
+from blf_dsc_controller.reference.turns import reference_near
 from blf_dsc_controller.run import Contact
 from blf_dsc_controller.supervision import retuning
 from blf_dsc_controller.supervision.contact import contact_of
@@ -62,6 +63,7 @@ from blf_dsc_controller.supervision.stop_speed import StopSpeed
 from blf_dsc_controller.supervision.supervisor import Fault, Phase, Reason, Supervisor
 from blf_dsc_controller.supervision.support import check_support
 from blf_dsc_controller.supervision.velocity import Velocity
+from blf_dsc_controller.supervision.wraps import Wraps
 
 Vector = NDArray[np.float64]
 _NANO = 1e-9
@@ -107,6 +109,7 @@ class Guard:
         start_stamp: stamp of t = 0 [ns]; -1 before the first start.
         last_stamp: stamp of the law's last sample [ns].
         settled: end of the approach or of the blend into a trajectory [s].
+        turned: how the configured reference is shifted by whole turns; empty if it is not.
         compute_time: computation time of the last sample [s].
     """
 
@@ -135,9 +138,11 @@ class Guard:
         self.foreign = 0
         self.start_stamp = self.last_stamp = -1
         self.settled = self.compute_time = 0.0
+        self.turned = ''
         tells = config.learning.tell_drive
         self._drive_loads = DriveLoads(config) if tells else None
         self._velocity = Velocity(n) if config.safety.velocity == 'estimated' else None
+        self._wraps = Wraps(config)
         self._safe_torque = SafeTorque(n)
         self._safe_torque.scale = self.controller.state.gain_scale
         self._seen = 0  # ns, stamp of the last state, used or not
@@ -174,12 +179,14 @@ class Guard:
         self.journal.stamp = stamp
         self._take_stamp(stamp)
         self.watchdog.restart()
+        measurement, wrapped = self._counted(measurement)
         if self._velocity is not None:
             self._velocity.replace(stamp, measurement)
         if self.supervisor.uses_states:
             fault = self.states.check(self.config.safety, stamp)
             if fault is SKIP:
                 return None
+            fault = fault or wrapped
             if fault is None and self.supervisor.running:
                 fault = self._clock_step(measurement)
             if fault is None:
@@ -191,6 +198,14 @@ class Guard:
         elif self._is_silenced(gap):
             return None
         return self._safe_at(stamp, measurement)
+
+    def _counted(self, measurement: Vector) -> tuple[Vector, Fault | None]:
+        """Return a measurement with turns counted on, and a wrap that cannot be one."""
+        fastest = self.config.safety.velocity_limit
+        counted, wrapped = self._wraps.counted(measurement, self._gap, fastest)
+        if wrapped is not None and self.supervisor.phase is Phase.STARTING:
+            self._wraps.restart()
+        return counted, wrapped
 
     def _is_silenced(self, gap: float) -> bool:
         """Whether to stay silent while not in command, after a long silence.
@@ -324,7 +339,7 @@ class Guard:
     def observe(self, stamp: int, measurement: Vector) -> None:
         """Compare velocities with positions for a state that is held back."""
         self._take_stamp(stamp)
-        self._compare_velocities(stamp, measurement)
+        self._compare_velocities(stamp, self._counted(measurement)[0])
 
     def _compare_velocities(self, stamp: int, measurement: Vector) -> None:
         is_next = 0.0 < self._gap < _IN_A_ROW
@@ -379,6 +394,7 @@ class Guard:
                 self.refuse(error)
                 return False
             self.start_stamp = stamp
+            _, self.turned = reference_near(self.config, q)
         self.journal.note(EventType.START, resumed=resumed)
         self.last_stamp = stamp - self.config.sample_time_ns
         self.watchdog.switch(self.config.safety.watchdog, stamp)
@@ -446,6 +462,7 @@ class Guard:
         self.journal.messages += count
         self.journal.commands += count
         self.has_sample = True
+        self._wraps.follow(measurement)
         self._safe_torque.last.take(stamp, measurement)
         self._safe_torque.commanded[:] = self.controller.state.torque
         self.states.advance(stamp)
@@ -702,6 +719,10 @@ class Guard:
         self.silenced = self.holds = False
         self.has_sample = False
         self._clean = True
+        if self._wraps.restart():  # to positions that differ from those before
+            self.controller.checks.readings[0] = 0.0
+            if self._velocity is not None:
+                self._velocity = Velocity(self._n)
         if self._safe_torque.last.age >= self.config.safety.fade_time:
             # else a torque may have to fade, which a driver must not hold
             self.watchdog.wait()

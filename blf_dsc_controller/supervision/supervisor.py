@@ -38,6 +38,7 @@ class Reason(str, Enum):
     FIELD_MISSING = 'field missing'
     NOT_FINITE = 'measurement not finite'
     VELOCITY = 'velocity not plausible'
+    WRAPPED = 'position wrapped'
     START_REJECTED = 'start rejected'
     OUTSIDE_BOUND = OUTSIDE_BOUND
     NO_EFFECT = 'commands without effect'

@@ -13,6 +13,7 @@ from blf_dsc_controller.law.factory import settings_of_config
 from blf_dsc_controller.supervision.model_torque import model_torque
 from blf_dsc_controller.supervision.safe_torque import SafeTorque
 from blf_dsc_controller.supervision.state_watchdog import LONG_SILENCE
+from blf_dsc_controller.supervision.wraps import Wraps
 
 Vector = NDArray[np.float64]
 
@@ -57,6 +58,7 @@ class TorqueWatchdog:
         self._timeout = timeout
         self._safe = SafeTorque(len(config.joints))
         self.config = config
+        self._wraps = Wraps(config)
         self.configure(config)
         self.stamp = -1
         self._commanded_stamp = -1  # of the last state before the last torque
@@ -71,6 +73,7 @@ class TorqueWatchdog:
         """Use another configuration of the same joints, from the next torque on."""
         if config.robot != self.config.robot:
             self._safe.load[:] = 0.0  # what was missing was missing from another model
+            self._wraps = Wraps(config)
         self.config = config
         self._settings = settings_of_config(config)
         self._estimate = self._settings.initial_estimate
@@ -90,6 +93,8 @@ class TorqueWatchdog:
     def state(self, stamp: int, measurement: Vector, now: float) -> None:
         """Take a joint state [q, dq, effort] (3n,) with its stamp [ns]."""
         limit = self.config.safety.velocity_limit
+        gap = (stamp - self.stamp) * 1e-9
+        measurement, _ = self._wraps.counted(measurement, gap, limit)
         self._safe.last.take_usable(stamp, measurement, limit, self.config.sample_time)
         if now - self._seen_at > LONG_SILENCE:
             self._forget_controller()

@@ -1,0 +1,298 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Values that no arm can mean: those of another unit, or of another arm.
+
+What is allowed follows from the arm: from the efforts of its drives, its reach, and the
+velocities and ranges of its joints.  A value beyond is refused, unless its parameter is
+listed in `insist`: nobody should have to find out in motion that a bound was in degrees.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Iterator, Sequence
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from blf_dsc_controller.arms.tuning import UNKNOWN_EFFORT
+from blf_dsc_controller.arms.urdf import Chain
+from blf_dsc_controller.configuration.schema import suggestion
+from blf_dsc_controller.configuration.tool_bound import ANGLE, POSITION
+
+if TYPE_CHECKING:
+    from blf_dsc_controller.configuration.controller import ControllerConfig
+    from blf_dsc_controller.configuration.plant import PlantConfig
+    from blf_dsc_controller.configuration.robot import Robot
+
+CHECKED = (
+    'torque.limit',
+    'safety.velocity_limit',
+    'limits.velocity',
+    'limits.position_lower',
+    'limits.position_upper',
+    'barrier.bound',
+    POSITION,
+    ANGLE,
+    'robot.gravity',
+    'robot.payload',
+    'robot.drive_payload',
+    'robot.drive_payload_centre',
+    'robot.rotor_inertia',
+    'robot.coulomb',
+    'robot.viscous',
+    'sensor.resolution',
+    'sensor.position_noise',
+    'actuator.time_constant',
+)
+"""Parameters whose values are compared with the arm."""
+
+_ROUNDED = 1.001  # defaults have four digits
+_BROKEN = 10.0  # times the speed of the fastest joint: no measurement
+_UNKNOWN = 100.0  # times the speed of motions, where the speed of the joints is unknown
+_PAST = 0.1  # rad or m, by which an arm may be past the limits of its URDF
+_QUARTER = 0.5 * math.pi  # rad: an arm so far from its reference points elsewhere
+_SOFTEST = 0.35  # rad or m, the widest bound that gains for an unknown arm need
+_WIDEST = 0.1  # of the reach
+_HEAVIEST = 30.0  # m/s^2, on no planet
+_CARRIED = 10.0  # times what the strongest joint holds at full reach
+_SLOWEST = 1.0  # rad/s^2, of a free drive at its rated torque
+_COARSEST = 0.01  # of the range
+_LONGEST = 0.1  # s, as `robot.lag`
+
+
+class _Doubt(NamedTuple):
+    """A value that cannot be meant."""
+
+    name: str  # of its parameter
+    text: str  # what it got, what the arm allows, and what may be meant
+
+
+def problems_of_controller(config: ControllerConfig) -> Iterator[str]:
+    """Yield what no arm can mean among the parameters of a controller."""
+    yield from _unknown_words(config.insist)
+    chain = None
+    if config.model == 'urdf':
+        chain = config.robot.chain(config.joints)
+        of_robot = list(_refused(_of_robot(config.robot, chain), config.insist))
+        if of_robot:  # from which the others follow
+            yield from of_robot
+            return
+    yield from _refused(_of_controller(config, chain), config.insist)
+
+
+def _of_controller(config: ControllerConfig, chain: Chain | None) -> Iterator[_Doubt]:
+    yield from _of_velocity(config, chain)
+    yield from _of_errors(config)
+    if chain is not None:
+        yield from _of_drives(config, chain)
+        yield from _of_ranges(config, chain)
+        yield from _of_tool(config, chain)
+
+
+def problems_of_plant(config: PlantConfig) -> Iterator[str]:
+    """Yield what no arm can mean among the parameters of a simulated one."""
+    yield from _unknown_words(config.insist)
+    yield from _refused(_of_sensors(config), config.insist)
+
+
+def _unknown_words(insist: Iterable[str]) -> Iterator[str]:
+    """Yield a problem for each entry of `insist` whose value is not checked."""
+    for name in insist:
+        if name not in CHECKED:
+            yield (
+                f'insist: got {name}, whose value is not compared with the arm'
+                f'{suggestion(name, CHECKED)}'
+            )
+
+
+def _refused(doubts: Iterable[_Doubt], insist: Sequence[str]) -> Iterator[str]:
+    """Yield the problem of each parameter, of the first joint that it has one for."""
+    first: dict[str, str] = {}
+    for name, text in doubts:
+        first.setdefault(name, text)
+    for name, text in first.items():
+        if name not in insist:
+            yield f'{name}: {text}; if it is meant, list {name} in insist'
+
+
+def _of_drives(config: ControllerConfig, chain: Chain) -> Iterator[_Doubt]:
+    """Check torques against the efforts of the drives."""
+    strongest = max(UNKNOWN_EFFORT, config.robot.largest_effort(chain))
+    for joint, limit in zip(chain.joints, config.torque.limit, strict=True):
+        allowed = joint.effort
+        source = 'the URDF gives its drive'
+        if math.isinf(allowed):
+            allowed = strongest
+            source = 'no drive of an arm of this weight has more than'
+        if limit > _ROUNDED * allowed:
+            text = f'got {limit:g} N m for {joint.name}, but {source} {allowed:.4g} N m'
+            yield _Doubt('torque.limit', text)
+
+
+def _of_velocity(config: ControllerConfig, chain: Chain | None) -> Iterator[_Doubt]:
+    """Check the velocity of a broken measurement against the speed of the joints."""
+    limit = config.safety.velocity_limit
+    joints = chain.joints if chain else ()
+    speeds = [joint.velocity for joint in joints if math.isfinite(joint.velocity)]
+    fastest = max(speeds, default=max(config.limits.velocity))
+    if limit > (_BROKEN if speeds else _UNKNOWN) * fastest:
+        yield _Doubt(
+            'safety.velocity_limit',
+            f'got {limit:g} rad/s, but the fastest joint has {fastest:.3g} rad/s'
+            f'{"" if speeds else " (limits.velocity)"}: {_of_degrees(limit)}',
+        )
+
+
+def _of_ranges(config: ControllerConfig, chain: Chain) -> Iterator[_Doubt]:
+    """Check the limits of motions against those of the URDF."""
+    limits = config.limits
+    for joint, fastest in zip(chain.joints, limits.velocity, strict=True):
+        if fastest > _ROUNDED * joint.velocity:
+            yield _Doubt(
+                'limits.velocity',
+                f'got {fastest:g} for {joint.name}, but the URDF allows '
+                f'{joint.velocity:g}: {_unit_of(joint.kind, fastest)}',
+            )
+    for joint, lower, upper in zip(
+        chain.joints, limits.position_lower, limits.position_upper, strict=True
+    ):
+        for name, value, is_past in (
+            ('limits.position_lower', lower, lower < joint.lower - _PAST),
+            ('limits.position_upper', upper, upper > joint.upper + _PAST),
+        ):
+            if is_past:
+                yield _Doubt(
+                    name,
+                    f'got {value:g} for {joint.name}, whose range in the URDF is '
+                    f'{joint.lower:g} to {joint.upper:g}: {_unit_of(joint.kind, value)}',
+                )
+
+
+def _of_errors(config: ControllerConfig) -> Iterator[_Doubt]:
+    """Check the bounds on errors against the ranges of the joints."""
+    if config.barrier.bounds_tool:  # from which they follow
+        return
+    limits = config.limits
+    for joint, kind, bound, lower, upper in zip(
+        config.joints,
+        config.robot.kinds(config.joints),
+        config.barrier.bound,
+        limits.position_lower,
+        limits.position_upper,
+        strict=True,
+    ):
+        allowed = 0.5 * (upper - lower)
+        if kind != 'prismatic':
+            allowed = min(allowed, _QUARTER)
+        if bound > max(allowed, _SOFTEST):
+            yield _Doubt(
+                'barrier.bound',
+                f'got {bound:g} for {joint}, but past {allowed:.3g}, half of its range or a '
+                f'quarter turn, nothing is bounded: {_unit_of(kind, bound)}',
+            )
+
+
+def _of_tool(config: ControllerConfig, chain: Chain) -> Iterator[_Doubt]:
+    """Check the bounds at the tool against the reach of the arm."""
+    reach = chain.reach
+    bound = config.barrier.tool_bound
+    if bound > _WIDEST * reach > 0.0:
+        yield _Doubt(
+            POSITION,
+            f'got {bound:g} m, more than a tenth of the reach, {reach:.3g} m: is it in mm? '
+            f'Give {1e-3 * bound:g}',
+        )
+    angle = config.barrier.tool_angle_bound
+    if angle > _QUARTER:
+        yield _Doubt(
+            ANGLE, f'got {angle:g} rad, more than a quarter turn: {_of_degrees(angle)}'
+        )
+
+
+def _of_robot(robot: Robot, chain: Chain) -> Iterator[_Doubt]:
+    """Check what is said of the robot against its efforts and its reach."""
+    if (gravity := float(np.linalg.norm(robot.gravity))) > _HEAVIEST:
+        text = f'got {gravity:.4g} m/s^2: is it in mm/s^2? Give {1e-3 * gravity:.4g}'
+        yield _Doubt('robot.gravity', text)
+        return
+    yield from _of_payloads(robot, chain)
+    efforts = robot.efforts(chain)
+    speeds = [min(joint.velocity, 1.0) for joint in chain.joints]
+    for name, unit, given, most in (
+        ('rotor_inertia', 'kg m^2', robot.rotor_inertia, efforts / _SLOWEST),
+        ('coulomb', 'N m', robot.coulomb, efforts),
+        ('viscous', 'N m s/rad', robot.viscous, efforts / speeds),
+    ):
+        for joint, value, allowed in zip(
+            chain.joints, given, most.tolist(), strict=False
+        ):
+            if value > allowed:
+                yield _Doubt(
+                    f'robot.{name}',
+                    f'got {value:g} {unit} for {joint.name}, which its drive could hardly move: '
+                    f'its effort allows {allowed:.3g} {unit}',
+                )
+
+
+def _of_payloads(robot: Robot, chain: Chain) -> Iterator[_Doubt]:
+    """Check loads against what the arm can hold, and their centre against its reach."""
+    reach = chain.reach
+    centre = float(np.linalg.norm(robot.drive_payload_centre))
+    if centre > reach > 0.0:
+        yield _Doubt(
+            'robot.drive_payload_centre',
+            f'got a centre {centre:g} m from the tip, farther than the arm reaches, '
+            f'{reach:.3g} m: is it in mm? Give '
+            f'{[1e-3 * each for each in robot.drive_payload_centre]}',
+        )
+    most = _CARRIED * robot.carried(chain)
+    for name, mass, default in (
+        ('payload', robot.payload, type(robot).payload),
+        ('drive_payload', robot.drive_payload, 0.0),
+    ):
+        if mass > most > 0.0 and mass != default:
+            yield _Doubt(
+                f'robot.{name}',
+                f'got {mass:g} kg, over ten times what the strongest joint holds at full '
+                f'reach, {most / _CARRIED:.3g} kg: is it in g? Give {1e-3 * mass:g}',
+            )
+
+
+def _of_sensors(config: PlantConfig) -> Iterator[_Doubt]:
+    """Check the sensors and actuators of a simulated arm."""
+    sensor = config.sensor
+    ranges = [math.tau]
+    if config.robot.urdf:
+        joints = config.robot.chain(config.joints).joints
+        ranges += [joint.upper - joint.lower for joint in joints]
+    coarsest = _COARSEST * min(ranges)
+    if sensor.resolution > coarsest:
+        bits = sensor.resolution
+        yield _Doubt(
+            'sensor.resolution',
+            f'got {bits:g} rad, with which the range of a joint has fewer than a hundred '
+            f'steps: is it in bits? Give {math.tau / 2.0 ** min(bits, 64.0):.3g}',
+        )
+    if sensor.position_noise > coarsest:
+        yield _Doubt(
+            'sensor.position_noise',
+            f'got {sensor.position_noise:g} rad rms, more than a hundredth of the range of a '
+            f'joint: {_of_degrees(sensor.position_noise)}',
+        )
+    lag = config.actuator.time_constant
+    if lag > _LONGEST:
+        yield _Doubt(
+            'actuator.time_constant',
+            f'got {lag:g} s, too long for any loop: is it in ms? Give {1e-3 * lag:g}',
+        )
+
+
+def _unit_of(kind: str, value: float) -> str:
+    """Ask whether a value of a joint is of another unit."""
+    if kind == 'prismatic':
+        return f'is it in mm? Give {1e-3 * value:g}'
+    return _of_degrees(value)
+
+
+def _of_degrees(value: float) -> str:
+    return f'is it in degrees? Give {math.radians(value):.3g}'

@@ -1,0 +1,87 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Positions that wrap: encoders that count within one turn, as (-pi, pi] or [0, 2 pi).
+
+Law, checks and differenced velocities need positions that go on.  Turns are counted
+from the first state on.  For a continuous joint this is all.  Another joint has a range,
+in which a driver that wraps cannot tell where it is: this is a fault.  Its turns are
+counted until the next start all the same, since the safe torque needs its motion, too.
+"""
+
+from __future__ import annotations
+
+from math import nan, pi, tau
+
+import numpy as np
+from numpy.typing import NDArray
+
+from blf_dsc_controller.configuration.controller import ControllerConfig
+from blf_dsc_controller.reference.turns import turns_freely
+from blf_dsc_controller.supervision.supervisor import Fault, Reason
+
+Vector = NDArray[np.float64]
+# s between two states, at most: later, the arm may have been moved by hand
+_IN_A_ROW = 0.1
+_MOST = 1000.0  # turns: a position farther away is none
+
+
+class Wraps:
+    """Counts the turns of an arm's joints, one state after the other."""
+
+    def __init__(self, config: ControllerConfig) -> None:
+        kinds = config.robot.kinds(config.joints)
+        n = len(kinds)
+        self._joints = config.joints
+        self._is_free = turns_freely(config)
+        self._is_bound = np.array([kind == 'revolute' for kind in kinds])
+        self._offset = np.zeros(n)  # rad, whole turns
+        self._last = np.full(n, nan)  # rad, counted on
+        self._counted = np.zeros(3 * n)
+
+    def counted(
+        self, measurement: Vector, gap: float, fastest: float
+    ) -> tuple[Vector, Fault | None]:
+        """Return a measurement [q, dq, effort] (3n,) with turns counted on, and its fault.
+
+        It is the given one unless a turn has been counted.  `gap` [s] is the time since
+        the state before, `fastest` [rad/s] the largest speed of a joint.
+        """
+        n = self._last.size
+        q = measurement[:n] + self._offset
+        step = q - self._last
+        fault = None
+        if (np.abs(step) > pi).any():
+            turns = -np.rint(np.nan_to_num(step, posinf=0.0, neginf=0.0) / tau)
+            turns[np.abs(turns) > _MOST] = 0.0
+            moved = np.abs(step + tau * turns)
+            is_wrap = 0.0 < gap < _IN_A_ROW and moved <= fastest * gap
+            is_bound = self._is_bound & is_wrap & (turns != 0.0)
+            if is_bound.any():
+                fault = self._fault(int(np.argmax(is_bound)), measurement)
+            self._offset += tau * turns * (self._is_free | is_bound)
+            q = measurement[:n] + self._offset
+        self._last = np.where(np.isfinite(q), q, self._last)
+        if not self._offset.any():
+            return measurement, fault
+        self._counted[:] = measurement
+        self._counted[:n] = q
+        return self._counted, fault
+
+    def follow(self, measurement: Vector) -> None:
+        """Take a measurement that has been counted on."""
+        self._last = measurement[: self._last.size].copy()
+
+    def restart(self) -> bool:
+        """Believe the positions of joints that have a range; return whether they change."""
+        wrong = self._is_bound & (self._offset != 0.0)
+        self._offset[wrong] = 0.0
+        self._last[wrong] = nan
+        return bool(wrong.any())
+
+    def _fault(self, i: int, measurement: Vector) -> Fault:
+        before = self._last[i] - self._offset[i]
+        return Fault(
+            Reason.WRAPPED,
+            f'the position of joint {self._joints[i]!r} has wrapped from {before:.4g} to '
+            f'{measurement[i]:.4g} rad: let its driver count turns, or, if it turns without end, '
+            'make it continuous in the URDF',
+        )
