@@ -54,13 +54,14 @@ class RosRig:
         self.context = _joined(args)
         self.executor = EventsExecutor(context=self.context)
         self.nodes = []
-        self.tester = self._keep(
+        self.tester = self.keep(
             rclpy.create_node('record_tester', context=self.context)
         )
         # by the name of their service; kept, since events may be pending
         self._clients = {}
 
-    def _keep(self, node):
+    def keep(self, node):
+        """Spin a node, until the end or `kill`."""
         self.nodes.append(node)
         self.executor.add_node(node)
         return node
@@ -93,7 +94,7 @@ class RosRig:
             cli_args=[],
             **({'steady': clock} if make in (PlantNode, ControllerNode) else {}),
         )
-        return self._keep(node)
+        return self.keep(node)
 
     def loop(self, plant=None, controller=None, **options):
         """Start plant and controller in lock-step; return both."""
@@ -131,6 +132,15 @@ class RosRig:
         )
         return messages
 
+    def driver(self):
+        """Start a node that takes torques, as an effort controller does."""
+        node = self.keep(rclpy.create_node('driver', context=self.context))
+        topic = topics.COMMANDS
+        quality = qos_profile(topic.requested)
+        node.create_subscription(
+            message_class(topic.type), topic.relative, lambda _: None, quality
+        )
+
     def publisher(self, topic):
         """Return a publisher of the test on a topic of another node."""
         return self.tester.create_publisher(
@@ -157,6 +167,26 @@ class RosRig:
         request = ChangeState.Request(transition=Transition(id=transition))
         name = f'{node.get_fully_qualified_name()}/change_state'
         return self.call(ChangeState, name, request).success
+
+
+class PatientClock:
+    """Steady clock [ns], slower than real time, that stands while nobody reads it.
+
+    So the arm does not fall on while the computer lets this process and its watchdog wait.
+    """
+
+    SLOWER = 5  # times
+    MOST = 2_000_000  # ns between two readings: a sample of the arm
+
+    def __init__(self):
+        self.now = 10**9
+        self._read = time.monotonic_ns()
+
+    def __call__(self):
+        read = time.monotonic_ns()
+        self.now += min((read - self._read) // self.SLOWER, self.MOST)
+        self._read = read
+        return self.now
 
 
 class FakeClock:

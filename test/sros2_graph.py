@@ -100,6 +100,9 @@ def live():
             # With robot.urdf: topic://robot_description, a separate node waits for that
             # topic.
             found['blf_dsc_controller']['subscribe'].append('/robot_description')
+            # Before its start it listens whether another node commands.
+            commands = '/blf_dsc_controller/commands'
+            found['blf_dsc_controller']['subscribe'].append(commands)
             hidden = '/_blf_dsc_controller_subscriptions/get_type_description'
             found['blf_dsc_controller']['reply'].insert(0, hidden)
             ros.executor.remove_node(recorder)

@@ -7,7 +7,6 @@ import os
 import signal
 import subprocess
 import sys
-import time
 from functools import partial
 
 import numpy as np
@@ -18,7 +17,7 @@ pytest.importorskip('rclpy', reason='needs ROS 2')
 from diagnostic_msgs.msg import DiagnosticStatus
 from random_arm import CONFIG
 from rclpy.parameter import Parameter
-from ros_rig import JOINTS, START, FakeClock
+from ros_rig import JOINTS, START, FakeClock, PatientClock, values
 from std_msgs.msg import String
 
 from blf_dsc_controller import load_loop
@@ -42,26 +41,6 @@ FR3 = CONFIG / 'fr3.yaml'
 UR5E = CONFIG / 'ur5e_driver.yaml'
 LOG = topics.STREAM, topics.STREAM
 ENDS = {'killed': signal.SIGKILL, 'stopped': signal.SIGSTOP, 'crashed': signal.SIGSEGV}
-
-
-class PatientClock:
-    """Steady clock [ns], slower than real time, that stands while nobody reads it.
-
-    So the arm does not fall on while the computer lets this process and its watchdog wait.
-    """
-
-    SLOWER = 5  # times
-    MOST = 2_000_000  # ns between two readings: a sample of the arm
-
-    def __init__(self):
-        self.now = 10**9
-        self._read = time.monotonic_ns()
-
-    def __call__(self):
-        read = time.monotonic_ns()
-        self.now += min((read - self._read) // self.SLOWER, self.MOST)
-        self._read = read
-        return self.now
 
 
 @pytest.fixture
@@ -212,16 +191,24 @@ class ByHand:
         """Publish an event of the controller, and wait until the watchdog knows it."""
         self._events.note(event, **content)
         known = []
-        take_event = self.node._take_event
+        heed = self.node._heed
 
-        def take(each):
-            take_event(each)
+        def heed_and_note(each):
+            heed(each)
             known.append(each)
 
-        self.node._take_event = take
+        self.node._heed = heed_and_note
         self._journal.publish(self._events.pending.popleft().encode())
         self.ros.until(lambda: known)
-        self.node._take_event = take_event
+        self.node._heed = heed
+
+    def restart(self, config, *, starts=True):
+        """Start another controller, which commands with the next state if it `starts`."""
+        self._events = Journal()
+        self.note(EventType.CONFIGURE, parameters=flatten(config))
+        self.note(EventType.ACTIVATE)
+        if starts:
+            self.note(EventType.START, resumed=False)
 
     def go_on(self, seconds, *, commands):
         """Send states, each with a torque of the controller if it `commands`."""
@@ -235,6 +222,7 @@ class ByHand:
             if commands:
                 encoder = Float64MultiArrayEncoder(len(self._q))
                 self._commands.publish(encoder.encode(self.holding))
+                self._events.commands += 1
                 self.ros.until(
                     lambda: (
                         self.watchdog._commanded_stamp == self._stamp
@@ -277,7 +265,7 @@ def test_watchdog_acts_by_the_parameters_in_force(ros, given, changed, restarted
     yesterday = loop.torque()
     loop.go_on(0.01, commands=True)
     if restarted:
-        loop.note(EventType.CONFIGURE, parameters=flatten(after))
+        loop.restart(after)
     else:
         loop.note(EventType.PARAMETERS, parameters=differences(before, after))
     loop.go_on(0.05, commands=True)
@@ -297,7 +285,7 @@ def test_watchdog_acts_by_what_the_drives_of_a_restarted_controller_compensate(r
     assert np.abs(loop.holding).max() > 10.0
     loop.holding[:] = 0.0  # as the drives do it
     loop.go_on(0.005, commands=True)
-    loop.note(EventType.CONFIGURE, parameters=flatten(right))
+    loop.restart(right)
     loop.go_on(0.005, commands=True)
     np.testing.assert_allclose(loop.torque(), 0.0, atol=0.1)
 
@@ -336,6 +324,94 @@ def test_watchdog_takes_over_from_a_controller_that_ends_in_motion(ros):
     loop.go_on(0.02, commands=True)
     loop.note(EventType.RELEASE, resting=False)
     assert np.abs(loop.torque()).min() > 0.5
+
+
+REFUSED = EventType.STOP, {'reason': 'start rejected', 'text': 'of the test'}
+OTHER_FILES = {
+    'the same file': HOLDING,
+    'a file that drops the arm': {'safety.torque': 'zero'},
+    'the file of another arm': {'joints': ['left', 'right'], **HOLDING},
+}
+
+
+@pytest.mark.parametrize('file', OTHER_FILES)
+def test_refused_start_of_a_controller_leaves_the_watchdog_in_command(ros, file):
+    """A restarted one after a kill: its configuration and its end are its own."""
+    loop = ByHand(ros, build(ControllerConfig, HOLDING))
+    loop.go_on(0.02, commands=True)
+    held = loop.torque()
+    loop.restart(build(ControllerConfig, OTHER_FILES[file]), starts=False)
+    loop.note(REFUSED[0], **REFUSED[1])
+    loop.note(EventType.RELEASE, resting=True)
+    np.testing.assert_allclose(loop.torque(), held, atol=0.1)
+    assert loop.watchdog.takeovers == 1
+    assert np.abs(held).min() > 0.5
+
+
+def test_second_controller_that_does_not_start_changes_nothing_for_the_first(ros):
+    """Its journal is on the same topic."""
+    loop = ByHand(ros, build(ControllerConfig, HOLDING))
+    loop.go_on(0.02, commands=True)
+    first = loop._events
+    loop.restart(build(ControllerConfig, {'safety.torque': 'zero'}), starts=False)
+    loop.note(EventType.RELEASE, resting=True)
+    loop._events = first
+    loop.note(EventType.PARAMETERS, parameters={'torque.limit': [15.0, 9.0]})
+    loop.go_on(0.02, commands=True)
+    assert loop.watchdog.config.torque.limit == (15.0, 9.0)
+    assert np.abs(loop.torque()).min() > 0.5
+
+
+@pytest.mark.parametrize('event', [WITHDRAWN, ENDED], ids=lambda event: event[0])
+def test_watchdog_in_command_stands_down_for_a_torque_alone(ros, event):
+    """The controller was stopped for a while, and is confused: the watchdog holds the arm."""
+    loop = ByHand(ros, build(ControllerConfig, HOLDING))
+    loop.go_on(0.02, commands=True)
+    held = loop.torque()
+    loop.note(event[0], **event[1])
+    np.testing.assert_allclose(loop.torque(), held, atol=0.1)
+    assert loop.watchdog.takeovers == 1
+
+
+def test_watchdog_watches_once_it_has_seen_a_state_and_a_torque(ros):
+    """And somebody takes its torques: until then it could do nothing."""
+    state = ros.listen(topics.WATCHDOG_STATE)
+
+    def says(text, ready):
+        last = state[-1] if state else DiagnosticStatus()
+        return text in last.message and values(last).get(topics.READY) == ready
+
+    loop = ByHand(ros, build(ControllerConfig, HOLDING))
+    ros.driver()
+    ros.until(lambda: says('not ready: no joint states arrive', 'False'))
+    loop.go_on(0.01, commands=False)
+    ros.until(lambda: says('ready: waiting for the first torque', 'True'))
+    loop.go_on(0.01, commands=True)
+    ros.until(lambda: says('watching', 'True'))
+    loop.torque()
+    ros.until(lambda: says('commands the safe torque', 'True'))
+    loop.go_on(0.01, commands=True)
+    loop.pause(3.0)
+    loop.go_on(0.01, commands=False)
+    ros.until(lambda: says('ready: waiting for the first torque', 'True'))
+
+
+def test_watchdog_whose_torques_nobody_takes_is_not_ready(ros):
+    node = ros.add(WatchdogNode)
+    journal, states = ros.publisher(topics.JOURNAL), ros.publisher(topics.JOINT_STATES)
+    ros.until(
+        lambda: journal.get_subscription_count() and states.get_subscription_count()
+    )
+    events = Journal()
+    events.note(EventType.CONFIGURE, parameters=flatten(build(ControllerConfig, {})))
+    journal.publish(events.pending.popleft().encode())
+    ros.until(lambda: node.watchdog is not None)
+    state = JointStateEncoder(JOINTS).encode(10**9, START, np.zeros(2), np.zeros(2))
+    states.publish(state)
+    ros.until(lambda: node.watchdog.has_state)
+    assert 'nobody subscribes' in node._status().text
+    ros.driver()
+    ros.until(lambda: states.publish(state) or node._status().is_ready)
 
 
 def test_watchdog_stays_silent_when_states_are_back_after_a_long_silence(ros):

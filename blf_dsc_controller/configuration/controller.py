@@ -185,8 +185,12 @@ class Safety:
     )
     expect_watchdog: bool = parameter(
         False,
-        'report that the node torque_watchdog is missing, also before one has been seen',
+        'wait for the node torque_watchdog before the first torque; report if it is missing',
         read_only='it says which processes belong together',
+    )
+    other_commands: Literal['refuse', 'allow'] = parameter(
+        'refuse',
+        'refuse to start while another node commands the arm, or start beside it',
     )
     velocity: Literal['measured', 'estimated'] = parameter(
         'measured',

@@ -95,6 +95,14 @@ STATE = Topic(
     LATCHED_QUALITY,
     LATCHED_QUALITY,
 )
+WATCHDOG_STATE = Topic(
+    WATCHDOG_NODE,
+    '~/state',
+    'diagnostic_msgs/msg/DiagnosticStatus',
+    LATCHED_QUALITY,
+    LATCHED_QUALITY,
+)
+"""Whether the watchdog is ready; not in TOPICS, as no loop of one process has it."""
 MONITOR = Topic(CONTROLLER, '~/monitor', JOINT_STATE, HISTORY, STREAM)
 EXTERNAL_TORQUE = Topic(CONTROLLER, '~/external_torque', JOINT_STATE, STREAM, STREAM)
 """Of each joint, and half of its 95 % interval as that of `joint +-`."""
@@ -179,7 +187,10 @@ LATE_STEPS = 'late_steps'
 # In /diagnostics.
 REJECTED = 'rejected '  # followed by the column that is not estimated
 
-# In ~/state.
+# In ~/state of the watchdog.
+READY = 'ready'  # whether it can take over
+
+# In ~/state of the controller.
 PHASE = 'phase'
 REASON = 'reason'
 STOPS = 'stops'  # since the node was configured

@@ -24,6 +24,7 @@ from blf_dsc_controller.nodes import parameters, process
 from blf_dsc_controller.nodes.diagnostics import ControllerStatus
 from blf_dsc_controller.nodes.lifecycle import LoopNode
 from blf_dsc_controller.nodes.load_service import LoadService
+from blf_dsc_controller.nodes.start_conditions import StartConditions
 from blf_dsc_controller.nodes.trajectory_action import TrajectoryAction, offered_action
 from blf_dsc_controller.nodes.trajectory_input import motion_input_of
 from blf_dsc_controller.nodes.watchdog_presence import WatchdogPresence
@@ -80,6 +81,7 @@ class ControllerNode(LoopNode[ControllerConfig]):
         self._status = ControllerStatus(self, joints)
         self._action: TrajectoryAction | None = None
         self._watchdog = WatchdogPresence(expected=self.config.safety.expect_watchdog)
+        self._conditions = StartConditions(self, self._watchdog, self._steady)
         self._changes = parameters.on_change(
             self, type(self.config), self._retune, self._problems, self._check
         )
@@ -129,12 +131,14 @@ class ControllerNode(LoopNode[ControllerConfig]):
             inputs = motion_input_of(self, len(joints), lambda: self.guard)
             self._status.trajectories = inputs
             self._action = offered_action(self, inputs, joints)
+        self._conditions.begin(self._outputs[topics.COMMANDS], self.config)
         self._report()
 
     def activate(self) -> None:
         """Take command with the next joint state."""
         self._gate.restart()
         if self.guard is not None:
+            self._begin_again(self.guard)
             self.guard.activate()
         self.get_logger().info(
             f'ready for joint states of {", ".join(self.config.joints)}'
@@ -151,6 +155,7 @@ class ControllerNode(LoopNode[ControllerConfig]):
     def release(self) -> None:
         """Command the torque to leave behind and release the law."""
         self._leave()
+        self._conditions.close()
         self.guard = None
         self._loop = None
         self._report()
@@ -165,6 +170,7 @@ class ControllerNode(LoopNode[ControllerConfig]):
         if self._action is not None:
             self._action.close()
             self._action = None
+        self._conditions.close()
         super().destroy_node()
 
     def ready_to_end(self) -> bool:
@@ -184,6 +190,11 @@ class ControllerNode(LoopNode[ControllerConfig]):
             self._last_seen[1] + _SILENT, self._ends_at
         )
 
+    def _begin_again(self, guard: Guard) -> None:
+        """Look at the conditions of the start, if this node does not command now."""
+        if guard.silenced or not guard.commanding:
+            self._conditions.begin(self._outputs[topics.COMMANDS], self.config)
+
     def _leave(self) -> None:
         """Command the torque that drivers may hold, and release the guard."""
         if self.guard is not None:
@@ -195,6 +206,7 @@ class ControllerNode(LoopNode[ControllerConfig]):
         if self.guard is not None:
             if self.guard.start_error is not None:
                 self._gate.restart()
+            self._begin_again(self.guard)
             self.guard.reset()
         self.failure = None
         self._report()
@@ -206,12 +218,7 @@ class ControllerNode(LoopNode[ControllerConfig]):
         guard = self.guard
         if guard is None:
             return
-        if not self._observed:
-            self._observed = self._is_observed()
-            if not self._observed:
-                self._pending = raw
-                return
-        if self._gate.state is GateState.MEASURING and self._holds_back(guard, raw):
+        if self._waits(guard, raw):
             return
         trajectories = self._status.trajectories
         if trajectories is not None and trajectories.job is not None:
@@ -234,6 +241,25 @@ class ControllerNode(LoopNode[ControllerConfig]):
                 throttle_duration_sec=_WAITING_PERIOD,
             )
         self._report_if_changed(guard)
+
+    def _waits(self, guard: Guard, raw: bytes) -> bool:
+        """Whether a state comes too early to be used."""
+        self._observed = self._observed or self._is_observed()
+        is_starting = guard.supervisor.phase is Phase.STARTING
+        if not self._observed or (is_starting and not self._may_start(guard)):
+            self._pending = raw
+            return True
+        is_measuring = self._gate.state is GateState.MEASURING
+        return is_measuring and self._holds_back(guard, raw)
+
+    def _may_start(self, guard: Guard) -> bool:
+        """Whether the law may start, as far as others are concerned."""
+        try:
+            return self._conditions.are_met(commanding=guard.commanding)
+        except StartError as error:
+            guard.refuse(error)
+            self._report_if_changed(guard)
+            return False
 
     def _holds_back(self, guard: Guard, raw: bytes) -> bool:
         """Whether a state before the start is only for the gate."""

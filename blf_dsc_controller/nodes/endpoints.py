@@ -183,6 +183,20 @@ class PollingTimer:
             self._timer.reset()
 
 
+def is_listener(node_name: str) -> bool:
+    """Whether a node that subscribes to torques applies none, by its name.
+
+    Such are recorders, and what takes its messages by `RawSubscriptions`.
+    """
+    return 'record' in node_name or node_name.endswith(_SUBSCRIPTIONS)
+
+
+def subscriptions_of(owner: Node) -> str:
+    """Return the name of the hidden node with the `RawSubscriptions` of a node."""
+    return f'_{owner.get_name()}{_SUBSCRIPTIONS}'
+
+
+_SUBSCRIPTIONS = '_subscriptions'
 _BATCH = 1000  # messages taken from one topic before the next one's turn
 
 
@@ -204,7 +218,7 @@ class RawSubscriptions:
 
     def __init__(self, owner: Node) -> None:
         self.node = Node(
-            f'_{owner.get_name()}_subscriptions',
+            subscriptions_of(owner),
             context=owner.context,
             use_global_arguments=False,
             enable_rosout=False,

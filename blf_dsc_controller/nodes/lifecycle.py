@@ -28,6 +28,7 @@ from blf_dsc_controller.nodes.endpoints import (
     create_publisher,
     create_steady_timer,
     create_subscription,
+    subscriptions_of,
 )
 from blf_dsc_controller.supervision.state_watchdog import PERIOD
 
@@ -229,6 +230,7 @@ class LoopNode(LifecycleNode, process.PlainNode, Generic[Config]):
         publishers = [*self._outputs.values()]
         others = publishers[0].get_subscription_count()
         others -= self._subscribers(publishers[0], WATCHDOG_NODE)
+        others -= self._subscribers(publishers[0], subscriptions_of(self))
         recorders = (self._subscribers(each, _RECORDER) for each in publishers)
         return others > wanted and (wanted == 0 or min(recorders) >= wanted)
 

@@ -18,7 +18,7 @@ import sys
 import time
 from collections.abc import Callable, Iterable
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -33,25 +33,36 @@ from blf_dsc_controller.messages.codecs import (
     JointStateDecoder,
     MessageError,
 )
-from blf_dsc_controller.messages.journal import Event, EventType, decode
-from blf_dsc_controller.messages.topics import Quality
+from blf_dsc_controller.messages.journal import decode
+from blf_dsc_controller.messages.topics import READY, Quality
 from blf_dsc_controller.nodes.diagnostics import ERROR, OK, WARN, DiagnosticsPublisher
 from blf_dsc_controller.nodes.endpoints import (
     PollingTimer,
     RawMessage,
     RawSubscriptions,
+    create_publisher,
     create_steady_timer,
+    is_listener,
     message_class,
     qos_profile,
 )
 from blf_dsc_controller.nodes.parameters import declare
 from blf_dsc_controller.nodes.process import PlainNode, drain, parameter_files, run
 from blf_dsc_controller.supervision.torque_watchdog import TorqueWatchdog
+from blf_dsc_controller.supervision.watched_journal import Meaning, WatchedJournal
 
 _PERIOD = 0.004  # s, of the checks and of the torques
+_LOOK_PERIOD = 0.05  # s, of looks at whether it is ready
 _REPORT_PERIOD = 1.0  # s
 _DEPTH = 20  # messages of a topic in a period
-_BACK_IN_COMMAND = (EventType.CONFIGURE, EventType.ACTIVATE, EventType.RESET)
+
+
+class Status(NamedTuple):
+    """What the node can do."""
+
+    level: bytes
+    text: str
+    is_ready: bool = False  # whether it can take over from a controller that commands
 
 
 class WatchdogNode(PlainNode):
@@ -72,7 +83,9 @@ class WatchdogNode(PlainNode):
         self._config = declare(self, WatchdogConfig)
         self.watchdog: TorqueWatchdog | None = None
         self.problem = ''
-        self._given: dict[str, Any] = {}  # parameters of the controller
+        self._journal = WatchedJournal()
+        self._given = self._journal.parameters  # those that are watched by
+        self._reported: Status | None = None
         self._states: JointStateDecoder
         self._commands: Float64MultiArrayDecoder
         self._encoder: Float64MultiArrayEncoder
@@ -86,8 +99,10 @@ class WatchdogNode(PlainNode):
             message_class(topic.type), topic.relative, offered
         )
         self._diagnostics = DiagnosticsPublisher(self, ())
+        self._latched = create_publisher(self, topics.WATCHDOG_STATE)
         self._controller = f'{self.get_namespace().rstrip("/")}/{topics.CONTROLLER}'
         self._timer = PollingTimer(self, _PERIOD, self._poll)
+        create_steady_timer(self, _LOOK_PERIOD, self._look)
         create_steady_timer(self, _REPORT_PERIOD, self._report)
         if self._config.armed:
             files = parameter_files(sys.argv) or ['recommended']
@@ -104,30 +119,36 @@ class WatchdogNode(PlainNode):
 
     # The journal.
 
-    def _read_journal(self, messages: Iterable[RawMessage]) -> None:
+    def _read_journal(self, messages: Iterable[RawMessage], now: float) -> None:
         """Follow the controller's configuration, and when its silence is meant."""
-        events = []
+        engaged = self.watchdog is not None and self.watchdog.is_engaged(now)
+        meanings = []
         for message in messages:
             try:
-                events.append(decode(message.raw))
+                event = decode(message.raw)
             except BlfDscError as error:  # of another version, or of somebody else
                 self._report_problem(f'{error}')
-        given = dict(self._given)
+                continue
+            meanings.append(self._journal.take(event, is_engaged=engaged))
+        self._adopt_parameters()
+        for meaning in meanings:
+            self._heed(meaning)
+
+    def _adopt_parameters(self) -> None:
+        """Watch a controller of the parameters that the journal has."""
+        given = self._journal.parameters
+        if given is self._given:
+            return
         try:
-            for event in events:
-                if event.type is EventType.CONFIGURE:
-                    given = {}
-                if event.type is EventType.CONFIGURE or given:
-                    given |= event.content.get('parameters', {})
-            if given != self._given:
-                self._watch(build(ControllerConfig, given, self._controller))
-                self._given = given
+            self._watch(build(ControllerConfig, given, self._controller))
         except BlfDscError as error:
             self._report_problem(f'the journal of {self._controller}: {error}')
-        for event in events:
-            self._take_event(event)
+            self._journal.parameters = self._given
+        else:
+            self.problem = ''
+            self._given = given
 
-    def _take_event(self, event: Event) -> None:
+    def _heed(self, meaning: Meaning) -> None:
         watchdog = self.watchdog
         if watchdog is None:
             self._report_problem(
@@ -136,15 +157,11 @@ class WatchdogNode(PlainNode):
                 'configure or restart the controller'
             )
             return
-        if event.type is EventType.CONFIGURE:
-            self.problem = ''
-        if event.type in _BACK_IN_COMMAND:
+        if meaning is Meaning.BACK:
             watchdog.stand_by()
         is_zero = watchdog.config.safety.torque == 'zero'
-        is_end = event.type is EventType.RELEASE
-        is_orderly = is_end and (is_zero or event.content.get('resting', True))
-        if event.type is EventType.WITHDRAW or is_orderly:
-            watchdog.stand_down()
+        is_meant = meaning is Meaning.SILENT or (meaning is Meaning.LEFT and is_zero)
+        if is_meant and watchdog.stand_down():
             self.get_logger().info(
                 f'{self._controller} has stopped commanding on purpose'
             )
@@ -166,16 +183,12 @@ class WatchdogNode(PlainNode):
         count = len(config.joints)
         if self.watchdog is not None and config.joints == self.watchdog.config.joints:
             self.watchdog.configure(config)
-        else:
-            self._states = JointStateDecoder(config.joints, required=('position',))
-            self._commands = Float64MultiArrayDecoder(count)
-            self._encoder = Float64MultiArrayEncoder(count, topics.WATCHDOG_NODE)
-            self.watchdog = TorqueWatchdog(
-                config, self._config.timeout, armed=self._config.armed
-            )
-        self.get_logger().info(
-            f'ready: {config.safety.torque} torque once {self._controller} is silent for '
-            f'{self._config.timeout:g} s'
+            return
+        self._states = JointStateDecoder(config.joints, required=('position',))
+        self._commands = Float64MultiArrayDecoder(count)
+        self._encoder = Float64MultiArrayEncoder(count, topics.WATCHDOG_NODE)
+        self.watchdog = TorqueWatchdog(
+            config, self._config.timeout, armed=self._config.armed
         )
 
     # States and torques.
@@ -183,17 +196,22 @@ class WatchdogNode(PlainNode):
     def _poll(self) -> bool:
         """Take what has arrived, and command if the controller does not."""
         messages = self._raw_subscriptions.take()
+        now = self._steady() * 1e-9
         was_active = self.watchdog is not None and self.watchdog.active
+        if self.watchdog is not None:
+            # Before the journal: the torque that a controller leaves behind ends nothing.
+            for message in messages:
+                self._take(self.watchdog, message, now)
         journal = [each for each in messages if each.handle is topics.JOURNAL]
         if journal:
-            self._read_journal(journal)
+            self._read_journal(journal, now)
         watchdog = self.watchdog
         if watchdog is None:
             return bool(messages)
-        now = self._steady() * 1e-9
-        for message in messages:
-            self._take(watchdog, message, now)
         self._publish(watchdog.poll(now))
+        if not watchdog.is_engaged(now):
+            self._journal.adopt_next()
+            self._adopt_parameters()
         if watchdog.active != was_active:
             self._change_command(watchdog)
         return bool(messages) or watchdog.active
@@ -230,23 +248,61 @@ class WatchdogNode(PlainNode):
         if torque is not None:
             self._output.publish(self._encoder.encode(torque))
 
-    def _report(self) -> None:
+    # What it can do.
+
+    def _reaches_drives(self) -> bool:
+        """Whether somebody takes its torques, besides those who only listen."""
+        found = self.get_subscriptions_info_by_topic(self._output.topic_name)
+        listening = sum(is_listener(each.node_name) for each in found)
+        return self._output.get_subscription_count() > listening
+
+    def _status(self) -> Status:
+        """Return what this node can do now."""
         watchdog = self.watchdog
-        takeovers = 0 if watchdog is None else watchdog.takeovers
-        level = OK
-        message = 'watching'
-        if watchdog is not None and watchdog.active:
-            level = ERROR
-            message = 'commands the safe torque: the controller is silent'
-        elif self.problem:
-            level = ERROR
-            message = f'{self.problem}; {self._state_of_problem}'
-        elif watchdog is None:
-            level = WARN
-            message = f'waiting for {self._controller}'
-        elif watchdog.stands_down:
-            message = 'the controller is silent on purpose'
-        self._diagnostics.publish(('torque', level, message, {'takeovers': takeovers}))
+        status = self._status_of(watchdog)
+        if self.problem and not (watchdog is not None and watchdog.active):
+            text = f'{self.problem}; {self._state_of_problem}'
+            status = status._replace(level=ERROR, text=text)
+        return status
+
+    def _status_of(self, watchdog: TorqueWatchdog | None) -> Status:
+        if watchdog is None:
+            return Status(WARN, f'waiting for {self._controller}')
+        if watchdog.active:
+            text = 'commands the safe torque: the controller is silent'
+            return Status(ERROR, text, is_ready=True)
+        if watchdog.stands_down:
+            return Status(OK, 'the controller is silent on purpose')
+        lack = self._lack_of(watchdog)
+        if lack:
+            return Status(WARN, f'not ready: {lack}')
+        waiting = f'ready: waiting for the first torque of {self._controller}'
+        return Status(OK, 'watching' if watchdog.watches else waiting, is_ready=True)
+
+    def _lack_of(self, watchdog: TorqueWatchdog) -> str:
+        """Return what this node lacks to take over, or empty."""
+        if not watchdog.has_state:
+            return 'no joint states arrive'
+        return '' if self._reaches_drives() else 'nobody subscribes to its torques'
+
+    def _look(self) -> None:
+        """Report what this node can do if that has changed."""
+        status = self._status()
+        if status == self._reported:
+            return
+        if status.level == OK:
+            self.get_logger().info(status.text)
+        self._report()
+
+    def _report(self) -> None:
+        status = self._status()
+        takeovers = 0 if self.watchdog is None else self.watchdog.takeovers
+        values = {'takeovers': takeovers, READY: status.is_ready}
+        part = ('torque', status.level, status.text, values)
+        message = self._diagnostics.publish(part)
+        if status != self._reported:
+            self._latched.publish(message)
+            self._reported = status
 
 
 main = partial(run, WatchdogNode)

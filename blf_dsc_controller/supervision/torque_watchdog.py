@@ -3,14 +3,14 @@
 
 from __future__ import annotations
 
-from math import inf
+from dataclasses import replace
+from math import inf, isfinite
 
 import numpy as np
 from numpy.typing import NDArray
 
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.law.factory import settings_of_config
-from blf_dsc_controller.supervision.model_torque import model_torque
 from blf_dsc_controller.supervision.safe_torque import SafeTorque
 from blf_dsc_controller.supervision.state_watchdog import LONG_SILENCE
 from blf_dsc_controller.supervision.wraps import Wraps
@@ -29,7 +29,8 @@ class TorqueWatchdog:
 
     It then waits for the next torque of the controller before it watches again, as it
     does after a silence of the states of LONG_SILENCE, and after the controller has
-    said that its silence is meant (`stand_down`).
+    said that its silence is meant (`stand_down`).  While it commands, it is what holds
+    the arm, and only a torque of the controller ends that.
 
     The gravity is that of the initial estimate, and what it lacks (a payload, say) is
     observed from the motion and the controller's torques all along, as in a safe stop.
@@ -67,7 +68,7 @@ class TorqueWatchdog:
         self._commanded_at = inf  # no takeover before the first torque
         self._knows_torque = False
         self._armed = armed
-        model_torque(self._settings, self._estimate, np.zeros(self._settings.n))
+        self._rehearse()
 
     def configure(self, config: ControllerConfig) -> None:
         """Use another configuration of the same joints, from the next torque on."""
@@ -79,10 +80,43 @@ class TorqueWatchdog:
         self._estimate = self._settings.initial_estimate
         self._safe.longest_step = config.sample_time
 
-    def stand_down(self) -> None:
-        """Command nothing until the controller commands again after `stand_by`."""
+    def _rehearse(self) -> None:
+        """Compute a safe torque as after a takeover: its kernels are compiled then."""
+        safe = SafeTorque(self._settings.n)
+        holding = replace(self.config.safety, torque='hold_gravity')
+        rest = np.zeros(3 * self._settings.n)
+        T = self.config.sample_time_ns
+        for k in (1, 2):  # the second one shows an acceleration
+            limit = holding.velocity_limit
+            safe.last.take_usable(k * T, rest, limit, self.config.sample_time)
+            safe.advance(holding, self._settings, self._estimate, 0.0)
+
+    @property
+    def has_state(self) -> bool:
+        """Whether it knows where the arm is."""
+        return self._safe.last.age < self.config.safety.fade_time
+
+    @property
+    def watches(self) -> bool:
+        """Whether it takes over once the controller is silent, or has done so."""
+        is_armed = isfinite(self._commanded_at) and self._knows_torque
+        return self.active or (is_armed and self.has_state and not self.stands_down)
+
+    def is_engaged(self, now: float) -> bool:
+        """Whether it commands, or the controller did just now."""
+        since = now - self._commanded_at  # infinite before the first torque
+        return self.active or 0.0 <= since <= self._timeout
+
+    def stand_down(self) -> bool:
+        """Command nothing until the controller commands again after `stand_by`.
+
+        Return whether it does: not while it commands.
+        """
+        if self.active:
+            return False
         self.stands_down = True
         self._forget_controller()
+        return True
 
     def stand_by(self) -> None:
         """Watch again from the next torque of the controller on."""

@@ -1,0 +1,89 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Whether another node commands the arm already, found out before the first torque.
+
+A publisher of torques may be one of a controller in command, of one that is not active,
+or of one that was killed: it stays visible for some 20 s.  So the torques themselves
+decide, for which there is a moment to wait where there is such a publisher.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from enum import Enum
+from math import inf
+
+from rclpy.node import Node
+
+from blf_dsc_controller.messages import topics
+from blf_dsc_controller.messages.codecs import Float64MultiArrayEncoder
+from blf_dsc_controller.messages.topics import Quality
+from blf_dsc_controller.nodes.endpoints import RawSubscriptions
+
+_LISTENING = 1.0  # s, in which a controller in command is heard
+_LOOK_PERIOD = 0.05  # s
+
+
+class Finding(Enum):
+    """Whether another node commands the arm."""
+
+    UNKNOWN = 'unknown yet'
+    NOBODY = 'nobody'
+    SOMEBODY = 'somebody'
+
+
+class OtherCommander:
+    """Listens to the torques of an arm on a topic, until this node publishes its own there.
+
+    `steady` is its clock [ns].
+
+    Attributes:
+        topic: its full name.
+    """
+
+    def __init__(
+        self, node: Node, topic: str, joints: int, steady: Callable[[], int]
+    ) -> None:
+        self._node = node
+        self.topic = topic
+        self._steady = steady
+        self._of_watchdog = Float64MultiArrayEncoder(joints, topics.WATCHDOG_NODE)
+        self._subscriptions = RawSubscriptions(node)
+        quality = Quality(depth=1, reliability='best_effort')
+        type_name = topics.COMMANDS.type
+        self._subscriptions.subscribe(self.topic, type_name, quality, None)
+        self.begin()
+
+    def begin(self) -> None:
+        """Listen from now on."""
+        self._subscriptions.take()
+        self._since: float | None = None  # s, when other publishers were seen first
+        self._looked = -inf
+
+    def find(self) -> Finding:
+        """Return who commands the arm, as far as it is known by now."""
+        now = self._steady() * 1e-9
+        heard = [
+            message.raw
+            for message in self._subscriptions.take()
+            if not self._of_watchdog.has_layout(message.raw)
+        ]
+        if heard:
+            return Finding.SOMEBODY
+        if now - self._looked < _LOOK_PERIOD:
+            return Finding.UNKNOWN
+        self._looked = now
+        if not self._has_others():
+            return Finding.NOBODY
+        self._since = now if self._since is None else self._since
+        is_silent = now - self._since >= _LISTENING
+        return Finding.NOBODY if is_silent else Finding.UNKNOWN
+
+    def close(self) -> None:
+        """Listen no more."""
+        self._subscriptions.close()
+
+    def _has_others(self) -> bool:
+        """Whether other nodes than the watchdog publish torques, besides the own one."""
+        found = self._node.get_publishers_info_by_topic(self.topic)
+        others = [each for each in found if each.node_name != topics.WATCHDOG_NODE]
+        return len(others) > 1
