@@ -4,7 +4,9 @@
 from __future__ import annotations
 
 import array
+from contextlib import suppress
 
+import numpy as np
 import pytest
 
 from blf_dsc_controller.configuration import schema
@@ -336,3 +338,29 @@ def test_on_and_off_may_be_written_without_quotes(given, kept):
     assert config.safety.watchdog == kept
     with pytest.raises(ConfigurationError, match='got true, but a string is expected'):
         build(ControllerConfig, {'safety.torque': True})
+
+
+ODD = [
+    '',
+    'x',
+    0,
+    -1,
+    1e308,
+    2**62,
+    True,
+    [],
+    ['x'],
+    [1e308] * 2,
+    [1.0] * 4,
+    [[]],
+    None,
+]
+
+
+def test_any_value_of_a_parameter_is_accepted_or_refused():
+    """Values of a stranger's journal too: no other error ends the nodes that read it."""
+    given = flatten(load_loop('fr3').controller)
+    for name in given:
+        for odd in ODD:
+            with suppress(ConfigurationError), np.errstate(all='ignore'):
+                build(ControllerConfig, {**given, name: odd})

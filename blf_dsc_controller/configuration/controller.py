@@ -636,11 +636,11 @@ class Learning:
 
     def problems(self, sample_time: float, model: str, count: int) -> Iterator[str]:
         """Check the window's size, and the initial estimate against model and ball."""
-        samples = round(self.window / sample_time)
+        samples = self.window / sample_time
         (fewest, most) = _SAMPLES
-        if not fewest <= samples <= most:
+        if not fewest - 0.5 <= samples <= most + 0.5:
             yield (
-                f'learning.window: got {self.window:g} s, which is {samples} samples of '
+                f'learning.window: got {self.window:g} s, which is {samples:.0f} samples of '
                 f'{sample_time:g} s: between {fewest} and {most} are allowed'
             )
         yield from _misfits(

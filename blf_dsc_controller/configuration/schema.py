@@ -229,7 +229,9 @@ def build(cls: type[Config], given: Mapping[str, Any], source: str = '') -> Conf
     if len(valid) < len(known.keys() & given.keys()):
         raise ConfigurationError(problems, source)
     try:
-        derived: Mapping[str, Value] = getattr(cls, 'defaults', lambda _: {})(valid)
+        derived: Mapping[str, Value] = getattr(cls, 'defaults', lambda _: {})(
+            {name: value for name, value in valid.items() if _fits(known[name], value)}
+        )
     except ConfigurationError as error:
         raise ConfigurationError([*problems, *error.problems], source) from error
     values = (
@@ -330,6 +332,12 @@ def _assemble(cls: Any, values: Mapping[str, Value], prefix: str = '') -> Any:
         for name, param in _fields(cls).items()
     }
     return cls(**content)
+
+
+def _fits(param: Parameter, value: Any) -> bool:
+    """Whether a value has its length, where that depends on no other parameter."""
+    is_fixed = all(each.isdigit() for each in param.length)
+    return not (is_fixed and any(_length_problems(param, {param.name: value})))
 
 
 def _length_problems(param: Parameter, values: Mapping[str, Any]) -> Iterator[str]:
