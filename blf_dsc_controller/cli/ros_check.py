@@ -8,8 +8,8 @@ import importlib.metadata
 import importlib.util
 import os
 import subprocess
-import sys
 
+from blf_dsc_controller import child
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.extras import install_command
 
@@ -45,7 +45,7 @@ def _require_middleware(name: str) -> None:
     """
     if name == _DEFAULT or importlib.util.find_spec('rclpy') is None:
         return
-    load = [sys.executable, '-c', _LOAD]
+    load = child.running(_LOAD)
     run = subprocess.run(load, capture_output=True, text=True, check=False)
     if run.returncode:
         reason = (run.stderr.strip().splitlines() or ['no reason given'])[-1]

@@ -24,6 +24,7 @@ from rclpy.experimental import EventsExecutor
 from sensor_msgs.msg import JointState
 from tqdm import tqdm
 
+from blf_dsc_controller import child
 from blf_dsc_controller.cli.domains import own_domain, strangers
 from blf_dsc_controller.compiled.announcement import COMPILING
 from blf_dsc_controller.configuration.files import share_folder
@@ -112,7 +113,7 @@ class NodeProcess:
         self._noticed = 0
         self._log = logs / f'{name}.log'
         module = _MODULES.get(name, name)  # of the benchmark, for instance
-        command = [sys.executable, '-m', module, '--ros-args', '--params-file']
+        command = [*child.running_module(module), '--ros-args', '--params-file']
         with self._log.open('wb') as output:
             # In its own session: Ctrl-C reaches only the parent, which stops the nodes
             # in order.
@@ -121,7 +122,7 @@ class NodeProcess:
                 stdin=subprocess.DEVNULL,
                 stdout=output,
                 stderr=subprocess.STDOUT,
-                env={**os.environ, 'PYTHONUNBUFFERED': '1'},
+                env={**os.environ, **child.places(), 'PYTHONUNBUFFERED': '1'},
                 start_new_session=True,
                 # it holds the claim of the domain, which ends with the last node
                 close_fds=False,

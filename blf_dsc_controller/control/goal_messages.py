@@ -1,13 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Messages between the controller and the process of its action, pickled.
+"""Messages between the controller and the process of its action.
 
-Joint values are in the order of the controller's joints.
+Joint values are in the order of the controller's joints. They are sent as JSON: a
+pickle could name code that the controller would run, and any DDS participant talks to
+the action's process.
 """
 
 from __future__ import annotations
 
+import json
+from base64 import b64decode, b64encode
 from enum import Enum
-from typing import NamedTuple
+from typing import NamedTuple, TypeAlias
 
 SUCCESSFUL = 'SUCCESSFUL'
 INVALID = 'INVALID_GOAL'
@@ -77,3 +81,34 @@ class End(NamedTuple):
     outcome: Outcome
     code: str  # the name of an error code of the action's result
     text: str
+
+
+Message: TypeAlias = Goal | Cancel | Answer | Feedback | End
+_KINDS: dict[str, type[Message]] = {
+    each.__name__: each for each in (Goal, Cancel, Answer, Feedback, End)
+}
+
+
+def encode(message: Message) -> bytes:
+    """Return a message as JSON; every number keeps its bits."""
+    fields = [type(message).__name__, *message]
+    return json.dumps(fields, default=_as_text).encode()
+
+
+def decode(raw: bytes) -> Message:
+    """Return the message of `encode`."""
+    kind, *fields = json.loads(raw)
+    message = _KINDS[kind](*fields)
+    if isinstance(message, Goal):
+        return message._replace(
+            trajectory=b64decode(message.trajectory),
+            path=tuple(JointTolerance(*each) for each in message.path),
+            goal=tuple(JointTolerance(*each) for each in message.goal),
+        )
+    if isinstance(message, End):
+        return message._replace(outcome=Outcome(message.outcome))
+    return message
+
+
+def _as_text(trajectory: bytes) -> str:
+    return b64encode(trajectory).decode('ascii')

@@ -10,9 +10,9 @@ from __future__ import annotations
 import os
 import socket
 import subprocess
-import sys
 from time import monotonic
 
+from blf_dsc_controller import child
 from blf_dsc_controller.control.arm_controller import ArmController
 from blf_dsc_controller.control.motion_input import MotionInput
 from blf_dsc_controller.control.status_report import StatusReport
@@ -179,16 +179,14 @@ def _start(
     with theirs:
         process = subprocess.Popen(
             [
-                sys.executable,
-                '-m',
-                _PROCESS,
+                *child.running_module(_PROCESS),
                 f'{theirs.fileno()}',
                 f'/{namespace.strip("/")}',
                 kinds,
                 *joints,
             ],
             pass_fds=[theirs.fileno()],
-            env=os.environ | {'PYTHONPATH': os.pathsep.join(filter(None, sys.path))},
+            env=os.environ | child.places(),
         )
     return Link(ours), process
 

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The process of the action, and messages to and from it without waiting.
 
-The threads only pass pickled messages on: they cost a sample some microseconds.
+The threads only pass messages on: they cost a sample some microseconds.
 """
 
 from __future__ import annotations
@@ -9,7 +9,6 @@ from __future__ import annotations
 import os
 import socket
 import subprocess
-import sys
 import threading
 from collections import deque
 from collections.abc import Sequence
@@ -17,11 +16,17 @@ from contextlib import suppress
 from importlib.util import find_spec
 from multiprocessing import Pipe
 from queue import SimpleQueue
-from typing import Any
 
 from rclpy.node import Node
 
-from blf_dsc_controller.control.goal_messages import Cancel, Goal
+from blf_dsc_controller import child
+from blf_dsc_controller.control.goal_messages import (
+    Cancel,
+    Goal,
+    Message,
+    decode,
+    encode,
+)
 
 ACTION = '~/follow_joint_trajectory'
 _PATIENCE = 5.0  # s for its end
@@ -43,13 +48,11 @@ class ActionProcess:
         """Start it, in the domain and the namespace of its owner."""
         self.inbox: deque[Goal | Cancel] = deque()
         self._log = owner.get_logger()
-        self._outbox: SimpleQueue[Any] = SimpleQueue()
+        self._outbox: SimpleQueue[Message | None] = SimpleQueue()
         self._connection, theirs = Pipe()
         self._process = subprocess.Popen(
             [
-                sys.executable,
-                '-m',
-                'blf_dsc_controller.nodes.action_server',
+                *child.running_module('blf_dsc_controller.nodes.action_server'),
                 f'{theirs.fileno()}',
                 f'{owner.context.get_domain_id()}',
                 f'_{owner.get_name()}_action',
@@ -59,7 +62,7 @@ class ActionProcess:
                 *joints,
             ],
             pass_fds=[theirs.fileno()],
-            env=os.environ | {'PYTHONPATH': os.pathsep.join(filter(None, sys.path))},
+            env=os.environ | child.places(),
         )
         theirs.close()
         self._is_ending = False
@@ -70,7 +73,7 @@ class ActionProcess:
         for thread in self._threads:
             thread.start()
 
-    def send(self, message: Any) -> None:
+    def send(self, message: Message) -> None:
         """Send a message, some time."""
         self._outbox.put(message)
 
@@ -89,9 +92,11 @@ class ActionProcess:
     def _receive(self) -> None:
         while True:
             try:
-                self.inbox.append(self._connection.recv())
+                message = decode(self._connection.recv_bytes())
             except (EOFError, OSError):
                 break
+            if isinstance(message, (Goal, Cancel)):
+                self.inbox.append(message)
         if not self._is_ending:
             self._log.error(
                 f'the process of {ACTION} has ended: the topics and ~/stop work on; for the action '
@@ -102,7 +107,7 @@ class ActionProcess:
         """Send what is in the outbox, until None; then the process ends."""
         with suppress(OSError):  # it has ended, which `_receive` says
             while (message := self._outbox.get()) is not None:
-                self._connection.send(message)
+                self._connection.send_bytes(encode(message))
         self._shut()
 
     def _shut(self) -> None:

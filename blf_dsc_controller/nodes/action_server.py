@@ -39,6 +39,8 @@ from blf_dsc_controller.control.goal_messages import (
     Goal,
     JointTolerance,
     Outcome,
+    decode,
+    encode,
 )
 
 _NANO = 1e-9
@@ -96,15 +98,14 @@ class TrajectoryActionServer:
         number = self._count
         answer: Future = Future()
         self._answers[number] = answer
-        self._connection.send(
-            Goal(
-                number,
-                bytes(serialize_message(request.trajectory)),
-                _tolerances(request.path_tolerance),
-                _tolerances(request.goal_tolerance),
-                Duration.from_msg(request.goal_time_tolerance).nanoseconds * _NANO,
-            )
+        goal = Goal(
+            number,
+            bytes(serialize_message(request.trajectory)),
+            _tolerances(request.path_tolerance),
+            _tolerances(request.goal_tolerance),
+            Duration.from_msg(request.goal_time_tolerance).nanoseconds * _NANO,
         )
+        self._connection.send_bytes(encode(goal))
         accepted = await answer
         if not accepted:
             return GoalResponse.REJECT
@@ -121,7 +122,7 @@ class TrajectoryActionServer:
     def _on_cancel(self, handle: ServerGoalHandle) -> CancelResponse:
         for number, each in self._handles.items():
             if each == handle:
-                self._connection.send(Cancel(number))
+                self._connection.send_bytes(encode(Cancel(number)))
                 return CancelResponse.ACCEPT
         return CancelResponse.REJECT
 
@@ -203,7 +204,7 @@ def _listen(
     """Deliver what the controller sends, until it ends."""
     while True:
         try:
-            message = connection.recv()
+            message = decode(connection.recv_bytes())
         except (EOFError, OSError):
             end()
             return
