@@ -9,6 +9,7 @@ from __future__ import annotations
 import hashlib
 import math
 import os
+import pickle
 import platform
 import shutil
 import subprocess
@@ -26,6 +27,7 @@ import pytest
 from closed_loop_case import closed_loop, controller, quick
 from command import OLDER, finished
 from numba.core.errors import TypingError, UnsupportedError
+from planted import Planted
 from random_arm import _shake, random_urdf
 
 import blf_dsc_controller
@@ -515,6 +517,44 @@ def test_kernels_of_one_urdf_are_those_of_every_other_arm(tmp_path):
         sys.executable, '-c', ANY_ARM, 'panda_rigid', 'ur5e_rigid', 'openarm', *paths
     )
     assert run.stdout.splitlines() == [f'{n} []' for n in (7, 6, 7, 2, 9)], run.stderr
+
+
+SHARED = """
+import os
+os.umask(0o002)  # as on Ubuntu: what is made, the group can write
+from blf_dsc_controller.compiled import jit
+
+@jit.kernel
+def twice(x):
+    return 2.0 * x
+
+assert twice(1.0) == 2.0
+print(*(sum(twice.stats[k].values()) for k in (1, 2)))
+"""
+
+
+@compiling
+def test_machine_code_that_others_could_write_is_not_read_but_replaced(tmp_path):
+    script = tmp_path / 'shared.py'
+    script.write_text(SHARED)
+    paths = {'NUMBA_CACHE_DIR': str(tmp_path / 'cache')}
+    environment = os.environ | paths | {'PYTHONPATH': str(PACKAGE.parent)}
+
+    def found_and_compiled():
+        run = finished(sys.executable, script, env=environment)
+        assert run.returncode == 0, run.stderr
+        return run.stdout.split()
+
+    assert found_and_compiled() == ['0', '1']
+    assert found_and_compiled() == ['1', '0']
+    (index,) = tmp_path.glob('cache/*/*twice*.nbi')
+    assert index.parent.stat().st_mode & 0o777 == 0o700
+    mark = tmp_path / 'was read'
+    index.parent.chmod(0o770)
+    index.write_bytes(pickle.dumps(numba.__version__) + pickle.dumps(Planted(mark)))
+    assert found_and_compiled() == ['0', '1']
+    assert found_and_compiled() == ['1', '0']
+    assert not mark.exists()
 
 
 def test_machine_code_is_loaded_only_from_a_folder_that_nobody_else_can_write(

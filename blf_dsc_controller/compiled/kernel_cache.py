@@ -8,7 +8,7 @@ it, and a reinstall or a second checkout finds the existing cache.
 The package's own folder `SHIPPED` is looked at first, and never written to when kernels
 run.  If the user's cache folder is not writable, the cache is in the folder for
 temporary files.  Machine code is loaded only from a folder of this user that nobody
-else can write.
+else can enter, whatever the umask; what comes with the package is as safe as its code.
 """
 
 from __future__ import annotations
@@ -28,6 +28,7 @@ import numba
 from numba.core import config
 
 from blf_dsc_controller.compiled.dependencies import PACKAGE, dependencies
+from blf_dsc_controller.compiled.own_folder import make_own
 
 try:
     from blf_dsc_controller.compiled.linked import KernelCache
@@ -72,6 +73,9 @@ def ship() -> Path:
                 ignore=shutil.ignore_patterns('*.lock'),
                 dirs_exist_ok=True,
             )
+    SHIPPED.mkdir(exist_ok=True)
+    for path in (SHIPPED, *SHIPPED.rglob('*')):  # for all to read, whatever the umask
+        path.chmod(0o755 if path.is_dir() else 0o644)
     return SHIPPED
 
 
@@ -83,6 +87,8 @@ def _keep(kernel: Any, folder: Path) -> None:
     if _CACHE is not None:
         cache = _CACHE(kernel.py_func, folder, SHIPPED / folder.name)
         kernel._cache = cache  # noqa: SLF001 - as numba's enable_caching
+        return
+    if not make_own(folder):
         return
     before = config.CACHE_DIR
     # of a further folder in it, for the place of the source

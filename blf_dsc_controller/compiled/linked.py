@@ -37,6 +37,7 @@ from numba.extending import intrinsic
 from numba.np.arrayobj import populate_array
 
 from blf_dsc_controller.compiled.file_lock import FileLock
+from blf_dsc_controller.compiled.own_folder import is_own, make_own
 
 FIRST = (0, 58)
 AFTER = (0, 69)
@@ -201,25 +202,33 @@ class KernelCache(_Stored):
 
     def __init__(self, function: Any, path: Path, shipped: Path) -> None:
         super().__init__(function, path)
+        self._folder = path
         self._shipped = _Stored(function, shipped)
         self._lock = FileLock(path / f'{function.__name__}.lock')
 
     def load_overload(self, signature: Any, context: Any) -> Any:
         """Return the compiled kernel, or None: then the caller compiles and saves it."""
         found = self._shipped.load_overload(signature, context)
-        found = found or super().load_overload(signature, context)
-        if found is not None:
+        found = found or self._load_own(signature, context)
+        if found is not None or not make_own(self._folder):
             return found
         self._lock.acquire()
-        found = super().load_overload(signature, context)
+        found = self._load_own(signature, context)
         if found is not None:
             self._lock.release()
         return found
 
+    def _load_own(self, signature: Any, context: Any) -> Any:
+        """Return the compiled kernel, or None; what others can write is not read."""
+        if not is_own(self._folder):
+            return None
+        return super().load_overload(signature, context)
+
     def save_overload(self, signature: Any, data: Any) -> None:
         """Write a compiled kernel, for the processes that wait for it, too."""
         try:
-            super().save_overload(signature, data)
+            if is_own(self._folder):
+                super().save_overload(signature, data)
         finally:
             self._lock.release()
 
