@@ -13,7 +13,7 @@ import pytest
 import blf_dsc_controller as blf
 from blf_dsc_controller.cli.main import main
 from blf_dsc_controller.configuration.controller import ControllerConfig
-from blf_dsc_controller.configuration.law_file import load_law
+from blf_dsc_controller.configuration.law_file import digest, load_law
 from blf_dsc_controller.configuration.nodes import locate
 from blf_dsc_controller.configuration.plant import PlantConfig
 from blf_dsc_controller.configuration.schema import build, change, flatten
@@ -152,6 +152,25 @@ def test_nodes_over_ros_take_their_own_of_the_section_of_all_nodes(bare_node, tm
     assert declare(bare_node('sim_plant', file), PlantConfig) == PlantConfig()
 
 
+def named(law):
+    """The file of a law, as the user of a replay names it."""
+    return f'{law}@{digest(str(law))}'
+
+
+def test_replay_repeats_a_change_of_its_gains(tmp_path):
+    loop = blf.load_loop('recommended', {'blf_dsc_controller': {'law': LAW}})
+    bag = tmp_path / 'bag'
+    with blf.ArmController(loop.controller, record=bag) as controller:
+        for step in range(6):
+            if step == 3:
+                softer = change(controller.guard.config, {'gains.velocity': 50.0})
+                controller.guard.retune(softer)
+            controller.update(1.0 + step * 1e-3, loop.plant.initial.position, [0.0] * 2)
+    result = blf.verify(bag, law=named(LAW))
+    assert result.difference is None
+    assert result.compared == 1.0
+
+
 def test_replay_remarks_that_the_file_of_the_law_has_changed(tmp_path):
     """A bag holds the digest of the file, not the file."""
     law = tmp_path / 'my_law.py'
@@ -161,9 +180,9 @@ def test_replay_remarks_that_the_file_of_the_law_has_changed(tmp_path):
     with blf.ArmController(loop.controller, record=bag) as controller:
         for step in range(3):
             controller.update(1.0 + step * 1e-3, loop.plant.initial.position, [0.0] * 2)
-    assert blf.verify(bag).remarks == ()
+    assert blf.verify(bag, law=named(law)).remarks == ()
     law.write_text(law.read_text(encoding='utf-8') + '# changed', encoding='utf-8')
-    (remark,) = blf.verify(bag).remarks
+    (remark,) = blf.verify(bag, law=named(law)).remarks
     assert remark.startswith(f'{law} is another file than the one recorded')
 
 
@@ -184,7 +203,7 @@ def test_node_offline_run_and_replay_compute_the_same_bits(tmp_path):
     )
     np.testing.assert_array_equal(offline.error, ros.error)
     np.testing.assert_array_equal(offline.torque, ros.torque)
-    assert blf.verify(tmp_path / 'ros' / 'bag').difference is None
+    assert blf.verify(tmp_path / 'ros' / 'bag', law=named(LAW)).difference is None
 
 
 @pytest.mark.parametrize('base', ['monte_carlo', 'monte_carlo_panda'])

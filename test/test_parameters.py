@@ -205,9 +205,9 @@ ON_TOPIC = {
 }
 
 
-def publish(ros, topic, quality=topics.ROBOT_DESCRIPTION.offered):
+def publish(ros, topic, quality=topics.ROBOT_DESCRIPTION.offered, text=TEXT):
     publisher = ros.tester.create_publisher(String, topic, qos_profile(quality))
-    publisher.publish(String(data=TEXT))
+    publisher.publish(String(data=text))
 
 
 def test_controller_uses_the_published_urdf(ros):
@@ -234,6 +234,18 @@ def test_urdf_that_is_missing_or_not_latched_is_reported(ros, monkeypatch, publi
         ros.until(lambda: ros.tester.count_publishers('/robot_description') == 1)
     expected = f'within 1 s on /robot_description, which has {publishers} publishers'
     with pytest.raises(ConfigurationError, match=expected):
+        ros.add(ControllerNode, ON_TOPIC)
+
+
+@pytest.mark.parametrize(
+    'text', ['{file}', '<mujoco><include file="{file}"/></mujoco>', ' ']
+)
+def test_text_on_the_topic_that_is_no_urdf_is_refused(ros, tmp_path, text):
+    """Anybody can send it: no file that it names is read, by MuJoCo neither."""
+    file = tmp_path / 'arm.urdf'
+    file.write_text(TEXT)
+    publish(ros, 'robot_description', text=text.format(file=file))
+    with pytest.raises(ConfigurationError, match=r'robot\.urdf: .*/robot_description'):
         ros.add(ControllerNode, ON_TOPIC)
 
 

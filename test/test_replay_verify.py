@@ -369,7 +369,7 @@ def test_added_parameter_has_its_rule_for_older_bags(entries, tmp_path, monkeypa
     found = []
     for value in ('reference', 'state'):
         monkeypatch.setitem(older_parameters.ADDED, name, value)
-        config = read_content(path).controller_config(exactly=True)
+        config = read_content(path).exact_config('')
         found.append(config.learning.compensation)
     assert found == ['reference', 'state']
 

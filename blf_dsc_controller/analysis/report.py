@@ -153,10 +153,8 @@ def _diagnosed(content: Content, run: Run) -> Iterator[TimedEvent]:
 def _changed(content: Content, run: Run) -> Iterator[TimedEvent]:
     """Yield each change of the simulated plant's parameters during the run."""
     for change in content.changes:
-        time = (change['stamp'] - int(run.stamp[0])) * 1e-9
-        for parameter, value in (
-            () if change.get('configured') else change['parameters'].items()
-        ):
+        time = (change.stamp - int(run.stamp[0])) * 1e-9
+        for parameter, value in () if change.configured else change.parameters.items():
             yield (time, 'plant', f'{parameter}: {_shown(value)}')
 
 

@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import heapq
-import json
 from bisect import bisect_right
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
@@ -23,11 +22,22 @@ from blf_dsc_controller.bags.older_parameters import (
 from blf_dsc_controller.bags.sources import BagError, OpenBag, open_bag
 from blf_dsc_controller.bags.topic_messages import TopicMessages
 from blf_dsc_controller.configuration.controller import ControllerConfig
+from blf_dsc_controller.configuration.received import (
+    with_law,
+    without_files,
+    without_law,
+)
 from blf_dsc_controller.configuration.schema import build
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.messages import topics
-from blf_dsc_controller.messages.codecs import typestore
-from blf_dsc_controller.messages.journal import MOTIONS, Event, EventType, decode
+from blf_dsc_controller.messages.journal import (
+    MOTIONS,
+    Change,
+    Event,
+    EventType,
+    decode,
+    decode_change,
+)
 from blf_dsc_controller.messages.topics import Topic
 
 _OF_INTEREST = (
@@ -157,46 +167,78 @@ class Content:
             yield received, event
 
     @cached_property
-    def changes(self) -> list[dict[str, Any]]:
-        """Parameters of the plant: all of them first, then each change."""
+    def changes(self) -> list[Change]:
+        """Parameters of the plant: all of them first, then each change.
+
+        Others' messages are skipped.
+        """
         changes = self.topics.get(topics.CHANGES)
         found = []
         for _, raw in changes.raw() if changes else ():
-            with suppress(Exception):  # of another node
-                message: Any = typestore().deserialize_cdr(raw, topics.CHANGES.type)
-                found.append({'stamp': 0, 'parameters': {}, **json.loads(message.data)})
+            with suppress(BlfDscError):
+                found.append(decode_change(raw))
         return found
 
     @property
-    def configurations(self) -> dict[str, dict[str, Any]]:
+    def configurations(self) -> dict[str, Mapping[str, Any]]:
         """First recorded parameters of each node of the loop, by node."""
-        found: dict[str, dict[str, Any]] = {}
+        found: dict[str, Mapping[str, Any]] = {}
         for _, event in self.events:
             if event.type is EventType.CONFIGURE:
                 recorded = renamed(event.content['parameters'])
                 found.setdefault(topics.CONTROLLER, recorded)
         for change in self.changes:
-            if change.get('configured'):
-                found[topics.PLANT] = change['parameters']
+            if change.configured:
+                found[topics.PLANT] = change.parameters
         return found
 
     @property
     def unknown_parameters(self) -> list[str]:
         """Recorded parameters of the controller that this version does not have."""
-        recorded = self.configurations.get(topics.CONTROLLER, {})
+        recorded = without_law(self.configurations.get(topics.CONTROLLER, {}))
         known = known_names(recorded)
         return [name for name in recorded if name not in known]
 
-    def controller_config(self, *, exactly: bool = False) -> ControllerConfig:
+    def controller_config(self) -> ControllerConfig:
         """Return the configuration of the controller as first recorded.
 
-        Unknown parameters are left out. If it should be `exactly` as recorded, only
-        those that had no effect are.
+        Left out are unknown parameters, and a law of a file, which is not run.
+
+        Raises:
+            BagError: the bag holds none, or names a file with the arm.
+            ConfigurationError: this version of the package cannot run the configuration.
+        """
+        values, source = self._recorded()
+        left_out = self.unknown_parameters
+        given = {
+            name: value
+            for name, value in without_files(values).items()
+            if name not in left_out
+        }
+        return build(ControllerConfig, completed(given), source)
+
+    def exact_config(self, law: str) -> ControllerConfig:
+        """Return the configuration exactly as recorded, but with the law of this file.
+
+        `law` is FILE@DIGEST, or empty for a law of the package. Only parameters that
+        had no effect are left out.
 
         Raises:
             BagError: the bag holds none, or a parameter without which the law may act differently.
+            BlfDscError: the recorded law is a file and `law` is none, or the other way round.
             ConfigurationError: this version of the package cannot run the configuration.
         """
+        values, source = self._recorded()
+        digests = (event.content.get('law_digest') for _, event in self.events)
+        digest = next(filter(None, digests), '')
+        try:
+            given = with_law(values, law, digest)
+        except BlfDscError as error:
+            raise BagError(f'{self.path}: {error}') from error
+        return build(ControllerConfig, completed(current(given, source)), source)
+
+    def _recorded(self) -> tuple[Mapping[str, Any], str]:
+        """Return the parameters of the controller, and where they are from."""
         values = self.configurations.get(topics.CONTROLLER)
         if values is None:
             raise BagError(
@@ -206,11 +248,7 @@ class Content:
         source = f'{self.path}, {topics.JOURNAL.resolved}'
         if self.version != __version__:
             source += f' by version {self.version or "unknown"}, not {__version__}'
-        if exactly:
-            return build(ControllerConfig, completed(current(values, source)), source)
-        left_out = self.unknown_parameters
-        given = {name: value for name, value in values.items() if name not in left_out}
-        return build(ControllerConfig, completed(given), source)
+        return values, source
 
 
 def read_content(path: Path, namespace: str = '', names: NameMap = NO_NAMES) -> Content:

@@ -29,14 +29,16 @@ ADDED: dict[str, Value] = {'surface.known_rate': False, 'insist': CHECKED}
 """Value of parameters that older bags do not have, where it is not the default."""
 
 
-def current(recorded: Mapping[str, Any], source: str) -> dict[str, Any]:
+def current(recorded: Mapping[str, Any], source: str, law: str = '') -> dict[str, Any]:
     """Return recorded parameters of a controller as those of this version.
+
+    `law` is that of the controller whose parameters changed to these.
 
     Raises:
         BagError: one of them is gone, and no rule says that the law does the same without it.
     """
     recorded = renamed(recorded)
-    known = known_names(recorded)
+    known = known_names({**recorded, 'law': law} if law else recorded)
     problems = []
     for name, value in recorded.items():
         if name in known:

@@ -103,7 +103,8 @@ def replay(options: Namespace) -> int:
     from blf_dsc_controller.replay.verify import verify
 
     begin = time.perf_counter()
-    result = verify(options.bag, options.namespace, NameMap.parse(options.map))
+    names = NameMap.parse(options.map)
+    result = verify(options.bag, options.namespace, names, options.law)
     seconds = result.duration
     took = time.perf_counter() - begin
     speed = f'{seconds:.3f} s in {took:.2f} s: {seconds / took:.0f}x real time'
@@ -116,8 +117,10 @@ def replay(options: Namespace) -> int:
 
 def play(options: Namespace) -> None:
     """Publish the messages of a bag until its end, or Ctrl-C."""
-    if options.map or options.namespace:
-        raise BlfDscError('--play publishes the bag as it is: no --map or --namespace')
+    if options.map or options.namespace or options.law:
+        raise BlfDscError(
+            '--play publishes the bag as it is: no --map, --namespace or --law'
+        )
     require_ros()
     import rclpy
 

@@ -277,6 +277,11 @@ def _add_bags(
     )
     option('bag', type=Path, help=_BAG)
     option('--play', action='store_true', help='publish the recorded topics over ROS')
+    law = (
+        'law to run if the recorded one is a Python file, which no bag can choose: its path, '
+        'and the SHA-256 of its content'
+    )
+    option('--law', default='', metavar='FILE@SHA256', help=law)
     option = command(
         'report',
         'Show one or several bags on one HTML page. It has zoomable plots, events and the '

@@ -100,7 +100,7 @@ def monte_carlo(options: Namespace) -> None:
     elif options.report:
         folder = options.out or Path('changes')
         folder.mkdir(parents=True, exist_ok=True)
-        stores = [runs.Store(each) for each in options.report]
+        stores = [runs.Store(each, runs_law=False) for each in options.report]
         print(report.write_comparison(stores, folder), end='')
     else:
         _run_study(options)

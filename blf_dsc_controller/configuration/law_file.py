@@ -8,6 +8,9 @@ controller:
 
     class LogBarrier(NamedTuple):
         rate: Annotated[float, positive(20.0, 'decay of the error', '1/s', 'k_1')]
+
+The file is code that runs. Written as `FILE@DIGEST`, it runs only with the content of
+this SHA-256; where a configuration was received, nothing else runs (`received`).
 """
 
 from __future__ import annotations
@@ -16,10 +19,11 @@ import dataclasses
 import functools
 import hashlib
 import importlib.util
+import re
 import sys
 import typing
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from blf_dsc_controller.configuration.schema import Parameter
 from blf_dsc_controller.errors import BlfDscError
@@ -28,47 +32,89 @@ GROUP = 'gains'
 """Group of the parameters of a law of a file."""
 
 
+_WRITTEN = re.compile(r'(.+\.py)(?:@([0-9a-f]{12,64}))?', re.DOTALL)
+
+
+class _File(NamedTuple):
+    """A file of a law as it is written: its path, and the digest that it must have."""
+
+    path: Path
+    wanted: str  # the beginning at least; empty: any
+
+    @classmethod
+    def of(cls, law: str) -> _File:
+        """Return the file that the parameter `law` names."""
+        written = _WRITTEN.fullmatch(law)
+        if written is None:
+            raise BlfDscError(f'{law} is not a Python file')
+        path, wanted = written.groups(default='')
+        return cls(Path(path).expanduser().resolve(), wanted)
+
+    def read(self) -> bytes:
+        """Return the content; BlfDscError if it cannot be read, or is another one."""
+        try:
+            content = self.path.read_bytes()
+        except OSError as error:
+            problem = f'{self.path} cannot be read: {error.strerror}'
+            raise BlfDscError(problem) from error
+        found = hashlib.sha256(content).hexdigest()
+        if not found.startswith(self.wanted):
+            raise BlfDscError(
+                f'{self.path} has the SHA-256 {found}, not {self.wanted} as given, so it was not '
+                f'run: read it, and give {self.path}@{found} if it may run'
+            )
+        return content
+
+
 def is_file(law: str) -> bool:
     """Whether the parameter `law` names a file, not a law of the package."""
-    return law.endswith('.py')
+    return _WRITTEN.fullmatch(law) is not None
+
+
+def is_pinned(law: str) -> bool:
+    """Whether the parameter `law` names a file with the digest that it must have."""
+    return is_file(law) and bool(_File.of(law).wanted)
 
 
 def kept(law: str) -> str:
     """Return the parameter `law` as kept: a file by its absolute path."""
-    return str(Path(law).expanduser().resolve()) if is_file(law) else law
+    if not is_file(law):
+        return law
+    path, wanted = _File.of(law)
+    return f'{path}@{wanted}' if wanted else str(path)
 
 
-def load_law(path: str) -> type:
-    """Return `LAW` of a Python file; the same file is loaded once.
+def load_law(law: str) -> type:
+    """Return `LAW` of the file that the parameter `law` names; a content is loaded once.
 
-    Raises BlfDscError if it cannot be imported, or defines no law.
+    Raises BlfDscError if it cannot be read or imported, is another file than the one
+    that is wanted, or defines no law.
     """
-    return _load(Path(path).expanduser().resolve(), digest(path))
+    file = _File.of(law)
+    return _load(file.path, file.read())
 
 
-def digest(path: str) -> str:
-    """Return the beginning of the SHA-256 of a file, in hexadecimal.
+def digest(law: str) -> str:
+    """Return the SHA-256 of the file that the parameter `law` names, in hexadecimal.
 
-    Raises BlfDscError if it cannot be read.
+    Raises BlfDscError if it cannot be read, or is another file than the one wanted.
     """
-    try:
-        content = Path(path).expanduser().read_bytes()
-    except OSError as error:
-        raise BlfDscError(f'{path} cannot be read: {error.strerror}') from error
-    return hashlib.sha256(content).hexdigest()[:12]
+    return hashlib.sha256(_File.of(law).read()).hexdigest()
 
 
 @functools.cache
-def _load(place: Path, digest: str) -> type:
+def _load(place: Path, content: bytes) -> type:
     # Kernels and pickles find the module by this name, another content has another one.
-    name = f'law_{place.stem}_{digest}'
+    name = f'law_{place.stem}_{hashlib.sha256(content).hexdigest()[:12]}'
     spec = importlib.util.spec_from_file_location(name, place)
-    if spec is None or spec.loader is None:
+    if spec is None:
         raise BlfDscError(f'{place} is not a Python file')
     module = importlib.util.module_from_spec(spec)
     sys.modules[name] = module
     try:
-        spec.loader.exec_module(module)
+        # What was read, neither the file again nor bytecode beside it.
+        code = compile(content, place, 'exec', dont_inherit=True)
+        exec(code, vars(module))  # noqa: S102 - the user has named this file
     except Exception as error:
         del sys.modules[name]
         raise BlfDscError(f'{place} cannot be imported: {error!r}') from error

@@ -14,7 +14,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Literal, NamedTuple, TypeVar
 
-from blf_dsc_controller.configuration import law_file
+from blf_dsc_controller.configuration import law_file, received
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.drive import DriveConfig
 from blf_dsc_controller.configuration.files import (
@@ -234,6 +234,8 @@ def load(
     node: str,
     cls: type[Config],
     overrides: Mapping[str, object] | None = None,
+    *,
+    runs_law: bool = True,
 ) -> Config:
     """Load the configuration of one node.
 
@@ -242,23 +244,28 @@ def load(
     `overrides`, by dotted name, take precedence over the file. Raises
     ConfigurationError with all problems and their line numbers. Unknown names are
     rejected; in a section for several nodes, a name that any node of the package knows
-    is accepted.
+    is accepted. Unless it `runs_law`, the law of a file is left out and not run.
     """
-    config: Config = _load_all(path, {node: cls}, {node: overrides or {}})[node]
+    chosen = {node: overrides or {}}
+    config: Config = _load_all(path, {node: cls}, chosen, runs_law=runs_law)[node]
     return config
 
 
 def load_loop(
-    given: str | Path, overrides: Mapping[str, Mapping[str, object]] | None = None
+    given: str | Path,
+    overrides: Mapping[str, Mapping[str, object]] | None = None,
+    *,
+    runs_law: bool = True,
 ) -> LoopConfig:
     """Load plant, controller and recorder from a preset or a file.
 
     `overrides`, by node and dotted name, take precedence over the file; None removes
-    what the file gives. Raises ConfigurationError with the problems of all nodes, or if
-    plant and controller disagree.
+    what the file gives. Unless it `runs_law`, the law of a file is left out and not
+    run. Raises ConfigurationError with the problems of all nodes, or if plant and
+    controller disagree.
     """
     path = locate(given)
-    configs = _load_all(path, NODES, overrides or {})
+    configs = _load_all(path, NODES, overrides or {}, runs_law=runs_law)
     loop = LoopConfig(configs[PLANT], configs[CONTROLLER], configs[RECORDER])
     if problems := loop.problems():
         raise ConfigurationError(problems, str(path))
@@ -269,6 +276,8 @@ def _load_all(
     path: str | Path,
     nodes: Mapping[str, Any],
     overrides: Mapping[str, Mapping[str, object]],
+    *,
+    runs_law: bool,
 ) -> dict[str, Any]:
     """Load the configurations of some nodes; a problem of several is reported once."""
     sections = read(path)
@@ -284,6 +293,8 @@ def _load_all(
         chosen = overrides.get(node, {})
         given: dict[str, object] = {**written, **chosen}
         values = {name: value for name, value in given.items() if value is not None}
+        if not runs_law:
+            values = received.without_law(values)
         try:
             configs[node] = build(cls, values)
         except ConfigurationError as error:

@@ -164,22 +164,44 @@ Others that a later version adds are ignored.
 """
 
 
+CHANGE = {
+    'stamp': Field(STAMP),
+    'parameters': Field(PARAMETERS),
+    'configured': Field(FLAG, optional=True),
+}
+"""Fields of a change of the plant's parameters; see `journal.Change`."""
+
+
+def check_change(given: object) -> None:
+    """Check the fields of a change of the plant's parameters.
+
+    Raises:
+        BlfDscError: a field is missing or of another kind.
+    """
+    _check(_fields_of(given), CHANGE)
+
+
 def check_event(given: object) -> None:
     """Check the fields of an event and its content.
 
     Raises:
         BlfDscError: its type is unknown, or a field is missing or of another kind.
     """
-    if not isinstance(given, Mapping):
-        raise BlfDscError('it is no object with fields by name')
-    _check(given, EVENT)
-    fields = SCHEMA.get(given['type'])
+    event = _fields_of(given)
+    _check(event, EVENT)
+    fields = SCHEMA.get(event['type'])
     if fields is None:
         raise BlfDscError(
-            f'the type {given["type"][:_SHOWN]!r} is none of {", ".join(SCHEMA)}: it may be of a '
+            f'the type {event["type"][:_SHOWN]!r} is none of {", ".join(SCHEMA)}: it may be of a '
             'later version'
         )
-    _check(given['content'], fields)
+    _check(event['content'], fields)
+
+
+def _fields_of(given: object) -> Mapping[str, Any]:
+    if not isinstance(given, Mapping):
+        raise BlfDscError('it is no object with fields by name')
+    return given
 
 
 def _check(given: Mapping[str, Any], fields: Mapping[str, Field]) -> None:

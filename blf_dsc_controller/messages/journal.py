@@ -9,15 +9,19 @@ from __future__ import annotations
 
 import json
 from collections import deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from enum import Enum
 from typing import Any, NamedTuple
 
 from blf_dsc_controller import __version__
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.messages.codecs import typestore
-from blf_dsc_controller.messages.event_content import FORMAT, check_event
-from blf_dsc_controller.messages.topics import JOURNAL
+from blf_dsc_controller.messages.event_content import (
+    FORMAT,
+    check_change,
+    check_event,
+)
+from blf_dsc_controller.messages.topics import CHANGES, JOURNAL
 from blf_dsc_controller.run import Contact
 
 OUTSIDE_BOUND = 'error past the bound'
@@ -111,15 +115,26 @@ def contact_in(event: Event) -> Contact:
     )
 
 
-def encode_change(
-    stamp: int, parameters: Mapping[str, Any], *, configured: bool = False
-) -> bytes:
-    """Return the message of `~/changes` on parameters in force from a stamp [ns].
+class Change(NamedTuple):
+    """Parameters of the plant in force from a stamp on."""
 
-    `configured`: these are all of them, at the start.
+    stamp: int  # ns
+    parameters: Mapping[str, Any]
+    configured: bool = False  # these are all of them, at the start
+
+    def encode(self) -> bytes:
+        """Return the serialised std_msgs/String of `~/changes`."""
+        return encode_string(json.dumps(self._asdict()))
+
+
+def decode_change(raw: bytes) -> Change:
+    """Decode the change of a serialised message.
+
+    Raises:
+        BlfDscError: it holds no change.
     """
-    given = {'stamp': stamp, 'parameters': parameters, 'configured': configured}
-    return encode_string(json.dumps(given))
+    given = _decoded(raw, check_change, f'{CHANGES.resolved} holds no change')
+    return Change(**{name: given[name] for name in Change._fields if name in given})
 
 
 def encode_string(text: str) -> bytes:
@@ -134,17 +149,23 @@ def decode(raw: bytes) -> Event:
     Raises:
         BlfDscError: it holds no event.
     """
-    try:
-        message: Any = typestore().deserialize_cdr(raw, JOURNAL.type)
-        given = json.loads(message.data)
-        check_event(given)
-    except Exception as error:  # libraries raise nearly anything
-        reason = f'a message of {JOURNAL.resolved} holds no event: {error}'
-        raise BlfDscError(' '.join(reason.split())) from error
+    given = _decoded(raw, check_event, f'{JOURNAL.resolved} holds no event')
     known = {name: given[name] for name in Event._fields}
     known['type'] = EventType(given['type'])
     known['content'] = {**given['content']}
     return Event(**known)
+
+
+def _decoded(raw: bytes, check: Callable[[object], None], problem: str) -> Any:
+    """Return the checked JSON of a std_msgs/String, whoever sent it."""
+    try:
+        message: Any = typestore().deserialize_cdr(raw, JOURNAL.type)
+        given = json.loads(message.data)
+        check(given)
+    except Exception as error:  # libraries raise nearly anything
+        reason = f'a message of {problem}: {error}'
+        raise BlfDscError(' '.join(reason.split())) from error
+    return given
 
 
 class Journal:

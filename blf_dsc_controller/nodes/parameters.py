@@ -21,6 +21,7 @@ from blf_dsc_controller.configuration.nodes import (
     is_of_node,
     known_names,
 )
+from blf_dsc_controller.configuration.received import check_arm
 from blf_dsc_controller.configuration.robot import TOPIC
 from blf_dsc_controller.configuration.schema import (
     Parameter,
@@ -29,7 +30,7 @@ from blf_dsc_controller.configuration.schema import (
     flatten,
     parameters,
 )
-from blf_dsc_controller.errors import ConfigurationError
+from blf_dsc_controller.errors import BlfDscError, ConfigurationError
 from blf_dsc_controller.messages.topics import ROBOT_DESCRIPTION
 from blf_dsc_controller.nodes import process
 from blf_dsc_controller.nodes.endpoints import qos_profile
@@ -239,11 +240,7 @@ def wait_for_description(node: Node, name: str) -> str:
         if process.interrupted():
             raise SystemExit(0)
         if found:
-            if message.data.strip():
-                return str(message.data)
-            raise ConfigurationError(
-                [f'robot.urdf: the one on {topic} is empty: did xacro fail?']
-            )
+            return _checked(message.data, topic)
         node.get_logger().info(
             f'waiting for the URDF on {topic}', throttle_duration_sec=5.0
         )
@@ -251,3 +248,16 @@ def wait_for_description(node: Node, name: str) -> str:
     problem = f'no URDF within {TIMEOUT} s on {topic}, which has {count} publishers'
     remedy = 'start robot_state_publisher, whose topic is latched, correct the name, or give a file'
     raise ConfigurationError([f'robot.urdf: {problem}: {remedy}'])
+
+
+def _checked(text: str, topic: str) -> str:
+    """Return a URDF that anybody may have sent; ConfigurationError if it is none."""
+    if not text.strip():
+        raise ConfigurationError(
+            [f'robot.urdf: the one on {topic} is empty: did xacro fail?']
+        )
+    try:
+        check_arm({'robot.urdf': text})
+    except BlfDscError as error:
+        raise ConfigurationError([f'{error} ({topic})']) from error
+    return text

@@ -33,7 +33,7 @@ from blf_dsc_controller.configuration.schema import Value, differences, flatten
 from blf_dsc_controller.law.telemetry import DECIMATION, PlantTelemetry
 from blf_dsc_controller.messages import topics
 from blf_dsc_controller.messages.codecs import Float64MultiArrayDecoder, MessageError
-from blf_dsc_controller.messages.journal import encode_change
+from blf_dsc_controller.messages.journal import Change
 from blf_dsc_controller.nodes import parameters, process
 from blf_dsc_controller.nodes.diagnostics import (
     ERROR,
@@ -331,7 +331,9 @@ class PlantNode(LoopNode[PlantConfig]):
     def _tell_parameters(self) -> None:
         """Publish all parameters, in force from the start."""
         given = flatten(self.config)
-        self._changes.publish(encode_change(self._start_stamp, given, configured=True))
+        self._changes.publish(
+            Change(self._start_stamp, given, configured=True).encode()
+        )
 
     def _reconfigure(self, config: PlantConfig) -> None:
         self._changed |= differences(self.config, config)
@@ -342,7 +344,7 @@ class PlantNode(LoopNode[PlantConfig]):
         if not self._changed:
             return
         self.plant.change(plant_settings(self.config))
-        self._changes.publish(encode_change(self.stamp, self._changed))
+        self._changes.publish(Change(self.stamp, self._changed).encode())
         self._changed = {}
 
     def _report(self) -> None:

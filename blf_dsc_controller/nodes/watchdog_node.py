@@ -24,6 +24,7 @@ import numpy as np
 
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.nodes import WatchdogConfig, load
+from blf_dsc_controller.configuration.received import without_files
 from blf_dsc_controller.configuration.schema import build
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.messages import topics
@@ -106,7 +107,9 @@ class WatchdogNode(PlainNode):
         create_steady_timer(self, _REPORT_PERIOD, self._report)
         if self._config.armed:
             files = parameter_files(sys.argv) or ['recommended']
-            self._watch(load(files[-1], self._controller, ControllerConfig))
+            self._watch(
+                load(files[-1], self._controller, ControllerConfig, runs_law=False)
+            )
         else:
             self.get_logger().info(f'waiting for {self._controller}')
 
@@ -140,7 +143,8 @@ class WatchdogNode(PlainNode):
         if given is self._given:
             return
         try:
-            self._watch(build(ControllerConfig, given, self._controller))
+            config = build(ControllerConfig, without_files(given), self._controller)
+            self._watch(config)
         except BlfDscError as error:
             self._report_problem(f'the journal of {self._controller}: {error}')
             self._journal.parameters = self._given

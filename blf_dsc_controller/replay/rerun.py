@@ -351,7 +351,7 @@ class Rerun:
             guard.take_over(DriveLoad(content['mass'], tuple(content['centre'])))
         elif event.type is EventType.PARAMETERS:
             where = f'event {event.number} of the journal'
-            given = current(content['parameters'], where)
+            given = current(content['parameters'], where, guard.config.law)
             guard.retune(change(guard.config, given, where))
             if guard.last_stamp >= 0:
                 stamp = guard.journal.stamp

@@ -147,21 +147,26 @@ class Verification(NamedTuple):
         ]
 
 
-def verify(path: Path, namespace: str = '', names: NameMap = NO_NAMES) -> Verification:
+def verify(
+    path: Path, namespace: str = '', names: NameMap = NO_NAMES, law: str = ''
+) -> Verification:
     """Replay a bag and compare every number of the controller bit for bit.
 
     `namespace` is that of the robot, if the bag holds several; `names` maps topics and
-    joints that have other names in the bag.
+    joints that have other names in the bag. If the recorded law is a file, `law` names
+    the file that runs in its place, and the SHA-256 of its content, as FILE@DIGEST: a
+    bag may come from anybody.
 
     Raises:
         ConfigurationError: this version of the package cannot run the configuration.
         BlfDscError: the bag holds no journal or nothing to compare, begins after the
-            controller, or cannot be read.
+            controller, or cannot be read; or its law is a file and `law` does not name
+            one.
     """
     content = read_content(path, namespace, names)
     events, until, other = _events(content)
     _check_format(path, events[0])
-    config = content.controller_config(exactly=True)
+    config = content.exact_config(law)
     recorded = content.configurations[topics.CONTROLLER]
     newer = sorted(flatten(config).keys() - recorded.keys() - {'insist'})
     errors: dict[int, MessageError] = {}
@@ -447,9 +452,10 @@ def _remarks(
 def _changed_law(config: ControllerConfig, configure: Event) -> str:
     """Return the file of the law if it has changed since the recording, or nothing."""
     recorded = configure.content.get('law_digest')
-    if recorded is None or law_file.digest(config.law) == recorded:
+    if not recorded or not law_file.is_file(config.law):
         return ''
-    return config.law
+    is_same = law_file.digest(config.law).startswith(recorded)
+    return '' if is_same else config.law.partition('@')[0]
 
 
 def _incomplete(

@@ -37,10 +37,10 @@ from blf_dsc_controller.law.telemetry import (
 )
 from blf_dsc_controller.messages import topics
 from blf_dsc_controller.messages.journal import (
+    Change,
     EventType,
     Journal,
     contact_in,
-    encode_change,
 )
 from blf_dsc_controller.run import Run, Series, Stop
 from blf_dsc_controller.simulation.compiled_loop import CompiledLoop, Rows, Span
@@ -327,7 +327,7 @@ def _write_bag(
     bag = TopicRecorder(path, compression=compression, flush_interval=None)
     with closing(bag):
         if plant is not None:
-            configured = encode_change(START, flatten(plant), configured=True)
+            configured = Change(START, flatten(plant), configured=True).encode()
             bag.write(START, topics.CHANGES, configured)
         for stamp, message in _messages(parts):
             bag.write(stamp, *message)

@@ -167,9 +167,14 @@ def torque_error(rows: Floats, estimate: Floats, P: Floats) -> float:
 
 
 def load_study(
-    path: str | Path, overrides: Mapping[str, object] | None = None
+    path: str | Path,
+    overrides: Mapping[str, object] | None = None,
+    *,
+    runs_law: bool = True,
 ) -> Study:
     """Read a study; `overrides` take precedence over its section `monte_carlo`.
+
+    Unless it `runs_law`, the law of a file is left out and not run.
 
     Raises ConfigurationError with all problems of all sections, and their lines.
     """
@@ -178,7 +183,7 @@ def load_study(
     loop: LoopConfig | None = None
     settings: MonteCarloConfig | None = None
     try:
-        loop = load_loop(path)
+        loop = load_loop(path, runs_law=runs_law)
     except ConfigurationError as error:
         problems += error.problems
     entries = _section(path)

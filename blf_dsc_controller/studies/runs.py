@@ -242,11 +242,12 @@ class Store:
     Raises BlfDscError if the folder holds no study.
     """
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Path, *, runs_law: bool = True) -> None:
+        """Open a folder; its results can be read without running a law of a file."""
         if not (folder / _STUDY).is_file():
             raise BlfDscError(f'{folder} holds no study: choose another folder')
         self.folder = folder
-        self.study = load_study(folder / _STUDY)
+        self.study = load_study(folder / _STUDY, runs_law=runs_law)
 
     @classmethod
     def create_or_open(cls, folder: Path, study: Study) -> Store:

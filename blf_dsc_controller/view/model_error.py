@@ -28,6 +28,12 @@ class ModelError:
         The acceleration is that since the last call, at `time` [s]; NaN where anything
         is unknown.
         """
+        with np.errstate(over='ignore', invalid='ignore'):  # whoever sent them
+            return self._squares(time, q, dq, estimate, truth)
+
+    def _squares(
+        self, time: float, q: Floats, dq: Floats, estimate: Floats, truth: Floats
+    ) -> Floats:
         ddq = (
             (dq - self._dq) / (time - self._time) if time > self._time else dq * np.nan
         )

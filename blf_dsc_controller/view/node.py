@@ -7,21 +7,21 @@ second, and tolerates lost ones. The controller's configuration comes from its j
 
 from __future__ import annotations
 
-import json
 import os
 import sys
 from collections import deque
-from collections.abc import Mapping, Sequence
-from math import inf
+from collections.abc import Iterable, Mapping, Sequence
+from math import inf, isfinite
 from typing import Any
 
 import numpy as np
-from rclpy.serialization import deserialize_message
 
 from blf_dsc_controller.analysis.report import LEVELS
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.nodes import VIEW, ViewConfig
+from blf_dsc_controller.configuration.received import without_files
 from blf_dsc_controller.configuration.schema import build
+from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.law.factory import estimate_names
 from blf_dsc_controller.law.telemetry import external_names
 from blf_dsc_controller.messages import topics
@@ -29,19 +29,19 @@ from blf_dsc_controller.messages.codecs import (
     JointStateDecoder,
     MessageError,
     joint_state_layout,
+    typestore,
 )
 from blf_dsc_controller.messages.journal import (
+    MOTIONS,
+    Change,
     Event,
     EventType,
     contact_in,
     decode,
+    decode_change,
 )
-from blf_dsc_controller.messages.topics import Topic
-from blf_dsc_controller.nodes.endpoints import (
-    RawSubscriptions,
-    create_steady_timer,
-    message_class,
-)
+from blf_dsc_controller.messages.topics import Quality, Topic
+from blf_dsc_controller.nodes.endpoints import RawSubscriptions, create_steady_timer
 from blf_dsc_controller.nodes.parameters import declare
 from blf_dsc_controller.nodes.process import PlainNode, run
 from blf_dsc_controller.run import Floats
@@ -55,7 +55,10 @@ _SILENCE = 30  # frames without a joint state before the page reports it
 _OUTDATED = 500_000_000  # ns
 _LISTED = 12  # events
 _KEPT = 2000  # snapshots of a run
+_LONGEST = 300  # characters of an event
+_MOST_PLANNED = 1000  # events of a plant
 _NICE = 10  # lower priority than the loop
+_SHARED = Quality(10, 'best_effort')  # the newest may be those of a gripper
 _LOCAL = ('127.0.0.1', 'localhost')  # hosts that only this computer can reach
 _STREAMS = (
     topics.JOINT_STATES,
@@ -99,6 +102,8 @@ class ViewNode(PlainNode):
         self._is_offered = False  # whether the page offers to replay them
         self._config: ControllerConfig | None = None
         self._plant: dict[str, Any] = {}  # parameters of the simulated plant
+        self._planned: list[tuple[float, str, str]] = []  # its events
+        self._bound: list[bytes] = []  # newest messages
         self._events: deque[tuple[float, str, str]] = deque(maxlen=_LISTED)
         self._noted = -1.0  # s, time up to which the plant's events are on the page
         self._state = (
@@ -112,8 +117,7 @@ class ViewNode(PlainNode):
         self._clients_seen: frozenset[int] = frozenset()
         self._raw_subscriptions = RawSubscriptions(self)
         for topic in {*_STREAMS, *_LATCHED, topics.TARGETS}:
-            quality = topics.UNRELIABLE if topic in _STREAMS else topic.requested
-            self._raw_subscriptions.follow(topic, quality)
+            self._raw_subscriptions.follow(topic, _quality(topic))
         self.get_logger().info(f'open {self.page.url}')
         if config.host not in _LOCAL:
             self.get_logger().warning(
@@ -128,12 +132,14 @@ class ViewNode(PlainNode):
 
     def update(self) -> None:
         """Process new messages and draw."""
-        streams: dict[Topic, bytes] = {}
+        streams: dict[Topic, list[bytes]] = {}
         for message in self._raw_subscriptions.take():
             if message.handle in _STREAMS:
-                streams[message.handle] = message.raw
+                streams.setdefault(message.handle, []).append(message.raw)
             else:
                 self._note(message.handle, message.raw)
+        # latched, it may come before the journal that says what it is of
+        self._bound = streams.setdefault(topics.BOUND, self._bound)
         has_state = self._config is not None and self._take(streams)
         self._silent = 0 if has_state else self._silent + 1
         self.page.state(*self._health())
@@ -147,6 +153,16 @@ class ViewNode(PlainNode):
             self.page.move(list(self.past))
             if self._pictures % _PLOTTED == 0 or is_new:
                 self.page.plot(list(self.past))
+
+    def survive(self, error: Exception) -> bool:
+        """Keep the page when something could not be drawn."""
+        self._pass_over(error)
+        return True
+
+    def _pass_over(self, error: Exception) -> None:
+        """Report what is not shown; odd messages may come at any rate."""
+        text = f'{error}' if isinstance(error, BlfDscError) else f'{error!r}'
+        self.get_logger().warning(f'not shown: {text}', throttle_duration_sec=10.0)
 
     def _offer_replay(self) -> None:
         """Let the page replay a run that has ended, until another one begins."""
@@ -184,32 +200,45 @@ class ViewNode(PlainNode):
     # Events.
 
     def _note(self, topic: Topic, raw: bytes) -> None:
-        if topic is topics.JOURNAL:
-            self._follow(decode(raw))
-            return
-        if topic is topics.TARGETS:
-            self._list_motion(decode(raw))
-            return
-        content: Any = deserialize_message(raw, message_class(topic.type))
-        if topic is topics.STATE:
-            self._state = LEVELS[content.level[0]], content.message
-            return
-        said = json.loads(content.data)
-        if said.get('configured'):
-            self._plant = said['parameters']
+        """Follow a message on what happens, unless it cannot be understood."""
+        try:
+            if topic is topics.JOURNAL:
+                self._follow(decode(raw))
+            elif topic is topics.TARGETS:
+                self._list_motion(decode(raw))
+            elif topic is topics.STATE:
+                self._state = _state_in(raw)
+            else:
+                self._follow_plant(decode_change(raw))
+        except BlfDscError as error:
+            self._pass_over(error)
+
+    def _list(self, time: float, kind: str, text: str) -> None:
+        """List an event; others may send texts of any length."""
+        shown = text if len(text) <= _LONGEST else f'{text[:_LONGEST]} ...'
+        self._events.append((time, kind[:_LONGEST], shown))
+
+    def _follow_plant(self, change: Change) -> None:
+        """Follow the parameters of the simulated plant."""
+        plant = dict(change.parameters)
+        if not change.configured:
+            plant = self._plant | plant
+        elif self._config is not None:
+            self.page.draw_arm(self._config, plant)
+        self._plant = plant
+        self._planned = plant_events(plant)
+        if change.configured:
             self._noted = -1.0
-            if self._config is not None:
-                self.page.draw_arm(self._config, self._plant)
             return
-        self._plant |= said['parameters']
-        for name, value in said['parameters'].items():
-            self._events.append((self._time(said['stamp']), name, f'{value}'))
+        for name, value in change.parameters.items():
+            self._list(self._time(change.stamp), name, f'{value}')
 
     def _follow(self, event: Event) -> None:
         """Follow the controller's journal, which begins with all its parameters."""
         content = event.content
         if event.type is EventType.CONFIGURE:
-            self._configure(build(ControllerConfig, content['parameters']))
+            given = without_files(content['parameters'])
+            self._configure(build(ControllerConfig, given))
             return
         self._finished = event.type is EventType.RELEASE
         if event.type is EventType.START:
@@ -223,12 +252,12 @@ class ViewNode(PlainNode):
         if event.type is EventType.CONTACT:
             _, joint, torque, interval, _ = contact_in(event)
             details = [contact_text(joint, torque, interval)]
-        self._events.append(
-            (self._time(event.stamp), event.type.value, ', '.join(details))
-        )
+        self._list(self._time(event.stamp), event.type.value, ', '.join(details))
 
     def _list_motion(self, event: Event) -> None:
         """List a trajectory, and a stream of targets when it begins."""
+        if event.type not in MOTIONS:
+            return
         time = self._time(event.stamp)
         if event.type is EventType.TARGET:
             if not 0.0 <= time - self._last_target < _PAUSE:
@@ -239,6 +268,7 @@ class ViewNode(PlainNode):
         self._events.append((time, event.type.value, f'{points} points'))
 
     def _configure(self, config: ControllerConfig) -> None:
+        self.page.draw_arm(config, self._plant)
         self._config = config
         estimates = estimate_names(config)
         joints = config.joints
@@ -255,7 +285,6 @@ class ViewNode(PlainNode):
         self._first_truth = self._values[topics.TRUTH][0]
         self._latched = np.nan
         self._model_error = ModelError(config)
-        self.page.draw_arm(config, self._plant)
 
     # Samples.
 
@@ -265,19 +294,24 @@ class ViewNode(PlainNode):
             self._start = stamp
         return max(0.0, (stamp - self._start) * 1e-9)
 
-    def _take(self, newest: Mapping[Topic, bytes]) -> bool:
+    def _take(self, streams: Mapping[Topic, Sequence[bytes]]) -> bool:
         """Take the newest message of each topic.
 
         Return whether there was a joint state.
         """
         stamps: dict[Topic, int] = {}
-        for topic, raw in newest.items():
+        for topic, messages in streams.items():
             try:
-                stamps[topic], self._values[topic] = _read(raw, self._names[topic])
+                found = _newest(messages, self._names[topic])
+                if found is None:  # those of a gripper, for instance
+                    continue
+                at, values = found
+                if topic is topics.JOINT_STATES:
+                    _check_positions(self._names[topic], values[0])
             except MessageError as error:
-                self.get_logger().warning(
-                    f'not shown: {error}', throttle_duration_sec=10.0
-                )
+                self._pass_over(error)
+            else:
+                stamps[topic], self._values[topic] = at, values
         self._sampled = max(stamps.get(topics.TRACKING_ERROR, -1), self._sampled)
         stamp = stamps.get(topics.JOINT_STATES)
         if stamp is None:
@@ -316,31 +350,67 @@ class ViewNode(PlainNode):
         self._keep_for_replay(now)
         while self.past[0].time < time - PAST - 1.0:
             self.past.popleft()
-        self._events += [
-            e for e in plant_events(self._plant) if self._noted < e[0] <= time
-        ]
+        self._events += [e for e in self._planned if self._noted < e[0] <= time]
         self._noted = time
 
 
-def _read(raw: bytes, names: Sequence[str]) -> tuple[int, Floats]:
-    """Return stamp [ns] and values (3, m) of these names in a message.
+def _quality(topic: Topic) -> Quality:
+    """Return the quality requested of a topic; a late view needs what is latched."""
+    if topic is topics.JOINT_STATES:
+        return _SHARED
+    is_stream = topic in _STREAMS and topic not in _LATCHED
+    return topics.UNRELIABLE if is_stream else topic.requested
 
-    Missing values are NaN.
+
+def _state_in(raw: bytes) -> tuple[str, str]:
+    """Return level and text of the controller's state; BlfDscError if there are none."""
+    try:
+        status: Any = typestore().deserialize_cdr(raw, topics.STATE.type)
+        return LEVELS[int(status.level)], str(status.message)[:_LONGEST]
+    except Exception as error:  # libraries raise nearly anything
+        raise BlfDscError(
+            f'a message of {topics.STATE.resolved} holds no state: {error!r}'
+        ) from error
+
+
+def _newest(
+    messages: Iterable[bytes], names: Sequence[str]
+) -> tuple[int, Floats] | None:
+    """Return stamp [ns] and values (3, m) of the last message with any of these names.
+
+    Missing values are NaN. None: no message has one.
     """
-    theirs = joint_state_layout(raw).names
-    decoder = JointStateDecoder(theirs, ())
-    stamp = decoder.decode(raw)
-    known = dict(zip(theirs, decoder.values.reshape(3, -1).T, strict=True))
-    return stamp, np.transpose([known.get(name, (np.nan,) * 3) for name in names])
+    for raw in reversed([*messages]):
+        theirs = joint_state_layout(raw).names
+        if set(theirs).isdisjoint(names):
+            continue
+        decoder = JointStateDecoder(theirs, ())
+        stamp = decoder.decode(raw)
+        known = dict(zip(theirs, decoder.values.reshape(3, -1).T, strict=True))
+        values = np.transpose([known.get(name, (np.nan,) * 3) for name in names])
+        return stamp, values
+    return None
+
+
+def _check_positions(joints: Sequence[str], position: Floats) -> None:
+    """Raise MessageError unless the arm can be drawn at these positions (n,)."""
+    odd = [
+        joint
+        for joint, value in zip(joints, position.tolist(), strict=True)
+        if not isfinite(value)
+    ]
+    if odd:
+        raise MessageError(f'no position of {", ".join(odd)} in the joint states')
 
 
 def plant_events(values: Mapping[str, Any]) -> list[tuple[float, str, str]]:
     """Return time [s], kind and text of a simulated arm's events."""
-    begin = values.get('events.begin', ())
-    nothing = (0.0,) * len(begin)
-    duration, masses = (
-        values.get(f'events.{k}') or nothing for k in ('duration', 'payload')
+    begin, duration, masses = (
+        _numbers(values.get(f'events.{name}'))
+        for name in ('begin', 'duration', 'payload')
     )
+    nothing = (0.0,) * len(begin)
+    duration, masses = duration or nothing, masses or nothing
     found = []
     for k, (at, lasts, mass) in enumerate(
         zip(begin, duration, masses, strict=False), 1
@@ -350,6 +420,15 @@ def plant_events(values: Mapping[str, Any]) -> list[tuple[float, str, str]]:
         found.append((at, 'plant', first))
         found += [(at + lasts, 'plant', last)] if lasts else []
     return sorted(found)
+
+
+def _numbers(given: Any) -> tuple[float, ...]:
+    """Return a list of finite numbers; empty if it is none, or too long to be shown."""
+    is_list = isinstance(given, (list, tuple)) and len(given) <= _MOST_PLANNED
+    is_known = is_list and all(
+        isinstance(each, (int, float)) and isfinite(each) for each in given
+    )
+    return tuple(map(float, given)) if is_known else ()
 
 
 def main() -> int:
