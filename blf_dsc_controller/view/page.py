@@ -14,11 +14,12 @@ import os
 import socket
 import sysconfig
 import time
+import xml.etree.ElementTree as ET
 from bisect import bisect_left, bisect_right
 from collections.abc import Mapping, Sequence
 from contextlib import redirect_stdout, suppress
 from html import escape
-from math import inf
+from math import inf, isfinite
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -63,6 +64,8 @@ _SHEET = (
     '<style>@media (max-width:36em){[style*="width: 20em"]'
     '{width:100%!important;max-height:50vh!important}}</style>'
 )
+_MESHES = ('.stl', '.dae', '.obj', '.ply', '.off', '.glb', '.gltf')
+_LARGEST_MESH = 1 << 28  # bytes
 _LEVELS = {'OK': GREEN, 'WARN': ORANGE, 'ERROR': ALARM, 'STALE': MUTED}
 
 
@@ -114,7 +117,7 @@ class Page:
 
     def __init__(self, host: str, port: int) -> None:
         require_viser()
-        import viser
+        from blf_dsc_controller.view.server import PageServer  # slow, and optional
 
         try:  # viser would try one port after the other, for ever
             socket.create_server((host, 0)).close()
@@ -122,7 +125,7 @@ class Page:
             problem = f'the page cannot be served at {host!r} ({error.strerror})'
             raise BlfDscError(f'{problem}: give an address of this computer') from error
         with redirect_stdout(io.StringIO()):  # hides its banner
-            self.server = viser.ViserServer(host, port, label='blf_dsc', verbose=False)
+            self.server = PageServer(host, port)
         self.url = f'http://{host}:{self.server.get_port()}'
         self._events: list[tuple[float, str, str]] = []
         self._state = 'STALE', ''
@@ -149,19 +152,20 @@ class Page:
         """Draw the arm of a controller, with the parameters of its plant."""
         from viser.extras import ViserUrdf
 
+        arm = arm_of(config, plant)
+        model, shadow = arm.model(), arm.model()  # whoever sent them: both can be drawn
         self._clear()
-        self._arm = arm = arm_of(config, plant)
+        self._arm = arm
         self._joints = [joint.name for joint in arm.chain.joints]
         self._feels = config.contact.enabled
         prefix, names = _shortened(self._joints)
         server = self.server
         gui = self.server.gui
         reach = arm.reach
-        model = arm.model()
         self._held = dict.fromkeys(model.actuated_joint_names, 0.0)
         self._drawn = ViserUrdf(server, model, root_node_name='/arm')
         self._ghost = ViserUrdf(
-            server, arm.model(), root_node_name='/reference', mesh_color_override=_GHOST
+            server, shadow, root_node_name='/reference', mesh_color_override=_GHOST
         )
         self._base = np.array(model.get_transform(arm.chain.base))
         server.scene.add_grid('/floor', 4 * reach, 4 * reach, cell_size=0.25)
@@ -497,7 +501,11 @@ def arm_of(config: ControllerConfig, plant: Mapping[str, Any]) -> ShownArm:
     robot = config.robot
     if config.model == 'urdf':
         return ShownArm(robot.text, robot.chain(config.joints))
-    lengths = [plant.get(name, config.arm.l1) for name in ('arm.l1', 'arm.l2')]
+    given = [plant.get(name) for name in ('arm.l1', 'arm.l2')]
+    lengths = [
+        each if isinstance(each, float) and isfinite(each) else config.arm.l1
+        for each in given
+    ]
     text = urdf(config.joints, lengths, (1.0, 1.0))
     return ShownArm(text, read_chain(text, '', 'tip', config.joints))
 
@@ -551,15 +559,32 @@ def _load(text: str) -> Any:
 
     # it warns about missing meshes
     logging.getLogger('yourdfpy').setLevel(logging.ERROR)
-    model = yourdfpy.URDF.load(io.BytesIO(text.encode()), filename_handler=_file)
+    # As `read_chain` has understood it: of another encoding that the text declares,
+    # another parser would make entities of a comment.
+    root = ET.fromstring(text)  # noqa: S314 - `read_chain` has accepted it
+    try:
+        model = yourdfpy.URDF.load(
+            io.BytesIO(ET.tostring(root)), filename_handler=_mesh
+        )
+    except Exception as error:  # its libraries raise nearly anything
+        raise BlfDscError(f'the arm cannot be drawn: {error!r}') from error
     for joint in model.robot.joints:
         if joint.axis is not None:  # yourdfpy scales prismatic motion by its length
             joint.axis = joint.axis / np.linalg.norm(joint.axis)
     return model
 
 
-def _file(fname: str) -> str:  # yourdfpy prescribes the argument's name
+def _mesh(fname: str) -> str:  # yourdfpy prescribes the argument's name
+    """Return the path of a mesh, empty if the file is none: it is a stranger who names it."""
+    path = _file(fname)
+    with suppress(OSError):
+        if path.suffix.lower() in _MESHES and path.stat().st_size <= _LARGEST_MESH:
+            return str(path)
+    return ''
+
+
+def _file(name: str) -> Path:
     with suppress(BlfDscError, OSError):
-        return str(resolve(fname.removeprefix('file://')))
-    package, _, rest = fname.removeprefix('package://').partition('/')
-    return str(_installed(package) / rest)
+        return resolve(name.removeprefix('file://'))
+    package, _, rest = name.removeprefix('package://').partition('/')
+    return _installed(package) / rest
