@@ -26,7 +26,6 @@ _LOG_FOLDER = tempfile.mkdtemp(prefix='blf_dsc_controller_test_log_')
 
 os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')  # numpy is not imported yet
 os.environ['ROS_LOG_DIR'] = os.environ['DASK_TEMPORARY_DIRECTORY'] = _LOG_FOLDER
-os.environ.pop('FASTRTPS_DEFAULT_PROFILES_FILE', None)
 if find_spec('rclpy'):  # some tests run without ROS
     from own_domain import avoid_domain_of_shell, own_domain
 

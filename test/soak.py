@@ -17,7 +17,7 @@ from pathlib import Path
 os.environ['FASTRTPS_DEFAULT_PROFILES_FILE'] = str(
     Path(__file__).with_name('one_process.xml')
 )
-os.environ.setdefault('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
+os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'SYSTEM_DEFAULT'
 
 import numpy as np
 from rcl_interfaces.srv import SetParametersAtomically

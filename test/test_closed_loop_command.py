@@ -94,10 +94,24 @@ def test_command_reports_where_the_results_are(out):
         assert 'XMLPARSER' not in log  # config/fastdds.xml is accepted
 
 
+OPEN = """<profiles xmlns="http://www.eprosima.com/XMLSchemas/fastRTPS_Profiles">
+  <participant profile_name="open" is_default_profile="true"/>
+</profiles>
+"""
+
+
 @pytest.fixture
 def running(tmp_path, monkeypatch):
-    monkeypatch.delenv('FASTRTPS_DEFAULT_PROFILES_FILE', raising=False)
-    # of a user; Fast DDS would share memory
+    """A run from a shell that is set up to reach other computers."""
+    open_profile = (
+        tmp_path / 'DEFAULT_FASTRTPS_PROFILES.xml'
+    )  # read where a node starts
+    open_profile.write_text(OPEN)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv('FASTRTPS_DEFAULT_PROFILES_FILE', str(open_profile))
+    monkeypatch.setenv('ROS_STATIC_PEERS', '192.0.2.1')
+    monkeypatch.setenv('ROS_DISCOVERY_SERVER', '192.0.2.1:11811')
+    # Fast DDS would share memory
     monkeypatch.setenv('ROS_LOCALHOST_ONLY', '1')
     command = Running(tmp_path / 'out')
     yield command
@@ -126,6 +140,25 @@ def ended_cleanly(running, number):
     for result in ('summary.json', 'tracking.png', 'bag/metadata.yaml'):
         assert (running.out / result).is_file()
     return output
+
+
+def sockets(pid):
+    """Yield the local address of each socket of a process, as the kernel shows it."""
+    opened = {str(each.readlink()) for each in Path(f'/proc/{pid}/fd').iterdir()}
+    for table in ('udp', 'udp6', 'tcp', 'tcp6'):
+        path = Path('/proc/net', table)
+        for line in path.read_text().splitlines()[1:] if path.exists() else ():
+            _, local, *columns = line.split()
+            if f'socket:[{columns[7]}]' in opened:
+                yield local.partition(':')[0]
+
+
+def test_run_exchanges_messages_on_this_computer_only(running):
+    """Another one may name it in its ROS_STATIC_PEERS: its datagrams find no socket."""
+    for process in (running.process.pid, *running.children):
+        found = [*sockets(process)]
+        assert found
+        assert set(found) == {'0100007F'}  # 127.0.0.1
 
 
 def test_sigterm_shuts_down_cleanly_with_bag_and_report(running):

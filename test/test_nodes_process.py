@@ -127,19 +127,32 @@ import numpy as np
 np.ones((500, 500)) @ np.ones((500, 500))
 print(code, len(os.listdir('/proc/self/task')))
 """
-LOCALHOST = {'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST'}
+OTHERS = {  # of a shell, which other nodes of its user use
+    'FASTRTPS_DEFAULT_PROFILES_FILE': 'own.xml',
+    'ROS_STATIC_PEERS': '192.0.2.1',
+    'ROS_DISCOVERY_SERVER': '192.0.2.1:11811',
+    'FASTDDS_ENVIRONMENT_FILE': 'own.json',
+    'ROS_LOCALHOST_ONLY': '0',
+}
 
 
-def test_profile_of_the_user_is_kept_and_other_middleware_limited_as_well(monkeypatch):
-    with monkeypatch.context() as own:
-        own.setenv('FASTRTPS_DEFAULT_PROFILES_FILE', 'own.xml')
-        assert localhost_environment() == LOCALHOST
+def test_nodes_of_a_run_look_for_nobody_elsewhere_whatever_the_shell_names(monkeypatch):
+    for name, value in OTHERS.items():
+        monkeypatch.setenv(name, value)
+    own = localhost_environment()
+    assert own.keys() >= OTHERS.keys()
+    assert own['FASTRTPS_DEFAULT_PROFILES_FILE'].endswith('config/fastdds.xml')
     with monkeypatch.context() as kilted:  # its Fast DDS 3 rejects the profile
         kilted.setattr(session.metadata, 'version', lambda _: '9.1.1')
-        assert localhost_environment() == LOCALHOST
-    name = 'get_rmw_implementation_identifier'
-    monkeypatch.setattr(rclpy, name, lambda: 'rmw_cyclonedds_cpp')
-    assert localhost_environment() == LOCALHOST
+        limited = localhost_environment()
+    monkeypatch.setattr(
+        rclpy, 'get_rmw_implementation_identifier', lambda: 'rmw_cyclonedds_cpp'
+    )
+    assert localhost_environment() == limited
+    assert limited['ROS_AUTOMATIC_DISCOVERY_RANGE'] == 'LOCALHOST'
+    for environment in (own, limited):
+        named = OTHERS.keys() & environment.keys() - {'FASTRTPS_DEFAULT_PROFILES_FILE'}
+        assert {environment[name] for name in named} == {''}
 
 
 @pytest.mark.parametrize(
@@ -200,7 +213,7 @@ def participant():
         variables['ROS_DOMAIN_ID'] = str(domain)
         process = subprocess.Popen(
             [sys.executable, '-c', PARTICIPANT],
-            env=os.environ | variables,
+            env={k: value for k, value in (os.environ | variables).items() if value},
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
         )
@@ -212,8 +225,9 @@ def participant():
         process.communicate(b'\n')
 
 
-PROFILE = {  # without limits to this computer
-    'FASTRTPS_DEFAULT_PROFILES_FILE': str(Path(__file__).with_name('one_process.xml'))
+PROFILE = {  # with sockets and shared memory as others' nodes have them
+    'FASTRTPS_DEFAULT_PROFILES_FILE': '',
+    'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST',
 }
 
 

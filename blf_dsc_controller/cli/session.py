@@ -61,6 +61,13 @@ _DISCOVERY = 0.5  # s, until the nodes of a domain have answered
 _RANGE = 'ROS_AUTOMATIC_DISCOVERY_RANGE'
 _ENDED = 'the run has ended: its page replays it until Ctrl-C, then the results follow'
 _PROFILES = 'FASTRTPS_DEFAULT_PROFILES_FILE'
+_NO_OTHERS = {
+    'ROS_LOCALHOST_ONLY': '',
+    'ROS_STATIC_PEERS': '',
+    'ROS_DISCOVERY_SERVER': '',
+    'FASTDDS_ENVIRONMENT_FILE': '',
+    'SKIP_DEFAULT_XML_FILE': '1',  # DEFAULT_FASTRTPS_PROFILES.xml in the current folder
+}
 
 
 def run_session(config: LoopConfig, out: Path, *, view: bool) -> bool:
@@ -322,19 +329,19 @@ class ProgressMonitor:
 
 
 def localhost_environment() -> dict[str, str]:
-    """Return the environment in which nodes find only those on this computer.
+    """Return the environment in which nodes exchange messages on this computer only.
 
-    A profile that the user has chosen, and middleware other than Jazzy's Fast DDS, are
-    left as they are: the one of Kilted rejects this package's profile, and would then
-    find the whole network.
+    Whatever else the shell names is overruled: a profile, peers or a server of other
+    computers. Other middleware than Jazzy's Fast DDS looks for nobody elsewhere, but
+    answers whoever finds it (doc/tools.md): the Fast DDS of Kilted rejects this
+    package's profile, and would then find the whole network.
     """
-    profiles = str(share_folder() / 'config/fastdds.xml')
-    chosen = os.environ.get(_PROFILES, profiles)
-    if chosen != profiles or not _is_jazzys_fast_dds():
-        return {_RANGE: 'LOCALHOST'}
+    if not _is_jazzys_fast_dds():
+        return {_RANGE: 'LOCALHOST', **_NO_OTHERS}
     # With LOCALHOST, rmw_fastrtps would add shared memory to the transports of the
     # profile.
-    return {_RANGE: 'SYSTEM_DEFAULT', 'ROS_LOCALHOST_ONLY': '', _PROFILES: profiles}
+    profiles = str(share_folder() / 'config/fastdds.xml')
+    return {_RANGE: 'SYSTEM_DEFAULT', **_NO_OTHERS, _PROFILES: profiles}
 
 
 def _is_jazzys_fast_dds() -> bool:
