@@ -90,6 +90,21 @@ class LearnedArm:
     regressor: Regressor
 
 
+class JointUnits(NamedTuple):
+    """Units of a joint's position and torque; errors are in thousandths of the former."""
+
+    position: str
+    torque: str
+
+    def of(self, unit: str) -> str:
+        """Return the unit of a joint that slides for one of a joint that turns."""
+        return unit.replace('rad', self.position).replace('N m', self.torque)
+
+
+TURNING = JointUnits('rad', 'N m')
+SLIDING = JointUnits('m', 'N')
+
+
 @dataclass(frozen=True)
 class Run:
     """N samples of n joints, simulated, recorded or replayed.
@@ -120,6 +135,12 @@ class Run:
     xi2: Floats | None = None  #: (N, n) rad/s
     tool: ToolErrors | None = None  #: of an arm with a bound at its tool
     notes: tuple[str, ...] = ()  #: samples of a bag that are left out, and why
+    #: joints that slide, where arrays have m and N instead of rad and N m
+    sliding: tuple[str, ...] = ()
+
+    def units(self, joint: str) -> JointUnits:
+        """Return the units of a joint."""
+        return SLIDING if joint in self.sliding else TURNING
 
     def column(self, name: str, i: int) -> Floats | None:
         """Return the values of one joint (N,) in an array by name.

@@ -16,6 +16,7 @@ from typing import Any
 
 import numpy as np
 
+from blf_dsc_controller.arms.arm_alone import arm_alone
 from blf_dsc_controller.configuration.plant import PlantConfig
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.extras import import_extra
@@ -139,18 +140,16 @@ def spec_of(config: PlantConfig) -> Any:
         BlfDscError: MuJoCo cannot read the arm.
     """
     mujoco = import_extra('mujoco', 'mujoco', 'physics: mujoco')
+    tip = config.robot.chain(config.joints).tip if config.robot.urdf else _TIP
+    text = arm_alone(urdf_of(config), config.joints, tip)
     try:
-        spec = mujoco.MjSpec.from_string(urdf_of(config))
+        spec = mujoco.MjSpec.from_string(text)
     except (ValueError, mujoco.FatalError) as error:
         raise _unreadable(error) from error
     spec.compiler.boundmass = spec.compiler.boundinertia = 0.0
     spec.compiler.fusestatic = False
     for unused in (*spec.geoms, *spec.meshes):
         spec.delete(unused)
-    for joint in spec.joints:
-        if joint.name not in config.joints:  # fingers and the like are fixed
-            spec.delete(joint)
-    tip = config.robot.chain(config.joints).tip if config.robot.urdf else _TIP
     spec.body(tip).add_body(name=PAYLOAD)
     return spec
 

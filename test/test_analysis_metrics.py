@@ -203,6 +203,7 @@ def test_unknown_values_are_null_and_never_nan(run, tmp_path):
             'duration',
             'samples',
             'joints',
+            'sliding',
             'violating_joint',
             'stops',
             'learns',

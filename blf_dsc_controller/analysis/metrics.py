@@ -66,6 +66,7 @@ class Metrics:
     duration: float  #: s
     samples: int
     joints: tuple[str, ...]
+    sliding: tuple[str, ...]  #: those that slide: m and N instead of rad and N m
     max_error: tuple[float, ...]  #: (n,) rad, of |xi1|
     rms_error: tuple[float, ...]  #: (n,) rad
     bound: tuple[float, ...]  #: (n,) rad, the smallest
@@ -118,6 +119,7 @@ def measure(run: Run) -> Metrics:
         duration=run.duration,
         samples=run.stamp.size,
         joints=run.joints,
+        sliding=run.sliding,
         max_error=each(_peak, 'error'),
         rms_error=each(rms, 'error'),
         bound=each(_least, 'bound'),

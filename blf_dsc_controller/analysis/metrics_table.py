@@ -11,6 +11,7 @@ from blf_dsc_controller.analysis.metrics import Metrics
 from blf_dsc_controller.analysis.output import aligned
 from blf_dsc_controller.law.telemetry import load_text
 from blf_dsc_controller.messages.topics import LOAD
+from blf_dsc_controller.run import SLIDING, TURNING, JointUnits
 
 _SHOWN_CONTACTS = 3
 _OFTEN = 0.01  # of the samples
@@ -28,9 +29,12 @@ def format_table(metrics: Metrics) -> str:
     """Format metrics as a few lines for the terminal, without a newline at the end."""
     rows = [['', *_TABLE]]
     for i, joint in enumerate(metrics.joints):
+        units = _units(metrics, joint)
         values = ((getattr(metrics, name)[i], *form) for name, *form in _TABLE.values())
         cells = (
-            f'{factor * value:.{decimals}f} {unit}' if math.isfinite(value) else '-'
+            f'{factor * value:.{decimals}f} {units.of(unit)}'
+            if math.isfinite(value)
+            else '-'
             for value, unit, factor, decimals in values
         )
         rows.append([joint, *cells])
@@ -43,7 +47,7 @@ def _sentences(of: Metrics) -> Iterator[str]:
     yield f'bound       {_bound_text(of)}'
     bounds = zip(of.joints, of.widest_bound, of.bound, strict=True)
     wider = [
-        f'{joint} {1e3 * widest:.3g} mrad'
+        f'{joint} {1e3 * widest:.3g} {_units(of, joint).of("mrad")}'
         for joint, widest, bound in bounds
         if widest > bound
     ]
@@ -61,6 +65,10 @@ def _sentences(of: Metrics) -> Iterator[str]:
         yield f'held        {load_text([load[name] for name in LOAD])}, until {load["until"]:.1f} s'
     if of.timing is not None:
         yield f'real time   {_timing_text(of.timing, of.samples)}'
+
+
+def _units(of: Metrics, joint: str) -> JointUnits:
+    return SLIDING if joint in of.sliding else TURNING
 
 
 def _bound_text(of: Metrics) -> str:

@@ -201,7 +201,8 @@ def _motion(run: Run) -> Iterator[Panel]:
         lines = [Line('measured', t, np.asarray(position))]
         if reference is not None:
             lines.append(Line('reference', t, reference, INK, dashed=True))
-        yield Panel('Motion', f'position of {joint}', 'rad', lines)
+        unit = run.units(joint).position
+        yield Panel('Motion', f'position of {joint}', unit, lines)
         error = run.column('error', i)
         if error is not None:
             yield _error(run, t, i, 1e3 * error)
@@ -213,7 +214,8 @@ def _motion(run: Run) -> Iterator[Panel]:
         if limit is not None and not np.isnan(limit).all():
             lines.append(Line('limit', t, limit, MUTED, dashed=True, mirrored=True))
         note = f'peak {np.nanmax(np.abs(torque)):.3g}'
-        yield Panel('Torque', f'torque of {joint}', 'N m', lines, note)
+        unit = run.units(joint).torque
+        yield Panel('Torque', f'torque of {joint}', unit, lines, note)
     for i in range(len(run.joints)) if t.size > _PIECES else ():
         error = run.column('error', i)
         if error is not None:
@@ -255,7 +257,8 @@ def _contact(run: Run) -> Iterator[Panel]:
         ]
         note = '' if np.isnan(torque).all() else f'peak {np.nanmax(np.abs(torque)):.3g}'
         title = f'external torque on {joint}'
-        yield Panel('Contact', title, 'N m', lines, note, marks=marks)
+        unit = run.units(joint).torque
+        yield Panel('Contact', title, unit, lines, note, marks=marks)
 
 
 def _error(run: Run, t: Floats, i: int, error: Floats) -> Panel:
@@ -272,7 +275,8 @@ def _error(run: Run, t: Floats, i: int, error: Floats) -> Panel:
         note = f'max {np.nanmax(np.abs(error)):.3g}, rms {rms(error):.3g}'
     title = f'error of {run.joints[i]}'
     span = _span(bound, error)
-    return Panel('Tracking', title, 'mrad', lines, note, marks=tuple(marks), span=span)
+    unit = run.units(run.joints[i]).of('mrad')
+    return Panel('Tracking', title, unit, lines, note, marks=tuple(marks), span=span)
 
 
 def _span(bound: Floats | None, error: Floats) -> float:
@@ -299,7 +303,8 @@ def _error_size(run: Run, t: Floats, i: int, error: Floats) -> Panel:
     note = f'end {known[-1]:.2g}' if known.size else ''
     title = f'|error| of {run.joints[i]}'
     span = _span(bound, error)
-    return Panel('Tracking', title, 'mrad', lines, note, log=True, span=span)
+    unit = run.units(run.joints[i]).of('mrad')
+    return Panel('Tracking', title, unit, lines, note, log=True, span=span)
 
 
 def _learning(run: Run) -> Iterator[Panel]:

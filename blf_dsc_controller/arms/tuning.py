@@ -179,6 +179,7 @@ def _of_arm(arm: Design) -> dict[str, Value]:
     n = len(chain.joints)
     effort = _finite([joint.effort for joint in chain.joints], UNKNOWN_EFFORT)
     velocity = _finite([joint.velocity for joint in chain.joints], 2.0)
+    acceleration = np.array([joint.acceleration for joint in chain.joints])
     lower, upper = arm.limits
     P = arm.parameters.of(chain.inertias, arm.rotors)
     floor = _UNMODELLED * arm.efforts
@@ -197,7 +198,9 @@ def _of_arm(arm: Design) -> dict[str, Value]:
         'limits.position_lower': _listed(lower),
         'limits.position_upper': _listed(upper),
         'limits.velocity': _listed(_SLOW * velocity),
-        'limits.acceleration': _listed(4.0 * _SLOW * velocity),
+        'limits.acceleration': _listed(
+            np.minimum(4.0 * _SLOW * velocity, acceleration)
+        ),
         'learning.initial_estimate': _listed(P),
         'learning.radius': 10.0 * max(float(np.sqrt((P * P).sum())), arm.payload),
         'learning.window': _WINDOW,

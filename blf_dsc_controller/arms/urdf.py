@@ -9,7 +9,8 @@ rules:
   held at position 0 and their links merged.
 - A link without `<inertial>` has no mass, but each body must have one.
 - Continuous joints, and joints without `<limit>`, have infinite limits; an effort or a
-  velocity of 0 means no limit.
+  velocity of 0 means no limit, and so does an acceleration.  Position limits are the
+  narrower ones of `<limit>` and `<safety_controller>`.
 
 Not supported: `floating`, `planar` and `mimic` joints in the chain, and closed chains.
 """
@@ -26,6 +27,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from blf_dsc_controller.arms.xml_text import XmlError, parse_xml
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.numerics.algebra import product
 from blf_dsc_controller.numerics.elementary import cos, sin
@@ -36,8 +38,10 @@ INERTIA_NAMES = ('m', 'm*cx', 'm*cy', 'm*cz', 'Ixx', 'Ixy', 'Iyy', 'Ixz', 'Iyz',
 INERTIA_UNITS = ('kg', *('kg m',) * 3, *('kg m^2',) * 6)
 
 _MOVING = ('revolute', 'continuous', 'prismatic')
+_ACCELERATIONS = ('acceleration', 'deceleration')  # of URDF 1.2
 _MAX_ELEMENTS = 500  # of links, and of joints
-_LIMITS = ('lower', 'upper', 'velocity', 'effort')
+_LIMITS = ('lower', 'upper', 'velocity', 'effort', *_ACCELERATIONS)
+_SHORTEST = 1e-6  # of an axis or a quaternion that has a direction
 _ROUNDED = 1e-12  # kg m^2, of moments of inertia
 _LARGEST = 1e6  # m, kg, kg m^2 and so on; limits may be larger
 
@@ -63,6 +67,7 @@ class Joint(NamedTuple):
     inertia: np.ndarray  # (10,) of the body, in the order of `INERTIA_NAMES`
     fixed: tuple[str, ...]  # links that are fixed to its link
     held: np.ndarray  # (4, 4) pseudo-inertia of what joints held at position 0 carry
+    acceleration: float = inf  # limit, also of deceleration, rad/s^2 or m/s^2
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,6 +92,15 @@ class Chain:
             float(np.linalg.norm(each[:3, 3]))
             for each in (*placements, self.tip_placement)
         )
+
+    @property
+    def gripper(self) -> str:
+        """Name of a last joint that slides where all others turn; empty if there is none.
+
+        It may be that of a gripper.
+        """
+        *arm, last = (joint.kind == 'prismatic' for joint in self.joints)
+        return self.joints[-1].name if last and arm and not any(arm) else ''
 
 
 @lru_cache(maxsize=16)
@@ -239,6 +253,11 @@ class Tree(NamedTuple):
         common = set.intersection(*map(set, leaves)) if leaves else set()
         return tuple(name for name in max(paths, key=len, default=()) if name in common)
 
+    def turning(self, joints: Sequence[str]) -> np.ndarray:
+        """Return which of some joints turn (n,), the others being prismatic."""
+        kinds = [self.joints[name].get('type') for name in joints]
+        return np.array([kind != 'prismatic' for kind in kinds])
+
     def only_chain(self) -> tuple[str, ...]:
         """Return the moving joints, which must be one chain."""
         moving = _moving([*self.joints.values()])
@@ -276,13 +295,9 @@ def _robot(text: str) -> ET.Element:
     expand = (
         'expand it first: `xacro FILE > robot.urdf` (from ROS or `pip install xacro`)'
     )
-    if '<!DOCTYPE' in text:  # its entities could expand to gigabytes
-        raise BlfDscError(
-            'a URDF must not have a <!DOCTYPE>: remove it, expand its entities'
-        )
     try:
-        robot = ET.fromstring(text)  # noqa: S314 - without entities
-    except ET.ParseError as error:
+        robot = parse_xml(text)
+    except XmlError as error:
         hint = f'; this looks like xacro, {expand}' if 'xacro:' in text else ''
         raise BlfDscError(
             f'not a URDF, as it is not valid XML: {error}{hint}'
@@ -323,25 +338,18 @@ def _joint(element: ET.Element, placement: np.ndarray, body: _Body) -> Joint:
     kind = element.get('type', '')
     axis = _numbers(element.find('axis'), 'xyz', '1 0 0')
     length = float(np.sqrt((axis**2).sum()))
-    if length < 1e-6:
+    if length < _SHORTEST:
         raise BlfDscError(
             f'the axis of joint {name!r} is zero: write a direction such as 0 0 1'
         )
     limit = element.find('limit')
-    lower, upper = -inf, inf
-    if kind != 'continuous' and limit is not None:
-        lower = _number(limit, 'lower')
-        upper = _number(limit, 'upper')
-        if lower >= upper:
-            raise BlfDscError(
-                f'joint {name!r} has an empty range, {lower:g} to {upper:g}: correct its <limit>'
-            )
-    for key in ('velocity', 'effort'):
+    for key in ('velocity', 'effort', *_ACCELERATIONS):
         if (value := _number(limit, key)) < 0.0:
             raise BlfDscError(
                 f'joint {name!r} has <limit {key}="{value:g}">: it is a magnitude, so give '
                 f'{-value:g}, or 0 if it is unknown'
             )
+    lower, upper = _range(element)
     dynamics = element.find('dynamics')
     return Joint(
         name=name,
@@ -358,7 +366,33 @@ def _joint(element: ET.Element, placement: np.ndarray, body: _Body) -> Joint:
         inertia=inertia_of(body.J),
         fixed=body.fixed,
         held=body.held,
+        acceleration=min(_number(limit, key) or inf for key in _ACCELERATIONS),
     )
+
+
+def _range(element: ET.Element) -> tuple[float, float]:
+    """Return the position limits of a joint, within those of its <safety_controller>."""
+    name = element.get('name', '')
+    limit = element.find('limit')
+    if element.get('type') == 'continuous' or limit is None:
+        return -inf, inf
+    lower = _number(limit, 'lower')
+    upper = _number(limit, 'upper')
+    if lower >= upper:
+        raise BlfDscError(
+            f'joint {name!r} has an empty range, {lower:g} to {upper:g}: correct its <limit>'
+        )
+    soft = element.find('safety_controller')
+    if soft is None or not {'soft_lower_limit', 'soft_upper_limit'} <= {*soft.attrib}:
+        return lower, upper
+    soft_lower = max(lower, _number(soft, 'soft_lower_limit'))
+    soft_upper = min(upper, _number(soft, 'soft_upper_limit'))
+    if soft_lower >= soft_upper:
+        raise BlfDscError(
+            f'joint {name!r} has an empty range, {soft_lower:g} to {soft_upper:g}: correct its '
+            '<safety_controller>'
+        )
+    return soft_lower, soft_upper
 
 
 def pseudo_inertia(inertia: np.ndarray) -> np.ndarray:
@@ -422,10 +456,16 @@ def _link_inertia(link: ET.Element) -> np.ndarray:
 
 
 def _origin(element: ET.Element) -> np.ndarray:
-    """Return the placement (4, 4) of an <origin>: roll, pitch, yaw about fixed axes, then xyz."""
+    """Return the placement (4, 4) of an <origin>: roll, pitch, yaw about fixed axes, then xyz.
+
+    URDF 1.1 may have a quaternion `quat_xyzw` instead.
+    """
     origin = element.find('origin')
     frame = np.eye(4)
     frame[:3, 3] = _numbers(origin, 'xyz', '0 0 0')
+    if origin is not None and 'quat_xyzw' in origin.attrib:
+        frame[:3, :3] = _rotation(origin)
+        return frame
     for k, angle in enumerate(_numbers(origin, 'rpy', '0 0 0')):
         i, j = (k + 1) % 3, (k + 2) % 3
         turn = np.eye(3)
@@ -433,6 +473,27 @@ def _origin(element: ET.Element) -> np.ndarray:
         turn[i, j], turn[j, i] = -sin(angle), sin(angle)
         frame[:3, :3] = product(turn, frame[:3, :3])
     return frame
+
+
+def _rotation(origin: ET.Element) -> np.ndarray:
+    """Return the rotation (3, 3) of the quaternion of an <origin>."""
+    if 'rpy' in origin.attrib:
+        raise BlfDscError('an <origin> has both rpy and quat_xyzw: remove one of them')
+    quaternion = _numbers(origin, 'quat_xyzw', '0 0 0 1', 4)
+    length = float(np.sqrt((quaternion**2).sum()))
+    if length < _SHORTEST:
+        raise BlfDscError(
+            f'<origin quat_xyzw="{origin.get("quat_xyzw")}">: a quaternion of no length has no '
+            'direction'
+        )
+    x, y, z, w = quaternion / length
+    return np.array(
+        [
+            [1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - z * w), 2.0 * (x * z + y * w)],
+            [2.0 * (x * y + z * w), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - x * w)],
+            [2.0 * (x * z - y * w), 2.0 * (y * z + x * w), 1.0 - 2.0 * (x * x + y * y)],
+        ]
+    )
 
 
 def _link(joint: ET.Element, role: str) -> str:

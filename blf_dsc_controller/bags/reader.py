@@ -99,6 +99,7 @@ def recorded_run(
         tool=_tool(content),
         learns=_learns([event.content.get('parameters', {}) for event in events]),
         notes=(*run.notes, *_unknown_parameters(content)),
+        sliding=_sliding(content),
     )
 
 
@@ -293,6 +294,15 @@ def _arm(content: Content) -> LearnedArm | None:
         with suppress(BlfDscError):
             return learned_arm(content.controller_config())
     return None
+
+
+def _sliding(content: Content) -> tuple[str, ...]:
+    """Return the joints that slide by the recorded configuration; none if it is unknown."""
+    if content.configurations.get(topics.CONTROLLER, {}).get('model') == 'urdf':
+        with suppress(BlfDscError):
+            config = content.controller_config()
+            return config.robot.sliding(config.joints)
+    return ()
 
 
 def _tool(content: Content) -> ToolErrors | None:

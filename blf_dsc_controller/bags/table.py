@@ -66,7 +66,7 @@ def table(run: Run, rows: slice = slice(None)) -> dict[str, NDArray[Any]]:
         values = getattr(run, field)
         if values is not None:
             for joint, column in zip(run.joints, values[rows].T, strict=True):
-                columns[f'{field} {joint} [{unit}]'] = column
+                columns[f'{field} {joint} [{run.units(joint).of(unit)}]'] = column
     for topic in ('monitor', 'external', 'truth', 'timing'):
         series = getattr(run, topic)
         if series is not None:

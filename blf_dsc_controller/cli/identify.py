@@ -156,6 +156,12 @@ def _facts(found: Identified, options: Namespace) -> list[str]:
         f'blf_dsc_controller {__version__}'
     )
     lines = [origin, header_of(found), *problems_of(found, options.effort)]
+    if found.chain.gripper and not options.tip:
+        lines.append(
+            f'{found.chain.gripper}, which slides at the end of an arm that turns, was identified '
+            'as a joint of the arm; if it is a gripper, give the link that carries it: --tip '
+            f'{found.chain.joints[-2].link}'
+        )
     return [textwrap.fill(line, _WIDTH) for line in [*lines, *notes_of(found)]]
 
 

@@ -16,6 +16,7 @@ from math import isfinite
 from typing import NamedTuple
 
 from blf_dsc_controller.arms.urdf import Chain
+from blf_dsc_controller.arms.xml_text import parse_xml
 from blf_dsc_controller.errors import BlfDscError
 
 ARMATURE = 'armature'
@@ -38,7 +39,7 @@ def describe(text: str) -> Description:
     found = Description({}, {}, {})
     if f'{ARMATURE}=' not in text and f'{GRAVITY}=' not in text:
         return found
-    root = ET.fromstring(text)  # noqa: S314 - `read_chain` has accepted it
+    root = parse_xml(text)
     for link in root.findall('link'):
         if GRAVITY in link.attrib:
             found.gravity[link.get('name', '')] = _numbers(link, GRAVITY, 3)

@@ -318,4 +318,4 @@ def read_text(path: Path) -> str:
         raise OSError(
             f'{path} has {state.st_size} bytes; expected text of at most {_LARGEST}'
         )
-    return path.read_text(encoding='utf-8')
+    return path.read_text(encoding='utf-8-sig')  # some editors mark their files

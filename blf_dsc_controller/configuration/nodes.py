@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -46,6 +47,8 @@ DRIVE = 'drive'
 STUDY = 'monte_carlo'
 """Name of the section of a study, which is no node."""
 
+_ARM = 'robot.urdf'  # a file, which may be beside the one that names it
+_PATH = 4096  # characters; longer ones are texts
 _of_bag = partial(parameter, read_only='a bag is opened once, when the recorder starts')
 _of_watchdog = partial(parameter, read_only='it is read once, when the node starts')
 _of_view = partial(parameter, read_only='the page is served once, when the node starts')
@@ -207,7 +210,7 @@ def read(path: str | Path, based: tuple[str, ...] = ()) -> Sequence[Section]:
     come first; `based` are the files that are based on it.
     """
     try:
-        sections = parse(read_text(Path(path)))
+        sections = _beside(parse(read_text(Path(path))), Path(path).parent)
         named = (each for each in sections if each.pattern.endswith(f'/{STUDY}'))
         base = next(
             (each.entries['base'].value for each in named if 'base' in each.entries),
@@ -227,6 +230,28 @@ def read(path: str | Path, based: tuple[str, ...] = ()) -> Sequence[Section]:
         )
         raise ConfigurationError([problem], str(path))
     return [*read(below, above), *sections]
+
+
+def _beside(sections: Sequence[Section], folder: Path) -> Sequence[Section]:
+    """Return sections in which arms are found beside the file that names them.
+
+    A file of the current folder takes precedence, one of `config/` does not.  Presets,
+    which are in `config/` themselves, keep their names.
+    """
+    if folder.resolve() == (share_folder() / 'config').resolve():
+        return sections
+    return [section._replace(entries=_found(section, folder)) for section in sections]
+
+
+def _found(section: Section, folder: Path) -> dict[str, Entry]:
+    entry = section.entries.get(_ARM)
+    if entry is None or not isinstance(entry.value, str) or len(entry.value) > _PATH:
+        return section.entries
+    with suppress(OSError, ValueError):  # no path
+        beside = folder / entry.value
+        if beside.is_file() and not Path(entry.value).expanduser().is_file():
+            return section.entries | {_ARM: entry._replace(value=str(beside))}
+    return section.entries
 
 
 def load(

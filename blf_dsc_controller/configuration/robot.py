@@ -17,7 +17,8 @@ from blf_dsc_controller.arms.base_parameters import (
     base_parameters,
 )
 from blf_dsc_controller.arms.serial_chain import serial_chain
-from blf_dsc_controller.arms.urdf import Chain, inertia_of, read_chain
+from blf_dsc_controller.arms.urdf import Chain, Joint, inertia_of, read_chain
+from blf_dsc_controller.arms.xml_text import without_mark
 from blf_dsc_controller.configuration import mjcf
 from blf_dsc_controller.configuration.description import (
     check_supported,
@@ -52,6 +53,7 @@ _PLACEHOLDER = 4.0
 # of that torque, where efforts are placeholders: no arm stretches every link
 _NEEDED = 0.5
 _MOST_FRICTION = 0.25  # of the effort
+_SLOWEST = {'revolute': 2.0, 'prismatic': 0.5}  # rad/s or m/s, of the drives of arms
 # relative; the product of a decimal fraction and 1e9 is off by a few 1e-16
 _ROUNDING = 1e-12
 
@@ -159,10 +161,15 @@ class Robot:
         """
         return _kinds(self, joints)
 
+    def sliding(self, joints: tuple[str, ...]) -> tuple[str, ...]:
+        """Return the joints that slide; none without a URDF."""
+        kinds = zip(joints, self.kinds(joints), strict=True)
+        return tuple(name for name, kind in kinds if kind == 'prismatic')
+
     def friction(self, chain: Chain) -> dict[str, tuple[float, ...]]:
         """Return the initial friction of each joint, by the name of its column."""
         compensated = self.drive_compensates == 'gravity_and_friction'
-        share = 0.0 if compensated or implausible_friction(chain) else 1.0
+        share = 0.0 if compensated or implausible_friction(self, chain) else 1.0
         return {
             'viscous': self.viscous
             or tuple(share * joint.damping for joint in chain.joints),
@@ -250,21 +257,26 @@ def _kinds(robot: Robot, joints: tuple[str, ...]) -> tuple[str, ...]:
     return tuple(joint.kind for joint in robot.chain(joints).joints)
 
 
-def implausible_friction(chain: Chain) -> tuple[str, ...]:
+def implausible_friction(robot: Robot, chain: Chain) -> tuple[str, ...]:
     """Return the joints whose friction takes a quarter of their effort or more.
 
-    One is enough: then the friction of the URDF is a placeholder, and not known for any
-    joint.
+    One is enough: then the friction of the description is a placeholder, and not known
+    for any joint.
     """
+    strongest = float(robot.efforts(chain).max())
     return tuple(
         joint.name
         for joint in chain.joints
         if joint.friction > _MOST_FRICTION * joint.effort
-        or (
-            math.isfinite(joint.velocity)
-            and joint.damping * joint.velocity > joint.effort
-        )
+        or joint.damping * _speed(joint) > min(joint.effort, strongest)
     )
+
+
+def _speed(joint: Joint) -> float:
+    """Return the velocity of a joint, or one that any drive reaches if it is unknown."""
+    if math.isfinite(joint.velocity):
+        return joint.velocity
+    return _SLOWEST['prismatic' if joint.kind == 'prismatic' else 'revolute']
 
 
 def read_urdf(given: str) -> str:
@@ -272,6 +284,7 @@ def read_urdf(given: str) -> str:
 
     Raises BlfDscError if it cannot be read.
     """
+    given = without_mark(given)
     if given.lstrip().startswith('<'):
         return mjcf.urdf_of_text(given) if mjcf.is_mjcf(given) else given
     if given.startswith(TOPIC):

@@ -325,6 +325,7 @@ def run_of(
         arm=learned_arm(config),
         tool=tool.errors if tool else None,
         learns=config.law == 'blf_dsc' and config.learning.weight > 0.0,
+        sliding=config.robot.sliding(config.joints),
     )
 
 

@@ -141,13 +141,19 @@ def _of_urdf(config: ControllerConfig, load: ReferenceLoad) -> Iterator[str]:
             'a placeholder on an arm of this weight. The assumed inertia of the drives and '
             'learning.residual_floor follow from the weight instead: give the rated torques'
         )
-    if (joints := implausible_friction(chain)) and not (
+    if (joints := implausible_friction(robot, chain)) and not (
         robot.viscous and robot.coulomb
     ):
         yield (
-            'robot.coulomb: the friction in <dynamics> takes a quarter of the effort of '
+            'robot.coulomb: the friction in the description takes a quarter of the effort of '
             f'{", ".join(joints)} or more, which looks like a placeholder. Friction is not '
             'compensated until it is learned: give robot.viscous and robot.coulomb'
+        )
+    if chain.gripper and not robot.tip:
+        yield (
+            f'robot.tip: without it, {chain.gripper}, which slides at the end of a turning arm, '
+            'is one of the joints of the arm. If it is a gripper, give the link that carries it: '
+            f'{chain.joints[-2].link}'
         )
     for joint, limit, inertia in zip(
         chain.joints, config.torque.limit, load.free_inertia, strict=True
