@@ -26,6 +26,8 @@ from blf_dsc_controller.configuration.description import (
     REASON,
     UNSUPPORTED,
 )
+from blf_dsc_controller.configuration.files import read_text
+from blf_dsc_controller.configuration.mjcf_limits import check_size
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.extras import install_command
 
@@ -48,6 +50,7 @@ def urdf_of_file(path: Path) -> str:
     Raises BlfDscError, with the file and the element, if MuJoCo is missing or cannot
     compile it.
     """
+    check_size(read_text(path), path.parent, str(path))
     return _urdf(_model(path, str(path)))
 
 
@@ -57,7 +60,9 @@ def urdf_of_text(text: str) -> str:
 
     It can include absolute paths only.
     """
-    return _urdf(_model(text, 'the MJCF text'))
+    name = 'the MJCF text'
+    check_size(text, None, name)
+    return _urdf(_model(text, name))
 
 
 def _model(source: str | Path, name: str) -> Any:
