@@ -120,9 +120,11 @@ def adaptation_gain(gains: JointGains, inertia: Floats, deviation: Floats) -> fl
     """Return the largest Gamma with which the tracking error adapts no faster than d^3.
 
     `deviation` (n,) [N m] is the standard deviation of the modelled torque: adaptation
-    integrates Gamma deviation^2 xi2 where d^3 integrates gamma xi2.
+    integrates Gamma deviation^2 xi2 where d^3 integrates gamma xi2.  Where no joint has
+    a modelled torque at rest it is infinite.
     """
-    return float((gains.integral(inertia) / deviation**2).min())
+    with np.errstate(divide='ignore'):
+        return float((gains.integral(inertia) / deviation**2).min())
 
 
 def funnel_rate(gains: JointGains) -> float:

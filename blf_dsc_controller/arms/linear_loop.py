@@ -155,19 +155,40 @@ def arm_response(links: Floats, joints: Joints, timing: Timing, s: Complex) -> C
 def law_response(feedback: Feedback, timing: Timing, s: Complex) -> Complex:
     """Return C (k, f, n, n) [N m/rad] at s = i omega (f,): tau = - C y."""
     T = timing.period
-    z = np.exp(T * s)[:, None]
+    z = np.exp(T * s)[:, None, None]
     decay = _decay(timing.velocity_lag, T)
     velocity = (1.0 - decay) * (1.0 - 1.0 / z) / T / (1.0 - decay / z)
+    of_position, of_velocity = law_responses(feedback, T, s)
+    return np.asarray(of_position + velocity * of_velocity)
+
+
+def law_responses(feedback: Feedback, T: float, s: Complex) -> tuple[Complex, Complex]:
+    """Return C_y [N m/rad] and C_v [N m s/rad] (k, f, n, n): tau = - C_y y - C_v v.
+
+    T [s] is the sample time, s = i omega (f,).
+    """
+    z = np.exp(T * s)[:, None]
     g = 1.0 - np.exp(-T / feedback.time_constant)
-    known = velocity * feedback.rate if feedback.known_rate else 0.0
-    # alpha2+ = alpha2 + g (-rate y - alpha2) - T known y
-    alpha2 = -(g * feedback.rate + T * known) / (z - 1.0 + g)
+    # alpha2+ = alpha2 + g (-rate y - alpha2) - T rate v
+    followed = -g * feedback.rate / (z - 1.0 + g)
+    known = (
+        -T * feedback.rate / (z - 1.0 + g) if feedback.known_rate else 0.0 * followed
+    )
+    return (
+        feedback.position[:, None] + _of_alpha2(feedback, T, z, followed, 0.0),
+        _of_alpha2(feedback, T, z, known, 1.0),
+    )
+
+
+def _of_alpha2(
+    feedback: Feedback, T: float, z: Complex, alpha2: Complex, velocity: float
+) -> Complex:
+    """Return what the law adds for alpha2 (f, n) and the velocity."""
     dalpha2 = (z - 1.0) / T * alpha2
     xi2 = velocity - alpha2
     d3 = -T / (z - 1.0) * xi2
     return np.asarray(
-        feedback.position[:, None]
-        + feedback.surface[:, None] * xi2[:, None, :]
+        feedback.surface[:, None] * xi2[:, None, :]
         - feedback.inertia[:, None] * dalpha2[:, None, :]
         - feedback.integral[:, None] * d3[:, None, :]
     )

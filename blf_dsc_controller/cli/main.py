@@ -192,6 +192,7 @@ def make_parser() -> argparse.ArgumentParser:
     _add_run(partial(command, 'run'))
     _add_drive(partial(command, 'drive'))
     _add_bags(partial(command, 'bags'), names, force)
+    _add_commissioning(partial(command, 'commission'), force)
     _add_identification(partial(command, 'identify'), names, force)
     _add_studies(partial(command, 'studies'))
     parser.set_defaults(commands=tuple(commands.choices))
@@ -310,6 +311,50 @@ def _add_bags(
     option = command('plot', about, 'run1/bag --out pictures', names, force)
     option('bag', type=Path, help=_BAG)
     option('--out', type=Path, default=Path(), help='folder to write into (.)')
+
+
+def _add_commissioning(command: _Command, force: argparse.ArgumentParser) -> None:
+    option = command(
+        'commission',
+        'Measure an arm from a URDF, and choose its gains by what was measured. A reference '
+        'shakes all joints a little, in a few postures; from torques and positions follow the '
+        'responses of the joints, and the stiffest gains with a modulus margin. Without BAG the '
+        'arm is simulated. With --write, write the motions for a real arm, to be run by the '
+        'node or `blf_dsc drive`; then give their bags. Exit code: 0 done, 3 no gains have the '
+        'margin, 1 an error.',
+        '--config ur5e --out commissioned.yaml\n'
+        '  blf_dsc commission --config my.yaml --write motion.yaml\n'
+        '  blf_dsc commission run1/bag run2/bag run3/bag --config my.yaml --out commissioned.yaml',
+        force,
+    )
+    option('bags', type=Path, nargs='*', metavar='BAG', help='runs of the motions')
+    option('--config', required=True, help=_CONFIG)
+    option(
+        '--out',
+        type=Path,
+        default=Path('commissioned.yaml'),
+        help='parameter file to write, and a picture beside it (commissioned.yaml)',
+    )
+    option(
+        '--write',
+        type=Path,
+        metavar='MOTION.yaml',
+        help='measure nothing, but write MOTION_1.yaml and so on, one for each posture',
+    )
+    option(
+        '--posture',
+        type=float,
+        nargs='+',
+        action='append',
+        metavar='ANGLE',
+        help='angles of all joints [rad]; can be repeated (three along the reference)',
+    )
+    torque = 'rms torque of the motion, as a share of the rated one (0.03)'
+    option('--torque', type=float, default=0.03, help=torque)
+    travel = 'farthest that the tool travels from its middle [m] (0.01)'
+    option('--travel', type=float, default=0.01, help=travel)
+    margin = 'modulus margin of the gains (0.5)'
+    option('--margin', type=float, default=0.5, help=margin)
 
 
 def _add_identification(

@@ -159,6 +159,8 @@ def sinusoids(
     velocity = 0.0
     acceleration = 0.0
     for k in range(tones):
+        if amplitude[i, k] == 0.0:  # a tone of other joints
+            continue
         angle = frequency[k] * t + phase[k]
         rate = frequency[k] * amplitude[i, k]
         position += amplitude[i, k] * cos(angle)

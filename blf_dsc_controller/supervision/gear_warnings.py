@@ -28,8 +28,9 @@ def gear_warnings(config: ControllerConfig, settings: Settings) -> Iterator[str]
         yield (
             'feedback.joint_stiffness: nothing is known of the gears of this arm, so its gains '
             f'only hold it softly, {joint} with a damping of {settings.Kp[softest]:.2g} N m s/rad. '
-            'Give feedback.joint_stiffness and feedback.joint_damping as the maker of the arm '
-            'publishes them, or robot.joint_stiffness'
+            'Measure it with `blf_dsc commission`, or give feedback.joint_stiffness and '
+            'feedback.joint_damping as the maker of the arm publishes them, or '
+            'robot.joint_stiffness'
         )
 
 

@@ -1,0 +1,161 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`blf_dsc commission`: measure an arm, and choose its gains by what was measured."""
+
+from __future__ import annotations
+
+import textwrap
+from argparse import Namespace
+from collections.abc import Sequence
+from datetime import datetime
+from pathlib import Path
+
+import numpy as np
+from tqdm import tqdm
+
+from blf_dsc_controller import __version__
+from blf_dsc_controller.bags.content import read_content
+from blf_dsc_controller.bags.reader import read_run
+from blf_dsc_controller.cli.main import make_room
+from blf_dsc_controller.cli.run import print_notice
+from blf_dsc_controller.commissioning import files, page, simulated
+from blf_dsc_controller.commissioning.commissioning import (
+    Commissioned,
+    Planned,
+    commissioned,
+    plan,
+    postures_of,
+)
+from blf_dsc_controller.compiled.announcement import announced_compilation
+from blf_dsc_controller.configuration.controller import ControllerConfig
+from blf_dsc_controller.configuration.nodes import (
+    CONTROLLER,
+    dump,
+    load,
+    load_loop,
+    locate,
+    read,
+)
+from blf_dsc_controller.errors import BlfDscError
+from blf_dsc_controller.run import Run
+
+_WIDTH = 98
+_Measured = tuple[Run, ControllerConfig]
+
+NO_MARGIN = 3
+"""Exit code if no gains have the margin."""
+
+
+def commission(options: Namespace) -> int:
+    """Write the motions to run, or measure, choose and write the gains."""
+    path = locate(options.config)
+    if options.write:
+        _write_motions(options, path)
+        return 0
+    picture = options.out.with_suffix('.png')
+    make_room(options.out, picture, force=options.force)
+    names, runs = _from_bags(options) if options.bags else _simulated(options, path)
+    config = load(path, CONTROLLER, ControllerConfig)
+    found = commissioned(config, runs, options.margin)
+    lines = _told(options, found)
+    print('\n'.join([page.table(found), '', *lines]))
+    page.draw(found, names, options.margin, picture)
+    print(f'wrote {picture}')
+    if found.choice.margin.value < options.margin:
+        print(f'not written: {options.out}')
+        return NO_MARGIN
+    comment = ''.join(f'# {line}\n' for line in lines)
+    dump(options.out, files.of_commissioned(read(path), found), comment)
+    print(f'wrote {options.out}')
+    if not options.bags:
+        _prove(options.out)
+    return 0
+
+
+def _planned(options: Namespace, config: ControllerConfig) -> list[Planned]:
+    """Return the motions, in the postures given or those that the reference visits."""
+    postures = np.array(options.posture) if options.posture else postures_of(config)
+    return plan(config, postures, torque=options.torque, travel=options.travel)
+
+
+def _write_motions(options: Namespace, path: Path) -> None:
+    """Write a parameter file for each motion, and say how far it goes."""
+    config = load(path, CONTROLLER, ControllerConfig)
+    planned = _planned(options, config)
+    sections = read(path)
+    paths = [
+        options.write.with_name(f'{options.write.stem}_{k}.yaml')
+        for k in range(1, len(planned) + 1)
+    ]
+    make_room(*paths, force=options.force)
+    for file, each in zip(paths, planned, strict=True):
+        line = _description(each)
+        dump(file, files.of_motion(sections, each), f'# {line}\n')
+        print(f'wrote {file}: {line}')
+    print(
+        'run the controller with each of them, for the time it says at least, from its posture '
+        'on, and record a bag; then give all bags to blf_dsc commission'
+    )
+
+
+def _description(planned: Planned) -> str:
+    """Return in a sentence how far and how fast a motion goes."""
+    made = planned.excitation
+    angles = ', '.join(f'{angle:.3g}' for angle in planned.posture)
+    return (
+        f'{planned.duration:.3g} s around [{angles}] rad; the tool travels '
+        f'{1e3 * made.travel:.2g} mm, the fastest joint moves at {made.speed.max():.2g} rad/s'
+    )
+
+
+def _simulated(options: Namespace, path: Path) -> tuple[list[str], list[_Measured]]:
+    """Return names and runs of the motions on the simulated arm."""
+    loop = load_loop(path)
+    planned = _planned(options, loop.controller)
+    for k, each in enumerate(planned, 1):
+        print(f'posture {k}: {_description(each)}')
+    names, runs = [], []
+    with announced_compilation(print_notice):
+        made = simulated.runs_of(planned, loop)
+        bar = tqdm(made, total=len(planned) + 1, unit='run', leave=False, disable=None)
+        for name, run in bar:
+            if isinstance(run, BlfDscError):
+                print(f'{name}: not measured: {run}')
+                continue
+            names.append(name)
+            runs.append(run)
+    return names, runs
+
+
+def _from_bags(options: Namespace) -> tuple[list[str], list[_Measured]]:
+    """Return names and runs of bags."""
+    runs = []
+    for bag in options.bags:
+        content = read_content(bag)
+        runs.append((read_run(bag), content.controller_config()))
+    return [str(bag) for bag in options.bags], runs
+
+
+def _told(options: Namespace, found: Commissioned) -> Sequence[str]:
+    """Return what was commissioned and when, and the sentences of the page; wrapped."""
+    today = datetime.now().astimezone().strftime('%Y-%m-%d %H:%M')
+    origin = (
+        f'{options.config} commissioned on {today} by blf_dsc_controller {__version__}, with a '
+        f'modulus margin of {found.choice.margin.value:.2g}'
+    )
+    told = [origin, *page.sentences(found, options.margin)]
+    return [line for each in told for line in textwrap.wrap(each, _WIDTH)]
+
+
+def _prove(path: Path) -> None:
+    """Say what the simulated arm does with its new gains."""
+    loop = load_loop(path)
+    proof = simulated.proof(loop)
+    if proof.stop:
+        print(
+            f'with these gains the simulated arm stops on its own motion: {proof.stop}'
+        )
+        return
+    print(
+        f'with these gains the simulated arm follows its own motion for {proof.duration:g} s, '
+        f'with {1e3 * proof.error:.2g} mrad at most'
+    )

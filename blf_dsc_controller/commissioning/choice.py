@@ -1,0 +1,135 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Gains by what was measured: the stiffest with a modulus margin, in every posture.
+
+With responses G_y, G_v and the law's C_y, C_v (`arms.linear_loop`) the loop, cut at the
+torques of all joints, is L = C_y G_y + C_v G_v, and the modulus margin is the least
+singular value of I + L over the frequencies, less what noise may make of it.  With small
+gains the loop is stable.  Raised step by step, they can only make it unstable where a
+singular value passes zero, so every step on the way must have the margin.
+
+First the stiffness and damping of all joints grow together, then those of each joint by
+itself, in turns, as far as the margin allows.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from blf_dsc_controller.arms.joint_gains import JointGains, linear
+from blf_dsc_controller.arms.linear_loop import law_responses
+from blf_dsc_controller.commissioning.response import Response
+
+Floats = NDArray[np.float64]
+Complex = NDArray[np.complex128]
+
+MARGIN = 0.5
+"""Modulus margin of the gains that are chosen."""
+
+SLOWEST = 5.0
+"""Frequency [Hz] from which on margins count: below, the damping ratio says more."""
+
+_DEVIATIONS = 2.0  # of noise, counted against a margin
+_STEP = 1.1
+_LEAST, _MOST = 0.05, 100.0  # times the damping of the measurement
+_OF_ONE = 5.0  # times that of all joints, of one joint by itself
+
+
+class Margin(NamedTuple):
+    """A modulus margin, and where it is least."""
+
+    value: float
+    frequency: float  # Hz
+    posture: int
+    joint: int  # with the largest part in it
+
+
+class Choice(NamedTuple):
+    """Chosen gains, and what limits them."""
+
+    gains: JointGains
+    factors: Floats  # (n,) on the damping of the measurement
+    margin: Margin
+    measured: Margin  # of the gains with which the arm was measured
+
+
+class Loops(NamedTuple):
+    """Measured arms in k postures, and the law by its gains."""
+
+    responses: Sequence[Response]
+    inertia: Floats  # (n,) kg m^2, the largest of each joint
+    sample_time: float  # s
+
+    def singular_values(self, gains: JointGains) -> list[tuple[Floats, Floats]]:
+        """Return for each posture the least singular value of I + L (f,), and its doubt."""
+        return [self._least(each, gains)[:2] for each in self.responses]
+
+    def margin(self, gains: JointGains) -> Margin:
+        """Return the margin of gains, noise counted against it."""
+        margins = []
+        for k, response in enumerate(self.responses):
+            value, doubt, direction = self._least(response, gains)
+            counted = np.where(response.frequency >= SLOWEST, value - doubt, np.inf)
+            at = int(counted.argmin())
+            joint = int(np.abs(direction[at]).argmax())
+            frequency = float(response.frequency[at])
+            margins.append(Margin(float(counted[at]), frequency, k, joint))
+        return min(margins)
+
+    def _least(
+        self, response: Response, gains: JointGains
+    ) -> tuple[Floats, Floats, Complex]:
+        """Return least singular values (f,), their doubt (f,) and directions (f, n)."""
+        n = len(self.inertia)
+        s: Complex = np.asarray(2j * np.pi * response.frequency, complex)
+        feedback = linear(gains, self.inertia, 1)
+        C_y, C_v = (each[0] for each in law_responses(feedback, self.sample_time, s))
+        L = C_y @ response.position + C_v @ response.velocity
+        left, values, right = np.linalg.svd(np.eye(n) + L)
+        # u^H (I + L) v changes by u^H dL v, dL_ij with the deviation rows_i columns_j
+        rows = np.abs(np.diagonal(C_y, axis1=1, axis2=2)) * response.position_noise
+        rows += np.abs(np.diagonal(C_v, axis1=1, axis2=2)) * response.velocity_noise
+        of_rows = np.linalg.norm(left[:, :, -1] * rows, axis=1)
+        of_columns = np.linalg.norm(right[:, -1] * response.columns, axis=1)
+        doubt = _DEVIATIONS * of_rows * of_columns
+        return values[:, -1], np.asarray(doubt), right[:, -1].conj()
+
+
+def choose(
+    loops: Loops,
+    start: JointGains,
+    by_factors: Callable[[Floats], JointGains],
+    margin: float = MARGIN,
+) -> Choice:
+    """Return the stiffest gains with the margin.
+
+    `start` are the gains of the measurement, `by_factors` the gains for factors (n,) on
+    its damping.
+    """
+
+    def has_margin(factors: Floats) -> bool:
+        return loops.margin(by_factors(factors)).value >= margin
+
+    factors = _LEAST * np.ones(len(start.damping))
+    while factors[0] * _STEP <= _MOST and has_margin(_STEP * factors):
+        factors *= _STEP
+    factors = _one_by_one(factors, has_margin)
+    gains = by_factors(factors)
+    return Choice(gains, factors, loops.margin(gains), loops.margin(start))
+
+
+def _one_by_one(factors: Floats, has_margin: Callable[[Floats], bool]) -> Floats:
+    """Raise the factor (n,) of each joint in turns."""
+    most = np.minimum(_OF_ONE * factors, _MOST)
+    grows = np.ones(len(factors), bool)
+    while grows.any():
+        for j in np.flatnonzero(grows):
+            more = factors.copy()
+            more[j] *= _STEP
+            grows[j] = more[j] <= most[j] and has_margin(more)
+            if grows[j]:
+                factors = more
+    return factors

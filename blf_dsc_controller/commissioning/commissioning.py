@@ -1,0 +1,185 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Commissioning of an arm from a URDF: the motions to run, and what follows from the runs."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from blf_dsc_controller.arms.joint_gains import JointGains, damped_arm, unknown_arm
+from blf_dsc_controller.arms.model import inertia_matrices
+from blf_dsc_controller.arms.tuning import Design
+from blf_dsc_controller.commissioning import motion
+from blf_dsc_controller.commissioning.choice import MARGIN, Choice, Loops, choose
+from blf_dsc_controller.commissioning.findings import Findings, findings_of
+from blf_dsc_controller.commissioning.response import Response, response_of
+from blf_dsc_controller.configuration.controller import ControllerConfig, design_of
+from blf_dsc_controller.configuration.schema import Value, change
+from blf_dsc_controller.errors import BlfDscError
+from blf_dsc_controller.run import Run
+from blf_dsc_controller.supervision.reference_load import along
+
+Floats = NDArray[np.float64]
+
+TORQUE = 0.03
+"""Torque of the motion, rms, as a share of the rated one."""
+TRAVEL = 0.01
+"""How far the tool may travel in the motion, from its middle [m]."""
+POSTURES = 3
+
+
+class Planned(NamedTuple):
+    """A motion to run, and how far it goes."""
+
+    config: ControllerConfig
+    values: dict[str, object]  # of it, that differ from those of the arm in use
+    posture: Floats  # (n,) rad
+    excitation: motion.Excitation
+
+    @property
+    def duration(self) -> float:
+        """Time [s] that a run needs, a little more than the period that counts."""
+        return motion.SETTLING + self.excitation.period + 0.5
+
+
+class Commissioned(NamedTuple):
+    """What was measured of an arm, and the gains that follow."""
+
+    joints: tuple[str, ...]
+    responses: tuple[Response, ...]
+    loops: Loops
+    start: JointGains  # of the measurement
+    choice: Choice
+    findings: Findings
+    assumed: Floats  # (n,) kg m^2, inertias by URDF and guess, where findings has them
+    lag: float  # s, robot.lag: measured, else as given
+
+    def parameters(self) -> dict[str, Value]:
+        """Return the parameters that follow, by dotted name."""
+        gains = self.choice.gains
+        return {
+            'robot.lag': float(f'{self.lag:.3g}'),
+            'feedback.inertia': 'none',
+            'feedback.joint_stiffness': _rounded(gains.stiffness),
+            'feedback.joint_damping': _rounded(gains.damping),
+            'feedback.stiffness': 1.0,
+        }
+
+
+def postures_of(config: ControllerConfig, count: int = POSTURES) -> Floats:
+    """Return postures (count, n) [rad] that the configured reference visits."""
+    return np.asarray(along(config, count)[0])
+
+
+def plan(
+    config: ControllerConfig,
+    postures: Floats,
+    *,
+    torque: float = TORQUE,
+    travel: float = TRAVEL,
+) -> list[Planned]:
+    """Return the motions around postures (k, n) [rad] by which an arm is measured.
+
+    Raises BlfDscError if the arm is not from a URDF, or has feedback through its inertia
+    matrix, with which no arm with elastic joints is safe to be measured.
+    """
+    if config.model != 'urdf':
+        raise BlfDscError(
+            f'model: got {config.model}, but commissioning needs an arm from a URDF'
+        )
+    if config.feedback.inertia != 'none':
+        raise BlfDscError(
+            f'feedback.inertia: got {config.feedback.inertia}, but an arm is measured with '
+            'gains of its joints, each on its own: give none'
+        )
+    planned = []
+    for posture in postures:
+        _check_posture(config, posture)
+        excitation = motion.excitation(config, posture, torque, travel)
+        values = motion.shaken(config, excitation, posture)
+        planned.append(Planned(change(config, values), values, posture, excitation))
+    return planned
+
+
+def commissioned(
+    config: ControllerConfig,
+    runs: Sequence[tuple[Run, ControllerConfig]],
+    margin: float = MARGIN,
+) -> Commissioned:
+    """Return what runs of `plan` show, each with the configuration that it had.
+
+    Raises BlfDscError if a run is not one of its motions, or has a stop.
+    """
+    arm, _ = design_of(config)
+    start = _gains_of(arm)
+    T = config.sample_time
+    for run, _ in runs:
+        if run.joints != config.joints:
+            raise BlfDscError(
+                f'the run is of the joints {", ".join(run.joints)}, the configuration of '
+                f'{", ".join(config.joints)}'
+            )
+    responses = tuple(response_of(run, motion.lines_in(each), T) for run, each in runs)
+    found = findings_of([run for run, _ in runs], responses)
+    postures = np.array([each.posture for each in responses])
+    model = arm.parameters.model
+    P = arm.parameters.of(arm.chain.inertias, arm.rotors)
+    here = np.diagonal(inertia_matrices(model, P, postures), axis1=1, axis2=2)
+    elsewhere = arm.over_postures().inertia - here.max(axis=0)
+    known = np.where(np.isnan(found.inertia), here.max(axis=0), found.inertia)
+    inertia = known + np.maximum(elsewhere, 0.0)
+    loops = Loops(responses, inertia, T)
+
+    def by_factors(factors: Floats) -> JointGains:
+        if config.feedback.joint_stiffness:
+            return start.scaled(factors)
+        return damped_arm(factors * start.damping, inertia)
+
+    lag = found.lag(T)
+    return Commissioned(
+        joints=config.joints,
+        responses=responses,
+        loops=loops,
+        start=start,
+        choice=choose(loops, start, by_factors, margin),
+        findings=found,
+        assumed=here.max(axis=0),
+        lag=config.robot.lag if np.isnan(lag) else lag,
+    )
+
+
+def _gains_of(arm: Design) -> JointGains:
+    """Return the gains with which an arm is measured."""
+    gains = arm.joints or unknown_arm(arm.rotors)
+    return gains.scaled(arm.stiffness)
+
+
+def _check_posture(config: ControllerConfig, posture: Floats) -> None:
+    n = len(config.joints)
+    if posture.shape != (n,):
+        raise BlfDscError(
+            f'posture: got {posture.size} angles, but the arm has {n} joints'
+        )
+    limits = zip(
+        config.joints,
+        posture,
+        config.limits.position_lower,
+        config.limits.position_upper,
+        strict=True,
+    )
+    for joint, at, lower, upper in limits:
+        if not lower + _ROOM <= at <= upper - _ROOM:
+            raise BlfDscError(
+                f'posture: {joint} would be at {at:.4g} rad, less than {_ROOM:g} rad from its '
+                f'limits, {lower:g} to {upper:g} rad'
+            )
+
+
+_ROOM = 0.05  # rad
+
+
+def _rounded(values: Floats) -> tuple[float, ...]:
+    return tuple(float(f'{value:.3g}') for value in values)

@@ -1,0 +1,57 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Parameter files with the motions of a commissioning, and with what was measured."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+
+from blf_dsc_controller.commissioning.commissioning import Commissioned, Planned
+from blf_dsc_controller.configuration.files import Section
+from blf_dsc_controller.configuration.nodes import CONTROLLER, PLANT, STUDY
+
+_Values = Mapping[str, object]
+
+
+def of_motion(sections: Sequence[Section], planned: Planned) -> dict[str, _Values]:
+    """Return the sections of a file with a motion in the place of its reference.
+
+    A simulated arm begins in its posture and picks nothing up.
+    """
+    arm = {'initial.position': planned.posture.tolist(), 'duration': planned.duration}
+    return _with(
+        sections,
+        {f'/**/{CONTROLLER}': planned.values, f'/**/{PLANT}': arm},
+        removed=('reference.', 'events.'),
+    )
+
+
+def of_commissioned(
+    sections: Sequence[Section], found: Commissioned
+) -> dict[str, _Values]:
+    """Return the sections of a file with what was measured in the place of guesses."""
+    chosen = found.parameters()
+    of_robot = {name: value for name, value in chosen.items() if 'robot.' in name}
+    own = {name: value for name, value in chosen.items() if name not in of_robot}
+    return _with(sections, {'/**': of_robot, f'/**/{CONTROLLER}': own})
+
+
+def _with(
+    sections: Iterable[Section],
+    given: Mapping[str, _Values],
+    removed: tuple[str, ...] = (),
+) -> dict[str, _Values]:
+    """Return sections as they are, but for the given values and names removed by their start."""
+    names = {name for values in given.values() for name in values}
+    nodes: dict[str, dict[str, object]] = {}
+    for section in sections:
+        if section.pattern.endswith(f'/{STUDY}'):
+            continue
+        kept = nodes.setdefault(section.pattern, {})
+        kept |= {
+            name: entry.value
+            for name, entry in section.entries.items()
+            if name not in names and not name.startswith(removed or ' ')
+        }
+    for pattern, values in given.items():
+        nodes[pattern] = {**nodes.get(pattern, {}), **values}
+    return dict(nodes)

@@ -1,0 +1,185 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What an arm is, by its responses: inertias, damping, lags, resonances and readings.
+
+Below its resonances an arm is rigid.  The inverse of its response, D = G_y^-1, has on its
+diagonal what each joint asks for while the others are held, with a lag on the way,
+
+    D_jj = (J (i omega)^2 + F i omega) e^(i omega tau)
+
+so inertia J, damping F (friction in motion acts like it) and lag tau follow by least
+squares.  The lag of velocities is that of G_v against i omega G_y.  Where a joint is free,
+gears show as an antiresonance, at which the link absorbs what its motor does, and a
+resonance above it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from blf_dsc_controller.commissioning.response import Response
+from blf_dsc_controller.run import Run
+
+Floats = NDArray[np.float64]
+Complex = NDArray[np.complex128]
+
+_RIGID = (2.0, 12.0)  # Hz, of the fit
+_BELOW, _FEWEST = 0.35, 5.0  # of a resonance, up to which an arm is rigid; Hz
+_SEEN = 1.0  # of the damping, what inertia asks for at the fastest of these
+_LAGS = np.linspace(0.0, 0.03, 301)  # s
+_SHOWN = 10.0  # times the doubt of a response, from which it shows resonances
+_PEAK = 1.5  # over its neighbours
+_APART = 16  # frequencies to either side of a peak, that it is compared with
+
+
+class Resonance(NamedTuple):
+    """A peak of the response of one joint."""
+
+    joint: int
+    posture: int
+    frequency: float  # Hz
+    height: float  # over a rigid joint
+
+
+class Findings(NamedTuple):
+    """What was measured of an arm, over its postures."""
+
+    inertia: (
+        Floats  # (n,) kg m^2, the largest with the others held; nan: friction hides it
+    )
+    damping: Floats  # (n,) N m s/rad, the mean
+    drive_lag: float  # s, from a torque to the motion, sampling included; nan likewise
+    velocity_lag: float  # s, of velocities against positions
+    resonances: tuple[Resonance, ...]
+    rate: float  # Hz, of joint states
+    jitter: float  # s, standard deviation of the time between two
+    lost: float  # fraction of the joint states
+    resolution: Floats  # (n,) rad, least step of the positions
+
+    def lag(self, sample_time: float) -> float:
+        """Return `robot.lag` [s]: the lags beyond those of sampling; nan: not known."""
+        beyond = self.drive_lag - 1.5 * sample_time
+        of_velocity = self.velocity_lag - 0.5 * sample_time
+        return float(np.maximum(0.0, beyond) + np.maximum(0.0, of_velocity))
+
+
+def findings_of(runs: Sequence[Run], responses: Sequence[Response]) -> Findings:
+    """Return what runs of the motion and their responses show."""
+    peaks = [_resonances(each, posture) for posture, each in enumerate(responses)]
+    fits = [
+        _rigid_fit(each, min((peak.frequency for peak in found), default=np.inf))
+        for each, found in zip(responses, peaks, strict=True)
+    ]
+    inertia, damping, lag = (np.array(each) for each in zip(*fits, strict=True))
+    hidden = inertia * 2.0 * np.pi * _RIGID[1] < _SEEN * damping
+    inertia[hidden] = lag[hidden] = np.nan
+    gaps = np.concatenate([np.diff(run.stamp) for run in runs]) * 1e-9
+    usual = float(np.median(gaps))
+    return Findings(
+        inertia=_largest(inertia),
+        damping=damping.mean(axis=0),
+        drive_lag=_middle(lag),
+        velocity_lag=float(np.median([_velocity_lag(each) for each in responses])),
+        resonances=tuple(each for found in peaks for each in found),
+        rate=1.0 / usual,
+        jitter=float(gaps.std()),
+        lost=float(np.maximum(np.rint(gaps / usual) - 1.0, 0.0).sum() / gaps.size),
+        resolution=_resolution(runs),
+    )
+
+
+def _rigid_fit(response: Response, peak: float) -> tuple[Floats, Floats, Floats]:
+    """Return inertia, damping and lag (n,) of the joints, below the lowest resonance [Hz]."""
+    low, high = _RIGID[0], max(_FEWEST, min(_RIGID[1], _BELOW * peak))
+    rows = (response.frequency >= low) & (response.frequency <= high)
+    s: Complex = np.asarray(2j * np.pi * response.frequency[rows], complex)
+    D: Complex = np.asarray(np.linalg.inv(response.position[rows]), complex)
+    joints = [_fit_of_joint(s, D[:, j, j]) for j in range(D.shape[-1])]
+    J, F, tau = np.array(joints).T
+    return J, F, tau
+
+
+def _fit_of_joint(s: Complex, D: Complex) -> tuple[float, float, float]:
+    """Return inertia, damping and lag by the least relative error, over a grid of lags."""
+    weight = 1.0 / np.abs(D)
+    wanted = np.concatenate(((D * weight).real, (D * weight).imag))
+
+    def fit(lag: float) -> tuple[float, float, float, float]:
+        turned = weight * np.exp(s * lag)
+        columns = np.column_stack((turned * s**2, turned * s))
+        rows = np.vstack((columns.real, columns.imag))
+        x, rest, *_ = np.linalg.lstsq(rows, wanted, rcond=None)
+        error = float(rest[0]) if rest.size else np.inf
+        return error, float(x[0]), float(x[1]), lag
+
+    return min(map(fit, _LAGS.tolist()))[1:]
+
+
+def _largest(values: Floats) -> Floats:
+    """Return the largest of each column (k, n) that is known, else nan."""
+    known = np.where(np.isnan(values), -np.inf, values).max(axis=0)
+    return np.where(np.isinf(known), np.nan, known)
+
+
+def _middle(values: Floats) -> float:
+    known = values[~np.isnan(values)]
+    return float(np.median(known)) if known.size else float('nan')
+
+
+def _velocity_lag(response: Response) -> float:
+    """Return the lag [s] of velocities, by the phase of the joints' own responses."""
+    s = 2j * np.pi * response.frequency[:, None]
+    own = [
+        np.diagonal(each, axis1=1, axis2=2)
+        for each in (response.velocity, response.position)
+    ]
+    rows = response.frequency >= _RIGID[0]
+    phase = np.angle(own[0] / (s * own[1]))[rows]
+    lags = -phase / (2.0 * np.pi * response.frequency[rows, None])
+    return float(np.median(lags))
+
+
+def _resonances(response: Response, posture: int) -> list[Resonance]:
+    """Return the highest peak of each joint that has one."""
+    own = np.abs(np.diagonal(response.position, axis1=1, axis2=2))
+    doubt = response.position_noise * response.columns
+    rate = 2.0 * np.pi * response.frequency
+    found = []
+    for j in range(own.shape[1]):
+        relative = own[:, j] * rate**2
+        rows = np.flatnonzero(
+            (own[:, j] > _SHOWN * doubt[:, j]) & (response.frequency > _RIGID[1])
+        )
+        peaks = [k for k in rows.tolist() if _is_peak(relative, k)]
+        if peaks:
+            rigid = np.median(relative[response.frequency < _RIGID[1]])
+            k = max(peaks, key=lambda k: float(relative[k]))
+            height = float(relative[k] / rigid)
+            found.append(Resonance(j, posture, float(response.frequency[k]), height))
+    return found
+
+
+def _is_peak(values: Floats, k: int) -> bool:
+    near = values[max(0, k - _APART) : k + _APART + 1]
+    if values[k] < near.max():
+        return False
+    before, after = values[max(0, k - _APART) : k], values[k + 1 : k + _APART + 1]
+    if not (before.size and after.size):
+        return False
+    return bool(values[k] > _PEAK * max(before.min(), after.min()))
+
+
+def _resolution(runs: Sequence[Run]) -> Floats:
+    """Return the least step (n,) [rad] between two positions, 0 where they never repeat."""
+    columns = np.concatenate([run.position for run in runs]).T
+    steps = []
+    for column in columns:
+        values = np.unique(column)
+        repeats = values.size < column.size / 2
+        steps.append(
+            float(np.diff(values).min()) if repeats and values.size > 1 else 0.0
+        )
+    return np.array(steps)

@@ -1,0 +1,244 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The motion that shakes an arm: a sum of many tones, of which each belongs to one joint.
+
+All joints move at once.  The period holds whole waves of every tone, so the spectrum of a
+period has one line for each.  Lines of the joints alternate,
+
+    f = (2 n k + j) / period      for joint j and some k,
+
+so that close to each frequency there is one line of every joint: n experiments at once,
+from which the whole matrix of responses follows.  What a period shows between these lines
+is noise and friction, and tells how much of a response can be believed.
+
+Torques are alike at all frequencies: a joint with inertia J moves by tau / (J omega^2).  Two
+slow tones keep each joint sliding, since friction hides the resonances of a joint that
+sticks.  Phases are random, but for the start: positions, velocities and accelerations
+begin at zero, so an arm at rest is not jerked.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from blf_dsc_controller.arms.model import inertia_matrices
+from blf_dsc_controller.arms.urdf import frames
+from blf_dsc_controller.configuration.controller import ControllerConfig
+from blf_dsc_controller.configuration.robot import parameters_of
+from blf_dsc_controller.errors import BlfDscError
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+SETTLING = 6.0
+"""Time [s] from the start until the period that is looked at."""
+
+_LINES = 80  # of each joint, at most
+_SLOWEST, _FASTEST = 2.0, 120.0  # Hz
+_OF_RATE = 0.35  # of the sample rate, the fastest line at most
+_SECONDS = 4.0  # of the period, for each joint
+_SLOW = 1.0  # Hz, of the tones that keep joints sliding
+_SLOW_TONES = 2
+_SLIDING = 0.1  # rad/s, their largest speed
+_LEAST_SWING = 0.05  # times that, before the lines shrink, too
+_SHRINKS = 40  # until travel and speeds are within their limits
+_SPEED = 0.25  # of the limit of velocity
+_SEED = 0
+_NEWTON = 50  # steps at most
+_AT_REST = 1e-12  # of the amplitude
+
+
+class Excitation(NamedTuple):
+    """Tones of a motion by joint, and how far it goes."""
+
+    period: float  # s
+    bins: Ints  # (n, K) of the spectrum of a period: lines of each joint
+    slow: Ints  # (n, 2) likewise: the tones that keep the joints sliding
+    amplitude: Floats  # (n, K + 2) rad, of lines and slow tones
+    phase: Floats  # (n, K + 2) rad
+    travel: float  # m, of the tool from its middle
+    speed: Floats  # (n,) rad/s, the largest
+
+    @property
+    def frequencies(self) -> Floats:
+        """Frequencies (K,) [Hz]: the middle of the lines of all joints."""
+        return np.asarray(self.bins.mean(axis=0) / self.period)
+
+    def reference(self, posture: Floats) -> dict[str, object]:
+        """Return the parameters of the reference around a posture (n,) [rad].
+
+        The first tone moves nothing; its period is that of the motion (`excitation_in`).
+        """
+        n, lines = self.amplitude.shape
+        bins = np.column_stack((self.bins, self.slow))
+        amplitude = np.zeros((n, 1 + n * lines))
+        for j in range(n):
+            amplitude[j, 1 + j * lines : 1 + (j + 1) * lines] = self.amplitude[j]
+        rates = 2.0 * np.pi / self.period * np.append(1, bins.ravel())
+        return {
+            'reference.type': 'sinusoids',
+            'reference.offset': _listed(posture),
+            'reference.amplitude': _listed(amplitude.ravel()),
+            'reference.frequency': _listed(rates),
+            'reference.phase': _listed(np.append(0.0, self.phase.ravel())),
+        }
+
+
+class Lines(NamedTuple):
+    """Lines of the joints in the spectrum of a period."""
+
+    period: float  # s
+    bins: Ints  # (n, K)
+
+    @property
+    def frequencies(self) -> Floats:
+        """Frequencies (K,) [Hz]: the middle of the lines of all joints."""
+        return np.asarray(self.bins.mean(axis=0) / self.period)
+
+
+def lines_in(config: ControllerConfig) -> Lines:
+    """Return the lines of the motion that a configuration has.
+
+    Raises BlfDscError if it is none of those that `shaken` makes.
+    """
+    reference = config.reference
+    n = len(config.joints)
+    rates = np.array(reference.frequency)
+    if reference.type != 'sinusoids' or rates.size < 4 * n + 1 or (rates.size - 1) % n:
+        raise BlfDscError(_OTHER_MOTION)
+    bins = rates[1:] / rates[0]
+    if np.abs(bins - np.rint(bins)).max() > 1e-6:
+        raise BlfDscError(_OTHER_MOTION)
+    by_joint = np.rint(bins).astype(np.int64).reshape(n, -1)
+    return Lines(2.0 * np.pi / float(rates[0]), by_joint[:, :-_SLOW_TONES])
+
+
+_OTHER_MOTION = (
+    'the reference of this run is not the motion of a commissioning: run the parameters that '
+    '`blf_dsc commission --write` writes'
+)
+
+
+def excitation(
+    config: ControllerConfig, posture: Floats, share: float, travel: float
+) -> Excitation:
+    """Return the motion around a posture (n,) [rad] of an arm from a URDF.
+
+    Its torques are `share` of the rated ones (rms), by the inertias that the URDF and
+    `robot.rotor_inertia` have; less, where its tool would travel farther than `travel`
+    [m] or a joint would move faster than a quarter of its limit.
+    """
+    n = len(config.joints)
+    period = _SECONDS * n
+    bins = _bins(n, period, config.sample_time)
+    first = round(_SLOW * period) - n + np.arange(n)
+    slow = np.column_stack((first, first + 2 * n))
+    chain = config.robot.chain(config.joints)
+    base = parameters_of(config.robot, chain)
+    P = base.of(chain.inertias, config.robot.rotors(chain))
+    inertia = np.diagonal(inertia_matrices(base.model, P, posture[None])[0])
+    rated = config.robot.efforts(chain)
+    rate = 2.0 * np.pi / period * bins
+    torque = share * rated / math.sqrt(0.5 * bins.shape[1])
+    lines = torque[:, None] / (inertia[:, None] * rate**2)
+    swing = np.full(slow.shape, _SLIDING / (2.0 * np.pi * _SLOW) / _SLOW_TONES)
+    shape = _Shape(np.column_stack((bins, slow)), period)
+    limit = _SPEED * np.array(config.limits.velocity)
+    middle = frames(chain, posture)[-1][:3, 3]
+    factors = np.ones(2)  # of lines and swings
+    for _ in range(_SHRINKS):
+        amplitude = np.column_stack((factors[0] * lines, factors[1] * swing))
+        phase, moved, speed = shape.motion(amplitude)
+        tips = frames(chain, posture + moved)[-1][:, :3, 3]
+        far = float(np.linalg.norm(tips - middle, axis=1).max())
+        excess = max(far / travel, float((speed / limit).max()))
+        if excess <= 1.0:
+            break
+        shrunk = slice(1, 2) if factors[1] > _LEAST_SWING else slice(None)
+        factors[shrunk] /= max(min(excess, 2.0), 1.05)
+    return Excitation(period, bins, slow, amplitude, phase, far, speed)
+
+
+class _Shape:
+    """Motions of given lines (n, K), by their amplitudes."""
+
+    def __init__(self, bins: Ints, period: float) -> None:
+        self._bins = bins
+        self._period = period
+        random = np.random.default_rng(_SEED)
+        self._phase = random.uniform(0.0, 2.0 * np.pi, bins.shape)
+        # against each other at the start
+        self._phase[:, -1] = self._phase[:, -2] + np.pi
+
+    def motion(self, amplitude: Floats) -> tuple[Floats, Floats, Floats]:
+        """Return phases (n, K), motion (N, n) [rad] over a period, and speeds (n,) [rad/s]."""
+        rows = zip(amplitude, self._bins, self._phase, strict=True)
+        phase = np.array([_from_rest(*row) for row in rows])
+        moved = _over_a_period(amplitude, phase, self._bins)
+        rate = np.gradient(moved, self._period / len(moved), axis=0)
+        return phase, moved, np.abs(rate).max(axis=0)
+
+
+def shaken(
+    config: ControllerConfig, excitation: Excitation, posture: Floats
+) -> dict[str, object]:
+    """Return the parameters that hold an arm by its own gains and shake it.
+
+    It learns nothing, so that it is the same at the end as at the beginning.
+    """
+    count = len(config.learning.initial_estimate)
+    barrier = config.barrier
+    wide = np.maximum(np.maximum(barrier.bound, barrier.initial_bound), _ROOM)
+    return excitation.reference(posture) | {
+        'learning.weight': 0.0,
+        'learning.adaptation_gain': [0.0] * count,
+        'barrier.bound': _listed(wide),
+        'barrier.initial_bound': [0.0] * len(wide),
+    }
+
+
+_ROOM = 0.1  # rad, bound of the errors
+
+
+def _bins(n: int, period: float, sample_time: float) -> Ints:
+    """Return the lines (n, K) of the joints: half of the spectrum stays free, for noise."""
+    fastest = min(_FASTEST, _OF_RATE / sample_time)
+    wanted = np.geomspace(_SLOWEST, fastest, _LINES) * period / (2 * n)
+    middle = np.unique(np.rint(wanted).astype(np.int64))
+    return np.asarray(2 * n * middle + np.arange(n)[:, None])
+
+
+def _from_rest(amplitude: Floats, bins: Ints, phase: Floats) -> Floats:
+    """Return phases near those given with which a joint begins at rest, in the middle.
+
+    Position, velocity and acceleration at the start are zero, by Newton's method with
+    the least change of the phases.
+    """
+    rates = bins / bins.max()
+    weights = amplitude * np.stack((np.ones_like(rates), rates, rates**2))
+    weights /= np.abs(weights).sum(axis=1, keepdims=True)
+    turn = np.array([0.0, 0.5 * np.pi, 0.0])[:, None]
+    for _ in range(_NEWTON):
+        value = (weights * np.cos(phase + turn)).sum(axis=1)
+        if np.abs(value).max() < _AT_REST:
+            break
+        slope = -weights * np.sin(phase + turn)
+        phase = phase - np.linalg.lstsq(slope, value, rcond=None)[0]
+    return phase
+
+
+def _over_a_period(amplitude: Floats, phase: Floats, bins: Ints) -> Floats:
+    """Return the motion (N, n) [rad] over a period, from the middle."""
+    n = len(amplitude)
+    count = 4 * (int(bins.max()) + 1)
+    spectrum = np.zeros((count // 2 + 1, n), complex)
+    for j in range(n):
+        spectrum[bins[j], j] = amplitude[j] * np.exp(1j * phase[j])
+    return np.asarray(np.fft.irfft(spectrum, count, axis=0) * (count / 2))
+
+
+def _listed(values: Floats) -> list[float]:
+    return [float(each) for each in np.asarray(values)]

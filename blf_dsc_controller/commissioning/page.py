@@ -1,0 +1,149 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A commissioning for people: a table, sentences and a picture."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from blf_dsc_controller.analysis.figures import Picture
+from blf_dsc_controller.analysis.output import aligned
+from blf_dsc_controller.analysis.panels import ALARM, BLUE, MUTED, ORANGE, SHADE
+from blf_dsc_controller.commissioning.choice import SLOWEST
+from blf_dsc_controller.commissioning.commissioning import Commissioned
+
+Floats = NDArray[np.float64]
+
+_COLOURS = (BLUE, ORANGE, MUTED, ALARM)
+_SIZE = (5.6, 3.4)  # inches, of a panel
+_MUCH = 0.1  # of the margin, by noise
+
+
+def table(found: Commissioned) -> str:
+    """Return what was measured and chosen for each joint, beside what was assumed."""
+    heads = (
+        '',
+        'inertia',
+        'as assumed',
+        'damping',
+        'resonance',
+        'stiffness',
+        'damping',
+    )
+    units = ('', 'kg m^2', 'kg m^2', 'N m s/rad', 'Hz', 'N m/rad', 'N m s/rad')
+    above = ('', 'measured', '', 'measured', 'measured', 'chosen', 'chosen')
+    rows: list[Sequence[str]] = [heads, above, units]
+    gains = found.choice.gains
+    for j, joint in enumerate(found.joints):
+        peaks = [
+            each.frequency for each in found.findings.resonances if each.joint == j
+        ]
+        rows.append(
+            (
+                joint,
+                _known(found.findings.inertia[j]),
+                f'{found.assumed[j]:.3g}',
+                f'{found.findings.damping[j]:.3g}',
+                f'{min(peaks):.0f}' if peaks else '-',
+                f'{gains.stiffness[j]:.3g}',
+                f'{gains.damping[j]:.3g}',
+            )
+        )
+    return aligned(rows)
+
+
+def sentences(found: Commissioned, aim: float) -> Iterator[str]:
+    """Yield what was found, what limits the gains, and what to do about it."""
+    arm = found.findings
+    states = f'joint states at {arm.rate:.4g} Hz, jitter {1e3 * arm.jitter:.2g} ms'
+    yield f'{states}, {100.0 * arm.lost:.2g} % lost'
+    if not np.isnan(arm.drive_lag):
+        yield (
+            f'a torque takes {1e3 * arm.drive_lag:.2g} ms to its motion, sampling included, and '
+            f'velocities are {1e3 * arm.velocity_lag:.2g} ms old'
+        )
+    hidden = np.isnan(arm.inertia)
+    if hidden.any():
+        names = ', '.join(np.array(found.joints)[hidden])
+        yield (
+            f'friction hides the inertia of {names}: that of the URDF is used; a larger '
+            '--travel shows more'
+        )
+    choice = found.choice
+    limit = choice.margin
+    joint = found.joints[limit.joint]
+    yield (
+        f'the gains are limited near {limit.frequency:.2g} Hz by {joint}: there the modulus '
+        f'margin is {limit.value:.2g}; that of the gains it was measured with is '
+        f'{choice.measured.value:.2g} at {choice.measured.frequency:.2g} Hz'
+    )
+    if limit.value < aim:
+        yield (
+            f'NO GAINS HAVE THE MARGIN of {aim:g}: noise or friction hide the response. Measure '
+            'again with a larger --torque or --travel'
+        )
+    doubt = _doubt_at(found)
+    if doubt > _MUCH:
+        yield (
+            f'noise costs {doubt:.2g} of the margin: a larger --torque may show that the arm '
+            'bears more'
+        )
+    yield (
+        'measured at '
+        f'{len(found.responses)} postures: with another load or far from these, measure again'
+    )
+
+
+def _doubt_at(found: Commissioned) -> float:
+    """Return what noise takes from the margin where it is least."""
+    limit = found.choice.margin
+    doubt = found.loops.singular_values(found.choice.gains)[limit.posture][1]
+    at = found.responses[limit.posture].frequency
+    return float(doubt[int(np.abs(at - limit.frequency).argmin())])
+
+
+def draw(found: Commissioned, names: Sequence[str], aim: float, path: Path) -> None:
+    """Draw the margins of measured and chosen gains, and the response of each joint."""
+    title = 'Commissioning: what the arm bears'
+    n = len(found.joints)
+    rows = 1 + -(-n // 2)
+    picture = Picture(rows, 2, title, _SIZE, share_time=False)
+    labels = ('as measured', 'as chosen')
+    for axes, label, gains in zip(
+        picture.axes[0], labels, (found.start, found.choice.gains), strict=True
+    ):
+        values = found.loops.singular_values(gains)
+        for (value, doubt), response, name, colour in zip(
+            values, found.responses, names, _colours(names), strict=True
+        ):
+            f = response.frequency
+            axes.semilogx(f, value, color=colour, label=name)
+            axes.fill_between(f, value - doubt, value, color=colour, alpha=0.2, lw=0.0)
+        axes.axhline(aim, color=ALARM, lw=1.0, ls='--')
+        axes.axvspan(axes.get_xlim()[0], SLOWEST, color=SHADE, alpha=0.5, lw=0.0)
+        axes.set_ylim(0.0, 1.5)
+        axes.set_title(f'least singular value of I + L, gains {label}', loc='left')
+        axes.set_xlabel('frequency [Hz]')
+    picture.axes[0, 0].legend(frameon=False, fontsize=8, loc='upper left')
+    panels = list(picture.axes[1:].flat)
+    for j, (axes, joint) in enumerate(zip(panels, found.joints, strict=False)):
+        for response, colour in zip(found.responses, _colours(names), strict=True):
+            f = response.frequency
+            own = np.abs(response.position[:, j, j])
+            axes.loglog(f, own * (2.0 * np.pi * f) ** 2, color=colour)
+        axes.set_title(f'{joint}: acceleration by torque [rad/(s^2 N m)]', loc='left')
+        axes.set_xlabel('frequency [Hz]')
+    for axes in panels[n:]:
+        axes.set_visible(False)
+    picture.save(path)
+
+
+def _colours(names: Sequence[str]) -> list[str]:
+    return [_COLOURS[k % len(_COLOURS)] for k in range(len(names))]
+
+
+def _known(value: float) -> str:
+    return '-' if np.isnan(value) else f'{value:.3g}'

@@ -1,0 +1,180 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The responses of an arm in a posture, from torques sent to what its sensors measured.
+
+In the closed loop, at the n lines around a frequency (`motion`), torques U and positions Y
+(n, n) are spectra of n different motions, so
+
+    Y = G_y U,   V = G_v U      G_y = Y U^-1  [rad/(N m)],   G_v = V U^-1  [rad/(s N m)]
+
+whatever feedback was at work, and without a model.  Delays, drives, gears, motors and what
+carries the arm are all in it.  The law acts on velocities as its driver measures or
+filters them, so theirs are measured, too.
+
+Gears have sharp resonances that may fall between two frequencies.  Where G_y peaks its
+inverse is smooth, as is G_v G_y^-1, so these are interpolated.
+
+Between the lines there is what the motion did not cause: noise, ripple, and what friction
+makes of it.  A line has as much, which gives the standard deviation of each response.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from blf_dsc_controller.commissioning.motion import SETTLING, Lines
+from blf_dsc_controller.errors import BlfDscError
+from blf_dsc_controller.run import Run
+
+Floats = NDArray[np.float64]
+Complex = NDArray[np.complex128]
+
+_MOST_LOST = 0.01  # of the samples of a period
+_FINER = 4  # times as many frequencies as there are lines of a joint
+_BETWEEN = 3  # times n lines to either side, from which the noise is taken
+
+
+class Response(NamedTuple):
+    """Responses in one posture, at f frequencies."""
+
+    frequency: Floats  # (f,) Hz
+    position: Complex  # G_y (f, n, n), rad/(N m)
+    velocity: Complex  # G_v (f, n, n), rad/(s N m)
+    # what Y and V - G U have beside the motion, at each line: (f, n) rms of the sensor
+    position_noise: Floats  # rad
+    velocity_noise: Floats  # rad/s
+    columns: Floats  # (f, n) 1/(N m), size of the columns of U^-1
+    posture: Floats  # (n,) rad, mean
+
+
+def response_of(run: Run, lines: Lines, sample_time: float) -> Response:
+    """Return the responses that a run of the motion shows.
+
+    Raises BlfDscError if it has no whole period, or too many samples are lost.
+    """
+    torque, position, velocity = _period(run, lines.period, sample_time)
+    U, Y, V = (_spectrum(each) for each in (torque, position, velocity))
+    at = lines.bins.T  # (f, n): the lines of each experiment
+    U_at, Y_at, V_at = (np.swapaxes(each[at], 1, 2) for each in (U, Y, V))
+    inverse = np.linalg.inv(U_at)
+    between = _between(lines.bins, len(U))
+    noises = [
+        _noise(measured, U, response, at, between)
+        for measured, response in ((Y, Y_at @ inverse), (V, V_at @ inverse))
+    ]
+    at_lines = Response(
+        frequency=lines.frequencies,
+        position=np.asarray(Y_at @ inverse),
+        velocity=np.asarray(V_at @ inverse),
+        position_noise=noises[0],
+        velocity_noise=noises[1],
+        columns=np.asarray(np.linalg.norm(inverse, axis=1)),
+        posture=np.asarray(position.mean(axis=0)),
+    )
+    return _refined(at_lines)
+
+
+def _refined(response: Response) -> Response:
+    """Return a response at more frequencies, interpolated between its own."""
+    f = response.frequency
+    fine = np.interp(
+        np.arange(_FINER * (f.size - 1) + 1) / _FINER, np.arange(f.size), f
+    )
+
+    def between(values: NDArray[Any]) -> NDArray[Any]:
+        rows = np.interp(fine, f, np.arange(f.size))
+        low = np.minimum(rows.astype(int), f.size - 2)
+        share = (rows - low).reshape(-1, *([1] * (values.ndim - 1)))
+        return np.asarray((1.0 - share) * values[low] + share * values[low + 1])
+
+    square = (2j * np.pi * f)[:, None, None] ** 2
+    fine_square = (2j * np.pi * fine)[:, None, None] ** 2
+    inverse = np.linalg.inv(response.position)
+    position = np.linalg.inv(between(inverse / square) * fine_square)
+    ratio = between(response.velocity @ inverse)
+    return Response(
+        frequency=fine,
+        position=np.asarray(position),
+        velocity=np.asarray(ratio @ position),
+        position_noise=between(response.position_noise),
+        velocity_noise=between(response.velocity_noise),
+        columns=between(response.columns),
+        posture=response.posture,
+    )
+
+
+def _period(run: Run, period: float, T: float) -> tuple[Floats, Floats, Floats]:
+    """Return torque, position, velocity (N + 1, n) over the first period after settling.
+
+    On an even grid: each sample is the one nearest to its time.
+    """
+    count = round(period / T)
+    begin = run.stamp[0] + round(1e9 * SETTLING)
+    times = begin + np.rint(1e9 * T * np.arange(count + 1)).astype(np.int64)
+    if run.stops and run.stops[0].stamp < times[-1]:
+        stop = run.stops[0]
+        raise BlfDscError(
+            f'the arm stopped {1e-9 * (stop.stamp - run.stamp[0]):.3g} s after the start: '
+            f'{stop.text}'
+        )
+    if run.stamp[-1] < times[-1]:
+        needed = SETTLING + period
+        raise BlfDscError(
+            f'the run has {run.duration:.3g} s, but the motion needs {needed:.3g} s'
+        )
+    after = np.searchsorted(run.stamp, times).clip(1, run.stamp.size - 1)
+    nearest = after - (times - run.stamp[after - 1] < run.stamp[after] - times)
+    lost = int(np.count_nonzero(np.diff(nearest) == 0))
+    if lost > _MOST_LOST * count:
+        raise BlfDscError(
+            f'{lost} of {count} joint states are missing in the period that counts: measure '
+            'with a driver that keeps its rate'
+        )
+    found = run.torque[nearest], run.position[nearest], run.velocity[nearest]
+    for name, values in zip(('torques', 'positions', 'velocities'), found, strict=True):
+        if not np.isfinite(values).all():
+            raise BlfDscError(f'the run has {name} that are not finite')
+    return found
+
+
+def _spectrum(values: Floats) -> Complex:
+    """Return amplitudes (N/2 + 1, n) of the waves of values (N + 1, n), without their drift.
+
+    The first and the last value are a period apart.
+    """
+    count = len(values) - 1
+    drift = np.linspace(0.0, values[-1] - values[0], count + 1)
+    return np.asarray(np.fft.rfft((values - drift)[:-1], axis=0) * (2.0 / count))
+
+
+def _between(bins: NDArray[np.int64], count: int) -> NDArray[np.bool_]:
+    """Return which waves (count,) of the spectrum the motion does not have."""
+    free = np.ones(count, bool)
+    free[bins.ravel()] = False
+    free[0] = False
+    return free
+
+
+def _noise(
+    measured: Complex,
+    U: Complex,
+    response: Complex,
+    at: NDArray[np.int64],
+    between: NDArray[np.bool_],
+) -> Floats:
+    """Return the rms (f, n) of what is measured between the lines beside G U."""
+    n = at.shape[1]
+    found = np.empty(at.shape)
+    for k, line in enumerate(at[:, 0]):
+        reach = _BETWEEN * n
+        while True:
+            low, high = max(1, line - reach), min(len(U), line + n + reach)
+            rows = low + np.flatnonzero(between[low:high])
+            if rows.size >= 2 * n or reach > len(U):
+                break
+            reach *= 2
+        rest = measured[rows] - U[rows] @ response[k].T
+        found[k] = np.sqrt((np.abs(rest) ** 2).mean(axis=0))
+    return found

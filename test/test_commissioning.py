@@ -1,0 +1,307 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Commissioning: motions, responses against the linear arm, gains, and what cannot be measured."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+
+from blf_dsc_controller.arms.joint_gains import JointGains, linear
+from blf_dsc_controller.arms.linear_loop import (
+    Joints,
+    Loop,
+    Timing,
+    arm_response,
+    law_response,
+    law_responses,
+)
+from blf_dsc_controller.arms.model import inertia_matrices
+from blf_dsc_controller.arms.urdf import frames
+from blf_dsc_controller.cli.main import main
+from blf_dsc_controller.commissioning import simulated
+from blf_dsc_controller.commissioning.choice import Loops, choose
+from blf_dsc_controller.commissioning.commissioning import commissioned, plan
+from blf_dsc_controller.commissioning.motion import excitation, lines_in
+from blf_dsc_controller.commissioning.response import response_of
+from blf_dsc_controller.configuration.controller import ControllerConfig
+from blf_dsc_controller.configuration.files import share_folder
+from blf_dsc_controller.configuration.nodes import load_loop
+from blf_dsc_controller.configuration.plant import PlantConfig
+from blf_dsc_controller.configuration.schema import build, change
+from blf_dsc_controller.errors import BlfDscError
+from blf_dsc_controller.law.factory import settings_of_config
+from blf_dsc_controller.reference.approach import reference_of
+from blf_dsc_controller.reference.terms import sampled
+from blf_dsc_controller.run import Stop
+from blf_dsc_controller.simulation.loop import simulate
+
+ROTORS = (0.3, 0.1)  # kg m^2
+SPRINGS = (3e3, 1.5e3)  # N m/rad: free resonances of 26 and 29 Hz
+VISCOUS = (2.0, 1.0)  # N m s/rad
+ROBOT = {
+    'robot.urdf': (share_folder() / 'config' / 'two_link.urdf').read_text(),
+    'robot.gravity': [0.0, 0.0, 0.0],
+    'robot.rotor_inertia': list(ROTORS),
+    'robot.lag': 0.001,
+}
+CONFIG = build(ControllerConfig, {**ROBOT, 'robot.payload': 0.1})
+POSTURE = np.array([0.3, 1.1])
+TIMING = Timing(1e-3, delay=1)
+ARM = build(
+    PlantConfig,
+    ROBOT
+    | {
+        'truth.rotor_inertia': list(ROTORS),
+        'joint.stiffness': list(SPRINGS),
+        'disturbance.constant': [0.0, 0.0],
+        'disturbance.amplitude': [0.0, 0.0],
+        'disturbance.viscous': list(VISCOUS),
+        'actuator.delay': 1,
+    },
+)
+
+
+@cache
+def planned():
+    """Return the motion around POSTURE."""
+    return plan(CONFIG, POSTURE[None])[0]
+
+
+@cache
+def found():
+    """Return what the simulated arm shows, without friction but viscous."""
+    return commissioned(CONFIG, [simulated.measured(planned(), ARM)])
+
+
+def true_loop(gains, inertia):
+    """Return the linear loop of the simulated arm with gains of its joints."""
+    settings = settings_of_config(CONFIG)
+    P = settings.initial_estimate[: settings.p]
+    links = inertia_matrices(settings.model, P, POSTURE[None]) - np.diag(ROTORS)
+    joints = Joints(np.array(ROTORS), np.array(VISCOUS), np.array(SPRINGS))
+    return Loop(links, joints, TIMING, linear(gains, inertia, 1))
+
+
+def test_motion_begins_at_rest_and_keeps_its_limits():
+    made = planned().excitation
+    reference = reference_of(planned().config)
+    times = np.linspace(0.0, made.period, 20_000)
+    q, dq, _ = sampled(reference, times).transpose(1, 0, 2)
+    start = sampled(reference, [0.0])[0]
+    largest = np.abs(sampled(reference, times)).max(axis=0)
+    # against the largest of the motion: rounding of 160 tones
+    np.testing.assert_array_less(np.abs(start[1:]), 1e-9 * largest[1:])
+    np.testing.assert_allclose(start[0], POSTURE, atol=1e-12)
+    chain = CONFIG.robot.chain(CONFIG.joints)
+    tips = frames(chain, q)[-1][:, :3, 3]
+    middle = frames(chain, POSTURE)[-1][:3, 3]
+    travel = np.linalg.norm(tips - middle, axis=1).max()
+    assert travel == pytest.approx(made.travel, rel=1e-2)  # of samples between others
+    assert 0.5 * 0.01 < travel <= 0.0101
+    np.testing.assert_allclose(np.abs(dq).max(axis=0), made.speed, rtol=0.05)
+
+
+@pytest.mark.parametrize('travel', [1e-4, 1e-3, 0.1])
+def test_travel_is_what_is_permitted(travel):
+    made = excitation(CONFIG, POSTURE, 0.03, travel)
+    assert made.travel <= travel
+    assert (made.speed <= 0.25 * np.array(CONFIG.limits.velocity)).all()
+
+
+def test_lines_belong_to_one_joint_each_and_are_known_from_the_configuration():
+    made = planned().excitation
+    lines = lines_in(planned().config)
+    np.testing.assert_array_equal(lines.bins, made.bins)
+    assert lines.period == pytest.approx(made.period)
+    every = np.concatenate((made.bins.ravel(), made.slow.ravel()))
+    assert np.unique(every).size == every.size
+    # all together within 1 / period of each other
+    assert np.ptp(made.bins, axis=0).max() == 1
+
+
+def test_law_of_position_and_velocity_is_the_law():
+    """With the velocity that the law takes from positions."""
+    inertia = np.array([1.5, 0.4])
+    gains = JointGains(np.array([80.0, 30.0]), np.array([9.0, 3.0]))
+    feedback = linear(gains, inertia, 1)
+    s = 2j * np.pi * np.geomspace(0.5, 450.0, 40)
+    timing = replace_lag(0.002)
+    z = np.exp(1e-3 * s)[:, None, None]
+    decay = np.exp(-1e-3 / 0.002)
+    velocity = (1.0 - decay) * (1.0 - 1.0 / z) / 1e-3 / (1.0 - decay / z)
+    C_y, C_v = law_responses(feedback, 1e-3, s)
+    whole = law_response(feedback, timing, s)
+    np.testing.assert_allclose(C_y + velocity * C_v, whole, rtol=1e-9)
+
+
+def replace_lag(lag):
+    return TIMING._replace(velocity_lag=lag)
+
+
+def test_responses_are_those_of_the_linear_arm():
+    """Of springs, motors, delay and hold, at lines from 2 to 120 Hz."""
+    (response,) = found().responses
+    loop = true_loop(found().start, found().loops.inertia)
+    s = 2j * np.pi * response.frequency
+    G = arm_response(loop.links, loop.joints, TIMING, s)[0]
+    size = np.linalg.norm(G, axis=(1, 2))
+    error = np.linalg.norm(response.position - G, axis=(1, 2)) / size
+    assert np.median(error) < 0.03
+    # Where G peaks, 1 / 8 Hz between the lines of the joints are much, but not of its inverse,
+    # which is J omega^2 while the arm is rigid, and twenty times as much at 120 Hz.
+    inverses = np.linalg.inv(response.position) - np.linalg.inv(G)
+    inertia = np.linalg.norm(np.diag(loop.links[0]) + ROTORS)
+    error = np.linalg.norm(inverses, axis=(1, 2)) / (inertia * np.abs(s) ** 2)
+    assert np.median(error) < 0.05
+    assert error.max() < 0.15
+
+
+def test_inertia_and_lags_are_found():
+    findings = found().findings
+    M = true_loop(found().start, found().loops.inertia).links[0]
+    # the motors are behind springs, which adds some percent at 12 Hz
+    np.testing.assert_allclose(findings.inertia, np.diag(M) + ROTORS, rtol=0.1)
+    # one sample of delay and half of one for which torques are held
+    assert findings.drive_lag == pytest.approx(1.5e-3, abs=1e-3)
+    assert findings.velocity_lag < 1e-3
+    assert findings.rate == pytest.approx(1000.0)
+    assert findings.lost == 0.0
+    assert findings.jitter < 1e-12  # s, of rounding
+
+
+def test_chosen_gains_have_the_margin_of_the_true_loop_and_twice_of_them_do_not():
+    choice = found().choice
+    assert choice.margin.value >= 0.5
+    inertia = found().loops.inertia
+    true = true_loop(choice.gains, inertia).margin()
+    assert true.value == pytest.approx(choice.margin.value, abs=0.1)
+    twice = true_loop(choice.gains.scaled(2.0), inertia).margin()
+    assert twice.value < 0.4
+
+
+def test_noise_is_counted_against_the_margin():
+    """The doubt covers what noise of 0.1 mrad makes of the singular values."""
+    run, config = simulated.measured(planned(), ARM)
+    random = np.random.default_rng(0)
+    noisy = replace(
+        run, position=run.position + random.normal(0.0, 1e-4, run.position.shape)
+    )
+    gains = found().start
+    inertia = found().loops.inertia
+    loops = [
+        Loops([response_of(each, lines_in(config), 1e-3)], inertia, 1e-3)
+        for each in (run, noisy)
+    ]
+    (true, none), (value, doubt) = (each.singular_values(gains)[0] for each in loops)
+    assert np.median(doubt) > 3.0 * np.median(none)
+    inside = np.abs(value - true) < doubt
+    assert inside.mean() > 0.9
+
+
+def test_simulated_arm_holds_with_the_chosen_gains():
+    config = build(
+        ControllerConfig,
+        {**ROBOT, 'robot.payload': 0.1, 'barrier.bound': [0.2, 0.2]}
+        | {'reference.type': 'hold'}
+        | found().parameters(),
+    )
+    push = {'duration': 10.0, 'disturbance.constant': [2.0, 1.0]}
+    start = {'initial.position': POSTURE.tolist()}
+    run = simulate(config, change(ARM, push | start)).run()
+    assert run.stops == ()
+    assert np.abs(run.velocity[-500:]).max() < 0.01
+
+
+def test_what_is_no_commissioning_is_refused():
+    run, config = simulated.measured(planned(), ARM)
+    with pytest.raises(BlfDscError, match='not the motion of a commissioning'):
+        commissioned(CONFIG, [(run, CONFIG)])
+    short = replace(
+        run,
+        stamp=run.stamp[:9000],
+        position=run.position[:9000],
+        velocity=run.velocity[:9000],
+        torque=run.torque[:9000],
+    )
+    with pytest.raises(BlfDscError, match='has 9 s, but the motion needs 14 s'):
+        commissioned(CONFIG, [(short, config)])
+    stopped = replace(run, stops=(Stop(int(run.stamp[7000]), 'fault', 'a push'),))
+    with pytest.raises(BlfDscError, match='stopped 7 s after the start: a push'):
+        commissioned(CONFIG, [(stopped, config)])
+    every = np.arange(run.stamp.size) % 20 != 0
+    lossy = replace(
+        run,
+        stamp=run.stamp[every],
+        position=run.position[every],
+        velocity=run.velocity[every],
+        torque=run.torque[every],
+    )
+    with pytest.raises(BlfDscError, match='joint states are missing'):
+        commissioned(CONFIG, [(lossy, config)])
+    with pytest.raises(BlfDscError, match=r'feedback\.inertia: got whole'):
+        plan(
+            build(ControllerConfig, {**ROBOT, 'feedback.inertia': 'whole'}),
+            POSTURE[None],
+        )
+    with pytest.raises(BlfDscError, match=r'joint2 would be at 6\.25 rad'):
+        plan(CONFIG, np.array([[0.0, 6.25]]))
+    with pytest.raises(BlfDscError, match='model: got two_link'):
+        plan(ControllerConfig(), POSTURE[None])
+
+
+def test_no_gains_have_a_margin_if_noise_hides_the_response():
+    (response,) = found().responses
+    loud = response._replace(position_noise=1e4 * (response.position_noise + 1e-6))
+    loops = found().loops._replace(responses=[loud])
+    start = found().start
+    choice = choose(loops, start, start.scaled)
+    assert choice.margin.value < 0.5
+    assert (choice.factors < 0.1).all()
+
+
+def test_bags_of_the_written_motions_commission_as_the_simulated_arm(tmp_path, capsys):
+    urdf = tmp_path / 'arm.urdf'
+    urdf.write_text(ROBOT['robot.urdf'])
+    config = tmp_path / 'arm.yaml'
+    config.write_text(f"""
+/**:
+  ros__parameters:
+    robot: {{urdf: {urdf}, gravity: [0.0, 0.0, 0.0], rotor_inertia: {list(ROTORS)}, payload: 0.1}}
+/**/sim_plant:
+  ros__parameters:
+    truth.rotor_inertia: {list(ROTORS)}
+    joint.stiffness: {list(SPRINGS)}
+    disturbance: {{constant: [0.0, 0.0], amplitude: [0.0, 0.0], viscous: {list(VISCOUS)}}}
+    duration: 5.0
+/**/blf_dsc_controller:
+  ros__parameters:
+    barrier.bound: [0.2, 0.2]
+    limits.position_lower: [-3.0, -3.0]
+    limits.position_upper: [3.0, 3.0]
+""")
+    common = ['commission', '--config', str(config)]
+    posture = ['--posture', '0.3', '1.1']
+    motion = tmp_path / 'motion.yaml'
+    assert main([*common, *posture, '--write', str(motion)]) == 0
+    assert 'the tool travels' in capsys.readouterr().out
+    out = tmp_path / 'run'
+    run = ['run', '--offline', '--config', str(tmp_path / 'motion_1.yaml')]
+    assert main([*run, '--out', str(out)]) == 0
+    capsys.readouterr()
+    by_bag, by_arm = tmp_path / 'bag.yaml', tmp_path / 'arm_out.yaml'
+    assert main([*common, str(out / 'bag'), '--out', str(by_bag)]) == 0
+    told = capsys.readouterr().out
+    assert 'the gains are limited near' in told
+    assert main([*common, *posture, '--out', str(by_arm)]) == 0
+    assert 'follows its own motion for 5 s' in capsys.readouterr().out
+    assert by_bag.with_suffix('.png').is_file()
+    gains = [load_loop(each).controller.feedback for each in (by_bag, by_arm)]
+    # the simulated one was measured with a payload, too
+    np.testing.assert_allclose(
+        gains[0].joint_damping, gains[1].joint_damping, rtol=0.35
+    )
+    assert main([*common, '--out', str(by_arm)]) == 1  # exists
+    assert 'exists already' in capsys.readouterr().err
