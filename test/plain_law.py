@@ -55,6 +55,7 @@ class PlainLaw:
         self.theta = settings.initial_estimate.copy()
         self.d3 = np.zeros(2)
         self.tau = np.zeros(2)
+        self.held = np.zeros(2)  # of the demand, by the rate limit
         self.alpha2 = None
         self.previous = None
         self.ring = np.zeros((settings.window, 2, settings.m + 1))
@@ -241,7 +242,9 @@ class PlainLaw:
         torque = np.clip(demand, -g.torque_limit, g.torque_limit)
         if self.samples:
             step = np.where(g.rate_limit > 0.0, g.rate_limit * dt, np.inf)
-            torque = np.clip(torque, self.tau - step, self.tau + step)
+            left = self.held - np.clip(self.held, -0.5 * step, 0.5 * step)
+            slowed = np.clip(torque - left, self.tau - step, self.tau + step)
+            self.held, torque = torque - slowed, slowed
         self.adapt(dt, q, H_r, xi2, saturated=np.any(torque != demand))
         self.disturbance = self.d3 + H_r[:, 3:] @ self.theta[3:]
         self.alpha2 = following

@@ -231,12 +231,23 @@ def test_law_matches_the_plain_one_in_closed_loop():
 DT = 2e-3  # s: with 500 N m/s, 1 N m from sample to sample
 
 
-def cut(demand, last, *, level=10.0, rate=500.0, samples=7.0, added=0.0):
+def cut(
+    demand,
+    last,
+    *,
+    level=10.0,
+    rate=500.0,
+    samples=7.0,
+    added=0.0,
+    held=0.0,
+    takes_over=0.0,
+):
     """Torque and what cut it; the cuts are counted, and any is reported."""
     case = arbitrary(0, torque_limit=np.full(2, level), rate_limit=np.full(2, rate))
     _, state, signals = case
     state.samples[0], state.torque[:] = samples, last
     state.level_cuts[:] = state.rate_cuts[:] = 0.0
+    state.held_back[:], state.takes_over[0] = held, takes_over
     signals.demand[:], signals.added[:] = demand, added
     saturated = saturate(*case, DT)
     cuts = signals.cuts[0]
@@ -255,20 +266,68 @@ def cut(demand, last, *, level=10.0, rate=500.0, samples=7.0, added=0.0):
         # the level was lowered below the last torque
         (13.0, 14.0, 10.0, LEVEL_CUT + RATE_CUT, {}),
         (9.0, -9.0, 9.0, 0.0, {'rate': 0.0}),  # no limit
-        (9.0, 0.0, 9.0, 0.0, {'samples': 0.0}),  # the first torque
+        (9.0, 0.0, 9.0, 0.0, {'samples': 0.0}),  # the first torque ...
+        # ... unless it continues another one
+        (9.0, 3.0, 4.0, RATE_CUT, {'samples': 0.0, 'takes_over': 1.0}),
         # With 4 N m of the drive: limits hold for the command and for the whole torque.
         (12.0, 6.0, 6.0, LEVEL_CUT, {'added': 4.0, 'rate': 1000.0}),
         (-7.0, -10.0, -10.0, LEVEL_CUT, {'added': 4.0, 'rate': 1000.0}),
         (9.0, 5.0, 5.0, 0.0, {'added': 4.0, 'rate': 1000.0}),
         (7.5, 5.0, 4.0, RATE_CUT, {'added': 4.0}),  # the rate is that of the command
+        # Of 5 N m that were held back, half of 1 N m is released, as the demand moves ...
+        (8.0, 3.0, 3.5, RATE_CUT, {'held': 5.0}),  # ... not at all,
+        (8.25, 3.0, 3.75, RATE_CUT, {'held': 5.0}),  # ... away,
+        (7.25, 3.0, 2.75, RATE_CUT, {'held': 5.0}),  # ... or back
+        (3.75, 3.0, 3.75, 0.0, {'held': 0.25}),  # the last of it
     ],
 )
 def test_torque_saturates_at_its_level_and_at_its_rate(
     demand, last, command, cuts, given
 ):
     for sign in (1.0, -1.0):
-        signed = given | {'added': sign * given.get('added', 0.0)}
+        signed = given | {
+            name: sign * given.get(name, 0.0) for name in ('added', 'held')
+        }
         assert cut(sign * demand, sign * last, **signed) == (sign * command, cuts)
+
+
+def follow(demands, rate):
+    """Torques that follow demands (k,) from the first one on."""
+    case = arbitrary(0, torque_limit=np.full(2, 1e3), rate_limit=np.full(2, rate))
+    _, state, signals = case
+    state.samples[0], state.held_back[:], signals.added[:] = 7.0, 0.0, 0.0
+    state.torque[:] = demands[0]
+    for demand in demands:
+        signals.demand[:] = demand
+        saturate(*case, DT)
+        state.torque[:] = signals.torque
+        yield signals.torque[0]
+
+
+@pytest.mark.parametrize('amplitude', [3.0, 30.0, 300.0])
+def test_torque_at_its_rate_limit_turns_round_with_its_demand(amplitude):
+    """At most asin 0.5, 30 degrees late, which are 83 samples of a second's turn of 500.
+
+    At 20 N m/s, a plain limit is up to 90 degrees late: it climbs until it meets the
+    demand on its way down.
+    """
+    turn = round(1.0 / DT)
+    k = np.arange(8 * turn)
+    demands = amplitude * np.sin(2.0 * np.pi * k / turn)
+    torques = np.array([*follow(demands, 20.0)])[-turn:]
+    step = 20.0 * DT
+    assert np.abs(np.diff(torques)).max() <= step * (1.0 + 1e-9)
+    top = turn // 4  # of the demand
+    late = np.argmax(torques) - top
+    is_cut = amplitude > 20.0 / (2.0 * np.pi)
+    assert (-1 if is_cut else 0) <= late <= (turn / 12 if is_cut else 0)
+    assert (np.ptp(torques) < 0.5 * np.ptp(demands)) == (amplitude > 10.0)
+
+
+def test_torque_reaches_a_constant_demand_at_half_its_rate_limit():
+    """A step of 3 N m with 1 N m at once, and 0.5 N m in each sample from then on."""
+    torques = [*follow([0.0, 3.0, 3.0, 3.0, 3.0, 3.0, 3.0], 500.0)]
+    assert torques == [0.0, 1.0, 1.5, 2.0, 2.5, 3.0, 3.0]
 
 
 @pytest.mark.parametrize('rate', [500.0, 0.0])

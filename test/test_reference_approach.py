@@ -237,7 +237,9 @@ def test_hold_reference_stays_where_the_arm_is_or_where_it_comes_to_rest():
     np.testing.assert_array_equal(qr, np.tile(FIRST - 0.7, (1001, 1)))
     assert np.abs(xi1).max() < BOUND
     _, qr, _, xi1, _ = run(config, FIRST, 6.0, velocity=(0.5, -0.5))
-    np.testing.assert_array_equal(qr[-1], FIRST)
+    # at half of 2 rad/s^2, on average, from 0.5 rad/s: 3 v / 4 s
+    brakes = 0.5 * (3.0 * 0.5 / 2.0) * np.array([0.5, -0.5])
+    np.testing.assert_allclose(qr[-1], FIRST + brakes, atol=1e-12)
     assert np.abs(xi1).max() < 0.5 * BOUND
 
 
@@ -248,7 +250,7 @@ def test_reactivation_on_the_reference_tracks_at_once_only_at_its_velocity(
 ):
     """An arm that the brakes hold needs an approach.
 
-    One that moves with the reference does not.
+    One that moves with the reference joins it within 0.1 s.
     """
     rig = Rig({'safety.velocity': velocity, 'torque.limit': [40.0, 40.0]})
     rig.step(1500)  # at 0.3 rad/s
@@ -261,7 +263,9 @@ def test_reactivation_on_the_reference_tracks_at_once_only_at_its_velocity(
     rig.step(1500)
     assert rig.guard.supervisor.running, rig.supervisor.text
     assert rig.guard.samples.ratio.max() < 0.6
-    assert (rig.guard.settled > 0.1) == rest
+    # it starts from the beginning, or goes on
+    assert (rig.guard.time < 2.0) == rest
+    assert rest or rig.guard.settled < 1.6
     assert np.abs(rig.commands[first:]).max() < 15.0
 
 
@@ -371,7 +375,8 @@ def test_arm_far_beyond_its_limits_is_not_held(at):
     """For example, an arm that reports degrees."""
     config = replace(CONFIG, reference=Reference(type='hold'))
     with pytest.raises(
-        StartError, match=r"joint 'joint2' is at .* rad, and its limits are -6.2"
+        StartError,
+        match=r"joint 'joint2' would be held at .* rad, and its limits are -6.2",
     ):
         plan_start(config, np.full(2, BOUND), np.array([0.0, at]), STILL)
     at_rest = np.array([0.0, 2.0 * np.pi + 0.09])

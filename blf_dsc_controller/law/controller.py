@@ -45,6 +45,7 @@ from blf_dsc_controller.law.state import (
     state_of,
     state_size,
 )
+from blf_dsc_controller.law.torque import added_torque
 from blf_dsc_controller.law.weighing import DEVIATION, TWO_SIDED, weigh
 from blf_dsc_controller.reference import terms as reference
 
@@ -354,6 +355,16 @@ class Controller:
         if self.settings.weighed:
             self._weigh(*self._vectors[:4], dt)
         return bool(self.settings.senses and self._sense(*self._vectors[:5], dt))
+
+    def take_over(self, torque: Array, q: Array) -> None:
+        """Continue from a command (n,) [N m] that acts on an arm at q (n,) [rad].
+
+        Call it before the first update: the rate limit then holds from this torque on.
+        """
+        self.state.torque[:] = torque
+        self.state.added[:] = added_torque(self.settings, q)
+        self.state.held_back[:] = 0.0
+        self.state.takes_over[0] = 1.0
 
     def trial(self, t: float, dt: float, measurement: Array) -> Array:
         """Return the torque of an unchecked update that only changes `signals` and `sample`."""

@@ -159,6 +159,9 @@ class State(NamedTuple):
     alpha2: Annotated[Array, 'n']  # rad/s
     torque: Annotated[Array, 'n']  # last commanded torque, N m
     added: Annotated[Array, 'n']  # what the drive added to it then, N m
+    # demand beyond the torque, that the rate limit has held back, N m
+    held_back: Annotated[Array, 'n']
+    takes_over: Cell  # 1: `torque` acts already when the first sample comes
     disturbance: Annotated[Array, 'n']  # d^3, N m
     observed: Annotated[Array, 'n']  # xi2 filtered by (8), rad/s
     observed_rate: Annotated[Array, 'n']  # its derivative, rad/s^2

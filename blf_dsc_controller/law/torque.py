@@ -15,8 +15,18 @@ with zero, which changes no bit.
 *Saturation* is in level and rate.  The level limit holds for the whole torque of the joint, which
 is what its motor bears, and for the command alone, which is what its driver may cut: the two differ
 by what the drive adds.  The rate is that of the command, and not limited at the first
-sample after a reset.  The level limit takes precedence, for example if it is lowered below the last
-torque.
+sample, unless another torque acts by then (`Controller.take_over`).  The level limit takes
+precedence, for example if it is lowered below the last torque.
+
+*What the rate limit holds back.*  A torque that always moves towards its demand still climbs to it
+while the demand falls already: it lags behind, the more the larger the motion, and a loop that has
+met its limit once may run away.  So the torque moves as its demand does, within the limit, and the
+difference is released at a share r of the limit:
+
+    |held - held'| <= r R dt,      torque = demand - held', within R dt of the last
+
+It turns round as soon as the demand moves back faster than r R.  For a sinusoid the lag thus stays
+below asin r, 30 degrees, whatever the amplitude: the limit lowers the gain of the loop instead.
 """
 
 from __future__ import annotations
@@ -29,6 +39,8 @@ from blf_dsc_controller.compiled.jit import inner
 from blf_dsc_controller.compiled.layout import Array
 from blf_dsc_controller.law.state import Settings, Signals, State
 from blf_dsc_controller.numerics.elementary import sin
+
+_RELEASED = 0.5  # r
 
 LEVEL_CUT = 1.0
 RATE_CUT = 2.0
@@ -88,12 +100,20 @@ def added_torque(settings: Settings, q: Array) -> Array:
 
 
 @inner
+def slow_down(demand: float, last: float, held: float, step: float) -> float:
+    """Return the torque [N m] for a demand, by at most `step` from `last`, less what is `held`."""
+    released = clip(held, -_RELEASED * step, _RELEASED * step)
+    return clip(demand - (held - released), last - step, last + step)
+
+
+@inner
 def saturate(settings: Settings, state: State, signals: Signals, dt: float) -> bool:
     """Limit `signals.demand`, giving the command `signals.torque` [N m]; return whether it is cut.
 
     `dt` [s] is the time since the last torque.
     """
     saturated = False
+    has_last = state.samples[0] > 0.0 or state.takes_over[0] > 0.0
     for i in range(settings.n):
         top = settings.torque_limit[i]
         added = signals.added[i]
@@ -104,14 +124,18 @@ def saturate(settings: Settings, state: State, signals: Signals, dt: float) -> b
         if torque != signals.demand[i]:
             signals.cuts[i] = LEVEL_CUT
             state.level_cuts[i] += 1.0
-        if settings.rate_limit[i] > 0.0 and state.samples[0] > 0.0:
+        if settings.rate_limit[i] > 0.0 and has_last:
             step = settings.rate_limit[i] * dt
             last = state.torque[i] + added
-            slowed = clip(torque, last - step, last + step)
+            slowed = slow_down(torque, last, state.held_back[i], step)
             if slowed != torque:
                 signals.cuts[i] += RATE_CUT
                 state.rate_cuts[i] += 1.0
-            torque = clip(slowed, low, high)
+            slowed = clip(slowed, low, high)
+            state.held_back[i] = torque - slowed
+            torque = slowed
+        else:
+            state.held_back[i] = 0.0
         signals.torque[i] = torque - added
         saturated = saturated or signals.cuts[i] > 0.0
     return saturated

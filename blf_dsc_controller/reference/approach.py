@@ -1,7 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """The configured reference, the approach to it, and limits of motions.
 
-The reference is blended into the present motion (see `terms`), starting at t0, in the
+An arm in motion is taken over at its velocity, in a motion that brakes.  A reference to
+hold rests where this ends.  Any other
+reference is blended into the present motion (see `terms`), starting at t0, in the
 shortest time that keeps the limits, found in 10 % steps and refined by bisection.  A
 blend exceeds the speed of its parts only by a multiple of their distance over its
 duration, so one exists if both parts stay strictly within the limits and their distance
@@ -32,6 +34,9 @@ from blf_dsc_controller.reference.terms import (
     unpack,
 )
 from blf_dsc_controller.reference.turns import reference_near
+
+AT_REST = 0.01
+"""Largest velocity of an arm at rest [rad/s]."""
 
 _SHORTEST = 0.02  # s
 _STEP = 1.1
@@ -275,15 +280,15 @@ def _via_centre(
 
 
 def _check_limits(config: ControllerConfig, q: np.ndarray) -> None:
-    """Check that the arm at q (n,) [rad] is at most `_PAST` past its limits."""
+    """Check that an arm at rest at q (n,) [rad] is at most `_PAST` past its limits."""
     limits = zip(
         config.limits.position_lower, config.limits.position_upper, strict=True
     )
     for joint, at, (lower, upper) in zip(config.joints, q, limits, strict=True):
         if not lower - _PAST <= at <= upper + _PAST:
             raise StartError(
-                f'joint {joint!r} is at {at:.6g} rad, and its limits are {lower:g} to {upper:g} '
-                'rad: if it really is there, change limits.position_lower or '
+                f'joint {joint!r} would be held at {at:.6g} rad, and its limits are {lower:g} to '
+                f'{upper:g} rad: if the arm really is there, change limits.position_lower or '
                 'limits.position_upper'
             )
 
@@ -302,26 +307,85 @@ def plan_start(
 
     Raises:
         StartError: the law cannot take over (`check_takeover`), and approach.enabled is false;
-            or the arm would be held far past its limits.
+            or the arm would be held far past its limits, or moves too fast to be held.
         MotionError: no approach keeps the limits.
     """
+    if config.reference.type == 'hold':
+        return _braked(config, q, dq, t)
     config, _ = reference_near(config, q)
     vector = reference_of(config)
-    if config.reference.type == 'hold':
-        _check_limits(config, q)
-        vector = pack(q.size, [hold(q)])
     try:
         check_takeover(config, bound, q, dq, vector, t)
     except StartError:
         if not config.approach.enabled:
             raise
-        (target,) = unpack(vector)
-        begin = [stop(t, q, dq, config)]
-        try:
-            return blend(begin, target, t, config)
-        except MotionError:
-            motion = _via_centre(begin, target, t, config)
-            if motion is None:
-                raise
-            return motion
-    return BlendedReference(vector, t)
+    else:
+        if _joins(config, dq, vector, t) or not config.approach.enabled:
+            return BlendedReference(vector, t)
+    (target,) = unpack(vector)
+    begin = [stop(t, q, dq, config)]
+    try:
+        return blend(begin, target, t, config)
+    except MotionError:
+        motion = _via_centre(begin, target, t, config)
+        if motion is None:
+            raise
+        return motion
+
+
+def plan_resumption(
+    config: ControllerConfig,
+    bound: np.ndarray,
+    q: np.ndarray,
+    dq: np.ndarray,
+    reference_vector: np.ndarray,
+    t: float,
+) -> BlendedReference:
+    """Plan the way back to a running reference, whose last motion goes on.
+
+    Arguments as for `check_takeover`.
+
+    Raises:
+        StartError: the arm is too far from it.
+        MotionError: no way back keeps the limits.
+    """
+    check_takeover(config, bound, q, dq, reference_vector, t)
+    if _joins(config, dq, reference_vector, t):
+        return BlendedReference(reference_vector, t)
+    begin = [stop(t, q, dq, config)]
+    return blend(begin, unpack(reference_vector)[-1], t, config)
+
+
+def _joins(
+    config: ControllerConfig, dq: np.ndarray, reference_vector: np.ndarray, t: float
+) -> bool:
+    """Whether an arm with dq (n,) [rad/s] joins a reference at time t [s] without a blend.
+
+    It does at the velocity of the reference.  From rest it does at any, if the drives
+    permit the jump of the torque.
+    """
+    qr, dqr, ddqr = np.zeros((3, dq.size))
+    evaluate(reference_vector, t, qr, dqr, ddqr)
+    if np.abs(dq - dqr).max() <= AT_REST:
+        return True
+    is_limited = any(config.torque.rate_limit)
+    return not is_limited and bool(np.abs(dq).max() <= AT_REST)
+
+
+def _braked(
+    config: ControllerConfig, q: np.ndarray, dq: np.ndarray, t: float
+) -> BlendedReference:
+    """Plan to hold the arm where it comes to rest from q, dq (n,) at time t [s]."""
+    for joint, speed, limit in zip(
+        config.joints, np.abs(dq), config.limits.velocity, strict=True
+    ):
+        if speed > limit + AT_REST:
+            raise StartError(
+                f'joint {joint!r} moves at {speed:.4g} rad/s, and its limit is {limit:g} rad/s: '
+                'wait until it is slower, or relax limits.velocity'
+            )
+    duration = braking_time(dq, config)
+    _check_limits(config, q + 0.5 * duration * dq)
+    is_moving = np.abs(dq).max() > AT_REST
+    settled = t + duration if is_moving else t
+    return BlendedReference(pack(q.size, [stop(t, q, dq, config)]), settled)

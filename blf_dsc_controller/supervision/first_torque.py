@@ -10,21 +10,16 @@ gravity is sent unless the configuration says that the drives tolerate it (`supp
 
 from __future__ import annotations
 
-from math import inf
-
 import numpy as np
 from numpy.typing import NDArray
 
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.errors import StartError
 from blf_dsc_controller.law.controller import Controller
-from blf_dsc_controller.law.torque import RATE_CUT
+from blf_dsc_controller.reference.approach import AT_REST
 from blf_dsc_controller.supervision.model_torque import model_torque
 
 Vector = NDArray[np.float64]
-
-AT_REST = 0.01
-"""Largest velocity of an arm at rest [rad/s]."""
 
 MATTERS = 0.05
 """Share of the torque limit from which a torque of gravity matters."""
@@ -65,6 +60,13 @@ def check_first_torque(
         text += (
             ': this is the gravity of the URDF. If the drives compensate it themselves, set '
             'robot.drive_compensates to gravity, or to gravity_and_friction'
+        )
+    speed = np.abs(dq)
+    if speed.max() > AT_REST:
+        fastest = int(np.argmax(speed))
+        text += (
+            f'; the arm still moves, joint {config.joints[fastest]!r} at {speed[fastest]:.3g} '
+            'rad/s: start again when it rests'
         )
     raise StartError(text)
 
@@ -123,20 +125,3 @@ def _check_gravity(
             'robot.drive_compensates to none. If the effort does not contain what the drives add, '
             f'set robot.effort to commanded, or {_SEND}'
         )
-
-
-def limit_first_torque(controller: Controller, last: Vector, dt: float) -> None:
-    """Limit the rate of the law's first torque, `dt` [s] after `last` (n,) [N m].
-
-    The law does not know `last`.
-    """
-    settings = controller.settings
-    state = controller.state
-    sample = controller.sample
-    step = np.where(settings.rate_limit > 0.0, settings.rate_limit * dt, inf)
-    slowed = np.clip(sample.torque, last - step, last + step)
-    limited = np.clip(slowed, -settings.torque_limit, settings.torque_limit)
-    cut = limited != sample.torque
-    state.rate_cuts[cut] += 1.0
-    sample.cuts[cut] += RATE_CUT
-    sample.torque[:] = state.torque[:] = limited

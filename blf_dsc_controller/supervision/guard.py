@@ -31,6 +31,7 @@ from blf_dsc_controller.messages.journal import (
 from blf_dsc_controller.reference.approach import (
     BlendedReference,
     MotionError,
+    plan_resumption,
     plan_start,
 )
 from blf_dsc_controller.reference.retargeting import (
@@ -45,16 +46,12 @@ from blf_dsc_controller.run import Contact
 from blf_dsc_controller.supervision import retuning
 from blf_dsc_controller.supervision.contact import contact_of
 from blf_dsc_controller.supervision.drive_load import DriveLoad, DriveLoads
-from blf_dsc_controller.supervision.first_torque import (
-    check_first_torque,
-    limit_first_torque,
-)
+from blf_dsc_controller.supervision.first_torque import check_first_torque
 from blf_dsc_controller.supervision.plan import Plan, plan_motion
 from blf_dsc_controller.supervision.safe_torque import SafeTorque
 from blf_dsc_controller.supervision.sample_check import SampleCheck
 from blf_dsc_controller.supervision.start import (
     PreparedStart,
-    can_take_over,
     prepared_start,
 )
 from blf_dsc_controller.supervision.state_check import SKIP, StateCheck, rate_mismatch
@@ -267,8 +264,6 @@ class Guard:
             return self._safe_at(stamp, measurement)
         last.take(stamp, measurement)
         self._advance_to(stamp)
-        if is_first and self.commanding:
-            limit_first_torque(law, self._safe_torque.commanded, dt)
         fault = self.samples.check(dt)
         if fault is not None:
             self._stop(*fault)
@@ -380,21 +375,25 @@ class Guard:
             )
 
     def _start(self, stamp: int, measurement: Vector) -> bool:
-        """Resume along the running reference if possible, otherwise start at t = 0."""
+        """Resume the running reference if possible, otherwise start at t = 0."""
         q, dq, _ = measurement.reshape(3, -1)
-        resumed = self._resumes(stamp, q, dq)
-        if not resumed:
-            try:
+        motion = self._resumption(stamp, q, dq)
+        resumed = motion is not None
+        try:
+            if motion is None:
                 motion = self._plan_start(q, dq)
-                self.controller.reference_vector = motion.vector
-                self.settled = motion.settled
-                if not self.commanding:
-                    check_first_torque(self.controller, self.config, measurement)
-            except (StartError, MotionError) as error:
-                self.refuse(error)
-                return False
+            self.controller.reference_vector = motion.vector
+            if not self.commanding:
+                check_first_torque(self.controller, self.config, measurement)
+        except (StartError, MotionError) as error:
+            self.refuse(error)
+            return False
+        self.settled = motion.settled
+        if not resumed:
             self.start_stamp = stamp
             _, self.turned = reference_near(self.config, q)
+        if self.commanding:
+            self.controller.take_over(self._safe_torque.commanded, q)
         self.journal.note(EventType.START, resumed=resumed)
         self.last_stamp = stamp - self.config.sample_time_ns
         self.watchdog.switch(self.config.safety.watchdog, stamp)
@@ -438,14 +437,17 @@ class Guard:
         self.start_error = error
         self._stop(Reason.START_REJECTED, str(error))
 
-    def _resumes(self, stamp: int, q: Vector, dq: Vector) -> bool:
-        """Whether the law can continue along the running reference."""
+    def _resumption(self, stamp: int, q: Vector, dq: Vector) -> BlendedReference | None:
+        """Return the way back to the running reference, None if the arm is too far."""
         if not self._resumable or stamp <= self.last_stamp:
-            return False
+            return None
         t = self._time_of(stamp)
         bound = self.controller.bound_at(t)
         vector = self.controller.reference_vector
-        return can_take_over(self.config, bound, q, dq, vector, t)
+        try:
+            return plan_resumption(self.config, bound, q, dq, vector, t)
+        except (StartError, MotionError):
+            return None
 
     def _advance_to(self, stamp: int) -> None:
         self.last_stamp = stamp

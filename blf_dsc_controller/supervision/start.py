@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.errors import StartError
 from blf_dsc_controller.reference.approach import (
+    AT_REST,
     BlendedReference,
     check_takeover,
     plan_start,
@@ -35,6 +36,8 @@ class PreparedStart(NamedTuple):
         """
         moved = np.abs(q - self.positions)
         if not np.all(moved < _SAME_PLACE * np.array(config.barrier.bound)):
+            return False
+        if np.abs(dq).max() > AT_REST:
             return False
         return can_take_over(config, bound, q, dq, self.motion.vector, 0.0)
 

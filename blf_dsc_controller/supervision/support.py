@@ -9,7 +9,8 @@ from numpy.typing import NDArray
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.errors import StartError
 from blf_dsc_controller.law.controller import Controller
-from blf_dsc_controller.supervision.first_torque import AT_REST, MATTERS, is_like
+from blf_dsc_controller.reference.approach import AT_REST
+from blf_dsc_controller.supervision.first_torque import MATTERS, is_like
 from blf_dsc_controller.supervision.model_torque import model_torque
 
 Vector = NDArray[np.float64]
