@@ -133,11 +133,15 @@ def test_topics_are_those_of_the_bag_and_motions_are_followed(ros, beside, tmp_p
 
     did_names = [topic.relative for topic in received]
     _, outcome, after = beside(between, tmp_path)
-    ros.spin(0.5)
     assert (outcome.end, after.problem) == (End.REQUESTED, '')
     assert did['stop'].result().success
     assert 'braking for' in did['stop'].result().message
     bag = recorded(tmp_path / 'bag')
+    ros.until(
+        lambda: all(
+            len(raws) >= len(bag[topic.resolved]) for topic, raws in received.items()
+        )
+    )
     for topic, raws in received.items():
         messages, wanted = raws, bag[topic.resolved]
         if topic in EVENTS:  # strings, which the middleware pads
