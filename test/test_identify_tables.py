@@ -288,7 +288,7 @@ def test_currents_without_gains_give_no_urdf(states, tmp_path, capsys):
     assert main(['identify', str(named), *words]) == 1
     error = capsys.readouterr().err
     assert 'these are currents' in error
-    assert '--gains [N m/A] of panda_joint1' in error
+    assert '--gains [N m/A or N m/%] of panda_joint1' in error
     assert main(['identify', str(unnamed), *words]) == 3
     output = ' '.join(capsys.readouterr().out.split())
     assert 'the efforts contain 0.1' in output

@@ -25,6 +25,7 @@ from mcap.summary import Summary
 from zstandard import FRAME_HEADER, ZstdError
 
 from blf_dsc_controller.bags.sources import (
+    CDR,
     MAGIC_SIZE,
     BagError,
     check_regular,
@@ -81,6 +82,7 @@ class _Copy:
         found: number of messages of each channel.
         unknown: number of messages whose topic or type is unknown.
         packed: number of compressed messages that cannot be unpacked.
+        foreign: numbers of messages that are not CDR, by topic and encoding.
     """
 
     def __init__(self, bag: BagWriter, summary: Summary) -> None:
@@ -88,6 +90,7 @@ class _Copy:
         self.found = Counter[int]()
         self.unknown = 0
         self.packed = 0
+        self.foreign = Counter[tuple[str, str]]()
         self._bag = bag
         self._summary = summary
         # by number of the channel; 0 where its topic is unknown
@@ -97,6 +100,10 @@ class _Copy:
         """Copy a message."""
         number, sequence, received, published, raw = message
         self.found[number] += 1
+        channel = self._summary.channels.get(number)
+        if channel and channel.message_encoding != CDR:
+            self.foreign[channel.topic, channel.message_encoding] += 1
+            return
         if not self._handles.get(number):  # its topic may have become known
             self._handles[number] = _handle(self._bag, self._summary, number)
         handle = self._handles[number]
@@ -137,6 +144,8 @@ def _copied(path: Path, bag: BagWriter) -> Iterator[str]:
         )
     if copy.unknown:
         yield f'{copy.unknown} messages of topics whose name or type is unknown'
+    for (topic, encoding), count in copy.foreign.items():
+        yield f'{count} messages of {topic}: they are {encoding or "unknown"}, not CDR'
     if copy.packed:
         yield f'{copy.packed} compressed messages that cannot be unpacked'
     yield from _missing(summary, copy.found)

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Collection, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from io import SEEK_CUR, SEEK_END, BytesIO
 from pathlib import Path
 from struct import Struct
@@ -29,6 +29,7 @@ from blf_dsc_controller.messages.codecs import typestore
 
 METADATA = 'metadata.yaml'
 _ROS1 = '.bag'
+CDR = 'cdr'
 MAGIC_SIZE = 8
 HEAD = Struct('<BQ')  # opcode and content length, at the start of each record
 _MESSAGE = Struct('<HIQQ')
@@ -195,16 +196,28 @@ def open_bag(path: Path) -> Iterator[OpenBag]:
     from rosbags import rosbag1, rosbag2  # a recorder needs neither
 
     check_regular(path)
+    opened = _only_file(path) or path
     try:
-        reader: Any = (rosbag1 if path.suffix == _ROS1 else rosbag2).Reader(path)
+        reader: Any = (rosbag1 if path.suffix == _ROS1 else rosbag2).Reader(opened)
         with reader:
-            yield OpenBag(reader, path)
+            yield OpenBag(reader, opened)
     except BlfDscError:
         raise
     except Exception as error:  # libraries raise nearly anything on damaged files
         raise BagError(
             f'{path} cannot be read as a bag: {_reason(path, error)}'
         ) from error
+
+
+def _only_file(path: Path) -> Path | None:
+    """Return the only database of a folder without metadata; None otherwise.
+
+    An MCAP without metadata is of an interrupted recording, which is to be recovered.
+    """
+    if not path.is_dir() or (path / METADATA).exists():
+        return None
+    files = list(path.glob('*.db3'))
+    return files[0] if len(files) == 1 else None
 
 
 def check_regular(path: Path) -> None:
@@ -218,16 +231,42 @@ def check_regular(path: Path) -> None:
 def _reason(path: Path, error: Exception) -> str:
     if not path.exists():
         return 'there is no such folder'
-    is_mcap = any(path.glob('*.mcap')) if path.is_dir() else path.suffix == '.mcap'
+    files = sorted(path.glob('*.mcap')) if path.is_dir() else [path]
+    is_mcap = bool(files) and files[0].suffix == '.mcap'
     text = ' '.join(f'{error}'.split()).rstrip('.') or type(error).__name__
     if path.is_dir() and not (path / METADATA).exists():
         text = f'the folder has no {METADATA}'
         if not is_mcap:
-            within = [
-                f'; did you mean {each.parent}?' for each in path.glob(f'*/{METADATA}')
-            ]
-            return text + min(within, default=': it is not a bag')
+            return text + _instead_of(path)
         text += ', as after an interrupted recording'
     elif isinstance(error, OSError) or not is_mcap:
         return text
+    for file in files:
+        encoding = other_encoding(file)
+        if encoding:
+            return f'its messages are {encoding}, not CDR of ROS 2: {_remedy(encoding)}'
     return f'{text}; to save the undamaged part: blf_dsc recover {path}'
+
+
+def _instead_of(path: Path) -> str:
+    """Return what may be meant by a folder without metadata or MCAP files."""
+    databases = sorted(path.glob('*.db3'))
+    if databases:
+        return f': give one of its {len(databases)} files, as {databases[0]}'
+    within = [f'; did you mean {each.parent}?' for each in path.glob(f'*/{METADATA}')]
+    return min(within, default=': it is not a bag')
+
+
+def other_encoding(path: Path) -> str:
+    """Return the encoding of the messages in an MCAP file if it is not CDR, else nothing."""
+    with suppress(Exception), path.open('rb') as stream:  # anything, if it is damaged
+        for record in _records(stream):
+            if isinstance(record, Channel) and record.message_encoding != CDR:
+                return record.message_encoding or 'of an unknown encoding'
+    return ''
+
+
+def _remedy(encoding: str) -> str:
+    if encoding == 'ros1':
+        return 'give the .bag of ROS 1 from which it was converted'
+    return 'export its joint states as CSV, which `blf_dsc identify` reads'

@@ -133,7 +133,9 @@ class JointStates:
     @property
     def stamp(self) -> Stamps:
         """Stamps (N,) [ns]."""
-        return self.messages.column(_STAMP, self.number)
+        return self.messages.column(
+            _STAMP if self.messages.is_stamped else _RECEIVED, self.number
+        )
 
     def field(self, k: int) -> Any:
         """Return positions (0), velocities (1) or efforts (2) as `Values` (N, n)."""
@@ -184,12 +186,14 @@ class TopicMessages:
     Attributes:
         name, type: of the topic.
         size: number of messages.
+        is_stamped: whether stamps are those of the messages; else the times of reception.
     """
 
     def __init__(self, name: str, type_name: str) -> None:
         self.name = name
         self.type = type_name
         self.size = 0
+        self.is_stamped = True
         self._file = tempfile.TemporaryFile()  # noqa: SIM115 - closed below
         self._blocks: list[_Block] = []
         # with the number of the layout

@@ -12,10 +12,16 @@ from blf_dsc_controller.arms.urdf import Tree
 from blf_dsc_controller.bags.content import NO_NAMES, NameMap, read_content
 from blf_dsc_controller.bags.reader import applied_torque, single_run
 from blf_dsc_controller.bags.sources import BagError
-from blf_dsc_controller.bags.topic_messages import Values
+from blf_dsc_controller.bags.topic_messages import JointStates, TopicMessages, Values
 from blf_dsc_controller.identification.on_disk import blocks_of
-from blf_dsc_controller.identification.recording import Recording, resampled
+from blf_dsc_controller.identification.recording import (
+    GAP,
+    Recording,
+    interpolated,
+    resampled,
+)
 from blf_dsc_controller.messages.topics import JOINT_STATES
+from blf_dsc_controller.run import Floats, Stamps
 
 
 def read_bag(
@@ -37,12 +43,27 @@ def read_bag(
             of no arm.
     """
     content = read_content(path, namespace, names)
-    named = content.topics[JOINT_STATES].name_lists()
+    messages = content.topics[JOINT_STATES]
+    named = messages.name_lists()
     joints = tuple(joints) or _arm_joints(text, set().union(*named), names)
     theirs = names.joints_of(joints)
-    states, _, _ = single_run(content, theirs)
+    groups = _groups(theirs, named)
+    source = f'effort of {messages.name}'
+    if not _has_stamps(messages, groups[0]):
+        messages.is_stamped = False
+        source += ' (without stamps: by the times of reception)'
+    turning = Tree.of(text).turning(joints)
+    parts = [single_run(content, group).states for group in groups]
+    if len(parts) > 1:
+        if commanded:
+            raise BagError(
+                f'{path}: the joints come in {len(parts)} messages, to which commands cannot be '
+                'assigned: leave out --effort command'
+            )
+        stamp, q, torque = _together(parts, theirs)
+        return resampled(joints, stamp, q, torque, source, turning)
+    (states,) = parts
     torque = states.field(2)
-    source = f'effort of {content.topics[JOINT_STATES].name}'
     if commanded or not _any(torque, states.size):
         source, applied = applied_torque(content, states)
         torque = applied.field(2)
@@ -50,7 +71,65 @@ def read_bag(
             raise BagError(
                 f'{path}: all torques in the {source} are zero: record measured efforts'
             )
-    return resampled(joints, states.stamp, states.field(0), torque, source)
+    return resampled(joints, states.stamp, states.field(0), torque, source, turning)
+
+
+def _groups(
+    joints: tuple[str, ...], named: Sequence[tuple[str, ...]]
+) -> list[tuple[str, ...]]:
+    """Return the joints as they come in one message, or else in several.
+
+    Raises BagError if several have some of them, and none the others.
+    """
+    left = list(joints)
+    groups: list[tuple[str, ...]] = []
+    for names in sorted(named, key=lambda each: -len({*each} & {*joints})):
+        group = tuple(name for name in left if name in names)
+        if group:
+            groups.append(group)
+            left = [name for name in left if name not in group]
+    if left and len(groups) > 1:
+        raise BagError(
+            f'no message has {", ".join(left)} (the bag names {_listed(named)}): give the names '
+            f'of these joints there, as in --map {left[0]}=ITS_NAME, or a --tip before them'
+        )
+    return [joints] if left else groups
+
+
+def _listed(named: Sequence[tuple[str, ...]]) -> str:
+    return ', '.join(sorted(set().union(*named)))
+
+
+def _has_stamps(messages: TopicMessages, joints: Sequence[str]) -> bool:
+    """Return whether not all states of these joints have one stamp."""
+    stamp = messages.joint_states(joints, ('position',)).stamp
+    return stamp.size < 2 or bool((stamp != stamp[0]).any())
+
+
+def _together(
+    parts: Sequence[JointStates], joints: Sequence[str]
+) -> tuple[Stamps, Floats, Floats]:
+    """Return stamps (N,) of the first states, and all positions and efforts (N, n) there.
+
+    Those of other states are interpolated; they are NaN before, after and in gaps.
+    """
+    stamp = parts[0].stamp
+    values = np.full((2, stamp.size, len(joints)), np.nan)
+    for part in parts:
+        own = part.stamp
+        if own.size < 2:
+            continue
+        after = np.clip(np.searchsorted(own, stamp), 1, own.size - 1)
+        pause = own[after] - own[after - 1]
+        is_known = (pause <= GAP * np.median(np.diff(own))) & (stamp <= own[-1])
+        is_known &= stamp >= own[0]
+        columns = [joints.index(name) for name in part.names]
+        seconds = (own - own[0]) * 1e-9
+        at = (stamp[is_known] - own[0]) * 1e-9
+        for row, field in enumerate((0, 2)):
+            found = interpolated(at, seconds, np.asarray(part.field(field)))
+            values[row, np.flatnonzero(is_known)[:, None], columns] = found
+    return stamp, values[0], values[1]
 
 
 def _any(values: Values, size: int) -> bool:

@@ -80,8 +80,9 @@ def identify_bag(
         recording = _with_gains(recording, gains)
     elif any(each.currents for each in recordings):
         raise BlfDscError(
-            f'{recording.source}: these are currents, from which no mass in kg can be told: give '
-            f'--gains [N m/A] of {", ".join(joints)}; 1 for each if they are torques'
+            f'{recording.source}: these are currents or percentages, from which no mass in kg '
+            f'can be told: give --gains [N m/A or N m/%] of {", ".join(joints)}; 1 for each if '
+            'they are torques'
         )
     return identify_arm(
         recording, robot, effort, picked_up, find_signs=not len(gains), begin=begin

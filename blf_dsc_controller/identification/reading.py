@@ -8,8 +8,9 @@ from pathlib import Path
 
 from blf_dsc_controller.bags.content import NO_NAMES, NameMap
 from blf_dsc_controller.identification.from_bag import read_bag
-from blf_dsc_controller.identification.from_table import TABLES, read_table
+from blf_dsc_controller.identification.from_table import read_table
 from blf_dsc_controller.identification.recording import Recording
+from blf_dsc_controller.identification.table_files import TABLES
 
 
 def read_recording(

@@ -12,17 +12,21 @@ from numpy.typing import NDArray
 from blf_dsc_controller.bags.topic_messages import Values
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.identification.on_disk import (
-    OnDisk,
     Samples,
     blocks_of,
     mapped,
 )
+from blf_dsc_controller.identification.turns import Turns
 from blf_dsc_controller.run import Floats, Stamps
 
-_SLOWEST = 0.02  # s between states
+LONGEST_PERIOD = 0.02
+"""Longest time between states [s], but for jitter."""
+
+_JITTER = 1.2  # times that, median that is accepted
 _FASTEST = 1e-5  # s, likewise
 _SPARSE = 100.0  # times the intervals between states: longest bag
-_GAP = 3.0  # intervals between two states
+GAP = 3.0
+"""Intervals between two states from which something is missing."""
 
 
 class Recording(NamedTuple):
@@ -48,11 +52,12 @@ def resampled(
     q: Floats | Values,
     torque: Floats | Values,
     source: str,
+    turning: NDArray[np.bool_],
 ) -> Recording:
     """Resample evenly, interpolating over uneven stamps and up to two lost states.
 
     Positions and torques are (N, n) at the stamps (N,) [ns]; NaN where one is unknown.
-    Turns are counted on where positions wrap.
+    Those of `turning` joints (n,) may be wrapped to one turn.
 
     Raises:
         BlfDscError: there are too few states, or their stamps cannot be of one clock.
@@ -73,9 +78,10 @@ def resampled(
     time = (stamp - stamp[0]) * 1e-9
     intervals = np.diff(time)
     period = float(np.median(intervals))
-    if period > _SLOWEST:
+    if period > _JITTER * LONGEST_PERIOD:
         raise BlfDscError(
-            f'the joint states are {period:.3g} s apart; at least one in {_SLOWEST:g} s is needed'
+            f'the joint states are {period:.3g} s apart; at least one in {LONGEST_PERIOD:g} s is '
+            'needed'
         )
     if period < _FASTEST or time[-1] > _SPARSE * period * time.size:
         raise BlfDscError(
@@ -84,7 +90,11 @@ def resampled(
             'where they jump'
         )
     grid = np.arange(0.0, time[-1], period)
-    gap = (intervals > _GAP * period)[np.searchsorted(time, grid, side='right') - 1]
+    gap = (intervals > GAP * period)[np.searchsorted(time, grid, side='right') - 1]
+    turns = Turns((q[order[rows]] for rows in blocks_of(order.size)), turning)
+    if turns.wrapped.any():
+        names = ', '.join(np.array(joints)[turns.wrapped])
+        source = f'{source} (positions of {names} are wrapped: full turns added)'
 
     def evenly(values: Callable[[slice], Floats]) -> Samples:
         def block(rows: slice) -> Floats:
@@ -94,23 +104,9 @@ def resampled(
 
         return mapped(grid.size, block)
 
-    positions = evenly(_counted_on(q, order).__getitem__)
+    positions = evenly(lambda rows: turns.added(rows, q[order[rows]]))
     torques = evenly(lambda rows: torque[order[rows]])
     return Recording(joints, period, positions, torques, gap, source)
-
-
-def _counted_on(q: Floats | Values, order: NDArray[np.intp]) -> OnDisk:
-    """Return positions (k, n) in an order, with turns counted on where an encoder wraps.
-
-    From one state to the next no joint moves by half a turn, and none by three metres.
-    """
-    before = q[order[:1]]
-    counted = OnDisk(before.shape[1])
-    for rows in blocks_of(order.size):
-        found = np.unwrap(np.concatenate((before, q[order[rows]])), axis=0)
-        counted.append(found[1:])
-        before = found[-1:]
-    return counted
 
 
 def interpolated(at: np.ndarray, time: np.ndarray, values: np.ndarray) -> Floats:

@@ -1,0 +1,239 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Which columns of a table are the time, and the positions and torques of the joints.
+
+They are found from their names, or given: `time=t`, `q=pos_*`, `tau=6:12` (columns 6 to
+11), `time=100Hz` if no column has the time.  A unit may follow in brackets, `time=t[ns]`;
+otherwise it is that of the names.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from fnmatch import fnmatchcase
+from pathlib import Path
+from typing import NamedTuple
+
+from blf_dsc_controller.errors import BlfDscError
+from blf_dsc_controller.identification.units import factor_of, is_of_drive, split_unit
+
+KINDS = ('time', 'q', 'tau')
+"""What columns are needed, by the names of `--map`."""
+
+_CURRENTS = {'current', 'currents'}
+_WORDS = {
+    'time': {'t', 'time', 'times', 'timestamp', 'stamp', 'secs', 'seconds'},
+    'q': {'q', 'pos', 'position', 'positions', 'angle', 'angles', 'jointposition'},
+    'tau': {
+        *('tau', 'torque', 'torques', 'effort', 'efforts', 'force', 'trq'),
+        *('jointtorque', *_CURRENTS),
+    },
+}
+_SIDES = {
+    *('d', 'des', 'desired', 'target', 'ref', 'reference', 'cmd', 'command'),
+    *('ext', 'external', 'error', 'err', 'offset'),
+}
+_SECONDS = re.compile('sec(ond)?s?', re.IGNORECASE)
+_NANOSECONDS = re.compile('n(ano)?sec(ond)?s?', re.IGNORECASE)
+_SHOWN = 60  # names of columns in a message
+_RATE = re.compile(r'([\d.]+)\s*Hz', re.IGNORECASE)
+_RANGE = re.compile(r'(\d+):(\d+)')
+_NUMBER = re.compile(r'\d+')
+
+
+class Column(NamedTuple):
+    """A column, and the factor of its unit."""
+
+    name: str
+    factor: float
+
+
+class Columns(NamedTuple):
+    """Columns of a recording.
+
+    The time is the sum of its columns, or that of rows at a rate.
+    """
+
+    time: list[Column]  # s
+    rate: float  # Hz; 0: the time is in columns
+    q: list[Column]  # rad, or m
+    tau: list[Column]  # N m, or N; none of a planned motion
+    has_currents: bool  # by their names or units: currents or shares of a rated torque
+
+    @property
+    def text(self) -> str:
+        """The columns, as they are reported."""
+        positions = f'positions {self.q[0].name!r} to {self.q[-1].name!r}'
+        if not self.tau:
+            return positions
+        return f'{positions}, torques {self.tau[0].name!r} to {self.tau[-1].name!r}'
+
+
+def choose_columns(
+    path: Path,
+    names: Sequence[str],
+    given: Mapping[str, str],
+    joints: Sequence[str],
+    *,
+    planned: bool,
+) -> Columns:
+    """Return the columns of the joints, which have these names in the table.
+
+    `given` has what was chosen of KINDS; a `planned` motion has no torques.
+
+    Raises:
+        BlfDscError: they are not found, or their units are not known.
+    """
+    q = _of_joints(path, names, 'q', given['q'], joints)
+    tau: list[str] = []
+    if not planned:
+        tau = _of_joints(path, names, 'tau', given['tau'], joints)
+        if len(tau) != len(q):
+            raise BlfDscError(
+                f'{path} has {len(q)} positions ({", ".join(q)}) and {len(tau)} torques '
+                f'({", ".join(tau)}): choose as many, as in --map tau=tau_*'
+            )
+    words = set().union(*(_meaning(name, joints) for name in tau))
+    units = [_unit_of(name, 'tau', given['tau']) for name in tau]
+    rate = _RATE.fullmatch(given['time'])
+    return Columns(
+        time=[] if rate else _time(path, names, given['time']),
+        rate=float(rate[1]) if rate else 0.0,
+        q=_with_factors(path, q, 'q', given['q']),
+        tau=_with_factors(path, tau, 'tau', given['tau']),
+        has_currents=bool(words & _CURRENTS) or any(map(is_of_drive, units)),
+    )
+
+
+def _of_joints(
+    path: Path, names: Sequence[str], kind: str, given: str, joints: Sequence[str]
+) -> list[str]:
+    """Return the columns of the positions or torques, in the order of the joints."""
+    if given:
+        found = _matching(names, given, kind)
+    else:
+        words = _WORDS[kind]
+        found = [
+            name
+            for name in names
+            if words & _meaning(split_unit(name, kind).stem, joints)
+        ]
+    named = [_of_joint(found, joint) for joint in joints]
+    if all(named):
+        return [name for name in named if name]
+    if found and len(found) <= len(joints):
+        are_numbers = _RANGE.fullmatch(split_unit(given, kind).stem)
+        return found if are_numbers else _by_number(found, kind)
+    raise BlfDscError(
+        f'{path}: which columns are {kind} of {", ".join(joints)} is not clear. Its columns are '
+        f'{_listed(names)}: choose them, as in --map {kind}={kind}_* or --map {kind}=1:7 '
+        '(columns 1 to 6, the first is 0)'
+    )
+
+
+def _of_joint(columns: Sequence[str], joint: str) -> str | None:
+    """Return the column of a joint, which has its name; None if there is not exactly one."""
+    own = [
+        name
+        for name in columns
+        if re.search(rf'(?<![^\W_]){re.escape(joint)}(?![^\W_])', name)
+    ]
+    own = own or [name for name in columns if joint in name]
+    return own[0] if len(own) == 1 else None
+
+
+def _by_number(columns: Sequence[str], kind: str) -> list[str]:
+    """Return columns in the order of their numbers, if these are all that differs."""
+    stems = [split_unit(name, kind).stem for name in columns]
+    numbers = [_NUMBER.findall(stem) for stem in stems]
+    if len({_NUMBER.sub('', stem) for stem in stems}) > 1 or not all(numbers):
+        return list(columns)
+    keys = [tuple(map(int, each)) for each in numbers]
+    return [columns[k] for k in sorted(range(len(keys)), key=keys.__getitem__)]
+
+
+def _matching(names: Sequence[str], given: str, kind: str) -> list[str]:
+    """Return the columns by their name, a range of numbers, or a pattern of names."""
+    for wanted in (given, split_unit(given, kind).stem):
+        if wanted in names:
+            return [wanted]
+        numbers = _RANGE.fullmatch(wanted)
+        if numbers:
+            return list(names[int(numbers[1]) : int(numbers[2])])
+        found = [name for name in names if fnmatchcase(name, wanted)]
+        if found:
+            return found
+    return []
+
+
+def _meaning(column: str, joints: Sequence[str]) -> set[str]:
+    """Return the words of a column's name besides a joint's; none if it is not measured."""
+    for joint in sorted(joints, key=len, reverse=True):
+        column = column.replace(joint, ' ')
+    spaced = re.sub('([a-z])([A-Z])', r'\1 \2', column)
+    words = set(re.findall('[a-z]+', spaced.lower()))
+    return set() if words & _SIDES else words
+
+
+def _time(path: Path, names: Sequence[str], given: str) -> list[Column]:
+    """Return the columns whose sum is the time."""
+    found = _matching(names, given, 'time') if given else _named_time(names)
+    pair = _seconds_and_nanoseconds(found)
+    if pair:
+        return pair
+    if len(found) != 1:
+        raise BlfDscError(
+            f'{path}: which column is the time is not clear. Its columns are '
+            f'{_listed(names)}: choose it and its unit, as in --map time=t or --map time=t[ns], '
+            'or give the rate of the rows, as in --map time=100Hz'
+        )
+    return _with_factors(path, found, 'time', given)
+
+
+def _named_time(names: Sequence[str]) -> list[str]:
+    """Return the columns that are the time by their names; of several, the stamps."""
+    found = [name for name in names if _is_time(name)]
+    stamps = [name for name in found if 'stamp' in name.lower()]
+    return stamps if len(found) > 1 and stamps else found
+
+
+def _is_time(name: str) -> bool:
+    words = _meaning(name, ())
+    is_time = _WORDS['time'] & words or any(map(_SECONDS.fullmatch, words))
+    is_rest = any(map(_NANOSECONDS.fullmatch, words))
+    return bool(is_time or is_rest) and not _WORDS['q'] & words
+
+
+def _seconds_and_nanoseconds(columns: Sequence[str]) -> list[Column]:
+    """Return a column of seconds and one of nanoseconds that are one time; else none."""
+    rest = [name for name in columns if _NANOSECONDS.search(name)]
+    seconds = [name for name in columns if name not in rest and _SECONDS.search(name)]
+    if len(seconds) != 1 or len(rest) != 1:
+        return []
+    if _SECONDS.sub('', seconds[0]) != _NANOSECONDS.sub('', rest[0]):
+        return []
+    return [Column(seconds[0], 1.0), Column(rest[0], 1e-9)]
+
+
+def _with_factors(
+    path: Path, names: Sequence[str], kind: str, given: str
+) -> list[Column]:
+    try:
+        return [
+            Column(name, factor_of(_unit_of(name, kind, given), kind)) for name in names
+        ]
+    except BlfDscError as error:
+        raise BlfDscError(f'{path}: {error}') from error
+
+
+def _unit_of(name: str, kind: str, given: str) -> str:
+    """Return the unit of a column: the one given, or that of its name."""
+    unit = split_unit(given, kind).unit if given != name else ''
+    return unit or split_unit(name, kind).unit
+
+
+def _listed(names: Sequence[str]) -> str:
+    """Return the names, not all of very many."""
+    shown = ', '.join(names[:_SHOWN])
+    more = len(names) - _SHOWN
+    return shown if more <= 0 else f'{shown} and {more} more'

@@ -1,0 +1,219 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Files of tables: names of columns, and values that are read when they are asked for.
+
+The columns of npz and mat files are their vectors, and those of matrices, in which each
+is named after its matrix with its index.  Only the longest columns are kept.
+
+Files are not trusted: what they unpack to has a limit.
+"""
+
+from __future__ import annotations
+
+import zlib
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from os import SEEK_CUR
+from pathlib import Path
+from struct import Struct
+from typing import Any, Protocol
+from zipfile import ZipFile
+
+import numpy as np
+
+from blf_dsc_controller.errors import BlfDscError
+from blf_dsc_controller.identification.text_tables import text_table
+from blf_dsc_controller.run import Floats
+
+_MOST = 1 << 28  # bytes that an array, or a mat file, may have, unpacked
+_BYTES = 8  # of a number
+_MOST_ARRAYS = 10_000
+_TAG = Struct('<II')  # type and bytes of an element of a mat file
+_HEADER = 128  # bytes of a mat file
+_COMPRESSED = 15  # type of an element
+_WITH_COMPRESSION, _HDF5 = 1, 2  # major versions of mat files
+_AT_ONCE = 1 << 20  # bytes
+
+
+class Table(Protocol):
+    """Columns of one length, by name."""
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the columns."""
+
+    def read(self, columns: Sequence[str], /) -> Floats:
+        """Return some columns (N, k)."""
+
+
+def open_table(path: Path) -> Table:
+    """Return the table of a file with one of the suffixes of `TABLES`.
+
+    Raises:
+        BlfDscError: it cannot be read as such.
+    """
+    if path.exists() and not path.is_file():
+        raise BlfDscError(f'{path} is not a regular file, so it is no table')
+    suffix = path.suffix.lower()
+    try:
+        return _TABLES[suffix](path)
+    except BlfDscError:
+        raise
+    except Exception as error:  # libraries raise nearly anything on damaged files
+        reason = ' '.join(str(error).split()) or type(error).__name__
+        raise BlfDscError(f'{path} cannot be read as {suffix[1:]}: {reason}') from error
+
+
+class _Arrays:
+    """Columns of arrays, of which each is loaded when it is asked for."""
+
+    def __init__(
+        self, shapes: Mapping[str, tuple[int, ...]], load: Callable[[str], Any]
+    ) -> None:
+        """Take the shapes of arrays by name; others than vectors and matrices are left out."""
+        self._load = load
+        self._columns: dict[str, tuple[str, int]] = {}
+        squeezed = {
+            name: [n for n in shape if n != 1] for name, shape in shapes.items()
+        }
+        vectors = {name: n for name, n in squeezed.items() if 0 < len(n) <= 2}
+        longest = max((max(n) for n in vectors.values()), default=0)
+        for name, n in vectors.items():
+            if max(n) < longest:
+                continue
+            if len(n) == 1:
+                self._columns[name] = name, 0
+            else:
+                of_matrix = {f'{name}_{k}': (name, k) for k in range(min(n))}
+                self._columns |= of_matrix
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the columns."""
+        return tuple(self._columns)
+
+    def read(self, columns: Sequence[str]) -> Floats:
+        """Return some columns (N, k)."""
+        loaded: dict[str, Floats] = {}
+        found = []
+        for column in columns:
+            name, k = self._columns[column]
+            if name not in loaded:
+                loaded[name] = _upright(self._load(name))
+            found.append(loaded[name][:, k])
+        return np.column_stack(found)
+
+
+def _upright(values: Any) -> Floats:
+    """Return a vector or matrix as columns (N, k), of which N is the larger."""
+    squeezed = np.squeeze(np.asarray(values))
+    if squeezed.ndim == 1:
+        squeezed = squeezed[:, None]
+    if squeezed.shape[0] < squeezed.shape[1]:
+        squeezed = squeezed.T
+    return squeezed.astype(np.float64, copy=False)
+
+
+def _npz(path: Path) -> _Arrays:
+    shapes: dict[str, tuple[int, ...]] = {}
+    with ZipFile(path) as archive:
+        members = [name for name in archive.namelist() if name.endswith('.npy')]
+        for member in members[:_MOST_ARRAYS]:
+            with archive.open(member) as stream:
+                shape, kind = _header_of_npy(stream)
+            if kind in 'fiu':
+                shapes[member.removesuffix('.npy')] = shape
+
+    def load(name: str) -> Any:
+        _check_size(path, _size_of(shapes[name]))
+        try:
+            with ZipFile(path) as archive, archive.open(f'{name}.npy') as stream:
+                return np.lib.format.read_array(stream, allow_pickle=False)
+        except Exception as error:  # as above
+            raise BlfDscError(f'{path} cannot be read as npz: {error}') from error
+
+    return _Arrays(shapes, load)
+
+
+def _header_of_npy(stream: Any) -> tuple[tuple[int, ...], str]:
+    """Return the shape of an array, and the kind of its numbers."""
+    version = np.lib.format.read_magic(stream)
+    read = np.lib.format.read_array_header_2_0
+    if version == (1, 0):
+        read = np.lib.format.read_array_header_1_0
+    shape, _, dtype = read(stream)
+    return shape, dtype.kind
+
+
+def _check_size(path: Path, size: int) -> None:
+    """Raise BlfDscError if so many bytes would be unpacked that they may be an attack."""
+    if size > _MOST:
+        raise BlfDscError(
+            f'{path} unpacks to {size / 1e9:.2g} GB or more; at most {_MOST / 1e9:.2g} GB of an '
+            'array are read: write it as several files, all of which can be given'
+        )
+
+
+def _mat(path: Path) -> _Arrays:
+    from scipy.io import loadmat, whosmat
+    from scipy.io.matlab import matfile_version
+
+    major, _ = matfile_version(path)
+    if major == _HDF5:
+        raise BlfDscError(
+            f"{path} is HDF5: write it again by MATLAB's save('FILE', '-v7')"
+        )
+    if major == _WITH_COMPRESSION:
+        for size in _unpacked_sizes(path):
+            _check_size(path, size)
+    for _, shape, _ in whosmat(path):
+        _check_size(path, _size_of(shape))
+    arrays = dict(_numbers_in(loadmat(path, simplify_cells=True)))
+    shapes = {name: values.shape for name, values in arrays.items()}
+    return _Arrays(shapes, arrays.__getitem__)
+
+
+def _size_of(shape: tuple[int, ...]) -> int:
+    """Return the bytes of an array of floats."""
+    return int(np.prod(shape, dtype=float)) * _BYTES
+
+
+def _unpacked_sizes(path: Path) -> Iterator[int]:
+    """Yield, ever larger, how many bytes the compressed elements of a file unpack to."""
+    size = 0
+    with path.open('rb') as stream:
+        stream.seek(_HEADER)
+        while len(tag := stream.read(_TAG.size)) == _TAG.size:
+            kind, length = _TAG.unpack(tag)
+            if kind != _COMPRESSED:
+                stream.seek(length, SEEK_CUR)
+                continue
+            unpack = zlib.decompressobj()
+            packed = stream.read(min(length, _MOST))
+            while packed and not unpack.eof:
+                size += len(unpack.decompress(packed, _AT_ONCE))
+                packed = unpack.unconsumed_tail
+                yield size
+
+
+def _numbers_in(
+    content: Mapping[str, Any], prefix: str = ''
+) -> Iterator[tuple[str, Any]]:
+    """Yield the arrays of numbers of a mat file, which may be in structures."""
+    for name, value in content.items():
+        if isinstance(value, Mapping):
+            yield from _numbers_in(value, f'{prefix}{name}_')
+            continue
+        values = np.asarray(value)
+        if values.dtype.kind in 'fiu':
+            yield prefix + name, values
+
+
+_TABLES: dict[str, Callable[[Path], Table]] = {
+    '.csv': text_table,
+    '.tsv': text_table,
+    '.txt': text_table,
+    '.npz': _npz,
+    '.mat': _mat,
+}
+
+TABLES = tuple(_TABLES)
+"""Suffixes of tables."""

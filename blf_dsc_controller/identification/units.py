@@ -1,0 +1,110 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Units in the names of columns: `q_1 [deg]`, `tau_1_Nmm`, `time (ms)`."""
+
+from __future__ import annotations
+
+import re
+from math import pi
+from typing import NamedTuple
+
+from blf_dsc_controller.errors import BlfDscError
+
+_TIME = {
+    **dict.fromkeys(('s', 'sec', 'secs', 'second', 'seconds'), 1.0),
+    **dict.fromkeys(('ms', 'msec', 'millisecond', 'milliseconds'), 1e-3),
+    **dict.fromkeys(('us', 'usec', 'microsecond', 'microseconds'), 1e-6),
+    **dict.fromkeys(('ns', 'nsec', 'nsecs', 'nanosec', 'nanosecs'), 1e-9),
+    **dict.fromkeys(('nanosecond', 'nanoseconds'), 1e-9),
+}
+_POSITION = {
+    **dict.fromkeys(('rad', 'radian', 'radians', 'm'), 1.0),
+    **dict.fromkeys(('mrad', 'mm'), 1e-3),
+    'cm': 1e-2,
+    **dict.fromkeys(('deg', 'degs', 'degree', 'degrees', '°'), pi / 180.0),
+    **dict.fromkeys(('rev', 'revs', 'turn', 'turns'), 2.0 * pi),
+}
+_TORQUE = {
+    **dict.fromkeys(('nm', 'n'), 1.0),
+    **dict.fromkeys(('nmm', 'mnm'), 1e-3),
+    'ncm': 1e-2,
+    **dict.fromkeys(('knm', 'kn'), 1e3),
+}
+_CURRENT = {
+    **dict.fromkeys(('a', 'amp', 'amps', 'ampere', 'arms'), 1.0),
+    'ma': 1e-3,
+    **dict.fromkeys(('%', 'percent'), 1.0),
+    '‰': 0.1,
+}
+_OF = {'time': _TIME, 'q': _POSITION, 'tau': {**_TORQUE, **_CURRENT}}
+_EXPECTED = {
+    'time': 's, ms, us or ns',
+    'q': 'rad, mrad, deg, rev (or m, cm, mm)',
+    'tau': 'N m, N cm, N mm, kN m (or N, kN), or A, mA or % with --gains',
+}
+# units of other quantities, or without a known size
+_OTHERS = frozenset(
+    (
+        *('count', 'counts', 'tick', 'ticks', 'inc', 'increments', 'raw', 'digits'),
+        *('v', 'volt', 'gon', 'lbfin', 'lbin', 'ftlb', 'lbft', 'kgcm', 'kgfcm', 'ozin'),
+    )
+)
+_BRACKETED = re.compile(r'\s*[\[({<]\s*([^\[\](){}<>]+?)\s*[\])}>]\s*$')
+_INDEX = re.compile(r'[\s_\[(]*\d+[\])]?$')
+_LAST_WORD = re.compile(r'[\s_]+([^\s_]+)$')
+_SHORT = 2  # letters; a last word without brackets that is shorter is no unit
+
+
+class Named(NamedTuple):
+    """A name, and the unit at its end, as it stands there; empty if it has none."""
+
+    stem: str
+    unit: str
+
+
+def split_unit(name: str, kind: str) -> Named:
+    """Return the name of a column of time, q or tau without its unit.
+
+    Other words in brackets, such as `(measured)`, belong to the name.
+    """
+    bracketed = _BRACKETED.search(name)
+    if bracketed and _is_unit(_normal(bracketed[1])):
+        return Named(name[: bracketed.start()], bracketed[1])
+    index = _INDEX.search(name)
+    head = name[: index.start()] if index else name
+    word = _LAST_WORD.search(head)
+    if word and len(word[1]) >= _SHORT and _normal(word[1]) in _OF[kind]:
+        return Named(head[: word.start()] + name[len(head) :], word[1])
+    return Named(name, '')
+
+
+def _is_unit(word: str) -> bool:
+    return (
+        '/' in word or word in _OTHERS or any(word in units for units in _OF.values())
+    )
+
+
+def factor_of(unit: str, kind: str) -> float:
+    """Return the unit of time, q or tau in s, rad (m), N m (N), A or %; empty: 1.
+
+    Raises:
+        BlfDscError: it is not known.
+    """
+    if not unit:
+        return 1.0
+    factor = _OF[kind].get(_normal(unit))
+    if factor is None:
+        raise BlfDscError(
+            f'the unit {unit!r} of {kind} is not known; expected {_EXPECTED[kind]}: convert the '
+            'values, or correct the name of the column'
+        )
+    return factor
+
+
+def is_of_drive(unit: str) -> bool:
+    """Return whether a unit of tau is that of currents, or a share of a rated torque."""
+    return _normal(unit) in _CURRENT
+
+
+def _normal(unit: str) -> str:
+    """Return a unit in lower case, without what separates its factors."""
+    return re.sub(r'[\s.·*⋅-]', '', unit.replace('µ', 'u').replace('μ', 'u')).lower()

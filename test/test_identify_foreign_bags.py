@@ -1,0 +1,163 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Bags of other drivers and tools, as recordings: stamps, split messages, storages."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+from mcap.writer import Writer as McapWriter
+from random_arm import PANDA, PANDA_TEXT
+from rosbags.rosbag2 import StoragePlugin, Writer
+
+from blf_dsc_controller.bags.sources import open_bag
+from blf_dsc_controller.bags.writer import BagWriter
+from blf_dsc_controller.cli.main import main
+from blf_dsc_controller.errors import BlfDscError
+from blf_dsc_controller.identification.reading import read_recording
+from blf_dsc_controller.messages.codecs import JointStateEncoder, typestore
+from blf_dsc_controller.messages.topics import JOINT_STATE
+
+PERIOD = 0.005  # s
+TIME = np.arange(400) * PERIOD
+START = 1_000_000_000  # ns
+SPEED = np.arange(1.0, 8.0)
+Q = np.sin(np.multiply.outer(TIME, SPEED))
+TAU = 10.0 * np.cos(np.multiply.outer(TIME, SPEED))
+
+
+def stamps_of(time):
+    return [START + round(t * 1e9) for t in time]
+
+
+def messages(joints, time, late=0.0, *, stamped=True):
+    """Times of reception and bytes of the states of some joints, sampled `late` [s]."""
+    encoder = JointStateEncoder(joints)
+    at = [PANDA.index(name) for name in joints]
+    for stamp, t in zip(stamps_of(time + late), time + late, strict=True):
+        q = np.sin(SPEED[at] * t)
+        torque = 10.0 * np.cos(SPEED[at] * t)
+        raw = encoder.encode(stamp if stamped else 0, q, np.zeros(len(at)), torque)
+        yield stamp, bytes(raw)
+
+
+def written(path, *parts):
+    entries = sorted(entry for part in parts for entry in part)
+    with BagWriter(path, flush_interval=None) as bag:
+        handle = bag.add_topic('/joint_states', JOINT_STATE, [])
+        for received, raw in entries:
+            bag.write(handle, raw, received)
+    return path
+
+
+def is_the_motion(recording, tolerance, begin=0.0):
+    assert recording.joints == PANDA
+    assert recording.period == pytest.approx(PERIOD, rel=1e-6)
+    samples = len(recording.q) - 1  # at the last one, not all joints may be known
+    assert samples > len(TIME) - 5
+    known = ~recording.gap[:samples]
+    assert known.mean() > 0.98
+    time = begin + np.arange(samples)[known] * recording.period
+    expected = np.sin(np.multiply.outer(time, SPEED))
+    np.testing.assert_allclose(recording.q[:samples][known], expected, atol=tolerance)
+
+
+def test_states_without_stamps_are_at_their_times_of_reception(tmp_path):
+    bag = written(tmp_path / 'bag', messages(PANDA, TIME, stamped=False))
+    recording = read_recording(bag, PANDA_TEXT)
+    is_the_motion(recording, 1e-6)
+    assert 'without stamps: by the times of reception' in recording.source
+
+
+@pytest.mark.parametrize('late', [0.0, 0.002])
+def test_joints_that_come_in_two_messages_are_one_arm(tmp_path, late):
+    """Between its samples, the second one is interpolated: (w h)^2 / 8 of it."""
+    shuffled = (PANDA[6], 'gripper', PANDA[4], PANDA[5])
+    arm = [name for name in shuffled if name in PANDA]
+    second = messages(arm, TIME, late)
+    bag = written(tmp_path / 'bag', messages(PANDA[:4], TIME), second)
+    begin = PERIOD if late else 0.0  # before, the second one is unknown
+    is_the_motion(read_recording(bag, PANDA_TEXT), 2e-4, begin)
+    with pytest.raises(BlfDscError, match='come in 2 messages'):
+        read_recording(bag, PANDA_TEXT, commanded=True)
+
+
+def test_joints_that_are_missing_are_named_still(tmp_path):
+    bag = written(
+        tmp_path / 'bag', messages(PANDA[:4], TIME), messages(PANDA[5:], TIME)
+    )
+    with pytest.raises(BlfDscError, match='no message has panda_joint5'):
+        read_recording(bag, PANDA_TEXT)
+
+
+@pytest.mark.parametrize('files', [1, 2])
+def test_database_without_metadata_is_read_if_it_is_one_file(tmp_path, files):
+    path = tmp_path / 'bag'
+    with Writer(path, version=8, storage_plugin=StoragePlugin.SQLITE3) as bag:
+        topic = bag.add_connection('/joint_states', JOINT_STATE, typestore=typestore())
+        for received, raw in messages(PANDA, TIME):
+            bag.write(topic, received, raw)
+    (path / 'metadata.yaml').unlink()
+    (database,) = path.glob('*.db3')
+    if files == 1:
+        is_the_motion(read_recording(path, PANDA_TEXT), 1e-6)
+        return
+    (path / 'other.db3').write_bytes(database.read_bytes())
+    with pytest.raises(BlfDscError, match=r'give one of its 2 files, as .*bag\.db3'):
+        read_recording(path, PANDA_TEXT)
+
+
+def foreign_mcap(path, encoding, profile):
+    """A file of joint states in JSON or as ROS 1 writes them."""
+    with path.open('wb') as stream:
+        writer = McapWriter(stream)
+        writer.start(profile=profile)
+        kind = {'json': 'jsonschema', 'ros1': 'ros1msg'}[encoding]
+        schema = writer.register_schema(JOINT_STATE, kind, b'{}')
+        channel = writer.register_channel('/joint_states', encoding, schema)
+        for stamp in stamps_of(TIME[:20]):
+            data = json.dumps({'position': [0.0] * 7}).encode()
+            writer.add_message(channel, stamp, data, stamp)
+        writer.finish()
+    return path
+
+
+@pytest.mark.parametrize(
+    ('encoding', 'profile', 'remedy'),
+    [
+        ('json', '', 'as CSV, which `blf_dsc identify` reads'),
+        ('json', 'ros2', 'as CSV, which `blf_dsc identify` reads'),
+        ('ros1', 'ros1', 'give the .bag of ROS 1'),
+    ],
+)
+def test_other_encodings_of_mcap_are_named_with_what_to_do(
+    tmp_path, capsys, encoding, profile, remedy
+):
+    """Recovery, which would be of no use, is not advised, and says so itself."""
+    path = foreign_mcap(tmp_path / 'run.mcap', encoding, profile)
+    with pytest.raises(BlfDscError, match=f'its messages are {encoding}') as error:
+        read_recording(path, PANDA_TEXT)
+    assert remedy in str(error.value)
+    assert 'recover' not in str(error.value)
+    assert main(['recover', str(path), '--out', str(tmp_path / 'clean')]) == 1
+    output = capsys.readouterr().out
+    assert f'20 messages of /joint_states: they are {encoding}, not CDR' in output
+    assert 'ALL LOST' in output
+
+
+def test_file_of_cdr_without_a_profile_is_saved_by_recovery(tmp_path, capsys):
+    path = tmp_path / 'run.mcap'
+    with path.open('wb') as stream:
+        writer = McapWriter(stream)
+        writer.start()
+        text = b'std_msgs/Header header'
+        schema = writer.register_schema(JOINT_STATE, 'ros2msg', text)
+        channel = writer.register_channel('/joint_states', 'cdr', schema)
+        for stamp, raw in messages(PANDA, TIME):
+            writer.add_message(channel, stamp, raw, stamp)
+        writer.finish()
+    assert main(['recover', str(path), '--out', str(tmp_path / 'clean')]) == 0
+    capsys.readouterr()
+    with open_bag(tmp_path / 'clean') as bag:
+        assert bag.counts['/joint_states'] == len(TIME)

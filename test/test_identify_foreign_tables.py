@@ -1,0 +1,382 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Tables as other tools write them, and as people name their columns."""
+
+from __future__ import annotations
+
+import os
+import warnings
+from zipfile import ZIP_DEFLATED, ZipFile
+
+import numpy as np
+import pytest
+from random_arm import PANDA, PANDA_TEXT, UR5E, UR5E_TEXT
+from scipy.io import savemat
+
+from blf_dsc_controller.bags.content import NameMap
+from blf_dsc_controller.cli.main import main
+from blf_dsc_controller.errors import BlfDscError
+from blf_dsc_controller.identification.from_table import read_table
+
+PERIOD = 0.01  # s
+TIME = np.arange(300) * PERIOD
+Q = np.sin(np.multiply.outer(TIME, np.arange(1.0, 7.0)))
+TAU = 10.0 * np.cos(np.multiply.outer(TIME, np.arange(1.0, 7.0)))
+EPOCH = 1_700_000_000  # s
+NUMBERS = range(1, 7)
+# As drivers of Universal Robots list their joints: by the alphabet
+SHUFFLED = tuple(sorted(UR5E))
+ORDER = [UR5E.index(name) for name in SHUFFLED]
+
+
+def numbered(stem, unit=''):
+    return [f'{stem}_{k}{unit}' for k in NUMBERS]
+
+
+def named(field, joints=UR5E, unit=''):
+    return [f'{field} {joint}{unit}' for joint in joints]
+
+
+def written(path, names, columns, delimiter=',', decimal='.', before='', **how):
+    """Write a table; a name that is None is that of text cells."""
+    table = np.column_stack(columns)
+    rows = [[f'{value:.9g}' for value in row] for row in table]
+    lines = [delimiter.join(row).replace('.', decimal) for row in rows]
+    header = [delimiter.join(names)] if names else []
+    path.write_text('\n'.join([*([before] if before else []), *header, *lines]), **how)
+    return path
+
+
+def is_read(path, *entries, time=TIME, urdf=UR5E_TEXT):
+    """Whether the motion is read as it is, without a warning."""
+    with warnings.catch_warnings():
+        warnings.simplefilter('error')
+        recording = read_table(path, urdf, names=NameMap.parse(entries))
+    assert recording.joints == UR5E
+    assert recording.period == pytest.approx(PERIOD, rel=1e-4)
+    samples = len(recording.q)
+    assert samples >= len(time) - 2
+    # stamps since 1970 have no more than 0.3 us in a float
+    time = np.multiply.outer(np.arange(samples) * recording.period, NUMBERS)
+    np.testing.assert_allclose(recording.q, np.sin(time), atol=1e-5)
+    np.testing.assert_allclose(recording.torque, 10.0 * np.cos(time), atol=1e-4)
+
+
+def refused(path, *entries):
+    with pytest.raises(BlfDscError) as error:
+        read_table(path, UR5E_TEXT, names=NameMap.parse(entries))
+    message = str(error.value)
+    assert '\n' not in message
+    return message
+
+
+# What the tools of ROS print.
+
+
+def test_rostopic_echo_p_is_read_with_its_names_and_nanoseconds(tmp_path):
+    n = range(len(SHUFFLED))
+    fields = [
+        f'field.{field}{k}' for field in ('position', 'velocity', 'effort') for k in n
+    ]
+    head = ['%time', 'field.header.seq', 'field.header.stamp', 'field.header.frame_id']
+    lines = [','.join([*head, *(f'field.name{k}' for k in n), *fields])]
+    for k, t in enumerate(TIME):
+        stamp = EPOCH * 10**9 + round(t * 1e9)
+        values = [*Q[k, ORDER], *np.zeros(6), *TAU[k, ORDER]]
+        cells = [f'{stamp + 999}', f'{k}', f'{stamp}', 'base', *SHUFFLED]
+        lines.append(','.join([*cells, *(f'{value:.9g}' for value in values)]))
+    path = tmp_path / 'a.csv'
+    path.write_text('\n'.join(lines))
+    is_read(path)
+
+
+def test_ros2_topic_echo_csv_is_read_without_a_header(tmp_path):
+    lines = []
+    for k, t in enumerate(TIME):
+        nanoseconds = round(t * 1e9)
+        stamp = [f'{EPOCH + nanoseconds // 10**9}', f'{nanoseconds % 10**9}', '']
+        values = [*Q[k, ORDER], *np.zeros(6), *TAU[k, ORDER]]
+        lines.append(
+            ','.join([*stamp, *SHUFFLED, *(f'{value:.9g}' for value in values)])
+        )
+    path = tmp_path / 'a.csv'
+    path.write_text('\n'.join(lines))
+    is_read(path)
+
+
+def test_seconds_and_nanoseconds_in_two_columns_are_one_time(tmp_path):
+    nanoseconds = np.round(TIME * 1e9).astype(int)
+    seconds = EPOCH + nanoseconds // 10**9
+    for first, second in (
+        ('sec', 'nanosec'),
+        ('header.stamp.secs', 'header.stamp.nsecs'),
+    ):
+        path = tmp_path / f'{first}.csv'
+        np.savetxt(
+            path,
+            np.column_stack((seconds, nanoseconds % 10**9, Q, TAU)),
+            delimiter=',',
+            header=','.join([first, second, *numbered('q'), *numbered('tau')]),
+            comments='',
+        )
+        is_read(path)
+
+
+# Separators, headers, orders.
+
+
+@pytest.mark.parametrize('delimiter', [';', '\t'])
+@pytest.mark.parametrize('has_header', [True, False])
+def test_decimal_commas_are_read(tmp_path, delimiter, has_header):
+    names = ['t', *numbered('q'), *numbered('tau')] if has_header else []
+    path = written(tmp_path / 'a.csv', names, (TIME, Q, TAU), delimiter, ',')
+    is_read(path, *([] if has_header else ['time=0:1', 'q=1:7', 'tau=7:13']))
+
+
+def test_header_of_savetxt_and_lines_above_and_units_below_it_are_read(tmp_path):
+    names = ['t', *numbered('q'), *numbered('tau')]
+    np.savetxt(
+        tmp_path / 'a.txt', np.column_stack((TIME, Q, TAU)), header=' '.join(names)
+    )
+    is_read(tmp_path / 'a.txt')
+    title = 'Recording of Monday\n# by somebody\n'
+    path = written(tmp_path / 'b.csv', names, (TIME, Q, TAU), before=title)
+    is_read(path)
+    units = ','.join(['ms', *['deg'] * 6, *['Nmm'] * 6])
+    columns = (1e3 * TIME, np.rad2deg(Q), 1e3 * TAU)
+    path = written(tmp_path / 'c.csv', [f'{",".join(names)}\n{units}'], columns)
+    is_read(path)
+
+
+def test_numbered_columns_are_those_of_their_numbers_in_any_order(tmp_path):
+    order = [5, 0, 1, 2, 3, 4]
+    names = ['t', *(f'q_{k + 1}' for k in order), *(f'tau[{k}]' for k in order)]
+    is_read(written(tmp_path / 'a.csv', names, (TIME, Q[:, order], TAU[:, order])))
+    # by number of the column, the order is that of the file
+    recording = read_table(
+        tmp_path / 'a.csv', UR5E_TEXT, names=NameMap.parse(['q=1:7', 'tau=7:13'])
+    )
+    np.testing.assert_allclose(recording.q[5:6][:, 0], Q[5:6, 5], atol=1e-6)
+
+
+def test_text_of_spreadsheets_is_read_in_any_encoding(tmp_path):
+    names = ['t', *(f'{name} [°]' for name in numbered('q')), *numbered('tau')]
+    for encoding in ('utf-8-sig', 'utf-16', 'cp1252'):
+        path = tmp_path / f'{encoding}.csv'
+        written(path, names, (TIME, np.rad2deg(Q), TAU), encoding=encoding)
+        is_read(path)
+
+
+def test_table_that_was_cut_off_and_one_with_empty_cells_are_read(tmp_path):
+    names = ['t', *numbered('q'), *numbered('tau')]
+    path = written(tmp_path / 'a.csv', names, (TIME, Q, TAU))
+    path.write_text(path.read_text()[:-20])
+    is_read(path, time=TIME[:-1])
+    lines = path.read_text().splitlines()
+    lines[50] = lines[50].replace(lines[50].split(',')[3], '')
+    path.write_text('\n'.join(lines))
+    assert not read_table(path, UR5E_TEXT).gap[:5].any()
+    lines[60] = ','.join(lines[60].split(',')[:4])
+    path.write_text('\n'.join(lines))
+    assert 'line 61: got 4 cells' in refused(path)
+
+
+# Units.
+
+
+@pytest.mark.parametrize(
+    ('time', 'q', 'tau'),
+    [
+        ('t [s]', ' [rad]', ' [N m]'),
+        ('t [ms]', ' [deg]', ' [Nmm]'),
+        ('time (us)', '_deg', '_mNm'),
+        ('stamp_ns', ' (degrees)', ' [N·m]'),
+        ('time', ' [mrad]', ' {kN m}'),
+        ('time_ms', ' [rev]', ' [N cm]'),
+    ],
+)
+def test_units_in_the_names_are_used(tmp_path, time, q, tau):
+    of_time = {'ms': 1e3, 'us': 1e6, 'ns': 1e9}
+    of_q = {'deg': 180 / np.pi, 'degrees': 180 / np.pi, 'mrad': 1e3, 'rev': 0.5 / np.pi}
+    of_tau = {'Nmm': 1e3, 'mNm': 1e3, 'kN m': 1e-3, 'N cm': 1e2}
+    factors = (
+        next(
+            (
+                f
+                for unit, f in units.items()
+                if unit in name.replace('_', ' ').split(' ', 1)[-1]
+            ),
+            1,
+        )
+        for units, name in ((of_time, time), (of_q, q), (of_tau, tau))
+    )
+    columns = [values * f for values, f in zip((TIME, Q, TAU), factors, strict=True)]
+    for names in (
+        [time, *numbered('q', q), *numbered('tau', tau)],
+        [time, *named('position', unit=q), *named('effort', unit=tau)],
+    ):
+        is_read(written(tmp_path / 'a.csv', names, columns))
+
+
+def test_units_of_matrices_are_used_and_may_be_given(tmp_path):
+    np.savez(tmp_path / 'a.npz', t_ms=1e3 * TIME, q_deg=np.rad2deg(Q), tau=TAU)
+    is_read(tmp_path / 'a.npz')
+    savemat(
+        tmp_path / 'a.mat', {'log': {'t': TIME, 'q_deg': np.rad2deg(Q), 'tau': TAU}}
+    )
+    is_read(tmp_path / 'a.mat')
+    np.savez(tmp_path / 'b.npz', t=1e9 * TIME, q=np.rad2deg(Q), tau=1e3 * TAU)
+    is_read(tmp_path / 'b.npz', 'time=t[ns]', 'q=q_*[deg]', 'tau=tau_*[Nmm]')
+    assert "--map 'time=t[ns]'" in refused(tmp_path / 'b.npz')
+
+
+def test_stamps_of_this_century_need_no_unit(tmp_path):
+    for factor in (1e3, 1e6, 1e9):
+        stamp = (EPOCH + TIME) * factor
+        np.savez(tmp_path / 'a.npz', time=stamp, q=Q, tau=TAU)
+        is_read(tmp_path / 'a.npz')
+
+
+@pytest.mark.parametrize('unit', ['counts', 'lbf in', 'rad/s'])
+def test_unknown_units_are_refused_with_those_that_are_known(tmp_path, unit):
+    names = ['t', *numbered('q', f' [{unit}]'), *numbered('tau')]
+    message = refused(written(tmp_path / 'a.csv', names, (TIME, Q, TAU)))
+    assert f"the unit '{unit}' of q is not known; expected rad" in message
+
+
+@pytest.mark.parametrize('unit', [' [%]', ' [A]', '_mA'])
+def test_percentages_and_currents_need_gains(tmp_path, unit):
+    names = ['t', *numbered('q'), *numbered('tau', unit)]
+    path = written(tmp_path / 'a.csv', names, (TIME, Q, TAU))
+    recording = read_table(path, UR5E_TEXT)
+    assert recording.currents
+    factor = 1e-3 if unit == '_mA' else 1.0
+    np.testing.assert_allclose(recording.torque[:9], factor * TAU[:9], atol=1e-5)
+
+
+def test_words_in_brackets_that_are_no_units_belong_to_the_name(tmp_path):
+    names = ['t', *numbered('q', ' (measured)'), *numbered('tau', ' (filtered)')]
+    is_read(written(tmp_path / 'a.csv', names, (TIME, Q, TAU)))
+
+
+# Time.
+
+
+def test_two_runs_in_one_table_are_two_runs(tmp_path):
+    """With the clock starting again, and also with the rows of another file in between."""
+    names = ['t', *numbered('q'), *numbered('tau')]
+    columns = [np.concatenate((values, values)) for values in (TIME, Q, TAU)]
+    path = written(tmp_path / 'a.csv', names, columns)
+    recording = read_table(path, UR5E_TEXT)
+    assert 'starts again 1 times: read as 2 runs' in recording.source
+    assert recording.duration == pytest.approx(2 * TIME[-1] + 1.0, abs=0.03)
+    second = round((TIME[-1] + 1.0) / PERIOD)
+    np.testing.assert_allclose(recording.q[second : second + 250], Q[:250], atol=1e-6)
+    pause = recording.gap[len(TIME) : second - 1]
+    assert pause.all()
+    assert not recording.gap[: len(TIME) - 1].any()
+    lines = path.read_text().splitlines()
+    half = 1 + len(TIME)
+    path.write_text('\n'.join([*lines[:half], *lines[:half]]))  # with its header
+    assert 'read as 2 runs' in read_table(path, UR5E_TEXT).source
+
+
+def test_rows_that_are_hardly_out_of_order_are_sorted(tmp_path):
+    order = np.arange(len(TIME))
+    order[[50, 51]] = order[[51, 50]]
+    names = ['t', *numbered('q'), *numbered('tau')]
+    is_read(written(tmp_path / 'a.csv', names, [v[order] for v in (TIME, Q, TAU)]))
+
+
+def test_time_that_starts_again_all_the_time_is_refused(tmp_path):
+    time = PERIOD * (np.arange(2500) % 20)
+    values = np.zeros((2500, 6))
+    path = tmp_path / 'a.npz'
+    np.savez(path, t=time, q=values, tau=values)
+    assert 'falls back 124 times' in refused(path)
+
+
+def test_fifty_hertz_with_jitter_are_enough(tmp_path):
+    random = np.random.default_rng(0)
+    time = np.arange(300) * 0.0203 + random.uniform(0.0, 0.004, 300)
+    names = ['t', *numbered('q'), *numbered('tau')]
+    path = written(tmp_path / 'a.csv', names, (time, Q, TAU))
+    assert read_table(path, UR5E_TEXT).period == pytest.approx(0.0203, rel=0.02)
+    path = written(tmp_path / 'a.csv', names, (2.0 * time, Q, TAU))
+    assert 'at least one in 0.02 s' in refused(path)
+
+
+def test_wrapped_positions_are_unwrapped_and_said(tmp_path):
+    turning = 3.0 * TIME[:, None] + np.zeros(6)
+    wrapped = turning.copy()
+    wrapped[:, 5] = np.angle(np.exp(1j * turning[:, 5]))
+    names = ['t', *numbered('q'), *numbered('tau')]
+    recording = read_table(
+        written(tmp_path / 'a.csv', names, (TIME, wrapped, TAU)), UR5E_TEXT
+    )
+    np.testing.assert_allclose(recording.q[:280], turning[:280], atol=1e-6)
+    assert 'positions of wrist_3_joint are wrapped' in recording.source
+
+
+# Files that take the machine.
+
+
+@pytest.mark.parametrize('suffix', ['csv', 'npz', 'mat'])
+@pytest.mark.parametrize('kind', ['pipe', 'device', 'folder'])
+def test_what_is_no_file_is_refused_at_once(tmp_path, suffix, kind, capsys):
+    path = tmp_path / f'a.{suffix}'
+    if kind == 'pipe':
+        os.mkfifo(path)
+    elif kind == 'folder':
+        path.mkdir()
+    else:
+        path.symlink_to('/dev/zero')
+    (tmp_path / 'panda.urdf').write_text(PANDA_TEXT)
+    words = ['--urdf', str(tmp_path / 'panda.urdf'), '--foresee']
+    assert main(['identify', str(path), *words]) == 1
+    error = capsys.readouterr().err
+    assert 'is not a regular file' in error
+    assert error.count('\n') == 1
+    assert len(PANDA) == 7
+
+
+def test_arrays_that_unpack_to_gigabytes_are_refused(tmp_path):
+    """A third of a gigabyte of zeros, in a third of a megabyte."""
+    shape = (7_000_000, 6)
+    head = {'descr': '<f8', 'fortran_order': False, 'shape': shape}
+    with ZipFile(tmp_path / 'a.npz', 'w', ZIP_DEFLATED) as archive:
+        for name in ('q', 'tau'):
+            with archive.open(f'{name}.npy', 'w') as stream:
+                np.lib.format.write_array_header_1_0(stream, head)
+                for _ in range(shape[0] * shape[1] * 8 >> 20):
+                    stream.write(bytes(1 << 20))
+    zeros = np.zeros(shape, np.uint8)  # numbers in memory have eight bytes
+    savemat(tmp_path / 'a.mat', {'q': zeros, 'tau': zeros}, do_compression=True)
+    for name in ('a.npz', 'a.mat'):
+        assert (tmp_path / name).stat().st_size < 1 << 20
+        message = refused(tmp_path / name, 'time=1000Hz')
+        assert 'unpacks to 0.34 GB' in message
+        assert 'write it as several files' in message
+
+
+@pytest.mark.parametrize('suffix', ['npz', 'mat'])
+def test_damaged_arrays_are_refused_in_one_line(tmp_path, suffix):
+    """Any of 60 flipped or missing bytes: they are refused, or hit what is not read."""
+    path = tmp_path / f'a.{suffix}'
+    if suffix == 'npz':
+        np.savez_compressed(path, t=TIME, q=Q, tau=TAU)
+    else:
+        savemat(path, {'t': TIME, 'q': Q, 'tau': TAU}, do_compression=True)
+    whole = path.read_bytes()
+    random = np.random.default_rng(0)
+    messages = []
+    for k in range(60):
+        at = int(random.integers(len(whole)))
+        raw = bytearray(whole)
+        raw[at] ^= 1 << int(random.integers(8))
+        path.write_bytes(raw[:at] if k % 3 == 0 else raw)
+        try:
+            read_table(path, UR5E_TEXT)
+        except BlfDscError as error:
+            messages.append(str(error))
+    assert len(messages) > 30
+    assert '\n' not in ''.join(messages)
