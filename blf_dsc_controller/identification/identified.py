@@ -47,14 +47,19 @@ class Identified(NamedTuple):
     # (2, n) damping and friction of the corrected URDF, which has no more terms
     dynamics: Floats
     score: Score
+    alone: Floats  # (n,) rms errors on the same windows of fits to each joint alone
     distances: Floats  # (n,) at which contacts slide, rad or m; 0: at once
     widths: dict[str, float]  # times the prior's, by group
     still: tuple[str, ...]  # joints that did not move
     reversed: tuple[str, ...]  # joints whose efforts had the opposite sign
     lasting: Floats  # (n,) correlation length of the residual, s
     rest: float  # s in which no joint moves, which were left out
-    # share of the URDF's gravity in the torques; NaN if it would hardly show
+    clipped: Floats  # (n,) share of the windows in which its torque is clipped
+    # share of the URDF's gravity in that of the values; NaN if it would hardly show
     gravity: float
+    inertia: float  # share of its other inertial torque, likewise
+    # (3,) gravity that explains the torques far better than the given one, m/s^2
+    other_gravity: Floats | None
     picked_up: float | None  # s, when the load was picked up
 
     @property

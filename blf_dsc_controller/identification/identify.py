@@ -19,14 +19,16 @@ from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.identification.foresight import Foresight, foresee
 from blf_dsc_controller.identification.friction_doubt import friction_doubt
 from blf_dsc_controller.identification.identified import Identified
+from blf_dsc_controller.identification.joint_alone import errors_alone, fit_alone
 from blf_dsc_controller.identification.on_disk import mapped
+from blf_dsc_controller.identification.plausibility import shares
 from blf_dsc_controller.identification.problem import Effort, problem_of
 from blf_dsc_controller.identification.reading import read_recording
 from blf_dsc_controller.identification.recording import Recording, joined
 from blf_dsc_controller.identification.regression import fitted
 from blf_dsc_controller.identification.scoring import nearest_friction, scored
 from blf_dsc_controller.identification.selection import select
-from blf_dsc_controller.identification.windows import HOP, STILL
+from blf_dsc_controller.identification.windows import COLUMNS, HOP, STILL
 from blf_dsc_controller.run import Floats
 
 STAGES = ('reading', 'checking efforts', 'selecting terms', 'fitting', 'intervals')
@@ -155,8 +157,10 @@ def identify_arm(
     begin(STAGES[3])
     trained = fitted(rows, windows.fit, problem.G, selected.prior, selected.found)
     score = scored(rows, windows, problem.G, problem.prior.mean, trained.values)
+    alone = fit_alone(rows, windows.fit, problem.G, problem.prior, COLUMNS)
     final = fitted(rows, windows.moving, problem.G, selected.prior, selected.found)
     dynamics = nearest_friction(rows, windows, final.values)
+    size = shares(rows, windows.moving, problem.P, (problem.G @ final.values)[: rows.p])
     begin(STAGES[4])
     return Identified(
         source=recording.source,
@@ -170,13 +174,17 @@ def identify_arm(
         + friction_doubt(problem, selected.prior, selected.found),
         dynamics=dynamics,
         score=score,
+        alone=errors_alone(rows, windows.test, alone),
         distances=selected.distances,
         widths=selected.widths,
         still=_named(recording.joints, rows.speed < STILL),
         reversed=_named(recording.joints, problem.reversed),
         lasting=final.lasting,
         rest=(rows.time.size - windows.moving.size) * HOP,
-        gravity=problem.gravity,
+        clipped=rows.clipped[windows.moving].mean(axis=0),
+        gravity=size.gravity,
+        inertia=size.inertia,
+        other_gravity=problem.other_gravity,
         picked_up=problem.picked_up,
     )
 

@@ -1,107 +1,62 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Whether efforts are what they are said to be: their gravity, and their signs.
+"""Whether the identified arm is of the size of the URDF's: its gravity, and its inertia.
 
-The torque of each joint is explained by three shares, of the URDF's gravity, of its
-other inertial torque, and of friction.  A share of gravity near 1 is right; near 0 it
-is missing; near -1 the sign of the effort is reversed.
+Each is the torque of the identified bodies over that of the URDF's, projected onto the
+latter.  Friction has no part in it, nor has the mean of gravity, which an offset can
+replace.  Efforts in other units than N m give shares of that factor; without gravity,
+its share is near 0.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from blf_dsc_controller.identification.regression import triangle
-from blf_dsc_controller.identification.values import LOAD
-from blf_dsc_controller.identification.windows import COLUMNS, Indices, Rows
+from blf_dsc_controller.identification.windows import Indices, Rows
 from blf_dsc_controller.run import Floats
 
-LEAST_GRAVITY = 0.4
-"""Share of the URDF's gravity below which it is missing."""
+GRAVITY = (0.4, 1.6)
+"""Least and largest share of the URDF's gravity: beyond, it is missing or double."""
 
-MOST_GRAVITY = 1.6
-"""Share of the URDF's gravity above which it is double."""
+INERTIA = (0.2, 5.0)
+"""Likewise of its inertia, which is asked where gravity is faint: rotors are guesses."""
 
-_FRICTION = ('viscous', 'Coulomb', 'offset')
-_FAINT = 0.1  # of the torque, least gravity that can be checked
-_TINY = 1e-6  # N m or N
-_DRIVEN = 0.3  # of the torque, least work of friction that shows a sign
+_FAINT = 0.02  # of the torque of the URDF, least part that says anything
 
 
-def gravity_share(rows: Rows, fit: Indices, P: Floats) -> float:
-    """Return the share of the gravity of P in all efforts; NaN where there is hardly any.
+class Shares(NamedTuple):
+    """Shares of the URDF's torques; NaN where that of the URDF would be faint."""
 
-    A load that the columns of the rows contain is found beside it.
-    """
-    size = _sizes(rows, fit)
-    weight = rows.weight[fit] / size
-    gravity, inertial = _shares_of(rows, fit, P)
-    if np.sqrt(np.mean((gravity.std(axis=0) / size) ** 2)) < _FAINT:
-        return float('nan')
-    u = rows.u(0.0)[fit]
-    names = [COLUMNS.index(name) for name in _FRICTION]
-    used = [*(rows.p + np.arange(size.size) + k * size.size for k in names)]
-    used.append(np.arange(rows.unknowns - LOAD, rows.unknowns))
-
-    def weighted() -> Iterator[Floats]:
-        known = np.stack((gravity, inertial), axis=2)
-        for block in rows.blocks(fit):
-            X = rows.matrix(fit[block])[:, :, np.concatenate(used)]
-            columns = np.concatenate((known[block], X, u[block, :, None]), axis=2)
-            yield (columns * weight[block, :, None]).reshape(-1, columns.shape[2])
-
-    R = triangle(weighted())
-    return float(_solved(R[:, :-1], R[:, -1])[0])
+    gravity: float
+    inertia: float
 
 
-def reversed_joints(rows: Rows, fit: Indices, P: Floats) -> NDArray[np.bool_]:
-    """Return which joints (n,) have efforts of the opposite sign.
-
-    Gravity shows it; where a joint carries hardly any, friction does, which cannot
-    drive.  What neither shows is taken to be as in all joints that carry some.
-    """
-    u = rows.u(0.0)[fit]
-    size = _sizes(rows, fit)
-    gravity, inertial = _shares_of(rows, fit, P)
-    carries = gravity.std(axis=0) > _FAINT * size
-    drags = np.zeros(size.size, dtype=bool)  # friction shows the sign
-    found = np.zeros(size.size, dtype=bool)
-    names = [COLUMNS.index(name) for name in _FRICTION]
-    for i in range(size.size):
-        friction = rows.friction[fit][:, names, i]
-        columns = np.column_stack((gravity[:, i], inertial[:, i], friction))
-        weight = rows.weight[fit, i]
-        share = _solved(columns * weight[:, None], u[:, i] * weight)
-        if carries[i]:
-            found[i] = share[0] < -LEAST_GRAVITY
-        else:
-            sliding = friction[:, :2] @ share[2:4]
-            drags[i] = _rms(sliding) > _DRIVEN * size[i]
-            found[i] = drags[i] and np.mean(sliding * friction[:, 0]) < 0.0
-    if carries.any() and found[carries].all():
-        found |= ~(carries | drags)
-    return found
+def shares(rows: Rows, fit: Indices, urdf: Floats, found: Floats) -> Shares:
+    """Return the shares of base parameters (p,) in some windows."""
+    gravity, inertial = inertial_torques(rows, fit, urdf)
+    found_gravity, found_inertial = inertial_torques(rows, fit, found)
+    size = float(np.sqrt(np.mean((gravity + inertial) ** 2)))
+    return Shares(
+        _share(_varying(found_gravity), _varying(gravity), size),
+        _share(found_inertial, inertial, size),
+    )
 
 
-def _sizes(rows: Rows, fit: Indices) -> Floats:
-    """Return the root mean square torque of each joint (n,), or a little where it is zero."""
-    rms = np.sqrt(np.mean(rows.u(0.0)[fit] ** 2, axis=0))
-    return np.asarray(np.maximum(rms, _TINY))
-
-
-def _shares_of(rows: Rows, fit: Indices, P: Floats) -> tuple[Floats, Floats]:
-    """Return the torques of gravity and of all other inertial terms of P in the windows."""
-    gravity = rows.over_windows(lambda at: rows.gravity_torque(P, at), rows.g)[fit]
+def inertial_torques(rows: Rows, windows: Indices, P: Floats) -> tuple[Floats, Floats]:
+    """Return the torques (k, n) of gravity, and the other inertial ones, of P (p,)."""
+    gravity = rows.over_windows(lambda at: rows.gravity_torque(P, at), rows.g)[windows]
     theta = np.zeros(rows.unknowns)
     theta[: rows.p] = P
-    return gravity, rows.torques(fit, theta) - gravity
+    return gravity, rows.torques(windows, theta) - gravity
 
 
-def _solved(A: Floats, b: Floats) -> Floats:
-    return np.asarray(np.linalg.lstsq(A, b, rcond=None)[0])
+def _varying(torque: Floats) -> Floats:
+    return np.asarray(torque - torque.mean(axis=0))
 
 
-def _rms(values: Floats) -> float:
-    return float(np.sqrt(np.mean(values**2)))
+def _share(found: Floats, urdf: Floats, size: float) -> float:
+    """Return the projection onto the torque (k, n) of the URDF, NaN if that is faint."""
+    if np.sqrt(np.mean(urdf**2)) <= _FAINT * size:
+        return float('nan')
+    return float(np.sum(found * urdf) / np.sum(urdf**2))

@@ -76,7 +76,7 @@ def regression(
     counted = np.maximum(counted, 1.0)
     for _ in range(_PASSES):
         rows.set_load(theta[: rows.p])
-        weighted = _Weighted(rows, fit, float(theta[-1]))
+        weighted = Weighted(rows, fit, float(theta[-1]))
         of_joints = triangle(np.moveaxis(each, 1, 0) for each in weighted.blocks())
         scaled = of_joints / deviation[:, None, None]
         R = triangle([scaled.reshape(-1, theta.size + 1)])
@@ -112,7 +112,7 @@ def successive(
     rows: Rows, fit: Indices, G: Floats, prior: Prior, found: Regression, parts: int
 ) -> Iterator[Floats]:
     """Yield the products of `Regression.folds` for so many parts, as the rows are now."""
-    weighted = _Weighted(rows, fit, found.delay)
+    weighted = Weighted(rows, fit, found.delay)
     B = G @ prior.D
     to_z = np.zeros((B.shape[0] + 1, B.shape[1] + 1))
     to_z[:-1, :-1] = B
@@ -122,7 +122,7 @@ def successive(
         yield to_z.T @ (products / found.deviation[:, None, None] ** 2) @ to_z
 
 
-class _Weighted:
+class Weighted:
     """The rows [X | -du/dt | u] (k, n, m + 2), the last of torques without their delay.
 
     They are those of some windows (k,), times the weights, and computed block by block.

@@ -41,8 +41,8 @@ def scored(
         time=rows.time[moving],
         measured=measured,
         predicted=predicted,
-        errors=np.sqrt(np.mean(residual**2, axis=1)),
-        torque=np.sqrt(np.mean(measured[shown] ** 2, axis=0)),
+        errors=rows.rms(residual, windows.test),
+        torque=rows.rms(measured[shown], windows.test),
         held_back=(float(held_back[0]), float(held_back[-1])),
     )
 

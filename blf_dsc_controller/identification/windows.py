@@ -85,6 +85,7 @@ class Rows(NamedTuple):
     load: Floats  # (p, 10) columns of P that are those of a load, from `loaded` on
     loaded: float  # s
     weight: Floats  # (R, n) of each row, at most 1
+    clipped: NDArray[np.bool_]  # (R, n) whether a torque in the window is clipped
     speeds: Floats  # (R, n) mean speed in each window, rad/s or m/s
     speed: Floats  # (n,) 95th percentile of each joint's speed, rad/s or m/s
     q: OnDisk  # (N, n) smoothed positions at all samples
@@ -135,6 +136,13 @@ class Rows(NamedTuple):
         with_load = self.time[windows] >= self.loaded
         X[with_load, :, -LOAD:] = inertial[with_load] @ self.load
         return X
+
+    def rms(self, values: Floats, windows: Indices) -> Floats:
+        """Return the root mean square (..., n) of values (..., k, n) that are not clipped."""
+        kept = ~self.clipped[windows]
+        counted = np.maximum(kept.sum(axis=0), 1)
+        squares = np.sum(values**2 * kept, axis=-2)
+        return np.asarray(np.sqrt(squares / counted))
 
     def torques(self, windows: Indices, theta: Floats) -> Floats:
         """Return X theta (k, n) of some windows, which increase."""
@@ -273,6 +281,7 @@ def rows_of(recording: Recording, model: SerialChain) -> Rows:
         load=np.zeros((model.p, LOAD)),
         loaded=-np.inf,
         weight=np.empty(0),
+        clipped=np.zeros((starts.size, n), dtype=bool),
         speeds=np.empty(0),
         speed=_fast(dq, ~near_gap),
         q=q,

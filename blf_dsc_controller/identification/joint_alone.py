@@ -1,0 +1,159 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Each joint alone, by all columns of its own torque and hardly any prior.
+
+Such a fit knows nothing of masses, of the other joints or of physical bodies, and its
+residual does not depend on the sign of the torque.  It shows how well the motion can be
+explained at all, and which sign the friction has, which can only brake.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from typing import NamedTuple
+
+import numpy as np
+
+from blf_dsc_controller.identification.prior import Prior
+from blf_dsc_controller.identification.regression import (
+    Weighted,
+    correlation_length,
+    triangle,
+)
+from blf_dsc_controller.identification.windows import COLUMNS, Indices, Rows
+from blf_dsc_controller.run import Floats
+
+SIMPLE = ('viscous', 'Coulomb', 'offset')
+"""Columns of friction that every joint has."""
+
+_WEAK = 100.0  # times the deviations of the prior
+_DELAY = 0.05  # s, deviation of the delay
+_PASSES = 5  # of fit and residual
+_FLOOR = 1e-3  # of the torque, least residual
+_TINY = 1e-9  # N m or N
+_CLEAR = 0.05  # of the torque, least friction that shows a sign ...
+_CERTAIN = 5.0  # ... and standard deviations of its Coulomb part
+
+
+class Alone(NamedTuple):
+    """Fits of n joints, each to its own torque."""
+
+    triangles: Floats  # (n, m + 2, m + 2) R of the rows of each joint: see `Weighted`
+    values: Floats  # (n, m + 1) of the unknowns of `Rows`, and delay [s]
+    residual: Floats  # (n,) root mean square, N m or N
+    torque: Floats  # (n,) likewise
+    friction: Floats  # (n,) 1: clear friction brakes, -1: it drives, 0: it is not clear
+
+    @property
+    def delay(self) -> float:
+        """Delay of the torques: the median over the joints [s]."""
+        return float(np.median(self.values[:, -1]))
+
+
+def fit_alone(
+    rows: Rows,
+    fit: Indices,
+    G: Floats,
+    prior: Prior,
+    columns: Collection[str] = SIMPLE,
+) -> Alone:
+    """Return the fits to the torques in some windows, with these columns of friction."""
+    weighted = Weighted(rows, fit, 0.0)
+    triangles = triangle(np.moveaxis(each, 1, 0) for each in weighted.blocks())
+    scale = _WEAK * np.linalg.norm(G @ prior.D, axis=1)
+    scale[-1] = _DELAY
+    counted = np.sum(rows.weight[fit] ** 2, axis=0)
+    fits = []
+    for i, R in enumerate(triangles):
+        own = np.zeros_like(scale)
+        used = _unknowns_of(rows, i, columns)
+        own[used] = scale[used]
+        fits.append(_fitted(R, own, float(counted[i])))
+    values = np.array([each.values for each in fits])
+    of_residuals = np.column_stack((values, np.full(len(values), -1.0)))
+    residuals = np.concatenate(
+        [np.einsum('kia,ia->ki', each, of_residuals) for each in weighted.blocks()]
+    )
+    signs = [
+        _sign(each, _friction_of(rows, i), correlation_length(residuals[:, i]))
+        for i, each in enumerate(fits)
+    ]
+    return Alone(
+        triangles,
+        values,
+        np.array([each.residual for each in fits]),
+        np.array([each.torque for each in fits]),
+        np.array(signs),
+    )
+
+
+def errors_alone(rows: Rows, test: Indices, alone: Alone) -> Floats:
+    """Return the root mean square errors (n,) of the fits in other windows."""
+    u, rate = (each[test] for each in rows.u_and_rate(0.0))
+    predicted = np.zeros_like(u)
+    for block in rows.blocks(test):
+        X = rows.matrix(test[block])
+        predicted[block] = np.einsum('kia,ia->ki', X, alone.values[:, :-1])
+    left = predicted - u - rate * alone.values[:, -1]
+    return rows.rms(left, test)
+
+
+class _Fit(NamedTuple):
+    """The fit of one joint, by values that are scale times z."""
+
+    scale: Floats  # (m + 1,)
+    z: Floats  # (m + 1,)
+    R: Floats  # (m + 2, m + 1) of the columns of z
+    counted: float  # rows
+    residual: float
+    torque: float
+
+    @property
+    def values(self) -> Floats:
+        """Values (m + 1,)."""
+        return np.asarray(self.scale * self.z)
+
+
+def _unknowns_of(rows: Rows, joint: int, columns: Collection[str]) -> list[int]:
+    """Return the unknowns in the torque of a joint: inertias, friction, and the delay."""
+    n = rows.speed.size
+    friction = [rows.p + COLUMNS.index(name) * n + joint for name in columns]
+    return [*range(rows.p), *friction, rows.unknowns]
+
+
+def _friction_of(rows: Rows, joint: int) -> list[int]:
+    """Return the unknowns of viscous and of Coulomb friction of a joint."""
+    n = rows.speed.size
+    return [rows.p + COLUMNS.index(name) * n + joint for name in ('viscous', 'Coulomb')]
+
+
+def _fitted(triangle: Floats, scale: Floats, counted: float) -> _Fit:
+    """Return the fit from the triangle of a joint's rows, of which so many count."""
+    R = triangle[:, :-1] * scale
+    u = triangle[:, -1]
+    counted = max(counted - np.count_nonzero(scale), 1.0)
+    torque = float(np.sqrt(u @ u / counted))
+    least = _FLOOR * torque + _TINY
+    residual = least
+    z = np.zeros(scale.size)
+    for _ in range(_PASSES):
+        A = R / residual
+        z = np.linalg.solve(A.T @ A + np.eye(z.size), A.T @ u / residual)
+        left = u - R @ z
+        residual = max(float(np.sqrt(left @ left / counted)), least)
+    return _Fit(scale, z, R, counted, residual, torque)
+
+
+def _sign(fit: _Fit, friction: list[int], length: float) -> float:
+    """Return the sign of clear friction, with residuals of a correlation length."""
+    _, coulomb = friction
+    torque = fit.R[:, friction] @ fit.z[friction]
+    if np.linalg.norm(torque) < _CLEAR * fit.torque * np.sqrt(fit.counted):
+        return 0.0
+    work = float(fit.R[:, friction[0]] @ torque)
+    A = fit.R / fit.residual
+    one = np.eye(fit.z.size)
+    H = np.linalg.inv(A.T @ A + one)
+    variance = (H @ (one + length * A.T @ A) @ H)[coulomb, coulomb]
+    value = float(fit.z[coulomb])
+    is_certain = abs(value) > _CERTAIN * np.sqrt(variance)
+    return float(np.sign(value)) if is_certain and value * work > 0.0 else 0.0
