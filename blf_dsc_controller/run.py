@@ -67,6 +67,17 @@ class Contact(NamedTuple):
     text: str = ''  #: sentence with the numbers
 
 
+class Oscillation(NamedTuple):
+    """An oscillation of the arm, or a step of softening that it caused."""
+
+    stamp: int  #: ns, of the joint state that showed it
+    joint: str  #: that showed it most
+    frequency: float  #: Hz
+    torque: float  #: N m, amplitude
+    share: float  #: of the configured rates that the feedback has since then
+    text: str  #: sentence with the numbers
+
+
 ToolErrors = Callable[[Floats, Floats, Floats], Floats]
 """Returns errors and bounds at the tool (k, 4) for references, errors, bounds (k, n).
 
@@ -128,6 +139,7 @@ class Run:
     external: Series | None = None  #: N m, external torque and `topics.INTERVAL`
     stops: tuple[Stop, ...] = ()
     contacts: tuple[Contact, ...] | None = None  #: None if not detected
+    oscillations: tuple[Oscillation, ...] = ()
     arm: LearnedArm | None = None  #: from a URDF
     learns: bool = True  #: whether the law uses the prediction error
     effort: Floats | None = None  #: (N, n) N m, as measured
@@ -178,6 +190,11 @@ class Run:
     def timed_contacts(self) -> list[tuple[float, Contact]]:
         """Contacts with their times [s]."""
         return [(self._seconds(each.stamp), each) for each in self.contacts or ()]
+
+    @property
+    def timed_oscillations(self) -> list[tuple[float, Oscillation]]:
+        """Oscillations with their times [s]."""
+        return [(self._seconds(each.stamp), each) for each in self.oscillations]
 
     def _seconds(self, stamp: int) -> float:
         return (stamp - int(self.stamp[0])) * 1e-9

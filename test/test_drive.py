@@ -125,16 +125,16 @@ def test_hold_gravity_commands_only_what_was_learned_beyond_the_model_of_the_dri
     config = build(ControllerConfig, PANDA | HELD)
     settings = controller_of(config).settings
     last = LastState(7)
-    last.take(1, np.concatenate((POSITION, np.zeros(14))))
+    last.take(1, np.concatenate((POSITION, np.zeros(14))), np.zeros(7))
     estimate = settings.initial_estimate.copy()
     at_rest = safe_torque(config.safety, settings, last, estimate, np.zeros(7))
     np.testing.assert_allclose(at_rest, 0.0, atol=0.01)  # the estimate has four digits
-    last.dq[:] = 0.1
+    last.slow[:] = 0.1
     damped = safe_torque(config.safety, settings, last, estimate, np.zeros(7))
     np.testing.assert_allclose(
         damped, -0.1 * np.array(config.safety.damping), atol=0.01
     )
-    last.dq[:] = 0.0
+    last.slow[:] = 0.0
     mass = estimate_names(config).index('m*cx7')
     estimate[mass] += 0.3
     assert (

@@ -44,6 +44,13 @@ EXAMPLES = {
         'interval': 0.5,
         'text': 'something touches the arm',
     },
+    'oscillation': {
+        'joint': 'joint1',
+        'frequency': 31.0,
+        'torque': 14.0,
+        'share': 0.5,
+        'text': 'joint1 oscillates',
+    },
     'stop': {'reason': 'failed', 'text': ''},
     'silence': {'torques': 3},
     'deactivate': {},

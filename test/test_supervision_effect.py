@@ -243,7 +243,8 @@ def test_load_known_before_is_used_if_the_arm_speeds_up_in_the_stop():
     for _ in range(50):
         rig.step()
     last = LastState(2)
-    last.take(0, np.concatenate(seen[-1][1:]))
+    slow = guard._safe_torque.last.slow
+    last.take(0, np.concatenate(seen[-1][1:]), slow)
     goal = safe_torque(safety, settings, last, guard.samples.estimate, known)
     np.testing.assert_allclose(rig.commands[-1], goal, rtol=0.0, atol=1e-9)
     assert rig.supervisor.text.count('speeds up') == 1

@@ -10,7 +10,6 @@ from plain_law import dynamics
 
 from blf_dsc_controller.configuration.controller import ControllerConfig, Safety
 from blf_dsc_controller.configuration.schema import change
-from blf_dsc_controller.control.status_report import chatter_of
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.law.factory import controller_of, settings_of_config
 from blf_dsc_controller.reference.terms import unpack
@@ -25,6 +24,7 @@ from blf_dsc_controller.supervision.plan import LatePlanError
 from blf_dsc_controller.supervision.retuning import apply, apply_bumpless
 from blf_dsc_controller.supervision.safe_torque import SafeTorque, safe_torque
 from blf_dsc_controller.supervision.state_check import StateCheck
+from blf_dsc_controller.supervision.stop_cause import chatter_of
 from blf_dsc_controller.supervision.supervisor import Phase, Reason
 
 Q, DQ = np.array([0.3, -0.4]), np.array([0.5, -2.0])
@@ -55,7 +55,7 @@ def test_safe_torque_does_what_its_name_says_limited_and_finite(
     torque, dq, estimate, limit, expected
 ):
     last = LastState(2)
-    last.take(1, np.concatenate((Q, dq, np.zeros(2))))
+    last.take(1, np.concatenate((Q, np.zeros(4))), dq)
     safety = Safety(torque=torque, damping=(2.0, 1.0))
     limited = {'torque.limit': (limit, limit)}
     got = safe_torque(safety, settings(**limited), last, estimate, np.zeros(2))
@@ -67,7 +67,7 @@ def test_ramp_is_linear_and_ends_at_a_moving_goal():
     safety = Safety(torque='damping', damping=(1.0, 1.0))
 
     def advance(goal):
-        ramp.last.take(1, np.array([0.0, 0.0, -goal, 0.0, 0.0, 0.0]))
+        ramp.last.take(1, np.zeros(6), np.array([-goal, 0.0]))
         return ramp.advance(safety, settings(), P, 0.001)[0]
 
     ramp.commanded[0] = 4.0
@@ -176,7 +176,7 @@ def test_load_is_bounded_and_left_as_it_is_while_brakes_hold_the_arm():
     ramp.commanded[:] = ramp.last.q[:] = 0.0
     ramp.begin_ramp(0.0, np.array([15.0, -2.0]))
     measurement = np.concatenate((Q, np.zeros(4)))
-    ramp.last.take(1, measurement)
+    ramp.last.take(1, measurement, np.zeros(2))
     for k in range(2, 300):
         ramp.last.take_usable(k * MILLISECOND, measurement, 50.0, 1e-3)
         torque = ramp.advance(safety, settings(), 0.1 * P, 1e-3)
@@ -189,7 +189,7 @@ def test_load_is_bounded_and_left_as_it_is_while_brakes_hold_the_arm():
 def test_arm_yields_to_a_contact_only_until_the_next_ramp():
     """It gives way by the torque that holds gravity, whatever is configured."""
     ramp = SafeTorque(2)
-    ramp.last.take(1, np.concatenate((Q, np.zeros(4))))
+    ramp.last.take(1, np.concatenate((Q, np.zeros(4))), np.zeros(2))
 
     def torque():
         return ramp.advance(Safety(torque='zero'), settings(), P, 1e-3)
@@ -203,12 +203,12 @@ def test_arm_yields_to_a_contact_only_until_the_next_ramp():
 
 
 def test_single_jerk_changes_the_observed_load_by_what_a_torque_at_the_limit_would():
-    """Within 1 ms by 20 N m times L of 30 rad/s, however large the acceleration."""
+    """Within 1 ms by 20 N m through lags of 60 and 30 1/s, however large the acceleration."""
     ramp = SafeTorque(2)
-    ramp.last.take(1, np.concatenate((Q, np.zeros(4))))
+    ramp.last.take(1, np.concatenate((Q, np.zeros(4))), np.zeros(2))
     ramp.last.ddq = np.array([1e5, -1e5])
     ramp.observe(settings(), P, 1e-3)
-    np.testing.assert_allclose(np.abs(ramp.load), 0.6)
+    np.testing.assert_allclose(np.abs(ramp.load), 20.0 * 0.06 * 0.03)
 
 
 @pytest.mark.parametrize(('last', 'speeds_up'), [(0.8, False), (2.3, True)])
@@ -592,8 +592,8 @@ def test_arm_that_stands_still_under_noise_is_named_but_not_taken_for_braked():
     assert np.abs(steps).max() > 2.0  # a tenth of the limit
     measured = np.sqrt(rig.guard.controller.checks.chatter)
     assert measured == pytest.approx(np.sqrt((steps**2).mean(axis=0)), rel=0.2)
-    assert 'joint1 changes by' in chatter_of(rig.guard)
-    assert chatter_of(quiet.guard) == ''
+    assert 'joint1 changes by' in chatter_of(rig.guard.controller, JOINTS)
+    assert chatter_of(quiet.guard.controller, JOINTS) == ''
 
 
 def test_estimates_are_discarded_by_a_reset_at_once():

@@ -30,7 +30,7 @@ from blf_dsc_controller.messages.topics import DIAGNOSTICS
 from blf_dsc_controller.run import Floats, Run
 
 _DIGITS = 7
-_ALARMING = ('violation', 'stop', 'contact', 'ERROR', 'lost')
+_ALARMING = ('violation', 'stop', 'contact', 'oscillation', 'ERROR', 'lost')
 _MOST_OF_A_KIND = 50
 _LONGEST = 1000  # characters of a parameter that is shown in full
 _AT_LIMIT = 1.0 - 1e-9
@@ -104,6 +104,8 @@ def _events(run: Run) -> Iterator[TimedEvent]:
         yield (t, 'stop', f'{stop.reason}: {stop.text}')
     for t, contact in run.timed_contacts:
         yield (t, 'contact', contact.text)
+    for t, oscillation in run.timed_oscillations:
+        yield (t, 'oscillation', oscillation.text)
     for i, joint in enumerate(run.joints):
         violated = outside(run, i)
         if violated is not None:

@@ -46,6 +46,7 @@ SAMPLES = 3.0
 # sag over (standard deviation of gravity / m omega_b^2); measured: at most 1
 _SAG = 1.5
 _PHASE = 0.625  # rad, phase lost to the delay at omega_b
+_BRAKING = 0.375  # of the fastest omega_b, by the damping of a stop
 _BOUND = 0.002  # rad, at full stiffness
 # Of gains of joints: fraction of the rated torque that is expected beside gravity, and
 # rad, the widest bound by default
@@ -142,7 +143,6 @@ def _through_inertia(arm: Design, bound: np.ndarray | None) -> dict[str, Value]:
         'comparison.surface_gain': (rate / 3.0,) * n,
         'comparison.position_gain': _listed(m * (rate / 4.0) ** 2),
         'learning.adaptation_gain': (_ADAPTATION,) * arm.parameters.model.p,
-        'safety.damping': _listed(m * fastest / 4.0),
     }
 
 
@@ -169,7 +169,6 @@ def _of_joints(
         'comparison.position_gain': _listed(0.5 * gains.stiffness),
         'learning.adaptation_gain': (min(_ADAPTATION, float(f'{Gamma:.4g}')),)
         * arm.parameters.model.p,
-        'safety.damping': _listed(gains.damping),
     }
 
 
@@ -182,6 +181,7 @@ def _of_arm(arm: Design) -> dict[str, Value]:
     acceleration = np.array([joint.acceleration for joint in chain.joints])
     lower, upper = arm.limits
     P = arm.parameters.of(chain.inertias, arm.rotors)
+    fastest = _PHASE / loop_delay(arm.sample_time, arm.lag)
     floor = _UNMODELLED * arm.efforts
     zeros = (0.0,) * n
     return {
@@ -219,7 +219,11 @@ def _of_arm(arm: Design) -> dict[str, Value]:
         'truth.amplitude': zeros,
         'truth.frequency': (1.0,) * n,
         'truth.phase': zeros,
+        'safety.oscillation': 'soften',
         'safety.torque': 'hold_gravity',
+        'safety.damping': _listed(
+            _BRAKING * arm.over_postures().free_inertia * fastest
+        ),
         'safety.velocity_limit': 3.0 * float(velocity.max()),
     }
 

@@ -25,7 +25,11 @@ from blf_dsc_controller.configuration.schema import (
 REMOVED: dict[str, Value] = {}
 """Last default of each parameter of the first release that is gone now."""
 
-ADDED: dict[str, Value] = {'surface.known_rate': False, 'insist': CHECKED}
+ADDED: dict[str, Value] = {
+    'surface.known_rate': False,
+    'safety.oscillation': 'ignore',
+    'insist': CHECKED,
+}
 """Value of parameters that older bags do not have, where it is not the default."""
 
 

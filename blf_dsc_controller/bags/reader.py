@@ -17,7 +17,12 @@ from blf_dsc_controller.bags.topic_messages import JointStates, TopicMessages, V
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.messages import topics
 from blf_dsc_controller.messages.codecs import JOINT_STATE_FIELDS
-from blf_dsc_controller.messages.journal import Event, EventType, contact_in
+from blf_dsc_controller.messages.journal import (
+    Event,
+    EventType,
+    contact_in,
+    oscillation_in,
+)
 from blf_dsc_controller.reference.turns import turns_freely
 from blf_dsc_controller.run import (
     Contact,
@@ -95,6 +100,11 @@ def recorded_run(
         external=series(topics.EXTERNAL_TORQUE, 'effort'),
         stops=tuple(_stops(events, int(stamp[0]))),
         contacts=_contacts(content, events),
+        oscillations=tuple(
+            oscillation_in(event)
+            for event in events
+            if event.type is EventType.OSCILLATION
+        ),
         arm=_arm(content),
         tool=_tool(content),
         learns=_learns([event.content.get('parameters', {}) for event in events]),

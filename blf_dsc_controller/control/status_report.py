@@ -14,6 +14,7 @@ from blf_dsc_controller.law.external_torque import DISTANCE
 from blf_dsc_controller.law.telemetry import load_text
 from blf_dsc_controller.messages.topics import LOAD, PHASE, REASON, REJECTED, STOPS
 from blf_dsc_controller.supervision.guard import Guard
+from blf_dsc_controller.supervision.stop_cause import chatter_of
 from blf_dsc_controller.supervision.supervisor import Phase, Supervisor
 
 # Levels of diagnostic_msgs/msg/DiagnosticStatus.
@@ -32,9 +33,6 @@ _PHASES = {
     Phase.TRACKING: (OK, 'tracking'),
     Phase.SAFE_STOP: (ERROR, 'stopped'),
 }
-
-
-_CHATTER = 0.11  # of the torque limit; 20 bits leave a Panda 0.01, 16 bits 0.13
 
 
 class StatusReport:
@@ -103,6 +101,10 @@ class StatusReport:
             'watchdog on the steady clock': 'on' if guard.watchdog.on else off,
             'samples cut by the torque limit': _by_joint(guard, state.level_cuts),
             'samples cut by the torque rate limit': _by_joint(guard, state.rate_cuts),
+            'share of the rates of the feedback': f'{guard.calming.share:g}',
+            'last oscillation': guard.calming.last.text
+            if guard.calming.last
+            else 'none',
             **(self.trajectories.values if self.trajectories else {}),
         }
         level = WARN
@@ -114,11 +116,13 @@ class StatusReport:
             message = missing
         elif samples.outside:
             message = 'the error has left its bound'
+        elif guard.calming.is_due(guard.time):
+            message = guard.calming.text
         elif samples.saturated_time > 0.0:
             message = message.format('')
         elif guard.has_sample and guard.controller.sample.cuts.any():
             message = message.format(' rate')
-        elif chatter := chatter_of(guard):
+        elif chatter := chatter_of(guard.controller, guard.config.joints):
             message = chatter
             if not self._has_warned:
                 self._has_warned = True
@@ -189,17 +193,4 @@ def _by_joint(guard: Guard, counts: np.ndarray) -> str:
     pairs = zip(guard.config.joints, counts, strict=True)
     return (
         ', '.join(f'{joint} {count:.0f}' for joint, count in pairs if count) or 'none'
-    )
-
-
-def chatter_of(guard: Guard) -> str:
-    """Return the warning about a chattering torque; empty if there is none."""
-    steps = np.sqrt(guard.controller.checks.chatter)
-    worst = int(np.argmax(steps / guard.controller.settings.torque_limit))
-    if steps[worst] <= _CHATTER * guard.controller.settings.torque_limit[worst]:
-        return ''
-    return (
-        f'the torque of {guard.config.joints[worst]} changes by {steps[worst]:.2g} N m rms each '
-        'sample: its measured velocity is coarse or noisy. Lower the pole of the velocity filter '
-        'and add its lag to robot.lag, which makes the gains softer'
     )

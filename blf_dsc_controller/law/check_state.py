@@ -6,6 +6,7 @@ from __future__ import annotations
 from typing import Annotated, NamedTuple
 
 from blf_dsc_controller.compiled.layout import Array, Cell, size_of, view_of
+from blf_dsc_controller.law.oscillation import Oscillation
 
 SUSPECT = 1
 """A value that is not finite, a torque demand past its limit, or too large an error."""
@@ -22,6 +23,9 @@ INVALID = 4
 
 CONTRADICTION = 16
 """Velocities that are not those of the positions; the law did not use them. Goes with INVALID."""
+
+OSCILLATES = 32
+"""The arm oscillates: at the beginning, and again and again while it lasts."""
 
 
 class Checks(NamedTuple):
@@ -67,6 +71,7 @@ class Checks(NamedTuple):
     # (rad/s)^2, mean squares of their difference and of the larger of both
     mismatch: Annotated[Array, 'n']
     speed: Annotated[Array, 'n']
+    oscillation: Oscillation
 
 
 checks_of = view_of(Checks)

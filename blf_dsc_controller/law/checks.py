@@ -10,6 +10,7 @@ from math import isfinite
 
 from blf_dsc_controller.compiled.jit import inner
 from blf_dsc_controller.compiled.layout import Array
+from blf_dsc_controller.law import oscillation
 from blf_dsc_controller.law.check_state import OUTSIDE, SUSPECT, Checks
 from blf_dsc_controller.law.effect import average_steps, check_effect
 from blf_dsc_controller.law.state import Sample, Settings, Signals, State
@@ -58,6 +59,27 @@ def bridge_repeats(
 
 
 @inner
+def watch_oscillation(
+    settings: Settings, checks: Checks, state: State, signals: Signals, dt: float
+) -> bool:
+    """Return whether an oscillation of the arm is to be reported."""
+    now = checks.oscillation
+    if state.samples[0] == 0.0:
+        oscillation.begin(now, signals.xi1, signals.applied)
+        return False
+    oscillation.watch(
+        now,
+        settings.torque_limit,
+        signals.xi1,
+        signals.applied,
+        checks.noise,
+        checks.resolution,
+        dt,
+    )
+    return oscillation.is_due(now, settings.torque_limit, dt)
+
+
+@inner
 def check_error(settings: Settings, checks: Checks, xi1: Array, bound: Array) -> int:
     """Return the flags for the errors (n,) [rad]; update the largest ratio."""
     flags = 0
@@ -80,14 +102,16 @@ def keep_consistent(
     """Keep the estimates of the smallest error of late, from before an error grows.
 
     Commands that do not reach the arm make its error grow, and the disturbance estimate
-    with it.
+    with it.  What is learned while the arm may oscillate is as wrong.
     """
     ratio = 0.0
+    oscillates = False
     for i in range(settings.n):
         ratio = max(ratio, abs(sample.xi1[i]) / sample.bound[i])
+        oscillates = oscillates or checks.oscillation.waves[i] >= oscillation.SOME
     least = checks.least_ratio[0] * (1.0 + checks.sample_time[0] / _RELAXED)
     least = max(_SMALL, least)
-    if ratio > least and state.samples[0] > 1.0:
+    if (ratio > least or oscillates) and state.samples[0] > 1.0:
         checks.least_ratio[0] = least
         return
     checks.least_ratio[0] = ratio

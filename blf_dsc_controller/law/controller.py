@@ -21,11 +21,17 @@ from blf_dsc_controller.law import barrier, torque
 from blf_dsc_controller.law.check_state import (
     CONTRADICTION,
     INVALID,
+    OSCILLATES,
     Checks,
     checks_of,
     checks_size,
 )
-from blf_dsc_controller.law.checks import bridge_repeats, check_sample, is_valid_state
+from blf_dsc_controller.law.checks import (
+    bridge_repeats,
+    check_sample,
+    is_valid_state,
+    watch_oscillation,
+)
 from blf_dsc_controller.law.external_torque import sense
 from blf_dsc_controller.law.friction import first_coulomb
 from blf_dsc_controller.law.interface import Law
@@ -116,6 +122,7 @@ def step(
     barrier.update_bound(settings, signals, t)
     for i in range(n):
         signals.xi1[i] = signals.q[i] - signals.qr[i]
+    oscillates = compares and watch_oscillation(settings, checks, state, signals, dt)
     law.compute_demand(settings, state, signals, t, dt)
     saturated = torque.saturate(settings, state, signals, dt)
     law.finish(settings, state, signals, dt, saturated)
@@ -123,7 +130,8 @@ def step(
         state.torque[i] = signals.torque[i]
     state.samples[0] += 1.0
     fill_sample(settings, state, signals, sample)
-    return check_sample(settings, checks, state, signals, sample) if is_checked else 0
+    flags = check_sample(settings, checks, state, signals, sample) if is_checked else 0
+    return flags | OSCILLATES if oscillates else flags
 
 
 @kernel

@@ -8,7 +8,7 @@ difference.
 
 from __future__ import annotations
 
-from math import isfinite
+from math import isfinite, sqrt
 
 from blf_dsc_controller.compiled.jit import inner
 from blf_dsc_controller.law.check_state import NO_EFFECT, SUSPECT, Checks
@@ -17,6 +17,9 @@ from blf_dsc_controller.law.state import Sample, Settings, Signals, State
 
 # of the torque limit: a command that differs by more should have moved something
 _CHANGED = 0.1
+# of the rms step of the commands, in addition: so much of the chatter by coarse encoders
+# is left in their average
+_CHATTERED = 0.5
 _RECENT = 0.05  # s, past the chatter of encoders' steps in the velocities
 _BEFORE = 1.0  # s
 _CHATTERS = 0.5  # s
@@ -74,7 +77,9 @@ def check_effect(
                 sample.torque[i] - checks.before[i]
             )
         change = abs(checks.recent[i] - checks.before[i])
-        has_changed = change > _CHANGED * settings.torque_limit[i]
+        least = _CHANGED * settings.torque_limit[i]
+        least += _CHATTERED * sqrt(checks.chatter[i])
+        has_changed = change > least
         if has_changed and checks.at_rest[0] > _RECENT and not follows:
             flags |= NO_EFFECT | SUSPECT
     if moves and checks.lacking[0] == 0.0:

@@ -15,7 +15,8 @@ filter's input is the change of the position over it, or the mean of the velocit
 both ends.  Where readings are missing, these ends show little of what was between them:
 the filters skip such an interval.  A velocity is contradicted when the mean square of
 their difference exceeds half of the larger one's: one that is stuck at 0 gives 1, the
-wrong sign 4, a lag of 6 ms 0.5 at 20 Hz.
+wrong sign 4, a lag of 6 ms 0.5 at 20 Hz.  What a lag explains is none if the joint
+oscillates faster than that.
 """
 
 from __future__ import annotations
@@ -25,15 +26,18 @@ from math import sqrt
 from blf_dsc_controller.compiled.jit import inner
 from blf_dsc_controller.compiled.layout import Array
 from blf_dsc_controller.law.check_state import Checks
+from blf_dsc_controller.law.oscillation import is_fast
 
 _NOISE = 0.5  # s, over which the noise is averaged
 _SIGMAS = 3.0  # of a filtered value
 # of a reading: two readings differ by as much only once in a day, at 1 kHz
 _MOVED = 8.0
 _STEPS = 1.5  # a reading between two steps of the sensor flickers by one
-_FILTER = 0.03  # s, tau
+FILTER = 0.03
+"""Time constant tau [s] of the filtered velocities."""
 _POWER = 0.1  # s, over which the mean squares are
 _WRONG = 0.5  # of the larger mean square
+_LATE = 0.9  # of the larger mean square: a first-order lag has less than 1
 _SECOND = 2.0  # readings before that of a second difference
 _ROW = 0.01  # s: up to here, the ends of an interval show the velocity within it
 _GAP = 2.5  # samples: readings are missing in an interval that is also longer than this
@@ -75,7 +79,7 @@ def compare_velocities(checks: Checks, dt: float, measurement: Array, n: int) ->
     measure_noise(checks, dt, measurement, n)
     begins = checks.readings[0] == 0.0
     checks.readings[0] += 1.0
-    share = min(1.0, dt / _FILTER)
+    share = min(1.0, dt / FILTER)
     slow = min(1.0, dt / _POWER)
     is_gap = dt > max(_ROW, _GAP * checks.sample_time[0])
     is_wrong = False
@@ -96,8 +100,18 @@ def compare_velocities(checks: Checks, dt: float, measurement: Array, n: int) ->
         larger = max(abs(checks.derived[i]), abs(checks.measured[i]))
         checks.speed[i] += slow * (larger * larger - checks.speed[i])
         least = max(_WRONG * checks.speed[i], unseen(checks, i, share, n))
-        is_wrong = is_wrong or checks.mismatch[i] > least
+        is_lag = is_fast(checks.oscillation, i) and is_late(checks, i)
+        is_wrong = is_wrong or (checks.mismatch[i] > least and not is_lag)
     return is_wrong
+
+
+@inner
+def is_late(checks: Checks, i: int) -> bool:
+    """Whether a lag of the velocity of joint i would explain how it contradicts the positions.
+
+    One that is stuck has a mean square difference of 1, one of the wrong sign 4.
+    """
+    return bool(checks.mismatch[i] < _LATE * checks.speed[i])
 
 
 @inner
@@ -105,4 +119,4 @@ def unseen(checks: Checks, i: int, share: float, n: int) -> float:
     """Return the mean square [(rad/s)^2] of the difference that noise and steps explain."""
     position = _SIGMAS * _SIGMAS * checks.noise[i] + checks.resolution[i] ** 2
     velocity = _SIGMAS * _SIGMAS * checks.noise[n + i] * 0.5 * share
-    return float(_SLOW * _SLOW + position / (_FILTER * _FILTER) + velocity)
+    return float(_SLOW * _SLOW + position / (FILTER * FILTER) + velocity)

@@ -151,6 +151,15 @@ SCHEMA: Mapping[str, Mapping[str, Field]] = {
         'interval': Field(NUMBER),  # N m, up to which model and noise explain it
         'text': Field(TEXT),
     },
+    'oscillation': {
+        'joint': Field(TEXT),  # that shows it most
+        'frequency': Field(NUMBER),  # Hz
+        'torque': Field(NUMBER),  # N m, amplitude
+        'share': Field(
+            NUMBER
+        ),  # of its configured rates that the feedback has from now on
+        'text': Field(TEXT),
+    },
     'stop': {'reason': Field(TEXT), 'text': Field(TEXT)},
     'silence': {'torques': Field(COUNT)},  # by the watchdog, before the next message
     'deactivate': {},

@@ -22,7 +22,7 @@ from blf_dsc_controller.messages.event_content import (
     check_event,
 )
 from blf_dsc_controller.messages.topics import CHANGES, JOURNAL
-from blf_dsc_controller.run import Contact
+from blf_dsc_controller.run import Contact, Oscillation
 
 OUTSIDE_BOUND = 'error past the bound'
 """Reason for a stop: the error left its bound."""
@@ -43,6 +43,7 @@ class EventType(str, Enum):
     PARAMETERS = 'parameters'
     DRIVE_LOAD = 'drive load'  # the drives add the weight of a load from now on
     CONTACT = 'contact'  # something touches the arm
+    OSCILLATION = 'oscillation'  # the arm oscillates
     STOP = 'stop'
     SILENCE = 'silence'  # of the joint states, in which the watchdog commanded
     DEACTIVATE = 'deactivate'
@@ -113,6 +114,13 @@ def contact_in(event: Event) -> Contact:
         content['interval'],
         content['text'],
     )
+
+
+def oscillation_in(event: Event) -> Oscillation:
+    """Return the oscillation of such an event."""
+    content = event.content
+    values = (content[name] for name in Oscillation._fields[1:])
+    return Oscillation(event.stamp, *values)
 
 
 class Change(NamedTuple):

@@ -62,7 +62,7 @@ class ControllerNode(LoopNode[ControllerConfig]):
         joints = self.config.joints
         self._columns = b''  # those that are estimated, and whether they were checked
         self._model_changes = 0.0
-        self._contacts = 0
+        self._contacts = self._oscillations = 0
         self._decoder = JointStateDecoder(joints, required=('position',))
         self._encoder = Float64MultiArrayEncoder(len(joints))
         self._pending: bytes | None = None
@@ -93,7 +93,7 @@ class ControllerNode(LoopNode[ControllerConfig]):
         """Compile the law; create the topics of the loop on the first call."""
         self._loop = GuardedLoop(self.config, self._steady, self._wall)
         self.guard = self._loop.guard
-        self._contacts = 0
+        self._contacts = self._oscillations = 0
         self.guard.journal.pending[-1].content['topics'] = {
             topic.leaf: self.resolve_topic_name(topic.relative)
             for topic in (topics.JOINT_STATES, topics.COMMANDS)
@@ -468,6 +468,9 @@ class ControllerNode(LoopNode[ControllerConfig]):
         if guard.contact is not None and guard.contacts != self._contacts:
             self._contacts = guard.contacts
             self.get_logger().warning(guard.contact.text)
+        if guard.calming.count != self._oscillations:
+            self._oscillations = guard.calming.count
+            self.get_logger().warning(guard.calming.text)
         is_stopped = supervisor.phase is Phase.SAFE_STOP  # its text may grow
         text = supervisor.text if is_stopped else ''
         now = supervisor.phase, supervisor.stops, guard.silenced, text

@@ -458,9 +458,8 @@ def _check(events: Sequence[Event]) -> None:
 def _is_own(event: Event) -> bool:
     """Whether the controller decides on an event itself, because of a message."""
     is_stop = event.type is EventType.STOP
-    return event.type in (EventType.START, EventType.CONTACT) or (
-        is_stop and _reason(event) not in _EXTERNAL
-    )
+    own = EventType.START, EventType.CONTACT, EventType.OSCILLATION
+    return event.type in own or (is_stop and _reason(event) not in _EXTERNAL)
 
 
 def _reason(event: Event | None) -> Reason:

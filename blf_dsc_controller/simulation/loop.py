@@ -41,6 +41,7 @@ from blf_dsc_controller.messages.journal import (
     EventType,
     Journal,
     contact_in,
+    oscillation_in,
 )
 from blf_dsc_controller.run import Run, Series, Stop
 from blf_dsc_controller.simulation.compiled_loop import CompiledLoop, Rows, Span
@@ -245,6 +246,11 @@ class Record:
             run,
             truth=Series(true, self.stamps, self.truths[:, : len(true)]),
             contacts=contacts if config.contact.enabled else None,
+            oscillations=tuple(
+                oscillation_in(event)._replace(stamp=event.stamp - START)
+                for event in self.journal.pending
+                if event.type is EventType.OSCILLATION
+            ),
             stops=tuple(
                 Stop(
                     event.stamp - START,

@@ -20,9 +20,10 @@ from blf_dsc_controller.configuration import law_file
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.schema import differences, flatten
 from blf_dsc_controller.errors import BlfDscError, StartError
-from blf_dsc_controller.law.check_state import CONTRADICTION, INVALID
+from blf_dsc_controller.law.check_state import CONTRADICTION, INVALID, OSCILLATES
 from blf_dsc_controller.law.checks import is_valid_state
 from blf_dsc_controller.law.factory import controller_of
+from blf_dsc_controller.law.sensor import is_late
 from blf_dsc_controller.messages import codecs
 from blf_dsc_controller.messages.journal import (
     EventType,
@@ -44,6 +45,7 @@ from blf_dsc_controller.reference.trajectory import Trajectory
 from blf_dsc_controller.reference.turns import reference_near
 from blf_dsc_controller.run import Contact
 from blf_dsc_controller.supervision import retuning
+from blf_dsc_controller.supervision.calming import Calming
 from blf_dsc_controller.supervision.contact import contact_of
 from blf_dsc_controller.supervision.drive_load import DriveLoad, DriveLoads
 from blf_dsc_controller.supervision.first_torque import check_first_torque
@@ -68,12 +70,18 @@ _MANY = 0.5  # states missed for each that came
 _LONG_GAP = 2.5  # samples
 _IN_A_ROW = 0.1  # s between two states, at most
 _AT_REST = 0.01  # rad/s
+_SLOWEST = 0.03  # rad/s: a velocity that contradicts positions has more
 
 # Commands that do not reach the arm may be why, or velocities that are not its own:
 # both wind up the estimates.
 _PERHAPS_UNREACHED = (Reason.OUTSIDE_BOUND, Reason.SATURATED)
 # A contact does so, too.
-_WINDING_UP = (*_PERHAPS_UNREACHED, Reason.VELOCITY, Reason.CONTACT)
+_WINDING_UP = (
+    *_PERHAPS_UNREACHED,
+    Reason.VELOCITY,
+    Reason.CONTACT,
+    Reason.OSCILLATION,
+)
 
 _REASONS: dict[type[codecs.MessageError], Reason] = {
     codecs.MissingJointError: Reason.JOINT_MISSING,
@@ -100,6 +108,7 @@ class Guard:
         waiting_for: what is wrong with the last state that the law could not start from; or empty.
         contact: what touched the arm last; None: nothing so far.
         contacts: contacts so far.
+        calming: what oscillates, and how much softer the feedback is since.
         holds: whether the reference rests since then, until the next trajectory.
         silenced: whether nothing is commanded until the next reset or activation.
         foreign: messages ignored because they name none of the joints.
@@ -123,7 +132,8 @@ class Guard:
         self.controller = controller_of(config)
         self.supervisor = Supervisor()
         self.states = StateCheck(config.joints, config.sample_time)
-        self.samples = SampleCheck(config, self.controller)
+        self.calming = Calming(config, self.controller)
+        self.samples = SampleCheck(config, self.controller, self.calming)
         self.watchdog = Watchdog(steady, wall)
         self.journal = Journal()
         self.has_sample = False
@@ -231,6 +241,11 @@ class Guard:
         if not 0.0 <= self._gap < _IN_A_ROW:
             self.controller.checks.readings[0] = 0.0
 
+    def _with_cause(self, fault: Fault) -> Fault:
+        """Return the fault of an arm that is too fast, and why if it oscillates."""
+        cause = self.calming.cause if fault.reason is Reason.VELOCITY else ''
+        return fault._replace(text='; '.join(filter(None, (cause, fault.text))))
+
     def _clock_step(self, measurement: Vector) -> Fault | None:
         """Return the fault of a clock that was set while the arm moved."""
         last = self._safe_torque.last
@@ -249,7 +264,7 @@ class Guard:
             if not is_valid_state(law.settings, law.checks, measurement):
                 self._wait(self.states.invalid(self.config.safety, measurement).text)
                 return self._safe_at(stamp, measurement)
-            last.take(stamp, measurement)
+            last.take(stamp, measurement, self._slow)
             if not self._start(stamp, measurement):
                 return self._safe(self.config.sample_time)
         dt = (stamp - self.last_stamp) * _NANO
@@ -260,11 +275,12 @@ class Guard:
             self._distrust_velocities(stamp, measurement)
             return self._safe_at(stamp, measurement)
         if law.flags & INVALID:
-            self._stop(*self.states.invalid(self.config.safety, measurement))
+            invalid = self.states.invalid(self.config.safety, measurement)
+            self._stop(*self._with_cause(invalid))
             return self._safe_at(stamp, measurement)
-        last.take(stamp, measurement)
+        last.take(stamp, measurement, self._slow)
         self._advance_to(stamp)
-        fault = self.samples.check(dt)
+        fault = self.samples.check(dt) or self._calm()
         if fault is not None:
             self._stop(*fault)
             return self._safe(self.config.sample_time)
@@ -272,6 +288,22 @@ class Guard:
         self.has_sample = True
         self.journal.commands += 1
         return torque
+
+    def _calm(self) -> Fault | None:
+        """Soften the feedback of an arm that oscillates; a fault if that has not helped."""
+        if not self.controller.flags & OSCILLATES:
+            return None
+        calming, before = self.calming, self.calming.count
+        if not calming.react(self.time):
+            return Fault(Reason.OSCILLATION, calming.cause)
+        if calming.last is not None and calming.count > before:
+            self._note(
+                EventType.OSCILLATION,
+                **calming.last._asdict(),
+                share=calming.share,
+                text=calming.text,
+            )
+        return None
 
     def load_to_tell(self) -> DriveLoad | None:
         """Return the load to declare to the drives next, None if there is none."""
@@ -347,6 +379,10 @@ class Guard:
         """Stop, and difference all velocities from the positions from this state on."""
         checks = self.controller.checks
         fault = self.states.contradicted(checks.derived, checks.measured)
+        worst = int(np.argmax(checks.mismatch / (checks.speed + _SLOWEST**2)))
+        cause = self.calming.cause if self.supervisor.running else ''
+        if cause and is_late(checks, worst):
+            fault = Fault(Reason.OSCILLATION, cause)
         if self.supervisor.uses_states:
             self._stop(*fault)
         else:
@@ -465,7 +501,7 @@ class Guard:
         self.journal.commands += count
         self.has_sample = True
         self._wraps.follow(measurement)
-        self._safe_torque.last.take(stamp, measurement)
+        self._safe_torque.last.take(stamp, measurement, self._slow)
         self._safe_torque.commanded[:] = self.controller.state.torque
         self.states.advance(stamp)
         self.samples.relax((stamp - self.last_stamp) * _NANO)
@@ -523,6 +559,12 @@ class Guard:
         """Largest speed of a joint [rad/s], as the positions show it."""
         return float(np.abs(self.controller.checks.derived).max())
 
+    @property
+    def _slow(self) -> Vector:
+        """Velocities (n,) [rad/s] to be damped in a stop, as the positions show them."""
+        limit = self.config.safety.velocity_limit
+        return np.asarray(np.clip(self.controller.checks.derived, -limit, limit))
+
     def _time_of(self, stamp: int) -> float:
         return (stamp - self.start_stamp) * _NANO
 
@@ -537,11 +579,15 @@ class Guard:
             if was_running and reason in _WINDING_UP:
                 self.samples.return_to_consistent()
             reached = reason not in (*_PERHAPS_UNREACHED, Reason.NO_EFFECT)
+            oscillates = was_running and bool(self.calming.cause)
             self._stop_speed.begin(self._speed)
             self.journal.note(EventType.STOP, reason=reason, text=text)
             self._clean = self._resumable = False
             self._safe_torque.begin_ramp(
-                self.config.safety.stop_ramp, self.samples.disturbance, reached=reached
+                self.config.safety.stop_ramp,
+                self.samples.disturbance,
+                reached=reached or oscillates,
+                oscillates=oscillates,
             )
 
     def _safe_without_state(self, dt: float) -> Vector | None:
@@ -677,6 +723,7 @@ class Guard:
         if self._drive_loads is not None:
             self._drive_loads.take(self.controller, self._drive_loads.told)
         self.config = config
+        self.calming.configure(config)
         self.samples.set_limits(config.safety)
 
     def problems(self, config: ControllerConfig) -> list[str]:
@@ -715,6 +762,7 @@ class Guard:
 
     def _start_over(self) -> None:
         self.supervisor.enter(Phase.STARTING)
+        self.calming.restart()
         self.states.restart()
         self.samples.restart()
         self.start_error = None

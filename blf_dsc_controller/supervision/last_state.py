@@ -1,5 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The last usable joint state, from which the safe torque is computed."""
+"""The last usable joint state, from which the safe torque is computed.
+
+The safe torque damps the velocity that the positions show, behind a low pass:
+
+    v' = (dq/dt - v) / 0.03 s
+
+Whatever springs a joint has, its damping then fades above the frequencies of the motion
+to be braked, and cannot keep up an oscillation of the arm.  It is that of
+`sensor.compare_velocities`, so that it is known from the first sample of a stop on.
+"""
 
 from __future__ import annotations
 
@@ -7,6 +16,8 @@ from math import inf
 
 import numpy as np
 from numpy.typing import NDArray
+
+from blf_dsc_controller.law.sensor import FILTER as SLOW
 
 Vector = NDArray[np.float64]
 
@@ -17,6 +28,7 @@ class LastState:
     Attributes:
         measurement: [q, dq, applied torque] (3 n,) [rad, rad/s, N m].
         q, dq: views of it; a velocity that is currently unknown is zero.
+        slow: v (n,) [rad/s], the velocity to damp.
         ddq: acceleration since the state before (n,) [rad/s^2], None if it is unknown.
         age: time without a usable state [s]; infinite before the first.
     """
@@ -25,13 +37,15 @@ class LastState:
         self.measurement = np.zeros(3 * n)
         self.q = self.measurement[:n]
         self.dq = self.measurement[n : 2 * n]
+        self.slow = np.zeros(n)
         self.ddq: Vector | None = None
         self.age = inf
         self._stamp = -1
 
-    def take(self, stamp: int, measurement: Vector) -> None:
-        """Store a valid state with its stamp [ns]."""
+    def take(self, stamp: int, measurement: Vector, slow: Vector) -> None:
+        """Store a valid state with its stamp [ns] and v (n,) [rad/s]."""
         self.measurement[:] = measurement
+        self.slow[:] = slow
         self.ddq = None
         self.age = 0.0
         self._stamp = stamp
@@ -56,6 +70,7 @@ class LastState:
             differenced = np.clip(
                 (q - self.q) / elapsed, -velocity_limit, velocity_limit
             )
+            self.slow += min(1.0, elapsed / SLOW) * (differenced - self.slow)
         usable = np.where(np.abs(dq) <= velocity_limit, dq, differenced)
         self.ddq = (usable - self.dq) / elapsed if is_next else None
         self.q[:] = q
@@ -65,6 +80,6 @@ class LastState:
 
     def miss(self, period: float) -> None:
         """Account for `period` [s] without a usable state."""
-        self.dq[:] = 0.0
+        self.dq[:] = self.slow[:] = 0.0
         self.ddq = None
         self.age += period

@@ -19,8 +19,15 @@ from blf_dsc_controller.supervision.model_torque import friction_torque, model_t
 Vector = NDArray[np.float64]
 
 _AT_REST = 0.01  # rad/s
-_OBSERVER = 30.0  # rad/s, L: slow against the lag of velocities and torques
+_OBSERVER = (
+    60.0,
+    30.0,
+)  # rad/s, L1 and L2: slow against the lag of velocities and torques
+_CALM_OBSERVER = 10.0, 10.0  # rad/s: slow against the oscillation of elastic joints
 _LARGEST_LOAD = 0.5  # of the torque limit
+_LIGHTEST = (
+    0.5  # of the damping: an elastic joint that oscillates passes for a light one
+)
 
 
 def safe_torque(
@@ -33,16 +40,16 @@ def safe_torque(
 ) -> Vector:
     """Return the safe torque (n,) [N m], within the torque limit and always finite.
 
-    It is zero, damping -D dq, or damping plus gravity H(q, 0, 0, 0) P^ and `load` (n,)
+    It is zero, damping -D v, or damping plus gravity H(q, 0, 0, 0) P^ and `load` (n,)
     [N m] as far as the drive does not add them, and fades to zero while no usable state
-    arrives. D is the configured damping times `scale` (n,).
+    arrives. D is the configured damping times `scale` (n,), v the velocity `last.slow`.
     """
     torque = np.zeros(settings.n)
     if last.age >= safety.fade_time:
         return torque
     with np.errstate(over='ignore', invalid='ignore'):  # checked below
         if safety.torque != 'zero':
-            torque -= scale * np.array(safety.damping) * last.dq
+            torque -= scale * np.array(safety.damping) * last.slow
         if safety.torque == 'hold_gravity':
             torque += model_torque(settings, estimate, last.q) + load
             torque -= added_torque(settings, last.q)
@@ -60,8 +67,13 @@ class SafeTorque:
     What holds the arm besides the model's gravity is observed from its motion, in the
     stop, too:
 
-        load' = L (tau - H(q, dq, dq, ddq) P^ - friction - load),   |load| <= half the torque limit
+        residual' = L1 (tau - H(q, dq, dq, ddq) P^ - friction - residual)
+        load' = L2 (residual - load),   |load| <= half the torque limit
 
+    The acceleration of an elastic joint is not that of a rigid one: above the first
+    resonance, what it says about the load is as wrong as it is large.  One pole of 30 1/s
+    lets an oscillation go on at up to 20 rad/s; two of 10 do not feed one that stops the
+    arm, and let a load sink further.
     Estimated friction is not part of it, since it helps to brake.  So an arm comes to
     rest with a payload, or with a model, that the law had not learned yet.  Commands
     that do not reach the arm would make that sum up for ever: after a stop that this
@@ -75,7 +87,8 @@ class SafeTorque:
         missed_change: change (n,) [N m] of the commands since the stop to which the arm has not
             answered, for the torque that showed it; else None.
         longest_step: time [s] for which one torque may change at the rate limit.
-        scale: factor (n,) on the damping: measured inertia of the joints over the assumed.
+        scale: factor (n,) on the damping: measured inertia of the joints over the assumed; at
+            least a half of it is used.
     """
 
     def __init__(self, n: int) -> None:
@@ -87,6 +100,8 @@ class SafeTorque:
         self.last = LastState(n)
         self._start = np.zeros(n)
         self._duration = self._elapsed = 0.0
+        self._residual = np.zeros(n)
+        self._rates = _OBSERVER
         self._known_load = np.zeros(n)
         self._effect = CommandEffect(n)
         self._reached = True
@@ -94,17 +109,24 @@ class SafeTorque:
         self._yields = False
 
     def begin_ramp(
-        self, duration: float, load: Vector, *, reached: bool = True
+        self,
+        duration: float,
+        load: Vector,
+        *,
+        reached: bool = True,
+        oscillates: bool = False,
     ) -> None:
         """Start a linear ramp of `duration` [s] at the last torque, with this `load`.
 
         If commands may not have `reached` the arm, the load is observed once they have
-        an effect.
+        an effect; that of an arm that `oscillates` more slowly.
         """
         self.load[:] = load
+        self._residual[:] = load
         self._known_load[:] = load
         self._effect.restart()
         self._reached = reached
+        self._rates = _CALM_OBSERVER if oscillates else _OBSERVER
         self._observes = True
         self._yields = False
         self._start[:] = self.commanded
@@ -119,6 +141,10 @@ class SafeTorque:
     def start_observing(self) -> None:
         """Observe the load from now on: it is known that commands reach the arm."""
         self._reached = True
+
+    def forget_load(self) -> None:
+        """Observe the load from zero on."""
+        self.load[:] = self._residual[:] = 0.0
 
     def stop_observing(self) -> None:
         """Return to the load that was known at the stop, until the next ramp."""
@@ -144,7 +170,7 @@ class SafeTorque:
         nothing.
         """
         self._duration = 0.0
-        self.last.dq[:] = 0.0
+        self.last.dq[:] = self.last.slow[:] = 0.0
         return self.advance(safety, settings, estimate, 0.0)
 
     def advance(
@@ -160,7 +186,8 @@ class SafeTorque:
             needed = self._needed(settings, estimate)
             if needed is not None:
                 self._observe_if_proven(settings, estimate, needed, dt)
-        goal = safe_torque(safety, settings, self.last, estimate, self.load, self.scale)
+        scale = np.maximum(self.scale, _LIGHTEST)
+        goal = safe_torque(safety, settings, self.last, estimate, self.load, scale)
         self._elapsed += dt
         if self._elapsed < self._duration:
             goal = self._start + self._elapsed / self._duration * (goal - self._start)
@@ -206,6 +233,8 @@ class SafeTorque:
 
     def _update_load(self, settings: Settings, needed: Vector, dt: float) -> None:
         limit = settings.torque_limit
-        residual = np.clip(self.commanded - needed - self.load, -limit, limit)
-        self.load += min(1.0, _OBSERVER * dt) * residual
+        first, second = (min(1.0, rate * dt) for rate in self._rates)
+        lacking = np.clip(self.commanded - needed - self._residual, -limit, limit)
+        self._residual += first * lacking
+        self.load += second * (self._residual - self.load)
         np.clip(self.load, -_LARGEST_LOAD * limit, _LARGEST_LOAD * limit, out=self.load)

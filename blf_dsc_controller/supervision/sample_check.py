@@ -12,6 +12,8 @@ from blf_dsc_controller.configuration.controller import ControllerConfig, Safety
 from blf_dsc_controller.configuration.tool_bound import tool_of
 from blf_dsc_controller.law.check_state import NO_EFFECT, OUTSIDE, SUSPECT
 from blf_dsc_controller.law.controller import Controller
+from blf_dsc_controller.supervision.calming import Calming
+from blf_dsc_controller.supervision.stop_cause import StopCause
 from blf_dsc_controller.supervision.supervisor import Fault, Reason
 from blf_dsc_controller.tool.errors import in_words
 
@@ -34,7 +36,9 @@ class SampleCheck:
         saturated: samples with a torque at its limit since the start.
     """
 
-    def __init__(self, config: ControllerConfig, controller: Controller) -> None:
+    def __init__(
+        self, config: ControllerConfig, controller: Controller, calming: Calming
+    ) -> None:
         """Enable the checks of the controller."""
         controller.checks.sample_time[0] = config.sample_time
         controller.checks.compares[0] = float(
@@ -43,6 +47,7 @@ class SampleCheck:
         self._joints = config.joints
         self._tool = tool_of(config)
         self._controller = controller
+        self._cause = StopCause(config.joints, controller, calming)
         self.ratio = controller.checks.ratio
         self._kept = controller.checks.kept
         self._saturation = 0  # ns, times _RELIEF
@@ -151,6 +156,10 @@ class SampleCheck:
         checks = self._controller.checks
         limit = self._controller.settings.torque_limit
         self._kept[:] = checks.moved
+        if shaking := self._cause.shaking:
+            return Fault(Reason.OSCILLATION, shaking)
+        if saturation := self._cause.saturation(self.saturated_time):
+            return Fault(Reason.SATURATED, f'{saturation}; no joint moves any more')
         if checks.lacking[0] > 0.0:
             lack = checks.lack - checks.lack_in_motion
             return self._lacking(int(np.argmax(np.abs(lack) / limit)), lack)
@@ -175,7 +184,7 @@ class SampleCheck:
         """Return the fault if efforts show that commands do not reach a moving arm."""
         settings = self._controller.settings
         checks = self._controller.checks
-        if checks.compares[0] == 0.0:
+        if checks.compares[0] == 0.0 or self._cause.oscillation:
             return None
         lack = checks.lack - checks.usual
         now = self._controller.sample.torque - checks.used[2 * settings.n :]
@@ -209,7 +218,15 @@ class SampleCheck:
         )
         if (at_tool := self.tool_errors) is not None:
             text += f'; {in_words(at_tool)}'
-        return Fault(Reason.OUTSIDE_BOUND, text + self._lightness(worst))
+        given = self._with_cause(text)
+        if given == text:
+            given += self._lightness(worst)
+        return Fault(Reason.OUTSIDE_BOUND, given)
+
+    def _with_cause(self, text: str) -> str:
+        """Return a text after what the arm suffers from, if it is known."""
+        cause = self._cause.text(self.saturated_time)
+        return '; '.join(filter(None, (cause, text)))
 
     def _lightness(self, joint: int) -> str:
         """Return a text if the inertia of a joint's drive is far below the assumed."""
@@ -237,14 +254,17 @@ class SampleCheck:
         needed = np.maximum(
             np.abs(signals.demand), np.abs(signals.demand - signals.added)
         )
+        worst = int(np.argmax(needed - limit))
+        self._cause.take_limited(worst)
         self.saturated += 1
         self._saturation += _RELIEF * round(dt * 1e9)
         if self.saturated_time <= self._safety.saturation_time:
             return None
-        worst = int(np.argmax(needed - limit))
         text = (
             f'joint {self._joints[worst]!r} needs {needed[worst]:.4g} N m and has been at '
             f'its limit of {limit[worst]:g} N m for {self.saturated_time:.4g} s (less a quarter '
             'of the time below it)'
         )
-        return Fault(Reason.SATURATED, text)
+        return Fault(
+            Reason.SATURATED, '; '.join(filter(None, (self._cause.shaking, text)))
+        )

@@ -45,6 +45,7 @@ class Reason(str, Enum):
     SATURATED = 'torque saturated'
     OVERRUN = 'loop overrun'
     CONTACT = 'contact'
+    OSCILLATION = 'oscillation'
     ESTIMATE = 'estimate not finite'
     TORQUE = 'torque not finite'
     FAILED = 'failed'

@@ -73,7 +73,7 @@ class TorqueWatchdog:
     def configure(self, config: ControllerConfig) -> None:
         """Use another configuration of the same joints, from the next torque on."""
         if config.robot != self.config.robot:
-            self._safe.load[:] = 0.0  # what was missing was missing from another model
+            self._safe.forget_load()  # what was missing was missing from another model
             self._wraps = Wraps(config)
         self.config = config
         self._settings = settings_of_config(config)

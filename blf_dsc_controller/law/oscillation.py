@@ -1,0 +1,209 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Whether a joint oscillates: half waves of its error that are regular and do not die out.
+
+The band begins at 8 Hz, where a motion ends, and ends at a third of the sample rate.
+In it, the error e and the applied torque tau of each joint are
+
+    p = (s/(s + w))^2 e,      u = s/(s + w) tau,      w = 2 pi 8 Hz
+
+A half wave of p ends where p has turned back by a quarter of it.  It counts if it is
+longer than what noise and steps of the sensor explain, if the amplitude sqrt(2 mean u^2)
+of the torque is a twentieth of its limit, if it takes about as long as those before it,
+and if it is not shorter than four half waves earlier.  Six in a row are an oscillation,
+or four of which the last two grow:
+
+- Noise, also that of coarse encoders, is irregular, or its half waves are too short.
+- A push, a load that is picked up, a reversal of friction, or a step of the reference
+  excites what dies out, in any loop that is not about to oscillate.
+- Torque ripple has about a hundredth of the limit.
+- A reference of fast tones is followed: the error does not show it.
+
+It is taken from the positions: a velocity of the wrong sign changes nothing.
+"""
+
+from __future__ import annotations
+
+from math import exp, inf, pi, sqrt
+from typing import Annotated, NamedTuple
+
+from blf_dsc_controller.compiled.jit import inner
+from blf_dsc_controller.compiled.layout import Array, Cell
+
+WAVES = 6
+"""Half waves in a row that are an oscillation."""
+
+FEW = 3
+"""Half waves in a row that tell why an arm stops: an oscillation may grow fast."""
+
+VIOLENT = 0.5
+"""Part of the torque limit, as amplitude of its torque, from which nothing may wait."""
+
+PATIENCE = 0.25
+"""Time [s] from one report to the next, in which an oscillation can die out."""
+
+_LOWEST = 8.0  # Hz
+_LONGEST = 0.5 / _LOWEST  # s, half period
+_FAST = 20.0  # Hz, from which a velocity may lag far behind its positions
+SOME = 2.0
+"""Half waves in a row from which on what a joint shows may be an oscillation."""
+
+_STRONG = 0.05  # of the torque limit, amplitude of its torque
+_TURNED = 0.25  # of a half wave, by which p turns back at its end
+# a half wave that is longer is one of the arm: standard deviations of the sensor's
+# noise, which the loop makes larger, and steps of the sensor
+_CLEAR = 10.0
+_STEPS = 2.0
+_REGULAR = 1.6  # ratio of two half periods
+_LASTING = 0.85  # of the half wave four earlier
+_EARLIER = 4
+_GROWS = 1.25  # times the half wave two earlier, of the same sign
+_GROWN = 2.0  # half waves in a row
+_AVERAGED = 4.0  # half periods
+
+
+class Oscillation(NamedTuple):
+    """What is kept of each joint from sample to sample."""
+
+    slow: Annotated[Array, 2, 'n']  # rad, lags of e
+    torque: Annotated[Array, 'n']  # N m, lag of tau
+    square: Annotated[Array, 'n']  # (N m)^2 s, int u^2 since the last half wave ended
+    span: Annotated[Array, 'n']  # s, since then
+    amplitude: Annotated[Array, 'n']  # N m, of u in the last half wave
+    # of p in the present half wave: 1, -1; 0: none yet
+    direction: Annotated[Array, 'n']
+    turn: Annotated[Array, 'n']  # rad, p at its beginning
+    farthest: Annotated[Array, 'n']  # rad, p farthest from there so far
+    since: Annotated[Array, 'n']  # s, since the beginning
+    farthest_at: Annotated[Array, 'n']  # s, of `farthest`, likewise
+    travel: Annotated[Array, 4, 'n']  # rad, of the last half waves
+    half: Annotated[Array, 'n']  # s, mean half period
+    waves: Annotated[Array, 'n']  # half waves in a row that count
+    grown: Annotated[Array, 'n']  # of them, the last ones that grow
+    calm: Annotated[Array, 'n']  # s, since there were FEW or more
+    wait: Cell  # s, until an oscillation may be reported
+
+
+@inner
+def watch(
+    now: Oscillation,
+    limit: Array,
+    error: Array,
+    torque: Array,
+    noise: Array,
+    resolution: Array,
+    dt: float,
+) -> None:
+    """Take the errors (n,) [rad] and the torques (n,) [N m] of the last interval `dt` [s].
+
+    `limit` (n,) [N m] are those of the torques; `noise` [rad^2] is the mean square of
+    the sensor's noise, `resolution` [rad] its step.
+    """
+    share = 1.0 - exp(-2.0 * pi * _LOWEST * dt)
+    for i in range(limit.size):
+        first = error[i] - now.slow[0, i]
+        now.slow[0, i] += share * first
+        p = first - now.slow[1, i]
+        now.slow[1, i] += share * p
+        u = torque[i] - now.torque[i]
+        now.torque[i] += share * u
+        now.square[i] += dt * u * u
+        now.span[i] += dt
+        now.since[i] += dt
+        now.calm[i] += dt
+        if now.since[i] > 1.5 * _LONGEST:  # with the quarter to turn back
+            forget(now, i, p)
+        ahead = now.direction[i] * (p - now.farthest[i])
+        if ahead >= 0.0:
+            now.farthest[i] = p
+            now.farthest_at[i] = now.since[i]
+            if now.direction[i] == 0.0:
+                now.direction[i] = 1.0
+            continue
+        least = max(_CLEAR * sqrt(noise[i]), _STEPS * resolution[i])
+        travel = abs(now.farthest[i] - now.turn[i])
+        if -ahead > max(least, _TURNED * travel):
+            end_half_wave(now, i, travel, travel > least, _STRONG * limit[i])
+            now.farthest[i] = p
+            now.farthest_at[i] = now.since[i]
+
+
+@inner
+def begin(now: Oscillation, error: Array, torque: Array) -> None:
+    """Begin with an error (n,) [rad] and a torque (n,) [N m], at rest."""
+    now.wait[0] = 0.0
+    for i in range(error.size):
+        now.slow[0, i] = error[i]
+        now.slow[1, i] = now.direction[i] = 0.0
+        now.torque[i] = torque[i]
+        now.calm[i] = inf
+        forget(now, i, 0.0)
+
+
+@inner
+def oscillates(now: Oscillation, i: int) -> bool:
+    """Whether joint i oscillates."""
+    return bool(now.waves[i] >= WAVES or now.grown[i] >= _GROWN)
+
+
+@inner
+def is_due(now: Oscillation, limit: Array, dt: float) -> bool:
+    """Whether to report an oscillation, `dt` [s] after the last call.
+
+    `limit` (n,) [N m] are those of the torques.
+    """
+    now.wait[0] = max(0.0, now.wait[0] - dt)
+    is_one = is_violent = False
+    for i in range(limit.size):
+        if oscillates(now, i):
+            is_one = True
+            is_violent = is_violent or now.amplitude[i] > VIOLENT * limit[i]
+    if not is_one or (now.wait[0] > 0.0 and not is_violent):
+        return False
+    now.wait[0] = PATIENCE
+    return True
+
+
+@inner
+def forget(now: Oscillation, i: int, p: float) -> None:
+    """Wait for the next half wave of joint i, from p [rad] on."""
+    now.waves[i] = now.grown[i] = now.amplitude[i] = 0.0
+    now.square[i] = now.span[i] = now.since[i] = now.farthest_at[i] = 0.0
+    now.turn[i] = now.farthest[i] = p
+
+
+@inner
+def end_half_wave(
+    now: Oscillation, i: int, travel: float, is_clear: bool, strong: float
+) -> None:
+    """Count the half wave of joint i that has ended, over `travel` [rad], if it counts.
+
+    `strong` [N m] is the least amplitude of its torque.
+    """
+    half = now.farthest_at[i]
+    now.amplitude[i] = sqrt(2.0 * now.square[i] / now.span[i])
+    now.square[i] = now.span[i] = 0.0
+    k = int(now.waves[i])
+    counts = is_clear and half < _LONGEST and now.amplitude[i] > strong
+    ratio = half / now.half[i] if k > 0 else 1.0
+    is_regular = 1.0 / _REGULAR < ratio < _REGULAR
+    lasts = k < _EARLIER or travel > _LASTING * now.travel[k % _EARLIER, i]
+    if not (counts and is_regular and lasts):
+        k = 0
+    grows = k > 1 and travel > _GROWS * now.travel[(k - 2) % _EARLIER, i]
+    now.grown[i] = now.grown[i] + 1.0 if grows else 0.0
+    now.travel[k % _EARLIER, i] = travel
+    now.half[i] = (
+        half if k == 0 else now.half[i] + (half - now.half[i]) / min(k + 1.0, _AVERAGED)
+    )
+    now.waves[i] = k + 1.0 if counts else 0.0
+    if now.waves[i] >= FEW:
+        now.calm[i] = 0.0
+    now.direction[i] = -now.direction[i]
+    now.turn[i] = now.farthest[i]
+    now.since[i] -= half
+
+
+@inner
+def is_fast(now: Oscillation, i: int) -> bool:
+    """Whether joint i seems to oscillate so fast that a filtered velocity lags far behind."""
+    return bool(now.waves[i] >= SOME and now.half[i] < 0.5 / _FAST)

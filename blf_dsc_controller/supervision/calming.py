@@ -1,0 +1,166 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What is said and done about an arm that oscillates: softer feedback, then a stop.
+
+The rates of the feedback are halved, which is what half of `feedback.stiffness` would
+be, and once more if the arm still oscillates a while later.  If that does not help
+either, or if the torques of the oscillation reach half of their limits, the arm stops.
+The gains stay soft until the next reset, activation or change of parameters: an arm
+that has oscillated with them would do so again.
+"""
+
+from __future__ import annotations
+
+from math import inf
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from blf_dsc_controller.configuration.controller import ControllerConfig
+from blf_dsc_controller.law.controller import Controller
+from blf_dsc_controller.law.oscillation import PATIENCE, VIOLENT, oscillates
+from blf_dsc_controller.law.state import Settings, settings_of
+
+_HALF = 0.5
+_SOFTEST = 0.25  # of the rates
+_RATES = ('Kp', 'd2', 'mu_bar', 'K', 'mu', 'damping_rate')
+_STIFFNESSES = ('weight', 'slope_limit', 'gamma')  # squares of rates
+_LATELY = 0.1  # s
+
+
+class Shaking(NamedTuple):
+    """The oscillation of the joint that shows it most."""
+
+    joint: str
+    frequency: float  # Hz
+    torque: float  # N m, amplitude
+
+    @property
+    def text(self) -> str:
+        """A sentence with the numbers, without its end."""
+        return (
+            f'joint {self.joint!r} oscillates at {self.frequency:.2g} Hz with '
+            f'+-{self.torque:.2g} N m'
+        )
+
+
+def softened(settings: Settings, share: float) -> Settings:
+    """Return settings with a share of the rates of the feedback; exact for powers of two."""
+    rates = {name: share * getattr(settings, name) for name in _RATES}
+    stiffnesses = {name: share**2 * getattr(settings, name) for name in _STIFFNESSES}
+    return settings._replace(**rates, **stiffnesses)
+
+
+class Calming:
+    """Finds the oscillation of a law's arm, and softens its feedback.
+
+    Attributes:
+        share: of the configured rates that the feedback has.
+        last: the last oscillation; None: none so far.
+        count: oscillations so far, and steps of softening.
+    """
+
+    def __init__(self, config: ControllerConfig, controller: Controller) -> None:
+        self._controller = controller
+        self._state = controller.checks.oscillation
+        self.last: Shaking | None = None
+        self.count = 0
+        self.configure(config)
+
+    def configure(self, config: ControllerConfig) -> None:
+        """Take note that the law has the gains of a configuration."""
+        self._config = config
+        self.share = 1.0
+        self._reported = -inf  # s
+
+    def react(self, t: float) -> bool:
+        """React to an oscillation that the law reports at t [s]; return False to stop.
+
+        `last` and `count` change if there is anything to tell.
+        """
+        reaction = self._config.safety.oscillation
+        joints = range(self._state.waves.size)
+        shakes = np.array([oscillates(self._state, i) for i in joints])
+        found = self._find(shakes)
+        if found is None or reaction == 'ignore':
+            return True
+        goes_on = t - self._reported < 2.0 * PATIENCE
+        self._reported = t
+        gives_up = self.share <= _SOFTEST or self._is_violent(shakes)
+        if reaction == 'stop' or (reaction == 'soften' and gives_up):
+            return False
+        if reaction == 'warn' and goes_on:
+            return True
+        if reaction == 'soften':
+            self._scale(_HALF)
+        self.last = found
+        self.count += 1
+        return True
+
+    def _find(self, shakes: NDArray[np.bool_]) -> Shaking | None:
+        """Return the oscillation of the worst of the joints that do (n,); None: none does."""
+        now = self._state
+        limit = self._controller.settings.torque_limit
+        torque = now.amplitude
+        if not shakes.any() or not np.isfinite(torque).all():
+            return None
+        worst = int(np.argmax(np.where(shakes, torque / limit, -1.0)))
+        frequency = 0.5 / float(now.half[worst])
+        joint = self._config.joints[worst]
+        return Shaking(joint, frequency, float(torque[worst]))
+
+    def _is_violent(self, shakes: NDArray[np.bool_]) -> bool:
+        """Whether one of the joints that oscillate (n,) does so with large torques."""
+        limit = self._controller.settings.torque_limit
+        return bool((self._state.amplitude > VIOLENT * limit)[shakes].any())
+
+    def is_due(self, t: float) -> bool:
+        """Whether the arm oscillates at t [s], or has softer feedback since it did."""
+        return self.share < 1.0 or t - self._reported < 2.0 * PATIENCE
+
+    @property
+    def text(self) -> str:
+        """The last oscillation, and what has been done about it; empty without one."""
+        if self.last is None:
+            return ''
+        if self.share == 1.0:
+            return self.last.text
+        return f'{self.last.text}: its feedback is softened, to {self.share:g} of its rates'
+
+    @property
+    def cause(self) -> str:
+        """What an arm that stops now was doing, and the remedy; empty if not oscillating."""
+        state = self._state
+        found = self._find((state.calm < _LATELY) & (state.half > 0.0))
+        if found is None:
+            return ''
+        return f'{found.text}: {self._remedy}'
+
+    @property
+    def _remedy(self) -> str:
+        config = self._config
+        softened_to = '' if self.share == 1.0 else f', even at {self.share:g} of them'
+        too_stiff = f'the gains are too high for this arm or its base{softened_to}'
+        if config.model != 'urdf':
+            return f'{too_stiff}; lower surface.mu, surface.gain and feedback.gain'
+        stiffness = _HALF * self.share * config.feedback.stiffness
+        return (
+            f'{too_stiff}; give a feedback.stiffness of {stiffness:.2g}, and lower gains of '
+            'feedback, surface and barrier that are given'
+        )
+
+    def restart(self) -> None:
+        """Return to the configured gains, and begin again at t = 0."""
+        self._reported = -inf
+        if self.share < 1.0:
+            self._scale(1.0 / self.share)
+
+    def _scale(self, factor: float) -> None:
+        controller = self._controller
+        # those in `controller.settings` that are no arrays are those of the start
+        settings = settings_of(controller.settings_vector, controller.settings.model)
+        if settings.has_barrier == 1:  # so that beta2 - alpha2 does not jump
+            signals = controller.signals
+            controller.state.alpha2[:] += (1.0 - factor) * (signals.dqr - signals.beta2)
+        controller.retune(controller.law, softened(settings, factor))
+        self.share *= factor

@@ -1,0 +1,96 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What an arm that leaves its bound, or seems unmoved by its commands, suffers from.
+
+An oscillation, a torque that only repeats the noise of a sensor, or a torque at its
+limit: whichever it is, its remedy is another than that of the check which stops the arm.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from blf_dsc_controller.law.controller import Controller
+from blf_dsc_controller.law.torque import RATE_CUT
+from blf_dsc_controller.supervision.calming import Calming
+
+_CHATTER = 0.11  # of the torque limit; 20 bits leave a Panda 0.01, 16 bits 0.13
+# of the sensor's noise: a step that is larger makes it, a sum of others hides one
+_STEPPED = 1.5
+_SATURATED = 0.05  # s: brakes that close in motion leave the bound sooner
+
+
+def chatter_of(controller: Controller, joints: Sequence[str]) -> str:
+    """Return what to do about a torque that changes in each sample; empty if it does not."""
+    checks = controller.checks
+    limit = controller.settings.torque_limit
+    steps = np.sqrt(checks.chatter)
+    worst = int(np.argmax(steps / limit))
+    if not steps[worst] > _CHATTER * limit[worst]:
+        return ''
+    step = float(checks.resolution[worst])
+    is_stepped = step > _STEPPED * float(np.sqrt(checks.noise[worst]))
+    why = (
+        f'its positions come in steps of {1e3 * step:.2g} mrad, and its velocity with them'
+        if is_stepped
+        else 'its measured velocity is noisy, or the gains are too high for its drive'
+    )
+    return (
+        f'the torque of {joints[worst]} changes by {steps[worst]:.2g} N m rms each '
+        f'sample: {why}. Lower the pole of the velocity filter '
+        'and add its lag to robot.lag, which makes the gains softer'
+    )
+
+
+class StopCause:
+    """Knows why the arm may be about to stop."""
+
+    def __init__(
+        self, joints: Sequence[str], controller: Controller, calming: Calming
+    ) -> None:
+        self._joints = joints
+        self._controller = controller
+        self._calming = calming
+        self._limited = 0  # number of the joint that was last at its limit
+
+    def take_limited(self, joint: int) -> None:
+        """Take note of the joint that needs more than its torque limit."""
+        self._limited = joint
+
+    @property
+    def oscillation(self) -> str:
+        """What oscillates, and the remedy; empty if nothing does."""
+        return self._calming.cause
+
+    @property
+    def shaking(self) -> str:
+        """What oscillates or chatters, and the remedy; empty if nothing does."""
+        return self.oscillation or chatter_of(self._controller, self._joints)
+
+    def text(self, saturated_time: float) -> str:
+        """Return the cause, and the remedy; empty if it is unknown.
+
+        A torque has been at its limit for `saturated_time` [s].
+        """
+        return self.shaking or self.saturation(saturated_time)
+
+    def saturation(self, time: float) -> str:
+        """Return which joint has lacked torque for long, `time` [s]; empty if none has."""
+        if time < _SATURATED:
+            return ''
+        settings = self._controller.settings
+        i = self._limited
+        demands = (
+            f'joint {self._joints[i]!r} has demanded more than its torque limit of '
+            f'{settings.torque_limit[i]:g} N m for {time:.2g} s'
+        )
+        if self._controller.signals.cuts[i] >= RATE_CUT:
+            return (
+                f'{demands}, and torque.rate_limit delays what it gets: raise it to what the drive '
+                'bears, or lower the gains'
+            )
+        return (
+            f'{demands}: follow a slower reference, carry less, or give the true limit as '
+            'torque.limit'
+        )
