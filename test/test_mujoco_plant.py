@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import os
+import re
 import sys
 
 import numpy as np
@@ -176,15 +177,13 @@ def test_what_mujoco_has_not_is_an_error_with_a_remedy(monkeypatch):
     config = build(PlantConfig, {'physics': 'mujoco', 'duration': 1.0})
     with pytest.raises(BlfDscError, match='a compiled loop: use own here'):
         simulate(build(ControllerConfig, {}), config, supervised=False)
-    floating = mounted().replace(
-        'type="fixed"><parent link="mount"', 'type="odd"><parent link="mount"'
-    )
-    odd = PANDA | {
-        'robot.urdf': floating,
-        'robot.base': 'panda_link0',
-        'physics': 'mujoco',
-    }
-    with pytest.raises(BlfDscError, match=r'MuJoCo cannot read the arm: .*joint type'):
+    text = (share_folder() / 'config/panda.urdf').read_text()
+    # no rigid body has one principal moment above the sum of the others
+    before, link, rest = text.partition('<link name="panda_link2"')
+    moments = '<inertia ixx="1" ixy="0" ixz="0" iyy="0.1" iyz="0" izz="0.1" />'
+    rest = re.sub('<inertia [^>]*>', moments, rest, count=1)
+    odd = PANDA | {'robot.urdf': before + link + rest, 'physics': 'mujoco'}
+    with pytest.raises(BlfDscError, match=r'MuJoCo cannot read the arm: .*A \+ B >= C'):
         plant_of(build(PlantConfig, odd))
     monkeypatch.setitem(sys.modules, 'mujoco', None)
     with pytest.raises(MissingExtraError, match=r'physics: mujoco needs .*\[mujoco\]'):
