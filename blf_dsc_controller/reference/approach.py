@@ -384,8 +384,9 @@ def _braked(
                 f'joint {joint!r} moves at {speed:.4g} rad/s, and its limit is {limit:g} rad/s: '
                 'wait until it is slower, or relax limits.velocity'
             )
+    if np.abs(dq).max() <= AT_REST:  # what it may still have is noise
+        _check_limits(config, q)
+        return BlendedReference(pack(q.size, [hold(q)]), t)
     duration = braking_time(dq, config)
     _check_limits(config, q + 0.5 * duration * dq)
-    is_moving = np.abs(dq).max() > AT_REST
-    settled = t + duration if is_moving else t
-    return BlendedReference(pack(q.size, [stop(t, q, dq, config)]), settled)
+    return BlendedReference(pack(q.size, [stop(t, q, dq, config)]), t + duration)
