@@ -38,7 +38,10 @@ from blf_dsc_controller.supervision import config_warnings, retuning
 from sim_plant.plant import Latency, parameter_names_of, plant_of, urdf_of
 
 ZERO = (0.0, 0.0)
-VELOCITY = (0.005, -0.01)  # rad/s, of an arm at rest: faster, its start would be a blend
+VELOCITY = (
+    0.005,
+    -0.01,
+)  # rad/s, of an arm at rest: faster, its start would be a blend
 NEXT = tuple(q + 1e-3 * dq for q, dq in zip(START, VELOCITY, strict=True))
 
 

@@ -11,9 +11,13 @@ import pytest
 
 from blf_dsc_controller.bags.reader import read_run
 from blf_dsc_controller.configuration.nodes import CONTROLLER, PLANT, load_loop
+from blf_dsc_controller.law.factory import controller_of
+from blf_dsc_controller.law.torque import RATE_CUT
 from blf_dsc_controller.replay.verify import verify
 from blf_dsc_controller.simulation.loop import START, simulate, write_bag
+from blf_dsc_controller.supervision.calming import Calming
 from blf_dsc_controller.supervision.guard import Guard
+from blf_dsc_controller.supervision.stop_cause import StopCause
 from blf_dsc_controller.supervision.supervisor import Phase
 from sim_plant.plant import plant_of
 
@@ -181,9 +185,16 @@ def test_arm_that_stops_in_want_of_torque_is_said_to_be_at_its_limit():
 
 
 def test_rate_limit_that_delays_the_torque_is_named():
-    """900 N m/s: 87 N m take 0.1 s, longer than half a period of what oscillates."""
-    run = stopped(loop_of('fr3_direct', 5e3))
-    assert 'torque.rate_limit delays what it gets' in run.guard.supervisor.text
+    config = load_loop('recommended').controller
+    law = controller_of(config)
+    cause = StopCause(config.joints, law, Calming(config, law))
+    assert cause.text(0.0) == ''
+    cause.take_limited(1)
+    law.signals.cuts[:] = 0.0, RATE_CUT
+    assert cause.text(0.1).startswith(
+        "joint 'joint2' has demanded more than its torque"
+    )
+    assert 'torque.rate_limit delays what it gets' in cause.text(0.1)
 
 
 def test_chatter_of_coarse_encoders_is_not_taken_for_brakes():
