@@ -141,7 +141,8 @@ def test_gains_of_the_presets_hold_on_elastic_joints(preset, changes, moving, pi
     assert error[run.time > 11.0].max() < 1.5 * moving
 
 
-def test_gains_of_rigid_gears_stop_an_elastic_arm():
+def test_gains_of_rigid_gears_shake_an_elastic_arm():
+    """It is stopped, or its feedback is softened."""
     given = {'duration': 2.0, 'joint.stiffness': [1e4] * 7}
     rigid = {
         'feedback.inertia': 'whole',
@@ -149,4 +150,5 @@ def test_gains_of_rigid_gears_stop_an_elastic_arm():
         'feedback.joint_damping': None,
     }
     loop = load_loop('fr3_direct', {'sim_plant': given, 'blf_dsc_controller': rigid})
-    assert simulate(loop.controller, loop.plant).run().stops
+    run = simulate(loop.controller, loop.plant).run()
+    assert run.stops or run.oscillations
