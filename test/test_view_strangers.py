@@ -182,6 +182,8 @@ def test_arm_moves_with_a_gripper_on_the_same_topic(watched):
 def test_bound_from_before_the_view_was_started_is_shown(watched):
     """It is latched, and not sent again."""
     _, sender = watched
+    # after all odd ones, which the late view reads, too
+    sender.send(topics.JOURNAL, text(configure()._asdict()))
     sender.send(topics.BOUND, states(JOINTS, [0.5, 0.25]))
     late = sender.ros.add(ViewNode, port=18390)
 
