@@ -6,10 +6,12 @@ drives, and all gains rest on them.  Here the arm is held softly and shaken a li
 reference; from the torques sent and the positions measured follow the responses of its
 joints, and from these the stiffest gains with a margin.
 
-    motion       the reference that shakes all joints at once
-    response     the responses (f, n, n) from a run of it, with their uncertainty
-    choice       gains by the modulus margin, at all postures measured
-    findings     inertias, lags, resonances: what the arm is, beside what was assumed
+    motion          the reference that shakes all joints at once
+    response        the responses (f, n, n) from a run of it, with their uncertainty
+    choice          gains by the modulus margin, at all postures measured
+    findings        inertias, lags, resonances: what the arm is, beside what was assumed
     commissioning   the three steps in a row
-    page         what was found and chosen, for people
+    simulated       the runs of a simulated arm
+    page            what was found and chosen, for people
+    files           the parameter files of motions, and with what was chosen
 """
