@@ -2,12 +2,11 @@
 """The configured reference, the approach to it, and limits of motions.
 
 An arm in motion is taken over at its velocity, in a motion that brakes.  A reference to
-hold rests where this ends.  Any other
-reference is blended into the present motion (see `terms`), starting at t0, in the
-shortest time that keeps the limits, found in 10 % steps and refined by bisection.  A
-blend exceeds the speed of its parts only by a multiple of their distance over its
-duration, so one exists if both parts stay strictly within the limits and their distance
-is finite.
+hold rests where this ends.  Any other reference is blended into the present motion (see
+`terms`), starting at t0, in the shortest time that keeps the limits, found in 10 %
+steps and refined by bisection.  A blend exceeds the speed of its parts only by a
+multiple of their distance over its duration, so one exists if both parts stay strictly
+within the limits and their distance is finite.
 """
 
 from __future__ import annotations

@@ -19,15 +19,12 @@ from blf_dsc_controller.supervision.model_torque import friction_torque, model_t
 Vector = NDArray[np.float64]
 
 _AT_REST = 0.01  # rad/s
-_OBSERVER = (
-    60.0,
-    30.0,
-)  # rad/s, L1 and L2: slow against the lag of velocities and torques
+# rad/s, L1 and L2: slow against the lag of velocities and torques
+_OBSERVER = 60.0, 30.0
 _CALM_OBSERVER = 10.0, 10.0  # rad/s: slow against the oscillation of elastic joints
 _LARGEST_LOAD = 0.5  # of the torque limit
-_LIGHTEST = (
-    0.5  # of the damping: an elastic joint that oscillates passes for a light one
-)
+# of the damping: an elastic joint that oscillates passes for a light one
+_LIGHTEST = 0.5
 
 
 def safe_torque(
