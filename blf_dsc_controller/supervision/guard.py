@@ -30,6 +30,7 @@ from blf_dsc_controller.messages.journal import (
     Journal,
 )
 from blf_dsc_controller.reference.approach import (
+    AT_REST,
     BlendedReference,
     MotionError,
     plan_resumption,
@@ -69,7 +70,6 @@ _NANO = 1e-9
 _MANY = 0.5  # states missed for each that came
 _LONG_GAP = 2.5  # samples
 _IN_A_ROW = 0.1  # s between two states, at most
-_AT_REST = 0.01  # rad/s
 _SLOWEST = 0.03  # rad/s: a velocity that contradicts positions has more
 
 # Commands that do not reach the arm may be why, or velocities that are not its own:
@@ -737,7 +737,7 @@ class Guard:
         """Whether the reference and the arm rest, while the law is in command."""
         signals = self.controller.signals
         speed = np.abs(np.concatenate((signals.dq, signals.dqr))).max()
-        return bool(speed < _AT_REST)
+        return bool(speed < AT_REST)
 
     @property
     def is_settled(self) -> bool:

@@ -12,13 +12,13 @@ from numpy.typing import NDArray
 from blf_dsc_controller.configuration.controller import Safety
 from blf_dsc_controller.law.state import Settings
 from blf_dsc_controller.law.torque import added_torque
+from blf_dsc_controller.reference.approach import AT_REST
 from blf_dsc_controller.supervision.command_effect import CommandEffect
 from blf_dsc_controller.supervision.last_state import LastState
 from blf_dsc_controller.supervision.model_torque import friction_torque, model_torque
 
 Vector = NDArray[np.float64]
 
-_AT_REST = 0.01  # rad/s
 # rad/s, L1 and L2: slow against the lag of velocities and torques
 _OBSERVER = 60.0, 30.0
 _CALM_OBSERVER = 10.0, 10.0  # rad/s: slow against the oscillation of elastic joints
@@ -155,7 +155,7 @@ class SafeTorque:
         return (
             is_over
             and self.last.age == 0.0
-            and float(np.abs(self.last.dq).max()) < _AT_REST
+            and float(np.abs(self.last.dq).max()) < AT_REST
         )
 
     def leave(
