@@ -25,6 +25,7 @@ from blf_dsc_controller.commissioning import simulated
 from blf_dsc_controller.commissioning.choice import Loops, choose
 from blf_dsc_controller.commissioning.commissioning import commissioned, plan
 from blf_dsc_controller.commissioning.motion import excitation, lines_in
+from blf_dsc_controller.commissioning.page import sentences
 from blf_dsc_controller.commissioning.response import response_of
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.files import share_folder
@@ -170,6 +171,17 @@ def test_inertia_and_lags_are_found():
     assert findings.rate == pytest.approx(1000.0)
     assert findings.lost == 0.0
     assert findings.jitter < 1e-12  # s, of rounding
+
+
+def test_steps_of_the_encoders_are_found_and_told():
+    """Of 12 bits, which the tones of 10 mrad pass many times."""
+    step = 2.0 * np.pi / 4096
+    run, config = simulated.measured(planned(), ARM)
+    coarse = replace(run, position=step * np.rint(run.position / step))
+    seen = commissioned(CONFIG, [(coarse, config)])
+    np.testing.assert_allclose(seen.findings.resolution, step, rtol=1e-9)
+    assert 'positions in steps of 1.5 mrad' in next(sentences(seen, 0.5))
+    assert 'steps' not in next(sentences(found(), 0.5))
 
 
 def test_chosen_gains_have_the_margin_of_the_true_loop_and_twice_of_them_do_not():

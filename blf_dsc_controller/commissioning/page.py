@@ -59,7 +59,9 @@ def sentences(found: Commissioned, aim: float) -> Iterator[str]:
     """Yield what was found, what limits the gains, and what to do about it."""
     arm = found.findings
     states = f'joint states at {arm.rate:.4g} Hz, jitter {1e3 * arm.jitter:.2g} ms'
-    yield f'{states}, {100.0 * arm.lost:.2g} % lost'
+    step = float(arm.resolution.max())
+    steps = f'; positions in steps of {1e3 * step:.2g} mrad' if step else ''
+    yield f'{states}, {100.0 * arm.lost:.2g} % lost{steps}'
     if not np.isnan(arm.drive_lag):
         yield (
             f'a torque takes {1e3 * arm.drive_lag:.2g} ms to its motion, sampling included, and '
