@@ -179,6 +179,16 @@ def test_arm_moves_with_a_gripper_on_the_same_topic(watched):
     assert np.isfinite(view.past[-1].position).all()
 
 
+def test_arm_is_drawn_without_a_plant_that_cannot_be(ros):
+    """The plant may come before the journal that says what it is of."""
+    view = ros.add(ViewNode, port=18400)
+    sender = Sender(ros)
+    sender.send(topics.CHANGES, change(configured=True, parameters={'arm.l1': 1e308}))
+    sender.send(topics.JOURNAL, text(configure()._asdict()))
+    sender.move(view)
+    view.close()
+
+
 def test_bound_from_before_the_view_was_started_is_shown(watched):
     """It is latched, and not sent again."""
     _, sender = watched

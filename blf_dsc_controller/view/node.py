@@ -268,7 +268,14 @@ class ViewNode(PlainNode):
         self._events.append((time, event.type.value, f'{points} points'))
 
     def _configure(self, config: ControllerConfig) -> None:
-        self.page.draw_arm(config, self._plant)
+        try:
+            self.page.draw_arm(config, self._plant)
+        except BlfDscError as error:  # anyone may have sent this plant
+            if not self._plant:
+                raise
+            self._pass_over(error)
+            self._plant, self._planned = {}, []
+            self.page.draw_arm(config, {})
         self._config = config
         estimates = estimate_names(config)
         joints = config.joints
