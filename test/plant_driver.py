@@ -27,6 +27,7 @@ from sim_plant.plant import plant_of
 
 class PlantDriver(Driver):
     facts = Facts(2, 0.001, 'none', 'unknown', (20.0, 20.0), (inf, inf))
+    arm = 'recommended'  # parameter file or preset of the plant
     last = None  # the driver that was made last
 
     def connect(self):
@@ -35,7 +36,7 @@ class PlantDriver(Driver):
         self.what, self.at = what, int(at or -1)
         if what == 'absent':
             raise DriverError('there is no robot: switch it on')
-        self.plant = plant_of(load_loop('recommended').plant)
+        self.plant = plant_of(load_loop(self.arm).plant)
         self.calls = ['connect']
         self.count = 0
         self.late = 0
@@ -52,6 +53,9 @@ class PlantDriver(Driver):
         self.count += 1
         if self.count == self.at:
             self.happen()
+        if self.what == 'lossy' and self.count % 20 == 0:
+            self.plant.step(self.torques[-1])
+            self.late += 1
         q, dq, effort = self.plant.measure().reshape(3, -1)
         self.velocity = np.abs(dq).max()
         return RobotState(1.0 + 1e-3 * (self.count + self.late), q, dq, effort)

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import sys
 import textwrap
 from argparse import Namespace
 from collections.abc import Sequence
@@ -15,16 +16,16 @@ from tqdm import tqdm
 from blf_dsc_controller import __version__
 from blf_dsc_controller.bags.content import read_content
 from blf_dsc_controller.bags.reader import read_run
+from blf_dsc_controller.cli.commission_robot import (
+    measured_on_robot,
+    planned_around,
+)
+from blf_dsc_controller.cli.drive import CODES
 from blf_dsc_controller.cli.main import make_room
 from blf_dsc_controller.cli.run import print_notice
 from blf_dsc_controller.commissioning import files, page, simulated
-from blf_dsc_controller.commissioning.commissioning import (
-    Commissioned,
-    Planned,
-    commissioned,
-    plan,
-    postures_of,
-)
+from blf_dsc_controller.commissioning.commissioning import Commissioned, commissioned
+from blf_dsc_controller.commissioning.driven import EndedError, Measured
 from blf_dsc_controller.compiled.announcement import announced_compilation
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.nodes import (
@@ -36,10 +37,8 @@ from blf_dsc_controller.configuration.nodes import (
     read,
 )
 from blf_dsc_controller.errors import BlfDscError
-from blf_dsc_controller.run import Run
 
 _WIDTH = 98
-_Measured = tuple[Run, ControllerConfig]
 
 NO_MARGIN = 3
 """Exit code if no gains have the margin."""
@@ -48,13 +47,18 @@ NO_MARGIN = 3
 def commission(options: Namespace) -> int:
     """Write the motions to run, or measure, choose and write the gains."""
     path = locate(options.config)
+    config = load(path, CONTROLLER, ControllerConfig)
+    _check(options)
     if options.write:
-        _write_motions(options, path)
+        _write_motions(options, path, config)
         return 0
     picture = options.out.with_suffix('.png')
     make_room(options.out, picture, force=options.force)
-    names, runs = _from_bags(options) if options.bags else _simulated(options, path)
-    config = load(path, CONTROLLER, ControllerConfig)
+    try:
+        names, runs = _all_runs(options, path, config)
+    except EndedError as error:
+        print(f'blf_dsc commission: {error}', file=sys.stderr)
+        return CODES[error.end]
     found = commissioned(config, runs, options.margin)
     lines = _told(options, found)
     print('\n'.join([page.table(found), '', *lines]))
@@ -66,21 +70,38 @@ def commission(options: Namespace) -> int:
     comment = ''.join(f'# {line}\n' for line in lines)
     dump(options.out, files.of_commissioned(read(path), found), comment)
     print(f'wrote {options.out}')
-    if not options.bags:
+    if not (options.bags or options.robot):
         _prove(options.out)
     return 0
 
 
-def _planned(options: Namespace, config: ControllerConfig) -> list[Planned]:
-    """Return the motions, in the postures given or those that the reference visits."""
-    postures = np.array(options.posture) if options.posture else postures_of(config)
-    return plan(config, postures, torque=options.torque, travel=options.travel)
+def _check(options: Namespace) -> None:
+    """Raise BlfDscError if options contradict each other."""
+    if options.write and (options.robot or options.bags):
+        raise BlfDscError(
+            '--write measures nothing: leave out bags and --robot, or leave out --write'
+        )
+    if not options.robot and (options.yes or options.record):
+        raise BlfDscError('--yes and --record are for a robot: give --robot, too')
 
 
-def _write_motions(options: Namespace, path: Path) -> None:
+def _all_runs(
+    options: Namespace, path: Path, config: ControllerConfig
+) -> tuple[list[str], list[Measured]]:
+    """Return names and runs: of bags, of the robot or both, else of the simulated arm."""
+    if not (options.bags or options.robot):
+        return _simulated(options, path)
+    names, runs = _from_bags(options)
+    if options.robot:
+        for name, run in measured_on_robot(options, path, config):
+            names.append(name)
+            runs.append(run)
+    return names, runs
+
+
+def _write_motions(options: Namespace, path: Path, config: ControllerConfig) -> None:
     """Write a parameter file for each motion, and say how far it goes."""
-    config = load(path, CONTROLLER, ControllerConfig)
-    planned = _planned(options, config)
+    planned = planned_around(options, config)
     sections = read(path)
     paths = [
         options.write.with_name(f'{options.write.stem}_{k}.yaml')
@@ -88,7 +109,7 @@ def _write_motions(options: Namespace, path: Path) -> None:
     ]
     make_room(*paths, force=options.force)
     for file, each in zip(paths, planned, strict=True):
-        line = _description(each)
+        line = page.description(each)
         dump(file, files.of_motion(sections, each), f'# {line}\n')
         print(f'wrote {file}: {line}')
     print(
@@ -97,22 +118,13 @@ def _write_motions(options: Namespace, path: Path) -> None:
     )
 
 
-def _description(planned: Planned) -> str:
-    """Return in a sentence how far and how fast a motion goes."""
-    made = planned.excitation
-    angles = ', '.join(f'{angle:.3g}' for angle in planned.posture)
-    return (
-        f'{planned.duration:.3g} s around [{angles}] rad; the tool travels '
-        f'{1e3 * made.travel:.2g} mm, the fastest joint moves at {made.speed.max():.2g} rad/s'
-    )
-
-
-def _simulated(options: Namespace, path: Path) -> tuple[list[str], list[_Measured]]:
+def _simulated(options: Namespace, path: Path) -> tuple[list[str], list[Measured]]:
     """Return names and runs of the motions on the simulated arm."""
     loop = load_loop(path)
-    planned = _planned(options, loop.controller)
+    here = np.array(loop.plant.initial.position)
+    planned = planned_around(options, loop.controller, here)
     for k, each in enumerate(planned, 1):
-        print(f'posture {k}: {_description(each)}')
+        print(f'posture {k}: {page.description(each)}')
     names, runs = [], []
     with announced_compilation(print_notice):
         made = simulated.runs_of(planned, loop)
@@ -126,7 +138,7 @@ def _simulated(options: Namespace, path: Path) -> tuple[list[str], list[_Measure
     return names, runs
 
 
-def _from_bags(options: Namespace) -> tuple[list[str], list[_Measured]]:
+def _from_bags(options: Namespace) -> tuple[list[str], list[Measured]]:
     """Return names and runs of bags."""
     runs = []
     for bag in options.bags:

@@ -8,6 +8,7 @@ import signal
 from argparse import Namespace
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
+from pathlib import Path
 
 from blf_dsc_controller.cli.main import INTERRUPTED
 from blf_dsc_controller.cli.ros_check import require_ros
@@ -18,7 +19,7 @@ from blf_dsc_controller.configuration.drive import DriveConfig
 from blf_dsc_controller.configuration.nodes import CONTROLLER, DRIVE, load, locate
 from blf_dsc_controller.control.arm_controller import ArmController
 from blf_dsc_controller.control.realtime import request_realtime
-from blf_dsc_controller.drive.driver import disagreements
+from blf_dsc_controller.drive.driver import Driver, disagreements
 from blf_dsc_controller.drive.drivers import find_driver
 from blf_dsc_controller.drive.loop import DriveLoop, End, Outcome
 from blf_dsc_controller.drive.ros_topics import RosTopics
@@ -27,13 +28,14 @@ from blf_dsc_controller.reference.approach import end_of_waypoints
 from blf_dsc_controller.supervision.config_warnings import config_warnings
 from blf_dsc_controller.supervision.expected_errors import expectation
 
-_CODES = {
+CODES = {
     End.DURATION: 0,
     End.REQUESTED: INTERRUPTED,
     End.STOPPED: STOPPED,
     End.REFLEX: STOPPED,
     End.LOST: STOPPED,
 }
+"""Exit codes by the end of a run."""
 
 
 def drive(options: Namespace) -> int:
@@ -41,18 +43,13 @@ def drive(options: Namespace) -> int:
     _check(options)
     path = locate(options.config)
     config = load(path, CONTROLLER, ControllerConfig)
-    settings = load(path, DRIVE, DriveConfig)
-    made = find_driver(settings.driver)
-    problems = disagreements(made.facts, config)
-    if problems:
-        raise ConfigurationError(problems, str(path))
+    driver = driver_of(options.robot, path, config)
     for warning in config_warnings(config):
         print_notice(f'warning: {warning}')
     if config.model == 'urdf':
         print(f'errors to expect: {expectation(config)}')
     if end := end_of_waypoints(config):
         print(end)
-    driver = made(options.robot, config, settings)
     with announced_compilation(print_notice):
         controller = ArmController(config, record=options.out, stamps='wall')
     with ExitStack() as ending:
@@ -68,10 +65,10 @@ def drive(options: Namespace) -> int:
             driver,
             controller,
             duration=options.duration or math.inf,
-            settle_time=settings.settle_time,
+            settle_time=driver.config.settle_time,
             ros=ros,
         )
-        with _signals_to(loop.request_end):
+        with signals_to(loop.request_end):
             print_notice(f'controlling {options.robot}: Ctrl-C ends')
             outcome = loop.run()
         _print(outcome, loop, controller)
@@ -83,7 +80,20 @@ def drive(options: Namespace) -> int:
         print(
             f'recorded      {options.out}: blf_dsc replay, report, plot and identify read it'
         )
-    return _CODES[outcome.end] or int(bool(controller.output_problem))
+    return CODES[outcome.end] or int(bool(controller.output_problem))
+
+
+def driver_of(address: str, path: Path, config: ControllerConfig) -> Driver:
+    """Return the driver that a file names, for the robot at an address.
+
+    Raises BlfDscError if there is no such driver, or the file contradicts the robot.
+    """
+    settings = load(path, DRIVE, DriveConfig)
+    made = find_driver(settings.driver)
+    problems = disagreements(made.facts, config)
+    if problems:
+        raise ConfigurationError(problems, str(path))
+    return made(address, config, settings)
 
 
 def _check(options: Namespace) -> None:
@@ -102,7 +112,7 @@ def _check(options: Namespace) -> None:
 
 
 @contextmanager
-def _signals_to(request_end: Callable[[], None]) -> Iterator[None]:
+def signals_to(request_end: Callable[[], None]) -> Iterator[None]:
     """Request the end on SIGINT and SIGTERM, instead of interrupting a step."""
     numbers = (signal.SIGINT, signal.SIGTERM)
     before = [signal.signal(number, lambda *_: request_end()) for number in numbers]

@@ -318,11 +318,13 @@ def _add_commissioning(command: _Command, force: argparse.ArgumentParser) -> Non
         'commission',
         'Measure an arm from a URDF, and choose its gains by what was measured. A reference '
         'shakes all joints a little, in a few postures; from torques and positions follow the '
-        'responses of the joints, and the stiffest gains with a modulus margin. Without BAG the '
-        'arm is simulated. With --write, write the motions for a real arm, to be run by the '
-        'node or `blf_dsc drive`; then give their bags. Exit code: 0 done, 3 no gains have the '
-        'margin, 1 an error.',
+        'responses of the joints, and the stiffest gains with a modulus margin. With --robot, the '
+        'driver of `blf_dsc drive` moves the robot to each posture and measures it. With --write, '
+        'write the motions for the node; then give their bags. With none of these the arm is '
+        'simulated. Exit code: 0 done, 3 no gains have the margin, 5 the controller or the robot '
+        'stopped before, 130 interrupted, 1 an error.',
         '--config ur5e --out commissioned.yaml\n'
+        '  blf_dsc commission --config my.yaml --robot 172.16.0.2 --out commissioned.yaml\n'
         '  blf_dsc commission --config my.yaml --write motion.yaml\n'
         '  blf_dsc commission run1/bag run2/bag run3/bag --config my.yaml --out commissioned.yaml',
         force,
@@ -334,6 +336,18 @@ def _add_commissioning(command: _Command, force: argparse.ArgumentParser) -> Non
         type=Path,
         default=Path('commissioned.yaml'),
         help='parameter file to write, and a picture beside it (commissioned.yaml)',
+    )
+    option(
+        '--robot',
+        metavar='ADDRESS',
+        help='measure this robot; with BAGs, these count, too',
+    )
+    option('--yes', action='store_true', help='start the robot without a question')
+    option(
+        '--record',
+        type=Path,
+        metavar='FOLDER',
+        help='new folder for the bags of the robot (commissioned_bags)',
     )
     option(
         '--write',

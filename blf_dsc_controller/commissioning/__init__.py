@@ -12,6 +12,7 @@ joints, and from these the stiffest gains with a margin.
     findings        inertias, lags, resonances: what the arm is, beside what was assumed
     commissioning   the three steps in a row
     simulated       the runs of a simulated arm
+    driven          the runs of a robot over its driver, from posture to posture
     page            what was found and chosen, for people
     files           the parameter files of motions, and with what was chosen
 """

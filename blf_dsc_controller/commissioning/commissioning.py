@@ -69,8 +69,21 @@ class Commissioned(NamedTuple):
         }
 
 
-def postures_of(config: ControllerConfig, count: int = POSTURES) -> Floats:
-    """Return postures (count, n) [rad] that the configured reference visits."""
+def postures_of(
+    config: ControllerConfig, count: int = POSTURES, here: Floats | None = None
+) -> Floats:
+    """Return postures (count, n) [rad] that the configured reference visits.
+
+    One to hold visits only `here` (n,) [rad], where the arm is. Raises BlfDscError if it
+    is not known.
+    """
+    if config.reference.type == 'hold':
+        if here is None:
+            raise BlfDscError(
+                'reference.type: got hold, with which the arm stays where it begins: give the '
+                'postures in which to measure it'
+            )
+        return here[None]
     return np.asarray(along(config, count)[0])
 
 

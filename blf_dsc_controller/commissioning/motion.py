@@ -190,15 +190,36 @@ def shaken(
     It learns nothing, so that it is the same at the end as at the beginning.
     """
     count = len(config.learning.initial_estimate)
+    return (
+        watched(config)
+        | excitation.reference(posture)
+        | {
+            'learning.weight': 0.0,
+            'learning.adaptation_gain': [0.0] * count,
+            'safety.oscillation': 'warn',  # with softer gains another arm would be measured
+        }
+    )
+
+
+def watched(config: ControllerConfig) -> dict[str, object]:
+    """Return the parameters of an arm with soft gains that nothing but a stop may change.
+
+    Errors may be wide, loads are not declared, and a contact ends the motion if it would
+    change it.
+    """
     barrier = config.barrier
     wide = np.maximum(np.maximum(barrier.bound, barrier.initial_bound), _ROOM)
-    return excitation.reference(posture) | {
-        'learning.weight': 0.0,
-        'learning.adaptation_gain': [0.0] * count,
+    values: dict[str, object] = {
         'barrier.bound': _listed(wide),
         'barrier.initial_bound': [0.0] * len(wide),
-        'safety.oscillation': 'warn',  # with softer gains another arm would be measured
     }
+    if barrier.bounds_tool:
+        values |= {'barrier.tool_bound': 0.0, 'barrier.tool_angle_bound': 0.0}
+    if config.learning.tell_drive:
+        values |= {'learning.tell_drive': False, 'learning.load_service': ''}
+    if config.contact.reaction != 'none':
+        values['contact.reaction'] = 'stop'
+    return values
 
 
 _ROOM = 0.1  # rad, bound of the errors

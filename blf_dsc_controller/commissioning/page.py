@@ -13,13 +13,23 @@ from blf_dsc_controller.analysis.figures import Picture
 from blf_dsc_controller.analysis.output import aligned
 from blf_dsc_controller.analysis.panels import ALARM, BLUE, MUTED, ORANGE, SHADE
 from blf_dsc_controller.commissioning.choice import SLOWEST
-from blf_dsc_controller.commissioning.commissioning import Commissioned
+from blf_dsc_controller.commissioning.commissioning import Commissioned, Planned
 
 Floats = NDArray[np.float64]
 
 _COLOURS = (BLUE, ORANGE, MUTED, ALARM)
 _SIZE = (5.6, 3.4)  # inches, of a panel
 _MUCH = 0.1  # of the margin, by noise
+
+
+def description(planned: Planned) -> str:
+    """Return in a sentence how far and how fast a motion goes."""
+    made = planned.excitation
+    angles = ', '.join(f'{angle:.3g}' for angle in planned.posture)
+    return (
+        f'{planned.duration:.3g} s around [{angles}] rad; the tool travels '
+        f'{1e3 * made.travel:.2g} mm, the fastest joint moves at {made.speed.max():.2g} rad/s'
+    )
 
 
 def table(found: Commissioned) -> str:

@@ -1,0 +1,119 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`blf_dsc commission --robot`: the limits, a question, and the robot in each posture."""
+
+from __future__ import annotations
+
+import sys
+from argparse import Namespace
+from collections.abc import Iterator
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from blf_dsc_controller.cli.drive import driver_of, signals_to
+from blf_dsc_controller.cli.main import make_room
+from blf_dsc_controller.cli.run import print_notice
+from blf_dsc_controller.commissioning import page
+from blf_dsc_controller.commissioning.commissioning import (
+    Planned,
+    plan,
+    postures_of,
+)
+from blf_dsc_controller.commissioning.driven import SPEED, Driven, Measured
+from blf_dsc_controller.compiled.announcement import announced_compilation
+from blf_dsc_controller.configuration.controller import ControllerConfig
+from blf_dsc_controller.control.arm_controller import ArmController
+from blf_dsc_controller.control.realtime import request_realtime
+from blf_dsc_controller.errors import BlfDscError
+
+Floats = NDArray[np.float64]
+
+
+def planned_around(
+    options: Namespace, config: ControllerConfig, here: Floats | None = None
+) -> list[Planned]:
+    """Return the motions in the postures given, or those that the reference visits.
+
+    The arm is at `here` (n,) [rad], if that is known.
+    """
+    postures = np.array(options.posture) if options.posture else None
+    if postures is None:
+        postures = postures_of(config, here=here)
+    return plan(config, postures, torque=options.torque, travel=options.travel)
+
+
+def measured_on_robot(
+    options: Namespace, path: Path, config: ControllerConfig
+) -> list[tuple[str, Measured]]:
+    """Measure the robot, and return for each posture its name and what was measured.
+
+    Raises:
+        EndedError: it ended before its time.
+        BlfDscError: nobody agrees, or the robot, the file or a run is not as it should be.
+    """
+    if not (options.yes or sys.stdin.isatty()):
+        raise BlfDscError(
+            'the robot moves, and nobody can be asked here: start it in a terminal, or give --yes'
+        )
+    folder = options.record or options.out.with_name(f'{options.out.stem}_bags')
+    make_room(folder, force=False)
+    driver = driver_of(options.robot, path, config)
+    motion_at = partial(_motion_at, options, config)
+    with announced_compilation(print_notice):
+        ArmController(config).close()
+    for remark in driver.connect():
+        print_notice(remark)
+    driven = Driven(driver, config, folder, motion_at)
+    planned = planned_around(options, config, driven.position())
+    print('\n'.join(_limits(options, config, planned, driven.duration(planned))))
+    if not options.yes and input('Type yes to start: ').strip().lower() != 'yes':
+        raise BlfDscError('not started: nothing has moved')
+    request_realtime(config.realtime, lambda text: print_notice(f'warning: {text}'))
+    with signals_to(driven.request_end):
+        return list(_followed(driven, planned))
+
+
+def _followed(driven: Driven, planned: list[Planned]) -> Iterator[tuple[str, Measured]]:
+    """Yield what is measured, and say how far it is."""
+    postures = np.array([each.posture for each in planned])
+    total = len(planned)
+    print(f'0 of {total} postures measured: Ctrl-C stops the arm', flush=True)
+    for k, measured in enumerate(driven.runs(postures), 1):
+        print(f'{k} of {total} postures measured', flush=True)
+        yield measured
+
+
+def _motion_at(
+    options: Namespace, config: ControllerConfig, posture: Floats
+) -> Planned:
+    (motion,) = plan(
+        config, posture[None], torque=options.torque, travel=options.travel
+    )
+    return motion
+
+
+def _limits(
+    options: Namespace,
+    config: ControllerConfig,
+    planned: list[Planned],
+    duration: float,
+) -> Iterator[str]:
+    """Yield what the arm is about to do at most."""
+    for k, each in enumerate(planned, 1):
+        yield f'posture {k}: {page.description(each)}'
+    rated = config.robot.efforts(config.robot.chain(config.joints))
+    shaking = ', '.join(f'{torque:.2g}' for torque in options.torque * rated)
+    most = ', '.join(f'{torque:.3g}' for torque in config.torque.limit)
+    bound = ', '.join(f'{each:.2g}' for each in planned[0].config.barrier.bound)
+    yield (
+        f'to each posture the joints move straight, at {SPEED:g} rad/s at most: keep the way of '
+        'the arm free'
+    )
+    yield f'the motions add torques of {shaking} N m (rms) at most; torque.limit is {most} N m'
+    yield (
+        f'an error of {bound} rad, any other check of the controller, or Ctrl-C brings the arm to '
+        'rest and ends'
+    )
+    yield f'{options.robot} moves for {duration:.0f} s in all'

@@ -1,0 +1,264 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`blf_dsc commission --robot` through the loop of `drive`, on an elastic arm in lock-step."""
+
+from __future__ import annotations
+
+import io
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from plant_driver import PlantDriver
+
+import blf_dsc_controller as blf
+from blf_dsc_controller.arms.urdf import frames
+from blf_dsc_controller.bags.content import read_content
+from blf_dsc_controller.cli.main import main
+from blf_dsc_controller.commissioning.commissioning import plan, postures_of
+from blf_dsc_controller.commissioning.driven import SPEED, Driven, EndedError, move
+from blf_dsc_controller.commissioning.motion import SETTLING
+from blf_dsc_controller.configuration.drive import DriveConfig
+from blf_dsc_controller.configuration.schema import change
+from blf_dsc_controller.drive.loop import End
+from blf_dsc_controller.errors import BlfDscError
+from blf_dsc_controller.reference.approach import reference_of
+from blf_dsc_controller.reference.terms import sampled
+
+BEGIN = (0.1, 0.8)  # rad, where the arm rests
+NEAR, FAR = (0.3, 1.1), (0.8, 0.5)  # rad
+# Springs of 26 and 29 Hz, and no torque where nothing moves: no gravity.
+ARM = """
+/**:
+  ros__parameters:
+    robot: {urdf: two_link.urdf, gravity: [0.0, 0.0, 0.0], rotor_inertia: [0.3, 0.1], payload: 0.1}
+/**/sim_plant:
+  ros__parameters:
+    truth.rotor_inertia: [0.3, 0.1]
+    joint.stiffness: [3.0e+3, 1.5e+3]
+    disturbance: {constant: [0.0, 0.0], amplitude: [0.0, 0.0], viscous: [2.0, 1.0]}
+    initial.position: [0.1, 0.8]
+/**/blf_dsc_controller:
+  ros__parameters:
+    barrier.bound: [0.2, 0.2]
+    limits.position_lower: [-3.0, -3.0]
+    limits.position_upper: [3.0, 3.0]
+"""
+DRIVER = """
+from math import inf
+from plant_driver import PlantDriver
+class DRIVER(PlantDriver):
+    arm = {arm!r}
+    facts = PlantDriver.facts._replace(joints={joints}, torque_limit=(inf,) * {joints})
+"""
+
+
+@pytest.fixture
+def arm(tmp_path, monkeypatch):
+    """Write the arm's parameter file, with a driver on this arm, and return its path."""
+    monkeypatch.syspath_prepend(Path(__file__).parent)
+    return written(tmp_path, joints=2)
+
+
+def written(folder, joints):
+    path, driver = folder / 'arm.yaml', folder / 'arm_driver.py'
+    driver.write_text(DRIVER.format(arm=str(path), joints=joints))
+    section = f'/**/drive:\n  ros__parameters:\n    driver: {driver}\n'
+    path.write_text(ARM + section)
+    return path
+
+
+def commission(arm, address, *options, postures=(NEAR,)):
+    """Run the command; return its exit code."""
+    words = ['commission', '--config', str(arm), '--robot', address]
+    for posture in postures:
+        words += ['--posture', *map(str, posture)]
+    return main([*words, '--out', str(arm.with_name('out.yaml')), *options])
+
+
+def nothing_looks_whole(arm):
+    return not (arm.with_name('out.yaml').exists() or arm.with_name('out.png').exists())
+
+
+def gains_of(path):
+    feedback = blf.load_loop(path).controller.feedback
+    return np.array([feedback.joint_stiffness, feedback.joint_damping])
+
+
+def test_robot_is_measured_posture_by_posture_and_its_bags_give_the_same(arm, capsys):
+    assert commission(arm, 'plant', '--yes', postures=(NEAR, FAR)) == 0
+    told = capsys.readouterr().out
+    before, _, after = told.partition('0 of 2 postures measured')
+    assert 'the tool travels 10 mm' in before
+    assert 'torque.limit is 60, 30 N m' in before
+    assert '2 of 2 postures measured' in after
+    assert 'the gains are limited near' in after
+    assert PlantDriver.last.calls == ['connect', *['start', 'finish'] * 4]
+    bags = sorted(arm.with_name('out_bags').glob('posture_*'))
+    assert len(bags) == 2
+    for bag, posture in zip(bags, (NEAR, FAR), strict=True):
+        run = blf.read_run(bag)
+        # it began at rest where the move ended: no error, and no jump of the torque
+        assert np.abs(run.error[0]).max() < 1e-6
+        assert np.abs(run.torque[0]).max() < 0.01  # N m, of 60
+        chain = read_content(bag).controller_config().robot.chain(run.joints)
+        tips = frames(chain, run.position)[-1][:, :3, 3]
+        middle = frames(chain, run.position[0])[-1][:3, 3]
+        # the reference travels 10 mm at most; the arm is softly held and exceeds it little
+        assert np.linalg.norm(tips - middle, axis=1).max() < 0.015
+        np.testing.assert_allclose(run.position[0], posture, atol=0.01)
+    assert blf.verify(bags[0]).difference is None
+    again = arm.with_name('again.yaml')
+    words = ['commission', *map(str, bags), '--config', str(arm), '--out', str(again)]
+    assert main(words) == 0
+    np.testing.assert_array_equal(gains_of(again), gains_of(arm.with_name('out.yaml')))
+
+
+@pytest.mark.parametrize(
+    ('address', 'code', 'printed'),
+    [
+        ('interrupt@300', 130, 'move 1: ended on request. No gains were chosen'),
+        ('interrupt@9000', 130, 'posture 1: ended on request. No gains were chosen'),
+        ('late@9000', 5, 'posture 1: the controller stopped: the stamp of a joint'),
+        ('reflex@9000', 5, 'posture 1: the robot stopped by itself: joint_reflex; it'),
+        ('silent@300', 5, 'move 1: the connection was lost: no state for 1 s'),
+        ('absent', 1, 'there is no robot: switch it on'),
+    ],
+)
+def test_end_before_its_time_is_calm_and_writes_nothing_that_looks_whole(
+    address, code, printed, arm, capsys
+):
+    """The move takes 3.5 s: state 9000 is in the motion, before its period is over."""
+    assert commission(arm, address, '--yes') == code
+    assert printed in capsys.readouterr().err
+    assert nothing_looks_whole(arm)
+    if code == 130:
+        assert PlantDriver.last.calls[-1] == 'finish'
+        assert PlantDriver.last.velocity < 0.01  # rad/s, at rest
+    cut = arm.with_name('out_bags') / 'posture_1'
+    if cut.exists():  # it is not taken for a whole one
+        assert main(['commission', str(cut), '--config', str(arm)]) == 1
+
+
+def test_lost_states_are_told_after_the_first_posture(arm, capsys):
+    """Every 20th, which no check of the controller minds."""
+    assert commission(arm, 'lossy@1', '--yes', postures=(NEAR, FAR)) == 1
+    assert 'posture 1: ' in (told := capsys.readouterr().err)
+    assert 'joint states are missing' in told
+    assert PlantDriver.last.calls == ['connect', *['start', 'finish'] * 2]
+    assert nothing_looks_whole(arm)
+
+
+class Terminal(io.StringIO):
+    def isatty(self):
+        return True
+
+
+def test_nothing_moves_unless_somebody_agrees(arm, capsys, monkeypatch):
+    monkeypatch.setattr(sys, 'stdin', io.StringIO('yes\n'))
+    PlantDriver.last = None
+    assert commission(arm, 'plant') == 1
+    assert 'start it in a terminal, or give --yes' in capsys.readouterr().err
+    assert PlantDriver.last is None
+    monkeypatch.setattr(sys, 'stdin', Terminal('no\n'))
+    assert commission(arm, 'plant') == 1
+    printed = capsys.readouterr()
+    assert 'plant moves for' in printed.out
+    assert 'nothing has moved' in printed.err
+    assert PlantDriver.last.calls == ['connect']
+    monkeypatch.setattr(sys, 'stdin', Terminal('yes\n'))
+    assert commission(arm, 'interrupt@300') == 130
+
+
+@pytest.mark.parametrize(
+    ('options', 'postures', 'printed'),
+    [
+        (['--write', 'm.yaml'], (NEAR,), '--write measures nothing'),
+        ([], ((0.3, 2.99),), 'joint2 would be at 2.99 rad, less than 0.05 rad from'),
+        ([], ((0.3, 1.1, 0.0),), 'got 3 angles, but the arm has 2 joints'),
+    ],
+)
+def test_what_cannot_be_measured_is_refused_before_anything_moves(
+    options, postures, printed, arm, capsys
+):
+    PlantDriver.last = None
+    assert commission(arm, 'plant', '--yes', *options, postures=postures) == 1
+    assert printed in capsys.readouterr().err
+    assert PlantDriver.last is None or PlantDriver.last.calls == ['connect']
+    assert nothing_looks_whole(arm)
+
+
+def test_another_robot_is_refused(arm, capsys):
+    written(arm.parent, joints=7)
+    assert commission(arm, 'plant', '--yes') == 1
+    assert 'joints: got 2, but the robot has 7' in capsys.readouterr().err
+
+
+def driven(arm, cls=PlantDriver):
+    """Return a robot, with its configuration."""
+    config = blf.load_loop(arm).controller
+    driver = cls('plant', config, DriveConfig())
+    driver.arm = arm
+    driver.connect()
+
+    def motion_at(posture):
+        return plan(config, posture[None])[0]
+
+    return Driven(driver, config, arm.with_name('bags'), motion_at), config
+
+
+def test_arm_that_moves_is_not_measured(arm):
+    class Pushed(PlantDriver):
+        pushed = 0.0
+
+        def positions(self):
+            self.pushed += 0.01
+            return super().positions() + np.array([0.0, self.pushed])
+
+    robot, _ = driven(arm, Pushed)
+    with pytest.raises(BlfDscError, match=r'joint2 moves by \+0\.01 rad in 0\.2 s'):
+        next(robot.runs(np.array([NEAR])))
+    assert PlantDriver.last.calls == ['connect']
+
+
+def test_request_between_two_runs_starts_no_other(arm):
+    robot, _ = driven(arm)
+    robot.request_end()
+    with pytest.raises(EndedError, match='move 1: ended on request') as caught:
+        next(robot.runs(np.array([NEAR])))
+    assert caught.value.end is End.REQUESTED
+    assert PlantDriver.last.calls == ['connect']
+
+
+def test_move_is_slow_straight_and_at_rest_at_both_ends(arm):
+    config = blf.load_loop(arm).controller
+    here, there = np.array(BEGIN), np.array([-2.0, 0.9])
+    made = move(config, here, there)
+    times = np.linspace(0.0, made.duration, 2001)
+    q, dq, _ = sampled(reference_of(made.config), times).transpose(1, 0, 2)
+    np.testing.assert_allclose(q[[0, -1]], (here, there), atol=1e-9)
+    np.testing.assert_allclose(dq[[0, -1]], 0.0, atol=1e-9)
+    assert np.abs(dq).max() == pytest.approx(SPEED, rel=1e-3)
+    share = (q - here) / (there - here)
+    np.testing.assert_allclose(share[:, 0], share[:, 1], atol=1e-9)
+
+
+def test_contacts_end_a_motion_and_loads_are_not_told_in_it():
+    preset = blf.load_loop('fr3_direct').controller
+    given = {
+        'contact.enabled': True,
+        'contact.reaction': 'yield',
+        'learning.tell_drive': True,
+    }
+    posture = np.array(preset.reference.offset)
+    (motion,) = plan(change(preset, given), posture[None])
+    assert motion.config.contact.reaction == 'stop'
+    assert not motion.config.learning.tell_drive
+    assert motion.duration > SETTLING + motion.excitation.period
+
+
+def test_reference_to_hold_visits_where_the_arm_is(arm):
+    config = change(blf.load_loop(arm).controller, {'reference.type': 'hold'})
+    np.testing.assert_array_equal(postures_of(config, here=np.array(BEGIN)), [BEGIN])
+    with pytest.raises(BlfDscError, match=r'reference\.type: got hold'):
+        postures_of(config)
