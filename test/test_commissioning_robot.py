@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import io
+import logging
 import sys
 from pathlib import Path
 
@@ -18,12 +19,15 @@ from blf_dsc_controller.cli.main import main
 from blf_dsc_controller.commissioning.commissioning import plan, postures_of
 from blf_dsc_controller.commissioning.driven import SPEED, Driven, EndedError, move
 from blf_dsc_controller.commissioning.motion import SETTLING
+from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.drive import DriveConfig
-from blf_dsc_controller.configuration.schema import change
+from blf_dsc_controller.configuration.schema import build, change
 from blf_dsc_controller.drive.loop import End
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.reference.approach import reference_of
 from blf_dsc_controller.reference.terms import sampled
+from blf_dsc_controller.supervision.config_warnings import config_warnings
+from blf_dsc_controller.supervision.not_commissioned import not_commissioned
 
 BEGIN = (0.1, 0.8)  # rad, where the arm rests
 NEAR, FAR = (0.3, 1.1), (0.8, 0.5)  # rad
@@ -81,7 +85,11 @@ def nothing_looks_whole(arm):
 
 
 def gains_of(path):
-    feedback = blf.load_loop(path).controller.feedback
+    config = blf.load_loop(path).controller
+    feedback = config.feedback
+    assert config.commissioning.margin >= 0.5
+    assert config.commissioning.version == blf.__version__
+    assert not_commissioned(config) == ''
     return np.array([feedback.joint_stiffness, feedback.joint_damping])
 
 
@@ -262,3 +270,25 @@ def test_reference_to_hold_visits_where_the_arm_is(arm):
     np.testing.assert_array_equal(postures_of(config, here=np.array(BEGIN)), [BEGIN])
     with pytest.raises(BlfDscError, match=r'reference\.type: got hold'):
         postures_of(config)
+
+
+def test_gains_that_nobody_measured_are_told_where_a_robot_is_meant():
+    preset = blf.load_loop('fr3_direct').controller
+    assert 'nobody has measured' in not_commissioned(preset)
+    measured = {'commissioning.date': '2026-11-25 12:00'}
+    assert not_commissioned(change(preset, measured)) == ''
+    stiffer = change(preset, measured | {'feedback.stiffness': 2.0})
+    assert '2 times the gains for which' in not_commissioned(stiffer)
+    # of the paper's arm; of an arm that is known to be unknown (another warning)
+    assert not_commissioned(blf.load_loop('recommended').controller) == ''
+    unknown = {'robot.urdf': preset.robot.text, 'robot.tip': 'fr3_link8'}
+    soft = build(ControllerConfig, unknown)
+    assert not_commissioned(soft) == ''
+    assert any('blf_dsc commission' in each for each in config_warnings(soft))
+
+
+def test_loop_of_ones_own_logs_it_without_a_warning(caplog):
+    with caplog.at_level(logging.INFO):
+        blf.ArmController('fr3_direct').close()
+    (line,) = [each for each in caplog.records if 'nobody has measured' in each.message]
+    assert line.levelno == logging.INFO

@@ -10,6 +10,7 @@ pytest.importorskip('rclpy', reason='needs ROS 2')
 
 from ros_rig import JOINTS, START, FakeClock, PatientClock
 
+from blf_dsc_controller.configuration.files import share_folder
 from blf_dsc_controller.messages import topics
 from blf_dsc_controller.messages.codecs import (
     Float64MultiArrayEncoder,
@@ -121,3 +122,59 @@ def test_torques_of_the_watchdog_do_not_count_as_those_of_another_controller(ros
 
     ros.until(go_on)
     assert not law.finished
+
+
+# A URDF's arm with gains that somebody has given.
+URDF_ARM = {
+    'robot.urdf': (share_folder() / 'config' / 'two_link.urdf').read_text(),
+    'robot.gravity': [0.0, 0.0, 0.0],
+    'feedback.joint_stiffness': [40.0, 20.0],
+    'feedback.joint_damping': [6.0, 2.0],
+    'reference.type': 'hold',
+}
+
+
+@pytest.mark.parametrize(
+    ('given', 'told'),
+    [
+        ({}, 1),
+        ({'commissioning.date': '2026-11-25 12:00'}, 0),
+    ],
+)
+def test_gains_that_nobody_measured_are_told_once_where_a_robot_sends_states(
+    ros, given, told
+):
+    log = ros.listen(LOG)
+    law = ros.add(ControllerNode, URDF_ARM | given)
+    states = ros.publisher(topics.JOINT_STATES)
+    ros.driver()
+    ros.until(states.get_subscription_count)
+    encoder = JointStateEncoder(JOINTS)
+    stamps = iter(range(10**9, 10**12, 10**6))
+    starts = []
+
+    def go_on():
+        states.publish(encoder.encode(next(stamps), START, np.zeros(2), np.zeros(2)))
+        ros.spin(0.005)  # it takes each state
+        return law.guard.supervisor.running or law.finished
+
+    for _ in range(2):
+        ros.until(go_on)
+        starts.append(law.guard.start_stamp)
+        law._on_second()
+        law.guard.reset()
+    assert starts[0] < starts[1]
+    ros.spin(0.1)
+    lines = [line.msg for line in log if 'nobody has measured' in line.msg]
+    assert len(lines) == told
+    assert all('`blf_dsc commission`' in line for line in lines)
+
+
+def test_gains_of_a_simulated_arm_need_no_measuring(ros):
+    log = ros.listen(LOG)
+    arm, law = ros.loop(controller=URDF_ARM)
+    ros.run(arm, 20)
+    law._on_second()
+    ros.spin(0.1)
+    assert law.guard.start_stamp > 0  # it has begun
+    assert not [line for line in log if 'nobody has measured' in line.msg]

@@ -7,7 +7,6 @@ import sys
 import textwrap
 from argparse import Namespace
 from collections.abc import Sequence
-from datetime import datetime
 from pathlib import Path
 
 import numpy as np
@@ -149,9 +148,8 @@ def _from_bags(options: Namespace) -> tuple[list[str], list[Measured]]:
 
 def _told(options: Namespace, found: Commissioned) -> Sequence[str]:
     """Return what was commissioned and when, and the sentences of the page; wrapped."""
-    today = datetime.now().astimezone().strftime('%Y-%m-%d %H:%M')
     origin = (
-        f'{options.config} commissioned on {today} by blf_dsc_controller {__version__}, with a '
+        f'{options.config} commissioned on {found.date} by blf_dsc_controller {__version__}, with '
         f'modulus margin of {found.choice.margin.value:.2g}'
     )
     told = [origin, *page.sentences(found, options.margin)]

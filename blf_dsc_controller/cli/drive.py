@@ -27,6 +27,7 @@ from blf_dsc_controller.errors import BlfDscError, ConfigurationError
 from blf_dsc_controller.reference.approach import end_of_waypoints
 from blf_dsc_controller.supervision.config_warnings import config_warnings
 from blf_dsc_controller.supervision.expected_errors import expectation
+from blf_dsc_controller.supervision.not_commissioned import not_commissioned
 
 CODES = {
     End.DURATION: 0,
@@ -44,7 +45,8 @@ def drive(options: Namespace) -> int:
     path = locate(options.config)
     config = load(path, CONTROLLER, ControllerConfig)
     driver = driver_of(options.robot, path, config)
-    for warning in config_warnings(config):
+    unmeasured = not_commissioned(config)
+    for warning in [*config_warnings(config), *([unmeasured] if unmeasured else [])]:
         print_notice(f'warning: {warning}')
     if config.model == 'urdf':
         print(f'errors to expect: {expectation(config)}')

@@ -4,11 +4,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from datetime import datetime
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from blf_dsc_controller import __version__
 from blf_dsc_controller.arms.joint_gains import JointGains, damped_arm, unknown_arm
 from blf_dsc_controller.arms.model import inertia_matrices
 from blf_dsc_controller.arms.tuning import Design
@@ -56,6 +58,7 @@ class Commissioned(NamedTuple):
     findings: Findings
     assumed: Floats  # (n,) kg m^2, inertias by URDF and guess, where findings has them
     lag: float  # s, robot.lag: measured, else as given
+    date: str  # when the gains were chosen
 
     def parameters(self) -> dict[str, Value]:
         """Return the parameters that follow, by dotted name."""
@@ -66,6 +69,9 @@ class Commissioned(NamedTuple):
             'feedback.joint_stiffness': _rounded(gains.stiffness),
             'feedback.joint_damping': _rounded(gains.damping),
             'feedback.stiffness': 1.0,
+            'commissioning.date': self.date,
+            'commissioning.version': __version__,
+            'commissioning.margin': float(f'{self.choice.margin.value:.3g}'),
         }
 
 
@@ -161,6 +167,7 @@ def commissioned(
         findings=found,
         assumed=here.max(axis=0),
         lag=config.robot.lag if np.isnan(lag) else lag,
+        date=datetime.now().astimezone().strftime('%Y-%m-%d %H:%M'),
     )
 
 

@@ -62,6 +62,7 @@ _in_window = partial(
 )
 _at_start = partial(parameter, read_only='it has no effect later')
 _known = partial(parameter, read_only='it is known data, not a gain')
+_measured = partial(parameter, read_only='it says how the gains were found')
 _FOLLOWED = 'the other gains follow from it when they are read: change those'
 _from_urdf = partial(non_negative, (), read_only=_FOLLOWED, omittable=True)
 _RISE = 0.05  # s to the largest acceleration
@@ -690,6 +691,20 @@ class Contact:
     )
 
 
+@dataclass(frozen=True)
+class CommissionedGains:
+    """When and with what result the gains were chosen by measuring the arm."""
+
+    date: str = _measured(
+        '',
+        'when `blf_dsc commission` measured the arm and chose the gains; empty: never',
+    )
+    version: str = _measured('', 'version of this package that chose them')
+    margin: float = _measured(
+        0.0, 'modulus margin that they have in all postures measured', at_least=0.0
+    )
+
+
 LAWS = ('blf_dsc', 'model_based', 'backstepping', 'slotine_li')
 """Laws of the package; the first is the default."""
 
@@ -722,6 +737,7 @@ class ControllerConfig(ArmConfig):
     truth: KnownArm = KnownArm()
     safety: Safety = Safety()
     telemetry: Telemetry = Telemetry()
+    commissioning: CommissionedGains = CommissionedGains()
 
     @classmethod
     def variant(cls, given: Mapping[str, Any]) -> type[ControllerConfig]:

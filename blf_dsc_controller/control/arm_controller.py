@@ -28,6 +28,7 @@ from blf_dsc_controller.messages.journal import MOTIONS
 from blf_dsc_controller.reference.trajectory import Trajectory, TrajectoryPoint
 from blf_dsc_controller.supervision.drive_load import DriveLoad
 from blf_dsc_controller.supervision.guard import Guard
+from blf_dsc_controller.supervision.not_commissioned import not_commissioned
 from blf_dsc_controller.supervision.supervisor import Phase
 
 Vector = NDArray[np.float64]
@@ -77,7 +78,8 @@ class ArmController:
     state that fails to arrive is noticed with the next one.  A recorded bag is that of
     a run over ROS: `blf_dsc` reports, plots, replays and identifies from it.  If it
     cannot be written any further, as on a full disk, the loop goes on without it:
-    `output_problem`.
+    `output_problem`.  Whether somebody has measured that the arm bears its gains is
+    logged at level INFO, since the arm may be simulated.
 
     Attributes:
         config: the configuration in force.
@@ -115,6 +117,8 @@ class ArmController:
         self._shift: int | None = None  # ns, of the stamps
         self._told_turns: set[str] = set()
         self._loop.guard.activate()
+        if text := not_commissioned(config):
+            logging.getLogger(__name__).info(text)
 
     def __enter__(self) -> ArmController:
         return self

@@ -31,6 +31,7 @@ from blf_dsc_controller.nodes.watchdog_presence import WatchdogPresence
 from blf_dsc_controller.reference.approach import end_of_waypoints
 from blf_dsc_controller.supervision.config_warnings import config_warnings, worsened
 from blf_dsc_controller.supervision.guard import Guard
+from blf_dsc_controller.supervision.not_commissioned import not_commissioned
 from blf_dsc_controller.supervision.reference_load import ReferenceLoad, reference_load
 from blf_dsc_controller.supervision.start_gate import GateState, StartGate
 from blf_dsc_controller.supervision.state_check import rate_mismatch
@@ -69,6 +70,7 @@ class ControllerNode(LoopNode[ControllerConfig]):
         self._polled = 0  # joint states at the last poll
         self._gate = StartGate(self.config.sample_time)
         self._warned_at = -1  # stamp of the start that the last warning was about
+        self._told_gains = False  # that nobody has measured whether the arm bears them
         self._turned_at = -1  # likewise, of the last reference shifted by turns
         # whether the tracking errors had subscribers at the last count
         self._errors_subscribed = False
@@ -446,14 +448,19 @@ class ControllerNode(LoopNode[ControllerConfig]):
             self._load_service.look()
         super()._on_second()
         guard = self.guard
-        if (
-            guard is not None
-            and guard.watchdog.why_off
-            and guard.start_stamp != self._warned_at
-        ):
+        if guard is not None and guard.start_stamp != self._warned_at:
             self._warned_at = guard.start_stamp
-            if not self._is_simulated():  # which waits in lock-step
-                self.get_logger().warning(guard.watchdog.why_off)
+            if not self._is_simulated():
+                self._warn_of_start(guard)
+
+    def _warn_of_start(self, guard: Guard) -> None:
+        """Say what matters to a robot, and not to a simulated arm, which waits in lock-step."""
+        if guard.watchdog.why_off:
+            self.get_logger().warning(guard.watchdog.why_off)
+        text = not_commissioned(self.config)
+        if text and not self._told_gains:
+            self._told_gains = True
+            self.get_logger().warning(text)
 
     def _look_for_watchdog(self) -> None:
         commands = self._outputs.get(topics.COMMANDS)

@@ -1,0 +1,32 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What to say before a robot moves with gains that were not found by measuring it."""
+
+from __future__ import annotations
+
+from blf_dsc_controller.configuration.controller import LAWS, ControllerConfig
+
+
+def not_commissioned(config: ControllerConfig) -> str:
+    """Return that the gains were not measured, with what to do; empty if nothing is to be said.
+
+    It is for robots: nobody measures a simulated arm, or the two links of the paper.
+    Gains of an arm of which nothing is known are warned of in any case
+    (`gear_warnings`).
+    """
+    feedback = config.feedback
+    if config.model != 'urdf' or config.law != LAWS[0]:
+        return ''
+    if config.commissioning.date:
+        if feedback.stiffness <= 1.0:
+            return ''
+        return (
+            f'feedback.stiffness: {feedback.stiffness:g} times the gains for which this arm was '
+            f'commissioned ({config.commissioning.date}): give 1 at most, or measure it again'
+        )
+    is_unknown = not (feedback.joint_stiffness or config.robot.joint_stiffness)
+    if feedback.inertia == 'none' and is_unknown:
+        return ''
+    return (
+        'commissioning: nobody has measured whether this arm bears its gains: '
+        '`blf_dsc commission` does, and chooses gains with a margin'
+    )
