@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from blf_dsc_controller.analysis.figures import draw as draw
     from blf_dsc_controller.analysis.metrics import measure as measure
     from blf_dsc_controller.bags.reader import read_run as read_run
+    from blf_dsc_controller.commissioning.own_loop import Commissioning as Commissioning
     from blf_dsc_controller.configuration.controller import (
         ControllerConfig as ControllerConfig,
     )
@@ -36,6 +37,7 @@ __version__ = '0.1.0'
 
 _PUBLIC = {
     'ArmController': 'control.arm_controller',
+    'Commissioning': 'commissioning.own_loop',
     'ControllerConfig': 'configuration.controller',
     'PlantConfig': 'configuration.plant',
     'Run': 'run',

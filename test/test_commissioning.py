@@ -9,6 +9,7 @@ from functools import cache
 import numpy as np
 import pytest
 
+import blf_dsc_controller as blf
 from blf_dsc_controller.arms.joint_gains import JointGains, linear
 from blf_dsc_controller.arms.linear_loop import (
     Joints,
@@ -180,8 +181,8 @@ def test_steps_of_the_encoders_are_found_and_told():
     coarse = replace(run, position=step * np.rint(run.position / step))
     seen = commissioned(CONFIG, [(coarse, config)])
     np.testing.assert_allclose(seen.findings.resolution, step, rtol=1e-9)
-    assert 'positions in steps of 1.5 mrad' in next(sentences(seen, 0.5))
-    assert 'steps' not in next(sentences(found(), 0.5))
+    assert 'positions in steps of 1.5 mrad' in next(sentences(seen))
+    assert 'steps' not in next(sentences(found()))
 
 
 def test_chosen_gains_have_the_margin_of_the_true_loop_and_twice_of_them_do_not():
@@ -272,6 +273,38 @@ def test_no_gains_have_a_margin_if_noise_hides_the_response():
     choice = choose(loops, start, start.scaled)
     assert choice.margin.value < 0.5
     assert (choice.factors < 0.1).all()
+
+
+def test_loop_of_ones_own_has_the_same_motions_and_gains():
+    commissioning = blf.Commissioning(CONFIG, [POSTURE, (0.8, 0.5)])
+    motion, other = commissioning.motions
+    assert motion.config == planned().config
+    np.testing.assert_array_equal(other.posture, (0.8, 0.5))
+    result = commissioning.result([simulated.measured(motion, ARM)])
+    expected = found().parameters() | {'commissioning.date': result.date}
+    assert result.parameters() == expected
+    config = blf.change(CONFIG, result.parameters())
+    assert config.feedback.joint_damping == expected['feedback.joint_damping']
+
+
+def test_gains_without_the_margin_are_no_parameters():
+    """No loop has a modulus margin above 1: its gain vanishes at high frequencies."""
+    run = simulated.measured(planned(), ARM)
+    result = blf.Commissioning(CONFIG, margin=1.1).result([run])
+    assert not result.has_margin
+    assert any('NO GAINS HAVE THE MARGIN of 1.1' in each for each in sentences(result))
+    with pytest.raises(BlfDscError, match=r'no gains have the modulus margin of 1\.1'):
+        result.parameters()
+
+
+def test_gains_far_from_those_of_the_measurement_are_to_be_raised_in_steps():
+    least = found()
+    choice = least.choice._replace(factors=np.array([2.0, 6.0]))
+    told = list(sentences(least._replace(choice=choice)))
+    assert any('joint2 gets 6 times the gains it was measured' in each for each in told)
+    choice = least.choice._replace(factors=np.array([2.0, 4.0]))
+    told = sentences(least._replace(choice=choice))
+    assert not any('times the gains it was measured' in each for each in told)
 
 
 def test_bags_of_the_written_motions_commission_as_the_simulated_arm(tmp_path, capsys):

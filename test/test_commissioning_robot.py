@@ -183,7 +183,7 @@ def test_nothing_moves_unless_somebody_agrees(arm, capsys, monkeypatch):
     [
         (['--write', 'm.yaml'], (NEAR,), '--write measures nothing'),
         ([], ((0.3, 2.99),), 'joint2 would be at 2.99 rad, less than 0.05 rad from'),
-        ([], ((0.3, 1.1, 0.0),), 'got 3 angles, but the arm has 2 joints'),
+        ([], (NEAR, (0.3, 1.1, 0.0)), 'got 3 angles, but the arm has 2 joints'),
     ],
 )
 def test_what_cannot_be_measured_is_refused_before_anything_moves(
@@ -203,16 +203,12 @@ def test_another_robot_is_refused(arm, capsys):
 
 
 def driven(arm, cls=PlantDriver):
-    """Return a robot, with its configuration."""
+    """Return a robot that is connected."""
     config = blf.load_loop(arm).controller
     driver = cls('plant', config, DriveConfig())
     driver.arm = arm
     driver.connect()
-
-    def motion_at(posture):
-        return plan(config, posture[None])[0]
-
-    return Driven(driver, config, arm.with_name('bags'), motion_at), config
+    return Driven(driver, blf.Commissioning(config), arm.with_name('bags'))
 
 
 def test_arm_that_moves_is_not_measured(arm):
@@ -223,14 +219,14 @@ def test_arm_that_moves_is_not_measured(arm):
             self.pushed += 0.01
             return super().positions() + np.array([0.0, self.pushed])
 
-    robot, _ = driven(arm, Pushed)
+    robot = driven(arm, Pushed)
     with pytest.raises(BlfDscError, match=r'joint2 moves by \+0\.01 rad in 0\.2 s'):
         next(robot.runs(np.array([NEAR])))
     assert PlantDriver.last.calls == ['connect']
 
 
 def test_request_between_two_runs_starts_no_other(arm):
-    robot, _ = driven(arm)
+    robot = driven(arm)
     robot.request_end()
     with pytest.raises(EndedError, match='move 1: ended on request') as caught:
         next(robot.runs(np.array([NEAR])))

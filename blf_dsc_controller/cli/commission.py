@@ -9,22 +9,21 @@ from argparse import Namespace
 from collections.abc import Sequence
 from pathlib import Path
 
-import numpy as np
 from tqdm import tqdm
 
 from blf_dsc_controller import __version__
-from blf_dsc_controller.bags.content import read_content
-from blf_dsc_controller.bags.reader import read_run
-from blf_dsc_controller.cli.commission_robot import (
-    measured_on_robot,
-    planned_around,
-)
+from blf_dsc_controller.cli.commission_robot import measured_on_robot
 from blf_dsc_controller.cli.drive import CODES
 from blf_dsc_controller.cli.main import make_room
 from blf_dsc_controller.cli.run import print_notice
 from blf_dsc_controller.commissioning import files, page, simulated
-from blf_dsc_controller.commissioning.commissioning import Commissioned, commissioned
-from blf_dsc_controller.commissioning.driven import EndedError, Measured
+from blf_dsc_controller.commissioning.commissioning import Commissioned
+from blf_dsc_controller.commissioning.driven import EndedError
+from blf_dsc_controller.commissioning.own_loop import (
+    Commissioning,
+    Measured,
+    measured_in,
+)
 from blf_dsc_controller.compiled.announcement import announced_compilation
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.nodes import (
@@ -46,24 +45,30 @@ NO_MARGIN = 3
 def commission(options: Namespace) -> int:
     """Write the motions to run, or measure, choose and write the gains."""
     path = locate(options.config)
-    config = load(path, CONTROLLER, ControllerConfig)
     _check(options)
+    commissioning = Commissioning(
+        load(path, CONTROLLER, ControllerConfig),
+        options.posture,
+        torque=options.torque,
+        travel=options.travel,
+        margin=options.margin,
+    )
     if options.write:
-        _write_motions(options, path, config)
+        _write_motions(options, path, commissioning)
         return 0
     picture = options.out.with_suffix('.png')
     make_room(options.out, picture, force=options.force)
     try:
-        names, runs = _all_runs(options, path, config)
+        names, runs = _all_runs(options, path, commissioning)
     except EndedError as error:
         print(f'blf_dsc commission: {error}', file=sys.stderr)
         return CODES[error.end]
-    found = commissioned(config, runs, options.margin)
+    found = commissioning.result(runs)
     lines = _told(options, found)
     print('\n'.join([page.table(found), '', *lines]))
-    page.draw(found, names, options.margin, picture)
+    page.draw(found, names, picture)
     print(f'wrote {picture}')
-    if found.choice.margin.value < options.margin:
+    if not found.has_margin:
         print(f'not written: {options.out}')
         return NO_MARGIN
     comment = ''.join(f'# {line}\n' for line in lines)
@@ -85,22 +90,25 @@ def _check(options: Namespace) -> None:
 
 
 def _all_runs(
-    options: Namespace, path: Path, config: ControllerConfig
+    options: Namespace, path: Path, commissioning: Commissioning
 ) -> tuple[list[str], list[Measured]]:
     """Return names and runs: of bags, of the robot or both, else of the simulated arm."""
     if not (options.bags or options.robot):
-        return _simulated(options, path)
-    names, runs = _from_bags(options)
+        return _simulated(path, commissioning)
+    names = [str(bag) for bag in options.bags]
+    runs = [measured_in(bag) for bag in options.bags]
     if options.robot:
-        for name, run in measured_on_robot(options, path, config):
+        for name, run in measured_on_robot(options, path, commissioning):
             names.append(name)
             runs.append(run)
     return names, runs
 
 
-def _write_motions(options: Namespace, path: Path, config: ControllerConfig) -> None:
+def _write_motions(
+    options: Namespace, path: Path, commissioning: Commissioning
+) -> None:
     """Write a parameter file for each motion, and say how far it goes."""
-    planned = planned_around(options, config)
+    planned = commissioning.motions
     sections = read(path)
     paths = [
         options.write.with_name(f'{options.write.stem}_{k}.yaml')
@@ -117,11 +125,12 @@ def _write_motions(options: Namespace, path: Path, config: ControllerConfig) -> 
     )
 
 
-def _simulated(options: Namespace, path: Path) -> tuple[list[str], list[Measured]]:
+def _simulated(
+    path: Path, commissioning: Commissioning
+) -> tuple[list[str], list[Measured]]:
     """Return names and runs of the motions on the simulated arm."""
     loop = load_loop(path)
-    here = np.array(loop.plant.initial.position)
-    planned = planned_around(options, loop.controller, here)
+    planned = commissioning.motions_from(loop.plant.initial.position)
     for k, each in enumerate(planned, 1):
         print(f'posture {k}: {page.description(each)}')
     names, runs = [], []
@@ -137,22 +146,13 @@ def _simulated(options: Namespace, path: Path) -> tuple[list[str], list[Measured
     return names, runs
 
 
-def _from_bags(options: Namespace) -> tuple[list[str], list[Measured]]:
-    """Return names and runs of bags."""
-    runs = []
-    for bag in options.bags:
-        content = read_content(bag)
-        runs.append((read_run(bag), content.controller_config()))
-    return [str(bag) for bag in options.bags], runs
-
-
 def _told(options: Namespace, found: Commissioned) -> Sequence[str]:
     """Return what was commissioned and when, and the sentences of the page; wrapped."""
     origin = (
         f'{options.config} commissioned on {found.date} by blf_dsc_controller {__version__}, with '
-        f'modulus margin of {found.choice.margin.value:.2g}'
+        f'a modulus margin of {found.choice.margin.value:.2g}'
     )
-    told = [origin, *page.sentences(found, options.margin)]
+    told = [origin, *page.sentences(found)]
     return [line for each in told for line in textwrap.wrap(each, _WIDTH)]
 
 

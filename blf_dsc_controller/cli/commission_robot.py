@@ -6,46 +6,26 @@ from __future__ import annotations
 import sys
 from argparse import Namespace
 from collections.abc import Iterator
-from functools import partial
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from blf_dsc_controller.cli.drive import driver_of, signals_to
 from blf_dsc_controller.cli.main import make_room
 from blf_dsc_controller.cli.run import print_notice
 from blf_dsc_controller.commissioning import page
-from blf_dsc_controller.commissioning.commissioning import (
-    Planned,
-    plan,
-    postures_of,
-)
-from blf_dsc_controller.commissioning.driven import SPEED, Driven, Measured
+from blf_dsc_controller.commissioning.commissioning import Planned
+from blf_dsc_controller.commissioning.driven import SPEED, Driven
+from blf_dsc_controller.commissioning.own_loop import Commissioning, Measured
 from blf_dsc_controller.compiled.announcement import announced_compilation
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.control.arm_controller import ArmController
 from blf_dsc_controller.control.realtime import request_realtime
 from blf_dsc_controller.errors import BlfDscError
 
-Floats = NDArray[np.float64]
-
-
-def planned_around(
-    options: Namespace, config: ControllerConfig, here: Floats | None = None
-) -> list[Planned]:
-    """Return the motions in the postures given, or those that the reference visits.
-
-    The arm is at `here` (n,) [rad], if that is known.
-    """
-    postures = np.array(options.posture) if options.posture else None
-    if postures is None:
-        postures = postures_of(config, here=here)
-    return plan(config, postures, torque=options.torque, travel=options.travel)
-
 
 def measured_on_robot(
-    options: Namespace, path: Path, config: ControllerConfig
+    options: Namespace, path: Path, commissioning: Commissioning
 ) -> list[tuple[str, Measured]]:
     """Measure the robot, and return for each posture its name and what was measured.
 
@@ -59,14 +39,14 @@ def measured_on_robot(
         )
     folder = options.record or options.out.with_name(f'{options.out.stem}_bags')
     make_room(folder, force=False)
+    config = commissioning.config
     driver = driver_of(options.robot, path, config)
-    motion_at = partial(_motion_at, options, config)
     with announced_compilation(print_notice):
         ArmController(config).close()
     for remark in driver.connect():
         print_notice(remark)
-    driven = Driven(driver, config, folder, motion_at)
-    planned = planned_around(options, config, driven.position())
+    driven = Driven(driver, commissioning, folder)
+    planned = commissioning.motions_from(driven.position())
     print('\n'.join(_limits(options, config, planned, driven.duration(planned))))
     if not options.yes and input('Type yes to start: ').strip().lower() != 'yes':
         raise BlfDscError('not started: nothing has moved')
@@ -83,15 +63,6 @@ def _followed(driven: Driven, planned: list[Planned]) -> Iterator[tuple[str, Mea
     for k, measured in enumerate(driven.runs(postures), 1):
         print(f'{k} of {total} postures measured', flush=True)
         yield measured
-
-
-def _motion_at(
-    options: Namespace, config: ControllerConfig, posture: Floats
-) -> Planned:
-    (motion,) = plan(
-        config, posture[None], torque=options.torque, travel=options.travel
-    )
-    return motion
 
 
 def _limits(

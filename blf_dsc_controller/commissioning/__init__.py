@@ -11,6 +11,7 @@ joints, and from these the stiffest gains with a margin.
     choice          gains by the modulus margin, at all postures measured
     findings        inertias, lags, resonances: what the arm is, beside what was assumed
     commissioning   the three steps in a row
+    own_loop        all of it for a loop of your own: `blf.Commissioning`
     simulated       the runs of a simulated arm
     driven          the runs of a robot over its driver, from posture to posture
     page            what was found and chosen, for people

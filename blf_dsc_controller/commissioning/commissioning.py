@@ -59,9 +59,23 @@ class Commissioned(NamedTuple):
     assumed: Floats  # (n,) kg m^2, inertias by URDF and guess, where findings has them
     lag: float  # s, robot.lag: measured, else as given
     date: str  # when the gains were chosen
+    aim: float  # the modulus margin that was asked for
+
+    @property
+    def has_margin(self) -> bool:
+        """Whether the chosen gains have the modulus margin."""
+        return self.choice.margin.value >= self.aim
 
     def parameters(self) -> dict[str, Value]:
-        """Return the parameters that follow, by dotted name."""
+        """Return the parameters that follow, by dotted name.
+
+        Raises BlfDscError if no gains have the margin.
+        """
+        if not self.has_margin:
+            raise BlfDscError(
+                f'no gains have the modulus margin of {self.aim:g}: noise or friction hide the '
+                'response. Measure again with more torque or travel'
+            )
         gains = self.choice.gains
         return {
             'robot.lag': float(f'{self.lag:.3g}'),
@@ -168,6 +182,7 @@ def commissioned(
         assumed=here.max(axis=0),
         lag=config.robot.lag if np.isnan(lag) else lag,
         date=datetime.now().astimezone().strftime('%Y-%m-%d %H:%M'),
+        aim=margin,
     )
 
 

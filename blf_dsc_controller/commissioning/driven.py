@@ -11,7 +11,7 @@ around the posture in which the arm rests by then, so it begins without an error
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from blf_dsc_controller.bags.reader import read_run
 from blf_dsc_controller.commissioning import motion
 from blf_dsc_controller.commissioning.commissioning import Planned
+from blf_dsc_controller.commissioning.own_loop import Commissioning, Measured
 from blf_dsc_controller.commissioning.response import response_of
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.schema import change
@@ -30,12 +31,8 @@ from blf_dsc_controller.drive.loop import DriveLoop, End
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.reference.approach import AT_REST
 from blf_dsc_controller.reference.turns import short_way
-from blf_dsc_controller.run import Run
 
 Floats = NDArray[np.float64]
-
-Measured = tuple[Run, ControllerConfig]
-"""The run of a motion, with its parameters."""
 
 SPEED = 0.3
 """Largest speed of a joint on the way to a posture [rad/s]."""
@@ -88,18 +85,14 @@ class Driven:
     def __init__(
         self,
         driver: Driver,
-        config: ControllerConfig,
+        commissioning: Commissioning,
         folder: Path,
-        motion_at: Callable[[Floats], Planned],
     ) -> None:
-        """Use a connected driver, and write bags into `folder`.
-
-        `motion_at` returns the motion around a posture (n,) [rad].
-        """
+        """Use a connected driver, and write bags into `folder`."""
         self._driver = driver
-        self._config = config
+        self._commissioning = commissioning
+        self._config = commissioning.config
         self._folder = folder
-        self._motion_at = motion_at
         self._measured = 0
         self._loop: DriveLoop | None = None
         self._requests = 0
@@ -149,7 +142,7 @@ class Driven:
             name = f'posture {k}'
             way = move(self._config, self.position(), posture)
             self._run(way.config, way.duration, f'move {k}')
-            here = self._motion_at(self.position())
+            here = self._commissioning.motion(self.position())
             bag = self._run(here.config, here.duration, name)
             run = read_run(bag)
             try:

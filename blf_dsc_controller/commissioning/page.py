@@ -20,6 +20,7 @@ Floats = NDArray[np.float64]
 _COLOURS = (BLUE, ORANGE, MUTED, ALARM)
 _SIZE = (5.6, 3.4)  # inches, of a panel
 _MUCH = 0.1  # of the margin, by noise
+_FAR = 5.0  # times the gains of the measurement: friction may act otherwise on theirs
 
 
 def description(planned: Planned) -> str:
@@ -65,7 +66,7 @@ def table(found: Commissioned) -> str:
     return aligned(rows)
 
 
-def sentences(found: Commissioned, aim: float) -> Iterator[str]:
+def sentences(found: Commissioned) -> Iterator[str]:
     """Yield what was found, what limits the gains, and what to do about it."""
     arm = found.findings
     states = f'joint states at {arm.rate:.4g} Hz, jitter {1e3 * arm.jitter:.2g} ms'
@@ -92,10 +93,10 @@ def sentences(found: Commissioned, aim: float) -> Iterator[str]:
         f'margin is {limit.value:.2g}; that of the gains it was measured with is '
         f'{choice.measured.value:.2g} at {choice.measured.frequency:.2g} Hz'
     )
-    if limit.value < aim:
+    if not found.has_margin:
         yield (
-            f'NO GAINS HAVE THE MARGIN of {aim:g}: noise or friction hide the response. Measure '
-            'again with a larger --torque or --travel'
+            f'NO GAINS HAVE THE MARGIN of {found.aim:g}: noise or friction hide the response. '
+            'Measure again with a larger --torque or --travel'
         )
     doubt = _doubt_at(found)
     if doubt > _MUCH:
@@ -103,9 +104,16 @@ def sentences(found: Commissioned, aim: float) -> Iterator[str]:
             f'noise costs {doubt:.2g} of the margin: a larger --torque may show that the arm '
             'bears more'
         )
+    most = float(choice.factors.max())
+    if most > _FAR:
+        joint = found.joints[int(choice.factors.argmax())]
+        yield (
+            f'{joint} gets {most:.2g} times the gains it was measured with: raise '
+            'feedback.stiffness from 0.25 to 1 in steps, or measure again with this file at 0.25'
+        )
     yield (
-        'measured at '
-        f'{len(found.responses)} postures: with another load or far from these, measure again'
+        f'measured in {len(found.responses)} runs: with another load, or far from their postures, '
+        'measure again'
     )
 
 
@@ -117,7 +125,7 @@ def _doubt_at(found: Commissioned) -> float:
     return float(doubt[int(np.abs(at - limit.frequency).argmin())])
 
 
-def draw(found: Commissioned, names: Sequence[str], aim: float, path: Path) -> None:
+def draw(found: Commissioned, names: Sequence[str], path: Path) -> None:
     """Draw the margins of measured and chosen gains, and the response of each joint."""
     title = 'Commissioning: what the arm bears'
     n = len(found.joints)
@@ -134,7 +142,7 @@ def draw(found: Commissioned, names: Sequence[str], aim: float, path: Path) -> N
             f = response.frequency
             axes.semilogx(f, value, color=colour, label=name)
             axes.fill_between(f, value - doubt, value, color=colour, alpha=0.2, lw=0.0)
-        axes.axhline(aim, color=ALARM, lw=1.0, ls='--')
+        axes.axhline(found.aim, color=ALARM, lw=1.0, ls='--')
         axes.axvspan(axes.get_xlim()[0], SLOWEST, color=SHADE, alpha=0.5, lw=0.0)
         axes.set_ylim(0.0, 1.5)
         axes.set_title(f'least singular value of I + L, gains {label}', loc='left')

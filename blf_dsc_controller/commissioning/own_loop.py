@@ -1,0 +1,135 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Commissioning of an arm in a loop of your own."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from blf_dsc_controller.bags.content import read_content
+from blf_dsc_controller.bags.reader import read_run
+from blf_dsc_controller.commissioning.choice import MARGIN
+from blf_dsc_controller.commissioning.commissioning import (
+    TORQUE,
+    TRAVEL,
+    Commissioned,
+    Planned,
+    commissioned,
+    plan,
+    postures_of,
+)
+from blf_dsc_controller.configuration.controller import ControllerConfig
+from blf_dsc_controller.configuration.nodes import CONTROLLER, load, locate
+from blf_dsc_controller.run import Run
+
+Measured = tuple[Run, ControllerConfig]
+"""The run of a motion, with its parameters."""
+
+
+class Commissioning:
+    """The motions by which an arm from a URDF is measured, and the gains that follow.
+
+    Run each motion from rest, near its posture, and record it::
+
+        commissioning = Commissioning('my.yaml')
+        for k, motion in enumerate(commissioning.motions):
+            with ArmController(motion.config, record=f'run_{k}') as controller:
+                ...  # update, for motion.duration [s]
+        found = commissioning.result(['run_0', 'run_1', 'run_2'])
+        controller = ArmController(change(commissioning.config, found.parameters()))
+
+    Attributes:
+        config: the configuration that the arm is measured for.
+        margin: modulus margin of the gains to choose.
+    """
+
+    def __init__(
+        self,
+        config: ControllerConfig | str | Path,
+        postures: Sequence[ArrayLike] | None = None,
+        *,
+        torque: float = TORQUE,
+        travel: float = TRAVEL,
+        margin: float = MARGIN,
+    ) -> None:
+        """Prepare the motions for a configuration, file or preset.
+
+        Args:
+            config: of an arm from a URDF, with gains that hold it, if only softly.
+            postures: some, each (n,) [rad]; without them, three that the reference visits.
+            torque: of a motion, rms, as a share of the rated torque, at most.
+            travel: how far the tool moves from its middle, at most [m].
+            margin: modulus margin of the gains.
+
+        Raises:
+            ConfigurationError: with all problems of the file.
+        """
+        if not isinstance(config, ControllerConfig):
+            config = load(locate(config), CONTROLLER, ControllerConfig)
+        self.config = config
+        self.margin = margin
+        self._postures = postures
+        self._torque = torque
+        self._travel = travel
+
+    @cached_property
+    def motions(self) -> list[Planned]:
+        """The motions: each has `config`, `duration` [s] and `posture` (n,) [rad].
+
+        Raises:
+            BlfDscError: the arm is not from a URDF, has feedback through its inertia
+                matrix, or a posture is not one of this arm or too near its limits; or
+                none is given, and the reference visits none.
+        """
+        return self.motions_from(None)
+
+    def motions_from(self, here: ArrayLike | None) -> list[Planned]:
+        """Return the motions of an arm at `here` (n,) [rad]: all that a reference to hold visits.
+
+        Raises:
+            BlfDscError: as for `motions`.
+        """
+        postures = self._postures
+        if postures is None:
+            at = None if here is None else np.asarray(here, float)
+            postures = list(postures_of(self.config, here=at))
+        return [self.motion(each) for each in postures]
+
+    def motion(self, posture: ArrayLike) -> Planned:
+        """Return the motion around a posture (n,) [rad], such as that of the arm at rest.
+
+        Raises:
+            BlfDscError: the posture is not one of this arm, or too near its limits.
+        """
+        around = np.asarray(posture, float)[None]
+        (motion,) = plan(self.config, around, torque=self._torque, travel=self._travel)
+        return motion
+
+    def result(self, runs: Sequence[str | Path | Measured]) -> Commissioned:
+        """Return what runs of motions show, and the gains that follow.
+
+        Args:
+            runs: folders of bags, or runs with the configurations that they had.
+
+        Raises:
+            BagError: a bag cannot be read.
+            BlfDscError: a run is not of this arm or no motion of a commissioning, ended
+                before its time, or lacks joint states.
+        """
+        measured = [
+            each if isinstance(each, tuple) else measured_in(each) for each in runs
+        ]
+        return commissioned(self.config, measured, self.margin)
+
+
+def measured_in(bag: str | Path) -> Measured:
+    """Return the run of a bag, with its parameters.
+
+    Raises BagError if it cannot be read, or has none.
+    """
+    content = read_content(Path(bag))
+    return read_run(bag), content.controller_config()
