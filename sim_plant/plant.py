@@ -11,7 +11,7 @@ from __future__ import annotations
 import functools
 import math
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, TypeVar, get_type_hints
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -20,7 +20,7 @@ from blf_dsc_controller.arms.two_link import PARAMETER_NAMES, urdf
 from blf_dsc_controller.arms.urdf import Chain, inertia_of, moved, pseudo_inertia
 from blf_dsc_controller.compiled.entry import Entry
 from blf_dsc_controller.compiled.jit import direct
-from blf_dsc_controller.compiled.layout import pack
+from blf_dsc_controller.compiled.layout import filled, pack
 from blf_dsc_controller.configuration.plant import Deviation, PlantConfig
 from blf_dsc_controller.configuration.robot import parameters_of
 from sim_plant.arm import (
@@ -65,8 +65,6 @@ from sim_plant.springs import (
     rigid,
     stiffness_of,
 )
-
-T = TypeVar('T')
 
 _RESOLVED = 1.5  # decay within a step; the integrator is stable up to 3.3
 _MOST_STEPS = 1000
@@ -348,21 +346,21 @@ def plant_settings(config: PlantConfig) -> PlantSettings:
         events=len(events.begin),
         bodies_size=bodies.size,
         memory_size=motion_size(arm) if bodies.size else 0,
-        encoders=_filled(
+        encoders=filled(
             Encoders,
             sensor,
             velocity_source=VELOCITY_SOURCES[sensor.velocity],
             side=SIDES[sensor.side],
             eccentricity=np.array(sensor.eccentricity or np.zeros(n)),
         ),
-        disturbance=_filled(
+        disturbance=filled(
             Disturbance,
             friction,
             ripple=actuator.ripple * np.array(actuator.torque_limit),
             ripple_frequency=actuator.ripple_cycles,
             warm_samples=friction.warm_time / T,
         ),
-        drives=_filled(
+        drives=filled(
             Drives,
             actuator,
             decay=decay,
@@ -374,7 +372,7 @@ def plant_settings(config: PlantConfig) -> PlantSettings:
             jump=actuator.reflex_rate * T,
             bodies=bodies,
         ),
-        load=_filled(
+        load=filled(
             Load,
             config.load,
             sensor,
@@ -431,17 +429,6 @@ def _steps_of(config: PlantConfig, arm: Arm, slope: np.ndarray) -> int:
         arm.accelerate(0.0, position, rest, torque, ddq[1])
         rate = max(rate, float(slope[i] * (ddq[1, i] - ddq[0, i])))
     return min(max(1, math.ceil(config.sample_time * rate / _RESOLVED)), _MOST_STEPS)
-
-
-def _filled(layout: type[T], *groups: object, **computed: object) -> T:
-    """Return a layout with the parameters named as its fields, and what is computed."""
-    given = {
-        name: np.array(value) if isinstance(value, tuple) else value
-        for group in groups
-        for name, value in vars(group).items()
-        if name in get_type_hints(layout)
-    }
-    return layout(**given | computed)
 
 
 def _schedule_of(config: PlantConfig) -> Events:

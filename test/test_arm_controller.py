@@ -127,7 +127,7 @@ def test_law_takes_what_it_commanded_for_efforts_that_are_not_given():
 def test_interval_of_the_load_covers_95_percent():
     """1.96 standard deviations of a normal distribution on each side."""
     controller = blf.ArmController('panda')
-    load = controller.guard.controller.state.load
+    load = controller.guard.controller.state.weighing.load
     load[0], load[DEVIATION] = 2.0, 0.1
     assert controller.load == (2.0, pytest.approx(0.196))
     load[DEVIATION] = 0.0

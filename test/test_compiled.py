@@ -17,6 +17,7 @@ import sys
 import tempfile
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Annotated, NamedTuple
 
 import mpmath
@@ -43,6 +44,7 @@ from blf_dsc_controller.compiled.layout import (
     Array,
     Cell,
     Passed,
+    filled,
     pack,
     size_of,
     source_of,
@@ -137,7 +139,8 @@ def test_kernel_of_a_law_depends_on_its_file_and_on_no_other_law(monkeypatch):
 
 FOLDERS = """
 from blf_dsc_controller.compiled import kernel_cache
-from blf_dsc_controller.law.controller import update, weigh
+from blf_dsc_controller.law.controller import update
+from blf_dsc_controller.law.perception import weigh
 from blf_dsc_controller.simulation.compiled_loop import run_loop
 from sim_plant.plant import run_plant
 
@@ -373,6 +376,7 @@ class Sized(NamedTuple):
     count: int
     motor: Motor
     gains: Annotated[Array, 'joints', 'columns + 1']
+    delayed: Annotated[Array, 'motor.delay']
 
 
 class State(NamedTuple):
@@ -393,7 +397,7 @@ def advance(vector, joints, state_vector):
     state.ring[settings.motor.delay - 1, settings.joints - 1] = settings.gains[
         0, settings.columns
     ]
-    return settings.motor.limit.sum() + settings.count
+    return settings.motor.limit.sum() + settings.count + settings.delayed.sum()
 
 
 compiled_advance = jit.kernel(advance)
@@ -405,19 +409,30 @@ def test_kernels_and_python_see_the_same_layout_of_every_size():
         gains = np.arange(1.0, 1.0 + joints * (columns + 1)).reshape(
             joints, columns + 1
         )
-        sized = Sized(joints, columns, 0.5, count, Motor(np.arange(joints), 4), gains)
+        sized = Sized(
+            joints, columns, 0.5, count, Motor(np.arange(joints), 4), gains, np.ones(4)
+        )
         vector = pack(sized)
-        assert vector.size == 4 + joints + gains.size
+        assert vector.size == 4 + joints + gains.size + 4
         view = sized_of(vector, joints)
         assert view[:4] == (joints, columns, 0.5, count)
         np.testing.assert_array_equal(view.gains, gains)
+        np.testing.assert_array_equal(view.delayed, np.ones(4))
         for function in (advance, compiled_advance):
             state = np.zeros(state_size(view))
-            assert function(vector, joints, state) == sum(range(joints)) + count
+            assert function(vector, joints, state) == sum(range(joints)) + count + 4
             last = 1 + 4 * joints - 1
             assert (state[0], state[last]) == (0.5, columns + 1.0)
             assert np.count_nonzero(state) == 2
     assert len(compiled_advance.signatures) == (0 if numba.config.DISABLE_JIT else 1)
+
+
+def test_layout_is_filled_with_parameters_of_the_same_names():
+    """What is computed goes before; a switch is a number in the vector."""
+    group = SimpleNamespace(limit=(2.0, 3.0), delay=True, unknown='not a field')
+    motor = filled(Motor, group)
+    np.testing.assert_array_equal(pack(motor), [2.0, 3.0, 1.0])
+    assert filled(Motor, group, delay=7).delay == 7
 
 
 def test_generated_view_can_be_read():

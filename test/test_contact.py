@@ -19,7 +19,8 @@ from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.schema import build
 from blf_dsc_controller.control.arm_controller import ArmController
 from blf_dsc_controller.errors import ConfigurationError
-from blf_dsc_controller.law.external_torque import CONTACT, absorb
+from blf_dsc_controller.law.external_torque import absorb
+from blf_dsc_controller.law.perception import CONTACT
 from blf_dsc_controller.law.telemetry import sample_columns
 from blf_dsc_controller.law.tip_wrench import TipWrench
 from blf_dsc_controller.messages import topics

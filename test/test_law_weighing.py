@@ -12,25 +12,17 @@ from blf_dsc_controller.analysis.metrics_table import format_table
 from blf_dsc_controller.bags.reader import read_run
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.errors import ConfigurationError
-from blf_dsc_controller.law.factory import controller_of
 from blf_dsc_controller.law.innovation import (
     CORRELATION,
-    NOISE,
     normalized_square,
     start,
     update,
 )
 from blf_dsc_controller.law.telemetry import learned_arm, load_text, sample_columns
 from blf_dsc_controller.law.weighing import (
-    BEFORE,
     DEVIATION,
-    LATEST,
     MASS,
-    NEWER,
-    describe,
-    solve,
 )
-from blf_dsc_controller.law.window import add_products
 from blf_dsc_controller.numerics.algebra import cholesky_factor
 from blf_dsc_controller.replay.verify import verify
 from blf_dsc_controller.simulation.loop import simulate, write_bag
@@ -101,61 +93,6 @@ def test_no_torque_depends_on_it(panda):
     )
     np.testing.assert_array_equal(torque, other)
     assert not np.isfinite(weighed(without)[0]).any()
-
-
-def test_solution_is_the_joint_least_squares_of_arm_and_load(panda):
-    """As numpy solves the stacked rows with both priors; deviations from the inverse."""
-    controller = controller_of(panda.config)
-    settings = controller.settings
-    state = controller.state
-    random = np.random.default_rng(1)
-    n = settings.n
-    m = settings.m
-    ND = settings.load_columns[:m]
-    D = settings.load_scale
-    period = CORRELATION / 7.0
-    noise = 0.04
-    theta = settings.initial_estimate + 0.1 * random.normal(size=m)
-    z = random.normal(size=10)
-    blocks = []
-    parts = (
-        (BEFORE, 90, theta),
-        (NEWER, 40, theta + ND @ z),
-        (LATEST, 20, theta + ND @ z),
-    )
-    for part, rows, model in parts:
-        X = random.normal(size=(rows, n, m))
-        u = X @ model + noise * random.normal(size=(rows, n))
-        for row in np.concatenate((X, u[:, :, None]), axis=2):
-            add_products(row, state.weighed_sums[part])
-        state.weighed_rows[part] = rows
-        blocks.append((X.reshape(-1, m), u.ravel()))
-    state.weighed_complete[0] = 1.0
-    state.weighed_statistics[NOISE] = noise**2
-    case = settings, state, controller.signals, period
-    solve(*case)
-    a = 7.0 * noise**2
-    H = np.zeros((m + 10, m + 10))
-    H[:m, :m] = settings.information
-    H[m:, m:] = np.eye(10)
-    prior = np.append(settings.initial_estimate, np.zeros(10))
-    (X, u), *since = blocks
-    both = np.vstack(
-        [np.hstack([X, np.zeros((len(X), 10))])]
-        + [np.hstack([Xs, Xs @ ND]) for Xs, _ in since]
-    )
-    g = both.T @ np.concatenate([u, *(us for _, us in since)]) + a * H @ prior
-    H = both.T @ both + a * H
-    expected = np.linalg.solve(H, g)
-    np.testing.assert_allclose(state.weighed_solution, expected, rtol=1e-6, atol=1e-9)
-    describe(*case)
-    mass, *moments = D @ expected[m:]
-    centre = np.array(moments) / mass
-    C = a * D @ np.linalg.inv(H)[m:, m:] @ D.T
-    J = np.column_stack((-centre, np.eye(3))) / mass
-    np.testing.assert_allclose(state.load[:4], (mass, *centre), rtol=1e-6)
-    deviation = np.sqrt(np.append(C[0, 0], np.diag(J @ C @ J.T)))
-    np.testing.assert_allclose(state.load[4:], deviation, rtol=1e-5)
 
 
 CYCLE, CARRIED = 6.0, 3.0  # s, of pick and place, and with the load

@@ -18,9 +18,10 @@ a vector, in order:
 Lengths are expressions in the attributes of the second argument, here `settings.n`,
 `settings.m` and `settings.N`; `'actuator.delay'` works as well, and any named tuple or
 object will do (a named tuple in kernels).  Fields of type `int` and `float` are
-numbers, read when the view is made.  An `int` field of the layout itself can also be a
-length; if the vector holds all lengths, the view takes the vector alone, and `pack`
-makes it from the tuple.  A field may itself be such a `NamedTuple`.  A field of any
+numbers, read when the view is made.  An `int` field of the layout itself, or of one in
+it, can be a length of those after it; if the vector holds all lengths, the view takes
+the vector alone, and `pack` makes it from the tuple.  A field may itself be such a
+`NamedTuple`, which `filled` makes from parameters of the same names.  A field of any
 other type, or of type `Passed`, is not in the vector: the view takes it as an argument.
 """
 
@@ -28,7 +29,7 @@ from __future__ import annotations
 
 import functools
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from typing import Annotated, Any, TypeVar, get_type_hints
 
 import numpy as np
@@ -60,6 +61,20 @@ def pack(layout: Any) -> np.ndarray:
         if _is_part(hint)
     ]
     return np.concatenate(parts)
+
+
+def filled(layout: type[T], *groups: object, **computed: object) -> T:
+    """Return a layout with the parameters named as its fields, and what is computed.
+
+    Parameters are the attributes of the `groups`; a switch becomes 0 or 1.
+    """
+    given = {
+        name: np.array(value) if isinstance(value, tuple) else value
+        for group in groups
+        for name, value in vars(group).items()
+        if name in _hints(layout)
+    }
+    return layout(**given | computed)
 
 
 def size_of(layout: type) -> Callable[..., int]:
@@ -99,10 +114,7 @@ def _view_arguments(layout: type) -> str:
 
 def _view_lines(layout: type) -> list[str]:
     """Return the statements of the view; no field's name starts with an underscore."""
-    hints = _hints(layout)
-    own = tuple(
-        name for name in hints if hints[name] is int or not _is_part(hints[name])
-    )
+    own = {name: name for name, hint in _hints(layout).items() if not _is_part(hint)}
     lines = ['_at = 0']
     result = _read(layout, own, lines, '')
     return [*lines, f'return _reference({result})']
@@ -117,18 +129,23 @@ def _tuples(layout: type, prefix: str) -> dict[str, Any]:
     return found
 
 
-def _read(layout: type, own: tuple[str, ...], lines: list[str], prefix: str) -> str:
-    """Append a statement for each field to `lines`; return the call that builds the tuple."""
+def _read(layout: type, own: dict[str, str], lines: list[str], prefix: str) -> str:
+    """Append a statement for each field to `lines`; return the call that builds the tuple.
+
+    `own` has the numbers that have been read and can be lengths: their local names.
+    """
     values = []
     for name, hint in _hints(layout).items():
-        local = f'{prefix}{name}'
+        path = f'{prefix}{name}'
+        local = path.replace('.', '_')
         if hasattr(hint, '_fields'):
-            values.append(f'{name}={_read(hint, own, lines, f"{local}_")}')
+            values.append(f'{name}={_read(hint, own, lines, f"{path}.")}')
             continue
         values.append(f'{name}={local}')
         if hint is int:
             lines.append(f'{local} = int(_vector[_at])')
             lines.append('_at += 1')
+            own[path] = local
         elif hint is float:
             lines.append(f'{local} = _vector[_at]')
             lines.append('_at += 1')
@@ -136,7 +153,8 @@ def _read(layout: type, own: tuple[str, ...], lines: list[str], prefix: str) -> 
             shape = [_length(length, own) for length in hint.__metadata__]
             lines.append(f'{local} = _part(_vector, _at, ({", ".join(shape)},))')
             lines.append(f'_at += {_product(shape)}')
-    return f'{prefix}{layout.__name__}({", ".join(values)})'
+    builds = f'{prefix}{layout.__name__}'.replace('.', '_')
+    return f'{builds}({", ".join(values)})'
 
 
 def _sizes(layout: type) -> Iterator[str]:
@@ -145,7 +163,7 @@ def _sizes(layout: type) -> Iterator[str]:
             yield from _sizes(hint)
         elif _is_part(hint):
             yield _product(
-                [_length(length, ()) for length in getattr(hint, '__metadata__', '1')]
+                [_length(length, {}) for length in getattr(hint, '__metadata__', '1')]
             )
 
 
@@ -156,11 +174,11 @@ def _is_part(hint: Any) -> bool:
     return hint in (int, float) or is_array or hasattr(hint, '_fields')
 
 
-def _length(expression: object, own: tuple[str, ...]) -> str:
-    """Return the length with names read from `_sizes`, except for the layout's own."""
+def _length(expression: object, own: Mapping[str, str]) -> str:
+    """Return the length with names read from `_sizes`, except for those in `own`."""
     return re.sub(
         r'[A-Za-z_][\w.]*',
-        lambda name: name[0] if name[0] in own else f'_sizes.{name[0]}',
+        lambda name: own.get(name[0], f'_sizes.{name[0]}'),
         str(expression),
     )
 

@@ -351,7 +351,7 @@ class ArmController:
     @property
     def load(self) -> Load:
         """What the tip has picked up since the first window, by weighing."""
-        values = self._loop.guard.controller.state.load
+        values = self._loop.guard.controller.state.weighing.load
         if values[DEVIATION] <= 0.0:
             return Load(math.nan, math.nan)
         return Load(float(values[0]), TWO_SIDED * float(values[DEVIATION]))

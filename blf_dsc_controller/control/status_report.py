@@ -10,7 +10,8 @@ import numpy as np
 
 from blf_dsc_controller.control.log import Log
 from blf_dsc_controller.control.motion_input import MotionInput
-from blf_dsc_controller.law.external_torque import DISTANCE
+from blf_dsc_controller.law.external_torque import is_touched
+from blf_dsc_controller.law.perception import DISTANCE
 from blf_dsc_controller.law.telemetry import load_text
 from blf_dsc_controller.messages.topics import LOAD, PHASE, REASON, REJECTED, STOPS
 from blf_dsc_controller.supervision.guard import Guard
@@ -64,7 +65,7 @@ class StatusReport:
         parts = [self._state(lifecycle, guard)]
         if guard is not None:
             parts += [self._loop(guard, others, missing), self._learning(guard)]
-            if guard.controller.settings.weighed:
+            if guard.controller.settings.weighing.size:
                 parts.append(_load(guard))
             if guard.config.contact.enabled:
                 parts.append(_contact(guard))
@@ -184,7 +185,7 @@ def _contact(guard: Guard) -> Part:
         }
     if not guard.supervisor.running:
         return 'contact', OK, 'not monitored: the law is not in command', values
-    if last is not None and guard.controller.state.contact[0] > 0.0:
+    if last is not None and is_touched(guard.controller.state.contact):
         return 'contact', WARN, last.text, values
     return 'contact', OK, 'nothing touches the arm', values
 

@@ -29,7 +29,8 @@ from math import isfinite, sqrt
 from blf_dsc_controller.compiled.jit import inner
 from blf_dsc_controller.compiled.layout import Array
 from blf_dsc_controller.compiled.views import part
-from blf_dsc_controller.law import friction, torque
+from blf_dsc_controller.law import friction
+from blf_dsc_controller.law.clipping import clip
 from blf_dsc_controller.law.state import NEWTON, Settings, Signals, State
 from blf_dsc_controller.numerics.algebra import cholesky_solve
 
@@ -184,7 +185,7 @@ def adapt(
     project(parameters, part(signals.rate, 0, (p,)), gain, settings.radius)
     for j in range(settings.m):
         estimate = state.estimate[j] + dt * signals.rate[j]
-        state.estimate[j] = torque.clip(estimate, settings.least[j], settings.most[j])
+        state.estimate[j] = clip(estimate, settings.least[j], settings.most[j])
     retract(parameters, gain, settings.radius)
     if not saturated:
         integrate(settings, state, signals, dt)

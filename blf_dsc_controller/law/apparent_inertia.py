@@ -31,7 +31,7 @@ learned acts there.
 import numpy as np
 
 from blf_dsc_controller.compiled.jit import inner
-from blf_dsc_controller.law import barrier
+from blf_dsc_controller.law.lag import filter_gain
 from blf_dsc_controller.law.state import Settings, Signals, State
 
 _SMOOTH = 0.5  # upper end of the band, times the sample rate
@@ -76,10 +76,10 @@ def begin(settings: Settings, state: State, signals: Signals) -> None:
 def pass_band(settings: Settings, state: State, signals: Signals, dt: float) -> None:
     """Write the torque in the band to `unit`, the acceleration to `band_acceleration`."""
     lags, dq = state.lags, signals.dq
-    late = barrier.filter_gain(0.5 * settings.lag, dt) if settings.lag > 0.0 else 1.0
-    smooth = barrier.filter_gain(dt / _SMOOTH, dt)
-    slow = barrier.filter_gain(dt / _SLOW, dt)
-    brief = barrier.filter_gain(_MEMORY, dt)
+    late = filter_gain(0.5 * settings.lag, dt) if settings.lag > 0.0 else 1.0
+    smooth = filter_gain(dt / _SMOOTH, dt)
+    slow = filter_gain(dt / _SLOW, dt)
+    brief = filter_gain(_MEMORY, dt)
     for i in range(settings.n):
         torque = low_pass(lags, _DRIVE, i, late, lags[_HELD, i])
         lags[_HELD, i] = signals.applied[i]

@@ -15,9 +15,9 @@ from typing import NamedTuple
 
 from blf_dsc_controller.compiled.jit import inner
 from blf_dsc_controller.law import adaptation, apparent_inertia, learning
+from blf_dsc_controller.law.clipping import clip
 from blf_dsc_controller.law.compensation import compensated
 from blf_dsc_controller.law.state import Settings, Signals, State
-from blf_dsc_controller.law.torque import clip
 
 
 class Backstepping(NamedTuple):

@@ -140,9 +140,3 @@ def virtual_slope(
         x = pi * ratio * ratio
         barrier_part = 0.5 * barrier_gain * (2.0 * cos(x) - sinc(x))
     return barrier_part + linear_gain
-
-
-@inner
-def filter_gain(time_constant: float, dt: float) -> float:
-    """Return the exact gain 1 - exp(-dt / time_constant) of a first-order lag with held input."""
-    return 1.0 - exp(-dt / time_constant)

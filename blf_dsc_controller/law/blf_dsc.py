@@ -30,10 +30,11 @@ from typing import NamedTuple
 
 from blf_dsc_controller.compiled.jit import inner
 from blf_dsc_controller.law import adaptation, apparent_inertia, barrier, learning
-from blf_dsc_controller.law.barrier import filter_gain, virtual_control
+from blf_dsc_controller.law.barrier import virtual_control
+from blf_dsc_controller.law.clipping import clip
 from blf_dsc_controller.law.compensation import compensated
+from blf_dsc_controller.law.lag import filter_gain
 from blf_dsc_controller.law.state import Settings, Signals, State
-from blf_dsc_controller.law.torque import clip
 
 
 class BlfDsc(NamedTuple):

@@ -15,7 +15,7 @@ was not fitted to.
 
 from blf_dsc_controller.compiled.jit import inner
 from blf_dsc_controller.compiled.layout import Array
-from blf_dsc_controller.law import adaptation, innovation, window
+from blf_dsc_controller.law import adaptation, innovation, sums, window
 from blf_dsc_controller.law.excitation import explained
 from blf_dsc_controller.law.state import Settings, Signals, State
 from blf_dsc_controller.numerics.algebra import cholesky_factor, cholesky_solve
@@ -149,11 +149,11 @@ def forget_window(settings: Settings, state: State) -> None:
     state.recent_residual[0] = 0.0
     state.rows[0] = 0.0
     state.cursor[0] = 0.0
-    window.clear(state.running)
-    window.clear(state.fresh)
-    window.clear(state.half)
-    window.clear(state.filter1)
-    window.clear(state.filter2)
+    sums.clear(state.running)
+    sums.clear(state.fresh)
+    sums.clear(state.half)
+    sums.clear(state.filter1)
+    sums.clear(state.filter2)
     for j in range(settings.m):
         state.anchor[j] = state.estimate[j]
     window.reset_direction(state)

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """One sample of the loop, and the controller: a law with explicit state, `reset`, and `update`.
 
-What the loop does for every law, and what a law does itself, is told in `interface`.
+See `interface` for what the loop does for every law, and what a law does itself.
 """
 
 from __future__ import annotations
@@ -32,11 +32,16 @@ from blf_dsc_controller.law.checks import (
     is_valid_state,
     watch_oscillation,
 )
-from blf_dsc_controller.law.external_torque import sense
 from blf_dsc_controller.law.friction import first_coulomb
 from blf_dsc_controller.law.interface import Law
 from blf_dsc_controller.law.laws import for_law
 from blf_dsc_controller.law.lyapunov import fill_energies
+from blf_dsc_controller.law.perception import (
+    sense,
+    sense_nothing,
+    weigh,
+    weigh_nothing,
+)
 from blf_dsc_controller.law.sensor import compare_velocities
 from blf_dsc_controller.law.state import (
     Sample,
@@ -52,7 +57,7 @@ from blf_dsc_controller.law.state import (
     state_size,
 )
 from blf_dsc_controller.law.torque import added_torque
-from blf_dsc_controller.law.weighing import DEVIATION, TWO_SIDED, weigh
+from blf_dsc_controller.law.weighing import DEVIATION, TWO_SIDED
 from blf_dsc_controller.reference import terms as reference
 
 
@@ -77,10 +82,11 @@ def fill_sample(
     sample.lambda_min[0] = state.lambda_min[0]
     sample.latched[0] = state.latched[0]
     sample.changes[0] = state.changes[0]
-    for k in range(state.load.size):
-        is_known = state.load[DEVIATION + k % DEVIATION] > 0.0
+    load = state.weighing.load
+    for k in range(load.size):
+        is_known = load[DEVIATION + k % DEVIATION] > 0.0
         factor = 1.0 if k < DEVIATION else TWO_SIDED
-        sample.load[k] = factor * state.load[k] if is_known else nan
+        sample.load[k] = factor * load[k] if is_known else nan
 
 
 @inner
@@ -186,30 +192,6 @@ def compare(
     return compare_velocities(checks, dt, measurement, settings.n)
 
 
-@kernel
-def weigh_nothing(
-    _model: ArmModel,
-    _settings_vector: Array,
-    _state_vector: Array,
-    _signals_vector: Array,
-    _dt: float,
-) -> None:
-    """Stand in for `weigh` where nothing is weighed."""
-
-
-@kernel
-def sense_nothing(
-    _model: ArmModel,
-    _settings_vector: Array,
-    _state_vector: Array,
-    _signals_vector: Array,
-    _sample_vector: Array,
-    dt: float,
-) -> bool:
-    """Stand in for `sense` where no external torque is found: no contact begins."""
-    return dt < 0.0  # not False, which is a type of its own
-
-
 class LawKernels(NamedTuple):
     """What a compiled loop calls of a controller."""
 
@@ -262,9 +244,9 @@ class Controller:
         )
         self._compared = (*self._vectors[:2], self.checks_vector, self._measurement)
         self._compare = direct(compare, *self._compared, 0.0)
-        if self.settings.weighed:
+        if self.settings.weighing.size:
             self._weigh = direct(weigh, *self._vectors[:4], 0.0)
-        if self.settings.senses:
+        if self.settings.contact.enabled:
             self._sense = direct(sense, *self._vectors[:5], 0.0)
         self.reset()
         self.reference_at(0.0)
@@ -277,8 +259,8 @@ class Controller:
         """The kernels of `update` and `perceive`, for a compiled loop."""
         law = self.law
         given = (*self._vectors, self.reference_vector, 0.0, 0.0, True)
-        weighs = weigh if self.settings.weighed else weigh_nothing
-        senses = sense if self.settings.senses else sense_nothing
+        weighs = weigh if self.settings.weighing.size else weigh_nothing
+        senses = sense if self.settings.contact.enabled else sense_nothing
         return LawKernels(
             Entry(for_law(update, law), law, *given),
             Entry(weighs, *self._vectors[:4], 0.0),
@@ -360,9 +342,11 @@ class Controller:
 
         It was `dt` [s] after the one before.  Returns whether a contact begins.
         """
-        if self.settings.weighed:
+        if self.settings.weighing.size:
             self._weigh(*self._vectors[:4], dt)
-        return bool(self.settings.senses and self._sense(*self._vectors[:5], dt))
+        return bool(
+            self.settings.contact.enabled and self._sense(*self._vectors[:5], dt)
+        )
 
     def take_over(self, torque: Array, q: Array) -> None:
         """Continue from a command (n,) [N m] that acts on an arm at q (n,) [rad].

@@ -27,7 +27,7 @@ large residual is pulled to an earlier solution, kept once per window.
 
 from blf_dsc_controller.compiled.jit import inner
 from blf_dsc_controller.compiled.layout import Array
-from blf_dsc_controller.law import window
+from blf_dsc_controller.law import sums, window
 from blf_dsc_controller.law.state import Settings, Signals, State
 from blf_dsc_controller.numerics.algebra import cholesky_factor, cholesky_solve
 
@@ -135,13 +135,13 @@ def agrees_with_parts(
     for k in range(3):
         if k == 0:
             rows = length - newer_rows
-            window.add(state.running, -1.0, signals.newer, signals.part)
+            sums.add(state.running, -1.0, signals.newer, signals.part)
         elif k == 1:
             rows = newer_rows
-            window.add(signals.newer, 0.0, signals.newer, signals.part)
+            sums.add(signals.newer, 0.0, signals.newer, signals.part)
         else:
             rows = length
-            window.add(state.running, 0.0, state.running, signals.part)
+            sums.add(state.running, 0.0, state.running, signals.part)
         window.average_window(signals.part, rows, signals.Phi, signals.b)
         if settings.prior_weight > 0.0:
             prior = settings.initial_estimate
@@ -153,7 +153,7 @@ def agrees_with_parts(
         return True
     state.split_residual[0] = residual
     state.rows[0] = float(newer_rows)
-    window.add(signals.newer, 0.0, signals.newer, state.running)
+    sums.add(signals.newer, 0.0, signals.newer, state.running)
     window.reset_direction(state)
     return False
 

@@ -20,127 +20,222 @@ reverse has an s^2 of its own.
 *A contact* is r with r^T S^-1 r > h^2, unless a load explains it.  A load in the tip with phi = D z
 adds X_L N D z (see `weighing`).  Once r is past h, z ~ (0, 1) is filtered from r, and only what is
 past h of S + X_L N D Cov(z) (X_L N D)^T is a contact: a load follows the arm in every posture and
-acceleration, another force does not.  Nor is a load lighter than nothing: an arm that is known to
+acceleration, another force does not.  A load cannot have negative mass: an arm that is known to
 hold no more than what z takes away presses on something.  A contact ends when r has stayed below
 half of h, or when a load has explained it for `_EXPLAINED`.  None is found before half a second
 after the first window.
 
-Everything here but the filter runs after the torque has been sent.
+`perception` calls these functions after the torque has been sent, except for the filter.
 """
 
 from math import sqrt
+from typing import Annotated, NamedTuple
 
-from blf_dsc_controller.arms.model import ArmModel
-from blf_dsc_controller.compiled.jit import inner, kernel
-from blf_dsc_controller.compiled.layout import Array
-from blf_dsc_controller.law import barrier, friction
-from blf_dsc_controller.law.state import (
-    Sample,
-    Settings,
-    Signals,
-    State,
-    sample_of,
-    settings_of,
-    signals_of,
-    state_of,
-)
-from blf_dsc_controller.law.torque import clip
-from blf_dsc_controller.law.weighing import DEVIATION, MASS, TWO_SIDED, is_first
+from blf_dsc_controller.compiled.jit import inner
+from blf_dsc_controller.compiled.layout import Array, Cell
+from blf_dsc_controller.law.clipping import clip
+from blf_dsc_controller.law.lag import filter_gain
 from blf_dsc_controller.numerics.algebra import cholesky_factor, whiten
 
-_LASTING = 0.2  # s, correlation length of r, as far as a load is concerned
-_FORGETTING = 1.0  # s, in which the filtered load returns to what is not known of it
+_LASTING = 0.2  # s, correlation time of r in the load filter
+_FORGETTING = 1.0  # s, in which the filtered load returns to its prior
 _FIRST = 0.5  # s since the first window, in which theta^ settles and s^2 is measured
 _CALM = 0.2  # s below half of the threshold, after which a contact is over
 _EXPLAINED = 0.5  # s, likewise for a load that explains it
-_SETTLED = 6.0  # time constants of the row filters, until learning goes on
 _REVERSING = 1.5  # `learning.coulomb_velocity`, below which a joint is about to reverse
 _AFTER = 3.0  # 1/L, for which it still counts as reversing
-_LEAST_NOISE = 0.01  # of the mean square of `residual_floor`
-_ASSUMED = 0.01  # of a window, for which `residual_floor` counts
-_MOST_NOISE = 4.0  # times the mean square: what more is in r counts as that
-_LIGHTER = 3.0  # standard deviations below nothing that no load is
+_LEAST_NOISE = 0.01  # of the mean square of the unmodelled torque
+_ASSUMED = 0.01  # of a window, for which the unmodelled torque counts
+_MOST_NOISE = 4.0  # times the mean square: r^2 is clipped at this multiple
+_LIGHTER = 3.0  # standard deviations below zero, from which a mass is negative
 
-CONTACT, DISTANCE = 0, 1  # in `sample.contact`
+QUIET, EXPLAINED, TOUCHED = range(3)
+"""Phases: r is small; it is large, but a load explains it; something touches the arm."""
+
+_STEADY, _REVERSAL = range(2)  # rows of `State.noise` and `State.samples`
+
+
+class Settings(NamedTuple):
+    """The parameters `contact.*`, and what they rest on."""
+
+    enabled: int  # 1: the external torque is found
+    bandwidth: float  # L, rad/s
+    threshold: float  # h
+    loads: int  # 1: what a load in the tip explains is no contact
+    freezes: int  # 1: nothing is learned while something touches the arm
+    window: int  # N, rows in a window of the learning
+    row_interval: int  # samples between two of them
+    coulomb_velocity: float  # rad/s
+    unmodelled: Annotated[Array, 'n']  # rms torque that no column describes, N m
+
+
+class State(NamedTuple):
+    """What it keeps from one sample to the next."""
+
+    filtered: Annotated[Array, 'n * contact.enabled', 'm + 1']  # [X_L | u_L]
+    latch_time: Cell  # s, when the window of `factor` was latched; 0: it is the prior's
+    factor: Annotated[Array, 'm * contact.enabled', 'm']  # of Phi_e + rho R, or of R
+    variance: Cell  # a: that times its inverse is the covariance of theta
+    # of r by theta, (N m)^2
+    covariance: Annotated[Array, 'n * contact.enabled', 'n']
+    spread: Annotated[Array, 'n * contact.enabled', 'n']  # factor of S
+    # s^2, in motion and at reversals, (N m)^2
+    noise: Annotated[Array, '2 * contact.enabled', 'n']
+    samples: Annotated[Array, '2 * contact.enabled', 'n']  # samples of that
+    # s, for which a joint still counts as reversing
+    reversing: Annotated[Array, 'n * contact.enabled']
+    load: Annotated[Array, '10 * contact.enabled']  # z, filtered from r
+    load_covariance: Annotated[Array, '10 * contact.enabled', 10]
+    torque: Annotated[Array, 'n * contact.enabled']  # r, N m
+    phase: Cell  # QUIET, EXPLAINED or TOUCHED
+    calm: Cell  # s, since r has been small
+    explained: Cell  # s, since a load has explained a contact
+
+
+class Work(NamedTuple):
+    """Scratch of one sample."""
+
+    rows: Annotated[Array, 'n * contact.enabled', 'm']  # X_L, whitened
+    white: Annotated[Array, 'n * contact.enabled']  # r, whitened
+    columns: Annotated[Array, 'n * contact.enabled', 10]  # X_L N D, whitened
+    load: Annotated[Array, '10 * contact.enabled']  # z by this sample alone
+    load_covariance: Annotated[Array, '10 * contact.enabled', 10]
+    gain: Annotated[Array, '10 * contact.enabled']
+
+
+class TipLoad(NamedTuple):
+    """How a load in the tip acts, and what is known to be held."""
+
+    columns: Array  # N D of `weighing`, (m + 1, 10)
+    scale: Array  # rows of D: mass [kg] and moments [kg m], (4, 10)
+    mass: float  # kg
+    deviation: float  # of the mass, kg; infinite where it is unknown
 
 
 @inner
 def filter_interval(
-    settings: Settings, state: State, signals: Signals, i: int, dt: float
+    settings: Settings, state: State, i: int, row: Array, friction: float, dt: float
 ) -> None:
-    """Pass [X | u] of joint i, before its other filters in `signals.row`, through the pole L.
+    """Pass [X | u] (m + 1,) of joint i in the last interval through the pole L.
 
-    What friction at breakaway adds to Coulomb friction is on the side of u.
+    `friction` [N m] is that which no column of X describes: it is on the side of u.
     """
-    if settings.senses == 0:
-        return
-    gain = barrier.filter_gain(1.0 / settings.contact_pole, dt)
-    felt = state.felt[i]
-    row = signals.row[i]
-    for j in range(settings.m + 1):
-        felt[j] += gain * (row[j] - felt[j])
-    if settings.coulomb == 1:
-        j = friction.first_coulomb(settings) + i
-        extra = state.estimate[j] * state.breakaway[i] * state.shape_lags[1, 0, i]
-        felt[settings.m] -= gain * extra
+    gain = filter_gain(1.0 / settings.bandwidth, dt)
+    filtered = state.filtered[i]
+    for j in range(row.size):
+        filtered[j] += gain * (row[j] - filtered[j])
+    filtered[row.size - 1] -= gain * friction
 
 
 @inner
-def know(settings: Settings, state: State) -> None:
-    """Keep the factor of the latched window, if it is full and new; before the first, that of R."""
-    m = settings.m
-    begins = state.samples[0] <= 1.0
-    is_full = state.rows[0] == settings.window and state.latched[0] == 1.0
-    if not begins and not (is_full and state.latch_time[0] != state.felt_latch[0]):
-        return
-    for i in range(m):
-        for j in range(i, m):
-            known = settings.information[i, j] if begins else state.factor[i, j]
-            state.felt_factor[i, j] = known
-    if begins:
-        cholesky_factor(state.felt_factor)
-        state.felt_variance[0] = 1.0
-        for i in range(settings.n):
-            floor = friction.unmodelled(settings, i)
-            for k in range(2):
-                state.felt_noise[k, i] = floor * floor
-        return
-    state.felt_latch[0] = state.latch_time[0]
-    excess = max(1.0, state.residual[0] / settings.residual_floor)
-    state.felt_variance[0] = settings.row_variance * excess
+def begin(settings: Settings, state: State, information: Array) -> None:
+    """Begin with the prior of theta, whose inverse covariance is R (m, m)."""
+    copy_upper(information, state.factor)
+    cholesky_factor(state.factor)
+    state.variance[0] = 1.0
+    for i in range(settings.unmodelled.size):
+        for k in range(2):
+            state.noise[k, i] = settings.unmodelled[i] * settings.unmodelled[i]
 
 
 @inner
-def find_spread(settings: Settings, state: State, signals: Signals) -> None:
-    """Write the covariance of r by theta to `state.felt_doubt` (n, n), and the factor of S."""
-    m = settings.m
-    n = settings.n
-    U = state.felt_factor
-    for i in range(n):
-        y = signals.felt_rows[i]
-        for k in range(m):
-            y[k] = state.felt[i, k]
-        whiten(U, y)
-    for i in range(n):
-        for other in range(i, n):
-            total = 0.0
-            for k in range(m):
-                total += signals.felt_rows[i, k] * signals.felt_rows[other, k]
-            state.felt_doubt[i, other] = state.felt_variance[0] * total
-            state.felt_spread[i, other] = state.felt_doubt[i, other]
-        state.felt_spread[i, i] += state.felt_noise[regime(state, i), i]
-    cholesky_factor(state.felt_spread)
+def update_covariance(
+    state: State, factor: Array, variance: float, latch_time: float
+) -> None:
+    """Take the covariance of theta from a window latched at `latch_time` [s].
+
+    It is the `variance` of rows that count, times the inverse of the matrix of which
+    `factor` (m, m) is.
+    """
+    copy_upper(factor, state.factor)
+    state.variance[0] = variance
+    state.latch_time[0] = latch_time
+
+
+@inner
+def copy_upper(source: Array, target: Array) -> None:
+    """Copy the upper triangle of a matrix."""
+    for i in range(source.shape[0]):
+        for j in range(i, source.shape[0]):
+            target[i, j] = source[i, j]
+
+
+@inner
+def update_torque(state: State, estimate: Array) -> None:
+    """Compute r = X_L theta^ - u_L."""
+    m = estimate.size
+    for i in range(state.torque.size):
+        r = -state.filtered[i, m]
+        for j in range(m):
+            r += state.filtered[i, j] * estimate[j]
+        state.torque[i] = r
+
+
+@inner
+def follow_reversals(settings: Settings, state: State, dqr: Array, dt: float) -> None:
+    """Note which joints are about to reverse, by the velocity dqr (n,) of the reference."""
+    lasts = _AFTER / settings.bandwidth
+    for i in range(dqr.size):
+        is_slow = abs(dqr[i]) < _REVERSING * settings.coulomb_velocity
+        left = state.reversing[i] - dt
+        state.reversing[i] = lasts if is_slow else max(0.0, left)
 
 
 @inner
 def regime(state: State, i: int) -> int:
-    """Return 1 for a joint that reverses, else 0: the row of its noise."""
-    return 1 if state.felt_reversing[i] > 0.0 else 0
+    """Return the row of the noise of joint i, which depends on whether it reverses."""
+    return _REVERSAL if state.reversing[i] > 0.0 else _STEADY
+
+
+@inner
+def variance_of(state: State, i: int) -> float:
+    """Return the variance of r of joint i [(N m)^2]."""
+    return float(state.covariance[i, i] + state.noise[regime(state, i), i])
+
+
+@inner
+def update_spread(state: State, work: Work) -> None:
+    """Compute the covariance of r by theta, and the factor of S."""
+    n, m = work.rows.shape
+    for i in range(n):
+        for k in range(m):
+            work.rows[i, k] = state.filtered[i, k]
+        whiten(state.factor, work.rows[i])
+    for i in range(n):
+        for other in range(i, n):
+            total = 0.0
+            for k in range(m):
+                total += work.rows[i, k] * work.rows[other, k]
+            state.covariance[i, other] = state.variance[0] * total
+            state.spread[i, other] = state.covariance[i, other]
+        state.spread[i, i] += state.noise[regime(state, i), i]
+    cholesky_factor(state.spread)
+
+
+@inner
+def whiten_torque(state: State, work: Work) -> float:
+    """Whiten r by the factor of S; return its length, the distance of r from zero."""
+    for i in range(state.torque.size):
+        work.white[i] = state.torque[i]
+    return sqrt(whiten(state.spread, work.white))
+
+
+@inner
+def is_settled(state: State, dt: float) -> bool:
+    """Whether theta^ has settled since the first window, and s^2 is measured."""
+    seen = state.samples[_STEADY, 0] + state.samples[_REVERSAL, 0]
+    return bool(state.latch_time[0] > 0.0 and seen * dt >= _FIRST)
+
+
+@inner
+def is_touched(state: State) -> bool:
+    """Whether something touches the arm."""
+    return bool(state.phase[0] == TOUCHED)
 
 
 @inner
 def absorb(
-    columns: Array, e: Array, noise: float, z: Array, doubt: Array, work: Array
+    columns: Array, e: Array, noise: float, z: Array, covariance: Array, work: Array
 ) -> float:
     """Update z and its covariance by e = columns z + white noise of variance `noise`.
 
@@ -155,202 +250,180 @@ def absorb(
             innovation -= columns[i, a] * z[a]
             work[a] = 0.0
             for b in range(size):
-                work[a] += doubt[a, b] * columns[i, b]
+                work[a] += covariance[a, b] * columns[i, b]
             variance += columns[i, a] * work[a]
         square += innovation * innovation / variance
         for a in range(size):
             z[a] += work[a] * innovation / variance
             for b in range(size):
-                doubt[a, b] -= work[a] * work[b] / variance
+                covariance[a, b] -= work[a] * work[b] / variance
     return square
 
 
 @inner
 def forget_load(state: State) -> None:
-    """Return to a load of which only the prior is known."""
-    for a in range(state.felt_load.size):
-        state.felt_load[a] = 0.0
-        for b in range(state.felt_load.size):
-            state.felt_load_doubt[a, b] = 1.0 if a == b else 0.0
+    """Return to the prior of the load."""
+    for a in range(state.load.size):
+        state.load[a] = 0.0
+        for b in range(state.load.size):
+            state.load_covariance[a, b] = 1.0 if a == b else 0.0
 
 
 @inner
-def distance_from_load(
-    settings: Settings, state: State, signals: Signals, dt: float
-) -> float:
-    """Return how far r is from what any load in the tip explains; filter the load from it.
-
-    `signals.felt_white` is r, whitened.
-    """
-    n = settings.n
-    columns = signals.felt_columns
+def fill_load_columns(state: State, work: Work, load_columns: Array) -> None:
+    """Compute -X_L N D, whitened: the load is missing in X theta^ = u + r."""
+    n, m = work.rows.shape
+    columns = work.columns
     for a in range(columns.shape[1]):
         for i in range(n):
             columns[i, a] = 0.0
-            for j in range(settings.m):
-                # the load is missing in X theta^ = u + r
-                columns[i, a] -= state.felt[i, j] * settings.load_columns[j, a]
+            for j in range(m):
+                columns[i, a] -= state.filtered[i, j] * load_columns[j, a]
         for k in range(n):
-            columns[k, a] *= state.felt_spread[k, k]
+            columns[k, a] *= state.spread[k, k]
             for i in range(k + 1, n):
-                columns[i, a] -= state.felt_spread[k, i] * columns[k, a]
-    size = state.felt_load.size
+                columns[i, a] -= state.spread[k, i] * columns[k, a]
+
+
+@inner
+def filter_load(state: State, work: Work, dt: float) -> float:
+    """Filter the load from r, whitened; return how far r is from what any load explains."""
+    size = state.load.size
     fade = min(1.0, dt / _FORGETTING)
     for a in range(size):
-        state.felt_load[a] -= fade * state.felt_load[a]
-        signals.felt_trial[a] = state.felt_load[a]
+        state.load[a] -= fade * state.load[a]
+        work.load[a] = state.load[a]
         for b in range(size):
             prior = 1.0 if a == b else 0.0
-            state.felt_load_doubt[a, b] += fade * (prior - state.felt_load_doubt[a, b])
-            signals.felt_trial_doubt[a, b] = state.felt_load_doubt[a, b]
-    e = signals.felt_white
-    work = signals.felt_work
-    square = absorb(columns, e, 1.0, signals.felt_trial, signals.felt_trial_doubt, work)
-    absorb(columns, e, _LASTING / dt, state.felt_load, state.felt_load_doubt, work)
+            state.load_covariance[a, b] += fade * (prior - state.load_covariance[a, b])
+            work.load_covariance[a, b] = state.load_covariance[a, b]
+    square = absorb(
+        work.columns, work.white, 1.0, work.load, work.load_covariance, work.gain
+    )
+    absorb(
+        work.columns,
+        work.white,
+        _LASTING / dt,
+        state.load,
+        state.load_covariance,
+        work.gain,
+    )
     return sqrt(square)
 
 
 @inner
-def is_lighter_than_nothing(settings: Settings, state: State) -> bool:
-    """Whether the filtered load takes away more than is held, as far as that is known."""
-    held = state.load[MASS]
-    deviation = state.load[DEVIATION]
-    if deviation == 0.0 and not is_first(state):
-        return False
-    mass = 0.0
-    square = deviation * deviation
-    for a in range(state.felt_load.size):
-        mass += settings.load_scale[0, a] * state.felt_load[a]
-        for b in range(state.felt_load.size):
-            square += (
-                settings.load_scale[0, a]
-                * settings.load_scale[0, b]
-                * state.felt_load_doubt[a, b]
-            )
-    return bool(held + mass < -_LIGHTER * sqrt(square))
+def is_negative_mass(mass: float, variance: float) -> bool:
+    """Whether a mass [kg] is below zero beyond doubt, with its variance [kg^2]."""
+    return bool(mass < -_LIGHTER * sqrt(variance))
 
 
 @inner
-def remaining_distance(
-    settings: Settings, state: State, signals: Signals, dt: float, distance: float
-) -> float:
-    """Return the distance of r from the arm with a load, or its `distance` without one."""
-    if settings.expects_loads == 0:
-        return distance
-    explained = distance_from_load(settings, state, signals, dt)
-    if is_lighter_than_nothing(settings, state):
-        return distance
-    return explained
+def takes_away_too_much(state: State, load: TipLoad) -> bool:
+    """Whether the filtered load takes away more mass than is held."""
+    mass = load.mass
+    variance = load.deviation * load.deviation
+    for a in range(state.load.size):
+        mass += load.scale[0, a] * state.load[a]
+        for b in range(state.load.size):
+            scale = load.scale[0, a] * load.scale[0, b]
+            variance += scale * state.load_covariance[a, b]
+    return is_negative_mass(mass, variance)
 
 
 @inner
-def judge(
-    settings: Settings, state: State, signals: Signals, dt: float, distance: float
+def explain_by_load(
+    settings: Settings,
+    state: State,
+    work: Work,
+    load: TipLoad,
+    distance: float,
+    dt: float,
 ) -> float:
-    """Update whether something touches the arm; return the distance that counts."""
-    threshold = settings.contact_threshold
-    if distance <= (0.5 if state.contact[0] == 1.0 else 1.0) * threshold:
-        state.contact_explained[0] = 0.0
-        state.contact_calm[0] += dt
-        if state.contact[0] == 0.0 or state.contact_calm[0] >= _CALM:
-            state.contact[0] = 0.0
-            forget_load(state)
+    """Return the distance of r from what a load explains, or its `distance` without one."""
+    if settings.loads == 0:
         return distance
-    state.contact_calm[0] = 0.0
-    remaining = remaining_distance(settings, state, signals, dt, distance)
+    fill_load_columns(state, work, load.columns)
+    remaining = filter_load(state, work, dt)
+    return distance if takes_away_too_much(state, load) else remaining
+
+
+@inner
+def is_small(phase: float, distance: float, threshold: float) -> bool:
+    """Whether r is too small for a contact, or for one that lasts."""
+    return bool(distance <= (0.5 if phase == TOUCHED else 1.0) * threshold)
+
+
+@inner
+def next_phase(
+    phase: float,
+    distance: float,
+    remaining: float,
+    calm: float,
+    explained: float,
+    threshold: float,
+) -> int:
+    """Return the phase that follows.
+
+    r is at a `distance`, which a load leaves `remaining`.  It has been small for `calm`
+    [s]; a load has explained a contact for `explained` [s].
+    """
+    if is_small(phase, distance, threshold):
+        return TOUCHED if phase == TOUCHED and calm < _CALM else QUIET
     if remaining > threshold:
-        state.contact[0] = 1.0
-        state.contact_explained[0] = 0.0
+        return TOUCHED
+    return TOUCHED if phase == TOUCHED and explained < _EXPLAINED else EXPLAINED
+
+
+@inner
+def update_contact(
+    settings: Settings,
+    state: State,
+    work: Work,
+    load: TipLoad,
+    distance: float,
+    dt: float,
+) -> float:
+    """Update the phase; return the distance of r from what explains it."""
+    phase = state.phase[0]
+    remaining = distance
+    if is_small(phase, distance, settings.threshold):
+        state.calm[0] += dt
+        state.explained[0] = 0.0
+    else:
+        state.calm[0] = 0.0
+        remaining = explain_by_load(settings, state, work, load, distance, dt)
+        is_explained = phase == TOUCHED and not remaining > settings.threshold
+        state.explained[0] = state.explained[0] + dt if is_explained else 0.0
+    state.phase[0] = next_phase(
+        phase,
+        distance,
+        remaining,
+        state.calm[0],
+        state.explained[0],
+        settings.threshold,
+    )
+    if state.phase[0] == QUIET or remaining > settings.threshold:
         forget_load(state)
-        return remaining
-    if state.contact[0] == 1.0:
-        state.contact_explained[0] += dt
-        if state.contact_explained[0] >= _EXPLAINED:
-            state.contact[0] = 0.0
     return remaining
 
 
 @inner
-def measure_noise(settings: Settings, state: State) -> None:
-    """Update the mean square of r that theta leaves, over a window, while nothing touches.
+def update_noise(settings: Settings, state: State) -> None:
+    """Update s^2, over a window, from the first one on while nothing touches the arm.
 
-    At first it is the mean since the first window, with `residual_floor` as a small
-    part of it.
+    At first it is the mean since the first window, with the unmodelled torque as a
+    small part of it.
     """
+    if state.latch_time[0] == 0.0 or is_touched(state):
+        return
     least = 1.0 / (settings.window * settings.row_interval)
-    for i in range(settings.n):
+    first = _ASSUMED * settings.window * settings.row_interval
+    for i in range(state.torque.size):
         k = regime(state, i)
-        noise = state.felt_noise[k]
-        state.felt_count[k, i] += 1.0
-        first = _ASSUMED * settings.window * settings.row_interval
-        share = max(least, 1.0 / (first + state.felt_count[k, i]))
-        floor = friction.unmodelled(settings, i)
-        left = state.external[i] * state.external[i] - state.felt_doubt[i, i]
+        noise = state.noise[k]
+        state.samples[k, i] += 1.0
+        share = max(least, 1.0 / (first + state.samples[k, i]))
+        floor = settings.unmodelled[i] * settings.unmodelled[i]
+        left = state.torque[i] * state.torque[i] - state.covariance[i, i]
         noise[i] += share * (clip(left, 0.0, _MOST_NOISE * noise[i]) - noise[i])
-        noise[i] = max(noise[i], _LEAST_NOISE * floor * floor)
-
-
-@inner
-def feel(
-    settings: Settings, state: State, signals: Signals, dt: float, sample: Sample
-) -> bool:
-    """Find r of the last sample, its interval, and whether something touches the arm.
-
-    Returns whether a contact begins.
-    """
-    if settings.senses == 0:
-        return False
-    n = settings.n
-    know(settings, state)
-    reversing = _AFTER / settings.contact_pole
-    for i in range(n):
-        r = -state.felt[i, settings.m]
-        for j in range(settings.m):
-            r += state.felt[i, j] * state.estimate[j]
-        state.external[i] = r
-        signals.felt_white[i] = r
-        is_slow = abs(signals.dqr[i]) < _REVERSING * settings.coulomb_velocity
-        left = state.felt_reversing[i] - dt
-        state.felt_reversing[i] = reversing if is_slow else max(0.0, left)
-    samples = int(state.samples[0])
-    interval = settings.row_interval
-    if samples <= 1 or samples % interval == interval // 4:
-        find_spread(settings, state, signals)
-    was = state.contact[0]
-    distance = sqrt(whiten(state.felt_spread, signals.felt_white))
-    is_known = state.felt_latch[0] > 0.0
-    if is_known:
-        seen = state.felt_count[0, 0] + state.felt_count[1, 0]
-        if seen * dt >= _FIRST:
-            distance = judge(settings, state, signals, dt, distance)
-        if state.contact[0] == 0.0:
-            measure_noise(settings, state)
-    if settings.freezes == 1 and state.contact[0] == 1.0:
-        state.frozen[0] = _SETTLED / settings.pole
-    for i in range(n):
-        variance = state.felt_doubt[i, i] + state.felt_noise[regime(state, i), i]
-        sample.external[i] = state.external[i]
-        sample.external_interval[i] = TWO_SIDED * sqrt(variance)
-    sample.contact[CONTACT] = state.contact[0]
-    sample.contact[DISTANCE] = distance
-    return bool(state.contact[0] > was)
-
-
-@kernel
-def sense(
-    model: ArmModel,
-    settings_vector: Array,
-    state_vector: Array,
-    signals_vector: Array,
-    sample_vector: Array,
-    dt: float,
-) -> bool:
-    """Run `feel` on packed vectors: of the last sample, `dt` [s] long."""
-    settings = settings_of(settings_vector, model)
-    return feel(
-        settings,
-        state_of(state_vector, settings),
-        signals_of(signals_vector, settings),
-        dt,
-        sample_of(sample_vector, settings),
-    )
+        noise[i] = max(noise[i], _LEAST_NOISE * floor)

@@ -34,11 +34,11 @@ from blf_dsc_controller.arms.model import (
 from blf_dsc_controller.arms.serial_chain import ROTOR
 from blf_dsc_controller.arms.tuning import over_postures
 from blf_dsc_controller.arms.urdf import inertia_of, moved, pseudo_inertia
-from blf_dsc_controller.compiled.layout import size_of
+from blf_dsc_controller.compiled.layout import filled, size_of
 from blf_dsc_controller.configuration import law_file
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.robot import drive_model, parameters_of
-from blf_dsc_controller.law import barrier
+from blf_dsc_controller.law import barrier, external_torque, weighing
 from blf_dsc_controller.law.backstepping import Backstepping
 from blf_dsc_controller.law.blf_dsc import BlfDsc
 from blf_dsc_controller.law.controller import Controller
@@ -79,8 +79,6 @@ _PARAMETER_OF = {
     'compensation': 'learning.compensation',
     'bumpless': 'learning.bumpless',
     'anchor_weight': 'learning.anchor_weight',
-    'contact_pole': 'contact.bandwidth',
-    'contact_threshold': 'contact.threshold',
 }
 """Parameters that settings take as they are; the others are computed from several."""
 
@@ -200,6 +198,8 @@ def settings_of_config(config: ControllerConfig) -> Settings:
     model = model_of(config)
     columns = columns_of(config)
     m = model.p + len(columns)
+    window = _window(config)
+    residuals = _residuals(config, model.n)
     computed = {
         'model': model,
         'n': model.n,
@@ -207,13 +207,13 @@ def settings_of_config(config: ControllerConfig) -> Settings:
         'm': m,
         **_of_other_laws(model.n),
         **_barrier(config),
-        **_window(config),
-        **_residuals(config, model.n),
-        **_contact(config),
+        **window,
+        **residuals,
+        'contact': _contact(config, residuals, window),
         **_estimates(config, model.p, columns),
         **_known_arm(config, model.p),
         **_inertias(config, model.n),
-        **_load(config, m),
+        'weighing': _weighing(config, m, residuals, window),
         **_drive(config),
     }
     settings = Settings(**(_gains(config) | computed))
@@ -288,14 +288,22 @@ def _residuals(config: ControllerConfig, n: int) -> dict[str, Any]:
     }
 
 
-def _contact(config: ControllerConfig) -> dict[str, Any]:
-    """Return whether contacts are found, and what they do."""
+def _contact(
+    config: ControllerConfig, residuals: dict[str, Any], window: dict[str, Any]
+) -> external_torque.Settings:
+    """Return whether contacts are found, what they do, and what is no contact."""
     contact = config.contact
-    return {
-        'senses': int(contact.enabled),
-        'freezes': int(contact.reaction != 'none'),
-        'expects_loads': int(contact.loads and config.learning.weighing),
-    }
+    least = np.sqrt(residuals['residual_floor'] / len(config.joints))
+    return filled(
+        external_torque.Settings,
+        contact,
+        loads=int(contact.loads and config.learning.weighing),
+        freezes=int(contact.reaction != 'none'),
+        window=window['window'],
+        row_interval=window['row_interval'],
+        coulomb_velocity=config.learning.coulomb_velocity,
+        unmodelled=least / residuals['row_weight'],
+    )
 
 
 def _estimates(
@@ -377,14 +385,22 @@ def _inertias(config: ControllerConfig, n: int) -> dict[str, Any]:
     }
 
 
-def _load(config: ControllerConfig, m: int) -> dict[str, Any]:
-    """Return what `weighing` needs: how a load in the tip changes the base parameters."""
+def _weighing(
+    config: ControllerConfig, m: int, residuals: dict[str, Any], window: dict[str, Any]
+) -> weighing.Settings:
+    """Return how a load in the tip changes the base parameters, and which rows count."""
+    settings = weighing.Settings(
+        size=0,
+        window=window['window'],
+        row_interval=window['row_interval'],
+        pole=config.learning.filter_pole,
+        motion_scale=window['motion_scale'],
+        unmodelled=residuals['residual_floor'] / len(config.joints),
+        columns=np.zeros((0, 10)),
+        scale=np.zeros((4, 10)),
+    )
     if not config.learning.weighing:
-        return {
-            'weighed': 0,
-            'load_columns': np.zeros((0, 10)),
-            'load_scale': np.zeros((4, 10)),
-        }
+        return settings
     robot = config.robot
     chain = robot.chain(config.joints)
     D = deviations(payload_inertia(max(robot.payload, 1.0)), 1.0, 2.0 * PAYLOAD_SIZE)
@@ -393,7 +409,7 @@ def _load(config: ControllerConfig, m: int) -> dict[str, Any]:
     columns = np.zeros((m + 1, 10))
     moves = [inertia_of(moved(pseudo_inertia(direction), T)) for direction in D.T]
     columns[: len(K)] = product(K, np.transpose(moves))
-    return {'weighed': m + 1, 'load_columns': columns, 'load_scale': D[:4]}
+    return settings._replace(size=m + 1, columns=columns, scale=D[:4])
 
 
 def _of_law(config: ControllerConfig, settings: Settings) -> dict[str, Any]:

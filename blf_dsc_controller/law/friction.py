@@ -44,7 +44,8 @@ from math import sqrt
 from blf_dsc_controller.arms.friction import STRIBECK_SPEED, fading, sliding
 from blf_dsc_controller.compiled.jit import inner
 from blf_dsc_controller.compiled.layout import Array
-from blf_dsc_controller.law import barrier
+from blf_dsc_controller.law.clipping import clip
+from blf_dsc_controller.law.lag import filter_gain
 from blf_dsc_controller.law.state import FILTERED, Settings, Signals, State
 
 _ENERGY = 1.0  # of p int s_h^2 dt; a reversal has an eighth of it
@@ -74,12 +75,6 @@ def learns_from_reversals(settings: Settings) -> bool:
 def unmodelled(settings: Settings, i: int) -> float:
     """Return the unmodelled torque f of joint i [N m]."""
     return float(sqrt(settings.residual_floor / settings.n) / settings.row_weight[i])
-
-
-@inner
-def clip(x: float, low: float, high: float) -> float:
-    """Limit x to [low, high]."""
-    return max(low, min(x, high))
 
 
 @inner
@@ -178,7 +173,7 @@ def filter_shapes(
     """Pass s and b of the last interval, at the measured velocity, through the poles of the row."""
     if not learns_from_reversals(settings):
         return
-    gain = barrier.filter_gain(1.0 / settings.pole, dt)
+    gain = filter_gain(1.0 / settings.pole, dt)
     lags = state.shape_lags
     for i in range(settings.n):
         s = sliding(signals.dq[i], settings.coulomb_velocity)
@@ -189,6 +184,15 @@ def filter_shapes(
             lags[k, 0, i] = now
             lags[k, 1, i] += gain * (mean - lags[k, 1, i])
             lags[k, 2, i] += gain * (lags[k, 1, i] - lags[k, 2, i])
+
+
+@inner
+def breakaway_torque(settings: Settings, state: State, i: int) -> float:
+    """Return what breakaway adds to the Coulomb friction of joint i, as it moves now [N m]."""
+    if settings.coulomb == 0:
+        return 0.0
+    j = first_coulomb(settings) + i
+    return float(state.estimate[j] * state.breakaway[i] * state.shape_lags[1, 0, i])
 
 
 @inner
@@ -233,7 +237,7 @@ def measure_reversals(settings: Settings, state: State, dt: float) -> None:
         or state.rows[0] >= 0.5 * settings.window
     )
     begins = state.since_latch[0] <= settling_time or not is_known
-    gain = barrier.filter_gain(1.0 / settings.pole, dt)
+    gain = filter_gain(1.0 / settings.pole, dt)
     weight = settings.pole * dt
     for i in range(settings.n):
         e = unexplained(settings, state, i)

@@ -20,6 +20,8 @@ s^2 is assumed at first, and measured as the mean of e^T C^-1 e / n.  Rows that 
 worse, as under a disturbance that lasts, raise it as they come, and contradict nothing.
 """
 
+from typing import NamedTuple
+
 from blf_dsc_controller.compiled.jit import inner
 from blf_dsc_controller.compiled.layout import Array
 from blf_dsc_controller.numerics.algebra import cholesky_factor, whiten
@@ -35,6 +37,13 @@ _ALARM = 5.0  # times s^2; an arm that does not change reaches 2.5
 _ASSUMED, _ASSUMED_ROWS = 0.1, 100.0
 _MOST = 3.0  # times s^2, as which a row counts: those of a change hardly raise it
 _LEAST = 0.001  # of that square, which s^2 is at least
+
+
+class Prior(NamedTuple):
+    """What is known of theta before any row."""
+
+    estimate: Array  # theta_0 (m,)
+    information: Array  # R (m, m)
 
 
 @inner

@@ -27,7 +27,8 @@ from math import sqrt
 from blf_dsc_controller.arms.friction import sliding
 from blf_dsc_controller.compiled.jit import inner
 from blf_dsc_controller.compiled.layout import Array
-from blf_dsc_controller.law import barrier, external_torque
+from blf_dsc_controller.law import external_torque, friction
+from blf_dsc_controller.law.lag import filter_gain
 from blf_dsc_controller.law.state import FILTERED, Settings, Signals, State
 from blf_dsc_controller.numerics.elementary import cos, exp, sin
 
@@ -71,7 +72,7 @@ def delay_torque(settings: Settings, state: State, signals: Signals, dt: float) 
     begins = settings.lag == 0.0 or state.samples[0] <= 1.0
     gain = 0.0
     if not begins:
-        gain = barrier.filter_gain(0.5 * settings.lag, dt)
+        gain = filter_gain(0.5 * settings.lag, dt)
     for i in range(settings.n):
         torque = signals.applied[i]
         for k in range(2):
@@ -88,7 +89,7 @@ def filter_row(settings: Settings, state: State, signals: Signals, dt: float) ->
     Rows of a joint that hardly moves count less: its stiction would be mistaken for
     gravity.
     """
-    gain = barrier.filter_gain(1.0 / settings.pole, dt)
+    gain = filter_gain(1.0 / settings.pole, dt)
     p = settings.p
     m = settings.m
     row = signals.row
@@ -103,7 +104,11 @@ def filter_row(settings: Settings, state: State, signals: Signals, dt: float) ->
         for j in range(p):
             row[i, j] += (signals.Yp[i, j] - state.Yp[i, j]) * (1.0 / dt)
         row[i, m] = state.late[1, i]
-        external_torque.filter_interval(settings, state, signals, i, dt)
+        if settings.contact.enabled == 1:
+            extra = friction.breakaway_torque(settings, state, i)
+            external_torque.filter_interval(
+                settings.contact, state.contact, i, row[i], extra, dt
+            )
         for j in range(m + 1):
             state.filter1[i, j] += gain * (row[i, j] - state.filter1[i, j])
             state.filter2[i, j] += gain * (state.filter1[i, j] - state.filter2[i, j])

@@ -12,6 +12,7 @@ from typing import Annotated, NamedTuple
 from blf_dsc_controller.arms.model import ArmModel
 from blf_dsc_controller.compiled.jit import inner
 from blf_dsc_controller.compiled.layout import Array, Cell, Passed, size_of, view_of
+from blf_dsc_controller.law import external_torque, weighing
 
 CHOICES = {
     'prediction': ('filtered', 'lambda'),
@@ -49,10 +50,6 @@ class Settings(NamedTuple):
     known_rate: int  # 1: the surface filter follows the known rate of beta2
     rotors_unsure: int  # 1: errors of the assumed rotor inertias are measured
     memory: int  # numbers in the memory of a law of a file
-    weighed: int  # m + 1 where the load in the tip is weighed, else 0
-    senses: int  # 1: the external torque is found
-    freezes: int  # 1: nothing is learned while something touches the arm
-    expects_loads: int  # 1: what a load in the tip explains is no contact
     window: int  # N, rows in tau_d
     row_interval: int  # samples between two rows of the window
     interval: int  # samples between two checks of the excitation
@@ -79,8 +76,6 @@ class Settings(NamedTuple):
     # omega_v, of the damping by the initial estimate's inertia, 1/s
     damping_rate: float
     pole: float  # of the regressor filter, rad/s
-    contact_pole: float  # L of the external torque, rad/s
-    contact_threshold: float  # h, from which it is a contact
     # a of the covariance of theta: variance of rows that count
     row_variance: float
     lag: float  # of measured velocities and applied torques together, s
@@ -123,14 +118,12 @@ class Settings(NamedTuple):
     true_parameters: Annotated[Array, 'p']
     frequencies: Annotated[Array, 'tones']  # of the sine and cosine columns, rad/s
     ripple_cycles: Annotated[Array, 'ripples']  # periods per turn
-    # N D of `weighing`, and a row of zeros
-    load_columns: Annotated[Array, 'weighed', 10]
-    # rows of D: mass [kg] and moments [kg m] in the tip
-    load_scale: Annotated[Array, 4, 10]
     # `Bodies` of the drive's model, with its memory
     drive_chain: Annotated[Array, 'drive_size']
     # masses [kg] and moments [kg m] of the drive's model
     drive_inertias: Annotated[Array, 'drive']
+    contact: external_torque.Settings
+    weighing: weighing.Settings
 
 
 class State(NamedTuple):
@@ -210,36 +203,9 @@ class State(NamedTuple):
     # least and largest delta of earlier motions, or 0, since a reversal was last
     # measured, N m
     unanswered: Annotated[Array, 2, 'n']
-    # moving rows before, of two parts since, and of two that are kept apart
-    weighed_rows: Annotated[Array, 5]
-    # of their [X | u]^T [X | u]
-    weighed_sums: Annotated[Array, 5, 'weighed', 'weighed']
-    weighed_complete: Cell  # 1: the rows before are complete
-    weighed_statistics: Annotated[Array, 4]  # of `innovation`
-    weighed_solution: Annotated[Array, 'weighed + 9']  # theta and z
-    weighed_factor: Annotated[Array, 'weighed + 9', 'weighed + 9']  # of their equations
-    weighed_changes: Cell  # `changes` at the last row
-    weighing_wait: Cell  # rows until the filters have settled
-    # mass [kg] and centre [m] in the tip, their deviations; 0: unknown
-    load: Annotated[Array, 8]
     frozen: Cell  # s, for which nothing is learned
-    # of `external_torque`: [X | u] behind the pole L
-    felt: Annotated[Array, 'n * senses', 'm + 1']
-    felt_latch: Cell  # s, when the window was latched that this is of
-    felt_factor: Annotated[Array, 'm * senses', 'm']  # of Phi_e + rho R, or of R
-    felt_variance: Cell  # that times its inverse is the covariance of theta
-    felt_doubt: Annotated[Array, 'n * senses', 'n']  # of r by theta, (N m)^2
-    felt_spread: Annotated[Array, 'n * senses', 'n']  # factor of S
-    # mean square of r that theta leaves, in motion and at reversals, (N m)^2
-    felt_noise: Annotated[Array, '2 * senses', 'n']
-    felt_count: Annotated[Array, '2 * senses', 'n']  # samples of that
-    felt_reversing: Annotated[Array, 'n * senses']  # s, for which it counts as such
-    felt_load: Annotated[Array, '10 * senses']  # z of a load
-    felt_load_doubt: Annotated[Array, '10 * senses', 10]  # its covariance
-    external: Annotated[Array, 'n * senses']  # r, N m
-    contact: Cell  # 1: something touches the arm
-    contact_calm: Cell  # s, since r has been small
-    contact_explained: Cell  # s, since a load has explained r
+    contact: external_torque.State
+    weighing: weighing.State
     memory: Annotated[Array, 'memory']  # of a law of a file
     ring: Annotated[Array, 'window', 'n', 'm + 1']  # the window's rows
 
@@ -300,18 +266,8 @@ class Signals(NamedTuple):
     band_acceleration: Annotated[Array, 'n']
     rate: Annotated[Array, 'm']  # theta^' [1/s]
     work: Annotated[Array, 'm']  # scratch
-    before: Annotated[Array, 'weighed', 'weighed']  # sums of `weighing`
-    since: Annotated[Array, 'weighed', 'weighed']
-    load_rows: Annotated[Array, 'n', 'weighed + 9']  # scratch
-    load_torque: Annotated[Array, 'n']
-    load_covariance: Annotated[Array, 'n', 'n']
-    load_spread: Annotated[Array, 4, 10]  # scratch
-    felt_rows: Annotated[Array, 'n * senses', 'm']  # scratch of `external_torque`
-    felt_white: Annotated[Array, 'n * senses']
-    felt_columns: Annotated[Array, 'n * senses', 10]
-    felt_trial: Annotated[Array, '10 * senses']
-    felt_trial_doubt: Annotated[Array, '10 * senses', 10]
-    felt_work: Annotated[Array, '10 * senses']
+    contact: external_torque.Work
+    weighing: weighing.Work
 
 
 class Sample(NamedTuple):
@@ -335,10 +291,10 @@ class Sample(NamedTuple):
     changes: Cell  # number of times that the arm was found to have changed
     # of the state, with 95 % intervals (half); NaN where unknown
     load: Annotated[Array, 8]
-    external: Annotated[Array, 'n * senses']  # r of `external_torque`, N m
-    external_interval: Annotated[Array, 'n * senses']  # half of 95 %, N m
+    external: Annotated[Array, 'n * contact.enabled']  # r of `external_torque`, N m
+    external_interval: Annotated[Array, 'n * contact.enabled']  # half of 95 %, N m
     # whether something touches the arm, and the distance of r from what explains it
-    contact: Annotated[Array, '2 * senses']
+    contact: Annotated[Array, '2 * contact.enabled']
 
 
 _settings_of = view_of(Settings)

@@ -37,6 +37,7 @@ from blf_dsc_controller.arms.model import regressors_at
 from blf_dsc_controller.arms.serial_chain import SerialChain, fill_regressor
 from blf_dsc_controller.compiled.jit import inner
 from blf_dsc_controller.compiled.layout import Array
+from blf_dsc_controller.law.clipping import clip
 from blf_dsc_controller.law.state import Settings, Signals, State
 from blf_dsc_controller.numerics.elementary import sin
 
@@ -44,16 +45,6 @@ _RELEASED = 0.5  # r
 
 LEVEL_CUT = 1.0
 RATE_CUT = 2.0
-
-
-@inner
-def clip(x: float, low: float, high: float) -> float:
-    """Limit x to [low, high]; NaN passes through."""
-    if x < low:
-        return low
-    if x > high:
-        return high
-    return x
 
 
 @inner

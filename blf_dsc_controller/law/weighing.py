@@ -21,23 +21,16 @@ until they make a window.  Rows are kept apart until they are 0.15 to 0.3 s old,
 those of a change that has not been found yet can be discarded.
 
 Rows of slow joints count little, since they may stick.  Nothing here acts on the
-torque: `weigh` runs after it has been sent.
+torque: `perception` calls `add_row` after it has been sent.
 """
 
-from math import sqrt
+from math import inf, sqrt
+from typing import Annotated, NamedTuple
 
-from blf_dsc_controller.arms.model import ArmModel
-from blf_dsc_controller.compiled.jit import inner, kernel
-from blf_dsc_controller.compiled.layout import Array
-from blf_dsc_controller.law import innovation, window
-from blf_dsc_controller.law.state import (
-    Settings,
-    Signals,
-    State,
-    settings_of,
-    signals_of,
-    state_of,
-)
+from blf_dsc_controller.compiled.jit import inner
+from blf_dsc_controller.compiled.layout import Array, Cell
+from blf_dsc_controller.law import innovation, sums
+from blf_dsc_controller.law.innovation import Prior
 from blf_dsc_controller.numerics.algebra import cholesky_factor, cholesky_solve
 
 _FEWEST = 0.5  # s of motion that a part has
@@ -51,104 +44,182 @@ _NOTHING, _LESS = 2.0, 4.0  # standard deviations: within, and below minus
 # rows before, of two halves since, and of the two parts that are kept apart
 BEFORE, OLDER, NEWER, RECENT, LATEST = range(5)
 TWO_SIDED = 1.96  # standard deviations in half of a 95 % interval
-MASS, DEVIATION = 0, 4  # in `state.load`, each followed by three of the centre
+MASS, DEVIATION = 0, 4  # in `State.load`, each followed by three of the centre
+
+
+class Settings(NamedTuple):
+    """How a load in the tip acts, and which rows count."""
+
+    size: int  # m + 1, or 0: nothing is weighed
+    window: int  # N, rows in a window of the learning
+    row_interval: int  # samples between two rows
+    pole: float  # of the row filters, rad/s
+    motion_scale: float  # reference velocity below which rows count less, rad/s
+    unmodelled: float  # mean square torque that no column describes, (N m)^2
+    columns: Annotated[Array, 'weighing.size', 10]  # N D, and a row of zeros
+    scale: Annotated[Array, 4, 10]  # rows of D: mass [kg] and moments [kg m]
+
+
+class State(NamedTuple):
+    """What it keeps from one row to the next."""
+
+    rows: Annotated[Array, 5]  # moving ones in each part
+    sums: Annotated[Array, 5, 'weighing.size', 'weighing.size']  # of [X | u]^T [X | u]
+    complete: Cell  # 1: the rows before are complete
+    statistics: Annotated[Array, 4]  # of `innovation`
+    solution: Annotated[Array, 'weighing.size + 9']  # theta and z
+    # of their equations
+    factor: Annotated[Array, 'weighing.size + 9', 'weighing.size + 9']
+    changes: Cell  # number of changes of the arm at the last row
+    wait: Cell  # rows until the filters have settled
+    # mass [kg] and centre [m] in the tip, their deviations; 0: unknown
+    load: Annotated[Array, 8]
+
+
+class Work(NamedTuple):
+    """Scratch of one row."""
+
+    before: Annotated[Array, 'weighing.size', 'weighing.size']  # sums of all such rows
+    since: Annotated[Array, 'weighing.size', 'weighing.size']
+    rows: Annotated[Array, 'n', 'weighing.size + 9']  # [X | X N D]
+    torque: Annotated[Array, 'n']  # that they do not explain, N m
+    covariance: Annotated[Array, 'n', 'n']
+    spread: Annotated[Array, 4, 10]  # D U^-1
 
 
 @inner
-def add_row(settings: Settings, state: State, signals: Signals, dt: float) -> None:
-    """Add the row of this sample if one is due, and solve for the load ten times a second."""
-    samples = int(state.samples[0])
-    interval = settings.row_interval
-    is_due = samples % interval == interval // 2 and state.frozen[0] == 0.0
-    if settings.weighed == 0 or not is_due:
+def add_row(
+    settings: Settings,
+    state: State,
+    work: Work,
+    prior: Prior,
+    row: Array,
+    dqr: Array,
+    samples: int,
+    changes: float,
+    dt: float,
+) -> None:
+    """Add the row of this sample if one is due, and solve for the load ten times a second.
+
+    `row` is [X | u] (n, m + 1), which is overwritten, dqr (n,) the velocity of the
+    reference [rad/s], `samples` the number of samples of `dt` [s], `changes` that of
+    the changes of the arm found so far.
+    """
+    if samples % settings.row_interval != settings.row_interval // 2:
         return
-    period = interval * dt
-    rows = samples // interval
-    has_changed = state.changes[0] != state.weighed_changes[0]
-    state.weighed_changes[0] = state.changes[0]
-    weight_row(settings, signals)
-    if samples <= interval:
-        begin(settings, state, signals, period)
+    period = settings.row_interval * dt
+    has_changed = changes != state.changes[0]
+    state.changes[0] = changes
+    weight_row(row, dqr)
+    if samples <= settings.row_interval:
+        begin(settings, state, work, prior, period)
     elif has_changed:
-        end_part(settings, state, signals, period)
-    elif state.weighing_wait[0] > 0.0:
-        state.weighing_wait[0] -= 1.0
-    elif is_contradicted(settings, state, signals, period):
-        end_part(settings, state, signals, period)
+        end_part(settings, state, work, prior, period)
+    elif state.wait[0] > 0.0:
+        state.wait[0] -= 1.0
+    elif compare_row(settings, state, work, row, period):
+        end_part(settings, state, work, prior, period)
     else:
-        window.add_products(signals.row, state.weighed_sums[LATEST])
-        state.weighed_rows[LATEST] += moving_share(settings, signals)
-        if is_first(state) and rows_before(state) >= settings.window:
-            state.weighed_complete[0] = 1.0
-        if rows % max(1, round(_APART / period)) == 0:
-            promote(settings, state)
-        if rows % max(1, round(innovation.REFRESH / period)) == 0:
-            solve(settings, state, signals, period)
-            if not is_first(state):
-                describe(settings, state, signals, period)
+        sums.add_products(row, state.sums[LATEST])
+        state.rows[LATEST] += moving_share(dqr, settings.motion_scale)
+        refresh(settings, state, work, prior, samples // settings.row_interval, period)
 
 
 @inner
-def weight_row(settings: Settings, signals: Signals) -> None:
+def refresh(
+    settings: Settings, state: State, work: Work, prior: Prior, rows: int, period: float
+) -> None:
+    """Use the rows that are old enough, and solve for the load, each when it is due."""
+    if is_first(state) and rows_before(state) >= settings.window:
+        state.complete[0] = 1.0
+    if rows % max(1, round(_APART / period)) == 0:
+        promote(settings, state)
+    if rows % max(1, round(innovation.REFRESH / period)) == 0:
+        solve(settings, state, work, prior, period)
+        if not is_first(state):
+            describe(settings, state, work, period)
+
+
+@inner
+def weight_row(row: Array, dqr: Array) -> None:
     """Let the rows of slow joints count little."""
-    for i in range(settings.n):
-        weight = abs(signals.dqr[i]) / sqrt(signals.dqr[i] ** 2 + _SLOW**2)
-        for j in range(settings.m + 1):
-            signals.row[i, j] *= weight
+    for i in range(row.shape[0]):
+        weight = abs(dqr[i]) / sqrt(dqr[i] ** 2 + _SLOW**2)
+        for j in range(row.shape[1]):
+            row[i, j] *= weight
 
 
 @inner
-def moving_share(settings: Settings, signals: Signals) -> float:
+def moving_share(dqr: Array, motion_scale: float) -> float:
     """Return the mean square weight of the joints' rows: 1 in motion, 0 at rest."""
     share = 0.0
-    for i in range(settings.n):
-        square = signals.dqr[i] ** 2
-        share += square / (square + settings.motion_scale**2 + 1e-12) / settings.n
+    for i in range(dqr.size):
+        square = dqr[i] ** 2
+        share += square / (square + motion_scale**2 + 1e-12) / dqr.size
     return share
 
 
 @inner
 def is_first(state: State) -> bool:
     """Whether the rows before are not complete."""
-    return bool(state.weighed_complete[0] == 0.0)
+    return bool(state.complete[0] == 0.0)
+
+
+@inner
+def held_mass(state: State) -> tuple[float, float]:
+    """Return the mass that the tip holds [kg] and its deviation [kg], infinite where unknown.
+
+    Before the rows of the arm alone are complete, it holds nothing.
+    """
+    mass = state.load[MASS]
+    deviation = state.load[DEVIATION]
+    if deviation == 0.0 and not is_first(state):
+        return mass, inf
+    return mass, deviation
 
 
 @inner
 def rows_before(state: State) -> float:
     """Return the number of moving rows so far, while the rows before are not complete."""
-    rows = state.weighed_rows
+    rows = state.rows
     return float(rows[BEFORE] + rows[RECENT] + rows[LATEST])
 
 
 @inner
-def begin(settings: Settings, state: State, signals: Signals, period: float) -> None:
+def begin(
+    settings: Settings, state: State, work: Work, prior: Prior, period: float
+) -> None:
     """Begin with an arm of which only the prior is known."""
-    unmodelled = settings.residual_floor / settings.n
-    innovation.start(unmodelled, state.weighed_statistics)
+    innovation.start(settings.unmodelled, state.statistics)
     discard(state, BEFORE)
-    state.weighed_complete[0] = 0.0
-    state.weighing_wait[0] = _SETTLED / (settings.pole * period)
-    solve(settings, state, signals, period)
+    state.complete[0] = 0.0
+    state.wait[0] = _SETTLED / (settings.pole * period)
+    solve(settings, state, work, prior, period)
 
 
 @inner
 def discard(state: State, first: int) -> None:
     """Discard the rows of the parts from the `first` on, and what was held."""
     for part in range(first, LATEST + 1):
-        window.clear(state.weighed_sums[part])
-        state.weighed_rows[part] = 0.0
+        clear_part(state, part)
     for k in range(state.load.size):
         state.load[k] = 0.0
 
 
 @inner
+def clear_part(state: State, part: int) -> None:
+    """Discard the rows of a part."""
+    sums.clear(state.sums[part])
+    state.rows[part] = 0.0
+
+
+@inner
 def move_rows(state: State, source: int, target: int) -> None:
     """Add the rows of the part `source` to those of the part `target`."""
-    sums = state.weighed_sums
-    window.add(sums[target], 1.0, sums[source], sums[target])
-    state.weighed_rows[target] += state.weighed_rows[source]
-    window.clear(sums[source])
-    state.weighed_rows[source] = 0.0
+    parts = state.sums
+    sums.add(parts[target], 1.0, parts[source], parts[target])
+    state.rows[target] += state.rows[source]
+    clear_part(state, source)
 
 
 @inner
@@ -158,99 +229,90 @@ def promote(settings: Settings, state: State) -> None:
         move_rows(state, RECENT, BEFORE)
     else:
         move_rows(state, RECENT, NEWER)
-        if state.weighed_rows[NEWER] >= 0.5 * settings.window:
-            window.clear(state.weighed_sums[OLDER])
-            state.weighed_rows[OLDER] = 0.0
+        if state.rows[NEWER] >= 0.5 * settings.window:
+            clear_part(state, OLDER)
             move_rows(state, NEWER, OLDER)
     move_rows(state, LATEST, RECENT)
 
 
 @inner
-def end_part(settings: Settings, state: State, signals: Signals, period: float) -> None:
+def end_part(
+    settings: Settings, state: State, work: Work, prior: Prior, period: float
+) -> None:
     """Something else is held: close the part, without its latest rows, and begin another."""
-    sums = state.weighed_sums
-    for part in (RECENT, LATEST):
-        window.clear(sums[part])
-        state.weighed_rows[part] = 0.0
+    clear_part(state, RECENT)
+    clear_part(state, LATEST)
     fewest = _FEWEST / period
     if not is_first(state):
         move_rows(state, OLDER, NEWER)
-        if state.weighed_rows[NEWER] >= fewest:
-            compare_with_nothing(settings, state, signals, period)
+        if state.rows[NEWER] >= fewest:
+            compare_with_nothing(settings, state, work, prior, period)
         discard(state, OLDER)
-    elif state.weighed_rows[BEFORE] >= fewest:
-        state.weighed_complete[0] = 1.0
+    elif state.rows[BEFORE] >= fewest:
+        state.complete[0] = 1.0
         discard(state, OLDER)
     else:
         discard(state, BEFORE)
-    state.weighed_statistics[innovation.RECENT] = 0.0
-    state.weighing_wait[0] = _SETTLED / (settings.pole * period)
-    solve(settings, state, signals, period)
+    state.statistics[innovation.RECENT] = 0.0
+    state.wait[0] = _SETTLED / (settings.pole * period)
+    solve(settings, state, work, prior, period)
 
 
 @inner
 def compare_with_nothing(
-    settings: Settings, state: State, signals: Signals, period: float
+    settings: Settings, state: State, work: Work, prior: Prior, period: float
 ) -> None:
     """Take the newer rows for those of an empty hand if it held nothing, or less than before."""
-    solve(settings, state, signals, period)
-    describe(settings, state, signals, period)
+    solve(settings, state, work, prior, period)
+    describe(settings, state, work, period)
     mass = state.load[MASS]
     deviation = state.load[DEVIATION]
-    is_full = state.weighed_rows[BEFORE] >= settings.window
+    is_full = state.rows[BEFORE] >= settings.window
     if mass < -_LESS * deviation:
-        window.clear(state.weighed_sums[BEFORE])
-        state.weighed_rows[BEFORE] = 0.0
+        clear_part(state, BEFORE)
         move_rows(state, NEWER, BEFORE)
     elif abs(mass) < _NOTHING * deviation and not is_full:
         move_rows(state, NEWER, BEFORE)
 
 
 @inner
-def fill_load(settings: Settings, state: State, signals: Signals) -> None:
-    """Fill [X | X N D] of this row, whose unknowns are theta and z; no load in the first rows."""
-    m = settings.m
-    ND = settings.load_columns
-    X = signals.load_rows
-    is_held = not is_first(state)
-    for i in range(settings.n):
+def fill_rows(settings: Settings, is_held: bool, row: Array, out: Array) -> None:
+    """Fill [X | X N D], whose unknowns are theta and z; no load where none `is_held`."""
+    m = row.shape[1] - 1
+    ND = settings.columns
+    for i in range(row.shape[0]):
         for j in range(m):
-            X[i, j] = signals.row[i, j]
+            out[i, j] = row[i, j]
         for c in range(ND.shape[1]):
-            X[i, m + c] = 0.0
+            out[i, m + c] = 0.0
             if is_held:
                 for j in range(m):
-                    X[i, m + c] += signals.row[i, j] * ND[j, c]
+                    out[i, m + c] += row[i, j] * ND[j, c]
 
 
 @inner
-def is_contradicted(
-    settings: Settings, state: State, signals: Signals, period: float
+def compare_row(
+    settings: Settings, state: State, work: Work, row: Array, period: float
 ) -> bool:
-    """Compare this row with the solution; return whether the last ones contradict it."""
-    X = signals.load_rows
-    e = signals.load_torque
-    x = state.weighed_solution
-    fill_load(settings, state, signals)
-    for i in range(settings.n):
-        e[i] = signals.row[i, settings.m]
+    """Compare a row with the solution; return whether the last ones contradict it."""
+    e = work.torque
+    x = state.solution
+    fill_rows(settings, not is_first(state), row, work.rows)
+    for i in range(e.size):
+        e[i] = row[i, row.shape[1] - 1]
         for j in range(x.size):
-            e[i] -= X[i, j] * x[j]
+            e[i] -= work.rows[i, j] * x[j]
     square = innovation.normalized_square(
-        X, e, state.weighed_factor, period, signals.load_covariance
+        work.rows, e, state.factor, period, work.covariance
     )
     return innovation.update(
-        square,
-        settings.residual_floor / settings.n,
-        period,
-        settings.window,
-        state.weighed_statistics,
+        square, settings.unmodelled, period, settings.window, state.statistics
     )
 
 
 @inner
 def fill_equations(
-    settings: Settings, state: State, signals: Signals, a: float
+    settings: Settings, state: State, work: Work, prior: Prior, a: float
 ) -> None:
     """Fill the upper triangle and the right-hand side of the normal equations of theta and z.
 
@@ -260,18 +322,19 @@ def fill_equations(
         [S + a R       S' N D             ] [theta]   [S_u + a R theta_0]
         [D^T N^T S'    D^T N^T S' N D + a ] [z    ] = [D^T N^T S'_u     ]
     """
-    m = settings.m
-    A = state.weighed_factor
-    x = state.weighed_solution
-    before = signals.before
-    since = signals.since
-    ND = settings.load_columns
+    m = prior.estimate.size
+    R = prior.information
+    A = state.factor
+    x = state.solution
+    before = work.before
+    since = work.since
+    ND = settings.columns
     for i in range(m):
         x[i] = before[i, m] + since[i, m]
         for j in range(m):
-            x[i] += a * settings.information[i, j] * settings.initial_estimate[j]
+            x[i] += a * R[i, j] * prior.estimate[j]
         for j in range(i, m):
-            A[i, j] = before[i, j] + since[i, j] + a * settings.information[i, j]
+            A[i, j] = before[i, j] + since[i, j] + a * R[i, j]
     for c in range(ND.shape[1]):
         x[m + c] = 0.0
         for j in range(m):
@@ -286,39 +349,42 @@ def fill_equations(
 
 
 @inner
-def solve(settings: Settings, state: State, signals: Signals, period: float) -> None:
+def solve(
+    settings: Settings, state: State, work: Work, prior: Prior, period: float
+) -> None:
     """Find theta and z of all rows, one each `period` [s], those kept apart included."""
-    sums = state.weighed_sums
-    window.add(sums[OLDER], 1.0, sums[NEWER], signals.since)
-    window.add(sums[BEFORE], 0.0, sums[BEFORE], signals.before)
+    parts = state.sums
+    sums.add(parts[OLDER], 1.0, parts[NEWER], work.since)
+    sums.add(parts[BEFORE], 0.0, parts[BEFORE], work.before)
     for part in (RECENT, LATEST):
         if is_first(state):
-            window.add(signals.before, 1.0, sums[part], signals.before)
+            sums.add(work.before, 1.0, parts[part], work.before)
         else:
-            window.add(signals.since, 1.0, sums[part], signals.since)
-    a = innovation.row_variance(state.weighed_statistics, period)
-    fill_equations(settings, state, signals, a)
-    cholesky_factor(state.weighed_factor)
-    cholesky_solve(state.weighed_factor, state.weighed_solution)
+            sums.add(work.since, 1.0, parts[part], work.since)
+    a = innovation.row_variance(state.statistics, period)
+    fill_equations(settings, state, work, prior, a)
+    cholesky_factor(state.factor)
+    cholesky_solve(state.factor, state.solution)
 
 
 @inner
-def describe(settings: Settings, state: State, signals: Signals, period: float) -> None:
+def describe(settings: Settings, state: State, work: Work, period: float) -> None:
     """Write mass and centre of the load to `state.load`, and their standard deviations.
 
     The covariance of z is a (U^T U)^-1 with the last rows U of the factor.  The centre
     is unknown where the mass is not twice its deviation.
     """
-    m, k = settings.m, settings.load_scale.shape[1]
-    U = state.weighed_factor[m:, m:]
-    z = state.weighed_solution[m:]
-    v = signals.load_spread
-    a = innovation.row_variance(state.weighed_statistics, period)
+    k = settings.scale.shape[1]
+    m = state.solution.size - k
+    U = state.factor[m:, m:]
+    z = state.solution[m:]
+    v = work.spread
+    a = innovation.row_variance(state.statistics, period)
     for r in range(4):
         state.load[r] = 0.0
         for c in range(k):
-            state.load[r] += settings.load_scale[r, c] * z[c]
-            v[r, c] = settings.load_scale[r, c]
+            state.load[r] += settings.scale[r, c] * z[c]
+            v[r, c] = settings.scale[r, c]
             for d in range(c):
                 v[r, c] -= U[d, c] * v[r, d]
             v[r, c] *= U[c, c]
@@ -335,17 +401,3 @@ def describe(settings: Settings, state: State, signals: Signals, period: float) 
             state.load[DEVIATION + r] = (
                 state.load[DEVIATION + r] / abs(mass) if is_known else 0.0
             )
-
-
-@kernel
-def weigh(
-    model: ArmModel,
-    settings_vector: Array,
-    state_vector: Array,
-    signals_vector: Array,
-    dt: float,
-) -> None:
-    """Take the row of the last sample on packed vectors: see `add_row`; `dt` [s] is its length."""
-    settings = settings_of(settings_vector, model)
-    state = state_of(state_vector, settings)
-    add_row(settings, state, signals_of(signals_vector, settings), dt)

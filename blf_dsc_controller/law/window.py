@@ -18,6 +18,7 @@ from math import sqrt
 from blf_dsc_controller.compiled.jit import called, inner
 from blf_dsc_controller.compiled.layout import Array
 from blf_dsc_controller.law.state import Settings, Signals, State
+from blf_dsc_controller.law.sums import add, clear
 from blf_dsc_controller.numerics.algebra import cholesky_factor, cholesky_solve
 
 
@@ -57,31 +58,6 @@ def push_row(state: State, row: Array) -> None:
             add(fresh, 0.0, fresh, running)
         add(fresh, -1.0, half, half)
         clear(fresh)
-
-
-@inner
-def add(first: Array, weight: float, second: Array, out: Array) -> None:
-    """Write the upper triangle of `first` + `weight` `second` to `out`."""
-    for a in range(out.shape[0]):
-        for b in range(a, out.shape[0]):
-            out[a, b] = first[a, b] + weight * second[a, b]
-
-
-@inner
-def add_products(row: Array, sums: Array) -> None:
-    """Add the upper triangle of [X | u]^T [X | u] of a row (n, m + 1) to `sums`."""
-    for i in range(row.shape[0]):
-        for a in range(row.shape[1]):
-            for b in range(a, row.shape[1]):
-                sums[a, b] += row[i, a] * row[i, b]
-
-
-@inner
-def clear(matrix: Array) -> None:
-    """Fill a matrix with zeros."""
-    for i in range(matrix.shape[0]):
-        for j in range(matrix.shape[1]):
-            matrix[i, j] = 0.0
 
 
 @inner

@@ -192,6 +192,6 @@ class CompiledLoop:
             controller.checks_vector,
             controller.reference_vector,
             controller.torque_at,
-            perceives=span.observed or settings.freezes == 1,
+            perceives=span.observed or settings.contact.freezes == 1,
             ends_at_contact=bool(controller.checks.velocity_limit[0] > 0.0),
         )

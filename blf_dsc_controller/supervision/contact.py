@@ -7,7 +7,7 @@ import numpy as np
 
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.law.controller import Controller
-from blf_dsc_controller.law.external_torque import DISTANCE
+from blf_dsc_controller.law.perception import DISTANCE
 from blf_dsc_controller.run import Contact
 
 

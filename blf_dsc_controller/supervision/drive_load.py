@@ -25,6 +25,7 @@ from blf_dsc_controller.arms.model import regressors_at
 from blf_dsc_controller.arms.serial_chain import SerialChain
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.law.controller import Controller
+from blf_dsc_controller.law.external_torque import is_touched
 from blf_dsc_controller.law.torque import added_torque
 from blf_dsc_controller.law.weighing import DEVIATION, MASS, TWO_SIDED
 
@@ -96,7 +97,7 @@ class DriveLoads:
         Nothing is told while something touches the arm.
         """
         target = self._weighed(controller)
-        if target is None or controller.state.contact[0] > 0.0:
+        if target is None or is_touched(controller.state.contact):
             return None
         settings = controller.settings
         chain = SerialChain(settings.n, settings.drive, settings.drive_chain)
@@ -111,7 +112,7 @@ class DriveLoads:
 
     def _weighed(self, controller: Controller) -> Vector | None:
         """Return mass and moments (4,) that the drives should get; None: no change."""
-        load = controller.state.load
+        load = controller.state.weighing.load
         half = TWO_SIDED * load[DEVIATION]
         narrow = max(_NARROW, _SHARE * abs(load[MASS]))
         if not 0.0 < half < narrow:

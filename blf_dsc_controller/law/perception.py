@@ -1,0 +1,160 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a controller finds after it has sent a torque: the load in the tip, and contacts.
+
+Nothing here acts on the torque of its sample, but a contact can stop the learning.
+"""
+
+from __future__ import annotations
+
+from math import sqrt
+
+from blf_dsc_controller.arms.model import ArmModel
+from blf_dsc_controller.compiled.jit import inner, kernel
+from blf_dsc_controller.compiled.layout import Array
+from blf_dsc_controller.law import external_torque, weighing
+from blf_dsc_controller.law.external_torque import TipLoad
+from blf_dsc_controller.law.innovation import Prior
+from blf_dsc_controller.law.state import (
+    Sample,
+    Settings,
+    Signals,
+    State,
+    sample_of,
+    settings_of,
+    signals_of,
+    state_of,
+)
+
+_SETTLED = 6.0  # time constants of the row filters, until learning goes on
+
+CONTACT, DISTANCE = 0, 1  # in `sample.contact`
+
+
+@inner
+def update_covariance(settings: Settings, state: State) -> None:
+    """Tell `external_torque` what is known of theta: at first the prior, then each full window."""
+    if state.samples[0] <= 1.0:
+        external_torque.begin(settings.contact, state.contact, settings.information)
+        return
+    is_full = state.rows[0] == settings.window and state.latched[0] == 1.0
+    if is_full and state.latch_time[0] != state.contact.latch_time[0]:
+        excess = max(1.0, state.residual[0] / settings.residual_floor)
+        external_torque.update_covariance(
+            state.contact,
+            state.factor,
+            settings.row_variance * excess,
+            state.latch_time[0],
+        )
+
+
+@inner
+def update_external_torque(
+    settings: Settings, state: State, signals: Signals, dt: float
+) -> float:
+    """Find r of the last sample and whether it is a contact; return its distance from none."""
+    part = settings.contact
+    now = state.contact
+    work = signals.contact
+    update_covariance(settings, state)
+    external_torque.update_torque(now, state.estimate)
+    external_torque.follow_reversals(part, now, signals.dqr, dt)
+    samples = int(state.samples[0])
+    interval = settings.row_interval
+    if samples <= 1 or samples % interval == interval // 4:
+        external_torque.update_spread(now, work)
+    distance = external_torque.whiten_torque(now, work)
+    if external_torque.is_settled(now, dt):
+        tip = settings.weighing
+        mass, deviation = weighing.held_mass(state.weighing)
+        load = TipLoad(tip.columns, tip.scale, mass, deviation)
+        distance = external_torque.update_contact(part, now, work, load, distance, dt)
+    external_torque.update_noise(part, now)
+    return distance
+
+
+@inner
+def fill_sample(state: State, distance: float, sample: Sample) -> None:
+    """Write r with its interval, and the contact, to the telemetry sample."""
+    now = state.contact
+    for i in range(now.torque.size):
+        sample.external[i] = now.torque[i]
+        deviation = sqrt(external_torque.variance_of(now, i))
+        sample.external_interval[i] = weighing.TWO_SIDED * deviation
+    sample.contact[CONTACT] = 1.0 if external_torque.is_touched(now) else 0.0
+    sample.contact[DISTANCE] = distance
+
+
+@kernel
+def sense(
+    model: ArmModel,
+    settings_vector: Array,
+    state_vector: Array,
+    signals_vector: Array,
+    sample_vector: Array,
+    dt: float,
+) -> bool:
+    """Find the external torque of the last sample, `dt` [s] long; return whether a contact begins.
+
+    While it lasts, and until the filters have settled, nothing is learned.
+    """
+    settings = settings_of(settings_vector, model)
+    state = state_of(state_vector, settings)
+    signals = signals_of(signals_vector, settings)
+    was_touched = external_torque.is_touched(state.contact)
+    distance = update_external_torque(settings, state, signals, dt)
+    is_touched = external_torque.is_touched(state.contact)
+    if is_touched and settings.contact.freezes == 1:
+        state.frozen[0] = _SETTLED / settings.pole
+    fill_sample(state, distance, sample_of(sample_vector, settings))
+    return is_touched and not was_touched
+
+
+@kernel
+def sense_nothing(
+    _model: ArmModel,
+    _settings_vector: Array,
+    _state_vector: Array,
+    _signals_vector: Array,
+    _sample_vector: Array,
+    dt: float,
+) -> bool:
+    """Stand in for `sense` where no external torque is found: no contact begins."""
+    return dt < 0.0  # numba: a literal False would have another type
+
+
+@kernel
+def weigh(
+    model: ArmModel,
+    settings_vector: Array,
+    state_vector: Array,
+    signals_vector: Array,
+    dt: float,
+) -> None:
+    """Weigh what the tip holds by the row of the last sample, `dt` [s] long."""
+    settings = settings_of(settings_vector, model)
+    state = state_of(state_vector, settings)
+    signals = signals_of(signals_vector, settings)
+    if state.frozen[0] > 0.0:  # the row is of a contact
+        return
+    weighing.add_row(
+        settings.weighing,
+        state.weighing,
+        signals.weighing,
+        Prior(settings.initial_estimate, settings.information),
+        signals.row,
+        signals.dqr,
+        int(state.samples[0]),
+        state.changes[0],
+        dt,
+    )
+
+
+@kernel
+def weigh_nothing(
+    _model: ArmModel,
+    _settings_vector: Array,
+    _state_vector: Array,
+    _signals_vector: Array,
+    _dt: float,
+) -> None:
+    """Stand in for `weigh` where nothing is weighed."""

@@ -1,0 +1,216 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The parts of the external torque: its filter, covariance, phases, load and noise."""
+
+from __future__ import annotations
+
+from math import inf
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from blf_dsc_controller.compiled.layout import size_of, view_of
+from blf_dsc_controller.law import external_torque
+from blf_dsc_controller.law.external_torque import (
+    EXPLAINED,
+    QUIET,
+    TOUCHED,
+    Settings,
+    State,
+    TipLoad,
+    Work,
+    next_phase,
+)
+from blf_dsc_controller.numerics.algebra import cholesky_factor
+
+H = 8.0  # threshold
+DT = 1e-3  # s
+SETTINGS = Settings(
+    enabled=1,
+    bandwidth=30.0,
+    threshold=H,
+    loads=1,
+    freezes=1,
+    window=500,
+    row_interval=10,
+    coulomb_velocity=0.02,
+    unmodelled=np.array([0.5, 0.1]),
+)
+N, M = 2, 3  # joints, entries of theta
+
+
+def part(layout):
+    """An empty state, or scratch."""
+    sizes = SimpleNamespace(n=N, m=M, contact=SETTINGS)
+    return view_of(layout)(np.zeros(size_of(layout)(sizes)), sizes)
+
+
+@pytest.fixture
+def state():
+    """That after the first window, with S = 1 and nothing known of theta's errors."""
+    state = part(State)
+    state.latch_time[0] = 1.0
+    state.noise[:] = 1.0
+    state.spread[:] = np.eye(N)
+    cholesky_factor(state.spread)
+    external_torque.forget_load(state)
+    return state
+
+
+@pytest.mark.parametrize(
+    ('phase', 'distance', 'remaining', 'calm', 'explained', 'expected'),
+    [
+        (QUIET, 0.9 * H, 0.9 * H, 9.0, 0.0, QUIET),
+        (QUIET, 1.1 * H, 1.1 * H, 0.0, 0.0, TOUCHED),  # no load explains it
+        (QUIET, 1.1 * H, 0.9 * H, 0.0, 0.0, EXPLAINED),
+        (EXPLAINED, 1.1 * H, 0.9 * H, 0.0, 0.0, EXPLAINED),
+        (EXPLAINED, 1.1 * H, 1.1 * H, 0.0, 0.0, TOUCHED),  # the load no longer does
+        (EXPLAINED, 0.9 * H, 0.9 * H, 0.001, 0.0, QUIET),
+        # a contact ends below half of the threshold, after 0.2 s
+        (TOUCHED, 0.6 * H, 0.6 * H, 0.0, 0.0, TOUCHED),
+        (TOUCHED, 0.4 * H, 0.4 * H, 0.19, 0.0, TOUCHED),
+        (TOUCHED, 0.4 * H, 0.4 * H, 0.21, 0.0, QUIET),
+        # or once a load has explained it for 0.5 s
+        (TOUCHED, 1.1 * H, 0.9 * H, 0.0, 0.49, TOUCHED),
+        (TOUCHED, 1.1 * H, 0.9 * H, 0.0, 0.51, EXPLAINED),
+        (TOUCHED, 1.1 * H, 1.1 * H, 0.0, 0.51, TOUCHED),
+    ],
+)
+def test_phase_follows_from_distances_and_times(
+    phase, distance, remaining, calm, explained, expected
+):
+    assert next_phase(phase, distance, remaining, calm, explained, H) == expected
+
+
+def update(state, r, load, seconds, settings=SETTINGS):
+    """Update the contact for some time of a constant r (n,)."""
+    work = part(Work)
+    state.torque[:] = r
+    for _ in range(round(seconds / DT)):
+        distance = external_torque.whiten_torque(state, work)
+        external_torque.update_contact(settings, state, work, load, distance, DT)
+
+
+def tip(mass, deviation):
+    """A load of z_0 kg that pulls joint 0 by 10 N m per kg, in theta_0."""
+    columns = np.zeros((M + 1, 10))
+    columns[0, 0] = 10.0
+    scale = np.zeros((4, 10))
+    scale[0, 0] = 1.0
+    return TipLoad(columns, scale, mass, deviation)
+
+
+@pytest.mark.parametrize(
+    ('mass', 'deviation', 'pull', 'expected'),
+    [
+        (0.0, 0.0, -10.0, EXPLAINED),  # 1 kg is picked up
+        (0.0, 0.0, 10.0, TOUCHED),  # no load is lighter than nothing
+        (2.0, 0.1, 10.0, EXPLAINED),  # 1 of 2 kg is put down
+        (0.2, 0.1, 10.0, TOUCHED),  # 1 of 0.2 kg, eight deviations less than nothing
+        (0.8, 0.1, 10.0, EXPLAINED),  # two deviations less
+        (0.0, inf, 10.0, EXPLAINED),  # it is unknown what is held
+    ],
+)
+def test_load_explains_no_more_than_is_held(state, mass, deviation, pull, expected):
+    """z_0 goes to 1 or -1, and the mass with it, within 2 s: 10 filters of 0.2 s."""
+    state.filtered[0, 0] = 1.0
+    update(state, [pull, 0.0], tip(mass, deviation), 2.0)
+    assert state.phase[0] == expected
+    loads = SETTINGS._replace(loads=0)
+    update(state, [pull, 0.0], tip(mass, deviation), DT, loads)
+    assert external_torque.is_touched(state)
+
+
+def test_force_that_no_load_explains_is_a_contact_until_it_ends(state):
+    state.filtered[0, 0] = 1.0
+    update(state, [0.0, 10.0], tip(0.0, 0.0), DT)
+    assert external_torque.is_touched(state)
+    update(state, [0.0, 0.0], tip(0.0, 0.0), 0.19)
+    assert external_torque.is_touched(state)
+    update(state, [0.0, 0.0], tip(0.0, 0.0), 0.02)
+    assert not external_torque.is_touched(state)
+
+
+def test_arm_with_friction_at_breakaway_alone_has_no_external_torque():
+    """u = X theta + friction, after 20 time constants of the filter: e^-20 is left."""
+    state = part(State)
+    theta, friction = np.array([1.0, -2.0, 3.0]), 0.7
+    X = np.array([[0.5, 1.0, 0.2], [1.5, -0.3, 0.1]])
+    rows = np.column_stack((X, X @ theta + [friction, 0.0]))
+    for _ in range(round(20.0 / SETTINGS.bandwidth / DT)):
+        for i in range(N):
+            breakaway = friction if i == 0 else 0.0
+            external_torque.filter_interval(SETTINGS, state, i, rows[i], breakaway, DT)
+    external_torque.update_torque(state, theta)
+    np.testing.assert_allclose(state.torque, 0.0, atol=1e-7)
+    np.testing.assert_allclose(state.filtered[:, :M], X, atol=1e-7)
+
+
+def test_distance_is_that_of_the_covariance_by_theta_and_noise(state):
+    """(r^T S^-1 r)^(1/2) with S = a X A^-1 X^T + diag(s^2), as numpy finds it."""
+    random = np.random.default_rng(1)
+    X = random.normal(size=(N, M))
+    B = random.normal(size=(M, M))
+    A = B @ B.T + np.eye(M)
+    factor = A.copy()
+    cholesky_factor(factor)
+    external_torque.update_covariance(state, factor, 0.04, 7.0)
+    state.filtered[:, :M] = X
+    state.noise[:] = [[0.3, 0.2], [5.0, 6.0]]  # in motion, at reversals
+    state.reversing[1] = 0.1
+    state.torque[:] = 1.0, -2.0
+    work = part(Work)
+    external_torque.update_spread(state, work)
+    by_theta = 0.04 * X @ np.linalg.inv(A) @ X.T
+    S = by_theta + np.diag([0.3, 6.0])
+    expected = np.sqrt(state.torque @ np.linalg.solve(S, state.torque))
+    assert external_torque.whiten_torque(state, work) == pytest.approx(expected)
+    for i in range(N):
+        assert external_torque.variance_of(state, i) == pytest.approx(S[i, i])
+
+
+def test_prior_is_that_of_theta_and_of_unmodelled_torque():
+    state = part(State)
+    information = np.diag([4.0, 1.0, 0.25])
+    external_torque.begin(SETTINGS, state, information)
+    state.filtered[0, 0] = 1.0  # whose standard deviation is 0.5
+    external_torque.update_spread(state, part(Work))
+    np.testing.assert_allclose(np.diag(state.covariance), [0.25, 0.0])
+    np.testing.assert_allclose(state.noise, [[0.25, 0.01]] * 2)
+
+
+def test_joint_counts_as_reversing_until_its_filter_has_settled():
+    """Below 1.5 times 0.02 rad/s, and for 3 / L = 0.1 s after."""
+    state = part(State)
+    external_torque.follow_reversals(SETTINGS, state, np.array([0.029, 0.031]), DT)
+    assert [external_torque.regime(state, i) for i in range(N)] == [1, 0]
+    for _ in range(99):
+        external_torque.follow_reversals(SETTINGS, state, np.array([-0.1, 0.1]), DT)
+    assert external_torque.regime(state, 0) == 1
+    for _ in range(2):
+        external_torque.follow_reversals(SETTINGS, state, np.array([-0.1, 0.1]), DT)
+    assert external_torque.regime(state, 0) == 0
+
+
+@pytest.mark.parametrize('phase', [QUIET, EXPLAINED, TOUCHED])
+def test_noise_is_measured_while_nothing_touches(state, phase):
+    """The mean square of r = 0.5 N m, within 10 % after a window: e^-1 of 1 % is assumed."""
+    state.noise[:] = 0.3
+    state.phase[0] = phase
+    state.torque[:] = 0.5
+    for _ in range(SETTINGS.window * SETTINGS.row_interval):
+        external_torque.update_noise(SETTINGS, state)
+    expected = 0.3 if phase == TOUCHED else pytest.approx(0.25, rel=0.1)
+    assert state.noise[0, 0] == expected
+    assert state.noise[1, 0] == 0.3  # of reversals
+
+
+def test_noise_is_measured_from_the_first_window_on(state):
+    state.latch_time[0] = 0.0
+    external_torque.update_noise(SETTINGS, state)
+    assert not state.samples.any()
+    state.latch_time[0] = 1.0
+    assert not external_torque.is_settled(state, DT)
+    for _ in range(500):  # 0.5 s
+        external_torque.update_noise(SETTINGS, state)
+    assert external_torque.is_settled(state, DT)

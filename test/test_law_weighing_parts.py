@@ -1,0 +1,207 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The parts of the weighing, on rows of an arm whose load is known."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from blf_dsc_controller.compiled.layout import size_of, view_of
+from blf_dsc_controller.law import weighing
+from blf_dsc_controller.law.innovation import CORRELATION, NOISE, Prior
+from blf_dsc_controller.law.sums import add_products
+from blf_dsc_controller.law.weighing import (
+    BEFORE,
+    DEVIATION,
+    LATEST,
+    MASS,
+    NEWER,
+    Settings,
+    State,
+    Work,
+)
+
+N, M = 2, 5  # joints, entries of theta
+DT = 0.01  # s, with a row in each sample
+RANDOM = np.random.default_rng(1)
+SCALE = RANDOM.normal(size=(4, 10))
+SCALE[:, 0] = 1.0, 0.1, 0.2, -0.1  # z = (1, 0, ..., 0) is 1 kg with its moments [kg m]
+SETTINGS = Settings(
+    size=M + 1,
+    window=200,
+    row_interval=1,
+    pole=20.0,
+    motion_scale=0.05,
+    unmodelled=0.01,
+    columns=np.vstack((RANDOM.normal(size=(M, 4)) @ SCALE, np.zeros((1, 10)))),
+    scale=SCALE,
+)
+PRIOR = Prior(RANDOM.normal(size=M), np.diag(RANDOM.uniform(0.5, 2.0, M)))
+SWIFT = np.array([1.0, -1.0])  # rad/s
+
+
+def part(layout):
+    """An empty state, or scratch."""
+    sizes = SimpleNamespace(n=N, weighing=SETTINGS)
+    return view_of(layout)(np.zeros(size_of(layout)(sizes)), sizes)
+
+
+def rows_of(theta, count, noise=0.0, seed=1):
+    """Random rows [X | u] (count, N, M + 1) of an arm."""
+    random = np.random.default_rng(seed)
+    X = random.normal(size=(count, N, M))
+    u = X @ theta + noise * random.normal(size=(count, N))
+    return np.concatenate((X, u[:, :, np.newaxis]), axis=2)
+
+
+def test_solution_is_the_joint_least_squares_of_arm_and_load():
+    """As numpy solves the stacked rows with both priors; deviations from the inverse."""
+    state = part(State)
+    work = part(Work)
+    ND = SETTINGS.columns[:M]
+    D = SETTINGS.scale
+    noise = 0.04
+    period = CORRELATION / 7.0  # so that seven rows count as one
+    z = RANDOM.normal(size=10)
+    theta = PRIOR.estimate + 0.1 * RANDOM.normal(size=M)
+    loaded = theta + ND @ z
+    stacked = []
+    for which, count, model in (
+        (BEFORE, 90, theta),
+        (NEWER, 40, loaded),
+        (LATEST, 20, loaded),
+    ):
+        rows = rows_of(model, count, noise, which)
+        for row in rows:
+            add_products(row, state.sums[which])
+        X, u = rows[:, :, :M].reshape(-1, M), rows[:, :, M].ravel()
+        held = np.zeros((len(X), 10)) if which == BEFORE else X @ ND
+        stacked.append(np.column_stack((X, held, u)))
+    state.complete[0] = 1.0
+    state.statistics[NOISE] = noise**2
+    weighing.solve(SETTINGS, state, work, PRIOR, period)
+    a = 7.0 * noise**2
+    H = np.zeros((M + 10, M + 10))
+    H[:M, :M] = PRIOR.information
+    H[M:, M:] = np.eye(10)
+    *A, u = np.vstack(stacked).T
+    g = np.array(A) @ u + a * H @ np.append(PRIOR.estimate, np.zeros(10))
+    H = np.array(A) @ np.transpose(A) + a * H
+    expected = np.linalg.solve(H, g)
+    np.testing.assert_allclose(state.solution, expected, rtol=1e-6, atol=1e-9)
+
+    weighing.describe(SETTINGS, state, work, period)
+    mass, *moments = D @ expected[M:]
+    centre = np.array(moments) / mass
+    C = a * D @ np.linalg.inv(H)[M:, M:] @ D.T
+    J = np.column_stack((-centre, np.eye(3))) / mass
+    np.testing.assert_allclose(state.load[:4], (mass, *centre), rtol=1e-6)
+    deviation = np.sqrt(np.append(C[0, 0], np.diag(J @ C @ J.T)))
+    np.testing.assert_allclose(state.load[4:], deviation, rtol=1e-5)
+
+
+class Arm:
+    """An arm of which rows are added, with something in its hand."""
+
+    def __init__(self):
+        self.state, self.work = part(State), part(Work)
+        self.theta = PRIOR.estimate + 0.1
+        self.samples = self.changes = 0
+
+    def moves(self, seconds, load=0.0, velocity=SWIFT):
+        """Add rows of a load [kg]; return its mass [kg] by the weighing."""
+        theta = self.theta + load * SETTINGS.columns[:M, 0]
+        count = round(seconds / DT)
+        for row in rows_of(theta, count, 0.01, self.samples):
+            self.samples += 1
+            weighing.add_row(
+                SETTINGS,
+                self.state,
+                self.work,
+                PRIOR,
+                row,
+                velocity,
+                self.samples,
+                self.changes,
+                DT,
+            )
+        return self.state.load[MASS]
+
+    @property
+    def knows(self):
+        """Whether a mass is known."""
+        return self.state.load[DEVIATION] > 0.0
+
+
+def test_load_that_no_change_was_told_of_is_weighed_by_its_rows():
+    """To four deviations; 3 s are the first window, and 1 s is more than is kept apart."""
+    arm = Arm()
+    arm.moves(3.0)
+    assert arm.state.complete[0] == 1.0
+    mass = arm.moves(1.0, 1.0)
+    assert mass == pytest.approx(1.0, abs=4.0 * arm.state.load[DEVIATION])
+    assert arm.state.load[DEVIATION] < 0.1
+    mass = arm.moves(1.0, 0.0)  # it is put down
+    assert mass == pytest.approx(0.0, abs=4.0 * arm.state.load[DEVIATION])
+
+
+@pytest.mark.parametrize(
+    ('seconds', 'complete'),
+    [
+        (0.7, 0.0),
+        (1.2, 1.0),
+    ],  # less and more than 0.5 s of motion, after 0.3 s and 0.3 s
+)
+def test_change_in_the_first_window_ends_the_rows_before_if_they_are_enough(
+    seconds, complete
+):
+    arm = Arm()
+    arm.moves(seconds)
+    arm.changes += 1
+    arm.moves(DT, 1.0)
+    assert arm.state.complete[0] == complete
+    assert (arm.state.rows[BEFORE] > 0.0) == bool(complete)
+    assert not arm.knows
+    assert weighing.held_mass(arm.state) == (0.0, np.inf if complete else 0.0)
+
+
+def test_hand_that_held_something_at_first_is_empty_once_it_is_put_down():
+    """What is held then counts from the lightest, whatever the first window held."""
+    arm = Arm()
+    arm.moves(1.5, 1.0)
+    arm.changes += 1
+    assert arm.moves(1.5) == pytest.approx(-1.0, abs=0.05)
+    arm.changes += 1
+    assert arm.moves(1.5, 1.0) == pytest.approx(1.0, abs=0.05)
+
+
+def test_rows_of_an_empty_hand_join_those_before_until_they_make_a_window():
+    arm = Arm()
+    arm.moves(1.5)
+    before = arm.state.rows[BEFORE]
+    arm.changes += 1
+    arm.moves(1.5)
+    assert arm.state.rows[BEFORE] == before
+    arm.changes += 1
+    arm.moves(DT)
+    assert before + 50.0 < arm.state.rows[BEFORE] < before + 150.0
+
+
+def test_rows_at_rest_count_little_and_are_no_motion():
+    """1e-6 of the weight of rows that move; none of a thousand is one of the window."""
+    arm = Arm()
+    arm.moves(10.0, velocity=np.full(N, 3e-7))
+    assert arm.state.rows.sum() < 1e-4
+    assert arm.state.complete[0] == 0.0
+
+
+def test_rows_are_kept_apart_and_then_used_in_two_halves():
+    state = part(State)
+    state.complete[0] = 1.0
+    for _ in range(10):
+        state.rows[LATEST] += 15.0
+        weighing.promote(SETTINGS, state)
+    # 150 rows: 15 are kept apart; a half of 105 was full, and 30 are of the next
+    assert state.rows.tolist() == [0.0, 105.0, 30.0, 15.0, 0.0]
