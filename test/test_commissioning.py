@@ -22,7 +22,7 @@ from blf_dsc_controller.arms.linear_loop import (
 from blf_dsc_controller.arms.model import inertia_matrices
 from blf_dsc_controller.arms.urdf import frames
 from blf_dsc_controller.cli.main import main
-from blf_dsc_controller.commissioning import simulated
+from blf_dsc_controller.commissioning import files, simulated
 from blf_dsc_controller.commissioning.choice import Loops, choose
 from blf_dsc_controller.commissioning.commissioning import commissioned, plan
 from blf_dsc_controller.commissioning.motion import excitation, lines_in
@@ -30,7 +30,7 @@ from blf_dsc_controller.commissioning.page import sentences
 from blf_dsc_controller.commissioning.response import response_of
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.files import share_folder
-from blf_dsc_controller.configuration.nodes import load_loop
+from blf_dsc_controller.configuration.nodes import load_loop, read
 from blf_dsc_controller.configuration.plant import PlantConfig
 from blf_dsc_controller.configuration.schema import build, change
 from blf_dsc_controller.errors import BlfDscError
@@ -39,6 +39,7 @@ from blf_dsc_controller.reference.approach import reference_of
 from blf_dsc_controller.reference.terms import sampled
 from blf_dsc_controller.run import Stop
 from blf_dsc_controller.simulation.loop import simulate
+from blf_dsc_controller.supervision.expected_errors import expected_errors
 
 ROTORS = (0.3, 0.1)  # kg m^2
 SPRINGS = (3e3, 1.5e3)  # N m/rad: free resonances of 26 and 29 Hz
@@ -49,7 +50,8 @@ ROBOT = {
     'robot.rotor_inertia': list(ROTORS),
     'robot.lag': 0.001,
 }
-CONFIG = build(ControllerConfig, {**ROBOT, 'robot.payload': 0.1})
+GIVEN = {**ROBOT, 'robot.payload': 0.1}
+CONFIG = build(ControllerConfig, GIVEN)
 POSTURE = np.array([0.3, 1.1])
 TIMING = Timing(1e-3, delay=1)
 ARM = build(
@@ -283,8 +285,26 @@ def test_loop_of_ones_own_has_the_same_motions_and_gains():
     result = commissioning.result([simulated.measured(motion, ARM)])
     expected = found().parameters() | {'commissioning.date': result.date}
     assert result.parameters() == expected
-    config = blf.change(CONFIG, result.parameters())
-    assert config.feedback.joint_damping == expected['feedback.joint_damping']
+    assert result.config.feedback.joint_damping == expected['feedback.joint_damping']
+    # as from a file: the law's own gains follow from those of the joints
+    written = build(ControllerConfig, {**GIVEN, **result.parameters()})
+    assert result.config == written
+    assert written.feedback.gain != CONFIG.feedback.gain
+
+
+def test_gains_of_the_law_in_a_file_give_way_to_those_that_were_chosen(tmp_path):
+    """What else the file gives stays."""
+    file = tmp_path / 'arm.yaml'
+    file.write_text(
+        '/**/blf_dsc_controller:\n  ros__parameters:\n'
+        '    feedback.gain: [1.0, 1.0]\n    barrier: {weight: [3.0, 3.0], bound: [0.3, 0.3]}\n'
+    )
+    sections = files.of_commissioned(read(file), found())
+    given = sections['/**/blf_dsc_controller']
+    assert 'feedback.gain' not in given
+    assert 'barrier.weight' not in given
+    assert given['feedback.joint_damping'] == found().config.feedback.joint_damping
+    assert given['barrier.bound'] == [0.3, 0.3]
 
 
 def test_gains_without_the_margin_are_no_parameters():
@@ -295,6 +315,31 @@ def test_gains_without_the_margin_are_no_parameters():
     assert any('NO GAINS HAVE THE MARGIN of 1.1' in each for each in sentences(result))
     with pytest.raises(BlfDscError, match=r'no gains have the modulus margin of 1\.1'):
         result.parameters()
+
+
+def test_bound_is_wide_enough_for_what_the_gains_allow_and_never_narrowed():
+    given = {'barrier.bound': [1e-3, 0.3], 'barrier.funnel_rate': 1.0}
+    tight = change(CONFIG, given | {'barrier.initial_bound': [2e-3, 0.0]})
+    run, config = simulated.measured(planned(), ARM)
+    result = commissioned(tight, [(run, config)])
+    bound = result.parameters()['barrier.bound']
+    errors = expected_errors(result.config, settings_of_config(result.config))
+    needed = np.maximum(errors.unmodelled, errors.pick_up)
+    assert needed[0] > 1e-3
+    assert bound[0] == pytest.approx(1.1 * needed[0], rel=0.05)  # two digits
+    assert bound[1] == 0.3
+    assert result.config.barrier.initial_bound == (bound[0], 0.0)
+    assert any('joint1' in each and 'widened' in each for each in sentences(result))
+    assert (
+        'barrier.bound'
+        not in commissioned(
+            change(
+                CONFIG,
+                {'barrier.bound': [0.3, 0.3], 'barrier.initial_bound': [0.0] * 2},
+            ),
+            [(run, config)],
+        ).parameters()
+    )
 
 
 def test_gains_far_from_those_of_the_measurement_are_to_be_raised_in_steps():

@@ -16,6 +16,7 @@ from blf_dsc_controller.arms.model import inertia_matrices
 from blf_dsc_controller.arms.tuning import Design
 from blf_dsc_controller.commissioning import motion
 from blf_dsc_controller.commissioning.choice import MARGIN, Choice, Loops, choose
+from blf_dsc_controller.commissioning.chosen import kept_bound, with_gains
 from blf_dsc_controller.commissioning.findings import Findings, findings_of
 from blf_dsc_controller.commissioning.response import Response, response_of
 from blf_dsc_controller.configuration.controller import ControllerConfig, design_of
@@ -60,6 +61,7 @@ class Commissioned(NamedTuple):
     lag: float  # s, robot.lag: measured, else as given
     date: str  # when the gains were chosen
     aim: float  # the modulus margin that was asked for
+    before: ControllerConfig  # for which the arm was measured
 
     @property
     def has_margin(self) -> bool:
@@ -76,6 +78,18 @@ class Commissioned(NamedTuple):
                 f'no gains have the modulus margin of {self.aim:g}: noise or friction hide the '
                 'response. Measure again with more torque or travel'
             )
+        values = self._values()
+        return values | kept_bound(with_gains(self.before, values))
+
+    @property
+    def config(self) -> ControllerConfig:
+        """The configuration with the parameters, and all that follows from them.
+
+        Raises BlfDscError if no gains have the margin.
+        """
+        return with_gains(self.before, self.parameters())
+
+    def _values(self) -> dict[str, Value]:
         gains = self.choice.gains
         return {
             'robot.lag': float(f'{self.lag:.3g}'),
@@ -183,6 +197,7 @@ def commissioned(
         lag=config.robot.lag if np.isnan(lag) else lag,
         date=datetime.now().astimezone().strftime('%Y-%m-%d %H:%M'),
         aim=margin,
+        before=config,
     )
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 
+from blf_dsc_controller.commissioning.chosen import FOLLOWED
 from blf_dsc_controller.commissioning.commissioning import Commissioned, Planned
 from blf_dsc_controller.configuration.files import Section
 from blf_dsc_controller.configuration.nodes import CONTROLLER, PLANT, STUDY
@@ -28,11 +29,15 @@ def of_motion(sections: Sequence[Section], planned: Planned) -> dict[str, _Value
 def of_commissioned(
     sections: Sequence[Section], found: Commissioned
 ) -> dict[str, _Values]:
-    """Return the sections of a file with what was measured in the place of guesses."""
+    """Return the sections of a file with what was measured in the place of guesses.
+
+    Gains of the law that the file gives are left out, since they follow.
+    """
     chosen = found.parameters()
     of_robot = {name: value for name, value in chosen.items() if 'robot.' in name}
     own = {name: value for name, value in chosen.items() if name not in of_robot}
-    return _with(sections, {'/**': of_robot, f'/**/{CONTROLLER}': own})
+    given = {'/**': of_robot, f'/**/{CONTROLLER}': own}
+    return _with(sections, given, removed=FOLLOWED)
 
 
 def _with(

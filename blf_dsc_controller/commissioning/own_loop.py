@@ -40,7 +40,7 @@ class Commissioning:
             with ArmController(motion.config, record=f'run_{k}') as controller:
                 ...  # update, for motion.duration [s]
         found = commissioning.result(['run_0', 'run_1', 'run_2'])
-        controller = ArmController(change(commissioning.config, found.parameters()))
+        controller = ArmController(found.config)
 
     Attributes:
         config: the configuration that the arm is measured for.

@@ -14,6 +14,7 @@ from blf_dsc_controller.analysis.output import aligned
 from blf_dsc_controller.analysis.panels import ALARM, BLUE, MUTED, ORANGE, SHADE
 from blf_dsc_controller.commissioning.choice import SLOWEST
 from blf_dsc_controller.commissioning.commissioning import Commissioned, Planned
+from blf_dsc_controller.supervision.expected_errors import expectation
 
 Floats = NDArray[np.float64]
 
@@ -111,10 +112,28 @@ def sentences(found: Commissioned) -> Iterator[str]:
             f'{joint} gets {most:.2g} times the gains it was measured with: raise '
             'feedback.stiffness from 0.25 to 1 in steps, or measure again with this file at 0.25'
         )
+    if found.has_margin:
+        yield f'errors to expect with these gains: {expectation(found.config)}'
+        yield from _of_bound(found)
     yield (
         f'measured in {len(found.responses)} runs: with another load, or far from their postures, '
         'measure again'
     )
+
+
+def _of_bound(found: Commissioned) -> Iterator[str]:
+    """Yield which bounds are wider than they were."""
+    bounds = found.config.barrier.bound, found.before.barrier.bound
+    wider = [
+        f'{joint} {after:g} rad instead of {before:g}'
+        for joint, after, before in zip(found.joints, *bounds, strict=True)
+        if after > before
+    ]
+    if wider:
+        yield (
+            f'barrier.bound is widened for these errors: {"; ".join(wider)}. With less '
+            'robot.payload less will do'
+        )
 
 
 def _doubt_at(found: Commissioned) -> float:

@@ -1,0 +1,75 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The configuration that follows from chosen gains, and the bounds that they can keep."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+from numpy.typing import NDArray
+
+from blf_dsc_controller.arms.joint_gains import JointGains
+from blf_dsc_controller.arms.tuning import gains_of
+from blf_dsc_controller.configuration.controller import ControllerConfig, design_of
+from blf_dsc_controller.configuration.schema import Value, change, flatten
+from blf_dsc_controller.law.factory import settings_of_config
+from blf_dsc_controller.supervision.expected_errors import expected_errors
+
+Floats = NDArray[np.float64]
+
+FOLLOWED = (
+    'surface.gain',
+    'surface.mu',
+    'feedback.gain',
+    'feedback.damping_rate',
+    'barrier.weight',
+    'barrier.slope_limit',
+    'disturbance.gain',
+)
+"""Gains of the law that are always those of the joints, whatever a file gives."""
+
+_ROOM = 1.1  # bound over the errors to expect
+
+
+def with_gains(
+    config: ControllerConfig, values: Mapping[str, Value]
+) -> ControllerConfig:
+    """Return a configuration with values, and what follows from them, as if read from a file.
+
+    `values` have `feedback.joint_stiffness` and `feedback.joint_damping`.
+    """
+    names = 'feedback.joint_stiffness', 'feedback.joint_damping'
+    gains = JointGains(*(np.array(values[name], float) for name in names))
+    arm, _ = design_of(config)
+    bound = np.array(values.get('barrier.bound', config.barrier.bound), float)
+    before = gains_of(arm, np.array(config.barrier.bound))
+    lag = float(np.asarray(values.get('robot.lag', arm.lag), float))
+    after = gains_of(arm._replace(joints=gains, stiffness=1.0, lag=lag), bound)
+    present = flatten(config)
+    followed = {
+        name: value
+        for name, value in after.items()
+        if name in FOLLOWED or present[name] == before[name]
+    }
+    return change(config, {**followed, **values})
+
+
+def kept_bound(config: ControllerConfig) -> dict[str, Value]:
+    """Return the bounds wide enough for the errors to expect, by dotted name.
+
+    None, if the bounds of the joints follow from one at the tool.
+    """
+    barrier = config.barrier
+    if barrier.bounds_tool:
+        return {}
+    errors = expected_errors(config, settings_of_config(config))
+    least = _ROOM * np.maximum(errors.unmodelled, errors.pick_up)
+    if (least <= barrier.bound).all():
+        return {}
+    wide = np.array([float(f'{each:.2g}') for each in np.maximum(barrier.bound, least)])
+    starts = np.array(barrier.initial_bound)
+    values: dict[str, Value] = {'barrier.bound': tuple(wide.tolist())}
+    if starts.any():
+        starts = np.where(starts > 0.0, np.maximum(starts, wide), 0.0)
+        values['barrier.initial_bound'] = tuple(starts.tolist())
+    return values
