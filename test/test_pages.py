@@ -37,7 +37,10 @@ LAUNCH = (ROOT / 'launch/closed_loop.launch.py').read_text()
 SETUP = (ROOT / 'setup.cfg').read_text()
 ROS2_CONTROL_NODES = {'controller_manager', 'effort_controller'}
 # Other programs that the pages may call; they are not checked.
-FOREIGN = 'cd colcon coverage docker export git pre-commit pytest rosdoc2 rviz2 source sudo tar xacro'
+FOREIGN = (
+    'cd colcon coverage docker export git pre-commit pytest rosdoc2 rviz2 source sudo tar '
+    'xacro'
+)
 
 
 @functools.cache
