@@ -63,6 +63,26 @@ def test_arm_at_rest_that_gently_receives_a_load_is_not_stopped(effort, bound):
     assert np.abs(torque[-1] - torque[400]).max() > 10.0  # N m: the load is held
 
 
+@pytest.mark.parametrize(('ramp', 'mass'), [(0.3, 1.0), (0.5, 3.0), (1.0, 2.0)])
+def test_stiff_arm_may_take_up_a_load_without_a_motion_that_its_encoders_resolve(
+    ramp, mass
+):
+    """Steps of 50 urad: the loop holds the sag below a step on the average."""
+    loop = load_loop('panda_rigid')
+    law = {'reference.type': 'hold', 'robot.effort': 'unknown'}
+    load = {
+        'sensor.resolution': 5e-5,
+        'events.begin': [4.0],
+        'events.duration': [0.0],
+        'events.ramp': [ramp],
+        'events.payload': [mass],
+        'duration': 5.5,
+    }
+    record = simulate(change(loop.controller, law), change(loop.plant, load)).run()
+    assert record.stops == ()
+    assert np.abs(record.torque[-1] - record.torque[3900]).max() > 3.0  # N m
+
+
 @pytest.mark.parametrize('bound', [0.002, 0.05])
 def test_brakes_are_found_on_any_bound_and_through_the_noise_of_the_encoders(bound):
     given = {'barrier.bound': [bound] * 2, 'safety.torque': 'hold_gravity'}

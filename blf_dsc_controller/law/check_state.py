@@ -15,7 +15,7 @@ OUTSIDE = 2
 """An error outside its bound."""
 
 NO_EFFECT = 8
-"""Commands that have changed without any joint moving: they do not reach the arm, or it is held."""
+"""Commands that do not reach the arm, or an arm that is held: see `effect`."""
 
 INVALID = 4
 """A joint state that is not finite or too fast; the law did not use it."""
@@ -42,6 +42,7 @@ class Checks(NamedTuple):
     chatter: Annotated[Array, 'n']
     at_rest: Cell  # s, since a joint has last moved
     q: Annotated[Array, 'n']  # rad, where it has
+    qr: Annotated[Array, 'n']  # rad, the reference of then
     moved: Annotated[Array, 'm + n']  # estimates and d^3 of then
     # |xi1| / k of the sample that `consistent` is of, relaxed since
     least_ratio: Cell

@@ -48,29 +48,40 @@ def has_moved(checks: Checks, n: int) -> bool:
 
 
 @inner
+def asks_for_motion(checks: Checks, sample: Sample, n: int) -> bool:
+    """Whether the reference has moved since a joint has, so far that a sensor would show it."""
+    asks = False
+    for i in range(n):
+        asks = asks or position_changed(checks, i, sample.qr[i] - checks.qr[i])
+    return asks
+
+
+@inner
 def check_effect(
     settings: Settings, checks: Checks, state: State, signals: Signals, sample: Sample
 ) -> int:
     """Return the flags for commands without effect; call it once the sample's values are kept.
 
-    While no joint moves, gravity does not change: the commands should not either,
-    except by what overcomes stiction. Otherwise brakes hold the arm, or its effort
-    controller is not active, and the law learns what its own commands say. Slower
-    drifts show in efforts that are torques, and an effort that follows the commands
-    shows that they have an effect: a load does not move an arm whose torque grows with
-    it.
+    The reference has moved on, the commands have changed by more than what overcomes
+    stiction, and still no joint has moved: brakes hold the arm, or its effort
+    controller is not active, and the law learns what its own commands say.  While the
+    reference rests, commands may change without a motion that the sensors resolve: a
+    stiff loop takes up a load so.  Slower drifts show in efforts that are torques; an
+    effort that follows the commands shows that they have an effect.
     """
     begins = state.samples[0] <= 1.0
     moves = begins or has_moved(checks, settings.n)
     T = checks.sample_time[0]
     flags = compare_effort(settings, checks, signals, sample, begins, moves)
-    follows = effort_follows(settings, checks)
+    is_due = asks_for_motion(checks, sample, settings.n)
+    is_due = is_due and not effort_follows(settings, checks)
     checks.at_rest[0] = 0.0 if moves else checks.at_rest[0] + T
     for i in range(settings.n):
         smooth = 1.0 if begins else min(1.0, T / _RECENT)
         checks.recent[i] += smooth * (sample.torque[i] - checks.recent[i])
         if moves:
             checks.q[i] = checks.read[i]
+            checks.qr[i] = sample.qr[i]
             checks.before[i] = checks.recent[i]
         else:
             checks.before[i] += min(1.0, T / _BEFORE) * (
@@ -80,7 +91,7 @@ def check_effect(
         least = _CHANGED * settings.torque_limit[i]
         least += _CHATTERED * sqrt(checks.chatter[i])
         has_changed = change > least
-        if has_changed and checks.at_rest[0] > _RECENT and not follows:
+        if has_changed and checks.at_rest[0] > _RECENT and is_due:
             flags |= NO_EFFECT | SUSPECT
     if moves and checks.lacking[0] == 0.0:
         for j in range(settings.m + settings.n):
