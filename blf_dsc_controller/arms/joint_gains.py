@@ -116,17 +116,6 @@ def law_gains(gains: JointGains, inertia: Floats) -> dict[str, Floats]:
     }
 
 
-def adaptation_gain(gains: JointGains, inertia: Floats, deviation: Floats) -> float:
-    """Return the largest Gamma with which the tracking error adapts no faster than d^3.
-
-    `deviation` (n,) [N m] is the standard deviation of the modelled torque: adaptation
-    integrates Gamma deviation^2 xi2 where d^3 integrates gamma xi2.  Where no joint has
-    a modelled torque at rest it is infinite.
-    """
-    with np.errstate(divide='ignore'):
-        return float((gains.integral(inertia) / deviation**2).min())
-
-
 def funnel_rate(gains: JointGains) -> float:
     """Return the rate [1/s] at which a bound may narrow: that of the slowest integral."""
     return float(_FUNNEL * gains.rate.min())

@@ -30,7 +30,6 @@ from blf_dsc_controller.arms.base_parameters import BaseParameters, prior_factor
 from blf_dsc_controller.arms.joint_gains import (
     SURFACE,
     JointGains,
-    adaptation_gain,
     funnel_rate,
     law_gains,
 )
@@ -125,6 +124,8 @@ def _through_inertia(arm: Design, bound: np.ndarray | None) -> dict[str, Value]:
     postures = arm.over_postures()
     m = postures.free_inertia
     sag = _SAG * postures.gravity / (m * rate**2)
+    integral = _INTEGRAL * m * rate**2
+    Gamma = adaptation_gain(integral, postures.gravity)
     zeros = (0.0,) * n
     return {
         'feedback.inertia': 'whole',
@@ -139,10 +140,10 @@ def _through_inertia(arm: Design, bound: np.ndarray | None) -> dict[str, Value]:
         'surface.mu': (_SURFACE[1] * rate,) * n,
         'feedback.gain': zeros,
         'feedback.damping_rate': _DAMPING * rate,
-        'disturbance.gain': _listed(_INTEGRAL * m * rate**2),
+        'disturbance.gain': _listed(integral),
         'comparison.surface_gain': (rate / 3.0,) * n,
         'comparison.position_gain': _listed(m * (rate / 4.0) ** 2),
-        'learning.adaptation_gain': (_ADAPTATION,) * arm.parameters.model.p,
+        'learning.adaptation_gain': (Gamma,) * arm.parameters.model.p,
     }
 
 
@@ -156,7 +157,7 @@ def _of_joints(
     usual_bound = np.maximum(sag, _BOUND)
     start = np.where(sag > (usual_bound if bound is None else bound), sag, 0.0)
     inertia = postures.inertia
-    Gamma = adaptation_gain(gains, inertia, postures.gravity)
+    Gamma = adaptation_gain(gains.integral(inertia), postures.gravity)
     law = {name: _listed(each) for name, each in law_gains(gains, inertia).items()}
     return {
         **law,
@@ -167,9 +168,21 @@ def _of_joints(
         'feedback.damping_rate': 0.0,
         'comparison.surface_gain': _listed(gains.rate),
         'comparison.position_gain': _listed(0.5 * gains.stiffness),
-        'learning.adaptation_gain': (min(_ADAPTATION, float(f'{Gamma:.4g}')),)
-        * arm.parameters.model.p,
+        'learning.adaptation_gain': (Gamma,) * arm.parameters.model.p,
     }
+
+
+def adaptation_gain(integral: np.ndarray, deviation: np.ndarray) -> float:
+    """Return a Gamma with which the tracking error adapts no faster than d^3.
+
+    `integral` (n,) [N m/rad] is gamma, and `deviation` (n,) [N m] the standard deviation
+    of the modelled torque: where d^3 integrates gamma xi2, adaptation integrates
+    Gamma deviation^2 xi2.  It grows with the square of the payload, and nothing else
+    bounds it on slow or soft loops.
+    """
+    with np.errstate(divide='ignore'):
+        slow = float((integral / deviation**2).min())
+    return min(_ADAPTATION, float(f'{slow:.4g}'))
 
 
 def _of_arm(arm: Design) -> dict[str, Value]:
