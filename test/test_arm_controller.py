@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import math
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -223,12 +224,14 @@ def test_full_disk_ends_the_recording_and_no_torque_is_lost(full, tmp_path, capl
         with blf.ArmController(LONG.controller, record=bag) as controller:
             torques = run(controller, plant, LONG.plant, steps_of(LONG.plant) + 1)
             assert controller.phase is Phase.TRACKING
-        saved = recover(bag, tmp_path / 'saved')
+        shutil.copytree(bag, tmp_path / 'bag')  # off the full disk
+    saved = recover(tmp_path / 'bag', tmp_path / 'saved')
     assert f'blf_dsc recover {bag} saves' in controller.output_problem
     np.testing.assert_array_equal(torques, simulated.torque)
     assert len(caplog.records) == 1  # said once
     assert 500 < saved.messages[COMMANDS.resolved] < 4000
-    assert not (bag / 'metadata.yaml').exists()  # it would count what is not there
+    metadata = tmp_path / 'bag' / 'metadata.yaml'
+    assert not metadata.exists()  # it would count what is not there
 
 
 class Failing:

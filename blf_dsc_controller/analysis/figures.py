@@ -32,6 +32,7 @@ from blf_dsc_controller.analysis.panels import (
     panels,
 )
 from blf_dsc_controller.run import Run
+from blf_dsc_controller.writing import writing
 
 NAMES = ('tracking.png', 'change.png', 'parameters.png')
 """Names of the files that `draw` can write."""
@@ -113,7 +114,8 @@ class Picture:
                 lowest.set_xlabel('time [s]')
                 lowest.tick_params(labelbottom=True)
             # Figure.savefig would draw twice, the first time for the layout only.
-            self._canvas.print_png(path)  # type: ignore[no-untyped-call]
+            with writing(path):
+                self._canvas.print_png(path)  # type: ignore[no-untyped-call]
 
 
 def head(axes: Axes, title: str, *, legend_at: float | None = None) -> None:

@@ -10,6 +10,8 @@ from dataclasses import asdict, is_dataclass
 from pathlib import Path
 from typing import Any
 
+from blf_dsc_controller.writing import write_text
+
 
 def aligned(rows: Sequence[Sequence[str]]) -> str:
     """Return a table for the terminal: first column flush left, others right."""
@@ -22,9 +24,7 @@ def aligned(rows: Sequence[Sequence[str]]) -> str:
 
 def write_json(numbers: Any, path: Path) -> None:
     """Write metrics, or other data in dictionaries and lists, as JSON."""
-    path.write_text(
-        json.dumps(plain(numbers), indent=2, allow_nan=False) + '\n', encoding='utf-8'
-    )
+    write_text(path, json.dumps(plain(numbers), indent=2, allow_nan=False) + '\n')
 
 
 def plain(value: Any) -> Any:

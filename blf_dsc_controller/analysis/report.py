@@ -28,6 +28,7 @@ from blf_dsc_controller.extras import import_extra
 from blf_dsc_controller.messages.codecs import typestore
 from blf_dsc_controller.messages.topics import DIAGNOSTICS
 from blf_dsc_controller.run import Floats, Run
+from blf_dsc_controller.writing import write_text
 
 _DIGITS = 7
 _ALARMING = ('violation', 'stop', 'contact', 'oscillation', 'ERROR', 'lost')
@@ -257,4 +258,4 @@ def _colour(k: int) -> str:
 def write_page(path: Path, template: str, title: str, **values: object) -> None:
     """Render a template with its variables and write the page."""
     text = _TEMPLATES.get_template(template).render(title=title, **values)
-    path.write_text(text, encoding='utf-8')
+    write_text(path, text)

@@ -36,6 +36,7 @@ from blf_dsc_controller.bags.unpacking import unpacked
 from blf_dsc_controller.bags.writer import BagWriter
 from blf_dsc_controller.configuration.files import load_yaml
 from blf_dsc_controller.messages.codecs import Definition
+from blf_dsc_controller.writing import writing
 
 # in the footer: begin of the summary and its offsets, and their checksum
 _END = Struct('<QQI')
@@ -58,6 +59,7 @@ def recover(path: Path, out: Path) -> Recovery:
 
     Raises:
         BagError: there is no MCAP file, or `out` exists already.
+        BlfDscError: `out` cannot be written; nothing of it is left.
     """
     check_regular(path)
     candidates = path.glob('*.mcap') if path.is_dir() else [path]
@@ -67,7 +69,7 @@ def recover(path: Path, out: Path) -> Recovery:
             f'{path} cannot be read as a bag: there is no MCAP file to recover'
         )
     files.sort(key=lambda file: (len(file.name), file.name))  # bag_10 after bag_9
-    with BagWriter(out, flush_interval=None) as bag:
+    with writing(out), BagWriter(out, flush_interval=None) as bag:
         losses = [
             f'{file.name}: {loss}' for file in files for loss in _copied(file, bag)
         ]

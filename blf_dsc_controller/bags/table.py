@@ -14,6 +14,7 @@ from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.extras import import_extra
 from blf_dsc_controller.messages import topics
 from blf_dsc_controller.run import Run
+from blf_dsc_controller.writing import writing
 
 _ARRAYS = {  # of a run, with a column per joint: unit
     'position': 'rad',
@@ -102,9 +103,10 @@ def export(run: Run, path: Path) -> int:
             f'{path} ends in neither .csv nor .parquet: the file extension selects the format'
         )
     blocks = (slice(begin, begin + _ROWS) for begin in range(0, run.stamp.size, _ROWS))
-    (_write_csv if path.suffix == '.csv' else _write_parquet)(
-        (table(run, rows) for rows in blocks), path
-    )
+    with writing(path):
+        (_write_csv if path.suffix == '.csv' else _write_parquet)(
+            (table(run, rows) for rows in blocks), path
+        )
     return len(table(run, slice(1)))
 
 

@@ -47,6 +47,7 @@ from blf_dsc_controller.identification.summary import (
     notes_of,
     problems_of,
 )
+from blf_dsc_controller.writing import write_text
 
 UNUSABLE = 3
 """Exit code if the model does not explain the torques held back."""
@@ -173,9 +174,9 @@ def _write(outputs: Sequence[Path], found: Identified, robot: Robot, note: str) 
             text = corrected_urdf(
                 robot.text, found.chain, found.parts.bodies, viscous, coulomb, note
             )
-            path.write_text(text, encoding='utf-8')
+            write_text(path, text)
         elif path.suffix == '.xml':
-            path.write_text(mjcf(found, robot.gravity, note), encoding='utf-8')
+            write_text(path, mjcf(found, robot.gravity, note))
         else:
             urdf = next(each for each in outputs if each.suffix == '.urdf')
             comment = ''.join(f'# {line}\n' for line in note.splitlines())

@@ -37,6 +37,7 @@ from blf_dsc_controller.configuration.schema import (
     unknown_names,
 )
 from blf_dsc_controller.errors import ConfigurationError
+from blf_dsc_controller.writing import write_text
 
 PLANT = 'sim_plant'
 CONTROLLER = 'blf_dsc_controller'
@@ -387,7 +388,7 @@ def dump(path: Path, nodes: Mapping[str, object], comment: str = '') -> None:
         lines += [
             f'    {name}: {format_value(value)}\n' for name, value in values.items()
         ]
-    path.write_text(''.join(lines), encoding='utf-8')
+    write_text(path, ''.join(lines))
 
 
 def unmatched_sections(

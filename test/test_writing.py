@@ -1,0 +1,50 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Files that cannot be written are named, and nothing of them is left."""
+
+from __future__ import annotations
+
+import pytest
+from recorded_run import limited_files
+
+from blf_dsc_controller.errors import BlfDscError
+from blf_dsc_controller.writing import write_text, writing
+
+
+@pytest.fixture
+def full(tmp_path):
+    """A folder in which files end at 1,000 bytes."""
+    with limited_files(tmp_path / 'disk', size=1000) as disk:
+        yield disk
+
+
+def test_text_that_the_disk_does_not_hold_leaves_no_stump(full):
+    path = full / 'page.html'
+    with pytest.raises(
+        BlfDscError, match=r'page\.html cannot be written: File too large'
+    ):
+        write_text(path, 'x' * 5000)
+    assert not path.exists()
+    write_text(path, 'x' * 500)
+    assert path.read_text() == 'x' * 500
+
+
+def test_folder_that_the_disk_does_not_hold_leaves_nothing(full):
+    def fill(folder):
+        folder.mkdir()
+        (folder / 'small').write_text('x')
+        (folder / 'large').write_text('x' * 5000)
+
+    with (
+        pytest.raises(BlfDscError, match='nothing of it is left'),
+        writing(full / 'bag'),
+    ):
+        fill(full / 'bag')
+    assert not (full / 'bag').exists()
+
+
+def test_what_cannot_be_opened_stays(tmp_path):
+    """Such as a folder of the same name."""
+    (tmp_path / 'page.html').mkdir()
+    with pytest.raises(BlfDscError, match=r'page\.html: Is a directory'):
+        write_text(tmp_path / 'page.html', 'x')
+    assert (tmp_path / 'page.html').is_dir()
