@@ -71,7 +71,7 @@ def commission(options: Namespace) -> int:
     if not found.has_margin:
         print(f'not written: {options.out}')
         return NO_MARGIN
-    comment = ''.join(f'# {line}\n' for line in lines)
+    comment = ''.join(f'# {line}\n' for line in (options.line, *lines))
     dump(options.out, files.of_commissioned(read(path), found), comment)
     print(f'wrote {options.out}')
     if not (options.bags or options.robot):

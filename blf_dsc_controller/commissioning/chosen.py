@@ -57,7 +57,8 @@ def with_gains(
 def kept_bound(config: ControllerConfig) -> dict[str, Value]:
     """Return the bounds wide enough for the errors to expect, by dotted name.
 
-    None, if the bounds of the joints follow from one at the tool.
+    None, if the bounds of the joints follow from one at the tool.  Funnels that are given
+    begin at these bounds at least; others follow.
     """
     barrier = config.barrier
     if barrier.bounds_tool:
@@ -67,9 +68,11 @@ def kept_bound(config: ControllerConfig) -> dict[str, Value]:
     if (least <= barrier.bound).all():
         return {}
     wide = np.array([float(f'{each:.2g}') for each in np.maximum(barrier.bound, least)])
-    starts = np.array(barrier.initial_bound)
     values: dict[str, Value] = {'barrier.bound': tuple(wide.tolist())}
-    if starts.any():
+    arm, _ = design_of(config)
+    usual = gains_of(arm, np.array(barrier.bound))['barrier.initial_bound']
+    if barrier.initial_bound != usual:
+        starts = np.array(barrier.initial_bound)
         starts = np.where(starts > 0.0, np.maximum(starts, wide), 0.0)
         values['barrier.initial_bound'] = tuple(starts.tolist())
     return values

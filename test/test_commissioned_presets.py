@@ -1,0 +1,72 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Presets that `blf_dsc commission` wrote: they are what they were, with gains that hold."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import blf_dsc_controller as blf
+from blf_dsc_controller.commissioning import files
+from blf_dsc_controller.configuration.files import share_folder
+from blf_dsc_controller.configuration.nodes import PLANT, load_loop, read
+
+PRESETS = ('fr3_direct', 'panda', 'ur5e')
+FOLDER = share_folder() / 'config'
+
+
+def path_of(preset):
+    return FOLDER / f'{preset}_commissioned.yaml'
+
+
+class Chosen:
+    """The parameters that a commissioned file has and its preset has otherwise."""
+
+    def __init__(self, preset):
+        config = load_loop(path_of(preset)).controller
+        feedback, commissioning = config.feedback, config.commissioning
+        self.values = {
+            'robot.lag': config.robot.lag,
+            'feedback.inertia': 'none',
+            'feedback.joint_stiffness': feedback.joint_stiffness,
+            'feedback.joint_damping': feedback.joint_damping,
+            'feedback.stiffness': 1.0,
+            'commissioning.date': commissioning.date,
+            'commissioning.version': commissioning.version,
+            'commissioning.margin': commissioning.margin,
+            'barrier.bound': config.barrier.bound,
+        }
+
+    def parameters(self):
+        return self.values
+
+
+@pytest.mark.parametrize('preset', PRESETS)
+def test_it_is_its_preset_with_what_was_chosen(preset):
+    """If it fails, the preset has changed: run the command in the first line of the file again."""
+    path = path_of(preset)
+    (command, *_) = path.read_text(encoding='utf-8').splitlines()
+    assert command == (
+        f'# blf_dsc commission --config {preset} --out config/{path.name}'
+    )
+    written = files.of_commissioned(read(FOLDER / f'{preset}.yaml'), Chosen(preset))
+    sections = {each.pattern: each.entries for each in read(path)}
+    for pattern, values in written.items():
+        entries = sections[pattern]
+        assert {name: entry.value for name, entry in entries.items()} == {
+            name: list(value) if isinstance(value, tuple) else value
+            for name, value in values.items()
+        }
+    assert load_loop(path).controller.commissioning.margin >= 0.5
+
+
+@pytest.mark.parametrize('preset', PRESETS)
+def test_simulated_arm_keeps_its_bound_when_it_picks_up_its_payload(preset):
+    """At 3 s in motion, where 30 s of the command have it at 20 s."""
+    early = {'duration': 6.0, 'events.begin': [3.0], 'events.duration': [0.0]}
+    loop = load_loop(path_of(preset), {PLANT: early})
+    run = blf.simulate(loop.controller, loop.plant).run()
+    assert run.stops == ()
+    assert run.oscillations == ()
+    ratio = np.abs(run.error) / loop.controller.barrier.bound
+    assert 0.1 < ratio.max() < 1.0  # it was picked up
