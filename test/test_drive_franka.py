@@ -203,6 +203,23 @@ def test_faults_on_the_wire_end_the_run_with_a_reason(wire, address, event, text
     assert_replays(wire.folder / 'bag')
 
 
+def test_commissioning_starts_torques_again_for_the_motion_and_ends_with_a_reflex(
+    wire, tmp_path
+):
+    """The move, of a second, is over by state 4000: the reflex is in the motion."""
+    wire.simulate('127.0.0.19', 'reflex@4000')
+    rest = [0.0, 0.0, 0.0, -1.57, 0.0, 1.57, 0.785]  # rad, where the simulator begins
+    words = ['commission', '--config', 'fr3_direct', '--robot', '127.0.0.19', '--yes']
+    out = ['--out', tmp_path / 'out.yaml', '--posture', *rest]
+    code, output = ended(wire.start('-m', 'blf_dsc_controller', *words, *out))
+    assert code == 5, output
+    assert 'posture 1: the robot stopped by itself' in output
+    assert 'recovered' in output
+    assert not (tmp_path / 'out.yaml').exists()
+    for name in ('move_1', 'posture_1'):
+        assert_replays(tmp_path / 'out_bags' / name)
+
+
 def test_sigterm_ends_at_rest_and_a_killed_command_leaves_a_robot_that_can_be_used(
     wire,
 ):
