@@ -10,7 +10,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from blf_dsc_controller.configuration.nodes import locate
 from blf_dsc_controller.configuration.schema import change
 from blf_dsc_controller.errors import ConfigurationError
 from blf_dsc_controller.law.telemetry import sample_columns
@@ -305,7 +304,7 @@ def is_kept(study, run, **learning):
 @pytest.mark.parametrize('name', FIRST)
 def test_papers_form_breaks_bounds_that_learning_here_does_not(name):
     """Nor are errors larger than without learning; and the model is found."""
-    study = load_study(locate(name))
+    study = load_study(name)
     found = compare_pairs(study, run_chunk(study, 0, FIRST[name]))
     assert found['kept']['without'] >= FIRST[name] // 3
     assert found['broken_only_with'] == []

@@ -136,7 +136,7 @@ def parameters_in(names: Iterable[str]) -> tuple[str, ...]:
 def bodies_of(names: Sequence[str]) -> dict[str, list[int]]:
     """Return the indices of the estimates of each link and kind of friction.
 
-    Of few, each alone.
+    If there are few of them, each estimate is a group of its own.
     """
     if len(names) <= _SHOWN_SINGLY:
         return {name: [k] for k, name in enumerate(names)}

@@ -38,13 +38,10 @@ PAYLOAD_SIZE = 0.05
 """Extent of a payload, and standard deviation of its centre of mass from the tip [m]."""
 
 ROTORS = 0.5
-"""Standard deviation of the inertia of a drive, relative to its value ..."""
+"""Standard deviation of the inertia of a drive, relative to its value."""
 
 UNKNOWN_ROTOR = 0.01
-"""...
-
-And absolute where that is 0, as neither effort nor inertia is known [kg m^2, or kg].
-"""
+"""The same where neither effort nor inertia is known, absolute [kg m^2, or kg]."""
 
 # for columns of order 1; rounding of pi / 2 in URDFs gives about 1e-10
 _DEPENDENT = 1e-6

@@ -149,7 +149,7 @@ def _outputs(options: Namespace) -> list[Path]:
 def _facts(found: Identified, options: Namespace) -> list[str]:
     """Return what was identified from what, and when.
 
-    Then problems and notes; wrapped.
+    Problems and notes follow, in lines of the terminal's width.
     """
     today = datetime.now().astimezone().strftime('%Y-%m-%d %H:%M')
     origin = (

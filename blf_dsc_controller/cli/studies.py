@@ -17,7 +17,6 @@ from tqdm import tqdm
 from blf_dsc_controller.analysis.output import aligned, write_json
 from blf_dsc_controller.cli.run import make_folder, print_notice
 from blf_dsc_controller.compiled.announcement import announced_compilation
-from blf_dsc_controller.configuration.nodes import locate
 from blf_dsc_controller.studies import contacts as contact_study
 from blf_dsc_controller.studies import laws, report, runs, stiffness
 from blf_dsc_controller.studies import paper as paper_study
@@ -108,7 +107,7 @@ def monte_carlo(options: Namespace) -> None:
 
 def _run_study(options: Namespace) -> None:
     given = {} if options.runs is None else {'runs': options.runs}
-    study = load_study(locate(options.config), given)
+    study = load_study(options.config, given)
     runs.require_pyarrow()
     store = runs.Store.create_or_open(options.out or Path('monte_carlo'), study)
     if chunks := store.missing():

@@ -306,7 +306,7 @@ def _dynamics(model: Any, joint: int) -> tuple[float, float]:
 def _effort(model: Any, joint: int) -> float:
     """Return the torque [N m] or force [N] that joint and actuators allow.
 
-    Infinity: any.
+    It is infinite where nothing limits it.
     """
     limit = inf
     if model.jnt_actfrclimited[joint]:

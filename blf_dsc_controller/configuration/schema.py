@@ -86,10 +86,7 @@ class Parameter:
 
     @property
     def constraints(self) -> str:
-        """What is allowed, and the number of entries, such as `above 0.
-
-        Entries: joints`.
-        """
+        """What is allowed, and the number of entries: `above 0; entries: joints`."""
         entries = f'entries: {" times ".join(self.length)}' if self.length else ''
         empty = 'may be empty' if self.omittable else ''
         return '; '.join(filter(None, (self.allowed, entries, empty)))

@@ -147,7 +147,8 @@ class ArmController:
             q: positions (n,) [rad], or [m] of prismatic joints.
             dq: velocities (n,) [rad/s].
             effort: torques (n,) [N m] over the last interval, as `robot.effort`
-                describes them; without them, the law takes those that it commanded.
+                describes them. They show whether commands reach the arm; the law
+                itself takes those that it commanded.
             send: called with the torques as soon as they are known, before weighing
                 and recording. Its errors are raised after these.
 
@@ -306,7 +307,7 @@ class ArmController:
 
     @property
     def phase(self) -> Phase:
-        """What the controller does, such as `Phase.TRACKING` or `Phase.STOPPED`."""
+        """What the controller does, such as `Phase.TRACKING` or `Phase.SAFE_STOP`."""
         return self._loop.guard.supervisor.phase
 
     @property

@@ -50,10 +50,7 @@ class Topic:
 
     @cached_property
     def relative(self) -> str:
-        """Name as another node of the same namespace writes it, e.g.
-
-        `sim_plant/truth`.
-        """
+        """Name as another node of the same namespace writes it: `sim_plant/truth`."""
         return self.name.replace('~', self.node, 1)
 
     @cached_property

@@ -53,7 +53,7 @@ def short_way(
 def reference_near(config: ControllerConfig, q: Floats) -> tuple[ControllerConfig, str]:
     """Return a configuration whose reference begins nearest to q (n,) [rad].
 
-    And the words of `short_way`.
+    The second value is the sentence of `short_way` about it.
     """
     reference = config.reference
     if reference.type == 'hold':

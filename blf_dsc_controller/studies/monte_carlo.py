@@ -42,6 +42,7 @@ from blf_dsc_controller.configuration.nodes import (
     PLANT,
     LoopConfig,
     load_loop,
+    locate,
     read,
 )
 from blf_dsc_controller.configuration.plant import PlantConfig
@@ -172,12 +173,15 @@ def load_study(
     *,
     runs_law: bool = True,
 ) -> Study:
-    """Read a study; `overrides` take precedence over its section `monte_carlo`.
+    """Read a study from a file or a preset's name.
+
+    `overrides` take precedence over its section `monte_carlo`.
 
     Unless it `runs_law`, the law of a file is left out and not run.
 
     Raises ConfigurationError with all problems of all sections, and their lines.
     """
+    path = locate(path)
     problems: list[str] = []
     own: list[str] = []
     loop: LoopConfig | None = None

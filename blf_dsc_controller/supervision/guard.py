@@ -322,7 +322,7 @@ class Guard:
         self._drive_loads.take(self.controller, load)
 
     def perceive(self) -> None:
-        """Weigh what the tip holds, and feel what touches the arm, by the last state.
+        """Weigh what the tip holds, and detect contact, by the last state.
 
         Call it after its torque has been sent.
         """
