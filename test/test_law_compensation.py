@@ -18,6 +18,7 @@ from scipy.linalg import expm
 from blf_dsc_controller.configuration.nodes import load_loop, locate
 from blf_dsc_controller.law import friction
 from blf_dsc_controller.law.factory import controller_of, estimate_names
+from blf_dsc_controller.law.learning import measure_reversals
 from blf_dsc_controller.law.state import sample_of
 from blf_dsc_controller.simulation.loop import simulate
 from blf_dsc_controller.studies.monte_carlo import load_study
@@ -255,12 +256,12 @@ def reverse(law, coulomb, reversals):
     """Show the law some reversals of its first joint with a Coulomb friction [N m]."""
     settings, state = law.settings, law.state
     for k in range(reversals):
-        friction.close_reversal(settings, state, 0)
+        friction.close_reversal(settings.friction, state.friction, 0)
         sign = (-1.0) ** k
         for _ in range(300):
-            state.shape_lags[0, 2, 0] = sign
+            state.friction.shape_lags[0, 2, 0] = sign
             state.filter2[0, -1] = coulomb * sign
-            friction.measure_reversals(settings, state, 0.001)
+            measure_reversals(settings, state, 0.001)
 
 
 @pytest.mark.parametrize(
@@ -272,26 +273,30 @@ def test_friction_is_measured_once_a_window_says_enough(rows, least, learns):
     law.state.rows[0] = rows * law.settings.window
     law.state.least_residual[0] = least
     reverse(law, 0.8, 5)
-    assert bool(law.state.shown[0, 0] == pytest.approx(0.8, abs=0.05)) == learns
+    assert (
+        bool(law.state.friction.reversal_estimate[0, 0] == pytest.approx(0.8, abs=0.05))
+        == learns
+    )
 
 
 def test_friction_is_not_forgotten_at_rest():
     """The sums age by what reversals tell, not by time."""
     law = reversing_law()
     settings, state = law.settings, law.state
+    part = settings.friction, state.friction
     reverse(law, 0.4, 20)
-    state.column_lags[:] = 0.0
-    state.torque_lags[:] = 0.0
-    state.shape_lags[:] = 0.0
+    state.friction.column_lags[:] = 0.0
+    state.friction.torque_lags[:] = 0.0
+    state.friction.shape_lags[:] = 0.0
     state.filter2[:] = 0.0
-    before = friction.learned_friction(settings, state, 0)
+    before = friction.learned_friction(*part, 0)
     assert before[0] == pytest.approx(0.4, abs=0.02)
     for _ in range(3_000):
-        friction.measure_reversals(settings, state, 0.001)
-    assert friction.learned_friction(settings, state, 0) == before
+        measure_reversals(settings, state, 0.001)
+    assert friction.learned_friction(*part, 0) == before
     state.latched[0] = 0.0
-    friction.measure_reversals(settings, state, 0.001)
-    assert state.since_latch[0] == 0.0
+    measure_reversals(settings, state, 0.001)
+    assert state.friction.since_latch[0] == 0.0
 
 
 @pytest.mark.parametrize(
@@ -302,8 +307,9 @@ def test_the_last_two_reversals_overrule_older_ones(other, reversals, most):
     law = reversing_law()
     reverse(law, 0.4, 30)
     reverse(law, other, reversals)
-    friction.close_reversal(law.settings, law.state, 0)
-    coulomb, _ = friction.learned_friction(law.settings, law.state, 0)
+    part = law.settings.friction, law.state.friction
+    friction.close_reversal(*part, 0)
+    coulomb, _ = friction.learned_friction(*part, 0)
     assert coulomb == pytest.approx(other, abs=most)
 
 
@@ -311,26 +317,25 @@ def test_the_last_two_reversals_overrule_older_ones(other, reversals, most):
 def test_compensation_lies_between_what_is_assumed_and_whatever_may_be_true(seed):
     """So none of it can cost more than not knowing it, up to the dead band."""
     law = controller_of(configured('ur5e_rigid', 1.0).controller)
-    settings, state, signals = law.settings, law.state, law.signals
+    settings, state = law.settings.friction, law.state.friction
+    work = law.signals.friction
+    n = law.settings.n
     random = np.random.default_rng(seed)
-    first = friction.first_coulomb(settings)
-    of = slice(first, first + settings.n)
-    assumed = settings.initial_estimate[of]
-    learned = assumed * random.uniform(1.0 / 3.0, 3.0, settings.n)
-    claims = assumed * random.uniform(0.0, 3.0, (4, settings.n))
-    state.estimate[of] = learned
-    state.shown[:] = claims[:2]
-    state.unanswered[0] = np.minimum(claims[2] - learned, 0.0)
-    state.unanswered[1] = np.maximum(claims[3] - learned, 0.0)
-    state.breakaway[:] = random.uniform(0.0, 1.0, settings.n)
-    signals.sign[:] = 1.0
-    signals.stribeck[:] = random.uniform(0.0, 1.0, settings.n)
-    scale = 1.0 + state.breakaway * signals.stribeck
-    for i in range(settings.n):
-        used = friction.coulomb_torque(settings, state, signals, i)
-        band = friction.unmodelled(settings, i)
-        changed = learned[i] + state.unanswered[:, i]
-        for true in (learned[i], *state.shown[:, i], *changed):
+    assumed = settings.initial
+    learned = assumed * random.uniform(1.0 / 3.0, 3.0, n)
+    claims = assumed * random.uniform(0.0, 3.0, (4, n))
+    state.reversal_estimate[:] = claims[:2]
+    state.drift_extremes[0] = np.minimum(claims[2] - learned, 0.0)
+    state.drift_extremes[1] = np.maximum(claims[3] - learned, 0.0)
+    state.breakaway[:] = random.uniform(0.0, 1.0, n)
+    work.sign[:] = 1.0
+    work.stribeck[:] = random.uniform(0.0, 1.0, n)
+    scale = 1.0 + state.breakaway * work.stribeck
+    for i in range(n):
+        used = friction.coulomb_torque(settings, state, work, learned[i], i)
+        band = settings.unmodelled[i]
+        changed = learned[i] + state.drift_extremes[:, i]
+        for true in (learned[i], *state.reversal_estimate[:, i], *changed):
             error = abs(used - scale[i] * true)
             not_knowing = abs(assumed[i] - scale[i] * true)
             assert error <= not_knowing + scale[i] * band + 1e-12
@@ -338,20 +343,23 @@ def test_compensation_lies_between_what_is_assumed_and_whatever_may_be_true(seed
 
 def test_evidence_changes_no_torque_until_the_joint_reverses():
     law = controller_of(configured('ur5e_rigid', 1.0).controller)
-    settings, state, signals = law.settings, law.state, law.signals
-    state.estimate[friction.first_coulomb(settings) :] *= 2.0
-    state.shown[:] = state.estimate[friction.first_coulomb(settings) :]
-    signals.sign[:] = [1.0, -1.0, 0.5, 0.0, 1.0, -1.0]
-    for i in range(settings.n):
-        signals.friction[i] = friction.coulomb_torque(settings, state, signals, i)
-    before = signals.friction.copy()
-    total = signals.friction + state.disturbance
-    state.unanswered[0] = -1.0
+    settings, state = law.settings.friction, law.state.friction
+    work = law.signals.friction
+    estimate, disturbance = law.state.estimate, law.state.disturbance
+    learned = estimate[settings.first_coulomb :]
+    learned *= 2.0
+    state.reversal_estimate[:] = learned
+    work.sign[:] = [1.0, -1.0, 0.5, 0.0, 1.0, -1.0]
+    for i, c in enumerate(learned):
+        work.torque[i] = friction.coulomb_torque(settings, state, work, c, i)
+    before = work.torque.copy()
+    total = work.torque + disturbance
+    state.drift_extremes[0] = -1.0
     state.breakaway[:] = 0.3
-    signals.stribeck[:] = 0.5
-    friction.hand_over(settings, state, signals)
-    assert np.abs(signals.friction - before).max() > 0.5
-    np.testing.assert_allclose(signals.friction + state.disturbance, total, atol=1e-12)
+    work.stribeck[:] = 0.5
+    friction.hand_over(settings, state, work, estimate, disturbance)
+    assert np.abs(work.torque - before).max() > 0.5
+    np.testing.assert_allclose(work.torque + disturbance, total, atol=1e-12)
 
 
 UR5E_COULOMB = (6.0, 6.0, 6.0, 1.1, 1.1, 1.1)
@@ -448,4 +456,6 @@ def test_geared_arm_learns_its_friction_at_breakaway():
     config = configured('ur5e_rigid', 15.0)
     record = simulate(config.controller, config.plant)
     assert np.abs(record.true_errors()[8000:]).max() < 0.6e-3
-    np.testing.assert_allclose(record.controller.state.breakaway, 0.5, atol=0.12)
+    np.testing.assert_allclose(
+        record.controller.state.friction.breakaway, 0.5, atol=0.12
+    )

@@ -273,8 +273,8 @@ def test_the_guess_stops_the_same_arm_where_nothing_is_measured():
 @pytest.mark.parametrize('factor', [1.0, 1.3])
 def test_noise_is_not_mistaken_for_a_light_arm(factor, plant):
     state = ran('panda_rigid', factor, plant).controller.state
-    assert (state.gain_scale == 1.0).all()
-    assert (state.rotor_error == 0.0).all()
+    assert (state.rotors.gain_scale == 1.0).all()
+    assert (state.rotors.error == 0.0).all()
 
 
 def test_measured_inertia_is_that_of_the_arm_where_the_loop_was_unstable():
@@ -286,8 +286,8 @@ def test_measured_inertia_is_that_of_the_arm_where_the_loop_was_unstable():
     chain = config.robot.chain(config.joints)
     limits = config.limits.position_lower, config.limits.position_upper
     base = parameters_of(robot, chain)
-    scale = record.controller.state.gain_scale
-    P = tuple(base.of(chain.inertias, 0.1 * settings.unsure_rotor))
+    scale = record.controller.state.rotors.gain_scale
+    P = tuple(base.of(chain.inertias, 0.1 * settings.rotors.rotor))
     true = over_postures(chain, base, robot.payload, P, *limits)[0]
     measured = scale < 0.6
     ratio = (scale * settings.joint_inertia / true)[measured]
@@ -320,10 +320,10 @@ def swinging_panda(samples):
 def test_error_of_the_guess_is_between_no_rotor_and_the_guess(evidence, share):
     """Whatever the sums say: a heavier drive would need higher gains, which are not for granted."""
     law, swing = swinging_panda(199)
-    law.state.rotor_sums[:2] = np.array([[evidence], [1e6]])
+    law.state.rotors.sums[:2] = np.array([[evidence], [1e6]])
     swing(199, 200)
     np.testing.assert_allclose(
-        law.state.rotor_error, share * law.settings.unsure_rotor, atol=1e-12
+        law.state.rotors.error, share * law.settings.rotors.rotor, atol=1e-12
     )
 
 
@@ -341,11 +341,11 @@ def test_error_of_the_guess_is_between_no_rotor_and_the_guess(evidence, share):
 def test_half_oscillation_that_no_drive_explains_is_forgotten(asked, work, kept):
     """As pushes are: they ask for more than a drive can lack, or move it against its torque."""
     law, swing = swinging_panda(199)
-    counted = law.state.rotor_sums[:2].copy()
-    half = 1e6 * np.array([asked * law.settings.unsure_rotor, np.full(7, work)])
-    law.state.rotor_sums[2:4] = half
+    counted = law.state.rotors.sums[:2].copy()
+    half = 1e6 * np.array([asked * law.settings.rotors.rotor, np.full(7, work)])
+    law.state.rotors.sums[2:4] = half
     swing(199, 208)  # past the next reversal of the acceleration
-    added = law.state.rotor_sums[:2] - counted
+    added = law.state.rotors.sums[:2] - counted
     np.testing.assert_allclose(added, half if kept else 0.0 * half, atol=1.0)
 
 

@@ -180,7 +180,7 @@ def test_estimates_of_before_a_restart_are_consistent_with_it(law):
     check = sample_check(ControllerConfig(), law)
     law.state.estimate[:] = 0.5
     law.state.disturbance[:] = 0.25
-    law.state.gain_scale[:] = 0.75
+    law.state.rotors.gain_scale[:] = 0.75
     check.keep()
     check.restart()
     check.return_to_consistent()

@@ -104,7 +104,14 @@ def prediction_error(settings: Settings, state: State, signals: Signals) -> None
             signals.rate[i] -= state.Phi[i, j] * state.estimate[j]
     if settings.update == NEWTON:
         cholesky_solve(state.factor, signals.rate)
-    friction.follow_reversals(settings, state, signals)
+    friction.follow_reversals(
+        settings.friction,
+        state.friction,
+        signals.friction,
+        state.active,
+        state.estimate,
+        signals.rate,
+    )
 
 
 @inner
@@ -115,6 +122,18 @@ def hand_over(settings: Settings, state: State, signals: Signals) -> None:
             state.disturbance[i] -= signals.H[i, j] * (
                 state.estimate[j] - signals.work[j]
             )
+
+
+@inner
+def hand_over_friction(settings: Settings, state: State, signals: Signals) -> None:
+    """Subtract from d^3 what this sample has changed in the compensation of Coulomb friction."""
+    friction.hand_over(
+        settings.friction,
+        state.friction,
+        signals.friction,
+        state.estimate,
+        state.disturbance,
+    )
 
 
 @inner
@@ -130,7 +149,7 @@ def integrate(settings: Settings, state: State, signals: Signals, dt: float) -> 
         scale_by_inertia(settings, state, signals)
     for i in range(settings.n):
         state.disturbance[i] -= signals.unit[i]
-        friction.follow_observer(state, signals, i, -signals.unit[i])
+        friction.follow_observer(state.friction, signals.friction, i, -signals.unit[i])
 
 
 @inner
@@ -141,7 +160,7 @@ def scale_by_inertia(settings: Settings, state: State, signals: Signals) -> None
         x[i] /= settings.joint_inertia[i]
     settings.model.momentum_regressor(signals.q, x, signals.Yp, signals.Yr)
     for i in range(settings.n):
-        x[i] *= state.rotor_error[i]
+        x[i] *= state.rotors.error[i]
         for j in range(settings.p):
             x[i] += signals.Yp[i, j] * settings.initial_estimate[j]
 
@@ -161,7 +180,7 @@ def adapt(
     if state.frozen[0] > 0.0:
         if not saturated:
             integrate(settings, state, signals, dt)
-        friction.hand_over(settings, state, signals)
+        hand_over_friction(settings, state, signals)
         return
     prediction_error(settings, state, signals)
     unexcited = (
@@ -191,5 +210,8 @@ def adapt(
         integrate(settings, state, signals, dt)
     if settings.bumpless == 1 and state.latched[0] == 1.0:
         hand_over(settings, state, signals)
-    friction.adapt_breakaway(settings, state, signals, dt)
-    friction.hand_over(settings, state, signals)
+    if state.latched[0] == 1.0:
+        friction.adapt_breakaway(
+            settings.friction, state.friction, signals.friction, dt
+        )
+    hand_over_friction(settings, state, signals)

@@ -14,9 +14,13 @@ from __future__ import annotations
 from typing import NamedTuple
 
 from blf_dsc_controller.compiled.jit import inner
-from blf_dsc_controller.law import adaptation, apparent_inertia, learning
+from blf_dsc_controller.law import adaptation, learning
 from blf_dsc_controller.law.clipping import clip
-from blf_dsc_controller.law.compensation import compensated
+from blf_dsc_controller.law.compensation import (
+    compensated,
+    correct_feedback,
+    measure_rotors,
+)
 from blf_dsc_controller.law.state import Settings, Signals, State
 
 
@@ -36,9 +40,9 @@ class Backstepping(NamedTuple):
         """Compute the torque (35)."""
         compute_surface(settings, state, signals)
         learning.observe(settings, state, signals, t, dt)
-        if settings.rotors_unsure == 1:
-            apparent_inertia.measure(settings, state, signals, dt)
-            apparent_inertia.correct_feedback(settings, state, signals)
+        if settings.rotors.unsure == 1:
+            measure_rotors(settings, state, signals, dt)
+            correct_feedback(settings, state, signals)
         for i in range(settings.n):
             torque = settings.Kp[i] * signals.xi2[i]
             torque += settings.mu_bar[i] * clip(signals.xi2[i] / self.layer, -1.0, 1.0)

@@ -29,10 +29,14 @@ from __future__ import annotations
 from typing import NamedTuple
 
 from blf_dsc_controller.compiled.jit import inner
-from blf_dsc_controller.law import adaptation, apparent_inertia, barrier, learning
+from blf_dsc_controller.law import adaptation, barrier, learning
 from blf_dsc_controller.law.barrier import virtual_control
 from blf_dsc_controller.law.clipping import clip
-from blf_dsc_controller.law.compensation import compensated
+from blf_dsc_controller.law.compensation import (
+    compensated,
+    correct_feedback,
+    measure_rotors,
+)
 from blf_dsc_controller.law.lag import filter_gain
 from blf_dsc_controller.law.state import Settings, Signals, State
 
@@ -53,9 +57,9 @@ class BlfDsc(NamedTuple):
         """Compute the torque (28)."""
         compute_surface(settings, state, signals, dt)
         learning.observe(settings, state, signals, t, dt)
-        if settings.rotors_unsure == 1:
-            apparent_inertia.measure(settings, state, signals, dt)
-            apparent_inertia.correct_feedback(settings, state, signals)
+        if settings.rotors.unsure == 1:
+            measure_rotors(settings, state, signals, dt)
+            correct_feedback(settings, state, signals)
         for i in range(settings.n):
             torque = feedback(settings, signals, self.layer, i)
             signals.demand[i] = compensated(settings, state, signals, i, torque)

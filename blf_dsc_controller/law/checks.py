@@ -118,7 +118,7 @@ def keep_consistent(
     for j in range(settings.m + settings.n):
         checks.consistent[j] = checks.kept[j]
     for i in range(settings.n):
-        checks.consistent_scale[i] = state.gain_scale[i]
+        checks.consistent_scale[i] = state.rotors.gain_scale[i]
 
 
 @inner

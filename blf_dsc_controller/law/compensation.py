@@ -27,7 +27,7 @@ from __future__ import annotations
 
 from blf_dsc_controller.compiled.jit import inner
 from blf_dsc_controller.compiled.layout import Array
-from blf_dsc_controller.law import friction
+from blf_dsc_controller.law import apparent_inertia, friction
 from blf_dsc_controller.law.state import (
     FILTERED,
     REFERENCE,
@@ -72,11 +72,47 @@ def fill_known_torque(
     """Write H(q, dq, v, a) P^(0) and the known friction at dqr to `signals.model_torque` [N m]."""
     H = signals.H
     settings.model.regressor(signals.q, signals.dq, v, a, H)
-    friction.fill_compensation(settings, state, signals, dt)
+    friction.fill_compensation(
+        settings.friction,
+        state.friction,
+        signals.friction,
+        state.estimate,
+        signals.dqr,
+        signals.ddqr,
+        H,
+        dt,
+    )
     for i in range(settings.n):
-        signals.model_torque[i] = signals.friction[i]
+        signals.model_torque[i] = signals.friction.torque[i]
         for j in range(settings.m):
             signals.model_torque[i] += H[i, j] * settings.initial_estimate[j]
+
+
+@inner
+def measure_rotors(
+    settings: Settings, state: State, signals: Signals, dt: float
+) -> None:
+    """Update J~ from the last interval; overwrites Yp and Yr of `signals`."""
+    part, now, work = settings.rotors, state.rotors, signals.rotors
+    if state.samples[0] <= 1.0:  # the first torque has had no effect yet
+        apparent_inertia.begin(now, signals.dq, signals.applied)
+        return
+    apparent_inertia.pass_band(part, now, work, signals.dq, signals.applied, dt)
+    if apparent_inertia.has_settled(state.samples[0], dt):
+        settings.model.momentum_regressor(
+            signals.q, work.acceleration, signals.Yp, signals.Yr
+        )
+        P0 = settings.initial_estimate
+        apparent_inertia.update(part, now, work, signals.Yp, P0, dt)
+
+
+@inner
+def correct_feedback(settings: Settings, state: State, signals: Signals) -> None:
+    """Add the torque of J~ for what the feedback accelerates to H P^(0)."""
+    for i in range(settings.n):
+        signals.model_torque[i] += state.rotors.error[i] * (
+            signals.damped[i] - signals.ddqr[i]
+        )
 
 
 @inner
@@ -85,7 +121,7 @@ def compensated(
 ) -> float:
     """Return the demand of joint i [N m]: feedback, model, d^3, and what is learned."""
     torque = feedback + signals.model_torque[i]
-    torque += state.disturbance[i] + signals.friction[i]
+    torque += state.disturbance[i] + signals.friction.torque[i]
     if settings.feed_forward == 1:
         torque += signals.feedforward[i]
     for j in range(settings.m):

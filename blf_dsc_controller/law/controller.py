@@ -17,7 +17,7 @@ from blf_dsc_controller.compiled.entry import Entry
 from blf_dsc_controller.compiled.jit import direct, inner, kernel
 from blf_dsc_controller.compiled.layout import Array, pack
 from blf_dsc_controller.errors import BlfDscError
-from blf_dsc_controller.law import barrier, torque
+from blf_dsc_controller.law import barrier, friction, torque
 from blf_dsc_controller.law.check_state import (
     CONTRADICTION,
     INVALID,
@@ -32,7 +32,6 @@ from blf_dsc_controller.law.checks import (
     is_valid_state,
     watch_oscillation,
 )
-from blf_dsc_controller.law.friction import first_coulomb
 from blf_dsc_controller.law.interface import Law
 from blf_dsc_controller.law.laws import for_law
 from blf_dsc_controller.law.lyapunov import fill_energies
@@ -72,7 +71,7 @@ def fill_sample(
         sample.xi1[i] = signals.xi1[i]
         sample.xi2[i] = signals.xi2[i]
         sample.torque[i] = signals.torque[i]
-        sample.disturbance[i] = state.disturbance[i] + signals.friction[i]
+        sample.disturbance[i] = state.disturbance[i] + signals.friction.torque[i]
         for j in range(settings.p, settings.m):
             sample.disturbance[i] += signals.H[i, j] * state.estimate[j]
         sample.bound[i] = signals.bound[i]
@@ -295,11 +294,8 @@ class Controller:
         self.state.anchor[:] = self.settings.initial_estimate
         self.state.min_eigenvector.fill(1.0 / np.sqrt(self.settings.m))
         self.state.active.fill(1.0)
-        self.state.gain_scale.fill(1.0)
-        if self.settings.coulomb:
-            first = first_coulomb(self.settings)
-            coulomb = self.settings.initial_estimate[first : first + self.settings.n]
-            self.state.shown[:] = coulomb
+        self.state.rotors.gain_scale.fill(1.0)
+        friction.begin(self.settings.friction, self.state.friction)
 
     def update(self, t: float, dt: float, measurement: Array) -> Array:
         """Return the torque (n,) [N m] for a measurement: a view that the next update overwrites.

@@ -38,12 +38,18 @@ from blf_dsc_controller.compiled.layout import filled, size_of
 from blf_dsc_controller.configuration import law_file
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.robot import drive_model, parameters_of
-from blf_dsc_controller.law import barrier, external_torque, weighing
+from blf_dsc_controller.law import (
+    apparent_inertia,
+    barrier,
+    external_torque,
+    friction,
+    weighing,
+)
 from blf_dsc_controller.law.backstepping import Backstepping
 from blf_dsc_controller.law.blf_dsc import BlfDsc
 from blf_dsc_controller.law.controller import Controller
 from blf_dsc_controller.law.interface import Law
-from blf_dsc_controller.law.state import CHOICES, Settings
+from blf_dsc_controller.law.state import CHOICES, FILTERED, Settings
 from blf_dsc_controller.numerics.algebra import inverse, product
 from blf_dsc_controller.reference.approach import plan_start, reference_of
 
@@ -210,6 +216,7 @@ def settings_of_config(config: ControllerConfig) -> Settings:
         **window,
         **residuals,
         'contact': _contact(config, residuals, window),
+        'friction': None,  # follows from the others
         **_estimates(config, model.p, columns),
         **_known_arm(config, model.p),
         **_inertias(config, model.n),
@@ -217,7 +224,8 @@ def settings_of_config(config: ControllerConfig) -> Settings:
         **_drive(config),
     }
     settings = Settings(**(_gains(config) | computed))
-    return settings._replace(**_of_law(config, settings))
+    settings = settings._replace(**_of_law(config, settings))
+    return settings._replace(friction=friction_settings(settings))
 
 
 def _gains(config: ControllerConfig) -> dict[str, Any]:
@@ -306,6 +314,35 @@ def _contact(
     )
 
 
+def friction_settings(settings: Settings) -> friction.Settings:
+    """Return what is known of friction, by all other settings."""
+    n = settings.n
+    viscous = settings.p + n * settings.bias
+    coulomb = viscous + n * settings.viscous
+    own = slice(coulomb, coulomb + n)
+
+    def of_coulomb(values: np.ndarray) -> np.ndarray:
+        return values[own] if settings.coulomb else np.zeros(n)
+
+    return friction.Settings(
+        viscous=settings.viscous,
+        coulomb=settings.coulomb,
+        first_viscous=viscous,
+        first_coulomb=coulomb,
+        learns=int(settings.coulomb and settings.prediction == FILTERED),
+        bumpless=settings.bumpless,
+        coulomb_velocity=settings.coulomb_velocity,
+        lag=settings.lag,
+        pole=settings.pole,
+        unmodelled=settings.contact.unmodelled,
+        initial=of_coulomb(settings.initial_estimate),
+        variance=of_coulomb(settings.variance),
+        least=of_coulomb(settings.least),
+        most=of_coulomb(settings.most),
+        gain=of_coulomb(settings.Gamma * settings.kappa),
+    )
+
+
 def _estimates(
     config: ControllerConfig, p: int, columns: Sequence[Column]
 ) -> dict[str, Any]:
@@ -360,28 +397,27 @@ def _inertias(config: ControllerConfig, n: int) -> dict[str, Any]:
     """Return m of each joint, and what `apparent_inertia` needs to measure assumed rotors."""
     is_urdf = config.model == 'urdf'
     follows_inertia = is_urdf and config.feedback.inertia == 'whole'
-    settings = {
+    P0 = config.learning.initial_estimate
+    m = joint_inertia(config, P0) if is_urdf else np.ones(n)
+    lag = config.robot.lag if is_urdf else 0.0
+    rotors = apparent_inertia.Settings(
+        unsure=0, lag=lag, rotor=np.zeros(n), joint=m, link=np.ones(n)
+    )
+    if follows_inertia and not config.robot.rotor_inertia:
+        robot = config.robot
+        chain = robot.chain(config.joints)
+        links = parameters_of(robot, chain).of(chain.inertias, np.zeros(n))
+        rotors = rotors._replace(
+            unsure=1,
+            rotor=robot.rotors(chain),
+            link=joint_inertia(config, tuple(links)),
+        )
+    return {
         'follows_inertia': int(follows_inertia),
         'decoupled': int(config.feedback.inertia == 'none'),
-        'rotors_unsure': 0,
-        'lag': config.robot.lag if is_urdf else 0.0,
-        'unsure_rotor': np.zeros(n),
-        'joint_inertia': np.ones(n),
-        'link_inertia': np.ones(n),
-    }
-    if not is_urdf:
-        return settings
-    robot = config.robot
-    chain = robot.chain(config.joints)
-    P0 = config.learning.initial_estimate
-    settings['joint_inertia'] = joint_inertia(config, P0)
-    if robot.rotor_inertia or not follows_inertia:
-        return settings
-    links = parameters_of(robot, chain).of(chain.inertias, np.zeros(n))
-    return settings | {
-        'rotors_unsure': 1,
-        'unsure_rotor': robot.rotors(chain),
-        'link_inertia': joint_inertia(config, tuple(links)),
+        'lag': lag,
+        'joint_inertia': m,
+        'rotors': rotors,
     }
 
 

@@ -25,9 +25,9 @@ torque f, they overrule what is older.
 *Used within the evidence.*  What is learned of friction must not cost more than not knowing it,
 which errs by |c_0 - c|.  Two things may contradict c^ before the sums do: a reversal that shows
 c_1, the last, or c_2, the one before; and the observer.  If d^3 rises by delta along the motion
-since the last reversal, either the friction has risen by that much, which turns over at the next
+since the last reversal, either the friction has risen by that much, which changes sign at the next
 reversal, or a push has begun, which stays.  delta is counted until v crosses zero: d^3 takes some
-0.05 s to follow, and what it adds while the joint slows down turns over all the same.  The
+0.05 s to follow, and what it adds while the joint slows down changes sign all the same.  The
 compensation at v is the value nearest to c_0
 
     C(v) = clip(c_0, g(v) min E, g(v) max E),
@@ -39,14 +39,13 @@ them, so that whichever is true, C errs by no more than c_0 does.  C is handed o
 d^3 like everything that is learned: it changes no torque until the joint reverses.
 """
 
-from math import sqrt
+from typing import Annotated, NamedTuple
 
 from blf_dsc_controller.arms.friction import STRIBECK_SPEED, fading, sliding
 from blf_dsc_controller.compiled.jit import inner
-from blf_dsc_controller.compiled.layout import Array
+from blf_dsc_controller.compiled.layout import Array, Cell
 from blf_dsc_controller.law.clipping import clip
 from blf_dsc_controller.law.lag import filter_gain
-from blf_dsc_controller.law.state import FILTERED, Settings, Signals, State
 
 _ENERGY = 1.0  # of p int s_h^2 dt; a reversal has an eighth of it
 _SHOWN = 0.06  # of p int (g s)_h^2 dt: half a reversal, which shows its friction
@@ -59,22 +58,67 @@ _MOVING = 0.9  # of |s|: below it a joint reverses
 _SE, _BE, _SS, _SB, _BB = range(5)
 
 
-@inner
-def first_coulomb(settings: Settings) -> int:
-    """Return the index of the first column of Coulomb friction in theta."""
-    return settings.p + settings.n * (settings.bias + settings.viscous)
+class Settings(NamedTuple):
+    """Columns of friction in theta, and what is known of Coulomb friction."""
+
+    viscous: int  # 1: theta has a column of viscous friction per joint
+    coulomb: int  # 1: theta has a column of Coulomb friction per joint
+    first_viscous: int  # index of the first such column
+    first_coulomb: int
+    learns: (
+        int  # 1: there are columns of Coulomb friction, and rows that show its steps
+    )
+    bumpless: int  # 1: d^3 gives up what a changed estimate adds to the torque
+    coulomb_velocity: float  # v_c, rad/s
+    lag: float  # of measured velocities and applied torques together, s
+    pole: float  # p of the row filters, rad/s
+    unmodelled: Annotated[Array, 'n']  # f, rms torque that no column describes, N m
+    initial: Annotated[Array, 'n']  # c_0, N m
+    variance: Annotated[Array, 'n']  # of c_0, (N m)^2
+    least: Annotated[Array, 'n']  # value that c^ can have, N m
+    most: Annotated[Array, 'n']
+    gain: Annotated[Array, 'n']  # Gamma kappa of its columns, 1/s
+
+
+class State(NamedTuple):
+    """What it keeps from one sample to the next."""
+
+    since_latch: Cell  # s
+    # s and b: now, behind one pole, behind both
+    shape_lags: Annotated[Array, 2, 3, 'n']
+    column_lags: Annotated[Array, 2, 2, 'n']  # of s_h and b_h
+    torque_lags: Annotated[Array, 2, 'n']  # of e_h, N m
+    # p int of s_h e_h, b_h e_h [N m], s_h^2, s_h b_h and b_h^2, over past reversals
+    reversal_sums: Annotated[Array, 5, 'n']
+    latest_sums: Annotated[Array, 5, 'n']  # likewise, over the present one
+    # Coulomb friction by the last reversal and the one before, N m
+    reversal_estimate: Annotated[Array, 2, 'n']
+    # k^, breakaway torque relative to Coulomb friction
+    breakaway: Annotated[Array, 'n']
+    moves: Annotated[Array, 'n']  # 1 while the joint does not reverse
+    direction: Annotated[Array, 'n']  # of its motion since the last reversal, 1 or -1
+    # delta, what d^3 has added along the motion since then, N m
+    observer_drift: Annotated[Array, 'n']
+    # least and largest delta of earlier motions, or 0, since a reversal was last
+    # measured, N m
+    drift_extremes: Annotated[Array, 2, 'n']
+
+
+class Work(NamedTuple):
+    """Values of one sample."""
+
+    sign: Annotated[Array, 'n']  # s(v)
+    stribeck: Annotated[Array, 'n']  # exp(-(v / v_s)^2)
+    torque: Annotated[Array, 'n']  # C(v) s(v), N m
+    breakaway_error: Annotated[Array, 'n']  # k - k^
 
 
 @inner
-def learns_from_reversals(settings: Settings) -> bool:
-    """Return whether there are columns of Coulomb friction, and rows that show its steps."""
-    return settings.coulomb == 1 and settings.prediction == FILTERED
-
-
-@inner
-def unmodelled(settings: Settings, i: int) -> float:
-    """Return the unmodelled torque f of joint i [N m]."""
-    return float(sqrt(settings.residual_floor / settings.n) / settings.row_weight[i])
+def begin(settings: Settings, state: State) -> None:
+    """Begin with the initial estimate of Coulomb friction, in place of past reversals."""
+    for i in range(settings.initial.size):
+        state.reversal_estimate[0, i] = settings.initial[i]
+        state.reversal_estimate[1, i] = settings.initial[i]
 
 
 @inner
@@ -84,100 +128,113 @@ def beyond(x: float, band: float) -> float:
 
 
 @inner
-def coulomb_torque(settings: Settings, state: State, signals: Signals, i: int) -> float:
-    """Return the compensation C(v) s(v) of joint i [N m]."""
-    j = first_coulomb(settings) + i
-    learned = state.estimate[j]
+def coulomb_torque(
+    settings: Settings, state: State, work: Work, learned: float, i: int
+) -> float:
+    """Return the compensation C(v) s(v) of joint i [N m], with c^ `learned` [N m]."""
     low = learned
     high = learned
-    if settings.prediction == FILTERED and settings.bumpless == 1:
-        band = unmodelled(settings, i)
+    if settings.learns == 1 and settings.bumpless == 1:
+        band = settings.unmodelled[i]
         for evidence in (
-            beyond(state.shown[0, i] - learned, band),
-            beyond(state.shown[1, i] - learned, band),
-            beyond(state.opposed[i], band),
-            beyond(state.unanswered[0, i], band),
-            beyond(state.unanswered[1, i], band),
+            beyond(state.reversal_estimate[0, i] - learned, band),
+            beyond(state.reversal_estimate[1, i] - learned, band),
+            beyond(state.observer_drift[i], band),
+            beyond(state.drift_extremes[0, i], band),
+            beyond(state.drift_extremes[1, i], band),
         ):
             low = min(low, learned + evidence)
             high = max(high, learned + evidence)
-    scale = 1.0 + state.breakaway[i] * signals.stribeck[i]
-    level = clip(settings.initial_estimate[j], scale * low, scale * high)
-    return float(level * signals.sign[i])
+    scale = 1.0 + state.breakaway[i] * work.stribeck[i]
+    level = clip(settings.initial[i], scale * low, scale * high)
+    return float(level * work.sign[i])
 
 
 @inner
 def fill_compensation(
-    settings: Settings, state: State, signals: Signals, dt: float
+    settings: Settings,
+    state: State,
+    work: Work,
+    estimate: Array,
+    dqr: Array,
+    ddqr: Array,
+    H: Array,
+    dt: float,
 ) -> None:
     """Compute the friction at the velocity that the reference has when the torque acts.
 
     Torques act 1.5 samples and half of `robot.lag` late.  The measured velocity would
-    feed its noise, and chatter at rest, into the torque.  Viscous friction has columns
-    in `signals.H`; that of Coulomb's, which is not linear in theta, is
-    `signals.friction` (n,) [N m].
+    feed its noise, and chatter at rest, into the torque.  Viscous friction is linear in
+    theta, the `estimate` (m,), and goes to its columns in H (n, m); that of Coulomb's
+    goes to `work.torque`.
     """
-    viscous = settings.p + settings.n * settings.bias
     lead = 1.5 * dt + 0.5 * settings.lag
-    for i in range(settings.n):
-        velocity = signals.dqr[i] + lead * signals.ddqr[i]
+    for i in range(dqr.size):
+        velocity = dqr[i] + lead * ddqr[i]
         if settings.viscous == 1:
-            signals.H[i, viscous + i] = velocity
+            H[i, settings.first_viscous + i] = velocity
         if settings.coulomb == 1:
-            signals.sign[i] = sliding(velocity, settings.coulomb_velocity)
-            signals.stribeck[i] = fading(velocity, STRIBECK_SPEED)
-            signals.friction[i] = coulomb_torque(settings, state, signals, i)
+            work.sign[i] = sliding(velocity, settings.coulomb_velocity)
+            work.stribeck[i] = fading(velocity, STRIBECK_SPEED)
+            learned = estimate[settings.first_coulomb + i]
+            work.torque[i] = coulomb_torque(settings, state, work, learned, i)
 
 
 @inner
-def hand_over(settings: Settings, state: State, signals: Signals) -> None:
-    """Subtract from d^3 what this sample has changed in the compensation of Coulomb friction."""
+def hand_over(
+    settings: Settings, state: State, work: Work, estimate: Array, disturbance: Array
+) -> None:
+    """Subtract from d^3 (n,) what this sample has changed in the compensation of Coulomb friction.
+
+    `estimate` (m,) is theta^ after the sample.
+    """
     if settings.coulomb == 0:
         return
-    for i in range(settings.n):
-        torque = coulomb_torque(settings, state, signals, i)
+    for i in range(disturbance.size):
+        learned = estimate[settings.first_coulomb + i]
+        torque = coulomb_torque(settings, state, work, learned, i)
         if settings.bumpless == 1:
-            state.disturbance[i] -= torque - signals.friction[i]
-        signals.friction[i] = torque
+            disturbance[i] -= torque - work.torque[i]
+        work.torque[i] = torque
 
 
 @inner
-def follow_observer(state: State, signals: Signals, i: int, step: float) -> None:
+def follow_observer(state: State, work: Work, i: int, step: float) -> None:
     """Add a step [N m] of d^3 of joint i by the tracking error to delta, until v crosses zero."""
-    if signals.sign[i] * state.direction[i] > 0.0:
-        state.opposed[i] += step * state.direction[i]
+    if work.sign[i] * state.direction[i] > 0.0:
+        state.observer_drift[i] += step * state.direction[i]
 
 
 @inner
-def follow_motion(settings: Settings, state: State, signals: Signals) -> None:
+def follow_motion(settings: Settings, state: State, work: Work) -> None:
     """Find the joints that begin to reverse, and those that have reversed: delta is zero again."""
-    if not learns_from_reversals(settings):
+    if settings.learns == 0:
         return
-    for i in range(settings.n):
-        sign = signals.sign[i]
+    drift = state.observer_drift
+    extremes = state.drift_extremes
+    for i in range(drift.size):
+        sign = work.sign[i]
         moves = abs(sign) > _MOVING
         if moves and sign * state.direction[i] <= 0.0:
             state.direction[i] = 1.0 if sign > 0.0 else -1.0
-            state.unanswered[0, i] = min(state.unanswered[0, i], state.opposed[i])
-            state.unanswered[1, i] = max(state.unanswered[1, i], state.opposed[i])
-            state.opposed[i] = 0.0
+            extremes[0, i] = min(extremes[0, i], drift[i])
+            extremes[1, i] = max(extremes[1, i], drift[i])
+            drift[i] = 0.0
         if not moves and state.moves[i] == 1.0:
             close_reversal(settings, state, i)
         state.moves[i] = 1.0 if moves else 0.0
 
 
 @inner
-def filter_shapes(
-    settings: Settings, state: State, signals: Signals, dt: float
-) -> None:
-    """Pass s and b of the last interval, at the measured velocity, through the poles of the row."""
-    if not learns_from_reversals(settings):
+def filter_shapes(settings: Settings, state: State, dq: Array, dt: float) -> None:
+    """Pass s and b of the last interval, at the velocity dq (n,), through the poles of the row."""
+    if settings.learns == 0:
         return
     gain = filter_gain(1.0 / settings.pole, dt)
     lags = state.shape_lags
-    for i in range(settings.n):
-        s = sliding(signals.dq[i], settings.coulomb_velocity)
-        b = s * fading(signals.dq[i], STRIBECK_SPEED)
+    for i in range(dq.size):
+        s = sliding(dq[i], settings.coulomb_velocity)
+        b = s * fading(dq[i], STRIBECK_SPEED)
         for k in range(2):
             now = s if k == 0 else b
             mean = 0.5 * (now + lags[k, 0, i])
@@ -187,12 +244,14 @@ def filter_shapes(
 
 
 @inner
-def breakaway_torque(settings: Settings, state: State, i: int) -> float:
+def breakaway_torque(
+    settings: Settings, state: State, estimate: Array, i: int
+) -> float:
     """Return what breakaway adds to the Coulomb friction of joint i, as it moves now [N m]."""
     if settings.coulomb == 0:
         return 0.0
-    j = first_coulomb(settings) + i
-    return float(state.estimate[j] * state.breakaway[i] * state.shape_lags[1, 0, i])
+    learned = estimate[settings.first_coulomb + i]
+    return float(learned * state.breakaway[i] * state.shape_lags[1, 0, i])
 
 
 @inner
@@ -208,54 +267,52 @@ def high_pass(lags: Array, i: int, gain: float, x: float, begins: bool) -> float
 
 
 @inner
-def unexplained(settings: Settings, state: State, i: int) -> float:
-    """Return e, what theta^ without Coulomb friction leaves of the torque in the row of joint i."""
-    own = first_coulomb(settings) + i
-    row = state.filter2[i]
-    e = row[settings.m]
-    for j in range(settings.m):
+def unexplained(row: Array, estimate: Array, own: int) -> float:
+    """Return e [N m], what theta^ but for its entry `own` leaves of u in [X | u] (m + 1,)."""
+    e = row[estimate.size]
+    for j in range(estimate.size):
         if j != own:
-            e -= row[j] * state.estimate[j]
+            e -= row[j] * estimate[j]
     return float(e)
 
 
 @inner
-def measure_reversals(settings: Settings, state: State, dt: float) -> None:
+def measure_reversals(
+    settings: Settings,
+    state: State,
+    rows: Array,
+    estimate: Array,
+    begins: bool,
+    dt: float,
+) -> None:
     """Add the last row, `dt` [s] after the one before it, to the sums of the present reversal.
 
-    They begin T_a after the latch, when the other columns are those of the window, and
-    once a full window is known to be of one arm or this one is half full: those of less
-    are too vague.
+    `rows` [X | u] (n, m + 1) are those behind both poles, unweighted, `estimate` (m,) is
+    theta^.  What the high pass leaves is zero where it `begins`.
     """
-    if not learns_from_reversals(settings):
-        return
-    settling_time = settings.learning_start - settings.window * dt
-    state.since_latch[0] = state.latched[0] * (state.since_latch[0] + dt)
-    is_known = (
-        settings.change_detection == 0
-        or state.least_residual[0] > 0.0
-        or state.rows[0] >= 0.5 * settings.window
-    )
-    begins = state.since_latch[0] <= settling_time or not is_known
     gain = filter_gain(1.0 / settings.pole, dt)
     weight = settings.pole * dt
-    for i in range(settings.n):
-        e = unexplained(settings, state, i)
-        s_h = high_pass(
-            state.column_lags[0], i, gain, state.shape_lags[0, 2, i], begins
-        )
-        b_h = high_pass(
-            state.column_lags[1], i, gain, state.shape_lags[1, 2, i], begins
-        )
+    latest = state.latest_sums
+    lags = state.column_lags
+    for i in range(rows.shape[0]):
+        e = unexplained(rows[i], estimate, settings.first_coulomb + i)
+        s_h = high_pass(lags[0], i, gain, state.shape_lags[0, 2, i], begins)
+        b_h = high_pass(lags[1], i, gain, state.shape_lags[1, 2, i], begins)
         e_h = high_pass(state.torque_lags, i, gain, e, begins)
         before = shown_energy(state, i)
-        latest = state.latest_sums
         latest[_SE, i] += weight * s_h * e_h
         latest[_BE, i] += weight * b_h * e_h
         latest[_SS, i] += weight * s_h * s_h
         latest[_SB, i] += weight * s_h * b_h
         latest[_BB, i] += weight * b_h * b_h
-        show_reversal(settings, state, i, before)
+        estimate_reversal(settings, state, i, before)
+
+
+@inner
+def update_since_latch(state: State, latched: float, dt: float) -> float:
+    """Return for how long [s] a window has been `latched` (1, or else 0)."""
+    state.since_latch[0] = latched * (state.since_latch[0] + dt)
+    return float(state.since_latch[0])
 
 
 @inner
@@ -267,19 +324,19 @@ def shown_energy(state: State, i: int) -> float:
 
 
 @inner
-def show_reversal(settings: Settings, state: State, i: int, before: float) -> None:
+def estimate_reversal(settings: Settings, state: State, i: int, before: float) -> None:
     """Compute c_1 of joint i once its reversal shows it; `before` is its energy a row ago."""
     energy = shown_energy(state, i)
     if energy <= _SHOWN:
         return
+    found = state.reversal_estimate
     if before <= _SHOWN:
-        state.shown[1, i] = state.shown[0, i]
-        state.unanswered[0, i] = 0.0
-        state.unanswered[1, i] = 0.0
-    j = first_coulomb(settings) + i
+        found[1, i] = found[0, i]
+        state.drift_extremes[0, i] = 0.0
+        state.drift_extremes[1, i] = 0.0
     latest = state.latest_sums
     torque = latest[_SE, i] + state.breakaway[i] * latest[_BE, i]
-    state.shown[0, i] = clip(torque / energy, settings.least[j], settings.most[j])
+    found[0, i] = clip(torque / energy, settings.least[i], settings.most[i])
 
 
 @inner
@@ -303,12 +360,13 @@ def close_reversal(settings: Settings, state: State, i: int) -> None:
 def overrule(settings: Settings, state: State, i: int) -> None:
     """Give the sums of joint i the friction of the last two reversals if both contradict them."""
     coulomb, stribeck = learned_friction(settings, state, i)
-    band = unmodelled(settings, i)
-    last = beyond(state.shown[0, i] - coulomb, band)
-    other = beyond(state.shown[1, i] - coulomb, band)
+    found = state.reversal_estimate
+    band = settings.unmodelled[i]
+    last = beyond(found[0, i] - coulomb, band)
+    other = beyond(found[1, i] - coulomb, band)
     if last * other <= 0.0:
         return
-    level = 0.5 * (state.shown[0, i] + state.shown[1, i])
+    level = 0.5 * (found[0, i] + found[1, i])
     extra = level * stribeck
     sums = state.reversal_sums
     sums[_SE, i] = level * sums[_SS, i] + extra * sums[_SB, i]
@@ -318,12 +376,11 @@ def overrule(settings: Settings, state: State, i: int) -> None:
 @inner
 def learned_friction(settings: Settings, state: State, i: int) -> tuple[float, float]:
     """Return c [N m] and k of joint i by all sums, k within its limits."""
-    j = first_coulomb(settings) + i
-    f = unmodelled(settings, i)
-    pull = _PRIOR * f * f / settings.variance[j]
+    f = settings.unmodelled[i]
+    pull = _PRIOR * f * f / settings.variance[i]
     sums = state.reversal_sums
     latest = state.latest_sums
-    se = sums[_SE, i] + latest[_SE, i] + pull * settings.initial_estimate[j]
+    se = sums[_SE, i] + latest[_SE, i] + pull * settings.initial[i]
     be = sums[_BE, i] + latest[_BE, i]
     ss = sums[_SS, i] + latest[_SS, i] + pull
     sb = sums[_SB, i] + latest[_SB, i]
@@ -339,36 +396,40 @@ def learned_friction(settings: Settings, state: State, i: int) -> tuple[float, f
             k = _MOST_STRIBECK
     energy = ss + 2.0 * k * sb + k * k * bb
     if energy <= 0.0:
-        return settings.initial_estimate[j], 0.0
+        return settings.initial[i], 0.0
     return (se + k * be) / energy, k
 
 
 @inner
-def follow_reversals(settings: Settings, state: State, signals: Signals) -> None:
-    """Write c minus the estimate to the entries of Coulomb friction in `signals.rate`.
+def follow_reversals(
+    settings: Settings,
+    state: State,
+    work: Work,
+    active: Array,
+    estimate: Array,
+    rate: Array,
+) -> None:
+    """Write c - c^ to the entries of Coulomb friction in `rate` (m,), k - k^ to `work`.
 
-    What k^ lacks goes to `signals.breakaway_rate`.
+    Entries of theta^ that are not `active` stay.
     """
-    if not learns_from_reversals(settings):
+    if settings.learns == 0:
         return
-    first = first_coulomb(settings)
-    for i in range(settings.n):
-        signals.breakaway_rate[i] = 0.0
-        if state.active[first + i] == 0.0:
+    for i in range(settings.initial.size):
+        j = settings.first_coulomb + i
+        work.breakaway_error[i] = 0.0
+        if active[j] == 0.0:
             continue
         coulomb, stribeck = learned_friction(settings, state, i)
-        signals.rate[first + i] = coulomb - state.estimate[first + i]
-        signals.breakaway_rate[i] = stribeck - state.breakaway[i]
+        rate[j] = coulomb - estimate[j]
+        work.breakaway_error[i] = stribeck - state.breakaway[i]
 
 
 @inner
-def adapt_breakaway(
-    settings: Settings, state: State, signals: Signals, dt: float
-) -> None:
+def adapt_breakaway(settings: Settings, state: State, work: Work, dt: float) -> None:
     """Advance k^ by `dt` [s]: k^' = Gamma kappa (k - k^)."""
-    if not learns_from_reversals(settings) or state.latched[0] == 0.0:
+    if settings.learns == 0:
         return
-    first = first_coulomb(settings)
-    for i in range(settings.n):
-        rate = settings.Gamma[first + i] * settings.kappa * signals.breakaway_rate[i]
+    for i in range(settings.initial.size):
+        rate = settings.gain[i] * work.breakaway_error[i]
         state.breakaway[i] += dt * rate

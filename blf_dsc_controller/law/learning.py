@@ -26,18 +26,54 @@ from blf_dsc_controller.law.state import Settings, Signals, State
 
 
 @inner
+def measure_reversals(settings: Settings, state: State, period: float) -> None:
+    """Let `friction` measure reversals, with a row each `period` [s].
+
+    It begins T_a after the latch, when the other columns are those of the window, and
+    once a full window is known to be of one arm or this one is half full: those of less
+    are too vague.
+    """
+    if settings.friction.learns == 0:
+        return
+    settling_time = settings.learning_start - settings.window * period
+    since_latch = friction.update_since_latch(state.friction, state.latched[0], period)
+    is_known = (
+        settings.change_detection == 0
+        or state.least_residual[0] > 0.0
+        or state.rows[0] >= 0.5 * settings.window
+    )
+    friction.measure_reversals(
+        settings.friction,
+        state.friction,
+        state.filter2,
+        state.estimate,
+        since_latch <= settling_time or not is_known,
+        period,
+    )
+
+
+@inner
 def observe(
     settings: Settings, state: State, signals: Signals, t: float, dt: float
 ) -> None:
     """Compute the regressors; add the row of the last interval; check the excitation when due."""
     compute_regressors(settings, state, signals)
-    friction.fill_compensation(settings, state, signals, dt)
-    friction.follow_motion(settings, state, signals)
+    friction.fill_compensation(
+        settings.friction,
+        state.friction,
+        signals.friction,
+        state.estimate,
+        signals.dqr,
+        signals.ddqr,
+        signals.H,
+        dt,
+    )
+    friction.follow_motion(settings.friction, state.friction, signals.friction)
     ripple.fill_compensated_ripple(settings, signals, dt)
     prediction.fill_columns(settings, t, signals.dq, signals.Yr)
     ripple.fill_measured_ripple(settings, signals)
     prediction.form_row(settings, state, signals, dt)
-    friction.filter_shapes(settings, state, signals, dt)
+    friction.filter_shapes(settings.friction, state.friction, signals.dq, dt)
     if state.samples[0] == 0.0:
         return
     if state.frozen[0] > 0.0:  # the row is of a contact
@@ -45,7 +81,7 @@ def observe(
         return
     if int(state.samples[0]) % settings.row_interval == 0:
         window.push_row(state, signals.row)
-        friction.measure_reversals(settings, state, settings.row_interval * dt)
+        measure_reversals(settings, state, settings.row_interval * dt)
     if settings.change_detection == 1:
         change.detect_change(settings, state, signals, dt)
     if int(state.samples[0]) % settings.interval == 0:

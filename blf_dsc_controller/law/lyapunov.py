@@ -33,7 +33,7 @@ def error_term(settings: Settings, state: State, signals: Signals) -> float:
             knee = signals.knee[i]
             weight = settings.weight[i]
             limit = settings.slope_limit[i]
-            total += state.gain_scale[i] * barrier.potential(
+            total += state.rotors.gain_scale[i] * barrier.potential(
                 xi1[i], bound, weight, limit, knee
             )
     return total
@@ -70,7 +70,9 @@ def fill_energies(
     for i in range(n):
         if settings.gamma[i] > 0.0:
             error = signals.feedforward[i] - state.disturbance[i]
-            V[3] += 0.5 * error * error / (state.gain_scale[i] * settings.gamma[i])
+            V[3] += (
+                0.5 * error * error / (state.rotors.gain_scale[i] * settings.gamma[i])
+            )
 
 
 def largest_inertia(settings: Settings) -> float:

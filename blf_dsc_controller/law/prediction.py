@@ -105,7 +105,9 @@ def filter_row(settings: Settings, state: State, signals: Signals, dt: float) ->
             row[i, j] += (signals.Yp[i, j] - state.Yp[i, j]) * (1.0 / dt)
         row[i, m] = state.late[1, i]
         if settings.contact.enabled == 1:
-            extra = friction.breakaway_torque(settings, state, i)
+            extra = friction.breakaway_torque(
+                settings.friction, state.friction, state.estimate, i
+            )
             external_torque.filter_interval(
                 settings.contact, state.contact, i, row[i], extra, dt
             )

@@ -12,7 +12,7 @@ from typing import Annotated, NamedTuple
 from blf_dsc_controller.arms.model import ArmModel
 from blf_dsc_controller.compiled.jit import inner
 from blf_dsc_controller.compiled.layout import Array, Cell, Passed, size_of, view_of
-from blf_dsc_controller.law import external_torque, weighing
+from blf_dsc_controller.law import apparent_inertia, external_torque, friction, weighing
 
 CHOICES = {
     'prediction': ('filtered', 'lambda'),
@@ -48,7 +48,6 @@ class Settings(NamedTuple):
     follows_inertia: int
     decoupled: int  # 1: no feedback acts through M(q, P^(0))
     known_rate: int  # 1: the surface filter follows the known rate of beta2
-    rotors_unsure: int  # 1: errors of the assumed rotor inertias are measured
     memory: int  # numbers in the memory of a law of a file
     window: int  # N, rows in tau_d
     row_interval: int  # samples between two rows of the window
@@ -108,11 +107,8 @@ class Settings(NamedTuple):
     # R, inverse covariance of the prior of theta
     information: Annotated[Array, 'm', 'm']
     variance: Annotated[Array, 'm']  # diagonal of R^-1
-    # assumed rotor inertias J that are a guess, kg m^2
-    unsure_rotor: Annotated[Array, 'n']
     # m, least inertia of a joint with the others free, kg m^2
     joint_inertia: Annotated[Array, 'n']
-    link_inertia: Annotated[Array, 'n']  # likewise, without J
     least: Annotated[Array, 'm']  # value that theta^ can have: friction is not negative
     most: Annotated[Array, 'm']  # value that theta^ can have
     true_parameters: Annotated[Array, 'p']
@@ -123,6 +119,8 @@ class Settings(NamedTuple):
     # masses [kg] and moments [kg m] of the drive's model
     drive_inertias: Annotated[Array, 'drive']
     contact: external_torque.Settings
+    friction: friction.Settings
+    rotors: apparent_inertia.Settings
     weighing: weighing.Settings
 
 
@@ -181,30 +179,10 @@ class State(NamedTuple):
     anchor: Annotated[Array, 'm']
     min_eigenvector: Annotated[Array, 'm']  # x of Phi x = lambda R x, x^T R x = 1
     active: Annotated[Array, 'm']  # 0 where a disturbance column has been rejected
-    lags: Annotated[Array, 14, 'n']  # of `apparent_inertia`
-    rotor_sums: Annotated[Array, 5, 'n']  # of z r and z a; see `apparent_inertia`
-    rotor_error: Annotated[Array, 'n']  # J~ <= 0 of the assumed rotor inertias, kg m^2
-    gain_scale: Annotated[Array, 'n']  # measured inertia of each joint over the assumed
-    since_latch: Cell  # s
-    # s and b of `friction`: now, behind one pole, behind both
-    shape_lags: Annotated[Array, 2, 3, 'n']
-    column_lags: Annotated[Array, 2, 2, 'n']  # of s_h and b_h
-    torque_lags: Annotated[Array, 2, 'n']  # of e_h, N m
-    # p int of s_h e_h, b_h e_h [N m], s_h^2, s_h b_h and b_h^2, over past reversals
-    reversal_sums: Annotated[Array, 5, 'n']
-    latest_sums: Annotated[Array, 5, 'n']  # likewise, over the present one
-    # Coulomb friction by the last reversal and the one before, N m
-    shown: Annotated[Array, 2, 'n']
-    breakaway: Annotated[Array, 'n']  # k^, what Stribeck adds, over Coulomb friction
-    moves: Annotated[Array, 'n']  # 1 while the joint does not reverse
-    direction: Annotated[Array, 'n']  # of its motion since the last reversal, 1 or -1
-    # delta, what d^3 has added along the motion since then, N m
-    opposed: Annotated[Array, 'n']
-    # least and largest delta of earlier motions, or 0, since a reversal was last
-    # measured, N m
-    unanswered: Annotated[Array, 2, 'n']
     frozen: Cell  # s, for which nothing is learned
     contact: external_torque.State
+    friction: friction.State
+    rotors: apparent_inertia.State
     weighing: weighing.State
     memory: Annotated[Array, 'memory']  # of a law of a file
     ring: Annotated[Array, 'window', 'n', 'm + 1']  # the window's rows
@@ -242,10 +220,6 @@ class Signals(NamedTuple):
     knee: Annotated[Array, 'n']  # knee of the barrier for that bound, rad
     narrowing: Annotated[Array, 'n']  # k'/k, 1/s
     H: Annotated[Array, 'n', 'm']  # of what is learned: [H | compensated columns]
-    sign: Annotated[Array, 'n']  # s(v) of `friction`
-    stribeck: Annotated[Array, 'n']  # exp(-(v / v_s)^2)
-    friction: Annotated[Array, 'n']  # compensation of Coulomb friction, N m
-    breakaway_rate: Annotated[Array, 'n']  # what k^ lacks
     Yp: Annotated[Array, 'n', 'p']  # Yp P = M dq
     Yr: Annotated[Array, 'n', 'm']  # [Yr | columns], Yr P = G - C^T dq
     row: Annotated[Array, 'n', 'm + 1']  # filtered [X | u]
@@ -262,11 +236,11 @@ class Signals(NamedTuple):
     unit: Annotated[Array, 'n']  # scratch
     zeros: Annotated[Array, 'n']
     drive: Annotated[Array, 'n', 'drive']  # columns of the gravity that the drive adds
-    # acceleration in the band of `apparent_inertia`, rad/s^2
-    band_acceleration: Annotated[Array, 'n']
     rate: Annotated[Array, 'm']  # theta^' [1/s]
     work: Annotated[Array, 'm']  # scratch
     contact: external_torque.Work
+    friction: friction.Work
+    rotors: apparent_inertia.Work
     weighing: weighing.Work
 
 

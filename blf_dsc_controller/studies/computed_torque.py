@@ -16,7 +16,6 @@ from blf_dsc_controller.arms.friction import sliding
 from blf_dsc_controller.compiled.jit import inner
 from blf_dsc_controller.compiled.layout import Array, view_of
 from blf_dsc_controller.configuration.schema import positive
-from blf_dsc_controller.law.friction import first_coulomb
 from blf_dsc_controller.law.state import Settings, Signals, State
 
 
@@ -34,10 +33,10 @@ def known_friction(settings: Settings, i: int, velocity: float) -> float:
     """Return the friction of joint i [N m] that the initial estimate has at a velocity."""
     friction = 0.0
     if settings.viscous == 1:
-        viscous = settings.p + settings.n * settings.bias
-        friction += settings.initial_estimate[viscous + i] * velocity
+        viscous = settings.initial_estimate[settings.friction.first_viscous + i]
+        friction += viscous * velocity
     if settings.coulomb == 1:
-        coulomb = settings.initial_estimate[first_coulomb(settings) + i]
+        coulomb = settings.friction.initial[i]
         friction += coulomb * sliding(velocity, settings.coulomb_velocity)
     return friction
 

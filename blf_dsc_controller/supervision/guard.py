@@ -151,7 +151,7 @@ class Guard:
         self._velocity = Velocity(n) if config.safety.velocity == 'estimated' else None
         self._wraps = Wraps(config)
         self._safe_torque = SafeTorque(n)
-        self._safe_torque.scale = self.controller.state.gain_scale
+        self._safe_torque.scale = self.controller.state.rotors.gain_scale
         self._seen = 0  # ns, stamp of the last state, used or not
         self._gap = 0.0  # s, since the one before
         self._stop_speed = StopSpeed()
@@ -393,7 +393,7 @@ class Guard:
         self._velocity.begin(before, checks.read_before[: self._n])
         self._velocity.replace(stamp, measurement)
         # What the wrong velocities showed of the rotors is as wrong.
-        self.controller.state.gain_scale[:] = checks.consistent_scale
+        self.controller.state.rotors.gain_scale[:] = checks.consistent_scale
         # Else the change from the wrong velocity would pass for an acceleration.
         self._safe_torque.last.dq[:] = measurement[self._n : -self._n]
         checks.readings[0] = 0.0

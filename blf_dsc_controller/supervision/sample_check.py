@@ -68,7 +68,7 @@ class SampleCheck:
         self.outside = self.saturated = 0
         checks = self._controller.checks
         checks.consistent[:] = self._kept
-        checks.consistent_scale[:] = self._controller.state.gain_scale
+        checks.consistent_scale[:] = self._controller.state.rotors.gain_scale
         checks.moved[:] = self._kept
         self.relax()
 
@@ -232,10 +232,10 @@ class SampleCheck:
         """Return a text if the inertia of a joint's drive is far below the assumed."""
         settings = self._controller.settings
         state = self._controller.state
-        if state.gain_scale[joint] > _LIGHT:
+        if state.rotors.gain_scale[joint] > _LIGHT:
             return ''
-        assumed = settings.unsure_rotor[joint]
-        error = state.rotor_error[joint]
+        assumed = settings.rotors.rotor[joint]
+        error = state.rotors.error[joint]
         if assumed + error < _NOTHING * assumed:
             return (
                 '; it moves as if nothing were commanded: release the brakes, and activate the '

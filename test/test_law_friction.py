@@ -1,0 +1,187 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The parts of the learned friction: its compensation, its evidence, its reversals."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from blf_dsc_controller.compiled.layout import size_of, view_of
+from blf_dsc_controller.law import friction
+from blf_dsc_controller.law.friction import Settings, State, Work
+
+N = 1  # joints; theta = (a parameter, Coulomb friction)
+F = 0.1  # N m, unmodelled
+SETTINGS = Settings(
+    viscous=0,
+    coulomb=1,
+    first_viscous=1,
+    first_coulomb=1,
+    learns=1,
+    bumpless=1,
+    coulomb_velocity=0.02,
+    lag=0.0,
+    pole=20.0,
+    unmodelled=np.array([F]),
+    initial=np.array([3.0]),
+    variance=np.array([2.25]),
+    least=np.array([1.0]),
+    most=np.array([9.0]),
+    gain=np.array([2.0]),
+)
+
+
+def part(layout):
+    """An empty state, or values of a sample."""
+    sizes = SimpleNamespace(n=N)
+    return view_of(layout)(np.zeros(size_of(layout)(sizes)), sizes)
+
+
+def learned_case(learned):
+    """A joint in motion, of which all evidence agrees with what is learned [N m]."""
+    state, work = part(State), part(Work)
+    state.reversal_estimate[:] = learned
+    work.sign[:] = 1.0
+    return state, work
+
+
+def compensation(state, work, learned, settings=SETTINGS):
+    return friction.coulomb_torque(settings, state, work, learned, 0)
+
+
+@pytest.mark.parametrize(
+    ('evidence', 'value', 'expected'),
+    [
+        (None, 0.0, 1.0),  # all agrees with 1 N m, in place of the assumed 3 N m
+        # Up to the dead band of 0.1 N m, the compensation is the nearest to 3 N m:
+        ('reversal_estimate', (2.0, 1.0), 1.9),  # the last reversal showed 2 N m
+        ('reversal_estimate', (1.0, 2.0), 1.9),  # the one before did
+        ('reversal_estimate', (9.0, 1.0), 3.0),  # no more than is assumed
+        ('reversal_estimate', (0.5, 1.0), 1.0),  # less is no reason to go away from it
+        ('observer_drift', (0.5,), 1.4),
+        ('observer_drift', (-0.5,), 1.0),
+        ('drift_extremes', (-0.5, 0.0), 1.0),
+        ('drift_extremes', (0.0, 0.5), 1.4),
+    ],
+)
+def test_friction_is_compensated_within_the_evidence(evidence, value, expected):
+    state, work = learned_case(1.0)
+    if evidence:
+        part_of = getattr(state, evidence)
+        part_of[:] = np.reshape(value, part_of.shape)
+    assert compensation(state, work, 1.0) == pytest.approx(expected)
+    work.sign[:] = -1.0
+    assert compensation(state, work, 1.0) == pytest.approx(-expected)
+
+
+def test_least_drift_lowers_what_is_compensated():
+    """9 N m are learned in place of 3 N m; d^3 once fell by 2 N m."""
+    state, work = learned_case(9.0)
+    assert compensation(state, work, 9.0) == 9.0
+    state.drift_extremes[0] = -2.0
+    assert compensation(state, work, 9.0) == pytest.approx(7.1)
+    # A law that hands nothing over to d^3 uses what it learns.
+    at_once = SETTINGS._replace(bumpless=0)
+    assert compensation(state, work, 9.0, at_once) == 9.0
+
+
+def test_breakaway_is_relative_to_the_learned_friction():
+    state, work = learned_case(9.0)
+    state.breakaway[:] = 0.5
+    state.shape_lags[1, 0] = -0.4  # b = s exp(-(v / v_s)^2), at the measured velocity
+    estimate = np.array([0.0, 9.0])
+    found = friction.breakaway_torque(SETTINGS, state, estimate, 0)
+    assert found == pytest.approx(9.0 * 0.5 * -0.4)
+    without = SETTINGS._replace(coulomb=0)
+    assert friction.breakaway_torque(without, state, estimate, 0) == 0.0
+    work.stribeck[:] = 1.0
+    assert compensation(state, work, 9.0) == pytest.approx(1.5 * 9.0)
+
+
+SE, BE, SS, SB, BB = range(5)
+
+
+@pytest.mark.parametrize(
+    ('last', 'before', 'expected'),
+    [
+        (4.0, 5.0, 4.5),  # both are above 3 N m: their mean
+        (2.0, 1.0, 1.5),  # both are below
+        (4.0, 2.0, 3.0),  # they contradict each other
+        (4.0, 3.05, 3.0),  # one of them agrees, within 0.1 N m
+    ],
+)
+def test_two_reversals_overrule_the_sums_if_both_contradict_them(
+    last, before, expected
+):
+    """The sums of eight reversals, which say 3 N m as the prior does, without breakaway.
+
+    The prior pulls to 3 N m by 0.015 (0.1 / 1.5)^2, 7e-5 of the sums.
+    """
+    state = part(State)
+    state.reversal_sums[[SE, SS], 0] = 3.0, 1.0
+    state.reversal_sums[BB] = 1.0
+    state.reversal_estimate[:, 0] = last, before
+    friction.overrule(SETTINGS, state, 0)
+    coulomb, stribeck = friction.learned_friction(SETTINGS, state, 0)
+    assert coulomb == pytest.approx(expected, abs=1e-3)
+    assert stribeck == 0.0
+
+
+def test_reversal_shows_its_friction_within_limits_and_forgets_earlier_drift():
+    """Once p int s_h^2 dt is 0.06, half a reversal."""
+    state = part(State)
+    friction.begin(SETTINGS, state)
+    state.drift_extremes[:, 0] = -1.0, 1.0
+    state.latest_sums[[SE, SS], 0] = 0.05 * 4.0, 0.05
+    friction.estimate_reversal(SETTINGS, state, 0, 0.0)
+    assert state.reversal_estimate[:, 0].tolist() == [3.0, 3.0]
+    assert state.drift_extremes.any()
+    state.latest_sums[[SE, SS], 0] = 0.07 * 4.0, 0.07
+    friction.estimate_reversal(SETTINGS, state, 0, 0.05)
+    np.testing.assert_allclose(state.reversal_estimate[:, 0], [4.0, 3.0])
+    assert not state.drift_extremes.any()
+    state.latest_sums[SE] = 0.07 * 40.0
+    friction.estimate_reversal(SETTINGS, state, 0, 0.07)
+    assert state.reversal_estimate[:, 0].tolist() == [9.0, 3.0]  # the most
+
+
+def test_drift_of_the_observer_is_counted_along_the_motion_until_the_joint_reverses():
+    state, work = part(State), part(Work)
+    for sign, step in ((1.0, 0.3), (0.5, 0.2), (-0.5, 5.0), (-1.0, -0.4)):
+        work.sign[:] = sign
+        friction.follow_motion(SETTINGS, state, work)
+        friction.follow_observer(state, work, 0, step)
+    # 0.3 and 0.2 N m along the first motion, nothing between, 0.4 along the second
+    assert state.observer_drift[0] == pytest.approx(0.4)
+    np.testing.assert_allclose(state.drift_extremes[:, 0], [0.0, 0.5])
+    assert state.direction[0] == -1.0
+
+
+def test_change_of_the_friction_is_taken_from_the_disturbance_estimate():
+    """Their sum does not change: it is the torque."""
+    state, work = learned_case(4.0)
+    work.torque[:] = compensation(state, work, 4.0)
+    state.reversal_estimate[:] = 5.0
+    disturbance = np.array([0.7])
+    friction.hand_over(SETTINGS, state, work, np.array([0.0, 5.0]), disturbance)
+    assert work.torque[0] == pytest.approx(5.0)
+    assert disturbance[0] + work.torque[0] == pytest.approx(0.7 + 4.0)
+
+
+def test_learned_friction_moves_the_estimate_unless_its_column_was_rejected():
+    state, work = part(State), part(Work)
+    state.reversal_sums[[SE, SS], 0] = 4.0, 1.0
+    state.reversal_sums[BB] = 1.0
+    rate = np.zeros(2)
+    estimate = np.array([0.0, 3.0])
+    for active, expected in ((0.0, 0.0), (1.0, 1.0)):
+        mask = np.array([1.0, active])
+        friction.follow_reversals(SETTINGS, state, work, mask, estimate, rate)
+        assert rate[1] == pytest.approx(expected, abs=1e-3)
+    state.breakaway[:] = 0.2
+    friction.follow_reversals(SETTINGS, state, work, mask, estimate, rate)
+    friction.adapt_breakaway(SETTINGS, state, work, 0.001)
+    # back to k = 0, at a rate of 2 / s
+    assert state.breakaway[0] == pytest.approx(0.2 - 0.001 * 2.0 * 0.2)
