@@ -70,7 +70,7 @@ def table(found: Commissioned) -> str:
 def sentences(found: Commissioned) -> Iterator[str]:
     """Yield what was found, what limits the gains, and what to do about it."""
     arm = found.findings
-    states = f'joint states at {arm.rate:.4g} Hz, jitter {1e3 * arm.jitter:.2g} ms'
+    states = f'joint states at {arm.rate:.4g} Hz, jitter {1e3 * arm.jitter:.3f} ms'
     step = float(arm.resolution.max())
     steps = f'; positions in steps of {1e3 * step:.2g} mrad' if step else ''
     yield f'{states}, {100.0 * arm.lost:.2g} % lost{steps}'
@@ -166,14 +166,15 @@ def draw(found: Commissioned, names: Sequence[str], path: Path) -> None:
         axes.set_ylim(0.0, 1.5)
         axes.set_title(f'least singular value of I + L, gains {label}', loc='left')
         axes.set_xlabel('frequency [Hz]')
-    picture.axes[0, 0].legend(frameon=False, fontsize=8, loc='upper left')
+    picture.axes[0, 0].legend(frameon=False, fontsize=8, loc='lower right')
     panels = list(picture.axes[1:].flat)
     for j, (axes, joint) in enumerate(zip(panels, found.joints, strict=False)):
         for response, colour in zip(found.responses, _colours(names), strict=True):
             f = response.frequency
             own = np.abs(response.position[:, j, j])
             axes.loglog(f, own * (2.0 * np.pi * f) ** 2, color=colour)
-        axes.set_title(f'{joint}: acceleration by torque [rad/(s^2 N m)]', loc='left')
+        axes.set_title(f'{joint}: acceleration by torque', loc='left')
+        axes.set_ylabel('rad/(s^2 N m)')
         axes.set_xlabel('frequency [Hz]')
     for axes in panels[n:]:
         axes.set_visible(False)
