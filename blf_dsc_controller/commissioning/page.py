@@ -22,6 +22,7 @@ _COLOURS = (BLUE, ORANGE, MUTED, ALARM)
 _SIZE = (5.6, 3.4)  # inches, of a panel
 _MUCH = 0.1  # of the margin, by noise
 _FAR = 5.0  # times the gains of the measurement: friction may act otherwise on theirs
+_SOFTER = 0.8  # of the stiffness of the measurement, from which it is said
 
 
 def description(planned: Planned) -> str:
@@ -122,7 +123,7 @@ def sentences(found: Commissioned) -> Iterator[str]:
 
 
 def _of_bound(found: Commissioned) -> Iterator[str]:
-    """Yield which bounds are wider than they were."""
+    """Yield which bounds are wider than they were, and what softer gains mean for others."""
     bounds = found.config.barrier.bound, found.before.barrier.bound
     wider = [
         f'{joint} {after:g} rad instead of {before:g}'
@@ -133,6 +134,14 @@ def _of_bound(found: Commissioned) -> Iterator[str]:
         yield (
             f'barrier.bound is widened for these errors: {"; ".join(wider)}. With less '
             'robot.payload less will do'
+        )
+    share = found.choice.gains.stiffness / found.start.stiffness
+    if share.min() < _SOFTER:
+        yield (
+            f'the gains are down to {share.min():.2g} of the stiffness that it was measured with '
+            f'({found.joints[int(share.argmin())]}): errors that nobody expects, such as by more '
+            'friction, grow by as much; a bound that was given for the stiffer gains may be too '
+            'narrow'
         )
 
 
