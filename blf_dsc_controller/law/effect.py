@@ -73,9 +73,8 @@ def check_effect(
     moves = begins or has_moved(checks, settings.n)
     T = checks.sample_time[0]
     flags = compare_effort(settings, checks, signals, sample, begins, moves)
-    is_due = asks_for_motion(checks, sample, settings.n)
-    is_due = is_due and not effort_follows(settings, checks)
     checks.at_rest[0] = 0.0 if moves else checks.at_rest[0] + T
+    has_changed = False
     for i in range(settings.n):
         smooth = 1.0 if begins else min(1.0, T / _RECENT)
         checks.recent[i] += smooth * (sample.torque[i] - checks.recent[i])
@@ -90,9 +89,11 @@ def check_effect(
         change = abs(checks.recent[i] - checks.before[i])
         least = _CHANGED * settings.torque_limit[i]
         least += _CHATTERED * sqrt(checks.chatter[i])
-        has_changed = change > least
-        if has_changed and checks.at_rest[0] > _RECENT and is_due:
-            flags |= NO_EFFECT | SUSPECT
+        has_changed = has_changed or change > least
+    has_changed = has_changed and checks.at_rest[0] > _RECENT
+    is_missing = has_changed and asks_for_motion(checks, sample, settings.n)
+    if is_missing and not effort_follows(settings, checks):
+        flags |= NO_EFFECT | SUSPECT
     if moves and checks.lacking[0] == 0.0:
         for j in range(settings.m + settings.n):
             checks.moved[j] = checks.kept[j]
