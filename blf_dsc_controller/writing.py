@@ -16,13 +16,14 @@ def writing(path: Path) -> Iterator[None]:
     """Name a file or folder that cannot be written, and leave no part of it.
 
     Raises:
+        OSError: it cannot be opened or made.
         BlfDscError: an OSError while it is written, such as that of a full disk.
     """
     try:
         yield
     except OSError as error:
-        if error.filename is not None:  # it was not opened: what is there stays
-            raise BlfDscError(f'{error.filename}: {error.strerror}') from error
+        if error.filename is not None:  # not opened, and named: what is there stays
+            raise
         if path.is_dir():
             shutil.rmtree(path, ignore_errors=True)
         else:
@@ -36,6 +37,7 @@ def write_text(path: Path, text: str) -> None:
     """Write a text in UTF-8.
 
     Raises:
+        OSError: it cannot be opened.
         BlfDscError: it cannot be written; no part of it is left.
     """
     with writing(path):

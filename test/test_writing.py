@@ -45,6 +45,6 @@ def test_folder_that_the_disk_does_not_hold_leaves_nothing(full):
 def test_what_cannot_be_opened_stays(tmp_path):
     """Such as a folder of the same name."""
     (tmp_path / 'page.html').mkdir()
-    with pytest.raises(BlfDscError, match=r'page\.html: Is a directory'):
+    with pytest.raises(IsADirectoryError, match=r'page\.html'):
         write_text(tmp_path / 'page.html', 'x')
     assert (tmp_path / 'page.html').is_dir()
