@@ -66,12 +66,10 @@ def compute_regressors(settings: Settings, state: State, signals: Signals) -> No
 
 
 @inner
-def fill_known_torque(
-    settings: Settings, state: State, signals: Signals, v: Array, a: Array, dt: float
+def fill_friction(
+    settings: Settings, state: State, signals: Signals, dt: float
 ) -> None:
-    """Write H(q, dq, v, a) P^(0) and the known friction at dqr to `signals.model_torque` [N m]."""
-    H = signals.H
-    settings.model.regressor(signals.q, signals.dq, v, a, H)
+    """Write the known friction at dqr to `signals.friction`, and its columns to H."""
     friction.fill_compensation(
         settings.friction,
         state.friction,
@@ -79,9 +77,19 @@ def fill_known_torque(
         state.estimate,
         signals.dqr,
         signals.ddqr,
-        H,
+        signals.H,
         dt,
     )
+
+
+@inner
+def fill_known_torque(
+    settings: Settings, state: State, signals: Signals, v: Array, a: Array, dt: float
+) -> None:
+    """Write H(q, dq, v, a) P^(0) and the known friction at dqr to `signals.model_torque` [N m]."""
+    H = signals.H
+    settings.model.regressor(signals.q, signals.dq, v, a, H)
+    fill_friction(settings, state, signals, dt)
     for i in range(settings.n):
         signals.model_torque[i] = signals.friction.torque[i]
         for j in range(settings.m):

@@ -21,7 +21,7 @@ from blf_dsc_controller.law import (
     ripple,
     window,
 )
-from blf_dsc_controller.law.compensation import compute_regressors
+from blf_dsc_controller.law.compensation import compute_regressors, fill_friction
 from blf_dsc_controller.law.state import Settings, Signals, State
 
 
@@ -58,16 +58,7 @@ def observe(
 ) -> None:
     """Compute the regressors; add the row of the last interval; check the excitation when due."""
     compute_regressors(settings, state, signals)
-    friction.fill_compensation(
-        settings.friction,
-        state.friction,
-        signals.friction,
-        state.estimate,
-        signals.dqr,
-        signals.ddqr,
-        signals.H,
-        dt,
-    )
+    fill_friction(settings, state, signals, dt)
     friction.follow_motion(settings.friction, state.friction, signals.friction)
     ripple.fill_compensated_ripple(settings, signals, dt)
     prediction.fill_columns(settings, t, signals.dq, signals.Yr)
