@@ -3,11 +3,14 @@
 
 A publisher of torques may be one of a controller in command, of one that is not active,
 or of one that was killed: it stays visible for some 20 s.  So the torques themselves
-decide, for which there is a moment to wait where there is such a publisher.
+decide, for which there is a moment to wait where there is such a publisher.  Of controllers
+that are started at once, each waits for a time of its own: the first commands, the others
+hear it.
 """
 
 from __future__ import annotations
 
+import random
 from collections.abc import Callable
 from enum import Enum
 from math import inf
@@ -20,6 +23,7 @@ from blf_dsc_controller.messages.topics import Quality
 from blf_dsc_controller.nodes.endpoints import RawSubscriptions
 
 _LISTENING = 1.0  # s, in which a controller in command is heard
+_SPREAD = 1.0  # s, over which controllers that start together spread
 _LOOK_PERIOD = 0.05  # s
 
 
@@ -46,6 +50,7 @@ class OtherCommander:
         self._node = node
         self.topic = topic
         self._steady = steady
+        self._listening = _LISTENING + random.uniform(0.0, _SPREAD)  # noqa: S311
         self._of_watchdog = Float64MultiArrayEncoder(joints, topics.WATCHDOG_NODE)
         self._subscriptions = RawSubscriptions(node)
         quality = Quality(depth=1, reliability='best_effort')
@@ -56,7 +61,7 @@ class OtherCommander:
     def begin(self) -> None:
         """Listen from now on."""
         self._subscriptions.take()
-        self._since: float | None = None  # s, when other publishers were seen first
+        self._since = inf  # s, when other publishers were seen first
         self._looked = -inf
 
     def find(self) -> Finding:
@@ -69,13 +74,12 @@ class OtherCommander:
         ]
         if heard:
             return Finding.SOMEBODY
-        if now - self._looked < _LOOK_PERIOD:
-            return Finding.UNKNOWN
-        self._looked = now
-        if not self._has_others():
-            return Finding.NOBODY
-        self._since = now if self._since is None else self._since
-        is_silent = now - self._since >= _LISTENING
+        if now - self._looked >= _LOOK_PERIOD:
+            self._looked = now
+            if not self._has_others():
+                return Finding.NOBODY
+            self._since = min(self._since, now)
+        is_silent = now - self._since >= self._listening
         return Finding.NOBODY if is_silent else Finding.UNKNOWN
 
     def close(self) -> None:
