@@ -1,0 +1,215 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Episodes of resets, activations and kills in motion, after which no joint may be faster.
+
+`python test/soak_motion.py --episodes 200 --busy 10` runs an FR3 and a UR5e, each with 2 kg that
+nobody has told of, beside ten busy processes.  The arm and its watchdog are in this process, the
+controller in one of its own.  The arm's clock is slower than the computer's, so that also a slow
+one keeps up.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import signal
+import subprocess
+import sys
+from collections import Counter, defaultdict, deque
+from functools import partial
+from pathlib import Path
+
+# Before anything of ROS is imported.
+os.environ['FASTRTPS_DEFAULT_PROFILES_FILE'] = str(
+    Path(__file__).with_name('one_process.xml')
+)
+
+import numpy as np
+from lifecycle_msgs.msg import Transition
+from lifecycle_msgs.srv import ChangeState
+from ros_rig import PatientClock, RosRig
+from std_srvs.srv import Trigger
+
+from blf_dsc_controller import load_loop
+from blf_dsc_controller.configuration.files import share_folder
+from blf_dsc_controller.configuration.schema import flatten
+from blf_dsc_controller.messages import topics
+from blf_dsc_controller.nodes.plant_node import PlantNode
+from blf_dsc_controller.nodes.watchdog_node import WatchdogNode
+
+CONTROLLER = '/blf_dsc_controller'
+LOAD = {'events.begin': [0.0], 'events.duration': [1e6], 'events.payload': [2.0]}
+PATIENT = {'safety.state_timeout': 10.0, 'safety.overrun_fraction': 1.0}
+SLACK = 0.2  # rad/s beyond what the reference asks: a load and links that nobody knows
+MOVING = 0.1  # rad/s, beyond which an episode begins
+
+
+class Episodes:
+    """An arm, its watchdog, its controller, and what happens to them."""
+
+    def __init__(self, preset, seed):
+        self.rng = np.random.default_rng(seed)
+        self.ros = RosRig()
+        self.clock = PatientClock()
+        self.file = share_folder() / 'config' / f'{preset}.yaml'
+        plant = flatten(load_loop(self.file).plant) | LOAD
+        self.arm = self.ros.add(PlantNode, plant, clock=self.clock)
+        self.joints = len(self.arm.config.joints)
+        self.speeds = deque(
+            maxlen=100_000
+        )  # of each sample, largest of the joints last
+        self._watch_speeds()
+        self.asked = self.ros.listen(topics.REFERENCE)
+        self.state = self.ros.listen(topics.STATE)
+        self.controller = None
+        self.add_watchdog()
+        self.start_controller()
+
+    def _watch_speeds(self):
+        step, n = self.arm.plant.step, self.joints
+
+        def step_and_look(torque):
+            step(torque)
+            self.speeds.append(np.abs(self.arm.plant.truth()[-n:]))
+
+        self.arm.plant.step = step_and_look
+
+    def add_watchdog(self):
+        self.watchdog = self.ros.add(partial(WatchdogNode, steady=self.clock))
+
+    def start_controller(self):
+        words = [
+            word
+            for name, value in PATIENT.items()
+            for word in ('-p', f'{name}:={value}')
+        ]
+        module = 'blf_dsc_controller.nodes.controller_node'
+        self.controller = subprocess.Popen(
+            [
+                sys.executable,
+                *('-m', module, '--ros-args', '--params-file', self.file),
+                *words,
+            ],
+            env=os.environ | {'ROS_DOMAIN_ID': str(self.ros.context.get_domain_id())},
+            stderr=subprocess.DEVNULL,
+        )
+
+    def close(self):
+        self.controller.kill()
+        self.controller.wait()
+        self.ros.close()
+
+    # What happens.
+
+    def reset(self):
+        request = Trigger.Request()
+        self.ros.call(Trigger, f'{CONTROLLER}/reset', request)
+
+    def pause(self):
+        """Deactivate, and activate again while the arm still moves."""
+        self._change(Transition.TRANSITION_DEACTIVATE)
+        self._run(self.rng.uniform(0.005, 0.3))
+        self._change(Transition.TRANSITION_ACTIVATE)
+
+    def kill_controller(self):
+        """Start it again while the watchdog brings the arm to rest."""
+        self.controller.kill()
+        self.controller.wait()
+        self.ros.until(lambda: self.watchdog.watchdog.active)
+        self._run(self.rng.uniform(0.0, 0.5))
+        self.start_controller()
+
+    def hang_controller(self):
+        self.controller.send_signal(signal.SIGSTOP)
+        self._run(self.rng.uniform(0.02, 0.5))
+        self.controller.send_signal(signal.SIGCONT)
+
+    def kill_watchdog(self):
+        self.ros.kill(self.watchdog)
+        self._run(self.rng.uniform(0.0, 0.5))
+        self.add_watchdog()
+
+    def _change(self, transition):
+        request = ChangeState.Request(transition=Transition(id=transition))
+        self.ros.call(ChangeState, f'{CONTROLLER}/change_state', request)
+
+    def _run(self, seconds):
+        self.ros.run(self.arm, round(seconds / self.arm.config.sample_time))
+
+    # What is seen.
+
+    def begin(self):
+        """Return the speeds (n,) [rad/s] that the arm had before, once it tracks in motion."""
+        samples = round(0.2 / self.arm.config.sample_time)
+        self.recover()
+        self._run(self.rng.uniform(1.0, 3.0))
+        self.ros.until(lambda: self.speeds[-1].max() > MOVING)
+        return np.max(list(self.speeds)[-samples:], axis=0)
+
+    def recover(self):
+        """Bring the loop back after a stop or a refusal."""
+        if self.controller.poll() is not None:
+            self.start_controller()
+        self.ros.until(lambda: self.state and self.watchdog.watchdog is not None)
+        self.ros.until(self._tracks)
+
+    def _tracks(self):
+        if self.controller.poll() is not None:
+            self.start_controller()
+            self.ros.spin(1.0)
+        name = self.state[-1].message
+        if name.startswith(('stop', 'safe')):
+            self.reset()
+            self.ros.spin(0.2)
+        return self.state[-1].message == 'tracking'
+
+    def episode(self, name):
+        """Return by how much [rad/s] a joint was faster than before and than it was asked to be."""
+        before = self.begin()
+        self.speeds.clear()
+        self.asked.clear()
+        getattr(self, name)()
+        self._run(1.0)
+        asked = [np.abs(each.velocity) for each in self.asked]
+        most = np.max([before, *asked], axis=0)
+        return float((np.max(self.speeds, axis=0) - most).max())
+
+
+NAMES = ('reset', 'pause', 'kill_controller', 'hang_controller', 'kill_watchdog')
+
+
+def soak(preset, episodes, seed):
+    """Return the excess of each episode by its name."""
+    found = defaultdict(list)
+    run = Episodes(preset, seed)
+    try:
+        for number in range(episodes):
+            name = NAMES[number % len(NAMES)]
+            found[name].append(run.episode(name))
+            print(f'{preset} {number} {name} {found[name][-1]:+.3f} rad/s', flush=True)
+    finally:
+        run.close()
+    return found
+
+
+if __name__ == '__main__':
+    options = argparse.ArgumentParser(description=__doc__)
+    options.add_argument('--episodes', type=int, default=200)
+    options.add_argument('--busy', type=int, default=0, help='busy processes beside')
+    options.add_argument('--seed', type=int, default=0)
+    given = options.parse_args()
+    busy = [
+        subprocess.Popen(
+            [sys.executable, '-c', 'import os; os.nice(10)\nwhile True: pass']
+        )
+        for _ in range(given.busy)
+    ]
+    try:
+        faster = Counter()
+        for preset in ('fr3', 'ur5e_driver'):
+            for name, excess in soak(preset, given.episodes // 2, given.seed).items():
+                print(f'{preset:12} {name:16} worst {max(excess):+.3f} rad/s')
+                faster[preset] += sum(each > SLACK for each in excess)
+        assert not faster.total(), faster
+    finally:
+        for process in busy:
+            process.kill()
