@@ -150,7 +150,10 @@ class Episodes:
         if self.controller.poll() is not None:
             self.start_controller()
         self.ros.until(lambda: self.state and self.watchdog.watchdog is not None)
-        self.ros.until(self._tracks)
+        try:
+            self.ros.until(self._tracks)
+        except AssertionError as error:
+            raise AssertionError(f'never tracks again: {self.state[-1]}') from error
 
     def _tracks(self):
         if self.controller.poll() is not None:

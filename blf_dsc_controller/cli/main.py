@@ -195,6 +195,7 @@ def make_parser() -> argparse.ArgumentParser:
     _add_commissioning(partial(command, 'commission'), force)
     _add_identification(partial(command, 'identify'), names, force)
     _add_studies(partial(command, 'studies'))
+    _add_doctor(partial(command, 'doctor'))
     parser.set_defaults(commands=tuple(commands.choices))
     return parser
 
@@ -567,6 +568,20 @@ def _add_studies(command: _Command) -> None:
     again = 'repeat one run of a study, with a bag, into --out'
     option('--reproduce', nargs=2, metavar=('DIR', 'RUN'), help=again)
     option('--out', type=Path, help='folder of the study (monte_carlo)')
+
+
+def _add_doctor(command: _Command) -> None:
+    option = command(
+        'doctor',
+        'Say what is installed, what this computer is like for a control loop, and what to mend. '
+        'It takes some seconds and changes nothing. Paste what it prints into a report of a bug. '
+        'Exit code: 0 no problem, 1 a problem.',
+        '--config my.yaml --robot 172.16.0.2',
+    )
+    option(
+        '--config', help='parameter file or preset, to hear what is said at its start'
+    )
+    option('--robot', help='address of a robot, to ask how fast it answers (ping)')
 
 
 def _positive(text: str) -> int:

@@ -46,6 +46,16 @@ SHIPPED = Path(__file__).with_name('kernels')
 _OTHERS_WRITE = stat.S_IWGRP | stat.S_IWOTH
 
 
+def is_quick() -> bool:
+    """Whether kernels are linked into one another: see `linked`."""
+    return _CACHE is not None
+
+
+def place() -> Path:
+    """Return the folder of all machine code: NUMBA_CACHE_DIR, or else the user's cache."""
+    return _base(os.environ.get('NUMBA_CACHE_DIR'))
+
+
 def add_kernel(kernel: Any, *types: type) -> None:
     """Keep the machine code of a kernel, which is compiled with these types, in its folder."""
     KERNELS.append(kernel)
@@ -54,12 +64,12 @@ def add_kernel(kernel: Any, *types: type) -> None:
 
 
 def cache_folder(function: Callable[..., object], *types: type) -> Path:
-    """Return the folder of a kernel's machine code, in NUMBA_CACHE_DIR or else the user's cache."""
+    """Return the folder of a kernel's machine code, in `place`."""
     files, constants = dependencies(function, *types)
     digest = hashlib.sha256(' '.join([numba.__version__, *sorted(constants)]).encode())
     for name, source in sorted((_name(source), source) for source in files):
         digest.update(name.encode() + b'\0' + source.read_bytes())
-    return _base(os.environ.get('NUMBA_CACHE_DIR')) / digest.hexdigest()[:16]
+    return place() / digest.hexdigest()[:16]
 
 
 def ship() -> Path:

@@ -1,0 +1,195 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`blf_dsc doctor`: what is installed, what this computer is like, and what to mend."""
+
+from __future__ import annotations
+
+import importlib.metadata
+import importlib.util
+import os
+import shutil
+import subprocess
+import textwrap
+from argparse import Namespace
+from collections.abc import Iterator
+from itertools import chain
+from pathlib import Path
+
+from blf_dsc_controller import __version__
+from blf_dsc_controller.cli import computer
+from blf_dsc_controller.cli.domains import check_network, shell_domain, strangers
+from blf_dsc_controller.cli.finding import Finding, Level, note, ok, problem
+from blf_dsc_controller.cli.ros_check import require_ros
+from blf_dsc_controller.compiled.kernel_cache import SHIPPED, is_quick, place
+from blf_dsc_controller.configuration.controller import ControllerConfig
+from blf_dsc_controller.configuration.nodes import CONTROLLER, load, locate
+from blf_dsc_controller.errors import BlfDscError
+from blf_dsc_controller.extras import install_command
+from blf_dsc_controller.supervision.config_warnings import config_warnings
+from blf_dsc_controller.supervision.not_commissioned import not_commissioned
+
+_NEEDED = ('numpy', 'scipy', 'numba', 'mcap', 'rosbags', 'matplotlib')
+_EXTRAS = {
+    'ruckig': ('streams', 'streams of positions'),
+    'pylibfranka': ('franka', 'blf_dsc drive with an FR3'),
+    'mujoco': ('mujoco', 'MJCF and physics: mujoco'),
+    'viser': ('view', 'the live view'),
+    'plotly': ('report', 'blf_dsc report'),
+    'pyarrow': ('parquet', 'Parquet files'),
+}
+"""Packages by what they are for, and the extra that installs them."""
+
+_WIDTH = 100
+_INDENT = 20
+_PINGS = 200
+_SLOW = 0.3  # ms, on a cable without a switch; libfranka asks for less than 1 ms with both ways
+
+
+def doctor(options: Namespace) -> int:
+    """Print what was found; return 1 if there is a problem."""
+    found: list[Finding] = []
+    every = chain(_software(), _ros(), computer.examine())
+    if options.config:
+        every = chain(every, _configuration(options.config))
+    if options.robot:
+        every = chain(every, _network(options.robot))
+    for finding in every:
+        print(_line(finding), flush=True)
+        found.append(finding)
+    counts = [sum(each.level is level for each in found) for level in Level]
+    _, notes, problems = counts
+    print(
+        f'\n{problems or "no"} problem{"s" * (problems != 1)}, '
+        f'{notes or "no"} note{"s" * (notes != 1)}. If you report a bug, paste all of this.'
+    )
+    return int(problems > 0)
+
+
+def _line(finding: Finding) -> str:
+    text = f'{finding.text}\n{finding.remedy}' if finding.remedy else finding.text
+    head = f'{finding.level:8}{finding.subject:{_INDENT - 8}}'
+    lines = [
+        line
+        for part in text.splitlines()
+        for line in textwrap.wrap(part, _WIDTH - _INDENT, break_on_hyphens=False)
+    ]
+    return head + f'\n{" " * _INDENT}'.join(lines)
+
+
+def _software() -> Iterator[Finding]:
+    yield ok('package', f'blf_dsc_controller {__version__}, {computer.python()}')
+    versions = {name: importlib.metadata.version(name) for name in _NEEDED}
+    yield ok('needs', ', '.join(f'{name} {each}' for name, each in versions.items()))
+    there = {name: _version(name) for name in _EXTRAS}
+    yield ok(
+        'extras', ', '.join(f'{name} {each}' for name, each in there.items() if each)
+    )
+    for name, (extra, purpose) in _EXTRAS.items():
+        if not there[name]:
+            yield ok('extras', f'no {name}, for {purpose}: {install_command(extra)}')
+    yield _kernels()
+
+
+def _kernels() -> Finding:
+    shipped = ', some come with the package' if SHIPPED.is_dir() else ''
+    where = str(place()).replace(str(Path.home()), '~', 1)
+    if is_quick():
+        return ok(
+            'kernels', f'compiled once for each kind of arm, into {where}{shipped}'
+        )
+    version = importlib.metadata.version('numba')
+    return note(
+        'kernels',
+        f'numba {version} compiles them several times slower, and each update takes longer',
+        "pip install 'numba<0.69'",
+    )
+
+
+def _ros() -> Iterator[Finding]:
+    if importlib.util.find_spec('rclpy') is None:
+        remedy = f'source /opt/ros/jazzy/setup.bash, or {install_command("ros")}'
+        yield note('ROS 2', 'not here; drive, ArmController and bags need none', remedy)
+        return
+    try:
+        require_ros()
+    except BlfDscError as error:
+        yield problem('ROS 2', str(error))
+        return
+    distribution = os.environ.get('ROS_DISTRO')
+    kind = f'{distribution}, sourced' if distribution else 'Jazzy, as wheels'
+    middleware = os.environ.get('RMW_IMPLEMENTATION') or 'rmw_fastrtps_cpp'
+    yield ok('ROS 2', f'{kind}, rclpy {_version("rclpy")}, {middleware}')
+    yield from _domain()
+    if importlib.util.find_spec('control_msgs') is None:
+        text = 'control_msgs is not installed: no action for MoveIt'
+        yield note('ROS 2', text, 'sudo apt install ros-jazzy-control-msgs')
+
+
+def _domain() -> Iterator[Finding]:
+    try:
+        check_network()
+    except BlfDscError as error:
+        yield problem('network', str(error))
+    domain = shell_domain()
+    reach = os.environ.get('ROS_AUTOMATIC_DISCOVERY_RANGE') or 'SUBNET'
+    peers = os.environ.get('ROS_STATIC_PEERS')
+    text = f'{domain}, discovery {reach}' + (f', peers {peers}' if peers else '')
+    others = strangers(domain)
+    text += f', {len(others)} UDP ports of others here' if others else ', nobody here'
+    yield ok('ROS domain', text)
+
+
+def _configuration(path: str) -> Iterator[Finding]:
+    """Yield what the controller would say at its start."""
+    try:
+        config = load(locate(path), CONTROLLER, ControllerConfig)
+        warnings = [
+            each
+            for each in (*config_warnings(config), not_commissioned(config))
+            if each
+        ]
+    except BlfDscError as error:
+        yield problem('config', str(error))
+        return
+    rate = 1.0 / config.sample_time
+    yield ok('config', f'{len(config.joints)} joints at {rate:g} Hz, law {config.law}')
+    for warning in warnings:
+        yield note('config', warning, '')
+
+
+def _network(address: str) -> Iterator[Finding]:
+    """Yield how long a robot's computer takes to answer."""
+    ping = shutil.which('ping')
+    if ping is None:
+        yield note(
+            'robot',
+            'there is no ping on this computer',
+            'sudo apt install iputils-ping',
+        )
+        return
+    command = [ping, '-n', '-q', '-c', str(_PINGS), '-i', '0.01', '-w', '10', address]
+    run = subprocess.run(command, capture_output=True, text=True, check=False)
+    lines = run.stdout.splitlines()
+    lost = next((line for line in lines if 'packet loss' in line), '')
+    times = next((line for line in lines if 'min/avg/max' in line), '')
+    if run.returncode or not times:
+        reason = lost or (run.stderr.strip().splitlines() or ['no answer'])[-1]
+        text = f'{address} does not answer: {reason.strip()}'
+        yield problem(
+            'robot', text, 'check the cable, the address, and that it is switched on'
+        )
+        return
+    _, mean, largest = (float(each) for each in times.split('=')[1].split('/')[:3])
+    text = f'answers within {mean:.2f} ms, at worst {largest:.2f} ms of {_PINGS}; {lost.strip()}'
+    if mean > _SLOW:
+        yield note(
+            'robot', text, 'connect the robot by a cable of its own, without a switch'
+        )
+    else:
+        yield ok('robot', text)
+
+
+def _version(name: str) -> str:
+    try:
+        return importlib.metadata.version(name)
+    except importlib.metadata.PackageNotFoundError:
+        return 'as installed' if importlib.util.find_spec(name) else ''

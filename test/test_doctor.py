@@ -1,0 +1,124 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`blf_dsc doctor` says what is there, and what to do about what is not."""
+
+from __future__ import annotations
+
+import importlib.util
+
+import pytest
+
+from blf_dsc_controller.cli import computer, doctor
+from blf_dsc_controller.cli.main import main
+
+PING = """#!/bin/sh
+echo "200 packets transmitted, 200 received, 0% packet loss, time 1990ms"
+echo "rtt min/avg/max/mdev = 0.080/{mean}/0.900/0.050 ms"
+"""
+
+SILENT = """#!/bin/sh
+echo "200 packets transmitted, 0 received, 100% packet loss"
+exit 1
+"""
+
+
+@pytest.fixture(autouse=True)
+def short(monkeypatch):
+    monkeypatch.setattr(computer, '_SAMPLES', 10)
+
+
+def diagnosed(capsys, *words):
+    """Return the exit code, and the lines by subject, each as (level, text)."""
+    code = main(['doctor', *words])
+    found = {}
+    for line in capsys.readouterr().out.partition('\n\n')[0].splitlines():
+        level, subject, text = line[:8].strip(), line[8:20].strip(), line[20:]
+        if level:
+            last = found.setdefault(subject, [])
+            last.append([level, text])
+        else:
+            last[-1][1] += f' {text}'
+    return code, found
+
+
+def test_everything_that_can_matter_is_named(capsys):
+    code, found = diagnosed(capsys)
+    assert code == 0
+    assert {'package', 'needs', 'kernels', 'ROS 2', 'kernel', 'clock', 'disk'} <= set(
+        found
+    )
+    assert 'numba' in found['needs'][0][1]
+
+
+def test_configuration_says_what_the_controller_would_say(capsys):
+    _, found = diagnosed(capsys, '--config', 'fr3_direct')
+    first, *others = found['config']
+    assert first == ['ok', '7 joints at 1000 Hz, law blf_dsc']
+    assert any('nobody has measured' in text for _, text in others)
+
+
+def test_configuration_with_a_mistake_is_a_problem(capsys, tmp_path):
+    path = tmp_path / 'my.yaml'
+    path.write_text('/**:\n  ros__parameters:\n    sample_tme: 0.001\n')
+    code, found = diagnosed(capsys, '--config', str(path))
+    assert code == 1
+    assert found['config'][0][0] == 'PROBLEM'
+    assert 'sample_tme' in found['config'][0][1]
+
+
+def test_computer_without_ros_is_no_problem(capsys, monkeypatch):
+    find = importlib.util.find_spec
+    monkeypatch.setattr(
+        'importlib.util.find_spec',
+        lambda name, *rest: None if name == 'rclpy' else find(name, *rest),
+    )
+    code, found = diagnosed(capsys)
+    assert code == 0
+    level, text = found['ROS 2'][0]
+    assert level == 'note'
+    assert 'source /opt/ros/jazzy/setup.bash' in text
+
+
+def test_slow_compilation_names_the_numba_that_is_quick(capsys, monkeypatch):
+    monkeypatch.setattr(doctor, 'is_quick', lambda: False)
+    _, found = diagnosed(capsys)
+    assert found['kernels'][0][0] == 'note'
+    assert 'numba<0.69' in found['kernels'][0][1]
+
+
+def test_full_and_read_only_disks_are_named(capsys, monkeypatch):
+    monkeypatch.setattr(computer, '_ENOUGH', float('inf'))
+    _, found = diagnosed(capsys)
+    assert found['disk'][0][0] == 'note'
+    monkeypatch.setattr(computer.os, 'access', lambda *_: False)
+    _, found = diagnosed(capsys)
+    assert 'cannot be written' in found['disk'][0][1]
+
+
+@pytest.mark.parametrize(
+    ('mean', 'level'), [('0.150', 'ok'), ('0.700', 'note')], ids=['cable', 'switch']
+)
+def test_robot_is_asked_how_fast_it_answers(capsys, monkeypatch, tmp_path, mean, level):
+    ping = tmp_path / 'ping'
+    ping.write_text(PING.format(mean=mean))
+    ping.chmod(0o755)
+    monkeypatch.setenv('PATH', str(tmp_path), prepend=':')
+    code, found = diagnosed(capsys, '--robot', '172.16.0.2')
+    assert code == 0
+    assert found['robot'][0][0] == level
+    assert 'at worst 0.90 ms of 200' in found['robot'][0][1]
+
+
+def test_robot_that_does_not_answer_is_a_problem(capsys, monkeypatch, tmp_path):
+    ping = tmp_path / 'ping'
+    ping.write_text(SILENT)
+    ping.chmod(0o755)
+    monkeypatch.setenv('PATH', str(tmp_path), prepend=':')
+    code, found = diagnosed(capsys, '--robot', '172.16.0.2')
+    assert code == 1
+    assert '172.16.0.2 does not answer' in found['robot'][0][1]
+
+
+def test_computer_without_ping_says_how_to_get_it(capsys, monkeypatch, tmp_path):
+    monkeypatch.setenv('PATH', str(tmp_path))
+    _, found = diagnosed(capsys, '--robot', '172.16.0.2')
+    assert 'iputils-ping' in found['robot'][0][1]
