@@ -18,6 +18,7 @@ from blf_dsc_controller.reference.trajectory import (
     TrajectoryError,
     TrajectoryPoint,
 )
+from blf_dsc_controller.supervision.braking import braking_matrix
 from blf_dsc_controller.supervision.guard import Guard
 from blf_dsc_controller.supervision.last_state import LastState
 from blf_dsc_controller.supervision.plan import LatePlanError
@@ -40,12 +41,15 @@ def weight(q):
     return dynamics(P, 9.8, q, (0.0, 0.0))[2]
 
 
+BRAKING = braking_matrix(settings(), np.array([2.0, 1.0]), Q)
+
+
 @pytest.mark.parametrize(
     ('torque', 'dq', 'estimate', 'limit', 'expected'),
     [
         ('zero', DQ, P, 20.0, [0.0, 0.0]),
         ('damping', DQ, P, 20.0, [-1.0, 2.0]),
-        ('hold_gravity', DQ, P, 20.0, weight(Q) + np.array([-1.0, 2.0])),
+        ('hold_gravity', DQ, P, 20.0, weight(Q) - BRAKING @ DQ),
         ('hold_gravity', DQ, P, 3.0, [3.0, 3.0]),
         ('hold_gravity', DQ, P * np.nan, 20.0, [0.0, 0.0]),
         ('damping', np.array([1.7e308, 0.0]), P, 20.0, [0.0, 0.0]),
@@ -558,7 +562,7 @@ def test_commands_without_effect_stop_the_arm_with_the_model_from_before():
     state = rig.state()
     rig.sense = lambda state: [state.raw()]  # the brakes open
     rig.step(1000)
-    assert np.abs(rig.state().q - state.q).max() < 0.02
+    assert np.abs(rig.state().q - state.q).max() < 0.025  # while the load is observed
 
 
 @pytest.mark.parametrize(('effort', 'stops'), [('unknown', False), ('commanded', True)])

@@ -13,6 +13,7 @@ from blf_dsc_controller.configuration.controller import Safety
 from blf_dsc_controller.law.state import Settings
 from blf_dsc_controller.law.torque import added_torque
 from blf_dsc_controller.reference.approach import AT_REST
+from blf_dsc_controller.supervision.braking import braking_matrix
 from blf_dsc_controller.supervision.command_effect import CommandEffect
 from blf_dsc_controller.supervision.last_state import LastState
 from blf_dsc_controller.supervision.model_torque import friction_torque, model_torque
@@ -39,15 +40,18 @@ def safe_torque(
 
     It is zero, damping -D v, or damping plus gravity H(q, 0, 0, 0) P^ and `load` (n,)
     [N m] as far as the drive does not add them, and fades to zero while no usable state
-    arrives. D is the configured damping times `scale` (n,), v the velocity `last.slow`.
+    arrives. D is the configured damping times `scale` (n,), with gravity held that of
+    `braking_matrix`; v is the velocity `last.slow`.
     """
     torque = np.zeros(settings.n)
     if last.age >= safety.fade_time:
         return torque
     with np.errstate(over='ignore', invalid='ignore'):  # checked below
-        if safety.torque != 'zero':
-            torque -= scale * np.array(safety.damping) * last.slow
+        damping = scale * np.array(safety.damping)
+        if safety.torque == 'damping':
+            torque -= damping * last.slow
         if safety.torque == 'hold_gravity':
+            torque -= braking_matrix(settings, damping, last.q) @ last.slow
             torque += model_torque(settings, estimate, last.q) + load
             torque -= added_torque(settings, last.q)
     if not np.isfinite(torque).all():
