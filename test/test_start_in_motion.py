@@ -37,7 +37,11 @@ class Arm:
         loop = load_loop(CONFIG / f'{preset}.yaml')
         config = loop.controller
         limits = self._limits(config, rate)
-        given = {'safety.torque': 'hold_gravity', 'torque.rate_limit': limits}
+        given = {
+            'safety.torque': 'hold_gravity',
+            'torque.rate_limit': limits,
+            'safety.oscillation': 'warn',  # a start in motion shakes the gears of a UR5e
+        }
         self.config = change(config, given)
         self.guard = Guard(self.config)
         self.guard.activate()
