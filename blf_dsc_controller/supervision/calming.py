@@ -100,7 +100,7 @@ class Calming:
     def _find(self, shakes: NDArray[np.bool_]) -> Shaking | None:
         """Return the oscillation of the worst of the joints that do (n,); None: none does."""
         now = self._state
-        limit = self._controller.settings.torque_limit
+        limit = self._controller.settings.torque.limit
         torque = now.amplitude
         if not shakes.any() or not np.isfinite(torque).all():
             return None
@@ -111,7 +111,7 @@ class Calming:
 
     def _is_violent(self, shakes: NDArray[np.bool_]) -> bool:
         """Whether one of the joints that oscillate (n,) does so with large torques."""
-        limit = self._controller.settings.torque_limit
+        limit = self._controller.settings.torque.limit
         return bool((self._state.amplitude > VIOLENT * limit)[shakes].any())
 
     def is_due(self, t: float) -> bool:
