@@ -29,7 +29,6 @@ from blf_dsc_controller.configuration.nodes import (
     load_loop,
 )
 from blf_dsc_controller.law.factory import begin, controller_of
-from blf_dsc_controller.law.innovation import NOISE, RECENT
 from blf_dsc_controller.law.telemetry import sample_columns
 from blf_dsc_controller.law.weighing import DEVIATION, MASS
 from blf_dsc_controller.run import Floats
@@ -236,12 +235,12 @@ def largest_square(loop: LoopConfig) -> float:
     T = config.sample_time
     plant, controller = plant_of(loop.plant), controller_of(config)
     begin(controller, config, *plant.measure().reshape(3, -1)[:2])
-    statistics = controller.state.rows_statistics
+    statistics = controller.state.change.innovation
     largest = 0.0
     for k in range(round(loop.plant.duration / T)):
         torque = controller.update(k * T, T, plant.measure())
-        if statistics[NOISE] > 0.0:
-            largest = max(largest, statistics[RECENT] / statistics[NOISE])
+        if statistics.noise[0] > 0.0:
+            largest = max(largest, statistics.recent[0] / statistics.noise[0])
         plant.step(torque)
     return largest
 

@@ -97,7 +97,7 @@ def with_position_loop(case: Case) -> list[Reached]:
     law = guard.controller
     kp, kd = np.array(case.kp), np.array(case.kd)
     initial = law.settings.initial_estimate
-    limit = law.settings.torque_limit
+    limit = law.settings.torque.limit
 
     def torque(_: int, measurement: np.ndarray, qr: np.ndarray) -> np.ndarray:
         q, dq = measurement.reshape(3, -1)[:2]

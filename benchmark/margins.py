@@ -137,7 +137,7 @@ def row(preset: str, T: float) -> list[str]:
     """Return the cells of an arm at a sample time."""
     config = controller_of(preset, T)
     loop = Loop(config, T)
-    soft, steep = loop.settings.weight, loop.settings.slope_limit
+    soft, steep = loop.settings.barrier.weight, loop.settings.barrier.slope_limit
     rate = config.feedback.damping_rate / 0.6  # as in arms/tuning.py
     return [
         f'{rate:.0f} 1/s',

@@ -113,20 +113,26 @@ def _settings() -> np.ndarray:
         'swing': reference.amplitude,
         'tone': reference.frequency[0],
         **{
-            name: getattr(law, name)
+            name: getattr(law.barrier, name)
             for name in ('bound', 'weight', 'slope_limit', 'knee')
         },
         **{
-            name: getattr(law, name)
-            for name in ('K', 'mu', 'time_constant', 'Kp', 'gamma')
+            name: getattr(law.surface, name) for name in ('gain', 'mu', 'time_constant')
         },
-        'limit': law.torque_limit,
+        'Kp': law.feedback.gain,
+        'gamma': law.disturbance.gain,
+        'limit': law.torque.limit,
         'P0': law.initial_estimate[:_P],
-        **{name: getattr(law, name) for name in ('Gamma', 'kappa', 'rho', 'sigma')},
-        **{name: getattr(law, name) for name in ('learning_start', 'pole', 'radius')},
+        'Gamma': law.adaptation.adaptation_gain,
+        'kappa': law.adaptation.weight,
+        'rho': law.window.regularization,
+        'sigma': law.excitation.excitation_threshold,
+        'learning_start': law.excitation.learning_start,
+        'pole': law.row.filter_pole,
+        'radius': law.adaptation.radius,
         'T': T,
-        'window': law.window,
-        'interval': law.interval,
+        'window': law.window.length,
+        'interval': law.window.interval,
     }
     kinds = [
         (name, np.int64 if isinstance(value, int) else np.float64, np.shape(value))

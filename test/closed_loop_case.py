@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import plants
 from plain_law import R
+from symbols import replaced
 
 from blf_dsc_controller.arms.two_link import TwoLink
 from blf_dsc_controller.configuration.controller import ControllerConfig
@@ -44,7 +45,7 @@ def recommended(
     frequencies: Sequence[float] = (),
     **changes: Any,
 ) -> Settings:
-    """Return the settings of the default configuration with changes, and the knee for them.
+    """Return the settings of the default configuration with changes (`symbols`), and their knee.
 
     Change detection is off, since the paper has none: test_law_consistency.py covers
     it.
@@ -52,9 +53,10 @@ def recommended(
     config = ControllerConfig()
     columns = {'viscous': viscous, 'frequencies': frequencies}
     config = replace(config, learning=replace(config.learning, bias=bias, **columns))
-    settings = settings_of_config(config)._replace(**{'change_detection': 0} | changes)
-    barriers = zip(settings.bound, settings.weight, settings.slope_limit, strict=True)
-    return settings._replace(knee=np.array([barrier.knee(*each) for each in barriers]))
+    settings = replaced(settings_of_config(config), **{'change_detection': 0} | changes)
+    of = settings.barrier
+    barriers = zip(of.bound, of.weight, of.slope_limit, strict=True)
+    return replaced(settings, knee=np.array([barrier.knee(*each) for each in barriers]))
 
 
 def quick(**changes: Any) -> Settings:

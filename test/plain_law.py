@@ -10,6 +10,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.linalg import eigvalsh
 from scipy.optimize import brentq
+from symbols import by_symbol
 
 R = 9.8  # 1/s^2, g / l1 of Section IV
 
@@ -45,11 +46,11 @@ def regressor(r, q, dq, v, a):
 
 
 class PlainLaw:
-    """The law as it is written, with settings under the package's names."""
+    """The law as it is written, with settings by the paper's symbols."""
 
     def __init__(self, settings):
-        self.gains = settings
-        self.newton = settings.update == 1
+        self.gains = g = by_symbol(settings)
+        self.newton = g.update == 0
         self.at_state = settings.compensation == 1
         self.linear = settings.has_barrier == 0
         self.theta = settings.initial_estimate.copy()
@@ -58,7 +59,7 @@ class PlainLaw:
         self.held = np.zeros(2)  # of the demand, by the rate limit
         self.alpha2 = None
         self.previous = None
-        self.ring = np.zeros((settings.window, 2, settings.m + 1))
+        self.ring = np.zeros((g.window, 2, settings.m + 1))
         self.total = np.zeros((settings.m + 1, settings.m + 1))
         self.rows = 0
         self.latched = None

@@ -717,7 +717,7 @@ def learned_torque():
     """Return the last torque of a loop that learns, with every imperfection of the plant."""
     law = controller(quick(window=100, learning_start=0.2, sigma=-1.0))
     list(closed_loop(law, plants.plant(**plants.FULL), 0.4))
-    assert law.state.latched[0] == 1.0
+    assert law.state.latch.latched[0] == 1.0
     return law.signals.torque.tolist()
 
 

@@ -16,6 +16,8 @@ from blf_dsc_controller.configuration.plant import PlantConfig
 from blf_dsc_controller.configuration.schema import build, change, flatten, parameters
 from blf_dsc_controller.errors import ConfigurationError
 from blf_dsc_controller.law import factory, state
+from blf_dsc_controller.law.adaptation import GRADIENT, NEWTON
+from blf_dsc_controller.law.prediction import FILTERED, LAMBDA
 
 NAN = float('nan')
 TRUE_MODEL = {'law': 'model_based', 'truth.parameters': [1.0, 0.32, 0.4]}
@@ -306,8 +308,13 @@ def test_choices_match_the_law():
     choices = {entry.name: entry.choices for entry in parameters(ControllerConfig)}
     for law in choices['law']:
         factory.settings_of_config(build(ControllerConfig, TRUE_MODEL | {'law': law}))
-    for name in ('prediction', 'update', 'compensation'):
-        assert sorted(choices[f'learning.{name}']) == sorted(state.CHOICES[name])
+    for name, numbers in (
+        ('prediction', {'filtered': FILTERED, 'lambda': LAMBDA}),
+        ('update', {'newton': NEWTON, 'gradient': GRADIENT}),
+        ('compensation', {'reference': state.REFERENCE, 'state': state.STATE}),
+    ):
+        given = choices[f'learning.{name}']
+        assert {choice: k for k, choice in enumerate(given)} == numbers
 
 
 @pytest.mark.parametrize('cls', NODES.values(), ids=NODES)

@@ -88,7 +88,7 @@ def test_command_is_the_whole_torque_without_what_the_drive_adds():
     whole, command = (law.update(0.0, 1e-3, measurement).copy() for law in laws)
     unlimited = laws[0].signals.demand
     np.testing.assert_allclose(laws[1].signals.demand, unlimited, rtol=1e-12)
-    inside = np.abs(unlimited) < laws[0].settings.torque_limit
+    inside = np.abs(unlimited) < laws[0].settings.torque.limit
     np.testing.assert_allclose(command[inside], (whole - added)[inside], atol=1e-9)
 
 
@@ -373,7 +373,8 @@ def test_friction_of_an_estimate_is_that_of_its_columns():
     columns = dict(zip(names, estimate, strict=True))
     expected = [
         columns[f'viscous {joint}'] * speed
-        + columns[f'coulomb {joint}'] * np.tanh(speed / settings.coulomb_velocity)
+        + columns[f'coulomb {joint}']
+        * np.tanh(speed / settings.columns.coulomb_velocity)
         for joint, speed in zip(('joint1', 'joint2'), dq, strict=True)
     ]
     found = friction_torque(settings, estimate, dq)

@@ -130,10 +130,10 @@ def test_predicted_information_of_a_panda_matches_its_loop():
     motion = {name: getattr(loop.controller.reference, name) for name in names}
     plant = replace(loop.plant, duration=11.0)
     state = simulate(loop.controller, plant).controller.state
-    upper = np.triu(state.running[:-1, :-1]) / state.rows[0]
+    upper = np.triu(state.window.running[:-1, :-1]) / state.window.rows[0]
     Phi = upper + np.triu(upper, 1).T
     settings = settings_of_config(loop.controller)
-    a = settings.prior_weight
+    a = settings.window.prior_weight
     gain = np.linalg.slogdet(
         np.linalg.solve(settings.information, Phi) / a + np.eye(len(Phi))
     )[1]

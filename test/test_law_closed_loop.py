@@ -20,8 +20,8 @@ from scipy.integrate import solve_ivp
 
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.schema import build, change
+from blf_dsc_controller.law import state
 from blf_dsc_controller.law.factory import columns_of, controller_of, settings_of_config
-from blf_dsc_controller.law.state import CHOICES
 from blf_dsc_controller.numerics.algebra import cholesky_factor
 from blf_dsc_controller.reference.terms import sampled
 
@@ -29,7 +29,7 @@ from blf_dsc_controller.reference.terms import sampled
 def test_recommended_loop_keeps_half_the_bound_and_finds_the_parameters():
     loop = run_preset(60.0)
     assert np.abs(loop.xi1).max() < 0.5 * BOUND
-    assert np.abs(loop.torque).max() < recommended().torque_limit.min()
+    assert np.abs(loop.torque).max() < recommended().torque.limit.min()
     assert loop.parameter_error[0] == pytest.approx(0.5, abs=0.01)  # P^(0) = P / 2
     assert loop.parameter_error[loop.t >= 15.0].max() < 0.01
     assert loop.parameter_error[-1] < 5e-4
@@ -53,14 +53,14 @@ def power_of_the_initial_model(law, q, dq):
     return s.xi2 @ (H - s.H[:, :3]) @ (law.settings.initial_estimate[:3] - P)
 
 
-@pytest.mark.parametrize('compensation', CHOICES['compensation'])
+@pytest.mark.parametrize('compensation', ['reference', 'state'])
 @pytest.mark.parametrize('kappa', [0.0, 100.0], ids=['tracking alone', 'learning too'])
 def test_lyapunov_function_decreases_from_sample_to_sample(kappa, compensation):
     """(31), (32) without a disturbance; before the latch at 6.8 s both cases are the same.
 
     With compensation along the reference V may rise by no more than the power of the initial model.
     """
-    form = CHOICES['compensation'].index(compensation)
+    form = state.REFERENCE if compensation == 'reference' else state.STATE
     gains = {'kappa': kappa, 'gamma': np.full(2, 1.0), 'compensation': form}
     known = {
         'truth_known': 1,
@@ -130,10 +130,10 @@ def of_samples(dt, settings):
     """The same for the sampled loop with the package's own kernels."""
     law = controller(settings)
     arm = plant(sample_time=dt)
-    law.state.latched[0] = 1.0
-    law.state.Phi[:], law.state.b[:] = PHI, PHI @ P
-    law.state.factor[:] = PHI + RHO * np.eye(3)
-    cholesky_factor(law.state.factor)
+    law.state.latch.latched[0] = 1.0
+    law.state.latch.Phi[:], law.state.latch.b[:] = PHI, PHI @ P
+    law.state.latch.factor[:] = PHI + RHO * np.eye(3)
+    cholesky_factor(law.state.latch.factor)
     stride = round(END / dt / (TIMES.size - 1))
     found, estimate = [], law.state.estimate.copy()
     for sample in closed_loop(law, arm, END + dt):
@@ -293,22 +293,24 @@ def test_comparison_laws_are_the_linear_surface_with_their_gains(law, share):
     config = configured('recommended', 1.0, given | {'law': law}).controller
     settings = settings_of_config(config)
     assert settings.has_barrier == 0
-    assert CHOICES['compensation'][settings.compensation] == 'state'
-    found = (settings.weight, settings.mu_bar, settings.Wc)
+    assert settings.compensation == state.STATE
+    found = (settings.barrier.weight, settings.robust_gain, settings.adaptation.leakage)
     for ours, name in zip(
         found, ('position_gain', 'robust_gain', 'leakage'), strict=True
     ):
         np.testing.assert_array_equal(ours, share * np.array(gains[name]))
-    np.testing.assert_array_equal(settings.K, gains['surface_gain'])
+    np.testing.assert_array_equal(settings.surface.gain, gains['surface_gain'])
     for zero in (
-        settings.d2,
-        settings.gamma,
-        settings.kappa,
-        settings.change_detection,
+        settings.feedback.damping,
+        settings.disturbance.gain,
+        settings.adaptation.weight,
+        settings.excitation.change_detection,
     ):
         assert not np.any(zero)
     told = change(config, {'comparison.learning_weight': 7.0})
-    assert settings_of_config(told).kappa == 7.0  # not the 100 of learning.weight
+    assert (
+        settings_of_config(told).adaptation.weight == 7.0
+    )  # not the 100 of learning.weight
 
 
 def test_proposed_law_with_everything_known_and_frozen_equals_model_based():
@@ -367,7 +369,12 @@ def test_settings_follow_the_configuration():
     config = build(ControllerConfig, given)
     settings = settings_of_config(config)
     columns = len(columns_of(config))
-    assert settings.learning_start == 1.0
-    assert settings.window == 750
+    assert settings.excitation.learning_start == 1.0
+    assert settings.window.length == 750
     assert columns > 0
-    assert settings.Gamma.tolist() == [1.5, 2.0, 3.0, *[1.0] * columns]
+    assert settings.adaptation.adaptation_gain.tolist() == [
+        1.5,
+        2.0,
+        3.0,
+        *[1.0] * columns,
+    ]

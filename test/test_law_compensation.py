@@ -176,9 +176,9 @@ def test_learned_friction_stays_friction():
         'recommended', 1.0, {'learning.coulomb': True, 'learning.viscous': True}
     )
     settings = controller_of(planar.controller).settings
-    assert np.all(settings.least[-4:] == 0.0)
+    assert np.all(settings.adaptation.least[-4:] == 0.0)
     np.testing.assert_allclose(
-        settings.most[-4:], [0.05 * 20.0 / 1.5] * 2 + [0.05 * 20.0] * 2
+        settings.adaptation.most[-4:], [0.05 * 20.0 / 1.5] * 2 + [0.05 * 20.0] * 2
     )
 
 
@@ -204,7 +204,8 @@ def test_sine_at_a_frequency_of_the_reference_is_not_learned_as_friction():
     state = record.controller.state
     first = estimate_names(config.controller).index('coulomb wrist_1_joint')
     learned, window = (
-        theta[first : first + 3] / true for theta in (state.estimate, state.solution)
+        theta[first : first + 3] / true
+        for theta in (state.estimate, state.latch.solution)
     )
     np.testing.assert_allclose(learned, 1.0, atol=0.2)
     assert (np.abs(window - 1.0) > 0.6).all()
@@ -247,8 +248,8 @@ def test_friction_that_falls_costs_no_more_than_not_having_learned_it(joint, tim
 def reversing_law():
     """Return a law with columns of Coulomb friction whose window is full and latched."""
     law = controller_of(configured('recommended', 1.0, COULOMB).controller)
-    law.state.latched[0] = 1.0
-    law.state.rows[0] = law.settings.window
+    law.state.latch.latched[0] = 1.0
+    law.state.window.rows[0] = law.settings.window.length
     return law
 
 
@@ -260,7 +261,7 @@ def reverse(law, coulomb, reversals):
         sign = (-1.0) ** k
         for _ in range(300):
             state.friction.shape_lags[0, 2, 0] = sign
-            state.filter2[0, -1] = coulomb * sign
+            state.row.filter2[0, -1] = coulomb * sign
             measure_reversals(settings, state, 0.001)
 
 
@@ -270,8 +271,8 @@ def reverse(law, coulomb, reversals):
 def test_friction_is_measured_once_a_window_says_enough(rows, least, learns):
     """It is half full, or a full one has been latched."""
     law = reversing_law()
-    law.state.rows[0] = rows * law.settings.window
-    law.state.least_residual[0] = least
+    law.state.window.rows[0] = rows * law.settings.window.length
+    law.state.latch.least_residual[0] = least
     reverse(law, 0.8, 5)
     assert (
         bool(law.state.friction.reversal_estimate[0, 0] == pytest.approx(0.8, abs=0.05))
@@ -288,13 +289,13 @@ def test_friction_is_not_forgotten_at_rest():
     state.friction.column_lags[:] = 0.0
     state.friction.torque_lags[:] = 0.0
     state.friction.shape_lags[:] = 0.0
-    state.filter2[:] = 0.0
+    state.row.filter2[:] = 0.0
     before = friction.learned_friction(*part, 0)
     assert before[0] == pytest.approx(0.4, abs=0.02)
     for _ in range(3_000):
         measure_reversals(settings, state, 0.001)
     assert friction.learned_friction(*part, 0) == before
-    state.latched[0] = 0.0
+    state.latch.latched[0] = 0.0
     measure_reversals(settings, state, 0.001)
     assert state.friction.since_latch[0] == 0.0
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from closed_loop_case import arbitrary
+from closed_loop_case import recommended
 from paper_case import (
     BOUND,
     CHANGED,
@@ -19,10 +19,13 @@ from paper_case import (
     run_preset,
     several,
 )
+from symbols import replaced
 
 from blf_dsc_controller import load_loop, simulate
-from blf_dsc_controller.law import change, excitation, window
+from blf_dsc_controller.law import excitation, learning, window
 from blf_dsc_controller.law.factory import settings_of_config
+from blf_dsc_controller.law.innovation import Prior
+from blf_dsc_controller.law.state import settings_of
 
 FRICTION = {'disturbance.viscous': [0.1, 0.1]}
 DIFFERENCED = {
@@ -80,11 +83,13 @@ def test_residual_matches_least_squares():
     controller = run_preset(8.0, NO_DISTURBANCE | FRICTION).controller
     settings = controller.settings
     state = controller.state
-    assert settings.change_detection == 1
-    rows = state.ring.reshape(-1, settings.m + 1)
+    assert settings.excitation.change_detection == 1
+    rows = state.window.ring.reshape(-1, settings.m + 1)
     _, squares, _, _ = np.linalg.lstsq(rows[:, :-1], rows[:, -1], rcond=None)
     # The residual is a few rows old.
-    assert state.residual[0] == pytest.approx(squares[0] / settings.window, rel=0.05)
+    assert state.latch.residual[0] == pytest.approx(
+        squares[0] / settings.window.length, rel=0.05
+    )
 
 
 def test_estimate_does_not_drift_at_rest_with_noise():
@@ -118,8 +123,41 @@ def test_column_rejected_at_rest_is_readmitted_in_motion():
         'disturbance.amplitude': [0.0, 0.0],
     }
     moved = run_preset(45.0, constant, law=law)
-    assert np.all(moved.controller.state.active == 1.0)
+    assert np.all(moved.controller.state.latch.active == 1.0)
     assert moved.parameter_error[-1] < 0.01
+
+
+def sliding_of(controller):
+    """The sliding window of a controller."""
+    return window.Window(
+        controller.settings.window, controller.state.window, controller.signals.window
+    )
+
+
+def prior_of(settings):
+    """What is known of theta before any row."""
+    return Prior(settings.initial_estimate, settings.information)
+
+
+def evaluate(controller):
+    """Fill the equations of the window, and their factor."""
+    active = controller.state.latch.active
+    prior = prior_of(controller.settings)
+    window.find_excitation(sliding_of(controller), prior, active, 60)
+
+
+def accept(controller):
+    """Whether the window is accepted, with its solution."""
+    settings = controller.settings
+    return excitation.accept_window(
+        settings.excitation,
+        controller.state.latch,
+        controller.signals.latch,
+        sliding_of(controller),
+        prior_of(settings),
+        settings.model,
+        controller.signals.q,
+    )
 
 
 def test_rejected_column_stays_zero_and_is_checked_again():
@@ -128,35 +166,41 @@ def test_rejected_column_stays_zero_and_is_checked_again():
     Unless they are checked again then, no window would ever be latched.
     """
     controller = run_preset(8.0, law={'learning.frequencies': [1.0]}).controller
-    case = _, state, _ = controller.settings, controller.state, controller.signals
-    rejected = state.active == 0.0
+    state = controller.state
+    rejected = state.latch.active == 0.0
     assert rejected.any()
-    assert state.columns_checked[0] == 1.0
-    state.anchor[rejected] = 0.1
-    state.rows[0] *= 0.5  # the window seems not to be full
-    window.excitation(*case, 60)
-    assert excitation.accept_window(*case)
-    np.testing.assert_array_equal(state.solution == 0.0, rejected)
+    assert state.latch.columns_checked[0] == 1.0
+    state.latch.anchor[rejected] = 0.1
+    state.window.rows[0] *= 0.5  # the window seems not to be full
+    evaluate(controller)
+    assert accept(controller)
+    np.testing.assert_array_equal(state.latch.solution == 0.0, rejected)
 
-    state.running[:] = 0.0
-    state.cursor[0] = 0.0
-    excitation.readmit_columns(*case)
-    assert state.columns_checked[0] == 0.0
+    state.window.running[:] = 0.0
+    state.window.cursor[0] = 0.0
+    excitation.readmit_columns(
+        controller.settings.excitation,
+        state.latch,
+        sliding_of(controller),
+        prior_of(controller.settings),
+        controller.settings.p,
+    )
+    assert state.latch.columns_checked[0] == 0.0
 
 
 def test_window_after_a_change_may_be_partial_and_stays_near_the_estimate_before():
     off = []
     for law in ({}, {'learning.anchor_weight': 0.0}):
         learning = run_preset(CHANGED + 5.0, payload(0.75), law=law).controller
-        assert learning.state.latched[0] == 1.0
-        assert learning.state.rows[0] < learning.settings.window
-        off.append(np.ptp(learning.state.estimate - learning.state.anchor))
+        assert learning.state.latch.latched[0] == 1.0
+        assert learning.state.window.rows[0] < learning.settings.window.length
+        off.append(np.ptp(learning.state.estimate - learning.state.latch.anchor))
     assert off[0] < off[1]
 
 
 def test_change_detection_is_off_for_rows_of_lambda_which_contradict_each_other_on_any_arm():
     config = configured('recommended', 1.0, {'learning.prediction': 'lambda'})
-    assert settings_of_config(config.controller).change_detection == 0
+    assert settings_of_config(config.controller).excitation.change_detection == 0
 
 
 @pytest.mark.parametrize(
@@ -179,39 +223,41 @@ def test_first_window_that_spans_a_change_is_not_latched(preset, begin, duration
     state = record.controller.state
     samples = [record.sample(k) for k in range(0, len(record.samples), 50)]
     first = next(k for k, sample in enumerate(samples) if sample.latched[0] == 1.0)
-    rows = state.ring[: int(state.rows[0])].reshape(-1, settings.m + 1)
+    rows = state.window.ring[: int(state.window.rows[0])].reshape(-1, settings.m + 1)
     for sample in samples[first + 2 :]:
         error = rows[:, :-1] @ np.nan_to_num(sample.estimate) - rows[:, -1]
-        assert settings.n * np.mean(error**2) < 4.0 * settings.residual_floor
+        assert settings.n * np.mean(error**2) < 4.0 * settings.excitation.residual_floor
 
 
 def test_lasting_disturbance_above_the_floor_does_not_end_learning():
     """Its first window is split once, since its parts never agree, and then accepted."""
     learning = run_preset(30.0, {'disturbance.amplitude': [1.5, 1.5]}, preset='noisy')
     state = learning.controller.state
-    assert state.split_residual[0] > 0.0
-    assert state.latched[0] == 1.0
-    assert state.rows[0] == learning.controller.settings.window
+    assert state.latch.split_residual[0] > 0.0
+    assert state.latch.latched[0] == 1.0
+    assert state.window.rows[0] == learning.controller.settings.window.length
 
 
 @pytest.fixture(scope='module')
 def window_of_friction():
     """A full latched window of unmodelled friction, its controller, and the state of that."""
     controller = run_preset(8.0, FRICTION).controller
-    settings = controller.settings._replace(residual_floor=0.0)
-    case = settings, controller.state, controller.signals
-    window.excitation(*case, 60)
-    assert excitation.accept_window(*case)
-    return *case, controller, controller.save()
+    controller.retune(controller.law, replaced(controller.settings, residual_floor=0.0))
+    controller.settings = settings_of(
+        controller.settings_vector, controller.settings.model
+    )
+    evaluate(controller)
+    assert accept(controller)
+    return controller, controller.save()
 
 
 @pytest.fixture
 def learned(window_of_friction):
-    """Settings, state and signals of that controller, and the residual."""
-    *case, controller, saved = window_of_friction
+    """That controller, and the residual."""
+    controller, saved = window_of_friction
     controller.restore(saved)
-    window.excitation(*case, 60)
-    return *case, float(controller.state.residual[0])
+    evaluate(controller)
+    return controller, float(controller.state.latch.residual[0])
 
 
 @pytest.mark.parametrize(
@@ -222,15 +268,15 @@ def test_window_is_latched_up_to_four_times_the_least_residual(
     learned, ratio, accepted, pulled
 ):
     """An unusual residual pulls it to the anchor, by 3 (r^2 - 1.25 r^2_least) R."""
-    settings, state, signals, residual = learned
-    before = np.diag(signals.Phi).copy()
-    state.least_residual[0] = residual / ratio
-    assert excitation.accept_window(settings, state, signals) == accepted
-    expected = (
-        3.0 * (1.0 - 1.25 / ratio) * residual * np.diag(settings.information) * pulled
-    )
+    controller, residual = learned
+    signals = controller.signals
+    before = np.diag(signals.window.Phi).copy()
+    controller.state.latch.least_residual[0] = residual / ratio
+    assert accept(controller) == accepted
+    information = np.diag(controller.settings.information)
+    expected = 3.0 * (1.0 - 1.25 / ratio) * residual * information * pulled
     np.testing.assert_allclose(
-        np.diag(signals.Phi) - before, expected, rtol=1e-6, atol=1e-12
+        np.diag(signals.window.Phi) - before, expected, rtol=1e-6, atol=1e-12
     )
 
 
@@ -242,20 +288,21 @@ def test_change_is_detected_from_eight_times_the_residual_on(
     learned, ratio, rows, changes, taken_back
 ):
     """What a window taught before it was full is taken back, and the torque stays the same."""
-    settings, state, signals, residual = learned
+    controller, residual = learned
+    settings, state, signals = controller.settings, controller.state, controller.signals
     signals.row[:] = 0.0
     signals.row[0, -1] = np.sqrt(ratio * residual)
-    state.rows[0] = rows * settings.window
-    state.anchor[:] = 0.9 * state.estimate
+    state.window.rows[0] = rows * settings.window.length
+    state.latch.anchor[:] = 0.9 * state.estimate
     before = state.estimate.copy()
     torque = signals.H @ state.estimate + state.disturbance
-    change.detect_change(settings, state, signals, 0.1)
-    assert state.changes[0] == changes
+    learning.detect_change(settings, state, signals, 0.1)
+    assert state.change.changes[0] == changes
     np.testing.assert_array_equal(
         state.estimate, 0.9 * before if taken_back else before
     )
     # The next, partial windows are pulled to the estimate from before.
-    assert np.array_equal(state.anchor, state.estimate) == (changes == 1.0)
+    assert np.array_equal(state.latch.anchor, state.estimate) == (changes == 1.0)
     np.testing.assert_allclose(
         signals.H @ state.estimate + state.disturbance, torque, atol=1e-12
     )
@@ -268,15 +315,16 @@ def test_change_is_detected_from_eight_times_the_residual_on(
 def test_anchor_is_kept_at_the_first_latch_and_once_per_window(
     learned, latched, cursor, kept
 ):
-    settings, state, signals, _ = learned
-    state.anchor[:] = 0.0
-    state.latched[0], state.cursor[0] = latched, cursor
-    assert excitation.accept_window(settings, state, signals)
-    assert np.array_equal(state.anchor, state.solution) == kept
+    controller, _ = learned
+    state = controller.state
+    state.latch.anchor[:] = 0.0
+    state.latch.latched[0], state.window.cursor[0] = latched, cursor
+    assert accept(controller)
+    assert np.array_equal(state.latch.anchor, state.latch.solution) == kept
 
 
 def test_residual_floor_follows_the_residual_learned():
-    settings, state, _ = arbitrary(0, residual_floor=1.0)
+    settings = recommended(residual_floor=1.0).excitation
     for least, residual, expected in (
         (0.0, 0.2, 1.0),  # no full window yet: as configured
         (0.05, 0.1, 0.2),  # the best window left a quarter of this
@@ -284,10 +332,8 @@ def test_residual_floor_follows_the_residual_learned():
         (1e-9, 1e-9, 0.01),  # nor below a tenth of its torque
         (0.05, 3.0, 3.0),
     ):
-        state.least_residual[0] = least
-        assert excitation.explained(settings, state, residual) == pytest.approx(
-            expected
-        )
+        found = excitation.explained(settings, least, residual)
+        assert found == pytest.approx(expected)
 
 
 def test_half_the_rated_load_is_noticed_with_a_floor_that_is_three_times_too_large():

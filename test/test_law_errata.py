@@ -17,12 +17,14 @@ from closed_loop_case import (
 from paper_case import EXACT, P, configured, run
 from plain_law import R, dynamics, regressor
 from plants import QUIET, START
+from symbols import replaced
 
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.errors import StartError
-from blf_dsc_controller.law import adaptation, barrier
+from blf_dsc_controller.law import adaptation, learning
 from blf_dsc_controller.law.lag import filter_gain
-from blf_dsc_controller.law.state import CHOICES, FILTERED
+from blf_dsc_controller.law.prediction import FILTERED, LAMBDA
+from blf_dsc_controller.law.surface import virtual_control
 from blf_dsc_controller.numerics.algebra import cholesky_factor
 from blf_dsc_controller.reference.approach import check_takeover
 
@@ -83,7 +85,7 @@ def test_erratum_12_linear_virtual_control_crosses_zero_without_a_jump():
     time_constant = 0.002
     T = 1e-3
     errors = 1e-3 * np.sin(10.0 * np.arange(0.0, 2.0, T))
-    beta2 = [barrier.virtual_control(xi1, bound, K, mu, 0.0) for xi1 in errors]
+    beta2 = [virtual_control(xi1, bound, K, mu, 0.0) for xi1 in errors]
     gain = filter_gain(time_constant, T)
     alpha2 = beta2[0]
     gap = []
@@ -102,7 +104,7 @@ def damping_torque(d2, xi1, xi2):
     for gain in (np.zeros(2), d2):
         law = controller(recommended(d2=gain))
         q = np.array([1.9935, 1.3961]) + 0.3 + xi1
-        beta2 = [barrier.virtual_control(x, 0.002, 150.0, 20.0, 0.0) for x in xi1]
+        beta2 = [virtual_control(x, 0.002, 150.0, 20.0, 0.0) for x in xi1]
         law.update(0.0, 1e-3, np.concatenate([q, beta2 + xi2, np.zeros(2)]))
         np.testing.assert_allclose(law.signals.xi2, xi2, atol=1e-12)
         demands.append(law.signals.demand.copy())
@@ -130,9 +132,6 @@ def test_erratum_15_robust_term_dominates_disturbances_bounded_joint_by_joint():
     np.testing.assert_allclose(torque, 0.0, atol=1e-12)
 
 
-LAMBDA = CHOICES['prediction'].index('lambda')
-
-
 def rows_of_a_loop(prediction, duration=1.0):
     """Yield X P - u of each sample without disturbances, with the controller that formed it.
 
@@ -152,7 +151,7 @@ def test_erratum_6_known_part_of_the_dynamics_is_subtracted():
     for _, law, sample in rows_of_a_loop(LAMBDA):
         q, dq, torque = sample.measurement.reshape(3, 2)
         xi2 = law.signals.xi2
-        observed = law.state.observed_rate
+        observed = law.state.row.observed_rate
         M, C, _ = dynamics(P, R, q, dq)
         known = regressor(R, q, dq, dq - xi2, law.signals.dalpha2) @ P
         rest = M @ observed + C @ xi2 - torque
@@ -168,7 +167,7 @@ def test_erratum_7_only_filtered_rows_are_exact_with_an_error():
         kind: max(np.abs(residual).max() for residual, _, _ in rows_of_a_loop(kind))
         for kind in (FILTERED, LAMBDA)
     }
-    assert recommended().prediction == FILTERED
+    assert recommended().row.prediction == FILTERED
     assert largest[FILTERED] < 1e-4  # N m, of second order in the sample time
     assert largest[LAMBDA] > 100.0 * largest[FILTERED]
 
@@ -237,9 +236,11 @@ def test_erratum_16_disturbance_reduces_the_effective_velocity_feedback():
         energy.append(law.sample.lyapunov[1])
         arm.step(law.signals.torque + d1 * xi2)
     power = np.diff(energy)[0] / T
-    assert power == pytest.approx(-xi2 @ ((law.settings.Kp - d1) * xi2), rel=0.01)
+    assert power == pytest.approx(
+        -xi2 @ ((law.settings.feedback.gain - d1) * xi2), rel=0.01
+    )
     # the printed rate is twice as fast
-    assert power > -0.5 * xi2 @ (law.settings.Kp * xi2)
+    assert power > -0.5 * xi2 @ (law.settings.feedback.gain * xi2)
 
 
 def test_erratum_1_prediction_error_enters_with_a_minus():
@@ -248,14 +249,14 @@ def test_erratum_1_prediction_error_enters_with_a_minus():
     torques = []
     estimates = []
     for sign in (1.0, -1.0):
-        law = controller(settings._replace(kappa=sign * settings.kappa))
+        law = controller(replaced(settings, kappa=sign * settings.adaptation.weight))
         torques.append(
             [law.signals.torque.copy() for _ in closed_loop(law, plant(), 8.0)]
         )
         estimates.append(law.state.estimate[:3])
-    before = round(settings.learning_start / 1e-3)
+    before = round(settings.excitation.learning_start / 1e-3)
     np.testing.assert_array_equal(*(torque[:before] for torque in torques))
-    assert np.linalg.norm(estimates[1]) == pytest.approx(settings.radius)
+    assert np.linalg.norm(estimates[1]) == pytest.approx(settings.adaptation.radius)
     np.testing.assert_allclose(estimates[0], P, atol=0.01)
 
 
@@ -265,20 +266,21 @@ def test_erratum_2_both_integrals_carry_the_same_factor():
     law = controller(settings)
     list(closed_loop(law, plant(constant=(0.3, -0.2), amplitude=QUIET), 8.0))
     theta = np.array([*P, 0.3, -0.2])
-    tau_d = settings.window * 1e-3
+    tau_d = settings.window.length * 1e-3
 
     def rest_point(Phi):
-        law.state.Phi[:] = Phi
-        law.state.factor[:] = law.state.Phi + settings.rho * np.eye(settings.m)
-        cholesky_factor(law.state.factor)
+        latch = law.state.latch
+        latch.Phi[:] = Phi
+        latch.factor[:] = Phi + settings.window.regularization * np.eye(settings.m)
+        cholesky_factor(latch.factor)
         law.signals.xi2[:] = 0.0
         for _ in range(2000):
-            adaptation.adapt(settings, law.state, law.signals, 1e-3, False)  # noqa: FBT003
+            learning.adapt(settings, law.state, law.signals, 1e-3, False)  # noqa: FBT003
         return law.state.estimate.copy()
 
-    np.testing.assert_allclose(rest_point(law.state.Phi.copy()), theta, atol=1e-4)
+    np.testing.assert_allclose(rest_point(law.state.latch.Phi.copy()), theta, atol=1e-4)
     np.testing.assert_allclose(
-        rest_point(law.state.Phi * tau_d), theta / tau_d, atol=1e-4
+        rest_point(law.state.latch.Phi * tau_d), theta / tau_d, atol=1e-4
     )
 
 
@@ -290,12 +292,15 @@ def test_erratum_3_integrand_belongs_to_the_integration_variable():
     ranks = set()
     for sample in closed_loop(printed, plant(), 8.0):
         if sample.k > 0 and sample.k % 10 == 0:
-            ranks.add(np.linalg.matrix_rank(printed.signals.Phi))
-            assert abs(printed.state.lambda_min[0]) < 1e-9
+            ranks.add(np.linalg.matrix_rank(printed.signals.window.Phi))
+            assert abs(printed.state.latch.lambda_min[0]) < 1e-9
     list(closed_loop(corrected, plant(), 8.0))
     assert max(ranks) == 2
-    assert (printed.state.latched[0], corrected.state.latched[0]) == (0.0, 1.0)
-    assert corrected.state.lambda_min[0] > 0.1  # over a period of the reference
+    assert (printed.state.latch.latched[0], corrected.state.latch.latched[0]) == (
+        0.0,
+        1.0,
+    )
+    assert corrected.state.latch.lambda_min[0] > 0.1  # over a period of the reference
 
 
 def test_erratum_8_estimates_drift_if_the_disturbance_estimate_is_subtracted():

@@ -34,6 +34,7 @@ SETTINGS = Settings(
     window=500,
     row_interval=10,
     coulomb_velocity=0.02,
+    row_variance=0.01,
     unmodelled=np.array([0.5, 0.1]),
 )
 N, M = 2, 3  # joints, entries of theta

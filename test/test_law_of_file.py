@@ -12,9 +12,10 @@ import pytest
 
 import blf_dsc_controller as blf
 from blf_dsc_controller.cli.main import main
-from blf_dsc_controller.configuration.controller import ControllerConfig
+from blf_dsc_controller.configuration.controller import LAWS, ControllerConfig
 from blf_dsc_controller.configuration.law_file import digest, load_law
-from blf_dsc_controller.configuration.nodes import locate
+from blf_dsc_controller.configuration.law_traits import traits_of
+from blf_dsc_controller.configuration.nodes import load_loop, locate
 from blf_dsc_controller.configuration.plant import PlantConfig
 from blf_dsc_controller.configuration.schema import build, change, flatten
 from blf_dsc_controller.errors import BlfDscError, ConfigurationError
@@ -26,6 +27,7 @@ from blf_dsc_controller.studies.runs import run_chunk
 from blf_dsc_controller.supervision.retuning import apply_bumpless
 
 LAW = COMPUTED_TORQUE
+TRUTH = {'truth.parameters': [1.0, 0.32, 0.4]}
 GAINS = ('gains.position', 'gains.velocity', 'gains.integral')
 
 
@@ -62,6 +64,22 @@ def test_mistakes_in_the_configuration_are_named(given, problem):
     assert problem in str(raised.value)
 
 
+METHODS = """\
+class LAW(NamedTuple):
+    k: Annotated[float, positive(1.0, 'gain')]
+
+    def compute_demand(self, settings, state, signals, t, dt):
+        pass
+
+    def finish(self, settings, state, signals, dt, saturated):
+        pass
+"""
+IMPORTS = (
+    'from typing import Annotated, NamedTuple\n'
+    'from blf_dsc_controller.configuration.schema import positive\n'
+)
+
+
 @pytest.mark.parametrize(
     ('text', 'problem'),
     [
@@ -73,18 +91,47 @@ def test_mistakes_in_the_configuration_are_named(given, problem):
             "class LAW(NamedTuple):\n    k: Annotated[float, positive(1.0, 'gain')]",
             'LAW has no method compute_demand',
         ),
+        (METHODS, 'LAW does not say by has_barrier whether it keeps'),
     ],
 )
 def test_file_that_defines_no_law_is_refused(text, problem, tmp_path):
-    imports = (
-        'from typing import Annotated, NamedTuple\n'
-        'from blf_dsc_controller.configuration.schema import positive\n'
-    )
     path = tmp_path / 'law.py'
-    path.write_text(imports + text, encoding='utf-8')
+    path.write_text(IMPORTS + text, encoding='utf-8')
     with pytest.raises(BlfDscError, match=r'law\.py') as raised:
         load_law(str(path))
     assert problem in str(raised.value)
+
+
+@pytest.mark.parametrize(
+    ('has_barrier', 'learns', 'problem'),
+    [
+        (True, True, ''),
+        (False, True, 'barrier.tool_bound: the law .* keeps no bound: choose blf_dsc'),
+        (True, False, 'contact.enabled: .* needs a law that learns, such as blf_dsc'),
+    ],
+)
+def test_bound_at_the_tool_needs_a_barrier_and_contacts_a_law_that_learns(
+    has_barrier, learns, problem, tmp_path
+):
+    """Whatever its name: a law of a file says what it does."""
+    path = tmp_path / 'law.py'
+    says = f'    has_barrier = {has_barrier}\n    learns = {learns}\n'
+    path.write_text(IMPORTS + METHODS + says, encoding='utf-8')
+    given = {'barrier.bound': None, 'barrier.tool_bound': 0.003, 'law': str(path)}
+    given |= {'contact.enabled': True}
+    if not problem:
+        load_loop('panda_rigid', {'blf_dsc_controller': given})
+        return
+    with pytest.raises(ConfigurationError, match=problem):
+        load_loop('panda_rigid', {'blf_dsc_controller': given})
+
+
+def test_traits_of_the_packaged_laws_are_those_of_the_laws():
+    """`learns` is of the configuration: model_based is blf_dsc with gains of zero."""
+    for law in LAWS:
+        config = build(ControllerConfig, TRUTH | {'law': law})
+        assert traits_of(config).has_barrier == law_of(config).has_barrier
+        assert traits_of(config).learns == (law == 'blf_dsc')
 
 
 @pytest.mark.parametrize(

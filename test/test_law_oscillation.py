@@ -137,9 +137,9 @@ def reports(waves, amplitude):
     now = view_of(Oscillation)(np.zeros(size_of(Oscillation)(one)), one)
     oscillation.begin(now, np.zeros(1), np.zeros(1))
     limit = np.array([LIMIT])
-    assert not oscillation.is_due(now, limit, 1e-3)
+    assert not oscillation.count_down(now, limit, 1e-3)
     now.waves[0], now.amplitude[0] = waves, amplitude
-    return [k for k in range(600) if oscillation.is_due(now, limit, 1e-3)]
+    return [k for k in range(600) if oscillation.count_down(now, limit, 1e-3)]
 
 
 def test_an_oscillation_is_reported_at_once_and_again_while_it_lasts():

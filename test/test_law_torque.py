@@ -8,7 +8,6 @@ from math import exp, sin
 import numpy as np
 import pytest
 from closed_loop_case import (
-    arbitrary,
     closed_loop,
     controller,
     plant,
@@ -20,8 +19,9 @@ from plain_law import PlainLaw, R, regressor
 from plants import QUIET
 from scipy.signal import cont2discrete
 
-from blf_dsc_controller.law import barrier, prediction
-from blf_dsc_controller.law.state import CHOICES
+from blf_dsc_controller.law import barrier, prediction, surface, torque
+from blf_dsc_controller.law.adaptation import GRADIENT, NEWTON
+from blf_dsc_controller.law.prediction import LAMBDA
 from blf_dsc_controller.law.torque import LEVEL_CUT, RATE_CUT, find_applied, saturate
 
 BOUND = 0.002
@@ -98,7 +98,7 @@ def test_virtual_control_has_no_singularity():
     """Elsewhere inside the bound it is that of the plain law."""
 
     def ours(xi1, dqr=0.0):
-        return barrier.virtual_control(xi1, BOUND, 150.0, 20.0, dqr)
+        return surface.virtual_control(xi1, BOUND, 150.0, 20.0, dqr)
 
     assert ours(0.0, -0.3) == -0.3
     for xi1 in (1e-12, -1e-9, 1e-7):  # linear: the next term is 1e-17 at 1e-7 rad
@@ -106,7 +106,7 @@ def test_virtual_control_has_no_singularity():
     for xi1 in (BOUND, -1.1 * BOUND, 10.0 * BOUND):  # only mu is left
         assert ours(xi1) == -20.0 * xi1
     for x in (1e-6, -5e-5, np.nextafter(1e-4, 0.0), 1e-4, 0.1, -2.0):
-        assert barrier.sinc(x) == pytest.approx(sin(x) / x, abs=3e-16)
+        assert surface.sinc(x) == pytest.approx(sin(x) / x, abs=3e-16)
 
 
 @pytest.mark.parametrize('share', [-0.99, -0.6, 0.0, 0.01, 0.3, 0.9, 1.001, 4.0])
@@ -115,10 +115,10 @@ def test_slope_of_the_virtual_control_is_its_derivative(share):
     error, h = share * BOUND, 1e-8  # rad
 
     def beta2(xi1):
-        return barrier.virtual_control(xi1, BOUND, 150.0, 20.0, 0.3)
+        return surface.virtual_control(xi1, BOUND, 150.0, 20.0, 0.3)
 
     difference = (beta2(error + h) - beta2(error - h)) / (2.0 * h)
-    slope = barrier.virtual_slope(error, BOUND, 150.0, 20.0)
+    slope = surface.virtual_slope(error, BOUND, 150.0, 20.0)
     assert slope == pytest.approx(-difference, abs=1e-4)
 
 
@@ -150,7 +150,7 @@ def drawn(seed):
         'learning_start': random.uniform(0.4, 0.7),
         'sigma': -1.0,
         'rho': 10.0,
-        'update': int(newton),
+        'update': NEWTON if newton else GRADIENT,
         'kappa': random.choice([0.0, 2.0, 50.0 if newton else 1.0]),
         'compensation': int(random.integers(2)),
         'bumpless': int(random.integers(2)),
@@ -221,14 +221,33 @@ def test_law_matches_the_plain_one_in_closed_loop():
                 ('at the ball', bool(np.linalg.norm(sample.estimate[:3]) > 0.999 * 0.8))
             }
         np.testing.assert_allclose(ours, theirs, rtol=0.0, atol=1e-11, err_msg=seed)
-        assert law.state.latched[0] == 1.0
+        assert law.state.latch.latched[0] == 1.0
         assert plain.latched is not None
-        met |= {('window full', law.state.rows[0] == settings.window)}
+        met |= {('window full', law.state.window.rows[0] == settings.window.length)}
         met |= {('linear surface', settings.has_barrier == 0)}
     assert len(met) == 4 + 4 * 2
 
 
 DT = 2e-3  # s: with 500 N m/s, 1 N m from sample to sample
+
+
+def limits(level, rate):
+    """Limits of one joint, whose drive is described by no model."""
+    nothing = np.zeros(0)
+    return torque.Settings(
+        limit=np.full(1, level),
+        rate_limit=np.full(1, rate),
+        effort_is_whole=1,
+        drive=0,
+        drive_size=0,
+        drive_chain=nothing,
+        drive_inertias=nothing,
+    )
+
+
+def torque_state(held):
+    """State of the saturation of one joint, which holds a torque back."""
+    return torque.State(np.full(1, held), *np.zeros((3, 1)))
 
 
 def cut(
@@ -237,23 +256,28 @@ def cut(
     *,
     level=10.0,
     rate=500.0,
-    samples=7.0,
+    has_last=True,
     added=0.0,
     held=0.0,
-    takes_over=0.0,
 ):
     """Torque and what cut it; the cuts are counted, and any is reported."""
-    case = arbitrary(0, torque_limit=np.full(2, level), rate_limit=np.full(2, rate))
-    _, state, signals = case
-    state.samples[0], state.torque[:] = samples, last
-    state.level_cuts[:] = state.rate_cuts[:] = 0.0
-    state.held_back[:], state.takes_over[0] = held, takes_over
-    signals.demand[:], signals.added[:] = demand, added
-    saturated = saturate(*case, DT)
-    cuts = signals.cuts[0]
-    assert saturated == (cuts > 0.0)
-    assert cuts == LEVEL_CUT * state.level_cuts[0] + RATE_CUT * state.rate_cuts[0]
-    return signals.torque[0], cuts
+    state = torque_state(held)
+    one = np.ones(1)
+    command, cuts = np.zeros((2, 1))
+    saturated = saturate(
+        limits(level, rate),
+        state,
+        demand * one,
+        added * one,
+        last * one,
+        has_last,
+        DT,
+        command,
+        cuts,
+    )
+    assert saturated == (cuts[0] > 0.0)
+    assert cuts == LEVEL_CUT * state.level_cuts + RATE_CUT * state.rate_cuts
+    return command[0], cuts[0]
 
 
 @pytest.mark.parametrize(
@@ -266,9 +290,7 @@ def cut(
         # the level was lowered below the last torque
         (13.0, 14.0, 10.0, LEVEL_CUT + RATE_CUT, {}),
         (9.0, -9.0, 9.0, 0.0, {'rate': 0.0}),  # no limit
-        (9.0, 0.0, 9.0, 0.0, {'samples': 0.0}),  # the first torque ...
-        # ... unless it continues another one
-        (9.0, 3.0, 4.0, RATE_CUT, {'samples': 0.0, 'takes_over': 1.0}),
+        (9.0, 0.0, 9.0, 0.0, {'has_last': False}),  # the first torque
         # With 4 N m of the drive: limits hold for the command and for the whole torque.
         (12.0, 6.0, 6.0, LEVEL_CUT, {'added': 4.0, 'rate': 1000.0}),
         (-7.0, -10.0, -10.0, LEVEL_CUT, {'added': 4.0, 'rate': 1000.0}),
@@ -293,15 +315,14 @@ def test_torque_saturates_at_its_level_and_at_its_rate(
 
 def follow(demands, rate):
     """Torques that follow demands (k,) from the first one on."""
-    case = arbitrary(0, torque_limit=np.full(2, 1e3), rate_limit=np.full(2, rate))
-    _, state, signals = case
-    state.samples[0], state.held_back[:], signals.added[:] = 7.0, 0.0, 0.0
-    state.torque[:] = demands[0]
+    of, state = limits(1e3, rate), torque_state(0.0)
+    last = np.full(1, demands[0])
     for demand in demands:
-        signals.demand[:] = demand
-        saturate(*case, DT)
-        state.torque[:] = signals.torque
-        yield signals.torque[0]
+        command, cuts, nothing = np.zeros((3, 1))
+        now = np.full(1, demand)
+        saturate(of, state, now, nothing, last, True, DT, command, cuts)  # noqa: FBT003
+        last = command
+        yield command[0]
 
 
 @pytest.mark.parametrize('amplitude', [3.0, 30.0, 300.0])
@@ -336,42 +357,51 @@ def test_torque_that_is_not_a_number_does_not_turn_into_one_that_looks_valid(rat
 
 
 def test_applied_torque_has_the_mean_of_what_the_drive_adds_at_both_ends():
-    case = _, state, signals = arbitrary(3)
-    expected = state.torque + 0.5 * (state.added + signals.added)
-    find_applied(*case)
-    np.testing.assert_array_equal(signals.applied, expected)
-    np.testing.assert_array_equal(state.added, signals.added)
+    command, before, added, applied = np.random.default_rng(3).normal(size=(4, 2))
+    expected = command + 0.5 * (before + added)
+    find_applied(command, before, added, applied)
+    np.testing.assert_array_equal(applied, expected)
+    np.testing.assert_array_equal(before, added)
 
 
-LAMBDA = CHOICES['prediction'].index('lambda')
+class Filter:
+    """The filter (8) of two joints, which is all that is used of `prediction` here."""
+
+    def __init__(self, omega):
+        self.omega = omega
+        self.observed, self.observed_rate = np.zeros((2, 2))
+        self.samples = 0
+
+    def step(self, xi2, dalpha2, dt):
+        """Return ddq^ (2,) of the next sample."""
+        ddq = np.zeros(2)
+        begins = self.samples == 0
+        prediction.differentiate(self, self, xi2, dalpha2, begins, dt, ddq)
+        self.samples += 1
+        return ddq
 
 
 @pytest.mark.parametrize('omega', [1.0, 30.0, 1000.0])
 @pytest.mark.parametrize('dt', [1e-3, 7e-3])
 def test_differentiating_filter_matches_the_exact_discretisation_of_scipy(omega, dt):
     """(8) without its hat and with damping 1, for an input held over each sample."""
-    settings, state, signals = arbitrary(4, omega=omega)
+    filtered = Filter(omega)
     system = (
         np.array([[0.0, 1.0], [-(omega**2), -2.0 * omega]]),
         np.array([[0.0], [omega**2]]),
     )
     A, B, *_ = cont2discrete((*system, np.eye(2), np.zeros((2, 1))), dt)
-    state.samples[0] = 0.0
     rounding = {'rtol': 1e-9, 'atol': 1e-9 * omega}
+    expected = np.zeros((2, 2))
     for xi2, dalpha2 in np.random.default_rng(0).normal(size=(100, 2, 2)):
-        signals.xi2[:] = xi2
-        signals.dalpha2[:] = dalpha2
-        prediction.differentiate(settings, state, signals, dt)
-        if state.samples[0] == 0.0:
-            expected = np.array([signals.xi2, np.zeros(2)])
-        else:
-            expected = A @ expected + B * signals.xi2
-        state.samples[0] += 1.0
-        np.testing.assert_allclose(state.observed, expected[0], atol=1e-12)
-        np.testing.assert_allclose(state.observed_rate, expected[1], **rounding)
-        np.testing.assert_allclose(
-            signals.acceleration, signals.dalpha2 + expected[1], **rounding
-        )
+        is_first = filtered.samples == 0
+        ddq = filtered.step(xi2, dalpha2, dt)
+        expected = A @ expected + B * xi2
+        if is_first:
+            expected[:] = xi2, np.zeros(2)
+        np.testing.assert_allclose(filtered.observed, expected[0], atol=1e-12)
+        np.testing.assert_allclose(filtered.observed_rate, expected[1], **rounding)
+        np.testing.assert_allclose(ddq, dalpha2 + expected[1], **rounding)
 
 
 def test_row_of_lambda_follows_equation_24_in_a_closed_loop():
@@ -380,7 +410,7 @@ def test_row_of_lambda_follows_equation_24_in_a_closed_loop():
         q, dq, applied = sample.measurement.reshape(3, 2)
         dalpha2 = law.signals.dalpha2
         alpha2 = dq - law.signals.xi2
-        x = np.array([*(dalpha2 + law.state.observed_rate), *dq, 1.0])
+        x = np.array([*(dalpha2 + law.state.row.observed_rate), *dq, 1.0])
         y = np.array([*dalpha2, *alpha2, 1.0])
         rest = x @ y / (x @ x) * np.column_stack([np.eye(2), applied])
         expected = np.column_stack([regressor(R, q, dq, alpha2, dalpha2), rest])
@@ -413,15 +443,13 @@ def test_erratum_21_filter_starts_at_its_input_with_zero_slope():
     omega = 100.0
     dt = 1e-3
     z = 0.3
-    settings, state, signals = arbitrary(4, omega=omega)
-    signals.xi2[:] = z
+    filtered = Filter(omega)
     slopes = []
     for k in range(151):
-        state.samples[0] = k
         if k == 2:
-            state.observed[:] = 0.0  # as if z^(0) had been taken for zero
-        prediction.differentiate(settings, state, signals, dt)
-        slopes.append(abs(state.observed_rate).max())
+            filtered.observed[:] = 0.0  # as if z^(0) had been taken for zero
+        filtered.step(np.full(2, z), np.zeros(2), dt)
+        slopes.append(abs(filtered.observed_rate).max())
     assert slopes[:2] == [0.0, 0.0]
     assert max(slopes) == max(slopes[:32])
     np.testing.assert_allclose(max(slopes), omega * z / np.e, rtol=0.01)

@@ -12,18 +12,11 @@ from blf_dsc_controller.analysis.metrics_table import format_table
 from blf_dsc_controller.bags.reader import read_run
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.errors import ConfigurationError
-from blf_dsc_controller.law.innovation import (
-    CORRELATION,
-    normalized_square,
-    start,
-    update,
-)
 from blf_dsc_controller.law.telemetry import learned_arm, load_text, sample_columns
 from blf_dsc_controller.law.weighing import (
     DEVIATION,
     MASS,
 )
-from blf_dsc_controller.numerics.algebra import cholesky_factor
 from blf_dsc_controller.replay.verify import verify
 from blf_dsc_controller.simulation.loop import simulate, write_bag
 
@@ -158,46 +151,10 @@ def test_arm_without_friction_or_noise_changes_only_when_it_does():
     assert load[t == PUT_DOWN - 0.5][0][DEVIATION] > 0.003  # kg: no absurd interval
 
 
-def test_square_of_an_innovation_is_that_of_its_covariance():
-    """As by numpy; it is 1 on average, whatever is known of theta."""
-    random = np.random.default_rng(3)
-    n, m, noise, period = 3, 5, 0.5, 0.01
-    a = noise * CORRELATION / period
-    squares = []
-    for _ in range(2000):
-        before = random.normal(size=(random.integers(1, 40), m))
-        A = before.T @ before + a * np.eye(m)
-        theta = random.multivariate_normal(np.zeros(m), a * np.linalg.inv(A))
-        X = random.normal(size=(n, m))
-        u = X @ theta + np.sqrt(noise) * random.normal(size=n)
-        factor = A.copy()
-        cholesky_factor(factor)
-        S = noise * np.eye(n) + a * X @ np.linalg.inv(A) @ X.T
-        expected = noise * u @ np.linalg.solve(S, u) / n
-        given = X.copy(), u.copy(), factor
-        square = normalized_square(*given, period, np.zeros((n, n)))
-        assert square == pytest.approx(expected, rel=1e-9)
-        squares.append(square / noise)
-    assert np.mean(squares) == pytest.approx(1.0, abs=0.05)
-
-
-def test_rows_that_fit_ever_worse_are_noise_and_those_of_a_change_are_not():
-    for squares, expected in (
-        (np.full(400, 0.3), False),
-        (0.1 + 0.9 * np.linspace(0.0, 1.0, 400) ** 2, False),
-        (np.append(np.full(200, 0.1), np.full(20, 2.0)), True),
-    ):
-        statistics = np.zeros(4)
-        start(1.0, statistics)
-        found = [update(each, 1.0, 0.01, 500.0, statistics) for each in squares]
-        assert any(found) == expected
-    assert np.argmax(found) - 200 < 10
-
-
 def test_light_load_that_the_law_does_not_notice_is_weighed():
     record = record_of('panda_rigid', {'events.payload': [0.08]})
     load, t = weighed(record)
-    assert record.controller.state.changes[0] == 0.0
+    assert record.controller.state.change.changes[0] == 0.0
     is_as_told(load[t == PUT_DOWN - 0.5][0], 0.08, 0.05)
     # The weighing notices it by itself: what it knew before is discarded.
     unknown = t[(t > 6.0) & ~np.isfinite(load[:, 0])]

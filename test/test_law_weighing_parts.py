@@ -10,7 +10,7 @@ import pytest
 
 from blf_dsc_controller.compiled.layout import size_of, view_of
 from blf_dsc_controller.law import weighing
-from blf_dsc_controller.law.innovation import CORRELATION, NOISE, Prior
+from blf_dsc_controller.law.innovation import CORRELATION, Prior
 from blf_dsc_controller.law.sums import add_products
 from blf_dsc_controller.law.weighing import (
     BEFORE,
@@ -80,7 +80,7 @@ def test_solution_is_the_joint_least_squares_of_arm_and_load():
         held = np.zeros((len(X), 10)) if which == BEFORE else X @ ND
         stacked.append(np.column_stack((X, held, u)))
     state.complete[0] = 1.0
-    state.statistics[NOISE] = noise**2
+    state.innovation.noise[0] = noise**2
     weighing.solve(SETTINGS, state, work, PRIOR, period)
     a = 7.0 * noise**2
     H = np.zeros((M + 10, M + 10))

@@ -17,9 +17,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 from paper_case import NO_DISTURBANCE, configured, run
 from scipy.linalg import eigh
+from symbols import replaced
 
-from blf_dsc_controller.law import adaptation, excitation, prediction, ripple, window
+from blf_dsc_controller.law import adaptation, columns, excitation, ripple, window
 from blf_dsc_controller.law.factory import controller_of, estimate_names
+from blf_dsc_controller.law.innovation import Prior
 from blf_dsc_controller.numerics.algebra import cholesky_factor, cholesky_solve
 
 
@@ -138,67 +140,93 @@ def excited_case(seed):
     """Case with a window of eight excited rows that has not been evaluated yet."""
     case = arbitrary(seed, sigma=0.01, learning_start=2.0)
     settings, state, signals = case
-    state.running[:] = state.fresh[:] = state.ring[:] = 0.0
-    state.latched[0] = 0.0
-    state.rows[0] = settings.window
-    state.cursor[0] = 0.0
+    state.window.running[:] = state.window.fresh[:] = state.window.ring[:] = 0.0
+    state.latch.latched[0] = 0.0
+    state.window.rows[0] = settings.window.length
+    state.window.cursor[0] = 0.0
     for row in np.random.default_rng(seed).normal(
-        size=(settings.window, *signals.row.shape)
+        size=(settings.window.length, *signals.row.shape)
     ):
-        window.push_row(state, row)
+        window.push_row(state.window, row)
     return case
+
+
+def sliding_of(case):
+    """The sliding window of settings, state and signals."""
+    return window.Window(*(each.window for each in case))
+
+
+def prior_of(settings):
+    """What is known of theta before any row."""
+    return Prior(settings.initial_estimate, settings.information)
+
+
+def update_excitation(case, t):
+    """Evaluate the window at time t."""
+    settings, state, signals = case
+    excitation.update_excitation(
+        settings.excitation,
+        state.latch,
+        signals.latch,
+        sliding_of(case),
+        prior_of(settings),
+        settings.model,
+        signals.q,
+        t,
+        1e-3,
+    )
 
 
 def evaluate_until_settled(case, t):
     """Evaluate the window often: the first evaluation starts from an arbitrary direction."""
     for _ in range(50):
-        excitation.update_excitation(*case, t, 1e-3)
+        update_excitation(case, t)
 
 
 def test_warm_started_iteration_tracks_the_minimum_eigenvalue_in_a_loop():
     """Never below it (a Rayleigh quotient cannot be), and close once the window has filled."""
     law = controller(quick())
     evaluations = [
-        (law.state.lambda_min[0], np.linalg.eigvalsh(law.signals.Phi)[0])
+        (law.state.latch.lambda_min[0], np.linalg.eigvalsh(law.signals.window.Phi)[0])
         for sample in closed_loop(law, plant(), 4.0)
-        if sample.k > 0 and sample.k % law.settings.interval == 0
+        if sample.k > 0 and sample.k % law.settings.window.interval == 0
     ]
     found, exact = np.transpose(evaluations)
     assert np.all(found >= exact - 1e-13)
-    filled = slice(1000 // law.settings.interval, None)
+    filled = slice(1000 // law.settings.window.interval, None)
     np.testing.assert_allclose(found[filled], exact[filled], rtol=1e-3)
     assert np.median(found[filled] / exact[filled] - 1.0) < 1e-6
 
 
 def test_latch_keeps_the_whole_window_when_time_and_excitation_suffice():
     excited = settings, state, signals = excited_case(2)
-    before = state.Phi.copy(), state.b.copy()
-    weak = settings._replace(sigma=1e3), state, signals
-    start = settings.learning_start
-    whole = settings.window
+    before = state.latch.Phi.copy(), state.latch.b.copy()
+    weak = replaced(settings, sigma=1e3), state, signals
+    start = settings.excitation.learning_start
+    whole = settings.window.length
     for case, t, rows in (
         (excited, start - 1e-9, whole),
         (weak, start, whole),
         (excited, start, 5.0),  # which do not span T_a
     ):
-        state.rows[0] = rows
+        state.window.rows[0] = rows
         evaluate_until_settled(case, t)
-        assert state.latched[0] == 0.0
-        np.testing.assert_array_equal(state.Phi, before[0])
-        np.testing.assert_array_equal(state.b, before[1])
+        assert state.latch.latched[0] == 0.0
+        np.testing.assert_array_equal(state.latch.Phi, before[0])
+        np.testing.assert_array_equal(state.latch.b, before[1])
 
-    state.rows[0] = whole
+    state.window.rows[0] = whole
     evaluate_until_settled(excited, start)
-    Phi, b = means(state.ring)
-    np.testing.assert_allclose(state.Phi, Phi, atol=1e-14)
-    np.testing.assert_allclose(state.b, b, atol=1e-14)
+    Phi, b = means(state.window.ring)
+    np.testing.assert_allclose(state.latch.Phi, Phi, atol=1e-14)
+    np.testing.assert_allclose(state.latch.b, b, atol=1e-14)
 
-    kept = state.Phi.copy()  # after excitation ends
-    state.running[:] = 0.0
+    kept = state.latch.Phi.copy()  # after excitation ends
+    state.window.running[:] = 0.0
     evaluate_until_settled(excited, start + 1.0)
-    assert state.lambda_min[0] == 0.0
-    assert (state.latched[0], state.latch_time[0]) == (1.0, start)
-    np.testing.assert_array_equal(state.Phi, kept)
+    assert state.latch.lambda_min[0] == 0.0
+    assert (state.latch.latched[0], state.latch.latch_time[0]) == (1.0, start)
+    np.testing.assert_array_equal(state.latch.Phi, kept)
 
 
 @pytest.mark.parametrize('missing', [1e-6, -1e-6])
@@ -208,17 +236,19 @@ def test_column_rejection_is_independent_of_the_starting_direction(missing):
     p, m = settings.p, settings.m
     ones = np.ones(m)
     columns = np.eye(m)[p] - np.eye(m)[p + 1]
-    least = settings.sigma - missing
+    least = settings.excitation.excitation_threshold - missing
     others = np.random.default_rng(0).normal(size=(m, m - 2))
     vectors = np.linalg.qr(np.column_stack((columns + 0.02 * ones, ones, others)))[0]
     Phi = (vectors * [least, 1.2 * least, *[9.0] * (m - 2)]) @ vectors.T
-    state.rows[0] = settings.window
-    state.running[:] = 0.0
-    state.active[:] = 1.0
-    state.running[:m, :m] = settings.window * Phi
-    excitation.reject_columns(*case)
-    assert state.columns_checked[0] == 1.0
-    assert (state.active[p:].sum() < m - p) == (missing > 0.0)
+    state.window.rows[0] = settings.window.length
+    state.window.running[:] = 0.0
+    state.latch.active[:] = 1.0
+    state.window.running[:m, :m] = settings.window.length * Phi
+    excitation.reject_columns(
+        settings.excitation, state.latch, sliding_of(case), prior_of(settings), p
+    )
+    assert state.latch.columns_checked[0] == 1.0
+    assert (state.latch.active[p:].sum() < m - p) == (missing > 0.0)
 
 
 def test_columns_match_their_names():
@@ -235,9 +265,9 @@ def test_columns_match_their_names():
     q = np.array([0.2, -0.5])
     dq = np.array([0.3, -0.1])
     rest = np.full((2, settings.m), np.nan)
-    prediction.fill_columns(settings, t, dq, rest)
+    columns.fill_columns(settings.columns, t, dq, rest)
     for i in range(2):
-        ripple.fill_ripple(settings, i, q[i], rest)
+        ripple.fill_ripple(settings.columns, i, q[i], rest)
 
     value = {'bias': np.ones(2), 'viscous': dq, 'coulomb': np.tanh(dq / 0.2)}
     for w in (1.5, 4.0):
@@ -261,7 +291,7 @@ def learned(preset, duration, learning, arm):
     names = estimate_names(config.controller)[3:]
     return [
         dict(zip(names, values[3:], strict=True))
-        for values in (state.estimate, state.active)
+        for values in (state.estimate, state.latch.active)
     ]
 
 
@@ -303,17 +333,17 @@ def test_cosine_columns_are_rejected_on_the_reference_of_the_paper():
     config = configured('recommended', 7.99, learning)  # ends with an evaluation of Phi
     law = run(config).controller
     names = estimate_names(config.controller)[3:]
-    on = law.state.active > 0.0
+    on = law.state.latch.active > 0.0
     rejected = [name for name, kept in zip(names, on[3:], strict=True) if not kept]
     assert rejected
     assert all(name.startswith('cos 1 rad/s') for name in rejected)
     np.testing.assert_allclose(law.state.estimate[~on], 0.0, atol=1e-12)
-    Phi, b = means(law.state.ring[:, :, np.append(on, True)])
-    np.testing.assert_allclose(law.signals.Phi[np.ix_(on, on)], Phi, atol=1e-10)
-    np.testing.assert_allclose(law.signals.b[on], b, atol=1e-10)
-    np.testing.assert_array_equal(law.signals.Phi[np.ix_(~on, on)], 0.0)
-    np.testing.assert_array_equal(law.signals.b[~on], 0.0)
-    assert np.linalg.eigvalsh(Phi)[0] >= law.settings.sigma
+    Phi, b = means(law.state.window.ring[:, :, np.append(on, True)])
+    np.testing.assert_allclose(law.signals.window.Phi[np.ix_(on, on)], Phi, atol=1e-10)
+    np.testing.assert_allclose(law.signals.window.b[on], b, atol=1e-10)
+    np.testing.assert_array_equal(law.signals.window.Phi[np.ix_(~on, on)], 0.0)
+    np.testing.assert_array_equal(law.signals.window.b[~on], 0.0)
+    assert np.linalg.eigvalsh(Phi)[0] >= law.settings.excitation.excitation_threshold
 
 
 def test_columns_are_not_checked_before_the_parameters_alone_are_excited():
@@ -329,9 +359,9 @@ def test_much_weaker_window_does_not_replace_the_latched_one():
     """As when the reference stops; the paper, without change detection, takes any above sigma."""
     for detection, expected in ((1, [False, True]), (0, [True, True])):
         settings, state, _ = arbitrary(0, change_detection=detection)
-        state.best_lambda[0] = 1.0
+        state.latch.best_lambda[0] = 1.0
         weaker = [
-            bool(excitation.is_preferred(settings, state, value))
+            bool(excitation.is_preferred(settings.excitation, state.latch, value))
             for value in (0.9, 1.0)
         ]
         assert weaker == expected
@@ -374,21 +404,26 @@ def test_excitation_is_relative_to_the_information_to_which_the_prior_pulls(seed
         seed, information=R, rho=1e-5, prior_weight=0.0
     )
     rows = random.normal(size=(16, 6)) / np.append(scale, 1.0)
-    state.running[:] = rows.T @ rows
-    state.rows[0] = 8.0
-    state.active[:] = 1.0
-    Phi = state.running[:5, :5] / 8.0
-    b = state.running[:5, 5] / 8.0
-    found = window.excitation(settings, state, signals, 200)
+    state.window.running[:] = rows.T @ rows
+    state.window.rows[0] = 8.0
+    state.latch.active[:] = 1.0
+    Phi = state.window.running[:5, :5] / 8.0
+    b = state.window.running[:5, 5] / 8.0
+    case = settings, state, signals
+    active = state.latch.active
+    found = window.find_excitation(sliding_of(case), prior_of(settings), active, 200)
     values, vectors = eigh(Phi, R)
     assert found == pytest.approx(values[0], rel=1e-8)
-    direction = state.min_eigenvector / state.min_eigenvector[0] * vectors[0, 0]
+    direction = (
+        state.window.min_eigenvector / state.window.min_eigenvector[0] * vectors[0, 0]
+    )
     np.testing.assert_allclose(direction, vectors[:, 0], rtol=1e-5)
 
-    window.excitation(settings._replace(prior_weight=0.5), state, signals, 1)
-    np.testing.assert_allclose(signals.Phi, Phi + 0.5 * R, rtol=1e-12)
+    pulled = replaced(settings, prior_weight=0.5), state, signals
+    window.find_excitation(sliding_of(pulled), prior_of(settings), active, 1)
+    np.testing.assert_allclose(signals.window.Phi, Phi + 0.5 * R, rtol=1e-12)
     np.testing.assert_allclose(
-        signals.b, b + 0.5 * R @ settings.initial_estimate, rtol=1e-12
+        signals.window.b, b + 0.5 * R @ settings.initial_estimate, rtol=1e-12
     )
 
 
@@ -401,4 +436,6 @@ def test_only_estimates_with_a_positive_inertia_are_physical(P2, physical):
     law.signals.q[:] = 2.0, 1.4
     if P2 == 0.02:  # positive definite, but below a tenth of the initial estimate
         law.settings.initial_estimate[:3] = [1.0, 0.32, 0.0]
-    assert excitation.is_physical(law.settings, law.signals, theta) == physical
+    work, P0 = law.signals.latch, law.settings.initial_estimate
+    excitation.find_spare_inertia(law.settings.model, work, law.signals.q, theta, P0)
+    assert cholesky_factor(work.inertia) == physical

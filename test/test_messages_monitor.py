@@ -202,9 +202,9 @@ def test_rejected_column_is_named_with_the_columns_that_it_resembles():
     names = estimate_names(config)
     X = np.random.default_rng(0).normal(size=(1000, len(names)))
     X[:, -1] = 2.0 * X[:, 0] - X[:, 2]
-    law.state.running[:-1, :-1] = np.triu(X.T @ X)
-    law.state.active[:] = 1.0
-    law.state.active[-1] = 0.0
+    law.state.window.running[:-1, :-1] = np.triu(X.T @ X)
+    law.state.latch.active[:] = 1.0
+    law.state.latch.active[-1] = 0.0
     ((name, reason),) = rejected_columns(law, names).items()
     assert name == names[-1]
     assert f'it from {names[0]} + {names[2]} (100 % of it' in reason

@@ -392,7 +392,7 @@ def test_load_is_learned_and_a_wall_is_not(monkeypatch, reaction):
         if arm.data.ncon and not touched:
             touched = k
             before = state.estimate.copy()
-            changes = state.changes[0]
+            changes = state.change.changes[0]
             assert state.weighing.load[0] == pytest.approx(LOAD, abs=0.05)
     assert touched > 1e3 * THERE
     events = [e for e in guard.journal.pending if e.type is EventType.CONTACT]
@@ -403,8 +403,8 @@ def test_load_is_learned_and_a_wall_is_not(monkeypatch, reaction):
         assert is_touched(state.contact)  # it leans on the wall
         # what was learned in the milliseconds before it was found
         assert np.abs(state.estimate - before).max() < 1e-3 * np.abs(before).max()
-        assert state.changes[0] == changes
+        assert state.change.changes[0] == changes
         assert state.weighing.load[0] == pytest.approx(LOAD, abs=0.05)
     else:
-        assert state.changes[0] > changes
+        assert state.change.changes[0] > changes
         assert state.weighing.load[0] == 0.0  # unknown

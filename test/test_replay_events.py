@@ -68,7 +68,7 @@ class Recorder(Rig):
             law = guard.controller
             if law.samples == 1:
                 self.telemetry.restart()
-            known = law.sample, law.settings.torque_limit, guard.samples.ratio
+            known = law.sample, law.settings.torque.limit, guard.samples.ratio
             for topic, message in self.telemetry.sample(guard.last_stamp, *known, 0.0):
                 if topic is not BOUND:  # of which the node also sends the changed ones
                     self.record(topic, message)

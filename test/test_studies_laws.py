@@ -337,8 +337,10 @@ def test_integral_gain_of_slotine_li_is_the_gain_of_its_disturbance_estimate():
         'comparison.integral_gain': [1.0, 2.0, 3.0, 4.0, 5.0, 6.0],
     }
     settings = settings_of_config(change(config, chosen))
-    assert settings.gamma.tolist() == [1.0, 2.0, 3.0, 4.0, 5.0, 6.0]
-    assert not settings_of_config(change(config, {'law': 'slotine_li'})).gamma.any()
+    assert settings.disturbance.gain.tolist() == [1.0, 2.0, 3.0, 4.0, 5.0, 6.0]
+    assert not settings_of_config(
+        change(config, {'law': 'slotine_li'})
+    ).disturbance.gain.any()
 
 
 @pytest.mark.parametrize('name', laws.LAWS)

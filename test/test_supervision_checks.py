@@ -49,10 +49,10 @@ def verdict(law, error_ratio=1.0):
 
 def test_estimates_of_a_valid_sample_are_kept(law):
     law.checks.ratio[:] = (0.9, 0.0)
-    law.checks.kept[:] = 0.0
+    law.checks.estimates.kept[:] = 0.0
     assert verdict(law) == 0
     np.testing.assert_array_equal(
-        law.checks.kept, [*law.state.estimate, *law.state.disturbance]
+        law.checks.estimates.kept, [*law.state.estimate, *law.state.disturbance]
     )
     # The largest ratio so far is kept; a smaller one is replaced.
     assert law.checks.ratio[0] == 0.9
@@ -87,9 +87,9 @@ def test_suspect_samples_are_flagged_and_not_kept(
     law, part, name, i, value, error_ratio, flags
 ):
     getattr(getattr(law, part), name)[i] = value
-    law.checks.kept[:] = 3.0
+    law.checks.estimates.kept[:] = 3.0
     assert verdict(law, error_ratio) == flags
-    assert (law.checks.kept == 3.0).all() == bool(flags & SUSPECT)
+    assert (law.checks.estimates.kept == 3.0).all() == bool(flags & SUSPECT)
 
 
 @pytest.mark.parametrize(('every', 'stops'), [(4, True), (6, False)])
@@ -135,9 +135,9 @@ def test_only_an_effort_that_lacks_more_than_usual_explains_an_error(
     """Of drives whose efforts always lack 1.8 N m, 9 % of the torque limit."""
     given = {'robot.effort': 'whole', 'safety.error_ratio': 1.0}
     check = sample_check(build(ControllerConfig, given), law)
-    law.checks.usual[0] = 1.8
-    law.checks.lack[0] = lack
-    law.checks.used[4:] = law.sample.torque - [now, 0.0]
+    law.checks.effect.usual[0] = 1.8
+    law.checks.effect.lack[0] = lack
+    law.checks.repeats.used[4:] = law.sample.torque - [now, 0.0]
     law.sample.xi1[0] = 2.0 * law.sample.bound[0]
     law.flags = verdict(law)
     fault = check.check(DT)
@@ -152,11 +152,11 @@ def test_what_drives_add_is_no_lack_of_a_whole_effort():
     law = controller_of(config)
     law.update(0.0, DT, plant_of(loop.plant).measure())
     check = sample_check(config, law)
-    added, limit = law.signals.added, law.settings.torque_limit
+    added, limit = law.signals.added, law.settings.torque.limit
     i = int(np.argmax(np.abs(added) / limit))
     assert abs(added[i]) > 0.1 * limit[i]
-    law.checks.lack[i] = -np.sign(added[i]) * limit[i] / 3.0
-    law.checks.used[14:] = law.sample.torque + added
+    law.checks.effect.lack[i] = -np.sign(added[i]) * limit[i] / 3.0
+    law.checks.repeats.used[14:] = law.sample.torque + added
     law.sample.xi1[i] = 2.0 * law.sample.bound[i]
     law.flags = verdict(law)
     assert check.check(DT).reason is Reason.OUTSIDE_BOUND
@@ -172,7 +172,7 @@ def test_usual_lack_of_an_effort_is_its_average_over_a_second():
         effort = law.signals.torque.copy()
         arm.step(effort)
     expected = [1.5 * (1.0 - np.exp(-1.0)), 0.0]
-    np.testing.assert_allclose(law.checks.usual, expected, atol=0.02)
+    np.testing.assert_allclose(law.checks.effect.usual, expected, atol=0.02)
 
 
 def test_estimates_of_before_a_restart_are_consistent_with_it(law):
@@ -186,7 +186,7 @@ def test_estimates_of_before_a_restart_are_consistent_with_it(law):
     check.return_to_consistent()
     assert (check.estimate == 0.5).all()
     assert (check.disturbance == 0.25).all()
-    assert (law.checks.consistent_scale == 0.75).all()
+    assert (law.checks.estimates.consistent_scale == 0.75).all()
 
 
 def test_law_continues_with_the_kept_estimates_after_a_stop(law):

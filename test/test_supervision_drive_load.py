@@ -36,7 +36,7 @@ def weigh(law, mass, deviations=SURE):
 
 def added_mass(law, before):
     """Return by how much more mass [kg] of the last link the law leaves to the drives."""
-    change = law.settings.drive_inertias - before
+    change = law.settings.torque.drive_inertias - before
     return float(change.reshape(-1, 4)[-1, 0])
 
 
@@ -48,7 +48,7 @@ def test_load_is_told_in_steps_of_half_a_percent_of_a_torque_limit(law):
         before = law.state.added.copy()
         loads.take(law, load)
         told.append(load.mass)
-        step = np.abs(law.state.added - before) / law.settings.torque_limit
+        step = np.abs(law.state.added - before) / law.settings.torque.limit
         assert step.max() < 0.005 * (1.0 + 1e-9)
     assert len(told) > 10
     assert (np.diff(told) > 0.0).all()
@@ -82,7 +82,7 @@ def test_only_a_load_that_is_well_known_is_told(law, mass, deviations, phase, is
 def test_law_leaves_to_the_drives_what_they_were_told_since_it_began(law):
     """After a reset it knows of no load, so what they have been told holds that load."""
     loads = DriveLoads(CONFIG)
-    before = law.settings.drive_inertias.copy()
+    before = law.settings.torque.drive_inertias.copy()
     loads.take(law, DriveLoad(2.5, CENTRE))
     assert added_mass(law, before) == pytest.approx(2.0)
     loads.forget(law)

@@ -308,9 +308,13 @@ def test_default_gains_have_margins_at_every_rate(preset, sample_time):
     lag = config.robot.lag
     M0 = inertias(config, settings)
     later = lag + 1.5 * sample_time
-    assert growth(settings, sample_time, lag, M0 / 1.5, M0, settings.weight) < 1.0
-    assert growth(settings, sample_time, later, M0, M0, settings.weight) < 1.0
-    assert growth(settings, sample_time, lag, M0, M0, settings.slope_limit) < 1.0
+    assert (
+        growth(settings, sample_time, lag, M0 / 1.5, M0, settings.barrier.weight) < 1.0
+    )
+    assert growth(settings, sample_time, later, M0, M0, settings.barrier.weight) < 1.0
+    assert (
+        growth(settings, sample_time, lag, M0, M0, settings.barrier.slope_limit) < 1.0
+    )
 
 
 def test_lags_of_the_loop_have_their_time_constants():
@@ -319,7 +323,7 @@ def test_lags_of_the_loop_have_their_time_constants():
     settings = settings_of_config(config)
     n, T, lag = settings.n, 0.001, 0.02
     M0 = inertias(config, settings)[:1]
-    A = transition(settings, T, lag, M0, M0, settings.weight)[0][0]
+    A = transition(settings, T, lag, M0, M0, settings.barrier.weight)[0][0]
     q, before, speed, alpha2 = (slice(k * n, k * n + n) for k in (0, 4, 5, 6))
     share = 1.0 - np.exp(-1.0)
     x = np.zeros(8 * n)
@@ -331,8 +335,8 @@ def test_lags_of_the_loop_have_their_time_constants():
     for _ in range(2):
         x[q] = x[before] = 0.1
         x = A @ x
-    rate = settings.K / 2.0 + settings.mu
-    share = 1.0 - np.exp(-2.0 * T / settings.time_constant)
+    rate = settings.surface.gain / 2.0 + settings.surface.mu
+    share = 1.0 - np.exp(-2.0 * T / settings.surface.time_constant)
     np.testing.assert_allclose(x[alpha2], -0.1 * rate * share)
 
 
@@ -344,7 +348,10 @@ def test_the_loop_is_that_of_one_joint_in_every_posture(preset):
     lag = config.robot.lag
     M0 = inertias(config, settings)
     one = np.eye(settings.n)[np.newaxis]
-    for M, stiffness in ((1.0, settings.weight), (0.6, settings.slope_limit)):
+    for M, stiffness in (
+        (1.0, settings.barrier.weight),
+        (0.6, settings.barrier.slope_limit),
+    ):
         A, _ = transition(settings, 0.001, lag, M * M0, M0, stiffness)
         alone, _ = transition(settings, 0.001, lag, M * one, one, stiffness)
         found = np.abs(np.linalg.eigvals(A)).max(axis=-1)
@@ -412,7 +419,9 @@ def test_lag_of_the_surface_filter_costs_margin_at_low_rates(known_rate, expecte
         settings = settings_of_config(config)
         M0 = inertias(config, settings)
         size = partial(growth, settings, 0.004, config.robot.lag)
-        found.append([size(M0 / x, M0, settings.weight) < 1.0 for x in (1.4, 1.6)])
+        found.append(
+            [size(M0 / x, M0, settings.barrier.weight) < 1.0 for x in (1.4, 1.6)]
+        )
     assert found == expected
 
 

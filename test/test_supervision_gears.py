@@ -108,8 +108,8 @@ def test_adaptation_integrates_no_faster_than_the_disturbance_estimate():
     q = np.zeros(6)
     settings.model.regressor(q, q, q, q, H)
     variance = ((H @ L[: settings.p, : settings.p]) ** 2).sum(axis=1)
-    Gamma = settings.Gamma[0]
-    assert (Gamma * variance <= 1.01 * settings.gamma).all()
+    Gamma = settings.adaptation.adaptation_gain[0]
+    assert (Gamma * variance <= 1.01 * settings.disturbance.gain).all()
 
 
 @pytest.mark.parametrize(

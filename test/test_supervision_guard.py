@@ -264,7 +264,7 @@ def test_rate_limit_applies_from_the_torque_before_an_activation(again):
     steps = np.abs(np.diff(rig.commands[-13:], axis=0))
     assert (steps <= rate * 1e-3 * (1.0 + 1e-12)).all()
     np.testing.assert_allclose(steps[0], rate * 1e-3)
-    assert rig.guard.controller.state.rate_cuts.min() >= 1.0
+    assert rig.guard.controller.state.saturation.rate_cuts.min() >= 1.0
     # The law learns from what was commanded.
     np.testing.assert_array_equal(rig.guard.controller.state.torque, rig.commands[-1])
 
@@ -275,12 +275,12 @@ def test_estimates_are_kept_over_an_activation_and_forgotten_by_a_reset(again):
     rig.step(200)
     state = rig.guard.controller.state
     learned = state.estimate.copy()
-    window = state.rows[0]
+    window = state.window.rows[0]
     rig.guard.deactivate()
     getattr(rig.guard, again)()
     start = rig.guard.controller.settings.initial_estimate
     np.testing.assert_array_equal(state.estimate, learned if keep else start)
-    assert state.rows[0] == (window if keep else 0.0)
+    assert state.window.rows[0] == (window if keep else 0.0)
     assert not np.array_equal(learned, start)
     rig.step()
     assert (rig.guard.time > 0.1) == keep  # an empty window fills from t = 0 on
@@ -348,13 +348,13 @@ def test_learning_waits_for_a_full_window_after_a_reset_in_motion():
     rig = Rig({'learning.window': 0.5, 'learning.excitation_threshold': 1e-9})
     rig.step(1200)
     state = rig.guard.controller.state
-    assert state.latched[0] == 1.0
+    assert state.latch.latched[0] == 1.0
     rig.guard.reset()
     rig.step(999)  # the window and the settling time of the filters
     assert rig.guard.supervisor.running
-    assert state.latched[0] == 0.0
+    assert state.latch.latched[0] == 0.0
     rig.step(20)
-    assert state.latched[0] == 1.0
+    assert state.latch.latched[0] == 1.0
 
 
 NEW_GAINS = [
@@ -424,7 +424,7 @@ EXCITED = {
 def test_gains_that_a_running_law_cannot_adopt_are_rejected(start, given, message):
     rig = Rig(start)
     rig.step(400 if start else 200)
-    assert rig.guard.controller.state.latched[0] == bool(start)
+    assert rig.guard.controller.state.latch.latched[0] == bool(start)
     candidate = change(rig.guard.config, given)
     found = rig.guard.problems(candidate)
     assert [problem.startswith(message) for problem in found] == [True] * bool(message)
@@ -594,7 +594,7 @@ def test_arm_that_stands_still_under_noise_is_named_but_not_taken_for_braked():
         assert each.supervisor.phase is Phase.TRACKING, each.supervisor.text
     steps = np.diff(rig.commands, axis=0)[-1000:]
     assert np.abs(steps).max() > 2.0  # a tenth of the limit
-    measured = np.sqrt(rig.guard.controller.checks.chatter)
+    measured = np.sqrt(rig.guard.controller.checks.effect.chatter)
     assert measured == pytest.approx(np.sqrt((steps**2).mean(axis=0)), rel=0.2)
     assert 'joint1 changes by' in chatter_of(rig.guard.controller, JOINTS)
     assert chatter_of(quiet.guard.controller, JOINTS) == ''

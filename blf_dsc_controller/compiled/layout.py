@@ -30,7 +30,7 @@ from __future__ import annotations
 import functools
 import re
 from collections.abc import Callable, Iterator, Mapping
-from typing import Annotated, Any, TypeVar, get_type_hints
+from typing import Annotated, Any, TypeVar, get_args, get_type_hints
 
 import numpy as np
 
@@ -66,15 +66,25 @@ def pack(layout: Any) -> np.ndarray:
 def filled(layout: type[T], *groups: object, **computed: object) -> T:
     """Return a layout with the parameters named as its fields, and what is computed.
 
-    Parameters are the attributes of the `groups`; a switch becomes 0 or 1.
+    Parameters are the attributes of the `groups`; a switch becomes 0 or 1, a choice its
+    index among those of its `Literal`.
     """
     given = {
-        name: np.array(value) if isinstance(value, tuple) else value
+        name: _as_number(group, name, value)
         for group in groups
         for name, value in vars(group).items()
         if name in _hints(layout)
     }
     return layout(**given | computed)
+
+
+def _as_number(group: object, name: str, value: Any) -> Any:
+    """Return the value of a group's parameter as a vector holds it."""
+    if isinstance(value, str):
+        return get_args(_hints(type(group))[name]).index(value)
+    if isinstance(value, tuple):
+        return np.array(value)
+    return int(value) if isinstance(value, bool) else value
 
 
 def size_of(layout: type) -> Callable[..., int]:

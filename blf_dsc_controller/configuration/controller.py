@@ -25,6 +25,7 @@ from blf_dsc_controller.arms.known_gears import Gears
 from blf_dsc_controller.arms.model import arm_model
 from blf_dsc_controller.arms.urdf import Chain
 from blf_dsc_controller.configuration import law_file, plausibility, tool_bound
+from blf_dsc_controller.configuration.law_traits import traits_of
 from blf_dsc_controller.configuration.robot import (
     ArmConfig,
     Robot,
@@ -874,11 +875,11 @@ class ControllerConfig(ArmConfig):
         """Check that contacts are found, and by a law that can find them."""
         contact = self.contact
         prediction = self.learning.prediction
-        can_find = self.law == LAWS[0] and prediction == 'filtered'
+        can_find = traits_of(self).learns and prediction == 'filtered'
         if contact.enabled and not can_find:
             yield (
                 f'contact.enabled: got true with {self.law}, {prediction}, but the external torque '
-                f'needs law {LAWS[0]} and learning.prediction filtered'
+                f'needs a law that learns, such as {LAWS[0]}, and learning.prediction filtered'
             )
         if contact.reaction != 'none' and not contact.enabled:
             yield (

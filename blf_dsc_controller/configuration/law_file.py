@@ -137,8 +137,12 @@ def _problem(law: Any) -> str:
             f'LAW.{undeclared[0]} must be declared with its default and unit, such as '
             "Annotated[float, positive(20.0, 'decay of the error', '1/s')]"
         )
-    missing = [name for name in ('compute_demand', 'finish') if not hasattr(law, name)]
-    return f'LAW has no method {missing[0]}' if missing else ''
+    for name in ('compute_demand', 'finish'):
+        if not hasattr(law, name):
+            return f'LAW has no method {name}'
+    if not hasattr(law, 'has_barrier'):
+        return 'LAW does not say by has_barrier whether it keeps the error inside its bound'
+    return ''
 
 
 def memory_of(law: type) -> type | None:

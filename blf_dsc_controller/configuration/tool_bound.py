@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from blf_dsc_controller.arms.base_parameters import BaseParameters
 from blf_dsc_controller.arms.model import inertia_matrices, regressors_at
 from blf_dsc_controller.arms.urdf import Chain
+from blf_dsc_controller.configuration.law_traits import traits_of
 from blf_dsc_controller.configuration.robot import Robot
 from blf_dsc_controller.numerics.algebra import inverse, product
 from blf_dsc_controller.tool.errors import MOST_JOINTS, Tool
@@ -33,13 +34,13 @@ POSITION = 'barrier.tool_bound'
 ANGLE = 'barrier.tool_angle_bound'
 
 _POSTURES = 40
-# of Coulomb friction: half of it too much at breakaway, with either sign
-_REVERSAL = 0.75
+REVERSAL = 0.75
+"""Of Coulomb friction, an error of it: half of it too much at breakaway, with either sign."""
+
 _PAST = 0.1  # rad or m, by which an arm may be past its position limits
 _DOWN = 0.9995  # four digits of a joint bound round up by less
 _FINEST = 1e-6  # rad, a sixth of a step of a 20 bit encoder
 _ROUNDED = 1.0 + 1e-9
-_BARRIERLESS = ('backstepping', 'slotine_li')
 
 
 def is_given(values: Mapping[str, Any]) -> bool:
@@ -78,7 +79,7 @@ def joint_bounds(
     if lengths != {n} or len(P0) != base.model.p or n > MOST_JOINTS:
         return None
     unmodelled = tuple(
-        rms + _REVERSAL * coulomb for rms, coulomb in zip(floor, friction, strict=True)
+        rms + REVERSAL * coulomb for rms, coulomb in zip(floor, friction, strict=True)
     )
     region = _region(values, n) or (lower, upper)
     stiffness = _stiffness(values)
@@ -181,7 +182,7 @@ def problems(config: ControllerConfig) -> Iterator[str]:
     if len(config.joints) > MOST_JOINTS:
         yield f'{name}: got {len(config.joints)} joints, but at most {MOST_JOINTS} are allowed'
         return
-    if config.law in _BARRIERLESS:
+    if not traits_of(config).has_barrier:
         yield f'{name}: the law {config.law} keeps no bound: choose blf_dsc, or remove {name}'
     least = min(barrier.bound)
     if least < _FINEST:

@@ -57,7 +57,7 @@ class GuardedLoop:
             yield from self.telemetry.sample(
                 guard.last_stamp,
                 controller.sample,
-                controller.settings.torque_limit,
+                controller.settings.torque.limit,
                 guard.samples.ratio,
                 guard.compute_time,
                 subscribed=errors_wanted,

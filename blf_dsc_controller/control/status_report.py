@@ -100,8 +100,12 @@ class StatusReport:
             'samples with a torque at its limit': samples.saturated,
             'messages for other joints': guard.foreign,
             'watchdog on the steady clock': 'on' if guard.watchdog.on else off,
-            'samples cut by the torque limit': _by_joint(guard, state.level_cuts),
-            'samples cut by the torque rate limit': _by_joint(guard, state.rate_cuts),
+            'samples cut by the torque limit': _by_joint(
+                guard, state.saturation.level_cuts
+            ),
+            'samples cut by the torque rate limit': _by_joint(
+                guard, state.saturation.rate_cuts
+            ),
             'share of the rates of the feedback': f'{guard.calming.share:g}',
             'last oscillation': guard.calming.last.text
             if guard.calming.last
@@ -135,9 +139,12 @@ class StatusReport:
 
     def _learning(self, guard: Guard) -> Part:
         state = guard.controller.state
-        learning = 'latched' if state.latched[0] else 'not yet excited'
-        values = {'lambda_min': f'{state.lambda_min[0]:.3g}', 'learning': learning}
-        values['model changes'] = f'{state.changes[0]:.0f}'
+        learning = 'latched' if state.latch.latched[0] else 'not yet excited'
+        values = {
+            'lambda_min': f'{state.latch.lambda_min[0]:.3g}',
+            'learning': learning,
+        }
+        values['model changes'] = f'{state.change.changes[0]:.0f}'
         values |= {
             f'{REJECTED}{column}': reason for column, reason in self.rejected.items()
         }

@@ -139,7 +139,7 @@ class RosTopics:
             self._tell_status(guard)
 
     def _tell_status(self, guard: Guard) -> None:
-        columns = guard.controller.state.active.tobytes()
+        columns = guard.controller.state.latch.active.tobytes()
         if columns != self._columns:
             self._columns = columns
             rejected = rejected_columns(guard.controller, self._estimates)

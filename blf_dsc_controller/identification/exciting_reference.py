@@ -200,15 +200,15 @@ class ExcitationProblem:
         self._times = np.arange(samples) * (config.learning.window / samples)
         omega = self._base * np.arange(samples // 2 + 1)
         # two poles in series
-        self._filter = 1.0 / (1.0 + 1j * omega / settings.pole) ** 2
+        self._filter = 1.0 / (1.0 + 1j * omega / settings.row.filter_pole) ** 2
 
     def _usable_limits(self, config: ControllerConfig) -> np.ndarray:
         """Return limits (4, n) of position from the middle, velocity, acceleration, torque."""
         limits = config.limits
-        position = self._reach - self._settings.bound
+        position = self._reach - self._settings.barrier.bound
         velocity = _SPEED * np.array(limits.velocity)
         acceleration = _SPEED * np.array(limits.acceleration)
-        torque = _TORQUE * self._settings.torque_limit
+        torque = _TORQUE * self._settings.torque.limit
         return np.array((position, velocity, acceleration, torque))
 
     def _largest_amplitudes(self) -> np.ndarray:
@@ -255,7 +255,7 @@ class ExcitationProblem:
         over = (ratios - 1.0 + _MARGIN, _MARGIN - room)
         excess = sum((np.maximum(each, 0.0) ** 2).sum() for each in over) / len(q)
         mu = np.linalg.eigvalsh(self._relative_excitation(dq, rows))
-        gain = np.log1p(np.maximum(mu, 0.0) / self._settings.prior_weight).sum()
+        gain = np.log1p(np.maximum(mu, 0.0) / self._settings.window.prior_weight).sum()
         left = float(np.exp(-0.5 * gain / len(mu)))
         return Excitation(
             float(gain), left, ratios.max(axis=0), room.min(axis=0), float(excess)
@@ -270,8 +270,8 @@ class ExcitationProblem:
         return Recording(joints, _RECORDED, q, np.zeros_like(q), gap, 'planned')
 
     def _rows(self, q: np.ndarray, dq: np.ndarray, ddq: np.ndarray) -> np.ndarray:
-        """Return [H(q, dq, dq, ddq) | D] (k, n, m) of a motion, as `law.prediction` describes D."""
-        given = self._settings
+        """Return [H(q, dq, dq, ddq) | D] (k, n, m) of a motion, as `law.columns` describes D."""
+        given = self._settings.columns
         ones = np.ones_like(dq)
         t = self._times[:, np.newaxis]
         columns = [ones] * given.bias + [dq] * given.viscous
@@ -279,7 +279,7 @@ class ExcitationProblem:
         columns += [
             wave(w * t) * ones for w in given.frequencies for wave in (np.sin, np.cos)
         ]
-        H = regressors_at(given.model, q, dq, dq, ddq)
+        H = regressors_at(self._settings.model, q, dq, dq, ddq)
         D = [column[:, :, np.newaxis] * np.eye(self.n) for column in columns]
         return np.concatenate((H, *D), axis=2)
 
@@ -291,9 +291,11 @@ class ExcitationProblem:
         X = np.fft.irfft(
             spectrum * self._filter[: len(spectrum), None, None], len(coarse), axis=0
         )
-        X *= settings.row_weight[:, None]
-        if settings.motion_scale > 0.0:
-            X *= (np.abs(coarse) / np.hypot(coarse, settings.motion_scale))[..., None]
+        X *= settings.row.row_weight[:, None]
+        if settings.row.motion_scale > 0.0:
+            X *= (np.abs(coarse) / np.hypot(coarse, settings.row.motion_scale))[
+                ..., None
+            ]
         X = X.reshape(-1, settings.m) @ self._scale
         return np.asarray(X.T @ X / len(coarse))
 

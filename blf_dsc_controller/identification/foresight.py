@@ -38,13 +38,13 @@ from blf_dsc_controller.identification.windows import (
     rows_of,
     split,
 )
+from blf_dsc_controller.numerics.intervals import TWO_SIDED
 from blf_dsc_controller.run import Floats
 
 _RESIDUAL = 0.02  # of the torque
 # of the largest torque of all joints, least that a joint is taken to have
 _FAINT = 0.01
 _RANK = 1e-6  # of the largest singular value, least that counts
-_TWO_SIDED = 1.96  # standard deviations in half of a 95 % interval
 _TERMS = {term: JOINT_TERMS[term] for term in (ROTOR_INERTIA, VISCOUS, COULOMB)}
 
 
@@ -166,7 +166,7 @@ def foresight_lines(found: Foresight) -> Iterator[str]:
 
 
 def _half(deviation: float) -> str:
-    return f'+- {_TWO_SIDED * deviation:.2g}'
+    return f'+- {TWO_SIDED * deviation:.2g}'
 
 
 def _deviations(covariance: Floats) -> Floats:

@@ -17,11 +17,11 @@ from blf_dsc_controller.identification.values import (
     units_of,
 )
 from blf_dsc_controller.identification.windows import SMOOTHING, WINDOW
+from blf_dsc_controller.numerics.intervals import TWO_SIDED
 
 UNSEEN = 0.5
 """Share of the prior's variance; parameters that keep more are not shown."""
 
-_TWO_SIDED = 1.96  # standard deviations of a 95 % interval
 _LASTING = 3.0 * WINDOW  # s; noise is correlated over one window
 _POOR = 0.2  # of the torque, largest accepted error on the part held back
 _GOOD = 0.02  # likewise, error that is accepted whatever else is possible
@@ -36,7 +36,7 @@ _ALL_WRONG = 1.0  # of the torque, error of a joint that the model does not expl
 
 def interval(value: float, deviation: float, digits: str = '.4g') -> str:
     """Return a value with its 95 % interval."""
-    return f'{value:{digits}} +- {_TWO_SIDED * deviation:.2g}'
+    return f'{value:{digits}} +- {TWO_SIDED * deviation:.2g}'
 
 
 def header_of(found: Identified) -> str:
@@ -114,7 +114,7 @@ def base_table(found: Identified) -> Iterator[str]:
     posterior = np.einsum('ia,ab,ib->i', K, found.covariance, K)
     yield 'base parameters (all that torques can show), in kg, kg m, kg m^2:'
     for k, name in enumerate(parameters.combinations):
-        half = f'{_TWO_SIDED * posterior[k] ** 0.5:<8.2g}'
+        half = f'{TWO_SIDED * posterior[k] ** 0.5:<8.2g}'
         unseen = posterior[k] > UNSEEN * prior[k]
         mark = '  NOT SHOWN by this recording: from the URDF' if unseen else ''
         yield f'{before[k]:10.4g} -> {after[k]:10.4g} +- {half}  {name}{mark}'

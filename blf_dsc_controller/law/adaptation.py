@@ -4,18 +4,10 @@
     eps = b_e - Phi_e theta^                                theta^ = [P^; d^], the current estimate
     theta^' = Proj( -Gamma (H^T xi2 - kappa W eps) )        W = I, or (Phi_e + rho R)^-1 (newton)
 
-    d^3' = -gamma (xi2 + eta d^3) - H (theta^' + Gamma H^T xi2)
-
 As printed, (20) has + kappa eps, which drives P^ to the projection ball as soon as
 learning starts.  H^T xi2 and the leakage W_c P^ of the comparison law (35) act on P^
 alone.  With the Newton W every excited direction converges at the rate Gamma kappa;
 with the gradient update the rates vary with the eigenvalues of Phi_e.
-
-(30) lacks the last term.  While the estimate is wrong, d^3 compensates for it; the
-prediction error then corrects the estimate within milliseconds, but d^3 follows only
-within seconds, and their sum is wrong in between.  With the term (`bumpless`) learning
-does not change the torque H P^ + d^3, and d^3 is left to estimate the disturbance
-alone.
 
 The update stays in a ball, in the metric of the adaptation gain.  As printed, (4) acts
 where |P^| equals the radius, which a sampled update never hits: it steps over and never
@@ -25,19 +17,42 @@ nearest point of the ball in that metric, which is never farther from a true P i
 """
 
 from math import isfinite, sqrt
+from typing import Annotated, NamedTuple
 
 from blf_dsc_controller.compiled.jit import inner
 from blf_dsc_controller.compiled.layout import Array
 from blf_dsc_controller.compiled.views import part
-from blf_dsc_controller.law import friction
+from blf_dsc_controller.law import excitation
 from blf_dsc_controller.law.clipping import clip
-from blf_dsc_controller.law.state import NEWTON, Settings, Signals, State
 from blf_dsc_controller.numerics.algebra import cholesky_solve
+
+NEWTON, GRADIENT = range(2)
+"""Choices of `learning.update`, in the order of the configuration."""
 
 _ON_SPHERE = 1.0 - 1e-12  # of radius^2: `retract` ends within rounding of the sphere
 _ROUNDED = 1.0 + 1e-14
 # of Newton's method; 12 for Gamma spanning eight decades, ten radii outside
 _MOST_STEPS = 20
+
+
+class Settings(NamedTuple):
+    """The parameters `learning.*` of the update, and what is known of theta."""
+
+    update: int  # NEWTON or GRADIENT
+    weight: float  # kappa, of the prediction error
+    leakage: float  # W_c of P^ in (35)
+    radius: float  # omega_a of (4)
+    adaptation_gain: Annotated[Array, 'm']  # diagonal of Gamma
+    variance: Annotated[Array, 'm']  # diagonal of R^-1, of the prior
+    least: Annotated[Array, 'm']  # value that theta^ can have: friction is not negative
+    most: Annotated[Array, 'm']  # value that theta^ can have
+
+
+class Work(NamedTuple):
+    """Values of one sample."""
+
+    rate: Annotated[Array, 'm']  # W eps, then theta^' [1/s]
+    tracked: Annotated[Array, 'm']  # theta^ after the tracking error alone
 
 
 @inner
@@ -92,126 +107,51 @@ def retract(estimate: Array, gain: Array, radius: float) -> None:
 
 
 @inner
-def prediction_error(settings: Settings, state: State, signals: Signals) -> None:
-    """Write W eps (m,) to `signals.rate`; zero while no window is latched."""
-    for i in range(settings.m):
-        signals.rate[i] = 0.0
-    if state.latched[0] == 0.0:
+def fill_prediction_error(
+    settings: Settings, work: Work, latch: excitation.State, estimate: Array
+) -> None:
+    """Write W eps (m,) to `work.rate`; zero while no window is latched."""
+    m = estimate.size
+    for i in range(m):
+        work.rate[i] = 0.0
+    if latch.latched[0] == 0.0:
         return
-    for i in range(settings.m):
-        signals.rate[i] = state.b[i]
-        for j in range(settings.m):
-            signals.rate[i] -= state.Phi[i, j] * state.estimate[j]
+    for i in range(m):
+        work.rate[i] = latch.b[i]
+        for j in range(m):
+            work.rate[i] -= latch.Phi[i, j] * estimate[j]
     if settings.update == NEWTON:
-        cholesky_solve(state.factor, signals.rate)
-    friction.follow_reversals(
-        settings.friction,
-        state.friction,
-        signals.friction,
-        state.active,
-        state.estimate,
-        signals.rate,
-    )
-
-
-@inner
-def hand_over(settings: Settings, state: State, signals: Signals) -> None:
-    """Subtract H (theta^ - `work`) from d^3; `work` is theta^ after the tracking error alone."""
-    for j in range(settings.m):
-        for i in range(settings.n):
-            state.disturbance[i] -= signals.H[i, j] * (
-                state.estimate[j] - signals.work[j]
-            )
-
-
-@inner
-def hand_over_friction(settings: Settings, state: State, signals: Signals) -> None:
-    """Subtract from d^3 what this sample has changed in the compensation of Coulomb friction."""
-    friction.hand_over(
-        settings.friction,
-        state.friction,
-        signals.friction,
-        state.estimate,
-        state.disturbance,
-    )
-
-
-@inner
-def integrate(settings: Settings, state: State, signals: Signals, dt: float) -> None:
-    """Advance d^3 by `dt` [s]: (30), with gamma (M(q, P^(0)) + J~) / m on an arm of a URDF.
-
-    Overwrites Yp and Yr of `signals`.
-    """
-    for i in range(settings.n):
-        error = signals.xi2[i] + settings.eta * state.disturbance[i]
-        signals.unit[i] = dt * settings.gamma[i] * error
-    if settings.follows_inertia == 1:
-        scale_by_inertia(settings, state, signals)
-    for i in range(settings.n):
-        state.disturbance[i] -= signals.unit[i]
-        friction.follow_observer(state.friction, signals.friction, i, -signals.unit[i])
-
-
-@inner
-def scale_by_inertia(settings: Settings, state: State, signals: Signals) -> None:
-    """Replace x in `signals.unit` by (M(q, P^(0)) + J~) x / m; overwrites Yp and Yr."""
-    x = signals.unit
-    for i in range(settings.n):
-        x[i] /= settings.joint_inertia[i]
-    settings.model.momentum_regressor(signals.q, x, signals.Yp, signals.Yr)
-    for i in range(settings.n):
-        x[i] *= state.rotors.error[i]
-        for j in range(settings.p):
-            x[i] += signals.Yp[i, j] * settings.initial_estimate[j]
+        cholesky_solve(latch.factor, work.rate)
 
 
 @inner
 def adapt(
-    settings: Settings, state: State, signals: Signals, dt: float, saturated: bool
+    settings: Settings,
+    work: Work,
+    estimate: Array,
+    H: Array,
+    xi2: Array,
+    p: int,
+    tracks: bool,
+    dt: float,
 ) -> None:
-    """Advance theta^ and d^3 by `dt` [s]: (20), (30).
+    """Advance theta^, the `estimate` (m,), by `dt` [s]: (20), with W eps in `work.rate`.
 
-    While a torque is saturated, the tracking error reflects the limit, not the
-    parameters, so only the prediction error, which uses the applied torque, adapts the
-    estimate.  While a full window is not excited, as at standstill, H^T xi2 is
-    correlated noise and ignored (`change_detection`).  While a contact lasts, and
-    something reacts to it, only d^3 follows.
+    H is (n, m); the tracking error acts on the p parameters, where it `tracks`.
     """
-    if state.frozen[0] > 0.0:
-        if not saturated:
-            integrate(settings, state, signals, dt)
-        hand_over_friction(settings, state, signals)
-        return
-    prediction_error(settings, state, signals)
-    unexcited = (
-        settings.change_detection == 1
-        and state.rows[0] == settings.window
-        and state.lambda_min[0] < settings.sigma
-    )
-    for j in range(settings.m):
+    gain = settings.adaptation_gain
+    for j in range(estimate.size):
         tracking = 0.0
-        if j < settings.p and not saturated and not unexcited:
-            for i in range(settings.n):
-                tracking += signals.H[i, j] * signals.xi2[i]
-            tracking = settings.variance[j] * tracking + settings.Wc * state.estimate[j]
-        signals.work[j] = state.estimate[j] - dt * settings.Gamma[j] * tracking
-        signals.rate[j] = settings.Gamma[j] * (
-            settings.kappa * signals.rate[j] - tracking
-        )
-    p = settings.p
-    parameters = part(state.estimate, 0, (p,))
-    gain = part(settings.Gamma, 0, (p,))
-    project(parameters, part(signals.rate, 0, (p,)), gain, settings.radius)
-    for j in range(settings.m):
-        estimate = state.estimate[j] + dt * signals.rate[j]
-        state.estimate[j] = clip(estimate, settings.least[j], settings.most[j])
-    retract(parameters, gain, settings.radius)
-    if not saturated:
-        integrate(settings, state, signals, dt)
-    if settings.bumpless == 1 and state.latched[0] == 1.0:
-        hand_over(settings, state, signals)
-    if state.latched[0] == 1.0:
-        friction.adapt_breakaway(
-            settings.friction, state.friction, signals.friction, dt
-        )
-    hand_over_friction(settings, state, signals)
+        if j < p and tracks:
+            for i in range(xi2.size):
+                tracking += H[i, j] * xi2[i]
+            tracking = settings.variance[j] * tracking + settings.leakage * estimate[j]
+        work.tracked[j] = estimate[j] - dt * gain[j] * tracking
+        work.rate[j] = gain[j] * (settings.weight * work.rate[j] - tracking)
+    parameters = part(estimate, 0, (p,))
+    of_parameters = part(gain, 0, (p,))
+    project(parameters, part(work.rate, 0, (p,)), of_parameters, settings.radius)
+    for j in range(estimate.size):
+        moved = estimate[j] + dt * work.rate[j]
+        estimate[j] = clip(moved, settings.least[j], settings.most[j])
+    retract(parameters, of_parameters, settings.radius)

@@ -14,7 +14,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 from blf_dsc_controller.compiled.jit import inner
-from blf_dsc_controller.law import adaptation, learning
+from blf_dsc_controller.law import learning
 from blf_dsc_controller.law.clipping import clip
 from blf_dsc_controller.law.compensation import (
     compensated,
@@ -44,10 +44,12 @@ class Backstepping(NamedTuple):
             measure_rotors(settings, state, signals, dt)
             correct_feedback(settings, state, signals)
         for i in range(settings.n):
-            torque = settings.Kp[i] * signals.xi2[i]
-            torque += settings.mu_bar[i] * clip(signals.xi2[i] / self.layer, -1.0, 1.0)
+            torque = settings.feedback.gain[i] * signals.xi2[i]
+            torque += settings.robust_gain[i] * clip(
+                signals.xi2[i] / self.layer, -1.0, 1.0
+            )
             torque = -torque
-            if settings.follows_inertia == 0:
+            if settings.feedback.follows_inertia == 0:
                 torque += signals.restoring[i]
             signals.demand[i] = compensated(settings, state, signals, i, torque)
 
@@ -60,16 +62,16 @@ class Backstepping(NamedTuple):
         saturated: bool,
     ) -> None:
         """Adapt P^, and the integral of z2 if there is one."""
-        adaptation.adapt(settings, state, signals, dt, saturated)
+        learning.adapt(settings, state, signals, dt, saturated)
 
 
 @inner
 def compute_surface(settings: Settings, state: State, signals: Signals) -> None:
     """Compute alpha2 = dqr - lambda_s z1, its derivative, which needs ddqr, and z2."""
     for i in range(settings.n):
-        state.alpha2[i] = signals.dqr[i] - settings.K[i] * signals.xi1[i]
+        state.alpha2[i] = signals.dqr[i] - settings.surface.gain[i] * signals.xi1[i]
         signals.beta2[i] = state.alpha2[i]
         rate = signals.dq[i] - signals.dqr[i]
-        signals.dalpha2[i] = signals.ddqr[i] - settings.K[i] * rate
+        signals.dalpha2[i] = signals.ddqr[i] - settings.surface.gain[i] * rate
         signals.xi2[i] = signals.dq[i] - state.alpha2[i]
-        signals.restoring[i] = -settings.weight[i] * signals.xi1[i]
+        signals.restoring[i] = -settings.barrier.weight[i] * signals.xi1[i]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The barrier (3), constant or a funnel, and the virtual control (15), (18).
+"""The barrier (3), whose bound is constant or a funnel.
 
 The weighted tan-type barrier is continued linearly past the stiffness a sampled loop
 can hold:
@@ -25,12 +25,32 @@ bound narrows (doc/stability.md, 'A bound that narrows').
 """
 
 from math import pi
+from typing import Annotated, NamedTuple
 
 from blf_dsc_controller.compiled.jit import inner
-from blf_dsc_controller.law.state import Settings, Signals
+from blf_dsc_controller.compiled.layout import Array
 from blf_dsc_controller.numerics.elementary import cos, exp, sin
 
 _BISECTIONS = 60
+
+
+class Settings(NamedTuple):
+    """The parameters `barrier.*`, and what follows from them."""
+
+    bound: Annotated[Array, 'n']  # k_c, rad
+    initial_bound: Annotated[Array, 'n']  # k_0, rad; k_c: constant bound
+    funnel_rate: float  # a, rate at which the bound narrows, 1/s
+    weight: Annotated[Array, 'n']  # w, N m/rad; of z1 in (35)
+    slope_limit: Annotated[Array, 'n']  # S_lim, N m/rad
+    # error at which the slope reaches S_lim if the bound is k_c, rad
+    knee: Annotated[Array, 'n']
+
+
+class Work(NamedTuple):
+    """Values of one sample."""
+
+    knee: Annotated[Array, 'n']  # knee of the barrier for k(t), rad
+    narrowing: Annotated[Array, 'n']  # k'/k, 1/s
 
 
 @inner
@@ -90,53 +110,29 @@ def potential(
 
 
 @inner
-def update_bound(settings: Settings, signals: Signals, t: float) -> None:
-    """Compute k(t), the knee of its barrier and k'/k [1/s] at time t [s]."""
-    for i in range(settings.n):
+def update_bound(settings: Settings, work: Work, t: float, bound: Array) -> None:
+    """Write k(t) [rad] at time t [s] to `bound` (n,); find the knee of its barrier and k'/k."""
+    for i in range(settings.bound.size):
         final = settings.bound[i]
         above = (settings.initial_bound[i] - final) * exp(-settings.funnel_rate * t)
-        signals.bound[i] = final + above
-        signals.knee[i] = settings.knee[i] * (signals.bound[i] / final)
-        signals.narrowing[i] = -settings.funnel_rate * above / signals.bound[i]
+        bound[i] = final + above
+        work.knee[i] = settings.knee[i] * (bound[i] / final)
+        work.narrowing[i] = -settings.funnel_rate * above / bound[i]
 
 
 @inner
-def sinc(x: float) -> float:
-    """Return sin(x) / x, by its series where the quotient would lose precision."""
-    if abs(x) < 1e-4:
-        return 1.0 - x * x / 6.0
-    return sin(x) / x
-
-
-@inner
-def virtual_control(
-    xi1: float,
-    bound: float,
-    barrier_gain: float,
-    linear_gain: float,
-    reference_velocity: float,
+def joint_gradient(
+    settings: Settings, work: Work, xi: float, bound: float, i: int
 ) -> float:
-    """Return beta2 = -(K/2) xi1 sinc(pi xi1^2 / k_c^2) - mu xi1 + dqr   [rad/s], (15) and (18).
-
-    (15) is printed as a quotient that is 0/0 at xi1 = 0; sin s cos s = sin(2 s)/2 turns
-    it into a sinc.  Its barrier part falls to zero at the bound, where only mu acts;
-    beyond, it would change sign and is set to zero.
-    """
-    ratio = xi1 / bound
-    barrier_part = 0.0
-    if abs(ratio) < 1.0:
-        barrier_part = 0.5 * barrier_gain * xi1 * sinc(pi * ratio * ratio)
-    return reference_velocity - barrier_part - linear_gain * xi1
+    """Return dV/dxi [N m] of joint i with an error and its bound k(t) [rad]."""
+    weight, limit = settings.weight[i], settings.slope_limit[i]
+    return gradient(xi, bound, weight, limit, work.knee[i])
 
 
 @inner
-def virtual_slope(
-    xi1: float, bound: float, barrier_gain: float, linear_gain: float
+def joint_potential(
+    settings: Settings, work: Work, xi: float, bound: float, i: int
 ) -> float:
-    """Return -d beta2 / d xi1 = (K/2) (2 cos x - sinc x) + mu,  x = pi xi1^2 / k_c^2   [1/s]."""
-    ratio = xi1 / bound
-    barrier_part = 0.0
-    if abs(ratio) < 1.0:
-        x = pi * ratio * ratio
-        barrier_part = 0.5 * barrier_gain * (2.0 * cos(x) - sinc(x))
-    return barrier_part + linear_gain
+    """Return V [J] of joint i with an error and its bound k(t) [rad]."""
+    weight, limit = settings.weight[i], settings.slope_limit[i]
+    return potential(xi, bound, weight, limit, work.knee[i])

@@ -18,7 +18,7 @@ Where it departs from the paper, and why:
 - A bound that narrows adds xi1 k'/k to the virtual control: `barrier`.
 - The feedback of an arm whose rotor inertias are guessed follows those that it measures:
   `apparent_inertia`.
-- f, zero in the paper, is what is known of beta2' if `known_rate` is 1: `follow_known_rate`.
+- f, zero in the paper, is what is known of beta2' if `surface.known_rate` is 1: `surface`.
 - beta2 is held for a sample, in which alpha2' decays from (beta2 - alpha2) / lambda by the factor
   exp(-dt / lambda).  The torque is held too, so it uses the mean of alpha2': with lambda = 2 dt the
   initial value would be 27 % too large.  With f, it is beta2 - f t that is held.
@@ -29,9 +29,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 from blf_dsc_controller.compiled.jit import inner
-from blf_dsc_controller.law import adaptation, barrier, learning
-from blf_dsc_controller.law.barrier import virtual_control
-from blf_dsc_controller.law.clipping import clip
+from blf_dsc_controller.law import barrier, feedback, learning
 from blf_dsc_controller.law.compensation import (
     compensated,
     correct_feedback,
@@ -39,6 +37,7 @@ from blf_dsc_controller.law.compensation import (
 )
 from blf_dsc_controller.law.lag import filter_gain
 from blf_dsc_controller.law.state import Settings, Signals, State
+from blf_dsc_controller.law.surface import known_rate, virtual_control
 
 
 class BlfDsc(NamedTuple):
@@ -61,7 +60,7 @@ class BlfDsc(NamedTuple):
             measure_rotors(settings, state, signals, dt)
             correct_feedback(settings, state, signals)
         for i in range(settings.n):
-            torque = feedback(settings, signals, self.layer, i)
+            torque = joint_feedback(settings, signals, self.layer, i)
             signals.demand[i] = compensated(settings, state, signals, i, torque)
 
     def finish(
@@ -73,8 +72,8 @@ class BlfDsc(NamedTuple):
         saturated: bool,
     ) -> None:
         """Adapt theta^ and d^3; advance alpha2 of the filter (13), exactly for the held beta2."""
-        adaptation.adapt(settings, state, signals, dt, saturated)
-        gain = filter_gain(settings.time_constant, dt)
+        learning.adapt(settings, state, signals, dt, saturated)
+        gain = filter_gain(settings.surface.time_constant, dt)
         for i in range(settings.n):
             state.alpha2[i] += gain * (signals.beta2[i] - state.alpha2[i])
             state.alpha2[i] += dt * signals.beta2_rate[i]
@@ -85,58 +84,35 @@ def compute_surface(
     settings: Settings, state: State, signals: Signals, dt: float
 ) -> None:
     """Compute beta2 of (15) and (18), alpha2' of the filter (13), xi2, and -dV/dxi1."""
-    gain = filter_gain(settings.time_constant, dt)
+    of = settings.surface
+    gain = filter_gain(of.time_constant, dt)
     for i in range(settings.n):
+        xi1, bound = signals.xi1[i], signals.bound[i]
+        dqr, narrowing = signals.dqr[i], signals.barrier.narrowing[i]
         signals.beta2[i] = virtual_control(
-            signals.xi1[i],
-            signals.bound[i],
-            settings.K[i],
-            settings.mu[i],
-            signals.dqr[i] + signals.narrowing[i] * signals.xi1[i],
+            xi1, bound, of.gain[i], of.mu[i], dqr + narrowing * xi1
         )
         signals.beta2_rate[i] = 0.0
-        if settings.known_rate == 1:
-            follow_known_rate(settings, signals, i)
+        if of.known_rate == 1:
+            dq, ddqr = signals.dq[i], signals.ddqr[i]
+            f, late = known_rate(of, xi1, bound, narrowing, dq, dqr, ddqr, i)
+            signals.beta2[i] -= late
+            signals.beta2_rate[i] = f
         if state.samples[0] == 0.0:
             state.alpha2[i] = signals.beta2[i]
         signals.dalpha2[i] = gain * (signals.beta2[i] - state.alpha2[i]) / dt
         signals.dalpha2[i] += signals.beta2_rate[i]
         signals.xi2[i] = signals.dq[i] - state.alpha2[i]
-        signals.restoring[i] = -barrier.gradient(
-            signals.xi1[i],
-            signals.bound[i],
-            settings.weight[i],
-            settings.slope_limit[i],
-            signals.knee[i],
+        signals.restoring[i] = -barrier.joint_gradient(
+            settings.barrier, signals.barrier, xi1, bound, i
         )
 
 
 @inner
-def follow_known_rate(settings: Settings, signals: Signals, i: int) -> None:
-    """Compute f, what is known of beta2', for joint i; let beta2 be of the measured velocity.
-
-        f = ddqr + (d beta2 / d xi1) (dq - dqr^)    [rad/s^2],    dqr^ = dqr - (lag / 2) ddqr
-
-    Only the changes of a funnel's k'/k are left out.  Measured velocities come half of
-    `robot.lag` late, so they are compared with the reference of that time, dqr^, in
-    beta2 as well: on the reference xi2 is then zero.
-    """
-    late = 0.5 * settings.lag * signals.ddqr[i]
-    slope = barrier.virtual_slope(
-        signals.xi1[i], signals.bound[i], settings.K[i], settings.mu[i]
-    )
-    slope -= signals.narrowing[i]
-    signals.beta2[i] -= late
-    rate = signals.dq[i] - signals.dqr[i] + late
-    signals.beta2_rate[i] = signals.ddqr[i] - slope * rate
-
-
-@inner
-def feedback(settings: Settings, signals: Signals, layer: float, i: int) -> float:
+def joint_feedback(settings: Settings, signals: Signals, layer: float, i: int) -> float:
     """Return the feedback of joint i [N m]: barrier, robust term and damping of (28)."""
-    robust = settings.d2[i] * abs(signals.xi1[i])
-    torque = settings.Kp[i] * signals.xi2[i]
-    torque += robust * clip(signals.xi2[i] / layer, -1.0, 1.0)
-    if settings.follows_inertia == 1:  # the barrier is in `model_torque`
-        return float(-torque)
-    return float(-torque) + float(signals.restoring[i])
+    of = settings.feedback
+    torque = feedback.joint_torque(of, signals.xi1[i], signals.xi2[i], layer, i)
+    if of.follows_inertia == 1:  # the barrier is in `model_torque`
+        return torque
+    return torque + float(signals.restoring[i])

@@ -10,14 +10,16 @@ not predict the next ones.
 
 If the arm has changed, window, filters and latch are cleared, and learning restarts.
 What a window has taught before it was full is taken back: it did not predict what it
-was not fitted to.
+was not fitted to (`learning.detect_change`).
 """
 
-from blf_dsc_controller.compiled.jit import inner
-from blf_dsc_controller.compiled.layout import Array
-from blf_dsc_controller.law import adaptation, innovation, sums, window
-from blf_dsc_controller.law.excitation import explained
-from blf_dsc_controller.law.state import Settings, Signals, State
+from typing import Annotated, NamedTuple
+
+from blf_dsc_controller.compiled.jit import called, inner
+from blf_dsc_controller.compiled.layout import Array, Cell
+from blf_dsc_controller.law import excitation, innovation, window
+from blf_dsc_controller.law.innovation import Prior
+from blf_dsc_controller.law.window import Window
 from blf_dsc_controller.numerics.algebra import cholesky_factor, cholesky_solve
 
 # ratio of mean squares; larger than the gate's, since a solution extrapolates
@@ -25,135 +27,143 @@ _ALARM = 8.0
 _MEMORY = 0.1  # s, averaging time of the last rows
 
 
-@inner
-def detect_change(
-    settings: Settings, state: State, signals: Signals, dt: float
-) -> None:
-    """Forget the window if the arm has changed: its rows contradict the solution, or each other.
+class State(NamedTuple):
+    """What it keeps from one row to the next."""
 
-    What a window has taught before it was full is taken back: back to the estimate
-    before.
-    """
-    if is_predicted(settings, state):
-        has_changed = contradicts_rows(settings, state, signals, dt)
-    else:
-        has_changed = contradicts_solution(settings, state, signals, dt)
-    if not has_changed:
-        return
-    state.changes[0] += 1.0
-    state.contradiction[0] = state.recent_residual[0]
-    if state.latched[0] == 1.0 and state.rows[0] < settings.window:
-        for j in range(settings.m):
-            signals.work[j] = state.estimate[j]
-            state.estimate[j] = state.anchor[j]
-        if settings.bumpless == 1:
-            adaptation.hand_over(settings, state, signals)
-    forget_window(settings, state)
-    state.rows_statistics[innovation.RECENT] = 0.0
-    fit_rows(settings, state, settings.row_interval * dt)
+    changes: Cell  # number of times that the arm was found to have changed
+    contradiction: Cell  # `recent_residual` at the last change, (N m)^2
+    recent_residual: Cell  # of the last rows against the solution, (N m)^2
+    # until a full window is known to be of one arm: theta of the rows so far, and the
+    # factor of its equations
+    rows_fit: Annotated[Array, 'm']
+    rows_factor: Annotated[Array, 'm', 'm']
+    innovation: innovation.State  # of these rows
+
+
+class Work(NamedTuple):
+    """Scratch of one row."""
+
+    predicted: Annotated[Array, 'n', 'm']
+    innovation: Annotated[Array, 'n']
+    covariance: Annotated[Array, 'n', 'n']
 
 
 @inner
-def is_predicted(settings: Settings, state: State) -> bool:
+def is_predicted(latch: excitation.State, sliding: Window) -> bool:
     """Whether rows are compared with those before them, as long as no full window is known.
 
     Without a prior, as of planar arms, the first rows predict too little.
     """
-    is_full = state.rows[0] == settings.window and state.least_residual[0] > 0.0
-    return bool(settings.prior_weight > 0.0 and not is_full)
+    is_full = window.is_full(sliding.settings, sliding.state)
+    is_known = is_full and latch.least_residual[0] > 0.0
+    return bool(sliding.settings.prior_weight > 0.0 and not is_known)
 
 
 @inner
 def compare_row(
-    settings: Settings, state: State, signals: Signals, theta: Array, period: float
+    state: State, row: Array, theta: Array, period: float, error: Array
 ) -> None:
-    """Write e = u - X theta of this row to `signals.innovation`; average its square.
+    """Write e = u - X theta of a `row` (n, m + 1) to `error` (n,); average its square.
 
     `period` [s] is the time from one row to the next.
     """
+    m = theta.size
     square = 0.0
-    for i in range(settings.n):
-        error = signals.row[i, settings.m]
-        for j in range(settings.m):
-            error -= signals.row[i, j] * theta[j]
-        signals.innovation[i] = error
-        square += error * error
+    for i in range(error.size):
+        e = row[i, m]
+        for j in range(m):
+            e -= row[i, j] * theta[j]
+        error[i] = e
+        square += e * e
     state.recent_residual[0] += min(1.0, period / _MEMORY) * (
         square - state.recent_residual[0]
     )
 
 
 @inner
-def contradicts_solution(
-    settings: Settings, state: State, signals: Signals, dt: float
+def compare_with_solution(
+    settings: excitation.Settings,
+    state: State,
+    work: Work,
+    latch: excitation.State,
+    row: Array,
+    dt: float,
 ) -> bool:
     """Compare this row with the latched solution; return whether the last ones contradict it."""
-    if state.latched[0] == 0.0:
+    if latch.latched[0] == 0.0:
         return False
-    compare_row(settings, state, signals, state.solution, dt)
-    allowed = _ALARM * explained(settings, state, state.residual[0])
+    compare_row(state, row, latch.solution, dt, work.innovation)
+    least = latch.least_residual[0]
+    allowed = _ALARM * excitation.explained(settings, least, latch.residual[0])
     return bool(state.recent_residual[0] > allowed)
 
 
 @inner
-def contradicts_rows(
-    settings: Settings, state: State, signals: Signals, dt: float
+def compare_with_rows(
+    state: State,
+    work: Work,
+    sliding: Window,
+    prior: Prior,
+    row: Array,
+    unmodelled: float,
+    samples: int,
+    dt: float,
 ) -> bool:
-    """Compare this row with those before it; return whether the last ones contradict them."""
-    samples = int(state.samples[0])
-    if samples % settings.row_interval != 0:
+    """Compare this row with those before it; return whether the last ones contradict them.
+
+    `unmodelled` is the mean square torque that no column describes [(N m)^2], `samples`
+    the number of samples of `dt` [s].
+    """
+    of = sliding.settings
+    if samples % of.row_interval != 0:
         return False
-    period = settings.row_interval * dt
-    unmodelled = settings.residual_floor / settings.n
-    statistics = state.rows_statistics
-    if statistics[innovation.NOISE] == 0.0:
-        innovation.start(unmodelled, statistics)
-        fit_rows(settings, state, period)
-    compare_row(settings, state, signals, state.rows_fit, period)
-    for i in range(settings.n):
-        for j in range(settings.m):
-            signals.predicted[i, j] = signals.row[i, j]
+    period = of.row_interval * dt
+    if not innovation.has_begun(state.innovation):
+        innovation.begin(state.innovation, unmodelled)
+        fit_rows(state, sliding, prior, period)
+    compare_row(state, row, state.rows_fit, period, work.innovation)
+    n, m = work.predicted.shape
+    for i in range(n):
+        for j in range(m):
+            work.predicted[i, j] = row[i, j]
     square = innovation.normalized_square(
-        signals.predicted,
-        signals.innovation,
-        state.rows_factor,
-        period,
-        signals.covariance,
+        work.predicted, work.innovation, state.rows_factor, period, work.covariance
     )
-    if innovation.update(square, unmodelled, period, settings.window, statistics):
+    if innovation.update(state.innovation, square, unmodelled, period, of.length):
         return True
     refresh = max(1, round(innovation.REFRESH / period))
-    # a quarter later than the excitation is checked: each takes its time
-    if samples // settings.row_interval % refresh == refresh // 4:
-        fit_rows(settings, state, period)
+    # a quarter later than the excitation is checked: not both in one sample
+    if samples // of.row_interval % refresh == refresh // 4:
+        fit_rows(state, sliding, prior, period)
     return False
 
 
-@inner
-def fit_rows(settings: Settings, state: State, period: float) -> None:
+@called
+def fit_rows(state: State, sliding: Window, prior: Prior, period: float) -> None:
     """Solve for theta of the rows so far, one each `period` [s], and of the prior."""
-    a = innovation.row_variance(state.rows_statistics, period)
+    a = innovation.row_variance(state.innovation, period)
     factor = state.rows_factor
     theta = state.rows_fit
-    window.average_window(state.running, 1, factor, theta)
-    window.pull_to(settings.initial_estimate, a, settings.information, factor, theta)
+    window.average_window(sliding.state.running, 1, factor, theta)
+    window.pull_to(prior.estimate, a, prior.information, factor, theta)
     cholesky_factor(factor)
     cholesky_solve(factor, theta)
 
 
 @inner
-def forget_window(settings: Settings, state: State) -> None:
-    """Clear the window, its filters and the latch; the estimate stays and becomes the anchor."""
-    state.latched[0] = 0.0
-    state.best_lambda[0] = 0.0
+def count_change(
+    state: State,
+    latch: excitation.State,
+    sliding: Window,
+    prior: Prior,
+    estimate: Array,
+    dt: float,
+) -> None:
+    """Count a change, and forget window and latch; the `estimate` (m,) becomes the anchor."""
+    state.changes[0] += 1.0
+    state.contradiction[0] = state.recent_residual[0]
     state.recent_residual[0] = 0.0
-    state.rows[0] = 0.0
-    state.cursor[0] = 0.0
-    sums.clear(state.running)
-    sums.clear(state.fresh)
-    sums.clear(state.half)
-    sums.clear(state.filter1)
-    sums.clear(state.filter2)
-    for j in range(settings.m):
-        state.anchor[j] = state.estimate[j]
-    window.reset_direction(state)
+    excitation.unlatch(latch, estimate)
+    window.forget(sliding.state)
+    innovation.forget_recent(state.innovation)
+    fit_rows(state, sliding, prior, sliding.settings.row_interval * dt)

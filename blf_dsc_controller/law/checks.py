@@ -10,20 +10,15 @@ from math import isfinite
 
 from blf_dsc_controller.compiled.jit import inner
 from blf_dsc_controller.compiled.layout import Array
-from blf_dsc_controller.law import oscillation
-from blf_dsc_controller.law.check_state import OUTSIDE, SUSPECT, Checks
-from blf_dsc_controller.law.effect import average_steps, check_effect
+from blf_dsc_controller.law import effect, kept_estimates, oscillation
+from blf_dsc_controller.law.check_state import NO_EFFECT, OUTSIDE, SUSPECT, Checks
 from blf_dsc_controller.law.state import Sample, Settings, Signals, State
-
-_BRIDGED = 3.5  # samples, for which a reading may be repeated
-_RELAXED = 1.4  # s, in which the least error may double, nearly: an error grows faster
-_SMALL = 0.01  # of the bound: an error that has not grown
 
 
 @inner
-def is_valid_state(settings: Settings, checks: Checks, measurement: Array) -> bool:
+def is_valid_state(checks: Checks, measurement: Array) -> bool:
     """Check that the used values of [q, dq, applied torque] (3 n,) are finite and not too fast."""
-    n = settings.n
+    n = measurement.size // 3
     for i in range(n):
         if not (
             isfinite(measurement[i])
@@ -34,120 +29,113 @@ def is_valid_state(settings: Settings, checks: Checks, measurement: Array) -> bo
 
 
 @inner
-def bridge_repeats(
-    settings: Settings, checks: Checks, state: State, dt: float, measurement: Array
-) -> None:
-    """Write the measurement (3 n,) that the law uses to `checks.used`.
-
-    Drivers that do not wait for their arm send a reading once more, with a new stamp:
-    an arm in motion that seems to stand still for a sample.  It is continued at its
-    velocity.
-    """
-    n = settings.n
-    repeats = state.samples[0] > 0.0
-    for i in range(2 * n):
-        repeats = repeats and measurement[i] == checks.read[i]
-        checks.read[i] = measurement[i]
-    checks.age[0] = checks.age[0] + dt if repeats else 0.0
-    is_bridged = repeats and checks.age[0] < _BRIDGED * checks.sample_time[0]
-    for i in range(n):
-        checks.used[i] = measurement[i]
-        checks.used[n + i] = measurement[n + i]
-        checks.used[2 * n + i] = measurement[2 * n + i]
-        if is_bridged:
-            checks.used[i] += checks.age[0] * measurement[n + i]
-
-
-@inner
 def watch_oscillation(
-    settings: Settings, checks: Checks, state: State, signals: Signals, dt: float
+    settings: Settings, checks: Checks, signals: Signals, begins: bool, dt: float
 ) -> bool:
     """Return whether an oscillation of the arm is to be reported."""
     now = checks.oscillation
-    if state.samples[0] == 0.0:
+    limit = settings.torque.limit
+    if begins:
         oscillation.begin(now, signals.xi1, signals.applied)
         return False
     oscillation.watch(
         now,
-        settings.torque_limit,
+        limit,
         signals.xi1,
         signals.applied,
-        checks.noise,
-        checks.resolution,
+        checks.sensor.noise,
+        checks.sensor.resolution,
         dt,
     )
-    return oscillation.is_due(now, settings.torque_limit, dt)
+    return oscillation.count_down(now, limit, dt)
 
 
 @inner
-def check_error(settings: Settings, checks: Checks, xi1: Array, bound: Array) -> int:
-    """Return the flags for the errors (n,) [rad]; update the largest ratio."""
+def check_error(
+    checks: Checks, has_barrier: bool, xi1: Array, bound: Array
+) -> tuple[int, float]:
+    """Return the flags for the errors (n,) [rad], and the largest |xi1| / k; update `ratio`."""
     flags = 0
-    error_ratio = checks.error_ratio[0] if settings.has_barrier == 1 else 0.0
-    for i in range(settings.n):
+    largest = 0.0
+    error_ratio = checks.error_ratio[0] if has_barrier else 0.0
+    for i in range(xi1.size):
         now = abs(xi1[i]) / bound[i]
+        largest = max(largest, now)
         if now == now:  # noqa: PLR0124 - not NaN
             checks.ratio[i] = max(checks.ratio[i], now)
         if not now < 1.0:
             flags |= OUTSIDE
         if error_ratio > 0.0 and not now < error_ratio:
             flags |= SUSPECT
-    return flags
+    return flags, largest
 
 
 @inner
-def keep_consistent(
-    settings: Settings, checks: Checks, state: State, sample: Sample
-) -> None:
-    """Keep the estimates of the smallest error of late, from before an error grows.
+def may_oscillate(checks: Checks) -> bool:
+    """Whether what a joint shows may be an oscillation."""
+    is_one = False
+    for i in range(checks.oscillation.waves.size):
+        is_one = is_one or checks.oscillation.waves[i] >= oscillation.SOME
+    return is_one
 
-    Commands that do not reach the arm make its error grow, and the disturbance estimate
-    with it.  What is learned while the arm may oscillate is as wrong.
+
+@inner
+def is_valid_sample(
+    settings: Settings, state: State, signals: Signals, sample: Sample
+) -> bool:
+    """Whether what the law computed is finite, and its demand within the limits.
+
+    The estimate of a rejected column is finite in the state but NaN in the sample.
     """
-    ratio = 0.0
-    oscillates = False
+    is_valid = True
     for i in range(settings.n):
-        ratio = max(ratio, abs(sample.xi1[i]) / sample.bound[i])
-        oscillates = oscillates or checks.oscillation.waves[i] >= oscillation.SOME
-    least = checks.least_ratio[0] * (1.0 + checks.sample_time[0] / _RELAXED)
-    least = max(_SMALL, least)
-    if (ratio > least or oscillates) and state.samples[0] > 1.0:
-        checks.least_ratio[0] = least
-        return
-    checks.least_ratio[0] = ratio
-    for j in range(settings.m + settings.n):
-        checks.consistent[j] = checks.kept[j]
-    for i in range(settings.n):
-        checks.consistent_scale[i] = state.rotors.gain_scale[i]
+        demand = signals.demand[i]
+        largest = max(abs(demand), abs(demand - signals.added[i]))
+        is_within = largest <= settings.torque.limit[i]
+        is_finite = isfinite(sample.torque[i]) and isfinite(state.disturbance[i])
+        is_valid = is_valid and is_within and is_finite
+    for j in range(settings.m):
+        is_valid = is_valid and isfinite(state.estimate[j])
+    return is_valid
 
 
 @inner
 def check_sample(
     settings: Settings, checks: Checks, state: State, signals: Signals, sample: Sample
 ) -> int:
-    """Return the flags for what the law computed in a sample; update the kept values.
-
-    The estimate of a rejected column is finite in the state but NaN in the sample.
-    """
-    flags = check_error(settings, checks, sample.xi1, sample.bound)
-    for i in range(settings.n):
-        demand = signals.demand[i]
-        largest = max(abs(demand), abs(demand - signals.added[i]))
-        within = largest <= settings.torque_limit[i]
-        if not (
-            within and isfinite(sample.torque[i]) and isfinite(state.disturbance[i])
-        ):
-            flags |= SUSPECT
-    for j in range(settings.m):
-        if not isfinite(state.estimate[j]):
-            flags |= SUSPECT
-    if flags & SUSPECT == 0:
-        for j in range(settings.m):
-            checks.kept[j] = state.estimate[j]
-        for i in range(settings.n):
-            checks.kept[settings.m + i] = state.disturbance[i]
-        if checks.sample_time[0] > 0.0:
-            average_steps(settings, checks, state, sample)
-            keep_consistent(settings, checks, state, sample)
-            flags |= check_effect(settings, checks, state, signals, sample)
+    """Return the flags for what the law computed in a sample; update the kept values."""
+    flags, ratio = check_error(
+        checks, settings.has_barrier == 1, sample.xi1, sample.bound
+    )
+    if not is_valid_sample(settings, state, signals, sample):
+        flags |= SUSPECT
+    if flags & SUSPECT != 0:
+        return flags
+    estimates = checks.estimates
+    kept_estimates.keep(estimates, state.estimate, state.disturbance)
+    T = checks.sample_time[0]
+    if not T > 0.0:
+        return flags
+    n = settings.n
+    begins = state.samples[0] <= 1.0
+    now = effect.Sample(
+        q=checks.repeats.read[:n],
+        qr=sample.qr,
+        effort=checks.repeats.used[2 * n :],
+        command=sample.torque,
+        added=signals.added,
+        begins=begins,
+        dt=T,
+    )
+    effect.average_steps(checks.effect, now)
+    oscillates = may_oscillate(checks)
+    scale = state.rotors.gain_scale
+    kept_estimates.keep_consistent(estimates, scale, ratio, oscillates, begins, T)
+    is_missing, moves = effect.check_effect(
+        settings.torque, checks.effect, checks.sensor, now
+    )
+    if is_missing:
+        flags |= NO_EFFECT | SUSPECT
+    if moves:
+        kept_estimates.keep_moved(estimates)
     return flags

@@ -27,41 +27,47 @@ from __future__ import annotations
 
 from blf_dsc_controller.compiled.jit import inner
 from blf_dsc_controller.compiled.layout import Array
-from blf_dsc_controller.law import apparent_inertia, friction
-from blf_dsc_controller.law.state import (
-    FILTERED,
-    REFERENCE,
-    Settings,
-    Signals,
-    State,
-)
+from blf_dsc_controller.law import apparent_inertia, feedback, friction
+from blf_dsc_controller.law.prediction import FILTERED
+from blf_dsc_controller.law.state import REFERENCE, Settings, Signals, State
+from blf_dsc_controller.numerics.elementary import sin
+
+
+@inner
+def update_feedforward(settings: Settings, signals: Signals, t: float) -> None:
+    """Compute the known disturbance `signals.feedforward` (n,) [N m] at time t [s]."""
+    if settings.truth_known == 0 and settings.feed_forward == 0:
+        return
+    d = settings.true_disturbance
+    for i in range(settings.n):
+        signals.feedforward[i] = d[0, i] + d[1, i] * sin(d[2, i] * t + d[3, i])
 
 
 @inner
 def compute_regressors(settings: Settings, state: State, signals: Signals) -> None:
     """Compute H P^(0) of the feedback, H of what is learned; if the row needs them, Yp and Yr."""
-    model = settings.model
-    H = signals.H
-    q, dq, v = signals.q, signals.dq, signals.model_velocity
-    for i in range(settings.n):
-        v[i] = signals.dqr[i] if settings.decoupled == 1 else state.alpha2[i]
-        rate = signals.ddqr[i] if settings.decoupled == 1 else signals.dalpha2[i]
-        signals.damped[i] = rate - settings.damping_rate * signals.xi2[i]
-        if settings.follows_inertia == 1:
-            signals.damped[i] += signals.restoring[i] / settings.joint_inertia[i]
-    if settings.prediction == FILTERED:
-        model.regressors(q, dq, v, signals.damped, H, signals.Yp, signals.Yr)
+    model, of = settings.model, settings.feedback
+    H, damped = signals.H, signals.damped
+    q, dq, dqr, ddqr = signals.q, signals.dq, signals.dqr, signals.ddqr
+    v, a = state.alpha2, signals.dalpha2
+    if of.decoupled == 1:
+        v, a = dqr, ddqr
+    feedback.fill_acceleration(
+        of, a, signals.xi2, signals.restoring, settings.joint_inertia, damped
+    )
+    if settings.row.prediction == FILTERED:
+        model.regressors(q, dq, v, damped, H, signals.Yp, signals.Yr)
     else:
-        model.regressor(q, dq, v, signals.damped, H)
+        model.regressor(q, dq, v, damped, H)
     for i in range(settings.n):
         signals.model_torque[i] = 0.0
         for j in range(settings.p):
             signals.model_torque[i] += H[i, j] * settings.initial_estimate[j]
     if settings.compensation == REFERENCE:
-        model.regressor(signals.qr, signals.dqr, signals.dqr, signals.ddqr, H)
-    elif settings.decoupled == 1:
-        model.regressor(q, dq, signals.dqr, signals.ddqr, H)
-    elif settings.damping_rate > 0.0 or settings.follows_inertia == 1:
+        model.regressor(signals.qr, dqr, dqr, ddqr, H)
+    elif of.decoupled == 1:
+        model.regressor(q, dq, dqr, ddqr, H)
+    elif of.damping_rate > 0.0 or of.follows_inertia == 1:
         model.regressor(q, dq, state.alpha2, signals.dalpha2, H)
 
 

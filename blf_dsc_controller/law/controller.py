@@ -17,7 +17,7 @@ from blf_dsc_controller.compiled.entry import Entry
 from blf_dsc_controller.compiled.jit import direct, inner, kernel
 from blf_dsc_controller.compiled.layout import Array, pack
 from blf_dsc_controller.errors import BlfDscError
-from blf_dsc_controller.law import barrier, friction, torque
+from blf_dsc_controller.law import barrier, friction, repeats, torque
 from blf_dsc_controller.law.check_state import (
     CONTRADICTION,
     INVALID,
@@ -27,11 +27,11 @@ from blf_dsc_controller.law.check_state import (
     checks_size,
 )
 from blf_dsc_controller.law.checks import (
-    bridge_repeats,
     check_sample,
     is_valid_state,
     watch_oscillation,
 )
+from blf_dsc_controller.law.compensation import update_feedforward
 from blf_dsc_controller.law.interface import Law
 from blf_dsc_controller.law.laws import for_law
 from blf_dsc_controller.law.lyapunov import fill_energies
@@ -56,7 +56,8 @@ from blf_dsc_controller.law.state import (
     state_size,
 )
 from blf_dsc_controller.law.torque import added_torque
-from blf_dsc_controller.law.weighing import DEVIATION, TWO_SIDED
+from blf_dsc_controller.law.weighing import DEVIATION
+from blf_dsc_controller.numerics.intervals import TWO_SIDED
 from blf_dsc_controller.reference import terms as reference
 
 
@@ -77,10 +78,10 @@ def fill_sample(
         sample.bound[i] = signals.bound[i]
         sample.cuts[i] = signals.cuts[i]
     for j in range(settings.m):
-        sample.estimate[j] = state.estimate[j] if state.active[j] != 0.0 else nan
-    sample.lambda_min[0] = state.lambda_min[0]
-    sample.latched[0] = state.latched[0]
-    sample.changes[0] = state.changes[0]
+        sample.estimate[j] = state.estimate[j] if state.latch.active[j] != 0.0 else nan
+    sample.lambda_min[0] = state.latch.lambda_min[0]
+    sample.latched[0] = state.latch.latched[0]
+    sample.changes[0] = state.change.changes[0]
     load = state.weighing.load
     for k in range(load.size):
         is_known = load[DEVIATION + k % DEVIATION] > 0.0
@@ -109,27 +110,42 @@ def step(
     """
     n = settings.n
     is_checked = checks.velocity_limit[0] > 0.0
-    if is_checked and not is_valid_state(settings, checks, measurement):
+    if is_checked and not is_valid_state(checks, measurement):
         return INVALID
-    compares = is_checked and checks.sample_time[0] > 0.0
-    if compares and compare_velocities(checks, dt, measurement, n):
+    sample_time = checks.sample_time[0]
+    compares = is_checked and sample_time > 0.0
+    if compares and compare_velocities(
+        checks.sensor, checks.oscillation, sample_time, dt, measurement
+    ):
         return INVALID | CONTRADICTION
+    begins = state.samples[0] == 0.0
     if is_checked:
-        bridge_repeats(settings, checks, state, dt, measurement)
-    used = checks.used if is_checked else measurement
+        repeats.bridge(checks.repeats, measurement, begins, sample_time, dt)
+    used = checks.repeats.used if is_checked else measurement
     for i in range(n):
         signals.q[i] = used[i]
         signals.dq[i] = used[n + i]
-    torque.find_added(settings, signals)
-    torque.find_applied(settings, state, signals)
+    added = signals.added
+    torque.find_added(settings.torque, signals.saturation, signals.q, added)
+    torque.find_applied(state.torque, state.added, added, signals.applied)
     reference.evaluate(reference_vector, t, signals.qr, signals.dqr, signals.ddqr)
-    torque.update_feedforward(settings, signals, t)
-    barrier.update_bound(settings, signals, t)
+    update_feedforward(settings, signals, t)
+    barrier.update_bound(settings.barrier, signals.barrier, t, signals.bound)
     for i in range(n):
         signals.xi1[i] = signals.q[i] - signals.qr[i]
-    oscillates = compares and watch_oscillation(settings, checks, state, signals, dt)
+    oscillates = compares and watch_oscillation(settings, checks, signals, begins, dt)
     law.compute_demand(settings, state, signals, t, dt)
-    saturated = torque.saturate(settings, state, signals, dt)
+    saturated = torque.saturate(
+        settings.torque,
+        state.saturation,
+        signals.demand,
+        added,
+        state.torque,
+        not begins or state.saturation.takes_over[0] > 0.0,
+        dt,
+        signals.torque,
+        signals.cuts,
+    )
     law.finish(settings, state, signals, dt, saturated)
     for i in range(n):
         state.torque[i] = signals.torque[i]
@@ -188,7 +204,8 @@ def compare(
     """Run `compare_velocities` on packed vectors, without the law."""
     settings = settings_of(settings_vector, model)
     checks = checks_of(checks_vector, settings)
-    return compare_velocities(checks, dt, measurement, settings.n)
+    T = checks.sample_time[0]
+    return compare_velocities(checks.sensor, checks.oscillation, T, dt, measurement)
 
 
 class LawKernels(NamedTuple):
@@ -274,7 +291,8 @@ class Controller:
 
     def bound_at(self, t: float) -> Array:
         """Return the bound k(t) (n,) [rad] at time t [s] since the start."""
-        barrier.update_bound(self.settings, self.signals, t)
+        signals = self.signals
+        barrier.update_bound(self.settings.barrier, signals.barrier, t, signals.bound)
         return np.array(self.signals.bound)
 
     def reference_at(self, t: float) -> Array:
@@ -291,9 +309,9 @@ class Controller:
         """Return to the initial state: initial estimate, empty filters and window."""
         self.state_vector.fill(0.0)
         self.state.estimate[:] = self.settings.initial_estimate
-        self.state.anchor[:] = self.settings.initial_estimate
-        self.state.min_eigenvector.fill(1.0 / np.sqrt(self.settings.m))
-        self.state.active.fill(1.0)
+        self.state.latch.anchor[:] = self.settings.initial_estimate
+        self.state.window.min_eigenvector.fill(1.0 / np.sqrt(self.settings.m))
+        self.state.latch.active.fill(1.0)
         self.state.rotors.gain_scale.fill(1.0)
         friction.begin(self.settings.friction, self.state.friction)
 
@@ -314,10 +332,11 @@ class Controller:
         )
         return self.sample.torque
 
-    def contradicts(self, dt: float, measurement: Array) -> bool:
-        """Whether a velocity contradicts the positions, by a state that the law does not use.
+    def compare_velocities(self, dt: float, measurement: Array) -> bool:
+        """Compare velocities with positions; return whether one contradicts them.
 
-        The measurement (3 n,) is finite, `dt` [s] after the last.
+        The law does not use the state. The measurement (3 n,) is finite, `dt` [s] after
+        the last.
         """
         self._take(measurement)
         return bool(self._compare(*self._compared, dt))
@@ -350,9 +369,9 @@ class Controller:
         Call it before the first update: the rate limit then holds from this torque on.
         """
         self.state.torque[:] = torque
-        self.state.added[:] = added_torque(self.settings, q)
-        self.state.held_back[:] = 0.0
-        self.state.takes_over[0] = 1.0
+        self.state.added[:] = added_torque(self.settings.torque, q)
+        self.state.saturation.held_back[:] = 0.0
+        self.state.saturation.takes_over[0] = 1.0
 
     def trial(self, t: float, dt: float, measurement: Array) -> Array:
         """Return the torque of an unchecked update that only changes `signals` and `sample`."""

@@ -9,11 +9,11 @@ difference.
 from __future__ import annotations
 
 from math import isfinite, sqrt
+from typing import Annotated, NamedTuple
 
 from blf_dsc_controller.compiled.jit import inner
-from blf_dsc_controller.law.check_state import NO_EFFECT, SUSPECT, Checks
-from blf_dsc_controller.law.sensor import position_changed
-from blf_dsc_controller.law.state import Sample, Settings, Signals, State
+from blf_dsc_controller.compiled.layout import Array, Cell
+from blf_dsc_controller.law import sensor, torque
 
 # of the torque limit: a command that differs by more should have moved something
 _CHANGED = 0.1
@@ -26,41 +26,61 @@ _CHATTERS = 0.5  # s
 _LASTING = 0.1  # s, for which the efforts have to differ from the commands
 
 
+class State(NamedTuple):
+    """What it keeps from past samples."""
+
+    last: Annotated[Array, 'n']  # N m, command of the last sample
+    # (N m)^2, mean square step of the commands over _CHATTERS
+    chatter: Annotated[Array, 'n']
+    at_rest: Cell  # s, since a joint has last moved
+    q: Annotated[Array, 'n']  # rad, where it has
+    qr: Annotated[Array, 'n']  # rad, the reference of then
+    recent: Annotated[Array, 'n']  # N m, average of the commands over _RECENT
+    before: Annotated[Array, 'n']  # N m, average of them over _BEFORE
+    compares: Cell  # 1: measured efforts are torques, to be compared with the commands
+    lack: Annotated[Array, 'n']  # N m, average of commands less efforts over _RECENT
+    # N m, of it the error of the model of what the drives add
+    lack_in_motion: Annotated[Array, 'n']
+    usual: Annotated[Array, 'n']  # N m, average of the lack over _BEFORE
+    lacking: Cell  # s, since a lack has become too large
+
+
+class Sample(NamedTuple):
+    """What the check reads of a sample."""
+
+    q: Array  # (n,) rad, as read
+    qr: Array  # (n,) rad
+    effort: Array  # (n,) as measured
+    command: Array  # (n,) N m
+    added: Array  # (n,) N m, what the drives add to it
+    begins: bool  # there is none before it
+    dt: float  # s, a sample time
+
+
 @inner
-def average_steps(
-    settings: Settings, checks: Checks, state: State, sample: Sample
-) -> None:
+def average_steps(state: State, sample: Sample) -> None:
     """Update the mean square step of the commands, which coarse encoders make chatter."""
-    share = min(1.0, checks.sample_time[0] / _CHATTERS)
-    for i in range(settings.n):
-        step = sample.torque[i] - checks.last[i] if state.samples[0] > 1.0 else 0.0
-        checks.chatter[i] += share * (step * step - checks.chatter[i])
-        checks.last[i] = sample.torque[i]
+    share = min(1.0, sample.dt / _CHATTERS)
+    for i in range(sample.q.size):
+        step = 0.0 if sample.begins else sample.command[i] - state.last[i]
+        state.chatter[i] += share * (step * step - state.chatter[i])
+        state.last[i] = sample.command[i]
 
 
 @inner
-def has_moved(checks: Checks, n: int) -> bool:
-    """Whether a joint is elsewhere than where one has last moved."""
+def is_elsewhere(readings: sensor.State, now: Array, then: Array) -> bool:
+    """Whether a position (n,) [rad] of one joint differs by more than its sensor explains."""
     moves = False
-    for i in range(n):
-        moves = moves or position_changed(checks, i, checks.read[i] - checks.q[i])
+    for i in range(now.size):
+        moves = moves or sensor.position_changed(readings, i, now[i] - then[i])
     return moves
 
 
 @inner
-def asks_for_motion(checks: Checks, sample: Sample, n: int) -> bool:
-    """Whether the reference has moved since a joint has, so far that a sensor would show it."""
-    asks = False
-    for i in range(n):
-        asks = asks or position_changed(checks, i, sample.qr[i] - checks.qr[i])
-    return asks
-
-
-@inner
 def check_effect(
-    settings: Settings, checks: Checks, state: State, signals: Signals, sample: Sample
-) -> int:
-    """Return the flags for commands without effect; call it once the sample's values are kept.
+    limits: torque.Settings, state: State, readings: sensor.State, sample: Sample
+) -> tuple[bool, bool]:
+    """Update; return whether commands have no effect, and whether a joint moves as it should.
 
     The reference has moved on, the commands have changed by more than what overcomes
     stiction, and still no joint has moved: brakes hold the arm, or its effort
@@ -69,78 +89,76 @@ def check_effect(
     stiff loop takes up a load so.  Slower drifts show in efforts that are torques; an
     effort that follows the commands shows that they have an effect.
     """
-    begins = state.samples[0] <= 1.0
-    moves = begins or has_moved(checks, settings.n)
-    T = checks.sample_time[0]
-    flags = compare_effort(settings, checks, signals, sample, begins, moves)
-    checks.at_rest[0] = 0.0 if moves else checks.at_rest[0] + T
-    has_changed = False
-    for i in range(settings.n):
-        smooth = 1.0 if begins else min(1.0, T / _RECENT)
-        checks.recent[i] += smooth * (sample.torque[i] - checks.recent[i])
-        if moves:
-            checks.q[i] = checks.read[i]
-            checks.qr[i] = sample.qr[i]
-            checks.before[i] = checks.recent[i]
-        else:
-            checks.before[i] += min(1.0, T / _BEFORE) * (
-                sample.torque[i] - checks.before[i]
-            )
-        change = abs(checks.recent[i] - checks.before[i])
-        least = _CHANGED * settings.torque_limit[i]
-        least += _CHATTERED * sqrt(checks.chatter[i])
-        has_changed = has_changed or change > least
-    has_changed = has_changed and checks.at_rest[0] > _RECENT
-    is_missing = has_changed and asks_for_motion(checks, sample, settings.n)
-    if is_missing and not effort_follows(settings, checks):
-        flags |= NO_EFFECT | SUSPECT
-    if moves and checks.lacking[0] == 0.0:
-        for j in range(settings.m + settings.n):
-            checks.moved[j] = checks.kept[j]
-    return flags
+    moves = sample.begins or is_elsewhere(readings, sample.q, state.q)
+    lacks = compare_effort(limits, state, sample, moves)
+    state.at_rest[0] = 0.0 if moves else state.at_rest[0] + sample.dt
+    has_changed = follow_commands(limits, state, sample, moves)
+    has_changed = has_changed and state.at_rest[0] > _RECENT
+    is_missing = has_changed and is_elsewhere(readings, sample.qr, state.qr)
+    is_missing = is_missing and not effort_follows(state, sample.effort)
+    return lacks or is_missing, moves and state.lacking[0] == 0.0
 
 
 @inner
-def effort_follows(settings: Settings, checks: Checks) -> bool:
-    """Whether measured efforts are torques and do what is commanded."""
-    follows = bool(checks.compares[0] == 1.0) and bool(checks.lacking[0] == 0.0)
-    for i in range(settings.n):
-        follows = follows and isfinite(checks.used[2 * settings.n + i])
+def follow_commands(
+    limits: torque.Settings, state: State, sample: Sample, moves: bool
+) -> bool:
+    """Average the commands; return whether they have changed since a joint has moved."""
+    has_changed = False
+    for i in range(sample.q.size):
+        command = sample.command[i]
+        smooth = 1.0 if sample.begins else min(1.0, sample.dt / _RECENT)
+        state.recent[i] += smooth * (command - state.recent[i])
+        if moves:
+            state.q[i] = sample.q[i]
+            state.qr[i] = sample.qr[i]
+            state.before[i] = state.recent[i]
+        else:
+            slow = min(1.0, sample.dt / _BEFORE)
+            state.before[i] += slow * (command - state.before[i])
+        change = abs(state.recent[i] - state.before[i])
+        least = _CHANGED * limits.limit[i]
+        least += _CHATTERED * sqrt(state.chatter[i])
+        has_changed = has_changed or change > least
+    return has_changed
+
+
+@inner
+def effort_follows(state: State, effort: Array) -> bool:
+    """Whether measured efforts (n,) are torques and do what is commanded."""
+    follows = bool(state.compares[0] == 1.0) and bool(state.lacking[0] == 0.0)
+    for i in range(effort.size):
+        follows = follows and isfinite(effort[i])
     return follows
 
 
 @inner
 def compare_effort(
-    settings: Settings,
-    checks: Checks,
-    signals: Signals,
-    sample: Sample,
-    begins: bool,
-    moves: bool,
-) -> int:
-    """Return the flags for efforts that do not follow the commands.
+    limits: torque.Settings, state: State, sample: Sample, moves: bool
+) -> bool:
+    """Average what the efforts lack of the commands; return whether it lasts.
 
     The drives' own model of what they add may differ from the law's: then what the
     efforts lack must not change while no joint moves.  In motion its usual value
     explains an error past the bound.
     """
-    if checks.compares[0] == 0.0:
-        return 0
-    T, is_lacking = checks.sample_time[0], False
-    is_relative = settings.drive > 0 and settings.effort_is_whole == 1
-    for i in range(settings.n):
-        lack = sample.torque[i] - checks.used[2 * settings.n + i]
+    if state.compares[0] == 0.0:
+        return False
+    is_lacking = False
+    is_relative = limits.drive > 0 and limits.effort_is_whole == 1
+    for i in range(sample.q.size):
+        lack = sample.command[i] - sample.effort[i]
         if is_relative:
-            lack += signals.added[i]
-        if begins:
-            checks.lack[i] = lack if is_relative else 0.0
-            checks.usual[i] = checks.lack[i]
+            lack += sample.added[i]
+        if sample.begins:
+            state.lack[i] = lack if is_relative else 0.0
+            state.usual[i] = state.lack[i]
         elif isfinite(lack):
-            checks.lack[i] += min(1.0, T / _RECENT) * (lack - checks.lack[i])
-            checks.usual[i] += min(1.0, T / _BEFORE) * (lack - checks.usual[i])
+            state.lack[i] += min(1.0, sample.dt / _RECENT) * (lack - state.lack[i])
+            state.usual[i] += min(1.0, sample.dt / _BEFORE) * (lack - state.usual[i])
         if moves:
-            checks.lack_in_motion[i] = checks.lack[i] if is_relative else 0.0
-        excess = abs(checks.lack[i] - checks.lack_in_motion[i])
-        is_lacking = is_lacking or excess > _CHANGED * settings.torque_limit[i]
-    checks.lacking[0] = checks.lacking[0] + T if is_lacking else 0.0
-    return NO_EFFECT | SUSPECT if checks.lacking[0] > _LASTING else 0
+            state.lack_in_motion[i] = state.lack[i] if is_relative else 0.0
+        excess = abs(state.lack[i] - state.lack_in_motion[i])
+        is_lacking = is_lacking or excess > _CHANGED * limits.limit[i]
+    state.lacking[0] = state.lacking[0] + sample.dt if is_lacking else 0.0
+    return bool(state.lacking[0] > _LASTING)

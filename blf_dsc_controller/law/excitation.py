@@ -25,10 +25,14 @@ most strongly in weakly excited directions.  Likewise, a full window with an unu
 large residual is pulled to an earlier solution, kept once per window.
 """
 
-from blf_dsc_controller.compiled.jit import inner
-from blf_dsc_controller.compiled.layout import Array
+from typing import Annotated, NamedTuple
+
+from blf_dsc_controller.arms.model import ArmModel
+from blf_dsc_controller.compiled.jit import called, inner
+from blf_dsc_controller.compiled.layout import Array, Cell
 from blf_dsc_controller.law import sums, window
-from blf_dsc_controller.law.state import Settings, Signals, State
+from blf_dsc_controller.law.innovation import Prior
+from blf_dsc_controller.law.window import Window
 from blf_dsc_controller.numerics.algebra import cholesky_factor, cholesky_solve
 
 _WARM = 4  # inverse iterations from the previous direction
@@ -46,16 +50,58 @@ _DOUBT = 3.0  # pull to the anchor per (N m)^2 above that, 1/(kg m^2)^2
 _LEAST_INERTIA = 0.1  # fraction of the initial estimate's
 
 
+class Settings(NamedTuple):
+    """The parameters `learning.*` of the latch, and what follows from others."""
+
+    excitation_threshold: float  # sigma, on lambda_min(Phi)
+    learning_start: float  # tau_d + T_a, s
+    change_detection: int  # 1: windows must be consistent
+    # mean square residual that noise and unmodelled torque explain, (N m)^2
+    residual_floor: float
+    anchor_weight: float  # pull to `anchor` while the window is not full
+
+
+class State(NamedTuple):
+    """The latched window, and what earlier ones have shown."""
+
+    latched: Cell  # 1 while a window (Phi_e, b_e) is latched
+    latch_time: Cell  # T_e, s
+    lambda_min: Cell  # of Phi at the last check
+    best_lambda: Cell  # largest of a full window since the last change, with decay
+    columns_checked: Cell  # 1 once the disturbance columns are accepted or rejected
+    residual: Cell  # mean square torque residual of the latched window, (N m)^2
+    least_residual: Cell  # smallest residual of any full window, (N m)^2
+    # of the last first window that its parts contradicted, (N m)^2
+    split_residual: Cell
+    Phi: Annotated[Array, 'm', 'm']  # latched Phi_e
+    b: Annotated[Array, 'm']  # latched b_e
+    factor: Annotated[Array, 'm', 'm']  # Cholesky factor of Phi_e + rho R
+    solution: Annotated[Array, 'm']  # of the latched window, (Phi_e + rho R)^-1 b_e
+    # theta^ to which windows with little information are pulled
+    anchor: Annotated[Array, 'm']
+    active: Annotated[Array, 'm']  # 0 where a disturbance column has been rejected
+
+
+class Work(NamedTuple):
+    """Scratch of the check for a positive inertia."""
+
+    # M^(q) minus its least admissible value, or its factor
+    inertia: Annotated[Array, 'n', 'n']
+    unit: Annotated[Array, 'n']
+    Yp: Annotated[Array, 'n', 'p']
+    Yr: Annotated[Array, 'n', 'm']
+
+
 @inner
-def explained(settings: Settings, state: State, residual: float) -> float:
+def explained(settings: Settings, least_residual: float, residual: float) -> float:
     """Return the mean square residual that noise and unmodelled torque explain (>= `residual`).
 
-    Their configured floor is an upper limit: the best full window shows how little they
-    are.
+    Their configured floor is an upper limit: the best full window, with the
+    `least_residual` or 0 if there is none, shows how little they are.
     """
     floor = settings.residual_floor
-    if state.least_residual[0] > 0.0:
-        shown = max(_QUIET * state.least_residual[0], _LEAST_FLOOR * floor)
+    if least_residual > 0.0:
+        shown = max(_QUIET * least_residual, _LEAST_FLOOR * floor)
         floor = min(floor, shown)
     return max(residual, floor)
 
@@ -74,174 +120,206 @@ def window_residual(running: Array, theta: Array) -> float:
 
 
 @inner
-def is_physical(settings: Settings, signals: Signals, theta: Array) -> bool:
-    """Check that M(q) of theta (m,), minus a tenth of that of P^(0), is positive definite.
-
-    Overwrites Yp and Yr of `signals`.
-    """
-    for k in range(settings.n):
-        for i in range(settings.n):
-            signals.unit[i] = 1.0 if i == k else 0.0
-        settings.model.momentum_regressor(
-            signals.q, signals.unit, signals.Yp, signals.Yr
-        )
-        for i in range(k, settings.n):
-            signals.inertia[k, i] = 0.0
-            for j in range(settings.p):
-                parameter = theta[j] - _LEAST_INERTIA * settings.initial_estimate[j]
-                signals.inertia[k, i] += signals.Yp[i, j] * parameter
-    return cholesky_factor(signals.inertia)
+def find_spare_inertia(
+    model: ArmModel, work: Work, q: Array, theta: Array, P0: Array
+) -> None:
+    """Write M(q) of theta (m,), minus a tenth of that of P^(0), to `work.inertia`."""
+    n = q.size
+    for k in range(n):
+        for i in range(n):
+            work.unit[i] = 1.0 if i == k else 0.0
+        model.momentum_regressor(q, work.unit, work.Yp, work.Yr)
+        for i in range(k, n):
+            work.inertia[k, i] = 0.0
+            for j in range(work.Yp.shape[1]):
+                parameter = theta[j] - _LEAST_INERTIA * P0[j]
+                work.inertia[k, i] += work.Yp[i, j] * parameter
 
 
 @inner
-def is_in_question(settings: Settings, state: State, residual: float) -> bool:
-    """Return whether a full window must be compared with its parts, for want of another measure."""
-    is_full = state.rows[0] == settings.window
-    if not is_full or state.least_residual[0] > 0.0 or settings.window == 1:
+def is_in_question(
+    settings: Settings, state: State, sliding: Window, residual: float
+) -> bool:
+    """Whether a full window must be compared with its parts: no other has been accepted yet."""
+    is_full = window.is_full(sliding.settings, sliding.state)
+    if not is_full or state.least_residual[0] > 0.0 or sliding.settings.length == 1:
         return False
     split = state.split_residual[0]
     is_new = split == 0.0 or residual < _FALLEN * split
     return bool(is_new and residual > _GATE * settings.residual_floor)
 
 
-@inner
-def solve(settings: Settings, state: State, signals: Signals) -> None:
-    """Factor Phi + rho R, and solve Phi theta = b, with theta in `signals.work`."""
-    window.regularized_factor(
-        state.active,
-        settings.rho,
-        settings.information,
-        signals.Phi,
-        signals.b,
-        signals.factor,
-    )
-    for j in range(settings.m):
-        signals.work[j] = signals.b[j]
-    cholesky_solve(signals.factor, signals.work)
+@called
+def part_residual(
+    sliding: Window, prior: Prior, active: Array, part: Array, rows: int
+) -> float:
+    """Return the mean square residual of some rows of the window, fitted apart.
 
-
-@inner
-def agrees_with_parts(
-    settings: Settings, state: State, signals: Signals, residual: float
-) -> bool:
-    """Check the residual of a full window against those of its two parts, each fitted apart.
-
-    If they contradict each other, only the newer part stays in the window.  Restores
-    Phi, b, its factor and the solution of the whole window in `signals`.
+    `part` (m + 1, m + 1) is the sum of their [X | u]^T [X | u].  Their equations and
+    solution are left in the scratch of the window.
     """
-    length = settings.window
-    newer_rows = window.newer_part(state, signals.newer)
-    least = residual
-    for k in range(3):
-        if k == 0:
-            rows = length - newer_rows
-            sums.add(state.running, -1.0, signals.newer, signals.part)
-        elif k == 1:
-            rows = newer_rows
-            sums.add(signals.newer, 0.0, signals.newer, signals.part)
-        else:
-            rows = length
-            sums.add(state.running, 0.0, state.running, signals.part)
-        window.average_window(signals.part, rows, signals.Phi, signals.b)
-        if settings.prior_weight > 0.0:
-            prior = settings.initial_estimate
-            weight = settings.prior_weight
-            window.pull_to(prior, weight, settings.information, signals.Phi, signals.b)
-        solve(settings, state, signals)
-        least = min(least, window_residual(signals.part, signals.work) / rows)
-    if residual <= _GATE * explained(settings, state, least):
-        return True
-    state.split_residual[0] = residual
-    state.rows[0] = float(newer_rows)
-    sums.add(signals.newer, 0.0, signals.newer, state.running)
-    window.reset_direction(state)
-    return False
+    work = sliding.work
+    window.fill_equations(sliding.settings, work, prior, part, rows)
+    window.solve(sliding.settings, work, prior.information, active)
+    return window_residual(part, work.solution) / rows
 
 
 @inner
-def accept_window(settings: Settings, state: State, signals: Signals) -> bool:
-    """Check that the window is consistent and its solution physical; if so, keep the solution.
+def best_part_residual(
+    sliding: Window, prior: Prior, active: Array, newer_rows: int
+) -> float:
+    """Return the smaller residual of the two parts of a full window, each fitted apart.
+
+    `sliding.work.newer` is the sum of its `newer_rows` newer rows.  Phi, b, the factor
+    and the solution of the whole window are in its scratch again afterwards.
+    """
+    work = sliding.work
+    whole = sliding.state.running
+    length = sliding.settings.length
+    sums.add(whole, -1.0, work.newer, work.part)
+    older = part_residual(sliding, prior, active, work.part, length - newer_rows)
+    newer = part_residual(sliding, prior, active, work.newer, newer_rows)
+    part_residual(sliding, prior, active, whole, length)
+    return min(older, newer)
+
+
+@inner
+def split_window(
+    settings: Settings,
+    state: State,
+    sliding: Window,
+    prior: Prior,
+    residual: float,
+) -> bool:
+    """Remove the older part of a full window if the parts contradict each other; return whether.
+
+    They do if one of them, fitted apart, explains its rows better than the window with
+    its `residual` by more than the gate.
+    """
+    newer = sliding.work.newer
+    rows = window.newer_part(sliding.state, newer)
+    best = best_part_residual(sliding, prior, state.active, rows)
+    best = min(residual, best)
+    if residual <= _GATE * explained(settings, state.least_residual[0], best):
+        return False
+    state.split_residual[0] = residual
+    window.keep_newer(sliding.state, newer, rows)
+    return True
+
+
+@inner
+def accept_window(
+    settings: Settings,
+    state: State,
+    work: Work,
+    sliding: Window,
+    prior: Prior,
+    model: ArmModel,
+    q: Array,
+) -> bool:
+    """Keep the solution of the window if it is consistent and physical; return whether.
 
     A window that is not full, or has an unusually large residual, is pulled to the
-    anchor: Phi + a R, b + a R theta_anchor, in `signals`.
+    anchor: Phi + a R, b + a R theta_anchor, in the scratch of the window.  The inertia
+    is that at the position q (n,).
     """
-    m = settings.m
-    solution = signals.work
+    now = sliding.work
+    solution = now.solution
+    m = solution.size
     for j in range(m):
-        solution[j] = signals.b[j]
-    cholesky_solve(signals.factor, solution)
-    residual = window_residual(state.running, solution) / state.rows[0]
-    missing = 1.0 - state.rows[0] / settings.window
+        solution[j] = now.b[j]
+    cholesky_solve(now.factor, solution)
+    rows = sliding.state.rows[0]
+    residual = window_residual(sliding.state.running, solution) / rows
+    missing = 1.0 - rows / sliding.settings.length
     is_first = state.latched[0] == 0.0
-    if is_in_question(settings, state, residual) and not agrees_with_parts(
-        settings, state, signals, residual
+    if is_in_question(settings, state, sliding, residual) and split_window(
+        settings, state, sliding, prior, residual
     ):
         return False
-    if missing <= 0.0 and (
-        state.least_residual[0] == 0.0 or residual < state.least_residual[0]
-    ):
-        state.least_residual[0] = residual
-    if residual > _GATE * explained(settings, state, state.least_residual[0]):
+    least = state.least_residual[0]
+    if missing <= 0.0 and (least == 0.0 or residual < least):
+        least = state.least_residual[0] = residual
+    if residual > _GATE * explained(settings, least, least):
         return False
-    doubt = _DOUBT * max(0.0, residual - _USUAL * state.least_residual[0])
-    pull = settings.anchor_weight * missing + doubt
+    pull = settings.anchor_weight * missing
+    pull += _DOUBT * max(0.0, residual - _USUAL * least)
     if pull > 0.0:
-        window.pull_to(state.anchor, pull, settings.information, signals.Phi, signals.b)
-        solve(settings, state, signals)
-    if not is_physical(settings, signals, solution):
+        window.pull_to(state.anchor, pull, prior.information, now.Phi, now.b)
+        window.solve(sliding.settings, now, prior.information, state.active)
+    find_spare_inertia(model, work, q, solution, prior.estimate)
+    if not cholesky_factor(work.inertia):
         return False
     for j in range(m):
         state.solution[j] = solution[j]
     state.residual[0] = residual
-    if missing <= 0.0 and (is_first or window.is_at_start(settings, state)):
+    is_start = window.is_at_start(sliding.settings, sliding.state)
+    if missing <= 0.0 and (is_first or is_start):
         for j in range(m):
             state.anchor[j] = solution[j]
     return True
 
 
 @inner
-def reject_columns(settings: Settings, state: State, signals: Signals) -> None:
+def reject_columns(
+    settings: Settings, state: State, sliding: Window, prior: Prior, first: int
+) -> None:
     """Reject the disturbance columns that this window cannot distinguish from the parameters.
 
-    The window must excite the parameters without any column; then the column with the
-    largest entry in the minimum eigenvector is rejected, repeatedly, until the rest is
-    excited.  This happens at the first settled window that is excited enough, and once
-    per window while a column is rejected.
+    The columns are those from the `first` on.  The window must excite the parameters
+    without any column; then the column with the largest entry in the minimum
+    eigenvector is rejected, repeatedly, until the rest is excited.  This happens at the
+    first settled window that is excited enough, and once per window while a column is
+    rejected.
     """
-    for j in range(settings.p, settings.m):
-        state.active[j] = 0.0
-    window.reset_direction(state)
+    active = state.active
+    m = active.size
+    direction = sliding.state.min_eigenvector
+    for j in range(first, m):
+        active[j] = 0.0
+    window.reset_direction(sliding.state)
     parameters_excited = (
-        window.excitation(settings, state, signals, _COLD) >= settings.sigma
+        window.find_excitation(sliding, prior, active, _COLD)
+        >= settings.excitation_threshold
     )
-    for j in range(settings.p, settings.m):
-        state.active[j] = 1.0
+    for j in range(first, m):
+        active[j] = 1.0
     if not parameters_excited:
         state.columns_checked[0] = 0.0  # readmit all, until a window is excited
-        window.reset_direction(state)
+        window.reset_direction(sliding.state)
         return
     state.columns_checked[0] = 1.0
-    for _ in range(settings.p, settings.m):
-        window.reset_direction(state)
-        if window.excitation(settings, state, signals, _COLD) >= settings.sigma:
+    for _ in range(first, m):
+        window.reset_direction(sliding.state)
+        value = window.find_excitation(sliding, prior, active, _COLD)
+        if value >= settings.excitation_threshold:
             return
-        worst = settings.p
-        for j in range(settings.p, settings.m):
-            strength = abs(state.min_eigenvector[j]) * state.active[j]
-            if strength > abs(state.min_eigenvector[worst]) * state.active[worst]:
-                worst = j
-        state.active[worst] = 0.0
+        active[strongest(direction, active, first)] = 0.0
 
 
 @inner
-def readmit_columns(settings: Settings, state: State, signals: Signals) -> None:
+def strongest(direction: Array, active: Array, first: int) -> int:
+    """Return the column, from the `first` on, that has most of a `direction` (m,)."""
+    worst = first
+    for j in range(first, direction.size):
+        strength = abs(direction[j]) * active[j]
+        if strength > abs(direction[worst]) * active[worst]:
+            worst = j
+    return worst
+
+
+@inner
+def readmit_columns(
+    settings: Settings, state: State, sliding: Window, prior: Prior, first: int
+) -> None:
     """Check rejected columns again, once per window: a later one may distinguish them."""
     rejected = 0.0
-    for j in range(settings.p, settings.m):
+    for j in range(first, state.active.size):
         rejected += 1.0 - state.active[j]
-    if rejected == 0.0 or not window.is_at_start(settings, state):
+    is_start = window.is_at_start(sliding.settings, sliding.state)
+    if rejected == 0.0 or not is_start:
         return
-    reject_columns(settings, state, signals)
+    reject_columns(settings, state, sliding, prior, first)
 
 
 @inner
@@ -258,43 +336,79 @@ def is_preferred(settings: Settings, state: State, value: float) -> bool:
 
 
 @inner
+def has_settled(settings: Settings, sliding: Window, t: float, dt: float) -> bool:
+    """Whether the window may be learned from at time t [s].
+
+    After a change of the arm it need not be full, but must span at least T_a.
+    """
+    of = sliding.settings
+    period = of.row_interval * dt
+    settling_time = settings.learning_start - of.length * period
+    rows = sliding.state.rows[0]
+    settled = rows == of.length or rows * period >= settling_time
+    return bool(t >= settings.learning_start and settled)
+
+
+@inner
 def update_excitation(
-    settings: Settings, state: State, signals: Signals, t: float, dt: float
+    settings: Settings,
+    state: State,
+    work: Work,
+    sliding: Window,
+    prior: Prior,
+    model: ArmModel,
+    q: Array,
+    t: float,
+    dt: float,
 ) -> None:
     """Compute lambda_min of the window; from tau_d + T_a on, latch the window if it suffices (27).
 
-    After a change of the arm the window need not be full, but must span at least T_a.
+    q (n,) [rad] is the position of the arm at time t [s].
     """
-    if state.rows[0] == 0.0:
+    if sliding.state.rows[0] == 0.0:
         return
-    period = settings.row_interval * dt
-    settling_time = settings.learning_start - settings.window * period
-    settled = (
-        state.rows[0] == settings.window or state.rows[0] * period >= settling_time
-    )
-    learning = t >= settings.learning_start and settled
+    first = work.Yp.shape[1]
+    learning = has_settled(settings, sliding, t, dt)
     if learning and state.columns_checked[0] == 0.0:
-        reject_columns(settings, state, signals)
+        reject_columns(settings, state, sliding, prior, first)
     elif learning:
-        readmit_columns(settings, state, signals)
-    value = window.excitation(settings, state, signals, _WARM)
+        readmit_columns(settings, state, sliding, prior, first)
+    value = window.find_excitation(sliding, prior, state.active, _WARM)
     state.lambda_min[0] = value
-    state.best_lambda[0] *= 1.0 - _FORGETTING * settings.interval / (
-        settings.window * settings.row_interval
+    of = sliding.settings
+    state.best_lambda[0] *= 1.0 - _FORGETTING * of.interval / (
+        of.length * of.row_interval
     )
-    if not (
-        learning and value >= settings.sigma and is_preferred(settings, state, value)
-    ):
+    suffices = value >= settings.excitation_threshold
+    if not (learning and suffices and is_preferred(settings, state, value)):
         return
     consistent = settings.change_detection == 0
-    if not (consistent or accept_window(settings, state, signals)):
+    if not (
+        consistent or accept_window(settings, state, work, sliding, prior, model, q)
+    ):
         return
-    for i in range(settings.m):
-        state.b[i] = signals.b[i]
-        for j in range(settings.m):
-            state.Phi[i, j] = signals.Phi[i, j]
-            state.factor[i, j] = signals.factor[i, j]
+    latch(state, sliding, value, t)
+
+
+@inner
+def latch(state: State, sliding: Window, value: float, t: float) -> None:
+    """Latch the window, whose lambda_min is the `value`, at time t [s]."""
+    now = sliding.work
+    for i in range(now.b.size):
+        state.b[i] = now.b[i]
+        for j in range(now.b.size):
+            state.Phi[i, j] = now.Phi[i, j]
+            state.factor[i, j] = now.factor[i, j]
     state.latched[0] = 1.0
-    if state.rows[0] == settings.window:
+    if window.is_full(sliding.settings, sliding.state):
         state.best_lambda[0] = max(value, state.best_lambda[0])
     state.latch_time[0] = t
+
+
+@inner
+def unlatch(state: State, estimate: Array) -> None:
+    """Forget the latched window; the `estimate` (m,) becomes the anchor."""
+    state.latched[0] = 0.0
+    state.best_lambda[0] = 0.0
+    for j in range(estimate.size):
+        state.anchor[j] = estimate[j]

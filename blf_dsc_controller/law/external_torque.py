@@ -66,6 +66,7 @@ class Settings(NamedTuple):
     window: int  # N, rows in a window of the learning
     row_interval: int  # samples between two of them
     coulomb_velocity: float  # rad/s
+    row_variance: float  # of rows that count, where residuals are at their floor
     unmodelled: Annotated[Array, 'n']  # rms torque that no column describes, N m
 
 

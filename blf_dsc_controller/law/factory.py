@@ -39,54 +39,28 @@ from blf_dsc_controller.configuration import law_file
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.robot import drive_model, parameters_of
 from blf_dsc_controller.law import (
+    adaptation,
     apparent_inertia,
     barrier,
+    columns,
+    disturbance,
+    excitation,
     external_torque,
+    feedback,
     friction,
+    prediction,
+    surface,
+    torque,
     weighing,
+    window,
 )
 from blf_dsc_controller.law.backstepping import Backstepping
 from blf_dsc_controller.law.blf_dsc import BlfDsc
 from blf_dsc_controller.law.controller import Controller
 from blf_dsc_controller.law.interface import Law
-from blf_dsc_controller.law.state import CHOICES, FILTERED, Settings
+from blf_dsc_controller.law.state import STATE, Settings
 from blf_dsc_controller.numerics.algebra import inverse, product
 from blf_dsc_controller.reference.approach import plan_start, reference_of
-
-_PARAMETER_OF = {
-    'bound': 'barrier.bound',
-    'funnel_rate': 'barrier.funnel_rate',
-    'weight': 'barrier.weight',
-    'slope_limit': 'barrier.slope_limit',
-    'Kp': 'feedback.gain',
-    'K': 'surface.gain',
-    'mu': 'surface.mu',
-    'time_constant': 'surface.time_constant',
-    'known_rate': 'surface.known_rate',
-    'damping_rate': 'feedback.damping_rate',
-    'd2': 'feedback.damping',
-    'gamma': 'disturbance.gain',
-    'eta': 'disturbance.leakage',
-    'torque_limit': 'torque.limit',
-    'rate_limit': 'torque.rate_limit',
-    'kappa': 'learning.weight',
-    'update': 'learning.update',
-    'prediction': 'learning.prediction',
-    'rho': 'learning.regularization',
-    'sigma': 'learning.excitation_threshold',
-    'bias': 'learning.bias',
-    'viscous': 'learning.viscous',
-    'coulomb': 'learning.coulomb',
-    'coulomb_velocity': 'learning.coulomb_velocity',
-    'frequencies': 'learning.frequencies',
-    'ripple_cycles': 'learning.ripple_cycles',
-    'pole': 'learning.filter_pole',
-    'radius': 'learning.radius',
-    'compensation': 'learning.compensation',
-    'bumpless': 'learning.bumpless',
-    'anchor_weight': 'learning.anchor_weight',
-}
-"""Parameters that settings take as they are; the others are computed from several."""
 
 _COLUMNS = 1.0  # Gamma of the disturbance columns
 _OMEGA = 100.0  # rad/s, of the filter (8)
@@ -122,7 +96,7 @@ class Column(NamedTuple):
 
 
 def columns_of(config: ControllerConfig) -> tuple[Column, ...]:
-    """Return the disturbance columns, in the order of `prediction.fill_columns` and `ripple`.
+    """Return the disturbance columns, in the order of `columns` and `ripple`.
 
     The standard deviation is half the initial estimate, or 5 % of the rated torque
     where that is zero, for `viscous` at the largest velocity of the reference.
@@ -196,192 +170,233 @@ def prior_covariance(config: ControllerConfig) -> np.ndarray:
 
 
 def settings_of_config(config: ControllerConfig) -> Settings:
-    """Return the settings of a configuration, in the paper's symbols.
+    """Return the settings of a configuration: those of each part of the law.
 
-    A gain that is not computed here is the parameter of the same symbol, or of the same
-    name.
+    A setting that is not computed here is the parameter of the same name.
     """
     model = model_of(config)
-    columns = columns_of(config)
-    m = model.p + len(columns)
-    window = _window(config)
-    residuals = _residuals(config, model.n)
-    computed = {
-        'model': model,
-        'n': model.n,
-        'p': model.p,
-        'm': m,
-        **_of_other_laws(model.n),
-        **_barrier(config),
-        **window,
-        **residuals,
-        'contact': _contact(config, residuals, window),
-        'friction': None,  # follows from the others
-        **_estimates(config, model.p, columns),
-        **_known_arm(config, model.p),
-        **_inertias(config, model.n),
-        'weighing': _weighing(config, m, residuals, window),
-        **_drive(config),
-    }
-    settings = Settings(**(_gains(config) | computed))
-    settings = settings._replace(**_of_law(config, settings))
+    learned = columns_of(config)
+    m = model.p + len(learned)
+    truth = config.truth
+    known = (truth.constant, truth.amplitude, truth.frequency, truth.phase)
+    covariance = prior_covariance(config)
+    initial = (column.initial for column in learned)
+    inertia = _joint_inertia(config)
+    row = _row(config)
+    sliding = _window(config)
+    settings = filled(
+        Settings,
+        config.learning,
+        model=model,
+        n=model.n,
+        p=model.p,
+        m=m,
+        memory=0,
+        has_barrier=int(law_of(config).has_barrier),
+        truth_known=int(bool(truth.parameters)),
+        feed_forward=0,
+        initial_estimate=np.array((*config.learning.initial_estimate, *initial)),
+        information=inverse(covariance),
+        joint_inertia=inertia,
+        robust_gain=np.zeros(model.n),
+        true_parameters=np.array(truth.parameters or (0.0,) * model.p),
+        true_disturbance=np.array(known),
+        barrier=_barrier(config),
+        surface=filled(surface.Settings, config.surface, lag=row.lag),
+        feedback=_feedback(config),
+        disturbance=filled(disturbance.Settings, config.disturbance, config.learning),
+        torque=_torque(config),
+        columns=_columns(config, model.p),
+        row=row,
+        window=sliding,
+        excitation=_excitation(config),
+        adaptation=_adaptation(config, model.p, learned, covariance),
+        contact=_contact(config, sliding),
+        friction=None,  # follows from the others
+        rotors=_rotors(config, row.lag, inertia),
+        weighing=_weighing(config, m, row, sliding),
+    )
+    settings = _of_law(config, settings)
     return settings._replace(friction=friction_settings(settings))
 
 
-def _gains(config: ControllerConfig) -> dict[str, Any]:
-    """Return the settings that are parameters of the configuration."""
-    return {name: _setting(config, name, at) for name, at in _PARAMETER_OF.items()}
-
-
-def _setting(config: ControllerConfig, name: str, parameter: str) -> Any:
-    """Return the value of a parameter as kernels take it: choices as their number."""
-    group, _, key = parameter.partition('.')
-    value = getattr(getattr(config, group), key)
-    if name in CHOICES:
-        return CHOICES[name].index(value)
-    return np.array(value) if isinstance(value, tuple) else value
-
-
-def _of_other_laws(n: int) -> dict[str, Any]:
-    """Return what `blf_dsc` does without: terms of other laws, that are zero."""
-    return {'Wc': 0.0, 'memory': 0, 'feed_forward': 0, 'mu_bar': np.zeros(n)}
-
-
-def _barrier(config: ControllerConfig) -> dict[str, Any]:
-    """Return the bound at the start [rad], and where the slope is limited [rad], (n,) each."""
+def _barrier(config: ControllerConfig) -> barrier.Settings:
+    """Return the barrier, with the bound at the start, and where its slope is limited."""
     given = config.barrier
     joints = zip(given.bound, given.weight, given.slope_limit, strict=True)
-    return {
-        'has_barrier': int(law_of(config).has_barrier),
-        'initial_bound': np.array(given.widest),
-        'knee': np.array([barrier.knee(*joint) for joint in joints]),
-    }
+    return filled(
+        barrier.Settings,
+        given,
+        initial_bound=np.array(given.widest),
+        knee=np.array([barrier.knee(*joint) for joint in joints]),
+    )
 
 
-def _window(config: ControllerConfig) -> dict[str, Any]:
-    """Return what enters the excitation window, and when it is checked."""
+def _feedback(config: ControllerConfig) -> feedback.Settings:
+    """Return the feedback of the velocity error, and what of it acts through the inertia."""
+    return filled(
+        feedback.Settings,
+        config.feedback,
+        follows_inertia=int(_follows_inertia(config)),
+        decoupled=int(config.feedback.inertia == 'none'),
+    )
+
+
+def _follows_inertia(config: ControllerConfig) -> bool:
+    """Whether the whole feedback acts through the inertia matrix."""
+    return config.model == 'urdf' and config.feedback.inertia == 'whole'
+
+
+def _torque(config: ControllerConfig) -> torque.Settings:
+    """Return the limits of the torque, and the model of what the drives add."""
+    chain, inertias = drive_model(config.robot, config.joints)
+    return filled(
+        torque.Settings,
+        config.torque,
+        effort_is_whole=int(config.robot.effort != 'commanded'),
+        drive=inertias.size,
+        drive_size=chain.size,
+        drive_chain=chain,
+        drive_inertias=inertias,
+    )
+
+
+def _columns(config: ControllerConfig, p: int) -> columns.Settings:
+    """Return which disturbance columns there are."""
     learning = config.learning
+    return filled(
+        columns.Settings,
+        learning,
+        first=p,
+        tones=len(learning.frequencies),
+        ripples=len(learning.ripple_cycles),
+    )
+
+
+def _row(config: ControllerConfig) -> prediction.Settings:
+    """Return how rows are formed; those of all joints are scaled to the least of them."""
+    is_urdf = config.model == 'urdf'
+    return filled(
+        prediction.Settings,
+        config.learning,
+        motion_scale=_SLOW if is_urdf else 0.0,
+        lag=config.robot.lag if is_urdf else 0.0,
+        omega=_OMEGA,
+        row_weight=_least_floor(config) / np.array(config.learning.residual_floor),
+    )
+
+
+def _least_floor(config: ControllerConfig) -> float:
+    """Return the least of the joints' rms unmodelled torques [N m]."""
+    return min(config.learning.residual_floor)
+
+
+def _window(config: ControllerConfig) -> window.Settings:
+    """Return what enters the excitation window, and when it is checked."""
     is_urdf = config.model == 'urdf'
     T = config.sample_time
     row_interval = max(1, round(_ROWS / T)) if is_urdf else 1
     between_checks = _SLOWER_CHECKS if is_urdf else _CHECKS
+    least = _least_floor(config)
+    return filled(
+        window.Settings,
+        config.learning,
+        length=round(config.learning.window / (T * row_interval)),
+        row_interval=row_interval,
+        interval=max(1, round(between_checks / T)),
+        prior_weight=(_PRIOR if is_urdf else 0.0) * least * least,
+    )
+
+
+def _excitation(config: ControllerConfig) -> excitation.Settings:
+    """Return which windows are learned from."""
+    learning = config.learning
+    least = _least_floor(config)
+    # Lambda is a heuristic: its rows contradict each other on any arm.
     is_lambda = learning.prediction == 'lambda'
-    return {
-        'window': round(learning.window / (T * row_interval)),
-        'row_interval': row_interval,
-        'interval': max(1, round(between_checks / T)),
-        'tones': len(learning.frequencies),
-        'ripples': len(learning.ripple_cycles),
-        'learning_start': learning.window + learning.settling_time,
-        'motion_scale': _SLOW if is_urdf else 0.0,
-        'omega': _OMEGA,
-        # Lambda is a heuristic: its rows contradict each other on any arm.
-        'change_detection': int(learning.change_detection and not is_lambda),
-    }
+    return filled(
+        excitation.Settings,
+        learning,
+        learning_start=learning.window + learning.settling_time,
+        change_detection=int(learning.change_detection and not is_lambda),
+        residual_floor=len(config.joints) * least * least,
+    )
 
 
-def _residuals(config: ControllerConfig, n: int) -> dict[str, Any]:
-    """Return what follows from the rms unmodelled torque [N m] of each joint.
-
-    The rows of all joints are scaled to the least of them.
-    """
-    floor = np.array(config.learning.residual_floor)
-    least = float(floor.min())
-    prior = _PRIOR if config.model == 'urdf' else 0.0
-    return {
-        'row_weight': least / floor,
-        'residual_floor': n * least * least,
-        'prior_weight': prior * least * least,
-        'row_variance': _PRIOR * least * least,
-    }
+def _adaptation(
+    config: ControllerConfig,
+    p: int,
+    learned: Sequence[Column],
+    covariance: np.ndarray,
+) -> adaptation.Settings:
+    """Return the update, and the range of theta: p parameters, then the columns."""
+    learning = config.learning
+    gains = learning.adaptation_gain + (_COLUMNS,) * len(learned)
+    return filled(
+        adaptation.Settings,
+        learning,
+        leakage=0.0,
+        adaptation_gain=np.array(gains),
+        variance=np.diag(covariance).copy(),
+        least=np.array([-np.inf] * p + [column.least for column in learned]),
+        most=np.array([np.inf] * p + [column.most for column in learned]),
+    )
 
 
 def _contact(
-    config: ControllerConfig, residuals: dict[str, Any], window: dict[str, Any]
+    config: ControllerConfig, sliding: window.Settings
 ) -> external_torque.Settings:
     """Return whether contacts are found, what they do, and what is no contact."""
     contact = config.contact
-    least = np.sqrt(residuals['residual_floor'] / len(config.joints))
+    least = _least_floor(config)
     return filled(
         external_torque.Settings,
         contact,
         loads=int(contact.loads and config.learning.weighing),
         freezes=int(contact.reaction != 'none'),
-        window=window['window'],
-        row_interval=window['row_interval'],
+        window=sliding.length,
+        row_interval=sliding.row_interval,
         coulomb_velocity=config.learning.coulomb_velocity,
-        unmodelled=least / residuals['row_weight'],
+        row_variance=_PRIOR * least * least,
+        unmodelled=_unmodelled(config),
     )
+
+
+def _unmodelled(config: ControllerConfig) -> np.ndarray:
+    """Return the rms torque (n,) [N m] that no column describes."""
+    least = np.sqrt(_excitation(config).residual_floor / len(config.joints))
+    return np.asarray(least / _row(config).row_weight)
 
 
 def friction_settings(settings: Settings) -> friction.Settings:
     """Return what is known of friction, by all other settings."""
     n = settings.n
-    viscous = settings.p + n * settings.bias
-    coulomb = viscous + n * settings.viscous
+    of, adapts = settings.columns, settings.adaptation
+    viscous = settings.p + n * of.bias
+    coulomb = viscous + n * of.viscous
     own = slice(coulomb, coulomb + n)
 
     def of_coulomb(values: np.ndarray) -> np.ndarray:
-        return values[own] if settings.coulomb else np.zeros(n)
+        return values[own] if of.coulomb else np.zeros(n)
 
+    is_filtered = settings.row.prediction == prediction.FILTERED
     return friction.Settings(
-        viscous=settings.viscous,
-        coulomb=settings.coulomb,
+        viscous=of.viscous,
+        coulomb=of.coulomb,
         first_viscous=viscous,
         first_coulomb=coulomb,
-        learns=int(settings.coulomb and settings.prediction == FILTERED),
-        bumpless=settings.bumpless,
-        coulomb_velocity=settings.coulomb_velocity,
-        lag=settings.lag,
-        pole=settings.pole,
+        learns=int(of.coulomb and is_filtered),
+        bumpless=settings.disturbance.bumpless,
+        coulomb_velocity=of.coulomb_velocity,
+        lag=settings.row.lag,
+        pole=settings.row.filter_pole,
         unmodelled=settings.contact.unmodelled,
         initial=of_coulomb(settings.initial_estimate),
-        variance=of_coulomb(settings.variance),
-        least=of_coulomb(settings.least),
-        most=of_coulomb(settings.most),
-        gain=of_coulomb(settings.Gamma * settings.kappa),
+        variance=of_coulomb(adapts.variance),
+        least=of_coulomb(adapts.least),
+        most=of_coulomb(adapts.most),
+        gain=of_coulomb(adapts.adaptation_gain * adapts.weight),
     )
-
-
-def _estimates(
-    config: ControllerConfig, p: int, columns: Sequence[Column]
-) -> dict[str, Any]:
-    """Return what is known of theta before the start: p parameters, then the columns."""
-    learning = config.learning
-    initial = [column.initial for column in columns]
-    gains = learning.adaptation_gain + (_COLUMNS,) * len(columns)
-    covariance = prior_covariance(config)
-    return {
-        'Gamma': np.array(gains),
-        'initial_estimate': np.array((*learning.initial_estimate, *initial)),
-        'information': inverse(covariance),
-        'variance': np.diag(covariance).copy(),
-        'least': np.array([-np.inf] * p + [column.least for column in columns]),
-        'most': np.array([np.inf] * p + [column.most for column in columns]),
-    }
-
-
-def _known_arm(config: ControllerConfig, p: int) -> dict[str, Any]:
-    """Return the truth: p parameters, zero where unknown, and the disturbance."""
-    truth = config.truth
-    disturbance = (truth.constant, truth.amplitude, truth.frequency, truth.phase)
-    return {
-        'truth_known': int(bool(truth.parameters)),
-        'true_parameters': np.array(truth.parameters or (0.0,) * p),
-        'true_disturbance': np.array(disturbance),
-    }
-
-
-def _drive(config: ControllerConfig) -> dict[str, Any]:
-    """Return the gravity that the drive adds, and whether measured efforts contain it."""
-    chain, inertias = drive_model(config.robot, config.joints)
-    return {
-        'effort_is_whole': int(config.robot.effort != 'commanded'),
-        'drive': inertias.size,
-        'drive_size': chain.size,
-        'drive_chain': chain,
-        'drive_inertias': inertias,
-    }
 
 
 def joint_inertia(config: ControllerConfig, P: tuple[float, ...]) -> np.ndarray:
@@ -393,45 +408,54 @@ def joint_inertia(config: ControllerConfig, P: tuple[float, ...]) -> np.ndarray:
     return over_postures(chain, base, robot.payload, P, *limits).free_inertia
 
 
-def _inertias(config: ControllerConfig, n: int) -> dict[str, Any]:
-    """Return m of each joint, and what `apparent_inertia` needs to measure assumed rotors."""
-    is_urdf = config.model == 'urdf'
-    follows_inertia = is_urdf and config.feedback.inertia == 'whole'
-    P0 = config.learning.initial_estimate
-    m = joint_inertia(config, P0) if is_urdf else np.ones(n)
-    lag = config.robot.lag if is_urdf else 0.0
+def _joint_inertia(config: ControllerConfig) -> np.ndarray:
+    """Return m (n,) [kg m^2] of each joint by the initial estimate; ones of a planar arm."""
+    if config.model != 'urdf':
+        return np.ones(len(config.joints))
+    return joint_inertia(config, config.learning.initial_estimate)
+
+
+def _rotors(
+    config: ControllerConfig, lag: float, inertia: np.ndarray
+) -> apparent_inertia.Settings:
+    """Return what `apparent_inertia` needs to measure assumed rotors.
+
+    `inertia` (n,) [kg m^2] is m of each joint, `lag` [s] that of `robot.lag`.
+    """
+    n = len(config.joints)
     rotors = apparent_inertia.Settings(
-        unsure=0, lag=lag, rotor=np.zeros(n), joint=m, link=np.ones(n)
+        unsure=0,
+        lag=lag,
+        rotor=np.zeros(n),
+        joint=inertia,
+        link=np.ones(n),
     )
-    if follows_inertia and not config.robot.rotor_inertia:
-        robot = config.robot
-        chain = robot.chain(config.joints)
-        links = parameters_of(robot, chain).of(chain.inertias, np.zeros(n))
-        rotors = rotors._replace(
-            unsure=1,
-            rotor=robot.rotors(chain),
-            link=joint_inertia(config, tuple(links)),
-        )
-    return {
-        'follows_inertia': int(follows_inertia),
-        'decoupled': int(config.feedback.inertia == 'none'),
-        'lag': lag,
-        'joint_inertia': m,
-        'rotors': rotors,
-    }
+    if not _follows_inertia(config) or config.robot.rotor_inertia:
+        return rotors
+    robot = config.robot
+    chain = robot.chain(config.joints)
+    links = parameters_of(robot, chain).of(chain.inertias, np.zeros(n))
+    return rotors._replace(
+        unsure=1,
+        rotor=robot.rotors(chain),
+        link=joint_inertia(config, tuple(links)),
+    )
 
 
 def _weighing(
-    config: ControllerConfig, m: int, residuals: dict[str, Any], window: dict[str, Any]
+    config: ControllerConfig,
+    m: int,
+    row: prediction.Settings,
+    sliding: window.Settings,
 ) -> weighing.Settings:
     """Return how a load in the tip changes the base parameters, and which rows count."""
     settings = weighing.Settings(
         size=0,
-        window=window['window'],
-        row_interval=window['row_interval'],
-        pole=config.learning.filter_pole,
-        motion_scale=window['motion_scale'],
-        unmodelled=residuals['residual_floor'] / len(config.joints),
+        window=sliding.length,
+        row_interval=sliding.row_interval,
+        pole=row.filter_pole,
+        motion_scale=row.motion_scale,
+        unmodelled=_excitation(config).residual_floor / len(config.joints),
         columns=np.zeros((0, 10)),
         scale=np.zeros((4, 10)),
     )
@@ -448,8 +472,8 @@ def _weighing(
     return settings._replace(size=m + 1, columns=columns, scale=D[:4])
 
 
-def _of_law(config: ControllerConfig, settings: Settings) -> dict[str, Any]:
-    """Return the settings of a law that differ from those of `blf_dsc`."""
+def _of_law(config: ControllerConfig, settings: Settings) -> Settings:
+    """Return the settings with what a law does otherwise than `blf_dsc`."""
     of_law = {
         'model_based': _of_model_based,
         'backstepping': _of_backstepping,
@@ -457,61 +481,65 @@ def _of_law(config: ControllerConfig, settings: Settings) -> dict[str, Any]:
     }
     if law_file.is_file(config.law):
         return _of_file(config, settings)
-    return of_law[config.law](config, settings) if config.law in of_law else {}
+    return of_law[config.law](config, settings) if config.law in of_law else settings
 
 
-def _of_model_based(_config: ControllerConfig, settings: Settings) -> dict[str, Any]:
+def _of_model_based(_config: ControllerConfig, settings: Settings) -> Settings:
     """Return the settings of (16): everything is known, nothing adapts."""
     nothing = np.zeros(settings.n)
     columns = settings.initial_estimate[settings.p :]
-    return {
-        'initial_estimate': np.concatenate((settings.true_parameters, columns)),
-        'feed_forward': 1,
-        'd2': nothing,
-        'gamma': nothing,
-        'Gamma': np.zeros(settings.m),
-    }
+    return settings._replace(
+        initial_estimate=np.concatenate((settings.true_parameters, columns)),
+        feed_forward=1,
+        feedback=settings.feedback._replace(damping=nothing),
+        disturbance=settings.disturbance._replace(gain=nothing),
+        adaptation=settings.adaptation._replace(adaptation_gain=np.zeros(settings.m)),
+    )
 
 
-def _of_linear_surface(config: ControllerConfig, n: int) -> dict[str, Any]:
+def _of_linear_surface(config: ControllerConfig, settings: Settings) -> Settings:
     """Return what the laws with a linear surface share; they learn if they are told to."""
-    nothing = np.zeros(n)
-    return {
-        'K': np.array(config.comparison.surface_gain),
-        'd2': nothing,
-        'gamma': nothing,
-        'kappa': config.comparison.learning_weight,
-        'compensation': CHOICES['compensation'].index('state'),
-        'bumpless': 0,
-        'change_detection': 0,
-    }
+    gains = config.comparison
+    nothing = np.zeros(settings.n)
+    return settings._replace(
+        compensation=STATE,
+        surface=settings.surface._replace(gain=np.array(gains.surface_gain)),
+        feedback=settings.feedback._replace(damping=nothing),
+        disturbance=settings.disturbance._replace(gain=nothing, bumpless=0),
+        excitation=settings.excitation._replace(change_detection=0),
+        adaptation=settings.adaptation._replace(weight=gains.learning_weight),
+    )
 
 
-def _of_backstepping(config: ControllerConfig, settings: Settings) -> dict[str, Any]:
+def _of_backstepping(config: ControllerConfig, settings: Settings) -> Settings:
     """Return the settings of (35)."""
-    return _of_linear_surface(config, settings.n) | {
-        'weight': np.array(config.comparison.position_gain),
-        'mu_bar': np.array(config.comparison.robust_gain),
-        'Wc': config.comparison.leakage,
-    }
+    gains = config.comparison
+    linear = _of_linear_surface(config, settings)
+    return linear._replace(
+        barrier=linear.barrier._replace(weight=np.array(gains.position_gain)),
+        robust_gain=np.array(gains.robust_gain),
+        adaptation=linear.adaptation._replace(leakage=gains.leakage),
+    )
 
 
-def _of_slotine_li(config: ControllerConfig, settings: Settings) -> dict[str, Any]:
+def _of_slotine_li(config: ControllerConfig, settings: Settings) -> Settings:
     """Return the settings of Slotine and Li's law: (35) without its extra terms."""
     nothing = np.zeros(settings.n)
-    return _of_linear_surface(config, settings.n) | {
-        'weight': nothing,
-        'gamma': np.array(config.comparison.integral_gain or nothing),
-    }
+    integral = np.array(config.comparison.integral_gain or nothing)
+    linear = _of_linear_surface(config, settings)
+    return linear._replace(
+        barrier=linear.barrier._replace(weight=nothing),
+        disturbance=linear.disturbance._replace(gain=integral),
+    )
 
 
-def _of_file(config: ControllerConfig, settings: Settings) -> dict[str, Any]:
+def _of_file(config: ControllerConfig, settings: Settings) -> Settings:
     """Return the settings of a law of a file: its memory, and the inertias to scale gains by."""
     memory = law_file.memory_of(law_file.load_law(config.law))
-    return {
-        'joint_inertia': least_inertias(config),
-        'memory': size_of(memory)(settings) if memory else 0,
-    }
+    return settings._replace(
+        joint_inertia=least_inertias(config),
+        memory=size_of(memory)(settings) if memory else 0,
+    )
 
 
 def least_inertias(config: ControllerConfig) -> np.ndarray:

@@ -23,13 +23,11 @@ worse, as under a disturbance that lasts, raise it as they come, and contradict 
 from typing import NamedTuple
 
 from blf_dsc_controller.compiled.jit import inner
-from blf_dsc_controller.compiled.layout import Array
+from blf_dsc_controller.compiled.layout import Array, Cell
 from blf_dsc_controller.numerics.algebra import cholesky_factor, whiten
 
 CORRELATION = 0.2  # s, of the residual
 REFRESH = 0.1  # s, from one solution to the next
-# s^2; the mean square, the rows that it is of, and the mean over 0.1 s
-NOISE, MEAN, COUNT, RECENT = range(4)
 _MEMORY = 0.1  # s
 _ALARM = 5.0  # times s^2; an arm that does not change reaches 2.5
 # s^2 before any row, of the square of the torque that is unmodelled; counts as so many
@@ -46,19 +44,40 @@ class Prior(NamedTuple):
     information: Array  # R (m, m)
 
 
-@inner
-def start(unmodelled: float, statistics: Array) -> None:
-    """Begin the `statistics` (4,), of rows in which a mean square of (N m)^2 is `unmodelled`."""
-    statistics[NOISE] = _ASSUMED * unmodelled
-    statistics[MEAN] = 0.0
-    statistics[COUNT] = 0.0
-    statistics[RECENT] = 0.0
+class State(NamedTuple):
+    """Statistics of e^T C^-1 e / n over the rows so far."""
+
+    noise: Cell  # s^2, (N m)^2
+    mean: Cell  # mean square
+    rows: Cell  # that it is of
+    recent: Cell  # mean over 0.1 s
 
 
 @inner
-def row_variance(statistics: Array, period: float) -> float:
+def begin(state: State, unmodelled: float) -> None:
+    """Begin, with rows in which a mean square of (N m)^2 is `unmodelled`."""
+    state.noise[0] = _ASSUMED * unmodelled
+    state.mean[0] = 0.0
+    state.rows[0] = 0.0
+    forget_recent(state)
+
+
+@inner
+def has_begun(state: State) -> bool:
+    """Whether s^2 has its first value."""
+    return bool(state.noise[0] != 0.0)
+
+
+@inner
+def forget_recent(state: State) -> None:
+    """Forget the last rows: those that follow are of another arm."""
+    state.recent[0] = 0.0
+
+
+@inner
+def row_variance(state: State, period: float) -> float:
     """Return a, with a row each `period` [s]: s^2 times the number of rows that count as one."""
-    return float(statistics[NOISE] * CORRELATION / period)
+    return float(state.noise[0] * CORRELATION / period)
 
 
 @inner
@@ -85,20 +104,25 @@ def normalized_square(
 
 @inner
 def update(
-    square: float, unmodelled: float, period: float, most: float, statistics: Array
+    state: State, square: float, unmodelled: float, period: float, most: float
 ) -> bool:
-    """Add e^T C^-1 e / n of a row to the `statistics`; return whether the arm has changed.
+    """Add e^T C^-1 e / n of a row; return whether the arm has changed.
 
     The mean square is of some `most` rows, a window.
     """
-    statistics[RECENT] += min(1.0, period / _MEMORY) * (square - statistics[RECENT])
-    has_changed = statistics[RECENT] > _ALARM * statistics[NOISE]
-    count = min(statistics[COUNT] + 1.0, most)
-    statistics[COUNT] = count
-    usual = min(square, _MOST * statistics[NOISE])
-    statistics[MEAN] += (usual - statistics[MEAN]) / count
+    state.recent[0] += min(1.0, period / _MEMORY) * (square - state.recent[0])
+    has_changed = state.recent[0] > _ALARM * state.noise[0]
+    state.rows[0] = min(state.rows[0] + 1.0, most)
+    usual = min(square, _MOST * state.noise[0])
+    state.mean[0] += (usual - state.mean[0]) / state.rows[0]
+    state.noise[0] = noise_of(state.mean[0], state.rows[0], unmodelled, most)
+    return bool(has_changed)
+
+
+@inner
+def noise_of(mean: float, count: float, unmodelled: float, most: float) -> float:
+    """Return s^2 by the `mean` square of `count` rows, and what is assumed before any."""
     assumed_rows = _ASSUMED_ROWS * (1.0 - count / most)
     share = assumed_rows / (assumed_rows + count)
-    noise = statistics[MEAN] + share * (_ASSUMED * unmodelled - statistics[MEAN])
-    statistics[NOISE] = max(noise, _LEAST * unmodelled)
-    return bool(has_changed)
+    noise = mean + share * (_ASSUMED * unmodelled - mean)
+    return max(noise, _LEAST * unmodelled)

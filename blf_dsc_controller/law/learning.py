@@ -1,28 +1,139 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What composite learning does with each sample: a row of the prediction error, and the window.
+"""What composite learning does with each sample: rows of the prediction error, and the window.
 
-prediction   a row [X | u] with X theta = u, of the last interval
-window       sums of the rows over tau_d
-excitation   whether a window is excited, consistent, and latched
-change       whether the arm has changed, so that the window must be forgotten
-ripple       columns of the torque ripple of gears and motors
-friction     friction from reversals, and how much of it is used
-adaptation   the step of the estimate, once the torque is known
+`observe`, before the torque is known:
+
+columns, ripple   the columns of what is learned besides P
+prediction        a row [X | u] with X theta = u, of the last interval
+window            sums of the rows over tau_d
+change            whether the arm has changed, so that the window must be forgotten
+excitation        whether a window is excited, consistent, and latched
+friction          friction from reversals, and how much of it is used
+
+`adapt`, once it is known:
+
+adaptation        the step of theta^, by the tracking error and the latched window
+disturbance       the step of d^3, which gives up what is learned
 """
 
 from __future__ import annotations
 
 from blf_dsc_controller.compiled.jit import inner
 from blf_dsc_controller.law import (
+    adaptation,
     change,
+    columns,
+    disturbance,
     excitation,
+    external_torque,
     friction,
     prediction,
     ripple,
     window,
 )
 from blf_dsc_controller.law.compensation import compute_regressors, fill_friction
+from blf_dsc_controller.law.innovation import Prior
+from blf_dsc_controller.law.prediction import FILTERED
 from blf_dsc_controller.law.state import Settings, Signals, State
+from blf_dsc_controller.law.window import Window
+
+
+@inner
+def observe(
+    settings: Settings, state: State, signals: Signals, t: float, dt: float
+) -> None:
+    """Compute the regressors; add the row of the last interval; check the excitation when due."""
+    compute_regressors(settings, state, signals)
+    fill_friction(settings, state, signals, dt)
+    friction.follow_motion(settings.friction, state.friction, signals.friction)
+    fill_columns(settings, signals, t, dt)
+    form_row(settings, state, signals, dt)
+    friction.filter_shapes(settings.friction, state.friction, signals.dq, dt)
+    if state.samples[0] == 0.0:
+        return
+    if state.frozen[0] > 0.0:  # the row is of a contact
+        state.frozen[0] = max(0.0, state.frozen[0] - dt)
+        return
+    samples = int(state.samples[0])
+    if samples % settings.window.row_interval == 0:
+        window.push_row(state.window, signals.row)
+        measure_reversals(settings, state, settings.window.row_interval * dt)
+    if settings.excitation.change_detection == 1:
+        detect_change(settings, state, signals, dt)
+    if samples % settings.window.interval == 0:
+        excitation.update_excitation(
+            settings.excitation,
+            state.latch,
+            signals.latch,
+            Window(settings.window, state.window, signals.window),
+            Prior(settings.initial_estimate, settings.information),
+            settings.model,
+            signals.q,
+            t,
+            dt,
+        )
+
+
+@inner
+def fill_columns(settings: Settings, signals: Signals, t: float, dt: float) -> None:
+    """Fill the disturbance columns of H, along the reference, and of [Yr | D], for the row."""
+    of = settings.columns
+    lag = settings.row.lag
+    q, dq = signals.q, signals.dq
+    qr, dqr, ddqr = signals.qr, signals.dqr, signals.ddqr
+    ripple.fill_compensated_ripple(of, lag, qr, dqr, ddqr, dt, signals.H)
+    columns.fill_columns(of, t, dq, signals.Yr)
+    ripple.fill_measured_ripple(of, lag, q, dq, signals.Yr)
+
+
+@inner
+def form_row(settings: Settings, state: State, signals: Signals, dt: float) -> None:
+    """Write the configured row of the last interval to `signals.row` (n, m + 1)."""
+    of, now, row = settings.row, state.row, signals.row
+    Yp, Yr = signals.Yp, signals.Yr
+    if of.prediction != FILTERED:
+        form_lambda_row(settings, state, signals, dt)
+        return
+    if state.samples[0] > 0.0:
+        begins = state.samples[0] <= 1.0
+        prediction.delay_torque(of, now, signals.applied, begins, dt)
+        prediction.fill_interval(now, Yp, Yr, dt, row)
+        if settings.contact.enabled == 1:
+            filter_external_torque(settings, state, signals, dt)
+        prediction.pass_poles(of, now, signals.dqr, dt, row)
+    prediction.keep_regressors(now, Yp, Yr)
+
+
+@inner
+def form_lambda_row(
+    settings: Settings, state: State, signals: Signals, dt: float
+) -> None:
+    """Write the row `lambda` of (24) to `signals.row`; overwrites Yp of `signals`."""
+    q, dq, ddq = signals.q, signals.dq, signals.acceleration
+    alpha2, dalpha2 = state.alpha2, signals.dalpha2
+    begins = state.samples[0] == 0.0
+    prediction.differentiate(
+        settings.row, state.row, signals.xi2, dalpha2, begins, dt, ddq
+    )
+    scale = prediction.lambda_of(ddq, dq, dalpha2, alpha2)
+    settings.model.regressor(q, dq, alpha2, dalpha2, signals.Yp)
+    prediction.fill_lambda_row(
+        scale, signals.Yp, signals.Yr, signals.applied, signals.row
+    )
+
+
+@inner
+def filter_external_torque(
+    settings: Settings, state: State, signals: Signals, dt: float
+) -> None:
+    """Let `external_torque` filter the row of the last interval, before its poles."""
+    for i in range(settings.n):
+        extra = friction.breakaway_torque(
+            settings.friction, state.friction, state.estimate, i
+        )
+        external_torque.filter_interval(
+            settings.contact, state.contact, i, signals.row[i], extra, dt
+        )
 
 
 @inner
@@ -35,17 +146,19 @@ def measure_reversals(settings: Settings, state: State, period: float) -> None:
     """
     if settings.friction.learns == 0:
         return
-    settling_time = settings.learning_start - settings.window * period
-    since_latch = friction.update_since_latch(state.friction, state.latched[0], period)
+    length = settings.window.length
+    latch = state.latch
+    settling_time = settings.excitation.learning_start - length * period
+    since_latch = friction.update_since_latch(state.friction, latch.latched[0], period)
     is_known = (
-        settings.change_detection == 0
-        or state.least_residual[0] > 0.0
-        or state.rows[0] >= 0.5 * settings.window
+        settings.excitation.change_detection == 0
+        or latch.least_residual[0] > 0.0
+        or state.window.rows[0] >= 0.5 * length
     )
     friction.measure_reversals(
         settings.friction,
         state.friction,
-        state.filter2,
+        state.row.filter2,
         state.estimate,
         since_latch <= settling_time or not is_known,
         period,
@@ -53,27 +166,132 @@ def measure_reversals(settings: Settings, state: State, period: float) -> None:
 
 
 @inner
-def observe(
-    settings: Settings, state: State, signals: Signals, t: float, dt: float
+def detect_change(
+    settings: Settings, state: State, signals: Signals, dt: float
 ) -> None:
-    """Compute the regressors; add the row of the last interval; check the excitation when due."""
-    compute_regressors(settings, state, signals)
-    fill_friction(settings, state, signals, dt)
-    friction.follow_motion(settings.friction, state.friction, signals.friction)
-    ripple.fill_compensated_ripple(settings, signals, dt)
-    prediction.fill_columns(settings, t, signals.dq, signals.Yr)
-    ripple.fill_measured_ripple(settings, signals)
-    prediction.form_row(settings, state, signals, dt)
-    friction.filter_shapes(settings.friction, state.friction, signals.dq, dt)
-    if state.samples[0] == 0.0:
+    """Forget the window if the arm has changed: its rows contradict the solution, or each other.
+
+    What a window has taught before it was full is taken back: back to the estimate
+    before.
+    """
+    of, latch, row = settings.excitation, state.latch, signals.row
+    sliding = Window(settings.window, state.window, signals.window)
+    prior = Prior(settings.initial_estimate, settings.information)
+    if change.is_predicted(latch, sliding):
+        samples = int(state.samples[0])
+        unmodelled = of.residual_floor / settings.n
+        has_changed = change.compare_with_rows(
+            state.change, signals.change, sliding, prior, row, unmodelled, samples, dt
+        )
+    else:
+        has_changed = change.compare_with_solution(
+            of, state.change, signals.change, latch, row, dt
+        )
+    if not has_changed:
         return
-    if state.frozen[0] > 0.0:  # the row is of a contact
-        state.frozen[0] = max(0.0, state.frozen[0] - dt)
+    if latch.latched[0] == 1.0 and not window.is_full(settings.window, state.window):
+        take_back(settings, state, signals)
+    change.count_change(state.change, latch, sliding, prior, state.estimate, dt)
+    prediction.forget(state.row)
+
+
+@inner
+def take_back(settings: Settings, state: State, signals: Signals) -> None:
+    """Return to the estimate before the window; the torque stays the same, if configured."""
+    taught = signals.adaptation.tracked
+    for j in range(settings.m):
+        taught[j] = state.estimate[j]
+        state.estimate[j] = state.latch.anchor[j]
+    if settings.disturbance.bumpless == 1:
+        disturbance.hand_over(state.disturbance, signals.H, state.estimate, taught)
+
+
+@inner
+def adapt(
+    settings: Settings, state: State, signals: Signals, dt: float, saturated: bool
+) -> None:
+    """Advance theta^ and d^3 by `dt` [s]: (20), (30).
+
+    While a torque is saturated, the tracking error reflects the limit, not the
+    parameters, so only the prediction error, which uses the applied torque, adapts the
+    estimate.  While a full window is not excited, as at standstill, H^T xi2 is
+    correlated noise and ignored (`change_detection`).  While a contact lasts, and
+    something reacts to it, only d^3 follows.
+    """
+    if state.frozen[0] > 0.0:
+        if not saturated:
+            follow_disturbance(settings, state, signals, dt)
+        hand_over_friction(settings, state, signals)
         return
-    if int(state.samples[0]) % settings.row_interval == 0:
-        window.push_row(state, signals.row)
-        measure_reversals(settings, state, settings.row_interval * dt)
-    if settings.change_detection == 1:
-        change.detect_change(settings, state, signals, dt)
-    if int(state.samples[0]) % settings.interval == 0:
-        excitation.update_excitation(settings, state, signals, t, dt)
+    of, work = settings.adaptation, signals.adaptation
+    latch, estimate, H = state.latch, state.estimate, signals.H
+    adaptation.fill_prediction_error(of, work, latch, estimate)
+    if latch.latched[0] == 1.0:
+        friction.follow_reversals(
+            settings.friction,
+            state.friction,
+            signals.friction,
+            latch.active,
+            estimate,
+            work.rate,
+        )
+    unexcited = (
+        settings.excitation.change_detection == 1
+        and window.is_full(settings.window, state.window)
+        and latch.lambda_min[0] < settings.excitation.excitation_threshold
+    )
+    tracks = not saturated and not unexcited
+    adaptation.adapt(of, work, estimate, H, signals.xi2, settings.p, tracks, dt)
+    if not saturated:
+        follow_disturbance(settings, state, signals, dt)
+    if latch.latched[0] == 1.0:
+        if settings.disturbance.bumpless == 1:
+            disturbance.hand_over(state.disturbance, H, estimate, work.tracked)
+        friction.adapt_breakaway(
+            settings.friction, state.friction, signals.friction, dt
+        )
+    hand_over_friction(settings, state, signals)
+
+
+@inner
+def hand_over_friction(settings: Settings, state: State, signals: Signals) -> None:
+    """Subtract from d^3 what this sample has changed in the compensation of Coulomb friction."""
+    friction.hand_over(
+        settings.friction,
+        state.friction,
+        signals.friction,
+        state.estimate,
+        state.disturbance,
+    )
+
+
+@inner
+def follow_disturbance(
+    settings: Settings, state: State, signals: Signals, dt: float
+) -> None:
+    """Advance d^3 by `dt` [s]: (30), with gamma (M(q, P^(0)) + J~) / m on an arm of a URDF.
+
+    Overwrites Yp and Yr of `signals`.
+    """
+    step = signals.unit
+    disturbance.fill_step(
+        settings.disturbance, state.disturbance, signals.xi2, dt, step
+    )
+    if settings.feedback.follows_inertia == 1:
+        scale_by_inertia(settings, state, signals)
+    for i in range(settings.n):
+        state.disturbance[i] -= step[i]
+        friction.follow_observer(state.friction, signals.friction, i, -step[i])
+
+
+@inner
+def scale_by_inertia(settings: Settings, state: State, signals: Signals) -> None:
+    """Replace x in `signals.unit` by (M(q, P^(0)) + J~) x / m; overwrites Yp and Yr."""
+    x = signals.unit
+    for i in range(settings.n):
+        x[i] /= settings.joint_inertia[i]
+    settings.model.momentum_regressor(signals.q, x, signals.Yp, signals.Yr)
+    for i in range(settings.n):
+        x[i] *= state.rotors.error[i]
+        for j in range(settings.p):
+            x[i] += signals.Yp[i, j] * settings.initial_estimate[j]

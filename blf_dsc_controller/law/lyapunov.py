@@ -9,14 +9,8 @@ from blf_dsc_controller.arms.model import inertia_matrices
 from blf_dsc_controller.compiled.jit import inner
 from blf_dsc_controller.compiled.layout import Array
 from blf_dsc_controller.law import barrier
-from blf_dsc_controller.law.state import (
-    NEWTON,
-    REFERENCE,
-    Sample,
-    Settings,
-    Signals,
-    State,
-)
+from blf_dsc_controller.law.adaptation import NEWTON
+from blf_dsc_controller.law.state import REFERENCE, Sample, Settings, Signals, State
 
 _POSTURES = 181
 
@@ -27,14 +21,10 @@ def error_term(settings: Settings, state: State, signals: Signals) -> float:
     total, xi1 = 0.0, signals.xi1
     for i in range(settings.n):
         if settings.has_barrier == 0:
-            total += 0.5 * settings.weight[i] * xi1[i] ** 2
+            total += 0.5 * settings.barrier.weight[i] * xi1[i] ** 2
         else:
-            bound = signals.bound[i]
-            knee = signals.knee[i]
-            weight = settings.weight[i]
-            limit = settings.slope_limit[i]
-            total += state.rotors.gain_scale[i] * barrier.potential(
-                xi1[i], bound, weight, limit, knee
+            total += state.rotors.gain_scale[i] * barrier.joint_potential(
+                settings.barrier, signals.barrier, xi1[i], signals.bound[i], i
             )
     return total
 
@@ -64,14 +54,17 @@ def fill_energies(
         for j in range(p):
             V[1] += 0.5 * signals.xi2[i] * Yp[i, j] * P[j]
     for j in range(p):
-        if settings.Gamma[j] > 0.0:
+        if settings.adaptation.adaptation_gain[j] > 0.0:
             error = P[j] - state.estimate[j]
-            V[2] += 0.5 * error * error / settings.Gamma[j]
+            V[2] += 0.5 * error * error / settings.adaptation.adaptation_gain[j]
     for i in range(n):
-        if settings.gamma[i] > 0.0:
+        if settings.disturbance.gain[i] > 0.0:
             error = signals.feedforward[i] - state.disturbance[i]
             V[3] += (
-                0.5 * error * error / (state.rotors.gain_scale[i] * settings.gamma[i])
+                0.5
+                * error
+                * error
+                / (state.rotors.gain_scale[i] * settings.disturbance.gain[i])
             )
 
 
@@ -97,16 +90,18 @@ def decay_rate(settings: Settings) -> float:
     """
     if settings.has_barrier == 0 or settings.truth_known == 0:
         return 0.0
-    if settings.compensation == REFERENCE or settings.bumpless == 1:
+    if settings.compensation == REFERENCE or settings.disturbance.bumpless == 1:
         return 0.0
-    sigma = settings.sigma
-    if settings.update == NEWTON:
-        sigma /= sigma + settings.rho
+    sigma = settings.excitation.excitation_threshold
+    if settings.adaptation.update == NEWTON:
+        sigma /= sigma + settings.window.regularization
+    slowest = float(settings.adaptation.adaptation_gain[: settings.p].min())
+    of = settings.disturbance
     return min(
-        float(settings.K.min()),
-        2.0 * float(settings.Kp.min()) / largest_inertia(settings),
-        2.0 * settings.kappa * sigma * float(settings.Gamma[: settings.p].min()),
-        settings.eta * float(settings.gamma.min()),
+        float(settings.surface.gain.min()),
+        2.0 * float(settings.feedback.gain.min()) / largest_inertia(settings),
+        2.0 * settings.adaptation.weight * sigma * slowest,
+        of.leakage * float(of.gain.min()),
     )
 
 
@@ -127,7 +122,12 @@ def exponential_bound(settings: Settings, t: Array, V: Array, holds: Array) -> A
     if rate == 0.0:
         return np.full(t.size, nan)
     constant, amplitude = np.abs(settings.true_disturbance[:2])
-    floor = 0.5 * settings.eta * float(np.sum((constant + amplitude) ** 2)) / rate
+    floor = (
+        0.5
+        * settings.disturbance.leakage
+        * float(np.sum((constant + amplitude) ** 2))
+        / rate
+    )
     begins = holds & ~np.append(False, holds[:-1])
     begin = np.maximum.accumulate(np.where(begins, np.arange(t.size), 0))
     decay = np.exp(-rate * (t - t[begin]))

@@ -146,10 +146,11 @@ def oscillates(now: Oscillation, i: int) -> bool:
 
 
 @inner
-def is_due(now: Oscillation, limit: Array, dt: float) -> bool:
-    """Whether to report an oscillation, `dt` [s] after the last call.
+def count_down(now: Oscillation, limit: Array, dt: float) -> bool:
+    """Count down to the next report; return whether an oscillation is to be reported now.
 
-    `limit` (n,) [N m] are those of the torques.
+    `dt` [s] is the time since the last call, `limit` (n,) [N m] are those of the
+    torques.
     """
     now.wait[0] = max(0.0, now.wait[0] - dt)
     is_one = is_violent = False

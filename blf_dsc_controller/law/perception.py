@@ -11,7 +11,7 @@ from math import sqrt
 from blf_dsc_controller.arms.model import ArmModel
 from blf_dsc_controller.compiled.jit import inner, kernel
 from blf_dsc_controller.compiled.layout import Array
-from blf_dsc_controller.law import external_torque, weighing
+from blf_dsc_controller.law import external_torque, weighing, window
 from blf_dsc_controller.law.external_torque import TipLoad
 from blf_dsc_controller.law.innovation import Prior
 from blf_dsc_controller.law.state import (
@@ -24,6 +24,7 @@ from blf_dsc_controller.law.state import (
     signals_of,
     state_of,
 )
+from blf_dsc_controller.numerics.intervals import TWO_SIDED
 
 _SETTLED = 6.0  # time constants of the row filters, until learning goes on
 
@@ -36,14 +37,15 @@ def update_covariance(settings: Settings, state: State) -> None:
     if state.samples[0] <= 1.0:
         external_torque.begin(settings.contact, state.contact, settings.information)
         return
-    is_full = state.rows[0] == settings.window and state.latched[0] == 1.0
-    if is_full and state.latch_time[0] != state.contact.latch_time[0]:
-        excess = max(1.0, state.residual[0] / settings.residual_floor)
+    latch = state.latch
+    is_full = window.is_full(settings.window, state.window) and latch.latched[0] == 1.0
+    if is_full and latch.latch_time[0] != state.contact.latch_time[0]:
+        excess = max(1.0, latch.residual[0] / settings.excitation.residual_floor)
         external_torque.update_covariance(
             state.contact,
-            state.factor,
-            settings.row_variance * excess,
-            state.latch_time[0],
+            latch.factor,
+            settings.contact.row_variance * excess,
+            latch.latch_time[0],
         )
 
 
@@ -59,7 +61,7 @@ def update_external_torque(
     external_torque.update_torque(now, state.estimate)
     external_torque.follow_reversals(part, now, signals.dqr, dt)
     samples = int(state.samples[0])
-    interval = settings.row_interval
+    interval = settings.window.row_interval
     if samples <= 1 or samples % interval == interval // 4:
         external_torque.update_spread(now, work)
     distance = external_torque.whiten_torque(now, work)
@@ -79,7 +81,7 @@ def fill_sample(state: State, distance: float, sample: Sample) -> None:
     for i in range(now.torque.size):
         sample.external[i] = now.torque[i]
         deviation = sqrt(external_torque.variance_of(now, i))
-        sample.external_interval[i] = weighing.TWO_SIDED * deviation
+        sample.external_interval[i] = TWO_SIDED * deviation
     sample.contact[CONTACT] = 1.0 if external_torque.is_touched(now) else 0.0
     sample.contact[DISTANCE] = distance
 
@@ -104,7 +106,7 @@ def sense(
     distance = update_external_torque(settings, state, signals, dt)
     is_touched = external_torque.is_touched(state.contact)
     if is_touched and settings.contact.freezes == 1:
-        state.frozen[0] = _SETTLED / settings.pole
+        state.frozen[0] = _SETTLED / settings.row.filter_pole
     fill_sample(state, distance, sample_of(sample_vector, settings))
     return is_touched and not was_touched
 
@@ -144,7 +146,7 @@ def weigh(
         signals.row,
         signals.dqr,
         int(state.samples[0]),
-        state.changes[0],
+        state.change.changes[0],
         dt,
     )
 

@@ -14,164 +14,175 @@ Lambda = x^T y / x^T x,  x = [xi2'^ + alpha2'; xi2 + alpha2; 1],  y = [alpha2'; 
 xi2'^ from the filter (8).  Since tau = [M C G] x and H P = [M C G] y, this is exact only where y is
 parallel to x: its error is of first order in xi2 and xi2', and depends on the units.
 
-Besides P, the learning estimates the coefficients d of the disturbance columns
-
-    tau_dist = D d,    D = [ I | diag(dq) | diag(tanh(dq / v_c)) | I sin(w t) | I cos(w t) | ... ]
-
-for each block that is configured, and those of `ripple`.  (22)-(24) instead subtract the
-estimate d^3 from the torque, which hides the parameter error.
+Besides P, the learning estimates the coefficients d of the disturbance `columns` D.
+`learning.form_row` calls these functions in order.
 """
 
 from math import sqrt
+from typing import Annotated, NamedTuple
 
-from blf_dsc_controller.arms.friction import sliding
 from blf_dsc_controller.compiled.jit import inner
 from blf_dsc_controller.compiled.layout import Array
-from blf_dsc_controller.law import external_torque, friction
 from blf_dsc_controller.law.lag import filter_gain
-from blf_dsc_controller.law.state import FILTERED, Settings, Signals, State
-from blf_dsc_controller.numerics.elementary import cos, exp, sin
+from blf_dsc_controller.law.sums import clear
+from blf_dsc_controller.numerics.elementary import exp
+
+FILTERED, LAMBDA = range(2)
+"""Choices of `learning.prediction`, in the order of the configuration."""
+
+
+class Settings(NamedTuple):
+    """The parameters `learning.*` of a row, and what follows from others."""
+
+    prediction: int  # FILTERED or LAMBDA
+    filter_pole: float  # of both poles, rad/s
+    motion_scale: float  # reference velocity below which rows count less, rad/s; 0: off
+    lag: float  # of measured velocities and applied torques together, s
+    omega: float  # of the differentiating filter (8), rad/s
+    # of a joint's rows: smaller where more torque is unmodelled
+    row_weight: Annotated[Array, 'n']
+
+
+class State(NamedTuple):
+    """What it keeps from one sample to the next."""
+
+    Yp: Annotated[Array, 'n', 'p']  # of the last sample
+    Yr: Annotated[Array, 'n', 'm']  # [Yr | D] of the last sample
+    late: Annotated[Array, 2, 'n']  # applied torque behind half of `lag`, and all, N m
+    filter1: Annotated[Array, 'n', 'm + 1']  # first pole
+    filter2: Annotated[Array, 'n', 'm + 1']  # second pole
+    observed: Annotated[Array, 'n']  # xi2 filtered by (8), rad/s
+    observed_rate: Annotated[Array, 'n']  # its derivative, rad/s^2
 
 
 @inner
-def set_block(rest: Array, at: int, i: int, value: float) -> None:
-    """Set entry (i, i) of the block that starts at column `at`; zero the rest of its row."""
-    for k in range(rest.shape[0]):
-        rest[i, at + k] = 0.0
-    rest[i, at + i] = value
-
-
-@inner
-def fill_columns(settings: Settings, t: float, dq: Array, rest: Array) -> None:
-    """Fill columns p.. of `rest` (n, m) with D at time t [s] and velocity dq (n,) [rad/s]."""
-    n = settings.n
-    for i in range(n):
-        at = settings.p
-        if settings.bias == 1:
-            set_block(rest, at, i, 1.0)
-            at += n
-        if settings.viscous == 1:
-            set_block(rest, at, i, dq[i])
-            at += n
-        if settings.coulomb == 1:
-            set_block(rest, at, i, sliding(dq[i], settings.coulomb_velocity))
-            at += n
-        for k in range(settings.tones):
-            set_block(rest, at, i, sin(settings.frequencies[k] * t))
-            set_block(rest, at + n, i, cos(settings.frequencies[k] * t))
-            at += 2 * n
-
-
-@inner
-def delay_torque(settings: Settings, state: State, signals: Signals, dt: float) -> None:
-    """Pass the applied torque through the lags of drives and sensors, to `state.late`.
+def delay_torque(
+    settings: Settings, state: State, applied: Array, begins: bool, dt: float
+) -> None:
+    """Pass the `applied` torque (n,) through the lags of drives and sensors, to `state.late`.
 
     A measured motion is that of a torque of `robot.lag` ago: half of it is the drives',
-    half the velocity filter's.
+    half the velocity filter's.  Where it `begins`, the torque has always been applied.
     """
-    begins = settings.lag == 0.0 or state.samples[0] <= 1.0
+    passes = settings.lag == 0.0 or begins
     gain = 0.0
-    if not begins:
+    if not passes:
         gain = filter_gain(0.5 * settings.lag, dt)
-    for i in range(settings.n):
-        torque = signals.applied[i]
+    for i in range(applied.size):
+        torque = applied[i]
         for k in range(2):
-            if begins:
+            if passes:
                 state.late[k, i] = torque
             torque = state.late[k, i] + gain * (torque - state.late[k, i])
             state.late[k, i] = torque
 
 
 @inner
-def filter_row(settings: Settings, state: State, signals: Signals, dt: float) -> None:
-    """Pass [X | u] of the last interval through both poles; write the result to `signals.row`.
+def fill_interval(state: State, Yp: Array, Yr: Array, dt: float, row: Array) -> None:
+    """Write [X | u] of the last interval, between the last regressors and these, to `row`."""
+    n, m = Yr.shape
+    for i in range(n):
+        for j in range(m):
+            row[i, j] = 0.5 * (Yr[i, j] + state.Yr[i, j])
+        for j in range(Yp.shape[1]):
+            row[i, j] += (Yp[i, j] - state.Yp[i, j]) * (1.0 / dt)
+        row[i, m] = state.late[1, i]
+
+
+@inner
+def motion_weight(settings: Settings, dqr: float, i: int) -> float:
+    """Return the weight of the row of joint i.
 
     Rows of a joint that hardly moves count less: its stiction would be mistaken for
     gravity.
     """
-    gain = filter_gain(1.0 / settings.pole, dt)
-    p = settings.p
-    m = settings.m
-    row = signals.row
-    for i in range(settings.n):
-        weight = settings.row_weight[i]
-        if settings.motion_scale > 0.0:
-            weight *= abs(signals.dqr[i]) / sqrt(
-                signals.dqr[i] ** 2 + settings.motion_scale**2
-            )
-        for j in range(m):
-            row[i, j] = 0.5 * (signals.Yr[i, j] + state.Yr[i, j])
-        for j in range(p):
-            row[i, j] += (signals.Yp[i, j] - state.Yp[i, j]) * (1.0 / dt)
-        row[i, m] = state.late[1, i]
-        if settings.contact.enabled == 1:
-            extra = friction.breakaway_torque(
-                settings.friction, state.friction, state.estimate, i
-            )
-            external_torque.filter_interval(
-                settings.contact, state.contact, i, row[i], extra, dt
-            )
-        for j in range(m + 1):
+    weight = settings.row_weight[i]
+    if settings.motion_scale > 0.0:
+        weight *= abs(dqr) / sqrt(dqr**2 + settings.motion_scale**2)
+    return float(weight)
+
+
+@inner
+def pass_poles(
+    settings: Settings, state: State, dqr: Array, dt: float, row: Array
+) -> None:
+    """Pass [X | u] of the last interval in `row` through both poles, and weight it."""
+    gain = filter_gain(1.0 / settings.filter_pole, dt)
+    for i in range(dqr.size):
+        weight = motion_weight(settings, dqr[i], i)
+        for j in range(row.shape[1]):
             state.filter1[i, j] += gain * (row[i, j] - state.filter1[i, j])
             state.filter2[i, j] += gain * (state.filter1[i, j] - state.filter2[i, j])
             row[i, j] = weight * state.filter2[i, j]
 
 
 @inner
+def forget(state: State) -> None:
+    """Empty the poles."""
+    clear(state.filter1)
+    clear(state.filter2)
+
+
+@inner
+def keep_regressors(state: State, Yp: Array, Yr: Array) -> None:
+    """Keep Yp (n, p) and [Yr | D] (n, m) for the next interval."""
+    for i in range(Yr.shape[0]):
+        for j in range(Yr.shape[1]):
+            state.Yr[i, j] = Yr[i, j]
+            if j < Yp.shape[1]:
+                state.Yp[i, j] = Yp[i, j]
+
+
+@inner
 def differentiate(
-    settings: Settings, state: State, signals: Signals, dt: float
+    settings: Settings,
+    state: State,
+    xi2: Array,
+    dalpha2: Array,
+    begins: bool,
+    dt: float,
+    acceleration: Array,
 ) -> None:
-    """Step the filter (8) with damping 1, exactly for held xi2; write ddq^ to `signals`."""
+    """Step the filter (8) with damping 1, exactly for held xi2 (n,).
+
+    Writes ddq^, the sum of alpha2' and the derivative of xi2, to `acceleration` (n,).
+    """
     decay = exp(-settings.omega * dt)
-    for i in range(settings.n):
-        if state.samples[0] == 0.0:
-            state.observed[i] = signals.xi2[i]
+    for i in range(xi2.size):
+        if begins:
+            state.observed[i] = xi2[i]
             state.observed_rate[i] = 0.0
         else:
-            offset = state.observed[i] - signals.xi2[i]
+            offset = state.observed[i] - xi2[i]
             slope = state.observed_rate[i] + settings.omega * offset
-            state.observed[i] = signals.xi2[i] + (offset + slope * dt) * decay
+            state.observed[i] = xi2[i] + (offset + slope * dt) * decay
             state.observed_rate[i] = (
                 state.observed_rate[i] - settings.omega * slope * dt
             ) * decay
-        signals.acceleration[i] = signals.dalpha2[i] + state.observed_rate[i]
+        acceleration[i] = dalpha2[i] + state.observed_rate[i]
 
 
 @inner
-def lambda_row(settings: Settings, state: State, signals: Signals) -> None:
-    """Write the row `lambda` to `signals.row`, from ddq^ of `differentiate`.
-
-    Lambda of (24) is dimensionless only if units are ignored.
-    """
+def lambda_of(ddq: Array, dq: Array, dalpha2: Array, alpha2: Array) -> float:
+    """Return Lambda of (24), which is dimensionless only if units are ignored."""
     products = 1.0
     squares = 1.0
-    X = signals.Yp
-    for i in range(settings.n):
-        products += (
-            signals.acceleration[i] * signals.dalpha2[i]
-            + signals.dq[i] * state.alpha2[i]
-        )
-        squares += signals.acceleration[i] ** 2 + signals.dq[i] ** 2
-    scale = products / squares
-    settings.model.regressor(signals.q, signals.dq, state.alpha2, signals.dalpha2, X)
-    for i in range(settings.n):
-        for j in range(settings.m):
-            signals.row[i, j] = X[i, j] if j < settings.p else scale * signals.Yr[i, j]
-        signals.row[i, settings.m] = scale * signals.applied[i]
+    for i in range(dq.size):
+        products += ddq[i] * dalpha2[i] + dq[i] * alpha2[i]
+        squares += ddq[i] ** 2 + dq[i] ** 2
+    return products / squares
 
 
 @inner
-def form_row(settings: Settings, state: State, signals: Signals, dt: float) -> None:
-    """Write the configured row of the last interval to `signals.row` (n, m + 1)."""
-    if settings.prediction != FILTERED:
-        differentiate(settings, state, signals, dt)
-        lambda_row(settings, state, signals)
-        return
-    if state.samples[0] > 0.0:
-        delay_torque(settings, state, signals, dt)
-        filter_row(settings, state, signals, dt)
-    for i in range(settings.n):  # Yp and [Yr | D] for the next interval
-        for j in range(settings.m):
-            state.Yr[i, j] = signals.Yr[i, j]
-            if j < settings.p:
-                state.Yp[i, j] = signals.Yp[i, j]
+def fill_lambda_row(
+    scale: float, H: Array, Yr: Array, applied: Array, row: Array
+) -> None:
+    """Write the row `lambda`, with its `scale` Lambda, to `row`.
+
+    H (n, p) is H(q, dq, alpha2, alpha2'), Yr (n, m) has the columns D.
+    """
+    n, m = Yr.shape
+    for i in range(n):
+        for j in range(m):
+            row[i, j] = H[i, j] if j < H.shape[1] else scale * Yr[i, j]
+        row[i, m] = scale * applied[i]

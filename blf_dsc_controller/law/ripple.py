@@ -12,16 +12,16 @@ the reference has when the torque acts.
 
 from blf_dsc_controller.compiled.jit import inner
 from blf_dsc_controller.compiled.layout import Array
-from blf_dsc_controller.law.state import Settings, Signals
+from blf_dsc_controller.law.columns import Settings
 from blf_dsc_controller.numerics.elementary import cos, sin
 
 
 @inner
 def fill_ripple(settings: Settings, i: int, angle: float, rest: Array) -> None:
     """Fill the ripple columns of row i of `rest` (n, m) at the position `angle` [rad]."""
-    n = settings.n
+    n = rest.shape[0]
     blocks = settings.bias + settings.viscous + settings.coulomb + 2 * settings.tones
-    at = settings.p + n * blocks
+    at = settings.first + n * blocks
     for k in range(settings.ripples):
         for j in range(2 * n):
             rest[i, at + j] = 0.0
@@ -31,24 +31,33 @@ def fill_ripple(settings: Settings, i: int, angle: float, rest: Array) -> None:
 
 
 @inner
-def fill_measured_ripple(settings: Settings, signals: Signals) -> None:
-    """Fill the ripple columns of `signals.Yr`, for the row.
+def fill_measured_ripple(
+    settings: Settings, lag: float, q: Array, dq: Array, rest: Array
+) -> None:
+    """Fill the ripple columns of `rest` (n, m) for the row, at q (n,) [rad] and dq (n,) [rad/s].
 
-    The row's torque has passed the velocity filter, half of `robot.lag`, but positions
-    have not.
+    The row's torque has passed the velocity filter, half of the `lag` [s] of
+    `robot.lag`, but positions have not.
     """
-    for i in range(settings.n):
-        angle = signals.q[i] - 0.5 * settings.lag * signals.dq[i]
-        fill_ripple(settings, i, angle, signals.Yr)
+    for i in range(q.size):
+        fill_ripple(settings, i, q[i] - 0.5 * lag * dq[i], rest)
 
 
 @inner
-def fill_compensated_ripple(settings: Settings, signals: Signals, dt: float) -> None:
-    """Fill the ripple columns of `signals.H`, where the reference is when the torque acts.
+def fill_compensated_ripple(
+    settings: Settings,
+    lag: float,
+    qr: Array,
+    dqr: Array,
+    ddqr: Array,
+    dt: float,
+    H: Array,
+) -> None:
+    """Fill the ripple columns of H (n, m), where the reference is when the torque acts.
 
-    Torques act 1.5 samples and half of `robot.lag` late.
+    Torques act 1.5 samples and half of the `lag` [s] late.
     """
-    lead = 1.5 * dt + 0.5 * settings.lag
-    for i in range(settings.n):
-        velocity = signals.dqr[i] + 0.5 * lead * signals.ddqr[i]
-        fill_ripple(settings, i, signals.qr[i] + lead * velocity, signals.H)
+    lead = 1.5 * dt + 0.5 * lag
+    for i in range(qr.size):
+        velocity = dqr[i] + 0.5 * lead * ddqr[i]
+        fill_ripple(settings, i, qr[i] + lead * velocity, H)

@@ -22,11 +22,11 @@ oscillates faster than that.
 from __future__ import annotations
 
 from math import sqrt
+from typing import Annotated, NamedTuple
 
 from blf_dsc_controller.compiled.jit import inner
-from blf_dsc_controller.compiled.layout import Array
-from blf_dsc_controller.law.check_state import Checks
-from blf_dsc_controller.law.oscillation import is_fast
+from blf_dsc_controller.compiled.layout import Array, Cell
+from blf_dsc_controller.law.oscillation import Oscillation, is_fast
 
 _NOISE = 0.5  # s, over which the noise is averaged
 _SIGMAS = 3.0  # of a filtered value
@@ -44,79 +44,120 @@ _GAP = 2.5  # samples: readings are missing in an interval that is also longer t
 _SLOW = 0.03  # rad/s: slower motion shows nothing
 
 
+class State(NamedTuple):
+    """What it keeps of the readings of q and dq."""
+
+    readings: Cell  # in a row so far
+    last_read: Annotated[Array, '2 * n']
+    read_before: Annotated[Array, '2 * n']
+    noise: Annotated[Array, '2 * n']  # mean square
+    resolution: Annotated[Array, 'n']  # rad, smallest change of a position; 0: none yet
+    derived: Annotated[Array, 'n']  # rad/s, filtered velocity by the positions
+    measured: Annotated[Array, 'n']  # rad/s, measured velocity through the same filter
+    # (rad/s)^2, mean squares of their difference and of the larger of both
+    mismatch: Annotated[Array, 'n']
+    speed: Annotated[Array, 'n']
+
+
 @inner
-def position_changed(checks: Checks, i: int, change: float) -> bool:
+def restart(state: State) -> None:
+    """Begin with the next reading, as after a gap."""
+    state.readings[0] = 0.0
+
+
+@inner
+def position_changed(state: State, i: int, change: float) -> bool:
     """Whether noise and steps of the sensor of joint i do not explain a change [rad]."""
-    noise = _MOVED * sqrt(checks.noise[i])
-    return bool(abs(change) > max(noise, _STEPS * checks.resolution[i]))
+    noise = _MOVED * sqrt(state.noise[i])
+    return bool(abs(change) > max(noise, _STEPS * state.resolution[i]))
 
 
 @inner
-def measure_noise(checks: Checks, dt: float, measurement: Array, n: int) -> None:
+def measure_noise(state: State, dt: float, measurement: Array) -> None:
     """Update noise and resolution by a reading [q, dq, ...], `dt` [s] after the last."""
-    count = checks.readings[0]
+    n = state.resolution.size
+    count = state.readings[0]
     share = max(min(1.0, dt / _NOISE), 1.0 / max(1.0, count - 1.0))
     for i in range(2 * n):
         reading = measurement[i]
         if count >= _SECOND:
-            second = reading - 2.0 * checks.last_read[i] + checks.read_before[i]
-            checks.noise[i] += share * (second * second / 6.0 - checks.noise[i])
-        change = abs(reading - checks.last_read[i])
+            second = reading - 2.0 * state.last_read[i] + state.read_before[i]
+            state.noise[i] += share * (second * second / 6.0 - state.noise[i])
+        change = abs(reading - state.last_read[i])
         if i < n and count >= 1.0 and change > 0.0:
-            is_first = checks.resolution[i] == 0.0
-            least = change if is_first else min(change, checks.resolution[i])
-            checks.resolution[i] = least
-        checks.read_before[i] = checks.last_read[i]
-        checks.last_read[i] = reading
+            is_first = state.resolution[i] == 0.0
+            least = change if is_first else min(change, state.resolution[i])
+            state.resolution[i] = least
+        state.read_before[i] = state.last_read[i]
+        state.last_read[i] = reading
 
 
 @inner
-def compare_velocities(checks: Checks, dt: float, measurement: Array, n: int) -> bool:
+def compare_velocities(
+    state: State,
+    oscillation: Oscillation,
+    sample_time: float,
+    dt: float,
+    measurement: Array,
+) -> bool:
     """Update with a reading [q, dq, ...]; return whether a velocity is contradicted.
 
-    The readings are finite, and `dt` [s] apart.
+    The readings are finite, and `dt` [s] apart, usually a `sample_time` [s].
     """
-    measure_noise(checks, dt, measurement, n)
-    begins = checks.readings[0] == 0.0
-    checks.readings[0] += 1.0
+    n = state.resolution.size
+    measure_noise(state, dt, measurement)
+    begins = state.readings[0] == 0.0
+    state.readings[0] += 1.0
     share = min(1.0, dt / FILTER)
     slow = min(1.0, dt / _POWER)
-    is_gap = dt > max(_ROW, _GAP * checks.sample_time[0])
+    is_gap = dt > max(_ROW, _GAP * sample_time)
     is_wrong = False
     for i in range(n):
         if begins:
-            checks.measured[i] = measurement[n + i]
-            checks.derived[i] = measurement[n + i]
-            checks.mismatch[i] = checks.speed[i] = 0.0
+            state.measured[i] = measurement[n + i]
+            state.derived[i] = measurement[n + i]
+            state.mismatch[i] = state.speed[i] = 0.0
             continue
         if is_gap:
             continue
-        change = (measurement[i] - checks.read_before[i]) / dt
-        velocity = 0.5 * (measurement[n + i] + checks.read_before[n + i])
-        checks.derived[i] += share * (change - checks.derived[i])
-        checks.measured[i] += share * (velocity - checks.measured[i])
-        difference = checks.derived[i] - checks.measured[i]
-        checks.mismatch[i] += slow * (difference * difference - checks.mismatch[i])
-        larger = max(abs(checks.derived[i]), abs(checks.measured[i]))
-        checks.speed[i] += slow * (larger * larger - checks.speed[i])
-        least = max(_WRONG * checks.speed[i], unseen(checks, i, share, n))
-        is_lag = is_fast(checks.oscillation, i) and is_late(checks, i)
-        is_wrong = is_wrong or (checks.mismatch[i] > least and not is_lag)
+        change = (measurement[i] - state.read_before[i]) / dt
+        velocity = 0.5 * (measurement[n + i] + state.read_before[n + i])
+        state.derived[i] += share * (change - state.derived[i])
+        state.measured[i] += share * (velocity - state.measured[i])
+        difference = state.derived[i] - state.measured[i]
+        state.mismatch[i] += slow * (difference * difference - state.mismatch[i])
+        larger = max(abs(state.derived[i]), abs(state.measured[i]))
+        state.speed[i] += slow * (larger * larger - state.speed[i])
+        is_wrong = is_wrong or is_contradicted(state, oscillation, i, share)
     return is_wrong
 
 
 @inner
-def is_late(checks: Checks, i: int) -> bool:
+def is_contradicted(
+    state: State, oscillation: Oscillation, i: int, share: float
+) -> bool:
+    """Whether the velocity of joint i contradicts its positions, which no lag explains.
+
+    `share` is that of a reading in a filtered velocity.
+    """
+    least = max(_WRONG * state.speed[i], unseen(state, i, share))
+    is_lag = is_fast(oscillation, i) and is_late(state, i)
+    return bool(state.mismatch[i] > least and not is_lag)
+
+
+@inner
+def is_late(state: State, i: int) -> bool:
     """Whether a lag of the velocity of joint i would explain how it contradicts the positions.
 
     One that is stuck has a mean square difference of 1, one of the wrong sign 4.
     """
-    return bool(checks.mismatch[i] < _LATE * checks.speed[i])
+    return bool(state.mismatch[i] < _LATE * state.speed[i])
 
 
 @inner
-def unseen(checks: Checks, i: int, share: float, n: int) -> float:
+def unseen(state: State, i: int, share: float) -> float:
     """Return the mean square [(rad/s)^2] of the difference that noise and steps explain."""
-    position = _SIGMAS * _SIGMAS * checks.noise[i] + checks.resolution[i] ** 2
-    velocity = _SIGMAS * _SIGMAS * checks.noise[n + i] * 0.5 * share
+    n = state.resolution.size
+    position = _SIGMAS * _SIGMAS * state.noise[i] + state.resolution[i] ** 2
+    velocity = _SIGMAS * _SIGMAS * state.noise[n + i] * 0.5 * share
     return float(_SLOW * _SLOW + position / (FILTER * FILTER) + velocity)

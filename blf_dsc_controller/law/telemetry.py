@@ -18,6 +18,7 @@ import numpy as np
 
 from blf_dsc_controller.arms.model import regressors_at
 from blf_dsc_controller.configuration.controller import ControllerConfig
+from blf_dsc_controller.configuration.law_traits import traits_of
 from blf_dsc_controller.configuration.tool_bound import tool_of
 from blf_dsc_controller.law.controller import Controller
 from blf_dsc_controller.law.factory import (
@@ -324,7 +325,7 @@ def run_of(
         external=external,
         arm=learned_arm(config),
         tool=tool.errors if tool else None,
-        learns=config.law == 'blf_dsc' and config.learning.weight > 0.0,
+        learns=traits_of(config).learns and config.learning.weight > 0.0,
         sliding=config.robot.sliding(config.joints),
     )
 
@@ -340,10 +341,10 @@ def rejected_columns(controller: Controller, names: Sequence[str]) -> dict[str, 
     `factory.estimate_names`.
     """
     state, reasons = controller.state, {}
-    upper = np.triu(state.running[:-1, :-1])
+    upper = np.triu(state.window.running[:-1, :-1])
     Phi = upper + np.triu(upper, 1).T
-    kept = np.flatnonzero(state.active > 0.0)
-    for column in np.flatnonzero(state.active == 0.0).tolist():
+    kept = np.flatnonzero(state.latch.active > 0.0)
+    for column in np.flatnonzero(state.latch.active == 0.0).tolist():
         products = Phi[kept, column]
         parts = np.linalg.lstsq(Phi[np.ix_(kept, kept)], products, rcond=None)[0]
         strength = np.abs(parts) * np.sqrt(np.diag(Phi)[kept])

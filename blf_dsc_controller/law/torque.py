@@ -31,15 +31,15 @@ below asin r, 30 degrees, whatever the amplitude: the limit lowers the gain of t
 
 from __future__ import annotations
 
+from typing import Annotated, NamedTuple
+
 import numpy as np
 
 from blf_dsc_controller.arms.model import regressors_at
 from blf_dsc_controller.arms.serial_chain import SerialChain, fill_regressor
 from blf_dsc_controller.compiled.jit import inner
-from blf_dsc_controller.compiled.layout import Array
+from blf_dsc_controller.compiled.layout import Array, Cell
 from blf_dsc_controller.law.clipping import clip
-from blf_dsc_controller.law.state import Settings, Signals, State
-from blf_dsc_controller.numerics.elementary import sin
 
 _RELEASED = 0.5  # r
 
@@ -47,46 +47,71 @@ LEVEL_CUT = 1.0
 RATE_CUT = 2.0
 
 
-@inner
-def update_feedforward(settings: Settings, signals: Signals, t: float) -> None:
-    """Compute the known disturbance `signals.feedforward` (n,) [N m] at time t [s]."""
-    if settings.truth_known == 0 and settings.feed_forward == 0:
-        return
-    d = settings.true_disturbance
-    for i in range(settings.n):
-        signals.feedforward[i] = d[0, i] + d[1, i] * sin(d[2, i] * t + d[3, i])
+class Settings(NamedTuple):
+    """The parameters `torque.*`, and the model of what the drives add."""
+
+    limit: Annotated[Array, 'n']  # N m
+    rate_limit: Annotated[Array, 'n']  # N m/s; 0: none
+    # 1: measured efforts contain what the drive adds, 0: they do not
+    effort_is_whole: int
+    drive: int  # columns of the gravity that the drive adds; 0: it adds none
+    drive_size: int  # of drive_chain
+    # `Bodies` of the drive's model, with its memory
+    drive_chain: Annotated[Array, 'torque.drive_size']
+    # masses [kg] and moments [kg m] of the drive's model
+    drive_inertias: Annotated[Array, 'torque.drive']
+
+
+class State(NamedTuple):
+    """What saturation keeps from one sample to the next."""
+
+    # demand beyond the torque, that the rate limit has held back, N m
+    held_back: Annotated[Array, 'n']
+    takes_over: Cell  # 1: the last torque acts already when the first sample comes
+    # number of samples in which the torque was cut at its limit
+    level_cuts: Annotated[Array, 'n']
+    # number of samples in which it was cut at its rate limit
+    rate_cuts: Annotated[Array, 'n']
+
+
+class Work(NamedTuple):
+    """Scratch of one sample."""
+
+    columns: Annotated[Array, 'n', 'torque.drive']  # of the gravity that the drive adds
+    zeros: Annotated[Array, 'n']
 
 
 @inner
-def find_added(settings: Settings, signals: Signals) -> None:
-    """Write G_d(q) to `signals.added` (n,) [N m]."""
+def find_added(settings: Settings, work: Work, q: Array, added: Array) -> None:
+    """Write G_d(q) at the position q (n,) [rad] to `added` (n,) [N m]."""
     if settings.drive == 0:
         return
-    zeros = signals.zeros
-    fill_regressor(settings.drive_chain, signals.q, zeros, zeros, zeros, signals.drive)
-    for i in range(settings.n):
-        signals.added[i] = 0.0
+    zeros = work.zeros
+    fill_regressor(settings.drive_chain, q, zeros, zeros, zeros, work.columns)
+    for i in range(q.size):
+        added[i] = 0.0
         for j in range(settings.drive):
-            signals.added[i] += signals.drive[i, j] * settings.drive_inertias[j]
+            added[i] += work.columns[i, j] * settings.drive_inertias[j]
 
 
 @inner
-def find_applied(settings: Settings, state: State, signals: Signals) -> None:
-    """Write the mean whole torque of the last interval to `signals.applied` (n,) [N m].
+def find_applied(command: Array, before: Array, added: Array, applied: Array) -> None:
+    """Write the mean whole torque of the last interval to `applied` (n,) [N m].
 
-    It is the last command and the mean of G_d at both ends.
+    It is the last `command` (n,) and the mean of G_d at both ends, `before` and `added`
+    (n,); the former takes the value of the latter.
     """
-    for i in range(settings.n):
-        signals.applied[i] = state.torque[i] + 0.5 * (state.added[i] + signals.added[i])
-        state.added[i] = signals.added[i]
+    for i in range(applied.size):
+        applied[i] = command[i] + 0.5 * (before[i] + added[i])
+        before[i] = added[i]
 
 
 def added_torque(settings: Settings, q: Array) -> Array:
     """Return G_d(q) (n,) [N m] at a position q (n,)."""
     if settings.drive == 0:
-        return np.zeros(settings.n)
-    chain = SerialChain(settings.n, settings.drive, settings.drive_chain)
-    (H,) = regressors_at(chain, q[np.newaxis], *np.zeros((3, 1, settings.n)))
+        return np.zeros(q.size)
+    chain = SerialChain(q.size, settings.drive, settings.drive_chain)
+    (H,) = regressors_at(chain, q[np.newaxis], *np.zeros((3, 1, q.size)))
     return np.asarray(H @ settings.drive_inertias)
 
 
@@ -98,35 +123,43 @@ def slow_down(demand: float, last: float, held: float, step: float) -> float:
 
 
 @inner
-def saturate(settings: Settings, state: State, signals: Signals, dt: float) -> bool:
-    """Limit `signals.demand`, giving the command `signals.torque` [N m]; return whether it is cut.
+def saturate(
+    settings: Settings,
+    state: State,
+    demand: Array,
+    added: Array,
+    last: Array,
+    has_last: bool,
+    dt: float,
+    torque: Array,
+    cuts: Array,
+) -> bool:
+    """Limit the `demand` (n,), giving the command `torque` (n,) [N m]; return whether it is cut.
 
-    `dt` [s] is the time since the last torque.
+    `added` (n,) [N m] is what the drives add to it, `last` (n,) [N m] the last command,
+    `dt` [s] ago, if it `has_last`.  How each joint's torque is cut is in `cuts` (n,).
     """
     saturated = False
-    has_last = state.samples[0] > 0.0 or state.takes_over[0] > 0.0
-    for i in range(settings.n):
-        top = settings.torque_limit[i]
-        added = signals.added[i]
-        low = max(-top, added - top)
-        high = min(top, added + top)
-        torque = clip(signals.demand[i], low, high)
-        signals.cuts[i] = 0.0
-        if torque != signals.demand[i]:
-            signals.cuts[i] = LEVEL_CUT
+    for i in range(demand.size):
+        top = settings.limit[i]
+        low = max(-top, added[i] - top)
+        high = min(top, added[i] + top)
+        whole = clip(demand[i], low, high)
+        cuts[i] = 0.0
+        if whole != demand[i]:
+            cuts[i] = LEVEL_CUT
             state.level_cuts[i] += 1.0
         if settings.rate_limit[i] > 0.0 and has_last:
             step = settings.rate_limit[i] * dt
-            last = state.torque[i] + added
-            slowed = slow_down(torque, last, state.held_back[i], step)
-            if slowed != torque:
-                signals.cuts[i] += RATE_CUT
+            slowed = slow_down(whole, last[i] + added[i], state.held_back[i], step)
+            if slowed != whole:
+                cuts[i] += RATE_CUT
                 state.rate_cuts[i] += 1.0
             slowed = clip(slowed, low, high)
-            state.held_back[i] = torque - slowed
-            torque = slowed
+            state.held_back[i] = whole - slowed
+            whole = slowed
         else:
             state.held_back[i] = 0.0
-        signals.torque[i] = torque - added
-        saturated = saturated or signals.cuts[i] > 0.0
+        torque[i] = whole - added[i]
+        saturated = saturated or cuts[i] > 0.0
     return saturated

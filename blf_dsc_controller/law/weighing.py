@@ -43,7 +43,6 @@ _NOTHING, _LESS = 2.0, 4.0  # standard deviations: within, and below minus
 
 # rows before, of two halves since, and of the two parts that are kept apart
 BEFORE, OLDER, NEWER, RECENT, LATEST = range(5)
-TWO_SIDED = 1.96  # standard deviations in half of a 95 % interval
 MASS, DEVIATION = 0, 4  # in `State.load`, each followed by three of the centre
 
 
@@ -66,7 +65,7 @@ class State(NamedTuple):
     rows: Annotated[Array, 5]  # moving ones in each part
     sums: Annotated[Array, 5, 'weighing.size', 'weighing.size']  # of [X | u]^T [X | u]
     complete: Cell  # 1: the rows before are complete
-    statistics: Annotated[Array, 4]  # of `innovation`
+    innovation: innovation.State
     solution: Annotated[Array, 'weighing.size + 9']  # theta and z
     # of their equations
     factor: Annotated[Array, 'weighing.size + 9', 'weighing.size + 9']
@@ -117,7 +116,7 @@ def add_row(
         end_part(settings, state, work, prior, period)
     elif state.wait[0] > 0.0:
         state.wait[0] -= 1.0
-    elif compare_row(settings, state, work, row, period):
+    elif update_innovation(settings, state, work, row, period):
         end_part(settings, state, work, prior, period)
     else:
         sums.add_products(row, state.sums[LATEST])
@@ -190,7 +189,7 @@ def begin(
     settings: Settings, state: State, work: Work, prior: Prior, period: float
 ) -> None:
     """Begin with an arm of which only the prior is known."""
-    innovation.start(settings.unmodelled, state.statistics)
+    innovation.begin(state.innovation, settings.unmodelled)
     discard(state, BEFORE)
     state.complete[0] = 0.0
     state.wait[0] = _SETTLED / (settings.pole * period)
@@ -253,7 +252,7 @@ def end_part(
         discard(state, OLDER)
     else:
         discard(state, BEFORE)
-    state.statistics[innovation.RECENT] = 0.0
+    innovation.forget_recent(state.innovation)
     state.wait[0] = _SETTLED / (settings.pole * period)
     solve(settings, state, work, prior, period)
 
@@ -291,7 +290,7 @@ def fill_rows(settings: Settings, is_held: bool, row: Array, out: Array) -> None
 
 
 @inner
-def compare_row(
+def update_innovation(
     settings: Settings, state: State, work: Work, row: Array, period: float
 ) -> bool:
     """Compare a row with the solution; return whether the last ones contradict it."""
@@ -306,7 +305,7 @@ def compare_row(
         work.rows, e, state.factor, period, work.covariance
     )
     return innovation.update(
-        square, settings.unmodelled, period, settings.window, state.statistics
+        state.innovation, square, settings.unmodelled, period, settings.window
     )
 
 
@@ -361,7 +360,7 @@ def solve(
             sums.add(work.before, 1.0, parts[part], work.before)
         else:
             sums.add(work.since, 1.0, parts[part], work.since)
-    a = innovation.row_variance(state.statistics, period)
+    a = innovation.row_variance(state.innovation, period)
     fill_equations(settings, state, work, prior, a)
     cholesky_factor(state.factor)
     cholesky_solve(state.factor, state.solution)
@@ -379,7 +378,7 @@ def describe(settings: Settings, state: State, work: Work, period: float) -> Non
     U = state.factor[m:, m:]
     z = state.solution[m:]
     v = work.spread
-    a = innovation.row_variance(state.statistics, period)
+    a = innovation.row_variance(state.innovation, period)
     for r in range(4):
         state.load[r] = 0.0
         for c in range(k):

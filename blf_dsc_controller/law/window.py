@@ -14,12 +14,60 @@ different units comparable: Phi x = lambda R x.
 """
 
 from math import sqrt
+from typing import Annotated, NamedTuple
 
 from blf_dsc_controller.compiled.jit import called, inner
-from blf_dsc_controller.compiled.layout import Array
-from blf_dsc_controller.law.state import Settings, Signals, State
+from blf_dsc_controller.compiled.layout import Array, Cell
+from blf_dsc_controller.law.innovation import Prior
 from blf_dsc_controller.law.sums import add, clear
 from blf_dsc_controller.numerics.algebra import cholesky_factor, cholesky_solve
+
+
+class Settings(NamedTuple):
+    """The size of the window, and what regularises its equations."""
+
+    length: int  # N, rows in tau_d
+    row_interval: int  # samples between two rows
+    interval: int  # samples between two checks of the excitation
+    regularization: float  # rho, of the Newton update
+    prior_weight: float  # pull to the initial estimate, always
+
+
+class State(NamedTuple):
+    """Its rows and their sums."""
+
+    cursor: Cell  # index of the oldest row
+    rows: Cell  # number of rows
+    running: Annotated[Array, 'm + 1', 'm + 1']  # S
+    fresh: Annotated[Array, 'm + 1', 'm + 1']  # F
+    half: Annotated[Array, 'm + 1', 'm + 1']  # L
+    min_eigenvector: Annotated[Array, 'm']  # x of Phi x = lambda R x, x^T R x = 1
+    ring: Annotated[Array, 'window.length', 'n', 'm + 1']
+
+
+class Work(NamedTuple):
+    """Equations of the current window, and scratch."""
+
+    Phi: Annotated[Array, 'm', 'm']
+    b: Annotated[Array, 'm']
+    factor: Annotated[Array, 'm', 'm']  # of Phi + rho R
+    solution: Annotated[Array, 'm']  # of Phi theta = b; scratch
+    newer: Annotated[Array, 'm + 1', 'm + 1']  # sum of the newer part of the window
+    part: Annotated[Array, 'm + 1', 'm + 1']  # of the part that is fitted
+
+
+class Window(NamedTuple):
+    """The whole of it."""
+
+    settings: Settings
+    state: State
+    work: Work
+
+
+@inner
+def is_full(settings: Settings, state: State) -> bool:
+    """Whether the window has all its rows."""
+    return bool(state.rows[0] == settings.length)
 
 
 @inner
@@ -169,6 +217,36 @@ def min_eigenvector(
 
 
 @inner
+def solve(settings: Settings, work: Work, information: Array, active: Array) -> None:
+    """Factor Phi + rho R, and solve Phi theta = b, with theta in `work.solution`."""
+    regularized_factor(
+        active, settings.regularization, information, work.Phi, work.b, work.factor
+    )
+    for j in range(work.b.size):
+        work.solution[j] = work.b[j]
+    cholesky_solve(work.factor, work.solution)
+
+
+@inner
+def forget(state: State) -> None:
+    """Discard all rows."""
+    state.rows[0] = 0.0
+    state.cursor[0] = 0.0
+    clear(state.running)
+    clear(state.fresh)
+    clear(state.half)
+    reset_direction(state)
+
+
+@inner
+def keep_newer(state: State, newer: Array, rows: int) -> None:
+    """Keep only the newer part of the rows, `rows` with the sum `newer` (of `newer_part`)."""
+    state.rows[0] = float(rows)
+    add(newer, 0.0, newer, state.running)
+    reset_direction(state)
+
+
+@inner
 def reset_direction(state: State) -> None:
     """Restart the inverse iteration, for a matrix that has changed."""
     for j in range(state.min_eigenvector.size):
@@ -176,20 +254,35 @@ def reset_direction(state: State) -> None:
 
 
 @inner
-def excitation(
-    settings: Settings, state: State, signals: Signals, iterations: int
-) -> float:
-    """Return lambda_min of the current window's Phi; leave Phi, b and its factor in `signals`."""
-    Phi = signals.Phi
-    b = signals.b
-    R = settings.information
-    average_window(state.running, int(state.rows[0]), Phi, b)
+def fill_equations(
+    settings: Settings, work: Work, prior: Prior, sums: Array, rows: int
+) -> None:
+    """Fill Phi and b of some rows, whose `sums` (m + 1, m + 1) of [X | u]^T [X | u] are given."""
+    average_window(sums, rows, work.Phi, work.b)
     if settings.prior_weight > 0.0:
-        pull_to(settings.initial_estimate, settings.prior_weight, R, Phi, b)
-    regularized_factor(state.active, settings.rho, R, Phi, b, signals.factor)
-    direction = state.min_eigenvector
-    work = signals.work
-    return min_eigenvector(Phi, R, signals.factor, direction, work, iterations)
+        pull_to(
+            prior.estimate, settings.prior_weight, prior.information, work.Phi, work.b
+        )
+
+
+@called
+def find_excitation(
+    whole: Window, prior: Prior, active: Array, iterations: int
+) -> float:
+    """Return lambda_min of the window's Phi; leave Phi, b and the factor in its scratch.
+
+    Columns that are not `active` (m,) are removed.  The inverse iteration begins where
+    the last one ended.
+    """
+    settings, state, work = whole
+    R = prior.information
+    fill_equations(settings, work, prior, state.running, int(state.rows[0]))
+    regularized_factor(
+        active, settings.regularization, R, work.Phi, work.b, work.factor
+    )
+    return min_eigenvector(
+        work.Phi, R, work.factor, state.min_eigenvector, work.solution, iterations
+    )
 
 
 @inner

@@ -349,11 +349,11 @@ class ControllerNode(LoopNode[ControllerConfig]):
     def _report_learning(self, guard: Guard) -> None:
         """Report columns that were rejected or restored, and changes of the arm."""
         state = guard.controller.state
-        columns = state.active.tobytes() + state.columns_checked.tobytes()
-        has_changed = state.changes[0] > self._model_changes
-        self._model_changes = state.changes[0]
+        columns = state.latch.active.tobytes() + state.latch.columns_checked.tobytes()
+        has_changed = state.change.changes[0] > self._model_changes
+        self._model_changes = state.change.changes[0]
         if has_changed:
-            residual = state.contradiction[0] ** 0.5
+            residual = state.change.contradiction[0] ** 0.5
             self.get_logger().warning(
                 f'the arm has changed: torques differ by {residual:.3g} N m from those expected; '
                 'learning restarts'
@@ -422,7 +422,7 @@ class ControllerNode(LoopNode[ControllerConfig]):
                 and config.telemetry.enabled
             ):
                 bound = guard.controller.bound_at(guard.time)
-                limit = guard.controller.settings.torque_limit
+                limit = guard.controller.settings.torque.limit
                 telemetry = self._loop.telemetry
                 self._publish(telemetry.bound(guard.journal.stamp, bound, limit))
 

@@ -283,7 +283,7 @@ class Rerun:
         self.samples = self.samples + 1
         if controller.samples == 1:
             self._telemetry.restart()
-        known = controller.sample, controller.settings.torque_limit, guard.samples.ratio
+        known = controller.sample, controller.settings.torque.limit, guard.samples.ratio
         for message in self._telemetry.sample(stamp, *known, 0.0):
             self._add(stamp, message)
 
@@ -355,7 +355,7 @@ class Rerun:
             guard.retune(change(guard.config, given, where))
             if guard.last_stamp >= 0:
                 stamp = guard.journal.stamp
-                limit = guard.controller.settings.torque_limit
+                limit = guard.controller.settings.torque.limit
                 bound = guard.controller.bound_at(guard.time)
                 self._add(stamp, self._telemetry.bound(stamp, bound, limit))
         elif event.type is EventType.SILENCE:

@@ -32,12 +32,12 @@ memory_of = view_of(Memory)
 def known_friction(settings: Settings, i: int, velocity: float) -> float:
     """Return the friction of joint i [N m] that the initial estimate has at a velocity."""
     friction = 0.0
-    if settings.viscous == 1:
+    if settings.columns.viscous == 1:
         viscous = settings.initial_estimate[settings.friction.first_viscous + i]
         friction += viscous * velocity
-    if settings.coulomb == 1:
+    if settings.columns.coulomb == 1:
         coulomb = settings.friction.initial[i]
-        friction += coulomb * sliding(velocity, settings.coulomb_velocity)
+        friction += coulomb * sliding(velocity, settings.columns.coulomb_velocity)
     return friction
 
 

@@ -342,7 +342,7 @@ def _fraction_met(run: Run, name: str) -> float:
     """Return the fraction of samples that meet (32), where it applies."""
     settings, V = _settings(name), _energy(run)
     assert run.bound is not None  # noqa: S101
-    knee = settings.knee / settings.bound * run.bound
+    knee = settings.barrier.knee / settings.barrier.bound * run.bound
     holds = _latched(run) & np.all(np.abs(np.asarray(run.error)) <= knee, axis=1)
     bound = exponential_bound(settings, run.time, V, holds)
     return float(np.mean(V[holds] <= bound[holds]))

@@ -139,7 +139,7 @@ def _events(record: Record, samples: Sample, plant: PlantConfig) -> Row:
     if end < t.size:
         outcome = DIVERGED
         violation = t[outside[0] if outside.size else end]
-    limit = record.controller.settings.torque_limit
+    limit = record.controller.settings.torque.limit
     motors = np.array(plant.actuator.torque_limit)  # 0: as strong as the law assumes
     limit = np.where(motors > 0.0, np.minimum(limit, motors), limit)
     is_cut = (np.abs(samples.torque) >= limit).any(axis=1)

@@ -23,8 +23,6 @@ from blf_dsc_controller.law.state import Settings, settings_of
 
 _HALF = 0.5
 _SOFTEST = 0.25  # of the rates
-_RATES = ('Kp', 'd2', 'mu_bar', 'K', 'mu', 'damping_rate')
-_STIFFNESSES = ('weight', 'slope_limit', 'gamma')  # squares of rates
 _LATELY = 0.1  # s
 
 
@@ -45,10 +43,26 @@ class Shaking(NamedTuple):
 
 
 def softened(settings: Settings, share: float) -> Settings:
-    """Return settings with a share of the rates of the feedback; exact for powers of two."""
-    rates = {name: share * getattr(settings, name) for name in _RATES}
-    stiffnesses = {name: share**2 * getattr(settings, name) for name in _STIFFNESSES}
-    return settings._replace(**rates, **stiffnesses)
+    """Return settings with a share of the rates of the feedback; exact for powers of two.
+
+    Stiffnesses are squares of rates.
+    """
+    surface, feedback = settings.surface, settings.feedback
+    barrier, disturbance = settings.barrier, settings.disturbance
+    square = share**2
+    return settings._replace(
+        robust_gain=share * settings.robust_gain,
+        surface=surface._replace(gain=share * surface.gain, mu=share * surface.mu),
+        feedback=feedback._replace(
+            gain=share * feedback.gain,
+            damping=share * feedback.damping,
+            damping_rate=share * feedback.damping_rate,
+        ),
+        barrier=barrier._replace(
+            weight=square * barrier.weight, slope_limit=square * barrier.slope_limit
+        ),
+        disturbance=disturbance._replace(gain=square * disturbance.gain),
+    )
 
 
 class Calming:
@@ -100,7 +114,7 @@ class Calming:
     def _find(self, shakes: NDArray[np.bool_]) -> Shaking | None:
         """Return the oscillation of the worst of the joints that do (n,); None: none does."""
         now = self._state
-        limit = self._controller.settings.torque_limit
+        limit = self._controller.settings.torque.limit
         torque = now.amplitude
         if not shakes.any() or not np.isfinite(torque).all():
             return None
@@ -111,7 +125,7 @@ class Calming:
 
     def _is_violent(self, shakes: NDArray[np.bool_]) -> bool:
         """Whether one of the joints that oscillate (n,) does so with large torques."""
-        limit = self._controller.settings.torque_limit
+        limit = self._controller.settings.torque.limit
         return bool((self._state.amplitude > VIOLENT * limit)[shakes].any())
 
     def is_due(self, t: float) -> bool:

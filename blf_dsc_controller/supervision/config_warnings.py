@@ -17,8 +17,9 @@ from blf_dsc_controller.arms.tuning import SAMPLES, UNKNOWN_EFFORT, loop_delay
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.robot import implausible_friction
 from blf_dsc_controller.configuration.tool_bound import ANGLE, POSITION
+from blf_dsc_controller.law.adaptation import NEWTON
 from blf_dsc_controller.law.factory import settings_of_config
-from blf_dsc_controller.law.state import NEWTON, Settings
+from blf_dsc_controller.law.state import Settings
 from blf_dsc_controller.supervision.expected_errors import expected_errors
 from blf_dsc_controller.supervision.gear_warnings import gear_warnings
 from blf_dsc_controller.supervision.reference_load import ReferenceLoad, reference_load
@@ -113,7 +114,11 @@ def config_warnings(
         found += _of_errors(config, settings)
     if config.model != 'urdf' and config.law == 'blf_dsc':
         found += _of_first_error(config, settings, load)
-    if settings.has_barrier == 1 and settings.kappa > 0.0 and settings.Gamma.any():
+    if (
+        settings.has_barrier == 1
+        and settings.adaptation.weight > 0.0
+        and settings.adaptation.adaptation_gain.any()
+    ):
         found += _of_learning(config, settings, load)
     return found
 
@@ -172,7 +177,7 @@ def _of_urdf(config: ControllerConfig, load: ReferenceLoad) -> Iterator[str]:
 
 def _of_errors(config: ControllerConfig, settings: Settings) -> Iterator[str]:
     """Check that the errors to expect are within the bound."""
-    bound = settings.bound
+    bound = settings.barrier.bound
     T = config.sample_time
     robot = config.robot
     of_tool = ''
@@ -226,9 +231,12 @@ def _of_first_error(
     by all that the reference needs, which feedback and barrier make up for: K_p (K/2 +
     mu) xi1 + w xi1.
     """
-    stiffness = settings.Kp * (settings.K / 2.0 + settings.mu) + settings.weight
+    stiffness = (
+        settings.feedback.gain * (settings.surface.gain / 2.0 + settings.surface.mu)
+        + settings.barrier.weight
+    )
     errors = load.torque / np.maximum(stiffness, 1e-12)
-    widest = settings.initial_bound
+    widest = settings.barrier.initial_bound
     worst = int(np.argmax(errors / widest))
     if errors[worst] > widest[worst]:
         needed = _FIRST_ERROR * errors[worst]
@@ -269,7 +277,7 @@ def _limits_of_gains(
         'sample_time. Above 1 the loop has little margin for delays, above 2 it chatters between '
         'the limits: lower feedback.gain or sample_time',
     )
-    absorbed = float(np.max(settings.gamma * T / damping))
+    absorbed = float(np.max(settings.disturbance.gain * T / damping))
     yield Finding(
         'disturbance.gain: in each sample the disturbance estimate absorbs',
         2.0 * absorbed,
@@ -285,8 +293,8 @@ def _limits_of_gains(
         f'{filtering:g} s is less than the sample time, {T:g} s: alpha2 follows the measurement '
         'noise, and its derivative enters the torque: give more',
     )
-    if settings.known_rate == 0:
-        rate = float(np.max(settings.K / 2.0 + settings.mu))
+    if settings.surface.known_rate == 0:
+        rate = float(np.max(settings.surface.gain / 2.0 + settings.surface.mu))
         yield Finding(
             'surface.gain, surface.mu: K/2 + mu',
             filtering * rate,
@@ -294,7 +302,7 @@ def _limits_of_gains(
             f'{0.25 / filtering:.3g} 1/s: lower surface.time_constant or the gains',
         )
     for joint, ratio in zip(
-        config.joints, settings.slope_limit * T / damping, strict=True
+        config.joints, settings.barrier.slope_limit * T / damping, strict=True
     ):
         yield Finding(
             f'barrier.slope_limit: past the knee of its barrier {joint} is corrected by',
@@ -308,13 +316,13 @@ def _of_learning(
     config: ControllerConfig, settings: Settings, load: ReferenceLoad
 ) -> Iterator[str]:
     learning = config.learning
-    rate = float(settings.Gamma.max())
+    rate = float(settings.adaptation.adaptation_gain.max())
     what = 'kappa Gamma T'
-    if settings.update != NEWTON:
-        scale = np.sqrt(settings.Gamma[: settings.p])
+    if settings.adaptation.update != NEWTON:
+        scale = np.sqrt(settings.adaptation.adaptation_gain[: settings.p])
         rate = float(np.linalg.eigvalsh(load.excitation * np.outer(scale, scale))[-1])
         what = 'kappa lambda_max(Gamma Phi) T'
-    step = settings.kappa * rate * config.sample_time
+    step = settings.adaptation.weight * rate * config.sample_time
     if step > 1.0:
         yield (
             f'learning.weight: {what} is {step:.2g}. Above 1 the estimate overshoots, above 2 it '

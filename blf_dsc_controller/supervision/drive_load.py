@@ -27,7 +27,8 @@ from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.law.controller import Controller
 from blf_dsc_controller.law.external_torque import is_touched
 from blf_dsc_controller.law.torque import added_torque
-from blf_dsc_controller.law.weighing import DEVIATION, MASS, TWO_SIDED
+from blf_dsc_controller.law.weighing import DEVIATION, MASS
+from blf_dsc_controller.numerics.intervals import TWO_SIDED
 
 Vector = NDArray[np.float64]
 
@@ -78,9 +79,9 @@ class DriveLoads:
         """Let the law know that the drives add the weight of this load from now on."""
         self.told = load
         settings = controller.settings
-        settings.drive_inertias[:] = self._added()
+        settings.torque.drive_inertias[:] = self._added()
         # the last command met the drives with this load already
-        controller.state.added[:] = added_torque(settings, controller.signals.q)
+        controller.state.added[:] = added_torque(settings.torque, controller.signals.q)
 
     def forget(self, controller: Controller) -> None:
         """Begin again with a law that has forgotten what the tip holds.
@@ -89,7 +90,7 @@ class DriveLoads:
         """
         self.base = self.told
         self._goes_on = False
-        controller.settings.drive_inertias[:] = self._added()
+        controller.settings.torque.drive_inertias[:] = self._added()
 
     def next(self, controller: Controller) -> DriveLoad | None:
         """Return the load to declare next; None if there is none, or too uncertain.
@@ -100,11 +101,13 @@ class DriveLoads:
         if target is None or is_touched(controller.state.contact):
             return None
         settings = controller.settings
-        chain = SerialChain(settings.n, settings.drive, settings.drive_chain)
+        chain = SerialChain(
+            settings.n, settings.torque.drive, settings.torque.drive_chain
+        )
         q = controller.signals.q[np.newaxis]
         (H,) = regressors_at(chain, q, *np.zeros((3, 1, settings.n)))
         change = H @ (self._columns(DriveLoad.of(target)) - self._columns(self.told))
-        largest = float((np.abs(change) / (_STEP * settings.torque_limit)).max())
+        largest = float((np.abs(change) / (_STEP * settings.torque.limit)).max())
         part = min(1.0, 1.0 / largest) if largest > 0.0 else 1.0
         moments = self.told.moments
         self._goes_on = part < 1.0

@@ -18,6 +18,7 @@ from blf_dsc_controller.arms.linear_loop import Feedback, Joints, Loop, Timing
 from blf_dsc_controller.arms.model import inertia_matrices, regressors_at
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.robot import parameters_of
+from blf_dsc_controller.configuration.tool_bound import REVERSAL
 from blf_dsc_controller.law.factory import settings_of_config
 from blf_dsc_controller.law.state import Settings
 from blf_dsc_controller.supervision.reference_load import along
@@ -27,8 +28,6 @@ Floats = NDArray[np.float64]
 _RESPONSE = 20.0  # time constants of the damping, for which the response is followed
 _PEAK = 6.0  # of the surface, likewise; the peak comes before the integral acts
 _MOMENTS = 40  # of the reference
-# of Coulomb friction: half of it too much at breakaway, with either sign
-_REVERSAL = 0.75
 
 
 def linear_feedback(settings: Settings, M0: Floats, stiffness: Floats) -> Feedback:
@@ -37,15 +36,17 @@ def linear_feedback(settings: Settings, M0: Floats, stiffness: Floats) -> Feedba
     `stiffness` (n,) [N m/rad] is the slope of the barrier.
     """
     one = np.broadcast_to(np.eye(settings.n), M0.shape)
-    acting = M0 / settings.joint_inertia if settings.follows_inertia == 1 else one
+    acting = (
+        M0 / settings.joint_inertia if settings.feedback.follows_inertia == 1 else one
+    )
     return Feedback(
         position=acting * stiffness,
-        surface=one * settings.Kp + M0 * settings.damping_rate,
-        inertia=0.0 * M0 if settings.decoupled == 1 else M0,
-        integral=acting * settings.gamma,
-        rate=settings.K / 2.0 + settings.mu,
-        time_constant=settings.time_constant,
-        known_rate=settings.known_rate == 1,
+        surface=one * settings.feedback.gain + M0 * settings.feedback.damping_rate,
+        inertia=0.0 * M0 if settings.feedback.decoupled == 1 else M0,
+        integral=acting * settings.disturbance.gain,
+        rate=settings.surface.gain / 2.0 + settings.surface.mu,
+        time_constant=settings.surface.time_constant,
+        known_rate=settings.surface.known_rate == 1,
     )
 
 
@@ -66,14 +67,14 @@ def _peak_errors(
 ) -> Floats:
     """Return the largest errors (k, n) [rad] after a torque step d (k, n) [N m]."""
     T = config.sample_time
-    feedback = linear_feedback(settings, M0, settings.weight)
+    feedback = linear_feedback(settings, M0, settings.barrier.weight)
     A, B = linear_loop(settings, T, config.robot.lag, M, feedback).transition()
     push = (B @ torque[..., None])[..., 0]
     x = np.zeros_like(push)
     largest = np.zeros_like(torque)
     duration = _PEAK / max(float(feedback.rate.min()), 1.0)
-    if settings.damping_rate > 0.0:
-        duration = _RESPONSE / max(settings.damping_rate, 1.0)
+    if settings.feedback.damping_rate > 0.0:
+        duration = _RESPONSE / max(settings.feedback.damping_rate, 1.0)
     for _ in range(round(duration / T)):
         x = (A @ x[..., None])[..., 0] + push
         largest = np.maximum(largest, np.abs(x[:, : settings.n]))
@@ -101,7 +102,7 @@ def expected_errors(config: ControllerConfig, settings: Settings) -> ExpectedErr
     load = robot.payload * parameters_of(robot, chain).load
     M0, M = (inertia_matrices(model, P, q) for P in (P0, P0 + load))
     floor = np.array(config.learning.residual_floor)
-    floor += _REVERSAL * np.array(robot.friction(chain)['coulomb'])
+    floor += REVERSAL * np.array(robot.friction(chain)['coulomb'])
     unmodelled = _peak_errors(config, settings, M0, M0, np.broadcast_to(floor, q.shape))
     pick_up = _peak_errors(
         config, settings, M, M0, regressors_at(model, q, dq, dq, ddq) @ load

@@ -23,11 +23,12 @@ def gear_warnings(config: ControllerConfig, settings: Settings) -> Iterator[str]
     if robot.joint_stiffness:
         yield from _of_margin(config, settings)
     elif feedback.inertia == 'none' and not feedback.joint_stiffness:
-        softest = int(np.argmin(settings.Kp))
+        damping = settings.feedback.gain
+        softest = int(np.argmin(damping))
         joint = config.joints[softest]
         yield (
             'feedback.joint_stiffness: nothing is known of the gears of this arm, so its gains '
-            f'only hold it softly, {joint} with a damping of {settings.Kp[softest]:.2g} N m s/rad. '
+            f'only hold it softly, {joint} with a damping of {damping[softest]:.2g} N m s/rad. '
             'Measure it with `blf_dsc commission`, or give feedback.joint_stiffness and '
             'feedback.joint_damping as the maker of the arm publishes them, or '
             'robot.joint_stiffness'
@@ -41,7 +42,7 @@ def _of_margin(config: ControllerConfig, settings: Settings) -> Iterator[str]:
         return
     known = tuning.geared_arm(arm, gears)
     M0 = known.links + np.diag(arm.rotors)
-    margin = known.margin(linear_feedback(settings, M0, settings.weight))
+    margin = known.margin(linear_feedback(settings, M0, settings.barrier.weight))
     if margin.value >= LEAST_MARGIN:
         return
     softer = (

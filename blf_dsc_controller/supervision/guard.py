@@ -23,7 +23,7 @@ from blf_dsc_controller.errors import BlfDscError, StartError
 from blf_dsc_controller.law.check_state import CONTRADICTION, INVALID, OSCILLATES
 from blf_dsc_controller.law.checks import is_valid_state
 from blf_dsc_controller.law.factory import controller_of
-from blf_dsc_controller.law.sensor import is_late
+from blf_dsc_controller.law.sensor import is_late, restart
 from blf_dsc_controller.messages import codecs
 from blf_dsc_controller.messages.journal import (
     EventType,
@@ -57,7 +57,12 @@ from blf_dsc_controller.supervision.start import (
     PreparedStart,
     prepared_start,
 )
-from blf_dsc_controller.supervision.state_check import SKIP, StateCheck, rate_mismatch
+from blf_dsc_controller.supervision.state_check import (
+    LONG_GAP,
+    SKIP,
+    StateCheck,
+    rate_mismatch,
+)
 from blf_dsc_controller.supervision.state_watchdog import LONG_SILENCE, PERIOD, Watchdog
 from blf_dsc_controller.supervision.stop_speed import StopSpeed
 from blf_dsc_controller.supervision.supervisor import Fault, Phase, Reason, Supervisor
@@ -68,7 +73,6 @@ from blf_dsc_controller.supervision.wraps import Wraps
 Vector = NDArray[np.float64]
 _NANO = 1e-9
 _MANY = 0.5  # states missed for each that came
-_LONG_GAP = 2.5  # samples
 _IN_A_ROW = 0.1  # s between two states, at most
 _SLOWEST = 0.03  # rad/s: a velocity that contradicts positions has more
 
@@ -239,7 +243,7 @@ class Guard:
         self._gap = (stamp - self._seen) * _NANO
         self._seen = stamp
         if not 0.0 <= self._gap < _IN_A_ROW:
-            self.controller.checks.readings[0] = 0.0
+            restart(self.controller.checks.sensor)
 
     def _with_cause(self, fault: Fault) -> Fault:
         """Return the fault of an arm that is too fast, and why if it oscillates."""
@@ -249,7 +253,7 @@ class Guard:
     def _clock_step(self, measurement: Vector) -> Fault | None:
         """Return the fault of a clock that was set while the arm moved."""
         last = self._safe_torque.last
-        if self._gap < _LONG_GAP * self.config.sample_time or last.age > 0.0:
+        if self._gap < LONG_GAP * self.config.sample_time or last.age > 0.0:
             return None
         q, dq, _ = measurement.reshape(3, -1)
         mean = 0.5 * (dq + last.dq)
@@ -261,7 +265,7 @@ class Guard:
         last = self._safe_torque.last
         is_first = self.supervisor.phase is Phase.STARTING
         if is_first:
-            if not is_valid_state(law.settings, law.checks, measurement):
+            if not is_valid_state(law.checks, measurement):
                 self._wait(self.states.invalid(self.config.safety, measurement).text)
                 return self._safe_at(stamp, measurement)
             last.take(stamp, measurement, self._slow)
@@ -372,16 +376,17 @@ class Guard:
         is_next = 0.0 < self._gap < _IN_A_ROW
         if not is_next or not np.isfinite(measurement[: -self._n]).all():
             return
-        if self.controller.contradicts(self._gap, measurement):
+        if self.controller.compare_velocities(self._gap, measurement):
             self._distrust_velocities(stamp, measurement)
 
     def _distrust_velocities(self, stamp: int, measurement: Vector) -> None:
         """Stop, and difference all velocities from the positions from this state on."""
         checks = self.controller.checks
-        fault = self.states.contradicted(checks.derived, checks.measured)
-        worst = int(np.argmax(checks.mismatch / (checks.speed + _SLOWEST**2)))
+        sensor = checks.sensor
+        fault = self.states.contradicted(sensor.derived, sensor.measured)
+        worst = int(np.argmax(sensor.mismatch / (sensor.speed + _SLOWEST**2)))
         cause = self.calming.cause if self.supervisor.running else ''
-        if cause and is_late(checks, worst):
+        if cause and is_late(sensor, worst):
             fault = Fault(Reason.OSCILLATION, cause)
         if self.supervisor.uses_states:
             self._stop(*fault)
@@ -390,13 +395,13 @@ class Guard:
             self._safe_torque.start_observing()  # this has let the error grow
         self._velocity = Velocity(self._n)
         before = stamp - round(self._gap / _NANO)
-        self._velocity.begin(before, checks.read_before[: self._n])
+        self._velocity.begin(before, sensor.read_before[: self._n])
         self._velocity.replace(stamp, measurement)
         # What the wrong velocities showed of the rotors is as wrong.
-        self.controller.state.rotors.gain_scale[:] = checks.consistent_scale
+        self.controller.state.rotors.gain_scale[:] = checks.estimates.consistent_scale
         # Else the change from the wrong velocity would pass for an acceleration.
         self._safe_torque.last.dq[:] = measurement[self._n : -self._n]
-        checks.readings[0] = 0.0
+        restart(sensor)
 
     def _check_speed(self) -> None:
         """Return to the load known before if the arm speeds up in the safe stop."""
@@ -557,13 +562,13 @@ class Guard:
     @property
     def _speed(self) -> float:
         """Largest speed of a joint [rad/s], as the positions show it."""
-        return float(np.abs(self.controller.checks.derived).max())
+        return float(np.abs(self.controller.checks.sensor.derived).max())
 
     @property
     def _slow(self) -> Vector:
         """Velocities (n,) [rad/s] to be damped in a stop, as the positions show them."""
         limit = self.config.safety.velocity_limit
-        return np.asarray(np.clip(self.controller.checks.derived, -limit, limit))
+        return np.asarray(np.clip(self.controller.checks.sensor.derived, -limit, limit))
 
     def _time_of(self, stamp: int) -> float:
         return (stamp - self.start_stamp) * _NANO
@@ -615,7 +620,7 @@ class Guard:
         """Report that commands that changed by these torques (n,) move nothing."""
         if self.supervisor.reason is Reason.NO_EFFECT:
             return
-        limit = self.controller.settings.torque_limit
+        limit = self.controller.settings.torque.limit
         worst = int(np.argmax(np.abs(change) / limit))
         self.supervisor.add(
             f'the torque of joint {self.config.joints[worst]!r} has changed by '
@@ -770,7 +775,7 @@ class Guard:
         self.has_sample = False
         self._clean = True
         if self._wraps.restart():  # to positions that differ from those before
-            self.controller.checks.readings[0] = 0.0
+            restart(self.controller.checks.sensor)
             if self._velocity is not None:
                 self._velocity = Velocity(self._n)
         if self._safe_torque.last.age >= self.config.safety.fade_time:

@@ -25,10 +25,15 @@ def model_torque(settings: Settings, estimate: Vector, *motion: Vector) -> Vecto
 def friction_torque(settings: Settings, estimate: Vector, dq: Vector) -> Vector:
     """Return the friction (n,) [N m] of the estimate at dq (n,) [rad/s], zero without columns."""
     n = settings.n
-    at = settings.p + settings.n * settings.bias
+    at = settings.p + settings.n * settings.columns.bias
     torque = np.zeros(n)
-    directions = [sliding(velocity, settings.coulomb_velocity) for velocity in dq]
-    for is_on, effect in ((settings.viscous, dq), (settings.coulomb, directions)):
+    directions = [
+        sliding(velocity, settings.columns.coulomb_velocity) for velocity in dq
+    ]
+    for is_on, effect in (
+        (settings.columns.viscous, dq),
+        (settings.columns.coulomb, directions),
+    ):
         if is_on:
             torque += estimate[at : at + n] * effect
             at += n

@@ -29,9 +29,11 @@ class ReferenceLoad(NamedTuple):
 
     def rate(self, settings: Settings) -> float:
         """Return the largest eigenvalue of M^-1 K_p + omega_v, 1/s."""
-        Kp = np.diag(settings.Kp)[np.newaxis]  # numpy 1 reads a lone matrix as vectors
+        Kp = np.diag(settings.feedback.gain)[
+            np.newaxis
+        ]  # numpy 1 reads a lone matrix as vectors
         roots = np.linalg.eigvals(np.linalg.solve(self.inertia, Kp))
-        return float(np.abs(roots).max(initial=0.0)) + settings.damping_rate
+        return float(np.abs(roots).max(initial=0.0)) + settings.feedback.damping_rate
 
     @property
     def free_inertia(self) -> Floats:
@@ -41,9 +43,9 @@ class ReferenceLoad(NamedTuple):
 
     def damping(self, settings: Settings) -> Floats:
         """Return the smallest damping (n,) [N m s/rad], with the other joints free."""
-        rate = settings.damping_rate
+        rate = settings.feedback.damping_rate
         damped = rate * self.free_inertia if rate > 0.0 else 0.0
-        return settings.Kp + damped
+        return settings.feedback.gain + damped
 
 
 def reference_load(config: ControllerConfig, settings: Settings) -> ReferenceLoad:

@@ -57,7 +57,7 @@ def apply_bumpless(
         controller.trial(t, T, measurement)
         state.alpha2[:] += signals.beta2 - beta2
     controller.trial(t, T, measurement)
-    integrates = controller.settings.gamma > 0.0
+    integrates = controller.settings.disturbance.gain > 0.0
     state.disturbance[integrates] -= (signals.demand - demand)[integrates]
 
 
@@ -71,7 +71,9 @@ def problems(
     errors = np.abs(controller.sample.xi1)
     torques = np.abs(controller.sample.torque)
     settings = settings_in_loop(config)
-    barrier.update_bound(settings, controller.signals, t)
+    barrier.update_bound(
+        settings.barrier, controller.signals.barrier, t, controller.signals.bound
+    )
     for joint, error, bound in zip(
         config.joints, errors, controller.signals.bound, strict=True
     ):
@@ -95,10 +97,17 @@ def problems(
             f'radius of {learning.radius:g} kg m^2: choose a larger one'
         )
     stretch = (
-        1.0 if learning.update == 'newton' else float(np.linalg.norm(state.Phi, 2))
+        1.0
+        if learning.update == 'newton'
+        else float(np.linalg.norm(state.latch.Phi, 2))
     )
-    step = learning.weight * float(settings.Gamma.max()) * stretch * config.sample_time
-    if state.latched[0] and step >= _STABLE:
+    step = (
+        learning.weight
+        * float(settings.adaptation.adaptation_gain.max())
+        * stretch
+        * config.sample_time
+    )
+    if state.latch.latched[0] and step >= _STABLE:
         yield (
             f'learning.weight: with the update {learning.update}, each sample would correct the '
             f'estimates by {step:.3g} times their error, which diverges at {_STABLE:g} or more: '

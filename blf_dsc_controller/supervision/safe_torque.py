@@ -53,10 +53,10 @@ def safe_torque(
         if safety.torque == 'hold_gravity':
             torque -= braking_matrix(settings, damping, last.q) @ last.slow
             torque += model_torque(settings, estimate, last.q) + load
-            torque -= added_torque(settings, last.q)
+            torque -= added_torque(settings.torque, last.q)
     if not np.isfinite(torque).all():
         return np.zeros(settings.n)
-    limited = np.clip(torque, -settings.torque_limit, settings.torque_limit)
+    limited = np.clip(torque, -settings.torque.limit, settings.torque.limit)
     return limited * (1.0 - last.age / safety.fade_time)
 
 
@@ -193,10 +193,10 @@ class SafeTorque:
         if self._elapsed < self._duration:
             goal = self._start + self._elapsed / self._duration * (goal - self._start)
         if dt > 0.0:  # drives that stop when commands jump would brake
-            step = settings.rate_limit * min(dt, self.longest_step)
-            step = np.where(settings.rate_limit > 0.0, step, inf)
+            step = settings.torque.rate_limit * min(dt, self.longest_step)
+            step = np.where(settings.torque.rate_limit > 0.0, step, inf)
             goal = np.clip(goal, self.commanded - step, self.commanded + step)
-        limit = settings.torque_limit
+        limit = settings.torque.limit
         self.commanded[:] = np.clip(goal, -limit, limit)
         return self.commanded
 
@@ -211,8 +211,8 @@ class SafeTorque:
     ) -> None:
         if not self._reached:
             still = model_torque(settings, estimate, self.last.q)
-            still -= added_torque(settings, self.last.q)
-            limit = settings.torque_limit
+            still -= added_torque(settings.torque, self.last.q)
+            limit = settings.torque.limit
             self._effect.update(needed - still, limit, dt)
             self._reached = self._effect.is_proven
             change = self.commanded - self._start
@@ -229,11 +229,11 @@ class SafeTorque:
         with np.errstate(over='ignore', invalid='ignore'):
             needed = model_torque(settings, estimate, last.q, last.dq, last.ddq)
             needed += friction_torque(settings, estimate, last.dq)
-        needed -= added_torque(settings, last.q)
+        needed -= added_torque(settings.torque, last.q)
         return needed if np.isfinite(needed).all() else None
 
     def _update_load(self, settings: Settings, needed: Vector, dt: float) -> None:
-        limit = settings.torque_limit
+        limit = settings.torque.limit
         first, second = (min(1.0, rate * dt) for rate in self._rates)
         lacking = np.clip(self.commanded - needed - self._residual, -limit, limit)
         self._residual += first * lacking

@@ -41,7 +41,7 @@ class SampleCheck:
     ) -> None:
         """Enable the checks of the controller."""
         controller.checks.sample_time[0] = config.sample_time
-        controller.checks.compares[0] = float(
+        controller.checks.effect.compares[0] = float(
             config.robot.effort in ('whole', 'commanded')
         )
         self._joints = config.joints
@@ -49,7 +49,7 @@ class SampleCheck:
         self._controller = controller
         self._cause = StopCause(config.joints, controller, calming)
         self.ratio = controller.checks.ratio
-        self._kept = controller.checks.kept
+        self._kept = controller.checks.estimates.kept
         self._saturation = 0  # ns, times _RELIEF
         self.set_limits(config.safety)
         self.keep()
@@ -67,9 +67,9 @@ class SampleCheck:
         self.ratio[:] = 0.0
         self.outside = self.saturated = 0
         checks = self._controller.checks
-        checks.consistent[:] = self._kept
-        checks.consistent_scale[:] = self._controller.state.rotors.gain_scale
-        checks.moved[:] = self._kept
+        checks.estimates.consistent[:] = self._kept
+        checks.estimates.consistent_scale[:] = self._controller.state.rotors.gain_scale
+        checks.estimates.moved[:] = self._kept
         self.relax()
 
     @property
@@ -111,7 +111,7 @@ class SampleCheck:
 
     def return_to_consistent(self) -> None:
         """Keep the estimates from before the error grew."""
-        self._kept[:] = self._controller.checks.consistent
+        self._kept[:] = self._controller.checks.estimates.consistent
 
     def restore(self) -> None:
         """Reset the controller, but set its estimates to the kept ones."""
@@ -154,16 +154,16 @@ class SampleCheck:
     def _without_effect(self) -> Fault:
         """Return to the estimates from before the commands had no effect."""
         checks = self._controller.checks
-        limit = self._controller.settings.torque_limit
-        self._kept[:] = checks.moved
+        limit = self._controller.settings.torque.limit
+        self._kept[:] = checks.estimates.moved
         if shaking := self._cause.shaking:
             return Fault(Reason.OSCILLATION, shaking)
         if saturation := self._cause.saturation(self.saturated_time):
             return Fault(Reason.SATURATED, f'{saturation}; no joint moves any more')
-        if checks.lacking[0] > 0.0:
-            lack = checks.lack - checks.lack_in_motion
+        if checks.effect.lacking[0] > 0.0:
+            lack = checks.effect.lack - checks.effect.lack_in_motion
             return self._lacking(int(np.argmax(np.abs(lack) / limit)), lack)
-        change = checks.recent - checks.before
+        change = checks.effect.recent - checks.effect.before
         worst = int(np.argmax(np.abs(change) / limit))
         text = (
             f'the torque of joint {self._joints[worst]!r} has changed by {change[worst]:+.4g} N m, '
@@ -184,15 +184,15 @@ class SampleCheck:
         """Return the fault if efforts show that commands do not reach a moving arm."""
         settings = self._controller.settings
         checks = self._controller.checks
-        if checks.compares[0] == 0.0 or self._cause.oscillation:
+        if checks.effect.compares[0] == 0.0 or self._cause.oscillation:
             return None
-        lack = checks.lack - checks.usual
-        now = self._controller.sample.torque - checks.used[2 * settings.n :]
-        if settings.drive > 0 and settings.effort_is_whole == 1:
+        lack = checks.effect.lack - checks.effect.usual
+        now = self._controller.sample.torque - checks.repeats.used[2 * settings.n :]
+        if settings.torque.drive > 0 and settings.torque.effort_is_whole == 1:
             now += self._controller.signals.added
-        now -= checks.usual
-        share = np.abs(lack) / settings.torque_limit
-        share_now = np.abs(now) / settings.torque_limit
+        now -= checks.effect.usual
+        share = np.abs(lack) / settings.torque.limit
+        share_now = np.abs(now) / settings.torque.limit
         lacks = (share > _LACKS) & (share_now > _LACKS_NOW) & (lack * now > 0.0)
         if not lacks.any():
             return None
@@ -250,7 +250,7 @@ class SampleCheck:
     def _saturated(self, dt: float) -> Fault | None:
         """Count a sample with a torque at its limit."""
         signals = self._controller.signals
-        limit = self._controller.settings.torque_limit
+        limit = self._controller.settings.torque.limit
         needed = np.maximum(
             np.abs(signals.demand), np.abs(signals.demand - signals.added)
         )

@@ -18,7 +18,8 @@ Vector = NDArray[np.float64]
 _NANO = 1e-9
 _PUBLISHER_PERIOD = 0.015  # s: joint_state_publisher has 10 Hz by default, Franka's 30
 _REPEATS = 3  # states in a row with the stamp of the one before that are ignored
-_LONG_GAP = 2.5  # samples: a shorter step of the clock does no harm
+LONG_GAP = 2.5
+"""Samples between two stamps: a shorter step of the clock does no harm."""
 _MOVING = 0.02  # rad/s: a slower motion shows no time
 _LESS = 0.5  # of the time by the stamps
 _AVERAGED = 1.0  # s, over which missed states are
@@ -140,7 +141,7 @@ class StateCheck:
         velocity.
         """
         speed = float(dq @ dq)
-        if gap < _LONG_GAP * self._sample_time or speed < _MOVING**2:
+        if gap < LONG_GAP * self._sample_time or speed < _MOVING**2:
             return None
         moved_for = float(q_step @ dq) / speed
         if moved_for > _LESS * gap:

@@ -24,13 +24,13 @@ _SATURATED = 0.05  # s: brakes that close in motion leave the bound sooner
 def chatter_of(controller: Controller, joints: Sequence[str]) -> str:
     """Return what to do about a torque that changes in each sample; empty if it does not."""
     checks = controller.checks
-    limit = controller.settings.torque_limit
-    steps = np.sqrt(checks.chatter)
+    limit = controller.settings.torque.limit
+    steps = np.sqrt(checks.effect.chatter)
     worst = int(np.argmax(steps / limit))
     if not steps[worst] > _CHATTER * limit[worst]:
         return ''
-    step = float(checks.resolution[worst])
-    is_stepped = step > _STEPPED * float(np.sqrt(checks.noise[worst]))
+    step = float(checks.sensor.resolution[worst])
+    is_stepped = step > _STEPPED * float(np.sqrt(checks.sensor.noise[worst]))
     why = (
         f'its positions come in steps of {1e3 * step:.2g} mrad, and its velocity with them'
         if is_stepped
@@ -83,7 +83,7 @@ class StopCause:
         i = self._limited
         demands = (
             f'joint {self._joints[i]!r} has demanded more than its torque limit of '
-            f'{settings.torque_limit[i]:g} N m for {time:.2g} s'
+            f'{settings.torque.limit[i]:g} N m for {time:.2g} s'
         )
         if self._controller.signals.cuts[i] >= RATE_CUT:
             return (

@@ -1,0 +1,42 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The disturbance estimate d^3 of (30), which gives up what is learned.
+
+    d^3' = -gamma (xi2 + eta d^3) - H (theta^' + Gamma H^T xi2)
+
+(30) lacks the last term.  While the estimate is wrong, d^3 compensates for it; the
+prediction error then corrects the estimate within milliseconds, but d^3 follows only
+within seconds, and their sum is wrong in between.  With the term (`bumpless`) learning
+does not change the torque H P^ + d^3, and d^3 is left to estimate the disturbance
+alone.
+"""
+
+from typing import Annotated, NamedTuple
+
+from blf_dsc_controller.compiled.jit import inner
+from blf_dsc_controller.compiled.layout import Array
+
+
+class Settings(NamedTuple):
+    """The parameters `disturbance.*`, and whether it gives up what is learned."""
+
+    gain: Annotated[Array, 'n']  # gamma, N m/rad
+    leakage: float  # eta, rad/(N m s)
+    bumpless: int  # 1: it gives up what a changed estimate adds to the torque
+
+
+@inner
+def fill_step(
+    settings: Settings, estimate: Array, xi2: Array, dt: float, step: Array
+) -> None:
+    """Write dt gamma (xi2 + eta d^3) (n,) [N m] to `step`; `estimate` (n,) is d^3."""
+    for i in range(xi2.size):
+        error = xi2[i] + settings.leakage * estimate[i]
+        step[i] = dt * settings.gain[i] * error
+
+
+@inner
+def hand_over(estimate: Array, H: Array, theta: Array, before: Array) -> None:
+    """Subtract H (theta - `before`) from d^3, the `estimate` (n,) [N m]; H is (n, m)."""
+    for j in range(theta.size):
+        for i in range(estimate.size):
+            estimate[i] -= H[i, j] * (theta[j] - before[j])

@@ -1,0 +1,57 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Feedback of the velocity error xi2: damping and the robust term of (28), by the inertia or not.
+
+    tau_f = -K_p xi2 - d2 |xi1| sat(xi2 / b)                                        [N m]
+    a_f = a - omega_v xi2 + tau_c / m                                           [rad/s^2]
+
+a_f is the acceleration that the model is given (see `compensation`), where damping and
+the torque tau_c by the error act through the inertia matrix of the initial estimate.
+"""
+
+from typing import Annotated, NamedTuple
+
+from blf_dsc_controller.compiled.jit import inner
+from blf_dsc_controller.compiled.layout import Array
+from blf_dsc_controller.law.clipping import clip
+
+
+class Settings(NamedTuple):
+    """The parameters `feedback.*`, and what follows from them."""
+
+    gain: Annotated[Array, 'n']  # K_p, N m s/rad
+    damping: Annotated[Array, 'n']  # d2, N m/rad
+    # omega_v, of the damping by the initial estimate's inertia, 1/s
+    damping_rate: float
+    follows_inertia: int  # 1: barrier and d^3 act through M(q, P^(0)) / m
+    decoupled: int  # 1: no feedback acts through M(q, P^(0))
+
+
+@inner
+def joint_torque(
+    settings: Settings, xi1: float, xi2: float, layer: float, i: int
+) -> float:
+    """Return the damping and the robust term of joint i [N m]; `layer` is b [rad/s]."""
+    robust = settings.damping[i] * abs(xi1)
+    torque = settings.gain[i] * xi2
+    torque += robust * clip(xi2 / layer, -1.0, 1.0)
+    return float(-torque)
+
+
+@inner
+def fill_acceleration(
+    settings: Settings,
+    wanted: Array,
+    xi2: Array,
+    restoring: Array,
+    inertia: Array,
+    out: Array,
+) -> None:
+    """Write a_f (n,) [rad/s^2] to `out`.
+
+    The surface has the acceleration `wanted` (n,) [rad/s^2], `restoring` (n,) [N m] is
+    tau_c, and `inertia` (n,) [kg m^2] m.
+    """
+    for i in range(xi2.size):
+        out[i] = wanted[i] - settings.damping_rate * xi2[i]
+        if settings.follows_inertia == 1:
+            out[i] += restoring[i] / inertia[i]

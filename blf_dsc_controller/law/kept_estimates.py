@@ -1,0 +1,69 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Estimates that a stop returns to: the last valid ones, and those from before a fault grew.
+
+Commands that do not reach the arm make its error grow, and the disturbance estimate
+with it.  What is learned while the arm may oscillate, or while no joint moves, is as
+wrong.
+"""
+
+from typing import Annotated, NamedTuple
+
+from blf_dsc_controller.compiled.jit import inner
+from blf_dsc_controller.compiled.layout import Array, Cell
+
+_RELAXED = 1.4  # s, in which the least error may double, nearly: an error grows faster
+_SMALL = 0.01  # of the bound: an error that has not grown
+
+
+class State(NamedTuple):
+    """Estimates and d^3 of some past samples."""
+
+    kept: Annotated[Array, 'm + n']  # of the last sample that was not suspect
+    moved: Annotated[Array, 'm + n']  # of when a joint last moved
+    consistent: Annotated[Array, 'm + n']  # from before the error grew
+    # measured inertia of each joint over the assumed, of the same sample
+    consistent_scale: Annotated[Array, 'n']
+    # |xi1| / k of the sample that `consistent` is of, relaxed since
+    least_ratio: Cell
+
+
+@inner
+def keep(state: State, estimate: Array, disturbance: Array) -> None:
+    """Keep the estimate (m,) and d^3 (n,) of a sample that is not suspect."""
+    m = estimate.size
+    for j in range(m):
+        state.kept[j] = estimate[j]
+    for i in range(disturbance.size):
+        state.kept[m + i] = disturbance[i]
+
+
+@inner
+def keep_moved(state: State) -> None:
+    """Take the kept estimates for those of a joint that moves."""
+    for j in range(state.kept.size):
+        state.moved[j] = state.kept[j]
+
+
+@inner
+def keep_consistent(
+    state: State,
+    gain_scale: Array,
+    ratio: float,
+    oscillates: bool,
+    begins: bool,
+    dt: float,
+) -> None:
+    """Keep the estimates of the smallest recent error, whose largest |xi1| / k is `ratio`.
+
+    `gain_scale` (n,) is the measured inertia of each joint over the assumed.
+    """
+    least = state.least_ratio[0] * (1.0 + dt / _RELAXED)
+    least = max(_SMALL, least)
+    if (ratio > least or oscillates) and not begins:
+        state.least_ratio[0] = least
+        return
+    state.least_ratio[0] = ratio
+    for j in range(state.kept.size):
+        state.consistent[j] = state.kept[j]
+    for i in range(gain_scale.size):
+        state.consistent_scale[i] = gain_scale[i]

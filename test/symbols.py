@@ -1,0 +1,56 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The paper's symbols for settings of the law, which has them in parts."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import Any
+
+from blf_dsc_controller.law.state import Settings
+
+_PARTS = {
+    '': 'robust_gain=mu_bar',
+    'barrier': 'bound initial_bound funnel_rate weight slope_limit knee',
+    'surface': 'gain=K mu time_constant known_rate',
+    'feedback': 'gain=Kp damping=d2 damping_rate follows_inertia decoupled',
+    'disturbance': 'gain=gamma leakage=eta bumpless',
+    'torque': 'limit=torque_limit rate_limit',
+    'columns': 'bias viscous frequencies',
+    'row': 'prediction filter_pole=pole motion_scale lag omega row_weight',
+    'window': 'length=window row_interval interval prior_weight regularization=rho',
+    'excitation': (
+        'excitation_threshold=sigma learning_start change_detection residual_floor'
+    ),
+    'adaptation': (
+        'update weight=kappa leakage=Wc radius adaptation_gain=Gamma variance least most'
+    ),
+}
+_FIELDS = {
+    symbol or field: (part, field)
+    for part, fields in _PARTS.items()
+    for field, _, symbol in (each.partition('=') for each in fields.split())
+}
+"""Part and field of each symbol; all others are fields of the settings themselves."""
+
+
+def replaced(settings: Settings, **changes: Any) -> Settings:
+    """Return settings with changes to fields or symbols."""
+    for name, value in changes.items():
+        part, field = _FIELDS.get(name, ('', name))
+        if part:
+            changed = getattr(settings, part)._replace(**{field: value})
+            settings = settings._replace(**{part: changed})
+        else:
+            settings = settings._replace(**{field: value})
+    return settings
+
+
+def by_symbol(settings: Settings) -> SimpleNamespace:
+    """Return the settings by their symbols."""
+    return SimpleNamespace(
+        **settings._asdict()
+        | {
+            symbol: getattr(getattr(settings, part) if part else settings, field)
+            for symbol, (part, field) in _FIELDS.items()
+        }
+    )

@@ -1,0 +1,115 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Whether a row is what those before it predict: its innovation, and the noise of the rows."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from blf_dsc_controller.law.innovation import (
+    CORRELATION,
+    State,
+    begin,
+    forget_recent,
+    has_begun,
+    noise_of,
+    normalized_square,
+    row_variance,
+    update,
+)
+from blf_dsc_controller.numerics.algebra import cholesky_factor
+
+PERIOD = 0.01  # s, of the rows
+MOST = 500.0  # rows of a window
+MEMORY = 10  # rows in 0.1 s
+
+
+def begun(unmodelled=1.0):
+    """Statistics before any row: s^2 is a tenth of what is unmodelled."""
+    state = State(*np.zeros((4, 1)))
+    assert not has_begun(state)
+    begin(state, unmodelled)
+    assert has_begun(state)
+    return state
+
+
+def test_square_of_an_innovation_is_that_of_its_covariance():
+    """As by numpy; it is 1 on average, whatever is known of theta."""
+    random = np.random.default_rng(3)
+    n, m, noise, period = 3, 5, 0.5, PERIOD
+    a = noise * CORRELATION / period
+    squares = []
+    for _ in range(2000):
+        before = random.normal(size=(random.integers(1, 40), m))
+        A = before.T @ before + a * np.eye(m)
+        theta = random.multivariate_normal(np.zeros(m), a * np.linalg.inv(A))
+        X = random.normal(size=(n, m))
+        u = X @ theta + np.sqrt(noise) * random.normal(size=n)
+        factor = A.copy()
+        cholesky_factor(factor)
+        S = noise * np.eye(n) + a * X @ np.linalg.inv(A) @ X.T
+        expected = noise * u @ np.linalg.solve(S, u) / n
+        given = X.copy(), u.copy(), factor
+        square = normalized_square(*given, period, np.zeros((n, n)))
+        assert square == pytest.approx(expected, rel=1e-9)
+        squares.append(square / noise)
+    assert np.mean(squares) == pytest.approx(1.0, abs=0.05)
+
+
+def test_rows_that_fit_ever_worse_are_noise_and_those_of_a_change_are_not():
+    for squares, expected in (
+        (np.full(400, 0.3), False),
+        (0.1 + 0.9 * np.linspace(0.0, 1.0, 400) ** 2, False),
+        (np.append(np.full(200, 0.1), np.full(20, 2.0)), True),
+    ):
+        state = begun()
+        found = [update(state, each, 1.0, PERIOD, MOST) for each in squares]
+        assert any(found) == expected
+    assert np.argmax(found) - 200 < 10
+
+
+@pytest.mark.parametrize(
+    ('mean', 'rows', 'expected'),
+    [
+        (0.0, 0.0, 0.1),  # as assumed, before any row
+        (0.5, 0.0, 0.1),
+        (0.5, MOST, 0.5),  # as measured, over a window
+        # a hundred assumed rows, fewer as the window fills: 50 beside 250
+        (0.5, 250.0, 0.5 + 50.0 / 300.0 * (0.1 - 0.5)),
+        (0.0, MOST, 0.001),  # a thousandth of what is unmodelled at least
+    ],
+)
+def test_noise_goes_from_what_is_assumed_to_what_is_measured(mean, rows, expected):
+    assert noise_of(mean, rows, 1.0, MOST) == pytest.approx(expected)
+    assert noise_of(7.0 * mean, rows, 7.0, MOST) == pytest.approx(7.0 * expected)
+
+
+def test_row_of_a_change_hardly_raises_the_noise():
+    """It counts as three times s^2, however large it is; less counts as it is."""
+    found = []
+    for square in (0.3, 1.0, 1e6):  # s^2 is 0.1
+        state = begun()
+        update(state, square, 1.0, PERIOD, MOST)
+        found.append(float(state.mean[0]))
+    assert found == pytest.approx([0.3, 0.3, 0.3])
+    state = begun()
+    update(state, 0.2, 1.0, PERIOD, MOST)
+    assert state.mean[0] == pytest.approx(0.2)
+
+
+@pytest.mark.parametrize(('factor', 'changed'), [(4.9, False), (5.1, True)])
+def test_arm_has_changed_from_five_times_the_noise_on_average_over_a_tenth_of_a_second(
+    factor, changed
+):
+    state = begun()
+    state.recent[0] = 0.1  # s^2: rows that fit
+    square = 0.1 * (1.0 + MEMORY * (factor - 1.0))  # moves that average to the factor
+    assert update(state, square, 1.0, PERIOD, MOST) == changed
+    forget_recent(state)
+    assert not update(state, 0.1, 1.0, PERIOD, MOST)
+
+
+def test_rows_of_a_correlated_residual_count_as_fewer():
+    """With a correlation of 0.2 s and a row each 10 ms, twenty as one."""
+    state = begun()
+    assert row_variance(state, PERIOD) == pytest.approx(20.0 * 0.1)
