@@ -19,7 +19,7 @@ from blf_dsc_controller.configuration.drive import DriveConfig
 from blf_dsc_controller.configuration.nodes import CONTROLLER, DRIVE, load, locate
 from blf_dsc_controller.control.arm_controller import ArmController
 from blf_dsc_controller.control.realtime import request_realtime
-from blf_dsc_controller.drive.driver import Driver, disagreements
+from blf_dsc_controller.drive.driver import Driver, check_feedback, disagreements
 from blf_dsc_controller.drive.drivers import find_driver
 from blf_dsc_controller.drive.loop import DriveLoop, End, Outcome
 from blf_dsc_controller.drive.ros_topics import RosTopics
@@ -92,7 +92,8 @@ def driver_of(address: str, path: Path, config: ControllerConfig) -> Driver:
     """
     settings = load(path, DRIVE, DriveConfig)
     made = find_driver(settings.driver)
-    problems = disagreements(made.facts, config)
+    check_feedback(made, settings)
+    problems = disagreements(made.facts_for(config), config)
     if problems:
         raise ConfigurationError(problems, str(path))
     return made(address, config, settings)

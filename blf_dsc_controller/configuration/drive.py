@@ -6,6 +6,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import partial
+from typing import Literal
 
 from blf_dsc_controller.configuration.schema import (
     Vector,
@@ -26,6 +27,11 @@ class DriveConfig:
 
     driver: str = _fixed(
         'franka', 'franka, or a Python file with a class DRIVER (drive/driver.py)'
+    )
+    feedback: Literal['host', 'motor'] = _fixed(
+        'host',
+        'who closes the feedback: the host, by torques, or as far as they can the '
+        "motors' own PD, by reference, gains and the rest of the torque",
     )
     collision_torque: tuple[float, ...] = _thresholds(
         'external torque of each joint that stops the robot; empty: as configured in'
