@@ -35,6 +35,7 @@ class MotorPlant:
 
     Attributes:
         plant: the arm, sampled at the rate of the motors.
+        per_frame: samples of the motors in a period of the host.
         frames: frames so far, which is the time in periods of the host.
     """
 
@@ -44,13 +45,13 @@ class MotorPlant:
         Raises:
             BlfDscError: the motors' rate is no multiple of the host's.
         """
-        self._per_frame = round(config.sample_time * rate)
-        if abs(self._per_frame - config.sample_time * rate) > 1e-6 * self._per_frame:
+        self.per_frame = round(config.sample_time * rate)
+        if abs(self.per_frame - config.sample_time * rate) > 1e-6 * self.per_frame:
             raise BlfDscError(
                 f'sample_time: got {config.sample_time:g} s, but motors at {rate:g} Hz need a '
                 f'multiple of {1.0 / rate:g} s'
             )
-        own = {'sample_time': config.sample_time / self._per_frame, 'actuator.delay': 0}
+        own = {'sample_time': config.sample_time / self.per_frame, 'actuator.delay': 0}
         self.plant = plant_of(change(config, own))
         self.ranges = ranges
         n = len(config.joints)
@@ -75,12 +76,15 @@ class MotorPlant:
         """Send a frame, and advance by a period of the host."""
         self._last = frame
         self._on_the_bus.append(frame)
-        acting = self._on_the_bus.popleft()
-        for _ in range(self._per_frame):
-            q, dq, _ = self.plant.measure().reshape(3, -1)
-            self.plant.step(self.ranges.torque.cut(acting.torque_at(q, dq)))
+        self.advance(self._on_the_bus.popleft(), self.per_frame)
         self.frames += 1
 
     def coast(self) -> None:
         """Advance by a period of a host that sends nothing."""
         self.step(self._last)
+
+    def advance(self, frame: Frame, samples: int) -> None:
+        """Advance by samples of the motors, in which they have a frame."""
+        for _ in range(samples):
+            q, dq, _ = self.plant.measure().reshape(3, -1)
+            self.plant.step(self.ranges.torque.cut(frame.torque_at(q, dq)))

@@ -8,7 +8,7 @@ import numpy as np
 from blf_dsc_controller.configuration.nodes import load_loop
 from blf_dsc_controller.drive.driver import Driver, Facts, RobotState
 from blf_dsc_controller.motors.field import Field
-from blf_dsc_controller.motors.frame import Frame, Ranges
+from blf_dsc_controller.motors.frame import Ranges, torque_alone
 from sim_plant.motors import MotorPlant
 
 # of DM8009, DM4340 and DM4310, as damiao-motor 1.0.6 has them
@@ -71,7 +71,7 @@ class MotorDriver(Driver):
         return RobotState(1.0 + self.plant.frames * 0.004, q, dq, effort)
 
     def write(self, torque):
-        self.write_frame(Frame(*np.zeros((4, 7)), torque))
+        self.write_frame(torque_alone(torque))
 
     def write_frame(self, frame):
         self.sent.append((frame, *self.plant.measure()[:2]))

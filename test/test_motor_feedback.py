@@ -17,7 +17,7 @@ from blf_dsc_controller.drive.motor_feedback import MotorFeedback
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.law.local_gains import LocalGains
 from blf_dsc_controller.motors.field import Field
-from blf_dsc_controller.motors.frame import Frame, Gains, Motion, split
+from blf_dsc_controller.motors.frame import Gains, Motion, split, torque_alone
 from blf_dsc_controller.studies.laws import COMPUTED_TORQUE
 from blf_dsc_controller.supervision.supervisor import Phase
 from sim_plant.motors import MotorPlant
@@ -104,7 +104,6 @@ def run(loop, feedback, duration, dies_after=2.0):
     controller = blf.ArmController(loop.controller)
     plant = MotorPlant(loop.plant, RANGES)
     motor = MotorFeedback(controller, RANGES, loop.plant.actuator.delay * period)
-    alone = np.zeros((4, 7))
     worst = 0.0
     for k in range(round(duration / period)):
         torque = controller.update(1.0 + k * period, *plant.measure())
@@ -113,7 +112,7 @@ def run(loop, feedback, duration, dies_after=2.0):
         if k * period > 2.0:
             position = plant.plant.truth()[-14:-7]
             worst = max(worst, np.abs(position - controller.reference.q).max())
-        frame = motor.frame(torque) if feedback == 'motor' else Frame(*alone, torque)
+        frame = motor.frame(torque) if feedback == 'motor' else torque_alone(torque)
         plant.step(frame)
     died = plant.plant.truth()[-14:-7].copy()
     for _ in range(round(dies_after / period)):

@@ -60,6 +60,7 @@ def drive(options: Namespace) -> int:
             ros = RosTopics(controller, options.namespace)
             ending.callback(ros.close)
         ending.enter_context(controller)
+        ending.callback(driver.close)
         for remark in driver.connect():
             print_notice(remark)
         request_realtime(config.realtime, lambda text: print_notice(f'warning: {text}'))

@@ -154,6 +154,9 @@ class Driver(ABC):
     def finish(self) -> None:
         """End the motion; the robot holds itself by its own means."""
 
+    def close(self) -> None:  # noqa: B027 - most have nothing to leave
+        """Leave the robot, after the last `finish` or an error."""
+
     @abstractmethod
     def recover(self) -> None:
         """Make a robot that has stopped by itself ready for another start."""

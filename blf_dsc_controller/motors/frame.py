@@ -64,6 +64,12 @@ class Frame(NamedTuple):
         return np.asarray(pushed + damped + self.torque)
 
 
+def torque_alone(torque: Vector) -> Frame:
+    """Return the frame of a torque (n,) [N m], without a PD."""
+    nothing = np.zeros_like(torque)
+    return Frame(nothing, nothing, nothing, nothing, torque)
+
+
 class Ranges(NamedTuple):
     """What the fields of a frame can hold."""
 
