@@ -5,7 +5,7 @@
 
 runs the simulated arm of a parameter file in real time, on a bus that reaches other
 processes of this computer.  Motors answer each command with their state, and keep the
-last frame while none comes.
+last frame while none comes.  As long as no motor is enabled, a stand holds the arm.
 """
 
 from __future__ import annotations
@@ -26,9 +26,10 @@ from blf_dsc_controller.motors.damiao import Limits, Register, StateCodes, Statu
 from blf_dsc_controller.motors.frame import Frame
 from sim_plant.motors import MotorPlant
 
-_RATE = 4000.0  # Hz, of motors in real time, in Python
+_RATE = 2000.0  # Hz, of motors in real time, in Python
 _PATIENCE = 0.05  # s, after which it is seen that the bus is closed
-_LONGEST = 0.05  # s that are made up for at once
+_AT_ONCE = 0.002  # s, in which no frame is answered
+_LATEST = 0.2  # s behind the clock, at most
 _COLD = 30  # deg C
 
 
@@ -107,7 +108,7 @@ class DamiaoArm:
                 self.serve(_PATIENCE)
                 if len(self._commanded) == self._n:
                     self._commanded.clear()
-                    self.arm.advance(self.frame, self.arm.per_frame)
+                    self._advance(self.arm.per_frame)
         except can.CanError:
             return
 
@@ -116,14 +117,20 @@ class DamiaoArm:
         period = self.arm.plant.period_ns * 1e-9
         done = time.monotonic()
         while True:
-            self.serve(period)
+            waited = period
+            while self.serve(waited):  # all that is there
+                waited = 0.0
             late = time.monotonic() - done
-            if late > _LONGEST:  # this computer is too slow: time stands still
-                done += late - _LONGEST
-                late = _LONGEST
-            samples = math.floor(late / period)
-            self.arm.advance(self.frame, samples)
+            if late > _LATEST:  # this computer is too slow: time stands still
+                done += late - _LATEST
+            samples = math.floor(min(late, _AT_ONCE) / period)
+            self._advance(samples)
             done += samples * period
+
+    def _advance(self, samples: int) -> None:
+        """Move on, unless a stand holds the arm because no motor is enabled."""
+        if any(each != Status.DISABLED for each in self.status):
+            self.arm.advance(self.frame, samples)
 
     def _take(self, joint: int, data: bytes) -> None:
         """Obey a command, and answer with the state."""

@@ -3,7 +3,11 @@
 
 from __future__ import annotations
 
+import os
 import re
+import subprocess
+import sys
+import time
 from pathlib import Path
 
 import numpy as np
@@ -21,9 +25,11 @@ from blf_dsc_controller.cli.main import main
 from blf_dsc_controller.configuration.drive import DriveConfig
 from blf_dsc_controller.configuration.schema import build
 from blf_dsc_controller.drive.can_bus import CanBus
+from blf_dsc_controller.drive.damiao import DamiaoDriver
 from blf_dsc_controller.drive.driver import ConnectionLostError, DriverError
 from blf_dsc_controller.drive.drivers import find_driver
 from blf_dsc_controller.drive.loop import DriveLoop, End
+from blf_dsc_controller.drive.ticks import Ticks
 from blf_dsc_controller.motors import damiao
 from blf_dsc_controller.motors.damiao import Status
 
@@ -54,7 +60,9 @@ def made(request, monkeypatch):
 
 def run(driver, duration=1.0, **options):
     with blf.ArmController(CONFIG, **options) as controller:
-        return DriveLoop(driver, controller, duration=duration).run()
+        feedback = driver.config.feedback
+        loop = DriveLoop(driver, controller, duration=duration, feedback=feedback)
+        return loop.run()
 
 
 def velocity_of(driver):
@@ -232,6 +240,42 @@ def test_a_closed_bus_is_a_lost_connection():
     for use in (lambda: bus.send(1, bytes(8)), lambda: bus.receive(0.0)):
         with pytest.raises(ConnectionLostError, match='the CAN bus'):
             use()
+
+
+def test_motors_in_a_process_of_their_own_answer():
+    """`python -m sim_plant.damiao` on a bus between processes; no motion, which takes time."""
+    bus = 'udp_multicast:239.74.163.9'
+    pytest.importorskip('msgpack')
+    try:
+        CanBus(bus, (), fd=False).close()
+    except DriverError as error:
+        pytest.skip(f'{error}')
+    command = [sys.executable, '-u', '-m', 'sim_plant.damiao', '--bus', bus]
+    environment = os.environ | {'PYTHONPATH': os.pathsep.join(filter(None, sys.path))}
+    process = subprocess.Popen(
+        command, stdout=subprocess.PIPE, text=True, env=environment
+    )
+    try:
+        assert '7 motors on' in process.stdout.readline()
+        driver = DamiaoDriver(bus, CONFIG, DriveConfig())
+        assert driver.connect() == [f'7 motors answer on {bus}']
+        wanted = loop_of(0.004).plant.initial.position
+        np.testing.assert_allclose(driver.positions(), wanted, atol=2e-4)
+        driver.close()
+    finally:
+        process.kill()
+        process.wait()
+
+
+def test_ticks_are_a_period_apart_and_skip_those_that_are_over():
+    ticks = Ticks(0.01)
+    first = ticks.begin()
+    assert ticks.wait() == pytest.approx(first + 0.01)
+    assert 0.0 <= ticks.left(0.5) <= 0.005
+    time.sleep(0.035)
+    late = ticks.wait()
+    assert late >= first + 0.035  # and not first + 0.02
+    assert ticks.left(-1.0) == 0.0
 
 
 def test_driver_is_found_by_its_name():

@@ -13,12 +13,14 @@ from blf_dsc_controller.configuration.drive import DriveConfig
 from blf_dsc_controller.configuration.schema import build, change
 from blf_dsc_controller.drive.driver import DriverError, check_feedback
 from blf_dsc_controller.drive.loop import DriveLoop, End
-from blf_dsc_controller.drive.motor_feedback import MotorFeedback
+from blf_dsc_controller.drive.motor_feedback import MotorFeedback, as_in_motors
 from blf_dsc_controller.errors import BlfDscError
+from blf_dsc_controller.law.factory import settings_of_config
 from blf_dsc_controller.law.local_gains import LocalGains
 from blf_dsc_controller.motors.field import Field
 from blf_dsc_controller.motors.frame import Gains, Motion, split, torque_alone
 from blf_dsc_controller.studies.laws import COMPUTED_TORQUE
+from blf_dsc_controller.supervision.expected_errors import expected_errors
 from blf_dsc_controller.supervision.supervisor import Phase
 from sim_plant.motors import MotorPlant
 
@@ -148,13 +150,11 @@ def test_motors_hold_elastic_gears_that_the_host_cannot_hold():
 
 def test_the_loop_sends_frames_whose_sum_is_in_the_bag_which_replays(tmp_path):
     loop = loop_of(SLOW)
-    driver = MotorDriver(
-        'here', loop.controller, build(DriveConfig, {'feedback': 'motor'})
-    )
+    driver = MotorDriver('here', loop.controller, DriveConfig())
     driver.plant = MotorPlant(loop.plant, RANGES)
     driver.connect()
     with blf.ArmController(loop.controller, record=tmp_path / 'bag') as controller:
-        outcome = DriveLoop(driver, controller, duration=1.0).run()
+        outcome = DriveLoop(driver, controller, duration=1.0, feedback='motor').run()
     assert outcome.end is End.DURATION
     verified = blf.verify(tmp_path / 'bag')
     assert verified.difference is None
@@ -181,7 +181,7 @@ def test_torques_alone_and_laws_of_files_cannot_have_it():
     loop = blf.load_loop('recommended')
     driver = PlantDriver('plant', loop.controller, config)
     with pytest.raises(BlfDscError, match='write host'):
-        DriveLoop(driver, blf.ArmController(loop.controller))
+        DriveLoop(driver, blf.ArmController(loop.controller), feedback='motor')
     controller = blf.ArmController(change(loop.controller, {'law': COMPUTED_TORQUE}))
     with pytest.raises(BlfDscError, match='a law of a file'):
         MotorFeedback(controller, RANGES, 0.0)
@@ -190,3 +190,17 @@ def test_torques_alone_and_laws_of_files_cannot_have_it():
 def test_motors_need_a_rate_that_fits_the_hosts():
     with pytest.raises(BlfDscError, match='a multiple of'):
         MotorPlant(loop_of(SLOW).plant, RANGES, rate=10_100.0)
+
+
+def test_margins_are_those_of_feedback_in_the_motors():
+    """LeRobot's gains at 250 Hz are unstable over a bus, by the linear loop as in the plant."""
+    config = loop_of(SLOW, LEROBOT).controller
+    judged = as_in_motors(config)
+    settings = settings_of_config(judged)
+    host, motor = (
+        expected_errors(each, settings).unmodelled.max() for each in (config, judged)
+    )
+    assert host > 0.5  # rad, within six time constants
+    assert motor < 0.02
+    assert judged.feedback.gain == config.feedback.gain
+    assert as_in_motors(judged) == judged

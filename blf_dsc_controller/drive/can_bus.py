@@ -8,13 +8,16 @@ udp_multicast:239.74.163.2 or slcan:/dev/ttyACM0.
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Collection
+from time import monotonic
 from typing import Any
 
 import can
 
 from blf_dsc_controller.drive.driver import ConnectionLostError, DriverError
 
+_ECHOES = 4  # frames to each identifier that may still come back
 _OPTIONS: dict[bool, dict[str, Any]] = {False: {}, True: {'fd': True}}
 
 
@@ -31,6 +34,7 @@ class CanBus:
         self.address = address
         self._commands = frozenset(commands)
         self._fd = fd
+        self._sent = deque[tuple[int, bytes]](maxlen=_ECHOES * len(self._commands))
         try:
             self._bus = can.Bus(
                 interface=interface if has_interface else 'socketcan',
@@ -57,6 +61,7 @@ class CanBus:
             is_fd=self._fd,
             bitrate_switch=self._fd,
         )
+        self._sent.append((identifier, data))
         try:
             self._bus.send(message)
         except (can.CanError, OSError) as error:
@@ -65,10 +70,25 @@ class CanBus:
     def receive(self, timeout: float) -> tuple[int, bytes] | None:
         """Return identifier and data of the next frame; None: there was none in time [s].
 
+        Some interfaces, such as udp_multicast, return what was sent: that is left out.
+
         Raises:
             ConnectionLostError: the bus is off, or gone.
             DriverError: another program commands the same motors.
         """
+        end = monotonic() + timeout
+        while (found := self._next(max(end - monotonic(), 0.0))) is not None:
+            identifier, _ = found
+            if identifier not in self._commands:
+                return found
+            if found not in self._sent:
+                raise DriverError(
+                    f'{self.address}: another program commands these motors, too (identifier '
+                    f'0x{identifier:03x}): end one of the two'
+                )
+        return None
+
+    def _next(self, timeout: float) -> tuple[int, bytes] | None:
         try:
             message = self._bus.recv(timeout)
         except (can.CanError, OSError) as error:
@@ -77,11 +97,6 @@ class CanBus:
             return None
         if message.is_error_frame:
             raise self._lost('reports an error, or is off')
-        if message.arbitration_id in self._commands:
-            raise DriverError(
-                f'{self.address}: another program commands these motors, too (identifier '
-                f'0x{message.arbitration_id:03x}): end one of the two'
-            )
         return message.arbitration_id, bytes(message.data)
 
     def clear(self) -> None:

@@ -38,6 +38,7 @@ from blf_dsc_controller.motors.frame import Frame, Ranges, torque_alone
 Vector = NDArray[np.float64]
 _ANSWER = 0.5  # s, for a motor at rest to answer
 _SHARE = 0.8  # of a period, for motors to answer a frame
+_TRIES = 3
 _MOST_LOST = 10  # states of a motor in a row
 _HOLD = 10.0  # 1/s, stiffness over damping of what holds the arm: slow, so it swings nowhere
 
@@ -153,13 +154,26 @@ class DamiaoDriver(Driver):
         return np.array(self._state[0])
 
     def start(self) -> None:
-        """Enable the motors that are not: their torque is zero until the first frame."""
+        """Enable the motors that are not: their torque is zero until the first frame.
+
+        Raises:
+            DriverError: one does not become enabled.
+        """
         self._refresh()
-        for each, status in zip(self._ids, self._status, strict=True):
-            if status != Status.ENABLED:
-                self._bus.send(each, damiao.ENABLE)
-        self._refresh()
-        self._refuse_errors()
+        for _ in range(_TRIES):
+            asleep = np.flatnonzero(self._status != Status.ENABLED).tolist()
+            if not asleep:
+                break
+            for joint in asleep:
+                self._bus.send(self._ids[joint], damiao.ENABLE)
+            self._refresh()
+            self._refuse_errors()
+        else:
+            names = ', '.join(map(self._name, asleep))
+            raise DriverError(
+                f'{names}: not enabled after {_TRIES} commands to do so: check the power of the '
+                'motors, and whether a button keeps them off'
+            )
         self._missed[:] = 0
         self._stamp = self._ticks.begin()
 
@@ -196,6 +210,7 @@ class DamiaoDriver(Driver):
         """Send a frame to each motor, at the next tick."""
         self._torque = frame.torque_at(*self._state[:2])
         self._stamp = self._ticks.wait()
+        self._bus.clear()  # answers that came too late
         self._send(frame)
 
     def _send(self, frame: Frame) -> None:

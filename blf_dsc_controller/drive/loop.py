@@ -77,12 +77,12 @@ class DriveLoop:
         duration: float = math.inf,
         settle_time: float = 3.0,
         ros: RosTopics | None = None,
-        feedback: Literal['host', 'motor'] | None = None,
+        feedback: Literal['host', 'motor'] = 'host',
     ) -> None:
         """Run for `duration` [s] of the robot's time, with or without topics.
 
-        The end may take `settle_time` [s] more.  The driver is connected; `feedback` is by
-        default that of its configuration.
+        The end may take `settle_time` [s] more.  The driver is connected; `feedback` is
+        `drive.feedback`.
 
         Raises:
             BlfDscError: `drive.feedback` is motor, and the driver takes torques only, or
@@ -97,7 +97,7 @@ class DriveLoop:
         self._settle_time = settle_time
         self._teller = LoadTeller(driver, controller)
         self._feedback: MotorFeedback | None = None
-        if (feedback or driver.config.feedback) == 'motor':
+        if feedback == 'motor':
             self._feedback = MotorFeedback(controller, driver.ranges, driver.latency)
         self._ros = ros
         self._requests = 0

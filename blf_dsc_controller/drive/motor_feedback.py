@@ -12,11 +12,27 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from blf_dsc_controller.configuration.controller import ControllerConfig
+from blf_dsc_controller.configuration.schema import change
 from blf_dsc_controller.control.arm_controller import ArmController
 from blf_dsc_controller.law.local_gains import LocalGains
 from blf_dsc_controller.motors.frame import Frame, Gains, Motion, Ranges, split
 
 Vector = NDArray[np.float64]
+_OF_MOTORS = 0.001  # s
+
+
+def as_in_motors(config: ControllerConfig) -> ControllerConfig:
+    """Return a configuration whose margins are those of its feedback inside the motors.
+
+    They close it at 10 kHz or more, without a bus.  A sample and a lag of at most 1 ms
+    each leave room for how they find their velocities.
+    """
+    fast = {
+        'sample_time': min(config.sample_time, _OF_MOTORS),
+        'robot.lag': min(config.robot.lag, _OF_MOTORS),
+    }
+    return change(config, fast)
 
 
 class MotorFeedback:
