@@ -43,7 +43,6 @@ from sim_plant.motors import MotorPlant
 
 SECONDS, PICK_UP, SETTLED, DEAD = 24.0, 12.0, 6.0, 2.0  # s
 WEIGHT = 0.5  # kg
-ENCODER = 4.3e-5  # rad, 14 bits of a turn of the motor, over its gear of 9
 RANGES = damiao.ranges_of([damiao.MODELS[each] for each in damiao.OPENARM])
 STIFFNESS = np.array([240.0, 240.0, 240.0, 240.0, 24.0, 31.0, 25.0])
 DAMPING = np.array([5.0, 5.0, 3.0, 5.0, 0.3, 0.3, 0.3])
@@ -100,7 +99,7 @@ def loop_of(law: str, arm: str, period: float) -> LoopConfig:
         'events.duration': [0.0],
         'events.payload': [WEIGHT],
     }
-    plant = {**time, **events, 'sensor.resolution': ENCODER, **ARMS[arm]}
+    plant = {**time, **events, 'sensor.resolution': damiao.ENCODER, **ARMS[arm]}
     given = {'blf_dsc_controller': {**time, **LAWS[law]}, 'sim_plant': plant}
     return load_loop('openarm', given)
 

@@ -19,7 +19,7 @@ from contextlib import suppress
 import can
 import numpy as np
 
-from blf_dsc_controller.configuration.nodes import load_loop
+from blf_dsc_controller.configuration.nodes import PLANT, load_loop
 from blf_dsc_controller.configuration.plant import PlantConfig
 from blf_dsc_controller.motors import damiao
 from blf_dsc_controller.motors.damiao import Limits, Register, StateCodes, Status
@@ -191,7 +191,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     interface, _, channel = options.bus.partition(':')
     with can.Bus(interface=interface, channel=channel) as bus:
         limits = [damiao.MODELS[each] for each in damiao.OPENARM]
-        motors = DamiaoArm(bus, load_loop(options.config).plant, limits)
+        own = {'sensor.resolution': damiao.ENCODER}
+        plant = load_loop(options.config, {PLANT: own}).plant
+        motors = DamiaoArm(bus, plant, limits)
         motors.arm.plant.compile()
         text = f'{len(limits)} motors on {options.bus}: Ctrl-C ends'
         print(text, flush=True)  # noqa: T201 - a command

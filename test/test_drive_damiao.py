@@ -7,7 +7,9 @@ import os
 import re
 import subprocess
 import sys
+import threading
 import time
+from contextlib import closing
 from pathlib import Path
 
 import numpy as np
@@ -32,6 +34,7 @@ from blf_dsc_controller.drive.loop import DriveLoop, End
 from blf_dsc_controller.drive.ticks import Ticks
 from blf_dsc_controller.motors import damiao
 from blf_dsc_controller.motors.damiao import Status
+from sim_plant.damiao import DamiaoArm
 
 CONFIG = loop_of(0.004).controller
 SAFE_PERIODS = 30
@@ -202,9 +205,23 @@ def test_an_error_frame_ends_the_run(made):
 def test_motors_that_cannot_be_driven_are_named(
     made, arrange, given, text, monkeypatch
 ):
-    monkeypatch.setattr('blf_dsc_controller.drive.damiao._ANSWER', 2.0)
+    monkeypatch.setattr('blf_dsc_controller.drive.damiao_motors._ANSWER', 2.0)
     with pytest.raises(DriverError, match=text):
         made(arrange, **given)
+
+
+def test_two_motors_with_one_identifier_are_named(made):
+    others = []
+
+    def double(motors):
+        bus = can.Bus(interface='virtual', channel=motors._bus.channel_info.split()[-1])
+        others.append(DamiaoArm(bus, loop_of(0.004).plant, lockstep_damiao.LIMITS))
+        thread = threading.Thread(target=others[0].serve_in_lockstep, daemon=True)
+        thread.start()
+
+    with pytest.raises(DriverError, match='answers twice: two motors on virtual'):
+        made(double)
+    others[0]._bus.shutdown()
 
 
 def test_motors_that_bear_less_than_the_torque_limit_are_named(made, monkeypatch):
@@ -257,11 +274,11 @@ def test_motors_in_a_process_of_their_own_answer():
     )
     try:
         assert '7 motors on' in process.stdout.readline()
-        driver = DamiaoDriver(bus, CONFIG, DriveConfig())
-        assert driver.connect() == [f'7 motors answer on {bus}']
+        with closing(DamiaoDriver(bus, CONFIG, DriveConfig())) as driver:
+            assert driver.connect() == [f'7 motors answer on {bus}']
+            positions = driver.positions()
         wanted = loop_of(0.004).plant.initial.position
-        np.testing.assert_allclose(driver.positions(), wanted, atol=2e-4)
-        driver.close()
+        np.testing.assert_allclose(positions, wanted, atol=6e-4)  # rad, rounded
     finally:
         process.kill()
         process.wait()
