@@ -100,8 +100,11 @@ def test_local_gains_are_what_a_lasting_deviation_changes(inside):
         np.testing.assert_allclose(gains[1], wanted, rtol=0.05)
 
 
-def run(loop, feedback, duration, dies_after=2.0):
-    """Run the law on motors; return controller, largest error late, travel once it is dead."""
+def run(loop, feedback, duration, dies_after=2.0, loses=0):
+    """Run the law on motors; return controller, largest error late, travel once it is dead.
+
+    Every `loses`-th frame is lost.
+    """
     period = loop.controller.sample_time
     controller = blf.ArmController(loop.controller)
     plant = MotorPlant(loop.plant, RANGES)
@@ -115,7 +118,10 @@ def run(loop, feedback, duration, dies_after=2.0):
             position = plant.plant.truth()[-14:-7]
             worst = max(worst, np.abs(position - controller.reference.q).max())
         frame = motor.frame(torque) if feedback == 'motor' else torque_alone(torque)
-        plant.step(frame)
+        if loses and k % loses == 0:
+            plant.coast()
+        else:
+            plant.step(frame)
     died = plant.plant.truth()[-14:-7].copy()
     for _ in range(round(dies_after / period)):
         plant.coast()
@@ -146,6 +152,41 @@ def test_motors_hold_elastic_gears_that_the_host_cannot_hold():
     assert motor.phase is Phase.TRACKING
     assert worst < 4e-3  # rad: gears give way by 2 mrad between encoder and link
     assert travel < 0.06
+
+
+def test_lost_frames_cost_motors_less_than_the_host():
+    """Every third: the motors go on with the gains and the reference that they have."""
+    loop = loop_of(SLOW, LEROBOT)
+    worst = []
+    for feedback in ('host', 'motor'):
+        controller, error, _ = run(loop, feedback, 4.0, loses=3)
+        assert controller.phase is Phase.TRACKING
+        worst.append(error)
+    assert worst[1] < 0.6 * worst[0] < 1e-3  # rad: 0.5 of 1.2 mrad
+
+
+@pytest.mark.parametrize('feedback', ['host', 'motor'])
+def test_a_host_that_hangs_finds_the_arm_where_its_motors_hold_it(feedback):
+    """For 0.3 s in motion; then it stops, since states were missed, and the arm rests."""
+    loop = loop_of(SLOW)
+    controller = blf.ArmController(loop.controller)
+    plant = MotorPlant(loop.plant, RANGES)
+    motor = MotorFeedback(controller, RANGES, SLOW)
+    for k in range(1000):
+        if 500 <= k < 575:
+            plant.coast()
+            continue
+        torque = controller.update(1.0 + k * SLOW, *plant.measure())
+        frame = motor.frame(torque) if feedback == 'motor' else torque_alone(torque)
+        plant.step(frame)
+        if k == 499:
+            hung = plant.measure()[0]
+        elif k == 575:
+            travel = np.abs(plant.measure()[0] - hung).max()
+    assert controller.phase is Phase.SAFE_STOP
+    assert 'is 0.304 s after the last one' in controller.reason
+    assert bool(travel < 0.05) is (feedback == 'motor')  # rad: 0.17, 0.025
+    assert np.abs(plant.measure()[1]).max() < 0.1  # rad/s
 
 
 def test_the_loop_sends_frames_whose_sum_is_in_the_bag_which_replays(tmp_path):
