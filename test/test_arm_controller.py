@@ -78,6 +78,31 @@ def test_it_computes_the_bits_of_the_simulation_and_its_bag_replays_them(tmp_pat
     assert not any(found.missing for found in verified.comparisons)
 
 
+def test_reference_is_that_of_the_last_sample_and_its_own_copy():
+    """q - q_r is the error that it reports, and dq_r, ddq_r are the rates of q_r."""
+    controller = blf.ArmController(LOOP.controller)
+    assert np.isnan(controller.reference).all()
+    plant = plant_of(LOOP.plant)
+    run(controller, plant, LOOP.plant, 100)
+    q, dq, effort = plant.measure().reshape(3, -1)
+    before = controller.reference
+    controller.update(1.1, q, dq, effort)
+    now = controller.reference
+    np.testing.assert_array_equal(q - now.q, controller.error)
+    T = LOOP.plant.sample_time
+    # of a trapezoid's error, T^2 / 12 times the third derivative: the reference is smooth
+    np.testing.assert_allclose(
+        (now.q - before.q) / T, 0.5 * (now.dq + before.dq), atol=1e-5
+    )
+    np.testing.assert_allclose(
+        (now.dq - before.dq) / T, 0.5 * (now.ddq + before.ddq), atol=1e-3
+    )
+    controller.stop()
+    np.testing.assert_array_equal(controller.reference, now)
+    controller.start()
+    assert np.isnan(controller.reference).all()
+
+
 @pytest.mark.parametrize(
     ('given', 'problem'),
     [

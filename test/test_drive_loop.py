@@ -493,5 +493,5 @@ def test_a_driver_is_a_file_with_a_class(content, problem, tmp_path):
         path.write_text(content)
     with pytest.raises(BlfDscError, match=problem):
         find_driver(str(path))
-    with pytest.raises(BlfDscError, match='expected franka, or a Python file'):
+    with pytest.raises(BlfDscError, match='expected franka, damiao, or a Python file'):
         find_driver('kuka')

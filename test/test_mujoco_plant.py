@@ -224,7 +224,7 @@ def test_closed_loop_runs_the_same_with_both_plants():
     [
         ('panda_rigid', 0.2, 2.3),
         ('ur5e_rigid', 0.55, 1.6),
-        ('openarm', 0.21, 0.9),
+        ('openarm', 0.47, 0.95),
         ('widowx', 0.45, 6.2),
     ],
 )

@@ -243,8 +243,10 @@ def test_every_import_is_a_declared_dependency(distribution):
     used |= set(imports(ROOT / 'launch/closed_loop.launch.py'))
     # a part of numba
     foreign = used - set(sys.stdlib_module_names) - set(PACKAGES) - {'llvmlite'}
-    distributions = {'pyyaml' if name == 'yaml' else name for name in foreign}
+    others = {'yaml': 'pyyaml', 'can': 'python-can'}
+    distributions = {others.get(name, name) for name in foreign}
     extras = ('monte-carlo', 'dask', 'report', 'view', 'streams', 'mujoco', 'franka')
+    extras += ('damiao',)
     optional = set().union(*(requirements(distribution, extra) for extra in extras))
     assert distributions <= requirements(distribution) | optional | depends(
         'exec_depend'

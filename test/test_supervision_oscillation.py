@@ -198,7 +198,7 @@ def test_rate_limit_that_delays_the_torque_is_named():
 
 
 def test_chatter_of_coarse_encoders_is_not_taken_for_brakes():
-    """0.38 mrad, of Damiao's drives: a differenced velocity comes in steps of 0.38 rad/s."""
-    coarse = {'sensor.resolution': 3.8e-4, 'duration': 3.0}
+    """0.38 mrad, of Damiao's frames: a differenced velocity comes in steps of 0.38 rad/s."""
+    coarse = {'sensor.velocity': 'differenced', 'duration': 3.0}
     loop = load_loop('openarm', {PLANT: coarse})
     assert simulate(loop.controller, loop.plant).run().stops == ()

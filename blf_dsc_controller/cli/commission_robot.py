@@ -6,6 +6,7 @@ from __future__ import annotations
 import sys
 from argparse import Namespace
 from collections.abc import Iterator
+from contextlib import closing
 from pathlib import Path
 
 import numpy as np
@@ -43,16 +44,17 @@ def measured_on_robot(
     driver = driver_of(options.robot, path, config)
     with announced_compilation(print_notice):
         ArmController(config).close()
-    for remark in driver.connect():
-        print_notice(remark)
-    driven = Driven(driver, commissioning, folder)
-    planned = commissioning.motions_from(driven.position())
-    print('\n'.join(_limits(options, config, planned, driven.duration(planned))))
-    if not options.yes and input('Type yes to start: ').strip().lower() != 'yes':
-        raise BlfDscError('not started: nothing has moved')
-    request_realtime(config.realtime, lambda text: print_notice(f'warning: {text}'))
-    with signals_to(driven.request_end):
-        return list(_followed(driven, planned))
+    with closing(driver):
+        for remark in driver.connect():
+            print_notice(remark)
+        driven = Driven(driver, commissioning, folder)
+        planned = commissioning.motions_from(driven.position())
+        print('\n'.join(_limits(options, config, planned, driven.duration(planned))))
+        if not options.yes and input('Type yes to start: ').strip().lower() != 'yes':
+            raise BlfDscError('not started: nothing has moved')
+        request_realtime(config.realtime, lambda text: print_notice(f'warning: {text}'))
+        with signals_to(driven.request_end):
+            return list(_followed(driven, planned))
 
 
 def _followed(driven: Driven, planned: list[Planned]) -> Iterator[tuple[str, Measured]]:

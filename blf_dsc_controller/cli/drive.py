@@ -19,9 +19,10 @@ from blf_dsc_controller.configuration.drive import DriveConfig
 from blf_dsc_controller.configuration.nodes import CONTROLLER, DRIVE, load, locate
 from blf_dsc_controller.control.arm_controller import ArmController
 from blf_dsc_controller.control.realtime import request_realtime
-from blf_dsc_controller.drive.driver import Driver, disagreements
+from blf_dsc_controller.drive.driver import Driver, check_feedback, disagreements
 from blf_dsc_controller.drive.drivers import find_driver
 from blf_dsc_controller.drive.loop import DriveLoop, End, Outcome
+from blf_dsc_controller.drive.motor_feedback import as_in_motors
 from blf_dsc_controller.drive.ros_topics import RosTopics
 from blf_dsc_controller.errors import BlfDscError, ConfigurationError
 from blf_dsc_controller.reference.approach import end_of_waypoints
@@ -46,10 +47,12 @@ def drive(options: Namespace) -> int:
     config = load(path, CONTROLLER, ControllerConfig)
     driver = driver_of(options.robot, path, config)
     unmeasured = not_commissioned(config)
-    for warning in [*config_warnings(config), *([unmeasured] if unmeasured else [])]:
+    in_motors = driver.config.feedback == 'motor'
+    judged = as_in_motors(config) if in_motors else config
+    for warning in [*config_warnings(judged), *([unmeasured] if unmeasured else [])]:
         print_notice(f'warning: {warning}')
     if config.model == 'urdf':
-        print(f'errors to expect: {expectation(config)}')
+        print(f'errors to expect: {expectation(judged)}')
     if end := end_of_waypoints(config):
         print(end)
     with announced_compilation(print_notice):
@@ -60,6 +63,7 @@ def drive(options: Namespace) -> int:
             ros = RosTopics(controller, options.namespace)
             ending.callback(ros.close)
         ending.enter_context(controller)
+        ending.callback(driver.close)
         for remark in driver.connect():
             print_notice(remark)
         request_realtime(config.realtime, lambda text: print_notice(f'warning: {text}'))
@@ -69,6 +73,7 @@ def drive(options: Namespace) -> int:
             duration=options.duration or math.inf,
             settle_time=driver.config.settle_time,
             ros=ros,
+            feedback=driver.config.feedback,
         )
         with signals_to(loop.request_end):
             print_notice(f'controlling {options.robot}: Ctrl-C ends')
@@ -92,7 +97,8 @@ def driver_of(address: str, path: Path, config: ControllerConfig) -> Driver:
     """
     settings = load(path, DRIVE, DriveConfig)
     made = find_driver(settings.driver)
-    problems = disagreements(made.facts, config)
+    check_feedback(made, settings)
+    problems = disagreements(made.facts_for(config), config)
     if problems:
         raise ConfigurationError(problems, str(path))
     return made(address, config, settings)

@@ -161,6 +161,7 @@ class Driven:
                 controller,
                 duration=duration,
                 settle_time=self._driver.config.settle_time,
+                feedback='host',  # what moves the arm is the torque alone, as recorded
             )
             if self._requests:
                 raise self._ended(name, End.REQUESTED, '')

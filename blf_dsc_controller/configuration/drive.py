@@ -6,6 +6,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import partial
+from typing import Literal
 
 from blf_dsc_controller.configuration.schema import (
     Vector,
@@ -17,6 +18,9 @@ from blf_dsc_controller.configuration.schema import (
 _WHY = 'it is read once, before the motion starts'
 _fixed = partial(parameter, read_only=_WHY)
 _thresholds = partial(positive, (), read_only=_WHY, omittable=True)
+_identifiers = partial(
+    parameter, (), read_only=_WHY, omittable=True, at_least=1, at_most=0x7FE
+)
 _FORCE = 6
 
 
@@ -25,7 +29,13 @@ class DriveConfig:
     """Parameters of `blf_dsc drive`, a loop on a robot's own interface without ROS."""
 
     driver: str = _fixed(
-        'franka', 'franka, or a Python file with a class DRIVER (drive/driver.py)'
+        'franka',
+        'franka, damiao, or a Python file with a class DRIVER (drive/driver.py)',
+    )
+    feedback: Literal['host', 'motor'] = _fixed(
+        'host',
+        'who closes the feedback: the host, by torques, or as far as they can the '
+        "motors' own PD, by reference, gains and the rest of the torque",
     )
     collision_torque: tuple[float, ...] = _thresholds(
         'external torque of each joint that stops the robot; empty: as configured in'
@@ -46,6 +56,18 @@ class DriveConfig:
         'inertia of that load about its centre, along the axes of the flange',
         'kg m^2',
         read_only=_WHY,
+    )
+    motor_ids: tuple[int, ...] = _identifiers(
+        'damiao: identifier of the motor of each joint; empty: 1, 2, ...'
+    )
+    feedback_ids: tuple[int, ...] = _identifiers(
+        'damiao: identifier with which each answers; empty: 16 more'
+    )
+    can_fd: bool = _fixed(False, 'damiao: send frames of CAN FD')
+    at_end: Literal['hold', 'release'] = _fixed(
+        'hold',
+        'damiao: at the end, the motors hold the arm where it is, or are disabled: an arm '
+        'without brakes falls',
     )
     settle_time: float = positive(
         3.0,

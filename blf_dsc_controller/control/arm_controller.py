@@ -51,6 +51,14 @@ class Load(NamedTuple):
     interval: float  # kg
 
 
+class Reference(NamedTuple):
+    """Where the arm should be, how fast, and accelerated by how much: each (n,)."""
+
+    q: Vector  # rad
+    dq: Vector  # rad/s
+    ddq: Vector  # rad/s^2
+
+
 class ToolError(NamedTuple):
     """Error at the tool, with what the joint bounds keep it within at this posture.
 
@@ -316,6 +324,15 @@ class ArmController:
         """Why the controller stopped or does not start; empty while all is well."""
         guard = self._loop.guard
         return guard.supervisor.text or guard.waiting_for
+
+    @property
+    def reference(self) -> Reference:
+        """Reference q_r, dq_r, ddq_r of the last sample; NaN before the first of a start."""
+        law = self._loop.guard.controller
+        now = law.signals.qr, law.signals.dqr, law.signals.ddqr
+        if not law.samples:
+            return Reference(*np.full((3, len(self.joints)), math.nan))
+        return Reference(*np.array(now))
 
     @property
     def error(self) -> Vector:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What `blf_dsc drive` needs of a robot: facts, states in, torques out.
+"""What `blf_dsc drive` needs of a robot: facts, states in, torques or frames out.
 
 A driver of your own is a Python file with a subclass of `Driver` that is called
 `DRIVER`, named by the parameter `driver`.  It is made with the robot's address and both
@@ -18,6 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.drive import DriveConfig
 from blf_dsc_controller.errors import BlfDscError
+from blf_dsc_controller.motors.frame import Frame, Ranges
 from blf_dsc_controller.supervision.drive_load import DriveLoad
 
 Vector = NDArray[np.float64]
@@ -65,9 +66,23 @@ class Driver(ABC):
     All methods may raise `DriverError`; between `start` and `finish` they raise
     `ReflexError` when the robot has stopped by itself, and `ConnectionLostError` when
     it has fallen silent.
+
+    Attributes:
+        facts: what is true of the robot.
+        has_feedback: whether its motors close a PD of their own; then there is
+            `write_frame`.
+        latency: time [s] from a state until the robot acts on the answer.
     """
 
     facts: ClassVar[Facts]
+    has_feedback: ClassVar[bool] = False
+    latency: float = 0.0
+
+    @classmethod
+    def facts_for(cls, controller: ControllerConfig) -> Facts:
+        """Return what is true of the robot under a configuration: by default `facts`."""
+        del controller
+        return cls.facts
 
     def __init__(
         self, address: str, controller: ControllerConfig, config: DriveConfig
@@ -103,6 +118,20 @@ class Driver(ABC):
     def write(self, torque: Vector | None) -> None:
         """Command torques (n,) [N m]; None: whatever lets the robot go on as it is."""
 
+    @property
+    def ranges(self) -> Ranges:
+        """What a frame to the motors can carry; known once it is connected.
+
+        Raises:
+            DriverError: its motors take torques only.
+        """
+        raise _only_torques(type(self))
+
+    def write_frame(self, frame: Frame) -> None:
+        """Command position, velocity, gains and torque of each motor's own PD."""
+        del frame
+        raise _only_torques(type(self))
+
     def tell_load(self, load: DriveLoad) -> None:
         """Declare this load, in the frame of the tip; called in another thread.
 
@@ -125,9 +154,25 @@ class Driver(ABC):
     def finish(self) -> None:
         """End the motion; the robot holds itself by its own means."""
 
+    def close(self) -> None:  # noqa: B027 - most have nothing to leave
+        """Leave the robot, after the last `finish` or an error."""
+
     @abstractmethod
     def recover(self) -> None:
         """Make a robot that has stopped by itself ready for another start."""
+
+
+def _only_torques(driver: type[Driver]) -> DriverError:
+    return DriverError(
+        f'drive.feedback: got motor, but {driver.__name__} commands torques only, so its motors '
+        'cannot close the feedback: write host'
+    )
+
+
+def check_feedback(driver: type[Driver], config: DriveConfig) -> None:
+    """Raise DriverError if the feedback is to be the motors', who have none."""
+    if config.feedback == 'motor' and not driver.has_feedback:
+        raise _only_torques(driver)
 
 
 def disagreements(facts: Facts, config: ControllerConfig) -> list[str]:

@@ -20,14 +20,19 @@ def find_driver(name: str) -> type[Driver]:
     """
     if name.endswith('.py'):
         return _load(Path(name).expanduser())
-    if name != 'franka':
-        raise BlfDscError(
-            f'drive: driver: got {name!r}, but expected franka, or a Python file (.py)'
-        )
-    import_extra('pylibfranka', 'franka', 'the driver franka')
-    from blf_dsc_controller.drive.franka import FrankaDriver
+    if name == 'franka':
+        import_extra('pylibfranka', 'franka', 'the driver franka')
+        from blf_dsc_controller.drive.franka import FrankaDriver
 
-    return FrankaDriver
+        return FrankaDriver
+    if name == 'damiao':
+        import_extra('can', 'damiao', 'the driver damiao')
+        from blf_dsc_controller.drive.damiao import DamiaoDriver
+
+        return DamiaoDriver
+    raise BlfDscError(
+        f'drive: driver: got {name!r}, but expected franka, damiao, or a Python file (.py)'
+    )
 
 
 def _load(path: Path) -> type[Driver]:

@@ -30,6 +30,7 @@ class LoadTeller:
         self._asked: DriveLoad | None = None
         self._answer: Future[None] | None = None
         self._states = 0
+        self._in_motion = driver.facts_for(controller.config).load_in_motion
         self._thread: ThreadPoolExecutor | None = None
         if controller.config.learning.tell_drive:
             self._thread = ThreadPoolExecutor(1, 'load')
@@ -44,7 +45,7 @@ class LoadTeller:
         self._states += 1
         if self._states % _EVERY:
             return
-        if self._driver.facts.load_in_motion or self._controller.is_at_rest:
+        if self._in_motion or self._controller.is_at_rest:
             self._asked = self._controller.load_to_tell()
             if self._asked is not None:
                 self._answer = self._thread.submit(self._driver.tell_load, self._asked)

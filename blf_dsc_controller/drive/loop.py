@@ -15,7 +15,7 @@ import gc
 import math
 from enum import Enum
 from time import perf_counter
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,6 +30,7 @@ from blf_dsc_controller.drive.driver import (
 )
 from blf_dsc_controller.drive.latency import Latency
 from blf_dsc_controller.drive.load_teller import LoadTeller
+from blf_dsc_controller.drive.motor_feedback import MotorFeedback
 from blf_dsc_controller.drive.ros_topics import RosTopics
 from blf_dsc_controller.supervision.supervisor import Phase
 
@@ -76,10 +77,16 @@ class DriveLoop:
         duration: float = math.inf,
         settle_time: float = 3.0,
         ros: RosTopics | None = None,
+        feedback: Literal['host', 'motor'] = 'host',
     ) -> None:
         """Run for `duration` [s] of the robot's time, with or without topics.
 
-        The end may take `settle_time` [s] more.
+        The end may take `settle_time` [s] more.  The driver is connected; `feedback` is
+        `drive.feedback`.
+
+        Raises:
+            BlfDscError: `drive.feedback` is motor, and the driver takes torques only, or
+                the law is one of a file.
         """
         self.latency = Latency()
         self.worst = 0.0
@@ -89,6 +96,9 @@ class DriveLoop:
         self._duration = duration
         self._settle_time = settle_time
         self._teller = LoadTeller(driver, controller)
+        self._feedback: MotorFeedback | None = None
+        if feedback == 'motor':
+            self._feedback = MotorFeedback(controller, driver.ranges, driver.latency)
         self._ros = ros
         self._requests = 0
         self._states = 0
@@ -174,7 +184,10 @@ class DriveLoop:
         self._watch(state.stamp)
 
     def _send(self, torque: Vector | None) -> None:
-        self._driver.write(torque)
+        if torque is None or self._feedback is None:
+            self._driver.write(torque)
+        else:
+            self._driver.write_frame(self._feedback.frame(torque))
         self.latency.add(perf_counter() - self._received)
 
     def _watch(self, stamp: float) -> None:

@@ -50,6 +50,7 @@ from blf_dsc_controller.supervision.calming import Calming
 from blf_dsc_controller.supervision.contact import contact_of
 from blf_dsc_controller.supervision.drive_load import DriveLoad, DriveLoads
 from blf_dsc_controller.supervision.first_torque import check_first_torque
+from blf_dsc_controller.supervision.last_state import LastState
 from blf_dsc_controller.supervision.plan import Plan, plan_motion
 from blf_dsc_controller.supervision.safe_torque import SafeTorque
 from blf_dsc_controller.supervision.sample_check import SampleCheck
@@ -178,6 +179,11 @@ class Guard:
     def time(self) -> float:
         """Time of the last sample of the law [s]."""
         return self._time_of(self.last_stamp)
+
+    @property
+    def last_state(self) -> LastState:
+        """The last usable joint state."""
+        return self._safe_torque.last
 
     def update(self, stamp: int, measurement: Vector) -> Vector | None:
         """Return the torque for a joint state, with its stamp [ns]; None: no command.

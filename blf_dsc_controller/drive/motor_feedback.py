@@ -1,0 +1,88 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The law's feedback inside the motors' own PD: a frame for each torque.
+
+The part of the feedback that a PD can do goes to the motors, which close it without the
+delay of a bus, from encoders that no frame rounds.  The rest of the law's torque is
+their feed-forward.  The law itself computes, learns and records the same torque as
+without.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from blf_dsc_controller.configuration.controller import ControllerConfig
+from blf_dsc_controller.configuration.schema import change
+from blf_dsc_controller.control.arm_controller import ArmController
+from blf_dsc_controller.law.local_gains import LocalGains
+from blf_dsc_controller.motors.frame import Frame, Gains, Motion, Ranges, split
+
+Vector = NDArray[np.float64]
+_OF_MOTORS = 0.001  # s
+
+
+def as_in_motors(config: ControllerConfig) -> ControllerConfig:
+    """Return a configuration whose margins are those of its feedback inside the motors.
+
+    They close it at 10 kHz or more, without a bus.  A sample and a lag of at most 1 ms
+    each leave room for how they find their velocities.
+    """
+    fast = {
+        'sample_time': min(config.sample_time, _OF_MOTORS),
+        'robot.lag': min(config.robot.lag, _OF_MOTORS),
+    }
+    return change(config, fast)
+
+
+class MotorFeedback:
+    """Frames for motors with a PD of their own.
+
+    Attributes:
+        ranges: what a frame can carry.
+    """
+
+    def __init__(
+        self, controller: ArmController, ranges: Ranges, latency: float
+    ) -> None:
+        """Prepare for motors that act on a frame `latency` [s] after the state behind it.
+
+        Raises:
+            BlfDscError: the law is one of a file, whose feedback is not known.
+        """
+        self.ranges = ranges
+        self._guard = controller.guard
+        self._ahead = latency + 0.5 * controller.config.sample_time
+        self._gains = LocalGains(self._guard.controller)
+        n = len(controller.joints)
+        self._nothing = Motion(np.zeros(n), np.zeros(n))
+
+    def frame(self, torque: Vector) -> Frame:
+        """Return the frame for the torque (n,) [N m] of the last state.
+
+        In a safe stop it damps, by `safety.damping`, and holds no position.
+        """
+        guard = self._guard
+        signals = guard.controller.signals
+        if not guard.has_sample:
+            return self._stopping(torque)
+        later = guard.controller.reference_at(guard.time + self._ahead)
+        return split(
+            torque,
+            Motion(signals.q, signals.dq),
+            Motion(signals.qr, signals.dqr),
+            Motion(later[0], later[1]),
+            Gains(*self._gains.now()),
+            self.ranges,
+        )
+
+    def _stopping(self, torque: Vector) -> Frame:
+        guard = self._guard
+        safety = guard.config.safety
+        damping = np.array(safety.damping)
+        if safety.torque == 'zero':
+            damping[:] = 0.0
+        measured = Motion(guard.last_state.q, guard.last_state.slow)
+        here = Motion(measured.q, self._nothing.dq)
+        gains = Gains(self._nothing.q, damping)
+        return split(torque, measured, here, here, gains, self.ranges)

@@ -1,0 +1,206 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Simulated Damiao motors on a CAN bus of python-can: an arm for `blf_dsc drive`.
+
+    python -m sim_plant.damiao --config openarm --bus udp_multicast:239.74.163.2
+
+runs the simulated arm of a parameter file in real time, on a bus that reaches other
+processes of this computer.  Motors answer each command with their state, and keep the
+last frame while none comes.  As long as no motor is enabled, a stand holds the arm.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+import time
+from collections.abc import Sequence
+from contextlib import suppress
+
+import can
+import numpy as np
+
+from blf_dsc_controller.configuration.nodes import PLANT, load_loop
+from blf_dsc_controller.configuration.plant import PlantConfig
+from blf_dsc_controller.motors import damiao
+from blf_dsc_controller.motors.damiao import Limits, Register, StateCodes, Status
+from blf_dsc_controller.motors.frame import Frame
+from sim_plant.motors import MotorPlant
+
+_RATE = 2000.0  # Hz, of motors in real time, in Python
+_PATIENCE = 0.05  # s, after which it is seen that the bus is closed
+_AT_ONCE = 0.002  # s, in which no frame is answered
+_LATEST = 0.2  # s behind the clock, at most
+_COLD = 30  # deg C
+
+
+class DamiaoArm:
+    """The motors of an arm, on a bus.
+
+    Attributes:
+        arm: the arm.
+        status: what each motor says of itself.
+        modes: mode of each motor, and its time-out [50 us], which only says so.
+        mute: joints whose motors do not answer.
+    """
+
+    def __init__(
+        self,
+        bus: can.BusABC,
+        config: PlantConfig,
+        limits: Sequence[Limits],
+        rate: float = _RATE,
+    ) -> None:
+        """Put the motors of a configured arm on a bus, disabled, as 1, 2, ..."""
+        self._bus = bus
+        self._limits = limits
+        self._ranges = damiao.ranges_of(limits)
+        self.arm = MotorPlant(config, self._ranges, rate)
+        n = len(limits)
+        self._n = n
+        self.status = [Status.DISABLED] * n
+        self.modes = [damiao.MIT] * n
+        self.timeouts = [0] * n
+        self.mute: set[int] = set()
+        self._codes = np.zeros((5, n), int)
+        self.forget()
+        self._commanded: set[int] = set()
+
+    def forget(self) -> None:
+        """Forget all frames: no gains, no torque."""
+        for joint in range(self._n):
+            self._forget(joint)
+
+    def _forget(self, joint: int) -> None:
+        nothing = [field.codes(np.zeros(self._n)) for field in self._ranges]
+        self._codes[:, joint] = np.array(nothing)[:, joint]
+
+    @property
+    def frame(self) -> Frame:
+        """What the motors have been sent last; those that are not enabled do nothing."""
+        values = [
+            field.values(codes)
+            for field, codes in zip(self._ranges, self._codes, strict=True)
+        ]
+        enabled = np.array([each == Status.ENABLED for each in self.status])
+        frame = Frame(*values)
+        return frame._replace(
+            stiffness=frame.stiffness * enabled,
+            damping=frame.damping * enabled,
+            torque=frame.torque * enabled,
+        )
+
+    def serve(self, timeout: float) -> bool:
+        """Take a frame from the bus, if one comes in time [s], and answer it."""
+        message = self._bus.recv(timeout)
+        if message is None:
+            return False
+        data = bytes(message.data)
+        if message.arbitration_id == damiao.TO_ALL:
+            self._answer_request(data)
+        elif 1 <= message.arbitration_id <= self._n:
+            self._take(message.arbitration_id - 1, data)
+        return True
+
+    def serve_in_lockstep(self) -> None:
+        """Serve until the bus is closed; time goes on once all motors got a frame."""
+        try:
+            while True:
+                self.serve(_PATIENCE)
+                if len(self._commanded) == self._n:
+                    self._commanded.clear()
+                    self._advance(self.arm.per_frame)
+        except can.CanError:
+            return
+
+    def serve_in_real_time(self) -> None:
+        """Serve for ever; time goes on with the clock."""
+        period = self.arm.plant.period_ns * 1e-9
+        done = time.monotonic()
+        while True:
+            waited = period
+            while self.serve(waited):  # all that is there
+                waited = 0.0
+            late = time.monotonic() - done
+            if late > _LATEST:  # this computer is too slow: time stands still
+                done += late - _LATEST
+            samples = math.floor(min(late, _AT_ONCE) / period)
+            self._advance(samples)
+            done += samples * period
+
+    def _advance(self, samples: int) -> None:
+        """Move on, unless a stand holds the arm because no motor is enabled."""
+        if any(each != Status.DISABLED for each in self.status):
+            self.arm.advance(self.frame, samples)
+
+    def _take(self, joint: int, data: bytes) -> None:
+        """Obey a command, and answer with the state."""
+        fails = self.status[joint] not in (Status.ENABLED, Status.DISABLED)
+        if data == damiao.ENABLE and not fails:
+            self.status[joint] = Status.ENABLED
+        elif data == damiao.DISABLE or (data == damiao.CLEAR and fails):
+            self.status[joint] = Status.DISABLED
+            self._forget(joint)
+        elif data not in (damiao.ENABLE, damiao.CLEAR):
+            if self.modes[joint] == damiao.MIT:
+                self._codes[:, joint] = damiao.codes_of_command(data)
+            self._commanded.add(joint)
+        self._send_state(joint)
+
+    def _answer_request(self, data: bytes) -> None:
+        identifier, request = int.from_bytes(data[:2], 'little'), data[2]
+        joint = identifier - 1
+        if not 0 <= joint < self._n:
+            return
+        if request == damiao.REFRESH:
+            self._send_state(joint)
+        elif request == damiao.READ:
+            register = Register(data[3])
+            value = {
+                Register.TIMEOUT: self.timeouts[joint],
+                Register.MODE: self.modes[joint],
+                Register.POSITION: self._limits[joint].position,
+                Register.VELOCITY: self._limits[joint].velocity,
+                Register.TORQUE: self._limits[joint].torque,
+            }[register]
+            self._send(joint, damiao.reading_data(identifier, register, value))
+
+    def _send_state(self, joint: int) -> None:
+        ranges = self._ranges
+        fields = ranges.position, ranges.velocity, ranges.torque
+        q, dq, torque = (
+            int(field.codes(values)[joint])
+            for field, values in zip(fields, self.arm.measure(), strict=True)
+        )
+        state = StateCodes(joint + 1, self.status[joint], q, dq, torque, _COLD, _COLD)
+        self._send(joint, damiao.state_data(state))
+
+    def _send(self, joint: int, data: bytes) -> None:
+        if joint not in self.mute:
+            answer = joint + 1 + damiao.ANSWERS
+            self._bus.send(
+                can.Message(arbitration_id=answer, data=data, is_extended_id=False)
+            )
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run motors in real time, until Ctrl-C."""
+    parser = argparse.ArgumentParser(prog='sim_plant.damiao', description=__doc__)
+    parser.add_argument('--config', default='openarm', help='parameter file or preset')
+    parser.add_argument('--bus', default='udp_multicast:239.74.163.2')
+    options = parser.parse_args(arguments)
+    interface, _, channel = options.bus.partition(':')
+    with can.Bus(interface=interface, channel=channel) as bus:
+        limits = [damiao.MODELS[each] for each in damiao.OPENARM]
+        own = {'sensor.resolution': damiao.ENCODER}
+        plant = load_loop(options.config, {PLANT: own}).plant
+        motors = DamiaoArm(bus, plant, limits)
+        motors.arm.plant.compile()
+        text = f'{len(limits)} motors on {options.bus}: Ctrl-C ends'
+        print(text, flush=True)  # noqa: T201 - a command
+        with suppress(KeyboardInterrupt):
+            motors.serve_in_real_time()
+    return 0
+
+
+if __name__ == '__main__':
+    raise SystemExit(main())

@@ -1,0 +1,80 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The driver of Damiao motors on simulated ones, on python-can's virtual bus, in lock-step.
+
+Time goes on with the frames: a test holds on any machine.  `arrange(motors)`, if set,
+gets the motors before they are reached; `at` calls something with them at a state.
+"""
+
+from __future__ import annotations
+
+import threading
+from typing import ClassVar
+
+import can
+
+from blf_dsc_controller.configuration.nodes import load_loop
+from blf_dsc_controller.drive.damiao import DamiaoDriver
+from blf_dsc_controller.drive.ticks import Ticks
+from blf_dsc_controller.motors import damiao
+from sim_plant.damiao import DamiaoArm
+
+PATIENCE = 20.0  # s, for an answer of a thread
+LIMITS = [damiao.MODELS[each] for each in damiao.OPENARM]
+
+
+class LockstepTicks(Ticks):
+    """Ticks that are there as soon as they are waited for."""
+
+    answers = PATIENCE  # s; less where answers are lost on purpose
+
+    def begin(self):
+        self._next = 1.0
+        return self._next
+
+    def wait(self):
+        self._next += self.period
+        return self._next
+
+    def left(self, _share):
+        return self.answers
+
+
+class LockstepDriver(DamiaoDriver):
+    """A driver that brings its motors, once for each bus."""
+
+    arrange = None
+    at: ClassVar = {}  # number of a state: what is done before it
+    made = None  # the driver that was made last
+
+    def make_ticks(self):
+        return LockstepTicks(self.controller.sample_time)
+
+    def connect(self):
+        LockstepDriver.made = self
+        self.states = 0
+        channel = self.address.partition(':')[2]
+        self.bus = can.Bus(interface='virtual', channel=channel)
+        period = {'sample_time': self.controller.sample_time}
+        loop = load_loop('openarm', {'blf_dsc_controller': period, 'sim_plant': period})
+        self.motors = DamiaoArm(self.bus, loop.plant, LIMITS, rate=2000.0)
+        if type(self).arrange is not None:
+            type(self).arrange(self.motors)
+        self.thread = threading.Thread(
+            target=self.motors.serve_in_lockstep, daemon=True
+        )
+        self.thread.start()
+        return super().connect()
+
+    def read(self):
+        self.states += 1
+        if self.states in self.at:
+            self.at[self.states](self)
+        return super().read()
+
+    def close(self):
+        super().close()
+        self.bus.shutdown()
+        self.thread.join(PATIENCE)
+
+
+DRIVER = LockstepDriver

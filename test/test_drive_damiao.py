@@ -1,0 +1,315 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`blf_dsc drive` on simulated Damiao motors, over their protocol, on a virtual CAN bus."""
+
+from __future__ import annotations
+
+import os
+import re
+import subprocess
+import sys
+import threading
+import time
+from contextlib import closing
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+pytest.importorskip('can')
+
+import can
+import lockstep_damiao
+from lockstep_damiao import LockstepDriver, LockstepTicks
+from markdown_it import MarkdownIt
+from motor_arm import loop_of
+
+import blf_dsc_controller as blf
+from blf_dsc_controller.cli.main import main
+from blf_dsc_controller.configuration.drive import DriveConfig
+from blf_dsc_controller.configuration.schema import build
+from blf_dsc_controller.drive.can_bus import CanBus
+from blf_dsc_controller.drive.damiao import DamiaoDriver
+from blf_dsc_controller.drive.driver import ConnectionLostError, DriverError
+from blf_dsc_controller.drive.drivers import find_driver
+from blf_dsc_controller.drive.loop import DriveLoop, End
+from blf_dsc_controller.drive.ticks import Ticks
+from blf_dsc_controller.motors import damiao
+from blf_dsc_controller.motors.damiao import Status
+from sim_plant.damiao import DamiaoArm
+
+CONFIG = loop_of(0.004).controller
+
+
+@pytest.fixture
+def made(request, monkeypatch):
+    """A connected driver, by the name of the test; its motors are gone afterwards."""
+    drivers = []
+
+    def make(arrange=None, at=None, config=CONFIG, **given):
+        monkeypatch.setattr(LockstepDriver, 'arrange', arrange)
+        monkeypatch.setattr(LockstepDriver, 'at', at or {})
+        address = f'virtual:{request.node.name}{len(drivers)}'
+        driver = LockstepDriver(
+            address, config, build(DriveConfig, {'feedback': 'motor', **given})
+        )
+        drivers.append(driver)
+        driver.connect()
+        return driver
+
+    yield make
+    for driver in drivers:
+        driver.close()
+
+
+def run(driver, duration=1.0, **options):
+    with blf.ArmController(CONFIG, **options) as controller:
+        feedback = driver.config.feedback
+        loop = DriveLoop(driver, controller, duration=duration, feedback=feedback)
+        return loop.run()
+
+
+def velocity_of(driver):
+    return np.abs(driver.motors.arm.plant.measure().reshape(3, -1)[1]).max()
+
+
+def of_preset():
+    """The preset at 250 Hz, with its motion."""
+    preset = Path('config/openarm.yaml').read_text()
+    assert 'sample_time: 0.001' in preset
+    return (
+        preset.replace('sample_time: 0.001', 'sample_time: 0.004')
+        + '\n/**/drive:\n  ros__parameters:\n    feedback: motor\n    driver: damiao\n'
+    )
+
+
+def of_page():
+    """The file of the page: LeRobot's gains, and a posture to hold."""
+    page = MarkdownIt().parse(Path('doc/real_arm.md').read_text())
+    texts = [block.content for block in page if block.info == 'yaml']
+    (text,) = [text for text in texts if 'driver: damiao' in text]
+    return text
+
+
+@pytest.mark.parametrize('text', [of_preset, of_page])
+def test_command_line_drives_the_motors_and_its_bag_replays(text, tmp_path, capsys):
+    file = tmp_path / 'my.yaml'
+    file.write_text(
+        text().replace('driver: damiao', f'driver: {lockstep_damiao.__file__}')
+    )
+    bag = tmp_path / 'bag'
+    robot = f'virtual:{text.__name__}'
+    arguments = ['--robot', robot, '--config', str(file), '--out', str(bag)]
+    assert main(['drive', *arguments, '--duration', '3']) == 0
+    printed = capsys.readouterr()
+    assert f'7 motors answer on {robot}' in printed.out + printed.err
+    assert 'and 0 missed' in printed.out
+    verified = blf.verify(bag)
+    assert verified.difference is None
+    recorded = blf.read_run(bag)
+    late = recorded.error[400:700]  # on the reference, before the end
+    assert np.abs(late).max() < 6e-3  # rad: with LeRobot's gains, friction takes 4 mrad
+
+
+@pytest.mark.parametrize('feedback', ['host', 'motor'])
+def test_at_the_end_the_motors_hold_or_are_disabled(made, feedback):
+    driver = made(feedback=feedback)
+    outcome = run(driver)
+    assert outcome.end is End.DURATION
+    before = driver.positions()
+    driver.motors.arm.advance(driver.motors.frame, 2000)  # 1 s
+    # rad: it rests as far as velocities in steps of 22 mrad/s show, and may creep on
+    assert np.abs(driver.positions() - before).max() < 0.03
+    assert set(driver.motors.status) == {Status.ENABLED}
+
+
+def test_at_the_end_the_motors_are_disabled_where_that_is_wanted(made):
+    driver = made(at_end='release')
+    run(driver, 0.3)
+    driver.positions()  # all frames have been taken
+    assert set(driver.motors.status) == {Status.DISABLED}
+
+
+def fail(joint, status):
+    """A motor that stops, before a run or within one."""
+
+    def happen(of):
+        getattr(of, 'motors', of).status[joint] = status
+
+    return happen
+
+
+@pytest.mark.parametrize(
+    ('status', 'text'),
+    [
+        (Status.HOT_ROTOR, r'its winding is too hot: let it cool.*winding 30 deg C'),
+        (Status.DISABLED, 'it is not enabled: another program has disabled it'),
+        (Status.LOST_FRAMES, r'no frames within its time-out \(register 9\)'),
+        (0x5, 'error 0x5'),
+    ],
+)
+def test_a_motor_that_stops_ends_the_run_and_the_others_hold(made, status, text):
+    driver = made(at={100: fail(6, status)})
+    outcome = run(driver)
+    assert outcome.end is End.REFLEX
+    assert outcome.states in (99, 100)  # the last frame may have been answered already
+    assert 'motor 0x07 of openarm_left_joint7 has stopped' in outcome.text
+    assert re.search(text, outcome.text)
+    frame = driver.motors.frame
+    assert (frame.stiffness[:6] > 0.0).all()
+    assert (frame.velocity[:6] < 0.02).all()
+
+
+def test_lost_answers_are_bridged_and_a_silent_motor_ends_the_run(made, monkeypatch):
+    def mute(driver):
+        monkeypatch.setattr(LockstepTicks, 'answers', 0.2)
+        driver.motors.mute = {2}
+
+    def unmute(driver):
+        driver.motors.mute = set()
+        monkeypatch.setattr(LockstepTicks, 'answers', lockstep_damiao.PATIENCE)
+
+    driver = made(at={100: mute, 103: unmute, 150: mute})
+    outcome = run(driver)
+    assert outcome.end is End.LOST
+    assert driver.lost >= 3 + 10
+    assert (
+        'motor 0x03 of openarm_left_joint3 has not answered 11 frames' in outcome.text
+    )
+
+
+def test_another_client_on_the_bus_ends_the_run(made):
+    def interfere(driver):
+        with can.Bus(
+            interface='virtual', channel=driver.address.partition(':')[2]
+        ) as bus:
+            bus.send(
+                can.Message(arbitration_id=2, data=damiao.DISABLE, is_extended_id=False)
+            )
+
+    driver = made(at={100: interfere})
+    with pytest.raises(
+        DriverError, match=r'another program commands these motors.*0x002'
+    ):
+        run(driver)
+
+
+def test_an_error_frame_ends_the_run(made):
+    def break_bus(driver):
+        with can.Bus(
+            interface='virtual', channel=driver.address.partition(':')[2]
+        ) as bus:
+            bus.send(can.Message(is_error_frame=True))
+
+    outcome = run(made(at={100: break_bus}))
+    assert outcome.end is End.LOST
+    assert 'the CAN bus reports an error, or is off' in outcome.text
+
+
+@pytest.mark.parametrize(
+    ('arrange', 'given', 'text'),
+    [
+        (
+            lambda motors: motors.modes.__setitem__(3, 2),
+            {},
+            'motor 0x04 of openarm_left_joint4 is in mode 2, but frames need mode 1',
+        ),
+        (lambda motors: motors.mute.add(1), {}, 'motor 0x02 .*: no answer on virtual'),
+        (fail(0, Status.OVER_VOLTAGE), {}, 'has stopped: its voltage is too high'),
+        (None, {'motor_ids': [1, 2]}, 'got 2 and 2, but the arm has 7 joints'),
+    ],
+)
+def test_motors_that_cannot_be_driven_are_named(
+    made, arrange, given, text, monkeypatch
+):
+    monkeypatch.setattr('blf_dsc_controller.drive.damiao_motors._ANSWER', 2.0)
+    with pytest.raises(DriverError, match=text):
+        made(arrange, **given)
+
+
+def test_two_motors_with_one_identifier_are_named(made):
+    others = []
+
+    def double(motors):
+        bus = can.Bus(interface='virtual', channel=motors._bus.channel_info.split()[-1])
+        others.append(DamiaoArm(bus, loop_of(0.004).plant, lockstep_damiao.LIMITS))
+        thread = threading.Thread(target=others[0].serve_in_lockstep, daemon=True)
+        thread.start()
+
+    with pytest.raises(DriverError, match='answers twice: two motors on virtual'):
+        made(double)
+    others[0]._bus.shutdown()
+
+
+def test_motors_that_bear_less_than_the_torque_limit_are_named(made, monkeypatch):
+    weak = [damiao.MODELS['4310']] * 7
+    monkeypatch.setattr(lockstep_damiao, 'LIMITS', weak)
+    with pytest.raises(
+        DriverError, match=r'got 40 N m .*joint1, whose frames hold 10 N m'
+    ):
+        made()
+
+
+def test_a_time_out_of_a_motor_is_remarked(request, monkeypatch):
+    def arrange(motors):
+        motors.timeouts[5] = 8000
+
+    monkeypatch.setattr(LockstepDriver, 'arrange', arrange)
+    driver = LockstepDriver(f'virtual:{request.node.name}', CONFIG, DriveConfig())
+    remarks = driver.connect()
+    driver.close()
+    assert 'motor 0x06 of openarm_left_joint6 stops holding 400 ms' in remarks[-1]
+
+
+def test_a_bus_that_cannot_be_opened_says_how_to_give_one():
+    with pytest.raises(DriverError, match='give a channel such as can0'):
+        CanBus('nowhere_like_this', (), fd=False)
+    with pytest.raises(DriverError, match='cannot be opened'):
+        CanBus('no_interface:1', (), fd=False)
+
+
+def test_a_closed_bus_is_a_lost_connection():
+    bus = CanBus('virtual:closed', (), fd=False)
+    bus.close()
+    for use in (lambda: bus.send(1, bytes(8)), lambda: bus.receive(0.0)):
+        with pytest.raises(ConnectionLostError, match='the CAN bus'):
+            use()
+
+
+def test_motors_in_a_process_of_their_own_answer():
+    """`python -m sim_plant.damiao` on a bus between processes; no motion, which takes time."""
+    bus = 'udp_multicast:239.74.163.9'
+    pytest.importorskip('msgpack')
+    try:
+        CanBus(bus, (), fd=False).close()
+    except DriverError as error:
+        pytest.skip(f'{error}')
+    command = [sys.executable, '-u', '-m', 'sim_plant.damiao', '--bus', bus]
+    environment = os.environ | {'PYTHONPATH': os.pathsep.join(filter(None, sys.path))}
+    process = subprocess.Popen(
+        command, stdout=subprocess.PIPE, text=True, env=environment
+    )
+    try:
+        assert '7 motors on' in process.stdout.readline()
+        with closing(DamiaoDriver(bus, CONFIG, DriveConfig())) as driver:
+            assert driver.connect() == [f'7 motors answer on {bus}']
+            positions = driver.positions()
+        wanted = loop_of(0.004).plant.initial.position
+        np.testing.assert_allclose(positions, wanted, atol=6e-4)  # rad, rounded
+    finally:
+        process.kill()
+        process.wait()
+
+
+def test_ticks_are_a_period_apart_and_skip_those_that_are_over():
+    ticks = Ticks(0.01)
+    first = ticks.begin()
+    assert ticks.wait() == pytest.approx(first + 0.01)
+    assert 0.0 <= ticks.left(0.5) <= 0.005
+    time.sleep(0.035)
+    late = ticks.wait()
+    assert late >= first + 0.035  # and not first + 0.02
+    assert ticks.left(-1.0) == 0.0
+
+
+def test_driver_is_found_by_its_name():
+    assert find_driver('damiao').__name__ == 'DamiaoDriver'

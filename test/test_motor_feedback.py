@@ -1,0 +1,257 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The law's feedback inside the motors' own PD: what is sent, and what it is good for."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from motor_arm import ELASTIC, LEROBOT, RANGES, TORQUE, MotorDriver, loop_of
+from plant_driver import PlantDriver
+
+import blf_dsc_controller as blf
+from blf_dsc_controller.configuration.drive import DriveConfig
+from blf_dsc_controller.configuration.schema import build, change
+from blf_dsc_controller.drive.driver import DriverError, check_feedback
+from blf_dsc_controller.drive.loop import DriveLoop, End
+from blf_dsc_controller.drive.motor_feedback import MotorFeedback, as_in_motors
+from blf_dsc_controller.errors import BlfDscError
+from blf_dsc_controller.law.factory import settings_of_config
+from blf_dsc_controller.law.local_gains import LocalGains
+from blf_dsc_controller.motors.field import Field
+from blf_dsc_controller.motors.frame import Gains, Motion, split, torque_alone
+from blf_dsc_controller.studies.laws import COMPUTED_TORQUE
+from blf_dsc_controller.supervision.expected_errors import expected_errors
+from blf_dsc_controller.supervision.supervisor import Phase
+from sim_plant.motors import MotorPlant
+
+SLOW = 0.004  # s
+
+
+def test_sum_of_a_frame_is_the_torque_up_to_the_rounding_of_the_last_field():
+    random = np.random.default_rng(0)
+    for _ in range(200):
+        q, dq = random.uniform(-2.0, 2.0, (2, 7))
+        reference = Motion(q + random.normal(0.0, 0.01, 7), dq + 0.1)
+        gains = Gains(random.uniform(0.0, 700.0, 7), random.uniform(0.0, 7.0, 7))
+        torque = random.uniform(-0.5, 0.5, 7) * TORQUE
+        frame = split(torque, Motion(q, dq), reference, reference, gains, RANGES)
+        off = np.abs(frame.torque_at(q, dq) - torque)
+        assert (off <= 0.5 * RANGES.torque.step + 1e-12).all()
+        whole = frame.stiffness > 0.0
+        assert whole.sum() >= 3  # of most joints, the rest fits into its range
+        wanted = np.minimum(gains.stiffness, 500.0)
+        assert (np.abs(frame.stiffness - wanted)[whole] < 0.07).all()  # half a step
+
+
+def test_mean_torque_of_an_arm_that_follows_is_that_of_the_law():
+    """The frame is held for a period, in which the reference moves on by dq T."""
+    dq, half = np.full(7, 2.0), 0.5 * SLOW
+    q, rest = np.zeros(7), np.zeros(7)
+    gains = Gains(np.full(7, 200.0), rest)
+    ahead = Motion(q + dq * half, dq)
+    frame = split(rest, Motion(q, dq), Motion(q, dq), ahead, gains, RANGES)
+    begins, ends = (frame.torque_at(q + dq * t, dq) for t in (0.0, SLOW))
+    step = RANGES.torque.step
+    assert (np.abs(begins + ends) <= step + 1e-12).all()
+    assert (begins > 0.5).all()  # with q_r in the frame, 0 N m to -1.6 N m instead
+
+
+def test_a_remainder_beyond_its_range_leaves_the_torque_alone():
+    q = np.zeros(7)
+    far = Motion(q + 0.5, q)
+    frame = split(q + 1.0, Motion(q, q), far, far, Gains(np.full(7, 400.0), q), RANGES)
+    assert (frame.stiffness == 0.0).all()
+    np.testing.assert_allclose(frame.torque, 1.0, atol=0.5 * RANGES.torque.step.max())
+
+
+def test_a_field_without_bits_is_cut_only():
+    field = Field(-1.0, 1.0)
+    np.testing.assert_array_equal(field.nearest([0.123, 7.0]), [0.123, 1.0])
+    assert field.step == 0.0
+
+
+@pytest.mark.parametrize('inside', [0.0, 0.5, 0.9])
+def test_local_gains_are_what_a_lasting_deviation_changes(inside):
+    """By differences, with the filter of the surface settled; `inside` of the bound."""
+    config = change(
+        loop_of(SLOW, LEROBOT).controller,
+        {'reference.type': 'hold', 'disturbance.gain': [0.0] * 7},
+    )
+    found = []
+    bound = np.array(config.barrier.bound)
+    for deviation, speed in ((0.0, 0.0), (1e-6, 0.0), (0.0, 1e-6)):
+        law = blf.ArmController(config).guard.controller
+        law.state.alpha2[:] = 0.0
+        q = np.array(config.reference.offset) + inside * bound + deviation
+        law.settings.Gamma[:] = 0.0
+        for k in range(200 if speed == 0.0 else 1):
+            law.update(100.0 + k * SLOW, SLOW, np.concatenate((q, np.zeros(14))))
+        saved = law.save()
+        q0 = np.concatenate((q, np.full(7, speed), np.zeros(7)))
+        law.restore(saved)
+        law.update(100.0 + 201 * SLOW, SLOW, q0)
+        signals = law.signals
+        found.append(signals.demand - signals.model_torque)
+        gains = LocalGains(law).now().copy()
+    stiffness = (found[0] - found[1]) / 1e-6
+    np.testing.assert_allclose(gains[0], stiffness, rtol=1e-3)
+    if inside == 0.0:
+        wanted = np.array(LEROBOT['feedback.joint_damping'])
+        np.testing.assert_allclose(gains[1], wanted, rtol=0.05)
+
+
+def run(loop, feedback, duration, dies_after=2.0, loses=0):
+    """Run the law on motors; return controller, largest error late, travel once it is dead.
+
+    Every `loses`-th frame is lost.
+    """
+    period = loop.controller.sample_time
+    controller = blf.ArmController(loop.controller)
+    plant = MotorPlant(loop.plant, RANGES)
+    motor = MotorFeedback(controller, RANGES, loop.plant.actuator.delay * period)
+    worst = 0.0
+    for k in range(round(duration / period)):
+        torque = controller.update(1.0 + k * period, *plant.measure())
+        if torque is None or controller.phase is Phase.SAFE_STOP:
+            break
+        if k * period > 2.0:
+            position = plant.plant.truth()[-14:-7]
+            worst = max(worst, np.abs(position - controller.reference.q).max())
+        frame = motor.frame(torque) if feedback == 'motor' else torque_alone(torque)
+        if loses and k % loses == 0:
+            plant.coast()
+        else:
+            plant.step(frame)
+    died = plant.plant.truth()[-14:-7].copy()
+    for _ in range(round(dies_after / period)):
+        plant.coast()
+    travel = np.abs(plant.plant.truth()[-14:-7] - died).max()
+    return controller, worst, travel
+
+
+def test_a_dead_host_leaves_an_arm_that_its_motors_hold():
+    """The last frame stays: a constant torque lets the arm go, a PD brings it to rest."""
+    loop = loop_of(SLOW)
+    errors, travels = [], []
+    for feedback in ('host', 'motor'):
+        controller, worst, travel = run(loop, feedback, 4.0)
+        assert controller.phase is Phase.TRACKING
+        errors.append(worst)
+        travels.append(travel)
+    assert errors[1] < 1.2 * errors[0] < 1e-3  # rad: some 0.6 mrad while it learns
+    assert travels[0] > 1.0  # rad: it falls
+    assert travels[1] < 0.06  # rad: 0.6 rad/s at most, braked within 0.1 s
+
+
+def test_motors_hold_elastic_gears_that_the_host_cannot_hold():
+    """LeRobot's gains at 250 Hz: through the bus they oscillate, in the motors they do not."""
+    loop = loop_of(SLOW, LEROBOT, ELASTIC)
+    host, _, _ = run(loop, 'host', 1.0)
+    assert host.phase is Phase.SAFE_STOP
+    motor, worst, travel = run(loop, 'motor', 4.0)
+    assert motor.phase is Phase.TRACKING
+    assert worst < 4e-3  # rad: gears give way by 2 mrad between encoder and link
+    assert travel < 0.06
+
+
+def test_lost_frames_cost_motors_less_than_the_host():
+    """Every third: the motors go on with the gains and the reference that they have."""
+    loop = loop_of(SLOW, LEROBOT)
+    worst = []
+    for feedback in ('host', 'motor'):
+        controller, error, _ = run(loop, feedback, 4.0, loses=3)
+        assert controller.phase is Phase.TRACKING
+        worst.append(error)
+    assert worst[1] < 0.6 * worst[0] < 1e-3  # rad: 0.5 of 1.2 mrad
+
+
+@pytest.mark.parametrize('feedback', ['host', 'motor'])
+def test_a_host_that_hangs_finds_the_arm_where_its_motors_hold_it(feedback):
+    """For 0.3 s in motion; then it stops, since states were missed, and the arm rests."""
+    loop = loop_of(SLOW)
+    controller = blf.ArmController(loop.controller)
+    plant = MotorPlant(loop.plant, RANGES)
+    motor = MotorFeedback(controller, RANGES, SLOW)
+    for k in range(1000):
+        if 500 <= k < 575:
+            plant.coast()
+            continue
+        torque = controller.update(1.0 + k * SLOW, *plant.measure())
+        frame = motor.frame(torque) if feedback == 'motor' else torque_alone(torque)
+        plant.step(frame)
+        if k == 499:
+            hung = plant.measure()[0]
+        elif k == 575:
+            travel = np.abs(plant.measure()[0] - hung).max()
+    assert controller.phase is Phase.SAFE_STOP
+    assert 'is 0.304 s after the last one' in controller.reason
+    assert bool(travel < 0.05) is (feedback == 'motor')  # rad: 0.17, 0.025
+    assert np.abs(plant.measure()[1]).max() < 0.1  # rad/s
+
+
+def test_the_loop_sends_frames_whose_sum_is_in_the_bag_which_replays(tmp_path):
+    loop = loop_of(SLOW)
+    driver = MotorDriver('here', loop.controller, DriveConfig())
+    driver.plant = MotorPlant(loop.plant, RANGES)
+    driver.connect()
+    with blf.ArmController(loop.controller, record=tmp_path / 'bag') as controller:
+        outcome = DriveLoop(driver, controller, duration=1.0, feedback='motor').run()
+    assert outcome.end is End.DURATION
+    verified = blf.verify(tmp_path / 'bag')
+    assert verified.difference is None
+    recorded = blf.read_run(tmp_path / 'bag').torque
+    tracking = 250
+    for torque, (frame, q, dq) in zip(
+        recorded[:tracking], driver.sent[:tracking], strict=True
+    ):
+        assert (frame.stiffness > 0.0).all()
+        # the reference moves on by 1.5 periods: kp and kd times at most 6 mrad, 0.1 rad/s
+        off = np.abs(frame.torque_at(q, dq) - torque)
+        assert off.max() < 4.0
+    stopping = driver.sent[-1][0]
+    assert (stopping.stiffness == 0.0).all()
+    assert (stopping.damping > 0.0).all()
+    assert np.abs(driver.plant.measure()[1]).max() < 0.03  # rad/s: at rest, to a step
+
+
+def test_torques_alone_and_laws_of_files_cannot_have_it():
+    config = build(DriveConfig, {'feedback': 'motor'})
+    with pytest.raises(DriverError, match='PlantDriver commands torques only'):
+        check_feedback(PlantDriver, config)
+    check_feedback(PlantDriver, DriveConfig())
+    loop = blf.load_loop('recommended')
+    driver = PlantDriver('plant', loop.controller, config)
+    with pytest.raises(BlfDscError, match='write host'):
+        DriveLoop(driver, blf.ArmController(loop.controller), feedback='motor')
+    controller = blf.ArmController(change(loop.controller, {'law': COMPUTED_TORQUE}))
+    with pytest.raises(BlfDscError, match='a law of a file'):
+        MotorFeedback(controller, RANGES, 0.0)
+
+
+def test_motors_need_a_rate_that_fits_the_hosts():
+    with pytest.raises(BlfDscError, match='a multiple of'):
+        MotorPlant(loop_of(SLOW).plant, RANGES, rate=10_100.0)
+
+
+def test_margins_are_those_of_feedback_in_the_motors():
+    """LeRobot's gains at 250 Hz are unstable over a bus, by the linear loop as in the plant."""
+    config = loop_of(SLOW, LEROBOT).controller
+    judged = as_in_motors(config)
+    settings = settings_of_config(judged)
+    host, motor = (
+        expected_errors(each, settings).unmodelled.max() for each in (config, judged)
+    )
+    assert host > 0.5  # rad, within six time constants
+    assert motor < 0.02
+    assert judged.feedback.gain == config.feedback.gain
+    assert as_in_motors(judged) == judged
+
+
+def test_motors_move_an_arm_of_mujoco_as_well():
+    """Its dry friction sticks, where the own plant's creeps: 0.2 mrad more of error."""
+    pytest.importorskip('mujoco')
+    loop = loop_of(SLOW, plant={'physics': 'mujoco'})
+    controller, worst, travel = run(loop, 'motor', 3.0)
+    assert controller.phase is Phase.TRACKING
+    assert worst < 2e-3
+    assert travel < 0.06
