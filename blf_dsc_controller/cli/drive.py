@@ -65,7 +65,7 @@ def drive(options: Namespace) -> int:
             controller,
             duration=options.duration or math.inf,
             settle_time=driver.config.settle_time,
-            ros=ros,
+            beside=ros,
         )
         with signals_to(loop.request_end):
             print_notice(f'controlling {options.robot}: Ctrl-C ends')

@@ -50,7 +50,7 @@ class SimulatedDriver(Driver):
 
     def positions(self) -> Vector:
         """Return the measured positions (n,) [rad]."""
-        return self.plant.measure()[: self.facts.joints].copy()
+        return np.array(self.plant.measure()[: self.facts.joints])
 
     def start(self) -> None:
         """Begin to wait for torques."""
@@ -69,7 +69,7 @@ class SimulatedDriver(Driver):
             )
         self._count += 1
         n = self.facts.joints
-        q, dq, effort = self.plant.measure().copy().reshape(3, n)
+        q, dq, effort = np.array(self.plant.measure()).reshape(3, n)
         return RobotState(_FIRST + self._count * period, q, dq, effort)
 
     def write(self, torque: Vector | None) -> None:
