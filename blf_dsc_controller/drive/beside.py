@@ -21,9 +21,9 @@ class Beside(ABC):
         """Take motions that come over a link, to which the log goes."""
         self._link = link
         self._guard = controller.guard
-        self._log = LinkLog(link)
+        self.log = LinkLog(link)
         self._inputs = MotionInput(
-            len(controller.joints), lambda: self._guard, _is_live, self._log
+            len(controller.joints), lambda: self._guard, _is_live, self.log
         )
 
     def follow(self) -> None:

@@ -69,7 +69,7 @@ class RosTopics(Beside):
             self._sent |= frozenset(_TELEMETRY)
         link, self._process = _start(config.joints, namespace, self._sent)
         super().__init__(link, controller)
-        self._report = StatusReport(self._log)
+        self._report = StatusReport(self.log)
         self._report.trajectories = self._inputs
         self._late = ''
         self._reported = -1.0, -1  # s, and revision of the state

@@ -1,0 +1,184 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A script beside the loop: its motions, its stops, its end; samples for it.
+
+When the script ends, in whatever way, the reference brakes and the loop ends at rest.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from blf_dsc_controller.control.arm_controller import ArmController
+from blf_dsc_controller.control.goal_messages import End, Goal, Message, encode
+from blf_dsc_controller.control.goals import Goals
+from blf_dsc_controller.control.slow_move import duration_of
+from blf_dsc_controller.drive.beside import Beside
+from blf_dsc_controller.law.external_torque import is_touched
+from blf_dsc_controller.messages import script_link, topic_link
+from blf_dsc_controller.messages.link import Link
+from blf_dsc_controller.messages.script_link import ArmState, encode_sample
+from blf_dsc_controller.reference.retargeting import TrajectoryError
+from blf_dsc_controller.reference.trajectory import Trajectory, TrajectoryPoint
+from blf_dsc_controller.reference.turns import short_way
+
+_PERIOD = 0.005  # s of the robot's time between two samples
+_SHORTEST = 0.1  # s, of a move
+_SOURCE = 'the script'
+
+
+class Script(Beside):
+    """What a script wants of the loop, and is told of it."""
+
+    def __init__(self, link: Link, controller: ArmController) -> None:
+        """Take the commands that come over a link of the parent process."""
+        super().__init__(link, controller)
+        self._controller = controller
+        self._goals = Goals(self._inputs, controller.joints, self._tell_goal, self.log)
+        self._parent = os.getppid()
+        self._told = -math.inf  # s, time of the last sample that was sent
+        self._braking: list[tuple[float, int]] = []  # s, end, and number of the request
+        self._request_end: Callable[[], None] = lambda: None
+        self._closes = 0
+        self._rests_at = math.nan  # s, when the loop may end
+        self._tells_running = False
+
+    def begin(self, request_end: Callable[[], None]) -> None:
+        """Begin a loop, which `request_end` ends."""
+        self._request_end = request_end
+        self._tells_running = True
+        self._told = -math.inf
+        self._braking.clear()
+
+    @property
+    def is_over(self) -> bool:
+        """Whether the script wants nothing more, or has ended."""
+        return self._closes > 0 or self._is_alone
+
+    @property
+    def _is_alone(self) -> bool:
+        return self._link.broken or os.getppid() != self._parent
+
+    def follow(self) -> None:
+        """Do what the script wants; end with it."""
+        super().follow()
+        if self._is_alone and not self._closes:
+            self.close()
+        if self._guard.time >= self._rests_at:
+            self._rests_at = math.nan
+            self._request_end()
+
+    def close(self) -> None:
+        """Brake, then end at rest; the second time end at once; for signals, too."""
+        self._closes += 1
+        if self._closes > 1 or not self._guard.supervisor.running:
+            self._request_end()
+            return
+        self._rests_at = self._inputs.stop(self._guard, 'the end of the script')
+
+    def _take(self, kind: int, content: bytes) -> None:
+        if kind == script_link.POSITIONS:
+            self._inputs.stream(self._guard, np.frombuffer(content), _SOURCE)
+            return
+        wanted = topic_link.decode(content)
+        match kind:
+            case script_link.MOVE:
+                self._begin_goal(wanted, lambda: self._move(wanted))
+            case script_link.FOLLOW:
+                self._begin_goal(wanted, lambda: _trajectory(wanted))
+            case script_link.BRAKE:
+                self._brake(wanted)
+            case script_link.CLOSE:
+                self.close()
+
+    def _begin_goal(
+        self, wanted: dict[str, Any], make: Callable[[], Trajectory]
+    ) -> None:
+        goal = Goal(wanted['number'], b'', (), (), 0.0)
+        self._goals.follow(self._guard, goal, make(), _SOURCE)
+
+    def _move(self, wanted: dict[str, Any]) -> Trajectory:
+        """Return the way from the present reference to rest at some positions."""
+        guard, config = self._guard, self._guard.config
+        here = guard.controller.reference_at(guard.time)[0]
+        (there,), _ = short_way(np.array([wanted['positions']]), here, config)
+        limits = config.limits.velocity, config.limits.acceleration
+        speed, acceleration = wanted['speed'] * np.array(limits)
+        time = max(_SHORTEST, duration_of(np.abs(there - here), speed, acceleration))
+        points = (TrajectoryPoint(time, tuple(there.tolist())),)
+        return Trajectory(config.joints, points)
+
+    def _brake(self, number: int) -> None:
+        try:
+            end = self._inputs.stop(self._guard, 'stop()')
+        except TrajectoryError as error:
+            self._tell_done(number, str(error))
+        else:
+            self._braking.append((end, number))
+
+    def _report_now_and_then(self) -> None:
+        guard = self._guard
+        self._goals.watch(guard)
+        while self._braking and guard.time >= self._braking[0][0]:
+            self._tell_done(self._braking.pop(0)[1])
+        if not guard.has_sample:
+            return
+        if self._tells_running:
+            self._tells_running = False
+            self.tell(script_link.RUNNING, list(self._controller.joints))
+        # An old state is worth nothing: send none before the last one is taken.
+        if guard.time - self._told >= _PERIOD and self._link.flush():
+            self._tell_sample()
+
+    def _tell_sample(self) -> None:
+        if self._guard.has_sample:
+            self._told = self._guard.time
+            self._link.put(script_link.SAMPLE, encode_sample(self._state()))
+
+    def _state(self) -> ArmState:
+        guard, controller = self._guard, self._guard.controller
+        signals, sample = controller.signals, controller.sample
+        load = self._controller.load
+        senses = guard.config.contact.enabled
+        return ArmState(
+            guard.time,
+            str(guard.supervisor.phase),
+            signals.q,
+            signals.dq,
+            controller.state.torque,
+            signals.qr,
+            sample.xi1,
+            sample.bound,
+            sample.external if senses else np.full_like(signals.q, math.nan),
+            load.mass,
+            load.interval,
+            senses and is_touched(controller.state.contact),
+        )
+
+    def tell(self, kind: int, content: Any) -> None:
+        """Tell the script something."""
+        self._link.put(kind, topic_link.encode(content))
+
+    def _tell_done(self, number: int, problem: str = '') -> None:
+        self._tell_sample()  # that of the end
+        self.tell(script_link.DONE, {'number': number, 'problem': problem})
+
+    def _tell_goal(self, message: Message) -> None:
+        if isinstance(message, End):
+            if not self._guard.supervisor.running:
+                return  # the loop ends, and says why
+            self._tell_sample()
+        self._link.put(script_link.GOAL, encode(message))
+
+
+def _trajectory(wanted: dict[str, Any]) -> Trajectory:
+    points = tuple(TrajectoryPoint(*map(_field, each)) for each in wanted['points'])
+    return Trajectory(tuple(wanted['joints']), points)
+
+
+def _field(value: Any) -> Any:
+    return tuple(value) if isinstance(value, list) else value
