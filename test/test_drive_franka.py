@@ -238,18 +238,16 @@ def test_sigterm_ends_at_rest_and_a_killed_command_leaves_a_robot_that_can_be_us
 
 
 def test_a_script_moves_it_and_takes_command_again_after_a_reflex(wire):
-    """The reflex comes in the second motion, which lasts for seconds."""
+    """The reflex comes in the second motion."""
     wire.simulate('127.0.0.20', 'reflex@6000')
     bag = wire.folder / 'bag'
     with blf.Drive('fr3_direct', robot='127.0.0.20', record=bag) as arm:
         start = arm.state.q
         arm.move_to(start + 0.1)
         np.testing.assert_allclose(arm.state.q, start + 0.1, atol=0.5 * BOUND)
-        there = start - 0.2
+        long = [(60.0, start - 0.2)]
         with pytest.raises(LoopEndedError, match=r'stopped by itself: .*recovered'):
-            while True:
-                arm.move_to(there, speed=0.3)
-                arm.move_to(start, speed=0.3)
+            arm.follow(long)
         arm.recover()
         arm.move_to(start)
         np.testing.assert_allclose(arm.state.q, start, atol=0.5 * BOUND)
