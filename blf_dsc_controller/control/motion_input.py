@@ -259,7 +259,7 @@ class MotionInput:
             fastest=np.array(guard.config.limits.velocity),
         )
         lead = self._target_lead
-        request = _Request(lambda: target, self._report, lead, source)
+        request = _Request(lambda: target, self._report_target, lead, source)
         self._request(guard, request)
 
     def _short_way(
@@ -403,6 +403,11 @@ class MotionInput:
             note = f' {plan.motion.note}' if plan.motion.note else ''
             self._log.info(f'following a trajectory of {points} points{note}')
             self._tell_turns(plan.motion.turned)
+
+    def _report_target(self, plan: Plan | None, reason: str) -> None:
+        """Count a target; in a stream the latest wins, which is no rejection."""
+        if reason != _REPLACED:
+            self._report(plan, reason)
 
     def _reject(self, reason: str) -> None:
         self.rejected += 1
