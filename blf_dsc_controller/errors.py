@@ -35,11 +35,11 @@ class DriveError(BlfDscError):
 
 
 class MotionFailedError(DriveError):
-    """A motion was rejected, replaced or given up; the arm is still in command."""
+    """A motion was rejected, replaced or given up; the law is still in command."""
 
 
 class NotInTimeError(DriveError, TimeoutError):
-    """A motion is not over after the given time; the arm brakes."""
+    """Not over after the given time; a motion is braked."""
 
 
 class LoopEndedError(DriveError):

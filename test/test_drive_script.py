@@ -112,12 +112,35 @@ def test_a_motion_is_waited_for_stopped_and_given_up(arm):
     with pytest.raises(MotionFailedError, match=r'pre-empted by stop\(\)|was stopped'):
         arm.wait()
     arm.move_to(start + STEP, speed=0.1, wait=False)
-    with pytest.raises(NotInTimeError, match=r'after 0.1 s: the arm brakes'):
+    with pytest.raises(NotInTimeError, match=r'after 0.1 s: the arm has braked'):
         arm.wait(timeout=0.1)
     assert rests(arm)
     arm.move_to(start + STEP, speed=0.1, wait=False)
     arm.move_to(start, speed=1.0)
     np.testing.assert_allclose(arm.state.q, start, atol=NEAR)
+
+
+def test_load_is_declared_to_drives_that_compensate_and_no_torque_changes(tmp_path):
+    """An arm that holds nothing: what the drives add, the command lacks."""
+    with blf.Drive('fr3_direct', robot='simulated', record=tmp_path / 'bag') as arm:
+        before = arm.state
+        arm.load(1.0, (0.0, 0.0, 0.05))
+        # N m: the weight of 1 kg about joint 2, an arm's length away
+        wait_for(lambda: abs(arm.state.tau[1] - before.tau[1]) > 3.0)
+        arm.load(0.0)
+        wait_for(lambda: np.abs(arm.state.tau - before.tau).max() < 0.5)
+        with pytest.raises(DriveError, match='got -1 kg'):
+            arm.load(-1)
+    verified = blf.verify(tmp_path / 'bag')
+    assert verified.difference is None
+    # rad: friction that holds the arm takes up the steps
+    error = blf.read_run(tmp_path / 'bag').error
+    assert np.nanmax(np.abs(error)) < 1e-3
+
+
+def test_load_is_not_declared_to_drives_that_add_nothing(arm):
+    with pytest.raises(MotionFailedError, match='drive_compensates: got none'):
+        arm.load(1.0)
 
 
 def test_a_stop_of_the_controller_is_an_error_and_can_be_recovered():

@@ -198,6 +198,37 @@ class Drive:
         """
         self._ask(script_link.BRAKE, lambda number: number, timeout)
 
+    def load(
+        self,
+        mass: float,
+        centre: Sequence[float] = (0.0, 0.0, 0.0),
+        timeout: float | None = None,
+    ) -> None:
+        """Declare what the tip holds to the robot's drives; return once they add its weight.
+
+        The law subtracts what they add, in small steps, so no joint torque changes.  For
+        robots whose drives compensate gravity; the law itself needs no declaration.
+
+        Args:
+            mass: all that the URDF lacks [kg]; 0: nothing.
+            centre: of this mass, in the frame of `robot.tip` [m].
+            timeout: longest time to wait [s].
+
+        Raises:
+            MotionFailedError: these drives cannot be told, or refuse.
+            NotInTimeError, LoopEndedError: as for `move_to`.
+        """
+        at = np.asarray(centre, float)
+        if not 0.0 <= mass < math.inf or at.shape != (3,) or not np.isfinite(at).all():
+            raise DriveError(
+                f'load: got {mass} kg at {list(centre)} m, but a mass of at least 0 and three '
+                'coordinates are needed'
+            )
+        wanted = {'mass': float(mass), 'centre': at.tolist()}
+        self._ask(
+            script_link.LOAD, lambda number: {'number': number, **wanted}, timeout
+        )
+
     # State.
 
     @property
@@ -391,9 +422,9 @@ class Drive:
     def _await_motion(self, number: int, timeout: float | None) -> None:
         try:
             self._await_result(number, timeout)
-        except NotInTimeError:
+        except NotInTimeError as error:
             self.stop()
-            raise
+            raise NotInTimeError(f'{error}: the arm has braked') from None
 
     def _ask(
         self, kind: int, wanted: Callable[[int], Any], timeout: float | None
@@ -421,9 +452,7 @@ class Drive:
             while not condition():
                 self._check()
                 if time.monotonic() > end:
-                    raise NotInTimeError(
-                        f'not over after {timeout:g} s: the arm brakes'
-                    )
+                    raise NotInTimeError(f'not over after {timeout} s')
                 self._link.flush()
                 self._news.wait(_POLL)
 

@@ -18,6 +18,8 @@ from blf_dsc_controller.control.goal_messages import End, Goal, Message, encode
 from blf_dsc_controller.control.goals import Goals
 from blf_dsc_controller.control.slow_move import duration_of
 from blf_dsc_controller.drive.beside import Beside
+from blf_dsc_controller.drive.loop import DriveLoop
+from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.law.external_torque import is_touched
 from blf_dsc_controller.messages import script_link, topic_link
 from blf_dsc_controller.messages.link import Link
@@ -25,6 +27,7 @@ from blf_dsc_controller.messages.script_link import ArmState, encode_sample
 from blf_dsc_controller.reference.retargeting import TrajectoryError
 from blf_dsc_controller.reference.trajectory import Trajectory, TrajectoryPoint
 from blf_dsc_controller.reference.turns import short_way
+from blf_dsc_controller.supervision.drive_load import DriveLoad
 
 _PERIOD = 0.005  # s of the robot's time between two samples
 _SHORTEST = 0.1  # s, of a move
@@ -42,14 +45,15 @@ class Script(Beside):
         self._parent = os.getppid()
         self._told = -math.inf  # s, time of the last sample that was sent
         self._braking: list[tuple[float, int]] = []  # s, end, and number of the request
-        self._request_end: Callable[[], None] = lambda: None
+        self._loop: DriveLoop | None = None
+        self._loading: int | None = None  # number of the request
         self._closes = 0
         self._rests_at = math.nan  # s, when the loop may end
         self._tells_running = False
 
-    def begin(self, request_end: Callable[[], None]) -> None:
-        """Begin a loop, which `request_end` ends."""
-        self._request_end = request_end
+    def begin(self, loop: DriveLoop) -> None:
+        """Begin a loop."""
+        self._loop = loop
         self._tells_running = True
         self._told = -math.inf
         self._braking.clear()
@@ -70,15 +74,19 @@ class Script(Beside):
             self.close()
         if self._guard.time >= self._rests_at:
             self._rests_at = math.nan
-            self._request_end()
+            self._end_loop()
 
     def close(self) -> None:
         """Brake, then end at rest; the second time end at once; for signals, too."""
         self._closes += 1
         if self._closes > 1 or not self._guard.supervisor.running:
-            self._request_end()
+            self._end_loop()
             return
         self._rests_at = self._inputs.stop(self._guard, 'the end of the script')
+
+    def _end_loop(self) -> None:
+        if self._loop is not None:
+            self._loop.request_end()
 
     def _take(self, kind: int, content: bytes) -> None:
         if kind == script_link.POSITIONS:
@@ -92,6 +100,8 @@ class Script(Beside):
                 self._begin_goal(wanted, lambda: _trajectory(wanted))
             case script_link.BRAKE:
                 self._brake(wanted)
+            case script_link.LOAD:
+                self._declare(wanted)
             case script_link.CLOSE:
                 self.close()
 
@@ -120,8 +130,25 @@ class Script(Beside):
         else:
             self._braking.append((end, number))
 
+    def _declare(self, wanted: dict[str, Any]) -> None:
+        load = DriveLoad(wanted['mass'], tuple(wanted['centre']))
+        try:
+            self._guard.declare(load)
+        except BlfDscError as error:
+            self._tell_done(wanted['number'], str(error))
+        else:
+            self._loading = wanted['number']
+
+    def _follow_load(self) -> None:
+        """Say when the drives have a load, or why they have not."""
+        problem = self._loop.remark if self._loop is not None else ''
+        if self._loading is not None and (problem or self._guard.is_load_told):
+            self._tell_done(self._loading, problem)
+            self._loading = None
+
     def _report_now_and_then(self) -> None:
         guard = self._guard
+        self._follow_load()
         self._goals.watch(guard)
         while self._braking and guard.time >= self._braking[0][0]:
             self._tell_done(self._braking.pop(0)[1])

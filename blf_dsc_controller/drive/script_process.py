@@ -89,7 +89,7 @@ def _run(driver: Driver, controller: ArmController, script: Script, link: Link) 
             settle_time=driver.config.settle_time,
             beside=script,
         )
-        script.begin(loop.request_end)
+        script.begin(loop)
         if script.is_over:
             return
         outcome = loop.run()
