@@ -7,6 +7,7 @@ The simulated arm waits for its torques: on a slow computer it is slow, and all 
 from __future__ import annotations
 
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -19,6 +20,10 @@ from command import COMPILED, wait_for
 from mcap.reader import make_reader
 
 import blf_dsc_controller as blf
+from blf_dsc_controller.cli.main import main
+from blf_dsc_controller.configuration.drive import DriveConfig
+from blf_dsc_controller.drive.driver import ReflexError
+from blf_dsc_controller.drive.simulated import SIMULATED, simulated
 from blf_dsc_controller.errors import (
     DriveError,
     LoopEndedError,
@@ -59,6 +64,31 @@ def rests(arm):
     before = arm.state
     wait_for(lambda: arm.state.time > before.time + 0.05)
     return np.array_equal(before.reference, arm.state.reference)
+
+
+def test_command_controls_the_simulated_arm_too(tmp_path, capsys):
+    out = tmp_path / 'bag'
+    words = ['drive', '--robot', 'simulated', '--config', 'panda', '--duration', '0.5']
+    assert main([*words, '--out', str(out)]) == 0
+    assert re.search(r'states +\d{3,}, and 0 missed', capsys.readouterr().out)
+    assert blf.verify(out).difference is None
+
+
+def test_simulated_drives_stop_by_themselves_and_are_released_where_they_are():
+    loop = blf.load_loop('fr3_direct')
+    made = simulated(loop.plant)
+    driver = made(SIMULATED, loop.controller, DriveConfig())
+    driver.connect()
+    driver.start()
+    for torque in (np.zeros(7), np.full(7, 5.0)):  # 5 N m in 1 ms, of 1 N m allowed
+        driver.read()
+        driver.write(torque)
+    with pytest.raises(ReflexError, match=r'actuator\.reflex_rate'):
+        driver.read()
+    before = driver.positions()
+    driver.recover()
+    driver.start()
+    np.testing.assert_allclose(driver.read().q, before, atol=1e-4)
 
 
 def test_motions_arrive_and_the_bag_replays_bit_equal(tmp_path):

@@ -86,7 +86,10 @@ class Drive:
         self.joints: tuple[str, ...] = ()
         self._wanted = {
             'config': str(config),
-            'overrides': {node: dict(each) for node, each in (overrides or {}).items()},
+            'overrides': {
+                node: {name: _plain(value) for name, value in each.items()}
+                for node, each in (overrides or {}).items()
+            },
             'robot': robot,
         }
         self._record = None if record is None else Path(record)
@@ -304,7 +307,10 @@ class Drive:
         self._link.put(script_link.START, topic_link.encode(wanted))
         self._link.flush()
         link = self._link
-        threading.Thread(target=self._listen, args=(link,), daemon=True).start()
+        self._listener = threading.Thread(
+            target=self._listen, args=(link,), daemon=True
+        )
+        self._listener.start()
         try:
             self._await_running()
         except BaseException:
@@ -347,7 +353,7 @@ class Drive:
         except subprocess.TimeoutExpired:
             self._process.kill()
             self._process.wait()
-        self._ended = self._ended or 'it was closed'
+        self._listener.join()
 
     # What the process tells, in a thread.
 
@@ -466,6 +472,11 @@ class Drive:
             raise LoopEndedError(
                 f'the loop has said nothing for {silent:.0f} s: look at the arm, then close()'
             )
+
+
+def _plain(value: object) -> object:
+    """Return a value as JSON has it."""
+    return value.tolist() if isinstance(value, (np.ndarray, np.generic)) else value
 
 
 def _death(code: int) -> str:

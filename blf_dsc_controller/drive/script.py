@@ -47,6 +47,7 @@ class Script(Beside):
         self._braking: list[tuple[float, int]] = []  # s, end, and number of the request
         self._loop: DriveLoop | None = None
         self._loading: int | None = None  # number of the request
+        self._asked = 0  # to close, by a signal
         self._closes = 0
         self._rests_at = math.nan  # s, when the loop may end
         self._tells_running = False
@@ -61,28 +62,36 @@ class Script(Beside):
     @property
     def is_over(self) -> bool:
         """Whether the script wants nothing more, or has ended."""
-        return self._closes > 0 or self._is_alone
+        return self._closes > 0 or self._asked > 0 or self._is_alone
 
     @property
     def _is_alone(self) -> bool:
         return self._link.broken or os.getppid() != self._parent
 
+    def request_close(self) -> None:
+        """Close after the next torque; the second time end at once; for signals."""
+        self._asked += 1
+        if self._asked > 1:
+            self._end_loop()
+
     def follow(self) -> None:
         """Do what the script wants; end with it."""
         super().follow()
-        if self._is_alone and not self._closes:
-            self.close()
+        if (self._is_alone or self._asked) and not self._closes:
+            self._close()
         if self._guard.time >= self._rests_at:
             self._rests_at = math.nan
             self._end_loop()
 
-    def close(self) -> None:
-        """Brake, then end at rest; the second time end at once; for signals, too."""
+    def _close(self) -> None:
+        """Brake, then end at rest; the second time end at once."""
         self._closes += 1
+        if self._closes > 1:
+            self._end_loop()
         if self._closes > 1 or not self._guard.supervisor.running:
             self._end_loop()
-            return
-        self._rests_at = self._inputs.stop(self._guard, 'the end of the script')
+        else:
+            self._rests_at = self._inputs.stop(self._guard, 'the end of the script')
 
     def _end_loop(self) -> None:
         if self._loop is not None:
@@ -103,7 +112,7 @@ class Script(Beside):
             case script_link.LOAD:
                 self._declare(wanted)
             case script_link.CLOSE:
-                self.close()
+                self._close()
 
     def _begin_goal(
         self, wanted: dict[str, Any], make: Callable[[], Trajectory]

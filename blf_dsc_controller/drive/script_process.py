@@ -81,7 +81,7 @@ def _control(link: Link, log: LinkLog, wanted: Mapping[str, Any]) -> None:
 def _run(driver: Driver, controller: ArmController, script: Script, link: Link) -> None:
     """Run the loop, and again each time that the script recovers it."""
     for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda *_: script.close())
+        signal.signal(number, lambda *_: script.request_close())
     while True:
         loop = DriveLoop(
             driver,
