@@ -54,14 +54,14 @@ def test_actions_at_30_hz_move_the_arm_and_observations_are_as_declared(robot):
     first = robot.get_observation()
     assert first.keys() == robot.observation_features.keys()
     assert all(type(value) is float for value in first.values())
-    for k in range(30):
-        action = {name: first[name] + 0.005 * k for name in robot.action_features}
+    for k in range(45):
+        ahead = 0.01 * min(k, 15)  # rad
+        action = {name: first[name] + ahead for name in robot.action_features}
         assert robot.send_action(action) == action
         time.sleep(1.0 / 30.0)
     time.sleep(1.0)
     last = robot.get_observation()
     moved = [last[name] - first[name] for name in robot.action_features]
-    # rad: to the last target, less what braking from 0.15 rad/s takes
-    np.testing.assert_allclose(moved, 0.145, atol=0.03)
+    np.testing.assert_allclose(moved, 0.15, atol=0.045)  # rad, the bound
     robot.disconnect()
     assert not robot.is_connected
