@@ -7,6 +7,7 @@ brakes the arm.
 
 from __future__ import annotations
 
+import functools
 import logging
 import math
 import os
@@ -18,7 +19,7 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from types import TracebackType
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -35,6 +36,9 @@ from blf_dsc_controller.errors import (
 from blf_dsc_controller.messages import script_link, topic_link
 from blf_dsc_controller.messages.link import Link
 from blf_dsc_controller.messages.script_link import ArmState
+
+if TYPE_CHECKING:
+    from blf_dsc_controller.drive.pose import Pose, Poses
 
 _PROCESS = 'blf_dsc_controller.drive.script_process'
 _ONE_THREAD = ('OPENBLAS_NUM_THREADS', 'OMP_NUM_THREADS', 'MKL_NUM_THREADS')
@@ -84,14 +88,12 @@ class Drive:
             DriveError: file, robot or arm are not as they should be.
         """
         self.joints: tuple[str, ...] = ()
-        self._wanted = {
-            'config': str(config),
-            'overrides': {
-                node: {name: _plain(value) for name, value in each.items()}
-                for node, each in (overrides or {}).items()
-            },
-            'robot': robot,
+        self._config = str(config)
+        self._overrides = {
+            node: {name: _plain(value) for name, value in each.items()}
+            for node, each in (overrides or {}).items()
         }
+        self._robot = robot
         self._record = None if record is None else Path(record)
         self._starts = 0
         self._news = threading.Condition()
@@ -137,11 +139,7 @@ class Drive:
             LoopEndedError: the loop has ended.
         """
         values = self._checked(positions)
-        if not 0.0 < speed <= 1.0:
-            raise DriveError(
-                f'speed: got {speed:g}, but a share of the limits is needed: above 0, up to 1'
-            )
-        wanted = {'positions': values.tolist(), 'speed': speed}
+        wanted = {'positions': values.tolist(), 'speed': _checked_speed(speed)}
         self._begin(script_link.MOVE, wanted, wait=wait, timeout=timeout)
 
     def follow(
@@ -171,6 +169,36 @@ class Drive:
             raise DriveError('points: got none; stop() brakes the arm')
         wanted = {'points': given, 'joints': list(joints or self.joints)}
         self._begin(script_link.FOLLOW, wanted, wait=wait, timeout=timeout)
+
+    def move_to_pose(
+        self,
+        position: ArrayLike,
+        rotation: ArrayLike | None = None,
+        *,
+        speed: float = 0.3,
+        wait: bool = True,
+        timeout: float | None = None,
+    ) -> None:
+        """Move the tip straight to rest at a pose, in the base frame.
+
+        The way is solved by pink before the arm moves (an extra: `pose`).  The joints have
+        only been checked against their limits: keep the line free.
+
+        Args:
+            position: (3,) [m], of `robot.tip`.
+            rotation: (3, 3), its columns are the axes of the tip; by default it does not turn.
+            speed: share of the limits of the joints, up to 1, roughly.
+            wait, timeout: as for `move_to`.
+
+        Raises:
+            MotionFailedError: the line leaves the limits, or as for `move_to`.
+            NotInTimeError, LoopEndedError: as for `move_to`.
+            MissingExtraError: pink is not installed.
+        """
+        begin = np.array(self.state.reference)
+        line = self._poses.line(begin, position, rotation, _checked_speed(speed))
+        points = list(zip(line.times, line.positions, strict=True))
+        self.follow(points, wait=wait, timeout=timeout)
 
     def stream(self, positions: ArrayLike) -> None:
         """Give the next positions (n,) [rad] of a stream, and return at once.
@@ -246,6 +274,25 @@ class Drive:
         return self._state
 
     @property
+    def pose(self) -> Pose:
+        """Where the tip is by the last state.
+
+        Raises:
+            LoopEndedError: the loop has ended.
+        """
+        return self._poses.at(np.array(self.state.q))
+
+    @functools.cached_property
+    def _poses(self) -> Poses:
+        """The kinematics of the file, imported when they are needed."""
+        from blf_dsc_controller.configuration.controller import ControllerConfig
+        from blf_dsc_controller.configuration.nodes import CONTROLLER, load, locate
+        from blf_dsc_controller.drive.pose import Poses
+
+        given = self._overrides.get(CONTROLLER)
+        return Poses(load(locate(self._config), CONTROLLER, ControllerConfig, given))
+
+    @property
     def is_moving(self) -> bool:
         """Whether the last `move_to` or `follow` is not over."""
         return self._last != 0 and self._last not in self._results
@@ -303,7 +350,12 @@ class Drive:
                 start_new_session=True,  # Ctrl-C is for the script, which brakes
             )
         self._link = Link(ours)
-        wanted = {**self._wanted, 'record': str(record) if record else None}
+        wanted = {
+            'config': self._config,
+            'overrides': self._overrides,
+            'robot': self._robot,
+            'record': str(record) if record else None,
+        }
         self._link.put(script_link.START, topic_link.encode(wanted))
         self._link.flush()
         link = self._link
@@ -472,6 +524,14 @@ class Drive:
             raise LoopEndedError(
                 f'the loop has said nothing for {silent:.0f} s: look at the arm, then close()'
             )
+
+
+def _checked_speed(speed: float) -> float:
+    if not 0.0 < speed <= 1.0:
+        raise DriveError(
+            f'speed: got {speed:g}, but a share of the limits is needed: above 0, up to 1'
+        )
+    return float(speed)
 
 
 def _plain(value: object) -> object:
