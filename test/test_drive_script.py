@@ -149,6 +149,15 @@ def test_a_motion_is_waited_for_stopped_and_given_up(arm):
     np.testing.assert_allclose(arm.state.q, start, atol=NEAR)
 
 
+def test_a_long_trajectory_is_read_beside_the_loop(arm):
+    """9000 points, 4 MB: reading them takes tens of milliseconds."""
+    start = arm.state.reference
+    times = np.arange(1, 9001) / 5000.0
+    wave = 0.05 * np.sin(np.pi * times / times[-1]) ** 2
+    arm.follow([(t, start + w) for t, w in zip(times, wave, strict=True)])
+    np.testing.assert_allclose(arm.state.reference, start, atol=1e-6)
+
+
 def test_load_is_declared_to_drives_that_compensate_and_no_torque_changes(tmp_path):
     """An arm that holds nothing: what the drives add, the command lacks."""
     with blf.Drive('fr3_direct', robot='simulated', record=tmp_path / 'bag') as arm:

@@ -89,7 +89,7 @@ class Goals:
         self,
         guard: Guard,
         goal: Goal,
-        trajectory: bytes | Trajectory,
+        trajectory: bytes | Callable[[], Trajectory],
         by: str = _SOURCE,
     ) -> None:
         """Begin a goal of a client whose trajectory came by another way."""

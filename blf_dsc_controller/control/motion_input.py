@@ -154,12 +154,12 @@ class MotionInput:
     def follow(
         self,
         guard: Guard,
-        given: bytes | Trajectory,
+        given: bytes | Callable[[], Trajectory],
         source: str,
         check: Callable[[Plan], None],
         report: Report,
     ) -> None:
-        """Follow a trajectory, perhaps serialised, that came by another way."""
+        """Follow a trajectory that came by another way, serialised or still to be made."""
 
         def tell(plan: Plan | None, reason: str) -> None:
             self._report(plan, reason)
@@ -168,7 +168,7 @@ class MotionInput:
         start = guard.start_stamp
 
         def make() -> Trajectory:
-            return given if isinstance(given, Trajectory) else _trajectory(given, start)
+            return _trajectory(given, start) if isinstance(given, bytes) else given()
 
         self._request(guard, _Request(make, tell, _LEAD, source, check))
 

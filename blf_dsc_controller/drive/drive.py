@@ -472,7 +472,10 @@ class Drive:
     ) -> None:
         self._number += 1
         self._last = number = self._number
-        content = topic_link.encode({**wanted, 'number': number})
+        if kind == script_link.FOLLOW:
+            content = script_link.HEAD.pack(number) + topic_link.encode(wanted)
+        else:
+            content = topic_link.encode({**wanted, 'number': number})
         self._put(kind, content)
         if wait:
             self._await_motion(number, timeout)

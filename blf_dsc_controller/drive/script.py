@@ -101,12 +101,15 @@ class Script(Beside):
         if kind == script_link.POSITIONS:
             self._inputs.stream(self._guard, np.frombuffer(content), _SOURCE)
             return
+        if kind == script_link.FOLLOW:
+            (number,) = script_link.HEAD.unpack_from(content)
+            self._begin_goal(number, lambda: _trajectory(content))
+            return
         wanted = topic_link.decode(content)
         match kind:
             case script_link.MOVE:
-                self._begin_goal(wanted, lambda: self._move(wanted))
-            case script_link.FOLLOW:
-                self._begin_goal(wanted, lambda: _trajectory(wanted))
+                trajectory = self._move(wanted)
+                self._begin_goal(wanted['number'], lambda: trajectory)
             case script_link.BRAKE:
                 self._brake(wanted)
             case script_link.LOAD:
@@ -114,11 +117,9 @@ class Script(Beside):
             case script_link.CLOSE:
                 self._close()
 
-    def _begin_goal(
-        self, wanted: dict[str, Any], make: Callable[[], Trajectory]
-    ) -> None:
-        goal = Goal(wanted['number'], b'', (), (), 0.0)
-        self._goals.follow(self._guard, goal, make(), _SOURCE)
+    def _begin_goal(self, number: int, make: Callable[[], Trajectory]) -> None:
+        goal = Goal(number, b'', (), (), 0.0)
+        self._goals.follow(self._guard, goal, make, _SOURCE)
 
     def _move(self, wanted: dict[str, Any]) -> Trajectory:
         """Return the way from the present reference to rest at some positions."""
@@ -211,7 +212,8 @@ class Script(Beside):
         self._link.put(script_link.GOAL, encode(message))
 
 
-def _trajectory(wanted: dict[str, Any]) -> Trajectory:
+def _trajectory(content: bytes) -> Trajectory:
+    wanted = topic_link.decode(content[script_link.HEAD.size :])
     points = tuple(TrajectoryPoint(*map(_field, each)) for each in wanted['points'])
     return Trajectory(tuple(wanted['joints']), points)
 

@@ -7,6 +7,7 @@ Contents are JSON, except those of SAMPLE and POSITIONS, and of GOAL, which is
 
 from __future__ import annotations
 
+from struct import Struct
 from typing import NamedTuple
 
 import numpy as np
@@ -14,13 +15,17 @@ from numpy.typing import NDArray
 
 Floats = NDArray[np.float64]
 
+HEAD = Struct('<Q')
+"""The number before the content of FOLLOW."""
+
 # To the loop.
 START = 110
 """What to control: `config`, `overrides`, `robot`, `record`."""
 MOVE = 111
 """Go straight to `positions` with a share `speed` of the limits, as goal `number`."""
 FOLLOW = 112
-"""Follow `points` (time, positions, velocities, accelerations) of `joints`, as goal `number`."""
+"""As goal of a number (`HEAD`), follow `points` (time, positions, velocities, accelerations) of
+`joints`: JSON that may be long, and is read where it is planned."""
 POSITIONS = 113
 """The next target of a stream: float64 (n,) [rad]."""
 BRAKE = 114
