@@ -406,6 +406,7 @@ class Drive:
             self._process.kill()
             self._process.wait()
         self._listener.join()
+        self._link.close()
 
     # What the process tells, in a thread.
 
@@ -472,6 +473,8 @@ class Drive:
     ) -> None:
         self._number += 1
         self._last = number = self._number
+        with self._news:
+            self._results.clear()  # nobody asks for those of earlier motions
         if kind == script_link.FOLLOW:
             content = script_link.HEAD.pack(number) + topic_link.encode(wanted)
         else:
