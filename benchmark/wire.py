@@ -91,7 +91,7 @@ def law_in_process(address: str, *, ros: bool = False) -> Latency:
         topics = RosTopics(controller) if ros else None
         try:
             driver.connect()
-            loop = DriveLoop(driver, controller, duration=_SECONDS, ros=topics)
+            loop = DriveLoop(driver, controller, duration=_SECONDS, beside=topics)
             loop.run()
         finally:
             if topics is not None:

@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from blf_dsc_controller.configuration.plant import PlantConfig as PlantConfig
     from blf_dsc_controller.configuration.schema import change as change
     from blf_dsc_controller.control.arm_controller import ArmController as ArmController
+    from blf_dsc_controller.drive.drive import Drive as Drive
     from blf_dsc_controller.law.factory import controller_of as controller_of
     from blf_dsc_controller.reference.trajectory import (
         TrajectoryPoint as TrajectoryPoint,
@@ -43,6 +44,7 @@ _PUBLIC = {
     'Run': 'run',
     'change': 'configuration.schema',
     'controller_of': 'law.factory',
+    'Drive': 'drive.drive',
     'draw': 'analysis.figures',
     'load_loop': 'configuration.nodes',
     'load_study': 'studies.monte_carlo',

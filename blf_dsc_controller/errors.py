@@ -28,3 +28,19 @@ class StartError(BlfDscError):
 
 class MissingExtraError(BlfDscError):
     """A package from one of the optional extras is not installed."""
+
+
+class DriveError(BlfDscError):
+    """The arm of a `Drive` cannot do what a script wants; the message says why."""
+
+
+class MotionFailedError(DriveError):
+    """A motion was rejected, replaced or given up; the law is still in command."""
+
+
+class NotInTimeError(DriveError, TimeoutError):
+    """Not over after the given time; a motion is braked."""
+
+
+class LoopEndedError(DriveError):
+    """The loop has ended: the law is not in command any more."""

@@ -23,6 +23,7 @@ from command import COMPILED, PATIENCE
 import blf_dsc_controller as blf
 from blf_dsc_controller.configuration.drive import DriveConfig
 from blf_dsc_controller.configuration.schema import build, change
+from blf_dsc_controller.errors import LoopEndedError
 from blf_dsc_controller.supervision.drive_load import DriveLoad
 
 if not all(map(importlib.util.find_spec, ('pylibfranka', 'franky_sim'))):
@@ -234,6 +235,23 @@ def test_sigterm_ends_at_rest_and_a_killed_command_leaves_a_robot_that_can_be_us
     code, output = ended(process)
     assert code == 130, output
     assert 'ended on request' in output
+
+
+def test_a_script_moves_it_and_takes_command_again_after_a_reflex(wire):
+    """The reflex comes in the second motion."""
+    wire.simulate('127.0.0.20', 'reflex@6000')
+    bag = wire.folder / 'bag'
+    with blf.Drive('fr3_direct', robot='127.0.0.20', record=bag) as arm:
+        start = arm.state.q
+        arm.move_to(start + 0.1)
+        np.testing.assert_allclose(arm.state.q, start + 0.1, atol=0.5 * BOUND)
+        long = [(60.0, start - 0.2)]
+        with pytest.raises(LoopEndedError, match=r'stopped by itself: .*recovered'):
+            arm.follow(long)
+        arm.recover()
+        arm.move_to(start)
+        np.testing.assert_allclose(arm.state.q, start, atol=0.5 * BOUND)
+    assert_replays(bag)
 
 
 class ToldRobot:

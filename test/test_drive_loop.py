@@ -349,10 +349,10 @@ def test_load_is_taken_over_when_it_is_in_force_not_when_it_is_accepted(
     assert taken == [load]
 
 
-def test_load_is_not_taken_over_unless_the_user_allows_it():
+def test_load_is_not_taken_over_from_drives_that_add_no_weight():
     controller = blf.ArmController(CONFIG)
     assert controller.load_to_tell() is None
-    with pytest.raises(BlfDscError, match=r'learning\.tell_drive: got false'):
+    with pytest.raises(BlfDscError, match=r'robot\.drive_compensates: got none'):
         controller.take_over(DriveLoad(1.0, (0.0, 0.0, 0.0)))
 
 

@@ -74,7 +74,7 @@ def beside(ros, monkeypatch):
         beside = RosTopics(controller, namespace)
         try:
             with controller:
-                loop = DriveLoop(driver, controller, duration=duration, ros=beside)
+                loop = DriveLoop(driver, controller, duration=duration, beside=beside)
                 driver.between = lambda count: between(count, loop, beside)
                 outcome = loop.run()
         finally:

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from blf_dsc_controller.cli.drive import driver_of, signals_to
+from blf_dsc_controller.cli.drive import signals_to
 from blf_dsc_controller.cli.main import make_room
 from blf_dsc_controller.cli.run import print_notice
 from blf_dsc_controller.commissioning import page
@@ -22,6 +22,7 @@ from blf_dsc_controller.compiled.announcement import announced_compilation
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.control.arm_controller import ArmController
 from blf_dsc_controller.control.realtime import request_realtime
+from blf_dsc_controller.drive.drivers import driver_of
 from blf_dsc_controller.errors import BlfDscError
 
 

@@ -8,23 +8,20 @@ import signal
 from argparse import Namespace
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
-from pathlib import Path
 
 from blf_dsc_controller.cli.main import INTERRUPTED
 from blf_dsc_controller.cli.ros_check import require_ros
 from blf_dsc_controller.cli.run import STOPPED, print_notice
 from blf_dsc_controller.compiled.announcement import announced_compilation
 from blf_dsc_controller.configuration.controller import ControllerConfig
-from blf_dsc_controller.configuration.drive import DriveConfig
-from blf_dsc_controller.configuration.nodes import CONTROLLER, DRIVE, load, locate
+from blf_dsc_controller.configuration.nodes import CONTROLLER, load, locate
 from blf_dsc_controller.control.arm_controller import ArmController
 from blf_dsc_controller.control.realtime import request_realtime
-from blf_dsc_controller.drive.driver import Driver, check_feedback, disagreements
-from blf_dsc_controller.drive.drivers import find_driver
+from blf_dsc_controller.drive.drivers import driver_of
 from blf_dsc_controller.drive.loop import DriveLoop, End, Outcome
 from blf_dsc_controller.drive.motor_feedback import as_in_motors
 from blf_dsc_controller.drive.ros_topics import RosTopics
-from blf_dsc_controller.errors import BlfDscError, ConfigurationError
+from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.reference.approach import end_of_waypoints
 from blf_dsc_controller.supervision.config_warnings import config_warnings
 from blf_dsc_controller.supervision.expected_errors import expectation
@@ -72,7 +69,7 @@ def drive(options: Namespace) -> int:
             controller,
             duration=options.duration or math.inf,
             settle_time=driver.config.settle_time,
-            ros=ros,
+            beside=ros,
             feedback=driver.config.feedback,
         )
         with signals_to(loop.request_end):
@@ -88,20 +85,6 @@ def drive(options: Namespace) -> int:
             f'recorded      {options.out}: blf_dsc replay, report, plot and identify read it'
         )
     return CODES[outcome.end] or int(bool(controller.output_problem))
-
-
-def driver_of(address: str, path: Path, config: ControllerConfig) -> Driver:
-    """Return the driver that a file names, for the robot at an address.
-
-    Raises BlfDscError if there is no such driver, or the file contradicts the robot.
-    """
-    settings = load(path, DRIVE, DriveConfig)
-    made = find_driver(settings.driver)
-    check_feedback(made, settings)
-    problems = disagreements(made.facts_for(config), config)
-    if problems:
-        raise ConfigurationError(problems, str(path))
-    return made(address, config, settings)
 
 
 def _check(options: Namespace) -> None:

@@ -253,7 +253,8 @@ def _add_drive(command: _Command) -> None:
         'over, 5 the controller or the robot stopped before, 130 interrupted, 1 an error.',
         '--robot 172.16.0.2 --config fr3_direct.yaml --duration 60 --out first',
     )
-    option('--robot', required=True, help='address of the robot')
+    address = 'address of the robot; simulated: the simulated arm of the file'
+    option('--robot', required=True, help=address)
     preset = 'parameter file, or a preset (fr3_direct)'
     option('--config', default='fr3_direct', help=preset)
     option('--duration', type=float, default=0.0, help='time [s]; 0: until Ctrl-C (0)')

@@ -26,6 +26,7 @@ from blf_dsc_controller.commissioning.response import response_of
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.schema import change
 from blf_dsc_controller.control.arm_controller import ArmController
+from blf_dsc_controller.control.slow_move import duration_of
 from blf_dsc_controller.drive.driver import Driver
 from blf_dsc_controller.drive.loop import DriveLoop, End
 from blf_dsc_controller.errors import BlfDscError
@@ -38,7 +39,6 @@ SPEED = 0.3
 """Largest speed of a joint on the way to a posture [rad/s]."""
 
 _ACCELERATION = 0.5  # rad/s^2, likewise
-_PEAK_SPEED, _PEAK_ACCELERATION = 1.875, 5.774  # of minimum jerk, over a unit of time
 _SHORTEST = 1.0  # s, of a move
 _REST = 1.0  # s, at its end
 _PAUSE = 0.2  # s, in which an arm at rest does not move
@@ -68,9 +68,7 @@ def move(config: ControllerConfig, here: Floats, there: Floats) -> Move:
     far = np.abs(target - here)
     speed = np.minimum(SPEED, 0.5 * np.array(config.limits.velocity))
     acceleration = np.minimum(_ACCELERATION, 0.5 * np.array(config.limits.acceleration))
-    by_speed = float((_PEAK_SPEED * far / speed).max())
-    by_acceleration = float(np.sqrt(_PEAK_ACCELERATION * far / acceleration).max())
-    duration = max(_SHORTEST, by_speed, by_acceleration)
+    duration = max(_SHORTEST, duration_of(far, speed, acceleration))
     values = motion.watched(config) | {
         'reference.type': 'waypoints',
         'reference.times': [0.0, duration],

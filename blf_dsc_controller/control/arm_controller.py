@@ -260,7 +260,7 @@ class ArmController:
         """Subtract the weight of a load that the drives add from the next state on.
 
         Raises:
-            BlfDscError: `learning.tell_drive` is false.
+            BlfDscError: the drives add no weight.
         """
         self._loop.guard.take_over(load)
 

@@ -54,6 +54,7 @@ class Answer(NamedTuple):
 
     number: int
     accepted: bool
+    reason: str = ''  # why it is not
 
 
 class Feedback(NamedTuple):

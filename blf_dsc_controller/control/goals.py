@@ -79,16 +79,27 @@ class Goals:
         if isinstance(message, Cancel):
             self._cancel(guard, message.number)
         elif guard is None:
-            self._log.warning('goal rejected: the controller is not configured')
-            self._send(Answer(message.number, accepted=False))
+            reason = 'the controller is not configured'
+            self._log.warning(f'goal rejected: {reason}')
+            self._send(Answer(message.number, accepted=False, reason=reason))
         else:
-            self._inputs.follow(
-                guard,
-                message.trajectory,
-                _SOURCE,
-                partial(_check_time, message),
-                partial(self._on_plan, guard, message),
-            )
+            self.follow(guard, message, message.trajectory)
+
+    def follow(
+        self,
+        guard: Guard,
+        goal: Goal,
+        trajectory: bytes | Callable[[], Trajectory],
+        by: str = _SOURCE,
+    ) -> None:
+        """Begin a goal of a client whose trajectory came by another way."""
+        self._inputs.follow(
+            guard,
+            trajectory,
+            by,
+            partial(_check_time, goal),
+            partial(self._on_plan, guard, goal),
+        )
 
     def watch(self, guard: Guard | None) -> None:
         """Compare the arm with the reference, after each sample and in a silence."""
@@ -111,10 +122,10 @@ class Goals:
             self._end(Outcome.ABORTED, INVALID, 'the controller ends')
 
     def _on_plan(
-        self, guard: Guard, goal: Goal, plan: Plan | None, _reason: str
+        self, guard: Guard, goal: Goal, plan: Plan | None, reason: str
     ) -> None:
         """Accept the goal whose trajectory is the reference now, or reject it."""
-        self._send(Answer(goal.number, accepted=plan is not None))
+        self._send(Answer(goal.number, accepted=plan is not None, reason=reason))
         if plan is None:
             return
         if self._followed is not None:

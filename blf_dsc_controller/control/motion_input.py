@@ -154,20 +154,23 @@ class MotionInput:
     def follow(
         self,
         guard: Guard,
-        raw: bytes,
+        given: bytes | Callable[[], Trajectory],
         source: str,
         check: Callable[[Plan], None],
         report: Report,
     ) -> None:
-        """Follow a serialised trajectory whose points came by another way."""
+        """Follow a trajectory that came by another way, serialised or still to be made."""
 
         def tell(plan: Plan | None, reason: str) -> None:
             self._report(plan, reason)
             report(plan, reason)
 
         start = guard.start_stamp
-        request = _Request(lambda: _trajectory(raw, start), tell, _LEAD, source, check)
-        self._request(guard, request)
+
+        def make() -> Trajectory:
+            return _trajectory(given, start) if isinstance(given, bytes) else given()
+
+        self._request(guard, _Request(make, tell, _LEAD, source, check))
 
     # Requests.
 
@@ -245,6 +248,10 @@ class MotionInput:
         except (MessageError, TrajectoryError) as error:
             self._reject(_reason(error))
             return
+        self.stream(guard, positions, _ON_POSITIONS)
+
+    def stream(self, guard: Guard, positions: np.ndarray, source: str) -> None:
+        """Follow the next positions (n,) [rad] of a stream."""
         target = self._positions.target(
             guard.time,
             self._short_way(guard, self._positions, positions),
@@ -252,7 +259,7 @@ class MotionInput:
             fastest=np.array(guard.config.limits.velocity),
         )
         lead = self._target_lead
-        request = _Request(lambda: target, self._report, lead, _ON_POSITIONS)
+        request = _Request(lambda: target, self._report_target, lead, source)
         self._request(guard, request)
 
     def _short_way(
@@ -396,6 +403,11 @@ class MotionInput:
             note = f' {plan.motion.note}' if plan.motion.note else ''
             self._log.info(f'following a trajectory of {points} points{note}')
             self._tell_turns(plan.motion.turned)
+
+    def _report_target(self, plan: Plan | None, reason: str) -> None:
+        """Count a target; in a stream the latest wins, which is no rejection."""
+        if reason != _REPLACED:
+            self._report(plan, reason)
 
     def _reject(self, reason: str) -> None:
         self.rejected += 1

@@ -1,14 +1,46 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The driver that a configuration names: one of this package, or a Python file."""
+"""The driver of a robot: of the simulated arm, of this package, or a Python file."""
 
 from __future__ import annotations
 
 import importlib.util
+from collections.abc import Mapping
 from pathlib import Path
 
-from blf_dsc_controller.drive.driver import Driver
-from blf_dsc_controller.errors import BlfDscError
+from blf_dsc_controller.configuration.controller import ControllerConfig
+from blf_dsc_controller.configuration.drive import DriveConfig
+from blf_dsc_controller.configuration.nodes import DRIVE, PLANT, load
+from blf_dsc_controller.configuration.plant import PlantConfig
+from blf_dsc_controller.drive.driver import Driver, check_feedback, disagreements
+from blf_dsc_controller.drive.simulated import SIMULATED, simulated
+from blf_dsc_controller.errors import BlfDscError, ConfigurationError
 from blf_dsc_controller.extras import import_extra
+
+
+def driver_of(
+    address: str,
+    path: Path,
+    config: ControllerConfig,
+    overrides: Mapping[str, Mapping[str, object]] | None = None,
+) -> Driver:
+    """Return the driver that a file names, for the robot at an address.
+
+    `overrides`, by node and dotted name, take precedence over the file.  The address
+    `simulated` is that of its simulated arm.
+
+    Raises BlfDscError if there is no such driver, or the file contradicts the robot.
+    """
+    given = overrides or {}
+    settings = load(path, DRIVE, DriveConfig, given.get(DRIVE))
+    if address == SIMULATED:
+        made: type[Driver] = simulated(load(path, PLANT, PlantConfig, given.get(PLANT)))
+    else:
+        made = find_driver(settings.driver)
+    check_feedback(made, settings)
+    problems = disagreements(made.facts_for(config), config)
+    if problems:
+        raise ConfigurationError(problems, str(path))
+    return made(address, config, settings)
 
 
 def find_driver(name: str) -> type[Driver]:

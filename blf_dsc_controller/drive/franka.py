@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 import pylibfranka
@@ -60,6 +60,7 @@ class FrankaDriver(Driver):
     ) -> None:
         super().__init__(address, controller, config)
         self._torque = np.zeros(_JOINTS)
+        self._control: Any = None
         self._load = 0.0
         # of the tip in the frame of the flange
         self._tip = controller.robot.chain(controller.joints).tip_placement.copy()
@@ -143,6 +144,7 @@ class FrankaDriver(Driver):
 
     def start(self) -> None:
         """Begin torque control."""
+        self._control = None  # one that a reflex has ended excludes another
         with self._explained('torque control was refused'):
             self._control = self._robot.start_torque_control()
 

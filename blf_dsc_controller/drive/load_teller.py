@@ -14,7 +14,7 @@ _SAME = 1e-5  # kg; robots report single precision
 
 
 class LoadTeller:
-    """What a robot is told of its load, while `learning.tell_drive` is true.
+    """What a robot is told of its load: as weighed, or as a script declares it.
 
     The law takes a step over with the state that reports it, or, of a robot that
     reports no load, with the first one after the robot has accepted it.
@@ -32,12 +32,10 @@ class LoadTeller:
         self._states = 0
         self._in_motion = driver.facts_for(controller.config).load_in_motion
         self._thread: ThreadPoolExecutor | None = None
-        if controller.config.learning.tell_drive:
-            self._thread = ThreadPoolExecutor(1, 'load')
 
     def follow(self) -> None:
         """Take over what the robot adds since the last state; ask for the next step."""
-        if self._thread is None or self.problem:
+        if self.problem:
             return
         if self._asked is not None:
             self._await(self._asked)
@@ -48,6 +46,7 @@ class LoadTeller:
         if self._in_motion or self._controller.is_at_rest:
             self._asked = self._controller.load_to_tell()
             if self._asked is not None:
+                self._thread = self._thread or ThreadPoolExecutor(1, 'load')
                 self._answer = self._thread.submit(self._driver.tell_load, self._asked)
 
     def _await(self, asked: DriveLoad) -> None:

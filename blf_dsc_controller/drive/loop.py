@@ -21,6 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from blf_dsc_controller.control.arm_controller import ArmController
+from blf_dsc_controller.drive.beside import Beside
 from blf_dsc_controller.drive.driver import (
     ConnectionLostError,
     Driver,
@@ -31,7 +32,6 @@ from blf_dsc_controller.drive.driver import (
 from blf_dsc_controller.drive.latency import Latency
 from blf_dsc_controller.drive.load_teller import LoadTeller
 from blf_dsc_controller.drive.motor_feedback import MotorFeedback
-from blf_dsc_controller.drive.ros_topics import RosTopics
 from blf_dsc_controller.supervision.supervisor import Phase
 
 Vector = NDArray[np.float64]
@@ -76,10 +76,10 @@ class DriveLoop:
         *,
         duration: float = math.inf,
         settle_time: float = 3.0,
-        ros: RosTopics | None = None,
+        beside: Beside | None = None,
         feedback: Literal['host', 'motor'] = 'host',
     ) -> None:
-        """Run for `duration` [s] of the robot's time, with or without topics.
+        """Run for `duration` [s] of the robot's time, with what is beside the loop.
 
         The end may take `settle_time` [s] more.  The driver is connected; `feedback` is
         `drive.feedback`.
@@ -99,7 +99,7 @@ class DriveLoop:
         self._feedback: MotorFeedback | None = None
         if feedback == 'motor':
             self._feedback = MotorFeedback(controller, driver.ranges, driver.latency)
-        self._ros = ros
+        self._beside = beside
         self._requests = 0
         self._states = 0
         self._begin = math.nan  # s, stamp of the first state
@@ -169,8 +169,8 @@ class DriveLoop:
         try:
             self._teller.follow()
             self._controller.update(*state, send=self._send)
-            if self._ros is not None:
-                self._ros.follow()
+            if self._beside is not None:
+                self._beside.follow()
         except DriverError:
             raise
         except Exception as error:

@@ -14,14 +14,14 @@ from time import monotonic
 
 from blf_dsc_controller import child
 from blf_dsc_controller.control.arm_controller import ArmController
-from blf_dsc_controller.control.motion_input import MotionInput
 from blf_dsc_controller.control.status_report import StatusReport
+from blf_dsc_controller.drive.beside import Beside
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.law.telemetry import rejected_columns
 from blf_dsc_controller.messages import topic_link, topics
 from blf_dsc_controller.messages.journal import encode_string
 from blf_dsc_controller.messages.link import Link
-from blf_dsc_controller.messages.topic_link import KINDS, LOG, READY, STATUS, STOP
+from blf_dsc_controller.messages.topic_link import KINDS, READY, STATUS, STOP
 from blf_dsc_controller.messages.topics import Topic
 from blf_dsc_controller.supervision.guard import Guard
 
@@ -47,7 +47,7 @@ _ALWAYS = (
 )
 
 
-class RosTopics:
+class RosTopics(Beside):
     """The topics of a controller that runs in a loop without ROS.
 
     It takes the messages of the loop, and passes on trajectories, targets and stops.
@@ -63,16 +63,13 @@ class RosTopics:
             BlfDscError: it did not start.
         """
         config = controller.config
-        self._guard = controller.guard
         self._estimates = controller.estimate_names
         self._sent = frozenset(_ALWAYS)
         if config.telemetry.enabled:
             self._sent |= frozenset(_TELEMETRY)
-        self._link, self._process = _start(config.joints, namespace, self._sent)
-        self._inputs = MotionInput(
-            len(config.joints), lambda: self._guard, _is_live, _LinkLog(self._link)
-        )
-        self._report = StatusReport(_LinkLog(self._link))
+        link, self._process = _start(config.joints, namespace, self._sent)
+        super().__init__(link, controller)
+        self._report = StatusReport(self.log)
         self._report.trajectories = self._inputs
         self._late = ''
         self._reported = -1.0, -1  # s, and revision of the state
@@ -97,17 +94,6 @@ class RosTopics:
         if topic in self._sent:
             self._link.put(KINDS[topic], raw)
 
-    def follow(self) -> None:
-        """Send what waits and take what has arrived; after each state's torque."""
-        if self._link.broken:
-            return
-        guard = self._guard
-        self._inputs.poll(guard)
-        for kind, content in self._link.messages():
-            self._take(kind, content)
-        self._report_now_and_then(guard)
-        self._link.flush()
-
     def close(self) -> None:
         """Publish what waits, and end the process."""
         if not self._link.broken:
@@ -130,8 +116,9 @@ class RosTopics:
         elif kind == KINDS[topics.JOINT_POSITIONS]:
             self._inputs.take_positions(content)
 
-    def _report_now_and_then(self, guard: Guard) -> None:
+    def _report_now_and_then(self) -> None:
         """Tell the status every second, and when the state changes."""
+        guard = self._guard
         since, revision = self._reported
         now = monotonic()
         if now - since > _STATUS_PERIOD or guard.supervisor.revision != revision:
@@ -189,32 +176,3 @@ def _start(
             env=os.environ | child.places(),
         )
     return Link(ours), process
-
-
-def _is_live(_guard: Guard) -> bool:
-    """Whether the robot does not wait: never, also if it is a simulated one."""
-    return True
-
-
-class _LinkLog:
-    """The log of the node in the other process."""
-
-    def __init__(self, link: Link) -> None:
-        self._link = link
-        self._warned: dict[str, float] = {}
-
-    def info(self, message: str) -> None:
-        self._send('info', message)
-
-    def warning(self, message: str, *, throttle_duration_sec: float = 0.0) -> None:
-        now = monotonic()
-        if now - self._warned.get(message, -1e9) >= throttle_duration_sec:
-            self._warned = {message: now}
-            self._send('warning', message)
-
-    def error(self, message: str) -> None:
-        self._send('error', message)
-
-    def _send(self, level: str, text: str) -> None:
-        content = topic_link.encode({'level': level, 'text': text})
-        self._link.put(LOG, content)

@@ -65,12 +65,14 @@ class DriveLoads:
         declared: what they had at the start, `robot.drive_payload`.
         base: what they had when the law began to learn: at the start, or at a reset.
         told: what they have now.
+        wanted: what a user declares, whatever is weighed; None: nothing.
     """
 
     def __init__(self, config: ControllerConfig) -> None:
         robot = config.robot
         self.declared = DriveLoad(robot.drive_payload, robot.drive_payload_centre)
         self.told = self.base = self.declared
+        self.wanted: DriveLoad | None = None
         self._robot = robot
         self._chain = robot.chain(config.joints)
         self._goes_on = False  # not all of a load has been told
@@ -97,7 +99,7 @@ class DriveLoads:
 
         Nothing is told while something touches the arm.
         """
-        target = self._weighed(controller)
+        target = self._weighed(controller) if self.wanted is None else self._left()
         if target is None or is_touched(controller.state.contact):
             return None
         settings = controller.settings
@@ -112,6 +114,17 @@ class DriveLoads:
         moments = self.told.moments
         self._goes_on = part < 1.0
         return DriveLoad.of(moments + part * (target - moments))
+
+    def _left(self) -> Vector | None:
+        """Return mass and moments (4,) that a user declares; None: the drives have them."""
+        if self.wanted is None or np.allclose(self.told.moments, self.wanted.moments):
+            return None
+        return self.wanted.moments
+
+    @property
+    def is_told(self) -> bool:
+        """Whether the drives have what a user declares, if anything."""
+        return self._left() is None
 
     def _weighed(self, controller: Controller) -> Vector | None:
         """Return mass and moments (4,) that the drives should get; None: no change."""

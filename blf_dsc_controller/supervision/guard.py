@@ -323,13 +323,32 @@ class Guard:
 
     def take_over(self, load: DriveLoad) -> None:
         """Subtract the weight of a load that the drives add from the next state on."""
-        if self._drive_loads is None:
-            raise BlfDscError(
-                'learning.tell_drive: got false, but a load is declared to the drives: set it to '
-                'true'
-            )
+        loads = self._loads()
         self._note(EventType.DRIVE_LOAD, mass=load.mass, centre=list(load.centre))
-        self._drive_loads.take(self.controller, load)
+        loads.take(self.controller, load)
+
+    def declare(self, load: DriveLoad) -> None:
+        """Let `load_to_tell` lead to this load, whatever is weighed.
+
+        Raises:
+            BlfDscError: the drives add no weight.
+        """
+        self._loads().wanted = load
+
+    @property
+    def is_load_told(self) -> bool:
+        """Whether the drives have the load of the last `declare`."""
+        return self._drive_loads is None or self._drive_loads.is_told
+
+    def _loads(self) -> DriveLoads:
+        if self._drive_loads is None:
+            if self.config.robot.drive_compensates == 'none':
+                raise BlfDscError(
+                    'robot.drive_compensates: got none: these drives add no weight, so no load '
+                    'can be declared to them; the law weighs and carries it by itself'
+                )
+            self._drive_loads = DriveLoads(self.config)
+        return self._drive_loads
 
     def perceive(self) -> None:
         """Weigh what the tip holds, and detect contact, by the last state.

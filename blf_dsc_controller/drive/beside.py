@@ -1,0 +1,77 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A process beside a loop, for which the loop never waits: its motions in, reports out."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from time import monotonic
+
+from blf_dsc_controller.control.arm_controller import ArmController
+from blf_dsc_controller.control.motion_input import MotionInput
+from blf_dsc_controller.messages import topic_link
+from blf_dsc_controller.messages.link import Link
+from blf_dsc_controller.messages.topic_link import LOG
+from blf_dsc_controller.supervision.guard import Guard
+
+
+class Beside(ABC):
+    """What a loop without ROS exchanges with a process beside it."""
+
+    def __init__(self, link: Link, controller: ArmController) -> None:
+        """Take motions that come over a link, to which the log goes."""
+        self._link = link
+        self._guard = controller.guard
+        self.log = LinkLog(link)
+        self._inputs = MotionInput(
+            len(controller.joints), lambda: self._guard, _is_live, self.log
+        )
+
+    def follow(self) -> None:
+        """Send what waits and take what has arrived; after each state's torque."""
+        if self._link.broken:
+            return
+        self._inputs.poll(self._guard)
+        for kind, content in self._link.messages():
+            self._take(kind, content)
+        self._report_now_and_then()
+        self._link.flush()
+
+    @abstractmethod
+    def _take(self, kind: int, content: bytes) -> None:
+        """Do what a message wants."""
+
+    @abstractmethod
+    def _report_now_and_then(self) -> None:
+        """Tell what has changed since the last state."""
+
+
+class LinkLog:
+    """The log of the loop, which is written in the other process."""
+
+    def __init__(self, link: Link) -> None:
+        self._link = link
+        self._warned: dict[str, float] = {}
+
+    def info(self, message: str) -> None:
+        """Tell what is as it should be."""
+        self._send('info', message)
+
+    def warning(self, message: str, *, throttle_duration_sec: float = 0.0) -> None:
+        """Warn, of the same only after a pause [s]."""
+        now = monotonic()
+        if now - self._warned.get(message, -1e9) >= throttle_duration_sec:
+            self._warned = {message: now}
+            self._send('warning', message)
+
+    def error(self, message: str) -> None:
+        """Tell what has gone wrong."""
+        self._send('error', message)
+
+    def _send(self, level: str, text: str) -> None:
+        content = topic_link.encode({'level': level, 'text': text})
+        self._link.put(LOG, content)
+
+
+def _is_live(_guard: Guard) -> bool:
+    """Whether the robot does not wait: never, also if it is a simulated one."""
+    return True

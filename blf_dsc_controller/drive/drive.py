@@ -1,0 +1,554 @@
+# SPDX-License-Identifier: Apache-2.0
+"""An arm under the guarded law, commanded from a script: the loop is in its own process.
+
+The script may be slow, stop, crash or be killed: the loop keeps its rate, and then
+brakes the arm.
+"""
+
+from __future__ import annotations
+
+import functools
+import logging
+import math
+import os
+import signal
+import socket
+import subprocess
+import threading
+import time
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from types import TracebackType
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from blf_dsc_controller import child
+from blf_dsc_controller.control import goal_messages
+from blf_dsc_controller.control.goal_messages import Answer, Outcome
+from blf_dsc_controller.errors import (
+    DriveError,
+    LoopEndedError,
+    MotionFailedError,
+    NotInTimeError,
+)
+from blf_dsc_controller.messages import script_link, topic_link
+from blf_dsc_controller.messages.link import Link
+from blf_dsc_controller.messages.script_link import ArmState
+
+if TYPE_CHECKING:
+    from blf_dsc_controller.drive.pose import Pose, Poses
+
+_PROCESS = 'blf_dsc_controller.drive.script_process'
+_ONE_THREAD = ('OPENBLAS_NUM_THREADS', 'OMP_NUM_THREADS', 'MKL_NUM_THREADS')
+_POLL = 0.1  # s
+_SILENCE = 60.0  # s without a word of a loop that runs
+_END = 5.0  # s, for a process that was told to end at once
+_LOG = logging.getLogger('blf_dsc_controller')
+
+
+class Drive:
+    """A robot, or a simulated arm, that does what a script says.
+
+    Use it as a context manager::
+
+        with blf.Drive('my.yaml', robot='172.16.0.2') as arm:
+            arm.move_to([0.0, -0.7, 0.0, -2.2, 0.0, 1.6, 0.7])
+            print(arm.state.q)
+
+    It starts the loop of `blf_dsc drive` in a process of its own, and waits until the
+    arm is held where it rests.  At the end of the block, or of the script, the arm is
+    brought to rest, and the robot holds it by its own means.  Warnings and remarks of
+    the loop go to the logger `blf_dsc_controller`.
+
+    Attributes:
+        joints: names of the n joints, in the order of all arrays.
+    """
+
+    def __init__(
+        self,
+        config: str | Path,
+        overrides: Mapping[str, Mapping[str, object]] | None = None,
+        *,
+        robot: str,
+        record: str | Path | None = None,
+    ) -> None:
+        """Start the loop; the first time, kernels may be compiled for minutes.
+
+        Args:
+            config: parameter file, or a preset.
+            overrides: values by node and dotted name, which take precedence over the file.
+                The reference of the file is not followed: the arm holds.
+            robot: its address, for the driver that the file names; or `simulated`, for the
+                simulated arm of the file, no faster than real time.
+            record: new folder for a bag.
+
+        Raises:
+            DriveError: file, robot or arm are not as they should be.
+        """
+        self.joints: tuple[str, ...] = ()
+        self._config = str(config)
+        self._overrides = {
+            node: {name: _plain(value) for name, value in each.items()}
+            for node, each in (overrides or {}).items()
+        }
+        self._robot = robot
+        self._record = None if record is None else Path(record)
+        self._starts = 0
+        self._news = threading.Condition()
+        self._number = 0
+        self._last = 0  # number of the last motion
+        self._start()
+
+    def __enter__(self) -> Drive:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        ended = self._ended
+        self.close()
+        if kind is None and ended:
+            raise LoopEndedError(ended)
+
+    # Motions.
+
+    def move_to(
+        self,
+        positions: ArrayLike,
+        *,
+        speed: float = 0.5,
+        wait: bool = True,
+        timeout: float | None = None,
+    ) -> None:
+        """Go straight to rest at positions (n,) [rad].
+
+        Args:
+            positions: of all joints; a continuous joint goes the short way.
+            speed: share of `limits.velocity` and `limits.acceleration`, up to 1.
+            wait: return once the arm is there; False: at once, see `wait`.
+            timeout: longest time to wait [s], then the arm brakes.
+
+        Raises:
+            MotionFailedError: it leaves the limits, something else replaced it, or touched the arm.
+            NotInTimeError: after `timeout`.
+            LoopEndedError: the loop has ended.
+        """
+        values = self._checked(positions)
+        wanted = {'positions': values.tolist(), 'speed': _checked_speed(speed)}
+        self._begin(script_link.MOVE, wanted, wait=wait, timeout=timeout)
+
+    def follow(
+        self,
+        points: Sequence[Sequence[Any]],
+        joints: Sequence[str] = (),
+        *,
+        wait: bool = True,
+        timeout: float | None = None,
+    ) -> None:
+        """Follow a trajectory from now on; it replaces a motion that is not over.
+
+        Args:
+            points: each a `TrajectoryPoint`, or likewise the time [s] from now, positions
+                [rad], and perhaps velocities [rad/s] and accelerations [rad/s^2].
+            joints: names, in the order of the values; by default the arm's.
+            wait, timeout: as for `move_to`.
+
+        Raises:
+            MotionFailedError, NotInTimeError, LoopEndedError: as for `move_to`.
+        """
+        given = [
+            [float(time), *(np.asarray(each, float).tolist() for each in values)]
+            for time, *values in points
+        ]
+        if not given:
+            raise DriveError('points: got none; stop() brakes the arm')
+        wanted = {'points': given, 'joints': list(joints or self.joints)}
+        self._begin(script_link.FOLLOW, wanted, wait=wait, timeout=timeout)
+
+    def move_to_pose(
+        self,
+        position: ArrayLike,
+        rotation: ArrayLike | None = None,
+        *,
+        speed: float = 0.3,
+        wait: bool = True,
+        timeout: float | None = None,
+    ) -> None:
+        """Move the tip straight to rest at a pose, in the base frame.
+
+        The way is solved by pink before the arm moves (an extra: `pose`).  The joints have
+        only been checked against their limits: keep the line free.
+
+        Args:
+            position: (3,) [m], of `robot.tip`.
+            rotation: (3, 3), its columns are the axes of the tip; by default it does not turn.
+            speed: share of the limits of the joints, up to 1, roughly.
+            wait, timeout: as for `move_to`.
+
+        Raises:
+            MotionFailedError: the line leaves the limits, or as for `move_to`.
+            NotInTimeError, LoopEndedError: as for `move_to`.
+            MissingExtraError: pink is not installed.
+        """
+        begin = np.array(self.state.reference)
+        line = self._poses.line(begin, position, rotation, _checked_speed(speed))
+        points = list(zip(line.times, line.positions, strict=True))
+        self.follow(points, wait=wait, timeout=timeout)
+
+    def stream(self, positions: ArrayLike) -> None:
+        """Give the next positions (n,) [rad] of a stream, and return at once.
+
+        Call it at a steady rate, such as 30 Hz.  The reference is there an interval later,
+        and brakes if nothing follows.  A target that cannot be followed is logged.
+
+        Raises:
+            LoopEndedError: the loop has ended.
+        """
+        values = self._checked(positions)
+        self._put(script_link.POSITIONS, values.tobytes())
+
+    def wait(self, timeout: float | None = None) -> None:
+        """Wait for the end of the last `move_to` or `follow` that did not.
+
+        Raises:
+            MotionFailedError, NotInTimeError, LoopEndedError: as for `move_to`.
+        """
+        if self._last:
+            self._await_motion(self._last, timeout)
+
+    def stop(self, timeout: float | None = None) -> None:
+        """Brake within the limits, and return once the reference rests; the arm holds.
+
+        Raises:
+            NotInTimeError, LoopEndedError: as for `move_to`.
+        """
+        self._ask(script_link.BRAKE, lambda number: number, timeout)
+
+    def load(
+        self,
+        mass: float,
+        centre: Sequence[float] = (0.0, 0.0, 0.0),
+        timeout: float | None = None,
+    ) -> None:
+        """Declare what the tip holds to the robot's drives; return once they add its weight.
+
+        The law subtracts what they add, in small steps, so no joint torque changes.  For
+        robots whose drives compensate gravity; the law itself needs no declaration.
+
+        Args:
+            mass: all that the URDF lacks [kg]; 0: nothing.
+            centre: of this mass, in the frame of `robot.tip` [m].
+            timeout: longest time to wait [s].
+
+        Raises:
+            MotionFailedError: these drives cannot be told, or refuse.
+            NotInTimeError, LoopEndedError: as for `move_to`.
+        """
+        at = np.asarray(centre, float)
+        if not 0.0 <= mass < math.inf or at.shape != (3,) or not np.isfinite(at).all():
+            raise DriveError(
+                f'load: got {mass} kg at {list(centre)} m, but a mass of at least 0 and three '
+                'coordinates are needed'
+            )
+        wanted = {'mass': float(mass), 'centre': at.tolist()}
+        self._ask(
+            script_link.LOAD, lambda number: {'number': number, **wanted}, timeout
+        )
+
+    # State.
+
+    @property
+    def state(self) -> ArmState:
+        """The last state, some milliseconds old.
+
+        Raises:
+            LoopEndedError: the loop has ended.
+        """
+        self._check()
+        assert self._state is not None  # noqa: S101 - since it runs
+        return self._state
+
+    @property
+    def pose(self) -> Pose:
+        """Where the tip is by the last state.
+
+        Raises:
+            LoopEndedError: the loop has ended.
+        """
+        return self._poses.at(np.array(self.state.q))
+
+    @functools.cached_property
+    def _poses(self) -> Poses:
+        """The kinematics of the file, imported when they are needed."""
+        from blf_dsc_controller.configuration.controller import ControllerConfig
+        from blf_dsc_controller.configuration.nodes import CONTROLLER, load, locate
+        from blf_dsc_controller.drive.pose import Poses
+
+        given = self._overrides.get(CONTROLLER)
+        return Poses(load(locate(self._config), CONTROLLER, ControllerConfig, given))
+
+    @property
+    def is_moving(self) -> bool:
+        """Whether the last `move_to` or `follow` is not over."""
+        return self._last != 0 and self._last not in self._results
+
+    @property
+    def ended(self) -> str:
+        """Why the loop has ended; empty while it runs."""
+        return self._ended
+
+    def recover(self) -> None:
+        """Take command again after an end, such as a stop of the controller or a reflex.
+
+        The arm then holds where it is.  What was learned is kept, unless the process died.
+
+        Raises:
+            DriveError: the cause is still there.
+        """
+        if not self._ended:
+            return
+        if self._waits and self._process.poll() is None:
+            self._forget()
+            self._link.put(script_link.RECOVER, b'{}')
+            self._link.flush()
+            self._await_running()
+        else:
+            self._end_process()
+            self._start()
+
+    def close(self) -> None:
+        """Bring the arm to rest, and end its loop; a second Ctrl-C ends it at once."""
+        if self._process.poll() is None:
+            try:
+                self._close_softly()
+            except KeyboardInterrupt:
+                self._tell_to_close()
+                self._end_process()
+                raise
+        self._end_process()
+
+    # The process.
+
+    def _start(self) -> None:
+        self._starts += 1
+        record = self._record
+        if record is not None and self._starts > 1:
+            record = record.with_name(f'{record.name}_{self._starts}')
+        self._forget()
+        ours, theirs = socket.socketpair()
+        with theirs:
+            self._process = subprocess.Popen(
+                [*child.running_module(_PROCESS), f'{theirs.fileno()}'],
+                pass_fds=[theirs.fileno()],
+                stdin=subprocess.DEVNULL,
+                env=dict.fromkeys(_ONE_THREAD, '1') | os.environ | child.places(),
+                start_new_session=True,  # Ctrl-C is for the script, which brakes
+            )
+        self._link = Link(ours)
+        wanted = {
+            'config': self._config,
+            'overrides': self._overrides,
+            'robot': self._robot,
+            'record': str(record) if record else None,
+        }
+        self._link.put(script_link.START, topic_link.encode(wanted))
+        self._link.flush()
+        link = self._link
+        self._listener = threading.Thread(
+            target=self._listen, args=(link,), daemon=True
+        )
+        self._listener.start()
+        try:
+            self._await_running()
+        except BaseException:
+            if self._process.poll() is None:
+                self._process.send_signal(signal.SIGTERM)
+            self._end_process()
+            raise
+
+    def _forget(self) -> None:
+        """Forget what an earlier loop told."""
+        self._state: ArmState | None = None
+        self._ended = ''
+        self._waits = self._runs = False
+        self._results: dict[int, tuple[type[DriveError] | None, str]] = {}
+        self._last = 0
+        self._heard = time.monotonic()
+
+    def _await_running(self) -> None:
+        self._until(lambda: self._runs and self._state is not None, None)
+
+    def _close_softly(self) -> None:
+        """Tell the loop to end, and wait as long as it says something."""
+        self._tell_to_close()
+        self._heard = time.monotonic()
+        while self._process.poll() is None:
+            if time.monotonic() - self._heard > _SILENCE:
+                _LOG.error(f'the loop does not end: silent for {_SILENCE:g} s, killed')
+                return
+            with self._news:
+                self._news.wait(_POLL)
+
+    def _tell_to_close(self) -> None:
+        self._link.put(script_link.CLOSE, b'null')
+        self._link.flush()
+
+    def _end_process(self) -> None:
+        """Wait for a process that is about to end, or kill it."""
+        try:
+            self._process.wait(_END)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            self._process.wait()
+        self._listener.join()
+        self._link.close()
+
+    # What the process tells, in a thread.
+
+    def _listen(self, link: Link) -> None:
+        while not link.broken:
+            link.wait(_POLL)
+            for kind, content in link.messages():
+                with self._news:
+                    self._take(kind, content)
+                    self._news.notify_all()
+        code = self._process.wait()
+        with self._news:
+            if link is self._link and not self._ended:
+                self._waits = False
+                self._ended = _death(code)
+            self._news.notify_all()
+
+    def _take(self, kind: int, content: bytes) -> None:
+        self._heard = time.monotonic()
+        if kind == script_link.SAMPLE:
+            self._state = script_link.decode_sample(content, len(self.joints))
+            return
+        if kind == script_link.GOAL:
+            self._take_goal(goal_messages.decode(content))
+            return
+        told = topic_link.decode(content)
+        if kind == script_link.RUNNING:
+            self.joints = tuple(told)
+            self._runs = True
+        elif kind == script_link.DONE:
+            error = MotionFailedError if told['problem'] else None
+            self._results[told['number']] = error, told['problem']
+        elif kind == script_link.ENDED:
+            reason = f': {told["text"]}' if told['text'] else ''
+            self._waits = told['waits']
+            self._ended = f'{told["end"]}{reason}'
+        elif kind == script_link.FAILED:
+            self._waits = False
+            self._ended = told
+        elif kind == topic_link.LOG:
+            _LOG.log(logging.getLevelName(told['level'].upper()), told['text'])
+
+    def _take_goal(self, told: goal_messages.Message) -> None:
+        if isinstance(told, Answer) and not told.accepted:
+            self._results[told.number] = MotionFailedError, told.reason
+        elif isinstance(told, goal_messages.End):
+            done = told.outcome is Outcome.SUCCEEDED
+            self._results[told.number] = None if done else MotionFailedError, told.text
+
+    # What the script wants.
+
+    def _checked(self, positions: ArrayLike) -> np.ndarray:
+        values = np.asarray(positions, float)
+        n = len(self.joints)
+        if values.shape != (n,) or not np.isfinite(values).all():
+            raise DriveError(
+                f'positions: got {values.tolist()}, but {n} finite values are needed, one for '
+                f'each of {", ".join(self.joints)}'
+            )
+        return values
+
+    def _begin(
+        self, kind: int, wanted: dict[str, Any], *, wait: bool, timeout: float | None
+    ) -> None:
+        self._number += 1
+        self._last = number = self._number
+        with self._news:
+            self._results.clear()  # nobody asks for those of earlier motions
+        if kind == script_link.FOLLOW:
+            content = script_link.HEAD.pack(number) + topic_link.encode(wanted)
+        else:
+            content = topic_link.encode({**wanted, 'number': number})
+        self._put(kind, content)
+        if wait:
+            self._await_motion(number, timeout)
+
+    def _await_motion(self, number: int, timeout: float | None) -> None:
+        try:
+            self._await_result(number, timeout)
+        except NotInTimeError as error:
+            self.stop()
+            raise NotInTimeError(f'{error}: the arm has braked') from None
+
+    def _ask(
+        self, kind: int, wanted: Callable[[int], Any], timeout: float | None
+    ) -> None:
+        self._number += 1
+        number = self._number
+        self._put(kind, topic_link.encode(wanted(number)))
+        self._await_result(number, timeout)
+
+    def _put(self, kind: int, content: bytes) -> None:
+        self._check()
+        self._link.put(kind, content)
+        self._link.flush()
+
+    def _await_result(self, number: int, timeout: float | None) -> None:
+        self._until(lambda: number in self._results, timeout)
+        error, text = self._results[number]
+        if error is not None:
+            raise error(text)
+
+    def _until(self, condition: Callable[[], bool], timeout: float | None) -> None:
+        """Wait until a condition holds; the link is flushed meanwhile."""
+        end = math.inf if timeout is None else time.monotonic() + timeout
+        with self._news:
+            while not condition():
+                self._check()
+                if time.monotonic() > end:
+                    raise NotInTimeError(f'not over after {timeout} s')
+                self._link.flush()
+                self._news.wait(_POLL)
+
+    def _check(self) -> None:
+        """Raise LoopEndedError if the loop has ended, or says nothing any more."""
+        if self._ended:
+            remedy = '; recover() takes command again' if self._waits else ''
+            raise LoopEndedError(f'{self._ended}{remedy}')
+        silent = time.monotonic() - self._heard
+        if self._runs and silent > _SILENCE:
+            raise LoopEndedError(
+                f'the loop has said nothing for {silent:.0f} s: look at the arm, then close()'
+            )
+
+
+def _checked_speed(speed: float) -> float:
+    if not 0.0 < speed <= 1.0:
+        raise DriveError(
+            f'speed: got {speed:g}, but a share of the limits is needed: above 0, up to 1'
+        )
+    return float(speed)
+
+
+def _plain(value: object) -> object:
+    """Return a value as JSON has it."""
+    return value.tolist() if isinstance(value, (np.ndarray, np.generic)) else value
+
+
+def _death(code: int) -> str:
+    """Return what is known of a process that ended without a word."""
+    how = f'by signal {-code}' if code < 0 else f'with exit code {code}'
+    return (
+        f'the process of the loop ended {how}, without bringing the arm to rest: look at the '
+        'robot; stderr may say why'
+    )

@@ -1,0 +1,222 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A script beside the loop: its motions, its stops, its end; samples for it.
+
+When the script ends, in whatever way, the reference brakes and the loop ends at rest.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from blf_dsc_controller.control.arm_controller import ArmController
+from blf_dsc_controller.control.goal_messages import End, Goal, Message, encode
+from blf_dsc_controller.control.goals import Goals
+from blf_dsc_controller.control.slow_move import duration_of
+from blf_dsc_controller.drive.beside import Beside
+from blf_dsc_controller.drive.loop import DriveLoop
+from blf_dsc_controller.errors import BlfDscError
+from blf_dsc_controller.law.external_torque import is_touched
+from blf_dsc_controller.messages import script_link, topic_link
+from blf_dsc_controller.messages.link import Link
+from blf_dsc_controller.messages.script_link import ArmState, encode_sample
+from blf_dsc_controller.reference.retargeting import TrajectoryError
+from blf_dsc_controller.reference.trajectory import Trajectory, TrajectoryPoint
+from blf_dsc_controller.reference.turns import short_way
+from blf_dsc_controller.supervision.drive_load import DriveLoad
+
+_PERIOD = 0.005  # s of the robot's time between two samples
+_SHORTEST = 0.1  # s, of a move
+_SOURCE = 'the script'
+
+
+class Script(Beside):
+    """What a script wants of the loop, and is told of it."""
+
+    def __init__(self, link: Link, controller: ArmController) -> None:
+        """Take the commands that come over a link of the parent process."""
+        super().__init__(link, controller)
+        self._controller = controller
+        self._goals = Goals(self._inputs, controller.joints, self._tell_goal, self.log)
+        self._parent = os.getppid()
+        self._told = -math.inf  # s, time of the last sample that was sent
+        self._braking: list[tuple[float, int]] = []  # s, end, and number of the request
+        self._loop: DriveLoop | None = None
+        self._loading: int | None = None  # number of the request
+        self._asked = 0  # to close, by a signal
+        self._closes = 0
+        self._rests_at = math.nan  # s, when the loop may end
+        self._tells_running = False
+
+    def begin(self, loop: DriveLoop) -> None:
+        """Begin a loop."""
+        self._loop = loop
+        self._tells_running = True
+        self._told = -math.inf
+        self._braking.clear()
+
+    @property
+    def is_over(self) -> bool:
+        """Whether the script wants nothing more, or has ended."""
+        return self._closes > 0 or self._asked > 0 or self._is_alone
+
+    @property
+    def _is_alone(self) -> bool:
+        return self._link.broken or os.getppid() != self._parent
+
+    def request_close(self) -> None:
+        """Close after the next torque; the second time end at once; for signals."""
+        self._asked += 1
+        if self._asked > 1:
+            self._end_loop()
+
+    def follow(self) -> None:
+        """Do what the script wants; end with it."""
+        super().follow()
+        if (self._is_alone or self._asked) and not self._closes:
+            self._close()
+        if self._guard.time >= self._rests_at:
+            self._rests_at = math.nan
+            self._end_loop()
+
+    def _close(self) -> None:
+        """Brake, then end at rest; the second time end at once."""
+        self._closes += 1
+        if self._closes > 1:
+            self._end_loop()
+        if self._closes > 1 or not self._guard.supervisor.running:
+            self._end_loop()
+        else:
+            self._rests_at = self._inputs.stop(self._guard, 'the end of the script')
+
+    def _end_loop(self) -> None:
+        if self._loop is not None:
+            self._loop.request_end()
+
+    def _take(self, kind: int, content: bytes) -> None:
+        if kind == script_link.POSITIONS:
+            self._inputs.stream(self._guard, np.frombuffer(content), _SOURCE)
+            return
+        if kind == script_link.FOLLOW:
+            (number,) = script_link.HEAD.unpack_from(content)
+            self._begin_goal(number, lambda: _trajectory(content))
+            return
+        wanted = topic_link.decode(content)
+        match kind:
+            case script_link.MOVE:
+                trajectory = self._move(wanted)
+                self._begin_goal(wanted['number'], lambda: trajectory)
+            case script_link.BRAKE:
+                self._brake(wanted)
+            case script_link.LOAD:
+                self._declare(wanted)
+            case script_link.CLOSE:
+                self._close()
+
+    def _begin_goal(self, number: int, make: Callable[[], Trajectory]) -> None:
+        goal = Goal(number, b'', (), (), 0.0)
+        self._goals.follow(self._guard, goal, make, _SOURCE)
+
+    def _move(self, wanted: dict[str, Any]) -> Trajectory:
+        """Return the way from the present reference to rest at some positions."""
+        guard, config = self._guard, self._guard.config
+        here = guard.controller.reference_at(guard.time)[0]
+        (there,), _ = short_way(np.array([wanted['positions']]), here, config)
+        limits = config.limits.velocity, config.limits.acceleration
+        speed, acceleration = wanted['speed'] * np.array(limits)
+        time = max(_SHORTEST, duration_of(np.abs(there - here), speed, acceleration))
+        points = (TrajectoryPoint(time, tuple(there.tolist())),)
+        return Trajectory(config.joints, points)
+
+    def _brake(self, number: int) -> None:
+        try:
+            end = self._inputs.stop(self._guard, 'stop()')
+        except TrajectoryError as error:
+            self._tell_done(number, str(error))
+        else:
+            self._braking.append((end, number))
+
+    def _declare(self, wanted: dict[str, Any]) -> None:
+        load = DriveLoad(wanted['mass'], tuple(wanted['centre']))
+        try:
+            self._guard.declare(load)
+        except BlfDscError as error:
+            self._tell_done(wanted['number'], str(error))
+        else:
+            self._loading = wanted['number']
+
+    def _follow_load(self) -> None:
+        """Say when the drives have a load, or why they have not."""
+        problem = self._loop.remark if self._loop is not None else ''
+        if self._loading is not None and (problem or self._guard.is_load_told):
+            self._tell_done(self._loading, problem)
+            self._loading = None
+
+    def _report_now_and_then(self) -> None:
+        guard = self._guard
+        self._follow_load()
+        self._goals.watch(guard)
+        while self._braking and guard.time >= self._braking[0][0]:
+            self._tell_done(self._braking.pop(0)[1])
+        if not guard.has_sample:
+            return
+        if self._tells_running:
+            self._tells_running = False
+            self.tell(script_link.RUNNING, list(self._controller.joints))
+        # An old state is worth nothing: send none before the last one is taken.
+        if guard.time - self._told >= _PERIOD and self._link.flush():
+            self._tell_sample()
+
+    def _tell_sample(self) -> None:
+        if self._guard.has_sample:
+            self._told = self._guard.time
+            self._link.put(script_link.SAMPLE, encode_sample(self._state()))
+
+    def _state(self) -> ArmState:
+        guard, controller = self._guard, self._guard.controller
+        signals, sample = controller.signals, controller.sample
+        load = self._controller.load
+        senses = guard.config.contact.enabled
+        return ArmState(
+            guard.time,
+            str(guard.supervisor.phase),
+            signals.q,
+            signals.dq,
+            controller.state.torque,
+            signals.qr,
+            sample.xi1,
+            sample.bound,
+            sample.external if senses else np.full_like(signals.q, math.nan),
+            load.mass,
+            load.interval,
+            senses and is_touched(controller.state.contact),
+        )
+
+    def tell(self, kind: int, content: Any) -> None:
+        """Tell the script something."""
+        self._link.put(kind, topic_link.encode(content))
+
+    def _tell_done(self, number: int, problem: str = '') -> None:
+        self._tell_sample()  # that of the end
+        self.tell(script_link.DONE, {'number': number, 'problem': problem})
+
+    def _tell_goal(self, message: Message) -> None:
+        if isinstance(message, End):
+            if not self._guard.supervisor.running:
+                return  # the loop ends, and says why
+            self._tell_sample()
+        self._link.put(script_link.GOAL, encode(message))
+
+
+def _trajectory(content: bytes) -> Trajectory:
+    wanted = topic_link.decode(content[script_link.HEAD.size :])
+    points = tuple(TrajectoryPoint(*map(_field, each)) for each in wanted['points'])
+    return Trajectory(tuple(wanted['joints']), points)
+
+
+def _field(value: Any) -> Any:
+    return tuple(value) if isinstance(value, list) else value

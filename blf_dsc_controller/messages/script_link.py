@@ -1,0 +1,107 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Messages over a `Link` between a script and the process of its loop.
+
+Contents are JSON, except those of SAMPLE and POSITIONS, and of GOAL, which is
+`control/goal_messages`'. A log entry is `topic_link`'s LOG.
+"""
+
+from __future__ import annotations
+
+from struct import Struct
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float64]
+
+HEAD = Struct('<Q')
+"""The number before the content of FOLLOW."""
+
+# To the loop.
+START = 110
+"""What to control: `config`, `overrides`, `robot`, `record`."""
+MOVE = 111
+"""Go straight to `positions` with a share `speed` of the limits, as goal `number`."""
+FOLLOW = 112
+"""As goal of a number (`HEAD`), follow `points` (time, positions, velocities, accelerations) of
+`joints`: JSON that may be long, and is read where it is planned."""
+POSITIONS = 113
+"""The next target of a stream: float64 (n,) [rad]."""
+BRAKE = 114
+"""Brake and hold: the number of the request."""
+LOAD = 115
+"""The drives are to add a load: `number`, `mass` [kg], `centre` [m]."""
+CLOSE = 116
+"""End at rest; a second one ends at once."""
+RECOVER = 117
+"""Start again after an end: {}."""
+
+# From the loop.
+RUNNING = 120
+"""The arm is in command: names of the joints."""
+SAMPLE = 121
+"""A state, as `encode_sample` packs it."""
+GOAL = 122
+"""What became of a goal."""
+DONE = 123
+"""A request other than a goal is done: `number`, and the `problem` if it cannot be."""
+ENDED = 124
+"""The loop has ended: `end`, `text`, and whether it `waits` for RECOVER."""
+FAILED = 125
+"""It could not start: the sentence."""
+
+
+class ArmState(NamedTuple):
+    """What a loop says of its arm at one sample; arrays are (n,).
+
+    `load` and its `load_interval`, half of a 95 % interval, are NaN until weighed.
+    """
+
+    time: float  #: s since the start, by the robot's clock
+    phase: str  #: such as ``tracking``
+    q: Floats  #: rad, measured
+    dq: Floats  #: rad/s, measured
+    tau: Floats  #: N m, commanded
+    reference: Floats  #: rad
+    error: Floats  #: rad, q - reference
+    bound: Floats  #: rad, on the error
+    external: Floats  #: N m, external torque; NaN unless `contact.enabled`
+    load: float  #: kg more at the tip than at the start
+    load_interval: float  #: kg
+    contact: bool  #: whether something touches the arm; False unless `contact.enabled`
+
+
+_SCALARS = 4
+_VECTORS = 7
+
+
+def encode_sample(state: ArmState) -> bytes:
+    """Return a state as bytes."""
+    scalars = state.time, state.load, state.load_interval, float(state.contact)
+    values = np.concatenate((scalars, *state[2 : 2 + _VECTORS]))
+    return values.tobytes() + state.phase.encode()
+
+
+def decode_sample(raw: bytes, joints: int) -> ArmState:
+    """Return the state of `encode_sample`, of an arm with so many joints."""
+    size = _SCALARS + _VECTORS * joints
+    values = np.frombuffer(raw, np.float64, size)
+    time, load, interval, contact = values[:_SCALARS].tolist()
+    q, dq, tau, reference, error, bound, external = values[_SCALARS:].reshape(
+        _VECTORS, joints
+    )
+    return ArmState(
+        time=time,
+        phase=raw[8 * size :].decode(),
+        q=q,
+        dq=dq,
+        tau=tau,
+        reference=reference,
+        error=error,
+        bound=bound,
+        external=external,
+        load=load,
+        load_interval=interval,
+        contact=bool(contact),
+    )

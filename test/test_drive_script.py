@@ -1,0 +1,289 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`blf.Drive`: a script's motions, its errors, and what the arm does when either side ends.
+
+The simulated arm waits for its torques: on a slow computer it is slow, and all else is the same.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+from collections import defaultdict
+
+import numpy as np
+import pytest
+from command import COMPILED, wait_for
+from mcap.reader import make_reader
+
+import blf_dsc_controller as blf
+from blf_dsc_controller.cli.main import main
+from blf_dsc_controller.configuration.drive import DriveConfig
+from blf_dsc_controller.drive.driver import ReflexError
+from blf_dsc_controller.drive.simulated import SIMULATED, simulated
+from blf_dsc_controller.errors import (
+    DriveError,
+    LoopEndedError,
+    MotionFailedError,
+    NotInTimeError,
+)
+from blf_dsc_controller.messages.journal import EventType, decode
+from blf_dsc_controller.messages.topics import TARGETS
+
+# rad: the bound of the preset, to which any error of the arm adds up
+NEAR = 0.045
+STEP = np.array([0.0, 0.1, 0.0, 0.3, 0.0, -0.2, 0.1])  # rad
+
+
+def drive(record=None, **given):
+    return blf.Drive('panda', given, robot='simulated', record=record)
+
+
+@pytest.fixture(scope='module')
+def arm():
+    with drive() as found:
+        yield found
+
+
+def recorded(folder):
+    """Serialised messages of each topic of a bag."""
+    found = defaultdict(list)
+    with next(folder.glob('*.mcap')).open('rb') as file:
+        for _, channel, message in make_reader(file).iter_messages(
+            log_time_order=False
+        ):
+            found[channel.topic].append(message.data)
+    return found
+
+
+def rests(arm):
+    """The reference does."""
+    before = arm.state
+    wait_for(lambda: arm.state.time > before.time + 0.05)
+    return np.array_equal(before.reference, arm.state.reference)
+
+
+def test_command_controls_the_simulated_arm_too(tmp_path, capsys):
+    out = tmp_path / 'bag'
+    words = ['drive', '--robot', 'simulated', '--config', 'panda', '--duration', '0.5']
+    assert main([*words, '--out', str(out)]) == 0
+    assert re.search(r'states +\d{3,}, and 0 missed', capsys.readouterr().out)
+    assert blf.verify(out).difference is None
+
+
+def test_simulated_drives_stop_by_themselves_and_are_released_where_they_are():
+    loop = blf.load_loop('fr3_direct')
+    made = simulated(loop.plant)
+    driver = made(SIMULATED, loop.controller, DriveConfig())
+    driver.connect()
+    driver.start()
+    for torque in (np.zeros(7), np.full(7, 5.0)):  # 5 N m in 1 ms, of 1 N m allowed
+        driver.read()
+        driver.write(torque)
+    with pytest.raises(ReflexError, match=r'actuator\.reflex_rate'):
+        driver.read()
+    before = driver.positions()
+    driver.recover()
+    driver.start()
+    np.testing.assert_allclose(driver.read().q, before, atol=1e-4)
+
+
+def test_motions_arrive_and_the_bag_replays_bit_equal(tmp_path):
+    with drive(tmp_path / 'bag') as arm:
+        assert arm.state.phase == 'tracking'
+        start = arm.state.q
+        arm.move_to(start + STEP, speed=1.0)
+        np.testing.assert_allclose(arm.state.q, start + STEP, atol=NEAR)
+        assert rests(arm)
+        arm.follow([(0.5, start + 0.5 * STEP), (1.0, start)])
+        np.testing.assert_allclose(arm.state.q, start, atol=NEAR)
+        for k in range(30):
+            arm.stream(start + 0.01 * min(k, 10))
+            time.sleep(1.0 / 30.0)
+        wait_for(lambda: rests(arm))
+        np.testing.assert_allclose(arm.state.q, start + 0.1, atol=NEAR)
+        assert (np.abs(arm.state.error) < arm.state.bound).all()
+    assert arm.ended == 'ended on request'
+    assert blf.verify(tmp_path / 'bag').difference is None
+    sent = recorded(tmp_path / 'bag')[TARGETS.resolved]
+    kinds = [decode(raw).type for raw in sent]
+    assert kinds.count(EventType.TRAJECTORY) == 2
+    assert kinds.count(EventType.TARGET) > 2  # the latest wins while one is planned
+
+
+def test_what_cannot_be_done_is_refused_with_the_reason_and_the_arm_holds(arm):
+    before = arm.state.reference
+    with pytest.raises(DriveError, match='7 finite values are needed'):
+        arm.move_to([0.0, 1.0])
+    with pytest.raises(DriveError, match='7 finite values are needed'):
+        arm.stream([np.nan] * 7)
+    with pytest.raises(DriveError, match='speed: got 1'):
+        arm.move_to(before, speed=1.5)
+    with pytest.raises(DriveError, match='points: got none'):
+        arm.follow([])
+    with pytest.raises(MotionFailedError, match=r"panda_joint\d' would be .* rad"):
+        arm.move_to(before + 9.0)
+    with pytest.raises(MotionFailedError, match='elbow'):
+        arm.follow([(1.0, [0.0])], ['elbow'])
+    np.testing.assert_array_equal(arm.state.reference, before)
+    assert not arm.is_moving
+
+
+def test_a_motion_is_waited_for_stopped_and_given_up(arm):
+    start = arm.state.q
+    arm.move_to(start + STEP, speed=0.1, wait=False)
+    assert arm.is_moving
+    arm.stop()
+    assert rests(arm)
+    with pytest.raises(MotionFailedError, match=r'pre-empted by stop\(\)|was stopped'):
+        arm.wait()
+    arm.move_to(start + STEP, speed=0.1, wait=False)
+    with pytest.raises(NotInTimeError, match=r'after 0.1 s: the arm has braked'):
+        arm.wait(timeout=0.1)
+    assert rests(arm)
+    arm.move_to(start + STEP, speed=0.1, wait=False)
+    arm.move_to(start, speed=1.0)
+    np.testing.assert_allclose(arm.state.q, start, atol=NEAR)
+
+
+def test_a_long_trajectory_is_read_beside_the_loop(arm):
+    """9000 points, 4 MB: reading them takes tens of milliseconds."""
+    start = arm.state.reference
+    times = np.arange(1, 9001) / 5000.0
+    wave = 0.05 * np.sin(np.pi * times / times[-1]) ** 2
+    arm.follow([(t, start + w) for t, w in zip(times, wave, strict=True)])
+    np.testing.assert_allclose(arm.state.reference, start, atol=1e-6)
+
+
+def test_load_is_declared_to_drives_that_compensate_and_no_torque_changes(tmp_path):
+    """An arm that holds nothing: what the drives add, the command lacks."""
+    with blf.Drive('fr3_direct', robot='simulated', record=tmp_path / 'bag') as arm:
+        before = arm.state
+        arm.load(1.0, (0.0, 0.0, 0.05))
+        # N m: the weight of 1 kg about joint 2, an arm's length away
+        wait_for(lambda: abs(arm.state.tau[1] - before.tau[1]) > 3.0)
+        arm.load(0.0)
+        wait_for(lambda: np.abs(arm.state.tau - before.tau).max() < 0.5)
+        with pytest.raises(DriveError, match='got -1 kg'):
+            arm.load(-1)
+    verified = blf.verify(tmp_path / 'bag')
+    assert verified.difference is None
+    # rad: friction that holds the arm takes up the steps
+    error = blf.read_run(tmp_path / 'bag').error
+    assert np.nanmax(np.abs(error)) < 1e-3
+
+
+def test_load_is_not_declared_to_drives_that_add_nothing(arm):
+    with pytest.raises(MotionFailedError, match='drive_compensates: got none'):
+        arm.load(1.0)
+
+
+def test_a_stop_of_the_controller_is_an_error_and_can_be_recovered():
+    """80 N m for 0.1 s, against 600 N m/rad and a bound of 49 mrad."""
+    push = {
+        'events.begin': [0.5],
+        'events.duration': [0.1],
+        'events.payload': [0.0],
+        'events.torque': [0.0, 80.0, 0.0, 0.0, 0.0, 0.0, 0.0],
+    }
+    with drive(sim_plant=push) as arm:
+        start = arm.state.q
+        with pytest.raises(LoopEndedError, match=r'the controller stopped: .*recover'):
+            arm.move_to(start + STEP, speed=0.1)
+        assert 'the controller stopped' in arm.ended
+        with pytest.raises(LoopEndedError, match='the controller stopped'):
+            arm.stream(start)
+        arm.recover()
+        arm.move_to(start, speed=0.5)
+        np.testing.assert_allclose(arm.state.q, start, atol=NEAR)
+
+
+def test_a_block_does_not_end_silently_with_an_arm_that_has_stopped():
+    push = {'events.begin': [0.2], 'events.force': [0.0, 0.0, 500.0]}
+    given = {'sim_plant': push | {'events.duration': [0.1], 'events.payload': [0.0]}}
+    arm = blf.Drive('panda', given, robot='simulated')
+    with pytest.raises(LoopEndedError, match='the controller stopped'), arm:
+        wait_for(lambda: arm.ended)
+
+
+def test_a_process_that_is_killed_is_an_error_and_another_can_be_started(tmp_path):
+    with drive(tmp_path / 'bag') as arm:
+        os.kill(arm._process.pid, signal.SIGKILL)
+        with pytest.raises(LoopEndedError, match='ended by signal 9, without bringing'):
+            arm.move_to(arm.state.q)
+        arm.recover()
+        assert rests(arm)
+    assert blf.verify(tmp_path / 'bag_2').difference is None
+
+
+@pytest.mark.parametrize(
+    ('config', 'robot', 'message'),
+    [
+        ('pando', 'simulated', 'pando does not exist, did you mean panda'),
+        ('ur5e', '192.0.2.1', 'ur5e.yaml:\n  - joints: got 6, but the robot has 7'),
+    ],
+)
+def test_a_start_that_fails_says_why(config, robot, message):
+    if robot != 'simulated':
+        pytest.importorskip('pylibfranka')
+    with pytest.raises(DriveError) as raised:
+        blf.Drive(config, robot=robot)
+    assert message in str(raised.value)
+
+
+# Without a function or a guard, as in a notebook.
+SCRIPT = """
+import os, signal, sys, time
+import blf_dsc_controller as blf
+arm = blf.Drive('panda', robot='simulated', record=sys.argv[2])
+q = arm.state.q + 0.5
+{}
+print('moving', flush=True)
+{}
+"""
+MOVES = 'arm.move_to(q, speed=1.0, wait=False); time.sleep(0.2)'
+STREAMS = 'for k in range(6): arm.stream(arm.state.q + 0.01 * k); time.sleep(0.03)'
+
+
+@pytest.mark.parametrize(
+    ('begin', 'end', 'code', 'said'),
+    [
+        (MOVES, '', 0, ''),
+        (MOVES, 'raise RuntimeError("a mistake")', 1, 'a mistake'),
+        (MOVES, 'os.kill(os.getpid(), signal.SIGKILL)', -9, ''),
+        (STREAMS, 'os._exit(3)', 3, ''),
+        (
+            MOVES,
+            'with arm: os.kill(os.getpid(), signal.SIGINT); arm.wait()',
+            -2,
+            'KeyboardInterrupt',
+        ),
+    ],
+)
+def test_a_script_that_ends_in_any_way_leaves_an_arm_at_rest(
+    begin, end, code, said, tmp_path
+):
+    script = tmp_path / 'script.py'
+    script.write_text(SCRIPT.format(begin, end))
+    ended = subprocess.run(
+        [sys.executable, script, 'x', tmp_path / 'bag'],
+        capture_output=True,
+        text=True,
+        timeout=COMPILED,
+        check=False,
+    )
+    assert ended.returncode == code, ended.stderr
+    assert said in ended.stderr
+    wait_for((tmp_path / 'bag' / 'metadata.yaml').exists)
+    verified = blf.verify(tmp_path / 'bag')
+    assert verified.difference is None
+    events = {event.type: event.content for event in verified.events}
+    assert EventType.BRAKE in events
+    assert events[EventType.RELEASE]['resting']
+    run = blf.read_run(tmp_path / 'bag')
+    # rad in 1 ms: it moved, also on a slow computer
+    assert np.nanmax(np.abs(np.diff(run.reference, axis=0))) > 1e-6
+    assert np.abs(run.velocity[-1]).max() < 0.02  # rad/s
