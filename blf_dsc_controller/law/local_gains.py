@@ -24,19 +24,21 @@ from blf_dsc_controller.law import barrier
 from blf_dsc_controller.law.controller import Controller
 from blf_dsc_controller.law.laws import PACKAGED
 from blf_dsc_controller.law.state import Settings, Signals, settings_of, signals_of
+from blf_dsc_controller.law.surface import virtual_slope
 
 
 @inner
 def stiffness_of(settings: Settings, signals: Signals, i: int, damping: float) -> float:
     """Return the stiffness [N m/rad] of joint i, whose damping is known."""
+    wall, surface = settings.barrier, settings.surface
     if settings.has_barrier == 0:
-        return float(settings.weight[i] + damping * settings.K[i])
+        return float(wall.weight[i] + damping * surface.gain[i])
     xi, bound = signals.xi1[i], signals.bound[i]
-    stiffness = settings.slope_limit[i]
-    if abs(xi) < signals.knee[i]:
-        stiffness = barrier.slope(xi, bound, settings.weight[i])
-    rate = barrier.virtual_slope(xi, bound, settings.K[i], settings.mu[i])
-    return float(stiffness + damping * max(rate - signals.narrowing[i], 0.0))
+    stiffness = wall.slope_limit[i]
+    if abs(xi) < signals.barrier.knee[i]:
+        stiffness = barrier.slope(xi, bound, wall.weight[i])
+    rate = virtual_slope(xi, bound, surface.gain[i], surface.mu[i])
+    return float(stiffness + damping * max(rate - signals.barrier.narrowing[i], 0.0))
 
 
 @kernel
@@ -46,8 +48,9 @@ def fill_local_gains(
     """Write stiffness and damping (2, n) of the last sample."""
     settings = settings_of(settings_vector, model)
     signals = signals_of(signals_vector, settings)
+    feedback = settings.feedback
     for i in range(settings.n):
-        damping = settings.Kp[i] + settings.damping_rate * settings.joint_inertia[i]
+        damping = feedback.gain[i] + feedback.damping_rate * settings.joint_inertia[i]
         gains[0, i] = stiffness_of(settings, signals, i, damping)
         gains[1, i] = damping
 
