@@ -82,6 +82,16 @@ def test_simulators_of_the_peers_run_the_same_arm():
         )
 
 
+def test_feedback_in_motors_is_compared_with_the_hosts(monkeypatch):
+    sizes = {'SECONDS': 0.2, 'PICK_UP': 0.1, 'SETTLED': 0.05, 'DEAD': 0.1}
+    motors = importlib.import_module('motor_feedback')
+    for name, value in {'ARMS': {'rigid': {}}, **sizes}.items():
+        monkeypatch.setattr(motors, name, value)
+    table = {first: cells for first, *cells in motors.rows(['lerobot', 'soft'])}
+    assert list(table) == ['lerobot, motor', 'soft, host', 'soft, motor']
+    assert all(len(cells) == 2 and 'stops' not in cells[0] for cells in table.values())
+
+
 def test_node_compared_with_null_node(monkeypatch):
     nodes = tiny(monkeypatch, 'nodes', _STEPS=20, _WARM_UP=2, _SETTLING=0.05)
     monkeypatch.setattr(nodes, '_ARMS', {'recommended': 'node'})
