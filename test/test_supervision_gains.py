@@ -431,7 +431,7 @@ def test_gains_follow_the_sample_time():
     assert (fast.surface.time_constant, slow.surface.time_constant) == (0.004, 0.005)
     planar = (arm_of('noisy', T) for T in (0.001, 0.005))
     settings = map(settings_of_config, (fast, slow, *planar))
-    intervals = [(each.row_interval, each.interval) for each in settings]
+    intervals = [(each.window.row_interval, each.window.interval) for each in settings]
     assert intervals == [(10, 50), (2, 10), (1, 10), (1, 2)]
 
 

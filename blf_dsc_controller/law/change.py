@@ -15,7 +15,7 @@ was not fitted to (`learning.detect_change`).
 
 from typing import Annotated, NamedTuple
 
-from blf_dsc_controller.compiled.jit import called, inner
+from blf_dsc_controller.compiled.jit import inner
 from blf_dsc_controller.compiled.layout import Array, Cell
 from blf_dsc_controller.law import excitation, innovation, window
 from blf_dsc_controller.law.innovation import Prior
@@ -138,7 +138,7 @@ def compare_with_rows(
     return False
 
 
-@called
+@inner
 def fit_rows(state: State, sliding: Window, prior: Prior, period: float) -> None:
     """Solve for theta of the rows so far, one each `period` [s], and of the prior."""
     a = innovation.row_variance(state.innovation, period)

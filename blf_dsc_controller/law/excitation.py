@@ -25,10 +25,11 @@ most strongly in weakly excited directions.  Likewise, a full window with an unu
 large residual is pulled to an earlier solution, kept once per window.
 """
 
+from math import inf
 from typing import Annotated, NamedTuple
 
 from blf_dsc_controller.arms.model import ArmModel
-from blf_dsc_controller.compiled.jit import called, inner
+from blf_dsc_controller.compiled.jit import inner
 from blf_dsc_controller.compiled.layout import Array, Cell
 from blf_dsc_controller.law import sums, window
 from blf_dsc_controller.law.innovation import Prior
@@ -149,7 +150,7 @@ def is_in_question(
     return bool(is_new and residual > _GATE * settings.residual_floor)
 
 
-@called
+@inner
 def part_residual(
     sliding: Window, prior: Prior, active: Array, part: Array, rows: int
 ) -> float:
@@ -168,7 +169,7 @@ def part_residual(
 def best_part_residual(
     sliding: Window, prior: Prior, active: Array, newer_rows: int
 ) -> float:
-    """Return the smaller residual of the two parts of a full window, each fitted apart.
+    """Return the smallest residual of the parts of a full window, each fitted apart.
 
     `sliding.work.newer` is the sum of its `newer_rows` newer rows.  Phi, b, the factor
     and the solution of the whole window are in its scratch again afterwards.
@@ -177,10 +178,15 @@ def best_part_residual(
     whole = sliding.state.running
     length = sliding.settings.length
     sums.add(whole, -1.0, work.newer, work.part)
-    older = part_residual(sliding, prior, active, work.part, length - newer_rows)
-    newer = part_residual(sliding, prior, active, work.newer, newer_rows)
-    part_residual(sliding, prior, active, whole, length)
-    return min(older, newer)
+    best = inf
+    for k in range(3):  # the older part, the newer one, and the whole window again
+        part, rows = work.part, length - newer_rows
+        if k == 1:
+            part, rows = work.newer, newer_rows
+        elif k == 2:
+            part, rows = whole, length
+        best = min(best, part_residual(sliding, prior, active, part, rows))
+    return best
 
 
 @inner
@@ -199,7 +205,6 @@ def split_window(
     newer = sliding.work.newer
     rows = window.newer_part(sliding.state, newer)
     best = best_part_residual(sliding, prior, state.active, rows)
-    best = min(residual, best)
     if residual <= _GATE * explained(settings, state.least_residual[0], best):
         return False
     state.split_residual[0] = residual

@@ -265,7 +265,7 @@ def fill_equations(
         )
 
 
-@called
+@inner
 def find_excitation(
     whole: Window, prior: Prior, active: Array, iterations: int
 ) -> float:
