@@ -12,6 +12,7 @@ import signal
 import socket
 import sys
 from collections.abc import Mapping
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +25,7 @@ from blf_dsc_controller.drive.beside import LinkLog
 from blf_dsc_controller.drive.driver import Driver
 from blf_dsc_controller.drive.drivers import driver_of
 from blf_dsc_controller.drive.loop import DriveLoop, End
+from blf_dsc_controller.drive.motor_feedback import as_in_motors
 from blf_dsc_controller.drive.script import Script
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.messages import script_link, topic_link
@@ -64,12 +66,13 @@ def _control(link: Link, log: LinkLog, wanted: Mapping[str, Any]) -> None:
     config = load(path, CONTROLLER, ControllerConfig, _HOLD | given)
     driver = driver_of(wanted['robot'], path, config, overrides)
     unmeasured = not_commissioned(config)
-    for warning in [*config_warnings(config), *([unmeasured] if unmeasured else [])]:
+    judged = as_in_motors(config) if driver.config.feedback == 'motor' else config
+    for warning in [*config_warnings(judged), *([unmeasured] if unmeasured else [])]:
         log.info(warning)
     record = Path(wanted['record']) if wanted['record'] else None
     with announced_compilation(lambda text: sys.stderr.write(f'{text}\n')):
         controller = ArmController(config, record=record, stamps='wall')
-    with controller:
+    with controller, closing(driver):
         for remark in driver.connect():
             log.info(remark)
         request_realtime(config.realtime, log.warning)
