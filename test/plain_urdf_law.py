@@ -12,6 +12,7 @@ from math import exp
 
 import numpy as np
 import pinocchio
+from symbols import by_symbol
 
 STRIBECK_VELOCITY = 0.1  # rad/s
 ENTRIES = ('m', 'm*cx', 'm*cy', 'm*cz', 'Ixx', 'Ixy', 'Iyy', 'Ixz', 'Iyz', 'Izz')
@@ -219,7 +220,7 @@ class PlainUrdfLaw:
     """The law (28) with learning, in the order of 'One sample, in order'."""
 
     def __init__(self, settings, arm):
-        g = self.gains = settings
+        g = self.gains = by_symbol(settings)
         n = g.n
         m = g.m
         self.arm = arm

@@ -14,8 +14,8 @@ _PARTS = {
     'surface': 'gain=K mu time_constant known_rate',
     'feedback': 'gain=Kp damping=d2 damping_rate follows_inertia decoupled',
     'disturbance': 'gain=gamma leakage=eta bumpless',
-    'torque': 'limit=torque_limit rate_limit',
-    'columns': 'bias viscous frequencies',
+    'torque': 'limit=torque_limit rate_limit drive',
+    'columns': 'bias viscous coulomb coulomb_velocity frequencies ripple_cycles',
     'row': 'prediction filter_pole=pole motion_scale lag omega row_weight',
     'window': 'length=window row_interval interval prior_weight regularization=rho',
     'excitation': (

@@ -73,7 +73,9 @@ def test_added_torque_is_the_gravity_of_the_urdf_and_of_the_payload_told():
     expected = pinocchio.computeGeneralizedGravity(model, model.createData(), q)[:7]
 
     settings = controller_of(config).settings
-    np.testing.assert_allclose(added_torque(settings, POSITION), expected, atol=1e-9)
+    np.testing.assert_allclose(
+        added_torque(settings.torque, POSITION), expected, atol=1e-9
+    )
 
 
 def test_command_is_the_whole_torque_without_what_the_drive_adds():
@@ -81,7 +83,7 @@ def test_command_is_the_whole_torque_without_what_the_drive_adds():
         controller_of(build(ControllerConfig, PANDA | given))
         for given in ({}, HELD | TOLD)
     ]
-    added = added_torque(laws[1].settings, POSITION)
+    added = added_torque(laws[1].settings.torque, POSITION)
     measurement = np.concatenate((POSITION, 0.01 * POSITION, np.zeros(7)))
     for law in laws:
         law.reference_vector = law.reference_vector.copy()
@@ -97,7 +99,7 @@ def test_learning_sees_the_whole_torque():
     measurement = np.concatenate((POSITION, np.zeros(14)))
     command = law.update(0.0, 1e-3, measurement).copy()
     law.update(1e-3, 1e-3, measurement)
-    whole = command + added_torque(law.settings, POSITION)
+    whole = command + added_torque(law.settings.torque, POSITION)
     np.testing.assert_allclose(law.signals.applied, whole, atol=1e-12)
 
 
@@ -105,7 +107,7 @@ def test_neither_the_command_nor_the_whole_torque_exceeds_the_limit():
     limit = [30.0, 5.0, 30.0, 30.0, 12.0, 12.0, 12.0]
     config = build(ControllerConfig, PANDA | HELD | {'torque.limit': limit})
     law = controller_of(config)
-    added = added_torque(law.settings, POSITION)
+    added = added_torque(law.settings.torque, POSITION)
     # so that the two limits contradict each other there
     assert np.any(np.abs(added) > limit)
     random = np.random.default_rng(0)
@@ -252,7 +254,7 @@ def test_slow_drift_of_commands_without_effect_shows_in_the_effort(drive, effort
         loop_of('panda_rigid').controller, given | {'reference.type': 'hold'}
     )
     q = np.array(loop_of('panda_rigid').plant.initial.position)
-    added = added_torque(controller_of(config).settings, q)
+    added = added_torque(controller_of(config).settings.torque, q)
     for follows in (True, False):
         guard = Guard(config)
         guard.activate()

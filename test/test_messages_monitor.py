@@ -13,7 +13,6 @@ from blf_dsc_controller.analysis.panels import panels
 from blf_dsc_controller.bags.reader import read_run
 from blf_dsc_controller.configuration.nodes import load_loop
 from blf_dsc_controller.law import barrier
-from blf_dsc_controller.law.barrier import virtual_control
 from blf_dsc_controller.law.factory import (
     controller_of,
     estimate_names,
@@ -24,6 +23,7 @@ from blf_dsc_controller.law.lyapunov import (
     exponential_bound,
     largest_inertia,
 )
+from blf_dsc_controller.law.surface import virtual_control
 from blf_dsc_controller.law.telemetry import ControllerTelemetry, rejected_columns
 from blf_dsc_controller.messages import topics
 from blf_dsc_controller.messages.codecs import JointStateDecoder
@@ -90,15 +90,17 @@ def test_bound_starts_at_the_latch_and_decays_to_theta_over_kappa_e():
 def test_virtual_control_loses_its_gain_past_the_knee():
     """K counts for 7 of its 150 1/s at 0.99 of the bound; the knee is at 0.78."""
     law = settings(LEAKY)
-    ratios = np.array([0.5, law.knee[0] / law.bound[0], 0.99])
-    shares = [gain_on_potential(law, ratio * law.bound[0]) for ratio in ratios]
+    bound = law.barrier.bound[0]
+    ratios = np.array([0.5, law.barrier.knee[0] / bound, 0.99])
+    shares = [gain_on_potential(law, ratio * bound) for ratio in ratios]
     assert shares == pytest.approx([150.0, 150.0, 7.1], rel=0.01)
 
 
 def gain_on_potential(law, xi1):
     """Rate [1/s] at which the part of beta2 with the gain K reduces V1 of joint1 at xi1 [rad]."""
-    joint = [part[0] for part in (law.bound, law.weight, law.slope_limit, law.knee)]
-    part = virtual_control(xi1, law.bound[0], law.K[0], 0.0, 0.0)
+    of = law.barrier
+    joint = [part[0] for part in (of.bound, of.weight, of.slope_limit, of.knee)]
+    part = virtual_control(xi1, of.bound[0], law.surface.gain[0], 0.0, 0.0)
     return -part * barrier.gradient(xi1, *joint) / barrier.potential(xi1, *joint)
 
 
