@@ -22,6 +22,7 @@ from blf_dsc_controller.law.factory import (
 from blf_dsc_controller.law.torque import added_torque
 from blf_dsc_controller.replay.verify import verify
 from blf_dsc_controller.simulation.loop import write_bag
+from blf_dsc_controller.supervision.braking import braking_matrix
 from blf_dsc_controller.supervision.first_torque import is_like
 from blf_dsc_controller.supervision.guard import Guard
 from blf_dsc_controller.supervision.last_state import LastState
@@ -133,9 +134,8 @@ def test_hold_gravity_commands_only_what_was_learned_beyond_the_model_of_the_dri
     np.testing.assert_allclose(at_rest, 0.0, atol=0.01)  # the estimate has four digits
     last.slow[:] = 0.1
     damped = safe_torque(config.safety, settings, last, estimate, np.zeros(7))
-    np.testing.assert_allclose(
-        damped, -0.1 * np.array(config.safety.damping), atol=0.01
-    )
+    braking = braking_matrix(settings, np.array(config.safety.damping), POSITION)
+    np.testing.assert_allclose(damped, -0.1 * braking.sum(axis=1), atol=0.01)
     last.slow[:] = 0.0
     mass = estimate_names(config).index('m*cx7')
     estimate[mass] += 0.3

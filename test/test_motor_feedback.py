@@ -83,7 +83,7 @@ def test_local_gains_are_what_a_lasting_deviation_changes(inside):
         law = blf.ArmController(config).guard.controller
         law.state.alpha2[:] = 0.0
         q = np.array(config.reference.offset) + inside * bound + deviation
-        law.settings.Gamma[:] = 0.0
+        law.settings.adaptation.adaptation_gain[:] = 0.0
         for k in range(200 if speed == 0.0 else 1):
             law.update(100.0 + k * SLOW, SLOW, np.concatenate((q, np.zeros(14))))
         saved = law.save()
