@@ -105,7 +105,7 @@ def test_every_number_is_reproduced(bag, tmp_path):
     ],
 )
 def test_other_laws_and_a_narrowing_bound_replay_from_compressed_bags(tmp_path, given):
-    result = verify(recorded_run.record(tmp_path / 'bag', 0.3, 'zstd', **given))
+    result = verify(str(recorded_run.record(tmp_path / 'bag', 0.3, 'zstd', **given)))
     assert (result.difference, result.remarks) == (None, ())
     assert EventType.PARAMETERS not in [item.type for item in result.events]
 

@@ -148,7 +148,7 @@ class Verification(NamedTuple):
 
 
 def verify(
-    path: Path, namespace: str = '', names: NameMap = NO_NAMES, law: str = ''
+    path: str | Path, namespace: str = '', names: NameMap = NO_NAMES, law: str = ''
 ) -> Verification:
     """Replay a bag and compare every number of the controller bit for bit.
 
@@ -163,6 +163,7 @@ def verify(
             controller, or cannot be read; or its law is a file and `law` does not name
             one.
     """
+    path = Path(path)
     content = read_content(path, namespace, names)
     events, until, other = _events(content)
     _check_format(path, events[0])
