@@ -15,6 +15,7 @@ from blf_dsc_controller.run import SLIDING, TURNING, JointUnits
 
 _SHOWN_CONTACTS = 3
 _OFTEN = 0.01  # of the samples
+_TITLE = 12  # characters
 _TABLE = {  # title: metric, unit, factor, decimals
     'max |xi1|': ('max_error', 'mrad', 1e3, 3),
     'rms xi1': ('rms_error', 'mrad', 1e3, 3),
@@ -27,7 +28,13 @@ _TABLE = {  # title: metric, unit, factor, decimals
 
 def format_table(metrics: Metrics) -> str:
     """Format metrics as a few lines for the terminal, without a newline at the end."""
-    rows = [['', *_TABLE]]
+    lines = (f'{title:{_TITLE}}{text}' for title, text in sentences(metrics))
+    return '\n'.join([aligned(rows(metrics)), '', *lines])
+
+
+def rows(metrics: Metrics) -> list[list[str]]:
+    """Return the table of the joints, with its heading."""
+    found = [['', *_TABLE]]
     for i, joint in enumerate(metrics.joints):
         units = _units(metrics, joint)
         values = ((getattr(metrics, name)[i], *form) for name, *form in _TABLE.values())
@@ -37,14 +44,14 @@ def format_table(metrics: Metrics) -> str:
             else '-'
             for value, unit, factor, decimals in values
         )
-        rows.append([joint, *cells])
-    return '\n'.join([aligned(rows), '', *_sentences(metrics)])
+        found.append([joint, *cells])
+    return found
 
 
-def _sentences(of: Metrics) -> Iterator[str]:
-    """Yield a line for each of what was measured, beginning with its title."""
-    yield f'run         {of.duration:.3f} s, {of.samples} samples'
-    yield f'bound       {_bound_text(of)}'
+def sentences(of: Metrics) -> Iterator[tuple[str, str]]:
+    """Yield a title and a sentence for each of what was measured."""
+    yield 'run', f'{of.duration:.3f} s, {of.samples} samples'
+    yield 'bound', _bound_text(of)
     bounds = zip(of.joints, of.widest_bound, of.bound, strict=True)
     wider = [
         f'{joint} {1e3 * widest:.3g} {_units(of, joint).of("mrad")}'
@@ -52,19 +59,22 @@ def _sentences(of: Metrics) -> Iterator[str]:
         if widest > bound
     ]
     if wider:
-        yield f'at widest   {", ".join(wider)}'
+        yield 'at widest', ', '.join(wider)
     if of.tool is not None:
-        yield f'tool        {tool_text(of.tool)}'
+        yield 'tool', tool_text(of.tool)
     for stop in of.stops:
-        yield f'stopped     at {stop["time"]:.3f} s, {stop["reason"]}: {stop["text"]}'
+        yield 'stopped', f'at {stop["time"]:.3f} s, {stop["reason"]}: {stop["text"]}'
     if of.contacts is not None:
-        yield f'contacts    {contacts_text(of.contacts)}'
+        yield 'contacts', contacts_text(of.contacts)
     if of.estimate is not None:
         yield from _learning_lines(of)
     for load in of.loads:
-        yield f'held        {load_text([load[name] for name in LOAD])}, until {load["until"]:.1f} s'
+        yield (
+            'held',
+            f'{load_text([load[name] for name in LOAD])}, until {load["until"]:.1f} s',
+        )
     if of.timing is not None:
-        yield f'real time   {_timing_text(of.timing, of.samples)}'
+        yield 'real time', _timing_text(of.timing, of.samples)
 
 
 def _units(of: Metrics, joint: str) -> JointUnits:
@@ -124,7 +134,7 @@ def contacts_text(contacts: Sequence[Mapping[str, Any]]) -> str:
     return f'{len(contacts)}: {"; ".join(shown)}'
 
 
-def _learning_lines(of: Metrics) -> Iterator[str]:
+def _learning_lines(of: Metrics) -> Iterator[tuple[str, str]]:
     """Yield what was learned, and how well where the truth is known."""
     if not of.learns:
         begun = 'not used by this law'
@@ -132,18 +142,21 @@ def _learning_lines(of: Metrics) -> Iterator[str]:
         begun = 'never began'
     else:
         begun = f'began at {of.latch_time:.3f} s'
-    yield f'learning    {begun}'
+    yield 'learning', begun
     if of.model_changes:
         times = ', '.join(f'{t:.3f} s' for t in of.model_changes)
-        yield f'arm         changed at {times}: learning restarted'
+        yield 'arm', f'changed at {times}: learning restarted'
     if of.rejected_columns:
         columns = ', '.join(of.rejected_columns)
-        yield f'rejected    {columns}: this motion cannot distinguish them from the other columns'
+        yield (
+            'rejected',
+            f'{columns}: this motion cannot distinguish them from the other columns',
+        )
     if math.isnan(of.final_parameter_error):
         return
-    what = 'parameters  error'
+    title, what = 'parameters', 'error'
     if of.of_torques:
-        what = 'model       torque error of the learned model'
+        title, what = 'model', 'torque error of the learned model'
     shown = [
         f'{t} s {100 * error:.3g} %'
         for t, error in of.parameter_error.items()
@@ -154,4 +167,4 @@ def _learning_lines(of: Metrics) -> Iterator[str]:
     ending = 'not below 1 %'
     if not math.isnan(settled):
         ending = f'below 1 % from {settled:.3f} s on'
-    yield f'{what} {", ".join(shown)}; {ending}'
+    yield title, f'{what} {", ".join(shown)}; {ending}'

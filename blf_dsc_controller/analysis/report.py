@@ -20,8 +20,9 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 
 from blf_dsc_controller.analysis.event_times import change_times, latch_time, outside
 from blf_dsc_controller.analysis.metrics import measure
-from blf_dsc_controller.analysis.metrics_table import format_table
+from blf_dsc_controller.analysis.metrics_table import rows, sentences
 from blf_dsc_controller.analysis.panels import COLOURS, INK, PIECES, Panel, panels
+from blf_dsc_controller.analysis.verdict import figures_of, verdict_of
 from blf_dsc_controller.bags.content import NO_NAMES, Content, NameMap, read_content
 from blf_dsc_controller.bags.reader import recorded_run
 from blf_dsc_controller.extras import import_extra
@@ -172,10 +173,14 @@ def write_report(bags: Sequence[ReportedBag], path: Path) -> None:
     """Write the page of some bags; raises MissingExtraError without plotly."""
     plotly = import_extra('plotly.offline', 'report', 'the page')
     events = sorted(
-        (time, k, kind, text)
-        for k, bag in enumerate(bags)
-        for time, kind, text in bag.events
+        (
+            (time, k, kind, text)
+            for k, bag in enumerate(bags)
+            for time, kind, text in bag.events
+        ),
+        key=itemgetter(0, 1),  # those of one time as they are told
     )
+    measured = [measure(bag.run) for bag in bags]
     parameters = []  # name, value in each bag, and whether these differ
     for name in dict.fromkeys(name for bag in bags for name in bag.parameters):
         values = [bag.parameters.get(name, 'not recorded') for bag in bags]
@@ -186,7 +191,10 @@ def write_report(bags: Sequence[ReportedBag], path: Path) -> None:
         ' and '.join(bag.name for bag in bags),
         names=[bag.name for bag in bags],
         versions=sorted({bag.content.version or 'unknown' for bag in bags}),
-        summaries=[format_table(measure(bag.run)) for bag in bags],
+        summaries=[
+            (verdict_of(each), figures_of(each), rows(each), list(sentences(each)))
+            for each in measured
+        ],
         data={
             'panels': plots(panels([bag.run for bag in bags]), bags),
             'seconds': max(bag.run.duration for bag in bags),
