@@ -449,6 +449,8 @@ WRONG_TEXTS = (  # what is replaced, by what, and the remedy
     (LINK8, '<link name="${name}_link8" />', 'xacro FILE > robot.urdf'),
     (LINK8, '<xacro:hand />', 'xacro FILE > robot.urdf'),
     (PANDA_TEXT, 'l1: 1.0', 'not a URDF, as it is not valid XML'),
+    (PANDA_TEXT, PANDA_TEXT[:9000], '</robot>: if it was cut off, copy it again'),
+    (LINK8, '<xacro:if></robot>', 'this looks like xacro, expand it first'),
     (PANDA_TEXT, '<sdf />', 'is <robot>, not <sdf>'),
     (AXIS, f'<mimic joint="j" />{AXIS}', "'panda_joint1' mimics"),
     (
@@ -484,6 +486,8 @@ WRONG_TEXTS = (  # what is replaced, by what, and the remedy
 WRONG_CHAINS = (
     ({'tip': 'tool'}, "no link 'tool' for the tip: the links are panda_link0, "),
     ({'base': 'world'}, "no link 'world' for the base"),
+    ({'tip': 'panda_joint7'}, "is a joint, and the tip is a link: give 'panda_link7'"),
+    ({'base': 'panda_joint1'}, "and the base is a link: give 'panda_link0'"),
     (
         {'base': 'panda_leftfinger', 'tip': 'panda_rightfinger'},
         "ends at 'panda_link0' without rea",

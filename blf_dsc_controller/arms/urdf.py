@@ -227,6 +227,12 @@ class Tree(NamedTuple):
         """Return the joints from a link to another."""
         for role, link in (('base', base), ('tip', tip)):
             if link not in self.links:
+                joint = self.joints.get(link)
+                if joint is not None:
+                    raise BlfDscError(
+                        f'{link!r} is a joint, and the {role} is a link: give '
+                        f'{_link(joint, "child" if role == "tip" else "parent")!r}'
+                    )
                 raise BlfDscError(
                     f'no link {link!r} for the {role}: the links are {_listed(self.links)}'
                 )
@@ -298,7 +304,11 @@ def _robot(text: str) -> ET.Element:
     try:
         robot = parse_xml(text)
     except XmlError as error:
-        hint = f'; this looks like xacro, {expand}' if 'xacro:' in text else ''
+        hint = ''
+        if not text.rstrip().endswith('</robot>'):
+            hint = '; it does not end with </robot>: if it was cut off, copy it again'
+        elif '<xacro:' in text:
+            hint = f'; this looks like xacro, {expand}'
         raise BlfDscError(
             f'not a URDF, as it is not valid XML: {error}{hint}'
         ) from error
