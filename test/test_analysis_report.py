@@ -31,6 +31,7 @@ from blf_dsc_controller.messages.codecs import typestore
 from blf_dsc_controller.messages.journal import Event, EventType
 from blf_dsc_controller.messages.topics import (
     CHANGES,
+    DIAGNOSTICS,
     JOINT_STATES,
     JOURNAL,
     MONITOR,
@@ -256,6 +257,39 @@ def test_events_list_violation_latch_saturation_and_plant_change(folder):
         ('saturation', 3.996): 'elbow at its torque limit for 4 samples',
         ('plant', 2.5): 'load.torque: [1.0, 0.0]',
     }
+
+
+def diagnosed(at, level, message):
+    """Return a message of diagnostics `at` [ns]."""
+    types = typestore().types
+    status = types['diagnostic_msgs/msg/DiagnosticStatus'](
+        level=level, name='state', message=message, hardware_id='', values=[]
+    )
+    stamp = types['builtin_interfaces/msg/Time'](sec=0, nanosec=0)
+    header = types['std_msgs/msg/Header'](stamp=stamp, frame_id='')
+    array = types[DIAGNOSTICS.type](header=header, status=[status])
+    raw = typestore().serialize_cdr(array, DIAGNOSTICS.type)
+    return DIAGNOSTICS, at, bytes(raw)
+
+
+def test_waiting_before_the_first_sample_is_no_event_but_an_error_is(tmp_path):
+    before, after = START - 1_000_000, START + 500_000_000
+    messages = [
+        diagnosed(before, 1, 'waiting for a joint state'),
+        diagnosed(before, 2, 'start rejected'),
+        *Synthetic(1000).messages(),
+        diagnosed(after, 1, 'half of the states are late'),
+    ]
+    bag = read_bag(recorded_run.write_made(tmp_path / 'bag', messages))
+    told = [
+        (round(t, 2), kind, text)
+        for t, kind, text in bag.events
+        if kind in ('WARN', 'ERROR')
+    ]
+    assert told == [
+        (0.0, 'ERROR', 'state: start rejected'),
+        (0.5, 'WARN', 'state: half of the states are late'),
+    ]
 
 
 def test_several_bags_are_overlaid_and_their_parameter_differences_listed(

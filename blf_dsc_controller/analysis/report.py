@@ -139,7 +139,10 @@ def _intervals(
 
 
 def _diagnosed(content: Content, run: Run) -> Iterator[TimedEvent]:
-    """Yield each change of a level or message, at the time of the last sample."""
+    """Yield each change of a level or message, at the time of the last sample.
+
+    Of those before the first one only errors count: every run waits before it begins.
+    """
     shown: dict[str, tuple[int, str]] = {}
     messages = content.topics.get(DIAGNOSTICS)
     for received, raw in messages.raw() if messages else ():
@@ -148,9 +151,9 @@ def _diagnosed(content: Content, run: Run) -> Iterator[TimedEvent]:
         time = float(run.time[max(k, 0)])
         for status in message.status:
             now = (int(status.level), str(status.message))
-            if shown.get(status.name) != now:
+            level = LEVELS[min(now[0], len(LEVELS) - 1)]
+            if shown.get(status.name) != now and (k >= 0 or level == 'ERROR'):
                 shown[status.name] = now
-                level = LEVELS[min(now[0], len(LEVELS) - 1)]
                 yield (time, level, f'{status.name}: {now[1]}')
 
 
