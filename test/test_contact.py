@@ -20,14 +20,21 @@ from blf_dsc_controller.configuration.schema import build
 from blf_dsc_controller.control.arm_controller import ArmController
 from blf_dsc_controller.errors import ConfigurationError
 from blf_dsc_controller.law.external_torque import absorb
+from blf_dsc_controller.law.factory import controller_of
 from blf_dsc_controller.law.perception import CONTACT
 from blf_dsc_controller.law.telemetry import sample_columns
 from blf_dsc_controller.law.tip_wrench import TipWrench
 from blf_dsc_controller.messages import topics
-from blf_dsc_controller.messages.journal import EventType
+from blf_dsc_controller.messages.journal import EventType, Journal
 from blf_dsc_controller.reference.retargeting import Target, TrajectoryError
 from blf_dsc_controller.replay.verify import verify
-from blf_dsc_controller.simulation.loop import START, simulate, write_bag
+from blf_dsc_controller.simulation.loop import (
+    START,
+    new_record,
+    run_alone,
+    simulate,
+    write_bag,
+)
 from blf_dsc_controller.supervision.guard import Guard
 from blf_dsc_controller.supervision.supervisor import Phase, Reason
 from sim_plant.plant import plant_of
@@ -84,6 +91,18 @@ def free():
 def held():
     """A push that makes the arm hold."""
     return run_of(pushed(PUSH), **{'contact.reaction': 'hold'})
+
+
+def test_run_of_a_study_reacts_to_a_contact_though_nobody_observes_it():
+    """The external torque is found where a reaction needs it, also if it is not recorded."""
+    config = loop_of(pushed(PUSH), **{'contact.reaction': 'hold'})
+    estimates = []
+    for observed in (True, False):
+        controller = controller_of(config.controller)
+        record = new_record(controller, config.controller, config.plant, Journal())
+        run_alone(record, plant_of(config.plant), observed=observed)
+        estimates.append(columns(record)[0].estimate)
+    np.testing.assert_array_equal(*estimates)
 
 
 def test_interval_covers_what_model_and_noise_leave(free):
