@@ -44,6 +44,10 @@ CONTROLLER = '/blf_dsc_controller'
 LOAD = {'events.begin': [0.0], 'events.duration': [1e6], 'events.payload': [2.0]}
 PATIENT = {'safety.state_timeout': 10.0, 'safety.overrun_fraction': 1.0}
 REPORTED = 'hang_controller'
+# ends with the process that started it
+BUSY = (
+    'import os; os.nice(10); parent = os.getppid()\nwhile os.getppid() == parent: pass'
+)
 SLACK = 0.2  # rad/s beyond what the reference asks: a load and links that nobody knows
 MOVING = 0.1  # rad/s, beyond which an episode begins
 
@@ -205,12 +209,7 @@ if __name__ == '__main__':
     options.add_argument('--busy', type=int, default=0, help='busy processes beside')
     options.add_argument('--seed', type=int, default=0)
     given = options.parse_args()
-    busy = [
-        subprocess.Popen(
-            [sys.executable, '-c', 'import os; os.nice(10)\nwhile True: pass']
-        )
-        for _ in range(given.busy)
-    ]
+    busy = [subprocess.Popen([sys.executable, '-c', BUSY]) for _ in range(given.busy)]
     try:
         faster = Counter()
         for preset in ('fr3', 'ur5e_driver'):
