@@ -449,7 +449,7 @@ WRONG_TEXTS = (  # what is replaced, by what, and the remedy
     (LINK8, '<link name="${name}_link8" />', 'xacro FILE > robot.urdf'),
     (LINK8, '<xacro:hand />', 'xacro FILE > robot.urdf'),
     (PANDA_TEXT, 'l1: 1.0', 'not a URDF, as it is not valid XML'),
-    (PANDA_TEXT, PANDA_TEXT[:9000], '</robot>: if it was cut off, copy it again'),
+    (PANDA_TEXT, PANDA_TEXT[:6000], '</robot>: if it was cut off, copy it again'),
     (LINK8, '<xacro:if></robot>', 'this looks like xacro, expand it first'),
     (PANDA_TEXT, '<sdf />', 'is <robot>, not <sdf>'),
     (AXIS, f'<mimic joint="j" />{AXIS}', "'panda_joint1' mimics"),
