@@ -8,11 +8,12 @@ from __future__ import annotations
 
 import resource
 import subprocess
-from collections import Counter
+from collections import Counter, defaultdict
 from contextlib import contextmanager, suppress
 
 import numpy as np
 import pytest
+from mcap.reader import make_reader
 from mcap.stream_reader import StreamReader
 from rosbags.rosbag2 import Reader
 
@@ -100,6 +101,17 @@ def read(path):
     """Return all messages of a bag as (topic, time, bytes)."""
     with Reader(path) as reader:
         return [(c.topic, at, bytes(raw)) for c, at, raw in reader.messages()]
+
+
+def messages_of(folder):
+    """Return the serialised messages of each topic of a bag, as mcap reads them."""
+    found = defaultdict(list)
+    with next(folder.glob('*.mcap')).open('rb') as file:
+        for _, channel, message in make_reader(file).iter_messages(
+            log_time_order=False
+        ):
+            found[channel.topic].append(message.data)
+    return found
 
 
 def raw_records(data):

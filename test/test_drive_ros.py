@@ -11,16 +11,15 @@ import os
 import signal
 import socket
 import time
-from collections import defaultdict
 
 import numpy as np
 import pytest
 
 pytest.importorskip('rclpy', reason='needs ROS 2')
 
-from mcap.reader import make_reader
 from plant_driver import PlantDriver
 from rclpy.duration import Duration
+from recorded_run import messages_of
 from ros_rig import JOINTS, PATIENCE
 from std_srvs.srv import Trigger
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
@@ -84,17 +83,6 @@ def beside(ros, monkeypatch):
     return run
 
 
-def recorded(folder):
-    """Return the serialised messages of each topic of a bag."""
-    found = defaultdict(list)
-    with next(folder.glob('*.mcap')).open('rb') as file:
-        for _, channel, message in make_reader(file).iter_messages(
-            log_time_order=False
-        ):
-            found[channel.topic].append(message.data)
-    return found
-
-
 def waypoint(positions):
     """Return a trajectory of one point, a second ahead."""
     point = JointTrajectoryPoint(positions=positions)
@@ -136,7 +124,7 @@ def test_topics_are_those_of_the_bag_and_motions_are_followed(ros, beside, tmp_p
     assert (outcome.end, after.problem) == (End.REQUESTED, '')
     assert did['stop'].result().success
     assert 'braking for' in did['stop'].result().message
-    bag = recorded(tmp_path / 'bag')
+    bag = messages_of(tmp_path / 'bag')
     ros.until(
         lambda: all(
             len(raws) >= len(bag[topic.resolved]) for topic, raws in received.items()

@@ -12,12 +12,11 @@ import signal
 import subprocess
 import sys
 import time
-from collections import defaultdict
 
 import numpy as np
 import pytest
 from command import COMPILED, wait_for
-from mcap.reader import make_reader
+from recorded_run import messages_of
 
 import blf_dsc_controller as blf
 from blf_dsc_controller.cli.main import main
@@ -46,17 +45,6 @@ def drive(record=None, **given):
 def arm():
     with drive() as found:
         yield found
-
-
-def recorded(folder):
-    """Serialised messages of each topic of a bag."""
-    found = defaultdict(list)
-    with next(folder.glob('*.mcap')).open('rb') as file:
-        for _, channel, message in make_reader(file).iter_messages(
-            log_time_order=False
-        ):
-            found[channel.topic].append(message.data)
-    return found
 
 
 def rests(arm):
@@ -108,7 +96,7 @@ def test_motions_arrive_and_the_bag_replays_bit_equal(tmp_path):
         assert (np.abs(arm.state.error) < arm.state.bound).all()
     assert arm.ended == 'ended on request'
     assert blf.verify(tmp_path / 'bag').difference is None
-    sent = recorded(tmp_path / 'bag')[TARGETS.resolved]
+    sent = messages_of(tmp_path / 'bag')[TARGETS.resolved]
     kinds = [decode(raw).type for raw in sent]
     assert kinds.count(EventType.TRAJECTORY) == 2
     assert kinds.count(EventType.TARGET) > 2  # the latest wins while one is planned

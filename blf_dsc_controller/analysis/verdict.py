@@ -74,9 +74,8 @@ def _error(of: Metrics) -> Figure:
 
 
 def _load(of: Metrics) -> Figure:
-    known = [
-        load for load in of.loads if load[_MASS] > load[_SPREAD]
-    ]  # not where it is NaN
+    # also not where they are NaN
+    known = [load for load in of.loads if load[_MASS] > load[_SPREAD]]
     if not known:
         return Figure('load', 'none', 'was weighed')
     heaviest = max(known, key=lambda load: load[_MASS])

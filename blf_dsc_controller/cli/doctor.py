@@ -31,6 +31,8 @@ _NEEDED = ('numpy', 'scipy', 'numba', 'mcap', 'rosbags', 'matplotlib')
 _EXTRAS = {
     'ruckig': ('streams', 'streams of positions'),
     'pylibfranka': ('franka', 'blf_dsc drive with an FR3'),
+    'python-can': ('damiao', 'blf_dsc drive with Damiao motors'),
+    'pin-pink': ('pose', 'poses of the tip as targets'),
     'mujoco': ('mujoco', 'MJCF and physics: mujoco'),
     'viser': ('view', 'the live view'),
     'plotly': ('report', 'blf_dsc report'),
@@ -41,7 +43,7 @@ _EXTRAS = {
 _WIDTH = 100
 _INDENT = 20
 _PINGS = 200
-_SLOW = 0.3  # ms, on a cable without a switch; libfranka asks for less than 1 ms with both ways
+_SLOW = 0.3  # ms: more leaves too little of a sample of 1 ms to the law and the robot
 
 
 def doctor(options: Namespace) -> int:

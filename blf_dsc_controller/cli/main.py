@@ -582,7 +582,10 @@ def _add_doctor(command: _Command) -> None:
     option(
         '--config', help='parameter file or preset, to hear what is said at its start'
     )
-    option('--robot', help='address of a robot, to ask how fast it answers (ping)')
+    option(
+        '--robot',
+        help='IP address or name of a robot, to ask how fast it answers (ping)',
+    )
 
 
 def _positive(text: str) -> int:

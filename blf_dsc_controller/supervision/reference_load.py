@@ -29,9 +29,8 @@ class ReferenceLoad(NamedTuple):
 
     def rate(self, settings: Settings) -> float:
         """Return the largest eigenvalue of M^-1 K_p + omega_v, 1/s."""
-        Kp = np.diag(settings.feedback.gain)[
-            np.newaxis
-        ]  # numpy 1 reads a lone matrix as vectors
+        # numpy 1 reads a lone matrix as vectors
+        Kp = np.diag(settings.feedback.gain)[np.newaxis]
         roots = np.linalg.eigvals(np.linalg.solve(self.inertia, Kp))
         return float(np.abs(roots).max(initial=0.0)) + settings.feedback.damping_rate
 
