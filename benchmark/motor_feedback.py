@@ -14,8 +14,8 @@ found [kg]; and how far the arm moves in 2 s [rad] once the host is dead.  The l
 
     lerobot      LeRobot's gains for OpenArm in the motors, over the gravity of the
                  description: position and torque, no velocity
-    preset       the gains of the preset, through the inertia matrix
-    soft         LeRobot's gains as those of the joints
+    whole        the gains of rigid gears, through the inertia matrix
+    preset       LeRobot's gains as those of the joints
     stiff        twice of them
 
 by torques alone (host), or inside the motors' PD (motor).
@@ -51,27 +51,29 @@ DAMPING = np.array([5.0, 5.0, 3.0, 5.0, 0.3, 0.3, 0.3])
 GEARS = [4000.0, 4000.0, 2000.0, 2000.0, 800.0, 800.0, 800.0]  # N m/rad
 
 _Changes = Mapping[str, object]
-_JOINTS: _Changes = {
-    'barrier.bound': [0.02] * 7,  # rad: with these gains a load leaves the preset's
-    'feedback.inertia': 'none',
-    'feedback.joint_stiffness': STIFFNESS.tolist(),
-    'feedback.joint_damping': DAMPING.tolist(),
-}
 LAWS: Mapping[str, _Changes] = {
     'lerobot': {  # whose errors and torques are no fault
         'robot.effort': 'unknown',
         'safety.saturation_time': 1e3,
-        **_JOINTS,
         'barrier.bound': [0.3] * 7,
         'barrier.initial_bound': [0.0] * 7,
     },
+    'whole': {
+        'feedback.inertia': 'whole',
+        'feedback.joint_stiffness': None,
+        'feedback.joint_damping': None,
+        'barrier.bound': [0.01] * 7,  # rad
+    },
     'preset': {},
-    'soft': _JOINTS,
-    'stiff': {**_JOINTS, 'feedback.stiffness': 2.0},
+    'stiff': {'feedback.stiffness': 2.0},
 }
 ARMS: Mapping[str, _Changes] = {
-    'rigid': {},
-    'elastic': {'joint.stiffness': GEARS, 'sensor.side': 'motor'},
+    'rigid': {
+        'joint.stiffness': None,
+        'joint.backlash': None,
+        'sensor.side': 'link',
+    },
+    'elastic': {'joint.stiffness': GEARS, 'joint.backlash': None},
 }
 
 
@@ -165,7 +167,7 @@ def rows(laws: Collection[str]) -> Iterator[tuple[str, ...]]:
     """Yield a row for each law."""
     cases = [
         ('lerobot', 'motor'),
-        *product(('preset', 'soft', 'stiff'), ('host', 'motor')),
+        *product(('whole', 'preset', 'stiff'), ('host', 'motor')),
     ]
     for law, feedback in cases:
         if law not in laws:

@@ -21,28 +21,39 @@ RANGES = Ranges(
     Field(0.0, 5.0, 12),
     Field(-TORQUE, TORQUE, 12),
 )
+# feedback through the inertia matrix, which only rigid gears bear
+WHOLE = {
+    'feedback.inertia': 'whole',
+    'feedback.joint_stiffness': None,
+    'feedback.joint_damping': None,
+    'barrier.bound': [0.01] * 7,
+}
+RIGID = {'joint.stiffness': None, 'joint.backlash': None, 'sensor.side': 'link'}
 # LeRobot's for OpenArm (config_openarm_follower.py, 27de2ca)
 LEROBOT = {
-    'feedback.inertia': 'none',
     'feedback.joint_stiffness': [240.0, 240.0, 240.0, 240.0, 24.0, 31.0, 25.0],
     'feedback.joint_damping': [5.0, 5.0, 3.0, 5.0, 0.3, 0.3, 0.3],
 }
 # planetary gears, of which nothing is published: soft enough for 0.2 to 0.7 mrad/(N m)
 ELASTIC = {
     'joint.stiffness': [4000.0, 4000.0, 2000.0, 2000.0, 800.0, 800.0, 800.0],
+    'joint.backlash': None,
     'sensor.side': 'motor',
 }
 
 
 def loop_of(period, law=None, plant=None):
-    """Configurations of both at a sample time [s], with 14 bits of the motors' encoders."""
+    """Configurations of both at a sample time [s], with 14 bits of the motors' encoders.
+
+    Without others, gears are rigid, and the feedback acts through the inertia matrix.
+    """
     given = {'sample_time': period}
     encoders = {'sensor.resolution': 4.3e-5}
     return load_loop(
         'openarm',
         {
-            'blf_dsc_controller': given | (law or {}),
-            'sim_plant': given | encoders | (plant or {}),
+            'blf_dsc_controller': given | (law or WHOLE),
+            'sim_plant': given | encoders | RIGID | (plant or {}),
         },
     )
 

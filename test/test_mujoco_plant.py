@@ -224,8 +224,8 @@ def test_closed_loop_runs_the_same_with_both_plants():
     [
         ('panda_rigid', 0.2, 2.3),
         ('ur5e_rigid', 0.55, 1.6),
-        ('openarm', 0.47, 0.95),
-        ('widowx', 0.45, 6.2),
+        ('openarm', 0.36, 5.3),
+        ('widowx', 1.4, 23.3),
     ],
 )
 def test_errors_with_dry_friction_are_as_documented(name, settled, peak):

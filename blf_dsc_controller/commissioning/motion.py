@@ -61,6 +61,7 @@ class Excitation(NamedTuple):
     phase: Floats  # (n, K + 2) rad
     travel: float  # m, of the tool from its middle
     speed: Floats  # (n,) rad/s, the largest
+    acceleration: Floats  # (n,) rad/s^2, which none exceeds
 
     @property
     def frequencies(self) -> Floats:
@@ -159,13 +160,15 @@ def excitation(
             break
         shrunk = slice(1, 2) if factors[1] > _LEAST_SWING else slice(None)
         factors[shrunk] /= max(min(excess, 2.0), 1.05)
-    return Excitation(period, bins, slow, amplitude, phase, far, speed)
+    acceleration = (amplitude * shape.rates**2).sum(axis=1)
+    return Excitation(period, bins, slow, amplitude, phase, far, speed, acceleration)
 
 
 class _Shape:
     """Motions of given lines (n, K), by their amplitudes."""
 
     def __init__(self, bins: Ints, period: float) -> None:
+        self.rates = 2.0 * np.pi / period * bins  # rad/s
         self._bins = bins
         self._period = period
         random = np.random.default_rng(_SEED)
@@ -187,15 +190,18 @@ def shaken(
 ) -> dict[str, object]:
     """Return the parameters that hold an arm by its own gains and shake it.
 
-    It learns nothing, so that it is the same at the end as at the beginning.
+    It learns nothing, so that it is the same at the end as at the beginning.  Torques bound
+    the motion, not accelerations: fast tones have high ones that hardly move a light wrist.
     """
     count = len(config.learning.initial_estimate)
+    limit = np.maximum(config.limits.acceleration, excitation.acceleration)
     return (
         watched(config)
         | excitation.reference(posture)
         | {
             'learning.weight': 0.0,
             'learning.adaptation_gain': [0.0] * count,
+            'limits.acceleration': _listed(limit),
             'safety.oscillation': 'warn',  # with softer gains another arm would be measured
         }
     )
