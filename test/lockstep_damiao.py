@@ -11,6 +11,7 @@ import threading
 from typing import ClassVar
 
 import can
+from motor_arm import RIGID
 
 from blf_dsc_controller.configuration.nodes import load_loop
 from blf_dsc_controller.drive.damiao import DamiaoDriver
@@ -55,7 +56,8 @@ class LockstepDriver(DamiaoDriver):
         channel = self.address.partition(':')[2]
         self.bus = can.Bus(interface='virtual', channel=channel)
         period = {'sample_time': self.controller.sample_time}
-        loop = load_loop('openarm', {'blf_dsc_controller': period, 'sim_plant': period})
+        given = {'blf_dsc_controller': period, 'sim_plant': period | RIGID}
+        loop = load_loop('openarm', given)
         self.motors = DamiaoArm(self.bus, loop.plant, LIMITS, rate=2000.0)
         if type(self).arrange is not None:
             type(self).arrange(self.motors)
