@@ -32,9 +32,8 @@ from harness import print_table
 from blf_dsc_controller.commissioning import simulated
 from blf_dsc_controller.commissioning.commissioning import (
     commissioned,
-    plan,
-    postures_of,
 )
+from blf_dsc_controller.commissioning.own_loop import Commissioning
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.nodes import LoopConfig, RecorderConfig
 from blf_dsc_controller.configuration.plant import PlantConfig
@@ -116,8 +115,8 @@ def outcome(name: str, number: int) -> Outcome:
     plant = plant_with(study, draw(study, number))
     loop = LoopConfig(plant, study.controller, RecorderConfig())
     try:
-        planned = plan(study.controller, postures_of(study.controller))
-        runs = [run for _, run in simulated.runs_of(planned, loop)]
+        measuring = Commissioning(study.controller)
+        runs = [run for _, run in simulated.runs_of(measuring, loop)]
         measured = [run for run in runs if not isinstance(run, BlfDscError)]
         found = commissioned(study.controller, measured, MARGIN)
     except BlfDscError as error:

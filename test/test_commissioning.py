@@ -28,6 +28,7 @@ from blf_dsc_controller.commissioning.commissioning import commissioned, plan
 from blf_dsc_controller.commissioning.motion import excitation, lines_in
 from blf_dsc_controller.commissioning.page import sentences
 from blf_dsc_controller.commissioning.response import response_of
+from blf_dsc_controller.commissioning.strength import MOST, strength
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.files import share_folder
 from blf_dsc_controller.configuration.nodes import load_loop, read
@@ -395,3 +396,61 @@ def test_bags_of_the_written_motions_commission_as_the_simulated_arm(tmp_path, c
     )
     assert main([*common, '--out', str(by_arm)]) == 1  # exists
     assert 'exists already' in capsys.readouterr().err
+
+
+def test_a_posture_that_noise_hides_is_measured_again_with_more_torque():
+    """Encoders of 0.05 mrad, whose velocities are differences."""
+    commissioning = blf.Commissioning(CONFIG, [POSTURE], torque=0.01, travel=0.05)
+    (weak,) = commissioning.motions
+    clear = simulated.measured(weak, ARM)
+    assert strength(*clear) == 1.0
+    assert commissioning.stronger(weak, clear[0]) is None
+    run = simulated.measured(weak, coarse(5e-5))
+    factor = strength(*run)
+    assert 2.0 < factor < MOST
+    again = commissioning.stronger(weak, run[0])
+    shares = again.excitation.amplitude / weak.excitation.amplitude
+    np.testing.assert_allclose(shares[:, :-2], factor, rtol=1e-9)
+    assert strength(*simulated.measured(again, coarse(5e-5))) == 1.0
+
+
+def coarse(resolution):
+    """Return the arm with encoders of a resolution [rad], whose velocities are differences."""
+    return change(
+        ARM, {'sensor.resolution': resolution, 'sensor.velocity': 'differenced'}
+    )
+
+
+def test_the_second_motion_shows_a_margin_that_noise_had_hidden():
+    commissioning = blf.Commissioning(CONFIG, [POSTURE], torque=0.01, travel=0.05)
+    (weak,) = commissioning.motions
+    runs = [simulated.measured(weak, coarse(4e-4))]
+    runs.append(
+        simulated.measured(commissioning.stronger(weak, runs[0][0]), coarse(4e-4))
+    )
+    found = [commissioning.result([each]) for each in runs]
+    assert [each.has_margin for each in found] == [False, True]
+
+
+def test_a_posture_is_measured_twice_at_most_and_motion_that_is_hidden_is_an_error():
+    commissioning = blf.Commissioning(CONFIG, [POSTURE], torque=0.01, travel=1e-5)
+    (weak,) = commissioning.motions
+    hidden = simulated.measured(weak, coarse(1e-4))
+    assert strength(*hidden) == MOST
+    again = commissioning.stronger(weak, hidden[0])
+    assert again.excitation.travel <= 1e-5
+    still = simulated.measured(again, coarse(1e-4))
+    assert commissioning.stronger(again, still[0]) is None
+    with pytest.raises(BlfDscError, match='positions do not show the motion'):
+        commissioning.result([still])
+
+
+def test_light_wrists_may_be_shaken_past_their_limit_of_acceleration():
+    """OpenArm's are: its preset limits them to 4 rad/s^2, and the tones need 15."""
+    config = load_loop('openarm').controller
+    motions = blf.Commissioning(config, [config.reference.offset]).motions
+    limit = np.array(config.limits.acceleration)
+    assert (motions[0].excitation.acceleration > limit).any()
+    times = np.linspace(0.0, motions[0].duration, 5000)
+    reached = np.abs(sampled(reference_of(motions[0].config), times)[:, 2])
+    assert (reached <= motions[0].config.limits.acceleration).all()

@@ -288,3 +288,32 @@ def test_loop_of_ones_own_logs_it_without_a_warning(caplog):
         blf.ArmController('fr3_direct').close()
     (line,) = [each for each in caplog.records if 'nobody has measured' in each.message]
     assert line.levelno == logging.INFO
+
+
+def test_a_posture_that_noise_hides_is_measured_again(arm, capsys):
+    """Both bags are kept, and only the second one counts."""
+    coarse = '    sensor: {resolution: 4.0e-4, velocity: differenced}\n'
+    arm.write_text(
+        arm.read_text().replace('    initial.position', coarse + '    initial.position')
+    )
+    assert commission(arm, 'plant', '--yes', '--torque', '0.01') == 0
+    told = capsys.readouterr().out
+    assert 'is measured once more' in told
+    assert PlantDriver.last.calls == ['connect', *['start', 'finish'] * 3]
+    folder = arm.with_name('out_bags')
+    assert {bag.name for bag in folder.iterdir()} == {
+        *('move_1', 'weak_posture_1', 'posture_1')
+    }
+    weak, strong = (
+        blf.read_run(folder / name) for name in ('weak_posture_1', 'posture_1')
+    )
+    moved = [np.ptp(run.position, axis=0) for run in (weak, strong)]
+    assert (moved[1] > 1.5 * moved[0]).all()
+    assert (
+        np.abs(strong.error[0]).max() < 1e-3
+    )  # from where the arm rests: a step or two
+    gains = gains_of(arm.with_name('out.yaml'))
+    bag = str(folder / 'posture_1')
+    again = arm.with_name('again.yaml')
+    assert main(['commission', bag, '--config', str(arm), '--out', str(again)]) == 0
+    np.testing.assert_array_equal(gains_of(again), gains)

@@ -135,7 +135,7 @@ def _simulated(
         print(f'posture {k}: {page.description(each)}')
     names, runs = [], []
     with announced_compilation(print_notice):
-        made = simulated.runs_of(planned, loop)
+        made = simulated.runs_of(commissioning, loop)
         bar = tqdm(made, total=len(planned) + 1, unit='run', leave=False, disable=None)
         for name, run in bar:
             if isinstance(run, BlfDscError):

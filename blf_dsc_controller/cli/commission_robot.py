@@ -18,6 +18,7 @@ from blf_dsc_controller.commissioning import page
 from blf_dsc_controller.commissioning.commissioning import Planned
 from blf_dsc_controller.commissioning.driven import SPEED, Driven
 from blf_dsc_controller.commissioning.own_loop import Commissioning, Measured
+from blf_dsc_controller.commissioning.strength import MOST
 from blf_dsc_controller.compiled.announcement import announced_compilation
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.control.arm_controller import ArmController
@@ -78,16 +79,27 @@ def _limits(
     for k, each in enumerate(planned, 1):
         yield f'posture {k}: {page.description(each)}'
     rated = config.robot.efforts(config.robot.chain(config.joints))
-    shaking = ', '.join(f'{torque:.2g}' for torque in options.torque * rated)
+    shaking, shaken_most = (
+        ', '.join(f'{torque:.2g}' for torque in share * rated)
+        for share in (options.torque, MOST * options.torque)
+    )
     most = ', '.join(f'{torque:.3g}' for torque in config.torque.limit)
     bound = ', '.join(f'{each:.2g}' for each in planned[0].config.barrier.bound)
     yield (
         f'to each posture the joints move straight, at {SPEED:g} rad/s at most: keep the way of '
         'the arm free'
     )
-    yield f'the motions add torques of {shaking} N m (rms) at most; torque.limit is {most} N m'
+    yield f'the motions add torques of {shaking} N m (rms); torque.limit is {most} N m'
+    yield (
+        f'where noise hides too much, a posture is measured once more, with {shaken_most} N m at '
+        f'most; the tool then travels {1e3 * options.travel:.3g} mm at most'
+    )
     yield (
         f'an error of {bound} rad, any other check of the controller, or Ctrl-C brings the arm to '
         'rest and ends'
     )
-    yield f'{options.robot} moves for {duration:.0f} s in all'
+    again = sum(each.duration for each in planned)
+    yield (
+        f'{options.robot} moves for {duration:.0f} s in all, and for {duration + again:.0f} s if '
+        'every posture is measured twice'
+    )

@@ -161,7 +161,7 @@ def commissioned(
     Raises BlfDscError if a run is not one of its motions, or has a stop.
     """
     arm, _ = design_of(config)
-    start = _gains_of(arm)
+    start = measuring_gains(arm)
     T = config.sample_time
     for run, _ in runs:
         if run.joints != config.joints:
@@ -201,7 +201,7 @@ def commissioned(
     )
 
 
-def _gains_of(arm: Design) -> JointGains:
+def measuring_gains(arm: Design) -> JointGains:
     """Return the gains with which an arm is measured."""
     gains = arm.joints or unknown_arm(arm.rotors)
     return gains.scaled(arm.stiffness)

@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Commissioning of a robot over its driver: slowly to each posture, and the motion there.
 
-    rest -> move -> rest -> motion -> rest      for each posture
+    rest -> move -> rest -> motion -> rest      for each posture, and the motion once more if
+                                                noise hides much
 
 Move and motion are runs of `drive.loop`, which end at rest whatever happens, and have a
 bag each.  Between two of them the robot holds itself by its own means.  A motion is
@@ -22,7 +23,6 @@ from blf_dsc_controller.bags.reader import read_run
 from blf_dsc_controller.commissioning import motion
 from blf_dsc_controller.commissioning.commissioning import Planned
 from blf_dsc_controller.commissioning.own_loop import Commissioning, Measured
-from blf_dsc_controller.commissioning.response import response_of
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.schema import change
 from blf_dsc_controller.control.arm_controller import ArmController
@@ -32,6 +32,7 @@ from blf_dsc_controller.drive.loop import DriveLoop, End
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.reference.approach import AT_REST
 from blf_dsc_controller.reference.turns import short_way
+from blf_dsc_controller.run import Run
 
 Floats = NDArray[np.float64]
 
@@ -141,18 +142,26 @@ class Driven:
             way = move(self._config, self.position(), posture)
             self._run(way.config, way.duration, f'move {k}')
             here = self._commissioning.motion(self.position())
-            bag = self._run(here.config, here.duration, name)
-            run = read_run(bag)
+            run = self._shaken(here, name)
             try:
-                response_of(run, motion.lines_in(here.config), here.config.sample_time)
+                again = self._commissioning.stronger(here, run, self.position())
             except BlfDscError as error:
                 raise BlfDscError(f'{name}: {error}') from error
+            if again is not None:
+                bag = self._bag(name)
+                bag.rename(bag.with_name(f'weak_{bag.name}'))
+                here = again
+                run = self._shaken(here, name)
             self._measured = k
             yield name, (run, here.config)
 
+    def _shaken(self, planned: Planned, name: str) -> Run:
+        """Run a motion, and return what it shows."""
+        return read_run(self._run(planned.config, planned.duration, name))
+
     def _run(self, config: ControllerConfig, duration: float, name: str) -> Path:
         """Control the robot for so long [s]; return the bag."""
-        bag = self._folder / name.replace(' ', '_')
+        bag = self._bag(name)
         with ArmController(config, record=bag, stamps='wall') as controller:
             self._loop = DriveLoop(
                 self._driver,
@@ -170,6 +179,9 @@ class Driven:
         if controller.output_problem:
             raise BlfDscError(f'{name}: {controller.output_problem}')
         return bag
+
+    def _bag(self, name: str) -> Path:
+        return self._folder / name.replace(' ', '_')
 
     def _ended(self, name: str, end: End, text: str) -> EndedError:
         reason = f': {text}' if text else ''

@@ -36,12 +36,14 @@ Ints = NDArray[np.int64]
 SETTLING = 6.0
 """Time [s] from the start until the period that is looked at."""
 
+SLOW_TONES = 2
+"""The last tones of a joint, which keep it sliding."""
+
 _LINES = 80  # of each joint, at most
 _SLOWEST, _FASTEST = 2.0, 120.0  # Hz
 _OF_RATE = 0.35  # of the sample rate, the fastest line at most
 _SECONDS = 4.0  # of the period, for each joint
 _SLOW = 1.0  # Hz, of the tones that keep joints sliding
-_SLOW_TONES = 2
 _SLIDING = 0.1  # rad/s, their largest speed
 _LEAST_SWING = 0.05  # times that, before the lines shrink, too
 _SHRINKS = 40  # until travel and speeds are within their limits
@@ -114,7 +116,7 @@ def lines_in(config: ControllerConfig) -> Lines:
     if np.abs(bins - np.rint(bins)).max() > 1e-6:
         raise BlfDscError(_OTHER_MOTION)
     by_joint = np.rint(bins).astype(np.int64).reshape(n, -1)
-    return Lines(2.0 * np.pi / float(rates[0]), by_joint[:, :-_SLOW_TONES])
+    return Lines(2.0 * np.pi / float(rates[0]), by_joint[:, :-SLOW_TONES])
 
 
 _OTHER_MOTION = (
@@ -145,7 +147,7 @@ def excitation(
     rate = 2.0 * np.pi / period * bins
     torque = share * rated / math.sqrt(0.5 * bins.shape[1])
     lines = torque[:, None] / (inertia[:, None] * rate**2)
-    swing = np.full(slow.shape, _SLIDING / (2.0 * np.pi * _SLOW) / _SLOW_TONES)
+    swing = np.full(slow.shape, _SLIDING / (2.0 * np.pi * _SLOW) / SLOW_TONES)
     shape = _Shape(np.column_stack((bins, slow)), period)
     limit = _SPEED * np.array(config.limits.velocity)
     middle = frames(chain, posture)[-1][:3, 3]

@@ -22,9 +22,13 @@ from blf_dsc_controller.commissioning.commissioning import (
     plan,
     postures_of,
 )
+from blf_dsc_controller.commissioning.motion import SLOW_TONES
+from blf_dsc_controller.commissioning.strength import strength
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.nodes import CONTROLLER, load, locate
 from blf_dsc_controller.run import Run
+
+_WORTH = 1.2  # times the amplitude, for which a posture is measured again
 
 Measured = tuple[Run, ControllerConfig]
 """The run of a motion, with its parameters."""
@@ -61,7 +65,7 @@ class Commissioning:
         Args:
             config: of an arm from a URDF, with gains that hold it, if only softly.
             postures: some, each (n,) [rad]; without them, three that the reference visits.
-            torque: of a motion, rms, as a share of the rated torque, at most.
+            torque: of a first motion, rms, as a share of the rated torque, at most.
             travel: how far the tool moves from its middle, at most [m].
             margin: modulus margin of the gains.
 
@@ -105,8 +109,31 @@ class Commissioning:
         Raises:
             BlfDscError: the posture is not one of this arm, or too near its limits.
         """
+        return self._motion(posture, self._torque)
+
+    def stronger(
+        self, motion: Planned, run: Run, posture: ArrayLike | None = None
+    ) -> Planned | None:
+        """Return a motion with more torque to repeat one with, if noise hides much in its run.
+
+        It is around a posture (n,) [rad], or that of the motion.  None: enough is seen, or
+        the travel of the tool and the speeds permit no more.
+
+        Raises:
+            BlfDscError: the run does not show the response.
+        """
+        factor = strength(run, motion.config)
+        if factor == 1.0:
+            return None
+        around = motion.posture if posture is None else posture
+        again = self._motion(around, factor * self._torque)
+        before, after = (each.excitation.amplitude for each in (motion, again))
+        gained = float((after[:, :-SLOW_TONES] / before[:, :-SLOW_TONES]).max())
+        return again if gained > _WORTH else None
+
+    def _motion(self, posture: ArrayLike, torque: float) -> Planned:
         around = np.asarray(posture, float)[None]
-        (motion,) = plan(self.config, around, torque=self._torque, travel=self._travel)
+        (motion,) = plan(self.config, around, torque=torque, travel=self._travel)
         return motion
 
     def result(self, runs: Sequence[str | Path | Measured]) -> Commissioned:

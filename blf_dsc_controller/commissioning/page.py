@@ -14,13 +14,13 @@ from blf_dsc_controller.analysis.output import aligned
 from blf_dsc_controller.analysis.panels import ALARM, BLUE, MUTED, ORANGE, SHADE
 from blf_dsc_controller.commissioning.choice import SLOWEST
 from blf_dsc_controller.commissioning.commissioning import Commissioned, Planned
+from blf_dsc_controller.commissioning.strength import LITTLE
 from blf_dsc_controller.supervision.expected_errors import expectation
 
 Floats = NDArray[np.float64]
 
 _COLOURS = (BLUE, ORANGE, MUTED, ALARM)
 _SIZE = (5.6, 3.4)  # inches, of a panel
-_MUCH = 0.1  # of the margin, by noise
 _FAR = 5.0  # times the gains of the measurement: friction may act otherwise on theirs
 _SOFTER = 0.8  # of the stiffness of the measurement, from which it is said
 
@@ -101,7 +101,7 @@ def sentences(found: Commissioned) -> Iterator[str]:
             'Measure again with a larger --torque or --travel'
         )
     doubt = _doubt_at(found)
-    if doubt > _MUCH:
+    if doubt > LITTLE:
         yield (
             f'noise costs {doubt:.2g} of the margin: a larger --torque may show that the arm '
             'bears more'

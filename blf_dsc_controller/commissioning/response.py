@@ -36,6 +36,10 @@ _FINER = 4  # times as many frequencies as there are lines of a joint
 _BETWEEN = 3  # times n lines to either side, from which the noise is taken
 
 
+class HiddenError(BlfDscError):
+    """The positions do not show the motion at all."""
+
+
 class Response(NamedTuple):
     """Responses in one posture, at f frequencies."""
 
@@ -52,12 +56,18 @@ class Response(NamedTuple):
 def response_of(run: Run, lines: Lines, sample_time: float) -> Response:
     """Return the responses that a run of the motion shows.
 
-    Raises BlfDscError if it has no whole period, or too many samples are lost.
+    Raises BlfDscError if it has no whole period, too many samples are lost, or the
+    positions do not show it.
     """
     torque, position, velocity = _period(run, lines.period, sample_time)
     U, Y, V = (_spectrum(each) for each in (torque, position, velocity))
     at = lines.bins.T  # (f, n): the lines of each experiment
     U_at, Y_at, V_at = (np.swapaxes(each[at], 1, 2) for each in (U, Y, V))
+    if (np.linalg.matrix_rank(Y_at) < Y_at.shape[-1]).any():
+        raise HiddenError(
+            'the positions do not show the motion: friction holds the arm, or it moves by less '
+            'than a step of its encoders. Measure with a larger --torque and --travel'
+        )
     inverse = np.linalg.inv(U_at)
     between = _between(lines.bins, len(U))
     noises = [

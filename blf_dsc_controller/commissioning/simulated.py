@@ -9,12 +9,11 @@ from typing import NamedTuple
 import numpy as np
 
 from blf_dsc_controller.commissioning.commissioning import Planned
-from blf_dsc_controller.configuration.controller import ControllerConfig
+from blf_dsc_controller.commissioning.own_loop import Commissioning, Measured
 from blf_dsc_controller.configuration.nodes import LoopConfig
 from blf_dsc_controller.configuration.plant import PlantConfig
 from blf_dsc_controller.configuration.schema import change
 from blf_dsc_controller.errors import BlfDscError
-from blf_dsc_controller.run import Run
 from blf_dsc_controller.simulation.loop import simulate
 
 _PROOF = 30.0  # s, at most
@@ -28,9 +27,7 @@ class Proof(NamedTuple):
     stop: str  # empty: none
 
 
-def measured(
-    planned: Planned, plant: PlantConfig, payload: float = 0.0
-) -> tuple[Run, ControllerConfig]:
+def measured(planned: Planned, plant: PlantConfig, payload: float = 0.0) -> Measured:
     """Return a run of a motion, of an arm that holds a payload [kg] its law knows nothing of.
 
     Raises BlfDscError if the arm stopped.
@@ -60,17 +57,23 @@ def proof(loop: LoopConfig) -> Proof:
 
 
 def runs_of(
-    planned: list[Planned], loop: LoopConfig
-) -> Iterator[tuple[str, tuple[Run, ControllerConfig] | BlfDscError]]:
+    commissioning: Commissioning, loop: LoopConfig
+) -> Iterator[tuple[str, Measured | BlfDscError]]:
     """Yield the runs of all motions, then one with the rated payload, with their names.
 
-    The last one may be beyond what soft gains hold: then it is the error.
+    Where noise hides much, it is the run of a stronger motion.  The last one may be beyond
+    what soft gains hold: then it is the error.
     """
+    strongest: list[Planned] = []
+    planned = commissioning.motions_from(loop.plant.initial.position)
     for k, each in enumerate(planned, 1):
-        yield f'posture {k}', measured(each, loop.plant)
+        run = measured(each, loop.plant)
+        again = commissioning.stronger(each, run[0])
+        strongest.append(again or each)
+        yield f'posture {k}', measured(again, loop.plant) if again else run
     payload = loop.controller.robot.payload
     name = f'posture 1 with {payload:g} kg'
     try:
-        yield name, measured(planned[0], loop.plant, payload)
+        yield name, measured(strongest[0], loop.plant, payload)
     except BlfDscError as error:
         yield name, error
