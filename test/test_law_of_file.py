@@ -114,7 +114,8 @@ def used(law, model, settings_vector, state_vector, signals_vector):
     state = state_of(state_vector, settings)
     signals = signals_of(signals_vector, settings)
     law.compute_demand(settings, state, signals, 0.0, 1e-3)
-    law.finish(settings, state, signals, 1e-3, False)
+    saturated = False
+    law.finish(settings, state, signals, 1e-3, saturated)
 
 
 @pytest.mark.parametrize(

@@ -141,6 +141,11 @@ def _problem(law: Any) -> str:
             f'LAW.{undeclared[0]} must be declared with its default and unit, such as '
             "Annotated[float, positive(20.0, 'decay of the error', '1/s')]"
         )
+    return _problem_of_methods(law)
+
+
+def _problem_of_methods(law: type) -> str:
+    """Return what `LAW` lacks beside its gains, or nothing."""
     for name, arguments in _METHODS.items():
         if not hasattr(law, name):
             return f'LAW has no method {name}'
