@@ -127,6 +127,9 @@ def used(law, model, settings_vector, state_vector, signals_vector):
         ('k', 'k is not defined: write self.k'),
         ('signals.H[0]', 'array(float64, 1d, C)): these shapes or types do not fit'),
         ('np.zeros(3)[0]', 'a law must not create arrays'),
+        ('(signals.q - signals.qr)[0]', 'a law must not create arrays'),
+        ("f'{t:.1f}'", 'it cannot be compiled: format spec in f-strings'),
+        ('np.absolut(t)', 'numpy has no absolut'),
         ('doubled(1.0)', 'the function doubled is not compiled: put @inner above it'),
         (
             'state.memory.sum_of[0]',
