@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Changes of the arm while the window is not full: the figures of doc/learning.md.
+"""Changes of the arm while the window is not full: figures of STUDIES.md.
 
     python benchmark/first_window.py
 

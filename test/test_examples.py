@@ -48,7 +48,7 @@ def test_example_runs_without_hardware(path, tmp_path):
 
 
 def test_page_names_every_example():
-    page = (ROOT / 'doc' / 'examples.md').read_text()
+    page = (ROOT / 'doc' / 'scripts.md').read_text()
     assert [path.stem for path in EXAMPLES] == sorted(EXPECTED)
     assert set(re.findall(r'examples/(\w+)\.py', page)) == set(EXPECTED)
-    assert 'doc/examples.md' in (ROOT / 'README.md').read_text()
+    assert 'doc/scripts.md#examples' in (ROOT / 'README.md').read_text()

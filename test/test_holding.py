@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The position loops that users of soft arms report, and this law: doc/real_arm.md's figures."""
+"""The position loops that users of soft arms report, and this law: figures of STUDIES.md."""
 
 from __future__ import annotations
 

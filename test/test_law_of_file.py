@@ -20,6 +20,8 @@ from blf_dsc_controller.configuration.plant import PlantConfig
 from blf_dsc_controller.configuration.schema import build, change, flatten
 from blf_dsc_controller.errors import BlfDscError, ConfigurationError
 from blf_dsc_controller.law.factory import controller_of, law_of
+from blf_dsc_controller.law.laws import for_law
+from blf_dsc_controller.law.state import settings_of, signals_of, state_of
 from blf_dsc_controller.studies import laws
 from blf_dsc_controller.studies.laws import COMPUTED_TORQUE
 from blf_dsc_controller.studies.monte_carlo import UNSEEN, load_study, torque_rows
@@ -92,6 +94,10 @@ IMPORTS = (
             'LAW has no method compute_demand',
         ),
         (METHODS, 'LAW does not say by has_barrier whether it keeps'),
+        (
+            METHODS.replace('dt, saturated', 'dt'),
+            'LAW.finish must have the arguments self, settings, state, signals, dt, saturated',
+        ),
     ],
 )
 def test_file_that_defines_no_law_is_refused(text, problem, tmp_path):
@@ -100,6 +106,63 @@ def test_file_that_defines_no_law_is_refused(text, problem, tmp_path):
     with pytest.raises(BlfDscError, match=r'law\.py') as raised:
         load_law(str(path))
     assert problem in str(raised.value)
+
+
+def used(law, model, settings_vector, state_vector, signals_vector):
+    """Run both methods of a law, as a loop does."""
+    settings = settings_of(settings_vector, model)
+    state = state_of(state_vector, settings)
+    signals = signals_of(signals_vector, settings)
+    law.compute_demand(settings, state, signals, 0.0, 1e-3)
+    saturated = False
+    law.finish(settings, state, signals, 1e-3, saturated)
+
+
+@pytest.mark.parametrize(
+    ('line', 'problem'),
+    [
+        ('signals.alpha2[0]', 'signals has no alpha2: it is state.alpha2'),
+        ('signals.demands[0]', 'signals has no demands: did you mean signals.demand?'),
+        ('self.kk', 'LAW has no gain kk: did you mean self.k?'),
+        ('k', 'k is not defined: write self.k'),
+        ('signals.H[0]', 'array(float64, 1d, C)): these shapes or types do not fit'),
+        ('np.zeros(3)[0]', 'a law must not create arrays'),
+        ('(signals.q - signals.qr)[0]', 'a law must not create arrays'),
+        ("f'{t:.1f}'", 'it cannot be compiled: format spec in f-strings'),
+        ('np.absolut(t)', 'numpy has no absolut'),
+        ('doubled(1.0)', 'the function doubled is not compiled: put @inner above it'),
+        (
+            'state.memory.sum_of[0]',
+            'an array has no sum_of: read what the law keeps as',
+        ),
+        ('signals', 'these shapes or types do not fit'),
+    ],
+)
+def test_mistake_that_cannot_be_compiled_is_told_with_its_line(line, problem, tmp_path):
+    path = tmp_path / 'law.py'
+    helper = 'import numpy as np\n\n\ndef doubled(x):\n    return x\n\n\n'
+    mistaken = METHODS.replace('pass', f'signals.demand[0] += {line}', 1)
+    path.write_text(
+        IMPORTS + helper + mistaken + '    has_barrier = False\n', encoding='utf-8'
+    )
+    of_package = controller_of(build(ControllerConfig, {}))
+    law = load_law(str(path))(1.0)
+    with pytest.raises(BlfDscError) as raised:
+        for_law(used, law)(
+            law,
+            of_package.settings.model,
+            of_package.settings_vector,
+            of_package.state_vector,
+            of_package.signals_vector,
+        )
+    (told,) = str(raised.value).splitlines()
+    number = (
+        path.read_text(encoding='utf-8')
+        .splitlines()
+        .index(f'        signals.demand[0] += {line}')
+    )
+    assert told.startswith(f'{path}, line {number + 1}: ')
+    assert problem in told
 
 
 @pytest.mark.parametrize(

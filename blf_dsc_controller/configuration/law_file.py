@@ -19,6 +19,7 @@ import dataclasses
 import functools
 import hashlib
 import importlib.util
+import inspect
 import re
 import sys
 import typing
@@ -31,7 +32,10 @@ from blf_dsc_controller.errors import BlfDscError
 GROUP = 'gains'
 """Group of the parameters of a law of a file."""
 
-
+_METHODS = {
+    'compute_demand': ('self', 'settings', 'state', 'signals', 't', 'dt'),
+    'finish': ('self', 'settings', 'state', 'signals', 'dt', 'saturated'),
+}
 _WRITTEN = re.compile(r'(.+\.py)(?:@([0-9a-f]{12,64}))?', re.DOTALL)
 
 
@@ -137,9 +141,16 @@ def _problem(law: Any) -> str:
             f'LAW.{undeclared[0]} must be declared with its default and unit, such as '
             "Annotated[float, positive(20.0, 'decay of the error', '1/s')]"
         )
-    for name in ('compute_demand', 'finish'):
+    return _problem_of_methods(law)
+
+
+def _problem_of_methods(law: type) -> str:
+    """Return what `LAW` lacks beside its gains, or nothing."""
+    for name, arguments in _METHODS.items():
         if not hasattr(law, name):
             return f'LAW has no method {name}'
+        if len(inspect.signature(getattr(law, name)).parameters) != len(arguments):
+            return f'LAW.{name} must have the arguments {", ".join(arguments)}'
     if not hasattr(law, 'has_barrier'):
         return 'LAW does not say by has_barrier whether it keeps the error inside its bound'
     return ''

@@ -16,6 +16,7 @@ from blf_dsc_controller.compiled.jit import compile_methods, kernel
 from blf_dsc_controller.law.backstepping import Backstepping
 from blf_dsc_controller.law.blf_dsc import BlfDsc
 from blf_dsc_controller.law.interface import Law
+from blf_dsc_controller.law.mistakes import tell_mistakes
 
 PACKAGED = (BlfDsc, Backstepping)
 """Types of the package's laws."""
@@ -24,7 +25,10 @@ compile_methods(Law, ('compute_demand', 'finish'), *PACKAGED)
 
 
 def for_law(compiled: Callable[..., Any], law: Law) -> Callable[..., Any]:
-    """Return a kernel for a law: the given one, or the same compiled with the law of a file."""
+    """Return a kernel for a law: the given one, or the same compiled with the law of a file.
+
+    Its compilation raises BlfDscError where the law of a file cannot be compiled.
+    """
     if isinstance(law, PACKAGED):
         return compiled
     return _compiled_with(compiled, type(law))
@@ -32,4 +36,6 @@ def for_law(compiled: Callable[..., Any], law: Law) -> Callable[..., Any]:
 
 @functools.cache
 def _compiled_with(compiled: Callable[..., Any], law: type) -> Callable[..., Any]:
-    return kernel(getattr(compiled, 'py_func', compiled), law)
+    mine = kernel(getattr(compiled, 'py_func', compiled), law)
+    tell_mistakes(mine, law)
+    return mine

@@ -14,6 +14,14 @@ function legendHeight(panel, width) {
   return 19 * Math.ceil(names.length / Math.max(1, Math.floor(width / entry)));
 }
 
+// A logarithmic axis shows a decade at least: its ticks would be numbers of many digits.
+function rangeOf(panel) {
+  const values = panel.traces.flatMap((trace) => trace.y).filter((y) => y > 0);
+  const ends = [Math.min, Math.max].map((of) => Math.log10(values.reduce((a, b) => of(a, b), values[0])));
+  const room = (1 - (ends[1] - ends[0])) / 2;
+  return panel.log && room > 0 ? {range: [ends[0] - room, ends[1] + room]} : {};
+}
+
 function layoutOf(panel, width) {
   const legend = legendHeight(panel, width - 110);
   const grid = {gridcolor: '#e5e7eb', zerolinecolor: '#d1d5db'};
@@ -30,7 +38,8 @@ function layoutOf(panel, width) {
     dragmode: 'zoom',
     xaxis: {...grid, title: {text: 'time [s]', standoff: 6}, range: [0, duration]},
     yaxis: {...grid, title: {text: panel.unit, standoff: 4},
-      type: panel.log ? 'log' : 'linear', exponentformat: 'power'},
+      type: panel.log ? 'log' : 'linear', exponentformat: 'power', automargin: true,
+      ...rangeOf(panel)},
     shapes: panel.marks.flatMap(([time, , colour, until]) => [
       {type: 'line', x0: time, x1: time, y0: 0, y1: 1, yref: 'paper',
         line: {color: colour, width: 1.2, dash: 'dot'}},
