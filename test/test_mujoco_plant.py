@@ -225,7 +225,7 @@ def test_closed_loop_runs_the_same_with_both_plants():
         ('panda_rigid', 0.2, 2.3),
         ('ur5e_rigid', 0.55, 1.6),
         ('openarm', 0.36, 5.3),
-        ('widowx', 1.4, 23.3),
+        ('widowx', 0.58, 39.0),
     ],
 )
 def test_errors_with_dry_friction_are_as_documented(name, settled, peak):
