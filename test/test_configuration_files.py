@@ -340,6 +340,16 @@ def test_unknown_names_are_rejected_and_those_of_other_nodes_only_in_their_own_s
         assert load_plant(file(section(pattern, of_ros))).seed == 2
 
 
+def test_a_damping_that_damps_nothing_is_told_apart_from_those_that_do(file):
+    """The name of d2 was taken for the damping of a joint."""
+    path = file(section('blf_dsc_controller', 'feedback.damping: [5.0, 5.0]'))
+    with pytest.raises(ConfigurationError) as caught:
+        load(path, 'blf_dsc_controller', ControllerConfig)
+    (problem,) = caught.value.problems
+    assert 'feedback.damping: is called feedback.robust_gain (d2)' in problem
+    assert 'feedback.joint_damping, or feedback.gain (K_p)' in problem
+
+
 def test_missing_file_error_lists_the_presets(tmp_path):
     assert locate('recommended') == locate('recommended.yaml')
     for name in ('recomended', tmp_path / 'absent.yaml', tmp_path):

@@ -301,7 +301,7 @@ def test_comparison_laws_are_the_linear_surface_with_their_gains(law, share):
         np.testing.assert_array_equal(ours, share * np.array(gains[name]))
     np.testing.assert_array_equal(settings.surface.gain, gains['surface_gain'])
     for zero in (
-        settings.feedback.damping,
+        settings.feedback.robust_gain,
         settings.disturbance.gain,
         settings.adaptation.weight,
         settings.excitation.change_detection,

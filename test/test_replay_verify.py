@@ -402,6 +402,21 @@ def test_waypoints_of_an_older_bag_stand_joint_by_joint(tmp_path):
     assert read_content(bag).unknown_parameters == []
 
 
+def test_robust_gain_of_an_older_bag_was_called_a_damping(tmp_path):
+    given = {'feedback.robust_gain': [3.0, 2.0]}
+    entries = recorded_run.messages(recorded_run.record(tmp_path / 'new', 0.3, **given))
+
+    def change(content):
+        parameters = content['parameters']
+        parameters['feedback.damping'] = parameters.pop('feedback.robust_gain')
+
+    configured(entries, change)
+    bag = recorded_run.write(tmp_path / 'old', entries)
+    result = verify(bag)
+    assert (result.difference, result.remarks, result.incomplete) == (None, (), ())
+    assert read_content(bag).unknown_parameters == []
+
+
 def test_journal_of_a_later_format_is_refused(entries, tmp_path):
     def change(content):
         content.update(format=FORMAT + 1, version='9.0.0')

@@ -201,7 +201,7 @@ def _of_arm(arm: Design) -> dict[str, Value]:
         'joints': tuple(joint.name for joint in chain.joints),
         'surface.time_constant': max(arm.sample_time, SURFACE),
         'surface.known_rate': True,
-        'feedback.damping': zeros,
+        'feedback.robust_gain': zeros,
         'torque.limit': _listed(effort),
         'torque.rate_limit': zeros,
         'torque.first_step': zeros,

@@ -22,6 +22,9 @@ from blf_dsc_controller.configuration.schema import (
     variant_of,
 )
 
+NAMES = {'feedback.damping': 'feedback.robust_gain'}
+"""Names of this version, by those of older bags."""
+
 REMOVED: dict[str, Value] = {}
 """Last default of each parameter of the first release that is gone now."""
 
@@ -67,9 +70,9 @@ def current(recorded: Mapping[str, Any], source: str, law: str = '') -> dict[str
 def renamed(recorded: Mapping[str, Any]) -> dict[str, Any]:
     """Return recorded parameters of a controller by their names of this version.
 
-    `reference.points` were waypoints joint by joint.
+    `reference.points` were waypoints joint by joint; the robust gain d2 was called a damping.
     """
-    values = dict(recorded)
+    values = {NAMES.get(name, name): value for name, value in recorded.items()}
     points = values.get('reference.points')
     times = values.get('reference.times', ())
     if points is not None and (not points or by_point(points, len(times))):

@@ -397,7 +397,7 @@ class Feedback:
         '1/s',
         'omega_v',
     )
-    damping: PerJoint = non_negative(
+    robust_gain: PerJoint = non_negative(
         (0.0, 0.0), 'robust term d2 |xi1| sat(xi2/b)', 'N m/rad', 'd2'
     )
 
@@ -759,16 +759,22 @@ class ControllerConfig(ArmConfig):
     @classmethod
     def replaced(cls, given: Mapping[str, Any]) -> Mapping[str, str]:
         """Return what to write instead of given parameters of earlier versions."""
+        found = {}
+        if 'feedback.damping' in given:
+            found['feedback.damping'] = (
+                'is called feedback.robust_gain (d2), since it damps nothing; the damping of a '
+                'joint is feedback.joint_damping, or feedback.gain (K_p)'
+            )
         points, times = (given.get(f'reference.{name}') for name in ('points', 'times'))
         if points is None:
-            return {}
+            return found
         remedy = 'write them as reference.waypoints' if points else 'leave it out'
         if isinstance(points, list | tuple) and isinstance(times, list | tuple):
             rows = by_point(points, len(times))
             remedy = (
                 f'write reference.waypoints: {format_value(rows)}' if rows else remedy
             )
-        return {
+        return found | {
             'reference.points': 'replaced by reference.waypoints, which has one row per point '
             f'as everywhere in ROS, and not one per joint: {remedy}'
         }

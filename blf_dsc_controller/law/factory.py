@@ -491,7 +491,7 @@ def _of_model_based(_config: ControllerConfig, settings: Settings) -> Settings:
     return settings._replace(
         initial_estimate=np.concatenate((settings.true_parameters, columns)),
         feed_forward=1,
-        feedback=settings.feedback._replace(damping=nothing),
+        feedback=settings.feedback._replace(robust_gain=nothing),
         disturbance=settings.disturbance._replace(gain=nothing),
         adaptation=settings.adaptation._replace(adaptation_gain=np.zeros(settings.m)),
     )
@@ -504,7 +504,7 @@ def _of_linear_surface(config: ControllerConfig, settings: Settings) -> Settings
     return settings._replace(
         compensation=STATE,
         surface=settings.surface._replace(gain=np.array(gains.surface_gain)),
-        feedback=settings.feedback._replace(damping=nothing),
+        feedback=settings.feedback._replace(robust_gain=nothing),
         disturbance=settings.disturbance._replace(gain=nothing, bumpless=0),
         excitation=settings.excitation._replace(change_detection=0),
         adaptation=settings.adaptation._replace(weight=gains.learning_weight),

@@ -19,7 +19,7 @@ class Settings(NamedTuple):
     """The parameters `feedback.*`, and what follows from them."""
 
     gain: Annotated[Array, 'n']  # K_p, N m s/rad
-    damping: Annotated[Array, 'n']  # d2, N m/rad
+    robust_gain: Annotated[Array, 'n']  # d2, N m/rad
     # omega_v, of the damping by the initial estimate's inertia, 1/s
     damping_rate: float
     follows_inertia: int  # 1: barrier and d^3 act through M(q, P^(0)) / m
@@ -31,7 +31,7 @@ def joint_torque(
     settings: Settings, xi1: float, xi2: float, layer: float, i: int
 ) -> float:
     """Return the damping and the robust term of joint i [N m]; `layer` is b [rad/s]."""
-    robust = settings.damping[i] * abs(xi1)
+    robust = settings.robust_gain[i] * abs(xi1)
     torque = settings.gain[i] * xi2
     torque += robust * clip(xi2 / layer, -1.0, 1.0)
     return float(-torque)

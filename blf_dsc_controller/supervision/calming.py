@@ -55,7 +55,7 @@ def softened(settings: Settings, share: float) -> Settings:
         surface=surface._replace(gain=share * surface.gain, mu=share * surface.mu),
         feedback=feedback._replace(
             gain=share * feedback.gain,
-            damping=share * feedback.damping,
+            robust_gain=share * feedback.robust_gain,
             damping_rate=share * feedback.damping_rate,
         ),
         barrier=barrier._replace(
