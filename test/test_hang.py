@@ -151,6 +151,7 @@ def test_arm_near_its_reference_returns_to_it_after_a_gap_at_the_torque_that_act
     loop.hang(0.12, queued=False)
     stamp, measurement = loop.state()
     guard, n = loop.guard, loop.n
+    held = loop.line._safe.commanded.copy()
     loop.answer(stamp, measurement)
     assert guard.supervisor.phase is Phase.APPROACHING
     assert guard.controller.samples == 1
@@ -159,12 +160,12 @@ def test_arm_near_its_reference_returns_to_it_after_a_gap_at_the_torque_that_act
     assert start.content['resumed']
     error = guard.controller.signals.xi1
     assert np.abs(error).max() < 1e-9
-    held = loop.line._safe.commanded
     whole = measurement[2 * n :] - guard.controller.signals.added
     # as measured and delayed, within what an arm that brakes changes in some samples
     np.testing.assert_allclose(whole, held, atol=0.5)
     step = np.array(loop.config.torque.rate_limit) * loop.config.sample_time
     assert np.all(np.abs(loop.torque - whole) <= step * (1.0 + 1e-9))
+    loop.plant.step(loop.torque)
     loop.run(2.0)
     assert guard.supervisor.phase is Phase.TRACKING
 
@@ -194,8 +195,9 @@ def test_load_is_the_torque_that_moves_the_arm_besides_its_model(T):
         torque = load + needed_torque(settings, estimate, q, dq, ddq)
         recent.take(START + round(k * T * 1e9), np.array([q, dq, q]).ravel(), torque)
 
+    assert (recent.size - 1) * T == pytest.approx(0.1, abs=1.5 * T)
     for k in range(round(0.35 / T)):
-        assert (recent.load(settings, estimate) is None) == (k <= 0.1 / T)
+        assert (recent.load(settings, estimate) is None) == (k < recent.size)
         take(k)
     # of 100 N m: the motion changes within a block of 10 ms
     np.testing.assert_allclose(recent.load(settings, estimate), load, atol=0.3)

@@ -77,6 +77,7 @@ from blf_dsc_controller.supervision.wraps import Wraps
 Vector = NDArray[np.float64]
 _NANO = 1e-9
 _MANY = 0.5  # states missed for each that came
+_CHANGED = 0.5  # of the speed: an arm whose clock was set keeps its own
 _SLOWEST = 0.03  # rad/s: a velocity that contradicts positions has more
 
 # Commands that do not reach the arm may be why, or velocities that are not its own:
@@ -270,6 +271,8 @@ class Guard:
             return None
         q, dq, _ = measurement.reshape(3, -1)
         mean = 0.5 * (dq + last.dq)
+        if np.abs(dq - last.dq).max() > _CHANGED * np.abs(mean).max():
+            return None  # it has been braked or driven on: the time has passed
         return self.states.clock_step(self._gap, q - last.q, mean)
 
     def _use(self, stamp: int, measurement: Vector) -> Vector | None:

@@ -22,7 +22,7 @@ Array = NDArray[np.float64]
 _GAP = 0.03  # s, in which an arm that another commands leaves its reference ...
 _MISSED = 2.5  # ... samples; fewer that are missing are no gap
 _AVERAGED = 0.1  # s: the noise of a difference of velocities over it is small
-_BLOCKS = 10  # of it, each with the mean acceleration in it
+_BLOCKS = 10  # of it or some more, each with the mean acceleration in it
 
 
 def is_gap(elapsed: float, sample_time: float) -> bool:
@@ -37,8 +37,8 @@ class RecentMotion:
         """`sample_time` is T [s]."""
         self._sample_time = sample_time
         samples = max(1, round(_AVERAGED / sample_time))
-        self._blocks = min(_BLOCKS, samples)
-        self._step = samples // self._blocks  # samples in a block
+        self._step = max(1, samples // _BLOCKS)  # samples in a block
+        self._blocks = samples // self._step
         self.size = self._blocks * self._step + 1
         self._stamps = np.zeros(self.size, dtype=np.int64)
         self._states = np.zeros((self.size, 2 * n))
