@@ -15,6 +15,7 @@ from blf_dsc_controller.configuration.schema import change
 from blf_dsc_controller.messages.journal import EventType
 from blf_dsc_controller.simulation.loop import simulate
 from blf_dsc_controller.supervision.guard import Guard
+from blf_dsc_controller.supervision.last_state import LastState
 from blf_dsc_controller.supervision.model_torque import needed_torque
 from blf_dsc_controller.supervision.recent_motion import RecentMotion
 from blf_dsc_controller.supervision.supervisor import Phase, Reason
@@ -127,6 +128,23 @@ def test_controller_that_goes_on_after_a_hang_makes_no_joint_faster(
         assert over.max() < SLACK, (queued, over)
 
 
+@pytest.mark.parametrize(
+    ('preset', 'moment', 'seconds', 'queued'),
+    [('fr3', 1.3, 0.12, False), ('ur5e_driver', 5.3, 0.09, True)],
+)
+def test_law_that_goes_on_does_not_pull_a_braked_arm_to_its_reference(
+    preset, moment, seconds, queued
+):
+    """Within its bound, but at another velocity: by 0.95 and 1.2 rad/s before."""
+    loop = Loop(preset, PATIENT)
+    before, _ = loop.run(moment)
+    loop.hang(seconds, queued=queued)
+    least = np.maximum(before[-200:].max(axis=0), loop.speed)
+    speed, asked = loop.run(0.6)
+    over = speed.max(axis=0) - np.maximum(least, asked.max(axis=0))
+    assert over.max() < SLACK
+
+
 @pytest.mark.parametrize('preset', ['fr3', 'ur5e_driver'])
 def test_controller_that_hung_takes_the_resting_arm_over_as_the_watchdog_holds_it(
     preset,
@@ -220,3 +238,16 @@ def test_torque_that_is_left_behind_is_that_of_a_run_sample_by_sample():
         if k + 1 < record.stamps.size:
             plant.step(torque)
     np.testing.assert_array_equal(guard.release(), record.left)
+
+
+@pytest.mark.parametrize(
+    ('gap', 'slow', 'ddq'), [(0.02, 2.0 / 3.0 * 3.0, 25.0), (0.37, 0.5, None)]
+)
+def test_after_a_gap_the_velocity_to_be_damped_is_the_measured_one(gap, slow, ddq):
+    """Positions show the mean of the gap, here 3 rad/s; a shorter step lets it in by 0.02/0.03."""
+    last = LastState(1)
+    last.take(START, np.zeros(3), np.zeros(1))
+    stamp = START + round(gap * 1e9)
+    last.take_usable(stamp, np.array([3.0 * gap, 0.5, 0.0]), 5.0, 1e-3)
+    np.testing.assert_allclose(last.slow, slow)
+    assert last.ddq == (None if ddq is None else pytest.approx(ddq))
