@@ -6,9 +6,8 @@ nobody has told of, beside ten busy processes.  The arm and its watchdog are in 
 controller in one of its own.  The arm's clock is slower than the computer's, so that also a slow
 one keeps up.
 
-Episodes in which the controller hangs are reported, but not asserted: when it goes on after more
-than some 0.1 s, and stops, it holds what it had learned of the load before.  In motion that is
-also inertia and friction, and a wrist was moved at up to 1 rad/s for a tenth of a second.
+A controller that hangs and goes on finds one of the states of the meantime in its queue, and then
+the newest, while the watchdog has braked the arm.
 """
 
 from __future__ import annotations
@@ -43,7 +42,6 @@ from blf_dsc_controller.nodes.watchdog_node import WatchdogNode
 CONTROLLER = '/blf_dsc_controller'
 LOAD = {'events.begin': [0.0], 'events.duration': [1e6], 'events.payload': [2.0]}
 PATIENT = {'safety.state_timeout': 10.0, 'safety.overrun_fraction': 1.0}
-REPORTED = 'hang_controller'
 # ends with the process that started it
 BUSY = (
     'import os; os.nice(10); parent = os.getppid()\nwhile os.getppid() == parent: pass'
@@ -215,8 +213,7 @@ if __name__ == '__main__':
         for preset in ('fr3', 'ur5e_driver'):
             for name, excess in soak(preset, given.episodes // 2, given.seed).items():
                 print(f'{preset:12} {name:16} worst {max(excess):+.3f} rad/s')
-                if name != REPORTED:
-                    faster[preset] += sum(each > SLACK for each in excess)
+                faster[preset] += sum(each > SLACK for each in excess)
         assert not faster.total(), faster
     finally:
         for process in busy:

@@ -12,7 +12,7 @@ _PARTS = {
     '': 'robust_gain=mu_bar',
     'barrier': 'bound initial_bound funnel_rate weight slope_limit knee',
     'surface': 'gain=K mu time_constant known_rate',
-    'feedback': 'gain=Kp damping=d2 damping_rate follows_inertia decoupled',
+    'feedback': 'gain=Kp robust_gain=d2 damping_rate follows_inertia decoupled',
     'disturbance': 'gain=gamma leakage=eta bumpless',
     'torque': 'limit=torque_limit rate_limit drive',
     'columns': 'bias viscous coulomb coulomb_velocity frequencies ripple_cycles',

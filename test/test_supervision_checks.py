@@ -478,13 +478,12 @@ def test_last_torque_is_the_safe_torque_of_an_arm_at_rest(safety, on_a_ramp):
     torque = rig.guard.release()
     samples = rig.guard.samples
     q = rig.guard._safe_torque.last.q
-    holding = (
-        dynamics(samples.estimate[:3], 9.8, q, (0.0, 0.0))[2] + samples.disturbance
-    )
+    load = rig.guard._recent.load(rig.guard.controller.settings, samples.estimate)
+    holding = dynamics(samples.estimate[:3], 9.8, q, (0.0, 0.0))[2] + load
     np.testing.assert_allclose(
         torque, holding if safety == 'hold_gravity' else [0.0, 0.0]
     )
-    assert np.abs(samples.disturbance).min() > 0.01
+    assert np.abs(load).min() > 0.01
 
 
 def test_arm_settles_after_a_deactivation():

@@ -247,7 +247,7 @@ def test_load_known_before_is_used_if_the_arm_speeds_up_in_the_stop():
     rig = Rig({'safety.torque': 'hold_gravity'})
     rig.step(300)
     rig.guard.fail('by the test')
-    known = rig.guard.samples.disturbance.copy()
+    known = rig.guard._safe_torque.load.copy()
     rig.push[:] = [0.0, 2.0]
     rig.actuate = lambda _: []  # the last torque is held: nothing brakes
     seen = []

@@ -24,7 +24,6 @@ from blf_dsc_controller.law.telemetry import disturbance_names
 from blf_dsc_controller.law.weighing import DEVIATION
 from blf_dsc_controller.messages import topics
 from blf_dsc_controller.messages.codecs import JointStateEncoder
-from blf_dsc_controller.messages.journal import MOTIONS
 from blf_dsc_controller.numerics.intervals import TWO_SIDED
 from blf_dsc_controller.reference.trajectory import Trajectory, TrajectoryPoint
 from blf_dsc_controller.supervision.drive_load import DriveLoad
@@ -429,8 +428,5 @@ class ArmController:
         self._tell_events(stamp)
 
     def _tell_events(self, stamp: int) -> None:
-        pending = self._loop.guard.journal.pending
-        while pending:
-            event = pending.popleft()
-            topic = topics.TARGETS if event.type in MOTIONS else topics.JOURNAL
-            self._outputs.write(stamp, topic, event.encode())
+        for message in self._loop.guard.journal.take():
+            self._outputs.write(stamp, *message)

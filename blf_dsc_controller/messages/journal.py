@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import json
 from collections import deque
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from enum import Enum
 from typing import Any, NamedTuple
 
@@ -21,7 +21,7 @@ from blf_dsc_controller.messages.event_content import (
     check_change,
     check_event,
 )
-from blf_dsc_controller.messages.topics import CHANGES, JOURNAL
+from blf_dsc_controller.messages.topics import CHANGES, JOURNAL, TARGETS, Topic
 from blf_dsc_controller.run import Contact, Oscillation
 
 OUTSIDE_BOUND = 'error past the bound'
@@ -205,3 +205,9 @@ class Journal:
         )
         self._number += 1
         self.pending.append(noted)
+
+    def take(self) -> Iterator[tuple[Topic, bytes]]:
+        """Yield each pending event with its topic, as a message; it is not pending any more."""
+        while self.pending:
+            event = self.pending.popleft()
+            yield TARGETS if event.type in MOTIONS else JOURNAL, event.encode()

@@ -21,7 +21,7 @@ from blf_dsc_controller.control.status_report import (
     StatusReport,
 )
 from blf_dsc_controller.messages import topics
-from blf_dsc_controller.messages.journal import MOTIONS, EventType
+from blf_dsc_controller.messages.journal import EventType
 from blf_dsc_controller.nodes.endpoints import create_publisher
 from blf_dsc_controller.supervision.guard import Guard
 
@@ -98,7 +98,6 @@ class ControllerStatus(StatusReport):
 
     def publish_events(self, guard: Guard) -> None:
         """Publish the new events."""
-        while guard.journal.pending:
-            event = guard.journal.pending.popleft()
-            publisher = self._targets if event.type in MOTIONS else self.journal
-            publisher.publish(event.encode())
+        for topic, raw in guard.journal.take():
+            publisher = self.journal if topic is topics.JOURNAL else self._targets
+            publisher.publish(raw)

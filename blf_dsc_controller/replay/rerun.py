@@ -21,9 +21,9 @@ from blf_dsc_controller.bags.sources import BagMessage
 from blf_dsc_controller.bags.topic_messages import JointStates, TopicMessages
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.schema import change, parameters
+from blf_dsc_controller.control.guarded_loop import GuardedLoop
 from blf_dsc_controller.errors import BlfDscError
-from blf_dsc_controller.law.factory import estimate_names
-from blf_dsc_controller.law.telemetry import ControllerTelemetry, Message
+from blf_dsc_controller.law.telemetry import Message
 from blf_dsc_controller.messages.codecs import MessageError
 from blf_dsc_controller.messages.journal import MOTIONS, Event, EventType
 from blf_dsc_controller.messages.topics import TRACKING_ERROR, Topic
@@ -34,7 +34,6 @@ from blf_dsc_controller.reference.trajectory import (
 )
 from blf_dsc_controller.run import Floats
 from blf_dsc_controller.supervision.drive_load import DriveLoad
-from blf_dsc_controller.supervision.guard import Guard
 from blf_dsc_controller.supervision.supervisor import Reason
 
 _UNREADABLE = frozenset(
@@ -102,9 +101,10 @@ class Rerun:
         self.departure: tuple[str, int] | None = None
         self.alteration: Alteration | None = None
         self.end = ''
-        self._guard = Guard(config, lambda: 0, lambda: 0)
+        self._loop = GuardedLoop(config, lambda: 0, lambda: 0)
+        self._guard = self._loop.guard
         self._guard.journal.pending.clear()
-        self._telemetry = ControllerTelemetry(config, estimate_names(config))
+        self._telemetry = self._loop.telemetry
         self._states = states
         self._values = np.empty((0, 3, 0))
         self._loaded = range(0)
@@ -257,9 +257,12 @@ class Rerun:
             if stamp <= self.last:
                 self.end = f'the stamps restart at {stamp} ns'
                 return
-            self._add_sample(stamp)
-        elif torque is not None:
-            self._add(stamp, self._telemetry.answer(stamp, torque))
+            self.first = stamp if self.first < 0 else self.first
+            self.last = stamp
+            self.samples += 1
+        guard.compute_time = 0.0  # of another computer
+        for message in self._loop.messages(torque):
+            self._add(stamp, message)
         self._command(stamp, torque)
 
     def _measurement(self, row: int) -> Floats:
@@ -272,20 +275,6 @@ class Rerun:
         return np.ravel(self._values[row - self._loaded.start])
 
     # Outputs.
-
-    def _add_sample(self, stamp: int) -> None:
-        """Add the last sample of the law, for the state with this stamp [ns]."""
-        guard = self._guard
-        controller = self._guard.controller
-        if self.first < 0:
-            self.first = stamp
-        self.last = stamp
-        self.samples = self.samples + 1
-        if controller.samples == 1:
-            self._telemetry.restart()
-        known = controller.sample, controller.settings.torque.limit, guard.samples.ratio
-        for message in self._telemetry.sample(stamp, *known, 0.0):
-            self._add(stamp, message)
 
     def _command(self, stamp: int, torque: Floats | None) -> None:
         """Add a torque (n,) [N m], if any, commanded after this state's stamp [ns]."""

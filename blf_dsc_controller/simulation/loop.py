@@ -154,9 +154,9 @@ def _run_compiled(
     before = controller.save(), plant.save(), controller.checks_vector.copy()
     span = Span(chunk.start, chunk.stop - 1, is_end, observed=True)
     if loop.run(span, record.rows_to_fill()):
-        guard.advance(
-            START + int(record.stamps[-1]), record.measurements[-1], len(chunk)
-        )
+        at = controller.torque_at
+        torques = record.samples[:, at : at + controller.settings.n]
+        guard.advance(START + record.stamps, record.measurements, torques)
         return True
     controller.restore(before[0])
     plant.restore(before[1])

@@ -50,8 +50,11 @@ from blf_dsc_controller.supervision.calming import Calming
 from blf_dsc_controller.supervision.contact import contact_of
 from blf_dsc_controller.supervision.drive_load import DriveLoad, DriveLoads
 from blf_dsc_controller.supervision.first_torque import check_first_torque
+from blf_dsc_controller.supervision.held_torque import held_command
 from blf_dsc_controller.supervision.last_state import LastState
+from blf_dsc_controller.supervision.model_torque import needed_torque
 from blf_dsc_controller.supervision.plan import Plan, plan_motion
+from blf_dsc_controller.supervision.recent_motion import RecentMotion, is_gap
 from blf_dsc_controller.supervision.safe_torque import SafeTorque
 from blf_dsc_controller.supervision.sample_check import SampleCheck
 from blf_dsc_controller.supervision.start import (
@@ -74,7 +77,7 @@ from blf_dsc_controller.supervision.wraps import Wraps
 Vector = NDArray[np.float64]
 _NANO = 1e-9
 _MANY = 0.5  # states missed for each that came
-_IN_A_ROW = 0.1  # s between two states, at most
+_CHANGED = 0.5  # of the speed: an arm whose clock was set keeps its own
 _SLOWEST = 0.03  # rad/s: a velocity that contradicts positions has more
 
 # Commands that do not reach the arm may be why, or velocities that are not its own:
@@ -157,6 +160,9 @@ class Guard:
         self._wraps = Wraps(config)
         self._safe_torque = SafeTorque(n)
         self._safe_torque.scale = self.controller.state.rotors.gain_scale
+        self._recent = RecentMotion(n, config.sample_time)
+        # the last measurement, if it is the first after a gap
+        self._after_gap: Vector | None = None
         self._seen = 0  # ns, stamp of the last state, used or not
         self._gap = 0.0  # s, since the one before
         self._stop_speed = StopSpeed()
@@ -199,6 +205,8 @@ class Guard:
         measurement, wrapped = self._counted(measurement)
         if self._velocity is not None:
             self._velocity.replace(stamp, measurement)
+        if is_gap(self._gap, self.config.sample_time):
+            self._after_gap = measurement
         if self.supervisor.uses_states:
             fault = self.states.check(self.config.safety, stamp)
             if fault is SKIP:
@@ -248,7 +256,7 @@ class Guard:
         """Compare velocities with positions only between states in a row."""
         self._gap = (stamp - self._seen) * _NANO
         self._seen = stamp
-        if not 0.0 <= self._gap < _IN_A_ROW:
+        if self._gap < 0.0 or is_gap(self._gap, self.config.sample_time):
             restart(self.controller.checks.sensor)
 
     def _with_cause(self, fault: Fault) -> Fault:
@@ -263,6 +271,8 @@ class Guard:
             return None
         q, dq, _ = measurement.reshape(3, -1)
         mean = 0.5 * (dq + last.dq)
+        if np.abs(dq - last.dq).max() > _CHANGED * np.abs(mean).max():
+            return None  # it has been braked or driven on: the time has passed
         return self.states.clock_step(self._gap, q - last.q, mean)
 
     def _use(self, stamp: int, measurement: Vector) -> Vector | None:
@@ -277,16 +287,14 @@ class Guard:
             last.take(stamp, measurement, self._slow)
             if not self._start(stamp, measurement):
                 return self._safe(self.config.sample_time)
+        elif self._after_gap is not None and not self._rejoin(stamp, measurement):
+            return self._safe_at(stamp, measurement)
         dt = (stamp - self.last_stamp) * _NANO
         before = perf_counter()
         torque = law.update(self._time_of(stamp), dt, measurement)
         self.compute_time = perf_counter() - before
-        if law.flags & CONTRADICTION:
-            self._distrust_velocities(stamp, measurement)
-            return self._safe_at(stamp, measurement)
         if law.flags & INVALID:
-            invalid = self.states.invalid(self.config.safety, measurement)
-            self._stop(*self._with_cause(invalid))
+            self._stop_at_invalid(stamp, measurement)
             return self._safe_at(stamp, measurement)
         last.take(stamp, measurement, self._slow)
         self._advance_to(stamp)
@@ -295,9 +303,18 @@ class Guard:
             self._stop(*fault)
             return self._safe(self.config.sample_time)
         self._safe_torque.commanded[:] = torque
+        self._recent.take(stamp, measurement, torque)
         self.has_sample = True
         self.journal.commands += 1
         return torque
+
+    def _stop_at_invalid(self, stamp: int, measurement: Vector) -> None:
+        """Stop because of a state that the law has not used."""
+        if self.controller.flags & CONTRADICTION:
+            self._distrust_velocities(stamp, measurement)
+        else:
+            invalid = self.states.invalid(self.config.safety, measurement)
+            self._stop(*self._with_cause(invalid))
 
     def _calm(self) -> Fault | None:
         """Soften the feedback of an arm that oscillates; a fault if that has not helped."""
@@ -326,6 +343,7 @@ class Guard:
         loads = self._loads()
         self._note(EventType.DRIVE_LOAD, mass=load.mass, centre=list(load.centre))
         loads.take(self.controller, load)
+        self._recent.restart()  # the torques so far met drives without it
 
     def declare(self, load: DriveLoad) -> None:
         """Let `load_to_tell` lead to this load, whatever is weighed.
@@ -398,7 +416,7 @@ class Guard:
         self._compare_velocities(stamp, self._counted(measurement)[0])
 
     def _compare_velocities(self, stamp: int, measurement: Vector) -> None:
-        is_next = 0.0 < self._gap < _IN_A_ROW
+        is_next = self._gap > 0.0 and not is_gap(self._gap, self.config.sample_time)
         if not is_next or not np.isfinite(measurement[: -self._n]).all():
             return
         if self.controller.compare_velocities(self._gap, measurement):
@@ -443,7 +461,7 @@ class Guard:
     def _start(self, stamp: int, measurement: Vector) -> bool:
         """Resume the running reference if possible, otherwise start at t = 0."""
         q, dq, _ = measurement.reshape(3, -1)
-        motion = self._resumption(stamp, q, dq)
+        motion = self._resumption(stamp, q, dq) if self._resumable else None
         resumed = motion is not None
         try:
             if motion is None:
@@ -454,17 +472,27 @@ class Guard:
         except (StartError, MotionError) as error:
             self.refuse(error)
             return False
-        self.settled = motion.settled
         if not resumed:
             self.start_stamp = stamp
             _, self.turned = reference_near(self.config, q)
+        self._take_over(stamp, q, motion, resumed=resumed)
+        return True
+
+    def _take_over(
+        self, stamp: int, q: Vector, motion: BlendedReference, *, resumed: bool
+    ) -> None:
+        """Let the law begin with this state, at the torque that acts."""
+        self.controller.reference_vector = motion.vector
+        self.settled = motion.settled
         if self.commanding:
-            self.controller.take_over(self._safe_torque.commanded, q)
+            held = self._held_since_gap()
+            acting = self._safe_torque.commanded if held is None else held
+            self.controller.take_over(acting, q)
         self.journal.note(EventType.START, resumed=resumed)
         self.last_stamp = stamp - self.config.sample_time_ns
+        self._recent.restart()
         self.watchdog.switch(self.config.safety.watchdog, stamp)
         self.supervisor.enter(Phase.APPROACHING)
-        return True
 
     def prepare(self, positions: Vector) -> None:
         """Plan the start from rest at `positions` (n,) [rad], before the first state.
@@ -503,9 +531,30 @@ class Guard:
         self.start_error = error
         self._stop(Reason.START_REJECTED, str(error))
 
+    def _rejoin(self, stamp: int, measurement: Vector) -> bool:
+        """Return to the reference from where the arm is after a gap, or stop if it is too far.
+
+        Whoever commanded it meanwhile may have braked it.  Of an invalid state, the law
+        says what is wrong.
+        """
+        if not is_valid_state(self.controller.checks, measurement):
+            return True
+        q, dq, _ = measurement.reshape(3, -1)
+        motion = self._resumption(stamp, q, dq)
+        if motion is None:
+            text = (
+                f'no joint state came for {self._gap:.3g} s, and the arm is too far from its '
+                'reference now'
+            )
+            self._stop(Reason.STAMP_JUMP, text)
+            return False
+        self.controller.state.samples[0] = 0.0
+        self._take_over(stamp, q, motion, resumed=True)
+        return True
+
     def _resumption(self, stamp: int, q: Vector, dq: Vector) -> BlendedReference | None:
         """Return the way back to the running reference, None if the arm is too far."""
-        if not self._resumable or stamp <= self.last_stamp:
+        if stamp <= self.last_stamp:
             return None
         t = self._time_of(stamp)
         bound = self.controller.bound_at(t)
@@ -520,11 +569,17 @@ class Guard:
         if self.supervisor.phase is Phase.APPROACHING and self.time >= self.settled:
             self.supervisor.enter(Phase.TRACKING)
 
-    def advance(self, stamp: int, measurement: Vector, count: int) -> None:
-        """Advance to the state of a stamp [ns], the last of `count` used by the law.
+    def advance(
+        self, stamps: Vector, measurements: np.ndarray, torques: np.ndarray
+    ) -> None:
+        """Advance by k states, all used by the law, with their stamps (k,) [ns].
 
-        All checks passed, and `samples.ratio` and the kept estimates are up to date.
+        `measurements` (k, 3n) and `torques` (k, n) [N m] have a row for each.  All checks
+        passed, and `samples.ratio` and the kept estimates are up to date.
         """
+        for k in range(max(0, stamps.size - self._recent.size), stamps.size):
+            self._recent.take(int(stamps[k]), measurements[k], torques[k])
+        count, stamp, measurement = stamps.size, int(stamps[-1]), measurements[-1]
         self.journal.stamp = stamp
         self._seen = stamp
         self.journal.messages += count
@@ -533,7 +588,7 @@ class Guard:
         self._wraps.follow(measurement)
         self._safe_torque.last.take(stamp, measurement, self._slow)
         self._safe_torque.commanded[:] = self.controller.state.torque
-        self.states.advance(stamp)
+        self.states.advance(stamp, count)
         self.samples.relax((stamp - self.last_stamp) * _NANO)
         self._advance_to(stamp)
 
@@ -562,6 +617,7 @@ class Guard:
 
     def time_out(self, text: str) -> Vector | None:
         """Return the torque of one watchdog period without a joint state."""
+        self._after_gap = None
         if self.supervisor.phase is not Phase.STARTING:  # which is waiting for a state
             self._stop(Reason.STATE_TIMEOUT, text)
         self.watchdog.torques += 1
@@ -575,12 +631,14 @@ class Guard:
 
     def fail(self, text: str) -> Vector | None:
         """Return the torque after an unexpected error."""
+        self._after_gap = None
         self._stop(Reason.FAILED, text)
         return self._safe_without_state(self.config.sample_time)
 
     def _begin_message(self) -> None:
         self.end_silence()
         self.waiting_for = ''
+        self._after_gap = None
         self.has_sample = False
         self.journal.messages += 1
 
@@ -599,8 +657,7 @@ class Guard:
         return (stamp - self.start_stamp) * _NANO
 
     def _stop(self, reason: Reason, text: str) -> None:
-        # for each that came
-        missed = self.states.missed / max(self.controller.samples - 1, 1)
+        missed = self.states.missed_for_each
         if missed > _MANY and reason is not Reason.OVERRUN:
             T = self.config.sample_time
             text += f'; {rate_mismatch((1.0 + missed) * T, T)}'
@@ -613,12 +670,46 @@ class Guard:
             self._stop_speed.begin(self._speed)
             self.journal.note(EventType.STOP, reason=reason, text=text)
             self._clean = self._resumable = False
+            load = self._load_at_stop(reason) if was_running else self._known_load
             self._safe_torque.begin_ramp(
                 self.config.safety.stop_ramp,
-                self.samples.disturbance,
+                load,
                 reached=reached or oscillates,
                 oscillates=oscillates,
             )
+
+    def _load_at_stop(self, reason: Reason) -> Vector:
+        """Return what holds the arm besides its model (n,) [N m], where the law stops.
+
+        After a silence it is what holds it now, whoever commands that.
+        """
+        if self._after_gap is None:
+            is_wound_up = reason in _WINDING_UP or reason is Reason.NO_EFFECT
+            return self._known_load if is_wound_up else self._recent_load
+        held = self._held_since_gap()
+        if held is None:
+            return self._recent_load
+        self._safe_torque.commanded[:] = held
+        settings, q = self.controller.settings, self._after_gap[: self._n]
+        at_rest = np.zeros((2, self._n))
+        return held - needed_torque(settings, self.samples.estimate, q, *at_rest)
+
+    def _held_since_gap(self) -> Vector | None:
+        """Return the command (n,) [N m] that acts, if a gap ends here and efforts show it."""
+        if self._after_gap is None:
+            return None
+        return held_command(self.config, self.controller.settings, self._after_gap)
+
+    @property
+    def _known_load(self) -> Vector:
+        """The load (n,) [N m] by the disturbance estimate."""
+        return self.samples.disturbance
+
+    @property
+    def _recent_load(self) -> Vector:
+        """The load (n,) [N m] by the motion of the last samples, if they are enough."""
+        load = self._recent.load(self.controller.settings, self.samples.estimate)
+        return self._known_load if load is None else load
 
     def _safe_without_state(self, dt: float) -> Vector | None:
         self.has_sample = False
@@ -672,7 +763,7 @@ class Guard:
         self.watchdog.restart()
         if self._resumable:
             ramp = self.config.safety.deactivation_ramp
-            self._safe_torque.begin_ramp(ramp, self.samples.disturbance)
+            self._safe_torque.begin_ramp(ramp, self._recent_load)
 
     def reset(self) -> None:
         """Discard all estimates and faults, and restart with the next state."""
@@ -781,7 +872,7 @@ class Guard:
         if not self.commanding or self.silenced:
             return None
         if self.supervisor.running:
-            self._safe_torque.load[:] = self.samples.disturbance
+            self._safe_torque.load[:] = self._recent_load
         return self._safe_torque.leave(
             self.config.safety, self.controller.settings, self.samples.estimate
         )

@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from blf_dsc_controller.law.sensor import FILTER as SLOW
+from blf_dsc_controller.supervision.recent_motion import is_gap
 
 Vector = NDArray[np.float64]
 
@@ -57,14 +58,16 @@ class LastState:
 
         Positions that are not finite or have a repeated stamp do not show where the arm
         is now. A velocity that is missing, not finite or beyond the limit is replaced
-        with the one differenced from the positions, within the limit.
+        with the one differenced from the positions, within the limit.  After a silence,
+        whose positions show only its mean velocity, `slow` begins with the measured one.
         """
         q, dq, _ = measurement.reshape(3, -1)
         if stamp == self._stamp or not np.isfinite(q).all():
             self.miss(period)
             return
         elapsed = (stamp - self._stamp) * 1e-9
-        is_next = self.age == 0.0 and elapsed > 0.0
+        is_late = is_gap(elapsed, period)
+        is_next = self.age == 0.0 and elapsed > 0.0 and not is_late
         differenced = np.zeros_like(q)
         if is_next:
             differenced = np.clip(
@@ -72,6 +75,8 @@ class LastState:
             )
             self.slow += min(1.0, elapsed / SLOW) * (differenced - self.slow)
         usable = np.where(np.abs(dq) <= velocity_limit, dq, differenced)
+        if is_late:
+            self.slow[:] = usable
         self.ddq = (usable - self.dq) / elapsed if is_next else None
         self.q[:] = q
         self.dq[:] = usable

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from blf_dsc_controller.arms.friction import sliding
 from blf_dsc_controller.arms.model import regressors_at
 from blf_dsc_controller.law.state import Settings
+from blf_dsc_controller.law.torque import added_torque
 
 Vector = NDArray[np.float64]
 
@@ -38,3 +39,14 @@ def friction_torque(settings: Settings, estimate: Vector, dq: Vector) -> Vector:
             torque += estimate[at : at + n] * effect
             at += n
     return torque
+
+
+def needed_torque(
+    settings: Settings, estimate: Vector, q: Vector, dq: Vector, ddq: Vector
+) -> Vector:
+    """Return the command (n,) [N m] behind a motion, by model and friction of the estimate."""
+    with np.errstate(over='ignore', invalid='ignore'):  # the caller checks it
+        needed = model_torque(settings, estimate, q, dq, ddq)
+        needed += friction_torque(settings, estimate, dq)
+    needed -= added_torque(settings.torque, q)
+    return needed

@@ -16,7 +16,7 @@ from blf_dsc_controller.reference.approach import AT_REST
 from blf_dsc_controller.supervision.braking import braking_matrix
 from blf_dsc_controller.supervision.command_effect import CommandEffect
 from blf_dsc_controller.supervision.last_state import LastState
-from blf_dsc_controller.supervision.model_torque import friction_torque, model_torque
+from blf_dsc_controller.supervision.model_torque import model_torque, needed_torque
 
 Vector = NDArray[np.float64]
 
@@ -82,7 +82,8 @@ class SafeTorque:
     they act (`CommandEffect`).  Once the arm has sped up it stays for good.
 
     Attributes:
-        load: torque (n,) [N m] that the model lacks; initially the disturbance estimate of the law.
+        load: torque (n,) [N m] that the model lacks; initially that of the motion before
+            (`RecentMotion`), or the disturbance estimate of the law.
         commanded: the last torque (n,) [N m], from the law or this ramp.
         last: the last usable joint state.
         missed_change: change (n,) [N m] of the commands since the stop to which the arm has not
@@ -226,10 +227,7 @@ class SafeTorque:
         last = self.last
         if last.ddq is None:
             return None
-        with np.errstate(over='ignore', invalid='ignore'):
-            needed = model_torque(settings, estimate, last.q, last.dq, last.ddq)
-            needed += friction_torque(settings, estimate, last.dq)
-        needed -= added_torque(settings.torque, last.q)
+        needed = needed_torque(settings, estimate, last.q, last.dq, last.ddq)
         return needed if np.isfinite(needed).all() else None
 
     def _update_load(self, settings: Settings, needed: Vector, dt: float) -> None:

@@ -64,14 +64,15 @@ class StateCheck:
 
     def restart(self) -> None:
         """Start with the next state, whatever its stamp."""
-        self.missed = 0
+        self.missed = self._taken = 0
         self.missed_fraction = 0.0
         self._last_stamp = -1
         self._repeats = 0
 
-    def advance(self, stamp: int) -> None:
-        """Mark all states up to a stamp [ns] as checked."""
+    def advance(self, stamp: int, count: int) -> None:
+        """Mark `count` states as checked, up to a stamp [ns]."""
         self._last_stamp = stamp
+        self._taken += count
 
     def check(self, safety: Safety, stamp: int) -> Fault | None:
         """Return why the controller must stop; SKIP: ignore the state; None: use it.
@@ -98,7 +99,13 @@ class StateCheck:
             )
             return Fault(Reason.STAMP_JUMP, text)
         self._last_stamp = stamp
+        self._taken += 1
         return self._count_missed(safety, max(1, round(step / self._sample_time)) - 1)
+
+    @property
+    def missed_for_each(self) -> float:
+        """States missing between two that came, on average since the start."""
+        return self.missed / max(self._taken - 1, 1)
 
     def _check_repeats(self) -> Fault:
         self.repeated += 1

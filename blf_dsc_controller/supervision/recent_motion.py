@@ -1,0 +1,81 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The motion of the last samples and its torques: what the arm carries besides its model.
+
+The disturbance estimate of the law is an integral: in motion it is also the friction,
+the error of the inertia, and what it has wound up so far.  As a load to be held it moves
+the joints that are light.  What the torques of the last samples have moved besides the
+model is not:
+
+    load = mean of tau - H(q, dq, dq, ddq) P^ - friction
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from blf_dsc_controller.law.state import Settings
+from blf_dsc_controller.supervision.model_torque import needed_torque
+
+Array = NDArray[np.float64]
+
+_GAP = 0.03  # s, in which an arm that another commands leaves its reference ...
+_MISSED = 2.5  # ... samples; fewer that are missing are no gap
+_AVERAGED = 0.1  # s: the noise of a difference of velocities over it is small
+_BLOCKS = 10  # of it or some more, each with the mean acceleration in it
+
+
+def is_gap(elapsed: float, sample_time: float) -> bool:
+    """Whether a state comes so long [s] after the last one that it does not follow it."""
+    return elapsed >= max(_GAP, _MISSED * sample_time)
+
+
+class RecentMotion:
+    """Positions, velocities and torques of the last 0.1 s of the law."""
+
+    def __init__(self, n: int, sample_time: float) -> None:
+        """`sample_time` is T [s]."""
+        self._sample_time = sample_time
+        samples = max(1, round(_AVERAGED / sample_time))
+        self._step = max(1, samples // _BLOCKS)  # samples in a block
+        self._blocks = samples // self._step
+        self.size = self._blocks * self._step + 1
+        self._stamps = np.zeros(self.size, dtype=np.int64)
+        self._states = np.zeros((self.size, 2 * n))
+        self._torques = np.zeros((self.size, n))
+        self._count = 0
+
+    def restart(self) -> None:
+        """Begin with the next sample."""
+        self._count = 0
+
+    def take(self, stamp: int, measurement: Array, torque: Array) -> None:
+        """Take a state [q, dq, ...] with its stamp [ns], and its torque (n,) [N m]."""
+        elapsed = 1e-9 * (stamp - self._stamps[(self._count - 1) % self.size])
+        if elapsed <= 0.0 or is_gap(elapsed, self._sample_time):
+            self.restart()
+        at = self._count % self.size
+        self._stamps[at] = stamp
+        self._states[at] = measurement[: self._states.shape[1]]
+        self._torques[at] = torque
+        self._count += 1
+
+    def load(self, settings: Settings, estimate: Array) -> Array | None:
+        """Return the torque (n,) [N m] that the model lacks; None in the first 0.1 s."""
+        if self._count < self.size:
+            return None
+        order = np.arange(self._count - self.size, self._count) % self.size
+        times = 1e-9 * self._stamps[order[:: self._step]]
+        states = self._states[order[:: self._step]]
+        torques = self._torques[order[:-1]].reshape(self._blocks, self._step, -1)
+        steps = np.diff(times)
+        means = 0.5 * (states[:-1] + states[1:])
+        changes = np.diff(states, axis=0) / steps[:, np.newaxis]
+        n = torques.shape[2]
+        lacking = [
+            torque.mean(axis=0)
+            - needed_torque(settings, estimate, mean[:n], mean[n:], change[n:])
+            for torque, mean, change in zip(torques, means, changes, strict=True)
+        ]
+        load = np.asarray(np.mean(lacking, axis=0))
+        return load if np.isfinite(load).all() else None
