@@ -157,7 +157,7 @@ def test_light_load_is_noticed_and_weighed():
     changes = measure(record.run()).model_changes
     assert changes == pytest.approx([PICKED_UP, PUT_DOWN], abs=1.0)
     is_as_told(load[t == PUT_DOWN - 0.5][0], 0.08, 0.05)
-    # The weighing notices it by itself: what it knew before is discarded.
+    # What was known before is discarded.
     unknown = t[(t > 6.0) & ~np.isfinite(load[:, 0])]
     assert PICKED_UP < unknown[0] < PICKED_UP + 1.0
 
