@@ -179,7 +179,7 @@ def loop_of(arm: str, seed: int, load: float) -> LoopConfig:
 
     def varied(values: tuple[float, ...]) -> list[float]:
         factors = random.uniform(*FRICTION, len(values))
-        return (factors * values).tolist()
+        return [float(each) for each in factors * values]
 
     held = [load] if load else []
     plant: dict[str, Any] = {
