@@ -69,22 +69,19 @@ def rows_of(theta, count, noise=0.0, seed=0):
 
 
 @pytest.mark.parametrize(
-    ('rows', 'least', 'prior', 'predicted'),
+    ('rows', 'prior', 'predicted'),
     [
-        (LENGTH - 1, 0.0, 1e-9, True),  # not full
-        (LENGTH - 1, 0.1, 1e-9, True),
-        (LENGTH, 0.0, 1e-9, True),  # full, but none has been accepted
-        (LENGTH, 0.1, 1e-9, False),  # known to be of one arm
-        (LENGTH - 1, 0.0, 0.0, False),  # a planar arm, without a prior
+        (LENGTH - 1, 1e-9, True),
+        (LENGTH, 1e-9, True),  # however many there are
+        (LENGTH, 0.0, False),  # a planar arm, without a prior
     ],
 )
-def test_rows_are_compared_with_those_before_until_a_full_window_is_known(
-    parts, rows, least, prior, predicted
+def test_rows_are_compared_with_those_before_where_there_is_a_prior(
+    parts, rows, prior, predicted
 ):
     parts.sliding.state.rows[0] = rows
-    parts.latch.least_residual[0] = least
     sliding = parts.sliding._replace(settings=SIZES._replace(prior_weight=prior))
-    assert change.is_predicted(parts.latch, sliding) == predicted
+    assert change.is_predicted(sliding) == predicted
 
 
 @pytest.mark.parametrize(
@@ -129,10 +126,40 @@ def test_rows_of_another_arm_contradict_those_before(parts, changed, found):
     )
     for k, row in enumerate(arms):
         contradicted = contradicted or change.compare_with_rows(
-            parts.change, parts.work, parts.sliding, PRIOR, row.copy(), 0.02, k + 1, DT
+            parts.change,
+            parts.work,
+            parts.sliding,
+            PRIOR,
+            row.copy(),
+            1.0,
+            0.02,
+            k + 1,
+            DT,
         )
         window.push_row(parts.sliding.state, row)
     assert contradicted == found
+
+
+def test_first_motion_after_a_rest_is_no_change(parts):
+    """Rows at rest are all zeros.  As rows that fit, they would leave no noise to compare with."""
+    rest = np.zeros((200, N, M + 1))
+    arms = np.concatenate(
+        (rows_of(THETA, 60, 0.05, 1), rest, rows_of(THETA, 60, 0.05, 2))
+    )
+    for k, row in enumerate(arms):
+        share = float(row.any())
+        assert not change.compare_with_rows(
+            parts.change,
+            parts.work,
+            parts.sliding,
+            PRIOR,
+            row.copy(),
+            share,
+            0.02,
+            k + 1,
+            DT,
+        )
+        window.push_row(parts.sliding.state, row)
 
 
 def test_change_forgets_the_window_and_the_latch_and_the_estimate_is_the_anchor(parts):

@@ -60,10 +60,10 @@ def test_rows_that_fit_ever_worse_are_noise_and_those_of_a_change_are_not():
     for squares, expected in (
         (np.full(400, 0.3), False),
         (0.1 + 0.9 * np.linspace(0.0, 1.0, 400) ** 2, False),
-        (np.append(np.full(200, 0.1), np.full(20, 2.0)), True),
+        (np.append(np.full(200, 0.1), np.full(20, 2.5)), True),
     ):
         state = begun()
-        found = [update(state, each, 1.0, PERIOD, MOST) for each in squares]
+        found = [update(state, each, 1.0, 1.0, PERIOD, MOST) for each in squares]
         assert any(found) == expected
     assert np.argmax(found) - 200 < 10
 
@@ -89,24 +89,51 @@ def test_row_of_a_change_hardly_raises_the_noise():
     found = []
     for square in (0.3, 1.0, 1e6):  # s^2 is 0.1
         state = begun()
-        update(state, square, 1.0, PERIOD, MOST)
+        update(state, square, 1.0, 1.0, PERIOD, MOST)
         found.append(float(state.mean[0]))
     assert found == pytest.approx([0.3, 0.3, 0.3])
     state = begun()
-    update(state, 0.2, 1.0, PERIOD, MOST)
+    update(state, 0.2, 1.0, 1.0, PERIOD, MOST)
     assert state.mean[0] == pytest.approx(0.2)
 
 
-@pytest.mark.parametrize(('factor', 'changed'), [(4.9, False), (5.1, True)])
-def test_arm_has_changed_from_five_times_the_noise_on_average_over_a_tenth_of_a_second(
+def test_rest_is_no_evidence_that_rows_fit():
+    """A row at rest has no share: neither the noise nor the last rows change in ten seconds."""
+    state = begun()
+    for _ in range(200):
+        update(state, 0.3, 1.0, 1.0, PERIOD, MOST)
+    before = [float(value[0]) for value in state]
+    for _ in range(1000):
+        assert not update(state, 0.0, 0.0, 1.0, PERIOD, MOST)
+    assert [float(value[0]) for value in state] == before
+
+
+@pytest.mark.parametrize('share', [1.0, 0.25, 0.01])
+def test_noise_is_that_of_moving_rows_whatever_their_weight(share):
+    """Rows of a weight w have w^2 of the square, and say the same of s^2."""
+    state = begun()
+    for _ in range(round(600 / share)):
+        assert not update(state, 0.3 * share, share, 1.0, PERIOD, MOST)
+    assert state.noise[0] == pytest.approx(0.3, rel=0.01)
+    assert state.recent[0] == pytest.approx(0.3, rel=0.01)
+
+
+def test_rows_before_any_motion_leave_what_is_assumed():
+    state = begun()
+    assert not update(state, 0.0, 0.0, 1.0, PERIOD, MOST)
+    assert state.noise[0] == 0.1
+
+
+@pytest.mark.parametrize(('factor', 'changed'), [(7.9, False), (8.1, True)])
+def test_arm_has_changed_from_eight_times_the_noise_on_average_over_a_tenth_of_a_second(
     factor, changed
 ):
     state = begun()
     state.recent[0] = 0.1  # s^2: rows that fit
     square = 0.1 * (1.0 + MEMORY * (factor - 1.0))  # moves that average to the factor
-    assert update(state, square, 1.0, PERIOD, MOST) == changed
+    assert update(state, square, 1.0, 1.0, PERIOD, MOST) == changed
     forget_recent(state)
-    assert not update(state, 0.1, 1.0, PERIOD, MOST)
+    assert not update(state, 0.1, 1.0, 1.0, PERIOD, MOST)
 
 
 def test_rows_of_a_correlated_residual_count_as_fewer():

@@ -28,14 +28,17 @@ DT = 0.01  # s, with a row in each sample
 RANDOM = np.random.default_rng(1)
 SCALE = RANDOM.normal(size=(4, 10))
 SCALE[:, 0] = 1.0, 0.1, 0.2, -0.1  # z = (1, 0, ..., 0) is 1 kg with its moments [kg m]
+FRICTION = 0.3  # N m, standard deviation of breakaway torques
+SIZE = M + N + 1
 SETTINGS = Settings(
-    size=M + 1,
+    size=SIZE,
     window=200,
     row_interval=1,
     pole=20.0,
     motion_scale=0.05,
     unmodelled=0.01,
-    columns=np.vstack((RANDOM.normal(size=(M, 4)) @ SCALE, np.zeros((1, 10)))),
+    breakaway=np.full(N, FRICTION**-2),
+    columns=np.vstack((RANDOM.normal(size=(M, 4)) @ SCALE, np.zeros((N + 1, 10)))),
     scale=SCALE,
 )
 PRIOR = Prior(RANDOM.normal(size=M), np.diag(RANDOM.uniform(0.5, 2.0, M)))
@@ -56,8 +59,15 @@ def rows_of(theta, count, noise=0.0, seed=1):
     return np.concatenate((X, u[:, :, np.newaxis]), axis=2)
 
 
+def with_breakaway(rows, torques, shapes):
+    """Rows (count, N, SIZE) with columns of breakaway, whose shapes (count, N) are given."""
+    columns = shapes[:, :, np.newaxis] * np.eye(N)
+    u = rows[:, :, M:] + (shapes * torques)[:, :, np.newaxis]
+    return np.concatenate((rows[:, :, :M], columns, u), axis=2)
+
+
 def test_solution_is_the_joint_least_squares_of_arm_and_load():
-    """As numpy solves the stacked rows with both priors; deviations from the inverse."""
+    """As numpy solves the stacked rows with all priors; deviations from the inverse."""
     state = part(State)
     work = part(Work)
     ND = SETTINGS.columns[:M]
@@ -67,35 +77,40 @@ def test_solution_is_the_joint_least_squares_of_arm_and_load():
     z = RANDOM.normal(size=10)
     theta = PRIOR.estimate + 0.1 * RANDOM.normal(size=M)
     loaded = theta + ND @ z
+    torques = FRICTION * RANDOM.normal(size=N)
+    K = M + N
     stacked = []
     for which, count, model in (
         (BEFORE, 90, theta),
         (NEWER, 40, loaded),
         (LATEST, 20, loaded),
     ):
-        rows = rows_of(model, count, noise, which)
+        rows = with_breakaway(
+            rows_of(model, count, noise, which), torques, RANDOM.normal(size=(count, N))
+        )
         for row in rows:
             add_products(row, state.sums[which])
-        X, u = rows[:, :, :M].reshape(-1, M), rows[:, :, M].ravel()
-        held = np.zeros((len(X), 10)) if which == BEFORE else X @ ND
+        X, u = rows[:, :, :K].reshape(-1, K), rows[:, :, K].ravel()
+        held = np.zeros((len(X), 10)) if which == BEFORE else X[:, :M] @ ND
         stacked.append(np.column_stack((X, held, u)))
     state.complete[0] = 1.0
     state.innovation.noise[0] = noise**2
     weighing.solve(SETTINGS, state, work, PRIOR, period)
     a = 7.0 * noise**2
-    H = np.zeros((M + 10, M + 10))
+    H = np.zeros((K + 10, K + 10))
     H[:M, :M] = PRIOR.information
-    H[M:, M:] = np.eye(10)
+    H[M:K, M:K] = np.diag(SETTINGS.breakaway)
+    H[K:, K:] = np.eye(10)
     *A, u = np.vstack(stacked).T
-    g = np.array(A) @ u + a * H @ np.append(PRIOR.estimate, np.zeros(10))
+    g = np.array(A) @ u + a * H @ np.append(PRIOR.estimate, np.zeros(N + 10))
     H = np.array(A) @ np.transpose(A) + a * H
     expected = np.linalg.solve(H, g)
     np.testing.assert_allclose(state.solution, expected, rtol=1e-6, atol=1e-9)
 
     weighing.describe(SETTINGS, state, work, period)
-    mass, *moments = D @ expected[M:]
+    mass, *moments = D @ expected[K:]
     centre = np.array(moments) / mass
-    C = a * D @ np.linalg.inv(H)[M:, M:] @ D.T
+    C = a * D @ np.linalg.inv(H)[K:, K:] @ D.T
     J = np.column_stack((-centre, np.eye(3))) / mass
     np.testing.assert_allclose(state.load[:4], (mass, *centre), rtol=1e-6)
     deviation = np.sqrt(np.append(C[0, 0], np.diag(J @ C @ J.T)))
@@ -122,6 +137,7 @@ class Arm:
                 self.work,
                 PRIOR,
                 row,
+                np.zeros(N),
                 velocity,
                 self.samples,
                 self.changes,
@@ -133,6 +149,27 @@ class Arm:
     def knows(self):
         """Whether a mass is known."""
         return self.state.load[DEVIATION] > 0.0
+
+
+def test_row_has_a_column_of_its_own_for_the_breakaway_of_each_joint():
+    (given,) = rows_of(PRIOR.estimate, 1)
+    row = np.full((N, SIZE), np.nan)
+    weighing.extend_row(given, np.array([0.7, -0.2]), row)
+    (expected,) = with_breakaway(
+        given[np.newaxis], np.zeros(N), np.array([[0.7, -0.2]])
+    )
+    np.testing.assert_array_equal(row, expected)
+
+
+def test_share_of_slow_rows_is_that_of_their_weights():
+    """Of their weight in the window times the one here, each a half at its own speed."""
+    scale = SETTINGS.motion_scale
+    for speed in (0.02, 0.1, 2.0):
+        row = np.ones((N, SIZE))
+        weighing.weight_row(row, np.full(N, speed))
+        moving = speed**2 / (speed**2 + scale**2)
+        share = weighing.counted_share(np.full(N, speed), scale)
+        assert share == pytest.approx(moving * np.mean(row[:, 0] ** 2))
 
 
 def test_load_that_no_change_was_told_of_is_weighed_by_its_rows():

@@ -1,12 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Whether the arm has changed: rows contradict the latched solution, or the rows before them.
+"""Whether the arm has changed: rows contradict those before them, or the latched solution.
 
-The mean square error of the solution of a full window over the last 0.1 s is compared
-with the residual that it had.  As long as the window is not full, and until the first
-full one is latched, each row is compared with what the rows so far and the prior
-predict (see `innovation`): a window that has a pick-up in it is a mixture of two arms,
-which may leave no more than the unmodelled torque, and the solution of few rows does
-not predict the next ones.
+With a prior, each row is compared with what the rows of the window so far and the prior
+predict (see `innovation`).  The solution of a window says nothing about postures that
+it has not seen, and its residual, if it has rested, nothing about motion: both would
+look like changes.
+
+Planar arms have no prior.  There the mean square error of the latched solution over the
+last 0.1 s is compared with the residual that it had.
 
 If the arm has changed, window, filters and latch are cleared, and learning restarts.
 What a window has taught before it was full is taken back: it did not predict what it
@@ -33,8 +34,7 @@ class State(NamedTuple):
     changes: Cell  # number of times that the arm was found to have changed
     contradiction: Cell  # `recent_residual` at the last change, (N m)^2
     recent_residual: Cell  # of the last rows against the solution, (N m)^2
-    # until a full window is known to be of one arm: theta of the rows so far, and the
-    # factor of its equations
+    # with a prior: theta of the rows so far, and the factor of its equations
     rows_fit: Annotated[Array, 'm']
     rows_factor: Annotated[Array, 'm', 'm']
     innovation: innovation.State  # of these rows
@@ -49,14 +49,12 @@ class Work(NamedTuple):
 
 
 @inner
-def is_predicted(latch: excitation.State, sliding: Window) -> bool:
-    """Whether rows are compared with those before them, as long as no full window is known.
+def is_predicted(sliding: Window) -> bool:
+    """Whether rows are compared with those before them.
 
-    Without a prior, as of planar arms, the first rows predict too little.
+    Without a prior, as of planar arms, these predict too little.
     """
-    is_full = window.is_full(sliding.settings, sliding.state)
-    is_known = is_full and latch.least_residual[0] > 0.0
-    return bool(sliding.settings.prior_weight > 0.0 and not is_known)
+    return bool(sliding.settings.prior_weight > 0.0)
 
 
 @inner
@@ -105,14 +103,15 @@ def compare_with_rows(
     sliding: Window,
     prior: Prior,
     row: Array,
+    share: float,
     unmodelled: float,
     samples: int,
     dt: float,
 ) -> bool:
     """Compare this row with those before it; return whether the last ones contradict them.
 
-    `unmodelled` is the mean square torque that no column describes [(N m)^2], `samples`
-    the number of samples of `dt` [s].
+    `share` is the mean square weight of its joints, `unmodelled` the mean square torque
+    that no column describes [(N m)^2], `samples` the number of samples of `dt` [s].
     """
     of = sliding.settings
     if samples % of.row_interval != 0:
@@ -129,7 +128,8 @@ def compare_with_rows(
     square = innovation.normalized_square(
         work.predicted, work.innovation, state.rows_factor, period, work.covariance
     )
-    if innovation.update(state.innovation, square, unmodelled, period, of.length):
+    now = state.innovation
+    if innovation.update(now, square, share, unmodelled, period, of.length):
         return True
     refresh = max(1, round(innovation.REFRESH / period))
     # a quarter later than the excitation is checked: not both in one sample

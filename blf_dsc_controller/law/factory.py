@@ -72,6 +72,8 @@ _PRIOR = 0.01  # 1 / (independent rows in a window): pull to the initial estimat
 _SLOW = 0.05  # rad/s, reference velocity below which the rows of a joint count less
 _FRICTION = 0.05  # standard deviation of friction, over the rated torque
 _MOST_FRICTION = 3.0  # times its initial estimate
+# standard deviation of what friction has more at breakaway, over its initial estimate
+_BREAKAWAY = 0.7
 _POSTURES = 1000  # random ones of a planar arm
 
 
@@ -214,7 +216,7 @@ def settings_of_config(config: ControllerConfig) -> Settings:
         contact=_contact(config, sliding),
         friction=None,  # follows from the others
         rotors=_rotors(config, row.lag, inertia),
-        weighing=_weighing(config, m, row, sliding),
+        weighing=_weighing(config, learned, row, sliding),
     )
     settings = _of_law(config, settings)
     return settings._replace(friction=friction_settings(settings))
@@ -444,18 +446,20 @@ def _rotors(
 
 def _weighing(
     config: ControllerConfig,
-    m: int,
+    learned: Sequence[Column],
     row: prediction.Settings,
     sliding: window.Settings,
 ) -> weighing.Settings:
     """Return how a load in the tip changes the base parameters, and which rows count."""
+    n = len(config.joints)
     settings = weighing.Settings(
         size=0,
         window=sliding.length,
         row_interval=sliding.row_interval,
         pole=row.filter_pole,
         motion_scale=row.motion_scale,
-        unmodelled=_excitation(config).residual_floor / len(config.joints),
+        unmodelled=_excitation(config).residual_floor / n,
+        breakaway=np.zeros(n),
         columns=np.zeros((0, 10)),
         scale=np.zeros((4, 10)),
     )
@@ -466,10 +470,15 @@ def _weighing(
     D = deviations(payload_inertia(max(robot.payload, 1.0)), 1.0, 2.0 * PAYLOAD_SIZE)
     T = chain.tip_placement
     K = parameters_of(robot, chain).K[:, -(ROTOR + 1) : -1]
-    columns = np.zeros((m + 1, 10))
+    columns = np.zeros((len(K) + len(learned) + n + 1, 10))
     moves = [inertia_of(moved(pseudo_inertia(direction), T)) for direction in D.T]
     columns[: len(K)] = product(K, np.transpose(moves))
-    return settings._replace(size=m + 1, columns=columns, scale=D[:4])
+    known = np.array(robot.friction(chain)['coulomb'])
+    usual = _FRICTION * np.array(config.torque.limit)
+    unsure = _BREAKAWAY * np.where(known > 0.0, known, usual)
+    return settings._replace(
+        size=len(columns), breakaway=unsure**-2.0, columns=columns, scale=D[:4]
+    )
 
 
 def _of_law(config: ControllerConfig, settings: Settings) -> Settings:

@@ -13,11 +13,19 @@ The innovation e = u - X theta of a later row has the covariance s^2 C, with
     C = I + a / s^2 X A^-1 X^T.
 
 A row is thus judged by what is known of theta so far, from the first row on, when many
-theta explain the rows.  The arm has changed where e^T C^-1 e / n exceeds five times s^2
-on average over 0.1 s.
+theta explain the rows.
 
-s^2 is assumed at first, and measured as the mean of e^T C^-1 e / n.  Rows that fit ever
-worse, as under a disturbance that lasts, raise it as they come, and contradict nothing.
+Rows of joints that hardly move have a small weight (see `prediction`), and are small
+whatever the arm is.  They must not count as rows that fit: after a rest, s^2 would be
+next to nothing, and the first motion a change.  So a mean is that of rows by their
+weights: with the share w^2 of a row, the mean square of its joints' weights,
+
+    mean = sum(e^T C^-1 e / n) / sum(w^2).
+
+The arm has changed where the mean over 0.1 s of motion exceeds eight times s^2.
+
+s^2 is assumed at first, and measured as the mean.  Rows that fit ever worse, as under a
+disturbance that lasts, raise it as they come, and contradict nothing.
 """
 
 from typing import NamedTuple
@@ -28,8 +36,9 @@ from blf_dsc_controller.numerics.algebra import cholesky_factor, whiten
 
 CORRELATION = 0.2  # s, of the residual
 REFRESH = 0.1  # s, from one solution to the next
-_MEMORY = 0.1  # s
-_ALARM = 5.0  # times s^2; an arm that does not change reaches 2.5
+_MEMORY = 0.1  # s of motion
+# times s^2: friction is no noise, and reaches what the noise of a sensor never would
+_ALARM = 8.0
 # s^2 before any row, of the square of the torque that is unmodelled; counts as so many
 # rows, and ever less until the mean square is of a window
 _ASSUMED, _ASSUMED_ROWS = 0.1, 100.0
@@ -45,12 +54,12 @@ class Prior(NamedTuple):
 
 
 class State(NamedTuple):
-    """Statistics of e^T C^-1 e / n over the rows so far."""
+    """Means of e^T C^-1 e / n by the weights of the rows so far."""
 
     noise: Cell  # s^2, (N m)^2
     mean: Cell  # mean square
-    rows: Cell  # that it is of
-    recent: Cell  # mean over 0.1 s
+    rows: Cell  # moving ones that it is of
+    recent: Cell  # mean over 0.1 s of motion
 
 
 @inner
@@ -104,17 +113,24 @@ def normalized_square(
 
 @inner
 def update(
-    state: State, square: float, unmodelled: float, period: float, most: float
+    state: State,
+    square: float,
+    share: float,
+    unmodelled: float,
+    period: float,
+    most: float,
 ) -> bool:
-    """Add e^T C^-1 e / n of a row; return whether the arm has changed.
+    """Add e^T C^-1 e / n of a row with its share w^2; return whether the arm has changed.
 
-    The mean square is of some `most` rows, a window.
+    The mean square is of some `most` moving rows, a window.
     """
-    state.recent[0] += min(1.0, period / _MEMORY) * (square - state.recent[0])
+    excess = square - share * state.recent[0]
+    state.recent[0] += min(1.0, period / _MEMORY) * excess
     has_changed = state.recent[0] > _ALARM * state.noise[0]
-    state.rows[0] = min(state.rows[0] + 1.0, most)
-    usual = min(square, _MOST * state.noise[0])
-    state.mean[0] += (usual - state.mean[0]) / state.rows[0]
+    state.rows[0] = min(state.rows[0] + share, most)
+    if state.rows[0] > 0.0:
+        usual = min(square, _MOST * share * state.noise[0])
+        state.mean[0] += (usual - share * state.mean[0]) / state.rows[0]
     state.noise[0] = noise_of(state.mean[0], state.rows[0], unmodelled, most)
     return bool(has_changed)
 

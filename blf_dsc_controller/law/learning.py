@@ -169,7 +169,7 @@ def measure_reversals(settings: Settings, state: State, period: float) -> None:
 def detect_change(
     settings: Settings, state: State, signals: Signals, dt: float
 ) -> None:
-    """Forget the window if the arm has changed: its rows contradict the solution, or each other.
+    """Forget the window if the arm has changed: its rows contradict each other, or the solution.
 
     What a window has taught before it was full is taken back: back to the estimate
     before.
@@ -177,11 +177,17 @@ def detect_change(
     of, latch, row = settings.excitation, state.latch, signals.row
     sliding = Window(settings.window, state.window, signals.window)
     prior = Prior(settings.initial_estimate, settings.information)
-    if change.is_predicted(latch, sliding):
-        samples = int(state.samples[0])
-        unmodelled = of.residual_floor / settings.n
+    if change.is_predicted(sliding):
         has_changed = change.compare_with_rows(
-            state.change, signals.change, sliding, prior, row, unmodelled, samples, dt
+            state.change,
+            signals.change,
+            sliding,
+            prior,
+            row,
+            prediction.moving_share(signals.dqr, settings.row.motion_scale),
+            of.residual_floor / settings.n,
+            int(state.samples[0]),
+            dt,
         )
     else:
         has_changed = change.compare_with_solution(

@@ -11,7 +11,7 @@ from math import sqrt
 from blf_dsc_controller.arms.model import ArmModel
 from blf_dsc_controller.compiled.jit import inner, kernel
 from blf_dsc_controller.compiled.layout import Array
-from blf_dsc_controller.law import external_torque, weighing, window
+from blf_dsc_controller.law import external_torque, prediction, weighing, window
 from blf_dsc_controller.law.external_torque import TipLoad
 from blf_dsc_controller.law.innovation import Prior
 from blf_dsc_controller.law.state import (
@@ -124,6 +124,14 @@ def sense_nothing(
     return dt < 0.0  # numba: a literal False would have another type
 
 
+@inner
+def fill_breakaway(settings: Settings, state: State, signals: Signals) -> None:
+    """Write the shapes of breakaway (n,), filtered and weighted as the row, to `signals.unit`."""
+    for i in range(settings.n):
+        weight = prediction.motion_weight(settings.row, signals.dqr[i], i)
+        signals.unit[i] = weight * state.friction.shape_lags[1, 2, i]
+
+
 @kernel
 def weigh(
     model: ArmModel,
@@ -138,12 +146,14 @@ def weigh(
     signals = signals_of(signals_vector, settings)
     if state.frozen[0] > 0.0:  # the row is of a contact
         return
+    fill_breakaway(settings, state, signals)
     weighing.add_row(
         settings.weighing,
         state.weighing,
         signals.weighing,
         Prior(settings.initial_estimate, settings.information),
         signals.row,
+        signals.unit,
         signals.dqr,
         int(state.samples[0]),
         state.change.changes[0],

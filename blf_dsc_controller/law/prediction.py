@@ -103,6 +103,16 @@ def motion_weight(settings: Settings, dqr: float, i: int) -> float:
 
 
 @inner
+def moving_share(dqr: Array, motion_scale: float) -> float:
+    """Return the mean square weight of the joints' rows: 1 in motion, 0 at rest."""
+    share = 0.0
+    for i in range(dqr.size):
+        square = dqr[i] ** 2
+        share += square / (square + motion_scale**2 + 1e-12) / dqr.size
+    return share
+
+
+@inner
 def pass_poles(
     settings: Settings, state: State, dqr: Array, dt: float, row: Array
 ) -> None:

@@ -20,8 +20,10 @@ is lightest is taken for nothing.  If it was nothing, its rows are added to thos
 until they make a window.  Rows are kept apart until they are 0.15 to 0.3 s old, so that
 those of a change that has not been found yet can be discarded.
 
-Rows of slow joints count little, since they may stick.  Nothing here acts on the
-torque: `perception` calls `add_row` after it has been sent.
+Rows of slow joints count little, since they may stick.  Beside theta there is an unknown
+more for each joint: what its friction has in excess at breakaway, as shaped by
+`friction`.  The columns of theta do not have it, and a load must not explain it.
+Nothing here acts on the torque: `perception` calls `add_row` after it has been sent.
 """
 
 from math import inf, sqrt
@@ -31,6 +33,7 @@ from blf_dsc_controller.compiled.jit import inner
 from blf_dsc_controller.compiled.layout import Array, Cell
 from blf_dsc_controller.law import innovation, sums
 from blf_dsc_controller.law.innovation import Prior
+from blf_dsc_controller.law.prediction import moving_share
 from blf_dsc_controller.numerics.algebra import cholesky_factor, cholesky_solve
 
 _FEWEST = 0.5  # s of motion that a part has
@@ -38,7 +41,7 @@ _FEWEST = 0.5  # s of motion that a part has
 _APART = 0.15
 _SETTLED = 6.0  # time constants of the filters
 # rad/s or m/s, below which friction is least like its columns, and rows count less
-_SLOW = 0.3
+_SLOW = 0.1
 _NOTHING, _LESS = 2.0, 4.0  # standard deviations: within, and below minus
 
 # rows before, of two halves since, and of the two parts that are kept apart
@@ -49,13 +52,15 @@ MASS, DEVIATION = 0, 4  # in `State.load`, each followed by three of the centre
 class Settings(NamedTuple):
     """How a load in the tip acts, and which rows count."""
 
-    size: int  # m + 1, or 0: nothing is weighed
+    size: int  # m + n + 1, or 0: nothing is weighed
     window: int  # N, rows in a window of the learning
     row_interval: int  # samples between two rows
     pole: float  # of the row filters, rad/s
     motion_scale: float  # reference velocity below which rows count less, rad/s
     unmodelled: float  # mean square torque that no column describes, (N m)^2
-    columns: Annotated[Array, 'weighing.size', 10]  # N D, and a row of zeros
+    # of the breakaway torques, 1 / variance, 1/(N m)^2
+    breakaway: Annotated[Array, 'n']
+    columns: Annotated[Array, 'weighing.size', 10]  # N D, and rows of zeros
     scale: Annotated[Array, 4, 10]  # rows of D: mass [kg] and moments [kg m]
 
 
@@ -66,7 +71,7 @@ class State(NamedTuple):
     sums: Annotated[Array, 5, 'weighing.size', 'weighing.size']  # of [X | u]^T [X | u]
     complete: Cell  # 1: the rows before are complete
     innovation: innovation.State
-    solution: Annotated[Array, 'weighing.size + 9']  # theta and z
+    solution: Annotated[Array, 'weighing.size + 9']  # theta, breakaway torques and z
     # of their equations
     factor: Annotated[Array, 'weighing.size + 9', 'weighing.size + 9']
     changes: Cell  # number of changes of the arm at the last row
@@ -80,6 +85,7 @@ class Work(NamedTuple):
 
     before: Annotated[Array, 'weighing.size', 'weighing.size']  # sums of all such rows
     since: Annotated[Array, 'weighing.size', 'weighing.size']
+    row: Annotated[Array, 'n', 'weighing.size']  # [X | u], weighted
     rows: Annotated[Array, 'n', 'weighing.size + 9']  # [X | X N D]
     torque: Annotated[Array, 'n']  # that they do not explain, N m
     covariance: Annotated[Array, 'n', 'n']
@@ -92,7 +98,8 @@ def add_row(
     state: State,
     work: Work,
     prior: Prior,
-    row: Array,
+    given: Array,
+    shapes: Array,
     dqr: Array,
     samples: int,
     changes: float,
@@ -100,15 +107,18 @@ def add_row(
 ) -> None:
     """Add the row of this sample if one is due, and solve for the load ten times a second.
 
-    `row` is [X | u] (n, m + 1), which is overwritten, dqr (n,) the velocity of the
-    reference [rad/s], `samples` the number of samples of `dt` [s], `changes` that of
-    the changes of the arm found so far.
+    The row that is `given` is [X | u] (n, m + 1), the `shapes` (n,) of breakaway are
+    filtered and weighted as it is, dqr (n,) is the velocity of the reference [rad/s],
+    `samples` the number of samples of `dt` [s], `changes` that of the changes of the
+    arm found so far.
     """
     if samples % settings.row_interval != settings.row_interval // 2:
         return
     period = settings.row_interval * dt
     has_changed = changes != state.changes[0]
     state.changes[0] = changes
+    row = work.row
+    extend_row(given, shapes, row)
     weight_row(row, dqr)
     if samples <= settings.row_interval:
         begin(settings, state, work, prior, period)
@@ -116,7 +126,7 @@ def add_row(
         end_part(settings, state, work, prior, period)
     elif state.wait[0] > 0.0:
         state.wait[0] -= 1.0
-    elif update_innovation(settings, state, work, row, period):
+    elif update_innovation(settings, state, work, row, dqr, period):
         end_part(settings, state, work, prior, period)
     else:
         sums.add_products(row, state.sums[LATEST])
@@ -140,6 +150,19 @@ def refresh(
 
 
 @inner
+def extend_row(given: Array, shapes: Array, row: Array) -> None:
+    """Write [X | u] (n, m + 1) with a column for the breakaway of each joint to `row`."""
+    n = shapes.size
+    m = row.shape[1] - 1 - n
+    for i in range(n):
+        for j in range(m):
+            row[i, j] = given[i, j]
+        for k in range(n):
+            row[i, m + k] = shapes[i] if k == i else 0.0
+        row[i, m + n] = given[i, m]
+
+
+@inner
 def weight_row(row: Array, dqr: Array) -> None:
     """Let the rows of slow joints count little."""
     for i in range(row.shape[0]):
@@ -149,12 +172,13 @@ def weight_row(row: Array, dqr: Array) -> None:
 
 
 @inner
-def moving_share(dqr: Array, motion_scale: float) -> float:
-    """Return the mean square weight of the joints' rows: 1 in motion, 0 at rest."""
+def counted_share(dqr: Array, motion_scale: float) -> float:
+    """Return the mean square weight that the joints' rows have here."""
     share = 0.0
     for i in range(dqr.size):
         square = dqr[i] ** 2
-        share += square / (square + motion_scale**2 + 1e-12) / dqr.size
+        moving = square / (square + motion_scale**2 + 1e-12)
+        share += moving * square / (square + _SLOW**2) / dqr.size
     return share
 
 
@@ -291,7 +315,7 @@ def fill_rows(settings: Settings, is_held: bool, row: Array, out: Array) -> None
 
 @inner
 def update_innovation(
-    settings: Settings, state: State, work: Work, row: Array, period: float
+    settings: Settings, state: State, work: Work, row: Array, dqr: Array, period: float
 ) -> bool:
     """Compare a row with the solution; return whether the last ones contradict it."""
     e = work.torque
@@ -304,8 +328,9 @@ def update_innovation(
     square = innovation.normalized_square(
         work.rows, e, state.factor, period, work.covariance
     )
+    share = counted_share(dqr, settings.motion_scale)
     return innovation.update(
-        state.innovation, square, settings.unmodelled, period, settings.window
+        state.innovation, square, share, settings.unmodelled, period, settings.window
     )
 
 
@@ -320,9 +345,10 @@ def fill_equations(
 
         [S + a R       S' N D             ] [theta]   [S_u + a R theta_0]
         [D^T N^T S'    D^T N^T S' N D + a ] [z    ] = [D^T N^T S'_u     ]
+
+    where theta has the breakaway torques, too.
     """
-    m = prior.estimate.size
-    R = prior.information
+    m = settings.size - 1
     A = state.factor
     x = state.solution
     before = work.before
@@ -330,10 +356,9 @@ def fill_equations(
     ND = settings.columns
     for i in range(m):
         x[i] = before[i, m] + since[i, m]
-        for j in range(m):
-            x[i] += a * R[i, j] * prior.estimate[j]
         for j in range(i, m):
-            A[i, j] = before[i, j] + since[i, j] + a * R[i, j]
+            A[i, j] = before[i, j] + since[i, j]
+    add_prior(settings, prior, a, A, x)
     for c in range(ND.shape[1]):
         x[m + c] = 0.0
         for j in range(m):
@@ -345,6 +370,20 @@ def fill_equations(
             A[m + d, m + c] = a if d == c else 0.0
             for j in range(m):
                 A[m + d, m + c] += ND[j, d] * A[j, m + c]
+
+
+@inner
+def add_prior(settings: Settings, prior: Prior, a: float, A: Array, x: Array) -> None:
+    """Add a R of theta and of the breakaway torques to A, and a R theta_0 to x."""
+    R = prior.information
+    known = prior.estimate.size
+    for i in range(known):
+        for j in range(known):
+            x[i] += a * R[i, j] * prior.estimate[j]
+        for j in range(i, known):
+            A[i, j] += a * R[i, j]
+    for i in range(settings.breakaway.size):
+        A[known + i, known + i] += a * settings.breakaway[i]
 
 
 @inner
