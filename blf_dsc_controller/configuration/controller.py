@@ -415,6 +415,14 @@ class DisturbanceEstimate:
     leakage: float = non_negative(
         0.0, 'leakage of the disturbance estimate', 'rad/(N m s)', 'eta'
     )
+    observer_bandwidth: float = non_negative(
+        0.0,
+        'pole of the load observer, which adds what joint torque sensors show and the '
+        'model lacks; 0: none. It needs robot.torque_loop and robot.effort whole',
+        'rad/s',
+        'L',
+        read_only='it sets the size of the state of the law',
+    )
 
 
 @dataclass(frozen=True)
@@ -820,6 +828,7 @@ class ControllerConfig(ArmConfig):
             return
         yield from self._drive_load_problems()
         yield from self._contact_problems()
+        yield from self._observer_problems()
         yield from self._stiffness_problems()
         yield from self.arm_problems(f'model {self.model}', needed)
         yield from self.reference.problems()
@@ -885,6 +894,24 @@ class ControllerConfig(ArmConfig):
             yield (
                 f'contact.reaction: got {contact.reaction}, but without contact.enabled nothing '
                 'finds contacts: set it to true'
+            )
+
+    def _observer_problems(self) -> Iterator[str]:
+        """Check that there are sensors for the load observer, and rows of the motion."""
+        bandwidth = self.disturbance.observer_bandwidth
+        has_sensors = self.robot.torque_loop and self.robot.effort == 'whole'
+        if bandwidth > 0.0 and not has_sensors:
+            yield (
+                f'disturbance.observer_bandwidth: got {bandwidth:g} rad/s with robot.torque_loop '
+                f'{str(self.robot.torque_loop).lower()} and robot.effort {self.robot.effort}, but '
+                'needs joint torque sensors, which efforts show: true and whole'
+            )
+        is_own = self.law == LAWS[0] and self.model == 'urdf'
+        if bandwidth > 0.0 and not (is_own and self.learning.prediction == 'filtered'):
+            yield (
+                f'disturbance.observer_bandwidth: got {bandwidth:g} rad/s with law {self.law}, '
+                f'model {self.model} and learning.prediction {self.learning.prediction}, but needs '
+                f'{LAWS[0]}, urdf and filtered'
             )
 
     def _stiffness_problems(self) -> Iterator[str]:
