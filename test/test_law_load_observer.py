@@ -11,12 +11,13 @@ import pytest
 from law_part import part
 
 from blf_dsc_controller.arms.model import regressors_at
-from blf_dsc_controller.configuration.nodes import CONTROLLER, load_loop
+from blf_dsc_controller.configuration.nodes import CONTROLLER, PLANT, load_loop
 from blf_dsc_controller.configuration.robot import parameters_of
 from blf_dsc_controller.errors import ConfigurationError
 from blf_dsc_controller.law import disturbance, load_observer
-from blf_dsc_controller.law.factory import settings_of_config
+from blf_dsc_controller.law.factory import controller_of, settings_of_config
 from blf_dsc_controller.law.load_observer import Settings, State, Work
+from blf_dsc_controller.simulation.loop import simulate
 
 DT = 1e-3  # s
 L = 50.0  # rad/s
@@ -52,13 +53,15 @@ def run(
     theta=THETA,
     information=CERTAIN,
     learned=False,
+    d3=None,
 ):
     """Observe constant sensors for some time; `effort` may be a function of the time."""
+    d3 = np.zeros(N) if d3 is None else d3
     for k in range(round(seconds / DT)):
         sensed = effort(k * DT) if callable(effort) else effort
         for i in range(N):
             load_observer.filter_interval(settings, state, i, X[i], sensed[i], DT)
-        load_observer.update(settings, state, work, theta, information, learned, DT)
+        load_observer.update(settings, state, work, theta, information, d3, learned, DT)
     return state.torque.copy()
 
 
@@ -101,6 +104,7 @@ def test_r_is_the_load_of_a_known_mass_on_an_arm_at_rest():
                 work,
                 theta,
                 settings.information,
+                np.zeros(n),
                 is_learned=False,
                 dt=DT,
             )
@@ -213,6 +217,17 @@ def test_what_remains_once_a_window_is_learned_is_not_added():
     assert 2.5 < r < 3.0  # 3 + 0.4 - 2 rms
 
 
+def test_threshold_begins_without_a_step_of_the_torque():
+    """The unmodelled 0.5 N m are s at first: 1 of 3 N m goes to d^3."""
+    state, work = settled()
+    sensed = X[:, :P] @ LINKS + [3.0, 0.0]
+    before = run(state, work, sensed, 1.0)
+    d3 = np.zeros(N)
+    after = run(state, work, sensed, DT, learned=True, d3=d3)
+    np.testing.assert_allclose(d3, [1.0, 0.0], atol=1e-9)
+    np.testing.assert_allclose(after + d3, before, atol=0.02)  # 1 / 200 windows
+
+
 def test_load_that_is_never_learned_goes_to_the_disturbance_estimate():
     """The mean of r becomes the bias, within windows; d^3 then takes it."""
     state, work = settled()
@@ -235,3 +250,69 @@ def test_without_sensors_or_rows_the_observer_is_refused(changes, named):
     given = {CONTROLLER: {'disturbance.observer_bandwidth': L, **changes}}
     with pytest.raises(ConfigurationError, match=named):
         load_loop('panda', given)
+
+
+def picked_up(controller):
+    """The largest error [mrad] in 2 s from a pick-up of 2 kg at 8 s on, and the run."""
+    plant = {
+        'duration': 10.0,
+        'events.begin': [8.0],
+        'events.duration': [0.0],
+        'events.payload': [2.0],
+    }
+    loop = load_loop('fr3_direct', {PLANT: plant, CONTROLLER: controller})
+    record = simulate(loop.controller, loop.plant)
+    errors = 1e3 * np.abs(np.asarray(record.run().error))
+    return errors[8000:].max(), record
+
+
+def test_soft_elastic_arm_takes_up_a_load_by_its_torque_sensors():
+    """An FR3 with elastic joints: 18 mrad by d^3 and learning, 6 by what its sensors show.
+
+    The load is weighed as well with it, no oscillation is found, and a stop holds what
+    r has taken.
+    """
+    without, _ = picked_up({'disturbance.observer_bandwidth': 0.0})
+    largest, record = picked_up({})
+    assert largest < 0.4 * without
+    load = record.controller.state.weighing.load
+    assert load[0] == pytest.approx(2.0, abs=0.05)
+    assert not record.run().oscillations
+    state, kept = record.controller.state, record.controller.checks.estimates.kept
+    held = state.disturbance + state.observer.torque
+    np.testing.assert_array_equal(kept[-len(held) :], held)
+
+
+def test_without_the_observer_efforts_change_no_torque():
+    """Efforts of any kind give the same bits; with it they do not."""
+
+    def torques(bandwidth, efforts):
+        given = {'disturbance.observer_bandwidth': bandwidth}
+        config = load_loop('panda', {CONTROLLER: given}).controller
+        controller = controller_of(config)
+        q = np.array(config.reference.offset)
+        found = []
+        for k in range(200):
+            motion = np.concatenate((q, np.zeros(len(q)), efforts))
+            found.append(controller.update(k * DT, DT, motion).copy())
+        return np.array(found)
+
+    n = len(load_loop('panda').controller.joints)
+    some, others = np.zeros(n), np.linspace(-9.0, 9.0, n)
+    assert np.array_equal(torques(0.0, some), torques(0.0, others))
+    assert not np.array_equal(torques(L, some), torques(L, others))
+
+
+@pytest.mark.parametrize(
+    ('preset', 'expected'),
+    [
+        ('panda', 60.0),
+        ('fr3', 60.0),
+        ('fr3_direct', 60.0),
+        ('panda_rigid', 0.0),
+        ('ur5e', 0.0),
+        ('recommended', 0.0),
+    ],
+)
+def test_soft_arms_with_torque_sensors_have_the_observer(preset, expected):
+    assert load_loop(preset).controller.disturbance.observer_bandwidth == expected

@@ -67,6 +67,7 @@ _measured = partial(parameter, read_only='it says how the gains were found')
 _FOLLOWED = 'the other gains follow from it when they are read: change those'
 _from_urdf = partial(non_negative, (), read_only=_FOLLOWED, omittable=True)
 _RISE = 0.05  # s to the largest acceleration
+_OBSERVER = 60.0  # rad/s, below the drives' own loops
 # per window: fewer do not determine P, more need over 100 MB
 _SAMPLES = (10, 1_000_000)
 
@@ -418,7 +419,8 @@ class DisturbanceEstimate:
     observer_bandwidth: float = non_negative(
         0.0,
         'pole of the load observer, which adds what joint torque sensors show and the '
-        'model lacks; 0: none. It needs robot.torque_loop and robot.effort whole',
+        'model lacks; 0: none. The default of arms with robot.torque_loop, robot.effort '
+        'whole and feedback.inertia none is 60',
         'rad/s',
         'L',
         read_only='it sets the size of the state of the law',
@@ -815,6 +817,7 @@ class ControllerConfig(ArmConfig):
             'learning.weighing': given.get('learning.prediction', 'filtered')
             == 'filtered',
             'feedback.stiffness': arm.stiffness,
+            'disturbance.observer_bandwidth': _observer_bandwidth(given, robot, arm),
             **tuning.gains_of(arm, np.array(bound) if is_whole else None),
             **followed,
         }
@@ -996,6 +999,17 @@ def _stated(
         given.get('sample_time', ArmConfig.sample_time),
     )
     return arm, gears
+
+
+def _observer_bandwidth(
+    given: Mapping[str, Any], robot: Robot, arm: tuning.Design
+) -> float:
+    """Return the pole of the load observer of an arm with joint torque sensors [rad/s]; else 0."""
+    has_sensors = robot.torque_loop and robot.effort == 'whole'
+    is_own = given.get('law', LAWS[0]) == LAWS[0]
+    has_rows = given.get('learning.prediction', 'filtered') == 'filtered'
+    is_soft = arm.joints is not None
+    return _OBSERVER if has_sensors and is_own and has_rows and is_soft else 0.0
 
 
 def _gears(robot: Robot, chain: Chain, motors: np.ndarray) -> Gears | None:

@@ -145,6 +145,7 @@ def filter_external_torque(
 def observe_load(settings: Settings, state: State, signals: Signals, dt: float) -> None:
     """Let `load_observer` find r by the row of the last interval, before its poles."""
     of, now = settings.observer, state.observer
+    is_learned = state.latch.latched[0] == 1.0 and settings.adaptation.weight > 0.0
     if state.samples[0] <= 1.0:
         load_observer.begin(now, state.disturbance)
     for i in range(settings.n):
@@ -155,7 +156,8 @@ def observe_load(settings: Settings, state: State, signals: Signals, dt: float) 
         signals.observer,
         state.estimate,
         settings.information,
-        state.latch.latched[0] == 1.0,
+        state.disturbance,
+        is_learned and state.frozen[0] == 0.0,
         dt,
     )
 

@@ -27,9 +27,11 @@ deviations keeps it: it has an offset, or the arm holds something.  It is also k
 law continues with a d^3 of its own, which may have that already.
 
 *Threshold.*  What is learned describes the torque of the motors, with all their friction:
-r would take back what of it helps the motors alone.  So once a window is learned, the
-mean of r and its rms s about that are measured, over the length of a window, and only
-what exceeds `_THRESHOLD` s is added.  A load that is never learned thus goes to d^3.
+r would take back what of it helps the motors alone.  So once a window is learned, only what
+exceeds `_THRESHOLD` s is added, s being the rms of r about its mean: at first that of the
+unmodelled torque, then measured over the length of a window while nothing touches the
+arm.  What r has added below that before is handed to d^3, and so is, in time, a load that
+is never learned.
 """
 
 from math import isfinite, sqrt
@@ -45,7 +47,7 @@ _SETTLING = 4.0  # 1/L, until r is that of the arm
 _RELEASED = 10.0  # 1/L, in which a plausible bias fades
 _SIGMAS = 3.0  # of what the prior explains
 _THRESHOLD = 2.0  # s: a sinusoid does not reach it
-_FIRST = 0.25  # of a window, for which it is assumed that r is zero
+_FIRST = 0.1  # of a window, for which the unmodelled torque counts as s
 _CLIPPED = 2.0  # s, beyond which r says nothing about its mean and its rms
 _LEAST = 0.1  # of the unmodelled torque, likewise
 
@@ -132,13 +134,15 @@ def update(
     work: Work,
     estimate: Array,
     information: Array,
+    disturbance: Array,
     is_learned: bool,
     dt: float,
 ) -> None:
     """Compute r after an interval of `dt` [s], and its bias once the filters have settled.
 
     The `information` (m, m) is the inverse covariance of the prior of theta, which
-    `is_learned` from a window or not.
+    `is_learned` by now, while nothing touches the arm, or not.  The first time, d^3, the
+    `disturbance` (n,) [N m], takes what the threshold keeps out of r.
     """
     settling = _SETTLING / settings.observer_bandwidth
     before = state.elapsed[0]
@@ -146,8 +150,10 @@ def update(
     if before < settling <= state.elapsed[0]:
         find_bias(settings, state, work, estimate, information)
     if is_learned:
+        if state.measured[0] == 0.0:
+            begin_threshold(settings, state, estimate, disturbance)
         measure(settings, state, estimate)
-    else:
+    elif state.measured[0] == 0.0:
         release_bias(settings, state, dt)
     for i in range(state.torque.size):
         state.torque[i] = load_torque(settings, state, i, estimate)
@@ -160,6 +166,17 @@ def release_bias(settings: Settings, state: State, dt: float) -> None:
     for i in range(state.bias.size):
         if state.keeps_bias[i] == 0.0:
             state.bias[i] -= share * state.bias[i]
+
+
+@inner
+def begin_threshold(
+    settings: Settings, state: State, estimate: Array, disturbance: Array
+) -> None:
+    """Begin with the unmodelled torque as s; d^3 takes what r loses."""
+    for i in range(state.square.size):
+        disturbance[i] += load_torque(settings, state, i, estimate)
+        state.square[i] = settings.unmodelled[i] * settings.unmodelled[i]
+        disturbance[i] -= load_torque(settings, state, i, estimate)
 
 
 @inner
