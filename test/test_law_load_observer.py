@@ -18,6 +18,7 @@ from blf_dsc_controller.law import disturbance, load_observer
 from blf_dsc_controller.law.factory import controller_of, settings_of_config
 from blf_dsc_controller.law.load_observer import Settings, State, Work
 from blf_dsc_controller.simulation.loop import simulate
+from blf_dsc_controller.supervision.calming import softened
 
 DT = 1e-3  # s
 L = 50.0  # rad/s
@@ -316,3 +317,8 @@ def test_without_the_observer_efforts_change_no_torque():
 )
 def test_soft_arms_with_torque_sensors_have_the_observer(preset, expected):
     assert load_loop(preset).controller.disturbance.observer_bandwidth == expected
+
+
+def test_softened_feedback_has_a_slower_observer():
+    settings = settings_of_config(load_loop('panda').controller)
+    assert softened(settings, 0.5).observer.observer_bandwidth == 30.0
