@@ -82,6 +82,8 @@ def loop_of(arm: Arm, stiffness: float, law: str) -> LoopConfig:
         **arm.changes,
     }
     controller = law_of(arm, law) | {'barrier.bound': [FREE] * n}
+    if 'actuator.loop_gain' in arm.changes:
+        controller['robot.torque_loop'] = plant['robot.torque_loop'] = False
     return load_loop(arm.preset, {PLANT: plant, CONTROLLER: controller})
 
 
@@ -101,6 +103,7 @@ def law_of(arm: Arm, law: str) -> dict[str, object]:
         'surface.mu': (0.99 * k / d).tolist(),
         'barrier.weight': (0.01 * k).tolist(),
         'disturbance.gain': zeros,
+        'disturbance.observer_bandwidth': 0.0,
         'learning.weight': 0.0,
     }
 

@@ -30,6 +30,7 @@ REMOVED: dict[str, Value] = {}
 
 ADDED: dict[str, Value] = {
     'surface.known_rate': False,
+    'disturbance.observer_bandwidth': 0.0,
     'safety.oscillation': 'ignore',
     'insist': CHECKED,
 }

@@ -67,6 +67,7 @@ _measured = partial(parameter, read_only='it says how the gains were found')
 _FOLLOWED = 'the other gains follow from it when they are read: change those'
 _from_urdf = partial(non_negative, (), read_only=_FOLLOWED, omittable=True)
 _RISE = 0.05  # s to the largest acceleration
+_OBSERVER = 60.0  # rad/s, below the drives' own loops
 # per window: fewer do not determine P, more need over 100 MB
 _SAMPLES = (10, 1_000_000)
 
@@ -414,6 +415,15 @@ class DisturbanceEstimate:
     )
     leakage: float = non_negative(
         0.0, 'leakage of the disturbance estimate', 'rad/(N m s)', 'eta'
+    )
+    observer_bandwidth: float = non_negative(
+        0.0,
+        'pole of the load observer, which adds what joint torque sensors show and the '
+        'model lacks; 0: none. The default of arms with robot.torque_loop, robot.effort '
+        'whole and feedback.inertia none is 60',
+        'rad/s',
+        'L',
+        read_only='it sets the size of the state of the law',
     )
 
 
@@ -813,6 +823,7 @@ class ControllerConfig(ArmConfig):
             'learning.weighing': given.get('learning.prediction', 'filtered')
             == 'filtered',
             'feedback.stiffness': arm.stiffness,
+            'disturbance.observer_bandwidth': _observer_bandwidth(given, robot, arm),
             **tuning.gains_of(arm, np.array(bound) if is_whole else None),
             **followed,
         }
@@ -826,6 +837,7 @@ class ControllerConfig(ArmConfig):
             return
         yield from self._drive_load_problems()
         yield from self._contact_problems()
+        yield from self._observer_problems()
         yield from self._stiffness_problems()
         yield from self.arm_problems(f'model {self.model}', needed)
         yield from self.reference.problems()
@@ -891,6 +903,24 @@ class ControllerConfig(ArmConfig):
             yield (
                 f'contact.reaction: got {contact.reaction}, but without contact.enabled nothing '
                 'finds contacts: set it to true'
+            )
+
+    def _observer_problems(self) -> Iterator[str]:
+        """Check that there are sensors for the load observer, and rows of the motion."""
+        bandwidth = self.disturbance.observer_bandwidth
+        has_sensors = self.robot.torque_loop and self.robot.effort == 'whole'
+        if bandwidth > 0.0 and not has_sensors:
+            yield (
+                f'disturbance.observer_bandwidth: got {bandwidth:g} rad/s with robot.torque_loop '
+                f'{str(self.robot.torque_loop).lower()} and robot.effort {self.robot.effort}, but '
+                'needs joint torque sensors, which efforts show: true and whole'
+            )
+        is_own = self.law == LAWS[0] and self.model == 'urdf'
+        if bandwidth > 0.0 and not (is_own and self.learning.prediction == 'filtered'):
+            yield (
+                f'disturbance.observer_bandwidth: got {bandwidth:g} rad/s with law {self.law}, '
+                f'model {self.model} and learning.prediction {self.learning.prediction}, but needs '
+                f'{LAWS[0]}, urdf and filtered'
             )
 
     def _stiffness_problems(self) -> Iterator[str]:
@@ -975,6 +1005,17 @@ def _stated(
         given.get('sample_time', ArmConfig.sample_time),
     )
     return arm, gears
+
+
+def _observer_bandwidth(
+    given: Mapping[str, Any], robot: Robot, arm: tuning.Design
+) -> float:
+    """Return the pole of the load observer of an arm with joint torque sensors [rad/s]; else 0."""
+    has_sensors = robot.torque_loop and robot.effort == 'whole'
+    is_own = given.get('law', LAWS[0]) == LAWS[0]
+    has_rows = given.get('learning.prediction', 'filtered') == 'filtered'
+    is_soft = arm.joints is not None
+    return _OBSERVER if has_sensors and is_own and has_rows and is_soft else 0.0
 
 
 def _gears(robot: Robot, chain: Chain, motors: np.ndarray) -> Gears | None:

@@ -112,7 +112,9 @@ def check_sample(
     if flags & SUSPECT != 0:
         return flags
     estimates = checks.estimates
-    kept_estimates.keep(estimates, state.estimate, state.disturbance)
+    kept_estimates.keep(
+        estimates, state.estimate, state.disturbance, state.observer.torque
+    )
     T = checks.sample_time[0]
     if not T > 0.0:
         return flags

@@ -133,11 +133,13 @@ def correct_feedback(settings: Settings, state: State, signals: Signals) -> None
 def compensated(
     settings: Settings, state: State, signals: Signals, i: int, feedback: float
 ) -> float:
-    """Return the demand of joint i [N m]: feedback, model, d^3, and what is learned."""
+    """Return the demand of joint i [N m]: feedback, model, d^3, r, and what is learned."""
     torque = feedback + signals.model_torque[i]
     torque += state.disturbance[i] + signals.friction.torque[i]
     if settings.feed_forward == 1:
         torque += signals.feedforward[i]
+    if settings.observer.enabled == 1:
+        torque += state.observer.torque[i]
     for j in range(settings.m):
         learned = state.estimate[j]
         if j < settings.p:

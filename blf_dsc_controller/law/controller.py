@@ -75,6 +75,8 @@ def fill_sample(
         sample.disturbance[i] = state.disturbance[i] + signals.friction.torque[i]
         for j in range(settings.p, settings.m):
             sample.disturbance[i] += signals.H[i, j] * state.estimate[j]
+        if settings.observer.enabled == 1:
+            sample.disturbance[i] += state.observer.torque[i]
         sample.bound[i] = signals.bound[i]
         sample.cuts[i] = signals.cuts[i]
     for j in range(settings.m):
@@ -125,6 +127,7 @@ def step(
     for i in range(n):
         signals.q[i] = used[i]
         signals.dq[i] = used[n + i]
+        signals.effort[i] = used[2 * n + i]
     added = signals.added
     torque.find_added(settings.torque, signals.saturation, signals.q, added)
     torque.find_applied(state.torque, state.added, added, signals.applied)

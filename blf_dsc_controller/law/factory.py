@@ -48,6 +48,7 @@ from blf_dsc_controller.law import (
     external_torque,
     feedback,
     friction,
+    load_observer,
     prediction,
     surface,
     torque,
@@ -74,6 +75,7 @@ _FRICTION = 0.05  # standard deviation of friction, over the rated torque
 _MOST_FRICTION = 3.0  # times its initial estimate
 # standard deviation of what friction has more at breakaway, over its initial estimate
 _BREAKAWAY = 0.7
+_MOST_LOAD = 0.5  # of the torque limit, of what joint torque sensors show
 _POSTURES = 1000  # random ones of a planar arm
 
 
@@ -207,6 +209,7 @@ def settings_of_config(config: ControllerConfig) -> Settings:
         surface=filled(surface.Settings, config.surface, lag=row.lag),
         feedback=_feedback(config),
         disturbance=filled(disturbance.Settings, config.disturbance, config.learning),
+        observer=_observer(config, model.p, row.lag, sliding),
         torque=_torque(config),
         columns=_columns(config, model.p),
         row=row,
@@ -247,6 +250,29 @@ def _feedback(config: ControllerConfig) -> feedback.Settings:
 def _follows_inertia(config: ControllerConfig) -> bool:
     """Whether the whole feedback acts through the inertia matrix."""
     return config.model == 'urdf' and config.feedback.inertia == 'whole'
+
+
+def _observer(
+    config: ControllerConfig, p: int, lag: float, sliding: window.Settings
+) -> load_observer.Settings:
+    """Return how the load is observed by joint torque sensors; `lag` [s] is that of the rows."""
+    robot = config.robot
+    is_on = config.disturbance.observer_bandwidth > 0.0
+    rotors = np.zeros(p if is_on else 0)
+    if is_on:
+        chain = robot.chain(config.joints)
+        base = parameters_of(robot, chain)
+        rotors += base.of(np.zeros_like(chain.inertias), robot.rotors(chain))
+    return filled(
+        load_observer.Settings,
+        config.disturbance,
+        enabled=int(is_on),
+        sensor_lag=0.5 * lag,  # the other half is that of the drives
+        samples=sliding.length * sliding.row_interval,
+        unmodelled=_unmodelled(config),
+        most=_MOST_LOAD * np.array(config.torque.limit),
+        rotors=rotors,
+    )
 
 
 def _torque(config: ControllerConfig) -> torque.Settings:

@@ -16,7 +16,7 @@ _SMALL = 0.01  # of the bound: an error that has not grown
 
 
 class State(NamedTuple):
-    """Estimates and d^3 of some past samples."""
+    """Estimates, and d^3 with r of `load_observer`, of some past samples."""
 
     kept: Annotated[Array, 'm + n']  # of the last sample that was not suspect
     moved: Annotated[Array, 'm + n']  # of when a joint last moved
@@ -28,13 +28,18 @@ class State(NamedTuple):
 
 
 @inner
-def keep(state: State, estimate: Array, disturbance: Array) -> None:
-    """Keep the estimate (m,) and d^3 (n,) of a sample that is not suspect."""
+def keep(state: State, estimate: Array, disturbance: Array, observed: Array) -> None:
+    """Keep the estimate (m,), and d^3 (n,) with r (n,), of a sample that is not suspect.
+
+    `observed` is r of `load_observer`, empty without sensors.
+    """
     m = estimate.size
     for j in range(m):
         state.kept[j] = estimate[j]
     for i in range(disturbance.size):
         state.kept[m + i] = disturbance[i]
+    for i in range(observed.size):
+        state.kept[m + i] += observed[i]
 
 
 @inner

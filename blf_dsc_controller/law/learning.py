@@ -5,6 +5,7 @@
 
 columns, ripple   the columns of what is learned besides P
 prediction        a row [X | u] with X theta = u, of the last interval
+load_observer     the torque that joint torque sensors show and the model lacks
 window            sums of the rows over tau_d
 change            whether the arm has changed, so that the window must be forgotten
 excitation        whether a window is excited, consistent, and latched
@@ -19,6 +20,7 @@ disturbance       the step of d^3, which gives up what is learned
 from __future__ import annotations
 
 from blf_dsc_controller.compiled.jit import inner
+from blf_dsc_controller.compiled.layout import Array
 from blf_dsc_controller.law import (
     adaptation,
     change,
@@ -27,6 +29,7 @@ from blf_dsc_controller.law import (
     excitation,
     external_torque,
     friction,
+    load_observer,
     prediction,
     ripple,
     window,
@@ -98,6 +101,8 @@ def form_row(settings: Settings, state: State, signals: Signals, dt: float) -> N
         begins = state.samples[0] <= 1.0
         prediction.delay_torque(of, now, signals.applied, begins, dt)
         prediction.fill_interval(now, Yp, Yr, dt, row)
+        if settings.observer.enabled == 1:
+            observe_load(settings, state, signals, dt)
         if settings.contact.enabled == 1:
             filter_external_torque(settings, state, signals, dt)
         prediction.pass_poles(of, now, signals.dqr, dt, row)
@@ -134,6 +139,27 @@ def filter_external_torque(
         external_torque.filter_interval(
             settings.contact, state.contact, i, signals.row[i], extra, dt
         )
+
+
+@inner
+def observe_load(settings: Settings, state: State, signals: Signals, dt: float) -> None:
+    """Let `load_observer` find r by the row of the last interval, before its poles."""
+    of, now = settings.observer, state.observer
+    is_learned = state.latch.latched[0] == 1.0 and settings.adaptation.weight > 0.0
+    if state.samples[0] <= 1.0:
+        load_observer.begin(now, state.disturbance)
+    for i in range(settings.n):
+        load_observer.filter_interval(of, now, i, signals.row[i], signals.effort[i], dt)
+    load_observer.update(
+        of,
+        now,
+        signals.observer,
+        state.estimate,
+        settings.information,
+        state.disturbance,
+        is_learned and state.frozen[0] == 0.0,
+        dt,
+    )
 
 
 @inner
@@ -209,7 +235,23 @@ def take_back(settings: Settings, state: State, signals: Signals) -> None:
         taught[j] = state.estimate[j]
         state.estimate[j] = state.latch.anchor[j]
     if settings.disturbance.bumpless == 1:
-        disturbance.hand_over(state.disturbance, signals.H, state.estimate, taught)
+        hand_over(settings, state, signals, taught)
+
+
+@inner
+def hand_over(
+    settings: Settings, state: State, signals: Signals, before: Array
+) -> None:
+    """Let d^3 give up what theta^ has learned since `before` (m,), as far as r does not."""
+    disturbance.hand_over(state.disturbance, signals.H, state.estimate, before)
+    if settings.observer.enabled == 1:
+        load_observer.hand_over(
+            settings.observer,
+            state.observer,
+            state.disturbance,
+            state.estimate,
+            before,
+        )
 
 
 @inner
@@ -252,7 +294,7 @@ def adapt(
         follow_disturbance(settings, state, signals, dt)
     if latch.latched[0] == 1.0:
         if settings.disturbance.bumpless == 1:
-            disturbance.hand_over(state.disturbance, H, estimate, work.tracked)
+            hand_over(settings, state, signals, work.tracked)
         friction.adapt_breakaway(
             settings.friction, state.friction, signals.friction, dt
         )

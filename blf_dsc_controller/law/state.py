@@ -27,6 +27,7 @@ from blf_dsc_controller.law import (
     external_torque,
     feedback,
     friction,
+    load_observer,
     prediction,
     surface,
     torque,
@@ -66,6 +67,7 @@ class Settings(NamedTuple):
     surface: surface.Settings
     feedback: feedback.Settings
     disturbance: disturbance.Settings
+    observer: load_observer.Settings
     torque: torque.Settings
     columns: columns.Settings
     row: prediction.Settings
@@ -90,6 +92,7 @@ class State(NamedTuple):
     estimate: Annotated[Array, 'm']  # theta^ = [P^; columns]
     saturation: torque.State
     row: prediction.State
+    observer: load_observer.State
     latch: excitation.State
     change: change.State
     contact: external_torque.State
@@ -124,6 +127,7 @@ class Signals(NamedTuple):
     acceleration: Annotated[Array, 'n']  # estimated ddq of the row `lambda`, rad/s^2
     added: Annotated[Array, 'n']  # torque that the drive adds to the command, N m
     applied: Annotated[Array, 'n']  # mean whole torque of the last interval, N m
+    effort: Annotated[Array, 'n']  # measured torque of the last interval, N m
     demand: Annotated[Array, 'n']  # whole torque (28) before saturation, N m
     torque: Annotated[Array, 'n']  # commanded torque, N m
     # how the torque was cut: 0, LEVEL_CUT, RATE_CUT, or their sum
@@ -135,6 +139,7 @@ class Signals(NamedTuple):
     unit: Annotated[Array, 'n']  # scratch
     barrier: barrier.Work
     saturation: torque.Work
+    observer: load_observer.Work
     window: window.Work
     latch: excitation.Work
     change: change.Work
@@ -153,7 +158,9 @@ class Sample(NamedTuple):
     xi1: Annotated[Array, 'n']  # rad
     xi2: Annotated[Array, 'n']  # rad/s
     torque: Annotated[Array, 'n']  # commanded, after saturation, N m
-    disturbance: Annotated[Array, 'n']  # d^3 plus the learned friction, N m
+    disturbance: Annotated[
+        Array, 'n'
+    ]  # d^3, r of `load_observer`, learned friction, N m
     bound: Annotated[Array, 'n']  # k(t), rad
     # how the torque was cut: 0, LEVEL_CUT, RATE_CUT, or their sum
     cuts: Annotated[Array, 'n']

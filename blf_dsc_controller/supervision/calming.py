@@ -49,6 +49,7 @@ def softened(settings: Settings, share: float) -> Settings:
     """
     surface, feedback = settings.surface, settings.feedback
     barrier, disturbance = settings.barrier, settings.disturbance
+    observer = settings.observer
     square = share**2
     return settings._replace(
         robust_gain=share * settings.robust_gain,
@@ -62,6 +63,9 @@ def softened(settings: Settings, share: float) -> Settings:
             weight=square * barrier.weight, slope_limit=square * barrier.slope_limit
         ),
         disturbance=disturbance._replace(gain=square * disturbance.gain),
+        observer=observer._replace(
+            observer_bandwidth=share * observer.observer_bandwidth
+        ),
     )
 
 

@@ -101,13 +101,15 @@ class SampleCheck:
 
     @property
     def disturbance(self) -> Vector:
-        """The kept disturbance estimate d^3 (n,) [N m]."""
+        """The kept disturbance estimate (n,) [N m]: d^3, and r of `load_observer`."""
         return self._kept[self._controller.settings.m :]
 
     def keep(self) -> None:
         """Keep the current estimates."""
         state = self._controller.state
         np.concatenate((state.estimate, state.disturbance), out=self._kept)
+        observed = state.observer.torque
+        self.disturbance[: observed.size] += observed
 
     def return_to_consistent(self) -> None:
         """Keep the estimates from before the error grew."""

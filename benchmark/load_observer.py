@@ -1,0 +1,386 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What joint torque sensors are worth at the gains that elastic joints bear.
+
+    python benchmark/load_observer.py margins
+    python benchmark/load_observer.py loops
+    python benchmark/load_observer.py pairs [--runs 20]
+
+`margins`: of the linear loop with gears, drives with a torque loop, and the load observer at a
+bandwidth, the worst over postures along the reference, gears of the preset's stiffness and
+thrice that, motors of 1 and 1.3 times the published, and links of 0.8 to 1.2 times the model,
+without a load and with the rated one before it is learned.  First the modulus margin above
+5 Hz.  Then the least distance from the ray [1, infinity) of the eigenvalues of
+-(I + G C)^-1 G C_r, from 0.3 Hz up, C_r being the observer: while it is not 0, no gain of the
+observer from 0 to 1, and a threshold is such a gain, makes a stable loop unstable.
+
+`loops`: each arm moves as its preset does and picks up 2 kg at 8 s.  A row has the largest
+error [mrad] from 4 s to then, at the pick-up, and from 3.5 s after it on, and how long after
+it the 95 % interval of the weight is within 0.1 kg of 2 kg.  Rivals have the same feedback:
+PD or PID on the model of the URDF along the reference, without learning, each alone and with
+the same observer by torque sensors.
+
+`pairs`: random arms of the study `monte_carlo_elastic_*`, each with and without observer.
+Besides, their sensors have offsets, friction changes, and something pushes them.  A row has
+the ratios of both runs: rms and largest error, in motion (4 to 8 s) and afterwards.
+"""
+
+from __future__ import annotations
+
+import argparse
+import itertools
+from collections.abc import Iterator, Mapping
+from dataclasses import replace
+from typing import Any, NamedTuple
+
+import numpy as np
+from harness import print_table
+
+from blf_dsc_controller.arms.linear_loop import (
+    Joints,
+    Timing,
+    TorqueLoop,
+    arm_response,
+    law_response,
+)
+from blf_dsc_controller.arms.model import inertia_matrices
+from blf_dsc_controller.configuration.controller import ControllerConfig
+from blf_dsc_controller.configuration.nodes import (
+    CONTROLLER,
+    PLANT,
+    LoopConfig,
+    load_loop,
+)
+from blf_dsc_controller.configuration.plant import PlantConfig
+from blf_dsc_controller.configuration.robot import parameters_of
+from blf_dsc_controller.configuration.schema import change
+from blf_dsc_controller.law.factory import begin, controller_of, settings_of_config
+from blf_dsc_controller.law.telemetry import sample_columns
+from blf_dsc_controller.reference.approach import reference_of
+from blf_dsc_controller.reference.terms import sampled
+from blf_dsc_controller.simulation.loop import Record, simulate
+from blf_dsc_controller.studies.monte_carlo import draw, load_study, plant_with
+from blf_dsc_controller.supervision.expected_errors import linear_feedback
+from sim_plant.plant import plant_of
+
+PRESETS = ('panda', 'fr3_direct', 'fr3')
+PICK_UP = 8.0  # s
+LATER = 3.5  # s
+SECONDS = 16.0
+WEIGHT = 2.0  # kg
+FREE = 0.3  # rad, a bound that no law leaves unless it shakes
+BANDWIDTH = 60.0  # rad/s
+
+BANDWIDTHS = (0.0, 40.0, 60.0, 100.0)
+STIFFNESS = (1.0, 3.0)  # of the gears, over that of the preset
+MOTORS = np.array(
+    (0.606, 0.606, 0.462, 0.462, 0.206, 0.206, 0.206)
+)  # kg m^2, published
+SPREAD = (1.0, 1.3)
+LINKS = (0.8, 1.0, 1.2)  # true over assumed
+POSTURES = 4
+PERIOD = 5.0  # s, of the reference
+VISCOUS = np.array((0.3,) * 4 + (0.04,) * 3)  # N m s/rad
+RIGID = 5.0  # Hz, up to which an arm is rigid
+FREQUENCIES = np.geomspace(0.3, 480.0, 120)  # Hz
+
+
+class LinearLoop(NamedTuple):
+    """The loop of a preset at small errors, and its links in some postures."""
+
+    loop: LoopConfig
+    assumed: np.ndarray  # links of the model, without rotors (k, n, n) kg m^2
+    loaded: np.ndarray  # with the rated payload
+
+
+def linear(preset: str) -> LinearLoop:
+    """Return the linear loop of a preset."""
+    loop = load_loop(preset)
+    config = loop.controller
+    chain = config.robot.chain(config.joints)
+    base = parameters_of(config.robot, chain)
+    q = sampled(reference_of(config), np.linspace(0.0, PERIOD, POSTURES))[:, 0]
+    none = np.zeros(len(config.joints))
+    links = inertia_matrices(base.model, base.of(chain.inertias, none), q)
+    held = replace(
+        config.robot, drive_compensates='gravity', drive_payload=config.robot.payload
+    ).drive_inertias(chain, chain.inertias)
+    return LinearLoop(loop, links, inertia_matrices(base.model, base.of(held, none), q))
+
+
+def observer(
+    bandwidth: float, timing: Timing, M: np.ndarray, model: np.ndarray, s: np.ndarray
+) -> np.ndarray:
+    """Return C_r (k, f, n, n) [N m/rad] of the observer, tau = - C_r q, at s = i omega (f,)."""
+    T = timing.period
+    z = np.exp(T * s)
+    pole = 1.0 - np.exp(-bandwidth * T)
+    old = np.exp(-T / timing.velocity_lag)
+    passed = pole / (1.0 - (1.0 - pole) / z)
+    late = (1.0 - old) / (1.0 - old / z)
+    difference = (1.0 - 1.0 / z) / T  # the mean of a derivative over an interval
+    sensed = (late * difference * s)[:, None, None] * M[:, None]
+    expected = (late * difference**2)[:, None, None] * model[:, None]
+    return np.asarray(-passed[:, None, None] * (sensed - expected))
+
+
+def from_ray(eigenvalues: np.ndarray) -> float:
+    """Return the least distance of eigenvalues from the ray [1, infinity)."""
+    beside = np.abs(eigenvalues.imag)
+    return float(
+        np.where(eigenvalues.real >= 1.0, beside, np.abs(eigenvalues - 1.0)).min()
+    )
+
+
+def margin(preset: LinearLoop, links: np.ndarray, bandwidth: float) -> str:
+    """Return the modulus margin, and how far the observer is from making the loop unstable."""
+    gears = np.array(preset.loop.plant.joint.stiffness)
+    config = preset.loop.controller
+    settings = settings_of_config(config)
+    lag = 0.5 * config.robot.lag
+    timing = Timing(config.sample_time, drive_lag=lag, velocity_lag=lag)
+    feedback = linear_feedback(settings, preset.assumed, settings.barrier.weight)
+    s = np.asarray(2j * np.pi * FREQUENCIES, complex)
+    C = law_response(feedback, timing, s)
+    one = np.eye(len(MOTORS))
+    modulus = distance = np.inf
+    for share, factor, K in itertools.product(LINKS, SPREAD, STIFFNESS):
+        M = share * links
+        joints = Joints(factor * MOTORS, VISCOUS, K * gears, 0.03, TorqueLoop())
+        G = arm_response(M, joints, timing, s)
+        seen = 0.0 * C
+        if bandwidth > 0.0:
+            seen = observer(bandwidth, timing, M, preset.assumed, s)
+            around = -np.linalg.solve(one + G @ C, G @ seen)
+            distance = min(distance, from_ray(np.linalg.eigvals(around)))
+        whole = (one + G @ (C + seen))[:, FREQUENCIES > RIGID]
+        values = np.linalg.svd(whole, compute_uv=False)[..., -1]
+        modulus = min(modulus, float(values.min()))
+    return f'{modulus:.2f}' + (f', {distance:.2f}' if bandwidth > 0.0 else '')
+
+
+def margins() -> Iterator[list[str]]:
+    """Compute the rows of the linear margins."""
+    for name in PRESETS:
+        preset = linear(name)
+        for label, links in (('empty', preset.assumed), ('loaded', preset.loaded)):
+            cells = (margin(preset, links, L) for L in BANDWIDTHS)
+            yield [name, label, *cells]
+
+
+class Law(NamedTuple):
+    """A law of the table: what differs from the preset, and what it learns."""
+
+    label: str
+    changes: Mapping[str, object]
+    is_learning: bool = True
+    has_integral: bool = True
+
+
+OBSERVED = {'disturbance.observer_bandwidth': BANDWIDTH}
+LAWS = (
+    Law('this law', {'disturbance.observer_bandwidth': 0.0}),
+    Law(f'this law, load observer at {BANDWIDTH:g} rad/s', OBSERVED),
+    Law(
+        'PD and model',
+        {'disturbance.observer_bandwidth': 0.0},
+        is_learning=False,
+        has_integral=False,
+    ),
+    Law('PID and model', {'disturbance.observer_bandwidth': 0.0}, is_learning=False),
+    Law(
+        'PD, model and observer by sensors',
+        OBSERVED,
+        is_learning=False,
+        has_integral=False,
+    ),
+    Law('PID, model and observer by sensors', OBSERVED, is_learning=False),
+)
+
+
+def loop_of(preset: str, law: Law) -> LoopConfig:
+    """Return the loop of an arm with a law."""
+    loop = load_loop(preset)
+    n = len(loop.controller.joints)
+    plant = {
+        'duration': SECONDS,
+        'events.begin': [PICK_UP],
+        'events.duration': [0.0],
+        'events.payload': [WEIGHT],
+    }
+    controller = {'barrier.bound': [FREE] * n, **law.changes}
+    if not law.has_integral:
+        controller['disturbance.gain'] = [0.0] * n
+    loop = load_loop(preset, {PLANT: plant, CONTROLLER: controller})
+    if law.is_learning:
+        return loop
+    count = len(loop.controller.learning.initial_estimate)
+    still = {'learning.weight': 0.0, 'learning.adaptation_gain': [0.0] * count}
+    return loop._replace(controller=change(loop.controller, still))
+
+
+def known_after(record: Record) -> float:
+    """Return how long after the pick-up the weight is known to 0.1 kg; NaN: never."""
+    sample = sample_columns(record.samples, record.controller.settings)
+    t = 1e-9 * record.stamps
+    known = sample.load[:, 4] < 0.1  # half of the interval
+    known &= np.abs(sample.load[:, 0] - WEIGHT) < 0.1
+    known &= t > PICK_UP
+    return float(t[known][0] - PICK_UP) if known.any() else float('nan')
+
+
+def loop_row(preset: str, law: Law) -> list[str]:
+    """Return what happens to an arm with a law."""
+    loop = loop_of(preset, law)
+    record = simulate(loop.controller, loop.plant)
+    run = record.run()
+    if run.stops:
+        stop = run.stops[0]
+        return [preset, law.label, f'{1e-9 * stop.stamp:.2f} s: {stop.reason}']
+    errors = 1e3 * np.abs(np.asarray(run.error)).max(axis=1)
+    after = PICK_UP + LATER
+    spans = (4.0, PICK_UP), (PICK_UP, after), (after, SECONDS)
+    cells = [f'{errors[(run.time >= a) & (run.time < b)].max():.2f}' for a, b in spans]
+    known = known_after(record)
+    cells.append(f'{known:.2f} s' if law.is_learning else '-')
+    return [preset, law.label, *cells]
+
+
+def loops() -> Iterator[list[str]]:
+    """Compute the rows of the closed loops."""
+    for preset, law in itertools.product(PRESETS, LAWS):
+        yield loop_row(preset, law)
+
+
+STUDIES = 'monte_carlo_elastic_panda', 'monte_carlo_elastic_fr3'
+OFFSET = 1.0  # N m, largest offset of sensors in large joints; in wrists a fifth
+LARGE = (True,) * 4 + (False,) * 3
+SPANS = {'in motion': (4.0, PICK_UP), 'from the load on': (PICK_UP, SECONDS)}
+
+
+class Pair(NamedTuple):
+    """A random arm: rms and largest error (spans, 2) [mrad] without and with observer."""
+
+    number: int
+    events: str
+    without: np.ndarray
+    observed: np.ndarray
+
+
+def events_of(
+    rng: np.random.Generator, viscous: np.ndarray, coulomb: np.ndarray
+) -> tuple[str, dict[str, Any]]:
+    """Return what happens besides 2 kg from 8 s on: nothing, other friction, or a push."""
+    kind = ('nothing', 'friction', 'push')[int(rng.integers(3))]
+    if kind == 'nothing':
+        return kind, {}
+    n = len(viscous)
+    events: dict[str, Any] = {
+        'events.begin': [float(rng.uniform(5.0, 7.0)), PICK_UP],
+        'events.duration': [0.0 if kind == 'friction' else 0.5, 0.0],
+        'events.payload': [0.0, WEIGHT],
+    }
+    if kind == 'push':
+        push = rng.uniform(-15.0, 15.0, 3).tolist()
+        return kind, events | {'events.force': [*push, 0.0, 0.0, 0.0]}
+    change_by = float(rng.uniform(-0.7, 1.0))
+    for name, value in (('viscous', viscous), ('coulomb', coulomb)):
+        events[f'events.{name}'] = [*(change_by * value).tolist(), *([0.0] * n)]
+    return f'{kind} {1.0 + change_by:.2f}', events
+
+
+def errors_of(
+    config: ControllerConfig, plant: PlantConfig, offset: np.ndarray
+) -> np.ndarray:
+    """Return rms and largest true error (spans, 2) [mrad] of a law whose sensors have offsets."""
+    controller, arm = controller_of(config), plant_of(plant)
+    n = len(config.joints)
+    dt = config.sample_time
+    measurement = np.array(arm.measure())
+    begin(controller, config, *measurement.reshape(3, n)[:2])
+    errors = np.zeros((round(SECONDS / dt), n))
+    for k, error in enumerate(errors):
+        measurement[:] = arm.measure()
+        measurement[2 * n :] += offset
+        torque = controller.update(k * dt, dt, measurement)
+        error[:] = controller.sample.xi1
+        controller.perceive(dt)
+        arm.step(torque)
+        if np.abs(error).max() > FREE:
+            errors[k:] = np.inf
+            break
+    t = dt * np.arange(len(errors))
+    spans = [1e3 * errors[(t >= a) & (t < b)] for a, b in SPANS.values()]
+    return np.array([[np.sqrt((e**2).mean()), np.abs(e).max()] for e in spans])
+
+
+def pair(study_name: str, number: int) -> Pair:
+    """Run a random arm with and without observer."""
+    study = load_study(study_name)
+    plant = plant_with(study, draw(study, number))
+    rng = np.random.default_rng(number)
+    friction = (
+        np.array(each)
+        for each in (plant.disturbance.viscous, plant.disturbance.coulomb)
+    )
+    label, events = events_of(rng, *friction)
+    plant = change(plant, {'duration': SECONDS, **events})
+    size = np.where(LARGE, OFFSET, 0.2 * OFFSET)
+    offset = size * rng.uniform(-1.0, 1.0, len(size))
+    if number % 2:
+        label = f'{label}, offsets'
+    else:
+        offset *= 0.0
+    n = len(study.controller.joints)
+    both = [
+        errors_of(_with_bandwidth(study.controller, L, n), plant, offset)
+        for L in (0.0, BANDWIDTH)
+    ]
+    return Pair(number, label, *both)
+
+
+def _with_bandwidth(
+    config: ControllerConfig, bandwidth: float, n: int
+) -> ControllerConfig:
+    changes = {
+        'disturbance.observer_bandwidth': bandwidth,
+        'barrier.bound': [FREE] * n,
+        'barrier.initial_bound': [0.0] * n,
+    }
+    return change(config, changes)
+
+
+def pairs(runs: int) -> Iterator[list[str]]:
+    """Compute the rows of random arms, and the worst and the median ratio of each study."""
+    for study in STUDIES:
+        found = []
+        for number in range(runs):
+            of = pair(study, number)
+            found.append(of.observed / of.without)
+            cells = [
+                f'{a:.3g} {b:.3g}'
+                for a, b in zip(of.without.ravel(), of.observed.ravel(), strict=True)
+            ]
+            yield [study, f'{number}', of.events, *cells]
+        for name, reduced in (('median', np.median), ('worst', np.max)):
+            ratios = reduced(found, axis=0).ravel()
+            yield [study, name, 'ratios', *(f'{each:.2f}' for each in ratios)]
+
+
+def main() -> None:
+    """Print the table that was asked for."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument('table', choices=('margins', 'loops', 'pairs'))
+    parser.add_argument('--runs', type=int, default=20, help='arms of each study')
+    given = parser.parse_args()
+    if given.table == 'margins':
+        print_table(['arm', 'tip', *(f'{L:g} rad/s' for L in BANDWIDTHS)], margins())
+    elif given.table == 'loops':
+        heads = ['arm', 'law', 'in motion', 'pick-up', 'later', 'weight known after']
+        print_table(heads, loops())
+    else:
+        of_spans = [f'{each}, {span}' for span in SPANS for each in ('rms', 'largest')]
+        print_table(['study', 'arm', 'events', *of_spans], pairs(given.runs))
+
+
+if __name__ == '__main__':
+    main()

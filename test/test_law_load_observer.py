@@ -1,0 +1,324 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The load observer: its filter, bias, threshold, and what it gives up to the learning."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from math import exp, nan
+
+import numpy as np
+import pytest
+from law_part import part
+
+from blf_dsc_controller.arms.model import regressors_at
+from blf_dsc_controller.configuration.nodes import CONTROLLER, PLANT, load_loop
+from blf_dsc_controller.configuration.robot import parameters_of
+from blf_dsc_controller.errors import ConfigurationError
+from blf_dsc_controller.law import disturbance, load_observer
+from blf_dsc_controller.law.factory import controller_of, settings_of_config
+from blf_dsc_controller.law.load_observer import Settings, State, Work
+from blf_dsc_controller.simulation.loop import simulate
+from blf_dsc_controller.supervision.calming import softened
+
+DT = 1e-3  # s
+L = 50.0  # rad/s
+N, P, M = 2, 3, 4  # joints, parameters, entries of theta: the last is friction
+SETTINGS = Settings(
+    enabled=1,
+    observer_bandwidth=L,
+    sensor_lag=0.0,
+    samples=2000,
+    most=np.array([40.0, 6.0]),
+    unmodelled=np.array([0.5, 0.1]),
+    rotors=np.array([0.0, 0.0, 0.25]),
+)
+X = np.array([[9.0, 2.0, 0.5, 1.0], [0.0, 3.0, 1.5, 1.0]])
+THETA = np.array([1.0, -2.0, 0.75, 5.0])
+LINKS = THETA[:P] - SETTINGS.rotors
+CERTAIN = np.diag([1e6] * M)  # 1e-3 of each parameter
+
+
+def new(settings=SETTINGS):
+    """An empty state, and scratch."""
+    sizes = {'n': N, 'p': P, 'm': M, 'observer': settings}
+    return part(State, **sizes), part(Work, **sizes)
+
+
+def run(
+    state,
+    work,
+    effort,
+    seconds,
+    *,
+    settings=SETTINGS,
+    theta=THETA,
+    information=CERTAIN,
+    learned=False,
+    d3=None,
+):
+    """Observe constant sensors for some time; `effort` may be a function of the time."""
+    d3 = np.zeros(N) if d3 is None else d3
+    for k in range(round(seconds / DT)):
+        sensed = effort(k * DT) if callable(effort) else effort
+        for i in range(N):
+            load_observer.filter_interval(settings, state, i, X[i], sensed[i], DT)
+        load_observer.update(settings, state, work, theta, information, d3, learned, DT)
+    return state.torque.copy()
+
+
+def settled(settings=SETTINGS):
+    """That of an arm which moves as the model says, after the filters have settled."""
+    state, work = new(settings)
+    run(state, work, X[:, :P] @ LINKS, 0.5, settings=settings)
+    np.testing.assert_allclose(state.torque, 0.0, atol=1e-9)
+    return state, work
+
+
+def test_r_is_the_load_of_a_known_mass_on_an_arm_at_rest():
+    """2 kg in the hand of a Panda at rest, by the model that knows of them; e^-50 is left."""
+    config = load_loop(
+        'panda', {CONTROLLER: {'disturbance.observer_bandwidth': L}}
+    ).controller
+    settings = settings_of_config(config)
+    robot, n = config.robot, settings.n
+    chain = robot.chain(config.joints)
+    base = parameters_of(robot, chain)
+    q = np.array(config.reference.offset)
+    (H,) = regressors_at(base.model, q[np.newaxis], *np.zeros((3, 1, n)))
+    held = replace(robot, drive_payload=2.0).drive_inertias(chain, chain.inertias)
+    links, loaded = (base.of(each, np.zeros(n)) for each in (chain.inertias, held))
+    theta = settings.initial_estimate.copy()
+    theta[: settings.p] = base.of(chain.inertias, robot.rotors(chain))
+    sizes = {'n': n, 'p': settings.p, 'm': settings.m, 'observer': settings.observer}
+    state, work = part(State, **sizes), part(Work, **sizes)
+    row = np.zeros((n, settings.m + 1))
+    row[:, : settings.p] = H
+    for parameters in (links, loaded):
+        for _ in range(1000):
+            for i, effort in enumerate(H @ parameters):
+                load_observer.filter_interval(
+                    settings.observer, state, i, row[i], effort, DT
+                )
+            load_observer.update(
+                settings.observer,
+                state,
+                work,
+                theta,
+                settings.information,
+                np.zeros(n),
+                is_learned=False,
+                dt=DT,
+            )
+    weight = H @ (loaded - links)
+    assert np.abs(weight).max() > 5.0  # N m
+    np.testing.assert_allclose(state.torque, weight, atol=1e-6)
+
+
+def test_r_follows_a_load_within_one_over_L():
+    state, work = settled()
+    load = np.array([4.0, -1.0])
+    r = run(state, work, X[:, :P] @ LINKS + load, 1.0 / L)
+    np.testing.assert_allclose(r, (1.0 - exp(-1.0)) * load, rtol=1e-9)
+
+
+def test_sensors_wait_for_velocities():
+    """Behind a lag of 1 / L, a step is 1 - 2 / e after 1 / L, but for a sample."""
+    state, work = settled(SETTINGS._replace(sensor_lag=1.0 / L))
+    waits = SETTINGS._replace(sensor_lag=1.0 / L)
+    load = np.array([4.0, -1.0])
+    r = run(state, work, X[:, :P] @ LINKS + load, 1.0 / L, settings=waits)
+    np.testing.assert_allclose(r, (1.0 - 2.0 * exp(-1.0)) * load, rtol=0.08)
+
+
+def test_friction_columns_are_those_of_the_motors():
+    state, work = settled()
+    other = THETA + np.array([0.0, 0.0, 0.0, 100.0])
+    r = run(state, work, X[:, :P] @ LINKS, 0.1, theta=other)
+    np.testing.assert_allclose(r, 0.0, atol=1e-9)
+
+
+def test_what_is_learned_fades_from_r_and_changes_no_torque():
+    """H = X: the model adds what r gives up, and nothing is left for d^3."""
+    state, work = settled()
+    learned = np.array([0.3, 0.5, -0.1, 0.0])
+    load = X[:, :P] @ learned[:P]
+    sensed = X[:, :P] @ LINKS + load
+    r = run(state, work, sensed, 1.0)
+    np.testing.assert_allclose(r, load, rtol=1e-9)
+    d3 = np.array([1.0, 2.0])
+    before, after = THETA.copy(), THETA + learned
+    disturbance.hand_over(d3, X, after, before)
+    load_observer.hand_over(SETTINGS, state, d3, after, before)
+    r = run(state, work, sensed, DT, theta=after)
+    np.testing.assert_allclose(r, 0.0, atol=1e-9)
+    np.testing.assert_allclose(d3, [1.0, 2.0], atol=1e-9)
+
+
+def test_missing_readings_change_nothing():
+    state, work = settled()
+    load = X[:, :P] @ LINKS + [4.0, -1.0]
+    r = run(state, work, load, 1.0)
+    np.testing.assert_allclose(run(state, work, [nan, nan], 0.1), r, rtol=1e-9)
+
+
+def test_r_is_within_its_limits():
+    state, work = settled()
+    np.testing.assert_allclose(run(state, work, [900.0, -900.0], 1.0), [40.0, -6.0])
+
+
+def test_offset_of_a_sensor_stays_out_of_r():
+    """3 N m, where the model is known to 0.5 N m: three deviations are 1.5.
+
+    e^-4 of it has not come through the filter by then.
+    """
+    state, work = new()
+    sensed = X[:, :P] @ LINKS + [3.0, 0.0]
+    r = run(state, work, sensed, 2.0)
+    np.testing.assert_allclose(r, [3.0 * exp(-4.0), 0.0], atol=1e-3)
+    assert state.keeps_bias.tolist() == [1.0, 0.0]
+    r = run(state, work, sensed + np.array([4.0, 0.0]), 1.0)  # a load on top of it
+    np.testing.assert_allclose(r, [4.0 + 3.0 * exp(-4.0), 0.0], atol=1e-3)
+
+
+def test_what_the_prior_explains_comes_into_r_without_a_step():
+    """The model may be 1 N m off; r begins at zero 4 / L after the start."""
+    state, work = new()
+    vague = np.eye(M)
+    sensed = X[:, :P] @ LINKS + [1.0, 0.0]
+    r = run(state, work, sensed, 4.0 / L, information=vague)
+    np.testing.assert_allclose(r, 0.0, atol=0.01)
+    run(state, work, sensed, 10.0 / L, information=vague)
+    assert 0.5 < state.torque[0] < 0.7  # 1 - 1 / e
+    r = run(state, work, sensed, 2.0, information=vague)
+    np.testing.assert_allclose(r, [1.0, 0.0], atol=1e-3)
+
+
+def test_law_that_continues_with_its_disturbance_does_not_have_it_twice():
+    state, work = new()
+    load_observer.begin(state, np.array([0.0, 2.0]))
+    sensed = X[:, :P] @ LINKS + [0.0, 2.0]
+    r = run(state, work, sensed, 2.0, information=np.eye(M))
+    np.testing.assert_allclose(r, [0.0, 2.0 * exp(-4.0)], atol=1e-3)
+
+
+def test_what_remains_once_a_window_is_learned_is_not_added():
+    """0.4 N m at 1 Hz: rms 0.28, of which twice is not reached; 3 N m are, less 0.57."""
+    state, work = settled()
+
+    def ripple(t, more=0.0):
+        wave = 0.4 * np.sin(2.0 * np.pi * t) + more
+        return X[:, :P] @ LINKS + [wave, 0.0]
+
+    run(state, work, ripple, 20.0, learned=True)
+    largest = 0.0
+    for _ in range(100):
+        largest = max(largest, abs(run(state, work, ripple, 0.01, learned=True)[0]))
+    assert largest < 0.05
+    r = run(state, work, lambda t: ripple(t, 3.0), 0.25, learned=True)[0]
+    assert 2.5 < r < 3.0  # 3 + 0.4 - 2 rms
+
+
+def test_threshold_begins_without_a_step_of_the_torque():
+    """The unmodelled 0.5 N m are s at first: 1 of 3 N m goes to d^3."""
+    state, work = settled()
+    sensed = X[:, :P] @ LINKS + [3.0, 0.0]
+    before = run(state, work, sensed, 1.0)
+    d3 = np.zeros(N)
+    after = run(state, work, sensed, DT, learned=True, d3=d3)
+    np.testing.assert_allclose(d3, [1.0, 0.0], atol=1e-9)
+    np.testing.assert_allclose(after + d3, before, atol=0.02)  # 1 / 200 windows
+
+
+def test_load_that_is_never_learned_goes_to_the_disturbance_estimate():
+    """The mean of r becomes the bias, within windows; d^3 then takes it."""
+    state, work = settled()
+    sensed = X[:, :P] @ LINKS + [3.0, 0.0]
+    run(state, work, X[:, :P] @ LINKS, 2.0, learned=True)
+    r = run(state, work, sensed, 0.2, learned=True)[0]
+    assert r > 2.5
+    assert run(state, work, sensed, 60.0, learned=True)[0] < 0.5
+
+
+@pytest.mark.parametrize(
+    ('changes', 'named'),
+    [
+        ({'robot.torque_loop': False}, 'robot.torque_loop false'),
+        ({'robot.effort': 'commanded'}, 'robot.effort commanded'),
+        ({'learning.prediction': 'lambda'}, 'learning.prediction lambda'),
+    ],
+)
+def test_without_sensors_or_rows_the_observer_is_refused(changes, named):
+    given = {CONTROLLER: {'disturbance.observer_bandwidth': L, **changes}}
+    with pytest.raises(ConfigurationError, match=named):
+        load_loop('panda', given)
+
+
+def picked_up(controller):
+    """The largest error [mrad] in 2 s from a pick-up of 2 kg at 8 s on, and the run."""
+    plant = {
+        'duration': 10.0,
+        'events.begin': [8.0],
+        'events.duration': [0.0],
+        'events.payload': [2.0],
+    }
+    loop = load_loop('fr3_direct', {PLANT: plant, CONTROLLER: controller})
+    record = simulate(loop.controller, loop.plant)
+    errors = 1e3 * np.abs(np.asarray(record.run().error))
+    return errors[8000:].max(), record
+
+
+def test_soft_elastic_arm_takes_up_a_load_by_its_torque_sensors():
+    """An FR3 with elastic joints: 18 mrad by d^3 and learning, 6 by what its sensors show.
+
+    The load is weighed as well with it, no oscillation is found, and a stop holds what
+    r has taken.
+    """
+    without, _ = picked_up({'disturbance.observer_bandwidth': 0.0})
+    largest, record = picked_up({})
+    assert largest < 0.4 * without
+    load = record.controller.state.weighing.load
+    assert load[0] == pytest.approx(2.0, abs=0.05)
+    assert not record.run().oscillations
+    state, kept = record.controller.state, record.controller.checks.estimates.kept
+    held = state.disturbance + state.observer.torque
+    np.testing.assert_array_equal(kept[-len(held) :], held)
+
+
+def test_without_the_observer_efforts_change_no_torque():
+    """Efforts of any kind give the same bits; with it they do not."""
+
+    def torques(bandwidth, efforts):
+        given = {'disturbance.observer_bandwidth': bandwidth}
+        config = load_loop('panda', {CONTROLLER: given}).controller
+        controller = controller_of(config)
+        q = np.array(config.reference.offset)
+        found = []
+        for k in range(200):
+            motion = np.concatenate((q, np.zeros(len(q)), efforts))
+            found.append(controller.update(k * DT, DT, motion).copy())
+        return np.array(found)
+
+    n = len(load_loop('panda').controller.joints)
+    some, others = np.zeros(n), np.linspace(-9.0, 9.0, n)
+    assert np.array_equal(torques(0.0, some), torques(0.0, others))
+    assert not np.array_equal(torques(L, some), torques(L, others))
+
+
+@pytest.mark.parametrize(
+    ('preset', 'expected'),
+    [
+        ('panda', 60.0),
+        ('fr3', 60.0),
+        ('fr3_direct', 60.0),
+        ('panda_rigid', 0.0),
+        ('ur5e', 0.0),
+        ('recommended', 0.0),
+    ],
+)
+def test_soft_arms_with_torque_sensors_have_the_observer(preset, expected):
+    assert load_loop(preset).controller.disturbance.observer_bandwidth == expected
+
+
+def test_softened_feedback_has_a_slower_observer():
+    settings = settings_of_config(load_loop('panda').controller)
+    assert softened(settings, 0.5).observer.observer_bandwidth == 30.0
