@@ -75,7 +75,6 @@ _FRICTION = 0.05  # standard deviation of friction, over the rated torque
 _MOST_FRICTION = 3.0  # times its initial estimate
 # standard deviation of what friction has more at breakaway, over its initial estimate
 _BREAKAWAY = 0.7
-_MOST_LOAD = 0.5  # of the torque limit, of what joint torque sensors show
 _POSTURES = 1000  # random ones of a planar arm
 
 
@@ -270,7 +269,7 @@ def _observer(
         sensor_lag=0.5 * lag,  # the other half is that of the drives
         samples=sliding.length * sliding.row_interval,
         unmodelled=_unmodelled(config),
-        most=_MOST_LOAD * np.array(config.torque.limit),
+        most=load_observer.most_load(np.array(config.torque.limit)),
         rotors=rotors,
     )
 

@@ -50,6 +50,12 @@ _THRESHOLD = 2.0  # s: a sinusoid does not reach it
 _FIRST = 0.1  # of a window, for which the unmodelled torque counts as s
 _CLIPPED = 2.0  # s, beyond which r says nothing about its mean and its rms
 _LEAST = 0.1  # of the unmodelled torque, likewise
+_MOST = 0.5  # of the torque limit
+
+
+def most_load(limit: Array) -> Array:
+    """Return the largest |r| (n,) [N m] with a torque limit (n,) [N m]."""
+    return _MOST * limit
 
 
 class Settings(NamedTuple):
@@ -59,7 +65,7 @@ class Settings(NamedTuple):
     observer_bandwidth: float  # L, rad/s
     sensor_lag: float  # of velocities, which the torque waits for, s
     samples: int  # in a window of the learning
-    most: Annotated[Array, 'n']  # largest |r|, N m
+    most: Annotated[Array, 'n']  # largest |r|, N m; zero: the observer is off
     unmodelled: Annotated[Array, 'n']  # rms torque that no column describes, N m
     # what the assumed rotors add to P^, kg m^2
     rotors: Annotated[Array, 'p * observer.enabled']

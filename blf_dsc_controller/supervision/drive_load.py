@@ -26,6 +26,7 @@ from blf_dsc_controller.arms.serial_chain import SerialChain
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.law.controller import Controller
 from blf_dsc_controller.law.external_torque import is_touched
+from blf_dsc_controller.law.load_observer import most_load
 from blf_dsc_controller.law.torque import added_torque
 from blf_dsc_controller.law.weighing import DEVIATION, MASS
 from blf_dsc_controller.numerics.intervals import TWO_SIDED
@@ -88,11 +89,15 @@ class DriveLoads:
     def forget(self, controller: Controller) -> None:
         """Begin again with a law that has forgotten what the tip holds.
 
-        It is held by what the drives have been told: both are left out of account.
+        It is held by what the drives have been told: both are left out of account.  Joint
+        torque sensors show both, so that the load observer is off from then on.
         """
         self.base = self.told
         self._goes_on = False
         controller.settings.torque.drive_inertias[:] = self._added()
+        is_left_out = not np.allclose(self.base.moments, self.declared.moments)
+        most = controller.settings.observer.most
+        most[:] = 0.0 if is_left_out else most_load(controller.settings.torque.limit)
 
     def next(self, controller: Controller) -> DriveLoad | None:
         """Return the load to declare next; None if there is none, or too uncertain.
