@@ -15,7 +15,7 @@ position loop (`kp`, `kd`) moves one joint to targets; where it is is read 6 s l
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import NamedTuple
 
 import numpy as np
@@ -31,6 +31,13 @@ from sim_plant.mujoco_plant import MujocoPlant
 
 _MOVING = 3.0  # s, to each target
 _HELD = 3.0  # s, until the arm is looked at
+
+AS_CONFIGURED: Mapping[str, object] = {}
+RIGID: Mapping[str, object] = {
+    'joint.stiffness': [],
+    'joint.backlash': [],
+    'sensor.side': 'link',
+}
 
 Torques = Callable[[int, np.ndarray, np.ndarray], np.ndarray]
 """Of the number of a state, its measurement (3 n,) and the target (n,) [rad]."""
@@ -79,21 +86,23 @@ class Reached(NamedTuple):
     error: float  # rad
 
 
-def arm_of(case: Case) -> tuple[Guard, MujocoPlant]:
+def arm_of(
+    case: Case, gears: Mapping[str, object] = AS_CONFIGURED
+) -> tuple[Guard, MujocoPlant]:
     """Return controller and arm of a case, at rest."""
     loop = load_loop(case.preset)
     nothing_happens: dict[str, list[float]] = {
         f'events.{name}': [] for name in ('begin', 'duration', 'payload')
     }
     at_rest = {'initial.position': list(case.rest)}
-    plant = change(loop.plant, at_rest | nothing_happens)
+    plant = change(loop.plant, at_rest | nothing_happens | gears)
     controller = change(loop.controller, {'reference.type': 'hold'})
     return Guard(controller, lambda: 0, lambda: 0), MujocoPlant(plant)
 
 
 def with_position_loop(case: Case) -> list[Reached]:
-    """Return what the position loop reaches."""
-    guard, arm = arm_of(case)
+    """Return what the position loop reaches with rigid gears: some are another arm's gains."""
+    guard, arm = arm_of(case, RIGID)
     law = guard.controller
     kp, kd = np.array(case.kp), np.array(case.kd)
     initial = law.settings.initial_estimate

@@ -125,8 +125,9 @@ def test_estimates_of_the_smallest_recent_error_are_kept(
     ratio, oscillates, begins, kept
 ):
     state = part(kept_estimates.State, n=N, m=3)
-    kept_estimates.keep(state, np.arange(3.0), np.array([7.0, 8.0]))
-    assert state.kept.tolist() == [0.0, 1.0, 2.0, 7.0, 8.0]
+    observed = np.array([0.5, 0.0])
+    kept_estimates.keep(state, np.arange(3.0), np.array([7.0, 8.0]), observed)
+    assert state.kept.tolist() == [0.0, 1.0, 2.0, 7.5, 8.0]
     state.least_ratio[0] = 0.25
     scale = np.array([0.5, 0.6])
     kept_estimates.keep_consistent(state, scale, ratio, oscillates, begins, DT)

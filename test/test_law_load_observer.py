@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from law_part import part
 
+import blf_dsc_controller as blf
 from blf_dsc_controller.arms.model import regressors_at
 from blf_dsc_controller.configuration.nodes import CONTROLLER, PLANT, load_loop
 from blf_dsc_controller.configuration.robot import parameters_of
@@ -154,11 +155,38 @@ def test_what_is_learned_fades_from_r_and_changes_no_torque():
     np.testing.assert_allclose(d3, [1.0, 2.0], atol=1e-9)
 
 
-def test_missing_readings_change_nothing():
-    state, work = settled()
-    load = X[:, :P] @ LINKS + [4.0, -1.0]
-    r = run(state, work, load, 1.0)
-    np.testing.assert_allclose(run(state, work, [nan, nan], 0.1), r, rtol=1e-9)
+def test_readings_are_missing_if_one_is():
+    assert load_observer.is_missing(np.array([1.0, nan]))
+    assert not load_observer.is_missing(np.array([1.0, -2.0]))
+
+
+def commanded(observer, sensed):
+    """Return the torques of a Panda that falls behind its reference; `sensed` reads a sample."""
+    law = {'disturbance.observer_bandwidth': observer}
+    config = load_loop('panda', {CONTROLLER: law}).controller
+    rest = np.array(config.reference.offset)
+    torques = []
+    with blf.ArmController(config) as controller:
+        for k in range(800):
+            effort = sensed(k)
+            given = () if effort is None else (effort,)
+            q = rest + 1e-5 * k * np.ones(7)
+            torque = controller.update(0.001 * k, q, np.full(7, 0.01), *given)
+            torques.append(torque.copy())
+    return np.array(torques)
+
+
+def test_arm_whose_sensors_are_not_read_gets_the_torque_without_them():
+    without = commanded(0.0, lambda _: None)
+    np.testing.assert_array_equal(commanded(60.0, lambda _: None), without)
+
+
+def test_sensors_that_fall_silent_leave_r_as_it_is():
+    """It does not take the weight of the arm for a load."""
+    reading = np.array([0.0, -30.0, 0.0, 20.0, 0.0, 2.0, 0.0])
+    silent = commanded(60.0, lambda k: reading if k < 300 else None)
+    steps = np.abs(np.diff(silent, axis=0))
+    assert steps[300:].max() <= steps[100:300].max()
 
 
 def test_r_is_within_its_limits():

@@ -148,6 +148,8 @@ def observe_load(settings: Settings, state: State, signals: Signals, dt: float) 
     is_learned = state.latch.latched[0] == 1.0 and settings.adaptation.weight > 0.0
     if state.samples[0] <= 1.0:
         load_observer.begin(now, state.disturbance)
+    if load_observer.is_missing(signals.effort):
+        return
     for i in range(settings.n):
         load_observer.filter_interval(of, now, i, signals.row[i], signals.effort[i], dt)
     load_observer.update(

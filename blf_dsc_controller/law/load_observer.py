@@ -93,17 +93,22 @@ class Work(NamedTuple):
 
 
 @inner
+def is_missing(effort: Array) -> bool:
+    """Whether a reading (n,) is missing, NaN: then r stays, and is zero before the first."""
+    missing = False
+    for i in range(effort.size):
+        missing = missing or not isfinite(effort[i])
+    return missing
+
+
+@inner
 def filter_interval(
     settings: Settings, state: State, i: int, row: Array, effort: float, dt: float
 ) -> None:
-    """Pass X of `row` and the sensed `effort` [N m] of joint i in an interval through L.
-
-    A reading that is missing, NaN, leaves the torque as it is.
-    """
-    if isfinite(effort):
-        passes = state.elapsed[0] == 0.0 or settings.sensor_lag == 0.0
-        share = 1.0 if passes else filter_gain(settings.sensor_lag, dt)
-        state.late[i] += share * (effort - state.late[i])
+    """Pass X of `row` and the sensed `effort` [N m] of joint i in an interval through L."""
+    passes = state.elapsed[0] == 0.0 or settings.sensor_lag == 0.0
+    share = 1.0 if passes else filter_gain(settings.sensor_lag, dt)
+    state.late[i] += share * (effort - state.late[i])
     gain = filter_gain(1.0 / settings.observer_bandwidth, dt)
     filtered = state.filtered[i]
     p = filtered.size - 1

@@ -65,10 +65,10 @@ class RecentMotion:
         if self._count < self.size:
             return None
         order = np.arange(self._count - self.size, self._count) % self.size
-        times = 1e-9 * self._stamps[order[:: self._step]]
+        stamps = self._stamps[order[:: self._step]]
         states = self._states[order[:: self._step]]
         torques = self._torques[order[:-1]].reshape(self._blocks, self._step, -1)
-        steps = np.diff(times)
+        steps = 1e-9 * np.diff(stamps)  # s
         means = 0.5 * (states[:-1] + states[1:])
         changes = np.diff(states, axis=0) / steps[:, np.newaxis]
         n = torques.shape[2]
