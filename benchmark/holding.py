@@ -95,7 +95,7 @@ def arm_of(
         f'events.{name}': [] for name in ('begin', 'duration', 'payload')
     }
     at_rest = {'initial.position': list(case.rest)}
-    plant = change(loop.plant, at_rest | nothing_happens | gears)
+    plant = change(loop.plant, {**at_rest, **nothing_happens, **gears})
     controller = change(loop.controller, {'reference.type': 'hold'})
     return Guard(controller, lambda: 0, lambda: 0), MujocoPlant(plant)
 

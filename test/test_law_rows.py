@@ -100,7 +100,7 @@ def test_lambda_of_equation_24(ddq, dq, dalpha2, alpha2, expected):
 
 FEEDBACK = feedback.Settings(
     gain=np.array([10.0, 20.0]),
-    damping=np.array([0.0, 300.0]),
+    robust_gain=np.array([0.0, 300.0]),
     damping_rate=5.0,
     follows_inertia=0,
     decoupled=0,
