@@ -251,3 +251,22 @@ def test_after_a_gap_the_velocity_to_be_damped_is_the_measured_one(gap, slow, dd
     last.take_usable(stamp, np.array([3.0 * gap, 0.5, 0.0]), 5.0, 1e-3)
     np.testing.assert_allclose(last.slow, slow)
     assert last.ddq == (None if ddq is None else pytest.approx(ddq))
+
+
+def test_arm_that_no_error_stops_goes_on_after_a_gap_outside_its_bound():
+    """As a busy computer leaves it: with `safety.error_ratio` 0 no bound is enforced."""
+    law = {
+        'reference.type': 'hold',
+        'safety.error_ratio': 0.0,
+        'safety.state_timeout': 10.0,
+    }
+    config = load_loop('recommended', {'blf_dsc_controller': law}).controller
+    rest = np.array([2.293, 1.696])  # rad
+    guard = Guard(config, lambda: 0, lambda: 0)
+    guard.activate()
+    for k in range(100):
+        guard.update(START + k * 1_000_000, np.array([*rest, *np.zeros(4)]))
+    # slower than `safety.velocity_limit`, so it is believed
+    far = rest + 3.0 * np.array(config.barrier.bound)
+    guard.update(START + 162_000_000, np.array([*far, *np.zeros(4)]))
+    assert guard.supervisor.running, guard.supervisor.text

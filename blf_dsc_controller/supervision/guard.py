@@ -534,13 +534,15 @@ class Guard:
     def _rejoin(self, stamp: int, measurement: Vector) -> bool:
         """Return to the reference from where the arm is after a gap, or stop if it is too far.
 
-        Whoever commanded it meanwhile may have braked it.  Of an invalid state, the law
-        says what is wrong.
+        Whoever commanded it meanwhile may have braked it.  Without `safety.error_ratio` the
+        law goes on instead.  Of an invalid state, the law says what is wrong.
         """
         if not is_valid_state(self.controller.checks, measurement):
             return True
         q, dq, _ = measurement.reshape(3, -1)
         motion = self._resumption(stamp, q, dq)
+        if motion is None and self.config.safety.error_ratio == 0.0:
+            return True  # no error stops this arm
         if motion is None:
             text = (
                 f'no joint state came for {self._gap:.3g} s, and the arm is too far from its '
