@@ -317,3 +317,17 @@ def test_a_posture_that_noise_hides_is_measured_again(arm, capsys):
     again = arm.with_name('again.yaml')
     assert main(['commission', bag, '--config', str(arm), '--out', str(again)]) == 0
     np.testing.assert_array_equal(gains_of(again), gains)
+
+
+def test_motion_that_stays_hidden_is_told_after_its_posture(arm, capsys):
+    """Not once all postures have been measured."""
+    coarse = '    sensor: {resolution: 1.0e-3, velocity: differenced}\n'
+    arm.write_text(
+        arm.read_text().replace('    initial.position', coarse + '    initial.position')
+    )
+    options = ('--yes', '--torque', '0.01', '--travel', '1e-5')
+    assert commission(arm, 'plant', *options, postures=(FAR, NEAR)) == 1
+    told = capsys.readouterr().err
+    assert 'posture 1: the positions do not show the motion' in told
+    assert PlantDriver.last.calls == ['connect', *['start', 'finish'] * 3]
+    assert nothing_looks_whole(arm)

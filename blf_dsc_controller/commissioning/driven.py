@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import NamedTuple
 
@@ -23,6 +24,7 @@ from blf_dsc_controller.bags.reader import read_run
 from blf_dsc_controller.commissioning import motion
 from blf_dsc_controller.commissioning.commissioning import Planned
 from blf_dsc_controller.commissioning.own_loop import Commissioning, Measured
+from blf_dsc_controller.commissioning.response import response_of
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.schema import change
 from blf_dsc_controller.control.arm_controller import ArmController
@@ -76,6 +78,15 @@ def move(config: ControllerConfig, here: Floats, there: Floats) -> Move:
         'reference.waypoints': [*here.tolist(), *target.tolist()],
     }
     return Move(change(config, values), duration + _REST)
+
+
+@contextmanager
+def _named(name: str) -> Iterator[None]:
+    """Let an error say in which posture it is."""
+    try:
+        yield
+    except BlfDscError as error:
+        raise BlfDscError(f'{name}: {error}') from error
 
 
 class Driven:
@@ -143,15 +154,15 @@ class Driven:
             self._run(way.config, way.duration, f'move {k}')
             here = self._commissioning.motion(self.position())
             run = self._shaken(here, name)
-            try:
+            with _named(name):
                 again = self._commissioning.stronger(here, run, self.position())
-            except BlfDscError as error:
-                raise BlfDscError(f'{name}: {error}') from error
             if again is not None:
                 bag = self._bag(name)
                 bag.rename(bag.with_name(f'weak_{bag.name}'))
                 here = again
                 run = self._shaken(here, name)
+            with _named(name):
+                response_of(run, motion.lines_in(here.config), here.config.sample_time)
             self._measured = k
             yield name, (run, here.config)
 
