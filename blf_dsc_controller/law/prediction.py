@@ -103,12 +103,18 @@ def motion_weight(settings: Settings, dqr: float, i: int) -> float:
 
 
 @inner
+def moving_square(speed: float, motion_scale: float) -> float:
+    """Return the squared weight of a joint's row by its speed: 1 in motion, 0 at rest."""
+    square = speed**2
+    return square / (square + motion_scale**2 + 1e-12)
+
+
+@inner
 def moving_share(dqr: Array, motion_scale: float) -> float:
     """Return the mean square weight of the joints' rows: 1 in motion, 0 at rest."""
     share = 0.0
     for i in range(dqr.size):
-        square = dqr[i] ** 2
-        share += square / (square + motion_scale**2 + 1e-12) / dqr.size
+        share += moving_square(dqr[i], motion_scale) / dqr.size
     return share
 
 

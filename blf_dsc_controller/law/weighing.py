@@ -33,7 +33,7 @@ from blf_dsc_controller.compiled.jit import inner
 from blf_dsc_controller.compiled.layout import Array, Cell
 from blf_dsc_controller.law import innovation, sums
 from blf_dsc_controller.law.innovation import Prior
-from blf_dsc_controller.law.prediction import moving_share
+from blf_dsc_controller.law.prediction import moving_share, moving_square
 from blf_dsc_controller.numerics.algebra import cholesky_factor, cholesky_solve
 
 _FEWEST = 0.5  # s of motion that a part has
@@ -177,8 +177,12 @@ def counted_share(dqr: Array, motion_scale: float) -> float:
     share = 0.0
     for i in range(dqr.size):
         square = dqr[i] ** 2
-        moving = square / (square + motion_scale**2 + 1e-12)
-        share += moving * square / (square + _SLOW**2) / dqr.size
+        share += (
+            moving_square(dqr[i], motion_scale)
+            * square
+            / (square + _SLOW**2)
+            / dqr.size
+        )
     return share
 
 
