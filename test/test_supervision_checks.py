@@ -478,7 +478,7 @@ def test_last_torque_is_the_safe_torque_of_an_arm_at_rest(safety, on_a_ramp):
     torque = rig.guard.release()
     samples = rig.guard.samples
     q = rig.guard._safe_torque.last.q
-    load = rig.guard._recent.load(rig.guard.controller.settings, samples.estimate)
+    load = rig.guard._held.recent.load(rig.guard.controller.settings, samples.estimate)
     holding = dynamics(samples.estimate[:3], 9.8, q, (0.0, 0.0))[2] + load
     np.testing.assert_allclose(
         torque, holding if safety == 'hold_gravity' else [0.0, 0.0]

@@ -50,11 +50,10 @@ from blf_dsc_controller.supervision.calming import Calming
 from blf_dsc_controller.supervision.contact import contact_of
 from blf_dsc_controller.supervision.drive_load import DriveLoad, DriveLoads
 from blf_dsc_controller.supervision.first_torque import check_first_torque
-from blf_dsc_controller.supervision.held_torque import held_command
+from blf_dsc_controller.supervision.held_torque import HeldTorque
 from blf_dsc_controller.supervision.last_state import LastState
-from blf_dsc_controller.supervision.model_torque import needed_torque
 from blf_dsc_controller.supervision.plan import Plan, plan_motion
-from blf_dsc_controller.supervision.recent_motion import RecentMotion, is_gap
+from blf_dsc_controller.supervision.recent_motion import is_gap
 from blf_dsc_controller.supervision.safe_torque import SafeTorque
 from blf_dsc_controller.supervision.sample_check import SampleCheck
 from blf_dsc_controller.supervision.start import (
@@ -160,9 +159,7 @@ class Guard:
         self._wraps = Wraps(config)
         self._safe_torque = SafeTorque(n)
         self._safe_torque.scale = self.controller.state.rotors.gain_scale
-        self._recent = RecentMotion(n, config.sample_time)
-        # the last measurement, if it is the first after a gap
-        self._after_gap: Vector | None = None
+        self._held = HeldTorque(config, self.controller, self.samples)
         self._seen = 0  # ns, stamp of the last state, used or not
         self._gap = 0.0  # s, since the one before
         self._stop_speed = StopSpeed()
@@ -206,7 +203,7 @@ class Guard:
         if self._velocity is not None:
             self._velocity.replace(stamp, measurement)
         if is_gap(self._gap, self.config.sample_time):
-            self._after_gap = measurement
+            self._held.after_gap = measurement
         if self.supervisor.uses_states:
             fault = self.states.check(self.config.safety, stamp)
             if fault is SKIP:
@@ -287,7 +284,7 @@ class Guard:
             last.take(stamp, measurement, self._slow)
             if not self._start(stamp, measurement):
                 return self._safe(self.config.sample_time)
-        elif self._after_gap is not None and not self._rejoin(stamp, measurement):
+        elif self._held.after_gap is not None and not self._rejoin(stamp, measurement):
             return self._safe_at(stamp, measurement)
         dt = (stamp - self.last_stamp) * _NANO
         before = perf_counter()
@@ -303,7 +300,7 @@ class Guard:
             self._stop(*fault)
             return self._safe(self.config.sample_time)
         self._safe_torque.commanded[:] = torque
-        self._recent.take(stamp, measurement, torque)
+        self._held.recent.take(stamp, measurement, torque)
         self.has_sample = True
         self.journal.commands += 1
         return torque
@@ -343,7 +340,7 @@ class Guard:
         loads = self._loads()
         self._note(EventType.DRIVE_LOAD, mass=load.mass, centre=list(load.centre))
         loads.take(self.controller, load)
-        self._recent.restart()  # the torques so far met drives without it
+        self._held.recent.restart()  # the torques so far met drives without it
 
     def declare(self, load: DriveLoad) -> None:
         """Let `load_to_tell` lead to this load, whatever is weighed.
@@ -485,12 +482,12 @@ class Guard:
         self.controller.reference_vector = motion.vector
         self.settled = motion.settled
         if self.commanding:
-            held = self._held_since_gap()
+            held = self._held.command()
             acting = self._safe_torque.commanded if held is None else held
             self.controller.take_over(acting, q)
         self.journal.note(EventType.START, resumed=resumed)
         self.last_stamp = stamp - self.config.sample_time_ns
-        self._recent.restart()
+        self._held.recent.restart()
         self.watchdog.switch(self.config.safety.watchdog, stamp)
         self.supervisor.enter(Phase.APPROACHING)
 
@@ -579,8 +576,9 @@ class Guard:
         `measurements` (k, 3n) and `torques` (k, n) [N m] have a row for each.  All checks
         passed, and `samples.ratio` and the kept estimates are up to date.
         """
-        for k in range(max(0, stamps.size - self._recent.size), stamps.size):
-            self._recent.take(int(stamps[k]), measurements[k], torques[k])
+        self._held.after_gap = None
+        for k in range(max(0, stamps.size - self._held.recent.size), stamps.size):
+            self._held.recent.take(int(stamps[k]), measurements[k], torques[k])
         count, stamp, measurement = stamps.size, int(stamps[-1]), measurements[-1]
         self.journal.stamp = stamp
         self._seen = stamp
@@ -619,7 +617,7 @@ class Guard:
 
     def time_out(self, text: str) -> Vector | None:
         """Return the torque of one watchdog period without a joint state."""
-        self._after_gap = None
+        self._held.after_gap = None
         if self.supervisor.phase is not Phase.STARTING:  # which is waiting for a state
             self._stop(Reason.STATE_TIMEOUT, text)
         self.watchdog.torques += 1
@@ -633,14 +631,14 @@ class Guard:
 
     def fail(self, text: str) -> Vector | None:
         """Return the torque after an unexpected error."""
-        self._after_gap = None
+        self._held.after_gap = None
         self._stop(Reason.FAILED, text)
         return self._safe_without_state(self.config.sample_time)
 
     def _begin_message(self) -> None:
         self.end_silence()
         self.waiting_for = ''
-        self._after_gap = None
+        self._held.after_gap = None
         self.has_sample = False
         self.journal.messages += 1
 
@@ -672,7 +670,9 @@ class Guard:
             self._stop_speed.begin(self._speed)
             self.journal.note(EventType.STOP, reason=reason, text=text)
             self._clean = self._resumable = False
-            load = self._load_at_stop(reason) if was_running else self._known_load
+            load = (
+                self._load_at_stop(reason) if was_running else self.samples.disturbance
+            )
             self._safe_torque.begin_ramp(
                 self.config.safety.stop_ramp,
                 load,
@@ -683,35 +683,15 @@ class Guard:
     def _load_at_stop(self, reason: Reason) -> Vector:
         """Return what holds the arm besides its model (n,) [N m], where the law stops.
 
-        After a silence it is what holds it now, whoever commands that.
+        After a gap it is what holds it now, whoever commands that.
         """
-        if self._after_gap is None:
-            is_wound_up = reason in _WINDING_UP or reason is Reason.NO_EFFECT
-            return self._known_load if is_wound_up else self._recent_load
-        held = self._held_since_gap()
-        if held is None:
-            return self._recent_load
-        self._safe_torque.commanded[:] = held
-        settings, q = self.controller.settings, self._after_gap[: self._n]
-        at_rest = np.zeros((2, self._n))
-        return held - needed_torque(settings, self.samples.estimate, q, *at_rest)
-
-    def _held_since_gap(self) -> Vector | None:
-        """Return the command (n,) [N m] that acts, if a gap ends here and efforts show it."""
-        if self._after_gap is None:
-            return None
-        return held_command(self.config, self.controller.settings, self._after_gap)
-
-    @property
-    def _known_load(self) -> Vector:
-        """The load (n,) [N m] by the disturbance estimate."""
-        return self.samples.disturbance
-
-    @property
-    def _recent_load(self) -> Vector:
-        """The load (n,) [N m] by the motion of the last samples, if they are enough."""
-        load = self._recent.load(self.controller.settings, self.samples.estimate)
-        return self._known_load if load is None else load
+        held = self._held.command()
+        if held is not None:
+            self._safe_torque.commanded[:] = held
+        is_wound_up = reason in _WINDING_UP or reason is Reason.NO_EFFECT
+        if is_wound_up and self._held.after_gap is None:
+            return self.samples.disturbance
+        return self._held.load()
 
     def _safe_without_state(self, dt: float) -> Vector | None:
         self.has_sample = False
@@ -765,7 +745,7 @@ class Guard:
         self.watchdog.restart()
         if self._resumable:
             ramp = self.config.safety.deactivation_ramp
-            self._safe_torque.begin_ramp(ramp, self._recent_load)
+            self._safe_torque.begin_ramp(ramp, self._held.load())
 
     def reset(self) -> None:
         """Discard all estimates and faults, and restart with the next state."""
@@ -874,7 +854,7 @@ class Guard:
         if not self.commanding or self.silenced:
             return None
         if self.supervisor.running:
-            self._safe_torque.load[:] = self._recent_load
+            self._safe_torque.load[:] = self._held.load()
         return self._safe_torque.leave(
             self.config.safety, self.controller.settings, self.samples.estimate
         )

@@ -1,5 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The command that acts on an arm by its effort, whoever has sent it."""
+"""What holds an arm where its law stops: the command that acts, and the load besides the model.
+
+Both follow from the motion before.  After a gap, in which others may have commanded the
+arm, they follow from its efforts, whoever has sent what acts.
+"""
 
 from __future__ import annotations
 
@@ -7,27 +11,60 @@ import numpy as np
 from numpy.typing import NDArray
 
 from blf_dsc_controller.configuration.controller import ControllerConfig
-from blf_dsc_controller.law.state import Settings
+from blf_dsc_controller.law.controller import Controller
 from blf_dsc_controller.law.torque import added_torque
+from blf_dsc_controller.supervision.model_torque import needed_torque
+from blf_dsc_controller.supervision.recent_motion import RecentMotion
+from blf_dsc_controller.supervision.sample_check import SampleCheck
 
 Vector = NDArray[np.float64]
 
 
-def held_command(
-    config: ControllerConfig, settings: Settings, measurement: Vector
-) -> Vector | None:
-    """Return the command (n,) [N m] that acts, within the torque limit; None: unknown.
+class HeldTorque:
+    """The command and the load of a controller's arm.
 
-    `measurement` is [q (n,) rad, dq (n,) rad/s, effort (n,) N m]; the effort may not be a
-    torque, or missing.
+    Attributes:
+        recent: the motion of the last samples.
+        after_gap: the last measurement (3n,), if it is the first after a gap; else None.
     """
-    q, _, effort = measurement.reshape(3, -1)
-    if config.robot.effort not in ('whole', 'commanded') or not (
-        np.isfinite(effort).all() and np.isfinite(q).all()
-    ):
-        return None
-    held = effort.copy()
-    if config.robot.effort == 'whole':
-        held -= added_torque(settings.torque, q)
-    limit = settings.torque.limit
-    return np.asarray(np.clip(held, -limit, limit))
+
+    def __init__(
+        self, config: ControllerConfig, controller: Controller, samples: SampleCheck
+    ) -> None:
+        """Look at the law of the controller, whose estimates `samples` keep."""
+        self.recent = RecentMotion(len(config.joints), config.sample_time)
+        self.after_gap: Vector | None = None
+        self._effort = config.robot.effort
+        self._controller = controller
+        self._samples = samples
+
+    def command(self) -> Vector | None:
+        """Return the command (n,) [N m] that acts after a gap, within the torque limit.
+
+        None: there was no gap, or efforts are no torques, or missing.
+        """
+        if self.after_gap is None or self._effort not in ('whole', 'commanded'):
+            return None
+        q, _, effort = self.after_gap.reshape(3, -1)
+        if not (np.isfinite(effort).all() and np.isfinite(q).all()):
+            return None
+        settings = self._controller.settings
+        held = effort.copy()
+        if self._effort == 'whole':
+            held -= added_torque(settings.torque, q)
+        limit = settings.torque.limit
+        return np.asarray(np.clip(held, -limit, limit))
+
+    def load(self) -> Vector:
+        """Return the load (n,) [N m] by the command after a gap, else by the last samples.
+
+        Where these are too few, it is the disturbance estimate of the law.
+        """
+        settings, estimate = self._controller.settings, self._samples.estimate
+        held = self.command()
+        if held is not None and self.after_gap is not None:
+            at_rest = np.zeros((2, held.size))
+            q = self.after_gap[: held.size]
+            return held - needed_torque(settings, estimate, q, *at_rest)
+        load = self.recent.load(settings, estimate)
+        return self._samples.disturbance if load is None else load
