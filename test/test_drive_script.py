@@ -232,8 +232,18 @@ q = arm.state.q + 0.5
 print('moving', flush=True)
 {}
 """
-MOVES = 'arm.move_to(q, speed=1.0, wait=False); time.sleep(0.2)'
-STREAMS = 'for k in range(6): arm.stream(arm.state.q + 0.01 * k); time.sleep(0.03)'
+# Ends once the arm is seen to move, however slow the computer is.
+MOVES = """
+start = arm.state.q
+arm.move_to(q, speed=1.0, wait=False)
+while abs(arm.state.q - start).max() < 0.01: time.sleep(0.01)
+"""
+STREAMS = """
+start = arm.state.q
+while abs(arm.state.q - start).max() < 0.01:
+    arm.stream(start + 0.05)
+    time.sleep(0.01)
+"""
 
 
 @pytest.mark.parametrize(
