@@ -139,7 +139,7 @@ def test_live_arm_is_measured_before_the_start(ros, steps, given, failure):
     for k in range(12):
         stamp += steps[k % len(steps)] * 10**6
         arm.send(stamp, np.zeros(3) if given else START)
-        ros.until(lambda k=k: node.finished or node._gate.count > k or arm.commands)
+        ros.until(lambda k=k: node.finished or node._start.count > k or arm.commands)
         assert bool(arm.commands) <= (k > 9 and not failure)
     ros.until(lambda: node.finished if failure else arm.commands)
     assert failure in str(node.failure)

@@ -53,7 +53,7 @@ def test_controller_refuses_to_start_without_the_watchdog_that_it_expects(ros):
     state = JointStateEncoder(JOINTS).encode(10**9, START, np.zeros(2), np.zeros(2))
     ros.driver()
     ros.until(states.get_subscription_count)
-    ros.until(lambda: states.publish(state) or law._pending)
+    ros.until(lambda: states.publish(state) or law._start.held)
     clock.advance(59.0)
     ros.spin(0.2)  # it looks every 8 ms
     assert not law.finished

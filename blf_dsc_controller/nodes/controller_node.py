@@ -12,7 +12,6 @@ import numpy as np
 
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.control.guarded_loop import GuardedLoop
-from blf_dsc_controller.errors import StartError
 from blf_dsc_controller.law.telemetry import rejected_columns
 from blf_dsc_controller.messages import topics
 from blf_dsc_controller.messages.codecs import (
@@ -21,6 +20,7 @@ from blf_dsc_controller.messages.codecs import (
     MessageError,
 )
 from blf_dsc_controller.nodes import parameters, process
+from blf_dsc_controller.nodes.controller_start import ControllerStart, Surroundings
 from blf_dsc_controller.nodes.diagnostics import ControllerStatus
 from blf_dsc_controller.nodes.lifecycle import LoopNode
 from blf_dsc_controller.nodes.load_service import LoadService
@@ -33,9 +33,7 @@ from blf_dsc_controller.supervision.config_warnings import config_warnings, wors
 from blf_dsc_controller.supervision.guard import Guard
 from blf_dsc_controller.supervision.not_commissioned import not_commissioned
 from blf_dsc_controller.supervision.reference_load import ReferenceLoad, reference_load
-from blf_dsc_controller.supervision.start_gate import GateState, StartGate
 from blf_dsc_controller.supervision.state_check import rate_mismatch
-from blf_dsc_controller.supervision.state_watchdog import SAME_CLOCK
 from blf_dsc_controller.supervision.supervisor import Phase
 
 _RARELY = 10  # samples between looks at what rarely changes
@@ -66,15 +64,13 @@ class ControllerNode(LoopNode[ControllerConfig]):
         self._contacts = self._oscillations = 0
         self._decoder = JointStateDecoder(joints, required=('position',))
         self._encoder = Float64MultiArrayEncoder(len(joints))
-        self._pending: bytes | None = None
         self._polled = 0  # joint states at the last poll
-        self._gate = StartGate(self.config.sample_time)
         self._warned_at = -1  # stamp of the start that the last warning was about
         self._told_gains = False  # that nobody has measured whether the arm bears them
         self._turned_at = -1  # likewise, of the last reference shifted by turns
         # whether the tracking errors had subscribers at the last count
         self._errors_subscribed = False
-        self._observed = self._started = False
+        self._started = False
         # phase, stops, silenced, text of a stop
         self._logged = Phase.INACTIVE, 0, False, ''
         self._ends_at = 0.0  # s, at the latest, since a signal
@@ -83,7 +79,12 @@ class ControllerNode(LoopNode[ControllerConfig]):
         self._status = ControllerStatus(self, joints)
         self._action: TrajectoryAction | None = None
         self._watchdog = WatchdogPresence(expected=self.config.safety.expect_watchdog)
-        self._conditions = StartConditions(self, self._watchdog, self._steady)
+        self._start = ControllerStart(
+            self.config,
+            self._decoder,
+            StartConditions(self, self._watchdog, self._steady),
+            Surroundings(self._is_observed, self._is_simulated, self._wall),
+        )
         self._changes = parameters.on_change(
             self, type(self.config), self._retune, self._problems, self._check
         )
@@ -133,12 +134,12 @@ class ControllerNode(LoopNode[ControllerConfig]):
             inputs = motion_input_of(self, len(joints), lambda: self.guard)
             self._status.trajectories = inputs
             self._action = offered_action(self, inputs, joints)
-        self._conditions.begin(self._outputs[topics.COMMANDS], self.config)
+        self._start.look_around(self._outputs[topics.COMMANDS], self.config)
         self._report()
 
     def activate(self) -> None:
         """Take command with the next joint state."""
-        self._gate.restart()
+        self._start.measure()
         if self.guard is not None:
             self._begin_again(self.guard)
             self.guard.activate()
@@ -157,7 +158,7 @@ class ControllerNode(LoopNode[ControllerConfig]):
     def release(self) -> None:
         """Command the torque to leave behind and release the law."""
         self._leave()
-        self._conditions.close()
+        self._start.close()
         self.guard = None
         self._loop = None
         self._report()
@@ -172,7 +173,7 @@ class ControllerNode(LoopNode[ControllerConfig]):
         if self._action is not None:
             self._action.close()
             self._action = None
-        self._conditions.close()
+        self._start.close()
         super().destroy_node()
 
     def ready_to_end(self) -> bool:
@@ -195,7 +196,7 @@ class ControllerNode(LoopNode[ControllerConfig]):
     def _begin_again(self, guard: Guard) -> None:
         """Look at the conditions of the start, if this node does not command now."""
         if guard.silenced or not guard.commanding:
-            self._conditions.begin(self._outputs[topics.COMMANDS], self.config)
+            self._start.look_around(self._outputs[topics.COMMANDS], self.config)
 
     def _leave(self) -> None:
         """Command the torque that drivers may hold, and release the guard."""
@@ -207,7 +208,7 @@ class ControllerNode(LoopNode[ControllerConfig]):
         """Restart with the next joint state and the initial estimates."""
         if self.guard is not None:
             if self.guard.start_error is not None:
-                self._gate.restart()
+                self._start.measure()
             self._begin_again(self.guard)
             self.guard.reset()
         self.failure = None
@@ -220,18 +221,19 @@ class ControllerNode(LoopNode[ControllerConfig]):
         guard = self.guard
         if guard is None:
             return
-        if self._waits(guard, raw):
+        if self._start.holds(guard, raw):
+            self._report_if_changed(guard)
             return
         trajectories = self._status.trajectories
         if trajectories is not None and trajectories.job is not None:
             trajectories.poll(guard)
         try:
             torque = self._torque_for(guard, raw)
+            self._command(torque)
+            guard.perceive()
         except Exception as error:  # noqa: BLE001 - the arm needs a torque after any error
             self.survive(error)
             return
-        self._command(torque)
-        guard.perceive()
         if guard.has_sample:
             self._look_at_learning(guard)
         self._publish_telemetry(torque)
@@ -243,53 +245,6 @@ class ControllerNode(LoopNode[ControllerConfig]):
                 throttle_duration_sec=_WAITING_PERIOD,
             )
         self._report_if_changed(guard)
-
-    def _waits(self, guard: Guard, raw: bytes) -> bool:
-        """Whether a state comes too early to be used."""
-        self._observed = self._observed or self._is_observed()
-        is_starting = guard.supervisor.phase is Phase.STARTING
-        if not self._observed or (is_starting and not self._may_start(guard)):
-            self._pending = raw
-            return True
-        is_measuring = self._gate.state is GateState.MEASURING
-        return is_measuring and self._holds_back(guard, raw)
-
-    def _may_start(self, guard: Guard) -> bool:
-        """Whether the law may start, as far as others are concerned."""
-        try:
-            return self._conditions.are_met(commanding=guard.commanding)
-        except StartError as error:
-            guard.refuse(error)
-            self._report_if_changed(guard)
-            return False
-
-    def _holds_back(self, guard: Guard, raw: bytes) -> bool:
-        """Whether a state before the start is only for the gate."""
-        try:
-            stamp = self._decoder.decode(raw)
-        except MessageError:
-            return False
-        if guard.supervisor.phase is not Phase.STARTING:
-            return False
-        is_live = abs(self._wall() - stamp) * _NANO < SAME_CLOCK
-        if not is_live and self._is_simulated():  # a plant in lock-step waits
-            return False
-        guard.observe(stamp, self._decoder.values)
-        state = self._gate.take(stamp)
-        self._pending = raw
-        if state is GateState.MEASURING:
-            return True
-        self._pending = None
-        if state is GateState.REFUSED:
-            guard.refuse(StartError(self._gate.problem))
-        return self._lacks_support(guard)
-
-    def _lacks_support(self, guard: Guard) -> bool:
-        """Whether the start is refused, by the gate or for lack of support."""
-        if guard.start_error is None:
-            guard.check_support(self._decoder.values)
-        self._report_if_changed(guard)
-        return guard.start_error is not None
 
     def _is_simulated(self) -> bool:
         """Whether all joint states are of this package's simulated arm."""
@@ -380,25 +335,14 @@ class ControllerNode(LoopNode[ControllerConfig]):
             self._action.poll(guard)
         if guard is None:
             return False
-        self._start_from_pending(guard)
+        held = self._start.release(guard)
+        if held is not None:
+            self._on_joint_state(held)
         self._command(guard.watch())
         self._report_if_changed(guard)
         is_watched = guard.watchdog.on and guard.commanding
         polled, self._polled = self._polled, guard.journal.messages
-        return is_watched or self._pending is not None or polled != self._polled
-
-    def _start_from_pending(self, guard: Guard) -> None:
-        """Use a state that was held back, once the gate opens or the sender waits."""
-        waits = self._gate.poll()
-        if self._pending is None or not self._is_observed():
-            return
-        if self._gate.state is GateState.MEASURING and self._gate.count:
-            return
-        raw = self._pending
-        self._pending = None
-        if waits and not self._is_simulated() and self._lacks_support(guard):
-            return
-        self._on_joint_state(raw)
+        return is_watched or self._start.held is not None or polled != self._polled
 
     # Changes of the configuration, and reports.
 

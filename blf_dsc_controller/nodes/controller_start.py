@@ -1,0 +1,137 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The start of the controller's node: which joint state the law may start from."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from rclpy.publisher import Publisher
+
+from blf_dsc_controller.configuration.controller import ControllerConfig
+from blf_dsc_controller.errors import StartError
+from blf_dsc_controller.messages.codecs import JointStateDecoder, MessageError
+from blf_dsc_controller.nodes.start_conditions import StartConditions
+from blf_dsc_controller.supervision.guard import Guard
+from blf_dsc_controller.supervision.start_gate import GateState, StartGate
+from blf_dsc_controller.supervision.state_watchdog import SAME_CLOCK
+from blf_dsc_controller.supervision.supervisor import Phase
+
+_NANO = 1e-9
+
+
+@dataclass(frozen=True)
+class Surroundings:
+    """What the node sees of others.
+
+    Attributes:
+        is_observed: whether somebody receives the commands.
+        is_simulated: whether the joint states are of this package's simulated arm,
+            which waits for a torque.
+        wall: the wall clock [ns].
+    """
+
+    is_observed: Callable[[], bool]
+    is_simulated: Callable[[], bool]
+    wall: Callable[[], int]
+
+
+class ControllerStart:
+    """Holds joint states back until the law may start; of several, the last.
+
+    It may start once the commands are received, nobody else commands the arm, an
+    expected watchdog is ready, the states have the rate of the law, and the arm, if it
+    must be, is held.  A start that is refused is an error of the guard.
+    """
+
+    def __init__(
+        self,
+        config: ControllerConfig,
+        decoder: JointStateDecoder,
+        conditions: StartConditions,
+        surroundings: Surroundings,
+    ) -> None:
+        self._decoder = decoder
+        self._conditions = conditions
+        self._around = surroundings
+        self._gate = StartGate(config.sample_time)
+        self._was_observed = False
+        self.held: bytes | None = None
+
+    @property
+    def count(self) -> int:
+        """Number of states by which the rate has been measured so far."""
+        return self._gate.count
+
+    def measure(self) -> None:
+        """Measure the rate of the states anew."""
+        self._gate.restart()
+
+    def look_around(self, commands: Publisher, config: ControllerConfig) -> None:
+        """Look from now on who else commands the arm, and for an expected watchdog."""
+        self._conditions.begin(commands, config)
+
+    def close(self) -> None:
+        """Look no more."""
+        self._conditions.close()
+
+    def holds(self, guard: Guard, raw: bytes) -> bool:
+        """Whether a state comes too early to be used; it is held, or refused, then."""
+        is_starting = guard.supervisor.phase is Phase.STARTING
+        if not self._is_observed() or (is_starting and not self._is_alone(guard)):
+            self.held = raw
+            return True
+        is_measuring = self._gate.state is GateState.MEASURING
+        return is_measuring and self._measures(guard, raw)
+
+    def release(self, guard: Guard) -> bytes | None:
+        """Return the state held, once it may be used; call it every 8 ms."""
+        waits = self._gate.poll()
+        if self.held is None or not self._is_observed():
+            return None
+        if self._gate.state is GateState.MEASURING and self._gate.count:
+            return None
+        raw, self.held = self.held, None
+        if waits and not self._around.is_simulated() and self._lacks_support(guard):
+            return None
+        return raw
+
+    def _is_observed(self) -> bool:
+        """Whether somebody receives the commands, or has once."""
+        self._was_observed = self._was_observed or self._around.is_observed()
+        return self._was_observed
+
+    def _is_alone(self, guard: Guard) -> bool:
+        """Whether the law may start, as far as others are concerned."""
+        try:
+            return self._conditions.are_met(commanding=guard.commanding)
+        except StartError as error:
+            guard.refuse(error)
+            return False
+
+    def _measures(self, guard: Guard, raw: bytes) -> bool:
+        """Whether a state before the start is only for the gate."""
+        try:
+            stamp = self._decoder.decode(raw)
+        except MessageError:
+            return False
+        if guard.supervisor.phase is not Phase.STARTING:
+            return False
+        is_live = abs(self._around.wall() - stamp) * _NANO < SAME_CLOCK
+        if not is_live and self._around.is_simulated():  # in lock-step, it waits
+            return False
+        guard.observe(stamp, self._decoder.values)
+        state = self._gate.take(stamp)
+        self.held = raw
+        if state is GateState.MEASURING:
+            return True
+        self.held = None
+        if state is GateState.REFUSED:
+            guard.refuse(StartError(self._gate.problem))
+        return self._lacks_support(guard)
+
+    def _lacks_support(self, guard: Guard) -> bool:
+        """Whether the start is refused, by the gate or for lack of support."""
+        if guard.start_error is None:
+            guard.check_support(self._decoder.values)
+        return guard.start_error is not None
