@@ -31,7 +31,8 @@ from blf_dsc_controller.cli.session import (
     environment,
     localhost_environment,
 )
-from blf_dsc_controller.configuration.controller import ControllerConfig, Telemetry
+from blf_dsc_controller.configuration.controller import ControllerConfig
+from blf_dsc_controller.configuration.controller_groups import Telemetry
 from blf_dsc_controller.configuration.nodes import (
     CONTROLLER,
     RECORDER,

@@ -12,9 +12,9 @@ import pytest
 
 import blf_dsc_controller as blf
 from blf_dsc_controller.cli.main import main
-from blf_dsc_controller.configuration.controller import LAWS, ControllerConfig
+from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.law_file import digest, load_law
-from blf_dsc_controller.configuration.law_traits import traits_of
+from blf_dsc_controller.configuration.law_traits import LAWS, traits_of
 from blf_dsc_controller.configuration.nodes import load_loop, locate
 from blf_dsc_controller.configuration.plant import PlantConfig
 from blf_dsc_controller.configuration.schema import build, change, flatten

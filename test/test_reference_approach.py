@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 from fault_table import Rig
 
-from blf_dsc_controller.configuration.controller import (
+from blf_dsc_controller.configuration.controller import ControllerConfig
+from blf_dsc_controller.configuration.controller_groups import (
     Approach,
-    ControllerConfig,
     MotionLimits,
     Reference,
 )

@@ -8,7 +8,8 @@ import pytest
 from fault_table import JOINTS, MILLISECOND, Rig, jammed, sparse
 from plain_law import dynamics
 
-from blf_dsc_controller.configuration.controller import ControllerConfig, Safety
+from blf_dsc_controller.configuration.controller import ControllerConfig
+from blf_dsc_controller.configuration.controller_groups import Safety
 from blf_dsc_controller.configuration.schema import change
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.law.factory import controller_of, settings_of_config

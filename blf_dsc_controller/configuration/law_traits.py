@@ -26,6 +26,9 @@ _PACKAGED = {
     'slotine_li': Traits(has_barrier=False, learns=False),
 }
 
+LAWS = tuple(_PACKAGED)
+"""Laws of the package; the first is the default."""
+
 
 def traits_of(config: ControllerConfig) -> Traits:
     """Return what the law of a configuration does; that of a file says so itself."""

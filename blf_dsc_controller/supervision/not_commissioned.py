@@ -3,7 +3,8 @@
 
 from __future__ import annotations
 
-from blf_dsc_controller.configuration.controller import LAWS, ControllerConfig
+from blf_dsc_controller.configuration.controller import ControllerConfig
+from blf_dsc_controller.configuration.law_traits import LAWS
 
 
 def not_commissioned(config: ControllerConfig) -> str:

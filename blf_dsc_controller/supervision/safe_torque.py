@@ -9,7 +9,7 @@ from math import inf
 import numpy as np
 from numpy.typing import NDArray
 
-from blf_dsc_controller.configuration.controller import Safety
+from blf_dsc_controller.configuration.controller_groups import Safety
 from blf_dsc_controller.law.state import Settings
 from blf_dsc_controller.law.torque import added_torque
 from blf_dsc_controller.reference.approach import AT_REST

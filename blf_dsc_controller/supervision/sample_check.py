@@ -8,7 +8,8 @@ from math import inf
 import numpy as np
 from numpy.typing import NDArray
 
-from blf_dsc_controller.configuration.controller import ControllerConfig, Safety
+from blf_dsc_controller.configuration.controller import ControllerConfig
+from blf_dsc_controller.configuration.controller_groups import Safety
 from blf_dsc_controller.configuration.tool_bound import tool_of
 from blf_dsc_controller.law.check_state import NO_EFFECT, OUTSIDE, SUSPECT
 from blf_dsc_controller.law.controller import Controller

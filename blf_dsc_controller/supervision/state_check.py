@@ -11,7 +11,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from blf_dsc_controller.configuration.controller import Safety
+from blf_dsc_controller.configuration.controller_groups import Safety
 from blf_dsc_controller.supervision.supervisor import Fault, Reason
 
 Vector = NDArray[np.float64]

@@ -1,0 +1,126 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Parameters of the controller that follow from others, by the arm of a URDF."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from blf_dsc_controller.arms import tuning
+from blf_dsc_controller.arms.base_parameters import BaseParameters
+from blf_dsc_controller.arms.joint_gains import JointGains, unknown_arm
+from blf_dsc_controller.arms.known_gears import Gears
+from blf_dsc_controller.arms.urdf import Chain
+from blf_dsc_controller.configuration import tool_bound
+from blf_dsc_controller.configuration.controller_groups import Feedback, Surface
+from blf_dsc_controller.configuration.law_traits import LAWS
+from blf_dsc_controller.configuration.robot import (
+    ArmConfig,
+    Robot,
+    described,
+    given_robot,
+    parameters_of,
+)
+from blf_dsc_controller.configuration.schema import Value
+
+_OBSERVER = 60.0  # rad/s, below the drives' own loops
+
+
+def followed_by(given: Mapping[str, Any]) -> Mapping[str, Value]:
+    """Return the gains and limits that follow from given parameters by dotted name."""
+    period = given.get('sample_time', ArmConfig.sample_time)
+    if given.get('model', 'urdf' if given.get('robot.urdf') else '') != 'urdf':
+        return {'surface.time_constant': max(period, Surface().time_constant)}
+    robot, chain = given_robot(given)
+    base = parameters_of(robot, chain)
+    arm = _design(given, robot, chain, base)
+    bound = given.get('barrier.bound')
+    bounds_tool = tool_bound.is_given(given)
+    if bound is None and bounds_tool:
+        usual = tuning.gains_of(arm, None)
+        bound = tool_bound.joint_bounds({**usual, **given}, robot, chain, base)
+    followed = {} if bound is None else {'barrier.bound': bound}
+    if bounds_tool:  # which holds from the start on
+        followed['barrier.initial_bound'] = (0.0,) * len(chain.joints)
+    is_whole = bound is not None and len(bound) == len(chain.joints)
+    return {
+        'model': 'urdf',
+        **described(robot, chain),
+        'learning.weighing': given.get('learning.prediction', 'filtered') == 'filtered',
+        'feedback.stiffness': arm.stiffness,
+        'disturbance.observer_bandwidth': _observer_bandwidth(given, robot, arm),
+        **tuning.gains_of(arm, np.array(bound) if is_whole else None),
+        **followed,
+    }
+
+
+def _design(
+    given: Mapping[str, Any], robot: Robot, chain: Chain, base: BaseParameters
+) -> tuning.Design:
+    """Return what the gains follow from: as given, by known gears, or of an unknown arm."""
+    arm, gears = stated_design(given, robot, chain, base)
+    chosen = _given_gains(given, len(chain.joints)) is not None
+    if arm.joints is None:
+        chosen = 'feedback.stiffness' in given
+    return arm if chosen or gears is None else tuning.with_known_gears(arm, gears)
+
+
+def stated_design(
+    given: Mapping[str, Any], robot: Robot, chain: Chain, base: BaseParameters
+) -> tuple[tuning.Design, Gears | None]:
+    """Return the design by what is given alone, and the gears, if known.
+
+    Other laws than the package's own have feedback through the inertia matrix.
+    """
+    motors = robot.rotors(chain)
+    gears = _gears(robot, chain, motors)
+    is_own = given.get('law', LAWS[0]) == LAWS[0]
+    usual = 'whole' if not is_own or (gears and gears.has_torque_loop) else 'none'
+    is_whole = given.get('feedback.inertia', usual) != 'none'
+    gains = _given_gains(given, len(motors)) or unknown_arm(motors)
+    arm = tuning.Design(
+        chain,
+        base,
+        robot.efforts(chain),
+        motors,
+        robot.payload,
+        robot.lag,
+        None if is_whole else gains,
+        given.get('feedback.stiffness', Feedback().stiffness),
+        given.get('sample_time', ArmConfig.sample_time),
+    )
+    return arm, gears
+
+
+def _observer_bandwidth(
+    given: Mapping[str, Any], robot: Robot, arm: tuning.Design
+) -> float:
+    """Return the pole of the load observer of an arm with joint torque sensors [rad/s]; else 0."""
+    has_sensors = robot.torque_loop and robot.effort == 'whole'
+    is_own = given.get('law', LAWS[0]) == LAWS[0]
+    has_rows = given.get('learning.prediction', 'filtered') == 'filtered'
+    is_soft = arm.joints is not None
+    return _OBSERVER if has_sensors and is_own and has_rows and is_soft else 0.0
+
+
+def _gears(robot: Robot, chain: Chain, motors: np.ndarray) -> Gears | None:
+    """Return the gears of the arm, if their stiffness is known."""
+    stiffness = np.array(robot.joint_stiffness)
+    if stiffness.shape != motors.shape or not stiffness.all():
+        return None
+    viscous = np.array(robot.friction(chain)['viscous'])
+    return Gears(stiffness, motors, viscous, robot.torque_loop)
+
+
+def _given_gains(given: Mapping[str, Any], n: int) -> JointGains | None:
+    """Return the given gains of n joints; None: not given, or not valid (`problems`)."""
+    gains = JointGains(
+        *(
+            np.array(given.get(f'feedback.joint_{each}', ()))
+            for each in JointGains._fields
+        )
+    )
+    is_valid = all(each.shape == (n,) and (each > 0.0).all() for each in gains)
+    return gains if is_valid else None

@@ -1,0 +1,692 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Groups of the controller's parameters: reference, limits, safety, telemetry, gains.
+
+The gains are those of the control laws (28) and (35), and of composite learning (20) to
+(27).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import partial
+from itertools import pairwise
+from typing import Annotated, Literal
+
+import numpy as np
+
+from blf_dsc_controller.configuration.schema import (
+    PerJoint,
+    non_negative,
+    parameter,
+    positive,
+)
+
+_of_tool = partial(
+    non_negative,
+    read_only='the joint bounds follow from it when they are read: change those',
+)
+_of_reference = partial(
+    parameter,
+    read_only='the reference would jump: send a trajectory on ~/joint_trajectory',
+)
+_telemetry = partial(
+    parameter, read_only='topics are created once, when the node starts'
+)
+sizing = partial(parameter, read_only='it sets the size of the state of the law')
+_in_window = partial(
+    parameter, read_only='the data in the excitation window depend on it'
+)
+_at_start = partial(parameter, read_only='it has no effect later')
+_known = partial(parameter, read_only='it is known data, not a gain')
+_measured = partial(parameter, read_only='it says how the gains were found')
+_FOLLOWED = 'the other gains follow from it when they are read: change those'
+_from_urdf = partial(non_negative, (), read_only=_FOLLOWED, omittable=True)
+_RISE = 0.05  # s to the largest acceleration
+# per window: fewer do not determine P, more need over 100 MB
+_SAMPLES = (10, 1_000_000)
+
+
+@dataclass(frozen=True)
+class Reference:
+    """The reference to track, until a trajectory arrives on `~/joint_trajectory`.
+
+    Sinusoids are qr_i = offset_i + sum_k amplitude_ik cos(frequency_k t + phase_k);
+    waypoints are passed with minimum jerk, at rest at both ends.
+    """
+
+    type: Literal['sinusoids', 'waypoints', 'hold'] = _of_reference(
+        'sinusoids',
+        'sinusoids (paper), waypoints (minimum jerk), or hold (the initial position)',
+    )
+    offset: PerJoint = _of_reference((1.9935, 1.3961), 'centre of the motion', 'rad')
+    amplitude: Annotated[tuple[float, ...], 'joints', 'reference.frequency'] = (
+        _of_reference((0.3, 0.3), 'amplitude of each tone, one row per joint', 'rad')
+    )
+    frequency: tuple[float, ...] = _of_reference(
+        (1.0,), 'angular frequency of each tone', 'rad/s', at_least=0.0
+    )
+    phase: Annotated[tuple[float, ...], 'reference.frequency'] = _of_reference(
+        (0.0,), 'phase of each tone', 'rad'
+    )
+    times: tuple[float, ...] = _of_reference(
+        (), 'time of each waypoint from the start', 's', at_least=0.0, omittable=True
+    )
+    waypoints: Annotated[tuple[float, ...], 'reference.times', 'joints'] = (
+        _of_reference((), 'positions of all joints, one row per waypoint', 'rad')
+    )
+
+    stream_timeout: float = positive(
+        0.25,
+        'time without a new target after which the reference of a stream brakes',
+        's',
+    )
+
+    def rows(self, joints: int) -> np.ndarray:
+        """Return the waypoints (k, n) [rad] of so many joints."""
+        return np.reshape(self.waypoints, (-1, joints))
+
+    def problems(self) -> list[str]:
+        """Check that waypoints are given if used, and that their times increase."""
+        if self.type == 'waypoints' and not self.times:
+            return [
+                'reference.times: got none, but reference.type waypoints needs at least one'
+            ]
+        return [
+            f'reference.times: got {after:g} s after {before:g} s, but they must increase'
+            for before, after in pairwise(self.times)
+            if after <= before
+        ]
+
+
+@dataclass(frozen=True)
+class Approach:
+    """Motion to the reference from a start outside the bound.
+
+    The bound applies along it.
+    """
+
+    enabled: bool = parameter(
+        True,
+        'guide an arm that starts outside the bound into it; false: refuse '
+        'such a start',
+    )
+    longest: float = positive(30.0, 'longest duration of the approach', 's')
+
+
+@dataclass(frozen=True)
+class MotionLimits:
+    """Limits of each joint for an approach or a received trajectory."""
+
+    position_lower: PerJoint = parameter(
+        (-2.0 * math.pi,) * 2, 'lowest position', 'rad'
+    )
+    position_upper: PerJoint = parameter(
+        (2.0 * math.pi,) * 2, 'highest position', 'rad'
+    )
+    velocity: PerJoint = positive((1.5, 1.5), 'largest velocity', 'rad/s')
+    acceleration: PerJoint = positive((2.0, 2.0), 'largest acceleration', 'rad/s^2')
+    jerk: PerJoint = positive(
+        (),
+        'largest jerk of motions to streamed targets; empty: the acceleration is '
+        'reached in 0.05 s',
+        'rad/s^3',
+        omittable=True,
+    )
+
+    @property
+    def largest_jerk(self) -> tuple[float, ...]:
+        """The jerk as given, or that which reaches the acceleration in `_RISE`."""
+        return self.jerk or tuple(each / _RISE for each in self.acceleration)
+
+    def problems(self, joints: tuple[str, ...]) -> list[str]:
+        """Check that the position limits leave a range."""
+        limits = zip(joints, self.position_lower, self.position_upper, strict=True)
+        return [
+            f'limits.position_upper: got {upper:g} rad for {joint}, but it must be above '
+            f'limits.position_lower, {lower:g} rad'
+            for joint, lower, upper in limits
+            if upper <= lower
+        ]
+
+
+@dataclass(frozen=True)
+class Safety:
+    """Limits past which the controller stops, and the torque of the stop."""
+
+    state_timeout: float = positive(
+        0.04, 'largest delay of a state, by steady clock or stamp', 's'
+    )
+    watchdog: Literal['auto', 'on', 'off'] = parameter(
+        'auto',
+        'steady-clock watchdog for missing states; auto: only if stamps are wall-clock time',
+    )
+    expect_watchdog: bool = parameter(
+        False,
+        'wait for the node torque_watchdog before the first torque; report if it is missing',
+        read_only='it says which processes belong together',
+    )
+    other_commands: Literal['refuse', 'allow'] = parameter(
+        'refuse',
+        'refuse to start while another node commands the arm, or start beside it',
+    )
+    velocity: Literal['measured', 'estimated'] = parameter(
+        'measured',
+        'velocity as measured, or estimated from position differences, starting at rest',
+        read_only='the filters hold data that depend on it',
+    )
+    velocity_limit: float = positive(
+        50.0, 'velocity above which a measurement counts as broken', 'rad/s'
+    )
+    error_ratio: float = non_negative(
+        1.0,
+        'tracking error to stop at, relative to the bound, for laws with a barrier; 0: never',
+    )
+    saturation_time: float = positive(
+        0.5,
+        'longest time with a torque at its limit, less a quarter of the time below it',
+        's',
+    )
+    overrun_fraction: float = positive(
+        0.4, 'largest fraction of missed states, averaged over a second', at_most=1.0
+    )
+    first_torque: Literal['check', 'send'] = parameter(
+        'check',
+        'refuse a first torque that an arm at rest contradicts, or send it unchecked',
+    )
+    oscillation: Literal['soften', 'stop', 'warn', 'ignore'] = parameter(
+        'warn',
+        'what is done about an arm that oscillates; soften: halve the rates of the feedback, '
+        'twice at most, then stop',
+    )
+    torque: Literal['zero', 'damping', 'hold_gravity'] = parameter(
+        'zero', 'safe torque: zero, damping -D dq, or the learned gravity with damping'
+    )
+    damping: PerJoint = non_negative(
+        (2.0, 1.0), 'damping in the safe torque', 'N m s/rad', 'D'
+    )
+    stop_ramp: float = non_negative(
+        0.0, 'ramp to the safe torque after a fault; 0: at once', 's'
+    )
+    deactivation_ramp: float = non_negative(
+        0.5, 'the same ramp when the node is deactivated', 's'
+    )
+    fade_time: float = positive(
+        0.5, 'time to fade the safe torque without usable states', 's'
+    )
+
+
+@dataclass(frozen=True)
+class Telemetry:
+    """What the controller publishes besides its commands."""
+
+    enabled: bool = _telemetry(
+        True, 'publish reference, errors, estimates and monitors'
+    )
+    decimation: int = _telemetry(
+        10,
+        'samples per message of reference and monitor; errors come with every sample',
+        at_least=1,
+    )
+
+
+@dataclass(frozen=True)
+class ArmGeometry:
+    """Known geometry in the regressor.
+
+    The masses and the length of the second link are learned.
+    """
+
+    l1: float = _in_window(1.0, 'length of the first link', 'm', 'l1', above=0.0)
+    gravity: float = _in_window(9.8, 'gravity; 0 for a horizontal arm', 'm/s^2', 'g')
+
+
+@dataclass(frozen=True)
+class Barrier:
+    """Bound on the tracking error, and the barrier that enforces it."""
+
+    bound: PerJoint = positive(
+        (0.002, 0.002), 'bound on the tracking error', 'rad', 'k_c'
+    )
+    tool_bound: float = _of_tool(
+        0.0, 'bound on the error of robot.tip, from which `bound` follows; 0: none', 'm'
+    )
+    tool_angle_bound: float = _of_tool(
+        0.0,
+        'bound on the angle error of robot.tip, from which `bound` follows; 0: none',
+        'rad',
+    )
+    initial_bound: PerJoint = non_negative(
+        (0.0, 0.0),
+        'initial bound of a funnel that narrows to `bound`; 0: constant',
+        'rad',
+        'k_0',
+    )
+    funnel_rate: float = non_negative(
+        0.0, 'rate at which the funnel narrows', '1/s', 'a'
+    )
+    weight: PerJoint = positive(
+        (1000.0, 1000.0),
+        'stiffness of the barrier at zero error; 1 in the paper',
+        'N m/rad',
+        'w',
+    )
+    slope_limit: PerJoint = positive(
+        (2e4, 2e4),
+        'stiffness at which the barrier continues linearly',
+        'N m/rad',
+        'S_lim',
+    )
+
+    @property
+    def bounds_tool(self) -> bool:
+        """Whether there is a bound at the tool."""
+        return self.tool_bound > 0.0 or self.tool_angle_bound > 0.0
+
+    @property
+    def widest(self) -> tuple[float, ...]:
+        """Bound of each joint at the start [rad]."""
+        return tuple(
+            initial or bound
+            for initial, bound in zip(self.initial_bound, self.bound, strict=True)
+        )
+
+    def problems(self, joints: tuple[str, ...]) -> Iterator[str]:
+        """Check the weight against the slope limit, and the bounds of the funnel."""
+        for joint, weight, limit in zip(
+            joints, self.weight, self.slope_limit, strict=True
+        ):
+            if limit <= weight:
+                yield (
+                    f'barrier.slope_limit: got {limit:g} N m/rad for {joint}, but it must be above '
+                    f'barrier.weight, {weight:g} N m/rad'
+                )
+        for joint, initial, bound in zip(
+            joints, self.initial_bound, self.bound, strict=True
+        ):
+            if 0.0 < initial < bound:
+                yield (
+                    f'barrier.initial_bound: got {initial:g} rad for {joint}, but it must be 0 '
+                    f'(no funnel) or at least barrier.bound, {bound:g} rad'
+                )
+        if self.funnel_rate == 0.0 and self.widest != self.bound:
+            yield (
+                'barrier.funnel_rate: got 0 1/s, but barrier.initial_bound must narrow to '
+                'barrier.bound: give the rate'
+            )
+
+
+@dataclass(frozen=True)
+class Surface:
+    """Virtual control (15), (18) and the surface filter (13)."""
+
+    gain: PerJoint = non_negative(
+        (150.0, 150.0), 'gain of the virtual control on the tracking error', '1/s', 'K'
+    )
+    mu: PerJoint = non_negative(
+        (20.0, 20.0),
+        'gain of the virtual control that remains at the bound',
+        '1/s',
+        'mu',
+    )
+    time_constant: float = positive(
+        0.002, 'time constant of the surface filter', 's', 'lambda'
+    )
+    known_rate: bool = parameter(
+        False,
+        'tell the surface filter the rate of the virtual control, by the reference and the '
+        'measured velocity, so that it has no lag; the default of an arm from a URDF',
+        read_only='the torque would jump',
+    )
+
+
+@dataclass(frozen=True)
+class Feedback:
+    """Feedback terms of the law (28)."""
+
+    inertia: Literal['none', 'surface', 'whole'] = _at_start(
+        'surface',
+        'what of the feedback acts through the inertia matrix of '
+        'learning.initial_estimate: none of it, so that each joint has gains of its own '
+        '(default for a URDF), the rate of the surface filter (paper), or the whole',
+    )
+    joint_stiffness: PerJoint = _from_urdf(
+        'with inertia none: stiffness of each joint, from which gains follow; empty: '
+        'what arms with elastic joints bear of which nothing is known',
+        'N m/rad',
+    )
+    joint_damping: PerJoint = _from_urdf(
+        'with inertia none: damping of each joint, likewise', 'N m s/rad'
+    )
+    stiffness: float = positive(
+        1.0,
+        'factor on joint_stiffness and joint_damping; with inertia whole, the bandwidth '
+        'of the gains relative to what the delay allows, at most 1',
+        read_only=_FOLLOWED,
+    )
+    gain: PerJoint = non_negative(
+        (60.0, 20.0), 'gain on the velocity error', 'N m s/rad', 'K_p'
+    )
+    damping_rate: float = non_negative(
+        0.0,
+        'rate of damping, scaled by the inertia of learning.initial_estimate',
+        '1/s',
+        'omega_v',
+    )
+    robust_gain: PerJoint = non_negative(
+        (0.0, 0.0), 'robust term d2 |xi1| sat(xi2/b)', 'N m/rad', 'd2'
+    )
+
+
+@dataclass(frozen=True)
+class DisturbanceEstimate:
+    """Adaptive estimate of the disturbance (30)."""
+
+    gain: PerJoint = non_negative(
+        (100.0, 100.0),
+        'adaptation gain of the disturbance estimate; 0: no estimate',
+        'N m/rad',
+        'gamma',
+    )
+    leakage: float = non_negative(
+        0.0, 'leakage of the disturbance estimate', 'rad/(N m s)', 'eta'
+    )
+    observer_bandwidth: float = non_negative(
+        0.0,
+        'pole of the load observer, which adds what joint torque sensors show and the '
+        'model lacks; 0: none. The default of arms with robot.torque_loop, robot.effort '
+        'whole and feedback.inertia none is 60',
+        'rad/s',
+        'L',
+        read_only='it sets the size of the state of the law',
+    )
+
+
+@dataclass(frozen=True)
+class Torque:
+    """Saturation of the commanded torque."""
+
+    limit: PerJoint = positive(
+        (20.0, 20.0),
+        'largest torque, both as commanded and including what the drives add',
+        'N m',
+    )
+    rate_limit: PerJoint = non_negative(
+        (0.0, 0.0), 'largest rate of commands; 0: no limit', 'N m/s'
+    )
+    first_step: PerJoint = non_negative(
+        (0.0, 0.0),
+        'largest first torque, a step from zero, that the drives tolerate; 0: no limit',
+        'N m',
+    )
+
+
+@dataclass(frozen=True)
+class ComparisonGains:
+    """Gains of the laws `backstepping` (35) and `slotine_li`.
+
+    Feedback and learning have groups of their own.
+    """
+
+    surface_gain: PerJoint = positive(
+        (70.0, 70.0),
+        'gain of the linear surface alpha2 = dqr - lambda_s z1',
+        '1/s',
+        'lambda_s',
+    )
+    position_gain: PerJoint = non_negative(
+        (1.0, 1.0),
+        'gain on the tracking error z1; not used by slotine_li',
+        'N m/rad',
+        'w',
+    )
+    robust_gain: PerJoint = non_negative(
+        (0.0, 0.0),
+        'amplitude of the robust term; not used by slotine_li',
+        'N m',
+        'mu_bar',
+    )
+    integral_gain: PerJoint = non_negative(
+        (),
+        'integral gain of slotine_li on its surface; empty: none',
+        'N m/rad',
+        omittable=True,
+    )
+    leakage: float = non_negative(
+        0.001, 'leakage of P^; not used by slotine_li', symbol='W_c'
+    )
+    learning_weight: float = non_negative(
+        0.0,
+        'weight of the prediction error; 0: by the tracking error alone',
+        '',
+        'kappa',
+    )
+
+
+def _misfits(
+    name: str, P: tuple[float, ...], model: str, count: int, radius: float
+) -> Iterator[str]:
+    """Check that parameters P are those of a model, and inside the ball."""
+    if len(P) != count:
+        yield f'{name}: got {len(P)}, but model {model} has {count} parameters'
+    if (norm := math.hypot(*P)) >= radius:
+        yield (
+            f'learning.radius: got {radius:g} kg m^2, but {name} has a norm of {norm:.6g} kg m^2 '
+            'and would be shrunk to the ball: the radius must be larger'
+        )
+
+
+@dataclass(frozen=True)
+class KnownArm:
+    """Known data of the arm: required by the law `model_based`, shown by the monitors.
+
+    The known disturbance is constant + amplitude*sin(frequency*t + phase) on each
+    joint.
+    """
+
+    parameters: tuple[float, ...] = _known(
+        (), 'true parameters; empty: unknown', 'kg m^2', 'P', omittable=True
+    )
+    constant: PerJoint = _known(
+        (0.0, 0.0), 'constant part of the known disturbance', 'N m'
+    )
+    amplitude: PerJoint = _known((0.0, 0.0), 'amplitude of the sinusoid', 'N m')
+    frequency: PerJoint = _known(
+        (1.0, 1.0), 'frequency of the sinusoid', 'rad/s', at_least=0.0
+    )
+    phase: PerJoint = _known((0.0, 0.0), 'phase of the sinusoid', 'rad')
+
+    def problems(
+        self, law: str, model: str, count: int, radius: float
+    ) -> Iterator[str]:
+        """Check that the parameters fit model and ball, and are given if required."""
+        if law == 'model_based' and not self.parameters:
+            yield 'truth.parameters: got none, but the law model_based needs them'
+        if self.parameters:
+            largest = radius if law == 'model_based' else math.inf
+            yield from _misfits(
+                'truth.parameters', self.parameters, model, count, largest
+            )
+
+
+@dataclass(frozen=True)
+class Learning:
+    """Composite learning of the parameters P and of the disturbance columns."""
+
+    initial_estimate: tuple[float, ...] = _at_start(
+        (0.5, 0.16, 0.2),
+        'initial estimate of (m1+m2)*l1^2, m2*l2^2, m2*l1*l2',
+        'kg m^2',
+        'P^(0)',
+    )
+    adaptation_gain: Annotated[tuple[float, ...], 'learning.initial_estimate'] = (
+        non_negative((0.5, 0.5, 0.5), 'diagonal of the adaptation gain', symbol='Gamma')
+    )
+    weight: float = non_negative(
+        100.0, 'weight of the prediction error; 0: no learning from it', symbol='kappa'
+    )
+    update: Literal['newton', 'gradient'] = parameter(
+        'newton',
+        'step along the prediction error: regularised Newton, or the gradient (paper)',
+    )
+    prediction: Literal['filtered', 'lambda'] = _in_window(
+        'filtered', 'prediction error by filtered regressor, or by Lambda (24)'
+    )
+    regularization: float = positive(
+        1e-5, 'regularisation of the Newton step', symbol='rho'
+    )
+    excitation_threshold: float = positive(
+        0.003,
+        'minimum eigenvalue of the excitation matrix of an excited window',
+        symbol='sigma',
+    )
+    window: float = sizing(
+        2.0 * math.pi,
+        'length of the excitation window; whole reference periods average out disturbances',
+        's',
+        'tau_d',
+        above=0.0,
+    )
+    settling_time: float = _at_start(
+        0.5,
+        'time for the filters to settle before the window is used',
+        's',
+        'T_a',
+        at_least=0.0,
+    )
+    filter_pole: float = _in_window(
+        10.0, 'pole of the filters on regressor and torque', 'rad/s', above=0.0
+    )
+    bias: bool = sizing(True, 'also estimate a constant disturbance of each joint')
+    viscous: bool = sizing(False, 'also estimate the viscous friction of each joint')
+    coulomb: bool = sizing(False, 'also estimate the Coulomb friction of each joint')
+    coulomb_velocity: float = _in_window(
+        0.01,
+        'velocity scale of the sign change of the Coulomb column',
+        'rad/s',
+        above=0.0,
+    )
+    frequencies: tuple[float, ...] = sizing(
+        (),
+        'also estimate a sinusoidal disturbance of each joint at each of these frequencies',
+        'rad/s',
+        above=0.0,
+        omittable=True,
+    )
+    ripple_cycles: tuple[float, ...] = sizing(
+        (),
+        'also estimate a torque ripple of each joint with so many periods per turn',
+        above=0.0,
+        omittable=True,
+    )
+    radius: float = positive(
+        3.0, 'radius of the projection ball of P^', 'kg m^2', 'omega_a'
+    )
+    compensation: Literal['reference', 'state'] = parameter(
+        'reference',
+        'where what is learned acts: along the reference, or at the state (paper)',
+    )
+    bumpless: bool = parameter(
+        True,
+        'let the disturbance estimate offset the torque that the prediction error adds',
+    )
+    change_detection: bool = sizing(
+        True, 'discard a window that torques contradict, because the arm has changed'
+    )
+    residual_floor: PerJoint = positive(
+        (0.07, 0.07),
+        'rms unmodelled torque that is not treated as a change of the arm',
+        'N m',
+    )
+    anchor_weight: float = non_negative(
+        0.1, 'pull to the estimate before a change, until a new window is full'
+    )
+    weighing: bool = sizing(
+        False,
+        'weigh what has been added to robot.tip since the first window (arm '
+        'from a URDF)',
+    )
+    tell_drive: bool = sizing(
+        False,
+        'declare the weighed load to drives that compensate gravity, once it is '
+        'known well',
+    )
+    load_service: str = sizing(
+        '',
+        'over ROS: service of the driver that accepts the load, a '
+        'ur_msgs/srv/SetPayload or franka_msgs/srv/SetLoad; empty: no load is '
+        'declared',
+    )
+    load_frame: str = sizing(
+        '',
+        'over ROS: link in whose frame that service expects the centre; empty: '
+        'robot.tip',
+    )
+    load_in_motion: bool = parameter(
+        False, 'over ROS: whether the drives accept a load while the arm moves'
+    )
+
+    def problems(self, sample_time: float, model: str, count: int) -> Iterator[str]:
+        """Check the window's size, and the initial estimate against model and ball."""
+        samples = self.window / sample_time
+        (fewest, most) = _SAMPLES
+        if not fewest - 0.5 <= samples <= most + 0.5:
+            yield (
+                f'learning.window: got {self.window:g} s, which is {samples:.0f} samples of '
+                f'{sample_time:g} s: between {fewest} and {most} are allowed'
+            )
+        yield from _misfits(
+            'learning.initial_estimate',
+            self.initial_estimate,
+            model,
+            count,
+            self.radius,
+        )
+
+
+@dataclass(frozen=True)
+class Contact:
+    """External torque, which the learned model does not explain; reactions."""
+
+    enabled: bool = sizing(
+        False, 'compute the external torque with its interval, and detect contacts'
+    )
+    bandwidth: float = _in_window(
+        30.0,
+        'pole of the filter of the external torque: a larger one is faster, '
+        'but noisier',
+        'rad/s',
+        'L',
+        above=0.0,
+    )
+    threshold: float = positive(
+        8.0,
+        'threshold of a contact: distance of the external torque from what model, '
+        'noise and a load explain, in standard deviations',
+        symbol='h',
+    )
+    reaction: Literal['none', 'stop', 'hold', 'yield'] = parameter(
+        'none',
+        'reaction to a contact: none, safe stop, brake and hold, or give way with '
+        'only gravity and damping; with a reaction, nothing is learned while a '
+        'contact lasts',
+    )
+    loads: bool = parameter(
+        True,
+        'with learning.weighing: what a load at the tip could explain is not a contact',
+    )
+
+
+@dataclass(frozen=True)
+class CommissionedGains:
+    """When and with what result the gains were chosen by measuring the arm."""
+
+    date: str = _measured(
+        '',
+        'when `blf_dsc commission` measured the arm and chose the gains; empty: never',
+    )
+    version: str = _measured('', 'version of this package that chose them')
+    margin: float = _measured(
+        0.0, 'modulus margin that they have in all postures measured', at_least=0.0
+    )
