@@ -544,7 +544,6 @@ def test_controller_goes_on_when_the_process_of_the_action_dies(own_loop, capfd)
     process.wait()
     client.ros.run(arm, 1000)
     np.testing.assert_allclose(rests_at(law), NEAR, atol=1e-9)
-    law._action._process._threads[0].join()
     assert (
         'the process of ~/follow_joint_trajectory has ended' in capfd.readouterr().err
     )

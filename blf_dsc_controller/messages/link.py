@@ -76,11 +76,15 @@ class Link:
         if not self.broken:
             select.select([self._end], [], [], seconds)
 
-    def close(self, patience: float = 0.0) -> None:
-        """End the connection after all is sent, or after the patience [s]."""
+    def drain(self, patience: float) -> None:
+        """Wait until all is sent, for this time [s] at most; not for a loop."""
         end = monotonic() + patience
         while not self.flush() and (left := end - monotonic()) > 0.0:
             select.select([], [self._end], [], left)
+
+    def close(self, patience: float = 0.0) -> None:
+        """End the connection after all is sent, or after the patience [s]."""
+        self.drain(patience)
         self._end.close()
 
     def _receive(self) -> None:

@@ -1,21 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The process of the action, and messages to and from it without waiting.
-
-The threads only pass messages on: they cost a sample some microseconds.
-"""
+"""The process of the action, and messages to and from it without waiting."""
 
 from __future__ import annotations
 
 import os
 import socket
 import subprocess
-import threading
-from collections import deque
-from collections.abc import Sequence
-from contextlib import suppress
+from collections.abc import Iterator, Sequence
 from importlib.util import find_spec
-from multiprocessing import Pipe
-from queue import SimpleQueue
 
 from rclpy.node import Node
 
@@ -27,8 +19,12 @@ from blf_dsc_controller.control.goal_messages import (
     decode,
     encode,
 )
+from blf_dsc_controller.messages.link import Link
 
 ACTION = '~/follow_joint_trajectory'
+KIND = 0
+"""Of all messages over the link."""
+
 _PATIENCE = 5.0  # s for its end
 
 
@@ -38,83 +34,57 @@ def can_offer() -> bool:
 
 
 class ActionProcess:
-    """The process of a controller's action.
-
-    Attributes:
-        inbox: messages that have arrived.
-    """
+    """The process of a controller's action, and our end of the link to it."""
 
     def __init__(self, owner: Node, joints: Sequence[str]) -> None:
         """Start it, in the domain and the namespace of its owner."""
-        self.inbox: deque[Goal | Cancel] = deque()
         self._log = owner.get_logger()
-        self._outbox: SimpleQueue[Message | None] = SimpleQueue()
-        self._connection, theirs = Pipe()
-        self._process = subprocess.Popen(
-            [
-                *child.running_module('blf_dsc_controller.nodes.action_server'),
-                f'{theirs.fileno()}',
-                f'{owner.context.get_domain_id()}',
-                f'_{owner.get_name()}_action',
-                owner.get_namespace(),
-                owner.resolve_service_name(ACTION),
-                _enclave_of(owner),
-                *joints,
-            ],
-            pass_fds=[theirs.fileno()],
-            env=os.environ | child.places(),
-        )
-        theirs.close()
-        self._is_ending = False
-        self._threads = [
-            threading.Thread(target=work, name='action', daemon=True)
-            for work in (self._receive, self._transmit)
-        ]
-        for thread in self._threads:
-            thread.start()
+        self._has_ended = False
+        ours, theirs = socket.socketpair()
+        self._link = Link(ours)
+        with theirs:
+            self._process = subprocess.Popen(
+                [
+                    *child.running_module('blf_dsc_controller.nodes.action_server'),
+                    f'{theirs.fileno()}',
+                    f'{owner.context.get_domain_id()}',
+                    f'_{owner.get_name()}_action',
+                    owner.get_namespace(),
+                    owner.resolve_service_name(ACTION),
+                    _enclave_of(owner),
+                    *joints,
+                ],
+                pass_fds=[theirs.fileno()],
+                env=os.environ | child.places(),
+            )
 
     def send(self, message: Message) -> None:
-        """Send a message, some time."""
-        self._outbox.put(message)
+        """Send a message, as soon as the process takes it."""
+        self._link.put(KIND, encode(message))
+        self._link.flush()
 
-    def close(self) -> None:
-        """Send what has not been sent, and end the process."""
-        self._is_ending = True
-        self._outbox.put(None)
-        self._threads[1].join(_PATIENCE)
-        try:
-            self._process.wait(_PATIENCE)
-        except subprocess.TimeoutExpired:
-            self._process.kill()
-            self._process.wait()
-        self._threads[0].join(_PATIENCE)
-
-    def _receive(self) -> None:
-        while True:
-            try:
-                message = decode(self._connection.recv_bytes())
-            except (EOFError, OSError):
-                break
+    def messages(self) -> Iterator[Goal | Cancel]:
+        """Send what still waits, and yield what clients want."""
+        self._link.flush()
+        for _, content in self._link.messages():
+            message = decode(content)
             if isinstance(message, (Goal, Cancel)):
-                self.inbox.append(message)
-        if not self._is_ending:
+                yield message
+        if self._link.broken and not self._has_ended:
+            self._has_ended = True
             self._log.error(
                 f'the process of {ACTION} has ended: the topics and ~/stop work on; for the action '
                 'start the controller again'
             )
 
-    def _transmit(self) -> None:
-        """Send what is in the outbox, until None; then the process ends."""
-        with suppress(OSError):  # it has ended, which `_receive` says
-            while (message := self._outbox.get()) is not None:
-                self._connection.send_bytes(encode(message))
-        self._shut()
-
-    def _shut(self) -> None:
-        """End the connection in both directions, even while a thread reads from it."""
-        twin = socket.socket(fileno=os.dup(self._connection.fileno()))
-        with twin, suppress(OSError):
-            twin.shutdown(socket.SHUT_RDWR)
+    def close(self) -> None:
+        """Send what has not been sent, and end the process."""
+        self._link.close(_PATIENCE)
+        try:
+            self._process.wait(_PATIENCE)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            self._process.wait()
 
 
 def _enclave_of(node: Node) -> str:

@@ -12,10 +12,10 @@ from __future__ import annotations
 
 import os
 import signal
+import socket
 import sys
 import threading
 from collections.abc import Callable
-from multiprocessing.connection import Connection
 from typing import Any
 
 import rclpy
@@ -42,7 +42,12 @@ from blf_dsc_controller.control.goal_messages import (
     decode,
     encode,
 )
+from blf_dsc_controller.messages.link import Link
+from blf_dsc_controller.nodes.action_process import KIND
 
+_LARGEST = 1 << 30  # bytes of goals that wait
+_PATIENCE = 10.0  # s, until a controller takes a goal
+_POLL = 1.0  # s
 _NANO = 1e-9
 _SECOND = 1_000_000_000
 Result = FollowJointTrajectory.Result
@@ -64,13 +69,11 @@ class _Server(ActionServer):
 class TrajectoryActionServer:
     """Passes goals to the controller, and tells clients what became of them."""
 
-    def __init__(
-        self, node: Node, name: str, joints: list[str], connection: Connection
-    ) -> None:
+    def __init__(self, node: Node, name: str, joints: list[str], link: Link) -> None:
         """Offer the action `name` for the controller at the other end."""
         self._log = node.get_logger()
         self._joints = joints
-        self._connection = connection
+        self._link = link
         self._count = 0
         self._answers: dict[int, Future] = {}
         self._numbers: dict[int, int] = {}  # of goals, by the id of their requests
@@ -105,12 +108,16 @@ class TrajectoryActionServer:
             _tolerances(request.goal_tolerance),
             Duration.from_msg(request.goal_time_tolerance).nanoseconds * _NANO,
         )
-        self._connection.send_bytes(encode(goal))
+        self._send(goal)
         accepted = await answer
         if not accepted:
             return GoalResponse.REJECT
         self._numbers[id(request)] = number
         return GoalResponse.ACCEPT
+
+    def _send(self, message: Goal | Cancel) -> None:
+        self._link.put(KIND, encode(message))
+        self._link.drain(_PATIENCE)
 
     def _on_accepted(self, handle: ServerGoalHandle) -> None:
         number = self._numbers.pop(id(handle.request))
@@ -122,7 +129,7 @@ class TrajectoryActionServer:
     def _on_cancel(self, handle: ServerGoalHandle) -> CancelResponse:
         for number, each in self._handles.items():
             if each == handle:
-                self._connection.send_bytes(encode(Cancel(number)))
+                self._send(Cancel(number))
                 return CancelResponse.ACCEPT
         return CancelResponse.REJECT
 
@@ -197,18 +204,16 @@ def _point(time: float, values: list[list[float]]) -> JointTrajectoryPoint:
 
 
 def _listen(
-    connection: Connection,
+    link: Link,
     deliver: Callable[[Any], object],
     end: Callable[[], object],
 ) -> None:
     """Deliver what the controller sends, until it ends."""
-    while True:
-        try:
-            message = decode(connection.recv_bytes())
-        except (EOFError, OSError):
-            end()
-            return
-        deliver(message)
+    while not link.broken:
+        link.wait(_POLL)
+        for _, content in link.messages():
+            deliver(decode(content))
+    end()
 
 
 def main() -> int:
@@ -217,7 +222,7 @@ def main() -> int:
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the controller may still brake
     # the controller's real-time priority is not for goals
     os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
-    connection = Connection(int(descriptor))
+    link = Link(socket.socket(fileno=int(descriptor)), _LARGEST)
     rclpy.init(
         args=['--ros-args', '--enclave', enclave],
         domain_id=int(domain),
@@ -230,14 +235,14 @@ def main() -> int:
         enable_rosout=False,
         start_parameter_services=False,
     )
-    server = TrajectoryActionServer(node, action, joints, connection)
+    server = TrajectoryActionServer(node, action, joints, link)
     executor = SingleThreadedExecutor()
     executor.add_node(node)
     over = Future()
     listener = threading.Thread(
         target=_listen,
         args=(
-            connection,
+            link,
             lambda message: executor.create_task(server.on_message, message),
             lambda: executor.create_task(over.set_result, None),
         ),

@@ -27,8 +27,8 @@ class TrajectoryAction:
 
     def poll(self, guard: Guard | None) -> None:
         """Take what clients want, and watch the goal; between two samples."""
-        while self._process.inbox:
-            self._goals.take(guard, self._process.inbox.popleft())
+        for message in self._process.messages():
+            self._goals.take(guard, message)
         self._goals.watch(guard)
 
     def close(self) -> None:
