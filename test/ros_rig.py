@@ -175,16 +175,16 @@ class PatientClock:
     So the arm does not fall on while the computer lets this process and its watchdog wait.
     """
 
-    SLOWER = 5  # times
     MOST = 2_000_000  # ns between two readings: a sample of the arm
 
-    def __init__(self):
+    def __init__(self, slower=5):
+        self.slower = slower  # times
         self.now = 10**9
         self._read = time.monotonic_ns()
 
     def __call__(self):
         read = time.monotonic_ns()
-        self.now += min((read - self._read) // self.SLOWER, self.MOST)
+        self.now += min((read - self._read) // self.slower, self.MOST)
         self._read = read
         return self.now
 

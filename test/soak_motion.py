@@ -3,8 +3,9 @@
 
 `python test/soak_motion.py --episodes 200 --busy 10` runs an FR3 and a UR5e, each with 2 kg that
 nobody has told of, beside ten busy processes.  The arm and its watchdog are in this process, the
-controller in one of its own.  The arm's clock is slower than the computer's, so that also a slow
-one keeps up.
+controller in one of its own.  The arm's clock is slower than the computer's, and nearly stands
+while the computer lets a controller wait that should answer: what is looked for are the
+consequences of an event, not those of a computer that is too slow for the loop.
 
 A controller that hangs and goes on finds one of the states of the meantime in its queue, and then
 the newest, while the watchdog has braked the arm.
@@ -47,6 +48,8 @@ BUSY = (
     'import os; os.nice(10); parent = os.getppid()\nwhile os.getppid() == parent: pass'
 )
 SLACK = 0.2  # rad/s beyond what the reference asks: a load and links that nobody knows
+USUAL, WAITING = 5, 100  # times slower than the computer's clock
+LATE = 3  # samples without a torque, from which on the arm waits for it
 MOVING = 0.1  # rad/s, beyond which an episode begins
 
 
@@ -56,7 +59,8 @@ class Episodes:
     def __init__(self, preset, seed):
         self.rng = np.random.default_rng(seed)
         self.ros = RosRig()
-        self.clock = PatientClock()
+        self.clock = PatientClock(USUAL)
+        self.is_interrupted = False
         self.file = share_folder() / 'config' / f'{preset}.yaml'
         plant = flatten(load_loop(self.file).plant) | LOAD
         self.arm = self.ros.add(PlantNode, plant, clock=self.clock)
@@ -76,6 +80,9 @@ class Episodes:
 
         def step_and_look(torque):
             step(torque)
+            age = self.arm.plant.sample - self.arm.input._taken_at
+            waits = age > LATE and not self.is_interrupted
+            self.clock.slower = WAITING if waits else USUAL
             self.speeds.append(np.abs(self.arm.plant.truth()[-n:]))
 
         self.arm.plant.step = step_and_look
@@ -119,16 +126,20 @@ class Episodes:
 
     def kill_controller(self):
         """Start it again while the watchdog brings the arm to rest."""
+        self.is_interrupted = True
         self.controller.kill()
         self.controller.wait()
         self.ros.until(lambda: self.watchdog.watchdog.active)
+        self.is_interrupted = False
         self._run(self.rng.uniform(0.0, 0.5))
         self.start_controller()
 
     def hang_controller(self):
+        self.is_interrupted = True
         self.controller.send_signal(signal.SIGSTOP)
         self._run(self.rng.uniform(0.02, 0.5))
         self.controller.send_signal(signal.SIGCONT)
+        self.is_interrupted = False
 
     def kill_watchdog(self):
         self.ros.kill(self.watchdog)

@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import os
 import platform
-import resource
 import shutil
 import sys
 import time
@@ -29,14 +28,17 @@ def examine() -> Iterator[Finding]:
     """Yield what was found; takes two seconds, for the clock."""
     yield _processor()
     yield _kernel()
-    yield _priority()
-    yield _memory()
+    if sys.platform == 'linux':
+        yield _priority()
+        yield _memory()
     yield _governor()
     yield _clock()
     yield _disk(Path.cwd())
 
 
 def _processor() -> Finding:
+    if sys.platform != 'linux':
+        return ok('computer', f'{platform.machine()}, {os.cpu_count()} cores')
     cores = len(os.sched_getaffinity(0))
     load = os.getloadavg()[0]
     text = f'{platform.machine()}, {cores} cores for this process, load {load:.1f}'
@@ -56,6 +58,8 @@ def _kernel() -> Finding:
 
 
 def _priority() -> Finding:
+    import resource  # Windows has none
+
     most, _ = resource.getrlimit(resource.RLIMIT_RTPRIO)
     if os.geteuid() == 0 or most == resource.RLIM_INFINITY or most > 0:
         return ok('priority', 'SCHED_FIFO is allowed (realtime.priority)')
@@ -64,6 +68,8 @@ def _priority() -> Finding:
 
 
 def _memory() -> Finding:
+    import resource
+
     most, _ = resource.getrlimit(resource.RLIMIT_MEMLOCK)
     if os.geteuid() == 0 or most == resource.RLIM_INFINITY or most > _GIGA:
         return ok('memory', 'may be locked (realtime.lock_memory)')

@@ -131,6 +131,7 @@ def _domain() -> Iterator[Finding]:
         check_network()
     except BlfDscError as error:
         yield problem('network', str(error))
+        return
     domain = shell_domain()
     reach = os.environ.get('ROS_AUTOMATIC_DISCOVERY_RANGE') or 'SUBNET'
     peers = os.environ.get('ROS_STATIC_PEERS')

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import os
 import socket
+import sys
 from collections.abc import Collection, Iterator
 from contextlib import closing, contextmanager, suppress
 from pathlib import Path
@@ -54,10 +55,15 @@ def own_domain(avoided: Collection[int] = ()) -> Iterator[int]:
 
 
 def check_network() -> None:
-    """Raise BlfDscError if processes of this computer cannot reach each other.
+    """Raise BlfDscError if nodes of this computer cannot reach each other.
 
     They would wait for each other for ever, as in a container without any interface.
     """
+    if sys.platform != 'linux':
+        raise BlfDscError(
+            'a run over ROS 2 keeps to a free domain, which is found on Linux only: run with '
+            '--offline, or start the nodes by `ros2 run`'
+        )
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
         try:
             probe.sendto(b'', (_LOOPBACK, _DISCARD))

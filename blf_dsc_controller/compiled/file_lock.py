@@ -1,20 +1,32 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A lock that processes hold one at a time; it ends with the process that holds it."""
+"""A lock that processes hold one at a time; it ends with the process that holds it.
+
+`filelock` has more, but rosdep knows no key for it.
+"""
 
 from __future__ import annotations
 
-import fcntl
 import time
 from contextlib import suppress
 from pathlib import Path
 from typing import IO
+
+try:
+    import fcntl
+except ImportError:  # such as on Windows
+    LOCKS = False
+else:
+    LOCKS = True
 
 _PATIENCE = 600.0  # s: a process may have been stopped while it holds the lock
 _POLL = 0.05  # s
 
 
 class FileLock:
-    """A lock by a file, which is created; without the right to, nobody is locked out."""
+    """A lock by a file, which is created.
+
+    Where no file can be created or locked, nobody is locked out: then several may do the same work.
+    """
 
     def __init__(self, path: Path) -> None:
         self._path = path
@@ -22,9 +34,9 @@ class FileLock:
 
     def acquire(self) -> None:
         """Wait until no other process holds the lock, at most ten minutes, and hold it."""
-        if self._file is not None:
+        if self._file is not None or not LOCKS:
             return
-        with suppress(OSError):  # read-only or full: then several may do the same work
+        with suppress(OSError):  # read-only or full
             self._path.parent.mkdir(parents=True, exist_ok=True)
             self._file = self._path.open('ab')
         end = time.monotonic() + _PATIENCE

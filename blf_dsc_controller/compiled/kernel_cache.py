@@ -17,7 +17,6 @@ import functools
 import hashlib
 import os
 import shutil
-import stat
 import tempfile
 from collections.abc import Callable
 from contextlib import suppress
@@ -28,7 +27,7 @@ import numba
 from numba.core import config
 
 from blf_dsc_controller.compiled.dependencies import PACKAGE, dependencies
-from blf_dsc_controller.compiled.own_folder import make_own
+from blf_dsc_controller.compiled.own_folder import is_of_user, make_own, user
 
 try:
     from blf_dsc_controller.compiled.linked import KernelCache
@@ -42,8 +41,6 @@ KERNELS: list[Any] = []
 
 SHIPPED = Path(__file__).with_name('kernels')
 """Folder of kernels that come with the package: see `ship`."""
-
-_OTHERS_WRITE = stat.S_IWGRP | stat.S_IWOTH
 
 
 def is_quick() -> bool:
@@ -113,7 +110,7 @@ def _keep(kernel: Any, folder: Path) -> None:
 def _base(chosen: str | None) -> Path:
     """Return the first folder for machine code that can be written, if need be a temporary one."""
     users = Path(os.environ.get('XDG_CACHE_HOME') or '~/.cache', 'blf_dsc_controller')
-    inside = f'blf_dsc_controller-{os.getuid()}'  # of a folder for everybody
+    inside = f'blf_dsc_controller-{user()}'  # of a folder for everybody
     folders = [users, Path(tempfile.gettempdir(), inside)]
     if chosen:
         folders[:0] = [Path(chosen), Path(chosen, inside)]
@@ -129,8 +126,7 @@ def _base(chosen: str | None) -> Path:
 
 def _is_private(folder: Path) -> bool:
     """Whether this user owns a folder, and nobody else can write it."""
-    found = folder.stat()
-    return found.st_uid == os.getuid() and not found.st_mode & _OTHERS_WRITE
+    return is_of_user(folder.stat())
 
 
 def _name(source: Path) -> str:

@@ -10,10 +10,27 @@ import os
 import shutil
 import stat
 import tempfile
+from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
 
 _OTHERS = stat.S_IRWXG | stat.S_IRWXO
+_OTHERS_WRITE = stat.S_IWGRP | stat.S_IWOTH
+
+
+def user() -> int | None:
+    """Return the number of this user; None where the system has none, such as Windows.
+
+    There, folders of the user's profile are closed to others by the system.
+    """
+    number: Callable[[], int] | None = getattr(os, 'getuid', None)
+    return None if number is None else number()
+
+
+def is_of_user(found: os.stat_result, closed: int = _OTHERS_WRITE) -> bool:
+    """Whether something is this user's, and has none of these rights, by default to write."""
+    own = user()
+    return own is None or (found.st_uid == own and not found.st_mode & closed)
 
 
 def is_own(folder: Path) -> bool:
@@ -22,8 +39,7 @@ def is_own(folder: Path) -> bool:
         found = folder.lstat()
     except OSError:
         return False
-    is_folder = stat.S_ISDIR(found.st_mode)
-    return is_folder and found.st_uid == os.getuid() and not found.st_mode & _OTHERS
+    return stat.S_ISDIR(found.st_mode) and is_of_user(found, _OTHERS)
 
 
 def make_own(folder: Path) -> bool:

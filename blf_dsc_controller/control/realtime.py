@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import ctypes
 import os
+import sys
 from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
@@ -21,6 +22,10 @@ def request_realtime(realtime: Realtime, warn: Callable[[str], object]) -> None:
 
     `warn` is called with a refusal.
     """
+    if sys.platform != 'linux':
+        if realtime.priority > 0 or realtime.lock_memory:
+            warn('realtime: left out, since only Linux has it')
+        return
     if realtime.priority > 0:
         try:
             _schedule(realtime.priority)

@@ -340,6 +340,11 @@ class Drive:
         if record is not None and self._starts > 1:
             record = record.with_name(f'{record.name}_{self._starts}')
         self._forget()
+        if os.name != 'posix':
+            raise DriveError(
+                'the loop of a Drive has a process of its own, which needs Linux or macOS: use '
+                'ArmController in a loop of yours'
+            )
         ours, theirs = socket.socketpair()
         with theirs:
             self._process = subprocess.Popen(
