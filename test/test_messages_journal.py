@@ -24,6 +24,7 @@ EXAMPLES = {
     'configure': {'parameters': {'joints': ['a'], 'law': 'dsc', 'x': 1.5, 'y': True}},
     'activate': {},
     'prepare': {'positions': [0.5, 1]},
+    'takeover': {'torque': [1.5, -2.0]},
     'start': {'resumed': False},
     'trajectory': {'joints': ['a', 'b'], 'points': [POINT], 'begin': None, 'at': 0.0},
     'target': {

@@ -18,6 +18,7 @@ from blf_dsc_controller.messages.codecs import (
     Float64MultiArrayEncoder,
     JointStateEncoder,
 )
+from blf_dsc_controller.messages.journal import EventType, decode
 from blf_dsc_controller.nodes.controller_node import ControllerNode
 from blf_dsc_controller.nodes.other_commander import Finding, OtherCommander
 from blf_dsc_controller.nodes.watchdog_node import WatchdogNode
@@ -123,8 +124,9 @@ def test_managed_controller_that_was_refused_starts_once_it_is_alone(ros):
 
 
 def test_torques_of_the_watchdog_do_not_count_as_those_of_another_controller(ros):
-    """It holds the arm until the controller is back."""
+    """It holds the arm until the controller is back, which goes on from its torque."""
     commands = ros.publisher(topics.COMMANDS)
+    journal = ros.listen(topics.JOURNAL, raw=True)
     law = ros.add(ControllerNode)
     states = ros.publisher(topics.JOINT_STATES)
     ros.driver()
@@ -145,6 +147,10 @@ def test_torques_of_the_watchdog_do_not_count_as_those_of_another_controller(ros
 
     ros.until(go_on)
     assert not law.finished
+    ros.until(lambda: journal and decode(journal[-1]).type is EventType.START)
+    before = decode(journal[-2])
+    assert before.type is EventType.TAKEOVER
+    assert before.content['torque'] == [1.0, 1.0]
 
 
 # A URDF's arm with gains that somebody has given.

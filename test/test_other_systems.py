@@ -58,7 +58,8 @@ def other(monkeypatch):
     monkeypatch.setattr(sys, 'platform', 'another')
 
 
-def test_a_run_over_ros_is_refused_elsewhere_with_what_to_do(other, tmp_path, capsys):
+@pytest.mark.usefixtures('other')
+def test_a_run_over_ros_is_refused_elsewhere_with_what_to_do(tmp_path, capsys):
     assert main(['run', '--out', str(tmp_path / 'out')]) == 1
     told = capsys.readouterr().err
     assert 'on Linux only: run with --offline' in told
@@ -66,14 +67,16 @@ def test_a_run_over_ros_is_refused_elsewhere_with_what_to_do(other, tmp_path, ca
         domains.check_network()
 
 
-def test_real_time_is_left_out_elsewhere_with_a_word(other):
+@pytest.mark.usefixtures('other')
+def test_real_time_is_left_out_elsewhere_with_a_word():
     said = []
     request_realtime(Realtime(priority=10, lock_memory=True), said.append)
     request_realtime(Realtime(), said.append)
     assert said == ['realtime: left out, since only Linux has it']
 
 
-def test_the_self_check_leaves_out_what_only_linux_has(other, monkeypatch):
+@pytest.mark.usefixtures('other')
+def test_the_self_check_leaves_out_what_only_linux_has(monkeypatch):
     monkeypatch.delattr('os.sched_getaffinity')
     monkeypatch.setattr(computer, '_SAMPLES', 10)
     subjects = {finding.subject for finding in computer.examine()}

@@ -123,6 +123,7 @@ SCHEMA: Mapping[str, Mapping[str, Field]] = {
     },
     'activate': {},
     'prepare': {'positions': Field(NUMBERS)},  # rad, of the arm at rest
+    'takeover': {'torque': Field(NUMBERS)},  # N m, by which another node holds the arm
     'start': {'resumed': Field(FLAG)},
     'trajectory': {
         'joints': Field(NAMES),

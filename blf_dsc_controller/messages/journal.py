@@ -36,6 +36,9 @@ class EventType(str, Enum):
     CONFIGURE = 'configure'
     ACTIVATE = 'activate'
     PREPARE = 'prepare'  # the approach is planned before the first state
+    TAKEOVER = (
+        'takeover'  # another node holds the arm, and the law will go on from there
+    )
     START = 'start'  # the law receives its first state
     TRAJECTORY = 'trajectory'
     TARGET = 'target'  # of a stream

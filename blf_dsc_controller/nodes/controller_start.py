@@ -82,7 +82,13 @@ class ControllerStart:
             self.held = raw
             return True
         is_measuring = self._gate.state is GateState.MEASURING
-        return is_measuring and self._measures(guard, raw)
+        if is_measuring and self._measures(guard, raw):
+            return True
+        if is_starting:
+            acting = self._conditions.end()
+            if acting is not None:
+                guard.take_over_from(acting)
+        return False
 
     def release(self, guard: Guard) -> bytes | None:
         """Return the state held, once it may be used; call it every 8 ms."""

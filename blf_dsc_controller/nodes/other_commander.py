@@ -11,20 +11,26 @@ hear it.
 from __future__ import annotations
 
 import random
+import time
 from collections.abc import Callable
 from enum import Enum
 from math import inf
 
+import numpy as np
 from rclpy.node import Node
 
 from blf_dsc_controller.messages import topics
-from blf_dsc_controller.messages.codecs import Float64MultiArrayEncoder
+from blf_dsc_controller.messages.codecs import (
+    Float64MultiArrayDecoder,
+    Float64MultiArrayEncoder,
+)
 from blf_dsc_controller.messages.topics import Quality
-from blf_dsc_controller.nodes.endpoints import RawSubscriptions
+from blf_dsc_controller.nodes.endpoints import RawMessage, RawSubscriptions
 
 _LISTENING = 1.0  # s, in which a controller in command is heard
 _SPREAD = 1.0  # s, over which controllers that start together spread
 _LOOK_PERIOD = 0.05  # s
+_ACTING = 100_000_000  # ns, for which a torque of the watchdog is the one that acts
 
 
 class Finding(Enum):
@@ -49,9 +55,11 @@ class OtherCommander:
     ) -> None:
         self._node = node
         self.topic = topic
+        self._joints = joints
         self._steady = steady
         self._listening = _LISTENING + random.uniform(0.0, _SPREAD)  # noqa: S311
-        self._of_watchdog = Float64MultiArrayEncoder(joints, topics.WATCHDOG_NODE)
+        self._of_watchdog: RawMessage | None = None  # its last torque
+        self._watchdogs = Float64MultiArrayEncoder(joints, topics.WATCHDOG_NODE)
         self._subscriptions = RawSubscriptions(node)
         quality = Quality(depth=1, reliability='best_effort')
         type_name = topics.COMMANDS.type
@@ -67,12 +75,7 @@ class OtherCommander:
     def find(self) -> Finding:
         """Return who commands the arm, as far as it is known by now."""
         now = self._steady() * 1e-9
-        heard = [
-            message.raw
-            for message in self._subscriptions.take()
-            if not self._of_watchdog.has_layout(message.raw)
-        ]
-        if heard:
+        if self._take():
             return Finding.SOMEBODY
         if now - self._looked >= _LOOK_PERIOD:
             self._looked = now
@@ -81,6 +84,26 @@ class OtherCommander:
             self._since = min(self._since, now)
         is_silent = now - self._since >= self._listening
         return Finding.NOBODY if is_silent else Finding.UNKNOWN
+
+    def _take(self) -> bool:
+        """Take the torques that have come; return whether one was another controller's."""
+        others = False
+        for message in self._subscriptions.take():
+            if self._watchdogs.has_layout(message.raw):
+                self._of_watchdog = message
+            else:
+                others = True
+        return others
+
+    def torque_of_watchdog(self) -> np.ndarray | None:
+        """Return the torque (n,) [N m] by which the watchdog holds the arm now; or None."""
+        self._take()
+        message = self._of_watchdog
+        if message is None or time.time_ns() - message.received > _ACTING:
+            return None
+        decoder = Float64MultiArrayDecoder(self._joints)
+        decoder.decode(message.raw)
+        return decoder.values
 
     def close(self) -> None:
         """Listen no more."""

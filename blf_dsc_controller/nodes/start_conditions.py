@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
+import numpy as np
 from diagnostic_msgs.msg import DiagnosticStatus
 from rclpy.publisher import Publisher
 
@@ -23,7 +24,7 @@ _WAITING_PERIOD = 5.0  # s between two warnings
 
 
 class StartConditions:
-    """Looks at both conditions until they are met; `steady` is its clock [ns]."""
+    """Looks at both conditions until the start; `steady` is its clock [ns]."""
 
     def __init__(
         self,
@@ -35,6 +36,7 @@ class StartConditions:
         self._watchdog = watchdog
         self._steady = steady
         self._other: OtherCommander | None = None  # while the node listens
+        self._are_met = False
         node.create_subscription(
             DiagnosticStatus,
             WATCHDOG_STATE.relative,
@@ -44,6 +46,7 @@ class StartConditions:
 
     def begin(self, commands: Publisher, config: ControllerConfig) -> None:
         """Listen from now on whether somebody else publishes like `commands`."""
+        self._are_met = False
         if config.safety.other_commands == 'allow':
             return
         if self._other is None:
@@ -58,10 +61,15 @@ class StartConditions:
         Raises:
             StartError: it must not.
         """
-        if not (self._is_alone() and (commanding or self._is_watched())):
-            return False
+        if not self._are_met:
+            self._are_met = self._is_alone() and (commanding or self._is_watched())
+        return self._are_met
+
+    def end(self) -> np.ndarray | None:
+        """Listen no more; return the torque (n,) [N m] by which the watchdog holds the arm."""
+        torque = None if self._other is None else self._other.torque_of_watchdog()
         self.close()
-        return True
+        return torque
 
     def close(self) -> None:
         """Listen no more."""

@@ -322,6 +322,8 @@ class Rerun:
             self._command(event.stamp, guard.time_out(content['text']))
         elif event.type in (EventType.ACTIVATE, EventType.RESET, EventType.DEACTIVATE):
             getattr(guard, event.type.value)()
+        elif event.type is EventType.TAKEOVER:
+            guard.take_over_from(np.array(content['torque']))
         elif event.type is EventType.PREPARE:
             guard.prepare(np.array(content['positions']))
         elif event.type is EventType.WITHDRAW:

@@ -30,23 +30,29 @@ _SEND = 'safety.first_torque: send'
 
 
 def check_first_torque(
-    controller: Controller, config: ControllerConfig, measurement: Vector
+    controller: Controller,
+    config: ControllerConfig,
+    measurement: Vector,
+    acting: Vector | None = None,
 ) -> None:
     """Raise StartError if the first torque must not be sent; the controller has begun.
 
-    `measurement` is [q (n,) rad, dq (n,) rad/s, effort (n,) N m].
+    `measurement` is [q (n,) rad, dq (n,) rad/s, effort (n,) N m]; `acting` (n,) [N m] the
+    command of another node, if one holds the arm.
     """
     if config.safety.first_torque == 'send':
         return
     torque = controller.trial(0.0, config.sample_time, measurement)
     q, dq, effort = measurement.reshape(3, -1)
     gravity = np.zeros_like(q)
-    if config.robot.urdf:
+    if config.robot.urdf and acting is None:
         gravity = model_torque(controller.settings, controller.state.estimate, q)
         _check_gravity(config, dq, effort, gravity, torque)
     step = np.array(config.torque.first_step)
     # Of an effort that only contains commands, a torque is held that this one replaces.
-    held = effort if config.robot.effort == 'commanded' else 0.0
+    held = effort if config.robot.effort == 'commanded' else np.zeros_like(q)
+    if acting is not None:
+        held = acting
     excess = np.where(step > 0.0, np.abs(torque - held) - step, 0.0)
     worst = int(np.argmax(excess))
     if excess[worst] <= 0.0:

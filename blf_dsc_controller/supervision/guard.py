@@ -52,6 +52,7 @@ from blf_dsc_controller.supervision.drive_load import DriveLoad, DriveLoads
 from blf_dsc_controller.supervision.first_torque import check_first_torque
 from blf_dsc_controller.supervision.held_torque import HeldTorque
 from blf_dsc_controller.supervision.last_state import LastState
+from blf_dsc_controller.supervision.model_torque import needed_torque
 from blf_dsc_controller.supervision.plan import Plan, plan_motion
 from blf_dsc_controller.supervision.recent_motion import is_gap
 from blf_dsc_controller.supervision.safe_torque import SafeTorque
@@ -164,6 +165,7 @@ class Guard:
         self._gap = 0.0  # s, since the one before
         self._stop_speed = StopSpeed()
         self._prepared: PreparedStart | None = None
+        self._acting: Vector | None = None  # N m, by which another node holds the arm
         self._clean = True  # whether the window holds valid samples only
         self._resumable = False  # whether the law may continue along its reference
         digest = (
@@ -464,8 +466,10 @@ class Guard:
             if motion is None:
                 motion = self._plan_start(q, dq)
             self.controller.reference_vector = motion.vector
+            self._begin_at_acting(q)
             if not self.commanding:
-                check_first_torque(self.controller, self.config, measurement)
+                acting = self._acting
+                check_first_torque(self.controller, self.config, measurement, acting)
         except (StartError, MotionError) as error:
             self.refuse(error)
             return False
@@ -481,15 +485,36 @@ class Guard:
         """Let the law begin with this state, at the torque that acts."""
         self.controller.reference_vector = motion.vector
         self.settled = motion.settled
-        if self.commanding:
+        if self.commanding and self._acting is None:
             held = self._held.command()
             acting = self._safe_torque.commanded if held is None else held
             self.controller.take_over(acting, q)
         self.journal.note(EventType.START, resumed=resumed)
         self.last_stamp = stamp - self.config.sample_time_ns
+        self._acting = None
         self._held.recent.restart()
         self.watchdog.switch(self.config.safety.watchdog, stamp)
         self.supervisor.enter(Phase.APPROACHING)
+
+    def take_over_from(self, torque: Vector) -> None:
+        """Start from a torque (n,) [N m] by which another node holds the arm.
+
+        The watchdog does so after a controller has died.  The first torque continues this
+        one, and what it carries besides the model is held from the start.
+        """
+        self._note(EventType.TAKEOVER, torque=torque.tolist())
+        self._acting = torque.copy()
+
+    def _begin_at_acting(self, q: Vector) -> None:
+        """Let the law begin with the torque that another node holds the arm by, if any."""
+        if self._acting is None:
+            return
+        law, estimate = self.controller, self.samples.estimate
+        at_rest = np.zeros((2, self._n))
+        load = self._acting - needed_torque(law.settings, estimate, q, *at_rest)
+        integrates = law.settings.disturbance.gain > 0.0
+        law.state.disturbance[integrates] = load[integrates]
+        law.take_over(self._acting, q)
 
     def prepare(self, positions: Vector) -> None:
         """Plan the start from rest at `positions` (n,) [rad], before the first state.
@@ -869,6 +894,7 @@ class Guard:
         self.states.restart()
         self.samples.restart()
         self.start_error = None
+        self._acting = None
         self.silenced = self.holds = False
         self.has_sample = False
         self._clean = True

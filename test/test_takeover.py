@@ -1,0 +1,119 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A controller that starts while another node, the watchdog, holds the arm with its load."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import blf_dsc_controller as blf
+from blf_dsc_controller import load_loop
+from blf_dsc_controller.errors import StartError
+from blf_dsc_controller.messages.journal import EventType
+from blf_dsc_controller.supervision.guard import Guard
+from sim_plant.plant import plant_of
+
+LOADED = {
+    'duration': 0.0,
+    'events.begin': [0.0],
+    'events.duration': [1e6],
+    'events.payload': [2.0],
+}
+HOLD = {'reference.type': 'hold'}
+
+
+class Arm:
+    """A simulated arm with 2 kg of which nobody knows, and one controller after another."""
+
+    def __init__(self, preset):
+        loop = load_loop(preset, {'sim_plant': LOADED, 'blf_dsc_controller': HOLD})
+        self.config = loop.controller
+        self.plant = plant_of(loop.plant)
+        self.stamp = 10**9
+        self.restart()
+
+    def restart(self, acting=None):
+        """Start another controller, which knows nothing but what it is told."""
+        self.guard = Guard(self.config, lambda: 0, lambda: 0)
+        self.guard.activate()
+        if acting is not None:
+            self.guard.take_over_from(acting)
+
+    def run(self, seconds):
+        """Return torques (k, n) and the largest speed [rad/s] of so many seconds."""
+        n = len(self.config.joints)
+        torques, fastest = [], 0.0
+        for _ in range(round(seconds / self.config.sample_time)):
+            torque = self.guard.update(self.stamp, self.plant.measure())
+            self.guard.perceive()
+            if torque is None:
+                break
+            torques.append(torque.copy())
+            self.plant.step(torque)
+            self.stamp += self.config.sample_time_ns
+            fastest = max(fastest, np.abs(self.plant.truth()[-n:]).max())
+        return np.array(torques), fastest
+
+
+@pytest.fixture(params=['fr3', 'panda', 'ur5e'])
+def arm(request):
+    held = Arm(request.param)
+    held.run(3.0)
+    return held
+
+
+def test_it_goes_on_from_the_torque_that_holds_the_arm(arm):
+    held = arm.guard.controller.state.torque.copy()
+    arm.restart(held)
+    torques, speed = arm.run(0.5)
+    limit = np.array(arm.config.torque.rate_limit) * arm.config.sample_time
+    assert (np.abs(torques[0] - held) <= np.where(limit > 0.0, limit, 0.5) + 1e-9).all()
+    assert speed < 0.02  # rad/s
+    types = [event.type for event in arm.guard.journal.pending]
+    assert types[-2:] == [EventType.TAKEOVER, EventType.START]
+
+
+@pytest.mark.parametrize('arm', ['fr3', 'panda'], indirect=True)
+def test_a_controller_that_is_told_nothing_lets_the_load_sag(arm):
+    """What the torque that is told saves; also after a reset, which forgets it."""
+    held = arm.guard.controller.state.torque.copy()
+    arm.restart(held)
+    arm.guard.reset()
+    _, speed = arm.run(0.5)
+    assert speed > 0.05
+
+
+def test_without_it_an_arm_that_rests_by_another_torque_is_not_taken_over():
+    arm = Arm('ur5e')
+    arm.run(3.0)
+    arm.restart()
+    assert not len(arm.run(0.1)[0])
+    assert 'gravity twice' in str(arm.guard.start_error)
+
+
+def test_the_largest_first_step_is_one_from_there():
+    arm = Arm('fr3')
+    arm.run(3.0)
+    held = arm.guard.controller.state.torque.copy()
+    assert np.abs(held).max() > 2.0 * max(arm.config.torque.first_step)
+    arm.restart(held)
+    torques, _ = arm.run(0.1)
+    assert len(torques) == 100
+    far = held + 50.0 * np.sign(held)
+    arm.restart(far)
+    assert not len(arm.run(0.1)[0])
+    assert isinstance(arm.guard.start_error, StartError)
+
+
+def test_a_bag_of_it_replays_bit_for_bit(tmp_path):
+    arm = Arm('fr3')
+    arm.run(1.0)
+    held = arm.guard.controller.state.torque.copy()
+    with blf.ArmController(arm.config, record=tmp_path / 'bag') as controller:
+        controller.guard.take_over_from(held)
+        for k in range(200):
+            q, dq, effort = arm.plant.measure().reshape(3, -1)
+            arm.plant.step(controller.update(1.0 + 0.001 * k, q, dq, effort))
+    verified = blf.verify(tmp_path / 'bag')
+    assert verified.difference is None
+    assert EventType.TAKEOVER in [event.type for event in verified.events]
