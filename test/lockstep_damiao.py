@@ -13,14 +13,15 @@ from typing import ClassVar
 import can
 from motor_arm import RIGID
 
-from blf_dsc_controller.configuration.nodes import load_loop
+from blf_dsc_controller.configuration.drive import DriveConfig
+from blf_dsc_controller.configuration.motor_options import limits_of, mounting_of
+from blf_dsc_controller.configuration.nodes import DRIVE, load, load_loop, locate
 from blf_dsc_controller.drive.damiao import DamiaoDriver
 from blf_dsc_controller.drive.ticks import Ticks
-from blf_dsc_controller.motors import damiao
 from sim_plant.damiao import DamiaoArm
 
 PATIENCE = 20.0  # s, for an answer of a thread
-LIMITS = [damiao.MODELS[each] for each in damiao.OPENARM]
+LIMITS = limits_of(load(locate('openarm'), DRIVE, DriveConfig), 7)
 
 
 class LockstepTicks(Ticks):
@@ -58,7 +59,8 @@ class LockstepDriver(DamiaoDriver):
         period = {'sample_time': self.controller.sample_time}
         given = {'blf_dsc_controller': period, 'sim_plant': period | RIGID}
         loop = load_loop('openarm', given)
-        self.motors = DamiaoArm(self.bus, loop.plant, LIMITS, rate=2000.0)
+        mounting = mounting_of(self.config, len(LIMITS))
+        self.motors = DamiaoArm(self.bus, loop.plant, LIMITS, 2000.0, mounting)
         if type(self).arrange is not None:
             type(self).arrange(self.motors)
         self.thread = threading.Thread(

@@ -10,6 +10,8 @@ from plant_driver import PlantDriver
 
 import blf_dsc_controller as blf
 from blf_dsc_controller.configuration.drive import DriveConfig
+from blf_dsc_controller.configuration.motor_options import limits_of
+from blf_dsc_controller.configuration.nodes import DRIVE, PLANT, load, load_loop, locate
 from blf_dsc_controller.configuration.schema import build, change
 from blf_dsc_controller.drive.driver import DriverError, check_feedback
 from blf_dsc_controller.drive.loop import DriveLoop, End
@@ -17,6 +19,7 @@ from blf_dsc_controller.drive.motor_feedback import MotorFeedback, as_in_motors
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.law.factory import settings_of_config
 from blf_dsc_controller.law.local_gains import LocalGains
+from blf_dsc_controller.motors import damiao
 from blf_dsc_controller.motors.field import Field
 from blf_dsc_controller.motors.frame import Gains, Motion, split, torque_alone
 from blf_dsc_controller.studies.laws import COMPUTED_TORQUE
@@ -152,6 +155,41 @@ def test_motors_hold_elastic_gears_that_the_host_cannot_hold():
     assert motor.phase is Phase.TRACKING
     assert worst < 4e-3  # rad: gears give way by 2 mrad between encoder and link
     assert travel < 0.06
+
+
+@pytest.mark.parametrize('physics', ['own', 'mujoco'])
+def test_yam_of_the_preset_takes_up_its_rated_payload_with_the_gains_of_its_maker(
+    physics,
+):
+    """20 s, 1 kg at 8 s: doc/real_arm.md.  Play of 15 minutes of arc, frames of 0.38 mrad."""
+    if physics == 'mujoco':
+        pytest.importorskip('mujoco', reason='needs MuJoCo: pip install mujoco')
+    config = load(locate('yam'), DRIVE, DriveConfig)
+    assert config.feedback == 'motor'
+    events = {'begin': [8.0], 'duration': [0.0], 'payload': [1.0]}
+    given = {f'events.{name}': value for name, value in events.items()}
+    loop = load_loop('yam', {PLANT: {'physics': physics, 'duration': 0.0} | given})
+    ranges = damiao.ranges_of(limits_of(config, 6))
+    plant = MotorPlant(loop.plant, ranges, rate=2000.0)
+    controller = blf.ArmController(loop.controller)
+    motor = MotorFeedback(controller, ranges, SLOW)
+    of_motors, of_links = np.zeros((2, 5000, 6))
+    for k in range(5000):
+        measured = plant.measure()
+        torque = controller.update(1.0 + k * SLOW, *measured)
+        assert controller.phase is not Phase.SAFE_STOP, controller.reason
+        reference = controller.reference.q
+        of_motors[k] = np.abs(measured[0] - reference)
+        of_links[k] = np.abs(plant.plant.truth()[-12:-6] - reference)
+        plant.step(motor.frame(torque))
+    assert controller.phase is Phase.TRACKING
+    assert of_motors[1000:2000].max() < 4e-3
+    assert (
+        of_links[1000:2000].max() < 8e-3
+    )  # gears: half a play, and what they give way
+    assert 0.15 < of_motors[2000:].max() < 0.25  # joint 4: 2 N m on 10 N m/rad
+    assert of_motors[4000:].max() < 6e-3
+    assert controller.load.mass == pytest.approx(1.0, abs=0.02)
 
 
 def test_lost_frames_cost_motors_less_than_the_host():
