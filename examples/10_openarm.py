@@ -29,4 +29,8 @@ with blf.Drive('openarm', MOTORS, robot=robot) as arm:
         while arm.is_moving:
             worst = max(worst, np.abs(arm.state.error).max())
             time.sleep(0.01)
-        print('at', np.round(arm.state.q, 2), f'rad: {1e3 * worst:.1f} mrad off on the way')
+        print(
+            'at',
+            np.round(arm.state.q, 2),
+            f'rad: {1e3 * worst:.1f} mrad off on the way',
+        )
