@@ -29,8 +29,5 @@ with blf.Drive('openarm', MOTORS, robot=robot) as arm:
         while arm.is_moving:
             worst = max(worst, np.abs(arm.state.error).max())
             time.sleep(0.01)
-        print(
-            'at',
-            np.round(arm.state.q, 2),
-            f'rad: {1e3 * worst:.1f} mrad off on the way',
-        )
+        there = np.round(arm.state.q, 2)
+        print('at', there, f'rad: {1e3 * worst:.1f} mrad off on the way')

@@ -90,6 +90,11 @@ def of_preset():
     )
 
 
+def of_yam():
+    """That preset as it is: 250 Hz, play of its gears, gains of its maker."""
+    return Path('config/yam.yaml').read_text()
+
+
 def of_page():
     """The file of the page: LeRobot's gains, and a posture to hold."""
     page = MarkdownIt().parse(Path('doc/real_arm.md').read_text())
@@ -98,8 +103,12 @@ def of_page():
     return text
 
 
-@pytest.mark.parametrize('text', [of_preset, of_page])
-def test_command_line_drives_the_motors_and_its_bag_replays(text, tmp_path, capsys):
+@pytest.mark.parametrize(
+    ('text', 'motors'), [(of_preset, 7), (of_page, 7), (of_yam, 6)]
+)
+def test_command_line_drives_the_motors_and_its_bag_replays(
+    text, motors, tmp_path, capsys
+):
     file = tmp_path / 'my.yaml'
     file.write_text(
         text().replace('driver: damiao', f'driver: {lockstep_damiao.__file__}')
@@ -109,7 +118,7 @@ def test_command_line_drives_the_motors_and_its_bag_replays(text, tmp_path, caps
     arguments = ['--robot', robot, '--config', str(file), '--out', str(bag)]
     assert main(['drive', *arguments, '--duration', '3']) == 0
     printed = capsys.readouterr()
-    assert f'7 motors answer on {robot}' in printed.out + printed.err
+    assert f'{motors} motors answer on {robot}' in printed.out + printed.err
     assert 'and 0 missed' in printed.out
     verified = blf.verify(bag)
     assert verified.difference is None
