@@ -25,9 +25,11 @@ from motor_arm import loop_of
 
 import blf_dsc_controller as blf
 from blf_dsc_controller.cli.main import main
+from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.drive import DriveConfig
-from blf_dsc_controller.configuration.nodes import DRIVE, load, locate
+from blf_dsc_controller.configuration.nodes import CONTROLLER, DRIVE, load, locate
 from blf_dsc_controller.configuration.schema import build
+from blf_dsc_controller.drive import show_joints
 from blf_dsc_controller.drive.can_bus import CanBus
 from blf_dsc_controller.drive.damiao import DamiaoDriver
 from blf_dsc_controller.drive.driver import ConnectionLostError, DriverError
@@ -399,3 +401,28 @@ def test_ticks_are_a_period_apart_and_skip_those_that_are_over():
 
 def test_driver_is_found_by_its_name():
     assert find_driver('damiao').__name__ == 'DamiaoDriver'
+
+
+def test_joints_are_shown_without_a_torque_and_a_turn_too_much_is_told(
+    tmp_path, capsys
+):
+    """As a motor may read after its power was off."""
+    file = tmp_path / 'my.yaml'
+    offsets = 'motor_offsets: [0.0, 0.0, 0.0, 0.0, 6.2831853, 0.0]'
+    driver = f'driver: {lockstep_damiao.__file__}\n    {offsets}'
+    file.write_text(of_yam().replace('driver: damiao', driver))
+    arguments = ['--robot', 'virtual:joints', '--config', str(file), '--period', '0']
+    with can.Bus(interface='virtual', channel='joints') as spy:
+        assert show_joints.main(arguments) == 0
+        seen = iter(lambda: spy.recv(0.0), None)
+        senders = {each.arbitration_id for each in seen}
+    assert senders == {damiao.TO_ALL, *range(0x11, 0x17)}  # questions and answers
+    printed = capsys.readouterr().out.splitlines()
+    assert [line.split()[0] for line in printed] == [f'joint{i}' for i in range(1, 7)]
+    assert [line.endswith('rad') for line in printed] == [True] * 6
+    chain = load(locate('yam'), CONTROLLER, ControllerConfig)
+    chain = chain.robot.chain(chain.joints)
+    told = list(show_joints.lines(chain, [0.1, -5.3, 1.1, 0.1, 6.2, 0.0]))
+    assert told[0].endswith('0.100 of -2.62 to 3.14 rad')
+    assert 'outside: +6.283 rad, a turn, would be within' in told[1]
+    assert 'outside: -6.283 rad, a turn, would be within' in told[4]
