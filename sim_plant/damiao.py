@@ -19,11 +19,14 @@ from contextlib import suppress
 import can
 import numpy as np
 
-from blf_dsc_controller.configuration.nodes import PLANT, load_loop
+from blf_dsc_controller.configuration.drive import DriveConfig
+from blf_dsc_controller.configuration.motor_options import limits_of, mounting_of
+from blf_dsc_controller.configuration.nodes import DRIVE, PLANT, load, load_loop, locate
 from blf_dsc_controller.configuration.plant import PlantConfig
 from blf_dsc_controller.motors import damiao
 from blf_dsc_controller.motors.damiao import Limits, Register, StateCodes, Status
 from blf_dsc_controller.motors.frame import Frame
+from blf_dsc_controller.motors.mounting import Mounting
 from sim_plant.motors import MotorPlant
 
 _RATE = 2000.0  # Hz, of motors in real time, in Python
@@ -49,13 +52,16 @@ class DamiaoArm:
         config: PlantConfig,
         limits: Sequence[Limits],
         rate: float = _RATE,
+        mounting: Mounting | None = None,
     ) -> None:
         """Put the motors of a configured arm on a bus, disabled, as 1, 2, ..."""
+        n = len(limits)
         self._bus = bus
         self._limits = limits
         self._ranges = damiao.ranges_of(limits)
-        self.arm = MotorPlant(config, self._ranges, rate)
-        n = len(limits)
+        self._mounting = mounting or Mounting(np.ones(n), np.zeros(n))
+        at_joints = self._mounting.ranges_at_joints(self._ranges)
+        self.arm = MotorPlant(config, at_joints, rate)
         self._n = n
         self.status = [Status.DISABLED] * n
         self.modes = [damiao.MIT] * n
@@ -76,13 +82,13 @@ class DamiaoArm:
 
     @property
     def frame(self) -> Frame:
-        """What the motors have been sent last; those that are not enabled do nothing."""
+        """What the joints have been sent last; motors that are not enabled do nothing."""
         values = [
             field.values(codes)
             for field, codes in zip(self._ranges, self._codes, strict=True)
         ]
         enabled = np.array([each == Status.ENABLED for each in self.status])
-        frame = Frame(*values)
+        frame = self._mounting.frame_at_joints(Frame(*values))
         return frame._replace(
             stiffness=frame.stiffness * enabled,
             damping=frame.damping * enabled,
@@ -167,9 +173,10 @@ class DamiaoArm:
     def _send_state(self, joint: int) -> None:
         ranges = self._ranges
         fields = ranges.position, ranges.velocity, ranges.torque
+        states = self._mounting.states_at_motors(self.arm.measure())
         q, dq, torque = (
             int(field.codes(values)[joint])
-            for field, values in zip(fields, self.arm.measure(), strict=True)
+            for field, values in zip(fields, states, strict=True)
         )
         state = StateCodes(joint + 1, self.status[joint], q, dq, torque, _COLD, _COLD)
         self._send(joint, damiao.state_data(state))
@@ -190,10 +197,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options = parser.parse_args(arguments)
     interface, _, channel = options.bus.partition(':')
     with can.Bus(interface=interface, channel=channel) as bus:
-        limits = [damiao.MODELS[each] for each in damiao.OPENARM]
         own = {'sensor.resolution': damiao.ENCODER}
         plant = load_loop(options.config, {PLANT: own}).plant
-        motors = DamiaoArm(bus, plant, limits)
+        config = load(locate(options.config), DRIVE, DriveConfig)
+        n = len(plant.joints)
+        limits = limits_of(config, n)
+        motors = DamiaoArm(bus, plant, limits, mounting=mounting_of(config, n))
         motors.arm.plant.compile()
         text = f'{len(limits)} motors on {options.bus}: Ctrl-C ends'
         print(text, flush=True)  # noqa: T201 - a command

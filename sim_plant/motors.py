@@ -35,6 +35,7 @@ class MotorPlant:
 
     Attributes:
         plant: the arm, sampled at the rate of the motors.
+        config: its configuration.
         per_frame: samples of the motors in a period of the host.
         frames: frames so far, which is the time in periods of the host.
     """
@@ -52,9 +53,9 @@ class MotorPlant:
                 f'multiple of {1.0 / rate:g} s'
             )
         own = {'sample_time': config.sample_time / self.per_frame, 'actuator.delay': 0}
-        self.plant = plant_of(change(config, own))
+        self.config = change(config, own)
+        self.plant = plant_of(self.config)
         self.ranges = ranges
-        n = len(config.joints)
         n = len(config.joints)
         self._last = Frame(*np.zeros((5, n)))
         self._on_the_bus = deque([self._last] * config.actuator.delay)

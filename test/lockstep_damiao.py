@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The driver of Damiao motors on simulated ones, on python-can's virtual bus, in lock-step.
 
+They are those of an OpenArm with rigid gears, or of a YAM as its preset has it.
 Time goes on with the frames: a test holds on any machine.  `arrange(motors)`, if set,
 gets the motors before they are reached; `at` calls something with them at a state.
 """
@@ -13,14 +14,16 @@ from typing import ClassVar
 import can
 from motor_arm import RIGID
 
-from blf_dsc_controller.configuration.nodes import load_loop
+from blf_dsc_controller.configuration.drive import DriveConfig
+from blf_dsc_controller.configuration.motor_options import limits_of, mounting_of
+from blf_dsc_controller.configuration.nodes import DRIVE, load, load_loop, locate
 from blf_dsc_controller.drive.damiao import DamiaoDriver
 from blf_dsc_controller.drive.ticks import Ticks
-from blf_dsc_controller.motors import damiao
 from sim_plant.damiao import DamiaoArm
 
 PATIENCE = 20.0  # s, for an answer of a thread
-LIMITS = [damiao.MODELS[each] for each in damiao.OPENARM]
+LIMITS = limits_of(load(locate('openarm'), DRIVE, DriveConfig), 7)
+YAM = 6  # joints
 
 
 class LockstepTicks(Ticks):
@@ -56,9 +59,13 @@ class LockstepDriver(DamiaoDriver):
         channel = self.address.partition(':')[2]
         self.bus = can.Bus(interface='virtual', channel=channel)
         period = {'sample_time': self.controller.sample_time}
-        given = {'blf_dsc_controller': period, 'sim_plant': period | RIGID}
-        loop = load_loop('openarm', given)
-        self.motors = DamiaoArm(self.bus, loop.plant, LIMITS, rate=2000.0)
+        n = len(self.controller.joints)
+        name, gears = ('yam', {}) if n == YAM else ('openarm', RIGID)
+        given = {'blf_dsc_controller': period, 'sim_plant': period | gears}
+        plant = load_loop(name, given).plant
+        limits = limits_of(self.config, n) if n == YAM else LIMITS
+        mounting = mounting_of(self.config, n)
+        self.motors = DamiaoArm(self.bus, plant, limits, 2000.0, mounting)
         if type(self).arrange is not None:
             type(self).arrange(self.motors)
         self.thread = threading.Thread(

@@ -71,7 +71,7 @@ def test_stiff_loops_stay_stable_with_and_without_the_rated_payload(
 
 
 @pytest.mark.parametrize('period', [0.001, 0.004, 0.01])
-@pytest.mark.parametrize('preset', ['panda', 'ur5e', 'fr3', 'openarm'])
+@pytest.mark.parametrize('preset', ['panda', 'ur5e', 'fr3', 'openarm', 'widowx', 'yam'])
 def test_soft_joints_hardly_drift_within_a_window(preset, period):
     """Their loops are near the least damped that adaptation allows: 1.35 times at most."""
     at_rest = AtRest(preset, 'none', period, 1.0)

@@ -82,13 +82,14 @@ def test_simulators_of_the_peers_run_the_same_arm():
         )
 
 
-def test_feedback_in_motors_is_compared_with_the_hosts(monkeypatch):
+@pytest.mark.parametrize('arm', ['openarm', 'yam'])
+def test_feedback_in_motors_is_compared_with_the_hosts(monkeypatch, arm):
     sizes = {'SECONDS': 0.2, 'PICK_UP': 0.1, 'SETTLED': 0.05, 'DEAD': 0.1}
     motors = importlib.import_module('motor_feedback')
-    for name, value in {'ARMS': {'rigid': {}}, **sizes}.items():
+    for name, value in {'KINDS': ('rigid',), **sizes}.items():
         monkeypatch.setattr(motors, name, value)
-    table = {first: cells for first, *cells in motors.rows(['lerobot', 'soft'])}
-    assert list(table) == ['lerobot, motor', 'soft, host', 'soft, motor']
+    table = {first: cells for first, *cells in motors.rows(arm, ['maker', 'whole'])}
+    assert list(table) == ['maker, motor', 'whole, host', 'whole, motor']
     assert all(len(cells) == 2 and 'stops' not in cells[0] for cells in table.values())
 
 

@@ -25,19 +25,27 @@ from motor_arm import loop_of
 
 import blf_dsc_controller as blf
 from blf_dsc_controller.cli.main import main
+from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.drive import DriveConfig
+from blf_dsc_controller.configuration.nodes import CONTROLLER, DRIVE, load, locate
 from blf_dsc_controller.configuration.schema import build
+from blf_dsc_controller.drive import show_joints
 from blf_dsc_controller.drive.can_bus import CanBus
 from blf_dsc_controller.drive.damiao import DamiaoDriver
 from blf_dsc_controller.drive.driver import ConnectionLostError, DriverError
 from blf_dsc_controller.drive.drivers import find_driver
 from blf_dsc_controller.drive.loop import DriveLoop, End
 from blf_dsc_controller.drive.ticks import Ticks
+from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.motors import damiao
 from blf_dsc_controller.motors.damiao import Status
+from blf_dsc_controller.motors.frame import Frame
 from sim_plant.damiao import DamiaoArm
 
 CONFIG = loop_of(0.004).controller
+PRESET = {
+    'motor_models': list(load(locate('openarm'), DRIVE, DriveConfig).motor_models)
+}
 
 
 @pytest.fixture
@@ -50,7 +58,7 @@ def made(request, monkeypatch):
         monkeypatch.setattr(LockstepDriver, 'at', at or {})
         address = f'virtual:{request.node.name}{len(drivers)}'
         driver = LockstepDriver(
-            address, config, build(DriveConfig, {'feedback': 'motor', **given})
+            address, config, build(DriveConfig, PRESET | {'feedback': 'motor'} | given)
         )
         drivers.append(driver)
         driver.connect()
@@ -76,10 +84,17 @@ def of_preset():
     """The preset at 250 Hz, with its motion."""
     preset = Path('config/openarm.yaml').read_text()
     assert 'sample_time: 0.001' in preset
-    return (
-        preset.replace('sample_time: 0.001', 'sample_time: 0.004')
-        + '\n/**/drive:\n  ros__parameters:\n    feedback: motor\n    driver: damiao\n'
+    motors = '/**/drive:\n  ros__parameters:\n'
+    assert motors in preset
+    driver = motors + '    feedback: motor\n    driver: damiao\n'
+    return preset.replace('sample_time: 0.001', 'sample_time: 0.004').replace(
+        motors, driver
     )
+
+
+def of_yam():
+    """That preset as it is: 250 Hz, play of its gears, gains of its maker."""
+    return Path('config/yam.yaml').read_text()
 
 
 def of_page():
@@ -90,8 +105,12 @@ def of_page():
     return text
 
 
-@pytest.mark.parametrize('text', [of_preset, of_page])
-def test_command_line_drives_the_motors_and_its_bag_replays(text, tmp_path, capsys):
+@pytest.mark.parametrize(
+    ('text', 'motors'), [(of_preset, 7), (of_page, 7), (of_yam, 6)]
+)
+def test_command_line_drives_the_motors_and_its_bag_replays(
+    text, motors, tmp_path, capsys
+):
     file = tmp_path / 'my.yaml'
     file.write_text(
         text().replace('driver: damiao', f'driver: {lockstep_damiao.__file__}')
@@ -101,7 +120,7 @@ def test_command_line_drives_the_motors_and_its_bag_replays(text, tmp_path, caps
     arguments = ['--robot', robot, '--config', str(file), '--out', str(bag)]
     assert main(['drive', *arguments, '--duration', '3']) == 0
     printed = capsys.readouterr()
-    assert f'7 motors answer on {robot}' in printed.out + printed.err
+    assert f'{motors} motors answer on {robot}' in printed.out + printed.err
     assert 'and 0 missed' in printed.out
     verified = blf.verify(bag)
     assert verified.difference is None
@@ -226,6 +245,75 @@ def test_motors_that_cannot_be_driven_are_named(
         made(arrange, **given)
 
 
+TURNED = {
+    'motor_directions': [1, -1, 1, -1, -1, 1, -1],
+    'motor_offsets': [0.3, -0.2, 0.0, 1.0, -0.7, 0.05, 2.0],  # rad
+}
+
+
+def test_motors_that_turn_the_other_way_from_another_zero_get_and_send_theirs(made):
+    """Bytes of both directions, as damiao-motor codes them for motors at d q + o."""
+    theirs = pytest.importorskip('damiao_motor.core.motor').DaMiaoMotor
+    driver = made(**TURNED)
+    d, o = np.array(TURNED['motor_directions']), np.array(TURNED['motor_offsets'])
+    channel = driver.address.partition(':')[2]
+    q, dq, torque = np.random.default_rng(4).uniform(-0.9, 0.9, (3, 7))
+    kp, kd = np.full(7, 100.0), np.full(7, 1.0)
+    driver.start()
+    with can.Bus(interface='virtual', channel=channel) as spy:
+        driver.write_frame(Frame(q, dq, kp, kd, torque))
+        seen = [spy.recv(lockstep_damiao.PATIENCE) for _ in range(14)]
+        state = driver.read()
+    data = {each.arbitration_id: bytes(each.data) for each in seen}
+    assert len(data) == 14
+    for i in range(7):
+        model = driver.config.motor_models[i]
+        motor = theirs(i + 1, 0x11 + i, None, motor_type=model)
+        ranges = damiao.ranges_of([damiao.MODELS[model]])
+        codes = damiao.codes_of_command(data[i + 1])
+        at_motor = (d[i] * q[i] + o[i], d[i] * dq[i], kp[i], kd[i], d[i] * torque[i])
+        for field, code, wanted in zip(ranges, codes, at_motor, strict=True):
+            assert abs(field.values([code]) - wanted) <= 0.5 * field.step + 1e-12
+        # what they code from our codes is what we sent: they take the code below
+        above = [
+            float((field.values([code]) + 0.25 * field.step)[0])
+            for field, code in zip(ranges, codes, strict=True)
+        ]
+        p, v, stiff, damp, t = above
+        assert motor.encode_cmd_msg(p, v, t, stiff, damp) == data[i + 1]
+        found = motor.decode_sensor_feedback(data[0x11 + i])
+        assert state.q[i] == pytest.approx(d[i] * (found['pos'] - o[i]), abs=1e-12)
+        assert state.dq[i] == pytest.approx(d[i] * found['vel'], abs=1e-12)
+        assert state.effort[i] == pytest.approx(d[i] * found['torq'], abs=1e-12)
+
+
+def test_an_arm_with_turned_motors_moves_as_one_without(made, tmp_path):
+    """Its positions lie on other steps of 0.38 mrad, so nothing is equal."""
+    moved = []
+    for name, given in (('plain', {}), ('turned', TURNED)):
+        outcome = run(made(**given), record=tmp_path / name)
+        assert outcome.end is End.DURATION
+        recorded = blf.read_run(tmp_path / name)
+        assert np.abs(recorded.error[150:250]).max() < 5e-3
+        moved.append(recorded.position[:250])
+    assert np.ptp(moved[0], axis=0).max() > 0.1
+    assert 1e-6 < np.abs(moved[1] - moved[0]).max() < 2e-3
+
+
+@pytest.mark.parametrize(
+    ('given', 'text'),
+    [
+        ({'motor_directions': [1, -1]}, r'motor_directions: got 2, .* 7 joints'),
+        ({'motor_offsets': [0.1] * 8}, r'motor_offsets: got 8, .* 7 joints'),
+        ({'motor_directions': [1, 0] * 3 + [1]}, 'turns with its joint, 1, or against'),
+        ({'motor_models': ['4310', '4311']}, 'got 4311, but known are 4310, 4340'),
+    ],
+)
+def test_motors_that_are_described_wrongly_are_told(made, given, text):
+    with pytest.raises(BlfDscError, match=text):
+        made(**given)
+
+
 def test_two_motors_with_one_identifier_are_named(made):
     others = []
 
@@ -313,3 +401,28 @@ def test_ticks_are_a_period_apart_and_skip_those_that_are_over():
 
 def test_driver_is_found_by_its_name():
     assert find_driver('damiao').__name__ == 'DamiaoDriver'
+
+
+def test_joints_are_shown_without_a_torque_and_a_turn_too_much_is_told(
+    tmp_path, capsys
+):
+    """As a motor may read after its power was off."""
+    file = tmp_path / 'my.yaml'
+    offsets = 'motor_offsets: [0.0, 0.0, 0.0, 0.0, 6.2831853, 0.0]'
+    driver = f'driver: {lockstep_damiao.__file__}\n    {offsets}'
+    file.write_text(of_yam().replace('driver: damiao', driver))
+    arguments = ['--robot', 'virtual:joints', '--config', str(file), '--period', '0']
+    with can.Bus(interface='virtual', channel='joints') as spy:
+        assert show_joints.main(arguments) == 0
+        seen = iter(lambda: spy.recv(0.0), None)
+        senders = {each.arbitration_id for each in seen}
+    assert senders == {damiao.TO_ALL, *range(0x11, 0x17)}  # questions and answers
+    printed = capsys.readouterr().out.splitlines()
+    assert [line.split()[0] for line in printed] == [f'joint{i}' for i in range(1, 7)]
+    assert [line.endswith('rad') for line in printed] == [True] * 6
+    chain = load(locate('yam'), CONTROLLER, ControllerConfig)
+    chain = chain.robot.chain(chain.joints)
+    told = list(show_joints.lines(chain, [0.1, -5.3, 1.1, 0.1, 6.2, 0.0]))
+    assert told[0].endswith('0.100 of -2.62 to 3.14 rad')
+    assert 'outside: +6.283 rad, a turn, would be within' in told[1]
+    assert 'outside: -6.283 rad, a turn, would be within' in told[4]

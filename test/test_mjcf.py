@@ -250,6 +250,27 @@ def test_preset_widowx_has_the_armatures_and_limits_of_its_mjcf():
     np.testing.assert_allclose(ratios, [2.1] * 3 + [9.7] * 3, atol=0.05)
 
 
+def test_preset_yam_has_the_weight_the_zero_posture_and_the_limits_that_its_maker_states():
+    """As the README of i2rt 1.2.4 beside its MJCF has them, which its gripper adds to."""
+    robot, chain = robot_of({'robot.urdf': 'yam.urdf', 'robot.tip': 'link6'})
+    moved = 4.291977 - 0.873654  # kg, all but the base
+    gripper = 0.553219 + 2.0 * 0.0710042
+    masses = [each.inertia[0] for each in chain.joints]
+    assert sum(masses) == pytest.approx(moved + gripper, abs=1e-6)
+    home = frames(chain, np.zeros((1, 6)))[-1][0]
+    wanted = [
+        [0.0, 0.0, -1.0, 0.110597],
+        [0.0, -1.0, 0.0, 0.0],
+        [-1.0, 0.0, 0.0, 0.173502],
+    ]
+    np.testing.assert_allclose(home[:3], wanted, atol=6e-6)  # axes are off by 4e-6 rad
+    lower = np.degrees([each.lower for each in chain.joints])
+    upper = np.degrees([each.upper for each in chain.joints])
+    np.testing.assert_allclose(lower, [-150, 0, 0, -97, -90, -120], atol=1e-3)
+    np.testing.assert_allclose(upper, [180, 210, 180, 90, 90, 120], atol=1e-3)
+    assert robot.rotor_inertia == (0.032,) * 3 + (0.0018,) * 3
+
+
 def test_mjcf_of_an_fr3_is_its_own_urdf():
     """Two files that franky-sim ships, and neither of us wrote."""
     chain = robot_of({'robot.urdf': FR3, 'robot.tip': 'fr3_link7'})[1]

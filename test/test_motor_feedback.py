@@ -10,13 +10,17 @@ from plant_driver import PlantDriver
 
 import blf_dsc_controller as blf
 from blf_dsc_controller.configuration.drive import DriveConfig
+from blf_dsc_controller.configuration.motor_options import limits_of
+from blf_dsc_controller.configuration.nodes import DRIVE, PLANT, load, load_loop, locate
 from blf_dsc_controller.configuration.schema import build, change
 from blf_dsc_controller.drive.driver import DriverError, check_feedback
 from blf_dsc_controller.drive.loop import DriveLoop, End
 from blf_dsc_controller.drive.motor_feedback import MotorFeedback, as_in_motors
+from blf_dsc_controller.drive.simulated import simulated
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.law.factory import settings_of_config
 from blf_dsc_controller.law.local_gains import LocalGains
+from blf_dsc_controller.motors import damiao
 from blf_dsc_controller.motors.field import Field
 from blf_dsc_controller.motors.frame import Gains, Motion, split, torque_alone
 from blf_dsc_controller.studies.laws import COMPUTED_TORQUE
@@ -25,6 +29,7 @@ from blf_dsc_controller.supervision.supervisor import Phase
 from sim_plant.motors import MotorPlant
 
 SLOW = 0.004  # s
+MODELS = ['8009', '8009', '4340', '4340', '4310', '4310', '4310']
 
 
 def test_sum_of_a_frame_is_the_torque_up_to_the_rounding_of_the_last_field():
@@ -152,6 +157,75 @@ def test_motors_hold_elastic_gears_that_the_host_cannot_hold():
     assert motor.phase is Phase.TRACKING
     assert worst < 4e-3  # rad: gears give way by 2 mrad between encoder and link
     assert travel < 0.06
+
+
+@pytest.mark.parametrize('physics', ['own', 'mujoco'])
+def test_yam_of_the_preset_takes_up_its_rated_payload_with_the_gains_of_its_maker(
+    physics,
+):
+    """20 s, 1 kg at 8 s: doc/real_arm.md.  Play of 15 minutes of arc, frames of 0.38 mrad."""
+    if physics == 'mujoco':
+        pytest.importorskip('mujoco', reason='needs MuJoCo: pip install mujoco')
+    config = load(locate('yam'), DRIVE, DriveConfig)
+    assert config.feedback == 'motor'
+    events = {'begin': [8.0], 'duration': [0.0], 'payload': [1.0]}
+    given = {f'events.{name}': value for name, value in events.items()}
+    loop = load_loop('yam', {PLANT: {'physics': physics, 'duration': 0.0} | given})
+    ranges = damiao.ranges_of(limits_of(config, 6))
+    plant = MotorPlant(loop.plant, ranges, rate=2000.0)
+    controller = blf.ArmController(loop.controller)
+    motor = MotorFeedback(controller, ranges, SLOW)
+    of_motors, of_links = np.zeros((2, 5000, 6))
+    for k in range(5000):
+        measured = plant.measure()
+        torque = controller.update(1.0 + k * SLOW, *measured)
+        assert controller.phase is not Phase.SAFE_STOP, controller.reason
+        reference = controller.reference.q
+        of_motors[k] = np.abs(measured[0] - reference)
+        of_links[k] = np.abs(plant.plant.truth()[-12:-6] - reference)
+        plant.step(motor.frame(torque))
+    assert controller.phase is Phase.TRACKING
+    assert of_motors[1000:2000].max() < 4e-3
+    assert (
+        of_links[1000:2000].max() < 8e-3
+    )  # gears: half a play, and what they give way
+    assert 0.15 < of_motors[2000:].max() < 0.25  # joint 4: 2 N m on 10 N m/rad
+    assert of_motors[4000:].max() < 6e-3
+    assert controller.load.mass == pytest.approx(1.0, abs=0.02)
+
+
+@pytest.mark.parametrize('feedback', ['host', 'motor'])
+def test_motors_of_the_simulated_robot_are_those_of_the_plant(feedback, tmp_path):
+    """Half a second of an OpenArm, by the driver and by hand: the same positions."""
+    config = build(DriveConfig, {'feedback': 'motor', 'motor_models': MODELS})
+    loop = loop_of(SLOW)
+    driver = simulated(loop.plant, 'motor')('simulated', loop.controller, config)
+    driver.connect()
+    with blf.ArmController(loop.controller, record=tmp_path / 'bag') as controller:
+        outcome = DriveLoop(driver, controller, duration=0.5, feedback=feedback).run()
+    assert outcome.end is End.DURATION
+    assert controller.missed == 0
+    driven = blf.read_run(tmp_path / 'bag')
+    plant = MotorPlant(loop.plant, driver.ranges, rate=2000.0)
+    with blf.ArmController(loop.controller) as by_hand:
+        motor = MotorFeedback(by_hand, driver.ranges, driver.latency)
+        for k in range(120):
+            measured = plant.measure()
+            np.testing.assert_array_equal(measured[0], driven.position[k])
+            torque = by_hand.update(1.0 + (k + 1) * SLOW, *measured)
+            plant.step(
+                motor.frame(torque) if feedback == 'motor' else torque_alone(torque)
+            )
+    rests = driver.positions()
+    driver.recover()
+    np.testing.assert_allclose(driver.positions(), rests, atol=1e-3)  # 0.38 mrad
+
+
+def test_simulated_motors_need_their_models():
+    loop = loop_of(SLOW)
+    made = simulated(loop.plant, 'motor')
+    with pytest.raises(BlfDscError, match=r'motor_models: got 0, .* 7 joints'):
+        made('simulated', loop.controller, build(DriveConfig, {'feedback': 'motor'}))
 
 
 def test_lost_frames_cost_motors_less_than_the_host():

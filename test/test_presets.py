@@ -12,10 +12,17 @@ import pytest
 
 from blf_dsc_controller.bags.reader import read_run
 from blf_dsc_controller.cli.main import main
+from blf_dsc_controller.cli.run import STOPPED
+from blf_dsc_controller.configuration.drive import DriveConfig
 from blf_dsc_controller.configuration.files import share_folder
-from blf_dsc_controller.configuration.nodes import load_loop
+from blf_dsc_controller.configuration.nodes import DRIVE, load, load_loop, locate
+from blf_dsc_controller.replay.verify import verify
 
-PRESETS = sorted(path.stem for path in (share_folder() / 'config').glob('*.yaml'))
+NAMES = sorted(path.stem for path in (share_folder() / 'config').glob('*.yaml'))
+IN_MOTORS = [
+    name for name in NAMES if load(locate(name), DRIVE, DriveConfig).feedback == 'motor'
+]
+PRESETS = sorted({*NAMES} - {*IN_MOTORS})
 LAW = {
     'comparison': 'backstepping',
     'comparison_detuned': 'backstepping',
@@ -62,6 +69,19 @@ def test_preset_runs_by_name_and_saves_its_configuration(
     from_urdf = saved.model == 'urdf'
     assert ('torque error of the learned model' in printed) is from_urdf
     assert summary['of_torques'] is from_urdf
+
+
+@pytest.mark.parametrize('preset', IN_MOTORS)
+def test_preset_with_feedback_in_its_motors_is_driven_by_name(preset, tmp_path, capsys):
+    """Over the bus its gains shake it, which `run` says."""
+    bag = tmp_path / 'bag'
+    arguments = ['--robot', 'simulated', '--config', preset, '--out', str(bag)]
+    assert main(['drive', *arguments, '--duration', '0.5']) == 0
+    assert 'and 0 missed' in capsys.readouterr().out
+    assert verify(bag).difference is None
+    assert offline(preset, tmp_path / 'out', 0.5) == STOPPED
+    told = capsys.readouterr()
+    assert f'blf_dsc drive --robot simulated --config {preset}' in told.err
 
 
 @pytest.mark.skipif(importlib.util.find_spec('rclpy') is None, reason='needs ROS 2')

@@ -54,7 +54,7 @@ def arm(name):
     if name == 'paper':
         text = urdf(('joint1', 'joint2'), (1.0, 0.8), (0.5, 0.5))
         return read_chain(text, '', 'tip', ())
-    if name in ('fr3', 'openarm', 'widowx'):
+    if name in ('fr3', 'openarm', 'widowx', 'yam'):
         config = load_loop(name).controller
         return config.robot.chain(config.joints)
     return chain_of(name)
@@ -136,7 +136,7 @@ def test_errors_are_those_of_the_placements(name):
     np.testing.assert_array_equal(found, each)
 
 
-@pytest.mark.parametrize('name', ['panda', 'ur5e', 'fr3', 'openarm', 'widowx'])
+@pytest.mark.parametrize('name', ['panda', 'ur5e', 'fr3', 'openarm', 'widowx', 'yam'])
 def test_bound_at_every_posture_is_tight(name):
     """Compare with the worst of many postures, which are not all: the true ratio is lower."""
     chain = arm(name)

@@ -19,12 +19,15 @@ from blf_dsc_controller.cli.main import INTERRUPTED
 from blf_dsc_controller.compiled.announcement import announced_compilation
 from blf_dsc_controller.compiled.kernel_cache import ship
 from blf_dsc_controller.configuration.controller import ControllerConfig
+from blf_dsc_controller.configuration.drive import DriveConfig
 from blf_dsc_controller.configuration.nodes import (
     CONTROLLER,
+    DRIVE,
     PLANT,
     LoopConfig,
     dump,
     ignored_sections,
+    load,
     load_loop,
     locate,
     read,
@@ -117,6 +120,12 @@ def _configuration(options: Namespace) -> LoopConfig:
     ignored = ignored_sections(read(path), (PLANT, CONTROLLER))
     if ignored:
         print_notice(f'warning: {path}: {ignored}')
+    if load(path, DRIVE, DriveConfig).feedback == 'motor':
+        print_notice(
+            f'warning: {path}: drive.feedback is motor, but this simulates torques over the '
+            f'bus, with the same gains; blf_dsc drive --robot simulated --config '
+            f'{options.config} simulates the motors'
+        )
     names = ('duration', 'mode', 'seed', 'physics')
     chosen = {name: getattr(options, name) for name in names}
     given = {name: value for name, value in chosen.items() if value is not None}

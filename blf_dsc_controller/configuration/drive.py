@@ -14,6 +14,7 @@ from blf_dsc_controller.configuration.schema import (
     parameter,
     positive,
 )
+from blf_dsc_controller.motors.damiao import MODELS
 
 _WHY = 'it is read once, before the motion starts'
 _fixed = partial(parameter, read_only=_WHY)
@@ -63,6 +64,27 @@ class DriveConfig:
     feedback_ids: tuple[int, ...] = _identifiers(
         'damiao: identifier with which each answers; empty: 16 more'
     )
+    motor_directions: tuple[int, ...] = parameter(
+        (),
+        'damiao: 1 for a motor that turns with its joint, -1 against it; empty: 1',
+        read_only=_WHY,
+        omittable=True,
+        at_least=-1,
+        at_most=1,
+    )
+    motor_offsets: tuple[float, ...] = parameter(
+        (),
+        'damiao: position of each motor at the zero of its joint; empty: 0',
+        'rad',
+        read_only=_WHY,
+        omittable=True,
+    )
+    motor_models: tuple[str, ...] = _fixed(
+        (),
+        'damiao: model of each motor, such as 4310, for simulated ones; real ones say '
+        'themselves what their frames hold',
+        omittable=True,
+    )
     can_fd: bool = _fixed(False, 'damiao: send frames of CAN FD')
     at_end: Literal['hold', 'release'] = _fixed(
         'hold',
@@ -77,7 +99,7 @@ class DriveConfig:
     )
 
     def problems(self) -> Iterator[str]:
-        """Check that thresholds come together, and that those of the hand are six."""
+        """Check thresholds, which come together and six at the hand, and motors."""
         if bool(self.collision_torque) != bool(self.collision_force):
             yield (
                 'collision_torque and collision_force: got one of them, but a robot takes both: '
@@ -87,4 +109,14 @@ class DriveConfig:
             yield (
                 f'collision_force: got {len(self.collision_force)} entries, but three forces and '
                 'three torques are needed'
+            )
+        if 0 in self.motor_directions:
+            yield (
+                f'motor_directions: got {list(self.motor_directions)}, but a motor turns with its '
+                'joint, 1, or against it, -1'
+            )
+        unknown = [each for each in self.motor_models if each not in MODELS]
+        if unknown:
+            yield (
+                f'motor_models: got {", ".join(unknown)}, but known are {", ".join(MODELS)}'
             )

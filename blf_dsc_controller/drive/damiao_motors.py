@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from blf_dsc_controller.configuration.drive import DriveConfig
+from blf_dsc_controller.configuration.motor_options import mounting_of
 from blf_dsc_controller.drive.can_bus import CanBus
 from blf_dsc_controller.drive.driver import DriverError
 from blf_dsc_controller.motors import damiao
@@ -26,11 +27,12 @@ class DamiaoMotors:
     """The motors of the n joints of an arm.
 
     Attributes:
-        ranges: what frames to them carry.
-        state: q, dq, torque (3, n) [rad, rad/s, N m] that they sent last.
+        ranges: what frames to them carry, as values of the joints.
+        state: q, dq, torque (3, n) [rad, rad/s, N m] of the joints, as they sent it last.
     """
 
     ranges: Ranges
+    _at_motors: Ranges
 
     def __init__(
         self, address: str, joints: Sequence[str], config: DriveConfig
@@ -38,9 +40,10 @@ class DamiaoMotors:
         """Note which motor is whose.
 
         Raises:
-            DriverError: there is not one for each joint.
+            BlfDscError: there is not one, a direction and an offset for each joint.
         """
         n = len(joints)
+        self._mounting = mounting_of(config, n)
         self._address = address
         self._joints = joints
         self._ids = config.motor_ids or tuple(range(1, n + 1))
@@ -83,7 +86,8 @@ class DamiaoMotors:
                 )
         limits = (Register.POSITION, Register.VELOCITY, Register.TORQUE)
         table = zip(*map(self.registers, limits), strict=True)
-        self.ranges = damiao.ranges_of([damiao.Limits(*row) for row in table])
+        self._at_motors = damiao.ranges_of([damiao.Limits(*row) for row in table])
+        self.ranges = self._mounting.ranges_at_joints(self._at_motors)
         self.refresh()
         for joint, _ in self._answers(_SECOND):
             raise DriverError(
@@ -104,7 +108,8 @@ class DamiaoMotors:
     def send(self, frame: Frame) -> None:
         """Send each its frame; answers that wait are too late, and dropped."""
         self._bus.clear()
-        commands = damiao.command_data(frame, self.ranges)
+        sent = self._mounting.frame_at_motors(frame)
+        commands = damiao.command_data(sent, self._at_motors)
         for each, data in zip(self._ids, commands, strict=True):
             self._bus.send(each, data)
 
@@ -196,10 +201,15 @@ class DamiaoMotors:
             if not missing:
                 break
         known = [joint for joint in range(len(self._ids)) if joint not in missing]
-        ranges = self.ranges
+        ranges = self._at_motors
         fields = ranges.position, ranges.velocity, ranges.torque
-        for values, codes, field in zip(self.state, self._codes, fields, strict=True):
-            values[known] = field.values(codes)[known]
+        states = [
+            field.values(codes)
+            for field, codes in zip(fields, self._codes, strict=True)
+        ]
+        self.state[:, known] = self._mounting.states_at_joints(np.array(states))[
+            :, known
+        ]
         return sorted(missing)
 
     def registers(self, register: Register) -> list[float]:

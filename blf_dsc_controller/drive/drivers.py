@@ -33,7 +33,8 @@ def driver_of(
     given = overrides or {}
     settings = load(path, DRIVE, DriveConfig, given.get(DRIVE))
     if address == SIMULATED:
-        made: type[Driver] = simulated(load(path, PLANT, PlantConfig, given.get(PLANT)))
+        plant = load(path, PLANT, PlantConfig, given.get(PLANT))
+        made: type[Driver] = simulated(plant, settings.feedback)
     else:
         made = find_driver(settings.driver)
     check_feedback(made, settings)

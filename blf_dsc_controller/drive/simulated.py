@@ -2,7 +2,8 @@
 """A simulated arm as a robot: the section `sim_plant` of the same file, no faster than real time.
 
 Its drives are braked until the first torque, and after the end.  It waits for each
-torque, so on a slow computer the arm is slow, and nothing is missed.
+torque, so on a slow computer the arm is slow, and nothing is missed.  With
+`drive.feedback: motor` its motors close a PD of their own (`sim_plant.motors`).
 """
 
 from __future__ import annotations
@@ -14,10 +15,16 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
+from blf_dsc_controller.configuration.controller import ControllerConfig
+from blf_dsc_controller.configuration.drive import DriveConfig
+from blf_dsc_controller.configuration.motor_options import limits_of
 from blf_dsc_controller.configuration.plant import PlantConfig
 from blf_dsc_controller.configuration.schema import change
 from blf_dsc_controller.drive.driver import Driver, Facts, ReflexError, RobotState
+from blf_dsc_controller.motors.damiao import ranges_of
+from blf_dsc_controller.motors.frame import Frame, Ranges, torque_alone
 from blf_dsc_controller.supervision.drive_load import DriveLoad
+from sim_plant.motors import MotorPlant
 from sim_plant.plant import Plant, plant_of, plant_settings
 
 Vector = NDArray[np.float64]
@@ -26,6 +33,7 @@ SIMULATED = 'simulated'
 
 _FIRST = 1.0  # s, stamp of the first state
 _BEHIND = 0.05  # s, which are caught up with; more are left behind
+_MOTORS = 2000.0  # Hz, of motors in real time, in Python
 
 
 class SimulatedDriver(Driver):
@@ -35,7 +43,7 @@ class SimulatedDriver(Driver):
 
     def connect(self) -> Sequence[str]:
         """Build the arm, at rest in its initial position."""
-        self.plant: Plant = plant_of(self.plant_config)
+        self._build(self.plant_config)
         self.plant.compile()
         self._torque = np.zeros(self.facts.joints)
         self._is_braked = True
@@ -48,9 +56,20 @@ class SimulatedDriver(Driver):
         self._load_in_force = self._load
         return ['the arm is simulated: no robot moves']
 
+    def _build(self, config: PlantConfig) -> None:
+        self.plant: Plant = plant_of(config)
+        self._built = config
+
+    def _measure(self) -> Vector:
+        measured = np.array(self.plant.measure())
+        return np.asarray(np.reshape(measured, (3, self.facts.joints)))
+
+    def _advance(self) -> None:
+        self.plant.step(self._torque)
+
     def positions(self) -> Vector:
         """Return the measured positions (n,) [rad]."""
-        return np.array(self.plant.measure()[: self.facts.joints])
+        return np.asarray(self._measure()[0])
 
     def start(self) -> None:
         """Begin to wait for torques."""
@@ -68,9 +87,7 @@ class SimulatedDriver(Driver):
                 f'({self.plant_config.actuator.reflex_rate:g} N m/s)'
             )
         self._count += 1
-        n = self.facts.joints
-        q, dq, effort = np.array(self.plant.measure()).reshape(3, n)
-        return RobotState(_FIRST + self._count * period, q, dq, effort)
+        return RobotState(_FIRST + self._count * period, *self._measure())
 
     def write(self, torque: Vector | None) -> None:
         """Apply torques (n,) [N m] until the next state; None: those before."""
@@ -81,7 +98,7 @@ class SimulatedDriver(Driver):
             return
         if self._load != self._load_in_force:
             self._put_into_force(self._load)
-        self.plant.step(self._torque)
+        self._advance()
 
     def tell_load(self, load: DriveLoad) -> None:
         """Let the drives add the weight of a load from the next state on."""
@@ -101,7 +118,7 @@ class SimulatedDriver(Driver):
             'initial.position': self.positions().tolist(),
             'initial.velocity': [0.0] * self.facts.joints,
         }
-        self.plant = plant_of(change(self.plant_config, here))
+        self._build(change(self.plant_config, here))
         self._torque[:] = 0.0
         self._is_braked = True
 
@@ -110,12 +127,59 @@ class SimulatedDriver(Driver):
             'robot.drive_payload': load.mass,
             'robot.drive_payload_centre': list(load.centre),
         }
-        self.plant.change(plant_settings(change(self.plant_config, given)))
+        self.plant.change(plant_settings(change(self._built, given)))
         self._load_in_force = load
 
 
-def simulated(plant: PlantConfig) -> type[SimulatedDriver]:
-    """Return the driver of a configured plant."""
+class SimulatedMotorsDriver(SimulatedDriver):
+    """A simulated arm whose motors close a PD of their own, from frames."""
+
+    has_feedback = True
+
+    def __init__(
+        self, address: str, controller: ControllerConfig, config: DriveConfig
+    ) -> None:
+        """Note what the frames of the motors hold.
+
+        Raises:
+            BlfDscError: `drive.motor_models` does not say it.
+        """
+        super().__init__(address, controller, config)
+        plant = self.plant_config
+        self.latency = plant.actuator.delay * plant.sample_time
+        self._ranges = ranges_of(limits_of(config, self.facts.joints))
+
+    @property
+    def ranges(self) -> Ranges:
+        """What a frame to the motors can carry."""
+        return self._ranges
+
+    def write(self, torque: Vector | None) -> None:
+        """Send torques (n,) [N m] without a PD; None: let the motors go on as they are."""
+        if torque is not None:
+            self._frame = torque_alone(torque)
+        super().write(torque)
+
+    def write_frame(self, frame: Frame) -> None:
+        """Send a frame to each motor."""
+        self._frame = frame
+        super().write(frame.torque)
+
+    def _build(self, config: PlantConfig) -> None:
+        self._motors = MotorPlant(config, self._ranges, _MOTORS)
+        self.plant = self._motors.plant
+        self._built = self._motors.config
+        self._frame = torque_alone(np.zeros(self.facts.joints))
+
+    def _measure(self) -> Vector:
+        return self._motors.measure()
+
+    def _advance(self) -> None:
+        self._motors.step(self._frame)
+
+
+def simulated(plant: PlantConfig, feedback: str = 'host') -> type[SimulatedDriver]:
+    """Return the driver of a configured plant; `feedback` is `drive.feedback`."""
     n = len(plant.joints)
     limits = [limit or np.inf for limit in plant.actuator.torque_limit]
     told = Facts(
@@ -128,10 +192,5 @@ def simulated(plant: PlantConfig) -> type[SimulatedDriver]:
         load_in_motion=True,
     )
 
-    class Simulated(SimulatedDriver):
-        """The driver of one configured plant."""
-
-        facts = told
-        plant_config = plant
-
-    return Simulated
+    kind = SimulatedMotorsDriver if feedback == 'motor' else SimulatedDriver
+    return type('Simulated', (kind,), {'facts': told, 'plant_config': plant})

@@ -98,8 +98,6 @@ MODELS = {
 """As delivered, by model; the registers of a motor may have others."""
 ENCODER = 4.3e-5
 """Resolution [rad] of a motor's own encoder at its joint: 14 bits, over a gear of 9."""
-OPENARM = ('8009', '8009', '4340', '4340', '4310', '4310', '4310')
-"""Models of the joints of an OpenArm."""
 
 
 def ranges_of(motors: Sequence[Limits]) -> Ranges:
