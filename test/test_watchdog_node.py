@@ -30,6 +30,7 @@ from blf_dsc_controller.messages.codecs import (
     JointStateEncoder,
 )
 from blf_dsc_controller.messages.journal import EventType, Journal
+from blf_dsc_controller.nodes import watchdog_node
 from blf_dsc_controller.nodes.controller_node import ControllerNode
 from blf_dsc_controller.nodes.endpoints import RawSubscriptions
 from blf_dsc_controller.nodes.plant_node import PlantNode
@@ -288,6 +289,18 @@ def test_watchdog_acts_by_what_the_drives_of_a_restarted_controller_compensate(r
     loop.restart(right)
     loop.go_on(0.005, commands=True)
     np.testing.assert_allclose(loop.torque(), 0.0, atol=0.1)
+
+
+def test_a_controller_that_is_started_again_as_it_was_costs_no_time(ros, monkeypatch):
+    """A new configuration takes tenths of a second, in which the watchdog would be blind."""
+    config = build(ControllerConfig, HOLDING)
+    loop = ByHand(ros, config)
+    loop.go_on(0.05, commands=True)
+    monkeypatch.setattr(watchdog_node, 'build', None)
+    loop.restart(config)
+    loop.go_on(0.01, commands=True)
+    assert loop.watchdog.config == config
+    assert not loop.node.problem
 
 
 def test_configuration_of_a_restarted_controller_replaces_the_one_before(ros):

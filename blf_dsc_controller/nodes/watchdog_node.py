@@ -140,7 +140,8 @@ class WatchdogNode(PlainNode):
     def _adopt_parameters(self) -> None:
         """Watch a controller of the parameters that the journal has."""
         given = self._journal.parameters
-        if given is self._given:
+        is_known = given is self._given or given == self._given
+        if is_known and not self.problem:  # also of a controller that was started again
             return
         try:
             config = build(ControllerConfig, without_files(given), self._controller)
