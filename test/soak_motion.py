@@ -8,7 +8,8 @@ while the computer lets a controller wait that should answer: what is looked for
 consequences of an event, not those of a computer that is too slow for the loop.
 
 A controller that hangs and goes on finds one of the states of the meantime in its queue, and then
-the newest, while the watchdog has braked the arm.
+the newest, while the watchdog has braked the arm.  It also hangs right after it was started again,
+before it has learned what the watchdog held.
 """
 
 from __future__ import annotations
@@ -126,13 +127,26 @@ class Episodes:
 
     def kill_controller(self):
         """Start it again while the watchdog brings the arm to rest."""
+        self._kill_controller()
+        self._run(self.rng.uniform(0.0, 0.5))
+        self.start_controller()
+
+    def hang_at_start(self):
+        """Start it again, and let it hang as soon as it is in command."""
+        self._kill_controller()
+        self.state.clear()
+        self.start_controller()
+        self.ros.until(
+            lambda: self.state and self.state[-1].message.startswith('approaching')
+        )
+        self.hang_controller()
+
+    def _kill_controller(self):
         self.is_interrupted = True
         self.controller.kill()
         self.controller.wait()
         self.ros.until(lambda: self.watchdog.watchdog.active)
         self.is_interrupted = False
-        self._run(self.rng.uniform(0.0, 0.5))
-        self.start_controller()
 
     def hang_controller(self):
         self.is_interrupted = True
@@ -195,7 +209,14 @@ class Episodes:
         return float((np.max(self.speeds, axis=0) - most).max())
 
 
-NAMES = ('reset', 'pause', 'kill_controller', 'hang_controller', 'kill_watchdog')
+NAMES = (
+    'reset',
+    'pause',
+    'kill_controller',
+    'hang_controller',
+    'hang_at_start',
+    'kill_watchdog',
+)
 
 
 def soak(preset, episodes, seed):
