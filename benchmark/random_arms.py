@@ -468,6 +468,26 @@ def stops(kept: Kept) -> Iterator[list[str]]:
         yield [name, drawn, *counts, common]
 
 
+def failures(kept: Kept) -> Iterator[list[str]]:
+    """Compute the rows of plausible arms on which this law does not hold."""
+    for key, result in sorted(kept.results.items()):
+        stock = kept.results.get(key._replace(law=STOCK))
+        if key.law != THIS or result.holds or stock is None or not stock.holds:
+            continue
+        plant = arm_of(study_of(key.robot, key.draw), key.number)
+        when = (
+            'softened' if np.isnan(result.stopped) else f'stop, {result.stopped:.2f} s'
+        )
+        yield [
+            key.robot,
+            f'{key.draw}, {key.number}',
+            plant.sensor.side,
+            'yes' if plant.actuator.loop_gain else 'no',
+            when,
+            result.text.partition(': ')[0],
+        ]
+
+
 def _kind(text: str) -> str:
     """Return a message without its numbers and joints."""
     return ' '.join(
@@ -541,6 +561,7 @@ HEADS = {
         'left after 1 s [rad/s]',
         'why',
     ),
+    'failures': ('robot', 'arm', 'encoders', 'torque loop', 'this law', 'why'),
 }
 
 
@@ -560,8 +581,9 @@ def main() -> None:
         return
     kept = Kept(given.keep)
     print_table(HEADS['arms'], arms(given.runs, given.robots, given.draws, kept))
-    print()
-    print_table(HEADS['stops'], stops(kept))
+    for name, rows in (('stops', stops), ('failures', failures)):
+        print()
+        print_table(HEADS[name], rows(kept))
 
 
 if __name__ == '__main__':

@@ -12,7 +12,7 @@ import pytest
 
 from blf_dsc_controller.arms.linear_loop import Timing, law_response
 from blf_dsc_controller.configuration.schema import change
-from blf_dsc_controller.law.factory import begin, controller_of
+from blf_dsc_controller.law.factory import controller_of
 from blf_dsc_controller.supervision.model_torque import model_torque
 
 BENCHMARK = Path(__file__).parents[1] / 'benchmark'
@@ -112,24 +112,23 @@ def test_linear_pid_is_one(study):
     np.testing.assert_allclose(found, expected, rtol=0.02)
 
 
-def test_stock_gains_are_a_pd_over_gravity(study):
-    own = study.study_of('panda')
-    config = study.law_of(own.controller, 'panda', study.STOCK)
-    controller = controller_of(config)
-    n = len(config.joints)
-    q, dq, _ = controller.reference_at(0.0)
-    q, dq = q + 0.01, dq - 0.02
-    config = change(config, {'approach.enabled': False})
-    begin(controller, config, q, dq)
-    tau = controller.update(
-        0.0, config.sample_time, np.concatenate((q, dq, np.zeros(n)))
-    )
-    qr, dqr, _ = controller.reference_at(0.0)
-    settings = controller.settings
-    expected = model_torque(settings, settings.initial_estimate, q)
-    expected = expected - np.array(study.ROBOTS['panda'].stiffness) * (q - qr)
-    expected = expected - np.array(study.ROBOTS['panda'].damping) * (dq - dqr)
-    np.testing.assert_allclose(tau, expected, atol=1e-9)
+def test_joint_pd_is_a_pd_over_gravity_with_the_published_gains(study):
+    robot = study.ROBOTS['panda']
+    own = study.study_of('panda').controller
+    config = study.law_of(own, 'panda', study.STOCK)
+    assert config.barrier.weight == robot.stiffness
+    assert config.feedback.gain == robot.damping
+    controller = controller_of(own)
+    settings, signals = controller.settings, controller.signals
+    rng = np.random.default_rng(1)
+    for each in (signals.q, signals.dq, signals.qr, signals.dqr, signals.xi1):
+        each[:] = rng.uniform(-0.5, 0.5, settings.n)
+    law = importlib.import_module('joint_pd').LAW(scale=2.0)
+    law.compute_demand(settings, controller.state, signals, 0.0, 1e-3)
+    expected = model_torque(settings, settings.initial_estimate, signals.q)
+    expected -= 2.0 * settings.barrier.weight * signals.xi1
+    expected -= 2.0 * settings.feedback.gain * (signals.dq - signals.dqr)
+    np.testing.assert_allclose(signals.demand, expected, atol=1e-9)
 
 
 def test_what_shakes_is_told_from_motion(study):
