@@ -88,6 +88,7 @@ FREE = 0.3  # rad, a bound that no law leaves unless it shakes
 JOINT_PD = str(Path(__file__).with_name('joint_pd.py').resolve())
 THIS, STOCK, PD, CT = 'this law', 'stock PD', 'PD', 'computed torque'
 LAWS = (THIS, STOCK, PD, CT)
+BLIND = 'this law without its load observer'
 
 
 class Robot(NamedTuple):
@@ -279,6 +280,8 @@ def law_of(config: ControllerConfig, name: str, law: str) -> ControllerConfig:
     """Return the configuration of a controller with a law."""
     if law == THIS:
         return config
+    if law == BLIND:
+        return change(config, {'disturbance.observer_bandwidth': 0.0})
     robot = ROBOTS[name]
     n = len(config.joints)
     changes: dict[str, object] = {
@@ -351,7 +354,8 @@ def result_of(record: Record, T: float, bound: np.ndarray) -> Result:
     torque = sample_columns(record.samples, settings).torque
     shaking = shaken(torque[running & (t >= BEGIN)] / settings.torque.limit, T)
     speed = np.abs(record.truths[:, -n:]).max(axis=1)
-    after, late = t >= end, t >= end + AT_REST
+    alone = (t < PICK_UP) | (end >= PICK_UP)  # a load moves an arm that has stopped
+    after, late = (t >= end) & alone, (t >= end + AT_REST) & alone
     return Result(
         stopped=end if stop else np.nan,
         text=texts[0] if texts else '',
@@ -474,18 +478,27 @@ def failures(kept: Kept) -> Iterator[list[str]]:
         stock = kept.results.get(key._replace(law=STOCK))
         if key.law != THIS or result.holds or stock is None or not stock.holds:
             continue
-        plant = arm_of(study_of(key.robot, key.draw), key.number)
-        when = (
-            'softened' if np.isnan(result.stopped) else f'stop, {result.stopped:.2f} s'
-        )
+        study = study_of(key.robot, key.draw)
+        plant = arm_of(study, key.number)
+        blind = '-'
+        if study.controller.disturbance.observer_bandwidth > 0.0:
+            blind = _briefly(kept.of(key._replace(law=BLIND), study))
         yield [
             key.robot,
             f'{key.draw}, {key.number}',
             plant.sensor.side,
             'yes' if plant.actuator.loop_gain else 'no',
-            when,
+            _briefly(result),
             result.text.partition(': ')[0],
+            blind,
         ]
+
+
+def _briefly(result: Result) -> str:
+    """Return what becomes of an arm, in a few words."""
+    if not np.isnan(result.stopped):
+        return f'stops at {result.stopped:.2f} s'
+    return 'oscillates' if result.oscillates else 'holds'
 
 
 def _kind(text: str) -> str:
@@ -519,11 +532,12 @@ def _cell(loop: LoopConfig, name: str, law: str, factor: float) -> str:
     plant = change(loop.plant, {'truth.rotor_inertia': inertia.tolist()})
     controller = law_of(loop.controller, name, law)
     found = run(controller, plant, np.array(loop.controller.barrier.bound))
+    text = found.text.partition(': ')[0]
     if not np.isnan(found.stopped):
-        return f'{found.stopped:.2f} s: {found.text}'
+        return f'{_briefly(found)}: {text}'
     spans = found.motion, found.pick_up, found.settled
     errors = ', '.join(f'{1e3 * each:.2g}' for each in spans)
-    return f'{errors}{"; " + found.text if found.text else ""}'
+    return f'{errors}; {text}' if text else errors
 
 
 def margins() -> Iterator[list[str]]:
@@ -561,7 +575,7 @@ HEADS = {
         'left after 1 s [rad/s]',
         'why',
     ),
-    'failures': ('robot', 'arm', 'encoders', 'torque loop', 'this law', 'why'),
+    'failures': ('robot', 'arm', 'encoders', 'torque loop', 'this law', 'why', BLIND),
 }
 
 
