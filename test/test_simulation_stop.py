@@ -146,3 +146,22 @@ def test_panda_rests_with_a_load_that_it_was_stopped_by():
     q, dq, _ = record.measurements[row:].reshape(-1, 3, 7).swapaxes(0, 1)
     assert np.abs(q - q[0]).max() < 0.15
     assert np.abs(dq[2000:]).max() < 0.02
+
+
+def test_a_run_may_end_early_after_a_stop():
+    """It ends with the chunk of 1000 samples in which 0.2 s have passed; its rows are the same."""
+    given = CASES['error past the bound']
+    whole = run(given)
+    early = simulate(
+        whole.config, build(PlantConfig, {'duration': 2.5} | NOISY), after_stop=0.2
+    )
+    assert (
+        early.stopped
+        == whole.stopped
+        == pytest.approx(1e-9 * whole.run().stops[0].stamp)
+    )
+    size = early.stamps.size
+    assert early.stopped + 0.2 <= 1e-9 * early.stamps[-1] < early.stopped + 1.3
+    assert size < whole.stamps.size
+    np.testing.assert_array_equal(early.truths, whole.truths[:size])
+    assert run(SATURATED).stopped == np.inf

@@ -11,6 +11,7 @@ import pytest
 
 from blf_dsc_controller.bags.reader import read_run
 from blf_dsc_controller.configuration.nodes import CONTROLLER, PLANT, load_loop
+from blf_dsc_controller.configuration.schema import change
 from blf_dsc_controller.law.factory import controller_of
 from blf_dsc_controller.law.torque import RATE_CUT
 from blf_dsc_controller.replay.verify import verify
@@ -172,6 +173,28 @@ def test_arm_that_shakes_stops_calmly_and_says_what_it_did(arm, reaction):
     before = largest[first : run.stop + 1].max()
     assert largest[run.stop + 1 :].max() < 1.7 * before + 0.02
     assert largest[run.stop + round(1.0 / run.period) :].max() < 0.15
+
+
+def test_stop_of_a_softened_arm_names_the_oscillation_before_it():
+    """A push of 60 N takes the softened Panda past its bound, 0.8 s after it was calmed."""
+    push = {
+        'events.begin': [1.0],  # s
+        'events.duration': [0.5],
+        'events.force': [0.0, 0.0, -60.0],
+    }
+    law = {'barrier.bound': [0.01] * 7, 'safety.oscillation': 'soften'}
+    loop = loop_of('panda', 3e4, seconds=1.5, **push)
+    loop = loop._replace(controller=change(loop.controller, law))
+    run = simulate(loop.controller, loop.plant, after_stop=0.0).run()
+    found = run.oscillations[-1]
+    (stop,) = run.stops
+    assert stop.reason == 'error past the bound'
+    assert stop.stamp > found.stamp + 0.5e9  # ns
+    said = found.text.partition(':')[0].replace('oscillates', 'has oscillated')
+    softened_to = f'the feedback has been softened to {found.share:g} of its rates'
+    assert stop.text.startswith(f'{said}, so that {softened_to}: ')
+    assert f'give a feedback.stiffness of {found.share:g}, and a wider' in stop.text
+    assert 'past its bound of 0.01 rad' in stop.text
 
 
 def test_arm_that_stops_in_want_of_torque_is_said_to_be_at_its_limit():

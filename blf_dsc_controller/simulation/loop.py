@@ -9,6 +9,7 @@ and so is everything after a stop.
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import closing
@@ -58,11 +59,12 @@ def simulate(
     plant_config: PlantConfig,
     *,
     supervised: bool = True,
+    after_stop: float = math.inf,
 ) -> Record:
     """Run controller and plant in closed loop for `duration` and return every sample.
 
     The plant's duration must not be 0.  If not `supervised`, the law runs alone, past
-    its limits too.
+    its limits too.  A run whose law has been stopped for `after_stop` [s] may end early.
 
     Raises StartError if the law cannot take over and approach.enabled is false, and
     MotionError if there is no approach within the limits.
@@ -74,9 +76,12 @@ def simulate(
         record = new_record(
             guard.controller, controller_config, plant_config, guard.journal
         )
-        for _ in _run_supervised(guard, plant, record.rows, record.stamps.size):
-            pass
-        return record
+        size = 0
+        for part in _run_supervised(guard, plant, record.rows, record.stamps.size):
+            size += part.stamps.size
+            if 1e-9 * record.stamps[size - 1] >= record.stopped + after_stop:
+                break
+        return record.rows(range(size))
     journal = Journal()
     record = new_record(
         controller_of(controller_config), controller_config, plant_config, journal
@@ -203,6 +208,13 @@ class Record:
     config: ControllerConfig
     controller: Controller  # after the run
     journal: Journal  # events of the run, their stamps from `START` on
+
+    @property
+    def stopped(self) -> float:
+        """When the law was stopped first [s], since the start; infinity: not yet."""
+        stops = (e.stamp for e in self.journal.pending if e.type is EventType.STOP)
+        first = next(stops, None)
+        return math.inf if first is None else 1e-9 * (first - START)
 
     def rows_to_fill(self) -> Rows:
         """Return the matrices with a row for each sample."""

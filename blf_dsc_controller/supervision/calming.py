@@ -36,8 +36,16 @@ class Shaking(NamedTuple):
     @property
     def text(self) -> str:
         """A sentence with the numbers, without its end."""
+        return self._with('oscillates')
+
+    @property
+    def past(self) -> str:
+        """The same of an oscillation that is over."""
+        return self._with('has oscillated')
+
+    def _with(self, verb: str) -> str:
         return (
-            f'joint {self.joint!r} oscillates at {self.frequency:.2g} Hz with '
+            f'joint {self.joint!r} {verb} at {self.frequency:.2g} Hz with '
             f'+-{self.torque:.2g} N m'
         )
 
@@ -153,6 +161,20 @@ class Calming:
         if found is None:
             return ''
         return f'{found.text}: {self._remedy}'
+
+    @property
+    def softness(self) -> str:
+        """Why the feedback is softer than configured, and the remedy; empty if it is not."""
+        if self.last is None or self.share == 1.0:
+            return ''
+        softer = 'lower surface.mu, surface.gain and feedback.gain'
+        if self._config.model == 'urdf':
+            stiffness = self.share * self._config.feedback.stiffness
+            softer = f'give a feedback.stiffness of {stiffness:.2g}'
+        return (
+            f'{self.last.past}, so that the feedback has been softened to {self.share:g} of its '
+            f'rates: {softer}, and a wider bound'
+        )
 
     @property
     def _remedy(self) -> str:

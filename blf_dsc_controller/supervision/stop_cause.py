@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """What an arm that leaves its bound, or seems unmoved by its commands, suffers from.
 
-An oscillation, a torque that only repeats the noise of a sensor, or a torque at its
-limit: whichever it is, its remedy is another than that of the check which stops the arm.
+An oscillation, a torque that only repeats the noise of a sensor, a torque at its limit,
+or feedback that has been softened: whichever it is, its remedy is another than that of
+the check which stops the arm.
 """
 
 from __future__ import annotations
@@ -73,7 +74,8 @@ class StopCause:
 
         A torque has been at its limit for `saturated_time` [s].
         """
-        return self.shaking or self.saturation(saturated_time)
+        softness = self._calming.softness
+        return self.shaking or self.saturation(saturated_time) or softness
 
     def saturation(self, time: float) -> str:
         """Return which joint has lacked torque for long, `time` [s]; empty if none has."""
