@@ -44,7 +44,6 @@ from pathlib import Path
 from typing import NamedTuple
 
 import elastic
-import motor_feedback
 import numpy as np
 from harness import print_table
 
@@ -101,7 +100,10 @@ class Robot(NamedTuple):
     gears: tuple[float, float]  # N m/rad, of the wide draw
 
 
-_LEROBOT = tuple(motor_feedback.STIFFNESS), tuple(motor_feedback.DAMPING)
+_LEROBOT = (  # config_openarm_follower.py of 27de2ca
+    (240.0, 240.0, 240.0, 240.0, 24.0, 31.0, 25.0),
+    (5.0, 5.0, 3.0, 5.0, 0.3, 0.3, 0.3),
+)
 ROBOTS = {
     'panda': Robot('panda', 'monte_carlo_elastic_panda', *elastic.FRANKA, (5e3, 1e5)),
     'fr3': Robot('fr3_direct', 'monte_carlo_elastic_fr3', *elastic.FRANKA, (5e3, 1e5)),
