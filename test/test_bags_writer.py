@@ -14,6 +14,7 @@ from threading import Event
 
 import pytest
 import yaml
+import zstandard
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from mcap.opcode import Opcode
@@ -432,6 +433,21 @@ def test_recording_that_was_not_closed_is_reported_and_keeps_its_topics(
         for found, original in zip(reader.connections, before.connections, strict=True):
             assert (found.topic, found.digest) == (original.topic, original.digest)
             assert found.ext.offered_qos_profiles == original.ext.offered_qos_profiles
+
+
+def test_compressed_messages_that_cannot_be_unpacked_are_losses(tmp_path):
+    """A recorder may compress each message by itself; one of three is cut off here."""
+    with BagWriter(tmp_path / 'bag', flush_interval=None) as bag:
+        handle = bag.add_topic(JOINT_STATES.resolved, JOINT_STATES.type, [STREAM])
+        for k in range(3):
+            packed = zstandard.compress(message(k))
+            bag.write(handle, packed[:-3] if k == 1 else packed, k)
+    saved = recover(tmp_path / 'bag', tmp_path / 'clean')
+    loss = 'bag_0.mcap: 1 compressed messages that cannot be unpacked'
+    assert saved.losses == [loss]
+    with open_bag(tmp_path / 'clean') as opened:
+        raws = [each.raw for each in opened.messages({JOINT_STATES.resolved})]
+    assert raws == [message(0), message(2)]
 
 
 def test_recovery_keeps_the_numbers_of_the_publishers(plain, tmp_path):

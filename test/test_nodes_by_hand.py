@@ -85,6 +85,18 @@ def test_safe_torque_is_repeated_when_the_arm_falls_silent(ros, monkeypatch):
     np.testing.assert_array_equal(torques(arm.commands)[-1], ZERO)
 
 
+def test_state_is_reported_when_it_changes_not_with_each_torque(ros):
+    node = ros.add(ControllerNode)
+    arm = Arm(ros)
+    for k in range(3):
+        arm.torque_for(k, START)
+        assert not node._status.has_news(node.guard)
+    node.guard.supervisor.add('of the test')
+    assert node._status.has_news(node.guard)
+    arm.torque_for(3, START)
+    assert not node._status.has_news(node.guard)
+
+
 @pytest.mark.parametrize('where', ['in the law', 'in another callback'])
 def test_unexpected_error_is_answered_with_the_safe_torque_at_once(ros, where):
     """No other state comes, and a driver would hold the last torque."""
