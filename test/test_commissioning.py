@@ -127,6 +127,18 @@ def test_lines_belong_to_one_joint_each_and_are_known_from_the_configuration():
     assert np.ptp(made.bins, axis=0).max() == 1
 
 
+def test_speed_of_a_motion_is_the_largest_in_either_direction():
+    """Of this one, the first joint is fastest backwards."""
+    made = excitation(CONFIG, POSTURE, 0.03, 1e-3)
+    rates = 2.0 * np.pi / made.period * np.column_stack((made.bins, made.slow))
+    times = np.linspace(0.0, made.period, 20_000)[:, None, None]
+    tones = -made.amplitude * rates * np.sin(rates * times + made.phase)
+    dq = tones.sum(axis=2)
+    assert dq[:, 0].max() < -0.95 * dq[:, 0].min()
+    # `speed` is that of differences of samples
+    np.testing.assert_allclose(made.speed, np.abs(dq).max(axis=0), rtol=0.02)
+
+
 @pytest.mark.parametrize('lines', [1, 2])
 def test_a_motion_has_at_least_two_lines_of_a_joint_beside_its_swings(lines):
     """Those of a swing are two, and a response at one frequency alone shows no arm."""
@@ -138,7 +150,7 @@ def test_a_motion_has_at_least_two_lines_of_a_joint_beside_its_swings(lines):
             'reference.type': 'sinusoids',
             'reference.frequency': rates,
             'reference.amplitude': [0.0] * (len(CONFIG.joints) * len(rates)),
-            'reference.phase': [0.0] * (len(CONFIG.joints) * len(rates)),
+            'reference.phase': [0.0] * len(rates),
         },
     )
     if lines == 2:
