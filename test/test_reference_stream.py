@@ -116,7 +116,10 @@ def test_burst_of_losses_is_no_slower_sender():
 
 def test_stream_begins_anew_at_rest_after_a_pause():
     stream = TargetStream()
+    assert stream.last(0.0, TIMEOUT) is None
     receive(stream, 0.01 * np.arange(100))
+    np.testing.assert_array_equal(stream.last(1.9, TIMEOUT), SLOPE * 0.99)
+    assert stream.last(2.1, TIMEOUT) is None
     target = receive(stream, [2.1])[0]
     assert (stream.interval, target.due) == (0.0, 2.1)
     assert target.velocities == (0.0, 0.0)
