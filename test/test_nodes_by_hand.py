@@ -188,6 +188,12 @@ def test_start_outside_the_bound_is_reported_with_joint_error_and_bound(ros):
             '; to use it anyway, start the node with it',
         ),
         (
+            'barrier.bound',
+            [1e-6, 0.002],
+            'barrier.bound: joint1 is ',
+            '',
+        ),
+        (
             'sample_time',
             0.002,
             'sample_time is fixed at the start: arm and law are built',
