@@ -17,7 +17,16 @@ from random_arm import random_urdf
 from rcl_interfaces.srv import SetParameters, SetParametersAtomically
 from rclpy.parameter import Parameter
 from rclpy.timer import Timer
-from ros_rig import JOINTS, PATIENCE, START, FakeClock, states, torques
+from ros_rig import (
+    JOINTS,
+    PATIENCE,
+    START,
+    FakeClock,
+    cleanup,
+    deactivate,
+    states,
+    torques,
+)
 
 from blf_dsc_controller.configuration import schema
 from blf_dsc_controller.configuration.controller import ControllerConfig
@@ -95,6 +104,18 @@ def test_state_is_reported_when_it_changes_not_with_each_torque(ros):
     assert node._status.has_news(node.guard)
     arm.torque_for(3, START)
     assert not node._status.has_news(node.guard)
+
+
+def test_cleanup_commands_the_torque_that_a_driver_may_hold(ros):
+    """In a ramp, whose last torque would else be held for as long as the node waits."""
+    node = ros.add(ControllerNode, {'safety.deactivation_ramp': 10.0})
+    arm = Arm(ros)
+    arm.torque_for(0, START)
+    assert deactivate(ros, node)
+    assert np.abs(arm.torque_for(1, START)).min() > 1.0
+    assert cleanup(ros, node)
+    ros.until(lambda: len(arm.commands) == 3)
+    assert not torques(arm.commands)[-1].any()
 
 
 @pytest.mark.parametrize('where', ['in the law', 'in another callback'])
