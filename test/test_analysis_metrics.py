@@ -332,6 +332,30 @@ def test_parameter_error_is_the_torque_error_along_the_reference():
     assert off == pytest.approx(expected, rel=0.01)
 
 
+def test_derivatives_of_the_reference_are_those_at_uneven_times():
+    """Three points at any distances show a parabola exactly; every third sample is left out."""
+    calls = []
+
+    def record(q, dq, _v, a):
+        calls.append((q[:, 0], dq[:, 0], a[:, 0]))
+        return pendulum(q, dq, _v, a)
+
+    run = run_of(P, regressor=record)
+    kept = np.arange(TIME.size) % 3 != 0
+    parabola = (TIME**2)[:, np.newaxis]
+    some = {
+        name: getattr(run, name)[kept]
+        for name in (
+            *('stamp', 'received', 'position', 'velocity', 'torque'),
+            *('error', 'bound', 'torque_limit'),
+        )
+    }
+    estimates_of(replace(run, reference=parabola[kept], **some))
+    ((q, dq, a),) = calls
+    np.testing.assert_allclose(dq, 2.0 * np.sqrt(q), atol=1e-8)
+    np.testing.assert_allclose(a, 2.0, atol=1e-6)
+
+
 def test_regressor_is_evaluated_along_the_reference():
     calls = []
 

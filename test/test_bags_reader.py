@@ -383,6 +383,30 @@ def test_stated_sizes_of_compressed_data_are_not_believed(compression):
     assert peak < 1_000_000
 
 
+def streamed(data):
+    """Compress without stating the size, as a pipe does."""
+    frame = zstandard.ZstdCompressor().compressobj()
+    return frame.compress(data) + frame.flush()
+
+
+@pytest.mark.parametrize(
+    ('compression', 'pack'),
+    [
+        ('zstd', zstandard.compress),
+        ('zstd', streamed),
+        ('lz4', lz4.frame.compress),
+    ],
+)
+def test_compressed_data_that_are_cut_off_are_an_error(compression, pack):
+    """What is left of them unpacks to their beginning."""
+    data = bytes(range(256)) * 1000
+    raw = pack(data)
+    assert unpacked(raw, compression) == data
+    for size in (len(raw) - 1, len(raw) - 8, len(raw) // 2):
+        with pytest.raises(ValueError, match='cut off'):
+            unpacked(raw[:size], compression)
+
+
 def test_gaps_in_sequence_numbers_are_losses():
     """Each publisher has its own numbers."""
     messages = TopicMessages('/x', JOINT_STATES.type)

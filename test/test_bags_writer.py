@@ -14,6 +14,7 @@ from threading import Event
 
 import pytest
 import yaml
+import zstandard
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from mcap.opcode import Opcode
@@ -432,6 +433,26 @@ def test_recording_that_was_not_closed_is_reported_and_keeps_its_topics(
         for found, original in zip(reader.connections, before.connections, strict=True):
             assert (found.topic, found.digest) == (original.topic, original.digest)
             assert found.ext.offered_qos_profiles == original.ext.offered_qos_profiles
+
+
+def test_compressed_messages_that_cannot_be_unpacked_are_losses(tmp_path, capsys):
+    """A recorder may compress each message by itself; some are cut off here.
+
+    All of one topic are, which is no loss of everything.
+    """
+    whole = zstandard.compress(message(0))
+    with BagWriter(tmp_path / 'bag', flush_interval=None) as bag:
+        first, second = (bag.add_topic(f, JOINT_STATES.type, [STREAM]) for f in 'ab')
+        for k, packed in enumerate((whole, whole[:-3], whole)):
+            bag.write(first, packed, k)
+        bag.write(second, whole[:-3], 3)
+    out = tmp_path / 'clean'
+    assert main(['recover', str(tmp_path / 'bag'), '--out', str(out)]) == 0
+    output = capsys.readouterr().out
+    loss = 'LOST bag_0.mcap: 2 compressed messages that cannot be unpacked'
+    assert output.splitlines()[:-1] == ['a: 2 messages', 'b: 0 messages', loss]
+    with open_bag(out) as opened:
+        assert [each.raw for each in opened.messages({'a'})] == 2 * [message(0)]
 
 
 def test_recovery_keeps_the_numbers_of_the_publishers(plain, tmp_path):

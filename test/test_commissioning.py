@@ -127,6 +127,39 @@ def test_lines_belong_to_one_joint_each_and_are_known_from_the_configuration():
     assert np.ptp(made.bins, axis=0).max() == 1
 
 
+def test_speed_of_a_motion_is_the_largest_in_either_direction():
+    """Of this one, the first joint is fastest backwards."""
+    made = excitation(CONFIG, POSTURE, 0.03, 1e-3)
+    rates = 2.0 * np.pi / made.period * np.column_stack((made.bins, made.slow))
+    times = np.linspace(0.0, made.period, 20_000)[:, None, None]
+    tones = -made.amplitude * rates * np.sin(rates * times + made.phase)
+    dq = tones.sum(axis=2)
+    assert dq[:, 0].max() < -0.95 * dq[:, 0].min()
+    # `speed` is that of differences of samples
+    np.testing.assert_allclose(made.speed, np.abs(dq).max(axis=0), rtol=0.02)
+
+
+@pytest.mark.parametrize('lines', [1, 2])
+def test_a_motion_has_at_least_two_lines_of_a_joint_beside_its_swings(lines):
+    """Those of a swing are two, and a response at one frequency alone shows no arm."""
+    count = len(CONFIG.joints) * (lines + 2)
+    rates = (1.0, *(10.0 + k for k in range(count)))
+    config = change(
+        CONFIG,
+        {
+            'reference.type': 'sinusoids',
+            'reference.frequency': rates,
+            'reference.amplitude': [0.0] * (len(CONFIG.joints) * len(rates)),
+            'reference.phase': [0.0] * len(rates),
+        },
+    )
+    if lines == 2:
+        assert lines_in(config).bins.tolist() == [[10, 11], [14, 15]]
+        return
+    with pytest.raises(BlfDscError, match='not the motion of a commissioning'):
+        lines_in(config)
+
+
 def test_law_of_position_and_velocity_is_the_law():
     """With the velocity that the law takes from positions."""
     inertia = np.array([1.5, 0.4])
@@ -235,6 +268,9 @@ def test_what_is_no_commissioning_is_refused():
     run, config = simulated.measured(planned(), ARM)
     with pytest.raises(BlfDscError, match='not the motion of a commissioning'):
         commissioned(CONFIG, [(run, CONFIG)])
+    reversed_ = replace(run, joints=run.joints[::-1])
+    with pytest.raises(BlfDscError, match='run is of the joints joint2, joint1, the'):
+        commissioned(CONFIG, [(reversed_, config)])
     short = replace(
         run,
         stamp=run.stamp[:9000],

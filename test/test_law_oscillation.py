@@ -10,7 +10,7 @@ import pytest
 
 from blf_dsc_controller.compiled.layout import size_of, view_of
 from blf_dsc_controller.law import oscillation
-from blf_dsc_controller.law.oscillation import WAVES, Oscillation
+from blf_dsc_controller.law.oscillation import FEW, WAVES, Oscillation
 
 LIMIT = 87.0  # N m, of a Panda's shoulder
 NOISE = 2e-6  # rad, of an encoder of 20 bits
@@ -18,7 +18,7 @@ RESOLUTION = 6e-6  # rad
 
 
 def watched(error, torque, rate=1000.0, noise=NOISE, resolution=RESOLUTION):
-    """Return half waves, frequency [Hz], amplitude [N m], and whether it is one (N, 4)."""
+    """Return half waves, frequency [Hz], amplitude [N m], whether it is one, calm [s] (N, 5)."""
     one = SimpleNamespace(n=1)
     now = view_of(Oscillation)(np.zeros(size_of(Oscillation)(one)), one)
     given = np.array([[LIMIT], [noise**2], [resolution]])
@@ -29,7 +29,8 @@ def watched(error, torque, rate=1000.0, noise=NOISE, resolution=RESOLUTION):
         oscillation.watch(now, given[0], *state, *given[1:], 1.0 / rate)
         half = max(float(now.half[0]), 1e-9)
         is_one = oscillation.oscillates(now, 0)
-        seen.append((now.waves[0], 0.5 / half, now.amplitude[0], is_one))
+        row = now.waves[0], 0.5 / half, now.amplitude[0], is_one, now.calm[0]
+        seen.append(row)
     return np.array(seen)
 
 
@@ -62,10 +63,20 @@ def test_an_oscillation_has_its_frequency_and_the_amplitude_of_its_torque(
     The high pass takes a fifth of the torque at 9 Hz.
     """
     _, error, torque = swing(frequency, 1.0, rate)
-    _, found, amplitude, is_one = watched(error, torque, rate)[-1]
+    _, found, amplitude, is_one, _ = watched(error, torque, rate)[-1]
     assert is_one
     assert found == pytest.approx(frequency, rel=0.05)
     assert 0.7 * 14.0 < amplitude < 1.1 * 14.0
+
+
+def test_an_arm_is_calm_until_the_third_half_wave():
+    """One or two are no cause of a stop: any push makes them."""
+    _, error, torque = swing(31.0)
+    seen = watched(error, torque)
+    third = int(np.argmax(seen[:, 0] >= FEW))
+    assert seen[:third, 0].max() == FEW - 1
+    assert np.isinf(seen[:third, 4]).all()
+    assert seen[third, 4] < 1.5e-3  # a sample
 
 
 def test_it_is_found_while_it_grows_within_four_periods_of_a_twentieth_of_the_limit():

@@ -104,6 +104,7 @@ def test_first_event_holds_the_number_of_the_format():
             "`commands` is '9223372036854775808', expected a count",
         ),
         (event(stamp=1.5), "`stamp` is '1.5', expected a stamp in ns, or -1"),
+        (event(stamp=-2), "`stamp` is '-2', expected a stamp in ns, or -1"),
         (event(type=3), "`type` is '3', expected a text"),
         (event(type='dance'), "the type 'dance' is none of configure, activate, "),
         (event(content=3), "`content` is '3', expected fields by name"),

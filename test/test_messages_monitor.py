@@ -11,7 +11,9 @@ from blf_dsc_controller.analysis.metrics import measure
 from blf_dsc_controller.analysis.metrics_table import format_table
 from blf_dsc_controller.analysis.panels import panels
 from blf_dsc_controller.bags.reader import read_run
+from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.nodes import load_loop
+from blf_dsc_controller.control.guarded_loop import GuardedLoop
 from blf_dsc_controller.law import barrier
 from blf_dsc_controller.law.factory import (
     controller_of,
@@ -37,6 +39,22 @@ LEAKY = EXACT | PAPER | {'disturbance.leakage': 0.02, 'disturbance.gain': [50.0,
 
 def settings(law):
     return settings_of_config(configured('recommended', 1.0, law).controller)
+
+
+@pytest.mark.parametrize('wanted', [False, True])
+def test_tracking_errors_come_if_they_are_wanted_with_each_torque(wanted):
+    """Of the law and of a safe torque; where nobody listens they cost time for nothing."""
+    loop = GuardedLoop(ControllerConfig())
+    loop.guard.activate()
+    errors = []
+    for k in range(3):
+        if k == 2:
+            loop.guard.deactivate()
+        torque = loop.guard.update(10**9 + k * 10**6, np.zeros(6))
+        sent = loop.messages(torque, errors_wanted=wanted)
+        errors.append(topics.TRACKING_ERROR in [topic for topic, _ in sent])
+    assert not loop.guard.has_sample
+    assert errors == [wanted] * 3
 
 
 def test_largest_inertia_is_that_of_the_stretched_arm():

@@ -17,7 +17,16 @@ from random_arm import random_urdf
 from rcl_interfaces.srv import SetParameters, SetParametersAtomically
 from rclpy.parameter import Parameter
 from rclpy.timer import Timer
-from ros_rig import JOINTS, PATIENCE, START, FakeClock, states, torques
+from ros_rig import (
+    JOINTS,
+    PATIENCE,
+    START,
+    FakeClock,
+    cleanup,
+    deactivate,
+    states,
+    torques,
+)
 
 from blf_dsc_controller.configuration import schema
 from blf_dsc_controller.configuration.controller import ControllerConfig
@@ -83,6 +92,30 @@ def test_safe_torque_is_repeated_when_the_arm_falls_silent(ros, monkeypatch):
     before = len(arm.commands)
     ros.until(lambda: clock.advance(0.01) or len(arm.commands) >= before + 20)
     np.testing.assert_array_equal(torques(arm.commands)[-1], ZERO)
+
+
+def test_state_is_reported_when_it_changes_not_with_each_torque(ros):
+    node = ros.add(ControllerNode)
+    arm = Arm(ros)
+    for k in range(3):
+        arm.torque_for(k, START)
+        assert not node._status.has_news(node.guard)
+    node.guard.supervisor.add('of the test')
+    assert node._status.has_news(node.guard)
+    arm.torque_for(3, START)
+    assert not node._status.has_news(node.guard)
+
+
+def test_cleanup_commands_the_torque_that_a_driver_may_hold(ros):
+    """In a ramp, whose last torque would else be held for as long as the node waits."""
+    node = ros.add(ControllerNode, {'safety.deactivation_ramp': 10.0})
+    arm = Arm(ros)
+    arm.torque_for(0, START)
+    assert deactivate(ros, node)
+    assert np.abs(arm.torque_for(1, START)).min() > 1.0
+    assert cleanup(ros, node)
+    ros.until(lambda: len(arm.commands) == 3)
+    assert not torques(arm.commands)[-1].any()
 
 
 @pytest.mark.parametrize('where', ['in the law', 'in another callback'])
@@ -174,6 +207,12 @@ def test_start_outside_the_bound_is_reported_with_joint_error_and_bound(ros):
             [4000.0, 15.0],
             'feedback.gain: K_p over the inertia is ',
             '; to use it anyway, start the node with it',
+        ),
+        (
+            'barrier.bound',
+            [1e-6, 0.002],
+            'barrier.bound: joint1 is ',
+            '',
         ),
         (
             'sample_time',

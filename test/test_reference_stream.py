@@ -16,7 +16,8 @@ from blf_dsc_controller.configuration.schema import change
 from blf_dsc_controller.reference.approach import hold
 from blf_dsc_controller.reference.retargeting import Target, plan_target
 from blf_dsc_controller.reference.stream import TargetStream
-from blf_dsc_controller.reference.terms import pack, sampled
+from blf_dsc_controller.reference.terms import pack, sampled, sinusoids_term
+from blf_dsc_controller.reference.trajectory import TrajectoryError
 
 BENCHMARK = Path(__file__).parents[1] / 'benchmark'
 FASTEST = np.array([1.5, 1.5])
@@ -115,7 +116,10 @@ def test_burst_of_losses_is_no_slower_sender():
 
 def test_stream_begins_anew_at_rest_after_a_pause():
     stream = TargetStream()
+    assert stream.last(0.0, TIMEOUT) is None
     receive(stream, 0.01 * np.arange(100))
+    np.testing.assert_array_equal(stream.last(1.9, TIMEOUT), SLOPE * 0.99)
+    assert stream.last(2.1, TIMEOUT) is None
     target = receive(stream, [2.1])[0]
     assert (stream.interval, target.due) == (0.0, 2.1)
     assert target.velocities == (0.0, 0.0)
@@ -231,3 +235,26 @@ def test_stream_towards_a_position_limit_is_slowed_so_that_the_arm_can_stop(
     motion = plan_target(target, start, 0.0, config)
     reached, _, _ = sampled(motion.vector, np.array([motion.end]))[0]
     np.testing.assert_allclose(reached, side, atol=1e-9)
+
+
+@pytest.mark.parametrize('side', [1.0, -1.0])
+def test_target_is_refused_if_the_arm_would_leave_its_limits_before_it_turns(side):
+    """From 1.4 rad/s at 6 rad/s^2 it needs 0.16 rad to stop: 0.05 rad are left."""
+    limit = {
+        'limits.position_lower': [-1.0, -1.0],
+        'limits.position_upper': [1.0, 1.0],
+        'limits.acceleration': [6.0, 6.0],
+    }
+    config = change(ControllerConfig(), limit)
+    target = Target((0.0, 0.0), (0.0, 0.0), 1.0, 1.1, held=False)
+    for left, refused in ((0.05, True), (0.3, False)):
+        q = (side * (1.0 - left), 0.0)
+        swing = sinusoids_term(q, (side * 0.1, 0.0), (14.0,), (-np.pi / 2,))
+        moving = pack(2, [swing])
+        if refused:
+            with pytest.raises(
+                TrajectoryError, match=r"'joint1' would be at .* room to"
+            ):
+                plan_target(target, moving, 0.0, config)
+        else:
+            plan_target(target, moving, 0.0, config)

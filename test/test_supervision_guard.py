@@ -646,6 +646,18 @@ def test_acceleration_is_unknown_after_a_missed_state():
     assert not last.dq.any()
 
 
+@pytest.mark.parametrize(('stamp', 'q'), [(10**9, 0.2), (10**9 + 10**6, np.nan)])
+def test_positions_that_show_no_arm_leave_the_last_ones_and_no_velocity(stamp, q):
+    """Those with the stamp of the state before, and those that are not finite."""
+    last = LastState(2)
+    state = np.array([0.1, 0.3, 0.5, 0.5, 0.0, 0.0])
+    last.take_usable(10**9, state, 50.0, 1e-3)
+    last.take_usable(stamp, np.array([q, *state[1:]]), 50.0, 1e-3)
+    assert last.q.tolist() == [0.1, 0.3]
+    assert not last.dq.any()
+    assert last.age == 1e-3
+
+
 def test_clock_that_is_set_is_named_instead_of_the_error_it_makes():
     """By 35 ms, which safety.state_timeout allows: the reference would jump by 10 mrad."""
     rig = Rig(live=True)

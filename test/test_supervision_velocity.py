@@ -97,6 +97,19 @@ def test_wrong_velocity_is_found_before_the_start():
     assert not rig.guard.commanding
 
 
+@pytest.mark.parametrize('entry', [0, 2])  # a position, a velocity
+def test_wrong_velocity_is_found_although_a_state_lacks_a_value(entry):
+    """One that is not finite stays out of the averages, in which it would stay for ever."""
+    rig = Rig()
+    for k in range(60):
+        q = np.full(2, 1.0 + 5e-4 * k)  # 0.5 rad/s
+        measurement = np.array([*q, 0.0, 0.5, 0.0, 0.0])  # joint 1 is wrong
+        if k == 5:
+            measurement[entry] = np.nan
+        rig.guard.observe(rig.base + k * MILLISECOND, measurement)
+    assert rig.supervisor.reason is Reason.VELOCITY
+
+
 @pytest.mark.parametrize('preset', ['recommended', 'noisy', 'panda', 'ur5e_driver'])
 def test_noise_lag_and_steps_of_sensors_contradict_nothing(preset):
     """Filtered and differenced velocities, quantised positions, all that the presets have."""

@@ -146,6 +146,14 @@ def test_damping_that_no_drive_overcomes_is_a_placeholder_without_velocities(lim
         assert robot.friction(chain)['viscous'] == (expected, expected)
 
 
+def test_efforts_that_nothing_states_are_half_the_weight_at_full_reach():
+    """Joint a holds two links, at 0.15 and 0.45 m, joint b one at 0.15 m."""
+    robot = Robot(urdf=arm_in_mjcf(0.0), payload=0.0)
+    of_a, of_b = robot.efforts(robot.chain(('a', 'b')))
+    assert of_a == pytest.approx(0.5 * 3.0 * 9.81 * (0.15 + 0.45), rel=1e-9)
+    assert of_b == pytest.approx(0.5 * 3.0 * 9.81 * 0.15, rel=1e-9)
+
+
 # Grippers, and arms beside their configuration.
 
 GRIPPER = (
