@@ -7,7 +7,7 @@ matter:
     fading       Coulomb friction fades with speed, in one of four ways
     contact      contacts slide after another distance
     direction    friction is larger in one direction: |v|
-    load         friction grows with the torque of the joint, of which gears lose a part
+    load         friction grows with the torque that moves the bodies: gears lose a part of it
     gain         the torque of the joint is measured with another gain
     elasticity   the link lags behind its motor, which has the encoder, by torque / stiffness
 """
@@ -26,6 +26,7 @@ from blf_dsc_controller.identification.on_disk import OnDisk, mapped
 from blf_dsc_controller.identification.sliding import DISTANCES
 from blf_dsc_controller.identification.values import (
     COULOMB,
+    LOAD,
     OFFSET,
     ROTOR_INERTIA,
     VISCOUS,
@@ -44,6 +45,9 @@ from blf_dsc_controller.run import Floats
 
 KINDS = ('fading', 'contact', 'direction', 'load', 'gain', 'elasticity')
 """What the model may leave out."""
+
+LARGEST = np.array((1.0, 1.0, 1.0, 0.2, 0.2, 3.0))
+"""Largest plausible standard deviation of the columns of each kind."""
 
 # rad/s or m/s, and exponent: scales and shapes that are published for gears and
 # bearings
@@ -90,12 +94,14 @@ def left_out(
     columns += [('contact', coulomb * (b - a)) for a, b in pairwise(sliding)]
     speeds = rows.over_windows(lambda at: np.abs(rows.dq[at]), rows.g)
     columns.append(('direction', viscous * speeds))
-    loads = rows.over_windows(
-        lambda at: np.abs(rows.torque[at]) * rows.sliding[at], rows.g
-    )
-    columns.append(('load', loads))
-    predicted = rows.torques(np.arange(rows.time.size), (G @ values)[:-1])
-    columns.append(('gain', predicted))
+    # measured torques would explain themselves
+    theta = (G @ values)[:-1]
+    moved = theta.copy()
+    moved[rows.p : rows.unknowns - LOAD] = 0.0
+    everything = np.arange(rows.time.size)
+    loads = np.abs(rows.torques(everything, moved))
+    columns.append(('load', loads * rows.friction[:, COLUMNS.index('Coulomb')]))
+    columns.append(('gain', rows.torques(everything, theta)))
     kinds = [KINDS.index(kind) for kind, _ in columns]
     return LeftOut(
         np.stack([column for _, column in columns], axis=1),

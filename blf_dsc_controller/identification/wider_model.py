@@ -2,12 +2,11 @@
 """Covariance of the values, with doubt about the model itself.
 
 A fit cannot tell that its model is not the arm's: it finds other values, with narrow
-intervals.  So the recording is fitted once more, without bounds, by a wider model that
-has the columns of `left_out` as well.  How large each kind of them is, as a standard
+intervals.  So what it leaves of the torques is fitted, without bounds, by a wider model
+that has the columns of `left_out` as well.  How large each kind of them is, as a standard
 deviation over its columns, is estimated together with them, so that kinds that the
 recording does not show vanish (empirical Bayes: MacKay, Bayesian interpolation, 1992).
-The covariance is that of the wider model, and the distance d of its values from those
-of the narrow one:
+The covariance is that of the wider model, and what it adds to the values, d:
 
     (I + sum_i A_i^T A_i / l_i)^-1 + d d^T
 
@@ -21,7 +20,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from blf_dsc_controller.identification.left_out import KINDS, LeftOut, left_out
+from blf_dsc_controller.identification.left_out import KINDS, LARGEST, LeftOut, left_out
 from blf_dsc_controller.identification.prior import Prior
 from blf_dsc_controller.identification.problem import Problem
 from blf_dsc_controller.identification.regression import (
@@ -34,7 +33,7 @@ from blf_dsc_controller.identification.windows import HOP
 from blf_dsc_controller.run import Floats
 
 _FIRST = 0.3  # size of each kind, at first
-_SIZES = (1e-5, 5.0)
+_LEAST = 1e-5  # size of each kind, at last
 _ROUNDS = 5  # of residuals ...
 _STEPS = 3  # ... and in each, of sizes
 _FLOOR = 1e-4  # of a joint's torque, least residual
@@ -61,13 +60,18 @@ def doubt(problem: Problem, prior: Prior, fit: Fit, distances: Floats) -> Doubt:
     # the size of what the model has is that of its prior
     sizes = np.append(np.full(len(KINDS), _FIRST), 1.0)
     narrow, _ = _solved(products, (kinds == len(KINDS)) * 1.0, deviation**2)
+    to_rest = np.eye(len(products[0]))
+    to_rest[:-1, -1] = -narrow
+    products = to_rest.T @ products @ to_rest
     for _ in range(_ROUNDS):
         for _ in range(_STEPS):
             z, H = _solved(products, sizes[kinds], deviation**2 * lengths)
             sizes[:-1] = _sizes(kinds, z, H, sizes)
-        deviation, lengths = _residual(problem, prior, fit, columns, z)
+        blocks = _blocks(problem, prior, fit, columns)
+        left = np.concatenate([each @ np.append(narrow + z, -1.0) for each in blocks])
+        deviation, lengths = _residual(problem, prior, fit, left)
     z, H = _solved(products, sizes[kinds], deviation**2 * lengths)
-    d = prior.D @ (z - narrow)[:k]
+    d = prior.D @ z[:k]
     covariance = prior.D @ H[:k, :k] @ prior.D.T + np.outer(d, d)
     return Doubt(covariance, _torques(problem, columns, z[k:]))
 
@@ -113,24 +117,20 @@ def _sizes(kinds: Floats, z: Floats, H: Floats, sizes: Floats) -> Floats:
     for kind, size in enumerate(sizes[:-1]):
         own = kinds == kind
         shown = np.sum(1.0 - np.diag(H)[own] / size**2)
-        found.append(np.sqrt(np.sum(z[own] ** 2) / max(shown, _SIZES[0])))
-    return np.asarray(np.clip(found, *_SIZES))
+        found.append(np.sqrt(np.sum(z[own] ** 2) / max(shown, _LEAST)))
+    return np.asarray(np.clip(found, _LEAST, LARGEST))
 
 
 def _residual(
-    problem: Problem, prior: Prior, fit: Fit, columns: LeftOut, z: Floats
+    problem: Problem, prior: Prior, fit: Fit, left: Floats
 ) -> tuple[Floats, Floats]:
-    """Return the deviation (n,) of each joint's residual, and its correlation length in windows."""
-    rows = problem.rows
-    moving = problem.windows.moving
-    blocks = _blocks(problem, prior, fit, columns)
-    left = np.concatenate([block @ np.append(z, -1.0) for block in blocks])
-    counted = np.sum(rows.weight[moving] ** 2, axis=0)
-    counted -= prior.D.any(axis=0).sum() / rows.speed.size
-    squares = np.sum(left**2, axis=0) / np.maximum(counted, 1.0)
+    """Return the deviation (n,) of a residual (., n), and its correlation length in windows."""
+    weight = problem.rows.weight[problem.windows.moving]
+    counted = np.sum(weight**2, axis=0) - prior.D.any(axis=0).sum() / left.shape[1]
+    deviation = np.sqrt(np.sum(left**2, axis=0) / np.maximum(counted, 1.0))
     floor = _FLOOR * fit.problem.deviation + 1e-12
     lengths = [correlation_length(column) for column in left.T]
-    return np.maximum(np.sqrt(squares), floor), np.array(lengths)
+    return np.maximum(deviation, floor), np.array(lengths)
 
 
 def _torques(problem: Problem, columns: LeftOut, z: Floats) -> Floats:
