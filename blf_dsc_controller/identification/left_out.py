@@ -131,7 +131,9 @@ def _elastic(rows: Rows, model: SerialChain, G: Floats, values: Floats) -> Float
     n = rows.speed.size
     links = values.copy()
     parts(links).terms[ROTOR_INERTIA] = 0.0
-    P = (G @ links)[: rows.p]
+    theta = (G @ links)[:-1]
+    P = theta[: rows.p]
+    P_loaded = P + rows.load @ theta[-LOAD:]
     transmitted = _transmitted(rows, values)
     twist = _TWIST / np.maximum(rows.largest_torque, _TINY)
     g, slope = weighting(rows.every * rows.period)
@@ -144,10 +146,14 @@ def _elastic(rows: Rows, model: SerialChain, G: Floats, values: Floats) -> Float
         )
         starts = np.minimum(starts, len(q) - g.size).astype(np.intp)
 
-        def torque(q: Floats, dq: Floats, starts: Indices = starts) -> Floats:
+        P_of = np.where(rows.time[block, None] < rows.loaded, P, P_loaded)
+
+        def torque(
+            q: Floats, dq: Floats, starts: Indices = starts, P_of: Floats = P_of
+        ) -> Floats:
             X = np.zeros((starts.size, n, rows.p))
             add_windows(model, q, dq, g, slope, starts, regressors, X)
-            return np.asarray(X @ P)
+            return np.asarray(np.einsum('kip,kp->ki', X, P_of))
 
         rigid = torque(q, dq)
         for j in range(n):
