@@ -69,7 +69,7 @@ from blf_dsc_controller.identification.values import (
     QUADRATIC,
     STRIBECK,
 )
-from blf_dsc_controller.identification.windows import WINDOW
+from blf_dsc_controller.identification.windows import HOP, WINDOW, Indices, Rows
 from blf_dsc_controller.run import Floats
 
 _WEAK = 100.0  # times the prior's deviations: hardly any prior
@@ -188,8 +188,8 @@ def _fits(
     equal = regression(rows, fit, G, weak)
     methods: dict[str, Callable[[], Fit | None]] = {
         'URDF': lambda: Fit(full.mean, arm.covariance),
-        'least squares': lambda: Fit(*fitted(rows, fit, G, free)[:2]),
-        'semidefinite': lambda: Fit(*fitted(rows, fit, G, weak)[:2]),
+        'least squares': lambda: _peer(rows, fit, G, free),
+        'semidefinite': lambda: _peer(rows, fit, G, weak),
         'figaroh': lambda: rivals.figaroh(arm, equal, weak),
         'mujoco.sysid': lambda: rivals.mujoco_sysid(
             arm, rows, fit, equal, full, robot.gravity
@@ -207,6 +207,15 @@ def _fits(
         if found is not None:
             fits[name] = found
     return fits, seconds
+
+
+def _peer(rows: Rows, fit: Indices, G: Floats, prior: Prior) -> Fit:
+    """Return the fit by a model that is taken to be right, with correlated residuals."""
+    found = fitted(rows, fit, G, prior)
+    products = found.problem.folds.sum(axis=0)[:, :-1, :-1]
+    information = np.tensordot(HOP / found.problem.lasting, products, 1)
+    H = np.linalg.inv(information + np.eye(len(information)))
+    return Fit(found.values, prior.D @ H @ prior.D.T)
 
 
 def _torque_errors(

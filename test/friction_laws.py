@@ -13,14 +13,14 @@ _SMOOTH = 0.005  # rad/s or m/s, of tanh
 
 
 def _coulomb(motion, friction, _random):
-    _, v = motion
+    _, v, _ = motion
     viscous, coulomb = friction
     return viscous * v + coulomb * np.tanh(v / _SMOOTH)
 
 
 def _stribeck(motion, friction, random):
     """20 to 80 % more at low speed, which fades as a Gaussian of 0.02 to 0.2 rad/s."""
-    _, v = motion
+    _, v, _ = motion
     viscous, coulomb = friction
     n = coulomb.size
     scale = random.uniform(0.02, 0.2, n)
@@ -31,7 +31,7 @@ def _stribeck(motion, friction, random):
 
 def _elastic(motion, friction, random):
     """As LuGre's: contacts yield over 0.2 to 4 mrad, and fade exponentially."""
-    q, v = motion
+    q, v, _ = motion
     viscous, coulomb = friction
     n = coulomb.size
     distance = random.uniform(2e-4, 4e-3, n)
@@ -45,7 +45,7 @@ def _elastic(motion, friction, random):
 
 def _rational(motion, friction, random):
     """20 to 80 % more at low speed, which fades as 1 / (1 + (v / v_s)^2): Hess and Soom."""
-    _, v = motion
+    _, v, _ = motion
     viscous, coulomb = friction
     n = coulomb.size
     scale = random.uniform(0.02, 0.2, n)
@@ -56,11 +56,19 @@ def _rational(motion, friction, random):
 
 def _asymmetric(motion, friction, random):
     """Up to 20 % more in one direction, and less in the other."""
-    _, v = motion
+    _, v, _ = motion
     viscous, coulomb = friction
     more = random.uniform(-0.2, 0.2, coulomb.size)
     sign = np.tanh(v / _SMOOTH)
     return (viscous * v + coulomb * sign) * (1.0 + more * sign)
+
+
+def _load(motion, friction, random):
+    """Grows by 3 to 12 % of the torque that the gear transmits."""
+    _, v, torque = motion
+    viscous, coulomb = friction
+    more = random.uniform(0.03, 0.12, coulomb.size)
+    return viscous * v + (coulomb + more * np.abs(torque)) * np.tanh(v / _SMOOTH)
 
 
 LAWS: dict[str, Callable[..., np.ndarray]] = {
@@ -69,8 +77,9 @@ LAWS: dict[str, Callable[..., np.ndarray]] = {
     'elastic': _elastic,
     'rational': _rational,
     'asymmetric': _asymmetric,
+    'load': _load,
 }
-"""Torques (N, n) of positions and speeds (N, n), viscous and Coulomb friction (n,)."""
+"""Torques (N, n) of positions, speeds, torques (N, n), viscous and Coulomb friction (n,)."""
 
 
 def with_friction(law, states, viscous, coulomb, seed):
@@ -79,7 +88,7 @@ def with_friction(law, states, viscous, coulomb, seed):
     The torque of a state is that of the period before it.
     """
     random = np.random.default_rng(seed)
-    motion = (states[:, 0], states[:, 1])
+    motion = (states[:, 0], states[:, 1], states[:, 2])
     friction = LAWS[law](motion, (viscous, coulomb), random)
     added = states.copy()
     added[1:, 2] += 0.5 * (friction[1:] + friction[:-1])

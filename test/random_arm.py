@@ -13,7 +13,7 @@ import pinocchio
 
 from blf_dsc_controller.arms.urdf import inertia_of, pseudo_inertia, read_chain
 from blf_dsc_controller.bags.writer import BagWriter
-from blf_dsc_controller.compiled.jit import kernel
+from blf_dsc_controller.compiled.jit import inner, kernel
 from blf_dsc_controller.identification.recording import Recording
 from blf_dsc_controller.identification.values import base_matrix
 from blf_dsc_controller.messages.codecs import (
@@ -136,6 +136,7 @@ def chain_of(name):
 PANDA_CHAIN = chain_of('panda')
 GRAVITY = (0.0, 0.0, -9.81)
 PERIOD = 0.001  # s
+_SPRING_STEPS = 8  # in a period: springs of light wrists ring at 2 kHz
 
 
 class Truth(NamedTuple):
@@ -260,6 +261,73 @@ def shake(chain, truth, reference, duration):
     return states
 
 
+@inner
+def _add(total, first, second, factor):
+    """Write first + factor second."""
+    for j in range(total.shape[0]):
+        for i in range(total.shape[1]):
+            total[j, i] = first[j, i] + factor * second[j, i]
+
+
+@inner
+def _spring_rate(arm, rotors, stiffness, torque, stage, rate):
+    """Write the rate (4, n) of positions and velocities (4, n) of motors and links."""
+    for i in range(rotors.size):
+        turn = stage[2, i] - stage[3, i]
+        spring = stiffness[i] * (stage[0, i] - stage[1, i] + 1e-4 * turn)
+        rate[0, i] = stage[2, i]
+        rate[1, i] = stage[3, i]
+        rate[2, i] = (torque[i] - spring) / rotors[i]
+        rate[3, i] = spring
+    arm.accelerate(0.0, stage[1], stage[3], rate[3], rate[3])
+
+
+@kernel
+def _shake_elastic(arm, rotors, stiffness, motion, gains, work, states):
+    """Follow `motion` (N, 3, n) by PD of motors, whose springs drive the links of the arm.
+
+    Fill states (N, 3, n) of the motors.  The rows of `work` (17, n) are zero at first.
+    """
+    now = work[:4]  # positions of motors and links, and their velocities
+    stage = work[4:8]
+    rate = work[8:12]
+    step = work[12:16]
+    torque = work[16]
+    h = PERIOD / _SPRING_STEPS
+    for i in range(rotors.size):
+        now[0, i] = now[1, i] = motion[0, 0, i]
+        now[2, i] = now[3, i] = motion[0, 1, i]
+    for k in range(motion.shape[0]):
+        for i in range(rotors.size):
+            states[k, 0, i] = now[0, i]
+            states[k, 1, i] = now[2, i]
+            states[k, 2, i] = torque[i]
+            error = motion[k, 0, i] - now[0, i]
+            torque[i] = gains[i] * (30.0 * error + 3.0 * (motion[k, 1, i] - now[2, i]))
+        for _ in range(_SPRING_STEPS):
+            step[:] = 0.0
+            for share, weight in ((0.0, 1.0), (0.5, 2.0), (0.5, 2.0), (1.0, 1.0)):
+                _add(stage, now, rate, share * h)
+                _spring_rate(arm, rotors, stiffness, torque, stage, rate)
+                _add(step, step, rate, weight * h / 6.0)
+            _add(now, now, step, 1.0)
+
+
+def shake_elastic(chain, truth, stiffness, reference, duration):
+    """Return states (N, 3, n) of motors without friction, behind springs (n,) [N m/rad]."""
+    arm = rigid_arm(
+        rigid_bodies(chain, GRAVITY, truth.inertias, np.zeros_like(truth.rotors))
+    )
+    times = np.arange(round(duration / PERIOD)) * PERIOD
+    gains = np.array([min(joint.effort, 100.0) for joint in chain.joints]) / 4.0
+    n = len(chain.joints)
+    states = np.zeros((times.size, 3, n))
+    work = np.zeros((17, n))
+    motion = reference.at(times)
+    _shake_elastic(arm, truth.rotors, stiffness, motion, gains, work, states)
+    return states
+
+
 def measured(states, seed, encoder=2.0 * np.pi / 2**20, noise=0.01):
     """Return the states as measured by encoders and torque sensors.
 
@@ -281,15 +349,27 @@ def recording_of(states, joints=PANDA, period=PERIOD):
     return Recording(joints, period, states[:, 0], states[:, 2], gap, 'made up')
 
 
-def is_covered(found, truth):
-    """Return whether each base parameter and friction is within its 95 % interval."""
+def errors_and_deviations(found, truth):
+    """Return errors of base parameters, viscous and Coulomb friction, and their deviations.
+
+    The last are those that the URDF leaves.
+    """
     true = np.concatenate(
         (truth.inertias.ravel(), truth.rotors, truth.viscous, truth.coulomb)
     )
     at, n = slice(0, true.size), len(truth.rotors)
     G = base_matrix(found.parameters, n)[: found.parameters.model.p + 2 * n, at]
-    deviation = np.sqrt(np.diag(G @ found.covariance[at, at] @ G.T))
-    return np.abs(G @ (found.values[at] - true)) < 1.96 * deviation
+    deviation, before = (
+        np.sqrt(np.diag(G @ C[at, at] @ G.T))
+        for C in (found.covariance, found.prior_covariance)
+    )
+    return G @ (found.values[at] - true), deviation, before
+
+
+def is_covered(found, truth):
+    """Return whether each base parameter and friction is within its 95 % interval."""
+    error, deviation, _ = errors_and_deviations(found, truth)
+    return np.abs(error) < 1.96 * deviation
 
 
 FIELDS = ('position', 'velocity', 'effort')

@@ -44,6 +44,7 @@ class Identified(NamedTuple):
     prior_covariance: Floats  # (17 n + 14, 17 n + 14)
     values: Floats  # (17 n + 14,) from all windows in motion
     covariance: Floats  # (17 n + 14, 17 n + 14) given the recording
+    left_out: Floats  # (kinds, n) rms torque of what the model leaves out, N m or N
     # (2, n) damping and friction of the corrected URDF, which has no more terms
     dynamics: Floats
     score: Score

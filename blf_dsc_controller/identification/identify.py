@@ -17,7 +17,6 @@ from blf_dsc_controller.bags.content import NO_NAMES, NameMap
 from blf_dsc_controller.configuration.robot import Robot
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.identification.foresight import Foresight, foresee
-from blf_dsc_controller.identification.friction_doubt import friction_doubt
 from blf_dsc_controller.identification.identified import Identified
 from blf_dsc_controller.identification.joint_alone import errors_alone, fit_alone
 from blf_dsc_controller.identification.on_disk import mapped
@@ -28,6 +27,7 @@ from blf_dsc_controller.identification.recording import Recording, joined
 from blf_dsc_controller.identification.regression import fitted
 from blf_dsc_controller.identification.scoring import nearest_friction, scored
 from blf_dsc_controller.identification.selection import select
+from blf_dsc_controller.identification.wider_model import doubt
 from blf_dsc_controller.identification.windows import COLUMNS, HOP, STILL
 from blf_dsc_controller.run import Floats
 
@@ -162,6 +162,7 @@ def identify_arm(
     dynamics = nearest_friction(rows, windows, final.values)
     size = shares(rows, windows.moving, problem.P, (problem.G @ final.values)[: rows.p])
     begin(STAGES[4])
+    doubted = doubt(problem, selected.prior, final, selected.distances)
     return Identified(
         source=recording.source,
         duration=recording.duration,
@@ -170,8 +171,8 @@ def identify_arm(
         prior=problem.prior.mean,
         prior_covariance=problem.prior.D @ problem.prior.D.T,
         values=final.values,
-        covariance=final.covariance
-        + friction_doubt(problem, selected.prior, selected.found),
+        covariance=doubted.covariance,
+        left_out=doubted.torques,
         dynamics=dynamics,
         score=score,
         alone=errors_alone(rows, windows.test, alone),
@@ -179,7 +180,7 @@ def identify_arm(
         widths=selected.widths,
         still=_named(recording.joints, rows.speed < STILL),
         reversed=_named(recording.joints, problem.reversed),
-        lasting=final.lasting,
+        lasting=final.problem.lasting,
         rest=(rows.time.size - windows.moving.size) * HOP,
         clipped=rows.clipped[windows.moving].mean(axis=0),
         gravity=size.gravity,

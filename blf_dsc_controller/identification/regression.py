@@ -1,18 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The weighted least-squares problem of a recording, with its folds and its covariance.
+"""The weighted least-squares problem of a recording, with its folds.
 
 Each joint is weighted by the inverse deviation of its own residual, the delay of the
 torques is linearised about its last estimate, and the load friction computed with the
 last estimate of gravity: a few passes until the deviations agree, fewer from the solution of
 a problem that is much like it.
-
-The covariance allows for residuals that are correlated,
-
-    H^-1 (I + sum_i l_i A_i^T A_i) H^-1,       H = I + sum_i A_i^T A_i,
-
-with the correlation lengths l_i of the joints (Liang and Zeger, Longitudinal data
-analysis using generalized linear models, 1986), and ignores the bounds, which can only
-reduce it.
 """
 
 from __future__ import annotations
@@ -45,7 +37,6 @@ class Regression(NamedTuple):
     # (parts, n, k + 1, k + 1) [A | b]^T [A | b] of successive windows, for each joint
     folds: Floats
     theta: Floats  # (m + 1,) solution without bounds: unknowns of `Rows`, delay in s
-    scatter: Floats  # (k, k) covariance of A^T b
     lasting: Floats  # (n,) correlation length of each joint's residual, s
     deviation: Floats  # (n,) of each joint's residual, N m or N
     delay: float  # s, of the torques in A
@@ -98,14 +89,12 @@ def regression(
         b,
         np.empty(0),
         theta,
-        np.empty(0),
         lengths * HOP,
         deviation_used,
         weighted.delay,
     )
     folds = np.array(list(successive(rows, fit, G, prior, solved, parts)))
-    together = folds.sum(axis=0)[:, :-1, :-1]
-    return solved._replace(folds=folds, scatter=np.tensordot(lengths, together, 1))
+    return solved._replace(folds=folds)
 
 
 def successive(
@@ -113,13 +102,19 @@ def successive(
 ) -> Iterator[Floats]:
     """Yield the products of `Regression.folds` for so many parts, as the rows are now."""
     weighted = Weighted(rows, fit, found.delay)
-    B = G @ prior.D
-    to_z = np.zeros((B.shape[0] + 1, B.shape[1] + 1))
-    to_z[:-1, :-1] = B
-    to_z[:-1, -1] = -G @ prior.mean
-    to_z[-1, -1] = 1.0
+    T = to_z(G, prior)
     for products in weighted.products(parts):
-        yield to_z.T @ (products / found.deviation[:, None, None] ** 2) @ to_z
+        yield T.T @ (products / found.deviation[:, None, None] ** 2) @ T
+
+
+def to_z(G: Floats, prior: Prior) -> Floats:
+    """Return T (m + 2, k + 1): the rows of `Weighted` times T are [A | b] of the prior's z."""
+    B = G @ prior.D
+    T = np.zeros((B.shape[0] + 1, B.shape[1] + 1))
+    T[:-1, :-1] = B
+    T[:-1, -1] = -G @ prior.mean
+    T[-1, -1] = 1.0
+    return T
 
 
 class Weighted:
@@ -192,11 +187,10 @@ def correlation_length(residual: Floats) -> float:
 
 
 class Fit(NamedTuple):
-    """The most likely values, and their covariance."""
+    """The most likely values over physical bodies, and the problem without this bound."""
 
     values: Floats  # (17 n + 14,) in the order of `Parts`
-    covariance: Floats  # (17 n + 14, 17 n + 14)
-    lasting: Floats  # (n,) correlation length of each joint's residual, s
+    problem: Regression
 
 
 def fitted(
@@ -206,12 +200,9 @@ def fitted(
     prior: Prior,
     near: Regression | None = None,
 ) -> Fit:
-    """Return the most likely values over physical bodies, from these windows."""
+    """Return the fit to these windows."""
     problem = regression(rows, windows, G, prior, near)
     z = solve(problem.A, problem.b, prior.cones, prior.start)
     values = prior.mean + prior.D @ z
-    one = np.eye(z.size)
-    H = np.linalg.inv(problem.A.T @ problem.A + one)
-    covariance = prior.D @ H @ (one + problem.scatter) @ H @ prior.D.T
     rows.set_load((G @ values)[: rows.p])
-    return Fit(values, covariance, problem.lasting)
+    return Fit(values, problem)

@@ -9,10 +9,14 @@ import numpy as np
 
 from blf_dsc_controller.analysis.output import aligned
 from blf_dsc_controller.identification.identified import Identified, mass_and_centre
+from blf_dsc_controller.identification.left_out import KINDS
 from blf_dsc_controller.identification.plausibility import GRAVITY, INERTIA
 from blf_dsc_controller.identification.values import (
+    COULOMB,
     JOINT_TERMS,
     OFFSET,
+    ROTOR_INERTIA,
+    VISCOUS,
     base_matrix,
     units_of,
 )
@@ -32,6 +36,20 @@ _LATE = 0.01  # s, longest plausible delay
 _LARGE_OFFSET = 0.1  # of the torque
 _HARDLY = 0.01  # of the largest torque: a joint whose torque is mostly noise
 _ALL_WRONG = 1.0  # of the torque, error of a joint that the model does not explain
+
+_FELT = 0.005  # of the torque, and of the largest: what the model leaves out is told
+_LEFT_OUT = (
+    'friction that fades with speed',
+    'friction that builds up along a distance at reversals',
+    'friction that differs with the direction',
+    'friction that grows with the torque',
+    'joints whose torque is measured with another gain',
+    'joints that give way behind their encoders',
+)  # of KINDS
+_REMEDIES = {
+    'gain': ', but not for an error that all gains have in common: check them',
+    'elasticity': '; encoders at the links would show more',
+}
 
 
 def interval(value: float, deviation: float, digits: str = '.4g') -> str:
@@ -155,6 +173,7 @@ def notes_of(found: Identified) -> Iterator[str]:
         )
     yield from _delay_notes(found)
     yield from _joint_notes(found)
+    yield from _doubt_notes(found)
     wider = [f'{name} {width:g}' for name, width in found.widths.items() if width > 1.0]
     if wider:
         yield (
@@ -211,6 +230,30 @@ def _joint_notes(found: Identified) -> Iterator[str]:
             yield (
                 f'{name} hardly needs a torque ({score.torque[i]:.2g} {unit}), so its error in % '
                 'means little'
+            )
+
+
+def _doubt_notes(found: Identified) -> Iterator[str]:
+    """Yield what the model leaves out, and which values are not known."""
+    share = found.left_out / found.score.torque
+    relevant = found.left_out > _FELT * found.score.torque.max()
+    for kind, words, shares, is_felt in zip(
+        KINDS, _LEFT_OUT, share, relevant & (share > _FELT), strict=True
+    ):
+        if is_felt.any():
+            i = int(np.argmax(shares * is_felt))
+            yield (
+                f'the recording shows {words}, more than the model has terms for: up to '
+                f'{100.0 * shares[i]:.1f} % of the torque, of {found.joints[i]}. Intervals allow '
+                f'for it{_REMEDIES.get(kind, "")}'
+            )
+    values, deviations = found.parts.terms, found.deviations.terms
+    for term in (ROTOR_INERTIA, VISCOUS, COULOMB):
+        unknown = np.flatnonzero(TWO_SIDED * deviations[term] > values[term])
+        if unknown.size:
+            yield (
+                f'{JOINT_TERMS[term]} of {", ".join(found.joints[i] for i in unknown)} cannot be '
+                'known from this recording: the interval contains zero'
             )
 
 

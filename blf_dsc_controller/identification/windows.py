@@ -263,7 +263,7 @@ def rows_of(recording: Recording, model: SerialChain) -> Rows:
     h = recording.period
     n = len(recording.joints)
     size = recording.gap.size
-    g, slope = _weighting(h)
+    g, slope = weighting(h)
     q, dq, near_gap = _smoothed(recording)
     starts = _starts(near_gap, g.size, h)
     every = max(1, round(_GRAVITY / h))
@@ -319,8 +319,7 @@ def _smoothed(recording: Recording) -> tuple[OnDisk, OnDisk, NDArray[np.bool_]]:
 
     h = recording.period
     size = recording.gap.size
-    half = max(2, round(0.5 * SMOOTHING / h))
-    width = 2 * half + 1
+    width = smoothing_width(h)
 
     def smoothed(rows: slice, derivative: int) -> Floats:
         first = max(rows.start - width, 0)
@@ -332,6 +331,11 @@ def _smoothed(recording: Recording) -> tuple[OnDisk, OnDisk, NDArray[np.bool_]]:
     near_gap = maximum_filter1d(recording.gap, width, mode='constant')
     q = mapped(size, lambda rows: smoothed(rows, 0))
     return q, mapped(size, lambda rows: smoothed(rows, 1)), near_gap
+
+
+def smoothing_width(h: float) -> int:
+    """Return the number of samples, one each h seconds, over which positions are smoothed."""
+    return 2 * max(2, round(0.5 * SMOOTHING / h)) + 1
 
 
 def _fast(dq: OnDisk, chosen: NDArray[np.bool_]) -> Floats:
@@ -358,7 +362,7 @@ def _add_inertial(rows: Rows, model: SerialChain) -> None:
         rows.inertial.append(X.reshape(len(X), -1))
 
 
-def _weighting(h: float) -> tuple[Floats, Floats]:
+def weighting(h: float) -> tuple[Floats, Floats]:
     """Return g with sum 1, and g' [1/s], at the samples of a window."""
     length = round(WINDOW / h) + 1
     turn = np.pi / (length - 1)

@@ -1,0 +1,186 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Columns of what the model leaves out, for `wider_model`: friction, sensors, elastic joints.
+
+Each kind has one or more columns of every joint, in units that are of order 1 if they
+matter:
+
+    fading       Coulomb friction fades with speed, in one of four ways
+    contact      contacts slide after another distance
+    direction    friction is larger in one direction: |v|
+    load         friction grows with the torque that moves the bodies: gears lose a part of it
+    gain         the torque of the joint is measured with another gain
+    elasticity   the link lags behind its motor, which has the encoder, by torque / stiffness
+"""
+
+from __future__ import annotations
+
+from itertools import pairwise
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from blf_dsc_controller.arms.friction import STRIBECK_SPEED
+from blf_dsc_controller.arms.serial_chain import SerialChain
+from blf_dsc_controller.identification.on_disk import OnDisk, mapped
+from blf_dsc_controller.identification.sliding import DISTANCES
+from blf_dsc_controller.identification.values import (
+    COULOMB,
+    LOAD,
+    OFFSET,
+    ROTOR_INERTIA,
+    VISCOUS,
+    parts,
+)
+from blf_dsc_controller.identification.windows import (
+    COLUMNS,
+    STILL,
+    Indices,
+    Rows,
+    add_windows,
+    smoothing_width,
+    weighting,
+)
+from blf_dsc_controller.run import Floats
+
+KINDS = ('fading', 'contact', 'direction', 'load', 'gain', 'elasticity')
+"""What the model may leave out."""
+
+LARGEST = np.array((1.0, 1.0, 1.0, 0.2, 0.2, 3.0))
+"""Largest plausible standard deviation of the columns of each kind."""
+
+# rad/s or m/s, and exponent: scales and shapes that are published for gears and
+# bearings
+_FADINGS = ((0.05, 2.0), (0.2, 2.0), (0.1, 1.0), (0.4, 1.0))
+_SMALL = 0.01  # of a joint's largest torque, least friction that is a unit
+_TWIST = 0.01  # rad or m, unit of what a joint gives way under its largest torque
+_STEP = 0.1  # of that twist, by which columns are differences
+_TINY = 1e-6  # N m or N, least torque of a joint that scales its twist
+
+
+class LeftOut(NamedTuple):
+    """Columns of R windows and n joints: e of each joint itself, and the twist of each joint."""
+
+    own: Floats  # (R, e, n), N m or N
+    elastic: Floats  # (R, n, n) torque of each joint by the twist of each
+    kind: NDArray[np.intp]  # (e n + n,) of each column, in KINDS
+
+    def matrix(self, windows: Indices) -> Floats:
+        """Return the columns (k, n, e n + n) of some windows."""
+        own = self.own[windows]
+        k, e, n = own.shape
+        found = np.zeros((k, n, (e + 1) * n))
+        joints = np.arange(n)
+        for c in range(e):
+            found[:, joints, c * n + joints] = own[:, c]
+        found[:, :, e * n :] = self.elastic[windows]
+        return found
+
+
+def left_out(
+    rows: Rows, model: SerialChain, G: Floats, values: Floats, distances: Floats
+) -> LeftOut:
+    """Return the columns for the values of a fit, with contacts that slide at `distances` (n,)."""
+    terms = parts(values).terms
+    least = _SMALL * rows.largest_torque
+    coulomb = np.maximum(terms[COULOMB], least)
+    speed = np.maximum(rows.speed, STILL)
+    viscous = np.maximum(terms[VISCOUS], least / speed)
+    sliding = [_contact(rows, distance) for distance in DISTANCES]
+    rows.set_sliding(distances)
+    columns = [('fading', coulomb * _fading(rows, *each)) for each in _FADINGS]
+    rows.set_stribeck(STRIBECK_SPEED, 2.0)
+    rows.set_load((G @ values)[: rows.p])
+    columns += [('contact', coulomb * (b - a)) for a, b in pairwise(sliding)]
+    speeds = rows.over_windows(lambda at: np.abs(rows.dq[at]), rows.g)
+    columns.append(('direction', viscous * speeds))
+    # measured torques would explain themselves
+    theta = (G @ values)[:-1]
+    moved = theta.copy()
+    moved[rows.p : rows.unknowns - LOAD] = 0.0
+    everything = np.arange(rows.time.size)
+    loads = np.abs(rows.torques(everything, moved))
+    columns.append(('load', loads * rows.friction[:, COLUMNS.index('Coulomb')]))
+    columns.append(('gain', rows.torques(everything, theta)))
+    kinds = [KINDS.index(kind) for kind, _ in columns]
+    return LeftOut(
+        np.stack([column for _, column in columns], axis=1),
+        _elastic(rows, model, G, values),
+        np.repeat([*kinds, KINDS.index('elasticity')], speed.size),
+    )
+
+
+def _contact(rows: Rows, distance: float) -> Floats:
+    """Return the column (R, n) of Coulomb friction for a distance; the rows keep it."""
+    rows.set_sliding(np.full(rows.speed.size, distance))
+    return np.array(rows.friction[:, COLUMNS.index('Coulomb')])
+
+
+def _fading(rows: Rows, speed: float, exponent: float) -> Floats:
+    """Return the column (R, n) of Stribeck friction that fades so; the rows keep it."""
+    rows.set_stribeck(speed, exponent)
+    return np.array(rows.friction[:, COLUMNS.index('Stribeck')])
+
+
+def _elastic(rows: Rows, model: SerialChain, G: Floats, values: Floats) -> Floats:
+    """Return what the links' torque (R, n, n) changes by if joints give way.
+
+    The link of a joint is at  q - s / K  if its motor is at q and transmits the torque s.
+    Every hundredth of a second is enough: these columns are smooth.
+    """
+    n = rows.speed.size
+    links = values.copy()
+    parts(links).terms[ROTOR_INERTIA] = 0.0
+    theta = (G @ links)[:-1]
+    P = theta[: rows.p]
+    P_loaded = P + rows.load @ theta[-LOAD:]
+    transmitted = _transmitted(rows, values)
+    twist = _TWIST / np.maximum(rows.largest_torque, _TINY)
+    g, slope = weighting(rows.every * rows.period)
+    regressors = np.zeros((2, n, rows.p))
+    found = np.zeros((rows.starts.size, n, n))
+    for block, samples in rows.in_blocks():
+        starts = np.round((rows.starts[block] - samples.start) / rows.every)
+        q, dq, s = (
+            each[samples][:: rows.every] for each in (rows.q, rows.dq, transmitted)
+        )
+        starts = np.minimum(starts, len(q) - g.size).astype(np.intp)
+
+        P_of = np.where(rows.time[block, None] < rows.loaded, P, P_loaded)
+
+        def torque(
+            q: Floats, dq: Floats, starts: Indices = starts, P_of: Floats = P_of
+        ) -> Floats:
+            X = np.zeros((starts.size, n, rows.p))
+            add_windows(model, q, dq, g, slope, starts, regressors, X)
+            return np.asarray(np.einsum('kip,kp->ki', X, P_of))
+
+        rigid = torque(q, dq)
+        for j in range(n):
+            step = np.zeros(n)
+            step[j] = _STEP * twist[j]
+            off = torque(q - step * s[:, :n], dq - step * s[:, n:])
+            found[block, :, j] = (off - rigid) / _STEP
+    return found
+
+
+def _transmitted(rows: Rows, values: Floats) -> OnDisk:
+    """Return the torque that each joint transmits to its link, and its rate (N, 2 n)."""
+    from scipy.signal import savgol_filter
+
+    h = rows.period
+    width = smoothing_width(h)
+    terms = parts(values).terms
+
+    def found(at: slice) -> Floats:
+        first = max(at.start - width, 0)
+        wide = slice(first, at.stop + width)
+        dq = rows.dq[wide]
+        torque = savgol_filter(rows.torque[wide], width, 3, axis=0)
+        torque -= terms[ROTOR_INERTIA] * np.gradient(dq, h, axis=0)
+        torque -= terms[VISCOUS] * dq + terms[COULOMB] * rows.sliding[wide]
+        torque -= terms[OFFSET]
+        both = np.hstack((torque, np.gradient(torque, h, axis=0)))
+        return both[at.start - first : at.stop - first]
+
+    return mapped(len(rows.q), found)
