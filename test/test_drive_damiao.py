@@ -139,6 +139,10 @@ def test_at_the_end_the_motors_hold_or_are_disabled(made, feedback):
     # rad: it rests as far as velocities in steps of 22 mrad/s show, and may creep on
     assert np.abs(driver.positions() - before).max() < 0.03
     assert set(driver.motors.status) == {Status.ENABLED}
+    held = driver.motors.frame
+    np.testing.assert_allclose(held.stiffness, 10.0 * held.damping, atol=0.2)  # steps
+    np.testing.assert_allclose(held.velocity, 0.0, atol=0.03)
+    assert (held.damping > 0.1).all()
 
 
 def test_at_the_end_the_motors_are_disabled_where_that_is_wanted(made):

@@ -12,7 +12,9 @@ from fault_table import Rig
 
 from blf_dsc_controller.control.motion_input import MotionInput
 from blf_dsc_controller.messages.codecs import Float64MultiArrayEncoder
+from blf_dsc_controller.reference.trajectory import Trajectory, TrajectoryPoint
 
+AT_REST = np.array([1.85, 1.6])  # rad
 FIRST = np.array([1.9, 1.4])  # rad
 STEP = np.array([0.004, -0.004])  # rad in 20 ms, 0.2 rad/s
 
@@ -72,3 +74,29 @@ def test_sender_is_followed_again_once_it_has_paused_or_after_a_reset(rig):
     assert rig.guard.time == 0.0  # before the stop, by the clock of the law
     stream(rig, 5)
     assert rig.inputs.targets == 15
+
+
+def test_a_plan_that_is_ready_too_late_is_made_again_for_twice_as_long_ahead(rig):
+    """Of a busy computer: planning took longer than the lead."""
+    inputs = MotionInput(2, lambda: rig.guard, lambda _: True, Quiet())
+    reports = []
+    made = []
+
+    def make():
+        made.append(rig.guard.time)
+        return Trajectory(('joint1', 'joint2'), (TrajectoryPoint(2.0, tuple(AT_REST)),))
+
+    inputs.follow(
+        rig.guard, make, 'a test', lambda _: None, lambda *given: reports.append(given)
+    )
+    inputs.job.plan.result()
+    rig.step(30)  # 30 ms, of a lead of 20 ms
+    inputs.poll(rig.guard)
+    assert not reports
+    inputs.job.plan.result()
+    rig.step(30)
+    inputs.poll(rig.guard)
+    ((plan, reason),) = reports
+    assert not reason
+    assert len(made) == 2
+    assert plan.at == pytest.approx(rig.guard.time + 0.01)

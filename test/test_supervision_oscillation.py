@@ -16,6 +16,7 @@ from blf_dsc_controller.law.factory import controller_of
 from blf_dsc_controller.law.torque import RATE_CUT
 from blf_dsc_controller.replay.verify import verify
 from blf_dsc_controller.simulation.loop import START, simulate, write_bag
+from blf_dsc_controller.supervision import calming
 from blf_dsc_controller.supervision.calming import Calming
 from blf_dsc_controller.supervision.guard import Guard
 from blf_dsc_controller.supervision.stop_cause import StopCause
@@ -226,3 +227,31 @@ def test_chatter_of_coarse_encoders_is_not_taken_for_brakes():
     coarse = {'sensor.velocity': 'differenced', 'duration': 3.0}
     loop = load_loop('openarm', {PLANT: coarse})
     assert simulate(loop.controller, loop.plant).run().stops == ()
+
+
+@pytest.mark.parametrize('preset', ['panda', 'panda_rigid'])
+def test_rates_are_softened_by_the_share_and_stiffnesses_by_its_square(preset):
+    """`panda` has gains of joints and a load observer, `panda_rigid` a damping rate."""
+    before = controller_of(load_loop(preset).controller).settings
+    after = calming.softened(before, 0.5)
+    pairs = {
+        0.5: (
+            lambda of: of.robust_gain,
+            lambda of: of.surface.gain,
+            lambda of: of.surface.mu,
+            lambda of: of.feedback.gain,
+            lambda of: of.feedback.robust_gain,
+            lambda of: of.feedback.damping_rate,
+            lambda of: of.observer.observer_bandwidth,
+        ),
+        0.25: (
+            lambda of: of.barrier.weight,
+            lambda of: of.barrier.slope_limit,
+            lambda of: of.disturbance.gain,
+        ),
+    }
+    for share, fields in pairs.items():
+        for field in fields:
+            np.testing.assert_allclose(field(after), share * np.array(field(before)))
+    assert np.all(before.surface.gain > 0.0)
+    assert np.all(before.disturbance.gain > 0.0)
