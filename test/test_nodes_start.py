@@ -147,8 +147,14 @@ def test_torques_of_the_watchdog_do_not_count_as_those_of_another_controller(ros
 
     ros.until(go_on)
     assert not law.finished
-    ros.until(lambda: journal and decode(journal[-1]).type is EventType.START)
-    before = decode(journal[-2])
+
+    def starts():
+        return [
+            k for k, raw in enumerate(journal) if decode(raw).type is EventType.START
+        ]
+
+    ros.until(starts)
+    before = decode(journal[starts()[0] - 1])
     assert before.type is EventType.TAKEOVER
     assert before.content['torque'] == [1.0, 1.0]
 
