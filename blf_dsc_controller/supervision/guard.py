@@ -52,7 +52,6 @@ from blf_dsc_controller.supervision.drive_load import DriveLoad, DriveLoads
 from blf_dsc_controller.supervision.first_torque import check_first_torque
 from blf_dsc_controller.supervision.held_torque import HeldTorque
 from blf_dsc_controller.supervision.last_state import LastState
-from blf_dsc_controller.supervision.model_torque import needed_torque
 from blf_dsc_controller.supervision.plan import Plan, plan_motion
 from blf_dsc_controller.supervision.recent_motion import is_gap
 from blf_dsc_controller.supervision.safe_torque import SafeTorque
@@ -509,10 +508,9 @@ class Guard:
         """Let the law begin with the torque that another node holds the arm by, if any."""
         if self._acting is None:
             return
-        law, estimate = self.controller, self.samples.estimate
-        at_rest = np.zeros((2, self._n))
-        load = self._acting - needed_torque(law.settings, estimate, q, *at_rest)
+        law = self.controller
         integrates = law.settings.disturbance.gain > 0.0
+        load = self._held.load_of(self._acting, q)
         law.state.disturbance[integrates] = load[integrates]
         law.take_over(self._acting, q)
 

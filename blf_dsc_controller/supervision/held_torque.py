@@ -60,11 +60,14 @@ class HeldTorque:
 
         Where these are too few, it is the disturbance estimate of the law.
         """
-        settings, estimate = self._controller.settings, self._samples.estimate
         held = self.command()
         if held is not None and self.after_gap is not None:
-            at_rest = np.zeros((2, held.size))
-            q = self.after_gap[: held.size]
-            return held - needed_torque(settings, estimate, q, *at_rest)
-        load = self.recent.load(settings, estimate)
+            return self.load_of(held, self.after_gap[: held.size])
+        load = self.recent.load(self._controller.settings, self._samples.estimate)
         return self._samples.disturbance if load is None else load
+
+    def load_of(self, command: Vector, q: Vector) -> Vector:
+        """Return what a command (n,) [N m] carries besides the model, at rest at q (n,) [rad]."""
+        at_rest = np.zeros((2, q.size))
+        estimate = self._samples.estimate
+        return command - needed_torque(self._controller.settings, estimate, q, *at_rest)
