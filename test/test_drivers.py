@@ -66,7 +66,9 @@ FACTS = {
 def fences():
     """Blocks of code of the pages on real arms."""
     pages = ('franka', 'ur5e', 'motor_arms', 'real_arm')
-    text = '\n'.join((CONFIG.parent / 'doc' / f'{page}.md').read_text() for page in pages)
+    text = '\n'.join(
+        (CONFIG.parent / 'doc' / f'{page}.md').read_text() for page in pages
+    )
     return [block for block in MarkdownIt().parse(text) if block.type == 'fence']
 
 
