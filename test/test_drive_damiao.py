@@ -99,7 +99,7 @@ def of_yam():
 
 def of_page():
     """The file of the page: LeRobot's gains, and a posture to hold."""
-    page = MarkdownIt().parse(Path('doc/real_arm.md').read_text())
+    page = MarkdownIt().parse(Path('doc/motor_arms.md').read_text())
     texts = [block.content for block in page if block.info == 'yaml']
     (text,) = [text for text in texts if 'driver: damiao' in text]
     return text

@@ -64,9 +64,12 @@ FACTS = {
 
 
 def fences():
-    """Blocks of code of the page on real arms."""
-    page = MarkdownIt().parse((CONFIG.parent / 'doc' / 'real_arm.md').read_text())
-    return [block for block in page if block.type == 'fence']
+    """Blocks of code of the pages on real arms."""
+    pages = ('franka', 'ur5e', 'motor_arms', 'real_arm')
+    text = '\n'.join(
+        (CONFIG.parent / 'doc' / f'{page}.md').read_text() for page in pages
+    )
+    return [block for block in MarkdownIt().parse(text) if block.type == 'fence']
 
 
 ROBOTS = pytest.mark.parametrize('robot', FACTS)

@@ -10,6 +10,7 @@ pytest.importorskip('ruckig', reason='needs ruckig')
 
 from fault_table import Rig
 
+from blf_dsc_controller.configuration.schema import change
 from blf_dsc_controller.control.motion_input import MotionInput
 from blf_dsc_controller.messages.codecs import Float64MultiArrayEncoder
 from blf_dsc_controller.reference.trajectory import Trajectory, TrajectoryPoint
@@ -100,3 +101,86 @@ def test_a_plan_that_is_ready_too_late_is_made_again_for_twice_as_long_ahead(rig
     assert not reason
     assert len(made) == 2
     assert plan.at == pytest.approx(rig.guard.time + 0.01)
+
+
+def moved(rig, seconds):
+    """Step the arm; return the state of its reference (k, 3, 2) at each sample."""
+    seen = []
+    for _ in range(round(1000 * seconds)):
+        rig.step()
+        seen.append(rig.guard.controller.reference_at(rig.guard.time))
+    return np.array(seen)
+
+
+def go_to(rig, positions, time=0.05):
+    """Send a trajectory of one point that is too near in time."""
+    point = TrajectoryPoint(time, tuple(positions))
+    made = Trajectory(('joint1', 'joint2'), (point,))
+    reports = []
+    rig.inputs.follow(
+        rig.guard,
+        lambda: made,
+        'a test',
+        lambda _: None,
+        lambda *given: reports.append(given),
+    )
+    ((plan, reason),) = reports
+    assert plan is not None, reason
+
+
+@pytest.mark.parametrize('scale', [1.0, 0.25])
+def test_motions_that_are_sent_use_their_share_of_the_limits(rig, scale):
+    rig.guard.retune(change(rig.config, {'limits.scale': scale}))
+    rig.inputs.take_stop()
+    moved(rig, 1.0)
+    q = rig.guard.controller.reference_at(rig.guard.time)[0]
+    limits = rig.config.limits
+    largest = scale * np.array((limits.velocity, limits.acceleration))
+    for target in (q + np.array([0.9, -0.9]), q):
+        go_to(rig, target)
+        seen = np.abs(moved(rig, 3.5))
+        peaks = seen[:, 1:].max(axis=0)
+        assert (peaks <= largest * (1.0 + 1e-6)).all()
+        assert (peaks > 0.98 * largest).all()
+        np.testing.assert_allclose(seen[-1, 0], np.abs(target), atol=1e-9)
+
+
+def test_stream_that_is_faster_than_its_share_is_followed_at_that(rig):
+    rig.guard.retune(change(rig.config, {'limits.scale': 0.1}))
+    rig.inputs.take_stop()
+    moved(rig, 1.0)
+    q = rig.guard.controller.reference_at(rig.guard.time)[0]
+    fastest = 0.1 * np.array(rig.config.limits.velocity)
+    for k in range(1, 40):  # 0.6 rad/s
+        target = q + 0.012 * k
+        rig.inputs.take_positions(Float64MultiArrayEncoder(2).encode(target))
+        speeds = np.abs(moved(rig, 0.02)[:, 1])
+        assert (speeds <= fastest * (1.0 + 1e-6)).all()
+    assert (speeds > 0.98 * fastest).all()
+
+
+@pytest.mark.parametrize(
+    ('time', 'scale', 'far'),
+    [(0.1, 0.05, 1.0), (0.2, 0.3, 1.7), (0.6, 0.3, 0.0), (1.15, 0.05, 1.7)],
+)
+def test_motion_sent_while_the_reference_is_faster_is_not_rejected(
+    rig, scale, far, time
+):
+    """It keeps at most the speed that it begins with; the next one has its share."""
+    rig.inputs.take_stop()
+    moved(rig, 1.0)
+    q = rig.guard.controller.reference_at(rig.guard.time)[0]
+    go_to(rig, q + np.array([1.5, -1.5]))
+    _, dq, ddq = moved(rig, time)[-1]
+    rig.guard.retune(change(rig.config, {'limits.scale': scale}))
+    go_to(rig, q + far * np.array([1.0, -1.0]))
+    seen = np.abs(moved(rig, 1.5)[:, 1])
+    limits = rig.config.limits
+    allowed = scale * np.array(limits.velocity)
+    gained = 0.5 * ddq * np.abs(ddq) / (scale * np.array(limits.largest_jerk))
+    begun = np.maximum(np.abs(dq), np.abs(dq + gained))
+    assert (seen <= np.maximum(allowed, begun) * (1.0 + 1e-6)).all()
+    rig.inputs.take_stop()
+    moved(rig, 1.0)
+    go_to(rig, q)
+    assert (np.abs(moved(rig, 0.5)[:, 1]) <= allowed * (1.0 + 1e-6)).all()

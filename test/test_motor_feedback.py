@@ -163,7 +163,7 @@ def test_motors_hold_elastic_gears_that_the_host_cannot_hold():
 def test_yam_of_the_preset_takes_up_its_rated_payload_with_the_gains_of_its_maker(
     physics,
 ):
-    """20 s, 1 kg at 8 s: doc/real_arm.md.  Play of 15 minutes of arc, frames of 0.38 mrad."""
+    """20 s, 1 kg at 8 s: doc/motor_arms.md.  Play of 15 minutes of arc, frames of 0.38 mrad."""
     if physics == 'mujoco':
         pytest.importorskip('mujoco', reason='needs MuJoCo: pip install mujoco')
     config = load(locate('yam'), DRIVE, DriveConfig)

@@ -229,7 +229,7 @@ def test_closed_loop_runs_the_same_with_both_plants():
     ],
 )
 def test_errors_with_dry_friction_are_as_documented(name, settled, peak):
-    """In mrad, from 8 s on and when 2 kg are picked up at 20 s: doc/arms.md.
+    """In mrad, from 8 s on and when 2 kg are picked up at 20 s: doc/gains.md.
 
     Below these, and not far below: dry friction amplifies last digits, so that other releases of
     the libraries give 9 % more.

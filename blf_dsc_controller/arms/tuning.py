@@ -10,7 +10,7 @@ of the inertia of each joint with the others free, m_i = 1 / (M^-1)_ii, minimise
 several postures; the law multiplies what acts on errors by M(q, P^(0)) / m. Three
 samples: half a sample for which torques are held, one until they are applied, half a
 sample of differenced velocities, and one for the surface filter and alpha2', so that
-gain margins are alike at 1 kHz and 250 Hz (doc/arms.md: margins).
+gain margins are alike at 1 kHz and 250 Hz (doc/gains.md: margins).
 
 Errors of the modelled gravity, including the rated payload, make a joint sag at the
 start until the disturbance estimate compensates them. If it sags by more than the

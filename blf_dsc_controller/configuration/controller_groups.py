@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from itertools import pairwise
 from typing import Annotated, Literal
@@ -44,6 +44,7 @@ _measured = partial(parameter, read_only='it says how the gains were found')
 _FOLLOWED = 'the other gains follow from it when they are read: change those'
 _from_urdf = partial(non_negative, (), read_only=_FOLLOWED, omittable=True)
 _RISE = 0.05  # s to the largest acceleration
+_ROUNDING = 1.0 + 1e-9
 # per window: fewer do not determine P, more need over 100 MB
 _SAMPLES = (10, 1_000_000)
 
@@ -134,11 +135,40 @@ class MotionLimits:
         'rad/s^3',
         omittable=True,
     )
+    scale: float = positive(
+        1.0,
+        'share of the largest velocity, acceleration and jerk that motions which are sent '
+        'may use; starts and stops have all of it',
+        at_most=1.0,
+    )
 
     @property
     def largest_jerk(self) -> tuple[float, ...]:
         """The jerk as given, or that which reaches the acceleration in `_RISE`."""
         return self.jerk or tuple(each / _RISE for each in self.acceleration)
+
+    def scaled(self, state: np.ndarray) -> MotionLimits:
+        """Return the limits of a motion that is sent while the reference has this state (3, n).
+
+        They are `scale` of these. A joint that is faster already may keep its speed, and has all
+        of its acceleration and jerk to slow down.
+        """
+        _, dq, ddq = np.abs(state)
+        speed, change, jerk = np.array(
+            (self.velocity, self.acceleration, self.largest_jerk)
+        )
+        # the speed goes on to change while the acceleration falls to zero
+        reached = np.abs(state[1] + 0.5 * state[2] * ddq / (self.scale * jerk))
+        reached = _ROUNDING * np.maximum(dq, reached)
+        is_faster = (reached > self.scale * speed) | (ddq > self.scale * change)
+        share = np.where(is_faster, 1.0, self.scale)
+        speed = np.clip(reached, self.scale * speed, speed)
+        return replace(
+            self,
+            velocity=tuple(speed.tolist()),
+            acceleration=tuple((share * change).tolist()),
+            jerk=tuple((share * jerk).tolist()),
+        )
 
     def problems(self, joints: tuple[str, ...]) -> list[str]:
         """Check that the position limits leave a range."""

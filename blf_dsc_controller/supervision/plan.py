@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -14,6 +15,7 @@ from blf_dsc_controller.reference.retargeting import (
     Target,
     TrajectoryError,
     plan_target,
+    state_at,
 )
 from blf_dsc_controller.reference.trajectory import Trajectory, plan_trajectory
 
@@ -55,9 +57,12 @@ def plan_motion(
 ) -> Plan:
     """Return the plan that continues a packed reference from the time `at` [s] on.
 
+    It uses `limits.scale` of the limits.
+
     Raises:
         TrajectoryError: it cannot be followed.
     """
+    config = _scaled(config, command, before, at)
     if isinstance(command, Trajectory):
         motion = plan_trajectory(command, before, at, config)
         joints, points, begin = command
@@ -67,3 +72,19 @@ def plan_motion(
         motion = plan_target(command, before, at, config)
         content = {**command._asdict(), 'at': at}
     return Plan(command, at, before, motion, content)
+
+
+def _scaled(
+    config: ControllerConfig,
+    command: Trajectory | Target,
+    before: np.ndarray,
+    at: float,
+) -> ControllerConfig:
+    """Return the configuration with the limits of a motion that begins then."""
+    if config.limits.scale == 1.0:
+        return config
+    begin = at
+    if isinstance(command, Trajectory) and command.begin is not None:
+        begin = max(at, command.begin)
+    limits = config.limits.scaled(state_at(before, begin))
+    return replace(config, limits=limits)
