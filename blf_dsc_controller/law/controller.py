@@ -17,7 +17,14 @@ from blf_dsc_controller.compiled.entry import Entry
 from blf_dsc_controller.compiled.jit import direct, inner, kernel
 from blf_dsc_controller.compiled.layout import Array, pack
 from blf_dsc_controller.errors import BlfDscError
-from blf_dsc_controller.law import barrier, friction, oscillation, repeats, torque
+from blf_dsc_controller.law import (
+    barrier,
+    friction,
+    oscillation,
+    repeats,
+    torque,
+    torque_sensors,
+)
 from blf_dsc_controller.law.check_state import (
     CONTRADICTION,
     INVALID,
@@ -160,7 +167,7 @@ def step(
     if is_checked and state.sensors.fault[0] != fault:
         flags |= NOT_SENSORS
         oscillation.forget_all(checks.oscillation)  # r may have been the cause
-    elif oscillates:
+    elif oscillates and not torque_sensors.is_fading(state.observer.faded):
         flags |= OSCILLATES
     return flags
 

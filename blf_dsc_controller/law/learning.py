@@ -188,12 +188,12 @@ def check_sensors(
     if begins:
         torque_sensors.begin(now, of.torque)
     torque_sensors.watch_shaking(now, work, limit, of.torque, dt)
-    torque_sensors.compare_with_commands(now, work, signals.dqr, begins, dt)
+    if settings.observer.most[0] > 0.0:  # else a load is left out of r
+        torque_sensors.compare_with_commands(now, work, signals.dqr, begins, dt)
     is_off = torque_sensors.follow_commands(
         now, work, limit, signals.dq, signals.dqr, dt
     )
-    is_doubted = is_off or now.fault[0] != torque_sensors.NONE
-    torque_sensors.fade(of.faded, is_doubted, dt)
+    torque_sensors.fade(now, of.faded, is_off, dt)
 
 
 @inner

@@ -143,7 +143,8 @@ def load_torque(settings: Settings, state: State, i: int, estimate: Array) -> fl
     r = residual(settings, state, i, estimate) - state.bias[i]
     usual = _THRESHOLD * sqrt(state.square[i])
     most = settings.most[i]
-    return (1.0 - state.faded[0]) * clip(r - clip(r, -usual, usual), -most, most)
+    share = 1.0 - state.faded[0]
+    return float(share * clip(r - clip(r, -usual, usual), -most, most))
 
 
 @inner

@@ -14,8 +14,7 @@ and k and D those of a gear,
     y is of the motor:     tau_J = M_l s^2 y (D s + k) / (M_l s^2 + D s + k)
                                              the gear's resonance, with M_l behind it
 
-are stable only with an L of some rad/s, where r is of no use.  So r is left out, within
-`_FADE`, once and for all, where
+are stable only with an L of some rad/s, where r is of no use.  So r fades out for good where
 
 - *it shakes*: what r adds oscillates (`oscillation`, of r instead of the error).
 - *efforts are commands*: in the first motion, efforts behind the filter L are within a
@@ -45,6 +44,8 @@ NONE, SHAKES, COMMANDS, OFF = range(4)
 """What is wrong with the efforts, if anything."""
 
 _FADE = 0.02  # s, time constant with which r is left out or comes back
+_SHAKEN = 0.005  # s, likewise of one that shakes: it may grow threefold in 10 ms
+_NOTHING = 1e-6  # of r
 _SLOWEST = 0.5  # Hz
 _EQUAL = 0.02
 _DISTINCT = 0.1
@@ -201,10 +202,18 @@ def follow_commands(
 
 
 @inner
-def fade(faded: Array, is_doubted: bool, dt: float) -> None:
-    """Leave more of r out where it `is_doubted`, or less; zero stays zero."""
+def fade(state: State, faded: Array, is_off: bool, dt: float) -> None:
+    """Leave more of r out where the efforts are in doubt, or less; zero stays zero."""
+    is_doubted = is_off or state.fault[0] != NONE
     aim = 1.0 if is_doubted else 0.0
+    time_constant = _SHAKEN if state.fault[0] == SHAKES else _FADE
     if faded[0] != aim:
-        faded[0] += filter_gain(_FADE, dt) * (aim - faded[0])
-        if abs(faded[0] - aim) < 1e-6:  # noqa: PLR2004 - of r, nothing
+        faded[0] += filter_gain(time_constant, dt) * (aim - faded[0])
+        if abs(faded[0] - aim) < _NOTHING:
             faded[0] = aim
+
+
+@inner
+def is_fading(faded: Array) -> bool:
+    """Whether some of r is left out, and not all yet."""
+    return bool(0.0 < faded[0] < 1.0)

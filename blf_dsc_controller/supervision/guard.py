@@ -905,6 +905,7 @@ class Guard:
     def _start_over(self) -> None:
         self.supervisor.enter(Phase.STARTING)
         self.calming.restart()
+        self.untrusted = not_sensors.text_of(self.controller, self.config.joints)
         self.states.restart()
         self.samples.restart()
         self.start_error = None

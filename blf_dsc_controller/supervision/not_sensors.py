@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from blf_dsc_controller.law.controller import Controller
 from blf_dsc_controller.law.torque_sensors import COMMANDS, NONE, OFF, SHAKES
 
-_ALONE = 'the load observer is off, the law goes on without it'
+_ALONE = 'the load observer is off, and the law goes on without it'
 _TEXTS = {
     SHAKES: (
         'joint {joint!r} shakes by the load observer: efforts are not those of joint torque '
