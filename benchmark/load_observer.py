@@ -4,6 +4,8 @@
     python benchmark/load_observer.py margins
     python benchmark/load_observer.py loops
     python benchmark/load_observer.py pairs [--runs 20]
+    python benchmark/load_observer.py declarations
+    python benchmark/load_observer.py sensors
 
 `margins`: of the linear loop with gears, drives with a torque loop, and the load observer at a
 bandwidth, the worst over postures along the reference, gears of the preset's stiffness and
@@ -22,6 +24,13 @@ the same observer by torque sensors.
 `pairs`: random arms of the study `monte_carlo_elastic_*`, each with and without observer.
 Besides, their sensors have offsets, friction changes, and something pushes them.  A row has
 the ratios of both runs: rms and largest error, in motion (4 to 8 s) and afterwards.
+
+`declarations`: of `margins`, arms that are as declared; whose encoders are at the motors; and
+whose efforts are commands, with and without a torque loop.  A cell has in how many of the
+cases (postures, gears, links) the linear loop with an observer at a bandwidth is unstable.
+
+`sensors`: the arms of `loops` with sensors that fail at 3 s.  A row has the largest error
+[mrad] afterwards, and what is said, after how long.
 """
 
 from __future__ import annotations
@@ -55,11 +64,13 @@ from blf_dsc_controller.configuration.robot import parameters_of
 from blf_dsc_controller.configuration.schema import change
 from blf_dsc_controller.law.factory import begin, controller_of, settings_of_config
 from blf_dsc_controller.law.telemetry import sample_columns
+from blf_dsc_controller.messages.journal import EventType
 from blf_dsc_controller.reference.approach import reference_of
 from blf_dsc_controller.reference.terms import sampled
 from blf_dsc_controller.simulation.loop import Record, simulate
 from blf_dsc_controller.studies.monte_carlo import draw, load_study, plant_with
 from blf_dsc_controller.supervision.expected_errors import linear_feedback
+from blf_dsc_controller.supervision.guard import Guard
 from sim_plant.plant import plant_of
 
 PRESETS = ('panda', 'fr3_direct', 'fr3')
@@ -366,10 +377,144 @@ def pairs(runs: int) -> Iterator[list[str]]:
             yield [study, name, 'ratios', *(f'{each:.2f}' for each in ratios)]
 
 
+DECLARATIONS = {
+    'as declared': (False, {'torque_loop': TorqueLoop()}),
+    'encoders at the motors': (
+        False,
+        {'torque_loop': TorqueLoop(), 'motor_side': True},
+    ),
+    'efforts are commands, torque loop': (True, {'torque_loop': TorqueLoop()}),
+    'efforts are commands, no torque loop': (True, {}),
+}
+SLOW_TO_FAST = (2.0, 5.0, 10.0, 20.0, 30.0, 60.0, 100.0)  # rad/s
+FINE = np.concatenate((np.geomspace(0.02, 5.0, 150), np.geomspace(5.05, 499.0, 1200)))
+
+
+def encircles(
+    preset: LinearLoop, M: np.ndarray, joints: Joints, bandwidth: float, *, echo: bool
+) -> np.ndarray:
+    """Return whether the observer makes the loop unstable in each posture (k,).
+
+    The loop is stable without it, so that det(I - T) has to encircle 0 for that, T being
+    that from r to r.  Efforts are commands, an `echo`, or the torques at the links.
+    """
+    config = preset.loop.controller
+    settings = settings_of_config(config)
+    T, lag = config.sample_time, 0.5 * config.robot.lag
+    timing = Timing(T, drive_lag=lag, velocity_lag=lag)
+    s = np.asarray(2j * np.pi * FINE, complex)
+    z = np.exp(T * s)
+    pole, old = 1.0 - np.exp(-bandwidth * T), np.exp(-T / lag)
+    passed = pole / (1.0 - (1.0 - pole) / z) * (1.0 - old) / (1.0 - old / z)
+    difference = (1.0 - 1.0 / z) / T
+    feedback = linear_feedback(settings, preset.assumed, settings.barrier.weight)
+    G, C = arm_response(M, joints, timing, s), law_response(feedback, timing, s)
+    one = np.eye(len(joints.motors))
+    expected = (passed * difference**2)[:, None, None] * preset.assumed[:, None] @ G
+    if echo:
+        held = np.exp(-timing.delay * T * s) / (1.0 + lag * s) * difference / s
+        sensed = (passed * held)[:, None, None] * one
+    else:
+        of_links = arm_response(M, joints._replace(motor_side=False), timing, s)
+        sensed = (passed * difference * s)[:, None, None] * M[:, None] @ of_links
+    around = np.linalg.inv(one + C @ G) @ (sensed - expected)
+    phase = np.unwrap(np.angle(np.linalg.det(one - around)), axis=1)
+    return np.asarray(np.abs(phase[:, -1] - phase[:, 0]) > 0.8 * np.pi)
+
+
+def declarations() -> Iterator[list[str]]:
+    """Compute the rows of arms that are not what is declared."""
+    for name, (label, (echo, changes)) in itertools.product(
+        PRESETS[:2], DECLARATIONS.items()
+    ):
+        preset = linear(name)
+        gears = np.array(preset.loop.plant.joint.stiffness)
+        cells = []
+        for bandwidth in SLOW_TO_FAST:
+            found = [
+                encircles(
+                    preset,
+                    share * preset.assumed,
+                    Joints(MOTORS, VISCOUS, K * gears, 0.03, **changes),
+                    bandwidth,
+                    echo=echo,
+                )
+                for share, K in itertools.product(LINKS, STIFFNESS)
+            ]
+            cells.append(f'{np.sum(found)} of {np.size(found)}')
+        yield [name, label, *cells]
+
+
+FAILS = 3.0  # s
+AFTER_FAILURE = 3.0  # s
+START = 1_000_000_000  # ns
+
+
+class Failure(NamedTuple):
+    """What is read instead of the torque: gain and offset [N m] of one or all joints."""
+
+    gain: float
+    offset: float = 0.0
+    joints: slice = slice(None)
+    is_stuck: bool = False
+
+    def read(self, torque: np.ndarray, before: np.ndarray) -> np.ndarray:
+        """Return what is read (n,) instead of a torque; `before` is the last that was right."""
+        wrong = np.array(torque)
+        source = before if self.is_stuck else torque
+        wrong[self.joints] = self.gain * source[self.joints] + self.offset
+        return wrong
+
+
+SECOND = slice(1, 2)
+FAILURES = {
+    'nothing': Failure(1.0),
+    'joint 2 stuck': Failure(1.0, joints=SECOND, is_stuck=True),
+    'joint 2 zero': Failure(0.0, joints=SECOND),
+    'joint 2 of the wrong sign': Failure(-1.0, joints=SECOND),
+    'joint 2, 5 N m more': Failure(1.0, 5.0, SECOND),
+    'joint 2, 15 N m more': Failure(1.0, 15.0, SECOND),
+    'all stuck': Failure(1.0, is_stuck=True),
+    'all zero': Failure(0.0),
+    'all of the wrong sign': Failure(-1.0),
+    'all a tenth': Failure(0.1),
+    'all in N mm': Failure(1000.0),
+}
+
+
+def failed(preset: str, failure: str) -> list[str]:
+    """Return what happens to an arm whose sensors fail."""
+    loop = load_loop(preset, {PLANT: {'duration': FAILS + AFTER_FAILURE}})
+    arm, guard = plant_of(loop.plant), Guard(loop.controller)
+    guard.activate()
+    n, period = len(loop.controller.joints), loop.plant.sample_time_ns
+    largest, before = 0.0, np.zeros(n)
+    for k in range(round((FAILS + AFTER_FAILURE) / (1e-9 * period))):
+        measurement = np.array(arm.measure())
+        if 1e-9 * k * period < FAILS:
+            before[:] = measurement[2 * n :]
+        else:
+            effort = FAILURES[failure].read(measurement[2 * n :], before)
+            measurement[2 * n :] = effort
+            largest = max(largest, np.abs(guard.controller.sample.xi1).max())
+        torque = guard.update(START + k * period, measurement)
+        if torque is None or not guard.supervisor.running:
+            break
+        arm.step(torque)
+    kinds = EventType.TORQUE_SENSORS, EventType.STOP
+    said = [
+        f'{1e-9 * (each.stamp - START) - FAILS:.3f} s: {each.content["text"][:60]}'
+        for each in guard.journal.pending
+        if each.type in kinds
+    ]
+    return [preset, failure, f'{1e3 * largest:.2f}', '; '.join(said)]
+
+
 def main() -> None:
     """Print the table that was asked for."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument('table', choices=('margins', 'loops', 'pairs'))
+    tables = 'margins', 'loops', 'pairs', 'declarations', 'sensors'
+    parser.add_argument('table', choices=tables)
     parser.add_argument('--runs', type=int, default=20, help='arms of each study')
     given = parser.parse_args()
     if given.table == 'margins':
@@ -377,6 +522,13 @@ def main() -> None:
     elif given.table == 'loops':
         heads = ['arm', 'law', 'in motion', 'pick-up', 'later', 'weight known after']
         print_table(heads, loops())
+    elif given.table == 'declarations':
+        heads = ['arm', 'it is', *(f'{L:g} rad/s' for L in SLOW_TO_FAST)]
+        print_table(heads, declarations())
+    elif given.table == 'sensors':
+        heads = ['arm', 'fails', 'largest error', 'said']
+        rows = (failed(*each) for each in itertools.product(('panda', 'fr3'), FAILURES))
+        print_table(heads, rows)
     else:
         of_spans = [f'{each}, {span}' for span in SPANS for each in ('rms', 'largest')]
         print_table(['study', 'arm', 'events', *of_spans], pairs(given.runs))

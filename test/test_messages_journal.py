@@ -52,6 +52,7 @@ EXAMPLES = {
         'share': 0.5,
         'text': 'joint1 oscillates',
     },
+    'torque sensors': {'joint': 'joint1', 'text': 'the efforts are commands'},
     'stop': {'reason': 'failed', 'text': ''},
     'silence': {'torques': 3},
     'deactivate': {},

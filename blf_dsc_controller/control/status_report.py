@@ -110,6 +110,7 @@ class StatusReport:
             'last oscillation': guard.calming.last.text
             if guard.calming.last
             else 'none',
+            'torque sensors': guard.untrusted or 'none or as configured',
             **(self.trajectories.values if self.trajectories else {}),
         }
         level = WARN
@@ -123,6 +124,8 @@ class StatusReport:
             message = 'the error has left its bound'
         elif guard.calming.is_due(guard.time):
             message = guard.calming.text
+        elif guard.untrusted:
+            message = guard.untrusted
         elif samples.saturated_time > 0.0:
             message = message.format('')
         elif guard.has_sample and guard.controller.sample.cuts.any():

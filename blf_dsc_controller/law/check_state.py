@@ -28,6 +28,9 @@ CONTRADICTION = 16
 OSCILLATES = 32
 """The arm oscillates: at the beginning, and again and again while it lasts."""
 
+NOT_SENSORS = 64
+"""Efforts have turned out not to be torques of joint sensors: see `torque_sensors`."""
+
 
 class Checks(NamedTuple):
     """Limits of the checks, and the values that they keep from past samples."""

@@ -17,10 +17,18 @@ from blf_dsc_controller.compiled.entry import Entry
 from blf_dsc_controller.compiled.jit import direct, inner, kernel
 from blf_dsc_controller.compiled.layout import Array, pack
 from blf_dsc_controller.errors import BlfDscError
-from blf_dsc_controller.law import barrier, friction, repeats, torque
+from blf_dsc_controller.law import (
+    barrier,
+    friction,
+    oscillation,
+    repeats,
+    torque,
+    torque_sensors,
+)
 from blf_dsc_controller.law.check_state import (
     CONTRADICTION,
     INVALID,
+    NOT_SENSORS,
     OSCILLATES,
     Checks,
     checks_of,
@@ -137,6 +145,7 @@ def step(
     for i in range(n):
         signals.xi1[i] = signals.q[i] - signals.qr[i]
     oscillates = compares and watch_oscillation(settings, checks, signals, begins, dt)
+    fault = state.sensors.fault[0]
     law.compute_demand(settings, state, signals, t, dt)
     saturated = torque.saturate(
         settings.torque,
@@ -155,7 +164,12 @@ def step(
     state.samples[0] += 1.0
     fill_sample(settings, state, signals, sample)
     flags = check_sample(settings, checks, state, signals, sample) if is_checked else 0
-    return flags | OSCILLATES if oscillates else flags
+    if is_checked and state.sensors.fault[0] != fault:
+        flags |= NOT_SENSORS
+        oscillation.forget_all(checks.oscillation)  # r may have been the cause
+    elif oscillates and not torque_sensors.is_fading(state.observer.faded):
+        flags |= OSCILLATES
+    return flags
 
 
 @kernel

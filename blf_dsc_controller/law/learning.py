@@ -6,6 +6,7 @@
 columns, ripple   the columns of what is learned besides P
 prediction        a row [X | u] with X theta = u, of the last interval
 load_observer     the torque that joint torque sensors show and the model lacks
+torque_sensors    whether they are such sensors, and alive
 window            sums of the rows over tau_d
 change            whether the arm has changed, so that the window must be forgotten
 excitation        whether a window is excited, consistent, and latched
@@ -32,6 +33,7 @@ from blf_dsc_controller.law import (
     load_observer,
     prediction,
     ripple,
+    torque_sensors,
     window,
 )
 from blf_dsc_controller.law.compensation import compute_regressors, fill_friction
@@ -150,6 +152,7 @@ def observe_load(settings: Settings, state: State, signals: Signals, dt: float) 
         load_observer.begin(now, state.disturbance)
     if load_observer.is_missing(signals.effort):
         return
+    had_settled = load_observer.has_settled(of, now)
     for i in range(settings.n):
         load_observer.filter_interval(of, now, i, signals.row[i], signals.effort[i], dt)
     load_observer.update(
@@ -162,6 +165,35 @@ def observe_load(settings: Settings, state: State, signals: Signals, dt: float) 
         is_learned and state.frozen[0] == 0.0,
         dt,
     )
+    torque_sensors.follow_applied(
+        state.sensors, signals.row, settings.m, of.observer_bandwidth, dt
+    )
+    if load_observer.has_settled(of, now):
+        check_sensors(settings, state, signals, not had_settled, dt)
+
+
+@inner
+def check_sensors(
+    settings: Settings, state: State, signals: Signals, begins: bool, dt: float
+) -> None:
+    """Leave r out where what is read is not the torque of sensors at the links."""
+    of, now, work = state.observer, state.sensors, signals.sensors
+    limit = settings.torque.limit
+    for i in range(settings.n):
+        work.differences[0, i] = of.filtered[i, settings.p] - now.command[i]
+        if now.is_told[0] == 0.0:
+            work.differences[1, i] = load_observer.residual(
+                settings.observer, of, i, state.estimate
+            )
+    if begins:
+        torque_sensors.begin(now, of.torque)
+    torque_sensors.watch_shaking(now, work, limit, of.torque, dt)
+    if settings.observer.most[0] > 0.0:  # else a load is left out of r
+        torque_sensors.compare_with_commands(now, work, signals.dqr, begins, dt)
+    is_off = torque_sensors.follow_commands(
+        now, work, limit, signals.dq, signals.dqr, dt
+    )
+    torque_sensors.fade(now, of.faded, is_off, dt)
 
 
 @inner

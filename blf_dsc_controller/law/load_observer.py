@@ -81,6 +81,7 @@ class State(NamedTuple):
     # 1: it stays
     keeps_bias: Annotated[Array, 'n * observer.enabled']
     square: Annotated[Array, 'n * observer.enabled']  # s^2, (N m)^2
+    faded: Cell  # share of r that is left out, as the sensors are in doubt
     elapsed: Cell  # s, since the first interval
     measured: Cell  # samples of s^2
 
@@ -90,6 +91,12 @@ class Work(NamedTuple):
 
     factor: Annotated[Array, 'm * observer.enabled', 'm']  # of R
     row: Annotated[Array, 'm * observer.enabled']
+
+
+@inner
+def has_settled(settings: Settings, state: State) -> bool:
+    """Whether the filters have settled, so that r is that of the arm."""
+    return bool(state.elapsed[0] * settings.observer_bandwidth >= _SETTLING)
 
 
 @inner
@@ -131,11 +138,13 @@ def residual(settings: Settings, state: State, i: int, estimate: Array) -> float
 @inner
 def load_torque(settings: Settings, state: State, i: int, estimate: Array) -> float:
     """Return r of joint i [N m] for an `estimate` theta (m,)."""
-    if state.elapsed[0] * settings.observer_bandwidth < _SETTLING:
+    if not has_settled(settings, state):
         return 0.0
     r = residual(settings, state, i, estimate) - state.bias[i]
     usual = _THRESHOLD * sqrt(state.square[i])
-    return clip(r - clip(r, -usual, usual), -settings.most[i], settings.most[i])
+    most = settings.most[i]
+    share = 1.0 - state.faded[0]
+    return float(share * clip(r - clip(r, -usual, usual), -most, most))
 
 
 @inner

@@ -173,6 +173,15 @@ def forget(now: Oscillation, i: int, p: float) -> None:
 
 
 @inner
+def forget_all(now: Oscillation) -> None:
+    """Wait for the next half waves of all joints, from where they are."""
+    now.wait[0] = 0.0
+    for i in range(now.waves.size):
+        forget(now, i, now.farthest[i])
+        now.calm[i] = inf
+
+
+@inner
 def end_half_wave(
     now: Oscillation, i: int, travel: float, is_clear: bool, strong: float
 ) -> None:

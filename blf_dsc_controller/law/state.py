@@ -31,6 +31,7 @@ from blf_dsc_controller.law import (
     prediction,
     surface,
     torque,
+    torque_sensors,
     weighing,
     window,
 )
@@ -93,6 +94,7 @@ class State(NamedTuple):
     saturation: torque.State
     row: prediction.State
     observer: load_observer.State
+    sensors: torque_sensors.State
     latch: excitation.State
     change: change.State
     contact: external_torque.State
@@ -140,6 +142,7 @@ class Signals(NamedTuple):
     barrier: barrier.Work
     saturation: torque.Work
     observer: load_observer.Work
+    sensors: torque_sensors.Work
     window: window.Work
     latch: excitation.Work
     change: change.Work

@@ -161,6 +161,10 @@ SCHEMA: Mapping[str, Mapping[str, Field]] = {
         ),  # of its configured rates that the feedback has from now on
         'text': Field(TEXT),
     },
+    'torque sensors': {
+        'joint': Field(TEXT),  # that shows it most
+        'text': Field(TEXT),
+    },
     'stop': {'reason': Field(TEXT), 'text': Field(TEXT)},
     'silence': {'torques': Field(COUNT)},  # by the watchdog, before the next message
     'deactivate': {},

@@ -47,6 +47,7 @@ class EventType(str, Enum):
     DRIVE_LOAD = 'drive load'  # the drives add the weight of a load from now on
     CONTACT = 'contact'  # something touches the arm
     OSCILLATION = 'oscillation'  # the arm oscillates
+    TORQUE_SENSORS = 'torque sensors'  # efforts are not those of sensors at joints
     STOP = 'stop'
     SILENCE = 'silence'  # of the joint states, in which the watchdog commanded
     DEACTIVATE = 'deactivate'

@@ -62,6 +62,7 @@ class ControllerNode(LoopNode[ControllerConfig]):
         self._columns = b''  # those that are estimated, and whether they were checked
         self._model_changes = 0.0
         self._contacts = self._oscillations = 0
+        self._untrusted = ''  # what was said of the torque sensors
         self._decoder = JointStateDecoder(joints, required=('position',))
         self._encoder = Float64MultiArrayEncoder(len(joints))
         self._polled = 0  # joint states at the last poll
@@ -414,14 +415,22 @@ class ControllerNode(LoopNode[ControllerConfig]):
         if self._watchdog.look(there=there):
             self.get_logger().error(self._watchdog.problem)
 
-    def _log_phase(self, guard: Guard) -> None:
-        supervisor = guard.supervisor
+    def _warn(self, guard: Guard) -> None:
+        """Warn of what has been found since the last call."""
         if guard.contact is not None and guard.contacts != self._contacts:
             self._contacts = guard.contacts
             self.get_logger().warning(guard.contact.text)
         if guard.calming.count != self._oscillations:
             self._oscillations = guard.calming.count
             self.get_logger().warning(guard.calming.text)
+        if guard.untrusted != self._untrusted:
+            self._untrusted = guard.untrusted
+            if guard.untrusted:
+                self.get_logger().warning(guard.untrusted)
+
+    def _log_phase(self, guard: Guard) -> None:
+        supervisor = guard.supervisor
+        self._warn(guard)
         is_stopped = supervisor.phase is Phase.SAFE_STOP  # its text may grow
         text = supervisor.text if is_stopped else ''
         now = supervisor.phase, supervisor.stops, guard.silenced, text

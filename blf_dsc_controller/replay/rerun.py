@@ -449,7 +449,12 @@ def _check(events: Sequence[Event]) -> None:
 def _is_own(event: Event) -> bool:
     """Whether the controller decides on an event itself, because of a message."""
     is_stop = event.type is EventType.STOP
-    own = EventType.START, EventType.CONTACT, EventType.OSCILLATION
+    own = (
+        EventType.START,
+        EventType.CONTACT,
+        EventType.OSCILLATION,
+        EventType.TORQUE_SENSORS,
+    )
     return event.type in own or (is_stop and _reason(event) not in _EXTERNAL)
 
 

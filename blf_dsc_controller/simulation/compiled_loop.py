@@ -14,7 +14,12 @@ import numpy as np
 from blf_dsc_controller.compiled.entry import invoke, loop
 from blf_dsc_controller.compiled.jit import direct, inner
 from blf_dsc_controller.compiled.views import part
-from blf_dsc_controller.law.check_state import INVALID, OSCILLATES, SUSPECT
+from blf_dsc_controller.law.check_state import (
+    INVALID,
+    NOT_SENSORS,
+    OSCILLATES,
+    SUSPECT,
+)
 from blf_dsc_controller.law.laws import for_law
 from sim_plant.kernels import OBSERVE, STEP, TRUTH
 
@@ -138,7 +143,7 @@ def run_loop(span: Span, plant: PlantArguments, law: LawArguments, rows: Rows) -
         if row > 0:
             run_plant(plant, STEP | OBSERVE | TRUTH, torque, row, rows)
         flags = run_law(law, t, dt, span.observed, row, rows)
-        if flags & (INVALID | SUSPECT | OSCILLATES):
+        if flags & (INVALID | SUSPECT | OSCILLATES | NOT_SENSORS):
             return False
         sample = rows.samples[row]
         if law.perceives and perceive(law, dt, sample) and law.ends_at_contact:
@@ -160,7 +165,7 @@ class CompiledLoop:
         """Run a span of samples; return False where a check stops it, in mid-sample.
 
         With checks (`law.checks`), that is the first invalid or suspect sample, or one in which
-        a contact begins or an oscillation is reported.
+        a contact begins, or an oscillation or efforts that are no sensors' are reported.
         """
         law = self._of_law(span)
         arguments = span, self._of_plant(span), law, rows

@@ -20,7 +20,12 @@ from blf_dsc_controller.configuration import law_file
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.schema import differences, flatten
 from blf_dsc_controller.errors import BlfDscError, StartError
-from blf_dsc_controller.law.check_state import CONTRADICTION, INVALID, OSCILLATES
+from blf_dsc_controller.law.check_state import (
+    CONTRADICTION,
+    INVALID,
+    NOT_SENSORS,
+    OSCILLATES,
+)
 from blf_dsc_controller.law.checks import is_valid_state
 from blf_dsc_controller.law.factory import controller_of
 from blf_dsc_controller.law.sensor import is_late, restart
@@ -45,7 +50,7 @@ from blf_dsc_controller.reference.terms import remaining
 from blf_dsc_controller.reference.trajectory import Trajectory
 from blf_dsc_controller.reference.turns import reference_near
 from blf_dsc_controller.run import Contact
-from blf_dsc_controller.supervision import retuning
+from blf_dsc_controller.supervision import not_sensors, retuning
 from blf_dsc_controller.supervision.calming import Calming
 from blf_dsc_controller.supervision.contact import contact_of
 from blf_dsc_controller.supervision.drive_load import DriveLoad, DriveLoads
@@ -115,6 +120,7 @@ class Guard:
         waiting_for: what is wrong with the last state that the law could not start from; or empty.
         contact: what touched the arm last; None: nothing so far.
         contacts: contacts so far.
+        untrusted: what is wrong with the efforts that joint torque sensors should show; or empty.
         calming: what oscillates, and how much softer the feedback is since.
         holds: whether the reference rests since then, until the next trajectory.
         silenced: whether nothing is commanded until the next reset or activation.
@@ -145,7 +151,7 @@ class Guard:
         self.journal = Journal()
         self.has_sample = False
         self.start_error: BlfDscError | None = None
-        self.waiting_for = ''
+        self.waiting_for = self.untrusted = ''
         self.contact: Contact | None = None
         self.contacts = 0
         self.silenced = self.holds = False
@@ -296,6 +302,7 @@ class Guard:
             return self._safe_at(stamp, measurement)
         last.take(stamp, measurement, self._slow)
         self._advance_to(stamp)
+        self._distrust_efforts()
         fault = self.samples.check(dt) or self._calm()
         if fault is not None:
             self._stop(*fault)
@@ -313,6 +320,15 @@ class Guard:
         else:
             invalid = self.states.invalid(self.config.safety, measurement)
             self._stop(*self._with_cause(invalid))
+
+    def _distrust_efforts(self) -> None:
+        """Tell that efforts are not those of joint torque sensors, when the law finds it."""
+        if not self.controller.flags & NOT_SENSORS:
+            return
+        joint = not_sensors.joint_of(self.controller, self.config.joints)
+        self.untrusted = not_sensors.text_of(self.controller, self.config.joints)
+        self.samples.compare_efforts()
+        self._note(EventType.TORQUE_SENSORS, joint=joint, text=self.untrusted)
 
     def _calm(self) -> Fault | None:
         """Soften the feedback of an arm that oscillates; a fault if that has not helped."""
@@ -889,6 +905,7 @@ class Guard:
     def _start_over(self) -> None:
         self.supervisor.enter(Phase.STARTING)
         self.calming.restart()
+        self.untrusted = not_sensors.text_of(self.controller, self.config.joints)
         self.states.restart()
         self.samples.restart()
         self.start_error = None

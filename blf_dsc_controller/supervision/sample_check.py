@@ -14,6 +14,7 @@ from blf_dsc_controller.configuration.tool_bound import tool_of
 from blf_dsc_controller.law.check_state import NO_EFFECT, OUTSIDE, SUSPECT
 from blf_dsc_controller.law.controller import Controller
 from blf_dsc_controller.supervision.calming import Calming
+from blf_dsc_controller.supervision.not_sensors import is_off
 from blf_dsc_controller.supervision.stop_cause import StopCause
 from blf_dsc_controller.supervision.supervisor import Fault, Reason
 from blf_dsc_controller.tool.errors import in_words
@@ -42,9 +43,7 @@ class SampleCheck:
     ) -> None:
         """Enable the checks of the controller."""
         controller.checks.sample_time[0] = config.sample_time
-        controller.checks.effect.compares[0] = float(
-            config.robot.effort in ('whole', 'commanded')
-        )
+        self._has_torques = config.robot.effort in ('whole', 'commanded')
         self._joints = config.joints
         self._tool = tool_of(config)
         self._controller = controller
@@ -65,6 +64,7 @@ class SampleCheck:
 
     def restart(self) -> None:
         """Reset the counts, starting with the next sample."""
+        self.compare_efforts()
         self.ratio[:] = 0.0
         self.outside = self.saturated = 0
         checks = self._controller.checks
@@ -72,6 +72,11 @@ class SampleCheck:
         checks.estimates.consistent_scale[:] = self._controller.state.rotors.gain_scale
         checks.estimates.moved[:] = self._kept
         self.relax()
+
+    def compare_efforts(self) -> None:
+        """Compare efforts with commands where they are torques, and follow them."""
+        compares = self._has_torques and not is_off(self._controller)
+        self._controller.checks.effect.compares[0] = float(compares)
 
     @property
     def saturated_time(self) -> float:

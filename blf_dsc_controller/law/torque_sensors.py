@@ -1,0 +1,219 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Whether what is read as the torque of joint sensors is that: else the load observer ends.
+
+An arm may be declared to have joint torque sensors and have none, so that its efforts are
+the commands or the motors' currents; its encoders may be at the motors; a sensor may be
+stuck, dead, or in another unit.  The load observer then is feedback that nobody designed.
+With U the response of the drives, M_l the inertia of the links of the model, L its pole,
+and k and D those of a gear,
+
+    r = L / (s + L) (tau_J - M_l s^2 y)
+
+    efforts are commands:  tau_J = U tau     a loop of gain up to 1 around the law, and more
+                                             where the gear resonates and M_l s^2 y turns
+    y is of the motor:     tau_J = M_l s^2 y (D s + k) / (M_l s^2 + D s + k)
+                                             the gear's resonance, with M_l behind it
+
+are stable only with an L of some rad/s, where r is of no use.  So r fades out for good where
+
+- *it shakes*: what r adds oscillates (`oscillation`, of r instead of the error).
+- *efforts are commands*: in the first motion, efforts behind the filter L are within a
+  `_EQUAL` share of the torque that is commanded, as seen against what they are away from
+  that of the links, in the geometric mean of the joints.  The mean squares are those of
+  what changes faster than `_SLOWEST`.  Between sensor and command are motor and friction,
+  also those that a torque loop leaves: they are known to be there as soon as the mean
+  exceeds `_DISTINCT`, and then this question is not asked again.
+- *efforts do not follow*: drives with a loop around sensors make of them what is commanded,
+  whatever load or contact is behind.  An effort that is off by `_OFF` of the torque limit
+  leaves r out while that lasts, and if it lasts while the arm follows its reference, for
+  good: the command has reached the arm.  Otherwise it may not have (`effect`).
+"""
+
+from __future__ import annotations
+
+from math import pi
+from typing import Annotated, NamedTuple
+
+from blf_dsc_controller.compiled.jit import inner
+from blf_dsc_controller.compiled.layout import Array, Cell
+from blf_dsc_controller.law import oscillation
+from blf_dsc_controller.law.lag import filter_gain
+from blf_dsc_controller.law.oscillation import Oscillation
+
+NONE, SHAKES, COMMANDS, OFF = range(4)
+"""What is wrong with the efforts, if anything."""
+
+_FADE = 0.02  # s, time constant with which r is left out or comes back
+_SHAKEN = 0.005  # s, likewise of one that shakes: it may grow threefold in 10 ms
+_NOTHING = 1e-6  # of r
+_SLOWEST = 0.5  # Hz
+_EQUAL = 0.02
+_DISTINCT = 0.1
+_LEAST_MOTION = 0.25  # s, of what is compared
+_MOVES = 0.03  # rad/s, of the reference
+_OFF = 0.1  # of the torque limit
+_LASTING = 0.05  # s
+_FOLLOWS = 0.25  # of the speed of the reference
+_CLEAR = 0.0125  # of the torque limit, half of a half wave of r
+_STRONG = 0.5  # of the torque limit, a twentieth of which is a wave
+
+
+class State(NamedTuple):
+    """What it keeps from one sample to the next."""
+
+    fault: Cell  # NONE, SHAKES, COMMANDS or OFF
+    joint: Cell  # that shows it
+    is_told: Cell  # 1: efforts are known not to be commands
+    moved: Cell  # s of motion so far
+    # N m, of the last interval behind L: the torque commanded
+    command: Annotated[Array, 'n * observer.enabled']
+    # N m, lags of efforts less commands, and of efforts less the torque of the links
+    slow: Annotated[Array, '2 * observer.enabled', 'n']
+    # (N m)^2 s, integrals of the squares of what is faster
+    square: Annotated[Array, '2 * observer.enabled', 'n']
+    lasted: Annotated[Array, 'n * observer.enabled']  # s, since efforts are off
+    shaking: Oscillation  # of r
+
+
+class Work(NamedTuple):
+    """Scratch of one sample."""
+
+    # N m, efforts less commands, and less the torque of the links
+    differences: Annotated[Array, '2 * observer.enabled', 'n']
+    limit: Annotated[Array, 'n * observer.enabled']  # N m, by which r counts as strong
+    clear: Annotated[Array, 'n * observer.enabled']  # N m, of a wave of r
+    none: Annotated[Array, 'n * observer.enabled']  # zeros
+
+
+@inner
+def begin(state: State, torque: Array) -> None:
+    """Begin with r, a `torque` (n,) [N m]."""
+    oscillation.begin(state.shaking, torque, torque)
+
+
+@inner
+def follow_applied(
+    state: State, row: Array, m: int, bandwidth: float, dt: float
+) -> None:
+    """Pass the torque of the last interval, at m of `row`, through L, `bandwidth` [rad/s]."""
+    share = filter_gain(1.0 / bandwidth, dt)
+    for i in range(state.command.size):
+        state.command[i] += share * (row[i, m] - state.command[i])
+
+
+@inner
+def find(state: State, fault: float, i: int) -> None:
+    """Keep what is wrong with joint i, if nothing was before."""
+    if state.fault[0] == NONE:
+        state.fault[0] = fault
+        state.joint[0] = i
+
+
+@inner
+def watch_shaking(
+    state: State, work: Work, limit: Array, torque: Array, dt: float
+) -> None:
+    """Find whether r, a `torque` (n,) [N m], shakes the arm; `limit` (n,) [N m] as configured."""
+    for i in range(torque.size):
+        work.limit[i] = _STRONG * limit[i]
+        work.clear[i] = _CLEAR * limit[i]
+    oscillation.watch(
+        state.shaking, work.limit, torque, torque, work.none, work.clear, dt
+    )
+    for i in range(torque.size):
+        if oscillation.oscillates(state.shaking, i):
+            find(state, SHAKES, i)
+
+
+@inner
+def compare_with_commands(
+    state: State, work: Work, reference_speed: Array, begins: bool, dt: float
+) -> None:
+    """Find whether efforts are commands, by `work.differences`: `begins` with them."""
+    if state.is_told[0] == 1.0:
+        return
+    n = reference_speed.size
+    share = filter_gain(1.0 / (2.0 * pi * _SLOWEST), dt)
+    moves = False
+    for i in range(n):
+        moves = moves or abs(reference_speed[i]) > _MOVES
+    for k in range(2):
+        for i in range(n):
+            if begins:
+                state.slow[k, i] = work.differences[k, i]
+            fast = work.differences[k, i] - state.slow[k, i]
+            state.slow[k, i] += share * fast
+            if moves:
+                state.square[k, i] += dt * fast * fast
+    if moves:
+        state.moved[0] += dt
+    if state.moved[0] > _LEAST_MOTION:
+        judge(state)
+
+
+@inner
+def judge(state: State) -> None:
+    """Judge by the mean squares whether efforts are commands, certainly not, or neither."""
+    product = equal = distinct = 1.0
+    nearest = 0
+    for i in range(state.square.shape[1]):
+        ratio = state.square[0, i] / max(state.square[1, i], 1e-12)
+        product *= ratio
+        equal *= _EQUAL
+        distinct *= _DISTINCT
+        near = state.square[0, nearest] / max(state.square[1, nearest], 1e-12)
+        if ratio < near:
+            nearest = i
+    if product < equal:
+        find(state, COMMANDS, nearest)
+    if product > distinct or state.fault[0] != NONE:
+        state.is_told[0] = 1.0
+
+
+@inner
+def follow_commands(
+    state: State,
+    work: Work,
+    limit: Array,
+    speed: Array,
+    reference_speed: Array,
+    dt: float,
+) -> bool:
+    """Find whether efforts are off; return whether they are now, which may pass.
+
+    `limit` (n,) [N m] is that of the torques; the arm follows its reference where the
+    speeds (n,) [rad/s] are about equal.
+    """
+    n = limit.size
+    square = 0.0
+    for i in range(n):
+        square += reference_speed[i] * reference_speed[i]
+    is_off = False
+    for i in range(n):
+        late = speed[i] - reference_speed[i]
+        follows = square > _MOVES * _MOVES
+        follows = follows and late * late < _FOLLOWS * _FOLLOWS * square
+        is_one = abs(work.differences[0, i]) > _OFF * limit[i]
+        is_off = is_off or is_one
+        state.lasted[i] = state.lasted[i] + dt if is_one and follows else 0.0
+        if state.lasted[i] > _LASTING:
+            find(state, OFF, i)
+    return is_off
+
+
+@inner
+def fade(state: State, faded: Array, is_off: bool, dt: float) -> None:
+    """Leave more of r out where the efforts are in doubt, or less; zero stays zero."""
+    is_doubted = is_off or state.fault[0] != NONE
+    aim = 1.0 if is_doubted else 0.0
+    time_constant = _SHAKEN if state.fault[0] == SHAKES else _FADE
+    if faded[0] != aim:
+        faded[0] += filter_gain(time_constant, dt) * (aim - faded[0])
+        if abs(faded[0] - aim) < _NOTHING:
+            faded[0] = aim
+
+
+@inner
+def is_fading(faded: Array) -> bool:
+    """Whether some of r is left out, and not all yet."""
+    return bool(0.0 < faded[0] < 1.0)

@@ -1,0 +1,53 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What is said of an arm whose efforts are not the torques of joint sensors."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from blf_dsc_controller.law.controller import Controller
+from blf_dsc_controller.law.torque_sensors import COMMANDS, NONE, OFF, SHAKES
+
+_ALONE = 'the load observer is off, and the law goes on without it'
+_TEXTS = {
+    SHAKES: (
+        'joint {joint!r} shakes by the load observer: efforts are not those of joint torque '
+        f'sensors, or positions are those of the motors; {_ALONE}. If so, set robot.effort to '
+        'unknown and robot.torque_loop to false; else disturbance.observer_bandwidth to 0'
+    ),
+    COMMANDS: (
+        'the efforts are what is commanded, most of all that of joint {joint!r}, and not those '
+        f'of joint torque sensors: {_ALONE}. Set robot.effort to commanded if they are commands '
+        'or unknown if they are currents of motors, and robot.torque_loop to false'
+    ),
+    OFF: (
+        'the effort of joint {joint!r} is off {off:+.3g} N m from what is commanded while the '
+        f'arm follows: a sensor is stuck, dead or in another unit; {_ALONE}. Mend it, or set '
+        'robot.effort to unknown'
+    ),
+}
+
+
+def fault_of(controller: Controller) -> int:
+    """Return what is wrong with the efforts, NONE if nothing is."""
+    return int(controller.state.sensors.fault[0])
+
+
+def is_off(controller: Controller) -> bool:
+    """Whether efforts do not even follow the commands, so that they tell nothing about them."""
+    return fault_of(controller) == OFF
+
+
+def text_of(controller: Controller, joints: Sequence[str]) -> str:
+    """Return what is wrong and the remedy; empty if nothing is."""
+    fault = fault_of(controller)
+    if fault == NONE:
+        return ''
+    i = int(controller.state.sensors.joint[0])
+    off = float(controller.signals.sensors.differences[0, i])
+    return _TEXTS[fault].format(joint=joints[i], off=off)
+
+
+def joint_of(controller: Controller, joints: Sequence[str]) -> str:
+    """Return the joint that shows it most."""
+    return joints[int(controller.state.sensors.joint[0])]

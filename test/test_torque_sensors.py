@@ -1,0 +1,270 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Efforts that are not the torques of joint sensors: the load observer is left out, and why."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+
+import numpy as np
+import pytest
+from law_part import part
+
+from blf_dsc_controller.configuration.nodes import PLANT, load_loop
+from blf_dsc_controller.law import torque_sensors
+from blf_dsc_controller.law.torque_sensors import COMMANDS, NONE, OFF, SHAKES
+from blf_dsc_controller.messages.journal import EventType
+from blf_dsc_controller.replay.verify import verify
+from blf_dsc_controller.simulation.loop import START, simulate, write_bag
+from blf_dsc_controller.supervision.guard import Guard
+from blf_dsc_controller.supervision.supervisor import Phase, Reason
+from sim_plant.plant import plant_of
+
+DT = 1e-3  # s
+LIMIT = np.array([80.0, 10.0])  # N m
+MOVES = np.array([0.5, -0.2])  # rad/s
+ECHO = {'actuator.loop_gain': 0.0, 'actuator.loop_damping': 0.0}
+MOTORS = {'sensor.side': 'motor'}
+
+
+class Observer:
+    """An observer with a bandwidth, by which parts of a state have a size."""
+
+    enabled = 1
+
+
+def new():
+    """An empty state, and scratch, of two joints."""
+    sizes = {'n': 2, 'observer': Observer}
+    state, work = (
+        part(each, **sizes) for each in (torque_sensors.State, torque_sensors.Work)
+    )
+    torque_sensors.begin(state, np.zeros(2))
+    return state, work
+
+
+def compared(of_command, of_links, seconds=0.5, speed=MOVES):
+    """Return what is found of efforts that are away from commands and from the links' torque."""
+    state, work = new()
+    for k in range(round(seconds / DT)):
+        wave = np.sin(2.0 * np.pi * 5.0 * k * DT)
+        work.differences[0] = (
+            of_command * wave + 1.0
+        )  # N m, an offset counts for nothing
+        work.differences[1] = of_links * wave - 2.0
+        torque_sensors.compare_with_commands(state, work, speed, k == 0, DT)
+    return state
+
+
+def test_efforts_that_are_nearer_to_commands_than_to_the_links_torque_are_commands():
+    state = compared(np.array([0.02, 0.1]), np.array([1.0, 2.0]))
+    assert (state.fault[0], state.joint[0]) == (COMMANDS, 0)
+
+
+def test_efforts_that_motors_and_friction_separate_from_commands_are_sensors():
+    state = compared(np.array([0.2, 0.4]), np.array([1.0, 0.4]))
+    assert (state.fault[0], state.is_told[0]) == (NONE, 1.0)
+
+
+def test_what_lies_between_is_not_judged_yet():
+    state = compared(np.array([0.2, 0.4]), np.array([1.0, 2.0]))
+    assert (state.fault[0], state.is_told[0]) == (NONE, 0.0)
+
+
+def test_an_arm_at_rest_and_a_load_that_comes_later_say_nothing():
+    still = compared(np.array([0.02, 0.1]), np.array([1.0, 2.0]), speed=0.05 * MOVES)
+    assert (still.fault[0], still.is_told[0]) == (NONE, 0.0)
+    state = compared(np.array([0.2, 0.4]), np.array([0.2, 0.4]))
+    work = new()[1]
+    for k in range(2000):  # s, a load, in which efforts are as commanded
+        work.differences[1] = 20.0 * np.sin(0.02 * k)
+        torque_sensors.compare_with_commands(state, work, MOVES, begins=False, dt=DT)
+    assert state.fault[0] == NONE
+
+
+def watched(torque, seconds=0.3):
+    """Return what is found of r, a function of the time [s]."""
+    state, work = new()
+    for k in range(round(seconds / DT)):
+        torque_sensors.watch_shaking(state, work, LIMIT, torque(k * DT), DT)
+    return state
+
+
+def test_r_that_shakes_is_found_and_one_that_takes_a_load_or_is_small_is_not():
+    shakes = watched(
+        lambda t: 3.0 * np.sin(2.0 * np.pi * 30.0 * t) * np.array([1.0, 0.0])
+    )
+    assert (shakes.fault[0], shakes.joint[0]) == (SHAKES, 0)
+    small = watched(
+        lambda t: 0.5 * np.sin(2.0 * np.pi * 30.0 * t) * np.array([1.0, 0.0])
+    )
+    load = watched(lambda t: 20.0 * (1.0 - np.exp(-60.0 * t)) * np.array([1.0, 0.1]))
+    assert (small.fault[0], load.fault[0]) == (NONE, NONE)
+
+
+def off(difference, speed, seconds):
+    """Return what is found of efforts that are off by some N m, at a speed (n,) [rad/s]."""
+    state, work = new()
+    for _ in range(round(seconds / DT)):
+        work.differences[0] = difference
+        now = torque_sensors.follow_commands(state, work, LIMIT, speed, MOVES, DT)
+    return state.fault[0], now
+
+
+def test_efforts_that_are_off_while_the_arm_follows_are_of_no_sensor():
+    """For good after 0.05 s; a tenth of the limit may be friction."""
+    assert off(np.array([9.0, 0.0]), MOVES, 0.04) == (NONE, True)
+    assert off(np.array([9.0, 0.0]), MOVES, 0.06) == (OFF, True)
+    assert off(np.array([7.0, 0.9]), MOVES, 1.0) == (NONE, False)
+
+
+def test_efforts_of_an_arm_that_does_not_follow_are_doubted_while_that_lasts():
+    """Brakes may hold it: `effect` stops it."""
+    assert off(np.array([9.0, 0.0]), 0.0 * MOVES, 1.0) == (NONE, True)
+
+
+def test_r_fades_out_and_comes_back_smoothly_and_stays_whole_without_doubt():
+    state, _ = new()
+    faded = np.zeros(1)
+    torque_sensors.fade(state, faded, is_off=False, dt=DT)
+    assert faded[0] == 0.0
+    torque_sensors.fade(state, faded, is_off=True, dt=0.02)
+    assert faded[0] == pytest.approx(1.0 - np.exp(-1.0))
+    assert torque_sensors.is_fading(faded)
+    for _ in range(500):
+        torque_sensors.fade(state, faded, is_off=False, dt=DT)
+    assert faded[0] == 0.0
+    state.fault[0] = SHAKES
+    torque_sensors.fade(state, faded, is_off=False, dt=0.005)
+    assert faded[0] == pytest.approx(1.0 - np.exp(-1.0))
+
+
+def loop_of(preset, seconds, **plant):
+    """Return the loop of a preset whose arm may be another."""
+    return load_loop(preset, {PLANT: {'duration': seconds, **plant}})
+
+
+def said(record):
+    """Return what is said of the sensors, with its time [s], and the reasons of stops."""
+    events = [e for e in record.journal.pending if e.type is EventType.TORQUE_SENSORS]
+    found = [(1e-9 * (each.stamp - START), each.content['text']) for each in events]
+    return found, [each.reason for each in record.run().stops]
+
+
+@lru_cache
+def without_sensors(stiffness):
+    """Return the record of a Panda that is said to have sensors, and echoes its commands."""
+    loop = loop_of('panda', 1.5, **ECHO, **{'joint.stiffness': [stiffness] * 7})
+    return simulate(loop.controller, loop.plant)
+
+
+@pytest.mark.parametrize(
+    ('stiffness', 'what'),
+    [(1e4, 'shakes by the load observer'), (5e4, 'the efforts are what is commanded')],
+)
+def test_panda_without_sensors_goes_on_without_the_observer(stiffness, what):
+    """With it, gears of 1e4 N m/rad resonate at 30 Hz at once."""
+    record = without_sensors(stiffness)
+    ((time, text),), stops = said(record)
+    assert not stops
+    assert not record.run().oscillations
+    assert time < 0.5
+    assert what in text
+    assert 'robot.torque_loop to false' in text
+    assert np.abs(record.run().error[-500:]).max() < 0.01
+
+
+@pytest.mark.parametrize('stiffness', [1e4, 5e4])
+def test_bag_of_an_arm_without_sensors_replays(tmp_path, stiffness):
+    write_bag(tmp_path / 'bag', without_sensors(stiffness))
+    result = verify(tmp_path / 'bag')
+    assert (result.difference, result.remarks) == (None, ())
+
+
+@pytest.mark.parametrize('preset', ['panda', 'fr3_direct'])
+def test_arm_with_encoders_at_the_motors_goes_on_without_the_observer(preset):
+    loop = loop_of(preset, 1.5, **MOTORS)
+    record = simulate(loop.controller, loop.plant)
+    ((time, text),), stops = said(record)
+    assert not stops
+    assert time < 1.0
+    assert 'shakes by the load observer' in text
+    assert 'positions are those of the motors' in text
+
+
+PUSHED = {
+    'events.begin': [0.0, 2.0, 3.0],  # s
+    'events.duration': [1.5, 0.2, 0.0],
+    'events.force': [0.0, 0.0, 0.0, 30.0, 15.0, -20.0, 0.0, 0.0, 0.0],  # N
+}
+
+
+@pytest.mark.parametrize('preset', ['panda', 'fr3', 'fr3_direct'])
+def test_sensors_of_an_arm_that_starts_with_a_load_and_is_pushed_are_left_alone(preset):
+    """It holds 2 kg that nobody declared, puts them down, is pushed, and picks up its payload."""
+    payload = load_loop(preset).controller.robot.payload
+    loop = loop_of(preset, 4.0, **PUSHED, **{'events.payload': [2.0, 0.0, payload]})
+    record = simulate(loop.controller, loop.plant)
+    assert said(record) == ([], [])
+    state = record.controller.state
+    assert (state.observer.faded[0], state.sensors.is_told[0]) == (0.0, 1.0)
+
+
+class Failing:
+    """A Panda whose efforts fail after a while, in the guarded loop."""
+
+    def __init__(self, fails, after=1.0, seconds=1.6):
+        loop = loop_of('panda', seconds)
+        plant, n = plant_of(loop.plant), len(loop.controller.joints)
+        self.guard = Guard(loop.controller, lambda: 0, lambda: 0)
+        self.guard.activate()
+        self.error = self.step = 0.0
+        before, held = None, None
+        for k in range(round(seconds / DT)):
+            measurement = np.array(plant.measure())
+            if k * DT >= after:
+                held = measurement[2 * n :].copy() if held is None else held
+                measurement[2 * n :] = fails(measurement[2 * n :], held)
+            torque = self.guard.update(START + k * 1_000_000, measurement).copy()
+            if before is not None and k * DT >= after:
+                self.step = max(self.step, np.abs(torque - before).max())
+            before = torque
+            self.error = max(self.error, np.abs(self.guard.controller.sample.xi1).max())
+            plant.step(torque)
+
+
+@pytest.mark.parametrize(
+    'fails',
+    [
+        lambda effort, _: 0.0 * effort,
+        lambda effort, _: -effort,
+        lambda effort, _: 1e3 * effort,
+    ],
+    ids=['dead', 'wrong sign', 'N mm'],
+)
+def test_panda_whose_sensors_fail_in_motion_goes_on_without_them(fails):
+    """It does not stop for commands without effect, which efforts would tell."""
+    run = Failing(fails)
+    assert run.guard.supervisor.phase is Phase.TRACKING
+    assert 'what is commanded while the arm follows' in run.guard.untrusted
+    assert run.guard.controller.state.observer.faded[0] == 1.0
+    assert run.error < 0.03
+
+
+def test_brakes_that_close_still_stop_an_arm_whose_efforts_say_so():
+    """The arm stands still: efforts of nothing are no reason to go on without them."""
+    loop = loop_of('panda', 2.0)
+    plant, n = plant_of(loop.plant), len(loop.controller.joints)
+    guard = Guard(loop.controller, lambda: 0, lambda: 0)
+    guard.activate()
+    rest = None
+    for k in range(2000):
+        measurement = np.array(plant.measure())
+        if k >= 1000:
+            rest = measurement[:n].copy() if rest is None else rest
+            measurement = np.concatenate((rest, np.zeros(2 * n)))
+        torque = guard.update(START + k * 1_000_000, measurement).copy()
+        if guard.supervisor.phase is Phase.SAFE_STOP:
+            break
+        plant.step(torque)
+    assert not guard.untrusted
+    assert guard.supervisor.reason in (Reason.NO_EFFECT, Reason.OUTSIDE_BOUND)
