@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from elastic_two_link import ARM, BEGIN, FAR, NEAR
 from plant_driver import PlantDriver
 
 import blf_dsc_controller as blf
@@ -17,8 +18,9 @@ from blf_dsc_controller.arms.urdf import frames
 from blf_dsc_controller.bags.content import read_content
 from blf_dsc_controller.cli.main import main
 from blf_dsc_controller.commissioning.commissioning import plan, postures_of
-from blf_dsc_controller.commissioning.driven import SPEED, Driven, EndedError, move
+from blf_dsc_controller.commissioning.driven import Driven
 from blf_dsc_controller.commissioning.motion import SETTLING
+from blf_dsc_controller.commissioning.postures import SPEED, EndedError, move
 from blf_dsc_controller.commissioning.strength import MOST
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.drive import DriveConfig
@@ -30,25 +32,6 @@ from blf_dsc_controller.reference.terms import sampled
 from blf_dsc_controller.supervision.config_warnings import config_warnings
 from blf_dsc_controller.supervision.not_commissioned import not_commissioned
 
-BEGIN = (0.1, 0.8)  # rad, where the arm rests
-NEAR, FAR = (0.3, 1.1), (0.8, 0.5)  # rad
-# Springs of 26 and 29 Hz, and no torque where nothing moves: no gravity.
-ARM = """
-/**:
-  ros__parameters:
-    robot: {urdf: two_link.urdf, gravity: [0.0, 0.0, 0.0], rotor_inertia: [0.3, 0.1], payload: 0.1}
-/**/sim_plant:
-  ros__parameters:
-    truth.rotor_inertia: [0.3, 0.1]
-    joint.stiffness: [3.0e+3, 1.5e+3]
-    disturbance: {constant: [0.0, 0.0], amplitude: [0.0, 0.0], viscous: [2.0, 1.0]}
-    initial.position: [0.1, 0.8]
-/**/blf_dsc_controller:
-  ros__parameters:
-    barrier.bound: [0.2, 0.2]
-    limits.position_lower: [-3.0, -3.0]
-    limits.position_upper: [3.0, 3.0]
-"""
 DRIVER = """
 from math import inf
 from plant_driver import PlantDriver

@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`blf_dsc commission --robot`: the limits, a question, and the robot in each posture."""
+"""`blf_dsc commission --robot`: the limits, a question, and the robot in each posture.
+
+`--ros` has the same limits and question.
+"""
 
 from __future__ import annotations
 
@@ -16,8 +19,13 @@ from blf_dsc_controller.cli.main import make_room
 from blf_dsc_controller.cli.run import print_notice
 from blf_dsc_controller.commissioning import page
 from blf_dsc_controller.commissioning.commissioning import Planned
-from blf_dsc_controller.commissioning.driven import SPEED, Driven
-from blf_dsc_controller.commissioning.own_loop import Commissioning, Measured
+from blf_dsc_controller.commissioning.driven import Driven
+from blf_dsc_controller.commissioning.own_loop import (
+    Commissioning,
+    Measured,
+    measured_in,
+)
+from blf_dsc_controller.commissioning.postures import SPEED, PostureByPosture
 from blf_dsc_controller.commissioning.strength import MOST
 from blf_dsc_controller.compiled.announcement import announced_compilation
 from blf_dsc_controller.configuration.controller import ControllerConfig
@@ -36,12 +44,7 @@ def measured_on_robot(
         EndedError: it ended before its time.
         BlfDscError: nobody agrees, or the robot, the file or a run is not as it should be.
     """
-    if not (options.yes or sys.stdin.isatty()):
-        raise BlfDscError(
-            'the robot moves, and nobody can be asked here: start it in a terminal, or give --yes'
-        )
-    folder = options.record or options.out.with_name(f'{options.out.stem}_bags')
-    make_room(folder, force=False)
+    folder = prepared_folder(options)
     config = commissioning.config
     driver = driver_of(options.robot, path, config)
     with announced_compilation(print_notice):
@@ -51,26 +54,60 @@ def measured_on_robot(
             print_notice(remark)
         driven = Driven(driver, commissioning, folder)
         planned = commissioning.motions_from(driven.position())
-        print('\n'.join(_limits(options, config, planned, driven.duration(planned))))
-        if not options.yes and input('Type yes to start: ').strip().lower() != 'yes':
-            raise BlfDscError('not started: nothing has moved')
+        ask(options, options.robot, driven, commissioning, planned)
         request_realtime(config.realtime, lambda text: print_notice(f'warning: {text}'))
         with signals_to(driven.request_end):
-            return list(_followed(driven, planned))
+            bags = list(followed(driven, planned))
+    return [(name, measured_in(bag)) for name, bag in bags]
 
 
-def _followed(driven: Driven, planned: list[Planned]) -> Iterator[tuple[str, Measured]]:
-    """Yield what is measured, and say how far it is."""
+def prepared_folder(options: Namespace) -> Path:
+    """Return the folder for the bags, which does not exist yet.
+
+    Raises BlfDscError if it does, or if nobody can be asked whether to start.
+    """
+    if not (options.yes or sys.stdin.isatty()):
+        raise BlfDscError(
+            'the robot moves, and nobody can be asked here: start it in a terminal, or give --yes'
+        )
+    folder: Path = options.record or options.out.with_name(f'{options.out.stem}_bags')
+    make_room(folder, force=False)
+    return folder
+
+
+def ask(
+    options: Namespace,
+    name: str,
+    robot: PostureByPosture,
+    commissioning: Commissioning,
+    planned: list[Planned],
+) -> None:
+    """Say what the robot of this name is about to do, and ask whether to start.
+
+    Raises BlfDscError if nobody agrees.
+    """
+    duration = robot.duration(planned)
+    limits = _limits(options, name, commissioning.config, planned, duration)
+    print('\n'.join(limits))
+    if not options.yes and input('Type yes to start: ').strip().lower() != 'yes':
+        raise BlfDscError('not started: nothing has moved')
+
+
+def followed(
+    robot: PostureByPosture, planned: list[Planned]
+) -> Iterator[tuple[str, Path]]:
+    """Yield the bags of the postures, and say how far it is."""
     postures = np.array([each.posture for each in planned])
     total = len(planned)
     print(f'0 of {total} postures measured: Ctrl-C stops the arm', flush=True)
-    for k, measured in enumerate(driven.runs(postures), 1):
+    for k, bag in enumerate(robot.runs(postures), 1):
         print(f'{k} of {total} postures measured', flush=True)
-        yield measured
+        yield bag
 
 
 def _limits(
     options: Namespace,
+    name: str,
     config: ControllerConfig,
     planned: list[Planned],
     duration: float,
@@ -100,6 +137,6 @@ def _limits(
     )
     again = sum(each.duration for each in planned)
     yield (
-        f'{options.robot} moves for {duration:.0f} s in all, and for {duration + again:.0f} s if '
+        f'{name} moves for {duration:.0f} s in all, and for {duration + again:.0f} s if '
         'every posture is measured twice'
     )
