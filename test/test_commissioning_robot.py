@@ -314,3 +314,72 @@ def test_motion_that_stays_hidden_is_told_after_its_posture(arm, capsys):
     assert 'posture 1: the positions do not show the motion' in told
     assert PlantDriver.last.calls == ['connect', *['start', 'finish'] * 3]
     assert nothing_looks_whole(arm)
+
+
+PROVEN = """
+    feedback: {joint_stiffness: [K1, K2], joint_damping: [D1, D2]}
+    reference: {type: sinusoids, offset: [0.3, 1.1], amplitude: [0.1, 0.1], frequency: [2.0],
+                phase: [0.0]}
+"""
+# N m/rad and N m s/rad: about what commissioning chooses for this arm
+CHOSEN = {'K1': '25.0', 'K2': '8.5', 'D1': '6.0', 'D2': '1.5'}
+
+
+def prove(arm, address, gains, *options):
+    text = PROVEN
+    for name, value in gains.items():
+        text = text.replace(name, value)
+    own = '/**/blf_dsc_controller:\n  ros__parameters:\n'
+    arm.write_text(arm.read_text().replace(own, own + text.strip('\n') + '\n'))
+    words = ['commission', '--prove', '--config', str(arm), '--robot', address]
+    return main([*words, '--yes', '--record', str(arm.with_name('proof')), *options])
+
+
+def test_gains_are_proven_in_three_steps_and_errors_compared(arm, capsys):
+    assert prove(arm, 'plant', CHOSEN) == 0
+    told = capsys.readouterr().out
+    said = [
+        '50% of the gains: calm',
+        '75% of the gains: calm',
+        '100% of the gains: calm',
+    ]
+    assert [told.find(each) > 0 for each in said] == [True] * 3
+    assert PlantDriver.last.calls == ['connect', *['start', 'finish'] * 6]
+    folder = arm.with_name('proof')
+    gains = []
+    for share in (50, 75, 100):
+        content = read_content(folder / f'{share}_of_the_gains').controller_config()
+        gains.append(content.feedback.gain)
+    np.testing.assert_allclose(gains[0], 0.5 * np.array(gains[2]), rtol=1e-9)
+    np.testing.assert_allclose(gains[1], 0.75 * np.array(gains[2]), rtol=1e-9)
+    # the table: the largest error of each joint, as its bag has it, beside one to expect
+    run = blf.read_run(folder / '100_of_the_gains')
+    for name, error in zip(
+        run.joints, np.nanmax(np.abs(run.error), axis=0), strict=True
+    ):
+        (row,) = [line.split() for line in told.splitlines() if line.startswith(name)]
+        assert float(row[1]) == pytest.approx(1e3 * error, rel=0.05)  # two digits
+        assert float(row[2]) > 0.0
+
+
+@pytest.mark.parametrize(
+    ('address', 'factor', 'code', 'printed'),
+    [
+        ('plant', '9', 5, ['way with 50% of the gains: the controller', 'oscillates']),
+        (
+            'interrupt@300',
+            '',
+            130,
+            ['way with 50% of the gains: ended on request', 'no share of the gains'],
+        ),
+    ],
+)
+def test_gains_that_are_not_proven_are_told(
+    address, factor, code, printed, arm, capsys
+):
+    """With 96 times the stiffness and damping of the arm; or ended by somebody."""
+    gains = {name: factor + value for name, value in CHOSEN.items()}
+    assert prove(arm, address, gains) == code
+    told = capsys.readouterr().err
+    for each in (*printed, 'The gains are not proven'):
+        assert each in told

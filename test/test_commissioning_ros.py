@@ -125,12 +125,15 @@ def test_ctrl_c_brings_the_arm_to_rest_in_a_move_and_in_a_motion(rig, at):
 @pytest.mark.parametrize(
     ('takes', 'told'),
     [
-        (True, r'no joint states on /joint_states for 2'),
+        (True, r'no joint states on /joint_states for 4'),
         (False, r'nobody takes torques on /blf_dsc_controller/commands'),
     ],
 )
-def test_a_driver_that_is_gone_is_told(rig, takes, told):
+def test_a_driver_that_is_gone_is_told(rig, takes, told, monkeypatch):
     """With somebody else who takes torques, or without."""
+    monkeypatch.setattr(
+        over_ros, '_PATIENCE', 4.0
+    )  # s; the arm's first state takes 3 s
     if takes:
         rig.ros.driver()
     rig.at(500, lambda: rig.ros.kill(rig.arm))
@@ -192,7 +195,7 @@ def test_parameters_cannot_be_changed_meanwhile(rig):
 
 
 def test_it_says_who_is_missing(ros, tmp_path, monkeypatch):
-    monkeypatch.setattr(over_ros, '_FIRST', 0.5)  # s
+    monkeypatch.setattr(over_ros, '_PATIENCE', 0.5)  # s
     rig = Rig(ros, tmp_path)
     ros.kill(rig.arm)
     with pytest.raises(BlfDscError, match='nobody takes torques on /blf_dsc_contr'):
@@ -209,6 +212,8 @@ def test_it_says_who_is_missing(ros, tmp_path, monkeypatch):
         (['--states', 'franka/joint_states'], 'are for topics: give --ros'),
         (['--ros', '--robot', '10.0.0.1'], 'leave out one of them'),
         (['--ros', '--write', 'motion.yaml'], '--write measures nothing'),
+        (['--prove'], 'give --robot or --ros'),
+        (['--ros', '--prove'], 'nobody can be asked here'),
         (['--ros'], 'nobody can be asked here'),
     ],
 )

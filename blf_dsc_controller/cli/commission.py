@@ -7,12 +7,13 @@ import sys
 import textwrap
 from argparse import Namespace
 from collections.abc import Sequence
+from contextlib import AbstractContextManager
 from pathlib import Path
 
 from tqdm import tqdm
 
 from blf_dsc_controller import __version__
-from blf_dsc_controller.cli.commission_robot import measured_on_robot
+from blf_dsc_controller.cli.commission_robot import measured_on, proven_on, robot
 from blf_dsc_controller.cli.drive import CODES
 from blf_dsc_controller.cli.main import make_room
 from blf_dsc_controller.cli.ros_check import require_ros
@@ -24,7 +25,7 @@ from blf_dsc_controller.commissioning.own_loop import (
     Measured,
     measured_in,
 )
-from blf_dsc_controller.commissioning.postures import EndedError
+from blf_dsc_controller.commissioning.postures import EndedError, PostureByPosture
 from blf_dsc_controller.compiled.announcement import announced_compilation
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.nodes import (
@@ -65,6 +66,8 @@ def _commission(options: Namespace, path: Path, config: ControllerConfig) -> int
         travel=options.travel,
         margin=options.margin,
     )
+    if options.prove:
+        return _prove_on_robot(options, path, commissioning)
     if options.write:
         _write_motions(options, path, commissioning)
         return 0
@@ -102,6 +105,11 @@ def _check(options: Namespace) -> None:
         raise BlfDscError(
             '--write measures nothing: leave out bags, --robot and --ros, or leave out --write'
         )
+    if options.prove and (not is_robot or options.write or options.bags):
+        raise BlfDscError(
+            '--prove runs a commissioned file on a robot: give --robot or --ros, no bags and no '
+            '--write'
+        )
     if not is_robot and (options.yes or options.record):
         raise BlfDscError(
             '--yes and --record are for a robot: give --robot or --ros, too'
@@ -120,15 +128,36 @@ def _all_runs(
         return _simulated(path, commissioning)
     names = [str(bag) for bag in options.bags]
     runs = [measured_in(bag) for bag in options.bags]
-    measured: Sequence[tuple[str, Measured]] = ()
-    if options.robot:
-        measured = measured_on_robot(options, path, commissioning)
-    elif options.ros:
-        from blf_dsc_controller.cli.commission_ros import measured_over_ros
-
-        measured = measured_over_ros(options, commissioning)
+    if not (options.robot or options.ros):
+        return names, runs
+    measured = measured_on(options, _arm(options, path, commissioning), commissioning)
     names += [name for name, _ in measured]
     return names, runs + [run for _, run in measured]
+
+
+def _arm(
+    options: Namespace, path: Path, commissioning: Commissioning
+) -> AbstractContextManager[PostureByPosture]:
+    """Return the robot that the options name, still to be entered."""
+    if options.robot:
+        return robot(options, path, commissioning)
+    from blf_dsc_controller.cli.commission_ros import robot_over_ros
+
+    return robot_over_ros(options, commissioning)
+
+
+def _prove_on_robot(
+    options: Namespace, path: Path, commissioning: Commissioning
+) -> int:
+    """Raise the gains of a file step by step on a robot, and say how far it errs."""
+    config = commissioning.config
+    try:
+        *_, last = proven_on(options, _arm(options, path, commissioning), config)
+    except EndedError as error:
+        print(f'blf_dsc commission: {error}', file=sys.stderr)
+        return CODES[error.end]
+    print(page.errors_table(config.joints, last))
+    return 0
 
 
 def _write_motions(

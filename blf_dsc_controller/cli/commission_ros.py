@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import gc
 import signal
 from argparse import Namespace
 from collections.abc import Iterator
@@ -17,16 +18,12 @@ from rclpy.experimental import EventsExecutor
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 
-from blf_dsc_controller.cli.commission_robot import ask, followed, prepared_folder
+from blf_dsc_controller.cli.commission_robot import prepared_folder
 from blf_dsc_controller.cli.drive import signals_to
 from blf_dsc_controller.commissioning import motion
 from blf_dsc_controller.commissioning.over_ros import OverRos
-from blf_dsc_controller.commissioning.own_loop import (
-    Commissioning,
-    Measured,
-    measured_in,
-)
-from blf_dsc_controller.commissioning.postures import move
+from blf_dsc_controller.commissioning.own_loop import Commissioning
+from blf_dsc_controller.commissioning.postures import PostureByPosture, move
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.nodes import CONTROLLER, load, read
 from blf_dsc_controller.configuration.robot import TOPIC
@@ -37,7 +34,6 @@ from blf_dsc_controller.nodes.run_by_run import RunByRunNode
 
 _NAME = 'blf_dsc_commission'  # of the node that asks for a URDF
 _URDF = 'robot.urdf'
-_HELD = 'the arm is held until Ctrl-C: engage its brakes first'
 
 
 @contextmanager
@@ -76,14 +72,13 @@ def config_over_ros(path: Path) -> ControllerConfig:
     return load(path, CONTROLLER, ControllerConfig, {_URDF: text})
 
 
-def measured_over_ros(
+@contextmanager
+def robot_over_ros(
     options: Namespace, commissioning: Commissioning
-) -> list[tuple[str, Measured]]:
-    """Measure the robot, and return for each posture its name and what was measured.
+) -> Iterator[PostureByPosture]:
+    """Wait for the robot behind the topics, and let the node work.
 
-    Raises:
-        EndedError: it ended before its time.
-        BlfDscError: nobody agrees, or the robot, the file or a run is not as it should be.
+    Raises BlfDscError if nobody can be asked, or nobody sends states or takes torques.
     """
     folder = prepared_folder(options)
     with ExitStack() as ending:
@@ -99,17 +94,13 @@ def measured_over_ros(
         executor.add_node(node)
         spin = partial(process.spin_once, executor, node)
         robot = OverRos(node, spin, commissioning, folder, worker)
+        ending.enter_context(signals_to(robot.request_end))
         robot.wait()
         here = robot.position()
         worker.submit(move, commissioning.config, here, here).result()  # it starts here
-        planned = commissioning.motions_from(here)
-        ask(options, node.commands, robot, commissioning, planned)
-        with signals_to(robot.request_end):
-            bags = list(followed(robot, planned))
-            if commissioning.config.robot.drive_compensates == 'none':
-                print(_HELD, flush=True)
-                robot.hold()
-    return [(name, measured_in(bag)) for name, bag in bags]
+        gc.collect()
+        gc.freeze()  # what is loaded by now stays: scanning it would stall the loop
+        yield robot
 
 
 def made(config: ControllerConfig, **options: object) -> RunByRunNode:

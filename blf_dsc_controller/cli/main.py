@@ -352,6 +352,12 @@ def _add_commissioning(command: _Command, force: argparse.ArgumentParser) -> Non
         help='measure the robot behind topics; with BAGs, these count, too',
     )
     option(
+        '--prove',
+        action='store_true',
+        help='measure nothing, but raise the gains of a commissioned file in three steps along '
+        'its reference, on the robot, and compare its errors with those expected',
+    )
+    option(
         '--states', metavar='TOPIC', help='joint states of its driver (joint_states)'
     )
     option(

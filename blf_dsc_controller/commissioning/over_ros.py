@@ -35,10 +35,12 @@ from blf_dsc_controller.supervision.supervisor import Phase, Reason
 Floats = NDArray[np.float64]
 
 _NANO = 1e-9
-_FIRST = 10.0  # s, for the first joint state, and for whoever takes the torques
-_SILENT = 2.0  # s without joint states
+# s without joint states, or anybody who takes torques: longer than the watchdog of the
+# law waits, which is for stamps of the wall clock only
+_PATIENCE = 10.0
 _LOOK = 1.0  # s between looks whether somebody takes the torques
 _SETTLING = 3.0  # s of the arm's time, to come to rest
+_HELD = 'the arm is held until Ctrl-C: engage its brakes first'
 _OTHERS = {
     EventType.TRAJECTORY: 'a trajectory was sent to the controller',
     EventType.TARGET: 'a position was sent to the controller',
@@ -89,7 +91,7 @@ class OverRos(PostureByPosture):
         Raises BlfDscError if there are none, or nobody does, for ten seconds.
         """
         node = self._node
-        end = time.monotonic() + _FIRST
+        end = time.monotonic() + _PATIENCE
         while node.position() is None:
             self._spin()
             if time.monotonic() < end and not self._requests:
@@ -104,8 +106,11 @@ class OverRos(PostureByPosture):
                 '--states'
             )
 
-    def hold(self) -> None:
-        """Hold the arm where it rests until an end is requested."""
+    def leave(self) -> None:
+        """Hold an arm whose drives do not until an end is requested."""
+        if self._config.robot.drive_compensates != 'none':
+            return
+        self._node.warn(_HELD)
         while not self._requests:
             self._spin()
 
@@ -162,7 +167,7 @@ class OverRos(PostureByPosture):
             self._spin()
             if self._requests:
                 return End.REQUESTED, ''
-            if trouble := self._stopped(guard) or self._lost(guard, began):
+            if trouble := self._stopped(guard) or self._lost(began):
                 return trouble
             if text := disturbed.text or self._of_others(others):
                 return End.STOPPED, text
@@ -180,12 +185,12 @@ class OverRos(PostureByPosture):
         is_lost = supervisor.reason is Reason.STATE_TIMEOUT
         return (End.LOST if is_lost else End.STOPPED), supervisor.text
 
-    def _lost(self, guard: Guard, began: float) -> tuple[End, str] | None:
+    def _lost(self, began: float) -> tuple[End, str] | None:
         """Return what is missing of a run that began then [s]: states, or who takes torques."""
         node = self._node
         now = time.monotonic()
         silent = now - max(node.heard, began)
-        if silent > (_SILENT if guard.commanding else _FIRST):
+        if silent > _PATIENCE:
             return End.LOST, f'no joint states on {node.states} for {silent:.2g} s'
         if now - self._looked > _LOOK:
             self._looked = now
@@ -208,5 +213,5 @@ class OverRos(PostureByPosture):
         while guard.commanding and not guard.is_settled and self._requests < 2:
             self._spin()
             is_late = (guard.journal.stamp - since) * _NANO > _SETTLING
-            if is_late or time.monotonic() - self._node.heard > _SILENT:
+            if is_late or time.monotonic() - self._node.heard > _PATIENCE:
                 return

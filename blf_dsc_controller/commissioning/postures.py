@@ -22,6 +22,7 @@ from numpy.typing import ArrayLike, NDArray
 from blf_dsc_controller.commissioning import motion
 from blf_dsc_controller.commissioning.commissioning import Planned
 from blf_dsc_controller.commissioning.own_loop import Commissioning, measured_in
+from blf_dsc_controller.commissioning.proof import Errors, Step, errors_of, start_of
 from blf_dsc_controller.commissioning.response import response_of
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.schema import change
@@ -116,6 +117,7 @@ class PostureByPosture(ABC):
         self._folder = folder
         self._measured = 0
         self._requests = 0
+        self._left = ''  # what is left after an end before its time, of a proof
 
     @abstractmethod
     def _positions(self) -> ArrayLike:
@@ -133,6 +135,9 @@ class PostureByPosture(ABC):
 
         Raises EndedError or BlfDscError if it ended before its time.
         """
+
+    def leave(self) -> None:  # noqa: B027 - most robots hold themselves
+        """Hold the arm after the last run for as long as it needs it."""
 
     def _aside(
         self,
@@ -200,16 +205,31 @@ class PostureByPosture(ABC):
             self._measured = k
             yield name, bag
 
+    def proof(self, steps: Sequence[Step]) -> Iterator[tuple[Step, Errors]]:
+        """Yield the errors of each step, to whose start the arm goes slowly.
+
+        Raises EndedError or BlfDscError as `runs`.
+        """
+        held = 'no share of the gains was calm so far'
+        for step in steps:
+            self._left = f'The gains are not proven: {held}; bags are in {self._folder}'
+            here = self.position()
+            way = self._aside(move, step.config, here, start_of(step.config, here))
+            self._run(way.config, way.duration, f'way with {step.name}')
+            bag = self._run(step.config, step.duration, step.name)
+            yield step, self._aside(errors_of, bag, step.config)
+            held = f'{step.share:.0%} of them were calm'
+
     def _run(self, config: ControllerConfig, duration: float, name: str) -> Path:
         """Control the robot for so long [s]; return the bag."""
-        bag = self._folder / name.replace(' ', '_')
+        bag = self._folder / name.replace(' ', '_').replace('%', '')
         self._control(config, duration, bag, name)
         return bag
 
     def _ended(self, name: str, end: End, text: str) -> EndedError:
         reason = f': {text}' if text else ''
-        return EndedError(
-            end,
-            f'{name}: {end}{reason}. No gains were chosen or written; whole bags of '
-            f'{self._measured} postures are in {self._folder}',
+        left = self._left or (
+            f'No gains were chosen or written; whole bags of {self._measured} postures are in '
+            f'{self._folder}'
         )
+        return EndedError(end, f'{name}: {end}{reason}. {left}')

@@ -72,6 +72,10 @@ class RunByRunNode(ControllerNode):
             return None
         return np.array(guard.last_state.q)
 
+    def warn(self, text: str) -> None:
+        """Log what somebody has to know."""
+        self.get_logger().warning(text)
+
     def begin(self, config: ControllerConfig, outputs: tuple[Output, ...]) -> Guard:
         """Begin a run with the next joint state; its messages also go to the outputs.
 
