@@ -155,7 +155,7 @@ def test_nothing_moves_unless_somebody_agrees(arm, capsys, monkeypatch):
     monkeypatch.setattr(sys, 'stdin', Terminal('no\n'))
     assert commission(arm, 'plant') == 1
     printed = capsys.readouterr()
-    assert 'plant moves for' in printed.out
+    assert 'the arm moves for' in printed.out
     assert 'nothing has moved' in printed.err
     assert PlantDriver.last.calls == ['connect']
     monkeypatch.setattr(sys, 'stdin', Terminal('yes\n'))

@@ -27,6 +27,7 @@ from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.messages import topics
 from blf_dsc_controller.messages.codecs import Float64MultiArrayEncoder
 from blf_dsc_controller.nodes.plant_node import PlantNode
+from blf_dsc_controller.nodes.watchdog_node import WatchdogNode
 
 
 class Rig:
@@ -187,6 +188,39 @@ def test_what_would_spoil_a_motion_ends_it(rig, name, told):
     rig.ros.until(lambda: calm(rig))
 
 
+def test_somebody_who_came_between_two_runs_is_noticed(rig):
+    found = []
+
+    def come():
+        if rig.bags.joinpath('move_1').exists() and rig.node.guard.is_settled:
+            rig.always = lambda: None
+            found.append(rig.ros.publisher(topics.COMMANDS))
+            rig.ros.until(lambda: rig.node.count_publishers(rig.node.commands) == 2)
+            rig.node._on_second()
+
+    rig.always = come
+    with pytest.raises(EndedError, match='another node publishes torques on'):
+        rig.measured(NEAR)
+    assert len(found) == 1
+
+
+def test_watchdog_relies_on_each_run(rig):
+    watchdog = rig.ros.add(WatchdogNode)
+    watched = []
+
+    def look():
+        watched.append(watchdog.watchdog.watches)
+        if len(watched) == 1:
+            rig.at(5000, look)  # in the motion
+        else:
+            rig.robot.request_end()
+
+    rig.at(2000, look)  # in the move
+    with pytest.raises(EndedError, match='posture 1: ended on request'):
+        rig.measured(NEAR)
+    assert watched == [True, True]
+
+
 def test_parameters_cannot_be_changed_meanwhile(rig):
     rig.measured()
     (answer,) = rig.node.set_parameters([Parameter('feedback.stiffness', value=2.0)])
@@ -213,7 +247,7 @@ def test_it_says_who_is_missing(ros, tmp_path, monkeypatch):
         (['--ros', '--robot', '10.0.0.1'], 'leave out one of them'),
         (['--ros', '--write', 'motion.yaml'], '--write measures nothing'),
         (['--prove'], 'give --robot or --ros'),
-        (['--ros', '--prove'], 'nobody can be asked here'),
+        (['--ros', '--prove'], 'prove the file that blf_dsc commission has written'),
         (['--ros'], 'nobody can be asked here'),
     ],
 )

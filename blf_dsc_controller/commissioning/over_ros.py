@@ -83,6 +83,7 @@ class OverRos(PostureByPosture):
         self._node = node
         self._spin = spin
         self._worker = worker
+        self._others = 0  # publishers of torques, beside the node, since the first run
         self._looked = 0.0  # s, when there was the last look at who takes the torques
 
     def wait(self) -> None:
@@ -94,7 +95,9 @@ class OverRos(PostureByPosture):
         end = time.monotonic() + _PATIENCE
         while node.position() is None:
             self._spin()
-            if time.monotonic() < end and not self._requests:
+            if self._requests:
+                raise KeyboardInterrupt
+            if time.monotonic() < end:
                 continue
             if not node.is_heard:
                 raise BlfDscError(
@@ -142,6 +145,8 @@ class OverRos(PostureByPosture):
         if self._requests:
             raise self._ended(name, End.REQUESTED, '')
         node = self._node
+        if not node.guard or not node.guard.commanding:
+            self._others = node.others
         recorder, disturbed = TopicRecorder(bag, in_background=True), _Disturbed()
         guard = node.begin(config, (recorder, disturbed))
         try:
@@ -161,7 +166,6 @@ class OverRos(PostureByPosture):
         self, guard: Guard, disturbed: _Disturbed, duration: float
     ) -> tuple[End, str]:
         """Return why a run is over, and in words, if it was not planned."""
-        others = self._node.others
         began = time.monotonic()
         while True:
             self._spin()
@@ -169,7 +173,7 @@ class OverRos(PostureByPosture):
                 return End.REQUESTED, ''
             if trouble := self._stopped(guard) or self._lost(began):
                 return trouble
-            if text := disturbed.text or self._of_others(others):
+            if text := disturbed.text or self._of_others():
                 return End.STOPPED, text
             passed = (guard.journal.stamp - guard.start_stamp) * _NANO
             if guard.commanding and passed >= duration:
@@ -198,10 +202,14 @@ class OverRos(PostureByPosture):
                 return End.LOST, f'nobody takes torques on {node.commands}'
         return None
 
-    def _of_others(self, before: int) -> str:
-        """Return that there are more other publishers of torques than before; or empty."""
+    def _of_others(self) -> str:
+        """Return that there are more other publishers of torques than before; or empty.
+
+        One that was killed stays visible for some time.
+        """
         node = self._node
-        if node.others <= before:
+        self._others = min(self._others, node.others)
+        if node.others == self._others:
             return ''
         return f'another node publishes torques on {node.commands}, too'
 

@@ -16,6 +16,7 @@ import numpy as np
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.control.guarded_loop import GuardedLoop
 from blf_dsc_controller.control.outputs import Output
+from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.messages import topics
 from blf_dsc_controller.nodes.controller_node import ControllerNode
 from blf_dsc_controller.supervision.guard import Guard
@@ -80,7 +81,11 @@ class RunByRunNode(ControllerNode):
         """Begin a run with the next joint state; its messages also go to the outputs.
 
         Return its guard.
+
+        Raises BlfDscError if the node cannot begin, or was silent since the last run.
         """
+        if self.guard is not None and self.guard.silenced:
+            raise BlfDscError(self.guard.supervisor.text)
         acting, self._acting = self._acting, None
         self._loop = GuardedLoop(config, self._steady, self._wall)
         self.config, self.guard = config, self._loop.guard
