@@ -2,6 +2,8 @@
 """Random arms with elastic joints: commissioned by simulated runs, then put to work.
 
     python benchmark/commissioning.py [ARMS] [STUDY ...]
+    python benchmark/commissioning.py repeat [ARMS] [STUDY ...]
+    python benchmark/commissioning.py careful [ARMS] [STUDY ...]
 
 The arms are those of the studies `monte_carlo_elastic_*`: gears, motors, friction, links,
 delays and tables are drawn independently of what controller and commissioning assume.  Each is
@@ -15,13 +17,26 @@ runs the motion of its preset for 60 s, and picks up its load at 8 s.
                brackets with the gains of the preset, where these hold
     bears      the largest of 1, 1.5, 2.5 and 4 by which all gains can be multiplied until the
                arm stops or oscillates within 16 s: the number of arms for each of them
+
+`repeat` commissions each arm four times, with other noise, and compares the stiffnesses that
+are chosen: (largest - least) / mean, in the median of the joints and in the worst of them.
+Beside it the same of the measured inertias.
+
+`careful` says what makes the chosen gains smaller than the largest that hold: the factors by
+which they can be raised
+
+    noise      until the margin of 0.5 is reached without the deviations by noise
+    margin     until a margin of 0.1 is left, likewise: nearly the stability limit
+    here       likewise, by the last run alone: in the first posture, with the load
+    holds      until the arm stops or oscillates within 16 s, by bisection; without a limit
+               it is 16
 """
 
 from __future__ import annotations
 
 import sys
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor
 from itertools import repeat
 from typing import NamedTuple
@@ -30,9 +45,8 @@ import numpy as np
 from harness import print_table
 
 from blf_dsc_controller.commissioning import simulated
-from blf_dsc_controller.commissioning.commissioning import (
-    commissioned,
-)
+from blf_dsc_controller.commissioning.choice import Loops
+from blf_dsc_controller.commissioning.commissioning import Commissioned, commissioned
 from blf_dsc_controller.commissioning.own_loop import Commissioning
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.nodes import LoopConfig, RecorderConfig
@@ -52,6 +66,13 @@ MARGIN = 0.5
 LONG, SHORT = 60.0, 16.0  # s
 PICK_UP, LOADED = 8.0, 4.0  # s, and for how long after it errors are counted
 FACTORS = (1.5, 2.5, 4.0)
+TIMES = 4  # that an arm is commissioned
+RAISE = 1.03  # step by step, since a loop beyond its stability limit has a margin again
+LEAST = 0.1  # modulus margin, of a loop that is nearly unstable
+MOST, HALVINGS = (
+    16.0,
+    6,
+)  # the largest factor on the gains that is tried, and how finely
 FREE = 0.3  # rad, a bound that no law leaves unless it shakes
 
 
@@ -92,33 +113,32 @@ def refused(why: str) -> Outcome:
 
 def borne(controller: ControllerConfig, plant: PlantConfig) -> float:
     """Return the largest factor on the gains with which an arm holds."""
-    largest = 1.0
+    most = 1.0
     for factor in FACTORS:
-        gains = {
-            'feedback.gain': controller.feedback.gain,
-            'barrier.weight': controller.barrier.weight,
-            'barrier.slope_limit': controller.barrier.slope_limit,
-            'disturbance.gain': controller.disturbance.gain,
-        }
-        stiff = {
-            name: (factor * np.array(values)).tolist() for name, values in gains.items()
-        }
-        if not worked(change(controller, stiff), plant, SHORT)[0]:
+        if not worked(scaled(controller, factor), plant, SHORT)[0]:
             break
-        largest = factor
-    return largest
+        most = factor
+    return most
+
+
+def scaled(controller: ControllerConfig, factor: float) -> ControllerConfig:
+    """Return a controller with all gains multiplied."""
+    gains = {
+        'feedback.gain': controller.feedback.gain,
+        'barrier.weight': controller.barrier.weight,
+        'barrier.slope_limit': controller.barrier.slope_limit,
+        'disturbance.gain': controller.disturbance.gain,
+    }
+    stiff = {
+        name: (factor * np.array(values)).tolist() for name, values in gains.items()
+    }
+    return change(controller, stiff)
 
 
 def outcome(name: str, number: int) -> Outcome:
     """Return what becomes of an arm of a study."""
-    study = load_study(name)
-    plant = plant_with(study, draw(study, number))
-    loop = LoopConfig(plant, study.controller, RecorderConfig())
     try:
-        measuring = Commissioning(study.controller)
-        runs = [run for _, run in simulated.runs_of(measuring, loop)]
-        measured = [run for run in runs if not isinstance(run, BlfDscError)]
-        found = commissioned(study.controller, measured, MARGIN)
+        found, plant = commissioning_of(name, number)
     except BlfDscError as error:
         return refused(str(error))
     if found.choice.margin.value < MARGIN:
@@ -127,8 +147,92 @@ def outcome(name: str, number: int) -> Outcome:
     free = without_bound(found.config)
     held, pick_up = worked(free, plant, LONG)
     kept, _ = worked(found.config, plant, LONG)
-    _, before = worked(without_bound(study.controller), plant, SHORT)
+    _, before = worked(without_bound(found.before), plant, SHORT)
     return Outcome('', held, kept, pick_up, before, borne(free, plant))
+
+
+def commissioning_of(
+    name: str, number: int, seed: int | None = None
+) -> tuple[Commissioned, PlantConfig]:
+    """Return what is found of an arm of a study, with a seed of its noise, and its plant."""
+    study = load_study(name)
+    plant = plant_with(study, draw(study, number))
+    if seed is not None:
+        plant = change(plant, {'seed': seed})
+    loop = LoopConfig(plant, study.controller, RecorderConfig())
+    runs = [run for _, run in simulated.runs_of(Commissioning(study.controller), loop)]
+    measured = [run for run in runs if not isinstance(run, BlfDscError)]
+    return commissioned(study.controller, measured, MARGIN), plant
+
+
+def repeated(name: str, number: int) -> list[str]:
+    """Return the row of `repeat` for an arm."""
+    found = [commissioning_of(name, number, 1 + k)[0] for k in range(TIMES)]
+    row = [name.rpartition('_')[2], f'{number}', f'{TIMES}']
+    for values in (
+        np.array([each.choice.gains.stiffness for each in found]),
+        np.array([each.findings.inertia for each in found]),
+    ):
+        spread = np.ptp(values, axis=0) / values.mean(axis=0)
+        row.append(f'{np.nanmedian(spread):.1%}, {np.nanmax(spread):.1%}')
+    return row
+
+
+def without_noise(loops: Loops) -> Loops:
+    """Return measured arms as if no noise had been measured."""
+    clean = [
+        each._replace(
+            position_noise=0.0 * each.position_noise,
+            velocity_noise=0.0 * each.velocity_noise,
+        )
+        for each in loops.responses
+    ]
+    return loops._replace(responses=clean)
+
+
+def largest(holds: Callable[[float], bool]) -> float:
+    """Return the largest factor from 1 to MOST that holds, by bisection of its logarithm."""
+    low, high = 0.0, float(np.log(MOST))
+    if holds(MOST):
+        return MOST
+    for _ in range(HALVINGS):
+        middle = 0.5 * (low + high)
+        low, high = (middle, high) if holds(float(np.exp(middle))) else (low, middle)
+    return float(np.exp(low))
+
+
+def careful(name: str, number: int) -> list[str]:
+    """Return the row of `careful` for an arm."""
+    found, plant = commissioning_of(name, number)
+    clean = without_noise(found.loops)
+    here = clean._replace(responses=clean.responses[-1:])
+    gains = found.choice.gains
+
+    def raised(loops: Loops, margin: float) -> float:
+        factor = 1.0
+        while (
+            factor < MOST and loops.margin(gains.scaled(RAISE * factor)).value >= margin
+        ):
+            factor *= RAISE
+        return factor
+
+    free = without_bound(found.config)
+    factors = (
+        raised(clean, MARGIN),
+        raised(clean, LEAST),
+        raised(here, LEAST),
+        largest(lambda f: worked(scaled(free, f), plant, SHORT)[0]),
+    )
+    return [name.rpartition('_')[2], f'{number}', *(f'{f:.2g}' for f in factors)]
+
+
+def of_arms(
+    row: Callable[[str, int], list[str]], names: tuple[str, ...], count: int
+) -> Iterator[list[str]]:
+    """Compute a row for each arm of each study."""
+    arms = [(name, number) for name in names for number in range(count)]
+    with ProcessPoolExecutor(cores()) as pool:
+        yield from pool.map(row, *zip(*arms, strict=True))
 
 
 def rows(names: tuple[str, ...], count: int) -> Iterator[list[str]]:
@@ -156,8 +260,21 @@ def rows(names: tuple[str, ...], count: int) -> Iterator[list[str]]:
             ]
 
 
-if __name__ == '__main__':
-    many, *given = [*sys.argv[1:], *['20'][len(sys.argv) - 1 :]]
+HEADS = {
+    'repeat': ['arm', 'number', 'times', 'stiffness chosen', 'inertia measured'],
+    'careful': ['arm', 'number', 'noise', 'margin', 'here', 'holds'],
+}
+ROWS = {'repeat': repeated, 'careful': careful}
+
+
+def main(words: list[str]) -> None:
+    """Print a table."""
+    what = words.pop(0) if words and words[0] in ROWS else ''
+    many, *given = words or ['2' if what else '20']
+    names = tuple(given) or STUDIES
+    if what:
+        print_table(HEADS[what], of_arms(ROWS[what], names, int(many)))
+        return
     print_table(
         [
             'arm',
@@ -168,5 +285,9 @@ if __name__ == '__main__':
             'pick-up',
             'bears 1, 1.5, 2.5, 4',
         ],
-        rows(tuple(given) or STUDIES, int(many)),
+        rows(names, int(many)),
     )
+
+
+if __name__ == '__main__':
+    main(sys.argv[1:])

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from elastic_two_link import ARM, BEGIN, FAR, NEAR
 from plant_driver import PlantDriver
 
 import blf_dsc_controller as blf
@@ -17,8 +18,9 @@ from blf_dsc_controller.arms.urdf import frames
 from blf_dsc_controller.bags.content import read_content
 from blf_dsc_controller.cli.main import main
 from blf_dsc_controller.commissioning.commissioning import plan, postures_of
-from blf_dsc_controller.commissioning.driven import SPEED, Driven, EndedError, move
+from blf_dsc_controller.commissioning.driven import Driven
 from blf_dsc_controller.commissioning.motion import SETTLING
+from blf_dsc_controller.commissioning.postures import SPEED, EndedError, move
 from blf_dsc_controller.commissioning.strength import MOST
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.drive import DriveConfig
@@ -30,25 +32,6 @@ from blf_dsc_controller.reference.terms import sampled
 from blf_dsc_controller.supervision.config_warnings import config_warnings
 from blf_dsc_controller.supervision.not_commissioned import not_commissioned
 
-BEGIN = (0.1, 0.8)  # rad, where the arm rests
-NEAR, FAR = (0.3, 1.1), (0.8, 0.5)  # rad
-# Springs of 26 and 29 Hz, and no torque where nothing moves: no gravity.
-ARM = """
-/**:
-  ros__parameters:
-    robot: {urdf: two_link.urdf, gravity: [0.0, 0.0, 0.0], rotor_inertia: [0.3, 0.1], payload: 0.1}
-/**/sim_plant:
-  ros__parameters:
-    truth.rotor_inertia: [0.3, 0.1]
-    joint.stiffness: [3.0e+3, 1.5e+3]
-    disturbance: {constant: [0.0, 0.0], amplitude: [0.0, 0.0], viscous: [2.0, 1.0]}
-    initial.position: [0.1, 0.8]
-/**/blf_dsc_controller:
-  ros__parameters:
-    barrier.bound: [0.2, 0.2]
-    limits.position_lower: [-3.0, -3.0]
-    limits.position_upper: [3.0, 3.0]
-"""
 DRIVER = """
 from math import inf
 from plant_driver import PlantDriver
@@ -172,7 +155,7 @@ def test_nothing_moves_unless_somebody_agrees(arm, capsys, monkeypatch):
     monkeypatch.setattr(sys, 'stdin', Terminal('no\n'))
     assert commission(arm, 'plant') == 1
     printed = capsys.readouterr()
-    assert 'plant moves for' in printed.out
+    assert 'the arm moves for' in printed.out
     assert 'nothing has moved' in printed.err
     assert PlantDriver.last.calls == ['connect']
     monkeypatch.setattr(sys, 'stdin', Terminal('yes\n'))
@@ -331,3 +314,72 @@ def test_motion_that_stays_hidden_is_told_after_its_posture(arm, capsys):
     assert 'posture 1: the positions do not show the motion' in told
     assert PlantDriver.last.calls == ['connect', *['start', 'finish'] * 3]
     assert nothing_looks_whole(arm)
+
+
+PROVEN = """
+    feedback: {joint_stiffness: [K1, K2], joint_damping: [D1, D2]}
+    reference: {type: sinusoids, offset: [0.3, 1.1], amplitude: [0.1, 0.1], frequency: [2.0],
+                phase: [0.0]}
+"""
+# N m/rad and N m s/rad: about what commissioning chooses for this arm
+CHOSEN = {'K1': '25.0', 'K2': '8.5', 'D1': '6.0', 'D2': '1.5'}
+
+
+def prove(arm, address, gains, *options):
+    text = PROVEN
+    for name, value in gains.items():
+        text = text.replace(name, value)
+    own = '/**/blf_dsc_controller:\n  ros__parameters:\n'
+    arm.write_text(arm.read_text().replace(own, own + text.strip('\n') + '\n'))
+    words = ['commission', '--prove', '--config', str(arm), '--robot', address]
+    return main([*words, '--yes', '--record', str(arm.with_name('proof')), *options])
+
+
+def test_gains_are_proven_in_three_steps_and_errors_compared(arm, capsys):
+    assert prove(arm, 'plant', CHOSEN) == 0
+    told = capsys.readouterr().out
+    said = [
+        '50% of the gains: calm',
+        '75% of the gains: calm',
+        '100% of the gains: calm',
+    ]
+    assert [told.find(each) > 0 for each in said] == [True] * 3
+    assert PlantDriver.last.calls == ['connect', *['start', 'finish'] * 6]
+    folder = arm.with_name('proof')
+    gains = []
+    for share in (50, 75, 100):
+        content = read_content(folder / f'{share}_of_the_gains').controller_config()
+        gains.append(content.feedback.gain)
+    np.testing.assert_allclose(gains[0], 0.5 * np.array(gains[2]), rtol=1e-9)
+    np.testing.assert_allclose(gains[1], 0.75 * np.array(gains[2]), rtol=1e-9)
+    # the table: the largest error of each joint, as its bag has it, beside one to expect
+    run = blf.read_run(folder / '100_of_the_gains')
+    for name, error in zip(
+        run.joints, np.nanmax(np.abs(run.error), axis=0), strict=True
+    ):
+        (row,) = [line.split() for line in told.splitlines() if line.startswith(name)]
+        assert float(row[1]) == pytest.approx(1e3 * error, rel=0.05)  # two digits
+        assert float(row[2]) > 0.0
+
+
+@pytest.mark.parametrize(
+    ('address', 'factor', 'code', 'printed'),
+    [
+        ('plant', '9', 5, ['way with 50% of the gains: the controller', 'oscillates']),
+        (
+            'interrupt@300',
+            '',
+            130,
+            ['way with 50% of the gains: ended on request', 'no share of the gains'],
+        ),
+    ],
+)
+def test_gains_that_are_not_proven_are_told(
+    address, factor, code, printed, arm, capsys
+):
+    """With 96 times the stiffness and damping of the arm; or ended by somebody."""
+    gains = {name: factor + value for name, value in CHOSEN.items()}
+    assert prove(arm, address, gains) == code
+    told = capsys.readouterr().err
+    for each in (*printed, 'The gains are not proven'):
+        assert each in told

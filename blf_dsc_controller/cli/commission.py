@@ -7,23 +7,25 @@ import sys
 import textwrap
 from argparse import Namespace
 from collections.abc import Sequence
+from contextlib import AbstractContextManager
 from pathlib import Path
 
 from tqdm import tqdm
 
 from blf_dsc_controller import __version__
-from blf_dsc_controller.cli.commission_robot import measured_on_robot
+from blf_dsc_controller.cli.commission_robot import measured_on, proven_on, robot
 from blf_dsc_controller.cli.drive import CODES
 from blf_dsc_controller.cli.main import make_room
+from blf_dsc_controller.cli.ros_check import require_ros
 from blf_dsc_controller.cli.run import print_notice
 from blf_dsc_controller.commissioning import files, page, simulated
 from blf_dsc_controller.commissioning.commissioning import Commissioned
-from blf_dsc_controller.commissioning.driven import EndedError
 from blf_dsc_controller.commissioning.own_loop import (
     Commissioning,
     Measured,
     measured_in,
 )
+from blf_dsc_controller.commissioning.postures import EndedError, PostureByPosture
 from blf_dsc_controller.compiled.announcement import announced_compilation
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.nodes import (
@@ -44,15 +46,28 @@ NO_MARGIN = 3
 
 def commission(options: Namespace) -> int:
     """Write the motions to run, or measure, choose and write the gains."""
-    path = locate(options.config)
     _check(options)
+    path = locate(options.config)
+    if not options.ros:
+        return _commission(options, path, load(path, CONTROLLER, ControllerConfig))
+    require_ros()
+    from blf_dsc_controller.cli.commission_ros import config_over_ros, ros_session
+
+    with ros_session(options):
+        return _commission(options, path, config_over_ros(path))
+
+
+def _commission(options: Namespace, path: Path, config: ControllerConfig) -> int:
+    """Write the motions of a configuration, or measure, choose and write the gains."""
     commissioning = Commissioning(
-        load(path, CONTROLLER, ControllerConfig),
+        config,
         options.posture,
         torque=options.torque,
         travel=options.travel,
         margin=options.margin,
     )
+    if options.prove:
+        return _prove_on_robot(options, path, commissioning)
     if options.write:
         _write_motions(options, path, commissioning)
         return 0
@@ -74,34 +89,75 @@ def commission(options: Namespace) -> int:
     comment = ''.join(f'# {line}\n' for line in (options.line, *lines))
     dump(options.out, files.of_commissioned(read(path), found), comment)
     print(f'wrote {options.out}')
-    if not (options.bags or options.robot):
+    if not (options.bags or options.robot or options.ros):
         _prove(options.out)
     return 0
 
 
 def _check(options: Namespace) -> None:
     """Raise BlfDscError if options contradict each other."""
-    if options.write and (options.robot or options.bags):
+    is_robot = options.robot or options.ros
+    if options.robot and options.ros:
         raise BlfDscError(
-            '--write measures nothing: leave out bags and --robot, or leave out --write'
+            '--robot is for a driver of blf_dsc drive, --ros for one of ROS: leave out one of them'
         )
-    if not options.robot and (options.yes or options.record):
-        raise BlfDscError('--yes and --record are for a robot: give --robot, too')
+    if options.write and (is_robot or options.bags):
+        raise BlfDscError(
+            '--write measures nothing: leave out bags, --robot and --ros, or leave out --write'
+        )
+    if options.prove and (not is_robot or options.write or options.bags):
+        raise BlfDscError(
+            '--prove runs a commissioned file on a robot: give --robot or --ros, no bags and no '
+            '--write'
+        )
+    if not is_robot and (options.yes or options.record):
+        raise BlfDscError(
+            '--yes and --record are for a robot: give --robot or --ros, too'
+        )
+    if not options.ros and (options.states or options.commands or options.namespace):
+        raise BlfDscError(
+            '--states, --commands and --namespace are for topics: give --ros, too'
+        )
 
 
 def _all_runs(
     options: Namespace, path: Path, commissioning: Commissioning
 ) -> tuple[list[str], list[Measured]]:
     """Return names and runs: of bags, of the robot or both, else of the simulated arm."""
-    if not (options.bags or options.robot):
+    if not (options.bags or options.robot or options.ros):
         return _simulated(path, commissioning)
     names = [str(bag) for bag in options.bags]
     runs = [measured_in(bag) for bag in options.bags]
+    if not (options.robot or options.ros):
+        return names, runs
+    measured = measured_on(options, _arm(options, path, commissioning), commissioning)
+    names += [name for name, _ in measured]
+    return names, runs + [run for _, run in measured]
+
+
+def _arm(
+    options: Namespace, path: Path, commissioning: Commissioning
+) -> AbstractContextManager[PostureByPosture]:
+    """Return the robot that the options name, still to be entered."""
     if options.robot:
-        for name, run in measured_on_robot(options, path, commissioning):
-            names.append(name)
-            runs.append(run)
-    return names, runs
+        return robot(options, path, commissioning)
+    from blf_dsc_controller.cli.commission_ros import robot_over_ros
+
+    return robot_over_ros(options, commissioning)
+
+
+def _prove_on_robot(
+    options: Namespace, path: Path, commissioning: Commissioning
+) -> int:
+    """Raise the gains of a file step by step on a robot, and say how far it errs."""
+    config = commissioning.config
+    try:
+        *_, last = proven_on(options, _arm(options, path, commissioning), config)
+    except EndedError as error:
+        print(f'blf_dsc commission: {error}', file=sys.stderr)
+        return CODES[error.end]
+    print(page.errors_table(config.joints, last))
+    return 0
 
 
 def _write_motions(

@@ -1,12 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`blf_dsc commission --robot`: the limits, a question, and the robot in each posture."""
+"""`blf_dsc commission --robot`: the limits, a question, and the robot in each posture.
+
+`--ros` has the same limits and question.
+"""
 
 from __future__ import annotations
 
+import signal
 import sys
 from argparse import Namespace
-from collections.abc import Iterator
-from contextlib import closing
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import AbstractContextManager, closing, contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -16,8 +20,14 @@ from blf_dsc_controller.cli.main import make_room
 from blf_dsc_controller.cli.run import print_notice
 from blf_dsc_controller.commissioning import page
 from blf_dsc_controller.commissioning.commissioning import Planned
-from blf_dsc_controller.commissioning.driven import SPEED, Driven
-from blf_dsc_controller.commissioning.own_loop import Commissioning, Measured
+from blf_dsc_controller.commissioning.driven import Driven
+from blf_dsc_controller.commissioning.own_loop import (
+    Commissioning,
+    Measured,
+    measured_in,
+)
+from blf_dsc_controller.commissioning.postures import SPEED, PostureByPosture
+from blf_dsc_controller.commissioning.proof import Errors, Step, steps
 from blf_dsc_controller.commissioning.strength import MOST
 from blf_dsc_controller.compiled.announcement import announced_compilation
 from blf_dsc_controller.configuration.controller import ControllerConfig
@@ -26,22 +36,19 @@ from blf_dsc_controller.control.realtime import request_realtime
 from blf_dsc_controller.drive.drivers import driver_of
 from blf_dsc_controller.errors import BlfDscError
 
+_SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
-def measured_on_robot(
+
+@contextmanager
+def robot(
     options: Namespace, path: Path, commissioning: Commissioning
-) -> list[tuple[str, Measured]]:
-    """Measure the robot, and return for each posture its name and what was measured.
+) -> Iterator[PostureByPosture]:
+    """Connect to the robot, at rest.
 
-    Raises:
-        EndedError: it ended before its time.
-        BlfDscError: nobody agrees, or the robot, the file or a run is not as it should be.
+    Raises BlfDscError if nobody can be asked, or the robot or the file is not as it should
+    be.
     """
-    if not (options.yes or sys.stdin.isatty()):
-        raise BlfDscError(
-            'the robot moves, and nobody can be asked here: start it in a terminal, or give --yes'
-        )
-    folder = options.record or options.out.with_name(f'{options.out.stem}_bags')
-    make_room(folder, force=False)
+    folder = prepared_folder(options)
     config = commissioning.config
     driver = driver_of(options.robot, path, config)
     with announced_compilation(print_notice):
@@ -50,23 +57,113 @@ def measured_on_robot(
         for remark in driver.connect():
             print_notice(remark)
         driven = Driven(driver, commissioning, folder)
-        planned = commissioning.motions_from(driven.position())
-        print('\n'.join(_limits(options, config, planned, driven.duration(planned))))
-        if not options.yes and input('Type yes to start: ').strip().lower() != 'yes':
-            raise BlfDscError('not started: nothing has moved')
         request_realtime(config.realtime, lambda text: print_notice(f'warning: {text}'))
         with signals_to(driven.request_end):
-            return list(_followed(driven, planned))
+            yield driven
 
 
-def _followed(driven: Driven, planned: list[Planned]) -> Iterator[tuple[str, Measured]]:
-    """Yield what is measured, and say how far it is."""
+def measured_on(
+    options: Namespace,
+    arm: AbstractContextManager[PostureByPosture],
+    commissioning: Commissioning,
+) -> list[tuple[str, Measured]]:
+    """Measure a robot, and return for each posture its name and what was measured.
+
+    Raises:
+        EndedError: it ended before its time.
+        BlfDscError: nobody agrees, or the robot, the file or a run is not as it should be.
+    """
+    with arm as here:
+        planned = commissioning.motions_from(here.position())
+        duration = here.duration(planned)
+        ask(options, _limits(options, commissioning.config, planned, duration))
+        bags = list(_followed(here, planned))
+        here.leave()
+    return [(name, measured_in(bag)) for name, bag in bags]
+
+
+def proven_on(
+    options: Namespace,
+    arm: AbstractContextManager[PostureByPosture],
+    config: ControllerConfig,
+) -> list[Errors]:
+    """Prove the gains of a configuration on a robot; return the errors of each step.
+
+    Raises as `measured_on`.
+    """
+    planned = steps(config)
+    with arm as here:
+        ask(options, _of_proof(options, planned))
+        found = []
+        for step, errors in here.proof(planned):
+            worst = 1e3 * float(errors.measured.max())
+            print(f'{step.name}: calm, errors of {worst:.2g} mrad at most', flush=True)
+            found.append(errors)
+        here.leave()
+    return found
+
+
+def prepared_folder(options: Namespace) -> Path:
+    """Return the folder for the bags, which does not exist yet.
+
+    Raises BlfDscError if it does, or if nobody can be asked whether to start.
+    """
+    if not (options.yes or sys.stdin.isatty()):
+        raise BlfDscError(
+            'the robot moves, and nobody can be asked here: start it in a terminal, or give --yes'
+        )
+    folder: Path = options.record or options.out.with_name(f'{options.out.stem}_bags')
+    make_room(folder, force=False)
+    return folder
+
+
+def ask(options: Namespace, lines: Iterable[str]) -> None:
+    """Say what the robot is about to do, and ask whether to start.
+
+    Raises BlfDscError if nobody agrees.
+    """
+    print('\n'.join(lines))
+    if not options.yes and not agreed():
+        raise BlfDscError('not started: nothing has moved')
+
+
+def agreed() -> bool:
+    """Whether somebody types yes; Ctrl-C is an answer, too."""
+    before = [signal.signal(each, signal.default_int_handler) for each in _SIGNALS]
+    try:
+        return input('Type yes to start: ').strip().lower() == 'yes'
+    finally:
+        for number, handler in zip(_SIGNALS, before, strict=True):
+            signal.signal(number, handler)
+
+
+def _followed(
+    robot: PostureByPosture, planned: list[Planned]
+) -> Iterator[tuple[str, Path]]:
+    """Yield the bags of the postures, and say how far it is."""
     postures = np.array([each.posture for each in planned])
     total = len(planned)
     print(f'0 of {total} postures measured: Ctrl-C stops the arm', flush=True)
-    for k, measured in enumerate(driven.runs(postures), 1):
+    for k, bag in enumerate(robot.runs(postures), 1):
         print(f'{k} of {total} postures measured', flush=True)
-        yield measured
+        yield bag
+
+
+def _of_proof(options: Namespace, planned: Sequence[Step]) -> Iterator[str]:
+    """Yield what the arm is about to do in a proof."""
+    seconds = sum(each.duration for each in planned)
+    yield (
+        f'before each step the joints move straight to the start of the reference, at {SPEED:g} '
+        'rad/s at most: keep the way of the arm free'
+    )
+    yield (
+        f'then the arm follows the reference of {options.config}, for {seconds:g} s in all, with '
+        f'{", ".join(each.name for each in planned)}'
+    )
+    yield (
+        'an oscillation, any other check of the controller, or Ctrl-C brings the arm to rest and '
+        'ends'
+    )
 
 
 def _limits(
@@ -100,6 +197,6 @@ def _limits(
     )
     again = sum(each.duration for each in planned)
     yield (
-        f'{options.robot} moves for {duration:.0f} s in all, and for {duration + again:.0f} s if '
+        f'the arm moves for {duration:.0f} s in all, and for {duration + again:.0f} s if '
         'every posture is measured twice'
     )

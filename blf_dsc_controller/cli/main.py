@@ -321,12 +321,14 @@ def _add_commissioning(command: _Command, force: argparse.ArgumentParser) -> Non
         'Measure an arm from a URDF, and choose its gains by what was measured. A reference '
         'shakes all joints a little, in a few postures; from torques and positions follow the '
         'responses of the joints, and the stiffest gains with a modulus margin. With --robot, the '
-        'driver of `blf_dsc drive` moves the robot to each posture and measures it. With --write, '
-        'write the motions for the node; then give their bags. With none of these the arm is '
-        'simulated. Exit code: 0 done, 3 no gains have the margin, 5 the controller or the robot '
-        'stopped before, 130 interrupted, 1 an error.',
+        'driver of `blf_dsc drive` moves the robot to each posture and measures it; with --ros, '
+        "the controller's node does. With --write, write the motions for a loop of your own; "
+        'then give their bags. With none of these the arm is simulated. Exit code: 0 done, 3 no '
+        'gains have the margin, 5 the controller or the robot stopped before, 130 interrupted, 1 '
+        'an error.',
         '--config ur5e --out commissioned.yaml\n'
         '  blf_dsc commission --config my.yaml --robot 172.16.0.2 --out commissioned.yaml\n'
+        '  blf_dsc commission --config my.yaml --ros --commands effort_controller/commands\n'
         '  blf_dsc commission --config my.yaml --write motion.yaml\n'
         '  blf_dsc commission run1/bag run2/bag run3/bag --config my.yaml --out commissioned.yaml',
         force,
@@ -344,6 +346,26 @@ def _add_commissioning(command: _Command, force: argparse.ArgumentParser) -> Non
         metavar='ADDRESS',
         help='measure this robot; with BAGs, these count, too',
     )
+    option(
+        '--ros',
+        action='store_true',
+        help='measure the robot behind topics; with BAGs, these count, too',
+    )
+    option(
+        '--prove',
+        action='store_true',
+        help='measure nothing, but raise the gains of a commissioned file in three steps along '
+        'its reference, on the robot, and compare its errors with those expected',
+    )
+    option(
+        '--states', metavar='TOPIC', help='joint states of its driver (joint_states)'
+    )
+    option(
+        '--commands',
+        metavar='TOPIC',
+        help='torques that its driver takes (blf_dsc_controller/commands)',
+    )
+    option('--namespace', default='', help='namespace of these topics (none)')
     option('--yes', action='store_true', help='start the robot without a question')
     option(
         '--record',

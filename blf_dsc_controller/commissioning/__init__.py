@@ -13,7 +13,10 @@ joints, and from these the stiffest gains with a margin.
     commissioning   the three steps in a row
     own_loop        all of it for a loop of your own: `blf.Commissioning`
     simulated       the runs of a simulated arm
-    driven          the runs of a robot over its driver, from posture to posture
+    postures        the runs of a robot, from posture to posture
+    driven          likewise, over its driver
+    over_ros        likewise, over ROS, by the controller's node
+    proof           the chosen gains in three steps along the arm's own reference
     page            what was found and chosen, for people
     files           the parameter files of motions, and with what was chosen
 """

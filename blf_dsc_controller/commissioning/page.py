@@ -14,6 +14,7 @@ from blf_dsc_controller.analysis.output import aligned
 from blf_dsc_controller.analysis.panels import ALARM, BLUE, MUTED, ORANGE, SHADE
 from blf_dsc_controller.commissioning.choice import SLOWEST
 from blf_dsc_controller.commissioning.commissioning import Commissioned, Planned
+from blf_dsc_controller.commissioning.proof import Errors
 from blf_dsc_controller.commissioning.strength import LITTLE
 from blf_dsc_controller.supervision.expected_errors import expectation
 
@@ -143,6 +144,16 @@ def _of_bound(found: Commissioned) -> Iterator[str]:
             'friction, grow by as much; a bound that was given for the stiffer gains may be too '
             'narrow'
         )
+
+
+def errors_table(joints: Sequence[str], errors: Errors) -> str:
+    """Return the largest errors of a proof beside those to expect, for each joint."""
+    rows: list[Sequence[str]] = [('', 'error', 'expected'), ('', 'mrad', 'mrad')]
+    rows += [
+        (joint, f'{1e3 * measured:.2g}', f'{1e3 * expected:.2g}')
+        for joint, measured, expected in zip(joints, *errors, strict=True)
+    ]
+    return aligned(rows)
 
 
 def _doubt_at(found: Commissioned) -> float:

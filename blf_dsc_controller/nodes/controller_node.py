@@ -12,7 +12,8 @@ import numpy as np
 
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.control.guarded_loop import GuardedLoop
-from blf_dsc_controller.law.telemetry import rejected_columns
+from blf_dsc_controller.control.outputs import Outputs
+from blf_dsc_controller.law.telemetry import Message, rejected_columns
 from blf_dsc_controller.messages import topics
 from blf_dsc_controller.messages.codecs import (
     Float64MultiArrayEncoder,
@@ -49,12 +50,16 @@ _SILENT = 0.1  # s without joint states, after which nothing is left to bring to
 class ControllerNode(LoopNode[ControllerConfig]):
     """Commands a torque on `~/commands` for each joint state, and publishes telemetry.
 
-    `guard` runs the guarded law; None until the node is configured.
+    Attributes:
+        guard: runs the guarded law; None until the node is configured.
+        outputs: take the loop's messages beside the topics: joint states, torques,
+            telemetry and events.
     """
 
     def __init__(self, **options: Any) -> None:
         super().__init__(topics.CONTROLLER, ControllerConfig, **options)
         self.guard: Guard | None = None
+        self.outputs = Outputs()
         self._loop: GuardedLoop | None = None
         self._load: ReferenceLoad | None = None
         self._load_service: LoadService | None = None
@@ -77,7 +82,7 @@ class ControllerNode(LoopNode[ControllerConfig]):
         self._ends_at = 0.0  # s, at the latest, since a signal
         # joint states processed by then, and when the last was
         self._last_seen = 0, 0.0
-        self._status = ControllerStatus(self, joints)
+        self._status = ControllerStatus(self, joints, self.outputs)
         self._action: TrajectoryAction | None = None
         self._watchdog = WatchdogPresence(expected=self.config.safety.expect_watchdog)
         self._start = ControllerStart(
@@ -230,6 +235,7 @@ class ControllerNode(LoopNode[ControllerConfig]):
             trajectories.poll(guard)
         try:
             torque = self._torque_for(guard, raw)
+            self._tell(topics.JOINT_STATES, raw)
             self._command(torque)
             guard.perceive()
         except Exception as error:  # noqa: BLE001 - the arm needs a torque after any error
@@ -292,7 +298,7 @@ class ControllerNode(LoopNode[ControllerConfig]):
         """Publish the messages about the last state and its torque (n,) [N m]."""
         if self._loop is not None and self.config.telemetry.enabled:
             for message in self._loop.messages(
-                torque, errors_wanted=self._errors_subscribed
+                torque, errors_wanted=self._errors_subscribed or bool(self.outputs)
             ):
                 self._publish(message)
 
@@ -326,7 +332,18 @@ class ControllerNode(LoopNode[ControllerConfig]):
 
     def _command(self, torque: np.ndarray | None) -> None:
         if torque is not None:
-            self._senders[topics.COMMANDS](self._encoder.encode(torque))
+            raw = self._encoder.encode(torque)
+            self._senders[topics.COMMANDS](raw)
+            self._tell(topics.COMMANDS, raw)
+
+    def _publish(self, message: Message) -> None:
+        super()._publish(message)
+        self._tell(*message)
+
+    def _tell(self, topic: topics.Topic, raw: bytes) -> None:
+        """Give a message to the outputs beside the topics."""
+        if self.outputs and self.guard is not None:
+            self.outputs.write(max(self.guard.journal.stamp, 0), topic, raw)
 
     def _on_poll(self) -> bool:
         """Check for missing states."""

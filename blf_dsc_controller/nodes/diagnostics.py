@@ -12,6 +12,7 @@ from collections.abc import Sequence
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rclpy.node import Node
 
+from blf_dsc_controller.control.outputs import Outputs
 from blf_dsc_controller.control.status_report import (
     ERROR,
     OK,
@@ -61,9 +62,13 @@ class ControllerStatus(StatusReport):
         journal: publisher of `~/journal`.
     """
 
-    def __init__(self, node: Node, joints: Sequence[str]) -> None:
-        """Create the publishers of a node that controls `joints`."""
+    def __init__(self, node: Node, joints: Sequence[str], outputs: Outputs) -> None:
+        """Create the publishers of a node that controls `joints`.
+
+        Events also go to the outputs.
+        """
         super().__init__(node.get_logger())
+        self._outputs = outputs
         self.journal = create_publisher(node, topics.JOURNAL)
         self._targets = create_publisher(node, topics.TARGETS)
         self._diagnostics = DiagnosticsPublisher(node, joints)
@@ -101,3 +106,4 @@ class ControllerStatus(StatusReport):
         for topic, raw in guard.journal.take():
             publisher = self.journal if topic is topics.JOURNAL else self._targets
             publisher.publish(raw)
+            self._outputs.write(max(guard.journal.stamp, 0), topic, raw)

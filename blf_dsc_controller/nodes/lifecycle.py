@@ -103,7 +103,11 @@ class LoopNode(LifecycleNode, process.PlainNode, Generic[Config]):
 
     def autostart(self) -> None:
         """Configure and activate the node as a manager would, or raise BlfDscError."""
-        for name in ('configure', 'activate'):
+        self._try_each('configure', 'activate')
+
+    def _try_each(self, *names: str) -> None:
+        """Trigger transitions in a row, or raise BlfDscError."""
+        for name in names:
             if getattr(self, f'trigger_{name}')() != TransitionCallbackReturn.SUCCESS:
                 error = self._transition_error
                 if isinstance(error, BlfDscError):

@@ -1,0 +1,235 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Commissioning of a robot from posture to posture: slowly to each, and the motion there.
+
+    rest -> move -> rest -> motion -> rest      for each posture, and the motion once more if
+                                                noise hides much
+
+Moves and motions are runs that end at rest whatever happens, and have a bag each.  A motion
+is around the posture in which the arm rests by then, so it begins without an error.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import NamedTuple, ParamSpec, TypeVar
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from blf_dsc_controller.commissioning import motion
+from blf_dsc_controller.commissioning.commissioning import Planned
+from blf_dsc_controller.commissioning.own_loop import Commissioning, measured_in
+from blf_dsc_controller.commissioning.proof import Errors, Step, errors_of, start_of
+from blf_dsc_controller.commissioning.response import response_of
+from blf_dsc_controller.configuration.controller import ControllerConfig
+from blf_dsc_controller.configuration.schema import change
+from blf_dsc_controller.control.slow_move import duration_of
+from blf_dsc_controller.drive.loop import End
+from blf_dsc_controller.errors import BlfDscError
+from blf_dsc_controller.reference.approach import AT_REST
+from blf_dsc_controller.reference.turns import short_way
+
+Floats = NDArray[np.float64]
+Given = ParamSpec('Given')
+Answer = TypeVar('Answer')
+
+SPEED = 0.3
+"""Largest speed of a joint on the way to a posture [rad/s]."""
+
+_ACCELERATION = 0.5  # rad/s^2, likewise
+_SHORTEST = 1.0  # s, of a move
+_REST = 1.0  # s, at its end
+_PAUSE = 0.2  # s, in which an arm at rest does not move
+
+
+class EndedError(BlfDscError):
+    """A run ended before its time; the message says why, and what is left."""
+
+    def __init__(self, end: End, message: str) -> None:
+        self.end = end
+        super().__init__(message)
+
+
+class Move(NamedTuple):
+    """The way to a posture."""
+
+    config: ControllerConfig
+    duration: float  # s, with the rest at its end
+
+
+def move(config: ControllerConfig, here: Floats, there: Floats) -> Move:
+    """Return the slow way from rest at `here` (n,) [rad] to rest at `there` (n,).
+
+    It has the gains of the configuration, and is straight in the angles of the joints.
+    """
+    (target,), _ = short_way(there[None], here, config)
+    far = np.abs(target - here)
+    speed = np.minimum(SPEED, 0.5 * np.array(config.limits.velocity))
+    acceleration = np.minimum(_ACCELERATION, 0.5 * np.array(config.limits.acceleration))
+    duration = max(_SHORTEST, duration_of(far, speed, acceleration))
+    values = motion.watched(config) | {
+        'reference.type': 'waypoints',
+        'reference.times': [0.0, duration],
+        'reference.waypoints': [*here.tolist(), *target.tolist()],
+    }
+    return Move(change(config, values), duration + _REST)
+
+
+def stronger(
+    commissioning: Commissioning, planned: Planned, bag: Path, posture: Floats
+) -> Planned | None:
+    """Return the motion to repeat the one of a bag with, around a posture (n,) [rad].
+
+    None: it shows enough.  Raises BlfDscError if it does not show the response.
+    """
+    run, config = measured_in(bag)
+    again = commissioning.stronger(planned, run, posture)
+    if again is None:
+        response_of(run, motion.lines_in(config), config.sample_time)
+    return again
+
+
+def check(bag: Path) -> None:
+    """Raise BlfDscError if the run of a bag does not show the response."""
+    run, config = measured_in(bag)
+    response_of(run, motion.lines_in(config), config.sample_time)
+
+
+@contextmanager
+def _named(name: str) -> Iterator[None]:
+    """Let an error say in which posture it is."""
+    try:
+        yield
+    except BlfDscError as error:
+        raise BlfDscError(f'{name}: {error}') from error
+
+
+class PostureByPosture(ABC):
+    """A robot at rest, which goes from posture to posture and is measured in each."""
+
+    def __init__(self, commissioning: Commissioning, folder: Path) -> None:
+        """Measure for a configuration, and write bags into `folder`."""
+        self._commissioning = commissioning
+        self._config = commissioning.config
+        self._folder = folder
+        self._measured = 0
+        self._requests = 0
+        self._left = ''  # what is left after an end before its time, of a proof
+
+    @abstractmethod
+    def _positions(self) -> ArrayLike:
+        """Return the present positions (n,) [rad]."""
+
+    @abstractmethod
+    def _pause(self, seconds: float) -> None:
+        """Let time pass."""
+
+    @abstractmethod
+    def _control(
+        self, config: ControllerConfig, duration: float, bag: Path, name: str
+    ) -> None:
+        """Control the robot from rest to rest, for so long [s], and record it.
+
+        Raises EndedError or BlfDscError if it ended before its time.
+        """
+
+    def leave(self) -> None:  # noqa: B027 - most robots hold themselves
+        """Hold the arm after the last run for as long as it needs it."""
+
+    def _aside(
+        self,
+        compute: Callable[Given, Answer],
+        *given: Given.args,
+        **named: Given.kwargs,
+    ) -> Answer:
+        """Return what takes a moment to compute, between two runs."""
+        return compute(*given, **named)
+
+    def request_end(self) -> None:
+        """Bring the arm to rest and end; a second request ends at once.
+
+        For signal handlers.
+        """
+        self._requests += 1
+
+    def position(self) -> Floats:
+        """Return the positions (n,) [rad] of the arm.
+
+        Raises BlfDscError if it moves.
+        """
+        before = np.array(self._positions(), float)
+        self._pause(_PAUSE)
+        after = np.array(self._positions(), float)
+        joint = int(np.abs(after - before).argmax())
+        moved = float(after[joint] - before[joint])
+        if abs(moved) > AT_REST * _PAUSE:
+            raise BlfDscError(
+                f'{self._config.joints[joint]} moves by {moved:+.2g} rad in {_PAUSE:g} s: let go '
+                'of the arm, end what else moves it, and start again when it rests'
+            )
+        return after
+
+    def duration(self, planned: Sequence[Planned]) -> float:
+        """Return the time [s] that all motions take, with the moves to their postures."""
+        there = [each.posture for each in planned]
+        ways = zip([self.position(), *there[:-1]], there, strict=True)
+        moving = sum(move(self._config, *way).duration for way in ways)
+        return moving + sum(each.duration for each in planned)
+
+    def runs(self, postures: Floats) -> Iterator[tuple[str, Path]]:
+        """Yield for each posture (k, n) [rad] its name and the bag of its motion.
+
+        Raises:
+            EndedError: on request, or since the controller or the robot stopped.
+            BlfDscError: the law cannot take over, the bag is not whole, or it does not show
+                the response.
+        """
+        for k, posture in enumerate(postures, 1):
+            name = f'posture {k}'
+            way = self._aside(move, self._config, self.position(), posture)
+            self._run(way.config, way.duration, f'move {k}')
+            here = self._aside(self._commissioning.motion, self.position())
+            bag = self._run(here.config, here.duration, name)
+            with _named(name):
+                again = self._aside(
+                    stronger, self._commissioning, here, bag, self.position()
+                )
+            if again is not None:
+                bag.rename(bag.with_name(f'weak_{bag.name}'))
+                self._run(again.config, again.duration, name)
+                with _named(name):
+                    self._aside(check, bag)
+            self._measured = k
+            yield name, bag
+
+    def proof(self, steps: Sequence[Step]) -> Iterator[tuple[Step, Errors]]:
+        """Yield the errors of each step, to whose start the arm goes slowly.
+
+        Raises EndedError or BlfDscError as `runs`.
+        """
+        held = 'no share of the gains was calm so far'
+        for step in steps:
+            self._left = f'The gains are not proven: {held}; bags are in {self._folder}'
+            here = self.position()
+            way = self._aside(move, step.config, here, start_of(step.config, here))
+            self._run(way.config, way.duration, f'way with {step.name}')
+            bag = self._run(step.config, step.duration, step.name)
+            yield step, self._aside(errors_of, bag, step.config)
+            held = f'{step.share:.0%} of them were calm'
+
+    def _run(self, config: ControllerConfig, duration: float, name: str) -> Path:
+        """Control the robot for so long [s]; return the bag."""
+        bag = self._folder / name.replace(' ', '_').replace('%', '')
+        self._control(config, duration, bag, name)
+        return bag
+
+    def _ended(self, name: str, end: End, text: str) -> EndedError:
+        reason = f': {text}' if text else ''
+        left = self._left or (
+            f'No gains were chosen or written; whole bags of {self._measured} postures are in '
+            f'{self._folder}'
+        )
+        return EndedError(end, f'{name}: {end}{reason}. {left}')

@@ -1,0 +1,22 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A parameter file of two links with elastic joints, and postures of it."""
+
+BEGIN = (0.1, 0.8)  # rad, where the arm rests
+NEAR, FAR = (0.3, 1.1), (0.8, 0.5)  # rad
+# Springs of 26 and 29 Hz, and no torque where nothing moves: no gravity.
+ARM = """
+/**:
+  ros__parameters:
+    robot: {urdf: two_link.urdf, gravity: [0.0, 0.0, 0.0], rotor_inertia: [0.3, 0.1], payload: 0.1}
+/**/sim_plant:
+  ros__parameters:
+    truth.rotor_inertia: [0.3, 0.1]
+    joint.stiffness: [3.0e+3, 1.5e+3]
+    disturbance: {constant: [0.0, 0.0], amplitude: [0.0, 0.0], viscous: [2.0, 1.0]}
+    initial.position: [0.1, 0.8]
+/**/blf_dsc_controller:
+  ros__parameters:
+    barrier.bound: [0.2, 0.2]
+    limits.position_lower: [-3.0, -3.0]
+    limits.position_upper: [3.0, 3.0]
+"""

@@ -1,0 +1,261 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`blf_dsc commission --ros` by the controller's node, on an elastic arm in lock-step."""
+
+from __future__ import annotations
+
+import io
+import sys
+from concurrent.futures import ThreadPoolExecutor
+
+import numpy as np
+import pytest
+
+pytest.importorskip('rclpy', reason='needs ROS 2')
+
+from elastic_two_link import ARM, NEAR
+from rclpy.parameter import Parameter
+
+import blf_dsc_controller as blf
+from blf_dsc_controller.cli.commission_ros import made
+from blf_dsc_controller.cli.main import main
+from blf_dsc_controller.commissioning import over_ros
+from blf_dsc_controller.commissioning.over_ros import OverRos
+from blf_dsc_controller.commissioning.postures import EndedError
+from blf_dsc_controller.configuration.schema import flatten
+from blf_dsc_controller.drive.loop import End
+from blf_dsc_controller.errors import BlfDscError
+from blf_dsc_controller.messages import topics
+from blf_dsc_controller.messages.codecs import Float64MultiArrayEncoder
+from blf_dsc_controller.nodes.plant_node import PlantNode
+from blf_dsc_controller.nodes.watchdog_node import WatchdogNode
+
+
+class Rig:
+    """An arm in lock-step, and the node that measures it."""
+
+    def __init__(self, ros, folder, text=ARM):
+        self.ros = ros
+        self.file = folder / 'arm.yaml'
+        self.file.write_text(text)
+        self.bags = folder / 'bags'
+        loop = blf.load_loop(self.file)
+        self.commissioning = blf.Commissioning(loop.controller)
+        values = {k: v for k, v in flatten(loop.plant).items() if v != ()}
+        self.arm = ros.add(PlantNode, {**values, 'mode': 'lockstep'})
+        self.node = ros.keep(made(loop.controller, context=ros.context, cli_args=[]))
+        self.samples = 0
+        self.then = self.always = lambda: None
+        self.robot = OverRos(
+            self.node,
+            self.spin,
+            self.commissioning,
+            self.bags,
+            ThreadPoolExecutor(1),
+        )
+
+    def spin(self):
+        self.ros.executor.spin_once(timeout_sec=0.01)
+        self.always()
+        if self.samples and self.arm.plant.sample >= self.samples:
+            self.samples = 0
+            self.then()
+
+    def at(self, samples, then):
+        """Do something once the arm has made this many samples."""
+        self.samples, self.then = samples, then
+
+    def measured(self, *postures):
+        self.robot.wait()
+        return list(self.robot.runs(np.array(postures)))
+
+    def speed(self):
+        return np.abs(self.arm.plant.measure().reshape(3, -1)[1]).max()
+
+
+@pytest.fixture
+def rig(ros, tmp_path):
+    return Rig(ros, tmp_path)
+
+
+def test_arm_is_measured_and_its_bags_give_gains_with_the_margin(rig):
+    found = rig.measured(NEAR)
+    assert [name for name, _ in found] == ['posture 1']
+    (bag,) = (bag for _, bag in found)
+    assert bag == rig.bags / 'posture_1'
+    run = blf.read_run(bag)
+    assert np.abs(run.error[0]).max() < 1e-3
+    assert np.abs(run.torque[0]).max() < 0.05
+    assert blf.verify(bag).difference is None
+    assert blf.verify(rig.bags / 'move_1').difference is None
+    out = rig.file.with_name('out.yaml')
+    words = ['commission', str(bag), '--config', str(rig.file), '--out', str(out)]
+    assert main(words) == 0
+    assert blf.load_loop(out).controller.commissioning.margin >= 0.5
+
+
+def test_a_run_goes_on_from_the_torque_that_holds_the_arm(ros, tmp_path):
+    """A load that the law knows nothing of does not sag between two runs."""
+    loaded = ARM.replace('constant: [0.0, 0.0]', 'constant: [1.0, 0.5]')  # N m
+    rig = Rig(ros, tmp_path, loaded)
+    rig.at(6000, rig.robot.request_end)  # in the motion
+    with pytest.raises(EndedError):
+        rig.measured(NEAR)
+    before, after = (blf.read_run(rig.bags / each) for each in ('move_1', 'posture_1'))
+    # from the first torque on, the whole of what holds the arm against the load
+    np.testing.assert_allclose(before.torque[-1], (1.0, 0.5), atol=0.05)
+    np.testing.assert_allclose(after.torque[0], (1.0, 0.5), atol=0.05)
+    np.testing.assert_allclose(after.position[100], before.position[-1], atol=2e-3)
+
+
+def calm(rig):
+    """Whether the arm rests, and the node holds it."""
+    return rig.speed() < 0.01 and rig.node.guard.is_settled  # rad/s
+
+
+@pytest.mark.parametrize('at', [300, 4500])
+def test_ctrl_c_brings_the_arm_to_rest_in_a_move_and_in_a_motion(rig, at):
+    rig.at(at, rig.robot.request_end)
+    with pytest.raises(EndedError, match='ended on request') as caught:
+        rig.measured(NEAR)
+    assert caught.value.end is End.REQUESTED
+    assert str(caught.value).startswith('move 1' if at == 300 else 'posture 1')
+    assert calm(rig)
+    assert main(['commission', str(rig.bags / 'move_1'), '--config', str(rig.file)])
+
+
+@pytest.mark.parametrize(
+    ('takes', 'told'),
+    [
+        (True, r'no joint states on /joint_states for 4'),
+        (False, r'nobody takes torques on /blf_dsc_controller/commands'),
+    ],
+)
+def test_a_driver_that_is_gone_is_told(rig, takes, told, monkeypatch):
+    """With somebody else who takes torques, or without."""
+    monkeypatch.setattr(
+        over_ros, '_PATIENCE', 4.0
+    )  # s; the arm's first state takes 3 s
+    if takes:
+        rig.ros.driver()
+    rig.at(500, lambda: rig.ros.kill(rig.arm))
+    with pytest.raises(EndedError, match=told) as caught:
+        rig.measured(NEAR)
+    assert caught.value.end is End.LOST
+    assert not (rig.bags / 'posture_1').exists()
+
+
+def test_somebody_who_also_commands_ends_it(rig):
+    def command():
+        rig.ros.publisher(topics.COMMANDS)
+        rig.ros.until(lambda: rig.node.count_publishers(rig.node.commands) == 2)
+        rig.node._on_second()  # it looks every second
+
+    rig.at(500, command)
+    with pytest.raises(EndedError, match='another node publishes torques on') as caught:
+        rig.measured(NEAR)
+    assert caught.value.end is End.STOPPED
+    assert calm(rig)
+
+
+def test_nothing_starts_beside_another_commander(rig):
+    other = rig.ros.publisher(topics.COMMANDS)
+    torque = Float64MultiArrayEncoder(2).encode(np.zeros(2))
+    rig.always = lambda: other.publish(torque)
+    with pytest.raises(BlfDscError, match='move 1: another node commands torques on'):
+        rig.measured(NEAR)
+
+
+@pytest.mark.parametrize(
+    ('name', 'told'),
+    [
+        ('stop', 'somebody called ~/stop'),
+        ('reset', 'somebody called ~/reset'),
+        ('deactivate', 'somebody deactivated the node'),
+    ],
+)
+def test_what_would_spoil_a_motion_ends_it(rig, name, told):
+    def do():
+        if name == 'deactivate':
+            rig.node.trigger_deactivate()
+        elif name == 'stop':
+            rig.node._status.trajectories.take_stop()
+        else:
+            rig.node.reset()
+
+    rig.at(500, do)
+    with pytest.raises(EndedError, match=told):
+        rig.measured(NEAR)
+    rig.ros.until(lambda: calm(rig))
+
+
+def test_somebody_who_came_between_two_runs_is_noticed(rig):
+    found = []
+
+    def come():
+        if rig.bags.joinpath('move_1').exists() and rig.node.guard.is_settled:
+            rig.always = lambda: None
+            found.append(rig.ros.publisher(topics.COMMANDS))
+            rig.ros.until(lambda: rig.node.count_publishers(rig.node.commands) == 2)
+            rig.node._on_second()
+
+    rig.always = come
+    with pytest.raises(EndedError, match='another node publishes torques on'):
+        rig.measured(NEAR)
+    assert len(found) == 1
+
+
+def test_watchdog_relies_on_each_run(rig):
+    watchdog = rig.ros.add(WatchdogNode)
+    watched = []
+
+    def look():
+        watched.append(watchdog.watchdog.watches)
+        if len(watched) == 1:
+            rig.at(5000, look)  # in the motion
+        else:
+            rig.robot.request_end()
+
+    rig.at(2000, look)  # in the move
+    with pytest.raises(EndedError, match='posture 1: ended on request'):
+        rig.measured(NEAR)
+    assert watched == [True, True]
+
+
+def test_parameters_cannot_be_changed_meanwhile(rig):
+    rig.measured()
+    (answer,) = rig.node.set_parameters([Parameter('feedback.stiffness', value=2.0)])
+    assert not answer.successful
+    assert 'an arm is being measured' in answer.reason
+
+
+def test_it_says_who_is_missing(ros, tmp_path, monkeypatch):
+    monkeypatch.setattr(over_ros, '_PATIENCE', 0.5)  # s
+    rig = Rig(ros, tmp_path)
+    ros.kill(rig.arm)
+    with pytest.raises(BlfDscError, match='nobody takes torques on /blf_dsc_contr'):
+        rig.robot.wait()
+    ros.driver()
+    ros.until(lambda: rig.node.is_heard)
+    with pytest.raises(BlfDscError, match='no joint states on /joint_states: start'):
+        rig.robot.wait()
+
+
+@pytest.mark.parametrize(
+    ('options', 'told'),
+    [
+        (['--states', 'franka/joint_states'], 'are for topics: give --ros'),
+        (['--ros', '--robot', '10.0.0.1'], 'leave out one of them'),
+        (['--ros', '--write', 'motion.yaml'], '--write measures nothing'),
+        (['--prove'], 'give --robot or --ros'),
+        (['--ros', '--prove'], 'prove the file that blf_dsc commission has written'),
+        (['--ros'], 'nobody can be asked here'),
+    ],
+)
+def test_options_that_contradict_each_other_are_refused(
+    options, told, tmp_path, capsys, monkeypatch
+):
+    monkeypatch.setattr(sys, 'stdin', io.StringIO())
+    file = tmp_path / 'arm.yaml'
+    file.write_text(ARM)
+    assert main(['commission', '--config', str(file), *options]) == 1
+    assert told in capsys.readouterr().err
