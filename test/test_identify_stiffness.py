@@ -91,13 +91,13 @@ def holds_the_truth(found, times=1.0):
 @pytest.mark.parametrize('side', ['link', 'motor'])
 def test_stiffness_is_that_of_the_gears_behind_friction_and_rotors(motion, side):
     torque = getattr(motion, side)
-    noise = 0.02 * torque.std(axis=0)
+    noise = 0.5 * torque.std(axis=0)
     torque = torque + noise * np.random.default_rng(0).normal(size=torque.shape) + 0.2
     found = motion.compliance(motion.link / STIFFNESS, torque)
     assert found.is_known.all()
     assert found.is_twist
     assert not found.is_computed.any()
-    np.testing.assert_allclose(found.stiffness[0], STIFFNESS, rtol=0.05)
+    np.testing.assert_allclose(found.stiffness[0], STIFFNESS, rtol=0.15)
     # seven intervals of 95 %: 1.7 times as wide, they all hold with 99 %
     assert holds_the_truth(found, 1.7)
 

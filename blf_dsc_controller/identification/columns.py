@@ -34,7 +34,7 @@ _SIDES = {
     *('d', 'des', 'desired', 'target', 'ref', 'reference', 'cmd', 'command'),
     *('ext', 'external', 'error', 'err', 'offset'),
 }
-_RATES = {'dot', 'vel', 'velocity', 'speed'}
+_RATES = {'dot', 'ddot', 'vel', 'velocity', 'speed', 'acc', 'acceleration'}
 _SECONDS = re.compile('sec(ond)?s?', re.IGNORECASE)
 _NANOSECONDS = re.compile('n(ano)?sec(ond)?s?', re.IGNORECASE)
 _SHOWN = 60  # names of columns in a message
@@ -125,7 +125,8 @@ def _of_joints(
         found = [
             name
             for name in names
-            if words & _meaning(split_unit(name, kind).stem, joints)
+            if words & (own := _meaning(split_unit(name, kind).stem, joints))
+            and not own & _RATES
         ]
     if kind == 'q' and not given:
         of_links = [
