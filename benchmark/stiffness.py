@@ -10,11 +10,13 @@ cell has the stiffness over the true one, and the ends of its 95 % interval, of 
 
 from __future__ import annotations
 
+import os
 import sys
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
 sys.path.append(str(Path(__file__).parents[1] / 'test'))
 
 from dataclasses import replace
