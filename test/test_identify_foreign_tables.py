@@ -158,6 +158,19 @@ def test_numbered_columns_are_those_of_their_numbers_in_any_order(tmp_path):
     np.testing.assert_allclose(recording.q[5:6][:, 0], Q[5:6, 5], atol=1e-6)
 
 
+@pytest.mark.parametrize('rate', ['q_dot', 'position_velocity', 'joint_pos_acc'])
+def test_rates_of_positions_are_no_positions(tmp_path, rate):
+    names = ['t', *numbered('q'), *numbered(rate), *numbered('tau')]
+    is_read(written(tmp_path / 'a.csv', names, (TIME, Q, 9.0 * Q, TAU)))
+
+
+def test_dates_and_lists_in_cells_are_refused_with_what_is_read(tmp_path):
+    for cell in ('2024-05-01 12:00:00.01,1.0', '"[1.0, 2.0]","[1.0, 2.0]"'):
+        path = tmp_path / 'a.csv'
+        path.write_text('\n'.join(['time,q', *[cell] * 9]))
+        assert 'dates and lists in cells are not read' in refused(path)
+
+
 def test_text_of_spreadsheets_is_read_in_any_encoding(tmp_path):
     names = ['t', *(f'{name} [°]' for name in numbered('q')), *numbered('tau')]
     for encoding in ('utf-8-sig', 'utf-16', 'cp1252'):

@@ -46,6 +46,7 @@ from blf_dsc_controller.identification.summary import (
     load_table,
     notes_of,
     problems_of,
+    stiffness_table,
 )
 from blf_dsc_controller.writing import write_text
 
@@ -74,7 +75,9 @@ def identify(options: Namespace) -> int:
     facts = _facts(found, options)
     bodies = bodies_table(found)
     base = '\n'.join(base_table(found))
-    tables = [*load_table(found), joints_table(found), errors_table(found)]
+    joints = joints_table(found)
+    stiffness = stiffness_table(found)
+    tables = [*load_table(found), joints, *stiffness, errors_table(found)]
     print('\n\n'.join([*facts[:2], bodies, base, *tables, *facts[2:]]))
     if options.report:
         # slow: its libraries

@@ -180,7 +180,7 @@ def make_parser() -> argparse.ArgumentParser:
     names, force = (argparse.ArgumentParser(add_help=False) for _ in range(2))
     theirs = (
         'what a topic or a joint is called in the bag, such as joint1=shoulder; or which '
-        'columns of a table are the time=, q= and tau=; can be repeated'
+        'columns of a table are the time=, q= and tau=, and theta= of motors; can be repeated'
     )
     names.add_argument(
         '--map', action='append', default=[], metavar='OURS=THEIRS', help=theirs

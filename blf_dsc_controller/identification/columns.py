@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which columns of a table are the time, and the positions and torques of the joints.
+"""Which columns of a table are the time, positions and torques of the joints, and motors.
 
 They are found from their names, or given: `time=t`, `q=pos_*`, `tau=6:12` (columns 6 to
 11), `time=100Hz` if no column has the time.  A unit may follow in brackets, `time=t[ns]`;
@@ -17,8 +17,8 @@ from typing import NamedTuple
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.identification.units import factor_of, is_of_drive, split_unit
 
-KINDS = ('time', 'q', 'tau')
-"""What columns are needed, by the names of `--map`."""
+KINDS = ('time', 'q', 'tau', 'theta')
+"""Columns, by the names of `--map`; positions theta of the motors are not needed."""
 
 _CURRENTS = {'current', 'currents'}
 _WORDS = {
@@ -28,11 +28,13 @@ _WORDS = {
         *('tau', 'torque', 'torques', 'effort', 'efforts', 'force', 'trq'),
         *('jointtorque', *_CURRENTS),
     },
+    'theta': {'theta', 'motor', 'motors'},
 }
 _SIDES = {
     *('d', 'des', 'desired', 'target', 'ref', 'reference', 'cmd', 'command'),
     *('ext', 'external', 'error', 'err', 'offset'),
 }
+_RATES = {'dot', 'ddot', 'vel', 'velocity', 'speed', 'acc', 'acceleration'}
 _SECONDS = re.compile('sec(ond)?s?', re.IGNORECASE)
 _NANOSECONDS = re.compile('n(ano)?sec(ond)?s?', re.IGNORECASE)
 _SHOWN = 60  # names of columns in a message
@@ -58,6 +60,7 @@ class Columns(NamedTuple):
     rate: float  # Hz; 0: the time is in columns
     q: list[Column]  # rad, or m
     tau: list[Column]  # N m, or N; none of a planned motion
+    theta: list[Column]  # rad, or m, of the motors; none if they are not known
     has_currents: bool  # by their names or units: currents or shares of a rated torque
 
     @property
@@ -66,7 +69,11 @@ class Columns(NamedTuple):
         positions = f'positions {self.q[0].name!r} to {self.q[-1].name!r}'
         if not self.tau:
             return positions
-        return f'{positions}, torques {self.tau[0].name!r} to {self.tau[-1].name!r}'
+        text = f'{positions}, torques {self.tau[0].name!r} to {self.tau[-1].name!r}'
+        if self.theta:
+            motors = f'{self.theta[0].name!r} to {self.theta[-1].name!r}'
+            text += f', positions of motors {motors}'
+        return text
 
 
 def choose_columns(
@@ -93,6 +100,7 @@ def choose_columns(
                 f'{path} has {len(q)} positions ({", ".join(q)}) and {len(tau)} torques '
                 f'({", ".join(tau)}): choose as many, as in --map tau=tau_*'
             )
+    theta = [] if planned else _of_motors(path, names, given['theta'], joints, q)
     words = set().union(*(_meaning(name, joints) for name in tau))
     units = [_unit_of(name, 'tau', given['tau']) for name in tau]
     rate = _RATE.fullmatch(given['time'])
@@ -101,6 +109,7 @@ def choose_columns(
         rate=float(rate[1]) if rate else 0.0,
         q=_with_factors(path, q, 'q', given['q']),
         tau=_with_factors(path, tau, 'tau', given['tau']),
+        theta=_with_factors(path, theta, 'q', given['theta']),
         has_currents=bool(words & _CURRENTS) or any(map(is_of_drive, units)),
     )
 
@@ -116,8 +125,14 @@ def _of_joints(
         found = [
             name
             for name in names
-            if words & _meaning(split_unit(name, kind).stem, joints)
+            if words & (own := _meaning(split_unit(name, kind).stem, joints))
+            and not own & _RATES
         ]
+    if kind == 'q' and not given:
+        of_links = [
+            name for name in found if not _meaning(name, joints) & _WORDS['theta']
+        ]
+        found = of_links or found
     named = [_of_joint(found, joint) for joint in joints]
     if all(named):
         return [name for name in named if name]
@@ -129,6 +144,33 @@ def _of_joints(
         f'{_listed(names)}: choose them, as in --map {kind}={kind}_* or --map {kind}=1:7 '
         '(columns 1 to 6, the first is 0)'
     )
+
+
+def _of_motors(
+    path: Path, names: Sequence[str], given: str, joints: Sequence[str], q: list[str]
+) -> list[str]:
+    """Return the columns of the motors' positions, besides those of the joints; none: unknown."""
+    if given:
+        theta = _of_joints(path, names, 'theta', given, joints)
+    else:
+        found = [name for name in names if _is_of_motor(name, joints) and name not in q]
+        theta = [name for joint in joints if (name := _of_joint(found, joint))]
+        if len(theta) != len(q) and len(found) == len(q):
+            theta = _by_number(found, 'q')
+    if len(theta) == len(q):
+        return theta
+    if not given:
+        return []
+    raise BlfDscError(
+        f'{path} has {len(q)} positions ({", ".join(q)}) and {len(theta)} of motors '
+        f'({", ".join(theta)}): choose as many, as in --map theta=theta_*'
+    )
+
+
+def _is_of_motor(name: str, joints: Sequence[str]) -> bool:
+    words = _meaning(split_unit(name, 'q').stem, joints)
+    is_position = 'theta' in words or bool(words & _WORDS['q'])
+    return is_position and bool(words & _WORDS['theta']) and not words & _RATES
 
 
 def _of_joint(columns: Sequence[str], joint: str) -> str | None:

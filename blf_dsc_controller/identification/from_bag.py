@@ -36,12 +36,15 @@ def read_bag(
 
     `text` is the URDF; `joints` are the arm's, from its base to its tip, by default all
     in the bag up to where the arm branches; `namespace` and `names` are as for
-    `read_run`.
+    `read_run`; `names.joints` may have `theta`, the topic of the motors' positions.
 
     Raises:
         BlfDscError: the bag cannot be read, has no torques or too few states, or has the joints
             of no arm.
     """
+    others = dict(names.joints)
+    motors = others.pop('theta', '')
+    names = NameMap(names.topics, others)
     content = read_content(path, namespace, names)
     messages = content.topics[JOINT_STATES]
     named = messages.name_lists()
@@ -53,6 +56,14 @@ def read_bag(
         messages.is_stamped = False
         source += ' (without stamps: by the times of reception)'
     turning = Tree.of(text).turning(joints)
+
+    def of_motors(stamp: Stamps) -> Floats | None:
+        if not motors:
+            return None
+        topics = {**names.topics, JOINT_STATES.leaf: '/' + motors.lstrip('/')}
+        other = read_content(path, namespace, NameMap(topics, names.joints))
+        return np.asarray(_at(stamp, single_run(other, theirs).states)[0])
+
     parts = [single_run(content, group).states for group in groups]
     if len(parts) > 1:
         if commanded:
@@ -61,7 +72,7 @@ def read_bag(
                 'assigned: leave out --effort command'
             )
         stamp, q, torque = _together(parts, theirs)
-        return resampled(joints, stamp, q, torque, source, turning)
+        return resampled(joints, stamp, q, torque, source, turning, of_motors(stamp))
     (states,) = parts
     torque = states.field(2)
     if commanded or not _any(torque, states.size):
@@ -71,7 +82,8 @@ def read_bag(
             raise BagError(
                 f'{path}: all torques in the {source} are zero: record measured efforts'
             )
-    return resampled(joints, states.stamp, states.field(0), torque, source, turning)
+    stamp, q = states.stamp, states.field(0)
+    return resampled(joints, stamp, q, torque, source, turning, of_motors(stamp))
 
 
 def _groups(
@@ -116,20 +128,27 @@ def _together(
     stamp = parts[0].stamp
     values = np.full((2, stamp.size, len(joints)), np.nan)
     for part in parts:
-        own = part.stamp
-        if own.size < 2:
-            continue
-        after = np.clip(np.searchsorted(own, stamp), 1, own.size - 1)
-        pause = own[after] - own[after - 1]
-        is_known = (pause <= GAP * np.median(np.diff(own))) & (stamp <= own[-1])
-        is_known &= stamp >= own[0]
         columns = [joints.index(name) for name in part.names]
-        seconds = (own - own[0]) * 1e-9
-        at = (stamp[is_known] - own[0]) * 1e-9
-        for row, field in enumerate((0, 2)):
-            found = interpolated(at, seconds, np.asarray(part.field(field)))
-            values[row, np.flatnonzero(is_known)[:, None], columns] = found
+        values[:, :, columns] = _at(stamp, part)
     return stamp, values[0], values[1]
+
+
+def _at(stamp: Stamps, states: JointStates) -> Floats:
+    """Return positions and efforts (2, N, n) at other stamps; NaN where they are unknown."""
+    own = states.stamp
+    values = np.full((2, stamp.size, len(states.names)), np.nan)
+    if own.size < 2:
+        return values
+    after = np.clip(np.searchsorted(own, stamp), 1, own.size - 1)
+    pause = own[after] - own[after - 1]
+    is_known = (pause <= GAP * np.median(np.diff(own))) & (stamp <= own[-1])
+    is_known &= stamp >= own[0]
+    seconds = (own - own[0]) * 1e-9
+    at = (stamp[is_known] - own[0]) * 1e-9
+    for row, field in enumerate((0, 2)):
+        found = interpolated(at, seconds, np.asarray(states.field(field)))
+        values[row, is_known] = found
+    return values
 
 
 def _any(values: Values, size: int) -> bool:

@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Recordings from tables: CSV and text with or without a header, npz, and mat.
 
-A table needs the time, and a position and a torque of each joint: see `columns`.
+A table needs the time, and a position and a torque of each joint: see `columns`.  It
+may have the positions of the motors, too.
 Velocities are not read: `windows` computes them from the positions.
 """
 
@@ -51,8 +52,8 @@ def read_table(
     A `planned` motion has no torques: they are zero.
 
     `joints` are the arm's, by default all from the root to where it branches, or as
-    many of them as the table has.  `names.joints` may have `time`, `q` and `tau`, as
-    for `choose_columns`, and the joints' names.
+    many of them as the table has.  `names.joints` may have `time`, `q`, `tau` and
+    `theta`, as for `choose_columns`, and the joints' names.
 
     Raises:
         BlfDscError: the file cannot be read, or its columns are not found.
@@ -71,26 +72,28 @@ def read_table(
             f'{path} has the positions of {n} joints ({listed}), but from base to '
             f'tip there are {len(arm)}: {", ".join(arm)}'
         )
-    time, q, tau = _values(path, table, columns)
+    time, q, tau, theta = _values(path, table, columns)
     q[~np.isfinite(time)] = np.nan
     stamp, runs = _one_clock(path, time)
     source = f'{path.name}: {columns.text}'
     if runs > 1:
         source += f'; the time starts again {runs - 1} times: read as {runs} runs'
-    recording = resampled(arm[:n], stamp, q, tau, source, tree.turning(arm[:n]))
+    motors = theta if columns.theta else None
+    turning = tree.turning(arm[:n])
+    recording = resampled(arm[:n], stamp, q, tau, source, turning, motors)
     return recording._replace(currents=columns.has_currents)
 
 
 def _values(
     path: Path, table: Table, columns: Columns
-) -> tuple[Floats, Floats, Floats]:
-    """Return time (N,) [s], positions and torques (N, n)."""
-    groups = columns.time, columns.q, columns.tau
+) -> tuple[Floats, Floats, Floats, Floats]:
+    """Return time (N,) [s], positions and torques (N, n), and positions of motors, if any."""
+    groups = columns.time, columns.q, columns.tau, columns.theta
     values = table.read([column.name for group in groups for column in group])
     if len(values) < _LEAST:
         raise BlfDscError(f'{path} has fewer than {_LEAST} rows of numbers')
     ends = np.cumsum([len(group) for group in groups])[:-1]
-    time, q, tau = (
+    time, q, tau, theta = (
         _scaled(part, group)
         for part, group in zip(np.split(values, ends, axis=1), groups, strict=True)
     )
@@ -100,7 +103,7 @@ def _values(
         first = time[np.isfinite(time).all(axis=1)][:1]
         seconds = np.sum(time - first, axis=1)
         seconds *= _unnamed_unit(path, columns.time, first, seconds)
-    return seconds, q, tau if columns.tau else np.zeros_like(q)
+    return seconds, q, tau if columns.tau else np.zeros_like(q), theta
 
 
 def _scaled(values: Floats, columns: Sequence[Column]) -> Floats:

@@ -9,6 +9,7 @@ import numpy as np
 
 from blf_dsc_controller.arms.base_parameters import BaseParameters
 from blf_dsc_controller.arms.urdf import Chain
+from blf_dsc_controller.identification.stiffness import Compliance
 from blf_dsc_controller.identification.values import Parts, indices, parts
 from blf_dsc_controller.run import Floats
 
@@ -62,6 +63,9 @@ class Identified(NamedTuple):
     # (3,) gravity that explains the torques far better than the given one, m/s^2
     other_gravity: Floats | None
     picked_up: float | None  # s, when the load was picked up
+    compliance: (
+        Compliance | None
+    )  # of gears, if positions of motors and links are known
 
     @property
     def joints(self) -> list[str]:

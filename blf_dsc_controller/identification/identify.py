@@ -21,12 +21,14 @@ from blf_dsc_controller.identification.identified import Identified
 from blf_dsc_controller.identification.joint_alone import errors_alone, fit_alone
 from blf_dsc_controller.identification.on_disk import mapped
 from blf_dsc_controller.identification.plausibility import shares
-from blf_dsc_controller.identification.problem import Effort, problem_of
+from blf_dsc_controller.identification.problem import Effort, Problem, problem_of
 from blf_dsc_controller.identification.reading import read_recording
 from blf_dsc_controller.identification.recording import Recording, joined
 from blf_dsc_controller.identification.regression import fitted
 from blf_dsc_controller.identification.scoring import nearest_friction, scored
 from blf_dsc_controller.identification.selection import select
+from blf_dsc_controller.identification.stiffness import Compliance, compliance_of
+from blf_dsc_controller.identification.values import parts
 from blf_dsc_controller.identification.wider_model import doubt
 from blf_dsc_controller.identification.windows import COLUMNS, HOP, STILL
 from blf_dsc_controller.run import Floats
@@ -161,6 +163,7 @@ def identify_arm(
     final = fitted(rows, windows.moving, problem.G, selected.prior, selected.found)
     dynamics = nearest_friction(rows, windows, final.values)
     size = shares(rows, windows.moving, problem.P, (problem.G @ final.values)[: rows.p])
+    compliance = _compliance(problem, recording, final.values)
     begin(STAGES[4])
     doubted = doubt(problem, selected.prior, final, selected.distances)
     return Identified(
@@ -187,7 +190,22 @@ def identify_arm(
         inertia=size.inertia,
         other_gravity=problem.other_gravity,
         picked_up=problem.picked_up,
+        compliance=compliance,
     )
+
+
+def _compliance(
+    problem: Problem, recording: Recording, values: Floats
+) -> Compliance | None:
+    """Return the compliances of the gears, if there are positions of motors and links."""
+    if recording.twist is None:
+        return None
+    links = values.copy()
+    parts(links).terms[:] = 0.0
+    parts(links).coupling[:] = 0.0
+    theta = (problem.G @ links)[:-1]
+    moving = problem.windows.moving
+    return compliance_of(problem.rows, recording.twist, moving, theta, values[-1])
 
 
 def _named(joints: tuple[str, ...], which: np.ndarray) -> tuple[str, ...]:

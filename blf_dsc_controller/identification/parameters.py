@@ -25,7 +25,12 @@ def robot_parameters(found: Identified, robot: Robot, urdf: Path) -> dict[str, A
         'viscous': viscous,
         'coulomb': coulomb,
     }
-    for name in ('rotor_inertia', 'viscous', 'coulomb'):
+    names = ['rotor_inertia', 'viscous', 'coulomb']
+    compliance = found.compliance
+    if compliance and compliance.is_twist and compliance.is_known.all():
+        names.append('joint_stiffness')
+        values['joint_stiffness'] = compliance.stiffness[0]
+    for name in names:
         values[name] = tuple(float(f'{value:.{_DIGITS}g}') for value in values[name])
     parameters = {f'robot.{name}': value for name, value in values.items()}
     return {'joints': tuple(found.joints), **parameters}

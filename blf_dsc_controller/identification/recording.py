@@ -16,7 +16,7 @@ from blf_dsc_controller.identification.on_disk import (
     blocks_of,
     mapped,
 )
-from blf_dsc_controller.identification.turns import Turns
+from blf_dsc_controller.identification.turns import TURN, Turns
 from blf_dsc_controller.run import Floats, Stamps
 
 LONGEST_PERIOD = 0.02
@@ -39,6 +39,9 @@ class Recording(NamedTuple):
     gap: NDArray[np.bool_]  # (N,) whether nothing was recorded here
     source: str  # of the torques: a topic, or columns of a table
     currents: bool = False  # whether the columns of the torques are named so
+    twist: Samples | None = (
+        None  # (N, n) motors minus links, rad or m, if both are known
+    )
 
     @property
     def duration(self) -> float:
@@ -53,17 +56,20 @@ def resampled(
     torque: Floats | Values,
     source: str,
     turning: NDArray[np.bool_],
+    motors: Floats | None = None,
 ) -> Recording:
     """Resample evenly, interpolating over uneven stamps and up to two lost states.
 
-    Positions and torques are (N, n) at the stamps (N,) [ns]; NaN where one is unknown.
-    Those of `turning` joints (n,) may be wrapped to one turn.
+    Positions and torques are (N, n) at the stamps (N,) [ns]; NaN where one is unknown,
+    and so are positions of the `motors`.  Those of `turning` joints (n,) may be wrapped
+    to one turn.
 
     Raises:
         BlfDscError: there are too few states, or their stamps cannot be of one clock.
     """
+    groups = (q, torque) if motors is None else (q, torque, motors)
     known = [
-        np.isfinite(np.column_stack((q[rows], torque[rows]))).all(axis=1)
+        np.isfinite(np.column_stack([each[rows] for each in groups])).all(axis=1)
         for rows in blocks_of(stamp.size)
     ]
     order = np.flatnonzero(np.concatenate([np.zeros(0, dtype=bool), *known]))
@@ -106,7 +112,13 @@ def resampled(
 
     positions = evenly(lambda rows: turns.added(rows, q[order[rows]]))
     torques = evenly(lambda rows: torque[order[rows]])
-    return Recording(joints, period, positions, torques, gap, source)
+    recording = Recording(joints, period, positions, torques, gap, source)
+    if motors is None:
+        return recording
+    twist = motors[order] - q[order]
+    twist -= np.median(twist, axis=0)
+    twist -= TURN * np.round(twist / TURN) * turning
+    return recording._replace(twist=evenly(lambda rows: twist[rows]))
 
 
 def interpolated(at: np.ndarray, time: np.ndarray, values: np.ndarray) -> Floats:
@@ -145,12 +157,17 @@ def joined(first: Recording, *others: Recording) -> tuple[Recording, list[float]
         grid = np.arange(0.0, times[-1], first.period)
         gap = np.interp(grid, times, other.gap) > 0.0
         gap[0] = True
+        twist = None
+        if together.twist is not None and other.twist is not None:
+            size = together.gap.size
+            twist = _followed(together.twist, size, other.twist, grid, times)
         together = together._replace(
             q=_followed(together.q, together.gap.size, other.q, grid, times),
             torque=_followed(
                 together.torque, together.gap.size, other.torque, grid, times
             ),
             gap=np.append(together.gap, gap),
+            twist=twist,
             source=f'{together.source}, {other.source}',
         )
     return together, begins

@@ -11,6 +11,7 @@ from blf_dsc_controller.analysis.output import aligned
 from blf_dsc_controller.identification.identified import Identified, mass_and_centre
 from blf_dsc_controller.identification.left_out import KINDS
 from blf_dsc_controller.identification.plausibility import GRAVITY, INERTIA
+from blf_dsc_controller.identification.stiffness import LARGEST_TWIST
 from blf_dsc_controller.identification.values import (
     COULOMB,
     JOINT_TERMS,
@@ -48,7 +49,7 @@ _LEFT_OUT = (
 )  # of KINDS
 _REMEDIES = {
     'gain': ', but not for an error that all gains have in common: check them',
-    'elasticity': '; encoders at the links would show more',
+    'elasticity': '; positions of motors and links, --map theta=, would show their stiffness',
 }
 
 
@@ -122,6 +123,25 @@ def joints_table(found: Identified) -> str:
     return aligned(rows)
 
 
+def stiffness_table(found: Identified) -> Iterator[str]:
+    """Yield the stiffness of each joint, if positions of motors and links are known."""
+    compliance = found.compliance
+    if compliance is None or not compliance.is_twist:
+        return
+    rows = [('joint', 'stiffness between motor and link', '95 % interval')]
+    values, least, most = compliance.stiffness
+    for i, joint in enumerate(found.chain.joints):
+        unit = 'N/m' if joint.kind == 'prismatic' else 'N m/rad'
+        bound = f': above {least[i]:.3g} {unit}' if least[i] else ''
+        cells = f'cannot be known{bound}', ''
+        if compliance.is_negative[i]:
+            cells = 'cannot be known: it twists against its torque', ''
+        elif compliance.is_known[i]:
+            cells = f'{values[i]:.5g} {unit}', f'{least[i]:.5g} to {most[i]:.5g}'
+        rows.append((joint.name, *cells))
+    yield aligned(rows)
+
+
 def base_table(found: Identified) -> Iterator[str]:
     """Yield the base parameters before and after, and which of them the recording shows."""
     parameters = found.parameters
@@ -174,6 +194,7 @@ def notes_of(found: Identified) -> Iterator[str]:
     yield from _delay_notes(found)
     yield from _joint_notes(found)
     yield from _doubt_notes(found)
+    yield from _stiffness_notes(found)
     wider = [f'{name} {width:g}' for name, width in found.widths.items() if width > 1.0]
     if wider:
         yield (
@@ -255,6 +276,35 @@ def _doubt_notes(found: Identified) -> Iterator[str]:
                 f'{JOINT_TERMS[term]} of {", ".join(found.joints[i] for i in unknown)} cannot be '
                 'known from this recording: the interval contains zero'
             )
+
+
+def _stiffness_notes(found: Identified) -> Iterator[str]:
+    """Yield what is wrong with the positions of motors and links."""
+    compliance = found.compliance
+    if compliance is None:
+        return
+    names = np.array(found.joints)
+    if not compliance.is_twist:
+        i = int(np.argmax(compliance.largest))
+        yield (
+            f'the position of the motor of {names[i]} differs by up to {compliance.largest[i]:.2g} '
+            f"from its link's, more than the {LARGEST_TWIST:g} by which gears give way: are "
+            'positions of motors divided by the ratios of their gears? The stiffness of joints '
+            'was not computed'
+        )
+        return
+    against = names[compliance.is_negative]
+    if against.size:
+        yield (
+            f'{", ".join(against)} twist against their torques: are the positions of motors '
+            '(theta) and links (q) exchanged?'
+        )
+    computed = names[compliance.is_computed]
+    if computed.size:
+        yield (
+            f'{", ".join(computed)} twist so exactly by their torques that the robot computes one '
+            'position from the other: their stiffness is the one that it assumes'
+        )
 
 
 def problems_of(found: Identified, effort: str) -> Iterator[str]:

@@ -135,7 +135,8 @@ def text_table(path: Path) -> TextTable:
     first = next((k for k, line in enumerate(head) if _has_numbers(line)), None)
     if first is None:
         raise BlfDscError(
-            f'{path} has no numbers in its first {len(head)} lines, so it is no table'
+            f'{path} has no numbers in its first {len(head)} lines, so it is no table: a '
+            'row begins with a number, and dates and lists in cells are not read'
         )
     layout = _layout_of(head[first])
     cells = layout.cells(head[first])

@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 
 from blf_dsc_controller.run import Floats
 
-_TURN = 2.0 * np.pi  # rad
+TURN = 2.0 * np.pi
+"""A full turn [rad]."""
 
 
 class Turns:
@@ -32,7 +33,7 @@ class Turns:
         for block in blocks:
             before = block[:1] if last is None else last
             step = np.diff(block, axis=0, prepend=before)
-            turns = -np.round(step / _TURN) * turning
+            turns = -np.round(step / TURN) * turning
             at = np.flatnonzero(turns.any(axis=1))
             steps.append((turns[at], at + first))
             first += len(block)
@@ -49,4 +50,4 @@ class Turns:
         if not self._at.size:
             return q
         passed = np.searchsorted(self._at, np.arange(len(q)) + rows.start, 'right')
-        return np.asarray(q + _TURN * self._total[passed])
+        return np.asarray(q + TURN * self._total[passed])

@@ -1,0 +1,298 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Stiffness of joints from the positions of motors and links."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import yaml
+from random_arm import (
+    PANDA,
+    PANDA_CHAIN,
+    PANDA_TEXT,
+    PERIOD,
+    reference_of,
+    shake,
+    truth_of,
+)
+
+from blf_dsc_controller.bags.content import NameMap
+from blf_dsc_controller.bags.writer import BagWriter
+from blf_dsc_controller.cli.main import main
+from blf_dsc_controller.configuration.robot import Robot
+from blf_dsc_controller.errors import BlfDscError
+from blf_dsc_controller.identification.from_table import read_table
+from blf_dsc_controller.identification.identify import identify_arm
+from blf_dsc_controller.identification.parameters import robot_parameters
+from blf_dsc_controller.identification.problem import problem_of
+from blf_dsc_controller.identification.reading import read_recording
+from blf_dsc_controller.identification.recording import joined, resampled
+from blf_dsc_controller.identification.stiffness import compliance_of
+from blf_dsc_controller.identification.summary import notes_of, stiffness_table
+from blf_dsc_controller.messages.codecs import JointStateEncoder
+from blf_dsc_controller.messages.topics import JOINT_STATE
+from blf_dsc_controller.numerics.intervals import TWO_SIDED
+
+ROBOT = Robot(urdf=PANDA_TEXT, tip='panda_hand_tcp')
+STIFFNESS = np.array([14e3, 14e3, 14e3, 14e3, 8e3, 8e3, 8e3])  # N m/rad
+DURATION = 12.0  # s
+EVERY = 5  # samples of 1 ms
+BITS = 2.0 * np.pi / 2.0 ** np.arange(21)  # rad, resolution of encoders of so many bits
+N = len(PANDA)
+
+
+class Motion:
+    """States of an arm whose motors are twisted against its links by its torques."""
+
+    def __init__(self):
+        truth = truth_of(PANDA_CHAIN, 4)
+        states = shake(PANDA_CHAIN, truth, reference_of(PANDA_CHAIN, 9), DURATION)
+        # the torque of a state is that which acts after it
+        self.q, dq, _ = np.moveaxis(states[:-1], 1, 0)
+        self.motor = states[1:, 2]
+        rotors = truth.rotors * np.gradient(dq, PERIOD, axis=0)
+        friction = truth.viscous * dq + truth.coulomb * np.tanh(dq / 0.005)
+        self.link = self.motor - rotors - friction
+        self.rate = np.gradient(self.link, PERIOD, axis=0)
+        self.time = np.arange(len(dq)) * PERIOD
+
+    def compliance(self, twist, torque=None, bits=20):
+        """What is found of twists (N, n) by the torques of the motors, or others."""
+        q = self.q
+        theta = q + twist + 0.3  # with another zero
+        q, theta = (np.round(each / BITS[bits]) * BITS[bits] for each in (q, theta))
+        torque = self.motor if torque is None else torque
+        stamp = np.round(1e9 * self.time[::EVERY]).astype(np.int64)
+        turning = np.ones(N, dtype=bool)
+        recording = resampled(
+            PANDA, stamp, q[::EVERY], torque[::EVERY], '', turning, theta[::EVERY]
+        )
+        problem = problem_of(recording, ROBOT, 'torque', None, find_signs=False)
+        truth = truth_of(PANDA_CHAIN, 4)
+        # the instrument is that of a model with wrong friction and rotors
+        theta = np.zeros(problem.rows.unknowns)
+        theta[: problem.rows.p] = problem.parameters.of(truth.inertias, np.zeros(N))
+        return compliance_of(
+            problem.rows, recording.twist, problem.windows.moving, theta, 0.0
+        )
+
+
+@pytest.fixture(scope='module')
+def motion():
+    return Motion()
+
+
+def holds_the_truth(found, times=1.0):
+    """Whether every interval, so many times as wide, contains the stiffness."""
+    off = np.abs(found.value - 1.0 / STIFFNESS)
+    return bool((off < times * TWO_SIDED * found.deviation).all())
+
+
+@pytest.mark.parametrize('side', ['link', 'motor'])
+def test_stiffness_is_that_of_the_gears_behind_friction_and_rotors(motion, side):
+    torque = getattr(motion, side)
+    noise = 0.5 * torque.std(axis=0)
+    torque = torque + noise * np.random.default_rng(0).normal(size=torque.shape) + 0.2
+    found = motion.compliance(motion.link / STIFFNESS, torque)
+    assert found.is_known.all()
+    assert found.is_twist
+    assert not found.is_computed.any()
+    np.testing.assert_allclose(found.stiffness[0], STIFFNESS, rtol=0.15)
+    # seven intervals of 95 %: 1.7 times as wide, they all hold with 99 %
+    assert holds_the_truth(found, 1.7)
+
+
+@pytest.mark.parametrize('what', ['encoder', 'hysteresis', 'play', 'damping'])
+def test_what_else_moves_the_encoders_does_not_change_the_stiffness(motion, what):
+    twist = motion.link / STIFFNESS
+    size = 0.2 * twist.std(axis=0)
+    twist = (
+        twist
+        + {
+            'encoder': size * np.sin(motion.q + 0.7),  # once per turn
+            'hysteresis': -size * np.sign(motion.rate),  # the spring lags
+            'play': size * np.sign(motion.link),
+            'damping': -2e-3 * motion.rate / STIFFNESS,
+        }[what]
+    )
+    found = motion.compliance(twist)
+    assert found.is_known.all()
+    # 0.2 of the twist are not the spring's
+    np.testing.assert_allclose(found.stiffness[0], STIFFNESS, rtol=0.02)
+    assert holds_the_truth(found, 1.7)
+
+
+def test_twist_that_encoders_do_not_show_is_not_known_but_bounded(motion):
+    """Steps of 25 mrad, and a twist of 1 mrad or less."""
+    twist = 0.3 * motion.link / STIFFNESS
+    assert twist.std(axis=0).max() < 0.05 * BITS[8]
+    found = motion.compliance(twist, bits=8)
+    value, least, most = found.stiffness
+    assert np.isinf(most[~found.is_known]).all()
+    assert (~found.is_known).sum() >= N - 1  # one in twenty may be known by chance
+    assert (least < STIFFNESS / 0.3).all()
+    assert (least > 0.0).all()
+    assert (value >= least).all()
+
+
+def test_exchanged_computed_and_undivided_positions_are_told(motion):
+    twist = motion.link / STIFFNESS
+    assert motion.compliance(-twist).is_negative.all()
+    assert not motion.compliance(99.0 * motion.q).is_twist  # of a gear of 1:100
+
+
+# Recordings.
+
+
+def table(path, motion, names, twist=0.001):
+    """Write 3 s as a table."""
+    rows = slice(0, 3000, EVERY)
+    columns = {
+        't': motion.time[rows, None],
+        'q': motion.q[rows],
+        'dtheta': np.ones_like(motion.q[rows]),
+        'theta': motion.q[rows] + twist,
+        'tau': motion.motor[rows],
+    }
+    heads = ['t']
+    values = [columns['t']]
+    for stem, kind in names:
+        heads += [stem.format(k) for k in range(1, N + 1)]
+        values.append(columns[kind])
+    header = ','.join(heads)
+    np.savetxt(path, np.hstack(values), header=header, delimiter=',', comments='')
+    return path
+
+
+LINKS, MOTORS, TORQUES = ('q_{}', 'q'), ('theta_{}', 'theta'), ('tau_J_{}', 'tau')
+
+
+@pytest.mark.parametrize(
+    ('motors', 'entries'),
+    [
+        ([MOTORS, ('dtheta_{}', 'dtheta')], ()),
+        ([('motor_position_{}', 'theta'), ('theta_dot_{}', 'dtheta')], ()),
+        ([('q_motor_{} [rad]', 'theta')], ()),
+        ([('encoder_{}', 'theta')], ('theta=encoder_*',)),
+    ],
+)
+def test_positions_of_motors_in_tables_are_found(tmp_path, motion, motors, entries):
+    twist = 0.001 * np.arange(600)[:, None] / 600 * np.arange(1, N + 1)
+    path = table(tmp_path / 'a.csv', motion, [*motors, LINKS, TORQUES], twist)
+    recording = read_table(path, PANDA_TEXT, PANDA, NameMap.parse(entries))
+    assert 'positions of motors' in recording.source
+    expected = twist - np.median(twist, axis=0)
+    np.testing.assert_allclose(recording.twist[:590], expected[:590], atol=1e-9)
+    np.testing.assert_allclose(
+        recording.q[:590], motion.q[: 590 * EVERY : EVERY], atol=1e-9
+    )
+
+
+def test_tables_without_both_positions_have_no_twist(tmp_path, motion):
+    only = table(tmp_path / 'a.csv', motion, [('motor_position_{}', 'theta'), TORQUES])
+    recording = read_table(only, PANDA_TEXT, PANDA)
+    assert recording.twist is None
+    np.testing.assert_allclose(recording.q[:1], motion.q[:1] + 0.001, atol=1e-9)
+    rates = table(
+        tmp_path / 'b.csv', motion, [LINKS, TORQUES, ('theta_dot_{}', 'dtheta')]
+    )
+    assert read_table(rates, PANDA_TEXT, PANDA).twist is None
+    with pytest.raises(BlfDscError, match=r'7 positions .* and 1 of motors'):
+        read_table(only, PANDA_TEXT, PANDA, NameMap.parse(['theta=t']))
+
+
+def test_positions_of_motors_in_bags_are_those_of_another_topic(tmp_path, motion):
+    encoder = JointStateEncoder(PANDA)
+    with BagWriter(tmp_path / 'bag', flush_interval=None) as bag:
+        links, motors = (
+            bag.add_topic(name, JOINT_STATE, [])
+            for name in ('/joint_states', '/motor_states')
+        )
+        for k in range(600):
+            stamp = 10**9 + k * 5_000_000
+            q, torque = motion.q[k * EVERY], motion.motor[k * EVERY]
+            twist = 0.001 * k / 600 * np.arange(1, N + 1)
+            bag.write(links, bytes(encoder.encode(stamp, q, q, torque)), stamp)
+            late = stamp + 1_000_000  # where the twist is 1/3000 of that after 3 s more
+            raw = encoder.encode(late, q + twist, q, torque)
+            bag.write(motors, bytes(raw), late)
+    names = NameMap.parse(['theta=/motor_states', 'joint_states=/joint_states'])
+    recording = read_recording(tmp_path / 'bag', PANDA_TEXT, PANDA, names=names)
+    assert recording.twist is not None
+    both, _ = joined(recording, recording)
+    assert both.twist is not None
+    assert len(both.twist[:]) == len(both.q[:])
+    lone = recording._replace(twist=None)
+    for pair in ((recording, lone), (lone, recording)):
+        assert joined(*pair)[0].twist is None
+
+
+# What the command says.
+
+
+@pytest.fixture(scope='module')
+def whole(tmp_path_factory, motion):
+    """A table with positions of motors, whose encoders have 20 bits."""
+    folder = tmp_path_factory.mktemp('whole')
+    rows = slice(None, None, EVERY)
+    twist = motion.link / STIFFNESS + 0.3
+    q, theta = (
+        np.round(each[rows] / BITS[20]) * BITS[20]
+        for each in (motion.q, motion.q + twist)
+    )
+    values = {'q': q, 'theta': theta, 'tau_J': motion.motor[rows]}
+    np.savez(folder / 'a.npz', t=motion.time[rows], **values)
+    (folder / 'panda.urdf').write_text(PANDA_TEXT)
+    return folder
+
+
+def test_command_prints_the_stiffness_and_writes_it_for_the_controller(whole, capsys):
+    words = [str(whole / 'a.npz'), '--urdf', str(whole / 'panda.urdf')]
+    words += ['--tip', 'panda_hand_tcp', '--out', str(whole / 'new.urdf')]
+    assert main(['identify', *words, '--out', str(whole / 'arm.yaml')]) == 0
+    text = capsys.readouterr().out
+    assert "positions of motors 'theta_0' to 'theta_6'" in ' '.join(text.split())
+    table = text[text.index('stiffness between motor and link') :].splitlines()
+    for name, line in zip(PANDA, table[1:], strict=False):
+        assert line.startswith(name)
+        assert 'N m/rad' in line
+    written = yaml.safe_load((whole / 'arm.yaml').read_text())['/**']
+    found = written['ros__parameters']['robot.joint_stiffness']
+    np.testing.assert_allclose(found, STIFFNESS, rtol=0.02)
+
+
+def test_what_is_wrong_with_positions_of_motors_is_said(whole):
+    """What is said if positions of motors are exchanged, not divided, computed, or unknown."""
+    recording = read_table(whole / 'a.npz', PANDA_TEXT, PANDA)
+    found = identify_arm(recording, ROBOT)
+    known = found.compliance
+    ones = np.ones(N)
+    faults = {
+        'are the positions of motors (theta) and links (q) exchanged': known._replace(
+            value=-known.value
+        ),
+        'divided by the ratios of their gears': known._replace(largest=99.0 * ones),
+        'the robot computes one position from the other': known._replace(
+            left=0.0 * ones
+        ),
+    }
+    unknown = known._replace(deviation=known.value)
+    nothing = known._replace(deviation=np.inf * ones)
+    for words, compliance in {**faults, '': unknown}.items():
+        notes = list(notes_of(found._replace(compliance=compliance)))
+        for each in faults:
+            assert any(each in note for note in notes) == (each == words)
+    assert not list(stiffness_table(found._replace(compliance=None)))
+    assert not list(
+        stiffness_table(found._replace(compliance=known._replace(largest=99.0 * ones)))
+    )
+    (text,) = stiffness_table(found._replace(compliance=unknown))
+    assert text.count('cannot be known: above ') == N
+    (text,) = stiffness_table(found._replace(compliance=nothing))
+    assert text.count('cannot be known') == N
+    assert 'above' not in text
+    one = unknown.deviation * (np.arange(N) == 3) + known.deviation
+    for compliance in (known._replace(deviation=one), None):
+        other = found._replace(compliance=compliance)
+        written = robot_parameters(other, ROBOT, whole / 'new.urdf')
+        assert 'robot.joint_stiffness' not in written
