@@ -14,6 +14,12 @@ from importlib.util import find_spec
 
 import hypothesis
 import pytest
+from cpu_times import (  # noqa: F401 - hooks
+    pytest_addoption,
+    pytest_runtest_makereport,
+    pytest_runtest_protocol,
+    pytest_terminal_summary,
+)
 
 # The time that an example takes depends on the machine, not on the package. Each run
 # has the same examples; `make test-nightly` (NIGHTLY=1) draws others, and more.
@@ -96,9 +102,10 @@ def bare_node():
 @pytest.fixture
 def blank_pictures(monkeypatch):
     """Write empty pictures where no test looks at them: drawing takes a second for each run."""
-    from blf_dsc_controller.analysis.figures import Picture
+    from blf_dsc_controller.analysis import figures
 
-    monkeypatch.setattr(Picture, 'save', lambda _picture, path: path.touch())
+    monkeypatch.setattr(figures, 'draw_panels', lambda path, *_, **__: path.touch())
+    monkeypatch.setattr(figures.Picture, 'save', lambda _, path: path.touch())
 
 
 def pytest_collection_finish():
