@@ -40,20 +40,27 @@ if find_spec('rclpy'):  # some tests run without ROS
     avoid_domain_of_shell()
     os.environ.update({'ROS_DOMAIN_ID': str(own_domain()), **localhost_environment()})
 
-# The longest tests start first, so that no worker is left with one of them at the end.
+# The files that take longest start first, by their CPU times (`--cpu`), so that no worker is left
+# with one of them at the end.
 _FIRST = (
-    'test_closed_loop',
-    'test_presets',
-    'test_monte_carlo',
-    'test_bag_recorder',
     'test_drive_franka',
     'test_identify',
+    'test_closed_loop',
+    'test_examples',
     'test_compiled',
-    'test_watchdog',
+    'test_presets',
     'test_view',
-    'test_replay',
-    'test_nodes',
+    'test_mujoco_plant',
+    'test_drive_damiao',
+    'test_drive_loop',
+    'test_bag_recorder',
     'test_studies',
+    'test_pages',
+    'test_monte_carlo',
+    'test_watchdog',
+    'test_nodes',
+    'test_commissioning',
+    'test_replay',
 )
 
 
@@ -115,7 +122,12 @@ def pytest_collection_finish():
 
 
 def pytest_collection_modifyitems(items):
-    items.sort(key=lambda item: not item.path.stem.startswith(_FIRST))
+    def place(item):
+        stem = item.path.stem
+        found = (k for k, name in enumerate(_FIRST) if stem.startswith(name))
+        return next(found, len(_FIRST))
+
+    items.sort(key=place)
 
 
 def pytest_unconfigure():
