@@ -9,7 +9,7 @@ import sys
 import time
 from pathlib import Path
 
-PATIENCE = 60.0  # s, until a test gives up on what should take seconds
+PATIENCE = 180.0  # s, until a test gives up on what should take seconds
 COMPILED = 300.0  # s, likewise with kernels, which a first run compiles in two minutes
 # For real time on a machine too slow for it, where a controller would rightly stop.
 PATIENT = """blf_dsc_controller:

@@ -14,6 +14,12 @@ from importlib.util import find_spec
 
 import hypothesis
 import pytest
+from cpu_times import (  # noqa: F401 - hooks
+    pytest_addoption,
+    pytest_runtest_makereport,
+    pytest_runtest_protocol,
+    pytest_terminal_summary,
+)
 
 # The time that an example takes depends on the machine, not on the package. Each run
 # has the same examples; `make test-nightly` (NIGHTLY=1) draws others, and more.
@@ -34,20 +40,27 @@ if find_spec('rclpy'):  # some tests run without ROS
     avoid_domain_of_shell()
     os.environ.update({'ROS_DOMAIN_ID': str(own_domain()), **localhost_environment()})
 
-# The longest tests start first, so that no worker is left with one of them at the end.
+# The files that take longest start first, by their CPU times (`--cpu`), so that no worker is left
+# with one of them at the end.
 _FIRST = (
-    'test_closed_loop',
-    'test_presets',
-    'test_monte_carlo',
-    'test_bag_recorder',
     'test_drive_franka',
     'test_identify',
+    'test_closed_loop',
+    'test_examples',
     'test_compiled',
-    'test_watchdog',
+    'test_presets',
     'test_view',
-    'test_replay',
-    'test_nodes',
+    'test_mujoco_plant',
+    'test_drive_damiao',
+    'test_drive_loop',
+    'test_bag_recorder',
     'test_studies',
+    'test_pages',
+    'test_monte_carlo',
+    'test_watchdog',
+    'test_nodes',
+    'test_commissioning',
+    'test_replay',
 )
 
 
@@ -96,9 +109,10 @@ def bare_node():
 @pytest.fixture
 def blank_pictures(monkeypatch):
     """Write empty pictures where no test looks at them: drawing takes a second for each run."""
-    from blf_dsc_controller.analysis.figures import Picture
+    from blf_dsc_controller.analysis import figures
 
-    monkeypatch.setattr(Picture, 'save', lambda _picture, path: path.touch())
+    monkeypatch.setattr(figures, 'draw_panels', lambda path, *_, **__: path.touch())
+    monkeypatch.setattr(figures.Picture, 'save', lambda _, path: path.touch())
 
 
 def pytest_collection_finish():
@@ -108,7 +122,12 @@ def pytest_collection_finish():
 
 
 def pytest_collection_modifyitems(items):
-    items.sort(key=lambda item: not item.path.stem.startswith(_FIRST))
+    def place(item):
+        stem = item.path.stem
+        found = (k for k, name in enumerate(_FIRST) if stem.startswith(name))
+        return next(found, len(_FIRST))
+
+    items.sort(key=place)
 
 
 def pytest_unconfigure():

@@ -20,6 +20,7 @@ import os
 import sys
 import time
 from collections import defaultdict
+from pathlib import Path
 from select import select
 
 import mujoco
@@ -71,13 +72,14 @@ class Simulator:
 
     def step(self):
         """Wait for the torque of the last state, and advance by one cycle."""
-        self.robot.process_commands()
+        if self.cycle and self.robot.current_motion_id:
+            self.wait()
+        else:
+            self.robot.process_commands()
         if not self.robot.current_motion_id:
             self.cycle = 0
         if self.cycle == 0:
             time.sleep(_SLOW if self.robot.current_motion_id else _IDLE)
-        else:
-            self.wait()
         for what in self.events[self.cycle] if self.cycle else ():
             self.happen(what)
         self.sim.step()
@@ -123,6 +125,21 @@ class Simulator:
         mujoco.mj_setConst(model, mujoco.MjData(model))
 
 
+def without_visuals(sim):
+    """Leave out what is only drawn: to load it takes half of a short run, and nothing looks.
+
+    Every body that moves has its inertia in the file.
+    """
+    for parent in list(sim.worldbody.iter()):
+        for drawn in parent.findall("geom[@class='visual']"):
+            parent.remove(drawn)
+    used = {geom.get('mesh') for geom in sim.worldbody.iter('geom')}
+    for assets in sim.scene.findall('asset'):
+        for mesh in assets.findall('mesh'):
+            if mesh.get('name', Path(mesh.get('file')).stem) not in used:
+                assets.remove(mesh)
+
+
 def main(address, *words):
     events = defaultdict(list)
     for word in words:
@@ -130,6 +147,7 @@ def main(address, *words):
         events[int(cycle)].append(what)
     with MujocoSimulator() as sim:
         sim.add_robot()
+        without_visuals(sim)
         with SimulationServer(sim, hostname_candidates=[address]) as server:
             simulator = Simulator(sim, server, events)
             print('ready', flush=True)  # noqa: T201

@@ -44,7 +44,7 @@ from blf_dsc_controller.nodes.endpoints import quality_of
 from blf_dsc_controller.nodes.recorder_node import BagRecorderNode
 
 # s
-KILLS, MOST, DURATION = (20, 10_000, 60) if os.environ.get('NIGHTLY') else (3, 1000, 2)
+KILLS, MOST, DURATION = (20, 10_000, 60) if os.environ.get('NIGHTLY') else (3, 1000, 1)
 PATIENCE = 60.0  # s, until a test gives up on what should take a moment
 RECORDER = (
     sys.executable,

@@ -287,7 +287,7 @@ def test_study_may_be_based_on_a_preset(tmp_path):
 
 
 PAPERS_FORM = {'compensation': 'state', 'change_detection': False}
-FIRST = {'monte_carlo_events': 16, 'monte_carlo_panda': 6, 'monte_carlo_ur5e': 6}
+FIRST = {'monte_carlo_events': 16, 'monte_carlo_panda': 3, 'monte_carlo_ur5e': 3}
 
 
 def is_kept(study, run, **learning):

@@ -71,6 +71,7 @@ def test_preset_runs_by_name_and_saves_its_configuration(
     assert summary['of_torques'] is from_urdf
 
 
+@pytest.mark.usefixtures('blank_pictures')
 @pytest.mark.parametrize('preset', IN_MOTORS)
 def test_preset_with_feedback_in_its_motors_is_driven_by_name(preset, tmp_path, capsys):
     """Over the bus its gains shake it, which `run` says."""
