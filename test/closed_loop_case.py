@@ -14,11 +14,11 @@ from symbols import replaced
 
 from blf_dsc_controller.arms.two_link import TwoLink
 from blf_dsc_controller.configuration.controller import ControllerConfig
+from blf_dsc_controller.factory.settings import settings_of_config
 from blf_dsc_controller.law import barrier
 from blf_dsc_controller.law.backstepping import Backstepping
 from blf_dsc_controller.law.blf_dsc import BlfDsc
 from blf_dsc_controller.law.controller import Controller
-from blf_dsc_controller.law.factory import settings_of_config
 from blf_dsc_controller.law.state import (
     Settings,
     Signals,

@@ -19,11 +19,10 @@ from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.schema import build
 from blf_dsc_controller.control.arm_controller import ArmController
 from blf_dsc_controller.errors import ConfigurationError
+from blf_dsc_controller.factory.controller import controller_of
 from blf_dsc_controller.law.external_torque import absorb
-from blf_dsc_controller.law.factory import controller_of
 from blf_dsc_controller.law.perception import CONTACT
-from blf_dsc_controller.law.telemetry import sample_columns
-from blf_dsc_controller.law.tip_wrench import TipWrench
+from blf_dsc_controller.law.samples import sample_columns
 from blf_dsc_controller.messages import topics
 from blf_dsc_controller.messages.journal import EventType, Journal
 from blf_dsc_controller.reference.retargeting import Target, TrajectoryError
@@ -37,6 +36,7 @@ from blf_dsc_controller.simulation.loop import (
 )
 from blf_dsc_controller.supervision.guard import Guard
 from blf_dsc_controller.supervision.supervisor import Phase, Reason
+from blf_dsc_controller.tool.tip_wrench import TipWrench
 from sim_plant.plant import plant_of
 
 # s

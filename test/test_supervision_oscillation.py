@@ -12,7 +12,7 @@ import pytest
 from blf_dsc_controller.bags.reader import read_run
 from blf_dsc_controller.configuration.nodes import CONTROLLER, PLANT, load_loop
 from blf_dsc_controller.configuration.schema import change
-from blf_dsc_controller.law.factory import controller_of
+from blf_dsc_controller.factory.controller import controller_of
 from blf_dsc_controller.law.torque import RATE_CUT
 from blf_dsc_controller.replay.verify import verify
 from blf_dsc_controller.simulation.loop import START, simulate, write_bag

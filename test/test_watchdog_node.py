@@ -23,7 +23,7 @@ from std_msgs.msg import String
 from blf_dsc_controller import load_loop
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.schema import build, change, differences, flatten
-from blf_dsc_controller.law.factory import settings_of_config
+from blf_dsc_controller.factory.settings import settings_of_config
 from blf_dsc_controller.messages import topics
 from blf_dsc_controller.messages.codecs import (
     Float64MultiArrayEncoder,

@@ -20,10 +20,10 @@ from blf_dsc_controller.configuration.nodes import CONTROLLER, load, locate
 from blf_dsc_controller.control.guarded_loop import GuardedLoop
 from blf_dsc_controller.control.outputs import Output, Outputs
 from blf_dsc_controller.errors import BlfDscError
-from blf_dsc_controller.law.telemetry import disturbance_names
 from blf_dsc_controller.law.weighing import DEVIATION
 from blf_dsc_controller.messages import topics
 from blf_dsc_controller.messages.codecs import JointStateEncoder
+from blf_dsc_controller.messages.named_values import disturbance_names
 from blf_dsc_controller.numerics.intervals import TWO_SIDED
 from blf_dsc_controller.reference.trajectory import Trajectory, TrajectoryPoint
 from blf_dsc_controller.supervision.drive_load import DriveLoad

@@ -12,7 +12,7 @@ import numpy as np
 
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.control.guarded_loop import GuardedLoop
-from blf_dsc_controller.law.telemetry import rejected_columns
+from blf_dsc_controller.control.rejected_columns import rejected_columns
 from blf_dsc_controller.messages import topics
 from blf_dsc_controller.messages.codecs import (
     Float64MultiArrayEncoder,

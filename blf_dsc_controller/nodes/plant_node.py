@@ -30,10 +30,10 @@ from std_srvs.srv import Trigger
 
 from blf_dsc_controller.configuration.plant import PlantConfig
 from blf_dsc_controller.configuration.schema import Value, differences, flatten
-from blf_dsc_controller.law.telemetry import DECIMATION, PlantTelemetry
 from blf_dsc_controller.messages import topics
 from blf_dsc_controller.messages.codecs import Float64MultiArrayDecoder, MessageError
 from blf_dsc_controller.messages.journal import Change
+from blf_dsc_controller.messages.plant_telemetry import DECIMATION, PlantTelemetry
 from blf_dsc_controller.nodes import parameters, process
 from blf_dsc_controller.nodes.diagnostics import (
     ERROR,

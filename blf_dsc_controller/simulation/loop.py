@@ -23,19 +23,13 @@ from blf_dsc_controller.bags.topic_recorder import TopicRecorder
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.plant import PlantConfig
 from blf_dsc_controller.configuration.schema import flatten
+from blf_dsc_controller.control.telemetry import ControllerTelemetry
 from blf_dsc_controller.errors import BlfDscError
+from blf_dsc_controller.factory.controller import begin, controller_of
+from blf_dsc_controller.factory.estimate import estimate_names
 from blf_dsc_controller.law.controller import Controller
-from blf_dsc_controller.law.factory import begin, controller_of, estimate_names
+from blf_dsc_controller.law.samples import sample_columns
 from blf_dsc_controller.law.state import Sample, sample_of
-from blf_dsc_controller.law.telemetry import (
-    DECIMATION,
-    ControllerTelemetry,
-    Message,
-    PlantTelemetry,
-    disturbance_names,
-    run_of,
-    sample_columns,
-)
 from blf_dsc_controller.messages import topics
 from blf_dsc_controller.messages.journal import (
     Change,
@@ -44,8 +38,12 @@ from blf_dsc_controller.messages.journal import (
     contact_in,
     oscillation_in,
 )
+from blf_dsc_controller.messages.named_values import disturbance_names
+from blf_dsc_controller.messages.plant_telemetry import DECIMATION, PlantTelemetry
+from blf_dsc_controller.messages.topics import Message
 from blf_dsc_controller.run import Run, Series, Stop
 from blf_dsc_controller.simulation.compiled_loop import CompiledLoop, Rows, Span
+from blf_dsc_controller.simulation.sampled_run import run_of
 from blf_dsc_controller.supervision.guard import Guard
 from sim_plant.plant import Plant, parameter_names_of, plant_of, steps_of
 

@@ -33,7 +33,7 @@ from blf_dsc_controller.analysis.panels import BLUE, MUTED, ORANGE
 from blf_dsc_controller.configuration.nodes import LoopConfig
 from blf_dsc_controller.configuration.schema import change
 from blf_dsc_controller.law.perception import DISTANCE
-from blf_dsc_controller.law.telemetry import sample_columns
+from blf_dsc_controller.law.samples import sample_columns
 from blf_dsc_controller.messages.journal import EventType
 from blf_dsc_controller.run import Floats
 from blf_dsc_controller.simulation.loop import START, Record, simulate

@@ -20,9 +20,9 @@ from blf_dsc_controller.configuration import law_file
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.schema import differences, flatten
 from blf_dsc_controller.errors import BlfDscError, StartError
+from blf_dsc_controller.factory.controller import controller_of
 from blf_dsc_controller.law.check_state import CONTRADICTION, INVALID, OSCILLATES
 from blf_dsc_controller.law.checks import is_valid_state
-from blf_dsc_controller.law.factory import controller_of
 from blf_dsc_controller.law.sensor import is_late, restart
 from blf_dsc_controller.messages import codecs
 from blf_dsc_controller.messages.journal import (
