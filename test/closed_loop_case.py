@@ -29,7 +29,7 @@ from blf_dsc_controller.law.state import (
     state_size,
 )
 from blf_dsc_controller.reference import terms as reference
-from sim_plant.plant import Plant
+from sim_plant.sampled_plant import Plant
 
 MODEL = TwoLink(R)
 REFERENCE = reference.pack(

@@ -29,7 +29,8 @@ from blf_dsc_controller.messages.topics import COMMANDS
 from blf_dsc_controller.reference.trajectory import TrajectoryError
 from blf_dsc_controller.simulation.loop import START
 from blf_dsc_controller.supervision.supervisor import Phase
-from sim_plant.plant import plant_of, steps_of
+from sim_plant.plant import plant_of
+from sim_plant.settings import steps_of
 
 LOOP = blf.load_loop('recommended', {'sim_plant': {'duration': 1.0}})
 LONG = blf.load_loop('recommended', {'sim_plant': {'duration': 4.0}})

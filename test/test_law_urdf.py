@@ -27,7 +27,7 @@ from blf_dsc_controller.factory.estimate import (
 )
 from blf_dsc_controller.factory.settings import settings_of_config
 from blf_dsc_controller.studies.monte_carlo import draw, load_study, plant_with
-from sim_plant.plant import plant_settings
+from sim_plant.settings import plant_settings
 
 ARM = {'model': 'urdf', 'robot.urdf': 'panda.urdf', 'robot.tip': 'panda_hand_tcp'}
 

@@ -41,7 +41,8 @@ from blf_dsc_controller.simulation.loop import START, simulate
 from blf_dsc_controller.supervision.guard import Guard
 from sim_plant import mujoco_plant
 from sim_plant.mujoco_plant import MujocoPlant
-from sim_plant.plant import plant_of, plant_settings
+from sim_plant.plant import plant_of
+from sim_plant.settings import plant_settings
 
 PANDA = {'robot.urdf': 'panda.urdf', 'robot.tip': 'panda_hand_tcp'}
 UR5E = {

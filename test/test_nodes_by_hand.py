@@ -45,7 +45,9 @@ from blf_dsc_controller.nodes import parameters, process
 from blf_dsc_controller.nodes.controller_node import ControllerNode
 from blf_dsc_controller.nodes.plant_node import PlantNode
 from blf_dsc_controller.supervision import config_warnings, retuning
-from sim_plant.plant import Latency, parameter_names_of, plant_of, urdf_of
+from sim_plant.plant import plant_of
+from sim_plant.settings import parameter_names_of, urdf_of
+from sim_plant.torque_input import Latency
 
 ZERO = (0.0, 0.0)
 VELOCITY = (

@@ -19,7 +19,8 @@ from blf_dsc_controller.configuration.schema import build, change
 from blf_dsc_controller.errors import ConfigurationError
 from blf_dsc_controller.messages.codecs import JointStateDecoder
 from blf_dsc_controller.messages.plant_telemetry import PlantTelemetry
-from sim_plant.plant import plant_of, plant_settings, true_inertias
+from sim_plant.plant import plant_of
+from sim_plant.settings import plant_settings, true_inertias
 
 PANDA = {'robot.urdf': 'panda.urdf', 'robot.tip': 'panda_hand_tcp'}
 HELD = {'robot.drive_compensates': 'gravity'}

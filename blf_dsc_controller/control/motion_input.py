@@ -17,9 +17,9 @@ import numpy as np
 from blf_dsc_controller.control.log import Log
 from blf_dsc_controller.messages.codecs import (
     Float64MultiArrayDecoder,
-    MessageError,
     joint_trajectory,
 )
+from blf_dsc_controller.messages.errors import MessageError
 from blf_dsc_controller.messages.topics import JOINT_POSITIONS, JOINT_TRAJECTORY
 from blf_dsc_controller.reference.retargeting import (
     Target,

@@ -25,7 +25,9 @@ from blf_dsc_controller.motors.damiao import ranges_of
 from blf_dsc_controller.motors.frame import Frame, Ranges, torque_alone
 from blf_dsc_controller.supervision.drive_load import DriveLoad
 from sim_plant.motors import MotorPlant
-from sim_plant.plant import Plant, plant_of, plant_settings
+from sim_plant.plant import plant_of
+from sim_plant.sampled_plant import Plant
+from sim_plant.settings import plant_settings
 
 Vector = NDArray[np.float64]
 SIMULATED = 'simulated'

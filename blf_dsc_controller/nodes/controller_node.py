@@ -17,8 +17,8 @@ from blf_dsc_controller.messages import topics
 from blf_dsc_controller.messages.codecs import (
     Float64MultiArrayEncoder,
     JointStateDecoder,
-    MessageError,
 )
+from blf_dsc_controller.messages.errors import MessageError
 from blf_dsc_controller.nodes import parameters, process
 from blf_dsc_controller.nodes.controller_start import ControllerStart, Surroundings
 from blf_dsc_controller.nodes.diagnostics import ControllerStatus

@@ -10,7 +10,8 @@ from rclpy.publisher import Publisher
 
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.errors import StartError
-from blf_dsc_controller.messages.codecs import JointStateDecoder, MessageError
+from blf_dsc_controller.messages.codecs import JointStateDecoder
+from blf_dsc_controller.messages.errors import MessageError
 from blf_dsc_controller.nodes.start_conditions import StartConditions
 from blf_dsc_controller.supervision.guard import Guard
 from blf_dsc_controller.supervision.start_gate import GateState, StartGate

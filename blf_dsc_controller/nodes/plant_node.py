@@ -31,7 +31,8 @@ from std_srvs.srv import Trigger
 from blf_dsc_controller.configuration.plant import PlantConfig
 from blf_dsc_controller.configuration.schema import Value, differences, flatten
 from blf_dsc_controller.messages import topics
-from blf_dsc_controller.messages.codecs import Float64MultiArrayDecoder, MessageError
+from blf_dsc_controller.messages.codecs import Float64MultiArrayDecoder
+from blf_dsc_controller.messages.errors import MessageError
 from blf_dsc_controller.messages.journal import Change
 from blf_dsc_controller.messages.plant_telemetry import DECIMATION, PlantTelemetry
 from blf_dsc_controller.nodes import parameters, process
@@ -44,16 +45,10 @@ from blf_dsc_controller.nodes.diagnostics import (
 )
 from blf_dsc_controller.nodes.endpoints import create_publisher, create_steady_timer
 from blf_dsc_controller.nodes.lifecycle import LoopNode
-from sim_plant.plant import (
-    Latency,
-    Plant,
-    TorqueInput,
-    parameter_names_of,
-    plant_of,
-    plant_settings,
-    steps_of,
-    urdf_of,
-)
+from sim_plant.plant import plant_of
+from sim_plant.sampled_plant import Plant
+from sim_plant.settings import parameter_names_of, plant_settings, steps_of, urdf_of
+from sim_plant.torque_input import Latency, TorqueInput
 
 LOCKSTEP_START = 1_000_000_000
 """First stamp in lock-step [ns]: a zero stamp means 'not set' in ROS."""
@@ -278,7 +273,7 @@ class PlantNode(LoopNode[PlantConfig]):
         was_stale = self._stale
         limit = self.config.actuator.command_timeout
         samples = round(limit / self.config.sample_time)
-        self._stale = not self._lockstep and self.input.is_stale(
+        self._stale = not self._lockstep and self.input.count_stale(
             self.plant.sample, samples
         )
         if self._stale and self.config.actuator.without_command == 'zero':

@@ -45,7 +45,9 @@ from blf_dsc_controller.run import Run, Series, Stop
 from blf_dsc_controller.simulation.compiled_loop import CompiledLoop, Rows, Span
 from blf_dsc_controller.simulation.sampled_run import run_of
 from blf_dsc_controller.supervision.guard import Guard
-from sim_plant.plant import Plant, parameter_names_of, plant_of, steps_of
+from sim_plant.plant import plant_of
+from sim_plant.sampled_plant import Plant
+from sim_plant.settings import parameter_names_of, steps_of
 
 _CHUNK = 1000  # samples; the guard takes about 20 ms for them
 START = 1_000_000_000

@@ -62,7 +62,8 @@ from blf_dsc_controller.studies.monte_carlo import (
 )
 from sim_plant.elastic import run_elastic_plant
 from sim_plant.kernels import run_plant
-from sim_plant.plant import parameter_order, plant_of
+from sim_plant.plant import plant_of
+from sim_plant.settings import parameter_order
 
 KEPT = 'kept'
 VIOLATED = 'violated'

@@ -24,7 +24,12 @@ from blf_dsc_controller.factory.controller import controller_of
 from blf_dsc_controller.law.check_state import CONTRADICTION, INVALID, OSCILLATES
 from blf_dsc_controller.law.checks import is_valid_state
 from blf_dsc_controller.law.sensor import is_late
-from blf_dsc_controller.messages import codecs
+from blf_dsc_controller.messages.errors import (
+    DuplicatedJointError,
+    MessageError,
+    MissingJointError,
+    ShortArrayError,
+)
 from blf_dsc_controller.messages.journal import (
     EventType,
     Journal,
@@ -70,10 +75,10 @@ _MANY = 0.5  # states missed for each that came
 _CHANGED = 0.5  # of the speed: an arm whose clock was set keeps its own
 _SLOWEST = 0.03  # rad/s: a velocity that contradicts positions has more
 
-_REASONS: dict[type[codecs.MessageError], Reason] = {
-    codecs.MissingJointError: Reason.JOINT_MISSING,
-    codecs.DuplicatedJointError: Reason.JOINT_DUPLICATED,
-    codecs.ShortArrayError: Reason.FIELD_MISSING,
+_REASONS: dict[type[MessageError], Reason] = {
+    MissingJointError: Reason.JOINT_MISSING,
+    DuplicatedJointError: Reason.JOINT_DUPLICATED,
+    ShortArrayError: Reason.FIELD_MISSING,
 }
 
 
@@ -554,10 +559,10 @@ class Guard:
         self.samples.relax((stamp - self.last_stamp) * _NANO)
         self._advance_to(stamp)
 
-    def reject(self, error: codecs.MessageError) -> Vector | None:
+    def reject(self, error: MessageError) -> Vector | None:
         """Return the torque for an unreadable message, None if it is another arm's."""
         self._begin_message()
-        if isinstance(error, codecs.MissingJointError) and error.is_foreign(
+        if isinstance(error, MissingJointError) and error.is_foreign(
             self.config.joints
         ):
             self.foreign += 1

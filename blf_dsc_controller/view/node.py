@@ -26,10 +26,10 @@ from blf_dsc_controller.factory.estimate import estimate_names
 from blf_dsc_controller.messages import topics
 from blf_dsc_controller.messages.codecs import (
     JointStateDecoder,
-    MessageError,
     joint_state_layout,
     typestore,
 )
+from blf_dsc_controller.messages.errors import MessageError
 from blf_dsc_controller.messages.journal import (
     MOTIONS,
     Change,
