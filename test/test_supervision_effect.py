@@ -308,10 +308,10 @@ def test_command_has_no_effect_if_it_changed_by_a_fifth_of_its_limit_for_a_while
     for changed, is_missing in (([3.9, -1.9], False), ([0.0, -2.1], True)):
         effect = CommandEffect(2)
         answers = [
-            effect.is_missing(np.array(changed), limit, 1e-3) for _ in range(300)
+            effect.await_effect(np.array(changed), limit, 1e-3) for _ in range(300)
         ]
         assert answers == [is_missing and k == answers.index(True) for k in range(300)]
         if is_missing:
             assert 0.0999 <= 1e-3 * (answers.index(True) + 1) <= 0.1021
     effect = CommandEffect(2)
-    assert not any(effect.is_missing(np.zeros(2), limit, 1e-3) for _ in range(300))
+    assert not any(effect.await_effect(np.zeros(2), limit, 1e-3) for _ in range(300))

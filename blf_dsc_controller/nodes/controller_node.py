@@ -39,7 +39,6 @@ from blf_dsc_controller.supervision.supervisor import Phase
 _RARELY = 10  # samples between looks at what rarely changes
 _RATE_SAMPLES = 1001  # samples before the rate is checked
 _FAST = 0.9  # fraction of the sample time
-_NANO = 1e-9
 _WAITING_PERIOD = 5.0  # s between two warnings
 # s from a signal to the end; ros2 launch sends the next signal after 5 s
 _LONGEST_END = 3.0
@@ -176,8 +175,8 @@ class ControllerNode(LoopNode[ControllerConfig]):
         self._start.close()
         super().destroy_node()
 
-    def ready_to_end(self) -> bool:
-        """Bring the arm to rest first, unless the safe torque is zero."""
+    def prepare_to_end(self) -> bool:
+        """Bring the arm to rest first, unless the safe torque is zero; return whether it rests."""
         guard = self.guard
         if guard is None or not guard.commanding or self.config.safety.torque == 'zero':
             return True
@@ -221,7 +220,7 @@ class ControllerNode(LoopNode[ControllerConfig]):
         guard = self.guard
         if guard is None:
             return
-        if self._start.holds(guard, raw):
+        if self._start.hold_early(guard, raw):
             self._report_if_changed(guard)
             return
         trajectories = self._status.trajectories

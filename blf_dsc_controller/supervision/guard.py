@@ -44,7 +44,7 @@ from blf_dsc_controller.reference.retargeting import (
     TrajectoryError,
 )
 from blf_dsc_controller.reference.trajectory import Trajectory
-from blf_dsc_controller.run import Contact
+from blf_dsc_controller.run import NANOSECOND, Contact
 from blf_dsc_controller.supervision import retuning
 from blf_dsc_controller.supervision.calming import Calming
 from blf_dsc_controller.supervision.contact import contact_of
@@ -70,7 +70,6 @@ from blf_dsc_controller.supervision.support import check_support
 from blf_dsc_controller.supervision.told_loads import ToldLoads
 
 Vector = NDArray[np.float64]
-_NANO = 1e-9
 _MANY = 0.5  # states missed for each that came
 _CHANGED = 0.5  # of the speed: an arm whose clock was set keeps its own
 _SLOWEST = 0.03  # rad/s: a velocity that contradicts positions has more
@@ -192,7 +191,7 @@ class Guard:
         (n,) N m].
         """
         self._begin_message()
-        gap = (stamp - self.journal.stamp) * _NANO
+        gap = (stamp - self.journal.stamp) * NANOSECOND
         self.journal.stamp = stamp
         self._readings.take_stamp(stamp)
         self.watchdog.restart()
@@ -277,7 +276,7 @@ class Guard:
                 return self._safe(self.config.sample_time)
         elif self._held.after_gap is not None and not self._rejoin(stamp, measurement):
             return self._safe_at(stamp, measurement)
-        dt = (stamp - self.last_stamp) * _NANO
+        dt = (stamp - self.last_stamp) * NANOSECOND
         before = perf_counter()
         torque = law.update(self._reference.time_of(stamp), dt, measurement)
         self.compute_time = perf_counter() - before
@@ -556,7 +555,7 @@ class Guard:
         self._safe_torque.last.take(stamp, measurement, self._slow)
         self._safe_torque.commanded[:] = self.controller.state.torque
         self.states.advance(stamp, count)
-        self.samples.relax((stamp - self.last_stamp) * _NANO)
+        self.samples.relax((stamp - self.last_stamp) * NANOSECOND)
         self._advance_to(stamp)
 
     def reject(self, error: MessageError) -> Vector | None:

@@ -13,13 +13,13 @@ from numpy.typing import NDArray
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.law.controller import Controller
 from blf_dsc_controller.law.sensor import restart
+from blf_dsc_controller.run import NANOSECOND
 from blf_dsc_controller.supervision.recent_motion import is_gap
 from blf_dsc_controller.supervision.supervisor import Fault
 from blf_dsc_controller.supervision.velocity import Velocity
 from blf_dsc_controller.supervision.wraps import Wraps
 
 Vector = NDArray[np.float64]
-_NANO = 1e-9
 
 
 class Readings:
@@ -46,7 +46,7 @@ class Readings:
 
     def take_stamp(self, stamp: int) -> None:
         """Begin a state; velocities are compared anew unless it follows the one before."""
-        self.gap = (stamp - self._seen) * _NANO
+        self.gap = (stamp - self._seen) * NANOSECOND
         self.is_after_gap = is_gap(self.gap, self._sample_time)
         self._seen = stamp
         if self.gap < 0.0 or self.is_after_gap:
@@ -77,7 +77,7 @@ class Readings:
         """Difference all velocities from the positions, from this measurement on."""
         sensor = self._controller.checks.sensor
         self._velocity = Velocity(self._n)
-        before = stamp - round(self.gap / _NANO)
+        before = stamp - round(self.gap / NANOSECOND)
         self._velocity.begin(before, sensor.read_before[: self._n])
         self._velocity.replace(stamp, measurement)
         restart(sensor)

@@ -18,10 +18,10 @@ from blf_dsc_controller.reference.approach import (
 from blf_dsc_controller.reference.retargeting import plan_stop
 from blf_dsc_controller.reference.terms import remaining
 from blf_dsc_controller.reference.turns import reference_near
+from blf_dsc_controller.run import NANOSECOND
 from blf_dsc_controller.supervision.start import PreparedStart, prepared_start
 
 Vector = NDArray[np.float64]
-_NANO = 1e-9
 
 
 class RunningReference:
@@ -45,7 +45,7 @@ class RunningReference:
 
     def time_of(self, stamp: int) -> float:
         """Return the time of a stamp [ns] since the start [s]."""
-        return (stamp - self.start_stamp) * _NANO
+        return (stamp - self.start_stamp) * NANOSECOND
 
     @property
     def time(self) -> float:
