@@ -27,8 +27,8 @@ from blf_dsc_controller.messages import topics
 from blf_dsc_controller.messages.journal import EventType, Journal
 from blf_dsc_controller.reference.retargeting import Target, TrajectoryError
 from blf_dsc_controller.replay.verify import verify
+from blf_dsc_controller.run import FIRST_STAMP
 from blf_dsc_controller.simulation.loop import (
-    START,
     new_record,
     run_alone,
     simulate,
@@ -76,7 +76,7 @@ def columns(record):
 def contacts(record):
     """Times of the contacts [s]."""
     return [
-        (event.stamp - START) * 1e-9
+        (event.stamp - FIRST_STAMP) * 1e-9
         for event in record.journal.pending
         if event.type is EventType.CONTACT
     ]
@@ -235,7 +235,7 @@ def test_arm_that_holds_takes_no_targets_until_a_trajectory_leads_away():
     config = loop_of(pushed(PUSH), **{'contact.reaction': 'hold'})
     guard = Guard(config.controller, lambda: 0, lambda: 0)
     guard.activate()
-    guard.update(START, plant_of(config.plant).measure())
+    guard.update(FIRST_STAMP, plant_of(config.plant).measure())
     guard.controller.sample.external_interval[:] = 1.0
     guard._react()
     q = guard.controller.signals.q
