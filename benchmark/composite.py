@@ -24,7 +24,7 @@ from harness import print_table
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.nodes import CONTROLLER, LoopConfig, load_loop
 from blf_dsc_controller.configuration.schema import change
-from blf_dsc_controller.law.factory import begin, controller_of
+from blf_dsc_controller.factory.controller import begin, controller_of
 from blf_dsc_controller.studies.laws import inertia_of_joints, linear_gains
 from blf_dsc_controller.studies.monte_carlo import another_motion
 from blf_dsc_controller.studies.runs import cores

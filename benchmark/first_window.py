@@ -28,8 +28,8 @@ from blf_dsc_controller.configuration.nodes import (
     LoopConfig,
     load_loop,
 )
-from blf_dsc_controller.law.factory import begin, controller_of
-from blf_dsc_controller.law.telemetry import sample_columns
+from blf_dsc_controller.factory.controller import begin, controller_of
+from blf_dsc_controller.law.samples import sample_columns
 from blf_dsc_controller.law.weighing import DEVIATION, MASS
 from blf_dsc_controller.run import Floats
 from blf_dsc_controller.simulation.loop import Record, simulate

@@ -16,7 +16,8 @@ from harness import Ratio, ratio
 
 from blf_dsc_controller.configuration.nodes import CONTROLLER, PLANT, load_loop
 from blf_dsc_controller.control.guarded_loop import GuardedLoop
-from blf_dsc_controller.simulation.loop import START, simulate
+from blf_dsc_controller.run import FIRST_STAMP
+from blf_dsc_controller.simulation.loop import simulate
 
 _ROUNDS = 15
 _STATES = 1000  # in each turn
@@ -48,7 +49,7 @@ class Contestant:
         plant = {'duration': _FULL + 1e-3 * states, **quiet}
         loop = load_loop('panda_rigid', {PLANT: plant, CONTROLLER: given})
         record = simulate(loop.controller, loop.plant)
-        stamps = (START + record.stamps).tolist()
+        stamps = (FIRST_STAMP + record.stamps).tolist()
         self._states = zip(stamps, record.measurements, strict=True)
         self._loop = GuardedLoop(loop.controller, lambda: 0, lambda: 0)
         self._loop.guard.activate()

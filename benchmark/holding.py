@@ -24,7 +24,7 @@ from harness import print_table
 from blf_dsc_controller.configuration.nodes import load_loop
 from blf_dsc_controller.configuration.schema import change
 from blf_dsc_controller.reference.trajectory import Trajectory, TrajectoryPoint
-from blf_dsc_controller.simulation.loop import START
+from blf_dsc_controller.run import FIRST_STAMP
 from blf_dsc_controller.supervision.guard import Guard
 from blf_dsc_controller.supervision.model_torque import model_torque
 from sim_plant.mujoco_plant import MujocoPlant
@@ -128,7 +128,7 @@ def with_this_law(case: Case) -> list[Reached]:
             last = qr
             point = TrajectoryPoint(_MOVING, tuple(qr.tolist()))
             guard.adopt(guard.plan(Trajectory(guard.config.joints, (point,))))
-        found = guard.update(START + k * guard.config.sample_time_ns, measurement)
+        found = guard.update(FIRST_STAMP + k * guard.config.sample_time_ns, measurement)
         if found is None or guard.supervisor.text:
             raise RuntimeError(guard.supervisor.text or guard.waiting_for)
         return found

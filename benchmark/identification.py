@@ -54,7 +54,7 @@ from blf_dsc_controller.identification.identify import identify_arm
 from blf_dsc_controller.identification.recording import Recording
 from blf_dsc_controller.identification.values import base_matrix
 from blf_dsc_controller.identification.windows import rows_of
-from blf_dsc_controller.law.telemetry import sample_columns
+from blf_dsc_controller.law.samples import sample_columns
 from blf_dsc_controller.reference.approach import MotionError
 from blf_dsc_controller.run import Floats
 from blf_dsc_controller.simulation.loop import simulate

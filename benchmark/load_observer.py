@@ -62,8 +62,9 @@ from blf_dsc_controller.configuration.nodes import (
 from blf_dsc_controller.configuration.plant import PlantConfig
 from blf_dsc_controller.configuration.robot import parameters_of
 from blf_dsc_controller.configuration.schema import change
-from blf_dsc_controller.law.factory import begin, controller_of, settings_of_config
-from blf_dsc_controller.law.telemetry import sample_columns
+from blf_dsc_controller.factory.controller import begin, controller_of
+from blf_dsc_controller.factory.settings import settings_of_config
+from blf_dsc_controller.law.samples import sample_columns
 from blf_dsc_controller.messages.journal import EventType
 from blf_dsc_controller.reference.approach import reference_of
 from blf_dsc_controller.reference.terms import sampled

@@ -41,7 +41,7 @@ from blf_dsc_controller.configuration.nodes import (
     load_loop,
 )
 from blf_dsc_controller.errors import BlfDscError
-from blf_dsc_controller.law.telemetry import PlantTelemetry
+from blf_dsc_controller.messages.plant_telemetry import PlantTelemetry
 from blf_dsc_controller.messages.topics import COMMANDS, JOINT_STATES
 from blf_dsc_controller.nodes.endpoints import message_class, qos_profile
 from blf_dsc_controller.simulation.loop import simulate

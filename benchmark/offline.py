@@ -26,7 +26,8 @@ from scipy.integrate import RK45
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.nodes import load_loop
 from blf_dsc_controller.configuration.plant import PlantConfig
-from blf_dsc_controller.law.factory import begin, controller_of, settings_of_config
+from blf_dsc_controller.factory.controller import begin, controller_of
+from blf_dsc_controller.factory.settings import settings_of_config
 from blf_dsc_controller.messages import topics
 from blf_dsc_controller.reference.approach import reference_of
 from blf_dsc_controller.reference.terms import sampled

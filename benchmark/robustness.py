@@ -25,7 +25,7 @@ from blf_dsc_controller.configuration.nodes import (
     load_loop,
 )
 from blf_dsc_controller.configuration.schema import change
-from blf_dsc_controller.law.telemetry import sample_columns
+from blf_dsc_controller.law.samples import sample_columns
 from blf_dsc_controller.simulation.loop import simulate
 from blf_dsc_controller.studies.laws import LAWS, law_changes, roughness
 from blf_dsc_controller.studies.runs import cores

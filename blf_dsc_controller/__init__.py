@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from blf_dsc_controller.configuration.schema import change as change
     from blf_dsc_controller.control.arm_controller import ArmController as ArmController
     from blf_dsc_controller.drive.drive import Drive as Drive
-    from blf_dsc_controller.law.factory import controller_of as controller_of
+    from blf_dsc_controller.factory.controller import controller_of as controller_of
     from blf_dsc_controller.reference.trajectory import (
         TrajectoryPoint as TrajectoryPoint,
     )
@@ -43,7 +43,7 @@ _PUBLIC = {
     'PlantConfig': 'configuration.plant',
     'Run': 'run',
     'change': 'configuration.schema',
-    'controller_of': 'law.factory',
+    'controller_of': 'factory.controller',
     'Drive': 'drive.drive',
     'draw': 'analysis.figures',
     'load_loop': 'configuration.nodes',

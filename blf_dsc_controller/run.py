@@ -13,6 +13,12 @@ from numpy.typing import NDArray
 Floats = NDArray[np.float64]
 Stamps = NDArray[np.int64]
 
+NANOSECOND = 1e-9
+"""In seconds."""
+
+FIRST_STAMP = 1_000_000_000
+"""Stamp of the first sample [ns] where no clock gives it: in ROS, zero means 'not set'."""
+
 
 @dataclass(frozen=True)
 class Series:

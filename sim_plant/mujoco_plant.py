@@ -22,7 +22,8 @@ from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.extras import import_extra
 from sim_plant.elastic import PREDICT, SWING
 from sim_plant.kernels import DRIVE, MOVE
-from sim_plant.plant import Plant, plant_settings, true_rotors, urdf_of
+from sim_plant.sampled_plant import Plant
+from sim_plant.settings import plant_settings, true_rotors, urdf_of
 from sim_plant.springs import CUBE, stiffness_of
 
 PAYLOAD = 'payload of sim_plant'

@@ -14,11 +14,11 @@ from symbols import replaced
 
 from blf_dsc_controller.arms.two_link import TwoLink
 from blf_dsc_controller.configuration.controller import ControllerConfig
+from blf_dsc_controller.factory.settings import settings_of_config
 from blf_dsc_controller.law import barrier
 from blf_dsc_controller.law.backstepping import Backstepping
 from blf_dsc_controller.law.blf_dsc import BlfDsc
 from blf_dsc_controller.law.controller import Controller
-from blf_dsc_controller.law.factory import settings_of_config
 from blf_dsc_controller.law.state import (
     Settings,
     Signals,
@@ -29,7 +29,7 @@ from blf_dsc_controller.law.state import (
     state_size,
 )
 from blf_dsc_controller.reference import terms as reference
-from sim_plant.plant import Plant
+from sim_plant.sampled_plant import Plant
 
 MODEL = TwoLink(R)
 REFERENCE = reference.pack(

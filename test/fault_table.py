@@ -27,8 +27,8 @@ from blf_dsc_controller.messages.codecs import (
     Float64MultiArrayEncoder,
     JointStateDecoder,
     JointStateEncoder,
-    MessageError,
 )
+from blf_dsc_controller.messages.errors import MessageError
 from blf_dsc_controller.reference.trajectory import (
     Trajectory,
     TrajectoryError,
@@ -37,7 +37,8 @@ from blf_dsc_controller.reference.trajectory import (
 from blf_dsc_controller.supervision.guard import Guard
 from blf_dsc_controller.supervision.state_watchdog import PERIOD
 from blf_dsc_controller.supervision.supervisor import Phase, Reason
-from sim_plant.plant import TorqueInput, plant_of
+from sim_plant.plant import plant_of
+from sim_plant.torque_input import TorqueInput
 
 JOINTS = ('joint1', 'joint2')
 MILLISECOND = 1_000_000  # ns

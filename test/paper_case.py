@@ -11,7 +11,7 @@ import numpy as np
 from blf_dsc_controller.configuration.nodes import LoopConfig, load_loop
 from blf_dsc_controller.configuration.schema import change
 from blf_dsc_controller.law.controller import Controller
-from blf_dsc_controller.law.telemetry import sample_columns
+from blf_dsc_controller.law.samples import sample_columns
 from blf_dsc_controller.simulation.loop import simulate
 
 P = np.array([1.0, 0.32, 0.4])

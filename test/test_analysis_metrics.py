@@ -25,7 +25,7 @@ from blf_dsc_controller.analysis.metrics_table import format_table
 from blf_dsc_controller.analysis.output import plain, write_json
 from blf_dsc_controller.analysis.panels import panels
 from blf_dsc_controller.bags.reader import read_run
-from blf_dsc_controller.law.telemetry import learned_arm
+from blf_dsc_controller.factory.estimate import learned_arm
 from blf_dsc_controller.messages.topics import LAMBDA_MIN, LATCHED, LATE_STEPS
 from blf_dsc_controller.run import LearnedArm, Run, Series
 from blf_dsc_controller.simulation.loop import simulate, write_bag

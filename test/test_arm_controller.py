@@ -27,9 +27,10 @@ from blf_dsc_controller.law.weighing import DEVIATION
 from blf_dsc_controller.messages.journal import EventType
 from blf_dsc_controller.messages.topics import COMMANDS
 from blf_dsc_controller.reference.trajectory import TrajectoryError
-from blf_dsc_controller.simulation.loop import START
+from blf_dsc_controller.run import FIRST_STAMP
 from blf_dsc_controller.supervision.supervisor import Phase
-from sim_plant.plant import plant_of, steps_of
+from sim_plant.plant import plant_of
+from sim_plant.settings import steps_of
 
 LOOP = blf.load_loop('recommended', {'sim_plant': {'duration': 1.0}})
 LONG = blf.load_loop('recommended', {'sim_plant': {'duration': 4.0}})
@@ -52,7 +53,7 @@ def run(controller, plant, config, steps):
     torques = []
     for step in range(steps):
         q, dq, effort = plant.measure().reshape(3, -1)
-        stamp = START * 1e-9 + step * config.sample_time
+        stamp = FIRST_STAMP * 1e-9 + step * config.sample_time
         torque = controller.update(stamp, q, dq, effort)
         torques.append(torque)
         plant.step(torque)

@@ -29,7 +29,7 @@ from blf_dsc_controller.arms.model import inertia_matrices
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.nodes import load, locate
 from blf_dsc_controller.configuration.robot import parameters_of
-from blf_dsc_controller.law.factory import controller_of
+from blf_dsc_controller.factory.controller import controller_of
 
 ONE = np.ones((1, 1, 1))  # one joint with a link of 1 kg m^2, in one posture
 TIMING = Timing(0.001, delay=1, drive_lag=0.001, velocity_lag=0.0025)

@@ -42,7 +42,7 @@ from blf_dsc_controller.messages.codecs import (
     definition,
     typestore,
 )
-from blf_dsc_controller.messages.journal import encode_string
+from blf_dsc_controller.messages.strings import encode_string
 from blf_dsc_controller.messages.topics import (
     COMMANDS,
     FLOAT64_MULTI_ARRAY,

@@ -41,7 +41,7 @@ from blf_dsc_controller.messages.codecs import (
     UnknownTypeError,
     typestore,
 )
-from blf_dsc_controller.messages.journal import encode_string
+from blf_dsc_controller.messages.strings import encode_string
 from blf_dsc_controller.messages.topics import COMMANDS, JOINT_STATES, STREAM, Quality
 
 START = 1_734_000_000_000_000_000

@@ -65,7 +65,7 @@ from blf_dsc_controller.studies.laws import COMPUTED_TORQUE
 from blf_dsc_controller.supervision.model_torque import friction_torque, model_torque
 from blf_dsc_controller.tool.errors import Tool, _fill_errors
 from sim_plant.kernels import run_plant
-from sim_plant.plant import plant_settings
+from sim_plant.settings import plant_settings
 
 PACKAGE = Path(blf_dsc_controller.__file__).resolve().parent
 
@@ -142,7 +142,7 @@ from blf_dsc_controller.compiled import kernel_cache
 from blf_dsc_controller.law.controller import update
 from blf_dsc_controller.law.perception import weigh
 from blf_dsc_controller.simulation.compiled_loop import run_loop
-from sim_plant.plant import run_plant
+from sim_plant.kernels import run_plant
 
 assert {update, weigh, run_loop, run_plant} <= {*kernel_cache.KERNELS}
 for kernel in kernel_cache.KERNELS:

@@ -15,7 +15,8 @@ from blf_dsc_controller.configuration.nodes import NODES, RecorderConfig, load_l
 from blf_dsc_controller.configuration.plant import PlantConfig
 from blf_dsc_controller.configuration.schema import build, change, flatten, parameters
 from blf_dsc_controller.errors import ConfigurationError
-from blf_dsc_controller.law import factory, state
+from blf_dsc_controller.factory.settings import settings_of_config
+from blf_dsc_controller.law import state
 from blf_dsc_controller.law.adaptation import GRADIENT, NEWTON
 from blf_dsc_controller.law.prediction import FILTERED, LAMBDA
 
@@ -307,7 +308,7 @@ def test_recommended_preset_equals_the_defaults():
 def test_choices_match_the_law():
     choices = {entry.name: entry.choices for entry in parameters(ControllerConfig)}
     for law in choices['law']:
-        factory.settings_of_config(build(ControllerConfig, TRUE_MODEL | {'law': law}))
+        settings_of_config(build(ControllerConfig, TRUE_MODEL | {'law': law}))
     for name, numbers in (
         ('prediction', {'filtered': FILTERED, 'lambda': LAMBDA}),
         ('update', {'newton': NEWTON, 'gradient': GRADIENT}),

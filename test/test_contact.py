@@ -19,17 +19,16 @@ from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.schema import build
 from blf_dsc_controller.control.arm_controller import ArmController
 from blf_dsc_controller.errors import ConfigurationError
+from blf_dsc_controller.factory.controller import controller_of
 from blf_dsc_controller.law.external_torque import absorb
-from blf_dsc_controller.law.factory import controller_of
 from blf_dsc_controller.law.perception import CONTACT
-from blf_dsc_controller.law.telemetry import sample_columns
-from blf_dsc_controller.law.tip_wrench import TipWrench
+from blf_dsc_controller.law.samples import sample_columns
 from blf_dsc_controller.messages import topics
 from blf_dsc_controller.messages.journal import EventType, Journal
 from blf_dsc_controller.reference.retargeting import Target, TrajectoryError
 from blf_dsc_controller.replay.verify import verify
+from blf_dsc_controller.run import FIRST_STAMP
 from blf_dsc_controller.simulation.loop import (
-    START,
     new_record,
     run_alone,
     simulate,
@@ -37,6 +36,7 @@ from blf_dsc_controller.simulation.loop import (
 )
 from blf_dsc_controller.supervision.guard import Guard
 from blf_dsc_controller.supervision.supervisor import Phase, Reason
+from blf_dsc_controller.tool.tip_wrench import TipWrench
 from sim_plant.plant import plant_of
 
 # s
@@ -76,7 +76,7 @@ def columns(record):
 def contacts(record):
     """Times of the contacts [s]."""
     return [
-        (event.stamp - START) * 1e-9
+        (event.stamp - FIRST_STAMP) * 1e-9
         for event in record.journal.pending
         if event.type is EventType.CONTACT
     ]
@@ -235,7 +235,7 @@ def test_arm_that_holds_takes_no_targets_until_a_trajectory_leads_away():
     config = loop_of(pushed(PUSH), **{'contact.reaction': 'hold'})
     guard = Guard(config.controller, lambda: 0, lambda: 0)
     guard.activate()
-    guard.update(START, plant_of(config.plant).measure())
+    guard.update(FIRST_STAMP, plant_of(config.plant).measure())
     guard.controller.sample.external_interval[:] = 1.0
     guard._react()
     q = guard.controller.signals.q

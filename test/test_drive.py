@@ -14,11 +14,9 @@ from blf_dsc_controller import load_loop, simulate
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.schema import build, change
 from blf_dsc_controller.errors import StartError
-from blf_dsc_controller.law.factory import (
-    controller_of,
-    estimate_names,
-    settings_of_config,
-)
+from blf_dsc_controller.factory.controller import controller_of
+from blf_dsc_controller.factory.estimate import estimate_names
+from blf_dsc_controller.factory.settings import settings_of_config
 from blf_dsc_controller.law.torque import added_torque
 from blf_dsc_controller.replay.verify import verify
 from blf_dsc_controller.simulation.loop import write_bag

@@ -31,7 +31,8 @@ from blf_dsc_controller.errors import BlfDscError, ConfigurationError
 from blf_dsc_controller.messages import topics
 from blf_dsc_controller.supervision.drive_load import DriveLoad
 from blf_dsc_controller.supervision.supervisor import Phase
-from sim_plant.plant import plant_of, plant_settings
+from sim_plant.plant import plant_of
+from sim_plant.settings import plant_settings
 
 HERE = Path(__file__).parent
 HOLD = {'safety.torque': 'hold_gravity'}

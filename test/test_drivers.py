@@ -29,7 +29,8 @@ from blf_dsc_controller.configuration.schema import change
 from blf_dsc_controller.messages import topics
 from blf_dsc_controller.messages.journal import decode
 from blf_dsc_controller.nodes.endpoints import qos_profile
-from blf_dsc_controller.simulation.loop import START, simulate
+from blf_dsc_controller.run import FIRST_STAMP
+from blf_dsc_controller.simulation.loop import simulate
 from blf_dsc_controller.supervision.guard import Guard
 from sim_plant.plant import plant_of
 
@@ -189,7 +190,9 @@ def test_lost_commands_neither_stop_the_drives_nor_cost_the_bound(robot, lost):
     random = np.random.default_rng(0)
     left = 0
     for k in range(round(9.0 / loop.plant.sample_time)):
-        torque = guard.update(START + k * loop.plant.sample_time_ns, plant.measure())
+        torque = guard.update(
+            FIRST_STAMP + k * loop.plant.sample_time_ns, plant.measure()
+        )
         if left == 0:
             applied = torque.copy()
             left = lost if random.random() < 0.05 else 0

@@ -15,13 +15,13 @@ from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.nodes import load_loop
 from blf_dsc_controller.configuration.robot import parameters_of
 from blf_dsc_controller.configuration.schema import build
+from blf_dsc_controller.factory.settings import settings_of_config
 from blf_dsc_controller.identification.exciting_reference import (
     Clearance,
     ExcitationProblem,
     distance,
     search,
 )
-from blf_dsc_controller.law.factory import settings_of_config
 from blf_dsc_controller.simulation.loop import simulate
 
 P = np.array([1.0, 0.32, 0.4])

@@ -20,8 +20,10 @@ from scipy.integrate import solve_ivp
 
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.schema import build, change
+from blf_dsc_controller.factory.controller import controller_of
+from blf_dsc_controller.factory.estimate import columns_of
+from blf_dsc_controller.factory.settings import settings_of_config
 from blf_dsc_controller.law import state
-from blf_dsc_controller.law.factory import columns_of, controller_of, settings_of_config
 from blf_dsc_controller.numerics.algebra import cholesky_factor
 from blf_dsc_controller.reference.terms import sampled
 

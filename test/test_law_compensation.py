@@ -16,8 +16,9 @@ from paper_case import OFF, configured, several
 from scipy.linalg import expm
 
 from blf_dsc_controller.configuration.nodes import load_loop, locate
+from blf_dsc_controller.factory.controller import controller_of
+from blf_dsc_controller.factory.estimate import estimate_names
 from blf_dsc_controller.law import friction
-from blf_dsc_controller.law.factory import controller_of, estimate_names
 from blf_dsc_controller.law.learning import measure_reversals
 from blf_dsc_controller.law.state import sample_of
 from blf_dsc_controller.simulation.loop import simulate

@@ -22,8 +22,8 @@ from paper_case import (
 from symbols import replaced
 
 from blf_dsc_controller import load_loop, simulate
+from blf_dsc_controller.factory.settings import settings_of_config
 from blf_dsc_controller.law import excitation, learning, window
-from blf_dsc_controller.law.factory import settings_of_config
 from blf_dsc_controller.law.innovation import Prior
 from blf_dsc_controller.law.state import settings_of
 

@@ -15,8 +15,9 @@ from blf_dsc_controller.arms.model import regressors_at
 from blf_dsc_controller.configuration.nodes import CONTROLLER, PLANT, load_loop
 from blf_dsc_controller.configuration.robot import parameters_of
 from blf_dsc_controller.errors import ConfigurationError
+from blf_dsc_controller.factory.controller import controller_of
+from blf_dsc_controller.factory.settings import settings_of_config
 from blf_dsc_controller.law import disturbance, load_observer
-from blf_dsc_controller.law.factory import controller_of, settings_of_config
 from blf_dsc_controller.law.load_observer import Settings, State, Work
 from blf_dsc_controller.simulation.loop import simulate
 from blf_dsc_controller.supervision.calming import softened

@@ -19,7 +19,8 @@ from blf_dsc_controller.configuration.nodes import load_loop, locate
 from blf_dsc_controller.configuration.plant import PlantConfig
 from blf_dsc_controller.configuration.schema import build, change, flatten
 from blf_dsc_controller.errors import BlfDscError, ConfigurationError
-from blf_dsc_controller.law.factory import controller_of, law_of
+from blf_dsc_controller.factory.controller import controller_of
+from blf_dsc_controller.factory.laws import law_of
 from blf_dsc_controller.law.laws import for_law
 from blf_dsc_controller.law.state import settings_of, signals_of, state_of
 from blf_dsc_controller.studies import laws

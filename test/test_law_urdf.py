@@ -18,16 +18,16 @@ from blf_dsc_controller.configuration.nodes import load_loop, locate
 from blf_dsc_controller.configuration.robot import parameters_of
 from blf_dsc_controller.configuration.schema import build, change
 from blf_dsc_controller.errors import ConfigurationError
-from blf_dsc_controller.law.factory import (
+from blf_dsc_controller.factory.controller import controller_of
+from blf_dsc_controller.factory.estimate import (
     columns_of,
-    controller_of,
     estimate_names,
     model_of,
     prior_covariance,
-    settings_of_config,
 )
+from blf_dsc_controller.factory.settings import settings_of_config
 from blf_dsc_controller.studies.monte_carlo import draw, load_study, plant_with
-from sim_plant.plant import plant_settings
+from sim_plant.settings import plant_settings
 
 ARM = {'model': 'urdf', 'robot.urdf': 'panda.urdf', 'robot.tip': 'panda_hand_tcp'}
 

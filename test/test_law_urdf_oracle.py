@@ -9,7 +9,7 @@ from plain_urdf_law import PlainArm, PlainUrdfLaw
 from random_arm import UR5E, UR5E_TEXT, pinocchio_model
 
 from blf_dsc_controller import load_loop, simulate
-from blf_dsc_controller.law.telemetry import sample_columns
+from blf_dsc_controller.law.samples import sample_columns
 from blf_dsc_controller.reference.terms import sampled
 
 PERIOD = 0.004  # s

@@ -12,11 +12,13 @@ from blf_dsc_controller.analysis.metrics_table import format_table
 from blf_dsc_controller.bags.reader import read_run
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.errors import ConfigurationError
-from blf_dsc_controller.law.telemetry import learned_arm, load_text, sample_columns
+from blf_dsc_controller.factory.estimate import learned_arm
+from blf_dsc_controller.law.samples import sample_columns
 from blf_dsc_controller.law.weighing import (
     DEVIATION,
     MASS,
 )
+from blf_dsc_controller.messages.named_values import load_text
 from blf_dsc_controller.replay.verify import verify
 from blf_dsc_controller.simulation.loop import simulate, write_bag
 

@@ -19,8 +19,9 @@ from paper_case import NO_DISTURBANCE, configured, run
 from scipy.linalg import eigh
 from symbols import replaced
 
+from blf_dsc_controller.factory.controller import controller_of
+from blf_dsc_controller.factory.estimate import estimate_names
 from blf_dsc_controller.law import adaptation, columns, excitation, ripple, window
-from blf_dsc_controller.law.factory import controller_of, estimate_names
 from blf_dsc_controller.law.innovation import Prior
 from blf_dsc_controller.numerics.algebra import cholesky_factor, cholesky_solve
 

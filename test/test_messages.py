@@ -12,16 +12,18 @@ from hypothesis import strategies as st
 
 from blf_dsc_controller.messages.codecs import (
     JOINT_STATE_FIELDS,
-    DuplicatedJointError,
     Float64MultiArrayDecoder,
     Float64MultiArrayEncoder,
     JointStateDecoder,
     JointStateEncoder,
+    encode_clock,
+    typestore,
+)
+from blf_dsc_controller.messages.errors import (
+    DuplicatedJointError,
     MessageError,
     MissingJointError,
     ShortArrayError,
-    encode_clock,
-    typestore,
 )
 
 STAMP = 1_734_000_123_456_789_012

@@ -14,19 +14,18 @@ from blf_dsc_controller.bags.reader import read_run
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.nodes import load_loop
 from blf_dsc_controller.control.guarded_loop import GuardedLoop
+from blf_dsc_controller.control.rejected_columns import rejected_columns
+from blf_dsc_controller.control.telemetry import ControllerTelemetry
+from blf_dsc_controller.factory.controller import controller_of
+from blf_dsc_controller.factory.estimate import estimate_names
+from blf_dsc_controller.factory.settings import settings_of_config
 from blf_dsc_controller.law import barrier
-from blf_dsc_controller.law.factory import (
-    controller_of,
-    estimate_names,
-    settings_of_config,
-)
 from blf_dsc_controller.law.lyapunov import (
     decay_rate,
     exponential_bound,
     largest_inertia,
 )
 from blf_dsc_controller.law.surface import virtual_control
-from blf_dsc_controller.law.telemetry import ControllerTelemetry, rejected_columns
 from blf_dsc_controller.messages import topics
 from blf_dsc_controller.messages.codecs import JointStateDecoder
 from blf_dsc_controller.simulation.loop import simulate, write_bag

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from blf_dsc_controller.configuration.schema import change
 from blf_dsc_controller.errors import ConfigurationError
-from blf_dsc_controller.law.telemetry import sample_columns
+from blf_dsc_controller.law.samples import sample_columns
 from blf_dsc_controller.simulation.loop import simulate
 from blf_dsc_controller.studies.monte_carlo import (
     another_motion,

@@ -18,7 +18,7 @@ from blf_dsc_controller.drive.loop import DriveLoop, End
 from blf_dsc_controller.drive.motor_feedback import MotorFeedback, as_in_motors
 from blf_dsc_controller.drive.simulated import simulated
 from blf_dsc_controller.errors import BlfDscError
-from blf_dsc_controller.law.factory import settings_of_config
+from blf_dsc_controller.factory.settings import settings_of_config
 from blf_dsc_controller.law.local_gains import LocalGains
 from blf_dsc_controller.motors import damiao
 from blf_dsc_controller.motors.field import Field

@@ -37,11 +37,13 @@ from blf_dsc_controller.nodes.plant_node import PlantNode
 from blf_dsc_controller.reference.approach import reference_of
 from blf_dsc_controller.reference.terms import sampled
 from blf_dsc_controller.replay.verify import verify
-from blf_dsc_controller.simulation.loop import START, simulate
+from blf_dsc_controller.run import FIRST_STAMP
+from blf_dsc_controller.simulation.loop import simulate
 from blf_dsc_controller.supervision.guard import Guard
 from sim_plant import mujoco_plant
 from sim_plant.mujoco_plant import MujocoPlant
-from sim_plant.plant import plant_of, plant_settings
+from sim_plant.plant import plant_of
+from sim_plant.settings import plant_settings
 
 PANDA = {'robot.urdf': 'panda.urdf', 'robot.tip': 'panda_hand_tcp'}
 UR5E = {
@@ -253,7 +255,7 @@ def close_loop(config, arm, samples):
     for k in range(samples):
         measurement = arm.measure()
         angles[k] = measurement[:n]
-        arm.step(guard.update(START + k * 1_000_000, measurement))
+        arm.step(guard.update(FIRST_STAMP + k * 1_000_000, measurement))
         errors[k] = guard.controller.sample.xi1
     assert not guard.supervisor.text
     return guard, angles, errors
@@ -386,7 +388,7 @@ def test_load_is_learned_and_a_wall_is_not(monkeypatch, reaction):
     for k in range(round(1e3 * ENDED)):
         if k == round(1e3 * THERE):
             arm.model.geom('wall').pos[0] -= 1.0
-        torque = guard.update(START + k * 1_000_000, arm.measure())
+        torque = guard.update(FIRST_STAMP + k * 1_000_000, arm.measure())
         guard.perceive()
         arm.step(torque)
         if arm.data.ncon and not touched:
@@ -396,7 +398,7 @@ def test_load_is_learned_and_a_wall_is_not(monkeypatch, reaction):
             assert state.weighing.load[0] == pytest.approx(LOAD, abs=0.05)
     assert touched > 1e3 * THERE
     events = [e for e in guard.journal.pending if e.type is EventType.CONTACT]
-    found = (events[0].stamp - START) // 1_000_000
+    found = (events[0].stamp - FIRST_STAMP) // 1_000_000
     assert 0 <= found - touched < 50  # ms
     if reaction == 'hold':
         assert not guard.supervisor.stops

@@ -33,18 +33,21 @@ from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.plant import PlantConfig
 from blf_dsc_controller.configuration.schema import build
 from blf_dsc_controller.errors import StartError
-from blf_dsc_controller.law.factory import controller_of, settings_of_config
-from blf_dsc_controller.law.telemetry import disturbance_names
+from blf_dsc_controller.factory.controller import controller_of
+from blf_dsc_controller.factory.settings import settings_of_config
 from blf_dsc_controller.messages import topics
 from blf_dsc_controller.messages.codecs import (
     Float64MultiArrayEncoder,
     JointStateEncoder,
 )
+from blf_dsc_controller.messages.named_values import disturbance_names
 from blf_dsc_controller.nodes import parameters, process
 from blf_dsc_controller.nodes.controller_node import ControllerNode
 from blf_dsc_controller.nodes.plant_node import PlantNode
 from blf_dsc_controller.supervision import config_warnings, retuning
-from sim_plant.plant import Latency, parameter_names_of, plant_of, urdf_of
+from sim_plant.plant import plant_of
+from sim_plant.settings import parameter_names_of, urdf_of
+from sim_plant.torque_input import Latency
 
 ZERO = (0.0, 0.0)
 VELOCITY = (

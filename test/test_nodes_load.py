@@ -30,7 +30,7 @@ from blf_dsc_controller.nodes.process import drain
 from blf_dsc_controller.nodes.recorder_node import BagRecorderNode
 from blf_dsc_controller.replay.verify import verify
 from blf_dsc_controller.supervision.drive_load import DriveLoad
-from sim_plant.plant import plant_settings
+from sim_plant.settings import plant_settings
 
 PACKAGES = ('ur_msgs', 'franka_msgs')
 SERVICE = '/driver/set_load'

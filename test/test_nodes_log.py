@@ -161,7 +161,7 @@ def test_leaving_node_commands_the_safe_torque_last(ros):
     ros.until(lambda: clock.advance(0.01) or arm.plant.sample > 0)
     ros.run(arm, 500)
     assert np.abs(arm.plant.measure()[2:4]).min() > 0.1
-    ros.until(law.ready_to_end)
+    ros.until(law.prepare_to_end)
     assert np.abs(arm.plant.measure()[2:4]).max() < 0.05
     ros.run(arm, 500)
     law.close()

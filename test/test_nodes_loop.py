@@ -37,9 +37,10 @@ from blf_dsc_controller.messages import topics
 from blf_dsc_controller.messages.codecs import JointStateDecoder
 from blf_dsc_controller.nodes.controller_node import ControllerNode
 from blf_dsc_controller.nodes.endpoints import message_class
-from blf_dsc_controller.nodes.plant_node import LOCKSTEP_START, PlantNode
+from blf_dsc_controller.nodes.plant_node import PlantNode
 from blf_dsc_controller.reference import terms as reference
 from blf_dsc_controller.reference.approach import reference_of
+from blf_dsc_controller.run import FIRST_STAMP
 from blf_dsc_controller.supervision.supervisor import Reason
 
 MILLISECOND = 1_000_000  # ns
@@ -156,7 +157,7 @@ def test_lockstep_torques_and_stops_match_the_offline_run_bit_for_bit(ros, name)
     same = eventless == plant or (over_ros == simulated(eventless, law).torque).all()
     assert same == (eventless == plant)
     np.testing.assert_array_equal(
-        stamps, LOCKSTEP_START + MILLISECOND * np.arange(len(stamps))
+        stamps, FIRST_STAMP + MILLISECOND * np.arange(len(stamps))
     )
 
 
@@ -203,7 +204,7 @@ def test_nodes_on_simulated_time_follow_the_clock_of_the_plant(ros):
     plant = {'duration': 0.5, 'publish_clock': True}
     over_ros, _ = run_lockstep(ros, plant, {'use_sim_time': True})
     ros.until(lambda: len(clock) == 501)
-    now = Time(nanoseconds=LOCKSTEP_START + 500 * MILLISECOND)
+    now = Time(nanoseconds=FIRST_STAMP + 500 * MILLISECOND)
     ros.until(lambda: ros.nodes[-1].get_clock().now().nanoseconds == now.nanoseconds)
     np.testing.assert_array_equal(over_ros, simulated({'duration': 0.5}).torque)
 
@@ -287,7 +288,7 @@ def test_parameter_change_takes_effect_at_the_published_sample(ros):
     configured, change = [json.loads(message.data) for message in changes]
     assert configured['configured']
     assert change['parameters'] == PUSHED
-    at = (change['stamp'] - LOCKSTEP_START) * 1e-9
+    at = (change['stamp'] - FIRST_STAMP) * 1e-9
     assert 0.05 < at < 1.0
     load = {
         f'events.{name.partition(".")[2]}': np.ravel(v).tolist()

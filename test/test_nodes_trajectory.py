@@ -18,7 +18,8 @@ from ros_rig import JOINTS, PATIENCE
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 from blf_dsc_controller.messages import topics
-from blf_dsc_controller.messages.codecs import MessageError, joint_trajectory
+from blf_dsc_controller.messages.codecs import joint_trajectory
+from blf_dsc_controller.messages.errors import MessageError
 from blf_dsc_controller.messages.journal import decode
 from blf_dsc_controller.reference.terms import sampled
 from blf_dsc_controller.reference.trajectory import plan_trajectory

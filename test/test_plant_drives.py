@@ -17,9 +17,10 @@ from blf_dsc_controller.arms.urdf import pseudo_inertia
 from blf_dsc_controller.configuration.plant import PlantConfig
 from blf_dsc_controller.configuration.schema import build, change
 from blf_dsc_controller.errors import ConfigurationError
-from blf_dsc_controller.law.telemetry import PlantTelemetry
 from blf_dsc_controller.messages.codecs import JointStateDecoder
-from sim_plant.plant import plant_of, plant_settings, true_inertias
+from blf_dsc_controller.messages.plant_telemetry import PlantTelemetry
+from sim_plant.plant import plant_of
+from sim_plant.settings import plant_settings, true_inertias
 
 PANDA = {'robot.urdf': 'panda.urdf', 'robot.tip': 'panda_hand_tcp'}
 HELD = {'robot.drive_compensates': 'gravity'}

@@ -19,7 +19,9 @@ from sim_plant.motion import (
     state_derivative,
     update_loads,
 )
-from sim_plant.plant import TorqueInput, plant_of, plant_settings
+from sim_plant.plant import plant_of
+from sim_plant.settings import plant_settings
+from sim_plant.torque_input import TorqueInput
 
 INITIAL = np.array([*START, 0.5, -1.0])
 TORQUE = np.array([-6.0, -2.0])
@@ -152,10 +154,12 @@ def test_eccentric_encoders_err_once_per_turn():
 def test_torque_is_stale_after_its_limit_and_each_such_step_counts():
     received = TorqueInput(2)
     assert received.take(2, TORQUE, 5)
-    assert [received.is_stale(k, 3) for k in range(7, 11)] == [False] * 2 + [True] * 2
+    assert [received.count_stale(k, 3) for k in range(7, 11)] == [False] * 2 + [
+        True
+    ] * 2
     assert received.stale_steps == 2
     received.renew(10)
-    assert not received.is_stale(13, 3)
+    assert not received.count_stale(13, 3)
     assert received.stale_steps == 2
 
 

@@ -12,7 +12,7 @@ import pytest
 
 from blf_dsc_controller.arms.linear_loop import Timing, law_response
 from blf_dsc_controller.configuration.schema import change
-from blf_dsc_controller.law.factory import controller_of
+from blf_dsc_controller.factory.controller import controller_of
 from blf_dsc_controller.supervision.model_torque import model_torque
 
 BENCHMARK = Path(__file__).parents[1] / 'benchmark'

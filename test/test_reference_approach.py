@@ -23,7 +23,7 @@ from blf_dsc_controller.errors import (
     ConfigurationError,
     StartError,
 )
-from blf_dsc_controller.law.factory import begin, controller_of
+from blf_dsc_controller.factory.controller import begin, controller_of
 from blf_dsc_controller.reference.approach import (
     MotionError,
     blend,

@@ -14,9 +14,9 @@ from recorded_run import compared, of
 from blf_dsc_controller.bags import content
 from blf_dsc_controller.bags.sources import BagError
 from blf_dsc_controller.configuration.schema import change
+from blf_dsc_controller.control.telemetry import ControllerTelemetry
 from blf_dsc_controller.errors import BlfDscError
-from blf_dsc_controller.law.factory import estimate_names
-from blf_dsc_controller.law.telemetry import ControllerTelemetry
+from blf_dsc_controller.factory.estimate import estimate_names
 from blf_dsc_controller.messages.journal import MOTIONS, decode
 from blf_dsc_controller.messages.topics import (
     BOUND,

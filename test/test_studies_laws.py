@@ -21,8 +21,8 @@ from blf_dsc_controller.configuration.nodes import known_names, load_loop, locat
 from blf_dsc_controller.configuration.plant import PlantConfig
 from blf_dsc_controller.configuration.robot import parameters_of
 from blf_dsc_controller.configuration.schema import build, change
-from blf_dsc_controller.law.factory import settings_of_config
-from blf_dsc_controller.law.telemetry import sample_columns
+from blf_dsc_controller.factory.settings import settings_of_config
+from blf_dsc_controller.law.samples import sample_columns
 from blf_dsc_controller.reference import terms
 from blf_dsc_controller.reference.approach import reference_of
 from blf_dsc_controller.simulation.loop import simulate

@@ -11,7 +11,7 @@ from blf_dsc_controller import load_loop
 from blf_dsc_controller.arms.model import inertia_matrices
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.schema import change
-from blf_dsc_controller.law.factory import settings_of_config
+from blf_dsc_controller.factory.settings import settings_of_config
 from blf_dsc_controller.supervision.braking import braking_matrix
 from blf_dsc_controller.supervision.guard import Guard
 from sim_plant.plant import plant_of

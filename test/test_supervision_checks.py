@@ -15,9 +15,9 @@ from plain_law import dynamics
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.nodes import load_loop
 from blf_dsc_controller.configuration.schema import build, change
+from blf_dsc_controller.factory.controller import controller_of
 from blf_dsc_controller.law.check_state import INVALID, OUTSIDE, SUSPECT
 from blf_dsc_controller.law.checks import check_sample
-from blf_dsc_controller.law.factory import controller_of
 from blf_dsc_controller.supervision.calming import Calming
 from blf_dsc_controller.supervision.sample_check import SampleCheck
 from blf_dsc_controller.supervision.supervisor import Phase, Reason

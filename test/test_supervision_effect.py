@@ -19,7 +19,8 @@ from plants import rigid_gears
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.nodes import load_loop
 from blf_dsc_controller.configuration.schema import build, change
-from blf_dsc_controller.simulation.loop import START, simulate
+from blf_dsc_controller.run import FIRST_STAMP
+from blf_dsc_controller.simulation.loop import simulate
 from blf_dsc_controller.supervision.command_effect import CommandEffect
 from blf_dsc_controller.supervision.guard import Guard
 from blf_dsc_controller.supervision.last_state import LastState
@@ -127,7 +128,7 @@ def stopped_by(config, plant, spoil=None, reach=None, at=2.0, after=3.0):
         is_spoilt = k * T >= at
         if is_spoilt and spoil is not None:
             spoil(q, dq)
-        torque = guard.update(START + round(k * T * 1e9), measurement)
+        torque = guard.update(FIRST_STAMP + round(k * T * 1e9), measurement)
         torques.append(np.zeros(n) if torque is None else torque.copy())
         if stop is None and not guard.supervisor.running:
             stop = k
@@ -278,7 +279,7 @@ def estimates_of(scale):
     guard = Guard(config, lambda: 0, lambda: 0)
     guard.activate()
     for k in range(12_000):
-        torque = guard.update(START + k * 1_000_000, arm.measure().copy())
+        torque = guard.update(FIRST_STAMP + k * 1_000_000, arm.measure().copy())
         arm.step(scale * torque)
     assert guard.supervisor.running, guard.supervisor.text
     return guard.controller.state.estimate[:3].copy()
@@ -308,10 +309,10 @@ def test_command_has_no_effect_if_it_changed_by_a_fifth_of_its_limit_for_a_while
     for changed, is_missing in (([3.9, -1.9], False), ([0.0, -2.1], True)):
         effect = CommandEffect(2)
         answers = [
-            effect.is_missing(np.array(changed), limit, 1e-3) for _ in range(300)
+            effect.await_effect(np.array(changed), limit, 1e-3) for _ in range(300)
         ]
         assert answers == [is_missing and k == answers.index(True) for k in range(300)]
         if is_missing:
             assert 0.0999 <= 1e-3 * (answers.index(True) + 1) <= 0.1021
     effect = CommandEffect(2)
-    assert not any(effect.is_missing(np.zeros(2), limit, 1e-3) for _ in range(300))
+    assert not any(effect.await_effect(np.zeros(2), limit, 1e-3) for _ in range(300))

@@ -10,7 +10,7 @@ from blf_dsc_controller import load_loop, simulate
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.schema import build
 from blf_dsc_controller.errors import ConfigurationError
-from blf_dsc_controller.law.factory import settings_of_config
+from blf_dsc_controller.factory.settings import settings_of_config
 from blf_dsc_controller.supervision.config_warnings import config_warnings
 
 UR5E = {'robot.urdf': 'ur5e.urdf', 'robot.tip': 'tool0'}

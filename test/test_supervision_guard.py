@@ -12,7 +12,8 @@ from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.controller_groups import Safety
 from blf_dsc_controller.configuration.schema import change
 from blf_dsc_controller.errors import BlfDscError
-from blf_dsc_controller.law.factory import controller_of, settings_of_config
+from blf_dsc_controller.factory.controller import controller_of
+from blf_dsc_controller.factory.settings import settings_of_config
 from blf_dsc_controller.reference.terms import unpack
 from blf_dsc_controller.reference.trajectory import (
     Trajectory,

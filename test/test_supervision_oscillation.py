@@ -12,10 +12,11 @@ import pytest
 from blf_dsc_controller.bags.reader import read_run
 from blf_dsc_controller.configuration.nodes import CONTROLLER, PLANT, load_loop
 from blf_dsc_controller.configuration.schema import change
-from blf_dsc_controller.law.factory import controller_of
+from blf_dsc_controller.factory.controller import controller_of
 from blf_dsc_controller.law.torque import RATE_CUT
 from blf_dsc_controller.replay.verify import verify
-from blf_dsc_controller.simulation.loop import START, simulate, write_bag
+from blf_dsc_controller.run import FIRST_STAMP
+from blf_dsc_controller.simulation.loop import simulate, write_bag
 from blf_dsc_controller.supervision import calming
 from blf_dsc_controller.supervision.calming import Calming
 from blf_dsc_controller.supervision.guard import Guard
@@ -60,7 +61,7 @@ def stopped(loop):
     n = len(loop.controller.joints)
     speed, torque, stop = [], [], -1
     while stop < 0 or (len(speed) - stop) * period < 1.2e9:
-        at = START + len(speed) * period
+        at = FIRST_STAMP + len(speed) * period
         torque.append(guard.update(at, plant.measure()).copy())
         speed.append((plant.truth()[-n:].copy(), plant.motors[1].copy()))
         if stop < 0 and guard.supervisor.phase is Phase.SAFE_STOP:

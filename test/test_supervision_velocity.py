@@ -11,7 +11,7 @@ from test_supervision_effect import stopped_by
 
 from blf_dsc_controller.configuration.nodes import load_loop
 from blf_dsc_controller.configuration.schema import change
-from blf_dsc_controller.law.factory import controller_of
+from blf_dsc_controller.factory.controller import controller_of
 from blf_dsc_controller.simulation.loop import simulate
 from blf_dsc_controller.supervision.supervisor import Phase, Reason
 

@@ -30,7 +30,7 @@ from blf_dsc_controller.configuration.schema import build, change, flatten
 from blf_dsc_controller.configuration.tool_bound import certified, tool_of
 from blf_dsc_controller.control.arm_controller import ArmController
 from blf_dsc_controller.errors import ConfigurationError
-from blf_dsc_controller.law.factory import settings_of_config
+from blf_dsc_controller.factory.settings import settings_of_config
 from blf_dsc_controller.messages.topics import TOOL
 from blf_dsc_controller.replay.verify import verify
 from blf_dsc_controller.simulation.loop import simulate, write_bag

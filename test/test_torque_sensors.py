@@ -14,7 +14,8 @@ from blf_dsc_controller.law import torque_sensors
 from blf_dsc_controller.law.torque_sensors import COMMANDS, NONE, OFF, SHAKES
 from blf_dsc_controller.messages.journal import EventType
 from blf_dsc_controller.replay.verify import verify
-from blf_dsc_controller.simulation.loop import START, simulate, write_bag
+from blf_dsc_controller.run import FIRST_STAMP
+from blf_dsc_controller.simulation.loop import simulate, write_bag
 from blf_dsc_controller.supervision.guard import Guard
 from blf_dsc_controller.supervision.supervisor import Phase, Reason
 from sim_plant.plant import plant_of
@@ -146,7 +147,9 @@ def loop_of(preset, seconds, **plant):
 def said(record):
     """Return what is said of the sensors, with its time [s], and the reasons of stops."""
     events = [e for e in record.journal.pending if e.type is EventType.TORQUE_SENSORS]
-    found = [(1e-9 * (each.stamp - START), each.content['text']) for each in events]
+    found = [
+        (1e-9 * (each.stamp - FIRST_STAMP), each.content['text']) for each in events
+    ]
     return found, [each.reason for each in record.run().stops]
 
 
@@ -224,7 +227,7 @@ class Failing:
             if k * DT >= after:
                 held = measurement[2 * n :].copy() if held is None else held
                 measurement[2 * n :] = fails(measurement[2 * n :], held)
-            torque = self.guard.update(START + k * 1_000_000, measurement).copy()
+            torque = self.guard.update(FIRST_STAMP + k * 1_000_000, measurement).copy()
             if before is not None and k * DT >= after:
                 self.step = max(self.step, np.abs(torque - before).max())
             before = torque
@@ -262,7 +265,7 @@ def test_brakes_that_close_still_stop_an_arm_whose_efforts_say_so():
         if k >= 1000:
             rest = measurement[:n].copy() if rest is None else rest
             measurement = np.concatenate((rest, np.zeros(2 * n)))
-        torque = guard.update(START + k * 1_000_000, measurement).copy()
+        torque = guard.update(FIRST_STAMP + k * 1_000_000, measurement).copy()
         if guard.supervisor.phase is Phase.SAFE_STOP:
             break
         plant.step(torque)

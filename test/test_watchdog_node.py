@@ -23,7 +23,7 @@ from std_msgs.msg import String
 from blf_dsc_controller import load_loop
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.schema import build, change, differences, flatten
-from blf_dsc_controller.law.factory import settings_of_config
+from blf_dsc_controller.factory.settings import settings_of_config
 from blf_dsc_controller.messages import topics
 from blf_dsc_controller.messages.codecs import (
     Float64MultiArrayEncoder,
@@ -533,7 +533,7 @@ def test_controller_that_goes_silent_on_purpose_says_so_to_its_watchdog(ros):
     ros.reset(law)
     go_on(6 * 10**9, 20)
     ros.until(lambda: not watchdog.watchdog.stands_down)
-    ros.until(lambda: law.ready_to_end() or go_on(law.guard.journal.stamp + 10**6, 1))
+    ros.until(lambda: law.prepare_to_end() or go_on(law.guard.journal.stamp + 10**6, 1))
     law.close()
     ros.until(lambda: watchdog.watchdog.stands_down)
     ros.kill(law)

@@ -9,7 +9,7 @@ from typing import Any
 
 from blf_dsc_controller.analysis.metrics import Metrics
 from blf_dsc_controller.analysis.output import aligned
-from blf_dsc_controller.law.telemetry import load_text
+from blf_dsc_controller.messages.named_values import load_text
 from blf_dsc_controller.messages.topics import LOAD
 from blf_dsc_controller.run import SLIDING, TURNING, JointUnits
 

@@ -299,7 +299,7 @@ def _joints(content: Content) -> tuple[str, ...]:
 def _arm(content: Content) -> LearnedArm | None:
     """Return the arm of the recorded configuration, None if it cannot be built."""
     if content.configurations.get(topics.CONTROLLER, {}).get('model') == 'urdf':
-        from blf_dsc_controller.law.telemetry import learned_arm  # slow: compiles
+        from blf_dsc_controller.factory.estimate import learned_arm  # slow: compiles
 
         with suppress(BlfDscError):
             return learned_arm(content.controller_config())

@@ -23,11 +23,10 @@ from blf_dsc_controller.messages.codecs import (
     ORIGIN,
     STAMP_OFFSET,
     Layout,
-    MessageError,
-    MissingJointError,
     array_layout,
     joint_state_layout,
 )
+from blf_dsc_controller.messages.errors import MessageError, MissingJointError
 from blf_dsc_controller.messages.topics import FLOAT64_MULTI_ARRAY, JOINT_STATE
 from blf_dsc_controller.run import Floats, Stamps
 

@@ -12,7 +12,7 @@ from blf_dsc_controller.arms.joint_gains import JointGains
 from blf_dsc_controller.arms.tuning import gains_of
 from blf_dsc_controller.configuration.controller import ControllerConfig, design_of
 from blf_dsc_controller.configuration.schema import Value, change, flatten
-from blf_dsc_controller.law.factory import settings_of_config
+from blf_dsc_controller.factory.settings import settings_of_config
 from blf_dsc_controller.supervision.expected_errors import expected_errors
 
 Floats = NDArray[np.float64]

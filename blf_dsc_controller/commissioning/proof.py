@@ -20,7 +20,7 @@ from blf_dsc_controller.commissioning.chosen import with_gains
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.schema import Value, change
 from blf_dsc_controller.errors import BlfDscError
-from blf_dsc_controller.law.factory import settings_of_config
+from blf_dsc_controller.factory.settings import settings_of_config
 from blf_dsc_controller.reference.approach import reference_of
 from blf_dsc_controller.reference.terms import sampled
 from blf_dsc_controller.supervision.expected_errors import expected_errors

@@ -4,12 +4,10 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 from blf_dsc_controller.configuration import law_file
-
-if TYPE_CHECKING:
-    from blf_dsc_controller.configuration.controller import ControllerConfig
+from blf_dsc_controller.configuration.checked import Checked
 
 
 class Traits(NamedTuple):
@@ -30,7 +28,7 @@ LAWS = tuple(_PACKAGED)
 """Laws of the package; the first is the default."""
 
 
-def traits_of(config: ControllerConfig) -> Traits:
+def traits_of(config: Checked) -> Traits:
     """Return what the law of a configuration does; that of a file says so itself."""
     if not law_file.is_file(config.law):
         return _PACKAGED[config.law]

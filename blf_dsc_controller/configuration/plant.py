@@ -382,7 +382,12 @@ class PlantConfig(ArmConfig):
                 f'duration: got {self.duration:g} s, shorter than one sample of '
                 f'{self.sample_time:g} s (0 runs until stopped)'
             )
-        yield from plausibility.problems_of_plant(self)
+        yield from plausibility.problems_of_plant(
+            self,
+            resolution=self.sensor.resolution,
+            noise=self.sensor.position_noise,
+            lag=self.actuator.time_constant,
+        )
 
     def _spring_problems(self) -> Iterator[str]:
         """Check what springs, their loop and a base need."""

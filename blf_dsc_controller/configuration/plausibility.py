@@ -10,19 +10,16 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Iterator, Sequence
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from blf_dsc_controller.arms.tuning import UNKNOWN_EFFORT
 from blf_dsc_controller.arms.urdf import Chain
+from blf_dsc_controller.configuration.checked import Checked
+from blf_dsc_controller.configuration.robot import ArmConfig, Robot
 from blf_dsc_controller.configuration.schema import suggestion
 from blf_dsc_controller.configuration.tool_bound import ANGLE, POSITION
-
-if TYPE_CHECKING:
-    from blf_dsc_controller.configuration.controller import ControllerConfig
-    from blf_dsc_controller.configuration.plant import PlantConfig
-    from blf_dsc_controller.configuration.robot import Robot
 
 CHECKED = (
     'torque.limit',
@@ -67,7 +64,7 @@ class _Doubt(NamedTuple):
     text: str  # what it got, what the arm allows, and what may be meant
 
 
-def problems_of_controller(config: ControllerConfig) -> Iterator[str]:
+def problems_of_controller(config: Checked) -> Iterator[str]:
     """Yield what no arm can mean among the parameters of a controller."""
     yield from _unknown_words(config.insist)
     chain = None
@@ -80,7 +77,7 @@ def problems_of_controller(config: ControllerConfig) -> Iterator[str]:
     yield from _refused(_of_controller(config, chain), config.insist)
 
 
-def _of_controller(config: ControllerConfig, chain: Chain | None) -> Iterator[_Doubt]:
+def _of_controller(config: Checked, chain: Chain | None) -> Iterator[_Doubt]:
     yield from _of_velocity(config, chain)
     yield from _of_errors(config)
     if chain is not None:
@@ -89,10 +86,17 @@ def _of_controller(config: ControllerConfig, chain: Chain | None) -> Iterator[_D
         yield from _of_tool(config, chain)
 
 
-def problems_of_plant(config: PlantConfig) -> Iterator[str]:
-    """Yield what no arm can mean among the parameters of a simulated one."""
+def problems_of_plant(
+    config: ArmConfig, *, resolution: float, noise: float, lag: float
+) -> Iterator[str]:
+    """Yield what no arm can mean among the parameters of a simulated one.
+
+    They are `sensor.resolution`, `sensor.position_noise` [rad] and
+    `actuator.time_constant` [s].
+    """
     yield from _unknown_words(config.insist)
-    yield from _refused(_of_sensors(config), config.insist)
+    doubts = _of_sensors(config, resolution, noise, lag)
+    yield from _refused(doubts, config.insist)
 
 
 def _unknown_words(insist: Iterable[str]) -> Iterator[str]:
@@ -115,7 +119,7 @@ def _refused(doubts: Iterable[_Doubt], insist: Sequence[str]) -> Iterator[str]:
             yield f'{name}: {text}; if it is meant, list {name} in insist'
 
 
-def _of_drives(config: ControllerConfig, chain: Chain) -> Iterator[_Doubt]:
+def _of_drives(config: Checked, chain: Chain) -> Iterator[_Doubt]:
     """Check torques against the efforts of the drives."""
     strongest = max(UNKNOWN_EFFORT, config.robot.largest_effort(chain))
     for joint, limit in zip(chain.joints, config.torque.limit, strict=True):
@@ -129,7 +133,7 @@ def _of_drives(config: ControllerConfig, chain: Chain) -> Iterator[_Doubt]:
             yield _Doubt('torque.limit', text)
 
 
-def _of_velocity(config: ControllerConfig, chain: Chain | None) -> Iterator[_Doubt]:
+def _of_velocity(config: Checked, chain: Chain | None) -> Iterator[_Doubt]:
     """Check the velocity of a broken measurement against the speed of the joints."""
     limit = config.safety.velocity_limit
     joints = chain.joints if chain else ()
@@ -143,7 +147,7 @@ def _of_velocity(config: ControllerConfig, chain: Chain | None) -> Iterator[_Dou
         )
 
 
-def _of_ranges(config: ControllerConfig, chain: Chain) -> Iterator[_Doubt]:
+def _of_ranges(config: Checked, chain: Chain) -> Iterator[_Doubt]:
     """Check the limits of motions against those of the URDF."""
     limits = config.limits
     for joint, fastest in zip(chain.joints, limits.velocity, strict=True):
@@ -168,7 +172,7 @@ def _of_ranges(config: ControllerConfig, chain: Chain) -> Iterator[_Doubt]:
                 )
 
 
-def _of_errors(config: ControllerConfig) -> Iterator[_Doubt]:
+def _of_errors(config: Checked) -> Iterator[_Doubt]:
     """Check the bounds on errors against the ranges of the joints."""
     if config.barrier.bounds_tool:  # from which they follow
         return
@@ -192,7 +196,7 @@ def _of_errors(config: ControllerConfig) -> Iterator[_Doubt]:
             )
 
 
-def _of_tool(config: ControllerConfig, chain: Chain) -> Iterator[_Doubt]:
+def _of_tool(config: Checked, chain: Chain) -> Iterator[_Doubt]:
     """Check the bounds at the tool against the reach of the arm."""
     reach = chain.reach
     bound = config.barrier.tool_bound
@@ -258,28 +262,27 @@ def _of_payloads(robot: Robot, chain: Chain) -> Iterator[_Doubt]:
             )
 
 
-def _of_sensors(config: PlantConfig) -> Iterator[_Doubt]:
+def _of_sensors(
+    config: ArmConfig, resolution: float, noise: float, lag: float
+) -> Iterator[_Doubt]:
     """Check the sensors and actuators of a simulated arm."""
-    sensor = config.sensor
     ranges = [math.tau]
     if config.robot.urdf:
         joints = config.robot.chain(config.joints).joints
         ranges += [joint.upper - joint.lower for joint in joints]
     coarsest = _COARSEST * min(ranges)
-    if sensor.resolution > coarsest:
-        bits = sensor.resolution
+    if resolution > coarsest:
         yield _Doubt(
             'sensor.resolution',
-            f'got {bits:g} rad, with which the range of a joint has fewer than a hundred '
-            f'steps: is it in bits? Give {math.tau / 2.0 ** min(bits, 64.0):.3g}',
+            f'got {resolution:g} rad, with which the range of a joint has fewer than a hundred '
+            f'steps: is it in bits? Give {math.tau / 2.0 ** min(resolution, 64.0):.3g}',
         )
-    if sensor.position_noise > coarsest:
+    if noise > coarsest:
         yield _Doubt(
             'sensor.position_noise',
-            f'got {sensor.position_noise:g} rad rms, more than a hundredth of the range of a '
-            f'joint: {_of_degrees(sensor.position_noise)}',
+            f'got {noise:g} rad rms, more than a hundredth of the range of a '
+            f'joint: {_of_degrees(noise)}',
         )
-    lag = config.actuator.time_constant
     if lag > _LONGEST:
         yield _Doubt(
             'actuator.time_constant',

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from functools import lru_cache
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,13 +20,11 @@ from numpy.typing import NDArray
 from blf_dsc_controller.arms.base_parameters import BaseParameters
 from blf_dsc_controller.arms.model import inertia_matrices, regressors_at
 from blf_dsc_controller.arms.urdf import Chain
+from blf_dsc_controller.configuration.checked import Checked
 from blf_dsc_controller.configuration.law_traits import traits_of
 from blf_dsc_controller.configuration.robot import Robot
 from blf_dsc_controller.numerics.algebra import inverse, product
 from blf_dsc_controller.tool.errors import MOST_JOINTS, Tool
-
-if TYPE_CHECKING:
-    from blf_dsc_controller.configuration.controller import ControllerConfig
 
 Floats = NDArray[np.float64]
 
@@ -48,7 +46,7 @@ def is_given(values: Mapping[str, Any]) -> bool:
     return any(values.get(name, 0.0) > 0.0 for name in (POSITION, ANGLE))
 
 
-def tool_of(config: ControllerConfig) -> Tool | None:
+def tool_of(config: Checked) -> Tool | None:
     """Return the tool of a configuration; None without a bound on its error."""
     if not config.barrier.bounds_tool:
         return None
@@ -158,7 +156,7 @@ def _expected(
     return tuple((np.ones(n) if even else found).tolist())
 
 
-def certified(config: ControllerConfig) -> tuple[float, float]:
+def certified(config: Checked) -> tuple[float, float]:
     """Return the bounds [m, rad] at the tool that the joint bounds ensure."""
     tool = tool_of(config)
     assert tool is not None  # noqa: S101 - the caller has looked
@@ -166,7 +164,7 @@ def certified(config: ControllerConfig) -> tuple[float, float]:
     return position, angle
 
 
-def problems(config: ControllerConfig) -> Iterator[str]:
+def problems(config: Checked) -> Iterator[str]:
     """Check that there is a tool, and that the joint bounds keep its bound."""
     barrier = config.barrier
     if not barrier.bounds_tool:

@@ -20,20 +20,19 @@ from blf_dsc_controller.configuration.nodes import CONTROLLER, load, locate
 from blf_dsc_controller.control.guarded_loop import GuardedLoop
 from blf_dsc_controller.control.outputs import Output, Outputs
 from blf_dsc_controller.errors import BlfDscError
-from blf_dsc_controller.law.telemetry import disturbance_names
 from blf_dsc_controller.law.weighing import DEVIATION
 from blf_dsc_controller.messages import topics
 from blf_dsc_controller.messages.codecs import JointStateEncoder
+from blf_dsc_controller.messages.named_values import disturbance_names
 from blf_dsc_controller.numerics.intervals import TWO_SIDED
 from blf_dsc_controller.reference.trajectory import Trajectory, TrajectoryPoint
+from blf_dsc_controller.run import FIRST_STAMP
 from blf_dsc_controller.supervision.drive_load import DriveLoad
 from blf_dsc_controller.supervision.guard import Guard
 from blf_dsc_controller.supervision.not_commissioned import not_commissioned
 from blf_dsc_controller.supervision.supervisor import Phase
 
 Vector = NDArray[np.float64]
-_NANO = 1e9
-_FIRST = 1_000_000_000  # ns
 
 
 class StateError(BlfDscError):
@@ -202,11 +201,11 @@ class ArmController:
 
         A clock from zero, which ROS takes for none, starts at 1 s.
         """
-        nanoseconds = round(stamp * _NANO)
+        nanoseconds = round(stamp * 1e9)
         if self._shift is None and self._is_on_wall:
             self._shift = time.time_ns() - nanoseconds
         elif self._shift is None:
-            self._shift = 0 if nanoseconds > 0 else _FIRST - nanoseconds
+            self._shift = 0 if nanoseconds > 0 else FIRST_STAMP - nanoseconds
         return nanoseconds + self._shift
 
     def _checked(self, name: str, values: ArrayLike) -> Vector:

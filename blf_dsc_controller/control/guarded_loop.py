@@ -13,8 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from blf_dsc_controller.configuration.controller import ControllerConfig
-from blf_dsc_controller.law.factory import estimate_names
-from blf_dsc_controller.law.telemetry import ControllerTelemetry, Message
+from blf_dsc_controller.control.telemetry import ControllerTelemetry
+from blf_dsc_controller.factory.estimate import estimate_names
+from blf_dsc_controller.messages.topics import Message
 from blf_dsc_controller.supervision.guard import Guard
 
 Vector = NDArray[np.float64]

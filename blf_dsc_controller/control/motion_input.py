@@ -17,9 +17,9 @@ import numpy as np
 from blf_dsc_controller.control.log import Log
 from blf_dsc_controller.messages.codecs import (
     Float64MultiArrayDecoder,
-    MessageError,
     joint_trajectory,
 )
+from blf_dsc_controller.messages.errors import MessageError
 from blf_dsc_controller.messages.topics import JOINT_POSITIONS, JOINT_TRAJECTORY
 from blf_dsc_controller.reference.retargeting import (
     Target,
@@ -34,10 +34,10 @@ from blf_dsc_controller.reference.trajectory import (
     trajectory_problems,
 )
 from blf_dsc_controller.reference.turns import short_way
+from blf_dsc_controller.run import NANOSECOND
 from blf_dsc_controller.supervision.guard import Guard
 from blf_dsc_controller.supervision.plan import LatePlanError, Plan
 
-_NANO = 1e-9
 # bytes per joint of a point with all its fields, each with a header of 8 bytes
 _POINT_SIZE = 32
 _SMALL = 4096  # bytes of a message that is read at once: a few points
@@ -180,7 +180,7 @@ class MotionInput:
         if guard is None:
             self._reject('trajectory rejected: the controller is not configured')
             return
-        if self._is_ignored(guard):
+        if self._ignore_after_stop(guard):
             return
         if len(raw) > self._largest:
             size = f'it has {len(raw)} bytes, more than {MOST_POINTS} points can have'
@@ -241,7 +241,7 @@ class MotionInput:
     def take_positions(self, raw: bytes) -> None:
         """Follow a message of `~/joint_positions`."""
         guard = self._guard()
-        if guard is None or self._is_ignored(guard):
+        if guard is None or self._ignore_after_stop(guard):
             return
         try:
             positions = self._read_positions(raw)
@@ -307,8 +307,8 @@ class MotionInput:
         self._log.info(text)
         return text
 
-    def _is_ignored(self, guard: Guard) -> bool:
-        """Whether a message comes from a sender that has not paused since `~/stop`."""
+    def _ignore_after_stop(self, guard: Guard) -> bool:
+        """Ignore a message of a sender that has not paused since `~/stop`; return whether it is."""
         pause = guard.time - self._last_message
         self._last_message = guard.time
         if self._is_stopped and 0.0 <= pause < _PAUSE:
@@ -427,6 +427,6 @@ def _reason(error: Exception) -> str:
 def _trajectory(raw: bytes, start_stamp: int) -> Trajectory:
     """Return a message's trajectory, in times since the controller's start."""
     stamp, names, points = joint_trajectory(raw)
-    begin = (stamp - start_stamp) * _NANO if stamp else None
-    own = (TrajectoryPoint(time * _NANO, *arrays) for time, arrays in points)
+    begin = (stamp - start_stamp) * NANOSECOND if stamp else None
+    own = (TrajectoryPoint(time * NANOSECOND, *arrays) for time, arrays in points)
     return Trajectory(names, tuple(own), begin)

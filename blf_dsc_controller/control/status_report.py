@@ -12,7 +12,7 @@ from blf_dsc_controller.control.log import Log
 from blf_dsc_controller.control.motion_input import MotionInput
 from blf_dsc_controller.law.external_torque import is_touched
 from blf_dsc_controller.law.perception import DISTANCE
-from blf_dsc_controller.law.telemetry import load_text
+from blf_dsc_controller.messages.named_values import load_text
 from blf_dsc_controller.messages.topics import LOAD, PHASE, REASON, REJECTED, STOPS
 from blf_dsc_controller.supervision.guard import Guard
 from blf_dsc_controller.supervision.stop_cause import chatter_of

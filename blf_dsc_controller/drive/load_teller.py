@@ -7,9 +7,8 @@ from concurrent.futures import Future, ThreadPoolExecutor
 
 from blf_dsc_controller.control.arm_controller import ArmController
 from blf_dsc_controller.drive.driver import Driver, DriverError
-from blf_dsc_controller.supervision.drive_load import DriveLoad
+from blf_dsc_controller.supervision.drive_load import EVERY, DriveLoad
 
-_EVERY = 20  # states, from one step to the next
 _SAME = 1e-5  # kg; robots report single precision
 
 
@@ -41,7 +40,7 @@ class LoadTeller:
             self._await(self._asked)
             return
         self._states += 1
-        if self._states % _EVERY:
+        if self._states % EVERY:
             return
         if self._in_motion or self._controller.is_at_rest:
             self._asked = self._controller.load_to_tell()

@@ -14,13 +14,13 @@ from time import monotonic
 
 from blf_dsc_controller import child
 from blf_dsc_controller.control.arm_controller import ArmController
+from blf_dsc_controller.control.rejected_columns import rejected_columns
 from blf_dsc_controller.control.status_report import StatusReport
 from blf_dsc_controller.drive.beside import Beside
 from blf_dsc_controller.errors import BlfDscError
-from blf_dsc_controller.law.telemetry import rejected_columns
 from blf_dsc_controller.messages import topic_link, topics
-from blf_dsc_controller.messages.journal import encode_string
 from blf_dsc_controller.messages.link import Link
+from blf_dsc_controller.messages.strings import encode_string
 from blf_dsc_controller.messages.topic_link import KINDS, READY, STATUS, STOP
 from blf_dsc_controller.messages.topics import Topic
 from blf_dsc_controller.supervision.guard import Guard

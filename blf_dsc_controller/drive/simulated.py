@@ -23,15 +23,17 @@ from blf_dsc_controller.configuration.schema import change
 from blf_dsc_controller.drive.driver import Driver, Facts, ReflexError, RobotState
 from blf_dsc_controller.motors.damiao import ranges_of
 from blf_dsc_controller.motors.frame import Frame, Ranges, torque_alone
+from blf_dsc_controller.run import FIRST_STAMP, NANOSECOND
 from blf_dsc_controller.supervision.drive_load import DriveLoad
 from sim_plant.motors import MotorPlant
-from sim_plant.plant import Plant, plant_of, plant_settings
+from sim_plant.plant import plant_of
+from sim_plant.sampled_plant import Plant
+from sim_plant.settings import plant_settings
 
 Vector = NDArray[np.float64]
 SIMULATED = 'simulated'
 """The address of a simulated arm."""
 
-_FIRST = 1.0  # s, stamp of the first state
 _BEHIND = 0.05  # s, which are caught up with; more are left behind
 _MOTORS = 2000.0  # Hz, of motors in real time, in Python
 
@@ -87,7 +89,9 @@ class SimulatedDriver(Driver):
                 f'({self.plant_config.actuator.reflex_rate:g} N m/s)'
             )
         self._count += 1
-        return RobotState(_FIRST + self._count * period, *self._measure())
+        return RobotState(
+            NANOSECOND * FIRST_STAMP + self._count * period, *self._measure()
+        )
 
     def write(self, torque: Vector | None) -> None:
         """Apply torques (n,) [N m] until the next state; None: those before."""

@@ -25,8 +25,9 @@ from blf_dsc_controller.arms.model import regressors_at
 from blf_dsc_controller.arms.urdf import Chain, frames
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.robot import parameters_of
+from blf_dsc_controller.factory.estimate import prior_covariance
+from blf_dsc_controller.factory.settings import settings_of_config
 from blf_dsc_controller.identification.recording import Recording
-from blf_dsc_controller.law.factory import prior_covariance, settings_of_config
 from blf_dsc_controller.reference.approach import MotionError
 from blf_dsc_controller.reference.terms import pack, sampled, sinusoids_term
 

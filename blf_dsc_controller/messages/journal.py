@@ -15,12 +15,12 @@ from typing import Any, NamedTuple
 
 from blf_dsc_controller import __version__
 from blf_dsc_controller.errors import BlfDscError
-from blf_dsc_controller.messages.codecs import typestore
 from blf_dsc_controller.messages.event_content import (
     FORMAT,
     check_change,
     check_event,
 )
+from blf_dsc_controller.messages.strings import decode_string, encode_string
 from blf_dsc_controller.messages.topics import CHANGES, JOURNAL, TARGETS, Topic
 from blf_dsc_controller.run import Contact, Oscillation
 
@@ -149,12 +149,6 @@ def decode_change(raw: bytes) -> Change:
     return Change(**{name: given[name] for name in Change._fields if name in given})
 
 
-def encode_string(text: str) -> bytes:
-    """Return the serialised std_msgs/String of a text."""
-    message = typestore().types[JOURNAL.type](data=text)
-    return bytes(typestore().serialize_cdr(message, JOURNAL.type))
-
-
 def decode(raw: bytes) -> Event:
     """Decode the event of a serialised message.
 
@@ -171,8 +165,7 @@ def decode(raw: bytes) -> Event:
 def _decoded(raw: bytes, check: Callable[[object], None], problem: str) -> Any:
     """Return the checked JSON of a std_msgs/String, whoever sent it."""
     try:
-        message: Any = typestore().deserialize_cdr(raw, JOURNAL.type)
-        given = json.loads(message.data)
+        given = json.loads(decode_string(raw))
         check(given)
     except Exception as error:  # libraries raise nearly anything
         reason = f'a message of {problem}: {error}'

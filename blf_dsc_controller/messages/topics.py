@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import TypeAlias
 
 CONTROLLER = 'blf_dsc_controller'
 PLANT = 'sim_plant'
@@ -62,6 +63,10 @@ class Topic:
     def leaf(self) -> str:
         """Last part of the name, under any namespace and node, e.g. `truth`."""
         return self.name.rsplit('/', 1)[-1]
+
+
+Message: TypeAlias = tuple[Topic, bytes]
+"""A serialised message and its topic."""
 
 
 JOINT_STATE = 'sensor_msgs/msg/JointState'

@@ -44,11 +44,11 @@ from blf_dsc_controller.control.goal_messages import (
 )
 from blf_dsc_controller.messages.link import Link
 from blf_dsc_controller.nodes.action_process import KIND
+from blf_dsc_controller.run import NANOSECOND
 
 _LARGEST = 1 << 30  # bytes of goals that wait
 _PATIENCE = 10.0  # s, until a controller takes a goal
 _POLL = 1.0  # s
-_NANO = 1e-9
 _SECOND = 1_000_000_000
 Result = FollowJointTrajectory.Result
 
@@ -106,7 +106,7 @@ class TrajectoryActionServer:
             bytes(serialize_message(request.trajectory)),
             _tolerances(request.path_tolerance),
             _tolerances(request.goal_tolerance),
-            Duration.from_msg(request.goal_time_tolerance).nanoseconds * _NANO,
+            Duration.from_msg(request.goal_time_tolerance).nanoseconds * NANOSECOND,
         )
         self._send(goal)
         accepted = await answer
@@ -199,7 +199,7 @@ def _point(time: float, values: list[list[float]]) -> JointTrajectoryPoint:
     """Return a point with positions, and with velocities and accelerations if any."""
     names = ('positions', 'velocities', 'accelerations')
     point = JointTrajectoryPoint(**dict(zip(names, values, strict=False)))
-    point.time_from_start = Duration(nanoseconds=round(time / _NANO)).to_msg()
+    point.time_from_start = Duration(nanoseconds=round(time / NANOSECOND)).to_msg()
     return point
 
 

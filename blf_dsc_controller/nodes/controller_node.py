@@ -13,13 +13,13 @@ import numpy as np
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.control.guarded_loop import GuardedLoop
 from blf_dsc_controller.control.outputs import Outputs
-from blf_dsc_controller.law.telemetry import Message, rejected_columns
+from blf_dsc_controller.control.rejected_columns import rejected_columns
 from blf_dsc_controller.messages import topics
 from blf_dsc_controller.messages.codecs import (
     Float64MultiArrayEncoder,
     JointStateDecoder,
-    MessageError,
 )
+from blf_dsc_controller.messages.errors import MessageError
 from blf_dsc_controller.nodes import parameters, process
 from blf_dsc_controller.nodes.controller_start import ControllerStart, Surroundings
 from blf_dsc_controller.nodes.diagnostics import ControllerStatus
@@ -40,7 +40,6 @@ from blf_dsc_controller.supervision.supervisor import Phase
 _RARELY = 10  # samples between looks at what rarely changes
 _RATE_SAMPLES = 1001  # samples before the rate is checked
 _FAST = 0.9  # fraction of the sample time
-_NANO = 1e-9
 _WAITING_PERIOD = 5.0  # s between two warnings
 # s from a signal to the end; ros2 launch sends the next signal after 5 s
 _LONGEST_END = 3.0
@@ -182,8 +181,8 @@ class ControllerNode(LoopNode[ControllerConfig]):
         self._start.close()
         super().destroy_node()
 
-    def ready_to_end(self) -> bool:
-        """Bring the arm to rest first, unless the safe torque is zero."""
+    def prepare_to_end(self) -> bool:
+        """Bring the arm to rest first, unless the safe torque is zero; return whether it rests."""
         guard = self.guard
         if guard is None or not guard.commanding or self.config.safety.torque == 'zero':
             return True
@@ -227,7 +226,7 @@ class ControllerNode(LoopNode[ControllerConfig]):
         guard = self.guard
         if guard is None:
             return
-        if self._start.holds(guard, raw):
+        if self._start.hold_early(guard, raw):
             self._report_if_changed(guard)
             return
         trajectories = self._status.trajectories
@@ -336,7 +335,7 @@ class ControllerNode(LoopNode[ControllerConfig]):
             self._senders[topics.COMMANDS](raw)
             self._tell(topics.COMMANDS, raw)
 
-    def _publish(self, message: Message) -> None:
+    def _publish(self, message: topics.Message) -> None:
         super()._publish(message)
         self._tell(*message)
 

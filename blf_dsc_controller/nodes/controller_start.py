@@ -10,14 +10,14 @@ from rclpy.publisher import Publisher
 
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.errors import StartError
-from blf_dsc_controller.messages.codecs import JointStateDecoder, MessageError
+from blf_dsc_controller.messages.codecs import JointStateDecoder
+from blf_dsc_controller.messages.errors import MessageError
 from blf_dsc_controller.nodes.start_conditions import StartConditions
+from blf_dsc_controller.run import NANOSECOND
 from blf_dsc_controller.supervision.guard import Guard
 from blf_dsc_controller.supervision.start_gate import GateState, StartGate
 from blf_dsc_controller.supervision.state_watchdog import SAME_CLOCK
 from blf_dsc_controller.supervision.supervisor import Phase
-
-_NANO = 1e-9
 
 
 @dataclass(frozen=True)
@@ -75,14 +75,16 @@ class ControllerStart:
         """Look no more."""
         self._conditions.close()
 
-    def holds(self, guard: Guard, raw: bytes) -> bool:
-        """Whether a state comes too early to be used; it is held, or refused, then."""
+    def hold_early(self, guard: Guard, raw: bytes) -> bool:
+        """Hold or refuse a state that comes too early to be used; return whether it does."""
         is_starting = guard.supervisor.phase is Phase.STARTING
-        if not self._is_observed() or (is_starting and not self._is_alone(guard)):
+        if not self._note_observers() or (
+            is_starting and not self._check_others(guard)
+        ):
             self.held = raw
             return True
         is_measuring = self._gate.state is GateState.MEASURING
-        if is_measuring and self._measures(guard, raw):
+        if is_measuring and self._give_to_gate(guard, raw):
             return True
         if is_starting:
             acting = self._conditions.end()
@@ -93,37 +95,41 @@ class ControllerStart:
     def release(self, guard: Guard) -> bytes | None:
         """Return the state held, once it may be used; call it every 8 ms."""
         waits = self._gate.poll()
-        if self.held is None or not self._is_observed():
+        if self.held is None or not self._note_observers():
             return None
         if self._gate.state is GateState.MEASURING and self._gate.count:
             return None
         raw, self.held = self.held, None
-        if waits and not self._around.is_simulated() and self._lacks_support(guard):
+        if (
+            waits
+            and not self._around.is_simulated()
+            and self._refuse_unsupported(guard)
+        ):
             return None
         return raw
 
-    def _is_observed(self) -> bool:
-        """Whether somebody receives the commands, or has once."""
+    def _note_observers(self) -> bool:
+        """Return whether somebody receives the commands, or has once."""
         self._was_observed = self._was_observed or self._around.is_observed()
         return self._was_observed
 
-    def _is_alone(self, guard: Guard) -> bool:
-        """Whether the law may start, as far as others are concerned."""
+    def _check_others(self, guard: Guard) -> bool:
+        """Return whether the law may start beside others; refuse it if it must not."""
         try:
-            return self._conditions.are_met(commanding=guard.commanding)
+            return self._conditions.check(commanding=guard.commanding)
         except StartError as error:
             guard.refuse(error)
             return False
 
-    def _measures(self, guard: Guard, raw: bytes) -> bool:
-        """Whether a state before the start is only for the gate."""
+    def _give_to_gate(self, guard: Guard, raw: bytes) -> bool:
+        """Measure the rate by a state before the start; return whether that is its only use."""
         try:
             stamp = self._decoder.decode(raw)
         except MessageError:
             return False
         if guard.supervisor.phase is not Phase.STARTING:
             return False
-        is_live = abs(self._around.wall() - stamp) * _NANO < SAME_CLOCK
+        is_live = abs(self._around.wall() - stamp) * NANOSECOND < SAME_CLOCK
         if not is_live and self._around.is_simulated():  # in lock-step, it waits
             return False
         guard.observe(stamp, self._decoder.values)
@@ -134,10 +140,10 @@ class ControllerStart:
         self.held = None
         if state is GateState.REFUSED:
             guard.refuse(StartError(self._gate.problem))
-        return self._lacks_support(guard)
+        return self._refuse_unsupported(guard)
 
-    def _lacks_support(self, guard: Guard) -> bool:
-        """Whether the start is refused, by the gate or for lack of support."""
+    def _refuse_unsupported(self, guard: Guard) -> bool:
+        """Refuse a start without support; return whether it is refused, if by the gate."""
         if guard.start_error is None:
             guard.check_support(self._decoder.values)
         return guard.start_error is not None

@@ -20,8 +20,7 @@ from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.plant import PlantConfig
 from blf_dsc_controller.control.realtime import request_realtime
 from blf_dsc_controller.errors import BlfDscError
-from blf_dsc_controller.law.telemetry import Message
-from blf_dsc_controller.messages.topics import WATCHDOG_NODE, Topic
+from blf_dsc_controller.messages.topics import WATCHDOG_NODE, Message, Topic
 from blf_dsc_controller.nodes import parameters, process
 from blf_dsc_controller.nodes.endpoints import (
     PollingTimer,

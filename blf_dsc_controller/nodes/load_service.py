@@ -17,10 +17,9 @@ import numpy as np
 from rclpy.node import Node
 
 from blf_dsc_controller.configuration.controller import ControllerConfig
-from blf_dsc_controller.supervision.drive_load import DriveLoad
+from blf_dsc_controller.supervision.drive_load import EVERY, DriveLoad
 from blf_dsc_controller.supervision.guard import Guard
 
-_EVERY = 20  # states, from one step to the next
 _PATIENCE = 2000  # states, until an answer is no longer waited for
 _DENSITY = 1000.0  # kg/m^3, of the ball that stands for the shape of a load
 
@@ -92,7 +91,7 @@ class LoadService:
         self._states += 1
         if self._asked is not None:
             self._await(guard, self._asked)
-        elif self._states >= _EVERY and self._client.service_is_ready():
+        elif self._states >= EVERY and self._client.service_is_ready():
             self._states = 0
             if config.learning.load_in_motion or guard.is_at_rest:
                 self._ask(guard.load_to_tell())

@@ -30,10 +30,11 @@ from std_srvs.srv import Trigger
 
 from blf_dsc_controller.configuration.plant import PlantConfig
 from blf_dsc_controller.configuration.schema import Value, differences, flatten
-from blf_dsc_controller.law.telemetry import DECIMATION, PlantTelemetry
 from blf_dsc_controller.messages import topics
-from blf_dsc_controller.messages.codecs import Float64MultiArrayDecoder, MessageError
+from blf_dsc_controller.messages.codecs import Float64MultiArrayDecoder
+from blf_dsc_controller.messages.errors import MessageError
 from blf_dsc_controller.messages.journal import Change
+from blf_dsc_controller.messages.plant_telemetry import DECIMATION, PlantTelemetry
 from blf_dsc_controller.nodes import parameters, process
 from blf_dsc_controller.nodes.diagnostics import (
     ERROR,
@@ -44,19 +45,11 @@ from blf_dsc_controller.nodes.diagnostics import (
 )
 from blf_dsc_controller.nodes.endpoints import create_publisher, create_steady_timer
 from blf_dsc_controller.nodes.lifecycle import LoopNode
-from sim_plant.plant import (
-    Latency,
-    Plant,
-    TorqueInput,
-    parameter_names_of,
-    plant_of,
-    plant_settings,
-    steps_of,
-    urdf_of,
-)
-
-LOCKSTEP_START = 1_000_000_000
-"""First stamp in lock-step [ns]: a zero stamp means 'not set' in ROS."""
+from blf_dsc_controller.run import FIRST_STAMP
+from sim_plant.plant import plant_of
+from sim_plant.sampled_plant import Plant
+from sim_plant.settings import parameter_names_of, plant_settings, steps_of, urdf_of
+from sim_plant.torque_input import Latency, TorqueInput
 
 _STALE = {'zero': ': not applied', 'hold': ', and still applied'}
 _REPEAT_PERIOD = 3.0  # s, until a state without a torque is sent again
@@ -92,7 +85,7 @@ class PlantNode(LoopNode[PlantConfig]):
         self._reported_rejected = 0
         self._diagnostics = DiagnosticsPublisher(self, joints)
         self._step_timer: Timer | None = None
-        self._start_stamp = LOCKSTEP_START
+        self._start_stamp = FIRST_STAMP
         self._changed: dict[str, Value] = {}
         self._changes = create_publisher(self, topics.CHANGES)
         self._tell_parameters()
@@ -262,7 +255,7 @@ class PlantNode(LoopNode[PlantConfig]):
             return
         elapsed = self._now() - self._began
         due = self._first + int(elapsed / self.config.sample_time + _EARLY)
-        while self.plant.sample < due and not self._is_over():
+        while self.plant.sample < due and not self._end_if_over():
             waited = self.latency.step(self._now())
             deadline = (self.plant.sample + 1 - self._first) * self.config.sample_time
             self._advance()
@@ -273,12 +266,12 @@ class PlantNode(LoopNode[PlantConfig]):
             )
 
     def _advance(self) -> None:
-        if self._is_over():
+        if self._end_if_over():
             return
         was_stale = self._stale
         limit = self.config.actuator.command_timeout
         samples = round(limit / self.config.sample_time)
-        self._stale = not self._lockstep and self.input.is_stale(
+        self._stale = not self._lockstep and self.input.count_stale(
             self.plant.sample, samples
         )
         if self._stale and self.config.actuator.without_command == 'zero':
@@ -306,7 +299,8 @@ class PlantNode(LoopNode[PlantConfig]):
         self.get_logger().error(self._halt)
         self._report()
 
-    def _is_over(self) -> bool:
+    def _end_if_over(self) -> bool:
+        """End after the last step; return whether that has been."""
         if 0 < self._steps <= self.plant.sample and not self.finished:
             self.finished = True
             if not self._lockstep:  # a controller would take the silence for a fault

@@ -61,7 +61,7 @@ class PlainNode(Node):
     def close(self) -> None:
         """Save data and release resources while ROS is still up."""
 
-    def ready_to_end(self) -> bool:
+    def prepare_to_end(self) -> bool:
         """Return whether the process may end after a signal; called repeatedly."""
         return True
 
@@ -116,7 +116,7 @@ def run(*make_nodes: Callable[[], PlainNode]) -> int:
 
 def _is_over(nodes: list[PlainNode]) -> bool:
     """Return whether a node has finished, or all are ready to end after a signal."""
-    ready = interrupted() and all(node.ready_to_end() for node in nodes)
+    ready = interrupted() and all(node.prepare_to_end() for node in nodes)
     return ready or any(node.finished for node in nodes)
 
 

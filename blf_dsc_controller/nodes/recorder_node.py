@@ -12,11 +12,8 @@ from typing import Any
 
 from blf_dsc_controller.bags.writer import BagWriter
 from blf_dsc_controller.configuration.nodes import RecorderConfig
-from blf_dsc_controller.messages.codecs import (
-    MessageError,
-    UnknownTypeError,
-    joint_state_stamp,
-)
+from blf_dsc_controller.messages.codecs import UnknownTypeError, joint_state_stamp
+from blf_dsc_controller.messages.errors import MessageError
 from blf_dsc_controller.messages.topics import JOINT_STATES
 from blf_dsc_controller.nodes.endpoints import (
     PollingTimer,

@@ -55,8 +55,10 @@ class StartConditions:
             self._other = OtherCommander(self._node, topic, joints, self._steady)
         self._other.begin()
 
-    def are_met(self, *, commanding: bool) -> bool:
-        """Whether the law may start; `commanding`: the node has commanded before.
+    def check(self, *, commanding: bool) -> bool:
+        """Return whether the law may start, now or before.
+
+        `commanding`: the node has commanded before.
 
         Raises:
             StartError: it must not.
@@ -93,7 +95,7 @@ class StartConditions:
         return finding is Finding.NOBODY
 
     def _is_watched(self) -> bool:
-        if not self._watchdog.delays_start(self._steady() * 1e-9):
+        if not self._watchdog.delay_start(self._steady() * 1e-9):
             return True
         self._node.get_logger().warning(
             'not started, waiting until torque_watchdog is ready',

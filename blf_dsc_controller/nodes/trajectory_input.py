@@ -14,10 +14,9 @@ from trajectory_msgs.msg import JointTrajectory
 from blf_dsc_controller.control.motion_input import MotionInput
 from blf_dsc_controller.messages.topics import JOINT_POSITIONS, JOINT_TRAJECTORY
 from blf_dsc_controller.nodes.endpoints import qos_profile
+from blf_dsc_controller.run import NANOSECOND
 from blf_dsc_controller.supervision.guard import Guard
 from blf_dsc_controller.supervision.state_watchdog import SAME_CLOCK
-
-_NANO = 1e-9
 
 
 def motion_input_of(
@@ -53,5 +52,5 @@ def connect(
 
 def _is_live(guard: Guard) -> bool:
     """Whether the plant does not wait for the controller."""
-    behind = (time.time_ns() - guard.last_stamp) * _NANO
+    behind = (time.time_ns() - guard.last_stamp) * NANOSECOND
     return guard.watchdog.on or abs(behind) < SAME_CLOCK

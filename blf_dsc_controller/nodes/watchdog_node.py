@@ -32,8 +32,8 @@ from blf_dsc_controller.messages.codecs import (
     Float64MultiArrayDecoder,
     Float64MultiArrayEncoder,
     JointStateDecoder,
-    MessageError,
 )
+from blf_dsc_controller.messages.errors import MessageError
 from blf_dsc_controller.messages.journal import decode
 from blf_dsc_controller.messages.topics import READY, Quality
 from blf_dsc_controller.nodes.diagnostics import ERROR, OK, WARN, DiagnosticsPublisher

@@ -35,8 +35,8 @@ class WatchdogPresence:
             'start it again'
         )
 
-    def delays_start(self, now: float) -> bool:
-        """Whether the start has to wait at the time `now` [s] of a steady clock.
+    def delay_start(self, now: float) -> bool:
+        """Return whether the start has to wait at the time `now` [s] of a steady clock.
 
         Raises:
             StartError: it has waited for too long.

@@ -23,10 +23,9 @@ from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.schema import change, parameters
 from blf_dsc_controller.control.guarded_loop import GuardedLoop
 from blf_dsc_controller.errors import BlfDscError
-from blf_dsc_controller.law.telemetry import Message
-from blf_dsc_controller.messages.codecs import MessageError
+from blf_dsc_controller.messages.errors import MessageError
 from blf_dsc_controller.messages.journal import MOTIONS, Event, EventType
-from blf_dsc_controller.messages.topics import TRACKING_ERROR, Topic
+from blf_dsc_controller.messages.topics import TRACKING_ERROR, Message, Topic
 from blf_dsc_controller.reference.retargeting import Target, TrajectoryError
 from blf_dsc_controller.reference.trajectory import (
     Trajectory,

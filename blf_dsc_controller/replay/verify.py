@@ -23,7 +23,8 @@ from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.schema import flatten
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.messages import topics
-from blf_dsc_controller.messages.codecs import JOINT_STATE_FIELDS, MessageError
+from blf_dsc_controller.messages.codecs import JOINT_STATE_FIELDS
+from blf_dsc_controller.messages.errors import MessageError
 from blf_dsc_controller.messages.event_content import FORMAT
 from blf_dsc_controller.messages.journal import Event, EventType
 from blf_dsc_controller.replay.rerun import Alteration, Rerun

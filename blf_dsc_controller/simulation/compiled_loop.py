@@ -31,7 +31,7 @@ if TYPE_CHECKING:  # else the loop would be compiled again whenever one of these
     from blf_dsc_controller.law.controller import Controller, LawKernels
     from blf_dsc_controller.law.interface import Law
     from sim_plant.arm import Arm
-    from sim_plant.plant import Plant
+    from sim_plant.sampled_plant import Plant
 
 
 class Span(NamedTuple):

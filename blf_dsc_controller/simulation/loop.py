@@ -23,19 +23,13 @@ from blf_dsc_controller.bags.topic_recorder import TopicRecorder
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.plant import PlantConfig
 from blf_dsc_controller.configuration.schema import flatten
+from blf_dsc_controller.control.telemetry import ControllerTelemetry
 from blf_dsc_controller.errors import BlfDscError
+from blf_dsc_controller.factory.controller import begin, controller_of
+from blf_dsc_controller.factory.estimate import estimate_names
 from blf_dsc_controller.law.controller import Controller
-from blf_dsc_controller.law.factory import begin, controller_of, estimate_names
+from blf_dsc_controller.law.samples import sample_columns
 from blf_dsc_controller.law.state import Sample, sample_of
-from blf_dsc_controller.law.telemetry import (
-    DECIMATION,
-    ControllerTelemetry,
-    Message,
-    PlantTelemetry,
-    disturbance_names,
-    run_of,
-    sample_columns,
-)
 from blf_dsc_controller.messages import topics
 from blf_dsc_controller.messages.journal import (
     Change,
@@ -44,14 +38,18 @@ from blf_dsc_controller.messages.journal import (
     contact_in,
     oscillation_in,
 )
-from blf_dsc_controller.run import Run, Series, Stop
+from blf_dsc_controller.messages.named_values import disturbance_names
+from blf_dsc_controller.messages.plant_telemetry import DECIMATION, PlantTelemetry
+from blf_dsc_controller.messages.topics import Message
+from blf_dsc_controller.run import FIRST_STAMP, Run, Series, Stop
 from blf_dsc_controller.simulation.compiled_loop import CompiledLoop, Rows, Span
+from blf_dsc_controller.simulation.sampled_run import run_of
 from blf_dsc_controller.supervision.guard import Guard
-from sim_plant.plant import Plant, parameter_names_of, plant_of, steps_of
+from sim_plant.plant import plant_of
+from sim_plant.sampled_plant import Plant
+from sim_plant.settings import parameter_names_of, steps_of
 
 _CHUNK = 1000  # samples; the guard takes about 20 ms for them
-START = 1_000_000_000
-"""Stamp of the first sample [ns], as in lock-step."""
 
 
 def simulate(
@@ -89,7 +87,7 @@ def simulate(
     run_alone(record, plant)
     journal.note(EventType.CONFIGURE, parameters=flatten(controller_config))
     journal.note(EventType.ACTIVATE)
-    journal.stamp, journal.messages = START, 1
+    journal.stamp, journal.messages = FIRST_STAMP, 1
     journal.note(EventType.START, resumed=False)
     return record
 
@@ -161,7 +159,7 @@ def _run_compiled(
     if loop.run(span, record.rows_to_fill()):
         at = controller.torque_at
         torques = record.samples[:, at : at + controller.settings.n]
-        guard.advance(START + record.stamps, record.measurements, torques)
+        guard.advance(FIRST_STAMP + record.stamps, record.measurements, torques)
         return True
     controller.restore(before[0])
     plant.restore(before[1])
@@ -179,7 +177,7 @@ def _run_guarded(
         measurement = plant.measure()
         record.measurements[row] = measurement
         record.truths[row] = plant.truth()
-        torque = guard.update(START + int(record.stamps[row]), measurement)
+        torque = guard.update(FIRST_STAMP + int(record.stamps[row]), measurement)
         guard.perceive()
         if torque is None:
             return
@@ -207,14 +205,14 @@ class Record:
     parameters: tuple[str, ...]  # names of the entries of P
     config: ControllerConfig
     controller: Controller  # after the run
-    journal: Journal  # events of the run, their stamps from `START` on
+    journal: Journal  # events of the run, their stamps from `FIRST_STAMP` on
 
     @property
     def stopped(self) -> float:
         """When the law was stopped first [s], since the start; infinity: not yet."""
         stops = (e.stamp for e in self.journal.pending if e.type is EventType.STOP)
         first = next(stops, None)
-        return math.inf if first is None else 1e-9 * (first - START)
+        return math.inf if first is None else 1e-9 * (first - FIRST_STAMP)
 
     def rows_to_fill(self) -> Rows:
         """Return the matrices with a row for each sample."""
@@ -249,7 +247,7 @@ class Record:
             config, self.controller, self.stamps, self.measurements, self.samples
         )
         contacts = tuple(
-            contact_in(event)._replace(stamp=event.stamp - START)
+            contact_in(event)._replace(stamp=event.stamp - FIRST_STAMP)
             for event in self.journal.pending
             if event.type is EventType.CONTACT
         )
@@ -259,13 +257,13 @@ class Record:
             truth=Series(true, self.stamps, self.truths[:, : len(true)]),
             contacts=contacts if config.contact.enabled else None,
             oscillations=tuple(
-                oscillation_in(event)._replace(stamp=event.stamp - START)
+                oscillation_in(event)._replace(stamp=event.stamp - FIRST_STAMP)
                 for event in self.journal.pending
                 if event.type is EventType.OSCILLATION
             ),
             stops=tuple(
                 Stop(
-                    event.stamp - START,
+                    event.stamp - FIRST_STAMP,
                     f'{event.content["reason"]}',
                     event.content['text'],
                 )
@@ -345,8 +343,8 @@ def _write_bag(
     bag = TopicRecorder(path, compression=compression, flush_interval=None)
     with closing(bag):
         if plant is not None:
-            configured = Change(START, flatten(plant), configured=True).encode()
-            bag.write(START, topics.CHANGES, configured)
+            configured = Change(FIRST_STAMP, flatten(plant), configured=True).encode()
+            bag.write(FIRST_STAMP, topics.CHANGES, configured)
         for stamp, message in _messages(parts):
             bag.write(stamp, *message)
 
@@ -364,7 +362,7 @@ def _messages(parts: Iterable[Record]) -> Iterator[tuple[int, Message]]:
             ratio = np.zeros(len(config.joints))
         events = deque(islice(record.journal.pending, noted, None))
         for k, elapsed in enumerate(record.stamps.tolist()):
-            stamp = START + elapsed
+            stamp = FIRST_STAMP + elapsed
             sample = record.sample(k)
             while events and events[0].messages <= row:
                 yield stamp, (topics.JOURNAL, events.popleft().encode())

@@ -33,10 +33,10 @@ from blf_dsc_controller.analysis.panels import BLUE, MUTED, ORANGE
 from blf_dsc_controller.configuration.nodes import LoopConfig
 from blf_dsc_controller.configuration.schema import change
 from blf_dsc_controller.law.perception import DISTANCE
-from blf_dsc_controller.law.telemetry import sample_columns
+from blf_dsc_controller.law.samples import sample_columns
 from blf_dsc_controller.messages.journal import EventType
-from blf_dsc_controller.run import Floats
-from blf_dsc_controller.simulation.loop import START, Record, simulate
+from blf_dsc_controller.run import FIRST_STAMP, Floats
+from blf_dsc_controller.simulation.loop import Record, simulate
 from blf_dsc_controller.studies import laws
 from blf_dsc_controller.studies.runs import cores
 
@@ -131,7 +131,7 @@ def run(arm: str, seed: int, force: float) -> Trial | None:
     distances = {LEARNED: learned, TOLD: told}
     alarms = np.array(
         [
-            (event.stamp - START) * 1e-9
+            (event.stamp - FIRST_STAMP) * 1e-9
             for event in records[''].journal.pending
             if event.type is EventType.CONTACT
         ]

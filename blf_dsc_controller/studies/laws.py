@@ -25,8 +25,8 @@ from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.nodes import LoopConfig, load_loop
 from blf_dsc_controller.configuration.schema import change
 from blf_dsc_controller.errors import BlfDscError
-from blf_dsc_controller.law.factory import joint_inertia
-from blf_dsc_controller.law.telemetry import sample_columns
+from blf_dsc_controller.factory.inertia import joint_inertia
+from blf_dsc_controller.law.samples import sample_columns
 from blf_dsc_controller.run import Floats
 from blf_dsc_controller.simulation.loop import simulate
 from blf_dsc_controller.studies.monte_carlo import (

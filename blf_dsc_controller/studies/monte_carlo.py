@@ -57,7 +57,8 @@ from blf_dsc_controller.configuration.schema import (
 )
 from blf_dsc_controller.configuration.schema import Value as Setting
 from blf_dsc_controller.errors import ConfigurationError
-from blf_dsc_controller.law.factory import controller_of, model_of
+from blf_dsc_controller.factory.controller import controller_of
+from blf_dsc_controller.factory.estimate import model_of
 from blf_dsc_controller.reference.approach import reference_of
 from blf_dsc_controller.reference.terms import sampled
 from blf_dsc_controller.run import Floats

@@ -26,7 +26,7 @@ from blf_dsc_controller.analysis.output import write_json
 from blf_dsc_controller.analysis.panels import ALARM, COLOURS, panels
 from blf_dsc_controller.configuration.nodes import LoopConfig, dump, load_loop
 from blf_dsc_controller.configuration.schema import change
-from blf_dsc_controller.law.factory import settings_of_config
+from blf_dsc_controller.factory.settings import settings_of_config
 from blf_dsc_controller.law.lyapunov import decay_rate, exponential_bound
 from blf_dsc_controller.law.state import Settings
 from blf_dsc_controller.messages.topics import LAMBDA_MIN, LATCHED, LYAPUNOV_TERMS

@@ -42,11 +42,11 @@ from blf_dsc_controller.configuration.nodes import dump
 from blf_dsc_controller.configuration.plant import PlantConfig
 from blf_dsc_controller.errors import BlfDscError, StartError
 from blf_dsc_controller.extras import import_extra
+from blf_dsc_controller.factory.controller import controller_of
 from blf_dsc_controller.law.controller import update
-from blf_dsc_controller.law.factory import controller_of
 from blf_dsc_controller.law.perception import sense
+from blf_dsc_controller.law.samples import sample_columns
 from blf_dsc_controller.law.state import Sample
-from blf_dsc_controller.law.telemetry import sample_columns
 from blf_dsc_controller.messages.journal import Journal
 from blf_dsc_controller.reference.approach import MotionError
 from blf_dsc_controller.run import Floats
@@ -62,7 +62,8 @@ from blf_dsc_controller.studies.monte_carlo import (
 )
 from sim_plant.elastic import run_elastic_plant
 from sim_plant.kernels import run_plant
-from sim_plant.plant import parameter_order, plant_of
+from sim_plant.plant import plant_of
+from sim_plant.settings import parameter_order
 
 KEPT = 'kept'
 VIOLATED = 'violated'

@@ -44,11 +44,11 @@ class CommandEffect:
         largest = float((np.abs(self._average) / limit).max())
         self.is_proven = self.is_proven or largest > _NOTICED
 
-    def is_missing(self, change: Vector, limit: Vector, dt: float) -> bool:
-        """Whether commands that changed by these torques (n,) [N m] had no effect.
+    def await_effect(self, change: Vector, limit: Vector, dt: float) -> bool:
+        """Wait for an effect of commands that changed by these torques (n,) [N m].
 
-        `dt` [s] is the time since the last call; it answers once.  Call it until one is
-        proven.
+        Return whether the wait has just been too long, once.  `dt` [s] is the time since
+        the last call.  Call it until an effect is proven.
         """
         has_changed = bool((np.abs(change) > _CHANGED * limit).any())
         if not has_changed or self._unanswered > _PATIENCE:

@@ -17,8 +17,8 @@ from blf_dsc_controller.arms.tuning import SAMPLES, UNKNOWN_EFFORT, loop_delay
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.robot import implausible_friction
 from blf_dsc_controller.configuration.tool_bound import ANGLE, POSITION
+from blf_dsc_controller.factory.settings import settings_of_config
 from blf_dsc_controller.law.adaptation import NEWTON
-from blf_dsc_controller.law.factory import settings_of_config
 from blf_dsc_controller.law.state import Settings
 from blf_dsc_controller.supervision.expected_errors import expected_errors
 from blf_dsc_controller.supervision.gear_warnings import gear_warnings

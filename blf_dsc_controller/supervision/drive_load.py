@@ -38,6 +38,9 @@ _SHARE = 0.05  # or this part of the mass
 _CENTRE = 0.03  # m, likewise of its centre
 _STEP = 0.005  # of the torque limit
 
+EVERY = 20
+"""States from one step of a load that is declared to the next."""
+
 
 class DriveLoad(NamedTuple):
     """A load that drives compensate, in the frame of the tip."""

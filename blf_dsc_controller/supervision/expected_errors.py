@@ -19,7 +19,7 @@ from blf_dsc_controller.arms.model import inertia_matrices, regressors_at
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.robot import parameters_of
 from blf_dsc_controller.configuration.tool_bound import REVERSAL
-from blf_dsc_controller.law.factory import settings_of_config
+from blf_dsc_controller.factory.settings import settings_of_config
 from blf_dsc_controller.law.state import Settings
 from blf_dsc_controller.supervision.reference_load import along
 

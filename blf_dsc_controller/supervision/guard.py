@@ -20,6 +20,7 @@ from blf_dsc_controller.configuration import law_file
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.schema import differences, flatten
 from blf_dsc_controller.errors import BlfDscError, StartError
+from blf_dsc_controller.factory.controller import controller_of
 from blf_dsc_controller.law.check_state import (
     CONTRADICTION,
     INVALID,
@@ -27,9 +28,13 @@ from blf_dsc_controller.law.check_state import (
     OSCILLATES,
 )
 from blf_dsc_controller.law.checks import is_valid_state
-from blf_dsc_controller.law.factory import controller_of
-from blf_dsc_controller.law.sensor import is_late, restart
-from blf_dsc_controller.messages import codecs
+from blf_dsc_controller.law.sensor import is_late
+from blf_dsc_controller.messages.errors import (
+    DuplicatedJointError,
+    MessageError,
+    MissingJointError,
+    ShortArrayError,
+)
 from blf_dsc_controller.messages.journal import (
     EventType,
     Journal,
@@ -38,33 +43,26 @@ from blf_dsc_controller.reference.approach import (
     AT_REST,
     BlendedReference,
     MotionError,
-    plan_resumption,
-    plan_start,
 )
 from blf_dsc_controller.reference.retargeting import (
     Target,
     TrajectoryError,
-    plan_stop,
 )
-from blf_dsc_controller.reference.terms import remaining
 from blf_dsc_controller.reference.trajectory import Trajectory
-from blf_dsc_controller.reference.turns import reference_near
-from blf_dsc_controller.run import Contact
+from blf_dsc_controller.run import NANOSECOND, Contact
 from blf_dsc_controller.supervision import not_sensors, retuning
 from blf_dsc_controller.supervision.calming import Calming
 from blf_dsc_controller.supervision.contact import contact_of
-from blf_dsc_controller.supervision.drive_load import DriveLoad, DriveLoads
+from blf_dsc_controller.supervision.drive_load import DriveLoad
 from blf_dsc_controller.supervision.first_torque import check_first_torque
 from blf_dsc_controller.supervision.held_torque import HeldTorque
 from blf_dsc_controller.supervision.last_state import LastState
 from blf_dsc_controller.supervision.plan import Plan, plan_motion
-from blf_dsc_controller.supervision.recent_motion import is_gap
+from blf_dsc_controller.supervision.readings import Readings
+from blf_dsc_controller.supervision.running_reference import RunningReference
+from blf_dsc_controller.supervision.safe_stop import WINDING_UP, SafeStop
 from blf_dsc_controller.supervision.safe_torque import SafeTorque
 from blf_dsc_controller.supervision.sample_check import SampleCheck
-from blf_dsc_controller.supervision.start import (
-    PreparedStart,
-    prepared_start,
-)
 from blf_dsc_controller.supervision.state_check import (
     LONG_GAP,
     SKIP,
@@ -72,33 +70,19 @@ from blf_dsc_controller.supervision.state_check import (
     rate_mismatch,
 )
 from blf_dsc_controller.supervision.state_watchdog import LONG_SILENCE, PERIOD, Watchdog
-from blf_dsc_controller.supervision.stop_speed import StopSpeed
 from blf_dsc_controller.supervision.supervisor import Fault, Phase, Reason, Supervisor
 from blf_dsc_controller.supervision.support import check_support
-from blf_dsc_controller.supervision.velocity import Velocity
-from blf_dsc_controller.supervision.wraps import Wraps
+from blf_dsc_controller.supervision.told_loads import ToldLoads
 
 Vector = NDArray[np.float64]
-_NANO = 1e-9
 _MANY = 0.5  # states missed for each that came
 _CHANGED = 0.5  # of the speed: an arm whose clock was set keeps its own
 _SLOWEST = 0.03  # rad/s: a velocity that contradicts positions has more
 
-# Commands that do not reach the arm may be why, or velocities that are not its own:
-# both wind up the estimates.
-_PERHAPS_UNREACHED = (Reason.OUTSIDE_BOUND, Reason.SATURATED)
-# A contact does so, too.
-_WINDING_UP = (
-    *_PERHAPS_UNREACHED,
-    Reason.VELOCITY,
-    Reason.CONTACT,
-    Reason.OSCILLATION,
-)
-
-_REASONS: dict[type[codecs.MessageError], Reason] = {
-    codecs.MissingJointError: Reason.JOINT_MISSING,
-    codecs.DuplicatedJointError: Reason.JOINT_DUPLICATED,
-    codecs.ShortArrayError: Reason.FIELD_MISSING,
+_REASONS: dict[type[MessageError], Reason] = {
+    MissingJointError: Reason.JOINT_MISSING,
+    DuplicatedJointError: Reason.JOINT_DUPLICATED,
+    ShortArrayError: Reason.FIELD_MISSING,
 }
 
 
@@ -125,10 +109,6 @@ class Guard:
         holds: whether the reference rests since then, until the next trajectory.
         silenced: whether nothing is commanded until the next reset or activation.
         foreign: messages ignored because they name none of the joints.
-        start_stamp: stamp of t = 0 [ns]; -1 before the first start.
-        last_stamp: stamp of the law's last sample [ns].
-        settled: end of the approach or of the blend into a trajectory [s].
-        turned: how the configured reference is shifted by whole turns; empty if it is not.
         compute_time: computation time of the last sample [s].
     """
 
@@ -156,23 +136,18 @@ class Guard:
         self.contacts = 0
         self.silenced = self.holds = False
         self.foreign = 0
-        self.start_stamp = self.last_stamp = -1
-        self.settled = self.compute_time = 0.0
-        self.turned = ''
-        tells = config.learning.tell_drive
-        self._drive_loads = DriveLoads(config) if tells else None
-        self._velocity = Velocity(n) if config.safety.velocity == 'estimated' else None
-        self._wraps = Wraps(config)
+        self.compute_time = 0.0
+        self._readings = Readings(config, self.controller)
+        self._reference = RunningReference(self.controller)
+        self._loads = ToldLoads(config, self.controller)
         self._safe_torque = SafeTorque(n)
         self._safe_torque.scale = self.controller.state.rotors.gain_scale
         self._held = HeldTorque(config, self.controller, self.samples)
-        self._seen = 0  # ns, stamp of the last state, used or not
-        self._gap = 0.0  # s, since the one before
-        self._stop_speed = StopSpeed()
-        self._prepared: PreparedStart | None = None
+        self._safe_stop = SafeStop(
+            config, self.controller, self.samples, self._safe_torque, self._held
+        )
         self._acting: Vector | None = None  # N m, by which another node holds the arm
         self._clean = True  # whether the window holds valid samples only
-        self._resumable = False  # whether the law may continue along its reference
         digest = (
             {'law_digest': law_file.digest(config.law)}
             if law_file.is_file(config.law)
@@ -186,9 +161,29 @@ class Guard:
         return self.journal.commands > 0
 
     @property
+    def start_stamp(self) -> int:
+        """Stamp of t = 0 [ns]; -1 before the first start."""
+        return self._reference.start_stamp
+
+    @property
+    def last_stamp(self) -> int:
+        """Stamp of the law's last sample [ns]."""
+        return self._reference.last_stamp
+
+    @property
     def time(self) -> float:
         """Time of the last sample of the law [s]."""
-        return self._time_of(self.last_stamp)
+        return self._reference.time
+
+    @property
+    def settled(self) -> float:
+        """End of the approach or of the blend into a trajectory [s]."""
+        return self._reference.settled
+
+    @property
+    def turned(self) -> str:
+        """How the configured reference is shifted by whole turns; empty if it is not."""
+        return self._reference.turned
 
     @property
     def last_state(self) -> LastState:
@@ -202,14 +197,13 @@ class Guard:
         (n,) N m].
         """
         self._begin_message()
-        gap = (stamp - self.journal.stamp) * _NANO
+        gap = (stamp - self.journal.stamp) * NANOSECOND
         self.journal.stamp = stamp
-        self._take_stamp(stamp)
+        self._readings.take_stamp(stamp)
         self.watchdog.restart()
         measurement, wrapped = self._counted(measurement)
-        if self._velocity is not None:
-            self._velocity.replace(stamp, measurement)
-        if is_gap(self._gap, self.config.sample_time):
+        self._readings.replace_velocities(stamp, measurement)
+        if self._readings.is_after_gap:
             self._held.after_gap = measurement
         if self.supervisor.uses_states:
             fault = self.states.check(self.config.safety, stamp)
@@ -224,20 +218,22 @@ class Guard:
                 self._wait(fault.text)
             else:
                 self._stop(*fault)
-        elif self._is_silenced(gap):
-            return None
+        else:
+            self._withdraw_after_silence(gap)
+            if self.silenced:
+                return None
         return self._safe_at(stamp, measurement)
 
     def _counted(self, measurement: Vector) -> tuple[Vector, Fault | None]:
         """Return a measurement with turns counted on, and a wrap that cannot be one."""
         fastest = self.config.safety.velocity_limit
-        counted, wrapped = self._wraps.counted(measurement, self._gap, fastest)
+        counted, wrapped = self._readings.count_turns(measurement, fastest)
         if wrapped is not None and self.supervisor.phase is Phase.STARTING:
-            self._wraps.restart()
+            self._readings.believe_positions()
         return counted, wrapped
 
-    def _is_silenced(self, gap: float) -> bool:
-        """Whether to stay silent while not in command, after a long silence.
+    def _withdraw_after_silence(self, gap: float) -> None:
+        """Stay silent after a long silence in which the law was not in command.
 
         By then the safe torque has faded to zero, and whoever restarted the driver may
         not expect another. `gap` [s] is the time since the state before.
@@ -248,20 +244,12 @@ class Guard:
                 f'joint states are back after {gap:.3g} s, and no torque is commanded until the '
                 'next reset or activation'
             )
-        return self.silenced
 
     def withdraw(self, text: str) -> None:
         """Command nothing until the next reset or activation, for a reason."""
         self._note(EventType.WITHDRAW, text=text)
         self.silenced = True
         self.supervisor.add(text)
-
-    def _take_stamp(self, stamp: int) -> None:
-        """Compare velocities with positions only between states in a row."""
-        self._gap = (stamp - self._seen) * _NANO
-        self._seen = stamp
-        if self._gap < 0.0 or is_gap(self._gap, self.config.sample_time):
-            restart(self.controller.checks.sensor)
 
     def _with_cause(self, fault: Fault) -> Fault:
         """Return the fault of an arm that is too fast, and why if it oscillates."""
@@ -271,13 +259,14 @@ class Guard:
     def _clock_step(self, measurement: Vector) -> Fault | None:
         """Return the fault of a clock that was set while the arm moved."""
         last = self._safe_torque.last
-        if self._gap < LONG_GAP * self.config.sample_time or last.age > 0.0:
+        gap = self._readings.gap
+        if gap < LONG_GAP * self.config.sample_time or last.age > 0.0:
             return None
         q, dq, _ = measurement.reshape(3, -1)
         mean = 0.5 * (dq + last.dq)
         if np.abs(dq - last.dq).max() > _CHANGED * np.abs(mean).max():
             return None  # it has been braked or driven on: the time has passed
-        return self.states.clock_step(self._gap, q - last.q, mean)
+        return self.states.clock_step(gap, q - last.q, mean)
 
     def _use(self, stamp: int, measurement: Vector) -> Vector | None:
         """Pass a state to the law, or stop if the law finds it invalid."""
@@ -293,9 +282,9 @@ class Guard:
                 return self._safe(self.config.sample_time)
         elif self._held.after_gap is not None and not self._rejoin(stamp, measurement):
             return self._safe_at(stamp, measurement)
-        dt = (stamp - self.last_stamp) * _NANO
+        dt = (stamp - self.last_stamp) * NANOSECOND
         before = perf_counter()
-        torque = law.update(self._time_of(stamp), dt, measurement)
+        torque = law.update(self._reference.time_of(stamp), dt, measurement)
         self.compute_time = perf_counter() - before
         if law.flags & INVALID:
             self._stop_at_invalid(stamp, measurement)
@@ -348,15 +337,12 @@ class Guard:
 
     def load_to_tell(self) -> DriveLoad | None:
         """Return the load to declare to the drives next, None if there is none."""
-        if self._drive_loads is None or not self.has_sample:
-            return None
-        return self._drive_loads.next(self.controller)
+        return self._loads.next() if self.has_sample else None
 
     def take_over(self, load: DriveLoad) -> None:
         """Subtract the weight of a load that the drives add from the next state on."""
-        loads = self._loads()
+        self._loads.take(self.config, load)
         self._note(EventType.DRIVE_LOAD, mass=load.mass, centre=list(load.centre))
-        loads.take(self.controller, load)
         self._held.recent.restart()  # the torques so far met drives without it
 
     def declare(self, load: DriveLoad) -> None:
@@ -365,22 +351,12 @@ class Guard:
         Raises:
             BlfDscError: the drives add no weight.
         """
-        self._loads().wanted = load
+        self._loads.want(self.config, load)
 
     @property
     def is_load_told(self) -> bool:
         """Whether the drives have the load of the last `declare`."""
-        return self._drive_loads is None or self._drive_loads.is_told
-
-    def _loads(self) -> DriveLoads:
-        if self._drive_loads is None:
-            if self.config.robot.drive_compensates == 'none':
-                raise BlfDscError(
-                    'robot.drive_compensates: got none: these drives add no weight, so no load '
-                    'can be declared to them; the law weighs and carries it by itself'
-                )
-            self._drive_loads = DriveLoads(self.config)
-        return self._drive_loads
+        return self._loads.is_told
 
     def perceive(self) -> None:
         """Weigh what the tip holds, and detect contact, by the last state.
@@ -401,8 +377,7 @@ class Guard:
         del content['stamp']
         self._note(EventType.CONTACT, reaction=reaction, **content)
         if reaction == 'hold':
-            before = self.controller.reference_vector
-            self._follow(plan_stop(before, self.time, self.config).vector)
+            self._reference.brake(self.config)
             self.holds = True
             self.supervisor.add(f'{text}: the reference brakes, and the arm holds')
         elif reaction != 'none':
@@ -421,19 +396,16 @@ class Guard:
         limit = self.config.safety.velocity_limit
         dt = self.config.sample_time
         self._safe_torque.last.take_usable(stamp, measurement, limit, dt)
-        self._check_speed()
+        self._observe_speed()
         return self._safe(dt)
 
     def observe(self, stamp: int, measurement: Vector) -> None:
         """Compare velocities with positions for a state that is held back."""
-        self._take_stamp(stamp)
+        self._readings.take_stamp(stamp)
         self._compare_velocities(stamp, self._counted(measurement)[0])
 
     def _compare_velocities(self, stamp: int, measurement: Vector) -> None:
-        is_next = self._gap > 0.0 and not is_gap(self._gap, self.config.sample_time)
-        if not is_next or not np.isfinite(measurement[: -self._n]).all():
-            return
-        if self.controller.compare_velocities(self._gap, measurement):
+        if self._readings.compare_velocities(measurement):
             self._distrust_velocities(stamp, measurement)
 
     def _distrust_velocities(self, stamp: int, measurement: Vector) -> None:
@@ -450,36 +422,32 @@ class Guard:
         else:
             self.supervisor.add(fault.text)
             self._safe_torque.start_observing()  # this has let the error grow
-        self._velocity = Velocity(self._n)
-        before = stamp - round(self._gap / _NANO)
-        self._velocity.begin(before, sensor.read_before[: self._n])
-        self._velocity.replace(stamp, measurement)
+        self._readings.distrust_velocities(stamp, measurement)
         # What the wrong velocities showed of the rotors is as wrong.
         self.controller.state.rotors.gain_scale[:] = checks.estimates.consistent_scale
         # Else the change from the wrong velocity would pass for an acceleration.
         self._safe_torque.last.dq[:] = measurement[self._n : -self._n]
-        restart(sensor)
 
-    def _check_speed(self) -> None:
+    def _observe_speed(self) -> None:
         """Return to the load known before if the arm speeds up in the safe stop."""
         if self.supervisor.phase is not Phase.SAFE_STOP:
             return
-        speed = self._speed
-        speeds_up = self._stop_speed.speeds_up(speed, self._gap)
-        if speeds_up and self.config.safety.torque != 'zero':
-            self._safe_torque.stop_observing()
-            self.supervisor.add(
-                f'the arm speeds up in the safe stop, to {speed:.3g} rad/s: engage the brakes'
-            )
+        speed, gap = self._readings.speed, self._readings.gap
+        text = self._safe_stop.observe_speed(self.config.safety, speed, gap)
+        if text:
+            self.supervisor.add(text)
 
     def _start(self, stamp: int, measurement: Vector) -> bool:
         """Resume the running reference if possible, otherwise start at t = 0."""
         q, dq, _ = measurement.reshape(3, -1)
-        motion = self._resumption(stamp, q, dq) if self._resumable else None
+        reference = self._reference
+        motion = None
+        if reference.resumable:
+            motion = reference.plan_resumption(self.config, stamp, q, dq)
         resumed = motion is not None
         try:
             if motion is None:
-                motion = self._plan_start(q, dq)
+                motion = reference.plan_start(self.config, q, dq)
             self.controller.reference_vector = motion.vector
             self._begin_at_acting(q)
             if not self.commanding:
@@ -489,8 +457,7 @@ class Guard:
             self.refuse(error)
             return False
         if not resumed:
-            self.start_stamp = stamp
-            _, self.turned = reference_near(self.config, q)
+            reference.start_at(stamp, self.config, q)
         self._take_over(stamp, q, motion, resumed=resumed)
         return True
 
@@ -498,14 +465,13 @@ class Guard:
         self, stamp: int, q: Vector, motion: BlendedReference, *, resumed: bool
     ) -> None:
         """Let the law begin with this state, at the torque that acts."""
-        self.controller.reference_vector = motion.vector
-        self.settled = motion.settled
+        self._reference.follow_from_start(motion)
         if self.commanding and self._acting is None:
             held = self._held.command()
             acting = self._safe_torque.commanded if held is None else held
             self.controller.take_over(acting, q)
         self.journal.note(EventType.START, resumed=resumed)
-        self.last_stamp = stamp - self.config.sample_time_ns
+        self._reference.last_stamp = stamp - self.config.sample_time_ns
         self._acting = None
         self._held.recent.restart()
         self.watchdog.switch(self.config.safety.watchdog, stamp)
@@ -540,19 +506,8 @@ class Guard:
             StartError: the law cannot take over there.
             MotionError: no approach from there keeps the limits.
         """
-        bound = self.controller.bound_at(0.0)
-        prepared = prepared_start(self.config, bound, positions)
+        self._reference.prepare(self.config, positions)
         self._note(EventType.PREPARE, positions=positions.tolist())
-        self._prepared = prepared
-
-    def _plan_start(self, q: Vector, dq: Vector) -> BlendedReference:
-        """Return the reference from q (n,) [rad] and dq (n,) [rad/s] on, at t = 0."""
-        prepared = self._prepared
-        self._prepared = None
-        bound = self.controller.bound_at(0.0)
-        if prepared is not None and prepared.fits(self.config, bound, q, dq):
-            return prepared.motion
-        return plan_start(self.config, bound, q, dq)
 
     def check_support(self, measurement: Vector) -> None:
         """Refuse to start if nothing shows what holds a live arm."""
@@ -576,13 +531,14 @@ class Guard:
         if not is_valid_state(self.controller.checks, measurement):
             return True
         q, dq, _ = measurement.reshape(3, -1)
-        motion = self._resumption(stamp, q, dq)
+        motion = self._reference.plan_resumption(self.config, stamp, q, dq)
         if motion is None and self.config.safety.error_ratio == 0.0:
             return True  # no error stops this arm
         if motion is None:
+            gap = self._readings.gap
             text = (
-                f'no joint state came for {self._gap:.3g} s, and the arm is too far from its '
-                'reference now'
+                f'no joint state came for {gap:.3g} s, and the arm is too far from its reference '
+                'now'
             )
             self._stop(Reason.STAMP_JUMP, text)
             return False
@@ -590,20 +546,8 @@ class Guard:
         self._take_over(stamp, q, motion, resumed=True)
         return True
 
-    def _resumption(self, stamp: int, q: Vector, dq: Vector) -> BlendedReference | None:
-        """Return the way back to the running reference, None if the arm is too far."""
-        if stamp <= self.last_stamp:
-            return None
-        t = self._time_of(stamp)
-        bound = self.controller.bound_at(t)
-        vector = self.controller.reference_vector
-        try:
-            return plan_resumption(self.config, bound, q, dq, vector, t)
-        except (StartError, MotionError):
-            return None
-
     def _advance_to(self, stamp: int) -> None:
-        self.last_stamp = stamp
+        self._reference.last_stamp = stamp
         if self.supervisor.phase is Phase.APPROACHING and self.time >= self.settled:
             self.supervisor.enter(Phase.TRACKING)
 
@@ -620,21 +564,20 @@ class Guard:
             self._held.recent.take(int(stamps[k]), measurements[k], torques[k])
         count, stamp, measurement = stamps.size, int(stamps[-1]), measurements[-1]
         self.journal.stamp = stamp
-        self._seen = stamp
+        self._readings.advance(stamp, measurement)
         self.journal.messages += count
         self.journal.commands += count
         self.has_sample = True
-        self._wraps.follow(measurement)
         self._safe_torque.last.take(stamp, measurement, self._slow)
         self._safe_torque.commanded[:] = self.controller.state.torque
         self.states.advance(stamp, count)
-        self.samples.relax((stamp - self.last_stamp) * _NANO)
+        self.samples.relax((stamp - self.last_stamp) * NANOSECOND)
         self._advance_to(stamp)
 
-    def reject(self, error: codecs.MessageError) -> Vector | None:
+    def reject(self, error: MessageError) -> Vector | None:
         """Return the torque for an unreadable message, None if it is another arm's."""
         self._begin_message()
-        if isinstance(error, codecs.MissingJointError) and error.is_foreign(
+        if isinstance(error, MissingJointError) and error.is_foreign(
             self.config.joints
         ):
             self.foreign += 1
@@ -682,18 +625,9 @@ class Guard:
         self.journal.messages += 1
 
     @property
-    def _speed(self) -> float:
-        """Largest speed of a joint [rad/s], as the positions show it."""
-        return float(np.abs(self.controller.checks.sensor.derived).max())
-
-    @property
     def _slow(self) -> Vector:
-        """Velocities (n,) [rad/s] to be damped in a stop, as the positions show them."""
-        limit = self.config.safety.velocity_limit
-        return np.asarray(np.clip(self.controller.checks.sensor.derived, -limit, limit))
-
-    def _time_of(self, stamp: int) -> float:
-        return (stamp - self.start_stamp) * _NANO
+        """Velocities (n,) [rad/s] to be damped in a stop."""
+        return self._readings.slow(self.config.safety.velocity_limit)
 
     def _stop(self, reason: Reason, text: str) -> None:
         missed = self.states.missed_for_each
@@ -701,36 +635,19 @@ class Guard:
             T = self.config.sample_time
             text += f'; {rate_mismatch((1.0 + missed) * T, T)}'
         was_running = self.supervisor.running
-        if self.supervisor.stop(reason, text):
-            if was_running and reason in _WINDING_UP:
-                self.samples.return_to_consistent()
-            reached = reason not in (*_PERHAPS_UNREACHED, Reason.NO_EFFECT)
-            oscillates = was_running and bool(self.calming.cause)
-            self._stop_speed.begin(self._speed)
-            self.journal.note(EventType.STOP, reason=reason, text=text)
-            self._clean = self._resumable = False
-            load = (
-                self._load_at_stop(reason) if was_running else self.samples.disturbance
-            )
-            self._safe_torque.begin_ramp(
-                self.config.safety.stop_ramp,
-                load,
-                reached=reached or oscillates,
-                oscillates=oscillates,
-            )
-
-    def _load_at_stop(self, reason: Reason) -> Vector:
-        """Return what holds the arm besides its model (n,) [N m], where the law stops.
-
-        After a gap it is what holds it now, whoever commands that.
-        """
-        held = self._held.command()
-        if held is not None:
-            self._safe_torque.commanded[:] = held
-        is_wound_up = reason in _WINDING_UP or reason is Reason.NO_EFFECT
-        if is_wound_up and self._held.after_gap is None:
-            return self.samples.disturbance
-        return self._held.load()
+        if not self.supervisor.stop(reason, text):
+            return
+        if was_running and reason in WINDING_UP:
+            self.samples.return_to_consistent()
+        self.journal.note(EventType.STOP, reason=reason, text=text)
+        self._clean = self._reference.resumable = False
+        self._safe_stop.begin(
+            self.config.safety,
+            reason,
+            self._readings.speed,
+            was_running=was_running,
+            oscillates=was_running and bool(self.calming.cause),
+        )
 
     def _safe_without_state(self, dt: float) -> Vector | None:
         self.has_sample = False
@@ -745,25 +662,12 @@ class Guard:
         """
         if not self.commanding:
             return None
-        torque = self._safe_torque.advance(
-            self.config.safety, self.controller.settings, self.samples.estimate, dt
-        )
+        torque = self._safe_stop.advance(self.config.safety, dt)
         self.journal.commands += torque is not None
-        if self._safe_torque.missed_change is not None:
-            self._add_missing_effect(self._safe_torque.missed_change)
+        missing = self._safe_stop.missing_effect
+        if missing and self.supervisor.reason is not Reason.NO_EFFECT:
+            self.supervisor.add(missing)
         return torque
-
-    def _add_missing_effect(self, change: Vector) -> None:
-        """Report that commands that changed by these torques (n,) move nothing."""
-        if self.supervisor.reason is Reason.NO_EFFECT:
-            return
-        limit = self.controller.settings.torque.limit
-        worst = int(np.argmax(np.abs(change) / limit))
-        self.supervisor.add(
-            f'the torque of joint {self.config.joints[worst]!r} has changed by '
-            f'{change[worst]:+.4g} N m since, but the arm has not accelerated: release the brakes, '
-            'activate the effort controller, or free the arm'
-        )
 
     def activate(self) -> None:
         """Take command with the next state, and what was learned before a fault."""
@@ -778,21 +682,20 @@ class Guard:
     def deactivate(self) -> None:
         """Leave command: the torque ramps to the safe torque."""
         self._note(EventType.DEACTIVATE)
-        self._resumable = self.supervisor.running
+        was_running = self.supervisor.running
+        self._reference.resumable = was_running
         self.supervisor.enter(Phase.INACTIVE)
         self.samples.relax()
         self.watchdog.restart()
-        if self._resumable:
-            ramp = self.config.safety.deactivation_ramp
-            self._safe_torque.begin_ramp(ramp, self._held.load())
+        if was_running:
+            self._safe_stop.begin_deactivation(self.config.safety)
 
     def reset(self) -> None:
         """Discard all estimates and faults, and restart with the next state."""
         self._note(EventType.RESET)
-        self._resumable = False
+        self._reference.resumable = False
         self.controller.reset()
-        if self._drive_loads is not None:
-            self._drive_loads.forget(self.controller)
+        self._loads.forget()
         self.samples.keep()
         self._start_over()
 
@@ -821,9 +724,9 @@ class Guard:
             return
         self.end_silence()
         self.journal.add(EventType.TRAJECTORY, planned.content)
-        self._follow(planned.motion.vector)
+        self._reference.follow(planned.motion.vector)
         self.holds = False
-        self.settled = planned.motion.settled
+        self._reference.settled = planned.motion.settled
         is_settled = self.settled <= self.time
         self.supervisor.enter(Phase.TRACKING if is_settled else Phase.APPROACHING)
 
@@ -834,7 +737,7 @@ class Guard:
             why = self.contact.text if self.contact else ''
             raise TrajectoryError([f'{why}, and the arm holds: {remedy}'])
         self._note(EventType.TARGET, **planned.content)
-        self._follow(planned.motion.vector)
+        self._reference.follow(planned.motion.vector)
 
     def brake(self) -> float:
         """Bring the reference to rest within the limits; return when it rests [s].
@@ -844,26 +747,18 @@ class Guard:
         """
         self._check_running()
         self._note(EventType.BRAKE)
-        before = self.controller.reference_vector
-        motion = plan_stop(before, self.time, self.config)
-        self._follow(motion.vector)
-        return motion.end
-
-    def _follow(self, vector: np.ndarray) -> None:
-        self.controller.reference_vector = remaining(vector, self.time)
-        self.settled = min(self.settled, self.time)
+        return self._reference.brake(self.config)
 
     def retune(self, config: ControllerConfig) -> None:
         """Apply a configuration, between two samples."""
         self._note(EventType.PARAMETERS, parameters=differences(self.config, config))
-        self._prepared = None
+        self._reference.drop_prepared()
         if self.supervisor.running:
             last = self._safe_torque.last.measurement
             retuning.apply_bumpless(self.controller, config, self.time, last)
         else:
             retuning.apply(self.controller, config)
-        if self._drive_loads is not None:
-            self._drive_loads.take(self.controller, self._drive_loads.told)
+        self._loads.take_again()
         self.config = config
         self.calming.configure(config)
         self.samples.set_limits(config.safety)
@@ -892,10 +787,8 @@ class Guard:
         self.has_sample = False  # the last torque is not the law's
         if not self.commanding or self.silenced:
             return None
-        if self.supervisor.running:
-            self._safe_torque.load[:] = self._held.load()
-        return self._safe_torque.leave(
-            self.config.safety, self.controller.settings, self.samples.estimate
+        return self._safe_stop.leave(
+            self.config.safety, was_running=self.supervisor.running
         )
 
     def _note(self, event: EventType, **content: Any) -> None:
@@ -913,10 +806,7 @@ class Guard:
         self.silenced = self.holds = False
         self.has_sample = False
         self._clean = True
-        if self._wraps.restart():  # to positions that differ from those before
-            restart(self.controller.checks.sensor)
-            if self._velocity is not None:
-                self._velocity = Velocity(self._n)
+        self._readings.restart()
         if self._safe_torque.last.age >= self.config.safety.fade_time:
             # else a torque may have to fade, which a driver must not hold
             self.watchdog.wait()

@@ -16,18 +16,18 @@ from numpy.typing import NDArray
 
 from blf_dsc_controller.law.state import Settings
 from blf_dsc_controller.supervision.model_torque import needed_torque
+from blf_dsc_controller.supervision.state_check import LONG_GAP
 
 Array = NDArray[np.float64]
 
-_GAP = 0.03  # s, in which an arm that another commands leaves its reference ...
-_MISSED = 2.5  # ... samples; fewer that are missing are no gap
+_GAP = 0.03  # s, in which an arm that another commands leaves its reference
 _AVERAGED = 0.1  # s: the noise of a difference of velocities over it is small
 _BLOCKS = 10  # of it or some more, each with the mean acceleration in it
 
 
 def is_gap(elapsed: float, sample_time: float) -> bool:
     """Whether a state comes so long [s] after the last one that it does not follow it."""
-    return elapsed >= max(_GAP, _MISSED * sample_time)
+    return elapsed >= max(_GAP, LONG_GAP * sample_time)
 
 
 class RecentMotion:

@@ -17,9 +17,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from blf_dsc_controller.configuration.controller import ControllerConfig
+from blf_dsc_controller.factory.laws import law_of
+from blf_dsc_controller.factory.settings import settings_of_config
 from blf_dsc_controller.law import barrier
 from blf_dsc_controller.law.controller import Controller
-from blf_dsc_controller.law.factory import law_of, settings_of_config
 
 Floats = NDArray[np.float64]
 

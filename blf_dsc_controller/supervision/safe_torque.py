@@ -217,7 +217,7 @@ class SafeTorque:
             self._effect.update(needed - still, limit, dt)
             self._reached = self._effect.is_proven
             change = self.commanded - self._start
-            if not self._reached and self._effect.is_missing(change, limit, dt):
+            if not self._reached and self._effect.await_effect(change, limit, dt):
                 self.missed_change = change
         if self._reached:
             self._update_load(settings, needed, dt)

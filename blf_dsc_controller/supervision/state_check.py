@@ -12,10 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from blf_dsc_controller.configuration.controller_groups import Safety
+from blf_dsc_controller.run import NANOSECOND
 from blf_dsc_controller.supervision.supervisor import Fault, Reason
 
 Vector = NDArray[np.float64]
-_NANO = 1e-9
 _PUBLISHER_PERIOD = 0.015  # s: joint_state_publisher has 10 Hz by default, Franka's 30
 _REPEATS = 3  # states in a row with the stamp of the one before that are ignored
 LONG_GAP = 2.5
@@ -84,7 +84,9 @@ class StateCheck:
             text = f'a joint state has the stamp {stamp} ns, which is not a valid time'
             return Fault(Reason.STAMP_MISSING, text)
         is_first = self._last_stamp < 0
-        step = self._sample_time if is_first else (stamp - self._last_stamp) * _NANO
+        step = (
+            self._sample_time if is_first else (stamp - self._last_stamp) * NANOSECOND
+        )
         if step == 0.0:
             return self._check_repeats()
         self._repeats = 0

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-_NANO = 1e-9
+from blf_dsc_controller.run import NANOSECOND
 
 PERIOD = 0.008
 """Time [s] between two checks of the steady clock."""
@@ -43,7 +43,7 @@ class Watchdog:
     def switch(self, mode: str, stamp: int) -> None:
         """Switch on or off; `auto`: by whether the stamps [ns] are wall-clock time."""
         self.why_off = ''
-        behind = (self._wall() - stamp) * _NANO
+        behind = (self._wall() - stamp) * NANOSECOND
         if mode == 'auto' and abs(behind) >= SAME_CLOCK:
             where = f'{abs(behind):.4g} s {"behind" if behind > 0.0 else "ahead of"}'
             self.why_off = (
@@ -63,7 +63,7 @@ class Watchdog:
     def silence(self, limit: float) -> float:
         """Return the length of a silence [s] if it exceeds `limit` [s], else 0."""
         now = self._steady()
-        is_late = (now - self._last_check) * _NANO > 2.0 * PERIOD
+        is_late = (now - self._last_check) * NANOSECOND > 2.0 * PERIOD
         self._last_check = now
-        silent = (now - self._last_state) * _NANO if self._last_state >= 0 else 0.0
+        silent = (now - self._last_state) * NANOSECOND if self._last_state >= 0 else 0.0
         return silent if silent > limit + _IN_TRANSIT and not is_late else 0.0

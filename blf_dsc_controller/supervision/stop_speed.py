@@ -22,8 +22,10 @@ class StopSpeed:
         self._peak = 0.0  # rad/s, since then
         self._speeding = 0.0  # s, for which the arm has been faster
 
-    def speeds_up(self, speed: float, gap: float) -> bool:
-        """Return whether the arm has been faster for long enough; once in a stop.
+    def observe(self, speed: float, gap: float) -> bool:
+        """Take the speed of a state; return whether this shows that the arm speeds up.
+
+        That is once it has been faster for long enough, and at most once in a stop.
 
         `speed` [rad/s] is the largest of a joint, `gap` [s] the time since the last
         one.

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from blf_dsc_controller.configuration.controller import ControllerConfig
-from blf_dsc_controller.law.factory import settings_of_config
+from blf_dsc_controller.factory.settings import settings_of_config
 from blf_dsc_controller.supervision.safe_torque import SafeTorque
 from blf_dsc_controller.supervision.state_watchdog import LONG_SILENCE
 from blf_dsc_controller.supervision.wraps import Wraps

@@ -7,7 +7,7 @@ import numpy as np
 
 from blf_dsc_controller.arms.model import regressors_at
 from blf_dsc_controller.configuration.controller import ControllerConfig
-from blf_dsc_controller.law.factory import model_of
+from blf_dsc_controller.factory.estimate import model_of
 from blf_dsc_controller.run import Floats
 
 

@@ -22,15 +22,14 @@ from blf_dsc_controller.configuration.nodes import VIEW, ViewConfig
 from blf_dsc_controller.configuration.received import without_files
 from blf_dsc_controller.configuration.schema import build
 from blf_dsc_controller.errors import BlfDscError
-from blf_dsc_controller.law.factory import estimate_names
-from blf_dsc_controller.law.telemetry import external_names
+from blf_dsc_controller.factory.estimate import estimate_names
 from blf_dsc_controller.messages import topics
 from blf_dsc_controller.messages.codecs import (
     JointStateDecoder,
-    MessageError,
     joint_state_layout,
     typestore,
 )
+from blf_dsc_controller.messages.errors import MessageError
 from blf_dsc_controller.messages.journal import (
     MOTIONS,
     Change,
@@ -40,6 +39,7 @@ from blf_dsc_controller.messages.journal import (
     decode,
     decode_change,
 )
+from blf_dsc_controller.messages.named_values import external_names
 from blf_dsc_controller.messages.topics import Quality, Topic
 from blf_dsc_controller.nodes.endpoints import RawSubscriptions, create_steady_timer
 from blf_dsc_controller.nodes.parameters import declare

@@ -32,7 +32,7 @@ from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.files import resolve
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.extras import missing_extra
-from blf_dsc_controller.law.telemetry import load_text
+from blf_dsc_controller.messages.named_values import load_text
 from blf_dsc_controller.run import Floats
 from blf_dsc_controller.view.model_error import shares
 

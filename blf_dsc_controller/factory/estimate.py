@@ -1,0 +1,130 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a law estimates of an arm: names, units, initial values and their covariance."""
+
+from __future__ import annotations
+
+from copy import deepcopy
+from functools import partial
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from blf_dsc_controller.arms.base_parameters import ROTORS, UNKNOWN_ROTOR, prior_factor
+from blf_dsc_controller.arms.model import ArmModel, arm_model, regressors_at
+from blf_dsc_controller.configuration.controller import ControllerConfig
+from blf_dsc_controller.configuration.robot import parameters_of
+from blf_dsc_controller.numerics.algebra import product
+from blf_dsc_controller.run import LearnedArm
+
+FRICTION = 0.05
+"""Standard deviation of unknown friction, over the rated torque."""
+_MOST_FRICTION = 3.0  # times its initial estimate
+
+
+def model_of(config: ControllerConfig) -> ArmModel:
+    """Return the model named by `model`, with the geometry known to the controller."""
+    if config.model == 'urdf':
+        robot = config.robot
+        base = parameters_of(robot, robot.chain(config.joints))
+        return deepcopy(base.model)  # has working memory
+    return arm_model(config.model, config.arm.l1, config.arm.gravity)
+
+
+class Column(NamedTuple):
+    """A disturbance column: what is known of its coefficient in theta before the start."""
+
+    name: str
+    unit: str
+    initial: float  # of a URDF's friction; else zero
+    deviation: float  # of the prior
+    least: float  # value that it can have
+    most: float
+
+
+def columns_of(config: ControllerConfig) -> tuple[Column, ...]:
+    """Return the disturbance columns, in the order of `columns` and `ripple`.
+
+    The standard deviation is half the initial estimate, or 5 % of the rated torque
+    where that is zero, for `viscous` at the largest velocity of the reference.
+    Friction is between a third of its initial estimate and three times that, or between
+    0 and those 5 %: a push that is learned as friction, negative or none, turns over
+    where the joint does.
+    """
+    known: dict[str, Any] = {}
+    if config.model == 'urdf':
+        known = config.robot.friction(config.robot.chain(config.joints))
+    return tuple(
+        _column(config, block, i, known[block][i] if block in known else 0.0)
+        for block in _column_blocks(config)
+        for i in range(len(config.joints))
+    )
+
+
+def _column_blocks(config: ControllerConfig) -> list[str]:
+    """Return the names of the blocks of columns, each with a column per joint."""
+    learning = config.learning
+    switched = {
+        'bias': learning.bias,
+        'viscous': learning.viscous,
+        'coulomb': learning.coulomb,
+    }
+    blocks = [name for name, is_on in switched.items() if is_on]
+    for w in learning.frequencies:
+        blocks += [f'sin {w:g} rad/s', f'cos {w:g} rad/s']
+    for cycles in learning.ripple_cycles:
+        blocks += [f'sin {cycles:g} q', f'cos {cycles:g} q']
+    return blocks
+
+
+def _column(config: ControllerConfig, block: str, i: int, initial: float) -> Column:
+    """Return the column of a block for joint i, with its initial estimate."""
+    is_viscous = block == 'viscous'
+    is_friction = block in {'viscous', 'coulomb'}
+    velocity = config.limits.velocity[i] if is_viscous else 1.0
+    usual = FRICTION * config.torque.limit[i] / velocity
+    return Column(
+        name=f'{block} {config.joints[i]}',
+        unit='N m s/rad' if is_viscous else 'N m',
+        initial=initial,
+        deviation=0.5 * initial or usual,
+        least=initial / _MOST_FRICTION if is_friction else -np.inf,
+        most=(_MOST_FRICTION * initial or usual) if is_friction else np.inf,
+    )
+
+
+def estimate_names(config: ControllerConfig) -> tuple[str, ...]:
+    """Return the name of each entry of theta^: model parameters, then disturbance columns."""
+    return (
+        *model_of(config).parameter_names,
+        *(column.name for column in columns_of(config)),
+    )
+
+
+def prior_covariance(config: ControllerConfig) -> np.ndarray:
+    """Return the prior covariance (m, m) of theta: identity for planar arms, else of the URDF."""
+    columns = columns_of(config)
+    if config.model != 'urdf':
+        return np.eye(model_of(config).p + len(columns))
+    robot = config.robot
+    chain = config.robot.chain(config.joints)
+    rotors = robot.rotors(chain)
+    unsure = np.where(rotors > 0.0, ROTORS * rotors, UNKNOWN_ROTOR)
+    L = prior_factor(chain, parameters_of(robot, chain), robot.payload, unsure)
+    covariance = np.diag([0.0] * len(L) + [column.deviation**2 for column in columns])
+    covariance[: len(L), : len(L)] = product(L, L.T)
+    return covariance
+
+
+def learned_arm(config: ControllerConfig) -> LearnedArm | None:
+    """Return units, prior and regressor of what is learned of a URDF; None for other models."""
+    if config.model != 'urdf':
+        return None
+    model = model_of(config)
+    names = estimate_names(config)
+    friction = (column.unit for column in columns_of(config))
+    deviations = np.sqrt(np.diag(prior_covariance(config))).tolist()
+    return LearnedArm(
+        dict(zip(names, (*model.parameter_units, *friction), strict=True)),
+        dict(zip(names, deviations, strict=True)),
+        partial(regressors_at, model),
+    )

@@ -1,0 +1,67 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Messages of the plant: joint states, truth, timing and its clock."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from blf_dsc_controller.messages import topics
+from blf_dsc_controller.messages.codecs import JointStateEncoder, encode_clock
+from blf_dsc_controller.messages.named_values import disturbance_names
+from blf_dsc_controller.messages.topics import Message
+
+DECIMATION = 10
+"""Number of samples from one message of the plant's truth to the next."""
+
+
+class PlantTelemetry:
+    """Messages of the plant of n joints and p true parameters.
+
+    Joint states have the names `published`, by default the joints; other joints stay at
+    0.
+    """
+
+    def __init__(
+        self,
+        joints: Sequence[str],
+        parameters: Sequence[str],
+        published: Sequence[str] = (),
+    ) -> None:
+        names = tuple(published) or tuple(joints)
+        true_state = [
+            what + joint
+            for what in (topics.POSITION, topics.VELOCITY)
+            for joint in joints
+        ]
+        self._joint_states = JointStateEncoder(names)
+        self._places = [names.index(joint) for joint in joints]
+        self._published = np.zeros((3, len(names)))
+        self._truth = JointStateEncoder(
+            (*parameters, *disturbance_names(joints), *true_state), ('position',)
+        )
+        self._timing = JointStateEncoder(
+            (topics.LATENCY, topics.LATENESS, topics.LATE_STEPS), ('position',)
+        )
+
+    def joint_states(self, stamp: int, measurement: np.ndarray) -> Message:
+        """Encode measured [q, dq, applied torque of the last interval] (3 n,)."""
+        self._published[:, self._places] = measurement.reshape(3, -1)
+        return topics.JOINT_STATES, self._joint_states.encode(stamp, *self._published)
+
+    def truth(self, stamp: int, truth: np.ndarray) -> Message:
+        """Encode the true [P, tau_dist, q, dq] (p + 3 n,)."""
+        return topics.TRUTH, self._truth.encode(stamp, truth)
+
+    def timing(
+        self, stamp: int, latency: float, lateness: float, late_steps: int
+    ) -> Message:
+        """Encode the real-time performance of the step up to this sample [s, s, count]."""
+        return topics.TIMING, self._timing.encode(
+            stamp, (latency, lateness, late_steps)
+        )
+
+    def clock(self, stamp: int) -> Message:
+        """Encode the plant's time [ns] for /clock."""
+        return topics.CLOCK, encode_clock(stamp)

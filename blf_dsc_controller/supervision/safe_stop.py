@@ -1,0 +1,123 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What the arm gets while the law is not in command: the safe torque, by what holds the arm."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from blf_dsc_controller.configuration.controller import ControllerConfig
+from blf_dsc_controller.configuration.controller_groups import Safety
+from blf_dsc_controller.law.controller import Controller
+from blf_dsc_controller.supervision.held_torque import HeldTorque
+from blf_dsc_controller.supervision.safe_torque import SafeTorque
+from blf_dsc_controller.supervision.sample_check import SampleCheck
+from blf_dsc_controller.supervision.stop_speed import StopSpeed
+from blf_dsc_controller.supervision.supervisor import Reason
+
+Vector = NDArray[np.float64]
+
+# Commands that do not reach the arm may be why, or velocities that are not its own:
+# both wind up the estimates.
+_PERHAPS_UNREACHED = (Reason.OUTSIDE_BOUND, Reason.SATURATED)
+# A contact does so, too.
+WINDING_UP = (
+    *_PERHAPS_UNREACHED,
+    Reason.VELOCITY,
+    Reason.CONTACT,
+    Reason.OSCILLATION,
+)
+"""Reasons of stops before which the estimates may have wound up."""
+
+
+class SafeStop:
+    """The ramp to the safe torque of a controller's arm, and what becomes of the arm."""
+
+    def __init__(
+        self,
+        config: ControllerConfig,
+        controller: Controller,
+        samples: SampleCheck,
+        torque: SafeTorque,
+        held: HeldTorque,
+    ) -> None:
+        """Use the ramp of `torque`, what `held` finds, and the estimates of `samples`."""
+        self._joints = config.joints
+        self._controller = controller
+        self._samples = samples
+        self._torque = torque
+        self._held = held
+        self._speed = StopSpeed()
+
+    def begin(
+        self,
+        safety: Safety,
+        reason: Reason,
+        speed: float,
+        *,
+        was_running: bool,
+        oscillates: bool,
+    ) -> None:
+        """Begin the ramp of a stop at a speed [rad/s], the largest of a joint."""
+        self._speed.begin(speed)
+        load = self._load_at_stop(reason) if was_running else self._samples.disturbance
+        reached = reason not in (*_PERHAPS_UNREACHED, Reason.NO_EFFECT)
+        self._torque.begin_ramp(
+            safety.stop_ramp,
+            load,
+            reached=reached or oscillates,
+            oscillates=oscillates,
+        )
+
+    def begin_deactivation(self, safety: Safety) -> None:
+        """Begin the ramp of a law that leaves command in order."""
+        self._torque.begin_ramp(safety.deactivation_ramp, self._held.load())
+
+    def advance(self, safety: Safety, dt: float) -> Vector | None:
+        """Return the torque (n,) [N m] `dt` [s] later; None before a usable state."""
+        settings = self._controller.settings
+        return self._torque.advance(safety, settings, self._samples.estimate, dt)
+
+    def leave(self, safety: Safety, *, was_running: bool) -> Vector | None:
+        """Return the last torque (n,) [N m]; None before the first usable state."""
+        if was_running:
+            self._torque.load[:] = self._held.load()
+        settings = self._controller.settings
+        return self._torque.leave(safety, settings, self._samples.estimate)
+
+    def observe_speed(self, safety: Safety, speed: float, gap: float) -> str:
+        """Return to the load known before if the arm speeds up; return a text if it does.
+
+        `speed` [rad/s] is the largest of a joint, `gap` [s] the time since the last one.
+        """
+        begins = self._speed.observe(speed, gap)
+        if not begins or safety.torque == 'zero':
+            return ''
+        self._torque.stop_observing()
+        return f'the arm speeds up in the safe stop, to {speed:.3g} rad/s: engage the brakes'
+
+    @property
+    def missing_effect(self) -> str:
+        """That the last change of the commands has moved nothing; empty if it may have."""
+        change = self._torque.missed_change
+        if change is None:
+            return ''
+        worst = int(np.argmax(np.abs(change) / self._controller.settings.torque.limit))
+        return (
+            f'the torque of joint {self._joints[worst]!r} has changed by '
+            f'{change[worst]:+.4g} N m since, but the arm has not accelerated: release the brakes, '
+            'activate the effort controller, or free the arm'
+        )
+
+    def _load_at_stop(self, reason: Reason) -> Vector:
+        """Return what holds the arm besides its model (n,) [N m], where the law stops.
+
+        After a gap it is what holds it now, whoever commands that.
+        """
+        held = self._held.command()
+        if held is not None:
+            self._torque.commanded[:] = held
+        is_wound_up = reason in WINDING_UP or reason is Reason.NO_EFFECT
+        if is_wound_up and self._held.after_gap is None:
+            return self._samples.disturbance
+        return self._held.load()
