@@ -167,7 +167,9 @@ def test_distance_is_that_of_the_covariance_by_theta_and_noise(state):
     expected = np.sqrt(state.torque @ np.linalg.solve(S, state.torque))
     assert external_torque.whiten_torque(state, work) == pytest.approx(expected)
     for i in range(N):
-        assert external_torque.variance_of(SETTINGS, state, i) == pytest.approx(S[i, i])
+        assert external_torque.variance_of(SETTINGS, state, work, i) == pytest.approx(
+            S[i, i]
+        )
 
 
 def test_prior_is_that_of_theta_and_of_unmodelled_torque():
@@ -218,25 +220,37 @@ def test_noise_is_measured_from_the_first_window_on(state):
     assert external_torque.is_settled(state, DT)
 
 
-def test_joint_counts_as_resting_once_its_filter_has_settled():
-    """Below 0.005 times 0.02 rad/s for 3 / L = 0.1 s; it begins to move at once."""
+def test_arm_counts_as_resting_once_its_filter_has_settled():
+    """All joints below 0.005 times 0.02 rad/s for 3 / L = 0.1 s; it begins to move at once."""
     state = part(State)
-    rest, moving = np.array([0.9e-4, 1.1e-4]), np.array([0.01, 0.01])
-    for _ in range(102):
-        assert not external_torque.follow_reversals(SETTINGS, state, rest, DT)
-    assert [external_torque.regime(SETTINGS, state, i) for i in range(N)] == [2, 1]
+    state.held[0] = 1.0
+    for speeds, expected in (([0.9e-4, 1.1e-4], 1), ([0.9e-4, 0.9e-4], 2)):
+        for _ in range(102):
+            external_torque.follow_reversals(SETTINGS, state, np.array(speeds), DT)
+        for i in range(N):
+            assert external_torque.regime(SETTINGS, state, i) == expected
+    moving = np.array([0.0, 0.01])
+    state.held[0] = 1.0
     assert external_torque.follow_reversals(SETTINGS, state, moving, DT)
+    assert not external_torque.follow_reversals(SETTINGS, state, moving, DT)
     assert external_torque.regime(SETTINGS, state, 0) == 1
+    for _ in range(98):
+        external_torque.follow_reversals(SETTINGS, state, moving, DT)
+    assert state.held[0] == pytest.approx(np.exp(-3.0), rel=0.01)
 
 
 @pytest.mark.parametrize(
     ('reversing', 'resting', 'least'),
-    [(0.0, 0.0, 0.05), (0.1, 0.0, np.hypot(0.05, 1.5)), (0.1, 1.0, 0.05)],
+    [
+        (0.0, 0.0, 0.05),
+        (0.1, 0.0, np.hypot(0.05, 1.5)),
+        (0.1, 1.0, np.hypot(0.05, 0.5)),
+    ],
 )
-def test_noise_of_slow_motion_is_at_least_a_share_of_friction(
+def test_noise_of_slow_motion_and_rest_is_at_least_a_share_of_friction(
     state, reversing, resting, least
 ):
-    """0.15 of 10 N m, and a tenth of the unmodelled 0.5 N m in any motion."""
+    """0.15 of 10 N m, 0.05 at rest, and a tenth of the unmodelled 0.5 N m in any motion."""
     state.reversing[:] = reversing
     state.resting[:] = resting
     state.noise[:] = 1e-9
@@ -249,7 +263,7 @@ def test_noise_of_slow_motion_is_at_least_a_share_of_friction(
 
 @pytest.fixture
 def tared(state):
-    """An arm of X_0 that was tared at rest, and has gone to X since; joint 1 moves."""
+    """An arm of X_0 that was tared at rest, and has gone to X since, where it moves."""
     random = np.random.default_rng(2)
     B = random.normal(size=(M, M))
     A = B @ B.T + np.eye(M)
@@ -259,26 +273,28 @@ def tared(state):
     state.filtered[:] = random.normal(size=(N, M + 1))
     state.noise[:] = [[0.3, 0.2], [0.5, 0.6], [0.04, 0.09]]
     state.reversing[:] = 1.0
-    state.resting[:] = 1.0
+    state.resting[0] = 1.0
     estimate = random.normal(size=M)
     X_0 = state.filtered.copy()
     external_torque.update_torque(state, estimate)
     external_torque.tare(state, 0.0)
     state.filtered[:] += 0.1 * random.normal(size=(N, M + 1))
-    state.resting[1] = state.held[1] = 0.0
+    state.resting[0] = 0.0
+    state.held[0] = 0.5
     return state, estimate, A, X_0
 
 
 def test_tare_is_zero_where_the_arm_rests(tared):
     state, estimate, _, X_0 = tared
     state.filtered[:] = X_0
-    state.resting[1] = state.held[1] = 1.0
+    state.resting[0] = state.held[0] = 1.0
+    work = part(Work)
     for _ in range(2):
         external_torque.update_torque(state, estimate)
         np.testing.assert_allclose(state.torque, 0.0, atol=1e-12)
-        external_torque.update_spread(SETTINGS, state, part(Work), estimate)
+        external_torque.update_spread(SETTINGS, state, work, estimate)
     deviations = [
-        np.sqrt(external_torque.variance_of(SETTINGS, state, i)) for i in range(N)
+        np.sqrt(external_torque.variance_of(SETTINGS, state, work, i)) for i in range(N)
     ]
     np.testing.assert_allclose(deviations, 0.1 * SETTINGS.unmodelled)  # the least
 
@@ -291,19 +307,17 @@ def test_tare_says_of_r_what_their_covariance_says(tared):
     external_torque.update_torque(state, estimate)
     P = 0.5 * np.linalg.inv(A)
     X, X_0, rows_0 = state.filtered[:, :M], X_0[:, :M], X_0
-    S = X @ P @ X.T + np.diag([0.04, 0.6])  # at rest, and slow
+    S = X @ P @ X.T + np.diag([0.5, 0.6])  # slow
     S_0 = X_0 @ P @ X_0.T + np.diag([0.04, 0.09])
-    C = X @ P @ X_0.T + np.diag([0.04, 0.0])  # joint 1 has moved
+    C = X @ P @ X_0.T + 0.5 * np.diag([0.04, 0.09])  # of friction
     K = C @ np.linalg.inv(S_0)
     r_0 = X_0 @ estimate - rows_0[:, M]
     expected = X @ estimate - state.filtered[:, M] - K @ r_0
     np.testing.assert_allclose(state.torque, expected)
     left = S - K @ C.T
     for i in range(N):
-        variance = external_torque.variance_of(SETTINGS, state, i)
-        assert variance == pytest.approx(
-            max(left[i, i], (0.1 * SETTINGS.unmodelled[i]) ** 2)
-        )
+        variance = external_torque.variance_of(SETTINGS, state, work, i)
+        assert variance == pytest.approx(left[i, i])
         assert variance < S[i, i]
 
 
@@ -319,6 +333,8 @@ def test_tare_is_forgotten_with_the_next_start(tared):
 def test_rest_after_a_tare_says_nothing_of_the_noise(tared):
     state = tared[0]
     state.torque[:] = 3.0
-    external_torque.update_noise(SETTINGS, state, part(Work))
-    assert state.noise[2, 0] == 0.04
-    assert state.noise[1, 1] > 0.6
+    for resting in (1.0, 0.0):
+        state.resting[0] = resting
+        external_torque.update_noise(SETTINGS, state, part(Work))
+        assert state.noise[2].tolist() == [0.04, 0.09]
+        assert (state.noise[1] > [0.5, 0.6]).all() is np.bool_(not resting)

@@ -377,7 +377,7 @@ class Controller:
         """Whether the external torque is found, and the arm has rested for long enough."""
         if not self.settings.contact.enabled:
             return False
-        return bool((self.state.contact.resting >= self.tare_rest).all())
+        return bool(self.state.contact.resting[0] >= self.tare_rest)
 
     @property
     def tare_rest(self) -> float:

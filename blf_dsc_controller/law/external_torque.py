@@ -16,15 +16,15 @@ with the variance a of rows that count (before the first window: the prior's), a
 mean square s^2 of r that theta leaves, measured while nothing touches: noise of the
 sensors, ripple, friction that its columns do not describe.  A joint that moves slowly, or is
 about to reverse, has an s^2 of its own, and so has one that rests.  Both are means over several
-windows, since what friction leaves is nearly constant in each slow motion and each rest; in slow
-motion s is at least a share of the friction, which is never known better there.
+windows, since what friction leaves is nearly constant in each slow motion and each rest, and at
+least a share of the Coulomb friction, which is never known better there.
 
 *A tare* keeps the row [X_0 | u_0] of an arm at rest, with S_0 and s_0 of then.  As r_0 = X_0
 theta^ - u_0 has the same error of theta as r, it says what r will be:
 
     r - K r_0,    K = C S_0^-1,    S - K C^T,    C = a X_L (Phi_e + rho R)^-1 X_0^T + diag(w s s_0)
 
-take the place of r and S.  w is 1 until the joint moves: until then its friction is that of the
+take the place of r and S.  w is 1 until the arm moves: until then its friction is that of the
 tare.  At the tare, K = 1 and the torque is zero; the further the arm moves from there, the less r
 and r_0 have in common, and the less K takes away.  A tare never widens an interval.  It is
 forgotten when the arm has changed, and at the next start.
@@ -63,7 +63,7 @@ _SETTLED = 6.0  # 1/L, of rest before a tare
 _LEAST_NOISE = 0.01  # of the mean square of the unmodelled torque
 _ASSUMED = (0.01, 0.1, 0.1)  # of a window, for which the unmodelled torque counts
 _REMEMBERED = (1.0, 4.0, 4.0)  # windows, over which the mean square is taken
-_LEAST_FRICTION = (0.0, 0.15, 0.0)  # of Coulomb friction, that is never known better
+_LEAST_FRICTION = (0.0, 0.15, 0.05)  # of Coulomb friction, which is never known better
 _MOST_NOISE = 4.0  # times the mean square: r^2 is clipped at this multiple
 _LIGHTER = 3.0  # standard deviations below zero, from which a mass is negative
 
@@ -103,12 +103,12 @@ class State(NamedTuple):
     samples: Annotated[Array, '3 * contact.enabled', 'n']  # samples of that
     # s, for which a joint still counts as reversing
     reversing: Annotated[Array, 'n * contact.enabled']
-    resting: Annotated[Array, 'n * contact.enabled']  # s, for which it has rested
+    resting: Cell  # s, for which the arm has rested
     tared: Cell  # 1: a tare is in force
     tare_changes: Cell  # changes of the arm that were found before it
     tare: Annotated[Array, 'n * contact.enabled', 'm + 1']  # its row [X_0 | u_0]
     tare_noise: Annotated[Array, 'n * contact.enabled']  # s_0^2, (N m)^2
-    held: Annotated[Array, 'n * contact.enabled']  # w
+    held: Cell  # w
     offset: Annotated[Array, 'n * contact.enabled']  # K r_0, N m
     load: Annotated[Array, '10 * contact.enabled']  # z, filtered from r
     load_covariance: Annotated[Array, '10 * contact.enabled', 10]
@@ -211,46 +211,49 @@ def residual(row: Array, estimate: Array) -> float:
 
 @inner
 def follow_reversals(settings: Settings, state: State, dqr: Array, dt: float) -> bool:
-    """Note which joints reverse, which rest and which have moved since a tare.
+    """Note which joints reverse, whether the arm rests, and whether it has since a tare.
 
-    dqr (n,) is the velocity of the reference.  Returns whether a joint begins to move.
+    dqr (n,) is the velocity of the reference.  Returns whether the arm begins to move.
     """
-    begins = False
     lasts = _AFTER / settings.bandwidth
-    fades = filter_gain(1.0 / settings.bandwidth, dt)
+    fastest = 0.0
     for i in range(dqr.size):
         speed = abs(dqr[i])
+        fastest = max(fastest, speed)
         is_slow = speed < _REVERSING * settings.coulomb_velocity
         left = state.reversing[i] - dt
         state.reversing[i] = lasts if is_slow else max(0.0, left)
-        if speed < _RESTING * settings.coulomb_velocity:
-            state.resting[i] += dt
-        else:
-            begins = begins or state.resting[i] > 0.0
-            state.resting[i] = 0.0
-            state.held[i] -= fades * state.held[i]
-    return begins
+    if fastest < _RESTING * settings.coulomb_velocity:
+        state.resting[0] += dt
+        return False
+    begins = state.resting[0] > 0.0
+    state.resting[0] = 0.0
+    state.held[0] -= filter_gain(1.0 / settings.bandwidth, dt) * state.held[0]
+    return bool(begins)
 
 
 @inner
 def regime(settings: Settings, state: State, i: int) -> int:
-    """Return the row of the noise of joint i, which depends on how it moves."""
-    if state.resting[i] * settings.bandwidth > _AFTER:
+    """Return the row of the noise of joint i, which depends on how the arm moves."""
+    if state.resting[0] * settings.bandwidth > _AFTER:
         return _REST
     return _SLOW if state.reversing[i] > 0.0 else _STEADY
 
 
 @inner
-def variance_of(settings: Settings, state: State, i: int) -> float:
-    """Return the variance of r - K r_0 of joint i [(N m)^2]."""
-    noise = state.noise[regime(settings, state, i), i]
-    return float(max(floor_of(settings, i), state.covariance[i, i] + noise))
+def least_variance(settings: Settings, work: Work, k: int, i: int) -> float:
+    """Return the least variance of r of joint i in a regime k [(N m)^2]."""
+    floor = settings.unmodelled[i]
+    friction = _LEAST_FRICTION[k] * work.coulomb[i]
+    return float(_LEAST_NOISE * floor * floor + friction * friction)
 
 
 @inner
-def floor_of(settings: Settings, i: int) -> float:
-    """Return the least variance of r of joint i [(N m)^2]."""
-    return float(_LEAST_NOISE * settings.unmodelled[i] * settings.unmodelled[i])
+def variance_of(settings: Settings, state: State, work: Work, i: int) -> float:
+    """Return the variance of r - K r_0 of joint i [(N m)^2]."""
+    k = regime(settings, state, i)
+    least = least_variance(settings, work, k, i)
+    return float(max(least, state.covariance[i, i] + state.noise[k, i]))
 
 
 @inner
@@ -258,11 +261,11 @@ def tare(state: State, changes: float) -> None:
     """Take r for that of an arm that rests and that nothing touches, after so many `changes`."""
     state.tared[0] = 1.0
     state.tare_changes[0] = changes
+    state.held[0] = 1.0
     for i in range(state.torque.size):
         for j in range(state.tare.shape[1]):
             state.tare[i, j] = state.filtered[i, j]
         state.tare_noise[i] = state.noise[_REST, i]
-        state.held[i] = 1.0
         state.offset[i] += state.torque[i]
         state.torque[i] = 0.0
 
@@ -294,7 +297,7 @@ def update_spread(
     for i in range(n):
         for other in range(i, n):
             state.spread[i, other] = state.covariance[i, other]
-        state.spread[i, i] = variance_of(settings, state, i)
+        state.spread[i, i] = variance_of(settings, state, work, i)
     cholesky_factor(state.spread)
 
 
@@ -333,7 +336,7 @@ def condition_on_tare(
         noise = state.noise[regime(settings, state, i), i]
         own = state.tare_noise[i]
         work.tare_spread[i, i] += own
-        work.shared[i, i] += state.held[i] * sqrt(own * min(own, noise))
+        work.shared[i, i] += state.held[0] * sqrt(own * min(own, noise))
         work.tare_torque[i] = residual(state.tare[i], estimate)
     cholesky_factor(work.tare_spread)
     whiten(work.tare_spread, work.tare_torque)
@@ -566,5 +569,4 @@ def update_noise(settings: Settings, state: State, work: Work) -> None:
         share = max(least, 1.0 / (first + state.samples[k, i]))
         left = state.torque[i] * state.torque[i] - state.covariance[i, i]
         noise[i] += share * (clip(left, 0.0, _MOST_NOISE * noise[i]) - noise[i])
-        friction = _LEAST_FRICTION[k] * work.coulomb[i]
-        noise[i] = max(noise[i], floor_of(settings, i) + friction * friction)
+        noise[i] = max(noise[i], least_variance(settings, work, k, i))

@@ -70,6 +70,7 @@ def update_external_torque(
     now = state.contact
     work = signals.contact
     update_covariance(settings, state)
+    fill_coulomb(settings, state, work.coulomb)
     external_torque.update_torque(now, state.estimate)
     begins = external_torque.follow_reversals(part, now, signals.dqr, dt)
     samples = int(state.samples[0])
@@ -82,20 +83,23 @@ def update_external_torque(
         mass, deviation = weighing.held_mass(state.weighing)
         load = TipLoad(tip.columns, tip.scale, mass, deviation)
         distance = external_torque.update_contact(part, now, work, load, distance, dt)
-    fill_coulomb(settings, state, work.coulomb)
     external_torque.update_noise(part, now, work)
     return distance
 
 
 @inner
 def fill_sample(
-    settings: Settings, state: State, distance: float, sample: Sample
+    settings: Settings,
+    state: State,
+    signals: Signals,
+    distance: float,
+    sample: Sample,
 ) -> None:
     """Write r with its interval, and the contact, to the telemetry sample."""
-    now = state.contact
+    now, work = state.contact, signals.contact
     for i in range(now.torque.size):
         sample.external[i] = now.torque[i]
-        deviation = sqrt(external_torque.variance_of(settings.contact, now, i))
+        deviation = sqrt(external_torque.variance_of(settings.contact, now, work, i))
         sample.external_interval[i] = TWO_SIDED * deviation
     sample.contact[CONTACT] = 1.0 if external_torque.is_touched(now) else 0.0
     sample.contact[DISTANCE] = distance
@@ -122,7 +126,7 @@ def sense(
     is_touched = external_torque.is_touched(state.contact)
     if is_touched and settings.contact.freezes == 1:
         state.frozen[0] = _SETTLED / settings.row.filter_pole
-    fill_sample(settings, state, distance, sample_of(sample_vector, settings))
+    fill_sample(settings, state, signals, distance, sample_of(sample_vector, settings))
     return is_touched and not was_touched
 
 
