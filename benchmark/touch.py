@@ -167,8 +167,8 @@ def loop_of(arm: str, seed: int) -> tuple[Loop, Trajectory, list[Insertion]]:
     usual = load_loop(arm).plant.disturbance
 
     def varied(values: tuple[float, ...]) -> list[float]:
-        n = len(controller.joints)
-        return (random.uniform(*FRICTION, n) * np.array(values)).tolist()
+        factors = random.uniform(*FRICTION, len(values))
+        return [float(each) for each in factors * values]
 
     given: dict[str, Any] = {
         'duration': insertions[-1].end,
