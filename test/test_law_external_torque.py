@@ -287,8 +287,12 @@ def tared(state):
 def test_tare_is_zero_where_the_arm_rests(tared):
     state, estimate, _, X_0 = tared
     state.filtered[:] = X_0
-    state.resting[0] = state.held[0] = 1.0
+    state.resting[0] = 1.0
     work = part(Work)
+    external_torque.forget_tare(state)
+    external_torque.update_torque(state, estimate)
+    assert (np.abs(state.torque) > 0.1).all()
+    external_torque.tare(state, 0.0)
     for _ in range(2):
         external_torque.update_torque(state, estimate)
         np.testing.assert_allclose(state.torque, 0.0, atol=1e-12)
