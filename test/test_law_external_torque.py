@@ -291,7 +291,7 @@ def test_tare_is_zero_where_the_arm_rests(tared):
     work = part(Work)
     external_torque.forget_tare(state)
     external_torque.update_torque(state, estimate)
-    assert (np.abs(state.torque) > 0.1).all()
+    assert (np.abs(state.torque) > 0.05).all()
     external_torque.tare(state, 0.0)
     for _ in range(2):
         external_torque.update_torque(state, estimate)
