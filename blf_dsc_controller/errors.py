@@ -26,6 +26,10 @@ class StartError(BlfDscError):
     """The law cannot take over the arm in its present state."""
 
 
+class TareError(BlfDscError):
+    """The external torque cannot be tared now; the message says why."""
+
+
 class MissingExtraError(BlfDscError):
     """A package from one of the optional extras is not installed."""
 

@@ -18,7 +18,7 @@ from blf_dsc_controller.bags.table import table
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.schema import build
 from blf_dsc_controller.control.arm_controller import ArmController
-from blf_dsc_controller.errors import ConfigurationError
+from blf_dsc_controller.errors import ConfigurationError, TareError
 from blf_dsc_controller.factory.controller import controller_of
 from blf_dsc_controller.law.external_torque import absorb
 from blf_dsc_controller.law.perception import CONTACT
@@ -340,3 +340,64 @@ def test_load_is_filtered_as_least_squares_would():
 def test_bad_values_are_named_with_a_remedy(given, problem):
     with pytest.raises(ConfigurationError, match=problem):
         build(ControllerConfig, given)
+
+
+def test_tare_at_rest_is_zero_there_replays_and_is_forgotten(tmp_path):
+    """Refused in motion and during a contact; a push of 20 N is found all the same."""
+    loop = loop_of(
+        pushed(PUSH, 9.5, 10.0),
+        **{'contact.reaction': 'hold', 'contact.loads': False},
+    )
+    plant = plant_of(loop.plant)
+    count = 0
+
+    def run(seconds):
+        nonlocal count
+        for _ in range(round(1e3 * seconds)):
+            state = plant.measure().reshape(3, -1)
+            plant.step(controller.update(1.0 + 1e-3 * count, *state))
+            count += 1
+
+    with ArmController(loop.controller, record=tmp_path / 'bag') as controller:
+        guard = controller.guard
+        law = guard.controller
+        with pytest.raises(TareError, match='the law is not in command'):
+            controller.tare()
+        run(8.0)
+        with pytest.raises(
+            TareError, match=r'the arm moves, .* hold it still for 0.2 s'
+        ):
+            controller.tare()
+        assert not controller.is_tared
+        guard.brake()
+        run(1.0)
+        before = law.sample.external_interval.copy()
+        controller.tare()
+        run(0.3)
+        assert controller.is_tared
+        assert (law.sample.external_interval < 0.7 * before).all()
+        assert (np.abs(law.sample.external) < law.sample.external_interval).all()
+        assert not guard.contacts
+        run(0.3)
+        assert guard.contacts == 1
+        with pytest.raises(
+            TareError, match=r'something touches the arm: .* clear it first'
+        ):
+            controller.tare()
+        law.state.change.changes[0] += 1.0  # as if it had picked up a load
+        law.perceive(1e-3)
+        assert not controller.is_tared
+        law.state.change.changes[0] -= 1.0
+    result = verify(tmp_path / 'bag')
+    assert result.difference is None
+    assert not result.is_partial
+    assert [event.type for event in result.events].count(EventType.TARE) == 1
+
+
+def test_tare_without_external_torque_says_what_to_set():
+    loop = loop_of(NOTHING, **{'contact.enabled': False})
+    with (
+        ArmController(loop.controller) as controller,
+        pytest.raises(TareError, match=r'set contact\.enabled'),
+    ):
+        controller.tare()

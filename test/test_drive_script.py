@@ -164,6 +164,13 @@ def test_load_is_declared_to_drives_that_compensate_and_no_torque_changes(tmp_pa
     assert np.nanmax(np.abs(error)) < 1e-3
 
 
+def test_tare_is_refused_with_the_reason_and_the_arm_holds(arm):
+    """The preset computes no external torque."""
+    with pytest.raises(MotionFailedError, match=r'set contact\.enabled'):
+        arm.tare()
+    assert not arm.ended
+
+
 def test_load_is_not_declared_to_drives_that_add_nothing(arm):
     with pytest.raises(MotionFailedError, match='drive_compensates: got none'):
         arm.load(1.0)

@@ -157,17 +157,19 @@ def test_distance_is_that_of_the_covariance_by_theta_and_noise(state):
     cholesky_factor(factor)
     external_torque.update_covariance(state, factor, 0.04, 7.0)
     state.filtered[:, :M] = X
-    state.noise[:] = [[0.3, 0.2], [5.0, 6.0]]  # in motion, at reversals
+    state.noise[:] = [[0.3, 0.2], [5.0, 6.0], [8.0, 9.0]]  # fast, slow, at rest
     state.reversing[1] = 0.1
     state.torque[:] = 1.0, -2.0
     work = part(Work)
-    external_torque.update_spread(state, work)
+    external_torque.update_spread(SETTINGS, state, work, np.zeros(M))
     by_theta = 0.04 * X @ np.linalg.inv(A) @ X.T
     S = by_theta + np.diag([0.3, 6.0])
     expected = np.sqrt(state.torque @ np.linalg.solve(S, state.torque))
     assert external_torque.whiten_torque(state, work) == pytest.approx(expected)
     for i in range(N):
-        assert external_torque.variance_of(state, i) == pytest.approx(S[i, i])
+        assert external_torque.variance_of(SETTINGS, state, work, i) == pytest.approx(
+            S[i, i]
+        )
 
 
 def test_prior_is_that_of_theta_and_of_unmodelled_torque():
@@ -175,22 +177,22 @@ def test_prior_is_that_of_theta_and_of_unmodelled_torque():
     information = np.diag([4.0, 1.0, 0.25])
     external_torque.begin(SETTINGS, state, information)
     state.filtered[0, 0] = 1.0  # whose standard deviation is 0.5
-    external_torque.update_spread(state, part(Work))
+    external_torque.update_spread(SETTINGS, state, part(Work), np.zeros(M))
     np.testing.assert_allclose(np.diag(state.covariance), [0.25, 0.0])
-    np.testing.assert_allclose(state.noise, [[0.25, 0.01]] * 2)
+    np.testing.assert_allclose(state.noise, [[0.25, 0.01]] * 3)
 
 
 def test_joint_counts_as_reversing_until_its_filter_has_settled():
     """Below 1.5 times 0.02 rad/s, and for 3 / L = 0.1 s after."""
     state = part(State)
     external_torque.follow_reversals(SETTINGS, state, np.array([0.029, 0.031]), DT)
-    assert [external_torque.regime(state, i) for i in range(N)] == [1, 0]
+    assert [external_torque.regime(SETTINGS, state, i) for i in range(N)] == [1, 0]
     for _ in range(99):
         external_torque.follow_reversals(SETTINGS, state, np.array([-0.1, 0.1]), DT)
-    assert external_torque.regime(state, 0) == 1
+    assert external_torque.regime(SETTINGS, state, 0) == 1
     for _ in range(2):
         external_torque.follow_reversals(SETTINGS, state, np.array([-0.1, 0.1]), DT)
-    assert external_torque.regime(state, 0) == 0
+    assert external_torque.regime(SETTINGS, state, 0) == 0
 
 
 @pytest.mark.parametrize('phase', [QUIET, EXPLAINED, TOUCHED])
@@ -199,8 +201,9 @@ def test_noise_is_measured_while_nothing_touches(state, phase):
     state.noise[:] = 0.3
     state.phase[0] = phase
     state.torque[:] = 0.5
+    work = part(Work)
     for _ in range(SETTINGS.window * SETTINGS.row_interval):
-        external_torque.update_noise(SETTINGS, state)
+        external_torque.update_noise(SETTINGS, state, work)
     expected = 0.3 if phase == TOUCHED else pytest.approx(0.25, rel=0.1)
     assert state.noise[0, 0] == expected
     assert state.noise[1, 0] == 0.3  # of reversals
@@ -208,10 +211,134 @@ def test_noise_is_measured_while_nothing_touches(state, phase):
 
 def test_noise_is_measured_from_the_first_window_on(state):
     state.latch_time[0] = 0.0
-    external_torque.update_noise(SETTINGS, state)
+    external_torque.update_noise(SETTINGS, state, part(Work))
     assert not state.samples.any()
     state.latch_time[0] = 1.0
     assert not external_torque.is_settled(state, DT)
     for _ in range(500):  # 0.5 s
-        external_torque.update_noise(SETTINGS, state)
+        external_torque.update_noise(SETTINGS, state, part(Work))
     assert external_torque.is_settled(state, DT)
+
+
+def test_arm_counts_as_resting_once_its_filter_has_settled():
+    """All joints below 0.005 times 0.02 rad/s for 3 / L = 0.1 s; it begins to move at once."""
+    state = part(State)
+    state.held[0] = 1.0
+    for speeds, expected in (([0.9e-4, 1.1e-4], 1), ([0.9e-4, 0.9e-4], 2)):
+        for _ in range(102):
+            external_torque.follow_reversals(SETTINGS, state, np.array(speeds), DT)
+        for i in range(N):
+            assert external_torque.regime(SETTINGS, state, i) == expected
+    moving = np.array([0.0, 0.01])
+    state.held[0] = 1.0
+    assert external_torque.follow_reversals(SETTINGS, state, moving, DT)
+    assert not external_torque.follow_reversals(SETTINGS, state, moving, DT)
+    assert external_torque.regime(SETTINGS, state, 0) == 1
+    for _ in range(98):
+        external_torque.follow_reversals(SETTINGS, state, moving, DT)
+    assert state.held[0] == pytest.approx(np.exp(-3.0), rel=0.01)
+
+
+@pytest.mark.parametrize(
+    ('reversing', 'resting', 'least'),
+    [
+        (0.0, 0.0, 0.05),
+        (0.1, 0.0, np.hypot(0.05, 1.5)),
+        (0.1, 1.0, np.hypot(0.05, 0.5)),
+    ],
+)
+def test_noise_of_slow_motion_and_rest_is_at_least_a_share_of_friction(
+    state, reversing, resting, least
+):
+    """0.15 of 10 N m, 0.05 at rest, and a tenth of the unmodelled 0.5 N m in any motion."""
+    state.reversing[:] = reversing
+    state.resting[:] = resting
+    state.noise[:] = 1e-9
+    work = part(Work)
+    work.coulomb[:] = 10.0
+    external_torque.update_noise(SETTINGS, state, work)
+    k = external_torque.regime(SETTINGS, state, 0)
+    assert np.sqrt(state.noise[k, 0]) == pytest.approx(least)
+
+
+@pytest.fixture
+def tared(state):
+    """An arm of X_0 that was tared at rest, and has gone to X since, where it moves."""
+    random = np.random.default_rng(2)
+    B = random.normal(size=(M, M))
+    A = B @ B.T + np.eye(M)
+    factor = A.copy()
+    cholesky_factor(factor)
+    external_torque.update_covariance(state, factor, 0.5, 7.0)
+    state.filtered[:] = random.normal(size=(N, M + 1))
+    state.noise[:] = [[0.3, 0.2], [0.5, 0.6], [0.04, 0.09]]
+    state.reversing[:] = 1.0
+    state.resting[0] = 1.0
+    estimate = random.normal(size=M)
+    X_0 = state.filtered.copy()
+    external_torque.update_torque(state, estimate)
+    external_torque.tare(state, 0.0)
+    state.filtered[:] += 0.1 * random.normal(size=(N, M + 1))
+    state.resting[0] = 0.0
+    state.held[0] = 0.5
+    return state, estimate, A, X_0
+
+
+def test_tare_is_zero_where_the_arm_rests(tared):
+    state, estimate, _, X_0 = tared
+    state.filtered[:] = X_0
+    state.resting[0] = 1.0
+    work = part(Work)
+    external_torque.forget_tare(state)
+    external_torque.update_torque(state, estimate)
+    assert (np.abs(state.torque) > 0.05).all()
+    external_torque.tare(state, 0.0)
+    for _ in range(2):
+        external_torque.update_torque(state, estimate)
+        np.testing.assert_allclose(state.torque, 0.0, atol=1e-12)
+        external_torque.update_spread(SETTINGS, state, work, estimate)
+    deviations = [
+        np.sqrt(external_torque.variance_of(SETTINGS, state, work, i)) for i in range(N)
+    ]
+    np.testing.assert_allclose(deviations, 0.1 * SETTINGS.unmodelled)  # the least
+
+
+def test_tare_says_of_r_what_their_covariance_says(tared):
+    """The conditional mean and covariance of Gaussian r given r_0, as numpy finds it."""
+    state, estimate, A, X_0 = tared
+    work = part(Work)
+    external_torque.update_spread(SETTINGS, state, work, estimate)
+    external_torque.update_torque(state, estimate)
+    P = 0.5 * np.linalg.inv(A)
+    X, X_0, rows_0 = state.filtered[:, :M], X_0[:, :M], X_0
+    S = X @ P @ X.T + np.diag([0.5, 0.6])  # slow
+    S_0 = X_0 @ P @ X_0.T + np.diag([0.04, 0.09])
+    C = X @ P @ X_0.T + 0.5 * np.diag([0.04, 0.09])  # of friction
+    K = C @ np.linalg.inv(S_0)
+    r_0 = X_0 @ estimate - rows_0[:, M]
+    expected = X @ estimate - state.filtered[:, M] - K @ r_0
+    np.testing.assert_allclose(state.torque, expected)
+    left = S - K @ C.T
+    for i in range(N):
+        variance = external_torque.variance_of(SETTINGS, state, work, i)
+        assert variance == pytest.approx(left[i, i])
+        assert variance < S[i, i]
+
+
+def test_tare_is_forgotten_with_the_next_start(tared):
+    state, estimate, _, _ = tared
+    external_torque.update_spread(SETTINGS, state, part(Work), estimate)
+    assert state.offset.any()
+    external_torque.begin(SETTINGS, state, np.eye(M))
+    assert state.tared[0] == 0.0
+    assert not state.offset.any()
+
+
+def test_rest_after_a_tare_says_nothing_of_the_noise(tared):
+    state = tared[0]
+    state.torque[:] = 3.0
+    for resting in (1.0, 0.0):
+        state.resting[0] = resting
+        external_torque.update_noise(SETTINGS, state, part(Work))
+        assert state.noise[2].tolist() == [0.04, 0.09]
+        assert (state.noise[1] > [0.5, 0.6]).all() is np.bool_(not resting)

@@ -38,6 +38,7 @@ EXAMPLES = {
     'brake': {},
     'parameters': {'parameters': {'feedback.gain': [1.0, 2.0]}},
     'drive load': {'mass': 1.5, 'centre': [0.0, 0.0, 0.1]},
+    'tare': {},
     'contact': {
         'reaction': 'hold',
         'joint': 'joint1',

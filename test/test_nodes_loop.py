@@ -28,6 +28,7 @@ from ros_rig import (
     torques,
     values,
 )
+from std_srvs.srv import Trigger
 from test_plant_sampled import ALL_KINDS
 
 from blf_dsc_controller.configuration.controller import ControllerConfig
@@ -197,6 +198,31 @@ def test_external_torque_and_its_interval_are_published(ros):
     decoder = JointStateDecoder(names, required=('effort',))
     decoder.decode(received[-1])
     assert (decoder.effort[2:] > np.abs(decoder.effort[:2])).all()
+
+
+@pytest.mark.parametrize(
+    ('kind', 'success', 'message'),
+    [
+        ('hold', True, 'the external torque is zero here'),
+        ('sinusoids', False, 'tare: the arm moves, or has just come to rest'),
+    ],
+)
+def test_external_torque_is_tared_at_rest(ros, kind, success, message):
+    """Once the arm has been held for half a second, and not in motion."""
+    received = ros.listen(topics.EXTERNAL_TORQUE, raw=True)
+    ros.add(PlantNode, {'mode': 'lockstep'})
+    given = {
+        'contact.enabled': True,
+        'reference.type': kind,
+        'telemetry.decimation': 1,
+    }
+    node = ros.add(ControllerNode, given)
+    ros.until(lambda: len(received) > 500)
+    response = ros.call(Trigger, f'{node.get_name()}/tare', Trigger.Request())
+    assert response.success is success
+    assert response.message.startswith(message)
+    ros.until(lambda: len(received) > 520)
+    assert node.guard.controller.is_tared is success
 
 
 def test_nodes_on_simulated_time_follow_the_clock_of_the_plant(ros):

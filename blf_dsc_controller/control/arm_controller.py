@@ -262,6 +262,24 @@ class ArmController:
         """
         self._loop.guard.take_over(load)
 
+    def tare(self) -> None:
+        """Take the external torque for zero where the arm rests now.
+
+        What an insertion needs: the wrench is then relative to this moment, with a narrower
+        interval as long as the arm stays near.  It is forgotten when the arm is found to have
+        changed, as by a load that it grips, and at the next start.
+
+        Raises:
+            TareError: the arm moves or has just come to rest, something touches it, the law
+                is not in command, or `contact.enabled` is false.
+        """
+        self._loop.guard.tare()
+
+    @property
+    def is_tared(self) -> bool:
+        """Whether a tare is in force."""
+        return self._loop.guard.controller.is_tared
+
     @property
     def is_at_rest(self) -> bool:
         """Whether the reference and the arm rest."""

@@ -185,6 +185,7 @@ def _contact(guard: Guard) -> Part:
         'contacts': guard.contacts,
         'distance': f'{guard.controller.sample.contact[DISTANCE]:.3g}',
         'threshold': f'{guard.config.contact.threshold:g}',
+        'tared': str(guard.controller.is_tared).lower(),
     }
     if last is not None:
         values |= {

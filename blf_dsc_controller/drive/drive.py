@@ -260,6 +260,18 @@ class Drive:
             script_link.LOAD, lambda number: {'number': number, **wanted}, timeout
         )
 
+    def tare(self, timeout: float | None = None) -> None:
+        """Take the external torque for zero where the arm rests now, as before an insertion.
+
+        `state.external` is then relative to this moment.
+
+        Raises:
+            MotionFailedError: the arm moves or has just come to rest, something touches it, or
+                `contact.enabled` is false.
+            NotInTimeError, LoopEndedError: as for `move_to`.
+        """
+        self._ask(script_link.TARE, lambda number: number, timeout)
+
     # State.
 
     @property

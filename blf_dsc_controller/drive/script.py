@@ -19,7 +19,7 @@ from blf_dsc_controller.control.goals import Goals
 from blf_dsc_controller.control.slow_move import duration_of
 from blf_dsc_controller.drive.beside import Beside
 from blf_dsc_controller.drive.loop import DriveLoop
-from blf_dsc_controller.errors import BlfDscError
+from blf_dsc_controller.errors import BlfDscError, TareError
 from blf_dsc_controller.law.external_torque import is_touched
 from blf_dsc_controller.messages import script_link, topic_link
 from blf_dsc_controller.messages.link import Link
@@ -114,6 +114,8 @@ class Script(Beside):
                 self._brake(wanted)
             case script_link.LOAD:
                 self._declare(wanted)
+            case script_link.TARE:
+                self._tare(wanted)
             case script_link.CLOSE:
                 self._close()
 
@@ -139,6 +141,14 @@ class Script(Beside):
             self._tell_done(number, str(error))
         else:
             self._braking.append((end, number))
+
+    def _tare(self, number: int) -> None:
+        try:
+            self._guard.tare()
+        except TareError as error:
+            self._tell_done(number, str(error))
+        else:
+            self._tell_done(number)
 
     def _declare(self, wanted: dict[str, Any]) -> None:
         load = DriveLoad(wanted['mass'], tuple(wanted['centre']))

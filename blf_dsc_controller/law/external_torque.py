@@ -14,8 +14,20 @@ covariance of r,
 
 with the variance a of rows that count (before the first window: the prior's), and the
 mean square s^2 of r that theta leaves, measured while nothing touches: noise of the
-sensors, ripple, friction that its columns do not describe.  A joint that is about to
-reverse has an s^2 of its own.
+sensors, ripple, friction that its columns do not describe.  A joint that moves slowly, or is
+about to reverse, has an s^2 of its own, and so has one that rests.  Both are means over several
+windows, since what friction leaves is nearly constant in each slow motion and each rest, and at
+least a share of the Coulomb friction, which is never known better there.
+
+*A tare* keeps the row [X_0 | u_0] of an arm at rest, with S_0 and s_0 of then.  As r_0 = X_0
+theta^ - u_0 has the same error of theta as r, it says what r will be:
+
+    r - K r_0,    K = C S_0^-1,    S - K C^T,    C = a X_L (Phi_e + rho R)^-1 X_0^T + diag(w s s_0)
+
+take the place of r and S.  w is 1 until the arm moves: until then its friction is that of the
+tare.  At the tare, K = 1 and the torque is zero; the further the arm moves from there, the less r
+and r_0 have in common, and the less K takes away.  A tare never widens an interval.  It is
+forgotten when the arm has changed, and at the next start.
 
 *A contact* is r with r^T S^-1 r > h^2, unless a load explains it.  A load in the tip with phi = D z
 adds X_L N D z (see `weighing`).  Once r is past h, z ~ (0, 1) is filtered from r, and only what is
@@ -43,16 +55,22 @@ _FIRST = 0.5  # s since the first window, in which theta^ settles and s^2 is mea
 _CALM = 0.2  # s below half of the threshold, after which a contact is over
 _EXPLAINED = 0.5  # s, likewise for a load that explains it
 _REVERSING = 1.5  # `learning.coulomb_velocity`, below which a joint is about to reverse
-_AFTER = 3.0  # 1/L, for which it still counts as reversing
+_RESTING = 0.005  # `learning.coulomb_velocity`, below which it rests
+_AFTER = (
+    3.0  # 1/L, for which it still counts as reversing, and does not count as resting
+)
+_SETTLED = 6.0  # 1/L, of rest before a tare
 _LEAST_NOISE = 0.01  # of the mean square of the unmodelled torque
-_ASSUMED = 0.01  # of a window, for which the unmodelled torque counts
+_ASSUMED = (0.01, 0.1, 0.1)  # of a window, for which the unmodelled torque counts
+_REMEMBERED = (1.0, 4.0, 4.0)  # windows, over which the mean square is taken
+_LEAST_FRICTION = (0.0, 0.15, 0.05)  # of Coulomb friction, which is never known better
 _MOST_NOISE = 4.0  # times the mean square: r^2 is clipped at this multiple
 _LIGHTER = 3.0  # standard deviations below zero, from which a mass is negative
 
 QUIET, EXPLAINED, TOUCHED = range(3)
 """Phases: r is small; it is large, but a load explains it; something touches the arm."""
 
-_STEADY, _REVERSAL = range(2)  # rows of `State.noise` and `State.samples`
+_STEADY, _SLOW, _REST = range(3)  # rows of `State.noise` and `State.samples`
 
 
 class Settings(NamedTuple):
@@ -77,17 +95,24 @@ class State(NamedTuple):
     latch_time: Cell  # s, when the window of `factor` was latched; 0: it is the prior's
     factor: Annotated[Array, 'm * contact.enabled', 'm']  # of Phi_e + rho R, or of R
     variance: Cell  # a: that times its inverse is the covariance of theta
-    # of r by theta, (N m)^2
+    # of r by theta, less what a tare knows of r, (N m)^2
     covariance: Annotated[Array, 'n * contact.enabled', 'n']
     spread: Annotated[Array, 'n * contact.enabled', 'n']  # factor of S
-    # s^2, in motion and at reversals, (N m)^2
-    noise: Annotated[Array, '2 * contact.enabled', 'n']
-    samples: Annotated[Array, '2 * contact.enabled', 'n']  # samples of that
+    # s^2, in motion, in slow motion and at rest, (N m)^2
+    noise: Annotated[Array, '3 * contact.enabled', 'n']
+    samples: Annotated[Array, '3 * contact.enabled', 'n']  # samples of that
     # s, for which a joint still counts as reversing
     reversing: Annotated[Array, 'n * contact.enabled']
+    resting: Cell  # s, for which the arm has rested
+    tared: Cell  # 1: a tare is in force
+    tare_changes: Cell  # changes of the arm that were found before it
+    tare: Annotated[Array, 'n * contact.enabled', 'm + 1']  # its row [X_0 | u_0]
+    tare_noise: Annotated[Array, 'n * contact.enabled']  # s_0^2, (N m)^2
+    held: Cell  # w
+    offset: Annotated[Array, 'n * contact.enabled']  # K r_0, N m
     load: Annotated[Array, '10 * contact.enabled']  # z, filtered from r
     load_covariance: Annotated[Array, '10 * contact.enabled', 10]
-    torque: Annotated[Array, 'n * contact.enabled']  # r, N m
+    torque: Annotated[Array, 'n * contact.enabled']  # r - K r_0, N m
     phase: Cell  # QUIET, EXPLAINED or TOUCHED
     calm: Cell  # s, since r has been small
     explained: Cell  # s, since a load has explained a contact
@@ -97,6 +122,11 @@ class Work(NamedTuple):
     """Scratch of one sample."""
 
     rows: Annotated[Array, 'n * contact.enabled', 'm']  # X_L, whitened
+    tare_rows: Annotated[Array, 'n * contact.enabled', 'm']  # X_0, whitened
+    tare_torque: Annotated[Array, 'n * contact.enabled']  # r_0, whitened by S_0
+    tare_spread: Annotated[Array, 'n * contact.enabled', 'n']  # factor of S_0
+    shared: Annotated[Array, 'n * contact.enabled', 'n']  # rows of C, whitened by S_0
+    coulomb: Annotated[Array, 'n * contact.enabled']  # c^, N m
     white: Annotated[Array, 'n * contact.enabled']  # r, whitened
     columns: Annotated[Array, 'n * contact.enabled', 10]  # X_L N D, whitened
     load: Annotated[Array, '10 * contact.enabled']  # z by this sample alone
@@ -134,8 +164,9 @@ def begin(settings: Settings, state: State, information: Array) -> None:
     copy_upper(information, state.factor)
     cholesky_factor(state.factor)
     state.variance[0] = 1.0
+    forget_tare(state)
     for i in range(settings.unmodelled.size):
-        for k in range(2):
+        for k in range(3):
             state.noise[k, i] = settings.unmodelled[i] * settings.unmodelled[i]
 
 
@@ -163,54 +194,161 @@ def copy_upper(source: Array, target: Array) -> None:
 
 @inner
 def update_torque(state: State, estimate: Array) -> None:
-    """Compute r = X_L theta^ - u_L."""
-    m = estimate.size
+    """Compute r - K r_0."""
     for i in range(state.torque.size):
-        r = -state.filtered[i, m]
-        for j in range(m):
-            r += state.filtered[i, j] * estimate[j]
-        state.torque[i] = r
+        state.torque[i] = residual(state.filtered[i], estimate) - state.offset[i]
 
 
 @inner
-def follow_reversals(settings: Settings, state: State, dqr: Array, dt: float) -> None:
-    """Note which joints are about to reverse, by the velocity dqr (n,) of the reference."""
+def residual(row: Array, estimate: Array) -> float:
+    """Return X theta^ - u of a row [X | u] (m + 1,) [N m]."""
+    m = estimate.size
+    r = -row[m]
+    for j in range(m):
+        r += row[j] * estimate[j]
+    return float(r)
+
+
+@inner
+def follow_reversals(settings: Settings, state: State, dqr: Array, dt: float) -> bool:
+    """Note which joints reverse, whether the arm rests, and whether it has since a tare.
+
+    dqr (n,) is the velocity of the reference.  Returns whether the arm begins to move.
+    """
     lasts = _AFTER / settings.bandwidth
+    fastest = 0.0
     for i in range(dqr.size):
-        is_slow = abs(dqr[i]) < _REVERSING * settings.coulomb_velocity
+        speed = abs(dqr[i])
+        fastest = max(fastest, speed)
+        is_slow = speed < _REVERSING * settings.coulomb_velocity
         left = state.reversing[i] - dt
         state.reversing[i] = lasts if is_slow else max(0.0, left)
+    if fastest < _RESTING * settings.coulomb_velocity:
+        state.resting[0] += dt
+        return False
+    begins = state.resting[0] > 0.0
+    state.resting[0] = 0.0
+    state.held[0] -= filter_gain(1.0 / settings.bandwidth, dt) * state.held[0]
+    return bool(begins)
 
 
 @inner
-def regime(state: State, i: int) -> int:
-    """Return the row of the noise of joint i, which depends on whether it reverses."""
-    return _REVERSAL if state.reversing[i] > 0.0 else _STEADY
+def regime(settings: Settings, state: State, i: int) -> int:
+    """Return the row of the noise of joint i, which depends on how the arm moves."""
+    if state.resting[0] * settings.bandwidth > _AFTER:
+        return _REST
+    return _SLOW if state.reversing[i] > 0.0 else _STEADY
 
 
 @inner
-def variance_of(state: State, i: int) -> float:
-    """Return the variance of r of joint i [(N m)^2]."""
-    return float(state.covariance[i, i] + state.noise[regime(state, i), i])
+def least_variance(settings: Settings, work: Work, k: int, i: int) -> float:
+    """Return the least variance of r of joint i in a regime k [(N m)^2]."""
+    floor = settings.unmodelled[i]
+    friction = _LEAST_FRICTION[k] * work.coulomb[i]
+    return float(_LEAST_NOISE * floor * floor + friction * friction)
 
 
 @inner
-def update_spread(state: State, work: Work) -> None:
-    """Compute the covariance of r by theta, and the factor of S."""
-    n, m = work.rows.shape
-    for i in range(n):
-        for k in range(m):
-            work.rows[i, k] = state.filtered[i, k]
-        whiten(state.factor, work.rows[i])
+def variance_of(settings: Settings, state: State, work: Work, i: int) -> float:
+    """Return the variance of r - K r_0 of joint i [(N m)^2]."""
+    k = regime(settings, state, i)
+    least = least_variance(settings, work, k, i)
+    return float(max(least, state.covariance[i, i] + state.noise[k, i]))
+
+
+@inner
+def tare(state: State, changes: float) -> None:
+    """Take r for that of an arm that rests and that nothing touches, after so many `changes`."""
+    state.tared[0] = 1.0
+    state.tare_changes[0] = changes
+    state.held[0] = 1.0
+    for i in range(state.torque.size):
+        for j in range(state.tare.shape[1]):
+            state.tare[i, j] = state.filtered[i, j]
+        state.tare_noise[i] = state.noise[_REST, i]
+        state.offset[i] += state.torque[i]
+        state.torque[i] = 0.0
+
+
+@inner
+def forget_tare(state: State) -> None:
+    """Go on without a tare."""
+    state.tared[0] = 0.0
+    for i in range(state.offset.size):
+        state.offset[i] = 0.0
+
+
+@inner
+def settling_time(settings: Settings) -> float:
+    """Return how long [s] an arm rests before a tare."""
+    return _SETTLED / settings.bandwidth
+
+
+@inner
+def update_spread(
+    settings: Settings, state: State, work: Work, estimate: Array
+) -> None:
+    """Compute the covariance of r - K r_0 by theta, the factor of S, and K r_0."""
+    whiten_rows(state, state.filtered, work.rows)
+    fill_products(state, work.rows, work.rows, state.covariance)
+    if state.tared[0] == 1.0:
+        condition_on_tare(settings, state, work, estimate)
+    n = state.torque.size
     for i in range(n):
         for other in range(i, n):
+            state.spread[i, other] = state.covariance[i, other]
+        state.spread[i, i] = variance_of(settings, state, work, i)
+    cholesky_factor(state.spread)
+
+
+@inner
+def whiten_rows(state: State, source: Array, rows: Array) -> None:
+    """Write the rows X of `source` (n, m + 1) to `rows` (n, m), whitened."""
+    n, m = rows.shape
+    for i in range(n):
+        for k in range(m):
+            rows[i, k] = source[i, k]
+        whiten(state.factor, rows[i])
+
+
+@inner
+def fill_products(state: State, rows: Array, others: Array, target: Array) -> None:
+    """Compute a X (Phi_e + rho R)^-1 Y^T (n, n) of whitened rows X and Y."""
+    n, m = rows.shape
+    for i in range(n):
+        for j in range(n):
             total = 0.0
             for k in range(m):
-                total += work.rows[i, k] * work.rows[other, k]
-            state.covariance[i, other] = state.variance[0] * total
-            state.spread[i, other] = state.covariance[i, other]
-        state.spread[i, i] += state.noise[regime(state, i), i]
-    cholesky_factor(state.spread)
+                total += rows[i, k] * others[j, k]
+            target[i, j] = state.variance[0] * total
+
+
+@inner
+def condition_on_tare(
+    settings: Settings, state: State, work: Work, estimate: Array
+) -> None:
+    """Take what r_0 says of r from its covariance; compute K r_0."""
+    n = state.torque.size
+    whiten_rows(state, state.tare, work.tare_rows)
+    fill_products(state, work.tare_rows, work.tare_rows, work.tare_spread)
+    fill_products(state, work.rows, work.tare_rows, work.shared)
+    for i in range(n):
+        noise = state.noise[regime(settings, state, i), i]
+        own = state.tare_noise[i]
+        work.tare_spread[i, i] += own
+        work.shared[i, i] += state.held[0] * sqrt(own * min(own, noise))
+        work.tare_torque[i] = residual(state.tare[i], estimate)
+    cholesky_factor(work.tare_spread)
+    whiten(work.tare_spread, work.tare_torque)
+    for i in range(n):
+        whiten(work.tare_spread, work.shared[i])
+        state.offset[i] = 0.0
+        for k in range(n):
+            state.offset[i] += work.shared[i, k] * work.tare_torque[k]
+    for i in range(n):
+        for other in range(n):
+            for k in range(n):
+                state.covariance[i, other] -= work.shared[i, k] * work.shared[other, k]
 
 
 @inner
@@ -224,7 +362,9 @@ def whiten_torque(state: State, work: Work) -> float:
 @inner
 def is_settled(state: State, dt: float) -> bool:
     """Whether theta^ has settled since the first window, and s^2 is measured."""
-    seen = state.samples[_STEADY, 0] + state.samples[_REVERSAL, 0]
+    seen = 0.0
+    for k in range(3):
+        seen += state.samples[k, 0]
     return bool(state.latch_time[0] > 0.0 and seen * dt >= _FIRST)
 
 
@@ -409,22 +549,24 @@ def update_contact(
 
 
 @inner
-def update_noise(settings: Settings, state: State) -> None:
-    """Update s^2, over a window, from the first one on while nothing touches the arm.
+def update_noise(settings: Settings, state: State, work: Work) -> None:
+    """Update s^2 from the first window on, while nothing touches the arm.
 
     At first it is the mean since the first window, with the unmodelled torque as a
-    small part of it.
+    small part of it.  At rest after a tare, r says nothing of it.
     """
     if state.latch_time[0] == 0.0 or is_touched(state):
         return
-    least = 1.0 / (settings.window * settings.row_interval)
-    first = _ASSUMED * settings.window * settings.row_interval
+    window = settings.window * settings.row_interval
     for i in range(state.torque.size):
-        k = regime(state, i)
+        k = regime(settings, state, i)
         noise = state.noise[k]
         state.samples[k, i] += 1.0
+        if k == _REST and state.tared[0] == 1.0:
+            continue
+        first = _ASSUMED[k] * window
+        least = 1.0 / (_REMEMBERED[k] * window)
         share = max(least, 1.0 / (first + state.samples[k, i]))
-        floor = settings.unmodelled[i] * settings.unmodelled[i]
         left = state.torque[i] * state.torque[i] - state.covariance[i, i]
         noise[i] += share * (clip(left, 0.0, _MOST_NOISE * noise[i]) - noise[i])
-        noise[i] = max(noise[i], _LEAST_NOISE * floor)
+        noise[i] = max(noise[i], least_variance(settings, work, k, i))

@@ -37,6 +37,8 @@ def update_covariance(settings: Settings, state: State) -> None:
     if state.samples[0] <= 1.0:
         external_torque.begin(settings.contact, state.contact, settings.information)
         return
+    if state.change.changes[0] != state.contact.tare_changes[0]:
+        external_torque.forget_tare(state.contact)
     latch = state.latch
     is_full = window.is_full(settings.window, state.window) and latch.latched[0] == 1.0
     if is_full and latch.latch_time[0] != state.contact.latch_time[0]:
@@ -50,6 +52,16 @@ def update_covariance(settings: Settings, state: State) -> None:
 
 
 @inner
+def fill_coulomb(settings: Settings, state: State, coulomb: Array) -> None:
+    """Write the Coulomb friction of each joint, learned or assumed, to `coulomb` (n,) [N m]."""
+    of = settings.friction
+    for i in range(coulomb.size):
+        coulomb[i] = of.initial[i]
+        if of.coulomb == 1:
+            coulomb[i] = state.estimate[of.first_coulomb + i]
+
+
+@inner
 def update_external_torque(
     settings: Settings, state: State, signals: Signals, dt: float
 ) -> float:
@@ -58,29 +70,36 @@ def update_external_torque(
     now = state.contact
     work = signals.contact
     update_covariance(settings, state)
+    fill_coulomb(settings, state, work.coulomb)
     external_torque.update_torque(now, state.estimate)
-    external_torque.follow_reversals(part, now, signals.dqr, dt)
+    begins = external_torque.follow_reversals(part, now, signals.dqr, dt)
     samples = int(state.samples[0])
     interval = settings.window.row_interval
-    if samples <= 1 or samples % interval == interval // 4:
-        external_torque.update_spread(now, work)
+    if begins or samples <= 1 or samples % interval == interval // 4:
+        external_torque.update_spread(part, now, work, state.estimate)
     distance = external_torque.whiten_torque(now, work)
     if external_torque.is_settled(now, dt):
         tip = settings.weighing
         mass, deviation = weighing.held_mass(state.weighing)
         load = TipLoad(tip.columns, tip.scale, mass, deviation)
         distance = external_torque.update_contact(part, now, work, load, distance, dt)
-    external_torque.update_noise(part, now)
+    external_torque.update_noise(part, now, work)
     return distance
 
 
 @inner
-def fill_sample(state: State, distance: float, sample: Sample) -> None:
+def fill_sample(
+    settings: Settings,
+    state: State,
+    signals: Signals,
+    distance: float,
+    sample: Sample,
+) -> None:
     """Write r with its interval, and the contact, to the telemetry sample."""
-    now = state.contact
+    now, work = state.contact, signals.contact
     for i in range(now.torque.size):
         sample.external[i] = now.torque[i]
-        deviation = sqrt(external_torque.variance_of(now, i))
+        deviation = sqrt(external_torque.variance_of(settings.contact, now, work, i))
         sample.external_interval[i] = TWO_SIDED * deviation
     sample.contact[CONTACT] = 1.0 if external_torque.is_touched(now) else 0.0
     sample.contact[DISTANCE] = distance
@@ -107,7 +126,7 @@ def sense(
     is_touched = external_torque.is_touched(state.contact)
     if is_touched and settings.contact.freezes == 1:
         state.frozen[0] = _SETTLED / settings.row.filter_pole
-    fill_sample(state, distance, sample_of(sample_vector, settings))
+    fill_sample(settings, state, signals, distance, sample_of(sample_vector, settings))
     return is_touched and not was_touched
 
 

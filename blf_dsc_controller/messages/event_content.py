@@ -145,6 +145,7 @@ SCHEMA: Mapping[str, Mapping[str, Field]] = {
         'mass': Field(NUMBER),  # kg
         'centre': Field(NUMBERS),  # m
     },
+    'tare': {},  # the external torque is zero where the arm rests now
     'contact': {
         'reaction': Field(TEXT),
         'joint': Field(TEXT),  # that shows it most

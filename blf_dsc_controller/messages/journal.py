@@ -45,6 +45,7 @@ class EventType(str, Enum):
     BRAKE = 'brake'
     PARAMETERS = 'parameters'
     DRIVE_LOAD = 'drive load'  # the drives add the weight of a load from now on
+    TARE = 'tare'  # the external torque of the arm at rest is taken for zero
     CONTACT = 'contact'  # something touches the arm
     OSCILLATION = 'oscillation'  # the arm oscillates
     TORQUE_SENSORS = 'torque sensors'  # efforts are not those of sensors at joints

@@ -32,6 +32,8 @@ BRAKE = 114
 """Brake and hold: the number of the request."""
 LOAD = 115
 """The drives are to add a load: `number`, `mass` [kg], `centre` [m]."""
+TARE = 118
+"""Take the external torque for zero: the number of the request."""
 CLOSE = 116
 """End at rest; a second one ends at once."""
 RECOVER = 117

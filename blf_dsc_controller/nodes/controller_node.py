@@ -9,11 +9,13 @@ from functools import partial
 from typing import Any
 
 import numpy as np
+from std_srvs.srv import Trigger
 
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.control.guarded_loop import GuardedLoop
 from blf_dsc_controller.control.outputs import Outputs
 from blf_dsc_controller.control.rejected_columns import rejected_columns
+from blf_dsc_controller.errors import TareError
 from blf_dsc_controller.messages import topics
 from blf_dsc_controller.messages.codecs import (
     Float64MultiArrayEncoder,
@@ -93,6 +95,8 @@ class ControllerNode(LoopNode[ControllerConfig]):
         self._changes = parameters.on_change(
             self, type(self.config), self._retune, self._problems, self._check
         )
+        if self.config.contact.enabled:
+            self.create_service(Trigger, '~/tare', self._on_tare)
         self.start()
 
     # Life cycle.
@@ -219,6 +223,23 @@ class ControllerNode(LoopNode[ControllerConfig]):
         self.failure = None
         self._report()
         return 'estimates cleared: starting with the next state'
+
+    def _on_tare(
+        self, _request: Trigger.Request, response: Trigger.Response
+    ) -> Trigger.Response:
+        """Take the external torque for zero, or say why not."""
+        response.success, response.message = self._tared()
+        self._report()
+        return response
+
+    def _tared(self) -> tuple[bool, str]:
+        if self.guard is None:
+            return False, f'{self.get_name()} is {self.state_label}: activate it first'
+        try:
+            self.guard.tare()
+        except TareError as error:
+            return False, str(error)
+        return True, 'the external torque is zero here'
 
     # The loop.
 

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from blf_dsc_controller.configuration import law_file
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.schema import differences, flatten
-from blf_dsc_controller.errors import BlfDscError, StartError
+from blf_dsc_controller.errors import BlfDscError, StartError, TareError
 from blf_dsc_controller.factory.controller import controller_of
 from blf_dsc_controller.law.check_state import (
     CONTRADICTION,
@@ -28,6 +28,7 @@ from blf_dsc_controller.law.check_state import (
     OSCILLATES,
 )
 from blf_dsc_controller.law.checks import is_valid_state
+from blf_dsc_controller.law.external_torque import is_touched
 from blf_dsc_controller.law.sensor import is_late
 from blf_dsc_controller.messages.errors import (
     DuplicatedJointError,
@@ -365,6 +366,35 @@ class Guard:
         """
         if self.has_sample and self.controller.perceive(self.config.sample_time):
             self._react()
+
+    def tare(self) -> None:
+        """Take the external torque for zero where the arm rests now.
+
+        Raises:
+            TareError: it is not computed, the law is not in command, the arm moves or has
+                just come to rest, or something touches it.
+        """
+        if problem := self._untarable():
+            raise TareError(f'tare: {problem}; the external torque is as it was')
+        self._note(EventType.TARE)
+        self.controller.tare()
+
+    def _untarable(self) -> str:
+        """Return why the external torque cannot be tared now; empty if it can."""
+        law = self.controller
+        if not law.settings.contact.enabled:
+            return 'no external torque is computed: set contact.enabled'
+        if not (self.supervisor.running and self.has_sample):
+            why = self.supervisor.text or self.supervisor.phase
+            return f'the law is not in command ({why})'
+        if is_touched(law.state.contact):
+            return (
+                f'{contact_of(law, self.config, self.last_stamp).text}: clear it first'
+            )
+        if not (self.is_at_rest and law.can_tare):
+            rest = f'{law.tare_rest:.2g} s'
+            return f'the arm moves, or has just come to rest: hold it still for {rest}'
+        return ''
 
     def _react(self) -> None:
         """Do what `contact.reaction` wants when something touches the arm."""
