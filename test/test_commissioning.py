@@ -263,12 +263,13 @@ def lines_of(stiffness, noise):
         velocity_noise=rows,
         columns=np.ones((f.size, 2)),
         posture=np.zeros(2),
+        seen=np.ones(f.size, bool),
     )
 
 
 def largest_of(response):
-    """Return the largest singular value of each response (f,) [rad/(N m)]."""
-    return np.linalg.norm(response.position, 2, axis=(1, 2))
+    """Return the largest singular value of the responses that count [rad/(N m)]."""
+    return np.linalg.norm(response.position[response.seen], 2, axis=(1, 2)).max()
 
 
 def test_sharp_resonance_between_two_lines_is_seen():
@@ -281,7 +282,7 @@ def test_sharp_resonance_between_two_lines_is_seen():
         return np.stack([np.diag([each, 3e4]) for each in mode]).astype(complex)
 
     at_lines = lines_of(stiffness, 1e-9)
-    assert largest_of(refined(at_lines)).max() > 3.0 * largest_of(at_lines).max()
+    assert largest_of(refined(at_lines)) > 3.0 * largest_of(at_lines)
 
 
 def test_mode_that_is_all_noise_makes_no_resonance_between_two_lines():
@@ -297,7 +298,7 @@ def test_mode_that_is_all_noise_makes_no_resonance_between_two_lines():
     at_lines = lines_of(
         stiffness, 1e-5
     )  # rad/(N m), as large as what is left of the mode
-    assert largest_of(refined(at_lines)).max() < 1.01 * largest_of(at_lines).max()
+    assert largest_of(refined(at_lines)) < 1.01 * largest_of(at_lines)
 
 
 def test_simulated_arm_holds_with_the_chosen_gains():

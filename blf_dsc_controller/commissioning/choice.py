@@ -71,7 +71,8 @@ class Loops(NamedTuple):
         margins = []
         for k, response in enumerate(self.responses):
             value, doubt, direction = self._least(response, gains)
-            counted = np.where(response.frequency >= SLOWEST, value - doubt, np.inf)
+            counts = response.seen & (response.frequency >= SLOWEST)
+            counted = np.where(counts, value - doubt, np.inf)
             at = int(counted.argmin())
             joint = int(np.abs(direction[at]).argmax())
             frequency = float(response.frequency[at])

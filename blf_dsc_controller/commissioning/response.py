@@ -11,8 +11,8 @@ carries the arm are all in it.  The law acts on velocities as its driver measure
 filters them, so theirs are measured, too.
 
 Gears have sharp resonances that may fall between two frequencies.  Where G_y peaks its
-inverse is smooth, as is G_v G_y^-1, so these are interpolated, but for modes of which the
-lines show nothing but noise.
+inverse is smooth, as is G_v G_y^-1, so these are interpolated.  A peak between two lines
+counts only if both lines show more of it than noise (`seen`).
 
 Between the lines there is what the motion did not cause: noise, ripple, and what friction
 makes of it.  A line has as much, which gives the standard deviation of each response.
@@ -53,6 +53,7 @@ class Response(NamedTuple):
     velocity_noise: Floats  # rad/s
     columns: Floats  # (f, n) 1/(N m), size of the columns of U^-1
     posture: Floats  # (n,) rad, mean
+    seen: NDArray[np.bool_]  # (f,) the rest may be noise that looks like a resonance
 
 
 def response_of(run: Run, lines: Lines, sample_time: float) -> Response:
@@ -84,6 +85,7 @@ def response_of(run: Run, lines: Lines, sample_time: float) -> Response:
         velocity_noise=noises[1],
         columns=np.asarray(np.linalg.norm(inverse, axis=1)),
         posture=np.asarray(position.mean(axis=0)),
+        seen=np.ones(len(lines.frequencies), bool),
     )
     return refined(at_lines)
 
@@ -106,12 +108,7 @@ def refined(response: Response) -> Response:
     inverse = np.linalg.inv(response.position)
     inverse_between = between(inverse / square) * fine_square
     low = np.minimum(np.arange(fine.size) // _FINER, f.size - 2)
-    is_seen = _is_seen(response, inverse, inverse_between, low)
-    position = np.where(
-        is_seen[:, None, None],
-        np.linalg.inv(inverse_between),
-        between(response.position * square) / fine_square,
-    )
+    position = np.linalg.inv(inverse_between)
     ratio = between(response.velocity @ inverse)
     return Response(
         frequency=fine,
@@ -121,6 +118,7 @@ def refined(response: Response) -> Response:
         velocity_noise=between(response.velocity_noise),
         columns=between(response.columns),
         posture=response.posture,
+        seen=_is_seen(response, inverse, inverse_between, low),
     )
 
 
@@ -148,6 +146,7 @@ def _is_seen(
         deviation *= np.linalg.norm(response.columns[k] * column, axis=1)
         seen &= value > DEVIATIONS * deviation
     peaks = values[:, -1] < np.minimum(at_lines[low], at_lines[low + 1])
+    peaks[::_FINER] = False  # lines
     return np.asarray(seen | ~peaks)
 
 
