@@ -27,7 +27,7 @@ from blf_dsc_controller.commissioning.choice import Loops, choose
 from blf_dsc_controller.commissioning.commissioning import commissioned, plan
 from blf_dsc_controller.commissioning.motion import excitation, lines_in
 from blf_dsc_controller.commissioning.page import sentences
-from blf_dsc_controller.commissioning.response import response_of
+from blf_dsc_controller.commissioning.response import Response, refined, response_of
 from blf_dsc_controller.commissioning.strength import MOST, strength
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.files import share_folder
@@ -248,6 +248,57 @@ def test_noise_is_counted_against_the_margin():
     assert np.median(doubt) > 3.0 * np.median(none)
     inside = np.abs(value - true) < doubt
     assert inside.mean() > 0.9
+
+
+def lines_of(stiffness, noise):
+    """Return a response (f, 2, 2) at lines of 10 to 20 Hz by its inverse, and its noise."""
+    f = np.arange(10.0, 21.0)
+    position = np.linalg.inv(stiffness(f))
+    rows = noise * np.ones((f.size, 2))
+    return Response(
+        frequency=f,
+        position=position,
+        velocity=2j * np.pi * f[:, None, None] * position,
+        position_noise=rows,
+        velocity_noise=rows,
+        columns=np.ones((f.size, 2)),
+        posture=np.zeros(2),
+        seen=np.ones(f.size, bool),
+    )
+
+
+def largest_of(response):
+    """Return the largest singular value of the responses that count [rad/(N m)]."""
+    return np.linalg.norm(response.position[response.seen], 2, axis=(1, 2)).max()
+
+
+def test_sharp_resonance_between_two_lines_is_seen():
+    """Of 3000 N m/rad and 1 kg m^2 behind 15.4 Hz, damped by 0.5 %, and a stiff second joint."""
+
+    def stiffness(f):
+        s = 2j * np.pi * f
+        w = 2.0 * np.pi * 15.4
+        mode = s * s + 2.0 * 0.005 * w * s + w * w
+        return np.stack([np.diag([each, 3e4]) for each in mode]).astype(complex)
+
+    at_lines = lines_of(stiffness, 1e-9)
+    assert largest_of(refined(at_lines)) > 3.0 * largest_of(at_lines)
+
+
+def test_mode_that_is_all_noise_makes_no_resonance_between_two_lines():
+    """Its inverse turns round from line to line, so that the mean of two is nearly singular."""
+
+    def stiffness(f):
+        noise = 1e3 * f**2 * np.where(np.arange(f.size) % 2, -0.999, 1.0)
+        clear = -((2.0 * np.pi * f) ** 2)
+        return np.stack(
+            [np.diag(each) for each in zip(clear, noise, strict=True)]
+        ).astype(complex)
+
+    at_lines = lines_of(
+        stiffness, 1e-5
+    )  # rad/(N m), as large as what is left of the mode
+    assert largest_of(refined(at_lines)) < 1.01 * largest_of(at_lines)
 
 
 def test_simulated_arm_holds_with_the_chosen_gains():

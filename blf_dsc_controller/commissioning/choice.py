@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from blf_dsc_controller.arms.joint_gains import JointGains, linear
 from blf_dsc_controller.arms.linear_loop import law_responses
-from blf_dsc_controller.commissioning.response import Response
+from blf_dsc_controller.commissioning.response import DEVIATIONS, Response
 
 Floats = NDArray[np.float64]
 Complex = NDArray[np.complex128]
@@ -32,7 +32,6 @@ MARGIN = 0.5
 SLOWEST = 5.0
 """Frequency [Hz] from which on margins count: below, the damping ratio says more."""
 
-_DEVIATIONS = 2.0  # of noise, counted against a margin
 _STEP = 1.1
 _LEAST, _MOST = 0.05, 100.0  # times the damping of the measurement
 _OF_ONE = 5.0  # times that of all joints, of one joint by itself
@@ -72,7 +71,8 @@ class Loops(NamedTuple):
         margins = []
         for k, response in enumerate(self.responses):
             value, doubt, direction = self._least(response, gains)
-            counted = np.where(response.frequency >= SLOWEST, value - doubt, np.inf)
+            counts = response.seen & (response.frequency >= SLOWEST)
+            counted = np.where(counts, value - doubt, np.inf)
             at = int(counted.argmin())
             joint = int(np.abs(direction[at]).argmax())
             frequency = float(response.frequency[at])
@@ -94,7 +94,7 @@ class Loops(NamedTuple):
         rows += np.abs(np.diagonal(C_v, axis1=1, axis2=2)) * response.velocity_noise
         of_rows = np.linalg.norm(left[:, :, -1] * rows, axis=1)
         of_columns = np.linalg.norm(right[:, -1] * response.columns, axis=1)
-        doubt = _DEVIATIONS * of_rows * of_columns
+        doubt = DEVIATIONS * of_rows * of_columns
         return values[:, -1], np.asarray(doubt), right[:, -1].conj()
 
 

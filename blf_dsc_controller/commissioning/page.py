@@ -178,9 +178,13 @@ def draw(found: Commissioned, names: Sequence[str], path: Path) -> None:
         for (value, doubt), response, name, colour in zip(
             values, found.responses, names, _colours(names), strict=True
         ):
-            f = response.frequency
-            axes.semilogx(f, value, color=colour, label=name)
-            axes.fill_between(f, value - doubt, value, color=colour, alpha=0.2, lw=0.0)
+            least, doubted, f = (
+                each[response.seen] for each in (value, doubt, response.frequency)
+            )
+            axes.semilogx(f, least, color=colour, label=name)
+            axes.fill_between(
+                f, least - doubted, least, color=colour, alpha=0.2, lw=0.0
+            )
         axes.axhline(found.aim, color=ALARM, lw=1.0, ls='--')
         axes.axvspan(axes.get_xlim()[0], SLOWEST, color=SHADE, alpha=0.5, lw=0.0)
         axes.set_ylim(0.0, 1.5)

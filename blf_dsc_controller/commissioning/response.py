@@ -11,7 +11,8 @@ carries the arm are all in it.  The law acts on velocities as its driver measure
 filters them, so theirs are measured, too.
 
 Gears have sharp resonances that may fall between two frequencies.  Where G_y peaks its
-inverse is smooth, as is G_v G_y^-1, so these are interpolated.
+inverse is smooth, as is G_v G_y^-1, so these are interpolated.  A peak between two lines
+counts only if both lines show more of it than noise (`seen`).
 
 Between the lines there is what the motion did not cause: noise, ripple, and what friction
 makes of it.  A line has as much, which gives the standard deviation of each response.
@@ -33,6 +34,7 @@ Complex = NDArray[np.complex128]
 
 _MOST_LOST = 0.01  # of the samples of a period
 _FINER = 4  # times as many frequencies as there are lines of a joint
+DEVIATIONS = 2.0  # of noise, that count
 _BETWEEN = 3  # times n lines to either side, from which the noise is taken
 
 
@@ -51,6 +53,7 @@ class Response(NamedTuple):
     velocity_noise: Floats  # rad/s
     columns: Floats  # (f, n) 1/(N m), size of the columns of U^-1
     posture: Floats  # (n,) rad, mean
+    seen: NDArray[np.bool_]  # (f,) the rest may be noise that looks like a resonance
 
 
 def response_of(run: Run, lines: Lines, sample_time: float) -> Response:
@@ -82,11 +85,12 @@ def response_of(run: Run, lines: Lines, sample_time: float) -> Response:
         velocity_noise=noises[1],
         columns=np.asarray(np.linalg.norm(inverse, axis=1)),
         posture=np.asarray(position.mean(axis=0)),
+        seen=np.ones(len(lines.frequencies), bool),
     )
-    return _refined(at_lines)
+    return refined(at_lines)
 
 
-def _refined(response: Response) -> Response:
+def refined(response: Response) -> Response:
     """Return a response at more frequencies, interpolated between its own."""
     f = response.frequency
     fine = np.interp(
@@ -102,7 +106,9 @@ def _refined(response: Response) -> Response:
     square = (2j * np.pi * f)[:, None, None] ** 2
     fine_square = (2j * np.pi * fine)[:, None, None] ** 2
     inverse = np.linalg.inv(response.position)
-    position = np.linalg.inv(between(inverse / square) * fine_square)
+    inverse_between = between(inverse / square) * fine_square
+    low = np.minimum(np.arange(fine.size) // _FINER, f.size - 2)
+    position = np.linalg.inv(inverse_between)
     ratio = between(response.velocity @ inverse)
     return Response(
         frequency=fine,
@@ -112,7 +118,36 @@ def _refined(response: Response) -> Response:
         velocity_noise=between(response.velocity_noise),
         columns=between(response.columns),
         posture=response.posture,
+        seen=_is_seen(response, inverse, inverse_between, low),
     )
+
+
+def _is_seen(
+    response: Response, inverse: NDArray[Any], between: NDArray[Any], low: NDArray[Any]
+) -> NDArray[np.bool_]:
+    """Whether G_y is of the arm where its inverse is interpolated (g,): `between`.
+
+    `inverse` (f, n, n) is that at the lines, of which each is between `low` (g,) and the next.
+    A mode in which the arm hardly moves has an inverse that is large and all noise.  Of two such
+    lines, the mean may be nearly singular, which looks like a resonance: where G_y exceeds that
+    of both lines, both must show what is left of its inverse in that mode.
+    """
+    left, values, right = np.linalg.svd(between)
+    u, v = left[:, :, -1], right[:, -1].conj()
+    at_lines = np.linalg.svd(inverse, compute_uv=False)[:, -1]
+    seen = np.ones(low.size, bool)
+    for k in (low, low + 1):
+        A = inverse[k]
+        row = np.einsum('gi,gij->gj', u.conj(), A)
+        column = np.einsum('gij,gj->gi', A, v)
+        value = np.abs(np.einsum('gi,gi->g', u.conj(), column))
+        # u^H A dG A v, dG_ij with the deviation rows_i columns_j
+        deviation = np.linalg.norm(row * response.position_noise[k], axis=1)
+        deviation *= np.linalg.norm(response.columns[k] * column, axis=1)
+        seen &= value > DEVIATIONS * deviation
+    peaks = values[:, -1] < np.minimum(at_lines[low], at_lines[low + 1])
+    peaks[::_FINER] = False  # lines
+    return np.asarray(seen | ~peaks)
 
 
 def _period(run: Run, period: float, T: float) -> tuple[Floats, Floats, Floats]:

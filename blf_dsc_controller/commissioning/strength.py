@@ -39,6 +39,6 @@ def strength(run: Run, config: ControllerConfig) -> float:
     (M,) = inertia_matrices(arm.parameters.model, P, response.posture[None])
     loops = Loops((response,), np.diagonal(M), config.sample_time)
     ((value, doubt),) = loops.singular_values(measuring_gains(arm))
-    counted = response.frequency >= SLOWEST
+    counted = response.seen & (response.frequency >= SLOWEST)
     taken = value[counted].min() - (value - doubt)[counted].min()
     return float(np.clip(taken / LITTLE, 1.0, MOST))
