@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import os
 from dataclasses import replace
 
 import numpy as np
@@ -287,7 +288,12 @@ def test_study_may_be_based_on_a_preset(tmp_path):
 
 
 PAPERS_FORM = {'compensation': 'state', 'change_detection': False}
-FIRST = {'monte_carlo_events': 16, 'monte_carlo_panda': 3, 'monte_carlo_ur5e': 3}
+PAIRS = 6 if os.environ.get('NIGHTLY') else 3
+FIRST = {
+    'monte_carlo_events': 16,
+    'monte_carlo_panda': PAIRS,
+    'monte_carlo_ur5e': PAIRS,
+}
 
 
 def is_kept(study, run, **learning):
