@@ -350,6 +350,25 @@ def test_a_damping_that_damps_nothing_is_told_apart_from_those_that_do(file):
     assert 'feedback.joint_damping, or feedback.gain (K_p)' in problem
 
 
+def test_load_of_an_older_file_is_told_its_group(file):
+    text = (
+        'learning: {tell_drive: true, load_service: /load, load_frame: tool0, '
+        'load_in_motion: true}'
+    )
+    with pytest.raises(ConfigurationError) as caught:
+        load(
+            file(section('blf_dsc_controller', text)),
+            'blf_dsc_controller',
+            ControllerConfig,
+        )
+    assert caught.value.problems == [
+        'line 2: learning.tell_drive: is called load.tell_drive',
+        'line 2: learning.load_service: is called load.service',
+        'line 2: learning.load_frame: is called load.frame',
+        'line 2: learning.load_in_motion: is called load.in_motion',
+    ]
+
+
 def test_missing_file_error_lists_the_presets(tmp_path):
     assert locate('recommended') == locate('recommended.yaml')
     for name in ('recomended', tmp_path / 'absent.yaml', tmp_path):

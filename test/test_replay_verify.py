@@ -22,6 +22,7 @@ from blf_dsc_controller.bags.content import read_content
 from blf_dsc_controller.bags.reader import read_run
 from blf_dsc_controller.cli.bags import DIFFERENT, PARTIAL
 from blf_dsc_controller.cli.main import main
+from blf_dsc_controller.configuration.earlier_names import RENAMED
 from blf_dsc_controller.configuration.nodes import load_loop
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.messages.codecs import JointStateEncoder
@@ -402,13 +403,14 @@ def test_waypoints_of_an_older_bag_stand_joint_by_joint(tmp_path):
     assert read_content(bag).unknown_parameters == []
 
 
-def test_robust_gain_of_an_older_bag_was_called_a_damping(tmp_path):
+def test_parameters_of_an_older_bag_are_read_by_their_earlier_names(tmp_path):
     given = {'feedback.robust_gain': [3.0, 2.0]}
     entries = recorded_run.messages(recorded_run.record(tmp_path / 'new', 0.3, **given))
 
     def change(content):
         parameters = content['parameters']
-        parameters['feedback.damping'] = parameters.pop('feedback.robust_gain')
+        for earlier, name in RENAMED.items():
+            parameters[earlier] = parameters.pop(name)
 
     configured(entries, change)
     bag = recorded_run.write(tmp_path / 'old', entries)

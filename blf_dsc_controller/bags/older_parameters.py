@@ -12,7 +12,8 @@ from collections.abc import Mapping
 from typing import Any
 
 from blf_dsc_controller.bags.sources import BagError
-from blf_dsc_controller.configuration.controller import ControllerConfig, by_point
+from blf_dsc_controller.configuration.controller import ControllerConfig
+from blf_dsc_controller.configuration.earlier_names import RENAMED, by_point
 from blf_dsc_controller.configuration.plausibility import CHECKED
 from blf_dsc_controller.configuration.schema import (
     Value,
@@ -21,9 +22,6 @@ from blf_dsc_controller.configuration.schema import (
     unknown,
     variant_of,
 )
-
-NAMES = {'feedback.damping': 'feedback.robust_gain'}
-"""Names of this version, by those of older bags."""
 
 REMOVED: dict[str, Value] = {}
 """Last default of each parameter of the first release that is gone now."""
@@ -71,9 +69,9 @@ def current(recorded: Mapping[str, Any], source: str, law: str = '') -> dict[str
 def renamed(recorded: Mapping[str, Any]) -> dict[str, Any]:
     """Return recorded parameters of a controller by their names of this version.
 
-    `reference.points` were waypoints joint by joint; the robust gain d2 was called a damping.
+    `reference.points` were waypoints joint by joint.
     """
-    values = {NAMES.get(name, name): value for name, value in recorded.items()}
+    values = {RENAMED.get(name, name): value for name, value in recorded.items()}
     points = values.get('reference.points')
     times = values.get('reference.times', ())
     if points is not None and (not points or by_point(points, len(times))):

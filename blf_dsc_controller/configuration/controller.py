@@ -5,16 +5,19 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any, Literal
-
-import numpy as np
 
 from blf_dsc_controller.arms import tuning
 from blf_dsc_controller.arms.known_gears import Gears
 from blf_dsc_controller.arms.model import arm_model
-from blf_dsc_controller.configuration import law_file, plausibility, tool_bound
+from blf_dsc_controller.configuration import (
+    earlier_names,
+    law_file,
+    plausibility,
+    tool_bound,
+)
 from blf_dsc_controller.configuration.arm_defaults import followed_by, stated_design
 from blf_dsc_controller.configuration.controller_groups import (
     Approach,
@@ -23,6 +26,7 @@ from blf_dsc_controller.configuration.controller_groups import (
     CommissionedGains,
     ComparisonGains,
     Contact,
+    DeclaredLoad,
     DisturbanceEstimate,
     Feedback,
     KnownArm,
@@ -73,6 +77,7 @@ class ControllerConfig(ArmConfig):
     disturbance: DisturbanceEstimate = DisturbanceEstimate()
     torque: Torque = Torque()
     learning: Learning = Learning()
+    load: DeclaredLoad = DeclaredLoad()
     contact: Contact = Contact()
     comparison: ComparisonGains = ComparisonGains()
     truth: KnownArm = KnownArm()
@@ -99,25 +104,7 @@ class ControllerConfig(ArmConfig):
     @classmethod
     def replaced(cls, given: Mapping[str, Any]) -> Mapping[str, str]:
         """Return what to write instead of given parameters of earlier versions."""
-        found = {}
-        if 'feedback.damping' in given:
-            found['feedback.damping'] = (
-                'is called feedback.robust_gain (d2), since it damps nothing; the damping of a '
-                'joint is feedback.joint_damping, or feedback.gain (K_p)'
-            )
-        points, times = (given.get(f'reference.{name}') for name in ('points', 'times'))
-        if points is None:
-            return found
-        remedy = 'write them as reference.waypoints' if points else 'leave it out'
-        if isinstance(points, list | tuple) and isinstance(times, list | tuple):
-            rows = by_point(points, len(times))
-            remedy = (
-                f'write reference.waypoints: {format_value(rows)}' if rows else remedy
-            )
-        return found | {
-            'reference.points': 'replaced by reference.waypoints, which has one row per point '
-            f'as everywhere in ROS, and not one per joint: {remedy}'
-        }
+        return earlier_names.remedies(given)
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Pickle by values.
@@ -174,26 +161,26 @@ class ControllerConfig(ArmConfig):
 
     def _drive_load_problems(self) -> Iterator[str]:
         """Check that the load can be declared to the drives, and how."""
-        learning = self.learning
+        load, learning = self.load, self.learning
         compensates = self.robot.drive_compensates != 'none'
-        if learning.tell_drive and not (learning.weighing and compensates):
+        if load.tell_drive and not (learning.weighing and compensates):
             yield (
-                f'learning.tell_drive: got true with learning.weighing '
+                f'load.tell_drive: got true with learning.weighing '
                 f'{str(learning.weighing).lower()} and robot.drive_compensates '
                 f'{self.robot.drive_compensates}, but needs a load that is weighed and drives that '
                 'compensate gravity'
             )
-        if learning.load_service and not learning.tell_drive:
+        if load.service and not load.tell_drive:
             yield (
-                f'learning.load_service: got {learning.load_service}, but learning.tell_drive is '
+                f'load.service: got {load.service}, but load.tell_drive is '
                 'false: set it to true'
             )
-        if learning.load_frame:
-            to_frame = dataclasses.replace(self.robot, tip=learning.load_frame)
+        if load.frame:
+            to_frame = dataclasses.replace(self.robot, tip=load.frame)
             try:
                 to_frame.chain(self.joints)
             except BlfDscError as error:
-                yield f'learning.load_frame: {error}'
+                yield f'load.frame: {error}'
 
     def _contact_problems(self) -> Iterator[str]:
         """Check that contacts are found, and by a law that can find them."""
@@ -273,17 +260,6 @@ def design_of(config: ControllerConfig) -> tuple[tuning.Design, Gears | None]:
     chain = config.robot.chain(config.joints)
     base = parameters_of(config.robot, chain)
     return stated_design(flatten(config), config.robot, chain, base)
-
-
-def by_point(points: Sequence[float], count: int) -> list[float]:
-    """Return the rows of so many points, joint by joint, point by point.
-
-    Empty if these are not as many in each row.
-    """
-    if count == 0 or len(points) % count:
-        return []
-    rows: list[float] = np.reshape(points, (-1, count)).T.ravel().tolist()
-    return rows
 
 
 @functools.cache

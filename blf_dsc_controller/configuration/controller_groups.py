@@ -637,25 +637,6 @@ class Learning:
         'weigh what has been added to robot.tip since the first window (arm '
         'from a URDF)',
     )
-    tell_drive: bool = sizing(
-        False,
-        'declare the weighed load to drives that compensate gravity, once it is '
-        'known well',
-    )
-    load_service: str = sizing(
-        '',
-        'over ROS: service of the driver that accepts the load, a '
-        'ur_msgs/srv/SetPayload or franka_msgs/srv/SetLoad; empty: no load is '
-        'declared',
-    )
-    load_frame: str = sizing(
-        '',
-        'over ROS: link in whose frame that service expects the centre; empty: '
-        'robot.tip',
-    )
-    load_in_motion: bool = parameter(
-        False, 'over ROS: whether the drives accept a load while the arm moves'
-    )
 
     def problems(self, sample_time: float, model: str, count: int) -> Iterator[str]:
         """Check the window's size, and the initial estimate against model and ball."""
@@ -673,6 +654,30 @@ class Learning:
             count,
             self.radius,
         )
+
+
+@dataclass(frozen=True)
+class DeclaredLoad:
+    """Whether the weighed load is declared to drives that compensate gravity, and how."""
+
+    tell_drive: bool = sizing(
+        False,
+        'declare the load of learning.weighing to the drives, once it is known well',
+    )
+    service: str = sizing(
+        '',
+        'over ROS: service of the driver that accepts the load, a '
+        'ur_msgs/srv/SetPayload or franka_msgs/srv/SetLoad; empty: no load is '
+        'declared',
+    )
+    frame: str = sizing(
+        '',
+        'over ROS: link in whose frame that service expects the centre; empty: '
+        'robot.tip',
+    )
+    in_motion: bool = parameter(
+        False, 'over ROS: whether the drives accept a load while the arm moves'
+    )
 
 
 @dataclass(frozen=True)
