@@ -6,6 +6,7 @@ Which section applies.
 
 from __future__ import annotations
 
+import copy
 import re
 import subprocess
 import sys
@@ -19,6 +20,7 @@ from hypothesis import strategies as st
 from blf_dsc_controller.configuration import files
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.files import parse, share_folder
+from blf_dsc_controller.configuration.law_traits import GAINS
 from blf_dsc_controller.configuration.nodes import (
     LoopConfig,
     RecorderConfig,
@@ -31,7 +33,7 @@ from blf_dsc_controller.configuration.nodes import (
     read,
 )
 from blf_dsc_controller.configuration.plant import PlantConfig
-from blf_dsc_controller.configuration.schema import build
+from blf_dsc_controller.configuration.schema import build, flatten, parameters
 from blf_dsc_controller.errors import BlfDscError, ConfigurationError
 from blf_dsc_controller.messages import topics
 
@@ -278,7 +280,8 @@ def test_parameter_page_is_what_its_command_writes(tmp_path):
         'run: python -m blf_dsc_controller.configuration.nodes doc/parameters.md'
     )
     rows = [row for row in committed.splitlines() if row.startswith('| `')]
-    assert {row.split('`')[1] for row in rows} == known_names()
+    gains = {f'gains.{each.name}' for of in GAINS.values() for each in parameters(of)}
+    assert {row.split('`')[1] for row in rows} == known_names() | gains
     assert {row.replace('\\|', '').count('|') for row in rows} == {7}
 
 
@@ -367,6 +370,42 @@ def test_load_of_an_older_file_is_told_its_group(file):
         'line 2: learning.load_frame: is called load.frame',
         'line 2: learning.load_in_motion: is called load.in_motion',
     ]
+
+
+@pytest.mark.parametrize(
+    ('law', 'surface', 'leakage'),
+    [
+        ('blf_dsc', 'it has no effect on', 'it has no effect on'),
+        ('backstepping', 'is called gains.surface_gain', 'is called gains.leakage'),
+        ('slotine_li', 'is called gains.surface_gain', 'it has no effect on'),
+    ],
+)
+def test_gains_of_the_compared_laws_are_told_the_law_that_has_them(
+    file, law, surface, leakage
+):
+    text = f'law: {law}, comparison: {{surface_gain: [9.0, 9.0], leakage: 0.1}}'
+    with pytest.raises(ConfigurationError) as caught:
+        load(
+            file(section('blf_dsc_controller', text)),
+            'blf_dsc_controller',
+            ControllerConfig,
+        )
+    first, second = caught.value.problems
+    assert f'line 2: comparison.surface_gain: {surface}' in first
+    assert f'line 2: comparison.leakage: {leakage}' in second
+    assert all(f'the law {law}' in problem for problem in (first, second))
+
+
+def test_a_law_of_the_package_has_its_gains_and_others_have_not(file):
+    gains = 'gains: {surface_gain: [9.0, 8.0]}'
+    path = file(section('/**', f'law: backstepping, {gains}'))
+    config = load(path, 'blf_dsc_controller', ControllerConfig)
+    assert flatten(config)['gains.surface_gain'] == (9.0, 8.0)
+    assert flatten(config)['gains.leakage'] == 0.001
+    assert not hasattr(ControllerConfig(), 'gains')
+    assert copy.deepcopy(config) == config  # through `__reduce__`, as pickle does
+    with pytest.raises(ConfigurationError, match=r'gains\.surface_gain: unknown'):
+        load(file(section('/**', gains)), 'blf_dsc_controller', ControllerConfig)
 
 
 def test_missing_file_error_lists_the_presets(tmp_path):

@@ -419,6 +419,31 @@ def test_parameters_of_an_older_bag_are_read_by_their_earlier_names(tmp_path):
     assert read_content(bag).unknown_parameters == []
 
 
+@pytest.mark.parametrize('law', ['blf_dsc', 'backstepping', 'slotine_li'])
+def test_gains_of_the_compared_laws_were_those_of_all_laws(tmp_path, law):
+    folder = recorded_run.record(tmp_path / 'new', 0.3, law=law)
+    entries = recorded_run.messages(folder)
+    earlier = {
+        'surface_gain': [71.0, 72.0],
+        'position_gain': [2.0, 3.0],
+        'robust_gain': [0.0, 0.0],
+        'integral_gain': [],
+        'leakage': 0.5,
+        'learning_weight': 0.0,
+    }
+
+    def change(content):
+        parameters = content['parameters']
+        for name, value in earlier.items():
+            parameters[f'comparison.{name}'] = parameters.pop(f'gains.{name}', value)
+
+    configured(entries, change)
+    bag = recorded_run.write(tmp_path / 'old', entries)
+    result = verify(bag)
+    assert (result.difference, result.remarks, result.incomplete) == (None, (), ())
+    assert read_content(bag).unknown_parameters == []
+
+
 def test_journal_of_a_later_format_is_refused(entries, tmp_path):
     def change(content):
         content.update(format=FORMAT + 1, version='9.0.0')

@@ -24,7 +24,6 @@ from blf_dsc_controller.configuration.controller_groups import (
     ArmGeometry,
     Barrier,
     CommissionedGains,
-    ComparisonGains,
     Contact,
     DeclaredLoad,
     DisturbanceEstimate,
@@ -39,7 +38,7 @@ from blf_dsc_controller.configuration.controller_groups import (
     Torque,
     sizing,
 )
-from blf_dsc_controller.configuration.law_traits import LAWS, traits_of
+from blf_dsc_controller.configuration.law_traits import LAWS, gains_of, traits_of
 from blf_dsc_controller.configuration.robot import (
     ArmConfig,
     parameters_of,
@@ -48,8 +47,6 @@ from blf_dsc_controller.configuration.schema import (
     Value,
     build,
     flatten,
-    format_value,
-    suggestion,
 )
 from blf_dsc_controller.errors import BlfDscError
 
@@ -79,7 +76,6 @@ class ControllerConfig(ArmConfig):
     learning: Learning = Learning()
     load: DeclaredLoad = DeclaredLoad()
     contact: Contact = Contact()
-    comparison: ComparisonGains = ComparisonGains()
     truth: KnownArm = KnownArm()
     safety: Safety = Safety()
     telemetry: Telemetry = Telemetry()
@@ -87,19 +83,13 @@ class ControllerConfig(ArmConfig):
 
     @classmethod
     def variant(cls, given: Mapping[str, Any]) -> type[ControllerConfig]:
-        """Return the configuration with a law's own gains as the group `gains`.
+        """Return the configuration with the gains that only the given law has.
 
         Raises BlfDscError if there is no such law.
         """
         law = given.get('law', LAWS[0])
-        if not isinstance(law, str) or law in LAWS:
-            return ControllerConfig
-        if not law_file.is_file(law):
-            raise BlfDscError(
-                f'law: got {format_value(law)}, but expected one of {", ".join(LAWS)}, or a '
-                f'Python file{suggestion(law, LAWS)}'
-            )
-        return _with_gains(law_file.gains_of(law_file.load_law(law)))
+        gains = gains_of(law) if isinstance(law, str) else None
+        return _with_gains(gains) if gains else ControllerConfig
 
     @classmethod
     def replaced(cls, given: Mapping[str, Any]) -> Mapping[str, str]:
@@ -109,7 +99,7 @@ class ControllerConfig(ArmConfig):
     def __reduce__(self) -> tuple[Any, ...]:
         """Pickle by values.
 
-        The class of a law of a file is made when it is loaded.
+        The class with the gains of a law is made when they are read.
         """
         return build, (ControllerConfig, flatten(self))
 
@@ -264,7 +254,7 @@ def design_of(config: ControllerConfig) -> tuple[tuning.Design, Gears | None]:
 
 @functools.cache
 def _with_gains(gains: type) -> type[ControllerConfig]:
-    """Return the configuration with a group of gains of a law of a file."""
+    """Return the configuration with the group of gains of a law."""
     group = dataclasses.field(default=gains())
     return dataclasses.make_dataclass(
         'ControllerConfig',

@@ -452,48 +452,6 @@ class Torque:
     )
 
 
-@dataclass(frozen=True)
-class ComparisonGains:
-    """Gains of the laws `backstepping` (35) and `slotine_li`.
-
-    Feedback and learning have groups of their own.
-    """
-
-    surface_gain: PerJoint = positive(
-        (70.0, 70.0),
-        'gain of the linear surface alpha2 = dqr - lambda_s z1',
-        '1/s',
-        'lambda_s',
-    )
-    position_gain: PerJoint = non_negative(
-        (1.0, 1.0),
-        'gain on the tracking error z1; not used by slotine_li',
-        'N m/rad',
-        'w',
-    )
-    robust_gain: PerJoint = non_negative(
-        (0.0, 0.0),
-        'amplitude of the robust term; not used by slotine_li',
-        'N m',
-        'mu_bar',
-    )
-    integral_gain: PerJoint = non_negative(
-        (),
-        'integral gain of slotine_li on its surface; empty: none',
-        'N m/rad',
-        omittable=True,
-    )
-    leakage: float = non_negative(
-        0.001, 'leakage of P^; not used by slotine_li', symbol='W_c'
-    )
-    learning_weight: float = non_negative(
-        0.0,
-        'weight of the prediction error; 0: by the tracking error alone',
-        '',
-        'kappa',
-    )
-
-
 def _misfits(
     name: str, P: tuple[float, ...], model: str, count: int, radius: float
 ) -> Iterator[str]:

@@ -12,7 +12,9 @@ from typing import Any
 
 import numpy as np
 
-from blf_dsc_controller.configuration.schema import format_value
+from blf_dsc_controller.configuration.law_file import GROUP
+from blf_dsc_controller.configuration.law_traits import GAINS, LAWS
+from blf_dsc_controller.configuration.schema import format_value, parameters
 
 RENAMED = {
     'feedback.damping': 'feedback.robust_gain',
@@ -23,6 +25,7 @@ RENAMED = {
 }
 """Names of this version, by earlier ones with the same meaning."""
 
+_COMPARISON = 'comparison.'
 _REASONS = {
     'feedback.damping': ' (d2), since it damps nothing; the damping of a joint is '
     'feedback.joint_damping, or feedback.gain (K_p)',
@@ -36,9 +39,32 @@ def remedies(given: Mapping[str, Any]) -> Mapping[str, str]:
         for name, new in RENAMED.items()
         if name in given
     }
+    for name in given:
+        if is_comparison(name):
+            found[name] = _of_comparison(name, given.get('law', LAWS[0]))
     if 'reference.points' in given:
         found['reference.points'] = _of_points(given)
     return found
+
+
+def is_comparison(name: str) -> bool:
+    """Whether a parameter is one of `comparison.*`, which all laws had."""
+    return name.startswith(_COMPARISON)
+
+
+def of_law(name: str, law: object) -> str:
+    """Return the name by which this law has a gain `comparison.NAME`; empty: it has none."""
+    gain = name.removeprefix(_COMPARISON)
+    group = GAINS.get(law) if isinstance(law, str) else None
+    has_it = group is not None and any(each.name == gain for each in parameters(group))
+    return f'{GROUP}.{gain}' if has_it else ''
+
+
+def _of_comparison(name: str, law: object) -> str:
+    new = of_law(name, law)
+    if new:
+        return f'is called {new}, and belongs to the law {law}'
+    return f'it has no effect on the law {law}: leave it out'
 
 
 def _of_points(given: Mapping[str, Any]) -> str:

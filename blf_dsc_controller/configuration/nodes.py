@@ -10,7 +10,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any, Literal, NamedTuple, TypeVar
@@ -25,6 +25,7 @@ from blf_dsc_controller.configuration.files import (
     read_text,
     share_folder,
 )
+from blf_dsc_controller.configuration.law_traits import GAINS
 from blf_dsc_controller.configuration.plant import PlantConfig
 from blf_dsc_controller.configuration.schema import (
     Parameter,
@@ -161,7 +162,7 @@ def known_names() -> frozenset[str]:
 def is_of_node(name: str, cls: type) -> bool:
     """Return whether a parameter in a section for several nodes is one of this node.
 
-    The gains of a law of a file are the controller's, whatever they are called.
+    The gains that only one law has are the controller's, whatever they are called.
     """
     if is_gain_of_law(name):
         return cls is ControllerConfig
@@ -169,7 +170,7 @@ def is_of_node(name: str, cls: type) -> bool:
 
 
 def is_gain_of_law(name: str) -> bool:
-    """Return whether the name is one of the group of a law of a file."""
+    """Return whether the name is one of the gains that only one law has."""
     return name.startswith(f'{law_file.GROUP}.')
 
 
@@ -449,8 +450,24 @@ def _is_of_others(section: Section) -> bool:
 def with_tables(page: str) -> str:
     """Return the page of all parameters; what is above its tables stays."""
     above = page.partition('\n## ')[0]
-    sections = (_section(node, parameters(cls)) for node, cls in NODES.items())
+    sections = (
+        _section(node, parameters(cls)) + (_gains() if node == CONTROLLER else '')
+        for node, cls in NODES.items()
+    )
     return above + ''.join(sections)
+
+
+def _gains() -> str:
+    """Return a table of the gains of each law of the package that has some of its own."""
+    tables = (
+        f'\n### Gains of {law}\n\nOnly the law `{law}` has them.\n\n'
+        + _table(
+            replace(param, name=f'{law_file.GROUP}.{param.name}')
+            for param in parameters(group)
+        )
+        for law, group in GAINS.items()
+    )
+    return ''.join(tables)
 
 
 def _section(node: str, params: Iterable[Parameter]) -> str:
@@ -462,8 +479,12 @@ def _section(node: str, params: Iterable[Parameter]) -> str:
     tables = [f'\n## {node}\n']
     for group, members in groups.items():
         heading = f'\n### {node}: {group}\n' if group else ''
-        tables.append(f'{heading}\n{_HEADER}{"".join(map(_row, members))}')
+        tables.append(f'{heading}\n{_table(members)}')
     return ''.join(tables)
+
+
+def _table(params: Iterable[Parameter]) -> str:
+    return _HEADER + ''.join(map(_row, params))
 
 
 def _row(param: Parameter) -> str:
