@@ -14,6 +14,7 @@ from blf_dsc_controller.arms.known_gears import Gears
 from blf_dsc_controller.arms.model import arm_model
 from blf_dsc_controller.configuration import (
     earlier_names,
+    known_arm,
     law_file,
     plausibility,
     tool_bound,
@@ -28,7 +29,6 @@ from blf_dsc_controller.configuration.controller_groups import (
     DeclaredLoad,
     DisturbanceEstimate,
     Feedback,
-    KnownArm,
     Learning,
     MotionLimits,
     Reference,
@@ -76,20 +76,19 @@ class ControllerConfig(ArmConfig):
     learning: Learning = Learning()
     load: DeclaredLoad = DeclaredLoad()
     contact: Contact = Contact()
-    truth: KnownArm = KnownArm()
     safety: Safety = Safety()
     telemetry: Telemetry = Telemetry()
     commissioning: CommissionedGains = CommissionedGains()
 
     @classmethod
     def variant(cls, given: Mapping[str, Any]) -> type[ControllerConfig]:
-        """Return the configuration with the gains that only the given law has.
+        """Return the configuration with the gains that only the given law has, and known data.
 
         Raises BlfDscError if there is no such law.
         """
         law = given.get('law', LAWS[0])
         gains = gains_of(law) if isinstance(law, str) else None
-        return _with_gains(gains) if gains else ControllerConfig
+        return _with_groups(gains, knows=known_arm.is_asked_for(given))
 
     @classmethod
     def replaced(cls, given: Mapping[str, Any]) -> Mapping[str, str]:
@@ -128,7 +127,9 @@ class ControllerConfig(ArmConfig):
         yield from self.barrier.problems(self.joints)
         yield from tool_bound.problems(self)
         radius = self.learning.radius
-        yield from self.truth.problems(self.law, self.model, count, radius)
+        known = known_arm.known_arm(self)
+        if known:
+            yield from known.problems(self.law, self.model, count, radius)
         yield from self.learning.problems(self.sample_time, self.model, count)
         yield from plausibility.problems_of_controller(self)
 
@@ -253,12 +254,21 @@ def design_of(config: ControllerConfig) -> tuple[tuning.Design, Gears | None]:
 
 
 @functools.cache
-def _with_gains(gains: type) -> type[ControllerConfig]:
-    """Return the configuration with the group of gains of a law."""
-    group = dataclasses.field(default=gains())
+def _with_groups(gains: type | None, *, knows: bool) -> type[ControllerConfig]:
+    """Return the configuration with the group of gains of a law, and that of known data."""
+    groups: dict[str, type] = {}
+    if knows:
+        groups[known_arm.GROUP] = known_arm.KnownArm
+    if gains:
+        groups[law_file.GROUP] = gains
+    if not groups:
+        return ControllerConfig
     return dataclasses.make_dataclass(
         'ControllerConfig',
-        [(law_file.GROUP, gains, group)],
+        [
+            (name, group, dataclasses.field(default=group()))
+            for name, group in groups.items()
+        ],
         bases=(ControllerConfig,),
         frozen=True,
     )

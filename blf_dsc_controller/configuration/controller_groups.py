@@ -39,7 +39,6 @@ _in_window = partial(
     parameter, read_only='the data in the excitation window depend on it'
 )
 _at_start = partial(parameter, read_only='it has no effect later')
-_known = partial(parameter, read_only='it is known data, not a gain')
 _measured = partial(parameter, read_only='it says how the gains were found')
 _FOLLOWED = 'the other gains follow from it when they are read: change those'
 _from_urdf = partial(non_negative, (), read_only=_FOLLOWED, omittable=True)
@@ -452,7 +451,7 @@ class Torque:
     )
 
 
-def _misfits(
+def misfits(
     name: str, P: tuple[float, ...], model: str, count: int, radius: float
 ) -> Iterator[str]:
     """Check that parameters P are those of a model, and inside the ball."""
@@ -463,39 +462,6 @@ def _misfits(
             f'learning.radius: got {radius:g} kg m^2, but {name} has a norm of {norm:.6g} kg m^2 '
             'and would be shrunk to the ball: the radius must be larger'
         )
-
-
-@dataclass(frozen=True)
-class KnownArm:
-    """Known data of the arm: required by the law `model_based`, shown by the monitors.
-
-    The known disturbance is constant + amplitude*sin(frequency*t + phase) on each
-    joint.
-    """
-
-    parameters: tuple[float, ...] = _known(
-        (), 'true parameters; empty: unknown', 'kg m^2', 'P', omittable=True
-    )
-    constant: PerJoint = _known(
-        (0.0, 0.0), 'constant part of the known disturbance', 'N m'
-    )
-    amplitude: PerJoint = _known((0.0, 0.0), 'amplitude of the sinusoid', 'N m')
-    frequency: PerJoint = _known(
-        (1.0, 1.0), 'frequency of the sinusoid', 'rad/s', at_least=0.0
-    )
-    phase: PerJoint = _known((0.0, 0.0), 'phase of the sinusoid', 'rad')
-
-    def problems(
-        self, law: str, model: str, count: int, radius: float
-    ) -> Iterator[str]:
-        """Check that the parameters fit model and ball, and are given if required."""
-        if law == 'model_based' and not self.parameters:
-            yield 'truth.parameters: got none, but the law model_based needs them'
-        if self.parameters:
-            largest = radius if law == 'model_based' else math.inf
-            yield from _misfits(
-                'truth.parameters', self.parameters, model, count, largest
-            )
 
 
 @dataclass(frozen=True)
@@ -605,7 +571,7 @@ class Learning:
                 f'learning.window: got {self.window:g} s, which is {samples:.0f} samples of '
                 f'{sample_time:g} s: between {fewest} and {most} are allowed'
             )
-        yield from _misfits(
+        yield from misfits(
             'learning.initial_estimate',
             self.initial_estimate,
             model,
