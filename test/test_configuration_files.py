@@ -372,6 +372,29 @@ def test_load_of_an_older_file_is_told_its_group(file):
     ]
 
 
+def test_model_of_an_older_file_follows_from_its_urdf(file):
+    path = file(section('blf_dsc_controller', 'model: urdf'))
+    with pytest.raises(
+        ConfigurationError, match=r'line 2: model: follows from robot\.urdf'
+    ):
+        load(path, 'blf_dsc_controller', ControllerConfig)
+    assert ControllerConfig().model == 'two_link'
+    assert load_loop('panda').controller.model == 'urdf'
+
+
+def test_known_data_of_the_arm_is_there_if_it_is_given_or_needed(file):
+    path = file(section('/**', 'truth: {parameters: [1.0, 0.32, 0.4], seed: 4}'))
+    assert load_plant(path).truth.seed == 4
+    config = load(path, 'blf_dsc_controller', ControllerConfig)
+    assert flatten(config)['truth.parameters'] == (1.0, 0.32, 0.4)
+    assert copy.deepcopy(config) == config
+    assert not hasattr(load_loop('recommended').controller, 'truth')
+    assert hasattr(load_loop('model_based').controller, 'truth')
+    text = section('blf_dsc_controller', 'truth: {seed: 4}')
+    with pytest.raises(ConfigurationError, match=r'truth\.seed: unknown'):
+        load(file(text), 'blf_dsc_controller', ControllerConfig)
+
+
 @pytest.mark.parametrize(
     ('law', 'surface', 'leakage'),
     [

@@ -411,12 +411,20 @@ def test_parameters_of_an_older_bag_are_read_by_their_earlier_names(tmp_path):
         parameters = content['parameters']
         for earlier, name in RENAMED.items():
             parameters[earlier] = parameters.pop(name)
+        parameters['model'] = 'two_link'
 
     configured(entries, change)
     bag = recorded_run.write(tmp_path / 'old', entries)
     result = verify(bag)
     assert (result.difference, result.remarks, result.incomplete) == (None, (), ())
     assert read_content(bag).unknown_parameters == []
+
+
+def test_model_of_an_older_bag_must_be_that_of_its_urdf(entries, tmp_path, capsys):
+    configured(entries, lambda content: content['parameters'].update(model='urdf'))
+    path = recorded_run.write(tmp_path / 'bag', entries)
+    assert main(['replay', str(path)]) == 1
+    assert 'model: unknown parameter' in capsys.readouterr().err
 
 
 @pytest.mark.parametrize('law', ['blf_dsc', 'backstepping', 'slotine_li'])

@@ -76,7 +76,8 @@ def renamed(recorded: Mapping[str, Any], law: str = '') -> dict[str, Any]:
     """Return recorded parameters of a controller by their names of this version.
 
     `law` is as in `current`. `reference.points` were waypoints joint by joint; gains of
-    other laws than the recorded one, which had no effect, are left out.
+    other laws than the recorded one, which had no effect, are left out, and so is a model
+    that follows from the URDF.
     """
     law = law or recorded.get('law', LAWS[0])
     names = {
@@ -84,6 +85,8 @@ def renamed(recorded: Mapping[str, Any], law: str = '') -> dict[str, Any]:
         for name in recorded
     }
     values = {names[name]: value for name, value in recorded.items() if names[name]}
+    if values.get('model') == ('urdf' if values.get('robot.urdf') else 'two_link'):
+        del values['model']
     points = values.get('reference.points')
     times = values.get('reference.times', ())
     if points is not None and (not points or by_point(points, len(times))):
@@ -103,8 +106,7 @@ def completed(recorded: Mapping[str, Any]) -> dict[str, Any]:
 
     The feedback of an arm from a URDF acted through its inertia matrix.
     """
-    is_urdf = recorded.get('model') == 'urdf'
-    feedback = {'feedback.inertia': 'whole'} if is_urdf else {}
+    feedback = {'feedback.inertia': 'whole'} if recorded.get('robot.urdf') else {}
     return {**ADDED, **feedback, **recorded}
 
 

@@ -32,7 +32,7 @@ _OBSERVER = 60.0  # rad/s, below the drives' own loops
 def followed_by(given: Mapping[str, Any]) -> Mapping[str, Value]:
     """Return the gains and limits that follow from given parameters by dotted name."""
     period = given.get('sample_time', ArmConfig.sample_time)
-    if given.get('model', 'urdf' if given.get('robot.urdf') else '') != 'urdf':
+    if not given.get('robot.urdf'):
         return {'surface.time_constant': max(period, Surface().time_constant)}
     robot, chain = given_robot(given)
     base = parameters_of(robot, chain)
@@ -47,7 +47,6 @@ def followed_by(given: Mapping[str, Any]) -> Mapping[str, Value]:
         followed['barrier.initial_bound'] = (0.0,) * len(chain.joints)
     is_whole = bound is not None and len(bound) == len(chain.joints)
     return {
-        'model': 'urdf',
         **described(robot, chain),
         'learning.weighing': given.get('learning.prediction', 'filtered') == 'filtered',
         'feedback.stiffness': arm.stiffness,

@@ -63,7 +63,6 @@ class ControllerConfig(ArmConfig):
         f'control law: {", ".join(LAWS)}, or a Python file that defines one',
         kept=law_file.kept,
     )
-    model: Literal['two_link', 'urdf'] = sizing('two_link', 'model of the arm')
     arm: ArmGeometry = ArmGeometry()
     reference: Reference = Reference()
     approach: Approach = Approach()
@@ -94,6 +93,11 @@ class ControllerConfig(ArmConfig):
     def replaced(cls, given: Mapping[str, Any]) -> Mapping[str, str]:
         """Return what to write instead of given parameters of earlier versions."""
         return earlier_names.remedies(given)
+
+    @property
+    def model(self) -> Literal['two_link', 'urdf']:
+        """Model of the arm: that of its URDF, or the paper's two links without one."""
+        return 'urdf' if self.robot.urdf else 'two_link'
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Pickle by values.
@@ -143,11 +147,12 @@ class ControllerConfig(ArmConfig):
 
     def _weighing_problems(self) -> Iterator[str]:
         """Check that the load in the tip can be weighed."""
-        learned = (self.model, self.learning.prediction)
-        if self.learning.weighing and learned != ('urdf', 'filtered'):
+        prediction = self.learning.prediction
+        can_weigh = self.model == 'urdf' and prediction == 'filtered'
+        if self.learning.weighing and not can_weigh:
             yield (
-                f'learning.weighing: got true with {", ".join(learned)}, but needs model urdf and '
-                'learning.prediction filtered'
+                f'learning.weighing: got true with model {self.model} and learning.prediction '
+                f'{prediction}, but needs robot.urdf and filtered'
             )
 
     def _drive_load_problems(self) -> Iterator[str]:
@@ -204,7 +209,7 @@ class ControllerConfig(ArmConfig):
             yield (
                 f'disturbance.observer_bandwidth: got {bandwidth:g} rad/s with law {self.law}, '
                 f'model {self.model} and learning.prediction {self.learning.prediction}, but needs '
-                f'{LAWS[0]}, urdf and filtered'
+                f'{LAWS[0]}, robot.urdf and filtered'
             )
 
     def _stiffness_problems(self) -> Iterator[str]:
@@ -213,8 +218,8 @@ class ControllerConfig(ArmConfig):
         if self.model != 'urdf' and feedback.stiffness != Feedback().stiffness:
             yield (
                 f'feedback.stiffness: got {feedback.stiffness:g} with model {self.model}, but only '
-                'the gains of model urdf follow from it: leave it at 1, and lower feedback.gain '
-                'and surface.gain'
+                'the gains of an arm from a URDF follow from it: leave it at 1, and lower '
+                'feedback.gain and surface.gain'
             )
         if feedback.inertia == 'whole' and feedback.stiffness > 1.0:
             yield (

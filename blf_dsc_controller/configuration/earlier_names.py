@@ -42,6 +42,10 @@ def remedies(given: Mapping[str, Any]) -> Mapping[str, str]:
     for name in given:
         if is_comparison(name):
             found[name] = _of_comparison(name, given.get('law', LAWS[0]))
+    if 'model' in given:
+        found['model'] = (
+            'follows from robot.urdf: give that, or nothing for the two links'
+        )
     if 'reference.points' in given:
         found['reference.points'] = _of_points(given)
     return found
