@@ -383,8 +383,8 @@ def test_model_of_an_older_file_follows_from_its_urdf(file):
 
 
 def test_known_data_of_the_arm_is_there_if_it_is_given_or_needed(file):
-    path = file(section('/**', 'truth: {parameters: [1.0, 0.32, 0.4], seed: 4}'))
-    assert load_plant(path).truth.seed == 4
+    path = file(section('/**', 'truth: {parameters: [1.0, 0.32, 0.4]}, seed: 4'))
+    assert load_plant(path).seed == 4
     config = load(path, 'blf_dsc_controller', ControllerConfig)
     assert flatten(config)['truth.parameters'] == (1.0, 0.32, 0.4)
     assert copy.deepcopy(config) == config

@@ -21,7 +21,6 @@ from blf_dsc_controller.configuration import (
 )
 from blf_dsc_controller.configuration.arm_defaults import followed_by, stated_design
 from blf_dsc_controller.configuration.controller_groups import (
-    Approach,
     ArmGeometry,
     Barrier,
     CommissionedGains,
@@ -30,8 +29,6 @@ from blf_dsc_controller.configuration.controller_groups import (
     DisturbanceEstimate,
     Feedback,
     Learning,
-    MotionLimits,
-    Reference,
     Safety,
     Surface,
     Telemetry,
@@ -39,6 +36,11 @@ from blf_dsc_controller.configuration.controller_groups import (
     sizing,
 )
 from blf_dsc_controller.configuration.law_traits import LAWS, gains_of, traits_of
+from blf_dsc_controller.configuration.motion_groups import (
+    Approach,
+    MotionLimits,
+    Reference,
+)
 from blf_dsc_controller.configuration.robot import (
     ArmConfig,
     parameters_of,
