@@ -22,6 +22,8 @@ import numpy as np
 from harness import print_table
 
 from blf_dsc_controller.configuration.controller import ControllerConfig
+from blf_dsc_controller.configuration.law_file import GROUP
+from blf_dsc_controller.configuration.law_gains import SlotineLi
 from blf_dsc_controller.configuration.nodes import CONTROLLER, LoopConfig, load_loop
 from blf_dsc_controller.configuration.schema import change
 from blf_dsc_controller.factory.controller import begin, controller_of
@@ -62,10 +64,10 @@ _NONE = {'learning.weight': 0.0, 'learning.adaptation_gain': [0.0] * 48}
 _NEWTON = {
     'learning.update': 'newton',
     'learning.adaptation_gain': [0.5] * 48,
-    'comparison.learning_weight': 100.0,
+    'gains.learning_weight': 100.0,
 }
 LAWS = (
-    Law('Slotine-Li, no learning', _NONE | {'comparison.learning_weight': 0.0}),
+    Law('Slotine-Li, no learning', _NONE | {'gains.learning_weight': 0.0}),
     Law('Slotine-Li, composite, the preset', {}),
     Law('the same, with the Newton step of the proposed', _NEWTON),
     Law('proposed, no learning', _NONE, proposed=True),
@@ -74,9 +76,15 @@ LAWS = (
 _WITHOUT = {law.proposed: k for k, law in enumerate(LAWS) if 'no learning' in law.label}
 
 
+def surface_gain(config: ControllerConfig) -> tuple[float, ...]:
+    """Return Lambda of the law of Slotine and Li [1/s]."""
+    gains: SlotineLi = getattr(config, GROUP)
+    return gains.surface_gain
+
+
 def stiffness(config: ControllerConfig) -> float:
     """Return K_c Lambda in N m/rad, its geometric mean over the joints."""
-    each = np.multiply(config.feedback.gain, config.comparison.surface_gain)
+    each = np.multiply(config.feedback.gain, surface_gain(config))
     return float(np.exp(np.log(each).mean()))
 
 
@@ -88,9 +96,7 @@ def softened(config: ControllerConfig, share: float) -> ControllerConfig:
         config,
         {
             'feedback.gain': [Kc * each for each in config.feedback.gain],
-            'comparison.surface_gain': [
-                Lambda * each for each in config.comparison.surface_gain
-            ],
+            'gains.surface_gain': [Lambda * each for each in surface_gain(config)],
         },
     )
 

@@ -15,7 +15,7 @@ rad/s.  The motions are those that people have, with rests:
 Each run is made twice: with an empty hand and nothing that changes, and with one load of 2 kg
 that is picked up half-way.  A reading is what the law says it holds, each tenth of a second where
 it says something; it is outside if its 95 % interval does not hold the truth.  *Certain* are
-readings to 5 % (50 g), which `learning.tell_drive` declares.
+readings to 5 % (50 g), which `load.tell_drive` declares.
 """
 
 from __future__ import annotations

@@ -351,7 +351,7 @@ def test_what_is_no_commissioning_is_refused():
         )
     with pytest.raises(BlfDscError, match=r'joint2 would be at 6\.25 rad'):
         plan(CONFIG, np.array([[0.0, 6.25]]))
-    with pytest.raises(BlfDscError, match='model: got two_link'):
+    with pytest.raises(BlfDscError, match=r'robot\.urdf: got none'):
         plan(ControllerConfig(), POSTURE[None])
 
 

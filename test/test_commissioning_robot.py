@@ -236,12 +236,12 @@ def test_contacts_end_a_motion_and_loads_are_not_told_in_it():
     given = {
         'contact.enabled': True,
         'contact.reaction': 'yield',
-        'learning.tell_drive': True,
+        'load.tell_drive': True,
     }
     posture = np.array(preset.reference.offset)
     (motion,) = plan(change(preset, given), posture[None])
     assert motion.config.contact.reaction == 'stop'
-    assert not motion.config.learning.tell_drive
+    assert not motion.config.load.tell_drive
     assert motion.duration > SETTLING + motion.excitation.period
 
 

@@ -6,6 +6,7 @@ Which section applies.
 
 from __future__ import annotations
 
+import copy
 import re
 import subprocess
 import sys
@@ -19,6 +20,7 @@ from hypothesis import strategies as st
 from blf_dsc_controller.configuration import files
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.files import parse, share_folder
+from blf_dsc_controller.configuration.law_traits import GAINS
 from blf_dsc_controller.configuration.nodes import (
     LoopConfig,
     RecorderConfig,
@@ -31,7 +33,7 @@ from blf_dsc_controller.configuration.nodes import (
     read,
 )
 from blf_dsc_controller.configuration.plant import PlantConfig
-from blf_dsc_controller.configuration.schema import build
+from blf_dsc_controller.configuration.schema import build, flatten, parameters
 from blf_dsc_controller.errors import BlfDscError, ConfigurationError
 from blf_dsc_controller.messages import topics
 
@@ -278,7 +280,8 @@ def test_parameter_page_is_what_its_command_writes(tmp_path):
         'run: python -m blf_dsc_controller.configuration.nodes doc/parameters.md'
     )
     rows = [row for row in committed.splitlines() if row.startswith('| `')]
-    assert {row.split('`')[1] for row in rows} == known_names()
+    gains = {f'gains.{each.name}' for of in GAINS.values() for each in parameters(of)}
+    assert {row.split('`')[1] for row in rows} == known_names() | gains
     assert {row.replace('\\|', '').count('|') for row in rows} == {7}
 
 
@@ -348,6 +351,84 @@ def test_a_damping_that_damps_nothing_is_told_apart_from_those_that_do(file):
     (problem,) = caught.value.problems
     assert 'feedback.damping: is called feedback.robust_gain (d2)' in problem
     assert 'feedback.joint_damping, or feedback.gain (K_p)' in problem
+
+
+def test_load_of_an_older_file_is_told_its_group(file):
+    text = (
+        'learning: {tell_drive: true, load_service: /load, load_frame: tool0, '
+        'load_in_motion: true}'
+    )
+    with pytest.raises(ConfigurationError) as caught:
+        load(
+            file(section('blf_dsc_controller', text)),
+            'blf_dsc_controller',
+            ControllerConfig,
+        )
+    assert caught.value.problems == [
+        'line 2: learning.tell_drive: is called load.tell_drive',
+        'line 2: learning.load_service: is called load.service',
+        'line 2: learning.load_frame: is called load.frame',
+        'line 2: learning.load_in_motion: is called load.in_motion',
+    ]
+
+
+def test_model_of_an_older_file_follows_from_its_urdf(file):
+    path = file(section('blf_dsc_controller', 'model: urdf'))
+    with pytest.raises(
+        ConfigurationError, match=r'line 2: model: follows from robot\.urdf'
+    ):
+        load(path, 'blf_dsc_controller', ControllerConfig)
+    assert ControllerConfig().model == 'two_link'
+    assert load_loop('panda').controller.model == 'urdf'
+
+
+def test_known_data_of_the_arm_is_there_if_it_is_given_or_needed(file):
+    path = file(section('/**', 'truth: {parameters: [1.0, 0.32, 0.4]}, seed: 4'))
+    assert load_plant(path).seed == 4
+    config = load(path, 'blf_dsc_controller', ControllerConfig)
+    assert flatten(config)['truth.parameters'] == (1.0, 0.32, 0.4)
+    assert copy.deepcopy(config) == config
+    assert not hasattr(load_loop('recommended').controller, 'truth')
+    assert hasattr(load_loop('model_based').controller, 'truth')
+    text = section('blf_dsc_controller', 'truth: {seed: 4}')
+    with pytest.raises(ConfigurationError, match=r'truth\.seed: unknown'):
+        load(file(text), 'blf_dsc_controller', ControllerConfig)
+
+
+@pytest.mark.parametrize(
+    ('law', 'surface', 'leakage'),
+    [
+        ('blf_dsc', 'it has no effect on', 'it has no effect on'),
+        ('backstepping', 'is called gains.surface_gain', 'is called gains.leakage'),
+        ('slotine_li', 'is called gains.surface_gain', 'it has no effect on'),
+    ],
+)
+def test_gains_of_the_compared_laws_are_told_the_law_that_has_them(
+    file, law, surface, leakage
+):
+    text = f'law: {law}, comparison: {{surface_gain: [9.0, 9.0], leakage: 0.1}}'
+    with pytest.raises(ConfigurationError) as caught:
+        load(
+            file(section('blf_dsc_controller', text)),
+            'blf_dsc_controller',
+            ControllerConfig,
+        )
+    first, second = caught.value.problems
+    assert f'line 2: comparison.surface_gain: {surface}' in first
+    assert f'line 2: comparison.leakage: {leakage}' in second
+    assert all(f'the law {law}' in problem for problem in (first, second))
+
+
+def test_a_law_of_the_package_has_its_gains_and_others_have_not(file):
+    gains = 'gains: {surface_gain: [9.0, 8.0]}'
+    path = file(section('/**', f'law: backstepping, {gains}'))
+    config = load(path, 'blf_dsc_controller', ControllerConfig)
+    assert flatten(config)['gains.surface_gain'] == (9.0, 8.0)
+    assert flatten(config)['gains.leakage'] == 0.001
+    assert not hasattr(ControllerConfig(), 'gains')
+    assert copy.deepcopy(config) == config  # through `__reduce__`, as pickle does
+    with pytest.raises(ConfigurationError, match=r'gains\.surface_gain: unknown'):
+        load(file(section('/**', gains)), 'blf_dsc_controller', ControllerConfig)
 
 
 def test_missing_file_error_lists_the_presets(tmp_path):

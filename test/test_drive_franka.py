@@ -150,10 +150,10 @@ def test_load_that_is_declared_and_not_there_makes_no_step(wire, tmp_path):
 
 
 def told_config():
-    """Return the preset with `learning.tell_drive`."""
+    """Return the preset with `load.tell_drive`."""
     preset = (blf.share_folder() / 'config/fr3_direct.yaml').read_text()
     section = '/**/blf_dsc_controller:\n  ros__parameters:\n'
-    return preset.replace(section, f'{section}    learning: {{tell_drive: true}}\n')
+    return preset.replace(section, f'{section}    load: {{tell_drive: true}}\n')
 
 
 def test_weighed_load_is_told_in_motion_and_no_torque_steps(wire, tmp_path):

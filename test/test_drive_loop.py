@@ -160,7 +160,7 @@ def test_torques_are_sent_before_weighing_and_recording(tmp_path):
 
 # s; the load is known about a second later
 PICKED_UP, PUSHED = 6.0, 9.2
-TOLD = {'learning.tell_drive': True}
+TOLD = {'load.tell_drive': True}
 RIGID = rigid_gears(7, 0.01)
 ALL = (
     TOLD
@@ -359,9 +359,9 @@ def test_load_is_not_taken_over_from_drives_that_add_no_weight():
 
 def test_tell_drive_needs_a_weighed_load_and_drives_that_compensate():
     with pytest.raises(ConfigurationError, match=r'robot\.drive_compensates none, but'):
-        change(blf.load_loop('panda').controller, {'learning.tell_drive': True})
+        change(blf.load_loop('panda').controller, {'load.tell_drive': True})
     with pytest.raises(ConfigurationError, match='got 1, but a bool'):
-        change(CONFIG, {'learning.tell_drive': 1})
+        change(CONFIG, {'load.tell_drive': 1})
 
 
 FACTS = Facts(2, 0.001, 'none', 'unknown', (20.0, 20.0), (inf, inf))

@@ -205,7 +205,6 @@ GAINS = {
     'learning.adaptation_gain': [0.5, 2.0, 1.5],
     'disturbance.gain': [40.0, 10.0],
     'barrier.weight': [800.0, 300.0],
-    'comparison.position_gain': [25.0, 9.0],
     'truth.phase': [0.0, 0.4],
 }
 
@@ -218,12 +217,15 @@ def samples(law, **changes):
         yield sample.t, controller, sample.measurement
 
 
-@pytest.mark.parametrize('law', ['blf_dsc', 'backstepping'])
-def test_terms_are_those_of_equation_29(law):
+@pytest.mark.parametrize(
+    ('law', 'own'),
+    [('blf_dsc', {}), ('backstepping', {'gains.position_gain': [25.0, 9.0]})],
+)
+def test_terms_are_those_of_equation_29(law, own):
     Gamma = np.array([0.5, 2.0, 1.5])
     gamma = np.array([40.0, 10.0])
     w = np.array([800.0, 300.0] if law == 'blf_dsc' else [25.0, 9.0])
-    for t, running, measurement in samples(law, **GAINS):
+    for t, running, measurement in samples(law, **GAINS, **own):
         sample = running.sample
         xi1, xi2 = sample.xi1, sample.xi2
         M, _, _ = dynamics(P, 9.8, measurement[:2], measurement[2:4])
@@ -286,21 +288,21 @@ def test_loop_continues_bit_for_bit_from_a_saved_state_and_begins_anew_after_a_r
     np.testing.assert_array_equal(torques(law, 0, 1337, begun), start)
 
 
+OWN = {'position_gain': [30.0, 11.0], 'robust_gain': [0.4, 0.2], 'leakage': 0.05}
+
+
 @pytest.mark.parametrize(('law', 'share'), [('backstepping', 1.0), ('slotine_li', 0.0)])
 def test_comparison_laws_are_the_linear_surface_with_their_gains(law, share):
     """`slotine_li` without w, mu_bar and W_c; neither learns from a window unless told to."""
-    gains = {'surface_gain': [60.0, 35.0], 'position_gain': [30.0, 11.0]}
-    gains |= {'robust_gain': [0.4, 0.2], 'leakage': 0.05}
-    given = {f'comparison.{name}': value for name, value in gains.items()}
+    gains = {'surface_gain': [60.0, 35.0]} | (OWN if share else {})
+    given = {f'gains.{name}': value for name, value in gains.items()}
     config = configured('recommended', 1.0, given | {'law': law}).controller
     settings = settings_of_config(config)
     assert settings.has_barrier == 0
     assert settings.compensation == state.STATE
     found = (settings.barrier.weight, settings.robust_gain, settings.adaptation.leakage)
-    for ours, name in zip(
-        found, ('position_gain', 'robust_gain', 'leakage'), strict=True
-    ):
-        np.testing.assert_array_equal(ours, share * np.array(gains[name]))
+    for ours, wanted in zip(found, OWN.values(), strict=True):
+        np.testing.assert_array_equal(ours, share * np.array(wanted))
     np.testing.assert_array_equal(settings.surface.gain, gains['surface_gain'])
     for zero in (
         settings.feedback.robust_gain,
@@ -309,7 +311,7 @@ def test_comparison_laws_are_the_linear_surface_with_their_gains(law, share):
         settings.excitation.change_detection,
     ):
         assert not np.any(zero)
-    told = change(config, {'comparison.learning_weight': 7.0})
+    told = change(config, {'gains.learning_weight': 7.0})
     assert (
         settings_of_config(told).adaptation.weight == 7.0
     )  # not the 100 of learning.weight

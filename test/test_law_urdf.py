@@ -29,7 +29,7 @@ from blf_dsc_controller.factory.settings import settings_of_config
 from blf_dsc_controller.studies.monte_carlo import draw, load_study, plant_with
 from sim_plant.settings import plant_settings
 
-ARM = {'model': 'urdf', 'robot.urdf': 'panda.urdf', 'robot.tip': 'panda_hand_tcp'}
+ARM = {'robot.urdf': 'panda.urdf', 'robot.tip': 'panda_hand_tcp'}
 
 
 def panda(**changes):
@@ -211,7 +211,7 @@ def test_drives_with_unknown_effort_limit_get_a_finite_prior():
 
 def test_random_arm_with_prismatic_joints_needs_only_its_urdf():
     # one chain: no tip needed
-    given = {'model': 'urdf', 'robot.urdf': random_urdf(4, seed=3)[0]}
+    given = {'robot.urdf': random_urdf(4, seed=3)[0]}
     config = build(ControllerConfig, given)
     assert config.joints == ('j1', 'j2', 'j3', 'j4')
     assert np.all(np.isfinite(settings_of_config(config).information))

@@ -34,7 +34,7 @@ from sim_plant.settings import plant_settings
 
 PACKAGES = ('ur_msgs', 'franka_msgs')
 SERVICE = '/driver/set_load'
-TOLD = {'learning.tell_drive': True, 'learning.load_service': SERVICE}
+TOLD = {'load.tell_drive': True, 'load.service': SERVICE}
 PICKED_UP = 6.0  # s; it is weighed about a second later
 FR3 = load_loop('fr3_direct')
 EVENT = {
@@ -117,7 +117,7 @@ def test_load_is_told_to_the_service_in_steps_that_no_joint_notices(services, tm
     arm.run_until(8.0)
     assert guard.controller.state.weighing.load[0] == pytest.approx(2.0, abs=0.1)
     assert not arm.requests
-    arm.law.set_parameters([Parameter('learning.load_in_motion', value=True)])
+    arm.law.set_parameters([Parameter('load.in_motion', value=True)])
     arm.run_until(9.5)
     masses = [request.mass for request in arm.requests]
     assert len(masses) > 10
@@ -142,9 +142,7 @@ def test_load_is_told_to_the_service_in_steps_that_no_joint_notices(services, tm
 
 def test_driver_that_refuses_is_asked_once(services, ros):
     """As that of a Franka does while a controller is active."""
-    arm = Arm(
-        ros, services['franka'], accepts=False, **{'learning.load_in_motion': True}
-    )
+    arm = Arm(ros, services['franka'], accepts=False, **{'load.in_motion': True})
     arm.run_until(8.0)
     assert len(arm.requests) == 1
     asked = f'/driver/set_load refused {arm.requests[0].mass:.2f} kg'
@@ -155,7 +153,7 @@ def test_driver_that_refuses_is_asked_once(services, ros):
 
 def test_law_that_begins_again_leaves_the_load_to_the_drives(services, ros):
     """After a reset it knows of no load: nor may its commands take away what the drives add."""
-    arm = Arm(ros, services['ur'], **{'learning.load_in_motion': True})
+    arm = Arm(ros, services['ur'], **{'load.in_motion': True})
     arm.run_until(8.5)
     told = arm.law._load_service.told
     assert told.mass == pytest.approx(2.0, abs=0.1)
@@ -203,17 +201,17 @@ def test_service_that_cannot_be_called_is_named(ros, monkeypatch):
 @pytest.mark.parametrize(
     ('given', 'problem'),
     [
-        ({'learning.load_service': 3}, 'learning.load_service: got 3'),
+        ({'load.service': 3}, 'load.service: got 3'),
         (
-            {'learning.tell_drive': False},
-            'learning.load_service: got /driver/set_load, but learning.tell_drive is false',
+            {'load.tell_drive': False},
+            'load.service: got /driver/set_load, but load.tell_drive is false',
         ),
-        ({'learning.load_frame': 'nowhere'}, 'learning.load_frame: .*nowhere'),
+        ({'load.frame': 'nowhere'}, 'load.frame: .*nowhere'),
         (
-            {'learning.load_frame': 'fr3_link2'},
-            'learning.load_frame: the moving joints',
+            {'load.frame': 'fr3_link2'},
+            'load.frame: the moving joints',
         ),
-        ({'learning.load_in_motion': 'yes'}, 'learning.load_in_motion: got .yes.'),
+        ({'load.in_motion': 'yes'}, 'load.in_motion: got .yes.'),
     ],
 )
 def test_bad_values_are_named_with_a_remedy(given, problem):
@@ -223,7 +221,7 @@ def test_bad_values_are_named_with_a_remedy(given, problem):
 
 def test_centre_is_in_the_frame_that_the_service_wants(ros):
     """The flange, link 8, is 0.107 m beyond the frame of the last joint, link 7."""
-    given = TOLD | {'robot.tip': 'fr3_link7', 'learning.load_frame': 'fr3_link8'}
+    given = TOLD | {'robot.tip': 'fr3_link7', 'load.frame': 'fr3_link8'}
     service = load_service.LoadService(ros.tester, change(FR3.controller, given))
     found = service._to_frame @ (0.01, 0.02, 0.03, 1.0)
     np.testing.assert_allclose(found[:3], (0.01, 0.02, 0.03 - 0.107), atol=1e-12)
@@ -233,7 +231,7 @@ def test_centre_is_in_the_frame_that_the_service_wants(ros):
 @pytest.mark.parametrize('mass', [2.0, 0.0])
 def test_load_that_is_put_down_has_no_centre(services, ros, kind, mass):
     """Although the origin of the tip is 0.107 m from that of the frame."""
-    given = TOLD | {'robot.tip': 'fr3_link7', 'learning.load_frame': 'fr3_link8'}
+    given = TOLD | {'robot.tip': 'fr3_link7', 'load.frame': 'fr3_link8'}
     requests = []
 
     def take(request, response):

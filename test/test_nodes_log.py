@@ -133,10 +133,8 @@ def test_a_stop_is_logged_once_with_how_to_continue_on_a_real_arm(ros, log):
 
 def test_a_load_that_nobody_tells_the_drives_is_warned_of(ros, log):
     fr3 = flatten(load_loop('fr3').controller)
-    ros.add(ControllerNode, fr3 | {'learning.tell_drive': True}, namespace='told')
-    ros.until(
-        lambda: log('told', 'without learning.load_service no load is declared', WARN)
-    )
+    ros.add(ControllerNode, fr3 | {'load.tell_drive': True}, namespace='told')
+    ros.until(lambda: log('told', 'without load.service no load is declared', WARN))
 
 
 def test_diagnostics_tell_what_is_held(ros):

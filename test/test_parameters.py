@@ -26,7 +26,7 @@ from std_msgs.msg import String
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.nodes import NODES, RecorderConfig
 from blf_dsc_controller.configuration.plant import PlantConfig
-from blf_dsc_controller.configuration.schema import build, change, parameters
+from blf_dsc_controller.configuration.schema import build, change, flatten, parameters
 from blf_dsc_controller.errors import ConfigurationError
 from blf_dsc_controller.messages import topics
 from blf_dsc_controller.messages.topics import Quality
@@ -59,6 +59,20 @@ def test_parameters_have_descriptors(bare_node):
     assert sample_time.additional_constraints.startswith(
         'at least 1e-05 and at most 1; fixed at'
     )
+
+
+def test_empty_lists_that_only_some_laws_have_stay_empty(bare_node, tmp_path):
+    path = tmp_path / 'config.yaml'
+    path.write_text(
+        'blf_dsc_controller:\n  ros__parameters:\n    law: slotine_li\n'
+        '    gains: {integral_gain: []}\n    truth: {parameters: []}\n'
+    )
+    node = bare_node('blf_dsc_controller', path)
+    config = declare(node, ControllerConfig)
+    for name in ('gains.integral_gain', 'truth.parameters'):
+        assert not flatten(config)[name]
+        assert node.get_parameter(name).type_.name == 'DOUBLE_ARRAY'
+    assert read(node, type(config)) == config
 
 
 def test_empty_list_stays_empty_and_keeps_its_type_and_description(bare_node, tmp_path):

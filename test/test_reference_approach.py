@@ -11,7 +11,7 @@ import pytest
 from fault_table import Rig
 
 from blf_dsc_controller.configuration.controller import ControllerConfig
-from blf_dsc_controller.configuration.controller_groups import (
+from blf_dsc_controller.configuration.motion_groups import (
     Approach,
     MotionLimits,
     Reference,

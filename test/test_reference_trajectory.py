@@ -12,7 +12,7 @@ import pytest
 from hypothesis import strategies as st
 
 from blf_dsc_controller.configuration.controller import ControllerConfig
-from blf_dsc_controller.configuration.controller_groups import MotionLimits
+from blf_dsc_controller.configuration.motion_groups import MotionLimits
 from blf_dsc_controller.reference import retargeting
 from blf_dsc_controller.reference import terms as reference
 from blf_dsc_controller.reference.approach import MotionError

@@ -22,6 +22,7 @@ from blf_dsc_controller.bags.content import read_content
 from blf_dsc_controller.bags.reader import read_run
 from blf_dsc_controller.cli.bags import DIFFERENT, PARTIAL
 from blf_dsc_controller.cli.main import main
+from blf_dsc_controller.configuration.earlier_names import RENAMED
 from blf_dsc_controller.configuration.nodes import load_loop
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.messages.codecs import JointStateEncoder
@@ -402,13 +403,47 @@ def test_waypoints_of_an_older_bag_stand_joint_by_joint(tmp_path):
     assert read_content(bag).unknown_parameters == []
 
 
-def test_robust_gain_of_an_older_bag_was_called_a_damping(tmp_path):
+def test_parameters_of_an_older_bag_are_read_by_their_earlier_names(tmp_path):
     given = {'feedback.robust_gain': [3.0, 2.0]}
     entries = recorded_run.messages(recorded_run.record(tmp_path / 'new', 0.3, **given))
 
     def change(content):
         parameters = content['parameters']
-        parameters['feedback.damping'] = parameters.pop('feedback.robust_gain')
+        for earlier, name in RENAMED.items():
+            parameters[earlier] = parameters.pop(name)
+        parameters['model'] = 'two_link'
+
+    configured(entries, change)
+    bag = recorded_run.write(tmp_path / 'old', entries)
+    result = verify(bag)
+    assert (result.difference, result.remarks, result.incomplete) == (None, (), ())
+    assert read_content(bag).unknown_parameters == []
+
+
+def test_model_of_an_older_bag_must_be_that_of_its_urdf(entries, tmp_path, capsys):
+    configured(entries, lambda content: content['parameters'].update(model='urdf'))
+    path = recorded_run.write(tmp_path / 'bag', entries)
+    assert main(['replay', str(path)]) == 1
+    assert 'model: unknown parameter' in capsys.readouterr().err
+
+
+@pytest.mark.parametrize('law', ['blf_dsc', 'backstepping', 'slotine_li'])
+def test_gains_of_the_compared_laws_were_those_of_all_laws(tmp_path, law):
+    folder = recorded_run.record(tmp_path / 'new', 0.3, law=law)
+    entries = recorded_run.messages(folder)
+    earlier = {
+        'surface_gain': [71.0, 72.0],
+        'position_gain': [2.0, 3.0],
+        'robust_gain': [0.0, 0.0],
+        'integral_gain': [],
+        'leakage': 0.5,
+        'learning_weight': 0.0,
+    }
+
+    def change(content):
+        parameters = content['parameters']
+        for name, value in earlier.items():
+            parameters[f'comparison.{name}'] = parameters.pop(f'gains.{name}', value)
 
     configured(entries, change)
     bag = recorded_run.write(tmp_path / 'old', entries)

@@ -11,7 +11,7 @@ from random_arm import CONFIG
 
 from blf_dsc_controller import load_loop
 from blf_dsc_controller.configuration.controller import ControllerConfig
-from blf_dsc_controller.configuration.controller_groups import MotionLimits, Reference
+from blf_dsc_controller.configuration.motion_groups import MotionLimits, Reference
 from blf_dsc_controller.configuration.schema import change
 from blf_dsc_controller.errors import StartError
 from blf_dsc_controller.reference.approach import plan_start

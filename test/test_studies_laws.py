@@ -334,7 +334,7 @@ def test_integral_gain_of_slotine_li_is_the_gain_of_its_disturbance_estimate():
     config = load_loop('ur5e_rigid').controller
     chosen = {
         'law': 'slotine_li',
-        'comparison.integral_gain': [1.0, 2.0, 3.0, 4.0, 5.0, 6.0],
+        'gains.integral_gain': [1.0, 2.0, 3.0, 4.0, 5.0, 6.0],
     }
     settings = settings_of_config(change(config, chosen))
     assert settings.disturbance.gain.tolist() == [1.0, 2.0, 3.0, 4.0, 5.0, 6.0]

@@ -14,7 +14,7 @@ from blf_dsc_controller.supervision.drive_load import DriveLoad, DriveLoads
 
 CONFIG = change(
     load_loop('fr3_direct').controller,
-    {'learning.tell_drive': True, 'robot.drive_payload': 0.5},
+    {'load.tell_drive': True, 'robot.drive_payload': 0.5},
 )
 CENTRE = (0.01, -0.02, 0.05)  # m
 SURE = (0.01, 0.005, 0.005, 0.005)  # kg and m, standard deviations

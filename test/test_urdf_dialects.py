@@ -83,7 +83,7 @@ def limited(more='', soft=''):
 def test_accelerations_of_urdf_1_2_limit_the_motion():
     text = limited('acceleration="3.0" deceleration="2.0"')
     assert chain_of(text).joints[0].acceleration == 2.0
-    values = {'model': 'urdf', 'robot.tip': 'panda_hand_tcp', 'joints': PANDA}
+    values = {'robot.tip': 'panda_hand_tcp', 'joints': PANDA}
     usual, lower = (
         build(ControllerConfig, {**values, 'robot.urdf': each}).limits.acceleration
         for each in (PANDA_TEXT, text)
@@ -167,13 +167,13 @@ ARM = re.sub('type="prismatic"', 'type="revolute"', ARMS['two'][0])
 
 def test_gripper_that_becomes_a_joint_is_named():
     text = ARM.replace('</robot>', GRIPPER.format('flange2'))
-    config = build(ControllerConfig, {'model': 'urdf', 'robot.urdf': text})
+    config = build(ControllerConfig, {'robot.urdf': text})
     assert config.joints[-1] == 'grip'
     warnings = [each for each in config_warnings(config) if 'robot.tip' in each]
     assert len(warnings) == 1
     assert 'grip, which slides' in warnings[0]
     assert warnings[0].endswith('l2')
-    given = {'model': 'urdf', 'robot.urdf': text, 'robot.tip': 'l2'}
+    given = {'robot.urdf': text, 'robot.tip': 'l2'}
     config = build(ControllerConfig, given)
     assert not any('robot.tip' in each for each in config_warnings(config))
 
@@ -184,7 +184,7 @@ def test_urdf_is_found_beside_the_file_that_names_it(tmp_path, monkeypatch):
     (folder / 'mine.urdf').write_text(PANDA_TEXT)
     path = folder / 'mine.yaml'
     path.write_text(
-        '/**:\n  ros__parameters:\n    model: urdf\n'
+        '/**:\n  ros__parameters:\n    sample_time: 0.001\n'
         '    robot: {urdf: mine.urdf, tip: panda_hand_tcp}\n'
     )
     monkeypatch.chdir(tmp_path)

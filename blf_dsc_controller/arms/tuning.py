@@ -141,8 +141,6 @@ def _through_inertia(arm: Design, bound: np.ndarray | None) -> dict[str, Value]:
         'feedback.gain': zeros,
         'feedback.damping_rate': _DAMPING * rate,
         'disturbance.gain': _listed(integral),
-        'comparison.surface_gain': (rate / 3.0,) * n,
-        'comparison.position_gain': _listed(m * (rate / 4.0) ** 2),
         'learning.adaptation_gain': (Gamma,) * arm.parameters.model.p,
     }
 
@@ -166,9 +164,26 @@ def _of_joints(
         'barrier.initial_bound': _listed(start),
         'barrier.funnel_rate': float(f'{funnel_rate(gains):.4g}'),
         'feedback.damping_rate': 0.0,
-        'comparison.surface_gain': _listed(gains.rate),
-        'comparison.position_gain': _listed(0.5 * gains.stiffness),
         'learning.adaptation_gain': (Gamma,) * arm.parameters.model.p,
+    }
+
+
+def linear_surface_gains(arm: Design) -> Mapping[str, Value]:
+    """Return the gains of the laws with a linear surface by the name of their parameter."""
+    n = len(arm.chain.joints)
+    if arm.joints is None:
+        fastest = _PHASE / loop_delay(arm.sample_time, arm.lag)
+        rate = arm.stiffness * fastest
+        surface = (rate / 3.0,) * n
+        position = arm.over_postures().free_inertia * (rate / 4.0) ** 2
+    else:
+        gains = arm.joints.scaled(arm.stiffness)
+        surface = _listed(gains.rate)
+        position = 0.5 * gains.stiffness
+    return {
+        'surface_gain': surface,
+        'position_gain': _listed(position),
+        'robust_gain': (0.0,) * n,
     }
 
 
@@ -227,7 +242,6 @@ def _of_arm(arm: Design) -> dict[str, Value]:
         'learning.viscous': True,
         'learning.coulomb': True,
         'learning.coulomb_velocity': 0.02,
-        'comparison.robust_gain': zeros,
         'truth.constant': zeros,
         'truth.amplitude': zeros,
         'truth.frequency': (1.0,) * n,

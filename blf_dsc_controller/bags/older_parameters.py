@@ -12,7 +12,14 @@ from collections.abc import Mapping
 from typing import Any
 
 from blf_dsc_controller.bags.sources import BagError
-from blf_dsc_controller.configuration.controller import ControllerConfig, by_point
+from blf_dsc_controller.configuration.controller import ControllerConfig
+from blf_dsc_controller.configuration.earlier_names import (
+    RENAMED,
+    by_point,
+    is_comparison,
+    of_law,
+)
+from blf_dsc_controller.configuration.law_traits import LAWS
 from blf_dsc_controller.configuration.plausibility import CHECKED
 from blf_dsc_controller.configuration.schema import (
     Value,
@@ -21,9 +28,6 @@ from blf_dsc_controller.configuration.schema import (
     unknown,
     variant_of,
 )
-
-NAMES = {'feedback.damping': 'feedback.robust_gain'}
-"""Names of this version, by those of older bags."""
 
 REMOVED: dict[str, Value] = {}
 """Last default of each parameter of the first release that is gone now."""
@@ -45,7 +49,7 @@ def current(recorded: Mapping[str, Any], source: str, law: str = '') -> dict[str
     Raises:
         BagError: one of them is gone, and no rule says that the law does the same without it.
     """
-    recorded = renamed(recorded)
+    recorded = renamed(recorded, law)
     known = known_names({**recorded, 'law': law} if law else recorded)
     problems = []
     for name, value in recorded.items():
@@ -68,12 +72,21 @@ def current(recorded: Mapping[str, Any], source: str, law: str = '') -> dict[str
     return {name: value for name, value in recorded.items() if name in known}
 
 
-def renamed(recorded: Mapping[str, Any]) -> dict[str, Any]:
+def renamed(recorded: Mapping[str, Any], law: str = '') -> dict[str, Any]:
     """Return recorded parameters of a controller by their names of this version.
 
-    `reference.points` were waypoints joint by joint; the robust gain d2 was called a damping.
+    `law` is as in `current`. `reference.points` were waypoints joint by joint; gains of
+    other laws than the recorded one, which had no effect, are left out, and so is a model
+    that follows from the URDF.
     """
-    values = {NAMES.get(name, name): value for name, value in recorded.items()}
+    law = law or recorded.get('law', LAWS[0])
+    names = {
+        name: of_law(name, law) if is_comparison(name) else RENAMED.get(name, name)
+        for name in recorded
+    }
+    values = {names[name]: value for name, value in recorded.items() if names[name]}
+    if values.get('model') == ('urdf' if values.get('robot.urdf') else 'two_link'):
+        del values['model']
     points = values.get('reference.points')
     times = values.get('reference.times', ())
     if points is not None and (not points or by_point(points, len(times))):
@@ -93,8 +106,7 @@ def completed(recorded: Mapping[str, Any]) -> dict[str, Any]:
 
     The feedback of an arm from a URDF acted through its inertia matrix.
     """
-    is_urdf = recorded.get('model') == 'urdf'
-    feedback = {'feedback.inertia': 'whole'} if is_urdf else {}
+    feedback = {'feedback.inertia': 'whole'} if recorded.get('robot.urdf') else {}
     return {**ADDED, **feedback, **recorded}
 
 

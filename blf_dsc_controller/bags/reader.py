@@ -176,7 +176,7 @@ def _arrays(
 
 def _may_wrap(content: Content) -> bool:
     """Return whether the controller counts turns on for a joint, as a continuous one."""
-    if content.configurations.get(topics.CONTROLLER, {}).get('model') == 'urdf':
+    if content.configurations.get(topics.CONTROLLER, {}).get('robot.urdf'):
         with suppress(BlfDscError):
             return bool(turns_freely(content.controller_config()).any())
     return False
@@ -298,7 +298,7 @@ def _joints(content: Content) -> tuple[str, ...]:
 
 def _arm(content: Content) -> LearnedArm | None:
     """Return the arm of the recorded configuration, None if it cannot be built."""
-    if content.configurations.get(topics.CONTROLLER, {}).get('model') == 'urdf':
+    if content.configurations.get(topics.CONTROLLER, {}).get('robot.urdf'):
         from blf_dsc_controller.factory.estimate import learned_arm  # slow: compiles
 
         with suppress(BlfDscError):
@@ -308,7 +308,7 @@ def _arm(content: Content) -> LearnedArm | None:
 
 def _sliding(content: Content) -> tuple[str, ...]:
     """Return the joints that slide by the recorded configuration; none if it is unknown."""
-    if content.configurations.get(topics.CONTROLLER, {}).get('model') == 'urdf':
+    if content.configurations.get(topics.CONTROLLER, {}).get('robot.urdf'):
         with suppress(BlfDscError):
             config = content.controller_config()
             return config.robot.sliding(config.joints)
@@ -317,7 +317,7 @@ def _sliding(content: Content) -> tuple[str, ...]:
 
 def _tool(content: Content) -> ToolErrors | None:
     """Return the errors at the tool as configured; None without a bound there."""
-    if content.configurations.get(topics.CONTROLLER, {}).get('model') == 'urdf':
+    if content.configurations.get(topics.CONTROLLER, {}).get('robot.urdf'):
         from blf_dsc_controller.configuration.tool_bound import tool_of  # as above
 
         with suppress(BlfDscError):

@@ -135,7 +135,7 @@ def plan(
     """
     if config.model != 'urdf':
         raise BlfDscError(
-            f'model: got {config.model}, but commissioning needs an arm from a URDF'
+            'robot.urdf: got none, but commissioning needs an arm from a URDF'
         )
     if config.feedback.inertia != 'none':
         raise BlfDscError(

@@ -223,8 +223,8 @@ def watched(config: ControllerConfig) -> dict[str, object]:
     }
     if barrier.bounds_tool:
         values |= {'barrier.tool_bound': 0.0, 'barrier.tool_angle_bound': 0.0}
-    if config.learning.tell_drive:
-        values |= {'learning.tell_drive': False, 'learning.load_service': ''}
+    if config.load.tell_drive:
+        values |= {'load.tell_drive': False, 'load.service': ''}
     if config.contact.reaction != 'none':
         values['contact.reaction'] = 'stop'
     return values

@@ -15,7 +15,8 @@ from blf_dsc_controller.arms.known_gears import Gears
 from blf_dsc_controller.arms.urdf import Chain
 from blf_dsc_controller.configuration import tool_bound
 from blf_dsc_controller.configuration.controller_groups import Feedback, Surface
-from blf_dsc_controller.configuration.law_traits import LAWS
+from blf_dsc_controller.configuration.law_file import GROUP
+from blf_dsc_controller.configuration.law_traits import GAINS, LAWS
 from blf_dsc_controller.configuration.robot import (
     ArmConfig,
     Robot,
@@ -23,7 +24,7 @@ from blf_dsc_controller.configuration.robot import (
     given_robot,
     parameters_of,
 )
-from blf_dsc_controller.configuration.schema import Value
+from blf_dsc_controller.configuration.schema import Value, parameters
 
 _OBSERVER = 60.0  # rad/s, below the drives' own loops
 
@@ -31,7 +32,7 @@ _OBSERVER = 60.0  # rad/s, below the drives' own loops
 def followed_by(given: Mapping[str, Any]) -> Mapping[str, Value]:
     """Return the gains and limits that follow from given parameters by dotted name."""
     period = given.get('sample_time', ArmConfig.sample_time)
-    if given.get('model', 'urdf' if given.get('robot.urdf') else '') != 'urdf':
+    if not given.get('robot.urdf'):
         return {'surface.time_constant': max(period, Surface().time_constant)}
     robot, chain = given_robot(given)
     base = parameters_of(robot, chain)
@@ -46,14 +47,24 @@ def followed_by(given: Mapping[str, Any]) -> Mapping[str, Value]:
         followed['barrier.initial_bound'] = (0.0,) * len(chain.joints)
     is_whole = bound is not None and len(bound) == len(chain.joints)
     return {
-        'model': 'urdf',
         **described(robot, chain),
         'learning.weighing': given.get('learning.prediction', 'filtered') == 'filtered',
         'feedback.stiffness': arm.stiffness,
         'disturbance.observer_bandwidth': _observer_bandwidth(given, robot, arm),
         **tuning.gains_of(arm, np.array(bound) if is_whole else None),
         **followed,
+        **_gains_of_law(given, arm),
     }
+
+
+def _gains_of_law(given: Mapping[str, Any], arm: tuning.Design) -> dict[str, Value]:
+    """Return the gains that only the given law of the package has."""
+    group = GAINS.get(given.get('law', LAWS[0]))
+    if group is None:
+        return {}
+    names = {param.name for param in parameters(group)}
+    usual = tuning.linear_surface_gains(arm)
+    return {f'{GROUP}.{name}': usual[name] for name in names & usual.keys()}
 
 
 def _design(

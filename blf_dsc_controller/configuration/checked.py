@@ -7,10 +7,10 @@ from typing import Protocol
 
 from blf_dsc_controller.configuration.controller_groups import (
     Barrier,
-    MotionLimits,
     Safety,
     Torque,
 )
+from blf_dsc_controller.configuration.motion_groups import MotionLimits
 from blf_dsc_controller.configuration.robot import Robot
 
 

@@ -5,37 +5,42 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any, Literal
-
-import numpy as np
 
 from blf_dsc_controller.arms import tuning
 from blf_dsc_controller.arms.known_gears import Gears
 from blf_dsc_controller.arms.model import arm_model
-from blf_dsc_controller.configuration import law_file, plausibility, tool_bound
+from blf_dsc_controller.configuration import (
+    earlier_names,
+    known_arm,
+    law_file,
+    plausibility,
+    tool_bound,
+)
 from blf_dsc_controller.configuration.arm_defaults import followed_by, stated_design
 from blf_dsc_controller.configuration.controller_groups import (
-    Approach,
     ArmGeometry,
     Barrier,
     CommissionedGains,
-    ComparisonGains,
     Contact,
+    DeclaredLoad,
     DisturbanceEstimate,
     Feedback,
-    KnownArm,
     Learning,
-    MotionLimits,
-    Reference,
     Safety,
     Surface,
     Telemetry,
     Torque,
     sizing,
 )
-from blf_dsc_controller.configuration.law_traits import LAWS, traits_of
+from blf_dsc_controller.configuration.law_traits import LAWS, gains_of, traits_of
+from blf_dsc_controller.configuration.motion_groups import (
+    Approach,
+    MotionLimits,
+    Reference,
+)
 from blf_dsc_controller.configuration.robot import (
     ArmConfig,
     parameters_of,
@@ -44,8 +49,6 @@ from blf_dsc_controller.configuration.schema import (
     Value,
     build,
     flatten,
-    format_value,
-    suggestion,
 )
 from blf_dsc_controller.errors import BlfDscError
 
@@ -62,7 +65,6 @@ class ControllerConfig(ArmConfig):
         f'control law: {", ".join(LAWS)}, or a Python file that defines one',
         kept=law_file.kept,
     )
-    model: Literal['two_link', 'urdf'] = sizing('two_link', 'model of the arm')
     arm: ArmGeometry = ArmGeometry()
     reference: Reference = Reference()
     approach: Approach = Approach()
@@ -73,56 +75,36 @@ class ControllerConfig(ArmConfig):
     disturbance: DisturbanceEstimate = DisturbanceEstimate()
     torque: Torque = Torque()
     learning: Learning = Learning()
+    load: DeclaredLoad = DeclaredLoad()
     contact: Contact = Contact()
-    comparison: ComparisonGains = ComparisonGains()
-    truth: KnownArm = KnownArm()
     safety: Safety = Safety()
     telemetry: Telemetry = Telemetry()
     commissioning: CommissionedGains = CommissionedGains()
 
     @classmethod
     def variant(cls, given: Mapping[str, Any]) -> type[ControllerConfig]:
-        """Return the configuration with a law's own gains as the group `gains`.
+        """Return the configuration with the gains that only the given law has, and known data.
 
         Raises BlfDscError if there is no such law.
         """
         law = given.get('law', LAWS[0])
-        if not isinstance(law, str) or law in LAWS:
-            return ControllerConfig
-        if not law_file.is_file(law):
-            raise BlfDscError(
-                f'law: got {format_value(law)}, but expected one of {", ".join(LAWS)}, or a '
-                f'Python file{suggestion(law, LAWS)}'
-            )
-        return _with_gains(law_file.gains_of(law_file.load_law(law)))
+        gains = gains_of(law) if isinstance(law, str) else None
+        return _with_groups(gains, knows=known_arm.is_asked_for(given))
 
     @classmethod
     def replaced(cls, given: Mapping[str, Any]) -> Mapping[str, str]:
         """Return what to write instead of given parameters of earlier versions."""
-        found = {}
-        if 'feedback.damping' in given:
-            found['feedback.damping'] = (
-                'is called feedback.robust_gain (d2), since it damps nothing; the damping of a '
-                'joint is feedback.joint_damping, or feedback.gain (K_p)'
-            )
-        points, times = (given.get(f'reference.{name}') for name in ('points', 'times'))
-        if points is None:
-            return found
-        remedy = 'write them as reference.waypoints' if points else 'leave it out'
-        if isinstance(points, list | tuple) and isinstance(times, list | tuple):
-            rows = by_point(points, len(times))
-            remedy = (
-                f'write reference.waypoints: {format_value(rows)}' if rows else remedy
-            )
-        return found | {
-            'reference.points': 'replaced by reference.waypoints, which has one row per point '
-            f'as everywhere in ROS, and not one per joint: {remedy}'
-        }
+        return earlier_names.remedies(given)
+
+    @property
+    def model(self) -> Literal['two_link', 'urdf']:
+        """Model of the arm: that of its URDF, or the paper's two links without one."""
+        return 'urdf' if self.robot.urdf else 'two_link'
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Pickle by values.
 
-        The class of a law of a file is made when it is loaded.
+        The class with the gains of a law is made when they are read.
         """
         return build, (ControllerConfig, flatten(self))
 
@@ -151,7 +133,9 @@ class ControllerConfig(ArmConfig):
         yield from self.barrier.problems(self.joints)
         yield from tool_bound.problems(self)
         radius = self.learning.radius
-        yield from self.truth.problems(self.law, self.model, count, radius)
+        known = known_arm.known_arm(self)
+        if known:
+            yield from known.problems(self.law, self.model, count, radius)
         yield from self.learning.problems(self.sample_time, self.model, count)
         yield from plausibility.problems_of_controller(self)
 
@@ -165,35 +149,36 @@ class ControllerConfig(ArmConfig):
 
     def _weighing_problems(self) -> Iterator[str]:
         """Check that the load in the tip can be weighed."""
-        learned = (self.model, self.learning.prediction)
-        if self.learning.weighing and learned != ('urdf', 'filtered'):
+        prediction = self.learning.prediction
+        can_weigh = self.model == 'urdf' and prediction == 'filtered'
+        if self.learning.weighing and not can_weigh:
             yield (
-                f'learning.weighing: got true with {", ".join(learned)}, but needs model urdf and '
-                'learning.prediction filtered'
+                f'learning.weighing: got true with model {self.model} and learning.prediction '
+                f'{prediction}, but needs robot.urdf and filtered'
             )
 
     def _drive_load_problems(self) -> Iterator[str]:
         """Check that the load can be declared to the drives, and how."""
-        learning = self.learning
+        load, learning = self.load, self.learning
         compensates = self.robot.drive_compensates != 'none'
-        if learning.tell_drive and not (learning.weighing and compensates):
+        if load.tell_drive and not (learning.weighing and compensates):
             yield (
-                f'learning.tell_drive: got true with learning.weighing '
+                f'load.tell_drive: got true with learning.weighing '
                 f'{str(learning.weighing).lower()} and robot.drive_compensates '
                 f'{self.robot.drive_compensates}, but needs a load that is weighed and drives that '
                 'compensate gravity'
             )
-        if learning.load_service and not learning.tell_drive:
+        if load.service and not load.tell_drive:
             yield (
-                f'learning.load_service: got {learning.load_service}, but learning.tell_drive is '
+                f'load.service: got {load.service}, but load.tell_drive is '
                 'false: set it to true'
             )
-        if learning.load_frame:
-            to_frame = dataclasses.replace(self.robot, tip=learning.load_frame)
+        if load.frame:
+            to_frame = dataclasses.replace(self.robot, tip=load.frame)
             try:
                 to_frame.chain(self.joints)
             except BlfDscError as error:
-                yield f'learning.load_frame: {error}'
+                yield f'load.frame: {error}'
 
     def _contact_problems(self) -> Iterator[str]:
         """Check that contacts are found, and by a law that can find them."""
@@ -226,7 +211,7 @@ class ControllerConfig(ArmConfig):
             yield (
                 f'disturbance.observer_bandwidth: got {bandwidth:g} rad/s with law {self.law}, '
                 f'model {self.model} and learning.prediction {self.learning.prediction}, but needs '
-                f'{LAWS[0]}, urdf and filtered'
+                f'{LAWS[0]}, robot.urdf and filtered'
             )
 
     def _stiffness_problems(self) -> Iterator[str]:
@@ -235,8 +220,8 @@ class ControllerConfig(ArmConfig):
         if self.model != 'urdf' and feedback.stiffness != Feedback().stiffness:
             yield (
                 f'feedback.stiffness: got {feedback.stiffness:g} with model {self.model}, but only '
-                'the gains of model urdf follow from it: leave it at 1, and lower feedback.gain '
-                'and surface.gain'
+                'the gains of an arm from a URDF follow from it: leave it at 1, and lower '
+                'feedback.gain and surface.gain'
             )
         if feedback.inertia == 'whole' and feedback.stiffness > 1.0:
             yield (
@@ -275,24 +260,22 @@ def design_of(config: ControllerConfig) -> tuple[tuning.Design, Gears | None]:
     return stated_design(flatten(config), config.robot, chain, base)
 
 
-def by_point(points: Sequence[float], count: int) -> list[float]:
-    """Return the rows of so many points, joint by joint, point by point.
-
-    Empty if these are not as many in each row.
-    """
-    if count == 0 or len(points) % count:
-        return []
-    rows: list[float] = np.reshape(points, (-1, count)).T.ravel().tolist()
-    return rows
-
-
 @functools.cache
-def _with_gains(gains: type) -> type[ControllerConfig]:
-    """Return the configuration with a group of gains of a law of a file."""
-    group = dataclasses.field(default=gains())
+def _with_groups(gains: type | None, *, knows: bool) -> type[ControllerConfig]:
+    """Return the configuration with the group of gains of a law, and that of known data."""
+    groups: dict[str, type] = {}
+    if knows:
+        groups[known_arm.GROUP] = known_arm.KnownArm
+    if gains:
+        groups[law_file.GROUP] = gains
+    if not groups:
+        return ControllerConfig
     return dataclasses.make_dataclass(
         'ControllerConfig',
-        [(law_file.GROUP, gains, group)],
+        [
+            (name, group, dataclasses.field(default=group()))
+            for name, group in groups.items()
+        ],
         bases=(ControllerConfig,),
         frozen=True,
     )

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Groups of the controller's parameters: reference, limits, safety, telemetry, gains.
+"""Groups of the controller's parameters: safety, telemetry, gains, learning, contact.
 
 The gains are those of the control laws (28) and (35), and of composite learning (20) to
 (27).
@@ -9,12 +9,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
-from itertools import pairwise
 from typing import Annotated, Literal
-
-import numpy as np
 
 from blf_dsc_controller.configuration.schema import (
     PerJoint,
@@ -27,10 +24,6 @@ _of_tool = partial(
     non_negative,
     read_only='the joint bounds follow from it when they are read: change those',
 )
-_of_reference = partial(
-    parameter,
-    read_only='the reference would jump: send a trajectory on ~/joint_trajectory',
-)
 _telemetry = partial(
     parameter, read_only='topics are created once, when the node starts'
 )
@@ -39,146 +32,11 @@ _in_window = partial(
     parameter, read_only='the data in the excitation window depend on it'
 )
 _at_start = partial(parameter, read_only='it has no effect later')
-_known = partial(parameter, read_only='it is known data, not a gain')
 _measured = partial(parameter, read_only='it says how the gains were found')
 _FOLLOWED = 'the other gains follow from it when they are read: change those'
 _from_urdf = partial(non_negative, (), read_only=_FOLLOWED, omittable=True)
-_RISE = 0.05  # s to the largest acceleration
-_ROUNDING = 1.0 + 1e-9
 # per window: fewer do not determine P, more need over 100 MB
 _SAMPLES = (10, 1_000_000)
-
-
-@dataclass(frozen=True)
-class Reference:
-    """The reference to track, until a trajectory arrives on `~/joint_trajectory`.
-
-    Sinusoids are qr_i = offset_i + sum_k amplitude_ik cos(frequency_k t + phase_k);
-    waypoints are passed with minimum jerk, at rest at both ends.
-    """
-
-    type: Literal['sinusoids', 'waypoints', 'hold'] = _of_reference(
-        'sinusoids',
-        'sinusoids (paper), waypoints (minimum jerk), or hold (the initial position)',
-    )
-    offset: PerJoint = _of_reference((1.9935, 1.3961), 'centre of the motion', 'rad')
-    amplitude: Annotated[tuple[float, ...], 'joints', 'reference.frequency'] = (
-        _of_reference((0.3, 0.3), 'amplitude of each tone, one row per joint', 'rad')
-    )
-    frequency: tuple[float, ...] = _of_reference(
-        (1.0,), 'angular frequency of each tone', 'rad/s', at_least=0.0
-    )
-    phase: Annotated[tuple[float, ...], 'reference.frequency'] = _of_reference(
-        (0.0,), 'phase of each tone', 'rad'
-    )
-    times: tuple[float, ...] = _of_reference(
-        (), 'time of each waypoint from the start', 's', at_least=0.0, omittable=True
-    )
-    waypoints: Annotated[tuple[float, ...], 'reference.times', 'joints'] = (
-        _of_reference((), 'positions of all joints, one row per waypoint', 'rad')
-    )
-
-    stream_timeout: float = positive(
-        0.25,
-        'time without a new target after which the reference of a stream brakes',
-        's',
-    )
-
-    def rows(self, joints: int) -> np.ndarray:
-        """Return the waypoints (k, n) [rad] of so many joints."""
-        return np.reshape(self.waypoints, (-1, joints))
-
-    def problems(self) -> list[str]:
-        """Check that waypoints are given if used, and that their times increase."""
-        if self.type == 'waypoints' and not self.times:
-            return [
-                'reference.times: got none, but reference.type waypoints needs at least one'
-            ]
-        return [
-            f'reference.times: got {after:g} s after {before:g} s, but they must increase'
-            for before, after in pairwise(self.times)
-            if after <= before
-        ]
-
-
-@dataclass(frozen=True)
-class Approach:
-    """Motion to the reference from a start outside the bound.
-
-    The bound applies along it.
-    """
-
-    enabled: bool = parameter(
-        True,
-        'guide an arm that starts outside the bound into it; false: refuse '
-        'such a start',
-    )
-    longest: float = positive(30.0, 'longest duration of the approach', 's')
-
-
-@dataclass(frozen=True)
-class MotionLimits:
-    """Limits of each joint for an approach or a received trajectory."""
-
-    position_lower: PerJoint = parameter(
-        (-2.0 * math.pi,) * 2, 'lowest position', 'rad'
-    )
-    position_upper: PerJoint = parameter(
-        (2.0 * math.pi,) * 2, 'highest position', 'rad'
-    )
-    velocity: PerJoint = positive((1.5, 1.5), 'largest velocity', 'rad/s')
-    acceleration: PerJoint = positive((2.0, 2.0), 'largest acceleration', 'rad/s^2')
-    jerk: PerJoint = positive(
-        (),
-        'largest jerk of motions to streamed targets; empty: the acceleration is '
-        'reached in 0.05 s',
-        'rad/s^3',
-        omittable=True,
-    )
-    scale: float = positive(
-        1.0,
-        'share of the largest velocity, acceleration and jerk that motions which are sent '
-        'may use; starts and stops have all of it',
-        at_most=1.0,
-    )
-
-    @property
-    def largest_jerk(self) -> tuple[float, ...]:
-        """The jerk as given, or that which reaches the acceleration in `_RISE`."""
-        return self.jerk or tuple(each / _RISE for each in self.acceleration)
-
-    def scaled(self, state: np.ndarray) -> MotionLimits:
-        """Return the limits of a motion that is sent while the reference has this state (3, n).
-
-        They are `scale` of these. A joint that is faster already may keep its speed, and has all
-        of its acceleration and jerk to slow down.
-        """
-        _, dq, ddq = np.abs(state)
-        speed, change, jerk = np.array(
-            (self.velocity, self.acceleration, self.largest_jerk)
-        )
-        # the speed goes on to change while the acceleration falls to zero
-        reached = np.abs(state[1] + 0.5 * state[2] * ddq / (self.scale * jerk))
-        reached = _ROUNDING * np.maximum(dq, reached)
-        is_faster = (reached > self.scale * speed) | (ddq > self.scale * change)
-        share = np.where(is_faster, 1.0, self.scale)
-        speed = np.clip(reached, self.scale * speed, speed)
-        return replace(
-            self,
-            velocity=tuple(speed.tolist()),
-            acceleration=tuple((share * change).tolist()),
-            jerk=tuple((share * jerk).tolist()),
-        )
-
-    def problems(self, joints: tuple[str, ...]) -> list[str]:
-        """Check that the position limits leave a range."""
-        limits = zip(joints, self.position_lower, self.position_upper, strict=True)
-        return [
-            f'limits.position_upper: got {upper:g} rad for {joint}, but it must be above '
-            f'limits.position_lower, {lower:g} rad'
-            for joint, lower, upper in limits
-            if upper <= lower
-        ]
 
 
 @dataclass(frozen=True)
@@ -452,49 +310,7 @@ class Torque:
     )
 
 
-@dataclass(frozen=True)
-class ComparisonGains:
-    """Gains of the laws `backstepping` (35) and `slotine_li`.
-
-    Feedback and learning have groups of their own.
-    """
-
-    surface_gain: PerJoint = positive(
-        (70.0, 70.0),
-        'gain of the linear surface alpha2 = dqr - lambda_s z1',
-        '1/s',
-        'lambda_s',
-    )
-    position_gain: PerJoint = non_negative(
-        (1.0, 1.0),
-        'gain on the tracking error z1; not used by slotine_li',
-        'N m/rad',
-        'w',
-    )
-    robust_gain: PerJoint = non_negative(
-        (0.0, 0.0),
-        'amplitude of the robust term; not used by slotine_li',
-        'N m',
-        'mu_bar',
-    )
-    integral_gain: PerJoint = non_negative(
-        (),
-        'integral gain of slotine_li on its surface; empty: none',
-        'N m/rad',
-        omittable=True,
-    )
-    leakage: float = non_negative(
-        0.001, 'leakage of P^; not used by slotine_li', symbol='W_c'
-    )
-    learning_weight: float = non_negative(
-        0.0,
-        'weight of the prediction error; 0: by the tracking error alone',
-        '',
-        'kappa',
-    )
-
-
-def _misfits(
+def misfits(
     name: str, P: tuple[float, ...], model: str, count: int, radius: float
 ) -> Iterator[str]:
     """Check that parameters P are those of a model, and inside the ball."""
@@ -505,39 +321,6 @@ def _misfits(
             f'learning.radius: got {radius:g} kg m^2, but {name} has a norm of {norm:.6g} kg m^2 '
             'and would be shrunk to the ball: the radius must be larger'
         )
-
-
-@dataclass(frozen=True)
-class KnownArm:
-    """Known data of the arm: required by the law `model_based`, shown by the monitors.
-
-    The known disturbance is constant + amplitude*sin(frequency*t + phase) on each
-    joint.
-    """
-
-    parameters: tuple[float, ...] = _known(
-        (), 'true parameters; empty: unknown', 'kg m^2', 'P', omittable=True
-    )
-    constant: PerJoint = _known(
-        (0.0, 0.0), 'constant part of the known disturbance', 'N m'
-    )
-    amplitude: PerJoint = _known((0.0, 0.0), 'amplitude of the sinusoid', 'N m')
-    frequency: PerJoint = _known(
-        (1.0, 1.0), 'frequency of the sinusoid', 'rad/s', at_least=0.0
-    )
-    phase: PerJoint = _known((0.0, 0.0), 'phase of the sinusoid', 'rad')
-
-    def problems(
-        self, law: str, model: str, count: int, radius: float
-    ) -> Iterator[str]:
-        """Check that the parameters fit model and ball, and are given if required."""
-        if law == 'model_based' and not self.parameters:
-            yield 'truth.parameters: got none, but the law model_based needs them'
-        if self.parameters:
-            largest = radius if law == 'model_based' else math.inf
-            yield from _misfits(
-                'truth.parameters', self.parameters, model, count, largest
-            )
 
 
 @dataclass(frozen=True)
@@ -637,25 +420,6 @@ class Learning:
         'weigh what has been added to robot.tip since the first window (arm '
         'from a URDF)',
     )
-    tell_drive: bool = sizing(
-        False,
-        'declare the weighed load to drives that compensate gravity, once it is '
-        'known well',
-    )
-    load_service: str = sizing(
-        '',
-        'over ROS: service of the driver that accepts the load, a '
-        'ur_msgs/srv/SetPayload or franka_msgs/srv/SetLoad; empty: no load is '
-        'declared',
-    )
-    load_frame: str = sizing(
-        '',
-        'over ROS: link in whose frame that service expects the centre; empty: '
-        'robot.tip',
-    )
-    load_in_motion: bool = parameter(
-        False, 'over ROS: whether the drives accept a load while the arm moves'
-    )
 
     def problems(self, sample_time: float, model: str, count: int) -> Iterator[str]:
         """Check the window's size, and the initial estimate against model and ball."""
@@ -666,13 +430,37 @@ class Learning:
                 f'learning.window: got {self.window:g} s, which is {samples:.0f} samples of '
                 f'{sample_time:g} s: between {fewest} and {most} are allowed'
             )
-        yield from _misfits(
+        yield from misfits(
             'learning.initial_estimate',
             self.initial_estimate,
             model,
             count,
             self.radius,
         )
+
+
+@dataclass(frozen=True)
+class DeclaredLoad:
+    """Whether the weighed load is declared to drives that compensate gravity, and how."""
+
+    tell_drive: bool = sizing(
+        False,
+        'declare the load of learning.weighing to the drives, once it is known well',
+    )
+    service: str = sizing(
+        '',
+        'over ROS: service of the driver that accepts the load, a '
+        'ur_msgs/srv/SetPayload or franka_msgs/srv/SetLoad; empty: no load is '
+        'declared',
+    )
+    frame: str = sizing(
+        '',
+        'over ROS: link in whose frame that service expects the centre; empty: '
+        'robot.tip',
+    )
+    in_motion: bool = parameter(
+        False, 'over ROS: whether the drives accept a load while the arm moves'
+    )
 
 
 @dataclass(frozen=True)

@@ -30,7 +30,7 @@ from blf_dsc_controller.configuration.schema import Parameter
 from blf_dsc_controller.errors import BlfDscError
 
 GROUP = 'gains'
-"""Group of the parameters of a law of a file."""
+"""Group of the parameters that only one law has."""
 
 _METHODS = {
     'compute_demand': ('self', 'settings', 'state', 'signals', 't', 'dt'),

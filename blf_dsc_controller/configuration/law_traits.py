@@ -1,13 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What other parameters ask of a law: whether it keeps the bound, and whether it learns."""
+"""What other parameters ask of a law: its gains, whether it keeps the bound, and learns."""
 
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Mapping
 from typing import NamedTuple
 
-from blf_dsc_controller.configuration import law_file
+from blf_dsc_controller.configuration import law_file, law_gains
 from blf_dsc_controller.configuration.checked import Checked
+from blf_dsc_controller.configuration.schema import format_value, suggestion
+from blf_dsc_controller.errors import BlfDscError
 
 
 class Traits(NamedTuple):
@@ -27,6 +30,12 @@ _PACKAGED = {
 LAWS = tuple(_PACKAGED)
 """Laws of the package; the first is the default."""
 
+GAINS: Mapping[str, type] = {
+    'backstepping': law_gains.Backstepping,
+    'slotine_li': law_gains.SlotineLi,
+}
+"""Groups of the gains that one law of the package has, by law."""
+
 
 def traits_of(config: Checked) -> Traits:
     """Return what the law of a configuration does; that of a file says so itself."""
@@ -35,3 +44,18 @@ def traits_of(config: Checked) -> Traits:
     gains = dataclasses.asdict(getattr(config, law_file.GROUP))
     law = law_file.load_law(config.law)(**gains)
     return Traits(bool(law.has_barrier), bool(getattr(law, 'learns', False)))
+
+
+def gains_of(law: str) -> type | None:
+    """Return the group of the gains that only this law has; None: it has none.
+
+    Raises BlfDscError if there is no such law.
+    """
+    if law in LAWS:
+        return GAINS.get(law)
+    if law_file.is_file(law):
+        return law_file.gains_of(law_file.load_law(law))
+    raise BlfDscError(
+        f'law: got {format_value(law)}, but expected one of {", ".join(LAWS)}, or a '
+        f'Python file{suggestion(law, LAWS)}'
+    )

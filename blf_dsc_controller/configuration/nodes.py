@@ -10,12 +10,12 @@ from __future__ import annotations
 import sys
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any, Literal, NamedTuple, TypeVar
 
-from blf_dsc_controller.configuration import law_file, received
+from blf_dsc_controller.configuration import known_arm, law_file, received
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.drive import DriveConfig
 from blf_dsc_controller.configuration.files import (
@@ -25,6 +25,7 @@ from blf_dsc_controller.configuration.files import (
     read_text,
     share_folder,
 )
+from blf_dsc_controller.configuration.law_traits import GAINS
 from blf_dsc_controller.configuration.plant import PlantConfig
 from blf_dsc_controller.configuration.schema import (
     Parameter,
@@ -155,21 +156,23 @@ class LoopConfig(NamedTuple):
 
 def known_names() -> frozenset[str]:
     """Return the parameter names of all nodes of the package."""
-    return frozenset(param.name for cls in NODES.values() for param in parameters(cls))
+    names = (param.name for cls in NODES.values() for param in parameters(cls))
+    return known_arm.NAMES.union(names)
 
 
 def is_of_node(name: str, cls: type) -> bool:
     """Return whether a parameter in a section for several nodes is one of this node.
 
-    The gains of a law of a file are the controller's, whatever they are called.
+    The gains that only one law has are the controller's, whatever they are called, and so is
+    what is known of the arm.
     """
-    if is_gain_of_law(name):
+    if is_gain_of_law(name) or name in known_arm.NAMES:
         return cls is ControllerConfig
     return name in {param.name for param in parameters(cls)}
 
 
 def is_gain_of_law(name: str) -> bool:
-    """Return whether the name is one of the group of a law of a file."""
+    """Return whether the name is one of the gains that only one law has."""
     return name.startswith(f'{law_file.GROUP}.')
 
 
@@ -449,8 +452,34 @@ def _is_of_others(section: Section) -> bool:
 def with_tables(page: str) -> str:
     """Return the page of all parameters; what is above its tables stays."""
     above = page.partition('\n## ')[0]
-    sections = (_section(node, parameters(cls)) for node, cls in NODES.items())
+    sections = (
+        _section(node, parameters(cls)) + (_optional() if node == CONTROLLER else '')
+        for node, cls in NODES.items()
+    )
     return above + ''.join(sections)
+
+
+def _optional() -> str:
+    """Return tables of what the controller has with some laws, or if it is given."""
+    tables = [
+        _of_group(
+            f'Gains of {law}', f'Only the law `{law}` has them.', law_file.GROUP, group
+        )
+        for law, group in GAINS.items()
+    ]
+    known = _of_group(
+        'Known data of the arm',
+        'The controller has them if one is given, or by the law `model_based`.',
+        known_arm.GROUP,
+        known_arm.KnownArm,
+    )
+    return ''.join((*tables, known))
+
+
+def _of_group(heading: str, text: str, group: str, cls: type) -> str:
+    """Return the section of a group that the controller may have."""
+    params = (replace(param, name=f'{group}.{param.name}') for param in parameters(cls))
+    return f'\n### {heading}\n\n{text}\n\n{_table(params)}'
 
 
 def _section(node: str, params: Iterable[Parameter]) -> str:
@@ -462,8 +491,12 @@ def _section(node: str, params: Iterable[Parameter]) -> str:
     tables = [f'\n## {node}\n']
     for group, members in groups.items():
         heading = f'\n### {node}: {group}\n' if group else ''
-        tables.append(f'{heading}\n{_HEADER}{"".join(map(_row, members))}')
+        tables.append(f'{heading}\n{_table(members)}')
     return ''.join(tables)
+
+
+def _table(params: Iterable[Parameter]) -> str:
+    return _HEADER + ''.join(map(_row, params))
 
 
 def _row(param: Parameter) -> str:

@@ -250,7 +250,7 @@ class ArmController:
     def load_to_tell(self) -> DriveLoad | None:
         """Return the load to declare to the drives next, a step at a time.
 
-        None: there is none, or `learning.tell_drive` is false.
+        None: there is none, or `load.tell_drive` is false.
         """
         return self._loop.guard.load_to_tell()
 

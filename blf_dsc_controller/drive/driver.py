@@ -140,7 +140,7 @@ class Driver(ABC):
         """
         raise DriverError(
             f'the driver of this robot cannot declare a load of {load.mass:.2f} kg: set '
-            'learning.tell_drive to false'
+            'load.tell_drive to false'
         )
 
     def load_in_force(self) -> float | None:

@@ -15,7 +15,7 @@ import dataclasses
 import numpy as np
 
 from blf_dsc_controller.compiled.layout import size_of
-from blf_dsc_controller.configuration import law_file
+from blf_dsc_controller.configuration import law_file, law_gains
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.factory.inertia import least_inertias
 from blf_dsc_controller.law.backstepping import Backstepping
@@ -64,7 +64,7 @@ def _of_model_based(_config: ControllerConfig, settings: Settings) -> Settings:
 
 def _of_linear_surface(config: ControllerConfig, settings: Settings) -> Settings:
     """Return what the laws with a linear surface share; they learn if they are told to."""
-    gains = config.comparison
+    gains: law_gains.LinearSurface = getattr(config, law_file.GROUP)
     nothing = np.zeros(settings.n)
     return settings._replace(
         compensation=STATE,
@@ -78,7 +78,7 @@ def _of_linear_surface(config: ControllerConfig, settings: Settings) -> Settings
 
 def _of_backstepping(config: ControllerConfig, settings: Settings) -> Settings:
     """Return the settings of (35)."""
-    gains = config.comparison
+    gains: law_gains.Backstepping = getattr(config, law_file.GROUP)
     linear = _of_linear_surface(config, settings)
     return linear._replace(
         barrier=linear.barrier._replace(weight=np.array(gains.position_gain)),
@@ -90,7 +90,8 @@ def _of_backstepping(config: ControllerConfig, settings: Settings) -> Settings:
 def _of_slotine_li(config: ControllerConfig, settings: Settings) -> Settings:
     """Return the settings of Slotine and Li's law: (35) without its extra terms."""
     nothing = np.zeros(settings.n)
-    integral = np.array(config.comparison.integral_gain or nothing)
+    gains: law_gains.SlotineLi = getattr(config, law_file.GROUP)
+    integral = np.array(gains.integral_gain or nothing)
     linear = _of_linear_surface(config, settings)
     return linear._replace(
         barrier=linear.barrier._replace(weight=nothing),

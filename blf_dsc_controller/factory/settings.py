@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 
@@ -16,6 +17,7 @@ from blf_dsc_controller.arms.serial_chain import ROTOR
 from blf_dsc_controller.arms.urdf import inertia_of, moved, pseudo_inertia
 from blf_dsc_controller.compiled.layout import filled
 from blf_dsc_controller.configuration.controller import ControllerConfig
+from blf_dsc_controller.configuration.known_arm import known_arm
 from blf_dsc_controller.configuration.robot import drive_model, parameters_of
 from blf_dsc_controller.factory.estimate import (
     FRICTION,
@@ -66,8 +68,6 @@ def settings_of_config(config: ControllerConfig) -> Settings:
     model = model_of(config)
     learned = columns_of(config)
     m = model.p + len(learned)
-    truth = config.truth
-    known = (truth.constant, truth.amplitude, truth.frequency, truth.phase)
     covariance = prior_covariance(config)
     initial = (column.initial for column in learned)
     inertia = _joint_inertia(config)
@@ -82,14 +82,12 @@ def settings_of_config(config: ControllerConfig) -> Settings:
         m=m,
         memory=0,
         has_barrier=int(law_of(config).has_barrier),
-        truth_known=int(bool(truth.parameters)),
         feed_forward=0,
         initial_estimate=np.array((*config.learning.initial_estimate, *initial)),
         information=inverse(covariance),
         joint_inertia=inertia,
         robust_gain=np.zeros(model.n),
-        true_parameters=np.array(truth.parameters or (0.0,) * model.p),
-        true_disturbance=np.array(known),
+        **_known(config, model.p),
         barrier=_barrier(config),
         surface=filled(surface.Settings, config.surface, lag=row.lag),
         feedback=_feedback(config),
@@ -108,6 +106,20 @@ def settings_of_config(config: ControllerConfig) -> Settings:
     )
     settings = of_law(config, settings)
     return settings._replace(friction=friction_settings(settings))
+
+
+def _known(config: ControllerConfig, p: int) -> dict[str, Any]:
+    """Return the settings of the known data of an arm with p parameters: zeros without any."""
+    known = known_arm(config)
+    disturbance = np.zeros((4, len(config.joints)))
+    if known:
+        disturbance[:] = known.constant, known.amplitude, known.frequency, known.phase
+    parameters = known.parameters if known else ()
+    return {
+        'truth_known': int(bool(parameters)),
+        'true_parameters': np.array(parameters or (0.0,) * p),
+        'true_disturbance': disturbance,
+    }
 
 
 def _barrier(config: ControllerConfig) -> barrier.Settings:

@@ -115,14 +115,14 @@ class ControllerNode(LoopNode[ControllerConfig]):
             self.get_logger().warning(warning)
         if end := end_of_waypoints(self.config):
             self.get_logger().info(end)
-        learning = self.config.learning
-        if learning.load_service:
+        load = self.config.load
+        if load.service:
             if self._load_service is None:
                 self._load_service = LoadService(self, self.config)
             self._load_service.begin()
-        elif learning.tell_drive:
+        elif load.tell_drive:
             self.get_logger().warning(
-                'learning.tell_drive: without learning.load_service no load is declared to the '
+                'load.tell_drive: without load.service no load is declared to the '
                 "drives: give the driver's service, or set robot.drive_payload and the load of "
                 'the driver'
             )

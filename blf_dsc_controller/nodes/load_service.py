@@ -25,7 +25,7 @@ _DENSITY = 1000.0  # kg/m^3, of the ball that stands for the shape of a load
 
 
 class LoadService:
-    """What the drives are told over ROS, while `learning.tell_drive` is true.
+    """What the drives are told over ROS, while `load.tell_drive` is true.
 
     The law takes a step over with the first state after the service has accepted it.
 
@@ -37,12 +37,12 @@ class LoadService:
     def __init__(self, node: Node, config: ControllerConfig) -> None:
         robot = config.robot
         tip = robot.chain(config.joints).tip_placement
-        link = config.learning.load_frame or robot.tip
+        link = config.load.frame or robot.tip
         frame = replace(robot, tip=link).chain(config.joints).tip_placement
         self.problem = ''
         self.told: DriveLoad | None = None
         self._node = node
-        self._name = node.resolve_service_name(config.learning.load_service)
+        self._name = node.resolve_service_name(config.load.service)
         self._to_frame = np.linalg.solve(frame, tip)
         self._client: Any = None
         self._type = ''
@@ -93,7 +93,7 @@ class LoadService:
             self._await(guard, self._asked)
         elif self._states >= EVERY and self._client.service_is_ready():
             self._states = 0
-            if config.learning.load_in_motion or guard.is_at_rest:
+            if config.load.in_motion or guard.is_at_rest:
                 self._ask(guard.load_to_tell())
 
     def _ask(self, load: DriveLoad | None) -> None:
@@ -129,7 +129,7 @@ class LoadService:
     def _give_up(self, problem: str) -> None:
         self.problem = problem
         self._node.get_logger().warning(
-            f'learning.tell_drive: {problem}; no more loads are declared to the drives'
+            f'load.tell_drive: {problem}; no more loads are declared to the drives'
         )
 
 

@@ -4,7 +4,8 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from contextlib import suppress
 from functools import partial
 from typing import Any, Generic, NamedTuple, TypeVar
 
@@ -29,6 +30,7 @@ from blf_dsc_controller.configuration.schema import (
     change,
     flatten,
     parameters,
+    variant_of,
 )
 from blf_dsc_controller.errors import BlfDscError, ConfigurationError
 from blf_dsc_controller.messages.topics import ROBOT_DESCRIPTION
@@ -208,19 +210,26 @@ def _overrides(node: Node, cls: type[Config]) -> dict[str, Any]:
     rclpy does not show which section a value comes from, so parameters of any node of
     the package are accepted, as in a section for several nodes.
     """
-    own = {parameter.name: parameter for parameter in parameters(cls)}
     known = known_names()
     for remark in check_sections(sys.argv, node.get_fully_qualified_name()):
         node.get_logger().warning(remark)
     overrides = node._parameter_overrides  # noqa: SLF001 - those in start files and arguments
     given = {name: parameter.value for name, parameter in overrides.items()}
     given |= assigned(sys.argv)
+    lists = _lists(cls, given)
     return {
-        name: [] if value is None and name in own and own[name].is_array else value
+        name: [] if value is None and name in lists else value
         for name, value in given.items()
         if is_of_node(name, cls) or not (name in known or is_gain_of_law(name))
         if not is_builtin(name)
     }
+
+
+def _lists(cls: type, given: Mapping[str, Any]) -> set[str]:
+    """Return the names of the lists that the node has with given values: empty ones are None."""
+    with suppress(BlfDscError):  # no such law
+        cls = variant_of(cls, given)
+    return {parameter.name for parameter in parameters(cls) if parameter.is_array}
 
 
 TIMEOUT = 60  # s

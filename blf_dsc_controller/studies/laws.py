@@ -89,8 +89,8 @@ _FEEDBACK = (
 )
 _SLOTINE_LI = (
     _DAMPING,
-    Gain('comparison.surface_gain', 5.0, 300.0),
-    Gain('comparison.integral_gain', 100.0, 3e4, inertial=True),
+    Gain('gains.surface_gain', 5.0, 300.0),
+    Gain('gains.integral_gain', 100.0, 3e4, inertial=True),
     _ADAPTATION,
 )
 _PID = (
@@ -138,8 +138,8 @@ def law_changes(
     config = change(config, changes)  # a law of a file has gains of its own
     if studied.law == 'slotine_li':  # the slope of the proposed law's surface at zero
         slope = np.array(config.surface.gain) / 2.0 + config.surface.mu
-        changes['comparison.surface_gain'] = slope.tolist()
-        changes['comparison.integral_gain'] = list(config.disturbance.gain)
+        changes['gains.surface_gain'] = slope.tolist()
+        changes['gains.integral_gain'] = list(config.disturbance.gain)
     elif studied.law == COMPUTED_TORQUE:  # of equal bandwidth
         position, velocity, integral = linear_gains(config).mean(axis=1).tolist()
         changes['gains.position'] = position

@@ -62,7 +62,7 @@ _SHARED = (
     Gain('feedback.gain', 2.0, 100.0, joint=1),
     Gain('learning.adaptation_gain', 0.01, 30.0),
 )
-_SURFACE_OF_35 = Gain('comparison.surface_gain', 10.0, 300.0)
+_SURFACE_OF_35 = Gain('gains.surface_gain', 10.0, 300.0)
 _PROPOSED = (
     *_SHARED,
     Gain('surface.gain', 10.0, 600.0),
@@ -73,9 +73,9 @@ _PROPOSED = (
 _COMPARISON = (
     *_SHARED,
     _SURFACE_OF_35,
-    Gain('comparison.position_gain', 0.1, 1e4),
-    Gain('comparison.robust_gain', 1e-3, 5.0),
-    Gain('comparison.leakage', 1e-5, 1.0),
+    Gain('gains.position_gain', 0.1, 1e4),
+    Gain('gains.robust_gain', 1e-3, 5.0),
+    Gain('gains.leakage', 1e-5, 1.0),
 )
 TASKS = {
     'proposed': Task('paper', {}, _PROPOSED),

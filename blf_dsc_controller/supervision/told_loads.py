@@ -10,11 +10,11 @@ from blf_dsc_controller.supervision.drive_load import DriveLoad, DriveLoads
 
 
 class ToldLoads:
-    """`DriveLoads` of a controller, from the first load on, or with `learning.tell_drive`."""
+    """`DriveLoads` of a controller, from the first load on, or with `load.tell_drive`."""
 
     def __init__(self, config: ControllerConfig, controller: Controller) -> None:
         self._controller = controller
-        tells = config.learning.tell_drive
+        tells = config.load.tell_drive
         self._loads = DriveLoads(config) if tells else None
 
     def next(self) -> DriveLoad | None:
