@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Touch on slow motion: the interval of the external torque, and pushes during insertions.
 
-    python benchmark/touch.py [--runs 12] [--arms panda fr3 ur5e] [--each]
+    python -m benchmark touch [--runs 12] [--arms panda fr3 ur5e] [--each]
 
-Gears, motors, lags and bases are those of `config/monte_carlo_elastic_*.yaml`.  Links are up to
+Gears, motors, lags and bases are those of `studies/monte_carlo_elastic_*.yaml`.  Links are up to
 30 % heavier or lighter than the URDF's, and their centres of mass 1 cm off.  Friction is drawn
 for each joint, 0.2 to 1.8 times what the law assumes, with up to 0.7 more at low speed, which
 fades over 0.02 to 0.2 rad/s, and 4 to 30 mrad/s within which it turns round.  The arm learns for
@@ -30,8 +30,10 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
-from harness import print_table
-from nothing_changes import (
+
+from benchmark.contacts import alarms, delays, threshold_at
+from benchmark.harness import print_table
+from benchmark.nothing_changes import (
     FRICTION,
     RANGE,
     STRIBECK,
@@ -40,7 +42,8 @@ from nothing_changes import (
     moved,
     rested,
 )
-
+from benchmark.options import add_arms
+from benchmark.studies import load_study
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.nodes import load_loop
 from blf_dsc_controller.configuration.plant import PlantConfig
@@ -58,8 +61,7 @@ from blf_dsc_controller.reference.trajectory import (
 from blf_dsc_controller.run import Floats
 from blf_dsc_controller.simulation.compiled_loop import CompiledLoop, Span
 from blf_dsc_controller.simulation.loop import new_record
-from blf_dsc_controller.studies.contacts import alarms, delays, threshold_at
-from blf_dsc_controller.studies.monte_carlo import draw, load_study, plant_with
+from blf_dsc_controller.studies.monte_carlo import draw, plant_with
 from sim_plant.plant import plant_of
 
 ARMS = ('panda', 'fr3', 'ur5e')
@@ -355,15 +357,13 @@ _PUSHES = (
 )
 
 
-def main() -> None:
+def arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the options."""
+    add_arms(parser, ARMS, 12, 'arms')
+
+
+def main(options: argparse.Namespace) -> None:
     """Print the tables."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument('--runs', type=int, default=12, help='arms')
-    parser.add_argument('--arms', nargs='+', default=ARMS, choices=ARMS)
-    parser.add_argument('--each', action='store_true', help='print each arm, too')
-    options = parser.parse_args()
     done = []
     for found in trials(options.arms, options.runs):
         done.append(found)
@@ -381,7 +381,3 @@ def main() -> None:
     )
     print()
     print_table(_PUSHES, [push_row(name, each) for name, each in by_name.items()])
-
-
-if __name__ == '__main__':
-    main()

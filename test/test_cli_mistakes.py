@@ -46,9 +46,7 @@ def bag(tmp_path_factory):
     return recorded_run.write_made(path, Synthetic(100).messages())
 
 
-COMMANDS = (
-    'run --offline, report, plot, recover, export, excite, paper, arms, monte-carlo'
-)
+COMMANDS = 'run --offline, report, plot, recover, export, excite, arms, monte-carlo'
 
 
 @pytest.mark.parametrize('place', ['file/below', '/proc/none', '/dev/full'])

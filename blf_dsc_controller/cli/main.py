@@ -32,6 +32,8 @@ _THREADS = ('OPENBLAS_NUM_THREADS', 'OMP_NUM_THREADS', 'MKL_NUM_THREADS')
 _BAG = 'folder of the bag, or its .mcap, .db3 or .bag file'
 _CONFIG = 'parameter file, or a preset (recommended)'
 _WIDTH = 88
+_MOVED = {'paper': 'paper', 'tool': 'tool-bound', 'contacts': 'contacts'}
+"""Commands of earlier versions, by their tables of `benchmark`."""
 _Command: TypeAlias = Callable[..., Callable[..., Any]]
 
 
@@ -46,7 +48,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options = parser.parse_args(
         words, argparse.Namespace(line=shlex.join(['blf_dsc', *words]))
     )
-    _keep_to_one_thread()
+    keep_to_one_thread()
     if options.command is None:
         parser.print_help(sys.stderr)
         return 2
@@ -74,13 +76,18 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _check_command(parser: argparse.ArgumentParser, words: Sequence[str]) -> None:
     """End with a suggestion if the first word is meant for a command, but is none."""
     known = parser.get_default('commands')
+    if words and words[0] in _MOVED:
+        parser.error(
+            f'{words[0]} makes a table of the project: in a checkout, call '
+            f'python -m benchmark {_MOVED[words[0]]}'
+        )
     if words and not words[0].startswith('-') and words[0] not in known:
         close = difflib.get_close_matches(words[0], known, n=1)
         guess = f', did you mean {close[0]}?' if close else ''
         parser.error(f'no command {words[0]}{guess}; there are {", ".join(known)}')
 
 
-def _keep_to_one_thread() -> None:
+def keep_to_one_thread() -> None:
     """Let numpy's libraries start no threads, unless the environment says so.
 
     They must not be loaded yet.
@@ -120,7 +127,7 @@ def make_room(*paths: Path, force: bool) -> None:
 
 
 def _node(module: str) -> int:
-    _keep_to_one_thread()
+    keep_to_one_thread()
     # until the node installs its own handlers
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: os._exit(0))
@@ -498,18 +505,6 @@ def _add_identification(
 
 def _add_studies(command: _Command) -> None:
     option = command(
-        'paper',
-        "Compare all laws in the paper's simulation. Check the paper's claims, and find where "
-        'each law breaks. Runs without ROS, on all cores.',
-        '--out paper_study',
-    )
-    option(
-        '--out',
-        type=Path,
-        default=Path('paper_study'),
-        help='new folder for the report',
-    )
-    option = command(
         'arms',
         'Compare laws on arms whose URDF is wrong. Each law is tuned on one simulated arm and run '
         'on others; the errors are printed as a table. Runs without ROS, on all cores, for some '
@@ -527,47 +522,6 @@ def _add_studies(command: _Command) -> None:
     )
     option('--laws', nargs='+', default=[], metavar='LAW', help=laws)
     option('--out', type=Path, default=Path('arms'), help='new folder for the figures')
-    option = command(
-        'tool',
-        'Test a bound at the tool. It is tried with random errors inside the joint bounds that '
-        'follow from it, and with closed loops of arms whose URDF is wrong. Runs without ROS, on '
-        'all cores, for a minute.',
-        '--config panda --bound 0.003 --out tool',
-    )
-    option(
-        '--config',
-        nargs='+',
-        default=['panda_rigid', 'ur5e_rigid', 'fr3'],
-        help='presets or files (panda ur5e fr3)',
-    )
-    option('--bound', type=float, default=0.005, help='bound at the tool [m] (0.005)')
-    option('--runs', type=_positive, default=10_000, help='random motions (10000)')
-    option('--truths', type=_positive, default=5, help='closed loops of each arm (5)')
-    option('--out', type=Path, default=Path('tool'), help='new folder for the figures')
-    option = command(
-        'contacts',
-        'Measure how soon contacts are detected. Random arms with wrong links and an unknown load '
-        "are pushed; the learned model is compared with the URDF's, at equal false-alarm rates. "
-        'Runs without ROS, on all cores, with half a second of CPU for each second of an arm.',
-        '--arms 100 --force 10 20 --out contacts',
-    )
-    option(
-        '--config',
-        nargs='+',
-        default=['panda_rigid', 'ur5e_rigid'],
-        help='presets or files (panda ur5e)',
-    )
-    option('--arms', type=_positive, default=1000, help='random arms (1000)')
-    option(
-        '--force',
-        type=float,
-        nargs='+',
-        default=[10.0, 20.0],
-        help='forces of the pushes [N] (10 20)',
-    )
-    option(
-        '--out', type=Path, default=Path('contacts'), help='new folder for the figures'
-    )
     option = command(
         'monte-carlo',
         'Run a study of many random arms. Thousands of closed loops run in parallel, and the '
