@@ -9,7 +9,7 @@ import sys
 from collections.abc import Sequence
 
 from benchmark.tables import BENCH, GROUPS, TABLES, module_of
-from blf_dsc_controller.cli.main import INTERRUPTED, keep_to_one_thread
+from blf_dsc_controller.cli.main import INTERRUPTED, end_at_signals, keep_to_one_thread
 from blf_dsc_controller.errors import BlfDscError
 
 
@@ -22,12 +22,12 @@ def main(words: Sequence[str] | None = None) -> int:
     if name not in TABLES:
         print(f'benchmark: no table {name}\n{listing()}', file=sys.stderr)
         return 2
+    end_at_signals(f'benchmark {name}')
     if name != BENCH:
         keep_to_one_thread()
-    module = importlib.import_module(module_of(name))
-    options = parser_of(name).parse_args(rest)
     try:
-        module.main(options)
+        module = importlib.import_module(module_of(name))
+        module.main(parser_of(name).parse_args(rest))
     except (BlfDscError, OSError) as error:
         print(f'benchmark {name}: {error}', file=sys.stderr)
         return 1

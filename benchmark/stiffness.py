@@ -69,7 +69,24 @@ def _cells(found: Compliance, truth: Floats) -> list[str]:
 
 
 def _found(config: PlantConfig, bits: int) -> Compliance:
-    """Return what is found of an arm that moves."""
+    """Return what is found of an arm that moves, by encoders of so many bits."""
+    states, motors = _moved(config)
+    step = 2.0 * np.pi / 2**bits
+    states[:, 0], motors = (
+        np.round(each / step) * step for each in (states[:, 0], motors)
+    )
+    recording = recording_of(
+        states[::_EVERY], config.joints, _EVERY * config.sample_time
+    )
+    twist = motors - states[:, 0]
+    found = identify_arm(recording._replace(twist=twist[::_EVERY]), config.robot)
+    if found.compliance is None:
+        raise AssertionError('a recording with both positions')
+    return found.compliance
+
+
+def _moved(config: PlantConfig) -> tuple[Floats, Floats]:
+    """Return states (k, 3, n) and positions of motors (k, n) [rad] of a PD on a random motion."""
     chain = config.robot.chain(config.joints)
     T = config.sample_time
     motion = reference_of(chain, _SEED).at(np.arange(round(_SECONDS / T)) * T)
@@ -89,13 +106,4 @@ def _found(config: PlantConfig, bits: int) -> Compliance:
         error = start + share * (position - start) - q
         p, d = _GAINS
         plant.step(efforts * (p * error + d * (share * velocity - dq)))
-    step = 2.0 * np.pi / 2**bits
-    states[:, 0], motors = (
-        np.round(each / step) * step for each in (states[:, 0], motors)
-    )
-    recording = recording_of(states[::_EVERY], config.joints, _EVERY * T)
-    twist = motors - states[:, 0]
-    found = identify_arm(recording._replace(twist=twist[::_EVERY]), config.robot)
-    if found.compliance is None:
-        raise AssertionError('a recording with both positions')
-    return found.compliance
+    return states, motors

@@ -25,7 +25,7 @@ from markdown_it import MarkdownIt
 
 from benchmark.__main__ import parser_of as table_parser
 from benchmark.tables import TABLES
-from blf_dsc_controller.cli.main import make_parser
+from blf_dsc_controller.cli.parser import make_parser
 from blf_dsc_controller.configuration.nodes import NODES, known_names, load, read
 from blf_dsc_controller.studies.monte_carlo import load_study
 

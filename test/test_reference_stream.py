@@ -10,6 +10,7 @@ pytest.importorskip('ruckig', reason='needs ruckig')
 
 from benchmark import scaling as table_of_scaling
 from benchmark import streams as table_of_streams
+from benchmark.__main__ import main as table
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.schema import change
 from blf_dsc_controller.reference.approach import hold
@@ -142,10 +143,11 @@ def test_lost_messages_cost_little_more_than_none(streams):
     assert found[0.1][1] <= found[0.0][1] + 0.001
 
 
-def test_tables_of_streams_and_chunks_are_printed(streams, monkeypatch, capsys):
+@pytest.mark.usefixtures('streams')
+def test_tables_of_streams_and_chunks_are_printed(monkeypatch, capsys):
     """A stream at 50 Hz is an interval behind, and what latency and planning take."""
     monkeypatch.setattr(table_of_streams, '_SAMPLE', 2e-3)
-    streams.main()
+    assert table(['streams']) == 0
     text = capsys.readouterr().out
     rows = [line.split(' | ') for line in text.splitlines() if 'mrad |' in line]
     assert [row[0].lstrip('| ') for row in rows] == [
@@ -163,9 +165,10 @@ def test_tables_of_streams_and_chunks_are_printed(streams, monkeypatch, capsys):
     assert max(accelerations) <= 6.0
 
 
-def test_motions_of_moveit_are_stretched_as_little_as_the_table_says(scaling, capsys):
+@pytest.mark.usefixtures('scaling')
+def test_motions_of_moveit_are_stretched_as_little_as_the_table_says(capsys):
     """With all of the limits all are, with 0.9 of the velocity and 0.6 few and little."""
-    scaling.main()
+    assert table(['scaling']) == 0
     rows = [
         line.strip('| ').split(' | ') for line in capsys.readouterr().out.splitlines()
     ]

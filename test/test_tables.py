@@ -12,6 +12,7 @@ from pathlib import Path
 import pytest
 
 from benchmark.__main__ import listing, main, parser_of
+from benchmark.studies import load_study
 from benchmark.tables import BENCH, TABLES, module_of
 from blf_dsc_controller.cli.main import main as blf_dsc
 
@@ -46,6 +47,17 @@ def test_help_of_a_table_says_how_it_is_called(name):
         pytest.importorskip('mujoco')
     text = parser_of(name).format_help()
     assert text.count(f'python -m benchmark {name}') >= 2  # the usage, and an example
+
+
+STUDIES = sorted(path.stem for path in (ROOT / 'benchmark/studies').glob('*.yaml'))
+
+
+@pytest.mark.parametrize('name', STUDIES)
+def test_every_study_of_the_tables_loads_and_varies(name):
+    """From any folder, also those that are based on the file beside them."""
+    study = load_study(name)
+    assert study.settings.pairs
+    assert len(study.variations) > 10
 
 
 def test_unknown_table_is_answered_by_the_list(capsys):
