@@ -239,7 +239,7 @@ def run(
 
 def tared(residuals: Floats, t: Floats, insertions: Sequence[Insertion]) -> Floats:
     """Return residuals (k, n) less their mean at the end of each rest."""
-    r = residuals.copy()
+    r: Floats = residuals.copy()
     for each in insertions:
         still = (t >= each.begin - TARE - MEAN) & (t < each.begin - TARE)
         r[t >= each.begin - TARE] -= r[still].mean(axis=0)
