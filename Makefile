@@ -14,7 +14,6 @@ MINUTES ?= 30
 # s, after which a test ends: far more than any needs, also one that compiles first.
 LIMIT ?= 900
 EXAMPLES ?= 300
-CHANGING := events panda panda_500hz ur5e ur5e_500hz
 
 .DEFAULT_GOAL := help
 MAKEFLAGS += --no-print-directory
@@ -63,12 +62,12 @@ demo: $(READY) ## Run the closed loop over ROS 2 (CONFIG, DURATION in s) and plo
 paper: $(READY) ## Run the paper's simulation with every law and check its claims, into out/
 	@mkdir -p out; out=out/paper; n=1; \
 	while [ -e "$$out" ]; do n=$$((n + 1)); out=out/paper-$$n; done; \
-	$(RUN) -m blf_dsc_controller paper --out "$$out"
+	$(RUN) -m benchmark paper --out "$$out"
 
 arms: $(READY) ## Compare laws on a Panda and a UR5e with wrong URDFs, into out/
 	@mkdir -p out; out=out/arms; n=1; \
 	while [ -e "$$out" ]; do n=$$((n + 1)); out=out/arms-$$n; done; \
-	$(RUN) -m blf_dsc_controller arms --out "$$out"
+	$(RUN) -m benchmark arms --out "$$out"
 
 # A file's tests stay together on one of the workers, for what they set up is shared; the files
 # come in the order of test/conftest.py. Bytecode is kept, also where the environment says not to,
@@ -91,12 +90,10 @@ test-nightly: ## Run all tests, those left out by make test as well, at length a
 	@NIGHTLY=1 PYTEST_ADDOPTS='-m "" -rP' $(MAKE) test LIMIT=7200
 
 changes: $(READY)-monte-carlo ## Simulate 14,000 randomly changing arms, each with and without learning, into out/changes
-	@for study in $(CHANGING); do $(RUN) -m blf_dsc_controller monte-carlo \
-	    --config monte_carlo_$$study --out out/changes/$$study || exit 1; done; \
-	$(RUN) -m blf_dsc_controller monte-carlo --report $(CHANGING:%=out/changes/%) --out out/changes
+	@$(RUN) -m benchmark changes --out out/changes
 
 bench: $(READY)-bench ## Run the benchmarks (GROUPS=offline for one group), into benchmark/RESULTS.md
-	@$(RUN) benchmark/harness.py $(GROUPS)
+	@$(RUN) -m benchmark bench $(GROUPS)
 
 soak: $(READY)-test ## Run half an hour of plant time (MINUTES) with a fault every few seconds, and 200 faults in motion
 	@$(RUN) test/soak.py --minutes "$(MINUTES)"
@@ -127,7 +124,7 @@ lint: $(READY)-lint ## Check style, types and layers
 clean: ## Remove everything installed and built; keep the results in out/
 	@rm -rf $(VENV) build install log *.egg-info .coverage .hypothesis .*_cache \
 	    blf_dsc_controller/compiled/kernels
-	@find blf_dsc_controller sim_plant test -name __pycache__ -prune -exec rm -rf {} +
+	@find benchmark blf_dsc_controller sim_plant test -name __pycache__ -prune -exec rm -rf {} +
 
 $(READY): setup.py setup.cfg
 	@$(check_python)

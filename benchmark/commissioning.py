@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Random arms with elastic joints: commissioned by simulated runs, then put to work.
 
-    python benchmark/commissioning.py [ARMS] [STUDY ...]
-    python benchmark/commissioning.py repeat [ARMS] [STUDY ...]
-    python benchmark/commissioning.py careful [ARMS] [STUDY ...]
+    python -m benchmark commissioning [ARMS] [STUDY ...]
+    python -m benchmark commissioning repeat [ARMS] [STUDY ...]
+    python -m benchmark commissioning careful [ARMS] [STUDY ...]
 
 The arms are those of the studies `monte_carlo_elastic_*`: gears, motors, friction, links,
 delays and tables are drawn independently of what controller and commissioning assume.  Each is
@@ -34,7 +34,7 @@ which they can be raised
 
 from __future__ import annotations
 
-import sys
+import argparse
 from collections import Counter
 from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor
@@ -42,8 +42,9 @@ from itertools import repeat
 from typing import NamedTuple
 
 import numpy as np
-from harness import print_table
 
+from benchmark.harness import print_table
+from benchmark.studies import load_study
 from blf_dsc_controller.commissioning import simulated
 from blf_dsc_controller.commissioning.choice import Loops
 from blf_dsc_controller.commissioning.commissioning import Commissioned, commissioned
@@ -54,7 +55,7 @@ from blf_dsc_controller.configuration.plant import PlantConfig
 from blf_dsc_controller.configuration.schema import change
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.simulation.loop import simulate
-from blf_dsc_controller.studies.monte_carlo import draw, load_study, plant_with
+from blf_dsc_controller.studies.monte_carlo import draw, plant_with
 from blf_dsc_controller.studies.runs import cores
 
 STUDIES = (
@@ -267,8 +268,14 @@ HEADS = {
 ROWS = {'repeat': repeated, 'careful': careful}
 
 
-def main(words: list[str]) -> None:
+def arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the options."""
+    parser.add_argument('words', nargs='*', metavar='WORD', help='see above')
+
+
+def main(options: argparse.Namespace) -> None:
     """Print a table."""
+    words = options.words
     what = words.pop(0) if words and words[0] in ROWS else ''
     many, *given = words or ['2' if what else '20']
     names = tuple(given) or STUDIES
@@ -287,7 +294,3 @@ def main(words: list[str]) -> None:
         ],
         rows(names, int(many)),
     )
-
-
-if __name__ == '__main__':
-    main(sys.argv[1:])

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Composite learning as published for a Panda, and this law, in a soft loop.
 
-    python benchmark/composite.py
+    python -m benchmark composite
 
 The law of config/composite_panda.yaml (Shi and Pan) learns for 40 s in a stiff loop.
 Within 10 s the loop then becomes soft (K_c to 0.05, Lambda to 0.3 of it), and another
@@ -12,6 +12,7 @@ in the geometric mean over the joints.  Learning continues in both.
 
 from __future__ import annotations
 
+import argparse
 from collections.abc import Mapping
 from concurrent.futures import ProcessPoolExecutor
 from functools import partial
@@ -19,8 +20,8 @@ from itertools import chain, product
 from typing import NamedTuple
 
 import numpy as np
-from harness import print_table
 
+from benchmark.harness import print_table
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.law_file import GROUP
 from blf_dsc_controller.configuration.law_gains import SlotineLi
@@ -237,7 +238,8 @@ def published_rows() -> list[list[str]]:
     ]
 
 
-if __name__ == '__main__':
+def main(_options: argparse.Namespace) -> None:
+    """Print the table."""
     heads = ['arm', 'payload', 'law', 'rms [mrad]', 'to no learning', 'to the first']
     studied = (row for case in CASES for row in rows_of(case, compare(case)))
     print_table(heads, chain(studied, published_rows()))

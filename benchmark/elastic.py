@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Arms whose gears give way: where the gains of the presets hold, and what they cost.
 
-    python benchmark/elastic.py
+    python -m benchmark elastic
 
 Each arm runs the motion of its preset for 20 s and picks up its rated payload at 8 s, with
 every gear as stiff as the head of the column says.  Its links are off by 30 % (FR3: 10 %).
@@ -17,14 +17,15 @@ and why the arm stopped.  The laws are
 
 from __future__ import annotations
 
+import argparse
 from collections.abc import Iterator, Mapping
 from concurrent.futures import ProcessPoolExecutor
 from itertools import product
 from typing import NamedTuple
 
 import numpy as np
-from harness import print_table
 
+from benchmark.harness import print_table
 from blf_dsc_controller.configuration.nodes import (
     CONTROLLER,
     PLANT,
@@ -134,6 +135,7 @@ def table() -> Iterator[list[str]]:
             yield [arm.label, law, *(each.result() for each in cells)]
 
 
-if __name__ == '__main__':
+def main(_options: argparse.Namespace) -> None:
+    """Print the table."""
     heads = ['arm', 'law', *(f'{K:.0e} N m/rad' for K in STIFFNESS)]
     print_table(heads, table())

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Changes of the arm while the window is not full: figures of STUDIES.md.
 
-    python benchmark/first_window.py
+    python -m benchmark first-window
 
 Cycles      1.5 kg in the hand for half of each cycle, from the first one on.
 Weighing    What the arm says it holds, in these cycles.
@@ -15,12 +15,13 @@ Without `learning.change_detection` windows may be mixtures of two arms.
 
 from __future__ import annotations
 
+import argparse
 from collections.abc import Iterable, Iterator, Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
-from harness import print_table
 
+from benchmark.harness import print_table
 from blf_dsc_controller.analysis.metrics import Metrics, measure
 from blf_dsc_controller.configuration.nodes import (
     CONTROLLER,
@@ -283,7 +284,8 @@ def tables() -> Iterator[tuple[list[str], Iterator[list[str]]]]:
     )
 
 
-if __name__ == '__main__':
+def main(_options: argparse.Namespace) -> None:
+    """Print the tables."""
     for heads, rows in tables():
         print_table(heads, rows)
         print()

@@ -12,8 +12,8 @@ from collections.abc import Iterator, Mapping
 from time import perf_counter
 
 import numpy as np
-from harness import Ratio, ratio
 
+from benchmark.harness import Ratio, ratio
 from blf_dsc_controller.configuration.nodes import CONTROLLER, PLANT, load_loop
 from blf_dsc_controller.control.guarded_loop import GuardedLoop
 from blf_dsc_controller.run import FIRST_STAMP

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Run all benchmarks and write a table: python benchmark/harness.py [GROUP ...] [--out FOLDER].
+"""Measuring in turns, and Markdown tables.
 
 Each figure is the ratio of interleaved measurements: on a shared machine only they can
 be compared. Contestants may be processes.
@@ -7,8 +7,6 @@ be compared. Contestants may be processes.
 
 from __future__ import annotations
 
-import argparse
-import datetime as dt
 import gc
 import importlib.metadata
 import itertools
@@ -18,7 +16,6 @@ import re
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
-from itertools import groupby
 from pathlib import Path
 from typing import NamedTuple, TextIO
 
@@ -26,15 +23,6 @@ import numpy as np
 
 from blf_dsc_controller import __version__
 
-_GROUPS = {  # module and function of each
-    'offline': ('offline', 'measure'),
-    'growth': ('offline', 'measure_growth'),
-    'guarded': ('guarded', 'measure'),
-    'node': ('nodes', 'measure'),
-    'startup': ('nodes', 'measure_start'),
-    'wire': ('wire', 'measure'),
-}
-_HERE = Path(__file__).parent
 _PACKAGES = ('numpy', 'numba', 'scipy', 'mujoco', 'pin', 'ros-jazzy-rclpy')
 
 
@@ -105,49 +93,3 @@ def machine() -> str:
     return (
         f'{model}, {os.cpu_count()} cores, {platform.system()}; {", ".join(versions)}'
     )
-
-
-def main() -> None:
-    """Run the groups and write RESULTS.md."""
-    options = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    options.add_argument('groups', nargs='*', metavar='GROUP', help=', '.join(_GROUPS))
-    options.add_argument(
-        '--out', type=Path, default=_HERE, help='folder for the results'
-    )
-    chosen = options.parse_args()
-    chosen.out.mkdir(parents=True, exist_ok=True)
-    rows: list[Ratio] = []
-    for name in chosen.groups or _GROUPS:
-        print(f'measuring: {name}', flush=True)
-        module, function = _GROUPS[name]
-        for row in getattr(importlib.import_module(module), function)():
-            print(
-                f'  {row.what}: {row.median:.3g} times {row.baseline}  {row.note}',
-                flush=True,
-            )
-            rows.append(row)
-    today = dt.datetime.now(dt.timezone.utc).date()
-    with (chosen.out / 'RESULTS.md').open('w', encoding='utf-8') as file:
-        file.write(
-            '# Results of the benchmarks\n\n'
-            f'Written by `make bench` on {today}. Every figure is a ratio of two things measured '
-            'in turns in\nthe same run: median and range of its rounds. Absolute times are notes '
-            f'about one machine.\n\n{machine()}\n'
-        )
-        for group, members in groupby(rows, key=lambda row: row.group):
-            file.write(f'\n## {group}\n\n')
-            cells = (
-                (
-                    row.what,
-                    f'**{row.median:.3g}**',
-                    f'{row.low:.3g} to {row.high:.3g}',
-                    *row[-2:],
-                )
-                for row in members
-            )
-            print_table(('what', 'ratio', 'range', 'to', ''), cells, file)
-    print(f'written: {file.name}')
-
-
-if __name__ == '__main__':
-    main()

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """What users report of arms with soft drives, and these arms under this law.
 
-    python benchmark/holding.py
+    python -m benchmark holding
 
 Both are simulated in MuJoCo, 10 % off their description as the presets have it.  A
 position loop (`kp`, `kd`) moves one joint to targets; where it is is read 6 s later.
@@ -15,12 +15,13 @@ position loop (`kp`, `kd`) moves one joint to targets; where it is is read 6 s l
 
 from __future__ import annotations
 
+import argparse
 from collections.abc import Callable, Mapping
 from typing import NamedTuple
 
 import numpy as np
-from harness import print_table
 
+from benchmark.harness import print_table
 from blf_dsc_controller.configuration.nodes import load_loop
 from blf_dsc_controller.configuration.schema import change
 from blf_dsc_controller.reference.trajectory import Trajectory, TrajectoryPoint
@@ -181,6 +182,7 @@ def rows() -> list[list[str]]:
     return found
 
 
-if __name__ == '__main__':
-    HEADS = ('arm', 'control', 'of the way', 'farthest joint', 'reached [degrees]')
-    print_table(HEADS, rows())
+def main(_options: argparse.Namespace) -> None:
+    """Print the table."""
+    heads = ('arm', 'control', 'of the way', 'farthest joint', 'reached [degrees]')
+    print_table(heads, rows())

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Identification and weighing of simulated arms, each in one table; real ones: `league.py`.
 
-    .venv/bin/python benchmark/identification.py arms --runs 100
-    .venv/bin/python benchmark/identification.py weighing --runs 100
+    python -m benchmark identification arms --runs 100
+    python -m benchmark identification weighing --runs 100
 
 arms        Panda, UR5e and random chains of six joints, with links, centres of mass, rotors and
             friction drawn at random, identified from positions and efforts alone: encoders of 20
@@ -16,21 +16,13 @@ weighing    What arms hold, weighed while they move. Each run has links up to 30
 from __future__ import annotations
 
 import argparse
-import os
-import sys
-from collections.abc import Iterable
-from pathlib import Path
-
-os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
-sys.path.append(str(Path(__file__).parents[1] / 'test'))
-
 import time
+from collections.abc import Iterable
 from contextlib import suppress
 from typing import Any
 
 import numpy as np
 import random_arm
-from harness import print_table
 from random_arm import (
     PERIOD,
     is_covered,
@@ -41,6 +33,8 @@ from random_arm import (
     truth_of,
 )
 
+from benchmark.harness import print_table
+from benchmark.options import add_configs, add_runs
 from blf_dsc_controller.arms.urdf import pseudo_inertia
 from blf_dsc_controller.configuration.nodes import (
     CONTROLLER,
@@ -81,17 +75,15 @@ _HEADS = {
 }
 
 
-def main() -> None:
-    """Print the table."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+def arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the options."""
     parser.add_argument('what', choices=_HEADS)
-    parser.add_argument('--config', nargs='+', default=['panda', 'ur5e', 'fr3'])
-    parser.add_argument(
-        '--runs', type=int, default=100, help='arms, or runs of each arm'
-    )
-    options = parser.parse_args()
+    add_configs(parser, 'panda', 'ur5e', 'fr3')
+    add_runs(parser, 100, 'arms, or runs of each arm')
+
+
+def main(options: argparse.Namespace) -> None:
+    """Print the table."""
     rows: Iterable[tuple[str, ...]] = (
         _weighed(name, options.runs) for name in options.config
     )
@@ -246,7 +238,3 @@ def _random_loop(
         'reference.phase': random.uniform(0.0, 6.0, tones).tolist(),
     }
     return load_loop(name, {PLANT: plant, CONTROLLER: controller})
-
-
-if __name__ == '__main__':
-    main()

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Whether the 95 % intervals of `identify` hold where the arm is not as its model says.
 
-    .venv/bin/python benchmark/intervals.py --runs 12
-    .venv/bin/python benchmark/intervals.py --runs 3 --kinds gains 'elastic joints'
+    python -m benchmark intervals --runs 12
+    python -m benchmark intervals --runs 3 --kinds gains 'elastic joints'
 
 The arms are those of `identification.py arms`.  Each moves for 20 s, and for 20 s with a load of
 1 to 3 kg whose centre is up to 5 cm from the tip; states are recorded at 100 Hz.  A row has one
@@ -20,10 +20,8 @@ import time
 from collections.abc import Iterator
 from typing import NamedTuple
 
-import identification
 import numpy as np
 from friction_laws import with_friction
-from harness import print_table
 from random_arm import (
     PERIOD,
     Truth,
@@ -36,6 +34,9 @@ from random_arm import (
     truth_of,
 )
 
+from benchmark import identification
+from benchmark.harness import print_table
+from benchmark.options import add_runs
 from blf_dsc_controller.arms.urdf import Chain, inertia_of
 from blf_dsc_controller.identification.identified import Identified
 from blf_dsc_controller.identification.identify import identify_arm
@@ -72,15 +73,15 @@ KINDS = {
 """Rows of the table."""
 
 
-def main() -> None:
-    """Print the table."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument('--runs', type=int, default=12, help='arms')
+def arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the options."""
+    add_runs(parser, 12, 'arms')
     parser.add_argument('--seed', type=int, default=0, help='of the first arm')
     parser.add_argument('--kinds', nargs='+', choices=KINDS, default=list(KINDS))
-    options = parser.parse_args()
+
+
+def main(options: argparse.Namespace) -> None:
+    """Print the table."""
     results: dict[str, list[list[Floats]]] = {kind: [] for kind in options.kinds}
     seconds: dict[str, list[float]] = {kind: [] for kind in options.kinds}
     for seed in range(options.seed, options.seed + options.runs):
@@ -174,7 +175,3 @@ def _held(error: Floats, deviation: Floats, scale: Floats) -> Floats:
 def _cell(found: Floats) -> str:
     held, half = found
     return f'{100.0 * held.mean():.0f} % (± {100.0 * np.median(half):.2g} %)'
-
-
-if __name__ == '__main__':
-    main()

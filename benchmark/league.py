@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Models of real and simulated robots by several methods, on equal terms.
 
-    .venv/bin/python benchmark/league.py FOLDER... [--urdf ur10.urdf] [--arms 3]
+    python -m benchmark league FOLDER... [--urdf ur10.urdf] [--arms 3]
 
 Folders are copies of the repositories of `recordings.SOURCES`, or any with bags and a URDF; `arms`
 are those of `identification.py arms`, whose truth is known.  All methods have the first four fifths
@@ -24,22 +24,14 @@ The rivals are compared where they are installed: pip install figaroh==1.0.2 'mu
 from __future__ import annotations
 
 import argparse
-import os
 import sys
-from collections.abc import Callable, Iterator
-from pathlib import Path
-
-os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
-sys.path.append(str(Path(__file__).parents[1] / 'test'))
-
 import tempfile
 import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
 from typing import NamedTuple
 
-import identification
 import numpy as np
-import rivals
-from harness import print_table
 from random_arm import (
     PERIOD,
     Truth,
@@ -50,10 +42,12 @@ from random_arm import (
     shake,
     truth_of,
 )
-from recordings import SOURCES, Published, Taken, bags_in
-from rivals import Fit
-from rollouts import rollout_error, rollouts_of
 
+from benchmark import identification, rivals
+from benchmark.harness import print_table
+from benchmark.recordings import SOURCES, Published, Taken, bags_in
+from benchmark.rivals import Fit
+from benchmark.rollouts import rollout_error, rollouts_of
 from blf_dsc_controller.configuration.robot import Robot
 from blf_dsc_controller.identification.identified import Identified
 from blf_dsc_controller.identification.identify import identify_arm
@@ -102,17 +96,17 @@ class Result(NamedTuple):
     terms: str
 
 
-def main() -> None:
-    """Print the tables."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+def arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the options."""
     parser.add_argument('folders', nargs='*', type=Path, metavar='FOLDER')
     parser.add_argument('--urdf', default='', help='of bags in folders without a URDF')
     parser.add_argument('--arms', type=int, default=0, help='simulated arms')
     fifths = 'without the errors on each fifth, which take most of the time'
     parser.add_argument('--last-only', action='store_true', help=fifths)
-    options = parser.parse_args()
+
+
+def main(options: argparse.Namespace) -> None:
+    """Print the tables."""
     loads: list[str] = []
     results = []
     for name in rivals.MISSING:
@@ -374,7 +368,3 @@ def _weigh_loaded(entry: Entry, bag: Path, mass: float) -> str:
         interval = f'{values[0]:.3f} +- {1.96 * deviations[0]:.2g} kg'
         texts.append(f'{interval} from {found.picked_up:.1f} s on')
     return f'{taken.name} with {mass:.3f} kg: {texts[0]}; as one bag: {texts[1]}'
-
-
-if __name__ == '__main__':
-    main()

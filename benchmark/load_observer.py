@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """What joint torque sensors are worth at the gains that elastic joints bear.
 
-    python benchmark/load_observer.py margins
-    python benchmark/load_observer.py loops
-    python benchmark/load_observer.py pairs [--runs 20]
-    python benchmark/load_observer.py declarations
-    python benchmark/load_observer.py sensors
+    python -m benchmark load-observer margins
+    python -m benchmark load-observer loops
+    python -m benchmark load-observer pairs [--runs 20]
+    python -m benchmark load-observer declarations
+    python -m benchmark load-observer sensors
 
 `margins`: of the linear loop with gears, drives with a torque loop, and the load observer at a
 bandwidth, the worst over postures along the reference, gears of the preset's stiffness and
@@ -42,8 +42,10 @@ from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
-from harness import print_table
 
+from benchmark.harness import print_table
+from benchmark.options import add_runs
+from benchmark.studies import load_study
 from blf_dsc_controller.arms.linear_loop import (
     Joints,
     Timing,
@@ -69,7 +71,7 @@ from blf_dsc_controller.messages.journal import EventType
 from blf_dsc_controller.reference.approach import reference_of
 from blf_dsc_controller.reference.terms import sampled
 from blf_dsc_controller.simulation.loop import Record, simulate
-from blf_dsc_controller.studies.monte_carlo import draw, load_study, plant_with
+from blf_dsc_controller.studies.monte_carlo import draw, plant_with
 from blf_dsc_controller.supervision.expected_errors import linear_feedback
 from blf_dsc_controller.supervision.guard import Guard
 from sim_plant.plant import plant_of
@@ -511,13 +513,15 @@ def failed(preset: str, failure: str) -> list[str]:
     return [preset, failure, f'{1e3 * largest:.2f}', '; '.join(said)]
 
 
-def main() -> None:
-    """Print the table that was asked for."""
-    parser = argparse.ArgumentParser(description=__doc__)
+def arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the options."""
     tables = 'margins', 'loops', 'pairs', 'declarations', 'sensors'
     parser.add_argument('table', choices=tables)
-    parser.add_argument('--runs', type=int, default=20, help='arms of each study')
-    given = parser.parse_args()
+    add_runs(parser, 20, 'arms of each study')
+
+
+def main(given: argparse.Namespace) -> None:
+    """Print the table that was asked for."""
     if given.table == 'margins':
         print_table(['arm', 'tip', *(f'{L:g} rad/s' for L in BANDWIDTHS)], margins())
     elif given.table == 'loops':
@@ -533,7 +537,3 @@ def main() -> None:
     else:
         of_spans = [f'{each}, {span}' for span in SPANS for each in ('rms', 'largest')]
         print_table(['study', 'arm', 'events', *of_spans], pairs(given.runs))
-
-
-if __name__ == '__main__':
-    main()

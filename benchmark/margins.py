@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Margins of the default gains of arms from a URDF, and their errors at a pick-up.
 
-    python benchmark/margins.py
+    python -m benchmark margins
 
 Margins are of the linear loop near the reference, of all joints together, in the worst
 of some postures: how many times lighter or heavier the arm may be than M0, and how much
@@ -10,11 +10,12 @@ later torques may come.  Near the bound the same holds where the barrier is stee
 
 from __future__ import annotations
 
+import argparse
 from collections.abc import Callable, Iterable, Iterator
 
 import numpy as np
-from harness import print_table
 
+from benchmark.harness import print_table
 from blf_dsc_controller.arms.model import inertia_matrices
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.nodes import load, load_loop, locate
@@ -157,5 +158,6 @@ def table() -> Iterator[list[str]]:
             yield [name, label, *row(preset, T)]
 
 
-if __name__ == '__main__':
+def main(_options: argparse.Namespace) -> None:
+    """Print the table."""
     print_table(HEADS, table())

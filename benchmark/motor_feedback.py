@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Feedback through a bus, and inside motors with a PD of their own: OpenArm, YAM.
 
-    python benchmark/motor_feedback.py [--arm openarm | yam] [LAW...]
+    python -m benchmark motor-feedback [--arm openarm | yam] [LAW...]
 
 The arm of the preset runs its motion for 14 s and picks up 0.5 kg at 8 s.  Its links are
 10 % off, its rotors 20 %.  The motors run at 4 kHz, frames go at 250 or 500 Hz with the
@@ -30,8 +30,8 @@ from itertools import product
 from typing import NamedTuple
 
 import numpy as np
-from harness import print_table
 
+from benchmark.harness import print_table
 from blf_dsc_controller.configuration.drive import DriveConfig
 from blf_dsc_controller.configuration.motor_options import limits_of
 from blf_dsc_controller.configuration.nodes import (
@@ -220,15 +220,13 @@ def rows(arm: str, laws: Collection[str]) -> Iterator[tuple[str, ...]]:
         yield f'{law}, {feedback}', *cells
 
 
-def main() -> None:
-    """Print the table."""
-    parser = argparse.ArgumentParser()
+def arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the options."""
     parser.add_argument('--arm', choices=GEARS, default='openarm')
     parser.add_argument('laws', nargs='*', metavar='LAW', help=', '.join(LAWS))
-    options = parser.parse_args()
+
+
+def main(options: argparse.Namespace) -> None:
+    """Print the table."""
     heads = [f'{kind}, {rate} Hz' for kind, rate in product(KINDS, (250, 500))]
     print_table(['law', *heads], rows(options.arm, options.laws or LAWS))
-
-
-if __name__ == '__main__':
-    main()

@@ -22,9 +22,9 @@ from typing import Any
 
 import numpy as np
 import rclpy
-from harness import Ratio, ratio
 from rclpy.experimental import EventsExecutor
 
+from benchmark.harness import Ratio, ratio
 from blf_dsc_controller.cli.domains import own_domain
 from blf_dsc_controller.cli.session import (
     NodeProcess,
@@ -60,7 +60,7 @@ _ARMS = {'recommended': 'node', 'panda': 'node with seven joints'}
 _NULL = 'null node'
 _QUIET = 'controller, telemetry off'
 _RECORDED = 'controller, telemetry on, recorder'
-_NULL_NODE = 'null_node'
+_NULL_NODE = 'benchmark.null_node'
 
 
 class StandIn:

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Changes and weights that are not there: arms, motions and friction unlike those of the law.
 
-    python benchmark/nothing_changes.py [--runs 24] [--arms panda ur5e ...] [--each]
+    python -m benchmark nothing-changes [--runs 24] [--arms panda ur5e ...] [--each]
 
 Links are up to 30 % heavier or lighter than the URDF's.  Friction is drawn for each joint, 0.2 to
 1.8 times what the law assumes, with up to 0.7 more at low speed, which fades over 0.02 to 0.2
@@ -26,8 +26,9 @@ from collections.abc import Callable, Iterable, Iterator
 from typing import Any, NamedTuple
 
 import numpy as np
-from harness import print_table
 
+from benchmark.harness import print_table
+from benchmark.options import add_arms
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.nodes import (
     CONTROLLER,
@@ -360,15 +361,13 @@ _LOADED = (
 )
 
 
-def main() -> None:
+def arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the options."""
+    add_arms(parser, ARMS, 24, 'pairs')
+
+
+def main(options: argparse.Namespace) -> None:
     """Print the tables."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument('--runs', type=int, default=24, help='pairs')
-    parser.add_argument('--arms', nargs='+', default=ARMS, choices=ARMS)
-    parser.add_argument('--each', action='store_true', help='print each pair, too')
-    options = parser.parse_args()
     done = []
     for pair in pairs(options.arms, options.runs):
         done.append(pair)
@@ -390,7 +389,3 @@ def main() -> None:
         _LOADED,
         [loaded_row(name, [p.loaded for p in chosen]) for name, chosen in groups],
     )
-
-
-if __name__ == '__main__':
-    main()

@@ -11,7 +11,6 @@ from __future__ import annotations
 import ctypes
 import itertools
 import subprocess
-import sys
 import tempfile
 from collections.abc import Callable, Iterator
 from dataclasses import replace
@@ -20,9 +19,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from harness import Ratio, interleaved, ratio
+from plain_law import PlainLaw, dynamics
 from scipy.integrate import RK45
 
+from benchmark.harness import Ratio, interleaved, ratio
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.nodes import load_loop
 from blf_dsc_controller.configuration.plant import PlantConfig
@@ -32,9 +32,6 @@ from blf_dsc_controller.messages import topics
 from blf_dsc_controller.reference.approach import reference_of
 from blf_dsc_controller.reference.terms import sampled
 from blf_dsc_controller.simulation.loop import simulate
-
-sys.path.append(str(Path(__file__).parents[1] / 'test'))
-from plain_law import PlainLaw, dynamics
 
 _ROOT = Path(__file__).parents[1]
 PACKAGE = 'blf_dsc_controller'

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Random arms with elastic joints: this law and its rivals on the same ones.
 
-    python benchmark/random_arms.py margins
-    python benchmark/random_arms.py arms [N] [--robots NAME...] [--draws DRAW...] [--keep FILE]
-    python benchmark/random_arms.py rotors
+    python -m benchmark random-arms margins
+    python -m benchmark random-arms arms [N] [--robots NAME...] [--draws DRAW...] [--keep FILE]
+    python -m benchmark random-arms rotors
 
 Arms are drawn independently of what the controller assumes: each pairs one draw with all
 laws, the same noise and the same torque limits.  It runs the motion of its preset under the
@@ -43,10 +43,11 @@ from functools import cache
 from pathlib import Path
 from typing import NamedTuple
 
-import elastic
 import numpy as np
-from harness import print_table
 
+from benchmark import elastic
+from benchmark.harness import print_table
+from benchmark.studies import load_study
 from blf_dsc_controller.arms.linear_loop import (
     Feedback,
     Joints,
@@ -70,7 +71,6 @@ from blf_dsc_controller.studies.monte_carlo import (
     Study,
     Variation,
     draw,
-    load_study,
     parse,
     plant_with,
 )
@@ -581,15 +581,17 @@ HEADS = {
 }
 
 
-def main() -> None:
-    """Print the table that was asked for."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+def arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the options."""
     parser.add_argument('table', choices=('margins', 'arms', 'rotors'))
     parser.add_argument('runs', type=int, nargs='?', default=1000, help='arms of each')
     parser.add_argument('--robots', nargs='+', choices=ROBOTS, default=list(ROBOTS))
     parser.add_argument('--draws', nargs='+', choices=DRAWS, default=list(DRAWS))
     parser.add_argument('--keep', type=Path, help='file of the runs that are made')
-    given = parser.parse_args()
+
+
+def main(given: argparse.Namespace) -> None:
+    """Print the table that was asked for."""
     if given.table != 'arms':
         print_table(
             HEADS[given.table], margins() if given.table == 'margins' else rotors()
@@ -600,7 +602,3 @@ def main() -> None:
     for name, rows in (('stops', stops), ('failures', failures)):
         print()
         print_table(HEADS[name], rows(kept))
-
-
-if __name__ == '__main__':
-    main()

@@ -18,8 +18,8 @@ from typing import Any, NamedTuple
 
 import mujoco
 import numpy as np
-from rollouts import spec_of
 
+from benchmark.rollouts import spec_of
 from blf_dsc_controller.arms.urdf import inertia_of
 from blf_dsc_controller.identification.identified import Identified
 from blf_dsc_controller.identification.prior import Prior

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """What laws of equal gains bear: a torque that comes late, and drives that are lighter.
 
-    python benchmark/robustness.py
+    python -m benchmark robustness
 
 The presets `panda` and `ur5e` run for 6 s before anything is picked up.  The controller
 is told the guessed rotor inertias as if they were known, so it measures none; nobody
@@ -10,14 +10,15 @@ tells it the later torque or the lighter drives.
 
 from __future__ import annotations
 
+import argparse
 from collections.abc import Mapping
 from concurrent.futures import ProcessPoolExecutor
 from itertools import product
 from typing import NamedTuple
 
 import numpy as np
-from harness import print_table
 
+from benchmark.harness import print_table
 from blf_dsc_controller.configuration.nodes import (
     CONTROLLER,
     PLANT,
@@ -96,7 +97,7 @@ def row(preset: str, rival: Rival) -> list[str]:
     return [rival.label, f'{each[0][1]:.1f} %', *(f'{error:.2f}' for error, _ in each)]
 
 
-def main() -> None:
+def main(_options: argparse.Namespace) -> None:
     """Print a table for each preset."""
     row(PRESETS[0], RIVALS[0])  # compiles what the workers load
     with ProcessPoolExecutor(cores()) as pool:
@@ -107,7 +108,3 @@ def main() -> None:
             line for (of, _), line in zip(jobs, rows, strict=True) if of == preset
         ]
         print_table([f'{preset}: largest error [mrad]', 'roughness', *ARMS], chosen)
-
-
-if __name__ == '__main__':
-    main()

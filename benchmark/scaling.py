@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """How many of MoveIt's trajectories exceed the controller's limits and are stretched.
 
-    .venv/bin/python benchmark/scaling.py
+    python -m benchmark scaling
 
 As MoveIt's time parametrisation: from rest to rest, each joint with a trapezoidal
 velocity, all in the time of the slowest, sampled with positions, velocities and
@@ -10,11 +10,12 @@ accelerations. Without ROS and without an arm, the same each time.
 
 from __future__ import annotations
 
+import argparse
 from collections.abc import Iterator
 
 import numpy as np
-from harness import print_table
 
+from benchmark.harness import print_table
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.schema import build
 from blf_dsc_controller.reference.terms import minimum_jerk, pack
@@ -92,11 +93,7 @@ def rows() -> Iterator[tuple[str, ...]]:
         yield f'{scale[0]:g}', f'{scale[1]:g}', *row
 
 
-def main() -> None:
+def main(_options: argparse.Namespace) -> None:
     """Print the table: how many are stretched, and by how much at most."""
     heads = [f'every {spacing:g} s' for spacing in SPACINGS]
     print_table(('of the velocity', 'of the acceleration', *heads), list(rows()))
-
-
-if __name__ == '__main__':
-    main()

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Stiffness of gears that `identify` finds in 15 s of positions of motors and of links.
 
-    .venv/bin/python benchmark/stiffness.py
+    python -m benchmark stiffness
 
 Presets follow a random motion by a PD, recorded at 200 Hz.  `fr3_direct` has torque sensors behind
 its gears; the efforts of the others are those of the motors, in front of gears with friction.  A
@@ -10,21 +10,15 @@ cell has the stiffness over the true one, and the ends of its 95 % interval, of 
 
 from __future__ import annotations
 
-import os
-import sys
+import argparse
 from collections.abc import Mapping
-from pathlib import Path
+from dataclasses import replace
 from typing import Any
 
-os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
-sys.path.append(str(Path(__file__).parents[1] / 'test'))
-
-from dataclasses import replace
-
 import numpy as np
-from harness import print_table
 from random_arm import recording_of, reference_of
 
+from benchmark.harness import print_table
 from blf_dsc_controller.configuration.nodes import PLANT, load_loop
 from blf_dsc_controller.configuration.plant import PlantConfig
 from blf_dsc_controller.identification.identify import identify_arm
@@ -51,7 +45,7 @@ _CASES: dict[str, tuple[str, int, Mapping[str, Any]]] = {
 }
 
 
-def main() -> None:
+def main(_options: argparse.Namespace) -> None:
     """Print the table."""
     rows = []
     for case, (name, bits, plant) in _CASES.items():
@@ -75,7 +69,24 @@ def _cells(found: Compliance, truth: Floats) -> list[str]:
 
 
 def _found(config: PlantConfig, bits: int) -> Compliance:
-    """Return what is found of an arm that moves."""
+    """Return what is found of an arm that moves, by encoders of so many bits."""
+    states, motors = _moved(config)
+    step = 2.0 * np.pi / 2**bits
+    states[:, 0], motors = (
+        np.round(each / step) * step for each in (states[:, 0], motors)
+    )
+    recording = recording_of(
+        states[::_EVERY], config.joints, _EVERY * config.sample_time
+    )
+    twist = motors - states[:, 0]
+    found = identify_arm(recording._replace(twist=twist[::_EVERY]), config.robot)
+    if found.compliance is None:
+        raise AssertionError('a recording with both positions')
+    return found.compliance
+
+
+def _moved(config: PlantConfig) -> tuple[Floats, Floats]:
+    """Return states (k, 3, n) and positions of motors (k, n) [rad] of a PD on a random motion."""
     chain = config.robot.chain(config.joints)
     T = config.sample_time
     motion = reference_of(chain, _SEED).at(np.arange(round(_SECONDS / T)) * T)
@@ -95,17 +106,4 @@ def _found(config: PlantConfig, bits: int) -> Compliance:
         error = start + share * (position - start) - q
         p, d = _GAINS
         plant.step(efforts * (p * error + d * (share * velocity - dq)))
-    step = 2.0 * np.pi / 2**bits
-    states[:, 0], motors = (
-        np.round(each / step) * step for each in (states[:, 0], motors)
-    )
-    recording = recording_of(states[::_EVERY], config.joints, _EVERY * T)
-    twist = motors - states[:, 0]
-    found = identify_arm(recording._replace(twist=twist[::_EVERY]), config.robot)
-    if found.compliance is None:
-        raise AssertionError('a recording with both positions')
-    return found.compliance
-
-
-if __name__ == '__main__':
-    main()
+    return states, motors

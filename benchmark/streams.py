@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """How far behind and how smooth the reference of a stream is, and that of chunks.
 
-    .venv/bin/python benchmark/streams.py
+    python -m benchmark streams
 
 Without ROS and without an arm, the same each time: messages arrive 2 ms after they were
 sent, in one case up to a third of an interval later, in another a tenth is lost. A target
@@ -10,13 +10,14 @@ is planned for 4 ms ahead, a chunk for 20 ms, as the node does.
 
 from __future__ import annotations
 
+import argparse
 from collections.abc import Callable, Iterator
 from functools import cache, partial
 from typing import NamedTuple
 
 import numpy as np
-from harness import print_table
 
+from benchmark.harness import print_table
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.schema import build
 from blf_dsc_controller.reference.retargeting import Target, plan_target
@@ -266,7 +267,7 @@ def chunk_rows() -> Iterator[tuple[str, ...]]:
             )
 
 
-def main() -> None:
+def main(_options: argparse.Namespace) -> None:
     """Print the tables."""
     print_table(_HEAD, list(stream_rows()))
     print_table(
@@ -280,7 +281,3 @@ def main() -> None:
         ),
         list(chunk_rows()),
     )
-
-
-if __name__ == '__main__':
-    main()

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Touch on slow motion: the interval of the external torque, and pushes during insertions.
 
-    python benchmark/touch.py [--runs 12] [--arms panda fr3 ur5e] [--each]
+    python -m benchmark touch [--runs 12] [--arms panda fr3 ur5e] [--each]
 
-Gears, motors, lags and bases are those of `config/monte_carlo_elastic_*.yaml`.  Links are up to
+Gears, motors, lags and bases are those of `studies/monte_carlo_elastic_*.yaml`.  Links are up to
 30 % heavier or lighter than the URDF's, and their centres of mass 1 cm off.  Friction is drawn
 for each joint, 0.2 to 1.8 times what the law assumes, with up to 0.7 more at low speed, which
 fades over 0.02 to 0.2 rad/s, and 4 to 30 mrad/s within which it turns round.  The arm learns for
@@ -30,8 +30,10 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
-from harness import print_table
-from nothing_changes import (
+
+from benchmark.contacts import alarms, delays, threshold_at
+from benchmark.harness import print_table
+from benchmark.nothing_changes import (
     FRICTION,
     RANGE,
     STRIBECK,
@@ -40,7 +42,8 @@ from nothing_changes import (
     moved,
     rested,
 )
-
+from benchmark.options import add_arms
+from benchmark.studies import load_study
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.nodes import load_loop
 from blf_dsc_controller.configuration.plant import PlantConfig
@@ -58,8 +61,7 @@ from blf_dsc_controller.reference.trajectory import (
 from blf_dsc_controller.run import Floats
 from blf_dsc_controller.simulation.compiled_loop import CompiledLoop, Span
 from blf_dsc_controller.simulation.loop import new_record
-from blf_dsc_controller.studies.contacts import alarms, delays, threshold_at
-from blf_dsc_controller.studies.monte_carlo import draw, load_study, plant_with
+from blf_dsc_controller.studies.monte_carlo import draw, plant_with
 from sim_plant.plant import plant_of
 
 ARMS = ('panda', 'fr3', 'ur5e')
@@ -144,11 +146,48 @@ def motion_of(
     return Trajectory(config.joints, tuple(points), 0.0), insertions
 
 
+def friction_of(arm: str, random: np.random.Generator) -> dict[str, Any]:
+    """Return a friction unlike the one that the law assumes."""
+    usual = load_loop(arm).plant.disturbance
+
+    def varied(values: tuple[float, ...]) -> list[float]:
+        factors = random.uniform(*FRICTION, len(values))
+        return [float(each) for each in factors * values]
+
+    def within(velocities: tuple[float, float]) -> float:
+        return float(np.exp(random.uniform(*np.log(velocities))))
+
+    return {
+        'disturbance.viscous': varied(usual.viscous),
+        'disturbance.coulomb': varied(usual.coulomb),
+        'disturbance.stribeck': float(random.uniform(*STRIBECK)),
+        'disturbance.stribeck_velocity': within(STRIBECK_SPEED),
+        'disturbance.coulomb_velocity': within(SLIDING),
+    }
+
+
+def pushes_of(
+    insertions: Sequence[Insertion], random: np.random.Generator
+) -> dict[str, Any]:
+    """Return the events of pushes in random directions."""
+    begins = [each.push for each in insertions if each.push < each.end]
+    forces: list[float] = []
+    for force in FORCES[1:]:
+        direction = random.normal(size=3)
+        forces += (force * direction / np.linalg.norm(direction)).tolist()
+    return {
+        'events.begin': begins,
+        'events.duration': [PUSH] * len(begins),
+        'events.ramp': [RISE] * len(begins),
+        'events.payload': [0.0] * len(begins),
+        'events.force': forces,
+    }
+
+
 def loop_of(arm: str, seed: int) -> tuple[Loop, Trajectory, list[Insertion]]:
     """Return an arm of its own, what it does, and when it is pushed."""
     random = np.random.default_rng((seed, 65))
     study = load_study(f'monte_carlo_elastic_{arm}')
-    plant = plant_with(study, draw(study, seed))
     controller = change(
         study.controller,
         {
@@ -159,35 +198,15 @@ def loop_of(arm: str, seed: int) -> tuple[Loop, Trajectory, list[Insertion]]:
         },
     )
     trajectory, insertions = motion_of(controller, random)
-    pushes = [each for each in insertions if each.push < each.end]
-    forces = []
-    for force in FORCES[1:]:
-        direction = random.normal(size=3)
-        forces += (force * direction / np.linalg.norm(direction)).tolist()
-    usual = load_loop(arm).plant.disturbance
-
-    def varied(values: tuple[float, ...]) -> list[float]:
-        factors = random.uniform(*FRICTION, len(values))
-        return [float(each) for each in factors * values]
-
-    given: dict[str, Any] = {
+    given = {
         'duration': insertions[-1].end,
         'truth.mass_deviation': 0.3,
         'truth.centre_deviation': 0.01,
-        'disturbance.viscous': varied(usual.viscous),
-        'disturbance.coulomb': varied(usual.coulomb),
-        'disturbance.stribeck': float(random.uniform(*STRIBECK)),
-        'disturbance.stribeck_velocity': float(
-            np.exp(random.uniform(*np.log(STRIBECK_SPEED)))
-        ),
-        'disturbance.coulomb_velocity': float(np.exp(random.uniform(*np.log(SLIDING)))),
-        'events.begin': [each.push for each in pushes],
-        'events.duration': [PUSH] * len(pushes),
-        'events.ramp': [RISE] * len(pushes),
-        'events.payload': [0.0] * len(pushes),
-        'events.force': forces,
+        **pushes_of(insertions, random),
+        **friction_of(arm, random),
     }
-    return Loop(change(plant, given), controller), trajectory, insertions
+    plant = change(plant_with(study, draw(study, seed)), given)
+    return Loop(plant, controller), trajectory, insertions
 
 
 def run(
@@ -218,36 +237,42 @@ def run(
     return record.stamps * 1e-9, sample_columns(record.samples, controller.settings)
 
 
+def tared(residuals: Floats, t: Floats, insertions: Sequence[Insertion]) -> Floats:
+    """Return residuals (k, n) less their mean at the end of each rest."""
+    r: Floats = residuals.copy()
+    for each in insertions:
+        still = (t >= each.begin - TARE - MEAN) & (t < each.begin - TARE)
+        r[t >= each.begin - TARE] -= r[still].mean(axis=0)
+    return r
+
+
 def trial_of(
     arm: str, t: Floats, samples: Any, insertions: Sequence[Insertion], *, tares: bool
 ) -> Trial:
     """Return what the samples say in the advances."""
-    r = np.array(samples.external)
+    r = tared(samples.external, t, insertions) if tares else samples.external
     half = samples.external_interval
     touched = samples.contact[:, CONTACT]
     distance = samples.contact[:, DISTANCE]
-    free, calm, pushed, reached, found = [], [], [], [], []
-    inside, width, false = [], [], 0
-    for each in insertions:
-        if tares:
-            still = (t >= each.begin - TARE - MEAN) & (t < each.begin - TARE)
-            r[t >= each.begin - TARE] -= r[still].mean(axis=0)
-        before = (t >= each.begin) & (t < each.push)
-        during = (t >= each.push) & (t < each.push + PUSH) & (t < each.end)
-        free.append(r[before])
-        calm.append(distance[before])
-        inside.append(np.abs(r[before]) <= half[before])
-        width.append(half[before])
-        false += int((np.diff(touched[before], prepend=0.0) > 0.5).sum())
-        if each.push < each.end:
-            pushed.append(r[during])
-            reached.append(distance[during])
-            found.append(bool(touched[during].any()))
-    covered = np.concatenate(inside).mean(axis=0)
-    widths = np.concatenate(width).mean(axis=0)
-    period = float(t[1] - t[0])
+    free = [(t >= each.begin) & (t < each.push) for each in insertions]
+    pushed = [
+        (t >= each.push) & (t < each.push + PUSH) & (t < each.end)
+        for each in insertions
+        if each.push < each.end
+    ]
+    inside = [np.abs(r[span]) <= half[span] for span in free]
+    starts = [np.diff(touched[span], prepend=0.0) > 0.5 for span in free]
     return Trial(
-        arm, free, covered, widths, calm, pushed, reached, false, found, period
+        arm=arm,
+        free=[r[span] for span in free],
+        covered=np.concatenate(inside).mean(axis=0),
+        half=np.concatenate([half[span] for span in free]).mean(axis=0),
+        calm=[distance[span] for span in free],
+        pushed=[r[span] for span in pushed],
+        reached=[distance[span] for span in pushed],
+        alarms=sum(int(each.sum()) for each in starts),
+        found=[bool(touched[span].any()) for span in pushed],
+        period=float(t[1] - t[0]),
     )
 
 
@@ -312,26 +337,28 @@ def coverage_row(name: str, done: Sequence[Trial]) -> list[str]:
     ]
 
 
+def delay_cell(times: Floats) -> str:
+    """Return how many pushes are not found, and the median and the last of delays [s]."""
+    late = np.isinf(times).sum()
+    median, last = (
+        f'{1e3 * each:.0f} ms' if np.isfinite(each) else '-'
+        for each in (np.median(times), times.max())
+    )
+    return f'{late} of {times.size} ({median}, {last})'
+
+
 def push_row(name: str, done: Sequence[Trial]) -> list[str]:
     """Return how many pushes are not found, and after what time."""
     free = [calm for each in done for calm in each.calm]
     period = done[0].period
     resampled = [calm for calm in free if calm.size]
     threshold = threshold_at(RATE, resampled, period)
-    cells = []
-    for k in range(len(FORCES) - 1):
-        times = np.array(
-            [delays([each.reached[k]], threshold, each.period)[0] for each in done]
-        )
-        late = np.isinf(times).sum()
-        median = (
-            f'{1e3 * np.median(times):.0f} ms' if np.isfinite(np.median(times)) else '-'
-        )
-        last = f'{1e3 * times.max():.0f} ms' if not late else '-'
-        cells.append(f'{late} of {times.size} ({median}, {last})')
+    pushes = range(len(FORCES) - 1)
+    times = [
+        delays([each.reached[k] for each in done], threshold, period) for k in pushes
+    ]
     missed = [
-        f'{sum(not each.found[k] for each in done)} of {len(done)}'
-        for k in range(len(FORCES) - 1)
+        f'{sum(not each.found[k] for each in done)} of {len(done)}' for k in pushes
     ]
     is_own = name != URDF
     count = sum(alarms(calm, threshold, round(0.2 / period)) for calm in resampled)
@@ -339,7 +366,7 @@ def push_row(name: str, done: Sequence[Trial]) -> list[str]:
         name,
         *(missed if is_own else ['-'] * len(missed)),
         f'{threshold:.2f} ({count})',
-        *cells,
+        *map(delay_cell, times),
     ]
 
 
@@ -355,25 +382,28 @@ _PUSHES = (
 )
 
 
-def main() -> None:
-    """Print the tables."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+def arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the options."""
+    add_arms(parser, ARMS, 12, 'arms')
+
+
+def print_trial(name: str, trial: Trial) -> None:
+    """Print what an observer says of one arm, with the largest distances of each advance."""
+    calm, reached = (
+        [round(float(each.max()), 1) for each in distances]
+        for distances in (trial.calm, trial.reached)
     )
-    parser.add_argument('--runs', type=int, default=12, help='arms')
-    parser.add_argument('--arms', nargs='+', default=ARMS, choices=ARMS)
-    parser.add_argument('--each', action='store_true', help='print each arm, too')
-    options = parser.parse_args()
+    print(coverage_row(f'{trial.arm} {name}', [trial]), calm, reached, flush=True)
+
+
+def main(options: argparse.Namespace) -> None:
+    """Print the tables."""
     done = []
     for found in trials(options.arms, options.runs):
         done.append(found)
         if options.each:
             for name in (PLAIN, TARED):
-                print(coverage_row(f'{found[name].arm} {name}', [found[name]]), end=' ')
-                print([round(float(d.max()), 1) for d in found[name].calm], end=' ')
-                print(
-                    [round(float(d.max()), 1) for d in found[name].reached], flush=True
-                )
+                print_trial(name, found[name])
     by_name = {name: [found[name] for found in done] for name in (PLAIN, TARED, URDF)}
     by_name[URDF] = with_limits(by_name[URDF])
     print_table(
@@ -381,7 +411,3 @@ def main() -> None:
     )
     print()
     print_table(_PUSHES, [push_row(name, each) for name, each in by_name.items()])
-
-
-if __name__ == '__main__':
-    main()

@@ -17,11 +17,11 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from time import perf_counter
 
-import nodes
 import numpy as np
 import pylibfranka
-from harness import Ratio, ratio
 
+from benchmark import nodes
+from benchmark.harness import Ratio, ratio
 from blf_dsc_controller.configuration.drive import DriveConfig
 from blf_dsc_controller.configuration.nodes import load_loop
 from blf_dsc_controller.control.arm_controller import ArmController

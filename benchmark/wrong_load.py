@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A Franka Research 3 whose declared load is wrong: python benchmark/wrong_load.py [--seconds S].
+"""A Franka Research 3 whose declared load is wrong.
+
+    python -m benchmark wrong-load [--seconds 15]
 
 Over libfranka's protocol against franky-sim (MuJoCo), in lock-step.  The hand is
 empty; 0 to 3 kg are declared by another client, as in Desk: the robot adds a weight
@@ -19,9 +21,9 @@ from pathlib import Path
 
 import numpy as np
 import yaml
-from harness import print_table
 
 import blf_dsc_controller as blf
+from benchmark.harness import print_table
 from blf_dsc_controller.configuration.files import share_folder
 
 _SIMULATOR = Path(__file__).parents[1] / 'test' / 'franka_simulator.py'
@@ -100,21 +102,19 @@ def _drive(
     )
 
 
-def main() -> None:
+def arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the options."""
+    parser.add_argument('--seconds', type=float, default=15.0)
+
+
+def main(options: argparse.Namespace) -> None:
     """Print the table."""
-    options = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    options.add_argument('--seconds', type=float, default=15.0)
-    chosen = options.parse_args()
     rows = []
     for number, load in enumerate(_LOADS):
         for any_step in (False, True):
             address = f'127.0.1.{1 + 2 * number + any_step}'
             who = 'any step' if any_step else 'preset'
-            found = run(address, load, chosen.seconds, any_step=any_step)
+            found = run(address, load, options.seconds, any_step=any_step)
             rows.append([f'{load:g} kg', who, *found])
             print(rows[-1], flush=True)
     print_table(('declared', '', 'first 5 s [mrad]', 'later [mrad]', 'weighed'), rows)
-
-
-if __name__ == '__main__':
-    main()

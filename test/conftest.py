@@ -9,8 +9,10 @@ at the end.
 import gc
 import os
 import shutil
+import sys
 import tempfile
 from importlib.util import find_spec
+from pathlib import Path
 
 import hypothesis
 import pytest
@@ -27,6 +29,9 @@ hypothesis.settings.register_profile(
     'suite', deadline=None, derandomize='NIGHTLY' not in os.environ
 )
 hypothesis.settings.load_profile('suite')
+
+# The folder of the tables, which is not installed.
+sys.path.append(str(Path(__file__).parents[1]))
 
 _LOG_FOLDER = tempfile.mkdtemp(prefix='blf_dsc_controller_test_log_')
 

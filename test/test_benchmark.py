@@ -6,27 +6,19 @@ from __future__ import annotations
 import importlib
 import math
 import shutil
-import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
 
+from benchmark.__main__ import main
 from blf_dsc_controller.errors import BlfDscError
 
 pytestmark = pytest.mark.nightly
 
-BENCHMARK = Path(__file__).parents[1] / 'benchmark'
-
-
-@pytest.fixture(autouse=True)
-def _importable(monkeypatch):
-    monkeypatch.syspath_prepend(str(BENCHMARK))
-
 
 def tiny(monkeypatch, name, **sizes):
     """Import a benchmark with one round and the given sizes."""
-    module = importlib.import_module(name)
+    module = importlib.import_module(f'benchmark.{name}')
     for constant, value in {'_ROUNDS': 1, **sizes}.items():
         monkeypatch.setattr(module, constant, value)
     return module
@@ -40,8 +32,7 @@ def contestants(rows):
 
 def test_growth_is_written_as_a_table(monkeypatch, tmp_path):
     offline = tiny(monkeypatch, 'offline', _UPDATES=2, _GROWTH_ROUNDS=1, _FULL=7.5)
-    monkeypatch.setattr(sys, 'argv', ['harness.py', 'growth', '--out', str(tmp_path)])
-    importlib.import_module('harness').main()
+    assert main(['bench', 'growth', '--out', str(tmp_path)]) == 0
     text = (tmp_path / 'RESULTS.md').read_text()
     row = 'panda: n = 7 joints, p = 62 unknowns (48 of the arm + 14 of disturbances)'
     assert f'\n| {row} | **' in text
@@ -73,7 +64,7 @@ def test_loop_compared_with_c_and_numpy(monkeypatch):
 
 
 def test_simulators_of_the_peers_run_the_same_arm():
-    offline = importlib.import_module('offline')
+    offline = importlib.import_module('benchmark.offline')
     numpy, *others = (loop(0.2) for loop, _ in offline._PEERS.values())
     # MuJoCo holds the disturbance over a sample, the URDF has 1e-6 kg m^2
     for errors in others:
@@ -85,7 +76,7 @@ def test_simulators_of_the_peers_run_the_same_arm():
 @pytest.mark.parametrize('arm', ['openarm', 'yam'])
 def test_feedback_in_motors_is_compared_with_the_hosts(monkeypatch, arm):
     sizes = {'SECONDS': 0.2, 'PICK_UP': 0.1, 'SETTLED': 0.05, 'DEAD': 0.1}
-    motors = importlib.import_module('motor_feedback')
+    motors = importlib.import_module('benchmark.motor_feedback')
     for name, value in {'KINDS': ('rigid',), **sizes}.items():
         monkeypatch.setattr(motors, name, value)
     table = {first: cells for first, *cells in motors.rows(arm, ['maker', 'whole'])}
@@ -116,9 +107,8 @@ def test_dead_or_silent_contestant_aborts_the_measurement(monkeypatch):
     silent.close()
 
 
-def test_arms_are_identified_at_both_rates(monkeypatch, capsys):
-    monkeypatch.setattr(sys, 'argv', ['identification.py', 'arms', '--runs', '1'])
-    importlib.import_module('identification').main()
+def test_arms_are_identified_at_both_rates(capsys):
+    assert main(['identification', 'arms', '--runs', '1']) == 0
     printed = capsys.readouterr().out
     assert '1 arms, 0 results with unphysical bodies' in printed
     assert '\n| 1000 Hz | ' in printed

@@ -15,7 +15,8 @@ from command import finished
 from recorded_run import Synthetic, small_disk
 
 from blf_dsc_controller import __version__
-from blf_dsc_controller.cli.main import main, make_parser
+from blf_dsc_controller.cli.main import main
+from blf_dsc_controller.cli.parser import make_parser
 from blf_dsc_controller.cli.run import _configuration
 from blf_dsc_controller.compiled.announcement import COMPILING
 
@@ -46,9 +47,7 @@ def bag(tmp_path_factory):
     return recorded_run.write_made(path, Synthetic(100).messages())
 
 
-COMMANDS = (
-    'run --offline, report, plot, recover, export, excite, paper, arms, monte-carlo'
-)
+COMMANDS = 'run --offline, report, plot, recover, export, excite, arms, monte-carlo'
 
 
 @pytest.mark.parametrize('place', ['file/below', '/proc/none', '/dev/full'])

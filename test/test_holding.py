@@ -4,20 +4,16 @@
 from __future__ import annotations
 
 import importlib
-from pathlib import Path
 
 import numpy as np
 import pytest
 
 pytest.importorskip('mujoco', reason='needs MuJoCo: pip install mujoco')
 
-BENCHMARK = Path(__file__).parents[1] / 'benchmark'
-
 
 @pytest.fixture
-def holding(monkeypatch):
-    monkeypatch.syspath_prepend(str(BENCHMARK))
-    return importlib.import_module('holding')
+def holding():
+    return importlib.import_module('benchmark.holding')
 
 
 def test_a_position_loop_sags_as_users_report_and_this_law_does_not(holding):

@@ -7,10 +7,8 @@ import base64
 import importlib
 import os
 import re
-import sys
 import tracemalloc
 from dataclasses import replace
-from pathlib import Path
 
 import mujoco
 import numpy as np
@@ -37,6 +35,7 @@ from random_arm import (
 from scipy.integrate import solve_ivp
 from test_analysis_report import amount, lightened, pixels
 
+from benchmark import __main__ as tables
 from blf_dsc_controller.analysis.panels import COLOURS, INK, ORANGE
 from blf_dsc_controller.arms.base_parameters import base_parameters
 from blf_dsc_controller.arms.friction import fading, fadings, sliding, slidings
@@ -573,13 +572,11 @@ def test_coupling_and_load_friction_that_would_drive_are_not_identified(plain, t
 def test_league_has_a_row_in_each_table_for_a_folder_with_a_bag(
     plain, tmp_path, capsys, monkeypatch
 ):
-    monkeypatch.syspath_prepend(str(Path(__file__).parents[1] / 'benchmark'))
-    benchmark = importlib.import_module('league')
-    monkeypatch.setattr(benchmark.rivals, 'MISSING', ['figaroh', 'mujoco.sysid'])
+    league = importlib.import_module('benchmark.league')
+    monkeypatch.setattr(league.rivals, 'MISSING', ['figaroh', 'mujoco.sysid'])
     write_states(tmp_path / 'bag', PANDA, measured(plain, 3))
     (tmp_path / 'panda.urdf').write_text(PANDA_TEXT)
-    monkeypatch.setattr(sys, 'argv', ['league.py', str(tmp_path), '--last-only'])
-    benchmark.main()
+    assert tables.main(['league', str(tmp_path), '--last-only']) == 0
     lines = capsys.readouterr().out.splitlines()
 
     def cells_of(first):

@@ -15,14 +15,14 @@ import pytest
 from paper_case import OFF, configured, several
 from scipy.linalg import expm
 
-from blf_dsc_controller.configuration.nodes import load_loop, locate
+from benchmark.studies import load_study
+from blf_dsc_controller.configuration.nodes import load_loop
 from blf_dsc_controller.factory.controller import controller_of
 from blf_dsc_controller.factory.estimate import estimate_names
 from blf_dsc_controller.law import friction
 from blf_dsc_controller.law.learning import measure_reversals
 from blf_dsc_controller.law.state import sample_of
 from blf_dsc_controller.simulation.loop import simulate
-from blf_dsc_controller.studies.monte_carlo import load_study
 from blf_dsc_controller.studies.report import compare_pairs
 from blf_dsc_controller.studies.runs import run_chunk
 
@@ -214,7 +214,7 @@ def test_sine_at_a_frequency_of_the_reference_is_not_learned_as_friction():
 
 @pytest.mark.parametrize(('name', 'run'), BROKEN_BY_FRICTION)
 def test_learning_breaks_no_bound_that_learned_friction_once_broke(name, run):
-    study = load_study(locate(name))
+    study = load_study(name)
     study = replace(study, settings=replace(study.settings, runs=run + 1))
     found = compare_pairs(study, run_chunk(study, run, 1))
     assert found['kept'] == {'with': 1, 'without': 1}

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 import blf_dsc_controller as blf
+from benchmark.studies import path_of
 from blf_dsc_controller.cli.main import main
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.law_file import digest, load_law
@@ -317,7 +318,7 @@ def test_node_offline_run_and_replay_compute_the_same_bits(tmp_path):
     assert blf.verify(tmp_path / 'ros' / 'bag', law=named(LAW)).difference is None
 
 
-@pytest.mark.parametrize('base', ['monte_carlo', 'monte_carlo_panda'])
+@pytest.mark.parametrize('base', ['monte_carlo', path_of('monte_carlo_panda')])
 def test_random_study_runs_it(base, tmp_path):
     """On two links and on a Panda, with its own results."""
     file = tmp_path / 'study.yaml'

@@ -3,17 +3,15 @@
 
 from __future__ import annotations
 
-import importlib
-from pathlib import Path
-
 import numpy as np
 import pytest
 
+from benchmark import nothing_changes
+
 
 @pytest.fixture
-def study(monkeypatch):
-    monkeypatch.syspath_prepend(str(Path(__file__).parents[1] / 'benchmark'))
-    return importlib.import_module('nothing_changes')
+def study():
+    return nothing_changes
 
 
 def run_of(study, arm, motion, seed, load):

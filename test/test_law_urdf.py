@@ -11,10 +11,11 @@ from paper_case import configured, several
 from plants import rigid_gears
 from random_arm import PANDA_TEXT, random_urdf
 
+from benchmark.studies import load_study
 from blf_dsc_controller import simulate
 from blf_dsc_controller.arms.tuning import over_postures
 from blf_dsc_controller.configuration.controller import ControllerConfig
-from blf_dsc_controller.configuration.nodes import load_loop, locate
+from blf_dsc_controller.configuration.nodes import load_loop
 from blf_dsc_controller.configuration.robot import parameters_of
 from blf_dsc_controller.configuration.schema import build, change
 from blf_dsc_controller.errors import ConfigurationError
@@ -26,7 +27,7 @@ from blf_dsc_controller.factory.estimate import (
     prior_covariance,
 )
 from blf_dsc_controller.factory.settings import settings_of_config
-from blf_dsc_controller.studies.monte_carlo import draw, load_study, plant_with
+from blf_dsc_controller.studies.monte_carlo import draw, plant_with
 from sim_plant.settings import plant_settings
 
 ARM = {'robot.urdf': 'panda.urdf', 'robot.tip': 'panda_hand_tcp'}
@@ -353,7 +354,7 @@ def test_half_oscillation_that_no_drive_explains_is_forgotten(asked, work, kept)
 @pytest.mark.parametrize('prefix', ['', 'without.'])
 def test_push_is_not_taken_for_light_drives(prefix, later):
     """A Panda whose drives are heavier than assumed, pushed by 9.4 N: error was up to 50 bounds."""
-    study = load_study(locate('monte_carlo_panda'))
+    study = load_study('monte_carlo_panda')
     plant = plant_with(study, draw(study, 325), prefix)
     assert plant.truth.rotor_factor > 1.2
     begin = tuple(moment + later for moment in plant.events.begin)

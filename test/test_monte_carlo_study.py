@@ -11,6 +11,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from benchmark.studies import path_of
 from blf_dsc_controller.configuration.schema import change
 from blf_dsc_controller.errors import ConfigurationError
 from blf_dsc_controller.law.samples import sample_columns
@@ -287,6 +288,20 @@ def test_study_may_be_based_on_a_preset(tmp_path):
         study(tmp_path, text.replace(str(base), str(tmp_path / 'study.yaml')))
 
 
+def test_study_may_be_based_on_a_file_beside_it(tmp_path, monkeypatch):
+    """One of that name in the current folder takes precedence, as with arms."""
+    monkeypatch.chdir(tmp_path)
+    folder = tmp_path / 'studies'
+    folder.mkdir()
+    write(folder).rename(folder / 'base.yaml')
+    text = 'monte_carlo:\n  ros__parameters: {base: base.yaml, seed: 1}\n'
+    assert study(folder, text).settings.runs == RUNS
+    write(tmp_path, (LOOP + STUDY).replace(f'runs: {RUNS}', 'runs: 2')).rename(
+        tmp_path / 'base.yaml'
+    )
+    assert study(folder, text).settings.runs == 2
+
+
 PAPERS_FORM = {'compensation': 'state', 'change_detection': False}
 PAIRS = 6 if os.environ.get('NIGHTLY') else 3
 FIRST = {
@@ -310,7 +325,7 @@ def is_kept(study, run, **learning):
 @pytest.mark.parametrize('name', FIRST)
 def test_papers_form_breaks_bounds_that_learning_here_does_not(name):
     """Nor are errors larger than without learning; and the model is found."""
-    study = load_study(name)
+    study = load_study(path_of(name))
     found = compare_pairs(study, run_chunk(study, 0, FIRST[name]))
     assert found['kept']['without'] >= FIRST[name] // 3
     assert found['broken_only_with'] == []

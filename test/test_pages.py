@@ -23,7 +23,9 @@ from urllib.parse import urlsplit
 import pytest
 from markdown_it import MarkdownIt
 
-from blf_dsc_controller.cli.main import make_parser
+from benchmark.__main__ import parser_of as table_parser
+from benchmark.tables import TABLES
+from blf_dsc_controller.cli.parser import make_parser
 from blf_dsc_controller.configuration.nodes import NODES, known_names, load, read
 from blf_dsc_controller.studies.monte_carlo import load_study
 
@@ -169,8 +171,8 @@ def check(words):
                 assert re.search(wanted, MAKEFILE, re.MULTILINE), words
         case ['blf_dsc', *rest] | ['python', '-m', 'blf_dsc_controller', *rest]:
             parse([word for word in rest if word[0] != '['])
-        case ['python', '-m', module, *_]:
-            assert importlib.util.find_spec(module), words
+        case ['python', '-m', module, *rest]:
+            check_module(module, rest)
         case ['python', file, *rest]:
             assert (ROOT / file).is_file()
             check_parameters(rest)
@@ -187,6 +189,17 @@ def check(words):
             assert program in FOREIGN.split(), words
 
 
+def check_module(module, words):
+    """Check that a module exists, or a table of the project with its options."""
+    assert importlib.util.find_spec(module), module
+    if module == 'benchmark' and words:
+        name, *given = (word for word in words if word[0] != '[')
+        assert name in TABLES, name
+        with contextlib.suppress(ImportError):  # of what it compares with
+            if given:  # a sentence may name it alone
+                parsed(table_parser(name), given)
+
+
 def check_ros2(rest):
     match rest:
         case ['run', 'blf_dsc_controller', *own]:
@@ -199,8 +212,12 @@ def check_ros2(rest):
 
 
 def parse(words):
+    parsed(make_parser(), words)
+
+
+def parsed(parser, words):
     try:
-        make_parser().parse_args(words)
+        parser.parse_args(words)
     except SystemExit as error:
         if error.code:
             pytest.fail(f'{shlex.join(words)}: {error}')  # argparse has printed why
@@ -214,10 +231,13 @@ def check_parameters(rest):
 @each_page(PAGES)
 def test_inline_commands_of_a_page_exist(page):
     """Subcommands with their options, and make targets, in `code` within a sentence."""
-    for code in re.findall(r'(?<!`)`((?:blf_dsc|make) [^`]+)`', page.read_text()):
+    begin = r'(?:blf_dsc|make|(?:\S*/)?python)'
+    for code in re.findall(rf'(?<!`)`({begin} [^`]+)`', page.read_text()):
         program, first, *rest = shlex.split(code)
         if program == 'make':
             check([program, first])
+        elif program.endswith('python'):
+            check([program, first, *rest])
         elif first.islower() and first[0] != '-':
             options = subcommand(first)._option_string_actions
             assert {word for word in rest if word.startswith('--')} <= set(options), (

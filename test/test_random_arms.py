@@ -3,26 +3,23 @@
 
 from __future__ import annotations
 
-import importlib
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 
+from benchmark import joint_pd, random_arms
 from blf_dsc_controller.arms.linear_loop import Timing, law_response
 from blf_dsc_controller.configuration.schema import change
 from blf_dsc_controller.factory.controller import controller_of
 from blf_dsc_controller.supervision.model_torque import model_torque
 
-BENCHMARK = Path(__file__).parents[1] / 'benchmark'
 ARMS = 300
 
 
 @pytest.fixture
-def study(monkeypatch):
-    monkeypatch.syspath_prepend(str(BENCHMARK))
-    return importlib.import_module('random_arms')
+def study():
+    return random_arms
 
 
 @pytest.mark.parametrize('drawn', ['study', 'wide'])
@@ -123,7 +120,7 @@ def test_joint_pd_is_a_pd_over_gravity_with_the_published_gains(study):
     rng = np.random.default_rng(1)
     for each in (signals.q, signals.dq, signals.qr, signals.dqr, signals.xi1):
         each[:] = rng.uniform(-0.5, 0.5, settings.n)
-    law = importlib.import_module('joint_pd').LAW(scale=2.0)
+    law = joint_pd.LAW(scale=2.0)
     law.compute_demand(settings, controller.state, signals, 0.0, 1e-3)
     expected = model_torque(settings, settings.initial_estimate, signals.q)
     expected -= 2.0 * settings.barrier.weight * signals.xi1

@@ -3,14 +3,14 @@
 
 from __future__ import annotations
 
-import sys
-from pathlib import Path
-
 import numpy as np
 import pytest
 
 pytest.importorskip('ruckig', reason='needs ruckig')
 
+from benchmark import scaling as table_of_scaling
+from benchmark import streams as table_of_streams
+from benchmark.__main__ import main as table
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.schema import change
 from blf_dsc_controller.reference.approach import hold
@@ -19,7 +19,6 @@ from blf_dsc_controller.reference.stream import TargetStream
 from blf_dsc_controller.reference.terms import pack, sampled, sinusoids_term
 from blf_dsc_controller.reference.trajectory import TrajectoryError
 
-BENCHMARK = Path(__file__).parents[1] / 'benchmark'
 FASTEST = np.array([1.5, 1.5])
 SLOPE = np.array([0.3, -0.2])  # rad/s
 TIMEOUT = 1.0  # s
@@ -27,26 +26,18 @@ TIMEOUT = 1.0  # s
 
 @pytest.fixture
 def scaling(monkeypatch):
-    """Return benchmark/scaling.py for a few motions."""
-    monkeypatch.syspath_prepend(str(BENCHMARK))
-    import scaling
-
-    monkeypatch.setattr(scaling, 'MOTIONS', 8)
-    monkeypatch.setattr(scaling, 'SPACINGS', (0.1,))
-    yield scaling
-    del sys.modules['scaling']
+    """Return the table `scaling` for a few motions."""
+    monkeypatch.setattr(table_of_scaling, 'MOTIONS', 8)
+    monkeypatch.setattr(table_of_scaling, 'SPACINGS', (0.1,))
+    return table_of_scaling
 
 
 @pytest.fixture
 def streams(monkeypatch):
-    """Return benchmark/streams.py for short streams at 50 Hz."""
-    monkeypatch.syspath_prepend(str(BENCHMARK))
-    import streams
-
-    monkeypatch.setattr(streams, 'RATES', (50.0,))
-    monkeypatch.setattr(streams, '_DURATION', 4.6)
-    yield streams
-    del sys.modules['streams']
+    """Return the table `streams` for short streams at 50 Hz."""
+    monkeypatch.setattr(table_of_streams, 'RATES', (50.0,))
+    monkeypatch.setattr(table_of_streams, '_DURATION', 4.6)
+    return table_of_streams
 
 
 def receive(stream, sent, late=0.0):
@@ -152,10 +143,11 @@ def test_lost_messages_cost_little_more_than_none(streams):
     assert found[0.1][1] <= found[0.0][1] + 0.001
 
 
-def test_tables_of_streams_and_chunks_are_printed(streams, monkeypatch, capsys):
+@pytest.mark.usefixtures('streams')
+def test_tables_of_streams_and_chunks_are_printed(monkeypatch, capsys):
     """A stream at 50 Hz is an interval behind, and what latency and planning take."""
-    monkeypatch.setattr(streams, '_SAMPLE', 2e-3)
-    streams.main()
+    monkeypatch.setattr(table_of_streams, '_SAMPLE', 2e-3)
+    assert table(['streams']) == 0
     text = capsys.readouterr().out
     rows = [line.split(' | ') for line in text.splitlines() if 'mrad |' in line]
     assert [row[0].lstrip('| ') for row in rows] == [
@@ -173,9 +165,10 @@ def test_tables_of_streams_and_chunks_are_printed(streams, monkeypatch, capsys):
     assert max(accelerations) <= 6.0
 
 
-def test_motions_of_moveit_are_stretched_as_little_as_the_table_says(scaling, capsys):
+@pytest.mark.usefixtures('scaling')
+def test_motions_of_moveit_are_stretched_as_little_as_the_table_says(capsys):
     """With all of the limits all are, with 0.9 of the velocity and 0.6 few and little."""
-    scaling.main()
+    assert table(['scaling']) == 0
     rows = [
         line.strip('| ').split(' | ') for line in capsys.readouterr().out.splitlines()
     ]

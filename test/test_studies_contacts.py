@@ -8,8 +8,8 @@ import json
 import numpy as np
 import pytest
 
-from blf_dsc_controller.cli.main import main
-from blf_dsc_controller.studies import contacts
+from benchmark import contacts
+from benchmark.__main__ import main
 
 MS = 0.001  # s, a sample
 

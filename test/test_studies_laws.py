@@ -14,6 +14,9 @@ import pytest
 from paper_case import P, configured, run
 from scipy.linalg import expm
 
+from benchmark import arms, tuning
+from benchmark.__main__ import main as table
+from benchmark.paper import CASES, FAILS, HOLDS, ONLY_IF, case_name
 from blf_dsc_controller.analysis.metrics import measure
 from blf_dsc_controller.cli.main import main
 from blf_dsc_controller.configuration.controller import ControllerConfig
@@ -26,43 +29,42 @@ from blf_dsc_controller.law.samples import sample_columns
 from blf_dsc_controller.reference import terms
 from blf_dsc_controller.reference.approach import reference_of
 from blf_dsc_controller.simulation.loop import simulate
-from blf_dsc_controller.studies import laws, stiffness
-from blf_dsc_controller.studies import tuning as tune
+from blf_dsc_controller.studies import laws
 from blf_dsc_controller.studies.monte_carlo import torque_rows
-from blf_dsc_controller.studies.paper import CASES, FAILS, HOLDS, ONLY_IF, case_name
+from blf_dsc_controller.studies.tuning import parameters_at, value_at
 
 
 def test_every_law_is_tuned_with_the_same_effort():
     """Same optimiser, seed and budget; one range per shared gain; as many for both of Fig. 2."""
     ranges = {}
-    for task in tune.TASKS.values():
+    for task in tuning.TASKS.values():
         for gain in task.gains:
             key = gain.name, gain.joint
             assert ranges.setdefault(key, (gain.least, gain.most)) == (
                 gain.least,
                 gain.most,
             )
-        values = [tune.value_at(k / 10.0) for k in range(len(task.gains))]
-        found = tune.parameters_at(ControllerConfig(), task.gains, values)
+        values = [value_at(k / 10.0) for k in range(len(task.gains))]
+        found = parameters_at(ControllerConfig(), task.gains, values)
         # of each joint; 10^0.1 to three digits
         assert found['feedback.gain'] == (1.0, 1.26)
         assert found['learning.adaptation_gain'] == (1.58,) * 3
-    assert len(tune.TASKS['proposed'].gains) == len(tune.TASKS['comparison'].gains)
+    assert len(tuning.TASKS['proposed'].gains) == len(tuning.TASKS['comparison'].gains)
 
 
-@pytest.mark.parametrize('name', tune.TASKS)
+@pytest.mark.parametrize('name', tuning.TASKS)
 def test_committed_gains_beat_the_middle_of_their_ranges(name):
     """By at least a decade of the search's objective, whose value is stated in their file."""
-    task = tune.TASKS[name]
+    task = tuning.TASKS[name]
     preset = {'proposed': 'paper_tuned'}.get(name, name)
     middle = np.array([np.log10(gain.least * gain.most) / 2.0 for gain in task.gains])
-    loops = tune.loops_of(task)
+    loops = tuning.loops_of(task)
     bare = task._replace(gains=())
     tuned = load_loop(preset).controller
-    best = tune.objective(
+    best = tuning.objective(
         np.array([]), bare, [loop._replace(controller=tuned) for loop in loops]
     )
-    assert best < tune.objective(middle, task, loops) - 1.0
+    assert best < tuning.objective(middle, task, loops) - 1.0
     stated = re.search(
         r'objective (-?[\d.]+)', locate(preset).read_text(encoding='utf-8')
     )
@@ -77,7 +79,7 @@ def report(tmp_path_factory):
         (out.parent / 'printed.txt').open('w') as file,
         contextlib.redirect_stdout(file),
     ):
-        assert main(['paper', '--out', str(out)]) == 0
+        assert table(['paper', '--out', str(out)]) == 0
     return out
 
 
@@ -311,7 +313,7 @@ def test_computed_torque_without_gains_has_those_of_the_law_at_small_errors():
 
 def test_soft_trial_has_a_part_of_the_bandwidth_and_a_bound_that_fits():
     stiff = laws.trial('ur5e_rigid', 1).controller
-    soft = stiffness.soft_trial('ur5e_rigid', 1, 0.25).controller
+    soft = arms.soft_trial('ur5e_rigid', 1, 0.25).controller
     assert soft.feedback.damping_rate == pytest.approx(
         0.25 * stiff.feedback.damping_rate
     )
@@ -321,12 +323,12 @@ def test_soft_trial_has_a_part_of_the_bandwidth_and_a_bound_that_fits():
 
 def test_table_and_picture_of_soft_arms_show_each_law(tmp_path):
     of_law = {'before': [1e-3, 2e-3, 3e-3, 4e-3], 'with the load': [5e-3] * 4}
-    errors = dict.fromkeys(stiffness.LAWS, of_law)
-    head, *lines = stiffness.format_errors(errors).splitlines()
+    errors = dict.fromkeys(arms.LAWS, of_law)
+    head, *lines = arms.format_errors(errors).splitlines()
     assert head.split()[-4:] == ['1', '0.5', '0.25', '0.125']
     assert len(lines) == 6
     assert lines[0].split()[-4:] == ['1.00', '2.00', '3.00', '4.00']
-    stiffness.draw({'ur5e_rigid': errors}, tmp_path / 'stiffness.png')
+    arms.draw({'ur5e_rigid': errors}, tmp_path / 'stiffness.png')
     assert (tmp_path / 'stiffness.png').stat().st_size > 10_000
 
 

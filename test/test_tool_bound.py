@@ -11,13 +11,13 @@ import pytest
 from random_arm import chain_of
 from recorded_run import compared
 
+from benchmark.__main__ import main as table
 from blf_dsc_controller.analysis.metrics import measure
 from blf_dsc_controller.analysis.metrics_table import format_table
 from blf_dsc_controller.analysis.panels import panels
 from blf_dsc_controller.arms.two_link import urdf
 from blf_dsc_controller.arms.urdf import frames, read_chain
 from blf_dsc_controller.bags.reader import read_run
-from blf_dsc_controller.cli.main import main
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.nodes import (
     CONTROLLER,
@@ -387,8 +387,16 @@ def test_without_a_bound_at_the_tool_nothing_of_it_is_shown():
 
 def test_study_tries_the_bound_by_one_command(tmp_path, capsys):
     out = tmp_path / 'out'
-    words = ['tool', '--config', 'ur5e_rigid', '--bound', '0.005', '--runs', '150']
-    assert main([*words, '--truths', '1', '--out', str(out)]) == 0
+    words = [
+        'tool-bound',
+        '--config',
+        'ur5e_rigid',
+        '--bound',
+        '0.005',
+        '--runs',
+        '150',
+    ]
+    assert table([*words, '--truths', '1', '--out', str(out)]) == 0
     header, row, wrote = capsys.readouterr().out.splitlines()
     assert header.startswith('mm at the tool')
     assert row.split()[:2] == ['ur5e_rigid', '5.00']
@@ -418,6 +426,6 @@ def test_study_tries_the_bound_by_one_command(tmp_path, capsys):
 )
 def test_study_refuses_what_it_cannot_try(tmp_path, capsys, words, problem):
     out = tmp_path / 'out'
-    assert main(['tool', *words, '--out', str(out)]) == 1
+    assert table(['tool-bound', *words, '--out', str(out)]) == 1
     assert problem in capsys.readouterr().err
     assert not out.exists()

@@ -1,8 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`blf_dsc paper`, `blf_dsc arms`: laws side by side; `blf_dsc contacts`: pushes.
-
-`blf_dsc monte-carlo`: random plants.
-"""
+"""`blf_dsc arms`: laws side by side; `blf_dsc monte-carlo`: random plants."""
 
 from __future__ import annotations
 
@@ -14,75 +11,27 @@ from pathlib import Path
 import numpy as np
 from tqdm import tqdm
 
-from blf_dsc_controller.analysis.output import aligned, write_json
+from blf_dsc_controller.analysis.output import write_json
 from blf_dsc_controller.cli.run import make_folder, print_notice
 from blf_dsc_controller.compiled.announcement import announced_compilation
-from blf_dsc_controller.studies import contacts as contact_study
-from blf_dsc_controller.studies import laws, report, runs, stiffness
-from blf_dsc_controller.studies import paper as paper_study
-from blf_dsc_controller.studies import tool as tool_study
+from blf_dsc_controller.studies import laws, report, runs
 from blf_dsc_controller.studies.monte_carlo import load_study
 
 _PAUSE_IN_A_LOG = 10.0  # s between two updates of the bar
 
 
-def paper(options: Namespace) -> None:
-    """Run the paper's Section IV with every law; print its claims and a table."""
-    claims, table = paper_study.compare(make_folder(options.out))
-    print(*claims, sep='\n')
-    print(aligned(table))
-    print(
-        f'wrote {options.out}: results.json, five pictures, configurations of all runs'
-    )
-
-
 def arms(options: Namespace) -> None:
-    """Tune and run every law on URDF arms, write figures.json and print the table.
-
-    Without a choice of laws also compare them at parts of the bandwidth.
-    """
+    """Tune and run every law on URDF arms, write figures.json and print the table."""
     laws.chosen_laws(options.laws)  # before there is a folder
     folder = make_folder(options.out)
     with announced_compilation(print_notice):
         found = laws.compare(folder, options.config, options.laws)
-        soft = {} if options.laws else stiffness.compare(folder, options.config)
     for arm, results in found.items():
         print(
             f'{arm}: {laws.TRUTHS} runs of each law; errors in mrad, of the model in %'
         )
         print(laws.format_results(results))
-    for arm, errors in soft.items():
-        print(f'{arm}: parts of the bandwidth')
-        print(stiffness.format_errors(errors))
-    print(
-        f'wrote {options.out}: {", ".join(sorted(path.name for path in folder.iterdir()))}'
-    )
-
-
-def tool(options: Namespace) -> None:
-    """Try a bound at the tool, write tool.json and tool.png, and print the table."""
-    with announced_compilation(print_notice):
-        configs = tool_study.configured(options.config, options.bound)
-        found = tool_study.compare(
-            make_folder(options.out),
-            configs,
-            options.bound,
-            options.runs,
-            options.truths,
-        )
-    print(tool_study.format_figures(found))
-    print(f'wrote {options.out}: tool.json, tool.png')
-
-
-def contacts(options: Namespace) -> None:
-    """Push random arms; write contacts.json and contacts.png, and print the table."""
-    folder = make_folder(options.out)
-    with announced_compilation(print_notice):
-        study = contact_study.compare(
-            folder, options.config, options.arms, options.force
-        )
-    print(contact_study.format_results(study))
-    print(f'wrote {options.out}: contacts.json, contacts.png')
+    print(f'wrote {options.out}: figures.json')
 
 
 def monte_carlo(options: Namespace) -> None:

@@ -222,7 +222,7 @@ def read(path: str | Path, based: tuple[str, ...] = ()) -> Sequence[Section]:
         )
         if base is None:
             return sections
-        below = locate(str(base))
+        below = _based_on(str(base), Path(path).parent)
         above = (*based, str(path))
     except (UnicodeDecodeError, OSError) as error:
         raise ConfigurationError([str(error)], str(path)) from error
@@ -234,6 +234,12 @@ def read(path: str | Path, based: tuple[str, ...] = ()) -> Sequence[Section]:
         )
         raise ConfigurationError([problem], str(path))
     return [*read(below, above), *sections]
+
+
+def _based_on(name: str, folder: Path) -> Path:
+    """Return the path of a preset, or of a file in the current folder or in this one."""
+    beside = folder / name
+    return beside if beside.is_file() and not Path(name).is_file() else locate(name)
 
 
 def _beside(sections: Sequence[Section], folder: Path) -> Sequence[Section]:

@@ -1,14 +1,19 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What learning is worth to a soft arm: errors against the stiffness of the loop.
+"""Laws on arms whose URDF is wrong, and what learning is worth to a soft one.
 
-A stiff loop hides an unknown load, a soft one shows it.  The runs are those of `laws`,
-at parts of the bandwidth that the delay allows (`feedback.stiffness`): the law with and
-without learning, and computed torque with the linear gains of the law.  The bound grows
-as the errors do, with the inverse square of the stiffness.
+    python -m benchmark arms --out arms
+
+The first table is that of `blf_dsc arms` with all of its laws.  The second has errors
+against the stiffness of the loop: a stiff one hides an unknown load, a soft one shows it.
+Its runs are the same at parts of the bandwidth that the delay allows
+(`feedback.stiffness`): the law with and without learning, and computed torque with the
+linear gains of the law.  The bound grows as the errors do, with the inverse square of the
+stiffness.
 """
 
 from __future__ import annotations
 
+import argparse
 from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor
 from functools import partial
@@ -18,9 +23,13 @@ from pathlib import Path
 import numpy as np
 from tqdm import tqdm
 
+from benchmark.options import add_configs, add_out
 from blf_dsc_controller.analysis.figures import Picture
 from blf_dsc_controller.analysis.output import aligned, write_json
 from blf_dsc_controller.analysis.panels import BLUE, MUTED, ORANGE
+from blf_dsc_controller.cli import studies
+from blf_dsc_controller.cli.run import print_notice
+from blf_dsc_controller.compiled.announcement import announced_compilation
 from blf_dsc_controller.configuration.nodes import CONTROLLER, LoopConfig, load_loop
 from blf_dsc_controller.studies import laws
 from blf_dsc_controller.studies.monte_carlo import UNSEEN, torque_rows
@@ -108,3 +117,20 @@ def draw(found: dict[str, Errors], path: Path) -> None:
         axes.set_ylabel('largest error [mrad]')
     picture.axes[0, 0].legend(frameon=False, fontsize=9, loc='lower left')
     picture.save(path)
+
+
+def arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the options."""
+    add_configs(parser, 'panda_rigid', 'ur5e_rigid')
+    add_out(parser, 'arms')
+
+
+def main(options: argparse.Namespace) -> None:
+    """Compare all laws, then at parts of the bandwidth; print both tables."""
+    studies.arms(argparse.Namespace(**vars(options), laws=[]))
+    with announced_compilation(print_notice):
+        soft = compare(options.out, options.config)
+    for arm, errors in soft.items():
+        print(f'{arm}: parts of the bandwidth')
+        print(format_errors(errors))
+    print(f'wrote {options.out}: stiffness.json, stiffness.png')

@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """How soon a contact is detected, with the learned model and the URDF's.
 
+    python -m benchmark contacts [--arms 1000] [--force 10 20] --out contacts
+
 Each arm has links up to 30 % heavier or lighter than its URDF, picks up an unknown
 load, and is pushed at the tip once it has learned it, in a random direction.  Two
 observers of the same bandwidth read the same sensors behind the same lag, in the same
@@ -18,6 +20,7 @@ there.  All thresholds are then scaled to equal false alarms.
 
 from __future__ import annotations
 
+import argparse
 import math
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
@@ -27,9 +30,12 @@ from typing import Any, NamedTuple
 import numpy as np
 from tqdm import tqdm
 
+from benchmark.options import add_configs, add_out, positive
 from blf_dsc_controller.analysis.figures import Picture, head
 from blf_dsc_controller.analysis.output import aligned, write_json
 from blf_dsc_controller.analysis.panels import BLUE, MUTED, ORANGE
+from blf_dsc_controller.cli.run import make_folder, print_notice
+from blf_dsc_controller.compiled.announcement import announced_compilation
 from blf_dsc_controller.configuration.nodes import LoopConfig
 from blf_dsc_controller.configuration.schema import change
 from blf_dsc_controller.law.perception import DISTANCE
@@ -305,3 +311,26 @@ def draw(found: Mapping[str, Any], path: Path) -> None:
         axes.set_ylabel('found [%]')
         head(axes, f'{force} N at the tip')
     picture.save(path)
+
+
+def arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the options."""
+    add_configs(parser, 'panda_rigid', 'ur5e_rigid')
+    parser.add_argument('--arms', type=positive, default=1000, help='arms (1000)')
+    parser.add_argument(
+        '--force',
+        type=float,
+        nargs='+',
+        default=[10.0, 20.0],
+        help='forces of the pushes [N] (10 20)',
+    )
+    add_out(parser, 'contacts')
+
+
+def main(options: argparse.Namespace) -> None:
+    """Push random arms; write contacts.json and contacts.png, and print the table."""
+    folder = make_folder(options.out)
+    with announced_compilation(print_notice):
+        study = compare(folder, options.config, options.arms, options.force)
+    print(format_results(study))
+    print(f'wrote {options.out}: contacts.json, contacts.png')

@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The paper's simulation with all laws: claims, sweeps, pictures.
 
+    python -m benchmark paper --out paper_study
+
 Every verdict is computed from the runs. It is `holds only if` for a claim that holds in
 some of the runs that it is about and fails in others; `condition` then says when it
 holds.
@@ -8,6 +10,7 @@ holds.
 
 from __future__ import annotations
 
+import argparse
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import replace
@@ -19,11 +22,13 @@ from matplotlib.ticker import NullFormatter
 from numpy.typing import NDArray
 from tqdm.contrib.concurrent import process_map
 
+from benchmark.options import add_out
 from blf_dsc_controller.analysis.estimates import estimates_of
 from blf_dsc_controller.analysis.figures import Picture, draw_panels
 from blf_dsc_controller.analysis.metrics import Metrics, measure
-from blf_dsc_controller.analysis.output import write_json
+from blf_dsc_controller.analysis.output import aligned, write_json
 from blf_dsc_controller.analysis.panels import ALARM, COLOURS, panels
+from blf_dsc_controller.cli.run import make_folder
 from blf_dsc_controller.configuration.nodes import LoopConfig, dump, load_loop
 from blf_dsc_controller.configuration.schema import change
 from blf_dsc_controller.factory.settings import settings_of_config
@@ -562,3 +567,18 @@ def draw_robustness(results: Results, folder: Path) -> None:
             axes.yaxis.set_minor_formatter(NullFormatter())
     picture.axes[0, 0].legend(frameon=False, fontsize=9)
     picture.save(folder / 'robustness.png')
+
+
+def arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the options."""
+    add_out(parser, 'paper_study')
+
+
+def main(options: argparse.Namespace) -> None:
+    """Run the paper's Section IV with every law; print its claims and a table."""
+    claims_found, table = compare(make_folder(options.out))
+    print(*claims_found, sep='\n')
+    print(aligned(table))
+    print(
+        f'wrote {options.out}: results.json, five pictures, configurations of all runs'
+    )

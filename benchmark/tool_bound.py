@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """How tight and how safe a certified bound at the tool is.
 
+    python -m benchmark tool-bound [--bound 0.005] [--truths 20] --out tool
+
 Kinematics: random motions within the position limits, with random joint errors within
 the joint bounds, of three kinds: independent from moment to moment, sines that rest on
 the bounds, and a corner of the box that is kept.  At a posture of each motion all
@@ -12,6 +14,7 @@ bounds that follow from the bound at the tool, from the first sample on.
 
 from __future__ import annotations
 
+import argparse
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from functools import partial
@@ -21,10 +24,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from benchmark.options import add_configs, add_out, add_runs, positive
 from blf_dsc_controller.analysis.figures import Picture, head
 from blf_dsc_controller.analysis.metrics import measure
 from blf_dsc_controller.analysis.output import aligned, write_json
 from blf_dsc_controller.analysis.panels import BLUE, INK, MUTED, ORANGE
+from blf_dsc_controller.cli.run import make_folder, print_notice
+from blf_dsc_controller.compiled.announcement import announced_compilation
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.nodes import CONTROLLER, load_loop
 from blf_dsc_controller.configuration.tool_bound import certified, tool_of
@@ -279,3 +285,24 @@ def draw(
         axes.legend(fontsize=7, loc='upper left')
         head(axes, arm, legend_at=0.0)
     picture.save(path)
+
+
+def arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the options."""
+    add_configs(parser, 'panda_rigid', 'ur5e_rigid', 'fr3')
+    about = 'bound at the tool [m] (0.005)'
+    parser.add_argument('--bound', type=float, default=0.005, help=about)
+    add_runs(parser, 10_000, 'random motions')
+    about = 'closed loops of each arm (5)'
+    parser.add_argument('--truths', type=positive, default=5, help=about)
+    add_out(parser, 'tool')
+
+
+def main(options: argparse.Namespace) -> None:
+    """Try a bound at the tool, write tool.json and tool.png, and print the table."""
+    with announced_compilation(print_notice):
+        configs = configured(options.config, options.bound)
+        folder = make_folder(options.out)
+        found = compare(folder, configs, options.bound, options.runs, options.truths)
+    print(format_figures(found))
+    print(f'wrote {options.out}: tool.json, tool.png')

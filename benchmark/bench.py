@@ -1,0 +1,69 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The loop, the node and the wire against their peers, each measured in turns.
+
+python -m benchmark bench [GROUP ...] [--out FOLDER]
+"""
+
+from __future__ import annotations
+
+import argparse
+import datetime as dt
+import importlib
+from itertools import groupby
+from pathlib import Path
+
+from benchmark.harness import Ratio, machine, print_table
+
+_GROUPS = {  # module and function of each
+    'offline': ('offline', 'measure'),
+    'growth': ('offline', 'measure_growth'),
+    'guarded': ('guarded', 'measure'),
+    'node': ('nodes', 'measure'),
+    'startup': ('nodes', 'measure_start'),
+    'wire': ('wire', 'measure'),
+}
+_HERE = Path(__file__).parent
+
+
+def arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the options."""
+    parser.add_argument('groups', nargs='*', metavar='GROUP', help=', '.join(_GROUPS))
+    parser.add_argument(
+        '--out', type=Path, default=_HERE, help='folder for the results'
+    )
+
+
+def main(options: argparse.Namespace) -> None:
+    """Run the groups and write RESULTS.md."""
+    options.out.mkdir(parents=True, exist_ok=True)
+    rows: list[Ratio] = []
+    for name in options.groups or _GROUPS:
+        print(f'measuring: {name}', flush=True)
+        module, function = _GROUPS[name]
+        for row in getattr(importlib.import_module(f'benchmark.{module}'), function)():
+            print(
+                f'  {row.what}: {row.median:.3g} times {row.baseline}  {row.note}',
+                flush=True,
+            )
+            rows.append(row)
+    today = dt.datetime.now(dt.timezone.utc).date()
+    with (options.out / 'RESULTS.md').open('w', encoding='utf-8') as file:
+        file.write(
+            '# Results of the benchmarks\n\n'
+            f'Written by `make bench` on {today}. Every figure is a ratio of two things measured '
+            'in turns in\nthe same run: median and range of its rounds. Absolute times are notes '
+            f'about one machine.\n\n{machine()}\n'
+        )
+        for group, members in groupby(rows, key=lambda row: row.group):
+            file.write(f'\n## {group}\n\n')
+            cells = (
+                (
+                    row.what,
+                    f'**{row.median:.3g}**',
+                    f'{row.low:.3g} to {row.high:.3g}',
+                    *row[-2:],
+                )
+                for row in members
+            )
+            print_table(('what', 'ratio', 'range', 'to', ''), cells, file)
+    print(f'written: {file.name}')

@@ -1,0 +1,58 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Every table by its name, with what it shows.
+
+The module of a table is called as the table is.  Its `main` makes the table from the
+options that its `arguments`, if it has any, adds to a parser.
+"""
+
+from __future__ import annotations
+
+BENCH = 'bench'
+"""Its peers run with the threads that they have elsewhere; all others with one."""
+
+GROUPS = {
+    'laws side by side': {
+        'paper': "the paper's simulation with every law: claims, sweeps, pictures",
+        'tuning': 'gains of the presets of two links, all laws tuned alike',
+        'arms': 'laws on a Panda and a UR5e with wrong URDFs; parts of the bandwidth',
+        'changes': '14,000 randomly changing arms, each with and without learning',
+        'random-arms': 'random arms with elastic gears: this law and its rivals',
+        'robustness': 'what laws of equal gains bear: late torques, lighter drives',
+        'composite': 'composite learning as published for a Panda, in a soft loop',
+    },
+    'gains': {
+        'margins': 'margins of the default gains, and errors at a pick-up',
+        'elastic': 'where the gains of the presets hold, by the stiffness of gears',
+        'commissioning': 'random arms, commissioned and put to work',
+        'load-observer': 'what joint torque sensors are worth',
+        'motor-feedback': 'feedback through a bus, and inside motors',
+        'holding': 'arms with soft drives, as users report them and under this law',
+    },
+    'bounds, loads and contacts': {
+        'tool-bound': 'how tight and how safe a certified bound at the tool is',
+        'contacts': 'how soon a push is found, with the learned model and the URDF',
+        'touch': 'the interval of the external torque, and pushes in slow motion',
+        'nothing-changes': 'changes and weights that are not there',
+        'first-window': 'changes of the arm before the first window is full',
+        'wrong-load': 'a Franka Research 3 whose declared load is wrong',
+    },
+    'identification': {
+        'identification': 'arms identified and loads weighed, at random',
+        'intervals': 'whether the intervals hold where the model does not',
+        'league': 'models of real and simulated robots by several methods',
+        'stiffness': 'stiffness of gears from positions of motors and links',
+    },
+    'references': {
+        'streams': 'how far behind and how smooth the reference of a stream is',
+        'scaling': "how many of MoveIt's trajectories are stretched",
+    },
+    'time': {
+        BENCH: 'the loop, the node and the wire against peers, into RESULTS.md',
+    },
+}
+TABLES = {name: about for group in GROUPS.values() for name, about in group.items()}
+
+
+def module_of(name: str) -> str:
+    """Return the module of a table."""
+    return f'benchmark.{name.replace("-", "_")}'

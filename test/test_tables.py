@@ -1,0 +1,107 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`python -m benchmark`: every table has one command, one line, and options that parse."""
+
+from __future__ import annotations
+
+import ast
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from benchmark.__main__ import listing, main, parser_of
+from benchmark.studies import load_study
+from benchmark.tables import BENCH, TABLES, module_of
+from blf_dsc_controller.cli.main import main as blf_dsc
+
+ROOT = Path(__file__).resolve().parents[1]
+NO_TABLES = {'__main__', 'null_node'}  # programs of their own
+
+
+def functions(path):
+    """Names of the functions of a module."""
+    tree = ast.parse(path.read_text(encoding='utf-8'))
+    return {node.name for node in tree.body if isinstance(node, ast.FunctionDef)}
+
+
+def test_every_module_that_makes_a_table_is_listed_with_one_line(capsys):
+    made = {
+        f'benchmark.{path.stem}'
+        for path in (ROOT / 'benchmark').glob('*.py')
+        if 'main' in functions(path) and path.stem not in NO_TABLES
+    }
+    assert made == {module_of(name) for name in TABLES}
+    assert main([]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    for name, about in TABLES.items():
+        (line,) = (each for each in lines if each.split()[:1] == [name])
+        assert line.endswith(about)
+        assert len(line) <= 88
+
+
+@pytest.mark.parametrize('name', TABLES)
+def test_help_of_a_table_says_how_it_is_called(name):
+    if name == 'league':
+        pytest.importorskip('mujoco')
+    text = parser_of(name).format_help()
+    assert text.count(f'python -m benchmark {name}') >= 2  # the usage, and an example
+
+
+STUDIES = sorted(path.stem for path in (ROOT / 'benchmark/studies').glob('*.yaml'))
+
+
+@pytest.mark.parametrize('name', STUDIES)
+def test_every_study_of_the_tables_loads_and_varies(name):
+    """From any folder, also those that are based on the file beside them."""
+    study = load_study(name)
+    assert study.settings.pairs
+    assert len(study.variations) > 10
+
+
+def test_unknown_table_is_answered_by_the_list(capsys):
+    assert main(['papers']) == 2
+    error = capsys.readouterr().err
+    assert error.startswith('benchmark: no table papers\n')
+    assert listing() in error
+
+
+def test_error_of_a_table_is_one_line_and_an_exit_code(tmp_path):
+    run = subprocess.run(
+        [sys.executable, '-m', 'benchmark', 'contacts', '--out', str(tmp_path)],
+        check=False,
+        capture_output=True,
+        text=True,
+        cwd=ROOT,
+    )
+    assert run.returncode == 1
+    assert run.stderr == (
+        f'benchmark contacts: {tmp_path} exists already and is not overwritten: '
+        'choose another --out\n'
+    )
+
+
+@pytest.mark.parametrize(('name', 'threads'), [('tuning', '1'), (BENCH, None)])
+def test_only_peers_have_the_threads_of_this_computer(monkeypatch, name, threads):
+    monkeypatch.setattr('importlib.import_module', lambda _: sys.modules[__name__])
+    monkeypatch.setattr(sys.modules[__name__], 'main', lambda _: None)
+    for variable in ('OPENBLAS_NUM_THREADS', 'OMP_NUM_THREADS', 'MKL_NUM_THREADS'):
+        monkeypatch.setenv(variable, 'restored afterwards')
+        monkeypatch.delenv(variable)
+    run = sys.modules['benchmark.__main__'].main
+    assert run([name]) == 0
+    assert os.environ.get('OPENBLAS_NUM_THREADS') == threads
+
+
+@pytest.mark.parametrize(
+    ('command', 'table'),
+    [('paper', 'paper'), ('tool', 'tool-bound'), ('contacts', 'contacts')],
+)
+def test_command_of_earlier_versions_says_where_its_table_is(command, table, capsys):
+    assert table in TABLES
+    with pytest.raises(SystemExit) as ended:
+        blf_dsc([command, '--out', 'nowhere'])
+    assert ended.value.code == 2
+    last = capsys.readouterr().err.splitlines()[-1]
+    assert last.endswith(f'in a checkout, call python -m benchmark {table}')
