@@ -125,6 +125,13 @@ def test_dragging_zooms_all_time_panels(pages):
         page.screenshot(path=SHOTS / 'report_zoomed.png')
 
 
+GRIDLINES = (
+    'Object.values(window.__viserTestpoints.uplots).map(({chart}) => chart)'
+    '.filter((chart) => chart.scales.y.distr == 3)'
+    '.map((chart) => [chart.axes[1]._splits, chart.axes[1]._values])'
+)
+
+
 def test_view_of_a_loop_in_the_browser(ros):
     view = ros.add(ViewNode, port=18280)
     arm, _ = ros.loop({'events.begin': [1.0], 'events.payload': [0.25]})
@@ -133,6 +140,8 @@ def test_view_of_a_loop_in_the_browser(ros):
         page.goto(view.page.url)
         page.wait_for_function(f"{TEXT}.includes('largest error')")
         page.wait_for_selector('canvas')
+        decades = [[0.1, 1, 10, 100], ['0.1', '1', '10', '100']]
+        assert page.evaluate(GRIDLINES) == [decades]
         for name in ('view', 'view_later'):
             ros.run(arm, 500)
             ros.until(lambda: view.past[-1].time > 1e-3 * arm.plant.sample - 0.1)

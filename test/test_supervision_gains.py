@@ -21,6 +21,7 @@ from blf_dsc_controller.factory.settings import settings_of_config
 from blf_dsc_controller.simulation.loop import simulate
 from blf_dsc_controller.supervision.config_warnings import config_warnings, worsened
 from blf_dsc_controller.supervision.expected_errors import (
+    expectation,
     expected_errors,
     linear_feedback,
     linear_loop,
@@ -205,6 +206,16 @@ def test_pick_up_past_the_bound_is_named_with_what_would_hold():
     )
     for changes in ({'barrier.bound': [bound] * 7}, {'robot.payload': 0.95 * payload}):
         assert of_bound(changes) == []
+
+
+@pytest.mark.parametrize(('bandwidth', 'sensed'), [(60.0, True), (0.0, False)])
+def test_expectation_says_that_torque_sensors_are_not_in_it(bandwidth, sensed):
+    config = change(
+        load_loop('panda').controller, {'disturbance.observer_bandwidth': bandwidth}
+    )
+    text = expectation(config)
+    assert 'mrad of panda_joint6 when 2 kg are picked up' in text
+    assert text.endswith(', less what joint torque sensors show in time') == sensed
 
 
 URDF = read_urdf('panda.urdf')

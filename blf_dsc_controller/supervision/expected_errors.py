@@ -115,7 +115,9 @@ def expectation(config: ControllerConfig) -> str:
     errors = expected_errors(config, settings_of_config(config))
     usual, most = (1e3 * float(each.max()) for each in errors)
     joint = config.joints[int(errors.pick_up.argmax())]
+    sensed = config.disturbance.observer_bandwidth > 0.0
     return (
         f'{usual:.2g} mrad by friction and unmodelled torque; {most:.2g} mrad of {joint} when '
         f'{config.robot.payload:g} kg are picked up in motion'
+        + (', less what joint torque sensors show in time' if sensed else '')
     )

@@ -57,6 +57,25 @@ _AUTO: Mapping[str, Any] = {}
 _FROM_ZERO = {
     'range': {'min': {'hard': 0.0, 'soft': 0.0, 'mode': 1}, 'max': {'pad': 0.1}}
 }
+_FROM_ZERO_KG = {  # at least 1 kg: an unknown load has no scale of its own
+    'range': {
+        'min': {'hard': 0.0, 'soft': 0.0, 'mode': 1},
+        'max': {'pad': 0.1, 'soft': 1.05, 'mode': 1},
+    }
+}
+_NO_TICKS: Mapping[str, Any] = {'ticks': {'show': False, 'size': 0}}
+_X_AXIS: Mapping[str, Any] = {**_NO_TICKS, 'size': 26}  # px, for one line of numbers
+_AXES = (_X_AXIS, _NO_TICKS)
+# By itself uPlot draws a line at each of 2, 3, ... 9 times a decade, which at this height
+# are grey bands, and names every second decade.
+_DECADES = (
+    _X_AXIS,
+    {
+        **_NO_TICKS,
+        'splits': [0.1, 1.0, 10.0, 100.0],
+        'values': ['0.1', '1', '10', '100'],
+    },
+)
 _SETTLED = 2.0  # s
 _NARROW = 576  # px, width up to which viser shows the panel below
 # viser's sheet for narrow windows is as wide as a panel and covers the arm on one side.
@@ -175,7 +194,11 @@ class Page:
             log = {'distr': 3, 'range': _AXIS_OF_SHARE}
             self._plots = [
                 self._plot(
-                    f'{prefix}: largest error in 1 s [% of bound]', names, log, 'bound'
+                    f'{prefix}: largest error in 1 s [% of bound]',
+                    names,
+                    log,
+                    'bound',
+                    _DECADES,
                 ),
                 self._plot(f'{prefix}: torque [N m]', names),
                 *(
@@ -189,7 +212,7 @@ class Page:
                 self._plot(
                     'load at the tip, 95 % interval [kg]',
                     ('weight', 'from', 'to'),
-                    _FROM_ZERO,
+                    _FROM_ZERO_KG,
                 ),
             ]
             self._caption = gui.add_html('')
@@ -202,6 +225,7 @@ class Page:
         names: Sequence[str],
         y: Mapping[str, Any] = _AUTO,
         limit: str = '',
+        axes: tuple[Mapping[str, Any], ...] = _AXES,
     ) -> Any:
         lines: list[dict[str, Any]] = [
             {'label': name, 'stroke': COLOURS[k % len(COLOURS)]}
@@ -217,6 +241,7 @@ class Page:
             tuple(lines),
             title=title,
             scales=scales,
+            axes=axes,
             legend={'show': True, 'live': False},
             height=_HEIGHT,
         )
