@@ -90,15 +90,16 @@ class SafeTorque:
         longest_step: time [s] for which one torque may change at the rate limit.
         scale: factor (n,) on the damping: measured inertia of the joints over the assumed; at
             least a half of it is used.
-        noise: mean square (n,) [rad^2] of the noise of positions; zero where it is not known.
-        resolution: steps (n,) [rad] of positions, likewise.
+        noise: mean square (n,) [rad^2] of the noise of positions; infinite where it is not
+            known: then nothing passes for a swing.
+        resolution: steps (n,) [rad] of positions.
     """
 
     def __init__(self, n: int) -> None:
         self.commanded = np.zeros(n)
         self.load = np.zeros(n)
         self.scale = np.ones(n)
-        self.noise = np.zeros(n)
+        self.noise = np.full(n, inf)
         self.resolution = np.zeros(n)
         self.missed_change: Vector | None = None
         self.longest_step = inf
