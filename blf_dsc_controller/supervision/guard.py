@@ -143,6 +143,9 @@ class Guard:
         self._loads = ToldLoads(config, self.controller)
         self._safe_torque = SafeTorque(n)
         self._safe_torque.scale = self.controller.state.rotors.gain_scale
+        sensor = self.controller.checks.sensor
+        self._safe_torque.noise = sensor.noise[:n]
+        self._safe_torque.resolution = sensor.resolution
         self._held = HeldTorque(config, self.controller, self.samples)
         self._safe_stop = SafeStop(
             config, self.controller, self.samples, self._safe_torque, self._held

@@ -17,13 +17,14 @@ from blf_dsc_controller.supervision.braking import braking_matrix
 from blf_dsc_controller.supervision.command_effect import CommandEffect
 from blf_dsc_controller.supervision.last_state import LastState
 from blf_dsc_controller.supervision.model_torque import model_torque, needed_torque
+from blf_dsc_controller.supervision.observed_load import ObservedLoad
+from blf_dsc_controller.supervision.swing import Swing
 
 Vector = NDArray[np.float64]
 
 # rad/s, L1 and L2: slow against the lag of velocities and torques
 _OBSERVER = 60.0, 30.0
 _CALM_OBSERVER = 10.0, 10.0  # rad/s: slow against the oscillation of elastic joints
-_LARGEST_LOAD = 0.5  # of the torque limit
 # of the damping: an elastic joint that oscillates passes for a light one
 _LIGHTEST = 0.5
 
@@ -66,20 +67,18 @@ class SafeTorque:
     It obeys the rate limit, except for the last torque of all.
 
     What holds the arm besides the model's gravity is observed from its motion, in the
-    stop, too:
-
-        residual' = L1 (tau - H(q, dq, dq, ddq) P^ - friction - residual)
-        load' = L2 (residual - load),   |load| <= half the torque limit
-
-    The acceleration of an elastic joint is not that of a rigid one: above the first
-    resonance, what it says about the load is as wrong as it is large.  One pole of 30 1/s
-    lets an oscillation go on at up to 20 rad/s; two of 10 do not feed one that stops the
-    arm, and let a load sink further.
+    stop, too (`ObservedLoad`).  The acceleration of an elastic joint is not that of a
+    rigid one: above the first resonance, what it says about the load is as wrong as it is
+    large.  One pole of 30 1/s lets an oscillation go on at up to 20 rad/s; two of 10 do
+    not feed one that stops the arm, and let a load sink further.  So they are those of an
+    arm that oscillates at the stop, and of each joint that swings in it.
     Estimated friction is not part of it, since it helps to brake.  So an arm comes to
     rest with a payload, or with a model, that the law had not learned yet.  Commands
     that do not reach the arm would make that sum up for ever: after a stop that this
     may have caused, the load stays as it is until the arm accelerates, as one on which
     they act (`CommandEffect`).  Once the arm has sped up it stays for good.
+
+    A joint that swings under its damping gets as much of it as it bears (`Swing`).
 
     Attributes:
         load: torque (n,) [N m] that the model lacks; initially that of the motion before
@@ -91,21 +90,28 @@ class SafeTorque:
         longest_step: time [s] for which one torque may change at the rate limit.
         scale: factor (n,) on the damping: measured inertia of the joints over the assumed; at
             least a half of it is used.
+        noise: mean square (n,) [rad^2] of the noise of positions; infinite where it is not
+            known: then nothing passes for a swing.
+        resolution: steps (n,) [rad] of positions.
     """
 
     def __init__(self, n: int) -> None:
         self.commanded = np.zeros(n)
         self.load = np.zeros(n)
         self.scale = np.ones(n)
+        self.noise = np.full(n, inf)
+        self.resolution = np.zeros(n)
         self.missed_change: Vector | None = None
         self.longest_step = inf
         self.last = LastState(n)
         self._start = np.zeros(n)
         self._duration = self._elapsed = 0.0
-        self._residual = np.zeros(n)
-        self._rates = _OBSERVER
+        self._usual = ObservedLoad(n, _OBSERVER)
+        self._calm = ObservedLoad(n, _CALM_OBSERVER)
+        self._oscillates = False
         self._known_load = np.zeros(n)
         self._effect = CommandEffect(n)
+        self._swing = Swing(n)
         self._reached = True
         self._observes = True
         self._yields = False
@@ -123,12 +129,12 @@ class SafeTorque:
         If commands may not have `reached` the arm, the load is observed once they have
         an effect; that of an arm that `oscillates` more slowly.
         """
-        self.load[:] = load
-        self._residual[:] = load
+        self._begin_observing(load)
         self._known_load[:] = load
         self._effect.restart()
         self._reached = reached
-        self._rates = _CALM_OBSERVER if oscillates else _OBSERVER
+        self._oscillates = oscillates
+        self._swing.begin()
         self._observes = True
         self._yields = False
         self._start[:] = self.commanded
@@ -146,7 +152,7 @@ class SafeTorque:
 
     def forget_load(self) -> None:
         """Observe the load from zero on."""
-        self.load[:] = self._residual[:] = 0.0
+        self._begin_observing(0.0)
 
     def stop_observing(self) -> None:
         """Return to the load that was known at the stop, until the next ramp."""
@@ -188,7 +194,11 @@ class SafeTorque:
             needed = self._needed(settings, estimate)
             if needed is not None:
                 self._observe_if_proven(settings, estimate, needed, dt)
-        scale = np.maximum(self.scale, _LIGHTEST)
+        if self.last.age > 0.0:
+            self._swing.forget()
+        elif dt > 0.0:
+            self._swing.observe(self.last.slow, self.noise, self.resolution, dt)
+        scale = self._swing.share * np.maximum(self.scale, _LIGHTEST)
         goal = safe_torque(safety, settings, self.last, estimate, self.load, scale)
         self._elapsed += dt
         if self._elapsed < self._duration:
@@ -202,7 +212,8 @@ class SafeTorque:
         return self.commanded
 
     def observe(self, settings: Settings, estimate: Vector, dt: float) -> None:
-        """Update the load by the motion of the last `dt` [s] and its torque."""
+        """Update the load by the motion of the last `dt` [s] and its torque, of another."""
+        self._swing.begin()
         needed = self._needed(settings, estimate)
         if needed is not None:
             self._update_load(settings, needed, dt)
@@ -232,8 +243,13 @@ class SafeTorque:
 
     def _update_load(self, settings: Settings, needed: Vector, dt: float) -> None:
         limit = settings.torque.limit
-        first, second = (min(1.0, rate * dt) for rate in self._rates)
-        lacking = np.clip(self.commanded - needed - self._residual, -limit, limit)
-        self._residual += first * lacking
-        self.load += second * (self._residual - self.load)
-        np.clip(self.load, -_LARGEST_LOAD * limit, _LARGEST_LOAD * limit, out=self.load)
+        lacking = self.commanded - needed
+        for each in (self._usual, self._calm):
+            each.update(lacking, limit, dt)
+        is_calm = self._oscillates | self._swing.has_swung
+        self.load[:] = np.where(is_calm, self._calm.load, self._usual.load)
+
+    def _begin_observing(self, load: Vector | float) -> None:
+        for each in (self._usual, self._calm):
+            each.begin(load)
+        self.load[:] = load

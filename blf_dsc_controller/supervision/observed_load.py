@@ -1,0 +1,46 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What holds an arm besides its model, observed from its motion.
+
+    residual' = L1 (tau - H(q, dq, dq, ddq) P^ - friction - residual)
+    load' = L2 (residual - load),   |load| <= half the torque limit
+
+On a joint that is lighter than its model by m, the model's acceleration comes back m - 1
+times too large.  With the delay T of the torques it is stable while
+
+    m T L1 L2 < L1 + L2
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+Vector = NDArray[np.float64]
+
+_LARGEST_LOAD = 0.5  # of the torque limit
+
+
+class ObservedLoad:
+    """The load of an arm.
+
+    Attributes:
+        load: torque (n,) [N m] that the model lacks.
+    """
+
+    def __init__(self, n: int, rates: tuple[float, float]) -> None:
+        """Observe with the rates L1 and L2 [rad/s]."""
+        self.load = np.zeros(n)
+        self._residual = np.zeros(n)
+        self._rates = rates
+
+    def begin(self, load: Vector | float) -> None:
+        """Begin with a load (n,) [N m]."""
+        self.load[:] = self._residual[:] = load
+
+    def update(self, lacking: Vector, limit: Vector, dt: float) -> None:
+        """Take what the model lacked (n,) [N m] in the last `dt` [s], of torques up to `limit`."""
+        first, second = (min(1.0, rate * dt) for rate in self._rates)
+        self._residual += first * np.clip(lacking - self._residual, -limit, limit)
+        self.load += second * (self._residual - self.load)
+        largest = _LARGEST_LOAD * limit
+        np.clip(self.load, -largest, largest, out=self.load)

@@ -1,0 +1,139 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Joints that swing under the damping of a stop, and the share of it that they bear.
+
+The damping -D v acts on a velocity behind a low pass, v' = (dq/dt - v)/tau, and behind
+the delay T of the loop.  A joint of inertia J then moves as in
+
+    J s (tau s + 1) + D e^(-T s) = 0
+
+It is stable up to D/J of about 1/T, and half critically damped at D/J = 1/tau, which is
+about what is configured.  A joint that is lighter than assumed swings at omega with
+
+    omega^2 = D / (J tau),        D / (tau omega)^2 = J / tau
+
+so that 1/(tau omega)^2 of its damping damps it well.  So does the load observer: the
+acceleration of a joint that is lighter than its model by m multiplies the observer's gain.
+Where this is more than delay and rates bear, it shakes the joint as well.
+
+A swing is a half wave of v, from one turning point to the next, that is more than half as
+high as the one before, twice in a row.  Noise and steps of the sensor make none.  The
+springs of an elastic arm and of its base may also ring by themselves, which takes damping
+away that does them no good.  It comes back, twice as much after each pi tau in which a
+joint moves without turning: what falls is braked.
+"""
+
+from __future__ import annotations
+
+from math import pi
+
+import numpy as np
+from numpy.typing import NDArray
+
+from blf_dsc_controller.law.sensor import FILTER
+
+Vector = NDArray[np.float64]
+
+_TURNED = 0.25  # of a half wave, by which v turns back at its end
+_LASTING = 0.5  # of the half wave before
+_IN_A_ROW = 2
+_LEAST = 0.03  # rad/s, of a half wave
+# likewise, of positions in the time of the low pass: standard deviations of the sensor's
+# noise, and its steps
+_CLEAR = 10.0
+_STEPS = 5.0
+# of the damping: a fifth of the inertia, behind a drive with a torque loop of gain 4
+_SMALLEST = 0.04
+_LONGEST = pi * FILTER  # s, half period at omega = 1/tau
+
+
+class Swing:
+    """Finds the share of the damping of a stop that each joint bears.
+
+    Attributes:
+        share: of the configured damping (n,).
+        has_swung: whether a joint has, since the beginning of the stop (n,).
+    """
+
+    def __init__(self, n: int) -> None:
+        self.share = np.ones(n)
+        self.has_swung = np.zeros(n, dtype=np.bool_)
+        self._follows = False  # whether the next v follows the last one
+        self._direction = np.ones(n)
+        # rad/s, v at the last turning point, and farthest from there so far
+        self._turn = np.zeros(n)
+        self._farthest = np.zeros(n)
+        # s, since the turning point, and of `farthest`, likewise
+        self._since = np.zeros(n)
+        self._farthest_at = np.zeros(n)
+        # rad/s and s, of the half wave before
+        self._travel = np.zeros(n)
+        self._half = np.zeros(n)
+        self._lasting = np.zeros(n)  # half waves in a row
+        self._steady = np.zeros(n)  # s, without a turning point or more damping
+
+    def begin(self) -> None:
+        """Begin a stop with all of the damping."""
+        self.share[:] = 1.0
+        self.has_swung[:] = False
+        self._follows = False
+
+    def forget(self) -> None:
+        """Wait for the next half waves, after a velocity that is unknown."""
+        self._follows = False
+
+    def observe(self, v: Vector, noise: Vector, resolution: Vector, dt: float) -> None:
+        """Take the velocities v (n,) [rad/s] that are damped, `dt` [s] after the last.
+
+        `noise` (n,) [rad^2] is the mean square of the noise of positions, `resolution` (n,)
+        [rad] their steps.
+        """
+        if not self._follows:
+            self._begin_at(v)
+            return
+        self._since += dt
+        self._steady += dt
+        farther = self._direction * (v - self._farthest) >= 0.0
+        self._farthest[farther] = v[farther]
+        self._farthest_at[farther] = self._since[farther]
+        travel = np.abs(self._farthest - self._turn)
+        unsure = np.maximum(_CLEAR * np.sqrt(noise), _STEPS * resolution)
+        least = np.maximum(_LEAST, unsure / FILTER)
+        back = np.abs(v - self._farthest)
+        ends = back > np.maximum(0.5 * least, _TURNED * travel)
+        self._end_half_waves(ends, travel, travel > least)
+        self._farthest[ends] = v[ends]
+        self._farthest_at[ends] = self._since[ends]
+        moves = np.abs(v) > 0.5 * least
+        returns = (self._steady > _LONGEST) & moves
+        self.share[returns] = np.minimum(1.0, 2.0 * self.share[returns])
+        self._steady[returns] = 0.0
+
+    def _begin_at(self, v: Vector) -> None:
+        """Begin with the next half waves at v (n,) [rad/s]."""
+        self._follows = True
+        self._direction[:] = np.where(v > 0.0, -1.0, 1.0)
+        self._turn[:] = self._farthest[:] = v
+        for each in (self._since, self._farthest_at, self._travel, self._half):
+            each[:] = 0.0
+        self._lasting[:] = self._steady[:] = 0.0
+
+    def _end_half_waves(
+        self, ends: NDArray[np.bool_], travel: Vector, is_clear: NDArray[np.bool_]
+    ) -> None:
+        """End the half waves of some joints (n,), over `travel` (n,) [rad/s]."""
+        half = np.maximum(self._farthest_at, self._half)
+        lasts = (
+            ends & is_clear & (self._half > 0.0) & (travel > _LASTING * self._travel)
+        )
+        self._lasting[ends] = np.where(lasts, self._lasting + 1.0, 0.0)[ends]
+        swings = lasts & (self._lasting >= _IN_A_ROW) & (half < _LONGEST)
+        borne = np.maximum(_SMALLEST, self.share * (half / _LONGEST) ** 2)
+        self.share[swings] = borne[swings]
+        self.has_swung |= swings
+        self._lasting[swings] = 0.0
+        self._travel[ends] = travel[ends]
+        self._half[ends] = self._farthest_at[ends]
+        self._turn[ends] = self._farthest[ends]
+        self._since[ends] -= self._farthest_at[ends]
+        self._direction[ends] *= -1.0
+        self._steady[ends] = 0.0

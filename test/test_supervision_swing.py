@@ -1,0 +1,125 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A stop does not shake joints that are lighter than assumed, and brakes others as before."""
+
+from __future__ import annotations
+
+import importlib
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from blf_dsc_controller.law.sensor import FILTER
+from blf_dsc_controller.replay.verify import verify
+from blf_dsc_controller.simulation.loop import simulate, write_bag
+from blf_dsc_controller.supervision.swing import Swing
+
+BENCHMARK = Path(__file__).parents[1] / 'benchmark'
+T = 1e-3  # s
+LATE = 5  # samples until a torque acts and shows
+ASSUMED = 1.0  # kg m^2
+RATE = 1.0 / FILTER  # 1/s, configured damping over the assumed inertia
+
+
+def braked(lighter, seconds=1.0, push=0.0, *, watched=True):
+    """Return speeds (k,) [rad/s] and shares (k,) of a joint that a stop brakes from 1 rad/s.
+
+    Its inertia is the assumed one over `lighter`; `push` [N m] acts on it all the time.
+    """
+    inertia = ASSUMED / lighter
+    swing = Swing(1)
+    swing.begin()
+    speed = slow = 1.0
+    torques = [0.0] * LATE
+    seen = []
+    for _ in range(round(seconds / T)):
+        slow += T / FILTER * (speed - slow)
+        swing.observe(np.array([slow]), np.zeros(1), np.zeros(1), T)
+        share = swing.share[0] if watched else 1.0
+        torques.append(-share * RATE * ASSUMED * slow)
+        speed += T / inertia * (torques.pop(0) + push)
+        seen.append((speed, share))
+    speeds, shares = np.array(seen).T
+    return speeds, shares
+
+
+@pytest.mark.parametrize('lighter', [1 / 7, 0.5, 1.0, 1.5])
+def test_joint_that_has_about_the_assumed_inertia_gets_all_of_the_damping(lighter):
+    """1 / T is 6 times the configured rate: up to there the loop is stable by itself."""
+    speeds, shares = braked(lighter)
+    assert (shares == 1.0).all()
+    assert np.abs(speeds).max() < 1.01
+
+
+@pytest.mark.parametrize('lighter', [4.0, 8.0, 16.0, 25.0])
+def test_light_joint_comes_to_rest_with_the_share_that_damps_it_well(lighter):
+    """That is the inertia over the assumed one, within the error of a half period of 30 ms."""
+    speeds, shares = braked(lighter)
+    assert np.abs(speeds[-100:]).max() < 0.02
+    assert 0.3 / lighter < shares.min() < 3.0 / lighter
+
+
+def test_without_it_the_damping_shakes_a_joint_of_an_eighth_of_the_inertia():
+    speeds, _ = braked(8.0, watched=False)
+    assert np.abs(speeds[-100:]).max() > 3.0
+
+
+def test_joint_that_has_swung_is_braked_again_if_it_moves_on():
+    """Pushed by 2 N m it would reach 16 rad/s in a second; all of the damping leaves 0.06."""
+    speeds, shares = braked(3.5, 2.0, push=2.0)
+    assert shares.min() < 0.5
+    assert shares[-1] == 1.0
+    assert abs(speeds[-1]) < 0.1
+
+
+@pytest.mark.parametrize(('sigma', 'resolution'), [(3.8e-4, 0.0), (1e-4, 3.8e-4)])
+def test_noise_and_steps_of_an_encoder_are_no_swing(sigma, resolution):
+    """A hundred times the noise of an encoder of 20 bits, or steps of 0.38 mrad."""
+    random = np.random.default_rng(0)
+    swing = Swing(1)
+    swing.begin()
+    slow, last = 0.0, 0.0
+    for k in range(5000):
+        q = 1e-3 * np.sin(1e-3 * k) + random.normal(0.0, sigma)
+        if resolution:
+            q = resolution * np.round(q / resolution)
+        slow += T / FILTER * ((q - last) / T - slow)
+        last = q
+        swing.observe(*np.array([[slow], [sigma**2], [resolution]]), T)
+    assert swing.share[0] == 1.0
+    assert not swing.has_swung[0]
+
+
+ARMS = {
+    'UR5e, encoders at the motors, torque loop': ('ur5e', 0),
+    'UR5e, encoders at the links, torque loop': ('ur5e', 2),
+    'UR5e, encoders at the motors': ('ur5e', 7),
+    'FR3, encoders at the motors, torque loop': ('fr3', 0),
+    'FR3, encoders at the links, torque loop': ('fr3', 9),
+}
+IN_FLIGHT = 0.2  # s, with what swings until it is found
+
+
+@pytest.mark.parametrize('arm', ARMS)
+def test_stop_of_an_arm_that_nobody_foresaw_brakes_it(arm, monkeypatch, tmp_path):
+    """Random arms whose motors have down to a fifth of the guess, behind any gears.
+
+    With all of the damping and the usual observer, a wrist goes on at 5 to 20 rad/s on all
+    but the third.  What the law has sent before the stop still speeds wrists up.
+    """
+    monkeypatch.syspath_prepend(str(BENCHMARK))
+    arms = importlib.import_module('random_arms')
+    name, number = ARMS[arm]
+    study = arms.study_of(name, 'wide')
+    plant = arms.arm_of(study, number)
+    with np.errstate(all='ignore'):
+        record = simulate(study.controller, plant, after_stop=1.3)
+    n = len(plant.joints)
+    t = 1e-9 * record.stamps - record.stopped
+    speed = np.abs(record.truths[:, -n:]).max(axis=1)
+    before = speed[t < 0.0].max()
+    assert speed[t > IN_FLIGHT].max() < before
+    assert speed[t > 1.0].max() < 0.15
+    write_bag(tmp_path / 'bag', record)
+    result = verify(tmp_path / 'bag')
+    assert (result.difference, result.remarks) == (None, ())
