@@ -134,11 +134,11 @@ def test_an_error_of_the_controller_brings_the_arm_to_rest_before_it_is_shown(
     update = controller.update
     states = []
 
-    def failing(*state, send):
+    def failing(*state, **options):
         states.append(state)
         if len(states) == 300:
             raise OSError('the disk is full')
-        return update(*state, send=send)
+        return update(*state, **options)
 
     monkeypatch.setattr(controller, 'update', failing)
     with pytest.raises(OSError, match='the disk is full'):
