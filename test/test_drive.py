@@ -195,7 +195,8 @@ def test_what_the_start_and_a_driver_advise_ends_with_an_arm_that_moves():
     lacking = {'robot.effort': 'commanded'}
     with pytest.raises(StartError, match=r'set robot\.effort to commanded') as refused:
         run('fr3_direct', 0.01, {}, {}, lacking)
-    config = change(loop_of('fr3_direct').controller, lacking)
+    law = lacking | {'disturbance.observer_bandwidth': 0.0}  # which needs whole efforts
+    config = change(loop_of('fr3_direct').controller, law)
     (problem,) = disagreements(facts, config)
     assert 'of this robot it is whole: write whole' in problem
     sends = 'set safety.first_torque: send'

@@ -134,11 +134,11 @@ def test_an_error_of_the_controller_brings_the_arm_to_rest_before_it_is_shown(
     update = controller.update
     states = []
 
-    def failing(*state, **options):
+    def failing(*state, send):
         states.append(state)
         if len(states) == 300:
             raise OSError('the disk is full')
-        return update(*state, **options)
+        return update(*state, send=send)
 
     monkeypatch.setattr(controller, 'update', failing)
     with pytest.raises(OSError, match='the disk is full'):

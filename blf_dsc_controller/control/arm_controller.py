@@ -145,8 +145,8 @@ class ArmController:
         q: ArrayLike,
         dq: ArrayLike,
         effort: ArrayLike | None = None,
-        *,
         motors: ArrayLike | None = None,
+        *,
         send: Callable[[Vector | None], None] | None = None,
     ) -> Vector | None:
         """Return the torques (n,) [N m] for a joint state; None: command nothing.

@@ -168,10 +168,7 @@ class DriveLoop:
         self._states += 1
         try:
             self._teller.follow()
-            stamp, q, dq, effort, motors = state
-            self._controller.update(
-                stamp, q, dq, effort, motors=motors, send=self._send
-            )
+            self._controller.update(*state, send=self._send)
             if self._beside is not None:
                 self._beside.follow()
         except DriverError:
