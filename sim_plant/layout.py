@@ -11,13 +11,14 @@ DIFFERENCED = 1
 VELOCITY_SOURCES = {'measured': MEASURED, 'differenced': DIFFERENCED}
 LINK = 0
 MOTOR = 1
-SIDES = {'link': LINK, 'motor': MOTOR}
+BOTH = 2
+SIDES = {'link': LINK, 'motor': MOTOR, 'both': BOTH}
 
 
 class Encoders(NamedTuple):
     """Quality of the encoders, the same on every joint but for their eccentricity."""
 
-    side: int  # of the springs: LINK or MOTOR
+    side: int  # of the springs: LINK, MOTOR, or BOTH: the motors apart
     position_noise: float  # rad, standard deviation
     velocity_noise: float  # rad/s, standard deviation; not used when differenced
     resolution: float  # rad, 0 = none

@@ -26,6 +26,7 @@ from sim_plant.kernels import (
     run_plant,
 )
 from sim_plant.layout import (
+    BOTH,
     PlantSettings,
     state_size,
 )
@@ -102,6 +103,20 @@ class Plant:
         if self._settings.springs == 0:
             return np.stack((self._q, self._dq))
         return np.stack((self._now.elastic.theta, self._now.elastic.dtheta))
+
+    @property
+    def motor_reading(self) -> np.ndarray | None:
+        """What encoders of motors beside those of links show (2, n); None: there are none.
+
+        They have the resolution of the others, no noise, no offset and no filter.
+        """
+        if self._settings.encoders.side != BOTH:
+            return None
+        reading = np.array(self.motors)
+        step = self._settings.encoders.resolution
+        if step > 0.0:
+            reading[0] = step * np.rint(reading[0] / step)
+        return reading
 
     @property
     def base(self) -> np.ndarray:

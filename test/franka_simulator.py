@@ -12,6 +12,7 @@ WHAT is one of
     reflex      the motion is aborted, as after a collision
     die         the process ends without a word
     lose=N      N states are lost on the network
+    gears=K     motors have positions, ahead of their links by the torque over K N m/rad
 """
 
 from __future__ import annotations
@@ -113,8 +114,20 @@ class Simulator:
                     self.sim.step()
                     self.robot.process_commands()
                     self.robot._FrankaServer__message_id += 1
+            case 'gears':
+                self.twist(float(value))
             case 'die':
                 os._exit(0)
+
+    def twist(self, stiffness):
+        """Let the states have positions of motors, of which the simulator has none."""
+
+        def with_motors():
+            state = self.robot.robot_state
+            theta = np.add(state.q, np.divide(state.tau_J, stiffness))
+            return state.replace(theta=tuple(theta), dtheta=state.dq).pack_state()
+
+        self.robot._get_state_bytes = with_motors
 
     def hold(self, mass):
         """Let the hand hold a point mass, or nothing but itself."""

@@ -117,6 +117,8 @@ def test_states_of_another_shape_are_errors_and_change_nothing(given, problem):
     controller = blf.ArmController(LOOP.controller)
     with pytest.raises(StateError, match=problem):
         controller.update(*given)
+    with pytest.raises(StateError, match=r'motors: got an array of shape \(2,\)'):
+        controller.update(0.0, [0.0, 0.0], [0.0, 0.0], motors=[0.0, 0.0])
     assert controller.phase is Phase.STARTING
 
 

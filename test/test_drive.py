@@ -13,6 +13,8 @@ from random_arm import CONFIG
 from blf_dsc_controller import load_loop, simulate
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.schema import build, change
+from blf_dsc_controller.drive.driver import disagreements
+from blf_dsc_controller.drive.simulated import simulated
 from blf_dsc_controller.errors import StartError
 from blf_dsc_controller.factory.controller import controller_of
 from blf_dsc_controller.factory.estimate import estimate_names
@@ -185,6 +187,25 @@ def test_first_torque_must_fit_the_drive(preset, both, law, plant, refusal, size
     record = run(preset, 0.01, both, law, plant)
     assert record.run().stops == ()
     assert np.abs(record.sample(0).torque).max() == pytest.approx(size, abs=0.1)
+
+
+def test_what_the_start_and_a_driver_advise_ends_with_an_arm_that_moves():
+    """A simulated FR3 whose efforts lack gravity, though its driver knows that they have it."""
+    facts = simulated(loop_of('fr3_direct').plant).facts
+    lacking = {'robot.effort': 'commanded'}
+    with pytest.raises(StartError, match=r'set robot\.effort to commanded') as refused:
+        run('fr3_direct', 0.01, {}, {}, lacking)
+    law = lacking | {'disturbance.observer_bandwidth': 0.0}  # which needs whole efforts
+    config = change(loop_of('fr3_direct').controller, law)
+    (problem,) = disagreements(facts, config)
+    assert 'of this robot it is whole: write whole' in problem
+    sends = 'set safety.first_torque: send'
+    assert str(refused.value).endswith(sends)
+    assert problem.endswith(sends)
+    record = run('fr3_direct', 0.5, {}, {'safety.first_torque': 'send'}, lacking)
+    assert record.run().stops == ()
+    config = change(loop_of('fr3_direct').controller, {'safety.first_torque': 'send'})
+    assert disagreements(facts, config) == []
 
 
 @pytest.mark.parametrize('preset', ['panda_rigid', 'ur5e_rigid'])

@@ -21,9 +21,12 @@ import pytest
 from command import COMPILED, PATIENCE
 
 import blf_dsc_controller as blf
+from blf_dsc_controller.bags.content import read_content
 from blf_dsc_controller.configuration.drive import DriveConfig
 from blf_dsc_controller.configuration.schema import build, change
 from blf_dsc_controller.errors import LoopEndedError
+from blf_dsc_controller.identification.reading import read_recording
+from blf_dsc_controller.messages.topics import MOTOR_STATES
 from blf_dsc_controller.supervision.drive_load import DriveLoad
 
 if not all(map(importlib.util.find_spec, ('pylibfranka', 'franky_sim'))):
@@ -117,7 +120,32 @@ def test_it_tracks_and_holds_two_kilograms_that_appear_in_the_hand(wire):
     recorded = blf.read_run(wire.folder / 'bag')
     assert set(np.diff(recorded.stamp)) == {1_000_000}  # ns: no state was missed
     assert recorded.stamp.size > 1500  # 1.5 s, and the end
+    assert MOTOR_STATES.resolved not in message_counts(wire)  # it reports zeros
     assert np.nanmax(np.abs(recorded.error)) < BOUND
+    assert_replays(wire.folder / 'bag')
+
+
+def message_counts(wire):
+    return read_content(wire.folder / 'bag').message_counts
+
+
+def test_positions_of_motors_are_recorded_and_identification_reads_them(wire):
+    """The wire carries them as float32."""
+    wire.simulate('127.0.0.22', 'gears=10000@1')
+    code, output = ended(wire.drive('127.0.0.22', 0.6))
+    assert code == 0, output
+    counts = message_counts(wire)
+    # the first state may come before the first torque, with which the cycles begin
+    assert counts[MOTOR_STATES.resolved] >= counts['/joint_states'] - 20
+    recorded = blf.read_run(wire.folder / 'bag')
+    robot = blf.load_loop('fr3_direct').controller.robot
+    read = read_recording(wire.folder / 'bag', robot.text, recorded.joints)
+    assert 'positions of motors of /motor_states' in read.source
+    twist = read.torque[:] / 10_000.0
+    known = ~np.isnan(read.twist[:]).any(axis=1)
+    assert known.sum() > 500
+    expected = (twist - np.median(twist[known], axis=0))[known]
+    np.testing.assert_allclose(read.twist[:][known], expected, atol=1e-6)
     assert_replays(wire.folder / 'bag')
 
 

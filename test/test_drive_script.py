@@ -21,6 +21,7 @@ from recorded_run import messages_of
 import blf_dsc_controller as blf
 from blf_dsc_controller.cli.main import main
 from blf_dsc_controller.configuration.drive import DriveConfig
+from blf_dsc_controller.configuration.nodes import PLANT
 from blf_dsc_controller.drive.driver import ReflexError
 from blf_dsc_controller.drive.simulated import SIMULATED, simulated
 from blf_dsc_controller.errors import (
@@ -77,6 +78,19 @@ def test_simulated_drives_stop_by_themselves_and_are_released_where_they_are():
     driver.recover()
     driver.start()
     np.testing.assert_allclose(driver.read().q, before, atol=1e-4)
+
+
+def test_simulated_robot_reports_motors_that_have_encoders():
+    loop = blf.load_loop('panda', {PLANT: {'sensor.side': 'both'}})
+    for plant, has in ((loop.plant, True), (blf.load_loop('panda').plant, False)):
+        driver = simulated(plant)(SIMULATED, loop.controller, DriveConfig())
+        driver.connect()
+        driver.start()
+        state = driver.read()
+        assert (state.motors is not None) == has
+        if has:
+            np.testing.assert_allclose(state.motors[0], state.q, atol=0.01)  # rad
+            assert (state.motors[0] != state.q).any()  # gravity twists them
 
 
 def test_motions_arrive_and_the_bag_replays_bit_equal(tmp_path):

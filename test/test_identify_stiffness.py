@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+import re
+
 import numpy as np
 import pytest
 import yaml
@@ -17,9 +19,12 @@ from random_arm import (
 )
 
 from blf_dsc_controller.bags.content import NameMap
+from blf_dsc_controller.bags.reader import read_run
 from blf_dsc_controller.bags.writer import BagWriter
 from blf_dsc_controller.cli.main import main
+from blf_dsc_controller.configuration.nodes import PLANT, load_loop
 from blf_dsc_controller.configuration.robot import Robot
+from blf_dsc_controller.configuration.schema import change
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.identification.from_table import read_table
 from blf_dsc_controller.identification.identify import identify_arm
@@ -32,6 +37,7 @@ from blf_dsc_controller.identification.summary import notes_of, stiffness_table
 from blf_dsc_controller.messages.codecs import JointStateEncoder
 from blf_dsc_controller.messages.topics import JOINT_STATE
 from blf_dsc_controller.numerics.intervals import TWO_SIDED
+from blf_dsc_controller.simulation.loop import simulate, simulate_into_bag
 
 ROBOT = Robot(urdf=PANDA_TEXT, tip='panda_hand_tcp')
 STIFFNESS = np.array([14e3, 14e3, 14e3, 14e3, 8e3, 8e3, 8e3])  # N m/rad
@@ -201,30 +207,89 @@ def test_tables_without_both_positions_have_no_twist(tmp_path, motion):
         read_table(only, PANDA_TEXT, PANDA, NameMap.parse(['theta=t']))
 
 
-def test_positions_of_motors_in_bags_are_those_of_another_topic(tmp_path, motion):
-    encoder = JointStateEncoder(PANDA)
-    with BagWriter(tmp_path / 'bag', flush_interval=None) as bag:
-        links, motors = (
+def write_both(path, motion, twist, names=PANDA):
+    """Write 3 s of links, and of motors with these names, twisted by `twist` of k."""
+    links, motors = JointStateEncoder(PANDA), JointStateEncoder(names)
+    with BagWriter(path, flush_interval=None) as bag:
+        of_links, of_motors = (
             bag.add_topic(name, JOINT_STATE, [])
             for name in ('/joint_states', '/motor_states')
         )
         for k in range(600):
             stamp = 10**9 + k * 5_000_000
             q, torque = motion.q[k * EVERY], motion.motor[k * EVERY]
-            twist = 0.001 * k / 600 * np.arange(1, N + 1)
-            bag.write(links, bytes(encoder.encode(stamp, q, q, torque)), stamp)
+            bag.write(of_links, links.encode(stamp, q, q, torque), stamp)
             late = stamp + 1_000_000  # where the twist is 1/3000 of that after 3 s more
-            raw = encoder.encode(late, q + twist, q, torque)
-            bag.write(motors, bytes(raw), late)
+            raw = motors.encode(late, q + twist(k), q, torque)
+            bag.write(of_motors, raw, late)
+
+
+def test_positions_of_motors_in_bags_are_those_of_another_topic(tmp_path, motion):
+    path = tmp_path / 'bag'
+    write_both(path, motion, lambda k: 0.001 * k / 600 * np.arange(1, N + 1))
     names = NameMap.parse(['theta=/motor_states', 'joint_states=/joint_states'])
-    recording = read_recording(tmp_path / 'bag', PANDA_TEXT, PANDA, names=names)
+    recording = read_recording(path, PANDA_TEXT, PANDA, names=names)
     assert recording.twist is not None
+    unasked = read_recording(path, PANDA_TEXT, PANDA)
+    np.testing.assert_array_equal(unasked.twist[:], recording.twist[:])
     both, _ = joined(recording, recording)
     assert both.twist is not None
     assert len(both.twist[:]) == len(both.q[:])
     lone = recording._replace(twist=None)
     for pair in ((recording, lone), (lone, recording)):
         assert joined(*pair)[0].twist is None
+
+
+# From the arm to its stiffness.
+
+GEARS = {
+    'sensor.side': 'both',
+    'sensor.resolution': BITS[20],
+    'duration': 8.0,
+    'events.begin': [100.0],
+}
+
+
+def test_simulated_arm_with_encoders_on_both_sides_shows_its_gears(tmp_path, capsys):
+    """A Panda's torque sensors, ripple, friction and lags, in lock-step; seven intervals of 95 %.
+
+    The compiled loop, which does not read the motors, has the same torques.
+    """
+    loop = load_loop('panda', {PLANT: GEARS})
+    simulate_into_bag(tmp_path / 'bag', loop.controller, loop.plant)
+    (tmp_path / 'panda.urdf').write_text(PANDA_TEXT)
+    words = [str(tmp_path / 'bag'), '--urdf', str(tmp_path / 'panda.urdf')]
+    words += ['--tip', 'panda_hand_tcp', '--out', str(tmp_path / 'new.urdf')]
+    assert main(['identify', *words, '--out', str(tmp_path / 'arm.yaml')]) == 0
+    text = ' '.join(capsys.readouterr().out.split())
+    assert 'positions of motors of /motor_states' in text
+    found = yaml.safe_load((tmp_path / 'arm.yaml').read_text())['/**']
+    stiffness = found['ros__parameters']['robot.joint_stiffness']
+    np.testing.assert_allclose(stiffness, loop.plant.joint.stiffness, rtol=0.02)
+    rows = re.findall(r'([\d.]+) N m/rad ([\d.]+) to ([\d.]+)', text)
+    ends = np.array(rows, float)
+    half = 0.5 * (ends[:, 2] - ends[:, 1])
+    assert len(ends) == N
+    assert (abs(ends[:, 0] - loop.plant.joint.stiffness) < 1.7 * half).all()
+    links = change(loop.plant, {'sensor.side': 'link'})
+    np.testing.assert_array_equal(
+        simulate(loop.controller, links).run().torque,
+        read_run(tmp_path / 'bag').torque,
+    )
+
+
+def test_motors_that_move_as_their_links_show_no_stiffness(motion):
+    """As of a robot without a second encoder, which reports one position twice."""
+    found = motion.compliance(-0.3)  # the zero of the motors
+    assert found.is_twist
+    assert not (found.is_known | found.is_negative | found.is_computed).any()
+    assert np.isinf(found.stiffness).all()
+    assert (found.largest == 0.0).all()
+
+
+def test_motor_states_of_other_joints_are_left_alone(tmp_path, motion):
+    write_both(tmp_path / 'bag', motion, lambda _: 0.0, tuple('abcdefg'))
+    assert read_recording(tmp_path / 'bag', PANDA_TEXT, PANDA).twist is None
 
 
 # What the command says.
@@ -276,6 +341,8 @@ def test_what_is_wrong_with_positions_of_motors_is_said(whole):
             left=0.0 * ones
         ),
     }
+    equal = known._replace(value=0.0 * ones, deviation=0.0 * ones, largest=0.0 * ones)
+    faults['have the same positions'] = equal
     unknown = known._replace(deviation=known.value)
     nothing = known._replace(deviation=np.inf * ones)
     for words, compliance in {**faults, '': unknown}.items():
@@ -288,9 +355,10 @@ def test_what_is_wrong_with_positions_of_motors_is_said(whole):
     )
     (text,) = stiffness_table(found._replace(compliance=unknown))
     assert text.count('cannot be known: above ') == N
-    (text,) = stiffness_table(found._replace(compliance=nothing))
-    assert text.count('cannot be known') == N
-    assert 'above' not in text
+    for compliance in (nothing, equal):
+        (text,) = stiffness_table(found._replace(compliance=compliance))
+        assert text.count('cannot be known') == N
+        assert 'above' not in text
     one = unknown.deviation * (np.arange(N) == 3) + known.deviation
     for compliance in (known._replace(deviation=one), None):
         other = found._replace(compliance=compliance)

@@ -272,6 +272,7 @@ def read_content(path: Path, namespace: str = '', names: NameMap = NO_NAMES) -> 
             )
         if not bag.counts[states]:
             raise BagError(f'{path} is empty: it holds no message of {states}')
+        found[topics.MOTOR_STATES] = _beside(states, topics.MOTOR_STATES, bag.held)
         kept = {
             topic: TopicMessages(name, bag.held[name])
             for topic, name in found.items()
@@ -281,6 +282,12 @@ def read_content(path: Path, namespace: str = '', names: NameMap = NO_NAMES) -> 
         for message in bag.messages(adds):
             adds[message.topic](message)
     return Content(path, names, kept, bag.counts)
+
+
+def _beside(name: str, topic: Topic, held: Mapping[str, str]) -> str | None:
+    """Return the name of a topic in the namespace of another, None if it is missing."""
+    found = f'{name.rpartition("/")[0]}/{topic.leaf}'
+    return found if found != name and held.get(found) == topic.type else None
 
 
 def _recorded_names(bag: OpenBag, namespace: str, names: NameMap) -> NameMap:

@@ -209,8 +209,10 @@ class PlantDisturbance:
 class Sensor:
     """Measurement of the true state."""
 
-    side: Literal['link', 'motor'] = _fixed(
-        'link', 'side of the springs on which positions and velocities are measured'
+    side: Literal['link', 'motor', 'both'] = _fixed(
+        'link',
+        'side of the springs on which positions and velocities are measured; both: that '
+        'of the links, and that of the motors on the topic motor_states',
     )
     position_noise: float = _magnitude(
         0.0, 'rms of the white noise on measured positions', 'rad'

@@ -121,6 +121,7 @@ class ArmController:
             self.add_output(self._recorder)
         self._is_on_wall = stamps == 'wall'
         self._states = JointStateEncoder(config.joints)
+        self._motors = JointStateEncoder(config.joints, ('position', 'velocity'))
         self._shift: int | None = None  # ns, of the stamps
         self._told_turns: set[str] = set()
         self._loop.guard.activate()
@@ -144,6 +145,7 @@ class ArmController:
         q: ArrayLike,
         dq: ArrayLike,
         effort: ArrayLike | None = None,
+        motors: ArrayLike | None = None,
         *,
         send: Callable[[Vector | None], None] | None = None,
     ) -> Vector | None:
@@ -156,6 +158,9 @@ class ArmController:
             effort: torques (n,) [N m] over the last interval, as `robot.effort`
                 describes them. They show whether commands reach the arm; the law
                 itself takes those that it commanded.
+            motors: positions and velocities (2, n) of the motors, where these have encoders
+                and q is of the links. They are recorded for `blf_dsc identify`, which finds
+                the stiffness of gears, and are not used.
             send: called with the torques as soon as they are known, before weighing
                 and recording. Its errors are raised after these.
 
@@ -169,6 +174,9 @@ class ArmController:
         measurement[0] = self._checked('q', q)
         measurement[1] = self._checked('dq', dq)
         measurement[2] = math.nan if effort is None else self._checked('effort', effort)
+        of_motors = None
+        if motors is not None:
+            of_motors = self._checked('motors', motors, (2, n))
         nanoseconds = self._nanoseconds(stamp)
         values = measurement.reshape(-1)
         torque = self._loop.guard.update(nanoseconds, values)
@@ -180,6 +188,9 @@ class ArmController:
             self._loop.guard.perceive()
             if self._outputs:
                 self._tell(nanoseconds, values, torque)
+                if of_motors is not None:
+                    raw = self._motors.encode(nanoseconds, *of_motors)
+                    self._outputs.write(nanoseconds, topics.MOTOR_STATES, raw)
             self._tell_turns('the reference', self._loop.guard.turned)
         return answer
 
@@ -208,13 +219,16 @@ class ArmController:
             self._shift = 0 if nanoseconds > 0 else FIRST_STAMP - nanoseconds
         return nanoseconds + self._shift
 
-    def _checked(self, name: str, values: ArrayLike) -> Vector:
+    def _checked(
+        self, name: str, values: ArrayLike, shape: tuple[int, ...] = ()
+    ) -> Vector:
+        """Return an array of a shape, by default (n,)."""
         array = np.asarray(values, dtype=np.float64)
-        n = len(self.joints)
-        if array.shape != (n,):
+        needed = shape or (len(self.joints),)
+        if array.shape != needed:
             raise StateError(
-                f'{name}: got an array of shape {array.shape}, but ({n},) is needed: one value for '
-                f'each of {", ".join(self.joints)}'
+                f'{name}: got an array of shape {array.shape}, but {needed} is needed: one value '
+                f'for each of {", ".join(self.joints)}'
             )
         return array
 

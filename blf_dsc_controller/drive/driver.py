@@ -39,13 +39,16 @@ class ConnectionLostError(DriverError):
 class RobotState(NamedTuple):
     """What a robot reports in one cycle.
 
-    The arrays have an entry for each of its n joints.
+    The arrays have an entry for each of its n joints. Those of motors are recorded, and
+    are not used.
     """
 
     stamp: float  # s, of the robot's clock
     q: ArrayLike  # rad
     dq: ArrayLike  # rad/s
     effort: ArrayLike  # N m, as `Facts.effort` says
+    # positions and velocities (2, n) of motors whose links have encoders, too [rad, rad/s]
+    motors: ArrayLike | None = None
 
 
 class Facts(NamedTuple):
@@ -196,7 +199,9 @@ def disagreements(facts: Facts, config: ControllerConfig) -> list[str]:
         got = getattr(config.robot, name)
         if got != needed:
             problems.append(
-                f'robot.{name}: got {got}, but of this robot it is {needed}: write {needed}'
+                f'robot.{name}: got {got}, but of this robot it is {needed}: write {needed}. If '
+                'the start is then rejected, since the states of a simulator do not show it, set '
+                'safety.first_torque: send'
             )
     problems += _excesses('torque.limit', config.torque.limit, facts.torque_limit)
     rates = [rate or float('inf') for rate in config.torque.rate_limit]

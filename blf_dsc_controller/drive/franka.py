@@ -149,11 +149,15 @@ class FrankaDriver(Driver):
             self._control = self._robot.start_torque_control()
 
     def read(self) -> RobotState:
-        """Wait for the next state; libfranka gives up after a second."""
+        """Wait for the next state; libfranka gives up after a second.
+
+        Positions of motors are left out if all are 0, as simulators report them.
+        """
         with self._in_motion():
             state, _ = self._control.readOnce()
         self._load = state.m_load
-        return RobotState(state.time.to_sec(), state.q, state.dq, state.tau_J)
+        motors = (state.theta, state.dtheta) if any(state.theta) else None
+        return RobotState(state.time.to_sec(), state.q, state.dq, state.tau_J, motors)
 
     def load_in_force(self) -> float:
         """Return the mass [kg] of the load that the last state had."""

@@ -89,9 +89,9 @@ class SimulatedDriver(Driver):
                 f'({self.plant_config.actuator.reflex_rate:g} N m/s)'
             )
         self._count += 1
-        return RobotState(
-            NANOSECOND * FIRST_STAMP + self._count * period, *self._measure()
-        )
+        stamp = NANOSECOND * FIRST_STAMP + self._count * period
+        q, dq, effort = self._measure()
+        return RobotState(stamp, q, dq, effort, self.plant.motor_reading)
 
     def write(self, torque: Vector | None) -> None:
         """Apply torques (n,) [N m] until the next state; None: those before."""

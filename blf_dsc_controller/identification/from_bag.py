@@ -4,12 +4,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 from blf_dsc_controller.arms.urdf import Tree
-from blf_dsc_controller.bags.content import NO_NAMES, NameMap, read_content
+from blf_dsc_controller.bags.content import NO_NAMES, Content, NameMap, read_content
 from blf_dsc_controller.bags.reader import applied_torque, single_run
 from blf_dsc_controller.bags.sources import BagError
 from blf_dsc_controller.bags.topic_messages import JointStates, TopicMessages, Values
@@ -20,7 +21,7 @@ from blf_dsc_controller.identification.recording import (
     interpolated,
     resampled,
 )
-from blf_dsc_controller.messages.topics import JOINT_STATES
+from blf_dsc_controller.messages.topics import JOINT_STATES, MOTOR_STATES
 from blf_dsc_controller.run import Floats, Stamps
 
 
@@ -36,7 +37,8 @@ def read_bag(
 
     `text` is the URDF; `joints` are the arm's, from its base to its tip, by default all
     in the bag up to where the arm branches; `namespace` and `names` are as for
-    `read_run`; `names.joints` may have `theta`, the topic of the motors' positions.
+    `read_run`; `names.joints` may have `theta`, the topic of the motors' positions, by
+    default `motor_states` beside the joint states.
 
     Raises:
         BlfDscError: the bag cannot be read, has no torques or too few states, or has the joints
@@ -57,11 +59,16 @@ def read_bag(
         source += ' (without stamps: by the times of reception)'
     turning = Tree.of(text).turning(joints)
 
-    def of_motors(stamp: Stamps) -> Floats | None:
-        if not motors:
-            return None
+    other = _motor_states(content, theirs)
+    if motors:
         topics = {**names.topics, JOINT_STATES.leaf: '/' + motors.lstrip('/')}
         other = read_content(path, namespace, NameMap(topics, names.joints))
+    if other is not None:
+        source += f', positions of motors of {other.topics[JOINT_STATES].name}'
+
+    def of_motors(stamp: Stamps) -> Floats | None:
+        if other is None:
+            return None
         return np.asarray(_at(stamp, single_run(other, theirs).states)[0])
 
     parts = [single_run(content, group).states for group in groups]
@@ -84,6 +91,16 @@ def read_bag(
             )
     stamp, q = states.stamp, states.field(0)
     return resampled(joints, stamp, q, torque, source, turning, of_motors(stamp))
+
+
+def _motor_states(content: Content, joints: Sequence[str]) -> Content | None:
+    """Return a bag with the states of motors as its joint states; None if it has none of these."""
+    messages = content.topics.get(MOTOR_STATES)
+    if messages is None:
+        return None
+    if not any({*joints} <= {*names} for names in messages.name_lists()):
+        return None
+    return replace(content, topics={**content.topics, JOINT_STATES: messages})
 
 
 def _groups(

@@ -132,7 +132,8 @@ def stiffness_table(found: Identified) -> Iterator[str]:
     values, least, most = compliance.stiffness
     for i, joint in enumerate(found.chain.joints):
         unit = 'N/m' if joint.kind == 'prismatic' else 'N m/rad'
-        bound = f': above {least[i]:.3g} {unit}' if least[i] else ''
+        is_bound = 0.0 < least[i] < np.inf
+        bound = f': above {least[i]:.3g} {unit}' if is_bound else ''
         cells = f'cannot be known{bound}', ''
         if compliance.is_negative[i]:
             cells = 'cannot be known: it twists against its torque', ''
@@ -293,6 +294,12 @@ def _stiffness_notes(found: Identified) -> Iterator[str]:
             'was not computed'
         )
         return
+    equal = names[compliance.largest == 0.0]
+    if equal.size:
+        yield (
+            f'{", ".join(equal)}: motors and links have the same positions, as where a robot has '
+            'one encoder and reports it twice'
+        )
     against = names[compliance.is_negative]
     if against.size:
         yield (

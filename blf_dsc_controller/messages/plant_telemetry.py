@@ -36,6 +36,7 @@ class PlantTelemetry:
             for joint in joints
         ]
         self._joint_states = JointStateEncoder(names)
+        self._motors = JointStateEncoder(joints, ('position', 'velocity'))
         self._places = [names.index(joint) for joint in joints]
         self._published = np.zeros((3, len(names)))
         self._truth = JointStateEncoder(
@@ -49,6 +50,10 @@ class PlantTelemetry:
         """Encode measured [q, dq, applied torque of the last interval] (3 n,)."""
         self._published[:, self._places] = measurement.reshape(3, -1)
         return topics.JOINT_STATES, self._joint_states.encode(stamp, *self._published)
+
+    def motor_states(self, stamp: int, reading: np.ndarray) -> Message:
+        """Encode positions and velocities (2, n) of the motors."""
+        return topics.MOTOR_STATES, self._motors.encode(stamp, *reading)
 
     def truth(self, stamp: int, truth: np.ndarray) -> Message:
         """Encode the true [P, tau_dist, q, dq] (p + 3 n,)."""

@@ -120,6 +120,8 @@ DIAGNOSTICS = Topic(
     DIAGNOSTIC,
     DIAGNOSTIC,
 )
+MOTOR_STATES = Topic(PLANT, 'motor_states', JOINT_STATE, STREAM, STREAM)
+"""Where motors have encoders beside those of the links; not in TOPICS: beside joint states."""
 ROBOT_DESCRIPTION = Topic(
     PLANT, 'robot_description', 'std_msgs/msg/String', LATCHED_QUALITY, LATCHED_QUALITY
 )

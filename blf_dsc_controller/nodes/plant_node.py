@@ -110,6 +110,8 @@ class PlantNode(LoopNode[PlantConfig]):
         self.deactivate()
         outputs = [topics.JOINT_STATES, topics.TRUTH]
         outputs += [] if self._lockstep else [topics.TIMING]
+        both = self.config.sensor.side == 'both'
+        outputs += [topics.MOTOR_STATES] if both else []
         outputs += [topics.CLOCK] if self.config.publish_clock else []
         if self.connect(outputs, topics.COMMANDS, self._on_command):
             description = create_publisher(self, topics.ROBOT_DESCRIPTION)
@@ -316,6 +318,8 @@ class PlantNode(LoopNode[PlantConfig]):
         self._has_torque = False
         self._published = self._now()
         self.latency.state_published(self._published)
+        if (motors := self.plant.motor_reading) is not None:
+            self._publish(self._telemetry.motor_states(stamp, motors))
         self._publish(self._telemetry.joint_states(stamp, measurement))
         if self.plant.sample % DECIMATION == 0:
             self._publish(self._telemetry.truth(stamp, self.plant.truth()))

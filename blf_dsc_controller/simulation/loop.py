@@ -152,6 +152,8 @@ def _run_compiled(
     controller = guard.controller
     if not (plant.is_compiled and guard.supervisor.running):
         return False
+    if record.motors.size:  # the compiled loop does not read them
+        return False
     if guard.config.safety.velocity != 'measured':
         return False
     before = controller.save(), plant.save(), controller.checks_vector.copy()
@@ -177,6 +179,8 @@ def _run_guarded(
         measurement = plant.measure()
         record.measurements[row] = measurement
         record.truths[row] = plant.truth()
+        if record.motors.size:
+            record.motors[row] = plant.motor_reading
         torque = guard.update(FIRST_STAMP + int(record.stamps[row]), measurement)
         guard.perceive()
         if torque is None:
@@ -201,6 +205,9 @@ class Record:
     # (k, s) rows of `law.state.Sample`; after a stop NaN except bound, torque
     samples: np.ndarray
     truths: np.ndarray  # (k, p + 3 n) [P, tau_dist, q, dq]
+    motors: (
+        np.ndarray
+    )  # (k, 2, n) rad, rad/s, by encoders of their own; empty: there are none
     left: np.ndarray  # (n,) N m, commanded after the last sample; NaN: nothing was
     parameters: tuple[str, ...]  # names of the entries of P
     config: ControllerConfig
@@ -227,6 +234,7 @@ class Record:
             measurements=self.measurements[rows],
             samples=self.samples[rows],
             truths=self.truths[rows],
+            motors=self.motors[rows],
         )
 
     def sample(self, row: int) -> Sample:
@@ -290,6 +298,7 @@ def new_record(
         measurements=np.zeros((size, 3 * n)),
         samples=np.zeros((size, controller.sample_vector.size)),
         truths=np.zeros((size, len(names) + 3 * n)),
+        motors=np.full((size * (plant.sensor.side == 'both'), 2, n), np.nan),
         left=np.full(n, np.nan),
         parameters=names,
         config=config,
@@ -349,6 +358,15 @@ def _write_bag(
             bag.write(stamp, *message)
 
 
+def _measured(
+    record: Record, k: int, stamp: int, plant: PlantTelemetry
+) -> Iterator[tuple[int, Message]]:
+    """Yield what the arm measures in row k; its motors are NaN where nothing read them."""
+    if record.motors.size and not np.isnan(record.motors[k, 0, 0]):
+        yield stamp, plant.motor_states(stamp, record.motors[k])
+    yield stamp, plant.joint_states(stamp, record.measurements[k])
+
+
 def _messages(parts: Iterable[Record]) -> Iterator[tuple[int, Message]]:
     """Yield the messages of a run, whose record comes in parts, with their times [ns]."""
     row = noted = 0
@@ -367,7 +385,7 @@ def _messages(parts: Iterable[Record]) -> Iterator[tuple[int, Message]]:
             while events and events[0].messages <= row:
                 yield stamp, (topics.JOURNAL, events.popleft().encode())
                 noted += 1
-            yield stamp, plant.joint_states(stamp, record.measurements[k])
+            yield from _measured(record, k, stamp, plant)
             yield stamp, controller.command(sample.torque)
             if row % DECIMATION == 0:
                 yield stamp, plant.truth(stamp, record.truths[k])

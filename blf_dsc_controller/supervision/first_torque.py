@@ -27,6 +27,10 @@ MATTERS = 0.05
 _NOTICED = 0.02  # of the torque of gravity; a few amperes for some fifty N m
 _ALIKE = 0.9  # cosine of the angle between two torques
 _SEND = 'safety.first_torque: send'
+_DRIVER = (
+    '. A driver of `blf_dsc drive` knows robot.drive_compensates and robot.effort of its robot, '
+    f'and takes no others: if its states do not show that, set {_SEND}'
+)
 
 
 def check_first_torque(
@@ -111,7 +115,7 @@ def _check_gravity(
             f'but the joint already rests with an effort of {effort[worst]:.4g} N m, before any '
             'command. If the drives compensate gravity, set robot.drive_compensates to gravity. '
             'If a torque of another or an earlier controller holds the arm, set robot.effort to '
-            f'commanded (if efforts contain only commands), or {_SEND}'
+            f'commanded (if efforts contain only commands), or {_SEND}{_DRIVER}'
         )
     no_gravity = f'no gravity: robot.drive_compensates is {compensates}, but joint {joint!r} rests'
     if is_commanded and holds:
@@ -119,7 +123,7 @@ def _check_gravity(
             f'{no_gravity} with a commanded effort of {effort[worst]:.4g} N m, where none should '
             'be needed. If the drives compensate nothing, set robot.drive_compensates to none. If '
             'the effort contains what the drives add, set robot.effort to whole. If a torque of '
-            f'another controller holds the arm, set {_SEND}'
+            f'another controller holds the arm, set {_SEND}{_DRIVER}'
         )
     if not is_commanded and np.linalg.norm(effort) <= _NOTICED * np.linalg.norm(
         gravity
@@ -129,5 +133,5 @@ def _check_gravity(
             f'{gravity[worst]:.4g} N m. The first torque, {torque[worst]:.4g} N m, would drop the '
             'arm. If the brakes hold it, release them. If the drives compensate nothing, set '
             'robot.drive_compensates to none. If the effort does not contain what the drives add, '
-            f'set robot.effort to commanded, or {_SEND}'
+            f'set robot.effort to commanded, or {_SEND}{_DRIVER}'
         )
