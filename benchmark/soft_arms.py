@@ -35,7 +35,8 @@ gears do not bear the gains of its maker has those that leave a margin of 0.5.
 
 `integrator`: this law with multiples of `disturbance.gain`, and of each the least factor by which
 the slow oscillation of the outstretched arm with its rated payload is damped in `joint_gains.py`
-(3 by the rule there; below 1 it grows), with the motors that the arm has.
+(3 by the rule there; below 1 it grows), with the motors that the arm has.  `by the rule`: as much
+as leaves each joint this 3, without the most that the rule also sets.
 """
 
 from __future__ import annotations
@@ -317,21 +318,25 @@ def rows(name: str, truths: int) -> Iterator[list[str]]:
 
 
 INTEGRALS = (1.0, 2.0, 4.0, 8.0)  # on `disturbance.gain`
+DAMPED = 3.0  # by the rule of `joint_gains.py`, which also bounds the integral's share
 
 
 def integrator(name: str, truths: int) -> Iterator[list[str]]:
     """Compute the rows of an arm with multiples of its integral gain."""
     loop = loop_with(ARMS[name], gains_of(name))
-    for factor in INTEGRALS:
-        gain = factor * np.array(loop.controller.disturbance.gain)
+    usual = np.array(loop.controller.disturbance.gain)
+    most = np.maximum(1.0, damped(loop, usual) / DAMPED)
+    factors = {f'{factor:g}': factor + 0.0 * usual for factor in INTEGRALS}
+    for label, factor in {**factors, 'by the rule': most}.items():
+        gain = factor * usual
         changes = {'disturbance.gain': gain.tolist()}
         found = [figures(name, THIS, k, changes) for k in range(1, truths + 1)]
-        cells = row(name, f'{factor:g}', found, found)
-        yield [*cells[:6], cells[8], f'{damped(loop, gain):.2g}']
+        cells = row(name, label, found, found)
+        yield [*cells[:6], cells[8], f'{damped(loop, gain).min():.2g}']
 
 
-def damped(loop: LoopConfig, gain: np.ndarray) -> float:
-    """Return by which factor the slow oscillation is damped with an integral gain (n,)."""
+def damped(loop: LoopConfig, gain: np.ndarray) -> np.ndarray:
+    """Return by which factor (n,) the slow oscillation is damped with an integral gain (n,)."""
     config, feedback = loop.controller, loop.controller.feedback
     robot, limits = config.robot, config.limits
     chain = robot.chain(config.joints)
@@ -343,9 +348,10 @@ def damped(loop: LoopConfig, gain: np.ndarray) -> float:
         limits.position_lower,
         limits.position_upper,
     ).inertia
-    inertia += loop.plant.truth.rotor_inertia - random_arms.guessed_rotors(config)
+    motors = np.array(loop.plant.truth.rotor_inertia)
+    inertia = inertia + motors - random_arms.guessed_rotors(config)
     damping = feedback.stiffness * np.array(feedback.joint_damping)
-    return float((1.2 * damping**2 / (inertia * gain)).min())
+    return np.asarray(1.2 * damping**2 / (inertia * gain))
 
 
 def gains_row(name: str) -> list[str]:
