@@ -332,7 +332,7 @@ def integrator(name: str, truths: int) -> Iterator[list[str]]:
         changes = {'disturbance.gain': gain.tolist()}
         found = [figures(name, THIS, k, changes) for k in range(1, truths + 1)]
         cells = row(name, label, found, found)
-        yield [*cells[:6], cells[8], f'{damped(loop, gain).min():.2g}']
+        yield [*cells[:5], cells[8], f'{damped(loop, gain).min():.2g}']
 
 
 def damped(loop: LoopConfig, gain: np.ndarray) -> np.ndarray:
@@ -372,7 +372,7 @@ _HEADS = (
     *('arm', 'law', 'in motion', 'pick-up', 'later', 'weight known after'),
     *('rms with 2 kg', 'without learning, over it', 'shakes'),
 )
-_INTEGRATOR = (*_HEADS[:1], 'factor', *_HEADS[2:6], _HEADS[8], 'damped')
+_INTEGRATOR = (*_HEADS[:1], 'factor', *_HEADS[2:5], _HEADS[8], 'damped')
 _GAINS = ('arm', 'margin', 'this law, factor', 'PD', 'computed torque', 'DOB')
 
 
