@@ -211,8 +211,13 @@ LAWS = (
 )
 
 
-def loop_of(preset: str, law: Law) -> LoopConfig:
-    """Return the loop of an arm with a law."""
+def loop_of(
+    preset: str,
+    law: Law,
+    changes: Mapping[str, object] | None = None,
+    gains: Mapping[str, object] | None = None,
+) -> LoopConfig:
+    """Return the loop of an arm with a law; `changes` of the arm and `gains` are optional."""
     loop = load_loop(preset)
     n = len(loop.controller.joints)
     plant = {
@@ -220,8 +225,9 @@ def loop_of(preset: str, law: Law) -> LoopConfig:
         'events.begin': [PICK_UP],
         'events.duration': [0.0],
         'events.payload': [WEIGHT],
+        **(changes or {}),
     }
-    controller = {'barrier.bound': [FREE] * n, **law.changes}
+    controller = {'barrier.bound': [FREE] * n, **(gains or {}), **law.changes}
     if not law.has_integral:
         controller['disturbance.gain'] = [0.0] * n
     loop = load_loop(preset, {PLANT: plant, CONTROLLER: controller})
@@ -242,6 +248,14 @@ def known_after(record: Record) -> float:
     return float(t[known][0] - PICK_UP) if known.any() else float('nan')
 
 
+def largest(time: np.ndarray, error: np.ndarray) -> list[float]:
+    """Return the largest of errors (k, n) [rad] in motion, at the pick-up, and later [mrad]."""
+    of_samples = 1e3 * np.abs(error).max(axis=1)
+    after = PICK_UP + LATER
+    spans = (4.0, PICK_UP), (PICK_UP, after), (after, SECONDS)
+    return [float(of_samples[(time >= a) & (time < b)].max()) for a, b in spans]
+
+
 def loop_row(preset: str, law: Law) -> list[str]:
     """Return what happens to an arm with a law."""
     loop = loop_of(preset, law)
@@ -250,10 +264,7 @@ def loop_row(preset: str, law: Law) -> list[str]:
     if run.stops:
         stop = run.stops[0]
         return [preset, law.label, f'{1e-9 * stop.stamp:.2f} s: {stop.reason}']
-    errors = 1e3 * np.abs(np.asarray(run.error)).max(axis=1)
-    after = PICK_UP + LATER
-    spans = (4.0, PICK_UP), (PICK_UP, after), (after, SECONDS)
-    cells = [f'{errors[(run.time >= a) & (run.time < b)].max():.2f}' for a, b in spans]
+    cells = [f'{each:.2f}' for each in largest(run.time, np.asarray(run.error))]
     known = known_after(record)
     cells.append(f'{known:.2f} s' if law.is_learning else '-')
     return [preset, law.label, *cells]

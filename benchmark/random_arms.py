@@ -37,7 +37,7 @@ import itertools
 import json
 import math
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -185,9 +185,13 @@ class Described(NamedTuple):
 def described(name: str) -> Described:
     """Return the arm in the middle of the distributions of a study, along its motion."""
     study = study_of(name)
-    config = study.controller
     middle = {each.column: each.distribution.at(0.5) for each in study.variations}
     plant = plant_with(study, {'seed': 0, **middle})
+    return describe(study.controller, plant, POSTURES)
+
+
+def describe(config: ControllerConfig, plant: PlantConfig, postures: int) -> Described:
+    """Return an arm along the motion of its controller, without and with its load."""
     actuator = plant.actuator
     loop = TorqueLoop(actuator.loop_gain, actuator.loop_damping, actuator.loop_lag)
     joints = Joints(
@@ -200,7 +204,7 @@ def described(name: str) -> Described:
     )
     chain = config.robot.chain(config.joints)
     base = parameters_of(config.robot, chain)
-    q = sampled(reference_of(config), np.linspace(0.0, PERIOD, POSTURES))[:, 0]
+    q = sampled(reference_of(config), np.linspace(0.0, PERIOD, postures))[:, 0]
     P = base.of(chain.inertias, np.zeros(len(config.joints)))
     loads = 0.0, max(plant.events.payload)
     links = [inertia_matrices(base.model, P + load * base.load, q) for load in loads]
@@ -217,12 +221,21 @@ def described(name: str) -> Described:
 def feedback_of(name: str, law: str, factor: float = 1.0) -> Feedback:
     """Return a law at small errors; `factor` is that of the PD, or w [1/s]."""
     robot, M0 = ROBOTS[name], described(name).M0
-    n = len(robot.stiffness)
-    one = np.broadcast_to(np.eye(n), M0.shape)
     if law == THIS:
-        settings = settings_of_config(load_loop(robot.preset).controller)
-        return linear_feedback(settings, M0, settings.barrier.weight)
+        return own_feedback(load_loop(robot.preset).controller, M0)
+    return rival_feedback(robot, M0, law, factor)
+
+
+def own_feedback(config: ControllerConfig, M0: np.ndarray) -> Feedback:
+    """Return this law at small errors, without its load observer."""
+    settings = settings_of_config(config)
+    return linear_feedback(settings, M0, settings.barrier.weight)
+
+
+def rival_feedback(robot: Robot, M0: np.ndarray, law: str, factor: float) -> Feedback:
+    """Return a rival at small errors; `factor` is that of the PD, or w [1/s]."""
     if law != CT:
+        one = np.broadcast_to(np.eye(len(robot.stiffness)), M0.shape)
         K, D = factor * np.array(robot.stiffness), factor * np.array(robot.damping)
         return pid(K * one, D * one, _WEAK * K * one)
     P, D, I = (M0 * each for each in computed_torque_gains(factor).values())
@@ -255,7 +268,7 @@ def computed_torque_gains(rate: float) -> dict[str, float]:
     return {f'gains.{name}': gain for name, gain in zip(_PID, gains, strict=True)}
 
 
-_RANGES = {PD: (0.05, 5.0), CT: (1.0, 100.0)}
+RANGES = {PD: (0.05, 5.0), CT: (1.0, 100.0)}
 _BISECTIONS = 9
 LEAST = 0.1
 """Margin of the rivals where this law has less."""
@@ -268,10 +281,17 @@ def factor_of(name: str, law: str) -> float:
         return 1.0
     arm = described(name)
     aim = max(arm.margin(feedback_of(name, THIS)), LEAST)
-    low, high = _RANGES[law]
+    return largest(
+        RANGES[law], lambda factor: arm.margin(feedback_of(name, law, factor)) >= aim
+    )
+
+
+def largest(within: tuple[float, float], holds: Callable[[float], bool]) -> float:
+    """Return the largest number for which something holds, by bisection of its logarithm."""
+    low, high = within
     for _ in range(_BISECTIONS):
         middle = math.sqrt(low * high)
-        if arm.margin(feedback_of(name, law, middle)) >= aim:
+        if holds(middle):
             low = middle
         else:
             high = middle
@@ -284,10 +304,21 @@ def law_of(config: ControllerConfig, name: str, law: str) -> ControllerConfig:
         return config
     if law == BLIND:
         return change(config, {'disturbance.observer_bandwidth': 0.0})
-    robot = ROBOTS[name]
+    factor = factor_of(name, law)
+    if law == CT:
+        return rival(
+            config, ROBOTS[name], COMPUTED_TORQUE, computed_torque_gains(factor)
+        )
+    return rival(config, ROBOTS[name], JOINT_PD, {'gains.scale': factor})
+
+
+def rival(
+    config: ControllerConfig, robot: Robot, law: str, gains: Mapping[str, object]
+) -> ControllerConfig:
+    """Return the configuration with the law of a file; of this law nothing is left."""
     n = len(config.joints)
     changes: dict[str, object] = {
-        'law': COMPUTED_TORQUE if law == CT else JOINT_PD,
+        'law': law,
         'barrier.bound': [FREE] * n,
         'barrier.initial_bound': [0.0] * n,
         'barrier.slope_limit': [2.0 * each for each in robot.stiffness],
@@ -297,10 +328,7 @@ def law_of(config: ControllerConfig, name: str, law: str) -> ControllerConfig:
         'learning.weight': 0.0,
         'learning.adaptation_gain': [0.0] * len(config.learning.initial_estimate),
     }
-    config = change(config, changes)
-    factor = factor_of(name, law)
-    gains = computed_torque_gains(factor) if law == CT else {'gains.scale': factor}
-    return change(config, gains)
+    return change(change(config, changes), gains)
 
 
 class Result(NamedTuple):
@@ -333,11 +361,11 @@ def run(config: ControllerConfig, plant: PlantConfig, bound: np.ndarray) -> Resu
     """Run a law on an arm; `bound` (n,) [rad] is that of the preset."""
     with np.errstate(all='ignore'):
         record = simulate(config, plant, after_stop=AFTER_STOP)
-        return result_of(record, plant.sample_time, bound)
+        return result_of(record, bound)
 
 
-def result_of(record: Record, T: float, bound: np.ndarray) -> Result:
-    """Return the figures of a run whose samples are T [s] apart."""
+def result_of(record: Record, bound: np.ndarray) -> Result:
+    """Return the figures of a run."""
     found = record.run()
     n = bound.size
     t = 1e-9 * record.stamps
@@ -352,9 +380,6 @@ def result_of(record: Record, T: float, bound: np.ndarray) -> Result:
         return float(error[chosen].max()) if last <= end else np.nan
 
     texts = [each.text for each in (found.stops or found.oscillations)]
-    settings = record.controller.settings
-    torque = sample_columns(record.samples, settings).torque
-    shaking = shaken(torque[running & (t >= BEGIN)] / settings.torque.limit, T)
     speed = np.abs(record.truths[:, -n:]).max(axis=1)
     alone = (t < PICK_UP) | (end >= PICK_UP)  # a load moves an arm that has stopped
     after, late = (t >= end) & alone, (t >= end + AT_REST) & alone
@@ -362,7 +387,7 @@ def result_of(record: Record, T: float, bound: np.ndarray) -> Result:
         stopped=end if stop else np.nan,
         text=texts[0] if texts else '',
         reports=len(found.oscillations),
-        shaking=shaking,
+        shaking=shaking_of(record, end),
         motion=largest(BEGIN, PICK_UP),
         pick_up=largest(PICK_UP, SETTLED),
         settled=largest(SETTLED, SECONDS),
@@ -371,6 +396,15 @@ def result_of(record: Record, T: float, bound: np.ndarray) -> Result:
         before=float(speed[running].max(initial=0.0)),
         left=float(speed[late].max()) if late.any() else np.nan,
     )
+
+
+def shaking_of(record: Record, end: float = math.inf) -> float:
+    """Return how much torques shake from 3 s on, and before `end` [s], of their limits."""
+    settings = record.controller.settings
+    t = 1e-9 * record.stamps
+    torque = sample_columns(record.samples, settings).torque
+    chosen = torque[(t >= BEGIN) & (t < end)]
+    return shaken(chosen / settings.torque.limit, record.config.sample_time)
 
 
 def shaken(values: np.ndarray, T: float) -> float:

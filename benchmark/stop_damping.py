@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """How much of the damping of a stop a joint bears whose motor is not the assumed one.
 
-    python benchmark/stop_damping.py
+    python -m benchmark stop-damping
 
 A motor B and a link M with a spring K and 3 % of damping between, no friction, and the torque
 -D v at the motor, 5.5 ms late (Pade, third order), of the velocity of either through the low
@@ -12,12 +12,13 @@ antiresonances sqrt(K/M) of 8 to 60 Hz.
 
 from __future__ import annotations
 
+import argparse
 import itertools
 from collections.abc import Iterator
 
 import numpy as np
-from harness import print_table
 
+from benchmark.harness import print_table
 from blf_dsc_controller.law.sensor import FILTER
 
 DELAY = 5.5e-3  # s
@@ -75,5 +76,6 @@ def rows() -> Iterator[list[str]]:
         yield [side, 'yes' if loop else 'no', *(f'{each:.2g}' for each in shares)]
 
 
-if __name__ == '__main__':
+def main(_options: argparse.Namespace) -> None:
+    """Print the table."""
     print_table(('encoders', 'torque loop', *(f'{each:g}' for each in MOTORS)), rows())

@@ -23,6 +23,9 @@ GROUPS = {
     'gains': {
         'margins': 'margins of the default gains, and errors at a pick-up',
         'elastic': 'where the gains of the presets hold, by the stiffness of gears',
+        'soft-arms': 'errors at gains that gears bear, against goals and rivals',
+        'known-load': 'what it would be worth to know a load at once',
+        'stop-damping': 'how much of the damping of a stop a joint bears',
         'commissioning': 'random arms, commissioned and put to work',
         'load-observer': 'what joint torque sensors are worth',
         'motor-feedback': 'feedback through a bus, and inside motors',

@@ -404,19 +404,23 @@ def test_metrics_match_the_full_record(tmp_path, loop):
 def test_pairs_run_the_same_plant_with_and_without_learning(tmp_path):
     """Each run with or without learning is that of an unpaired study, bit for bit.
 
-    The third has the same arm and motion, and other noise.
+    The third has the same arm and motion, and other noise; in the fourth nothing moves the
+    parameters, which end as they began.
     """
-    pairs = STUDY.replace('seed: 7', 'seed: 7\n    pairs: true')
+    pairs = STUDY.replace('seed: 7', 'seed: 7\n    pairs: true\n    still: true')
     found = whole(study(tmp_path, LOOP + pairs, runs=6))
     alone = whole(study(tmp_path, LOOP + STUDY, runs=6))
     never = LOOP.replace('learning: {', 'learning: {weight: 0.0, ')
     without = whole(study(tmp_path, never + STUDY, runs=6))
+    gains = 'learning: {adaptation_gain: [0.0, 0.0, 0.0], '
+    still = whole(study(tmp_path, never.replace('learning: {', gains) + STUDY, runs=6))
     figures = [name for name in alone if not name.startswith('plant.')][2:]
     for name in figures:
         np.testing.assert_array_equal(found[name], alone[name], err_msg=name)
         np.testing.assert_array_equal(
             found[f'without.{name}'], without[name], err_msg=name
         )
+        np.testing.assert_array_equal(found[f'still.{name}'], still[name], err_msg=name)
     assert (found['parameter_error.end'] != found['without.parameter_error.end']).any()
     for joint in ('joint1', 'joint2'):
         quiet, noisy = (

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from benchmark import joint_pd, random_arms
+from benchmark import joint_pd, momentum_observer, random_arms
 from blf_dsc_controller.arms.linear_loop import Timing, law_response
 from blf_dsc_controller.configuration.schema import change
 from blf_dsc_controller.factory.controller import controller_of
@@ -126,6 +126,26 @@ def test_joint_pd_is_a_pd_over_gravity_with_the_published_gains(study):
     expected -= 2.0 * settings.barrier.weight * signals.xi1
     expected -= 2.0 * settings.feedback.gain * (signals.dq - signals.dqr)
     np.testing.assert_allclose(signals.demand, expected, atol=1e-9)
+
+
+def test_momentum_observer_feeds_forward_what_holds_a_load(study):
+    """At rest, what is sent beyond gravity holds a load; a pole of 10 rad/s shows it in 1 s."""
+    controller = controller_of(study.study_of('panda').controller)
+    settings, signals = controller.settings, controller.signals
+    n, dt = settings.n, 0.01
+    state = controller.state._replace(memory=np.zeros(3 * n))
+    rng = np.random.default_rng(1)
+    signals.q[:] = rng.uniform(-0.5, 0.5, n)
+    for each in (signals.dq, signals.dqr, signals.ddqr, signals.xi1):
+        each[:] = 0.0
+    gravity = model_torque(settings, settings.initial_estimate, signals.q)
+    held = rng.uniform(-9.0, 9.0, n)
+    signals.applied[:] = gravity + held
+    law = momentum_observer.LAW(scale=1.0, bandwidth=10.0)
+    for k in range(round(1.0 / dt) + 1):
+        state.samples[0] = k
+        law.compute_demand(settings, state, signals, k * dt, dt)
+    np.testing.assert_allclose(signals.demand, gravity + held, atol=1e-3)
 
 
 def test_what_shakes_is_told_from_motion(study):

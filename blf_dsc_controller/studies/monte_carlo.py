@@ -67,6 +67,8 @@ WITHOUT = 'without.'
 """Prefix of the columns of a run without learning."""
 NOISE = 'noise.'
 """Prefix of the columns of a run without learning and with other sensor noise."""
+STILL = 'still.'
+"""Prefix of the columns of a run in which nothing moves the parameters."""
 
 UNSEEN = 1000
 """Seed of the motion on which the torque of a learned model is judged."""
@@ -87,6 +89,11 @@ class MonteCarloConfig:
         default=False,
         description='run each plant also without learning (learning.weight: 0), and once more so '
         'with other sensor noise',
+    )
+    still: bool = parameter(
+        default=False,
+        description='with pairs: run each plant once more without learning and without adaptation '
+        'by the tracking error (learning.adaptation_gain: 0)',
     )
     settled_after: float = parameter(
         0.0,
@@ -110,7 +117,11 @@ class Study:
         if not self.settings.pairs:
             return {'': self.controller}
         without = change(self.controller, {'learning.weight': 0.0})
-        return {'': self.controller, WITHOUT: without, NOISE: without}
+        laws = {'': self.controller, WITHOUT: without, NOISE: without}
+        if self.settings.still:
+            gains = [0.0] * len(self.controller.learning.adaptation_gain)
+            laws[STILL] = change(without, {'learning.adaptation_gain': gains})
+        return laws
 
     def values(self) -> dict[str, dict[str, Setting]]:
         """Return every value by node and name, with distributions as written."""

@@ -21,6 +21,7 @@ from blf_dsc_controller.run import Floats
 from blf_dsc_controller.simulation.loop import simulate, write_bag
 from blf_dsc_controller.studies.monte_carlo import (
     NOISE,
+    STILL,
     WITHOUT,
     Study,
     draw,
@@ -46,7 +47,12 @@ ALLOWED = 1.3
 
 _WORST = 10
 _LAWS = {'': 'with', WITHOUT: 'without'}
-_FOLDERS = {'': '', WITHOUT: 'without_learning', NOISE: 'other_noise'}
+_FOLDERS = {
+    '': '',
+    WITHOUT: 'without_learning',
+    NOISE: 'other_noise',
+    STILL: 'no_adaptation',
+}
 _FACTORS = {'median': 0.5, 'p99': 0.99, 'p99.9': 0.999, 'max': 1.0}
 _NEAR = (0.8, 1.2)  # times the bound
 _SHOWN = (0.03, 2.0)  # |xi1| / k_c; what is beyond is drawn at these
@@ -110,18 +116,20 @@ def compare_pairs(study: Study, results: Columns) -> Summary:
     start = study.settings.settled_after
     early = [results[f'{law}first_violation_s'] < start for law in (NOISE, WITHOUT)]
     late = {name: values[~np.any(early, axis=0)] for name, values in results.items()}
-    return _compare(study, results, '') | {'noise': _compare(study, late, NOISE)}
+    still = _compare(study, results, '', STILL) if study.settings.still else None
+    noise = _compare(study, late, NOISE)
+    return _compare(study, results, '') | {'noise': noise, 'still': still}
 
 
-def _compare(study: Study, results: Columns, law: str) -> Summary:
-    """Compare the runs of a law, by its prefix, with those without learning.
+def _compare(study: Study, results: Columns, law: str, other: str = WITHOUT) -> Summary:
+    """Compare the runs of a law, by its prefix, with those of another one that learns nothing.
 
     `factor` is the largest settled error with it over that without. It and the medians
     are of the runs that keep the bound without. `near` counts the runs that come near
     the bound without, with a largest error that is at least 1 % larger or smaller with
     it.
     """
-    laws = {law: 'with', WITHOUT: 'without'}
+    laws = {law: 'with', other: 'without'}
     kept, without = (results[f'{each}outcome'] == KEPT for each in laws)
     settled, settled_without = (
         _worst_of(study, results, 'settled_error_ratio', each)[without] for each in laws
@@ -150,7 +158,7 @@ def _compare(study: Study, results: Columns, law: str) -> Summary:
             name: {
                 label: float(np.median(known)) if known.size else np.nan
                 for each, label in laws.items()
-                for known in [_known(study, results, name, each)]
+                for known in [_known(study, results, name, each, other)]
             }
             for name in ('rms_error_rad', 'torque_error.end')
         },
@@ -164,13 +172,15 @@ def _worst_of(study: Study, results: Columns, name: str, law: str = '') -> Float
     return np.where(lost, np.inf, np.max(each, axis=0))
 
 
-def _known(study: Study, results: Columns, name: str, law: str) -> Floats:
-    """Return a figure's finite values, of runs that keep the bound without learning."""
+def _known(
+    study: Study, results: Columns, name: str, law: str, other: str = WITHOUT
+) -> Floats:
+    """Return a figure's finite values, of runs in which the `other` law keeps the bound."""
     column = f'{law}{name}'
     values = (
         results[column] if column in results else _worst_of(study, results, name, law)
     )
-    kept = results[f'{WITHOUT}outcome'] == KEPT
+    kept = results[f'{other}outcome'] == KEPT
     return np.asarray(values[kept & np.isfinite(values)])
 
 
@@ -222,6 +232,8 @@ def format_report(summary: Summary, folder: Path) -> str:
     ]
     if summary['pairs'] is not None:
         lines += [f'{title}: {figure}' for title, figure in summary['table'].items()]
+        if summary['pairs']['still'] is not None:
+            lines.append(_against_none(summary['pairs']['still']))
         runs['bound broken only with learning'] = summary['pairs']['broken_only_with']
         runs[f'error above {ALLOWED:g} times that without'] = summary['pairs']['above']
     lines += [
@@ -231,6 +243,20 @@ def format_report(summary: Summary, folder: Path) -> str:
     out = shlex.quote(f'{folder.name}-run-{worst}')
     command = f'blf_dsc monte-carlo --reproduce {shlex.quote(str(folder))} {worst} --out {out}'
     return '\n'.join([*lines, f'one again   {command}'])
+
+
+def _against_none(still: Summary) -> str:
+    """Return a line about learning against parameters that nothing moves."""
+    kept, rms = still['kept'], still['median']['rms_error_rad']
+    with_, without = (
+        '-' if each is None else f'{1e3 * each:.3g}' for each in rms.values()
+    )
+    broken = [len(still[f'broken_only_{law}']) for law in _LAWS.values()]
+    return (
+        'with learning / with neither learning nor adaptation: bound kept '
+        f'{kept["with"]} / {kept["without"]}, broken only {broken[0]} / {broken[1]}, '
+        f'rms error {with_} / {without} mrad'
+    )
 
 
 def _percent(fraction: float) -> str:
@@ -256,8 +282,8 @@ def write_comparison(stores: Sequence[Store], folder: Path) -> str:
 def reproduce(store: Store, run: str, out: Path) -> None:
     """Repeat the run of this number: write its config.yaml and bag to `out`.
 
-    Those without learning, of a study of pairs, go to `without_learning` and
-    `other_noise` in it.
+    Those without learning, of a study of pairs, go to `without_learning`, `other_noise`
+    and `no_adaptation` in it.
 
     Raises BlfDscError if the run has no results, or if they are not reproduced bit for
     bit; StartError if the controller rejects its start.

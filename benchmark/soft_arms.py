@@ -1,0 +1,397 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What gains that elastic joints bear leave of the error: this law, its rivals, and the goals.
+
+    python -m benchmark soft-arms [goals] [--truths N] [--arms NAME...]
+    python -m benchmark soft-arms integrator [--truths N] [--arms NAME...]
+
+`goals`: each arm moves as its preset does and picks up 2 kg at 8 s.  A row has the worst of N arms
+whose links deviate differently from their URDF:
+
+    in motion, pick-up, later   the largest error [mrad] from 4 s to the pick-up, from then on, and
+                                from 3.5 s after it on, at the encoders; where these are at the
+                                motors, a second row has that of the links
+    weight known after          until its 95 % interval is within 0.1 kg of 2 kg
+    rms                         of the error's norm [mrad], from 3.5 s after the pick-up on; and of
+                                each arm, that of the law without learning over it
+    shakes                      rms of the torque above 8 Hz in the worst second, of its limit, and
+                                whether an oscillation was reported, by which this law halves
+                                its gains
+
+The laws:
+
+    this law           with its joint torque sensors, where the arm has them
+    without sensors    the same without its load observer
+    without learning   the same feedback and model: a PID over the URDF's model along the
+                       reference, with the load observer where the arm has sensors
+    PD                 stiffness and damping of the maker over gravity, as in Franka's example
+    computed torque    with an integral, through the inertia matrix of the URDF
+    DOB                that PD over the URDF's model along the reference, and a disturbance
+                       observer by momentum, fed forward
+
+The last three have the gains with which the linear loop (`random_arms`) has the modulus margin
+of this law on this arm, the largest factor or rate; of the DOB's, the pair of factor and pole
+with the largest integral gain.  The margin is without the load observer.  The UR5e whose
+gears do not bear the gains of its maker has those that leave a margin of 0.5.
+
+`integrator`: this law with multiples of `disturbance.gain`, and of each the least factor by which
+the slow oscillation of the outstretched arm with its rated payload is damped in `joint_gains.py`
+(3 by the rule there; below 1 it grows), with the motors that the arm has.  `by the rule`: as much
+as leaves each joint this 3, without the most that the rule also sets.
+"""
+
+from __future__ import annotations
+
+import argparse
+import itertools
+from collections.abc import Iterator, Mapping
+from functools import cache
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from benchmark import elastic, load_observer, random_arms
+from benchmark.harness import print_table
+from benchmark.load_observer import LATER, PICK_UP, Law
+from benchmark.options import positive
+from benchmark.random_arms import CT, PD, RANGES, ROBOTS, THIS
+from blf_dsc_controller.arms.linear_loop import Feedback
+from blf_dsc_controller.arms.tuning import over_postures
+from blf_dsc_controller.configuration.controller import ControllerConfig
+from blf_dsc_controller.configuration.nodes import LoopConfig
+from blf_dsc_controller.configuration.robot import parameters_of
+from blf_dsc_controller.simulation.loop import simulate
+from blf_dsc_controller.studies.laws import COMPUTED_TORQUE
+
+NO_SENSORS, NO_LEARNING, DOB = 'without sensors', 'without learning', 'DOB'
+MOMENTUM = str(Path(__file__).with_name('momentum_observer.py').resolve())
+MARGIN = 0.5  # of gains that are chosen
+FACTORS = 0.01, 1.0  # on the maker's gains, among them
+POLES = 0.1, 100.0  # rad/s, of the DOB
+SHARES = (0.5, 0.75, 1.0)  # of the PD's factor, in the DOB
+POSTURES = 3
+
+_Changes = Mapping[str, object]
+
+
+class Arm(NamedTuple):
+    """A preset, what differs from it, and what is aimed at."""
+
+    robot: str
+    label: str
+    plant: _Changes
+    gains: _Changes
+    goal: tuple[str, str, str]  # in motion, pick-up, later [mrad]
+    known: str = '1'  # s
+    is_chosen: bool = (
+        False  # whether its gains leave MARGIN, instead of those of the preset
+    )
+
+
+_MOTOR: _Changes = {'sensor.side': 'motor'}
+
+
+def _gears(stiffness: float, joints: int) -> _Changes:
+    return {'joint.stiffness': [stiffness] * joints}
+
+
+_TWICE: _Changes = {'feedback.stiffness': 2.0}
+_UNKNOWN: _Changes = {'robot.torque_loop': False}
+ARMS = {
+    'ur5e': Arm('ur5e', 'UR5e', {}, {}, ('1.5', '5', '0.8')),
+    'ur5e_motor': Arm(
+        'ur5e',
+        'UR5e, motor 1e4',
+        {**_gears(1e4, 6), **_MOTOR},
+        {},
+        ('1.5', '5', '0.8'),
+    ),
+    'ur5e_twice': Arm(
+        'ur5e', 'UR5e, twice as stiff', {}, _TWICE, ('0.8', '2.5', '0.5')
+    ),
+    'ur5e_motor_twice': Arm(
+        'ur5e',
+        'UR5e, motor 1e4, twice as stiff',
+        {**_gears(1e4, 6), **_MOTOR},
+        _TWICE,
+        ('0.8', '2.5', '0.5'),
+    ),
+    'ur5e_soft': Arm(
+        'ur5e',
+        'UR5e, link 1e4',
+        _gears(1e4, 6),
+        {},
+        ('1.5', '6', '1'),
+        is_chosen=True,
+    ),
+    'panda': Arm('panda', 'Panda, 1e4', _gears(1e4, 7), {}, ('1', '8', '0.5'), '0.3'),
+    'panda_no_loop': Arm(
+        'panda',
+        'Panda, 1e4, no torque loop',
+        {**_gears(1e4, 7), **elastic.NO_LOOP, **_UNKNOWN},
+        _UNKNOWN,
+        ('-', '8', '1'),
+        is_chosen=True,
+    ),
+    'fr3': Arm('fr3', 'FR3, direct', {}, {}, ('0.4', '1.5', '0.3'), '0.3'),
+}
+
+
+class Figures(NamedTuple):
+    """What becomes of an arm: errors [mrad]; NaN where it stops."""
+
+    stop: str
+    errors: list[float]  # in motion, at the pick-up, later, at the encoders
+    links: list[float]  # likewise
+    rms: float  # of the norm, later
+    known: float  # s
+    shaking: float  # of the torque limit: see `random_arms`
+    is_softened: bool  # an oscillation was reported
+
+
+@cache
+def gains_of(name: str) -> _Changes:
+    """Return the gains of this law on an arm, by the names of their parameters."""
+    arm = ARMS[name]
+    if not arm.is_chosen:
+        return arm.gains
+    factor = random_arms.largest(
+        FACTORS, lambda factor: own_margin(arm, factor) >= MARGIN
+    )
+    return {**arm.gains, 'feedback.stiffness': factor}
+
+
+def own_margin(arm: Arm, factor: float) -> float:
+    """Return the margin of this law with a factor on the gains of the preset."""
+    loop = loop_with(arm, {**arm.gains, 'feedback.stiffness': factor})
+    described = random_arms.describe(loop.controller, loop.plant, POSTURES)
+    return described.margin(random_arms.own_feedback(loop.controller, described.M0))
+
+
+def loop_with(arm: Arm, gains: _Changes, law: str = THIS, truth: int = 0) -> LoopConfig:
+    """Return the loop of an arm with one of our own laws; `truth` is the seed of its links."""
+    blind: _Changes = {'disturbance.observer_bandwidth': 0.0}
+    own = Law(law, blind if law == NO_SENSORS else {}, law != NO_LEARNING)
+    seeds = {'truth.seed': truth, 'seed': truth}
+    preset = ROBOTS[arm.robot].preset
+    return load_observer.loop_of(preset, own, {**arm.plant, **seeds}, gains)
+
+
+class Equal(NamedTuple):
+    """Gains of equal margin on an arm."""
+
+    margin: float
+    PD: float  # factor
+    rate: float  # of computed torque, 1/s
+    DOB: tuple[float, float]  # factor, and pole in rad/s
+
+
+def dob(arm: Arm, M0: np.ndarray, factor: float, pole: float) -> Feedback:
+    """Return the DOB at small errors."""
+    robot = ROBOTS[arm.robot]
+    one = np.broadcast_to(np.eye(len(robot.stiffness)), M0.shape)
+    K = factor * np.array(robot.stiffness) * one
+    D = factor * np.array(robot.damping) * one
+    return random_arms.pid(K + pole * D, D + pole * M0, pole * K)
+
+
+@cache
+def equal(arm_name: str) -> Equal:
+    """Return the gains with which rivals have the margin of this law."""
+    arm = ARMS[arm_name]
+    loop = loop_with(arm, gains_of(arm_name))
+    of = random_arms.describe(loop.controller, loop.plant, POSTURES)
+    margin = of.margin(random_arms.own_feedback(loop.controller, of.M0))
+    aim = max(margin, random_arms.LEAST)
+
+    def rival(law: str) -> float:
+        robot = ROBOTS[arm.robot]
+        return random_arms.largest(
+            RANGES[law],
+            lambda factor: (
+                of.margin(random_arms.rival_feedback(robot, of.M0, law, factor)) >= aim
+            ),
+        )
+
+    def pole(share: float) -> float:
+        return random_arms.largest(
+            POLES, lambda pole: of.margin(dob(arm, of.M0, share, pole)) >= aim
+        )
+
+    factor = rival(PD)
+    pairs = [(share * factor, pole(share * factor)) for share in SHARES]
+    return Equal(
+        margin, factor, rival(CT), max(pairs, key=lambda pair: pair[0] * pair[1])
+    )
+
+
+def law_of(config: ControllerConfig, name: str, law: str) -> ControllerConfig:
+    """Return the configuration of a controller with a rival."""
+    gains, robot = equal(name), ROBOTS[ARMS[name].robot]
+    if law == PD:
+        return random_arms.rival(
+            config, robot, random_arms.JOINT_PD, {'gains.scale': gains.PD}
+        )
+    if law == CT:
+        own = random_arms.computed_torque_gains(gains.rate)
+        return random_arms.rival(config, robot, COMPUTED_TORQUE, own)
+    factor, pole = gains.DOB
+    own = {'gains.scale': factor, 'gains.bandwidth': pole}
+    return random_arms.rival(config, robot, MOMENTUM, own)
+
+
+def figures(
+    name: str, law: str, truth: int, changes: _Changes | None = None
+) -> Figures:
+    """Run a law on an arm, with `changes` of its gains if they are given."""
+    loop = loop_with(ARMS[name], {**gains_of(name), **(changes or {})}, law, truth)
+    controller = loop.controller
+    if law in (PD, CT, DOB):
+        controller = law_of(controller, name, law)
+    record = simulate(controller, loop.plant)
+    run = record.run()
+    if run.stops:
+        stop = run.stops[0]
+        nothing = [np.nan] * 3
+        text = f'{1e-9 * stop.stamp:.2f} s: {stop.text.partition(": ")[0]}'
+        return Figures(
+            text, nothing, nothing, np.nan, np.nan, np.nan, is_softened=False
+        )
+    error = np.asarray(run.error)
+    late = error[run.time >= PICK_UP + LATER]
+    return Figures(
+        '',
+        load_observer.largest(run.time, error),
+        load_observer.largest(run.time, record.true_errors()),
+        1e3 * float(np.sqrt((late**2).sum(axis=1).mean())),
+        load_observer.known_after(record) if law in (THIS, NO_SENSORS) else np.nan,
+        random_arms.shaking_of(record),
+        bool(run.oscillations),
+    )
+
+
+def laws_of(name: str) -> tuple[str, ...]:
+    """Return the laws of the table on an arm."""
+    observes = (
+        loop_with(ARMS[name], gains_of(name)).controller.disturbance.observer_bandwidth
+        > 0.0
+    )
+    return (THIS, *((NO_SENSORS,) if observes else ()), NO_LEARNING, PD, CT, DOB)
+
+
+def row(name: str, law: str, found: list[Figures], others: list[Figures]) -> list[str]:
+    """Return the worst of some arms with a law; `others` are those without learning."""
+    heads = [ARMS[name].label, law]
+    stops = [each.stop for each in found if each.stop]
+    if stops:
+        return [*heads, f'{len(stops)} of {len(found)} stop, {stops[0]}', *['-'] * 6]
+    worst = np.max([each.errors for each in found], axis=0)
+    known = max(each.known if law == THIS else np.nan for each in found)
+    rms = max(each.rms for each in found)
+    ratio = min(b.rms / a.rms for a, b in zip(found, others, strict=True))
+    return [
+        *heads,
+        *(f'{each:.2f}' for each in worst),
+        f'{known:.2f} s' if np.isfinite(known) else '-',
+        f'{rms:.2f}',
+        f'{ratio:.2g}' if law != NO_LEARNING else '1',
+        f'{100.0 * max(each.shaking for each in found):.1f} %'
+        + (', oscillates' if any(each.is_softened for each in found) else ''),
+    ]
+
+
+def rows(name: str, truths: int) -> Iterator[list[str]]:
+    """Compute the rows of an arm."""
+    arm = ARMS[name]
+    yield [arm.label, 'goal', *arm.goal, f'{arm.known} s', '-', '8', '-']
+    found = {
+        law: [figures(name, law, k) for k in range(1, truths + 1)]
+        for law in laws_of(name)
+    }
+    for law, each in found.items():
+        yield row(name, law, each, found[NO_LEARNING])
+        if 'sensor.side' in arm.plant:
+            at_links = [of._replace(errors=of.links, known=np.nan) for of in each]
+            cells = row(name, f'{law}, links', at_links, found[NO_LEARNING])
+            yield [*cells[:5], *['-'] * 4]
+
+
+INTEGRALS = (1.0, 2.0, 4.0, 8.0)  # on `disturbance.gain`
+DAMPED = 3.0  # by the rule of `joint_gains.py`, which also bounds the integral's share
+
+
+def integrator(name: str, truths: int) -> Iterator[list[str]]:
+    """Compute the rows of an arm with multiples of its integral gain."""
+    loop = loop_with(ARMS[name], gains_of(name))
+    usual = np.array(loop.controller.disturbance.gain)
+    most = np.maximum(1.0, damped(loop, usual) / DAMPED)
+    factors = {f'{factor:g}': factor + 0.0 * usual for factor in INTEGRALS}
+    for label, factor in {**factors, 'by the rule': most}.items():
+        gain = factor * usual
+        changes = {'disturbance.gain': gain.tolist()}
+        found = [figures(name, THIS, k, changes) for k in range(1, truths + 1)]
+        cells = row(name, label, found, found)
+        yield [*cells[:5], cells[8], f'{damped(loop, gain).min():.2g}']
+
+
+def damped(loop: LoopConfig, gain: np.ndarray) -> np.ndarray:
+    """Return by which factor (n,) the slow oscillation is damped with an integral gain (n,)."""
+    config, feedback = loop.controller, loop.controller.feedback
+    robot, limits = config.robot, config.limits
+    chain = robot.chain(config.joints)
+    inertia = over_postures(
+        chain,
+        parameters_of(robot, chain),
+        robot.payload,
+        config.learning.initial_estimate,
+        limits.position_lower,
+        limits.position_upper,
+    ).inertia
+    motors = np.array(loop.plant.truth.rotor_inertia)
+    inertia = inertia + motors - random_arms.guessed_rotors(config)
+    damping = feedback.stiffness * np.array(feedback.joint_damping)
+    return np.asarray(1.2 * damping**2 / (inertia * gain))
+
+
+def gains_row(name: str) -> list[str]:
+    """Return margin and gains of an arm."""
+    of = equal(name)
+    own = gains_of(name).get('feedback.stiffness', 1.0)
+    return [
+        ARMS[name].label,
+        f'{of.margin:.2f}',
+        f'{own:.2g}',
+        f'{of.PD:.2g}',
+        f'{of.rate:.2g} 1/s',
+        f'{of.DOB[0]:.2g}, {of.DOB[1]:.2g} rad/s',
+    ]
+
+
+_HEADS = (
+    *('arm', 'law', 'in motion', 'pick-up', 'later', 'weight known after'),
+    *('rms with 2 kg', 'without learning, over it', 'shakes'),
+)
+_INTEGRATOR = (*_HEADS[:1], 'factor', *_HEADS[2:5], _HEADS[8], 'damped')
+_GAINS = ('arm', 'margin', 'this law, factor', 'PD', 'computed torque', 'DOB')
+
+
+def arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the options."""
+    tables = 'goals', 'integrator'
+    parser.add_argument('table', nargs='?', choices=tables, default='goals')
+    about = 'arms of each kind (5)'
+    parser.add_argument('--truths', type=positive, default=5, help=about)
+    parser.add_argument('--arms', nargs='+', choices=ARMS, default=list(ARMS))
+
+
+def main(given: argparse.Namespace) -> None:
+    """Print the table that was asked for; beside the goals, the gains."""
+    if given.table == 'integrator':
+        of_arms = (integrator(name, given.truths) for name in given.arms)
+        print_table(_INTEGRATOR, itertools.chain.from_iterable(of_arms))
+        return
+    print_table(_GAINS, map(gains_row, given.arms))
+    print()
+    print_table(
+        _HEADS, (row for name in given.arms for row in rows(name, given.truths))
+    )
