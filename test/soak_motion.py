@@ -14,6 +14,11 @@ before it has learned what the watchdog held.
 While nobody commands, the drives hold the last torque, and the arm keeps its acceleration, as its
 reference would: 2.3 rad/s^2 of an FR3 or a UR5e add 0.12 rad/s in the 52 ms of a watchdog.  What is
 asked for includes that, by the silence that was, which is printed.
+
+The watchdog then brakes the arm by its model without the load.  A light wrist is dragged along by
+what the load lacks there, the torque dM a of its inertia dM at the acceleration a of the other
+joints, until it is observed: by dM a (1/L1 + 1/L2) over the inertia of the wrist.  While the
+watchdog brakes, and no longer, a joint may be faster by that.
 """
 
 from __future__ import annotations
@@ -39,11 +44,14 @@ from ros_rig import PatientClock, RosRig
 from std_srvs.srv import Trigger
 
 from blf_dsc_controller import load_loop
+from blf_dsc_controller.arms.model import inertia_matrices
 from blf_dsc_controller.configuration.files import share_folder
 from blf_dsc_controller.configuration.schema import flatten
+from blf_dsc_controller.factory.settings import settings_of_config
 from blf_dsc_controller.messages import topics
 from blf_dsc_controller.nodes.plant_node import PlantNode
 from blf_dsc_controller.nodes.watchdog_node import WatchdogNode
+from blf_dsc_controller.tool.tip_wrench import TipWrench
 
 CONTROLLER = '/blf_dsc_controller'
 LOAD = {'events.begin': [0.0], 'events.duration': [1e6], 'events.payload': [2.0]}
@@ -56,6 +64,31 @@ SLACK = 0.2  # rad/s beyond what the reference asks, as in `test_hang`
 USUAL, WAITING = 5, 100  # times slower than the computer's clock
 LATE = 3  # samples without a torque, from which on the arm waits for it
 MOVING = 0.1  # rad/s, beyond which an episode begins
+OBSERVED = 1.0 / 60.0 + 1.0 / 30.0  # s, in which the watchdog observes a load
+AVERAGED = 0.01  # s, over which the acceleration is a difference
+
+
+class Load:
+    """The load in the hand, and the inertia of the arm without it."""
+
+    def __init__(self, config):
+        self._settings = settings_of_config(config)
+        self._tip = TipWrench(config.robot.chain(config.joints))
+        self._samples = round(AVERAGED / config.sample_time)
+
+    def drag(self, q, velocities):
+        """Return by how much (n,) [rad/s] it drags joints that brake at q (n,), unobserved.
+
+        `velocities` are (k, n) [rad/s].
+        """
+        settings, k = self._settings, self._samples
+        P = settings.initial_estimate[: settings.p]
+        M = inertia_matrices(settings.model, P, q[np.newaxis])[0]
+        J = self._tip.jacobian(q)[:3]
+        dM = LOAD['events.payload'][0] * J.T @ J
+        of_others = dM - np.diag(np.diagonal(dM))
+        a = (velocities[k:] - velocities[:-k]) / AVERAGED
+        return OBSERVED * np.abs(a @ of_others).max(axis=0) / np.diagonal(M + dM)
 
 
 class Episodes:
@@ -70,9 +103,9 @@ class Episodes:
         plant = flatten(load_loop(self.file).plant) | LOAD
         self.arm = self.ros.add(PlantNode, plant, clock=self.clock)
         self.joints = len(self.arm.config.joints)
-        self.speeds = deque(
-            maxlen=100_000
-        )  # of each sample, largest of the joints last
+        self.load = Load(load_loop(self.file).controller)
+        self.velocities = deque(maxlen=100_000)  # (n,) of each sample
+        self.braked = []  # samples from a silence on, and the posture (n,) [rad] there
         self._watch_speeds()
         self.asked = self.ros.listen(topics.REFERENCE)
         self.silence = (
@@ -93,7 +126,7 @@ class Episodes:
             self.silence = max(self.silence, age * self.arm.config.sample_time)
             waits = age > LATE and not self.is_interrupted
             self.clock.slower = WAITING if waits else USUAL
-            self.speeds.append(np.abs(self.arm.plant.truth()[-n:]))
+            self.velocities.append(self.arm.plant.truth()[-n:].copy())
 
         self.arm.plant.step = step_and_look
 
@@ -151,7 +184,7 @@ class Episodes:
         self.hang_controller()
 
     def _kill_controller(self):
-        self._begin_silence()
+        self._begin_silence(round(0.5 / self.arm.config.sample_time))
         self.controller.kill()
         self.controller.wait()
         self.ros.until(lambda: self.watchdog.watchdog.active)
@@ -162,11 +195,17 @@ class Episodes:
         self.controller.send_signal(signal.SIGSTOP)
         self._run(self.rng.uniform(0.02, 0.5))
         self._end_silence()
+        during, q = self.braked.pop()
+        self.braked.append((slice(during.start, len(self.velocities)), q))
         self.controller.send_signal(signal.SIGCONT)
 
-    def _begin_silence(self):
+    def _begin_silence(self, most=0):
+        """The watchdog brakes for so many samples at `most`, if given."""
         self.is_interrupted = True
         self.silence = 0.0
+        begin = len(self.velocities)
+        q = self.arm.plant.truth()[-2 * self.joints : -self.joints].copy()
+        self.braked.append((slice(begin, begin + most), q))
 
     def _end_silence(self):
         """Count as asked for what the reference would have asked in the silence.
@@ -198,8 +237,8 @@ class Episodes:
         samples = round(0.2 / self.arm.config.sample_time)
         self.recover()
         self._run(self.rng.uniform(1.0, 3.0))
-        self.ros.until(lambda: self.speeds[-1].max() > MOVING)
-        return np.max(list(self.speeds)[-samples:], axis=0)
+        self.ros.until(lambda: np.abs(self.velocities[-1]).max() > MOVING)
+        return np.abs(list(self.velocities)[-samples:]).max(axis=0)
 
     def recover(self):
         """Bring the loop back after a stop or a refusal."""
@@ -224,7 +263,8 @@ class Episodes:
     def episode(self, name):
         """Return by how much [rad/s] a joint was faster than before and than it was asked to be."""
         before = self.begin()
-        self.speeds.clear()
+        self.velocities.clear()
+        self.braked.clear()
         del self.asked[:-2]  # the last acceleration that was asked for
         self.goes_on.clear()
         self.silence = 0.0
@@ -232,7 +272,11 @@ class Episodes:
         self._run(1.0)
         asked = [np.abs(each.velocity) for each in self.asked] + self.goes_on
         most = np.max([before, *asked], axis=0)
-        return float((np.max(self.speeds, axis=0) - most).max())
+        velocities = np.array(self.velocities)
+        speeds = np.abs(velocities)
+        for during, q in self.braked:
+            speeds[during] -= self.load.drag(q, velocities[during])
+        return float((speeds - most).max())
 
 
 def _nanoseconds(message):
