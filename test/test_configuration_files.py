@@ -26,6 +26,7 @@ from blf_dsc_controller.configuration.nodes import (
     RecorderConfig,
     dump,
     format_value,
+    ignored_sections,
     known_names,
     load,
     load_loop,
@@ -509,6 +510,25 @@ def test_misspelt_node_name_is_reported(file):
     assert (
         load_loop(file(section('robot_state_publisher', 'a: 1'))).plant == PlantConfig()
     )
+
+
+@pytest.mark.parametrize(
+    ('node', 'ignored'),
+    [
+        ('left/sim_plant', False),
+        ('right/sim_plant', False),
+        ('sim_plant', True),
+    ],
+)
+def test_sections_of_several_robots_are_read_if_one_of_them_is_that_of_the_node(
+    node, ignored
+):
+    """Each robot has its own in one file."""
+    text = ''.join(
+        f'/{name}/**:\n  ros__parameters: {{seed: 1}}\n' for name in ('left', 'right')
+    )
+    said = ignored_sections(parse(text), [node])
+    assert ('/left/** (line 2), /right/** (line 4)' in said) == ignored == bool(said)
 
 
 @pytest.mark.parametrize('prefix', ['source', 'prefix/share/blf_dsc_controller'])

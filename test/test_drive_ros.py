@@ -11,6 +11,7 @@ import os
 import signal
 import socket
 import time
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -147,6 +148,19 @@ def test_topics_are_those_of_the_bag_and_motions_are_followed(ros, beside, tmp_p
     assert blf.verify(tmp_path / 'bag').difference is None
     stamp = blf.read_run(tmp_path / 'bag').stamp[0]
     assert abs(time.time_ns() - stamp) < 1e9 * PATIENCE  # of the wall clock
+
+
+def test_status_is_told_every_second_and_as_soon_as_the_state_changes(monkeypatch):
+    """By a clock and a state that are made up."""
+    now, state, told = [100.0], SimpleNamespace(revision=3), []
+    monkeypatch.setattr(ros_topics, 'monotonic', lambda: now[0])
+    beside = RosTopics.__new__(RosTopics)
+    beside._guard = SimpleNamespace(supervisor=state)
+    beside._reported = 100.0, 3
+    beside._tell_status = lambda _: told.append((now[0], state.revision))
+    for now[0], state.revision in ((100.5, 3), (100.6, 4), (100.7, 4), (101.7, 4)):
+        beside._report_now_and_then()
+    assert told == [(100.6, 4), (101.7, 4)]
 
 
 def test_stop_without_an_answer_of_the_loop_says_so(ros, beside, tmp_path):

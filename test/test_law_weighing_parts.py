@@ -117,6 +117,16 @@ def test_solution_is_the_joint_least_squares_of_arm_and_load():
     np.testing.assert_allclose(state.load[4:], deviation, rtol=1e-5)
 
 
+@pytest.mark.parametrize('rows', [10, 13, 20])
+def test_load_is_solved_for_every_tenth_of_a_second(rows):
+    """With a row each 10 ms it is after every tenth; between, the last solution stays."""
+    state = part(State)
+    for row in rows_of(PRIOR.estimate + 0.1, 30):
+        add_products(np.insert(row, M, np.zeros((N, N)), axis=1), state.sums[LATEST])
+    weighing.refresh(SETTINGS, state, part(Work), PRIOR, rows, DT)
+    assert bool(state.solution.any()) == (rows % 10 == 0)
+
+
 class Arm:
     """An arm of which rows are added, with something in its hand."""
 

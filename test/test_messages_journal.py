@@ -20,13 +20,19 @@ from blf_dsc_controller.messages.journal import (
 from blf_dsc_controller.messages.topics import JOURNAL
 
 POINT = {'time': 1.0, 'positions': [0.5, 1], 'velocities': []}
+WHOLE = POINT | {'accelerations': [0.1, 0.2], 'effort': [0.0, 3.0]}  # has every field
 EXAMPLES = {
     'configure': {'parameters': {'joints': ['a'], 'law': 'dsc', 'x': 1.5, 'y': True}},
     'activate': {},
     'prepare': {'positions': [0.5, 1]},
     'takeover': {'torque': [1.5, -2.0]},
     'start': {'resumed': False},
-    'trajectory': {'joints': ['a', 'b'], 'points': [POINT], 'begin': None, 'at': 0.0},
+    'trajectory': {
+        'joints': ['a', 'b'],
+        'points': [POINT, WHOLE],
+        'begin': None,
+        'at': 0.0,
+    },
     'target': {
         'positions': [0.5, 1],
         'velocities': [0.0, 0.1],

@@ -329,11 +329,12 @@ def test_waypoints_of_an_older_file_are_refused_with_the_remedy(
 def test_waypoints_of_an_arm_are_read_point_by_point_and_their_end_is_told():
     robot = {'robot.urdf': 'ur5e.urdf', 'robot.tip': 'tool0'}
     rest, end = [0.0] * 6, [0.1, -1.0, 1.0, 0.0, 0.0, 0.0]
-    times = {'reference.type': 'waypoints', 'reference.times': [0.0, 5.0]}
-    config = build(
-        ControllerConfig, robot | times | {'reference.waypoints': rest + end}
-    )
-    np.testing.assert_allclose(sampled(reference_of(config), [5.0])[0, 0], end)
+    between = [0.2, -0.5, 0.5, 0.3, 0.2, 0.1]
+    times = {'reference.type': 'waypoints', 'reference.times': [0.0, 3.0, 5.0]}
+    points = {'reference.waypoints': rest + between + end}
+    config = build(ControllerConfig, robot | times | points)
+    motion = sampled(reference_of(config), [3.0, 5.0])
+    np.testing.assert_allclose(motion[:, 0], [between, end])
     assert end_of_waypoints(config) == (
         'the waypoints end after 5 s at shoulder_pan_joint 0.1 rad, shoulder_lift_joint -1 rad, '
         'elbow_joint 1 rad, wrist_1_joint 0 rad, wrist_2_joint 0 rad, wrist_3_joint 0 rad'

@@ -14,8 +14,9 @@ from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.motion_groups import MotionLimits, Reference
 from blf_dsc_controller.configuration.schema import change
 from blf_dsc_controller.errors import StartError
-from blf_dsc_controller.reference.approach import plan_start
+from blf_dsc_controller.reference.approach import AT_REST, plan_start
 from blf_dsc_controller.supervision.guard import Guard
+from blf_dsc_controller.supervision.start import prepared_start
 from sim_plant.plant import plant_of
 
 START = 1_000_000_000  # ns
@@ -129,6 +130,25 @@ def test_restarted_controller_says_that_the_arm_still_moves():
     assert 'the arm still moves' in text
     said = float(re.search(r'at ([\d.]+) rad/s: start again when it rests', text)[1])
     assert said == pytest.approx(speed, rel=0.05)  # as measured
+
+
+@pytest.mark.parametrize(
+    ('away', 'speed', 'fits'),
+    [
+        (0.0, 0.0, True),
+        (0.04, 0.9 * AT_REST, True),
+        (0.0, 1.1 * AT_REST, False),
+        (0.06, 0.0, False),  # of the bound
+    ],
+)
+def test_start_that_was_planned_from_rest_is_not_used_in_motion(away, speed, fits):
+    config = load_loop(CONFIG / 'ur5e.yaml').controller
+    bound = Guard(config).controller.bound_at(0.0)
+    n = len(config.joints)
+    q, joint = np.full(n, 0.1), np.eye(n)[2]
+    prepared = prepared_start(config, bound, q)
+    beside = q + away * np.array(config.barrier.bound) * joint
+    assert prepared.fits(config, bound, beside, -speed * joint) == fits
 
 
 @pytest.mark.parametrize(
