@@ -128,7 +128,8 @@ def _add_run(command: _Command) -> None:
 def _add_drive(command: _Command) -> None:
     option = command(
         'drive',
-        'Control a Franka Research 3 over its own interface, without ROS. The law runs in the '
+        'Control an arm over its own interface, without ROS: a Franka Research 3, or motors by '
+        'Damiao on CAN. The law runs in the '
         'loop that reads states and writes torques; --ros adds the topics. Ctrl-C or SIGTERM '
         'brings the arm to rest and ends; a second one ends at once. Exit code: 0 the duration is '
         'over, 5 the controller or the robot stopped before, 130 interrupted, 1 an error.',

@@ -58,6 +58,7 @@ def print_notice(notice: str) -> None:
 
 def run(options: Namespace) -> int:
     """Run the closed loop and write the results to a new folder."""
+    refuse_existing(options.out)  # before warnings, and what takes seconds
     with announced_compilation(print_notice):
         config = _configuration(options)
     if options.view:
@@ -101,13 +102,17 @@ def run(options: Namespace) -> int:
 
 def make_folder(path: Path) -> Path:
     """Create a folder; raises BlfDscError if it exists already."""
-    try:
-        path.mkdir(parents=True)
-    except FileExistsError:
+    refuse_existing(path)
+    path.mkdir(parents=True)
+    return path
+
+
+def refuse_existing(path: Path) -> None:
+    """Raise BlfDscError if something exists there."""
+    if path.exists():
         raise BlfDscError(
             f'{path} exists already and is not overwritten: choose another --out'
-        ) from None
-    return path
+        )
 
 
 def _configuration(options: Namespace) -> LoopConfig:

@@ -45,7 +45,7 @@ class _Listener(event.Listener):  # type: ignore[misc]
         total = max(self._count, len(KERNELS))
         self._say(
             f'{COMPILING}{self._count} of at most {total}, once for this version and kind of arm: '
-            f'{kernel.py_func.__name__}'
+            f'{kernel.py_func.__name__.strip("_").replace("_", " ")}'
         )
 
     def on_end(self, _event: object) -> None:
