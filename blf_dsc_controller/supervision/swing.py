@@ -15,11 +15,11 @@ so that 1/(tau omega)^2 of its damping damps it well.  So does the load observer
 acceleration of a joint that is lighter than its model by m multiplies the observer's gain.
 Where this is more than delay and rates bear, it shakes the joint as well.
 
-A swing is a half wave of v, from one turning point to the next, that is more than half as
-high as the one before, twice in a row.  Noise and steps of the sensor make none.  The
-springs of an elastic arm and of its base may also ring by themselves, which takes damping
-away that does them no good.  It comes back, twice as much after each pi tau in which a
-joint moves without turning: what falls is braked.
+A swing is a half wave of v, from one turning point to the next and through zero, that is
+more than half as high as the one before, twice in a row.  Noise and steps of the sensor
+make none.  The springs of an elastic arm and of its base may also ring by themselves, which
+takes damping away that does them no good.  It comes back, twice as much after each pi tau
+in which a joint moves in one direction: what falls is braked, also while its springs ring.
 """
 
 from __future__ import annotations
@@ -69,7 +69,7 @@ class Swing:
         self._travel = np.zeros(n)
         self._half = np.zeros(n)
         self._lasting = np.zeros(n)  # half waves in a row
-        self._steady = np.zeros(n)  # s, without a turning point or more damping
+        self._steady = np.zeros(n)  # s, in one direction and without more damping
 
     def begin(self) -> None:
         """Begin a stop with all of the damping."""
@@ -122,9 +122,9 @@ class Swing:
     ) -> None:
         """End the half waves of some joints (n,), over `travel` (n,) [rad/s]."""
         half = np.maximum(self._farthest_at, self._half)
-        lasts = (
-            ends & is_clear & (self._half > 0.0) & (travel > _LASTING * self._travel)
-        )
+        returns = self._turn * self._farthest < 0.0
+        lasts = ends & is_clear & returns & (self._half > 0.0)
+        lasts &= travel > _LASTING * self._travel
         self._lasting[ends] = np.where(lasts, self._lasting + 1.0, 0.0)[ends]
         swings = lasts & (self._lasting >= _IN_A_ROW) & (half < _LONGEST)
         borne = np.maximum(_SMALLEST, self.share * (half / _LONGEST) ** 2)
@@ -136,4 +136,4 @@ class Swing:
         self._turn[ends] = self._farthest[ends]
         self._since[ends] -= self._farthest_at[ends]
         self._direction[ends] *= -1.0
-        self._steady[ends] = 0.0
+        self._steady[ends & returns] = 0.0
