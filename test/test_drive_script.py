@@ -12,6 +12,7 @@ import signal
 import subprocess
 import sys
 import time
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -23,6 +24,7 @@ from blf_dsc_controller.cli.main import main
 from blf_dsc_controller.configuration.drive import DriveConfig
 from blf_dsc_controller.configuration.nodes import PLANT
 from blf_dsc_controller.drive.driver import ReflexError
+from blf_dsc_controller.drive.script import Script
 from blf_dsc_controller.drive.simulated import SIMULATED, simulated
 from blf_dsc_controller.errors import (
     DriveError,
@@ -30,6 +32,7 @@ from blf_dsc_controller.errors import (
     MotionFailedError,
     NotInTimeError,
 )
+from blf_dsc_controller.messages import script_link
 from blf_dsc_controller.messages.journal import EventType, decode
 from blf_dsc_controller.messages.topics import TARGETS
 
@@ -208,6 +211,24 @@ def test_a_stop_of_the_controller_is_an_error_and_can_be_recovered():
         arm.recover()
         arm.move_to(start, speed=0.5)
         np.testing.assert_allclose(arm.state.q, start, atol=NEAR)
+
+
+def test_a_script_is_told_that_the_arm_runs_once_the_law_has_its_first_sample():
+    """A start may be refused, or wait for states, for long."""
+    beside, told = Script.__new__(Script), []
+    guard = SimpleNamespace(has_sample=False, time=0.0)
+    link = SimpleNamespace(flush=lambda: False, put=lambda kind, _: told.append(kind))
+    beside._guard, beside._link, beside._told = guard, link, 0.0
+    beside._controller = SimpleNamespace(joints=('joint1',))
+    beside._goals = SimpleNamespace(watch=lambda _: None)
+    beside._loop = beside._loading = None
+    beside._braking, beside._tells_running = [], True
+    beside._report_now_and_then()
+    assert told == []
+    guard.has_sample = True
+    for _ in range(3):
+        beside._report_now_and_then()
+    assert told == [script_link.RUNNING]
 
 
 def test_a_block_does_not_end_silently_with_an_arm_that_has_stopped():

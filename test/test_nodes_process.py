@@ -33,7 +33,7 @@ from blf_dsc_controller.errors import BlfDscError, ConfigurationError
 from blf_dsc_controller.nodes.controller_node import ControllerNode
 from blf_dsc_controller.nodes.endpoints import PollingTimer
 from blf_dsc_controller.nodes.plant_node import PlantNode
-from blf_dsc_controller.nodes.process import assigned
+from blf_dsc_controller.nodes.process import assigned, drain
 from blf_dsc_controller.nodes.recorder_node import BagRecorderNode
 from blf_dsc_controller.nodes.watchdog_node import WatchdogNode
 from blf_dsc_controller.studies.runs import cores
@@ -458,6 +458,34 @@ def test_callbacks_of_timers_take_no_argument(ros, tmp_path, monkeypatch):
     assert len(callbacks) >= 8
     for callback in callbacks:
         assert not inspect.signature(callback).parameters, callback
+
+
+@pytest.mark.parametrize(
+    ('answers', 'levels'),
+    [([True], []), ([False, True], ['info']), ([False, False], ['info', 'warning'])],
+)
+def test_subscribers_that_are_late_are_waited_for_once_more_and_named(
+    answers, levels, monkeypatch
+):
+    """One has everything at once; of the other it is asked `answers`, in turn."""
+    said, asked = [], list(answers)
+    log = SimpleNamespace(
+        info=lambda text: said.append(('info', text)),
+        warning=lambda text: said.append(('warning', text)),
+    )
+    where = 'blf_dsc_controller.nodes.process.get_logger'
+    monkeypatch.setattr(where, lambda _: log)
+    swift, late = (
+        SimpleNamespace(topic_name=f'/{name}', wait_for_all_acked=answer)
+        for name, answer in (
+            ('swift', lambda _: True),
+            ('late', lambda _: asked.pop(0)),
+        )
+    )
+    drain([swift, late])
+    assert asked == []
+    assert [level for level, _ in said] == levels
+    assert all('/late' in text and '/swift' not in text for _, text in said)
 
 
 def test_nodes_without_work_poll_rarely_and_at_once_often_again(ros):

@@ -466,6 +466,23 @@ def test_plan_keeps_one_in_force_that_has_not_begun():
     assert len(unpack(guard.controller.reference_vector)) == 1  # the past is forgotten
 
 
+def test_arm_approaches_a_motion_that_begins_later_and_then_tracks_it():
+    rig = Rig()
+    rig.step(1500)
+    assert rig.supervisor.phase is Phase.TRACKING
+    to = Trajectory(JOINTS, (TrajectoryPoint(1.0, (2.1, 1.5)),))
+    begin = rig.guard.time + 0.3
+    plan = rig.guard.plan(to, begin)
+    assert plan.motion.settled >= begin
+    rig.guard.adopt(plan)
+    assert rig.supervisor.phase is Phase.APPROACHING
+    T = rig.guard.config.sample_time
+    rig.step(round((plan.motion.settled - rig.guard.time) / T) - 1)
+    assert rig.supervisor.phase is Phase.APPROACHING
+    rig.step(2)
+    assert rig.supervisor.phase is Phase.TRACKING
+
+
 def test_plan_is_followed_from_its_start_unless_late_or_from_a_replaced_reference():
     rig = Rig()
     rig.step(100)
