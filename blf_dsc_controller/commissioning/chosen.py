@@ -49,7 +49,7 @@ def with_gains(
     followed = {
         name: value
         for name, value in after.items()
-        if name in FOLLOWED or present[name] == before[name]
+        if name in FOLLOWED or (name in present and present[name] == before[name])
     }
     return change(config, {**followed, **values})
 
