@@ -430,6 +430,16 @@ def test_bound_is_wide_enough_for_what_the_gains_allow_and_never_narrowed():
     )
 
 
+def test_joint_whose_inertia_friction_hides_is_not_trusted():
+    seen = found()
+    hidden = seen.findings._replace(inertia=np.array([np.nan, 1.0]))
+    told = '\n'.join(sentences(seen._replace(findings=hidden)))
+    assert 'friction hides the inertia of joint1: ' in told
+    assert 'joints that stick' in told
+    assert '--prove' in told
+    assert 'stick' not in '\n'.join(sentences(seen))
+
+
 def test_gains_far_from_those_of_the_measurement_are_to_be_raised_in_steps():
     least = found()
     choice = least.choice._replace(factors=np.array([2.0, 6.0]))

@@ -85,8 +85,9 @@ def sentences(found: Commissioned) -> Iterator[str]:
     if hidden.any():
         names = ', '.join(np.array(found.joints)[hidden])
         yield (
-            f'friction hides the inertia of {names}: that of the URDF is used; a larger '
-            '--travel shows more'
+            f'friction hides the inertia of {names}: that of the URDF is used, and the margin is '
+            'that of joints that stick, not that of joints that slide: prove the gains (--prove), '
+            'or take half of feedback.stiffness and a wider bound'
         )
     choice = found.choice
     limit = choice.margin
