@@ -36,7 +36,8 @@ gears do not bear the gains of its maker has those that leave a margin of 0.5.
 `integrator`: this law with multiples of `disturbance.gain`, and of each the least factor by which
 the slow oscillation of the outstretched arm with its rated payload is damped in `joint_gains.py`
 (3 by the rule there; below 1 it grows), with the motors that the arm has.  `by the rule`: as much
-as leaves each joint this 3, without the most that the rule also sets.
+as leaves each joint this 3, without the most that the rule also sets.  Arms `*_rest` hold their
+posture, in gears with play.
 """
 
 from __future__ import annotations
@@ -137,6 +138,25 @@ ARMS = {
 }
 
 
+PLAY = 4e-4  # rad
+_NONE = ('-', '-', '-')
+
+
+def _resting(robot: str, label: str, joints: int, plant: _Changes) -> Arm:
+    """Return an arm that holds its posture, in gears with play."""
+    still: _Changes = {'reference.amplitude': [0.0] * (3 * joints)}
+    play = {'joint.backlash': [PLAY] * joints}
+    return Arm(robot, f'{label} at rest, play', {**plant, **play}, still, _NONE)
+
+
+RESTING = {
+    'ur5e_rest': _resting('ur5e', 'UR5e', 6, {}),
+    'panda_rest': _resting('panda', 'Panda, 1e4', 7, _gears(1e4, 7)),
+    'fr3_rest': _resting('fr3', 'FR3', 7, {}),
+}
+ALL = {**ARMS, **RESTING}
+
+
 class Figures(NamedTuple):
     """What becomes of an arm: errors [mrad]; NaN where it stops."""
 
@@ -152,7 +172,7 @@ class Figures(NamedTuple):
 @cache
 def gains_of(name: str) -> _Changes:
     """Return the gains of this law on an arm, by the names of their parameters."""
-    arm = ARMS[name]
+    arm = ALL[name]
     if not arm.is_chosen:
         return arm.gains
     factor = random_arms.largest(
@@ -198,7 +218,7 @@ def dob(arm: Arm, M0: np.ndarray, factor: float, pole: float) -> Feedback:
 @cache
 def equal(arm_name: str) -> Equal:
     """Return the gains with which rivals have the margin of this law."""
-    arm = ARMS[arm_name]
+    arm = ALL[arm_name]
     loop = loop_with(arm, gains_of(arm_name))
     of = random_arms.describe(loop.controller, loop.plant, POSTURES)
     margin = of.margin(random_arms.own_feedback(loop.controller, of.M0))
@@ -227,7 +247,7 @@ def equal(arm_name: str) -> Equal:
 
 def law_of(config: ControllerConfig, name: str, law: str) -> ControllerConfig:
     """Return the configuration of a controller with a rival."""
-    gains, robot = equal(name), ROBOTS[ARMS[name].robot]
+    gains, robot = equal(name), ROBOTS[ALL[name].robot]
     if law == PD:
         return random_arms.rival(
             config, robot, random_arms.JOINT_PD, {'gains.scale': gains.PD}
@@ -244,7 +264,7 @@ def figures(
     name: str, law: str, truth: int, changes: _Changes | None = None
 ) -> Figures:
     """Run a law on an arm, with `changes` of its gains if they are given."""
-    loop = loop_with(ARMS[name], {**gains_of(name), **(changes or {})}, law, truth)
+    loop = loop_with(ALL[name], {**gains_of(name), **(changes or {})}, law, truth)
     controller = loop.controller
     if law in (PD, CT, DOB):
         controller = law_of(controller, name, law)
@@ -273,7 +293,7 @@ def figures(
 def laws_of(name: str) -> tuple[str, ...]:
     """Return the laws of the table on an arm."""
     observes = (
-        loop_with(ARMS[name], gains_of(name)).controller.disturbance.observer_bandwidth
+        loop_with(ALL[name], gains_of(name)).controller.disturbance.observer_bandwidth
         > 0.0
     )
     return (THIS, *((NO_SENSORS,) if observes else ()), NO_LEARNING, PD, CT, DOB)
@@ -281,7 +301,7 @@ def laws_of(name: str) -> tuple[str, ...]:
 
 def row(name: str, law: str, found: list[Figures], others: list[Figures]) -> list[str]:
     """Return the worst of some arms with a law; `others` are those without learning."""
-    heads = [ARMS[name].label, law]
+    heads = [ALL[name].label, law]
     stops = [each.stop for each in found if each.stop]
     if stops:
         return [*heads, f'{len(stops)} of {len(found)} stop, {stops[0]}', *['-'] * 6]
@@ -302,7 +322,7 @@ def row(name: str, law: str, found: list[Figures], others: list[Figures]) -> lis
 
 def rows(name: str, truths: int) -> Iterator[list[str]]:
     """Compute the rows of an arm."""
-    arm = ARMS[name]
+    arm = ALL[name]
     yield [arm.label, 'goal', *arm.goal, f'{arm.known} s', '-', '8', '-']
     found = {
         law: [figures(name, law, k) for k in range(1, truths + 1)]
@@ -322,7 +342,7 @@ DAMPED = 3.0  # by the rule of `joint_gains.py`, which also bounds the integral'
 
 def integrator(name: str, truths: int) -> Iterator[list[str]]:
     """Compute the rows of an arm with multiples of its integral gain."""
-    loop = loop_with(ARMS[name], gains_of(name))
+    loop = loop_with(ALL[name], gains_of(name))
     usual = np.array(loop.controller.disturbance.gain)
     most = np.maximum(1.0, damped(loop, usual) / DAMPED)
     factors = {f'{factor:g}': factor + 0.0 * usual for factor in INTEGRALS}
@@ -358,7 +378,7 @@ def gains_row(name: str) -> list[str]:
     of = equal(name)
     own = gains_of(name).get('feedback.stiffness', 1.0)
     return [
-        ARMS[name].label,
+        ALL[name].label,
         f'{of.margin:.2f}',
         f'{own:.2g}',
         f'{of.PD:.2g}',
@@ -381,7 +401,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('table', nargs='?', choices=tables, default='goals')
     about = 'arms of each kind (5)'
     parser.add_argument('--truths', type=positive, default=5, help=about)
-    parser.add_argument('--arms', nargs='+', choices=ARMS, default=list(ARMS))
+    parser.add_argument('--arms', nargs='+', choices=ALL, default=list(ARMS))
 
 
 def main(given: argparse.Namespace) -> None:
