@@ -3,18 +3,19 @@
 
 from __future__ import annotations
 
-import importlib
-from pathlib import Path
-
 import numpy as np
 import pytest
 
+from benchmark import random_arms
 from blf_dsc_controller.law.sensor import FILTER
 from blf_dsc_controller.replay.verify import verify
+from blf_dsc_controller.run import FIRST_STAMP
 from blf_dsc_controller.simulation.loop import simulate, write_bag
+from blf_dsc_controller.supervision.guard import Guard
+from blf_dsc_controller.supervision.supervisor import Phase
 from blf_dsc_controller.supervision.swing import Swing
+from sim_plant.plant import plant_of
 
-BENCHMARK = Path(__file__).parents[1] / 'benchmark'
 T = 1e-3  # s
 LATE = 5  # samples until a torque acts and shows
 ASSUMED = 1.0  # kg m^2
@@ -101,17 +102,15 @@ IN_FLIGHT = 0.2  # s, with what swings until it is found
 
 
 @pytest.mark.parametrize('arm', ARMS)
-def test_stop_of_an_arm_that_nobody_foresaw_brakes_it(arm, monkeypatch, tmp_path):
+def test_stop_of_an_arm_that_nobody_foresaw_brakes_it(arm, tmp_path):
     """Random arms whose motors have down to a fifth of the guess, behind any gears.
 
     With all of the damping and the usual observer, a wrist goes on at 5 to 20 rad/s on all
     but the third.  What the law has sent before the stop still speeds wrists up.
     """
-    monkeypatch.syspath_prepend(str(BENCHMARK))
-    arms = importlib.import_module('random_arms')
     name, number = ARMS[arm]
-    study = arms.study_of(name, 'wide')
-    plant = arms.arm_of(study, number)
+    study = random_arms.study_of(name, 'wide')
+    plant = random_arms.arm_of(study, number)
     with np.errstate(all='ignore'):
         record = simulate(study.controller, plant, after_stop=1.3)
     n = len(plant.joints)
@@ -123,3 +122,19 @@ def test_stop_of_an_arm_that_nobody_foresaw_brakes_it(arm, monkeypatch, tmp_path
     write_bag(tmp_path / 'bag', record)
     result = verify(tmp_path / 'bag')
     assert (result.difference, result.remarks) == (None, ())
+
+
+def test_stop_names_the_joints_that_swing_in_it():
+    study = random_arms.study_of('fr3', 'wide')
+    guard = Guard(study.controller)
+    arm = plant_of(random_arms.arm_of(study, 9))
+    guard.activate()
+    with np.errstate(all='ignore'):
+        for k in range(1500):
+            stamp = FIRST_STAMP + k * study.controller.sample_time_ns
+            torque = guard.update(stamp, np.array(arm.measure()))
+            arm.step(torque)
+    assert guard.supervisor.phase is Phase.SAFE_STOP
+    text = guard.supervisor.text
+    assert text.count("joint 'fr3_joint7' swings under the damping of the stop") == 1
+    assert 'robot.rotor_inertia' in text

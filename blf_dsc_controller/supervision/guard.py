@@ -700,6 +700,8 @@ class Guard:
         missing = self._safe_stop.missing_effect
         if missing and self.supervisor.reason is not Reason.NO_EFFECT:
             self.supervisor.add(missing)
+        if swings := self._safe_stop.name_swings():
+            self.supervisor.add(swings)
         return torque
 
     def activate(self) -> None:

@@ -48,6 +48,7 @@ class SafeStop:
         self._torque = torque
         self._held = held
         self._speed = StopSpeed()
+        self._named = np.zeros(len(config.joints), dtype=np.bool_)
 
     def begin(
         self,
@@ -60,6 +61,7 @@ class SafeStop:
     ) -> None:
         """Begin the ramp of a stop at a speed [rad/s], the largest of a joint."""
         self._speed.begin(speed)
+        self._named[:] = False
         load = self._load_at_stop(reason) if was_running else self._samples.disturbance
         reached = reason not in (*_PERHAPS_UNREACHED, Reason.NO_EFFECT)
         self._torque.begin_ramp(
@@ -71,6 +73,7 @@ class SafeStop:
 
     def begin_deactivation(self, safety: Safety) -> None:
         """Begin the ramp of a law that leaves command in order."""
+        self._named[:] = False
         self._torque.begin_ramp(safety.deactivation_ramp, self._held.load())
 
     def advance(self, safety: Safety, dt: float) -> Vector | None:
@@ -95,6 +98,23 @@ class SafeStop:
             return ''
         self._torque.stop_observing()
         return f'the arm speeds up in the safe stop, to {speed:.3g} rad/s: engage the brakes'
+
+    def name_swings(self) -> str:
+        """Return a text about joints that swing in the stop and have not been named; or empty."""
+        new = self._torque.has_swung & ~self._named
+        if not new.any():
+            return ''
+        self._named |= new
+        names = [repr(self._joints[j]) for j in np.flatnonzero(new)]
+        what = (
+            f'joints {", ".join(names)} swing'
+            if len(names) > 1
+            else f'joint {names[0]} swings'
+        )
+        return (
+            f'{what} under the damping of the stop, which is taken down there: is a motor lighter '
+            'than robot.rotor_inertia, or a torque later than robot.lag?'
+        )
 
     @property
     def missing_effect(self) -> str:

@@ -116,6 +116,11 @@ class SafeTorque:
         self._observes = True
         self._yields = False
 
+    @property
+    def has_swung(self) -> NDArray[np.bool_]:
+        """Whether each joint (n,) has swung under the damping since the ramp began."""
+        return self._swing.has_swung
+
     def begin_ramp(
         self,
         duration: float,
