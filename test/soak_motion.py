@@ -51,6 +51,7 @@ from blf_dsc_controller.factory.settings import settings_of_config
 from blf_dsc_controller.messages import topics
 from blf_dsc_controller.nodes.plant_node import PlantNode
 from blf_dsc_controller.nodes.watchdog_node import WatchdogNode
+from blf_dsc_controller.supervision.safe_torque import OBSERVER
 from blf_dsc_controller.tool.tip_wrench import TipWrench
 
 CONTROLLER = '/blf_dsc_controller'
@@ -64,7 +65,7 @@ SLACK = 0.2  # rad/s beyond what the reference asks, as in `test_hang`
 USUAL, WAITING = 5, 100  # times slower than the computer's clock
 LATE = 3  # samples without a torque, from which on the arm waits for it
 MOVING = 0.1  # rad/s, beyond which an episode begins
-OBSERVED = 1.0 / 60.0 + 1.0 / 30.0  # s, in which the watchdog observes a load
+OBSERVED = sum(1.0 / rate for rate in OBSERVER)  # s, until the watchdog sees a load
 AVERAGED = 0.01  # s, over which the acceleration is a difference
 
 

@@ -22,8 +22,9 @@ from blf_dsc_controller.supervision.swing import Swing
 
 Vector = NDArray[np.float64]
 
-# rad/s, L1 and L2: slow against the lag of velocities and torques
-_OBSERVER = 60.0, 30.0
+OBSERVER = 60.0, 30.0
+"""L1 and L2 [rad/s] of the load: slow against the lag of velocities and torques."""
+
 _CALM_OBSERVER = 10.0, 10.0  # rad/s: slow against the oscillation of elastic joints
 # of the damping: an elastic joint that oscillates passes for a light one
 _LIGHTEST = 0.5
@@ -106,7 +107,7 @@ class SafeTorque:
         self.last = LastState(n)
         self._start = np.zeros(n)
         self._duration = self._elapsed = 0.0
-        self._usual = ObservedLoad(n, _OBSERVER)
+        self._usual = ObservedLoad(n, OBSERVER)
         self._calm = ObservedLoad(n, _CALM_OBSERVER)
         self._oscillates = False
         self._known_load = np.zeros(n)
