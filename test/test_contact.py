@@ -331,10 +331,10 @@ def test_load_is_filtered_as_least_squares_would():
             'contact.reaction: got stop, but without contact.enabled',
         ),
         (
-            ON | {'learning.prediction': 'lambda'},
-            'contact.enabled: got true with blf_dsc, lambda',
+            ON | {'law': 'paper'},
+            'contact.enabled: got true with law paper, whose gains.prediction is lambda',
         ),
-        (ON | {'law': 'slotine_li'}, 'contact.enabled: got true with slotine_li'),
+        (ON | {'law': 'slotine_li'}, 'contact.enabled: got true with law slotine_li'),
     ],
 )
 def test_bad_values_are_named_with_a_remedy(given, problem):
