@@ -25,6 +25,7 @@ from blf_dsc_controller.configuration.earlier_names import chosen_by
 from blf_dsc_controller.configuration.files import parse, share_folder
 from blf_dsc_controller.configuration.law_traits import GAINS
 from blf_dsc_controller.configuration.nodes import (
+    CONTROLLER,
     LoopConfig,
     RecorderConfig,
     dump,
@@ -40,6 +41,9 @@ from blf_dsc_controller.configuration.plant import PlantConfig
 from blf_dsc_controller.configuration.schema import build, flatten, parameters
 from blf_dsc_controller.errors import BlfDscError, ConfigurationError
 from blf_dsc_controller.factory.settings import settings_of_config
+from blf_dsc_controller.law.adaptation import GRADIENT
+from blf_dsc_controller.law.prediction import LAMBDA
+from blf_dsc_controller.law.state import STATE
 from blf_dsc_controller.messages import topics
 
 CHANGED = LoopConfig(
@@ -468,6 +472,42 @@ def test_the_law_paper_with_all_choices_of_blf_dsc_is_that_law(preset):
     np.testing.assert_array_equal(
         *(pack(settings_of_config(each)) for each in (ours, theirs))
     )
+
+
+@pytest.mark.parametrize(
+    ('name', 'printed'),
+    [
+        ('prediction', LAMBDA),
+        ('update', GRADIENT),
+        ('compensation', STATE),
+        ('bumpless', 0),
+        ('known_rate', 0),
+    ],
+)
+def test_each_choice_of_the_law_paper_is_as_printed_unless_it_is_given(name, printed):
+    """On an arm from a URDF, for which `blf_dsc` knows the rate."""
+    ours = load_loop('panda').controller
+    usual = {'law': 'paper', 'learning.weighing': False} | chosen_by(
+        'paper', flatten(ours)
+    )
+    for gains, as_printed in ((usual, False), (without(usual, f'gains.{name}'), True)):
+        changes = {CONTROLLER: gains | {'disturbance.observer_bandwidth': 0.0}}
+        settings = settings_of_config(load_loop('panda', changes).controller)
+        found = {
+            'prediction': settings.row.prediction,
+            'update': settings.adaptation.update,
+            'compensation': settings.compensation,
+            'bumpless': settings.disturbance.bumpless,
+            'known_rate': settings.surface.known_rate,
+        }
+        assert (found[name] == printed) == as_printed
+        assert settings.friction.bumpless == found['bumpless']
+        finds_changes = not (as_printed and name == 'prediction')
+        assert settings.excitation.change_detection == finds_changes
+
+
+def without(values, name):
+    return {each: value for each, value in values.items() if each != name}
 
 
 def test_a_law_of_the_package_has_its_gains_and_others_have_not(file):
