@@ -63,7 +63,7 @@ class Law(NamedTuple):
 
 _NONE = {'learning.weight': 0.0, 'learning.adaptation_gain': [0.0] * 48}
 _NEWTON = {
-    'learning.update': 'newton',
+    'gains.update': 'newton',
     'learning.adaptation_gain': [0.5] * 48,
     'gains.learning_weight': 100.0,
 }

@@ -22,39 +22,51 @@ import numpy as np
 from benchmark import soft_arms
 from benchmark.harness import print_table
 from benchmark.load_observer import LATER, PICK_UP, WEIGHT
+from blf_dsc_controller.configuration.nodes import LoopConfig
 from blf_dsc_controller.configuration.robot import parameters_of
 from blf_dsc_controller.factory.controller import begin, controller_of
+from blf_dsc_controller.law.state import State
 from sim_plant.plant import plant_of
 
 DELAYS = (None, 0.3, 0.15, 0.1, 0.05, 0.02)  # s; None: the load is never told
 TRUTH = 1
 
 
-def told(arm: str, integral: float, delay: float | None) -> tuple[np.ndarray, float]:
-    """Return the errors (k, n) [rad] of a run, and when the arm was found to have changed [s]."""
-    of = soft_arms.ARMS[arm]
-    gains = soft_arms.gains_of(arm)
+def loop_of(arm: str, integral: float) -> LoopConfig:
+    """Return an arm of `soft_arms` with a multiple of the integral gain that follows for it."""
+    of, gains = soft_arms.ARMS[arm], soft_arms.gains_of(arm)
     usual = soft_arms.loop_with(of, gains).controller.disturbance.gain
     changed = {**gains, 'disturbance.gain': [integral * each for each in usual]}
-    loop = soft_arms.loop_with(of, changed, truth=TRUTH)
+    return soft_arms.loop_with(of, changed, truth=TRUTH)
+
+
+def declare(state: State, load: np.ndarray, disturbance: np.ndarray) -> None:
+    """Add the parameters of a load to what is learned, and return d^3 (n,) to `disturbance`."""
+    for values in (state.estimate, state.latch.anchor):
+        values[: load.size] += load
+    state.disturbance[:] = disturbance
+
+
+def pick_up(loop: LoopConfig, delay: float | None) -> tuple[np.ndarray, float]:
+    """Run a pick-up; return errors (k, n) [rad], and when the law found a change [s], both from it.
+
+    The load is declared `delay` [s] after it; None: never.
+    """
     config, dt = loop.controller, loop.controller.sample_time
     controller, plant = controller_of(config), plant_of(loop.plant)
     robot, n = config.robot, len(config.joints)
     load = WEIGHT * parameters_of(robot, robot.chain(config.joints)).load
-    measurement = np.array(plant.measure())
-    begin(controller, config, *measurement.reshape(3, n)[:2])
-    picked = round(PICK_UP / dt)
-    errors = np.zeros((picked + round(LATER / dt), n))
+    begin(controller, config, *np.reshape(plant.measure(), (3, n))[:2])
     state, before, found = controller.state, np.zeros(n), np.nan
+    picked = round(PICK_UP / dt)
+    declared = None if delay is None else picked + round(delay / dt)
+    errors = np.zeros((picked + round(LATER / dt), n))
     for k, error in enumerate(errors):
-        measurement[:] = plant.measure()
         if k == picked:
-            before[:] = state.disturbance
-        if delay is not None and k == picked + round(delay / dt):
-            for values in (state.estimate, state.latch.anchor):
-                values[: load.size] += load
-            state.disturbance[:] = before
-        torque = controller.update(k * dt, dt, measurement)
+            before = state.disturbance.copy()
+        if k == declared:
+            declare(state, load, before)
+        torque = controller.update(k * dt, dt, np.array(plant.measure()))
         error[:] = controller.sample.xi1
         if np.isnan(found) and k > picked and state.change.changes[0] > 0.0:
             found = k * dt - PICK_UP
@@ -67,7 +79,7 @@ def rows(arm: str, integrals: list[float]) -> Iterator[list[str]]:
     """Compute the rows: each delay with each integral gain."""
     dt = soft_arms.loop_with(soft_arms.ARMS[arm], {}).controller.sample_time
     for integral, delay in itertools.product(integrals, DELAYS):
-        errors, found = told(arm, integral, delay)
+        errors, found = pick_up(loop_of(arm, integral), delay)
         errors = 1e3 * errors
         t = dt * np.arange(len(errors))
         norm = np.sqrt((errors**2).sum(axis=1))

@@ -404,7 +404,7 @@ SLOW_TO_FAST = (2.0, 5.0, 10.0, 20.0, 30.0, 60.0, 100.0)  # rad/s
 FINE = np.concatenate((np.geomspace(0.02, 5.0, 150), np.geomspace(5.05, 499.0, 1200)))
 
 
-def encircles(
+def destabilises(
     preset: LinearLoop, M: np.ndarray, joints: Joints, bandwidth: float, *, echo: bool
 ) -> np.ndarray:
     """Return whether the observer makes the loop unstable in each posture (k,).
@@ -412,28 +412,45 @@ def encircles(
     The loop is stable without it, so that det(I - T) has to encircle 0 for that, T being
     that from r to r.  Efforts are commands, an `echo`, or the torques at the links.
     """
+    T = response_of_observer(preset, M, joints, bandwidth, echo=echo)
+    one = np.eye(len(joints.motors))
+    phase = np.unwrap(np.angle(np.linalg.det(one - T)), axis=1)
+    return np.asarray(np.abs(phase[:, -1] - phase[:, 0]) > 0.8 * np.pi)
+
+
+def response_of_observer(
+    preset: LinearLoop, M: np.ndarray, joints: Joints, bandwidth: float, *, echo: bool
+) -> np.ndarray:
+    """Return the response (k, frequencies, n, n) from the torque r of the observer to r.
+
+    It is the filtered difference of what sensors show and what the model expects.
+    """
     config = preset.loop.controller
     settings = settings_of_config(config)
-    T, lag = config.sample_time, 0.5 * config.robot.lag
-    timing = Timing(T, drive_lag=lag, velocity_lag=lag)
+    dt, lag = config.sample_time, 0.5 * config.robot.lag
+    timing = Timing(dt, drive_lag=lag, velocity_lag=lag)
     s = np.asarray(2j * np.pi * FINE, complex)
-    z = np.exp(T * s)
-    pole, old = 1.0 - np.exp(-bandwidth * T), np.exp(-T / lag)
-    passed = pole / (1.0 - (1.0 - pole) / z) * (1.0 - old) / (1.0 - old / z)
-    difference = (1.0 - 1.0 / z) / T
+    z = np.exp(dt * s)
+    passed = pole_response(np.exp(-bandwidth * dt), z) * pole_response(
+        np.exp(-dt / lag), z
+    )
+    difference = (1.0 - 1.0 / z) / dt
     feedback = linear_feedback(settings, preset.assumed, settings.barrier.weight)
     G, C = arm_response(M, joints, timing, s), law_response(feedback, timing, s)
     one = np.eye(len(joints.motors))
     expected = (passed * difference**2)[:, None, None] * preset.assumed[:, None] @ G
     if echo:
-        held = np.exp(-timing.delay * T * s) / (1.0 + lag * s) * difference / s
+        held = np.exp(-timing.delay * dt * s) / (1.0 + lag * s) * difference / s
         sensed = (passed * held)[:, None, None] * one
     else:
         of_links = arm_response(M, joints._replace(motor_side=False), timing, s)
         sensed = (passed * difference * s)[:, None, None] * M[:, None] @ of_links
-    around = np.linalg.inv(one + C @ G) @ (sensed - expected)
-    phase = np.unwrap(np.angle(np.linalg.det(one - around)), axis=1)
-    return np.asarray(np.abs(phase[:, -1] - phase[:, 0]) > 0.8 * np.pi)
+    return np.asarray(np.linalg.inv(one + C @ G) @ (sensed - expected))
+
+
+def pole_response(decay: float, z: np.ndarray) -> np.ndarray:
+    """Return the response of a first-order filter that keeps `decay` of its value in a sample."""
+    return np.asarray((1.0 - decay) / (1.0 - decay / z))
 
 
 def declarations() -> Iterator[list[str]]:
@@ -446,7 +463,7 @@ def declarations() -> Iterator[list[str]]:
         cells = []
         for bandwidth in SLOW_TO_FAST:
             found = [
-                encircles(
+                destabilises(
                     preset,
                     share * preset.assumed,
                     Joints(MOTORS, VISCOUS, K * gears, 0.03, **changes),

@@ -105,8 +105,9 @@ _PUSHED = {'disturbance.constant': [8.0, 0.1]}  # 8 N m against joint 1
 _AT_REST = {'reference.amplitude': [0.0, 0.0], 'reference.offset': START}
 _LEAKY = {  # in the paper's form, eta = 0.02
     'disturbance.leakage': 0.02,
-    'learning.compensation': 'state',
-    'learning.bumpless': False,
+    'law': 'paper',
+    'gains.prediction': 'filtered',
+    'gains.update': 'newton',
     'truth.parameters': list(P),
     'truth.constant': [0.1, 0.1],
 }

@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from blf_dsc_controller.configuration.earlier_names import chosen_by
 from blf_dsc_controller.configuration.nodes import LoopConfig, load_loop
 from blf_dsc_controller.configuration.schema import change
 from blf_dsc_controller.law.controller import Controller
@@ -24,6 +25,16 @@ EXACT = {
     'truth.constant': [0.1, 0.1],
     'truth.amplitude': [0.1, 0.1],
 }
+
+
+def instead(*, known_rate: bool = False, **choices: object) -> dict[str, object]:
+    """Return what `blf_dsc` does for two links, but for these choices, as the law `paper`.
+
+    For an arm from a URDF give `known_rate=True`.
+    """
+    usual = chosen_by('paper', {}) | {'gains.known_rate': known_rate}
+    given = {f'gains.{name}': choice for name, choice in choices.items()}
+    return {'law': 'paper', **usual, **given}
 
 
 def configured(

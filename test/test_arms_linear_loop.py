@@ -7,6 +7,7 @@ from itertools import product
 
 import numpy as np
 import pytest
+from paper_case import instead
 
 from blf_dsc_controller.arms.joint_gains import (
     JointGains,
@@ -184,11 +185,11 @@ def test_the_integral_is_smaller_where_a_heavy_arm_is_hardly_damped():
 def test_a_law_of_joints_does_not_multiply_its_feedback_by_inertias():
     """The torque changes with an error by the joint's own gains, at any posture."""
     preset = {
+        **instead(),
         'feedback.inertia': 'none',
         'feedback.joint_stiffness': [600.0] * 6,
         'feedback.joint_damping': [30.0] * 6,
         'surface.time_constant': 0.001,
-        'surface.known_rate': False,
         'disturbance.gain': [0.0] * 6,
         'barrier.bound': [0.5] * 6,
     }

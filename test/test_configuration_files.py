@@ -12,16 +12,20 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 import yaml
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from blf_dsc_controller.compiled.layout import pack
 from blf_dsc_controller.configuration import files
 from blf_dsc_controller.configuration.controller import ControllerConfig
+from blf_dsc_controller.configuration.earlier_names import chosen_by
 from blf_dsc_controller.configuration.files import parse, share_folder
 from blf_dsc_controller.configuration.law_traits import GAINS
 from blf_dsc_controller.configuration.nodes import (
+    CONTROLLER,
     LoopConfig,
     RecorderConfig,
     dump,
@@ -36,6 +40,10 @@ from blf_dsc_controller.configuration.nodes import (
 from blf_dsc_controller.configuration.plant import PlantConfig
 from blf_dsc_controller.configuration.schema import build, flatten, parameters
 from blf_dsc_controller.errors import BlfDscError, ConfigurationError
+from blf_dsc_controller.factory.settings import settings_of_config
+from blf_dsc_controller.law.adaptation import GRADIENT
+from blf_dsc_controller.law.prediction import LAMBDA
+from blf_dsc_controller.law.state import STATE
 from blf_dsc_controller.messages import topics
 
 CHANGED = LoopConfig(
@@ -418,6 +426,88 @@ def test_gains_of_the_compared_laws_are_told_the_law_that_has_them(
     assert f'line 2: comparison.surface_gain: {surface}' in first
     assert f'line 2: comparison.leakage: {leakage}' in second
     assert all(f'the law {law}' in problem for problem in (first, second))
+
+
+@pytest.mark.parametrize(
+    ('law', 'update', 'bumpless'),
+    [
+        (
+            'blf_dsc',
+            (
+                'is a choice of the law paper: write law: paper, gains.prediction: "filtered", '
+                'gains.update: "gradient", gains.compensation: "reference", '
+                'gains.bumpless: true, gains.known_rate: false'
+            ),
+            'the law blf_dsc has no such choice: leave it out',
+        ),
+        ('paper', 'is called gains.update', 'is called gains.bumpless'),
+        (
+            'slotine_li',
+            'is called gains.update',
+            'the law slotine_li has no such choice',
+        ),
+        ('model_based', 'the law model_based has no', 'the law model_based has no'),
+    ],
+)
+def test_choices_between_the_law_and_the_paper_are_told_the_law_that_has_them(
+    file, law, update, bumpless
+):
+    text = f'law: {law}, learning: {{update: gradient, bumpless: true}}'
+    with pytest.raises(ConfigurationError) as caught:
+        load(
+            file(section('blf_dsc_controller', text)),
+            'blf_dsc_controller',
+            ControllerConfig,
+        )
+    first, second, *_ = caught.value.problems
+    assert f'line 2: learning.update: {update}' in first
+    assert f'line 2: learning.bumpless: {bumpless}' in second
+
+
+@pytest.mark.parametrize('preset', ['recommended', 'panda'])
+def test_the_law_paper_with_all_choices_of_blf_dsc_is_that_law(preset):
+    ours = load_loop(preset).controller
+    choices = chosen_by('paper', flatten(ours))
+    theirs = build(ControllerConfig, flatten(ours) | {'law': 'paper', **choices})
+    np.testing.assert_array_equal(
+        *(pack(settings_of_config(each)) for each in (ours, theirs))
+    )
+
+
+@pytest.mark.parametrize(
+    ('name', 'printed'),
+    [
+        ('prediction', LAMBDA),
+        ('update', GRADIENT),
+        ('compensation', STATE),
+        ('bumpless', 0),
+        ('known_rate', 0),
+    ],
+)
+def test_each_choice_of_the_law_paper_is_as_printed_unless_it_is_given(name, printed):
+    """On an arm from a URDF, for which `blf_dsc` knows the rate."""
+    ours = load_loop('panda').controller
+    usual = {'law': 'paper', 'learning.weighing': False} | chosen_by(
+        'paper', flatten(ours)
+    )
+    for gains, as_printed in ((usual, False), (without(usual, f'gains.{name}'), True)):
+        changes = {CONTROLLER: gains | {'disturbance.observer_bandwidth': 0.0}}
+        settings = settings_of_config(load_loop('panda', changes).controller)
+        found = {
+            'prediction': settings.row.prediction,
+            'update': settings.adaptation.update,
+            'compensation': settings.compensation,
+            'bumpless': settings.disturbance.bumpless,
+            'known_rate': settings.surface.known_rate,
+        }
+        assert (found[name] == printed) == as_printed
+        assert settings.friction.bumpless == found['bumpless']
+        finds_changes = not (as_printed and name == 'prediction')
+        assert settings.excitation.change_detection == finds_changes
+
+
+def without(values, name):
+    return {each: value for each, value in values.items() if each != name}
 
 
 def test_a_law_of_the_package_has_its_gains_and_others_have_not(file):

@@ -11,6 +11,7 @@ import pytest
 
 from blf_dsc_controller.configuration import schema
 from blf_dsc_controller.configuration.controller import ControllerConfig
+from blf_dsc_controller.configuration.law_gains import Paper
 from blf_dsc_controller.configuration.nodes import NODES, RecorderConfig, load_loop
 from blf_dsc_controller.configuration.plant import PlantConfig
 from blf_dsc_controller.configuration.schema import build, change, flatten, parameters
@@ -309,12 +310,13 @@ def test_choices_match_the_law():
     choices = {entry.name: entry.choices for entry in parameters(ControllerConfig)}
     for law in choices['law']:
         settings_of_config(build(ControllerConfig, TRUE_MODEL | {'law': law}))
+    of_paper = {entry.name: entry.choices for entry in parameters(Paper)}
     for name, numbers in (
         ('prediction', {'filtered': FILTERED, 'lambda': LAMBDA}),
         ('update', {'newton': NEWTON, 'gradient': GRADIENT}),
         ('compensation', {'reference': state.REFERENCE, 'state': state.STATE}),
     ):
-        given = choices[f'learning.{name}']
+        given = of_paper[name]
         assert {choice: k for k, choice in enumerate(given)} == numbers
 
 

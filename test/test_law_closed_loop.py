@@ -13,7 +13,7 @@ from closed_loop_case import (
     quick,
     recommended,
 )
-from paper_case import BOUND, EXACT, NO_DISTURBANCE, P, configured, run_preset
+from paper_case import BOUND, EXACT, NO_DISTURBANCE, P, configured, instead, run_preset
 from plain_law import PlainLaw, R, dynamics, regressor
 from plants import QUIET, START
 from scipy.integrate import solve_ivp
@@ -176,7 +176,7 @@ def test_first_latch_disturbs_neither_the_tracking_nor_the_disturbance_estimate(
     end = LATCH + 1.0
     true = 0.1 + 0.1 * np.sin(end)  # N m
     bumpless, paper = (
-        run_preset(end, law={'learning.bumpless': choice}) for choice in (True, False)
+        run_preset(end, law=instead(bumpless=choice)) for choice in (True, False)
     )
     off, late = (
         np.abs(loop.controller.state.disturbance - true).max()
@@ -317,12 +317,17 @@ def test_comparison_laws_are_the_linear_surface_with_their_gains(law, share):
     )  # not the 100 of learning.weight
 
 
+FROZEN = {
+    'learning.initial_estimate': list(P),
+    'learning.adaptation_gain': [0.0] * 3,
+    'disturbance.gain': [0.0] * 2,
+}
+
+
 def test_proposed_law_with_everything_known_and_frozen_equals_model_based():
-    frozen = {'learning.initial_estimate': list(P), 'disturbance.gain': [0.0] * 2}
-    frozen |= {'learning.adaptation_gain': [0.0] * 3}
     known = {'law': 'model_based', 'truth.parameters': list(P)}
     frozen, model_based = (
-        run_preset(10.0, NO_DISTURBANCE, law=law) for law in (frozen, known)
+        run_preset(10.0, NO_DISTURBANCE, law=law) for law in (FROZEN, known)
     )
     np.testing.assert_allclose(frozen.torque, model_based.torque, atol=1e-12)
     np.testing.assert_allclose(frozen.xi1, model_based.xi1, atol=1e-15)
@@ -340,7 +345,7 @@ def test_error_of_the_oracle_is_the_lag_of_the_surface_filter(
 
     xi1 compensates it by (K/2 + mu) xi1 in beta2, and by w xi1 = -K_p xi2 in the torque.  The
     reference's acceleration is 0.3 rad/s^2; the held torque adds half a sample to the lag.
-    With the known rate of beta2 neither is left.
+    With the known rate of beta2 neither is left, here of the law whose estimate is true and frozen.
     """
     gains = {'surface.gain': gain, 'surface.mu': mu, 'barrier.weight': weight}
     changes = {name: [value] * 2 for name, value in gains.items()}
@@ -349,8 +354,8 @@ def test_error_of_the_oracle_is_the_lag_of_the_surface_filter(
     rate = gain / 2.0 + mu + weight / np.array([60.0, 20.0])
     expected = (time_constant + 0.5e-3) * 0.3 / rate
     np.testing.assert_allclose(loop.largest(1.0), expected, rtol=0.05)
-    changes['surface.known_rate'] = True
-    loop = run_preset(8.0, preset='model_based', law=changes)
+    changes |= FROZEN | instead(known_rate=True)
+    loop = run_preset(8.0, NO_DISTURBANCE, law=changes)
     assert (loop.largest(1.0) < 0.2 * 0.5e-3 * 0.3 / rate).all()  # alpha2 does not lag
 
 

@@ -12,7 +12,7 @@ from functools import cache
 
 import numpy as np
 import pytest
-from paper_case import OFF, configured, several
+from paper_case import OFF, configured, instead, several
 from scipy.linalg import expm
 
 from benchmark.studies import load_study
@@ -26,7 +26,6 @@ from blf_dsc_controller.simulation.loop import simulate
 from blf_dsc_controller.studies.report import compare_pairs
 from blf_dsc_controller.studies.runs import run_chunk
 
-AT_STATE = {'learning.compensation': 'state'}
 # rad/s, first of the presets panda and ur5e, third of the last
 TONE = 1.2566370614359172
 
@@ -50,6 +49,11 @@ ROWS = {
 MIXTURES = ('panda, 0.76 kg in 0.5 s', 'ur5e, 1.26 kg put down again')
 """Rows whose first window is a mixture with a small residual."""
 UNCHECKED = {'learning.change_detection': False}
+
+
+def at_state(row):
+    """What is learned acts at the state."""
+    return instead(compensation='state', known_rate=ROWS[row][0] != 'noisy')
 
 
 def spectral_radius(T, *, learned=1.0, initial=1.0, at_state=False, delay=1):
@@ -122,9 +126,9 @@ def test_learning_breaks_no_bound_that_is_kept_without_it(name):
 @pytest.mark.parametrize('name', MIXTURES)
 def test_compensation_of_the_paper_breaks_the_bound_by_a_mixture(name):
     """It is a mixture that `residual_floor` explains; change detection does not latch it."""
-    (stop,) = run(name, AT_STATE | UNCHECKED).stops
+    (stop,) = run(name, at_state(name) | UNCHECKED).stops
     assert stop.reason == 'error past the bound'
-    checked = run(name, AT_STATE)
+    checked = run(name, at_state(name))
     assert not checked.stops
     assert np.abs(checked.error).max() < 0.3 * checked.bound[0, 0]
 
@@ -144,7 +148,7 @@ def test_torques_that_bang_between_their_limits_stop_the_arm():
 
     None stays at its limit for 0.5 s, but more than a fifth of the samples adds up.
     """
-    found = run('noisy, cosines', AT_STATE)
+    found = run('noisy, cosines', at_state('noisy, cosines'))
     (stop,) = found.stops
     assert stop.reason == 'torque saturated'
     begin = (

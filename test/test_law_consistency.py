@@ -15,6 +15,7 @@ from paper_case import (
     WINDOW,
     configured,
     end_of,
+    instead,
     payload,
     run_preset,
     several,
@@ -199,7 +200,7 @@ def test_window_after_a_change_may_be_partial_and_stays_near_the_estimate_before
 
 
 def test_change_detection_is_off_for_rows_of_lambda_which_contradict_each_other_on_any_arm():
-    config = configured('recommended', 1.0, {'learning.prediction': 'lambda'})
+    config = configured('recommended', 1.0, instead(prediction='lambda'))
     assert settings_of_config(config.controller).excitation.change_detection == 0
 
 

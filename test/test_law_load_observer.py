@@ -273,7 +273,7 @@ def test_load_that_is_never_learned_goes_to_the_disturbance_estimate():
     [
         ({'robot.torque_loop': False}, 'robot.torque_loop false'),
         ({'robot.effort': 'commanded'}, 'robot.effort commanded'),
-        ({'learning.prediction': 'lambda'}, 'learning.prediction lambda'),
+        ({'law': 'paper'}, 'gains.prediction is lambda'),
     ],
 )
 def test_without_sensors_or_rows_the_observer_is_refused(changes, named):

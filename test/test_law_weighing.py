@@ -165,7 +165,7 @@ def test_light_load_is_noticed_and_weighed():
 
 
 def test_weighing_what_cannot_be_weighed_is_rejected():
-    given = {'learning.prediction': 'lambda'}
+    given = {'law': 'paper'}
     with pytest.raises(
         ConfigurationError, match=r'weighing: got true with .*, but needs'
     ):

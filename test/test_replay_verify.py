@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 import recorded_run
 from command import OLDER, finished
+from paper_case import instead
 from random_arm import random_urdf
 from recorded_run import MILLISECOND, START, compared, of
 
@@ -22,7 +23,7 @@ from blf_dsc_controller.bags.content import read_content
 from blf_dsc_controller.bags.reader import read_run
 from blf_dsc_controller.cli.bags import DIFFERENT, PARTIAL
 from blf_dsc_controller.cli.main import main
-from blf_dsc_controller.configuration.earlier_names import RENAMED
+from blf_dsc_controller.configuration.earlier_names import RENAMED, chosen_by
 from blf_dsc_controller.configuration.nodes import load_loop
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.messages.codecs import JointStateEncoder
@@ -305,14 +306,14 @@ def test_what_limits_a_result_is_remarked(bag, entries, tmp_path, monkeypatch):
     """Another version or law, and messages that the recorder missed."""
 
     def change(content):
-        del content['parameters']['learning.compensation']
+        del content['parameters']['learning.anchor_weight']
 
     configured(entries, change)
     of(entries, MONITOR)[7][3] = None
     path = recorded_run.write(tmp_path / 'bag', entries, publishers=1)
     missed, newer = verify(path).remarks
     assert missed == f'the recorder missed messages of {MONITOR.resolved}: 1 missed'
-    assert 'before the law had learning.compensation' in newer
+    assert 'before the law had learning.anchor_weight' in newer
     monkeypatch.setattr('blf_dsc_controller.replay.verify.__version__', '9.9.9')
     (remark,) = verify(bag).remarks
     assert 'recorded by version 0.1.0 and replayed by 9.9.9' in remark
@@ -360,7 +361,7 @@ def test_removed_parameter_leaves_a_rule(
 
 
 def test_added_parameter_has_its_rule_for_older_bags(entries, tmp_path, monkeypatch):
-    name = 'learning.compensation'
+    name = 'disturbance.leakage'
 
     def change(content):
         del content['parameters'][name]
@@ -368,11 +369,11 @@ def test_added_parameter_has_its_rule_for_older_bags(entries, tmp_path, monkeypa
     configured(entries, change)
     path = recorded_run.write(tmp_path / 'bag', entries)
     found = []
-    for value in ('reference', 'state'):
+    for value in (0.25, 0.5):
         monkeypatch.setitem(older_parameters.ADDED, name, value)
         config = read_content(path).exact_config('')
-        found.append(config.learning.compensation)
-    assert found == ['reference', 'state']
+        found.append(config.disturbance.leakage)
+    assert found == [0.25, 0.5]
 
 
 def test_values_of_an_older_bag_need_no_word_to_insist(tmp_path):
@@ -450,6 +451,69 @@ def test_gains_of_the_compared_laws_were_those_of_all_laws(tmp_path, law):
     result = verify(bag)
     assert (result.difference, result.remarks, result.incomplete) == (None, (), ())
     assert read_content(bag).unknown_parameters == []
+
+
+CHOICES = {
+    'learning.prediction': 'lambda',
+    'learning.update': 'gradient',
+    'learning.compensation': 'state',
+    'learning.bumpless': False,
+    'surface.known_rate': False,
+}
+
+
+@pytest.mark.parametrize(
+    ('law', 'given'),
+    [
+        ('blf_dsc', {}),
+        ('paper', {}),
+        ('paper', instead(compensation='state')),
+        ('slotine_li', {'gains.update': 'gradient', 'gains.learning_weight': 1.0}),
+    ],
+)
+def test_choices_between_the_law_and_the_paper_were_those_of_all_laws(
+    tmp_path, law, given
+):
+    folder = recorded_run.record(tmp_path / 'new', 0.3, **{'law': law, **given})
+    entries = recorded_run.messages(folder)
+
+    def change(content):
+        parameters = content['parameters']
+        if law == 'paper':
+            parameters['law'] = 'blf_dsc'
+        for name, choice in CHOICES.items():
+            gain = f'gains.{name.rpartition(".")[2]}'
+            parameters[name] = parameters.pop(gain, chosen_by('paper', {})[gain])
+            assert law != 'paper' or given or parameters[name] == choice
+
+    configured(entries, change)
+    bag = recorded_run.write(tmp_path / 'old', entries)
+    result = verify(bag)
+    assert (result.difference, result.remarks, result.incomplete) == (None, (), ())
+    assert read_content(bag).unknown_parameters == []
+    assert read_content(bag).exact_config('').law == law
+
+
+def test_arm_of_a_urdf_in_a_bag_from_before_the_known_rate_had_none():
+    recorded = {'robot.urdf': 'arm.urdf', 'learning.update': 'newton'}
+    found = older_parameters.renamed(recorded)
+    assert (found['law'], found['gains.known_rate']) == ('paper', False)
+    assert found['gains.update'] == 'newton'
+    recorded['surface.known_rate'] = True
+    assert older_parameters.renamed(recorded) == {'robot.urdf': 'arm.urdf'}
+
+
+def test_choice_that_a_law_has_not_is_not_left_out_of_a_bag():
+    assert older_parameters.current({'learning.bumpless': True}, '', 'blf_dsc') == {}
+    for law in ('blf_dsc', 'model_based'):
+        with pytest.raises(BlfDscError, match=r'learning\.bumpless: unknown'):
+            older_parameters.current({'learning.bumpless': False}, '', law)
+    assert older_parameters.current({'learning.bumpless': False}, '', 'paper') == {
+        'gains.bumpless': False
+    }
+    assert (
+        older_parameters.current({'learning.bumpless': False}, '', 'slotine_li') == {}
+    )
 
 
 def test_journal_of_a_later_format_is_refused(entries, tmp_path):

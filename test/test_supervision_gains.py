@@ -8,7 +8,7 @@ from functools import partial
 
 import numpy as np
 import pytest
-from paper_case import EXACT, NO_DISTURBANCE, configured, run
+from paper_case import EXACT, NO_DISTURBANCE, P, configured, instead, run
 from plants import rigid_gears
 
 from blf_dsc_controller.arms.model import inertia_matrices
@@ -52,7 +52,7 @@ def test_presets_cause_no_warnings(preset):
         ('surface.gain', {'surface.time_constant': 0.05}),
         ('barrier.slope_limit', {'barrier.slope_limit': [2e4, 5e4]}),
         ('learning.weight', {'learning.weight': 2500.0}),
-        ('learning.weight', {'learning.update': 'gradient'}),
+        ('learning.weight', instead(update='gradient')),
         ('learning.window', {'learning.window': 5.0}),
     ],
 )
@@ -114,9 +114,11 @@ def test_change_must_not_worsen_an_existing_warning_nor_cause_one(gain, accepted
 
 
 def test_filter_that_knows_the_rate_of_its_input_does_not_ring():
-    changes = {'surface.time_constant': 0.05, 'surface.known_rate': True} | EXACT
+    changes = {'surface.time_constant': 0.05} | EXACT | instead(known_rate=True)
     assert warnings(changes) == []
-    assert np.abs(run(configured('model_based', 4.0, changes)).xi1).max() < BOUND / 4.0
+    known = {'learning.initial_estimate': list(P)}
+    loop = configured('recommended', 4.0, changes | known, NO_DISTURBANCE)
+    assert np.abs(run(loop).xi1).max() < BOUND / 4.0
 
 
 def test_laws_cause_no_warnings_about_gains_they_do_not_have():
@@ -156,7 +158,7 @@ STRONG = {'learning.adaptation_gain': [0.02] * 3, 'learning.weight': 2100.0}
         ('', STRONG | {'learning.weight': 900.0}, 12.0, leaves_the_bound),
         (
             'learning.weight: kappa lambda_max',
-            {'learning.update': 'gradient', 'learning.weight': 30.0},
+            instead(update='gradient') | {'learning.weight': 30.0},
             9.0,
             lambda loop: loop.parameter_error[-1] > 0.5,
         ),
@@ -422,10 +424,8 @@ def test_lag_of_the_surface_filter_costs_margin_at_low_rates(known_rate, expecte
     """Of an arm that is 1.4 and 1.6 times lighter, with time constants of one and two samples."""
     found = []
     for time_constant in (0.004, 0.008):
-        surface = {
-            'surface.time_constant': time_constant,
-            'surface.known_rate': known_rate,
-        }
+        surface = instead(known_rate=known_rate)
+        surface['surface.time_constant'] = time_constant
         config = arm_of('panda_rigid', 0.004, surface)
         settings = settings_of_config(config)
         M0 = inertias(config, settings)

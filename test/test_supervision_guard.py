@@ -6,6 +6,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from fault_table import JOINTS, MILLISECOND, Rig, jammed, sparse
+from paper_case import instead
 from plain_law import dynamics
 
 from blf_dsc_controller.configuration.controller import ControllerConfig
@@ -417,11 +418,15 @@ EXCITED = {
         # Gradient: kappa Gamma lambda_max T >= 2; here kappa is 100 and lambda_max
         # about 100.
         (
-            EXCITED,
-            {'learning.update': 'gradient'},
-            'learning.weight: with the update gradient',
+            EXCITED | instead(),
+            {'gains.update': 'gradient'},
+            'learning.weight: the gradient step',
         ),
-        (EXCITED, {'learning.update': 'gradient', 'learning.weight': 2.0}, ''),
+        (
+            EXCITED | instead(),
+            {'gains.update': 'gradient', 'learning.weight': 2.0},
+            '',
+        ),
     ],
 )
 def test_gains_that_a_running_law_cannot_adopt_are_rejected(start, given, message):

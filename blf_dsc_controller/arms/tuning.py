@@ -215,7 +215,6 @@ def _of_arm(arm: Design) -> dict[str, Value]:
     return {
         'joints': tuple(joint.name for joint in chain.joints),
         'surface.time_constant': max(arm.sample_time, SURFACE),
-        'surface.known_rate': True,
         'feedback.robust_gain': zeros,
         'torque.limit': _listed(effort),
         'torque.rate_limit': zeros,

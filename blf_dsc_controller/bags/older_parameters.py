@@ -15,11 +15,14 @@ from blf_dsc_controller.bags.sources import BagError
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.earlier_names import (
     RENAMED,
+    SWITCHES,
     by_point,
+    chosen_by,
     is_comparison,
+    is_usual,
     of_law,
 )
-from blf_dsc_controller.configuration.law_traits import LAWS
+from blf_dsc_controller.configuration.law_traits import LAWS, OWN
 from blf_dsc_controller.configuration.plausibility import CHECKED
 from blf_dsc_controller.configuration.schema import (
     Value,
@@ -32,8 +35,13 @@ from blf_dsc_controller.configuration.schema import (
 REMOVED: dict[str, Value] = {}
 """Last default of each parameter of the first release that is gone now."""
 
+_IGNORED = dict.fromkeys(
+    ('backstepping', 'slotine_li'),
+    ('learning.compensation', 'learning.bumpless', 'surface.known_rate'),
+)
+"""Those of `SWITCHES` that had no effect on a law."""
+
 ADDED: dict[str, Value] = {
-    'surface.known_rate': False,
     'disturbance.observer_bandwidth': 0.0,
     'safety.oscillation': 'ignore',
     'insist': CHECKED,
@@ -77,8 +85,10 @@ def renamed(recorded: Mapping[str, Any], law: str = '') -> dict[str, Any]:
 
     `law` is as in `current`. `reference.points` were waypoints joint by joint; gains of
     other laws than the recorded one, which had no effect, are left out, and so is a model
-    that follows from the URDF.
+    that follows from the URDF. Choices between the law and the paper are those of the law
+    `paper`, if they are not what `blf_dsc` does.
     """
+    recorded = _with_law_of_choices(recorded, law)
     law = law or recorded.get('law', LAWS[0])
     names = {
         name: of_law(name, law) if is_comparison(name) else RENAMED.get(name, name)
@@ -92,6 +102,31 @@ def renamed(recorded: Mapping[str, Any], law: str = '') -> dict[str, Any]:
     if points is not None and (not points or by_point(points, len(times))):
         del values['reference.points']
         values['reference.waypoints'] = by_point(points, len(times))
+    return values
+
+
+def _with_law_of_choices(recorded: Mapping[str, Any], law: str) -> dict[str, Any]:
+    """Return recorded parameters with the law and the gains that `SWITCHES` ask for.
+
+    Left out are those that say what the law does anyhow, or that had no effect on it.
+    """
+    choices = {name: recorded[name] for name in SWITCHES if name in recorded}
+    values = {name: value for name, value in recorded.items() if name not in choices}
+    if not choices:
+        return values
+    if not law:  # all parameters; a bag with some of these is older than the last
+        choices.setdefault('surface.known_rate', False)
+    unusual = [name for name in choices if not is_usual(name, choices[name], recorded)]
+    running = law or recorded.get('law', LAWS[0])
+    if unusual and not law and running in OWN:
+        running = 'paper'
+        values |= {'law': running, **chosen_by(running, recorded)}
+    for name, value in choices.items():
+        gain = of_law(name, running)
+        if gain:
+            values[gain] = value
+        elif name in unusual and name not in _IGNORED.get(running, ()):
+            values[name] = value  # nothing does so any more
     return values
 
 

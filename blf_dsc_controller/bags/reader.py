@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from blf_dsc_controller.bags.content import NO_NAMES, Content, NameMap, read_content
 from blf_dsc_controller.bags.sources import BagError
 from blf_dsc_controller.bags.topic_messages import JointStates, TopicMessages, Values
+from blf_dsc_controller.configuration.law_traits import OWN
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.messages import topics
 from blf_dsc_controller.messages.codecs import JOINT_STATE_FIELDS
@@ -356,7 +357,7 @@ def _learns(settings: Sequence[Mapping[str, Any]]) -> bool:
     weights = [
         each['learning.weight'] for each in settings if 'learning.weight' in each
     ]
-    return laws <= {'blf_dsc'} and any(weights or [1.0])
+    return laws <= set(OWN) and any(weights or [1.0])
 
 
 class TorqueError(BlfDscError):

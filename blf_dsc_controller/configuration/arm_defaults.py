@@ -16,7 +16,12 @@ from blf_dsc_controller.arms.urdf import Chain
 from blf_dsc_controller.configuration import tool_bound
 from blf_dsc_controller.configuration.controller_groups import Feedback, Surface
 from blf_dsc_controller.configuration.law_file import GROUP
-from blf_dsc_controller.configuration.law_traits import GAINS, LAWS
+from blf_dsc_controller.configuration.law_traits import (
+    GAINS,
+    LAWS,
+    OWN,
+    has_exact_rows,
+)
 from blf_dsc_controller.configuration.robot import (
     ArmConfig,
     Robot,
@@ -48,7 +53,7 @@ def followed_by(given: Mapping[str, Any]) -> Mapping[str, Value]:
     is_whole = bound is not None and len(bound) == len(chain.joints)
     return {
         **described(robot, chain),
-        'learning.weighing': given.get('learning.prediction', 'filtered') == 'filtered',
+        'learning.weighing': has_exact_rows(given),
         'feedback.stiffness': arm.stiffness,
         'disturbance.observer_bandwidth': _observer_bandwidth(given, robot, arm),
         **tuning.gains_of(arm, np.array(bound) if is_whole else None),
@@ -87,7 +92,7 @@ def stated_design(
     """
     motors = robot.rotors(chain)
     gears = _gears(robot, chain, motors)
-    is_own = given.get('law', LAWS[0]) == LAWS[0]
+    is_own = given.get('law', LAWS[0]) in OWN
     usual = 'whole' if not is_own or (gears and gears.has_torque_loop) else 'none'
     is_whole = given.get('feedback.inertia', usual) != 'none'
     gains = _given_gains(given, len(motors)) or unknown_arm(motors)
@@ -110,10 +115,9 @@ def _observer_bandwidth(
 ) -> float:
     """Return the pole of the load observer of an arm with joint torque sensors [rad/s]; else 0."""
     has_sensors = robot.torque_loop and robot.effort == 'whole'
-    is_own = given.get('law', LAWS[0]) == LAWS[0]
-    has_rows = given.get('learning.prediction', 'filtered') == 'filtered'
+    is_own = given.get('law', LAWS[0]) in OWN and has_exact_rows(given)
     is_soft = arm.joints is not None
-    return _OBSERVER if has_sensors and is_own and has_rows and is_soft else 0.0
+    return _OBSERVER if has_sensors and is_own and is_soft else 0.0
 
 
 def _gears(robot: Robot, chain: Chain, motors: np.ndarray) -> Gears | None:

@@ -35,7 +35,13 @@ from blf_dsc_controller.configuration.controller_groups import (
     Torque,
     sizing,
 )
-from blf_dsc_controller.configuration.law_traits import LAWS, gains_of, traits_of
+from blf_dsc_controller.configuration.law_traits import (
+    LAWS,
+    OWN,
+    gains_of,
+    has_exact_rows,
+    traits_of,
+)
 from blf_dsc_controller.configuration.motion_groups import (
     Approach,
     MotionLimits,
@@ -51,6 +57,8 @@ from blf_dsc_controller.configuration.schema import (
     flatten,
 )
 from blf_dsc_controller.errors import BlfDscError
+
+_FILTERED = '; of the law paper, gains.prediction filtered'
 
 
 @dataclass(frozen=True)
@@ -149,13 +157,21 @@ class ControllerConfig(ArmConfig):
 
     def _weighing_problems(self) -> Iterator[str]:
         """Check that the load in the tip can be weighed."""
-        prediction = self.learning.prediction
-        can_weigh = self.model == 'urdf' and prediction == 'filtered'
+        can_weigh = self.model == 'urdf' and self._has_exact_rows()
         if self.learning.weighing and not can_weigh:
             yield (
-                f'learning.weighing: got true with model {self.model} and learning.prediction '
-                f'{prediction}, but needs robot.urdf and filtered'
+                f'learning.weighing: got true with model {self.model} and {self._rows()}, but '
+                f'needs robot.urdf{_FILTERED}'
             )
+
+    def _has_exact_rows(self) -> bool:
+        """Whether loads and contacts show in the rows that the law learns from."""
+        return has_exact_rows(flatten(self))
+
+    def _rows(self) -> str:
+        """Return the law, and its rows if these are not exact."""
+        rows = '' if self._has_exact_rows() else ', whose gains.prediction is lambda'
+        return f'law {self.law}{rows}'
 
     def _drive_load_problems(self) -> Iterator[str]:
         """Check that the load can be declared to the drives, and how."""
@@ -183,12 +199,11 @@ class ControllerConfig(ArmConfig):
     def _contact_problems(self) -> Iterator[str]:
         """Check that contacts are found, and by a law that can find them."""
         contact = self.contact
-        prediction = self.learning.prediction
-        can_find = traits_of(self).learns and prediction == 'filtered'
+        can_find = traits_of(self).learns and self._has_exact_rows()
         if contact.enabled and not can_find:
             yield (
-                f'contact.enabled: got true with {self.law}, {prediction}, but the external torque '
-                f'needs a law that learns, such as {LAWS[0]}, and learning.prediction filtered'
+                f'contact.enabled: got true with {self._rows()}, but the external torque needs a '
+                f'law that learns, such as {LAWS[0]}{_FILTERED}'
             )
         if contact.reaction != 'none' and not contact.enabled:
             yield (
@@ -206,12 +221,11 @@ class ControllerConfig(ArmConfig):
                 f'{str(self.robot.torque_loop).lower()} and robot.effort {self.robot.effort}, but '
                 'needs joint torque sensors, which efforts show: true and whole'
             )
-        is_own = self.law == LAWS[0] and self.model == 'urdf'
-        if bandwidth > 0.0 and not (is_own and self.learning.prediction == 'filtered'):
+        is_own = self.law in OWN and self.model == 'urdf'
+        if bandwidth > 0.0 and not (is_own and self._has_exact_rows()):
             yield (
-                f'disturbance.observer_bandwidth: got {bandwidth:g} rad/s with law {self.law}, '
-                f'model {self.model} and learning.prediction {self.learning.prediction}, but needs '
-                f'{LAWS[0]}, robot.urdf and filtered'
+                f'disturbance.observer_bandwidth: got {bandwidth:g} rad/s with model {self.model} '
+                f'and {self._rows()}, but needs {LAWS[0]} and robot.urdf{_FILTERED}'
             )
 
     def _stiffness_problems(self) -> Iterator[str]:
@@ -235,7 +249,7 @@ class ControllerConfig(ArmConfig):
             )
         given = bool(feedback.joint_stiffness), bool(feedback.joint_damping)
         acts = feedback.inertia == 'none' and self.model == 'urdf'
-        if any(given) and self.law == LAWS[0] and not acts:
+        if any(given) and self.law in OWN and not acts:
             yield (
                 'feedback.joint_stiffness, feedback.joint_damping: gains follow from them only '
                 f'for a URDF with feedback.inertia none, but got {feedback.inertia} and model '

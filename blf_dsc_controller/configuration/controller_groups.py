@@ -28,9 +28,10 @@ _telemetry = partial(
     parameter, read_only='topics are created once, when the node starts'
 )
 sizing = partial(parameter, read_only='it sets the size of the state of the law')
-_in_window = partial(
+in_window = partial(
     parameter, read_only='the data in the excitation window depend on it'
 )
+"""Declare a parameter on which the rows of a window depend."""
 _at_start = partial(parameter, read_only='it has no effect later')
 _measured = partial(parameter, read_only='it says how the gains were found')
 _FOLLOWED = 'the other gains follow from it when they are read: change those'
@@ -126,8 +127,8 @@ class ArmGeometry:
     The masses and the length of the second link are learned.
     """
 
-    l1: float = _in_window(1.0, 'length of the first link', 'm', 'l1', above=0.0)
-    gravity: float = _in_window(9.8, 'gravity; 0 for a horizontal arm', 'm/s^2', 'g')
+    l1: float = in_window(1.0, 'length of the first link', 'm', 'l1', above=0.0)
+    gravity: float = in_window(9.8, 'gravity; 0 for a horizontal arm', 'm/s^2', 'g')
 
 
 @dataclass(frozen=True)
@@ -220,12 +221,6 @@ class Surface:
     )
     time_constant: float = positive(
         0.002, 'time constant of the surface filter', 's', 'lambda'
-    )
-    known_rate: bool = parameter(
-        False,
-        'tell the surface filter the rate of the virtual control, by the reference and the '
-        'measured velocity, so that it has no lag; the default of an arm from a URDF',
-        read_only='the torque would jump',
     )
 
 
@@ -339,13 +334,6 @@ class Learning:
     weight: float = non_negative(
         100.0, 'weight of the prediction error; 0: no learning from it', symbol='kappa'
     )
-    update: Literal['newton', 'gradient'] = parameter(
-        'newton',
-        'step along the prediction error: regularised Newton, or the gradient (paper)',
-    )
-    prediction: Literal['filtered', 'lambda'] = _in_window(
-        'filtered', 'prediction error by filtered regressor, or by Lambda (24)'
-    )
     regularization: float = positive(
         1e-5, 'regularisation of the Newton step', symbol='rho'
     )
@@ -368,13 +356,13 @@ class Learning:
         'T_a',
         at_least=0.0,
     )
-    filter_pole: float = _in_window(
+    filter_pole: float = in_window(
         10.0, 'pole of the filters on regressor and torque', 'rad/s', above=0.0
     )
     bias: bool = sizing(True, 'also estimate a constant disturbance of each joint')
     viscous: bool = sizing(False, 'also estimate the viscous friction of each joint')
     coulomb: bool = sizing(False, 'also estimate the Coulomb friction of each joint')
-    coulomb_velocity: float = _in_window(
+    coulomb_velocity: float = in_window(
         0.01,
         'velocity scale of the sign change of the Coulomb column',
         'rad/s',
@@ -395,14 +383,6 @@ class Learning:
     )
     radius: float = positive(
         3.0, 'radius of the projection ball of P^', 'kg m^2', 'omega_a'
-    )
-    compensation: Literal['reference', 'state'] = parameter(
-        'reference',
-        'where what is learned acts: along the reference, or at the state (paper)',
-    )
-    bumpless: bool = parameter(
-        True,
-        'let the disturbance estimate offset the torque that the prediction error adds',
     )
     change_detection: bool = sizing(
         True, 'discard a window that torques contradict, because the arm has changed'
@@ -470,7 +450,7 @@ class Contact:
     enabled: bool = sizing(
         False, 'compute the external torque with its interval, and detect contacts'
     )
-    bandwidth: float = _in_window(
+    bandwidth: float = in_window(
         30.0,
         'pole of the filter of the external torque: a larger one is faster, '
         'but noisier',

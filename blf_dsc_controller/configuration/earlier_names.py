@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from blf_dsc_controller.configuration.law_file import GROUP
-from blf_dsc_controller.configuration.law_traits import GAINS, LAWS
+from blf_dsc_controller.configuration.law_traits import GAINS, LAWS, OWN
 from blf_dsc_controller.configuration.schema import format_value, parameters
 
 RENAMED = {
@@ -24,6 +24,15 @@ RENAMED = {
     'learning.load_in_motion': 'load.in_motion',
 }
 """Names of this version, by earlier ones with the same meaning."""
+
+SWITCHES = (
+    'learning.prediction',
+    'learning.update',
+    'learning.compensation',
+    'learning.bumpless',
+    'surface.known_rate',
+)
+"""Choices between `blf_dsc` and the paper that all laws had."""
 
 _COMPARISON = 'comparison.'
 _REASONS = {
@@ -39,9 +48,12 @@ def remedies(given: Mapping[str, Any]) -> Mapping[str, str]:
         for name, new in RENAMED.items()
         if name in given
     }
+    law = given.get('law', LAWS[0])
     for name in given:
         if is_comparison(name):
-            found[name] = _of_comparison(name, given.get('law', LAWS[0]))
+            found[name] = _of_comparison(name, law)
+        elif name in SWITCHES:
+            found[name] = _of_switch(name, law, given)
     if 'model' in given:
         found['model'] = (
             'follows from robot.urdf: give that, or nothing for the two links'
@@ -57,8 +69,11 @@ def is_comparison(name: str) -> bool:
 
 
 def of_law(name: str, law: object) -> str:
-    """Return the name by which this law has a gain `comparison.NAME`; empty: it has none."""
-    gain = name.removeprefix(_COMPARISON)
+    """Return the name of this law's gain for one of `comparison.*` or `SWITCHES`.
+
+    Empty: it has none.
+    """
+    gain = name.rpartition('.')[2]
     group = GAINS.get(law) if isinstance(law, str) else None
     has_it = group is not None and any(each.name == gain for each in parameters(group))
     return f'{GROUP}.{gain}' if has_it else ''
@@ -69,6 +84,32 @@ def _of_comparison(name: str, law: object) -> str:
     if new:
         return f'is called {new}, and belongs to the law {law}'
     return f'it has no effect on the law {law}: leave it out'
+
+
+def chosen_by(law: str, given: Mapping[str, Any]) -> dict[str, Any]:
+    """Return what `blf_dsc` does as gains of `law`, for the arm of given parameters."""
+    usual = 'filtered', 'newton', 'reference', True, bool(given.get('robot.urdf'))
+    choices = zip(SWITCHES, usual, strict=True)
+    named = {of_law(name, law): value for name, value in choices}
+    return {name: value for name, value in named.items() if name}
+
+
+def is_usual(name: str, value: object, given: Mapping[str, Any]) -> bool:
+    """Whether a law without this one of `SWITCHES` does what it says."""
+    return bool(chosen_by('paper', given)[of_law(name, 'paper')] == value)
+
+
+def _of_switch(name: str, law: object, given: Mapping[str, Any]) -> str:
+    new = of_law(name, law)
+    if new:
+        return f'is called {new}, and belongs to the law {law}'
+    if law not in OWN or is_usual(name, given[name], given):
+        return f'the law {law} has no such choice: leave it out'
+    gains = chosen_by('paper', given) | {
+        of_law(each, 'paper'): given[each] for each in SWITCHES if each in given
+    }
+    listed = ', '.join(f'{gain}: {format_value(each)}' for gain, each in gains.items())
+    return f'is a choice of the law paper: write law: paper, {listed}'
 
 
 def _of_points(given: Mapping[str, Any]) -> str:

@@ -8,12 +8,42 @@ The controller has them if that law is chosen, as it has those of a law of a fil
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Literal
 
+from blf_dsc_controller.configuration.controller_groups import in_window
 from blf_dsc_controller.configuration.schema import (
     PerJoint,
     non_negative,
+    parameter,
     positive,
 )
+
+_UPDATE = 'step along the prediction error: regularised Newton, or the gradient (paper)'
+
+
+@dataclass(frozen=True)
+class Paper:
+    """What `paper` does as printed; the other choice is that of `blf_dsc`."""
+
+    prediction: Literal['filtered', 'lambda'] = in_window(
+        'lambda', 'prediction error by filtered regressor, or by Lambda (24)'
+    )
+    update: Literal['newton', 'gradient'] = parameter('gradient', _UPDATE)
+    compensation: Literal['reference', 'state'] = parameter(
+        'state',
+        'where what is learned acts: along the reference, or at the state (28)',
+    )
+    bumpless: bool = parameter(
+        False,
+        'let the disturbance estimate offset the torque that the prediction error adds; '
+        'false: (30)',
+    )
+    known_rate: bool = parameter(
+        False,
+        'tell the surface filter the rate of the virtual control, by the reference and the '
+        'measured velocity, so that it has no lag; `blf_dsc` does so for an arm from a URDF',
+        read_only='the torque would jump',
+    )
 
 
 @dataclass(frozen=True)
@@ -35,6 +65,7 @@ class LinearSurface:
         '',
         'kappa',
     )
+    update: Literal['newton', 'gradient'] = parameter('newton', _UPDATE)
 
 
 @dataclass(frozen=True)

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Mapping
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from blf_dsc_controller.configuration import law_file, law_gains
 from blf_dsc_controller.configuration.checked import Checked
@@ -22,6 +22,7 @@ class Traits(NamedTuple):
 
 _PACKAGED = {
     'blf_dsc': Traits(has_barrier=True, learns=True),
+    'paper': Traits(has_barrier=True, learns=True),
     'model_based': Traits(has_barrier=True, learns=False),
     'backstepping': Traits(has_barrier=False, learns=False),
     'slotine_li': Traits(has_barrier=False, learns=False),
@@ -30,7 +31,11 @@ _PACKAGED = {
 LAWS = tuple(_PACKAGED)
 """Laws of the package; the first is the default."""
 
+OWN = ('blf_dsc', 'paper')
+"""Laws with the feedback and the learning of (28): gains follow from an arm for these."""
+
 GAINS: Mapping[str, type] = {
+    'paper': law_gains.Paper,
     'backstepping': law_gains.Backstepping,
     'slotine_li': law_gains.SlotineLi,
 }
@@ -44,6 +49,17 @@ def traits_of(config: Checked) -> Traits:
     gains = dataclasses.asdict(getattr(config, law_file.GROUP))
     law = law_file.load_law(config.law)(**gains)
     return Traits(bool(law.has_barrier), bool(getattr(law, 'learns', False)))
+
+
+def has_exact_rows(given: Mapping[str, Any]) -> bool:
+    """Whether the rows that are learned from hold in any motion, by given parameters.
+
+    Loads and contacts show in such rows only; the paper's (24) are not.
+    """
+    usual = law_gains.Paper.prediction
+    prediction = given.get(f'{law_file.GROUP}.prediction', usual)
+    is_paper: bool = given.get('law', LAWS[0]) == 'paper'
+    return not is_paper or bool(prediction == 'filtered')
 
 
 def gains_of(law: str) -> type | None:

@@ -133,7 +133,7 @@ def _urdf(model: Any) -> str:
 class _Writer:
     """Bodies become links, in the frame of their last joint.
 
-    Several joints of one body, several.
+    A body with several joints becomes as many links.
 
     Positions are those of MuJoCo's joints (`qpos`), so that 0 is 0 whatever the `ref`
     of a joint.
@@ -477,7 +477,7 @@ def _shift(position: Floats) -> Floats:
 def _add_origin(element: ET.Element, placement: Floats) -> None:
     """Add an <origin>: roll, pitch and yaw about fixed axes.
 
-    Exact at 90 degrees, too.
+    A pitch of 90 degrees is exact as well.
     """
     R = placement[:3, :3]
     yaw = atan2(R[1, 0], R[0, 0])

@@ -20,6 +20,9 @@ _of_reference = partial(
 _RISE = 0.05  # s to the largest acceleration
 _ROUNDING = 1.0 + 1e-9
 
+PAST_LIMITS = 0.1
+"""Distance [rad or m] by which an arm may be past its position limits."""
+
 
 @dataclass(frozen=True)
 class Reference:

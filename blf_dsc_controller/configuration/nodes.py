@@ -428,9 +428,7 @@ def unmatched_sections(
 
 
 def ignored_sections(sections: Sequence[Section], nodes: Iterable[str]) -> str:
-    """Return the sections that no node of this package reads, in words.
-
-    Empty without any.
+    """Return the sections that no node of this package reads, in words; empty: none.
 
     They may belong to others in the same file, or be misspelt. `nodes` are those that
     are started.

@@ -17,6 +17,7 @@ import numpy as np
 from blf_dsc_controller.arms.tuning import UNKNOWN_EFFORT
 from blf_dsc_controller.arms.urdf import Chain
 from blf_dsc_controller.configuration.checked import Checked
+from blf_dsc_controller.configuration.motion_groups import PAST_LIMITS
 from blf_dsc_controller.configuration.robot import ArmConfig, Robot
 from blf_dsc_controller.configuration.schema import suggestion
 from blf_dsc_controller.configuration.tool_bound import ANGLE, POSITION
@@ -46,7 +47,6 @@ CHECKED = (
 _ROUNDED = 1.001  # defaults have four digits
 _BROKEN = 10.0  # times the speed of the fastest joint: no measurement
 _UNKNOWN = 100.0  # times the speed of motions, where the speed of the joints is unknown
-_PAST = 0.1  # rad or m, by which an arm may be past the limits of its URDF
 _QUARTER = 0.5 * math.pi  # rad: an arm so far from its reference points elsewhere
 _SOFTEST = 0.35  # rad or m, the widest bound that gains for an unknown arm need
 _WIDEST = 0.1  # of the reach
@@ -161,8 +161,8 @@ def _of_ranges(config: Checked, chain: Chain) -> Iterator[_Doubt]:
         chain.joints, limits.position_lower, limits.position_upper, strict=True
     ):
         for name, value, is_past in (
-            ('limits.position_lower', lower, lower < joint.lower - _PAST),
-            ('limits.position_upper', upper, upper > joint.upper + _PAST),
+            ('limits.position_lower', lower, lower < joint.lower - PAST_LIMITS),
+            ('limits.position_upper', upper, upper > joint.upper + PAST_LIMITS),
         ):
             if is_past:
                 yield _Doubt(

@@ -214,7 +214,7 @@ class Robot:
     def carried(self, chain: Chain) -> float:
         """Return the mass [kg] that the strongest joint holds at full reach.
 
-        0 if nothing tells.
+        It is 0 without a reach or an effort limit.
         """
         weight = float(np.linalg.norm(self.gravity)) or _GRAVITY
         efforts = [each.effort for each in chain.joints if math.isfinite(each.effort)]

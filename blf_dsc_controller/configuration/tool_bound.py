@@ -22,6 +22,7 @@ from blf_dsc_controller.arms.model import inertia_matrices, regressors_at
 from blf_dsc_controller.arms.urdf import Chain
 from blf_dsc_controller.configuration.checked import Checked
 from blf_dsc_controller.configuration.law_traits import traits_of
+from blf_dsc_controller.configuration.motion_groups import PAST_LIMITS
 from blf_dsc_controller.configuration.robot import Robot
 from blf_dsc_controller.numerics.algebra import inverse, product
 from blf_dsc_controller.tool.errors import MOST_JOINTS, Tool
@@ -35,7 +36,6 @@ _POSTURES = 40
 REVERSAL = 0.75
 """Of Coulomb friction, an error of it: half of it too much at breakaway, with either sign."""
 
-_PAST = 0.1  # rad or m, by which an arm may be past its position limits
 _DOWN = 0.9995  # four digits of a joint bound round up by less
 _FINEST = 1e-6  # rad, a sixth of a step of a 20 bit encoder
 _ROUNDED = 1.0 + 1e-9
@@ -57,7 +57,7 @@ def tool_of(config: Checked) -> Tool | None:
 
 
 def _tool(chain: Chain, lower: tuple[float, ...], upper: tuple[float, ...]) -> Tool:
-    return Tool(chain, np.maximum(np.abs(lower), np.abs(upper)) + _PAST)
+    return Tool(chain, np.maximum(np.abs(lower), np.abs(upper)) + PAST_LIMITS)
 
 
 def joint_bounds(

@@ -110,7 +110,7 @@ class Goals:
             self._end(Outcome.ABORTED, *_why_out_of_command(guard))
         elif guard.controller.reference_vector is not followed.vector:
             by = self._inputs.source or 'a reset'
-            if guard.holds:
+            if guard.contacts.hold:
                 by = 'a contact'
             self._end(Outcome.ABORTED, INVALID, f'pre-empted by {by}')
         elif guard.has_sample:

@@ -180,9 +180,9 @@ def _load(guard: Guard) -> Part:
 
 def _contact(guard: Guard) -> Part:
     """Return whether something touches the arm, and what did last."""
-    last = guard.contact
+    last = guard.contacts.last
     values: dict[str, Any] = {
-        'contacts': guard.contacts,
+        'contacts': guard.contacts.count,
         'distance': f'{guard.controller.sample.contact[DISTANCE]:.3g}',
         'threshold': f'{guard.config.contact.threshold:g}',
         'tared': str(guard.controller.is_tared).lower(),

@@ -2,6 +2,7 @@
 """The law of a configuration, and what its settings have otherwise than those of `blf_dsc`.
 
 blf_dsc       (28): filtered surface, barrier, composite learning, d^3     `law.blf_dsc`
+paper         the same without what `blf_dsc` does otherwise, or some of it
 model_based   (16): the same with P^ = P and the disturbance known
 backstepping  (35): linear surface, adaptation by the tracking error       `law.backstepping`
 slotine_li    the same without position gain, robust term and leakage
@@ -11,16 +12,18 @@ FILE.py       a law of a user's own                                        its `
 from __future__ import annotations
 
 import dataclasses
+from typing import Any
 
 import numpy as np
 
-from blf_dsc_controller.compiled.layout import size_of
+from blf_dsc_controller.compiled.layout import filled, size_of
 from blf_dsc_controller.configuration import law_file, law_gains
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.factory.inertia import least_inertias
 from blf_dsc_controller.law.backstepping import Backstepping
 from blf_dsc_controller.law.blf_dsc import BlfDsc
 from blf_dsc_controller.law.interface import Law
+from blf_dsc_controller.law.prediction import FILTERED
 from blf_dsc_controller.law.state import STATE, Settings
 
 
@@ -38,6 +41,7 @@ def law_of(config: ControllerConfig) -> Law:
 def of_law(config: ControllerConfig, settings: Settings) -> Settings:
     """Return the settings with what a law does otherwise than `blf_dsc`."""
     changes = {
+        'paper': _of_paper,
         'model_based': _of_model_based,
         'backstepping': _of_backstepping,
         'slotine_li': _of_slotine_li,
@@ -47,6 +51,30 @@ def of_law(config: ControllerConfig, settings: Settings) -> Settings:
     if config.law not in changes:
         return settings
     return changes[config.law](config, settings)
+
+
+def _of_paper(config: ControllerConfig, settings: Settings) -> Settings:
+    """Return the settings of the law as printed, as far as its gains leave it."""
+    gains: law_gains.Paper = getattr(config, law_file.GROUP)
+    settings = _chosen(gains, settings)._replace(
+        row=_chosen(gains, settings.row),
+        adaptation=_chosen(gains, settings.adaptation),
+        disturbance=_chosen(gains, settings.disturbance),
+        surface=_chosen(gains, settings.surface),
+    )
+    if settings.row.prediction == FILTERED:
+        return settings
+    # Lambda is a heuristic: its rows contradict each other on any arm.
+    return settings._replace(
+        excitation=settings.excitation._replace(change_detection=0)
+    )
+
+
+def _chosen(gains: object, settings: Any) -> Any:
+    """Return settings of a part with the gains that are named as its fields."""
+    others = settings._asdict().items()
+    kept = {name: value for name, value in others if name not in vars(gains)}
+    return filled(type(settings), gains, **kept)
 
 
 def _of_model_based(_config: ControllerConfig, settings: Settings) -> Settings:
@@ -72,7 +100,9 @@ def _of_linear_surface(config: ControllerConfig, settings: Settings) -> Settings
         feedback=settings.feedback._replace(robust_gain=nothing),
         disturbance=settings.disturbance._replace(gain=nothing, bumpless=0),
         excitation=settings.excitation._replace(change_detection=0),
-        adaptation=settings.adaptation._replace(weight=gains.learning_weight),
+        adaptation=_chosen(gains, settings.adaptation)._replace(
+            weight=gains.learning_weight
+        ),
     )
 
 
@@ -83,7 +113,6 @@ def _of_backstepping(config: ControllerConfig, settings: Settings) -> Settings:
     return linear._replace(
         barrier=linear.barrier._replace(weight=np.array(gains.position_gain)),
         robust_gain=np.array(gains.robust_gain),
-        adaptation=linear.adaptation._replace(leakage=gains.leakage),
     )
 
 

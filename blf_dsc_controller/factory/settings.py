@@ -45,7 +45,7 @@ from blf_dsc_controller.law import (
     weighing,
     window,
 )
-from blf_dsc_controller.law.state import Settings
+from blf_dsc_controller.law.state import REFERENCE, Settings
 from blf_dsc_controller.numerics.algebra import inverse, product
 
 _COLUMNS = 1.0  # Gamma of the disturbance columns
@@ -76,6 +76,7 @@ def settings_of_config(config: ControllerConfig) -> Settings:
     settings = filled(
         Settings,
         config.learning,
+        compensation=REFERENCE,
         model=model,
         n=model.n,
         p=model.p,
@@ -89,9 +90,9 @@ def settings_of_config(config: ControllerConfig) -> Settings:
         robust_gain=np.zeros(model.n),
         **_known(config, model.p),
         barrier=_barrier(config),
-        surface=filled(surface.Settings, config.surface, lag=row.lag),
+        surface=_surface(config, row.lag),
         feedback=_feedback(config),
-        disturbance=filled(disturbance.Settings, config.disturbance, config.learning),
+        disturbance=filled(disturbance.Settings, config.disturbance, bumpless=1),
         observer=_observer(config, model.p, row.lag, sliding),
         torque=_torque(config),
         columns=_columns(config, model.p),
@@ -132,6 +133,12 @@ def _barrier(config: ControllerConfig) -> barrier.Settings:
         initial_bound=np.array(given.widest),
         knee=np.array([barrier.knee(*joint) for joint in joints]),
     )
+
+
+def _surface(config: ControllerConfig, lag: float) -> surface.Settings:
+    """Return the surface; the filter of an arm from a URDF is told the known rate."""
+    is_urdf = config.model == 'urdf'
+    return filled(surface.Settings, config.surface, known_rate=int(is_urdf), lag=lag)
 
 
 def _feedback(config: ControllerConfig) -> feedback.Settings:
@@ -204,6 +211,7 @@ def _row(config: ControllerConfig) -> prediction.Settings:
     return filled(
         prediction.Settings,
         config.learning,
+        prediction=prediction.FILTERED,
         motion_scale=_SLOW if is_urdf else 0.0,
         lag=config.robot.lag if is_urdf else 0.0,
         omega=_OMEGA,
@@ -237,13 +245,10 @@ def _excitation(config: ControllerConfig) -> excitation.Settings:
     """Return which windows are learned from."""
     learning = config.learning
     least = _least_floor(config)
-    # Lambda is a heuristic: its rows contradict each other on any arm.
-    is_lambda = learning.prediction == 'lambda'
     return filled(
         excitation.Settings,
         learning,
         learning_start=learning.window + learning.settling_time,
-        change_detection=int(learning.change_detection and not is_lambda),
         residual_floor=len(config.joints) * least * least,
     )
 
@@ -260,6 +265,7 @@ def _adaptation(
     return filled(
         adaptation.Settings,
         learning,
+        update=adaptation.NEWTON,
         leakage=0.0,
         adaptation_gain=np.array(gains),
         variance=np.diag(covariance).copy(),

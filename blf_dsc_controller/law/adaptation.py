@@ -27,7 +27,7 @@ from blf_dsc_controller.law.clipping import clip
 from blf_dsc_controller.numerics.algebra import cholesky_solve
 
 NEWTON, GRADIENT = range(2)
-"""Choices of `learning.update`, in the order of the configuration."""
+"""Choices of `gains.update`, in the order of the configuration."""
 
 _ON_SPHERE = 1.0 - 1e-12  # of radius^2: `retract` ends within rounding of the sphere
 _ROUNDED = 1.0 + 1e-14

@@ -18,7 +18,7 @@ Where it departs from the paper, and why:
 - A bound that narrows adds xi1 k'/k to the virtual control: `barrier`.
 - The feedback of an arm whose rotor inertias are guessed follows those that it measures:
   `apparent_inertia`.
-- f, zero in the paper, is what is known of beta2' if `surface.known_rate` is 1: `surface`.
+- f, zero in the paper, is what is known of beta2' if `known_rate` of `surface.Settings` is 1.
 - beta2 is held for a sample, in which alpha2' decays from (beta2 - alpha2) / lambda by the factor
   exp(-dt / lambda).  The torque is held too, so it uses the mean of alpha2': with lambda = 2 dt the
   initial value would be 27 % too large.  With f, it is beta2 - f t that is held.

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Rows [X | u] of the prediction error: X theta = u holds for the true theta = [P; d].
 
-`filtered` (default).  d/dt(Yp P) + Yr P + D d = tau, integrated over a sample of held
+`filtered`.  d/dt(Yp P) + Yr P + D d = tau, integrated over a sample of held
 torque, gives
 
     X_k = (Yp_k - Yp_{k-1}) / T + (Yr_k + Yr_{k-1}) / 2,      X_k P + D_k d = tau on [k-1, k]
@@ -9,7 +9,7 @@ torque, gives
 up to O(T^2).  Both sides pass through the same two cascaded poles, which preserves the
 identity and filters the noise of the difference quotient.  No acceleration is needed.
 
-`lambda`.  The paper's (24): X = H(q, dq, alpha2, alpha2'), u = Lambda tau with the scalar
+`lambda`, of the law `paper`.  (24): X = H(q, dq, alpha2, alpha2'), u = Lambda tau with the scalar
 Lambda = x^T y / x^T x,  x = [xi2'^ + alpha2'; xi2 + alpha2; 1],  y = [alpha2'; alpha2; 1], and
 xi2'^ from the filter (8).  Since tau = [M C G] x and H P = [M C G] y, this is exact only where y is
 parallel to x: its error is of first order in xi2 and xi2', and depends on the units.
@@ -28,7 +28,7 @@ from blf_dsc_controller.law.sums import clear
 from blf_dsc_controller.numerics.elementary import exp
 
 FILTERED, LAMBDA = range(2)
-"""Choices of `learning.prediction`, in the order of the configuration."""
+"""Choices of `gains.prediction` of the law `paper`, in the order of the configuration."""
 
 
 class Settings(NamedTuple):

@@ -37,7 +37,7 @@ from blf_dsc_controller.law import (
 )
 
 REFERENCE, STATE = range(2)
-"""Choices of `learning.compensation`, in the order of the configuration."""
+"""Choices of `gains.compensation` of the law `paper`, in the order of the configuration."""
 
 
 class Settings(NamedTuple):

@@ -19,7 +19,7 @@ from blf_dsc_controller.numerics.elementary import cos, sin
 
 
 class Settings(NamedTuple):
-    """The parameters `surface.*`."""
+    """The parameters `surface.*`, and what follows from others."""
 
     gain: Annotated[Array, 'n']  # K, 1/s; lambda_s of (35)
     mu: Annotated[Array, 'n']  # 1/s

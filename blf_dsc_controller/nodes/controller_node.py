@@ -27,7 +27,7 @@ from blf_dsc_controller.nodes.controller_start import ControllerStart, Surroundi
 from blf_dsc_controller.nodes.diagnostics import ControllerStatus
 from blf_dsc_controller.nodes.lifecycle import LoopNode
 from blf_dsc_controller.nodes.load_service import LoadService
-from blf_dsc_controller.nodes.start_conditions import StartConditions
+from blf_dsc_controller.nodes.start_conditions import WAITING_PERIOD, StartConditions
 from blf_dsc_controller.nodes.trajectory_action import TrajectoryAction, offered_action
 from blf_dsc_controller.nodes.trajectory_input import motion_input_of
 from blf_dsc_controller.nodes.watchdog_presence import WatchdogPresence
@@ -42,7 +42,6 @@ from blf_dsc_controller.supervision.supervisor import Phase
 _RARELY = 10  # samples between looks at what rarely changes
 _RATE_SAMPLES = 1001  # samples before the rate is checked
 _FAST = 0.9  # fraction of the sample time
-_WAITING_PERIOD = 5.0  # s between two warnings
 # s from a signal to the end; ros2 launch sends the next signal after 5 s
 _LONGEST_END = 3.0
 _SILENT = 0.1  # s without joint states, after which nothing is left to bring to rest
@@ -269,7 +268,7 @@ class ControllerNode(LoopNode[ControllerConfig]):
         if guard.waiting_for:
             self.get_logger().warning(
                 f'not started, waiting for a usable joint state: {guard.waiting_for}',
-                throttle_duration_sec=_WAITING_PERIOD,
+                throttle_duration_sec=WAITING_PERIOD,
             )
         self._report_if_changed(guard)
 
@@ -454,9 +453,10 @@ class ControllerNode(LoopNode[ControllerConfig]):
 
     def _warn(self, guard: Guard) -> None:
         """Warn of what has been found since the last call."""
-        if guard.contact is not None and guard.contacts != self._contacts:
-            self._contacts = guard.contacts
-            self.get_logger().warning(guard.contact.text)
+        contacts = guard.contacts
+        if contacts.last is not None and contacts.count != self._contacts:
+            self._contacts = contacts.count
+            self.get_logger().warning(contacts.last.text)
         if guard.calming.count != self._oscillations:
             self._oscillations = guard.calming.count
             self.get_logger().warning(guard.calming.text)

@@ -20,7 +20,8 @@ from blf_dsc_controller.nodes.other_commander import Finding, OtherCommander
 from blf_dsc_controller.nodes.process import PlainNode
 from blf_dsc_controller.nodes.watchdog_presence import WatchdogPresence
 
-_WAITING_PERIOD = 5.0  # s between two warnings
+WAITING_PERIOD = 5.0
+"""Time [s] between two warnings that the start is waited for."""
 
 
 class StartConditions:
@@ -99,6 +100,6 @@ class StartConditions:
             return True
         self._node.get_logger().warning(
             'not started, waiting until torque_watchdog is ready',
-            throttle_duration_sec=_WAITING_PERIOD,
+            throttle_duration_sec=WAITING_PERIOD,
         )
         return False

@@ -17,6 +17,7 @@ from typing import NamedTuple
 import numpy as np
 
 from blf_dsc_controller.configuration.controller import ControllerConfig
+from blf_dsc_controller.configuration.motion_groups import PAST_LIMITS
 from blf_dsc_controller.errors import (
     BlfDscError,
     StartError,
@@ -40,7 +41,6 @@ AT_REST = 0.01
 _SHORTEST = 0.02  # s
 _STEP = 1.1
 _BISECTIONS = 5
-_PAST = 0.1  # rad, tolerance of the position limits
 _BRAKE = 3.0
 """Braking from v in the time h takes up to 1.5 v / h: h = 3 v / limit takes half."""
 _PERIOD = 0.005  # s, between two checked samples
@@ -279,12 +279,12 @@ def _via_centre(
 
 
 def _check_limits(config: ControllerConfig, q: np.ndarray) -> None:
-    """Check that an arm at rest at q (n,) [rad] is at most `_PAST` past its limits."""
+    """Check that an arm at rest at q (n,) [rad] is at most `PAST_LIMITS` past its limits."""
     limits = zip(
         config.limits.position_lower, config.limits.position_upper, strict=True
     )
     for joint, at, (lower, upper) in zip(config.joints, q, limits, strict=True):
-        if not lower - _PAST <= at <= upper + _PAST:
+        if not lower - PAST_LIMITS <= at <= upper + PAST_LIMITS:
             raise StartError(
                 f'joint {joint!r} would be held at {at:.6g} rad, and its limits are {lower:g} to '
                 f'{upper:g} rad: if the arm really is there, change limits.position_lower or '

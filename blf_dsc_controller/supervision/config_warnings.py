@@ -15,6 +15,7 @@ import numpy as np
 
 from blf_dsc_controller.arms.tuning import SAMPLES, UNKNOWN_EFFORT, loop_delay
 from blf_dsc_controller.configuration.controller import ControllerConfig
+from blf_dsc_controller.configuration.law_traits import OWN
 from blf_dsc_controller.configuration.robot import implausible_friction
 from blf_dsc_controller.configuration.tool_bound import ANGLE, POSITION
 from blf_dsc_controller.factory.settings import settings_of_config
@@ -109,10 +110,10 @@ def config_warnings(
     if config.model == 'urdf':
         found += _of_urdf(config, load)
     found += [f'{each.subject} {each.text}' for each in _of_gains(config, load)]
-    if config.model == 'urdf' and config.law == 'blf_dsc':
+    if config.model == 'urdf' and config.law in OWN:
         found += gear_warnings(config, settings)
         found += _of_errors(config, settings)
-    if config.model != 'urdf' and config.law == 'blf_dsc':
+    if config.model != 'urdf' and config.law in OWN:
         found += _of_first_error(config, settings, load)
     if (
         settings.has_barrier == 1

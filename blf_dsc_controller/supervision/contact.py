@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Describe a contact for events, logs, stops and diagnostics."""
+"""What touches an arm: in words, and whether the arm holds since."""
 
 from __future__ import annotations
 
@@ -7,7 +7,9 @@ import numpy as np
 
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.law.controller import Controller
+from blf_dsc_controller.law.external_torque import is_touched
 from blf_dsc_controller.law.perception import DISTANCE
+from blf_dsc_controller.reference.retargeting import TrajectoryError
 from blf_dsc_controller.run import Contact
 
 
@@ -24,3 +26,45 @@ def contact_of(controller: Controller, config: ControllerConfig, stamp: int) -> 
         f'(distance {sample.contact[DISTANCE]:.3g}, threshold {config.contact.threshold:g})'
     )
     return Contact(stamp, joint, torque, interval, text)
+
+
+class Contacts:
+    """What has touched an arm.
+
+    Attributes:
+        last: the last contact; None: nothing so far.
+        count: contacts so far.
+        hold: whether the reference rests since the last one, until the next trajectory.
+    """
+
+    def __init__(self) -> None:
+        self.last: Contact | None = None
+        self.count = 0
+        self.hold = False
+
+    def add(self, contact: Contact) -> None:
+        """Count a contact."""
+        self.last = contact
+        self.count += 1
+
+    def check_target(self) -> None:
+        """Raise TrajectoryError for a target, which may lead into what the arm holds before."""
+        if self.hold:
+            remedy = 'send a trajectory that leads away from it, or call reset'
+            why = self.last.text if self.last else ''
+            raise TrajectoryError([f'{why}, and the arm holds: {remedy}'])
+
+
+def untarable(
+    controller: Controller, config: ControllerConfig, stamp: int, *, rests: bool
+) -> str:
+    """Return why the external torque of a law in command cannot be tared; empty if it can.
+
+    `stamp` [ns] is that of the last sample, `rests` whether reference and arm rest.
+    """
+    if is_touched(controller.state.contact):
+        return f'{contact_of(controller, config, stamp).text}: clear it first'
+    if not (rests and controller.can_tare):
+        rest = f'{controller.tare_rest:.2g} s'
+        return f'the arm moves, or has just come to rest: hold it still for {rest}'
+    return ''

@@ -4,6 +4,12 @@
 joint state -> StateCheck -> law -> SampleCheck -> torque
                    |                     |
                    +---- safe torque <---+    until the next reset or activation
+
+Here is what each event leads to, in which order. What is remembered from one to the next
+is in its parts: `Supervisor` the phase, `Readings` stamps, turns and velocities,
+`RunningReference` what is followed and the time, `Takeover` from which torque the law
+begins, `HeldTorque`, `SafeTorque` and `SafeStop` what holds the arm, `Calming` what
+oscillates, `Contacts` what touches it, `ToldLoads` what its drives were told.
 """
 
 from __future__ import annotations
@@ -28,7 +34,6 @@ from blf_dsc_controller.law.check_state import (
     OSCILLATES,
 )
 from blf_dsc_controller.law.checks import is_valid_state
-from blf_dsc_controller.law.external_torque import is_touched
 from blf_dsc_controller.law.sensor import is_late
 from blf_dsc_controller.messages.errors import (
     DuplicatedJointError,
@@ -42,7 +47,6 @@ from blf_dsc_controller.messages.journal import (
 )
 from blf_dsc_controller.reference.approach import (
     AT_REST,
-    BlendedReference,
     MotionError,
 )
 from blf_dsc_controller.reference.retargeting import (
@@ -50,12 +54,11 @@ from blf_dsc_controller.reference.retargeting import (
     TrajectoryError,
 )
 from blf_dsc_controller.reference.trajectory import Trajectory
-from blf_dsc_controller.run import NANOSECOND, Contact
+from blf_dsc_controller.run import NANOSECOND
 from blf_dsc_controller.supervision import not_sensors, retuning
 from blf_dsc_controller.supervision.calming import Calming
-from blf_dsc_controller.supervision.contact import contact_of
+from blf_dsc_controller.supervision.contact import Contacts, contact_of, untarable
 from blf_dsc_controller.supervision.drive_load import DriveLoad
-from blf_dsc_controller.supervision.first_torque import check_first_torque
 from blf_dsc_controller.supervision.held_torque import HeldTorque
 from blf_dsc_controller.supervision.last_state import LastState
 from blf_dsc_controller.supervision.plan import Plan, plan_motion
@@ -73,6 +76,7 @@ from blf_dsc_controller.supervision.state_check import (
 from blf_dsc_controller.supervision.state_watchdog import LONG_SILENCE, PERIOD, Watchdog
 from blf_dsc_controller.supervision.supervisor import Fault, Phase, Reason, Supervisor
 from blf_dsc_controller.supervision.support import check_support
+from blf_dsc_controller.supervision.takeover import Takeover
 from blf_dsc_controller.supervision.told_loads import ToldLoads
 
 Vector = NDArray[np.float64]
@@ -103,11 +107,9 @@ class Guard:
         has_sample: whether the law used the last message, so that there is new telemetry.
         start_error: why the law could not start; None if it could.
         waiting_for: what is wrong with the last state that the law could not start from; or empty.
-        contact: what touched the arm last; None: nothing so far.
-        contacts: contacts so far.
+        contacts: what has touched the arm.
         untrusted: what is wrong with the efforts that joint torque sensors should show; or empty.
         calming: what oscillates, and how much softer the feedback is since.
-        holds: whether the reference rests since then, until the next trajectory.
         silenced: whether nothing is commanded until the next reset or activation.
         foreign: messages ignored because they name none of the joints.
         compute_time: computation time of the last sample [s].
@@ -133,9 +135,8 @@ class Guard:
         self.has_sample = False
         self.start_error: BlfDscError | None = None
         self.waiting_for = self.untrusted = ''
-        self.contact: Contact | None = None
-        self.contacts = 0
-        self.silenced = self.holds = False
+        self.contacts = Contacts()
+        self.silenced = False
         self.foreign = 0
         self.compute_time = 0.0
         self._readings = Readings(config, self.controller)
@@ -150,7 +151,7 @@ class Guard:
         self._safe_stop = SafeStop(
             config, self.controller, self.samples, self._safe_torque, self._held
         )
-        self._acting: Vector | None = None  # N m, by which another node holds the arm
+        self._takeover = Takeover(self.controller, self._reference, self._held)
         self._clean = True  # whether the window holds valid samples only
         digest = (
             {'law_digest': law_file.digest(config.law)}
@@ -390,28 +391,20 @@ class Guard:
         if not (self.supervisor.running and self.has_sample):
             why = self.supervisor.text or self.supervisor.phase
             return f'the law is not in command ({why})'
-        if is_touched(law.state.contact):
-            return (
-                f'{contact_of(law, self.config, self.last_stamp).text}: clear it first'
-            )
-        if not (self.is_at_rest and law.can_tare):
-            rest = f'{law.tare_rest:.2g} s'
-            return f'the arm moves, or has just come to rest: hold it still for {rest}'
-        return ''
+        return untarable(law, self.config, self.last_stamp, rests=self.is_at_rest)
 
     def _react(self) -> None:
         """Do what `contact.reaction` wants when something touches the arm."""
         reaction = self.config.contact.reaction
         contact = contact_of(self.controller, self.config, self.last_stamp)
-        self.contact = contact
-        self.contacts += 1
+        self.contacts.add(contact)
         text = contact.text
         content = contact._asdict()
         del content['stamp']
         self._note(EventType.CONTACT, reaction=reaction, **content)
         if reaction == 'hold':
             self._reference.brake(self.config)
-            self.holds = True
+            self.contacts.hold = True
             self.supervisor.add(f'{text}: the reference brakes, and the arm holds')
         elif reaction != 'none':
             self._stop(Reason.CONTACT, text)
@@ -472,40 +465,20 @@ class Guard:
 
     def _start(self, stamp: int, measurement: Vector) -> bool:
         """Resume the running reference if possible, otherwise start at t = 0."""
-        q, dq, _ = measurement.reshape(3, -1)
-        reference = self._reference
-        motion = None
-        if reference.resumable:
-            motion = reference.plan_resumption(self.config, stamp, q, dq)
-        resumed = motion is not None
+        last = self._safe_torque.commanded if self.commanding else None
         try:
-            if motion is None:
-                motion = reference.plan_start(self.config, q, dq)
-            self.controller.reference_vector = motion.vector
-            self._begin_at_acting(q)
-            if not self.commanding:
-                acting = self._acting
-                check_first_torque(self.controller, self.config, measurement, acting)
+            resumed = self._takeover.start(self.config, stamp, measurement, last)
         except (StartError, MotionError) as error:
             self.refuse(error)
             return False
-        if not resumed:
-            reference.start_at(stamp, self.config, q)
-        self._take_over(stamp, q, motion, resumed=resumed)
+        self._take_command(stamp, resumed=resumed)
         return True
 
-    def _take_over(
-        self, stamp: int, q: Vector, motion: BlendedReference, *, resumed: bool
-    ) -> None:
-        """Let the law begin with this state, at the torque that acts."""
-        self._reference.follow_from_start(motion)
-        if self.commanding and self._acting is None:
-            held = self._held.command()
-            acting = self._safe_torque.commanded if held is None else held
-            self.controller.take_over(acting, q)
+    def _take_command(self, stamp: int, *, resumed: bool) -> None:
+        """Go on from a start, or from the return to the reference, with this state."""
         self.journal.note(EventType.START, resumed=resumed)
         self._reference.last_stamp = stamp - self.config.sample_time_ns
-        self._acting = None
+        self._takeover.acting = None
         self._held.recent.restart()
         self.watchdog.switch(self.config.safety.watchdog, stamp)
         self.supervisor.enter(Phase.APPROACHING)
@@ -517,17 +490,7 @@ class Guard:
         one, and what it carries besides the model is held from the start.
         """
         self._note(EventType.TAKEOVER, torque=torque.tolist())
-        self._acting = torque.copy()
-
-    def _begin_at_acting(self, q: Vector) -> None:
-        """Let the law begin with the torque that another node holds the arm by, if any."""
-        if self._acting is None:
-            return
-        law = self.controller
-        integrates = law.settings.disturbance.gain > 0.0
-        load = self._held.load_of(self._acting, q)
-        law.state.disturbance[integrates] = load[integrates]
-        law.take_over(self._acting, q)
+        self._takeover.acting = torque.copy()
 
     def prepare(self, positions: Vector) -> None:
         """Plan the start from rest at `positions` (n,) [rad], before the first state.
@@ -563,21 +526,18 @@ class Guard:
         """
         if not is_valid_state(self.controller.checks, measurement):
             return True
-        q, dq, _ = measurement.reshape(3, -1)
-        motion = self._reference.plan_resumption(self.config, stamp, q, dq)
-        if motion is None and self.config.safety.error_ratio == 0.0:
+        last = self._safe_torque.commanded if self.commanding else None
+        if self._takeover.rejoin(self.config, stamp, measurement, last):
+            self._take_command(stamp, resumed=True)
+            return True
+        if self.config.safety.error_ratio == 0.0:
             return True  # no error stops this arm
-        if motion is None:
-            gap = self._readings.gap
-            text = (
-                f'no joint state came for {gap:.3g} s, and the arm is too far from its reference '
-                'now'
-            )
-            self._stop(Reason.STAMP_JUMP, text)
-            return False
-        self.controller.state.samples[0] = 0.0
-        self._take_over(stamp, q, motion, resumed=True)
-        return True
+        text = (
+            f'no joint state came for {self._readings.gap:.3g} s, and the arm is too far from its '
+            'reference now'
+        )
+        self._stop(Reason.STAMP_JUMP, text)
+        return False
 
     def _advance_to(self, stamp: int) -> None:
         self._reference.last_stamp = stamp
@@ -760,17 +720,14 @@ class Guard:
         self.end_silence()
         self.journal.add(EventType.TRAJECTORY, planned.content)
         self._reference.follow(planned.motion.vector)
-        self.holds = False
+        self.contacts.hold = False
         self._reference.settled = planned.motion.settled
         is_settled = self.settled <= self.time
         self.supervisor.enter(Phase.TRACKING if is_settled else Phase.APPROACHING)
 
     def _adopt_target(self, planned: Plan) -> None:
         """Follow a target; raise TrajectoryError if the arm holds after a contact."""
-        if self.holds:
-            remedy = 'send a trajectory that leads away from it, or call reset'
-            why = self.contact.text if self.contact else ''
-            raise TrajectoryError([f'{why}, and the arm holds: {remedy}'])
+        self.contacts.check_target()
         self._note(EventType.TARGET, **planned.content)
         self._reference.follow(planned.motion.vector)
 
@@ -837,8 +794,8 @@ class Guard:
         self.states.restart()
         self.samples.restart()
         self.start_error = None
-        self._acting = None
-        self.silenced = self.holds = False
+        self._takeover.acting = None
+        self.silenced = self.contacts.hold = False
         self.has_sample = False
         self._clean = True
         self._readings.restart()

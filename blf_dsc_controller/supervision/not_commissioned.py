@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from blf_dsc_controller.configuration.controller import ControllerConfig
-from blf_dsc_controller.configuration.law_traits import LAWS
+from blf_dsc_controller.configuration.law_traits import OWN
 
 
 def not_commissioned(config: ControllerConfig) -> str:
@@ -15,7 +15,7 @@ def not_commissioned(config: ControllerConfig) -> str:
     (`gear_warnings`).
     """
     feedback = config.feedback
-    if config.model != 'urdf' or config.law != LAWS[0]:
+    if config.model != 'urdf' or config.law not in OWN:
         return ''
     if config.commissioning.date:
         if feedback.stiffness <= 1.0:

@@ -20,6 +20,7 @@ from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.factory.laws import law_of
 from blf_dsc_controller.factory.settings import settings_of_config
 from blf_dsc_controller.law import barrier
+from blf_dsc_controller.law.adaptation import NEWTON
 from blf_dsc_controller.law.controller import Controller
 
 Floats = NDArray[np.float64]
@@ -97,20 +98,18 @@ def problems(
             f'learning.radius: the norm of the estimate is {norm:.4g} kg m^2 now, above a '
             f'radius of {learning.radius:g} kg m^2: choose a larger one'
         )
-    stretch = (
-        1.0
-        if learning.update == 'newton'
-        else float(np.linalg.norm(state.latch.Phi, 2))
-    )
-    step = (
+    step, stretch = 'Newton step', 1.0
+    if settings.adaptation.update != NEWTON:
+        step, stretch = 'gradient step', float(np.linalg.norm(state.latch.Phi, 2))
+    share = (
         learning.weight
         * float(settings.adaptation.adaptation_gain.max())
         * stretch
         * config.sample_time
     )
-    if state.latch.latched[0] and step >= _STABLE:
+    if state.latch.latched[0] and share >= _STABLE:
         yield (
-            f'learning.weight: with the update {learning.update}, each sample would correct the '
-            f'estimates by {step:.3g} times their error, which diverges at {_STABLE:g} or more: '
+            f'learning.weight: the {step} of each sample would correct the '
+            f'estimates by {share:.3g} times their error, which diverges at {_STABLE:g} or more: '
             'lower learning.weight or learning.adaptation_gain'
         )

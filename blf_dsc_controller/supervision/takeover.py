@@ -1,0 +1,103 @@
+# SPDX-License-Identifier: Apache-2.0
+"""How a law takes an arm over: along which motion, and from which torque."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from blf_dsc_controller.configuration.controller import ControllerConfig
+from blf_dsc_controller.law.controller import Controller
+from blf_dsc_controller.reference.approach import BlendedReference
+from blf_dsc_controller.supervision.first_torque import check_first_torque
+from blf_dsc_controller.supervision.held_torque import HeldTorque
+from blf_dsc_controller.supervision.running_reference import RunningReference
+
+Vector = NDArray[np.float64]
+
+
+class Takeover:
+    """The start of a controller's law, and its return to the reference after a gap.
+
+    Attributes:
+        acting: torque (n,) [N m] by which another node holds the arm; None: none does.
+    """
+
+    def __init__(
+        self, controller: Controller, reference: RunningReference, held: HeldTorque
+    ) -> None:
+        self.acting: Vector | None = None
+        self._controller = controller
+        self._reference = reference
+        self._held = held
+
+    def start(
+        self,
+        config: ControllerConfig,
+        stamp: int,
+        measurement: Vector,
+        commanded: Vector | None,
+    ) -> bool:
+        """Begin with a measurement (3 n,); return whether the running reference is resumed.
+
+        Else it starts at t = 0, the `stamp` [ns].  `commanded` (n,) [N m] is the last
+        torque, None before the first one.
+
+        Raises:
+            StartError: the law cannot take over there.
+            MotionError: no approach from there keeps the limits.
+        """
+        q, dq, _ = measurement.reshape(3, -1)
+        reference = self._reference
+        motion = None
+        if reference.resumable:
+            motion = reference.plan_resumption(config, stamp, q, dq)
+        resumed = motion is not None
+        if motion is None:
+            motion = reference.plan_start(config, q, dq)
+        self._controller.reference_vector = motion.vector
+        self._begin_at_acting(q)
+        if commanded is None:
+            check_first_torque(self._controller, config, measurement, self.acting)
+        if not resumed:
+            reference.start_at(stamp, config, q)
+        self._follow(motion, q, commanded)
+        return resumed
+
+    def rejoin(
+        self,
+        config: ControllerConfig,
+        stamp: int,
+        measurement: Vector,
+        commanded: Vector | None,
+    ) -> bool:
+        """Return to the running reference; return whether the arm is near enough for that.
+
+        The arguments are those of `start`.
+        """
+        q, dq, _ = measurement.reshape(3, -1)
+        motion = self._reference.plan_resumption(config, stamp, q, dq)
+        if motion is None:
+            return False
+        self._controller.state.samples[0] = 0.0
+        self._follow(motion, q, commanded)
+        return True
+
+    def _begin_at_acting(self, q: Vector) -> None:
+        """Let the law begin with the torque that another node holds the arm by, if any."""
+        if self.acting is None:
+            return
+        law = self._controller
+        integrates = law.settings.disturbance.gain > 0.0
+        load = self._held.load_of(self.acting, q)
+        law.state.disturbance[integrates] = load[integrates]
+        law.take_over(self.acting, q)
+
+    def _follow(
+        self, motion: BlendedReference, q: Vector, commanded: Vector | None
+    ) -> None:
+        """Follow a motion from q (n,) [rad] on, at the torque that acts."""
+        self._reference.follow_from_start(motion)
+        if commanded is not None and self.acting is None:
+            held = self._held.command()
+            self._controller.take_over(commanded if held is None else held, q)
