@@ -7,9 +7,7 @@ The safe torque damps the velocity that the positions show, behind a low pass:
 
 Whatever springs a joint has, its damping then fades above the frequencies of the motion
 to be braked, and cannot keep up an oscillation of the arm.  It is that of
-`sensor.compare_velocities`, so that it is known from the first sample of a stop on.  What
-is late by as much drives a joint that swings: it is damped as far as a velocity behind a
-quicker low pass, of 0.003 s, has the same direction (`dissipating`).
+`sensor.compare_velocities`, so that it is known from the first sample of a stop on.
 """
 
 from __future__ import annotations
@@ -24,9 +22,6 @@ from blf_dsc_controller.supervision.recent_motion import is_gap
 
 Vector = NDArray[np.float64]
 
-FAST = 0.003
-"""Time constant [s] of the quicker low pass."""
-
 
 class LastState:
     """The last usable joint state.
@@ -35,7 +30,6 @@ class LastState:
         measurement: [q, dq, applied torque] (3 n,) [rad, rad/s, N m].
         q, dq: views of it; a velocity that is currently unknown is zero.
         slow: v (n,) [rad/s], the velocity to damp.
-        fast: likewise (n,) [rad/s], behind the quicker low pass.
         ddq: acceleration since the state before (n,) [rad/s^2], None if it is unknown.
         age: time without a usable state [s]; infinite before the first.
     """
@@ -45,7 +39,6 @@ class LastState:
         self.q = self.measurement[:n]
         self.dq = self.measurement[n : 2 * n]
         self.slow = np.zeros(n)
-        self.fast = np.zeros(n)
         self.ddq: Vector | None = None
         self.age = inf
         self._stamp = -1
@@ -53,7 +46,7 @@ class LastState:
     def take(self, stamp: int, measurement: Vector, slow: Vector) -> None:
         """Store a valid state with its stamp [ns] and v (n,) [rad/s]."""
         self.measurement[:] = measurement
-        self.slow[:] = self.fast[:] = slow
+        self.slow[:] = slow
         self.ddq = None
         self.age = 0.0
         self._stamp = stamp
@@ -81,10 +74,9 @@ class LastState:
                 (q - self.q) / elapsed, -velocity_limit, velocity_limit
             )
             self.slow += min(1.0, elapsed / SLOW) * (differenced - self.slow)
-            self.fast += min(1.0, elapsed / FAST) * (differenced - self.fast)
         usable = np.where(np.abs(dq) <= velocity_limit, dq, differenced)
         if is_late:
-            self.slow[:] = self.fast[:] = usable
+            self.slow[:] = usable
         self.ddq = (usable - self.dq) / elapsed if is_next else None
         self.q[:] = q
         self.dq[:] = usable
@@ -93,6 +85,6 @@ class LastState:
 
     def miss(self, period: float) -> None:
         """Account for `period` [s] without a usable state."""
-        self.dq[:] = self.slow[:] = self.fast[:] = 0.0
+        self.dq[:] = self.slow[:] = 0.0
         self.ddq = None
         self.age += period

@@ -15,7 +15,6 @@ from blf_dsc_controller.law.torque import added_torque
 from blf_dsc_controller.reference.approach import AT_REST
 from blf_dsc_controller.supervision.braking import braking_matrix
 from blf_dsc_controller.supervision.command_effect import CommandEffect
-from blf_dsc_controller.supervision.dissipating import dissipating
 from blf_dsc_controller.supervision.last_state import LastState
 from blf_dsc_controller.supervision.model_torque import model_torque, needed_torque
 from blf_dsc_controller.supervision.observed_load import ObservedLoad
@@ -38,25 +37,23 @@ def safe_torque(
     estimate: Vector,
     load: Vector,
     scale: Vector | float = 1.0,
-    velocity: Vector | None = None,
 ) -> Vector:
     """Return the safe torque (n,) [N m], within the torque limit and always finite.
 
     It is zero, damping -D v, or damping plus gravity H(q, 0, 0, 0) P^ and `load` (n,)
     [N m] as far as the drive does not add them, and fades to zero while no usable state
     arrives. D is the configured damping times `scale` (n,), with gravity held that of
-    `braking_matrix`; v is the `velocity` (n,) [rad/s], `last.slow` if there is none.
+    `braking_matrix`; v is the velocity `last.slow`.
     """
-    v = last.slow if velocity is None else velocity
     torque = np.zeros(settings.n)
     if last.age >= safety.fade_time:
         return torque
     with np.errstate(over='ignore', invalid='ignore'):  # checked below
         damping = scale * np.array(safety.damping)
         if safety.torque == 'damping':
-            torque -= damping * v
+            torque -= damping * last.slow
         if safety.torque == 'hold_gravity':
-            torque -= braking_matrix(settings, damping, last.q) @ v
+            torque -= braking_matrix(settings, damping, last.q) @ last.slow
             torque += model_torque(settings, estimate, last.q) + load
             torque -= added_torque(settings.torque, last.q)
     if not np.isfinite(torque).all():
@@ -82,8 +79,7 @@ class SafeTorque:
     may have caused, the load stays as it is until the arm accelerates, as one on which
     they act (`CommandEffect`).  Once the arm has sped up it stays for good.
 
-    The damping drives no motion (`dissipating`), and a joint that swings under it all the
-    same gets as much of it as it bears (`Swing`).
+    A joint that swings under its damping gets as much of it as it bears (`Swing`).
 
     Attributes:
         load: torque (n,) [N m] that the model lacks; initially that of the motion before
@@ -209,8 +205,7 @@ class SafeTorque:
         elif dt > 0.0:
             self._swing.observe(self.last.slow, self.noise, self.resolution, dt)
         scale = self._swing.share * np.maximum(self.scale, _LIGHTEST)
-        v = dissipating(self.last, self.noise, self.resolution)
-        goal = safe_torque(safety, settings, self.last, estimate, self.load, scale, v)
+        goal = safe_torque(safety, settings, self.last, estimate, self.load, scale)
         self._elapsed += dt
         if self._elapsed < self._duration:
             goal = self._start + self._elapsed / self._duration * (goal - self._start)
