@@ -80,7 +80,8 @@ class RosRig:
         """Destroy a node without notifying the others."""
         self.nodes.remove(node)
         self.executor.remove_node(node)
-        self.spin(0.05)  # drains the node's pending events before its handles are gone
+        # A busy computer may be late: the node's pending events are before this task.
+        self.until(self.executor.create_task(lambda: None).done)
         node.destroy_node()
 
     def add(self, make, values=None, *, namespace='', clock=time.monotonic_ns, **given):

@@ -291,6 +291,17 @@ def test_watchdog_acts_by_what_the_drives_of_a_restarted_controller_compensate(r
     np.testing.assert_allclose(loop.torque(), 0.0, atol=0.1)
 
 
+def test_watchdog_reports_the_joint_that_swings_under_its_torque(ros):
+    log = ros.listen(topics.Topic('', '/rosout', 'rcl_interfaces/msg/Log', *LOG))
+    loop = ByHand(ros, build(ControllerConfig, HOLDING))
+    loop.go_on(0.05, commands=True)
+    for k in range(300):
+        loop._q[1] = 0.3 + 2e-3 * np.sin(2.0 * np.pi * 25.0 * k * 1e-3)
+        loop.go_on(1e-3, commands=False)
+    assert loop.watchdog.active
+    ros.until(lambda: any("joint 'joint2' swings" in line.msg for line in log))
+
+
 def test_a_controller_that_is_started_again_as_it_was_costs_no_time(ros, monkeypatch):
     """A new configuration takes tenths of a second, in which the watchdog would be blind."""
     config = build(ControllerConfig, HOLDING)

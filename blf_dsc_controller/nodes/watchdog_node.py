@@ -214,6 +214,8 @@ class WatchdogNode(PlainNode):
         if watchdog is None:
             return bool(messages)
         self._publish(watchdog.poll(now))
+        if swings := watchdog.name_swings():
+            self.get_logger().warning(swings)
         if not watchdog.is_engaged(now):
             self._journal.adopt_next()
             self._adopt_parameters()

@@ -14,6 +14,7 @@ from blf_dsc_controller.supervision.safe_torque import SafeTorque
 from blf_dsc_controller.supervision.sample_check import SampleCheck
 from blf_dsc_controller.supervision.stop_speed import StopSpeed
 from blf_dsc_controller.supervision.supervisor import Reason
+from blf_dsc_controller.supervision.swing_names import SwingNames
 
 Vector = NDArray[np.float64]
 
@@ -48,7 +49,7 @@ class SafeStop:
         self._torque = torque
         self._held = held
         self._speed = StopSpeed()
-        self._named = np.zeros(len(config.joints), dtype=np.bool_)
+        self._swings = SwingNames(config.joints)
 
     def begin(
         self,
@@ -61,7 +62,7 @@ class SafeStop:
     ) -> None:
         """Begin the ramp of a stop at a speed [rad/s], the largest of a joint."""
         self._speed.begin(speed)
-        self._named[:] = False
+        self._swings.begin()
         load = self._load_at_stop(reason) if was_running else self._samples.disturbance
         reached = reason not in (*_PERHAPS_UNREACHED, Reason.NO_EFFECT)
         self._torque.begin_ramp(
@@ -73,7 +74,7 @@ class SafeStop:
 
     def begin_deactivation(self, safety: Safety) -> None:
         """Begin the ramp of a law that leaves command in order."""
-        self._named[:] = False
+        self._swings.begin()
         self._torque.begin_ramp(safety.deactivation_ramp, self._held.load())
 
     def advance(self, safety: Safety, dt: float) -> Vector | None:
@@ -101,20 +102,7 @@ class SafeStop:
 
     def name_swings(self) -> str:
         """Return a text about joints that swing in the stop and have not been named; or empty."""
-        new = self._torque.has_swung & ~self._named
-        if not new.any():
-            return ''
-        self._named |= new
-        names = [repr(self._joints[j]) for j in np.flatnonzero(new)]
-        what = (
-            f'joints {", ".join(names)} swing'
-            if len(names) > 1
-            else f'joint {names[0]} swings'
-        )
-        return (
-            f'{what} under the damping of the stop, which is taken down there: is a motor lighter '
-            'than robot.rotor_inertia, or a torque later than robot.lag?'
-        )
+        return self._swings.text(self._torque.has_swung)
 
     @property
     def missing_effect(self) -> str:

@@ -12,7 +12,9 @@ from numpy.typing import NDArray
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.factory.settings import settings_of_config
 from blf_dsc_controller.supervision.safe_torque import SafeTorque
+from blf_dsc_controller.supervision.sensor_noise import SensorNoise
 from blf_dsc_controller.supervision.state_watchdog import LONG_SILENCE
+from blf_dsc_controller.supervision.swing_names import SwingNames
 from blf_dsc_controller.supervision.wraps import Wraps
 
 Vector = NDArray[np.float64]
@@ -58,6 +60,10 @@ class TorqueWatchdog:
         self.stands_down = False
         self._timeout = timeout
         self._safe = SafeTorque(len(config.joints))
+        self._sensor = SensorNoise(len(config.joints))
+        self._safe.noise = self._sensor.noise
+        self._safe.resolution = self._sensor.resolution
+        self._swings = SwingNames(config.joints)
         self.config = config
         self._wraps = Wraps(config)
         self.configure(config)
@@ -82,9 +88,11 @@ class TorqueWatchdog:
 
     def _rehearse(self) -> None:
         """Compute a safe torque as after a takeover: its kernels are compiled then."""
-        safe = SafeTorque(self._settings.n)
+        n = self._settings.n
+        safe = SafeTorque(n)
+        SensorNoise(n).take(np.zeros(n), self.config.sample_time, inf)
         holding = replace(self.config.safety, torque='hold_gravity')
-        rest = np.zeros(3 * self._settings.n)
+        rest = np.zeros(3 * n)
         T = self.config.sample_time_ns
         for k in (1, 2):  # the second one shows an acceleration
             limit = holding.velocity_limit
@@ -129,6 +137,8 @@ class TorqueWatchdog:
         limit = self.config.safety.velocity_limit
         gap = (stamp - self.stamp) * 1e-9
         measurement, _ = self._wraps.counted(measurement, gap, limit)
+        q = measurement[: self._settings.n]
+        self._sensor.take(q, gap, self.config.sample_time)
         self._safe.last.take_usable(stamp, measurement, limit, self.config.sample_time)
         if now - self._seen_at > LONG_SILENCE:
             self._forget_controller()
@@ -167,6 +177,10 @@ class TorqueWatchdog:
             self._forget_controller()
         return torque
 
+    def name_swings(self) -> str:
+        """Return a text about joints that swing under its torque, each once; or empty."""
+        return self._swings.text(self._safe.has_swung)
+
     def leave(self) -> Vector | None:
         """Return the torque to leave behind, None if the controller commands."""
         if not self.active:
@@ -187,6 +201,7 @@ class TorqueWatchdog:
         self.active = True
         self.silence = silence
         self.takeovers += 1
+        self._swings.begin()
         # as if the torque that the drive holds were the model's
         if not self._knows_torque:
             self._safe.leave(self.config.safety, self._settings, self._estimate)

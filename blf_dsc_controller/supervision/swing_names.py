@@ -1,0 +1,40 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What is said of joints that swing under the damping of a stop."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+class SwingNames:
+    """Names each joint that swings once in a stop."""
+
+    def __init__(self, joints: Sequence[str]) -> None:
+        self._joints = joints
+        self._named = np.zeros(len(joints), dtype=np.bool_)
+
+    def begin(self) -> None:
+        """Begin a stop."""
+        self._named[:] = False
+
+    def text(self, has_swung: NDArray[np.bool_]) -> str:
+        """Return a text about joints (n,) that are not named yet; or empty."""
+        new = has_swung & ~self._named
+        if not new.any():
+            return ''
+        self._named |= new
+        names = [
+            repr(name) for name, is_new in zip(self._joints, new, strict=True) if is_new
+        ]
+        what = (
+            f'joints {", ".join(names)} swing'
+            if len(names) > 1
+            else f'joint {names[0]} swings'
+        )
+        return (
+            f'{what} under the damping of the stop, which is taken down there: is a motor lighter '
+            'than robot.rotor_inertia, or a torque later than robot.lag?'
+        )
