@@ -15,7 +15,7 @@ from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.schema import build, change
 from blf_dsc_controller.drive.driver import disagreements
 from blf_dsc_controller.drive.simulated import simulated
-from blf_dsc_controller.errors import StartError
+from blf_dsc_controller.errors import ConfigurationError, StartError
 from blf_dsc_controller.factory.controller import controller_of
 from blf_dsc_controller.factory.estimate import estimate_names
 from blf_dsc_controller.factory.settings import settings_of_config
@@ -193,10 +193,16 @@ def test_what_the_start_and_a_driver_advise_ends_with_an_arm_that_moves():
     """A simulated FR3 whose efforts lack gravity, though its driver knows that they have it."""
     facts = simulated(loop_of('fr3_direct').plant).facts
     lacking = {'robot.effort': 'commanded'}
-    with pytest.raises(StartError, match=r'set robot\.effort to commanded') as refused:
+    advice = r'set robot\.effort to commanded and disturbance\.observer_bandwidth to 0'
+    with pytest.raises(StartError, match=advice) as refused:
         run('fr3_direct', 0.01, {}, {}, lacking)
-    law = lacking | {'disturbance.observer_bandwidth': 0.0}  # which needs whole efforts
-    config = change(loop_of('fr3_direct').controller, law)
+    given = loop_of('fr3_direct').controller
+    # one of the two alone is refused, with the other
+    with pytest.raises(
+        ConfigurationError, match=r'or set disturbance\.observer_bandwidth: 0'
+    ):
+        change(given, lacking)
+    config = change(given, lacking | {'disturbance.observer_bandwidth': 0.0})
     (problem,) = disagreements(facts, config)
     assert 'of this robot it is whole: write whole' in problem
     sends = 'set safety.first_torque: send'

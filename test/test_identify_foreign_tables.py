@@ -158,6 +158,18 @@ def test_numbered_columns_are_those_of_their_numbers_in_any_order(tmp_path):
     np.testing.assert_allclose(recording.q[5:6][:, 0], Q[5:6, 5], atol=1e-6)
 
 
+def test_columns_of_one_name_are_given_by_their_numbers(tmp_path):
+    names = ['t', *['q'] * 6, *['tau'] * 6]
+    path = written(tmp_path / 'a.csv', names, (TIME, Q, TAU))
+    assert '--map q=1:7' in refused(path)
+    is_read(path, 'q=1:7', 'tau=7:13')
+    # a table of a spreadsheet, with columns that nobody needs
+    names = ['t', *numbered('q'), *numbered('tau'), 'note', 'note', '', '']
+    is_read(
+        written(tmp_path / 'b.csv', names, (TIME, Q, TAU, *[np.zeros(len(TIME))] * 4))
+    )
+
+
 @pytest.mark.parametrize('rate', ['q_dot', 'position_velocity', 'joint_pos_acc'])
 def test_rates_of_positions_are_no_positions(tmp_path, rate):
     names = ['t', *numbered('q'), *numbered(rate), *numbered('tau')]

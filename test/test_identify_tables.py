@@ -138,7 +138,11 @@ def test_missing_cells_and_rows_are_gaps(tmp_path):
             [TIME, Q, TAU[:, :6]],
             'choose as many',
         ),
-        (['t', *numbered('q_'), *['tau'] * 7], [TIME, Q, TAU], 'have one name'),
+        (
+            ['t', *numbered('q_'), *['tau'] * 7],
+            [TIME, Q, TAU],
+            'which columns are tau of .* Its columns are .* 8, 9,',
+        ),
     ],
 )
 def test_unclear_tables_are_rejected_with_a_remedy(tmp_path, names, columns, message):

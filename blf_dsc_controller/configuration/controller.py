@@ -219,7 +219,8 @@ class ControllerConfig(ArmConfig):
             yield (
                 f'disturbance.observer_bandwidth: got {bandwidth:g} rad/s with robot.torque_loop '
                 f'{str(self.robot.torque_loop).lower()} and robot.effort {self.robot.effort}, but '
-                'needs joint torque sensors, which efforts show: true and whole'
+                'needs joint torque sensors, which efforts show: write true and whole, or set '
+                'disturbance.observer_bandwidth: 0.0'
             )
         is_own = self.law in OWN and self.model == 'urdf'
         if bandwidth > 0.0 and not (is_own and self._has_exact_rows()):

@@ -141,11 +141,8 @@ def text_table(path: Path) -> TextTable:
     layout = _layout_of(head[first])
     cells = layout.cells(head[first])
     names = _ros2_names(cells) or _header(head[:first], layout, cells)
-    repeated = {name for name in names if names.count(name) > 1}
-    if repeated:
-        raise BlfDscError(
-            f'{path}: two columns have one name: {", ".join(sorted(repeated))}'
-        )
+    # One that another column has as well names none.
+    names = [str(k) if names.count(each) > 1 else each for k, each in enumerate(names)]
     return TextTable(path, tuple(names), first, layout)
 
 

@@ -117,6 +117,9 @@ def _check_gravity(
             'If a torque of another or an earlier controller holds the arm, set robot.effort to '
             f'commanded (if efforts contain only commands), or {_SEND}{_DRIVER}'
         )
+    # The load observer needs whole efforts.
+    observes = config.disturbance.observer_bandwidth > 0.0
+    off = ' and disturbance.observer_bandwidth to 0' if observes else ''
     no_gravity = f'no gravity: robot.drive_compensates is {compensates}, but joint {joint!r} rests'
     if is_commanded and holds:
         raise StartError(
@@ -133,5 +136,5 @@ def _check_gravity(
             f'{gravity[worst]:.4g} N m. The first torque, {torque[worst]:.4g} N m, would drop the '
             'arm. If the brakes hold it, release them. If the drives compensate nothing, set '
             'robot.drive_compensates to none. If the effort does not contain what the drives add, '
-            f'set robot.effort to commanded, or {_SEND}{_DRIVER}'
+            f'set robot.effort to commanded{off}, or {_SEND}{_DRIVER}'
         )
