@@ -36,7 +36,8 @@ def with_gains(
 ) -> ControllerConfig:
     """Return a configuration with values, and what follows from them, as if read from a file.
 
-    `values` have `feedback.joint_stiffness` and `feedback.joint_damping`.
+    `values` have `feedback.joint_stiffness` and `feedback.joint_damping`, and may have
+    `robot.lag` and `robot.rotor_inertia`.
     """
     names = 'feedback.joint_stiffness', 'feedback.joint_damping'
     gains = JointGains(*(np.array(values[name], float) for name in names))
@@ -44,7 +45,9 @@ def with_gains(
     bound = np.array(values.get('barrier.bound', config.barrier.bound), float)
     before = gains_of(arm, np.array(config.barrier.bound))
     lag = float(np.asarray(values.get('robot.lag', arm.lag), float))
-    after = gains_of(arm._replace(joints=gains, stiffness=1.0, lag=lag), bound)
+    rotors = np.array(values.get('robot.rotor_inertia', arm.rotors), float)
+    follows = arm._replace(joints=gains, stiffness=1.0, lag=lag, rotors=rotors)
+    after = gains_of(follows, bound)
     present = flatten(config)
     followed = {
         name: value
@@ -52,6 +55,20 @@ def with_gains(
         if name in FOLLOWED or (name in present and present[name] == before[name])
     }
     return change(config, {**followed, **values})
+
+
+def kept_stop(config: ControllerConfig, before: ControllerConfig) -> dict[str, Value]:
+    """Return the damping of a stop that is no more than that of the joints, by dotted name.
+
+    By the inertias alone it may be more, and the joints' is what has a margin.  None, if
+    it was given `before`, or is less.
+    """
+    arm, _ = design_of(before)
+    usual = gains_of(arm, np.array(before.barrier.bound))['safety.damping']
+    least = np.minimum(config.safety.damping, config.feedback.joint_damping)
+    if before.safety.damping != usual or (least == config.safety.damping).all():
+        return {}
+    return {'safety.damping': tuple(least.tolist())}
 
 
 def kept_bound(config: ControllerConfig) -> dict[str, Value]:

@@ -15,8 +15,18 @@ from blf_dsc_controller.arms.joint_gains import JointGains, damped_arm, unknown_
 from blf_dsc_controller.arms.model import inertia_matrices
 from blf_dsc_controller.arms.tuning import Design
 from blf_dsc_controller.commissioning import motion
-from blf_dsc_controller.commissioning.choice import MARGIN, Choice, Loops, choose
-from blf_dsc_controller.commissioning.chosen import kept_bound, with_gains
+from blf_dsc_controller.commissioning.choice import (
+    MARGIN,
+    Choice,
+    Loops,
+    RigidArm,
+    choose,
+)
+from blf_dsc_controller.commissioning.chosen import (
+    kept_bound,
+    kept_stop,
+    with_gains,
+)
 from blf_dsc_controller.commissioning.findings import Findings, findings_of
 from blf_dsc_controller.commissioning.response import Response, response_of
 from blf_dsc_controller.configuration.controller import ControllerConfig, design_of
@@ -58,7 +68,8 @@ class Commissioned(NamedTuple):
     choice: Choice
     findings: Findings
     assumed: Floats  # (n,) kg m^2, inertias by URDF and guess, where findings has them
-    lag: float  # s, robot.lag: measured, else as given
+    rotors: Floats  # (n,) kg m^2, robot.rotor_inertia: measured, else as assumed
+    lag: float  # s, robot.lag: likewise
     date: str  # when the gains were chosen
     aim: float  # the modulus margin that was asked for
     before: ControllerConfig  # for which the arm was measured
@@ -79,6 +90,7 @@ class Commissioned(NamedTuple):
                 'response. Measure again with more torque or travel'
             )
         values = self._values()
+        values |= kept_stop(with_gains(self.before, values), self.before)
         return values | kept_bound(with_gains(self.before, values))
 
     @property
@@ -93,6 +105,7 @@ class Commissioned(NamedTuple):
         gains = self.choice.gains
         return {
             'robot.lag': float(f'{self.lag:.3g}'),
+            'robot.rotor_inertia': _rounded(self.rotors),
             'feedback.inertia': 'none',
             'feedback.joint_stiffness': _rounded(gains.stiffness),
             'feedback.joint_damping': _rounded(gains.damping),
@@ -174,11 +187,14 @@ def commissioned(
     postures = np.array([each.posture for each in responses])
     model = arm.parameters.model
     P = arm.parameters.of(arm.chain.inertias, arm.rotors)
-    here = np.diagonal(inertia_matrices(model, P, postures), axis1=1, axis2=2)
+    M = inertia_matrices(model, P, postures)
+    here = np.diagonal(M, axis1=1, axis2=2)
     elsewhere = arm.over_postures().inertia - here.max(axis=0)
     known = np.where(np.isnan(found.inertia), here.max(axis=0), found.inertia)
     inertia = known + np.maximum(elsewhere, 0.0)
     loops = Loops(responses, inertia, T)
+    rotors = _rotors(found, here - arm.rotors, arm.rotors)
+    rigid = RigidArm(M + np.diag(rotors - arm.rotors), found.timing(T, arm.lag))
 
     def by_factors(factors: Floats) -> JointGains:
         if config.feedback.joint_stiffness:
@@ -191,14 +207,26 @@ def commissioned(
         responses=responses,
         loops=loops,
         start=start,
-        choice=choose(loops, start, by_factors, margin),
+        choice=choose(loops, start, by_factors, rigid, margin),
         findings=found,
         assumed=here.max(axis=0),
+        rotors=rotors,
         lag=config.robot.lag if np.isnan(lag) else lag,
         date=datetime.now().astimezone().strftime('%Y-%m-%d %H:%M'),
         aim=margin,
         before=config,
     )
+
+
+def _rotors(found: Findings, links: Floats, assumed: Floats) -> Floats:
+    """Return the rotor inertias (n,) [kg m^2]: what was measured beyond links (k, n).
+
+    The least of all runs, since the arm may have held a load in some; as `assumed` where
+    friction hides it.
+    """
+    beyond = np.where(np.isnan(found.inertias), np.inf, found.inertias - links)
+    least = beyond.min(axis=0)
+    return np.where(np.isinf(least), assumed, least.clip(0.0))
 
 
 def measuring_gains(arm: Design) -> JointGains:
