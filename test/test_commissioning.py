@@ -24,7 +24,8 @@ from blf_dsc_controller.arms.model import inertia_matrices
 from blf_dsc_controller.arms.urdf import frames
 from blf_dsc_controller.cli.main import main
 from blf_dsc_controller.commissioning import files, simulated
-from blf_dsc_controller.commissioning.choice import Loops, choose
+from blf_dsc_controller.commissioning.choice import Loops, RigidArm, choose
+from blf_dsc_controller.commissioning.chosen import kept_stop
 from blf_dsc_controller.commissioning.commissioning import commissioned, plan
 from blf_dsc_controller.commissioning.motion import SLOW_TONES, excitation, lines_in
 from blf_dsc_controller.commissioning.page import sentences
@@ -106,14 +107,24 @@ def test_motion_begins_at_rest_and_keeps_its_limits():
     middle = frames(chain, POSTURE)[-1][:3, 3]
     travel = np.linalg.norm(tips - middle, axis=1).max()
     assert travel == pytest.approx(made.travel, rel=1e-2)  # of samples between others
-    assert 0.2 * 0.01 < travel <= 0.0101
+    assert travel <= 0.0101
     np.testing.assert_allclose(np.abs(dq).max(axis=0), made.speed, rtol=0.05)
+    # nothing had to shrink: the joints swing as fast as they should, with 10 mm to spare
+    np.testing.assert_allclose(swing_speeds(made), 0.1, rtol=1e-9)
+
+
+def swing_speeds(made):
+    """Return the largest speeds (n,) [rad/s] by the slow tones of a motion."""
+    rates = 2.0 * np.pi / made.period * made.slow
+    return (made.amplitude[:, -SLOW_TONES:] * rates).sum(axis=1)
 
 
 @pytest.mark.parametrize('travel', [1e-4, 1e-3, 0.1])
 def test_travel_is_what_is_permitted(travel):
     made = excitation(CONFIG, POSTURE, 0.03, travel)
     assert made.travel <= travel
+    if travel <= 1e-3:  # all of it is used
+        assert made.travel > 0.95 * travel
     assert (made.speed <= 0.25 * np.array(CONFIG.limits.velocity)).all()
 
 
@@ -152,10 +163,8 @@ def test_joints_slide_on_an_arm_whose_wrists_are_as_fast_as_they_may():
     loop = load_loop(share_folder() / 'config' / 'ur5e.yaml')
     posture = np.array(loop.plant.initial.position)
     made = excitation(loop.controller, posture, 0.03, 0.01)
-    rates = 2.0 * np.pi / made.period * made.slow
-    swings = (made.amplitude[:, -SLOW_TONES:] * rates).sum(axis=1)
-    assert (swings > 0.04).all()
-    assert made.travel <= 0.01
+    assert (swing_speeds(made) > 0.04).all()
+    assert 0.9 * 0.01 < made.travel <= 0.01
 
 
 def test_speed_of_a_motion_is_the_largest_in_either_direction():
@@ -410,9 +419,72 @@ def test_no_gains_have_a_margin_if_noise_hides_the_response():
     loud = response._replace(position_noise=1e4 * (response.position_noise + 1e-6))
     loops = found().loops._replace(responses=[loud])
     start = found().start
-    choice = choose(loops, start, start.scaled)
+    choice = choose(loops, start, start.scaled, true_rigid_arm())
     assert choice.margin.value < 0.5
     assert (choice.factors < 0.1).all()
+    assert not choice.by_inertia.any()
+
+
+def true_rigid_arm():
+    """Return the arm of the true inertias and delay, without springs and friction."""
+    (links,) = true_loop(found().start, found().loops.inertia).links
+    return RigidArm(np.diag(links) + ROTORS, TIMING)
+
+
+def test_gains_are_none_that_the_inertia_alone_would_not_bear():
+    """Joint 1 answers a tenth of what its inertia would: something damps it, or it sticks."""
+    (response,) = found().responses
+    slow = np.array([0.1, 1.0])[:, None]
+    stuck = response._replace(
+        position=slow * response.position,
+        velocity=slow * response.velocity,
+        position_noise=0.0 * response.position_noise,
+        velocity_noise=0.0 * response.velocity_noise,
+    )
+    loops = found().loops._replace(responses=[stuck])
+    start = found().start
+    rigid = true_rigid_arm()
+    choice = choose(loops, start, start.scaled, rigid)
+    assert choice.by_inertia.tolist() == [True, False]
+    assert rigid.margin(choice.gains, loops.inertia) >= 0.5
+    # without the bound it would be raised by another half at least
+    more = choice.gains.scaled(np.array([1.5, 1.0]))
+    assert loops.margin(more).value >= 0.5
+    assert rigid.margin(more, loops.inertia) < 0.5
+
+
+def test_inertias_of_the_arm_are_those_that_were_measured():
+    """Of motors five times as heavy as assumed; a load in one of the runs is no motor."""
+    light = change(CONFIG, {'robot.rotor_inertia': [each / 5.0 for each in ROTORS]})
+    config = build(
+        ControllerConfig, {**GIVEN, 'robot.rotor_inertia': light.robot.rotor_inertia}
+    )
+    (motion,) = plan(config, POSTURE[None])
+    runs = [simulated.measured(motion, ARM, payload) for payload in (0.0, 1.0)]
+    result = commissioned(config, runs)
+    settings = settings_of_config(result.config)
+    (M,) = inertia_matrices(
+        settings.model, settings.initial_estimate[: settings.p], POSTURE[None]
+    )
+    true = true_rigid_arm().inertias
+    np.testing.assert_allclose(np.diag(M), true, rtol=0.1)  # as the inertias above
+    assert result.findings.inertia[0] > 1.2 * true[0]  # 1 kg at 1 m and more
+    # so are the errors to expect: with the assumed motors the loop would be another
+    errors = expected_errors(result.config, settings)
+    assert (errors.unmodelled < 0.1).all()
+    written = build(ControllerConfig, {**GIVEN, **result.parameters()})
+    assert written == result.config
+
+
+def test_stop_damps_as_before_but_no_more_than_the_gains_with_the_margin():
+    usual = CONFIG.safety.damping
+    damping = np.array([0.5 * usual[0], 2.0 * usual[1]])
+    expected = {'safety.damping': (damping[0], usual[1])}
+    assert kept_stop(CONFIG, damping) == expected
+    given = change(CONFIG, {'safety.damping': [9.0, 9.0]})
+    assert kept_stop(given, damping) == {}
+    chosen = found().config
+    assert (np.array(chosen.safety.damping) <= chosen.feedback.joint_damping).all()
 
 
 def test_loop_of_ones_own_has_the_same_motions_and_gains():
@@ -488,6 +560,21 @@ def test_joint_whose_inertia_friction_hides_is_not_trusted():
     assert 'joints that stick' in told
     assert '--prove' in told
     assert 'stick' not in '\n'.join(sentences(seen))
+
+
+def test_what_friction_and_inertia_do_to_the_gains_is_told():
+    seen = found()
+    damping = seen.choice.gains.damping * np.array([0.9, 1.1])
+    rubbing = seen._replace(findings=seen.findings._replace(damping=damping))
+    told = '\n'.join(sentences(rubbing))
+    assert 'friction damps joint2 more than the gains do' in told
+    assert '--prove' in told
+    choice = seen.choice._replace(by_inertia=np.array([True, False]))
+    told = '\n'.join(sentences(seen._replace(choice=choice)))
+    assert 'joint1: limited by inertia' in told
+    told = '\n'.join(sentences(seen))
+    assert 'limited by inertia' not in told
+    assert 'more than the gains do' not in told
 
 
 def test_gains_far_from_those_of_the_measurement_are_to_be_raised_in_steps():

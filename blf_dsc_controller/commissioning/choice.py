@@ -62,9 +62,9 @@ class Choice(NamedTuple):
 
 
 class RigidArm(NamedTuple):
-    """A rigid arm without friction, in k postures: what its inertias and lags alone bear."""
+    """Rigid joints without friction, the others held: what inertias and lags alone bear."""
 
-    inertias: Floats  # M (k, n, n), kg m^2
+    inertias: Floats  # (n,) kg m^2, the least of each joint
     timing: Timing
 
     def margin(self, gains: JointGains, inertia: Floats) -> float:
@@ -73,9 +73,9 @@ class RigidArm(NamedTuple):
         `inertia` (n,) [kg m^2] is the largest of each joint.
         """
         nothing = np.zeros(len(inertia))
-        feedback = linear(gains, inertia, len(self.inertias))
+        M = np.diag(self.inertias)[None]
         joints = Joints(motors=nothing, viscous=nothing)
-        return Loop(self.inertias, joints, self.timing, feedback).margin().value
+        return Loop(M, joints, self.timing, linear(gains, inertia, 1)).margin().value
 
 
 class Loops(NamedTuple):

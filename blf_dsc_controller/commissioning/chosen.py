@@ -57,18 +57,18 @@ def with_gains(
     return change(config, {**followed, **values})
 
 
-def kept_stop(config: ControllerConfig, before: ControllerConfig) -> dict[str, Value]:
-    """Return the damping of a stop that is no more than that of the joints, by dotted name.
+def kept_stop(config: ControllerConfig, damping: Floats) -> dict[str, Value]:
+    """Return the damping of a stop by dotted name: as it is, but no more than `damping` (n,).
 
-    By the inertias alone it may be more, and the joints' is what has a margin.  None, if
-    it was given `before`, or is less.
+    Gains have a margin with that of the joints.  It does not follow from the measured inertia:
+    with drives that hide their motors, this is small, and a stop is to brake the motors, too.
+    None, if the damping of a stop is given.
     """
-    arm, _ = design_of(before)
-    usual = gains_of(arm, np.array(before.barrier.bound))['safety.damping']
-    least = np.minimum(config.safety.damping, config.feedback.joint_damping)
-    if before.safety.damping != usual or (least == config.safety.damping).all():
+    arm, _ = design_of(config)
+    usual = gains_of(arm, np.array(config.barrier.bound))['safety.damping']
+    if config.safety.damping != usual:
         return {}
-    return {'safety.damping': tuple(least.tolist())}
+    return {'safety.damping': tuple(np.minimum(usual, damping).tolist())}
 
 
 def kept_bound(config: ControllerConfig) -> dict[str, Value]:

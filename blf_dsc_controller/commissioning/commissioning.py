@@ -90,7 +90,6 @@ class Commissioned(NamedTuple):
                 'response. Measure again with more torque or travel'
             )
         values = self._values()
-        values |= kept_stop(with_gains(self.before, values), self.before)
         return values | kept_bound(with_gains(self.before, values))
 
     @property
@@ -103,12 +102,14 @@ class Commissioned(NamedTuple):
 
     def _values(self) -> dict[str, Value]:
         gains = self.choice.gains
+        damping = _rounded(gains.damping)
         return {
+            **kept_stop(self.before, np.array(damping)),
             'robot.lag': float(f'{self.lag:.3g}'),
             'robot.rotor_inertia': _rounded(self.rotors),
             'feedback.inertia': 'none',
             'feedback.joint_stiffness': _rounded(gains.stiffness),
-            'feedback.joint_damping': _rounded(gains.damping),
+            'feedback.joint_damping': damping,
             'feedback.stiffness': 1.0,
             'commissioning.date': self.date,
             'commissioning.version': __version__,
@@ -187,14 +188,15 @@ def commissioned(
     postures = np.array([each.posture for each in responses])
     model = arm.parameters.model
     P = arm.parameters.of(arm.chain.inertias, arm.rotors)
-    M = inertia_matrices(model, P, postures)
-    here = np.diagonal(M, axis1=1, axis2=2)
+    here = np.diagonal(inertia_matrices(model, P, postures), axis1=1, axis2=2)
     elsewhere = arm.over_postures().inertia - here.max(axis=0)
     known = np.where(np.isnan(found.inertia), here.max(axis=0), found.inertia)
     inertia = known + np.maximum(elsewhere, 0.0)
     loops = Loops(responses, inertia, T)
-    rotors = _rotors(found, here - arm.rotors, arm.rotors)
-    rigid = RigidArm(M + np.diag(rotors - arm.rotors), found.timing(T, arm.lag))
+    beyond = _least(found.inertias - here, 0.0 * here)  # least: a load is no motor
+    rotors = (arm.rotors + beyond).clip(0.0)
+    least = _least(found.inertias, here)
+    rigid = RigidArm(least, found.timing(T, arm.lag))
 
     def by_factors(factors: Floats) -> JointGains:
         if config.feedback.joint_stiffness:
@@ -218,15 +220,10 @@ def commissioned(
     )
 
 
-def _rotors(found: Findings, links: Floats, assumed: Floats) -> Floats:
-    """Return the rotor inertias (n,) [kg m^2]: what was measured beyond links (k, n).
-
-    The least of all runs, since the arm may have held a load in some; as `assumed` where
-    friction hides it.
-    """
-    beyond = np.where(np.isnan(found.inertias), np.inf, found.inertias - links)
-    least = beyond.min(axis=0)
-    return np.where(np.isinf(least), assumed, least.clip(0.0))
+def _least(measured: Floats, assumed: Floats) -> Floats:
+    """Return the least (n,) of what was measured in k runs (k, n); of `assumed` where none was."""
+    least = np.where(np.isnan(measured), np.inf, measured).min(axis=0)
+    return np.where(np.isinf(least), assumed.min(axis=0), least)
 
 
 def measuring_gains(arm: Design) -> JointGains:
