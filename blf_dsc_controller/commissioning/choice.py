@@ -10,7 +10,7 @@ singular value passes zero, so every step on the way must have the margin.
 First the stiffness and damping of all joints grow together, then those of each joint by
 itself, in turns, as far as the margin allows.
 
-A rigid arm of the measured inertias and lags must have the margin, too (`RigidArm`).  What is
+A rigid joint of the measured inertia and lags must have the margin, too (`RigidArm`).  What is
 measured bears more only where friction damps it, or where it is not seen.
 """
 

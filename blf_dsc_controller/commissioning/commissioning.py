@@ -223,7 +223,7 @@ def commissioned(
 def _least(measured: Floats, assumed: Floats) -> Floats:
     """Return the least (n,) of what was measured in k runs (k, n); of `assumed` where none was."""
     least = np.where(np.isnan(measured), np.inf, measured).min(axis=0)
-    return np.where(np.isinf(least), assumed.min(axis=0), least)
+    return np.asarray(np.where(np.isinf(least), assumed.min(axis=0), least))
 
 
 def measuring_gains(arm: Design) -> JointGains:
