@@ -27,8 +27,6 @@ class Chosen:
         feedback, commissioning = config.feedback, config.commissioning
         self.values = {
             'robot.lag': config.robot.lag,
-            'robot.rotor_inertia': config.robot.rotor_inertia,
-            'safety.damping': config.safety.damping,
             'feedback.inertia': 'none',
             'feedback.joint_stiffness': feedback.joint_stiffness,
             'feedback.joint_damping': feedback.joint_damping,

@@ -5,7 +5,6 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import cache
-from itertools import product
 
 import numpy as np
 import pytest
@@ -24,10 +23,9 @@ from blf_dsc_controller.arms.model import inertia_matrices
 from blf_dsc_controller.arms.urdf import frames
 from blf_dsc_controller.cli.main import main
 from blf_dsc_controller.commissioning import files, simulated
-from blf_dsc_controller.commissioning.choice import Loops, RigidArm, choose
-from blf_dsc_controller.commissioning.chosen import kept_stop
+from blf_dsc_controller.commissioning.choice import Loops, choose
 from blf_dsc_controller.commissioning.commissioning import commissioned, plan
-from blf_dsc_controller.commissioning.motion import SLOW_TONES, excitation, lines_in
+from blf_dsc_controller.commissioning.motion import excitation, lines_in
 from blf_dsc_controller.commissioning.page import sentences
 from blf_dsc_controller.commissioning.response import Response, refined, response_of
 from blf_dsc_controller.commissioning.strength import MOST, strength
@@ -107,24 +105,14 @@ def test_motion_begins_at_rest_and_keeps_its_limits():
     middle = frames(chain, POSTURE)[-1][:3, 3]
     travel = np.linalg.norm(tips - middle, axis=1).max()
     assert travel == pytest.approx(made.travel, rel=1e-2)  # of samples between others
-    assert travel <= 0.0101
+    assert 0.5 * 0.01 < travel <= 0.0101
     np.testing.assert_allclose(np.abs(dq).max(axis=0), made.speed, rtol=0.05)
-    # nothing had to shrink: the joints swing as fast as they should, with 10 mm to spare
-    np.testing.assert_allclose(swing_speeds(made), 0.1, rtol=1e-9)
-
-
-def swing_speeds(made):
-    """Return the largest speeds (n,) [rad/s] by the slow tones of a motion."""
-    rates = 2.0 * np.pi / made.period * made.slow
-    return (made.amplitude[:, -SLOW_TONES:] * rates).sum(axis=1)
 
 
 @pytest.mark.parametrize('travel', [1e-4, 1e-3, 0.1])
 def test_travel_is_what_is_permitted(travel):
     made = excitation(CONFIG, POSTURE, 0.03, travel)
     assert made.travel <= travel
-    if travel <= 1e-3:  # all of it is used
-        assert made.travel > 0.95 * travel
     assert (made.speed <= 0.25 * np.array(CONFIG.limits.velocity)).all()
 
 
@@ -133,48 +121,20 @@ def test_lines_belong_to_one_joint_each_and_are_known_from_the_configuration():
     lines = lines_in(planned().config)
     np.testing.assert_array_equal(lines.bins, made.bins)
     assert lines.period == pytest.approx(made.period)
-    every = np.concatenate((made.bins.ravel(), made.slow[0]))
+    every = np.concatenate((made.bins.ravel(), made.slow.ravel()))
     assert np.unique(every).size == every.size
-    np.testing.assert_array_equal(lines.slow, made.slow)
     # all together within 1 / period of each other
     assert np.ptp(made.bins, axis=0).max() == 1
 
 
-def test_what_friction_makes_of_the_swings_meets_no_line():
-    """It is odd: of sums of an odd number of swings, here of three and five."""
-    made = planned().excitation
-    for count in (3, 5):
-        signed = np.concatenate((made.slow[0], -made.slow[0]))
-        sums = {sum(each) for each in product(signed.tolist(), repeat=count)}
-        assert not sums & set(made.bins.ravel().tolist())
-
-
-def test_fast_joint_takes_no_swing_from_the_others():
-    """Joint 2 may move by a hundredth of what it would: joint 1 slides as fast."""
-    free = planned().excitation
-    slow = change(CONFIG, {'limits.velocity': [5.0, 0.05 * free.speed[1]]})
-    made = excitation(slow, POSTURE, 0.03, 0.01)
-    assert made.speed[1] <= 0.25 * 0.05 * free.speed[1]
-    np.testing.assert_allclose(made.amplitude[0], free.amplitude[0])
-
-
-def test_joints_slide_on_an_arm_whose_wrists_are_as_fast_as_they_may():
-    """Swings of a UR5e keep 0.04 rad/s or more, in 10 mm: friction is steep below 0.02 rad/s."""
-    loop = load_loop(share_folder() / 'config' / 'ur5e.yaml')
-    posture = np.array(loop.plant.initial.position)
-    made = excitation(loop.controller, posture, 0.03, 0.01)
-    assert (swing_speeds(made) > 0.04).all()
-    assert 0.9 * 0.01 < made.travel <= 0.01
-
-
 def test_speed_of_a_motion_is_the_largest_in_either_direction():
-    """Of this one, the second joint is fastest backwards."""
-    made = excitation(CONFIG, POSTURE, 0.3, 1e-3)
+    """Of this one, the first joint is fastest backwards."""
+    made = excitation(CONFIG, POSTURE, 0.03, 1e-3)
     rates = 2.0 * np.pi / made.period * np.column_stack((made.bins, made.slow))
     times = np.linspace(0.0, made.period, 20_000)[:, None, None]
     tones = -made.amplitude * rates * np.sin(rates * times + made.phase)
     dq = tones.sum(axis=2)
-    assert dq[:, 1].max() < -0.95 * dq[:, 1].min()
+    assert dq[:, 0].max() < -0.95 * dq[:, 0].min()
     # `speed` is that of differences of samples
     np.testing.assert_allclose(made.speed, np.abs(dq).max(axis=0), rtol=0.02)
 
@@ -269,25 +229,6 @@ def test_chosen_gains_have_the_margin_of_the_true_loop_and_twice_of_them_do_not(
     assert true.value == pytest.approx(choice.margin.value, abs=0.1)
     twice = true_loop(choice.gains.scaled(2.0), inertia).margin()
     assert twice.value < 0.4
-
-
-def test_friction_does_not_hide_where_the_loop_is_unstable():
-    """In one direction Coulomb friction damps nothing: the loop without it is the true one.
-
-    Of an arm that sticks, one measures its friction instead: gains that seem to have the
-    margin are beyond the limit of stability.  Sliding, what is left of it costs half.
-    """
-    rubbing = change(
-        ARM, {'disturbance.coulomb': [1.0, 0.5], 'disturbance.stribeck': 0.5}
-    )
-    commissioning = blf.Commissioning(CONFIG, [POSTURE])
-    (first,) = commissioning.motions
-    run, _ = simulated.measured(first, rubbing)
-    again = commissioning.stronger(first, run) or first
-    seen = commissioned(CONFIG, [simulated.measured(again, rubbing)])
-    assert seen.has_margin
-    gains = seen.choice.gains
-    assert true_loop(gains, seen.loops.inertia).margin().value > 0.2
 
 
 def test_noise_is_counted_against_the_margin():
@@ -419,71 +360,9 @@ def test_no_gains_have_a_margin_if_noise_hides_the_response():
     loud = response._replace(position_noise=1e4 * (response.position_noise + 1e-6))
     loops = found().loops._replace(responses=[loud])
     start = found().start
-    choice = choose(loops, start, start.scaled, true_rigid_arm())
+    choice = choose(loops, start, start.scaled)
     assert choice.margin.value < 0.5
     assert (choice.factors < 0.1).all()
-    assert not choice.by_inertia.any()
-
-
-def true_rigid_arm():
-    """Return the arm of the true inertias and delay, without springs and friction."""
-    (links,) = true_loop(found().start, found().loops.inertia).links
-    return RigidArm(np.diag(links) + ROTORS, TIMING)
-
-
-def test_gains_are_none_that_the_inertia_alone_would_not_bear():
-    """The joints answer a thousandth of what their inertias would: something damps them."""
-    (response,) = found().responses
-    stuck = response._replace(
-        position=0.001 * response.position,
-        velocity=0.001 * response.velocity,
-        position_noise=0.0 * response.position_noise,
-        velocity_noise=0.0 * response.velocity_noise,
-    )
-    loops = found().loops._replace(responses=[stuck])
-    start = found().start
-    rigid = true_rigid_arm()
-    choice = choose(loops, start, start.scaled, rigid)
-    assert choice.by_inertia.tolist() == [False, True]
-    assert choice.factors[0] > 90.0  # 100 times those of the measurement are tried
-    assert rigid.margin(choice.gains, loops.inertia) >= 0.5
-    more = choice.gains.scaled(np.array([1.0, 1.5]))
-    assert loops.margin(more).value >= 0.5  # nothing else would limit them
-    assert rigid.margin(more, loops.inertia) < 0.5
-
-
-def test_inertias_of_the_arm_are_those_that_were_measured():
-    """Of motors five times as heavy as assumed; a load in one of the runs is no motor."""
-    light = change(CONFIG, {'robot.rotor_inertia': [each / 5.0 for each in ROTORS]})
-    config = build(
-        ControllerConfig, {**GIVEN, 'robot.rotor_inertia': light.robot.rotor_inertia}
-    )
-    (motion,) = plan(config, POSTURE[None])
-    runs = [simulated.measured(motion, ARM, payload) for payload in (0.0, 1.0)]
-    result = commissioned(config, runs)
-    settings = settings_of_config(result.config)
-    (M,) = inertia_matrices(
-        settings.model, settings.initial_estimate[: settings.p], POSTURE[None]
-    )
-    true = true_rigid_arm().inertias
-    np.testing.assert_allclose(np.diag(M), true, rtol=0.1)  # as the inertias above
-    assert result.findings.inertia[0] > 1.2 * true[0]  # 1 kg at 1 m and more
-    # so are the errors to expect: with the assumed motors the loop would be another
-    errors = expected_errors(result.config, settings)
-    assert (errors.unmodelled < 0.1).all()
-    written = build(ControllerConfig, {**GIVEN, **result.parameters()})
-    assert written == result.config
-
-
-def test_stop_damps_as_before_but_no_more_than_the_gains_with_the_margin():
-    usual = CONFIG.safety.damping
-    damping = np.array([0.5 * usual[0], 2.0 * usual[1]])
-    expected = {'safety.damping': (damping[0], usual[1])}
-    assert kept_stop(CONFIG, damping) == expected
-    given = change(CONFIG, {'safety.damping': [9.0, 9.0]})
-    assert kept_stop(given, damping) == {}
-    chosen = found().config
-    assert (np.array(chosen.safety.damping) <= chosen.feedback.joint_damping).all()
 
 
 def test_loop_of_ones_own_has_the_same_motions_and_gains():
@@ -561,21 +440,6 @@ def test_joint_whose_inertia_friction_hides_is_not_trusted():
     assert 'stick' not in '\n'.join(sentences(seen))
 
 
-def test_what_friction_and_inertia_do_to_the_gains_is_told():
-    seen = found()
-    damping = seen.choice.gains.damping * np.array([0.9, 1.1])
-    rubbing = seen._replace(findings=seen.findings._replace(damping=damping))
-    told = '\n'.join(sentences(rubbing))
-    assert 'friction damps joint2 more than the gains do' in told
-    assert '--prove' in told
-    choice = seen.choice._replace(by_inertia=np.array([True, False]))
-    told = '\n'.join(sentences(seen._replace(choice=choice)))
-    assert 'joint1: limited by inertia' in told
-    told = '\n'.join(sentences(seen))
-    assert 'limited by inertia' not in told
-    assert 'more than the gains do' not in told
-
-
 def test_gains_far_from_those_of_the_measurement_are_to_be_raised_in_steps():
     least = found()
     choice = least.choice._replace(factors=np.array([2.0, 6.0]))
@@ -632,19 +496,19 @@ def test_bags_of_the_written_motions_commission_as_the_simulated_arm(tmp_path, c
 
 
 def test_a_posture_that_noise_hides_is_measured_again_with_more_torque():
-    """Encoders of 0.045 mrad, whose velocities are differences."""
+    """Encoders of 0.05 mrad, whose velocities are differences."""
     commissioning = blf.Commissioning(CONFIG, [POSTURE], torque=0.01, travel=0.05)
     (weak,) = commissioning.motions
     clear = simulated.measured(weak, ARM)
     assert strength(*clear) == 1.0
     assert commissioning.stronger(weak, clear[0]) is None
-    run = simulated.measured(weak, coarse(4.5e-5))
+    run = simulated.measured(weak, coarse(5e-5))
     factor = strength(*run)
     assert 2.0 < factor < MOST
     again = commissioning.stronger(weak, run[0])
     shares = again.excitation.amplitude / weak.excitation.amplitude
     np.testing.assert_allclose(shares[:, :-2], factor, rtol=1e-9)
-    assert strength(*simulated.measured(again, coarse(4.5e-5))) == 1.0
+    assert strength(*simulated.measured(again, coarse(5e-5))) == 1.0
 
 
 def coarse(resolution):

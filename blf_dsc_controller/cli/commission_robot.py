@@ -186,12 +186,7 @@ def _limits(
         f'to each posture the joints move straight, at {SPEED:g} rad/s at most: keep the way of '
         'the arm free'
     )
-    swings = np.max([each.excitation.swing for each in planned], axis=0)
-    swing = ', '.join(f'{torque:.2g}' for torque in swings)
-    yield (
-        f'the motions add torques of {shaking} N m (rms), and swings of {swing} N m that keep '
-        f'the joints sliding; torque.limit is {most} N m'
-    )
+    yield f'the motions add torques of {shaking} N m (rms); torque.limit is {most} N m'
     yield (
         f'where noise hides too much, a posture is measured once more, with {shaken_most} N m at '
         f'most; the tool then travels {1e3 * options.travel:.3g} mm at most'

@@ -15,18 +15,8 @@ from blf_dsc_controller.arms.joint_gains import JointGains, damped_arm, unknown_
 from blf_dsc_controller.arms.model import inertia_matrices
 from blf_dsc_controller.arms.tuning import Design
 from blf_dsc_controller.commissioning import motion
-from blf_dsc_controller.commissioning.choice import (
-    MARGIN,
-    Choice,
-    Loops,
-    RigidArm,
-    choose,
-)
-from blf_dsc_controller.commissioning.chosen import (
-    kept_bound,
-    kept_stop,
-    with_gains,
-)
+from blf_dsc_controller.commissioning.choice import MARGIN, Choice, Loops, choose
+from blf_dsc_controller.commissioning.chosen import kept_bound, with_gains
 from blf_dsc_controller.commissioning.findings import Findings, findings_of
 from blf_dsc_controller.commissioning.response import Response, response_of
 from blf_dsc_controller.configuration.controller import ControllerConfig, design_of
@@ -68,8 +58,7 @@ class Commissioned(NamedTuple):
     choice: Choice
     findings: Findings
     assumed: Floats  # (n,) kg m^2, inertias by URDF and guess, where findings has them
-    rotors: Floats  # (n,) kg m^2, robot.rotor_inertia: measured, else as assumed
-    lag: float  # s, robot.lag: likewise
+    lag: float  # s, robot.lag: measured, else as given
     date: str  # when the gains were chosen
     aim: float  # the modulus margin that was asked for
     before: ControllerConfig  # for which the arm was measured
@@ -102,14 +91,11 @@ class Commissioned(NamedTuple):
 
     def _values(self) -> dict[str, Value]:
         gains = self.choice.gains
-        damping = _rounded(gains.damping)
         return {
-            **kept_stop(self.before, np.array(damping)),
             'robot.lag': float(f'{self.lag:.3g}'),
-            'robot.rotor_inertia': _rounded(self.rotors),
             'feedback.inertia': 'none',
             'feedback.joint_stiffness': _rounded(gains.stiffness),
-            'feedback.joint_damping': damping,
+            'feedback.joint_damping': _rounded(gains.damping),
             'feedback.stiffness': 1.0,
             'commissioning.date': self.date,
             'commissioning.version': __version__,
@@ -193,10 +179,6 @@ def commissioned(
     known = np.where(np.isnan(found.inertia), here.max(axis=0), found.inertia)
     inertia = known + np.maximum(elsewhere, 0.0)
     loops = Loops(responses, inertia, T)
-    beyond = _least(found.inertias - here, 0.0 * here)  # least: a load is no motor
-    rotors = (arm.rotors + beyond).clip(0.0)
-    least = _least(found.inertias, here)
-    rigid = RigidArm(least, found.timing(T, arm.lag))
 
     def by_factors(factors: Floats) -> JointGains:
         if config.feedback.joint_stiffness:
@@ -209,21 +191,14 @@ def commissioned(
         responses=responses,
         loops=loops,
         start=start,
-        choice=choose(loops, start, by_factors, rigid, margin),
+        choice=choose(loops, start, by_factors, margin),
         findings=found,
         assumed=here.max(axis=0),
-        rotors=rotors,
         lag=config.robot.lag if np.isnan(lag) else lag,
         date=datetime.now().astimezone().strftime('%Y-%m-%d %H:%M'),
         aim=margin,
         before=config,
     )
-
-
-def _least(measured: Floats, assumed: Floats) -> Floats:
-    """Return the least (n,) of what was measured in k runs (k, n); of `assumed` where none was."""
-    least = np.where(np.isnan(measured), np.inf, measured).min(axis=0)
-    return np.asarray(np.where(np.isinf(least), assumed.min(axis=0), least))
 
 
 def measuring_gains(arm: Design) -> JointGains:

@@ -20,7 +20,6 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from blf_dsc_controller.arms.linear_loop import Timing
 from blf_dsc_controller.commissioning.response import Response
 from blf_dsc_controller.run import Run
 
@@ -51,7 +50,6 @@ class Findings(NamedTuple):
     inertia: (
         Floats  # (n,) kg m^2, the largest with the others held; nan: friction hides it
     )
-    inertias: Floats  # (k, n) likewise in each run
     damping: Floats  # (n,) N m s/rad, the mean
     drive_lag: float  # s, from a torque to the motion, sampling included; nan likewise
     velocity_lag: float  # s, of velocities against positions
@@ -63,20 +61,9 @@ class Findings(NamedTuple):
 
     def lag(self, sample_time: float) -> float:
         """Return `robot.lag` [s]: the lags beyond those of sampling; nan: not known."""
-        return float(np.sum(self._lags(sample_time)))
-
-    def timing(self, sample_time: float, lag: float) -> Timing:
-        """Return sampling and lags; where they are not known, halves of `lag` [s]."""
-        drives, velocity = self._lags(sample_time)
-        if np.isnan(drives):
-            drives = velocity = 0.5 * lag
-        return Timing(sample_time, drive_lag=drives, velocity_lag=velocity)
-
-    def _lags(self, sample_time: float) -> tuple[float, float]:
-        """Return the lags of drives and velocities [s] beyond those of sampling."""
-        drives = np.maximum(0.0, self.drive_lag - 1.5 * sample_time)
-        velocity = np.maximum(0.0, self.velocity_lag - 0.5 * sample_time)
-        return float(drives), float(velocity)
+        beyond = self.drive_lag - 1.5 * sample_time
+        of_velocity = self.velocity_lag - 0.5 * sample_time
+        return float(np.maximum(0.0, beyond) + np.maximum(0.0, of_velocity))
 
 
 def findings_of(runs: Sequence[Run], responses: Sequence[Response]) -> Findings:
@@ -93,7 +80,6 @@ def findings_of(runs: Sequence[Run], responses: Sequence[Response]) -> Findings:
     usual = float(np.median(gaps))
     return Findings(
         inertia=_largest(inertia),
-        inertias=inertia,
         damping=damping.mean(axis=0),
         drive_lag=_middle(lag),
         velocity_lag=float(np.median([_velocity_lag(each) for each in responses])),

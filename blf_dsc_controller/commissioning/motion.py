@@ -11,9 +11,8 @@ from which the whole matrix of responses follows.  What a period shows between t
 is noise and friction, and tells how much of a response can be believed.
 
 Torques are alike at all frequencies: a joint with inertia J moves by tau / (J omega^2).  Two
-tones more keep each joint sliding, since friction hides and damps the resonances of a joint
-that sticks.  A swing of a given speed travels less the faster it is, so these are of 4 Hz.
-Phases are random, but for the start: positions, velocities and accelerations
+slow tones keep each joint sliding, since friction hides the resonances of a joint that
+sticks.  Phases are random, but for the start: positions, velocities and accelerations
 begin at zero, so an arm at rest is not jerked.
 """
 
@@ -44,8 +43,9 @@ _LINES = 80  # of each joint, at most
 _SLOWEST, _FASTEST = 2.0, 120.0  # Hz
 _OF_RATE = 0.35  # of the sample rate, the fastest line at most
 _SECONDS = 4.0  # of the period, for each joint
-_SLOW = 4.0  # Hz, of the tones that keep joints sliding
+_SLOW = 1.0  # Hz, of the tones that keep joints sliding
 _SLIDING = 0.1  # rad/s, their largest speed
+_LEAST_SWING = 0.05  # times that, before the lines shrink, too
 _SHRINKS = 40  # until travel and speeds are within their limits
 _SPEED = 0.25  # of the limit of velocity
 _SEED = 0
@@ -58,13 +58,12 @@ class Excitation(NamedTuple):
 
     period: float  # s
     bins: Ints  # (n, K) of the spectrum of a period: lines of each joint
-    slow: Ints  # (n, 2) likewise: the tones that keep the joints sliding, of all alike
+    slow: Ints  # (n, 2) likewise: the tones that keep the joints sliding
     amplitude: Floats  # (n, K + 2) rad, of lines and slow tones
     phase: Floats  # (n, K + 2) rad
     travel: float  # m, of the tool from its middle
     speed: Floats  # (n,) rad/s, the largest
     acceleration: Floats  # (n,) rad/s^2, which none exceeds
-    swing: Floats  # (n,) N m, torque of the slow tones at most, without friction
 
     @property
     def frequencies(self) -> Floats:
@@ -96,7 +95,6 @@ class Lines(NamedTuple):
 
     period: float  # s
     bins: Ints  # (n, K)
-    slow: Ints  # (n, 2) of the swings, which are neither lines nor noise
 
     @property
     def frequencies(self) -> Floats:
@@ -118,8 +116,7 @@ def lines_in(config: ControllerConfig) -> Lines:
     if np.abs(bins - np.rint(bins)).max() > 1e-6:
         raise BlfDscError(_OTHER_MOTION)
     by_joint = np.rint(bins).astype(np.int64).reshape(n, -1)
-    period = 2.0 * np.pi / float(rates[0])
-    return Lines(period, by_joint[:, :-SLOW_TONES], by_joint[:, -SLOW_TONES:])
+    return Lines(2.0 * np.pi / float(rates[0]), by_joint[:, :-SLOW_TONES])
 
 
 _OTHER_MOTION = (
@@ -135,13 +132,13 @@ def excitation(
 
     Its torques are `share` of the rated ones (rms), by the inertias that the URDF and
     `robot.rotor_inertia` have; less, where its tool would travel farther than `travel`
-    [m], and of each joint that would move faster than a quarter of its limit.  Its swing
-    shrinks with its lines, so that it slides as much of the time.
+    [m] or a joint would move faster than a quarter of its limit.
     """
     n = len(config.joints)
     period = _SECONDS * n
     bins = _bins(n, period, config.sample_time)
-    slow = np.tile(_swings(n, period), (n, 1))
+    first = round(_SLOW * period) - n + np.arange(n)
+    slow = np.column_stack((first, first + 2 * n))
     chain = config.robot.chain(config.joints)
     base = parameters_of(config.robot, chain)
     P = base.of(chain.inertias, config.robot.rotors(chain))
@@ -154,29 +151,19 @@ def excitation(
     shape = _Shape(np.column_stack((bins, slow)), period)
     limit = _SPEED * np.array(config.limits.velocity)
     middle = frames(chain, posture)[-1][:3, 3]
-    tones = np.column_stack((lines, swing))
-    factors = np.ones(n)
+    factors = np.ones(2)  # of lines and swings
     for _ in range(_SHRINKS):
-        amplitude = factors[:, None] * tones
+        amplitude = np.column_stack((factors[0] * lines, factors[1] * swing))
         phase, moved, speed = shape.motion(amplitude)
         tips = frames(chain, posture + moved)[-1][:, :3, 3]
         far = float(np.linalg.norm(tips - middle, axis=1).max())
-        excess = np.maximum(speed / limit, far / travel)
-        if (excess <= 1.0).all():
+        excess = max(far / travel, float((speed / limit).max()))
+        if excess <= 1.0:
             break
-        factors /= np.where(excess > 1.0, excess.clip(1.02, 2.0), 1.0)
-    accelerations = amplitude * shape.rates**2
-    return Excitation(
-        period=period,
-        bins=bins,
-        slow=slow,
-        amplitude=amplitude,
-        phase=phase,
-        travel=far,
-        speed=speed,
-        acceleration=accelerations.sum(axis=1),
-        swing=inertia * accelerations[:, -SLOW_TONES:].sum(axis=1),
-    )
+        shrunk = slice(1, 2) if factors[1] > _LEAST_SWING else slice(None)
+        factors[shrunk] /= max(min(excess, 2.0), 1.05)
+    acceleration = (amplitude * shape.rates**2).sum(axis=1)
+    return Excitation(period, bins, slow, amplitude, phase, far, speed, acceleration)
 
 
 class _Shape:
@@ -252,15 +239,6 @@ def _bins(n: int, period: float, sample_time: float) -> Ints:
     wanted = np.geomspace(_SLOWEST, fastest, _LINES) * period / (2 * n)
     middle = np.unique(np.rint(wanted).astype(np.int64))
     return np.asarray(2 * n * middle + np.arange(n)[:, None])
-
-
-def _swings(n: int, period: float) -> Ints:
-    """Return two waves, odd multiples of n: so are those that friction, odd, makes of them.
-
-    Lines are none of these.
-    """
-    below = 2 * n * round(_SLOW * period / (2 * n))
-    return np.array([below - n, below + n])
 
 
 def _from_rest(amplitude: Floats, bins: Ints, phase: Floats) -> Floats:
