@@ -18,7 +18,7 @@ from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 
-from blf_dsc_controller.cli.parser import check_command, make_parser
+from blf_dsc_controller.cli.parser import check_command, check_text, make_parser
 from blf_dsc_controller.cli.ros_check import require_ros
 from blf_dsc_controller.errors import BlfDscError
 
@@ -36,6 +36,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser = make_parser()
     words = sys.argv[1:] if arguments is None else arguments
     check_command(parser, words)
+    check_text(parser, words)
     options = parser.parse_args(
         words, argparse.Namespace(line=shlex.join(['blf_dsc', *words]))
     )

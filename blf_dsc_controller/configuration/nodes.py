@@ -199,9 +199,11 @@ def locate(given: str | Path) -> Path:
     if stem in presets:
         return presets[stem]
     what = 'is a folder' if path.is_dir() else 'does not exist'
+    if path.exists() and not path.is_dir():
+        what = 'is no regular file'
     remedy = f'give a parameter file, or a preset: {", ".join(presets)}'
     raise ConfigurationError(
-        [f'{name} {what}{suggestion(stem, presets) or ":"} {remedy}']
+        [f'{name or "an empty name"} {what}{suggestion(stem, presets) or ":"} {remedy}']
     )
 
 
@@ -224,7 +226,7 @@ def read(path: str | Path, based: tuple[str, ...] = ()) -> Sequence[Section]:
             return sections
         below = _based_on(str(base), Path(path).parent)
         above = (*based, str(path))
-    except (UnicodeDecodeError, OSError) as error:
+    except OSError as error:
         raise ConfigurationError([str(error)], str(path)) from error
     except ConfigurationError as error:
         raise ConfigurationError(error.problems, str(path)) from error

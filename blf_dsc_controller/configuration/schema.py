@@ -108,6 +108,8 @@ class Parameter:
                 _is(entry, int | float) for entry in entries
             )
             expected += ', with a decimal point' if lacks_point else ''
+            if self.type is str and not any(isinstance(each, str) for each in entries):
+                expected += ': write it in quotes'
             yield f'{self.name}: got {format_value(given)}, {expected}'
             return
         if not (entries or self.omittable or self.length):
