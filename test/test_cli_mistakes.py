@@ -19,7 +19,7 @@ from blf_dsc_controller.cli.main import main
 from blf_dsc_controller.cli.parser import make_parser
 from blf_dsc_controller.cli.run import _configuration, _ideal
 from blf_dsc_controller.compiled.announcement import COMPILING
-from blf_dsc_controller.configuration.nodes import load_loop
+from blf_dsc_controller.configuration.nodes import CONTROLLER, load_loop
 
 INTERRUPTED_WHILE_COMPILING = """
 import os, signal, sys
@@ -114,6 +114,8 @@ def test_run_says_that_its_simulated_arm_is_ideal_and_that_nothing_moves(tmp_pat
     rigid, holds = _ideal(load_loop(path))
     assert 'exactly that of the URDF, on rigid gears' in rigid
     assert 'reference.type is hold' in holds
+    still = {CONTROLLER: {'reference.type': 'sinusoids'}}
+    assert 'reference.amplitude is 0' in [*_ideal(load_loop(path, still))][1]
     assert [*_ideal(load_loop('ur5e'))] == []
 
 
@@ -273,6 +275,49 @@ def test_numbers_that_no_stamp_or_file_holds_are_refused(
     run = here(capsys, '--offline', *words, '--out', tmp_path / 'out')
     assert run.returncode == 1
     assert problem in run.stderr
+
+
+@pytest.mark.parametrize(
+    ('output', 'code', 'said'),
+    [
+        (
+            '/dev/full',
+            1,
+            'blf_dsc export: what it says cannot be written: No space left',
+        ),
+        ('pipe', 0, ''),
+    ],
+)
+def test_output_that_nobody_takes_ends_in_a_sentence_or_silently(
+    bag, tmp_path, output, code, said
+):
+    reader, writer = os.pipe()
+    os.close(reader)
+    target = writer if output == 'pipe' else os.open(output, os.O_WRONLY)
+    words = [sys.executable, '-m', 'blf_dsc_controller', 'export', str(bag), '--out']
+    run = subprocess.run(
+        [*words, str(tmp_path / 'a.csv')],
+        stdout=target,
+        stderr=subprocess.PIPE,
+        env={**os.environ, 'PYTHONUNBUFFERED': ''},
+        text=True,
+        check=False,
+    )
+    assert run.returncode == code, run.stderr
+    assert run.stderr.startswith(said)
+    assert len(run.stderr.splitlines()) == bool(said)
+    assert (tmp_path / 'a.csv').stat().st_size > 1000
+
+
+def test_name_that_the_shell_cannot_write_is_told_with_the_remedy(
+    tmp_path, monkeypatch, capsys
+):
+    def plot(_):
+        'ü'.encode('ascii')
+
+    monkeypatch.setattr('blf_dsc_controller.cli.bags.plot', plot)
+    assert main(['plot', str(tmp_path)]) == 1
+    assert "'\\xfc' cannot be written" in capsys.readouterr().err
 
 
 def test_version_is_that_of_the_package(capsys):

@@ -352,8 +352,21 @@ def test_overrides_take_precedence_over_the_file(file):
     plant = load_plant(path, overrides={'duration': 5.0})
     assert (plant.seed, plant.duration) == (3, 5.0)
     assert problems_of(path, load_plant, 'sim_plant', {'duration': -2.0}) == [
-        'duration: got -2.0, but it must be at least 0 s (given as an override)'
+        (
+            'duration: got -2.0, but it must be at least 0 and at most 1e+08 s '
+            '(given as an override)'
+        )
     ]
+
+
+@pytest.mark.parametrize(
+    'overrides', [{'plant': {'duration': 1.0}}, {'duration': 1.0}, {'sim_plant': 1.0}]
+)
+def test_overrides_of_no_node_are_not_ignored(overrides):
+    with pytest.raises(
+        ConfigurationError, match=r"such as \{'sim_plant': \{'duration'"
+    ):
+        load_loop('recommended', overrides)
 
 
 def test_unknown_names_are_rejected_and_those_of_other_nodes_only_in_their_own_section(

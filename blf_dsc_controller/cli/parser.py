@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import argparse
 import difflib
+import os
 import textwrap
 from collections.abc import Callable, Sequence
 from functools import partial
@@ -464,6 +465,6 @@ def check_text(parser: argparse.ArgumentParser, words: Sequence[str]) -> None:
     """End with a message if a word is no text: pages and files could not name it."""
     for word in words:
         try:
-            word.encode()
-        except UnicodeEncodeError:
+            os.fsencode(word).decode()
+        except UnicodeDecodeError:
             parser.error(f'{word!a} is no text in UTF-8: rename the file')

@@ -171,8 +171,14 @@ def _ideal(config: LoopConfig) -> Iterator[str]:
             'the simulated arm is exactly that of the URDF, on rigid gears: give sim_plant truth, '
             'joint and sensor to make it like a real one (doc/simulation.md)'
         )
-    if config.controller.reference.type == 'hold':
+    reference = config.controller.reference
+    if reference.type == 'hold':
         yield 'reference.type is hold: the arm stays where it is until it is sent a motion'
+    if reference.type == 'sinusoids' and not any(reference.amplitude):
+        yield (
+            'reference.amplitude is 0 for each joint: the arm stays at reference.offset. Give '
+            'both, or let blf_dsc excite find them'
+        )
 
 
 def _report(out: Path) -> bool:

@@ -302,11 +302,31 @@ def load_loop(
     controller disagree.
     """
     path = locate(given)
+    _check_overrides(overrides or {})
     configs = _load_all(path, NODES, overrides or {}, runs_law=runs_law)
     loop = LoopConfig(configs[PLANT], configs[CONTROLLER], configs[RECORDER])
     if problems := loop.problems():
         raise ConfigurationError(problems, str(path))
     return loop
+
+
+def _check_overrides(overrides: Mapping[str, Any]) -> None:
+    """Raise ConfigurationError if overrides are not those of nodes by name."""
+    expected = (
+        f"give them by node and name, such as {{'{PLANT}': {{'duration': 10.0}}}}"
+    )
+    problems = [
+        f'{name}: no node has this name{suggestion(name, NODES)}; {expected}'
+        for name in overrides
+        if name not in NODES
+    ]
+    problems += [
+        f'{name}: got {values!r} instead of overrides; {expected}'
+        for name, values in overrides.items()
+        if name in NODES and not isinstance(values, Mapping)
+    ]
+    if problems:
+        raise ConfigurationError(problems)
 
 
 def _load_all(
