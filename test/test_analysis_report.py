@@ -83,7 +83,7 @@ def test_a_change_of_the_arm_is_drawn_from_close_by(tmp_path):
         'events.payload': (0.25,),
     }
     loop = load_loop('recommended', {'sim_plant': {'duration': 4.0, **event}})
-    drawn = draw(simulate(loop.controller, loop.plant).run(), tmp_path)
+    drawn = draw(simulate(loop.controller, loop.plant).run(), str(tmp_path))
     assert [path.name for path in drawn[:2]] == ['tracking.png', 'change.png']
     image = pixels(tmp_path / 'change.png')
     assert amount(image, '#DCE9F5') > 100_000  # the bound

@@ -171,6 +171,8 @@ def test_it_follows_trajectories_and_stops_on_request():
     controller.follow([goal])
     with pytest.raises(TrajectoryError, match='rejected'):
         controller.follow([blf.TrajectoryPoint(1e-3, (90.0, 90.0))])
+    with pytest.raises(TrajectoryError, match='got a tuple, but each point is a Traj'):
+        controller.follow([(2.0, (2.2, 1.6))])
     for step in range(10, 2500):
         q, dq, effort = plant.measure().reshape(3, -1)
         plant.step(controller.update(1.0 + 1e-3 * step, q, dq, effort))

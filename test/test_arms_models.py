@@ -475,7 +475,13 @@ WRONG_TEXTS = (  # what is replaced, by what, and the remedy
     ('upper="2.8973"', 'upper="-3"', 'empty range, -2.8973 to -3'),
     (MASS, '<mass value="heavy" />', '<mass value="heavy">: expected 1 finite number'),
     (AXIS, '<axis xyz="0 1" />', 'expected 3 finite number'),
-    (LINK8, '<link name="panda_link7" />', 'each link needs a unique name'),
+    (
+        LINK8,
+        '<link name="panda_link7" />',
+        "each link needs a unique name; got 'panda_link7' 2 times: rename",
+    ),
+    ('<robot', '\n<?xml version="1.0"?><robot', 'remove what is above its <?xml'),
+    ('<robot', '<!DOCTYPE html><html>404</html><robot', 'it is a web page'),
     (LINK8, '', "has the child 'panda_link8', but the links are"),
     (
         'child link="panda_right',
@@ -486,6 +492,12 @@ WRONG_TEXTS = (  # what is replaced, by what, and the remedy
 WRONG_CHAINS = (
     ({'tip': 'tool'}, "no link 'tool' for the tip: the links are panda_link0, "),
     ({'base': 'world'}, "no link 'world' for the base"),
+    ({'tip': 'Panda_Link7'}, "; did you mean 'panda_link7'?"),
+    ({'text': '<robot name="a"><group /></robot>', 'joints': ()}, 'perhaps an SRDF'),
+    (
+        {'tip': '', 'joints': ()},
+        'Set robot.tip to the last link of the arm, such as panda_link7',
+    ),
     ({'tip': 'panda_joint7'}, "is a joint, and the tip is a link: give 'panda_link7'"),
     ({'base': 'panda_joint1'}, "and the base is a link: give 'panda_link0'"),
     (
@@ -496,7 +508,7 @@ WRONG_CHAINS = (
     ({'joints': PANDA[::-1]}, 'panda_joint7, in this order; got panda_joint7'),
     ({'joints': PANDA[:6]}, 'panda_joint7, in this order'),
     ({'joints': (*PANDA, 'panda_finger_joint1')}, 'choose another base or tip'),
-    ({'base': 'panda_hand', 'joints': ()}, 'are none'),
+    ({'base': 'panda_hand', 'joints': ()}, 'are none: choose another base or tip'),
     (
         {'text': WEIGHTLESS.replace('<mass value="0.015" />', '<mass value="0" />')},
         'nor has anything fixed to them: panda_link7 (moved by panda_joint7): add',

@@ -17,8 +17,9 @@ from recorded_run import Synthetic, small_disk
 from blf_dsc_controller import __version__
 from blf_dsc_controller.cli.main import main
 from blf_dsc_controller.cli.parser import make_parser
-from blf_dsc_controller.cli.run import _configuration
+from blf_dsc_controller.cli.run import _configuration, _ideal
 from blf_dsc_controller.compiled.announcement import COMPILING
+from blf_dsc_controller.configuration.nodes import CONTROLLER, load_loop
 
 INTERRUPTED_WHILE_COMPILING = """
 import os, signal, sys
@@ -67,6 +68,55 @@ def test_unwritable_output_path_is_reported(
     (error,) = (line for line in lines if COMPILING not in line)
     assert error.startswith(f'blf_dsc {command.split()[0]}: ')
     assert '[Errno ' in error or 'choose another' in error
+
+
+@pytest.mark.parametrize(
+    ('words', 'answer'),
+    [
+        (
+            'report BAG --out page.pdf',
+            'page.pdf: the report is a page: give a name in .ht',
+        ),
+        ('report table.csv', 'only blf_dsc identify reads: give a bag'),
+        (
+            'excite no/e.yaml --config panda',
+            'there is no folder no: make it, or choose',
+        ),
+    ],
+)
+def test_file_of_another_kind_or_place_is_answered_with_what_to_give(
+    bag, tmp_path, monkeypatch, capsys, words, answer
+):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / 'table.csv').write_text('time,q1\n0,1\n')
+    assert main([str(bag) if word == 'BAG' else word for word in words.split()]) == 1
+    assert answer in capsys.readouterr().err
+    assert [path.name for path in tmp_path.iterdir()] == ['table.csv']
+
+
+def test_study_of_an_arm_that_is_none_leaves_no_folder(tmp_path, capsys):
+    out = tmp_path / 'arms'
+    for config, problem in (('nothing', 'does not exist'), ('paper', 'model two_link')):
+        assert main(['arms', '--config', config, '--out', str(out)]) == 1
+        assert problem in capsys.readouterr().err
+    assert not out.exists()
+
+
+def test_commissioned_file_is_not_written_over_its_picture(tmp_path, capsys):
+    words = ['commission', '--config', 'ur5e', '--out', str(tmp_path / 'found.png')]
+    assert main(words) == 1
+    assert 'would be the picture' in capsys.readouterr().err
+
+
+def test_run_says_that_its_simulated_arm_is_ideal_and_that_nothing_moves(tmp_path):
+    path = tmp_path / 'my.yaml'
+    path.write_text('/**: {ros__parameters: {robot: {urdf: ur5e.urdf, tip: tool0}}}\n')
+    rigid, holds = _ideal(load_loop(path))
+    assert 'exactly that of the URDF, on rigid gears' in rigid
+    assert 'reference.type is hold' in holds
+    still = {CONTROLLER: {'reference.type': 'sinusoids'}}
+    assert 'reference.amplitude is 0' in [*_ideal(load_loop(path, still))][1]
+    assert [*_ideal(load_loop('ur5e'))] == []
 
 
 def test_interrupt_during_kernel_compilation_ends_the_command():
@@ -198,6 +248,76 @@ def test_unknown_command_is_answered_with_the_closest_one(capsys):
         main(['rnu'])
     assert ended.value.code == 2
     assert 'no command rnu, did you mean run?' in capsys.readouterr().err
+
+
+def test_path_that_is_no_text_is_refused_before_anything_is_made(tmp_path, capsys):
+    name = os.fsdecode(os.fsencode(tmp_path) + b'/\xff')
+    with pytest.raises(SystemExit) as ended:
+        main(['run', '--offline', '--duration', '0.1', '--out', name])
+    assert ended.value.code == 2
+    assert 'is no text in UTF-8: rename' in capsys.readouterr().err
+    assert not [*tmp_path.iterdir()]
+
+
+@pytest.mark.parametrize(
+    ('words', 'problem'),
+    [
+        (
+            ['--duration', '1e300'],
+            'duration: got 1.0e+300, but it must be at least 0 a',
+        ),
+        (['--seed', str(2**63)], 'seed: got 9223372036854775808, but it must be at l'),
+    ],
+)
+def test_numbers_that_no_stamp_or_file_holds_are_refused(
+    tmp_path, capsys, words, problem
+):
+    run = here(capsys, '--offline', *words, '--out', tmp_path / 'out')
+    assert run.returncode == 1
+    assert problem in run.stderr
+
+
+@pytest.mark.parametrize(
+    ('output', 'code', 'said'),
+    [
+        (
+            '/dev/full',
+            1,
+            'blf_dsc export: what it says cannot be written: No space left',
+        ),
+        ('pipe', 0, ''),
+    ],
+)
+def test_output_that_nobody_takes_ends_in_a_sentence_or_silently(
+    bag, tmp_path, output, code, said
+):
+    reader, writer = os.pipe()
+    os.close(reader)
+    target = writer if output == 'pipe' else os.open(output, os.O_WRONLY)
+    words = [sys.executable, '-m', 'blf_dsc_controller', 'export', str(bag), '--out']
+    run = subprocess.run(
+        [*words, str(tmp_path / 'a.csv')],
+        stdout=target,
+        stderr=subprocess.PIPE,
+        env={**os.environ, 'PYTHONUNBUFFERED': ''},
+        text=True,
+        check=False,
+    )
+    assert run.returncode == code, run.stderr
+    assert run.stderr.startswith(said)
+    assert len(run.stderr.splitlines()) == bool(said)
+    assert (tmp_path / 'a.csv').stat().st_size > 1000
+
+
+def test_name_that_the_shell_cannot_write_is_told_with_the_remedy(
+    tmp_path, monkeypatch, capsys
+):
+    def plot(_):
+        'ü'.encode('ascii')
+
+    monkeypatch.setattr('blf_dsc_controller.cli.bags.plot', plot)
+    assert main(['plot', str(tmp_path)]) == 1
+    assert "'\\xfc' cannot be written" in capsys.readouterr().err
 
 
 def test_version_is_that_of_the_package(capsys):

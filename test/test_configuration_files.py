@@ -189,6 +189,8 @@ MALFORMED = [
     ('- 1\n', 'line 1: expected node names or ros__parameters at the top'),
     ('a: [1\n', 'line 2: not valid YAML'),
     ('a:\n\tb: 1\n', 'line 2: not valid YAML'),
+    ('<robot name="a">\n<!-- it: is -->\n</robot>', 'line 2: not valid YAML'),
+    (section('n', 'a: [\u22121.0, 2.0]'), 'line 2: a mixes types'),
     ('n:\n  seed: 1\n', 'line 2: seed has a value, but is outside of ros__parameters'),
     ('n:\n', 'line 1: n has a value, but is outside of ros__parameters'),
     (
@@ -228,6 +230,39 @@ IGNORED = [
     (section('n', 'a: {}'), 'line 2: a has no parameters'),
 ]
 """What ROS would silently ignore, or read in part."""
+
+
+REMEDIES = [
+    ('a:\n\tb: 1\n', 'indent with spaces, not with tabs'),
+    ('<robot name="a">\n<!-- it: is -->\n</robot>', 'names it as robot.urdf'),
+    (section('n', 'a: 1') + '---\nm: {}\n', 'leave out the line ---'),
+    (section('n', 'a: &x 1, b: *x'), 'alias *x: write out its value'),
+    ('- 1\n', 'at the top, such as {/**: {ros__parameters: '),
+    ('n:\n  ros_parameters: {a: 1}\n', 'ros_parameters has to be ros__parameters'),
+    ('n:\n  seed: 1\n', 'write ros__parameters: below the name of the node'),
+    (section('n', '') + '\u00a0 a: 1\n', r"'\xa0 a' has other letters than those of"),
+    (section('n', 'a: [\u22121.0, 2.0]'), r"('\u22121.0' is text)"),
+]
+"""Mistakes whose cause is seen in the text, not in the word of the parser."""
+
+
+@pytest.mark.parametrize(('text', 'remedy'), REMEDIES)
+def test_frequent_mistake_is_told_with_its_remedy(file, text, remedy):
+    (problem,) = problems_of(file(text))
+    assert remedy in problem
+
+
+@pytest.mark.parametrize('encoding', ['utf-16', 'latin-1'])
+def test_file_that_is_not_utf_8_is_to_be_saved_so(tmp_path, encoding):
+    text = section('sim_plant', 'seed: 1 # groß')
+    (tmp_path / 'a.yaml').write_bytes(text.encode(encoding))
+    (problem,) = problems_of(tmp_path / 'a.yaml')
+    assert problem.endswith(': save it as UTF-8')
+    (tmp_path / 'a.urdf').write_bytes('<robot name="groß" />'.encode(encoding))
+    arm = f'robot: {{urdf: "{tmp_path}/a.urdf", tip: tool0}}'
+    (tmp_path / 'a.yaml').write_text(section('sim_plant', arm))
+    (problem,) = problems_of(tmp_path / 'a.yaml')
+    assert 'a.urdf is no text in UTF-8' in problem
 
 
 @pytest.mark.parametrize(('text', 'message'), MALFORMED + IGNORED)
@@ -325,8 +360,21 @@ def test_overrides_take_precedence_over_the_file(file):
     plant = load_plant(path, overrides={'duration': 5.0})
     assert (plant.seed, plant.duration) == (3, 5.0)
     assert problems_of(path, load_plant, 'sim_plant', {'duration': -2.0}) == [
-        'duration: got -2.0, but it must be at least 0 s (given as an override)'
+        (
+            'duration: got -2.0, but it must be at least 0 and at most 1e+08 s '
+            '(given as an override)'
+        )
     ]
+
+
+@pytest.mark.parametrize(
+    'overrides', [{'plant': {'duration': 1.0}}, {'duration': 1.0}, {'sim_plant': 1.0}]
+)
+def test_overrides_of_no_node_are_not_ignored(overrides):
+    with pytest.raises(
+        ConfigurationError, match=r"such as \{'sim_plant': \{'duration'"
+    ):
+        load_loop('recommended', overrides)
 
 
 def test_unknown_names_are_rejected_and_those_of_other_nodes_only_in_their_own_section(
@@ -663,3 +711,19 @@ def test_missing_urdf_is_reported_with_the_places_where_it_was_looked_for(
         load_loop(path)
     own = share_folder() / 'config' / 'no.urdf'
     assert f'there is no {tmp_path / "no.urdf"}, nor {own}' in str(error.value)
+
+
+def test_arm_may_be_named_by_the_url_of_a_file(file, tmp_path):
+    (tmp_path / 'mine.urdf').write_text(
+        (share_folder() / 'config/ur5e.urdf').read_text(encoding='utf-8')
+    )
+    arm = f'robot: {{urdf: "file://{tmp_path}/mine.urdf", tip: tool0}}'
+    assert len(load_plant(file(section('sim_plant', arm))).joints) == 6
+
+
+@pytest.mark.parametrize(
+    ('name', 'what'), [('', 'an empty name is a folder'), ('/dev/null', 'no regular f')]
+)
+def test_what_is_no_parameter_file_is_said(name, what):
+    with pytest.raises(ConfigurationError, match=what):
+        locate(name)

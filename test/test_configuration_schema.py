@@ -55,6 +55,11 @@ def test_values_are_kept_and_flattened_and_a_change_keeps_the_others():
     entries = array.array('d', [3.0, 4.0])  # as ROS gives them
     changed = change(built, {'disturbance.viscous': entries})
     assert flatten(changed) == {**flatten(built), 'disturbance.viscous': (3.0, 4.0)}
+    computed = {'seed': np.int64(6), 'disturbance.viscous': 2.0 * np.array([3.0, 4.0])}
+    of_script = change(built, computed)
+    assert of_script.seed == 6
+    assert of_script.disturbance.viscous == (6.0, 8.0)
+    assert type(of_script.disturbance.viscous[0]) is float
     with pytest.raises(ConfigurationError, match='shorter than one sample'):
         change(changed, {'sample_time': 1.0, 'duration': 0.5})
 

@@ -430,6 +430,7 @@ def test_file_without_a_usable_law_is_rejected(tmp_path, capsys):
         ('missing.py', None, 'expected a law of the study (proposed, '),
         ('json.py', '', 'there is another module of this name'),
         ('broken.py', '1 / 0', 'cannot be imported: ZeroDivisionError'),
+        ('unclosed.py', '\nLAWS = {', 'cannot be imported: line 2: '),
         ('empty.py', '', 'LAWS must be a dict of StudiedLaw by name'),
         ('taken.py', taken, 'has a law slotine_li already'),
     ):

@@ -220,6 +220,22 @@ def test_expectation_says_that_torque_sensors_are_not_in_it(bandwidth, sensed):
     assert text.endswith(', less what joint torque sensors show in time') == sensed
 
 
+@pytest.mark.parametrize(
+    ('changes', 'said'),
+    [
+        ({'feedback.joint_damping': [9e9] * 7}, 'errors grow from sample to sample'),
+        ({'robot.payload': 20.0, 'feedback.joint_stiffness': [40.0] * 7}, '00 mrad of'),
+    ],
+)
+def test_expectation_is_a_number_of_two_digits_or_the_reason_why_there_is_none(
+    changes, said
+):
+    text = expectation(load_loop('panda', {'blf_dsc_controller': changes}).controller)
+    assert said in text
+    assert 'nan' not in text
+    assert 'e+' not in text
+
+
 URDF = read_urdf('panda.urdf')
 IN_KG_MM2 = re.sub(
     r'\b(i[xyz]{2})="(.+?)"',

@@ -147,13 +147,14 @@ def head(axes: Axes, title: str, *, legend_at: float | None = None) -> None:
     )
 
 
-def draw(run: Run, folder: Path, metrics: Metrics | None = None) -> list[Path]:
+def draw(run: Run, folder: str | Path, metrics: Metrics | None = None) -> list[Path]:
     """Draw tracking.png and what else the run has data for; return the paths.
 
     These are change.png if a simulated arm changed, and parameters.png if parameters
     were learned. The folder is created if necessary. `metrics` are those of the run, if
     they have been measured already.
     """
+    folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
     tracking, change, parameters = (folder / name for name in NAMES)
     metrics = metrics or measure(run)

@@ -17,7 +17,9 @@ Not supported: `floating`, `planar` and `mimic` joints in the chain, and closed 
 
 from __future__ import annotations
 
+import difflib
 import xml.etree.ElementTree as ET
+from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
@@ -133,11 +135,7 @@ def read_chain(text: str, base: str, tip: str, joints: tuple[str, ...]) -> Chain
                 f'joint {name!r} mimics another: choose a base and a tip without it'
             )
     moving = _moving(path)
-    if not moving or (wanted and wanted != moving):
-        raise BlfDscError(
-            f'the moving joints from base to tip are {_listed(moving)}, in this order; got '
-            f'{_listed(wanted)}: list them like this, or choose another base or tip'
-        )
+    _check_moving(moving, wanted, base, tip)
     chain: list[Joint] = []
     frame = np.eye(4)
     for element in path:
@@ -158,6 +156,22 @@ def read_chain(text: str, base: str, tip: str, joints: tuple[str, ...]) -> Chain
             'an <inertial> to each, even a rough one'
         )
     return Chain(base, tip, tuple(chain), frame)
+
+
+def _check_moving(
+    moving: Sequence[str], wanted: Sequence[str], base: str, tip: str
+) -> None:
+    """Raise BlfDscError if no joint moves between base and tip, or others than wanted."""
+    if not moving:
+        raise BlfDscError(
+            f'the moving joints from the base {base!r} to the tip {tip!r} are none: choose '
+            'another base or tip'
+        )
+    if wanted and wanted != moving:
+        raise BlfDscError(
+            f'the moving joints from base to tip are {_listed(moving)}, in this order; got '
+            f'{_listed(wanted)}: list them like this, or choose another base or tip'
+        )
 
 
 def frames(chain: Chain, q: np.ndarray) -> list[np.ndarray]:
@@ -235,6 +249,7 @@ class Tree(NamedTuple):
                     )
                 raise BlfDscError(
                     f'no link {link!r} for the {role}: the links are {_listed(self.links)}'
+                    f'{self._meant(link)}'
                 )
         path: list[ET.Element] = []
         link = tip
@@ -247,6 +262,16 @@ class Tree(NamedTuple):
             path.insert(0, self.above[link])
             link = _link(path[0], 'parent')
         return path
+
+    def _meant(self, link: str) -> str:
+        """Return what may be meant by a link that is none."""
+        if not self.links:
+            return (
+                ': a file without <link> is no URDF, but perhaps an SRDF; give another'
+            )
+        folded = {name.casefold(): name for name in self.links}
+        close = difflib.get_close_matches(link.casefold(), folded, n=1)
+        return f'; did you mean {folded[close[0]]!r}?' if close else ''
 
     def trunk(self) -> tuple[str, ...]:
         """Return the moving joints from the root to where they branch, as into fingers."""
@@ -267,10 +292,14 @@ class Tree(NamedTuple):
     def only_chain(self) -> tuple[str, ...]:
         """Return the moving joints, which must be one chain."""
         moving = _moving([*self.joints.values()])
-        if not moving or len(trunk := self.trunk()) < len(moving):
+        trunk = self.trunk() if moving else ()
+        if not moving or len(trunk) < len(moving):
+            such = (
+                f', such as {_link(self.joints[trunk[-1]], "child")}' if trunk else ''
+            )
             raise BlfDscError(
                 'neither a tip nor joints were given, and the moving joints are not one chain: '
-                f'{_listed(moving)}. Set robot.tip to the last link of the arm'
+                f'{_listed(moving)}. Set robot.tip to the last link of the arm{such}'
             )
         return trunk
 
@@ -305,7 +334,11 @@ def _robot(text: str) -> ET.Element:
         robot = parse_xml(text)
     except XmlError as error:
         hint = ''
-        if not text.rstrip().endswith('</robot>'):
+        if '<html' in text[:1000].lower():
+            hint = '; it is a web page: download the file that it shows'
+        elif 'declaration not at start' in str(error):
+            hint = ': remove what is above its <?xml'
+        elif not text.rstrip().endswith('</robot>'):
             hint = '; it does not end with </robot>: if it was cut off, copy it again'
         elif '<xacro:' in text:
             hint = f'; this looks like xacro, {expand}'
@@ -339,7 +372,11 @@ def _named(robot: ET.Element, tag: str) -> dict[str, ET.Element]:
         )
     named = {element.get('name', ''): element for element in elements}
     if len(named) < len(elements):
-        raise BlfDscError(f'each {tag} needs a unique name; got {_listed(named)}')
+        counts = Counter(element.get('name', '') for element in elements)
+        name, count = counts.most_common(1)[0]
+        raise BlfDscError(
+            f'each {tag} needs a unique name; got {name!r} {count} times: rename all but one'
+        )
     return named
 
 

@@ -29,6 +29,7 @@ from blf_dsc_controller.messages.codecs import typestore
 
 METADATA = 'metadata.yaml'
 _ROS1 = '.bag'
+_TABLES = {'.csv', '.txt', '.npz', '.mat', '.parquet'}
 CDR = 'cdr'
 MAGIC_SIZE = 8
 HEAD = Struct('<BQ')  # opcode and content length, at the start of each record
@@ -231,6 +232,8 @@ def check_regular(path: Path) -> None:
 def _reason(path: Path, error: Exception) -> str:
     if not path.exists():
         return 'there is no such folder'
+    if path.suffix in _TABLES:
+        return 'it is a table, which only blf_dsc identify reads: give a bag'
     files = sorted(path.glob('*.mcap')) if path.is_dir() else [path]
     is_mcap = bool(files) and files[0].suffix == '.mcap'
     text = ' '.join(f'{error}'.split()).rstrip('.') or type(error).__name__

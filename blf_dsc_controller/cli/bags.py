@@ -25,6 +25,7 @@ DIFFERENT = 3
 PARTIAL = 4
 """Exit code if all compared outputs are equal, but others could not be compared."""
 
+_PAGES = {'', '.html', '.htm'}
 _DISCOVERY = 1.0  # s, until subscribers have found the publishers
 
 
@@ -32,6 +33,8 @@ def report(options: Namespace) -> None:
     """Write the HTML page of one or several bags."""
     from blf_dsc_controller.analysis.report import read_bag, write_report
 
+    if options.out.suffix not in _PAGES:
+        raise BlfDscError(f'{options.out}: the report is a page: give a name in .html')
     make_room(options.out, force=options.force)
     names = NameMap.parse(options.map)
     bags = [read_bag(path, options.namespace, names) for path in options.bags]

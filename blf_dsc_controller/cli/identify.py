@@ -195,6 +195,10 @@ def excite(options: Namespace) -> None:
     """Search for the reference, and write it as a preset."""
     make_room(options.out, force=options.force)
     # what cannot be written is said at once
+    if not options.out.parent.is_dir():
+        raise BlfDscError(
+            f'there is no folder {options.out.parent}: make it, or choose another path'
+        )
     TemporaryFile(dir=options.out.parent).close()
     config = load(locate(options.config), CONTROLLER, ControllerConfig)
     if config.model != 'urdf':

@@ -18,7 +18,7 @@ from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 
-from blf_dsc_controller.cli.parser import check_command, make_parser
+from blf_dsc_controller.cli.parser import check_command, check_text, make_parser
 from blf_dsc_controller.cli.ros_check import require_ros
 from blf_dsc_controller.errors import BlfDscError
 
@@ -36,6 +36,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser = make_parser()
     words = sys.argv[1:] if arguments is None else arguments
     check_command(parser, words)
+    check_text(parser, words)
     options = parser.parse_args(
         words, argparse.Namespace(line=shlex.join(['blf_dsc', *words]))
     )
@@ -46,6 +47,16 @@ def main(arguments: Sequence[str] | None = None) -> int:
     end_at_signals(f'blf_dsc {options.command}')
     # Names may have letters that the font of the pictures lacks.
     warnings.filterwarnings('ignore', 'Glyph .* missing')
+    code = _code_of(options)
+    lost = _lost_output()
+    if lost:
+        print(f'blf_dsc {options.command}: {lost}', file=sys.stderr)
+        return code or 1
+    return code
+
+
+def _code_of(options: argparse.Namespace) -> int:
+    """Run the chosen command and return its exit code."""
     try:
         if options.command == 'run' and not options.offline:
             require_ros()  # before what takes a second to import
@@ -54,13 +65,37 @@ def main(arguments: Sequence[str] | None = None) -> int:
             importlib.import_module(f'blf_dsc_controller.cli.{module}'), function
         )
         code: int | None = command(options)
+    except BrokenPipeError:
+        return 1  # nobody reads any more
     except (BlfDscError, OSError) as error:
         print(f'blf_dsc {options.command}: {error}', file=sys.stderr)
+        return 1
+    except UnicodeEncodeError as error:
+        print(
+            f'blf_dsc {options.command}: {error.object[error.start : error.end]!a} cannot be '
+            'written in the encoding of this shell: set LC_ALL=C.UTF-8',
+            file=sys.stderr,
+        )
         return 1
     except KeyboardInterrupt:
         print(f'blf_dsc {options.command}: interrupted', file=sys.stderr)
         return INTERRUPTED
     return code or 0
+
+
+def _lost_output() -> str:
+    """Write what is still to be printed; return what is lost of it, in a sentence.
+
+    Nothing is lost of a pipe that somebody closes, as `head` does.
+    """
+    try:
+        sys.stdout.flush()
+    except OSError as error:
+        # so that the end of the interpreter does not try again
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        if not isinstance(error, BrokenPipeError):
+            return f'what it says cannot be written: {error.strerror}'
+    return ''
 
 
 def keep_to_one_thread() -> None:

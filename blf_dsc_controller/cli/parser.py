@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import argparse
 import difflib
+import os
 import textwrap
 from collections.abc import Callable, Sequence
 from functools import partial
@@ -458,3 +459,12 @@ def check_command(parser: argparse.ArgumentParser, words: Sequence[str]) -> None
         close = difflib.get_close_matches(words[0], known, n=1)
         guess = f', did you mean {close[0]}?' if close else ''
         parser.error(f'no command {words[0]}{guess}; there are {", ".join(known)}')
+
+
+def check_text(parser: argparse.ArgumentParser, words: Sequence[str]) -> None:
+    """End with a message if a word is no text: pages and files could not name it."""
+    for word in words:
+        try:
+            os.fsencode(word).decode()
+        except UnicodeDecodeError:
+            parser.error(f'{word!a} is no text in UTF-8: rename the file')

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import sys
 from argparse import Namespace
+from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import get_context
 from pathlib import Path
@@ -32,7 +33,7 @@ from blf_dsc_controller.configuration.nodes import (
     locate,
     read,
 )
-from blf_dsc_controller.configuration.plant import PlantConfig
+from blf_dsc_controller.configuration.plant import PlantConfig, Truth
 from blf_dsc_controller.configuration.schema import change
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.messages.codecs import JointStateDecoder
@@ -155,9 +156,29 @@ def _configuration(options: Namespace) -> LoopConfig:
         print(f'warning: {warning}', file=sys.stderr)
     if controller.model == 'urdf':
         print(f'errors to expect: {expectation(controller)}')
+        for note in _ideal(config):
+            print_notice(f'note: {note}')
     if end := end_of_waypoints(controller):
         print(end)
     return config
+
+
+def _ideal(config: LoopConfig) -> Iterator[str]:
+    """Yield why a simulated arm of a URDF errs less than a real one."""
+    plant = config.plant
+    if plant.truth == Truth() and not any(plant.joint.stiffness):
+        yield (
+            'the simulated arm is exactly that of the URDF, on rigid gears: give sim_plant truth, '
+            'joint and sensor to make it like a real one (doc/simulation.md)'
+        )
+    reference = config.controller.reference
+    if reference.type == 'hold':
+        yield 'reference.type is hold: the arm stays where it is until it is sent a motion'
+    if reference.type == 'sinusoids' and not any(reference.amplitude):
+        yield (
+            'reference.amplitude is 0 for each joint: the arm stays at reference.offset. Give '
+            'both, or let blf_dsc excite find them'
+        )
 
 
 def _report(out: Path) -> bool:

@@ -23,6 +23,8 @@ _PAUSE_IN_A_LOG = 10.0  # s between two updates of the bar
 def arms(options: Namespace) -> None:
     """Tune and run every law on URDF arms, write figures.json and print the table."""
     laws.chosen_laws(options.laws)  # before there is a folder
+    for config in options.config:
+        laws.trial(config, 0)
     folder = make_folder(options.out)
     with announced_compilation(print_notice):
         found = laws.compare(folder, options.config, options.laws)

@@ -15,6 +15,7 @@ PyYAML; `yes` is a bool, `010` is eight, `null` a string.
 
 from __future__ import annotations
 
+import difflib
 import functools
 import importlib.util
 import math
@@ -89,7 +90,8 @@ def parse(text: str) -> tuple[Section, ...]:
         line = f'line {mark.line + 1}: ' if mark else ''
         # of `_Limited`
         kind = '' if type(error) is yaml.MarkedYAMLError else 'not valid YAML: '
-        raise ConfigurationError([f'{line}{kind}{error.problem}']) from error
+        problem = f'{line}{kind}{error.problem}{_remedy(text, error)}'
+        raise ConfigurationError([problem]) from error
     except yaml.YAMLError as error:
         raise ConfigurationError([f'not valid YAML: {error}']) from error
     if root is None:
@@ -99,10 +101,7 @@ def parse(text: str) -> tuple[Section, ...]:
     sections: dict[tuple[str, ...], Section] = {}
     for names, node in _leaves(root, ()):
         if _MARK not in names:
-            outside = (
-                f'{names[-1]} has a value, but is outside of {_MARK}' if names else ''
-            )
-            raise _error(node, outside or f'expected node names or {_MARK} at the top')
+            raise _error(node, _outside(names))
         at = names.index(_MARK)
         pattern = f'/{"/".join(names[:at]).removeprefix("/")}'
         name = '.'.join(names[at + 1 :])
@@ -118,6 +117,34 @@ def parse(text: str) -> tuple[Section, ...]:
         elif not isinstance(node, yaml.MappingNode):
             raise _error(node, f'{_MARK} of {pattern} has no parameters')
     return tuple(sections.values())
+
+
+def _remedy(text: str, error: yaml.MarkedYAMLError) -> str:
+    """Return what to do about frequent mistakes in YAML."""
+    if text.lstrip().startswith('<'):
+        return '; it is XML: give a parameter file that names it as robot.urdf'
+    mark = error.problem_mark
+    if mark is not None and mark.buffer and mark.buffer[mark.pointer :][:1] == '\t':
+        return ': indent with spaces, not with tabs'
+    if error.problem and 'another document' in error.problem:
+        return ': leave out the line ---'
+    return ''
+
+
+def _outside(names: tuple[str, ...]) -> str:
+    """Return what is wrong with a value outside of the mark, below these names."""
+    if not names:
+        return (
+            f'expected node names or {_MARK} at the top, such as '
+            f'{{/**: {{{_MARK}: {{sample_time: 0.001}}}}}}'
+        )
+    problem = f'{names[-1]} has a value, but is outside of {_MARK}'
+    if any(not character.isascii() for character in ''.join(names)):
+        return f'{problem}: {names[-1]!a} has other letters than those of ASCII, perhaps spaces'
+    close = difflib.get_close_matches(_MARK, names, n=1, cutoff=0.8)
+    if close:
+        return f'{problem}: {close[0]} has to be {_MARK}'
+    return f'{problem}: write {_MARK}: below the name of the node, and this below it'
 
 
 def parse_scalar(word: str) -> bool | int | float | str:
@@ -169,9 +196,11 @@ def _value(node: yaml.Node, name: str) -> object:
         return _scalar(node, name)
     values = [_scalar(entry, name) for entry in node.value]
     if len({type(value) for value in values}) > 1:
+        words = [value for value in values if isinstance(value, str)]
+        alike = f'{words[0]!a} is text' if words else '1.0, not 1'
         raise _error(
             node,
-            f'{name} mixes types, which ROS rejects: write all entries alike (1.0, not 1)',
+            f'{name} mixes types, which ROS rejects: write all entries alike ({alike})',
         )
     return values
 
@@ -210,7 +239,9 @@ class _Limited(yaml.composer.Composer):
         self._depth += 1
         problem = ''
         if isinstance(event, yaml.AliasEvent):
-            problem = f'ROS does not support the alias *{event.anchor}'
+            problem = (
+                f'ROS does not support the alias *{event.anchor}: write out its value'
+            )
         elif self._depth > _DEEPEST:
             problem = f'nested more than {_DEEPEST} levels deep'
         elif self._nodes > _MOST_NODES:
@@ -267,6 +298,7 @@ def resolve(url: str) -> Path:
     own. Raises BlfDscError if there is no such folder or package.
     """
     if not url.startswith('package://'):
+        url = url.removeprefix('file://')
         path = Path(url).expanduser()
         own = share_folder() / 'config' / url
         return path if path.is_file() or not own.is_file() else own
@@ -309,7 +341,7 @@ def places_of(url: str) -> str:
 def read_text(path: Path) -> str:
     """Return the text of a file.
 
-    OSError if not regular or too large, or UnicodeDecodeError.
+    OSError if it is not regular, too large, or not UTF-8.
     """
     state = path.stat()
     if not stat.S_ISREG(state.st_mode):
@@ -318,4 +350,9 @@ def read_text(path: Path) -> str:
         raise OSError(
             f'{path} has {state.st_size} bytes; expected text of at most {_LARGEST}'
         )
-    return path.read_text(encoding='utf-8-sig')  # some editors mark their files
+    try:
+        return path.read_text(encoding='utf-8-sig')  # some editors mark their files
+    except UnicodeDecodeError as error:
+        raise OSError(
+            f'{path} is no text in UTF-8 (byte {error.start}): save it as UTF-8'
+        ) from error

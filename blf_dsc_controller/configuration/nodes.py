@@ -199,9 +199,11 @@ def locate(given: str | Path) -> Path:
     if stem in presets:
         return presets[stem]
     what = 'is a folder' if path.is_dir() else 'does not exist'
+    if path.exists() and not path.is_dir():
+        what = 'is no regular file'
     remedy = f'give a parameter file, or a preset: {", ".join(presets)}'
     raise ConfigurationError(
-        [f'{name} {what}{suggestion(stem, presets) or ":"} {remedy}']
+        [f'{name or "an empty name"} {what}{suggestion(stem, presets) or ":"} {remedy}']
     )
 
 
@@ -224,7 +226,7 @@ def read(path: str | Path, based: tuple[str, ...] = ()) -> Sequence[Section]:
             return sections
         below = _based_on(str(base), Path(path).parent)
         above = (*based, str(path))
-    except (UnicodeDecodeError, OSError) as error:
+    except OSError as error:
         raise ConfigurationError([str(error)], str(path)) from error
     except ConfigurationError as error:
         raise ConfigurationError(error.problems, str(path)) from error
@@ -300,11 +302,31 @@ def load_loop(
     controller disagree.
     """
     path = locate(given)
+    _check_overrides(overrides or {})
     configs = _load_all(path, NODES, overrides or {}, runs_law=runs_law)
     loop = LoopConfig(configs[PLANT], configs[CONTROLLER], configs[RECORDER])
     if problems := loop.problems():
         raise ConfigurationError(problems, str(path))
     return loop
+
+
+def _check_overrides(overrides: Mapping[str, Any]) -> None:
+    """Raise ConfigurationError if overrides are not those of nodes by name."""
+    expected = (
+        f"give them by node and name, such as {{'{PLANT}': {{'duration': 10.0}}}}"
+    )
+    problems = [
+        f'{name}: no node has this name{suggestion(name, NODES)}; {expected}'
+        for name in overrides
+        if name not in NODES
+    ]
+    problems += [
+        f'{name}: got {values!r} instead of overrides; {expected}'
+        for name, values in overrides.items()
+        if name in NODES and not isinstance(values, Mapping)
+    ]
+    if problems:
+        raise ConfigurationError(problems)
 
 
 def _load_all(

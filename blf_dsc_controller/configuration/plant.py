@@ -39,6 +39,7 @@ PerEventAndJoint = Annotated[tuple[float, ...], 'events.begin', 'joints']
 _BUILT = 'the plant is built once, when the node starts'
 _fixed = partial(parameter, read_only=_BUILT)
 _magnitude = partial(non_negative, read_only=_BUILT)
+_LONGEST = 1e8  # s: the seconds of a stamp are an int32
 _omitted = partial(non_negative, (), read_only=_BUILT, omittable=True)
 _of_events = partial(parameter, (), omittable=True)
 
@@ -316,9 +317,11 @@ class PlantConfig(ArmConfig):
         'one step per sample time of the wall clock, or one per received torque',
     )
     duration: float = _magnitude(
-        0.0, 'simulated time until the plant stops; 0: no limit', 's'
+        0.0, 'simulated time until the plant stops; 0: no limit', 's', at_most=_LONGEST
     )
-    seed: int = _magnitude(0, 'seed of the noise; equal seeds give equal runs')
+    seed: int = _magnitude(
+        0, 'seed of the noise; equal seeds give equal runs', at_most=2**63 - 1
+    )
     publish_clock: bool = _fixed(False, 'publish the simulated time on /clock')
     physics: Literal['own', 'mujoco'] = _fixed(
         'own', 'mechanics of the arm: compiled equations, or MuJoCo (an extra)'

@@ -108,6 +108,8 @@ class Parameter:
                 _is(entry, int | float) for entry in entries
             )
             expected += ', with a decimal point' if lacks_point else ''
+            if self.type is str and not any(isinstance(each, str) for each in entries):
+                expected += ': write it in quotes'
             yield f'{self.name}: got {format_value(given)}, {expected}'
             return
         if not (entries or self.omittable or self.length):
@@ -215,7 +217,7 @@ def build(cls: type[Config], given: Mapping[str, Any], source: str = '') -> Conf
     valid: dict[str, Any] = {}
     for name in (name for name in known if name in given):
         param = known[name]
-        value = param.spelt(given[name])
+        value = param.spelt(_plain(given[name]))
         found = list(param.problems(value))
         try:
             if not found:
@@ -256,6 +258,13 @@ def variant_of(cls: type[Config], given: Mapping[str, Any]) -> type[Config]:
     variant: Callable[[Mapping[str, Any]], type[Config]] | None
     variant = getattr(cls, 'variant', None)
     return variant(given) if variant else cls
+
+
+def _plain(value: Any) -> Any:
+    """Return a value without the types of numpy, which scripts compute with."""
+    if isinstance(value, list | tuple):
+        return [_plain(entry) for entry in value]
+    return value.tolist() if hasattr(value, 'tolist') else value
 
 
 def change(config: Config, given: Mapping[str, object], source: str = '') -> Config:

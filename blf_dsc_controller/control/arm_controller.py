@@ -25,6 +25,7 @@ from blf_dsc_controller.messages import topics
 from blf_dsc_controller.messages.codecs import JointStateEncoder
 from blf_dsc_controller.messages.named_values import disturbance_names
 from blf_dsc_controller.numerics.intervals import TWO_SIDED
+from blf_dsc_controller.reference.retargeting import TrajectoryError
 from blf_dsc_controller.reference.trajectory import Trajectory, TrajectoryPoint
 from blf_dsc_controller.run import FIRST_STAMP
 from blf_dsc_controller.supervision.drive_load import DriveLoad
@@ -249,6 +250,14 @@ class ArmController:
                 stays.
         """
         names = tuple(joints) or self.joints
+        for point in points:
+            if not isinstance(point, TrajectoryPoint):
+                got = type(point).__name__
+                raise TrajectoryError(
+                    [
+                        f'got a {got}, but each point is a TrajectoryPoint(time, positions)'
+                    ]
+                )
         trajectory = Trajectory(names, tuple(points), begin)
         guard = self._loop.guard
         plan = guard.plan(trajectory)

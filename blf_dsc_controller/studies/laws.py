@@ -223,7 +223,10 @@ def load_laws(path: Path) -> list[str]:
     try:
         module = importlib.import_module(path.stem)
     except Exception as error:
-        raise BlfDscError(f'{path} cannot be imported: {error!r}') from error
+        reason = repr(error)
+        if isinstance(error, SyntaxError):
+            reason = f'line {error.lineno}: {error.msg}'
+        raise BlfDscError(f'{path} cannot be imported: {reason}') from error
     finally:
         sys.path.remove(str(path.parent))
     if getattr(module, '__file__', '') != str(path):

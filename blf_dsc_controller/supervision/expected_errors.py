@@ -28,6 +28,7 @@ Floats = NDArray[np.float64]
 _RESPONSE = 20.0  # time constants of the damping, for which the response is followed
 _PEAK = 6.0  # of the surface, likewise; the peak comes before the integral acts
 _MOMENTS = 40  # of the reference
+_UNSTABLE = 1e6  # mrad
 
 
 def linear_feedback(settings: Settings, M0: Floats, stiffness: Floats) -> Feedback:
@@ -75,9 +76,10 @@ def _peak_errors(
     duration = _PEAK / max(float(feedback.rate.min()), 1.0)
     if settings.feedback.damping_rate > 0.0:
         duration = _RESPONSE / max(settings.feedback.damping_rate, 1.0)
-    for _ in range(round(duration / T)):
-        x = (A @ x[..., None])[..., 0] + push
-        largest = np.maximum(largest, np.abs(x[:, : settings.n]))
+    with np.errstate(over='ignore', invalid='ignore'):  # of an unstable loop
+        for _ in range(round(duration / T)):
+            x = (A @ x[..., None])[..., 0] + push
+            largest = np.maximum(largest, np.abs(x[:, : settings.n]))
     return largest
 
 
@@ -114,10 +116,18 @@ def expectation(config: ControllerConfig) -> str:
     """Return the largest errors to expect of an arm of a URDF, in a sentence."""
     errors = expected_errors(config, settings_of_config(config))
     usual, most = (1e3 * float(each.max()) for each in errors)
+    if not max(usual, most) < _UNSTABLE:  # or NaN
+        return 'none can be told, since errors grow from sample to sample: give lower gains'
     joint = config.joints[int(errors.pick_up.argmax())]
     sensed = config.disturbance.observer_bandwidth > 0.0
     return (
-        f'{usual:.2g} mrad by friction and unmodelled torque; {most:.2g} mrad of {joint} when '
+        f'{_rounded(usual)} mrad by friction and unmodelled torque; {_rounded(most)} mrad of '
+        f'{joint} when '
         f'{config.robot.payload:g} kg are picked up in motion'
         + (', less what joint torque sensors show in time' if sensed else '')
     )
+
+
+def _rounded(value: float) -> str:
+    """Return a number with two digits, without an exponent."""
+    return f'{float(f"{value:.2g}"):g}'
