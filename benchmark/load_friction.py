@@ -9,7 +9,6 @@ draw is run with each kind of friction:
 
     as assumed     viscous, Coulomb and Stribeck friction, which do not change
     lose 8, 15 %   more Coulomb friction, by a share of the torque in the gear
-    lose 25 %      more than the law assumes
     falls, 40 %    viscous and Coulomb friction fall by 40 %, with a time constant of 10 s
     both           gears lose 12 %, and friction falls by 30 %
 
@@ -48,7 +47,6 @@ KINDS: dict[str, dict[str, float]] = {
     'as assumed': {},
     'lose 8 %': {'load_share': 0.08},
     'lose 15 %': {'load_share': 0.15},
-    'lose 25 %': {'load_share': 0.25},
     'falls, 40 %': {'warm_factor': 0.6, 'warm_time': 10.0},
     'both': {'load_share': 0.12, 'warm_factor': 0.7, 'warm_time': 10.0},
 }

@@ -119,12 +119,15 @@ def test_solution_is_the_joint_least_squares_of_arm_and_load():
         held = np.zeros((len(X), SINCE)) if which == BEFORE else X[:, :M] @ NDE
         stacked.append(np.column_stack((X, held, u)))
     state.complete[0] = 1.0
+    state.age[0] = 5.0
+    grown = 5.0 / 20.0  # of the variance of changed friction
     state.innovation.noise[0] = noise**2
     weighing.solve(SETTINGS, state, work, PRIOR, period)
     a = 7.0 * noise**2
     H = np.eye(K + SINCE)
     H[:M, :M] = PRIOR.information
     H[M:K, M:K] = np.diag(np.repeat((FRICTION, LOST), N) ** -2.0)
+    H[K + LOAD :, K + LOAD :] /= grown
     *A, u = np.vstack(stacked).T
     g = np.array(A) @ u + a * H @ np.append(PRIOR.estimate, np.zeros(2 * N + SINCE))
     H = np.array(A) @ np.transpose(A) + a * H
@@ -265,10 +268,24 @@ def test_interval_holds_if_friction_grows_with_the_load_or_changes(friction):
     """
     arm = Arm()
     arm.moves(3.0, lost=friction.get('lost', 0.0))
+    arm.state.age[0] = 20.0  # s, in which friction may have changed
     arm.changes += 1
     mass = arm.moves(1.5, 1.0, **friction)
     assert arm.state.load[DEVIATION] < 2.0 * LOST  # of 1 kg
     assert mass == pytest.approx(1.0, abs=2.0 * arm.state.load[DEVIATION])
+
+
+def test_time_is_counted_in_which_friction_may_change():
+    """From the last moment at which an empty hand was learned anew."""
+    arm = Arm()
+    arm.moves(1.5, 1.0)
+    assert arm.state.age[0] == 0.0
+    arm.changes += 1
+    arm.moves(1.5)
+    assert arm.state.age[0] == pytest.approx(1.5 - DT)
+    arm.changes += 1
+    arm.moves(1.0, 1.0)  # what was held before is nothing
+    assert arm.state.age[0] == pytest.approx(1.0 - DT)
 
 
 def test_hand_that_held_something_at_first_is_empty_once_it_is_put_down():

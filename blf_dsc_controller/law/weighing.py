@@ -27,7 +27,8 @@ with its prior:
     b_i  what a joint has in excess at breakaway, as shaped by `friction`;
     k_i  the share of the torque tau_L in its gear that is lost there, k |tau_L| s(dq): a load
          adds to it, and its loss does not average out while a joint mostly moves one way;
-    e    by how much viscous and Coulomb friction differ since from before: as the arm gets warm.
+    e    by how much viscous and Coulomb friction differ since from before, as the arm gets
+         warm: its variance grows for 20 s, since friction does not change at once.
 
     before:  X theta + b s_b + k |tau_L| s = u,
     since:   X (theta + N phi + E e) + b s_b + k |tau_L| s = u
@@ -50,6 +51,7 @@ _FEWEST = 0.5  # s of motion that a part has
 # s, for which the latest rows are kept apart, and then those of them again
 _APART = 0.15
 _SETTLED = 6.0  # time constants of the filters
+_CHANGING = 20.0  # s, until the variance of e has grown
 # rad/s or m/s, below which friction is least like its columns, and rows count less
 _SLOW = 0.1
 _NOTHING, _LESS = 2.0, 4.0  # standard deviations: within, and below minus
@@ -87,6 +89,7 @@ class State(NamedTuple):
     rows: Annotated[Array, 5]  # moving ones in each part
     sums: Annotated[Array, 5, 'weighing.size', 'weighing.size']  # of [X | u]^T [X | u]
     complete: Cell  # 1: the rows before are complete
+    age: Cell  # s since then
     innovation: innovation.State
     solution: Annotated[Array, 'weighing.unknowns']  # theta, b, k, z and e
     # of their equations
@@ -136,6 +139,8 @@ def add_row(
     period = settings.row_interval * dt
     has_changed = changes != state.changes[0]
     state.changes[0] = changes
+    if not is_first(state):
+        state.age[0] += period
     row = work.row
     find_held(settings, state, work.held)
     extend_row(given, shapes, signs, work.held, row)
@@ -258,6 +263,7 @@ def begin(
     innovation.begin(state.innovation, settings.unmodelled)
     discard(state, BEFORE)
     state.complete[0] = 0.0
+    state.age[0] = 0.0
     state.wait[0] = _SETTLED / (settings.pole * period)
     solve(settings, state, work, prior, period)
 
@@ -334,6 +340,7 @@ def compare_with_nothing(
     deviation = state.load[DEVIATION]
     is_full = state.rows[BEFORE] >= settings.window
     if mass < -_LESS * deviation:
+        state.age[0] = 0.0
         clear_part(state, BEFORE)
         move_rows(state, NEWER, BEFORE)
     elif abs(mass) < _NOTHING * deviation and not is_full:
@@ -378,7 +385,7 @@ def update_innovation(
 
 @inner
 def fill_equations(
-    settings: Settings, state: State, work: Work, prior: Prior, a: float
+    settings: Settings, state: State, work: Work, prior: Prior, a: float, grown: float
 ) -> None:
     """Fill the upper triangle and the right-hand side of the normal equations of theta and z.
 
@@ -388,7 +395,8 @@ def fill_equations(
         [S + a R       S' N D             ] [theta]   [S_u + a R theta_0]
         [D^T N^T S'    D^T N^T S' N D + a ] [z    ] = [D^T N^T S'_u     ]
 
-    where theta has b and k, too.
+    where theta has b and k, too, and a is divided by the share that has `grown` of the
+    variance of e for its entries.
     """
     m = settings.size - 1
     A = state.factor
@@ -409,9 +417,10 @@ def fill_equations(
             for i in range(m):
                 A[j, m + c] += since[min(i, j), max(i, j)] * ND[i, c]
         for d in range(c + 1):
-            A[m + d, m + c] = a if d == c else 0.0
+            A[m + d, m + c] = 0.0
             for j in range(m):
                 A[m + d, m + c] += ND[j, d] * A[j, m + c]
+        A[m + c, m + c] += a if c < LOAD else a / grown
 
 
 @inner
@@ -444,7 +453,8 @@ def solve(
         else:
             sums.add(work.since, 1.0, parts[part], work.since)
     a = innovation.row_variance(state.innovation, period)
-    fill_equations(settings, state, work, prior, a)
+    grown = min(1.0, max(state.age[0], period) / _CHANGING)
+    fill_equations(settings, state, work, prior, a, grown)
     cholesky_factor(state.factor)
     cholesky_solve(state.factor, state.solution)
 
