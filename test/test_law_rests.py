@@ -46,8 +46,9 @@ def test_load_is_weighed_though_gears_lose_15_percent_of_the_torque_they_carry(s
 
 
 def test_load_is_weighed_though_friction_falls_by_40_percent(study):
-    """46 % were outside, the empty hand at 0.37 +- 0.20 kg."""
+    """It was 2.61 +- 0.40 kg after 8 s."""
     friction = {'warm_factor': 0.6, 'warm_time': 10.0}
     run = run_of(study, 'ur5e', 'trapezoids', 1, 2.0, **friction)
-    assert len(run.readings) > 100
-    assert study.outside(run.readings).mean() <= 0.05
+    held = run.readings[run.readings[:, 0] > study.PICK_UP]
+    assert len(held) > 100
+    assert study.outside(held).mean() <= 0.05
