@@ -172,8 +172,8 @@ def trajectory_of(config: ControllerConfig, motion: str, seed: int) -> Trajector
     raise AssertionError
 
 
-def loop_of(arm: str, seed: int, load: float) -> LoopConfig:
-    """Return an arm with links and friction of its own."""
+def loop_of(arm: str, seed: int, load: float, **more: Any) -> LoopConfig:
+    """Return an arm with links and friction of its own, and `more` of `disturbance`."""
     random = np.random.default_rng(seed)
     preset = RIGID.get(arm, arm)
     usual = load_loop(preset).plant.disturbance
@@ -201,6 +201,7 @@ def loop_of(arm: str, seed: int, load: float) -> LoopConfig:
         'events.ramp': [RAMP] * len(held),
         'events.payload': held,
     }
+    plant |= {f'disturbance.{name}': value for name, value in more.items()}
     if arm in RIGID:
         plant['joint.stiffness'] = []
         plant |= {'actuator.loop_gain': 0.0, 'actuator.loop_damping': 0.0}
@@ -208,18 +209,19 @@ def loop_of(arm: str, seed: int, load: float) -> LoopConfig:
 
 
 def recorded(loop: LoopConfig, motion: str, seed: int) -> Record:
-    """Run the law along a motion, without supervision."""
-    config = dataclasses.replace(
-        loop.controller,
-        reference=dataclasses.replace(loop.controller.reference, type='hold'),
-    )
+    """Run the law along a motion, or that of the preset, without supervision."""
+    config = loop.controller
+    if motion in MOTIONS:
+        holding = dataclasses.replace(config.reference, type='hold')
+        config = dataclasses.replace(config, reference=holding)
     record = new_record(controller_of(config), config, loop.plant, Journal())
     plant = plant_of(loop.plant)
     controller = record.controller
     begin(controller, config, *plant.measure().reshape(3, -1)[:2])
-    trajectory = trajectory_of(config, motion, seed)
-    planned = plan_trajectory(trajectory, controller.reference_vector, 0.0, config)
-    controller.reference_vector = planned.vector
+    if motion in MOTIONS:
+        trajectory = trajectory_of(config, motion, seed)
+        planned = plan_trajectory(trajectory, controller.reference_vector, 0.0, config)
+        controller.reference_vector = planned.vector
     span = Span(0, record.stamps.size - 1, is_end=True, observed=True)
     CompiledLoop(controller, plant).run(span, record.rows_to_fill())
     return record

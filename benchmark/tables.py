@@ -36,6 +36,7 @@ GROUPS = {
         'contacts': 'how soon a push is found, with the learned model and the URDF',
         'touch': 'the interval of the external torque, and pushes in slow motion',
         'nothing-changes': 'changes and weights that are not there',
+        'load-friction': 'loads weighed while gears lose torque or get warm',
         'first-window': 'changes of the arm before the first window is full',
         'wrong-load': 'a Franka Research 3 whose declared load is wrong',
     },

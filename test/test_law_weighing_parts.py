@@ -16,6 +16,7 @@ from blf_dsc_controller.law.weighing import (
     BEFORE,
     DEVIATION,
     LATEST,
+    LOAD,
     MASS,
     NEWER,
     Settings,
@@ -26,19 +27,39 @@ from blf_dsc_controller.law.weighing import (
 N, M = 2, 5  # joints, entries of theta
 DT = 0.01  # s, with a row in each sample
 RANDOM = np.random.default_rng(1)
-SCALE = RANDOM.normal(size=(4, 10))
+INERTIAL = 3  # of them, base parameters; the others are Coulomb friction
+SCALE = RANDOM.normal(size=(4, LOAD))
 SCALE[:, 0] = 1.0, 0.1, 0.2, -0.1  # z = (1, 0, ..., 0) is 1 kg with its moments [kg m]
+SCALE = np.hstack((SCALE, np.zeros((4, N))))
 FRICTION = 0.3  # N m, standard deviation of breakaway torques
-SIZE = M + N + 1
+LOST = 0.1  # likewise of the share of the torque in a gear that is lost
+CHANGED = 0.2  # N m, likewise of how friction has changed
+K = M + 2 * N  # entries of theta, breakaway torques and shares
+SINCE = LOAD + N
+SIZE = K + 1
+
+
+def columns():
+    """[N D | E], with zeros where a load adds nothing."""
+    filled = np.zeros((SIZE, SINCE))
+    filled[:M, :LOAD] = RANDOM.normal(size=(M, 4)) @ SCALE[:, :LOAD]
+    filled[INERTIAL:M, LOAD:] = CHANGED * np.eye(N)
+    return filled
+
+
 SETTINGS = Settings(
     size=SIZE,
+    inertial=INERTIAL,
+    since=SINCE,
+    unknowns=K + SINCE,
     window=200,
     row_interval=1,
     pole=20.0,
     motion_scale=0.05,
     unmodelled=0.01,
+    load_friction=LOST**-2,
     breakaway=np.full(N, FRICTION**-2),
-    columns=np.vstack((RANDOM.normal(size=(M, 4)) @ SCALE, np.zeros((N + 1, 10)))),
+    columns=columns(),
     scale=SCALE,
 )
 PRIOR = Prior(RANDOM.normal(size=M), np.diag(RANDOM.uniform(0.5, 2.0, M)))
@@ -59,10 +80,13 @@ def rows_of(theta, count, noise=0.0, seed=1):
     return np.concatenate((X, u[:, :, np.newaxis]), axis=2)
 
 
-def with_breakaway(rows, torques, shapes):
-    """Rows (count, N, SIZE) with columns of breakaway, whose shapes (count, N) are given."""
-    columns = shapes[:, :, np.newaxis] * np.eye(N)
-    u = rows[:, :, M:] + (shapes * torques)[:, :, np.newaxis]
+def with_friction(rows, shares, shapes):
+    """Rows (count, N, SIZE) with columns of breakaway and lost torque, whose shapes are given.
+
+    Shares (2 N,) and shapes (count, 2 N) are those of breakaway, then those of torques.
+    """
+    columns = shapes[:, np.newaxis] * np.hstack((np.eye(N), np.eye(N)))
+    u = rows[:, :, M:] + (columns @ shares)[:, :, np.newaxis]
     return np.concatenate((rows[:, :, :M], columns, u), axis=2)
 
 
@@ -70,39 +94,42 @@ def test_solution_is_the_joint_least_squares_of_arm_and_load():
     """As numpy solves the stacked rows with all priors; deviations from the inverse."""
     state = part(State)
     work = part(Work)
-    ND = SETTINGS.columns[:M]
+    NDE = SETTINGS.columns[:M]
     D = SETTINGS.scale
     noise = 0.04
     period = CORRELATION / 7.0  # so that seven rows count as one
-    z = RANDOM.normal(size=10)
+    z = RANDOM.normal(size=SINCE)
     theta = PRIOR.estimate + 0.1 * RANDOM.normal(size=M)
-    loaded = theta + ND @ z
-    torques = FRICTION * RANDOM.normal(size=N)
-    K = M + N
+    loaded = theta + NDE @ z
+    shares = np.repeat((FRICTION, LOST), N) * RANDOM.normal(size=2 * N)
     stacked = []
     for which, count, model in (
         (BEFORE, 90, theta),
         (NEWER, 40, loaded),
         (LATEST, 20, loaded),
     ):
-        rows = with_breakaway(
-            rows_of(model, count, noise, which), torques, RANDOM.normal(size=(count, N))
+        rows = with_friction(
+            rows_of(model, count, noise, which),
+            shares,
+            RANDOM.normal(size=(count, 2 * N)),
         )
         for row in rows:
             add_products(row, state.sums[which])
         X, u = rows[:, :, :K].reshape(-1, K), rows[:, :, K].ravel()
-        held = np.zeros((len(X), 10)) if which == BEFORE else X[:, :M] @ ND
+        held = np.zeros((len(X), SINCE)) if which == BEFORE else X[:, :M] @ NDE
         stacked.append(np.column_stack((X, held, u)))
     state.complete[0] = 1.0
+    state.age[0] = 5.0
+    grown = 5.0 / 20.0  # of the variance of changed friction
     state.innovation.noise[0] = noise**2
     weighing.solve(SETTINGS, state, work, PRIOR, period)
     a = 7.0 * noise**2
-    H = np.zeros((K + 10, K + 10))
+    H = np.eye(K + SINCE)
     H[:M, :M] = PRIOR.information
-    H[M:K, M:K] = np.diag(SETTINGS.breakaway)
-    H[K:, K:] = np.eye(10)
+    H[M:K, M:K] = np.diag(np.repeat((FRICTION, LOST), N) ** -2.0)
+    H[K + LOAD :, K + LOAD :] /= grown
     *A, u = np.vstack(stacked).T
-    g = np.array(A) @ u + a * H @ np.append(PRIOR.estimate, np.zeros(N + 10))
+    g = np.array(A) @ u + a * H @ np.append(PRIOR.estimate, np.zeros(2 * N + SINCE))
     H = np.array(A) @ np.transpose(A) + a * H
     expected = np.linalg.solve(H, g)
     np.testing.assert_allclose(state.solution, expected, rtol=1e-6, atol=1e-9)
@@ -122,7 +149,8 @@ def test_load_is_solved_for_every_tenth_of_a_second(rows):
     """With a row each 10 ms it is after every tenth; between, the last solution stays."""
     state = part(State)
     for row in rows_of(PRIOR.estimate + 0.1, 30):
-        add_products(np.insert(row, M, np.zeros((N, N)), axis=1), state.sums[LATEST])
+        longer = np.insert(row, [M] * 2 * N, 0.0, axis=1)
+        add_products(longer, state.sums[LATEST])
     weighing.refresh(SETTINGS, state, part(Work), PRIOR, rows, DT)
     assert bool(state.solution.any()) == (rows % 10 == 0)
 
@@ -135,12 +163,20 @@ class Arm:
         self.theta = PRIOR.estimate + 0.1
         self.samples = self.changes = 0
 
-    def moves(self, seconds, load=0.0, velocity=SWIFT):
-        """Add rows of a load [kg]; return its mass [kg] by the weighing."""
+    def moves(self, seconds, load=0.0, velocity=SWIFT, lost=0.0, changed=0.0):
+        """Add rows of a load [kg]; return its mass [kg] by the weighing.
+
+        Gears lose a share of their torque, which they always move against, and friction
+        has `changed` [N m].
+        """
         theta = self.theta + load * SETTINGS.columns[:M, 0]
+        friction = np.repeat((0.0, changed), (INERTIAL, M - INERTIAL))
         count = round(seconds / DT)
-        for row in rows_of(theta, count, 0.01, self.samples):
+        for row in rows_of(theta + friction, count, 0.01, self.samples):
             self.samples += 1
+            torque = row[:, :INERTIAL] @ theta[:INERTIAL]
+            signs = np.sign(torque)
+            row[:, M] += lost * torque
             weighing.add_row(
                 SETTINGS,
                 self.state,
@@ -148,6 +184,7 @@ class Arm:
                 PRIOR,
                 row,
                 np.zeros(N),
+                signs,
                 velocity,
                 self.samples,
                 self.changes,
@@ -161,14 +198,21 @@ class Arm:
         return self.state.load[DEVIATION] > 0.0
 
 
-def test_row_has_a_column_of_its_own_for_the_breakaway_of_each_joint():
+def test_row_has_columns_of_its_own_for_breakaway_and_lost_torque_of_each_joint():
+    """Of the torque in the gear, that of the base parameters with the load, at its sign."""
     (given,) = rows_of(PRIOR.estimate, 1)
     row = np.full((N, SIZE), np.nan)
-    weighing.extend_row(given, np.array([0.7, -0.2]), row)
-    (expected,) = with_breakaway(
-        given[np.newaxis], np.zeros(N), np.array([[0.7, -0.2]])
-    )
-    np.testing.assert_array_equal(row, expected)
+    state, held = part(State), np.zeros(INERTIAL)
+    state.solution[:] = RANDOM.normal(size=K + SINCE)
+    weighing.find_held(SETTINGS, state, held)
+    load = SETTINGS.columns[:INERTIAL, :LOAD] @ state.solution[K : K + LOAD]
+    np.testing.assert_allclose(held, state.solution[:INERTIAL] + load)
+    signs = np.array([0.9, -0.4])
+    weighing.extend_row(given, np.array([0.7, -0.2]), signs, held, row)
+    torque = given[:, :INERTIAL] @ held
+    shapes = np.append([0.7, -0.2], np.abs(torque) * signs)
+    (expected,) = with_friction(given[np.newaxis], np.zeros(2 * N), shapes[np.newaxis])
+    np.testing.assert_allclose(row, expected)
 
 
 def test_share_of_slow_rows_is_that_of_their_weights():
@@ -212,6 +256,36 @@ def test_change_in_the_first_window_ends_the_rows_before_if_they_are_enough(
     assert (arm.state.rows[BEFORE] > 0.0) == bool(complete)
     assert not arm.knows
     assert weighing.held_mass(arm.state) == (0.0, np.inf if complete else 0.0)
+
+
+@pytest.mark.parametrize(
+    'friction', [{}, {'lost': LOST}, {'changed': CHANGED}, {'changed': -CHANGED}]
+)
+def test_interval_holds_if_friction_grows_with_the_load_or_changes(friction):
+    """By one standard deviation of what is assumed: the mass is off by less than two of its own.
+
+    Without the columns it was off by 23 and by 66.
+    """
+    arm = Arm()
+    arm.moves(3.0, lost=friction.get('lost', 0.0))
+    arm.state.age[0] = 20.0  # s, in which friction may have changed
+    arm.changes += 1
+    mass = arm.moves(1.5, 1.0, **friction)
+    assert arm.state.load[DEVIATION] < 2.0 * LOST  # of 1 kg
+    assert mass == pytest.approx(1.0, abs=2.0 * arm.state.load[DEVIATION])
+
+
+def test_time_is_counted_in_which_friction_may_change():
+    """From the last moment at which an empty hand was learned anew."""
+    arm = Arm()
+    arm.moves(1.5, 1.0)
+    assert arm.state.age[0] == 0.0
+    arm.changes += 1
+    arm.moves(1.5)
+    assert arm.state.age[0] == pytest.approx(1.5 - DT)
+    arm.changes += 1
+    arm.moves(1.0, 1.0)  # what was held before is nothing
+    assert arm.state.age[0] == pytest.approx(1.0 - DT)
 
 
 def test_hand_that_held_something_at_first_is_empty_once_it_is_put_down():

@@ -39,6 +39,7 @@ class Column(NamedTuple):
     deviation: float  # of the prior
     least: float  # value that it can have
     most: float
+    is_friction: bool
 
 
 def columns_of(config: ControllerConfig) -> tuple[Column, ...]:
@@ -89,6 +90,7 @@ def _column(config: ControllerConfig, block: str, i: int, initial: float) -> Col
         deviation=0.5 * initial or usual,
         least=initial / _MOST_FRICTION if is_friction else -np.inf,
         most=(_MOST_FRICTION * initial or usual) if is_friction else np.inf,
+        is_friction=is_friction,
     )
 
 

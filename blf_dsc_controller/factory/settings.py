@@ -58,6 +58,10 @@ _PRIOR = 0.01  # 1 / (independent rows in a window): pull to the initial estimat
 _SLOW = 0.05  # rad/s, reference velocity below which the rows of a joint count less
 # standard deviation of what friction has more at breakaway, over its initial estimate
 _BREAKAWAY = 0.7
+# likewise of the share of the torque in a gear that is lost there
+_LOAD_FRICTION = 0.15
+# and of the change of friction as the arm gets warm, over what is unsure of it at first
+_CHANGED_FRICTION = 0.4
 
 
 def settings_of_config(config: ControllerConfig) -> Settings:
@@ -374,14 +378,18 @@ def _weighing(
     n = len(config.joints)
     settings = weighing.Settings(
         size=0,
+        inertial=0,
+        since=weighing.LOAD,
+        unknowns=0,
         window=sliding.length,
         row_interval=sliding.row_interval,
         pole=row.filter_pole,
         motion_scale=row.motion_scale,
         unmodelled=_excitation(config).residual_floor / n,
+        load_friction=_LOAD_FRICTION**-2.0,
         breakaway=np.zeros(n),
-        columns=np.zeros((0, 10)),
-        scale=np.zeros((4, 10)),
+        columns=np.zeros((0, weighing.LOAD)),
+        scale=np.zeros((4, weighing.LOAD)),
     )
     if not config.learning.weighing:
         return settings
@@ -390,12 +398,29 @@ def _weighing(
     D = deviations(payload_inertia(max(robot.payload, 1.0)), 1.0, 2.0 * PAYLOAD_SIZE)
     T = chain.tip_placement
     K = parameters_of(robot, chain).K[:, -(ROTOR + 1) : -1]
-    columns = np.zeros((len(K) + len(learned) + n + 1, 10))
     moves = [inertia_of(moved(pseudo_inertia(direction), T)) for direction in D.T]
-    columns[: len(K)] = product(K, np.transpose(moves))
+    changed = _changed_friction(learned)
+    since = weighing.LOAD + changed.shape[1]
+    columns = np.zeros((len(K) + len(learned) + 2 * n + 1, since))
+    columns[: len(K), : weighing.LOAD] = product(K, np.transpose(moves))
+    columns[len(K) :, weighing.LOAD :][: len(learned)] = changed
+    scale = np.zeros((4, since))
+    scale[:, : weighing.LOAD] = D[:4]
     known = np.array(robot.friction(chain)['coulomb'])
     usual = FRICTION * np.array(config.torque.limit)
     unsure = _BREAKAWAY * np.where(known > 0.0, known, usual)
     return settings._replace(
-        size=len(columns), breakaway=unsure**-2.0, columns=columns, scale=D[:4]
+        size=len(columns),
+        inertial=len(K),
+        since=since,
+        unknowns=len(columns) - 1 + since,
+        breakaway=unsure**-2.0,
+        columns=columns,
+        scale=scale,
     )
+
+
+def _changed_friction(learned: Sequence[Column]) -> np.ndarray:
+    """Return E, deviations of viscous and Coulomb friction from before to since, a column each."""
+    deviations = np.diag([_CHANGED_FRICTION * each.deviation for each in learned])
+    return deviations[:, [each.is_friction for each in learned]]

@@ -137,8 +137,8 @@ class Work(NamedTuple):
 class TipLoad(NamedTuple):
     """How a load in the tip acts, and what is known to be held."""
 
-    columns: Array  # N D of `weighing`, (m + 1, 10)
-    scale: Array  # rows of D: mass [kg] and moments [kg m], (4, 10)
+    columns: Array  # of `weighing`: those of N D are first
+    scale: Array  # rows of D, likewise: mass [kg] and moments [kg m]
     mass: float  # kg
     deviation: float  # of the mass, kg; infinite where it is unknown
 

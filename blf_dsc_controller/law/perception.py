@@ -173,6 +173,7 @@ def weigh(
         Prior(settings.initial_estimate, settings.information),
         signals.row,
         signals.unit,
+        state.friction.shape_lags[0, 2],
         signals.dqr,
         int(state.samples[0]),
         state.change.changes[0],

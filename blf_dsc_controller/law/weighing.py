@@ -20,9 +20,20 @@ is lightest is taken for nothing.  If it was nothing, its rows are added to thos
 until they make a window.  Rows are kept apart until they are 0.15 to 0.3 s old, so that
 those of a change that has not been found yet can be discarded.
 
-Rows of slow joints count little, since they may stick.  Beside theta there is an unknown
-more for each joint: what its friction has in excess at breakaway, as shaped by
-`friction`.  The columns of theta do not have it, and a load must not explain it.
+Rows of slow joints count little, since they may stick.  Friction must not be taken for a load,
+nor a load for friction.  What the columns of theta do not say of it are unknowns, too, each
+with its prior:
+
+    b_i  what a joint has in excess at breakaway, as shaped by `friction`;
+    k_i  the share of the torque tau_L in its gear that is lost there, k |tau_L| s(dq): a load
+         adds to it, and its loss does not average out while a joint mostly moves one way;
+    e    by how much viscous and Coulomb friction differ since from before, as the arm gets
+         warm: its variance grows for 20 s, since friction does not change at once.
+
+    before:  X theta + b s_b + k |tau_L| s = u,
+    since:   X (theta + N phi + E e) + b s_b + k |tau_L| s = u
+
+tau_L is that of the solution so far, not the measured torque, which would explain itself.
 Nothing here acts on the torque: `perception` calls `add_row` after it has been sent.
 """
 
@@ -40,6 +51,7 @@ _FEWEST = 0.5  # s of motion that a part has
 # s, for which the latest rows are kept apart, and then those of them again
 _APART = 0.15
 _SETTLED = 6.0  # time constants of the filters
+_CHANGING = 20.0  # s, until the variance of e has grown
 # rad/s or m/s, below which friction is least like its columns, and rows count less
 _SLOW = 0.1
 _NOTHING, _LESS = 2.0, 4.0  # standard deviations: within, and below minus
@@ -47,21 +59,28 @@ _NOTHING, _LESS = 2.0, 4.0  # standard deviations: within, and below minus
 # rows before, of two halves since, and of the two parts that are kept apart
 BEFORE, OLDER, NEWER, RECENT, LATEST = range(5)
 MASS, DEVIATION = 0, 4  # in `State.load`, each followed by three of the centre
+LOAD = 10  # entries of z
 
 
 class Settings(NamedTuple):
     """How a load in the tip acts, and which rows count."""
 
-    size: int  # m + n + 1, or 0: nothing is weighed
+    size: int  # m + 2 n + 1, or 0: nothing is weighed
+    inertial: int  # p, entries of theta that are base parameters
+    since: int  # unknowns of the rows since alone: z, then e
+    unknowns: int  # theta, b, k, z and e
     window: int  # N, rows in a window of the learning
     row_interval: int  # samples between two rows
     pole: float  # of the row filters, rad/s
     motion_scale: float  # reference velocity below which rows count less, rad/s
     unmodelled: float  # mean square torque that no column describes, (N m)^2
+    load_friction: float  # of the shares k, 1 / variance
     # of the breakaway torques, 1 / variance, 1/(N m)^2
     breakaway: Annotated[Array, 'n']
-    columns: Annotated[Array, 'weighing.size', 10]  # N D, and rows of zeros
-    scale: Annotated[Array, 4, 10]  # rows of D: mass [kg] and moments [kg m]
+    # [N D | E], e in standard deviations, and rows of zeros
+    columns: Annotated[Array, 'weighing.size', 'weighing.since']
+    # rows of D: mass [kg] and moments [kg m], and zeros
+    scale: Annotated[Array, 4, 'weighing.since']
 
 
 class State(NamedTuple):
@@ -70,10 +89,11 @@ class State(NamedTuple):
     rows: Annotated[Array, 5]  # moving ones in each part
     sums: Annotated[Array, 5, 'weighing.size', 'weighing.size']  # of [X | u]^T [X | u]
     complete: Cell  # 1: the rows before are complete
+    age: Cell  # s since then
     innovation: innovation.State
-    solution: Annotated[Array, 'weighing.size + 9']  # theta, breakaway torques and z
+    solution: Annotated[Array, 'weighing.unknowns']  # theta, b, k, z and e
     # of their equations
-    factor: Annotated[Array, 'weighing.size + 9', 'weighing.size + 9']
+    factor: Annotated[Array, 'weighing.unknowns', 'weighing.unknowns']
     changes: Cell  # number of changes of the arm at the last row
     wait: Cell  # rows until the filters have settled
     # mass [kg] and centre [m] in the tip, their deviations; 0: unknown
@@ -86,10 +106,11 @@ class Work(NamedTuple):
     before: Annotated[Array, 'weighing.size', 'weighing.size']  # sums of all such rows
     since: Annotated[Array, 'weighing.size', 'weighing.size']
     row: Annotated[Array, 'n', 'weighing.size']  # [X | u], weighted
-    rows: Annotated[Array, 'n', 'weighing.size + 9']  # [X | X N D]
+    rows: Annotated[Array, 'n', 'weighing.unknowns']  # [X | X N D | X E]
     torque: Annotated[Array, 'n']  # that they do not explain, N m
     covariance: Annotated[Array, 'n', 'n']
-    spread: Annotated[Array, 4, 10]  # D U^-1
+    spread: Annotated[Array, 4, 'weighing.since']  # D U^-1
+    held: Annotated[Array, 'weighing.inertial']  # base parameters with the load
 
 
 @inner
@@ -100,6 +121,7 @@ def add_row(
     prior: Prior,
     given: Array,
     shapes: Array,
+    signs: Array,
     dqr: Array,
     samples: int,
     changes: float,
@@ -108,17 +130,20 @@ def add_row(
     """Add the row of this sample if one is due, and solve for the load ten times a second.
 
     The row that is `given` is [X | u] (n, m + 1), the `shapes` (n,) of breakaway are
-    filtered and weighted as it is, dqr (n,) is the velocity of the reference [rad/s],
-    `samples` the number of samples of `dt` [s], `changes` that of the changes of the
-    arm found so far.
+    filtered and weighted as it is, the `signs` s (n,) of the motion filtered alone.  dqr (n,) is
+    the velocity of the reference [rad/s], `samples` the number of samples of `dt` [s],
+    `changes` that of the changes of the arm found so far.
     """
     if samples % settings.row_interval != settings.row_interval // 2:
         return
     period = settings.row_interval * dt
     has_changed = changes != state.changes[0]
     state.changes[0] = changes
+    if not is_first(state):
+        state.age[0] += period
     row = work.row
-    extend_row(given, shapes, row)
+    find_held(settings, state, work.held)
+    extend_row(given, shapes, signs, work.held, row)
     weight_row(row, dqr)
     if samples <= settings.row_interval:
         begin(settings, state, work, prior, period)
@@ -150,16 +175,34 @@ def refresh(
 
 
 @inner
-def extend_row(given: Array, shapes: Array, row: Array) -> None:
-    """Write [X | u] (n, m + 1) with a column for the breakaway of each joint to `row`."""
+def find_held(settings: Settings, state: State, held: Array) -> None:
+    """Write the base parameters of the arm with what it holds, by the solution, to `held` (p,)."""
+    x = state.solution
+    load = settings.size - 1
+    for j in range(held.size):
+        held[j] = x[j]
+        for c in range(LOAD):
+            held[j] += settings.columns[j, c] * x[load + c]
+
+
+@inner
+def extend_row(
+    given: Array, shapes: Array, signs: Array, held: Array, row: Array
+) -> None:
+    """Write [X | u] (n, m + 1) with columns of b, then of k, to `row`."""
     n = shapes.size
-    m = row.shape[1] - 1 - n
+    m = row.shape[1] - 1 - 2 * n
     for i in range(n):
         for j in range(m):
             row[i, j] = given[i, j]
-        for k in range(n):
-            row[i, m + k] = shapes[i] if k == i else 0.0
-        row[i, m + n] = given[i, m]
+        for j in range(m, m + 2 * n):
+            row[i, j] = 0.0
+        torque = 0.0
+        for j in range(held.size):
+            torque += given[i, j] * held[j]
+        row[i, m + i] = shapes[i]
+        row[i, m + n + i] = abs(torque) * signs[i]
+        row[i, m + 2 * n] = given[i, m]
 
 
 @inner
@@ -220,6 +263,7 @@ def begin(
     innovation.begin(state.innovation, settings.unmodelled)
     discard(state, BEFORE)
     state.complete[0] = 0.0
+    state.age[0] = 0.0
     state.wait[0] = _SETTLED / (settings.pole * period)
     solve(settings, state, work, prior, period)
 
@@ -296,6 +340,7 @@ def compare_with_nothing(
     deviation = state.load[DEVIATION]
     is_full = state.rows[BEFORE] >= settings.window
     if mass < -_LESS * deviation:
+        state.age[0] = 0.0
         clear_part(state, BEFORE)
         move_rows(state, NEWER, BEFORE)
     elif abs(mass) < _NOTHING * deviation and not is_full:
@@ -304,7 +349,7 @@ def compare_with_nothing(
 
 @inner
 def fill_rows(settings: Settings, is_held: bool, row: Array, out: Array) -> None:
-    """Fill [X | X N D], whose unknowns are theta and z; no load where none `is_held`."""
+    """Fill [X | X N D | X E]; zeros in place of the last two before anything `is_held`."""
     m = row.shape[1] - 1
     ND = settings.columns
     for i in range(row.shape[0]):
@@ -340,17 +385,18 @@ def update_innovation(
 
 @inner
 def fill_equations(
-    settings: Settings, state: State, work: Work, prior: Prior, a: float
+    settings: Settings, state: State, work: Work, prior: Prior, a: float, grown: float
 ) -> None:
     """Fill the upper triangle and the right-hand side of the normal equations of theta and z.
 
     With the sums S of all rows and S' of those since, and the variance a of rows that
-    count,
+    count, and [D | E] for D and (z, e) for z,
 
         [S + a R       S' N D             ] [theta]   [S_u + a R theta_0]
         [D^T N^T S'    D^T N^T S' N D + a ] [z    ] = [D^T N^T S'_u     ]
 
-    where theta has the breakaway torques, too.
+    where theta has b and k, too, and a is divided by the share that has `grown` of the
+    variance of e for its entries.
     """
     m = settings.size - 1
     A = state.factor
@@ -371,14 +417,15 @@ def fill_equations(
             for i in range(m):
                 A[j, m + c] += since[min(i, j), max(i, j)] * ND[i, c]
         for d in range(c + 1):
-            A[m + d, m + c] = a if d == c else 0.0
+            A[m + d, m + c] = 0.0
             for j in range(m):
                 A[m + d, m + c] += ND[j, d] * A[j, m + c]
+        A[m + c, m + c] += a if c < LOAD else a / grown
 
 
 @inner
 def add_prior(settings: Settings, prior: Prior, a: float, A: Array, x: Array) -> None:
-    """Add a R of theta and of the breakaway torques to A, and a R theta_0 to x."""
+    """Add a R of theta, b and k to A, and a R theta_0 to x."""
     R = prior.information
     known = prior.estimate.size
     for i in range(known):
@@ -386,8 +433,10 @@ def add_prior(settings: Settings, prior: Prior, a: float, A: Array, x: Array) ->
             x[i] += a * R[i, j] * prior.estimate[j]
         for j in range(i, known):
             A[i, j] += a * R[i, j]
-    for i in range(settings.breakaway.size):
+    n = settings.breakaway.size
+    for i in range(n):
         A[known + i, known + i] += a * settings.breakaway[i]
+        A[known + n + i, known + n + i] += a * settings.load_friction
 
 
 @inner
@@ -404,7 +453,8 @@ def solve(
         else:
             sums.add(work.since, 1.0, parts[part], work.since)
     a = innovation.row_variance(state.innovation, period)
-    fill_equations(settings, state, work, prior, a)
+    grown = min(1.0, max(state.age[0], period) / _CHANGING)
+    fill_equations(settings, state, work, prior, a, grown)
     cholesky_factor(state.factor)
     cholesky_solve(state.factor, state.solution)
 
