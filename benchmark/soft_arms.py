@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """What gains that elastic joints bear leave of the error: this law, its rivals, and the goals.
 
-    python -m benchmark soft-arms [goals] [--truths N] [--arms NAME...]
+    python -m benchmark soft-arms [goals] [--truths N] [--arms NAME...] [--laws LAW...]
     python -m benchmark soft-arms integrator [--truths N] [--arms NAME...]
+    python -m benchmark soft-arms observers [--truths N] [--arms NAME...]
 
 `goals`: each arm moves as its preset does and picks up 2 kg at 8 s.  A row has the worst of N arms
 whose links deviate differently from their URDF:
@@ -37,14 +38,16 @@ gears do not bear the gains of its maker has those that leave a margin of 0.5.
 the slow oscillation of the outstretched arm with its rated payload is damped in `joint_gains.py`
 (3 by the rule there; below 1 it grows), with the motors that the arm has.  `by the rule`: as much
 as leaves each joint this 3, without the most that the rule also sets.  Arms `*_rest` hold their
-posture, in gears with play.
+posture, in gears with play; rivals have there the gains that they have in motion.
+
+`observers`: the DOB with each pair of factor and pole that has the margin.
 """
 
 from __future__ import annotations
 
 import argparse
 import itertools
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from functools import cache
 from pathlib import Path
 from typing import NamedTuple
@@ -65,6 +68,7 @@ from blf_dsc_controller.simulation.loop import simulate
 from blf_dsc_controller.studies.laws import COMPUTED_TORQUE
 
 NO_SENSORS, NO_LEARNING, DOB = 'without sensors', 'without learning', 'DOB'
+LAWS = (THIS, NO_SENSORS, NO_LEARNING, PD, CT, DOB)
 MOMENTUM = str(Path(__file__).with_name('momentum_observer.py').resolve())
 MARGIN = 0.5  # of gains that are chosen
 FACTORS = 0.01, 1.0  # on the maker's gains, among them
@@ -149,10 +153,11 @@ def _resting(robot: str, label: str, joints: int, plant: _Changes) -> Arm:
     return Arm(robot, f'{label} at rest, play', {**plant, **play}, still, _NONE)
 
 
+_REST = '_rest'
 RESTING = {
-    'ur5e_rest': _resting('ur5e', 'UR5e', 6, {}),
-    'panda_rest': _resting('panda', 'Panda, 1e4', 7, _gears(1e4, 7)),
-    'fr3_rest': _resting('fr3', 'FR3', 7, {}),
+    f'ur5e{_REST}': _resting('ur5e', 'UR5e', 6, {}),
+    f'panda{_REST}': _resting('panda', 'Panda, 1e4', 7, _gears(1e4, 7)),
+    f'fr3{_REST}': _resting('fr3', 'FR3', 7, {}),
 }
 ALL = {**ARMS, **RESTING}
 
@@ -197,13 +202,21 @@ def loop_with(arm: Arm, gains: _Changes, law: str = THIS, truth: int = 0) -> Loo
     return load_observer.loop_of(preset, own, {**arm.plant, **seeds}, gains)
 
 
+_Pair = tuple[float, float]  # of a DOB: factor, and pole in rad/s
+
+
 class Equal(NamedTuple):
     """Gains of equal margin on an arm."""
 
     margin: float
     PD: float  # factor
     rate: float  # of computed torque, 1/s
-    DOB: tuple[float, float]  # factor, and pole in rad/s
+    observers: tuple[_Pair, ...]
+
+    @property
+    def DOB(self) -> _Pair:
+        """The pair with the largest integral gain."""
+        return max(self.observers, key=lambda pair: pair[0] * pair[1])
 
 
 def dob(arm: Arm, M0: np.ndarray, factor: float, pole: float) -> Feedback:
@@ -217,7 +230,7 @@ def dob(arm: Arm, M0: np.ndarray, factor: float, pole: float) -> Feedback:
 
 @cache
 def equal(arm_name: str) -> Equal:
-    """Return the gains with which rivals have the margin of this law."""
+    """Return the gains with which rivals have the margin of this law, in motion."""
     arm = ALL[arm_name]
     loop = loop_with(arm, gains_of(arm_name))
     of = random_arms.describe(loop.controller, loop.plant, POSTURES)
@@ -239,15 +252,15 @@ def equal(arm_name: str) -> Equal:
         )
 
     factor = rival(PD)
-    pairs = [(share * factor, pole(share * factor)) for share in SHARES]
-    return Equal(
-        margin, factor, rival(CT), max(pairs, key=lambda pair: pair[0] * pair[1])
-    )
+    pairs = tuple((share * factor, pole(share * factor)) for share in SHARES)
+    return Equal(margin, factor, rival(CT), pairs)
 
 
-def law_of(config: ControllerConfig, name: str, law: str) -> ControllerConfig:
-    """Return the configuration of a controller with a rival."""
-    gains, robot = equal(name), ROBOTS[ALL[name].robot]
+def law_of(
+    config: ControllerConfig, name: str, law: str, pair: _Pair | None = None
+) -> ControllerConfig:
+    """Return the configuration of a controller with a rival; `pair` is that of a DOB."""
+    gains, robot = equal(name.removesuffix(_REST)), ROBOTS[ALL[name].robot]
     if law == PD:
         return random_arms.rival(
             config, robot, random_arms.JOINT_PD, {'gains.scale': gains.PD}
@@ -255,19 +268,23 @@ def law_of(config: ControllerConfig, name: str, law: str) -> ControllerConfig:
     if law == CT:
         own = random_arms.computed_torque_gains(gains.rate)
         return random_arms.rival(config, robot, COMPUTED_TORQUE, own)
-    factor, pole = gains.DOB
+    factor, pole = pair or gains.DOB
     own = {'gains.scale': factor, 'gains.bandwidth': pole}
     return random_arms.rival(config, robot, MOMENTUM, own)
 
 
 def figures(
-    name: str, law: str, truth: int, changes: _Changes | None = None
+    name: str,
+    law: str,
+    truth: int,
+    changes: _Changes | None = None,
+    pair: _Pair | None = None,
 ) -> Figures:
-    """Run a law on an arm, with `changes` of its gains if they are given."""
+    """Run a law on an arm, with `changes` of its gains, or a DOB's `pair`, if they are given."""
     loop = loop_with(ALL[name], {**gains_of(name), **(changes or {})}, law, truth)
     controller = loop.controller
     if law in (PD, CT, DOB):
-        controller = law_of(controller, name, law)
+        controller = law_of(controller, name, law, pair)
     record = simulate(controller, loop.plant)
     run = record.run()
     if run.stops:
@@ -300,7 +317,7 @@ def laws_of(name: str) -> tuple[str, ...]:
 
 
 def row(name: str, law: str, found: list[Figures], others: list[Figures]) -> list[str]:
-    """Return the worst of some arms with a law; `others` are those without learning."""
+    """Return the worst of some arms with a law; `others`, if any, are those without learning."""
     heads = [ALL[name].label, law]
     stops = [each.stop for each in found if each.stop]
     if stops:
@@ -308,31 +325,33 @@ def row(name: str, law: str, found: list[Figures], others: list[Figures]) -> lis
     worst = np.max([each.errors for each in found], axis=0)
     known = max(each.known if law == THIS else np.nan for each in found)
     rms = max(each.rms for each in found)
-    ratio = min(b.rms / a.rms for a, b in zip(found, others, strict=True))
+    ratios = [b.rms / a.rms for a, b in zip(found, others, strict=False)]
     return [
         *heads,
         *(f'{each:.2f}' for each in worst),
         f'{known:.2f} s' if np.isfinite(known) else '-',
         f'{rms:.2f}',
-        f'{ratio:.2g}' if law != NO_LEARNING else '1',
+        f'{min(ratios):.2g}' if ratios else '-',
         f'{100.0 * max(each.shaking for each in found):.1f} %'
         + (', oscillates' if any(each.is_softened for each in found) else ''),
     ]
 
 
-def rows(name: str, truths: int) -> Iterator[list[str]]:
-    """Compute the rows of an arm."""
+def rows(name: str, truths: int, laws: Sequence[str]) -> Iterator[list[str]]:
+    """Compute the rows of an arm with some laws."""
     arm = ALL[name]
     yield [arm.label, 'goal', *arm.goal, f'{arm.known} s', '-', '8', '-']
     found = {
         law: [figures(name, law, k) for k in range(1, truths + 1)]
         for law in laws_of(name)
+        if law in laws
     }
+    others = found.get(NO_LEARNING, [])
     for law, each in found.items():
-        yield row(name, law, each, found[NO_LEARNING])
+        yield row(name, law, each, others)
         if 'sensor.side' in arm.plant:
             at_links = [of._replace(errors=of.links, known=np.nan) for of in each]
-            cells = row(name, f'{law}, links', at_links, found[NO_LEARNING])
+            cells = row(name, f'{law}, links', at_links, others)
             yield [*cells[:5], *['-'] * 4]
 
 
@@ -352,6 +371,14 @@ def integrator(name: str, truths: int) -> Iterator[list[str]]:
         found = [figures(name, THIS, k, changes) for k in range(1, truths + 1)]
         cells = row(name, label, found, found)
         yield [*cells[:5], cells[8], f'{damped(loop, gain).min():.2g}']
+
+
+def observers(name: str, truths: int) -> Iterator[list[str]]:
+    """Compute the rows of an arm with the pairs of a DOB."""
+    for pair in equal(name.removesuffix(_REST)).observers:
+        found = [figures(name, DOB, k, pair=pair) for k in range(1, truths + 1)]
+        cells = row(name, '{:.2g}, {:.2g} rad/s'.format(*pair), found, [])
+        yield [*cells[:5], *cells[-1:]]
 
 
 def damped(loop: LoopConfig, gain: np.ndarray) -> np.ndarray:
@@ -375,7 +402,7 @@ def damped(loop: LoopConfig, gain: np.ndarray) -> np.ndarray:
 
 def gains_row(name: str) -> list[str]:
     """Return margin and gains of an arm."""
-    of = equal(name)
+    of = equal(name.removesuffix(_REST))
     own = gains_of(name).get('feedback.stiffness', 1.0)
     return [
         ALL[name].label,
@@ -392,16 +419,18 @@ _HEADS = (
     *('rms with 2 kg', 'without learning, over it', 'shakes'),
 )
 _INTEGRATOR = (*_HEADS[:1], 'factor', *_HEADS[2:5], _HEADS[8], 'damped')
+_OBSERVERS = (*_HEADS[:1], 'factor and pole', *_HEADS[2:5], _HEADS[8])
 _GAINS = ('arm', 'margin', 'this law, factor', 'PD', 'computed torque', 'DOB')
 
 
 def arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options."""
-    tables = 'goals', 'integrator'
+    tables = 'goals', 'integrator', 'observers'
     parser.add_argument('table', nargs='?', choices=tables, default='goals')
     about = 'arms of each kind (5)'
     parser.add_argument('--truths', type=positive, default=5, help=about)
     parser.add_argument('--arms', nargs='+', choices=ALL, default=list(ARMS))
+    parser.add_argument('--laws', nargs='+', choices=LAWS, default=list(LAWS))
 
 
 def main(given: argparse.Namespace) -> None:
@@ -410,8 +439,11 @@ def main(given: argparse.Namespace) -> None:
         of_arms = (integrator(name, given.truths) for name in given.arms)
         print_table(_INTEGRATOR, itertools.chain.from_iterable(of_arms))
         return
+    if given.table == 'observers':
+        of_arms = (observers(name, given.truths) for name in given.arms)
+        print_table(_OBSERVERS, itertools.chain.from_iterable(of_arms))
+        return
     print_table(_GAINS, map(gains_row, given.arms))
     print()
-    print_table(
-        _HEADS, (row for name in given.arms for row in rows(name, given.truths))
-    )
+    of_arms = (rows(name, given.truths, given.laws) for name in given.arms)
+    print_table(_HEADS, itertools.chain.from_iterable(of_arms))

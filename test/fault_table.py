@@ -582,11 +582,10 @@ def rows() -> Iterator[str]:
         stopped = outcome.noticed >= 0
         noticed = f'{outcome.noticed}' if stopped else 'tolerated'
         largest = f'{np.abs(outcome.after).max():.3g}' if len(outcome.after) else 'none'
-        recovered = 'yes' if outcome.recovered else 'NO'
-        yield f'| {fault.name} | {noticed} | {outcome.reason} | {largest} | {recovered} |\n'
+        yield f'| {fault.name} | {noticed} | {outcome.reason} | {largest} |\n'
 
 
-RULE = '| --- | --- | --- | --- | --- |\n'
+RULE = '| --- | --- | --- | --- |\n'
 
 
 def page(text: str) -> str:

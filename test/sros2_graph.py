@@ -46,7 +46,7 @@ HEAD = """\
 <?xml version="1.0" encoding="UTF-8"?>
 <!-- SPDX-License-Identifier: Apache-2.0 -->
 <!-- What each node may do, for SROS 2: made by `python test/sros2_graph.py config/sros2_policy.xml`
-     from the running nodes in the root namespace. See doc/tools.md for how to use it. -->
+     from the running nodes in the root namespace. See doc/topics.md for how to use it. -->
 """
 
 

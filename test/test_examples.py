@@ -26,6 +26,7 @@ EXPECTED = {
     '08_own_law': ([], [], r'(?s)blf_dsc: largest error 0\.0.*08_own_law.py: .* \d+\.'),
     '09_ros2_nodes': (['lockstep'], ['rclpy'], r'the arm is there: \[0\.0\d, '),
     '10_openarm': ([], [], r'at \[-0\.6 .*\n?.* mrad off on the way\nat \[-0\.9 .*'),
+    '11_own_model': ([], [], r'both identities hold'),
 }
 
 

@@ -8,7 +8,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from benchmark import joint_pd, many_arms, momentum_observer, random_arms
+from benchmark import (
+    joint_pd,
+    many_arms,
+    momentum_observer,
+    random_arms,
+    soft_arms,
+)
 from blf_dsc_controller.arms.linear_loop import Timing, law_response
 from blf_dsc_controller.configuration.schema import change
 from blf_dsc_controller.factory.controller import controller_of
@@ -201,3 +207,42 @@ def test_published_gains_are_tried_where_this_law_does_not_hold(study, monkeypat
     assert [found[name] for name in names] == ['3', '1', '0', '2', '0']
     assert found['not held, plausible'] == '1'
     assert found['settled [mrad]'] == '3 / 3 / 3'
+
+
+def test_rivals_at_rest_have_the_gains_that_they_have_in_motion(monkeypatch):
+    asked = []
+    gains = soft_arms.Equal(0.2, 0.9, 10.0, ((0.9, 4.0), (0.7, 8.0), (0.5, 9.0)))
+
+    def equal(name):
+        asked.append(name)
+        return gains
+
+    monkeypatch.setattr(soft_arms, 'equal', equal)
+    at_rest = soft_arms.ALL['ur5e_rest']
+    assert set(at_rest.gains['reference.amplitude']) == {0.0}
+    assert set(at_rest.plant['joint.backlash']) == {soft_arms.PLAY}
+    config = soft_arms.loop_with(at_rest, at_rest.gains).controller
+    found = soft_arms.law_of(config, 'ur5e_rest', soft_arms.DOB)
+    assert asked == ['ur5e']
+    assert (found.gains.scale, found.gains.bandwidth) == (
+        0.7,
+        8.0,
+    )  # 5.6 is the most of 3.6, 4.5
+    other = soft_arms.law_of(config, 'ur5e_rest', soft_arms.DOB, (0.5, 9.0))
+    assert (other.gains.scale, other.gains.bandwidth) == (0.5, 9.0)
+
+
+def test_table_of_soft_arms_has_the_laws_that_are_asked_for(monkeypatch):
+    none = [0.0] * 3
+
+    def figures(*run):
+        rms = 2.0 if run[1] == soft_arms.NO_LEARNING else 1.0
+        return soft_arms.Figures('', none, none, rms, np.nan, 0.0, is_softened=False)
+
+    monkeypatch.setattr(soft_arms, 'figures', figures)
+    asked = soft_arms.DOB, soft_arms.THIS
+    rows = list(soft_arms.rows('ur5e', 1, asked))
+    assert [row[1] for row in rows] == ['goal', soft_arms.THIS, soft_arms.DOB]
+    assert {row[7] for row in rows[1:]} == {'-'}  # nothing to compare with
+    rows = list(soft_arms.rows('ur5e', 1, (soft_arms.NO_LEARNING, *asked)))
+    assert [row[7] for row in rows[1:]] == ['2', '1', '2']

@@ -333,7 +333,7 @@ def localhost_environment() -> dict[str, str]:
 
     Whatever else the shell names is overruled: a profile, peers or a server of other
     computers. Other middleware than Jazzy's Fast DDS looks for nobody elsewhere, but
-    answers whoever finds it (doc/tools.md): the Fast DDS of Kilted rejects this
+    answers whoever finds it (doc/topics.md): the Fast DDS of Kilted rejects this
     package's profile, and would then find the whole network.
     """
     if not _is_jazzys_fast_dds():
