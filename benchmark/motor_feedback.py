@@ -16,8 +16,9 @@ found [kg]; and how far the arm moves in 2 s [rad] once the host is dead.  The l
     maker        the gains that LeRobot has for OpenArm and i2rt for YAM in the motors, over
                  the gravity of the description: position and torque, no velocity
     whole        the gains of rigid gears, through the inertia matrix
-    preset       the maker's gains as those of the joints
+    published    the maker's gains as those of the joints
     stiff        twice of them
+    preset       the gains of the preset, where they are others: OpenArm's
 
 by torques alone (host), or inside the motors' PD (motor).
 """
@@ -57,7 +58,7 @@ RATE = 4000.0  # Hz, of the motors: they have 10 kHz or more, which takes longer
 WEIGHT = 0.5  # kg
 
 _Changes = Mapping[str, object]
-LAWS = ('maker', 'whole', 'preset', 'stiff')
+LAWS = ('maker', 'whole', 'published', 'stiff', 'preset')
 GEARS: Mapping[str, _Changes] = {
     'openarm': {
         'joint.stiffness': [
@@ -74,6 +75,11 @@ GEARS: Mapping[str, _Changes] = {
     'yam': {},
 }
 """Where elastic gears are not those of the preset."""
+PUBLISHED: Mapping[str, _Changes] = {
+    'openarm': {'feedback.joint_damping': [5.0, 5.0, 3.0, 5.0, 0.3, 0.3, 0.3]},
+    'yam': {},
+}
+"""The maker's gains for motors, where those of the preset, for a host, are others."""
 RIGID: _Changes = {
     'joint.stiffness': None,
     'joint.backlash': None,
@@ -99,10 +105,12 @@ class Result(NamedTuple):
         return f'{late:.1f}, {pick_up:.1f}; {weight}; {self.travel:.2g}'
 
 
-def changes_of(law: str, joints: int) -> _Changes:
+def changes_of(arm: str, law: str, joints: int) -> _Changes:
     """Return what a law changes of the controller of a preset."""
+    published = PUBLISHED[arm]
     if law == 'maker':  # whose errors and torques are no fault
         return {
+            **published,
             'robot.effort': 'unknown',
             'safety.saturation_time': 1e3,
             'barrier.bound': [0.5] * joints,
@@ -115,7 +123,8 @@ def changes_of(law: str, joints: int) -> _Changes:
             'feedback.joint_damping': None,
             'barrier.bound': [0.01] * joints,  # rad
         }
-    return {'feedback.stiffness': 2.0} if law == 'stiff' else {}
+    stiffness = {'feedback.stiffness': 2.0} if law == 'stiff' else {}
+    return {} if law == 'preset' else {**published, **stiffness}
 
 
 def loop_of(arm: str, law: str, kind: str, period: float) -> LoopConfig:
@@ -129,7 +138,7 @@ def loop_of(arm: str, law: str, kind: str, period: float) -> LoopConfig:
     gears = RIGID if kind == 'rigid' else GEARS[arm]
     plant = {**time, **events, 'sensor.resolution': damiao.ENCODER, **gears}
     joints = len(load_loop(arm).controller.joints)
-    given = {**time, **changes_of(law, joints)}
+    given = {**time, **changes_of(arm, law, joints)}
     return load_loop(arm, {CONTROLLER: given, PLANT: plant})
 
 
@@ -208,10 +217,10 @@ def rows(arm: str, laws: Collection[str]) -> Iterator[tuple[str, ...]]:
     """Yield a row for each law."""
     cases = [
         ('maker', 'motor'),
-        *product(('whole', 'preset', 'stiff'), ('host', 'motor')),
+        *product(LAWS[1:], ('host', 'motor')),
     ]
     for law, feedback in cases:
-        if law not in laws:
+        if law not in laws or (law == 'preset' and not PUBLISHED[arm]):
             continue
         cells = [
             str(run(arm, law, feedback, kind, period))

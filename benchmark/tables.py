@@ -17,6 +17,7 @@ GROUPS = {
         'arms': 'laws on a Panda and a UR5e with wrong URDFs; parts of the bandwidth',
         'changes': '14,000 randomly changing arms, each with and without learning',
         'random-arms': 'random arms with elastic gears: this law and its rivals',
+        'many-arms': 'a thousand of them with this law: what is rare',
         'robustness': 'what laws of equal gains bear: late torques, lighter drives',
         'composite': 'composite learning as published for a Panda, in a soft loop',
     },

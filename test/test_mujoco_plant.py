@@ -226,7 +226,7 @@ def test_closed_loop_runs_the_same_with_both_plants():
     [
         ('panda_rigid', 0.2, 2.3),
         pytest.param('ur5e_rigid', 0.55, 1.6, marks=pytest.mark.nightly),
-        pytest.param('openarm', 0.36, 5.3, marks=pytest.mark.nightly),
+        pytest.param('openarm', 0.36, 6.4, marks=pytest.mark.nightly),
         ('widowx', 0.58, 39.0),
     ],
 )

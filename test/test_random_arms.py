@@ -8,7 +8,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from benchmark import joint_pd, momentum_observer, random_arms, soft_arms
+from benchmark import (
+    joint_pd,
+    many_arms,
+    momentum_observer,
+    random_arms,
+    soft_arms,
+)
 from blf_dsc_controller.arms.linear_loop import Timing, law_response
 from blf_dsc_controller.configuration.schema import change
 from blf_dsc_controller.factory.controller import controller_of
@@ -171,6 +177,36 @@ def test_runs_that_are_kept_are_not_made_again(study, monkeypatch, tmp_path):
     assert len(made) == 2 * len(study.LAWS)
     assert list(study.arms(2, ['openarm'], ['study'], study.Kept(path))) == rows
     assert len(made) == 2 * len(study.LAWS)
+
+
+def test_published_gains_are_tried_where_this_law_does_not_hold(study, monkeypatch):
+    """An arm on which those hold counts as a failure, any other does not."""
+    kept = study.Kept(None)
+    made = []
+
+    def of(key, _):
+        made.append(key)
+        holds = key.number == 0 or (key.number == 1 and key.law == study.STOCK)
+        stopped = np.nan if holds else 2.0
+        errors = 0.001, 0.002, 0.003, 0.5 + key.number
+        kept.results[key] = study.Result(stopped, 'text', 0, 0.01, *errors, 1, 1, 1)
+        return kept.results[key]
+
+    monkeypatch.setattr(kept, 'of', of)
+    many_arms.make(3, ['panda'], ['study'], kept)
+    assert [(key.number, key.law) for key in made] == [
+        (0, study.THIS),
+        (1, study.THIS),
+        (1, study.STOCK),
+        (2, study.THIS),
+        (2, study.STOCK),
+    ]
+    (row,) = many_arms.rows(kept)
+    found = dict(zip(many_arms.HEAD, row, strict=True))
+    names = 'arms', 'hold', 'shake', 'stop', 'hold, beyond the bound'
+    assert [found[name] for name in names] == ['3', '1', '0', '2', '0']
+    assert found['not held, plausible'] == '1'
+    assert found['settled [mrad]'] == '3 / 3 / 3'
 
 
 def test_rivals_at_rest_have_the_gains_that_they_have_in_motion(monkeypatch):
