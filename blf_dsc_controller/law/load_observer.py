@@ -30,8 +30,8 @@ law continues with a d^3 of its own, which may have that already.
 r would take back what of it helps the motors alone.  So once a window is learned, only what
 exceeds `_THRESHOLD` s is added, s being the rms of r about its mean: at first that of the
 unmodelled torque, then measured over the length of a window while nothing touches the
-arm.  What r has added below that before is handed to d^3, and so is, in time, a load that
-is never learned.
+arm.  What r has added below that before is handed to d^3, and so is a load that is not learned, as
+at rest, in the seconds in which it becomes the usual r.
 """
 
 from math import isfinite, sqrt
@@ -161,8 +161,8 @@ def update(
     """Compute r after an interval of `dt` [s], and its bias once the filters have settled.
 
     The `information` (m, m) is the inverse covariance of the prior of theta, which
-    `is_learned` by now, while nothing touches the arm, or not.  The first time, d^3, the
-    `disturbance` (n,) [N m], takes what the threshold keeps out of r.
+    `is_learned` by now, while nothing touches the arm, or not.  d^3, the `disturbance` (n,)
+    [N m], takes what bias and threshold then keep out of r.
     """
     settling = _SETTLING / settings.observer_bandwidth
     before = state.elapsed[0]
@@ -172,7 +172,7 @@ def update(
     if is_learned:
         if state.measured[0] == 0.0:
             begin_threshold(settings, state, estimate, disturbance)
-        measure(settings, state, estimate)
+        measure(settings, state, estimate, disturbance)
     elif state.measured[0] == 0.0:
         release_bias(settings, state, dt)
     for i in range(state.torque.size):
@@ -200,18 +200,25 @@ def begin_threshold(
 
 
 @inner
-def measure(settings: Settings, state: State, estimate: Array) -> None:
-    """Update the mean of r, which is the bias, and its mean square about that."""
+def measure(
+    settings: Settings, state: State, estimate: Array, disturbance: Array
+) -> None:
+    """Update the mean of r, which is the bias, and its mean square about that.
+
+    d^3, the `disturbance` (n,) [N m], takes what r loses.
+    """
     state.measured[0] += 1.0
     first = _FIRST * settings.samples + state.measured[0]
     share = max(1.0 / settings.samples, 1.0 / first)
     for i in range(state.bias.size):
+        disturbance[i] += load_torque(settings, state, i, estimate)
         r = residual(settings, state, i, estimate) - state.bias[i]
         least = _LEAST * settings.unmodelled[i]
         most = _CLIPPED * max(least, sqrt(state.square[i]))
         r = clip(r, -most, most)
         state.bias[i] += share * r
         state.square[i] += share * (r * r - state.square[i])
+        disturbance[i] -= load_torque(settings, state, i, estimate)
 
 
 @inner
