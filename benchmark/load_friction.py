@@ -78,7 +78,8 @@ def draws(arms: Sequence[str], runs: int) -> Iterator[Weighed]:
 def readings_of(runs: Iterable[Weighed], *, held: bool) -> Floats:
     """Return the readings after the pick-up, or before."""
     readings = np.concatenate([each.run.readings for each in runs])
-    return readings[(readings[:, 0] > PICK_UP) == held]
+    chosen: Floats = readings[(readings[:, 0] > PICK_UP) == held]
+    return chosen
 
 
 def worst(readings: Floats) -> str:

@@ -77,7 +77,9 @@ def test_change_makes_the_load_unknown_until_the_filters_have_settled(panda):
     assert PICKED_UP < unknown[0] < PICKED_UP + 0.2
     assert 0.3 < unknown[-1] - unknown[0] < 0.5
     half = load[(t > unknown[-1]) & (t < PICKED_UP + 1.0), 4]
-    assert half[0] > 2.5 * half[-1]  # friction may have changed since the hand was empty
+    assert (
+        half[0] > 2.5 * half[-1]
+    )  # friction may have changed since the hand was empty
 
 
 def test_no_torque_depends_on_it(panda):
