@@ -27,7 +27,12 @@ from blf_dsc_controller.commissioning.choice import Loops, choose
 from blf_dsc_controller.commissioning.commissioning import commissioned, plan
 from blf_dsc_controller.commissioning.motion import excitation, lines_in
 from blf_dsc_controller.commissioning.page import sentences
-from blf_dsc_controller.commissioning.response import Response, refined, response_of
+from blf_dsc_controller.commissioning.response import (
+    Response,
+    _noise,
+    refined,
+    response_of,
+)
 from blf_dsc_controller.commissioning.strength import MOST, strength
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.files import share_folder
@@ -265,6 +270,37 @@ def lines_of(stiffness, noise):
         posture=np.zeros(2),
         seen=np.ones(f.size, bool),
     )
+
+
+def test_noise_of_velocities_is_counted_as_that_of_positions_is():
+    """The doubt is linear in each, and neither is left out."""
+    response = lines_of(lambda f: 300.0 * np.broadcast_to(np.eye(2), (f.size, 2, 2)), 1)
+    nothing = np.zeros_like(response.position_noise)
+
+    def doubt_of(**noise):
+        loops = Loops([response._replace(**noise)], np.ones(2), 1e-3)
+        return loops.singular_values(found().start)[0][1]
+
+    whole = doubt_of()
+    for left_out in ('position_noise', 'velocity_noise'):
+        rest = doubt_of(**{left_out: nothing})
+        assert (rest > 0.0).all()
+        assert (rest < whole).all()
+    twice = doubt_of(position_noise=nothing, velocity_noise=2.0 + nothing)
+    np.testing.assert_allclose(
+        twice, 2.0 * doubt_of(position_noise=nothing), rtol=1e-12
+    )
+
+
+def test_noise_is_looked_for_as_far_as_there_are_waves_between_the_lines():
+    """Nothing but lines is near: it is that of the free waves farther out."""
+    count, at = 400, np.array([[100, 101]])
+    between = np.ones(count, bool)
+    between[60:160] = False
+    U = np.zeros((count, 2), complex)
+    measured = 0.3 * np.ones((count, 2), complex)
+    noise = _noise(measured, U, np.zeros((1, 2, 2), complex), at, between)
+    np.testing.assert_allclose(noise, 0.3)
 
 
 def largest_of(response):

@@ -167,6 +167,8 @@ def test_nothing_moves_unless_somebody_agrees(arm, capsys, monkeypatch):
     [
         (['--write', 'm.yaml'], (NEAR,), '--write measures nothing'),
         ([], ((0.3, 2.99),), 'joint2 would be at 2.99 rad, less than 0.05 rad from'),
+        ([], ((0.3, 90.0),), 'beyond (90 degrees are 1.571 rad) its limits'),
+        ([], ((0.3, 4.0),), 'joint2 would be at 4 rad, beyond its limits'),
         ([], (NEAR, (0.3, 1.1, 0.0)), 'got 3 angles, but the arm has 2 joints'),
     ],
 )
@@ -248,7 +250,7 @@ def test_contacts_end_a_motion_and_loads_are_not_told_in_it():
 def test_reference_to_hold_visits_where_the_arm_is(arm):
     config = change(blf.load_loop(arm).controller, {'reference.type': 'hold'})
     np.testing.assert_array_equal(postures_of(config, here=np.array(BEGIN)), [BEGIN])
-    with pytest.raises(BlfDscError, match=r'reference\.type: got hold'):
+    with pytest.raises(BlfDscError, match=r'reference\.type: got hold.*--posture'):
         postures_of(config)
 
 

@@ -187,7 +187,7 @@ def told_config():
 def test_weighed_load_is_told_in_motion_and_no_torque_steps(wire, tmp_path):
     """The robot adds 2 kg in the end, and the whole torque of each joint (tau_J) goes on.
 
-    Steps are those of the motion before, and 0.5 % of the torque limit.
+    Steps are those of the motion before the pick-up, and 0.5 % of the torque limit.
     """
     (tmp_path / 'my.yaml').write_text(told_config())
     wire.simulate('127.0.0.17', 'load=2@2500')
@@ -207,7 +207,7 @@ def test_weighed_load_is_told_in_motion_and_no_torque_steps(wire, tmp_path):
         int(np.searchsorted(recorded.stamp, each.stamp))
         for each in (loads[0], loads[-1])
     )
-    usual = np.abs(np.diff(effort[begin - 1000 : begin], axis=0)).max(axis=0)
+    usual = np.abs(np.diff(effort[1000:2400], axis=0)).max(axis=0)
     steps = np.abs(np.diff(effort[begin - 5 : end + 5], axis=0)).max(axis=0)
     limit = np.array((87.0,) * 4 + (12.0,) * 3)
     assert (steps < 1.5 * usual + 0.005 * limit).all()

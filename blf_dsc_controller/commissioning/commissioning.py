@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from datetime import datetime
 from typing import NamedTuple
@@ -115,7 +116,8 @@ def postures_of(
         if here is None:
             raise BlfDscError(
                 'reference.type: got hold, with which the arm stays where it begins: give the '
-                'postures in which to measure it'
+                'postures in which to measure it (--posture ANGLE ... [rad]), or a reference '
+                'that moves'
             )
         return here[None]
     return np.asarray(along(config, count)[0])
@@ -222,13 +224,23 @@ def _check_posture(config: ControllerConfig, posture: Floats) -> None:
     )
     for joint, at, lower, upper in limits:
         if not lower + _ROOM <= at <= upper - _ROOM:
+            problem = _beyond(float(at), lower, upper)
             raise BlfDscError(
-                f'posture: {joint} would be at {at:.4g} rad, less than {_ROOM:g} rad from its '
-                f'limits, {lower:g} to {upper:g} rad'
+                f'posture: {joint} would be at {at:.4g} rad, {problem} its limits, {lower:g} to '
+                f'{upper:g} rad'
             )
 
 
 _ROOM = 0.05  # rad
+
+
+def _beyond(at: float, lower: float, upper: float) -> str:
+    """Return how an angle [rad] is to the limits of its joint."""
+    if lower <= at <= upper:
+        return f'less than {_ROOM:g} rad from'
+    degrees = abs(at) > 2.0 * math.pi and lower <= math.radians(at) <= upper
+    hint = f' ({at:g} degrees are {math.radians(at):.4g} rad)' if degrees else ''
+    return f'beyond{hint}'
 
 
 def _rounded(values: Floats) -> tuple[float, ...]:

@@ -11,6 +11,7 @@ from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.drive import DriveConfig
 from blf_dsc_controller.configuration.nodes import DRIVE, PLANT, load
 from blf_dsc_controller.configuration.plant import PlantConfig
+from blf_dsc_controller.configuration.schema import suggestion
 from blf_dsc_controller.drive.driver import Driver, check_feedback, disagreements
 from blf_dsc_controller.drive.simulated import SIMULATED, simulated
 from blf_dsc_controller.errors import BlfDscError, ConfigurationError
@@ -36,6 +37,8 @@ def driver_of(
         plant = load(path, PLANT, PlantConfig, given.get(PLANT))
         made: type[Driver] = simulated(plant, settings.feedback)
     else:
+        if close := suggestion(address, [SIMULATED], cutoff=0.9):
+            raise BlfDscError(f'--robot: there is no robot {address}{close}')
         made = find_driver(settings.driver)
     check_feedback(made, settings)
     problems = disagreements(made.facts_for(config), config)
