@@ -28,6 +28,8 @@ LAW = {
     'comparison_detuned': 'backstepping',
     'composite_panda': 'slotine_li',
     'model_based': 'model_based',
+    'paper': 'paper',
+    'paper_tuned': 'paper',
     'slotine_li': 'slotine_li',
 }
 
