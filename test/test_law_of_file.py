@@ -15,7 +15,7 @@ from benchmark.studies import path_of
 from blf_dsc_controller.cli.main import main
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.law_file import digest, load_law
-from blf_dsc_controller.configuration.law_traits import LAWS, traits_of
+from blf_dsc_controller.configuration.law_traits import LAWS, OWN, traits_of
 from blf_dsc_controller.configuration.nodes import load_loop, locate
 from blf_dsc_controller.configuration.plant import PlantConfig
 from blf_dsc_controller.configuration.schema import build, change, flatten
@@ -196,7 +196,7 @@ def test_traits_of_the_packaged_laws_are_those_of_the_laws():
     for law in LAWS:
         config = build(ControllerConfig, TRUTH | {'law': law})
         assert traits_of(config).has_barrier == law_of(config).has_barrier
-        assert traits_of(config).learns == (law == 'blf_dsc')
+        assert traits_of(config).learns == (law in OWN)
 
 
 @pytest.mark.parametrize(

@@ -105,7 +105,7 @@ def test_all_problems_are_reported_at_once_and_nothing_is_declared(bare_node, tm
         'sensr.resolution: unknown parameter, did you mean sensor.resolution?',
         'initial.v: unknown parameter, did you mean initial.velocity?',
         'mode: got "offline", but it must be one of realtime, lockstep',
-        'seed: got -1, but it must be at least 0',
+        'seed: got -1, but it must be at least 0 and at most 9223372036854775807',
         'arm.l1: got 1, but a double is expected, with a decimal point',
     ]
     assert not node.has_parameter('seed')

@@ -82,7 +82,10 @@ class Parameter:
         """
         if self.choices:
             return 'one of ' + ', '.join(self.choices)
-        return ' and '.join(f'{words} {limit:g}' for words, limit, _ in self._limits())
+        return ' and '.join(
+            f'{words} {limit if isinstance(limit, int) else f"{limit:g}"}'
+            for words, limit, _ in self._limits()
+        )
 
     @property
     def constraints(self) -> str:
