@@ -140,7 +140,13 @@ def load_torque(settings: Settings, state: State, i: int, estimate: Array) -> fl
     """Return r of joint i [N m] for an `estimate` theta (m,)."""
     if not has_settled(settings, state):
         return 0.0
-    r = residual(settings, state, i, estimate) - state.bias[i]
+    return excess(settings, state, i, residual(settings, state, i, estimate))
+
+
+@inner
+def excess(settings: Settings, state: State, i: int, seen: float) -> float:
+    """Return r of joint i [N m] for a `seen` residual [N m]: what its threshold leaves of it."""
+    r = seen - state.bias[i]
     usual = _THRESHOLD * sqrt(state.square[i])
     most = settings.most[i]
     share = 1.0 - state.faded[0]
@@ -211,14 +217,16 @@ def measure(
     first = _FIRST * settings.samples + state.measured[0]
     share = max(1.0 / settings.samples, 1.0 / first)
     for i in range(state.bias.size):
-        disturbance[i] += load_torque(settings, state, i, estimate)
-        r = residual(settings, state, i, estimate) - state.bias[i]
+        seen = residual(settings, state, i, estimate)
+        before = excess(settings, state, i, seen)
+        r = seen - state.bias[i]
         least = _LEAST * settings.unmodelled[i]
         most = _CLIPPED * max(least, sqrt(state.square[i]))
         r = clip(r, -most, most)
         state.bias[i] += share * r
         state.square[i] += share * (r * r - state.square[i])
-        disturbance[i] -= load_torque(settings, state, i, estimate)
+        if has_settled(settings, state):
+            disturbance[i] += before - excess(settings, state, i, seen)
 
 
 @inner
