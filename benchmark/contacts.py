@@ -34,7 +34,8 @@ from benchmark.options import add_configs, add_out, positive
 from blf_dsc_controller.analysis.figures import Picture, head
 from blf_dsc_controller.analysis.output import aligned, write_json
 from blf_dsc_controller.analysis.panels import BLUE, MUTED, ORANGE
-from blf_dsc_controller.cli.run import make_folder, print_notice
+from blf_dsc_controller.cli.result_folder import make_folder
+from blf_dsc_controller.cli.run import print_notice
 from blf_dsc_controller.compiled.announcement import announced_compilation
 from blf_dsc_controller.configuration.nodes import LoopConfig
 from blf_dsc_controller.configuration.schema import change

@@ -28,7 +28,7 @@ from blf_dsc_controller.analysis.figures import Picture, draw_panels
 from blf_dsc_controller.analysis.metrics import Metrics, measure
 from blf_dsc_controller.analysis.output import aligned, write_json
 from blf_dsc_controller.analysis.panels import ALARM, COLOURS, panels
-from blf_dsc_controller.cli.run import make_folder
+from blf_dsc_controller.cli.result_folder import make_folder
 from blf_dsc_controller.configuration.nodes import LoopConfig, dump, load_loop
 from blf_dsc_controller.configuration.schema import change
 from blf_dsc_controller.factory.settings import settings_of_config

@@ -29,7 +29,8 @@ from blf_dsc_controller.analysis.figures import Picture, head
 from blf_dsc_controller.analysis.metrics import measure
 from blf_dsc_controller.analysis.output import aligned, write_json
 from blf_dsc_controller.analysis.panels import BLUE, INK, MUTED, ORANGE
-from blf_dsc_controller.cli.run import make_folder, print_notice
+from blf_dsc_controller.cli.result_folder import make_folder
+from blf_dsc_controller.cli.run import print_notice
 from blf_dsc_controller.compiled.announcement import announced_compilation
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.nodes import CONTROLLER, load_loop

@@ -6,6 +6,7 @@ from __future__ import annotations
 import json
 import os
 import signal
+import subprocess
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +14,7 @@ import pytest
 
 pytest.importorskip('rclpy', reason='needs ROS 2')
 
-from command import COMMAND, PATIENT, Running, closed_loop, finished, wait_for
+from command import COMMAND, COMPILED, PATIENT, Running, closed_loop, finished, wait_for
 from recorded_run import small_disk
 from ros_rig import simulated
 from rosbags.highlevel import AnyReader
@@ -21,6 +22,11 @@ from rosbags.highlevel import AnyReader
 from blf_dsc_controller.bags.reader import read_run
 from blf_dsc_controller.bags.recovery import recover
 from blf_dsc_controller.cli.main import main
+from blf_dsc_controller.cli.result_folder import (
+    discard_unrecorded,
+    make_folder,
+    make_run_folder,
+)
 
 HALF = {'learning.initial_estimate': [0.5, 0.16, 0.2]}
 DURATION = 1  # s
@@ -227,6 +233,35 @@ def test_loop_in_lockstep_waits_for_its_recorder_and_ctrl_c_shuts_down_cleanly(r
     wait_for(lambda: 'waiting for subscribers' in log.read_text())
     os.kill(recorder, signal.SIGCONT)
     assert 'missing' not in ended_cleanly(running, signal.SIGINT)
+
+
+def test_interrupted_before_the_loop_began_a_run_leaves_nothing_and_may_be_repeated(
+    tmp_path,
+):
+    out = tmp_path / 'out'
+    started = subprocess.Popen(
+        [*COMMAND, '--mode', 'lockstep', '--duration', '0.1', '--out', str(out)],
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    wait_for((out / 'logs' / 'loop.log').exists, COMPILED)  # it imports now
+    started.send_signal(signal.SIGINT)
+    _, errors = started.communicate()
+    assert started.returncode == 130, errors
+    assert errors.splitlines()[-1] == 'blf_dsc run: interrupted'
+    assert 'Traceback' not in errors
+    assert not out.exists()
+
+
+def test_folder_of_a_run_without_a_bag_goes_at_an_interrupt(tmp_path):
+    """And no other: not that of a recorded run, nor what another command has made."""
+    made = [make_run_folder(tmp_path / name) for name in ('waiting', 'recorded')]
+    (made[0] / 'config.yaml').touch()
+    (made[1] / 'bag').mkdir()
+    other = make_folder(tmp_path / 'figures')
+    assert discard_unrecorded() == made[:1]
+    assert [each.exists() for each in (*made, other)] == [False, True, True]
+    assert discard_unrecorded() == []
 
 
 @pytest.mark.parametrize('mode', ['lockstep', 'realtime'])

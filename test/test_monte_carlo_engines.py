@@ -24,7 +24,7 @@ from test_monte_carlo_study import LOOP, RUNS, STUDY, study, whole, write
 
 from blf_dsc_controller.bags.reader import read_run
 from blf_dsc_controller.cli.main import main
-from blf_dsc_controller.cli.run import make_folder
+from blf_dsc_controller.cli.result_folder import make_folder
 from blf_dsc_controller.configuration.nodes import load_loop
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.simulation.loop import simulate

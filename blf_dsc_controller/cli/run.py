@@ -17,6 +17,10 @@ from blf_dsc_controller.bags.content import read_content
 from blf_dsc_controller.bags.reader import recorded_run
 from blf_dsc_controller.cli.domains import check_network
 from blf_dsc_controller.cli.main import INTERRUPTED
+from blf_dsc_controller.cli.result_folder import (
+    make_run_folder,
+    refuse_existing,
+)
 from blf_dsc_controller.compiled.announcement import announced_compilation
 from blf_dsc_controller.compiled.kernel_cache import ship
 from blf_dsc_controller.configuration.controller import ControllerConfig
@@ -70,7 +74,7 @@ def run(options: Namespace) -> int:
         require_viser()
     if not options.offline:
         check_network()
-    out = make_folder(options.out)
+    out = make_run_folder(options.out)
     clock = 'plant' if config.plant.mode == 'lockstep' else 'wall'
     recorder = {'output': str(out / 'bag'), 'clock': clock}
     config = config._replace(recorder=change(config.recorder, recorder))
@@ -99,21 +103,6 @@ def run(options: Namespace) -> int:
     if not completed:
         return INTERRUPTED
     return STOPPED if stopped else 0
-
-
-def make_folder(path: Path) -> Path:
-    """Create a folder; raises BlfDscError if it exists already."""
-    refuse_existing(path)
-    path.mkdir(parents=True)
-    return path
-
-
-def refuse_existing(path: Path) -> None:
-    """Raise BlfDscError if something exists there."""
-    if path.exists():
-        raise BlfDscError(
-            f'{path} exists already and is not overwritten: choose another --out'
-        )
 
 
 def _configuration(options: Namespace) -> LoopConfig:

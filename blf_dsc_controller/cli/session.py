@@ -14,7 +14,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import ExitStack, closing, contextmanager
 from importlib import metadata
 from pathlib import Path
@@ -50,7 +50,7 @@ _MODULES = {
     VIEW: 'blf_dsc_controller.view.node',  # only on request, once the loop runs
 }
 _ENDING = 20.0  # s that a node may take to exit before it is killed
-_UNHEARD = 1.0  # s likewise, once nobody is left to record its last messages
+_UNHEARD = 1.0  # s likewise, while nobody records its messages
 _TAIL = 12  # lines of a failed node's log that are shown
 _MIN_FREE_SPACE = 1_000_000  # bytes; with less free space the disk counts as full
 _PR_SET_PDEATHSIG = 1
@@ -75,7 +75,8 @@ def run_session(config: LoopConfig, out: Path, *, view: bool) -> bool:
 
     They run in a ROS domain of their own, and with a page if they should be viewed.
     Returns False if a signal to this process, or to another node than the plant, ended
-    the run; raises BlfDscError if a node exited with an error.
+    the run; raises BlfDscError if a node exited with an error, and KeyboardInterrupt,
+    without a bag, if a signal came before the loop had begun.
     """
     logs = out / 'logs'
     logs.mkdir()
@@ -89,6 +90,9 @@ def run_session(config: LoopConfig, out: Path, *, view: bool) -> bool:
             print(f'the recording up to then is in {bag}', file=sys.stderr)
         elif bag.exists():
             print(f'blf_dsc recover {bag} saves what was recorded', file=sys.stderr)
+        raise
+    except KeyboardInterrupt:
+        shutil.rmtree(out / 'bag', ignore_errors=True)  # empty, if it is there already
         raise
 
 
@@ -190,7 +194,8 @@ def _run_nodes(
 ) -> bool:
     """Run the nodes until the plant has ended.
 
-    Return False if something else ended the run.
+    Return False if something else ended the run; raise KeyboardInterrupt if it had not
+    begun.
     """
     interrupts: list[int] = []
     # stops the nodes in reverse, then restores the handlers
@@ -221,6 +226,9 @@ def _run_nodes(
                     pages.append(started(VIEW))
                 starting = pages if view else []
                 view = False
+        if interrupts and monitor.start is None:
+            _do_not_wait_for(nodes)  # they import, compile or wait for each other
+            raise KeyboardInterrupt
         _hurry_without_recorder(*nodes)
         completed = not (interrupts or nodes[-1].is_running)
         if completed:
@@ -240,7 +248,11 @@ def _hurry_without_recorder(recorder: NodeProcess, *others: NodeProcess) -> None
     if recorder.is_running:
         return
     tqdm.write(f'{recorder.name} has ended: so does the run', file=sys.stderr)
-    for node in others:
+    _do_not_wait_for(others)
+
+
+def _do_not_wait_for(nodes: Iterable[NodeProcess]) -> None:
+    for node in nodes:
         node.patience = _UNHEARD
 
 

@@ -12,7 +12,8 @@ import numpy as np
 from tqdm import tqdm
 
 from blf_dsc_controller.analysis.output import write_json
-from blf_dsc_controller.cli.run import make_folder, print_notice
+from blf_dsc_controller.cli.result_folder import make_folder
+from blf_dsc_controller.cli.run import print_notice
 from blf_dsc_controller.compiled.announcement import announced_compilation
 from blf_dsc_controller.studies import laws, report, runs
 from blf_dsc_controller.studies.monte_carlo import load_study
