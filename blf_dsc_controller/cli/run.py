@@ -48,11 +48,13 @@ from blf_dsc_controller.supervision.config_warnings import config_warnings
 from blf_dsc_controller.supervision.expected_errors import expectation
 from blf_dsc_controller.supervision.guard import Guard
 from blf_dsc_controller.supervision.supervisor import Reason
+from blf_dsc_controller.supervision.torque_watchdog import TorqueWatchdog
 from sim_plant.plant import plant_of
 
 STOPPED = 5
 """Exit code if the controller stopped before the end."""
 
+_ANY_TIMEOUT = 1.0  # s
 _DURATION = 60.0  # s, if neither the file nor an option sets it
 
 
@@ -201,7 +203,7 @@ def _report(out: Path) -> bool:
 
 
 def precompile(options: Namespace) -> None:
-    """Compile the kernels of controller and plant, in two parallel processes."""
+    """Compile the kernels of controller, watchdog and plant, in two parallel processes."""
     config = load_loop(options.config)
     with ProcessPoolExecutor(2, get_context('spawn')) as pool:
         list(pool.map(_compile, (config.controller, config.plant)))
@@ -219,5 +221,6 @@ def _compile(config: ControllerConfig | PlantConfig) -> None:
     if isinstance(config, ControllerConfig):
         Guard(config)
         JointStateDecoder(config.joints)
+        TorqueWatchdog(config, _ANY_TIMEOUT)  # rehearses
     else:
         plant_of(config).compile()
